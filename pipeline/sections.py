@@ -218,7 +218,8 @@ class VerifyConfig(Section):
     better_alignment_z: Positive = 1.0
     # A result within so many of its sigmas of the prior need not align better; the largest of six degrees of freedom.
     prior_agreement_sigmas: Positive = 4.0
-    # Frames of the fit: with fewer the record is refused. Selection refuses a pair with fewer than 8 before that.
+    # Frames of the fit: with fewer the record is refused, camera-lidar of 5 or more held. Selection refuses a pair with
+    # fewer before that.
     min_fit_frames: Annotated[int, Field(ge=8)] = 8
     # Frames, and blocks of frames that share a scene, without which held-out data decide nothing.
     min_held_out_frames: Annotated[int, Field(ge=1)] = 3

@@ -78,6 +78,8 @@ class Judging:
         mounting = mounting_covariance(pair, estimate.T, estimate.covariance, self.camera_turn_sigma_rad)
         targets = seen_targets(pair, self.prior, self._views)
         unseen = [] if targets is not None else [unseen_failure(pair)]
+        if active and not held_out:
+            unseen.append(FailedCheck("the day has too few frames to fit and to judge: none judges"))
         targets = DEFAULT_TARGETS if targets is None else targets
         test, claims = self._held_out(estimate, held_out, limits, mounting, targets)
         verdict = judge(

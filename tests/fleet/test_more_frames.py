@@ -29,7 +29,7 @@ from tests.makers.written_logs import Kit, fleet_config
 PRIOR = Prior(np.eye(4), np.eye(4), 0.035, 0.05)
 ESTIMATE = PairEstimate("lidar_radar", np.eye(4), np.eye(6) * 1e-6, np.full(6, 0.9), np.ones(6, bool), 50)
 VAGUE, SURE = (Claim(sigma, 0.0, 0.0, sigma, 0.003, 0.995) for sigma in (0.01, 1e-4))
-FEW = _too_few("camera_lidar", [1, 2], [["sky"]] * 9)
+FEW = _too_few("camera_lidar", [1, 2], [["sky"]] * 9, 5)
 
 
 def held_for(claim, frames):

@@ -31,6 +31,7 @@ from schemas.observations import Observation
 __all__ = [
     "MIN_FRAMES",
     "PAPER_SYNC_GATE_S",
+    "SHORTEST",
     "Selection",
     "hold_out",
     "missing_content",
@@ -40,7 +41,9 @@ __all__ = [
 
 PAPER_SYNC_GATE_S = 0.005  # section 4.5.1
 
-MIN_FRAMES = 8  # fewer carry no calibration: 10 frames already scatter by 0.1 deg (evidence on the real logs)
+MIN_FRAMES = 8  # fewer are not accepted: 10 frames already scatter by 0.1 deg (evidence on the real logs)
+# With so many camera-lidar of method `joint` says how sure it is (README); it is held.
+SHORTEST = 5
 _HARD = frozenset(
     {"sync", "empty", *(f"no_{sensor}" for sensor in SENSORS)}
 )  # no method can use such a frame
@@ -81,7 +84,8 @@ def select_frames(
         paper: prefer frames that meet the paper's conditions; else choose by content alone.
         sync_gate_s: largest difference of a pair's stamps; None = any that ingest let in.
         motion_gate: how far the car may drive and turn [m, rad] between a pair's stamps, their constant gap aside.
-        pairs: those of the rig. One for which fewer than MIN_FRAMES frames are left is refused.
+        pairs: those of the rig. One for which fewer than MIN_FRAMES frames are left (SHORTEST of camera-lidar by
+            content) is refused.
         absent: why frames lack a sensor, in words by sensor, as far as the caller knows.
     """
     scene = scenes_of(observations)
@@ -93,7 +97,12 @@ def select_frames(
         for i in [] if motion_gate is None else np.flatnonzero(_apart(observations, pair, *motion_gate)):
             reasons[i].append("sync")
         usable = [i for i, r in enumerate(reasons) if not _HARD & set(r)]
+        judges = [i for i in usable if held_out[i] is True]
         candidates = _few_of_each([i for i in usable if held_out[i] is False], scene)
+        silent = _silent(pair, observations, absent or {})
+        least = SHORTEST if pair == "camera_lidar" and not paper and silent is None else MIN_FRAMES
+        if len(candidates) < least == SHORTEST:  # too few to fit and to judge: all fit, and none judges
+            judges, candidates = [], _few_of_each(usable, scene)
         ideal = [i for i in candidates if not reasons[i]]
         contents = contents_of(observations, pair)
         chosen = choose_for_information(ideal if paper else candidates, contents, config.frames)
@@ -103,13 +112,11 @@ def select_frames(
             chosen += choose_for_information(fewest, contents, config.frames - len(chosen))
             chosen = sorted(chosen)
         rejected[pair] = _count_rejected(reasons, held_out, chosen, paper=paper)
-        if len(chosen) < MIN_FRAMES:
-            refused[pair] = _silent(pair, observations, absent or {}) or SolveError(
-                _too_few(pair, chosen, reasons)
-            )
+        if len(chosen) < least:
+            refused[pair] = silent or SolveError(_too_few(pair, chosen, reasons, least))
             continue
         fit[pair] = chosen
-        holdout[pair] = [i for i in usable if held_out[i] is True]
+        holdout[pair] = judges
         passed[pair] = sum(1 for r in reasons if not r)
         notes[pair] = _notes(pair, passed[pair], [i for i in chosen if reasons[i]], len(chosen), paper=paper)
         missing[pair] = missing_content([observations[i] for i in chosen], pair)
@@ -300,7 +307,7 @@ def _fault_in(why: str) -> str:
     return next((code for code, sentence in FAULTS.items() if why.startswith(sentence)), "silent_sensor")
 
 
-def _too_few(pair: str, chosen: Sequence[int], reasons: Sequence[Sequence[str]]) -> str:
+def _too_few(pair: str, chosen: Sequence[int], reasons: Sequence[Sequence[str]], fewest: int) -> str:
     counts: Mapping[str, int] = Counter(r for unmet in reasons for r in unmet)
     why = ", ".join(f"{name} {n}" for name, n in sorted(counts.items())) or "the day is that short"
-    return f"too few frames: {pair} has {len(chosen)} of {len(reasons)}, needs {MIN_FRAMES} ({why})"
+    return f"too few frames: {pair} has {len(chosen)} of {len(reasons)}, needs {fewest} ({why})"

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pipeline.calibrate.numerics.search_range import SearchRange
+from pipeline.calibrate.select.frames import SHORTEST
 from pipeline.calibrate.verify.held_out_test import HeldOutTest
 from pipeline.calibrate.verify.limits import UNCHECKED_MOVE_SIGMAS, VerdictLimits
 from pipeline.calibrate.verify.target_accuracy import Claim
@@ -110,11 +111,14 @@ def judge(
     if not triggered:
         return Verdict("held", "not triggered: the prior stays", _FAILED)
     faults = dict.fromkeys(faults_of(evidence.failed_checks))
+    checks: list[_Check] = []
     if estimate.frames_used < limits.min_fit_frames:
         few = f"too few frames: {estimate.frames_used}, needs {limits.min_fit_frames}"
         sentences = [check.sentence for check in evidence.failed_checks]
-        return Verdict("refused", "; ".join([*sentences, few]), _FAILED, faults=tuple(faults))
-    checks = [_Check(_FAILED, check.sentence, check.disproves) for check in evidence.failed_checks]
+        if estimate.pair != "camera_lidar" or estimate.frames_used < SHORTEST:
+            return Verdict("refused", "; ".join([*sentences, few]), _FAILED, faults=tuple(faults))
+        checks.append(_Check(_FAILED, few))
+    checks += [_Check(_FAILED, check.sentence, check.disproves) for check in evidence.failed_checks]
     if estimate.disproved:
         checks.append(_Check(_FAILED, estimate.disproved, disproves=True))
     if together:

@@ -171,6 +171,15 @@ def test_parts_of_the_view_without_content_are_named(day):
     )
 
 
+def test_where_too_few_are_left_to_judge_all_frames_fit_and_none_judges():
+    day = make_day(5)
+    chosen = select_frames(day, CONFIG, paper=False)
+    assert chosen.fit["camera_lidar"] == list(range(5))
+    assert chosen.holdout["camera_lidar"] == []
+    assert set(chosen.refused) == {"camera_radar", "lidar_radar"}
+    assert select_frames(day[:4], CONFIG, paper=False).fit == {}
+
+
 def test_a_pair_with_too_few_frames_is_refused_alone_with_its_reasons():
     day = [make_changed(o, radar_stamp_ns=0) if i >= 5 else o for i, o in enumerate(make_day(30))]
     chosen = select_frames(day, CONFIG, paper=True)
