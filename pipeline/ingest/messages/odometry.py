@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,7 +42,7 @@ class EgoTrack:
         p, q = message.pose.pose.position, message.pose.pose.orientation
         twist = message.twist.twist
         numbers = (p.x, p.y, p.z, q.w, q.x, q.y, q.z, twist.linear.x, twist.angular.z)
-        if not np.all(np.isfinite(numbers)) or not 0.5 < q.w**2 + q.x**2 + q.y**2 + q.z**2 < 2:
+        if not all(map(math.isfinite, numbers)) or not 0.5 < q.w**2 + q.x**2 + q.y**2 + q.z**2 < 2:
             return False
         self._rows.append((stamp_ns, *numbers))
         self._sorted = None
@@ -86,7 +87,8 @@ class EgoTrack:
 
 
 def _state(a: Float[np.ndarray, " 9"], b: Float[np.ndarray, " 9"], share: float) -> EgoState:
-    T_a, T_b = from_quaternion(a[3:7], a[:3]), from_quaternion(b[3:7], b[:3])
+    both = np.stack([a, b])
+    T_a, T_b = from_quaternion(both[:, 3:7], both[:, :3])
     R = T_a[:3, :3] @ exp_so3(share * log_so3(T_a[:3, :3].T @ T_b[:3, :3]))
     mixed = a + share * (b - a)
     return EgoState(float(mixed[7]), float(mixed[8]), from_rotation_translation(R, mixed[:3]))
