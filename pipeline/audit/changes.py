@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -21,6 +21,7 @@ __all__ = ["Change", "Levels", "clearest", "describe", "levels_of", "start_inter
 _START_DROP = 6.0
 # Twice the log-likelihood by which a slow drift must beat a step: odds of 20.
 _CLEAR_ODDS = 6.0
+_BACK = 2.0  # sigmas from the fixed reference within which a level is where that was
 
 
 @dataclass(frozen=True)
@@ -94,11 +95,12 @@ def levels_of(chart: Charts, value: Float[np.ndarray, " N"], noise: Noise, thres
         edges.pop(-2)
     spans = list(pairwise(edges))
     off = [_against(chart, value, spans[0], span, noise) for span in spans[1:]]
+    differs = [abs(size) / sigma > threshold for size, sigma in off]
+    returned = _where_the_reference_is(chart, value, spans, noise) if differs and differs[-1] else None
     if not off:
         s = int(np.argmax(np.abs(whole.drift_z[0])))
         spans, off = [(0, s + 1), (s + 1, N)], [(float(whole.drift[0, s]), float(whole.drift_sigma[0, s]))]
-    size, sigma = off[-1]
-    differs = [abs(s) / g > threshold for s, g in off]
+    size, sigma = off[-1] if returned is None else returned
     back = len(off) - 1
     while back > 0 and differs[back - 1]:
         back -= 1
@@ -109,8 +111,21 @@ def levels_of(chart: Charts, value: Float[np.ndarray, " N"], noise: Noise, thres
         days_before = max(days_before, int(chart.reference_days[0]))
     return Levels(
         chart, value, noise, whole, edges[back + 1] % N, size, sigma, threshold, days_before, days_after,
-        2 - sum(accepted), len(off) > 1 and not differs[-1],
+        2 - sum(accepted), returned is not None or (len(off) > 1 and not differs[-1]),
     )  # fmt: skip
+
+
+def _where_the_reference_is(
+    chart: Charts, value: np.ndarray, spans: Sequence[tuple[int, int]], noise: Noise
+) -> tuple[float, float] | None:
+    """How far the last level lies from the fixed reference alone, where it is back there, with its sigma.
+
+    A few days that were off may pass for days of the first level, which then lies off the reference itself.
+    """
+    if not chart.has_reference[0] or len(spans) < 2 or spans[0][1] < 2:
+        return None
+    size, sigma = _against(chart, value, (0, 1), spans[-1], noise)
+    return (size, sigma) if abs(size) < _BACK * sigma else None
 
 
 def describe(levels: Levels) -> Change:
@@ -131,7 +146,11 @@ def describe(levels: Levels) -> Change:
 
 
 def clearest(
-    whole: Scan, day: Int[np.ndarray, " N"], limit: float, threshold: Float[np.ndarray, " 2"]
+    whole: Scan,
+    day: Int[np.ndarray, " N"],
+    limit: float,
+    threshold: Float[np.ndarray, " 2"],
+    days_after: int = 1,
 ) -> Change | None:
     """The surest step or drift beyond a size and a threshold; None where there is none.
 
@@ -140,14 +159,16 @@ def clearest(
         day: of its columns.
         limit: size of a change that matters [rad or m].
         threshold: on size over sigma, of a step and of a drift.
+        days_after: that it must have lasted at least.
     """
+    last = len(day) - days_after
     step, drift = (
-        np.where((np.abs(size) > limit) & (np.abs(z) > beyond), np.abs(z), 0.0)
+        np.where((np.abs(size) > limit) & (np.abs(z) > beyond), np.abs(z), 0.0)[:last]
         for size, z, beyond in zip(
             (whole.size[0], whole.drift[0]), (whole.z[0], whole.drift_z[0]), threshold, strict=True
         )
     )
-    if not max(step.max(), drift.max()):
+    if not max(step.max(initial=0.0), drift.max(initial=0.0)):
         return None
     if drift.max() ** 2 > step.max() ** 2 + _CLEAR_ODDS * (step.max() > 0):
         return _drift(whole, day, int(np.argmax(drift)))

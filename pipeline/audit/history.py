@@ -7,7 +7,7 @@ stand in table states, and so does the first accepted day of those that are not:
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 
@@ -18,6 +18,7 @@ from pipeline.audit.days import Reference
 from pipeline.audit.estimates import COLUMNS, Estimates, day_name, estimates_of, faults_of, joined
 from pipeline.audit.references import first_accepted, read_kept
 from pipeline.audit.service import restart_of
+from pipeline.config import FleetConfig
 from pipeline.rig.edges import words_of
 from pipeline.rig.graph import Edge
 from pipeline.store.partitions import Lake, days_after, months_before
@@ -25,7 +26,7 @@ from pipeline.store.records import first_day, last_day, read_columns
 from schemas.calibrations import CALIBRATIONS
 from schemas.service_events import ServiceEvent
 
-__all__ = ["History", "last_audited_day"]
+__all__ = ["History", "last_audited_day", "models_of"]
 
 _MONTHS_BACK = 4  # that a window of few days reaches back
 _YEARS_BACK = 20  # before which no lake began
@@ -39,6 +40,11 @@ def last_audited_day(lake: Lake, tomorrow: str) -> str | None:
         return last
     found = read_columns(lake, CALIBRATIONS, (), first=None, last=tomorrow)
     return None if found is None else str(pc.max(found["day"]).as_py())
+
+
+def models_of(fleet: FleetConfig, vehicles: Iterable[str]) -> list[str]:
+    """By vehicle the name of its rig; of one that fleet.toml does not know, none."""
+    return [fleet.vehicle(vehicle).rig if fleet.knows(vehicle) else "" for vehicle in vehicles]
 
 
 @dataclass

@@ -8,39 +8,36 @@ Mol. Biol. 3(1), moments of log-variances), and one that differs by far more sta
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float
 from scipy.special import digamma, polygamma
 
 from pipeline.audit.charts import Charts
-from pipeline.config import FleetConfig
-from pipeline.errors import ConfigError
+from pipeline.audit.differences import (
+    APART,
+    WINSOR,
+    Differences,
+    far_off,
+    leave_out_steps,
+    winsorised_variance,
+)
 
-__all__ = ["Noise", "Prior", "estimate_noise", "models_of"]
+__all__ = ["Noise", "Prior", "estimate_noise"]
 
-_WINSOR = 2.0  # sigmas beyond which a difference counts as one of that size: a step is one of them
-_WINSORED = 0.9205  # of the variance of a normal distribution that is left by that
 # Of n differences of neighbouring days, degrees of freedom of their variance: they share days, and are winsorised.
 _EFFICIENCY = 0.6
 # Days that scatter more than this times what they say do not scatter: something moves, and is to be found. Four
 # standard deviations of sigmas that are wrong by a log-normal factor of 0.25.
 _MOST_SCALE = 3.0
 _MOST_AUTOCORRELATION = 0.9
-# The newest days of a chart, a quarter of them at most, are judged by what older ones show: what begins on all
-# vehicles at once is no scatter.
-_NEWEST, _OLDER = 6, 4
-# Days apart that tell how alike they are, beside neighbours: a working week has them.
-_APART = 3
 # One autocorrelation from n differences is known to 2.2 / sqrt(n), in variance: this over n.
 _OF_ONE = 4.8
-# Share of a normal distribution beyond three sigmas, and the differences that it is worth.
-_NORMAL, _FAR_WORTH = 0.0027, 200.0
-_JUMP = 4.0  # sigmas of a difference that is no scatter
-_TAKEN_BACK = 0.25  # share of a day's error that the next day lacks, at least: days err alike by 0.6
+# Share of differences beyond three sigmas, three times that of normal days, from which on single days are often far
+# off; and the sigmas that such a day may then bring that no day before showed: what dies away begins like a change.
+_OFTEN, _REACH = 0.0085, 3.5
 _AXES_DIFFER = 0.07  # autocorrelations of one edge's degrees of freedom
 _FAR = 3.0  # sigmas from its fleet beyond which a vehicle is no member of it
 _MOST_FREEDOM = 1000.0  # as good as known
@@ -72,6 +69,7 @@ class Noise:
 
     Args:
         far: share of days' differences beyond three sigmas, without changes that stay.
+        wander: variance that a level gains a day, though nothing changed; None = none.
         less_alike: the same with the least autocorrelation that the days allow; None where there is one answer.
     """
 
@@ -79,12 +77,26 @@ class Noise:
     freedom: Float[np.ndarray, " M"]
     autocorrelation: Float[np.ndarray, " M"]
     far: Float[np.ndarray, " M"]
+    wander: Float[np.ndarray, " M"] | None = None
     less_alike: Noise | None = None
+
+    @property
+    def heavy(self) -> Bool[np.ndarray, " M"]:
+        """Charts of edges whose single days are often far off."""
+        return self.far > _OFTEN
+
+    @property
+    def reach(self) -> Float[np.ndarray, " M"]:
+        """Sigmas that a day may bring that no day before showed; of normal days any."""
+        return np.where(self.heavy, _REACH, np.inf)
 
     def at(self, rows: slice) -> Noise:
         """Of some charts."""
         other = None if self.less_alike is None else self.less_alike.at(rows)
-        return Noise(self.scale[rows], self.freedom[rows], self.autocorrelation[rows], self.far[rows], other)
+        wander = None if self.wander is None else self.wander[rows]
+        return Noise(
+            self.scale[rows], self.freedom[rows], self.autocorrelation[rows], self.far[rows], wander, other
+        )
 
 
 def estimate_noise(
@@ -106,12 +118,12 @@ def estimate_noise(
     vehicles = len(charts.count) // (edges * dofs)
     _, model_of = np.unique(list(models) or [""] * vehicles, return_inverse=True)
     out = np.ones((2, 4, vehicles, edges, dofs))
-    differences = [_Differences.of(charts, lag, (vehicles, edges, dofs)) for lag in (1, _APART)]
+    differences = [Differences.of(charts, lag, (vehicles, edges, dofs)) for lag in (1, APART)]
     for model in np.unique(model_of):
         own = np.flatnonzero(model_of == model)
         near, far = (found.at(own) for found in differences)
-        out[:, 3, own] = _far_off(near.in_sigmas(0.0))[:, None]
-        _leave_out_steps(near, far)
+        out[:, 3, own] = far_off(near.in_sigmas(0.0))[:, None]
+        leave_out_steps(near, far)
         for k, most in enumerate((prior.autocorrelation, 0.0)):
             phi = _autocorrelation(near, far, most, prior)
             out[k, :2, own] = np.stack(_scatter(near, phi, prior), axis=1)
@@ -122,72 +134,11 @@ def estimate_noise(
 
 def _noise(columns: tuple[np.ndarray, ...], less_alike: Noise | None = None) -> Noise:
     scale, freedom, autocorrelation, far = columns
-    return Noise(scale, freedom, autocorrelation, far, less_alike)
-
-
-def models_of(fleet: FleetConfig, vehicles: Iterable[str]) -> list[str]:
-    """By vehicle the name of its rig; of one that fleet.toml does not know, none."""
-    found = []
-    for vehicle in vehicles:
-        with suppress(ConfigError):
-            found.append(fleet.vehicle(vehicle).rig)
-            continue
-        found.append("")
-    return found
-
-
-@dataclass(frozen=True, eq=False)
-class _Differences:
-    """Differences of days that stand `lag` apart on a chart (nan: none), days between them, and their sigmas."""
-
-    lag: int
-    size: Float[np.ndarray, "V P D S"]
-    gap: Int[np.ndarray, "V P D S"]
-    square: Float[np.ndarray, "V P D S"]
-    product: Float[np.ndarray, "V P D S"]
-
-    @classmethod
-    def of(cls, charts: Charts, lag: int, shape: tuple[int, int, int]) -> _Differences:
-        sigma = np.where(np.isfinite(charts.sigma), charts.sigma, 1.0)
-        older = charts.count - np.minimum(charts.count // _OLDER, _NEWEST)
-        there = np.arange(lag, sigma.shape[1]) < older[:, None]
-        there[:, :1] &= ~charts.has_reference[:, None]
-        a, b = (slice(None), slice(lag, None)), (slice(None), slice(None, -lag))
-        size = np.where(there, charts.value[a] - charts.value[b], np.nan)
-        parts = (
-            size,
-            (charts.day[a] - charts.day[b]).clip(min=0),
-            sigma[a] ** 2 + sigma[b] ** 2,
-            sigma[a] * sigma[b],
-        )
-        return cls(lag, *(part.reshape(*shape, -1) for part in parts))
-
-    def at(self, vehicles: np.ndarray) -> _Differences:
-        """Of some vehicles."""
-        return _Differences(
-            self.lag, self.size[vehicles], self.gap[vehicles], self.square[vehicles], self.product[vehicles]
-        )
-
-    def in_sigmas(self, phi: np.ndarray | float) -> Float[np.ndarray, "V P D S"]:
-        """Differences in units of what days that err alike by phi say."""
-        rho = np.asarray(phi)[..., None] ** self.gap
-        return self.size / np.sqrt(np.maximum(self.square - 2 * rho * self.product, 1e-12 * self.square))
-
-
-def _leave_out_steps(near: _Differences, far: _Differences) -> None:
-    """What spans a jump that no day explains says nothing of days, and would make them look alike."""
-    z = near.in_sigmas(0.0)
-    sigma = np.sqrt(_variance(np.moveaxis(z, 0, 2).reshape(*z.shape[1:3], -1))[0])
-    with np.errstate(invalid="ignore"):
-        jump = np.abs(z) > _JUMP * sigma[None, :, :, None]
-    near.size[jump] = np.nan
-    spans = far.size.shape[-1]
-    for k in range(_APART):
-        far.size[jump[..., k : k + spans]] = np.nan
+    return Noise(scale, freedom, autocorrelation, far, None, less_alike)
 
 
 def _autocorrelation(
-    near: _Differences, far: _Differences, most: float, prior: Prior
+    near: Differences, far: Differences, most: float, prior: Prior
 ) -> Float[np.ndarray, "V P D"]:
     """By vehicle, edge and axis, from how much more days differ that lie three days apart: by 1 + phi + phi^2.
 
@@ -210,7 +161,7 @@ def _autocorrelation(
 
 def _alike(z: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Autocorrelation of neighbours and of days further apart, and how many differences told it."""
-    (near, seen), (far, fewer) = (_variance(part) for part in z)
+    (near, seen), (far, fewer) = (winsorised_variance(part) for part in z)
     with np.errstate(invalid="ignore", divide="ignore"):
         return 0.5 * (np.sqrt(np.maximum(4 * far / near - 3, 0)) - 1), np.minimum(seen, fewer)
 
@@ -222,20 +173,20 @@ def _drawn(alike: tuple[np.ndarray, np.ndarray], towards: np.ndarray, worth: flo
 
 
 def _scatter(
-    near: _Differences, phi: np.ndarray, prior: Prior
+    near: Differences, phi: np.ndarray, prior: Prior
 ) -> tuple[Float[np.ndarray, "V P D"], Float[np.ndarray, "V P D"]]:
     """Factor on sigmas, and the degrees of freedom that it is known to."""
     z = near.in_sigmas(phi)
     V, P, D, S = z.shape
-    found, seen = _variance(np.moveaxis(z, 0, 2).reshape(P, D, V * S))
+    found, seen = winsorised_variance(np.moveaxis(z, 0, 2).reshape(P, D, V * S))
     worth, most = _EFFICIENCY * seen, _MOST_SCALE**2
     found = np.where(seen > 0, np.minimum(found, most), 0.0)
     of_fleet = np.maximum((prior.freedom * prior.variance + worth * found) / (prior.freedom + worth), 1.0)
     relative = z / np.sqrt(of_fleet)[None, :, :, None]
-    found, seen = _variance(relative.reshape(V, P, D * S))
+    found, seen = winsorised_variance(relative.reshape(V, P, D * S))
     freedom = _EFFICIENCY * seen * _independent(z)[None] / D
     vehicle = _drawn_to_fleet(np.minimum(found, most / of_fleet.max(axis=1)), freedom, 1.0, prior)
-    own, seen = _variance(relative)
+    own, seen = winsorised_variance(relative)
     own = np.minimum(own, most / of_fleet)
     variance, freedom = _drawn_to_fleet(own, _EFFICIENCY * seen, vehicle[0][..., None], prior)
     scale = np.sqrt(np.clip(of_fleet[None] * variance, 1.0, _MOST_SCALE**2))
@@ -243,20 +194,6 @@ def _scatter(
     alike = _OF_ONE / (worth / _EFFICIENCY + _OF_ONE / _AXES_DIFFER**2) / (2 * (1 - phi) ** 2)
     known = 1 / (1 / freedom + 1 / vehicle[1][..., None] + alike)
     return scale, np.minimum(known, _MOST_FREEDOM)
-
-
-def _far_off(z: Float[np.ndarray, "V P D S"]) -> Float[np.ndarray, " P"]:
-    """Share of an edge's differences beyond three sigmas, drawn towards the normal distribution's.
-
-    One of which neither difference beside it takes back a part is a change that stays, and no day far off.
-    """
-    sigma = np.sqrt(_variance(np.moveaxis(z, 0, 2).reshape(*z.shape[1:3], -1))[0])
-    beside = np.pad(z, ((0, 0),) * 3 + ((1, 1),), constant_values=np.nan)
-    with np.errstate(invalid="ignore"):
-        taken = np.minimum(beside[..., :-2] * np.sign(z), beside[..., 2:] * np.sign(z))
-        stays = taken > -_TAKEN_BACK * np.abs(z)  # not where there is none beside
-        far = (~stays & (np.abs(z) > 3 * sigma[None, :, :, None])).sum(axis=(0, 2, 3))
-    return np.asarray((far + _NORMAL * _FAR_WORTH) / (np.isfinite(z).sum(axis=(0, 2, 3)) + _FAR_WORTH))
 
 
 def _drawn_to_fleet(
@@ -283,23 +220,9 @@ def _drawn_to_fleet(
 
 def _independent(z: Float[np.ndarray, "V P D S"]) -> Float[np.ndarray, " P"]:
     """How many of an edge's degrees of freedom err by themselves: they share scenes."""
-    rows = np.moveaxis(np.clip(np.nan_to_num(z), -_WINSOR, _WINSOR), 2, -1).swapaxes(0, 1)
+    rows = np.moveaxis(np.clip(np.nan_to_num(z), -WINSOR, WINSOR), 2, -1).swapaxes(0, 1)
     rows = rows.reshape(z.shape[1], -1, z.shape[2])
     square = np.einsum("pna,pnb->pab", rows, rows)
     size = np.sqrt(np.maximum(np.einsum("paa->pa", square), 1e-12))
     correlation = square / size[:, :, None] / size[:, None, :]
     return np.asarray(z.shape[2] ** 2 / np.maximum((correlation**2).sum(axis=(1, 2)), z.shape[2]))
-
-
-def _variance(values: Float[np.ndarray, "*rows N"]) -> tuple[np.ndarray, np.ndarray]:
-    """Winsorised variance about zero along the last axis (nan where nothing is), and how many numbers there are."""
-    size = np.abs(values)
-    ordered = np.sort(size, axis=-1)  # nan comes last
-    count = np.isfinite(values).sum(axis=-1)
-    if ordered.shape[-1] == 0:
-        return np.full(values.shape[:-1], np.nan), count
-    low = np.take_along_axis(ordered, np.maximum((count - 1) // 2, 0)[..., None], -1)
-    high = np.take_along_axis(ordered, np.minimum(count // 2, ordered.shape[-1] - 1)[..., None], -1)
-    reach = _WINSOR * 0.5 * (low + high) / 0.6745
-    total = np.nansum(np.minimum(size, reach) ** 2, axis=-1)
-    return np.where(count > 0, total / np.maximum(count, 1) / _WINSORED, np.nan), count

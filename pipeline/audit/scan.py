@@ -4,10 +4,11 @@ What a day says is a level that stays, an error that is AR(1) from day to day, a
 
     y_i = level_i + h_i u_i + e_i,   u_i = rho_i u_{i-1} + w_i,   rho_i = autocorrelation ** (days between)
 
-A step adds to the level between two days, a drift to its slope. Both are likelihood ratios against no change, by one
-run of a Kalman filter and one of its smoother over all charts at once: a shock to a state at a split has the estimate
-`r / N` and the variance `1 / N` of the smoother's cumulants (de Jong & Penzer 1998, J. Am. Stat. Assoc. 93(442)). That
-is generalised least squares: with days that err alike, the day of a jump tells most.
+The level itself may be a random walk, by as much as such levels wander. A step adds to the level between two days, a
+drift to its slope. Both are likelihood ratios against no change, by one run of a Kalman filter and one of its smoother
+over all charts at once: a shock to a state at a split has the estimate `r / N` and the variance `1 / N` of the
+smoother's cumulants (de Jong & Penzer 1998, J. Am. Stat. Assoc. 93(442)). That is generalised least squares: with days
+that err alike, the day of a jump tells most.
 """
 
 from __future__ import annotations
@@ -22,8 +23,9 @@ from numba import njit
 from pipeline.audit.charts import Charts
 from pipeline.audit.noise import Noise
 
-__all__ = ["Scan", "alike", "scan", "scan_by"]
+__all__ = ["Scan", "alike", "errors_of", "scan", "scan_by"]
 
+_WEEK = 7  # days that show a level
 _SAME = 0.02  # autocorrelations that differ by no more say the same
 
 
@@ -64,6 +66,8 @@ def scan(
     value: Float[np.ndarray, "M N"],
     scale: Float[np.ndarray, " M"],
     autocorrelation: Float[np.ndarray, " M"],
+    wander: Float[np.ndarray, " M"] | None = None,
+    reach: Float[np.ndarray, " M"] | None = None,
 ) -> Scan:
     """Steps and drifts at every split.
 
@@ -75,7 +79,29 @@ def scan(
         value: theirs, clipped or not.
         scale: factor on the sigmas.
         autocorrelation: of days that follow each other, below 1; it falls with the power of the days between.
+        wander: variance that the level gains a day besides; None = none.
+        reach: sigmas beyond which what a day brings that no day before showed counts as that, once a first week or a
+            reference has shown the level; None = all of it. Sizes are then too small, what they are in sigmas is not.
     """
+    h, own = errors_of(charts, autocorrelation)
+    walk = (np.zeros(len(scale)) if wander is None else wander) / scale**2
+    # A mean of days that wandered lies off the last of them by a third of what they wandered.
+    own[:, 0] += walk * charts.reference_days / 3
+    most = np.full(len(scale), np.inf) if reach is None else reach * scale
+    first = np.where(charts.has_reference, 0, _WEEK)
+    gap = np.diff(charts.day, axis=1).clip(min=0)
+    rho = autocorrelation[:, None] ** gap
+    out = np.zeros((4, len(gap), gap.shape[1]))
+    out[1::2] = np.inf
+    days = gap.astype(np.float64)
+    _scan(np.ascontiguousarray(value), h, own, days, rho, walk, most, first, charts.count, scale, out)
+    return Scan(*out)
+
+
+def errors_of(
+    charts: Charts, autocorrelation: Float[np.ndarray, " M"]
+) -> tuple[Float[np.ndarray, "M N"], Float[np.ndarray, "M N"]]:
+    """Of each day, the sigma of what is alike from day to day, and the variance of what is its own."""
     held, known = charts.has_reference, np.isfinite(charts.sigma)
     known[:, 0] &= ~held
     ordered = np.sort(np.where(known, charts.sigma, np.inf), axis=1)
@@ -86,23 +112,24 @@ def scan(
     own = sigma**2 - h**2
     if held.any():
         own[held, 0] *= alike(charts.reference_days[held], autocorrelation[held])
-    gap = np.diff(charts.day, axis=1).clip(min=0)
-    rho = autocorrelation[:, None] ** gap
-    out = np.zeros((4, len(gap), gap.shape[1]))
-    out[1::2] = np.inf
-    _scan(np.ascontiguousarray(value), h, own, gap.astype(np.float64), rho, charts.count, scale, out)
-    return Scan(*out)
+    return h, own
 
 
-def scan_by(charts: Charts, value: Float[np.ndarray, "M N"], noise: Noise) -> Scan:
+def scan_by(
+    charts: Charts,
+    value: Float[np.ndarray, "M N"],
+    noise: Noise,
+    reach: Float[np.ndarray, " M"] | None = None,
+) -> Scan:
     """Steps and drifts, each as sure as it is by the autocorrelation under which it is less so.
 
     Where days are taken for more alike than they are, one jump says too much; where for less, a mean of many does.
     """
-    found, other = scan(charts, value, noise.scale, noise.autocorrelation), noise.less_alike
+    found = scan(charts, value, noise.scale, noise.autocorrelation, noise.wander, reach)
+    other = noise.less_alike
     if other is None or not np.any(noise.autocorrelation - other.autocorrelation > _SAME):
         return found
-    less = scan(charts, value, other.scale, other.autocorrelation)
+    less = scan(charts, value, other.scale, other.autocorrelation, other.wander, reach)
     step, slow = np.abs(less.z) < np.abs(found.z), np.abs(less.drift_z) < np.abs(found.drift_z)
     return Scan(
         np.where(step, less.size, found.size),
@@ -114,7 +141,7 @@ def scan_by(charts: Charts, value: Float[np.ndarray, "M N"], noise: Noise) -> Sc
 
 @no_type_check
 @njit(cache=True)
-def _scan(value, h, own, gap, rho, count, scale, out):  # noqa: ANN001, ANN202 (types by numba)
+def _scan(value, h, own, gap, rho, walk, reach, first, count, scale, out):  # noqa: ANN001, ANN202 (types by numba)
     """Fill `out` (size, sigma, drift, its sigma; chart; split): forward the filter, backward the smoother."""
     most = value.shape[1]
     surprise, weight, gain, slow_gain = (np.zeros(most), np.zeros(most), np.zeros(most), np.zeros(most))
@@ -124,9 +151,13 @@ def _scan(value, h, own, gap, rho, count, scale, out):  # noqa: ANN001, ANN202 (
         for t in range(1, count[m]):
             r, k = rho[m, t - 1], h[m, t]
             u, p13, p33 = r * u, r * p13, r * r * (p33 - 1) + 1
+            p11 += walk[m] * gap[m, t - 1]
             both, slow = p11 + k * p13, p13 + k * p33
             weight[t] = 1 / (both + k * slow + own[m, t])
             surprise[t] = value[m, t] - level - k * u
+            if t > first[m]:
+                far = reach[m] / np.sqrt(weight[t])
+                surprise[t] = min(max(surprise[t], -far), far)
             gain[t], slow_gain[t] = both * weight[t], slow * weight[t]
             level, u = level + gain[t] * surprise[t], u + slow_gain[t] * surprise[t]
             p11, p13, p33 = p11 - gain[t] * both, p13 - gain[t] * slow, p33 - slow_gain[t] * slow

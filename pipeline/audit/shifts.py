@@ -40,8 +40,13 @@ class Whitened:
     root: Float[np.ndarray, "X X"]
 
     @classmethod
-    def of(cls, days: PairDays, autocorrelation: Float[np.ndarray, " 6"]) -> Whitened:
-        """Days of which each errs like the last by as much, axis by axis."""
+    def of(
+        cls,
+        days: PairDays,
+        autocorrelation: Float[np.ndarray, " 6"],
+        wander: Float[np.ndarray, " 6"] | None = None,
+    ) -> Whitened:
+        """Days of which each errs like the last by as much, axis by axis, and wanders by that variance a day."""
         N, sigma = len(days.day), days.sigma
         correlation = days.spread / (sigma[:, :, None] * sigma[:, None, :])
         values, vectors = np.linalg.eigh(correlation)
@@ -56,6 +61,11 @@ class Whitened:
         gap = np.abs(days.day[:, None] - days.day)[:, :, None]
         covariance = np.einsum("iac,ijc,jbc->iajb", root, autocorrelation**gap, root)
         covariance[np.arange(N), :, np.arange(N)] += own
+        if wander is not None:
+            since = days.day - days.day[0]
+            covariance[:, range(DOFS), :, range(DOFS)] += wander[:, None, None] * np.minimum.outer(
+                since, since
+            )
         L = np.linalg.cholesky(covariance.reshape(DOFS * N, DOFS * N))
         return cls(days.day, days.origin, solve_triangular(L, days.change.ravel(), lower=True), L)
 

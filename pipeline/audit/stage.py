@@ -14,8 +14,7 @@ from pipeline.audit.days import FEWEST_DAYS, PairDays, Reference, charted, refer
 from pipeline.audit.estimates import Estimates, days_of
 from pipeline.audit.findings import VehicleAudit, vehicle_findings
 from pipeline.audit.fleet_shift import FleetShift, judge_without_fleet_shifts
-from pipeline.audit.history import History, last_audited_day
-from pipeline.audit.noise import models_of
+from pipeline.audit.history import History, last_audited_day, models_of
 from pipeline.audit.realignments import Realignments, find_realignments
 from pipeline.audit.service import events_until, restart_of, what_was_done, with_events
 from pipeline.audit.standing import said_before, standing

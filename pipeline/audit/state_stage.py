@@ -11,8 +11,8 @@ from jaxtyping import Float
 
 from pipeline.audit.days import DOFS, charts_of_fleet, edges_of_fleet
 from pipeline.audit.estimates import Estimates, days_of, estimates_of, joined
-from pipeline.audit.history import History
-from pipeline.audit.noise import estimate_noise, models_of
+from pipeline.audit.history import History, models_of
+from pipeline.audit.noise import estimate_noise
 from pipeline.audit.pose_states import pose_states, read_poses
 from pipeline.audit.references import Kept, first_accepted, kept_columns, kept_of, read_kept
 from pipeline.audit.service import events_until, restart_of, what_was_done

@@ -13,6 +13,7 @@ from pipeline.audit.days import DOFS, PairDays, charts_of_fleet, clipped_days, e
 from pipeline.audit.noise import Noise, estimate_noise
 from pipeline.audit.shifts import Whitened
 from pipeline.audit.verdicts import ChartVerdict, judge_charts
+from pipeline.audit.wander import with_wander
 from pipeline.config import AuditConfig
 from pipeline.extrinsics.attribution import Attribution, attribute
 from pipeline.rig.graph import Edge
@@ -58,7 +59,10 @@ def judge_fleet(
     if not edges:
         return [VehicleVerdict({}, None) for _ in fleet]
     charts = charts_of_fleet(fleet, edges)
+    limit = np.array([limit_of(edge, dof, config) for edge in edges for dof in DOF_NAMES])
+    limit = np.tile(limit, len(fleet))
     noise = estimate_noise(charts, DOFS, len(edges), models)
+    noise = with_wander(charts, noise, limit, (len(fleet), len(edges), DOFS), models)
     per_vehicle = len(edges) * DOFS
     live = (charts.count > 1).reshape(len(fleet), per_vehicle).sum(axis=1)
     # An audit is one vehicle-night: its expected number of alarms stays within the budget whatever the nights
@@ -66,11 +70,10 @@ def judge_fleet(
     alarm = min(config.false_alarms_per_1000_vehicle_days / 1000, 0.5)
     budget = np.array([alarm, max(alarm, _YELLOW)])
     probability = budget[:, None] / np.maximum(live, 1)
-    limit = np.array([limit_of(edge, dof, config) for edge in edges for dof in DOF_NAMES])
     verdicts = judge_charts(
         charts,
         noise,
-        np.tile(limit, len(fleet)),
+        limit,
         np.repeat(probability, per_vehicle, axis=1),
         config.baseline_days,
     )
@@ -126,7 +129,9 @@ def _whitened(
     if not alone:
         seen = {edge: clipped_days(found, noise[edge].scale) for edge, found in seen.items()}
     return {
-        edge: Whitened.of(found.at(np.searchsorted(found.day, days)), noise[edge].autocorrelation)
+        edge: Whitened.of(
+            found.at(np.searchsorted(found.day, days)), noise[edge].autocorrelation, noise[edge].wander
+        )
         for edge, found in independent_edges(seen, days).items()
     }
 

@@ -28,6 +28,8 @@ _SURELY = 1.645
 # Degrees of freedom of a scale that is as good as known: where a person only looks again, what it lacks is not counted
 # of a chart whose own days tell how they scatter. Of one with fewer days it is: their scatter is a guess.
 _KNOWN = 240.0
+_HEAVY = 2 / 3  # of the sigmas that one day may lie off, where single days are often far off
+_TAIL = 4.0  # power by which days far off fall with the distance: Student's t with four degrees of freedom
 _TAME = 2  # days in a row that are no chance where single days are seldom far off
 _LASTING = "a lasting change of a size that matters"
 _ONE_DAY = f"one day stands out: the next day {DAYS_WILL_TELL} whether it lasts"
@@ -66,6 +68,7 @@ class _Judged:
     believed: np.ndarray  # days in a row that are no chance
     visible: np.ndarray
     last_day: np.ndarray  # sigmas by which the last day stands out
+    alone: np.ndarray  # beyond which one does where single days are as far off as they are
     last_size: np.ndarray
     baseline_days: int
 
@@ -93,8 +96,8 @@ def judge_charts(
     """
     if not len(charts.count):
         return []
-    value = clipped(charts, noise.scale)
-    found = scan_by(charts, value, noise)
+    value = clipped(charts, noise.scale * np.where(noise.heavy, _HEAVY, 1.0))
+    found = scan_by(charts, value, noise, noise.reach)
     z = [np.abs(z).max(axis=1, initial=0.0) for z in (found.z, found.drift_z)]
     # Steps and drifts share the budget; of a chart that counts which is further beyond its own threshold.
     to_watch = np.where(charts.count < FEWEST_DAYS, noise.freedom, np.maximum(noise.freedom, _KNOWN))
@@ -114,10 +117,10 @@ def judge_charts(
         np.where(drifts, z[1], z[0]),
         np.where(drifts, limits[1], limits[0]),
         np.stack(limits[2:]),
-        # Two days far off on the same side, by chance, would use up the budget where days have heavy tails.
-        np.where(0.5 * noise.far**2 > probability[0], _TAME + 1, _TAME),
+        np.where(noise.heavy, _TAME + 1, _TAME),
         _VISIBLE_SIGMAS * found.sigma.min(axis=1, initial=np.inf),
         last_day,
+        np.maximum(np.where(drifts, limits[1], limits[0]), 3 * (noise.far / probability[1]) ** (1 / _TAIL)),
         last_size,
         baseline_days,
     )
@@ -196,10 +199,11 @@ def _unchanged(seen: _Judged, m: int, levels: Levels | None) -> ChartVerdict:
     def say(status: str, reason: str, change: Change | None = None) -> ChartVerdict:
         return ChartVerdict(status, reason, days, statistic, float(seen.threshold[m]), visible, change)
 
-    if days > 2 and seen.last_day[m] > seen.threshold[m] and abs(seen.last_size[m]) > limit:
+    if days > 2 and seen.last_day[m] > seen.alone[m] and abs(seen.last_size[m]) > limit:
         return _one_day(seen, m)
     if levels is None:
-        begun = clearest(seen.scan.row(m, days), seen.charts.day[m, :days], limit, seen.watch[:, m])
+        after = 1 if seen.believed[m] == _TAME else int(seen.believed[m])
+        begun = clearest(seen.scan.row(m, days), seen.charts.day[m, :days], limit, seen.watch[:, m], after)
         if begun is not None:
             return say("YELLOW", _BEGUN, begun)
     if days <= seen.baseline_days:

@@ -1,6 +1,7 @@
 """The charts: their false alarms, their power, their start days."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from pipeline.audit.charts import Charts, alarm_threshold, clipped, thresholds
 from pipeline.audit.noise import Noise, Prior, estimate_noise
 from pipeline.audit.scan import scan, scan_by
 from pipeline.audit.verdicts import ChartVerdict, judge_charts
+from pipeline.audit.wander import with_wander
 
 PROBABILITY = 1e-3 / 18  # one chart's share of one false alarm in 1000 vehicle-days over 18 charts
 
@@ -123,14 +125,15 @@ def test_the_scan_of_a_chart_does_not_depend_on_the_others_beside_it() -> None:
 
 @pytest.mark.parametrize("phi", [0.0, 0.6, 0.9])
 @pytest.mark.parametrize("reference_days", [0, 10])
-def test_steps_and_drifts_are_least_squares_through_ar1_days_with_gaps(
-    phi: float, reference_days: int
+@pytest.mark.parametrize("wander", [0.0, 0.09])
+def test_steps_and_drifts_are_least_squares_through_ar1_days_with_gaps_about_a_level_that_wanders(
+    phi: float, reference_days: int, wander: float
 ) -> None:
     rng = np.random.default_rng(5)
     day, sigma, value = np.array([0, 1, 2, 5, 6, 9, 10]), rng.uniform(0.5, 2, 7), rng.normal(size=7) + 100
     charts = _charts([value, value[:3]], 1.0, None, None, reference_days)
     charts.day[0], charts.day[1], charts.sigma[0] = day, [0, 1, 2, 2, 2, 2, 2], sigma
-    found = scan(charts, charts.value, np.array([1.5, 1.0]), np.full(2, phi))
+    found = scan(charts, charts.value, np.array([1.5, 1.0]), np.full(2, phi), np.full(2, wander))
     # A day that is less sure than most errs for reasons of its own; a reference is a mean of days long ago.
     days = sigma[reference_days > 0 :]
     h = np.minimum(sigma, np.sort(days)[(len(days) - 1) // 2])
@@ -138,7 +141,9 @@ def test_steps_and_drifts_are_least_squares_through_ar1_days_with_gaps(
     if reference_days:
         lag = np.arange(1, 10)
         h[0], own[0] = 0, sigma[0] ** 2 * (1 + 2 * ((1 - lag / 10) * phi**lag).sum())
-    W = np.linalg.inv(phi ** np.abs(day[:, None] - day[None]) * np.outer(h, h) + np.diag(own))
+    walk = wander / 1.5**2 * np.minimum.outer(day, day)
+    walk[0, 0] += wander / 1.5**2 * reference_days / 3
+    W = np.linalg.inv(phi ** np.abs(day[:, None] - day[None]) * np.outer(h, h) + np.diag(own) + walk)
     for s in range(6):
         for shape, size, error in (
             ((np.arange(7) > s).astype(float), found.size, found.sigma),
@@ -170,7 +175,7 @@ def test_where_the_autocorrelation_is_not_known_each_split_is_as_sure_as_by_the_
     charts = _charts(rng.normal(size=(3, 9)))
     low, high = _known(charts, 0.0), _known(charts, 0.6)
     either = scan_by(
-        charts, charts.value, Noise(high.scale, high.freedom, high.autocorrelation, high.far, low)
+        charts, charts.value, Noise(high.scale, high.freedom, high.autocorrelation, high.far, less_alike=low)
     )
     both = [scan_by(charts, charts.value, n) for n in (low, high)]
     z = [np.abs(found.z) for found in both]
@@ -456,3 +461,79 @@ def test_a_change_that_may_have_begun_takes_more_where_few_days_say_how_they_sca
             charts, hardly, np.array([0.25]), np.array([[PROBABILITY], [20 * PROBABILITY]]), 2
         )
     assert [v.status for v in verdicts] == ["GREEN", "YELLOW"]
+
+
+def _swinging(vehicles: int, swing: float, moved: float = 0.0) -> tuple[Charts, Noise]:
+    """Charts of one edge with two DoF, a reference and 28 days a month later, and what they are found to wander by."""
+    rng = np.random.default_rng(11)
+    values = 0.05 * rng.normal(size=(vehicles, 2, 29))
+    values[..., 0] = 0.05 / np.sqrt(10) * rng.normal(size=(vehicles, 2))
+    values[:, 0, 1:] += swing * rng.normal(size=(vehicles, 1)) + moved
+    charts = _charts(values.reshape(-1, 29), 0.05, np.r_[0, np.arange(40, 68)], reference_days=10)
+    charts.sigma[:, 0] = 0.05 / np.sqrt(10)
+    noise = estimate_noise(charts, 2, 1)
+    return charts, with_wander(charts, noise, np.full(2 * vehicles, 0.1), (vehicles, 1, 2))
+
+
+def test_what_all_vehicles_wander_by_over_weeks_is_learnt_by_axis() -> None:
+    _, noise = _swinging(60, 0.03)
+    assert noise.wander is not None
+    turning, still = noise.wander.reshape(60, 2)[0]
+    assert 0.02 < np.sqrt(50 * turning) < 0.04
+    assert still < 0.1 * turning
+
+
+@pytest.mark.parametrize("moved", [0.15, 0.3])
+def test_a_fleet_that_moved_as_one_is_not_taken_to_wander(moved: float) -> None:
+    _, noise = _swinging(60, 0.0, moved)
+    assert noise.wander is not None
+    assert noise.wander.max() == 0
+
+
+def test_a_swing_that_all_vehicles_show_is_no_change_and_a_larger_change_is() -> None:
+    charts, noise = _swinging(60, 0.03)
+    still = replace(noise, wander=None, less_alike=None)
+    charts.value[0, 1:] = 0.1 + 0.02 * np.random.default_rng(1).normal(size=28)
+    charts.value[2, 1:] = 0.3 + 0.02 * np.random.default_rng(2).normal(size=28)
+    probability = np.full((2, 120), PROBABILITY)
+    found, strict = (judge_charts(charts, n, np.full(120, 0.05), probability, 2) for n in (noise, still))
+    assert [strict[m].status for m in (0, 2)] == ["RED", "RED"]
+    assert [found[m].status for m in (0, 2)] == ["GREEN", "RED"]
+
+
+def test_an_error_that_dies_away_is_no_change_where_days_are_often_far_off_and_one_that_stays_is() -> None:
+    rng = np.random.default_rng(3)
+    dying, lasting = (0.1 * rng.normal(size=28) for _ in range(2))
+    dying[24:] += 6 * 0.6 ** np.arange(4)
+    lasting[24:] += 6
+    charts = _charts([dying, lasting])
+    known = _known(charts, 0.6)
+    often = replace(known, far=np.full(2, 0.02))
+    probability = np.full((2, 2), PROBABILITY)
+    z = [np.abs(scan_by(charts, charts.value, n, n.reach).z).max(axis=1) for n in (known, often)]
+    assert z[0][0] > 5
+    assert z[1][0] < 4.5
+    verdicts = judge_charts(charts, often, np.full(2, 2.0), probability, 2)
+    assert [v.status for v in verdicts] == ["GREEN", "RED"]
+    assert verdicts[1].change is not None
+    assert verdicts[1].change.size == pytest.approx(6, abs=0.6)
+
+
+@pytest.mark.parametrize(("far", "status"), [(0.0027, "YELLOW"), (0.02, "GREEN")])
+def test_a_last_day_alone_stands_out_only_beyond_what_single_days_do(far: float, status: str) -> None:
+    charts = _charts([np.array([0.0] * 14 + [8.0])])  # 5.7 sigmas of a difference of two days
+    noise = replace(_known(charts), far=np.full(1, far))
+    (verdict,) = judge_charts(charts, noise, np.full(1, 2.0), np.full((2, 1), 1e-3), 2)
+    assert verdict.status == status
+
+
+def test_a_value_that_is_back_at_its_reference_is_green_though_days_off_are_all_that_is_left_beside_it() -> (
+    None
+):
+    rng = np.random.default_rng(5)
+    value = np.r_[0.0, np.full(4, 0.9), np.zeros(20)] + 0.03 * rng.normal(size=25)
+    charts = _charts([value], 0.1, np.r_[0, np.arange(40, 64)], reference_days=10)
+    charts.sigma[0, 0] = 0.03
+    wandering = replace(_known(charts, 0.6), wander=np.full(1, 0.002))
+    (verdict,) = judge_charts(charts, wandering, np.full(1, 0.8), np.full((2, 1), PROBABILITY), 2)
+    assert verdict.status == "GREEN"
