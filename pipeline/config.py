@@ -1,4 +1,4 @@
-"""fleet.toml as frozen values: validated as a whole, nothing repaired, defaults are physical numbers with units."""
+"""fleet.toml as frozen values: validated as a whole, never repaired, with physical defaults."""
 
 from __future__ import annotations
 
@@ -61,25 +61,26 @@ _SHORT = {(section, kind) for kind, section in SECTIONS.items()}
 
 
 class Vehicle(Section):
-    """One vehicle."""
+    """One vehicle and the name of its rig."""
 
     rig: str = "default"
 
 
 class FleetSection(Section):
-    """The fleet's name, and what its workers may take of the machine."""
+    """Name of the fleet, and the limits of its workers on one machine."""
 
     name: str
-    # Of one stage of one vehicle-day, beside what the worker has. Ordinary days take 1.3, 1 of it reserved and unused.
+    # Memory [GB] that one stage of one vehicle-day may use in addition to the idle worker. Ordinary days use
+    # 1.3, of which 1 is reserved and never touched.
     memory_gb: Positive = 4.0
 
 
 class FleetConfig(Section):
-    """The whole of fleet.toml, and which file it was read from: paths in it are relative to that file."""
+    """All of fleet.toml, and the path of the file it was read from: paths in the file are relative to it."""
 
     fleet: FleetSection
     rigs: dict[str, Rig]
-    # By name, or by a pattern with * and ? for whichever vehicles the logs are of.
+    # By name, or by a pattern with * and ? that matches the names of vehicles in the logs.
     vehicles: dict[str, Vehicle] = Field(default_factory=dict)
     ingest: IngestConfig = IngestConfig()
     perceive: PerceiveConfig = PerceiveConfig()
@@ -91,14 +92,14 @@ class FleetConfig(Section):
     learn: LearnConfig = LearnConfig()
     audit: AuditConfig = AuditConfig()
     report: ReportConfig = ReportConfig()
-    _file: Path = PrivateAttr(default=Path("fleet.toml"))  # no value of the file: never dumped, never hashed
+    _file: Path = PrivateAttr(default=Path("fleet.toml"))  # not a key of the file: neither dumped nor hashed
 
     @model_validator(mode="after")
     def _vehicles_name_known_rigs(self) -> FleetConfig:
         for name, vehicle in self.vehicles.items():
             if not is_vehicle(name):
                 raise ValueError(
-                    f"{name!r} cannot be a vehicle's name: it names folders, so no / or =, and not as long"
+                    f"{name!r} cannot be a vehicle's name: it becomes a folder name, so no / or =, and shorter"
                 )
             if vehicle.rig not in self.rigs:
                 raise ValueError(
@@ -108,13 +109,16 @@ class FleetConfig(Section):
 
     @property
     def file(self) -> Path:
-        """The file that this was read from; "fleet.toml" of the working folder where it came from no file."""
+        """Path of fleet.toml; "fleet.toml" of the working folder if the values came from no file."""
         return self._file
 
     def require_files(self) -> None:
-        """Raise ConfigError, naming the key, for the first file that the vehicles' rigs or [learn] name and is missing.
+        """Check that all files exist that the vehicles' rigs or [learn] name.
 
-        For commands that read logs: before the first one is opened, not after a night.
+        For commands that read logs: the error then comes before the first log is opened.
+
+        Raises:
+            ConfigError: a file is missing; the message names the key of the first one.
         """
         for key, name in self._named_files():
             if not self.path_of(name).is_file():
@@ -132,17 +136,17 @@ class FleetConfig(Section):
             yield f"learn.pairwise_models.{pair}", model
 
     def path_of(self, name: str) -> Path:
-        """A path that the file names: relative to the file's folder unless absolute, or a network that ships."""
+        """Path of a file named in fleet.toml (relative to its folder), or of a network of the package."""
         return shipped_manifest(name) if name.startswith(PREFIX) else self._file.parent / name
 
     def read_from(self, file: Path) -> FleetConfig:
-        """The same configuration as if it had been read from another file."""
+        """Copy of this configuration with another file path."""
         copy = self.model_copy()
         copy._file = file  # noqa: SLF001 - a copy of this very class
         return copy
 
     def changed(self, **sections: dict[str, Any]) -> FleetConfig:
-        """With other values in some sections, validated like those of a file; the file stays.
+        """Copy with other values in some sections, validated as on loading; the file path stays.
 
         Args:
             sections: as `select={"frames": 16}`; keys that are not named keep their value.
@@ -155,25 +159,25 @@ class FleetConfig(Section):
             section = getattr(self, name, None)
             if not isinstance(section, Section):
                 raise ConfigError(str(self._file), name, "no such section")
-            # Not through a dump: it would leave out what is no part of a work key (`exclude`).
+            # Not through a dump, which leaves out fields that are not part of a work key (`exclude`).
             kept = {key: getattr(section, key) for key in type(section).model_fields}
             new[name] = validated(type(section), kept | values, str(self._file), name)
         return self.model_copy(update=new)
 
     @property
     def named_vehicles(self) -> tuple[str, ...]:
-        """Vehicles that the file names; those of its patterns are known by their logs."""
+        """Vehicles named in the file; vehicles that match a pattern are found in their logs."""
         return tuple(name for name in self.vehicles if not is_pattern(name))
 
     def knows(self, vehicle: str) -> bool:
-        """Whether the file names the vehicle, or has a pattern for it."""
+        """Whether the file has an entry or a pattern for the vehicle."""
         return bool(self._entries_for(vehicle))
 
     def vehicle(self, vehicle: str) -> Vehicle:
-        """What the file says of a vehicle: by its name, else by the longest pattern that it matches.
+        """Entry of a vehicle in [vehicles]: the one of this name, else the longest pattern that matches.
 
         Raises:
-            ConfigError: nothing.
+            ConfigError: no entry matches.
         """
         entries = self._entries_for(vehicle)
         if not entries:
@@ -182,21 +186,21 @@ class FleetConfig(Section):
         return self.vehicles[vehicle if vehicle in entries else max(entries, key=lambda e: (len(e), e))]
 
     def _entries_for(self, vehicle: str) -> list[str]:
-        """Keys of [vehicles] that are the vehicle's name or a pattern of it."""
+        """Keys of [vehicles] that equal the vehicle's name, or are patterns that match it."""
         return [e for e in self.vehicles if e == vehicle or (is_pattern(e) and matches(e, vehicle))]
 
     def rig_of(self, vehicle: str) -> Rig:
-        """The rig of a vehicle; ConfigError where the file does not know the vehicle."""
+        """Rig of a vehicle; raises ConfigError for an unknown vehicle."""
         return self.rigs[self.vehicle(vehicle).rig]
 
     def with_prior_file(self, vehicle: str, file: Path) -> FleetConfig:
-        """The same configuration, with the prior of a vehicle's rig from a file, as far to be trusted as before."""
+        """Copy in which the prior of a vehicle's rig comes from a file; its sigmas stay."""
         rig = self.rig_of(vehicle)
         prior = rig.prior.model_copy(update={"source": "file", "file": str(file.resolve())})
         return self.with_rig(vehicle, rig.model_copy(update={"prior": prior}))
 
     def with_rig(self, vehicle: str, rig: Rig) -> FleetConfig:
-        """The same configuration, with another rig in place of a vehicle's."""
+        """Copy in which a vehicle's rig is replaced."""
         return self.model_copy(update={"rigs": self.rigs | {self.vehicle(vehicle).rig: rig}})
 
 
@@ -210,10 +214,10 @@ def load_fleet(path: Path) -> FleetConfig:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """What a TOML file says.
+    """Content of a TOML file.
 
     Raises:
-        ConfigError: missing file, no TOML.
+        ConfigError: missing file, or not TOML.
     """
     try:
         return tomllib.loads(path.read_text())
@@ -224,7 +228,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def validated(kind: type[_Kind], values: dict[str, Any], file: str, *above: str) -> _Kind:
-    """A section of a file; `above` names the sections that it lies in.
+    """Section of a file, validated; `above` names the sections that contain it.
 
     Raises:
         ConfigError: unknown key, impossible value; the message names the key.
@@ -248,7 +252,7 @@ def validated(kind: type[_Kind], values: dict[str, Any], file: str, *above: str)
 
 
 def _written(loc: Sequence[str | int], values: Any) -> Sequence[str | int]:
-    """A key as the file has it: a sensor of the short form is `camera`, and `cameras.camera` in the model."""
+    """Key as written in the file: the model has `cameras.camera` for a sensor of the short form, `camera`."""
     for i, key in enumerate(loc):
         if not isinstance(values, dict):
             break
@@ -259,14 +263,14 @@ def _written(loc: Sequence[str | int], values: Any) -> Sequence[str | int]:
 
 
 def _unknown_key(key: str | int, whole: type[BaseModel]) -> str:
-    """What to say of a key that no section of the whole has: the nearest one that some section has."""
+    """Message for an unknown key; it suggests the most similar known key."""
     known = {name for kind in _kinds(whole, set()) for name in kind.model_fields}
     near = difflib.get_close_matches(str(key), known, n=1)
     return f"unknown key; did you mean {near[0]!r}?" if near else "unknown key"
 
 
 def _kinds(annotation: Any, seen: set[type[BaseModel]]) -> set[type[BaseModel]]:
-    """All sections that an annotation reaches."""
+    """All sections that are reachable from an annotation."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         if annotation not in seen:
             seen.add(annotation)

@@ -1,4 +1,4 @@
-"""Errors that a user can act on. Fields, not strings: each error builds its message from what it knows."""
+"""Errors that a user can act on. Each error has fields, and builds its message from them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class BoresightError(Exception):
     exit_code = 1
 
     def __reduce__(self) -> Any:
-        # Errors come home from other processes; by default Python would build them from their message alone.
+        # Errors cross process boundaries; by default, unpickling would call the class with the message only.
         return _revived, (type(self), self.args, self.__dict__)
 
 
@@ -39,7 +39,7 @@ def _revived(kind: type[BoresightError], args: tuple[Any, ...], fields: dict[str
 
 
 class ConfigError(BoresightError):
-    """fleet.toml, a manifest or a command line that cannot be right: `file`, `key`, what is wrong and what to do."""
+    """Wrong entry in fleet.toml, a manifest or a command line. Has file, key, and problem with remedy."""
 
     exit_code = 2
 
@@ -58,7 +58,7 @@ class LogError(BoresightError):
 
 
 class ContractError(BoresightError):
-    """A table that does not have the schema, version or content that its contract promises."""
+    """A table without the schema, version or content that its contract requires."""
 
     def __init__(self, path: str, problem: str) -> None:
         self.path, self.problem = path, problem
@@ -66,28 +66,28 @@ class ContractError(BoresightError):
 
 
 class DamagedError(ContractError):
-    """A file of a table that cannot be read; out of the way, it is made anew from what it was made of."""
+    """A file of a table that cannot be read; with the file moved away, its stage makes it again."""
 
     def __init__(self, path: str, problem: str) -> None:
         super().__init__(path, f"is damaged, make it anew: {problem}")
 
 
 class DamagedLogError(ContractError):
-    """A record table whose log cannot be read; what its data files hold, `boresight repair` puts under a new one."""
+    """A record table with an unreadable log; `boresight repair` writes a new log for its data files."""
 
     def __init__(self, path: str, problem: str, lake: str) -> None:
         super().__init__(path, f"its log is damaged ({problem}): run `boresight repair --lake {lake}`")
 
 
 class CollectedError(DamagedError):
-    """A partition whose rows left the lake after their time; out of the way, they are made anew from the logs."""
+    """A partition whose rows were deleted at the end of their retention. Ingest makes them again."""
 
     def __init__(self, path: str, day: str) -> None:
         ContractError.__init__(self, path, f"its rows left the lake on {day}: ingest the day's logs again")
 
 
 class MissingExtraError(BoresightError):
-    """A command needs `module`, which a plain `pip install boresight` leaves out: `extra` brings it."""
+    """A command needs `module`, which only `pip install boresight[extra]` installs."""
 
     exit_code = 2
 
@@ -99,7 +99,7 @@ class MissingExtraError(BoresightError):
 
 
 class DownloadError(BoresightError):
-    """A file that the web did not give; nothing was placed."""
+    """A download that failed; no file was written."""
 
     def __init__(self, url: str, problem: str) -> None:
         self.url, self.problem = url, problem
@@ -107,7 +107,7 @@ class DownloadError(BoresightError):
 
 
 class ModelError(BoresightError):
-    """A model file that does not do what its manifest says."""
+    """A model file that does not match its manifest."""
 
     exit_code = 2
 
@@ -117,11 +117,11 @@ class ModelError(BoresightError):
 
 
 class ModelOutputError(ModelError):
-    """Values of a model that cannot be right, whatever it was shown: the day is refused."""
+    """Impossible output values of a model; the day is refused."""
 
 
 class StorageError(BoresightError):
-    """An object store that does not answer, also after retries: nothing is damaged, and another try may help."""
+    """An object store that does not answer after several tries; nothing is damaged, so try again later."""
 
     def __init__(self, place: str, problem: str) -> None:
         self.place, self.problem = place, problem
@@ -129,7 +129,7 @@ class StorageError(BoresightError):
 
 
 class TooMuchMemoryError(BoresightError):
-    """Work on a vehicle-day that asked for more memory than a worker may take; the day is refused."""
+    """Work on a vehicle-day that needed more memory than the limit of a worker; the day is refused."""
 
     faults = ("memory",)
 
@@ -146,5 +146,5 @@ class SolveError(BoresightError):
     exit_code = 3
 
     def __init__(self, reason: str, fault: str = "") -> None:
-        self.reason, self.fault = reason, fault  # a key of schemas.faults.FAULTS, where one is known
+        self.reason, self.fault = reason, fault  # key of schemas.faults.FAULTS, empty if unknown
         super().__init__(reason)

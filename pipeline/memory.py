@@ -1,4 +1,4 @@
-"""What a stage of a vehicle-day may take of the machine: CPUs, and memory, so that a bad log costs its own day only."""
+"""Limits of one stage of one vehicle-day on CPUs and memory, so that a damaged log stops its own day only."""
 
 from __future__ import annotations
 
@@ -17,19 +17,20 @@ __all__ = ["MODEL_THREADS", "at_most", "usable_cpus"]
 # Set for the workers of a night: threads of one model on the CPU, so that no core is idle where days are few.
 MODEL_THREADS: Final = "BORESIGHT_MODEL_THREADS"
 _STATUS = Path("/proc/self/status")
-# How libraries that have no exception of their own for it say that memory was refused.
+# Messages of libraries that raise no exception of their own when an allocation fails.
 _REFUSED = ("bad_alloc", "bad allocation", "Failed to allocate", "allocation error")
 
 
 @contextmanager
 def at_most(gigabytes: float) -> Iterator[None]:
-    """Within the block the process gets no more than `gigabytes` of memory beside what it has when the block begins.
+    """Limit the memory of the process within the block to `gigabytes` more than at its start.
 
-    RLIMIT_DATA counts what is written to. RLIMIT_AS would count what is mapped: numba, Arrow and ONNX Runtime map
-    gigabytes that they never touch. No effect where /proc does not say what the process has.
+    Uses RLIMIT_DATA, which limits writable memory. RLIMIT_AS would limit mapped memory, and numba, Arrow and
+    ONNX Runtime map gigabytes that they never use. No effect if /proc does not give the memory of the
+    process.
 
     Raises:
-        TooMuchMemoryError: more was asked for.
+        TooMuchMemoryError: the block needed more.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
     now = _private_bytes()
@@ -47,7 +48,7 @@ def at_most(gigabytes: float) -> Iterator[None]:
 
 
 def _private_bytes() -> int:
-    """Memory that the process may write to and shares with nobody; 0 where the system does not say."""
+    """Private writable memory of the process [bytes]; 0 if the system does not report it."""
     with suppress(OSError):
         lines = _STATUS.read_text().splitlines()
         return next((int(line.split()[1]) << 10 for line in lines if line.startswith("VmData:")), 0)

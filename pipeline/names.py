@@ -1,4 +1,4 @@
-"""Names that become folders of the lake and files of the report: what a vehicle may be called."""
+"""Names of vehicles, which become folders of the lake and files of the report."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ __all__ = ["is_pattern", "is_vehicle", "matches"]
 
 _VEHICLE = re.compile(r"[^/\0=]+")
 _WILD = {"*": ".*", "?": "."}
-_LONGEST_FOLDER = 200  # of the 255 bytes that file systems allow: pages and partitions add to the name
+_LONGEST_FOLDER = 200  # of the 255 bytes that file systems allow; pages and partitions extend the name
 
 
 def is_vehicle(name: str) -> bool:
-    """Whether a name can be a vehicle's: no control characters, path or "=", and short enough for a folder."""
+    """Whether a vehicle may have this name: no control characters, "/" or "=", not too long."""
     return (
         bool(_VEHICLE.fullmatch(name))
         and name not in (".", "..")
@@ -24,12 +24,12 @@ def is_vehicle(name: str) -> bool:
 
 
 def is_pattern(name: str) -> bool:
-    """Whether a name in fleet.toml stands for whichever vehicles match it."""
+    """Whether a name in fleet.toml is a pattern for vehicles."""
     return any(letter in name for letter in _WILD)
 
 
 def matches(pattern: str, vehicle: str) -> bool:
-    """Whether a vehicle's name is as the pattern says: * for any letters or none, ? for one."""
+    """Whether a vehicle's name matches a pattern: * for any number of letters, ? for one."""
     return (
         re.fullmatch("".join(_WILD.get(letter, re.escape(letter)) for letter in pattern), vehicle) is not None
     )

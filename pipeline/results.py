@@ -1,4 +1,4 @@
-"""What every stage returns, what it cost, and how it says how far it is."""
+"""Outcome of a stage, its effort, and the interface for progress."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from typing import Any, TypeVar, overload
 
 __all__ = ["Effort", "MadeWhenAsked", "Outcome", "Progress", "measured", "plain", "silent"]
 
-_COUNTERS = Path("/proc/self/io")  # Linux: every read and write of the process, from the page cache too
-# progress(done, total, what): total 0 = unknown. Stages call it often; the job decides what a person sees.
+_COUNTERS = Path("/proc/self/io")  # Linux: bytes of every read and write of the process, page cache included
+# progress(done, total, what): total 0 = unknown. Stages call it often; the job decides how often to print.
 Progress = Callable[[int, int, str], None]
 
 
@@ -22,11 +22,11 @@ Item = TypeVar("Item")
 
 
 class MadeWhenAsked(Sequence[Item]):
-    """Items that are put together when their turn comes: thousands wait, and a few are in work.
+    """Sequence whose items are built on access, so that few of thousands are in memory.
 
     Args:
-        count: of the items.
-        make: puts one together, from its index.
+        count: number of items.
+        make: builds the item of an index.
     """
 
     def __init__(self, count: int, make: Callable[[int], Item]) -> None:
@@ -45,12 +45,12 @@ class MadeWhenAsked(Sequence[Item]):
 
 
 def silent(done: int, total: int, what: str) -> None:
-    """Progress that nobody watches."""
+    """Progress function that shows nothing."""
 
 
 @dataclass(frozen=True)
 class Effort:
-    """When work began (UTC, ISO 8601), how long it took, and the bytes that the process read and wrote meanwhile."""
+    """Start of work (UTC, ISO 8601), its duration, and bytes read and written by the process meanwhile."""
 
     began_at: str = ""
     seconds: float = 0.0
@@ -60,10 +60,10 @@ class Effort:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one stage on one vehicle-day, or on the fleet (`vehicle` and `day` are empty then).
+    """Result of one stage on one vehicle-day, or on the fleet (then `vehicle` and `day` are empty).
 
-    `status`: "done", "cached" (same work key, nothing to do), "refused" (recorded with a reason; the fleet goes on),
-    "failed" (an error; another try may help).
+    `status`: "done", "cached" (same work key, nothing to do), "refused" (recorded with a reason; the fleet
+    goes on), "failed" (an error; another try may help).
     """
 
     stage: str
@@ -76,23 +76,21 @@ class Outcome:
     rejected: dict[str, int] = field(default_factory=dict)
     reason: str = ""
     outputs: list[str] = field(default_factory=list)
-    faults: tuple[str, ...] = ()  # that the reason states, keys of `schemas.faults.FAULTS`
-    damaged: str = ""  # the file that could not be read, where that made it fail
+    faults: tuple[str, ...] = ()  # faults named in the reason, keys of `schemas.faults.FAULTS`
+    damaged: str = ""  # path of the unreadable file, if that was the error
     inputs: tuple[str, ...] = ()
     effort: Effort = field(default=Effort(), compare=False, repr=False)
-    records: tuple[Any, ...] = field(
-        default=(), repr=False
-    )  # rows of a record table, those of a cached day too
+    records: tuple[Any, ...] = field(default=(), repr=False)  # rows of a record table, also for a cached day
 
     def counts(self) -> dict[str, Any]:
-        """What a command's summary says beside the status."""
+        """All fields but the status that belong in a command's summary."""
         left_out = ("status", "records", "damaged", "inputs", "effort")
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in left_out}
 
 
 @contextmanager
 def measured() -> Iterator[Callable[[], Effort]]:
-    """A function that says the effort since the block began."""
+    """Measure a block: yields a function that returns the effort since the block began."""
     began_at = dt.datetime.now(dt.UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
     began, before = time.perf_counter(), _bytes()
 
@@ -114,7 +112,10 @@ def _bytes() -> tuple[int | None, int | None]:
 
 
 def plain(value: Any) -> Any:
-    """A value as strict JSON has it: NumPy's and paths too; null for what is not finite, as an unknown sigma."""
+    """Value in strict JSON types.
+
+    NumPy values and paths are converted; non-finite numbers (an unknown sigma) become null.
+    """
     if isinstance(value, Mapping):
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple, set, frozenset)):
@@ -127,4 +128,4 @@ def plain(value: Any) -> Any:
         return str(value)
     if hasattr(value, "tolist"):  # numpy scalars and arrays, without importing numpy here
         return plain(value.tolist())
-    raise TypeError(f"{type(value).__name__} has no place in a JSON summary")
+    raise TypeError(f"{type(value).__name__} cannot be written as JSON")

@@ -1,4 +1,4 @@
-"""What fleet.toml says of sensors: their topics, what a radar's numbers mean, where the prior comes from."""
+"""Sensors in fleet.toml: their topics, the meaning of radar values, and the source of the prior."""
 
 from __future__ import annotations
 
@@ -29,9 +29,10 @@ __all__ = [
 Positive = Annotated[float, Field(gt=0)]
 Topic = Annotated[str, Field(pattern=r"^/\S+$")]
 TF_STATIC = "/tf_static"
-# By the unit in a number's name, the least and the most that it can mean on a car. 0 has a meaning of its own.
+# Plausible range of a value on a car, by the unit at the end of its name. 0 is always allowed and has its own
+# meaning.
 _OF_THIS_WORLD = {"deg": (1e-4, 180.0), "m": (1e-4, 1e3), "s": (1e-6, 86_400.0), "mps": (0.01, 1000.0)}
-# What labels can mean (Cityscapes' classes), and which of them are road users.
+# Classes that labels can stand for (those of Cityscapes), and the road users among them.
 StreetClass = Literal[
     "road", "sidewalk", "building", "wall", "fence", "pole", "traffic light", "traffic sign", "vegetation",
     "terrain", "sky", "person", "rider", "car", "truck", "bus", "train", "motorcycle", "bicycle",
@@ -48,7 +49,7 @@ class Section(BaseModel):
     @field_validator("*", mode="after")
     @classmethod
     def _is_of_this_world(cls, value: Any, info: Any) -> Any:
-        """A number is one of its unit: 180 deg is all there is, and no car's radar measures nanometres a second."""
+        """Refuse a value outside the plausible range of its unit, such as an angle above 180 deg."""
         unit = (info.field_name or "").rpartition("_")[2]
         least, most = _OF_THIS_WORLD.get(unit, (0.0, math.inf))
         if isinstance(value, float) and value and not least <= abs(value) <= most:
@@ -57,14 +58,15 @@ class Section(BaseModel):
 
 
 class TopicSemantics(Section):
-    """Semantics that the car already logged."""
+    """Semantics that are in the log already."""
 
     source: Literal["topics"]
     labels: Topic
     detections: Topic
-    # One of these, or a set of one's own: { road = [7, 8], car = [26], ... }; labels that it leaves out mean nothing.
+    # One of these sets, or a table such as { road = [7, 8], car = [26], ... }; other label values are
+    # ignored.
     label_set: Literal["cityscapes", "ade20k", "coco"] | dict[StreetClass, tuple[LabelId, ...]] = "cityscapes"
-    # Of a detector that logs numbers or names of its own: { "2" = "car", ... }, as logged.
+    # For a detector that logs other names or numbers: { "2" = "car", ... }, with the names as logged.
     classes: dict[str, RoadUser] = Field(default_factory=dict, exclude_if=lambda classes: not classes)
 
     @model_validator(mode="after")
@@ -78,7 +80,7 @@ class TopicSemantics(Section):
 
 
 class OnnxSemantics(Section):
-    """Semantics computed here by ONNX models; paths of manifests, relative to fleet.toml."""
+    """Semantics computed by ONNX models; paths of manifests, relative to fleet.toml."""
 
     source: Literal["onnx"]
     segmenter: str
@@ -87,61 +89,63 @@ class OnnxSemantics(Section):
 
 @dataclass(frozen=True)
 class CameraPrior:
-    """What is known of a camera beside its CameraInfo."""
+    """Prior knowledge of a camera in addition to its CameraInfo."""
 
     readout_s: float = 0.0
-    # Target calibrations repeated with other pictures of the same camera scatter by some tenths of a percent and by one
-    # or two pixels (Zhang 2000, table 2); the better ones of these.
+    # Repeated target calibrations of one camera with new pictures scatter by some tenths of a percent and by
+    # one or two pixels (Zhang 2000, table 2); these are the better of those values.
     focal_sigma: float = 0.003
     centre_sigma_px: float = 1.0
     centre_is_stated: bool = (
-        False  # else nobody promised it: enough to doubt a day, not to certify the camera's turn
+        False  # False = a default: enough to doubt a day, not enough to certify the camera's rotation
     )
 
 
 class SensorPrior(Section):
-    """How far one sensor's prior is to be trusted, where that is not the rig's."""
+    """Sigmas of one sensor's prior, if they differ from those of the rig."""
 
     rotation_sigma_deg: Positive | None = None
     translation_sigma_m: Positive | None = None
 
 
 class _Sensor(Section):
-    """What every sensor may be told."""
+    """Settings that every sensor has."""
 
-    # Left out of dumps: it is calibration's, and no reason to ingest a rig's logs again.
+    # Left out of dumps: only calibration uses it, so a change must not ingest a rig's logs again.
     prior: SensorPrior = Field(default=SensorPrior(), exclude=True)
 
 
 class CameraTopics(_Sensor):
-    """A camera's topics, and what CameraInfo does not say."""
+    """Topics of a camera, and what CameraInfo does not contain."""
 
     image: Topic
     info: Topic
-    # Left out: only what needs no labels and no road users can be made of its images.
+    # None = only steps that need neither labels nor road users use the camera's images.
     semantics: Annotated[TopicSemantics | OnnxSemantics, Field(discriminator="source")] | None = None
-    # Rolling shutter: time from the first image row to the last, which is seen later [s]; 0 = global shutter. The stamp
-    # is that of the middle row; where it is another row's, the time offset that is estimated takes that up. Left out of
-    # dumps: it is calibration's, and no reason to ingest a rig's logs again.
+    # Rolling shutter: time from the first image row to the last, which is exposed later [s]; 0 = global
+    # shutter. The stamp is that of the middle row; if it is another row's, the estimated time offset absorbs
+    # the difference. Left out of dumps: only calibration uses it, so a change must not ingest a rig's logs
+    # again.
     readout_s: Annotated[float, Field(ge=0, le=0.1)] = Field(default=0.0, exclude=True)
 
-    # How surely CameraInfo is right (1 sigma): focal length, and principal point in either direction.
-    # 0 = surely: the day then needs no more than its own sigma to contradict it. With `centre_sigma_px` records can
-    # certify how the camera is mounted; without it only where things appear in the image with this CameraInfo.
+    # 1-sigma accuracy of CameraInfo: focal length, and principal point in each direction.
+    # 0 = treat CameraInfo as exact: only the day's own sigma is used in the test. With `centre_sigma_px`
+    # records can certify the mounting of the camera; without it only the positions of objects in images with
+    # this CameraInfo.
     focal_sigma_relative: Annotated[float, Field(ge=0, le=0.05)] = Field(
         default=CameraPrior.focal_sigma, exclude=True
     )
     centre_sigma_px: Annotated[float, Field(ge=0, le=100)] | None = Field(default=None, exclude=True)
 
     def named_models(self) -> Iterator[tuple[str, str]]:
-        """Files of models that it names, by key."""
+        """Model files of this sensor as (key, path)."""
         if isinstance(self.semantics, OnnxSemantics):
             yield "semantics.segmenter", self.semantics.segmenter
             yield "semantics.detector", self.semantics.detector
 
     @property
     def known(self) -> CameraPrior:
-        """What calibration takes as known of the camera."""
+        """Prior knowledge of the camera for calibration."""
         known = CameraPrior(self.readout_s, self.focal_sigma_relative)
         if self.centre_sigma_px is None:
             return known
@@ -149,46 +153,48 @@ class CameraTopics(_Sensor):
 
 
 class OnnxPointSemantics(Section):
-    """What lidar points are, computed here by a range-image model; path of its manifest, relative to fleet.toml."""
+    """Classes of lidar points from a range-image model; path of its manifest, relative to fleet.toml."""
 
     source: Literal["onnx"]
     segmenter: str
-    remission_scale: Positive = 1.0  # makes logged intensity what the model was trained on
+    # factor from logged intensity to the remission that the model was trained on
+    remission_scale: Positive = 1.0
 
 
 class LidarTopics(_Sensor):
-    """A lidar's topic."""
+    """Topic of a lidar, and its height if measured."""
 
     points: Topic
-    # None = from geometry. Left out of dumps: it is perception's, and no reason to ingest a rig's logs again.
+    # None = from geometry. Left out of dumps: only perception uses it, so a change must not ingest a rig's
+    # logs again.
     semantics: OnnxPointSemantics | None = Field(default=None, exclude=True)
-    # Over the road, as somebody measured it, and how well: for the edge to the vehicle frame.
+    # Measured height above the road and its sigma, for the edge to the vehicle frame.
     height_m: Positive | None = Field(default=None, exclude=True)
     height_sigma_m: Positive | None = Field(default=None, exclude=True)
 
     @model_validator(mode="after")
     def _height_has_a_sigma(self) -> LidarTopics:
         if (self.height_m is None) != (self.height_sigma_m is None):
-            raise ValueError("height_m and height_sigma_m go together: say both, or neither")
+            raise ValueError("height_m and height_sigma_m go together: give both, or neither")
         return self
 
     def named_models(self) -> Iterator[tuple[str, str]]:
-        """Files of models that it names, by key."""
+        """Model files of this sensor as (key, path)."""
         if self.semantics is not None:
             yield "semantics.segmenter", self.semantics.segmenter
 
 
 class OnnxDrivable(Section):
-    """The radar's drivable area computed here by a network; path of its manifest, relative to fleet.toml."""
+    """Drivable area of the radar, computed by a network; path of its manifest, relative to fleet.toml."""
 
     source: Literal["onnx"]
     model: str
 
 
 class AlignmentFields(Section):
-    """Where a message says how a radar is misaligned: paths as `packet.theta`, `-packet.theta` of the opposite sign.
+    """Message fields with the radar's misalignment: `packet.theta`, or `-packet.theta` for the opposite sign.
 
-    Azimuth is positive to the left, elevation upwards. A message may hold one of the two.
+    Azimuth is positive to the left, elevation is positive upwards. A message may hold one of the two.
     """
 
     azimuth: str | None = None
@@ -206,27 +212,30 @@ class AlignmentFields(Section):
 
 
 class RadarTopics(_Sensor):
-    """A radar's topic and what its Doppler means."""
+    """Topic of a radar, and the meaning of its Doppler field."""
 
     points: Topic
     doppler_field: str = "doppler"
     doppler_positive: Literal["approaching", "receding"] = "receding"
     doppler_period_mps: Positive | None = None
-    # ["vx", "vy"] or three: components of the velocity relative to the radar, in its axes, of a cloud without a Doppler
-    # field. Ego-compensated ones (over ground) say nothing of the radar's pose and must not be named here.
+    # ["vx", "vy"] or three names: components of the velocity relative to the radar, in radar axes, for a
+    # cloud without a Doppler field. Ego-compensated velocities (over ground) contain no information on the
+    # radar's pose and must not be named here.
     velocity_fields: tuple[str, str] | tuple[str, str, str] | None = Field(
         default=None, exclude_if=lambda fields: fields is None
     )
-    azimuth_positive: Literal["left", "right"] = "left"  # RadarScan drivers differ; PointCloud2 has x y z
-    # Messages of its own estimate of its misalignment; one topic may stand without brackets. Left out of dumps where
-    # there is none.
+    # drivers that log RadarScan differ; PointCloud2 has x y z
+    azimuth_positive: Literal["left", "right"] = "left"
+    # Topics with the radar's estimate of its misalignment; a single topic needs no brackets. Left out of
+    # dumps if empty.
     alignment: tuple[Topic, ...] = Field(default=(), exclude_if=lambda topics: not topics)
     alignment_fields: AlignmentFields | None = Field(default=None, exclude_if=lambda fields: fields is None)
-    # None = from geometry. Left out of dumps: it is perception's, and no reason to ingest a rig's logs again.
+    # None = from geometry. Left out of dumps: only perception uses it, so a change must not ingest a rig's
+    # logs again.
     drivable: OnnxDrivable | None = Field(default=None, exclude=True)
 
     def named_models(self) -> Iterator[tuple[str, str]]:
-        """Files of models that it names, by key."""
+        """Model files of this sensor as (key, path)."""
         if self.drivable is not None:
             yield "drivable.model", self.drivable.model
 
@@ -238,7 +247,7 @@ class RadarTopics(_Sensor):
     @model_validator(mode="after")
     def _fields_are_of_a_topic(self) -> RadarTopics:
         if self.alignment_fields is not None and not self.alignment:
-            raise ValueError("alignment_fields are of a message: name its topic, alignment = ...")
+            raise ValueError("alignment_fields needs the topic of the message: alignment = ...")
         return self
 
     @model_validator(mode="after")
@@ -252,20 +261,20 @@ class RadarTopics(_Sensor):
 
 
 class EgoTopics(Section):
-    """Optional ego motion."""
+    """Topic of the ego motion (optional)."""
 
     odometry: Topic
 
 
 class PriorConfig(Section):
-    """Where the prior comes from and how far to trust it."""
+    """Source of the prior and its sigmas."""
 
     source: Literal["tf_static", "file"] = "tf_static"
-    # Where static transforms are logged: ROS's name; Foxglove's loggers have no custom. Left out of dumps where it is
-    # that: no reason to ingest a rig's logs again.
+    # Topic of static transforms; Foxglove's loggers have no fixed name. Left out of dumps if it is ROS's
+    # name, so that older rigs are not ingested again.
     topic: Topic = Field(default=TF_STATIC, exclude_if=lambda topic: topic == TF_STATIC)
-    # JSON, relative to fleet.toml: {"reference": "top", "T": {"front": 4x4, ...}} with T_reference_sensor of each
-    # sensor; of a short-form rig also {"T_camera_lidar": 4x4, "T_lidar_radar": 4x4}.
+    # JSON, relative to fleet.toml: {"reference": "top", "T": {"front": 4x4, ...}} with T_reference_sensor of
+    # each sensor; for a rig in the short form also {"T_camera_lidar": 4x4, "T_lidar_radar": 4x4}.
     file: str | None = None
     rotation_sigma_deg: Positive = 2.0
     translation_sigma_m: Positive = 0.05

@@ -1,8 +1,8 @@
-"""Message definitions for bags that carry none (ROS 2 Humble and older) and that rosbags does not bundle.
+"""Message definitions for bags that contain none (ROS 2 Humble and older) and that rosbags does not bundle.
 
-Of logs that are read, used only where the log itself has no definition; a message that does not fit byte for byte is
-refused. What is written here has the same.
-Source: vision_msgs 4.1 (Humble); radar_msgs 0.2 (Humble); off_highway_premium_radar_msgs 0.9.
+When reading a log, they are used only if the log itself has no definition; a message that does not fit byte
+for byte is refused. Logs that are written here use the same definitions. Source: vision_msgs 4.1 (Humble);
+radar_msgs 0.2 (Humble); off_highway_premium_radar_msgs 0.9.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _PARTS = (
     "Time", "OperationMode", "LocationAttributesHeader", "SensorModulationPerformance", "MisalignmentPacket",
     "InterferenceIndicator", "SensorFieldOfView", "LocationAttributesPacket",
 )  # fmt: skip
-# type -> (types it needs first, text)
+# type -> (types that it needs, text)
 DEFINITIONS: dict[str, tuple[tuple[str, ...], str]] = {
     "vision_msgs/msg/Point2D": ((), "float64 x\nfloat64 y\n"),
     "vision_msgs/msg/Pose2D": ((), "vision_msgs/Point2D position\nfloat64 theta\n"),
@@ -124,6 +124,6 @@ DEFINITIONS: dict[str, tuple[tuple[str, ...], str]] = {
 
 
 def register(store: Typestore, msgtype: str) -> None:
-    """Add one of the types of DEFINITIONS, and those it needs."""
+    """Add one type of DEFINITIONS and the types it needs."""
     for name in (*DEFINITIONS[msgtype][0], msgtype):
         store.register(get_types_from_msg(DEFINITIONS[name][1], name))

@@ -1,4 +1,4 @@
-"""ROS messages filled from plain arrays, and MCAP of them: what the simulator, `convert` and `export` write."""
+"""ROS messages and MCAP files from plain arrays: used by the simulator, `convert` and `export`."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _DATATYPES: Final = {"f4": 7, "u2": 4, "u1": 2}  # sensor_msgs/PointField
 
 @lru_cache(maxsize=2)
 def _typestore(ros_version: int) -> Typestore:
-    """All types that are written; compiled once per process."""
+    """Type store with all types that are written; built once per process."""
     store = get_typestore(Stores.ROS1_NOETIC if ros_version == 1 else Stores.ROS2_HUMBLE)
     for kind in ("vision_msgs/msg/Detection2DArray", "off_highway_premium_radar_msgs/msg/LocationAttributes"):
         register(store, kind)
@@ -36,18 +36,18 @@ def _typestore(ros_version: int) -> Typestore:
 
 
 class RosMessages:
-    """Makes messages of ROS version 1 or 2 (Humble), and their wire bytes; headers by `header` or `at`."""
+    """Makes and serialises messages of ROS version 1 or 2 (Humble); headers: `header` or `at`."""
 
     def __init__(self, ros_version: int) -> None:
         self.typestore, self.ros_version = _typestore(ros_version), ros_version
 
     def make(self, name: str, /, **fields: Any) -> Any:
-        """A message of a type; name as "sensor_msgs/PointCloud2"."""
+        """An empty message of a type, such as "sensor_msgs/PointCloud2"."""
         package, short = name.split("/")
         return self.typestore.types[f"{package}/msg/{short}"](**fields)
 
     def serialised(self, message: Any) -> bytes:
-        """Wire bytes."""
+        """Wire bytes of a message."""
         pack = self.typestore.serialize_ros1 if self.ros_version == 1 else self.typestore.serialize_cdr
         return bytes(pack(message, message.__msgtype__))
 
@@ -58,7 +58,7 @@ class RosMessages:
         return self.make("std_msgs/Header", stamp=time, frame_id=frame_id, **seq)
 
     def at(self, stamp_ns: int, sensor: str) -> Any:
-        """Header of a sensor's message, or the vehicle's ("base"), in the frame that logs written here give it."""
+        """Header of a message of a sensor or the vehicle ("base"), with its frame id."""
         return self.header(stamp_ns, frame_of(sensor))
 
     def image(self, header: Any, data: bytes, encoding: str) -> Any:
@@ -91,7 +91,7 @@ class RosMessages:
         )
 
     def cloud(self, header: Any, columns: Mapping[str, np.ndarray]) -> Any:
-        """PointCloud2 of columns of float32, uint16 and uint8 (N each), packed in their order."""
+        """PointCloud2 of columns of float32, uint16 and uint8 (N each), packed in this order."""
         dtype = np.dtype([(name, c.dtype.newbyteorder("<")) for name, c in columns.items()])
         rows = np.empty(len(next(iter(columns.values()))), dtype)
         fields, offset = [], 0
@@ -118,7 +118,7 @@ class RosMessages:
     def location_attributes(
         self, header: Any, azimuth_rad: float, elevation_rad: float, sigma_rad: float
     ) -> Any:
-        """LocationAttributes of a Bosch radar that state its misalignment and nothing else."""
+        """LocationAttributes of a Bosch radar with its misalignment; all other fields are zero."""
         stated = {
             "theta": azimuth_rad,
             "phi": elevation_rad,
@@ -128,7 +128,7 @@ class RosMessages:
         return self._filled("off_highway_premium_radar_msgs/msg/LocationAttributes", header, stated)
 
     def _filled(self, kind: str, header: Any, values: Mapping[str, float]) -> Any:
-        """A message of a type, of nested ones too, whose fields are zero but for those named."""
+        """A message of a type, nested types included, with zeros in all fields but the named ones."""
         fields: dict[str, Any] = {}
         for name, (_, detail) in self.typestore.fielddefs[kind][1]:
             if detail == "std_msgs/msg/Header":
@@ -144,7 +144,7 @@ class RosMessages:
         return self.typestore.types[kind](**fields)
 
     def transforms(self, of_child: Iterable[tuple[Any, str, Float[np.ndarray, "4 4"]]]) -> Any:
-        """TFMessage of (header that names the parent, child frame, T_parent_child)."""
+        """TFMessage from (header with the parent's frame, child frame, T_parent_child)."""
         items = []
         for header, child, T in of_child:
             x, y, z = (float(v) for v in T[:3, 3])
@@ -164,14 +164,14 @@ class RosMessages:
         return self.make("tf2_msgs/TFMessage", transforms=items)
 
     def sensor_poses(self, stamp_ns: int, T_vehicle_sensor: Mapping[str, Float[np.ndarray, "4 4"]]) -> Any:
-        """TFMessage with the vehicle as parent of every sensor, by name."""
+        """TFMessage with the vehicle as the parent of every sensor."""
         poses = T_vehicle_sensor.items()
         return self.transforms((self.at(stamp_ns, "base"), frame_of(name), T) for name, T in poses)
 
     def odometry(
         self, stamp_ns: int, T_odom_vehicle: Float[np.ndarray, "4 4"], speed_mps: float, yaw_rate_radps: float
     ) -> Any:
-        """Odometry: pose in odom, twist (forward speed and yaw rate) in the vehicle's frame."""
+        """Odometry: pose in the frame odom, twist (forward speed and yaw rate) in the vehicle frame."""
         zero = {"x": 0.0, "y": 0.0, "z": 0.0}
         linear = self.make("geometry_msgs/Vector3", **(zero | {"x": speed_mps}))
         angular = self.make("geometry_msgs/Vector3", **(zero | {"z": yaw_rate_radps}))
@@ -185,7 +185,7 @@ class RosMessages:
         )
 
     def pose(self, T: Float[np.ndarray, "4 4"], *, with_covariance: bool = False) -> Any:
-        """Pose, or PoseWithCovariance with a covariance of zeros (unknown, as ROS has it)."""
+        """Pose, or PoseWithCovariance with a covariance of zeros (in ROS: unknown)."""
         x, y, z = (float(v) for v in T[:3, 3])
         position = self.make("geometry_msgs/Point", x=x, y=y, z=z)
         pose = self.make("geometry_msgs/Pose", position=position, orientation=self._quaternion(T))
@@ -199,11 +199,11 @@ class RosMessages:
 
 
 class McapLog:
-    """A ROS 2 MCAP open for writing.
+    """Writer of a ROS 2 MCAP file.
 
     Args:
-        stream: takes the bytes; stays open.
-        library: what writes, for the file's header.
+        stream: receives the bytes; stays open.
+        library: name of the writing program, for the file header.
         compression: of the chunks.
     """
 
@@ -219,7 +219,7 @@ class McapLog:
         self._channels: dict[str, int] = {}
 
     def put(self, topic: str, stamp_ns: int, message: Any, **metadata: str) -> None:
-        """Write a message; metadata is that of a topic's first."""
+        """Write a message; the metadata of a topic is that of its first message."""
         if topic not in self._channels:
             kind = message.__msgtype__
             text = self.messages.typestore.generate_msgdef(kind, ros_version=2)[0]

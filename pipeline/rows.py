@@ -1,4 +1,4 @@
-"""Dataclasses all of whose arrays have one row per thing; other fields belong to all of them."""
+"""Tables as dataclasses: arrays have one entry per row, other fields apply to all rows."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ _Table = TypeVar("_Table")
 
 
 def take_rows(table: _Table, rows: np.ndarray) -> _Table:
-    """Some of the rows, by number or mask."""
+    """Subset of rows, by number or mask."""
     return _changed(table, {name: values[rows] for name, values in _arrays(table).items()})
 
 
 def join_rows(parts: Sequence[_Table]) -> _Table:
-    """The rows of all parts, one after another; what is no array is the first one's."""
+    """Rows of all parts, concatenated; fields that are not arrays come from the first part."""
     columns = [_arrays(part) for part in parts]
     return _changed(parts[0], {name: np.concatenate([c[name] for c in columns]) for name in columns[0]})
 
 
 def columns_of(rows: Sequence[tuple[Any, ...]], dtype: np.dtype) -> dict[str, np.ndarray]:
-    """The fields of a structured dtype as arrays with an entry per row, also where there is none."""
+    """Fields of a structured dtype as arrays with one entry per row; empty arrays for no row."""
     table = np.array(rows, dtype)
     return {name: np.ascontiguousarray(table[name]) for name in dtype.names or ()}
 

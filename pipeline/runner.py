@@ -1,7 +1,7 @@
-"""Run a stage on a task: what every stage needs done around it, once.
+"""Run a stage on a task: the steps around every stage.
 
-Work key, question whether the same work is done already, inputs, the stage itself, atomic commit, manifest with
-counts, outcome. Inline, in a pool of processes or elsewhere, this is what runs.
+The steps: work key, check for finished work, inputs, the stage itself, atomic commit, manifest with counts,
+outcome. Every executor runs this code: in the same process, in a pool, or on another machine.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ __all__ = ["Stage", "run_stage", "try_stage", "why_to_run"]
 
 @dataclass(frozen=True)
 class Stage:
-    """One step of the night.
+    """One step of the nightly run.
 
     Args:
-        name: what its command and its outcomes are called.
+        name: of its command and its outcomes.
         reads: tables that it reads.
-        writes: table that it writes, then those of sensors' files that it joins; none where it writes files.
+        writes: table that it writes, then the tables of sensors that belong to it; empty if it writes files.
         function: import path of `work(task) -> Work`.
-        needs_inputs: a vehicle-day without all that the stage reads is an error. False where the stage reads what
-            the task's method asks for and answers for its absence itself.
-        per_vehicle_day: False where it looks at all vehicles and days of a window.
+        needs_inputs: True if a missing input table is an error. False if the stage reads what the task's
+            method needs and handles missing tables itself.
+        per_vehicle_day: False if it works on all vehicles and days of a window.
     """
 
     name: str
@@ -50,7 +50,7 @@ class Stage:
     per_vehicle_day: bool = True
 
     def load(self) -> Callable[[Task], Work]:
-        """The stage's function; its module is imported now."""
+        """Import the stage's module and return its function."""
         module, name = self.function.split(":")
         function: Callable[[Task], Work] = getattr(importlib.import_module(module), name)
         return function
@@ -61,14 +61,15 @@ class Stage:
 
 
 def run_stage(stage: Stage, task: Task) -> Outcome:
-    """Do what the task asks, unless the same work is done already.
+    """Run the task unless the same work is done already.
 
-    The same code version, settings and inputs give the same work key, and a partition or record with that key is
-    not made again ("cached"). A stage that raises or is killed leaves what was written before as it was.
+    Equal code version, settings and inputs give an equal work key; a partition or record with that key is not
+    made again ("cached"). If a stage raises or is killed, tables stay as they were.
 
     Raises:
-        ConfigError: unknown vehicle, or what the stage says of its configuration.
-        ContractError: a vehicle-day without what the stage reads; a row without what its table promises.
+        ConfigError: unknown vehicle, or a configuration that the stage refuses.
+        ContractError: an input table of the vehicle-day is missing, or a row breaks the contract of its
+            table.
     """
     with measured() as effort:
         outcome = _run_stage(stage, task)
@@ -76,11 +77,7 @@ def run_stage(stage: Stage, task: Task) -> Outcome:
 
 
 def why_to_run(stage: Stage, task: Task) -> str:
-    """What a stage of a vehicle-day that writes a table would run for; empty where its work is done already.
-
-    Raises:
-        ConfigError, ContractError: see `run_stage`.
-    """
+    """Reason to run a stage of a vehicle-day that writes a table; empty if its work is done already."""
     task, work, run = _prepared(stage, task)
     schema = stage.writes[0]
     if _refused_before(stage, task, run) is not None:
@@ -112,7 +109,7 @@ def _run_stage(stage: Stage, task: Task) -> Outcome:
 
 
 def _prepared(stage: Stage, task: Task) -> tuple[Task, Work, Run]:
-    """The task with its inputs, what the stage answers, and the run with its work key."""
+    """The task with its inputs, the stage's work for it, and the run with its work key."""
     if isinstance(task.of, Partition):
         task.fleet.rig_of(task.of.vehicle)
     if stage.per_vehicle_day and stage.needs_inputs:
@@ -125,12 +122,12 @@ def _prepared(stage: Stage, task: Task) -> tuple[Task, Work, Run]:
 
 
 def _wider_keys(stage: Stage, work: Work, run: Run) -> list[str]:
-    """Keys of the same inputs under settings that give all that these do, and more."""
+    """Work keys of the same inputs under settings that produce a superset of this work."""
     return [work_key(stage.name, CODE_VERSION, config_hash(*s), list(run.inputs)) for s in work.wider]
 
 
 def try_stage(stage: Stage, task: Task, progress: Progress) -> Outcome:
-    """`run_stage` whose errors are outcomes: one vehicle-day's trouble never stops the others."""
+    """`run_stage` with errors turned into outcomes, so that one vehicle-day never stops the others."""
     with measured() as effort:
         try:
             return stage.run(replace(task, progress=progress))
@@ -147,7 +144,7 @@ def try_stage(stage: Stage, task: Task, progress: Progress) -> Outcome:
 
 
 def _inputs(stage: Stage, task: Task) -> dict[str, Manifest]:
-    """Manifests of all tables that the stage reads, in that order."""
+    """Manifests of all tables that the stage reads, in order of `stage.reads`."""
     found = {}
     for schema in (s for s in stage.reads if not s.of_sensor):
         manifest = read_manifest(task.lake, schema, task.partition)
@@ -159,11 +156,11 @@ def _inputs(stage: Stage, task: Task) -> dict[str, Manifest]:
 
 
 def _replace_partition(stage: Stage, task: Task, work: Work, run: Run, schema: TableSchema) -> Outcome:
-    """Stream the rows into the partition, which appears as a whole or not at all."""
+    """Write the rows into the partition, which appears as a whole or not at all."""
     done = _readable(task, schema)
     keys = (run.work_key, *_wider_keys(stage, work, run))
     if done is not None and done.work_key in keys and not work.again:
-        # A night that was killed told nobody what it had to say of its work: the next one does.
+        # The same remarks again: if the night that made the partition was killed, they were never printed.
         return replace(_partition_outcome(stage, task, work, "cached", done), inputs=run.inputs)
     refused = _refused_before(stage, task, run)
     if refused is not None:
@@ -193,8 +190,8 @@ def _replace_partition(stage: Stage, task: Task, work: Work, run: Run, schema: T
 
 
 def _refused_before(stage: Stage, task: Task, run: Run) -> Outcome | None:
-    """What was said of the same inputs before, if they were refused: nothing would be written now either."""
-    too_much = str(TooMuchMemoryError(task.fleet.fleet.memory_gb))  # with another bound it may be enough
+    """Outcome of an earlier refusal of the same inputs, if any: they would be refused again."""
+    too_much = str(TooMuchMemoryError(task.fleet.fleet.memory_gb))  # a larger limit may be enough
     for row in task.before:
         if "memory" in row.faults and row.reason != too_much:
             continue
@@ -206,7 +203,7 @@ def _refused_before(stage: Stage, task: Task, run: Run) -> Outcome | None:
 
 
 def _readable(task: Task, schema: TableSchema) -> Manifest | None:
-    """Manifest of the partition as it is; None where it is absent, of another version or damaged: made anew."""
+    """Manifest of the partition; None if absent, of another version or damaged: to be made anew."""
     try:
         found = read_manifest(task.lake, schema, task.partition)
         return found if found is None or is_whole(task.lake, task.partition, found) else None
@@ -238,7 +235,7 @@ def _partition_outcome(stage: Stage, task: Task, work: Work, status: str, manife
 
 
 def _add_records(stage: Stage, task: Task, work: Work, run: Run) -> Outcome:
-    """Records of work that is not recorded yet; committed here, unless who gave the task does that."""
+    """Record work that is not recorded yet; commit it here unless the task's owner does."""
     recorded = [] if work.again else _recorded(stage, task, run.work_key)
     if stage.writes[0].rows_among(recorded):
         if task.commit:
@@ -251,7 +248,7 @@ def _add_records(stage: Stage, task: Task, work: Work, run: Run) -> Outcome:
         for records in batches:
             written += records.rows
     if task.commit:
-        # The first table last: where its rows are, those beside them are too.
+        # The first table is committed last: if its rows are there, the rows of the other tables are too.
         for schema in reversed(stage.writes):
             is_said_of_all = isinstance(task.of, Window) and schema is stage.writes[0]
             commit = commit_last if is_said_of_all else commit_records
@@ -261,7 +258,7 @@ def _add_records(stage: Stage, task: Task, work: Work, run: Run) -> Outcome:
 
 
 def _recorded(stage: Stage, task: Task, key: str) -> list[Any]:
-    """What the same work has recorded already."""
+    """Records that the same work has made already."""
     if task.recorded is not None:
         return [r for r in task.recorded if r.work_key == key]
     vehicle, day = task.partition.vehicle, task.partition.day
@@ -291,7 +288,7 @@ def _record_outcome(stage: Stage, task: Task, work: Work, status: str, key: str,
 
 
 def _write_files(stage: Stage, task: Task, work: Work, run: Run) -> Outcome:
-    """A stage that writes no table: it writes each file atomically itself and yields the path."""
+    """Run a stage that writes no table: it writes each file atomically itself and yields its path."""
     with closing(work.rows(run)) as paths:
         outputs = [str(path) for path in paths]
     return _outcome(stage, task, "done", run.work_key, outputs=outputs)

@@ -1,4 +1,4 @@
-"""Sections of fleet.toml beside fleet, rigs and vehicles: what each stage may be told, with physical defaults."""
+"""Sections of fleet.toml with the settings of each stage (all but fleet, rigs and vehicles)."""
 
 from __future__ import annotations
 
@@ -40,18 +40,21 @@ MethodName = Annotated[str, AfterValidator(_known_method)]
 
 
 class IngestConfig(Section):
-    """Synchronisation and what to keep."""
+    """Synchronisation of the sensors, and which data to keep."""
 
-    # Largest difference of raw stamps within a moment, 0.005 in the paper's section 4.5.1. None = by motion: how far
-    # the car may drive and turn between the stamps, beyond the day's constant gaps. Odometry knows that to 2 to 5 %, so
-    # these leave some 10 cm and 0.1 deg, of either sign.
+    # Largest difference of raw stamps within a moment; 0.005 in section 4.5.1 of the paper. None = limited by
+    # motion: how far the car may drive and turn between the stamps, after the day's constant clock offsets
+    # are removed. Odometry is accurate to 2 to 5 %, so the limits below leave errors of about 10 cm and 0.1
+    # deg, of either sign.
     sync_gate_s: Positive | None = None
-    sync_gate_m: Positive = 2.5  # 45 ms at 55 m/s; 55 ms, the most that 30, 10 and 13 Hz leave, at 45 m/s
+    # 45 ms at 55 m/s. Sensors of 30, 10 and 13 Hz are at most 55 ms apart, which is 2.5 m at 45 m/s.
+    sync_gate_m: Positive = 2.5
     sync_gate_deg: Positive = 2.0  # 55 ms at 36 deg/s
-    # Sweeps of a vehicle-day that are read, a longer one in bursts. A calibration takes 100 frames (`select.frames`)
-    # and is judged by a fifth of the day; four times as many leave it a choice.
+    # Lidar sweeps read per vehicle-day; a longer day is read in bursts. A calibration takes 100 frames
+    # (`select.frames`), and a fifth of the day is held out; four times as many frames leave enough to choose
+    # from.
     read_sweeps: Annotated[int, Field(gt=0)] | Literal["all"] = 400
-    max_frames: Annotated[int, Field(gt=0)] | None = None  # of those read, evenly spread; None = all
+    max_frames: Annotated[int, Field(gt=0)] | None = None  # of the sweeps read, evenly spread; None = all
     min_lidar_points: Annotated[int, Field(ge=0)] = 500
     min_radar_points: Annotated[int, Field(ge=0)] = 1
     max_lidar_range_m: Positive = 120.0
@@ -64,7 +67,7 @@ class IngestConfig(Section):
 
     @property
     def wider(self) -> IngestConfig:
-        """The same, with twice the sweeps."""
+        """Copy with twice as many sweeps to read."""
         return self.model_copy(
             update={"read_sweeps": "all" if self.read_sweeps == "all" else 2 * self.read_sweeps}
         )
@@ -73,7 +76,8 @@ class IngestConfig(Section):
 class PerceiveConfig(Section):
     """Feature extraction."""
 
-    label_scale: Annotated[float, Field(ge=0.05, le=1)] = 0.5  # below it nothing is left of a car's image
+    # at smaller scales the image of a car disappears
+    label_scale: Annotated[float, Field(ge=0.05, le=1)] = 0.5
     voxel_m: Positive = 0.25
     cluster_eps_m: Positive = 0.7
     cluster_min_points: Annotated[int, Field(gt=1)] = 8
@@ -93,7 +97,7 @@ class PerceiveConfig(Section):
 
 
 class SelectConfig(Section):
-    """The paper's frame selection, section 4.5.1, and how many frames a calibration takes."""
+    """Frame selection of section 4.5.1 of the paper, and the number of frames of a calibration."""
 
     frames: Annotated[int, Field(gt=0)] = 100
     holdout_fraction: Annotated[float, Field(gt=0, lt=1)] = 0.2
@@ -104,7 +108,7 @@ class SelectConfig(Section):
 
 
 class TriggerConfig(Section):
-    """The paper's triggers, section 4.5.2."""
+    """Triggers of section 4.5.2 of the paper."""
 
     when: Literal["always", "triggered"] = "always"
     lidar_outside_fraction: Fraction = 0.01
@@ -114,20 +118,21 @@ class TriggerConfig(Section):
 
 
 class SolveConfig(Section):
-    """Search range and effort; `paper_*` steer the paper's DE and Nelder-Mead."""
+    """Search range and effort; `paper_*` are for the paper's differential evolution and Nelder-Mead."""
 
     search_rotation_deg: Positive = 6.0
     search_translation_m: Positive = 0.3
     paper_population: Annotated[int, Field(gt=3)] = 90
     paper_generations: Annotated[int, Field(gt=0)] = 60
-    # of joint-optimisation, in equation 2: each pair's loss over its pairwise minimum, or to the letter
+    # Method joint-optimisation, equation 2: divide each pair's loss by its pairwise minimum, or use the
+    # equation exactly as printed.
     paper_loss_scale: Literal["pairwise_minimum", "none"] = "pairwise_minimum"
     bootstrap_blocks: Annotated[int, Field(gt=1)] = 24
     time_offset_sigma_s: Positive = 0.05
     terms: tuple[Term, ...] = (
-        TERMS  # of method joint (`doppler`: of networks too); leave some out to see what they are worth
+        TERMS  # of method joint (`doppler`: of networks too); leave terms out to see how much they contribute
     )
-    polish: bool = False  # of the SSL methods: let method joint finish from the network's answer
+    polish: bool = False  # of the SSL methods: method joint refines the network's answer
     seed: Annotated[int, Field(ge=0)] = 0
 
     @model_validator(mode="after")
@@ -135,37 +140,37 @@ class SolveConfig(Section):
         if len(set(self.terms)) < len(self.terms):
             raise ValueError(f"terms names one twice: {', '.join(self.terms)}")
         if not {"edges", "reflectivity"} & set(self.terms):
-            raise ValueError(
-                "terms needs edges or reflectivity: nothing else brings camera and lidar together"
-            )
+            raise ValueError("terms needs edges or reflectivity: no other term connects camera and lidar")
         if not {"static", "moving"} & set(self.terms):
-            raise ValueError("terms needs static or moving: nothing else brings lidar and radar together")
+            raise ValueError("terms needs static or moving: no other term connects lidar and radar")
         return self
 
 
 class PrepareConfig(Section):
-    """Training data: the camera's grid, how much of each cloud, and how frames are split."""
+    """Training data: grid of the camera, points per cloud, and how frames are split."""
 
     grid_step_deg: Annotated[float, Field(ge=0.1, le=0.5)] = 0.4
-    # A lidar's 60 x 24 deg, 8 deg about it for the guess to be wrong, 6 deg to turn the camera by in training.
+    # A lidar's 60 x 24 deg, plus 8 deg on each side for an error of the guess, plus 6 deg by which training
+    # turns the camera.
     grid_width_deg: Annotated[float, Field(ge=20, le=160)] = 89.6
     grid_height_deg: Annotated[float, Field(ge=10, le=90)] = 51.2
     lidar_points: Annotated[int, Field(ge=256)] = 8192
     cluster_points: Annotated[int, Field(ge=64)] = 1024
     edge_points: Annotated[int, Field(ge=64)] = 768
     max_frames: Annotated[int, Field(gt=0)] | None = None  # per vehicle-day, evenly spread; None = all
-    # A frame that the vehicle hardly moved for says nothing new.
+    # Shortest distance driven between frames: a frame from the same place adds nothing new.
     min_step_m: Annotated[float, Field(ge=0)] = 0.5
-    # What no two sides share; in fleet.toml also one word: "vehicle", "day", "place" or "all".
+    # What training, validation and test must not share; in fleet.toml also one word: "vehicle", "day",
+    # "place", "all".
     split_by: tuple[Literal["vehicle", "day", "place"], ...] = ("vehicle", "day", "place")
     val_fraction: Annotated[float, Field(ge=0, le=0.4)] = 0.1
     test_fraction: Annotated[float, Field(ge=0, le=0.4)] = 0.1
     positions: Literal["local", "map"] = "local"  # map: odometry of all logs is in one frame (GNSS, a map)
-    place_m: Positive = 100.0  # side of a place's cell
-    place_s: Positive = 20.0  # stretch of a drive that counts as a place where the log has no positions
-    # Frames of one drive this near to another split are left out.
+    place_m: Positive = 100.0  # side of the square cell that counts as one place
+    place_s: Positive = 20.0  # part of a drive that counts as one place if the log has no positions
+    # Frames of one drive that are closer in time than this to another split are left out.
     guard_s: Annotated[float, Field(ge=0)] = 3.0
-    # Of 256 fingerprint bits: fewer differ = same view.
+    # Two views are the same if fewer than this many of their 256 fingerprint bits differ.
     duplicate_bits: Annotated[int, Field(ge=0, le=128)] = 16
     seed: Annotated[int, Field(ge=0)] = 0
 
@@ -186,85 +191,92 @@ class PrepareConfig(Section):
 
     @property
     def grid_shape(self) -> tuple[int, int]:
-        """(height, width) in cells, whole multiples of 16: networks halve them four times."""
+        """(height, width) in cells, multiples of 16: networks halve them four times."""
         sides = (self.grid_height_deg, self.grid_width_deg)
         height, width = (16 * max(1, round(side / self.grid_step_deg / 16)) for side in sides)
         return height, width
 
 
 class VerifyConfig(Section):
-    """What an accepted calibration must be good for, and from where on a check of a pair fails.
+    """Accuracy that an accepted calibration must have, and thresholds of the checks of a pair.
 
-    Limits are of the errors of azimuth and elevation at targets 15 to 40 m away. The thresholds below them were chosen
-    on simulated days (seeds 140 to 145, demo and paper rig, 40 frames; 24 good days and 28 with faults), and on the
-    real day for the question what methods that are 0.3 to 0.8 deg off look like. `prior_sigmas` are sigmas of the
-    prior, other `sigmas` those of the quantity itself; `z` is a one-sided normal deviate of the paired test on
-    held-out frames.
+    Limits apply to the errors of azimuth and elevation at targets 15 to 40 m away. The thresholds below the
+    limits were chosen on simulated days (seeds 140 to 145, demo and paper rig, 40 frames; 24 good days and 28
+    with faults), and on one real day, with results of methods that are wrong by 0.3 to 0.8 deg.
+    `prior_sigmas` are sigmas of the prior, other `sigmas` are sigmas of the quantity itself; `z` is a
+    one-sided normal deviate of the paired test on held-out frames.
     """
 
     camera_lidar_limit_deg: Positive = 0.2
     radar_limit_deg: Positive = 0.4
-    # Of a radar's elevation, the coarser of its two angles: aperture is scarce upwards.
+    # For the elevation of a radar, which is less accurate than its azimuth: its antenna is small in height.
     radar_elevation_limit_deg: Positive = 0.6
-    # Probability that an error stays within the limit, before a direction is certified.
+    # Smallest probability that an error is within its limit, for a direction to be certified.
     confidence: Annotated[float, Field(gt=0.5, lt=1)] = 0.995
-    # A move this large happens once in 16,000 days if the prior's sigma is right.
+    # Largest move from the prior. It is exceeded once in 16,000 days if the prior's sigma is right.
     max_move_prior_sigmas: Positive = 4.0
-    # z above which held-out frames align worse than at the prior. One-sided 1 %: a right result near a good prior
-    # aligns worse by chance.
+    # The check fails if held-out frames align worse than at the prior by more than this z. One-sided 1 %: a
+    # right result near a good prior can align worse by chance.
     worse_alignment_z: Positive = 2.33
-    # -z from which they align better. One-sided 16 %: short days hold out some ten frames, and 5 % would hold right
-    # results that moved by 10 cm.
+    # Held-out frames align better than at the prior from this z on. One-sided 16 %: short days hold out about
+    # ten frames, and 5 % would hold right results that moved by 10 cm.
     better_alignment_z: Positive = 1.0
-    # A result within so many of its sigmas of the prior need not align better; the largest of six degrees of freedom.
+    # A result within this many of its sigmas of the prior need not align better; for the largest of six
+    # degrees of freedom.
     prior_agreement_sigmas: Positive = 4.0
-    # Frames of the fit: with fewer the record is refused, camera-lidar of 5 or more held. Selection refuses a pair with
-    # fewer before that.
+    # Fewest frames of the fit; with fewer the record is refused (camera-lidar with 5 or more: held). Selection
+    # refuses a pair with even fewer before that.
     min_fit_frames: Annotated[int, Field(ge=8)] = 8
-    # Frames, and blocks of frames that share a scene, without which held-out data decide nothing.
+    # Fewest held-out frames, and blocks of frames that share a scene; with fewer, held-out data decide
+    # nothing.
     min_held_out_frames: Annotated[int, Field(ge=1)] = 3
     min_held_out_blocks: Annotated[int, Field(ge=2)] = 3
-    # Held-out frames that would move the result by more of that move's sigmas contradict it.
+    # Held-out frames contradict a result if they would move it by more than this many sigmas of that move.
     held_out_contradiction_sigmas: Positive = 3.0
-    # An open loop of three independent estimates is an error of one of them beyond so many sigmas of the loop.
+    # If three independent estimates form a loop that stays open by more than this many of its sigmas, one is
+    # wrong.
     max_loop_sigmas: Positive = 3.0
-    # Camera-lidar was solved along the prior's heading: beyond so many of its sigmas that heading was wrong ...
+    # Camera-lidar is solved with the heading of the prior. That heading was wrong if it changed by more than
+    # this many of its sigmas ...
     heading_change_prior_sigmas: Positive = 3.0
-    # ... and the record is held where this costs more than this share of `camera_lidar_limit_deg`.
+    # ... and the record is held if the effect exceeds this share of `camera_lidar_limit_deg`.
     max_heading_error_share: Fraction = 0.25
 
 
 class LearnConfig(Section):
-    """Networks of the methods `joint-ssl` and `pairwise-ssl`; left out: those that come with Boresight."""
+    """Networks of the methods `joint-ssl` and `pairwise-ssl`; default: the networks of the package."""
 
     model: str | None = None  # ONNX file of the joint network, relative to fleet.toml
     pairwise_models: dict[Literal["camera_lidar", "camera_radar", "lidar_radar"], str] = Field(
         default_factory=dict
     )
-    iterations: Annotated[int, Field(ge=1, le=5)] = 3  # passes per frame, each rendered at the one before
+    # passes per frame; each renders at the result of the previous pass
+    iterations: Annotated[int, Field(ge=1, le=5)] = 3
     threads: Annotated[int, Field(ge=1)] = 1
-    # What a network that takes classes is shown of a frame with labels: both, its image alone, or its classes alone.
+    # Input of a network that takes classes, for frames with labels: image and classes, image only, or classes
+    # only.
     camera: Literal["both", "image", "classes"] = "both"
 
 
 class ReportConfig(Section):
-    """What pages show."""
+    """Content of report pages."""
 
-    # "hidden": people and vehicles in mosaic, as far as perception found them, faces and number plates with them.
+    # "hidden": pixelates people and vehicles that perception found, and so their faces and number plates.
     road_users: Literal["shown", "hidden"] = "shown"
 
 
 class AuditConfig(Section):
-    """Control charts."""
+    """Control charts and drift audit."""
 
     method: MethodName = "joint"
     false_alarms_per_1000_vehicle_days: Positive = 1.0
-    baseline_days: Annotated[int, Field(gt=0)] = 2  # a chart says nothing until it has one day more than this
-    # Held days weigh less: held-out frames did not confirm them.
+    # a chart gives no verdict until it has one day more than this
+    baseline_days: Annotated[int, Field(gt=0)] = 2
+    # Sigmas of held days are multiplied by this, because held-out frames did not confirm these days.
     held_sigma_factor: Annotated[float, Field(ge=1)] = 2.0
-    # First accepted days that tonight is held against, for good.
+    # Tonight's state is compared with this many first accepted days; these reference days never change.
     reference_days: Annotated[int, Field(gt=1)] = 10
-    # Audited days where the command names no first day.
+    # Number of days to audit if the command names no first day.
     window_days: Annotated[int, Field(gt=2, le=3660)] = 28
     camera_lidar_limit_deg: Positive = 0.1
     radar_limit_deg: Positive = 0.25

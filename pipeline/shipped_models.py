@@ -1,4 +1,4 @@
-"""The networks that ship inside the package, each with its card, and whether files are what their cards speak of."""
+"""The networks in the package, each with a model card, and a check of each file against its card."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ __all__ = ["PREFIX", "REQUIRED", "SHIPPED", "ShippedModel", "shipped_manifest", 
 SHIPPED = Path(__file__).parent / "learn" / "models"
 PREFIX = "shipped:"  # in fleet.toml: `model = "shipped:radar_drivable"`
 
-# What a card must say before its model ships.
+# Keys that the card of a shipped model must have.
 REQUIRED = ("purpose", "license", "bytes", "sha256", "command", "data", "limits")
 
 
 @dataclass(frozen=True)
 class ShippedModel:
-    """One model file as its card describes it.
+    """One model file and its card.
 
     Args:
         file: the .onnx file.
-        card: what the .json beside it says; empty where it is missing or no JSON object.
-        problems: what does not hold, in sentences; empty = the file is the one that the card speaks of.
+        card: content of the .json file beside it; empty if that is missing or holds no JSON object.
+        problems: differences between file and card, in sentences; empty = none.
     """
 
     file: Path
@@ -33,32 +33,32 @@ class ShippedModel:
 
     @property
     def name(self) -> str:
-        """What the model is called: its file without suffix."""
+        """Name of the model: its file name without suffix."""
         return self.file.stem
 
 
 def shipped_manifest(name: str) -> Path:
-    """The manifest that fleet.toml names by `shipped:NAME`."""
+    """Manifest of the network that fleet.toml names as `shipped:NAME`."""
     return SHIPPED / f"{name.removeprefix(PREFIX)}.toml"
 
 
 def shipped_models(folder: Path | None = None) -> list[ShippedModel]:
-    """Every model file under a folder (default: this package), by name, compared with its card."""
+    """Model files under a folder (default: this package), sorted by name, compared with their cards."""
     root = folder or Path(__file__).parent
     return [_compared(file) for file in sorted(root.rglob("*.onnx"), key=lambda f: f.name)]
 
 
 def _compared(file: Path) -> ShippedModel:
-    """Card and problems of one file."""
+    """Compare one file with its card."""
     try:
         card = json.loads(file.with_suffix(".json").read_text())
     except (OSError, ValueError) as err:
         return ShippedModel(file, {}, (f"no readable card {file.stem}.json: {err}",))
     if not isinstance(card, dict):
         return ShippedModel(file, {}, (f"the card {file.stem}.json holds no JSON object",))
-    problems = [f"the card does not say: {key}" for key in REQUIRED if not card.get(key)]
+    problems = [f"the card lacks the key {key}" for key in REQUIRED if not card.get(key)]
     if not file.with_suffix(".md").exists():
-        problems.append(f"no card for people, {file.stem}.md")
+        problems.append(f"no readable card for users, {file.stem}.md")
     digest = hashlib.sha256(file.read_bytes()).hexdigest()
     if card.get("sha256") not in (None, digest):
         problems.append(f"sha256 is {digest}, the card says {card['sha256']}: another file")

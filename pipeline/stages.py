@@ -1,6 +1,6 @@
-"""The table of contents: what each stage reads and writes, and where it is.
+"""The stages: tables that each one reads and writes, and its function.
 
-Stages know nothing of each other; they meet in the tables. Whoever runs them goes through this list, and a
+Stages do not import each other; they exchange data through tables. Runners iterate over this list, and a
 stage's module is imported when it runs.
 """
 

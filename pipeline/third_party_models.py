@@ -1,4 +1,4 @@
-"""Models of other people that `boresight models fetch` downloads: address, size, sha256, licence and manifest."""
+"""Third-party models that `boresight models fetch` downloads: address, size, sha256, licence and manifest."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class ThirdPartyModel:
         licence: its name, and what it forbids.
         licence_url: its text.
         interface: sections `[input]` and `[output]` of the manifest.
-        tried: what of it was tried here.
+        tried: which parts of this entry were tested.
     """
 
     name: str
@@ -87,7 +87,7 @@ label_set = "coco"
 
 
 def named(names: Sequence[str]) -> list[ThirdPartyModel]:
-    """Models of the catalogue by name, all for no name.
+    """Models of the catalogue by name; all models if no name is given.
 
     Raises:
         ConfigError: no such model.
@@ -100,7 +100,7 @@ def named(names: Sequence[str]) -> list[ThirdPartyModel]:
 
 
 def manifest_text(model: ThirdPartyModel) -> str:
-    """The manifest that stands beside the file."""
+    """Text of the manifest of a downloaded model."""
     return (
         f"# From {model.url}\n# Licence: {model.licence} ({model.licence_url})\n"
         f'path = "{model.name}.onnx"\nsha256 = "{model.sha256}"\ntask = "{model.task}"\n\n{model.interface}'
@@ -108,7 +108,7 @@ def manifest_text(model: ThirdPartyModel) -> str:
 
 
 def semantics_line(folder: str) -> str:
-    """The line of fleet.toml that names the catalogue's models in a folder, relative to fleet.toml."""
+    """Line of fleet.toml that selects the catalogue's models in a folder (relative to fleet.toml)."""
     by_task = {model.task: f"{folder}/{model.name}.toml" for model in CATALOGUE}
     segmenter, detector = by_task["segment"], by_task["detect"]
     return f'semantics = {{ source = "onnx", segmenter = "{segmenter}", detector = "{detector}" }}'

@@ -1,4 +1,4 @@
-"""What a stage is asked (`Task`), what it answers (`Work`), and what it counts while it works (`Run`)."""
+"""Input of a stage (`Task`), its answer (`Work`), and the counts of a run (`Run`)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["NothingUsable", "Records", "Run", "Task", "Told", "Window", "Work"]
 
 @dataclass(frozen=True)
 class Window:
-    """Days that a stage of the whole fleet looks at, both included; None = as far as the records go."""
+    """First and last day of a fleet stage, both included; None = no limit."""
 
     first: str | None = None
     last: str | None = None
@@ -32,19 +32,20 @@ class Task:
     """One call of a stage.
 
     Args:
-        fleet: the whole configuration, which knows its file.
-        lake: where the tables are.
-        of: a vehicle-day, or the window of days of a stage of the whole fleet.
+        fleet: the whole configuration, including the path of its file.
+        lake: location of the tables.
+        of: a vehicle-day, or the window of days for a stage of the whole fleet.
         method: of calibration records; None = the stage's default.
-        seed: of everything random; None = `solve.seed`.
-        perturb: of calibrate: exact angle [deg] and shift [m] by which the prior is moved on purpose.
-        logs: of ingest: files, ROS 2 bag folders or objects of a bucket, of the day, in any order.
-        given: what one stage alone is given; its function says what.
-        progress: told how far it is.
+        seed: for all random numbers; None = `solve.seed`.
+        perturb: calibrate only: rotation [deg] and shift [m] that are added to the prior on purpose, exact in
+            size.
+        logs: ingest only: files, ROS 2 bag folders or bucket objects of the day, in any order.
+        given: input of one particular stage; documented at its function.
+        progress: called with the progress of the stage.
         inputs: manifests of the tables that the stage reads, by name; the runner fills them in.
-        commit: False where who gave the task commits the outcome's records, together with those of other tasks.
-        recorded: what the lake has of the vehicle-day's records, where the giver of the task has read it already.
-        before: what became of the vehicle-day's stages before: a refusal of the same inputs is not worked out again.
+        commit: False if the caller commits the outcome's records, together with those of other tasks.
+        recorded: records of the vehicle-day in the lake, if the caller has read them already.
+        before: earlier outcomes of the vehicle-day: a refusal of the same inputs is not computed again.
     """
 
     fleet: FleetConfig
@@ -63,14 +64,14 @@ class Task:
 
     @property
     def partition(self) -> Partition:
-        """The vehicle-day of a stage that works on one."""
+        """The vehicle-day; only for stages that work on one."""
         assert isinstance(self.of, Partition), "only stages of the whole fleet are given a window"
         return self.of
 
 
 @dataclass(frozen=True)
 class Told:
-    """What an outcome says of record rows: how many of which status, what was left out, why."""
+    """Summary of record rows for an outcome: counts by status, counts of rejections, and the reason."""
 
     kept: dict[str, int]
     rejected: dict[str, int] = field(default_factory=dict)
@@ -81,20 +82,20 @@ class Told:
 
 @dataclass
 class Run:
-    """One run of a stage: its work key and inputs, and what it counts for the manifest and the outcome."""
+    """One run of a stage: its work key, its inputs, and its counts for the manifest and the outcome."""
 
     work_key: str
     inputs: tuple[str, ...]
     progress: Progress
     kept: Counter[str] = field(default_factory=Counter)
     rejected: Counter[str] = field(default_factory=Counter)
-    extra: dict[str, Any] = field(default_factory=dict)  # into the manifest as it is
-    remarks: str = ""  # what the outcome says although the work is done
+    extra: dict[str, Any] = field(default_factory=dict)  # copied to the manifest
+    remarks: str = ""  # text for the outcome of work that is done
 
 
 @dataclass(frozen=True)
 class Records:
-    """Rows of a record table that are written together; None = under the task's own key, inputs and partition."""
+    """Rows of a record table that are written together; None = key, inputs and partition of the task."""
 
     rows: Sequence[Any]
     partition: Partition | None = None
@@ -104,19 +105,17 @@ class Records:
 
 @dataclass(frozen=True)
 class Work:
-    """What a stage would do for a task. The runner asks for `rows` only where the work is not done already.
+    """Work of a stage for a task. The runner calls `rows` only if the work is not done already.
 
     Args:
-        settings: all of the configuration that the answer depends on, for the work key.
-        rows: the stage itself: yields, while it is asked, rows of the table that the stage writes (`Records` of a
-            record table, paths of files where it writes no table). It raises `NothingUsable` where nothing shall
-            be written.
-        inputs: work keys of what is read; None = those of all tables of `task.inputs`.
-        nothing: what the outcome says of a partition without a row, before the counted reasons.
-        tell: what the outcome says of record rows.
-        wider: settings under which the partition would hold all of this one and more: where it was made under one of
-            them, nothing is to do.
-        again: True where work that is recorded already is recorded once more, so that it becomes current.
+        settings: all parts of the configuration that affect the result; they enter the work key.
+        rows: the stage itself, a generator of rows of its table (`Records` for a record table, paths of files
+            if it writes no table). It raises `NothingUsable` if nothing can be written.
+        inputs: work keys of the inputs; None = those of all tables of `task.inputs`.
+        nothing: first words of the reason for a partition without rows; the counted rejections follow.
+        tell: summarises record rows for the outcome.
+        wider: settings that produce a superset of this work: a partition made with one of them is kept.
+        again: True if recorded work is recorded again, so that it becomes the current record.
     """
 
     settings: tuple[BaseModel | dict[str, Any], ...]
@@ -129,11 +128,11 @@ class Work:
 
 
 class NothingUsable(Exception):  # noqa: N818 - an outcome, not an error: the day is refused with this reason
-    """Nothing of the input can be used: nothing is written, and what was written before stays.
+    """No part of the input is usable: nothing is written, and existing tables stay.
 
     Args:
         reason: in words.
-        faults: that it states, keys of `schemas.faults.FAULTS`.
+        faults: faults named in the reason, keys of `schemas.faults.FAULTS`.
     """
 
     def __init__(self, reason: str, *faults: str) -> None:
