@@ -14,7 +14,8 @@ from pipeline.errors import TooMuchMemoryError
 
 __all__ = ["MODEL_THREADS", "at_most", "usable_cpus"]
 
-# Set for the workers of a night: threads of one model on the CPU, so that no core is idle where days are few.
+# Number of CPU threads for one model; set for the workers of a night, so that no core is idle if days are
+# few.
 MODEL_THREADS: Final = "BORESIGHT_MODEL_THREADS"
 _STATUS = Path("/proc/self/status")
 # Messages of libraries that raise no exception of their own when an allocation fails.
@@ -62,5 +63,5 @@ def _is_refused(err: Exception) -> bool:
 
 
 def usable_cpus() -> int:
-    """CPUs that this process may use; containers often give fewer than the machine has."""
+    """Number of CPUs that this process may use; in containers often fewer than the machine has."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

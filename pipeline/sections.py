@@ -87,12 +87,12 @@ class PerceiveConfig(Section):
     radar_cluster_eps_m: Positive = 1.8
     static_gate_mps: Positive = 0.45
     detection_min_score: Fraction = 0.3
-    # Where models run and how many images they are shown at once: no part of the work key.
+    # ONNX Runtime providers in order of preference, and images per run of a model; not in the work key.
     providers: tuple[Annotated[str, Field(pattern=r"^[A-Za-z]+ExecutionProvider$")], ...] = ()
     batch: Annotated[int, Field(ge=1, le=64)] = 1
 
     def keyed(self) -> dict[str, Any]:
-        """What features depend on, for the work key."""
+        """Settings that features depend on, for the work key."""
         return self.model_dump(mode="json", exclude={"providers", "batch"})
 
 

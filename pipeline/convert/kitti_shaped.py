@@ -181,7 +181,7 @@ def _lines(path: Path) -> dict[str, list[float]]:
             try:
                 found[name.strip()] = [float(word) for word in numbers.split()]
             except ValueError as err:
-                raise ConfigError(str(path), name.strip(), f"holds what is no number: {err}") from err
+                raise ConfigError(str(path), name.strip(), f"holds what is not a number: {err}") from err
     return found
 
 

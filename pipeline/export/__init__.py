@@ -1,1 +1,4 @@
-"""A calibration in the formats that cars, simulators and viewers read, and back; and two calibrations compared."""
+"""Export of calibrations to formats of cars, simulators and viewers; import.
+
+Comparison of two calibrations.
+"""

@@ -1,8 +1,9 @@
 """Apollo's extrinsics: a file per child frame, and the camera's intrinsics as a CameraInfo.
 
-`transform` takes coordinates in child_frame_id to header.frame_id; cameras are optical frames.
+`transform` maps coordinates from child_frame_id to header.frame_id; camera frames are optical frames.
 
-Source: ApolloAuto/apollo, modules/calibration/data and modules/transform (extrinsic_file in static_transform_conf).
+Source: ApolloAuto/apollo, modules/calibration/data and modules/transform (extrinsic_file in
+static_transform_conf).
 """
 
 from __future__ import annotations
@@ -76,7 +77,7 @@ def _tree(files: Files) -> TransformTree:
     for file, content in files.items():
         held = load_yaml(file, content)
         if isinstance(held, dict) and "transform" not in held and "K" in held:
-            continue  # intrinsics lie beside the extrinsics
+            continue  # camera intrinsics, stored beside the extrinsics
         parent, child = field_of(file, held, "header", "frame_id"), field_of(file, held, "child_frame_id")
         q = [number_of(file, held, "transform", "rotation", n) for n in _ROTATION]
         t = [number_of(file, held, "transform", "translation", n) for n in _TRANSLATION]

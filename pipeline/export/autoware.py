@@ -1,9 +1,11 @@
-"""Autoware's sensor kit: sensor_kit_calibration.yaml, sensors_calibration.yaml, and a xacro that loads the first.
+"""Autoware's sensor kit: sensor_kit_calibration.yaml, sensors_calibration.yaml, and a xacro.
 
-Children of the kit are links: a camera's link looks along x, its optics hang below it in the camera's own xacro, and a
-lidar's `*_base_link` may lie apart from the frame of its points by what its description says.
+Children of the kit are links: a camera's link looks along x; the camera's own xacro adds the optical frame
+below it. A lidar's `*_base_link` may differ from the frame of its points, as given in the lidar's
+description.
 
-Source: autowarefoundation/sample_sensor_kit_launch and tier4/aip_launcher (config/*.yaml, urdf/sensor_kit.xacro).
+Source: autowarefoundation/sample_sensor_kit_launch and tier4/aip_launcher (config/*.yaml,
+urdf/sensor_kit.xacro).
 """
 
 from __future__ import annotations
@@ -36,13 +38,15 @@ _KIT_FILE, _CAR_FILE, _XACRO_FILE = (
 
 
 def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
-    """The kit sits at the reference lidar unless the base frame is the kit itself."""
+    """Files of a calibration; the kit is placed at the reference lidar unless the base frame is the kit."""
     names, T_base_lidar = calibration.names, calibration.T_base
     lidar = names.of(calibration.reference.name)
     is_kit_known = T_base_lidar is not None and names.base == _KIT
     T_kit_lidar = T_base_lidar if is_kit_known and T_base_lidar is not None else np.eye(4)
     poses = {lidar: T_kit_lidar} | _links(calibration, T_kit_lidar)
-    comments = comment_lines(calibration, "the camera's link, not its optical frame: x forward, y left, z up")
+    comments = comment_lines(
+        calibration, "pose of the camera's link (x forward, y left, z up), not of its optical frame"
+    )
     if not is_kit_known:
         comments.append(f"{_KIT} sits at {lidar}")
     children = {child: _entry(T) for child, T in poses.items()}
@@ -56,7 +60,7 @@ def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
 
 
 def _links(calibration: ExportedCalibration, T_kit_lidar: np.ndarray) -> dict[str, np.ndarray]:
-    """Poses of cameras' links and of the other sensors in the kit, those of them that the calibration has."""
+    """Poses in the kit of camera links and of the other sensors, for the sensors in the calibration."""
     poses, reference = {}, calibration.reference.name
     for sensor in calibration.sensors:
         found = None if sensor.name == reference else calibration.between(reference, sensor.name)
@@ -68,12 +72,16 @@ def _links(calibration: ExportedCalibration, T_kit_lidar: np.ndarray) -> dict[st
 
 
 def _update(file: str, content: bytes, calibration: ExportedCalibration) -> tuple[bytes, list[str]]:
-    """A kit's own sensor_kit_calibration.yaml with new numbers for its sensors, and the frames that have them.
+    """Write new poses into an existing sensor_kit_calibration.yaml.
 
-    The reference lidar keeps its place in the kit; entries of other sensors, their order and all comments stay.
+    The reference lidar keeps its pose in the kit; entries of other sensors, their order and all comments
+    stay.
+
+    Returns:
+        The file's new content, and the frames with new poses.
 
     Raises:
-        ConfigError: the file is no kit with that lidar, or has none of the other sensors.
+        ConfigError: the file is not a kit with that lidar, or has none of the other sensors.
     """
     names, changed = calibration.names, list[str]()
     lidar = names.of(calibration.reference.name)
@@ -100,7 +108,7 @@ def _entry(T: np.ndarray) -> dict[str, float]:
 
 
 def _xacro(children: list[str]) -> ET.Element:
-    """`sensor_kit_macro` as Autoware's vehicles include it, of links and joints alone."""
+    """`sensor_kit_macro`, which Autoware's vehicles include: links and joints only."""
     robot = ET.Element("robot", {"xmlns:xacro": "http://ros.org/wiki/xacro"})
     macro = ET.SubElement(
         robot, "xacro:macro", name="sensor_kit_macro", params="parent x y z roll pitch yaw config_dir:=."
@@ -130,13 +138,13 @@ def _tree(files: Files) -> TransformTree:
     tree = TransformTree()
     for file, content in files.items():
         if file.endswith(".xacro"):
-            continue  # it loads the numbers from beside it
+            continue  # it loads the YAML file beside it
         held: Any = load_yaml(file, content)
         if not isinstance(held, dict):
-            raise ConfigError(file, "", "is no map of parent frames")
+            raise ConfigError(file, "", "is not a map of parent frames")
         for parent, children in held.items():
             if not isinstance(children, dict):
-                raise ConfigError(file, str(parent), "is no map of child frames")
+                raise ConfigError(file, str(parent), "is not a map of child frames")
             for child in children:
                 names = require_frames(file, parent, child)
                 values = np.array([number_of(file, held, parent, child, name) for name in _FIELDS])

@@ -1,4 +1,4 @@
-"""What every format is written from, and what reading one gives back."""
+"""The calibration that every format is written from, and its poses."""
 
 from __future__ import annotations
 
@@ -33,26 +33,26 @@ __all__ = [
     "written_pairs",
 ]
 
-# Statuses of a pair that may be loaded: of a record, and of a vehicle's state.
+# Statuses of a pair that may be loaded, of records and of states.
 USABLE = ("accepted", "current")
 _KINDS = ("camera", "lidar", "radar", "base")
-_REFERENCES = ("lidar", "radar", "camera")  # kinds that poses refer to, the first that there is
-# Of a ROS frame; also what needs no quoting in XML, YAML, a shell or a xacro expression.
+_REFERENCES = ("lidar", "radar", "camera")  # sensor kinds in order of preference as reference of the poses
+# Valid as a ROS frame, and without quotes in XML, YAML, a shell and a xacro expression.
 _FRAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_./-]*")
 
 
 def is_frame(name: str) -> bool:
-    """True for a name that a frame can have in every format."""
+    """Whether a name is valid for a frame in every format."""
     return _FRAME.fullmatch(name) is not None
 
 
 @dataclass(frozen=True)
 class FrameNames:
-    """What the sensors' frames are called where the file goes; `base` is used where its pose is known.
+    """Frame names of the sensors in the exported file; `base` is used if its pose is known.
 
     Args:
-        camera, lidar, radar, base: of sensors of these names.
-        others: by name of any other sensor; one that no name is given is called as itself.
+        camera, lidar, radar, base: frames of the sensors of these names.
+        others: frames by sensor name; a sensor that is not listed uses its name as its frame.
     """
 
     camera: str = "camera"
@@ -65,50 +65,52 @@ class FrameNames:
         values = {sensor: self.of(sensor) for sensor in (*_KINDS, *self.others)}
         for option, name in values.items():
             if not is_frame(name):
-                problem = f"{name!r} is no frame name: letters, digits and _ - . / only, no / in front"
+                problem = (
+                    f"{name!r} is not a valid frame name: letters, digits and _ - . / only, no / in front"
+                )
                 raise ConfigError("command line", f"{option}-frame", problem)
-        # A rig whose sensors have names of their own has none that the defaults are for.
+        # In a rig whose sensors have other names, the defaults apply to none.
         require_different([values[sensor] for sensor in self.others or _KINDS])
 
     @classmethod
     def named(cls, frames: Mapping[str, str]) -> FrameNames:
-        """Names by sensor.
+        """Frame names from a mapping by sensor.
 
         Raises:
-            ConfigError: no names of frames.
+            ConfigError: invalid frame names.
         """
         known = {sensor: name for sensor, name in frames.items() if sensor in _KINDS}
         return cls(**known, others={s: n for s, n in frames.items() if s not in _KINDS})
 
     def of(self, sensor: str) -> str:
-        """Name of the frame of a sensor, or of base."""
+        """Frame name of a sensor or of base."""
         known = {"camera": self.camera, "lidar": self.lidar, "radar": self.radar, "base": self.base}
         return {**known, **self.others}.get(sensor, sensor)
 
 
 def require_different(names: Sequence[str]) -> None:
-    """Raise ConfigError for two frames of one name."""
+    """Raise ConfigError if two frames have the same name."""
     if len(set(names)) < len(names):
         raise ConfigError("command line", "frame names", f"must differ: {', '.join(names)}")
 
 
 @dataclass(frozen=True, eq=False)
 class ExportedPair:
-    """One edge: T_parent_child, how sure it is, and where it comes from.
+    """One edge: T_parent_child, its uncertainty and its origin.
 
     Args:
-        pair: the edge in words: camera_lidar, camera_radar, lidar_radar, or names of sensors, as front-top.
+        pair: name of the edge: camera_lidar, camera_radar, lidar_radar, or sensor names such as front-top.
         T: T_parent_child.
-        covariance: 6x6 of the left perturbation, rx ry rz tx ty tz in parent axes [rad, m]; None where nobody says.
+        covariance: 6x6 of the left perturbation, rx ry rz tx ty tz in parent axes [rad, m]; None if unknown.
         status: of the record or state.
         reason: in words.
-        observable: per DoF, whether the data determined it; the others keep the prior.
-        certified: of azimuth and elevation, those within their limit.
-        common: the part of the covariance that all days of a vehicle err by alike; None where nobody says.
-        details: what else is known of its origin, in plain values (work key, days, time offset, notes).
-        unchecked: by DoF, how many sigmas it lies from the prior where that is far and nothing checks it.
-        resting: those of `unchecked` that were put back to the prior.
-        of: the edge; None = the one that its words say.
+        observable: per DoF, whether the data determined it; the other DoF keep the prior.
+        certified: whether azimuth and elevation are within their limits.
+        common: part of the covariance that is common to all days of a vehicle; None if unknown.
+        details: more about its origin, in plain values (work key, days, time offset, notes).
+        unchecked: distance from the prior in sigmas, of DoF that are far from it and that no check covers.
+        resting: DoF of `unchecked` that were reset to the prior.
+        of: the edge; None = taken from the name `pair`.
     """
 
     pair: str
@@ -126,12 +128,12 @@ class ExportedPair:
 
     @property
     def edge(self) -> Edge:
-        """The edge; of three sensors that are called by their kinds where it is not given."""
+        """The edge; if not given, the pair name is read as sensor kinds."""
         return EDGE_OF_PAIR[self.pair] if self.of is None else self.of
 
     @property
     def identifier(self) -> str:
-        """Names of both sensors as one word that every language takes for a name, as in T_front_top."""
+        """Both sensor names as one identifier that is valid in every language, as in T_front_top."""
         return f"{self.edge.parent.name}_{self.edge.child.name}"
 
     @property
@@ -142,7 +144,10 @@ class ExportedPair:
     def resting_at(
         self, T_prior: Float[np.ndarray, "4 4"], prior_covariance: Float[np.ndarray, "6 6"]
     ) -> ExportedPair:
-        """The pair with what nothing checks back at the prior, as unsure as that; the others follow as they covary."""
+        """Copy with the unchecked DoF reset to the prior and its covariance.
+
+        The other DoF follow by correlation.
+        """
         rows = [DOF_NAMES.index(dof) for dof in self.unchecked]
         if not rows or self.covariance is None:
             return self
@@ -158,29 +163,30 @@ class ExportedPair:
 
 
 def reference_of(edges: Collection[Edge]) -> Sensor:
-    """The sensor that poses refer to: the lidar with most edges, of a vehicle without a lidar the radar."""
+    """Reference sensor of the poses: the lidar with most edges; without a lidar, the radar."""
     ends = Counter(sensor for edge in edges for sensor in edge.sensors if sensor != BASE)
     return min(ends, key=lambda s: (_REFERENCES.index(s.kind), -ends[s], s.name))
 
 
 @dataclass(frozen=True, eq=False)
 class ExportedCalibration:
-    """A calibration on its way into a file.
+    """A calibration to be exported.
 
     Args:
         vehicle: its id.
-        source: in words, as "record of 2026-03-02".
+        source: in words, such as "record of 2026-03-02".
         method: of the calibration.
         code_version: of Boresight.
-        pairs: edges by their words. A file holds poses to the reference along edges with a lidar; camera and radar
-            against each other say only how sure they are, unless nothing else ties them.
-        camera: intrinsics of the only camera, where known.
+        pairs: edges by name. A file holds poses relative to the reference along edges with a lidar. An edge
+            of camera and radar contributes its sigma only, unless no other edge connects them.
+        camera: intrinsics of the only camera, if known.
         names: of the frames.
-        T_base_lidar: where the reference sits on the car; None: an edge to base says it, or the reference is the root.
-        left_out: words of an edge to reason, of those that are not in `pairs`.
-        word: of the record or state as a whole, one of DAY_WORDS.
-        cameras: intrinsics of each camera by name, where there are several.
-        known: all edges of the vehicle, with those that are left out; empty: those of camera, lidar and radar.
+        T_base_lidar: pose of the reference on the car; None = from an edge to base, or the reference is the
+            root.
+        left_out: reason by name, for edges that are not in `pairs`.
+        word: status of the record or state as a whole, one of DAY_WORDS.
+        cameras: intrinsics by camera name, for several cameras.
+        known: all edges of the vehicle, those left out included; empty = those of camera, lidar and radar.
     """
 
     vehicle: str
@@ -212,29 +218,29 @@ class ExportedCalibration:
 
     @property
     def reference(self) -> Sensor:
-        """What poses refer to: the lidar with most edges, of a vehicle without one the radar."""
+        """Reference of the poses: the lidar with most edges; without a lidar, the radar."""
         return reference_of(self.edges)
 
     @property
     def root(self) -> str:
-        """Name of the frame that all others hang on."""
+        """Name of the root frame."""
         return self.names.of(self.reference.name) if self.T_base is None else self.names.base
 
     @property
     def T_base(self) -> Float[np.ndarray, "4 4"] | None:
-        """T_base_reference: as given, or by an edge to base; None where nobody knows."""
+        """T_base_reference, as given or from an edge to base; None if unknown."""
         if self.T_base_lidar is not None:
             return self.T_base_lidar
         found = self.between(BASE.name, self.reference.name) if self._has(BASE.name) else None
         return None if found is None else found[0]
 
     def camera_of(self, sensor: str) -> Camera | None:
-        """A camera's intrinsics; None where they are not known."""
+        """Intrinsics of a camera; None if unknown."""
         only = [s.name for s in self.sensors if s.kind == "camera"] == [sensor]
         return self.cameras.get(sensor, self.camera if only else None)
 
     def T_root(self, sensor: str) -> Float[np.ndarray, "4 4"] | None:
-        """T_root_sensor; None where the calibration lacks it."""
+        """T_root_sensor; None if the calibration does not have it."""
         found = self.between(self.reference.name, sensor)
         if found is None:
             return None
@@ -242,7 +248,10 @@ class ExportedCalibration:
         return found[0] if T_base is None else T_base @ found[0]
 
     def way(self, a: str, b: str) -> tuple[Edge, ...] | None:
-        """Edges that lead from one sensor to another; None where none do. They need not have an estimate."""
+        """Chain of edges from one sensor to another, with or without estimates.
+
+        None if they are not connected.
+        """
         nodes = {s.name: s for edge in self.edges for s in edge.sensors}
         if a not in nodes or b not in nodes:
             return () if a == b else None
@@ -254,7 +263,10 @@ class ExportedCalibration:
     def between(
         self, a: str, b: str
     ) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "6 6"] | None] | None:
-        """T_a_b and its covariance in a's axes (None: nobody says); None where the calibration lacks it."""
+        """T_a_b and its covariance in axes of a (None if unknown).
+
+        None if the calibration does not have it.
+        """
         pairs, way = {pair.edge: pair for pair in self.pairs.values()}, self.way(a, b)
         if way is None or any(edge not in pairs for edge in way):
             return None
@@ -272,7 +284,10 @@ class ExportedCalibration:
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """A sensor's pose: T takes coordinates in `child` to `parent`, names of frames; covariance in parent axes."""
+    """Pose of a sensor: T maps coordinates from frame `child` to frame `parent`.
+
+    Covariance in parent axes.
+    """
 
     sensor: str
     parent: str
@@ -282,7 +297,7 @@ class Pose:
 
 
 def poses_of(calibration: ExportedCalibration) -> list[Pose]:
-    """The tree of frames, parents first: base -> reference where known, reference -> each other sensor."""
+    """Tree of poses, parents first: base -> reference if known, then reference -> each other sensor."""
     names, reference = calibration.names, calibration.reference.name
     poses, T_base = [], calibration.T_base
     if T_base is not None:
@@ -295,14 +310,14 @@ def poses_of(calibration: ExportedCalibration) -> list[Pose]:
 
 
 def written_pairs(calibration: ExportedCalibration) -> list[str]:
-    """Words of the edges that poses are made of, in order."""
+    """Names of the edges that the poses are made of, in order."""
     reference = calibration.reference.name
     used = {edge for s in calibration.sensors for edge in calibration.way(reference, s.name) or ()}
     return [name for name, pair in calibration.pairs.items() if pair.edge in used]
 
 
 def _step(pair: ExportedPair, here: str) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "6 6"] | None]:
-    """An edge's transform from the sensor where one stands, and its covariance in that sensor's axes."""
+    """Transform of an edge from sensor `here` to the other one, with its covariance in axes of `here`."""
     if pair.edge.parent.name == here:
         return pair.T, pair.covariance
     T = inverse(pair.T)
@@ -326,10 +341,10 @@ def sigmas_of(
 
 
 def cameras_of(calibration: ExportedCalibration, by: str) -> list[str]:
-    """Cameras whose pose is known, of a format that cannot do without one.
+    """Cameras with a known pose, for formats that require a camera.
 
     Raises:
-        ConfigError: none is; it says why of one that is left out.
+        ConfigError: there is none; the message gives the reason for a camera that is left out.
     """
     reference = calibration.reference.name
     cameras = [s.name for s in calibration.sensors if s.kind == "camera"]
@@ -343,13 +358,13 @@ def cameras_of(calibration: ExportedCalibration, by: str) -> list[str]:
 
 
 def needed_camera(calibration: ExportedCalibration, by: str, sensor: str) -> Camera:
-    """A camera's intrinsics, for a format that cannot do without.
+    """Intrinsics of a camera, for formats that require them.
 
     Raises:
-        ConfigError: they are not known.
+        ConfigError: they are unknown.
     """
     camera = calibration.camera_of(sensor)
     if camera is None:
-        problem = "the format needs intrinsics, and the lake has no observations of these days any more"
+        problem = "the format needs intrinsics, and the observations of these days are no longer in the lake"
         raise ConfigError(f"export {by}", sensor, problem)
     return camera

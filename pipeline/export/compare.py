@@ -1,4 +1,4 @@
-"""Two calibrations, axis by axis: how far apart, and whether their sigmas explain it."""
+"""Difference of two calibrations per axis, and whether their sigmas explain it."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ __all__ = ["Side", "compare", "composed"]
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """One of the two.
+    """One of the two calibrations.
 
     Args:
-        title: as a person calls it.
-        pairs: by pair, what it says.
-        vehicle: whose it is; empty where a file does not say.
-        days: days that it rests on; empty where a file does not say.
-        missing: by pair, why there is none.
+        title: for the user.
+        pairs: its pairs by name.
+        vehicle: id; empty if a file does not contain it.
+        days: days of its data; empty if a file does not contain them.
+        missing: reason for each missing pair, by name.
     """
 
     title: str
@@ -39,10 +39,10 @@ class Side:
 
 
 def compare(a: Side, b: Side) -> tuple[list[PairDifference], list[str]]:
-    """By pair that both have, the change from A to B, and what to know of the sigmas, a sentence each.
+    """Change from A to B of each pair that both have, and remarks on the sigmas, in sentences.
 
-    Different days of one vehicle: what all days err by alike is no part of their difference, and is left out of its
-    sigma where both sides state it. Otherwise the sigmas are those of independent estimates.
+    For different days of one vehicle, the common part of the covariance cancels in the difference. It is left
+    out of the sigma if both sides state it. Otherwise the sigmas are those of independent estimates.
     """
     apart = bool(a.vehicle) and a.vehicle == b.vehicle and bool(a.days and b.days) and not a.days & b.days
     found, lacks_common = [], False
@@ -68,7 +68,7 @@ def compare(a: Side, b: Side) -> tuple[list[PairDifference], list[str]]:
 
 
 def composed(pairs: Mapping[str, ExportedPair]) -> dict[str, ExportedPair]:
-    """With the third pair, of those that a file has; nobody says how sure it is."""
+    """Add the third pair, composed of two, with unknown covariance."""
     found = dict(pairs)
     if "camera_radar" not in found and all(p in found for p in ESTIMATED_PAIRS):
         first, second = (found[p] for p in ESTIMATED_PAIRS)
@@ -77,14 +77,14 @@ def composed(pairs: Mapping[str, ExportedPair]) -> dict[str, ExportedPair]:
 
 
 def _covariance(pair: ExportedPair, *, without_common: bool) -> Float[np.ndarray, "6 6"] | None:
-    """Of (rotation vector, origin) of an estimate, as far as it counts for a difference."""
+    """Covariance of (rotation vector, origin) of an estimate, as needed for a difference."""
     if pair.covariance is None:
         return None
     full = change_covariance(pair.T, pair.covariance)
     if not without_common or pair.common is None:
         return full
     varying = change_covariance(pair.T, pair.covariance - pair.common)
-    # Sigmas are estimates themselves: as in the state, a day varies by a tenth of its sigma at least.
+    # Sigmas are estimates too: as in the state, the relative scatter of a day's sigma is at least a tenth.
     floor = 0.01 * np.diag(full)
     return varying + np.diag(np.maximum(floor - np.diag(varying), 0.0))
 
@@ -92,17 +92,17 @@ def _covariance(pair: ExportedPair, *, without_common: bool) -> Float[np.ndarray
 def _notes(a: Side, b: Side, *, apart: bool, lacks_common: bool) -> list[str]:
     notes = [f"{side.title}: no {pair}: {why}" for side in (a, b) for pair, why in side.missing.items()]
     if a.vehicle and b.vehicle and a.vehicle != b.vehicle:
-        notes.append("Two vehicles: their mountings differ, whatever the sigmas.")
+        notes.append("Two vehicles: their mountings differ by more than the sigmas.")
     elif a.days & b.days:
         notes.append(
-            "Both rest on the same days: their errors are not independent, and the true sigma may be smaller."
+            "Both use the same days: their errors are not independent, and the true sigma may be smaller."
         )
     elif apart:
-        words = "Different days of one vehicle: what all days err by alike is left out of the sigmas"
+        words = "Different days of one vehicle: the sigmas leave out the error common to all days"
         notes.append(f"{words}{', where the records state it' if lacks_common else ''}.")
     if any(p.status == "prior" for side in (a, b) for p in side.pairs.values()):
         notes.append(
-            "A record leans on its prior: what the day did not determine changes less than the sigmas say."
+            "A record depends on its prior: axes that the day did not determine change less than the sigmas suggest."
         )
     exact = [s.title for s in (a, b) if s.pairs and all(p.covariance is None for p in s.pairs.values())]
-    return [*notes, *(f"{title} states no sigma and is taken as exact." for title in exact)]
+    return [*notes, *(f"{title} states no sigma and is treated as exact." for title in exact)]

@@ -1,4 +1,4 @@
-"""Files of a format on disk: where they go, the side file beside them, and the prior that an import makes."""
+"""Files of a format on disk: paths, side file, and the prior file of an import."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ __all__ = [
 ]
 
 SIDE_FILE = ".provenance.json"
-_MOST_BYTES = 1 << 30  # a calibration is kilobytes; a log that is read for /tf_static may be larger
+_MOST_BYTES = 1 << 30  # a calibration has kilobytes; a log that is read for /tf_static may be larger
 
 
 def written_files(form: Format, calibration: ExportedCalibration, out: Path) -> dict[Path, bytes]:
-    """Content by path: PATH itself where the format is one file and PATH has a suffix, else files in the folder PATH.
+    """Content by path: `out` itself for a format of one file and `out` with a suffix, else files in it.
 
     Raises:
-        ConfigError: the format is only read, or cannot hold the calibration.
+        ConfigError: the format can only be read, or cannot hold the calibration.
     """
     if form.write is None:
-        raise ConfigError("command line", "format", f"{form.name} is only read")
+        raise ConfigError("command line", "format", f"{form.name} can only be imported")
     files = form.write(calibration)
     is_one = len(files) == 1 and out.suffix != "" and not out.is_dir()
     first = out if is_one else out / next(iter(files))
@@ -53,13 +53,13 @@ def written_files(form: Format, calibration: ExportedCalibration, out: Path) -> 
 def updated_file(
     form: Format, calibration: ExportedCalibration, template: Path, out: Path
 ) -> dict[Path, bytes]:
-    """Content by path: the caller's own file with new numbers, as the file `out`, and the side file.
+    """Content by path: the user's file with new poses, written as `out`, and the side file.
 
     Raises:
-        ConfigError: the format's files are not updated in place, or the file is none with these frames.
+        ConfigError: the format does not support updates, or the file has none of these frames.
     """
     if form.update is None:
-        raise ConfigError("command line", "update", f"{form.name} has no files that are updated in place")
+        raise ConfigError("command line", "update", f"{form.name} does not support --update")
     [(name, content)] = read_files([template]).items()
     text, changed = form.update(name, content, calibration)
     side = provenance_of(calibration) | {"format": form.name, "updated": changed}
@@ -67,7 +67,7 @@ def updated_file(
 
 
 def write_files(files: Mapping[Path, bytes]) -> None:
-    """Write each at once and whole; folders are made."""
+    """Write each file atomically; make the folders."""
     for path, content in files.items():
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(path) as stream:
@@ -75,10 +75,10 @@ def write_files(files: Mapping[Path, bytes]) -> None:
 
 
 def read_files(paths: Sequence[Path]) -> dict[str, bytes]:
-    """Content by path as given, side files left out.
+    """Content by path, without side files.
 
     Raises:
-        ConfigError: one of them cannot be read.
+        ConfigError: a file cannot be read.
     """
     found = {}
     for path in paths:
@@ -96,7 +96,7 @@ def read_files(paths: Sequence[Path]) -> dict[str, bytes]:
 
 
 def noted_frames(paths: Sequence[Path]) -> dict[str, str]:
-    """Frame of each sensor as an export noted it, in the files or beside them; empty where none did."""
+    """Frame of each sensor as noted by an export, in the files or beside them; empty if there is no note."""
     for path in paths:
         for file in (path.with_name(path.name.partition(".")[0] + SIDE_FILE), path):
             if file.suffix == ".json" and file.is_file() and file.stat().st_size <= _MOST_BYTES:
@@ -108,7 +108,7 @@ def noted_frames(paths: Sequence[Path]) -> dict[str, str]:
 
 
 def _within(content: object, key: str) -> object:
-    """The value of a key, however deep; None where there is none."""
+    """Value of a key at any depth; None if there is none."""
     if isinstance(content, dict):
         return content[key] if key in content else _within(list(content.values()), key)
     if isinstance(content, list):
@@ -117,14 +117,14 @@ def _within(content: object, key: str) -> object:
 
 
 def prior_text(pairs: Mapping[str, np.ndarray], form: str, files: Sequence[str]) -> bytes:
-    """A prior file (`[rigs.*.prior] source = "file"`) of both transforms, their bits unchanged.
+    """Prior file (`[rigs.*.prior] source = "file"`) of both transforms, with identical bits.
 
     Raises:
-        ConfigError: one of them is missing.
+        ConfigError: a transform is missing.
     """
     missing = [pair for pair in ESTIMATED_PAIRS if pair not in pairs]
     if missing:
-        problem = "missing, and a prior needs it: give a prior file that has it with --also"
+        problem = "missing, but a prior needs it: give a prior file that has it with --also"
         raise ConfigError(", ".join(files), f"T_{missing[0]}", problem)
     transforms = {f"T_{pair}": np.asarray(pairs[pair]).tolist() for pair in ESTIMATED_PAIRS}
     return to_json(transforms | {"imported_from": {"format": form, "files": list(files)}})

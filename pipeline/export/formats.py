@@ -1,4 +1,4 @@
-"""The formats by name: what each writes, and how it is read back."""
+"""The formats by name, with their functions for writing and reading."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ from pipeline.rig.graph import Edge
 
 __all__ = ["FORMATS", "Files", "Format", "format_named"]
 
-Files = Mapping[str, bytes]  # by name (when written, relative to --out)
+Files = Mapping[str, bytes]  # by file name (when written, relative to --out)
 
 
 @dataclass(frozen=True)
 class Format:
-    """A format as a value.
+    """A file format.
 
     Args:
         name: on the command line.
-        write: files of a calibration; None of a format that is only read. Raises ConfigError where the format cannot
-            hold it.
-        tree: frames that files hold, where the format names frames.
-        read: transforms that files hold of edges, by their words, where it has names of its own for them. Both raise
-            ConfigError that names file and field.
-        update: of a format whose files hold more than a calibration: a file with new numbers in place of the old, and
-            the frames that have them.
-        T_frame_camera: of a format whose camera frame is not the optical one: from the optical frame to its own.
-        holds_provenance: the files say all that the side file would.
-        notes: for the side file, what the format cannot say or takes for granted.
+        write: returns the files of a calibration; None if the format can only be read. Raises ConfigError if
+            the format cannot hold the calibration.
+        tree: reads the frames in the files, for formats that name frames.
+        read: reads edges from the files, by edge name, for formats with names of their own. `tree` and `read`
+            raise ConfigError with file and field.
+        update: for formats whose files hold more than a calibration: returns a file with new poses in place
+            of the old ones, and the updated frames.
+        T_frame_camera: from the optical frame to the format's camera frame, if they differ.
+        holds_provenance: the files contain all that the side file would contain.
+        notes: for the side file: assumptions, and information that the format cannot hold.
     """
 
     name: str
@@ -51,19 +51,19 @@ class Format:
     def pairs(
         self, files: Files, names: FrameNames, edges: Sequence[Edge] = ESTIMATED_EDGES
     ) -> dict[str, np.ndarray]:
-        """T_parent_child of edges, those of them that the files hold, by their words.
+        """T_parent_child of those edges that the files hold, by edge name.
 
         Args:
-            files: by name.
+            files: content by file name.
             names: of the frames.
-            edges: that are asked for; as they are given, T_camera_lidar and T_lidar_radar.
+            edges: the edges to read, in the given direction, such as T_camera_lidar and T_lidar_radar.
 
         Raises:
-            ConfigError: none, or the files cannot be read; it names file and field.
+            ConfigError: no edge found, or the files cannot be read; the message has file and field.
         """
         if self.read is not None:
             return self.read(files, edges, names)
-        assert self.tree is not None, "a format names frames or pairs"
+        assert self.tree is not None, "a format needs `tree` or `read`"
         found = pairs_of_tree(", ".join(files), self.tree(files), names, edges)
         if self.T_frame_camera is not None:
             for edge in (e for e in edges if words_of(e) in found):
@@ -72,7 +72,7 @@ class Format:
         return found
 
 
-# Name -> where its value is (resolved on use: some bring OpenCV or the ROS message types).
+# Name -> import path, resolved on use: some import OpenCV or the ROS message types.
 FORMATS = {
     "ros2": "pipeline.export.ros2:ROS2",
     "tf-static": "pipeline.export.tf_static:TF_STATIC",
@@ -92,10 +92,10 @@ FORMATS = {
 
 
 def format_named(name: str) -> Format:
-    """The format of a name.
+    """The format of this name.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: unknown name.
     """
     if name not in FORMATS:
         raise ConfigError("command line", "format", f"{name!r} is none of {', '.join(FORMATS)}")

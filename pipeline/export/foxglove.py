@@ -1,8 +1,9 @@
-"""A vehicle-day as a Foxglove MCAP: what the sensors saw, at the prior and at the calibration, and how sure that is.
+"""A vehicle-day as a Foxglove MCAP: sensor data at the prior and at the calibration, and the uncertainty.
 
-Frames: the lidar is the root (or base, where its pose is known), camera and radar hang on it as calibrated. What the
-prior would show hangs on frames of its own: `lidar_prior` on the camera, `radar_prior` on the lidar, each with the same
-points again, so that a viewer draws both and one is switched off. Source: foxglove-sdk 0.30, schemas of the same names.
+Frames: the lidar is the root (or base, if its pose is known); camera and radar are its children, as
+calibrated. The prior has frames of its own with the same points again: `lidar_prior`, child of the camera,
+and `radar_prior`, child of the lidar. A viewer shows both, and either can be hidden. Source: foxglove-sdk
+0.30, schemas of the same names.
 """
 
 from __future__ import annotations
@@ -56,11 +57,12 @@ TOPICS = {
     "tf": "/tf",
     "table": "/boresight/calibration",
 }
-_MODELS = {"equidistant": "kannala_brandt"}  # Foxglove does not know ROS's name
+_MODELS = {"equidistant": "kannala_brandt"}  # ROS's name -> Foxglove's name
 _COEFFICIENTS = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
 _FLOAT32 = fg.PackedElementFieldNumericType.Float32
 CALIBRATED, PRIOR, _BOX = (0.2, 0.9, 0.4), (1.0, 0.45, 0.1), (0.3, 0.85, 1.0)  # red, green, blue
-_PIXEL_CENTRE = 0.5  # Foxglove counts from the corner of the first pixel, the house from its centre
+# Foxglove's pixel coordinates start at the corner of the first pixel, Boresight's at its centre
+_PIXEL_CENTRE = 0.5
 
 
 def write_foxglove(
@@ -73,12 +75,12 @@ def write_foxglove(
 
     Args:
         stream: seekable.
-        calibration: what is drawn as calibrated; a pair that it lacks is drawn at the prior alone.
-        priors: T_camera_lidar and T_lidar_radar as they were before the day, those that are known.
-        scenes: frames in order of stamp, with what perception found in them (None where it left the frame out).
+        calibration: drawn as calibrated; for a missing pair only the prior is drawn.
+        priors: T_camera_lidar and T_lidar_radar before the day, if known.
+        scenes: frames in order of stamp, with their features (None if perception left the frame out).
 
     Returns:
-        Scenes written.
+        Number of scenes written.
     """
     context = foxglove.Context()
     topics = _Topics(context)
@@ -93,7 +95,7 @@ def write_foxglove(
             count += 1
         told = {name: str(provenance[name]) for name in ("written_by", "vehicle", "source", "method")}
         writer.write_metadata("boresight", told)
-        # Not at time 0: viewers count an attachment into the recording's length.
+        # Not at time 0: viewers include attachments in the length of the recording.
         media, times = "application/json", {"log_time": stamp_ns, "create_time": stamp_ns}
         writer.attach(**times, name="calibration.json", media_type=media, data=to_json(provenance))
     return count
@@ -163,7 +165,7 @@ def _log_scene(
 def _transforms(
     calibration: ExportedCalibration, priors: Mapping[str, np.ndarray], stamp_ns: int
 ) -> list[fg.FrameTransform]:
-    """Poses of child in parent: the calibrated tree, and on it the frames of what the prior would show."""
+    """Poses of child in parent: the calibrated tree, and the frames of the prior as children of it."""
     names = calibration.names
     edges = [(edge.parent, edge.child, edge.T) for edge in poses_of(calibration)]
     if "camera_lidar" in priors:
@@ -176,7 +178,7 @@ def _transforms(
 def transform_message(
     parent: str, child: str, T: Float[np.ndarray, "4 4"], stamp_ns: int
 ) -> fg.FrameTransform:
-    """A pose of child in parent."""
+    """Pose of child in parent as a message."""
     w, x, y, z = (float(v) for v in to_quaternion(T))
     return fg.FrameTransform(
         timestamp=time_message(stamp_ns),
@@ -188,7 +190,7 @@ def transform_message(
 
 
 def time_message(stamp_ns: int) -> fg.Timestamp:
-    """A stamp."""
+    """Stamp as a message."""
     return fg.Timestamp(sec=stamp_ns // 10**9, nsec=stamp_ns % 10**9)
 
 
@@ -196,7 +198,7 @@ def time_message(stamp_ns: int) -> fg.Timestamp:
 
 
 def intrinsics_message(camera: Camera, frame_id: str, at: fg.Timestamp) -> fg.CameraCalibration:
-    """A camera's intrinsics, by Foxglove's names of models."""
+    """Intrinsics of a camera as a message, with Foxglove's names of the lens models."""
     D = np.zeros(_COEFFICIENTS[camera.model])
     D[: len(camera.D)] = camera.D
     P = np.hstack([camera.K, np.zeros((3, 1))])
@@ -214,7 +216,10 @@ def intrinsics_message(camera: Camera, frame_id: str, at: fg.Timestamp) -> fg.Ca
 
 
 def cloud_columns(frame: Frame, kind: str) -> tuple[dict[str, np.ndarray], int]:
-    """Points of the frame's lidar or radar by field, and their stamp [ns]; a range rate is positive = receding."""
+    """Points of the frame's lidar or radar by field, and their stamp [ns].
+
+    Range rate is positive = receding.
+    """
     columns = {axis: getattr(frame, f"{kind}_{axis}_m") for axis in "xyz"}
     if kind == "lidar":
         more = {"intensity": frame.lidar_intensity}
@@ -224,7 +229,7 @@ def cloud_columns(frame: Frame, kind: str) -> tuple[dict[str, np.ndarray], int]:
 
 
 def cloud_message(columns: Mapping[str, np.ndarray], frame_id: str, stamp_ns: int) -> fg.PointCloud:
-    """Points of equal columns in a frame."""
+    """Points as a message; the columns have equal length."""
     points = np.stack([np.asarray(c, "<f4") for c in columns.values()], axis=1)
     fields = [fg.PackedElementField(name=n, offset=4 * i, type=_FLOAT32) for i, n in enumerate(columns)]
     origin = fg.Pose(
@@ -244,7 +249,7 @@ def cloud_message(columns: Mapping[str, np.ndarray], frame_id: str, stamp_ns: in
 
 
 def boxes_message(observation: Observation, at: fg.Timestamp) -> fg.ImageAnnotations:
-    """Road users that the camera saw, named."""
+    """Boxes of road users in the image, with their classes."""
     points, texts = [], []
     boxes = observation.road_user_boxes_px.astype(np.float64) + _PIXEL_CENTRE
     for (x0, y0, x1, y1), name in zip(boxes.tolist(), observation.road_user_classes, strict=True):
@@ -270,7 +275,7 @@ def edges_message(
     colour: tuple[float, ...],
     at: fg.Timestamp,
 ) -> fg.ImageAnnotations:
-    """Depth jumps of the lidar in the image: on a good calibration they lie on silhouettes."""
+    """Depth jumps of the lidar in the image; with a good calibration they lie on silhouettes."""
     camera = camera_of(observation)
     uv, valid = camera.project(
         transform_points(T_camera_lidar, observation.lidar_edge_xyz_m.astype(np.float64))
@@ -287,7 +292,7 @@ def edges_message(
 
 
 def clusters_message(observation: Observation, frame_id: str, stamp_ns: int) -> fg.SceneUpdate:
-    """Objects that the lidar saw, as boxes along its axes."""
+    """Clusters of the lidar as boxes parallel to its axes."""
     low, high = observation.lidar_cluster_min_m.astype(float), observation.lidar_cluster_max_m.astype(float)
     cubes = [
         fg.CubePrimitive(

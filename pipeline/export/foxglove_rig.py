@@ -1,8 +1,8 @@
-"""A vehicle-day of a rig of many sensors as a Foxglove MCAP: channels for every sensor, called as the sensor.
+"""A vehicle-day of a rig of many sensors as a Foxglove MCAP, with topics named after the sensors.
 
-As `foxglove.py` has it for one of each: images pass byte for byte, clouds are each in the frame of its sensor, the
-lidar's depth jumps lie in every image. The reference is the root (or base, where its pose is known); what the prior
-would show of a lidar or radar hangs on the reference as `NAME_prior`.
+As in `foxglove.py`, images are copied byte for byte, each cloud is in the frame of its sensor, and the
+lidar's depth jumps are drawn in every image. The reference is the root (or base, if its pose is known). The
+prior of a lidar or radar is the frame `NAME_prior`, child of the reference.
 """
 
 from __future__ import annotations
@@ -31,23 +31,23 @@ from schemas.observations import Observation
 
 __all__ = ["layout_of_rig", "write_foxglove_rig"]
 
-_IN_A_ROW = 3  # pictures of the layout
+_IN_A_ROW = 3  # pictures per row of the layout
 
 
 @dataclass(frozen=True, eq=False)
 class _Drive:
-    """What is drawn: the calibration, and the same of what was known before the day."""
+    """Calibration to draw, and the prior in the same form."""
 
     now: ExportedCalibration
     before: ExportedCalibration
-    lidar: str | None  # whose depth jumps lie in the images
+    lidar: str | None  # its depth jumps are drawn in the images
 
     def frame(self, sensor: str) -> str:
         return self.now.names.of(sensor)
 
 
 class _Channels:
-    """Channels by topic, made when they have something to say."""
+    """Channels by topic, each created with its first message."""
 
     def __init__(self, context: foxglove.Context) -> None:
         self._context, self._made = context, dict[str, Any]()
@@ -68,12 +68,12 @@ def write_foxglove_rig(
 
     Args:
         stream: seekable.
-        calibration: what is drawn as calibrated; a sensor that it lacks is drawn at the prior alone.
-        before: the same edges as they were before the day, those that are known.
-        scenes: of each sensor that is shown, in order of moments; of a camera with the reference lidar beside it.
+        calibration: drawn as calibrated; for a missing sensor only the prior is drawn.
+        before: the same edges before the day, if known.
+        scenes: by sensor, in order of moments; those of a camera include the reference lidar.
 
     Returns:
-        Scenes written.
+        Number of scenes written.
     """
     context = foxglove.Context()
     logged, count, moment = _Channels(context), 0, -1
@@ -105,13 +105,13 @@ def write_foxglove_rig(
 def _in_order(
     place: int, sensor: Sensor, scenes: Iterable[Scene]
 ) -> Iterator[tuple[int, int, Sensor, Frame, Observation | None]]:
-    """Scenes with what they are merged by: moment, then place of the sensor."""
+    """Scenes with their sort key: moment, then index of the sensor."""
     for frame, seen in scenes:
         yield frame.frame_index, place, sensor, frame, seen
 
 
 def _priors(drive: _Drive) -> dict[str, Float[np.ndarray, "4 4"]]:
-    """What was known before the day of the pairs that are calibrated, by their words."""
+    """Prior of each calibrated pair, by pair name."""
     ends = {words: (pair.edge.parent.name, pair.edge.child.name) for words, pair in drive.now.pairs.items()}
     found = {words: drive.before.between(*two) for words, two in ends.items()}
     return {words: known[0] for words, known in found.items() if known is not None}
@@ -168,12 +168,12 @@ def _log_cloud(logged: _Channels, drive: _Drive, sensor: Sensor, scene: Scene) -
 
 
 def layout_of_rig(sensors: Sequence[Sensor], reference: str, follow: str) -> bytes:
-    """A layout of Foxglove's: a picture of every camera with the lidar's edges, the scene from above, the sigmas.
+    """Foxglove layout: an image panel per camera with the lidar's edges, the scene from above, the sigmas.
 
     Args:
-        sensors: that the file shows.
-        reference: the sensor that poses refer to.
-        follow: frame that the scene follows.
+        sensors: sensors in the file.
+        reference: reference sensor of the poses.
+        follow: frame that the scene panel follows.
     """
     pictures = [_picture(sensor.name, reference) for sensor in sensors if sensor.kind == "camera"]
     clouds = {

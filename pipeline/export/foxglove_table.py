@@ -1,4 +1,4 @@
-"""What is sure of a calibration as one JSON message, for a viewer's table; and the layout that shows all of it."""
+"""Changes and sigmas of a calibration as one JSON message for a table panel; and a layout of all topics."""
 
 from __future__ import annotations
 
@@ -42,7 +42,10 @@ TABLE_SCHEMA: dict[str, Any] = {
 def table_of(
     calibration: ExportedCalibration, priors: Mapping[str, Float[np.ndarray, "4 4"]]
 ) -> dict[str, Any]:
-    """A row per pair and axis: turn about and shift along the parent's axes since the prior, with sigma [deg, cm]."""
+    """One row per pair and axis.
+
+    Rotation and shift from the prior along the parent's axes, with sigma [deg, cm].
+    """
     rows = [row for pair in calibration.pairs.values() for row in _rows(pair, priors.get(pair.pair))]
     told = {"vehicle": calibration.vehicle, "source": calibration.source, "method": calibration.method}
     return told | {"warnings": warnings_of(calibration), "rows": rows}
@@ -68,7 +71,10 @@ def _rows(pair: ExportedPair, prior: Float[np.ndarray, "4 4"] | None) -> list[di
 
 
 def layout_of(topics: Mapping[str, str], names: FrameNames) -> bytes:
-    """A layout of Foxglove's for these topics: image with lidar and overlay, scene from the lidar, table of sigmas."""
+    """Foxglove layout for these topics.
+
+    Image with lidar and overlay, scene from the lidar, table of sigmas.
+    """
 
     def cloud(name: str, field: str, *, visible: bool) -> tuple[str, Any]:
         settings = layouts.BaseRendererPointCloudTopicSettings(

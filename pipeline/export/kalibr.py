@@ -1,7 +1,7 @@
-"""Kalibr's camera chain, with T_cam_SENSOR of the other sensors (T_cam_lidar, T_cam_radar) beside Kalibr's own keys.
+"""Kalibr's camera chain, with keys T_cam_SENSOR added for other sensors (T_cam_lidar, T_cam_radar).
 
-Source: ethz-asl/kalibr wiki "Yaml formats" and kalibr_common/ConfigReader.py (which counts the keys of the file as
-cameras, so all stands under cam0, cam1, ...); T_cam_lidar as in Oxford Spires.
+Source: ethz-asl/kalibr wiki "Yaml formats" and kalibr_common/ConfigReader.py (counts the keys of the file as
+cameras, so all entries are under cam0, cam1, ...); T_cam_lidar as in Oxford Spires.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
         chain[f"cam{k}"]["T_cn_cnm1"] = found[0].tolist()
     comments = [
         *comment_lines(calibration),
-        "T_cam_x takes coordinates in x to the camera's optical frame; rostopic is a name only",
+        "T_cam_x maps coordinates from x to the camera's optical frame; rostopic is only a label",
     ]
     return {"camchain.yaml": to_yaml(chain, comments)}
 
@@ -66,16 +66,16 @@ def _distortion(name: str, camera: Camera) -> tuple[str, list[float]]:
     if camera.model == "equidistant":
         return "equidistant", D or [0.0] * 4
     if any(D[_RADTAN:]):
-        problem = f"{camera.model} with more than k1 k2 p1 p2 is none of Kalibr's models"
+        problem = f"{camera.model} with more than k1 k2 p1 p2 is not a model of Kalibr"
         raise ConfigError("export kalibr", f"{name}: distortion", problem)
     return "radtan", [*D[:_RADTAN], *[0.0] * (_RADTAN - len(D))]
 
 
 def _read(files: Files, edges: Sequence[Edge], names: FrameNames) -> dict[str, np.ndarray]:
-    """Transforms from the first lidar's of an edge; cameras are told by their topics, else by the order of their names.
+    """Transforms relative to the first lidar. Cameras are identified by topic, else by order of names.
 
     Raises:
-        ConfigError: the chain's topics name none of the cameras, and there are more or fewer of them.
+        ConfigError: the topics match no camera, and the numbers of cameras differ.
     """
     found: dict[str, np.ndarray] = {}
     for file, content in files.items():
@@ -96,16 +96,16 @@ def _read(files: Files, edges: Sequence[Edge], names: FrameNames) -> dict[str, n
 
 
 def _cameras_in(file: str, chain: Any, edges: Sequence[Edge], names: FrameNames) -> dict[str, str]:
-    """Key in the chain of each camera by name, those that it has."""
+    """Key in the chain of each camera, by camera name, for the cameras in the chain."""
     cameras = sorted({edge.parent.name for edge in edges if edge.parent.kind == "camera"})
     held = chain if isinstance(chain, dict) else {}
     topics = {key: str(cam.get("rostopic")) for key, cam in held.items() if isinstance(cam, dict)}
     known = {f"/{names.of(name)}/image_raw": name for name in cameras}
     found = {known[topic]: key for key, topic in topics.items() if topic in known}
     if found and len(found) < sum(topic in known for topic in topics.values()):
-        raise ConfigError(file, "rostopic", "two cameras have the same topic: one sensor stands there twice")
+        raise ConfigError(file, "rostopic", "two cameras have the same topic: a sensor occurs twice")
     if not found and len(cameras) not in (0, 1, len(topics)):
-        problem = f"names none of {', '.join(known)}, and there are {len(topics)} cameras: which is which is not said"
+        problem = f"names none of {', '.join(known)}, and there are {len(topics)} cameras: which is which?"
         raise ConfigError(file, "rostopic", problem)
     return found or {name: f"cam{k}" for k, name in enumerate(cameras)}
 

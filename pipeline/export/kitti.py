@@ -1,8 +1,9 @@
-"""KITTI's calibration of one frame (object benchmark), a file per camera, with V2X-Radar's line of a radar.
+"""KITTI's calibration of one frame (object benchmark), a file per camera, with V2X-Radar's line for a radar.
 
-Row-major numbers after a name: P0 to P3 (3x4), R0_rect (3x3), Tr_velo_to_cam, Tr_imu_to_velo, Tr_radar_to_velo (3x4);
-Tr_a_to_b takes coordinates in a to b, so Tr_velo_to_cam = T_camera_lidar where the camera of image_2 is the reference;
-in KITTI's own files it lies beside it, which reading takes into account.
+Row-major numbers after a name: P0 to P3 (3x4), R0_rect (3x3), Tr_velo_to_cam, Tr_imu_to_velo,
+Tr_radar_to_velo (3x4). Tr_a_to_b maps coordinates from a to b. Tr_velo_to_cam = T_camera_lidar if image_2's
+camera is the reference; in KITTI's own files the reference is another camera beside it, and reading corrects
+for that.
 
 Source: KITTI object development kit, readme and matlab/; V2X-Radar (Tr_radar_to_velo).
 """
@@ -25,8 +26,8 @@ __all__ = ["KITTI", "VOD"]
 
 _CAMERA, _TO_LIDAR, _RECTIFIED, _IMAGE = "Tr_velo_to_cam", "_to_velo", "R0_rect", "P2"
 _NOTES = (
-    "P0 to P3 are all K [I | 0] of the one camera: undistort its images before they are used with them.",
-    "R0_rect is the identity: the camera's optical frame counts as rectified.",
+    "P0 to P3 are all K [I | 0] of the one camera: undistort its images before use.",
+    "R0_rect is the identity: the camera's optical frame is used as the rectified frame.",
     (
         "Tr_imu_to_velo is the inverse of the lidar's pose on the car where that is known, else the identity is in its "
         "place: no IMU is calibrated here."
@@ -50,12 +51,12 @@ def _of_camera(calibration: ExportedCalibration, name: str) -> bytes:
         "Tr_imu_to_velo": T_lidar_base[:3],
     }
     others = [s.name for s in calibration.sensors if s.kind != "camera" and s.name != lidar]
-    for other in others:  # Tr_radar_to_velo of a radar that is called so
+    for other in others:  # Tr_radar_to_velo for a radar named "radar"
         if calibration.between(lidar, other) is not None:
             values[f"Tr_{other}{_TO_LIDAR}"] = _pose(calibration, lidar, other)[:3]
-    # KITTI prints 12 digits after the point; 16 give every float64 back.
+    # KITTI prints 12 digits after the point; with 16, reading gives the same float64.
     lines = (f"{name}: {' '.join(f'{v:.16e}' for v in M.reshape(-1))}\n" for name, M in values.items())
-    return "".join(lines).encode()  # KITTI's own blank line at the end stops some readers
+    return "".join(lines).encode()  # some readers fail on the blank line at the end of KITTI's own files
 
 
 def _pose(calibration: ExportedCalibration, a: str, b: str) -> np.ndarray:
@@ -73,7 +74,7 @@ def _read(files: Files, edges: Sequence[Edge], _names: FrameNames) -> dict[str, 
             of_file = len(cameras) == 1 or file.endswith(f"calib_{edge.parent.name}.txt")
             if edge.kind == "camera_lidar" and _CAMERA in lines and of_file:
                 found[words_of(edge)] = _rectified(file, lines) @ matrix_of(file, _CAMERA, lines[_CAMERA])
-            if edge.kind in ("lidar_radar", "lidar_lidar"):  # one of them may be KITTI's velo
+            if edge.kind in ("lidar_radar", "lidar_lidar"):  # one of the two may be KITTI's velo
                 keys = [f"Tr_{sensor.name}{_TO_LIDAR}" for sensor in edge.sensors]
                 a, b = (matrix_of(file, k, lines[k]) if k in lines else np.eye(4) for k in keys)
                 if lines.keys() & set(keys):
@@ -84,7 +85,7 @@ def _read(files: Files, edges: Sequence[Edge], _names: FrameNames) -> dict[str, 
 
 
 def _read_vod(files: Files, _edges: Sequence[Edge], _names: FrameNames) -> dict[str, np.ndarray]:
-    """View-of-Delft has a file per sensor, and calls either one's transform into the camera Tr_velo_to_cam."""
+    """View-of-Delft has one file per sensor; each holds its sensor's T_camera_sensor as Tr_velo_to_cam."""
     if len(files) != 2:
         problem = (
             "give two files: the lidar's calibration, then the radar's (lidar/.../calib, radar/.../calib)"
@@ -104,7 +105,7 @@ def _lines(file: str, content: bytes) -> dict[str, list[float]]:
         if not line.strip():
             continue
         if not colon:
-            raise ConfigError(file, line.split()[0], "is no line of the form NAME: NUMBERS")
+            raise ConfigError(file, line.split()[0], "is not a line of the form NAME: NUMBERS")
         found[name.strip()] = _numbers(file, name.strip(), numbers.split())
     return found
 
@@ -114,14 +115,14 @@ def _numbers(file: str, name: str, words: Iterable[str]) -> list[float]:
         return [float(word) for word in words]
     except ValueError as err:
         if name in (_CAMERA, _RECTIFIED, _IMAGE) or name.endswith(_TO_LIDAR):
-            raise ConfigError(file, name, f"holds what is no number: {err}") from err
-        return []  # a line of others, as calib_time
+            raise ConfigError(file, name, f"holds a value that is not a number: {err}") from err
+        return []  # a line with other content, such as calib_time
 
 
 def _rectified(file: str, lines: dict[str, list[float]]) -> np.ndarray:
-    """What takes the reference camera's coordinates to those of the camera that image_2 is of.
+    """Transform from the reference camera to the camera of image_2.
 
-    That is the rectification, and the baseline between the two cameras, which KITTI has in P2's last column.
+    It consists of the rectification, and of the baseline between the cameras, which is in P2's last column.
     """
     T = np.eye(4)
     if (rectification := lines.get(_RECTIFIED)) is not None:
@@ -131,7 +132,7 @@ def _rectified(file: str, lines: dict[str, list[float]]) -> np.ndarray:
         T = matrix_of(file, _RECTIFIED, np.hstack([R, np.zeros((3, 1))]))
     if (projection := lines.get(_IMAGE)) is not None:
         if len(projection) != 12 or not np.linalg.det(np.reshape(projection, (3, 4))[:, :3]):
-            raise ConfigError(file, _IMAGE, "is no 3x4 projection")
+            raise ConfigError(file, _IMAGE, "is not a 3x4 projection")
         P = np.reshape(projection, (3, 4))
         T[:3, 3] += np.linalg.solve(P[:, :3], P[:, 3])
     return T

@@ -1,4 +1,4 @@
-"""A calibration out of the lake: a day's records, or a vehicle's state."""
+"""Read a calibration from the lake: a day's records, or a vehicle's state."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ __all__ = [
     "rest_at_prior",
 ]
 
-# What a record or state says of itself beside its numbers, as far as it has it.
+# Fields of a record or state for the provenance, if present.
 _DETAILS = (
     *("day", "days", "since", "work_key", "recorded_at", "inputs", "notes", "assumptions"),
     *("edges", "dt_s", "time_offset_s", "time_offset_sigma_s", "azimuth_sigma_rad", "elevation_sigma_rad"),
@@ -42,19 +42,19 @@ _DETAILS = (
 
 
 def pairs_of_day(lake: Lake, vehicle: str, day: str, method: str) -> dict[str, ExportedPair | str]:
-    """By words of the edge what the day's current records say: an estimate, or why there is none.
+    """Estimates of the day's current records by edge name, or the reason why there is none.
 
     Raises:
-        ConfigError: there is no record of that vehicle, day and method; it names those that there are.
+        ConfigError: no record of that vehicle, day and method; the message lists the existing ones.
     """
     return _pairs(_records(lake, vehicle, day, method))
 
 
 def pairs_of_poses(lake: Lake, vehicle: str, day: str | None, method: str) -> dict[Edge, ExportedPair | str]:
-    """Each sensor against the reference as the day's adjusted rig, or without a day the vehicle's state, has it.
+    """Poses relative to the reference, from the day's adjusted rig or (no day) the vehicle's state.
 
-    By the tie between them; none of a vehicle whose rig is not adjusted as a whole, nor of one with one sensor of each
-    kind, whose records are of the adjusted poses.
+    Keys are edges to the reference. Empty for a vehicle whose rig is not adjusted as a whole, and for a
+    vehicle with one sensor of each kind, whose records hold the adjusted poses already.
 
     Raises:
         ConfigError: as `pairs_of_day`, or no state of that vehicle and method is stored.
@@ -75,7 +75,7 @@ def pairs_of_poses(lake: Lake, vehicle: str, day: str | None, method: str) -> di
 
 
 def _pair_of_pose(row: PoseRow | StateRow, sensor: str, edge: Edge) -> ExportedPair | str:
-    """A sensor's pose as its tie to the reference, whichever is the parent."""
+    """Pose of a sensor as its edge to the reference, whichever of the two is the parent."""
     T, covariance, common = transform_of(row), row.covariance, row.common_covariance
     if T is None or covariance is None:
         return f"{row.status}: {row.reason}"
@@ -85,7 +85,7 @@ def _pair_of_pose(row: PoseRow | StateRow, sensor: str, edge: Edge) -> ExportedP
         A = adjoint(T)
         covariance, common = A @ covariance @ A.T, None if common is None else A @ common @ A.T
         unseen = ", ".join(dof for dof, is_seen in zip(DOF_NAMES, seen, strict=True) if not is_seen)
-        # Degrees of freedom are those of the reference's axes: in the sensor's own they are mixed.
+        # The degrees of freedom refer to axes of the reference; in axes of the sensor they are mixed.
         own = f"{unseen} along the axes of {edge.child.name} kept at the prior" if unseen else ""
         seen, reason = (True,) * 6, "; ".join(words for words in (reason, own) if words)
     return ExportedPair(
@@ -103,7 +103,7 @@ def _pair_of_pose(row: PoseRow | StateRow, sensor: str, edge: Edge) -> ExportedP
 
 
 def priors_of_day(lake: Lake, vehicle: str, day: str, method: str) -> dict[str, ExportedPair | str]:
-    """By words of the edge what was known before the day, as its records say.
+    """Priors of the day's records by edge name, or the reason why there is none.
 
     Raises:
         ConfigError: as `pairs_of_day`.
@@ -121,7 +121,7 @@ def priors_of_day(lake: Lake, vehicle: str, day: str, method: str) -> dict[str, 
 
 
 def edges_of_vehicle(lake: Lake, vehicle: str, day: str | None, method: str) -> tuple[Edge, ...]:
-    """All edges that the day's records, or without a day the states, are about."""
+    """All edges in the day's records or (no day) in the states."""
     if day is None:
         rows: Sequence[CalibrationRecord | StateRow] = _states(lake, vehicle, method)
     else:
@@ -130,7 +130,7 @@ def edges_of_vehicle(lake: Lake, vehicle: str, day: str | None, method: str) -> 
 
 
 def _records(lake: Lake, vehicle: str, day: str, method: str) -> list[CalibrationRecord]:
-    Partition(vehicle, day)  # refuses what is no vehicle or day
+    Partition(vehicle, day)  # raises for an invalid vehicle or day
     records = current_records(read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle=vehicle, day=day))
     found = [r for r in records if r.method == method]
     if not found:
@@ -143,7 +143,7 @@ def _records(lake: Lake, vehicle: str, day: str, method: str) -> list[Calibratio
 
 
 def pairs_of_state(lake: Lake, vehicle: str, method: str) -> dict[str, ExportedPair | str]:
-    """By words of the edge what a vehicle should load tonight, or why nothing.
+    """Edges that a vehicle should load tonight, by name, or the reason why there is none.
 
     Raises:
         ConfigError: no state of that vehicle and method is stored.
@@ -199,7 +199,7 @@ def _unchecked(row: CalibrationRecord | StateRow) -> dict[str, float]:
 def rest_at_prior(
     lake: Lake, vehicle: str, method: str, pairs: Mapping[str, ExportedPair]
 ) -> dict[str, ExportedPair]:
-    """Pairs with what is far from the prior and checked by nothing put back to it: that of their last day's record."""
+    """Pairs with unchecked DoF that are far from the prior reset to the prior of their last day's record."""
     return {name: _rested(lake, vehicle, method, pair) for name, pair in pairs.items()}
 
 
@@ -217,7 +217,7 @@ def _rested(lake: Lake, vehicle: str, method: str, pair: ExportedPair) -> Export
 def choose_pairs(
     found: Mapping[str, ExportedPair | str], *, force: bool
 ) -> tuple[dict[str, ExportedPair], dict[str, str]]:
-    """Those that may be loaded (with `force` all that have a transform), and why the others are left out."""
+    """Pairs that may be loaded (with `force` all that have a transform), and reasons for those left out."""
     chosen: dict[str, ExportedPair] = {}
     left_out: dict[str, str] = {}
     for name, pair in found.items():
@@ -231,7 +231,7 @@ def choose_pairs(
 
 
 def read_cameras(lake: Lake, vehicle: str, days: Iterable[str], cameras: Sequence[str]) -> dict[str, Camera]:
-    """Intrinsics of cameras by name, each of the latest of these days whose observations show it in the lake."""
+    """Intrinsics by camera, each from the latest of these days that has observations of it in the lake."""
     found: dict[str, Camera] = {}
     for day in sorted(days, reverse=True):
         partition = Partition(vehicle, day)
@@ -245,13 +245,16 @@ def read_cameras(lake: Lake, vehicle: str, days: Iterable[str], cameras: Sequenc
                     camera = camera_of(seen)
                     K, D = np.array(camera.K), np.array(camera.D)
                     found[name] = Camera(camera.model, K, D, camera.width_px, camera.height_px)
-        except ContractError as err:  # damaged, or collected after its time
+        except ContractError as err:  # damaged, or deleted at the end of its retention
             lake.damage.append(str(err))
     return found
 
 
 def read_frame_ids(lake: Lake, vehicle: str, days: Iterable[str]) -> dict[str, str]:
-    """Frame of each sensor as the logs of the latest of these days call it; none of a sensor that has several names."""
+    """Frame of each sensor in the logs of the latest of these days.
+
+    Sensors with several frame names are left out.
+    """
     for day in sorted(days, reverse=True):
         try:
             manifest = ingested(lake, Partition(vehicle, day))

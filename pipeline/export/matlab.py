@@ -1,7 +1,7 @@
-"""JSON for MATLAB's jsondecode: matrices as rows of equal length, names that are identifiers; also a prior file.
+"""JSON for MATLAB's jsondecode: matrices as rows of equal length, names as identifiers; also a prior.
 
-`rigidtform3d(s.T_camera_lidar)` (R2022b and later) takes columns of coordinates as the matrix does; the older
-`rigid3d` takes rows: give it the transpose.
+`rigidtform3d(s.T_camera_lidar)` (R2022b and later) uses column vectors, as the matrix does; the older
+`rigid3d` uses row vectors: pass the transpose.
 """
 
 from __future__ import annotations

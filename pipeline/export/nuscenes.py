@@ -1,6 +1,7 @@
-"""nuScenes' tables sensor and calibrated_sensor, and TIER IV's T4, which adds the camera's distortion.
+"""nuScenes' tables sensor and calibrated_sensor, and TIER IV's T4, which includes the camera's distortion.
 
-`calibrated_sensor` holds T_ego_sensor: rotation (w, x, y, z), translation [m]; the ego frame is the root of the tree.
+`calibrated_sensor` holds T_ego_sensor: rotation (w, x, y, z), translation [m]; the ego frame is the root of
+the tree.
 
 Source: nuscenes-devkit, docs/schema_nuscenes.md; tier4/t4-devkit, schema.
 """
@@ -22,11 +23,11 @@ from pipeline.geometry.transform_tree import TransformTree
 
 __all__ = ["NUSCENES", "T4"]
 
-_EGO = "nuscenes ego"  # no channel is called so
-_SAME = 1e-9  # one channel's poses in scenes of one car are the same numbers
+_EGO = "nuscenes ego"  # no channel has this name
+_SAME = 1e-9  # tolerance: poses of one channel in scenes of one car are the same numbers
 _NOTES = (
-    "The ego frame is the root named under `frames`: the lidar itself where its pose on the car is not known.",
-    "nuScenes' images are rectified: undistort the camera's before they are used with camera_intrinsic.",
+    "The ego frame is the root listed under `frames`: the lidar, if its pose on the car is unknown.",
+    "nuScenes' images are rectified: undistort the camera's images before use with camera_intrinsic.",
 )
 
 
@@ -54,7 +55,7 @@ def _write(calibration: ExportedCalibration, *, distortion: bool) -> dict[str, b
 
 
 def _token(*words: str) -> str:
-    """32 hexadecimal digits that are the same for the same words."""
+    """32 hexadecimal digits, equal for equal words."""
     return hashlib.sha256("\0".join(words).encode()).hexdigest()[:32]
 
 
@@ -64,7 +65,7 @@ def _tree(files: Files) -> TransformTree:
         if name not in tables:
             raise ConfigError(", ".join(files), name, "missing: give sensor.json and calibrated_sensor.json")
         if not isinstance(tables[name][1], list):
-            raise ConfigError(tables[name][0], "", "is no list of rows")
+            raise ConfigError(tables[name][0], "", "is not a list of rows")
     file, rows = tables["sensor.json"]
     channels = {
         field_of(file, rows, k, "token"): field_of(file, rows, k, "channel") for k in range(len(rows))
@@ -74,7 +75,7 @@ def _tree(files: Files) -> TransformTree:
     for k in range(len(rows)):
         channel = channels.get(field_of(file, rows, k, "sensor_token"))
         if channel is None:
-            raise ConfigError(file, f"{k}.sensor_token", "is in no row of sensor.json")
+            raise ConfigError(file, f"{k}.sensor_token", "is not in sensor.json")
         q = [number_of(file, rows, k, "rotation", i) for i in range(4)]
         t = [number_of(file, rows, k, "translation", i) for i in range(3)]
         T = pose_of_quaternion(file, f"{k}.rotation", q, t)

@@ -1,4 +1,4 @@
-"""OpenCV's FileStorage (YAML): transforms, covariances and intrinsics under the names that OpenCV's samples use.
+"""OpenCV's FileStorage (YAML): transforms, covariances and intrinsics, with names as in OpenCV's samples.
 
 Source: OpenCV core/persistence; samples/cpp/tutorial_code/calib3d (image_width, camera_matrix, ...).
 """
@@ -53,7 +53,7 @@ def _read(files: Files, edges: Sequence[Edge], _names: FrameNames) -> dict[str, 
             nodes = {edge: storage.getNode(f"T_{edge.parent.name}_{edge.child.name}") for edge in edges}
             values = {words_of(edge): node.mat() for edge, node in nodes.items() if not node.empty()}
         except (cv2.error, SystemError) as err:
-            raise ConfigError(file, "", f"no readable FileStorage: {' '.join(str(err).split())}") from err
+            raise ConfigError(file, "", f"not a readable FileStorage: {' '.join(str(err).split())}") from err
         found |= {pair: matrix_of(file, f"T_{pair}", value) for pair, value in values.items()}
     if not found:
         raise ConfigError(", ".join(files), f"T_{edges[0].parent.name}_{edges[0].child.name}", "missing")

@@ -1,6 +1,6 @@
 """ASAM OpenLABEL 1.0: coordinate systems and streams; provenance under metadata, sigma beside each pose.
 
-`pose_wrt_parent` takes coordinates of the child to its parent, X_parent = pose X_child.
+`pose_wrt_parent` maps coordinates from child to parent: X_parent = pose X_child.
 
 Source: ASAM OpenLABEL 1.0.0, section 7.8 and JSON schema.
 """
@@ -20,7 +20,7 @@ from pipeline.geometry.transform_tree import TransformTree
 
 __all__ = ["OPENLABEL"]
 
-_FEWEST_COEFFICIENTS = 5  # of distortion_coeffs in the schema
+_FEWEST_COEFFICIENTS = 5  # fewest distortion_coeffs that the schema allows
 
 
 def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
@@ -71,7 +71,7 @@ def _tree(files: Files) -> TransformTree:
         held = load_json(file, content)
         key = "vcd" if isinstance(held, dict) and "vcd" in held else "openlabel"
         if key == "vcd":
-            problem = "drafts before OpenLABEL 1.0 state poses the other way round in part; convert it first"
+            problem = "some drafts before OpenLABEL 1.0 store inverse poses; convert the file first"
             raise ConfigError(file, "vcd", problem)
         systems = field_of(file, held, key, "coordinate_systems")
         if not isinstance(systems, dict):

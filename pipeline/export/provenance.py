@@ -1,4 +1,4 @@
-"""What a file says of itself: its frames, how sure it is, where it comes from, and what must not be overlooked."""
+"""Provenance of an exported file: frames, uncertainty, origin, and warnings."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _AXES = {
     "radar": "x forward, y left, z up",
 }
 _CONVENTION = (
-    "T_a_b takes coordinates in frame b to frame a: p_a = T_a_b p_b. Metres, radians. Covariances are of the left "
+    "T_a_b maps coordinates from frame b to frame a: p_a = T_a_b p_b. Metres, radians. Covariances are of the left "
     "perturbation exp(xi) T, xi = rx ry rz tx ty tz along the axes of a; sigmas of the rotation about these axes and "
     "of the position of b's origin."
 )
@@ -25,7 +25,7 @@ _DIRECTIONS = ("azimuth", "elevation")
 
 
 def provenance_of(calibration: ExportedCalibration) -> dict[str, Any]:
-    """All that is known of a calibration as plain values, for a side file or a format's own place."""
+    """All information on a calibration in plain values, for a side file or a format's metadata."""
     return {
         "written_by": f"Boresight {calibration.code_version}",
         "vehicle": calibration.vehicle,
@@ -42,11 +42,11 @@ def provenance_of(calibration: ExportedCalibration) -> dict[str, Any]:
 
 
 def warnings_of(calibration: ExportedCalibration) -> list[str]:
-    """What a reader must not overlook, a sentence each: pairs left out or not accepted, and what is not certified."""
+    """Warnings, a sentence each: pairs left out or not accepted, and directions that are not certified."""
     found = [f"{pair} is left out: {reason}" for pair, reason in calibration.left_out.items()]
     for pair in calibration.pairs.values():
         if pair.status not in USABLE:
-            found.append(f"{pair.pair} is {pair.status.upper()}, do not load it unseen: {pair.reason}")
+            found.append(f"{pair.pair} is {pair.status.upper()}, check it before loading: {pair.reason}")
         elif missing := [d for d in _DIRECTIONS if d not in pair.certified]:
             found.append(f"{pair.pair}: {' and '.join(missing)} not certified; {pair.reason}".rstrip("; "))
         if pair.at_prior:
@@ -58,15 +58,17 @@ def warnings_of(calibration: ExportedCalibration) -> list[str]:
 
 
 def _far(pair: ExportedPair, dof: str, sigmas: float) -> str:
-    """What becomes of an axis that nothing checks, in words."""
+    """Warning for an axis that no check covers, with its treatment."""
     became = (
-        "it rests at the prior (--unchecked writes it)" if dof in pair.resting else "written all the same"
+        "reset to the prior (--unchecked writes the estimate)"
+        if dof in pair.resting
+        else "written as estimated (--unchecked)"
     )
-    return f"{dof} lies {sigmas:.1f} sigma from the prior and nothing checks it: {became}"
+    return f"{dof} lies {sigmas:.1f} sigma from the prior and no check covers it: {became}"
 
 
 def not_certified(calibration: ExportedCalibration) -> dict[str, str]:
-    """By pair, why not all of it may be relied on; empty where everything is accepted and certified."""
+    """Reason by pair why not all of it is reliable; empty if all pairs are accepted and certified."""
     found = dict(calibration.left_out)
     for name, pair in calibration.pairs.items():
         if pair.status not in USABLE:
@@ -77,11 +79,11 @@ def not_certified(calibration: ExportedCalibration) -> dict[str, str]:
 
 
 def comment_lines(calibration: ExportedCalibration, camera_axes: str | None = None) -> list[str]:
-    """The same in short, for formats with comments: one line each, printable.
+    """Provenance and warnings as printable single lines, for formats with comments.
 
     Args:
-        calibration: what is written.
-        camera_axes: of a format whose camera frame is not the optical one.
+        calibration: the calibration to write.
+        camera_axes: axes of the format's camera frame, if it is not the optical frame.
     """
     frames = _frames(calibration)
     if camera_axes is not None:
@@ -102,7 +104,7 @@ def _frames(calibration: ExportedCalibration) -> dict[str, str]:
     names = calibration.names
     axes = {names.of(sensor.name): _AXES[sensor.kind] for sensor in calibration.sensors}
     if calibration.T_base is None:
-        axes[names.of(calibration.reference.name)] += "; the root: where it sits on the car is not known here"
+        axes[names.of(calibration.reference.name)] += "; the root: its pose on the car is unknown"
     else:
         axes[names.base] = "x forward, y left, z up; the root"
     return axes
@@ -140,7 +142,7 @@ def _pair(pair: ExportedPair) -> dict[str, Any]:
 
 
 def _plain(details: Mapping[str, object]) -> dict[str, Any]:
-    """Values that JSON has."""
+    """Values that JSON supports."""
     return {
         name: list(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
         for name, value in details.items()

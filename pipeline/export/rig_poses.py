@@ -1,4 +1,4 @@
-"""Where all sensors of a rig are, out of files of any format, each by its name."""
+"""Poses of all sensors of a rig, by sensor name, from files of any format."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ __all__ = ["from_ties", "reference_of_rig", "require_all", "rig_poses", "star_te
 
 
 def reference_of_rig(rig: Rig) -> Sensor:
-    """The sensor that poses in files are said to: as fleet.toml has it, else the first lidar, radar or camera."""
+    """Reference sensor of the poses: from fleet.toml, else the first lidar, radar or camera."""
     return next((n for n in rig.nodes if n.name == rig.reference), None) or middle_of(rig.nodes)
 
 
 def rig_poses(form: Format, files: Files, names: FrameNames, rig: Rig) -> dict[str, Float[np.ndarray, "4 4"]]:
-    """T_reference_sensor by name, of those of the rig's nodes that the files hold.
+    """T_reference_sensor by name, for the sensors and base of the rig that the files contain.
 
     Raises:
-        ConfigError: they hold none, or one twice; it names file and field.
+        ConfigError: the files contain none, or one twice; the message has file and field.
     """
     reference = reference_of_rig(rig)
     ties = {words_of(edge): edge for n in rig.nodes if n != reference for edge in (tie(n, reference),)}
@@ -38,7 +38,7 @@ def rig_poses(form: Format, files: Files, names: FrameNames, rig: Rig) -> dict[s
 
 
 def from_ties(ties: Mapping[Edge, np.ndarray], reference: Sensor) -> dict[str, Float[np.ndarray, "4 4"]]:
-    """T_reference_sensor by name of the sensor, from T_parent_child of ties to the reference."""
+    """T_reference_sensor by sensor name, from T_parent_child of edges to the reference."""
     return {
         edge.other(reference.name).name: T if edge.parent == reference else inverse(T)
         for edge, T in ties.items()
@@ -51,7 +51,7 @@ def require_all(
     """The poses in the rig's order.
 
     Raises:
-        ConfigError: sensors that are missing, by name, with the frames that were looked for.
+        ConfigError: sensors are missing; the message has their names and the frames that were searched for.
     """
     reference = reference_of_rig(rig)
     missing = [n.name for n in rig.nodes if n != reference and n.name not in poses]
@@ -66,7 +66,7 @@ def require_all(
 
 
 def star_text(poses: Mapping[str, np.ndarray], rig: Rig, form: str, files: Sequence[str]) -> bytes:
-    """A prior file (`[rigs.*.prior] source = "file"`) of these poses."""
+    """Prior file (`[rigs.*.prior] source = "file"`) with these poses."""
     T = {name: np.asarray(pose).tolist() for name, pose in poses.items()}
     origin = {"format": form, "files": list(files)}
     return to_json({"reference": reference_of_rig(rig).name, "T": T, "imported_from": origin})

@@ -84,7 +84,7 @@ def _tree(files: Files) -> TransformTree:
 def _from_yaml(file: str, content: bytes) -> list[list[str]]:
     nodes = field_of(file, load_yaml(file, content), "launch")
     if not isinstance(nodes, list):
-        raise ConfigError(file, "launch", "is no list of nodes")
+        raise ConfigError(file, "launch", "is not a list of nodes")
     found = []
     for k, entry in enumerate(nodes):
         node = entry.get("node") if isinstance(entry, dict) else None
@@ -94,11 +94,11 @@ def _from_yaml(file: str, content: bytes) -> list[list[str]]:
 
 
 def _from_python(file: str, content: bytes) -> list[list[str]]:
-    """Lists of literals given as `arguments=` to Node(...); nothing of the file is run."""
+    """Lists of literals passed as `arguments=` to Node(...); the file is parsed, not run."""
     try:
         tree = ast.parse(text_of(file, content))
     except (SyntaxError, ValueError, RecursionError) as err:
-        raise ConfigError(file, "", f"is no Python: {err}") from err
+        raise ConfigError(file, "", f"is not Python: {err}") from err
     found: list[list[str]] = []
     for call in ast.walk(tree):
         if isinstance(call, ast.Call):
@@ -106,7 +106,7 @@ def _from_python(file: str, content: bytes) -> list[list[str]]:
             if "arguments" in given and _literal(given.get("executable")) == "static_transform_publisher":
                 arguments = _literal(given["arguments"])
                 if not isinstance(arguments, list):
-                    raise ConfigError(file, f"line {call.lineno}: arguments", "is no list of literals")
+                    raise ConfigError(file, f"line {call.lineno}: arguments", "is not a list of literals")
                 found.append([str(a) for a in arguments])
     return found
 
@@ -114,7 +114,7 @@ def _from_python(file: str, content: bytes) -> list[list[str]]:
 def _literal(node: ast.expr | None) -> Any:
     try:
         return None if node is None else ast.literal_eval(node)
-    except ValueError:  # computed there
+    except ValueError:  # not a literal
         return None
 
 
@@ -125,7 +125,7 @@ def _add(file: str, tree: TransformTree, arguments: Sequence[str]) -> None:
         try:
             values.append(float(given[name]))
         except (KeyError, ValueError) as err:
-            problem = "missing" if isinstance(err, KeyError) else f"{given[name]!r} is no number"
+            problem = "missing" if isinstance(err, KeyError) else f"{given[name]!r} is not a number"
             raise ConfigError(file, name, problem) from err
     parent, child = require_frames(file, given.get("--frame-id"), given.get("--child-frame-id"))
     tree.add_transform(parent, child, pose_of_quaternion(file, "--qw", values[3:], values[:3]))

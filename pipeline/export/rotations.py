@@ -1,4 +1,4 @@
-"""Rotations as other programs write them: roll, pitch, yaw of URDF and ROS, and a camera's link beside its optics."""
+"""Rotations in other conventions: roll, pitch, yaw of URDF and ROS, and a camera's link and optical frame."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from pipeline.geometry.se3 import from_rotation_translation
 
 __all__ = ["T_LINK_OPTICAL", "pose_of_rpy", "rpy_of"]
 
-# Axes of the optical frame (x right, y down, z forward) seen in the camera's link (x forward, y left, z up), REP 103:
-# as roll, pitch, yaw it is -pi/2, 0, -pi/2, here without rounding.
+# Axes of the optical frame (x right, y down, z forward) in the camera's link (x forward, y left, z up), REP
+# 103: roll, pitch, yaw = -pi/2, 0, -pi/2, here without rounding.
 T_LINK_OPTICAL = from_rotation_translation(
     np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3)
 )
@@ -19,8 +19,8 @@ T_LINK_OPTICAL = from_rotation_translation(
 def rpy_of(R: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 3"]:
     """Roll, pitch, yaw [rad] about fixed axes x, y, z: R = Rz(yaw) Ry(pitch) Rx(roll).
 
-    Each angle is taken from what the ones before leave, so that the three give R back to rounding even where the
-    pitch is +-90 deg and roll and yaw are not unique.
+    Each angle is computed from the rest that the previous ones leave. So the three reproduce R to rounding,
+    also at a pitch of +-90 deg, where roll and yaw are not unique.
     """
     yaw = np.arctan2(R[1, 0], R[0, 0])
     c, s = np.cos(yaw), np.sin(yaw)
@@ -30,7 +30,7 @@ def rpy_of(R: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 3"]:
 
 
 def pose_of_rpy(xyz_m: Float[np.ndarray, " 3"], rpy_rad: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "4 4"]:
-    """T_parent_child of a position and of roll, pitch, yaw about fixed axes: URDF's origin, Autoware's entries."""
+    """T_parent_child from a position and from roll, pitch, yaw about fixed axes, as in URDF and Autoware."""
     (cr, cp, cy), (sr, sp, sy) = np.cos(rpy_rad), np.sin(rpy_rad)
     R = np.array(
         [

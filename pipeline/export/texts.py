@@ -1,4 +1,4 @@
-"""JSON and YAML as text and back: floats with all their digits, errors that name the file and the field."""
+"""JSON and YAML: floats with all their digits, errors with file and field."""
 
 from __future__ import annotations
 
@@ -32,25 +32,25 @@ __all__ = [
     "to_yaml",
 ]
 
-# As in `extrinsics.prior`: calibrations shipped with three or four digits are still meant as rotations.
+# As in `extrinsics.prior`: matrices with three or four digits are accepted as rotations.
 _ROTATION_TOLERANCE = 1e-3
-_NORM_TOLERANCE = 0.01  # as `TransformTree`: a quaternion farther from unit length is no rotation
+_NORM_TOLERANCE = 0.01  # as `TransformTree`: largest deviation of a quaternion's length from 1
 
 
 def text_of(file: str, content: bytes) -> str:
     """Text of a file.
 
     Raises:
-        ConfigError: it is not UTF-8.
+        ConfigError: not UTF-8.
     """
     try:
         return content.decode()
     except UnicodeDecodeError as err:
-        raise ConfigError(file, "", f"is no text (UTF-8): {err.reason} at byte {err.start}") from err
+        raise ConfigError(file, "", f"is not UTF-8 text: {err.reason} at byte {err.start}") from err
 
 
 def to_json(value: Any) -> bytes:
-    """Indented JSON; floats as Python prints them, so that reading gives the same bits; null for what is not finite."""
+    """Indented JSON; floats keep all bits, non-finite numbers become null."""
     return (json.dumps(plain(value), indent=2, allow_nan=False) + "\n").encode()
 
 
@@ -58,12 +58,12 @@ def load_json(file: str, content: bytes) -> Any:
     """Value of a JSON file.
 
     Raises:
-        ConfigError: it is none.
+        ConfigError: not JSON.
     """
     try:
         return json.loads(text_of(file, content))
     except (ValueError, RecursionError) as err:
-        raise ConfigError(file, "", f"no readable JSON: {err}") from err
+        raise ConfigError(file, "", f"not readable JSON: {err}") from err
 
 
 def to_yaml(value: Mapping[str, Any], comments: Sequence[str]) -> bytes:
@@ -72,16 +72,16 @@ def to_yaml(value: Mapping[str, Any], comments: Sequence[str]) -> bytes:
     yaml = YAML()
     yaml.Representer = _Representer
     yaml.default_flow_style = False
-    yaml.width = 4096  # a row of numbers stays a row
+    yaml.width = 4096  # keeps a row of numbers on one line
     yaml.dump(_styled(value), stream)
     return ("".join(f"# {line}\n" for line in comments) + stream.getvalue()).encode()
 
 
 def load_yaml(file: str, content: bytes) -> Any:
-    """Value of a YAML file; OpenCV's `%YAML:1.0` in front, which strict readers refuse, is passed over.
+    """Value of a YAML file; skips OpenCV's first line `%YAML:1.0`, which strict readers refuse.
 
     Raises:
-        ConfigError: it is none.
+        ConfigError: not YAML.
     """
     text = text_of(file, content)
     if text.startswith("%YAML:"):
@@ -89,14 +89,14 @@ def load_yaml(file: str, content: bytes) -> Any:
     try:
         return YAML(typ="safe", pure=True).load(text)
     except (YAMLError, ValueError, RecursionError) as err:
-        raise ConfigError(file, "", f"no readable YAML: {' '.join(str(err).split())[:200]}") from err
+        raise ConfigError(file, "", f"not readable YAML: {' '.join(str(err).split())[:200]}") from err
 
 
 def edit_yaml(file: str, content: bytes, edit: Callable[[Any], None]) -> bytes:
-    """A YAML file with some values changed in place: other values, their order and all comments stay.
+    """Change values of a YAML file in place; other values, their order and all comments stay.
 
     Raises:
-        ConfigError: it is no YAML.
+        ConfigError: not YAML.
     """
     yaml = YAML()
     yaml.Representer = _Representer
@@ -105,7 +105,7 @@ def edit_yaml(file: str, content: bytes, edit: Callable[[Any], None]) -> bytes:
     try:
         held = yaml.load(text_of(file, content))
     except (YAMLError, ValueError, RecursionError) as err:
-        raise ConfigError(file, "", f"no readable YAML: {' '.join(str(err).split())[:200]}") from err
+        raise ConfigError(file, "", f"not readable YAML: {' '.join(str(err).split())[:200]}") from err
     edit(held)
     stream = io.StringIO()
     yaml.dump(held, stream)
@@ -113,10 +113,10 @@ def edit_yaml(file: str, content: bytes, edit: Callable[[Any], None]) -> bytes:
 
 
 def field_of(file: str, value: Any, *path: str | int) -> Any:
-    """What lies under a path of keys and indices.
+    """Value at a path of keys and indices.
 
     Raises:
-        ConfigError: there is nothing; it names the path up to what is missing.
+        ConfigError: there is none; the message has the path up to the missing part.
     """
     for depth, key in enumerate(path):
         where = ".".join(str(p) for p in path[: depth + 1])
@@ -128,7 +128,7 @@ def field_of(file: str, value: Any, *path: str | int) -> Any:
 
 
 def number_of(file: str, value: Any, *path: str | int) -> float:
-    """The finite number under a path.
+    """Finite number at a path.
 
     Raises:
         ConfigError: there is none.
@@ -136,22 +136,22 @@ def number_of(file: str, value: Any, *path: str | int) -> float:
     found = field_of(file, value, *path)
     where = ".".join(str(p) for p in path)
     if isinstance(found, bool) or not isinstance(found, int | float):
-        raise ConfigError(file, where, f"{found!r} is no number")
+        raise ConfigError(file, where, f"{found!r} is not a number")
     if not np.isfinite(found):
         raise ConfigError(file, where, f"{found!r} is not finite")
     return float(found)
 
 
 def matrix_of(file: str, key: str, values: Any) -> Float[np.ndarray, "4 4"]:
-    """T of 3x4 or 4x4 numbers, nested or flat, row-major, bit for bit.
+    """T from 3x4 or 4x4 numbers, nested or flat, row-major, bit for bit.
 
     Raises:
-        ConfigError: these are no rigid transform.
+        ConfigError: not a rigid transform.
     """
     try:
         flat = np.array(values, np.float64).reshape(-1)
     except (TypeError, ValueError) as err:
-        raise ConfigError(file, key, "is no matrix of numbers") from err
+        raise ConfigError(file, key, "is not a matrix of numbers") from err
     if flat.size not in (12, 16) or not np.all(np.isfinite(flat)):
         raise ConfigError(file, key, f"needs 12 or 16 finite numbers, row by row, and has {flat.size}")
     T = np.vstack([flat[:12].reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
@@ -159,17 +159,17 @@ def matrix_of(file: str, key: str, values: Any) -> Float[np.ndarray, "4 4"]:
         raise ConfigError(file, key, "its last row is not 0 0 0 1")
     R = T[:3, :3]
     if not np.allclose(R @ R.T, np.eye(3), atol=_ROTATION_TOLERANCE) or np.linalg.det(R) < 0:
-        raise ConfigError(file, key, "its 3x3 part is no rotation")
+        raise ConfigError(file, key, "its 3x3 part is not a rotation")
     return T
 
 
 def pose_of_quaternion(
     file: str, key: str, q_wxyz: Sequence[float], t_m: Sequence[float]
 ) -> Float[np.ndarray, "4 4"]:
-    """T of a quaternion, scalar first, and a translation.
+    """T from a quaternion, scalar first, and a translation [m].
 
     Raises:
-        ConfigError: the quaternion is no rotation, or a number is not finite.
+        ConfigError: not a unit quaternion, or a number is not finite.
     """
     q, t = np.array(q_wxyz, np.float64), np.array(t_m, np.float64)
     if q.shape != (4,) or t.shape != (3,) or not np.all(np.isfinite([*q, *t])):
@@ -180,7 +180,7 @@ def pose_of_quaternion(
 
 
 class _Representer(RoundTripRepresenter):
-    """Floats with a point always: YAML 1.1, which most cars read, takes 1e-17 for a word."""
+    """Writes floats with a decimal point: YAML 1.1, which most cars read, parses 1e-17 as a string."""
 
 
 def _float(representer: RoundTripRepresenter, value: float) -> ScalarNode:
@@ -194,7 +194,7 @@ _Representer.add_representer(float, _float)
 
 
 def _styled(value: Any) -> Any:
-    """The same with maps in blocks and rows of numbers in flow style."""
+    """Copy with maps in block style and rows of numbers in flow style."""
     if isinstance(value, Mapping):
         return CommentedMap((key, _styled(v)) for key, v in value.items())
     if isinstance(value, (list, tuple)):

@@ -1,6 +1,7 @@
-"""MCAP with one tf2_msgs/TFMessage on /tf_static, as a ROS 2 recording has it; provenance is in its metadata.
+"""MCAP with one tf2_msgs/TFMessage on /tf_static, as in a ROS 2 recording; provenance in its metadata.
 
-Source: rosbag2_storage_mcap (channel metadata `offered_qos_profiles`), tf2_ros StaticTransformBroadcaster (QoS).
+Source: rosbag2_storage_mcap (channel metadata `offered_qos_profiles`), tf2_ros StaticTransformBroadcaster
+(QoS).
 """
 
 from __future__ import annotations
@@ -25,14 +26,15 @@ __all__ = ["TF_STATIC"]
 
 _TYPE = "tf2_msgs/msg/TFMessage"
 _TOPIC = "/tf_static"
-# Who comes late gets the message too: transient local (1), reliable (1), keep last (1), as the static broadcaster.
+# Late subscribers receive the message too: transient local (1), reliable (1), keep last (1), as in tf2_ros.
 _QOS = (
     "- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n"
     "  deadline:\n    sec: 9223372036\n    nsec: 854775807\n  lifespan:\n    sec: 9223372036\n    nsec: 854775807\n"
     "  liveliness: 1\n  liveliness_lease_duration:\n    sec: 9223372036\n    nsec: 854775807\n"
     "  avoid_ros_namespace_conventions: false\n"
 )
-_MOST_BYTES = 1 << 30  # /tf_static comes first in a log; of a larger one, give the split's first file
+# /tf_static is at the start of a log; of a larger log, give the first file of the split
+_MOST_BYTES = 1 << 30
 
 
 def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
@@ -54,10 +56,10 @@ def _tree(files: Files) -> TransformTree:
 
 
 def read_static_transforms(file: str, content: bytes, tree: TransformTree) -> None:
-    """Put every transform on /tf_static of a ROS 2 MCAP into a tree.
+    """Add every transform on /tf_static of a ROS 2 MCAP to a tree.
 
     Raises:
-        ConfigError: it is no such file.
+        ConfigError: not such a file.
     """
     if len(content) > _MOST_BYTES:
         raise ConfigError(
@@ -73,10 +75,10 @@ def read_static_transforms(file: str, content: bytes, tree: TransformTree) -> No
                 )
             bad = tree.add_message(store.deserialize_cdr(message.data, _TYPE))
             if bad:
-                raise ConfigError(file, _TOPIC, f"{bad} of its entries are no rigid transforms")
+                raise ConfigError(file, _TOPIC, f"{bad} of its entries are not rigid transforms")
             seen += 1
     except (McapError, struct.error, ValueError, IndexError, AssertionError) as err:
-        raise ConfigError(file, _TOPIC, f"no readable MCAP: {err}") from err
+        raise ConfigError(file, _TOPIC, f"not a readable MCAP: {err}") from err
     if not seen:
         raise ConfigError(file, _TOPIC, "no message")
 

@@ -1,4 +1,4 @@
-"""Edges out of the trees of frames that most formats hold."""
+"""Edges from trees of frames, which most formats hold."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pipeline.rig.graph import Edge
 
 __all__ = ["ESTIMATED_EDGES", "ESTIMATED_PAIRS", "pairs_of_tree", "require_frames"]
 
-# The pairs that a prior file holds; the third is their composition.
+# The pairs in a prior file; the third pair is their composition.
 ESTIMATED_PAIRS = ("camera_lidar", "lidar_radar")
 ESTIMATED_EDGES = tuple(EDGE_OF_PAIR[pair] for pair in ESTIMATED_PAIRS)
 
@@ -23,14 +23,14 @@ ESTIMATED_EDGES = tuple(EDGE_OF_PAIR[pair] for pair in ESTIMATED_PAIRS)
 def pairs_of_tree(
     file: str, tree: TransformTree, names: FrameNames, edges: Sequence[Edge]
 ) -> dict[str, Float[np.ndarray, "4 4"]]:
-    """T_parent_child of edges by their words, those of them that the tree joins.
+    """T_parent_child by edge name, of those edges whose frames the tree connects.
 
     Raises:
-        ConfigError: none, with the frames that the file holds; or one stands there twice.
+        ConfigError: no edge found (the message lists the file's frames), or a frame occurs twice.
     """
     twice = sorted(tree.twice & {names.of(s.name) for edge in edges for s in edge.sensors})
     if twice:
-        raise ConfigError(file, twice[0], "stands there twice, with different poses: give one calibration")
+        raise ConfigError(file, twice[0], "occurs twice, with different poses: give one calibration")
     found = {}
     for edge in edges:
         T = tree.lookup(names.of(edge.parent.name), names.of(edge.child.name))
@@ -49,14 +49,14 @@ def pairs_of_tree(
 
 
 def require_frames(file: str, parent: object, child: object) -> tuple[str, str]:
-    """Two frame names as a file gives them, without ROS 1's leading slash.
+    """Two frame names of a file, without ROS 1's leading slash.
 
     Raises:
-        ConfigError: they are no two different names.
+        ConfigError: invalid or equal names.
     """
     if not (isinstance(parent, str) and isinstance(child, str)):
-        raise ConfigError(file, "parent, child", f"{parent!r} and {child!r} are no frame names")
+        raise ConfigError(file, "parent, child", f"{parent!r} and {child!r} are not frame names")
     parent, child = parent.lstrip("/"), child.lstrip("/")
     if not parent or not child or parent == child:
-        raise ConfigError(file, "parent, child", f"{parent!r} and {child!r} are no two frames")
+        raise ConfigError(file, "parent, child", f"{parent!r} and {child!r} must be two different frames")
     return parent, child

@@ -1,4 +1,4 @@
-"""URDF: a link per frame, a fixed joint per pose; and the same as a xacro macro, to hang on a car's own description.
+"""URDF: a link per frame, a fixed joint per pose; and a xacro macro of both, for a car's own description.
 
 Source: URDF XML specification (origin: xyz [m], rpy [rad] about fixed axes); xacro's macros and properties.
 """
@@ -35,7 +35,10 @@ def _write_urdf(calibration: ExportedCalibration) -> dict[str, bytes]:
 
 
 def _write_xacro(calibration: ExportedCalibration) -> dict[str, bytes]:
-    """A macro with all links and joints below the root, which the including file owns, and one call of it."""
+    """A macro with all links and joints below the root, and one call of it.
+
+    The including file defines the root.
+    """
     edges = poses_of(calibration)
     robot = ET.Element("robot", {"xmlns:xacro": _XACRO, "name": _identifier(calibration.vehicle)})
     macro = ET.SubElement(robot, "xacro:macro", name=_MACRO, params=f"parent:={calibration.root}")
@@ -49,7 +52,7 @@ def _write_xacro(calibration: ExportedCalibration) -> dict[str, bytes]:
 
 
 def joint_of(edge: Pose, parent: str | None = None) -> ET.Element:
-    """The fixed joint of a pose; `parent` where the link is named by a macro's parameter."""
+    """Fixed joint of a pose; `parent` = name of the macro parameter that replaces the parent link."""
     joint = ET.Element("joint", name=f"{edge.parent}_to_{edge.child}", type="fixed")
     ET.SubElement(joint, "origin", xyz=_numbers(edge.T[:3, 3]), rpy=_numbers(rpy_of(edge.T[:3, :3])))
     ET.SubElement(joint, "parent", link=parent or edge.parent)
@@ -58,7 +61,10 @@ def joint_of(edge: Pose, parent: str | None = None) -> ET.Element:
 
 
 def xml_of(root: ET.Element, comments: Sequence[str]) -> bytes:
-    """An indented document whose first lines are comments; two hyphens, which would end one, are set apart."""
+    """Indented document with comments on its first lines.
+
+    Double hyphens, which end a comment, are separated.
+    """
     safe = [line.replace("--", "- -").replace("--", "- -") for line in comments]
     for line in reversed(safe):
         root.insert(0, ET.Comment(f" {line} "))
@@ -78,10 +84,10 @@ def _tree(files: Files) -> TransformTree:
     tree = TransformTree()
     for file, content in files.items():
         try:
-            # expat refuses entities that explode (libexpat 2.4.1 and later), and loads nothing from elsewhere.
+            # expat limits entity expansion (libexpat 2.4.1 and later) and loads no external entities.
             root = ET.fromstring(content)  # noqa: S314
         except ET.ParseError as err:
-            raise ConfigError(file, "", f"no readable XML: {err}") from err
+            raise ConfigError(file, "", f"not readable XML: {err}") from err
         default = _default_parent(root)
         for joint in root.iter("joint"):
             if joint.get("type") == "fixed":
@@ -90,7 +96,7 @@ def _tree(files: Files) -> TransformTree:
 
 
 def _default_parent(root: ET.Element) -> str:
-    """What `${parent}` stands for in our own macro."""
+    """Default of `${parent}` in Boresight's own macro."""
     macro = root.find(f"{{{_XACRO}}}macro")
     params = macro.get("params", "") if macro is not None else ""
     return params.partition(":=")[2]

@@ -1,4 +1,4 @@
-"""Frames of a vehicle-day with what perception found in them, for formats that show a drive."""
+"""Frames of a vehicle-day with their features, for formats that show a drive."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ __all__ = ["read_scenes"]
 def read_scenes(
     lake: Lake, partition: Partition, most: int, chosen: Chosen | None = None
 ) -> Iterator[tuple[Frame, Observation | None]]:
-    """At most so many frames, evenly spread, in order of stamp; None beside those that perception left out.
+    """At most `most` frames, evenly spread, in order of stamp; None beside a frame that perception left out.
 
-    `chosen`: whose frames; None = the first camera, lidar and radar of the day.
+    `chosen`: sensors of the frames; None = the first camera, lidar and radar of the day.
 
     Raises:
         ConfigError: the lake has no frames of that day.
         DamagedError: a file of the day cannot be read.
-        CollectedError: the day's rows left the lake after their time.
+        CollectedError: the day's rows were deleted at the end of their retention.
     """
     manifest = ingested(lake, partition)
     if manifest is None:
         problem = f"the lake has no frames of {partition.vehicle} {partition.day}: ingest the day's logs"
         raise ConfigError("command line", "day", problem)
     picked = np.unique(np.linspace(0, max(manifest.rows - 1, 0), most).round().astype(int)).tolist()
-    # None of a day that was not perceived.
+    # Empty for a day that was not perceived.
     seen = iter(()) if perceived(lake, partition) is None else observations_of(lake, partition, None, chosen)
     observation = next(seen, None)
     for frame in frames_of(lake, partition, picked, chosen):

@@ -158,7 +158,7 @@ def test_a_jump_of_the_poses_begins_another_drive(tmp_path):
         ("vod", "lidar/training/calib/00000.txt", b"P2: 1 2\n", "00000.txt: P2: needs 12 numbers and has 2"),
         ("vod", "lidar/training/pose/00003.json", b'{"odomToCamera": [1]}', "odomToCamera: needs 16 numbers"),
         ("vod", "lidar/training/image_2/00000.jpg", b"", "00000.jpg: is no readable image"),
-        ("kitti", "calib/000000.txt", b"P2: one\n", "P2: holds what is no number"),
+        ("kitti", "calib/000000.txt", b"P2: one\n", "P2: holds what is not a number"),
     ],
 )
 def test_a_broken_file_is_named_and_leaves_no_log(name, file, content, words, tmp_path, capsys):

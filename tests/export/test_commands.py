@@ -136,7 +136,7 @@ def test_a_held_pair_is_left_out_unless_forced_and_then_marked(lake, tmp_path, c
     assert "\n  radar:" not in kit.read_text()
     code, summary, _ = run(capsys, *call, "--force")
     assert (code, summary["pairs"]) == (3, ["camera_lidar", "lidar_radar"])
-    assert "WARNING: lidar_radar is HELD, do not load it unseen: halves disagree" in kit.read_text()
+    assert "WARNING: lidar_radar is HELD, check it before loading: halves disagree" in kit.read_text()
     assert "\n  radar:" in kit.read_text()
 
 
@@ -195,7 +195,7 @@ def test_the_car_hangs_on_its_own_base_where_a_file_says_where_the_lidar_sits(la
         (["kitti", "--lake", "{lake}", "--vehicle", "w"], "no state of w by joint"),
         (["kitti", "--lake", "{lake}", "--vehicle", "v", "--day", "2020-01-01"], "no record of v 2020-01-01"),
         (["kitti", "--lake", "{lake}", "--vehicle", "v", "--day", "yesterday"], "is no day"),
-        (["urdf", "--lake", "{lake}", "--vehicle", "v", "--lidar-frame", "a b"], "is no frame name"),
+        (["urdf", "--lake", "{lake}", "--vehicle", "v", "--lidar-frame", "a b"], "is not a valid frame name"),
         (["urdf", "--lake", "{lake}", "--vehicle", "v", "--lidar-frame", "radar"], "must differ"),
         (
             ["urdf", "--lake", "{lake}", "--vehicle", "v", "--mount", "car.urdf"],
@@ -267,7 +267,7 @@ def test_autoware_s_own_kit_keeps_its_comments_its_other_sensors_and_its_lidar(l
     for form, bad, words in (
         ("autoware", [*names[:2], "--lidar-frame", "side"], "sensor_kit_base_link.side: missing"),
         ("autoware", ["--camera-frame", "c", *names[2:]], "none is in sensor_kit_base_link"),
-        ("urdf", names, "no files that are updated in place"),
+        ("urdf", names, "does not support --update"),
     ):
         code, summary, _ = run(capsys, "export", form, *of_v, *bad)
         assert code == 2

@@ -116,7 +116,7 @@ def test_poses_of_one_of_each_are_written_with_what_their_pairs_call_unchecked(
     assert json.loads(said.splitlines()[-1])["pairs"] == ["camera_lidar", "lidar_radar"]
     T = np.array(side["pairs"]["lidar_radar"]["T_lidar_radar"])
     assert change_between(T_LIDAR_RADAR, T)[0] == pytest.approx(0.0, abs=1e-9)
-    assert "sigma from the prior and nothing checks it" in err
+    assert "sigma from the prior and no check covers it" in err
 
 
 @pytest.mark.parametrize("source", [[], ["--day", "2026-03-04"]])
@@ -135,8 +135,8 @@ def test_an_export_leaves_it_at_the_prior_unless_it_is_asked_for(
         assert code == 3
         assert "rx" in pair["unchecked_sigmas"]
         assert ("rx" in pair["kept_at_prior"]) == (not options)
-        assert "sigma from the prior and nothing checks it" in err
-        assert any("nothing checks it" in words for words in side["warnings"])
+        assert "sigma from the prior and no check covers it" in err
+        assert any("no check covers it" in words for words in side["warnings"])
     assert rolls[0] == pytest.approx(0.0, abs=1e-9)
     assert rolls[1] == pytest.approx(0.05, abs=0.02)
 
