@@ -1,1 +1,1 @@
-"""Logs to table frames: read, synchronise, de-skew, keep what is needed."""
+"""From logs to table rows: read, synchronise, de-skew, keep only the needed data."""

@@ -1,4 +1,4 @@
-"""A day's messages of radars about their own alignment, as one statement per radar for the manifest."""
+"""Radar misalignment messages of a day, summarised as one estimate per radar for the manifest."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from pipeline.rigs import RadarTopics
 
 __all__ = ["day_alignments", "level_and_step"]
 
-_MOST_MESSAGES = 300  # of a topic, evenly spread: some drivers put the angles beside 800 detections
-_LEAST_STEP_RAD = np.radians(0.1)  # what a day knows a radar's yaw to, at best
+_MOST_MESSAGES = 300  # per topic, evenly spread: some drivers put the angles beside 800 detections
+_LEAST_STEP_RAD = np.radians(0.1)  # best accuracy of a day's radar yaw
 _STEP_SIGMAS = 5.0
-_FEWEST = 3  # messages on either side of a step
+_FEWEST = 3  # fewest messages on either side of a step
 
 
 def day_alignments(index: DayIndex, rig: Rig) -> dict[str, dict[str, Any]]:
-    """By radar the columns of table `radar_alignments` that its messages fill; none of a radar without a usable one.
+    """Columns of table `radar_alignments` by radar, for radars with a usable message.
 
-    What cannot be read is named among the index's problems, with file, topic and field, and counted.
+    Unreadable messages are counted, and added to the index's problems with file, topic and field.
     """
     found = {name: _of_radar(index, name, radar) for name, radar in rig.radars.items() if radar.alignment}
     return {name: columns for name, columns in found.items() if columns["messages"]}
@@ -36,14 +36,14 @@ def day_alignments(index: DayIndex, rig: Rig) -> dict[str, dict[str, Any]]:
 def level_and_step(
     values: Float[np.ndarray, " N"],
 ) -> tuple[float, float, float | None, int]:
-    """Level of values in order of time, scatter about it, a step among them, and its place.
+    """Level of a series of values, their scatter, and a possible step.
 
     Args:
         values: at least one, in order of time [rad].
 
     Returns:
-        Median of what comes after the step; robust sigma of single values; the step's size, None where none exceeds
-        five sigmas and 0.1 deg; index of the first value after it (0 without a step).
+        Median of the values after the step; robust sigma of single values; size of the step, None if none
+        exceeds five sigmas and 0.1 deg; index of the first value after the step (0 without a step).
     """
     place, step, n = 0, None, len(values)
     if n >= 2 * _FEWEST:
@@ -95,7 +95,7 @@ def _axis(
     stamps_ns: Int64[np.ndarray, " N"],
     said: list[tuple[float | None, float | None]],
 ) -> tuple[float, int]:
-    """Fill in one axis; size and stamp of its step, 0 and 0 without one."""
+    """Fill in the columns of one axis; returns size and stamp of its step, 0 and 0 without one."""
     known = np.array([angle is not None for angle, _ in said])
     if not known.any():
         return 0.0, 0
@@ -110,7 +110,7 @@ def _axis(
 
 
 def _messages(index: DayIndex, name: str, radar: RadarTopics) -> list[tuple[int, Misalignment]]:
-    """Stamps and contents in order of stamps, at most some hundred of each topic."""
+    """Stamps and contents in order of stamps, at most a few hundred per topic."""
     stream = index.stream(Role(ALIGNMENT, name))
     of_topic: dict[str, list[int]] = {}
     for place in np.argsort(stream.stamps_ns, kind="stable").tolist():

@@ -1,9 +1,9 @@
-"""Which parts of a long day are read: bursts of consecutive moments, spread over time, speed, turn and place.
+"""Choice of what to read of a long day: bursts of moments, spread over time, speed, turn and place.
 
-A calibration takes some hundred frames, and the ones that come next in a drive show much the same. So the day is cut
-into parts of equally many sweeps; in the middle of each lies a burst that could be read, and of these those are read
-that show most: a set is worth the sum over time, speed, turn and place of log(1 + bursts) in each class of it, and the
-burst that adds most comes next (submodular, as the choice of frames in `calibrate/select/coverage.py`).
+A calibration takes about a hundred frames, and consecutive frames of a drive are similar. The day is divided
+into parts with equal numbers of sweeps, with one possible burst in the middle of each. Bursts are then chosen
+greedily to maximise the sum over classes of time, speed, turn and place of log(1 + bursts in the class). This
+function is submodular, as in the choice of frames in `calibrate/select/coverage.py`.
 """
 
 from __future__ import annotations
@@ -17,29 +17,31 @@ from pipeline.ingest.containers.timeline import PAUSE_NS
 
 __all__ = ["BURST_TRIOS", "BurstMotion", "PossibleBursts", "choose_bursts", "possible_bursts"]
 
-# Tracks of moving clusters count from their second scan on (`calibrate/select/triggers.py`), and Doppler wraps are told
-# apart within a few more; 20 scans are 2 s at 10 Hz, shorter than the blocks by which frames that judge are held out.
-# Bursts of 10 were as good on two simulated days of three, and had a radar held on one.
+# Tracks of moving clusters count from their second scan on (`calibrate/select/triggers.py`), and Doppler
+# aliases are resolved within a few more scans; 20 scans are 2 s at 10 Hz, shorter than the blocks of held-out
+# frames. Bursts of 10 were as good on two simulated days of three, and one radar was held on the third.
 BURST_TRIOS = 20
-# Where most sweeps have no 20 about them without a pause, there are no tracks to gain, and more scenes are worth
-# more: 80 sweeps of the real day in runs of 20, 10 and 5 had camera-lidar 0.20, 0.04 and 0.01 deg off in elevation.
+# If most sweeps are not part of 20 without a pause, tracks gain nothing, and more scenes are better: 80
+# sweeps of the real day in runs of 20, 10 and 5 had a camera-lidar elevation error of 0.20, 0.04 and 0.01
+# deg.
 _CLUMP_TRIOS = 5
-_CHOICE = 3  # as many bursts could be read as are, times this: each costs a glance at its odometry
-# Classes: standing, creeping, city, main road, country road, motorway; turning right, bending, straight ...
+_CHOICE = 3  # possible bursts per burst to read; for each possible one, a short stretch of odometry is read
+# Limits of classes: standing, creeping, city, main road, country road, motorway; turning right, bending,
+# straight ...
 _SPEEDS_MPS = np.array([1.0, 5.0, 10.0, 16.0, 25.0])
 _YAW_RATES_RADPS = np.radians([-8.0, -2.0, 2.0, 8.0])
-_TIE = 1e-3  # less than any difference in what bursts add
-_PLACE_M = 200.0  # side of a place's cell: what a lidar sees in it is the same scene
+_TIE = 1e-3  # smaller than any real difference of the objective
+_PLACE_M = 200.0  # side of a place's cell: a lidar sees the same scene within it
 
 
 @dataclass(frozen=True, eq=False)
 class PossibleBursts:
-    """Bursts that could be read, in order of time.
+    """Bursts that can be read, in order of time.
 
     Args:
         spans_ns: first and last moment of each.
-        middle_ns: its middle sweep, with the sweeps before and after that one.
-        sweeps: how many each holds.
+        middle_ns: the middle sweep of each, with the sweeps before and after it.
+        sweeps: number of sweeps of each.
     """
 
     spans_ns: Int64[np.ndarray, "M 2"]
@@ -49,30 +51,30 @@ class PossibleBursts:
 
 @dataclass(frozen=True, eq=False)
 class BurstMotion:
-    """How the car moves in the middle of each possible burst; NaN where nobody measured it."""
+    """Motion of the car in the middle of each possible burst; NaN where it was not measured."""
 
     speed_mps: Float[np.ndarray, " M"]
     yaw_rate_radps: Float[np.ndarray, " M"]  # positive to the left
-    position_m: Float[np.ndarray, "M 2"]  # in any frame that stays the same for the day
+    position_m: Float[np.ndarray, "M 2"]  # in any frame that is constant for the day
 
     @classmethod
     def unknown(cls, count: int) -> BurstMotion:
-        """Of so many bursts, nothing."""
+        """Unknown motion for `count` bursts."""
         return cls(np.full(count, np.nan), np.full(count, np.nan), np.full((count, 2), np.nan))
 
 
 def possible_bursts(
     sweeps_ns: Int64[np.ndarray, " N"], budget: int, *, is_motion_known: bool
 ) -> PossibleBursts:
-    """The bursts that could be read, in order of time: of as many sweeps, wherever these lie.
+    """Bursts that can be read, in order of time, all with the same number of sweeps.
 
-    Within a stretch without pause, where one is long enough; where most sweeps come in clumps, bursts are shorter, of a
-    clump or several.
+    A burst lies within a stretch without pauses if one is long enough. If most sweeps come in short groups,
+    bursts are shorter: one group or several.
 
     Args:
-        sweeps_ns: when each was logged, as far as the index tells; in order.
-        budget: sweeps that shall be read.
-        is_motion_known: False where nothing tells one burst from another: no more are asked for than are read.
+        sweeps_ns: log time of each sweep, to the accuracy of the index; in order.
+        budget: number of sweeps to read.
+        is_motion_known: False if bursts cannot be compared; then only as many are returned as will be read.
     """
     sweeps = len(sweeps_ns)
     edges = np.concatenate([[0], np.flatnonzero(np.diff(sweeps_ns) > PAUSE_NS) + 1, [sweeps]])
@@ -81,7 +83,7 @@ def possible_bursts(
     wanted = -(-budget // length) * (_CHOICE if is_motion_known else 1)
     count = max(1, min(wanted, sweeps // length))
     middle = ((np.arange(count) + 0.5) * sweeps / count).astype(np.int64)
-    # A burst that would reach beyond its stretch is moved into it.
+    # Move a burst into its stretch if it reaches beyond it.
     stretch = np.searchsorted(edges, middle, "right") - 1
     begin, end = edges[stretch], edges[stretch + 1]
     is_long = end - begin >= length
@@ -90,7 +92,7 @@ def possible_bursts(
     )
     last = first + length - 1
     gaps_ns = np.diff(sweeps_ns, prepend=sweeps_ns[0], append=sweeps_ns[-1])
-    # Half-way to the sweeps beside it: an index knows only to within a chunk when a sweep was logged.
+    # Half-way to the neighbouring sweeps: the index gives the log time of a sweep only to within a chunk.
     reach_ns = np.minimum(gaps_ns // 2, PAUSE_NS)
     spans = np.stack([sweeps_ns[first] - reach_ns[first], sweeps_ns[last] + reach_ns[last + 1]], axis=1)
     around = sweeps_ns[np.clip(middle[:, None] + [-1, 0, 1], 0, sweeps - 1)]
@@ -98,11 +100,11 @@ def possible_bursts(
 
 
 def choose_bursts(motion: BurstMotion, count: int) -> list[int]:
-    """The `count` bursts that together show most, in order of time; all where there are no more.
+    """The `count` best bursts as a set, in order of time; all of them if there are no more.
 
     Args:
         motion: of the possible bursts, in order of time.
-        count: how many are to be read.
+        count: number of bursts to read.
     """
     classes = _classes(motion, count)
     possible, kinds = classes.shape
@@ -113,7 +115,7 @@ def choose_bursts(motion: BurstMotion, count: int) -> list[int]:
     for _ in range(count):
         known = seen[np.arange(kinds), np.maximum(classes, 0)]
         gain = np.where(classes >= 0, np.log1p(1 / (1 + known)), 0.0).sum(axis=1)
-        # Of equals the one furthest in time from those chosen.
+        # Ties are resolved by the largest distance in time from the chosen bursts.
         apart = np.abs(np.subtract.outer(places, chosen)).min(axis=1, initial=possible) / possible
         best = int(np.argmax(np.where(left, gain + _TIE * apart, -1.0)))
         chosen.append(best)
@@ -124,7 +126,7 @@ def choose_bursts(motion: BurstMotion, count: int) -> list[int]:
 
 
 def _classes(motion: BurstMotion, count: int) -> Int64[np.ndarray, "M 4"]:
-    """Class of each burst in time, speed, turn and place; -1 where it is unknown."""
+    """Class of each burst in time, speed, turn and place; -1 if unknown."""
     possible = len(motion.speed_mps)
     speed = np.searchsorted(_SPEEDS_MPS, np.abs(motion.speed_mps))
     turn = np.searchsorted(_YAW_RATES_RADPS, motion.yaw_rate_radps)

@@ -1,4 +1,7 @@
-"""One message of a sensor to one row of its table: only here are payloads decoded, only those of kept moments."""
+"""One message of a sensor to one row of its table.
+
+Only here are payloads decoded, only those of kept moments.
+"""
 
 from __future__ import annotations
 
@@ -35,11 +38,11 @@ from schemas.captures import Capture, Image, Scan, Sweep
 
 __all__ = ["CaptureReader", "Read", "Rejected", "readers_of"]
 
-_SAME_IMAGE_NS = 5_000_000  # labels and detections carry the stamp of the image that they were computed on
+_SAME_IMAGE_NS = 5_000_000  # labels and detections have the stamp of the image they were computed from
 
 
 class Rejected(Exception):  # noqa: N818  # an outcome that is counted, not an error that anyone sees
-    """A capture, or a moment, that becomes no row."""
+    """A capture or a moment that is rejected."""
 
     def __init__(self, reason: Rejection | str, detail: str = "") -> None:
         self.reason, self.detail = reason, detail
@@ -48,13 +51,13 @@ class Rejected(Exception):  # noqa: N818  # an outcome that is counted, not an e
 
 @dataclass(frozen=True, eq=False)
 class Read:
-    """A capture as its table has it, with what only ingest asks of it.
+    """A row of a sensor's table, with further values for ingest.
 
     Args:
         capture: the row.
         frame_id: of the message.
-        measured: as logged, to tell a sensor that is stuck.
-        dropped: points that the row lacks, by reason.
+        measured: raw measurement, to detect a sensor that repeats itself.
+        dropped: number of dropped points by reason.
     """
 
     capture: Capture
@@ -65,13 +68,13 @@ class Read:
 
 @runtime_checkable
 class CaptureReader(Protocol):
-    """What makes rows of one sensor's messages."""
+    """Reads the messages of one sensor as rows."""
 
     def read(self, place: int, moment: int) -> Read:
-        """A message by its place in the sensor's stream, as a row of a moment.
+        """Read a message, given by its index in the sensor's stream, as a row of a moment.
 
         Raises:
-            Rejected: the payload is damaged or says too little; nothing is made up.
+            Rejected: the payload is damaged or incomplete; missing values are never replaced.
         """
         ...
 
@@ -79,7 +82,10 @@ class CaptureReader(Protocol):
 def readers_of(
     index: DayIndex, rig: Rig, ingest: IngestConfig, counts: Counter[str]
 ) -> dict[str, CaptureReader]:
-    """Of each sensor of a rig, by name; `counts` gathers dropped points and what captures go without."""
+    """Reader of each sensor of a rig, by name.
+
+    `counts` collects dropped points and missing parts of captures.
+    """
     readers: dict[str, CaptureReader] = {}
     for name, camera in rig.cameras.items():
         readers[name] = _Images(_Messages(index, name), camera, counts)
@@ -95,7 +101,7 @@ class _Messages:
         self.index, self.sensor, self.captures = index, sensor, index.captures(sensor)
 
     def stamp_ns(self, place: int) -> int:
-        """Of a capture."""
+        """Stamp of a capture [ns]."""
         return self.captures.stamps[place]
 
     def read(self, located: Located) -> tuple[Any, str]:
@@ -105,11 +111,11 @@ class _Messages:
 
 
 class _Images:
-    """Images of a camera, with what was logged of what they show."""
+    """Images of a camera, with their logged labels and detections."""
 
     def __init__(self, messages: _Messages, camera: CameraTopics, counts: Counter[str]) -> None:
         self._messages, self._index, self._counts = messages, messages.index, counts
-        # Where models compute semantics later, frames without logged ones lack nothing.
+        # If models compute semantics later, frames without logged ones are complete.
         self._logged_semantics = int(isinstance(camera.semantics, TopicSemantics))
         stamps_ns = messages.captures.stamps_ns
         self._video = VideoPictures(self._packet, stamps_ns)
@@ -155,7 +161,7 @@ class _Images:
         return str(message.format), bytes(message.data)
 
     def _logged_at(self, what: str, place: int) -> Located | None:
-        """The message of that image; None where none was logged."""
+        """Message of type `what` for this image; None if none was logged."""
         stream, partner = self._logged[what]
         if partner[place] < 0:
             self._counts[f"frames_without_{what}"] += self._logged_semantics
@@ -193,7 +199,7 @@ class _Images:
 
 
 class _Sweeps:
-    """Sweeps of a lidar, de-skewed to their own stamps where the car's motion is known."""
+    """Sweeps of a lidar, de-skewed to their stamps if the car's motion is known."""
 
     def __init__(self, messages: _Messages, ingest: IngestConfig, counts: Counter[str]) -> None:
         self._messages, self._index, self._ingest, self._counts = messages, messages.index, ingest, counts
@@ -224,8 +230,9 @@ class _Sweeps:
             return as_logged, False
         T_vehicle_lidar = self._index.trees[log].lookup(self._index.ego.vehicle_frame, frame_id)
         if T_vehicle_lidar is None:
-            # Without the lever arm the axes' convention (x forward, y left, z up) still tells the direction
-            # of travel; the error left is yaw rate x lever arm x sweep, some 2 cm in a city turn.
+            # Without the lever arm, the convention of the axes (x forward, y left, z up) still gives the
+            # direction of travel; the remaining error is yaw rate x lever arm x sweep time, about 2 cm in a
+            # city turn.
             self._counts["sweeps_deskewed_without_lever_arm"] += 1
             T_vehicle_lidar = np.eye(4)
         points = np.stack(as_logged, axis=-1)

@@ -1,4 +1,4 @@
-"""Can these logs be calibrated, and which DoF? Looks at topics, stamps, frame ids and a sample of frames."""
+"""Check whether logs can be calibrated, and which DoF: by topics, stamps, frame ids and some frames."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ from schemas.frames import Frame
 
 __all__ = ["CheckReport", "SyncQuality", "TopicFinding", "check_logs"]
 
-_SAMPLE = 40  # frames looked into; the rest only by their stamps
+_SAMPLE = 40  # frames that are decoded; of the others only the stamps are read
 
 
 @dataclass(frozen=True)
 class TopicFinding:
-    """One topic that the rig names. `problem` is empty where it is as it must be."""
+    """One topic of the rig; `problem` is empty if there is none."""
 
     role: str
     topic: str
@@ -52,10 +52,10 @@ class TopicFinding:
 
 @dataclass(frozen=True)
 class SyncQuality:
-    """How sweeps meet images and scans: median distance to the nearest, and moments within the gate.
+    """Synchronisation: median time from sweeps to the nearest image and scan, and moments within the gate.
 
-    `gate_ms` is of raw stamps, None where the gate is by motion; `camera_offset_ms` and `radar_offset_ms` are the
-    constant parts of the gaps, 0 where sensors run freely.
+    `gate_ms` applies to raw stamps, None if the gate is by motion; `camera_offset_ms` and `radar_offset_ms`
+    are the constant parts of the gaps, 0 if a sensor is not triggered.
     """
 
     sweeps: int
@@ -69,7 +69,7 @@ class SyncQuality:
 
 @dataclass(frozen=True)
 class CheckReport:
-    """What `boresight check` found. `answer` is "yes", "partly" or "no"."""
+    """Result of `boresight check`; `answer` is "yes", "partly" or "no"."""
 
     answer: str
     verdicts: list[DofVerdict]
@@ -83,7 +83,7 @@ class CheckReport:
     rejected: dict[str, int]
     problems: list[str]
     advice: list[str]
-    radar_alignments: dict[str, dict[str, Any]]  # by radar, what it states of its own alignment
+    radar_alignments: dict[str, dict[str, Any]]  # by radar, the alignment that it logs
 
 
 def check_logs(
@@ -92,7 +92,7 @@ def check_logs(
     fleet: FleetConfig,
     progress: Progress = silent,
 ) -> CheckReport:
-    """Look at logs without writing anything.
+    """Check logs without writing anything.
 
     Raises:
         ConfigError: a log does not exist, or the prior file is unusable.
@@ -152,7 +152,7 @@ def check_logs(
 def _prior(
     rows: Sequence[Mapping[str, Any]], fleet: FleetConfig, rig: Rig, problems: list[str]
 ) -> RigPrior | None:
-    """The prior of all sensors; None, and why among the problems, where there is none."""
+    """Prior of all sensors; None if there is none, with the reason added to `problems`."""
     try:
         return rig_prior(rows, fleet, rig)
     except SolveError as err:
@@ -163,7 +163,7 @@ def _prior(
 def _of_another_unit(
     counts: Counter[str], rig: Rig, problems: Sequence[str], shown: Collection[str]
 ) -> dict[str, tuple[str, ...]]:
-    """Sensors whose points are no metres, as topics that are as good as missing, and which unit fits."""
+    """Topics by sensor whose points are not in metres; their problem names the unit that fits."""
     found = dict[str, tuple[str, ...]]()
     for node in (n for n in rig.nodes if n.kind in WRONG_UNIT):
         reason = WRONG_UNIT[node.kind]
@@ -195,12 +195,12 @@ def _topics(index: DayIndex, rig: Rig) -> list[TopicFinding]:
 
 
 def _has_fields(rig: Rig, role: Role) -> bool:
-    """Whether fleet.toml says what fields a message has, whatever its type."""
+    """Whether fleet.toml names the fields of this message, so that any type is accepted."""
     return role.what == ALIGNMENT and rig.radars[role.sensor].alignment_fields is not None
 
 
 def _unnamed(index: DayIndex, rig: Rig) -> list[str]:
-    """Topics on which radars state their own alignment and that the rig does not name."""
+    """Topics on which radars log their alignment, but that fleet.toml does not name."""
     found = sorted({(t, kind) for t, kind in index.surveyed if kind in ACCEPTED_TYPES[ALIGNMENT]})
     return [
         f'{topic} ({kind}) states the alignment of a radar: alignment = "{topic}" in its section reads it'
@@ -243,7 +243,8 @@ def _advice(frames: list[Frame], rig: Rig, topics: list[TopicFinding], usable: i
     ]
     if frames and "camera_lidar" in frames[0].priors:
         R = prior_transform(frames[0], "camera_lidar")[:3, :3]
-        # Up of the lidar is -y of an optical frame; more than 45 deg off, the frame is no optical one.
+        # The lidar's up axis is -y in an optical frame; if it is off by more than 45 deg, the frame is not
+        # optical.
         if -R[1, 2] < np.cos(np.pi / 4):
             advice.append(
                 "the image's frame id is no optical frame (x right, y down, z forward): check /tf_static"

@@ -1,4 +1,4 @@
-"""Move the points of a sweep to where they would have been seen at its stamp."""
+"""De-skew: move the points of a sweep to their positions at the stamp of the sweep."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def deskew(
         time_s: of each point, relative to the stamp.
         speed_mps: forward speed of the vehicle frame's origin.
         yaw_rate_radps: positive to the left.
-        T_vehicle_lidar: takes lidar coordinates to the vehicle frame (x forward, y left, z up).
+        T_vehicle_lidar: maps lidar coordinates to the vehicle frame (x forward, y left, z up).
     """
     points = transform_points(T_vehicle_lidar, points_lidar.astype(np.float64))
     yaw, shift_x, shift_y = planar_motion(time_s.astype(np.float64), speed_mps, yaw_rate_radps)
@@ -43,7 +43,7 @@ def deskew(
 def planar_motion(
     time_s: Float[np.ndarray, " N"], speed_mps: float, yaw_rate_radps: float
 ) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, " N"], Float[np.ndarray, " N"]]:
-    """Yaw [rad] and position [m] of the vehicle on a circular arc, seen from where it is at time 0."""
+    """Yaw [rad] and position [m] of the vehicle on a circular arc, relative to its pose at time 0."""
     yaw = yaw_rate_radps * time_s
     # sin(a)/a and (1-cos(a))/a through sinc: exact on a straight line too
     half = np.sinc(yaw / (2 * np.pi))

@@ -1,7 +1,7 @@
-"""Signs, units and directions by a sample of frames: what a log shows of them before anything is calibrated.
+"""Check signs, units and directions on a sample of frames, before any calibration.
 
-Doppler, odometry and the clouds are held against each other. A sign or unit is tried where they disagree, and what fits
-is said. All of it is coarse: a fault moves these numbers by factors.
+Doppler, odometry and clouds are compared. If they disagree, other signs and units are tried, and those that
+fit are reported. The checks are coarse: the faults that they detect change these values by factors.
 """
 
 from __future__ import annotations
@@ -21,30 +21,30 @@ __all__ = ["MOVING_MPS", "Motion", "drives_ahead", "motion_of", "prior_transform
 
 MOVING_MPS = 1.0
 _BACKWARDS = "the car would drive backwards"
-_FEWEST = 3  # moving frames that tell a sign
-_MOST = 2 / 3  # of them that must show the same
+_FEWEST = 3  # moving frames needed to determine a sign
+_MOST = 2 / 3  # share of them that must agree
 _EXPLAINED = 1 / 3  # share of a scan's detections that a speed must explain
 _KMH = 3.6
-_NEAR = 0.1  # relative: a unit or a plain factor is met
-_OFF = 0.25  # beyond which odometry and Doppler are not the same speed
-# Cells in which something stands, and how much oftener detections must meet them with the radar turned round. Where
-# cells came from the car's own way, 70 to 93 % met, and 29 % at most the other way round.
+_NEAR = 0.1  # relative tolerance of a match with a unit or a simple factor
+_OFF = 0.25  # larger relative differences of odometry and Doppler are an error
+# Number of occupied cells, and the factor by which more detections must meet them with the radar turned
+# round. On logs where cells came from the car's motion, 70 to 93 % met, and at most 29 % the other way round.
 _CELL_M, _TALL_M, _LEAST_MET, _TURNED_MORE = 1.0, 0.5, 0.3, 1.5
 
 
 @dataclass(frozen=True)
 class Motion:
-    """What the frames show of the car's motion, and what is wrong with whom."""
+    """Motion of the car in the frames, and the problems found by source."""
 
-    moving_share: float | None  # by odometry or else Doppler; None = nobody knows
+    moving_share: float | None  # by odometry or else Doppler; None = unknown
     doppler_problem: str = ""
-    doppler_is_wrong: bool = False  # its sign or unit surely is, to be mended before anything else
-    wrong: tuple[str, ...] = ()  # what else is wrong, likewise
+    doppler_is_wrong: bool = False  # its sign or unit is certainly wrong, and must be corrected first
+    wrong: tuple[str, ...] = ()  # other sources that are certainly wrong
     advice: tuple[str, ...] = ()
 
 
 def motion_of(frames: Sequence[Frame], rig: Rig) -> Motion:
-    """Hold odometry, Doppler and the clouds of some frames against each other."""
+    """Compare odometry, Doppler and clouds of some frames."""
     scanned = [f for f in frames if "radar" in f.sensors]
     fits = [_fit(f, rig.radar) for f in scanned]
     speeds = np.array([s for s, share in fits if share > _EXPLAINED])
@@ -77,9 +77,9 @@ def motion_of(frames: Sequence[Frame], rig: Rig) -> Motion:
 
 
 def drives_ahead(frames: Sequence[Frame], rig: Rig) -> int:
-    """1 = by its Doppler the car drives ahead, -1 = it would drive backwards, 0 = the frames do not tell.
+    """Direction of travel by Doppler: 1 = forward, -1 = backward, 0 = cannot be determined.
 
-    With odometry the two are compared; without, a car is taken to drive ahead most of the time.
+    With odometry the two are compared; without it, the car is assumed to drive forward most of the time.
     """
     scanned = [f for f in frames if "radar" in f.sensors]
     fits = [(f, *_fit(f, rig.radar)) for f in scanned]
@@ -89,13 +89,13 @@ def drives_ahead(frames: Sequence[Frame], rig: Rig) -> int:
 
 
 def prior_transform(frame: Frame, pair: str) -> Float[np.ndarray, "4 4"]:
-    """A pair's prior; identity where the frame has none."""
+    """Prior of a pair; identity if the frame has none."""
     return frame.priors.get(pair, np.eye(4))
 
 
 def _fit(frame: Frame, radar: RadarTopics | None, factor: float = 1.0) -> tuple[float, float]:
-    """Speed by the Doppler times a factor, and the share of detections that it explains."""
-    # A radar may look anywhere; a lidar's x axis is taken to point ahead.
+    """Speed from the Doppler times a factor, and the share of detections that it explains."""
+    # A radar may point in any direction; a lidar's x axis is assumed to point forward.
     xyz = frame.radar_xyz_m.astype(np.float64) @ prior_transform(frame, "lidar_radar")[:3, :3].T
     directions = xyz / np.linalg.norm(xyz, axis=1, keepdims=True)
     period = None if radar is None else radar.doppler_period_mps
@@ -103,7 +103,7 @@ def _fit(frame: Frame, radar: RadarTopics | None, factor: float = 1.0) -> tuple[
 
 
 def _unfit(frames: Sequence[Frame], fits: Sequence[tuple[float, float]], radar: RadarTopics) -> str:
-    """Why the Doppler shows no speed: its period, its unit, or what nobody knows."""
+    """Reason why the Doppler gives no speed: its period, its unit, or unknown."""
     period = radar.doppler_period_mps
     spans = [float(np.ptp(f.radar_range_rate_mps)) for f in frames]
     if period is not None and spans and max(spans) > 1.05 * period:
@@ -117,7 +117,7 @@ def _unfit(frames: Sequence[Frame], fits: Sequence[tuple[float, float]], radar: 
 
 
 def _sign(moved_mps: Float[np.ndarray, " N"]) -> int:
-    """1 = the car drives ahead, -1 = it would drive backwards, 0 = the frames do not tell."""
+    """Direction of travel: 1 = forward, -1 = backward, 0 = cannot be determined."""
     if len(moved_mps) < _FEWEST:
         return 0
     backwards = float(np.mean(moved_mps < 0))
@@ -132,7 +132,7 @@ def _other_sign(radar: RadarTopics) -> str:
 
 
 def _assumed_sign(radar: RadarTopics, sign: int) -> tuple[str, ...]:
-    """What the log shows of a sign that fleet.toml leaves out."""
+    """Advice on a sign that fleet.toml leaves out, with the result of the log."""
     if radar.velocity_fields is not None or "doppler_positive" in radar.model_fields_set:
         return ()
     absent = f'fleet.toml does not say doppler_positive, so "{radar.doppler_positive}" is assumed'
@@ -141,7 +141,7 @@ def _assumed_sign(radar: RadarTopics, sign: int) -> tuple[str, ...]:
 
 
 def _ratio_problem(both: Sequence[tuple[float, float]]) -> tuple[str, str]:
-    """What is wrong with the Doppler, and with the odometry, by their speeds in the same frames."""
+    """Problems of Doppler and of odometry, from their speeds in the same frames."""
     if len(both) < _FEWEST:
         return "", ""
     odometry, doppler = np.array(both).T
@@ -159,7 +159,7 @@ def _ratio_problem(both: Sequence[tuple[float, float]]) -> tuple[str, str]:
 
 
 def _turned_round(frames: Sequence[Frame], sign: int) -> str:
-    """Says so where detections meet what stands in the sweeps only with one sensor turned round; else empty."""
+    """Problem text if detections meet occupied cells only with one sensor turned round; else empty."""
     whole = [f for f in frames if "lidar" in f.sensors and len(f.radar_xyz_m)]
     if not whole:
         return ""
@@ -167,16 +167,16 @@ def _turned_round(frames: Sequence[Frame], sign: int) -> str:
     turned = max(radar, lidar)
     if turned < max(_LEAST_MET, _TURNED_MORE * given):
         return ""
-    # Where the Doppler shows the radar's own heading right, the sweeps are turned.
+    # If the Doppler confirms the radar's heading, the lidar is turned.
     who = {1: "the lidar", -1: "the radar", 0: "the lidar or the radar"}[sign]
     met = f"{turned:.0%} of the detections meet what the sweeps show where it is turned round"
     return f"{who} looks the other way: {met}, {given:.0%} by the prior; mend its transform"
 
 
 def _met(frame: Frame) -> list[float]:
-    """Share of a scan's detections in cells in which the sweep shows something that stands.
+    """Share of a scan's detections in occupied cells of the sweep.
 
-    By the prior, with the radar turned round, and with the lidar turned round.
+    Three shares: with the prior, with the radar turned round, and with the lidar turned round.
     """
     points = frame.lidar_xyz_m.astype(np.float64)
     points = points[np.isfinite(points).all(1)]

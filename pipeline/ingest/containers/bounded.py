@@ -1,4 +1,4 @@
-"""Decompression that gives no more than was announced: damaged or forged bytes must not cost a machine its memory."""
+"""Bounded decompression: damaged or forged data must not exhaust the machine's memory."""
 
 from __future__ import annotations
 
@@ -9,34 +9,36 @@ import zstandard
 
 __all__ = ["MOST_CHUNK_BYTES", "OversizedError", "most_bytes", "unpack_bz2", "unpack_lz4", "unpack_zstd"]
 
-# Logs shrink by 2 to 10, label images alone by some hundred: beyond, and beyond what any worker has room for, it is a
-# bomb. A single chunk or message of up to 32 MiB (a raw picture of 8 Mpx has 24) may be as uniform as it likes.
+# Logs compress by 2 to 10, only label images by some hundred; data beyond that ratio and beyond a worker's
+# memory is a decompression bomb. A single chunk or message of up to 32 MiB (a raw picture of 8 Mpx has 24)
+# may have any ratio.
 _MOST_RATIO = 100
 _ANYWAY_BYTES = 32 << 20
 MOST_CHUNK_BYTES = 512 << 20
 
 
 class OversizedError(ValueError):
-    """What would unpack to more than what is packed can hold in earnest."""
+    """The data would decompress to more than real data of this packed size can hold."""
 
 
 def most_bytes(packed_bytes: int) -> int:
-    """The most that so many packed bytes may become."""
+    """Largest plausible decompressed size of so many packed bytes."""
     return max(_ANYWAY_BYTES, _MOST_RATIO * packed_bytes)
 
 
 def unpack_zstd(data: bytes | memoryview, limit_bytes: int) -> bytes:
-    """The content of a zstd frame of at most `limit_bytes`; no memory is taken for a frame that announces more.
+    """Content of a zstd frame of at most `limit_bytes`; a header with more is refused before allocation.
 
     Raises:
-        OversizedError: it unpacks to more than `most_bytes`.
-        ValueError: it is larger than `limit_bytes`, or announces that it is.
-        zstandard.ZstdError: no whole zstd frame.
+        OversizedError: decompresses to more than `most_bytes`.
+        ValueError: larger than `limit_bytes`, by header or content.
+        zstandard.ZstdError: not a complete zstd frame.
     """
     _check_ratio(data, limit_bytes)
     announced = zstandard.get_frame_parameters(data).content_size
     if announced == zstandard.CONTENTSIZE_UNKNOWN:
-        # Without a size a buffer as large as allowed would be taken at once: read as much as there is instead.
+        # Without a size in the header, the library would allocate the whole limit: read piece by piece
+        # instead.
         content = zstandard.ZstdDecompressor().stream_reader(data).read(limit_bytes + 1)
         return _at_most(limit_bytes, content)
     if announced > limit_bytes:
@@ -45,24 +47,24 @@ def unpack_zstd(data: bytes | memoryview, limit_bytes: int) -> bytes:
 
 
 def unpack_lz4(data: bytes | memoryview, limit_bytes: int) -> bytes:
-    """The content of an lz4 frame of at most `limit_bytes`.
+    """Content of an lz4 frame of at most `limit_bytes`.
 
     Raises:
-        OversizedError: it unpacks to more than `most_bytes`.
-        ValueError: it is larger than `limit_bytes`.
-        RuntimeError: no lz4 frame.
+        OversizedError: decompresses to more than `most_bytes`.
+        ValueError: larger than `limit_bytes`.
+        RuntimeError: not an lz4 frame.
     """
     _check_ratio(data, limit_bytes)
     return _at_most(limit_bytes, lz4.frame.LZ4FrameDecompressor().decompress(data, limit_bytes + 1))
 
 
 def unpack_bz2(data: bytes | memoryview, limit_bytes: int) -> bytes:
-    """The content of bz2 data of at most `limit_bytes`.
+    """Content of bz2 data of at most `limit_bytes`.
 
     Raises:
-        OversizedError: it unpacks to more than `most_bytes`.
-        ValueError: it is larger than `limit_bytes`.
-        OSError: no bz2 data.
+        OversizedError: decompresses to more than `most_bytes`.
+        ValueError: larger than `limit_bytes`.
+        OSError: not bz2 data.
     """
     _check_ratio(data, limit_bytes)
     return _at_most(limit_bytes, bz2.BZ2Decompressor().decompress(data, limit_bytes + 1))

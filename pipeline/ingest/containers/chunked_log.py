@@ -1,4 +1,7 @@
-"""What MCAP files and ROS 1 bags have in common: messages in chunks, which an index at the file's end names."""
+"""Common code for MCAP files and ROS 1 bags.
+
+Messages in chunks, listed in an index at the end of the file.
+"""
 
 from __future__ import annotations
 
@@ -17,17 +20,17 @@ __all__ = ["ChunkedLog"]
 
 
 class ChunkedLog(ABC):
-    """LogReader of a file of chunks; the cache keeps those that were unpacked last."""
+    """LogReader of a file of chunks; the cache keeps the most recently decompressed chunks."""
 
-    _head = 0  # bytes of a chunk's record before what positions of messages count from
+    _head = 0  # offset within a chunk's record from which positions of messages count
 
     def __init__(self, path: LogPath, cache: ChunkCache) -> None:
         self.path, self.damage = path, Counter[str]()
         self._cache, self._file = cache, path.open("rb")
         self._size = path.stat().st_size
-        self._channels: dict[int, Any] = {}  # each has a topic
-        self._messages: Mapping[int, int] = {}  # of each channel, by the index
-        self._chunks: list[Chunk] = []  # by the index
+        self._channels: dict[int, Any] = {}  # connections or channels by id; each has a topic
+        self._messages: Mapping[int, int] = {}  # number by channel, from the index
+        self._chunks: list[Chunk] = []  # from the index
         self._chunk_starts: list[int] = []
 
     def timeline(self) -> Timeline | None:
@@ -87,7 +90,7 @@ class ChunkedLog(ABC):
 
     @abstractmethod
     def _scan_all(self, topics: Collection[str] | None) -> Iterator[RawMessage]:
-        """Messages of the whole file, in its order."""
+        """Messages of the whole file, in file order."""
 
     @abstractmethod
     def _scan_chunk(self, chunk: bytes, start: int, topics: Collection[str] | None) -> Iterator[RawMessage]:
@@ -95,8 +98,8 @@ class ChunkedLog(ABC):
 
     @abstractmethod
     def _indexed_chunk(self, indexed: Chunk) -> bytes | None:
-        """The records of a chunk that the index names; None (and counted) where it is damaged."""
+        """Decompressed records of a chunk in the index; None (and counted) if it is damaged."""
 
     @abstractmethod
     def _chunk_again(self, start: int) -> bytes | None:
-        """The records of a chunk that was scanned before."""
+        """Decompressed records of a chunk that was scanned before."""

@@ -1,4 +1,4 @@
-"""MCAP logs, read chunk by chunk: a wrong checksum, a lost tail or a broken record costs only itself.
+"""MCAP logs, read chunk by chunk: wrong checksums, lost tails and broken records cost only themselves.
 
 Source: MCAP specification, https://mcap.dev/spec (records, chunks, summary section, footer).
 """
@@ -50,7 +50,8 @@ class McapLog(ChunkedLog):
         super().__init__(path, cache)
         self._schemas: dict[int, Schema] = {}
         self._resolved: dict[int, Channel] = {}
-        # True where the summary's checksum is right: its schemas and channels win over the data section's.
+        # True if the summary's checksum is right: its schemas and channels then replace those of the data
+        # section.
         self._trusted = False
         self._chunks = self._read_summary()
         self._chunk_starts = [c.position for c in self._chunks]
@@ -84,7 +85,7 @@ class McapLog(ChunkedLog):
         return self._open_chunk(self._content(start, length), check=False)
 
     def _indexed_chunk(self, indexed: Chunk) -> bytes | None:
-        """The records of a chunk that the summary names, in one read; None (and counted) where it is damaged."""
+        """Records of a chunk listed in the summary, in one read; None (and counted) if it is damaged."""
         if indexed.length > MOST_CHUNK_BYTES:
             self.damage["oversized_chunks"] += 1
             return None
@@ -98,7 +99,10 @@ class McapLog(ChunkedLog):
     # -- records ------------------------------------------------------------
 
     def _records(self) -> Iterator[tuple[int, int, int]]:
-        """(opcode, start of content, length) of records; lost footing is regained at the next known chunk."""
+        """(opcode, start of content, length) of records.
+
+        After a damaged part, continues at the next known chunk.
+        """
         position = _MAGIC_SIZE
         while True:
             head = self._content(position, _RECORD.size)
@@ -130,7 +134,10 @@ class McapLog(ChunkedLog):
             position = end
 
     def _read_summary(self) -> list[Chunk]:
-        """Chunks by the summary, none where it is lost or damaged; learns schemas, channels and counts."""
+        """Chunks listed in the summary, none if it is lost or damaged.
+
+        Also reads schemas, channels and counts.
+        """
         try:
             tail = self._content(max(self._size - _FOOTER_SIZE - _MAGIC_SIZE, 0), _FOOTER_SIZE)
             footer = Footer.read(ReadDataStream(BytesIO(tail[_RECORD.size :])))
@@ -171,14 +178,14 @@ class McapLog(ChunkedLog):
     # -- chunks ------------------------------------------------------------
 
     def _open_chunk(self, content: bytes, *, check: bool) -> bytes | None:
-        """The chunk's records, None (and counted) where it is damaged."""
+        """Decompressed records of the chunk, None (and counted) if it is damaged."""
         try:
             _, _, size, crc, name_length = _CHUNK.unpack_from(content)
             name_end = _CHUNK.size + name_length
             compression = content[_CHUNK.size : name_end].decode()
             data = _decompress(compression, memoryview(content)[name_end + 8 :], size)
             if len(data) != size or (check and crc and zlib.crc32(data) != crc):
-                raise ValueError("checksum")  # counted below with what the codecs raise
+                raise ValueError("checksum")  # caught below like the errors of the codecs
         except OversizedError:
             self.damage["oversized_chunks"] += 1
             return None
@@ -224,7 +231,7 @@ def _chunk_of(index: ChunkIndex) -> Chunk:
 
 
 def _counts_of(statistics: bytes) -> dict[int, int]:
-    """Messages of each channel, none where the record is damaged."""
+    """Number of messages by channel; empty if the record is damaged."""
     try:
         return dict(Statistics.read(ReadDataStream(BytesIO(statistics))).channel_message_counts)
     except _DAMAGED:

@@ -1,8 +1,7 @@
-"""One interface over MCAP, ROS 1 and ROS 2 bags: scan once for an index, then read messages by position.
+"""One interface for MCAP, ROS 1 and ROS 2 bags: scan once for an index, then read messages by position.
 
-Every backend reads the containers' own records in file order and never a whole file, so damage costs the
-damaged part and memory stays bounded by the chunk cache, whatever the log's length. What is not whole is
-counted in `damage`.
+Every backend reads the records of its container in file order and never a whole file. So damage costs only
+the damaged part, and the chunk cache bounds memory for any length of log. `damage` counts unreadable parts.
 """
 
 from __future__ import annotations
@@ -33,18 +32,18 @@ __all__ = [
     "open_log",
 ]
 
-# Where a message lies inside its log: opaque to all but the backend that gave it.
+# Position of a message in its log; its meaning is private to the backend.
 Position = tuple[int, ...]
-PROTOBUF = "protobuf"  # MCAP's name of the encoding, of messages and of schemas
-BYTES_AS_TEXT = "latin-1"  # one character for each byte and back, for definitions that are no text
+PROTOBUF = "protobuf"  # name of the encoding in MCAP, for messages and schemas
+BYTES_AS_TEXT = "latin-1"  # one character for each byte and back, for definitions that are not text
 
 
 @dataclass(frozen=True)
 class Channel:
     """A stream of messages in a log.
 
-    `encoding` is "cdr", "ros1" or "protobuf" (others cannot be decoded); `definition` is the embedded schema, "" where
-    there is none; `definition_format` is "msg", "idl" or "protobuf" (BYTES_AS_TEXT).
+    `encoding` is "cdr", "ros1" or "protobuf" (others cannot be decoded); `definition` is the embedded schema,
+    "" if there is none; `definition_format` is "msg", "idl" or "protobuf" (BYTES_AS_TEXT).
     """
 
     topic: str
@@ -56,7 +55,7 @@ class Channel:
 
 @dataclass(frozen=True, slots=True)
 class RawMessage:
-    """One message as logged: `data` is valid until the next one is taken from the scan."""
+    """One message as logged; `data` is valid until the scan yields the next message."""
 
     channel: Channel
     log_time_ns: int
@@ -66,34 +65,35 @@ class RawMessage:
 
 @runtime_checkable
 class LogReader(Protocol):
-    """What a backend can do. `damage` counts by name what could not be read, complete after a scan."""
+    """Interface of a backend; `damage` counts unreadable parts by name and is complete after a scan."""
 
     path: LogPath
     damage: Counter[str]
 
     def timeline(self) -> Timeline | None:
-        """What the log's own index says, without reading messages; None where it has none that can be trusted."""
+        """Timeline from the log's index, without reading messages; None without a trustworthy index."""
 
     def scan(
         self, topics: Collection[str] | None = None, within: Stretches | None = None
     ) -> Iterator[RawMessage]:
-        """All whole messages of the topics (None = every topic) in file order.
+        """All complete messages of the topics (None = every topic) in file order.
 
-        With `within`, those logged in these stretches; where the log has an index, only their chunks are read.
+        With `within`, only those logged in these stretches; if the log has an index, only their chunks are
+        read.
         """
 
     def read(self, position: Position) -> memoryview:
-        """The payload of a message that a scan has given.
+        """Payload of a message found by a scan.
 
         Raises:
             LogError: the log changed since the scan.
         """
 
     def close(self) -> None:
-        """Let go of files."""
+        """Close all files."""
 
 
-# By what the first bytes say, whatever the file is called. Values are resolved on use.
+# Reader by first bytes of the file, independent of its name; resolved on use.
 BACKENDS: dict[str, str] = {
     ".mcap": "pipeline.ingest.containers.mcap:McapLog",
     ".bag": "pipeline.ingest.containers.rosbag1:BagLog",
@@ -102,14 +102,14 @@ BACKENDS: dict[str, str] = {
     "folder": "pipeline.ingest.containers.rosbag2_folder:FolderLog",
     "fetched": "pipeline.ingest.containers.rosbag2_folder:FetchedLog",
 }
-_BY_RANGES = (".mcap", ".bag")  # of a bucket's logs, those that are read where they lie
+_BY_RANGES = (".mcap", ".bag")  # logs in buckets that are read in place, by byte ranges
 _MAGIC = {
     b"\x89MCAP": ".mcap",
     b"#ROSBAG": ".bag",
     b"SQLite format 3\0": ".db3",
     b"\x28\xb5\x2f\xfd": ".zstd",
 }
-# What damaged bytes make the container libraries raise; a backend turns it into counted damage or a LogError.
+# Errors of container libraries for damaged bytes; backends turn them into counted damage or a LogError.
 READ_ERRORS = (
     ValueError,
     KeyError,
@@ -124,11 +124,11 @@ READ_ERRORS = (
 
 
 def open_log(path: LogPath, cache: ChunkCache | None = None) -> LogReader:
-    """The reader of a log: an MCAP, .bag or .db3 file, of a folder or a bucket, or a ROS 2 bag folder.
+    """Reader of a log: an .mcap, .bag or .db3 file on disk or in a bucket, or a ROS 2 bag folder.
 
     Raises:
-        LogError: there is no such file, or it is none of these.
-        StorageError: the bucket's store does not answer.
+        LogError: no such file, or another type of file.
+        StorageError: the object store does not answer.
     """
     kind = _kind(path)
     if isinstance(path, RemoteLog) and kind not in _BY_RANGES:
@@ -139,12 +139,12 @@ def open_log(path: LogPath, cache: ChunkCache | None = None) -> LogReader:
 
 
 def content_identity(path: LogPath) -> str:
-    """Name, size and a hash of samples of a log, for work keys; of a bucket's log name, size and entity tag.
+    """Identity of a log for work keys: name, size, hash of samples; in a bucket name, size, entity tag.
 
-    Hashed are the first and last MiB of each file and 64 samples of 4 KiB evenly between. A full hash would
-    read a fleet's terabytes only to find that nothing is to be done; logs are written once, and what changes
-    in them (an appended, recovered, re-indexed or re-recorded log) changes size, head or tail. Modification
-    times are left out: copies differ in them.
+    The hash covers the first and last MiB of each file and 64 samples of 4 KiB evenly between. A full hash
+    would read terabytes of a fleet even if there is nothing to do. Logs are written once, and an appended,
+    recovered, re-indexed or re-recorded log differs in size, head or tail. Modification times are not used:
+    copies differ in them.
     """
     if isinstance(path, RemoteLog):
         return path.identity
@@ -166,26 +166,26 @@ def content_identity(path: LogPath) -> str:
 
 
 class ChunkCache:
-    """Decompressed chunks of all open logs, the oldest dropped first: the bound on a reader's memory."""
+    """Decompressed chunks of all open logs, the oldest dropped first: bounds the memory of readers."""
 
     def __init__(self, max_bytes: int = 128 << 20) -> None:
         self._max_bytes, self._bytes = max_bytes, 0
         self._chunks: OrderedDict[tuple[str, int], bytes] = OrderedDict()
 
     def get(self, key: tuple[str, int]) -> bytes | None:
-        """The chunk, None where it was dropped."""
+        """The chunk; None if it was dropped."""
         chunk = self._chunks.get(key)
         if chunk is not None:
             self._chunks.move_to_end(key)
         return chunk
 
     def offer(self, key: tuple[str, int], chunk: bytes) -> None:
-        """Keep a chunk where there is room: a scan of a short day saves the second pass its decompression."""
+        """Keep a chunk if there is room: a short day then needs no second decompression."""
         if self._bytes + len(chunk) <= self._max_bytes and key not in self._chunks:
             self.put(key, chunk)
 
     def put(self, key: tuple[str, int], chunk: bytes) -> None:
-        """Keep a chunk; at least the last one stays, however large."""
+        """Keep a chunk; at least the last one stays, whatever its size."""
         self._chunks[key] = chunk
         self._bytes += len(chunk)
         while self._bytes > self._max_bytes and len(self._chunks) > 1:
@@ -198,7 +198,7 @@ def _kind(path: LogPath) -> str:
         if path.is_dir():
             return "folder"
         if path.exists() and not path.is_file():
-            raise LogError(str(path), "is neither a file nor a folder")  # to open a pipe would wait for ever
+            raise LogError(str(path), "is neither a file nor a folder")  # opening a pipe would block for ever
     try:
         with path.open("rb") as stream:
             head = stream.read(16)
@@ -207,7 +207,7 @@ def _kind(path: LogPath) -> str:
     if not head:
         raise LogError(str(path), "is empty")
     for magic, kind in _MAGIC.items():
-        # Half of the bytes are enough: a flipped bit must not cost the whole log.
+        # Half of the magic bytes are enough: a flipped bit must not make the whole log unreadable.
         if 2 * sum(a == b for a, b in zip(head, magic, strict=False)) > len(magic):
             return kind
     raise LogError(

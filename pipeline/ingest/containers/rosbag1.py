@@ -1,4 +1,4 @@
-"""ROS 1 bags (format 2.0), read chunk by chunk: one cut off, without its index, reads as far as it goes.
+"""ROS 1 bags (format 2.0), read chunk by chunk; a truncated bag without index is read as far as it goes.
 
 Source: http://wiki.ros.org/Bags/Format/2.0
 """
@@ -31,7 +31,7 @@ class BagLog(ChunkedLog):
 
     def __init__(self, path: LogPath, cache: ChunkCache) -> None:
         super().__init__(path, cache)
-        self._messages: Counter[int] = Counter()  # of each connection, by the index
+        self._messages: Counter[int] = Counter()  # number by connection, from the index
         self._chunks = self._read_index()
         self._chunk_starts = [c.position for c in self._chunks]
 
@@ -42,7 +42,7 @@ class BagLog(ChunkedLog):
                 if chunk is not None:
                     self._cache.offer((str(self.path), position), chunk)
                     yield from self._scan_chunk(chunk, position, topics)
-            elif header["op"] == bytes([_MESSAGE]):  # bags of an unchunked writer
+            elif header["op"] == bytes([_MESSAGE]):  # bags without chunks
                 channel, stamp = self._message(header, topics)
                 if channel is not None:
                     yield RawMessage(
@@ -65,7 +65,7 @@ class BagLog(ChunkedLog):
     # -- records ------------------------------------------------------------
 
     def _record(self, position: int) -> tuple[dict[str, bytes], int, int] | None:
-        """(header, start of data, its length) of a record, None where there is no whole one."""
+        """(header, start of data, its length) of a record; None if it is incomplete."""
         head = self._content(position, 4)
         if len(head) < 4:
             return None
@@ -95,7 +95,10 @@ class BagLog(ChunkedLog):
             position = record[1] + record[2]
 
     def _read_index(self) -> list[Chunk]:
-        """Chunks by the index at the bag's end, none where it is lost; learns its connections and their counts."""
+        """Chunks in the index at the bag's end, none if it is lost.
+
+        Also reads its connections and their counts.
+        """
         chunks: list[Chunk] = []
         try:
             first = self._record(_FIRST_RECORD)
@@ -115,7 +118,10 @@ class BagLog(ChunkedLog):
         return sorted(chunks, key=lambda c: c.position)
 
     def _indexed(self, header: dict[str, bytes], counts: bytes) -> Chunk:
-        """The chunk of an index record, whose messages are counted; one that is damaged still says where it lies."""
+        """Chunk of an index record, with its message counts.
+
+        The position is kept even if the counts are damaged.
+        """
         position = struct.unpack("<Q", header["chunk_pos"])[0]
         try:
             messages = dict(_PAIR.iter_unpack(counts))
@@ -130,7 +136,8 @@ class BagLog(ChunkedLog):
         try:
             if fields is None or len(header["conn"]) != 4:
                 raise ValueError("connection")
-            package, *_, name = fields["type"].decode().split("/")  # some converters leave ROS 2's `/msg/` in
+            # some converters leave ROS 2's `/msg/` in the type
+            package, *_, name = fields["type"].decode().split("/")
             if not package or package == name:
                 raise ValueError("type")
             channel = Channel(
@@ -204,7 +211,7 @@ def _time_ns(data: bytes) -> int:
 
 
 def _fields(data: bytes) -> dict[str, bytes] | None:
-    """`name=value` fields of a header; None where they do not add up or a record has no known op."""
+    """`name=value` fields of a header; None if their lengths do not fit or a record has an unknown op."""
     fields: dict[str, bytes] = {}
     position = 0
     while position + 4 <= len(data):

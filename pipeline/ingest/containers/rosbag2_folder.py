@@ -1,4 +1,4 @@
-"""ROS 2 bag folders: their .db3 or .mcap files together, with or without metadata.yaml, compressed or not."""
+"""ROS 2 bag folders: all their .db3 or .mcap files, with or without metadata.yaml, compressed or not."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from pipeline.store.remote_logs import LogPath
 
 __all__ = ["CompressedLog", "FetchedLog", "FolderLog"]
 
-# Of one object: a worker's scratch is no archive. MCAP and .bag have no limit.
+# Size limit of one object, because a worker's scratch disk is small. MCAP and .bag have no limit.
 _MOST_FETCHED_BYTES = 16 << 30
 
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-_UNPACKED = "boresight-unpacked-"  # then the process that unpacked it
+_UNPACKED = "boresight-unpacked-"  # followed by the id of the process that unpacked it
 _LEFT_BEHIND_S = 86400.0  # longer than any log is open
 _FILES = ("*.db3", "*.mcap", "*.db3.zstd", "*.mcap.zstd")
 
 
 class FolderLog:
-    """LogReader of a folder; a file of it that cannot be opened is counted and the others are read."""
+    """LogReader of a folder; files that cannot be opened are counted, and the others are read."""
 
     def __init__(self, path: Path, cache: ChunkCache) -> None:
         self.path, self.damage = path, Counter[str]()
@@ -81,7 +81,7 @@ class FolderLog:
 
 
 class _CopiedLog(ABC):
-    """LogReader of a temporary copy of a log, which is gone when it is closed."""
+    """LogReader of a temporary copy of a log, which is removed on closing."""
 
     def __init__(self, path: LogPath, cache: ChunkCache) -> None:
         self.path = path
@@ -92,7 +92,8 @@ class _CopiedLog(ABC):
             self._log = open_log(self._copied(Path(where)), cache)
         except (zstandard.ZstdError, OSError, LogError) as err:
             self._folder.cleanup()
-            if isinstance(err, OSError) and err.errno in NO_SPACE:  # this machine's trouble, not the log's
+            # a problem of this machine, not of the log
+            if isinstance(err, OSError) and err.errno in NO_SPACE:
                 raise StorageError(where, f"no space left to unpack {path}") from err
             raise LogError(str(path), f"cannot be unpacked: {err}") from err
         except BaseException:
@@ -102,7 +103,7 @@ class _CopiedLog(ABC):
 
     @abstractmethod
     def _copied(self, folder: Path) -> Path:
-        """The copy, put into the folder."""
+        """Path of the copy in the folder."""
 
     def timeline(self) -> Timeline | None:
         """See LogReader."""
@@ -143,7 +144,7 @@ class CompressedLog(_CopiedLog):
 
 
 class FetchedLog(_CopiedLog):
-    """An object of a bucket that cannot be read where it lies: a database, or what is compressed as a whole."""
+    """A bucket object that cannot be read in place: a database, or a file compressed as a whole."""
 
     def _copied(self, folder: Path) -> Path:
         size = self.path.stat().st_size
@@ -159,9 +160,9 @@ class FetchedLog(_CopiedLog):
 
 
 def _remove_left_behind() -> None:
-    """Remove what killed processes unpacked a day ago: nothing of theirs could clean up after them.
+    """Remove files that killed processes left more than a day ago.
 
-    Not sooner: containers may share the folder, and a process of another one is not seen running here.
+    Not sooner: containers may share the folder, and processes of other containers are not visible here.
     """
     for folder in Path(tempfile.gettempdir()).glob(f"{_UNPACKED}*-*"):
         pid = folder.name.removeprefix(_UNPACKED).partition("-")[0]
@@ -176,6 +177,6 @@ def _is_running(pid: int) -> bool:
         os.kill(pid, 0)
     except ProcessLookupError:
         return False
-    except PermissionError:  # somebody else's
+    except PermissionError:  # a process of another user
         return True
     return True

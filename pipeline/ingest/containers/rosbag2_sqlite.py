@@ -1,4 +1,4 @@
-"""SQLite files of ROS 2 bags, read row by row in order of recording; a damaged page costs the rows on it.
+"""SQLite files of ROS 2 bags, read row by row in order of recording; a damaged page costs only its rows.
 
 Source: rosbag2_storage_sqlite3 (tables topics, messages, message_definitions since schema 4).
 """
@@ -25,9 +25,9 @@ __all__ = ["Db3Log"]
 
 # rosbag2 can compress single messages; CDR starts with a zero byte, so this is unambiguous.
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-_MOST_ROWS_SKIPPED = 1 << 20  # as many unreadable rows on end are a lost tail
-# To count the rows of a topic, all rows would have to be read: there is no index of topics. A minute of a car's day has
-# some thousand rows, and among so many every topic that recurs has its share.
+_MOST_ROWS_SKIPPED = 1 << 20  # this many consecutive unreadable rows are treated as a lost tail
+# Exact counts by topic would read all rows, because there is no index of topics. A minute of a car's day has
+# some thousand rows; the first rows give the share of every periodic topic.
 _FIRST_ROWS = (
     "SELECT topic_id, count(*), min(timestamp) FROM "
     "(SELECT topic_id, timestamp FROM messages ORDER BY id LIMIT 20000) GROUP BY topic_id"
@@ -43,7 +43,7 @@ class Db3Log:
         self._channels = self._read_channels()
 
     def timeline(self) -> Timeline | None:
-        """See LogReader. Topics are counted among the first rows, and taken to keep their shares from there on."""
+        """See LogReader. Counts by topic are extrapolated from the shares among the first rows."""
         try:
             if not self._has_time_index():
                 return None
@@ -69,7 +69,7 @@ class Db3Log:
         """See LogReader."""
         self.damage.clear()
         if Path(f"{self.path}-wal").exists() and Path(f"{self.path}-wal").stat().st_size:
-            # The recorder died: open the bag once with sqlite3 to merge.
+            # The recorder was killed: open the bag once with sqlite3 to merge its journal.
             self.damage["write_ahead_log_not_merged"] += 1
         wanted = [i for i, c in self._channels.items() if topics is None or c.topic in topics]
         indexed = within is not None and self._has_time_index()
@@ -114,7 +114,7 @@ class Db3Log:
                     last, skip = row[0], 1
                     yield row
             except (apsw.Error, OverflowError, UnicodeDecodeError):
-                # Step over the damaged row, twice as far each time it fails again: a lost tail ends soon.
+                # Skip the damaged row, and twice as many at each further failure: a lost tail ends soon.
                 self.damage["damaged_rows"] += 1
                 last, skip = last + skip, skip * 2
             else:
@@ -134,7 +134,10 @@ class Db3Log:
                 self.damage["damaged_rows"] += 1
 
     def _has_time_index(self) -> bool:
-        """rosbag2 makes one on the time stamps; without it each question would read all rows."""
+        """Whether there is an index on time stamps, as rosbag2 makes it.
+
+        Without it each query would read all rows.
+        """
         try:
             rows = self._db.execute("SELECT sql FROM sqlite_master WHERE type = 'index'").fetchall()
         except (apsw.Error, UnicodeDecodeError):
@@ -161,7 +164,7 @@ class Db3Log:
             ).fetchall()
             definitions = {str(t): (str(text), "idl" if e == "ros2idl" else "msg") for t, e, text in rows}
         except (apsw.Error, UnicodeDecodeError, OverflowError):
-            pass  # bags up to ROS 2 Humble carry no definitions
+            pass  # bags up to ROS 2 Humble have no definitions
         return {
             int(i): Channel(str(name), str(kind), str(encoding), *definitions.get(str(kind), ("", "msg")))
             for i, name, kind, encoding in topics
@@ -170,7 +173,7 @@ class Db3Log:
 
 
 class _WholePages(apsw.VFS):
-    """A file system that shows only the whole pages of a file, so that SQLite cannot fill up a torn one with zeros."""
+    """File system that shows only whole pages of a file, so that SQLite cannot zero-fill torn ones."""
 
     def __init__(self, page_size: int) -> None:
         self.name, self.page_size = f"boresight-{page_size}", page_size
@@ -207,7 +210,7 @@ def _open(path: Path) -> apsw.Connection:
             flags=apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI,
             vfs=_whole_pages(page_size).name if is_torn else None,
         )
-        # Without it SQLite refuses a file shorter than its header says, as a cut-off recording is.
+        # Without it SQLite refuses a file shorter than its header claims, such as a truncated recording.
         # Nothing is written.
         db.execute("PRAGMA writable_schema=ON")
         db.execute("SELECT count(*) FROM sqlite_master").fetchall()

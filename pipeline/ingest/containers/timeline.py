@@ -1,4 +1,4 @@
-"""What a container's own index says of a log, and stretches of log time: what lets a part of a log be read alone."""
+"""Content of a container's index, and stretches of log time, for reading parts of a log."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jaxtyping import Float, Int64
 
 __all__ = ["PAUSE_NS", "Chunk", "Counted", "Stretches", "Timeline", "timeline_of_chunks"]
 
-# Messages of a driving car come every tenth of a second: where none came for so long, nothing was recorded.
+# A driving car logs messages every tenth of a second: after a gap of this length, recording was paused.
 PAUSE_NS = 2 * 10**9
 
 
@@ -28,7 +28,7 @@ class Stretches:
 
     @classmethod
     def merged(cls, spans_ns: Iterable[tuple[int, int]], pause_ns: int = 0) -> Stretches:
-        """Of any spans: those that overlap, or lie no further apart than a pause, become one."""
+        """Stretches from any spans: overlapping ones, and those no further apart than a pause, are merged."""
         found: list[tuple[int, int]] = []
         for start, end in sorted(spans_ns):
             if found and start <= found[-1][1] + pause_ns:
@@ -39,7 +39,10 @@ class Stretches:
 
     @classmethod
     def of_times(cls, times_ns: Int64[np.ndarray, " N"]) -> Stretches:
-        """Of messages by their times, in order: those that no pause parts lie in one stretch."""
+        """Stretches of messages from their times, in order.
+
+        One stretch for all messages without a pause between them.
+        """
         if not len(times_ns):
             return cls(())
         ends = np.flatnonzero(np.diff(times_ns) > PAUSE_NS)
@@ -50,23 +53,26 @@ class Stretches:
         return self.touch(time_ns, time_ns)
 
     def touch(self, start_ns: int, end_ns: int) -> bool:
-        """Whether a span and any of the stretches have a moment in common."""
+        """Whether a span overlaps any of the stretches."""
         i = bisect_right(self._starts, end_ns)
         return i > 0 and self.spans_ns[i - 1][1] >= start_ns
 
     def widened(self, by_ns: int) -> Stretches:
-        """All of them, longer by so much at both ends."""
+        """Stretches extended by `by_ns` at both ends."""
         return Stretches.merged((start - by_ns, end + by_ns) for start, end in self.spans_ns)
 
     @property
     def length_ns(self) -> int:
-        """How long they are together."""
+        """Total length [ns]."""
         return sum(end - start for start, end in self.spans_ns)
 
 
 @dataclass(frozen=True, eq=False)
 class Counted:
-    """How many messages an index counts from when to when; a fraction where it only knows that there are some."""
+    """Message counts of an index: start, end and number of each span.
+
+    A fraction if only their existence is known.
+    """
 
     start_ns: Int64[np.ndarray, " K"]
     end_ns: Int64[np.ndarray, " K"]
@@ -74,20 +80,21 @@ class Counted:
 
     @classmethod
     def of(cls, parts: Iterable[tuple[int, int, float]]) -> Counted:
-        """From when, to when, how many."""
+        """Counts from (start, end, number) of each span."""
         start, end, messages = zip(*parts, strict=True)
         return cls(np.array(start, np.int64), np.array(end, np.int64), np.array(messages, np.float64))
 
     @classmethod
     def joined(cls, parts: Sequence[Counted]) -> Counted:
-        """Of several logs as one."""
+        """Counts of several logs as one."""
         columns = zip(*((p.start_ns, p.end_ns, p.messages) for p in parts), strict=True)
         return cls(*(np.concatenate(column) for column in columns))
 
     def evened(self, recorded: Stretches) -> Counted:
-        """With one span for each stretch through which messages came steadily, as far as these counts tell.
+        """Counts with one span for each stretch of steady messages.
 
-        Where a chunk ends is an accident of its size: what came steadily is known better by the whole stretch.
+        The ends of chunks depend only on their size, so a steady topic is better described by the whole
+        stretch.
         """
         begins, kept = (
             np.array([start for start, _ in recorded.spans_ns], np.int64),
@@ -99,7 +106,7 @@ class Counted:
             start, end = int(self.start_ns[part].min()), int(self.end_ns[part].max())
             total, after = float(self.messages[part].sum()), np.cumsum(self.messages[part])
             steady = total * (self.end_ns[part] - start) / max(end - start, 1)
-            # Two chunks may overlap, and the last message of one be counted by the next.
+            # Chunks may overlap; the last message of one may be counted in the next.
             if np.abs(after - steady).max() <= self.messages[part].max() + 1:
                 kept.append((start, end, total))
             else:
@@ -108,13 +115,14 @@ class Counted:
         return Counted.of(kept)
 
     def times_ns(self) -> Int64[np.ndarray, " N"]:
-        """When each message was logged, in order: right to within the span that counts it, evenly spread there."""
+        """Log time of each message, in order: evenly spread within the span that counts it."""
         order = np.argsort(self.start_ns, kind="stable")
         messages = self.messages[order]
         after = np.cumsum(messages)
         if not len(after):
             return np.zeros(0, np.int64)
-        origin = int(self.start_ns[order[0]])  # of a day, so that a double holds nanoseconds
+        # origin within the day, so that a double represents nanoseconds
+        origin = int(self.start_ns[order[0]])
         spans = np.stack([self.start_ns[order], self.end_ns[order]], axis=1) - origin
         counts = np.stack([after - messages, after], axis=1)
         number = np.arange(round(float(after[-1]))) + 0.5
@@ -125,7 +133,7 @@ class Counted:
 
 @dataclass(frozen=True)
 class Timeline:
-    """When a log was recorded, how many messages a topic has and where, and between when its first one was logged."""
+    """Recorded stretches of a log, message counts by topic, and the span of each topic's first message."""
 
     recorded: Stretches
     messages: Mapping[str, int]
@@ -134,7 +142,7 @@ class Timeline:
 
     @classmethod
     def joined(cls, parts: Iterable[Timeline]) -> Timeline:
-        """Of several logs as one."""
+        """Timeline of several logs as one."""
         spans: list[tuple[int, int]] = []
         messages: dict[str, int] = {}
         first: dict[str, tuple[int, int]] = {}
@@ -153,9 +161,9 @@ class Timeline:
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """A chunk as an index knows it: where it lies, between when its messages were logged, of which channels.
+    """A chunk in the index: its position, the span of its messages, and their channels.
 
-    `channels` is None where the index does not say; `messages` of each channel, where it counts them.
+    `channels` is None if the index does not list them; `messages` by channel, if the index counts them.
     """
 
     position: int
@@ -169,19 +177,19 @@ class Chunk:
 def timeline_of_chunks(
     chunks: Iterable[Chunk], topics: Mapping[int, str], messages: Mapping[int, int]
 ) -> Timeline:
-    """The timeline of a chunked log.
+    """Timeline of a chunked log.
 
     Args:
-        chunks: of the log's index.
-        topics: of each channel.
-        messages: number of each channel's messages.
+        chunks: from the log's index.
+        topics: by channel.
+        messages: number of messages by channel.
     """
     counts: dict[str, int] = {}
     for channel, count in messages.items():
         if channel in topics:
             counts[topics[channel]] = counts.get(topics[channel], 0) + count
     first: dict[str, tuple[int, int]] = {}
-    # Without those that have no message, or whose index is damaged.
+    # Without chunks that have no message or a damaged index.
     filled = sorted((c for c in chunks if 0 < c.end_ns >= c.start_ns), key=lambda c: c.start_ns)
     typical_ns = int(np.median([c.end_ns - c.start_ns for c in filled])) if filled else 0
     spans = []
@@ -198,7 +206,10 @@ def timeline_of_chunks(
 def _counted(
     chunks: Sequence[Chunk], topics: Mapping[int, str], messages: Mapping[int, int], typical_ns: int
 ) -> dict[str, Counted]:
-    """Messages of each topic by chunk: those that the index counts there, else by its share of the chunks' bytes."""
+    """Messages of each topic by chunk.
+
+    Counts of the index if it has them, else by the chunk's share of bytes.
+    """
     bytes_of = Counter[int]()
     for chunk in chunks:
         bytes_of.update(dict.fromkeys(_channels(chunk, topics), max(chunk.length, 1)))
@@ -217,9 +228,9 @@ def _channels(chunk: Chunk, topics: Mapping[int, str]) -> Iterable[int]:
 
 
 def _without_pause(chunk: Chunk, typical_ns: int) -> list[tuple[int, int]]:
-    """When a chunk's messages were logged, as far as its span tells: chunks hold equal amounts of data.
+    """Recorded stretches of a chunk, estimated from its span: chunks hold equal amounts of data.
 
-    One that took much longer than others to fill was begun before a pause and ended after it.
+    A chunk that took much longer to fill than others began before a pause and ended after it.
     """
     if chunk.end_ns - chunk.start_ns <= 3 * typical_ns + PAUSE_NS:
         return [(chunk.start_ns, chunk.end_ns)]

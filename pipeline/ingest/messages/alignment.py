@@ -114,4 +114,6 @@ def _value(channel: Channel, message: Any, path: str) -> float:
         return sign * float(value)
     except (TypeError, ValueError) as err:
         field = path.lstrip("-")
-        raise LogError("", f"{channel.msgtype}: this is no number", topic=channel.topic, field=field) from err
+        raise LogError(
+            "", f"{channel.msgtype}: this is not a number", topic=channel.topic, field=field
+        ) from err

@@ -78,7 +78,7 @@ def test_a_field_that_is_not_there_is_named_with_those_that_are():
 
 
 def test_a_field_that_is_no_number_is_named():
-    with pytest.raises(LogError, match=r"field header: .*no number"):
+    with pytest.raises(LogError, match=r"field header: .*not a number"):
         read_alignment(*sent(2, of.ESR4), AlignmentFields(azimuth="header"))
 
 
