@@ -1,1 +1,1 @@
-"""Folders of public data sets to logs that ingest reads."""
+"""Conversion of folders of public data sets to logs that ingest reads."""

@@ -1,4 +1,4 @@
-"""Files of data sets: tables of numbers, JSON, point clouds; what is wrong with them names the file."""
+"""Files of data sets: tables of numbers, JSON, point clouds; errors name the file."""
 
 from __future__ import annotations
 
@@ -32,23 +32,23 @@ def read_json(path: Path) -> Any:
     """Value of a JSON file.
 
     Raises:
-        ConfigError: it cannot be read, or is none.
+        ConfigError: it cannot be read, or is not JSON.
     """
     try:
         return json.loads(read_bytes(path))
     except ValueError as err:
-        raise ConfigError(str(path), "", f"no readable JSON: {err}") from err
+        raise ConfigError(str(path), "", f"not readable JSON: {err}") from err
 
 
 def read_float_rows(path: Path, columns: int) -> Float32[np.ndarray, "N C"]:
-    """Rows of little-endian float32 without a header, as KITTI's and nuScenes' .bin files have them.
+    """Rows of little-endian float32 without a header, as in .bin files of KITTI and nuScenes.
 
     Raises:
-        ConfigError: the size is no multiple of a row's.
+        ConfigError: the size is not a multiple of a row.
     """
     data = read_bytes(path)
     if len(data) % (4 * columns):
-        raise ConfigError(str(path), "", f"{len(data)} bytes are no rows of {columns} float32")
+        raise ConfigError(str(path), "", f"{len(data)} bytes are not rows of {columns} float32")
     return np.frombuffer(data, "<f4").reshape(-1, columns)
 
 
@@ -56,7 +56,7 @@ def read_pcd(path: Path) -> np.ndarray:
     """Points of a binary PCD 0.7 file as a structured array.
 
     Raises:
-        ConfigError: no such file, or its header and its size contradict each other.
+        ConfigError: no such file, or its header does not fit its size.
     """
     data = read_bytes(path)
     head, separator, body = data.partition(b"DATA binary\n")
@@ -70,7 +70,7 @@ def read_pcd(path: Path) -> np.ndarray:
         count = int(header["POINTS"][0])
         is_single = set(header.get("COUNT", ["1"])) == {"1"}
     except (KeyError, IndexError, ValueError, TypeError) as err:
-        raise ConfigError(str(path), "", f"no readable PCD: {type(err).__name__} {err}") from err
+        raise ConfigError(str(path), "", f"not a readable PCD: {type(err).__name__} {err}") from err
     if not separator or not is_single or len(body) < count * dtype.itemsize:
         raise ConfigError(str(path), "DATA", f"needs {count} binary points of single numbers")
     return np.frombuffer(body, dtype, count)

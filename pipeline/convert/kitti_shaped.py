@@ -1,11 +1,11 @@
-"""KITTI-shaped folders: View-of-Delft's two trees, and one tree, with folders `image_3` and `radar` or without.
+"""Folders in KITTI's layout: View-of-Delft's two trees, or one tree with optional image_3 and radar.
 
-The data sets give no stamps: frames count at 10 Hz from noon of the day that the caller names, and all sensors of a
-frame have the same stamp. Where poses jump farther than a car drives between frames, another drive begins a minute
-later.
+The data sets have no stamps: frames are numbered at 10 Hz from noon of the day given by the caller, and all
+sensors of a frame have the same stamp. If poses jump farther than a car drives between frames, a new drive
+begins a minute later.
 
-Source: View-of-Delft development kit (vod/configuration/file_locations.py, vod/frame/transformations.py: pose, calib;
-radar rows are x, y, z, RCS, v_r, v_r compensated, time); KITTI object development kit.
+Source: View-of-Delft development kit (vod/configuration/file_locations.py, vod/frame/transformations.py:
+pose, calib; radar rows are x, y, z, RCS, v_r, v_r compensated, time); KITTI object development kit.
 """
 
 from __future__ import annotations
@@ -32,23 +32,25 @@ __all__ = ["Layout", "read_kitti", "read_view_of_delft"]
 
 _PERIOD_NS = 100_000_000
 _PAUSE_NS = 60 * 10**9
-_JUMP_M = 5.0  # 50 m/s at 10 Hz: farther from frame to frame is another drive
+_JUMP_M = 5.0  # 50 m/s at 10 Hz: a larger step between frames is a new drive
 _LIDAR_COLUMNS = ("x", "y", "z", "intensity")
 _VOD_RADAR = ("x", "y", "z", "power", "doppler", "", "")  # the last two are derived or constant
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where things are in the folder.
+    """Layout of a folder.
 
     Args:
-        images: folders of images, named by frame, by the camera's name; P2 in calib is of image_2, P3 of image_3.
+        images: folders of images by camera name, files named by frame; P2 in calib is of image_2, P3 of
+            image_3.
         lidar: folder of .bin.
-        radar: folder of .bin; empty: there is none.
+        radar: folder of .bin; empty = none.
         calib: folder of .txt.
-        radar_calib: folder of the radar's own, whose Tr_velo_to_cam is the radar's; empty: Tr_radar_to_velo in calib.
+        radar_calib: folder of the radar's own, with the radar's transform as Tr_velo_to_cam; empty =
+            Tr_radar_to_velo in calib.
         poses: folder of .json; may be missing.
-        radar_columns: of a row; empty names are left out.
+        radar_columns: of a row; columns with empty names are left out.
     """
 
     images: Mapping[str, str]
@@ -61,10 +63,10 @@ class Layout:
 
 
 def read_view_of_delft(folder: Path, vehicle: str, day: str) -> list[Recording]:
-    """The one recording of a View-of-Delft folder (with `lidar` and `radar` in it).
+    """The single recording of a View-of-Delft folder (with `lidar` and `radar` in it).
 
     Raises:
-        ConfigError: no frame is whole, or a file is not what it should be.
+        ConfigError: no frame is complete, or a file has another format.
     """
     lidar, radar = "lidar/training", "radar/training"
     layout = Layout(
@@ -80,9 +82,9 @@ def read_view_of_delft(folder: Path, vehicle: str, day: str) -> list[Recording]:
 
 
 def read_kitti(folder: Path, vehicle: str, day: str, radar_columns: Sequence[str]) -> list[Recording]:
-    """The one recording of a folder with image_2, velodyne and calib; image_3 and radar where there are such.
+    """The single recording of a folder with image_2, velodyne and calib, and optional image_3 and radar.
 
-    The radar needs Tr_radar_to_velo. Of two cameras that of image_2 is called left, the other right.
+    The radar needs Tr_radar_to_velo. With two cameras, that of image_2 is named left, the other right.
 
     Raises:
         ConfigError: as `read_view_of_delft`, or the radar's columns lack x, y, z or doppler.
@@ -126,14 +128,17 @@ def _read(folder: Path, layout: Layout, vehicle: str, day: str) -> Recording:
 
 
 def _images(folder: Path) -> dict[str, Path]:
-    """Images by frame, in their order."""
+    """Images by frame, in order."""
     return {p.stem: p for p in sorted(folder.glob("*")) if p.suffix in (".jpg", ".png")}
 
 
 def _calibration(
     folder: Path, layout: Layout, frame: str, images: Mapping[str, Path]
 ) -> tuple[dict[str, Camera], dict[str, Float[np.ndarray, "4 4"]]]:
-    """Cameras by name, and T_lidar_sensor of all: the lidar is the base, for nothing says where it sits on the car."""
+    """Cameras by name, and T_lidar_sensor of all sensors.
+
+    The lidar is the base, as its pose on the car is unknown.
+    """
     path = folder / layout.calib / f"{frame}.txt"
     lines = _lines(path)
     cameras, T_lidar = {}, {}
@@ -157,12 +162,15 @@ def _camera(image: Path, P: Float[np.ndarray, "4 4"]) -> Camera:
     data = np.frombuffer(read_bytes(image), np.uint8)
     pixels = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
     if pixels is None:
-        raise ConfigError(str(image), "", "is no readable image")
+        raise ConfigError(str(image), "", "is not a readable image")
     return Camera("plumb_bob", P[:3, :3].copy(), np.zeros(5), pixels.shape[1], pixels.shape[0])
 
 
 def _rectified(path: Path, lines: Mapping[str, Sequence[float]], P: np.ndarray) -> Float[np.ndarray, "4 4"]:
-    """From the reference camera to the camera of P: rectified, and shifted by its baseline (K^-1 P's last column)."""
+    """Transform from the reference camera to the camera of P.
+
+    Rectification and baseline (K^-1 P's last column).
+    """
     T = np.eye(4)
     T[:3, 3] = np.linalg.solve(P[:3, :3], P[:3, 3])
     R = np.eye(4)
@@ -181,7 +189,7 @@ def _lines(path: Path) -> dict[str, list[float]]:
             try:
                 found[name.strip()] = [float(word) for word in numbers.split()]
             except ValueError as err:
-                raise ConfigError(str(path), name.strip(), f"holds what is not a number: {err}") from err
+                raise ConfigError(str(path), name.strip(), f"is not a number: {err}") from err
     return found
 
 
@@ -193,14 +201,14 @@ def _matrix(path: Path, lines: Mapping[str, Sequence[float]], name: str) -> Floa
 
 
 def _pose(path: Path) -> Float[np.ndarray, "4 4"] | None:
-    """T_odom_camera of the line that has it; the key reads the other way round, the development kit this way."""
+    """T_odom_camera of a pose file; its key reads the other way round, this follows the development kit."""
     if not path.is_file():
         return None
     for line in read_bytes(path).decode("utf-8", "replace").splitlines():
         try:
             held = json.loads(line)
         except ValueError as err:
-            raise ConfigError(str(path), "", f"no readable JSON: {err}") from err
+            raise ConfigError(str(path), "", f"not readable JSON: {err}") from err
         if "odomToCamera" in held:
             T = np.array(held["odomToCamera"], np.float64).reshape(-1)
             if T.size != 16:
@@ -210,7 +218,7 @@ def _pose(path: Path) -> Float[np.ndarray, "4 4"] | None:
 
 
 def _stamps(frames: Sequence[str], T_odom_base: Mapping[str, np.ndarray], day: str) -> dict[str, int]:
-    """Stamp of each frame: its number, or its place where names are no numbers, at 10 Hz, with a pause at each jump."""
+    """Stamp of each frame at 10 Hz, from its number (else its index), with a pause at each jump."""
     noon = dt.datetime.fromisoformat(f"{day}T12:00:00+00:00")
     start, pauses, found = int(noon.timestamp()) * 10**9, 0, {}
     numbers = [int(n) if n.isdecimal() else k for k, n in enumerate(frames)]
@@ -228,7 +236,7 @@ def _is_jump(T_odom_base: Mapping[str, np.ndarray], before: str, after: str, fra
 
 
 def _drives(stamps: Mapping[str, int], T_odom_base: Mapping[str, np.ndarray]) -> list[list[str]]:
-    """Frames with a pose, split where the clock pauses."""
+    """Frames with a pose, split at pauses of the stamps."""
     drives: list[list[str]] = []
     last = -_PAUSE_NS
     for n, stamp in stamps.items():

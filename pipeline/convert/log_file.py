@@ -1,4 +1,4 @@
-"""A recording as a ROS 2 MCAP, and the fleet.toml of several."""
+"""A recording as a ROS 2 MCAP, and a fleet.toml for several recordings."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ __all__ = ["fleet_text", "write_log"]
 
 
 def write_log(path: Path, recording: Recording) -> int:
-    """Write a recording, one message in memory at a time; returns how many messages there are.
+    """Write a recording, with one message in memory at a time; returns the number of messages.
 
     Raises:
-        ConfigError: a file of the data set is not what its format promises; no log is left then.
+        ConfigError: a file of the data set violates its format; then no log is left.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as stream:
@@ -38,7 +38,7 @@ def write_log(path: Path, recording: Recording) -> int:
 
 
 def _messages(ros: RosMessages, recording: Recording, event: Event) -> list[tuple[str, Any]]:
-    """(topic, message) of what one sensor saw."""
+    """(topic, message) pairs of one event."""
     held, name, at_ns = event.load(), event.sensor, event.stamp_ns
     if name == "ego":
         return [(TOPICS["odometry"], ros.odometry(at_ns, *held))]
@@ -60,15 +60,16 @@ def fleet_text(
     ego: bool,
     base: bool,
 ) -> str:
-    """fleet.toml of converted logs.
+    """Text of fleet.toml for converted logs.
 
     Args:
         name: of the fleet.
-        vehicles: all on one rig.
+        vehicles: all with the same rig.
         kinds: of the rig's sensors, by name.
-        models: manifests of a segmenter and a detector; None names topics for semantics that the logs do not hold.
-        ego: the logs hold odometry.
-        base: the frame that poses are given in is the vehicle's.
+        models: manifests of a segmenter and a detector; None = topics for semantics, which the logs do not
+            have yet.
+        ego: whether the logs have odometry.
+        base: whether the frame of the poses is the vehicle's.
     """
     is_short = all(sensor == kind for sensor, kind in kinds.items())
     lines = [

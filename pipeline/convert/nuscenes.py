@@ -1,8 +1,8 @@
-"""nuScenes-shaped folders: a recording per scene, samples and sweeps of all its cameras, lidars and radars.
+"""Folders in nuScenes' layout: a recording per scene, with samples and sweeps of all sensors.
 
-nuScenes' lidar looks along y, with x to the right: its points are turned to x forward, y left. Its radar gives a
-velocity vector, whose part along the ray is what was measured; points that the devkit hides by default (ambiguous,
-invalid) are left out. Sweeps have no times of points and are not de-skewed.
+nuScenes' lidar looks along y, with x to the right: its points are rotated to x forward, y left. Its radar
+gives a velocity vector; the component along the ray is the measured one. Points that the devkit hides by
+default (ambiguous, invalid) are left out. Sweeps have no times of points and are not de-skewed.
 
 Source: nuscenes-devkit, docs/schema_nuscenes.md and utils/data_classes.py (RadarPointCloud, LidarPointCloud).
 """
@@ -27,23 +27,24 @@ from pipeline.rig.graph import Kind
 
 __all__ = ["read_nuscenes"]
 
-# Coordinates in x forward, y left, z up to those of nuScenes' lidar (x right, y forward, z up).
+# Rotation from x forward, y left, z up to nuScenes' lidar frame (x right, y forward, z up).
 _T_NUSCENES_LIDAR = from_rotation_translation(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.zeros(3))
 _OfScene = defaultdict[str, defaultdict[str, list[dict[str, Any]]]]
 _UNAMBIGUOUS, _VALID = 3, 0  # ambig_state and invalid_state that the devkit shows by default
 
 
 def read_nuscenes(folder: Path, channels: Mapping[Kind, Sequence[str]]) -> list[Recording]:
-    """Recordings of all scenes, their points not loaded yet.
+    """Recordings of all scenes; points are loaded later.
 
-    Sensors go by their channels in small letters, as cam_front; where no kind has two, by their kinds.
+    Sensors are named after their channels in lower case, such as cam_front; if no kind has two, after their
+    kinds.
 
     Args:
-        folder: holds one folder of tables (as v1.0-mini), samples and sweeps.
-        channels: which ones to take of a kind; all of kinds that it leaves out.
+        folder: contains one folder of tables (such as v1.0-mini), samples and sweeps.
+        channels: channels to use, by kind; all channels of a kind that is not given.
 
     Raises:
-        ConfigError: a table, row or channel is missing; it names the file.
+        ConfigError: a table, row or channel is missing; the message names the file.
     """
     tables = _Tables(folder)
     calibrated = {row["token"]: row for row in tables.rows("calibrated_sensor")}
@@ -66,7 +67,7 @@ def read_nuscenes(folder: Path, channels: Mapping[Kind, Sequence[str]]) -> list[
 
 
 def _sensors(tables: _Tables, channels: Mapping[Kind, Sequence[str]]) -> dict[str, tuple[str, Kind]]:
-    """Name and kind of the sensors to take, cameras first, by their tokens."""
+    """Name and kind of the sensors to use, cameras first, by their tokens."""
     rows = {str(row["channel"]): row for row in tables.rows("sensor")}
     for kind, channel in ((kind, c) for kind, of in channels.items() for c in of):
         there = sorted(c for c, row in rows.items() if row["modality"] == kind)
@@ -80,7 +81,7 @@ def _sensors(tables: _Tables, channels: Mapping[Kind, Sequence[str]]) -> dict[st
 
 
 def _by_scene(tables: _Tables, name_of: Mapping[str, str], calibrated: Mapping[str, Any]) -> _OfScene:
-    """Rows of sample_data by scene and the sensor's name."""
+    """Rows of sample_data by scene and sensor name."""
     scene_of = {row["token"]: row["scene_token"] for row in tables.rows("sample")}
     of_scene: _OfScene = defaultdict(lambda: defaultdict(list))
     for row in tables.rows("sample_data"):
@@ -91,7 +92,7 @@ def _by_scene(tables: _Tables, name_of: Mapping[str, str], calibrated: Mapping[s
 
 
 class _Tables:
-    """Tables of the only folder that has them, read as they are asked for."""
+    """Tables of the single folder of tables, read on demand."""
 
     def __init__(self, folder: Path) -> None:
         found = sorted(p.parent for p in folder.glob("*/calibrated_sensor.json"))
@@ -106,7 +107,7 @@ class _Tables:
     def rows(self, table: str) -> list[dict[str, Any]]:
         rows = read_json(self.path(table))
         if not isinstance(rows, list):
-            raise ConfigError(str(self.path(table)), "", "is no list of rows")
+            raise ConfigError(str(self.path(table)), "", "is not a list of rows")
         return [_Row(str(self.path(table)), row) for row in rows]
 
     def found(self, table: str, rows: Mapping[str, Any], token: str) -> Any:
@@ -116,7 +117,7 @@ class _Tables:
 
 
 class _Row(dict[str, Any]):
-    """A row that names its table where it lacks a field."""
+    """A row whose error for a missing field names the table."""
 
     def __init__(self, file: str, values: Mapping[str, Any]) -> None:
         super().__init__(values)
@@ -147,7 +148,7 @@ def _recording(
         for name, kind in kinds.items()
         for row in rows[name]
     ]
-    # Every row has the pose of its own time; the lidar's are the densest.
+    # Every row has the pose of its own time; the lidar's rows are the most frequent.
     ego = next((n for n, kind in kinds.items() if kind == "lidar"), next(iter(kinds)))
     events += _ego(rows[ego], poses)
     return Recording(*about, kinds, cameras, T_base, sorted(events, key=lambda event: event.stamp_ns))
@@ -156,7 +157,7 @@ def _recording(
 def _camera(folder: Path, calibrated: Mapping[str, Any], image: Mapping[str, Any]) -> Camera:
     K = np.array(calibrated["camera_intrinsic"], np.float64)
     if K.shape != (3, 3):
-        raise ConfigError(str(folder), "calibrated_sensor.camera_intrinsic", "is no 3x3 matrix")
+        raise ConfigError(str(folder), "calibrated_sensor.camera_intrinsic", "is not a 3x3 matrix")
     return Camera("plumb_bob", K, np.zeros(5), int(image["width"]), int(image["height"]))
 
 
@@ -178,7 +179,7 @@ def _pose(row: Mapping[str, Any]) -> Float[np.ndarray, "4 4"]:
 
 
 def _lidar(path: Path) -> dict[str, np.ndarray]:
-    """x, y, z, intensity, ring; the file's x points to the right and its y forward."""
+    """x, y, z, intensity, ring; in the file x points to the right and y forward."""
     points = read_float_rows(path, 5)
     return {
         "x": points[:, 1],

@@ -1,4 +1,4 @@
-"""A drive of a data set: intrinsics, where sensors sit on the car, and what each of them saw when."""
+"""A drive of a data set: intrinsics, sensor poses on the car, and events of each sensor."""
 
 from __future__ import annotations
 
@@ -26,10 +26,13 @@ class EgoMotion(NamedTuple):
 
 
 class Event(NamedTuple):
-    """What one sensor saw: `load` gives JPEG or PNG bytes, columns of points by name, or an EgoMotion."""
+    """One measurement of a sensor.
+
+    `load` returns JPEG or PNG bytes, columns of points by name, or an EgoMotion.
+    """
 
     stamp_ns: int
-    sensor: str  # its name, or ego
+    sensor: str  # name of the sensor, or ego
     load: Callable[[], Any]
 
 
@@ -57,7 +60,10 @@ class Recording:
 
 
 def ego_events(stamps_ns: Sequence[int], T_odom_base: Sequence[Float[np.ndarray, "4 4"]]) -> list[Event]:
-    """Odometry of poses at rising stamps: motion from one neighbour to the other, at the ends to the only one."""
+    """Odometry from poses at increasing stamps.
+
+    Motion between the neighbours, at the ends to the only neighbour.
+    """
     events = []
     for k, (stamp, T) in enumerate(zip(stamps_ns, T_odom_base, strict=True)):
         before, after = max(k - 1, 0), min(k + 1, len(stamps_ns) - 1)
@@ -75,5 +81,5 @@ def _same(motion: EgoMotion) -> EgoMotion:
 
 
 def image_format(data: bytes) -> str:
-    """'jpeg' or 'png', by the first bytes."""
+    """'jpeg' or 'png', from the first bytes."""
     return "png" if data.startswith(b"\x89PNG") else "jpeg"

@@ -115,7 +115,7 @@ def _numbers(file: str, name: str, words: Iterable[str]) -> list[float]:
         return [float(word) for word in words]
     except ValueError as err:
         if name in (_CAMERA, _RECTIFIED, _IMAGE) or name.endswith(_TO_LIDAR):
-            raise ConfigError(file, name, f"holds a value that is not a number: {err}") from err
+            raise ConfigError(file, name, f"is not a number: {err}") from err
         return []  # a line with other content, such as calib_time
 
 

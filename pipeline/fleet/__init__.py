@@ -1,1 +1,1 @@
-"""Many vehicle-days: executors and the nightly run."""
+"""Processing of many vehicle-days: executors and the nightly run."""

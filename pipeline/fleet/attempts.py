@@ -1,4 +1,4 @@
-"""One function on many items: what is asked of an executor, how an item ends, and when it is given up."""
+"""One function on many items: the executor interface, the result of an item, and retries."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ __all__ = ["ONE_THREAD", "Executor", "Finished", "Turns", "Watch", "attempt", "u
 
 Item = TypeVar("Item")
 Outcome = TypeVar("Outcome")
-# watch(item's index, done, total, what): what each item in work is doing.
+# watch(item's index, done, total, what): progress of each item in work.
 Watch = Callable[[int, int, int, str], None]
 
-# A worker that dies takes innocent neighbours with it: whoever was in work then is tried again, alone. One
-# death alone may still be the machine's (out of memory beside another program), a second is the item's own.
+# A worker that dies also stops other items in work: each of them is tried again, alone. One death alone may
+# be due to the machine (another program used up the memory); after a second the item is given up.
 _DEATHS_ALONE = 2
-# One thread per worker: nested thread pools starve each other.
+# One thread per worker: nested thread pools compete for CPUs.
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
 )
@@ -29,7 +29,7 @@ ONE_THREAD = dict.fromkeys(
 
 @dataclass(frozen=True)
 class Finished(Generic[Item, Outcome]):
-    """What became of one item: its value, or the error in a line, with a traceback where there is one."""
+    """Result of one item: its value, or the error in a line, with a traceback if there is one."""
 
     item: Item
     value: Outcome | None = None
@@ -40,8 +40,8 @@ class Finished(Generic[Item, Outcome]):
 class Executor(Protocol):
     """`function(item, progress)` must be importable and picklable, and safe to run again.
 
-    What all items share is bound to the function (`functools.partial`), which each worker is sent once; `items` may
-    put each item together when it is asked for. `workers` None = one per CPU that may be used.
+    Data shared by all items are bound to the function (`functools.partial`), which each worker receives once;
+    `items` may build each item on access. `workers` None = one per available CPU.
     """
 
     def __call__(
@@ -51,17 +51,17 @@ class Executor(Protocol):
         workers: int | None,
         watch: Watch,
     ) -> Generator[Finished[Any, Any], None, None]:
-        """Yield each item's end as it comes."""
+        """Yield the result of each item in order of completion."""
         ...
 
 
 class Turns:
-    """Whose turn it is: first the fresh items, then one at a time those whose worker died.
+    """Order of work: first the fresh items, then one at a time the items whose worker died.
 
-    An item that kills its worker twice alone is given up, so that one item at most is lost to it.
+    An item that kills its worker twice while alone is given up, so a night loses only that item.
 
     Args:
-        items: how many there are.
+        items: number of items.
     """
 
     def __init__(self, items: int) -> None:
@@ -73,16 +73,16 @@ class Turns:
 
     @property
     def alone(self) -> bool:
-        """Whether only suspects are left, each of which must be the only one in work."""
+        """Whether only suspects are left, which must run one at a time."""
         return not self._fresh
 
     @property
     def queue(self) -> deque[int]:
-        """Who waits, to be taken from the left."""
+        """Waiting items, to be taken from the left."""
         return self._suspects if self.alone else self._fresh
 
     def died(self, index: int, *, alone: bool) -> str:
-        """Note that a worker died with an item: empty where the item gets another turn, else why it gets none."""
+        """Record that a worker died with an item; returns the reason if the item is given up, else empty."""
         self._deaths[index] += alone
         if self._deaths[index] < _DEATHS_ALONE:
             self._suspects.append(index)
@@ -93,7 +93,7 @@ class Turns:
 def attempt(
     function: Callable[[Item, Progress], Outcome], item: Item, progress: Progress
 ) -> Finished[Item, Outcome]:
-    """The function's value, or its error: one item's trouble stays its own."""
+    """Value of the function, or its error as a result, so that it does not affect other items."""
     try:
         return Finished(item, function(item, progress))
     except Exception as err:  # noqa: BLE001 - one vehicle-day's trouble, whatever it is, must not stop the fleet

@@ -1,4 +1,4 @@
-"""Where workers write how far they are: shared memory without locks: a killed worker blocks nobody."""
+"""Progress of workers in shared memory, without locks, so that a killed worker blocks no other process."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ class _Slot(ctypes.Structure):
 
 
 class Board:
-    """One slot per item. A reader may see a slot half-written: it is for the eye only."""
+    """One slot per item. A reader may see a half-written slot: use it for display only."""
 
     def __init__(self, items: int) -> None:
         self._slots = get_context("spawn").RawArray(_Slot, max(items, 1))
 
     def write(self, index: int, done: int, total: int, what: str) -> None:
-        """Say how far an item is."""
+        """Write the progress of an item."""
         slot = self._slots[index]
         slot.done, slot.total, slot.what = done, total, what.encode()[: _TEXT_BYTES - 1]
 
     def read(self, index: int) -> tuple[int, int, str]:
-        """What was last written: done, total, what."""
+        """Last progress of an item: done, total, what."""
         slot = self._slots[index]
         return slot.done, slot.total, slot.what.decode(errors="replace")

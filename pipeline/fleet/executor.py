@@ -1,8 +1,8 @@
-"""Run one function on many vehicle-days: here, in a pool of processes, or on a Ray cluster.
+"""Run one function on many vehicle-days: in this process, in a pool of processes, or on a Ray cluster.
 
-A backend is a function in EXECUTORS; all yield one `Finished` per item, in order of completion, whatever
-happens to the item. Only an order to stop (KeyboardInterrupt, SystemExit) ends them early, and then no worker
-stays behind.
+A backend is a function in EXECUTORS; all yield one `Finished` per item, in order of completion, for every
+outcome of the item. Only a request to stop (KeyboardInterrupt, SystemExit) ends them early, and then all
+workers end too.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Outcome = TypeVar("Outcome")
 def run_inline(
     function: Callable[[Item, Progress], Outcome], items: Sequence[Item], workers: int | None, watch: Watch
 ) -> Generator[Finished[Item, Outcome], None, None]:
-    """One item after the other in this process; `workers` has no meaning here."""
+    """Run one item after the other in this process; `workers` is ignored."""
     del workers
     for index, item in enumerate(items):
         yield attempt(function, item, lambda *at, i=index: watch(i, *at))

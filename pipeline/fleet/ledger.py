@@ -1,4 +1,4 @@
-"""What a night records: the driver commits the workers' rows in batches, so that workers share nothing."""
+"""Records of a night: only the driver commits the workers' rows, in batches."""
 
 from __future__ import annotations
 
@@ -21,15 +21,18 @@ from schemas.versions import CODE_VERSION, TABLES
 
 __all__ = ["Known", "Ledger", "outcome_row", "record_outcome"]
 
-# A commit takes some tenths of a second. Every half minute is one hundredth of the time, and what a killed night has to
-# calibrate again is what ended in the last half minute.
+# A commit takes some tenths of a second: every half minute it costs a hundredth of the time. A killed night
+# must repeat the calibrations of its last half minute.
 _EVERY_S = 30.0
 _ROWS = 3000
 
 
 @dataclass(frozen=True)
 class Known:
-    """What the lake has of one vehicle-day: its records (without what outcomes do not say), and what became of it."""
+    """One vehicle-day in the lake.
+
+    Its records (without columns that outcomes do not have), and its outcomes.
+    """
 
     records: tuple[CalibrationRecord | PoseRow | RadarAlignment, ...] = ()
     outcomes: tuple[OutcomeRow, ...] = ()
@@ -37,7 +40,7 @@ class Known:
 
 @dataclass
 class _Waiting:
-    """Rows of one table that are not committed yet, and those that shall be current again."""
+    """Rows of one table that are not committed yet, and recorded rows to become current again."""
 
     schema: TableSchema
     new: list[Any] = field(default_factory=list)
@@ -45,10 +48,10 @@ class _Waiting:
 
 
 class Ledger:
-    """Reads once what the lake has of a night's vehicle-days, and commits what the night adds.
+    """Reads the lake's rows of a night's vehicle-days once, and commits the night's new rows.
 
     Args:
-        lake: where the tables are.
+        lake: with the tables.
         partitions: the night's vehicle-days.
 
     Raises:
@@ -60,13 +63,13 @@ class Ledger:
             if schema.is_record_table:
                 open_table(
                     lake, schema
-                )  # one that could not be written to after a night's work is named before it
+                )  # an unwritable table is reported before the night's work, not after it
         self._lake = lake
-        # In the order of commits: where a calibration is, its poses are too, and no outcome tells of what is not there.
+        # Commit order: a calibration's poses are committed before it, and outcomes come last.
         self._waiting = [_Waiting(t) for t in (RADAR_ALIGNMENTS, POSES, CALIBRATIONS, OUTCOMES)]
         self._committed_at = time.monotonic()
         days = sorted({p.day for p in partitions})
-        # A night without a vehicle-day asks for none.
+        # a night without vehicle-days needs no tables
         span = (days[0], days[-1]) if days else ("9999-12-31", "0001-01-01")
         self._records = RecordIndex(
             lake, CALIBRATIONS, CalibrationRecord, *span, ("frames_rejected", "inputs")
@@ -78,16 +81,16 @@ class Ledger:
         )
 
     def known(self, partition: Partition) -> Known:
-        """What the lake had of a vehicle-day when the night began; the current one of a kind comes last."""
+        """Rows of a vehicle-day at the beginning of the night; the current one of a key comes last."""
         of = (partition.vehicle, partition.day)
         found = self._records.of(*of), self._poses.of(*of), self._alignments.of(*of)
         return Known((*found[0], *found[1], *found[2]), tuple(self._outcomes.of(*of)))
 
     def add(self, outcome: Outcome, method: str) -> None:
-        """Take an outcome and its records; commit those that came together, if it is time.
+        """Add an outcome and its records; commit all waiting rows if it is time.
 
         Raises:
-            OSError: the storage does not answer; the rows are kept, and the next commit has them too.
+            OSError: the storage does not answer; the rows are kept for the next commit.
         """
         alignments, poses, records, outcomes = self._waiting
         of = (outcome.vehicle, outcome.day)
@@ -102,7 +105,7 @@ class Ledger:
             self.commit()
 
     def commit(self) -> None:
-        """Commit what has not been yet.
+        """Commit all waiting rows.
 
         Raises:
             OSError: the storage does not answer; the rows are kept.
@@ -118,7 +121,7 @@ class Ledger:
 
 
 def record_outcome(lake: Lake, outcome: Outcome, method: str = "") -> None:
-    """Add the outcome of a stage that a command ran by itself.
+    """Record the outcome of a stage that was run by a command of its own.
 
     Raises:
         OSError: the storage does not answer.
@@ -127,11 +130,11 @@ def record_outcome(lake: Lake, outcome: Outcome, method: str = "") -> None:
 
 
 def outcome_row(outcome: Outcome, method: str) -> OutcomeRow:
-    """The row of table `outcomes` that an outcome is.
+    """Row of table `outcomes` for an outcome.
 
     Args:
         outcome: of a stage on a vehicle-day.
-        method: of the calibration; other stages have none.
+        method: of the calibration; empty for other stages.
     """
     effort = outcome.effort
     return OutcomeRow(
@@ -141,7 +144,7 @@ def outcome_row(outcome: Outcome, method: str) -> OutcomeRow:
         method=method if outcome.stage == CALIBRATIONS.made_by else "",
         status="done" if outcome.status == "cached" else outcome.status,
         reason=outcome.reason,
-        # What fails has no key: the same failure is the same row, however often it is tried.
+        # A failure has no work key: the same failure gives the same row, however often it is tried.
         work_key=outcome.work_key or work_key(outcome.stage, CODE_VERSION, outcome.reason, []),
         rows=outcome.rows,
         kept=outcome.kept,
@@ -157,7 +160,10 @@ def outcome_row(outcome: Outcome, method: str) -> OutcomeRow:
 
 
 def _sort(waiting: _Waiting, rows: Sequence[Any], recorded: Sequence[Any]) -> None:
-    """Rows that are not recorded are new; those that others about the same came after are to be current again."""
+    """Sort rows: unrecorded rows are new.
+
+    Recorded rows that others have replaced are to become current again.
+    """
     about_of = waiting.schema.about_of
     last = {about_of(r): r.work_key for r in recorded}
     keys = {(about_of(r), r.work_key) for r in recorded}

@@ -1,6 +1,7 @@
-"""What a night did as OpenLineage events: a run per stage and vehicle-day, below the night's. Needs the extra [ops].
+"""A night as OpenLineage events: a run per stage and vehicle-day, below the night's run. Extra [ops].
 
-A run's id comes from the work key, so that the same work, whoever does it and how often, is the same run.
+The id of a run is derived from the work key, so that the same work is the same run for every executor and
+repetition.
 """
 
 from __future__ import annotations
@@ -27,14 +28,14 @@ if TYPE_CHECKING:
 
 __all__ = ["NightLineage", "run_id_of"]
 
-# Ours, drawn once: run ids are names below it (RFC 9562, version 5).
+# Namespace of Boresight's run ids, a random UUID: ids are names below it (RFC 9562, version 5).
 _NAMESPACE = UUID("5b0c7e86-3d1a-5f5e-9a4c-6f1f8c1a7d20")
 _PRODUCER = f"https://pypi.org/project/boresight/{CODE_VERSION}"
 _STAGES = {stage.name: stage for stage in STAGES}
 
 
 def run_id_of(stage: str, vehicle: str, day: str, work_key: str) -> str:
-    """The run of a stage on a vehicle-day: from what table `outcomes` has in the columns of these names."""
+    """Run id of a stage on a vehicle-day, from the columns of these names in table `outcomes`."""
     return str(uuid5(_NAMESPACE, f"{stage}/{vehicle}/{day}/{work_key}"))
 
 
@@ -43,7 +44,7 @@ class NightLineage:
     """The events of one night.
 
     Args:
-        night: what its vehicle-days share.
+        night: settings shared by its vehicle-days.
         logs: of each vehicle-day.
     """
 
@@ -52,23 +53,26 @@ class NightLineage:
 
     @classmethod
     def of(cls, night: Night, days: Sequence[VehicleDay]) -> NightLineage:
-        """The lineage of a night over these days."""
+        """Lineage of a night with these vehicle-days."""
         return cls(night, {d.partition: d.logs for d in days})
 
     def begun(self, at: dt.datetime) -> RunEvent:
-        """The night's own first event."""
+        """First event of the night's run."""
         from openlineage.client.event_v2 import RunState  # noqa: PLC0415 - an extra
 
         return self._event(RunState.START, at, self._night_run(), self._job("nightly"))
 
     def ended(self, at: dt.datetime, state: str) -> RunEvent:
-        """The night's own last event; `state` is COMPLETE, FAIL or, where somebody stopped it, ABORT."""
+        """Last event of the night's run; `state` is COMPLETE, FAIL, or ABORT if it was stopped."""
         from openlineage.client.event_v2 import RunState  # noqa: PLC0415 - an extra
 
         return self._event(RunState(state), at, self._night_run(), self._job("nightly"))
 
     def of_day(self, outcome: DayOutcome) -> Iterator[RunEvent]:
-        """Two events for each stage that did work; one that was up to date is the run that made it, told before."""
+        """Two events for each stage that did work.
+
+        A stage that is up to date has been reported by its run.
+        """
         for result in outcome.results:
             if result.status != "cached" and result.effort.began_at:
                 yield from self._of_stage(result)
@@ -149,7 +153,7 @@ class NightLineage:
         }
         if result.status == "failed":
             facets["errorMessage"] = error_message_run.ErrorMessageRunFacet(result.reason, "python")
-        # What failed has no key of its own: `outcomes` gives it one, and so does this.
+        # A failure has no work key; this derives one as `outcomes` does.
         row = outcome_row(result, self.night.method)
         return Run(run_id_of(row.stage, row.vehicle, row.day, row.work_key), facets)
 
@@ -180,13 +184,13 @@ class NightLineage:
 
 
 def _place(lake: Lake, schema: TableSchema, partition: Partition) -> tuple[str, str]:
-    """Namespace and name of a dataset, in OpenLineage's way: a day of a heavy table, a record table whole."""
+    """Namespace and name of a dataset for OpenLineage: one day of a heavy table, or a whole record table."""
     of_day = lake.files.uri(lake.folder(schema.name, partition))
     return _named(lake.table(schema.name) if schema.is_record_table else of_day)
 
 
 def _named(where: str) -> tuple[str, str]:
-    """Namespace and name of a path of this machine, or of an object of a bucket."""
+    """Namespace and name of a local path or of a bucket object."""
     scheme, separator, rest = where.partition("://")
     if not separator:
         return "file", str(Path(where).absolute())

@@ -1,4 +1,7 @@
-"""Sends OpenLineage events to a file or a server, beside the night: a sink that is slow or down delays nothing."""
+"""Sends OpenLineage events to a file or a server in a thread.
+
+A slow or dead sink does not delay the night.
+"""
 
 from __future__ import annotations
 
@@ -16,18 +19,18 @@ if TYPE_CHECKING:
 
 __all__ = ["LineageSink"]
 
-_WAITING = 10_000  # events: a fleet of a thousand could end at once; each is a few kilobytes
-_TIMEOUT_S = 5.0  # the library's own
-_TRIES = 3  # of an event; after so many that were lost in a row the sink is left alone
-_ENDPOINT = "api/v1/lineage"  # OpenLineage's, where the URL names none
+_WAITING = 10_000  # queued events: a fleet of a thousand could end at once; each is a few kilobytes
+_TIMEOUT_S = 5.0  # default of the library
+_TRIES = 3  # tries per event; after this many events lost in a row, sending stops
+_ENDPOINT = "api/v1/lineage"  # OpenLineage's default, if the URL has no path
 
 
 class LineageSink:
     """A thread that sends events in order.
 
     Args:
-        target: http:// or https:// of a server that takes OpenLineage (its key in $OPENLINEAGE_API_KEY), or a file,
-            to which a line of JSON per event is added.
+        target: http:// or https:// URL of an OpenLineage server (key in $OPENLINEAGE_API_KEY), or a file, to
+            which a line of JSON per event is appended.
     """
 
     def __init__(self, target: str) -> None:
@@ -38,14 +41,17 @@ class LineageSink:
         self._thread.start()
 
     def emit(self, event: RunEvent) -> None:
-        """Send an event, some time; it is lost where too many wait."""
+        """Queue an event for sending; it is lost if the queue is full."""
         try:
             self._events.put_nowait(event)
         except queue.Full:
             self._lost, self._problem = self._lost + 1, self._problem or "it is too slow"
 
     def close(self, timeout_s: float) -> str:
-        """Wait until all is sent, so long at most; what went wrong, in words, or nothing."""
+        """Wait until all events are sent, at most `timeout_s`.
+
+        Returns the problem in words, or an empty text.
+        """
         until = time.monotonic() + timeout_s
         try:
             self._events.put(None, timeout=timeout_s)

@@ -1,4 +1,7 @@
-"""A night's counts as a Prometheus text file, as node_exporter's textfile collector reads it. Needs the extra [ops]."""
+"""A night's counts as a Prometheus text file for node_exporter's textfile collector.
+
+Needs the extra [ops].
+"""
 
 from __future__ import annotations
 
@@ -16,19 +19,19 @@ if TYPE_CHECKING:
 
 __all__ = ["NightEnd", "write_metrics"]
 
-_SUCCESS = (0, 3)  # what is held or refused is an answer; a night that only has those was a good one
+_SUCCESS = (0, 3)  # held and refused days are valid results: a night with only those is a success
 _LAST_SUCCESS = "boresight_last_success_timestamp_seconds"
 
 
 @dataclass(frozen=True)
 class NightEnd:
-    """How a night ended.
+    """End of a night.
 
     Args:
         exit_code: of the command.
         began_s: Unix time.
         ended_s: Unix time.
-        vehicles: how many of which status (GREEN, YELLOW, RED, UNKNOWN), after the audit.
+        vehicles: number by status (GREEN, YELLOW, RED, UNKNOWN), after the audit.
         moved: vehicle, sensor and first day ("since") of each sensor that moved.
     """
 
@@ -40,13 +43,13 @@ class NightEnd:
 
 
 def write_metrics(path: Path, fleet: str, tally: Tally, end: NightEnd) -> None:
-    """Replace the file as a whole; when the last good night was is taken over from it, where this one was not good.
+    """Replace the file atomically; the time of the last successful night is kept if this night failed.
 
     Args:
-        path: what node_exporter looks at, so NAME.prom; its folder must be there.
+        path: read by node_exporter, so NAME.prom; its folder must exist.
         fleet: the fleet's name, label of every metric.
-        tally: what the night counted.
-        end: how it ended.
+        tally: the night's counts.
+        end: how the night ended.
 
     Raises:
         OSError: the file cannot be written; it stays as it was.
@@ -70,10 +73,10 @@ def _about_the_night(
         add(_LAST_SUCCESS, "When the last night ended without a failure.", {(): last_success_s})
     add(
         "boresight_exit_code",
-        "Of the last night: 0, 1 failed, 2 to be mended, 3 held or refused.",
+        "Exit code of the last night: 0, 1 failed, 2 misconfigured, 3 held or refused.",
         {(): end.exit_code},
     )
-    add("boresight_duration_seconds", "Of the last night.", {(): end.ended_s - end.began_s})
+    add("boresight_duration_seconds", "Duration of the last night.", {(): end.ended_s - end.began_s})
     days = {(s,): tally.vehicle_days[s] for s in ("cached", *DAY_WORDS) if s != "missing"}
     add("boresight_vehicle_days", "Vehicle-days of the last night.", days, ("status",))
     add(
@@ -100,7 +103,7 @@ def _about_stages(registry: CollectorRegistry, fleet: str, tally: Tally) -> None
 
 
 class _Gauges:
-    """Adds gauges of one fleet. All are gauges: a night's counts do not add up to the next one's."""
+    """Adds gauges of one fleet. All metrics are gauges: counts of different nights do not add up."""
 
     def __init__(self, registry: CollectorRegistry, fleet: str) -> None:
         self._registry, self._fleet = registry, fleet
@@ -120,7 +123,7 @@ class _Gauges:
 
 
 def _last_success(path: Path, fleet: str) -> float | None:
-    """What the file says; None where it is not there or says nothing that can be read."""
+    """Time of the last success in the file; None if the file is missing or unreadable."""
     from prometheus_client.parser import text_string_to_metric_families  # noqa: PLC0415 - an extra
 
     try:

@@ -1,4 +1,4 @@
-"""What of a night no retry can end: fleet.toml, or a file that it names, is to be mended."""
+"""Failures that no retry can fix: fleet.toml, or a file that it names, must be corrected."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["night_statuses", "rigs_to_mend"]
 
 
 def rigs_to_mend(outcomes: Sequence[DayOutcome], fleet: FleetConfig) -> dict[str, str]:
-    """Rigs of which every day of the night was misconfigured, with the first one's reason."""
+    """Rigs whose days were all misconfigured in this night, with the reason of the first day."""
     of_rig: dict[str, list[DayOutcome]] = {}
     for outcome in outcomes:
         if fleet.knows(outcome.vehicle):
@@ -20,10 +20,10 @@ def rigs_to_mend(outcomes: Sequence[DayOutcome], fleet: FleetConfig) -> dict[str
 
 
 def night_statuses(outcomes: Sequence[DayOutcome], fleet: FleetConfig) -> list[str]:
-    """Status of each vehicle-day; "misconfigured" where a retry does not help.
+    """Status of each vehicle-day; "misconfigured" if a retry does not help.
 
-    That is so where a day failed for its configuration. Of days that were refused for it, it takes all of the rig: one
-    log without a topic says nothing of fleet.toml.
+    A day that failed because of its configuration is misconfigured. Refused days count only if all days of
+    the rig were refused for it: a single log without a topic is no error of fleet.toml.
     """
     mend = rigs_to_mend(outcomes, fleet)
     return [

@@ -1,4 +1,4 @@
-"""A long day that was read in part and could not be decided: when more of it is read, and how much more."""
+"""Repeated reading of a long day with more sweeps, if the sweeps read did not suffice for a decision."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ from schemas.radar_alignments import RadarAlignment
 
 __all__ = ["MOST_TIMES_MORE", "asks_for_more", "spent_before", "with_more_sweeps"]
 
-# How often twice as much is read: 1,600 sweeps at most, and all passes together cost seven of the first. Sigmas fall
-# with the root of the frames that a calibration takes; where four times the choice does not help, more will not.
+# Number of doublings: 1,600 sweeps at most, and all passes together cost seven times the first. Sigmas fall
+# with the root of the number of frames in a calibration; if four times the choice does not help, more will
+# not.
 MOST_TIMES_MORE = 2
 
 
 def asks_for_more(results: Sequence[Outcome]) -> bool:
-    """Whether sweeps lie unread and a pair, or the whole day, lacks frames and nothing else.
+    """Whether there are unread sweeps and a pair, or the whole day, lacks nothing but frames.
 
     Args:
         results: of the day's stages.
@@ -42,13 +43,13 @@ def with_more_sweeps(task: Task) -> Task:
 
 
 def spent_before(earlier: Sequence[Outcome], later: Sequence[Outcome]) -> tuple[Outcome, ...]:
-    """The later results, whose efforts count those of the same stages of an earlier pass too."""
+    """The later results, with the effort of an earlier pass added to the same stages."""
     efforts = {r.stage: r.effort for r in earlier}
     return tuple(replace(r, effort=_sum(efforts.get(r.stage), r.effort)) for r in later)
 
 
 def _lacks_frames(reason: str) -> bool:
-    """Every clause of a record's reason is one that more frames may clear."""
+    """Whether more frames may remove every clause of a record's reason."""
     clauses = reason.split("; ")
     return all(any(words in clause for words in ASKS_FOR_FRAMES) for clause in clauses)
 

@@ -1,8 +1,8 @@
 """The night: every vehicle-day through the stages, then the audit of the fleet and the pages.
 
-Each vehicle-day stands for itself: what cannot be calibrated becomes a refused record with its reason, what
-fails is told in the outcome, and neither keeps the others waiting. Running the night again repeats only what
-failed or whose inputs changed, because every stage answers "cached" to a work key that it knows.
+Vehicle-days are independent. A day that cannot be calibrated becomes a refused record with its reason, and an
+error is reported in the outcome; neither stops the others. Running the night again repeats only days that
+failed or whose inputs changed, because every stage returns "cached" for a known work key.
 """
 
 # ruff: noqa: PTH100 (os.path.abspath leaves links alone and costs a microsecond)
@@ -36,7 +36,7 @@ __all__ = ["DayOutcome", "Night", "refused_at_once", "run_night", "run_vehicle_d
 
 @dataclass(frozen=True)
 class Night:
-    """What all vehicle-days of a night share."""
+    """Settings shared by all vehicle-days of a night."""
 
     fleet: FleetConfig
     lake: Lake
@@ -46,10 +46,10 @@ class Night:
 
 @dataclass(frozen=True)
 class DayOutcome:
-    """What became of a vehicle-day.
+    """Result of a vehicle-day.
 
-    `status`: a word of DAY_WORDS, or "cached" where all is done already. `misconfigured`: it ended so for what
-    fleet.toml says, or a file that it names, and will until that is mended.
+    `status`: a word of DAY_WORDS, or "cached" if all was done already. `misconfigured`: the cause is
+    fleet.toml, or a file that it names, and must be corrected there.
     """
 
     vehicle: str
@@ -64,21 +64,21 @@ class DayOutcome:
     results: tuple[Outcome, ...] = field(default=(), repr=False)  # of the stages, with the records to commit
 
 
-# What fleet.toml says of the vehicle, the day with its logs, and what the lake has of it.
+# Configuration of the vehicle, the day with its logs, and its rows in the lake.
 _Job = tuple[dict[str, Any], VehicleDay, Known]
 
 
 def run_night(
     night: Night, days: Sequence[VehicleDay], executor: str, workers: int | None, watch: Watch
 ) -> Iterator[DayOutcome]:
-    """Outcome of every vehicle-day as it comes; unknown vehicles and days to come are refused at once.
+    """Outcomes of vehicle-days in order of completion; unknown vehicles and future days are refused.
 
     Args:
-        night: what the vehicle-days share.
-        days: what is to be done.
+        night: settings shared by the vehicle-days.
+        days: to process.
         executor: a key of EXECUTORS.
         workers: processes or tasks at a time; None = as many as the executor finds CPUs for.
-        watch: told what the i-th of the days known to fleet.toml is doing.
+        watch: called with the progress of the i-th of the days known to fleet.toml.
     """
     known = []
     for day in days:
@@ -102,28 +102,28 @@ def run_night(
 
 
 def refused_at_once(night: Night, of: Partition) -> str:
-    """Why logs cannot be of the vehicle and day that their path names; empty where they can."""
+    """Reason why logs cannot be of the vehicle and day in their path; empty if they can."""
     if not night.fleet.knows(of.vehicle):
         return f"{night.fleet.file} has no vehicle {of.vehicle!r}"
-    return f"{of.day} has not come yet: mend the logs' path" if of.day > last_possible_day() else ""
+    return f"{of.day} is in the future: correct the logs' path" if of.day > last_possible_day() else ""
 
 
 def run_vehicle_day(night: Night, work: VehicleDay, known: Known, progress: Progress) -> DayOutcome:
-    """Ingest, perceive and calibrate one vehicle-day; a stage's refusal ends as a refused record.
+    """Ingest, perceive and calibrate one vehicle-day; if a stage refuses it, the result is a refused record.
 
     Its records are in the outcome, for the caller to commit.
 
     Args:
-        night: the configuration, as far as this vehicle needs it.
+        night: the configuration, reduced to this vehicle.
         work: the day and its logs.
-        known: what the lake has of the day's records and outcomes.
-        progress: told how far it is.
+        known: the day's records and outcomes in the lake.
+        progress: called with the progress.
     """
     task = task_of(night, work, known, progress)
     outcome = _through_stages(task, progress)
     damaged = next((r.damaged for r in outcome.results if r.damaged), "")
     if damaged:
-        night.lake.set_aside(damaged)  # what it was made of is there: make it anew, once
+        night.lake.set_aside(damaged)  # its inputs exist: make it again, once
         outcome = _through_stages(task, progress)
     for _ in range(MOST_TIMES_MORE):
         if not asks_for_more(outcome.results):
@@ -135,7 +135,7 @@ def run_vehicle_day(night: Night, work: VehicleDay, known: Known, progress: Prog
 
 
 def task_of(night: Night, work: VehicleDay, known: Known, progress: Progress = silent) -> Task:
-    """A vehicle-day as the stages are asked to do it; what they record is left to the caller to commit."""
+    """Task of a vehicle-day for the stages; the caller commits the records."""
     return Task(
         night.fleet,
         night.lake,
@@ -157,19 +157,19 @@ def _through_stages(task: Task, progress: Progress) -> DayOutcome:
         if done[-1].status == "failed":
             break
         if done[-1].status == "refused" and stage is not CALIBRATE:
-            refusal = CALIBRATE.run(replace(task, given=done[-1]))  # records it
+            refusal = CALIBRATE.run(replace(task, given=done[-1]))  # records the refusal
             return replace(_summarise(partition, done), results=(*done, refusal))
     return replace(_summarise(partition, done), results=tuple(done))
 
 
 def _jobs(night: Night, days: Sequence[VehicleDay], ledger: Ledger) -> Sequence[_Job]:
-    """What the workers are sent."""
+    """Items for the workers."""
 
     def job(index: int) -> _Job:
         day, fleet = days[index], night.fleet
         vehicle = fleet.vehicle(day.partition.vehicle)
         own = {"vehicles": {day.partition.vehicle: vehicle}, "rigs": {vehicle.rig: fleet.rigs[vehicle.rig]}}
-        # As in `_shared`; what lies in a bucket is there from everywhere.
+        # as in `_shared`; bucket addresses are valid everywhere
         logs = tuple(Path(os.path.abspath(g)) if isinstance(g, Path) else g for g in day.logs)
         return own, replace(day, logs=logs), ledger.known(day.partition)
 
@@ -177,9 +177,9 @@ def _jobs(night: Night, days: Sequence[VehicleDay], ledger: Ledger) -> Sequence[
 
 
 def _shared(night: Night) -> Night:
-    """The night as every worker needs it: no vehicle's own configuration, and no path that depends on where it runs."""
+    """The night reduced for all workers: without vehicles' own configuration, and with absolute paths."""
     fleet = night.fleet.model_copy(update={"vehicles": {}, "rigs": {}})
-    file = Path(os.path.abspath(night.fleet.file))  # a link in the path stays what the user called it
+    file = Path(os.path.abspath(night.fleet.file))  # keeps symbolic links in the path
     return replace(night, fleet=fleet.read_from(file), lake=night.lake.absolute())
 
 

@@ -1,4 +1,4 @@
-"""Pages of vehicle-days, drawn where the night's other work is done."""
+"""Pages of vehicle-days, drawn by the executor of the night."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from pipeline.results import Progress
 
 __all__ = ["OnWorkers"]
 
-_FEW = 3  # items for which a pool's start, about two seconds, takes longer than doing them here
+_FEW = 3  # for fewer items, starting a pool (about two seconds) takes longer than the work itself
 
 
 @dataclass(frozen=True)
 class OnWorkers:
-    """Runs a function on many items by an executor; what an item ends with is told, whatever it is.
+    """Runs a function on many items by an executor; reports every item's outcome, success or error.
 
     Args:
         executor: a key of EXECUTORS.

@@ -1,6 +1,6 @@
-"""Which logs belong to which vehicle-day: "logs/{vehicle}/{day}/*.mcap" against what is there.
+"""Assignment of logs to vehicle-days by a pattern such as "logs/{vehicle}/{day}/*.mcap".
 
-Paths are strings here: a fleet's night looks at a hundred thousand of them.
+Paths are strings here for speed: a fleet's night checks a hundred thousand of them.
 """
 
 # ruff: noqa: PTH116, PTH118, PTH120, PTH207
@@ -40,19 +40,20 @@ class VehicleDay:
 def find_vehicle_days(
     pattern: str, from_day: str | None = None, to_day: str | None = None
 ) -> list[VehicleDay]:
-    """Vehicle-days of all logs that match, in order of day and vehicle, so that a night ends day by day.
+    """Vehicle-days of all logs that match, in order of day and vehicle, so that a night finishes day by day.
 
     Args:
-        pattern: a path with {vehicle} and {day} (YYYY-MM-DD or YYYYMMDD), each as often as wanted, also inside file
-            names; besides *, ?, [abc] and ** as in a shell. A match is an .mcap, .bag or .db3 file, a ROS 2
-            bag folder, or a folder of such logs; other files are passed over. Of a bucket
-            ("s3://BUCKET/{vehicle}/{day}/*.mcap") each object that matches is a log. A bag folder is one log where all
-            of its files match for the same vehicle-day; in a folder that vehicles or days share, each file is.
-        from_day: first day wanted, None = from the beginning.
-        to_day: last day wanted.
+        pattern: a path with {vehicle} and {day} (YYYY-MM-DD or YYYYMMDD), each at least once, also inside
+            file names; also *, ?, [abc] and ** as in a shell. A match is an .mcap, .bag or .db3 file, a ROS 2
+            bag folder, or a folder of such logs; other files are ignored. In a bucket
+            ("s3://BUCKET/{vehicle}/{day}/*.mcap") each matching object is a log. A bag folder is one log if
+            all of its files match for the same vehicle-day; in a folder shared by vehicles or days, each file
+            is a log.
+        from_day: first day, None = from the beginning.
+        to_day: last day, None = until the end.
 
     Raises:
-        ConfigError: a placeholder is missing or unknown, a day is no day, or nothing at all matches.
+        ConfigError: a placeholder is missing or unknown, a day is invalid, or nothing matches.
     """
     for name, day in (("--from", from_day), ("--to", to_day)):
         check_day(name, day)
@@ -68,11 +69,11 @@ def find_vehicle_days(
 
 
 def _found(pattern: str) -> Mapping[_Owner, Iterable[LogPath]]:
-    """Logs of each vehicle-day that matches, in a folder or in a bucket."""
+    """Logs of each matching vehicle-day, in a folder or in a bucket."""
     if not pattern.startswith("s3://"):
         return _logs_by_owner(_owned(pattern))
     matcher, found = _matcher(pattern), defaultdict[_Owner, list[LogPath]](list)
-    # Listed is what lies below the last folder that the pattern names to the letter.
+    # List everything below the last folder that the pattern names without wildcards.
     for log in find_remote_logs(re.split(r"[{*?\[]", pattern)[0].rpartition("/")[0]):
         match = matcher.fullmatch(str(log))
         if match and is_day(_day(match)) and log.name.endswith(_SUFFIXES):
@@ -81,7 +82,7 @@ def _found(pattern: str) -> Mapping[_Owner, Iterable[LogPath]]:
 
 
 def _matcher(pattern: str) -> re.Pattern[str]:
-    """The pattern as a regular expression; a placeholder that comes again must say the same."""
+    """The pattern as a regular expression; a repeated placeholder must match the same text."""
     seen: set[str] = set()
     parts = []
     for token in _TOKEN.findall(pattern.rstrip("/")):
@@ -114,11 +115,11 @@ def _shell_token(token: str) -> str:
 
 
 def _owned(pattern: str) -> dict[str, _Owner]:
-    """Whose each log file and bag folder is that matches, or that lies in a folder that does.
+    """Vehicle-day of each log file and bag folder that matches, or that lies in a matching folder.
 
-    Folders are listed once each, so the work grows with the number of files. What a link leads to a second time within
-    a vehicle-day is passed over: a link to its own parent would show every log forty times. Linked into two
-    vehicle-days it is a log of both, as a copy would be.
+    Folders are listed once each, so the work grows with the number of files. A symbolic link to a log that
+    was already found in the same vehicle-day is ignored: a link to its own parent would repeat every log
+    forty times. A log linked into two vehicle-days belongs to both, as a copy would.
     """
     matcher, listings = _matcher(pattern), _Listings()
     shell = re.sub(r"\{(vehicle|day)\}", "*", pattern)
@@ -137,7 +138,10 @@ def _owned(pattern: str) -> dict[str, _Owner]:
 
 
 def _logs_by_owner(owner: dict[str, _Owner]) -> dict[_Owner, set[Path]]:
-    """Logs of each vehicle-day: a recording's folder as one where all of its files are that vehicle-day's."""
+    """Logs of each vehicle-day.
+
+    The folder of a recording is one log if all of its files are of that vehicle-day.
+    """
     folders: dict[str, list[str]] = defaultdict(list)
     for log in owner:
         folders[os.path.dirname(log)].append(log)
@@ -152,23 +156,23 @@ def _logs_by_owner(owner: dict[str, _Owner]) -> dict[_Owner, set[Path]]:
 
 
 class _Listings:
-    """What lies in folders, each listed once."""
+    """Contents of folders, each listed once."""
 
     def __init__(self) -> None:
         self._of: dict[str, tuple[dict[str, None], list[str]]] = {}
 
     def logs_at(self, path: str) -> list[str]:
-        """The log files that a match stands for: itself, or those in it and in the recordings in it."""
+        """Log files of a match: the match itself, or the logs and recordings in it."""
         if path.endswith(_SUFFIXES) and path in self._listed(os.path.dirname(path))[0]:
             return [path]
         files, folders = self._listed(path)
         if os.path.join(path, "metadata.yaml") in files and not self.bag_files(path):
-            return [path]  # a recording that lost its files: `ingest` says so
+            return [path]  # a recording that lost its files, which `ingest` reports
         logs = [f for f in files if f.endswith(_SUFFIXES)]
         return logs + [f for inner in folders for f in sorted(self.bag_files(inner))]
 
     def bag_files(self, folder: str) -> set[str]:
-        """Files that ROS 2's recorder wrote into a folder: with its metadata, or databases that lost theirs."""
+        """Files of a ROS 2 recording in a folder: with its metadata, or databases without metadata."""
         files, _ = self._listed(folder)
         recorded = {f for f in files if f.endswith(_ROS2_FILES)}
         is_recording = os.path.join(folder, "metadata.yaml") in files or any(
@@ -177,7 +181,7 @@ class _Listings:
         return recorded if is_recording else set()
 
     def _listed(self, folder: str) -> tuple[dict[str, None], list[str]]:
-        """Regular files and folders, by name; both empty for what is no folder that can be read."""
+        """Regular files and folders, by name; both empty if it is not a readable folder."""
         if folder not in self._of:
             try:
                 with os.scandir(folder or ".") as entries:
@@ -191,7 +195,7 @@ class _Listings:
 
 
 def _is(kind: Callable[[], bool]) -> bool:
-    """What an entry says of itself; no for a link that leads nowhere or round in a circle."""
+    """Type check of a directory entry; False for a broken or circular link."""
     try:
         return kind()
     except OSError:

@@ -1,4 +1,4 @@
-"""What a night would do, and why, without doing it."""
+"""Plan of a night (`--dry-run`): the stages that would run, and why."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ _ORDER = (INGEST, PERCEIVE, CALIBRATE)
 
 @dataclass(frozen=True)
 class DayPlan:
-    """Stages that would run on a vehicle-day, in order, and why the first of them would; none: it is up to date."""
+    """Stages that would run on a vehicle-day, in order, and the reason of the first.
+
+    No stage = up to date.
+    """
 
     vehicle: str
     day: str
@@ -29,9 +32,9 @@ class DayPlan:
 
 
 def plan_night(night: Night, days: Sequence[VehicleDay]) -> Iterator[DayPlan]:
-    """The plan of every vehicle-day, in order; logs are looked at as far as their identity needs it.
+    """The plan of every vehicle-day, in order; logs are read only to identify their content.
 
-    What runs anew may turn out as before, and then what follows it is up to date after all.
+    If a stage's new result equals the old one, the stages after it turn out to be up to date.
     """
     known = [d for d in days if not refused_at_once(night, d.partition)]
     ledger = Ledger(night.lake, [d.partition for d in known])

@@ -35,8 +35,8 @@ def run_processes(
 ) -> Generator[Finished[Item, Outcome], None, None]:
     """A pool of spawned processes (fork would copy the threads that numeric libraries hold).
 
-    Where a worker is killed, the pool is built anew: items that had not begun go on as before, items that
-    were in work are tried again one at a time, and one that kills its worker twice alone ends with an error.
+    If a worker is killed, the pool is built again: waiting items go on as before, items in work are tried
+    again one at a time, and an item that kills its worker twice while alone ends with an error.
     """
     board, turns = Board(len(items)), Turns(len(items))
     while turns:
@@ -58,10 +58,10 @@ def _drain(
     board: Board,
     watch: Watch,
 ) -> Generator[Finished[Item, Outcome], None, list[int]]:
-    """Run the queue until it is empty or the pool breaks; returns what was in work when it broke."""
+    """Run the queue until it is empty or the pool breaks; returns the items in work when it broke."""
     running: dict[Future[Finished[Item, Outcome]], int] = {}
     while queue or running:
-        # No more than there are workers, so that what is in work when the pool breaks is known.
+        # Submit no more items than workers, so that the items in work are known if the pool breaks.
         while queue and len(running) < workers:
             index = queue.popleft()
             try:
@@ -90,7 +90,7 @@ def _drain(
 def _pool(
     workers: int, function: Callable[[Any, Progress], Any], board: Board
 ) -> Iterator[ProcessPoolExecutor]:
-    """A pool whose processes are gone when the block ends, however it ends."""
+    """A pool whose processes have ended when the block ends, in every case."""
     own = ONE_THREAD | {MODEL_THREADS: str(max(1, usable_cpus() // workers))}
     before = {name: os.environ.get(name) for name in own}
     os.environ.update(own)  # spawned processes read it while they import
@@ -117,7 +117,7 @@ _OF_THIS_WORKER: list[tuple[Callable[[Any, Progress], Any], Board]] = []
 
 
 def _begin(function: Callable[[Any, Progress], Any], board: Board) -> None:
-    """Prepare a worker: stop when told, leave Ctrl-C to the parent, never outlive it."""
+    """Prepare a worker: stop on request, leave Ctrl-C to the parent, never outlive the parent."""
     _OF_THIS_WORKER[:] = [(function, board)]
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _leave)
@@ -141,6 +141,6 @@ def _work(item: Any, index: int) -> Finished[Any, Any]:
     try:
         finished = attempt(function, item, lambda done, total, what: board.write(index, done, total, what))
     except SystemExit as err:
-        # Told to stop, and everything is put away. The pool would send this back as a result and go on.
+        # Stopped on request, with cleanup done. The pool would return this as a result and go on.
         os._exit(int(err.code or 0))
     return Finished(None, finished.value, finished.error, finished.trace)  # the parent has the item

@@ -1,4 +1,4 @@
-"""The Ray cluster that tasks run on: connecting to it, so that nothing of Ray's shows or stays."""
+"""Connection to the Ray cluster of the tasks, without Ray's output and side effects."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from pipeline.errors import ConfigError, MissingExtraError
 
 __all__ = ["Cluster", "connected", "sigterm_between_calls"]
 
-# Vehicle-days and their records are kilobytes, a page is a megabyte; left alone, Ray takes 30 % of the memory.
+# Vehicle-days and their records are kilobytes, a page is a megabyte; by default Ray takes 30 % of the memory.
 _STORE_BYTES = 200 << 20
 _ANSWER_S = 10.0  # a connection takes milliseconds
 
@@ -30,7 +30,7 @@ class Cluster:
 
     Args:
         ray: the module.
-        is_shared: $RAY_ADDRESS names it; else it is this process's own, on this machine.
+        is_shared: True for the cluster in $RAY_ADDRESS; False for a cluster of this process on this machine.
     """
 
     ray: ModuleType
@@ -38,11 +38,14 @@ class Cluster:
 
     @property
     def environment(self) -> dict[str, str]:
-        """What tasks need to import what this process can; on a shared cluster the same must be installed."""
+        """Environment that tasks need for imports.
+
+        A shared cluster must have the same installation instead.
+        """
         return {} if self.is_shared else {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
 
     def beside_the_driver(self, kind: type[Any]) -> Any:
-        """An actor on this very node, where it lives as long as who asks for it."""
+        """An actor on this node, which ends with its creator."""
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy  # noqa: PLC0415 - an extra
 
         here = self.ray.get_runtime_context().get_node_id()
@@ -51,13 +54,13 @@ class Cluster:
 
 
 def connected(workers: int) -> Cluster:
-    """The cluster that $RAY_ADDRESS names, else one of this machine with so many workers, until the process ends.
+    """Connect to the cluster in $RAY_ADDRESS, else start one on this machine with `workers` CPUs.
 
     Raises:
         MissingExtraError: Ray is not installed.
         ConfigError: $RAY_ADDRESS cannot be reached, or is that of a Ray client.
     """
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing leaves the cluster
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # no usage data leaves the cluster
     try:
         import ray  # noqa: PLC0415 - an extra
     except ImportError as err:
@@ -72,22 +75,22 @@ def connected(workers: int) -> Cluster:
         if not address:
             os.environ.setdefault(
                 "RAY_AUTH_TOKEN", secrets.token_hex()
-            )  # Ray would write one into the home folder
+            )  # else Ray writes one into the home folder
         quiet = {"log_to_driver": False, "logging_level": logging.ERROR}
         with _signals_stay():
             try:
                 ray.init(address or "local", **quiet, **({} if address else own))
             except ConnectionError as err:
                 raise ConfigError("environment", "RAY_ADDRESS", f"no cluster at {address!r}") from err
-        # It would write onto stdout whose worker died; whoever runs the tasks tells that, and stdout is for a summary.
+        # Ray would print dead workers to stdout, which is for the summary; the executor reports them.
         ray._private.worker.print_to_stdstream = _say_nothing  # noqa: SLF001 - there is no other way
     return Cluster(ray, bool(address))
 
 
 def _require_answer(address: str) -> None:
-    """Raise ConfigError where HOST:PORT does not answer: Ray itself would ask for a quarter of an hour."""
+    """Raise ConfigError if HOST:PORT does not answer: Ray itself would try for a quarter of an hour."""
     host, separator, port = address.rpartition(":")
-    if not separator:  # none, or "auto"
+    if not separator:  # no port, or "auto"
         return
     try:
         socket.create_connection((host, int(port)), _ANSWER_S).close()
@@ -97,14 +100,17 @@ def _require_answer(address: str) -> None:
 
 @contextmanager
 def _signals_stay() -> Iterator[None]:
-    """Ray takes SIGTERM for itself, and would end the process with another code."""
+    """Keep the process's SIGTERM handler.
+
+    Ray replaces it and would end the process with another exit code.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     before = signal.getsignal(signal.SIGTERM)
     try:
         yield
-    except SystemExit:  # Ray's answer to SIGTERM
+    except SystemExit:  # Ray's reaction to SIGTERM
         sys.exit(128 + signal.SIGTERM)
     finally:
         signal.signal(signal.SIGTERM, before)
@@ -112,7 +118,7 @@ def _signals_stay() -> Iterator[None]:
 
 @contextmanager
 def sigterm_between_calls() -> Iterator[Callable[[], None]]:
-    """A function to call often: SIGTERM has its effect there. Inside a call of Ray's, any exit code becomes 1."""
+    """Defer SIGTERM to calls of the returned function: inside a call of Ray, every exit code becomes 1."""
     if threading.current_thread() is not threading.main_thread():
         yield lambda: None
         return
@@ -133,4 +139,4 @@ def sigterm_between_calls() -> Iterator[Callable[[], None]]:
 
 
 def _say_nothing(*_args: Any, **_kwargs: Any) -> None:
-    """In place of what Ray would print."""
+    """Replaces Ray's printing."""

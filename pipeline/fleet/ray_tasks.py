@@ -1,7 +1,7 @@
-"""Items as plain tasks of a Ray cluster: the one that $RAY_ADDRESS names, or a small one on this machine.
+"""Items as plain tasks of a Ray cluster: the one in $RAY_ADDRESS, or a small one on this machine.
 
-Ray gives every task in work a process of its own, so a worker that dies takes nobody with it. A node that is lost is
-nobody's fault: what was in work there is tried again elsewhere. Needs the extra [ray]; see README.md beside this file.
+Ray runs every task in a process of its own, so a dead worker affects no other task. If a node is lost, its
+tasks are tried again elsewhere, without blame. Needs the extra [ray]; see README.md beside this file.
 """
 
 from __future__ import annotations
@@ -25,30 +25,33 @@ __all__ = ["run_on_ray"]
 Item = TypeVar("Item")
 Outcome = TypeVar("Outcome")
 
-# What DESIGN grants a worker, whatever the log's length (tests/benchmarks/results/long_log.json: 455 MB).
+# Memory limit of a worker in DESIGN, for logs of any length (tests/benchmarks/results/long_log.json: 455 MB).
 _MEMORY_BYTES = 2 << 30
-# For each CPU two tasks: the second waits for the first, and tells an autoscaler that more nodes have work.
+# Two tasks per CPU: the second waits for the first, and shows an autoscaler that more nodes have work.
 _TASKS_PER_CPU = 2
-# An item that was in work on so many nodes when they were lost may be why: it goes on alone. Where spot nodes are taken
-# away within a vehicle-day's minute one time in a hundred, that is one item in a million, and costs it time only.
+# An item that was in work on this many lost nodes may be the cause: it goes on alone. If spot nodes disappear
+# during a vehicle-day's minute one time in a hundred, this affects one item in a million, and costs only
+# time.
 _NODES_LOST = 3
 _POLL_S = 0.2
-_LOOK_S = 0.5  # between two looks at the board, and what a task says of itself: all of it goes to one process
-_COUNT_S = 5.0  # between two looks at the nodes
+# between reads of the board, and between progress reports of a task: they all go to one process
+_LOOK_S = 0.5
+_COUNT_S = 5.0  # between counts of the nodes
 _GRACE_S = 10.0  # for a worker to leave its `with` blocks, as in a pool
-_NO_NODE_S = 600.0  # Kubernetes brings a node within minutes, or never
+_NO_NODE_S = 600.0  # Kubernetes provides a node within minutes, or never
 
 
 def run_on_ray(
     function: Callable[[Item, Progress], Outcome], items: Sequence[Item], workers: int | None, watch: Watch
 ) -> Generator[Finished[Item, Outcome], None, None]:
-    """Tasks of one CPU and 2 GiB each; `workers` bounds how many are in flight, None = two for each CPU of the cluster.
+    """Tasks of one CPU and 2 GiB each, at most `workers` in flight (None = two per CPU of the cluster).
 
     An item whose worker is killed is tried again alone, as in a pool of processes.
 
     Raises:
         MissingExtraError: Ray is not installed.
-        ConfigError: the cluster cannot be reached, or for ten minutes has no node that such a task fits on.
+        ConfigError: the cluster cannot be reached, or has had no node large enough for a task for ten
+            minutes.
     """
     if not items:
         return
@@ -68,27 +71,28 @@ def run_on_ray(
 
 
 class _Crew:
-    """Tasks in flight, and what is known of them and of the nodes that they run on.
+    """Tasks in flight, with the state of the tasks and of their nodes.
 
     Args:
         cluster: connected.
-        function: what all tasks do; put into the object store once.
-        items: on what; each is put together when its turn comes.
-        watch: told how far each one is.
+        function: of all tasks; put into the object store once.
+        items: its arguments; each is built when its turn comes.
+        watch: called with the progress of each item.
     """
 
     def __init__(
         self, cluster: Cluster, function: Callable[[Any, Progress], Any], items: Sequence[Any], watch: Watch
     ) -> None:
         self._ray, self._items, self._watch = cluster.ray, items, watch
-        self._memory = _MEMORY_BYTES if cluster.is_shared else 0  # alone on a machine, `workers` bounds it
+        # on a single machine `workers` limits the memory
+        self._memory = _MEMORY_BYTES if cluster.is_shared else 0
         self._function = self._ray.put(function)
         self._board = cluster.beside_the_driver(_Board)
         self._reading, self._read_at = self._board.read.remote(), time.monotonic()
         self._task = self._ray.remote(_work).options(
             num_cpus=1,
             memory=self._memory or None,
-            max_retries=0,  # Ray would try a poisoned item again beside the others
+            max_retries=0,  # Ray would retry a poisoned item beside the others
             runtime_env={"env_vars": cluster.environment | ONE_THREAD},
         )
         self._running: dict[Any, int] = {}
@@ -98,7 +102,7 @@ class _Crew:
     def drain(
         self, queue: deque[int], most: int | None, obey: Callable[[], None]
     ) -> Generator[Finished[Any, Any], None, list[int]]:
-        """Run the queue until it is empty; returns the items that shall go on alone."""
+        """Run the queue until it is empty; returns the items that must go on alone."""
         suspects: list[int] = []
         while queue or self._running:
             self._count()
@@ -121,9 +125,9 @@ class _Crew:
         return suspects
 
     def leave(self) -> None:
-        """Stop what is still in work: it puts its things away first."""
+        """Stop the tasks in work, with time for cleanup."""
         waiting = list(self._running)
-        with suppress(Exception):  # whatever is wrong with the cluster, the night ends here
+        with suppress(Exception):  # the night ends here, even if the cluster is broken
             for force in (False, True):
                 for ref in waiting:
                     self._ray.cancel(ref, force=force)
@@ -139,7 +143,7 @@ class _Crew:
         return list(done)
 
     def _end(self, ref: Any, index: int) -> Finished[None, Any] | None:
-        """How a task ended; None where it did not, because its worker or its node died."""
+        """Result of a task; None if its worker or its node died."""
         errors = self._ray.exceptions
         try:
             return self._ray.get(ref)
@@ -153,9 +157,9 @@ class _Crew:
             return Finished(None, error=f"{type(err).__name__}: {err}".splitlines()[0], trace=str(err))
 
     def _tell(self) -> None:
-        """Pass on what the board says."""
+        """Report the progress on the board."""
         now = time.monotonic()
-        with suppress(self._ray.exceptions.RayError):  # the board may be lost: it is for the eye only
+        with suppress(self._ray.exceptions.RayError):  # the board may be lost: it is for display only
             if self._reading is not None and self._ray.wait([self._reading], timeout=0)[0]:
                 reading, self._reading = self._reading, None
                 in_work = set(self._running.values())
@@ -166,10 +170,10 @@ class _Crew:
                 self._reading, self._read_at = self._board.read.remote(), now
 
     def _count(self) -> None:
-        """See how many CPUs there are.
+        """Count the CPUs of the cluster.
 
         Raises:
-            ConfigError: no node has had room for a task for long.
+            ConfigError: no node has had room for a task for a long time.
         """
         now = time.monotonic()
         if now - self._counted_at < min(_COUNT_S, _NO_NODE_S):
@@ -185,7 +189,7 @@ class _Crew:
 
 
 class _Board:
-    """Where tasks write how far they are; keeps what nobody has read yet."""
+    """Progress of tasks; keeps unread entries."""
 
     def __init__(self) -> None:
         self._news: dict[int, tuple[int, int, str]] = {}
@@ -201,9 +205,9 @@ class _Board:
 def _work(
     function: Callable[[Any, Progress], Any], item: Any, index: int, board: Any, version: str
 ) -> Finished[None, Any]:
-    """A task; the driver has the item. Every second it says how far it is, and whenever its stage changes."""
+    """A task; the driver has the item. It reports its progress every second, and when its stage changes."""
     if version != CODE_VERSION:
-        problem = f"the night is of version {version}: install the same on every node"
+        problem = f"the driver is of version {version}: install the same on every node"
         raise ContractError(f"boresight {CODE_VERSION}", problem)
     said_at, said = 0.0, ""
 
@@ -212,10 +216,10 @@ def _work(
         now, stage = time.monotonic(), what.partition(" ")[0]
         if stage != said or now - said_at >= _LOOK_S:
             said_at, said = now, stage
-            with suppress(Exception):  # nobody needs to know
+            with suppress(Exception):  # progress is optional
                 board.write.remote(index, done, total, what)
 
-    # Ray's order to stop is an interrupt, which what a shell starts in the background ignores, and its heirs.
+    # Ray stops a task by SIGINT, which background processes of a shell and their children ignore.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     finished = attempt(function, item, progress)
     return Finished(None, finished.value, finished.error, finished.trace)

@@ -1,4 +1,4 @@
-"""How every vehicle-day of a lake stands, in a word of `schemas.words`, and why."""
+"""Status of every vehicle-day of a lake, as a word of `schemas.words`, with the reason."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ class DayStatus:
     Args:
         vehicle: vehicle id.
         day: YYYY-MM-DD.
-        method: of the calibration; empty where none came to it.
+        method: of the calibration; empty if no calibration was reached.
         status: one of DAY_WORDS.
-        stage: where it ended; empty where no stage ran.
-        reason: why, in words.
-        pairs: how many pairs are accepted, held, refused.
-        asserted_at: when a night last said so.
-        seconds: that its stages took when they last ran.
-        bytes_read: by them; None where unknown.
+        stage: last stage; empty if no stage ran.
+        reason: in words.
+        pairs: number of accepted, held and refused pairs.
+        asserted_at: time at which a night last confirmed it.
+        seconds: duration of its stages in their last runs.
+        bytes_read: by these runs; None if unknown.
         bytes_written: likewise.
-        faults: that the reason states, keys of `schemas.faults.FAULTS`.
+        faults: faults named in the reason, keys of `schemas.faults.FAULTS`.
     """
 
     vehicle: str
@@ -47,14 +47,14 @@ class DayStatus:
 
 
 def day_statuses(rows: Sequence[OutcomeRow], method: str | None = None) -> list[DayStatus]:
-    """Every vehicle on every day that any vehicle was run on, in order of day, vehicle and method.
+    """Every vehicle on every day on which any vehicle was processed, in order of day, vehicle and method.
 
-    A vehicle that has no outcome on a day on which others have is missing there: no logs of it were found. So is a day
-    whose night ended before its last stage.
+    A vehicle without outcome on a day on which others have one is "missing": no logs of it were found. A day
+    whose night ended before its last stage is "missing" too.
 
     Args:
         rows: as `read_records` returns them, the last asserted last.
-        method: each vehicle-day once, by this method, whatever others calibrated it too; None = once per method.
+        method: one entry per vehicle-day, for this method; None = one per method.
     """
     stages: dict[tuple[str, str], dict[tuple[str, str], OutcomeRow]] = {}
     for row in rows:
@@ -65,7 +65,7 @@ def day_statuses(rows: Sequence[OutcomeRow], method: str | None = None) -> list[
         for vehicle in sorted(vehicles):
             current = stages.get((day, vehicle))
             if current is None:
-                reason = "no logs of this vehicle were found on a day of which others have some"
+                reason = "no logs of this vehicle were found on a day on which others have some"
                 found.append(DayStatus(vehicle, day, "", "missing", reason=reason))
                 continue
             known = sorted({of for stage, of in current if stage == _LAST_STAGE}) or [""]
@@ -78,7 +78,7 @@ def _of_method(vehicle: str, day: str, method: str, rows: Sequence[OutcomeRow]) 
     own = [r for r in rows if r.method in ("", method)]
     failed = next((r for r in own if r.status == "failed"), None)
     last = next((r for r in own if r.stage == _LAST_STAGE), None)
-    # The reason of the stage that refused, not what calibrate recorded of it for every pair.
+    # Use the reason of the stage that refused, not its copy in calibrate's records of every pair.
     refused = next((r for r in own if r.status == "refused" and r.stage != _LAST_STAGE), None)
     said = failed or (refused if last is not None and last.status == "refused" else None) or last
     if said is None:

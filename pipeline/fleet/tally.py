@@ -1,4 +1,4 @@
-"""What a night counts: added up as vehicle-days end, so that nobody keeps their records for it."""
+"""Counts of a night, added up as vehicle-days end, so that their records need not stay in memory."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ class Tally:
 
     Args:
         vehicle_days: by status.
-        records: of calibrations that are current, by pair and status.
-        stages: by stage and how it ended.
-        seconds: by stage, of the workers; of audit, state and report, of the driver.
-        bytes_read: by them, from the page cache too, by stage.
+        records: current calibration records, by pair and status.
+        stages: by stage and status.
+        seconds: by stage, of the workers; for audit, state and report, of the driver.
+        bytes_read: by stage, page cache included.
         bytes_written: likewise.
     """
 

@@ -247,7 +247,7 @@ def _advice(frames: list[Frame], rig: Rig, topics: list[TopicFinding], usable: i
         # optical.
         if -R[1, 2] < np.cos(np.pi / 4):
             advice.append(
-                "the image's frame id is no optical frame (x right, y down, z forward): check /tf_static"
+                "the image's frame id is not an optical frame (x right, y down, z forward): check /tf_static"
             )
     if rig.ego is None and not rig.radars:
         advice.append(
@@ -255,14 +255,14 @@ def _advice(frames: list[Frame], rig: Rig, topics: list[TopicFinding], usable: i
         )
     elif rig.ego is None:
         advice.append(
-            "no odometry configured: ego speed comes from Doppler, by which the lidar is de-skewed but for turns"
+            "no odometry configured: ego speed comes from Doppler, and the lidar is de-skewed without turns"
         )
     elif frames and all(f.ego_speed_mps is None for f in frames):
         advice.append(
-            f"{rig.ego.odometry} never brackets a sweep: the lidar is de-skewed by Doppler, but for turns"
+            f"{rig.ego.odometry} has no messages around any sweep: the lidar is de-skewed by Doppler, without turns"
         )
     if any("lidar" in f.sensors for f in frames) and all(f.lidar_time_s is None for f in frames):
         advice.append("the lidar logs no time per point: sweeps cannot be de-skewed")
     if 0 < usable < 100:
-        advice.append(f"{usable} frames: a calibration takes 100 where it can, so log a longer drive")
+        advice.append(f"{usable} frames: a calibration uses up to 100, so log a longer drive")
     return advice

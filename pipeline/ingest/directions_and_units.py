@@ -135,7 +135,7 @@ def _assumed_sign(radar: RadarTopics, sign: int) -> tuple[str, ...]:
     """Advice on a sign that fleet.toml leaves out, with the result of the log."""
     if radar.velocity_fields is not None or "doppler_positive" in radar.model_fields_set:
         return ()
-    absent = f'fleet.toml does not say doppler_positive, so "{radar.doppler_positive}" is assumed'
+    absent = f'fleet.toml does not set doppler_positive, so "{radar.doppler_positive}" is assumed'
     shown = {1: "the log shows that it is", -1: "the log shows the opposite", 0: "this log cannot tell"}[sign]
     return (f"{absent}; {shown}: write it down" if sign else f"{absent}; {shown}: drive, or look it up",)
 

@@ -1,6 +1,6 @@
-"""First pass over a day's logs: when and where each message lies, and the small messages that frames need.
+"""First pass over a day's logs: position and time of each message, and the small messages that frames need.
 
-Of a day that is longer than asked for, only the stretches that a plan names are read (`reading_plan.py`).
+For a day longer than requested, only the stretches of a reading plan are read (`reading_plan.py`).
 """
 
 from __future__ import annotations
@@ -55,13 +55,13 @@ ACCEPTED_TYPES: dict[str, tuple[str, ...]] = {
         *foxglove_types("FrameTransforms", "FrameTransform"),
     ),
 }
-_MOST_OPEN_FILES = 65536  # as many minutes are 45 days: more than one vehicle-day has
-_MOST_CAMERAS = 1000  # distinct camera_info contents remembered: a bound where a driver writes noise into it
+_MOST_OPEN_FILES = 65536  # one per minute of 45 days, more than a vehicle-day has
+_MOST_CAMERAS = 1000  # distinct camera_info contents kept: a limit for drivers that write noise into them
 
 
 @dataclass(frozen=True, slots=True)
 class Located:
-    """Where one message lies."""
+    """Position of one message."""
 
     log: int
     channel: Channel
@@ -84,17 +84,18 @@ class Stream:
 
 @dataclass(eq=False)
 class DayIndex:
-    """What the logs of a day hold. `problems` says in words, `damage` counts, what could not be read.
+    """Index of a day's logs; `problems` describes and `damage` counts unreadable parts.
 
     Args:
-        kinds: of the rig's sensors by name; the lidar that others are matched to comes before other lidars.
+        kinds: of the rig's sensors by name; the lidar that the others are matched to comes first of the
+            lidars.
     """
 
     kinds: dict[str, str] = field(default_factory=dict)
     logs: list[LogReader] = field(default_factory=list)
     log_names: list[str] = field(default_factory=list)
     streams: dict[Role, Stream] = field(default_factory=dict)
-    # By camera: log, stamp, intrinsics.
+    # by camera: log, stamp, intrinsics
     cameras: dict[str, list[tuple[int, int, Camera]]] = field(default_factory=dict)
     trees: list[TransformTree] = field(default_factory=list)
     ego: EgoTrack = field(default_factory=EgoTrack)
@@ -108,7 +109,7 @@ class DayIndex:
 
     @property
     def anchor(self) -> str:
-        """The sensor whose captures moments are built about: the first lidar, a radar where there is no sweep."""
+        """Sensor whose captures define the moments: the first lidar, or a radar if there is no sweep."""
         able = sorted((s for s in self.kinds if self.kinds[s] != "camera"), key=lambda s: self.kinds[s])
         return next((s for s in able if self.captures(s).stamps), able[0] if able else "")
 
@@ -117,14 +118,14 @@ class DayIndex:
         return self.stream(Role(CAPTURED[self.kinds[sensor]], sensor)) if sensor else Stream()
 
     def sweeps_in_bursts(self) -> Int64[np.ndarray, " N"]:
-        """Places of the sweeps that may become moments: all, or those that the plan is about."""
+        """Indices of the sweeps that may become moments: all, or those of the reading plan."""
         located = self.captures(self.anchor).located
         if self.reading is None:
             return np.arange(len(located), dtype=np.int64)
         return np.array([i for i, at in enumerate(located) if at.logged_ns in self.reading.bursts], np.int64)
 
     def stream(self, role: Role) -> Stream:
-        """Messages of a role; empty where there are none."""
+        """Messages of a role; empty if there are none."""
         return self.streams.setdefault(role, Stream())
 
     def read(self, located: Located) -> memoryview:
@@ -132,19 +133,19 @@ class DayIndex:
         return self.logs[located.log].read(located.position)
 
     def camera_at(self, sensor: str, log: int, stamp_ns: int) -> Camera | None:
-        """Intrinsics nearest in time within the same log, else within any; None where no log has any."""
+        """Intrinsics nearest in time within the same log, else in any log; None if no log has any."""
         known = self.cameras.get(sensor, [])
         own = [c for c in known if c[0] == log] or known
         return min(own, key=lambda c: abs(c[1] - stamp_ns))[2] if own else None
 
     def complain(self, problem: str) -> None:
-        """Remember a problem once, as text: what broken bytes left in it is shown as question marks."""
+        """Add a problem, once; unprintable bytes in it become question marks."""
         problem = "".join(c if c.isprintable() else "?" for c in problem.replace("\n", " "))
         if problem not in self.problems:
             self.problems.append(problem)
 
     def close(self) -> None:
-        """Let go of all logs."""
+        """Close all logs."""
         for log in self.logs:
             log.close()
 
@@ -156,16 +157,16 @@ def index_logs(
 
     Args:
         paths: the day's logs.
-        rig: whose topics are looked for.
-        survey: every topic is counted in `surveyed`, for those who ask what a log holds at all.
-        budget: sweeps beyond which a day is read in bursts, None = it is read whole.
+        rig: its topics are indexed.
+        survey: count the messages of every topic in `surveyed`.
+        budget: largest number of sweeps; a longer day is read in bursts. None = read the whole day.
     """
     index = DayIndex({role.sensor: role.kind for role in topics_of(rig).values() if role.is_capture})
     _allow_open_files()
     try:
         _open_logs(index, paths)
         _read_day(index, rig, budget, survey=survey)
-    except BaseException:  # a store that does not answer: nobody else would let go of the others
+    except BaseException:  # e.g. the object store does not answer: the open logs must be closed here
         index.close()
         raise
     return index
@@ -217,7 +218,7 @@ def _read_log(
 ) -> None:
     try:
         _index_log(index, number, topics, within, survey=survey)
-    except OSError as err:  # a disk or share that fails half-way: what was read so far counts
+    except OSError as err:  # a disk or share failed on the way: messages read so far are used
         index.complain(f"{index.logs[number].path}: cannot be read further: {err}")
         index.damage["logs_lost_while_reading"] += 1
 
@@ -225,9 +226,11 @@ def _read_log(
 def _read_bursts(
     index: DayIndex, number: int, topics: dict[str, Role], timeline: Timeline | None, around: Stretches
 ) -> None:
-    """What a log has of the stretches to read, and before it what a driver may log but once."""
+    """Read the planned stretches of a log, and the topics before them that a driver may log only once."""
     if timeline is None:
-        index.complain(f"{index.log_names[number]}: left unread, for it has no usable index and others do")
+        index.complain(
+            f"{index.log_names[number]}: not read: it has no usable index, and other logs have one"
+        )
         index.damage["logs_left_unread"] += 1
         return
     rare, first = rare_topics(timeline, topics)
@@ -241,7 +244,7 @@ def _read_bursts(
 
 
 def _take_bursts(index: DayIndex, timelines: Sequence[Timeline | None], budget: int) -> None:
-    """Of a long day that had to be read whole, the bursts that become frames; and which logs made it so."""
+    """Choose the bursts of a long day that had to be read whole, and report the logs that caused this."""
     sweeps = index.captures(index.anchor)
     logged_ns = np.array([at.logged_ns for at in sweeps.located], np.int64)
     index.reading = plan_sweeps(logged_ns, sweeps.stamps_ns, index.ego, budget)
@@ -251,12 +254,13 @@ def _take_bursts(index: DayIndex, timelines: Sequence[Timeline | None], budget: 
 
 
 def _allow_open_files() -> None:
-    """Raise this process's soft limit of open files to its hard one: a day in a thousand logs has them all open."""
+    """Raise this process's soft limit of open files to its hard one.
+
+    A day in a thousand logs opens them all.
+    """
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     most = _MOST_OPEN_FILES if hard == resource.RLIM_INFINITY else min(hard, _MOST_OPEN_FILES)
-    with suppress(
-        ValueError, OSError
-    ):  # where that is not allowed, logs that cannot be opened are counted and named
+    with suppress(ValueError, OSError):  # if not allowed, logs that cannot be opened are counted and reported
         resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
 
 
@@ -271,7 +275,7 @@ def _index_log(
         if role is None:
             continue
         index.topics_seen.add(message.channel.topic)
-        # Of another alignment message fleet.toml may name the fields.
+        # For an unknown type of alignment message, fleet.toml may name the fields.
         if role.what != ALIGNMENT and message.channel.msgtype not in ACCEPTED_TYPES[role.what]:
             index.damage["wrong_type"] += 1
             index.complain(
@@ -291,7 +295,7 @@ def _index_log(
 
 
 def _take(index: DayIndex, number: int, message: RawMessage, role: Role) -> None:
-    """A message that begins with a header."""
+    """Index a message that begins with a header."""
     stamp = header_stamp_ns(message.channel, message.data)
     if stamp is None:
         index.damage[f"{role.what}_without_stamp"] += 1
@@ -306,9 +310,9 @@ def _take(index: DayIndex, number: int, message: RawMessage, role: Role) -> None
 
 
 def _is_of_another_encoding(index: DayIndex, number: int, message: RawMessage) -> bool:
-    """Whether a message's bytes are not what its log says, which is named; not asked once one of its topic was right.
+    """Whether a message has another encoding than its log claims; checked until a topic's first good one.
 
-    One that is not says nothing of the next: a flipped bit must not cost a topic.
+    Each message is judged by itself: a flipped bit must not cost a topic.
     """
     of = (number, message.channel.topic)
     if of in index.encodings_right:
@@ -324,7 +328,7 @@ def _is_of_another_encoding(index: DayIndex, number: int, message: RawMessage) -
 
 
 def _refusal(message: RawMessage, role: Role) -> str:
-    """Why a message of this type cannot be what the rig says that its topic is."""
+    """Reason why a message of this type does not fit the topic's role in the rig."""
     found = message.channel.msgtype or "no type"
     reason = REFUSED.get(found.removeprefix("foxglove.").removeprefix("foxglove_msgs/msg/"))
     return f"{found}: {reason}" if reason else f"{found}, not {' or '.join(ACCEPTED_TYPES[role.what])}"
@@ -350,7 +354,7 @@ def _take_odometry(index: DayIndex, stamp: int, message: RawMessage) -> None:
 
 def _take_camera(index: DayIndex, number: int, stamp: int, message: RawMessage, role: Role) -> None:
     index.stream(role).stamps.append(stamp)
-    content = content_without_stamp(message.channel, message.data)  # the same for hours
+    content = content_without_stamp(message.channel, message.data)  # often constant for hours
     camera = index.camera_of_bytes.get(content)
     if camera is None:
         try:
@@ -363,7 +367,7 @@ def _take_camera(index: DayIndex, number: int, stamp: int, message: RawMessage, 
         index.damage["camera_info_unusable"] += 1
         index.complain(f"{index.log_names[number]}, topic {message.channel.topic}: {camera}")
         return
-    # One entry per change and log is enough for "nearest": keep the first and the last of each run.
+    # For "nearest" one entry per change and log is enough: keep the first and the last of each run.
     known = index.cameras.setdefault(role.sensor, [])
     if len([c for c in known[-2:] if c[0] == number and c[2] is camera]) == 2:
         known.pop()

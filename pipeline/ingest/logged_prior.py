@@ -1,4 +1,4 @@
-"""Where the sensors of a rig are by its logs: transforms between the frames that its messages name."""
+"""Prior poses of a rig's sensors from its logs: transforms between the frame ids of its messages."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["LoggedPrior"]
 
 
 class LoggedPrior:
-    """Gathers, log by log, the transforms between sensors; from a prior file where the rig names one."""
+    """Collects the transforms between sensors, log by log; from a prior file if the rig names one."""
 
     def __init__(self, index: DayIndex, rig: Rig, given: Star | None) -> None:
         self._index, self._rig, self._given = index, rig, given
@@ -26,11 +26,11 @@ class LoggedPrior:
         self.frame_ids: dict[str, list[str]] = {}
 
     def take(self, log: int, ids: Mapping[str, str]) -> bool:
-        """Look up where the sensors of a moment are; whether all of them are tied.
+        """Look up the poses of the sensors of a moment; returns whether all of them are connected.
 
         Args:
             log: number of the moment's log.
-            ids: frame of each sensor's message, by sensor.
+            ids: frame id of each sensor's message, by sensor.
         """
         key = (log, tuple(ids.items()))
         if key not in self._stars:
@@ -46,7 +46,10 @@ class LoggedPrior:
         return self._stars[key][1]
 
     def rows(self) -> list[dict[str, Any]]:
-        """For the manifest: each transform of each log once, as `schemas.moments.PRIOR` says."""
+        """Rows for the manifest.
+
+        Each transform of each log once, in the layout of `schemas.moments.PRIOR`.
+        """
         rows = {}
         for (log, _), (star, _) in self._stars.items():
             for row in to_rows([star]):
@@ -59,7 +62,7 @@ class LoggedPrior:
         if (log, a, b) not in self._found:
             T = self._index.trees[log].lookup(a[1], b[1])
             self._found[log, a, b] = T
-            # Once for each sensor: of several without a chain every two have none.
+            # Report each sensor once: if several have no chain, no two of them are connected.
             if T is None and not {a, b} <= self._untied:
                 self._untied |= {a, b}
                 names = f"{a[1] or '(no frame id)'} to {b[1] or '(no frame id)'}"

@@ -1,8 +1,8 @@
-"""One moment of a day to its row, with a row of each sensor that it has.
+"""One moment of a day as a table row, with a row of each of its sensors.
 
-A sensor whose payload is damaged, says too little or repeats an earlier one is left out of its moment. Of a rig with
-one sensor of each kind the moment goes on where no whole one within the second before shows the same scene, of others
-where an edge can still join two of its sensors.
+A sensor whose payload is damaged, incomplete or a repetition is left out of its moment. For a rig with one
+sensor of each kind, such a moment is kept if no complete moment within the second before shows the same
+scene; for other rigs, if an edge can still be estimated between two of its sensors.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ __all__ = ["Anchored", "MomentBuilder"]
 
 @dataclass(frozen=True, slots=True)
 class Anchored:
-    """What belongs together.
+    """Captures that belong to one moment.
 
     Args:
-        places: by sensor, in its stream; of sensors that the moment has.
-        anchor: the sensor whose stamp is the moment's.
-        drive: the stretch of driving.
+        places: index in its stream, for each sensor of the moment.
+        anchor: sensor whose stamp is the moment's stamp.
+        drive: number of the continuous stretch of driving.
     """
 
     places: Mapping[str, int]
@@ -46,7 +46,7 @@ class Anchored:
 
 
 class MomentBuilder:
-    """Builds rows from an index. `counts` gathers, by name, dropped points and what moments go without."""
+    """Builds rows from an index; `counts` collects dropped points and missing parts by name."""
 
     def __init__(
         self, index: DayIndex, rig: Rig, ingest: IngestConfig, file_prior: Star | None = None
@@ -57,14 +57,13 @@ class MomentBuilder:
         self._readers = readers_of(index, rig, ingest, self.counts)
         self._kinds = {node.name: node.kind for node in rig.nodes if node.name in self._readers}
         self._repetitions = {sensor: Repetitions() for sensor in self._readers}
-        self._whole_ns = -SAME_SCENE_NS  # of the last moment with all sensors
+        self._whole_ns = -SAME_SCENE_NS  # stamp of the last moment with all sensors
 
     def build(self, at: Anchored, moment: int) -> tuple[Moment, dict[str, Capture]]:
-        """The row of a moment, and those of its sensors by name; ask in order of time.
+        """Row of a moment, and rows of its sensors by name; call in order of time.
 
         Raises:
-            Rejected: a payload is damaged or says too little, and fewer than two sensors are left, or a whole moment
-                shows the same; nothing is made up.
+            Rejected: fewer than two sensors have a usable payload, or a complete moment shows the same scene.
         """
         missing: dict[str, Rejected] = {}
         parts = {s: part for s in self._readers if (part := self._part(s, at, moment, missing)) is not None}
@@ -91,7 +90,7 @@ class MomentBuilder:
         return row, captures
 
     def _is_worth_having(self, parts: Collection[str], stamp_ns: int) -> bool:
-        """Whether what is left of a moment shows what no other does."""
+        """Whether an incomplete moment shows a scene that no complete one shows."""
         if len(set(self._kinds.values())) == len(self._kinds):
             is_seen = stamp_ns - self._whole_ns <= SAME_SCENE_NS
             return len(parts) >= min(2, len(self._readers)) and not is_seen
@@ -99,7 +98,7 @@ class MomentBuilder:
         return len(parts) > 1 and bool(possible_edges(left))
 
     def _part(self, sensor: str, at: Anchored, moment: int, missing: dict[str, Rejected]) -> Read | None:
-        """What a sensor of the rig adds to the moment; None, and why in `missing`, where it adds nothing."""
+        """Row of one sensor in the moment; None if unusable, with the reason added to `missing`."""
         kind = self._kinds[sensor]
         try:
             if sensor in at.places:
@@ -115,7 +114,7 @@ class MomentBuilder:
         return None
 
     def _count(self, missing: Mapping[str, Rejected]) -> None:
-        """Sensors that the moment goes without, by reason; what a payload's trouble is, is said once."""
+        """Count the missing sensors of the moment by reason; each payload problem is reported once."""
         for sensor, why in missing.items():
             name = f"without_{sensor}_{why.reason}"
             self.counts[name] += 1

@@ -1,4 +1,4 @@
-"""From what logs hold to what they can calibrate, per pair and class of DoF, and what is missing."""
+"""Readiness: what logs can calibrate, per pair and class of DoF, and what is missing."""
 
 from __future__ import annotations
 
@@ -7,19 +7,20 @@ from dataclasses import dataclass, field, replace
 
 __all__ = ["DofVerdict", "Evidence", "in_order", "judge", "judge_edge", "overall"]
 
-# 30 frames give camera-lidar within 0.1 deg and lidar-radar yaw within 0.15 deg on real logs, 10 twice that.
+# 30 frames give camera-lidar within 0.1 deg and lidar-radar yaw within 0.15 deg on real logs; 10 give twice
+# that.
 _ENOUGH_FRAMES, _FEW_FRAMES = 30, 10
-_MOVING_SHARE = 0.2  # time offsets show only where the car moves
-_ORDER = ("camera_lidar", "lidar_radar", "camera_radar")  # in which they are shown, other kinds behind
-_DENSE_RINGS = 32  # below, reflectivity on the road has to carry pitch
+_MOVING_SHARE = 0.2  # time offsets are observable only while the car moves
+_ORDER = ("camera_lidar", "lidar_radar", "camera_radar")  # display order; other kinds come after these
+_DENSE_RINGS = 32  # with fewer rings, pitch depends on reflectivity of the road
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a verdict rests on; shares are of the frames looked at, and say nothing where there are none.
+    """Facts that a verdict is based on; shares are of the sampled frames, and meaningless without frames.
 
-    `missing` names the topics without which a sensor is silent: no message of theirs, or of another type. `frames_of`
-    counts by pair of the rig the frames that have both sensors; None = all have all.
+    `missing` has the topics without usable messages (none, or of another type) by sensor. `frames_of` counts
+    the frames with both sensors by pair of the rig; None = all frames have all sensors.
     """
 
     frames: int
@@ -31,15 +32,15 @@ class Evidence:
     elevation_share: float
     moving_share: float | None
     doppler_problem: str = ""
-    doppler_is_wrong: bool = False  # its sign or unit surely is: to be mended before anything else
-    wrong: tuple[str, ...] = ()  # other sources of motion and directions that surely are
+    doppler_is_wrong: bool = False  # its sign or unit is certainly wrong and must be corrected first
+    wrong: tuple[str, ...] = ()  # other sources of motion and directions that are certainly wrong
     missing: tuple[str, ...] = ()
     frames_of: Mapping[str, int] | None = None
 
 
 @dataclass(frozen=True)
 class DofVerdict:
-    """Whether a class of DoF can be calibrated: "yes", "weak" (the prior carries part of it) or "no"."""
+    """Whether a class of DoF can be calibrated: "yes", "weak" (the prior provides part of it) or "no"."""
 
     pair: str
     dof: str
@@ -48,7 +49,7 @@ class DofVerdict:
 
 
 def judge(evidence: Evidence) -> list[DofVerdict]:
-    """One verdict per pair and class of DoF, the weakest of what it needs."""
+    """One verdict per pair and class of DoF: the weakest of its requirements."""
     of_pair = dict.fromkeys(_ORDER, evidence.frames) if evidence.frames_of is None else evidence.frames_of
     return [
         verdict
@@ -58,12 +59,12 @@ def judge(evidence: Evidence) -> list[DofVerdict]:
 
 
 def in_order(kind: str) -> int:
-    """Place of an edge's kind among those that are shown."""
+    """Position of an edge's kind in the display order."""
     return _ORDER.index(kind) if kind in _ORDER else len(_ORDER)
 
 
 def judge_edge(name: str, kind: str, evidence: Evidence) -> list[DofVerdict]:
-    """One verdict per class of DoF of an edge, by what is known of its two sensors."""
+    """One verdict per class of DoF of an edge, from facts on its two sensors."""
     needs = [(dof, needs) for of, dof, needs in _needs(evidence) if of == kind]
     return [
         _verdict(name, dof, needs if evidence.frames else _without_frames(evidence)) for dof, needs in needs
@@ -71,12 +72,12 @@ def judge_edge(name: str, kind: str, evidence: Evidence) -> list[DofVerdict]:
 
 
 def _needs(evidence: Evidence) -> list[tuple[str, str, _Needs]]:
-    """What each pair and class of DoF needs and has not."""
+    """Unmet requirements of each pair and class of DoF."""
     camera, radar, ground = _camera_needs(evidence), _radar_needs(evidence), _common_needs(evidence)
     pitch = ground + camera + _pitch_needs(evidence)
     tilt = ground + radar + _elevation_needs(evidence)
     moving = ground + _moving_needs(evidence)
-    shift = [("weak", "far objects say little about shifts: the prior carries part of it")]
+    shift = [("weak", "far objects constrain shifts weakly: the prior provides part of it")]
     return [
         ("camera_lidar", "yaw and roll", ground + camera),
         ("camera_lidar", "pitch", pitch),
@@ -93,14 +94,14 @@ def _needs(evidence: Evidence) -> list[tuple[str, str, _Needs]]:
         ("lidar_lidar", "time offset", moving),
         ("lidar_base", "roll, pitch and z", ground),
         ("lidar_base", "yaw", moving),
-        ("lidar_base", "x and y", ground + [("weak", "only turns say where the vehicle's x and y are")]),
+        ("lidar_base", "x and y", ground + [("weak", "x and y of the vehicle are observable only in turns")]),
         ("radar_base", "yaw", moving + radar),
         ("radar_base", "pitch", moving + radar + _elevation_needs(evidence)),
     ]
 
 
 def overall(verdicts: list[DofVerdict]) -> str:
-    """The answer for all: "no" where every DoF is, "yes" where none is, else "partly"."""
+    """Overall answer: "no" if every DoF is "no", "yes" if none is, else "partly"."""
     refused = [v.verdict == "no" for v in verdicts]
     return "yes" if not any(refused) else "no" if all(refused) else "partly"
 
@@ -109,7 +110,7 @@ _Needs = list[tuple[str, str]]
 
 
 def _without_frames(e: Evidence) -> _Needs:
-    """Where no frame could be looked at, only why: nobody knows whether prior, labels or motion are there."""
+    """Without frames only the reason: prior, labels and motion are unknown."""
     why = [("no", topic) for topic in e.missing] or [
         ("no", f"0 usable synchronised frames; at least {_FEW_FRAMES} are needed")
     ]
@@ -137,7 +138,7 @@ def _camera_needs(e: Evidence) -> _Needs:
 def _pitch_needs(e: Evidence) -> _Needs:
     if e.has_intensity or e.rings >= _DENSE_RINGS:
         return []
-    return [("weak", "the lidar has few rings and logs no intensity: pitch rests on vertical edges alone")]
+    return [("weak", "the lidar has few rings and logs no intensity: pitch depends on vertical edges only")]
 
 
 def _radar_needs(e: Evidence) -> _Needs:
@@ -148,15 +149,17 @@ def _elevation_needs(e: Evidence) -> _Needs:
     if e.elevation_share < 0.5:
         return [("no", "the radar measures no elevation: roll, pitch and z keep their prior")]
     if e.detections_share < 0.5:
-        return [("weak", "no camera detections to hold against the radar's elevation")]
+        return [("weak", "no camera detections to compare with the radar's elevation")]
     return [("weak", "radar elevation is coarse: expect half a degree, and z from the prior")]
 
 
 def _moving_needs(e: Evidence) -> _Needs:
     if e.moving_share is None:
-        return [("weak", "whether the car moves could not be told from Doppler or odometry")]
+        return [("weak", "Doppler and odometry do not show whether the car moves")]
     if e.moving_share < _MOVING_SHARE:
-        return [("no", f"the car moves in {e.moving_share:.0%} of the frames: time offsets do not show")]
+        return [
+            ("no", f"the car moves in {e.moving_share:.0%} of the frames: time offsets are not observable")
+        ]
     return []
 
 

@@ -1,4 +1,4 @@
-"""What of a long day's logs is read: planned by their indices, and by a glance at how the car moved here and there."""
+"""Plan of what to read of a long day's logs, from their indices and short samples of the car's motion."""
 
 from __future__ import annotations
 
@@ -23,24 +23,25 @@ from pipeline.rigs import RadarTopics
 
 __all__ = ["Reading", "plan_reading", "plan_sweeps", "rare_topics"]
 
-_GLANCE_NS = 250_000_000  # to either side: odometry comes at 10 Hz or more, and a chunk often holds a second
+_GLANCE_NS = 250_000_000  # on each side: odometry comes at 10 Hz or more, and a chunk often holds a second
 _LATENCY_GLANCES = 3  # at the day's begin, middle and end: clocks drift by some hundred ppm
-# A sensor's messages are logged after their stamps, one sensor's later than another's: the read stretch is longer than
-# the burst by the largest difference seen and by this, within which odometry of 2 Hz comes too.
+# Messages are logged after their stamps, with a latency by sensor: the stretch to read exceeds the burst by
+# the largest observed latency difference plus this margin, which also covers odometry of 2 Hz.
 _MARGIN_NS = 500_000_000
-_MOST_MARGIN_NS = 10 * 10**9  # beyond it log time says nothing of when a message was measured
-_FIT_SHARE = 1 / 3  # of a scan, below which its Doppler speed is none
+_MOST_MARGIN_NS = 10 * 10**9  # beyond it log time does not indicate the time of measurement
+_FIT_SHARE = 1 / 3  # of a scan's detections; below it the Doppler speed is invalid
 
 
 @dataclass(frozen=True)
 class Reading:
-    """What is read of a day.
+    """Parts of a day to read.
 
     Args:
         bursts: log time of the sweeps that become moments.
-        around: log time of everything that is read: images and scans of the bursts' sweeps may be logged beside them.
-        sweeps: sweeps that the logs hold, by their indices.
-        planned: sweeps of as many bursts, had each its full length.
+        around: log time of everything to read: images and scans of these sweeps may be logged before or after
+            them.
+        sweeps: number of sweeps in the logs, from their indices.
+        planned: number of sweeps of as many bursts of full length.
     """
 
     bursts: Stretches
@@ -55,10 +56,13 @@ class _Day:
 
     logs: tuple[LogReader, ...]
     rig: Rig
-    roles: Mapping[str, Role]  # of topics
+    roles: Mapping[str, Role]  # by topic
 
     def messages(self, roles: Collection[Role], within: Stretches) -> Iterator[tuple[Role, RawMessage]]:
-        """Messages of some roles with their role; a log that cannot be read now is read, and counted, later."""
+        """Messages of some roles with their role.
+
+        A log that cannot be read is skipped here and counted later.
+        """
         topics = {topic for topic, role in self.roles.items() if role in roles}
         for log in self.logs:
             with suppress(OSError):
@@ -69,16 +73,16 @@ class _Day:
 def plan_reading(
     logs: Mapping[LogReader, Timeline | None], rig: Rig, roles: Mapping[str, Role], budget: int
 ) -> Reading | None:
-    """The bursts to read, None where the day is to be read whole.
+    """Bursts to read; None if the whole day is to be read.
 
-    It is where it holds no more sweeps than the budget; where most logs have no index; and where log time says nothing
-    of stamps.
+    The whole day is read if it has no more sweeps than the budget, if most logs have no index, or if log time
+    is unrelated to stamps.
 
     Args:
-        logs: with what their indices say.
-        rig: for Doppler, where there is no odometry.
+        logs: with the timelines of their indices.
+        rig: for Doppler, if there is no odometry.
         roles: of the rig's topics.
-        budget: sweeps that shall be read.
+        budget: number of sweeps to read.
     """
     indexed = {log: t for log, t in logs.items() if t is not None}
     held = {
@@ -108,13 +112,13 @@ def plan_reading(
 def plan_sweeps(
     logged_ns: Int64[np.ndarray, " N"], stamps_ns: Int64[np.ndarray, " N"], ego: EgoTrack, budget: int
 ) -> Reading:
-    """The bursts to take of a day that had to be read whole, because its logs have no index.
+    """Bursts of a day that had to be read whole because its logs have no index.
 
     Args:
-        logged_ns: when each sweep was logged.
+        logged_ns: log time of each sweep.
         stamps_ns: their stamps.
         ego: the day's odometry.
-        budget: sweeps that shall be taken.
+        budget: number of sweeps to use.
     """
     order = np.argsort(logged_ns, kind="stable")
     possible = possible_bursts(logged_ns[order], budget, is_motion_known=len(ego) > 0)
@@ -123,7 +127,10 @@ def plan_sweeps(
 
 
 def rare_topics(timeline: Timeline, roles: Mapping[str, Role]) -> tuple[dict[str, Role], Stretches]:
-    """Topics that a driver may log once, at the beginning, with their roles; and where their first messages lie."""
+    """Topics that a driver may log only once, at the start, with their roles.
+
+    And the spans of their first messages.
+    """
     rare = {
         topic: role
         for topic, role in roles.items()
@@ -141,7 +148,7 @@ def _reading(
 
 
 def _motion_at(day: _Day, middle_ns: Int64[np.ndarray, "M 3"], by: Role | None) -> BurstMotion:
-    """Motion of the car at these sweeps, by odometry or by a radar scan's Doppler."""
+    """Motion of the car at these sweeps, from odometry or from a radar scan's Doppler."""
     motion = BurstMotion.unknown(len(middle_ns))
     if by is None:
         return motion
@@ -160,7 +167,7 @@ def _motion_at(day: _Day, middle_ns: Int64[np.ndarray, "M 3"], by: Role | None) 
 
 
 def _by_odometry(message: RawMessage) -> Float[np.ndarray, " 4"]:
-    """Speed, yaw rate, x and y, NaN where the message holds no motion."""
+    """Speed, yaw rate, x and y; NaN if the message is invalid."""
     track = EgoTrack()
     track.add(0, decode(message.channel, message.data))
     state = track.at(0)
@@ -170,7 +177,7 @@ def _by_odometry(message: RawMessage) -> Float[np.ndarray, " 4"]:
 
 
 def _speed_by_doppler(message: RawMessage, radar: RadarTopics) -> float:
-    """Speed by a scan, NaN where it shows no static world."""
+    """Speed from a scan; NaN if it shows no static world."""
     cloud = read_radar(decode(message.channel, message.data), message.channel.msgtype, radar)
     distance = np.linalg.norm(cloud.xyz_m, axis=1, keepdims=True)
     directions = (cloud.xyz_m / np.maximum(distance, 1e-3)).astype(np.float64)
@@ -190,9 +197,9 @@ def _ego_motion(ego: EgoTrack, stamps_ns: Int64[np.ndarray, " M"]) -> BurstMotio
 
 
 def _margin_ns(day: _Day, middle_ns: Int64[np.ndarray, "M 3"], needed: set[Role], anchor: Role) -> int | None:
-    """By how much longer than a burst the stretch must be that is read for it.
+    """Margin to read before and after each burst [ns].
 
-    None where that is too much, or where of the needed roles one is never logged when the anchor is.
+    None if it would be too large, or if a needed role is never logged near the anchor.
     """
     glances = middle_ns[np.unique(np.linspace(0, len(middle_ns) - 1, _LATENCY_GLANCES).round().astype(int))]
     edges = _between(glances)
@@ -215,12 +222,15 @@ def _margin_ns(day: _Day, middle_ns: Int64[np.ndarray, "M 3"], needed: set[Role]
 
 
 def _between(middle_ns: Int64[np.ndarray, "M 3"]) -> Int64[np.ndarray, " M-1"]:
-    """Moments that part one middle sweep from the next."""
+    """Times that separate each middle sweep from the next."""
     return (middle_ns[1:, 1] + middle_ns[:-1, 1]) // 2
 
 
 def _glances(middle_ns: Int64[np.ndarray, "M 3"], half_ns: int) -> Stretches:
-    """About each middle sweep, to the sweeps beside it: where these are far, it may lie anywhere between."""
+    """Stretch about each middle sweep.
+
+    Extended to its neighbours, because the index gives its time only between them.
+    """
     begin = np.minimum(middle_ns[:, 0], middle_ns[:, 1] - half_ns)
     end = np.maximum(middle_ns[:, 2], middle_ns[:, 1] + half_ns)
     far = _MOST_MARGIN_NS

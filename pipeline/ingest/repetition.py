@@ -1,7 +1,7 @@
-"""Data that a sensor delivers again under a new stamp: a stuck driver, a frozen picture.
+"""Detection of repeated data under a new stamp: a stuck driver, a frozen image.
 
-What a sensor measures differs from moment to moment by its noise, of a car that stands too. So no two pictures, sweeps
-or scans of a day are alike to the byte. A list of a few objects may be: it is left alone.
+Noise makes measurements differ between moments, even when the car stands. So no two images, sweeps or scans
+of a day are equal to the byte. A list of a few objects may be; it is not checked.
 """
 
 from __future__ import annotations
@@ -21,24 +21,25 @@ _FEWEST_POINTS = 10
 
 
 class Repetitions:
-    """Remembers what a sensor delivered so far."""
+    """Hashes of the captures that a sensor delivered so far."""
 
     def __init__(self) -> None:
         self._seen: set[int] = set()
 
     def is_new(self, measured: LidarCloud | RadarCloud | bytes) -> bool:
-        """Whether no picture, sweep or scan before was the same, whatever its stamp."""
+        """Whether this image, sweep or scan is new, apart from its stamp."""
         content = _content(measured)
         if not content:
             return True
-        # A day's thousands of captures share none of 2**64 values by chance, in a third of a digest's time.
+        # Random collisions among a day's thousands of captures are negligible with 2**64 values, at a third
+        # of a digest's time.
         known = hash(content) in self._seen
         self._seen.add(hash(content))
         return not known
 
 
 def _content(part: LidarCloud | RadarCloud | bytes) -> tuple[bytes, ...]:
-    """What was measured, without stamps; empty where equal ones may be two measurements."""
+    """Measured content, without stamps; empty if equal content may be two measurements."""
     if isinstance(part, LidarCloud):
         return part.x_m.tobytes(), part.y_m.tobytes(), part.z_m.tobytes()
     if isinstance(part, RadarCloud):

@@ -1,4 +1,4 @@
-"""A rig as a matrix, sensor by sensor: what each two see in common, how often, and which DoF that can give."""
+"""A rig as a matrix of sensor pairs: common field of view, common moments, and the DoF that they can give."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ _COUNTED: Final = ("roll", "pitch", "yaw", "x", "y", "z")
 
 @dataclass(frozen=True)
 class PairFinding:
-    """What two sensors can say of each other.
+    """One pair of sensors.
 
     Args:
         parent: a sensor.
         child: another, or base.
         kind: of their edge, e.g. camera_lidar.
-        share: of the directions of the one that sees fewer, at the prior; None where nobody knows, and to base.
-        moments: that have both; to base, that have the sensor.
+        share: common share of the smaller field of view, at the prior; None if unknown, and for base.
+        moments: number with both sensors; for base, number with the sensor.
         is_edge: whether they are calibrated against each other.
-        why_not: they are not.
-        verdicts: of each class of DoF, of an edge.
+        why_not: reason, if they are not.
+        verdicts: for each class of DoF of an edge.
     """
 
     parent: str
@@ -42,7 +42,7 @@ class PairFinding:
 
 @dataclass(frozen=True)
 class RigFinding:
-    """The rig: kinds by sensor, which one poses refer to, all that could be edges, and what nothing ties to it."""
+    """The rig: kinds by sensor, the reference of the poses, all possible edges, and unconnected sensors."""
 
     sensors: dict[str, str]
     reference: str
@@ -56,12 +56,12 @@ def rig_finding(
     moments: Sequence[Collection[str]],
     verdicts: Mapping[Edge, list[DofVerdict]],
 ) -> RigFinding:
-    """The matrix of a rig.
+    """Matrix of a rig.
 
     Args:
         graph: with the edges that are calibrated.
         overlaps: of sensors with data and a prior.
-        moments: sensors that have data, of each moment.
+        moments: for each moment, the sensors with data.
         verdicts: of the graph's edges.
     """
     seen = {o.edge: o for o in overlaps}
@@ -81,7 +81,7 @@ def rig_finding(
 
 
 def dof_counts(verdicts: Sequence[DofVerdict]) -> tuple[int, int]:
-    """How many of the six DoF an edge gives, and how many of which the prior carries part."""
+    """Number of DoF of the six that an edge gives, and number that depend partly on the prior."""
     counts = dict.fromkeys(("yes", "weak", "no"), 0)
     for verdict in verdicts:
         words = verdict.dof.replace("translation", "x y z").replace(",", " ").split()
@@ -95,4 +95,4 @@ def _why_not(edge: Edge, overlap: Overlap | None, moments: Sequence[Collection[s
         return f"no data of {' and '.join(silent)}"
     if overlap is None:
         return "no prior" if edge.child.kind != "base" else "not named"
-    return "others share more" if overlap.is_enough else "they see nothing in common"
+    return "others share more" if overlap.is_enough else "their fields of view do not overlap"

@@ -1,4 +1,4 @@
-"""What a sample of a day's moments shows of a rig: views, edges, and what each edge's verdict rests on."""
+"""A sample of a day's moments for a rig: fields of view, edges, and facts for the verdict on each edge."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ Topics = TypeVar("Topics")
 
 @dataclass(frozen=True, eq=False)
 class RigSample:
-    """Moments of a day that were looked into.
+    """Sampled moments of a day.
 
     Args:
-        rig: whose.
-        built: the sample, in order of time.
-        looked: how many moments were looked into, with those of which nothing was usable.
-        present: of each moment of the day, the sensors that it has by their stamps.
-        stars: transforms that the logs carry, by log.
-        prior: of all sensors; None where there is none.
-        missing: by sensor, topics without which it is silent and why.
+        rig: the rig.
+        built: usable moments of the sample, in order of time.
+        looked: number of sampled moments, unusable ones included.
+        present: for each moment of the day, the sensors that have a stamp.
+        stars: transforms in the logs, by log.
+        prior: of all sensors; None if there is none.
+        missing: by sensor, the topics without usable messages and the reason.
     """
 
     rig: Rig
@@ -59,12 +59,12 @@ class RigSample:
 
     @cached_property
     def overlaps(self) -> tuple[Overlap, ...]:
-        """Of all sensors that have data and a prior."""
+        """Overlaps of all sensors that have data and a prior."""
         return () if self.prior is None else overlaps_of(self.prior, self._views())
 
     @cached_property
     def graph(self) -> RigGraph:
-        """The rig's edges by the views of the sample."""
+        """The rig's edges, from the fields of view in the sample."""
         nodes = {node.name: node for node in self.rig.nodes}
         reference = None if self.rig.reference is None else nodes[self.rig.reference]
         prior = self.prior or RigPrior(self.rig.nodes, middle_of(self.rig.nodes), {}, {})
@@ -72,18 +72,18 @@ class RigSample:
 
     @cached_property
     def evidence(self) -> dict[Edge, Evidence]:
-        """What each edge's verdict rests on."""
+        """Facts for the verdict on each edge."""
         edges = sorted(self.graph.edges, key=lambda edge: in_order(edge.kind))
         return {edge: self._evidence(edge) for edge in edges}
 
     @cached_property
     def verdicts(self) -> dict[Edge, list[DofVerdict]]:
-        """Of every edge."""
+        """Verdicts of every edge."""
         return {edge: judge_edge(self.name(edge), edge.kind, of) for edge, of in self.evidence.items()}
 
     @property
     def whole(self) -> Evidence:
-        """Of the rig: what is known of sensors by its first edge, of moments by them all."""
+        """Facts for the whole rig: on sensors from its first edge, on moments from all edges."""
         if not self.evidence:
             return Evidence(self._usable(len(self.built)), False, 0.0, 0.0, False, 0, 0.0, None)
         return replace(
@@ -95,7 +95,7 @@ class RigSample:
         )
 
     def name(self, edge: Edge) -> str:
-        """Its kind where the rig's sensors are called so, else names of its sensors."""
+        """Name of an edge: its kind if the sensors are named after their kinds, else the sensors' names."""
         return edge.kind if all(node.name == node.kind for node in self.rig.nodes) else edge.name
 
     @property
@@ -104,7 +104,7 @@ class RigSample:
         return rig_finding(self.graph, self.overlaps, self.present, self.verdicts)
 
     def _evidence(self, edge: Edge) -> Evidence:
-        """Of an edge's two sensors, and of one of each other kind beside them."""
+        """Facts on an edge's two sensors, and on one more sensor of each other kind."""
         chosen, ends = self._beside(edge), {s.name for s in edge.sensors if s.kind != "base"}
         own = [m for m, captures in self.built if ends <= captures.keys()]
         tied = [
@@ -120,7 +120,7 @@ class RigSample:
         )
 
     def frames(self, chosen: Mapping[str, str]) -> list[Frame]:
-        """Moments as some of the sensors saw them, names by kind."""
+        """Moments as frames of some of the sensors, given by kind."""
         priors = {log: priors_of(star, chosen) for log, star in self.stars.items()}
         return [
             frame_of(m, {k: captures[s] for k, s in chosen.items() if s in captures}, priors.get(m.log, {}))
@@ -128,14 +128,14 @@ class RigSample:
         ]
 
     def motion(self, chosen: Mapping[str, str]) -> Motion:
-        """How the chosen lidar and radar show the car to move, found out once."""
+        """Motion of the car from the chosen lidar and radar, computed once."""
         shown = (chosen.get("lidar", ""), chosen.get("radar", ""))
         if shown not in self._motions:
             self._motions[shown] = motion_of(self.frames(chosen), _only(self.rig, chosen))
         return self._motions[shown]
 
     def _rings(self, chosen: Mapping[str, str]) -> int:
-        """Of the chosen lidar, counted once."""
+        """Number of rings of the chosen lidar, computed once."""
         lidar = chosen.get("lidar", "")
         if lidar not in self._ring_counts:
             self._ring_counts[lidar] = max((_rings(f) for f in self.frames(chosen)), default=0)
@@ -143,16 +143,16 @@ class RigSample:
 
     @property
     def advice(self) -> list[str]:
-        """What each radar's Doppler gives reason to say, once."""
+        """Advice from each radar's Doppler, computed once."""
         edges = [edge for edge in self.graph.edges if "radar" in edge.kind]
         return list(dict.fromkeys(a for edge in edges for a in self.motion(self._beside(edge)).advice))
 
     def _usable(self, looked_into: int) -> int:
-        """Of the day, as of the sample."""
+        """Number of usable moments of the day, extrapolated from the sample."""
         return round(len(self.present) * looked_into / max(self.looked, 1))
 
     def _beside(self, edge: Edge) -> dict[str, str]:
-        """The edge's sensors by kind, and of each kind that it lacks the one that shares most with them."""
+        """The edge's sensors by kind, and for each missing kind the sensor with the largest overlap."""
         chosen: dict[str, str] = {s.kind: s.name for s in edge.sensors if s.kind != "base"}
         for node in self.rig.nodes:
             if node.kind not in ("base", *chosen):
@@ -175,7 +175,7 @@ class RigSample:
 
 
 def _only(rig: Rig, chosen: Mapping[str, str]) -> Rig:
-    """The rig with these sensors alone, at most one of a kind."""
+    """The rig with only these sensors, at most one of a kind."""
 
     def kept(kind: str, of: Mapping[str, Topics]) -> dict[str, Topics]:
         return {name: topics for name, topics in of.items() if chosen.get(kind) == name}
@@ -197,7 +197,7 @@ def _points(capture: Sweep | Scan) -> Float[np.ndarray, "N 3"]:
 
 
 def _evidence(frames: list[Frame], rig: Rig, motion: Motion) -> Evidence:
-    """Of a camera, a lidar and a radar at most; how many frames and rows there are is asked elsewhere."""
+    """Facts on at most one camera, lidar and radar; frame counts and rings are computed elsewhere."""
 
     def share(flags: list[bool]) -> float:
         return float(np.mean(flags)) if flags else 0.0
@@ -222,7 +222,7 @@ def _evidence(frames: list[Frame], rig: Rig, motion: Motion) -> Evidence:
 
 
 def _rings(frame: Frame) -> int:
-    """Rows that the log names; none where what it calls rings are lasers of a pattern without rows."""
+    """Number of rows in the log; 0 if its rings are lasers of a scan pattern without rows."""
     if frame.lidar_ring is None:
         return 0
     xyz = frame.lidar_xyz_m.astype(np.float64)

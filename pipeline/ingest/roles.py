@@ -1,4 +1,4 @@
-"""What a topic of the rig is: which sensor's, and what of it."""
+"""Role of a topic in the rig: the sensor, and the kind of content."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ __all__ = [
 IMAGE, INFO, LABELS, DETECTIONS, LIDAR, RADAR = "image", "info", "labels", "detections", "lidar", "radar"
 ALIGNMENT = "alignment"
 CAPTURED: Final = {"camera": IMAGE, "lidar": LIDAR, "radar": RADAR}  # by kind of sensor
-NEEDED: Final = (IMAGE, INFO, LIDAR, RADAR)  # without which a sensor is missing
+NEEDED: Final = (IMAGE, INFO, LIDAR, RADAR)  # a sensor without one of these is missing
 
 
 class Role(NamedTuple):
-    """What a topic carries, and the sensor that it is of; none for transforms and odometry."""
+    """Content of a topic, and its sensor; no sensor for transforms and odometry."""
 
     what: str
     sensor: str = ""
 
     @property
     def kind(self) -> str:
-        """Of the sensor."""
+        """Kind of the sensor."""
         if self.what in (LIDAR, RADAR, ALIGNMENT):
             return LIDAR if self.what == LIDAR else RADAR
         return "camera" if self.sensor else ""
 
     @property
     def is_capture(self) -> bool:
-        """Whether it is what the sensor measures."""
+        """Whether it is a measurement of the sensor."""
         return self.what in CAPTURED.values()
 
     def __str__(self) -> str:
@@ -44,7 +44,7 @@ TF_STATIC, ODOMETRY = Role("tf_static"), Role("odometry")
 
 
 def topics_of(rig: Rig) -> dict[str, Role]:
-    """Role of each topic that the rig names; the lidar that moments are built about comes first of lidars."""
+    """Role of each topic of the rig; the lidar that defines the moments comes first of the lidars."""
     topics: dict[str, Role] = {}
     for name, camera in rig.cameras.items():
         topics |= {camera.image: Role(IMAGE, name), camera.info: Role(INFO, name)}

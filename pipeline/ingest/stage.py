@@ -1,4 +1,4 @@
-"""Stage ingest: the logs of one vehicle-day to its moments, and to a file of each sensor."""
+"""Stage ingest: from the logs of one vehicle-day to its moments and a file of each sensor."""
 
 from __future__ import annotations
 
@@ -50,9 +50,9 @@ from schemas.moments import (
 __all__ = ["find_moments", "pick_moments", "read_file_prior", "work"]
 
 _PROBLEMS_SHOWN = 3
-# Reasons that state a fault.
+# Rejections that state a fault.
 _STATED = dict.fromkeys(REPEATED.values(), "stuck_sensor") | dict.fromkeys(WRONG_UNIT.values(), "unit")
-_FAR_FROM_DAY = dt.timedelta(hours=12 + 14 + 12)  # half a day, the earliest time zone, and a night's drive
+_FAR_FROM_DAY = dt.timedelta(hours=12 + 14 + 12)  # half a day, the earliest time zone, and a drive at night
 _UNUSABLE = (
     Rejection.IMAGE_DAMAGED,
     Rejection.IMAGE_SIZE,
@@ -66,12 +66,12 @@ _UNUSABLE = (
 
 
 def work(task: Task) -> Work:
-    """The moments that the task's logs give, and the captures of each sensor.
+    """Moments in the task's logs, and the captures of each sensor.
 
-    A day without a single moment that two sensors saw is refused: nothing is written (an empty table would look like a
-    day that was looked at and gave nothing), a partition of earlier inputs stays, and the reason names topics and what
-    to do. `rejected` counts each sweep that became no moment under one reason, and damage, dropped points and missing
-    parts under names of their own.
+    A day without a moment of two sensors is refused and nothing is written: an empty table would look like a
+    processed day without data. A partition of earlier inputs stays, and the reason names topics and the
+    remedy. `rejected` counts each sweep that became no moment under one reason; damage, dropped points and
+    missing parts have counts of their own.
 
     Raises:
         ConfigError: unknown vehicle, a log that does not exist, an unusable prior file.
@@ -85,7 +85,7 @@ def work(task: Task) -> Work:
         {} if file_prior is None else {"prior": [[*ends, T.tolist()] for ends, T in file_prior.items()]}
     )
     config = task.fleet.ingest
-    wider = (config.wider, config.wider.wider)  # as a night reads a long day that asked for more
+    wider = (config.wider, config.wider.wider)  # settings of a night that reads more of a long day
     return Work(
         (config, rig, prior_key),
         lambda run: _rows(task, rig, file_prior, run),
@@ -97,7 +97,7 @@ def work(task: Task) -> Work:
 def _rows(
     task: Task, rig: Rig, file_prior: Star | None, run: Run
 ) -> Generator[tuple[Moment, dict[str, Capture]], None, None]:
-    """The day's moments in order of time, one at a time."""
+    """Moments of the day in order of time, one at a time."""
     config = task.fleet.ingest
     run.progress(0, 0, "reading the index")
     index = index_logs(task.logs, rig, budget=config.read_budget)
@@ -128,7 +128,10 @@ def _rows(
 
 
 def _complain_of_date(index: DayIndex, day: str) -> None:
-    """Name a day whose sweeps were stamped on another one, whatever the time zone and also of a drive over midnight."""
+    """Report a day whose sweeps are stamped on another day.
+
+    Allows for time zones and drives over midnight.
+    """
     stamps_ns = index.captures(index.anchor).stamps_ns
     stamped = dt.datetime.fromtimestamp(float(np.median(stamps_ns)) * 1e-9, dt.UTC)
     if abs(stamped - dt.datetime.fromisoformat(f"{day}T12:00+00:00")) > _FAR_FROM_DAY:
@@ -138,7 +141,10 @@ def _complain_of_date(index: DayIndex, day: str) -> None:
 
 
 def pick_moments(index: DayIndex, rig: Rig, config: IngestConfig) -> tuple[list[Anchored], Counter[str]]:
-    """What belongs together, in order of time, thinned evenly to `max_frames`; and why other sweeps are left out."""
+    """Captures by moment, in order of time, thinned evenly to `max_frames`.
+
+    And counts of unused sweeps by reason.
+    """
     found, drives = find_moments(index, rig, config), _drives(index)
     picked = _spread(len(found.anchor), config.max_frames)
     places = {index.anchor: found.anchor, **found.others}
@@ -154,9 +160,9 @@ def pick_moments(index: DayIndex, rig: Rig, config: IngestConfig) -> tuple[list[
 
 
 def find_moments(index: DayIndex, rig: Rig, config: IngestConfig) -> Matched:
-    """All moments of the day, or of its bursts, within the gate that the configuration asks for.
+    """All moments of the day, or of its bursts, within the configured gate.
 
-    They are built about the sweeps of the first lidar; without a sweep all day, about the first radar's scans.
+    Moments are built about the sweeps of the first lidar; without any sweep, about the first radar's scans.
     """
     wanted = index.sweeps_in_bursts()
     anchors_ns = index.captures(index.anchor).stamps_ns[wanted]
@@ -172,7 +178,10 @@ def find_moments(index: DayIndex, rig: Rig, config: IngestConfig) -> Matched:
 
 
 def _tied(rig: Rig, anchor: str) -> set[str] | None:
-    """Sensors that an edge can tie to the anchor, by way of the vehicle too; None of a rig with one of each kind."""
+    """Sensors that can have an edge to the anchor, also by way of the vehicle.
+
+    None for a rig with one of each kind.
+    """
     sensors = [node for node in rig.nodes if node.kind != "base"]
     if len({node.kind for node in sensors}) == len(sensors):
         return None
@@ -181,7 +190,7 @@ def _tied(rig: Rig, anchor: str) -> set[str] | None:
 
 
 def refusal(index: DayIndex, rig: Rig, rejected: Counter[str], config: IngestConfig) -> tuple[str, ...]:
-    """Why a day gives no frame, in words: which topic, and what to do; then the faults that this states."""
+    """Reason why a day gives no frame, with topic and remedy; then the faults that it states."""
     topics = {role.sensor: f"{topic} ({role})" for topic, role in topics_of(rig).items() if role.is_capture}
     absent = [name for sensor, name in topics.items() if not index.captures(sensor).stamps]
     faults: tuple[str, ...] = ()
@@ -197,14 +206,14 @@ def refusal(index: DayIndex, rig: Rig, rejected: Counter[str], config: IngestCon
         what = f"{met} never come {_near_enough(config)}"
     else:
         reason = max(_UNUSABLE, key=lambda r: rejected[r])
-        what = f"of no moment two sensors were usable, most often {reason} ({rejected[reason]})"
+        what = f"no moment has two usable sensors, most often {reason} ({rejected[reason]})"
         if reason in _STATED:
             what, faults = f"{FAULTS[_STATED[reason]]}: {what}", (_STATED[reason],)
     return _shorten([what, *index.problems]), *faults
 
 
 def absences(index: DayIndex, rig: Rig, counts: Counter[str], config: IngestConfig) -> dict[str, str]:
-    """Why moments lack a sensor of the rig, in words, by sensor: which topic, and what to do."""
+    """By missing sensor, the reason, with topic and remedy."""
     found = {}
     for topic, role in topics_of(rig).items():
         if not role.is_capture:
@@ -241,7 +250,7 @@ def _no_intrinsics(topic: str) -> str:
 
 
 def _near_enough(config: IngestConfig) -> str:
-    """The gate in words, and what to do where nothing passes it."""
+    """The gate in words, and the remedy if no capture is within it."""
     if config.sync_gate_s is not None:
         gate = f"within {config.sync_gate_s * 1e3:g} ms"
         return f"{gate}: check their clocks, raise ingest.sync_gate_s, or leave it out to gate by motion"
@@ -253,16 +262,16 @@ def _near_enough(config: IngestConfig) -> str:
 
 
 def read_file_prior(rig: Rig, fleet: FleetConfig) -> Star | None:
-    """Transforms of a prior file, None where the prior comes from /tf_static.
+    """Transforms of a prior file; None if the prior comes from static transforms.
 
     Raises:
-        ConfigError: no such file, or not the rigid 4x4 transforms in it that the rig needs.
+        ConfigError: no such file, or it lacks the rigid 4x4 transforms that the rig needs.
     """
     return None if rig.prior.file is None else read_star(fleet.path_of(rig.prior.file), rig)
 
 
 def _drives(index: DayIndex) -> Int64[np.ndarray, " N"]:
-    """Drive of each sweep, by its place in the stream."""
+    """Number of the drive of each sweep."""
     sweeps = index.captures(index.anchor)
     order = np.argsort(sweeps.stamps_ns, kind="stable")
     drives = np.zeros(len(order), np.int64)
@@ -300,7 +309,7 @@ def _all_counts(rejected: Counter[str], index: DayIndex, builder: MomentBuilder)
 
 
 def _reading_counts(index: DayIndex) -> dict[str, int]:
-    """Of a day that was read in bursts: sweeps that its logs hold, that the plan is about, and that were read."""
+    """For a day read in bursts: numbers of sweeps in the logs, in the plan, and read."""
     if index.reading is None:
         return {}
     read = len(index.sweeps_in_bursts())

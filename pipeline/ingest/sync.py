@@ -1,4 +1,4 @@
-"""Which captures of a rig's sensors belong together: stamps in, indices out; nothing is decoded for it."""
+"""Synchronisation of a rig's captures: stamps in, indices out, without decoding."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ __all__ = [
 ]
 
 _DRIVE_GAP_NS = 10 * 10**9
-_HALF_A_PERIOD = 0.55  # and a tenth for jitter
-# Length of the gaps' mean on the circle of a period: they scatter by a tenth of it, one sigma.
+_HALF_A_PERIOD = 0.55  # half a period, and a tenth of it for jitter
+# Length of the mean of the gaps on the circle of a period, if they scatter by a tenth of it (one sigma).
 _TRIGGERED = 0.8
 
 
 class Rejection(StrEnum):
-    """Why a sweep became no moment; each is kept, or counted under one of these or by the sensors that are apart.
+    """Reasons why a sweep became no moment; a sweep is kept, or counted by reason or missing sensor.
 
-    Of a moment that is kept without a sensor, why it lacks that is counted as `without_SENSOR_REASON`.
+    For a moment kept without a sensor, the sensor's reason is counted as `without_SENSOR_REASON`.
     """
 
     DUPLICATE_STAMP = "duplicate_stamp"
@@ -60,15 +60,15 @@ WRONG_UNIT: Final = {"lidar": Rejection.LIDAR_UNIT, "radar": Rejection.RADAR_UNI
 
 @dataclass(frozen=True, eq=False)
 class Matched:
-    """Indices into the stamp lists, in order of the anchor's stamp, and why anchors found no partner.
+    """Indices into the stamp lists, in order of the anchor's stamp, and counts of anchors without partner.
 
     `len(anchor) + sum(rejected.values())` is the number of anchors.
 
     Args:
-        anchor: of the sweeps that moments are built about.
-        others: by sensor, -1 where a moment has nothing of it.
-        rejected: anchors that became no moment.
-        constant_ns: by sensor, the constant part of its stamps' gaps to the anchor's, found before gating.
+        anchor: indices of the sweeps that define the moments.
+        others: by sensor, -1 if a moment does not have it.
+        rejected: anchors that became no moment, by reason.
+        constant_ns: by sensor, the constant gap of its stamps to the anchor's, found before gating.
     """
 
     anchor: Int64[np.ndarray, " N"]
@@ -78,22 +78,22 @@ class Matched:
 
 
 def none_near(sensor: str) -> str:
-    """The count of anchors that nothing of a sensor is near enough to."""
+    """Name of the count of anchors without a near capture of a sensor."""
     return f"no_{sensor}_in_gate"
 
 
 def first_occurrences(stamps_ns: Int[np.ndarray, " N"]) -> Int64[np.ndarray, " M"]:
-    """Indices of stamps in order of time, each value once (the first one logged)."""
+    """Indices of distinct stamps in order of time; of equal stamps the first one logged."""
     return np.unique(stamps_ns, return_index=True)[1].astype(np.int64)
 
 
 def match_nearest(
     a_ns: Int[np.ndarray, " N"], b_ns: Int[np.ndarray, " M"], gate_ns: int
 ) -> Int64[np.ndarray, " N"]:
-    """For each stamp of a the index of its partner in b within the gate, else -1; each b is used once.
+    """For each stamp of a, the index of its partner in b within the gate, else -1; each b is used once.
 
-    Of two that want the same b the nearer one gets it (the earlier, where they are as near); the other gets
-    its next nearest that is free.
+    If two want the same b, the nearer one gets it (the earlier one if equally near); the other gets its next
+    nearest free b.
     """
     partner = np.full(len(a_ns), -1, np.int64)
     if not len(a_ns) or not len(b_ns):
@@ -122,12 +122,12 @@ def match_by_stamp(
     gate_ns: int,
     tied: Collection[str] | None = None,
 ) -> Matched:
-    """Synchronised moments: every two stamps of one lie within the gate (paper, section 4.5.1: under 5 ms).
+    """Synchronised moments: any two stamps of one are within the gate (paper, section 4.5.1: under 5 ms).
 
-    One that lacks sensors is taken where no whole one within a second shows the same scene. For rigs of many sensors
-    (`tied`) the gate is between each stamp and the anchor's.
+    An incomplete moment is kept if no complete one within a second shows the same scene. For rigs of many
+    sensors (`tied`) the gate applies between each stamp and the anchor's.
 
-    Stamps may come in any order and more than once: the first of equal stamps counts.
+    Stamps may have any order and repeat: of equal stamps the first one counts.
     """
     anchor = first_occurrences(anchor_ns)
     once = {s: stamps[first_occurrences(stamps)] for s, stamps in others_ns.items()}
@@ -142,18 +142,19 @@ def match_by_motion(
     gates_ns: Int[np.ndarray, " L"],
     tied: Collection[str] | None = None,
 ) -> Matched:
-    """Each anchor with what of each sensor is nearest to it, where the stamps' gaps are within the anchor's own gate.
+    """Each anchor with the nearest capture of each sensor, if the gap is within the anchor's own gate.
 
-    The constant part of a sensor's gaps is found first and counts for nothing: a calibration estimates it. Nearest
-    means within half a period, so that an anchor without a partner does not borrow a neighbour's.
+    The constant part of a sensor's gaps is removed first: calibration estimates it. Nearest means within half
+    a period, so that an anchor without a partner does not take a neighbour's.
 
     Args:
-        anchor_ns: stamps of the sensor that moments are built about, in any order, the first of equal ones counts.
+        anchor_ns: stamps of the sensor that defines the moments, in any order; of equal ones the first
+            counts.
         others_ns: of the others by name, likewise.
-        gates_ns: per anchor, the largest gap beyond the constant ones between any two captures of its moment.
-        tied: of a rig with several sensors of a kind, those that can be calibrated against the anchor. A moment is what
-            one of them belongs to, each sensor within the gate of the anchor, whatever others it lacks: every edge
-            takes the moments that its own two sensors have.
+        gates_ns: per anchor, the largest gap between two captures of its moment, constant gaps removed.
+        tied: for a rig with several sensors of a kind, those that can be calibrated against the anchor. A
+            moment then needs one of them, each within the gate of the anchor, and may lack others: every edge
+            uses the moments that have its own two sensors.
     """
     anchor = first_occurrences(anchor_ns)
     partners, constant = {}, {}
@@ -167,13 +168,13 @@ def match_by_motion(
 
 
 def constant_gap_ns(lidar_ns: Int[np.ndarray, " L"], stamps_ns: Int[np.ndarray, " M"]) -> int:
-    """By how much the stamps of a triggered sensor come after the sweeps' [ns]; 0 where it runs freely.
+    """Constant gap of a triggered sensor's stamps after the sweeps' stamps [ns]; 0 for a free-running sensor.
 
-    It is known up to whole periods of the sensor, and the one next to 0 is taken.
+    It is ambiguous by whole periods of the sensor; the value nearest to 0 is returned.
 
     Args:
         lidar_ns: stamps of the sweeps.
-        stamps_ns: of the sensor, each once, in order.
+        stamps_ns: of the sensor, distinct, in order.
     """
     period = _period_ns(stamps_ns)
     if period is None or not len(lidar_ns):
@@ -188,12 +189,13 @@ def constant_gap_ns(lidar_ns: Int[np.ndarray, " L"], stamps_ns: Int[np.ndarray, 
     if abs(mean) < _TRIGGERED:
         return 0
     middle = float(np.angle(mean)) / (2 * np.pi) * period
-    # Gaps of half a period are of either sign: all on the side of the mean, before their median is taken.
+    # Gaps near half a period may have either sign: shift them to one side of the mean before taking the
+    # median.
     return round(middle + float(np.median((gap - middle + period / 2) % period - period / 2)))
 
 
 def _period_ns(stamps_ns: Int[np.ndarray, " M"]) -> float | None:
-    """Median time between stamps, None of fewer than two."""
+    """Median time between stamps; None for fewer than two."""
     return float(np.median(np.diff(np.sort(stamps_ns)))) if len(stamps_ns) > 1 else None
 
 
@@ -205,12 +207,12 @@ def _gated(
     gates: np.ndarray,
     tied: Collection[str] | None,
 ) -> Matched:
-    """The moments of which every two stamps, less the constant gaps, lie within the anchor's gate; the others counted.
+    """Moments with all stamps, constant gaps removed, within the anchor's gate; the others are counted.
 
-    Anchors without all partners are taken far from whole moments only: there a sensor is silent or the rig has none.
-    Where sensors are `tied` to the anchor, gates and what a moment may lack are as `match_by_motion` says.
+    Incomplete anchors are kept only far from complete moments: there a sensor failed or the rig lacks it. For
+    sensors `tied` to the anchor, gates and incomplete moments are as in `match_by_motion`.
 
-    `partners` are places in the stamps that count of each sensor, -1 = none.
+    `partners` are indices into the distinct stamps of each sensor, -1 = none.
     """
     anchor = first_occurrences(anchor_ns)
     names, own = list(others_ns), anchor_ns[anchor]
@@ -241,9 +243,9 @@ def _gated(
 def _together(
     gap: Int64[np.ndarray, "S N"], has: Bool[np.ndarray, "S N"], gates: Int64[np.ndarray, " N"]
 ) -> tuple[Bool[np.ndarray, "S N"], dict[int, tuple[int, int]]]:
-    """What of each moment lies within its gate, the farthest from the anchor left out while two are farther apart.
+    """Captures within the gate by moment; the farthest from the anchor is removed until all pairs fit.
 
-    Also the two that were, by moment.
+    Also the pair that did not fit, by moment.
     """
     kept, apart = has.copy(), {}
     low, high = np.where(kept, gap, 0).min(0, initial=0), np.where(kept, gap, 0).max(0, initial=0)
@@ -258,7 +260,7 @@ def _together(
 def _worth_having(
     stamps_ns: Int64[np.ndarray, " N"], sensors: Int[np.ndarray, " N"], least: int
 ) -> Bool[np.ndarray, " N"]:
-    """Moments, in order, of so many sensors or more that none with more near in time shows too."""
+    """Mask of moments, in order, with at least `least` sensors and no near moment that has more."""
     first = np.searchsorted(stamps_ns, stamps_ns - SAME_SCENE_NS, "left")
     end = np.searchsorted(stamps_ns, stamps_ns + SAME_SCENE_NS, "right")
     most = np.array([sensors[a:b].max() for a, b in zip(first, end, strict=True)], np.int64)
@@ -266,12 +268,12 @@ def _worth_having(
 
 
 def _at(places: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """`places[index]`, -1 where the index is."""
+    """`places[index]`, -1 where the index is -1."""
     return np.append(places, -1)[index]
 
 
 def number_drives(stamps_ns: Sequence[int], logs: Sequence[int]) -> Int64[np.ndarray, " N"]:
-    """Number of the continuous stretch of driving that each sweep (in order of time) belongs to, from 0.
+    """Number of the continuous stretch of driving of each sweep (in order of time), from 0.
 
     It grows where the log changes or where the stamps gap by more than 10 s.
     """

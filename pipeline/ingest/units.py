@@ -1,4 +1,4 @@
-"""Points in another unit than metres: which one fits, where hardly any point lies where metres would have it."""
+"""Unit of points, if it is not metres: tested by the distances of the points."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from jaxtyping import Float
 __all__ = ["unit_that_fits"]
 
 _IN_METRES = {"millimetres": 1e-3, "centimetres": 1e-2}
-# The nearest tenth of a car's points ends here: the road around the car, what a radar sees ahead on an empty one. It
-# tells the units apart; nine tenths of the points must then lie within the sensor's reach.
+# Distance of the nearest tenth of a car's points: the road around the car, or what a radar detects on an
+# empty one. It separates the units; nine tenths of the points must also be within the sensor's reach.
 _NEAREST_M, _MOST = (1.0, 60.0), 0.9
 
 
 def unit_that_fits(distance: Float[np.ndarray, " N"], reach_m: float) -> str:
-    """Name of the unit in which points are where a car's sensor sees them; empty where metres or none is it.
+    """Name of the unit at which the points have plausible distances; empty for metres or no match.
 
     Args:
-        distance: of all points as logged, those without a return too.
-        reach_m: nothing is seen beyond.
+        distance: of all points as logged, including those without a return.
+        reach_m: largest plausible distance.
     """
     distance = distance[np.isfinite(distance) & (distance > 0)]
     if not len(distance):

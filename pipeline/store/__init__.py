@@ -1,1 +1,1 @@
-"""The only place that touches tables."""
+"""Storage of tables; no other package reads or writes them."""

@@ -1,4 +1,4 @@
-"""Files that appear at once and whole: written under a temporary name, flushed to disk, renamed."""
+"""Atomic files: written under a temporary name, flushed to disk, renamed."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from typing import BinaryIO
 
 __all__ = ["NO_SPACE", "atomic_write", "naming", "remove_abandoned"]
 
-# No vehicle-day takes a day: what is older was left by a killed writer on another machine.
+# No vehicle-day takes a day: an older temporary file was left by a killed writer on another machine.
 _ABANDONED_S = 24 * 3600.0
-NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # a disk, a quota or a limit is used up
+NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # a disk, a quota or a limit is exhausted
 
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[BinaryIO]:
     """A stream whose content replaces `path` when the block ends; on an error `path` stays as it was.
 
-    The temporary file does not end in .parquet, so that no glob of a table sees it half-written. A killed writer
-    leaves it behind; the next writer in that folder removes it.
+    The temporary file does not end in .parquet, so that no glob of a table matches it. A killed writer leaves
+    it behind; the next writer in that folder removes it.
     """
     remove_abandoned(path.parent)
     temporary = path.parent / f".writing-{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex}.tmp"
     try:
-        # "x" and not mkstemp: the file gets the rights that the umask says, so that others can read the lake.
+        # "x" and not mkstemp: the file gets the permissions of the umask, so that others can read the lake.
         with naming(path), temporary.open("xb") as stream:
             yield stream
             stream.flush()
@@ -43,7 +43,7 @@ def atomic_write(path: Path) -> Iterator[BinaryIO]:
 
 @contextmanager
 def naming(path: object) -> Iterator[None]:
-    """Let an error for want of space say where: what writes to an open file does not know its name.
+    """Add the path to an error for lack of space; errors of writes to an open file have none.
 
     Raises:
         OSError: with the path.
@@ -57,7 +57,10 @@ def naming(path: object) -> Iterator[None]:
 
 
 def remove_abandoned(folder: Path) -> None:
-    """Remove temporary files of killed writers: of this machine's dead processes at once, of others after a day."""
+    """Remove temporary files of killed writers.
+
+    Of dead processes of this machine at once, others after a day.
+    """
     for temporary in folder.glob(".writing-*.tmp"):
         with suppress(OSError):  # another writer may have removed it
             if _is_abandoned(temporary):
@@ -80,7 +83,7 @@ def _is_abandoned(temporary: Path) -> bool:
 
 
 def _flush_folder(folder: Path) -> None:
-    """Make the rename itself survive a power cut, where the file system lets a folder be flushed."""
+    """Make the rename survive a power cut, if the file system can flush a folder."""
     with suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:

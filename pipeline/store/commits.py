@@ -1,6 +1,6 @@
-"""Records come in: rows that are added and never replaced, several about the same, one of them current.
+"""Writing of records: rows are added and never replaced; of several rows with the same key one is current.
 
-`commit_records` knows the same work again and never doubles it.
+`commit_records` recognises work that is recorded already and never duplicates it.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ __all__ = ["assert_records", "commit_last", "commit_records"]
 
 
 def commit_records(lake: Lake, schema: TableSchema, rows: Iterable[Any]) -> int:
-    """Add records as one commit, and make them the current ones about what they are about.
+    """Add records as one commit, and make them current for their keys.
 
-    A row whose work is recorded already is not added again: where another row became current since, the recorded one
-    becomes current once more. `recorded_at` and `asserted_at` are set here, unless the row has them.
+    A row whose work is recorded already is not added again; if another row became current since, the recorded
+    one becomes current once more. `recorded_at` and `asserted_at` are set here unless the row has them.
 
     Returns:
-        How many rows were added or became current again.
+        Number of rows that were added or became current again.
 
     Raises:
         ContractError: the lake is of another release, or a row breaks its table's contract.
@@ -55,10 +55,10 @@ def commit_records(lake: Lake, schema: TableSchema, rows: Iterable[Any]) -> int:
 
 
 def commit_last(lake: Lake, schema: TableSchema, rows: Sequence[Any]) -> int:
-    """Add what a stage says of the whole fleet, all rows under one later stamp than any before: `read_last` finds them.
+    """Add rows of a stage of the whole fleet, all with one stamp later than any before; see `read_last`.
 
     Returns:
-        How many rows were added or became current again; 0 where the same rows were the last already.
+        Number of rows that were added or became current again; 0 if the same rows were the last already.
 
     Raises:
         ContractError, OSError: as `commit_records`.
@@ -74,10 +74,10 @@ def commit_last(lake: Lake, schema: TableSchema, rows: Sequence[Any]) -> int:
 
 
 def assert_records(lake: Lake, schema: TableSchema, rows: Sequence[Any]) -> int:
-    """Make recorded rows current again where others about the same became it since; adds nothing.
+    """Make recorded rows current again if others with the same key became current since; adds nothing.
 
     Returns:
-        How many became current again.
+        Number of rows that became current again.
     """
     known = _known(lake, schema, rows)
     now = dt.datetime.now(dt.UTC)
@@ -93,7 +93,7 @@ def assert_records(lake: Lake, schema: TableSchema, rows: Sequence[Any]) -> int:
 
 
 def _known(lake: Lake, schema: TableSchema, rows: Iterable[Any]) -> Mapping[tuple[str, ...], dict[str, str]]:
-    """What is recorded about the same: work key to `asserted_at`."""
+    """Recorded rows by key: work key to `asserted_at`."""
     rows = list(rows)
     days = sorted({row.day for row in rows})
     vehicles = {row.vehicle for row in rows}
@@ -110,7 +110,7 @@ def _known(lake: Lake, schema: TableSchema, rows: Iterable[Any]) -> Mapping[tupl
 
 
 def _after(now: dt.datetime, latest: str) -> str:
-    """Now, or a moment after `latest` where that lies in the future of this machine's clock."""
+    """Now, or a moment after `latest` if that is in the future of this machine's clock."""
     if latest >= _iso(now):
         return _iso(dt.datetime.fromisoformat(latest) + dt.timedelta(microseconds=1))
     return _iso(now)

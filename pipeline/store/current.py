@@ -1,4 +1,4 @@
-"""The current record of each vehicle, day, method and edge, and the transforms that records carry."""
+"""Current record of each vehicle, day, method and edge, and the transforms in records."""
 
 from __future__ import annotations
 
@@ -71,10 +71,10 @@ def _last_of_each(rows: Sequence[_Row], schema: TableSchema) -> list[_Row]:
 
 
 def current_rows(table: pa.Table, schema: TableSchema) -> pa.Table:
-    """The current row of each thing that rows of a record table are about, as columns, in order of what they are about.
+    """Current row of each key of a record table, as columns, in order of key.
 
     Args:
-        table: with the columns `schema.about`, `asserted_at` and `work_key`, in any order of rows.
+        table: with the columns `schema.about` (the key), `asserted_at` and `work_key`, in any order of rows.
         schema: of the table.
     """
     if not table.num_rows:
@@ -91,14 +91,14 @@ def current_rows(table: pa.Table, schema: TableSchema) -> pa.Table:
 
 
 def _ranks(column: pa.DictionaryArray) -> np.ndarray:
-    """For each row, the place of its value among the sorted values."""
+    """For each row, the rank of its value among the sorted values."""
     places = np.empty(len(column.dictionary), np.int64)
     places[np.asarray(pc.sort_indices(column.dictionary))] = np.arange(len(places))
     return places[np.asarray(column.indices)]
 
 
 def current_drift(findings: Sequence[DriftFinding]) -> list[DriftFinding]:
-    """The findings of the last audit that looked at a vehicle, by vehicle and method, in order.
+    """Findings of the last audit that included a vehicle, by vehicle and method, in order.
 
     Args:
         findings: as `read_records` returns them.
@@ -107,7 +107,7 @@ def current_drift(findings: Sequence[DriftFinding]) -> list[DriftFinding]:
 
 
 def current_states(states: Sequence[StateRow]) -> list[StateRow]:
-    """The states that the last night said of a vehicle, by vehicle and method, in order.
+    """States of a vehicle from the last night that included it, by vehicle and method, in order.
 
     Args:
         states: as `read_records` returns them.
@@ -129,7 +129,7 @@ def _asserted_last(rows: Sequence[_Said]) -> list[_Said]:
 
 
 def current_events(events: Sequence[ServiceEvent]) -> list[ServiceEvent]:
-    """Each event as it was last noted, without those that were withdrawn.
+    """Latest version of each event, without withdrawn events.
 
     Args:
         events: as `read_records` returns them, the last asserted last.
@@ -139,12 +139,12 @@ def current_events(events: Sequence[ServiceEvent]) -> list[ServiceEvent]:
 
 
 def transform_of(record: CalibrationRecord | StateRow | PoseRow) -> Float[np.ndarray, "4 4"] | None:
-    """T_parent_child of a record or state, T_reference_sensor of a pose; None where there is no estimate."""
+    """T_parent_child of a record or state, T_reference_sensor of a pose; None without an estimate."""
     return _transform(record.qw, record.qx, record.qy, record.qz, record.tx_m, record.ty_m, record.tz_m)
 
 
 def prior_of(record: CalibrationRecord) -> Float[np.ndarray, "4 4"] | None:
-    """Prior T_parent_child of a record; None where none was given."""
+    """Prior T_parent_child of a record; None if none was given."""
     return _transform(
         record.prior_qw, record.prior_qx, record.prior_qy, record.prior_qz,
         record.prior_tx_m, record.prior_ty_m, record.prior_tz_m,
@@ -152,7 +152,10 @@ def prior_of(record: CalibrationRecord) -> Float[np.ndarray, "4 4"] | None:
 
 
 def targets_of(record: CalibrationRecord) -> Float[np.ndarray, "N 3"]:
-    """Targets that a record's sigmas are stated at, in the child's frame; those of older releases where it has none."""
+    """Targets for which a record's sigmas are stated, in the child's frame [m].
+
+    Else those of older releases.
+    """
     return DEFAULT_TARGETS if record.targets_m is None else np.asarray(record.targets_m)
 
 

@@ -1,4 +1,4 @@
-"""Which files hold a record table's rows: as its log says, or all that are there where the log is damaged."""
+"""Data files of a record table: those in its log, or all existing files if the log is damaged."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["data_files", "files_there", "once"]
 
 
 def data_files(lake: Lake, schema: TableSchema) -> list[LiveFile]:
-    """The data files of a table; `lake.damage` names a log that cannot be read, and they are those that are there.
+    """Data files of a table; if its log cannot be read, all existing files, with a note in `lake.damage`.
 
     Raises:
         ContractError: the lake is of another release.
@@ -34,14 +34,14 @@ def data_files(lake: Lake, schema: TableSchema) -> list[LiveFile]:
 
 
 def files_there(lake: Lake, schema: TableSchema) -> list[str]:
-    """Names of all data files of a table, whether its log knows them or not."""
+    """Names of all data files of a table, in its log or not."""
     folder = lake.root / schema.name
     found = lake.files.find(folder, "month=*/*.parquet")
     return sorted(str(PurePosixPath(path.relative_to(folder))) for path in found)
 
 
 def once(rows: pa.Table, schema: TableSchema) -> pa.Table:
-    """Rows of files of which some may stand for others: of the same work about the same, the last asserted."""
+    """Rows without duplicates of the same work and key (the last asserted one stays)."""
     names = [*schema.about, "work_key", "asserted_at"]
     if not set(names) <= set(rows.column_names):
         return rows

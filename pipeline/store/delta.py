@@ -1,7 +1,7 @@
-"""Record tables as Delta Lake tables: open, create, merge, read their files, and keep them tidy.
+"""Record tables as Delta Lake tables: open, create, merge, read their files, and maintain them.
 
-One folder per table, partitioned by month of the row's day. A commit is one file of the log that appears as a whole, so
-a killed writer leaves rows or none, and two writers at once both get theirs in.
+One folder per table, partitioned by month of the row's day. A commit is one log file that appears atomically.
+So a killed writer leaves all of its rows or none, and two writers at the same time both succeed.
 """
 
 from __future__ import annotations
@@ -44,27 +44,30 @@ __all__ = [
 
 _MONTH = "month"
 _VERSION = "boresight.version"
-# A reader of one vehicle's day reads whole files: 32 MB are some thousand vehicle-days, read in a tenth of a second.
+# A reader of one vehicle's day reads whole files: 32 MB hold some thousand vehicle-days, read in a tenth of a
+# second.
 _FILE_BYTES = 32 << 20
-# Rows of a row group: a day of a thousand vehicles is one or a few, and a reader of one day reads no more of a month's
-# file. A group costs 20 kB of footer, a hundredth of what it holds.
+# Rows of a row group: a day of a thousand vehicles has one or a few groups, and a reader of one day reads
+# only these of a month's file. A group costs 20 kB of footer, a hundredth of its content.
 _GROUP_ROWS = 4096
 _WRITER = WriterProperties(compression="ZSTD", max_row_group_size=_GROUP_ROWS)
-_FILES_A_MONTH = 8  # more small files than this are put together after the night
-# Old generations stay for readers that began before the compaction: the week that Delta's own tools keep.
+_FILES_A_MONTH = 8  # more small files than this are compacted after the night
+# Replaced files stay for readers that began before the compaction: a week, as in Delta's own tools.
 _KEEP_HOURS = 7 * 24
-# Every writer that comes in between costs one more try; none comes in forty times while others wait for seconds.
+# Every commit of another writer costs one more try; forty in a row do not happen while others wait for
+# seconds.
 _TRIES = 40
 _PAUSE_S = 0.05
-# Columns that are no more: a table of an older release asks every row for them, and gets what that release wrote.
+# Removed columns: a table of an older release requires them in every row, and gets the values of that
+# release.
 _RETIRED = {"trio": "default"}
-DAMAGED = "_damaged"  # a name with an underscore: Delta's own tools leave it alone
+DAMAGED = "_damaged"  # the underscore makes Delta's own tools ignore it
 LOG = "_delta_log"
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """Which rows a reader asks for (None = all): of these vehicles, from day `first` to day `last`, asserted after."""
+    """Filter of rows (None = all): vehicles, days from `first` to `last`, assertion time."""
 
     vehicles: frozenset[str] | None = None
     first: str | None = None
@@ -77,7 +80,7 @@ class Wanted:
         vehicles: tuple[str, str] | None,
         asserted: tuple[str, str] | None = None,
     ) -> bool:
-        """False where no such row can be among rows between these (None: not known)."""
+        """False if no row within these ranges can pass the filter (None: range unknown)."""
         if asserted is not None and asserted[1] <= (self.asserted_after or ""):
             return False
         if days is not None and ((self.first or "") > days[1] or (self.last or "9999") < days[0]):
@@ -89,19 +92,19 @@ class Wanted:
 
 @dataclass(frozen=True)
 class LiveFile:
-    """A data file of a table's newest version; its rows lie between these days and vehicles (None: not known)."""
+    """A data file of a table's newest version, with the ranges of its days and vehicles (None: unknown)."""
 
     name: str
     days: tuple[str, str] | None = None
     vehicles: tuple[str, str] | None = None
-    written_s: float = 0.0  # since 1970
-    in_log: bool = True  # False: found without one, and others may hold the same rows
+    written_s: float = 0.0  # Unix time
+    in_log: bool = True  # False: found without the log, so other files may hold the same rows
 
 
 def stored_schema(schema: TableSchema) -> pa.Schema:
-    """The Arrow schema of a record table's files: its columns, and the month.
+    """Arrow schema of a record table's files: its columns, and the month.
 
-    All may be null but what a row is about: rows that an older release wrote have none of the columns that came later.
+    All columns but the key may be null: rows of older releases lack the columns that were added later.
     """
     known = {*schema.about, "work_key", "asserted_at"}
     stored = [f.with_nullable(f.name not in known) for f in schema.arrow_schema()]
@@ -109,11 +112,11 @@ def stored_schema(schema: TableSchema) -> pa.Schema:
 
 
 def open_table(lake: Lake, schema: TableSchema) -> DeltaTable | None:
-    """The table as it is now; None where nothing was recorded yet.
+    """The table in its current version; None if nothing was recorded yet.
 
     Raises:
         DamagedLogError: the table's log cannot be read, or lacks an entry.
-        ContractError: the lake holds records of a release that kept them as Parquet files, or of a newer one.
+        ContractError: records of a release that stored them as Parquet files, or of a newer release.
     """
     where = lake.table(schema.name)
     if lake.has_record_files(schema.name):
@@ -129,9 +132,9 @@ def open_table(lake: Lake, schema: TableSchema) -> DeltaTable | None:
         return None
     except DeltaError as err:
         raise DamagedLogError(where, str(err).splitlines()[0], str(lake)) from err
-    except OSError as err:  # says neither what it is nor where
+    except OSError as err:  # its message names neither problem nor file
         raise OSError(errno.EIO, " ".join(str(err).split()), where) from err
-    # Taken for an entry that says nothing: what a machine leaves that lost its power.
+    # deltalake ignores empty entries, which a power cut leaves behind.
     empty = [
         n for n, size in lake.files.sizes(lake.root / schema.name / LOG) if n.endswith(".json") and not size
     ]
@@ -146,7 +149,7 @@ def open_table(lake: Lake, schema: TableSchema) -> DeltaTable | None:
 
 
 def live_files(table: DeltaTable) -> list[LiveFile]:
-    """The data files of a table, with what its log knows of them."""
+    """Data files of a table, with their ranges from the log."""
     actions = pa.table(table.get_add_actions(flatten=True))
     columns = {n: actions.column(n).to_pylist() for n in actions.column_names}
     nothing = [None] * actions.num_rows
@@ -164,35 +167,35 @@ def live_files(table: DeltaTable) -> list[LiveFile]:
 def read_file(
     lake: Lake, schema: TableSchema, name: str, columns: Sequence[str], wanted: Wanted | None = None
 ) -> pa.Table | None:
-    """Columns of one data file, those that it has; None where it is damaged or gone, which `lake.damage` then names.
+    """Requested columns that a data file has; None, with an entry in `lake.damage`, if it is unreadable.
 
     Args:
-        lake: where the table is.
+        lake: with the table.
         schema: of the table.
         name: of the file.
         columns: names; "MAP.KEY" is one value of a column of maps, as float64, null where a row has none.
-        wanted: row groups without such rows are left out; rows beside them in the others are not.
+        wanted: skips row groups without such rows; other rows of the remaining groups are returned too.
     """
     path, mapped = lake.record_file(schema.name, name), _mapped(columns)
     asked = [c for c in columns if "." not in c]
     whole = [*asked, *(schema.follows[c][0] for c in asked if c in schema.follows)]
-    # Keys of maps are the same in every row: as places in a dictionary they are a fifth of the memory and time.
+    # Keys of maps repeat in every row: dictionary encoding takes a fifth of the memory and time.
     coded = [f"{c}.key_value.key" for c in mapped if c not in whole]
     try:
         with opened_parquet(lake.files, path, coded) as file:
             there = [c for c in dict.fromkeys([*whole, *mapped]) if c in file.names]
-            # One by one: coded keys of maps of several row groups at once are not implemented in pyarrow 26.
+            # One by one: pyarrow 26 cannot read dictionary-encoded map keys of several row groups at once.
             groups = _groups(file.metadata, wanted or Wanted())
             parts = [file.groups([g], there) for g in groups]
             table = pa.concat_tables(parts) if parts else file.groups([], there)
     except (PermissionError, pa.ArrowNotImplementedError):
-        raise  # what we may not or cannot read is not damaged: left out, its records would be lost to every audit
+        raise  # no permission is not damage: leaving the file out would hide its records from every audit
     except (pa.ArrowException, OSError, EOFError) as err:
         if not isinstance(lake.root, Path) and getattr(err, "errno", None) == errno.EIO:
-            raise  # the store does not answer: that says nothing of the file
+            raise  # the store does not answer, which is no damage of the file
         lake.damage.append(f"{path}: {str(err).splitlines()[0]}")
         return None
-    # The writer may have chosen string views for strings.
+    # the writer may have chosen string views for strings
     there = [c for c in there if c in whole]
     arrow = schema.arrow_schema()
     found = table.select(there).cast(pa.schema([arrow.field(c).with_nullable(True) for c in there]))
@@ -204,7 +207,7 @@ def read_file(
 
 
 def _mapped(columns: Sequence[str]) -> dict[str, list[str]]:
-    """Keys that are asked for of columns of maps."""
+    """Requested keys by column of maps."""
     found: dict[str, list[str]] = {}
     for column, _, key in (c.partition(".") for c in columns if "." in c):
         found.setdefault(column, []).append(key)
@@ -212,7 +215,7 @@ def _mapped(columns: Sequence[str]) -> dict[str, list[str]]:
 
 
 def _groups(metadata: pq.FileMetaData, wanted: Wanted) -> list[int]:
-    """Row groups in which rows that are asked for may be."""
+    """Row groups that may contain requested rows."""
     place = {metadata.schema.column(i).path: i for i in range(metadata.num_columns)}
     return [
         g
@@ -226,7 +229,7 @@ def _groups(metadata: pq.FileMetaData, wanted: Wanted) -> list[int]:
 def spans_of_file(
     lake: Lake, schema: TableSchema, name: str
 ) -> tuple[tuple[str, str] | None, tuple[str, str] | None]:
-    """Days and vehicles of a data file, as its own footer says; None where that cannot be read."""
+    """Ranges of days and vehicles of a data file, from its footer; None if unreadable."""
     found: list[tuple[str, str] | None] = []
     try:
         with opened_parquet(lake.files, lake.record_file(schema.name, name)) as file:
@@ -248,7 +251,7 @@ def _span(group: pq.RowGroupMetaData, column: int | None) -> tuple[str, str] | N
 
 
 def _values_of(maps: pa.ChunkedArray | None, key: str, rows: int) -> pa.Array:
-    """The values of one key of a column of maps."""
+    """Values of one key of a column of maps."""
     values, begin = np.full(rows, np.nan), 0
     there = np.zeros(rows, bool)
     for chunk in maps.chunks if maps is not None else []:
@@ -263,17 +266,17 @@ def _values_of(maps: pa.ChunkedArray | None, key: str, rows: int) -> pa.Array:
 
 
 def merge_rows(lake: Lake, schema: TableSchema, rows: pa.Table, *, insert: bool = True) -> None:
-    """Add the rows whose work is not recorded; of the others only take over `asserted_at`, where it is later.
+    """Add rows whose work is not recorded; for the others update only `asserted_at`, if it is later.
 
     Args:
-        lake: where the table is.
+        lake: with the table.
         schema: of the table.
-        rows: with all columns of `stored_schema`, no two about the same by the same work.
-        insert: False = only take over `asserted_at`.
+        rows: with all columns of `stored_schema`, without duplicates of key and work.
+        insert: False = only update `asserted_at`.
 
     Raises:
         ContractError: see `open_table`.
-        OSError: the storage does not answer, or others commit without end.
+        OSError: the storage does not answer, or other writers commit all the time.
     """
     for attempt in range(_TRIES):
         try:
@@ -282,7 +285,7 @@ def merge_rows(lake: Lake, schema: TableSchema, rows: pa.Table, *, insert: bool 
         except CommitFailedError:  # another writer was first
             time.sleep(_PAUSE_S * random.uniform(1, 1 + min(attempt, 10)))
         except (DeltaError, OSError) as err:
-            # A damaged file must be out of the way, or nothing is ever recorded again.
+            # move damaged files away, or no commit can succeed any more
             if not set_aside_damaged(lake, schema):
                 raise OSError(f"{lake.table(schema.name)}: {err}") from err
         else:
@@ -292,16 +295,16 @@ def merge_rows(lake: Lake, schema: TableSchema, rows: pa.Table, *, insert: bool 
 
 def _merge(table: DeltaTable, schema: TableSchema, rows: pa.Table, *, insert: bool) -> None:
     days, months = (sorted(set(rows.column(n).to_pylist())) for n in ("day", _MONTH))
-    # Literals, so that only files of these days are looked at; days and months are digits and hyphens.
+    # Literals, so that only files of these days are read; days and months are digits and hyphens.
     window = f"t.day >= '{days[0]}' and t.day <= '{days[-1]}' and t.{_MONTH} in ({_quoted(months)})"
     same = " and ".join(_same(c, schema) for c in (*schema.about, "work_key"))
     known = {f.name for f in table.schema().fields}
     later = [f.with_nullable(True) for f in stored_schema(schema) if f.name in set(schema.about) - known]
-    if later:  # a merge looks at them before it would add them
+    if later:  # else the merge would read them before adding rows
         table.alter.add_columns(Schema.from_arrow(pa.schema(later)).fields)
     for name in _RETIRED.keys() & known - set(rows.column_names):
         rows = rows.append_column(name, pa.array([_RETIRED[name]] * rows.num_rows, pa.string()))
-    # The words of an older release about a column stay: two that differ cannot be merged.
+    # Keep an older release's column descriptions: differing ones cannot be merged.
     rows = rows.cast(pa.schema([f.remove_metadata() if f.name in known else f for f in rows.schema]))
     if table.metadata().configuration.get(_VERSION) != str(schema.version):
         table.alter.set_table_properties({_VERSION: str(schema.version)}, raise_if_not_exists=False)
@@ -317,7 +320,7 @@ def _merge(table: DeltaTable, schema: TableSchema, rows: pa.Table, *, insert: bo
 
 
 def _same(column: str, schema: TableSchema) -> str:
-    """That two rows are about the same; null of an older release's row is what follows from another column."""
+    """Condition for an equal key column; null in a row of an older release is derived from another column."""
     same = f"t.{column} = s.{column}"
     return f"({same} or t.{column} is null)" if column in schema.follows else same
 
@@ -327,7 +330,7 @@ def _quoted(values: Sequence[str]) -> str:
 
 
 def create_table(lake: Lake, schema: TableSchema) -> DeltaTable:
-    """An empty table; another writer may have made it meanwhile."""
+    """Create an empty table, unless another writer has created it meanwhile."""
     if isinstance(lake.root, Path):
         (lake.root / schema.name).mkdir(parents=True, exist_ok=True)
     return DeltaTable.create(
@@ -339,7 +342,7 @@ def create_table(lake: Lake, schema: TableSchema) -> DeltaTable:
         description=schema.doc or None,
         configuration={
             _VERSION: str(schema.version),
-            # The log stays small: of the other columns nobody asks which files to leave out.
+            # Keeps the log small: no query filters files by the other columns.
             "delta.dataSkippingStatsColumns": "vehicle,day",
             "delta.targetFileSize": str(_FILE_BYTES),
         },
@@ -349,9 +352,9 @@ def create_table(lake: Lake, schema: TableSchema) -> DeltaTable:
 
 
 def set_aside_damaged(lake: Lake, schema: TableSchema) -> list[str]:
-    """Move files that cannot be read out of the table, into `_damaged` beside its months; returns their names.
+    """Move unreadable files of the table into `_damaged` beside its months; returns their names.
 
-    What was in them is made anew by the next night that is given the logs.
+    The next night with the logs makes their content again.
     """
     table = open_table(lake, schema)
     bad = []
@@ -361,14 +364,14 @@ def set_aside_damaged(lake: Lake, schema: TableSchema) -> list[str]:
             path = lake.record_file(schema.name, file.name)
             lake.files.move(path, lake.root / schema.name / DAMAGED / file.name.replace("/", "_"))
     if bad and table is not None:
-        table.repair()  # the log forgets files that are not there
+        table.repair()  # removes missing files from the log
     return bad
 
 
 def tidy_table(lake: Lake, schema: TableSchema) -> Iterator[str]:
-    """After a night: set damaged files aside, put small files together, remove what no reader can still hold.
+    """Maintenance after a night: move damaged files away, compact small files, remove files no longer in use.
 
-    Yields what was done, in words. Another writer at work at the same time costs this time's compaction only.
+    Yields a description of each action. A concurrent writer only makes this compaction fail.
     """
     table = open_table(lake, schema)
     if table is None:

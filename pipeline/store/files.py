@@ -1,4 +1,4 @@
-"""Files of a lake, in a folder or in a bucket: what the tables need of either."""
+"""File operations of a lake, in a folder or in a bucket."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ __all__ = ["Files", "LocalFiles"]
 
 @runtime_checkable
 class Files(Protocol):
-    """A place for whole files. `pipeline/store/object_store.py` has the other one."""
+    """A location of whole files; `pipeline/store/object_store.py` has the other implementation."""
 
     def uri(self, path: PurePath) -> str:
-        """What a person, and `deltalake`, calls a file or folder."""
+        """Address of a file or folder for users and for `deltalake`."""
         ...
 
     def exists(self, path: PurePath) -> bool:
-        """Whether there is such a file or folder."""
+        """Whether the file or folder exists."""
         ...
 
     def find(self, folder: PurePath, pattern: str) -> Iterator[PurePath]:
-        """Files below a folder whose path matches."""
+        """Files below a folder whose path matches a pattern."""
         ...
 
     def opened(self, path: PurePath) -> AbstractContextManager[BinaryIO]:
-        """A file, to be read at any place."""
+        """A file opened for random access."""
         ...
 
     def replacing(self, path: PurePath) -> AbstractContextManager[BinaryIO]:
@@ -39,23 +39,23 @@ class Files(Protocol):
         ...
 
     def move(self, path: PurePath, to: PurePath) -> None:
-        """Give a file another name, if it is there."""
+        """Rename a file, if it exists."""
         ...
 
     def delete(self, path: PurePath) -> None:
-        """Remove a file, if it is there."""
+        """Remove a file, if it exists."""
         ...
 
     def size(self, path: PurePath) -> int:
-        """Bytes of a file; 0 where there is none."""
+        """Size of a file [bytes]; 0 if it does not exist."""
         ...
 
     def sizes(self, folder: PurePath) -> Iterator[tuple[str, int]]:
-        """Name and bytes of each file that lies in a folder; none where there is no folder."""
+        """Name and size [bytes] of each file in a folder; empty if the folder does not exist."""
         ...
 
     def delta_options(self) -> dict[str, str]:
-        """What `deltalake` is told of the storage."""
+        """Storage options for `deltalake`."""
         ...
 
 
@@ -68,47 +68,47 @@ class LocalFiles:
         return str(path)
 
     def exists(self, path: PurePath) -> bool:
-        """Whether there is such a file or folder."""
+        """Whether the file or folder exists."""
         return Path(path).exists()
 
     def find(self, folder: PurePath, pattern: str) -> Iterator[PurePath]:
-        """Paths below a folder that match."""
+        """Paths below a folder that match a pattern."""
         return iter(Path(folder).glob(pattern))
 
     @contextmanager
     def opened(self, path: PurePath) -> Iterator[BinaryIO]:
-        """A file, to be read at any place."""
+        """A file opened for random access."""
         with Path(path).open("rb") as stream:
             yield stream
 
     @contextmanager
     def replacing(self, path: PurePath) -> Iterator[BinaryIO]:
-        """A stream into a file aside, which takes the name when the block ends."""
+        """A stream into a temporary file, which replaces the file when the block ends."""
         Path(path).parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(Path(path)) as stream:
             yield stream
 
     def move(self, path: PurePath, to: PurePath) -> None:
-        """Give a file another name, if it is there."""
+        """Rename a file, if it exists."""
         Path(to).parent.mkdir(parents=True, exist_ok=True)
         with suppress(FileNotFoundError):
             Path(path).replace(to)
 
     def delete(self, path: PurePath) -> None:
-        """Remove a file, if it is there."""
+        """Remove a file, if it exists."""
         Path(path).unlink(missing_ok=True)
 
     def size(self, path: PurePath) -> int:
-        """Bytes of a file; 0 where there is none."""
+        """Size of a file [bytes]; 0 if it does not exist."""
         return Path(path).stat().st_size if Path(path).is_file() else 0
 
     def sizes(self, folder: PurePath) -> Iterator[tuple[str, int]]:
-        """Name and bytes of each file that lies in a folder; none where there is no folder."""
+        """Name and size [bytes] of each file in a folder; empty if the folder does not exist."""
         with suppress(FileNotFoundError), os.scandir(folder) as entries:
             for entry in entries:
                 if entry.is_file():
                     yield entry.name, entry.stat().st_size
 
     def delta_options(self) -> dict[str, str]:
-        """Nothing."""
+        """No options."""
         return {}

@@ -1,4 +1,4 @@
-"""A lake of releases before 0.6, which kept records as Parquet files, to record tables."""
+"""Migration of a lake of releases before 0.6, which stored records as Parquet files, to record tables."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from schemas.columns import TableSchema
 
 __all__ = ["Migrated", "migrate_table"]
 
-_FILES_A_COMMIT = 500  # some thousand rows: a commit's own cost is small beside reading the files
+_FILES_A_COMMIT = 500  # some thousand rows: then a commit costs little compared with reading the files
 
 
 @dataclass
 class Migrated:
-    """What became of a table's record files."""
+    """Result of the migration of a table's record files."""
 
     files: int = 0
     rows: int = 0
@@ -37,9 +37,9 @@ class Migrated:
 def migrate_table(lake: Lake, schema: TableSchema, row_type: type[Any], progress: Progress) -> Migrated:
     """Move all record files of a table into its record table, and remove them.
 
-    A file goes once its rows are committed, and rows that are there already are not added again, so a migration that
-    was stopped anywhere goes on where it was. Which record is current was told by the files' times: these become
-    `recorded_at` and `asserted_at`. Files that cannot be read are moved into `_damaged`, and named.
+    A file is removed after the commit of its rows, and existing rows are not added again, so an interrupted
+    migration can continue. The times of the files determined which record was current: they become
+    `recorded_at` and `asserted_at`. Unreadable files are moved into `_damaged` and reported.
 
     Raises:
         ContractError: a file of another table or version.
@@ -67,7 +67,7 @@ def migrate_table(lake: Lake, schema: TableSchema, row_type: type[Any], progress
 def _read(
     files: Sequence[Path], folder: Path, schema: TableSchema, row_type: type[Any], done: Migrated
 ) -> Iterator[tuple[int, list[Any]]]:
-    """Time [ns] and rows of each file that can be read; the others are set aside."""
+    """Time [ns] and rows of each readable file; the others are moved away."""
     for path in files:
         try:
             with pq.ParquetFile(path) as file:
@@ -92,7 +92,7 @@ def _check(path: Path, footer: dict[bytes, bytes], schema: TableSchema) -> None:
 
 
 def _dated(files: Iterator[tuple[int, list[Any]]]) -> Iterator[Any]:
-    """Rows whose time is their file's, in whole microseconds, each file's later than the one before it."""
+    """Rows with the time of their file, in whole microseconds, strictly increasing from file to file."""
     last: dict[tuple[str, str], dt.datetime] = {}
     for modified_ns, rows in files:
         stamp = dt.datetime.fromtimestamp(0, dt.UTC) + dt.timedelta(microseconds=modified_ns // 1000)
@@ -107,10 +107,10 @@ def _dated(files: Iterator[tuple[int, list[Any]]]) -> Iterator[Any]:
 
 
 def _remove_empty(folder: Path) -> None:
-    """Remove folders of days and vehicles, with what killed writers left in them."""
+    """Remove folders of days and vehicles, and files left by killed writers in them."""
     for day in folder.glob("vehicle=*/day=*"):
         for left in day.glob(".writing-*.tmp"):
             left.unlink(missing_ok=True)
-        with suppress(OSError):  # somebody keeps something of theirs there
+        with suppress(OSError):  # not empty: it holds files of other programs
             day.rmdir()
             day.parent.rmdir()

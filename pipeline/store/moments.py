@@ -1,7 +1,7 @@
-"""Moments of a vehicle-day: a table that joins rows of its sensors' files, all replaced together.
+"""Moments of a vehicle-day: a table that joins rows of the sensors' files, all replaced together.
 
-The joining table (`moments`, `perceived`) has the manifest. It is taken away before the first of its sensors' files is
-replaced and written last: where it is there, all are of one work.
+The joining table (`moments`, `perceived`) has the manifest. It is removed before the first sensor file is
+replaced, and written last: if it exists, all files are of the same work.
 """
 
 from __future__ import annotations
@@ -43,7 +43,10 @@ _KINDS = {t.name: kind for tables in (CAPTURES, FEATURES) for kind, t in tables.
 
 
 class MomentWriter:
-    """Streams moments and the rows of their sensors; nothing is visible until the block ends without an error."""
+    """Streams moments and the rows of their sensors.
+
+    Nothing is visible until the block ends without an error.
+    """
 
     def __init__(self, stack: ExitStack, lake: Lake, partition: Partition, index: PartitionWriter) -> None:
         self._stack, self._lake, self._partition, self._index = stack, lake, partition, index
@@ -52,11 +55,11 @@ class MomentWriter:
 
     @property
     def rows(self) -> int:
-        """Moments so far."""
+        """Number of moments so far."""
         return len(self._held)
 
     def append(self, moment: Any, captures: Mapping[str, Any]) -> None:
-        """Take a moment and what it has of each sensor, by name."""
+        """Add a moment and its rows by sensor name."""
         rows = {sensor: self._file(sensor, row).add(row) for sensor, row in captures.items()}
         self._held.append(replace(moment, rows=rows))
 
@@ -67,7 +70,7 @@ class MomentWriter:
 
     def finish(self) -> None:
         """Write the moments."""
-        self._index.append(self._held)  # a kilobyte each
+        self._index.append(self._held)  # about a kilobyte per moment
 
     def _file(self, sensor: str, row: Any) -> PartitionWriter:
         if sensor not in self.files:
@@ -88,11 +91,12 @@ def write_moments(
 ) -> Iterator[MomentWriter]:
     """Replace the moments of a vehicle-day and the files of its sensors; on an error the old ones stay.
 
-    A writer that is killed while files take their names leaves a day without moments, which the next one makes anew.
+    A writer that is killed during the final renames leaves a day without moments, which the next one makes
+    again.
     """
     path = lake.file(schema.name, partition)
     with ExitStack() as stack:
-        # Left last: the joining table takes its name after all files have theirs.
+        # Left last: the joining table is renamed after all other files.
         index = stack.enter_context(opened_for_writing(lake, path, schema))
         writer = MomentWriter(stack, lake, partition, index)
         yield writer
@@ -105,7 +109,7 @@ def write_moments(
 
 
 def is_whole(lake: Lake, partition: Partition, manifest: Manifest) -> bool:
-    """Whether all files that a joining table's manifest names are there, and of the same work."""
+    """Whether all files named in a joining table's manifest exist, and are of the same work."""
     if COLLECTED in manifest.extra:
         return True
     for sensor, table in manifest.extra.get(FILES, {}).items():
@@ -116,12 +120,12 @@ def is_whole(lake: Lake, partition: Partition, manifest: Manifest) -> bool:
 
 
 def sensors_of(manifest: Manifest) -> dict[str, str]:
-    """Kind of each sensor that has rows, by name, in the order in which they came."""
+    """Kind of each sensor with rows, by name, in order of first appearance."""
     return {sensor: _KINDS[table] for sensor, table in manifest.extra.get(FILES, {}).items()}
 
 
 def sensor_tables(schema: TableSchema) -> list[TableSchema]:
-    """The tables of sensors' files that a table joins; none that is not such a one."""
+    """Tables of sensors' files that a table joins; empty for other tables."""
     return [table for table in _OF_SENSORS.values() if table.made_by == schema.made_by]
 
 
@@ -138,19 +142,19 @@ def joined(
     sensors: Sequence[str] | None = None,
     moments: Sequence[int] | None = None,
 ) -> Iterator[tuple[Any, dict[str, Any]]]:
-    """Moments of a vehicle-day in order, each with what it has of each sensor; a row group of each in memory at a time.
+    """Moments of a vehicle-day in order, with rows by sensor; one row group of each file is in memory.
 
     Args:
-        lake: where the tables are.
+        lake: with the tables.
         schema: of the joining table.
         partition: the vehicle-day.
-        sensors: whose files are read; None = all.
-        moments: the moments that are wanted; None = all.
+        sensors: sensors to read; None = all.
+        moments: moments to read; None = all.
 
     Raises:
         ContractError: the lake has none of that day, or they are of another release.
         DamagedError: a file cannot be read.
-        CollectedError: they left the lake after their time.
+        CollectedError: the rows were deleted at the end of their retention.
     """
     wanted = None if moments is None else set(moments)
     rows: list[Any] = read_rows(lake, schema, partition, schema.row_type)
@@ -191,7 +195,7 @@ def _rows_of(
 def _tidy(
     lake: Lake, schema: TableSchema, partition: Partition, files: Mapping[str, PartitionWriter]
 ) -> None:
-    """Take away files of sensors that the day has no longer."""
+    """Remove files of sensors that the day no longer has."""
     kept = {lake.file(f.schema.name, partition, sensor) for sensor, f in files.items()}
     for path in sensor_files(lake, schema, partition):
         if path not in kept:

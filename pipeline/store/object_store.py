@@ -1,6 +1,6 @@
-"""Objects of an S3 bucket as files: whole writes, reads at any place, listings; transient faults are tried again.
+"""Objects of an S3 bucket as files: atomic writes, random access, listings; transient faults are retried.
 
-Credentials, region and endpoint come from the environment alone (`AWS_ACCESS_KEY_ID`, `AWS_SECRET_ACCESS_KEY`,
+Credentials, region and endpoint come only from the environment (`AWS_ACCESS_KEY_ID`, `AWS_SECRET_ACCESS_KEY`,
 `AWS_REGION`, `AWS_ENDPOINT_URL`, `AWS_ALLOW_HTTP`, ...), as `obstore` and `deltalake` read them.
 """
 
@@ -28,29 +28,29 @@ from pipeline.store.atomic_write import naming
 
 __all__ = ["Bucket"]
 
-# A request that takes longer than this is tried anew: a healthy store answers one of 8 MiB within a second.
+# A slower request is repeated: a healthy store answers one of 8 MiB within a second.
 REQUEST_S = 30.0
 CONNECT_S = 5.0
-# S3 asks clients to back off for seconds when it answers 503; what is down for longer is down.
+# S3 asks clients to back off for seconds when it answers 503; a longer outage is an error.
 RETRIES = 10
 RETRY_S = 180.0
-_BUFFER_BYTES = 1 << 20  # of a reader: a Parquet footer and the pages of a small column in one request
+_BUFFER_BYTES = 1 << 20  # of a reader: a Parquet footer or the pages of a small column in one request
 
 _ABSENT = (NotFoundError, FileNotFoundError)  # the client raises either
 
 
 @dataclass(frozen=True)
 class Bucket:
-    """A bucket whose objects are read and written as files; a `Files`."""
+    """A bucket whose objects are used as files; implements `Files`."""
 
     name: str
 
     def uri(self, key: PurePath) -> str:
-        """What a person calls the object."""
+        """Address of an object for users."""
         return f"s3://{self.name}/{key}"
 
     def exists(self, key: PurePath) -> bool:
-        """Whether there is such an object, or any below that key."""
+        """Whether the object exists, or any object below that key."""
         with self._as_os_errors(key):
             try:
                 obstore.head(_store(self.name), str(key))
@@ -59,7 +59,10 @@ class Bucket:
         return True
 
     def find(self, folder: PurePath, pattern: str) -> Iterator[PurePath]:
-        """Keys below a folder that match a pattern of as many parts; all where the pattern begins with **."""
+        """Keys below a folder that match a pattern with as many parts.
+
+        All keys if the pattern begins with **.
+        """
         parts = pattern.split("/")
         literal = list(takewhile(lambda part: not set(part) & set("*?["), parts))
         for key, _, _ in self.listed(folder.joinpath(*literal)):
@@ -69,7 +72,7 @@ class Bucket:
 
     @contextmanager
     def opened(self, key: PurePath) -> Iterator[BinaryIO]:
-        """A reader of an object; only what is asked for is fetched.
+        """A reader of an object, which fetches only the requested bytes.
 
         Raises:
             FileNotFoundError: no such object.
@@ -80,7 +83,7 @@ class Bucket:
         yield cast("BinaryIO", io.BufferedReader(_Reader(self, key, reader), _BUFFER_BYTES))
 
     def read_range(self, key: PurePath, start: int, length: int) -> bytes:
-        """Bytes of an object, by one request for just them.
+        """Byte range of an object, fetched by one request.
 
         Raises:
             OSError: the store does not answer, or there is no such object.
@@ -89,7 +92,7 @@ class Bucket:
             return bytes(obstore.get_range(_store(self.name), str(key), start=start, length=length))
 
     def size_and_tag(self, key: PurePath) -> tuple[int, str]:
-        """Bytes of an object, and its entity tag, which another content changes.
+        """Size [bytes] and entity tag of an object; the tag changes with the content.
 
         Raises:
             FileNotFoundError: no such object.
@@ -113,9 +116,9 @@ class Bucket:
 
     @contextmanager
     def replacing(self, key: PurePath) -> Iterator[BinaryIO]:
-        """A stream whose content becomes the object when the block ends; on an error the object stays as it was.
+        """A stream whose content becomes the object when the block ends; on an error the object stays.
 
-        It goes through a local file, so that readers of the store see the whole object or none.
+        The content goes through a local file, so that readers of the store see the whole object or none.
         """
         with naming(tempfile.gettempdir()), tempfile.TemporaryFile() as stream:
             yield cast("BinaryIO", stream)
@@ -124,30 +127,30 @@ class Bucket:
                 obstore.put(_store(self.name), str(key), stream)
 
     def move(self, key: PurePath, to: PurePath) -> None:
-        """Give an object another key, if it is there."""
+        """Rename an object, if it exists."""
         with suppress(FileNotFoundError), self._as_os_errors(key):
             obstore.rename(_store(self.name), str(key), str(to))
 
     def delete(self, key: PurePath) -> None:
-        """Remove an object, if it is there."""
+        """Remove an object, if it exists."""
         with suppress(FileNotFoundError), self._as_os_errors(key):
             obstore.delete(_store(self.name), str(key))
 
     def size(self, key: PurePath) -> int:
-        """Bytes of an object; 0 where there is none."""
+        """Size of an object [bytes]; 0 if it does not exist."""
         with suppress(FileNotFoundError):
             return self.size_and_tag(key)[0]
         return 0
 
     def sizes(self, folder: PurePath) -> Iterator[tuple[str, int]]:
-        """Name and bytes of each object right below a key."""
+        """Name and size [bytes] of each object directly below a key."""
         for key, size, _ in self.listed(folder):
             name = PurePosixPath(key).relative_to(folder)
             if len(name.parts) == 1:
                 yield str(name), size
 
     def delta_options(self) -> dict[str, str]:
-        """The same patience for `deltalake`."""
+        """Retry settings for `deltalake`, equal to those of this client."""
         return {
             "timeout": f"{REQUEST_S:g}s",
             "connect_timeout": f"{CONNECT_S:g}s",
@@ -157,7 +160,7 @@ class Bucket:
 
     @contextmanager
     def _as_os_errors(self, key: PurePath) -> Iterator[None]:
-        """The store's errors as those of files: with a number, so that nobody takes them for damage."""
+        """Raise the store's errors as OSErrors with a number, so that they are not mistaken for damaged files."""
         try:
             yield
         except _ABSENT as err:
@@ -167,7 +170,7 @@ class Bucket:
 
 
 class _Reader(io.RawIOBase):
-    """obstore's reader as Python and Arrow know readers."""
+    """obstore's reader with the interface of Python's and Arrow's readers."""
 
     def __init__(self, bucket: Bucket, key: PurePath, reader: Any) -> None:
         super().__init__()
@@ -193,7 +196,7 @@ class _Reader(io.RawIOBase):
 
 
 def _store(bucket: str) -> S3Store:
-    """The client of a bucket, another one where the environment names another store or other credentials."""
+    """Client of a bucket, cached per set of environment variables (store, credentials)."""
     return _client(bucket, tuple(sorted(item for item in os.environ.items() if item[0].startswith("AWS_"))))
 
 
@@ -204,7 +207,7 @@ def _client(bucket: str, environment: tuple[tuple[str, str], ...]) -> S3Store:  
         client_options={
             "timeout": timedelta(seconds=REQUEST_S),
             "connect_timeout": timedelta(seconds=CONNECT_S),
-            # Given any option, the client asks the environment for none of them.
+            # With any option given, the client reads none of them from the environment.
             "allow_http": os.environ.get("AWS_ALLOW_HTTP", "").lower() in ("1", "true"),
         },
         retry_config={"max_retries": RETRIES, "retry_timeout": timedelta(seconds=RETRY_S)},

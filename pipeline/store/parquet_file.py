@@ -1,6 +1,7 @@
-"""Parquet files of a lake, opened so that no thread of Arrow's ever holds an object of Python's.
+"""Parquet files of a lake, opened so that no Arrow thread ever holds a Python object.
 
-Such a thread that lets go of one while the interpreter ends would abort a process that had done its work.
+If such a thread released the object during interpreter shutdown, the process would abort after its work was
+done.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ __all__ = ["ParquetReader", "opened_parquet"]
 
 
 class ParquetReader:
-    """What is read of one file; where its source is an object of Python's, in the caller's thread alone."""
+    """Reader of one file; if its source is a Python object, it reads only in the caller's thread."""
 
     def __init__(self, file: pq.ParquetFile, *, threads: bool) -> None:
         self._file, self._threads = file, threads
@@ -26,11 +27,11 @@ class ParquetReader:
 
     @property
     def names(self) -> list[str]:
-        """Of the columns."""
+        """Names of the columns."""
         return list(self._file.schema_arrow.names)
 
     def groups(self, groups: list[int], columns: list[str] | None = None) -> pa.Table:
-        """Columns of row groups, all where none are named."""
+        """Columns of row groups; all columns if none are given."""
         return self._file.read_row_groups(groups, columns=columns, use_threads=self._threads)
 
 
@@ -41,7 +42,7 @@ def opened_parquet(
     """A Parquet file of a folder or a bucket.
 
     Raises:
-        FileNotFoundError: there is none.
+        FileNotFoundError: it does not exist.
         OSError: the storage does not answer, or the file is damaged.
         pyarrow.ArrowException: the file is damaged.
     """
@@ -49,7 +50,7 @@ def opened_parquet(
         with pa.OSFile(str(path)) as source, pq.ParquetFile(source, read_dictionary=read_dictionary) as file:
             yield ParquetReader(file, threads=True)
     else:
-        # Read ahead, it would be read by threads.
+        # pre-buffering would read it in threads
         with (
             files.opened(path) as source,
             pq.ParquetFile(source, read_dictionary=read_dictionary, pre_buffer=False) as file,

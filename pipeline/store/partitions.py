@@ -1,4 +1,4 @@
-"""Where partitions and records of a lake lie: LAKE/<table>/vehicle=V/day=YYYY-MM-DD/<name>.parquet."""
+"""Paths of partitions and records of a lake: LAKE/<table>/vehicle=V/day=YYYY-MM-DD/<name>.parquet."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ __all__ = [
 
 
 def is_day(text: str) -> bool:
-    """True for a day of the calendar as YYYY-MM-DD (ISO 8601 has other spellings, the lake has one)."""
+    """Whether a text is a calendar day as YYYY-MM-DD (the only spelling in a lake; ISO 8601 has others)."""
     try:
         return dt.date.fromisoformat(text).isoformat() == text
     except ValueError:
@@ -33,23 +33,23 @@ def is_day(text: str) -> bool:
 
 
 def check_day(name: str, day: str | None) -> None:
-    """Raise ConfigError, naming the option, where a day is given that is no YYYY-MM-DD."""
+    """Raise ConfigError, naming the option, for a day that is not YYYY-MM-DD."""
     if day is not None and not is_day(day):
-        raise ConfigError("command line", name, f"{day!r} is no day of the form YYYY-MM-DD")
+        raise ConfigError("command line", name, f"{day!r} is not a day of the form YYYY-MM-DD")
 
 
 def last_possible_day() -> str:
-    """Tomorrow: elsewhere on earth it has begun; a drive of a later day cannot be."""
+    """Tomorrow, because some time zones are ahead; a later day of a drive is impossible."""
     return (dt.datetime.now(dt.UTC).date() + dt.timedelta(days=1)).isoformat()
 
 
 def days_after(day: str, days: int) -> str:
-    """The day of the calendar so many days later; earlier where `days` is negative."""
+    """Calendar day so many days later; earlier if `days` is negative."""
     return (dt.date.fromisoformat(day) + dt.timedelta(days=days)).isoformat()
 
 
 def months_before(day: str, count: int) -> Iterator[tuple[str, str]]:
-    """First and last day of what lies before a day, by month, the latest first."""
+    """First and last day of each month before a day, the latest first."""
     for _ in range(count):
         end = days_after(day, -1)
         day = f"{end[:-2]}01"
@@ -58,7 +58,7 @@ def months_before(day: str, count: int) -> Iterator[tuple[str, str]]:
 
 @dataclass(frozen=True, order=True)
 class Partition:
-    """One vehicle-day, the unit of work everywhere."""
+    """One vehicle-day, the unit of work of most stages."""
 
     vehicle: str
     day: str
@@ -67,37 +67,37 @@ class Partition:
         if not is_vehicle(self.vehicle):
             raise ConfigError("command line", "vehicle", f"{self.vehicle!r} cannot be a vehicle's name")
         if not is_day(self.day):
-            raise ConfigError("command line", "day", f"{self.day!r} is no day of the form YYYY-MM-DD")
+            raise ConfigError("command line", "day", f"{self.day!r} is not a day of the form YYYY-MM-DD")
 
     @property
     def folder(self) -> str:
-        """Hive path below the table."""
+        """Hive path of the partition below the table."""
         return f"vehicle={quote(self.vehicle, safe='')}/day={self.day}"
 
 
 @dataclass(frozen=True)
 class LostRows:
-    """Records that cannot be read: of these days and vehicles, first and last (None: not known)."""
+    """Ranges of days and vehicles of unreadable records, first and last (None: unknown)."""
 
     table: str
     days: tuple[str, str] | None
     vehicles: tuple[str, str] | None
 
     def may_be_of(self, vehicle: str) -> bool:
-        """False where none of them can be of this vehicle."""
+        """False if none of them can be of this vehicle."""
         return self.vehicles is None or self.vehicles[0] <= vehicle <= self.vehicles[1]
 
 
 @dataclass(frozen=True)
 class Lake:
-    """The root of the tables: a folder, or a prefix of a bucket.
+    """Root of the tables: a folder, or a prefix of a bucket.
 
     Args:
-        root: the folder, a `Path`; or the prefix, which is no path of this machine.
-        files: where its files are.
-        migrating: True for who moves the records of an older release, and meets them beside the new ones.
-        damage: what was left out because it could not be read, as it is found: file and reason, in words.
-        lost: whose records were in what was left out.
+        root: a `Path` for a folder; for a bucket the prefix, which is not a local path.
+        files: file operations at that location.
+        migrating: True during migration, when records of an older release exist beside the new ones.
+        damage: filled while reading: file and reason of everything left out because it is unreadable.
+        lost: days and vehicles of the records left out.
     """
 
     root: PurePath
@@ -118,15 +118,17 @@ class Lake:
             return cls(Path(location))
         bucket, _, prefix = rest.strip("/").partition("/")
         if scheme != "s3" or not bucket or not prefix:
-            raise ConfigError("command line", "lake", f"{location!r} is no folder and no s3://BUCKET/PREFIX")
+            raise ConfigError(
+                "command line", "lake", f"{location!r} is neither a folder nor s3://BUCKET/PREFIX"
+            )
         return cls(PurePosixPath(prefix), Bucket(bucket))
 
     @classmethod
     def existing(cls, location: str | Path) -> Lake:
-        """The lake at a place where there is one, for commands that read: a mistyped name is no empty lake.
+        """The existing lake at a location, for commands that read: a mistyped name is an error.
 
         Raises:
-            ConfigError: there is none, or it cannot be a lake's place (see `at`).
+            ConfigError: no such lake, or not a valid location (see `at`).
         """
         lake = cls.at(location)
         if not lake.exists():
@@ -138,57 +140,57 @@ class Lake:
 
     @property
     def local_root(self) -> Path:
-        """The folder, for what works on folders only.
+        """The folder, for code that works on folders only.
 
         Raises:
             ConfigError: the lake is in an object store.
         """
         if not isinstance(self.root, Path):
-            raise ConfigError("command line", "lake", f"{self} is no folder, and this command needs one")
+            raise ConfigError("command line", "lake", f"{self} is not a folder, and this command needs one")
         return self.root
 
     def absolute(self) -> Lake:
-        """The same lake, wherever a process works."""
+        """The same lake with an absolute path, for processes in other working folders."""
         return replace(self, root=self.root.absolute()) if isinstance(self.root, Path) else self
 
     def folder(self, table: str, partition: Partition) -> PurePath:
-        """The folder of one partition of one table."""
+        """Folder of one partition of one table."""
         return self.root / table / partition.folder
 
     def file(self, table: str, partition: Partition, sensor: str | None = None) -> PurePath:
-        """The file of a partition, or the one that it has of a sensor (records have tables of their own)."""
+        """File of a partition, or its file of a sensor (records have tables of their own)."""
         return self.folder(table, partition) / f"{sensor or 'part-0'}.parquet"
 
     def partitions(self, table: str, vehicle: str | None = None, day: str | None = None) -> list[Partition]:
-        """Partitions of a table that hold at least one file, in order; only those of a vehicle or day if given."""
+        """Partitions of a table with at least one file, in order; with a vehicle or day, only those."""
         vehicles = "*" if vehicle is None else quote(vehicle, safe="")
         found = self.files.find(self.root / table, f"vehicle={vehicles}/day={day or '*'}/*.parquet")
         return sorted({p for f in found if (p := _partition_of(f.parent)) is not None})
 
     def set_aside(self, path: str) -> None:
-        """Take a damaged file of a partition out of the readers' sight; it keeps its name and ends in .damaged."""
+        """Hide a damaged file of a partition from readers by adding .damaged to its name."""
         self.files.move(type(self.root)(path), type(self.root)(f"{path}.damaged"))
 
     def table(self, name: str) -> str:
-        """Where a record table lies."""
+        """Location of a record table."""
         return self.files.uri(self.root / name)
 
     def exists(self) -> bool:
-        """True where there is such a folder."""
+        """Whether the folder exists."""
         return self.files.exists(self.root)
 
     def has_record_files(self, table: str) -> bool:
-        """True where a release before 0.6 left records as files in folders of vehicles."""
+        """Whether a release before 0.6 left records as files in folders of vehicles."""
         found = self.files.find(self.root / table, "vehicle=*/day=*/*.parquet")
         return not self.migrating and isinstance(self.root, Path) and any(True for _ in found)
 
     def record_file(self, table: str, name: str) -> PurePath:
-        """A data file of a record table, by its name in the table's log."""
+        """Data file of a record table, by its name in the table's log."""
         return self.root / table / unquote(name)
 
 
 def _partition_of(folder: PurePath) -> Partition | None:
-    """The partition that a folder is; None for one that nobody could have written through here."""
+    """Partition of a folder; None if its name is not valid."""
     try:
         return Partition(
             unquote(folder.parent.name.removeprefix("vehicle=")), folder.name.removeprefix("day=")
@@ -204,6 +206,6 @@ def work_key(stage: str, code_version: str, config: str, inputs: list[str]) -> s
 
 
 def content_hash(rows: Sequence[Any]) -> str:
-    """Hash of all that record rows say, arrays included."""
+    """Hash of the content of record rows, arrays included."""
     plain = [[v.tolist() if isinstance(v, np.ndarray) else v for v in vars(row).values()] for row in rows]
     return hashlib.sha256(json.dumps(plain).encode()).hexdigest()[:20]

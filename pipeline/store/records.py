@@ -1,6 +1,6 @@
-"""Records go out: of several rows about the same, one of them current, those that are asked for.
+"""Reading of records; of several rows with the same key one is current.
 
-Months, files and columns that nobody asks for are not read, and damaged files are left out.
+Months, files and columns that are not requested are not read, and damaged files are left out.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ __all__ = [
 ]
 
 Row = TypeVar("Row")
-# Of machines that write a table: a file is at most this much older than the rows in it.
+# Clock difference of machines that write a table: a file is at most this much older than its rows.
 _CLOCKS_DIFFER_S = 86_400.0
 
 
 class Assertion(NamedTuple):
-    """What rows that a stage of the whole fleet asserted together have in common."""
+    """Rows that a stage of the whole fleet asserted together, and their common stamp."""
 
     asserted_at: str
     day: str
@@ -59,19 +59,20 @@ def read_records(
     last: str | None = None,
     columns: Sequence[str] | None = None,
 ) -> list[Row]:
-    """Records in order of vehicle, day and time of their last assertion; `current_records` keeps the last of a kind.
+    """Records in order of vehicle, day and last assertion; `current_records` keeps the last of a key.
 
-    Files that are damaged or gone are left out, and `lake.damage` names them.
+    Damaged or missing files are left out and listed in `lake.damage`.
 
     Args:
-        lake: where the table is.
+        lake: with the table.
         schema: of the table.
         row_type: its dataclass.
-        vehicle: only this vehicle's, or only these'.
+        vehicle: only records of this vehicle, or of these.
         day: only of this day.
         first: only from this day on.
         last: only until this day.
-        columns: of those with a default in `row_type`, which to read; the others keep their default. None = all.
+        columns: columns to read, of those with a default in `row_type`; the others keep their default. None =
+            all.
 
     Raises:
         ContractError: the lake is of another release, or lacks a column that has no default.
@@ -91,22 +92,22 @@ def read_columns(
     vehicle: str | AbstractSet[str] | None = None,
     asserted_after: str | None = None,
 ) -> pa.Table | None:
-    """Columns of the records of a window of days, in no order, with what tells which of them are current.
+    """Columns of the records of a window of days, unordered, plus those that `current_rows` needs.
 
-    For thousands of vehicles, of which rows would be gigabytes (`current_rows` keeps the current ones).
+    For thousands of vehicles, whose records would be gigabytes as rows.
 
     Args:
-        lake: where the table is.
+        lake: with the table.
         schema: of the table.
-        columns: names; "diagnostics.disproved" is one value of a column of maps, null where a record has none. A column
-            that no release which wrote to the lake knew yet is null in every row.
+        columns: names; "diagnostics.disproved" is one value of a column of maps, null where a record has
+            none. A column unknown to all releases that wrote to the lake is null in every row.
         first: only from this day on.
         last: only until this day.
-        vehicle: only this vehicle's, or only these'.
-        asserted_after: only what became current after this moment.
+        vehicle: only records of this vehicle, or of these.
+        asserted_after: only records that became current after this moment.
 
     Returns:
-        None where there is no record.
+        None if there is no record.
     """
     asked = dict.fromkeys([*schema.about, "asserted_at", "work_key", *columns])
     wanted = replace(_wanted(vehicle, first, last), asserted_after=asserted_after)
@@ -120,12 +121,12 @@ def read_columns(
 
 
 class RecordIndex(Generic[Row]):
-    """Records of a window of days, as they were when it was made: those of a vehicle-day become rows when asked for.
+    """Records of a window of days as of its creation; those of a vehicle-day become rows when requested.
 
     A year of a thousand vehicles is a few hundred megabytes as columns, and gigabytes as rows.
 
     Args:
-        lake: where the table is.
+        lake: with the table.
         schema: of the table.
         row_type: its dataclass.
         first: first day.
@@ -152,7 +153,7 @@ class RecordIndex(Generic[Row]):
                 self._spans[owner] = (places[0], len(places))
 
     def of(self, vehicle: str, day: str) -> list[Row]:
-        """The rows of a vehicle-day, the last asserted last."""
+        """Rows of a vehicle-day, the last asserted last."""
         if self._rows is None or (vehicle, day) not in self._spans:
             return []
         return from_table(self._rows.slice(*self._spans[vehicle, day]), self._schema, self._row_type)
@@ -165,7 +166,7 @@ def _sorted_rows(
     wanted: Wanted,
     columns: Sequence[str] | None,
 ) -> pa.Table | None:
-    """Columns as `read_records` promises them, in its order; None where there is no row."""
+    """Columns in the order of `read_records`; None if there is no row."""
     known = {f.name: f for f in fields(row_type)}
     required = {n for n, f in known.items() if (f.default, f.default_factory) == (MISSING, MISSING)}
     always = required | {*schema.about, "work_key", "recorded_at", "asserted_at"}
@@ -186,16 +187,16 @@ def read_latest(
     last: str | None = None,
     columns: Sequence[str] | None = None,
 ) -> list[Row]:
-    """Records of the last day that each vehicle and method has any of, in order as `read_records` gives them.
+    """Records of the last recorded day of each vehicle and method, in the order of `read_records`.
 
-    Which day that is, is found from three columns; of the others only those days are read.
+    That day is found from three columns; the other columns are read for those days only.
 
     Args:
-        lake: where the table is.
+        lake: with the table.
         schema: of the table.
         row_type: its dataclass.
-        first: days before this one are not looked at.
-        last: nor are days after this one.
+        first: earlier days are ignored.
+        last: later days are ignored.
         columns: see `read_records`.
     """
     keys = _rows_of(lake, schema, ["vehicle", "method", "day"], _wanted(None, first, last))
@@ -214,9 +215,9 @@ def read_latest(
 
 
 def last_assertion(lake: Lake, schema: TableSchema, method: str | None = None) -> Assertion | None:
-    """Which rows of a method (None = of any) were asserted last; None where there are none.
+    """Rows of a method (None = any) that were asserted last; None if there are none.
 
-    Files are looked at from the last written on, until the others are older than what was found.
+    Files are read from the last written one on, until the others are older than the stamp found.
     """
     found: Assertion | None = None
     for file in sorted(data_files(lake, schema), key=lambda f: f.written_s, reverse=True):
@@ -241,14 +242,14 @@ def read_last(
     vehicle: str | AbstractSet[str] | None = None,
     columns: Sequence[str] | None = None,
 ) -> list[Row]:
-    """What a stage of the whole fleet said last of a method: the rows that it asserted together, by `commit_last`.
+    """Rows that a stage of the whole fleet asserted last for a method, together, by `commit_last`.
 
     Args:
-        lake: where the table is.
+        lake: with the table.
         schema: of the table.
         row_type: its dataclass.
         method: of the records.
-        vehicle: only this vehicle's, or only these'.
+        vehicle: only rows of this vehicle, or of these.
         columns: see `read_records`.
     """
     last = last_assertion(lake, schema, method)
@@ -261,7 +262,7 @@ def read_last(
 def read_last_columns(
     lake: Lake, schema: TableSchema, method: str, columns: Sequence[str]
 ) -> pa.Table | None:
-    """The same as columns, in no order; None where there is no such row."""
+    """Rows of `read_last` as columns, unordered; None if there is no such row."""
     last = last_assertion(lake, schema, method)
     found = last and read_columns(lake, schema, columns, first=last.day, last=last.day)
     if last is None or found is None:
@@ -271,13 +272,13 @@ def read_last_columns(
 
 
 def first_day(lake: Lake, schema: TableSchema) -> str | None:
-    """The first day that any record of a table is about, as its log says; None where there is none."""
+    """First day of any record of a table, from its log; None if there is none."""
     spans = [f.days for f in data_files(lake, schema)]
     return min((days[0] for days in spans if days is not None), default=None)
 
 
 def last_day(lake: Lake, schema: TableSchema) -> str | None:
-    """The last day that any record of a table is about, as its log says; None where there is none."""
+    """Last day of any record of a table, from its log; None if there is none."""
     spans = [f.days for f in data_files(lake, schema)]
     return max((days[1] for days in spans if days is not None), default=None)
 

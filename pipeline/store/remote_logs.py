@@ -1,4 +1,4 @@
-"""Logs that lie in a bucket, as the readers know files: what is asked for is fetched, and nothing else."""
+"""Logs in a bucket with the interface of files; only the requested bytes are fetched."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pipeline.store.object_store import Bucket
 
 __all__ = ["LogPath", "RangeReader", "RemoteLog", "find_remote_logs", "log_at"]
 
-_AHEAD_BYTES = 1 << 16  # of a small read: record headers and footers come one after another
+_AHEAD_BYTES = 1 << 16  # added to small reads: record headers and footers follow each other
 
 
 class _About(NamedTuple):
@@ -24,16 +24,16 @@ class _About(NamedTuple):
 
 @dataclass(frozen=True, order=True)
 class RemoteLog:
-    """An object that is a log. It answers as much of what a `Path` does as the readers of logs ask.
+    """A log in a bucket, with the part of `Path`'s interface that log readers use.
 
-    Its methods raise StorageError where the store does not answer: never an OSError, which readers take for damage.
+    Methods raise StorageError if the store does not answer: never OSError, which readers treat as damage.
     """
 
     bucket: str
     key: str
     listed: tuple[int, str] | None = field(
         default=None, compare=False
-    )  # size and tag, where a listing told them
+    )  # size and tag, if a listing gave them
 
     def __str__(self) -> str:
         return f"s3://{self.bucket}/{self.key}"
@@ -45,12 +45,12 @@ class RemoteLog:
 
     @property
     def identity(self) -> str:
-        """Name, and what the store says of the content: another one has another tag."""
+        """Name, size and entity tag, which changes with the content."""
         size, tag = self._size_and_tag
         return f"{self.name}:{size}:{tag}"
 
     def exists(self) -> bool:
-        """Whether there is such an object."""
+        """Whether the object exists."""
         with suppress(FileNotFoundError):
             return self._size_and_tag[0] >= 0
         return False
@@ -60,12 +60,12 @@ class RemoteLog:
         return _About(self._size_and_tag[0])
 
     def open(self, mode: str) -> RangeReader:
-        """To read at any place."""
+        """Open for random access."""
         assert mode == "rb", "logs are read"
         return RangeReader(self)
 
     def content(self, start: int, length: int) -> bytes:
-        """Bytes from a place on.
+        """Bytes from a position on.
 
         Raises:
             StorageError: the store does not answer.
@@ -91,7 +91,7 @@ LogPath = Path | RemoteLog
 
 
 class RangeReader(io.RawIOBase):
-    """A stream whose reads are requests for what they ask for; small ones take some of what follows along."""
+    """A stream that fetches what is read; small reads fetch some of the following bytes too."""
 
     def __init__(self, log: RemoteLog) -> None:
         super().__init__()
@@ -99,12 +99,12 @@ class RangeReader(io.RawIOBase):
         self._start, self._held = 0, b""
 
     def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        """Move; nothing is fetched for it."""
+        """Move the position; fetches nothing."""
         self._at = offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._size}[whence]
         return self._at
 
     def tell(self) -> int:
-        """Where the next read begins."""
+        """Position of the next read."""
         return self._at
 
     def seekable(self) -> bool:
@@ -116,7 +116,7 @@ class RangeReader(io.RawIOBase):
         return True
 
     def read(self, size: int = -1) -> bytes:
-        """So many bytes, fewer at the end.
+        """The next `size` bytes, fewer at the end.
 
         Raises:
             StorageError: the store does not answer.
@@ -145,7 +145,7 @@ def log_at(place: str) -> LogPath:
         return Path(place)
     bucket, _, key = rest.partition("/")
     if scheme != "s3" or not bucket or not key:
-        raise ConfigError("command line", "LOG", f"{place!r} is no file and no s3://BUCKET/KEY")
+        raise ConfigError("command line", "LOG", f"{place!r} is neither a file nor s3://BUCKET/KEY")
     return RemoteLog(bucket, key)
 
 

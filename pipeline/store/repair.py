@@ -1,4 +1,4 @@
-"""A record table with a damaged log, or without some of its files, made whole again from what its files hold."""
+"""Repair of a record table with a damaged log or missing files, from its data files."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ __all__ = ["Repaired", "repair_table"]
 
 @dataclass
 class Repaired:
-    """What was wrong with a table, in words; how many files gave their rows anew; whose rows are lost."""
+    """Problems of a table in words, number of files whose rows were recovered, and lost rows."""
 
     found: str = ""
     files: int = 0
@@ -37,11 +37,11 @@ class Repaired:
 
 
 def repair_table(lake: Lake, schema: TableSchema) -> Repaired:
-    """Take the rows of all data files into the table that its log does not know; nothing that is recorded doubles.
+    """Add the rows of all data files that the table's log does not list; recorded rows are never duplicated.
 
-    A log that cannot be read goes to `_damaged`, and another one begins. So do files that cannot be read, and those
-    whose rows were taken in. Where a file is gone that replaced others, the others still hold its rows for a week.
-    Killed, it goes on when it is run again.
+    An unreadable log is moved to `_damaged`, and a new one is begun. Unreadable data files, and files whose
+    rows were added, are moved there too. If a compacted file is missing, the files that it replaced still
+    exist for a week. A killed repair can be run again.
 
     Raises:
         ContractError: the lake is of another release.
@@ -62,7 +62,7 @@ def repair_table(lake: Lake, schema: TableSchema) -> Repaired:
     there = files_there(lake, schema)
     bad = {name for name in words if name not in there} if done.found else set[str]()
     bad |= set(set_aside_damaged(lake, schema)) if live else set()
-    # What a lost file replaced is known as removed, and may still be there.
+    # Files replaced by a lost file are marked as removed, and may still exist.
     beside = {f.name for f in live} | (set() if bad else known)
     for name in [n for n in there if n not in beside]:
         _take_in(lake, schema, name, done, bad)
@@ -70,12 +70,12 @@ def repair_table(lake: Lake, schema: TableSchema) -> Repaired:
         done.found = (
             done.found or f"{done.files} files that its log does not know, {len(bad)} that cannot be read"
         )
-    done.lost = [words.get(name) or f"{name}: rows of which nothing is known" for name in sorted(bad)]
+    done.lost = [words.get(name) or f"{name}: rows about which nothing is known" for name in sorted(bad)]
     return done
 
 
 def _take_in(lake: Lake, schema: TableSchema, name: str, done: Repaired, bad: set[str]) -> None:
-    """Merge the rows of a file into the table and put the file aside."""
+    """Merge the rows of a file into the table and move the file away."""
     rows = _whole_rows(lake, schema, name)
     if rows is None:
         bad.add(name)
@@ -93,11 +93,11 @@ def _words(name: str, vehicles: tuple[str, str] | None, days: tuple[str, str] | 
         for what, of in (("vehicles", vehicles), ("days", days))
         if of is not None
     ]
-    return f"{name}: rows of {', '.join(spans) or 'which nothing is known'}"
+    return f"{name}: rows of {', '.join(spans) or 'unknown vehicles and days'}"
 
 
 def _said_by_entries(lake: Lake, schema: TableSchema) -> dict[str, str]:
-    """What the entries that can be read say of files: name to words; none of those that were removed."""
+    """Descriptions of files by name, from the readable log entries; without removed files."""
     said: dict[str, str] = {}
     folder = lake.root / schema.name / LOG
     for name in sorted(n for n, _ in lake.files.sizes(folder) if n.endswith(".json")):
@@ -112,12 +112,12 @@ def _said_by_entries(lake: Lake, schema: TableSchema) -> dict[str, str]:
                     file = action["add"]["path"]
                     said[file] = _words(file, *_spans(json.loads(action["add"].get("stats") or "{}")))
             except (ValueError, TypeError, KeyError, AttributeError):
-                continue  # the damage
+                continue  # the damaged entry
     return said
 
 
 def _spans(stats: dict[str, Any]) -> list[tuple[str, str] | None]:
-    """First and last vehicle and day."""
+    """First and last vehicle, first and last day."""
     least, most = stats.get("minValues", {}), stats.get("maxValues", {})
     return [(least[c], most[c]) if c in least and c in most else None for c in ("vehicle", "day")]
 
@@ -130,7 +130,7 @@ def _set_log_aside(lake: Lake, schema: TableSchema) -> None:
 
 
 def _whole_rows(lake: Lake, schema: TableSchema, name: str) -> pa.Table | None:
-    """All rows of a file with all columns of the table, null where the file is of a release that had fewer."""
+    """All rows of a file with all columns of the table, null for columns that its release did not have."""
     rows = read_file(lake, schema, name, [c.name for c in schema.columns])
     if rows is None:
         return None

@@ -1,4 +1,4 @@
-"""What leaves a lake after a time: moments, with their images of public roads. Records stay."""
+"""Retention: deletion of moments, with their images of public roads, after a time. Records stay."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["Collected", "collect", "collect_pages", "first_day_kept"]
 
 @dataclass(frozen=True)
 class Collected:
-    """A partition whose rows left the lake, and how many bytes that gave back."""
+    """A partition whose rows were deleted, and the number of bytes freed."""
 
     partition: Partition
     freed_bytes: int
@@ -26,17 +26,18 @@ class Collected:
 def collect(
     lake: Lake, schema: TableSchema, before: str, today: str, *, dry_run: bool = False
 ) -> Iterator[Collected]:
-    """Take the rows of partitions of days before `before` out of the lake.
+    """Delete the rows of partitions of days before `before`.
 
-    The manifest stays, so that the same logs are not taken for new ones: who needs the rows gets an error that says
-    when they left, and a night that is given the logs again makes them anew. Damaged files go as a whole.
+    The manifest stays, so that the same logs are not treated as new: reading the rows raises an error with
+    the day of deletion, and a night with the logs makes the rows again. Damaged files are deleted completely.
 
     Args:
-        lake: where the tables are.
-        schema: of a table that joins the files of sensors; what an older release had in its place goes as a whole.
-        before: first day that stays, YYYY-MM-DD.
-        today: written down as the day on which they left.
-        dry_run: only say what would go.
+        lake: with the tables.
+        schema: of a table that joins the files of sensors; its predecessor of older releases is deleted
+            completely.
+        before: first day to keep, YYYY-MM-DD.
+        today: stored as the day of deletion.
+        dry_run: only list what would be deleted.
     """
     days = [p for p in lake.partitions(schema.name) if p.day < before]
     yield from (c for p in days if (c := _collect_day(lake, schema, p, today, dry_run=dry_run)) is not None)
@@ -50,13 +51,13 @@ def collect(
 def _collect_day(
     lake: Lake, schema: TableSchema, partition: Partition, today: str, *, dry_run: bool
 ) -> Collected | None:
-    """Take the rows of one partition; None where they are gone."""
+    """Delete the rows of one partition; None if they are deleted already."""
     path, gone = lake.file(schema.name, partition), sensor_files(lake, schema, partition)
     size = sum(lake.files.size(file) for file in (path, *gone))
     try:
         manifest = read_manifest(lake, schema, partition)
     except ContractError as err:
-        # Of another release, or damaged: nothing is known of it that would have to stay.
+        # Of another release, or damaged: it has no manifest that must stay.
         lake.damage.append(str(err))
         gone.append(path)
     else:
@@ -71,7 +72,7 @@ def _collect_day(
 
 
 def _collect_older(lake: Lake, schema: TableSchema, before: str, *, dry_run: bool) -> Iterator[Collected]:
-    """What a release before 0.11 left in the table's place: nobody reads it."""
+    """Tables of releases before 0.11 in the table's place, which no command reads."""
     for partition in lake.partitions(schema.before) if schema.before else ():
         path = lake.file(schema.before, partition)
         if partition.day < before:
@@ -82,7 +83,7 @@ def _collect_older(lake: Lake, schema: TableSchema, before: str, *, dry_run: boo
 
 
 def collect_pages(lake: Lake, before: str, *, dry_run: bool = False) -> list[str]:
-    """Remove pages of vehicle-days before `before` from the lake's reports; returns what they were called."""
+    """Remove pages of vehicle-days before `before` from the lake's reports; returns their names."""
     gone = []
     report, wide = lake.root / "report", len("YYYY-MM-DD")
     pages = [(page.parent.name, page) for page in lake.files.find(report, "*_days/*/*.html")]
@@ -96,5 +97,5 @@ def collect_pages(lake: Lake, before: str, *, dry_run: bool = False) -> list[str
 
 
 def first_day_kept(today: dt.date, days: int) -> str:
-    """The first day that stays where `days` days are kept, today among them."""
+    """First day to keep if `days` days are kept, today included."""
     return (today - dt.timedelta(days=days - 1)).isoformat()

@@ -31,7 +31,7 @@ class RowGroup:
 def read_columns(
     lake: Lake, schema: TableSchema, partition: Partition, names: Sequence[str]
 ) -> dict[str, list[Any]]:
-    """Plain columns of a whole partition; nothing else of it is read. Arrays come as bytes.
+    """Plain columns of a whole partition, without reading the others. Arrays are returned as bytes.
 
     Raises:
         ContractError: there is no such partition, or it was written with another schema version.
@@ -65,7 +65,7 @@ def read_group(lake: Lake, schema: TableSchema, group: RowGroup, row_type: type[
         with naming_damage(path), opened_parquet(lake.files, path) as file:
             return from_table(file.groups([group.index]), schema, row_type)
     except FileNotFoundError as err:
-        raise ContractError(str(path), "the partition went away while it was read") from err
+        raise ContractError(str(path), "the partition disappeared while it was read") from err
 
 
 def _checked(lake: Lake, schema: TableSchema, partition: Partition) -> PurePath:

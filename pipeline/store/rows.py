@@ -1,4 +1,4 @@
-"""Row values to Arrow tables and back: arrays become blobs as the column says, and come back read-only."""
+"""Conversion of rows to Arrow tables and back: arrays become blobs, and are read-only when read."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def to_table(rows: Sequence[Any], schema: TableSchema) -> pa.Table:
 def from_table(table: pa.Table, schema: TableSchema, row_type: type[Row]) -> list[Row]:
     """Row dataclasses of a table; array fields are decoded without a copy.
 
-    Records are kept for good: a column that an older release did not write yet takes the field's default.
+    Records are kept for ever: a column that an older release did not have takes the field's default.
 
     Raises:
         ContractError: the table lacks a column of the schema that has no default.
@@ -54,7 +54,7 @@ def from_table(table: pa.Table, schema: TableSchema, row_type: type[Row]) -> lis
 
 
 def with_what_follows(found: pa.Table, schema: TableSchema, asked: Sequence[str]) -> pa.Table:
-    """The table with asked columns of rows that a release wrote before there were such columns."""
+    """The table with requested columns derived for rows of releases that did not have them."""
     for column, (source, values) in schema.follows.items():
         if column in asked and source in found.column_names:
             place = pc.index_in(found[source], pa.array(values.keys(), pa.string()))
@@ -67,7 +67,10 @@ def with_what_follows(found: pa.Table, schema: TableSchema, asked: Sequence[str]
 
 
 def _filled(values: list[Any], column: Column, field: Field[Any]) -> list[Any]:
-    """The field's default where an older row has null in a column that came later and may not be null."""
+    """Values of a column.
+
+    Null becomes the field's default if the column was added later and is not nullable.
+    """
     if column.nullable or column.is_array or None not in values:
         return values
     if field.default_factory is MISSING:
@@ -88,7 +91,7 @@ def _encode(value: Any, column: Column, table: str) -> Any:
         isinstance(w, int) and w != s for w, s in zip(wanted, array.shape, strict=False)
     ):
         raise ContractError(table, f"column {column.name} has shape {array.shape}, not {wanted}")
-    return array.tobytes()  # a copy: pyarrow 26 never frees the buffer of a memoryview that it is given
+    return array.tobytes()  # a copy: pyarrow 26 never frees the buffer of a memoryview
 
 
 def _decode_column(values: pa.ChunkedArray, column: Column) -> list[Any]:

@@ -1,4 +1,4 @@
-"""Read and write partitions, each replaced atomically as a whole; records have a module of their own."""
+"""Reading and writing of partitions, each replaced atomically as a whole; for records see `records.py`."""
 
 from __future__ import annotations
 
@@ -34,10 +34,11 @@ __all__ = [
 
 Row = TypeVar("Row")
 _KEY = b"boresight"
-# A row group: large enough to compress, small enough that a worker that holds one of each sensor stays far below 2 GB.
+# A row group: large enough to compress, small enough for a worker with one of each sensor to stay far below 2
+# GB.
 _GROUP_ROWS = 16
 _GROUP_BYTES = 24 << 20
-COLLECTED = "collected"  # among a manifest's extra: the day on which the partition's rows left the lake
+COLLECTED = "collected"  # key in a manifest's extra: the day on which the partition's rows were deleted
 
 
 @dataclass(frozen=True)
@@ -53,11 +54,14 @@ class Manifest:
     kept: dict[str, int] = field(default_factory=dict)
     rejected: dict[str, int] = field(default_factory=dict)
     extra: dict[str, Any] = field(default_factory=dict)
-    remarks: str = ""  # what the outcome said although the work was done
+    remarks: str = ""  # text of the outcome although the work was done
 
 
 class PartitionWriter:
-    """Streams rows of one partition into a temporary file; nothing is visible until the block ends without an error."""
+    """Streams rows of one partition into a temporary file.
+
+    Nothing is visible until the block ends without an error.
+    """
 
     def __init__(self, writer: pq.ParquetWriter, schema: TableSchema) -> None:
         self._writer, self.schema = writer, schema
@@ -67,11 +71,11 @@ class PartitionWriter:
 
     @property
     def rows(self) -> int:
-        """Rows so far."""
+        """Number of rows so far."""
         return self._written + len(self._held)
 
     def add(self, row: Any) -> int:
-        """Take a row, which is written with others as a row group; returns its place in the file."""
+        """Add a row, which is written in a row group with others; returns its row number in the file."""
         self._held.append(row)
         self._held_bytes += _bytes_of(row)
         place = self.rows - 1
@@ -92,11 +96,11 @@ class PartitionWriter:
     def describe(
         self, *, kept: dict[str, int], rejected: dict[str, int], remarks: str = "", **extra: Any
     ) -> None:
-        """Counts and words for the manifest."""
+        """Set counts and texts of the manifest."""
         self.manifest_fields = {"kept": kept, "rejected": rejected, "remarks": remarks, "extra": extra}
 
     def close(self, work_key: str, code_version: str, inputs: Iterable[str] = ()) -> None:
-        """Write what is held, and the manifest as a file's last."""
+        """Write the remaining rows, then the manifest."""
         self._write_held()
         of = self.schema.name, self.schema.version, work_key, code_version, list(inputs), self.rows
         manifest = Manifest(*of, **self.manifest_fields)
@@ -105,14 +109,14 @@ class PartitionWriter:
 
 
 def _bytes_of(row: Any) -> int:
-    """Memory of a row's arrays and blobs; the rest is small."""
+    """Memory of a row's arrays and blobs [bytes]; the rest is small."""
     values = (getattr(row, f.name) for f in fields(row))
     return sum(len(v) if isinstance(v, bytes) else getattr(v, "nbytes", 0) for v in values)
 
 
 @contextmanager
 def opened_for_writing(lake: Lake, path: PurePath, schema: TableSchema) -> Iterator[PartitionWriter]:
-    """A file of a partition, which takes its name when the block ends without an error."""
+    """A file of a partition, which is renamed to its name when the block ends without an error."""
     with _replacing(lake, path, schema) as parquet:
         yield PartitionWriter(parquet, schema)
 
@@ -133,7 +137,7 @@ def write_partition(
 
 
 def write_manifest(lake: Lake, schema: TableSchema, partition: Partition, manifest: Manifest) -> None:
-    """Replace a partition by its manifest alone."""
+    """Replace a partition by its manifest, without rows."""
     with _replacing(lake, lake.file(schema.name, partition), schema) as parquet:
         parquet.add_key_value_metadata({_KEY.decode(): json.dumps(manifest.__dict__)})
 
@@ -141,7 +145,7 @@ def write_manifest(lake: Lake, schema: TableSchema, partition: Partition, manife
 def read_manifest(
     lake: Lake, schema: TableSchema, partition: Partition, sensor: str | None = None
 ) -> Manifest | None:
-    """Manifest of a partition, or of the file that it has of a sensor; None where there is no such file."""
+    """Manifest of a partition, or of its file of a sensor; None if there is no such file."""
     path = lake.file(schema.name, partition, sensor)
     try:
         return _manifest(lake, path, schema)
@@ -150,11 +154,11 @@ def read_manifest(
 
 
 def absence(lake: Lake, schema: TableSchema, partition: Partition) -> str:
-    """What is missing where there is no such partition, and what to do."""
+    """Error text for a missing partition, with the remedy."""
     problem = f"table {schema.name} has no partition for {partition.vehicle} on {partition.day}"
     problem += f": run `boresight {schema.made_by}` first" if schema.made_by else ""
     if schema.before and lake.partitions(schema.before, partition.vehicle, partition.day):
-        problem += f" (its {schema.before} are of a release before 0.11, and are made anew)"
+        problem += f" (its {schema.before} are of a release before 0.11; ingest makes them again)"
     return problem
 
 
@@ -171,12 +175,12 @@ def iterate_rows(
     rows: Sequence[int] | None = None,
     sensor: str | None = None,
 ) -> Iterator[list[Row]]:
-    """Rows of a partition, or of a sensor's file, one row group at a time; `rows` picks row numbers.
+    """Rows of a partition, or of a sensor's file, one row group at a time; `rows` selects row numbers.
 
     Raises:
         ContractError: there is no such partition, or it was written with another schema version.
         DamagedError: its file cannot be read.
-        CollectedError: its rows left the lake after their time.
+        CollectedError: its rows were deleted at the end of their retention.
     """
     path = lake.file(schema.name, partition, sensor)
     manifest = read_manifest(lake, schema, partition, sensor)
@@ -211,10 +215,10 @@ def _replacing(lake: Lake, path: PurePath, schema: TableSchema) -> Iterator[pq.P
 def _writer_options(schema: TableSchema) -> dict[str, Any]:
     arrow = schema.arrow_schema()
     nested = any(pa.types.is_nested(f.type) for f in arrow)
-    # JPEG and PNG don't compress further; zstd on them only costs time. Nested columns name their leaves apart.
-    # Arrays: LZ4 writes in half zstd's time and reads in a quarter, for a tenth more space (on a real day).
-    # Points' coordinates and times are noise in their low bits: compressing them takes twice the time for a twelfth
-    # of the space.
+    # JPEG and PNG do not compress further; zstd on them only costs time. Nested columns list their leaves
+    # separately. Arrays: LZ4 writes in half zstd's time and reads in a quarter, for a tenth more space (on a
+    # real day). Low bits of coordinates and times are noise: compressing them takes twice the time for a
+    # twelfth of the space.
     coded = {
         "image",
         "labels_png",
@@ -243,17 +247,17 @@ def _writer_options(schema: TableSchema) -> dict[str, Any]:
 
 @contextmanager
 def naming_damage(path: PurePath) -> Iterator[None]:
-    """What a file's content makes readers stumble over, as an error that names the file.
+    """Turn reader errors caused by a file's content into an error that names the file.
 
     Raises:
-        DamagedError: the content is not that of a whole file.
+        DamagedError: the file is incomplete or damaged.
     """
     try:
         yield
     except pa.ArrowException as err:
         raise DamagedError(str(path), str(err).splitlines()[0]) from err
     except OSError as err:
-        if err.errno is not None:  # the disk's or the network's trouble, not the file's
+        if err.errno is not None:  # a problem of disk or network, not of the file
             raise
         raise DamagedError(str(path), str(err).splitlines()[0]) from err
 

@@ -1,4 +1,4 @@
-"""What one camera, one lidar and one radar saw at a moment, joined of a lake's tables: frames and observations."""
+"""Frames and observations of one camera, one lidar and one radar, joined from a lake's tables."""
 
 from __future__ import annotations
 
@@ -34,11 +34,9 @@ __all__ = [
     "priors_of",
 ]
 
-Chosen = Mapping[
-    str, str
-]  # names of the camera, lidar and radar that a view is of, by kind; some may be left out
+Chosen = Mapping[str, str]  # names of the camera, lidar and radar of a view, by kind; some may be missing
 
-# Of a sensor that is not there: the value of a column by its name, else by its kind.
+# For a missing sensor: value of a column by column name, else by kind.
 _EMPTY: Final[Mapping[str, Any]] = {
     "camera_K": np.full((3, 3), np.nan), "label_scale": 1.0,
     "binary": b"", "string": "", "int32": 0, "float64": 0.0, "bool": False, "list<string>": [],
@@ -48,7 +46,7 @@ _FOUND = {"camera": ImageFeatureColumns, "lidar": SweepFeatureColumns, "radar": 
 
 
 def ingested(lake: Lake, partition: Partition) -> Manifest | None:
-    """What ingest says of a vehicle-day; None where the lake has nothing of it.
+    """Ingest manifest of a vehicle-day; None if it is not in the lake.
 
     Raises:
         ContractError: it is damaged, or of another release.
@@ -57,7 +55,7 @@ def ingested(lake: Lake, partition: Partition) -> Manifest | None:
 
 
 def perceived(lake: Lake, partition: Partition) -> Manifest | None:
-    """What perceive says of a vehicle-day; None where the lake has nothing of it.
+    """Perceive manifest of a vehicle-day; None if it is not in the lake.
 
     Raises:
         ContractError: it is damaged, or of another release.
@@ -81,19 +79,19 @@ def perceived_days(lake: Lake) -> list[Partition]:
 def frames_of(
     lake: Lake, partition: Partition, moments: Sequence[int] | None = None, chosen: Chosen | None = None
 ) -> Iterator[Frame]:
-    """Frames of a vehicle-day in order of time, a row group of each sensor in memory at a time.
+    """Frames of a vehicle-day in order of time; one row group of each sensor is in memory.
 
     Args:
-        lake: where the tables are.
+        lake: with the tables.
         partition: the vehicle-day.
-        moments: the moments that are wanted; None = all.
-        chosen: whose frames; None = the first camera, lidar and radar of the day. Moments that have fewer than two of
-            several chosen sensors are left out.
+        moments: moments to read; None = all.
+        chosen: sensors of the frames; None = the first camera, lidar and radar of the day. Moments with fewer
+            than two of several chosen sensors are left out.
 
     Raises:
         ContractError: the lake has none of that day, or they are of another release.
         DamagedError: a file cannot be read.
-        CollectedError: they left the lake after their time.
+        CollectedError: the rows were deleted at the end of their retention.
     """
     for moment, rows, priors in _seen(lake, MOMENTS, partition, moments, chosen):
         yield frame_of(moment, rows, priors)
@@ -102,12 +100,12 @@ def frames_of(
 def observations_of(
     lake: Lake, partition: Partition, moments: Sequence[int] | None = None, chosen: Chosen | None = None
 ) -> Iterator[Observation]:
-    """Observations of a vehicle-day, as `frames_of` has its frames.
+    """Observations of a vehicle-day; see `frames_of`.
 
     Raises:
         ContractError: the lake has none of that day, or they are of another release.
         DamagedError: a file cannot be read.
-        CollectedError: they left the lake after their time.
+        CollectedError: the rows were deleted at the end of their retention.
     """
     for moment, rows, priors in _seen(lake, PERCEIVED, partition, moments, chosen):
         yield Observation(
@@ -117,7 +115,7 @@ def observations_of(
 
 
 def frame_of(moment: Moment, rows: Mapping[str, Any], priors: Mapping[str, np.ndarray]) -> Frame:
-    """A moment as one camera, one lidar and one radar saw it: its captures by kind, and the priors of their pairs."""
+    """A moment as a frame of one camera, lidar and radar: captures by kind, and the priors of their pairs."""
     return Frame(
         **_stamps(moment, rows), priors=priors, lidar_stamp_ns=_stamp(moment, rows, "lidar"),
         **_values(moment, EgoColumns), **_columns(rows, _MEASURED),
@@ -125,7 +123,10 @@ def frame_of(moment: Moment, rows: Mapping[str, Any], priors: Mapping[str, np.nd
 
 
 def priors_of(star: Star, chosen: Chosen) -> dict[str, np.ndarray]:
-    """Transforms of the pairs of chosen sensors; camera-radar only where it does not follow from the other two."""
+    """Transforms of the pairs of chosen sensors.
+
+    Camera-radar only if it does not follow from the other two.
+    """
     found = {}
     for pair in PAIRS:
         a, b = (chosen.get(kind) for kind in FRAMES_OF_PAIR[pair])
@@ -138,7 +139,7 @@ def priors_of(star: Star, chosen: Chosen) -> dict[str, np.ndarray]:
 
 
 def logged_stars(rows: Iterable[Mapping[str, Any]]) -> Mapping[str, Star]:
-    """The transforms that each log carries, by its name; the first where a log has several.
+    """Transforms in each log, by log name; the first ones if a log has several.
 
     Args:
         rows: of a manifest's extra, under `schemas.moments.PRIOR`.
@@ -156,7 +157,7 @@ def _seen(
     moments: Sequence[int] | None,
     chosen: Chosen | None,
 ) -> Iterator[tuple[Any, dict[str, Any], dict[str, np.ndarray]]]:
-    """Moments with the rows of the chosen sensors, by kind, and the priors of those."""
+    """Moments with the rows of the chosen sensors, by kind, and their priors."""
     manifest = read_manifest(lake, schema, partition)
     sensors = {} if manifest is None else sensors_of(manifest)
     logged = () if manifest is None else manifest.extra.get(PRIOR, ())
@@ -197,7 +198,7 @@ def _values(row: Any, columns: type) -> dict[str, Any]:
 
 @cache
 def _nothing(columns: type) -> Any:
-    """What a view holds of a sensor that it goes without: null, or no bytes, no rows of arrays, 0, no camera matrix."""
+    """Values of a view for a missing sensor: null, empty bytes, arrays without rows, 0, no camera matrix."""
     return columns(**{c.name: _empty(c) for c in TableSchema(columns, "", 0).columns})
 
 

@@ -146,19 +146,19 @@ def test_a_jump_of_the_poses_begins_another_drive(tmp_path):
     ("name", "file", "content", "words"),
     [
         ("nuscenes", "v1.0-mini/sensor.json", b"[]", "scene.json: no scene has two sensors"),
-        ("nuscenes", "v1.0-mini/sample.json", b"{", "sample.json: no readable JSON"),
+        ("nuscenes", "v1.0-mini/sample.json", b"{", "sample.json: not readable JSON"),
         (
             "nuscenes",
             "v1.0-mini/sample_data.json",
             b'[{"token": "a"}]',
             "sample_data.json: calibrated_sensor_token",
         ),
-        ("nuscenes", "samples/LIDAR_TOP/0.pcd.bin", b"123", "0.pcd.bin: 3 bytes are no rows of 5 float32"),
-        ("nuscenes", "samples/RADAR_FRONT/0.pcd", b"FIELDS x\n", "0.pcd: no readable PCD"),
+        ("nuscenes", "samples/LIDAR_TOP/0.pcd.bin", b"123", "0.pcd.bin: 3 bytes are not rows of 5 float32"),
+        ("nuscenes", "samples/RADAR_FRONT/0.pcd", b"FIELDS x\n", "0.pcd: not a readable PCD"),
         ("vod", "lidar/training/calib/00000.txt", b"P2: 1 2\n", "00000.txt: P2: needs 12 numbers and has 2"),
         ("vod", "lidar/training/pose/00003.json", b'{"odomToCamera": [1]}', "odomToCamera: needs 16 numbers"),
-        ("vod", "lidar/training/image_2/00000.jpg", b"", "00000.jpg: is no readable image"),
-        ("kitti", "calib/000000.txt", b"P2: one\n", "P2: holds what is not a number"),
+        ("vod", "lidar/training/image_2/00000.jpg", b"", "00000.jpg: is not a readable image"),
+        ("kitti", "calib/000000.txt", b"P2: one\n", "P2: is not a number"),
     ],
 )
 def test_a_broken_file_is_named_and_leaves_no_log(name, file, content, words, tmp_path, capsys):

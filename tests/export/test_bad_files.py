@@ -31,7 +31,7 @@ BAD = [
      r"kit\.camera\.x: nan is not finite"),
     ("kitti", {"c.txt": "Tr_velo_to_cam: 1 0 0\n"}, r"c\.txt: Tr_velo_to_cam: needs 12 or 16"),
     ("kitti", {"c.txt": "Tr_velo_to_cam: 2 0 0 0 0 1 0 0 0 0 1 0\n"}, "Tr_velo_to_cam: its 3x3 part is not a rotation"),
-    ("kitti", {"c.txt": "Tr_velo_to_cam: 1 0 0 0 0 1 0 0 0 0 x 0\n"}, "Tr_velo_to_cam: holds a value that is not a number"),
+    ("kitti", {"c.txt": "Tr_velo_to_cam: 1 0 0 0 0 1 0 0 0 0 x 0\n"}, "Tr_velo_to_cam: is not a number"),
     ("kitti", {"c.txt": "P2: 1 0 0 0 0 1 0 0 0 0 1 0\n"}, "Tr_velo_to_cam: missing"),
     ("kitti", {"c.txt": "Tr_velo_to_cam: 1 0 0 0 0 1 0 0 0 0 1 0\nP2: 1 2\n"}, r"c\.txt: P2: is not a 3x4"),
     ("vod", {"c.txt": ""}, "give two files"),

@@ -194,7 +194,7 @@ def test_the_car_hangs_on_its_own_base_where_a_file_says_where_the_lidar_sits(la
         (["kitti"], "needs --lake and --vehicle"),
         (["kitti", "--lake", "{lake}", "--vehicle", "w"], "no state of w by joint"),
         (["kitti", "--lake", "{lake}", "--vehicle", "v", "--day", "2020-01-01"], "no record of v 2020-01-01"),
-        (["kitti", "--lake", "{lake}", "--vehicle", "v", "--day", "yesterday"], "is no day"),
+        (["kitti", "--lake", "{lake}", "--vehicle", "v", "--day", "yesterday"], "is not a day"),
         (["urdf", "--lake", "{lake}", "--vehicle", "v", "--lidar-frame", "a b"], "is not a valid frame name"),
         (["urdf", "--lake", "{lake}", "--vehicle", "v", "--lidar-frame", "radar"], "must differ"),
         (

@@ -141,7 +141,7 @@ def test_an_export_is_its_record_and_every_kind_of_source_can_be_named(lake, tmp
         (["2026-03-01", "x.json"], "needs --lake and --vehicle"),
         (["kitti:none.txt", "kitti:none.txt"], "none.txt: cannot be read"),
         (["none.json", "none.json"], "none.json: no readable JSON"),
-        (["v@2026-03-01", "v@today", "--lake", "{lake}"], "is no day"),
+        (["v@2026-03-01", "v@today", "--lake", "{lake}"], "is not a day"),
         (["v@state", "v@2026-03-01", "--lake", "{lake}"], "no state of v"),
     ],
 )

@@ -276,5 +276,5 @@ def test_a_day_that_has_not_come_yet_is_refused_at_once(night, monkeypatch):
     script = StagesThatSay(monkeypatch, night.lake)
     days = [VehicleDay(Partition("car", "2099-01-01"), (Path("a.mcap"),))]
     [car] = run_night(night, days, "inline", 1, lambda *_: None)
-    assert (car.status, car.reason) == ("refused", "2099-01-01 has not come yet: mend the logs' path")
+    assert (car.status, car.reason) == ("refused", "2099-01-01 is in the future: correct the logs' path")
     assert not script.called

@@ -128,7 +128,7 @@ def test_a_cluster_without_room_for_a_task_is_named_after_a_while(behave, tmp_pa
 
 
 def test_another_version_on_a_node_is_named(behave, tmp_path):
-    with pytest.raises(ContractError, match=r"the night is of version 0\.0\.1"):
+    with pytest.raises(ContractError, match=r"the driver is of version 0\.0\.1"):
         _work(behave, ("a", str(tmp_path)), 0, None, "0.0.1")
 
 

@@ -141,7 +141,7 @@ def test_a_log_without_index_among_others_is_left_unread_and_named(kit, day, tmp
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(day.read_bytes()[:-200])
     result, frames = run_ingest(day, cut, fleet=in_bursts(kit))
-    assert "cut.mcap: left unread, for it has no usable index and others do" in result.reason
+    assert "cut.mcap: not read: it has no usable index, and other logs have one" in result.reason
     assert result.rejected["logs_left_unread"] == 1
     assert {f.log for f in frames} == {"day.mcap"}
 

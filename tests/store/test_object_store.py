@@ -243,5 +243,5 @@ def test_a_place_that_is_no_folder_and_no_prefix_of_a_bucket_is_a_usage_error(pl
 
 
 def test_what_works_on_folders_only_says_so():
-    with pytest.raises(ConfigError, match="is no folder"):
+    with pytest.raises(ConfigError, match="is not a folder"):
         _ = Lake.at(f"s3://{BUCKET}/lake").local_root

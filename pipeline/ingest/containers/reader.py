@@ -211,7 +211,7 @@ def _kind(path: LogPath) -> str:
         if 2 * sum(a == b for a, b in zip(head, magic, strict=False)) > len(magic):
             return kind
     raise LogError(
-        str(path), "is no log that Boresight reads: an .mcap, .bag or .db3 file, or a ROS 2 bag folder"
+        str(path), "is not a log that Boresight reads: an .mcap, .bag or .db3 file, or a ROS 2 bag folder"
     )
 
 

@@ -49,7 +49,7 @@ class FolderLog:
                 problems.append(str(err))
         if not self._logs:
             raise LogError(
-                str(path), "; ".join(problems) or "holds no .db3 or .mcap file, so it is no ROS 2 bag"
+                str(path), "; ".join(problems) or "holds no .db3 or .mcap file, so it is not a ROS 2 bag"
             )
 
     def timeline(self) -> Timeline | None:

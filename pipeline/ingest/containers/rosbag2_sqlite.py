@@ -156,7 +156,7 @@ class Db3Log:
         try:
             topics = self._db.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
         except (apsw.Error, UnicodeDecodeError, OverflowError) as err:
-            raise LogError(str(self.path), f"is no readable ROS 2 bag: {err}") from err
+            raise LogError(str(self.path), f"is not a readable ROS 2 bag: {err}") from err
         definitions: dict[str, tuple[str, str]] = {}
         try:
             rows = self._db.execute(
@@ -215,7 +215,7 @@ def _open(path: Path) -> apsw.Connection:
         db.execute("PRAGMA writable_schema=ON")
         db.execute("SELECT count(*) FROM sqlite_master").fetchall()
     except (apsw.Error, UnicodeDecodeError) as err:
-        raise LogError(str(path), f"is no readable ROS 2 bag: {err}") from err
+        raise LogError(str(path), f"is not a readable ROS 2 bag: {err}") from err
     return db
 
 

@@ -1,1 +1,1 @@
-"""Messages of every kind to plain arrays."""
+"""Decoding of messages of every kind to plain arrays."""

@@ -1,8 +1,8 @@
-"""What radars say of their own misalignment, by the fields of their messages; angles to radians, left and up positive.
+"""Radar misalignment from radar messages; angles in radians, positive to the left and upwards.
 
-Sources: off_highway_premium_radar_msgs (angles in rad, left and up positive of a radar mounted upright, NaN where
-there is no estimate), continental_msgs of Nebula and ars548_messages (rad), delphi_esr_msgs, delphi_mrr_msgs and
-delphi_srr_msgs (deg, in steps of 0.0625).
+Sources: off_highway_premium_radar_msgs (angles in rad, left and up positive for a radar mounted upright, NaN
+if there is no estimate), continental_msgs of Nebula and ars548_messages (rad), delphi_esr_msgs,
+delphi_mrr_msgs and delphi_srr_msgs (deg, in steps of 0.0625).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _OF_BOSCH: Final = AlignmentFields(
     elevation_variance=f"{_BOSCH}phi_variance",
     status=f"{_BOSCH}status",
 )
-# Types that are known; of others fleet.toml names the fields.
+# Known types; for others fleet.toml names the fields.
 ALIGNMENT_MESSAGES: Final = {
     "off_highway_premium_radar_msgs/msg/LocationAttributes": _OF_BOSCH,
     "off_highway_premium_radar_sample_msgs/msg/LocationAttributes": _OF_BOSCH,
@@ -45,13 +45,13 @@ ALIGNMENT_MESSAGES: Final = {
     ),
     "delphi_srr_msgs/msg/SrrStatus4": AlignmentFields(azimuth="can_tx_auto_align_angle", unit="deg"),
 }
-# Of these the maker says which way angles count.
+# types for which the manufacturer documents the signs
 SIGNS_PUBLISHED: Final = frozenset(name for name, fields in ALIGNMENT_MESSAGES.items() if fields is _OF_BOSCH)
 
 
 @dataclass(frozen=True)
 class Misalignment:
-    """One message: angles and sigmas [rad], None where it states none; status as logged."""
+    """One message: angles and sigmas [rad], None if not stated; status as logged."""
 
     azimuth_rad: float | None = None
     azimuth_sigma_rad: float | None = None
@@ -61,21 +61,21 @@ class Misalignment:
 
 
 def read_alignment(channel: Channel, data: memoryview, fields: AlignmentFields | None = None) -> Misalignment:
-    """The misalignment that a message states.
+    """Misalignment stated in a message.
 
     Args:
         channel: of the message.
         data: its bytes.
-        fields: where it states what; None = as its type is known to.
+        fields: names of its fields; None = those of its known type.
 
     Raises:
-        LogError: the type is not known and no fields are named, a field is not there or no number, or the bytes do not
+        LogError: unknown type without field names, a field is missing or not a number, or the bytes do not
             fit the definition.
     """
     known = fields or ALIGNMENT_MESSAGES.get(channel.msgtype)
     if known is None:
         problem = (
-            f"{channel.msgtype} is no known alignment message: name its fields, alignment_fields = {{...}}"
+            f"{channel.msgtype} is not a known alignment message: name its fields, alignment_fields = {{...}}"
         )
         raise LogError("", problem, topic=channel.topic)
     message = decode(channel, data)
@@ -100,7 +100,7 @@ def read_alignment(channel: Channel, data: memoryview, fields: AlignmentFields |
 
 
 def _value(channel: Channel, message: Any, path: str) -> float:
-    """The number at a path of a message."""
+    """Number at a path of a message."""
     value, sign = message, -1.0 if path.startswith("-") else 1.0
     for name in path.lstrip("-").split("."):
         if not hasattr(value, name):

@@ -1,4 +1,4 @@
-"""Messages from bytes: header stamps from the wire, whole messages by the schema that the log carries."""
+"""Decoding of messages: header stamps from raw bytes, whole messages by the schema in the log."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from pipeline.ros_definitions import DEFINITIONS, register
 
 __all__ = ["DECODE_ERRORS", "content_without_stamp", "decode", "header_frame_id", "header_stamp_ns"]
 
-# What malformed bytes make rosbags and numpy raise.
+# errors of rosbags and numpy for malformed bytes
 DECODE_ERRORS = (*READ_ERRORS, struct.error, SerdeError, TypesysError, TypeError, AttributeError, MemoryError)
 # CDR: 4 bytes of encapsulation, seconds, nanoseconds; ROS 1: sequence number, seconds, nanoseconds.
 _STAMP_END = 12
@@ -26,9 +26,9 @@ _SEPARATOR = "=" * 80 + "\n"
 
 
 def header_stamp_ns(channel: Channel, data: memoryview) -> int | None:
-    """Stamp of a message that starts with a std_msgs/Header; None where that is cut off, zero or no time.
+    """Stamp of a message that starts with a std_msgs/Header; None if it is truncated, zero or invalid.
 
-    Foxglove's ROS 2 messages start with the same bytes; of a protobuf message it is the `timestamp`.
+    Foxglove's ROS 2 messages start with the same bytes; for a protobuf message it is the `timestamp`.
     """
     if channel.encoding == PROTOBUF:
         return protobuf.stamp_ns_of(channel, data)
@@ -43,7 +43,7 @@ def header_stamp_ns(channel: Channel, data: memoryview) -> int | None:
 
 
 def header_frame_id(channel: Channel, data: memoryview) -> str:
-    """Frame id of such a message, without ROS 1's leading slash; "" where there is none."""
+    """Frame id of such a message, without ROS 1's leading slash; "" if there is none."""
     if channel.encoding == PROTOBUF:
         return protobuf.frame_id_of(channel, data)
     if len(data) < _STAMP_END + 4:
@@ -54,16 +54,16 @@ def header_frame_id(channel: Channel, data: memoryview) -> str:
 
 
 def content_without_stamp(channel: Channel, data: memoryview) -> bytes:
-    """Bytes that are the same for messages that differ in nothing but stamp and sequence number."""
+    """Bytes that are equal for messages that differ only in stamp and sequence number."""
     if channel.encoding == PROTOBUF:
         return protobuf.content_without_stamp(channel, data)
     return bytes(data[_STAMP_END:])
 
 
 def decode(channel: Channel, data: memoryview) -> Any:
-    """The message by its embedded definition (arrays are views: copy what outlives the bytes).
+    """Decode a message by its embedded definition; arrays are views into `data`.
 
-    Foxglove's messages have the attributes of their ROS twins.
+    Foxglove's messages get the attributes of the corresponding ROS messages.
 
     Raises:
         LogError: no definition, neither CDR, ROS 1 nor protobuf, or bytes that do not fit the definition.
@@ -107,7 +107,7 @@ def _typestore(channel: Channel) -> Typestore:
 
 @lru_cache(maxsize=8)
 def _fallback(msgtype: str) -> Typestore:
-    """For bags up to ROS 2 Humble, which carry no definitions: that distribution's own."""
+    """Definitions of the ROS 2 distribution, for bags up to Humble, which contain none."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     if msgtype in DEFINITIONS:
         register(store, msgtype)

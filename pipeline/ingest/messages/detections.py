@@ -14,9 +14,9 @@ __all__ = ["read_detections"]
 def read_detections(
     message: Any,
 ) -> tuple[Float32[np.ndarray, "N 4"], list[str], Float32[np.ndarray, " N"], int]:
-    """Boxes (x0 y0 x1 y1 [px]), classes as logged and scores, and how many had no box or class.
+    """Boxes (x0 y0 x1 y1 [px]), classes as logged, scores, and number of detections without box or class.
 
-    A turned box becomes the upright box around it. Version 3 and later of vision_msgs name a class
+    A rotated box becomes its upright bounding box. Version 3 and later of vision_msgs name a class
     `hypothesis.class_id`, earlier ones `id`; version 4 has the centre in `center.position`.
     """
     boxes, classes, scores, dropped = [], [], [], 0

@@ -1,7 +1,7 @@
-"""Road users logged as boxes in space: what they are in the image, where they are given in the camera's own frame.
+"""Road users logged as 3D boxes in the camera's own frame, projected to 2D boxes.
 
-In any other frame they would reach the image through the calibration that is looked for, and confirm whatever prior
-they came through: those are refused.
+Boxes in any other frame are refused: projecting them needs the calibration that is to be estimated, and they
+would confirm whatever prior they were made with.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ DETECTIONS_3D = (
 )
 # autoware_perception_msgs/ObjectClassification; 0 is unknown.
 _AUTOWARE = {1: "car", 2: "truck", 3: "bus", 4: "trailer", 5: "motorcycle", 6: "bicycle", 7: "pedestrian"}
-# Places on a box of side 1: corners, and the middles between them, since a lens bends edges outwards.
+# Points on a box of side 1: corners and midpoints of edges, because a lens bends edges outwards.
 _ON_A_BOX = np.array(list(product((-0.5, 0.0, 0.5), repeat=3)))
-_UNIT_TOLERANCE = 0.01  # a quaternion farther from unit length is damaged
+_UNIT_TOLERANCE = 0.01  # largest deviation of a quaternion's length from 1; beyond it is damaged
 
 _Thing = tuple[Any, Any, str, float]  # pose, size, class, score
 
@@ -35,7 +35,7 @@ _Thing = tuple[Any, Any, str, float]  # pose, size, class, score
 def read_detections_3d(
     message: Any, camera: Camera, camera_frame: str
 ) -> tuple[Float32[np.ndarray, "N 4"], list[str], Float32[np.ndarray, " N"], int]:
-    """As `read_detections`: boxes in the image, classes, scores, and how many had no box or class or were not in view.
+    """Boxes in the image, classes, scores, and number of detections without box or class or out of view.
 
     Args:
         message: vision_msgs/Detection3DArray or Autoware's DetectedObjects.
@@ -48,7 +48,7 @@ def read_detections_3d(
     frame = str(message.header.frame_id).lstrip("/")
     if frame != camera_frame:
         raise ValueError(
-            f"3D boxes in frame {frame!r} would reach the image through the calibration that is looked for: log them "
+            f"3D boxes in frame {frame!r} can be projected only with the calibration that is to be estimated: log them "
             f"in the camera's frame {camera_frame!r}, or 2D detections of the image"
         )
     things = _autoware(message) if hasattr(message, "objects") else _vision(message)
@@ -81,7 +81,10 @@ def _autoware(message: Any) -> Iterator[_Thing]:
 
 
 def _box(pose: Any, size: Any, camera: Camera) -> Float[np.ndarray, " 4"] | None:
-    """The upright box around what is seen, inside the image; None where it is no box or not whole before the camera."""
+    """Upright box of the visible part, in the image.
+
+    None if the box is invalid or partly behind the camera.
+    """
     p, q = pose.position, pose.orientation
     t, q_wxyz = np.array([p.x, p.y, p.z], np.float64), np.array([q.w, q.x, q.y, q.z], np.float64)
     sides = np.array([size.x, size.y, size.z], np.float64)

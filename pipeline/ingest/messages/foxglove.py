@@ -1,7 +1,7 @@
-"""Foxglove's messages as the ROS messages that say the same, so that one reader serves both.
+"""Conversion of Foxglove's messages to the corresponding ROS messages, so that one reader serves both.
 
-Of Foxglove's schemas those count that have a twin in ROS; they come as protobuf (`foxglove.PointCloud`) and as ROS 2
-messages (`foxglove_msgs/msg/PointCloud`). CompressedImage and CompressedVideo need no translation.
+Supported are Foxglove's schemas with a counterpart in ROS; they come as protobuf (`foxglove.PointCloud`) and
+as ROS 2 messages (`foxglove_msgs/msg/PointCloud`). CompressedImage and CompressedVideo need no conversion.
 Source: foxglove-sdk, schemas/proto/foxglove; sensor_msgs, geometry_msgs, nav_msgs.
 """
 
@@ -15,28 +15,29 @@ import numpy as np
 
 __all__ = ["REFUSED", "as_ros", "foxglove_types"]
 
-# Foxglove's PackedElementField.NumericType -> sensor_msgs/PointField's datatype: signed and unsigned change places.
+# Foxglove's PackedElementField.NumericType -> sensor_msgs/PointField's datatype: signed and unsigned are
+# swapped.
 _DATATYPE = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}
-_POSE_TOLERANCE = 1e-9  # beyond it a pose is no identity that went through float32 or decimal text
-# What cannot be used and why, said where a topic of the rig carries it.
+_POSE_TOLERANCE = 1e-9  # tolerance for an identity pose stored as float32 or decimal text
+# Unusable types with the reason, reported if a topic of the rig has one.
 REFUSED = {
     "LaserScan": "it has no Doppler, without which no radar can be calibrated: log the radar as a PointCloud",
     "CompressedPointCloud": "its compression is not read: log the points as a PointCloud",
-    "SceneUpdate": "what it draws says nothing of the image: log 2D detections",
+    "SceneUpdate": "it has no boxes in the image: log 2D detections",
     "ImageAnnotations": "what it draws has no classes: log 2D detections",
 }
 
 
 def foxglove_types(*kinds: str) -> tuple[str, ...]:
-    """Names of message types as protobuf and as ROS 2 messages have them."""
+    """Names of message types in their protobuf and ROS 2 forms."""
     return (*(f"foxglove.{k}" for k in kinds), *(f"foxglove_msgs/msg/{k}" for k in kinds))
 
 
 def as_ros(msgtype: str, message: Any) -> Any:
-    """A message of Foxglove's with the attributes of its ROS twin; any other as it is.
+    """A Foxglove message with the attributes of its ROS counterpart; other messages unchanged.
 
     Raises:
-        ValueError: a cloud that is posed elsewhere than in its frame, or one without a size of its points.
+        ValueError: a cloud with a pose other than identity in its frame, or without the size of its points.
     """
     package, _, kind = msgtype.replace("/msg/", ".").rpartition(".")
     twin = _TWINS.get(kind) if package in {"foxglove", "foxglove_msgs"} else None
@@ -66,14 +67,14 @@ def _point_cloud(message: Any) -> Any:
 
 
 def _camera_calibration(message: Any) -> Any:
-    """Foxglove leaves K empty where ROS writes zeros: the camera is not calibrated."""
+    """Foxglove leaves K empty and ROS writes zeros for a camera that is not calibrated."""
     K, D = _upper(message, "K"), _upper(message, "D")
     fields = {name: getattr(message, name) for name in ("distortion_model", "width", "height")}
     return SimpleNamespace(K=K if len(K) else np.zeros(9), D=D, **fields)
 
 
 def _upper(message: Any, name: str) -> Any:
-    """ROS 2 spells the names of fields in small letters."""
+    """ROS 2 writes field names in lower case."""
     return getattr(message, name) if hasattr(message, name) else getattr(message, name.lower())
 
 
@@ -94,7 +95,7 @@ def _stamped(transform: Any) -> Any:
 
 
 def _odometry(message: Any) -> Any:
-    """Velocities of both are those of the body in its own frame."""
+    """In both, velocities are those of the body in its own frame."""
     twist = SimpleNamespace(linear=message.linear_velocity, angular=message.angular_velocity)
     return SimpleNamespace(
         child_frame_id=message.body_frame_id,
@@ -104,7 +105,7 @@ def _odometry(message: Any) -> Any:
 
 
 def _is_identity(pose: Any) -> bool:
-    """True of a pose that moves nothing, an unset one (all zeros) too."""
+    """Whether a pose is the identity, or unset (all zeros)."""
     p, q = pose.position, pose.orientation
     return max(abs(v) for v in (p.x, p.y, p.z, q.x, q.y, q.z)) < _POSE_TOLERANCE
 

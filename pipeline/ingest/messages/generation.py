@@ -1,7 +1,7 @@
-"""Whether a message's bytes are of the ROS generation that its log says, told by the header that it begins with.
+"""Check by the header at its start whether a message's bytes match the ROS generation that its log claims.
 
-Both generations begin with 4 bytes (CDR's encapsulation, ROS 1's sequence number), a stamp and the frame's name. CDR
-counts and writes a zero after the name, ROS 1 does not.
+Both generations begin with 4 bytes (CDR's encapsulation, ROS 1's sequence number), a stamp and the frame's
+name. CDR counts and writes a zero after the name, ROS 1 does not.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ from pipeline.ingest.containers.reader import PROTOBUF, Channel
 __all__ = ["encoding_fault"]
 
 _WRITTEN_BY = {"cdr": "ROS 2", "ros1": "ROS 1"}
-_NAME = 16  # offset of the frame's name; its length stands in the 4 bytes before
+_NAME = 16  # offset of the frame's name; its length is in the 4 bytes before
 _LONGEST_NAME = 1024
 
 
 def encoding_fault(channel: Channel, data: memoryview) -> str:
-    """Why a message that begins with a header cannot be read as its log says, and what to do; empty where it may be.
+    """Reason why a message with a header cannot be read as its log claims, and the remedy; empty if it can.
 
     Args:
-        channel: what the log says.
+        channel: with the encoding that the log claims.
         data: the message.
     """
     said = channel.encoding
@@ -39,7 +39,7 @@ def encoding_fault(channel: Channel, data: memoryview) -> str:
 
 
 def _written_as(data: memoryview) -> str:
-    """Encoding that the header at the front of a message is of; empty where nothing tells."""
+    """Encoding of the header at the start of a message; empty if undetermined."""
     if len(data) < _NAME:
         return ""
     for order, encoding in (("<", "ros1"), ("<" if data[1] & 1 else ">", "cdr")):

@@ -1,4 +1,4 @@
-"""Camera images, label images and camera intrinsics as logged; encoded images pass through byte for byte."""
+"""Logged camera images, label images and camera intrinsics; encoded images stay byte for byte."""
 
 from __future__ import annotations
 
@@ -37,7 +37,8 @@ _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _JPEG_EOI = b"\xff\xd9"
 _JPEG_SOF = {0xC0, 0xC1, 0xC2, 0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF}
 _JPEG_SOS, _JPEG_ALONE = 0xDA, {0x01, *range(0xD0, 0xD9)}
-# ROS names a Bayer pattern by its first two pixels, OpenCV by the second row's middle: hence RGGB = "BG".
+# ROS names a Bayer pattern by its first two pixels, OpenCV by the middle of the second row: hence RGGB =
+# "BG".
 _CONVERSIONS = {
     "rgb8": cv2.COLOR_RGB2BGR,
     "rgba8": cv2.COLOR_RGBA2BGR,
@@ -64,14 +65,15 @@ _CHANNELS = {
     "yuyv": 2,
 }
 _LEAST_FOCAL_PX = 10.0  # a fisheye of 190 deg on 64 pixels has 20
-# Four times what cars' cameras have (8 Mpx): to decode what a forged header claims takes minutes and all memory.
+# Four times the pixels of car cameras (8 Mpx): decoding the size in a forged header would take minutes and
+# all memory.
 MOST_PIXELS = 32_000_000
 _BYTES = {"mono16": 2, "16uc1": 2}
 
 
 @dataclass(frozen=True)
 class EncodedImage:
-    """JPEG or PNG bytes and what their own header says."""
+    """JPEG or PNG bytes with the size from their header."""
 
     data: bytes
     format: str
@@ -82,10 +84,10 @@ class EncodedImage:
 def inspect_image(data: bytes) -> EncodedImage:
     """Check an encoded image without decoding its pixels: JPEG structure and end marker, PNG checksums.
 
-    WebP, AVIF and JPEG 2000 become the PNG of their pixels.
+    WebP, AVIF and JPEG 2000 are converted to PNG.
 
     Raises:
-        ValueError: none of these, or cut off, or damaged where the structure shows it.
+        ValueError: another format, or truncated, or visibly damaged.
     """
     if data[:3] == b"\xff\xd8\xff":
         return EncodedImage(data, "jpeg", *_possible(*_jpeg_size(data)))
@@ -105,7 +107,7 @@ def encode_raw_image(message: Any) -> EncodedImage:
     """PNG of a raw sensor_msgs/Image; colours become BGR for OpenCV, nothing is rescaled.
 
     Raises:
-        ValueError: an encoding that is not supported, or fewer bytes than the size says.
+        ValueError: an unsupported encoding, or fewer bytes than the size requires.
     """
     encoding = str(message.encoding).lower()
     pixels = _raw_pixels(message, encoding)
@@ -115,10 +117,10 @@ def encode_raw_image(message: Any) -> EncodedImage:
 
 
 def label_image(message: Any) -> bytes:
-    """PNG mono8 of a label image: a PNG CompressedImage as it is, or a mono8/8UC1/16-bit Image encoded here.
+    """PNG mono8 of a label image: a PNG CompressedImage unchanged, or a mono8/8UC1/16-bit Image encoded here.
 
     Raises:
-        ValueError: a lossy or coloured image (labels would be invented), a damaged one, or labels above 255.
+        ValueError: a lossy or coloured image (its labels would be wrong), a damaged one, or labels above 255.
     """
     if hasattr(message, "format"):
         data = bytes(message.data)
@@ -127,7 +129,7 @@ def label_image(message: Any) -> bytes:
         width, height, depth, colour = _png_header(data)
         _possible(width, height)
         if (depth, colour) != (8, 0):
-            raise ValueError("label images must be 8 bit grey PNG: colours and palettes say no label")
+            raise ValueError("label images must be 8 bit grey PNG: colours and palettes are not labels")
         return data
     encoding = str(message.encoding).lower()
     if encoding not in {"mono8", "8uc1", "mono16", "16uc1"}:
@@ -139,7 +141,7 @@ def label_image(message: Any) -> bytes:
 
 
 def read_camera_info(message: Any) -> Camera:
-    """Intrinsics of a sensor_msgs/CameraInfo, ROS 1 (D, K) or ROS 2 (d, k) spelling.
+    """Intrinsics of a sensor_msgs/CameraInfo, with ROS 1 (D, K) or ROS 2 (d, k) names.
 
     Raises:
         ValueError: no intrinsics (zero K), an unknown distortion model, or no image size.
@@ -157,7 +159,7 @@ def read_camera_info(message: Any) -> Camera:
         )
     if not np.all(np.isfinite(D)):
         raise ValueError("camera_info has a distortion that is not finite")
-    if name == "" and not np.any(D):  # what rectifying drivers write
+    if name == "" and not np.any(D):  # as written by drivers that rectify
         name, D = "plumb_bob", D[:0]
     if name not in _MODELS:
         raise ValueError(f"distortion model {message.distortion_model!r} is none of {', '.join(_MODELS)}")
@@ -166,7 +168,7 @@ def read_camera_info(message: Any) -> Camera:
 
 def _distortion(model: str, D: Float[np.ndarray, " N"]) -> Float[np.ndarray, " M"]:
     longest = 4 if model == "equidistant" else 8
-    if np.any(D[longest:]):  # thin prism and tilt terms of OpenCV's 12 and 14
+    if np.any(D[longest:]):  # thin prism and tilt terms of OpenCV's models with 12 and 14 coefficients
         raise ValueError(f"{model} with more than {longest} distortion coefficients is not supported")
     return D[:longest]
 
@@ -203,7 +205,7 @@ def _possible(width_px: int, height_px: int) -> tuple[int, int]:
 
 
 def _png_header(data: bytes) -> tuple[int, int, int, int]:
-    """Width, height, bit depth and colour type; every chunk's checksum is proved on the way."""
+    """Width, height, bit depth and colour type; also verifies every chunk's checksum."""
     position, kind = len(_PNG_MAGIC), b""
     while kind != b"IEND":
         length = int.from_bytes(data[position : position + 4])
@@ -227,7 +229,7 @@ def _raw_pixels(message: Any, encoding: str) -> np.ndarray:
         raise ValueError(f"image encoding {message.encoding!r} is not supported")
     channels, size = _CHANNELS.get(encoding, 1), _BYTES.get(encoding, 1)
     height, width, row = int(message.height), int(message.width), int(message.width) * channels * size
-    if encoding == "nv12":  # below the brightness, half as many rows hold the colours of 2x2 pixels each
+    if encoding == "nv12":  # below the luma rows, half as many rows hold the colours of 2x2 pixels each
         if height % 2 or width % 2:
             raise ValueError(f"nv12 needs even sides, not {width}x{height}")
         height += height // 2
@@ -244,7 +246,7 @@ def _raw_pixels(message: Any, encoding: str) -> np.ndarray:
 
 
 def _to_png(pixels: UInt8[np.ndarray, ...] | np.ndarray) -> bytes:
-    # Level 1: raw images compress to much the same size at a fifth of the time of the default.
+    # Level 1: raw images compress to nearly the same size in a fifth of the default's time.
     ok, encoded = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not ok:
         raise ValueError("image cannot be encoded as PNG")

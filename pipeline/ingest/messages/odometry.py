@@ -1,4 +1,4 @@
-"""Ego motion at a stamp, interpolated from logged odometry; nothing is said outside of what was logged."""
+"""Ego motion at a stamp, interpolated from logged odometry; never extrapolated."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pipeline.geometry.se3 import exp_so3, from_quaternion, from_rotation_transl
 
 __all__ = ["EgoState", "EgoTrack"]
 
-# Odometry comes at 10 Hz or more; across a longer gap a car's yaw rate is anyone's guess.
+# Odometry comes at 10 Hz or more; across a longer gap the yaw rate cannot be interpolated.
 _LONGEST_GAP_S = 0.5
 
 
@@ -38,7 +38,7 @@ class EgoTrack:
         return len(self._rows)
 
     def add(self, stamp_ns: int, message: Any) -> bool:
-        """Take a nav_msgs/Odometry; False where its numbers are no motion (not finite, zero quaternion)."""
+        """Add a nav_msgs/Odometry; returns False for invalid values (not finite, zero quaternion)."""
         p, q = message.pose.pose.position, message.pose.pose.orientation
         twist = message.twist.twist
         numbers = (p.x, p.y, p.z, q.w, q.x, q.y, q.z, twist.linear.x, twist.angular.z)
@@ -65,7 +65,7 @@ class EgoTrack:
     def motion_at(
         self, stamps_ns: Int[np.ndarray, " N"]
     ) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, " N"]]:
-        """Forward speed [m/s] and yaw rate [rad/s] at many stamps, NaN where `at` says nothing."""
+        """Forward speed [m/s] and yaw rate [rad/s] at many stamps, NaN where `at` returns None."""
         unknown = np.full(len(stamps_ns), np.nan)
         if len(self._rows) < 2:
             return unknown, unknown

@@ -1,4 +1,4 @@
-"""Compressed images that are neither JPEG nor PNG: pixels of WebP, AVIF and JPEG 2000, by OpenCV.
+"""Compressed images other than JPEG and PNG: WebP, AVIF and JPEG 2000, decoded by OpenCV.
 
 Sources of the headers: RFC 9649 (WebP); ISO/IEC 23008-12, 6.5.3 (AVIF's ispe); ISO/IEC 15444-1, A.5.1 (SIZ).
 """
@@ -20,10 +20,10 @@ def decode_other(data: bytes, check_size: Callable[[int, int], object]) -> np.nd
 
     Args:
         data: the whole file.
-        check_size: given width and height before anything is decoded; raises where no camera has as many pixels.
+        check_size: called with width and height before decoding; raises if they are implausible for a camera.
 
     Raises:
-        ValueError: none of these formats, or damaged.
+        ValueError: another format, or damaged.
     """
     sizes = next((of for at, magic, of in _FORMATS if data[at : at + len(magic)] == magic), None)
     if sizes is None:
@@ -41,7 +41,7 @@ def decode_other(data: bytes, check_size: Callable[[int, int], object]) -> np.nd
 
 
 def _webp_sizes(data: bytes) -> Iterator[tuple[int, int]]:
-    """Of the canvas and of every frame: a chunk's kind says where they stand."""
+    """Sizes of the canvas and of every frame; the kind of a chunk determines their position."""
     for match in re.finditer(rb"VP8[XL ]", data[:64]):
         kind, at = match[0], match.end() + 4
         if kind == b"VP8X":
@@ -68,7 +68,7 @@ def _jpeg2000_sizes(data: bytes) -> Iterator[tuple[int, int]]:
 
 
 _FLAGS = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
-# Where the bytes that tell a format lie, what they are, and the sizes that its header announces.
+# For each format: position and value of its signature, and the function that reads the sizes in its header.
 _FORMATS: tuple[tuple[int, bytes, Callable[[bytes], Iterator[tuple[int, int]]]], ...] = (
     (8, b"WEBP", _webp_sizes),
     (4, b"ftypavif", _avif_sizes),

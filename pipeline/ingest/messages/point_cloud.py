@@ -27,16 +27,16 @@ _TIME = (
     "timestampOffset",
     "point_time_offset",
 )
-# Drivers write (0, 0, 0) for a beam without return; no sensor sees its own housing this near.
+# Drivers write (0, 0, 0) for a beam without return; real returns are never this near.
 _MIN_RANGE_M = 0.05
 _LONGEST_SWEEP_S = 1.0
-# 12 days after 1970, in seconds and nanoseconds: no sweep is that long, no date that early.
+# 12 days after 1970, in seconds and nanoseconds: longer than any sweep, earlier than any date.
 _DATE_S, _DATE_NS = 1e6, 10**15
 
 
 @dataclass(frozen=True, eq=False)
 class LidarCloud:
-    """Points of one sweep in its own frame; `dropped` counts by reason those that were left out."""
+    """Points of one sweep in its own frame; `dropped` counts removed points by reason."""
 
     x_m: Float32[np.ndarray, " N"]
     y_m: Float32[np.ndarray, " N"]
@@ -45,7 +45,7 @@ class LidarCloud:
     ring: UInt16[np.ndarray, " N"] | None
     time_s: Float32[np.ndarray, " N"] | None
     dropped: Counter[str] = field(default_factory=Counter)
-    unit: str = ""  # that fits, where it is not metres
+    unit: str = ""  # unit that fits, if it is not metres
 
 
 def cloud_columns(message: Any) -> np.ndarray:
@@ -62,7 +62,7 @@ def cloud_columns(message: Any) -> np.ndarray:
     for f in message.fields:
         if int(f.datatype) not in _DATATYPES:
             raise ValueError(f"field {f.name!r} has the unknown datatype {f.datatype}")
-        count = max(int(f.count), 1)  # 0 is against the standard but common
+        count = max(int(f.count), 1)  # 0 violates the standard but is common
         names.append(str(f.name))
         formats.append(
             (order + _DATATYPES[int(f.datatype)], (count,))
@@ -86,7 +86,7 @@ def cloud_columns(message: Any) -> np.ndarray:
 
 
 def first_field(points: np.ndarray, names: tuple[str, ...]) -> np.ndarray | None:
-    """The first of these fields (compared without case) that the cloud has as a scalar column, else None."""
+    """First of these fields (case-insensitive) that the cloud has as a scalar column, else None."""
     found = {str(n).lower(): n for n in reversed(points.dtype.names or ())}
     for name in names:
         if name.lower() in found:
@@ -96,17 +96,17 @@ def first_field(points: np.ndarray, names: tuple[str, ...]) -> np.ndarray | None
     return None
 
 
-@np.errstate(all="ignore")  # damaged numbers become inf or nan, and those are dropped
+@np.errstate(all="ignore")  # damaged numbers become inf or nan, and are dropped
 def read_lidar(message: Any, stamp_ns: int, max_range_m: float) -> LidarCloud:
-    """A sweep's finite points within range; intensity, ring and time where the cloud has them.
+    """Finite points of a sweep within range; intensity, ring and time if the cloud has them.
 
     Args:
         message: sensor_msgs/PointCloud2 with x, y, z [m] in the lidar frame.
-        stamp_ns: the sweep's stamp; times become seconds relative to it, whatever they count in the log.
+        stamp_ns: the sweep's stamp; times become seconds relative to it, for all conventions of the log.
         max_range_m: points beyond are dropped and counted.
 
     Raises:
-        ValueError: no x, y, z, or a layout that contradicts itself.
+        ValueError: no x, y, z, or an inconsistent layout.
     """
     points = cloud_columns(message)
     x, y, z = _coordinates(points)
@@ -137,7 +137,7 @@ def _coordinates(points: np.ndarray) -> list[Float32[np.ndarray, " N"]]:
 def _within(
     range2: Float32[np.ndarray, " N"], max_range_m: float
 ) -> tuple[slice | Bool[np.ndarray, " N"], Counter[str]]:
-    """What to index with to keep the points with a return within range, and how many are dropped for what."""
+    """Index of the points with a return within range, and counts of dropped points by reason."""
     keep = (range2 >= _MIN_RANGE_M**2) & (range2 <= max_range_m**2)  # False for NaN
     if keep.all():
         return slice(None), Counter()
@@ -164,9 +164,9 @@ def _ring(ring: np.ndarray | None, keep: slice | Bool[np.ndarray, " N"]) -> UInt
 def _relative_time_s(
     time: np.ndarray | None, keep: slice | Bool[np.ndarray, " N"], stamp_ns: int
 ) -> Float32[np.ndarray, " M"] | None:
-    """Seconds after the stamp: floats count seconds, integers nanoseconds; absolute where they are dates.
+    """Seconds after the stamp: floats are seconds, integers nanoseconds; large values are absolute.
 
-    None where the result is no time within a sweep: better no de-skew than a wrong one.
+    None if the result is not a time within a sweep: no de-skew is better than a wrong one.
     """
     if time is None or not len(time):
         return None

@@ -1,4 +1,4 @@
-"""Protobuf messages by the schema that an MCAP carries, decoded by mcap-protobuf-support."""
+"""Protobuf messages, decoded by mcap-protobuf-support with the schema in the MCAP."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from pipeline.ingest.containers.reader import BYTES_AS_TEXT, PROTOBUF, Channel
 
 __all__ = ["content_without_stamp", "frame_id_of", "parse", "stamp_ns_of"]
 
-_LAST_S = 2**33  # beyond it nanoseconds leave int64: a damaged number
+_LAST_S = 2**33  # beyond it nanoseconds overflow int64: a damaged number
 
 
 def parse(channel: Channel, data: memoryview) -> Any:
-    """The message as its schema says.
+    """Decode a message by its schema.
 
     Raises:
-        ValueError: a schema or bytes that are no protobuf.
+        ValueError: invalid schema or bytes.
     """
     from google.protobuf.message import DecodeError  # noqa: PLC0415  # logs of ROS alone need no protobuf
 
@@ -28,7 +28,7 @@ def parse(channel: Channel, data: memoryview) -> Any:
 
 
 def stamp_ns_of(channel: Channel, data: memoryview) -> int | None:
-    """The message's `timestamp`; None where it is unset or no time, or the message is damaged."""
+    """The message's `timestamp`; None if it is unset or invalid, or the message is damaged."""
     try:
         stamp = parse(channel, data).timestamp
         seconds, nanoseconds = int(stamp.seconds), int(stamp.nanos)
@@ -39,12 +39,12 @@ def stamp_ns_of(channel: Channel, data: memoryview) -> int | None:
 
 
 def frame_id_of(channel: Channel, data: memoryview) -> str:
-    """The message's `frame_id`; "" where it has none."""
+    """The message's `frame_id`; "" if it has none."""
     return str(getattr(parse(channel, data), "frame_id", "")).lstrip("/")
 
 
 def content_without_stamp(channel: Channel, data: memoryview) -> bytes:
-    """Bytes that are the same for messages that differ in their stamp alone."""
+    """Bytes that are equal for messages that differ only in their stamp."""
     message = parse(channel, data)
     message.ClearField("timestamp")
     return message.SerializeToString(deterministic=True)

@@ -16,8 +16,8 @@ from pipeline.rigs import RadarTopics
 __all__ = ["RadarCloud", "read_radar"]
 
 _POWER = ("power", "rcs", "amplitude", "intensity", "snr", "snr_db", "power_db")
-_MIN_RANGE_M, _MAX_RANGE_M = 0.05, 1000.0  # no automotive radar sees farther; more is a damaged number
-_REACH_M = 300.0  # of car radars' data sheets
+_MIN_RANGE_M, _MAX_RANGE_M = 0.05, 1000.0  # automotive radars have shorter ranges; larger values are damaged
+_REACH_M = 300.0  # from data sheets of car radars
 _FLAT_RAD = 1e-6
 
 
@@ -30,22 +30,22 @@ class RadarCloud:
     power_db: Float32[np.ndarray, " N"] | None
     has_elevation: bool
     dropped: Counter[str] = field(default_factory=Counter)
-    unit: str = ""  # that fits, where it is not metres
+    unit: str = ""  # unit that fits, if it is not metres
 
 
-@np.errstate(all="ignore")  # damaged numbers become inf or nan, and those are dropped
+@np.errstate(all="ignore")  # damaged numbers become inf or nan, and are dropped
 def read_radar(message: Any, msgtype: str, config: RadarTopics) -> RadarCloud:
-    """Detections of one radar message, those that are not finite or at no range dropped and counted.
+    """Detections of one radar message; those that are not finite or have zero range are dropped and counted.
 
     Args:
         message: decoded by the log's own definition.
-        msgtype: PointCloud2, RadarScan or RadarTracks decide what is read.
-        config: name and sign of the Doppler field, sign of RadarScan's azimuth. The velocity of a RadarTrack, and the
-            components that `velocity_fields` names, need no sign: taken relative to the sensor, their part along the
-            line of sight is the range rate.
+        msgtype: PointCloud2, RadarScan or RadarTracks.
+        config: name and sign of the Doppler field, sign of RadarScan's azimuth. Velocities of a RadarTrack,
+            and the components in `velocity_fields`, need no sign: they are relative to the sensor, and their
+            component along the line of sight is the range rate.
 
     Raises:
-        ValueError: a field is missing (the message names those there are), or the layout is contradictory.
+        ValueError: a field is missing (the message lists the existing ones), or the layout is inconsistent.
     """
     kind = msgtype.rsplit("/", 1)[-1]
     xyz, range_rate, power = {"RadarScan": _scan, "RadarTracks": _tracks}.get(kind, _cloud)(message, config)
@@ -66,7 +66,7 @@ def read_radar(message: Any, msgtype: str, config: RadarTopics) -> RadarCloud:
 def _within(
     range2: Float[np.ndarray, " N"], range_rate_mps: Float[np.ndarray, " N"]
 ) -> tuple[slice | Bool[np.ndarray, " N"], Counter[str]]:
-    """What to index with to keep the detections that are measurements, and how many are dropped for what."""
+    """Index of the valid detections, and counts of dropped ones by reason."""
     measured = np.isfinite(range_rate_mps)
     keep = (range2 >= _MIN_RANGE_M**2) & (range2 <= _MAX_RANGE_M**2) & measured  # False for NaN
     if keep.all():
@@ -97,7 +97,7 @@ def _cloud(message: Any, config: RadarTopics) -> _Columns:
     used = ["x", "y", *(["z"] if "z" in names else []), *moving]
     if any(points[n].ndim > 1 for n in used):
         raise ValueError(f"a field of {', '.join(used)} holds more than one value a point")
-    # A planar radar has no z: 0 and has_elevation = False say so.
+    # A planar radar has no z: it is set to 0, and has_elevation = False.
     z = points["z"] if "z" in names else 0.0
     xyz = np.empty((len(points), 3))
     xyz[:, 0], xyz[:, 1], xyz[:, 2] = points["x"], points["y"], z
@@ -131,9 +131,12 @@ def _tracks(message: Any, _config: RadarTopics) -> _Columns:
 
 
 def _along(xyz: Float[np.ndarray, "N 3"], velocity: Float[np.ndarray, "N K"]) -> Float[np.ndarray, " N"]:
-    """Part of velocities relative to the sensor along the line of sight; of two components the third is 0."""
+    """Component along the line of sight of velocities relative to the sensor.
+
+    With two components the third is 0.
+    """
     return np.einsum("ij,ij->i", xyz[:, : velocity.shape[1]], velocity) / np.linalg.norm(xyz, axis=1)
 
 
 def _receding(doppler: Float[np.ndarray, " N"], config: RadarTopics) -> Float[np.ndarray, " N"]:
-    return doppler if config.doppler_positive == "receding" else 0.0 - doppler  # no negative zeros
+    return doppler if config.doppler_positive == "receding" else 0.0 - doppler  # avoids negative zeros

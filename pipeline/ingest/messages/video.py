@@ -1,7 +1,7 @@
-"""Pictures out of a video that was logged packet by packet: decoded forward from the last key frame.
+"""Images from a video logged packet by packet: decoded forward from the last key frame.
 
-A message holds the data of one picture (foxglove.CompressedVideo; sensor_msgs/CompressedImage of such a format),
-without B frames. Source: ITU-T H.264, table 7-1; ITU-T H.265, table 7-1 (types of NAL units).
+A message holds the data of one image (foxglove.CompressedVideo; sensor_msgs/CompressedImage with a video
+format), without B frames. Source: ITU-T H.264, table 7-1; ITU-T H.265, table 7-1 (types of NAL units).
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ _CODECS = {"h264": "h264", "h265": "hevc", "hevc": "hevc"}
 _START_CODE = re.compile(rb"\x00\x00\x01(.)", re.DOTALL)
 _H264_IDR = 5
 _H265_IRAP = range(16, 22)
-# Longest run back to a key frame: ten seconds at 30 Hz, what encoders choose at most unless told otherwise.
+# Longest distance to a key frame: ten seconds at 30 Hz, the usual maximum of encoders.
 _MOST_PACKETS = 300
-# Between stamps: nearer to two periods than to one, so a picture is missing that others refer to.
+# Gap in periods between stamps: closer to two than to one, so an image is missing that others refer to.
 _LOST_PERIODS = 1.7
 
 
 def video_codec(format_: str) -> str | None:
-    """The decoder's name for a message's format, None where that is no video."""
+    """Decoder name for a message's format; None if it is not a video."""
     return _CODECS.get(format_.strip().lower())
 
 
 class VideoPictures:
-    """Pictures of one stream of messages by their place; cheap where they are asked for in order.
+    """Images of a video stream by message index; fast if read in order.
 
     Args:
-        read: format and data of the message at a place.
-        stamps_ns: of all messages in the order in which they were logged; where a gap shows that one is missing,
-            nothing is decoded across it.
+        read: returns format and data of the message of an index.
+        stamps_ns: of all messages in order of logging; nothing is decoded across a gap that shows a missing
+            message.
     """
 
     def __init__(self, read: Callable[[int], tuple[str, bytes]], stamps_ns: Int64[np.ndarray, " N"]) -> None:
@@ -49,13 +49,14 @@ class VideoPictures:
         period_ns = float(np.median(gaps[gaps > 0])) if np.any(gaps > 0) else 0.0
         self._is_broken = np.concatenate([[True], (gaps <= 0) | (gaps > _LOST_PERIODS * period_ns)])
         self._decoder: Any = None
-        self._last = -1  # place of the packet that the decoder was fed last
+        self._last = -1  # index of the last packet that was decoded
 
     def picture(self, place: int) -> UInt8[np.ndarray, "H W 3"]:
-        """The picture of a message as BGR.
+        """The image of a message as BGR.
 
         Raises:
-            ValueError: no key frame before it, a packet that is damaged or missing, or a stream with B frames.
+            ValueError: no key frame before it, a packet that is damaged or missing, or a stream with B
+                frames.
             MissingExtraError: PyAV is not installed.
         """
         av = _pyav()
@@ -63,7 +64,7 @@ class VideoPictures:
         first = place - len(packets) + 1
         if self._last != first - 1 or _is_key(*packets[0]):
             self._decoder = _decoder(av, packets[0][0])
-        self._last = -1  # until all is well: after an error the next picture starts from a key frame
+        self._last = -1  # until success: after an error the next image starts from a key frame
         try:
             decoded = [
                 f for i, p in enumerate(packets, first) for f in self._decoder.decode(_packet(av, p[1], i))
@@ -77,7 +78,7 @@ class VideoPictures:
         return np.asarray(found[0].to_ndarray(format="bgr24"), np.uint8)
 
     def _packets(self, place: int) -> list[tuple[str, bytes]]:
-        """Packets to feed for a picture: from its key frame on, or from where the decoder stands."""
+        """Packets to decode for an image: from its key frame on, or from the decoder's current position."""
         packets: list[tuple[str, bytes]] = []
         for i in range(place, max(place - _MOST_PACKETS, -1), -1):
             packets.insert(0, self._read(i))
@@ -105,7 +106,7 @@ def _packet(av: ModuleType, data: bytes, place: int) -> Any:
 
 
 def _decoder(av: ModuleType, format_: str) -> Any:
-    # One thread and low delay: a picture comes out with its packet. Errors are raised, not painted over.
+    # One thread and low delay: an image is returned with its packet. Errors are raised, not concealed.
     decoder = av.CodecContext.create(video_codec(format_), "r")
     decoder.thread_count = 1
     decoder.options = {"err_detect": "explode", "max_pixels": str(MOST_PIXELS)}

@@ -1,1 +1,1 @@
-"""What fleet.toml can be written from the logs themselves: which topic is which sensor, what its numbers mean."""
+"""Proposal of a fleet.toml from logs: which topic is which sensor, and the meaning of its values."""

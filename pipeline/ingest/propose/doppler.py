@@ -1,4 +1,4 @@
-"""What a radar's Doppler means, tried on the log: at which speed it wraps, and which sign says receding."""
+"""Meaning of a radar's Doppler, tested on the log: its aliasing period and its sign."""
 
 from __future__ import annotations
 
@@ -14,17 +14,19 @@ from schemas.frames import Frame
 
 __all__ = ["doppler_period", "doppler_sign"]
 
-_FEWEST_SCANS = 3  # that no speed explains without a period
-_HALF = 0.5  # of a scan's detections, explained by one speed: it needs no period
-_MORE, _MOST = 0.1, 2 / 3  # how much more of a scan a period must explain, and of how many scans
-_MOST_STEPS = 4096  # of a quantised Doppler, from end to end: finer ones are numbers without steps
+_FEWEST_SCANS = 3  # scans that no speed explains without a period
+_HALF = 0.5  # share of a scan's detections explained by one speed: then no period is needed
+# increase of the explained share by a period, and share of scans with that increase
+_MORE, _MOST = 0.1, 2 / 3
+_MOST_STEPS = 4096  # most distinct values of a quantised Doppler; with more it is not quantised
 
 
 def doppler_period(frames: Sequence[Frame]) -> float | None:
-    """The period by which the Doppler is aliased [m/s]; None where it is not, or the log does not show it.
+    """Aliasing period of the Doppler [m/s]; None if it is not aliased or the log does not show it.
 
-    An aliased Doppler fills the span of one period, whatever the car does: the span is tried. It counts where the
-    static world explains more with it of most of those scans that it does not explain without.
+    An aliased Doppler fills the range of one period for any speed of the car, so the observed range is tried.
+    It is accepted if, in most scans that no speed explains without it, a static world explains more
+    detections with it.
     """
     scans = [(_directions(f), f.radar_range_rate_mps.astype(np.float64)) for f in frames if _has_scan(f)]
     if len(scans) < _FEWEST_SCANS:
@@ -43,11 +45,11 @@ def doppler_period(frames: Sequence[Frame]) -> float | None:
 
 
 def doppler_sign(frames: Sequence[Frame], rig: Rig) -> str:
-    """The `doppler_positive` that the frames show, read as `rig` says; "" where they do not tell.
+    """The `doppler_positive` that fits the frames; "" if undetermined.
 
     Args:
-        frames: with the radar's scans, and odometry where the log has it.
-        rig: of this radar, with a `doppler_positive` that is tried.
+        frames: with the radar's scans, and odometry if the log has it.
+        rig: of this radar, with the `doppler_positive` that the frames were read with.
     """
     if rig.radar is None:
         return ""

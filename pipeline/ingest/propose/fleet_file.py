@@ -1,4 +1,7 @@
-"""The text of a fleet.toml for sensors that were found: every line one can trust, and comments for what one cannot."""
+"""Text of a fleet.toml for the sensors that were found.
+
+Reliable values as lines, uncertain ones as comments.
+"""
 
 from __future__ import annotations
 
@@ -14,12 +17,12 @@ __all__ = ["Facts", "RadarMeaning", "fleet_text", "names_of"]
 
 _NO_NAME = re.compile(r"[^A-Za-z0-9_]+")
 _ENDINGS = ("_optical_frame", "_optical", "_frame", "_link")
-_COLUMN = 60  # where comments behind a line begin
+_COLUMN = 60  # column of comments behind a line
 
 
 @dataclass(frozen=True)
 class RadarMeaning:
-    """What the log shows of a radar's Doppler: the sign ("" = nothing), the period of an aliased one [m/s]."""
+    """Doppler of a radar in the log: sign ("" = undetermined), period if aliased [m/s]."""
 
     positive: str = ""
     period_mps: float | None = None
@@ -28,13 +31,13 @@ class RadarMeaning:
 
 @dataclass(frozen=True)
 class Facts:
-    """What the text says beside the sensors.
+    """Content of the text in addition to the sensors.
 
     Args:
-        static_topic: of the static transforms, "" where the logs have none.
-        untied: sensors that no chain of transforms leads to, with their frame ids.
+        static_topic: of the static transforms, "" if the logs have none.
+        untied: sensors that no chain of transforms reaches, with their frame ids.
         vehicle_frames: frames of the transforms that may be the vehicle's.
-        meanings: what the log shows of each radar's Doppler.
+        meanings: Doppler of each radar in the log.
     """
 
     static_topic: str
@@ -44,7 +47,7 @@ class Facts:
 
 
 def names_of(found: FoundSensors) -> dict[str, FoundCamera | FoundCloud]:
-    """Sensors by the names that they get: their kind where there is one of each, else by frame ids."""
+    """Sensors by name: their kind if there is one of each, else from frame ids."""
     of_kind: dict[str, Sequence[FoundCamera | FoundCloud]] = {
         "camera": found.cameras,
         "lidar": found.lidars,
@@ -67,7 +70,7 @@ def names_of(found: FoundSensors) -> dict[str, FoundCamera | FoundCloud]:
 def fleet_text(
     fleet: str, found: FoundSensors, names: Mapping[str, FoundCamera | FoundCloud], facts: Facts
 ) -> str:
-    """The whole file, for a fleet of that name."""
+    """Text of the file for a fleet of that name."""
     is_short = all(name in ("camera", "lidar", "radar") for name in names)
     lines = ["[fleet]", f"name = {json.dumps(fleet)}", *_of_rig(facts, is_short=is_short)]
     for name, sensor in names.items():
@@ -93,7 +96,7 @@ def fleet_text(
 
 
 def _of_rig(facts: Facts, *, is_short: bool) -> list[str]:
-    """The vehicle frame: named where it is logged on a rig of many sensors, offered on a small one."""
+    """Lines on the vehicle frame: active for a rig of many sensors if it is logged, else a comment."""
     if not facts.vehicle_frames:
         return []
     line = f"base = {json.dumps(facts.vehicle_frames[0])}"

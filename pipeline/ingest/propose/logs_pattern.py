@@ -1,4 +1,4 @@
-"""The pattern by which a night finds logs, out of the paths of some of them."""
+"""Path pattern of logs for the nightly command, derived from the paths of some logs."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ _DAY = re.compile(r"\d{4}-?\d{2}-?\d{2}")
 
 
 def logs_pattern(logs: Sequence[Path]) -> str:
-    """Where the logs are, as `boresight nightly --logs` wants it; "" where their names tell no vehicle or day.
+    """Pattern of the logs for `boresight nightly --logs`; "" if the names contain no vehicle or day.
 
-    Files that are no logs (a licence beside them, a calibration) do not count: a shell's `logs/*` names them too.
+    Files that are not logs (a licence beside them, a calibration) are ignored: a shell's `logs/*` includes
+    them.
     """
     paths = [path for path in logs if path.is_dir() or path.suffix in _SUFFIXES]
     patterns = {_pattern(path) for path in paths}
@@ -35,7 +36,7 @@ def nightly_command(fleet: Path, logs: Sequence[Path]) -> list[str]:
 
 
 def _pattern(path: Path) -> str:
-    """By folders VEHICLE/DAY, else by a file's name VEHICLE_DAY..."""
+    """From folders VEHICLE/DAY, else from a file name VEHICLE_DAY..."""
     parts = path.parts
     day = next((i for i, part in enumerate(parts[:-1]) if _DAY.fullmatch(part)), 0)
     if day:

@@ -1,4 +1,4 @@
-"""A fleet.toml for some logs: survey, sensors, and what the radars' numbers mean."""
+"""A fleet.toml for some logs: survey, sensors, and the meaning of the radars' values."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from schemas.frames import Frame
 
 __all__ = ["Proposal", "propose_fleet"]
 
-_SAMPLE = 30  # moments by which the Doppler is tried
+_SAMPLE = 30  # moments on which the Doppler is tested
 _VEHICLE_FRAMES = ("base_link", "base_footprint", "vehicle", "ego_vehicle", "rear_axle", "imu_link")
 
 
 @dataclass(frozen=True)
 class Proposal:
-    """The file's text, the logs that could be read, and what went wrong."""
+    """Text of the file, the readable logs, and the problems."""
 
     text: str
     sensors: tuple[str, ...]
@@ -47,12 +47,12 @@ def propose_fleet(logs: Sequence[Path], fleet: str, progress: Progress = silent)
     """Write a fleet.toml for logs of vehicles of one build.
 
     Args:
-        logs: some of them; a minute of each is looked through.
+        logs: some of them; a minute of each is read.
         fleet: name of the fleet.
-        progress: told of each log, and of moments.
+        progress: called for each log, and for moments.
 
     Raises:
-        ConfigError: fewer than two sensors are in the logs.
+        ConfigError: the logs have fewer than two sensors.
     """
     survey = survey_logs(logs, progress)
     found = find_sensors(survey)
@@ -78,7 +78,7 @@ def propose_fleet(logs: Sequence[Path], fleet: str, progress: Progress = silent)
 
 
 def _static(survey: Survey) -> tuple[str, TransformTree]:
-    """The topic that says where sensors are, and its transforms: one whose frames never move, with most of them."""
+    """Topic of static transforms and its tree: frames never move on it, and it has the most of them."""
     still = {name: tree for name, tree in survey.transforms.items() if not tree.twice and tree.edges}
     name = max(still, key=lambda n: (n == "/tf_static", len(still[n].edges)), default="")
     return name, still.get(name, TransformTree())
@@ -91,7 +91,7 @@ def _meanings(
     names: Mapping[str, FoundCamera | FoundCloud],
     progress: Progress,
 ) -> dict[str, RadarMeaning]:
-    """What moments of the logs show of each radar's Doppler."""
+    """Doppler of each radar, tested on moments of the logs."""
     radars = {n: s for n, s in names.items() if isinstance(s, FoundCloud) and s in found.radars}
     can_be_tried = {n for n, s in radars.items() if len(s.doppler) == 1 or not s.fields}
     fleet = validated(FleetConfig, tomllib.loads(text), "fleet.toml")

@@ -1,4 +1,7 @@
-"""Which topics are which sensors: by types, frame ids, fields and sizes; names of topics decide last."""
+"""Assignment of topics to sensors: by types, frame ids, fields and sizes.
+
+By topic names only if undecided.
+"""
 
 from __future__ import annotations
 
@@ -19,22 +22,23 @@ from pipeline.ingest.propose.survey import Survey, Topic
 
 __all__ = ["FoundCamera", "FoundCloud", "FoundSensors", "find_sensors"]
 
-# Names that drivers give to the speed along the line of sight; those with "comp" are over ground and say nothing.
+# Names that drivers use for the speed along the line of sight; those with "comp" are over ground and useless
+# here.
 _DOPPLER = (
     "doppler", "doppler_velocity", "dopplervelocity", "range_rate", "rangerate", "radial_velocity", "radial_speed",
     "v_doppler", "v_radial", "v_r", "vr", "velocity", "speed",
 )  # fmt: skip
 _COMPONENTS = (("vx", "vy", "vz"), ("vx", "vy"), ("v_x", "v_y"), ("velocity_x", "velocity_y"))
-_MOST_DETECTIONS = 10_000  # a cloud of more is a lidar's, though it measures speeds
-_MOST_LABELS = 160  # distinct values of a label image; a grey picture has more
+_MOST_DETECTIONS = 10_000  # a larger cloud is a lidar's, even with speeds
+_MOST_LABELS = 160  # most distinct values of a label image; a grey image has more
 _VOID = 255
-_VIDEO = (0, 0)  # the size of a video's pictures stands in none of its packets alone
-_SETS = (("cityscapes", 18), ("ade20k", 149))  # largest label but void
+_VIDEO = (0, 0)  # the size of a video is not in every packet
+_SETS = (("cityscapes", 18), ("ade20k", 149))  # largest label other than void
 
 
 @dataclass(frozen=True, eq=False)
 class FoundCamera:
-    """A camera's topics. `labels_say` is what their values look like, "" where there are none."""
+    """A camera's topics; `labels_say` describes the label values, "" if there are none."""
 
     frame_id: str
     image: str
@@ -48,19 +52,19 @@ class FoundCamera:
 
 @dataclass(frozen=True, eq=False)
 class FoundCloud:
-    """A lidar or a radar. `doppler` is its field, or its fields where it logs components; () of messages of radars."""
+    """A lidar or a radar; `doppler` has its field or its components' fields, () for radar message types."""
 
     frame_id: str
     topic: str
     msgtype: str
     fields: tuple[str, ...] = ()
     doppler: tuple[str, ...] = ()
-    alignment: tuple[str, ...] = ()  # topics on which a radar states its own
+    alignment: tuple[str, ...] = ()  # topics with the radar's own alignment
 
 
 @dataclass(eq=False)
 class FoundSensors:
-    """All that was found, and in words what was passed over."""
+    """All sensors found, and descriptions of the topics not used."""
 
     cameras: list[FoundCamera] = field(default_factory=list)
     lidars: list[FoundCloud] = field(default_factory=list)
@@ -70,7 +74,7 @@ class FoundSensors:
 
 
 def find_sensors(survey: Survey) -> FoundSensors:
-    """Cameras, lidars and radars of the logs, one for each frame id and kind."""
+    """Cameras, lidars and radars in the logs, one for each frame id and kind."""
     found = FoundSensors()
     _find_clouds(survey, found)
     _find_alignments(survey, found)
@@ -87,7 +91,7 @@ def find_sensors(survey: Survey) -> FoundSensors:
 
 def _find_clouds(survey: Survey, found: FoundSensors) -> None:
     best: dict[tuple[str, str], list[tuple[FoundCloud, float]]] = defaultdict(list)
-    for topic in survey.of("radar"):  # their types hold a lidar's
+    for topic in survey.of("radar"):  # types that only radars use
         is_cloud = topic.is_a("lidar")
         columns = [_columns(m) for m in topic.samples] if is_cloud else []
         fields = max((c.dtype.names or () for c in columns), key=len, default=())
@@ -101,7 +105,7 @@ def _find_clouds(survey: Survey, found: FoundSensors) -> None:
         cloud = FoundCloud(
             topic.frame_id, topic.name, topic.msgtype, fields, doppler if is_radar and is_cloud else ()
         )
-        # Of several clouds of one sensor the one that says most of its points: rings and times are in the raw one.
+        # Of several clouds of one sensor, choose the one with most fields: raw clouds have rings and times.
         best[kind, topic.frame_id].append((cloud, len(fields) * 1e6 + points))
     for (kind, _), clouds in best.items():
         clouds.sort(key=lambda c: -c[1])
@@ -110,7 +114,7 @@ def _find_clouds(survey: Survey, found: FoundSensors) -> None:
 
 
 def _find_alignments(survey: Survey, found: FoundSensors) -> None:
-    """Messages of a radar about itself: of the only radar, or in the frame of its points."""
+    """Alignment messages: of the only radar, or in the frame of a radar's points."""
     topics, radars = survey.of("alignment"), found.radars
     for k, radar in enumerate(radars):
         own = [t.name for t in topics if len(radars) == 1 or t.frame_id == radar.frame_id]
@@ -166,7 +170,7 @@ def _find_cameras(survey: Survey, found: FoundSensors) -> None:
 
 
 def _camera(info: Topic, pictures: dict[str, tuple[Topic, tuple[int, int]]]) -> FoundCamera | None:
-    """The camera that a CameraInfo is of: an image of its size and frame, whose name shares most with its own."""
+    """Camera of a CameraInfo: an image of its size and frame with the most similar topic name."""
     camera = next((c for c in (_intrinsics(m) for m in info.samples) if c is not None), None)
     if camera is None:
         return None
@@ -209,7 +213,7 @@ def _with_semantics(
 
 
 def _label_set(values: np.ndarray) -> tuple[str, str]:
-    """The label set whose numbers these are, the smallest that has them all, and what was seen."""
+    """Smallest known label set that contains all these values, and a description of the values."""
     seen = values[values != _VOID]
     if not len(seen):
         return "cityscapes", "void only"
@@ -218,7 +222,7 @@ def _label_set(values: np.ndarray) -> tuple[str, str]:
 
 
 def _label_values(topic: Topic) -> np.ndarray | None:
-    """Values of label images; None where they are pictures."""
+    """Values of label images; None if they are pictures."""
     values, areas = set[int](), []
     for message in topic.samples:
         try:
@@ -233,7 +237,10 @@ def _label_values(topic: Topic) -> np.ndarray | None:
 
 
 def _has_areas(pixels: np.ndarray) -> bool:
-    """Whether most pixels equal their right neighbour, as in a map of areas; in a grey picture one in ten does."""
+    """Whether most pixels equal their right neighbour, as in a label image.
+
+    In a grey picture one in ten does.
+    """
     return bool(np.mean(pixels[:, 1:] == pixels[:, :-1]) > 0.8)
 
 
@@ -269,7 +276,7 @@ def _moves(topic: Topic) -> bool:
 
 @cache
 def _shared(a: str, b: str) -> int:
-    """How many words from the left two topics have in common."""
+    """Number of leading words that two topic names share."""
     return sum(1 for _ in _same(re.split(r"[/_]", a.strip("/")), re.split(r"[/_]", b.strip("/"))))
 
 

@@ -1,4 +1,4 @@
-"""Every topic of some logs with a few of its messages decoded: what can be known before anybody names a sensor."""
+"""Survey of logs: every topic with a few of its messages decoded."""
 
 from __future__ import annotations
 
@@ -16,15 +16,18 @@ from pipeline.results import Progress, silent
 
 __all__ = ["Survey", "Topic", "survey_logs"]
 
-_SAMPLES = 5  # messages of a topic that are decoded in each log: an empty scan or a dark image may come first
-# Of a log that is looked through. All sensors of a car speak within a second; transforms are logged at the start.
+_SAMPLES = 5  # messages of a topic decoded per log: an empty scan or a dark image may come first
+# Length of the surveyed part. All sensors of a car log within a second; transforms are logged at the start.
 _LONGEST_NS = 60 * 10**9
 _KNOWN = {kind for kinds in ACCEPTED_TYPES.values() for kind in kinds}
 
 
 @dataclass(eq=False)
 class Topic:
-    """A topic of a type that Boresight reads. `frame_id` is that of its last decoded message, "" where it has none."""
+    """A topic of a type that Boresight reads.
+
+    `frame_id` is that of its last decoded message, "" if it has none.
+    """
 
     name: str
     msgtype: str
@@ -33,13 +36,13 @@ class Topic:
     samples: list[Any] = field(default_factory=list)
 
     def is_a(self, role: str) -> bool:
-        """Whether its type can be what a rig calls image, info, labels, detections, lidar, radar, odometry."""
+        """Whether its type fits a role: image, info, labels, detections, lidar, radar, odometry."""
         return self.msgtype in ACCEPTED_TYPES[role]
 
 
 @dataclass(eq=False)
 class Survey:
-    """What the `logs` that could be read hold. `transforms`: of each topic that says where frames are, one tree."""
+    """Content of the readable `logs`; `transforms` holds a tree for each topic of transforms."""
 
     topics: dict[str, Topic] = field(default_factory=dict)
     transforms: dict[str, TransformTree] = field(default_factory=dict)
@@ -47,16 +50,16 @@ class Survey:
     logs: list[Path] = field(default_factory=list)
 
     def of(self, role: str) -> list[Topic]:
-        """Topics whose type fits a role, by name."""
+        """Topics whose type fits a role, sorted by name."""
         return [self.topics[name] for name in sorted(self.topics) if self.topics[name].is_a(role)]
 
 
 def survey_logs(logs: Sequence[Path], progress: Progress = silent) -> Survey:
-    """Look through the first minute of each log.
+    """Read the first minute of each log.
 
     Args:
         logs: of one or several vehicles of the same build.
-        progress: told of each log.
+        progress: called for each log.
     """
     survey = Survey()
     for done, path in enumerate(logs):
@@ -92,7 +95,7 @@ def _look_through(log: LogReader, survey: Survey) -> None:
 
 def _take(message: RawMessage, topic: Topic, survey: Survey) -> None:
     try:
-        # A view of the log's chunk: what is kept is decoded from a copy.
+        # the data is a view of the log's chunk, so decode from a copy
         decoded = decode(message.channel, memoryview(bytes(message.data)))
         if topic.is_a("tf_static"):
             survey.transforms.setdefault(topic.name, TransformTree()).add_message(decoded)

@@ -104,5 +104,5 @@ def test_detection_3d_arrays_go_through_the_whole_stage_in_the_cameras_frame_onl
 
 
 def test_boxes_in_another_frame_are_refused_with_the_reason():
-    with pytest.raises(ValueError, match="'base_link' would reach the image through the calibration"):
+    with pytest.raises(ValueError, match="'base_link' can be projected only with the calibration"):
         read_detections_3d(autoware(frame="base_link"), CAMERA, "camera_optical")
