@@ -9,7 +9,10 @@ from pathlib import Path
 import psutil
 import pytest
 
+from pipeline.fleet import processes
+from pipeline.fleet.board import Board
 from pipeline.fleet.executor import EXECUTORS
+from pipeline.memory import MODEL_THREADS
 from tests.makers.ray_clusters import ray_or_skip
 
 HERE = Path(__file__).resolve().parent
@@ -22,6 +25,15 @@ def run(name, function, kinds, folder, workers=2, watch=lambda *_: None):
 
 def tries(folder, kind):
     return len((folder / f"{kind}.tries").read_text().split())
+
+
+@pytest.mark.parametrize(("workers", "cpus", "share"), [(2, 9, "4"), (4, 2, "1")])
+def test_a_workers_models_may_use_its_share_of_the_cores(workers, cpus, share, monkeypatch):
+    monkeypatch.delenv(MODEL_THREADS, raising=False)
+    monkeypatch.setattr(processes, "usable_cpus", lambda: cpus)
+    with processes._pool(workers, print, Board(1)):
+        assert (os.environ[MODEL_THREADS], os.environ["OMP_NUM_THREADS"]) == (share, "1")
+    assert MODEL_THREADS not in os.environ
 
 
 @pytest.fixture
