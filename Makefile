@@ -18,6 +18,9 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[simulate,train,ray,ops,video,viz,test,dev]'
 	@touch $(STAMP)
 
+view: setup ## open3d beside it (a gigabyte): the 3D view of a vehicle-day, and the tests of it
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[view]'
+
 demo: setup ## synthetic fleet to HTML report, in minutes
 	$(BIN)/boresight demo --out demo || [ $$? -eq 3 ] # 3: done, and something was held, as it should be
 
@@ -69,4 +72,4 @@ audit-dependencies: $(LOOKERS)/.ready ## known vulnerabilities of what constrain
 clean: ## remove what the other targets made
 	rm -rf .venv $(LOOKERS) sbom.json demo .pytest_cache .mypy_cache .ruff_cache
 
-.PHONY: help setup demo test browser lint bench bench-accept results accuracy-accept licenses sbom audit-dependencies clean
+.PHONY: help setup view demo test browser lint bench bench-accept results accuracy-accept licenses sbom audit-dependencies clean

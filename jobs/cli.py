@@ -62,6 +62,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "state": ("jobs.state:state", "Show the calibration that each vehicle should load tonight, with sigmas."),
     "report": ("jobs.report:report", "Write HTML pages of vehicle-days and of the fleet."),
     "show": ("jobs.show:show", "Show the rows of a lake's tables, as a table or as JSON."),
+    "view": ("jobs.view:view", "Show one vehicle-day in 3D, before and after its calibration."),
     "status": (
         "jobs.status:status",
         "Show which vehicle-days are done, held, refused, failed or missing, and why.",

@@ -13,7 +13,14 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 # Extra -> a module that commands with this extra import.
-EXTRAS = {"simulate": "embreex", "train": "torch", "ray": "ray", "ops": "openlineage", "viz": "foxglove"}
+EXTRAS = {
+    "simulate": "embreex",
+    "train": "torch",
+    "ray": "ray",
+    "ops": "openlineage",
+    "viz": "foxglove",
+    "view": "open3d",
+}
 
 
 def needs(extra: str) -> Callable[[Callable[P, R]], Callable[P, R]]:

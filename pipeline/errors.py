@@ -14,6 +14,7 @@ __all__ = [
     "DownloadError",
     "LogError",
     "MissingExtraError",
+    "MissingLibraryError",
     "ModelError",
     "ModelOutputError",
     "SolveError",
@@ -104,6 +105,18 @@ class DownloadError(BoresightError):
     def __init__(self, url: str, problem: str) -> None:
         self.url, self.problem = url, problem
         super().__init__(f"{url}: {problem}")
+
+
+class MissingLibraryError(BoresightError):
+    """`needed_by` needs `missing` of the system, which pip does not install; `packages` of Debian bring it."""
+
+    exit_code = 2
+
+    def __init__(self, needed_by: str, missing: str, packages: str, instead: str = "") -> None:
+        self.needed_by, self.missing, self.packages, self.instead = needed_by, missing, packages, instead
+        command = f"apt-get install {packages} (Debian, Ubuntu)" if packages else ""
+        what = command or instead or "install the package that holds it"
+        super().__init__(f"{needed_by} needs {missing}, which this machine lacks: {what}")
 
 
 class ModelError(BoresightError):

@@ -33,6 +33,7 @@ NEEDS = {
     "train-radar-drivable": "train",
     "train-lidar-semantics": "train",
     "export": "train",
+    "view": "view",
 }
 # What only an option of a command imports, and asks for before anything is read: `--executor ray`, `--metrics` ...
 OPTIONAL = {"av", "foxglove", "ray", "openlineage", "prometheus_client"}
@@ -44,6 +45,7 @@ CALLS = {
     "train-radar-drivable": ["train-radar-drivable", "--fleet", "f.toml", "--lake", "lake", "--out", "run"],
     "train-lidar-semantics": ["train-lidar-semantics", "--fleet", "f.toml", "--lake", "lake", "--out", "run"],
     "export": ["export", "onnx", "--out", "a.onnx", "--run", "."],
+    "view": ["view", "--lake", "lake", "--vehicle", "v", "--day", "2026-03-02"],
 }
 
 
@@ -118,7 +120,7 @@ def test_an_extra_holds_all_else_that_its_commands_may_import(command):
 
 def test_nothing_is_declared_that_nothing_imports():
     imported = set().union(*(reached(command)[1] for command in COMMANDS))
-    declared_for_users = declared("simulate", "train", "ray", "train-ray", "ops", "video", "viz") - {
+    declared_for_users = declared("simulate", "train", "ray", "train-ray", "ops", "video", "viz", "view") - {
         "boresight"
     }
     assert declared_for_users - imported == {"tensorboard"}  # imported by torch.utils.tensorboard

@@ -38,7 +38,7 @@ FOUNDATIONS = {
 # Folders of commands.
 ROOMS = {
     "ingest", "perceive", "calibrate", "evaluate", "audit", "report", "fleet", "simulate", "learn", "in_use",
-    "export", "convert",
+    "export", "convert", "view",
 }  # fmt: skip
 # Beside the rooms: the table of contents, which knows them all, and what runs a stage of it.
 JOINTS = {"stages", "runner"}

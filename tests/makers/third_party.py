@@ -22,7 +22,7 @@ licence that each distribution states. Nothing of it is shipped with Boresight. 
 bring NVIDIA's own libraries as well, under NVIDIA's licence; a CPU build of torch does not. opencv's wheel holds
 FFmpeg's libraries (LGPL-2.1), unchanged and loaded at run time. PyAV (`[video]`) states its own licence; its wheel
 holds FFmpeg with x264 and x265, which are under the GPL: who passes that wheel on owes what the GPL asks. Written in
-the environment of `make setup`, which leaves out `[train-ray]`: `ray[train]` brings pandas and tensorboardX besides;
+the environment of `make view`, which leaves out `[train-ray]`: `ray[train]` brings pandas and tensorboardX besides;
 and `[gpu]`: onnxruntime-gpu (MIT) takes the place of onnxruntime, and asks for NVIDIA's libraries.
 
 """
