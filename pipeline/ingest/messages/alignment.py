@@ -1,8 +1,10 @@
 """Radar misalignment from radar messages; angles in radians, positive to the left and upwards.
 
 Sources: off_highway_premium_radar_msgs (angles in rad, left and up positive for a radar mounted upright, NaN
-if there is no estimate), continental_msgs of Nebula and ars548_messages (rad), delphi_esr_msgs,
-delphi_mrr_msgs and delphi_srr_msgs (deg, in steps of 0.0625).
+if there is no estimate), continental_msgs of Nebula and ars548_messages (rad: neither states a unit; both copy
+the number that the radar sends, and Nebula's decoder of the ARS548, nebula_decoders_continental, asserts -pi to
+pi of it as of the angles beside it; neither states the sign), delphi_esr_msgs, delphi_mrr_msgs and
+delphi_srr_msgs (deg, in steps of 0.0625).
 """
 
 from __future__ import annotations
