@@ -1,1 +1,1 @@
-"""Against the truth: reflector targets or a simulator's answer, and the paper's tables."""
+"""Errors against the truth, from a simulator or reflector targets, and the paper's tables."""

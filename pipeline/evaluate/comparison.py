@@ -1,4 +1,4 @@
-"""Runs against the truth: errors at the reflectors as the paper measures them, and errors in sigmas."""
+"""Errors of runs against the truth, at reflectors as in the paper, and in units of sigma."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ __all__ = ["compare", "current_runs"]
 
 
 def current_runs(records: Sequence[CalibrationRecord]) -> list[dict[str, CalibrationRecord]]:
-    """Records by run; of runs that differ only in code or configuration the last one counts."""
+    """Records by run; if runs differ only in code or configuration, the last one."""
     runs: dict[tuple[object, ...], dict[str, CalibrationRecord]] = {}
     by_key: dict[tuple[str, str, str, str], dict[str, CalibrationRecord]] = {}
     for r in records:
@@ -48,13 +48,13 @@ def compare(
     picks: Picks | None = None,
     truth_sigma: tuple[float, float] = (0.0, 0.0),
 ) -> Comparison | None:
-    """Errors of one run, from truth or from picked reflectors; None where a pair was refused.
+    """Errors of one run against a truth or picked reflectors; None if a pair was refused.
 
     Args:
-        run: the records of one work key, by pair.
+        run: records with one work key, by pair.
         truth: T of each pair.
         picks: reflector positions, instead of a truth.
-        truth_sigma: how well the truth itself is known, per axis: rotation [rad], translation [m].
+        truth_sigma: uncertainty of the truth, per axis: rotation [rad], translation [m].
     """
     if set(run) != set(PAIRS) or any(r.qw is None for r in run.values()):
         return None
@@ -66,7 +66,7 @@ def compare(
         if picks is not None:
             found = {pair: errors_of_picks(pair, of[pair], picks) for pair in PAIRS}
         else:
-            assert truth is not None, "either truth or picks"
+            assert truth is not None, "give either truth or picks"
             found = {
                 pair: errors_at_targets(pair, of[pair], truth[pair], targets_of(run[pair])) for pair in PAIRS
             }

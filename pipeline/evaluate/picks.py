@@ -1,17 +1,19 @@
-"""The file of picked reflectors, the one format that `boresight simulate --reflectors` writes and `evaluate` reads.
+"""The file of picked reflectors, written by `boresight simulate --reflectors` and read by `evaluate`.
 
-    {"vehicle": "vehicle-1", "day": "2026-03-02",        whose mounting it shows; left out: that of every record
+    {"vehicle": "vehicle-1", "day": "2026-03-02",        whose mounting it shows; left out: that of every
+    record
      "frames": 150,                                      of the standing recording
-     "reflector": {"edge_m": 0.35},                      optional: trihedral, edges that meet in its apex; it opens
+     "reflector": {"edge_m": 0.35},                      optional: trihedral, edges that meet in its apex; it
+     opens
                                                          towards the lidar, one edge upright, to 2 deg
      "camera": {"model", "K", "D", "width_px", "height_px"},
      "targets": [{"pixel": [u, v], "lidar_m": [x, y, z], "radar_m": [x, y, z],
                   "spread": {"pixel": [su, sv], "lidar_m": [sx, sy, sz], "radar_m": [sx, sy, sz]},
                   "frames": {"pixel": 1, "lidar_m": 1, "radar_m": 150}}, ...]}
 
-Pixels refer to the full image, (0, 0) the centre of its first pixel; metres in each sensor's own frame. `spread`
-(optional) is the standard deviation of one pick, `frames` how many picks the position is the mean of: its standard
-error is spread / sqrt(frames). Further keys, such as the simulator's `truth`, are not read.
+Pixels refer to the full image, (0, 0) the centre of its first pixel; metres in each sensor's own frame.
+`spread` (optional) is the standard deviation of one pick, `frames` how many picks the position is the mean
+of: its standard error is spread / sqrt(frames). Further keys, such as the simulator's `truth`, are not read.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ _KEYS = ("pixel", "lidar_m", "radar_m")
 
 @dataclass(frozen=True, eq=False)
 class ReflectorFile:
-    """Picks, whose they are, and where each sensor's positions come from."""
+    """Picks of one recording, the vehicle and day that they belong to, and the sources of the positions."""
 
     picks: Picks
     vehicle: str | None
@@ -45,15 +47,15 @@ class ReflectorFile:
     sources: tuple[str, ...]  # sentences
 
     def applies_to(self, vehicle: str, day: str) -> bool:
-        """True where the recording shows the mounting of that vehicle-day."""
+        """True if the recording is valid for the mounting of that vehicle-day."""
         return self.vehicle in (None, vehicle) and self.day in (None, day)
 
 
 def read_reflectors(path: Path) -> ReflectorFile:
-    """The file at `path`.
+    """Read a file of picked reflectors.
 
     Raises:
-        ConfigError: no such file, no JSON, or not of this form.
+        ConfigError: no such file, invalid JSON, or another form.
     """
     try:
         content = json.loads(path.read_text())
@@ -66,7 +68,7 @@ def read_reflectors(path: Path) -> ReflectorFile:
         error = {key: spread[key] / np.sqrt(frames[key].reshape(-1, 1)) for key in _KEYS}
         edge = content.get("reflector", {}).get("edge_m")
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as err:
-        raise ConfigError(str(path), "", f"no readable reflector file: {err!r}") from err
+        raise ConfigError(str(path), "", f"not a readable reflector file: {err!r}") from err
     shapes = [a.shape[1:] for a in (*at.values(), *spread.values())]
     if not targets or shapes != [(2,), (3,), (3,)] * 2 or not all(np.isfinite(a).all() for a in at.values()):
         raise ConfigError(
@@ -90,14 +92,14 @@ def read_reflectors(path: Path) -> ReflectorFile:
 def find_again(
     file: ReflectorFile, lidar: list[Echoes] | None, radar: list[Echoes] | None, where: str
 ) -> ReflectorFile:
-    """The same with lidar and radar positions found in the frames of the recording, near the picks.
+    """The file with lidar and radar positions measured in the frames of the recording, near the picks.
 
-    A reflector that is not found in a sensor keeps its pick there; `sources` says which.
+    A reflector that is not found in a sensor keeps its pick there; `sources` lists those.
 
     Args:
-        file: picks, taken as guesses.
-        lidar: points and intensities of each frame, None where the log has no intensity.
-        radar: points and power of each frame, None where the log has no power.
+        file: picks, used as initial guesses.
+        lidar: points and intensities of each frame; None if the log has no intensity.
+        radar: points and power of each frame; None if the log has no power.
         where: name of the recording, for `sources`.
     """
     picks, edge = file.picks, file.edge_m
@@ -114,7 +116,7 @@ def find_again(
 
 
 def _source(what: str, found: Sequence[Found | None], where: str, picked: str) -> str:
-    """Which reflectors were found in the recording, in how many frames, and what holds for the others."""
+    """Sentence for `sources`: reflectors found in the recording, with frames, and source of the others."""
     hits = [f"{k} ({f.frames} frames)" for k, f in enumerate(found, 1) if f is not None]
     lost = [str(k) for k, f in enumerate(found, 1) if f is None]
     if not hits:
@@ -124,7 +126,7 @@ def _source(what: str, found: Sequence[Found | None], where: str, picked: str) -
 
 
 def _moved(picks: Picks, sensor: str, found: Sequence[Found | None]) -> Picks:
-    """Positions of that sensor, their spread and their sigma, as found."""
+    """Picks with positions, standard deviation and sigma of one sensor replaced by those found."""
     values = {
         "position_m": getattr(picks, sensor).copy(),
         "spread_m": getattr(picks.spread or _none(picks), sensor).copy(),

@@ -1,4 +1,4 @@
-"""The standing reflector recording in table `frames`, and the reflector files of several vehicle-days."""
+"""The standing reflector recording in the lake, and the reflector files of vehicle-days."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ _STANDING_MPS = 0.3  # odometry of a parked car is not exactly zero
 
 
 class ReflectorFiles:
-    """Reflector files by vehicle-day, each read, and its recording searched, once.
+    """Reflector files by vehicle-day; each file is read, and its recording searched, once.
 
     Args:
-        path: a file, or a folder with VEHICLE/DAY.json; None = none at all.
-        recording: lake that the recordings were ingested into, and the day under which if not that of the picks.
+        path: a file, or a folder with VEHICLE/DAY.json; None = no files.
+        recording: lake with the ingested recordings, and their day if it differs from that of the picks.
     """
 
     def __init__(self, path: Path | None, recording: tuple[str, str | None] | None) -> None:
@@ -28,7 +28,7 @@ class ReflectorFiles:
         self._read: dict[Path, ReflectorFile] = {}
 
     def of(self, vehicle: str, day: str) -> ReflectorFile | None:
-        """The file that shows that vehicle-day's mounting; None where there is none."""
+        """The file valid for the mounting of that vehicle-day; None if there is none."""
         if self._path is None:
             return None
         path = self._path / vehicle / f"{day}.json" if self._path.is_dir() else self._path
@@ -40,7 +40,7 @@ class ReflectorFiles:
         return file if file.applies_to(vehicle, day) else None
 
     def notes(self) -> list[str]:
-        """Where the positions come from, in sentences."""
+        """Sources of the positions, as sentences."""
         several = len(self._read) > 1
         notes = [
             f"{path.parent.name}/{path.stem}: {source}" if several else source
@@ -66,7 +66,7 @@ class ReflectorFiles:
 
 
 def standing_echoes(lake: Lake, partition: Partition) -> tuple[list[Echoes] | None, list[Echoes] | None]:
-    """Points and strengths of every frame, lidar and radar; None for a sensor that logs no strength.
+    """Points and intensities of every frame, of lidar and radar; None for a sensor without logged intensity.
 
     Raises:
         ContractError: there is no such partition, or the car moves in it.

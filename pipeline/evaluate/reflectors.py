@@ -1,8 +1,9 @@
-"""Corner reflectors found by themselves in a standing recording, near a guess: lidar by echo and shape, radar by power.
+"""Detection of corner reflectors near a guess: lidar by intensity and shape, radar by power.
 
-A trihedral corner's phase centre is its apex, where its three plates meet: that is what a radar reports and what
-a person marks. No lidar beam meets the apex itself, so it is fitted from the ranges on the plates.
-Source: paper, section 2.1 (three trihedral reflectors, 150 frames, positions in each sensor's own coordinates).
+The phase centre of a trihedral corner is its apex, where its three plates meet. A radar measures the apex,
+and a person marks it. Lidar beams do not hit the apex itself, so it is fitted from the ranges on the plates.
+Source: paper, section 2.1 (three trihedral reflectors, 150 frames, positions in each sensor's own
+coordinates).
 """
 
 from __future__ import annotations
@@ -23,16 +24,16 @@ __all__ = ["Found", "find_in_lidar", "find_in_radar", "robust_mean"]
 Echoes = tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, " N"]]  # points [m], intensity or power [dB]
 
 _CLIP_SIGMAS: Final = 3.5
-_FEWEST_FRAMES: Final = 8  # fewer give no standard error worth its name
-_RADAR_REACH_M, _LIDAR_REACH_M = 1.5, 1.0  # of the guess: in top view, and in space
+_FEWEST_FRAMES: Final = 8  # with fewer frames the standard error is unreliable
+_RADAR_REACH_M, _LIDAR_REACH_M = 1.5, 1.0  # search radius about the guess: in top view, and in space
 _BRIGHT: Final = 0.5  # of the brightest echo near the guess
-# Bare metal against the median echo of a lot, asphalt; a tripod reaches half of that.
+# Intensity of bare metal over the median of the scene, asphalt; a tripod reaches half of that.
 _OVER_MEDIAN: Final = 4.0
-_CELL_RAD: Final = np.radians(0.1)  # returns of one beam of a standing sensor fall into one cell
-_RANGE_SIGMA_M: Final = 0.02  # of a beam's mean range on a plate: mixed returns, steps of the range counter
+_CELL_RAD: Final = np.radians(0.1)  # returns of one beam of a standing sensor are in one cell
+_RANGE_SIGMA_M: Final = 0.02  # of a beam's mean range on a plate: mixed returns, range quantisation
 _FACING_SIGMA_RAD: Final = np.radians(
     2.0
-)  # how well a person turns a reflector to the car, and the lidar's own tilt
+)  # alignment of a reflector to the car by hand, and tilt of the lidar
 _BLOCKS: Final = 8
 
 
@@ -43,15 +44,15 @@ class Found:
     position_m: np.ndarray  # 3
     sigma_m: np.ndarray  # 3, standard error of the position, per axis
     spread_m: np.ndarray  # 3, standard deviation of one frame's position
-    frames: int  # that the position rests on
+    frames: int  # number of frames used
 
 
 def robust_mean(
     samples: Float[np.ndarray, "N 3"],
 ) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"], int]:
-    """Mean and standard deviation of the samples within 3.5 robust sigmas of the median on every axis, and their count.
+    """Mean, standard deviation and number of samples within 3.5 robust sigmas of the median on every axis.
 
-    Sigma is 1.4826 times the median absolute deviation; the samples are one frame's position each.
+    Robust sigma is 1.4826 times the median absolute deviation; each sample is the position in one frame.
     """
     off = np.abs(samples - np.median(samples, axis=0))
     sigma = 1.4826 * np.median(off, axis=0)
@@ -62,10 +63,10 @@ def robust_mean(
 
 
 def find_in_radar(frames: Sequence[Echoes], guess_m: Float[np.ndarray, " 3"]) -> Found | None:
-    """Robust mean of the strongest detection of every frame that lies near the guess in top view.
+    """Robust mean of the strongest detection near the guess in every frame, in top view.
 
-    Top view, because a radar's elevation is off by metres where the ground reflects too. At one range the
-    strongest echo is the largest radar cross-section. None where fewer than 8 frames hold one.
+    Elevation is ignored, because ground reflections change a radar's elevation by metres. At equal range the
+    strongest echo has the largest radar cross-section. None if fewer than 8 frames have one.
     """
     strongest = []
     for points, power_db in frames:
@@ -83,18 +84,18 @@ def find_in_lidar(
     guess_m: Float[np.ndarray, " 3"],
     edge_m: float | None = None,
 ) -> Found | None:
-    """Apex of a trihedral from the bright echoes near the guess; their plain centre where its edge is unknown.
+    """Apex of a trihedral from the bright echoes near the guess; if its edge is unknown, their centre.
 
     Args:
         frames: points and intensities of each standing frame, lidar frame.
-        guess_m: where it stands, roughly.
-        edge_m: length of the edges that meet in the apex. The reflector opens towards the sensor with one edge
-            upright, to 2 deg per axis, and the fit may turn it within that.
+        guess_m: approximate position.
+        edge_m: length of the edges that meet in the apex. The reflector opens towards the sensor with one
+            edge upright, to 2 deg per axis; the fit may rotate it within that.
 
     Returns:
-        None where fewer than 8 frames hold a bright echo, or where its beams leave the apex open by more than a
-        quarter of an edge (one sigma). sigma_m holds the scatter between frames and what the
-        few standing beams leave open; without edge_m, the apex lies deeper than the returned centre.
+        None if fewer than 8 frames have a bright echo, or if the sigma of the apex is above a quarter of an
+        edge. sigma_m includes the scatter between frames and the geometry of the few standing beams. Without
+        edge_m the apex is deeper than the returned centre.
     """
     bright = [b for points, intensity in frames if len(b := _bright(points, intensity, guess_m))]
     if len(bright) < _FEWEST_FRAMES:
@@ -122,10 +123,10 @@ def _bright(points: np.ndarray, intensity: np.ndarray, guess_m: np.ndarray) -> n
 
 
 def _fit_apex(points: np.ndarray, edge_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Apex and its sigma: where a ray leaves the corner of three planes through the apex is the range it measured."""
+    """Apex and its sigma: fits measured ranges to the exit of each ray from the corner of three planes."""
     rays, range_m = _by_beam(points)
     centre = (rays * range_m[:, None]).mean(axis=0)
-    # The centre of a plate lies 2/3 of an edge's depth in front of the apex: edge / sqrt(3) * 2/3.
+    # The centroid of the plates is 2/3 of the corner's depth in front of the apex: edge / sqrt(3) * 2/3.
     start = centre * (1 + edge_m * 2 / np.sqrt(27) / np.linalg.norm(centre))
     edges = _facing(start)
 
@@ -135,7 +136,7 @@ def _fit_apex(points: np.ndarray, edge_m: float) -> tuple[np.ndarray, np.ndarray
             t = (plates @ (start + x[:3])) / (rays @ plates.T)
         at = np.where(t > 0, t, np.inf).min(axis=1)
         miss = np.where(np.isfinite(at), at - range_m, 10.0) / _RANGE_SIGMA_M
-        # The echoes' centre holds the apex where the beams are too few: half an edge across.
+        # With too few beams, the centre of the echoes limits the apex: half an edge across.
         return np.concatenate([miss, x[:3] / (edge_m / 2), x[3:] / _FACING_SIGMA_RAD])
 
     found = least_squares(residuals, np.zeros(6), loss="soft_l1", x_scale=0.05)
@@ -144,7 +145,7 @@ def _fit_apex(points: np.ndarray, edge_m: float) -> tuple[np.ndarray, np.ndarray
 
 
 def _by_beam(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean direction and median range of each cell of directions that a good part of the returns fall into."""
+    """Mean direction and median range of each cell of directions with a sufficient share of the returns."""
     spherical = to_spherical(points)
     _, cell, counts = np.unique(
         np.round(spherical[:, :2] / _CELL_RAD), axis=0, return_inverse=True, return_counts=True
@@ -157,7 +158,7 @@ def _by_beam(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _facing(apex: np.ndarray) -> np.ndarray:
-    """Unit edges (rows) of a trihedral that opens along the level line to the sensor, one edge in the upright plane."""
+    """Unit edges (rows) of a trihedral that opens level towards the sensor, with one edge vertical."""
     towards = -apex * [1, 1, 0] / np.linalg.norm(apex[:2])
     side, up = np.array([-towards[1], towards[0], 0.0]), np.array([0.0, 0.0, 1.0])
     turns = np.radians([90.0, 210.0, 330.0])

@@ -1,4 +1,4 @@
-"""All runs of a lake beside what is known of their vehicles: a truth, or picked reflectors."""
+"""All runs of a lake with the truth or picked reflectors of their vehicles."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ def compare_runs(
     files: ReflectorFiles,
     truth_sigma: tuple[float, float],
 ) -> tuple[list[ComparedRun], dict[str, int]]:
-    """Every current run that has a truth, and how many have none or no result.
+    """Compare every current run that has a truth; also returns the number of runs without a truth or result.
 
     Args:
         records: of any vehicles, days and methods.
-        truth: JSON with transforms, or a folder with VEHICLE/DAY.json; None where `files` hold reflectors.
+        truth: JSON with transforms, or a folder with VEHICLE/DAY.json; None if `files` has reflectors.
         files: reflector positions.
-        truth_sigma: how well the truth is known, per axis: rotation [rad], translation [m].
+        truth_sigma: uncertainty of the truth, per axis: rotation [rad], translation [m].
     """
     compared, counts = [], {"refused_runs": 0, "runs_without_truth": 0}
     for run in current_runs(records):

@@ -1,7 +1,7 @@
-"""Table 1 and extended data table 1 of the paper: our rows beside the printed ones, as Markdown and as Parquet.
+"""Table 1 and extended data table 1 of the paper: our rows beside the printed ones, in Markdown or Parquet.
 
-The printed rows were measured with other sensors on other roads ("other data"): they say what the rows mean and what
-order of size is known, not who is better. Methods without a record keep their row, with dashes.
+The printed rows come from other sensors on other roads ("other data"). They show the meaning and the order of
+magnitude of the rows; they are no ranking. Methods without a record have a row with dashes.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ COLUMNS = (
 _TABLES = {"all": "Table 1", "highway": "Extended data table 1", "urban": "Extended data table 1"}
 _NAN = float("nan")
 _CLOSED = 1e-6  # degrees or metres: rounding of stored quaternions
-# Method, environment, the name that the paper prints, COLUMNS. Camera pairs have no range in the paper either.
+# Method, environment, name printed in the paper, COLUMNS. Camera pairs have no range in the paper either.
 _PAPER: tuple[tuple[str, str, str, tuple[float, ...]], ...] = (
     ("tracking", "all", "object tracking [60]", (0.55, 2.01, 1.92, 3.13, 1.46, 1.87, 0.22, _NAN, _NAN, _NAN)),
     (
@@ -76,19 +76,19 @@ class TableRow:
     environment: str
     source: str  # ours, or paper (other data)
     runs: int | None
-    values: tuple[float, ...]  # COLUMNS, NaN where there is none
+    values: tuple[float, ...]  # COLUMNS, NaN = no value
     accepted_pairs: int | None = None
     pairs: int | None = None
-    # Of pairs estimated apart: a check, where a method closes the loop itself.
+    # Loop of independently estimated pairs: a check for methods that close the loop by construction.
     independent_loop_deg: float | None = None
     independent_loop_m: float | None = None
 
 
 def table_rows(comparisons: Sequence[Comparison]) -> list[TableRow]:
-    """All lines: the prior, what the truth itself is worth, then each method with the paper's line below ours.
+    """All rows: the prior, the uncertainty of the truth, then each method with the paper's row below ours.
 
-    A line is the mean over runs (and reflectors) of absolute errors, as in the paper; environment "all" counts every
-    run, highway and urban those whose drives were only that.
+    A row is the mean of absolute errors over runs (and reflectors), as in the paper; environment "all"
+    includes every run, highway and urban only runs whose drives were all of that kind.
     """
     rows = [*_reference_rows(comparisons)]
     for environment, table in _TABLES.items():
@@ -107,12 +107,12 @@ def table_rows(comparisons: Sequence[Comparison]) -> list[TableRow]:
 def as_markdown(
     rows: Sequence[TableRow], comparisons: Sequence[Comparison], notes: Sequence[str] = ()
 ) -> dict[str, str]:
-    """Markdown of each table by its title, the honesty of the sigmas below Table 1.
+    """Markdown of each table by title; below Table 1, the calibration of the sigmas.
 
     Args:
-        rows: of `table_rows`.
-        comparisons: what they were made from.
-        notes: sentences on where the truth comes from, printed below Table 1.
+        rows: from `table_rows`.
+        comparisons: the comparisons that the rows were made from.
+        notes: sentences on the source of the truth, printed below Table 1.
     """
     texts = {}
     for title in dict.fromkeys(_TABLES.values()):
@@ -126,7 +126,7 @@ def as_markdown(
 
 
 def as_parquet(rows: Sequence[TableRow], notes: Sequence[str] = ()) -> bytes:
-    """The same lines as one Parquet file: degrees and metres, null for a dash, notes in the footer."""
+    """The rows as one Parquet file: degrees and metres, null for a dash, notes in the footer."""
     names = ("table", "method", "environment", "source", "runs", "accepted_pairs", "pairs")
     integers = {"runs", "accepted_pairs", "pairs"}
     arrays = {
@@ -152,7 +152,7 @@ _HEADER = (
 
 
 def _reference_rows(comparisons: Sequence[Comparison]) -> list[TableRow]:
-    """What the prior's error was, and how far the truth itself may be off."""
+    """Rows for the error of the prior and the uncertainty of the truth."""
     if not comparisons:
         return []
     rows = [_mean_row("(prior)", [c.prior_errors for c in comparisons])]
@@ -190,7 +190,7 @@ def _our_row(table: str, method: str, environment: str, members: Sequence[Compar
 
 
 def _loop_remarks(rows: Sequence[TableRow]) -> list[str]:
-    """A loop that a method closes by construction says nothing; that of its independent pair estimates does."""
+    """Notes on methods that close the loop by construction: the loop of their independent pair estimates."""
     closed = [
         r
         for r in rows
@@ -224,7 +224,7 @@ def _values(errors: Sequence[Mapping[str, np.ndarray]]) -> tuple[float, ...]:
 
 def _line(row: TableRow) -> str:
     v = row.values
-    digits = 3 if row.source == "ours" else 2  # as many as the paper prints
+    digits = 3 if row.source == "ours" else 2  # number of digits printed in the paper
     cells = " | ".join(_join(part, digits) for part in (v[:2], v[2:4], v[4:7], v[7:]))
     runs = "other data" if row.runs is None else str(row.runs)
     share = f"{row.accepted_pairs} of {row.pairs} pairs" if row.pairs else ""

@@ -1,14 +1,15 @@
-"""Which sensor moved: the one whose motion explains the shifts of all edges.
+"""Attribution of edge changes to the sensor that moved.
 
-A sensor that moves by xi in its own axes shifts the edges that it is an end of, consistently, and leaves all others
-alone:
+A sensor that moves by xi in its own axes changes the edges at which it is an end, consistently, and no
+others:
 
     its edges as parent:  T_sensor_other' = exp(-xi) T_sensor_other
     its edges as child:   T_other_sensor' = T_other_sensor exp(xi)
 
-With `T exp(xi) = exp(Ad_T xi) T` each is linear in xi, so each sensor's best motion is one generalised least squares
-fit. A leaf of one edge is told from the sensor that it hangs on by that one's other edges, which stay. The vehicle
-frame is a node like the others: that `base` moved means that all sensors moved against the road.
+With `T exp(xi) = exp(Ad_T xi) T` each change is linear in xi, so the best motion of each sensor is one
+generalised least squares fit. A sensor with a single edge is distinguished from its neighbour by the
+neighbour's other edges, which do not change. The vehicle frame is a node like the others: if `base` moved,
+all sensors moved relative to the road.
 """
 
 from __future__ import annotations
@@ -29,17 +30,17 @@ __all__ = ["Attribution", "Moved", "PairShift", "attribute"]
 
 _Who = TypeVar("_Who", str, tuple[str, str])
 _CLEAR_PROBABILITY = 0.95
-# A best motion that explains the shifts worse than this is not the whole story ...
+# A best motion with a smaller probability of its residual does not explain the changes ...
 _MISFIT_PROBABILITY = 1e-3
-_KNOWN = 1e9  # degrees of freedom: as good as infinitely many, for which SciPy's F has no value
-_WHOLE_STORY = 0.99  # ... unless it explains this share of them (of chi-squared): sigmas are estimates
-# Of three sensors, any two that move against the third explain all: two are looked for among more.
+_KNOWN = 1e9  # degrees of freedom treated as infinite, for which SciPy's F has no value
+_WHOLE_STORY = 0.99  # ... unless it explains this share of their chi-squared: sigmas are estimates
+# With three sensors, any two moving against the third explain every change: pairs need more than three.
 _FEWEST_FOR_TWO = 4
 
 
 @dataclass(frozen=True, eq=False)
 class PairShift:
-    """Twist (left perturbation, parent axes [rad, m]) by which an edge changed, its 6x6 covariance, at `T`."""
+    """Change of an edge as twist (left perturbation, parent axes [rad, m]), 6x6 covariance, and T."""
 
     T: np.ndarray
     xi: np.ndarray
@@ -48,7 +49,7 @@ class PairShift:
 
 @dataclass(frozen=True, eq=False)
 class _Weighed:
-    """A shift with what every fit needs of it: its weight, what it weighs, and the adjoint of T."""
+    """A change with precomputed parts of every fit: its weight, its weighted value, and the adjoint of T."""
 
     xi: np.ndarray
     W: np.ndarray
@@ -63,7 +64,7 @@ class _Weighed:
 
 @dataclass(frozen=True, eq=False)
 class Moved:
-    """How a sensor moved: motion (rotation vector [rad], shift [m]) in its own axes, and how surely it was this one."""
+    """Motion of a sensor in its axes (rotation vector [rad], shift [m]), and probability that it moved."""
 
     probability: float
     motion: np.ndarray
@@ -72,12 +73,12 @@ class Moved:
 
 @dataclass(frozen=True, eq=False)
 class Attribution:
-    """What moved, and why that is said.
+    """Sensors that moved, with explanation and probabilities.
 
     Args:
-        explanation: in words.
-        moved: by name the sensors that moved, one or two; none where the days cannot tell.
-        probability: of each sensor against the others, given that exactly one of them moved.
+        explanation: sentence for records and pages.
+        moved: sensors that moved, by name, one or two; empty if the days cannot decide.
+        probability: probability of each sensor, given that exactly one of them moved.
     """
 
     explanation: str
@@ -86,21 +87,22 @@ class Attribution:
 
     @property
     def sensor(self) -> str | None:
-        """The sensor that moved, of two the first; None where the days cannot tell."""
+        """The sensor that moved, the first if two did; None if the days cannot decide."""
         return next(iter(self.moved), None)
 
     def on(self, edge: Edge) -> str | None:
-        """The sensor that an edge shows: the one of two that is an end of it, else the first."""
+        """The moved sensor at an end of this edge; if neither is, the first."""
         ends = [sensor.name for sensor in edge.sensors]
         return next((name for name in self.moved if name in ends), self.sensor)
 
 
 def attribute(shifts: Mapping[Edge, PairShift], known_by: float = np.inf) -> Attribution:
-    """Decide between the sensors of a rig.
+    """Decide which sensors of a rig moved.
 
     Args:
-        shifts: by edge, of edges whose errors are their own; at least two, else nothing can be told apart.
-        known_by: degrees of freedom that the scale of the covariances is known to; inf = it is known.
+        shifts: changes by edge, with independent errors; at least two edges, otherwise no decision is
+            possible.
+        known_by: degrees of freedom of the estimated scale of the covariances; inf = the scale is known.
     """
     if len(shifts) < 2:
         names = [sensor.name for edge in shifts for sensor in edge.sensors]
@@ -131,7 +133,7 @@ def attribute(shifts: Mapping[Edge, PairShift], known_by: float = np.inf) -> Att
 def _two(
     names: Sequence[str], shifts: Mapping[Edge, _Weighed], total: float, known_by: float
 ) -> dict[str, Moved]:
-    """The two sensors that explain what none does alone; empty where no two do, or not clearly these."""
+    """Two sensors that explain the changes together; empty if no pair does, or not clearly."""
     freedom = 6 * len(shifts) - 12
     if len(names) < _FEWEST_FOR_TWO or freedom <= 0:
         return {}
@@ -148,16 +150,16 @@ def _two(
 
 
 def _shares(cost: Mapping[_Who, float]) -> dict[_Who, float]:
-    """Probabilities of explanations by their chi-squared, none likelier than another before."""
+    """Probabilities of explanations from chi-squared, with equal prior probabilities."""
     least = min(cost.values())
     share = {who: float(np.exp(-0.5 * (c - least))) for who, c in cost.items()}
     return {who: value / sum(share.values()) for who, value in share.items()}
 
 
 def _explains(cost: float, total: float, freedom: int, known_by: float) -> bool:
-    """Whether what an explanation leaves is noise, or next to nothing.
+    """True if the residual of an explanation is noise or negligible.
 
-    What is left, over a scale that the vehicle's own few days gave: F, not chi-squared (Hotelling 1931).
+    The scale of the residual was estimated from a few days, hence F instead of chi-squared (Hotelling 1931).
     """
     chance = f_distribution.sf(cost / freedom, freedom, min(known_by, _KNOWN))
     return bool(chance >= _MISFIT_PROBABILITY or cost <= (1 - _WHOLE_STORY) * total)
@@ -166,7 +168,7 @@ def _explains(cost: float, total: float, freedom: int, known_by: float) -> bool:
 def _fit(
     moving: Sequence[str], shifts: Mapping[Edge, _Weighed]
 ) -> tuple[float, Float[np.ndarray, " P"], Float[np.ndarray, "P P"]]:
-    """Chi-squared, motions and covariance of the best motions of some sensors, six numbers each."""
+    """Chi-squared, best motions and their covariance for moving sensors, six numbers each."""
     size = 6 * len(moving)
     information, moment, total = np.zeros((size, size)), np.zeros(size), 0.0
     for edge, shift in shifts.items():
@@ -175,7 +177,7 @@ def _fit(
             H = _design(moving, edge, shift)
             information += H.T @ shift.W @ H
             moment += H.T @ shift.W @ shift.xi
-    # Two sensors that share their only edge cannot be told apart: the least motion of both.
+    # Two sensors whose only edge joins them cannot be distinguished: minimum-norm motion of both.
     covariance = (
         np.linalg.inv(information) if len(moving) == 1 else np.linalg.pinv(information, hermitian=True)
     )

@@ -1,4 +1,4 @@
-"""One failed check of a calibration, as it travels from the solver or the judge into a record."""
+"""One failed check of a calibration, passed from solvers and verification to the record."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ __all__ = ["FailedCheck", "faults_of"]
 
 @dataclass(frozen=True)
 class FailedCheck:
-    """What failed, in a sentence, and the fault of `schemas.faults` behind it where the check can name one."""
+    """Sentence about a failed check, and its fault in `schemas.faults` if it has one."""
 
     sentence: str
-    fault: str = ""  # key of FAULTS; empty where the check shows that something is wrong, but not what
-    disproves: bool = False  # the pose is wrong, not only unproved: nobody should use it
+    fault: str = ""  # key of FAULTS; empty if the check cannot name the cause
+    disproves: bool = False  # the pose is certainly wrong and must not be used, not only unproved
 
     def __post_init__(self) -> None:
         assert not self.fault or self.fault in FAULTS, self.fault
 
 
 def faults_of(checks: Iterable[FailedCheck]) -> list[str]:
-    """Faults that the checks name, each once, in order."""
+    """Faults of the checks, each once, in order."""
     return list(dict.fromkeys(check.fault for check in checks if check.fault))

@@ -1,8 +1,9 @@
-"""Which part of a day's covariance all days of a vehicle have in common.
+"""Part of a day's covariance from errors common to all days of a vehicle.
 
-A day's error has two parts. One is drawn anew every day: what scenes and noise leave. The other is the same every day,
-so that no number of days averages it down, and a change from one day to the next does not show it: bias floors (masks,
-intrinsics, how a radar sees cars), and the error of the prior, as far as each day's estimate rests on it.
+The error of a day has two parts. One is independent from day to day: scenes and noise. The other is the same
+every day: bias floors (masks, intrinsics, reflections of cars in radar) and the error of the prior, as far as
+estimates depend on it. Averaging over days does not reduce the common part, and changes between days do not
+contain it.
 """
 
 from __future__ import annotations
@@ -16,10 +17,10 @@ __all__ = ["common_of", "common_part", "prior_share"]
 def prior_share(
     covariance: Float[np.ndarray, "P P"], prior_information: Float[np.ndarray, "P P"]
 ) -> Float[np.ndarray, "P P"]:
-    """Covariance of a MAP estimate by the prior's own error: `C P^-1 (error of the prior)` is what it adds.
+    """Covariance of a MAP estimate due to its prior, whose error adds `C P^-1 (prior's error)` to it.
 
     Args:
-        covariance: C, of the estimate, its floors left out.
+        covariance: C, of the estimate, without floors.
         prior_information: P^-1.
     """
     share = covariance @ prior_information @ covariance
@@ -29,11 +30,11 @@ def prior_share(
 def common_part(
     common: Float[np.ndarray, "P P"], covariance: Float[np.ndarray, "P P"]
 ) -> Float[np.ndarray, "P P"]:
-    """`common`, in no direction more than `covariance`, so that what is left of it is a covariance too.
+    """`common`, limited to `covariance` in every direction, so that the difference is a covariance too.
 
     Args:
-        common: what days err by alike, from approximations.
-        covariance: of the estimate, positive definite.
+        common: approximate covariance of the common errors.
+        covariance: covariance of the estimate, positive definite.
     """
     scale = 1 / np.sqrt(np.diag(covariance))
     L = np.linalg.cholesky(covariance * np.outer(scale, scale))
@@ -48,11 +49,11 @@ def common_of(
     prior_covariance: Float[np.ndarray, "6 6"],
     bias: Float[np.ndarray, "6 6"],
 ) -> Float[np.ndarray, "6 6"]:
-    """The common part of an estimate whose method states one bias and one prior.
+    """Common covariance of an estimate with one bias floor and one prior.
 
     Args:
-        covariance: of the estimate, all included.
-        prior_covariance: before the day.
+        covariance: total covariance of the estimate.
+        prior_covariance: covariance of the prior.
         bias: covariance of the bias floor.
     """
     return common_part(bias + prior_share(covariance, np.linalg.inv(prior_covariance)), covariance)

@@ -1,4 +1,4 @@
-"""What lies between two calibrations, or between a run and its truth: measured by one room, shown by another."""
+"""Differences between two calibrations, or between a run and its truth."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ __all__ = ["ComparedRun", "Comparison", "PairDifference"]
 
 @dataclass(frozen=True, eq=False)
 class PairDifference:
-    """What leads from A's estimate of a pair to B's.
+    """Change from A's estimate of a pair to B's.
 
     Args:
-        edge: of two sensors.
+        edge: edge between the two sensors.
         statuses: of A and B.
         change: rotation vector [rad], shift of the child's origin [m], along the axes of the parent.
-        sigma: of it; None where neither side states any.
-        determined: per DoF, both sides' data did, or are taken as given.
-        targets_rad: how far azimuth and elevation of targets 15 to 40 m away move, root mean square.
+        sigma: sigmas of the change; None if neither side has any.
+        determined: per DoF, determined by the data of both sides, or given.
+        targets_rad: change of azimuth and elevation of targets 15 to 40 m away, root mean square.
     """
 
     edge: Edge
@@ -38,37 +38,37 @@ class PairDifference:
 
     @property
     def pair(self) -> str:
-        """The edge in words."""
+        """Text for the edge."""
         return words_of(self.edge)
 
     @property
     def z(self) -> Float[np.ndarray, " 6"] | None:
-        """The change in its sigmas."""
+        """The change in units of sigma; None without sigmas."""
         return None if self.sigma is None else self.change / self.sigma
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """One run (all pairs of one work key) against the truth."""
+    """Errors of one run (all pairs with one work key) against the truth."""
 
     method: str
     environment: str
     errors: dict[str, np.ndarray]  # pair or "loop" -> azimuth, elevation [rad], range [m]
     prior_errors: dict[str, np.ndarray]
     statuses: dict[str, str]
-    normalised: np.ndarray  # error / sigma of every observable DoF of every pair
-    # Angle [rad] and shift [m] of pairs estimated apart; the shift is None where they did not determine it.
+    normalised: np.ndarray  # error / sigma of every observable DoF of all pairs
+    # Loop of independently estimated pairs: angle [rad] and shift [m]; the shift is None if not determined.
     independent_loop: tuple[float, float | None] | None = None
     truth_spread: dict[str, np.ndarray] = field(
         default_factory=dict
-    )  # like errors: spread of one frame's picks
+    )  # like errors: standard deviation of the picks in one frame
     truth_sigma: dict[str, np.ndarray] = field(
         default_factory=dict
-    )  # and what is left of it in the truth, 1 sigma
+    )  # like errors: 1 sigma of the mean picked positions
 
 
 class ComparedRun(NamedTuple):
-    """One run (records by pair), what it was compared with, and the result."""
+    """One run (records by pair), the truth or picks it was compared with, and the result."""
 
     run: dict[str, CalibrationRecord]
     truth: dict[str, np.ndarray] | None

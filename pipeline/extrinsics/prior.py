@@ -1,4 +1,4 @@
-"""The prior of a vehicle-day: from tf_static as logged, or from a file; moved on purpose for tests."""
+"""Prior of a vehicle-day: from logged tf_static or from a file; perturbed for tests."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ __all__ = [
 
 
 def read_prior(observations: Sequence[Observation], fleet: FleetConfig, vehicle: str) -> Prior:
-    """The prior of one sensor of each kind (`Rig.one_of_each`) as the vehicle's rig says: logged, or from a file.
+    """The prior of one camera, lidar and radar (`Rig.one_of_each`), from the logs or from the rig's file.
 
     Raises:
-        SolveError: no frame carries a tf_static prior, or it changes over the day.
+        SolveError: no frame has a tf_static prior, or it changes over the day.
         ConfigError: unknown vehicle, or the prior file cannot be read.
     """
     rig = fleet.rig_of(vehicle)
@@ -45,16 +45,16 @@ def read_prior(observations: Sequence[Observation], fleet: FleetConfig, vehicle:
 
 
 def rig_prior(rows: Iterable[Mapping[str, Any]], fleet: FleetConfig, rig: Rig) -> RigPrior:
-    """The prior of all sensors of a rig: as logged, or from the file that the rig names.
+    """The prior of all sensors of a rig, from the logs or from the rig's file.
 
     Args:
-        rows: what ingest says in its manifest under `schemas.moments.PRIOR`.
-        fleet: which the file's path is relative to.
-        rig: sigmas are its sensors' own, else its own.
+        rows: `schemas.moments.PRIOR` of ingest's manifest.
+        fleet: configuration; file paths are relative to it.
+        rig: the rig, with sigmas of its sensors or one for all.
 
     Raises:
-        SolveError: the logs carry no transform between any two sensors, or one changes over the day.
-        ConfigError: the prior file cannot be read, or is not of this rig.
+        SolveError: the logs have no transform between any two sensors, or one changes over the day.
+        ConfigError: the prior file cannot be read, or belongs to another rig.
     """
     return _prior(lambda: from_rows(rows), fleet, rig)
 
@@ -73,9 +73,9 @@ def _prior(logged: Callable[[], Star], fleet: FleetConfig, rig: Rig) -> RigPrior
 def prior_of_three(
     prior: RigPrior, rig: Rig, camera: str | None, lidar: str | None, radar: str | None
 ) -> Prior:
-    """The prior of up to one sensor of each kind, for what thinks in a camera, a lidar and a radar; None = without it.
+    """The prior of one camera, one lidar and one radar, for three-sensor methods; None = without that sensor.
 
-    Its sigmas are those of the transform that is known worst.
+    Its sigmas are those of the least certain transform.
     """
     names = {"camera": camera, "lidar": lidar, "radar": radar}
     T, sigmas = dict[str, np.ndarray](), list[tuple[float, float]]()
@@ -84,7 +84,7 @@ def prior_of_three(
         known = prior.between(a, b)
         if known is not None:
             T[pair] = known
-            # Camera-radar follows from the other two where the lidar's place is known.
+            # Camera-radar follows from the other two if the lidar's pose is known.
             sigmas += [prior.sigmas_between(a, b)] if pair != "camera_radar" else []
     if not sigmas and "camera_radar" in T:
         sigmas = [prior.sigmas_between(camera or "", radar or "")]
@@ -100,7 +100,7 @@ def prior_of_three(
 
 
 def _carried(observations: Sequence[Observation], names: Sequence[str]) -> list[Star]:
-    """The transforms that the logs of observations carry: those of one log share theirs."""
+    """Transforms in the logs of observations; observations from one log have the same."""
     ends = {
         pair: tuple(names[SENSORS.index(kind)] for kind in kinds) for pair, kinds in FRAMES_OF_PAIR.items()
     }
@@ -109,15 +109,15 @@ def _carried(observations: Sequence[Observation], names: Sequence[str]) -> list[
 
 
 def no_prior(pair: str) -> str:
-    """What a day or a pair without a prior is refused with."""
+    """Reason for refusing a day or a pair without a prior."""
     return f'no prior: the logs have no tf_static chain for {pair}; give prior.source = "file"'
 
 
 def perturbed(prior: Prior, perturb: tuple[float, float] | None, seed: int) -> Prior:
-    """The prior moved by an exact angle [deg] and shift [m] on all transforms, with sigmas that allow for it.
+    """The prior with all transforms moved by an exact angle [deg] and shift [m]; sigmas at least as large.
 
-    The sigmas become max(configured sigma, size of the perturbation): whoever moves a prior on purpose knows
-    how far, as a workshop knows its tolerance, but not which way.
+    The sigmas become max(configured sigma, size of the perturbation): the size is known, like the tolerance
+    of a workshop, but the direction is not.
     """
     if perturb is None:
         return prior
@@ -137,7 +137,7 @@ def perturbed(prior: Prior, perturb: tuple[float, float] | None, seed: int) -> P
 
 
 def prior_key(fleet: FleetConfig, vehicle: str) -> str:
-    """Hash of the prior file's content for the work key; empty where the prior is logged."""
+    """Hash of the prior file's content, for the work key; empty if the prior is logged."""
     file = fleet.rig_of(vehicle).prior.file
     if file is None:
         return ""
@@ -149,9 +149,10 @@ def prior_key(fleet: FleetConfig, vehicle: str) -> str:
 
 
 def require_named_files(fleet: FleetConfig) -> None:
-    """Raise ConfigError for a model or prior that the configuration names and that is missing, or a prior that is none.
+    """Raise ConfigError for a missing model or prior file in the configuration, or an invalid prior file.
 
-    For commands that read logs: before the first one is opened, not after a night.
+    Commands that read logs call it before they open the first one, so that the error does not come after a
+    night.
     """
     fleet.require_files()
     for rig in {v.rig for v in fleet.vehicles.values()}:
@@ -161,13 +162,13 @@ def require_named_files(fleet: FleetConfig) -> None:
 
 
 def _sigmas(prior: SensorPrior) -> tuple[float, float]:
-    """Of rotation [rad] and translation [m]."""
+    """Sigmas of rotation [rad] and translation [m]."""
     assert prior.rotation_sigma_deg is not None
     assert prior.translation_sigma_m is not None
     return float(np.radians(prior.rotation_sigma_deg)), prior.translation_sigma_m
 
 
 def _only(rig: Rig) -> tuple[str | None, str | None, str | None]:
-    """Names of the only sensor of each kind, or of the three that the rig names; ConfigError where neither is."""
+    """Names of the only sensor of each kind, or of the rig's `three`; ConfigError if there is neither."""
     names = rig.one_of_each("this")
     return names.get("camera"), names.get("lidar"), names.get("radar")

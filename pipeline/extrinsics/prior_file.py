@@ -1,4 +1,4 @@
-"""Prior files: poses of all sensors in one of them, or the two matrices of a camera, a lidar and a radar."""
+"""Prior files: poses of all sensors relative to one, or two matrices for a camera, a lidar and a radar."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from schemas.calibrations import FRAMES_OF_PAIR, SENSORS, pairs_of
 __all__ = ["read_star", "read_transforms"]
 
 _KEYS = {"T_camera_lidar", "T_lidar_radar", "T_radar_lidar", "T_camera_radar"}
-_SAME = 1e-6  # rad and m, of numbers that were written and not measured
+_SAME = 1e-6  # rad and m: tolerance for written numbers, which have no noise
 
 
 def read_star(path: Path, rig: Rig) -> dict[tuple[str, str], Float[np.ndarray, "4 4"]]:
     """Transforms between a rig's sensors, by (parent, child).
 
-    The file says {"reference": "top", "T": {"front": 4x4, ...}} with T_reference_sensor, row-major, of every sensor of
-    the rig and of `base` where it has that. Of a rig with one sensor of each kind it may say T_camera_lidar and
-    T_lidar_radar.
+    The file has the form {"reference": "top", "T": {"front": 4x4, ...}} with T_reference_sensor, row-major,
+    for every sensor of the rig and for `base` if the rig has one. For a rig with one sensor of each kind it
+    may have T_camera_lidar and T_lidar_radar instead.
 
     Raises:
-        ConfigError: not such a file, a sensor that it lacks or the rig lacks, or no rigid transforms.
+        ConfigError: another form, missing or unknown sensors, or matrices that are not rigid transforms.
     """
     content = _content(path)
     if "T" in content:
@@ -38,20 +38,20 @@ def read_star(path: Path, rig: Rig) -> dict[tuple[str, str], Float[np.ndarray, "
     kinds = {str(node.kind): node for node in rig.nodes}
     if len(kinds) < len(rig.nodes) or "base" in kinds:
         wanted = '{"reference": "%s", "T": {...}}' % (rig.reference or middle_of(rig.nodes).name)
-        raise ConfigError(str(path), "T", f"missing: {_listed(rig.nodes)} need a file that says {wanted}")
+        raise ConfigError(str(path), "T", f"missing: {_listed(rig.nodes)} need a file with {wanted}")
     found = read_transforms(path, [node.kind for node in rig.nodes])
     names = {pair: (kinds[a].name, kinds[b].name) for pair, (a, b) in FRAMES_OF_PAIR.items() if pair in found}
     return {names[pair]: T for pair, T in found.items() if len(found) == 1 or pair != "camera_radar"}
 
 
 def read_transforms(path: Path, sensors: Sequence[str] = SENSORS) -> dict[str, Float[np.ndarray, "4 4"]]:
-    """Transforms from a JSON file, by pair: T_camera_lidar and T_lidar_radar (or T_radar_lidar), 4x4 row-major.
+    """Transforms from a JSON file by pair: T_camera_lidar, T_lidar_radar (or T_radar_lidar), 4x4 row-major.
 
-    A file of several such objects by name (one per log) must agree with itself. Of a rig with two sensors their
-    transform alone is read; T_camera_radar may be given as the product of the other two.
+    In a file with several such objects by name (one per log), all must agree. For a rig with two sensors only
+    their transform is read; T_camera_radar may be given as the product of the other two.
 
     Raises:
-        ConfigError: not such a file, or not rigid transforms.
+        ConfigError: another form, or matrices that are not rigid transforms.
     """
     content = _content(path)
     if "T" in content:
@@ -81,7 +81,7 @@ def _content(path: Path) -> dict[str, object]:
 def _star(
     path: Path, content: Mapping[str, object], nodes: Sequence[str]
 ) -> dict[tuple[str, str], Float[np.ndarray, "4 4"]]:
-    """Poses in the reference, of all nodes and of no others."""
+    """Poses relative to the reference, for exactly these nodes."""
     reference, given = content.get("reference"), content["T"]
     if not isinstance(reference, str) or reference not in nodes:
         raise ConfigError(str(path), "reference", f"{reference!r} is none of {', '.join(nodes)}")
@@ -138,7 +138,7 @@ def _rigid(path: Path, key: str, value: object) -> np.ndarray:
     if T.shape != (4, 4) or not np.allclose(T[3], [0, 0, 0, 1]):
         raise ConfigError(str(path), key, "is no 4x4 matrix with the last row 0 0 0 1")
     R = T[:3, :3]
-    # 1e-3: calibrations shipped with three or four digits are still meant as rotations.
+    # 1e-3: accepts rotations written with three or four digits.
     if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0:
         raise ConfigError(str(path), key, "its upper left 3x3 is no rotation")
     u, _, vt = np.linalg.svd(R)

@@ -1,4 +1,4 @@
-"""A change of an edge as a turn of its radar: azimuth, positive to the left of its x axis, and elevation, upwards."""
+"""A change of an edge as rotation of its radar: azimuth positive to the left, elevation upwards."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ __all__ = ["turn_of_radar"]
 
 
 def turn_of_radar(edge: Edge, T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "2 3"]:
-    """What takes a change's rotation vector (of T_parent_child, parent's axes) to the radar's azimuth and elevation.
+    """Matrix from the rotation vector of a change (parent's axes) to the radar's azimuth and elevation.
 
-    A radar that is turned to the left by an angle has turned by that azimuth; one whose software turns its points to
-    the left seems to have turned to the right.
+    A radar rotated to the left by an angle has a positive azimuth change; a radar whose software rotates its
+    points to the left has a negative one.
 
     Args:
-        edge: one end is a radar; of an edge of two it is the child.
+        edge: edge with a radar at one end; if both are radars, the child is used.
         T: T_parent_child.
     """
     if edge.child.kind == "radar":

@@ -1,1 +1,1 @@
-"""Pure maths of frames, cameras and angles; conventions in CONVENTIONS.md."""
+"""Mathematics of frames, cameras and angles; conventions in CONVENTIONS.md."""

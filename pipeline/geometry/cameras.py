@@ -1,4 +1,4 @@
-"""Camera models of ROS CameraInfo: plumb_bob, rational_polynomial, equidistant (Kannala-Brandt; D = 0 is f-theta).
+"""Camera models of ROS CameraInfo: plumb_bob, rational_polynomial, equidistant (Kannala-Brandt).
 
 Optical frame: x right, y down, z forward [m]; pixels: u right, v down, (0, 0) = centre of the first pixel.
 
@@ -19,7 +19,7 @@ from schemas.captures import CameraColumns
 __all__ = ["CAMERA_MODELS", "Camera", "camera_of"]
 
 CAMERA_MODELS = ("plumb_bob", "rational_polynomial", "equidistant")
-_MIN_DEPTH_M = 0.05  # nothing that a car camera sees is nearer; keeps 1/z bounded
+_MIN_DEPTH_M = 0.05  # closer than any object that a car's camera sees; bounds 1/z
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ class Camera:
 
     @cached_property
     def max_angle_rad(self) -> float:
-        """Angle from the optical axis up to which the model is one-to-one (its radius grows with the angle)."""
+        """Angle from the optical axis up to which the model is one-to-one (radius grows with angle)."""
         limit = np.pi if self.model == "equidistant" else np.arctan(20.0)
         theta = np.linspace(0.0, limit * 0.999, 4000)
         radius = self._radius(theta)
@@ -80,9 +80,9 @@ class Camera:
     def project(
         self, points_camera: Float[np.ndarray, "*batch 3"]
     ) -> tuple[Float[np.ndarray, "*batch 2"], Bool[np.ndarray, "*batch"]]:
-        """Pixels of points, and a mask that is False where they mean nothing.
+        """Pixels of points, and a mask that is False for invalid ones.
 
-        That is behind the camera and outside the angle up to which the model is one-to-one.
+        Invalid points are behind the camera or outside the angle up to which the model is one-to-one.
         """
         x, y, z = points_camera.astype(np.float64).reshape(-1, 3).T
         if self.model == "equidistant":
@@ -96,13 +96,13 @@ class Camera:
     def contains(
         self, uv: Float[np.ndarray, "*batch 2"], margin_px: float = 0.0
     ) -> Bool[np.ndarray, "*batch"]:
-        """True for pixels inside the image, `margin_px` from its border."""
+        """True for pixels inside the image and at least `margin_px` from its border."""
         u, v = uv[..., 0], uv[..., 1]
         m = margin_px - 0.5
         return (u >= m) & (v >= m) & (u <= self.width_px - 1 - m) & (v <= self.height_px - 1 - m)
 
     def unproject(self, uv: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 3"]:
-        """Unit rays in the optical frame through pixels; NaN where no ray of the model meets the pixel."""
+        """Unit rays in the optical frame through pixels; NaN if the model has no ray through the pixel."""
         flat = uv.astype(np.float64).reshape(-1, 2)
         xd = (flat[:, 0] - self.K[0, 2]) / self.K[0, 0]
         yd = (flat[:, 1] - self.K[1, 2]) / self.K[1, 1]
@@ -111,10 +111,10 @@ class Camera:
         return rays.reshape(*uv.shape[:-1], 3)
 
     def fast_polynomial(self, degree: int = 9) -> tuple[Float[np.ndarray, " P"], float]:
-        """k(c) with `u = cx + fx k x/|p|`, `v = cy + fy k y/|p|`, c = z/|p|, and the fit's largest error [px].
+        """Coefficients k(c) of `u = cx + fx k x/|p|`, `v = cy + fy k y/|p|`, c = z/|p|; largest error [px].
 
-        Coefficients come lowest power first.
-        Only for `equidistant`: replaces atan2 in hot loops by a polynomial over the angles that the image can show.
+        Coefficients are in ascending order of power. For `equidistant` only: replaces atan2 in hot loops by a
+        polynomial over the angles in the image.
         """
         if self.model != "equidistant":
             raise ValueError("the polynomial path is for equidistant cameras")
@@ -129,7 +129,8 @@ class Camera:
         error_px = float(np.max(np.abs(fit(np.cos(theta)) - k) * np.sin(theta)) * max(self.focal_px))
         return fit.coef, error_px
 
-    # -- models ------------------------------------------------------------------------------------------------------
+    # -- models
+    # ------------------------------------------------------------------------------------------------------
 
     @cached_property
     def _coefficients(self) -> np.ndarray:
@@ -138,7 +139,7 @@ class Camera:
         return d
 
     def _radius(self, theta: np.ndarray) -> np.ndarray:
-        """Distorted radius (in focal lengths) at an angle from the axis, tangential terms left out."""
+        """Distorted radius (in focal lengths) at an angle from the axis, without tangential terms."""
         d = self._coefficients
         if self.model == "equidistant":
             t2 = theta * theta
@@ -226,7 +227,7 @@ def camera_of(row: CameraColumns) -> Camera:
     """The camera of a row, at the size of the full image.
 
     Raises:
-        ValueError: the columns describe no camera (unknown model, wrong number of coefficients, focal length not
-            positive).
+        ValueError: the columns are not a valid camera (unknown model, wrong number of coefficients, focal
+            length not positive).
     """
     return Camera(row.camera_model, row.camera_K, row.camera_D, row.image_width_px, row.image_height_px)

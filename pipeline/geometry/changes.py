@@ -1,8 +1,8 @@
-"""How far two estimates of one transform differ, in numbers that a mechanic can check.
+"""Change between two estimates of one transform, in measurable quantities.
 
 A change is (rotation vector, shift of the child's origin), both along the axes of the parent frame. Unlike
 the twist of the left perturbation, its translation is the plain difference of the columns tx_m, ty_m, tz_m:
-a sensor that only turned in its bracket shows no shift, whatever its lever arm.
+a sensor that only rotated in its bracket has no shift, whatever its lever arm.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ __all__ = ["change_between", "change_covariance", "change_jacobian", "changed"]
 def change_between(
     T_before: Float[np.ndarray, "*#batch 4 4"], T_after: Float[np.ndarray, "*#batch 4 4"]
 ) -> Float[np.ndarray, "*batch 6"]:
-    """Change (rx ry rz [rad], tx ty tz [m]) that leads from one estimate of T_parent_child to another."""
+    """Change (rx ry rz [rad], tx ty tz [m]) from one estimate of T_parent_child to another."""
     rotation = log_so3(T_after[..., :3, :3] @ np.swapaxes(T_before[..., :3, :3], -1, -2))
     return np.concatenate([rotation, T_after[..., :3, 3] - T_before[..., :3, 3]], axis=-1)
 
@@ -26,7 +26,7 @@ def change_between(
 def changed(
     T: Float[np.ndarray, "*#batch 4 4"], change: Float[np.ndarray, "*#batch 6"]
 ) -> Float[np.ndarray, "*batch 4 4"]:
-    """The estimate of T_parent_child that a change leads to: `change_between` of the two gives it back."""
+    """Apply a change to an estimate of T_parent_child; inverse of `change_between`."""
     R = exp_so3(change[..., :3]) @ T[..., :3, :3]
     return from_rotation_translation(R, T[..., :3, 3] + change[..., 3:])
 

@@ -1,7 +1,7 @@
-"""Objects followed from scan to scan in the ground plane: Kalman filters at constant velocity, Hungarian assignment.
+"""Object tracking in the ground plane: Kalman filters with constant velocity, Hungarian assignment.
 
-A sensor follows objects in its own level axes (x forward, y left, z up) while it moves itself. An object may be several
-hypotheses; the one that its next measurements suit best outweighs the others.
+The sensor moves; states are in its current level axes (x forward, y left, z up). An object may have several
+hypotheses; those with likelier measurements gain weight.
 
 Source: Blackman, Popoli, "Design and Analysis of Modern Tracking Systems", 1999, sections 4.2, 6.2 and 6.4.
 """
@@ -22,12 +22,12 @@ __all__ = ["Filters", "Measurements", "advance", "carried", "lines_of_sight", "n
 _ACCELERATION_MPS2 = 2.5  # braking and turning road users
 _MAX_GAP_S = 2.5
 _FORBIDDEN = 1e6  # cost of a pair outside the gate
-_PRUNE = -8.0  # log weight against the best hypothesis of the object
+_PRUNE = -8.0  # log weight relative to the best hypothesis of the object
 
 
 @dataclass(frozen=True, eq=False)
 class Filters:
-    """Hypotheses: row h of state (x y vx vy, velocity over ground) is one about object `identity[h]`."""
+    """Hypotheses: row h has state (x y vx vy, velocity over ground) and belongs to object `identity[h]`."""
 
     state: Float[np.ndarray, "H 4"]
     cov: Float[np.ndarray, "H 4 4"]
@@ -38,22 +38,22 @@ class Filters:
 
     @classmethod
     def none(cls) -> Filters:
-        """Nothing followed."""
+        """Filters without objects."""
         return new_filters(np.zeros((0, 4)), np.zeros((0, 4, 4)), np.zeros(0, np.int32), 0)
 
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
-    """What a scan measures of K objects: z = H state + noise of covariance R."""
+    """Measurements of K objects in a scan: z = H state + noise with covariance R."""
 
     stamp_ns: int
     z: Float[np.ndarray, "K M"]
     H: Float[np.ndarray, "K M 4"]
     R: Float[np.ndarray, "K M M"]
-    period: float | None = None  # of the last component, where it is known modulo that only
+    period: float | None = None  # of the last component, if it is ambiguous
 
     def innovation(self, k: np.ndarray, state: np.ndarray) -> np.ndarray:
-        """Measurements k less what states expect of them; the two broadcast."""
+        """Measurements k minus predictions from states; the two broadcast."""
         found = self.z[k] - np.einsum("...ij,...j->...i", self.H[k], state)
         if self.period is not None:
             found[..., -1] -= self.period * np.round(found[..., -1] / self.period)
@@ -61,7 +61,7 @@ class Measurements:
 
 
 def new_filters(state: np.ndarray, cov: np.ndarray, identity: np.ndarray, stamp_ns: int) -> Filters:
-    """Filters at their first sighting."""
+    """New filters, after their first measurement."""
     once, stamps = np.ones(len(identity), np.int32), np.full(len(identity), stamp_ns)
     return Filters(state, cov, np.zeros(len(identity)), identity.astype(np.int32), once, stamps)
 
@@ -72,9 +72,9 @@ def carried(
     velocities_mps: tuple[tuple[float, float] | None, tuple[float, float] | None],
     yaw_rate: tuple[float, float],
 ) -> Filters:
-    """The filters after `dt_s`, in the axes that the sensor has then; none after a gap or without its velocities.
+    """Filters predicted over `dt_s`, in the sensor's axes then; none after a gap or without velocities.
 
-    `velocities_mps` are the sensor's at both scans, in its own axes; `yaw_rate` its mean and sigma [rad/s].
+    `velocities_mps` are the sensor's at both scans, in its axes; `yaw_rate` has mean and sigma [rad/s].
     """
     before, after = velocities_mps
     if not 0 < dt_s <= _MAX_GAP_S or before is None or after is None:
@@ -100,13 +100,13 @@ def advance(
     gate: float,
     missed_s: float,
 ) -> tuple[Filters, Int[np.ndarray, " K"]]:
-    """Match a scan to the filters carried to it; `born` makes filters of the measurements that match none.
+    """Assign measurements to filters predicted to the scan; `born` makes filters from the unassigned ones.
 
-    Identities below `first_identity` are taken. A match lies within `gate` (squared distance in sigmas); an object may
-    stay unseen for `missed_s`.
+    New identities start at `first_identity`. A match is within `gate` (squared distance in sigmas); an object
+    is dropped after `missed_s` without measurements.
 
     Returns:
-        The filters after the scan, and the identity of each measurement.
+        Filters after the scan, and the identity of each measurement.
     """
     identity = _matched(filters, measured, gate)
     fresh = np.flatnonzero(identity < 0)
@@ -122,17 +122,17 @@ def advance(
 
 
 def lines_of_sight(points_m: np.ndarray) -> np.ndarray:
-    """Unit vectors to points; zeros for the origin."""
+    """Unit vectors to points; zero for the origin."""
     return points_m / np.maximum(np.linalg.norm(points_m, axis=1, keepdims=True), 1e-6)
 
 
 def outer(v: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "N D D"]:
-    """Each vector times itself."""
+    """Outer product of each vector with itself."""
     return v[:, :, None] * v[:, None, :]
 
 
 def _matched(filters: Filters, measured: Measurements, gate: float) -> np.ndarray:
-    """Identity of the object that each measurement continues, -1 where it begins one."""
+    """Identity of the assigned object per measurement, -1 for a new object."""
     identity = np.full(len(measured.z), -1, np.int32)
     if not len(identity) or not len(filters.identity):
         return identity
@@ -141,7 +141,7 @@ def _matched(filters: Filters, measured: Measurements, gate: float) -> np.ndarra
     H = measured.H[:, None]
     S = H @ filters.cov @ np.swapaxes(H, 2, 3) + measured.R[:, None]
     d2 = np.einsum("khi,khi->kh", innovation, np.linalg.solve(S, innovation[..., None])[..., 0])
-    # log det S: a track that expects anything anywhere must not outbid one that expects exactly this.
+    # log det S: penalises tracks with a large predicted covariance.
     cost = np.where(d2 < gate, d2 + np.linalg.slogdet(S)[1] - 2 * filters.log_weight, _FORBIDDEN)
     objects, column = np.unique(filters.identity, return_inverse=True)
     best = np.full((len(identity), len(objects)), _FORBIDDEN)
@@ -153,7 +153,7 @@ def _matched(filters: Filters, measured: Measurements, gate: float) -> np.ndarra
 
 
 def _updated(filters: Filters, measured: Measurements, k: np.ndarray) -> Filters:
-    """Filters after the measurements of these numbers (Joseph form), without hypotheses grown unlikely."""
+    """Filters updated with measurements k (Joseph form), without unlikely hypotheses."""
     H, R, P = measured.H[k], measured.R[k], filters.cov
     innovation = measured.innovation(k, filters.state)
     S = H @ P @ np.swapaxes(H, 1, 2) + R

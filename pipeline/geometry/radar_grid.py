@@ -1,7 +1,7 @@
-"""A radar scan as a polar grid seen from above, and free sectors on it: what a small network reads and answers.
+"""A radar scan as a polar grid seen from above, and free sectors on it: input and output of a small network.
 
-Directions by rows (azimuth, right to left), ranges by columns, radar frame (x forward, y left). Perception runs a
-network on this grid and training makes its samples on it; both call the same functions.
+Rows are azimuths (right to left), columns ranges, in the radar frame (x forward, y left). Perception and
+training both use these functions.
 
 Source: paper, section 4.2 (a weakly supervised network segments the radar's drivable area); the grid is ours.
 """
@@ -29,14 +29,14 @@ __all__ = [
 ]
 
 CHANNELS = ("static", "moving", "undecided", "power", "residual", "recent_static", "static_until", "range")
-SHAPE = (70, 60)  # directions, ranges: the sector and the reach of the geometric free sector
+SHAPE = (70, 60)  # azimuths, ranges: the extent of the geometric free sector
 AZIMUTH_STEP_RAD, RANGE_STEP_M = float(np.deg2rad(2.0)), 1.0
 _FIRST_RAD = -SHAPE[0] / 2 * AZIMUTH_STEP_RAD
 _MIN_RANGE_M = 1.5  # bumper and radome echoes
-_HEIGHT_M = 2.5  # above hang signs and branches, below lie multipath images
+_HEIGHT_M = 2.5  # signs and branches are above, multipath images below
 _RECENT_SCANS, _RECENT_S = 3, 1.0
 _STATIC, _MOVING, _UNDECIDED = 0, 1, 2
-_POWER_DB, _RESIDUAL_MPS = 10.0, 5.0  # what counts as 1 in the features
+_POWER_DB, _RESIDUAL_MPS = 10.0, 5.0  # scale of the features: these values become 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,14 +44,14 @@ class Scan:
     """One radar scan after Doppler compensation.
 
     Args:
-        stamp_ns: of the scan.
-        drive: scans of different drives do not see the same world.
+        stamp_ns: stamp of the scan.
+        drive: drive number; scans of different drives are not combined.
         xyz_m: detections, radar frame.
         power_db: power or RCS as logged; None = not logged.
-        residual_mps: range rate less what a static point would show.
+        residual_mps: range rate minus that of a static point.
         motion: 0 static, 1 moving, 2 undecided.
-        has_elevation: False where heights say nothing.
-        velocity_mps: the radar's own, x and y; None = unknown.
+        has_elevation: False if the radar measures no heights.
+        velocity_mps: x and y velocity of the radar; None = unknown.
         yaw_rate_radps: None = unknown.
     """
 
@@ -67,13 +67,13 @@ class Scan:
 
 
 class ScanMemory:
-    """The last scans of a drive, carried along with the radar's motion."""
+    """The last scans of a drive, transformed to the current radar pose."""
 
     def __init__(self) -> None:
         self._scans: deque[Scan] = deque(maxlen=_RECENT_SCANS)
 
     def features(self, scan: Scan) -> Float32[np.ndarray, "C A R"]:
-        """The scan's features given those before it, and remember it; scans come in the order of their stamps."""
+        """Features of the scan given the previous ones; stores the scan. Scans must be in order of stamp."""
         recent = [
             s
             for s in self._scans
@@ -85,7 +85,7 @@ class ScanMemory:
 
 
 def grid_layout() -> dict[str, Any]:
-    """What a model must have been trained on to fit this grid."""
+    """Grid parameters that a model must have been trained with."""
     return {
         "channels": list(CHANNELS),
         "directions": SHAPE[0],
@@ -104,8 +104,8 @@ def cell_centres() -> tuple[Float[np.ndarray, " A"], Float[np.ndarray, " R"]]:
 def scan_features(scan: Scan, recent: list[Scan]) -> Float32[np.ndarray, "C A R"]:
     """The channels of CHANNELS, each about 0..1.
 
-    Counts are logarithmic; power is relative to the scan's median, as units differ from radar to radar;
-    `static_until` counts the static detections at or before a cell in its direction.
+    Counts are logarithmic; power is relative to the scan's median, because units differ between radars;
+    `static_until` counts static detections at or before a cell in its direction.
     """
     cell, inside = _cells(scan.xyz_m, scan.has_elevation)
     counts = [_count(cell[inside & (scan.motion == m)]) for m in (_STATIC, _MOVING, _UNDECIDED)]
@@ -134,10 +134,10 @@ def scan_features(scan: Scan, recent: list[Scan]) -> Float32[np.ndarray, "C A R"
 def sector_of(
     probability: Float[np.ndarray, "A R"],
 ) -> tuple[Float32[np.ndarray, " B"], Float32[np.ndarray, " B"]]:
-    """Azimuths and free ranges that agree best with how likely each cell is drivable.
+    """Azimuths and free ranges that fit the drivable probability of the cells best.
 
-    A direction is cut where most of its cells fall on the right side, weighed by how sure they are. Directions
-    without free cells at both ends are left out; between others they are free until 0 m.
+    The free range of a direction classifies most of its cells correctly, weighted by confidence. Directions
+    without free cells are left out at both ends of the sector; between other directions their range is 0 m.
     """
     gain = np.cumsum(probability - 0.5, axis=1)
     cut = np.argmax(np.pad(gain, ((0, 0), (1, 0))), axis=1)
@@ -151,7 +151,7 @@ def sector_of(
 def sector_mask(
     azimuth_rad: Float[np.ndarray, " B"], range_m: Float[np.ndarray, " B"]
 ) -> Bool[np.ndarray, "A R"]:
-    """Cells whose centres lie in a free sector, as the objective's map of it has them."""
+    """Cells with centres in a free sector, as in the objective's map."""
     azimuth, ranges = cell_centres()
     if not len(azimuth_rad):
         return np.zeros(SHAPE, bool)
@@ -162,7 +162,7 @@ def sector_mask(
 
 
 def _cells(xyz_m: np.ndarray, has_elevation: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Flat cell of each detection, and which of them count."""
+    """Flat cell index of each detection, and a mask of those inside the grid."""
     azimuth, range_m = np.arctan2(xyz_m[:, 1], xyz_m[:, 0]), np.hypot(xyz_m[:, 0], xyz_m[:, 1])
     finite = np.isfinite(azimuth) & np.isfinite(range_m)
     a = np.floor((np.where(finite, azimuth, 0) - _FIRST_RAD) / AZIMUTH_STEP_RAD).astype(int)
@@ -183,13 +183,13 @@ def _mean(cell: np.ndarray, value: np.ndarray) -> np.ndarray:
 
 
 def _carried(old: Scan, now: Scan) -> np.ndarray | None:
-    """Where an older scan's static detections are now: the radar moved between; None where it is unknown how."""
+    """Static detections of an older scan in the current radar frame; None if the motion is unknown."""
     if old.velocity_mps is None or now.velocity_mps is None:
         return None
     seconds = (now.stamp_ns - old.stamp_ns) * 1e-9
     shift = (np.array(old.velocity_mps) + np.array(now.velocity_mps)) / 2 * seconds
     turn = (old.yaw_rate_radps or 0.0) * seconds
-    # Half of the turn happens before half of the way: the chord leaves at half the angle.
+    # The chord of an arc is at half the turning angle.
     c, s = np.cos(turn / 2), np.sin(turn / 2)
     x, y = (old.xyz_m[:, :2] - np.array([c * shift[0] - s * shift[1], s * shift[0] + c * shift[1]])).T
     c, s = np.cos(turn), np.sin(turn)

@@ -1,7 +1,7 @@
-"""Sweeps as range images and back: spherical projection, a network's input, labels of points by their neighbours.
+"""Sweeps as range images: spherical projection, input channels of a network, point labels from neighbours.
 
 Conventions of RangeNet++: azimuth runs from left behind (column 0) over ahead (the middle) to right behind,
-rows from the upper edge of the field of view down; where several points share a pixel, the nearest is drawn.
+rows from the upper edge of the field of view down; if several points share a pixel, the nearest is drawn.
 
 Source: Milioto et al., RangeNet++ (IROS 2019), sections III-A and III-D; the paper's reference 67.
 """
@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float, Float32, Int
 
 __all__ = ["EMPTY", "RangeImage", "channels_of", "project", "vote_of_neighbours"]
 
-EMPTY = -1  # range, and index of the point, of a pixel that no point fell into
-_POINTS_AT_ONCE = 16384  # 5 x 5 neighbours of each: some 10 MB
+EMPTY = -1  # range and point index of an empty pixel
+_POINTS_AT_ONCE = 16384  # 5 x 5 neighbours each: some 10 MB
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,11 +37,11 @@ class RangeImage:
 def project(
     xyz_m: Float32[np.ndarray, "N 3"], size: tuple[int, int], fov_up_deg: float, fov_down_deg: float
 ) -> RangeImage:
-    """Spherical projection of a sweep (lidar frame: x ahead, y left, z up).
+    """Spherical projection of a sweep (lidar frame: x forward, y left, z up).
 
     Args:
         xyz_m: finite points.
-        size: rows, columns; the columns go all the way round.
+        size: rows, columns; the columns cover 360 deg.
         fov_up_deg: elevation of the upper edge, positive above the horizon.
         fov_down_deg: elevation of the lower edge, negative below the horizon.
     """
@@ -54,12 +54,12 @@ def project(
     height = (up - elevation) / (up - down) * rows
     row = np.clip(np.floor(height), 0, rows - 1).astype(np.int64)
     column = np.clip(np.floor(0.5 * (1 - azimuth / np.pi) * columns), 0, columns - 1).astype(np.int64)
-    # The edge rows take beams that lie half a row beyond; more would pile a whole lidar up on its own border.
+    # Edge rows include beams up to half a row outside; more would collect all outer beams of a lidar there.
     inside = (height >= -0.5) & (height < rows + 0.5) & (range_m > 0)
     image = np.full(size, EMPTY, np.float32)
     point = np.full(size, EMPTY, np.int64)
     drawn = np.flatnonzero(inside)
-    drawn = drawn[np.argsort(-range_m[drawn], kind="stable")]  # of repeated pixels numpy keeps the last
+    drawn = drawn[np.argsort(-range_m[drawn], kind="stable")]  # numpy keeps the last of repeated pixels
     image[row[drawn], column[drawn]] = range_m[drawn]
     point[row[drawn], column[drawn]] = drawn
     return RangeImage(image, point, row, column, range_m.astype(np.float32), inside)
@@ -68,7 +68,7 @@ def project(
 def channels_of(
     image: RangeImage, xyz_m: Float32[np.ndarray, "N 3"], remission: Float32[np.ndarray, " N"]
 ) -> Float32[np.ndarray, "5 H W"]:
-    """Range, x, y, z [m] and remission by pixel, EMPTY in all five where no point is."""
+    """Range, x, y, z [m] and remission by pixel; EMPTY in all five for empty pixels."""
     values = np.column_stack([image.point_range_m, xyz_m, remission]).astype(np.float32)
     channels = np.full((5, *image.point.shape), EMPTY, np.float32)
     filled = image.point != EMPTY
@@ -86,19 +86,19 @@ def vote_of_neighbours(
     sigma_px: float,
     cutoff_m: float,
 ) -> Int[np.ndarray, " N"]:
-    """Labels of all points: the vote of the pixels around each that are the nearest to it in range.
+    """Labels of all points, by vote of the surrounding pixels closest in range.
 
-    A point behind the one that was drawn has that one's label in its own pixel; its neighbours in range outvote
-    it. Azimuth wraps around. Label 0, unlabelled, wins only where nothing else votes.
+    A hidden point has the label of the drawn point in its own pixel, but its neighbours in range outvote it.
+    Azimuth wraps around. Label 0, unlabelled, wins only without other votes.
 
     Args:
-        image: where the points are.
-        labels: of the pixels, 0..classes - 1.
-        classes: how many labels there are.
-        neighbours: pixels that vote, at most.
-        search: side of the square window that they come from [px], odd.
-        sigma_px: ranges differ by less the nearer a pixel is: of the Gauss that distances are weighed with.
-        cutoff_m: a pixel that differs by more has no vote.
+        image: projected sweep.
+        labels: labels of the pixels, 0..classes - 1.
+        classes: number of labels.
+        neighbours: maximum number of voting pixels.
+        search: side of the square search window [px], odd.
+        sigma_px: sigma of the Gaussian that weights range differences by pixel distance.
+        cutoff_m: pixels with a larger range difference have no vote.
     """
     half = search // 2
     ranges = np.where(image.range_m == EMPTY, np.float32(np.inf), image.range_m)
@@ -112,7 +112,7 @@ def vote_of_neighbours(
         part = rows[first : first + _POINTS_AT_ONCE]
         y, x = image.row[part, None] + dy, image.column[part, None] + dx
         distance = np.abs(framed_range[y, x] - image.point_range_m[part, None]) * far
-        distance[:, len(far) // 2] = 0  # its own pixel, whoever was drawn there
+        distance[:, len(far) // 2] = 0  # its own pixel, even if another point is drawn there
         nearest = np.argpartition(distance, neighbours - 1, axis=1)[:, :neighbours]
         label = np.take_along_axis(framed_label[y, x], nearest, axis=1)
         label[np.take_along_axis(distance, nearest, axis=1) > cutoff_m] = 0
@@ -124,13 +124,13 @@ def vote_of_neighbours(
 
 
 def _farness(search: int, sigma_px: float) -> Float[np.ndarray, " K"]:
-    """One minus the normalised Gauss of the window's pixels: what differences of range are multiplied by."""
+    """One minus the normalised Gaussian of the window's pixels: factor of range differences."""
     offset = np.arange(search) - search // 2
     gauss = np.exp(-(offset[:, None] ** 2 + offset[None, :] ** 2) / (2 * sigma_px**2))
     return (1 - gauss / gauss.sum()).astype(np.float32).ravel()
 
 
 def _framed(image: np.ndarray, half: int, outside: float) -> np.ndarray:
-    """The image with what lies around it: the other side to the left and right, nothing above and below."""
+    """The image with margins: columns wrap around, `outside` above and below."""
     wrapped = np.pad(image, ((0, 0), (half, half)), mode="wrap")
     return np.pad(wrapped, ((half, half), (0, 0)), constant_values=outside)

@@ -1,10 +1,10 @@
-"""Which beams of a lidar sweep lie side by side in a row, and whether it has rows at all.
+"""Neighbouring beams of a lidar sweep in rows; detects sweeps without rows.
 
-A scanner draws rows, and says which point is of which row (`ring`), or its elevations crowd around one value per row.
-Where its beams start side by side they do not crowd, but clouds are often stored one whole turn after the other. A
-lidar with turning prisms draws a rosette: its drivers number lasers, which readers take for rings, but neighbours in
-azimuth of one laser lie degrees apart in elevation. Calling anything there a row makes jumps of the ground and of time
-look like silhouettes.
+A scanner measures in rows: the log has the row of each point (`ring`), or elevations cluster around one value
+per row. If beams start side by side, elevations do not cluster, but clouds are often stored turn by turn. A
+lidar with rotating prisms draws a rosette: drivers number its lasers, which readers treat as rings, but
+points of one laser that are neighbours in azimuth differ by degrees in elevation. As rows they would make
+false depth jumps on the ground.
 """
 
 from __future__ import annotations
@@ -16,28 +16,28 @@ from jaxtyping import Float, Int32, UInt16
 
 __all__ = ["rows_of"]
 
-# Along a row the elevation hardly changes from beam to beam: rows of cars' scanners are calibrated to hundredths of a
-# degree, de-skewing bends them by less than a tenth, and a raster that sags does so by degrees over its whole width.
-# Of one laser of a rosette it changes by degrees.
+# Elevation changes little from beam to beam in a row: rows of automotive scanners are calibrated to
+# hundredths of a degree, de-skewing bends them by less than a tenth, and a sagging raster changes by degrees
+# over its whole width only. In one laser of a rosette it changes by degrees.
 _SAME_ROW_RAD: Final = np.radians(0.15)
-# A gap between crowds of elevations is wide against what lies inside them; jitter inside is below 0.02 deg for real
-# beams.
+# Gaps between clusters of elevations are wide compared to the clusters; jitter in real beams is below 0.02
+# deg.
 _BETWEEN_ROWS_RAD: Final = np.radians(0.03)
 _FEWEST_IN_ROW: Final = 16
-# Of steps from point to point of a cloud that is stored turn by turn, those that go on in one sense; firings of several
-# lasers go to and fro.
+# Minimum share of steps in one sense of rotation, for a cloud stored turn by turn; firings of several lasers
+# alternate.
 _ONE_SENSE: Final = 0.999
-_BESIDE: Final = 6  # points to each side of a place, whose mean elevations are compared
+_BESIDE: Final = 6  # points on each side whose mean elevations are compared
 
 
 def rows_of(
     azimuth_elevation_range: Float[np.ndarray, "N 3"], ring: UInt16[np.ndarray, " N"] | None
 ) -> Int32[np.ndarray, " N"] | None:
-    """Row numbers from the lowest row up; None where the sweep has no rows.
+    """Row numbers from the lowest row up; None if the sweep has no rows.
 
     Args:
         azimuth_elevation_range: of each point [rad, rad, m].
-        ring: what the log calls the point's beam, channel or line; None = it does not say, and points are as stored.
+        ring: beam, channel or line of each point in the log; None = not logged, points in stored order.
     """
     if not len(azimuth_elevation_range):
         return None
@@ -59,7 +59,7 @@ def _by_height(ring: np.ndarray, elevation: np.ndarray) -> np.ndarray:
 
 
 def _by_elevation(elevation: np.ndarray) -> np.ndarray | None:
-    """Crowds of elevations; None where they are too small to be rows."""
+    """Rows from clusters of elevations; None if the clusters are too small."""
     order = np.argsort(elevation, kind="stable")
     wide = np.diff(elevation[order]) > _BETWEEN_ROWS_RAD
     if len(elevation) < _FEWEST_IN_ROW * (1 + np.count_nonzero(wide)):
@@ -70,7 +70,7 @@ def _by_elevation(elevation: np.ndarray) -> np.ndarray | None:
 
 
 def _by_order(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray | None:
-    """Turns, one stored after the other; None where the points are not stored so."""
+    """Rows from turns stored one after the other; None if points are not stored so."""
     step = (np.diff(azimuth) + np.pi) % (2 * np.pi) - np.pi
     sense = np.sign(np.median(step)) if len(step) else 0.0
     way = np.append(0.0, np.cumsum(sense * step)) / (2 * np.pi)
@@ -81,9 +81,9 @@ def _by_order(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray | None:
 
 
 def _beginning(way: np.ndarray, elevation: np.ndarray) -> float:
-    """Where turns begin, in parts of one: there the elevation steps from row to row.
+    """Start of the turns, as fraction of a turn: the elevation steps there from row to row.
 
-    Not before the last point nor after the first one, and there is little between if they are whole.
+    It lies between the last and the first point, which are close together if turns are complete.
     """
     place = np.arange(1.0, way[-1] % 1.0, -1 / 720)
     crossing = np.searchsorted(way, place + np.arange(int(way[-1]))[:, None])
@@ -95,7 +95,7 @@ def _beginning(way: np.ndarray, elevation: np.ndarray) -> float:
 
 
 def _are_rows(azimuth: np.ndarray, elevation: np.ndarray, row: np.ndarray) -> bool:
-    """Whether neighbours in a row lie at one height; a row of a single point says nothing."""
+    """True if neighbours in a row have the same elevation; rows of a single point are ignored."""
     order = np.lexsort((azimuth, row))
     step = np.abs(np.diff(elevation[order]))[np.diff(row[order]) == 0]
     return len(step) == 0 or bool(np.median(step) < _SAME_ROW_RAD)

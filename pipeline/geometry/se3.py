@@ -1,10 +1,10 @@
 """Rigid transforms as 4x4 arrays, with their covariances.
 
-`T_a_b` takes coordinates in b to a. A twist is (rotation vector, translation). Perturbations stand on the left:
-`T' = exp(xi) T`, so xi lives in the axes of the parent frame a.
+`T_a_b` takes coordinates in b to a. A twist is (rotation vector, translation). Perturbations stand on the
+left: `T' = exp(xi) T`, so xi lives in the axes of the parent frame a.
 
-Source: Sola, Deray, Atchuthan 2018, "A micro Lie theory for state estimation in robotics", section IV and appendix D
-(their twist is translation first; here rotation comes first).
+Source: Sola, Deray, Atchuthan 2018, "A micro Lie theory for state estimation in robotics", section IV and
+appendix D (their twist is translation first; here rotation comes first).
 """
 
 from __future__ import annotations
@@ -155,7 +155,7 @@ def from_quaternion(
     """
     norm = np.linalg.norm(q_wxyz, axis=-1, keepdims=True)
     if not np.all(np.isfinite(norm)) or np.any(norm < 1e-6):
-        raise ValueError(f"no rotation: quaternion (w, x, y, z) = {q_wxyz}")
+        raise ValueError(f"not a rotation: quaternion (w, x, y, z) = {q_wxyz}")
     w, x, y, z = np.moveaxis(q_wxyz / norm, -1, 0)
     R = np.stack(
         [
@@ -171,9 +171,10 @@ def from_quaternion(
 def perturb_exactly(
     T: Float[np.ndarray, "4 4"], rotation_rad: float, translation_m: float, rng: np.random.Generator
 ) -> Float[np.ndarray, "4 4"]:
-    """Turn T by exactly `rotation_rad` about a random axis and shift it exactly `translation_m` in a random direction.
+    """Rotate T by exactly `rotation_rad` and shift it by exactly `translation_m`, in random directions.
 
-    Rotation acts about the parent's axes on the rotation part alone: both amounts are exact whatever the lever arm.
+    The rotation acts about the parent's axes on the rotation part alone: both amounts are exact whatever the
+    lever arm.
     """
     axis, direction = rng.normal(size=3), rng.normal(size=3)
     R = exp_so3(rotation_rad * axis / np.linalg.norm(axis)) @ T[:3, :3]

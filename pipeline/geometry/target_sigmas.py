@@ -1,4 +1,4 @@
-"""How far a pose's errors move targets 15 to 40 m away: sigmas of their azimuth and elevation."""
+"""Sigmas of azimuth and elevation at targets 15 to 40 m away, from the covariance of a pose."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def target_jacobian(
 
 @cache
 def _nudges() -> tuple[tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "4 4"]], ...]:
-    """Small twists ahead and back along each axis: making them was most of a Jacobian."""
+    """Small twists forward and back along each axis, cached: computing them dominated the Jacobian."""
     return tuple((exp_se3(_STEP * axis), exp_se3(-_STEP * axis)) for axis in np.eye(6))
 
 

@@ -1,8 +1,8 @@
-"""The paper's error: azimuth, elevation (and range) of corner reflectors, carried from one sensor to another.
+"""The paper's errors: azimuth, elevation and range of corner reflectors, from one sensor to another.
 
-Camera pairs are compared as directions in the camera, lidar-radar in lidar coordinates; the loop carries a
-lidar point through radar and camera back to the lidar (section 2.2). Known truth takes the place of picked
-positions where it exists.
+Camera pairs are compared as directions in the camera, lidar-radar in lidar coordinates. The loop transforms a
+lidar point to the radar, to the camera and back to the lidar (section 2.2). A known truth replaces picked
+positions.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ __all__ = [
     "loop_errors",
 ]
 
-# Three reflectors inside the field of view that sensors share which look ahead: azimuth, elevation [rad], range [m].
-# A record has its own, where both of its sensors see them (`calibrate/verify/seen_targets.py`).
+# Three reflectors in the shared field of view of sensors that look ahead: azimuth, elevation [rad], range
+# [m]. Records have other targets, visible to both of their sensors (`calibrate/verify/seen_targets.py`).
 DEFAULT_TARGETS = from_spherical(
     np.array([[np.radians(-10), 0, 15.0], [np.radians(8), 0, 25.0], [0.0, 0, 40.0]])
 )
@@ -62,20 +62,20 @@ def errors_at_targets(
     T_true: Float[np.ndarray, "4 4"],
     targets: Float[np.ndarray, "N 3"] = DEFAULT_TARGETS,
 ) -> Float[np.ndarray, " 3"]:
-    """Mean absolute azimuth and elevation error [rad] and range error [m] at targets given in the child's frame."""
+    """Mean absolute azimuth and elevation error [rad] and range error [m] at targets in the child's frame."""
     return _mean_error(pair, transform_points(T, targets), transform_points(T_true, targets))
 
 
 def loop_errors(
     transforms: Mapping[str, Float[np.ndarray, "4 4"]], targets: Float[np.ndarray, "N 3"] = DEFAULT_TARGETS
 ) -> Float[np.ndarray, " 3"]:
-    """The same for lidar points sent to camera, radar and back to the lidar; no truth is needed."""
+    """Mean absolute errors of lidar points after the loop through camera and radar; no truth is needed."""
     loop = transforms["lidar_radar"] @ inverse(transforms["camera_radar"]) @ transforms["camera_lidar"]
     return _mean_error("lidar_radar", transform_points(loop, targets), targets)
 
 
 def errors_of_picks(pair: str, T: Float[np.ndarray, "4 4"], picks: Picks) -> Float[np.ndarray, " 3"]:
-    """Mean absolute errors at picked reflectors; range is NaN for camera pairs, for a pixel has none."""
+    """Mean absolute errors at picked reflectors; range is NaN for camera pairs, because a pixel has none."""
     if pair == "lidar_radar":
         return _mean_error(pair, transform_points(T, picks.radar_m), picks.lidar_m)
     points = transform_points(T, picks.lidar_m if pair == "camera_lidar" else picks.radar_m)
@@ -86,10 +86,10 @@ def errors_of_picks(pair: str, T: Float[np.ndarray, "4 4"], picks: Picks) -> Flo
 def error_sigma_at_picks(
     pair: str, T: Float[np.ndarray, "4 4"], picks: Picks, uncertainty: PickUncertainty
 ) -> Float[np.ndarray, " 3"]:
-    """Sigma of a reflector's error that comes from the picks alone: azimuth, elevation [rad] and range [m].
+    """Sigma of the errors at reflectors due to the picks alone: azimuth, elevation [rad] and range [m].
 
-    Root mean square over the reflectors, first order; range is NaN for camera pairs. T turns the child's axes into
-    the parent's, which any estimate does well enough.
+    Root mean square over the reflectors, first order; range is NaN for camera pairs. T rotates the child's
+    axes into the parent's; any estimate is accurate enough for that.
     """
     radar = pair == "lidar_radar"
     angles = to_spherical if radar else camera_direction_angles
@@ -111,7 +111,7 @@ def error_sigma_at_picks(
 def loop_error_sigma(
     transforms: Mapping[str, Float[np.ndarray, "4 4"]], picks: Picks, uncertainty: PickUncertainty
 ) -> Float[np.ndarray, " 3"]:
-    """The same for the loop: nearly 0, because the loop compares a lidar point with itself."""
+    """Sigma of loop errors due to the picks: nearly 0, as the loop compares a lidar point with itself."""
     loop = transforms["lidar_radar"] @ inverse(transforms["camera_radar"]) @ transforms["camera_lidar"]
     return np.sqrt(
         _propagated(

@@ -1,4 +1,4 @@
-"""Static transforms as logged: a tree of frames, walked in both directions."""
+"""Static transforms as logged: a tree of frames with lookups in both directions."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from pipeline.geometry.se3 import from_quaternion, inverse
 
 __all__ = ["TransformTree"]
 
-_SAME = 1e-9  # of two copies of one transform
-_UNIT_TOLERANCE = 0.01  # a quaternion farther from unit length is damaged or no rotation at all
+_SAME = 1e-9  # tolerance for two copies of one transform
+_UNIT_TOLERANCE = 0.01  # quaternions farther from unit length are rejected as damaged
 
 
 class TransformTree:
-    """Edges `T_parent_child` by frame ids; the last one logged for a child counts."""
+    """Edges `T_parent_child` by frame ids; the last one logged for a child is valid."""
 
     def __init__(self) -> None:
         self._parent_of: dict[str, tuple[str, np.ndarray]] = {}
-        self.twice: set[str] = set()  # children that stand there more than once, not alike
+        self.twice: set[str] = set()  # children logged more than once, with different transforms
 
     @property
     def edges(self) -> dict[str, str]:
@@ -29,7 +29,7 @@ class TransformTree:
         return {child: parent for child, (parent, _) in self._parent_of.items()}
 
     def add_message(self, message: Any) -> int:
-        """Take a tf2_msgs/TFMessage; returns how many of its entries were no rigid transforms."""
+        """Add the transforms of a tf2_msgs/TFMessage; returns the number of non-rigid entries."""
         bad = 0
         for entry in message.transforms:
             q, t = entry.transform.rotation, entry.transform.translation
@@ -44,7 +44,7 @@ class TransformTree:
         q_wxyz: tuple[float, float, float, float],
         t: tuple[float, float, float],
     ) -> bool:
-        """One edge; False (and nothing added) where it is no rigid transform between two frames."""
+        """Add an edge; returns False and adds nothing if it is not a rigid transform between two frames."""
         parent, child = parent.lstrip("/"), child.lstrip("/")
         numbers = np.array([*q_wxyz, *t], np.float64)
         is_rigid = np.all(np.isfinite(numbers)) and abs(np.linalg.norm(numbers[:4]) - 1) < _UNIT_TOLERANCE
@@ -54,19 +54,19 @@ class TransformTree:
         return True
 
     def add_transform(self, parent: str, child: str, T_parent_child: Float[np.ndarray, "4 4"]) -> None:
-        """One edge, known to be rigid and between two frames."""
+        """Add an edge that is known to be a rigid transform between two frames."""
         known = self._parent_of.get(child)
         if known is not None and (known[0] != parent or np.abs(known[1] - T_parent_child).max() > _SAME):
             self.twice.add(child)
         self._parent_of[child] = (parent, T_parent_child)
 
     def fill_from(self, other: TransformTree) -> None:
-        """Take edges of frames that this tree lacks: a split recording logs them in its first file only."""
+        """Copy edges of frames that this tree lacks: a split recording logs them in its first file only."""
         for child, edge in other._parent_of.items():
             self._parent_of.setdefault(child, edge)
 
     def lookup(self, a: str, b: str) -> Float[np.ndarray, "4 4"] | None:
-        """T_a_b along the shortest chain of edges, None where no chain joins the two frames."""
+        """T_a_b along the shortest chain of edges; None if no chain joins the two frames."""
         a, b = a.lstrip("/"), b.lstrip("/")
         neighbours: dict[str, list[tuple[str, np.ndarray]]] = {}
         for child, (parent, T_parent_child) in self._parent_of.items():

@@ -1,1 +1,1 @@
-"""Is the calibration that a car uses still right? One log answers, axis by axis."""
+"""Check of the calibration that a car uses now against one log, axis by axis."""

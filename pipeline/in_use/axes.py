@@ -1,16 +1,18 @@
-"""Pass, warn, fail or inconclusive: what one log says of the calibration in use, per pair and axis.
+"""Check of the calibration in use against one log: pass, warn, fail or inconclusive per pair and axis.
 
-The log is calibrated by itself, from the calibration in use; `off` is how far that one lies from the answer, `sigma`
-how surely the answer is known. An axis fails where the distance is both measured (beyond three sigmas, once in 370
-right calibrations by chance) and of a size that matters (beyond the limit of `[verify]`). What a pass is worth is the
-detection power: the probability with which an error of the size asked for would have failed. An axis without it is
-inconclusive, however small its distance.
+The log is calibrated independently, starting from the calibration in use; `off` is the distance between the
+two, `sigma` the uncertainty of the log's result. An axis fails if the distance is significant (beyond three
+sigmas, which a correct calibration exceeds by chance once in 370 times) and large enough to matter (beyond
+the limit of `[verify]`). The detection power is the probability that an error of the requested size would
+have failed. Without enough power an axis is inconclusive, however small its distance.
 
-Of a rig of many sensors the log's poses answer, a sensor at a time: all its edges speak in them. So many axes would
-make false alarms frequent, so their probability is shared: three sigmas for one axis are 3.9 for 25.
+For a rig of many sensors, poses are compared, one sensor at a time; each pose combines all edges of its
+sensor. To keep the false-alarm rate over all axes constant, the threshold grows: three sigmas for one axis
+become 3.9 for 25.
 
-Azimuth and elevation are those of targets 15 to 40 m away (root mean square); roll is the camera's about its own axis,
-which turns pictures without moving their middle. Everything else of a pose is told by the record, not judged here.
+Azimuth and elevation are those of targets 15 to 40 m away (root mean square); roll is the camera's about its
+optical axis, which rotates the image about its centre. Other components of the pose are in the record, but
+not judged here.
 """
 
 from __future__ import annotations
@@ -47,14 +49,15 @@ __all__ = [
     "shared_sigmas",
 ]
 
-# Once in 370 right calibrations by chance; rarer where the limit, which has to be passed too, is the larger one.
+# False alarm once in 370 correct calibrations; rarer if the limit, which must be exceeded too, is larger than
+# that.
 CONTRADICTION_SIGMAS = 3.0
-# The smallest error that a log can show is the one that it would have failed with this probability.
+# The smallest detectable error of a log would have failed with this probability.
 SHOWN_POWER = 0.95
 _SHOWN_SIGMAS = float(ndtri(SHOWN_POWER))
-_ROLL = 2  # of a camera pose's change: about the optical axis
+_ROLL = 2  # component of a camera pose's change: about the optical axis
 
-# What a pair is good for; a radar need not know its elevation.
+# Axes that each kind of pair must determine; the elevation of a radar is optional.
 NEEDED_AXES: Mapping[str, tuple[str, ...]] = {
     "camera_lidar": ("azimuth", "elevation"),
     "camera_radar": ("azimuth",),
@@ -67,9 +70,9 @@ NEEDED_AXES: Mapping[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class AxisLimits:
-    """Of one axis: an error from which on the calibration is wrong, and one that must not go unseen [rad].
+    """Limits of one axis: error that makes a calibration wrong, and error that must not go undetected [rad].
 
-    A pass promises that an error of `asked_rad` would have failed with probability `confidence`.
+    For a pass, an error of `asked_rad` would have failed with probability `confidence`.
     """
 
     limit_rad: float
@@ -79,10 +82,10 @@ class AxisLimits:
 
 @dataclass(frozen=True)
 class AxisCheck:
-    """One axis of one pair; angles [rad] are nan where the log gives no estimate.
+    """Result of one axis of one pair; angles [rad] are nan if the log gives no estimate.
 
-    `pair` is the pair's kind, or names of its sensors where they are called otherwise; of a rig of many sensors the
-    sensor's own name.
+    `pair` is the kind of the pair, or the names of its sensors if they differ from their kinds; for a rig of
+    many sensors, the name of the sensor.
     """
 
     pair: str
@@ -94,17 +97,17 @@ class AxisCheck:
     sigma_rad: float
     limit_rad: float
     asked_rad: float
-    power: float  # probability with which an error of `asked_rad` would have failed
+    power: float  # probability that an error of `asked_rad` would have failed
     shown_rad: float  # smallest error that would have failed with probability SHOWN_POWER
 
 
 def limits_of(pair: str, verify: VerifyConfig, asked_deg: tuple[float, float]) -> dict[str, AxisLimits]:
-    """What is judged of a pair: azimuth and elevation, and the camera's roll beside the lidar.
+    """Limits of the judged axes of a pair: azimuth and elevation, and for camera-lidar the camera's roll.
 
     Args:
-        pair: kind of it.
-        verify: from where on an error matters, and the confidence.
-        asked_deg: errors of camera-lidar, and of pairs with the radar, that must not go unseen.
+        pair: kind of the pair.
+        verify: sizes of errors that matter, and the confidence.
+        asked_deg: errors of camera-lidar, and of pairs with the radar, that must not go undetected.
     """
     has_radar = "radar" in pair
     azimuth = verify.radar_limit_deg if has_radar else verify.camera_lidar_limit_deg
@@ -119,7 +122,7 @@ def limits_of(pair: str, verify: VerifyConfig, asked_deg: tuple[float, float]) -
 
 
 def check_axes(record: CalibrationRecord, limits: Mapping[str, AxisLimits]) -> list[AxisCheck]:
-    """Every axis that `limits` names, from the log's record whose prior is the calibration in use."""
+    """Check every axis in `limits`, from the log's record, whose prior is the calibration in use."""
     in_use, found = prior_of(record), transform_of(record)
     blocked = _why_not(record)
     if in_use is None or found is None or record.covariance is None:
@@ -135,32 +138,32 @@ def check_axes(record: CalibrationRecord, limits: Mapping[str, AxisLimits]) -> l
 
 
 def kind_of_pose(kind: str) -> str:
-    """As which kind of pair a sensor's pose to the reference is judged."""
+    """Kind of pair whose limits apply to a sensor's pose relative to the reference."""
     return {"camera": "camera_lidar", "radar": "lidar_radar", "base": "lidar_base"}.get(kind, "lidar_lidar")
 
 
 def shared_sigmas(axes: int) -> float:
-    """Sigmas beyond which one of so many axes contradicts: together as rare by chance as three of one alone."""
+    """Threshold in sigmas for several axes, with the false-alarm probability of three sigmas for one."""
     return float(norm.isf(norm.sf(CONTRADICTION_SIGMAS) / max(axes, 1)))
 
 
 def check_pose(
     row: PoseRow, in_use: Float[np.ndarray, "4 4"] | None, limits: Mapping[str, AxisLimits], beyond: float
 ) -> list[AxisCheck]:
-    """Every axis that `limits` names of one sensor, from its pose by the log.
+    """Check every axis in `limits` of one sensor, from its pose in the log.
 
     Args:
-        row: the pose.
-        in_use: T_reference_sensor as the car uses it; None where it has none.
+        row: pose of the sensor from the log.
+        in_use: T_reference_sensor of the calibration in use; None if it has none.
         limits: of the axes.
-        beyond: sigmas from which on an axis contradicts, `shared_sigmas`.
+        beyond: threshold in sigmas, from `shared_sigmas`.
     """
     of, found = (row.sensor, kind_of_pose(row.kind)), transform_of(row)
-    why = f"the log gives no answer of its own: {row.reason}" if row.faults or found is None else ""
+    why = f"the log gives no estimate: {row.reason}" if row.faults or found is None else ""
     why = why if in_use is not None else "the calibration in use has no pose of it"
     if in_use is None or found is None or row.covariance is None:
         return [_silent(of, axis, limit, why) for axis, limit in limits.items()]
-    T = inverse(found)  # what the sensor's directions are stated by
+    T = inverse(found)  # the sensor's directions are in its own frame
     A = adjoint(T)
     targets = DEFAULT_TARGETS if row.targets_m is None else np.asarray(row.targets_m)
     off = _off(f"{row.kind}_of", inverse(in_use), T, A @ np.asarray(row.covariance) @ A.T, targets)
@@ -168,7 +171,7 @@ def check_pose(
 
 
 def answers_by_sensor(checks: Sequence[AxisCheck]) -> dict[str, str]:
-    """right, wrong or undecided, by sensor: right where all that its kind is good for passes or warns."""
+    """Answers by sensor, right, wrong or undecided: right if all axes required of its kind pass or warn."""
     answers: dict[str, str] = {}
     for sensor in dict.fromkeys(c.pair for c in checks):
         own = [c for c in checks if c.pair == sensor]
@@ -179,16 +182,16 @@ def answers_by_sensor(checks: Sequence[AxisCheck]) -> dict[str, str]:
 
 
 def answer_of_sensors(answers: Mapping[str, str]) -> str:
-    """Of the whole rig: wrong where a sensor is, right where all are."""
+    """Answer for the rig: wrong if one sensor is wrong, right if all are right."""
     said = set(answers.values())
     return "wrong" if "wrong" in said else "right" if said == {"right"} else "inconclusive"
 
 
 def answer_of(checks: Sequence[AxisCheck]) -> str:
-    """Of all pairs: "wrong" where an axis fails, "right" where all that they are good for passes or warns.
+    """Answer for all pairs: "wrong" if an axis fails, "right" if all required axes pass or warn.
 
-    Of sensors with names, several pairs see the same sensor: there it is right where the pairs of which that is so tie
-    all sensors to each other.
+    For sensors with names, several pairs share a sensor: the answer is right if the right pairs connect all
+    sensors.
     """
     if any(c.status == "fail" for c in checks):
         return "wrong"
@@ -197,7 +200,7 @@ def answer_of(checks: Sequence[AxisCheck]) -> str:
         if c.axis in NEEDED_AXES[c.kind]:
             good[c.pair] = good.get(c.pair, True) and c.status in {"pass", "warn"}
     edges = [set(pair.split("-")) for pair in good if "-" in pair]
-    if len(edges) < len(good):  # sensors are called by their kinds
+    if len(edges) < len(good):  # sensors are named after their kinds
         return "right" if all(good.values()) else "inconclusive"
     tied: set[str] = set()
     for ends in len(edges) * [set(pair.split("-")) for pair, is_good in good.items() if is_good]:
@@ -212,7 +215,7 @@ def _off(
     covariance: Float[np.ndarray, "6 6"],
     targets: Float[np.ndarray, "N 3"],
 ) -> dict[str, tuple[float, float]]:
-    """Distance of the calibration in use from the answer, and the answer's sigma, by axis [rad]."""
+    """Distance of the calibration in use from the log's estimate, and its sigma, by axis [rad]."""
     xi = log_se3(in_use @ inverse(found))
     distance = np.sqrt(np.mean((target_jacobian(pair, found, targets) @ xi) ** 2, axis=1))
     sigma = target_sigmas(pair, found, covariance, targets)
@@ -226,7 +229,7 @@ def _off(
 def _checked(
     of: tuple[str, str], axis: str, limits: AxisLimits, off: tuple[float, float], blocked: str, beyond: float
 ) -> AxisCheck:
-    """One axis of a pair or sensor: its words and its kind; `off` is the distance and its sigma."""
+    """Check one axis of a pair or sensor, `of` its text and kind; `off` is the distance and its sigma."""
     off_rad, sigma_rad = off
     threshold = max(limits.limit_rad, beyond * sigma_rad)
     power = float(ndtr((limits.asked_rad - threshold) / sigma_rad))
@@ -269,13 +272,13 @@ def _pair(record: CalibrationRecord) -> str:
 
 
 def _why_not(record: CalibrationRecord) -> str:
-    """Why the log's answer cannot be held against anything; empty where it can.
+    """Reason why the log's estimate cannot be compared; empty if it can.
 
-    A record that is held only because its sigma is too large for its own limits is as good as that sigma says.
+    A record that is held only because its sigma exceeds its limits can be compared: its sigma is valid.
     """
     if record.status == "accepted" or (record.status == "held" and record.diagnostics.get("unsure_only")):
         return ""
-    return f"the log gives no answer of its own: {record.reason}"
+    return f"the log gives no estimate: {record.reason}"
 
 
 def _deg(angle_rad: float) -> str:

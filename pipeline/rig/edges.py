@@ -1,4 +1,4 @@
-"""Edges as tables name them: a pair, which is the edge's kind, and the names of its two sensors."""
+"""Edges in table columns: the pair (kind of the edge) and the names of its two sensors."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ _COLUMNS: Final = ("pair", "parent_frame", "child_frame")
 
 
 def edge_named(pair: str, parent: str, child: str) -> Edge:
-    """The edge of a kind between two sensors.
+    """The edge of the given kind between two sensors.
 
     Args:
-        pair: its kind, as camera_lidar.
+        pair: kind of the edge, e.g. camera_lidar.
         parent: name of a sensor.
-        child: name of another.
+        child: name of another sensor.
 
     Raises:
-        ValueError: no edge is of that kind, or both are one sensor.
+        ValueError: unknown kind, or both names are the same.
     """
     if pair not in EDGE_KINDS:
         raise ValueError(f"no edge is of the kind {pair!r}: there are {', '.join(EDGE_KINDS)}")
@@ -38,31 +38,32 @@ def edge_named(pair: str, parent: str, child: str) -> Edge:
 
 
 def edge_of(row: CalibrationRecord | StateRow | DriftFinding) -> Edge:
-    """The edge that a row is about."""
+    """The edge of a record."""
     return edge_named(row.pair, row.parent_frame, row.child_frame)
 
 
-# Edges of a rig whose sensors are called by their kinds, as a short fleet.toml does and all records until 0.10 did.
+# Edges of a rig whose sensors are named after their kinds, as in a short fleet.toml and in all records until
+# 0.10.
 EDGE_OF_PAIR: Final[Mapping[str, Edge]] = {
     pair: edge_named(pair, *frames) for pair, frames in FRAMES_OF_PAIR.items()
 }
 
 
 def edge_order(edge: Edge) -> tuple[int, str, str]:
-    """Key to sort edges by: kinds in the order of TIE_KINDS, then names."""
+    """Sort key of an edge: kinds in the order of TIE_KINDS, then names."""
     return TIE_KINDS.index(edge.kind), edge.parent.name, edge.child.name
 
 
 def words_of(edge: Edge) -> str:
-    """An edge in sentences: its kind where its sensors are called by their kinds, else their names."""
+    """Text for an edge: its kind if the sensors are named after their kinds, else their names."""
     return edge.kind if edge == EDGE_OF_PAIR.get(edge.kind) else edge.name
 
 
 def edges_of_rows(rows: pa.Table) -> tuple[tuple[Edge, ...], Int[np.ndarray, " N"]]:
-    """The edges that rows are about, in order, and the place among them of each row's; -1 where it is no edge.
+    """Unique sorted edges of rows, and the index of each row's edge among them (-1 if the row has none).
 
     Args:
-        rows: with columns pair, parent_frame and child_frame.
+        rows: table with columns pair, parent_frame and child_frame.
     """
     names = [pc.fill_null(rows[name], "").combine_chunks() for name in _COLUMNS]
     coded = pc.binary_join_element_wise(*names, "\0").dictionary_encode()

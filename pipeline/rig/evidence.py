@@ -1,4 +1,4 @@
-"""What the data of one edge show, without any prior: what edges hand over to the adjustment."""
+"""Result of one edge without the prior: the input of the rig's adjustment."""
 
 from __future__ import annotations
 
@@ -12,29 +12,32 @@ from pipeline.rig.graph import Edge
 
 __all__ = ["EDGE", "EdgeEvidence"]
 
-EDGE = "edge"  # owner of a bias that is the edge's own: how its two sensors are matched
+EDGE = "edge"  # owner of a bias from the matching of the two sensors
 
 
 @dataclass(frozen=True, eq=False)
 class EdgeEvidence:
     """A quadratic cost of one edge around T: 1/2 x' information x - gradient' x, with x = (xi, dt).
 
-    xi is the left perturbation T_parent_child <- exp(xi) T [rad, m] in the parent's axes, dt [s] is the child's clock
-    against the parent's: stamp_parent = stamp_child + dt_s + dt. What the day does not show has no information.
+    xi is the left perturbation T_parent_child <- exp(xi) T [rad, m] in the parent's axes, dt [s] the change
+    of the child's clock: stamp_parent = stamp_child + dt_s + dt. Undetermined directions have zero
+    information.
 
     Args:
-        edge: whose data.
-        T: T_parent_child where the cost is linearised.
-        dt_s: the clock where it is.
-        information: 7 7, of the data alone, robust (the spread over scenes is in it).
-        gradient: 7, descent: the data alone would move by information^-1 gradient.
-        bias: covariance 6 6 of what all frames err by alike, by owner: a sensor's name (its intrinsics, its elevation;
-            in that sensor's own axes, as a twist by which it seems to be turned), or EDGE (in the parent's axes).
-        frames_used: frames that it rests on.
-        frames_rejected: frames that it does not, by reason.
-        checks: of its own that failed: basin, halves, held-out frames. Such an edge is left out of the adjustment.
-        diagnostics: numbers behind it, names with units.
-        notes: what a reader should know.
+        edge: the edge.
+        T: T_parent_child at the point of linearisation.
+        dt_s: clock offset at that point.
+        information: 7 7, from the data alone, robust (it includes the scatter between scenes).
+        gradient: 7, descent: without a prior the step is information^-1 gradient.
+        bias: covariances 6 6 of errors common to all frames, by owner: a sensor's name (error of its
+            intrinsics or elevation, as an apparent rotation in the sensor's axes), or EDGE (in the parent's
+            axes).
+        frames_used: number of frames used.
+        frames_rejected: number of frames not used, by reason.
+        checks: failed checks of this edge: basin, halves, held-out frames. Such an edge is left out of the
+            adjustment.
+        diagnostics: numbers for the record, names with units.
+        notes: remarks for the record.
     """
 
     edge: Edge

@@ -1,4 +1,4 @@
-"""Poses of all sensors of a rig in one reference, with the covariance of them all."""
+"""Poses of all sensors of a rig relative to one reference, with their joint covariance."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ __all__ = ["Extrinsics"]
 
 @dataclass(frozen=True, eq=False)
 class Extrinsics:
-    """T_reference_sensor of each sensor; a prior is one too.
+    """T_reference_sensor of each sensor; also used for a prior.
 
-    Perturbations stand on the left, in the reference's axes: T <- exp(xi) T, rotation vector [rad], translation [m].
-    The reference has the identity, and no rows in the covariance.
+    Perturbations are on the left, in the reference's axes: T <- exp(xi) T, rotation vector [rad], translation
+    [m]. The reference has the identity, and no rows in the covariance.
 
     Args:
-        reference: sensor that poses refer to.
-        T: by sensor's name, the reference included.
-        order: sensors of the covariance's rows, six each, less the reference.
-        covariance: of all perturbations at once.
-        common: the part of it that all days of a vehicle err by alike.
-        dt_s: clocks against the reference's by sensor's name, where estimated: stamp_reference = stamp_sensor + dt.
+        reference: reference sensor of all poses.
+        T: by sensor name, reference included.
+        order: sensors in the order of the covariance's rows, six rows each, without the reference.
+        covariance: of all perturbations jointly.
+        common: part of the covariance from errors common to all days of a vehicle.
+        dt_s: clock offsets by sensor name, if estimated: stamp_reference = stamp_sensor + dt.
     """
 
     reference: Sensor
@@ -47,12 +47,12 @@ class Extrinsics:
         return inverse(self.T[a]) @ self.T[b]
 
     def covariance_between(self, a: str, b: str, *, common: bool = False) -> Float[np.ndarray, "6 6"]:
-        """Covariance of T_a_b's left perturbation, in a's axes; of its common part alone where asked."""
+        """Covariance of T_a_b's left perturbation, in a's axes; with `common`, only its common part."""
         J = self.jacobian_between(a, b)
         return J @ (self.common if common else self.covariance) @ J.T
 
     def jacobian_between(self, a: str, b: str) -> Float[np.ndarray, "6 P"]:
-        """Derivative of T_a_b's left perturbation by those of all sensors.
+        """Derivative of T_a_b's left perturbation with respect to those of all sensors.
 
         exp(xi) T_a_b with xi = Ad(T_a_reference) (xi_b - xi_a).
         """

@@ -1,7 +1,8 @@
-"""Sensors of a rig, the edges that can be calibrated between them, and the questions asked of that graph.
+"""Sensors of a rig, edges that can be calibrated between them, and graph queries.
 
-Names only: no transform, no array. A sensor has a name of its own and a kind; `base` is the vehicle frame, a node
-without data. An edge joins two nodes that see the same; kinds stand in the order camera, lidar, radar, base.
+The graph has names only, no transforms or arrays. A sensor has a unique name and a kind; `base` is the
+vehicle frame, a node without data. An edge joins two nodes with a shared view; kinds are in the order camera,
+lidar, radar, base.
 """
 
 from __future__ import annotations
@@ -28,11 +29,12 @@ __all__ = [
 
 Kind = Literal["camera", "lidar", "radar", "base"]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
-# Kinds of two nodes that can be calibrated against each other; two cameras meet through a lidar.
+# Kinds of two nodes that can be calibrated against each other; two cameras are connected through a lidar.
 EDGE_KINDS: Final = (
     "camera_lidar", "camera_radar", "lidar_radar", "lidar_lidar", "lidar_base", "radar_base",
 )  # fmt: skip
-# Also of two nodes that others tie to each other: where one is to the reference follows from a rig that was adjusted.
+# Kinds of two nodes connected through other nodes: their relative pose follows from the adjustment of the
+# rig.
 TIE_KINDS: Final = (*EDGE_KINDS, "camera_camera", "radar_radar", "camera_base")
 
 
@@ -41,7 +43,7 @@ class Sensor:
     """A node of the rig.
 
     Args:
-        name: unique in the rig, whatever the kind.
+        name: unique in the rig, for all kinds together.
         kind: camera, lidar, radar, or base for the vehicle frame.
     """
 
@@ -58,10 +60,10 @@ BASE: Final = Sensor("base", "base")
 
 @dataclass(frozen=True, order=True)
 class Edge:
-    """Two nodes of which T_parent_child is known: calibrated against each other, or by way of others (`tie`).
+    """Two nodes with an estimated T_parent_child: calibrated directly, or through other nodes (`tie`).
 
     Raises:
-        ValueError: a sensor and itself; both in the wrong order.
+        ValueError: both nodes are the same, or in the wrong order.
     """
 
     parent: Sensor
@@ -75,7 +77,7 @@ class Edge:
 
     @property
     def kind(self) -> str:
-        """Kinds of both sensors, e.g. camera_lidar; what a record calls its pair."""
+        """Kinds of both sensors, e.g. camera_lidar; column `pair` of records."""
         return f"{self.parent.kind}_{self.child.kind}"
 
     @property
@@ -94,16 +96,16 @@ class Edge:
 
 
 def possible_edges(nodes: Sequence[Sensor]) -> tuple[Edge, ...]:
-    """All edges that the nodes' kinds allow."""
+    """All edges between nodes whose kinds can be calibrated against each other."""
     pairs = (sorted(two, key=lambda s: KINDS.index(s.kind)) for two in combinations(nodes, 2))
     return tuple(edge_between(a, b) for a, b in pairs if f"{a.kind}_{b.kind}" in EDGE_KINDS)
 
 
 def edge_between(a: Sensor, b: Sensor) -> Edge:
-    """The edge of two sensors, whichever is given first.
+    """The edge between two sensors, given in any order.
 
     Raises:
-        ValueError: they cannot be calibrated against each other.
+        ValueError: these kinds cannot be calibrated against each other.
     """
     found = tie(a, b)
     if found.kind not in EDGE_KINDS:
@@ -112,16 +114,16 @@ def edge_between(a: Sensor, b: Sensor) -> Edge:
 
 
 def tie(a: Sensor, b: Sensor) -> Edge:
-    """Two nodes of any kinds as an edge, whichever is given first: what a rig's pose is known by, not how.
+    """An edge between two nodes of any kinds and in any order, for relative poses from any method.
 
     Raises:
-        ValueError: a sensor and itself.
+        ValueError: both nodes are the same.
     """
     return Edge(*sorted((a, b), key=lambda s: (KINDS.index(s.kind), s.name)))
 
 
 def is_one_of_each(sensors: Collection[Sensor]) -> bool:
-    """At most one camera, one lidar and one radar, and no vehicle frame: a rig whose records are of adjusted poses."""
+    """True for at most one camera, one lidar and one radar, and no vehicle frame: records are per pair."""
     return BASE not in sensors and len({s.kind for s in sensors}) == len(sensors)
 
 
@@ -134,15 +136,15 @@ def _no_edge(a: Sensor, b: Sensor) -> str:
 
 @dataclass(frozen=True)
 class RigGraph:
-    """Sensors, edges and the sensor that poses refer to.
+    """Sensors, edges and the reference sensor of the poses.
 
     Args:
-        sensors: by unique names.
+        sensors: with unique names.
         edges: between sensors of the rig, each once.
         reference: one of the sensors.
 
     Raises:
-        ValueError: a name twice, an edge twice, an edge or a reference that is not of the rig.
+        ValueError: a duplicate name, a duplicate edge, or an edge or reference with a sensor outside the rig.
     """
 
     sensors: tuple[Sensor, ...]
@@ -165,7 +167,7 @@ class RigGraph:
                 raise ValueError(f"edge {edge.name} stands twice")
 
     def __getitem__(self, name: str) -> Sensor:
-        """The sensor of that name; KeyError where there is none."""
+        """The sensor with this name; raises KeyError if there is none."""
         found = [s for s in self.sensors if s.name == name]
         if not found:
             raise KeyError(name)
@@ -176,19 +178,19 @@ class RigGraph:
         return tuple(s for s in self.sensors if s.kind in kinds)
 
     def edges_of(self, sensor: Sensor) -> tuple[Edge, ...]:
-        """Edges that the sensor is an end of."""
+        """Edges with this sensor at one end."""
         return tuple(e for e in self.edges if sensor in e.sensors)
 
     def with_edges(self, edges: Collection[Edge]) -> RigGraph:
-        """The same sensors with other edges."""
+        """A graph of the same sensors with other edges."""
         return RigGraph(self.sensors, tuple(edges), self.reference)
 
     def without(self, edges: Collection[Edge]) -> RigGraph:
-        """The graph less some edges."""
+        """The graph without some edges."""
         return self.with_edges([e for e in self.edges if e not in edges])
 
     def components(self) -> tuple[tuple[Sensor, ...], ...]:
-        """Sensors that edges tie together, the reference's first, then by the rig's order."""
+        """Connected sensors, the reference's component first, then in the rig's order."""
         found: list[tuple[Sensor, ...]] = []
         for start in (self.reference, *self.sensors):
             if not any(start in c for c in found):
@@ -197,7 +199,7 @@ class RigGraph:
         return tuple(found)
 
     def path(self, a: Sensor, b: Sensor) -> tuple[Edge, ...] | None:
-        """A shortest way of edges from a to b; empty where they are one, None where nothing ties them."""
+        """A shortest path of edges from a to b; empty if a is b, None if no path connects them."""
         if a == b:
             return ()
         came: Mapping[Sensor, tuple[Edge, ...]] = {a: ()}
@@ -213,11 +215,11 @@ class RigGraph:
         return seen.get(b)
 
     def is_on_cycle(self, edge: Edge) -> bool:
-        """Whether its sensors are tied without it: only then does anything else check it."""
+        """True if its sensors stay connected without it: only then can other edges check it."""
         return self.without([edge]).path(*edge.sensors) is not None
 
     def cycles(self) -> tuple[tuple[Edge, ...], ...]:
-        """A basis: each edge outside a spanning tree, with the shortest way between its ends in the tree."""
+        """A cycle basis: each edge outside a spanning tree, and the path between its ends in the tree."""
         tree, rest = self._spanning_tree()
         grown = self.with_edges(tree)
         return tuple((edge, *(grown.path(*edge.sensors) or ())) for edge in rest)
@@ -231,7 +233,7 @@ class RigGraph:
         return tied
 
     def _spanning_tree(self) -> tuple[Sequence[Edge], Sequence[Edge]]:
-        """Edges of a tree in each component, and the others, both in the rig's order."""
+        """Edges of a spanning tree of each component, and the other edges, both in the rig's order."""
         tree: list[Edge] = []
         for edge in self.edges:
             if self.with_edges(tree).path(*edge.sensors) is None:

@@ -1,4 +1,4 @@
-"""Which sensors see the same, and so which edges a rig has: found from their views at the prior."""
+"""Pairs of sensors with overlapping views at the prior, and the edges of a rig from them."""
 
 from __future__ import annotations
 
@@ -16,22 +16,23 @@ from pipeline.rig.views import View
 
 __all__ = ["Overlap", "best_three", "find_edges", "overlaps_of"]
 
-_RANGES_M = (15.0, 25.0, 40.0)  # of the targets that pairs are certified at
-_LEAST = 0.05  # of the directions of the sensor that sees fewer
-# Edges that each sensor keeps, whichever cut is clearer: more add cost, and sigma falls with the root of their number.
-# What two sensors share differs by 1 to 5 % from day to day (eight days of a van), and charts need the same edges.
+_RANGES_M = (15.0, 25.0, 40.0)  # target ranges at which pairs are certified
+_LEAST = 0.05  # minimum overlap, as share of the smaller view
+# Number of edges per sensor, three or four, at the clearer cut. More edges add cost; sigma falls with the
+# square root of their number. Overlaps differ by 1 to 5 % from day to day (eight days of a van), and charts
+# need the same edges.
 _BEST = (3, 4)
-_DIRECTIONS = 10_000  # about 2 deg apart, as fine as a view's borders are known
+_DIRECTIONS = 10_000  # about 2 deg apart, the resolution of a view's borders
 
 
 @dataclass(frozen=True)
 class Overlap:
-    """How much two sensors see in common.
+    """Overlap of the views of two sensors.
 
     Args:
-        edge: between them.
-        share: of the directions of the one that sees fewer, mean over 15, 25 and 40 m.
-        shared_sr: solid angle that they share.
+        edge: edge between the two sensors.
+        share: share of the directions of the smaller view, mean over 15, 25 and 40 m.
+        shared_sr: solid angle of the overlap.
     """
 
     edge: Edge
@@ -40,14 +41,14 @@ class Overlap:
 
     @property
     def is_enough(self) -> bool:
-        """Whether that makes an edge."""
+        """True if the overlap is large enough for an edge."""
         return self.share >= _LEAST
 
 
 def overlaps_of(prior: RigPrior, views: Mapping[str, View]) -> tuple[Overlap, ...]:
-    """Of each two sensors that could be calibrated against each other; a sensor without a view shares nothing.
+    """Overlaps of all pairs of sensors that could be calibrated; a sensor without a view has no overlap.
 
-    Within a sigma of the prior views count as overlapping: it is the prior that may be off.
+    Views within one sigma of the prior count as overlapping, because the prior may be wrong by that much.
     """
     own = {s: _sphere()[views[s.name](_sphere())] for s in prior.nodes if s.name in views}
     found = []
@@ -70,17 +71,18 @@ def find_edges(
     named: Sequence[Edge] | None = None,
     reference: Sensor | None = None,
 ) -> RigGraph:
-    """The rig's graph: edges that it names, or those of sensors that see the same.
+    """The graph of the rig: edges from fleet.toml, or edges between sensors with overlapping views.
 
-    Each sensor keeps its three or four best edges by what they share, and those that a tree needs which ties all that
-    can be tied. Where the rig has `base`, every lidar and every radar has an edge to it. What nothing ties to the
-    reference is in another of the graph's components. A rig with one sensor of each kind has all pairs as edges.
+    Each sensor keeps the three or four edges with the largest overlap, plus the edges of a spanning tree. If
+    the rig has `base`, every lidar and every radar has an edge to it. Sensors that no edge connects to the
+    reference form other components of the graph. A rig with one sensor of each kind has all pairs as edges.
 
     Args:
-        prior: of the rig, which knows its nodes.
-        overlaps: of its sensors.
-        named: edges of fleet.toml; they are all that the graph has.
-        reference: sensor of fleet.toml; None = the lidar with most edges, of a rig without one the radar.
+        prior: prior of the rig, with its nodes.
+        overlaps: overlaps of its sensors.
+        named: edges from fleet.toml; if given, the graph has only these.
+        reference: reference sensor from fleet.toml; None = the lidar with most edges, or a radar in a rig
+            without lidar.
     """
     found = _of_overlaps(prior.nodes, overlaps)
     base = [edge for edge in possible_edges(prior.nodes) if edge.child.kind == "base"]
@@ -89,7 +91,7 @@ def find_edges(
 
 
 def best_three(overlaps: Sequence[Overlap]) -> tuple[Sensor, Sensor, Sensor] | None:
-    """Camera, lidar and radar of which all three pairs share a view, the most by the pair that shares least."""
+    """Camera, lidar and radar that maximise the smallest of their three overlaps; None without such."""
     shared = {o.edge: o.shared_sr for o in overlaps if o.is_enough}
     sensors = dict.fromkeys(s for edge in shared for s in edge.sensors)
     by_kind = [[s for s in sensors if s.kind == kind] for kind in ("camera", "lidar", "radar")]
@@ -102,7 +104,7 @@ def best_three(overlaps: Sequence[Overlap]) -> tuple[Sensor, Sensor, Sensor] | N
 
 
 def _of_overlaps(nodes: Sequence[Sensor], overlaps: Sequence[Overlap]) -> list[Edge]:
-    """Best edges of each sensor and a tree, in the order of the overlaps."""
+    """Edges with the largest overlap per sensor plus a spanning tree, in the order of the overlaps."""
     sensors = [n for n in nodes if n.kind != "base"]
     if len({s.kind for s in sensors}) == len(sensors):
         return [edge_between(a, b) for a, b in combinations(sensors, 2)]
@@ -121,7 +123,7 @@ def _of_overlaps(nodes: Sequence[Sensor], overlaps: Sequence[Overlap]) -> list[E
 
 
 def _clearness(best_first: Sequence[Overlap], best: int) -> float:
-    """How much more the last of so many edges shares than the next one does, or than an edge has to."""
+    """Ratio of the overlap of the last of `best` edges to that of the next one (or to the minimum)."""
     if best > len(best_first):
         return 0.0
     last = best_first[best - 1]
@@ -129,7 +131,7 @@ def _clearness(best_first: Sequence[Overlap], best: int) -> float:
 
 
 def _most_tied(nodes: Sequence[Sensor], edges: Sequence[Edge]) -> Sensor:
-    """Of lidars, else radars, else cameras, the first of those with most edges."""
+    """The first of the lidars with most edges; without lidars of the radars, then of the cameras."""
     kind = next(k for k in ("lidar", "radar", "camera") if any(n.kind == k for n in nodes))
     return max((n for n in nodes if n.kind == kind), key=lambda n: sum(n in e.sensors for e in edges))
 
@@ -141,7 +143,7 @@ def _seen(
     sigmas: tuple[float, float],
     range_m: float,
 ) -> Bool[np.ndarray, " N"]:
-    """Points that are in view, or come into it where the prior is off by a sigma in some direction."""
+    """True for points in view, also if the prior is wrong by one sigma in any direction."""
     margin = float(np.hypot(sigmas[0], sigmas[1] / range_m))
     there = transform_points(T_view_points, points)
     seen = view(there)
@@ -151,7 +153,7 @@ def _seen(
 
 
 def _sphere() -> Float[np.ndarray, "N 3"]:
-    """Directions evenly over the sphere (Fibonacci's spiral)."""
+    """Directions evenly over the sphere (Fibonacci spiral)."""
     k = np.arange(_DIRECTIONS) + 0.5
     z, azimuth = 1 - 2 * k / _DIRECTIONS, np.pi * (1 + np.sqrt(5)) * k
     return np.stack([np.sqrt(1 - z**2) * np.cos(azimuth), np.sqrt(1 - z**2) * np.sin(azimuth), z], -1)

@@ -1,7 +1,7 @@
-"""What is known of a rig before the day: where each sensor is, and how far that is to be trusted.
+"""Prior of a rig: transforms between sensors and their sigmas.
 
-Known are transforms of a star: each sensor to one in the middle, mostly the first lidar. Sensors that nothing ties to
-it have a star of their own. Between the ends of a star's edge, numbers stay as they were given.
+Transforms form a star from one sensor in the middle (usually the first lidar) to the others. Sensors not
+connected to it form another star. Transforms of the star's edges keep their given numbers exactly.
 """
 
 from __future__ import annotations
@@ -41,24 +41,26 @@ __all__ = [
 
 Star = Mapping[tuple[str, str], np.ndarray]  # T_parent_child 4 4 by (parent, child)
 
-_SAME = 1e-6  # rad and m: logs repeat transforms, they do not measure
+_SAME = 1e-6  # rad and m: logs repeat transforms without noise
 _MIDDLES: tuple[Kind, ...] = ("lidar", "radar", "camera")
-# The order in which transforms of a rig with one sensor of each kind are moved, since release 0.1.
+# Order in which `moved` draws perturbations for a rig with one sensor of each kind; unchanged since release
+# 0.1.
 _DRAWN: tuple[tuple[Kind, Kind], ...] = (("camera", "lidar"), ("lidar", "radar"), ("camera", "radar"))
 
 
 @dataclass(frozen=True, eq=False)
 class RigPrior:
-    """Transforms between sensors, and each sensor's sigmas.
+    """Transforms between sensors, and the sigmas of each sensor.
 
-    Where the rig has a vehicle frame, all sensors are mounted on it, the reference too: what that is off by, all poses
-    in it are. Without one, transforms are known between sensors, and the reference is where poses are said to be from.
+    If the rig has a vehicle frame, all sensors are mounted on it, the reference included: the reference's
+    mounting error is part of all poses in it. Without a vehicle frame, sensors are mounted on the reference.
 
     Args:
-        nodes: sensors, and `base` where the rig has it.
-        reference: the sensor that poses refer to.
-        T: of a star, by (parent, child).
-        sigmas: rotation [rad] and translation [m] by which a sensor is mounted otherwise, isotropic about itself.
+        nodes: sensors, and `base` if the rig has it.
+        reference: reference sensor of the poses.
+        T: transforms of the stars, by (parent, child).
+        sigmas: sigma of each sensor's mounting: rotation [rad] and translation [m], isotropic about the
+            sensor.
     """
 
     nodes: tuple[Sensor, ...]
@@ -67,11 +69,11 @@ class RigPrior:
     sigmas: Mapping[str, tuple[float, float]]
 
     def between(self, a: str, b: str) -> Float[np.ndarray, "4 4"] | None:
-        """T_a_b; None where the star does not tie them."""
+        """T_a_b; None if the star does not connect them."""
         return between(self.T, a, b)
 
     def sigmas_between(self, a: str, b: str) -> tuple[float, float]:
-        """Rotation [rad] and translation [m] of T_a_b, without lever arms: of a given transform as of one sensor."""
+        """Sigmas of T_a_b: rotation [rad], translation [m], without lever arms; not summed if T_a_b is given."""
         own = [self.sigmas[n] for n in (a, b) if n not in self._exact]
         rotation, translation = zip(*own, strict=True)
         if self._exact == (BASE.name,) or _direct(self.T, a, b) is None:
@@ -80,19 +82,19 @@ class RigPrior:
 
     @property
     def _exact(self) -> tuple[str]:
-        """The node that the others are mounted on."""
+        """The node on which the others are mounted."""
         return (BASE.name,) if BASE in self.nodes else (self.reference.name,)
 
     @property
     def untied(self) -> tuple[Sensor, ...]:
-        """Nodes whose pose in the reference nobody knows."""
+        """Nodes without a known pose relative to the reference."""
         return tuple(n for n in self.nodes if self.between(self.reference.name, n.name) is None)
 
     def extrinsics(self) -> Extrinsics:
-        """Poses of all nodes that are tied to the reference.
+        """Poses of all nodes connected to the reference, with covariance.
 
-        A sensor's rotation is wrong about itself, as whoever mounts it turns it where it stands. No day differs from
-        another by its prior: the whole covariance is common.
+        Mounting errors rotate a sensor about itself. The prior is the same on every day, so the whole
+        covariance is common.
         """
         T = {n.name: self.between(self.reference.name, n.name) for n in self.nodes}
         poses = {name: pose for name, pose in T.items() if pose is not None}
@@ -107,25 +109,25 @@ class RigPrior:
         return Extrinsics(self.reference, poses, order, covariance, covariance.copy())
 
     def _mounted(self, name: str, T_reference_sensor: np.ndarray) -> np.ndarray:
-        """Covariance 6 6 of a sensor's own mounting, as left perturbation in the reference."""
+        """Covariance 6 6 of a sensor's mounting, as left perturbation in the reference."""
         rotation, translation = self.sigmas[name]
         A = adjoint(from_rotation_translation(np.eye(3), T_reference_sensor[:3, 3]))
         return A @ np.diag([rotation**2] * 3 + [translation**2] * 3) @ A.T
 
 
 def middle_of(nodes: Iterable[Sensor]) -> Sensor:
-    """The sensor that a star is about where none is named: the first lidar, else radar, else camera."""
+    """Default middle of a star: the first lidar, else the first radar, else the first camera."""
     return min((n for n in nodes if n.kind in _MIDDLES), key=lambda n: _MIDDLES.index(n.kind))
 
 
 def star_of(
     nodes: Sequence[Sensor], transform: Callable[[str, str], Float[np.ndarray, "4 4"] | None]
 ) -> dict[tuple[str, str], Float[np.ndarray, "4 4"]]:
-    """A star about the middle, and one about the middle of those that it does not reach, and so on.
+    """Stars of known transforms: one about the middle, another for nodes that it does not reach, and so on.
 
     Args:
-        nodes: of which something is known, as the frames of their data.
-        transform: T_a_b of two names, None where there is no chain between them.
+        nodes: nodes with some known transform, e.g. frames of logged data.
+        transform: T_a_b for two names, None if no chain of transforms connects them.
     """
     found, left = dict[tuple[str, str], np.ndarray](), list(nodes)
     while any(n.kind in _MIDDLES for n in left):
@@ -141,7 +143,7 @@ def star_of(
 
 
 def to_rows(stars: Iterable[Star]) -> list[dict[str, Any]]:
-    """As JSON: each transform once, as quaternion (w x y z) and translation [m]; stars of several logs may differ."""
+    """Stars as JSON rows: each distinct transform once, quaternion (w x y z) and translation [m]."""
     rows = [
         {"parent": a, "child": b, "q": to_quaternion(T).tolist(), "t_m": T[:3, 3].tolist()}
         for star in stars
@@ -151,7 +153,7 @@ def to_rows(stars: Iterable[Star]) -> list[dict[str, Any]]:
 
 
 def from_rows(rows: Iterable[Mapping[str, Any]]) -> dict[tuple[str, str], Float[np.ndarray, "4 4"]]:
-    """The star that all of the day's logs agree on.
+    """The star common to all logs of the day.
 
     Raises:
         SolveError: a transform changes over the day.
@@ -161,12 +163,12 @@ def from_rows(rows: Iterable[Mapping[str, Any]]) -> dict[tuple[str, str], Float[
 
 
 def transform_of_row(row: Mapping[str, Any]) -> Float[np.ndarray, "4 4"]:
-    """T_parent_child of a row."""
+    """T_parent_child of a JSON row."""
     return from_quaternion(np.array(row["q"], np.float64), np.array(row["t_m"], np.float64))
 
 
 def agreed(stars: Iterable[Star]) -> dict[tuple[str, str], Float[np.ndarray, "4 4"]]:
-    """The star that all of these agree on, as the first of each has it.
+    """The common star of several, with the numbers of the first.
 
     Raises:
         SolveError: a transform changes over the day.
@@ -181,9 +183,10 @@ def agreed(stars: Iterable[Star]) -> dict[tuple[str, str], Float[np.ndarray, "4 
 
 
 def moved(prior: RigPrior, angle_rad: float, shift_m: float, seed: int) -> RigPrior:
-    """The prior with each sensor but the reference turned and shifted by so much, with sigmas that allow for it.
+    """The prior with all sensors except the reference moved by exact amounts; sigmas at least as large.
 
-    A rig with one sensor of each kind has its transforms moved as since release 0.1: camera to lidar, lidar to radar.
+    In a rig with one sensor of each kind the transforms are moved as in release 0.1: camera-lidar, then
+    lidar-radar.
     """
     rng = np.random.default_rng(seed)
     kinds = [n.kind for n in prior.nodes]
@@ -208,14 +211,14 @@ def _moved_as_pairs(
     T = dict(prior.T)
     for a, b in _DRAWN:
         ends = (name.get(a, ""), name.get(b, ""))
-        # Drawn for a pair that the rig lacks as well: the others' draws stay.
+        # Draw for an absent pair too, so that the draws of the others stay the same.
         drawn = perturb_exactly(T.get(ends, np.eye(4)), angle_rad, shift_m, rng)
         T |= {ends: drawn} if ends in T else {}
     return T
 
 
 def between(T: Star, a: str, b: str) -> Float[np.ndarray, "4 4"] | None:
-    """T_a_b by a star; None where it does not tie them."""
+    """T_a_b from a star; None if the star does not connect them."""
     direct = _direct(T, a, b)
     if direct is not None:
         return direct

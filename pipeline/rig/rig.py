@@ -1,4 +1,4 @@
-"""What fleet.toml says of a rig: its sensors by name, the one that poses refer to, and which edges are wanted."""
+"""A rig in fleet.toml: sensors by name, reference sensor, edges."""
 
 from __future__ import annotations
 
@@ -29,17 +29,21 @@ from pipeline.rigs import (
 
 __all__ = ["SECTIONS", "Rig"]
 
-SECTIONS: Final = {"camera": "cameras", "lidar": "lidars", "radar": "radars"}  # of each kind, in a rig
-# It names files of the lake, columns of maps and ends of edges.
+SECTIONS: Final = {
+    "camera": "cameras",
+    "lidar": "lidars",
+    "radar": "radars",
+}  # Kind -> section of its sensors in a rig.
+# Names are file names in the lake, keys of maps and ends of edges.
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")
 _Topics = TypeVar("_Topics")
 
 
 class Rig(Section):
-    """One rig model; a vehicle names its rig. Between two of its sensors at least there can be an edge.
+    """One rig model; each vehicle names its rig. At least two of its sensors can have an edge.
 
-    `[rigs.X.camera]` is short for `[rigs.X.cameras.camera]`, likewise lidar and radar. A rig that has no other sensors
-    is dumped in the short form.
+    `[rigs.X.camera]` is short for `[rigs.X.cameras.camera]`, likewise lidar and radar. A rig without other
+    sensors is dumped in the short form.
     """
 
     cameras: dict[str, CameraTopics] = Field(default_factory=dict)
@@ -47,15 +51,17 @@ class Rig(Section):
     radars: dict[str, RadarTopics] = Field(default_factory=dict)
     ego: EgoTopics | None = None
     prior: PriorConfig = PriorConfig()
-    reference: str | None = None  # sensor that poses refer to; None = the lidar with most edges
+    reference: str | None = None  # reference sensor of the poses; None = the lidar with most edges
     base: str | None = Field(
         default=None, min_length=1
-    )  # the vehicle frame as transforms call it; None = no edges to it
-    # Where the road lies in axes of the base, as below an axle's middle. Left out of dumps, like what follows.
+    )  # frame id of the vehicle frame; None = no edges to it
+    # Height of the road in the base frame, e.g. negative for a base at an axle. Not in dumps, like the
+    # following fields.
     road_z_m: float = Field(default=0.0, exclude=True)
-    # Pairs of sensors; None = found from overlap. Left out of dumps: no reason to ingest a rig's logs again.
+    # Pairs of sensors; None = from overlap. Not in dumps: a change does not require ingest to run again.
     edges: tuple[tuple[str, str], ...] | None = Field(default=None, exclude=True)
-    # Camera, lidar and radar for methods that work on three; None = those that share most. Likewise.
+    # Camera, lidar and radar for methods of three sensors; None = those with the largest overlap. Not in
+    # dumps.
     three: tuple[str, str, str] | None = Field(default=None, exclude=True)
 
     @property
@@ -65,17 +71,17 @@ class Rig(Section):
 
     @property
     def nodes(self) -> tuple[Sensor, ...]:
-        """Its sensors, and the vehicle frame where that is configured."""
+        """Its sensors, and the vehicle frame if configured."""
         own = tuple(Sensor(name, kind) for kind, of in self._of_kind.items() for name in of)
         return own if self.base is None else (*own, BASE)
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """Which of camera, lidar and radar it has."""
+        """Kinds of its sensors."""
         return tuple(kind for kind, of in self._of_kind.items() if of)
 
     def of_sensors(self, names: Collection[str]) -> Rig:
-        """The same rig with some of its sensors, and the vehicle frame where `base` is among the names."""
+        """The rig with a subset of its sensors, and with the vehicle frame if `base` is in the names."""
         kept = {
             section: {name: topics for name, topics in self._of_kind[kind].items() if name in names}
             for kind, section in SECTIONS.items()
@@ -87,25 +93,25 @@ class Rig(Section):
 
     @property
     def is_one_of_each(self) -> bool:
-        """At most one camera, one lidar and one radar, and no vehicle frame: what methods of three sensors know."""
+        """True for at most one camera, one lidar and one radar, and no vehicle frame: for three-sensor methods."""
         return self.base is None and all(len(of) <= 1 for of in self._of_kind.values())
 
     @property
     def named_edges(self) -> tuple[Edge, ...] | None:
-        """The edges that the file names; None where they are to be found."""
+        """Edges named in the file; None if they are found from overlap."""
         if self.edges is None:
             return None
         nodes = {node.name: node for node in self.nodes}
         return tuple(edge_between(nodes[a], nodes[b]) for a, b in self.edges)
 
     def one_of_each(self, what: str) -> dict[str, str]:
-        """Names by kind of the sensors for something that knows one camera, one lidar and one radar.
+        """Sensor names by kind, for a consumer of one camera, one lidar and one radar.
 
         Args:
-            what: that is, for the error.
+            what: name of the consumer, for the error.
 
         Raises:
-            ConfigError: the rig has several of a kind, and `three` names none of them.
+            ConfigError: the rig has several sensors of a kind, and `three` names none of them.
         """
         if self.three is not None:
             return dict(zip(self._of_kind, self.three, strict=True))
@@ -120,27 +126,27 @@ class Rig(Section):
 
     @property
     def camera(self) -> CameraTopics | None:
-        """The only camera; None where there is none, ConfigError where there are several."""
+        """The only camera; None if there is none, ConfigError if there are several."""
         return _only("cameras", self.cameras)
 
     @property
     def lidar(self) -> LidarTopics | None:
-        """The only lidar; None where there is none, ConfigError where there are several."""
+        """The only lidar; None if there is none, ConfigError if there are several."""
         return _only("lidars", self.lidars)
 
     @property
     def radar(self) -> RadarTopics | None:
-        """The only radar; None where there is none, ConfigError where there are several."""
+        """The only radar; None if there is none, ConfigError if there are several."""
         return _only("radars", self.radars)
 
     @property
     def semantics(self) -> TopicSemantics | OnnxSemantics | None:
-        """Where the only camera's labels and road users come from; None without a camera or semantics."""
+        """Source of labels and road users of the only camera; None without a camera or semantics."""
         return None if self.camera is None else self.camera.semantics
 
     @property
     def told_to_calibrate(self) -> dict[str, Any]:
-        """What dumps leave out and calibration depends on, for its work key; empty where nothing of it is said."""
+        """Settings for calibration that dumps leave out, for its work key; empty if all are defaults."""
         told: dict[str, Any] = {"edges": self.edges, "three": self.three}
         told["priors"] = {
             name: of[name].prior.model_dump(exclude_none=True)
@@ -153,14 +159,14 @@ class Rig(Section):
 
     @property
     def measured_heights(self) -> dict[str, tuple[float, float]]:
-        """Of lidars over the road, as somebody measured them: metres, and the sigma of that."""
+        """Measured heights of lidars above the road: metres, and sigma."""
         found = ((name, of.height_m, of.height_sigma_m) for name, of in self.lidars.items())
         return {
             name: (height, sigma) for name, height, sigma in found if height is not None and sigma is not None
         }
 
     def prior_of(self, name: str) -> SensorPrior:
-        """How far a sensor's prior is to be trusted: what it is told itself, else the rig's."""
+        """Sigmas of a sensor's prior: from its section, else the rig's."""
         own = next((of[name].prior for of in self._of_kind.values() if name in of), SensorPrior())
         rotation, translation = own.rotation_sigma_deg, own.translation_sigma_m
         return SensorPrior(
@@ -169,10 +175,10 @@ class Rig(Section):
         )
 
     def named_models(self) -> Iterator[tuple[str, str]]:
-        """Files of models that its sensors name, each with its key in the rig's section."""
+        """Model files named by its sensors, each with its key in the rig's section."""
         for kind, of in self._of_kind.items():
             for name, sensor in of.items():
-                # The short key says the same where it can.
+                # Use the short key if possible.
                 key = kind if name == kind else f"{SECTIONS[kind]}.{name}"
                 yield from ((f"{key}.{part}", file) for part, file in sensor.named_models())
 
@@ -183,7 +189,7 @@ class Rig(Section):
     @model_validator(mode="before")
     @classmethod
     def _long_form(cls, values: Any) -> Any:
-        """Of `[rigs.X.camera]`, what it is short for."""
+        """Expand `[rigs.X.camera]` to its long form."""
         if not isinstance(values, dict):
             return values
         values = dict(values)
@@ -198,7 +204,7 @@ class Rig(Section):
 
     @model_serializer(mode="wrap")
     def _short_form(self, dump: Any, info: Any) -> dict[str, Any]:
-        """As before rigs had more than three sensors, where it has no more: work keys stay."""
+        """The dump of releases before 0.11 for rigs of three sensors, so that work keys do not change."""
         whole = dump(self)
         if all(set(of) <= {kind} for kind, of in self._of_kind.items()):
             short = {kind: whole.pop(section).get(kind) for kind, section in SECTIONS.items()}
@@ -301,7 +307,7 @@ class Rig(Section):
         return self
 
     def _topics(self) -> Iterator[tuple[str, str]]:
-        """Every topic with what it is of."""
+        """All topics, each with its meaning."""
         for name, camera in self.cameras.items():
             yield f"image of {name}", camera.image
             yield f"info of {name}", camera.info

@@ -1,4 +1,4 @@
-"""Topics and frames of the logs that are written here: simulated ones, and those of converted data sets."""
+"""Topics and frames of logs written by Boresight: simulated logs and converted data sets."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pipeline.rig.graph import Kind
 
 __all__ = ["TOPICS", "frame_of", "topics_of"]
 
-# Of a rig whose sensors are called camera, lidar and radar, and of the vehicle.
+# For sensors named camera, lidar and radar, and for the vehicle.
 TOPICS: Final = {
     "tf": "/tf_static",
     "info": "/camera/front/camera_info",
@@ -28,7 +28,7 @@ _FRAMES: Final = {
 
 
 def topics_of(name: str, kind: Kind) -> dict[str, str]:
-    """Topics of a sensor: image, info, labels and detections of a camera, points of another, a radar's alignment."""
+    """Topics of a sensor: image, info, labels, detections of a camera; points; alignment of a radar."""
     if kind != "camera":
         points = TOPICS[kind] if name == kind else f"/{kind}/{name}/points"
         alignment = points.replace("points", "location_attributes")
@@ -44,5 +44,5 @@ def topics_of(name: str, kind: Kind) -> dict[str, str]:
 
 
 def frame_of(node: str) -> str:
-    """The frame of a sensor, which has its name but for camera, lidar and radar, or of the base."""
+    """Frame id of a sensor or of the base: the sensor's name, except for camera, lidar and radar."""
     return _FRAMES.get(node, node)

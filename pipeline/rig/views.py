@@ -1,6 +1,6 @@
-"""What a sensor sees: a camera's image through CameraInfo, directions in which a lidar or a radar has points.
+"""Field of view of a sensor: image area of a camera (CameraInfo), directions with points of a lidar or radar.
 
-Holes of the scene are filled. A radar without elevation sees any.
+Gaps due to the scene are filled. A radar without elevation has no limits in elevation.
 """
 
 from __future__ import annotations
@@ -15,23 +15,23 @@ from pipeline.geometry.spherical import to_spherical
 
 __all__ = ["FRAMES", "View", "view_of_camera", "view_of_clouds"]
 
-# Which points of its own frame a sensor sees.
+# Mask of the points in a sensor's frame that it can see.
 View = Callable[[Float[np.ndarray, "*batch 3"]], Bool[np.ndarray, "*batch"]]
 
-FRAMES = 20  # of a day, enough for a view's borders
-_POINTS = 2000  # of each of them
+FRAMES = 20  # per day, enough for the borders of a view
+_POINTS = 2000  # per frame
 _BIN_RAD = np.radians(2.0)
-_FEWEST = 100  # points that show a view
-# Of the density that a typical point has about it: below it a direction is not in view. De-skewing smears the border of
-# a sweep by ten degrees at highway speeds, thinner than the view by more than this.
+_FEWEST = 100  # minimum number of points for a view
+# Share of the median point density; directions below it are outside the view. De-skewing spreads the border
+# of a sweep over ten degrees at highway speeds, with a lower density than this.
 _DENSE = 0.25
 _STRAY = 0.002  # share of points that may lie above a view, and below it
-# A wider gap between directions with points is the view's end, one such gap at most.
+# A wider gap between directions with points is the end of the view; a view has at most one.
 _HOLE_RAD = np.radians(20.0)
 
 
 def view_of_camera(camera: Camera) -> View:
-    """Points that project into the image."""
+    """Mask of points that project into the image."""
 
     def seen(points: Float[np.ndarray, "*batch 3"]) -> Bool[np.ndarray, "*batch"]:
         uv, valid = camera.project(points)
@@ -41,10 +41,10 @@ def view_of_camera(camera: Camera) -> View:
 
 
 def view_of_clouds(clouds: Sequence[Float[np.ndarray, "_ 3"]]) -> View | None:
-    """What a lidar or radar sees by some of its day's sweeps or scans; None where they are too few points to tell.
+    """View of a lidar or radar from sweeps or scans of its day; None if there are too few points.
 
     Args:
-        clouds: evenly spread over the day, FRAMES of them at best; in the sensor's frame [m].
+        clouds: evenly spaced over the day, ideally FRAMES of them; in the sensor's frame [m].
     """
     if sum(len(c) for c in clouds) < _FEWEST:
         return None
@@ -52,7 +52,7 @@ def view_of_clouds(clouds: Sequence[Float[np.ndarray, "_ 3"]]) -> View | None:
 
 
 def _of_points(points: Float[np.ndarray, "N 3"]) -> View:
-    """Azimuths beside the widest gap without points, between lowest and highest elevation; any where all are level."""
+    """Azimuths outside the widest gap, lowest to highest elevation (no limits if all points are level)."""
     azimuth, elevation = to_spherical(points)[:, :2].T
     bins = round(2 * np.pi / _BIN_RAD)
     count = np.bincount(_bin(azimuth, bins), minlength=bins)
@@ -68,7 +68,7 @@ def _of_points(points: Float[np.ndarray, "N 3"]) -> View:
 
 
 def _without_holes(filled: Bool[np.ndarray, " B"]) -> Bool[np.ndarray, " B"]:
-    """Bins of a circle with all gaps filled but the widest, and that as well where it is a hole of the scene."""
+    """Bins of a circle with all gaps filled, except the widest unless it is due to the scene."""
     at = np.flatnonzero(filled)
     if not len(at):
         return np.ones_like(filled)

@@ -112,7 +112,7 @@ def test_evaluate_reads_picked_reflectors(workplace):
     numbers = [np.array([float(v) for v in row.split("|")[4].split("/")]) for row in rows]
     np.testing.assert_allclose(*numbers, atol=0.05)
     path.write_text(json.dumps(content | {"targets": [{"pixel": [1, 2]}]}))
-    with pytest.raises(ConfigError, match="no readable reflector file"):
+    with pytest.raises(ConfigError, match="not a readable reflector file"):
         evaluate(lake=str(workplace / "lake"), reflectors=path)
 
 
