@@ -123,7 +123,7 @@ def _bright(points: np.ndarray, intensity: np.ndarray, guess_m: np.ndarray) -> n
 
 
 def _fit_apex(points: np.ndarray, edge_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Apex and its sigma: fits measured ranges to the exit of each ray from the corner of three planes."""
+    """Apex and its sigma, fitted so that each ray leaves the corner of three planes at its measured range."""
     rays, range_m = _by_beam(points)
     centre = (rays * range_m[:, None]).mean(axis=0)
     # The centroid of the plates is 2/3 of the corner's depth in front of the apex: edge / sqrt(3) * 2/3.

@@ -91,7 +91,7 @@ class Attribution:
         return next(iter(self.moved), None)
 
     def on(self, edge: Edge) -> str | None:
-        """The moved sensor at an end of this edge; if neither is, the first."""
+        """The moved sensor at an end of this edge; if there is none, the first moved sensor."""
         ends = [sensor.name for sensor in edge.sensors]
         return next((name for name in self.moved if name in ends), self.sensor)
 

@@ -111,7 +111,7 @@ class Camera:
         return rays.reshape(*uv.shape[:-1], 3)
 
     def fast_polynomial(self, degree: int = 9) -> tuple[Float[np.ndarray, " P"], float]:
-        """Coefficients k(c) of `u = cx + fx k x/|p|`, `v = cy + fy k y/|p|`, c = z/|p|; largest error [px].
+        """Polynomial k(c) with `u = cx + fx k x/|p|`, `v = cy + fy k y/|p|`, c = z/|p|; largest error [px].
 
         Coefficients are in ascending order of power. For `equidistant` only: replaces atan2 in hot loops by a
         polynomial over the angles in the image.

@@ -1,7 +1,7 @@
 """Neighbouring beams of a lidar sweep in rows; detects sweeps without rows.
 
 A scanner measures in rows: the log has the row of each point (`ring`), or elevations cluster around one value
-per row. If beams start side by side, elevations do not cluster, but clouds are often stored turn by turn. A
+per row. If the beams of a row are staggered, elevations do not cluster; but clouds are often stored turn by turn. A
 lidar with rotating prisms draws a rosette: drivers number its lasers, which readers treat as rings, but
 points of one laser that are neighbours in azimuth differ by degrees in elevation. As rows they would make
 false depth jumps on the ground.

@@ -155,7 +155,7 @@ def from_quaternion(
     """
     norm = np.linalg.norm(q_wxyz, axis=-1, keepdims=True)
     if not np.all(np.isfinite(norm)) or np.any(norm < 1e-6):
-        raise ValueError(f"not a rotation: quaternion (w, x, y, z) = {q_wxyz}")
+        raise ValueError(f"no rotation: quaternion (w, x, y, z) = {q_wxyz}")
     w, x, y, z = np.moveaxis(q_wxyz / norm, -1, 0)
     R = np.stack(
         [
