@@ -43,7 +43,7 @@ def simulate(
         rig: sensors: demo, paper, paper-one-clock, paper-free, ring16, corner-left, corner-right, spin128,
             rosette, hdl64, keyhole, telephoto, fisheye, pinhole, rolling, truck, bumper, tilted, van (6
             cameras, 2 lidars, 5 radars) or duo (2, 1, 2); append `-flat` for radars without elevation, or
-            `-dirty` for radars with false detections and mirror images in the road.
+            `-dirty` for radars with strong road reflections and twice the noise.
             pipeline/simulate/README.md describes each rig.
         environments: surroundings of the drives: urban and highway in turn (mixed), one of them, suburb, jam,
             alley, country, deck, tunnel, or world-SEED, drawn from SEED.

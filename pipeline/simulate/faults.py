@@ -1,21 +1,22 @@
-"""What goes wrong with a vehicle, and bad days: written `vehicle:day:sensor:kind:amount`, several with commas.
+"""Faults of sensors, and bad days: written `vehicle:day:sensor:kind:amount`, separated by commas.
 
-A sensor goes by its name in the rig.
+Sensors are named as in the rig.
 
-Kinds: yaw, pitch, roll [deg] and x, y, z [m] are knocks from that day on, about the vehicle's axes at the sensor; the
-same with `drift-` before it grow by the amount per day, starting that day. From that day on `time` [s] lets a sensor
-measure earlier than its stamps say, which stay with the others'; `stamp` [s] shifts its stamps, and nothing else.
-`realign` [deg] is a radar whose software turns its points to the left by so much, and states it; `realign-untold` one
-that does not state it.
-All of these may begin within their day: amount `0.5@0.6` comes after six tenths of its frames. With `warm-` before it a
-turn or shift grows from nothing to the amount from the first frame of that day to its last, and is gone the next day.
-Only on that day, and from within it too: `missing` (no data), `stuck` (the first data of each drive are sent again and
-again, with new stamps). Only on that day: `swap` (the sensor's topic carries the other point cloud; on a rig of many,
-that of the next sensor of its kind, and its own goes there), `intrinsics` (logged focal length wrong by the fraction),
-`centre` and `centre-v` (logged principal point too far to the right, or down, by so many pixels), `labels` (classes
-permuted). Of the whole vehicle, on that day, named with any camera: `night` (dark images, outlines three times as
-loose, classes confused, half of the boxes missed), `dusk` (dark images, outlines 2 label pixels noisier, half of the
-boxes missed, nothing else), `few` (that many frames in all).
+Kinds: yaw, pitch, roll [deg] and x, y, z [m] move a sensor from that day on, about the vehicle's axes at the
+sensor; with the prefix `drift-` they grow by the amount per day, starting that day. From that day on, `time`
+[s] lets a sensor measure earlier than its stamps, which stay aligned with the others; `stamp` [s] shifts only
+its stamps. `realign` [deg]: the radar's software rotates its points to the left by this angle, and reports
+it; `realign-untold` does not report it.
+All of these may start within their day: amount `0.5@0.6` starts after six tenths of its frames. With the
+prefix `warm-` a rotation or shift grows from zero at the first frame of that day to the amount at its last,
+and is gone the next day. Only on that day, also starting within it: `missing` (no data), `stuck` (the first
+data of each drive are repeated with new stamps). Only on that day: `swap` (the sensor's topic has the other
+point cloud; in a rig of many sensors, that of the next sensor of its kind, and vice versa), `intrinsics`
+(logged focal length wrong by the fraction), `centre` and `centre-v` (logged principal point too far to the
+right, or down, by this many pixels), `labels` (classes permuted). For the whole vehicle on that day, written
+with any camera: `night` (dark images, outlines three times as noisy, confused classes, half of the boxes
+missed), `dusk` (dark images, outlines 2 label pixels noisier, half of the boxes missed), `few` (this many
+frames in total).
 """
 
 from __future__ import annotations
@@ -63,9 +64,9 @@ KINDS: Final = (
 
 @dataclass(frozen=True)
 class Fault:
-    """One thing that goes wrong; `day` counts from 0, amounts in deg, m, s, a fraction or a count, by kind.
+    """One fault; `day` counts from 0, amounts are in deg, m, s, a fraction or a count, by kind.
 
-    `after` is the share of the day's frames that a knock, a drift or a shifted clock spares.
+    `after` is the share of the day's frames before the start of a move, drift or clock shift.
     """
 
     vehicle: str
@@ -78,24 +79,24 @@ class Fault:
 
 @dataclass(frozen=True)
 class DayFaults:
-    """What is wrong on one vehicle-day after a share of its frames, besides where the sensors are."""
+    """Faults of one vehicle-day after a share of its frames, except changes of the mounting."""
 
     faults: tuple[Fault, ...] = ()
 
     def has(self, kind: str, sensor: str | None = None) -> bool:
-        """Whether a kind of fault is there, of any sensor or of the named one."""
+        """True if a kind of fault is present, for any sensor or for the named one."""
         return any(f.kind == kind and sensor in (None, f.sensor) for f in self.faults)
 
     def amount(self, kind: str, sensor: str | None = None) -> float:
-        """Its amount; 0 where it is not there."""
+        """Amount of the fault; 0 if it is not present."""
         return sum((f.amount for f in self.faults if f.kind == kind and sensor in (None, f.sensor)), 0.0)
 
 
 def parse_faults(text: str, days: list[str], rig: RigSpec = RIGS["demo"]) -> tuple[Fault, ...]:
-    """Faults of a list; a day is one of `days` or its number, a sensor one of the rig's.
+    """Parse a list of faults; a day is one of `days` or its number, a sensor one of the rig's.
 
     Raises:
-        ConfigError: wrong number of parts, unknown day, sensor or kind, amount that is no number.
+        ConfigError: wrong number of parts, unknown day, sensor or kind, or an amount that is not a number.
     """
     faults = []
     for item in filter(None, re.split(r"[,\s]+", text)):
@@ -117,7 +118,7 @@ def parse_faults(text: str, days: list[str], rig: RigSpec = RIGS["demo"]) -> tup
         try:
             fault = Fault(vehicle, number, sensor, kind, float(size), float(after) if at else 0.0)
         except ValueError as err:
-            raise ConfigError("--faults", item, f"amount {amount!r} is no number") from err
+            raise ConfigError("--faults", item, f"amount {amount!r} is not a number") from err
         whole = kind in set(_DAY_ONLY) - set(_SENT) or kind.startswith(_WARM)
         if at and (whole or not 0 <= fault.after < 1):
             raise ConfigError("--faults", item, f"{kind} cannot begin after {after} of its day")
@@ -126,8 +127,8 @@ def parse_faults(text: str, days: list[str], rig: RigSpec = RIGS["demo"]) -> tup
 
 
 def _sensors(kind: str, rig: RigSpec) -> list[str]:
-    """Sensors of a rig that a kind of fault can happen to."""
-    if kind in _CLOCKS:  # the reference lidar's clock is what the others are compared with
+    """Sensors of a rig that a kind of fault applies to."""
+    if kind in _CLOCKS:  # other clocks are compared with the reference lidar's
         return [s.name for s in rig.sensors if s != rig.reference]
     if kind in _REALIGNED:
         return [s.name for s in rig.of_kind("radar")]
@@ -137,12 +138,12 @@ def _sensors(kind: str, rig: RigSpec) -> list[str]:
 
 
 def states_alignment(faults: tuple[Fault, ...]) -> bool:
-    """Whether radars of the fleet state their own alignment: where one of them is aligned anew."""
+    """True if radars of the fleet report their alignment: if a fault realigns one of them."""
     return any(fault.kind in _REALIGNED for fault in faults)
 
 
 def swapped_with(sensor: SensorSpec, rig: RigSpec) -> SensorSpec | None:
-    """The sensor that another's cable can be mistaken for: the next of its kind, or the other of lidar and radar."""
+    """The sensor to swap with: the next of its kind, or the other of lidar and radar; None without one."""
     if rig.is_short:
         return rig["radar" if sensor.kind == "lidar" else "lidar"]
     alike = rig.of_kind(sensor.kind)
@@ -152,7 +153,7 @@ def swapped_with(sensor: SensorSpec, rig: RigSpec) -> SensorSpec | None:
 def shaken(
     mounting: Mounting, faults: tuple[Fault, ...], vehicle: str, day: int, share: float = 0.0
 ) -> Mounting:
-    """The mounting after every knock and drift up to a share of a day's frames, and clocks after every shift."""
+    """Mounting after all moves and drifts up to a share of a day's frames, and clocks after all shifts."""
     sensors = dict(mounting.sensors)
     for fault in faults:
         is_past = (fault.day, fault.after) <= (day, share)
@@ -163,9 +164,9 @@ def shaken(
 
 
 def _moved(mounted: Mounted, fault: Fault, day: int, share: float) -> Mounted:
-    """A sensor after one knock, drift or shift of its clock."""
+    """A sensor after one move, drift or clock shift."""
     if fault.kind in _CLOCKS:
-        # A stamp that is late belongs to an event as much earlier: shifting both leaves the event where it was.
+        # A late stamp belongs to an earlier event: shifting both keeps the time of the event.
         phase_s = mounted.phase_s + (fault.amount if fault.kind == "stamp" else 0.0)
         return replace(mounted, delay_s=mounted.delay_s + fault.amount, phase_s=phase_s)
     if fault.kind in _REALIGNED:
@@ -184,12 +185,12 @@ def _moved(mounted: Mounted, fault: Fault, day: int, share: float) -> Mounted:
 
 
 def faults_on(faults: tuple[Fault, ...], vehicle: str, day: int, share: float = 1.0) -> DayFaults:
-    """What is wrong on that day only, after a share of its frames."""
+    """Faults limited to that day, after a share of its frames."""
     return DayFaults(tuple(f for f in faults if f.vehicle == vehicle and f.day == day and f.after <= share))
 
 
 def misread(camera: Camera, today: DayFaults, name: str) -> Camera:
-    """A camera as the day's logs describe it: focal length or principal point may be wrong."""
+    """The camera in the day's logs: focal length or principal point may be wrong."""
     K = camera.K.copy()
     K[[0, 1], [0, 1]] *= 1 + today.amount("intrinsics", name)
     K[:2, 2] += (today.amount("centre", name), today.amount("centre-v", name))

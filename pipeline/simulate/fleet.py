@@ -1,4 +1,4 @@
-"""A fleet's logs, truth and fleet.toml. Every vehicle-day has its own seed, so days come out the same in any order."""
+"""A fleet's logs, truth and fleet.toml. Each vehicle-day has its seed, so their order has no effect."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _IN_TURN: Final = "mixed"
 
 @dataclass(frozen=True)
 class FleetSpec:
-    """What to simulate; `frames` per vehicle-day, spread over `drives` drives."""
+    """Specification of a simulated fleet; `frames` per vehicle-day, spread over `drives` drives."""
 
     vehicles: int = 3
     days: int = 4
@@ -57,8 +57,8 @@ class FleetSpec:
     drives: int = 3
     rate_hz: float = 2.0
     rig: str = "demo"
-    own_rigs: tuple[tuple[str, str], ...] = ()  # vehicles that have another rig, and which
-    own_frames: int | None = None  # of those vehicles' days; None = as many as the others'
+    own_rigs: tuple[tuple[str, str], ...] = ()  # (vehicle, rig) for vehicles with another rig
+    own_frames: int | None = None  # frames per day of those vehicles; None = same as the others
     environments: str = "mixed"  # a landscape's name, or urban and highway in turn
     container: str = "mcap"  # mcap, ros1, db3, mixed
     faults: tuple[Fault, ...] = ()
@@ -90,12 +90,12 @@ class FleetSpec:
 
 
 def rig_of(spec: FleetSpec, vehicle: int) -> RigSpec:
-    """What is mounted on a vehicle."""
+    """The rig of a vehicle."""
     return rig_named(dict(spec.own_rigs).get(vehicle_names(spec)[vehicle], spec.rig))
 
 
 def rigs_of(spec: FleetSpec) -> dict[str, RigSpec]:
-    """What is mounted on each vehicle, by name."""
+    """The rig of each vehicle, by name."""
     return {name: rig_of(spec, i) for i, name in enumerate(vehicle_names(spec))}
 
 
@@ -108,12 +108,12 @@ def day_names(first_day: str, days: int) -> list[str]:
     """Consecutive days as YYYY-MM-DD.
 
     Raises:
-        ConfigError: `first_day` is no such day.
+        ConfigError: `first_day` is not a valid day.
     """
     try:
         first = date.fromisoformat(first_day)
     except ValueError as err:
-        raise ConfigError("--first-day", "", f"{first_day!r} is no day as YYYY-MM-DD") from err
+        raise ConfigError("--first-day", "", f"{first_day!r} is not a day as YYYY-MM-DD") from err
     return [(first + timedelta(days=i)).isoformat() for i in range(days)]
 
 
@@ -151,7 +151,7 @@ def simulate_fleet(
                     logs, done = logs + job.result(), done + spec.frames
                     progress(done, total, f"{vehicles[v]} {days[d]}")
             except BaseException:
-                # Stopped or failed: days not begun yet need not be, nor those that were begun.
+                # After a stop or failure, remaining days are not needed, nor those in progress.
                 pool.shutdown(wait=False, cancel_futures=True)
                 for worker in set(active_children()) - others:
                     worker.terminate()
@@ -167,7 +167,7 @@ def simulate_fleet(
 
 
 def _stop_on_sigterm() -> None:
-    """A worker told to stop unwinds, so that no log is left in halves; ^C reaches it through its parent."""
+    """Make a worker unwind on SIGTERM, so that no log is half-written; ^C reaches it through its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _leave)
 
@@ -175,7 +175,7 @@ def _stop_on_sigterm() -> None:
 def _work(spec: FleetSpec, vehicle: int, day: int, out: Path) -> int:
     try:
         return simulate_vehicle_day(spec, vehicle, day, out)
-    except SystemExit as err:  # told to stop, and unwound: the pool would hand this worker the next day
+    except SystemExit as err:  # after SIGTERM: without this the pool would give the worker the next day
         os._exit(int(err.code or 0))
 
 
@@ -216,9 +216,9 @@ def simulate_vehicle_day(
 
 
 def mounting_on(spec: FleetSpec, vehicle: int, day: int, share: float = 0.0) -> Mounting:
-    """Where the sensors of a vehicle are after a share of a day's frames, faults included."""
+    """Mounting of a vehicle's sensors after a share of a day's frames, faults included."""
     rig = rig_of(spec, vehicle)
-    if spec.remount_deg is not None:  # the paper takes its rig off every evening: lever arms move along
+    if spec.remount_deg is not None:  # the paper's rig is taken off every evening: lever arms change too
         shift_m = rig.remount_translation_m * max(spec.remount_deg / rig.remount_rotation_deg, 1.0) / 4
         rig = replace(rig, remount_rotation_deg=spec.remount_deg, remount_translation_m=shift_m)
     mounting = mounting_of(rig, spec.seed, vehicle, day)
@@ -226,7 +226,7 @@ def mounting_on(spec: FleetSpec, vehicle: int, day: int, share: float = 0.0) -> 
 
 
 def _setup(spec: FleetSpec, vehicle: int, day: int, share: float) -> Setup:
-    """The vehicle after a share of a day's frames."""
+    """State of the vehicle after a share of a day's frames."""
     today = faults_on(spec.faults, vehicle_names(spec)[vehicle], day, share)
     return Setup(
         rig_of(spec, vehicle),

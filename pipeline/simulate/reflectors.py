@@ -1,7 +1,7 @@
-"""The paper's controlled recording: three trihedral corner reflectors on a level empty lot, seen standing still.
+"""The paper's controlled recording: a standing car and three trihedral corner reflectors on a level lot.
 
-The JSON beside the recording is the file that `boresight evaluate --reflectors` reads as it is: its format is
-described in pipeline/evaluate/picks.py. What is true stands in it under `truth`, which evaluate does not read.
+The JSON beside the recording is the input of `boresight evaluate --reflectors`; pipeline/evaluate/picks.py
+describes its format. The truth is under `truth`, which evaluate does not read.
 
 Source: paper, section 2.1 (150 frames, positions picked by hand in each sensor's data) and figure 2.
 """
@@ -32,7 +32,7 @@ from pipeline.simulate.world.meshes import Mesh, MeshBuilder, Number
 
 __all__ = ["REFLECTORS_VEHICLE", "simulate_reflectors"]
 
-# Apexes in the vehicle frame [m]: three ranges, three bearings, at about the height of the sensors.
+# Apexes in the vehicle frame [m]: three ranges, three bearings, at about sensor height.
 REFLECTORS_VEHICLE: Final = np.array([[16.3, -2.6, 1.45], [26.0, 3.5, 1.30], [41.2, 0.6, 1.60]])
 _EDGE_M: Final = 0.35
 _LIDAR_PICK_SIGMA_M: Final = 0.015
@@ -43,7 +43,7 @@ _SUN: Final = np.array([0.35, 0.55, 0.76]) / np.linalg.norm([0.35, 0.55, 0.76])
 def simulate_reflectors(
     spec: FleetSpec, vehicle: int, day: int, out: Path, frames: int = 150, progress: Progress = silent
 ) -> Path:
-    """Write `reflectors/<vehicle>/<day>.mcap` and `<day>.json` (picked positions, and the truth apart from them).
+    """Write `reflectors/<vehicle>/<day>.mcap` and `<day>.json` (picked positions, and separately the truth).
 
     Returns:
         Path of the JSON file.
@@ -107,7 +107,7 @@ def _trihedral(b: MeshBuilder, apex: np.ndarray) -> None:
     u = -apex * [1, 1, 0] / np.linalg.norm(apex[:2])
     side = np.array([-u[1], u[0], 0.0])
     up = np.array([0.0, 0.0, 1.0])
-    # Orthonormal triad whose sum points along u: columns of a rotation that takes (1, 1, 1)/sqrt(3) to u.
+    # Orthonormal triad with its sum along u: columns of a rotation that takes (1, 1, 1)/sqrt(3) to u.
     edges = [
         u / np.sqrt(3) + (np.cos(a) * side + np.sin(a) * up) * np.sqrt(2 / 3)
         for a in np.radians([90, 210, 330])
@@ -124,7 +124,7 @@ def _trihedral(b: MeshBuilder, apex: np.ndarray) -> None:
 def _picks(
     vehicle: str, day: str, m: Mounting, scans: list[Scan], rng: np.random.Generator
 ) -> dict[str, Any]:
-    """What a patient person marks in each sensor's data, and what is true."""
+    """Careful manual picks in each sensor's data, and the truth."""
     seen, lidar, radar = (
         transform_points(inverse(m[n].T_points), REFLECTORS_VEHICLE) for n in ("camera", "lidar", "radar")
     )
@@ -164,7 +164,7 @@ def _target(
     width_px: int,
     rng: np.random.Generator,
 ) -> dict[str, Any]:
-    """One reflector as picked, given where each sensor should see it."""
+    """One reflector as picked, from its true position in each sensor."""
     step = width_px / 1824  # half a pixel of the full camera
     pixel_sd, lidar_sd = 0.5 * max(step, 0.5), _LIDAR_PICK_SIGMA_M
     picked_pixel, picked_lidar = pixel + rng.normal(0, pixel_sd, 2), lidar_m + rng.normal(0, lidar_sd, 3)
@@ -173,7 +173,7 @@ def _target(
         "pixel": picked_pixel.tolist(),
         "lidar_m": picked_lidar.tolist(),
         "radar_m": detections.mean(axis=0).tolist(),
-        # A person marks a standing scene once in image and cloud; the radar's detections dance.
+        # In image and cloud, a person picks a standing target once; the radar's detections scatter.
         "spread": {
             "pixel": [pixel_sd] * 2,
             "lidar_m": [lidar_sd] * 3,
@@ -184,7 +184,7 @@ def _target(
 
 
 def _radar_picks(scans: list[Scan], near_m: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "N 3"]:
-    """The strongest detection around a reflector in every scan that has one."""
+    """The strongest detection near a reflector in every scan that has one."""
     found = []
     for scan in scans:
         offset = np.linalg.norm(scan.xyz_m[:, :2] - near_m[:2], axis=1)

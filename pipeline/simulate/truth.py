@@ -1,4 +1,4 @@
-"""What is true of a vehicle-day, by sensor: what a judge needs to know and no log says."""
+"""True poses, clocks and errors of a vehicle-day, by sensor, for evaluation; not in the logs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["truth_of"]
 
 
 def truth_of(rig: RigSpec, morning: Mounting, evening: Mounting, today: DayFaults) -> dict[str, Any]:
-    """Poses, clocks and errors of a day's sensors; stamp_a = stamp_b + dt_a_b_s, as in the calibration records."""
+    """Poses, clocks and errors of a day's sensors; stamp_a = stamp_b + dt_a_b_s, as in records."""
     ends = _poses(evening) | (_pairs(evening) if rig.is_short else {})
     return {
         "rig": rig.name,
@@ -28,7 +28,7 @@ def truth_of(rig: RigSpec, morning: Mounting, evening: Mounting, today: DayFault
 
 
 def _poses(mounting: Mounting) -> dict[str, Any]:
-    """Where every sensor is, and how much later than the reference's its stamps of an event are."""
+    """Poses of all sensors, and delays of their stamps relative to the reference's."""
     sensors = mounting.sensors.items()
     return {
         "T_base_sensor": {n: m.T_points.tolist() for n, m in sensors},
@@ -44,13 +44,13 @@ def _camera(sensor: SensorSpec, mounting: Mounting, today: DayFaults) -> dict[st
 
 
 def _pairs(m: Mounting) -> dict[str, Any]:
-    """T_parent_child of the pairs of a rig of three."""
+    """T_parent_child of the pairs of a three-sensor rig."""
     pairs = (("camera", "lidar"), ("lidar", "radar"), ("camera", "radar"))
     return {f"T_{a}_{b}": m.between(a, b).tolist() for a, b in pairs}
 
 
 def _of_three(m: Mounting, rig: RigSpec, today: DayFaults) -> dict[str, Any]:
-    """The same by the names that readers of rigs of three know."""
+    """Truth of a three-sensor rig under the keys that its readers expect."""
     camera, radar, errors = m["camera"], m["radar"], m["radar"].errors
     assert errors is not None
     about = _camera(rig["camera"], m, today)

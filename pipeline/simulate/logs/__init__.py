@@ -1,1 +1,1 @@
-"""Measurements as messages, messages as logs."""
+"""Conversion of measurements to messages, and of messages to logs."""

@@ -1,4 +1,4 @@
-"""The fleet.toml that goes with simulated logs."""
+"""fleet.toml for simulated logs."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ __all__ = ["fleet_toml", "mixed_fleet_toml"]
 
 
 def fleet_toml(fleet: str, rig_name: str, rig: RigSpec, vehicles: list[str]) -> str:
-    """Text of fleet.toml; the prior's sigmas are those of a mounting against CAD for a pair of sensors."""
+    """Text of fleet.toml; the prior's sigmas are deviations of a pair of sensors from CAD."""
     return _text(fleet, {rig_name: rig}, dict.fromkeys(vehicles, rig_name))
 
 
 def mixed_fleet_toml(fleet: str, rigs: Mapping[str, RigSpec], states_alignment: bool = False) -> str:
-    """Text of the fleet.toml of vehicles of which each has a rig of its own, by vehicle.
+    """Text of fleet.toml for vehicles with a rig each, by vehicle.
 
     Args:
-        fleet: its name.
-        rigs: by vehicle.
-        states_alignment: radars send messages of their own alignment.
+        fleet: name of the fleet.
+        rigs: rigs by vehicle.
+        states_alignment: radars send messages with their alignment.
     """
     return _text(
         fleet, {r.name: r for r in rigs.values()}, {v: r.name for v, r in rigs.items()}, states_alignment

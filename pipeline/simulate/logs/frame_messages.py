@@ -1,4 +1,4 @@
-"""What sensors deliver at one moment as messages of a log, the day's faults included."""
+"""Messages of a log for the measurements of one moment, faults included."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from pipeline.simulate.sensors.simulated_frame import Image, SimulatedFrame
 
 __all__ = ["At", "Sent", "Setup", "messages_of"]
 
-# A radar that filters its estimate over minutes: it scatters far less than it may err.
+# The radar filters its estimate over minutes: messages scatter far less than their error.
 _STATED_SCATTER_RAD, _STATED_SIGMA_RAD = np.radians(0.01), np.radians(0.05)
 At = Callable[[float], int]  # stamp [ns] of a time of the drive [s]
 Sent = tuple[int, str, Any]  # log time [ns], topic, message
@@ -30,9 +30,9 @@ Sent = tuple[int, str, Any]  # log time [ns], topic, message
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """A vehicle at one moment: its rig, where its sensors are, how well networks label, what is wrong with it.
+    """A vehicle at one moment: rig, mounting, quality of its label networks, faults.
 
-    `states_alignment`: its radars send messages of their own alignment.
+    `states_alignment`: its radars send messages with their alignment.
     """
 
     rig: RigSpec
@@ -45,14 +45,14 @@ class Setup:
 def messages_of(
     messages: RosMessages, frame: SimulatedFrame, setup: Setup, at: At, rng: np.random.Generator
 ) -> list[Sent]:
-    """The messages of one frame; none of a sensor that is missing.
+    """The messages of one frame; a missing sensor has none.
 
     Args:
-        messages: makes them.
-        frame: what the sensors deliver.
+        messages: message factory.
+        frame: measurements of the sensors.
         setup: rig and faults of the day.
-        at: stamp of a time of the drive.
-        rng: exchanges classes where the day's labels are permuted.
+        at: stamp for a time of the drive.
+        rng: permutes classes if the day's labels have that fault.
     """
     sent: list[Sent] = []
     for sensor in setup.rig.sensors:
@@ -69,7 +69,7 @@ def messages_of(
                 else _of_radar(frame.scans[name], sensor)
             )
             plug = _plugged(sensor, setup)
-            # A reader takes the frame of a mistaken cable from the driver behind it.
+            # A reader gets the frame id from the driver of the swapped sensor.
             owner = plug if plug.kind == sensor.kind else sensor
             topic = topics_of(plug.name, plug.kind)["points"]
             sent.append((stamp, topic, messages.cloud(messages.at(stamp, owner.name), columns)))
@@ -82,13 +82,13 @@ def messages_of(
 
 
 def _alignment(stated_rad: float, stamp_ns: int) -> tuple[float, float, float]:
-    """Azimuth, elevation and their sigma as a radar states them; of their own random numbers, so that days stay."""
+    """Azimuth, elevation and sigma as reported by a radar, from a separate random generator."""
     azimuth, elevation = np.random.default_rng(stamp_ns).normal(0, _STATED_SCATTER_RAD, 2)
     return stated_rad + azimuth, elevation, _STATED_SIGMA_RAD
 
 
 def _plugged(sensor: SensorSpec, setup: Setup) -> SensorSpec:
-    """The sensor on whose topic this one's points are sent."""
+    """The sensor whose points are sent on this sensor's topic."""
     for fault in setup.faults.faults:
         if fault.kind == "swap":
             one = setup.rig[fault.sensor]
@@ -140,7 +140,7 @@ def _detections(ros: RosMessages, header: Any, boxes: list[Box]) -> Any:
 def _of_lidar(sweep: Sweep, sensor: SensorSpec) -> dict[str, np.ndarray]:
     assert isinstance(sensor.sheet, LidarSpec)
     points = dict(zip("xyz", sweep.xyz_m.T, strict=True))
-    # Drivers of solid-state lidars call their lasers lines, and readers take them for rings.
+    # Drivers of solid-state lidars call their lasers lines, and readers treat them as rings.
     laser = "ring" if sensor.sheet.pattern == "rows" else "line"
     return points | {"intensity": sweep.intensity, laser: sweep.ring, "time": sweep.time_s}
 
@@ -153,6 +153,6 @@ def _of_radar(scan: Scan, sensor: SensorSpec) -> dict[str, np.ndarray]:
 
 
 def _permuted(png: bytes, rng: np.random.Generator) -> bytes:
-    """Labels with their classes exchanged (a model with another label set)."""
+    """Labels with permuted classes, as from a model with another label set."""
     labels = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
     return encode_png(np.concatenate([rng.permutation(19), np.full(237, 255)]).astype(np.uint8)[labels])

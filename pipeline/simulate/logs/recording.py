@@ -1,4 +1,4 @@
-"""Turns what the sensors deliver into the messages of a log, day faults included."""
+"""Conversion of simulated measurements to the messages of a log, faults included."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ __all__ = ["FIRST_FRAME_S", "nominal_poses", "record_drive"]
 
 T = TypeVar("T")
 _ODOMETRY_HZ: Final = 20.0
-FIRST_FRAME_S: Final = 1.0  # a drive's log begins this long before its first frame
-# Of free-running sensors the log holds what each measured next to the reference's sweep, for rendering costs most of a
-# day; with every so many sweeps also the second next, so that pairing has to choose.
+FIRST_FRAME_S: Final = 1.0  # the log of a drive starts this long before its first frame
+# For free-running sensors the log has the measurement nearest to the reference's sweep, because rendering
+# dominates the cost; every few sweeps also the second nearest, so that pairing must choose.
 _NEIGHBOURS_EVERY: Final = 4
 
 
@@ -50,11 +50,11 @@ def record_drive(
 
     Args:
         log: open for writing.
-        world: of the drive.
-        setups: the vehicle at each moment to write.
+        world: world of the drive.
+        setups: state of the vehicle at each moment to write.
         rate_hz: moments per second.
         rng: noise.
-        tick: told the number of moments written, after each.
+        tick: called with the number of moments written, after each.
     """
     drive, messages, rig = world.drive, log.messages, setups[0].rig
 
@@ -98,7 +98,7 @@ def _sweep_s(rig: RigSpec) -> float:
 def _stamps(
     setup: Setup, clocks: Mapping[str, Ticks], sweep_s: float, rng: np.random.Generator
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """By sensor the stamp nearest to the reference's, and of others that run freely the next nearest."""
+    """By sensor, the stamp nearest to the reference's; for free-running sensors also the second nearest."""
     rig, mounting = setup.rig, setup.mounting
     if not clocks:
         return triggered_stamps(rig, mounting, sweep_s, rng), {}
@@ -109,7 +109,7 @@ def _stamps(
 
 
 def _resent(frame: SimulatedFrame, first: Mapping[str, SimulatedFrame], today: DayFaults) -> SimulatedFrame:
-    """A frame in which stuck sensors deliver what they did first."""
+    """A frame in which stuck sensors repeat their first data."""
 
     def held(by_name: Mapping[str, T], of: Callable[[SimulatedFrame], Mapping[str, T]]) -> dict[str, T]:
         return {n: of(first[n])[n] if today.has("stuck", n) else value for n, value in by_name.items()}
@@ -123,14 +123,15 @@ def _resent(frame: SimulatedFrame, first: Mapping[str, SimulatedFrame], today: D
 
 
 def nominal_poses(mounting: Mounting) -> dict[str, np.ndarray]:
-    """T_vehicle_sensor as /tf_static says."""
+    """T_vehicle_sensor as in /tf_static."""
     return {name: mounted.T_vehicle_nominal for name, mounted in mounting.sensors.items()}
 
 
 def _labelled_in_the_dark(spec: SemanticsSpec, today: DayFaults) -> SemanticsSpec:
-    """What networks that learned by day make of the night: outlines three times as loose, half of the boxes missed.
+    """Errors of day-trained networks at night: outlines three times as noisy, half of the boxes missed.
 
-    Or of dusk: outlines 2 label pixels looser, half of the boxes missed, and what is seen is told as by day.
+    At dusk: outlines 2 label pixels noisier, half of the boxes missed; classes of visible objects are as
+    reliable as by day.
     """
     if today.has("dusk"):
         return replace(spec, boundary_px=spec.boundary_px + 2.0, miss=0.5)

@@ -1,4 +1,4 @@
-"""Writes messages as ROS 2 MCAP (zstd chunks), ROS 1 bag or ROS 2 bag folder (sqlite3); one interface, same content."""
+"""Writers for ROS 2 MCAP (zstd chunks), ROS 1 bag and ROS 2 bag folder (sqlite3), with equal content."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CONTAINERS: Final = ("mcap", "ros1", "db3")
 
 
 class OpenLog(NamedTuple):
-    """A log open for writing: makes its messages, and writes them by put(topic, stamp_ns, message)."""
+    """A log open for writing: creates messages, and writes them with put(topic, stamp_ns, message)."""
 
     messages: RosMessages
     put: Callable[[str, int, Any], None]
@@ -33,7 +33,7 @@ def log_name(stem: str, container: str) -> str:
 
 @contextmanager
 def open_log(path: Path, container: str) -> Iterator[OpenLog]:
-    """A log that appears under its name, in place of an old one, when the block has ended without an error."""
+    """Open a log; it gets its final name, replacing an old one, when the block ends without an error."""
     partial = path.parent / f".partial-{path.name}"
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)

@@ -1,1 +1,1 @@
-"""What is mounted on a vehicle and what it measures of the world."""
+"""Sensors of a vehicle and their measurements of the world."""

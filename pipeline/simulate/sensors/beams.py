@@ -1,7 +1,7 @@
-"""Where a lidar's beams point and when they fire: the rows of a scanner, or the rosette of two turning prisms.
+"""Directions and times of a lidar's beams: rows of a scanner, or the rosette of two rotating prisms.
 
-Source of the rosette: Marshall 1999, "Risley prism scan patterns" (SPIE 3787): each prism adds a deflection that turns
-with it, and the sum of two closes only where their rates are to each other as small whole numbers.
+Source of the rosette: Marshall 1999, "Risley prism scan patterns" (SPIE 3787): each prism adds a rotating
+deflection, and their sum is periodic only if the ratio of their rates is one of small whole numbers.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ __all__ = ["Beams", "beams_of"]
 
 @dataclass(frozen=True, eq=False)
 class Beams:
-    """All beams of a sweep, firing by firing: (azimuth, elevation) [rad], which laser, which firing."""
+    """All beams of a sweep in order of firing: (azimuth, elevation) [rad], laser, firing."""
 
     angles: Float64[np.ndarray, "N 2"]
     laser: UInt16[np.ndarray, " N"]
@@ -27,7 +27,7 @@ class Beams:
 
 
 def beams_of(spec: LidarSpec, end_s: float) -> Beams:
-    """The beams of the sweep that ends at `end_s`; those of a scanner are the same in every sweep."""
+    """The beams of the sweep that ends at `end_s`; a scanner has the same in every sweep."""
     return _scanned(spec) if spec.pattern == "rows" else _rosette(spec, end_s)
 
 

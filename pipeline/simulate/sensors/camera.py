@@ -1,4 +1,4 @@
-"""What a camera sees: exact visibility per pixel by ray casting, light, texture, optics, noise, JPEG."""
+"""Camera images: exact visibility per pixel by ray casting, light, texture, optics, noise, JPEG."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ __all__ = ["View", "encode_jpeg", "render", "view_of"]
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Triangle seen by each pixel, at half size (`coarse`) and at full size, and the rays behind it.
+    """Visible triangle per pixel, at half size (`coarse`) and at full size, and the rays.
 
-    `origin` is where all rays begin; with a rolling shutter those of the row in the middle do.
+    `origin` is the start of all rays; with a rolling shutter, of those in the middle row.
     """
 
     coarse: Int32[np.ndarray, "h w"]
@@ -51,10 +51,10 @@ def view_of(
     T_map_camera: Float[np.ndarray, "4 4"],
     shutter: RollingShutter | None = None,
 ) -> View:
-    """Cast every pixel of the half-size image, then those of the full image whose surroundings at half size differ.
+    """Cast all pixels of the half-size image, then full-size pixels whose half-size neighbourhoods differ.
 
-    With a rolling shutter every ray begins where the camera is when its row is exposed, and meets the world of then;
-    `T_map_camera` is the pose of the row in the middle.
+    With a rolling shutter every ray starts at the camera's position when its row is exposed, in the world at
+    that time; `T_map_camera` is the pose for the middle row.
     """
     half, half_rows = _aimed(moment, camera.scaled(0.5), T_map_camera, shutter)
     full, full_rows = _aimed(moment, camera, T_map_camera, shutter)
@@ -67,7 +67,7 @@ def view_of(
 
 
 class _Rows(NamedTuple):
-    """Where the rays of each image row begin, in the moment's coordinates, and how long after the moment."""
+    """Start of the rays of each image row, in the moment's coordinates, and delay after the moment."""
 
     origin: np.ndarray
     delay_s: np.ndarray
@@ -76,7 +76,7 @@ class _Rows(NamedTuple):
 def _aimed(
     moment: Moment, camera: Camera, T_map_camera: np.ndarray, shutter: RollingShutter | None
 ) -> tuple[np.ndarray, _Rows]:
-    """Directions of all pixels in the map, and the rows that they belong to."""
+    """Directions of all pixels in the map, and their rows."""
     rows = camera.height_px
     if shutter is None:
         R = T_map_camera[:3, :3].astype(np.float32)
@@ -94,7 +94,7 @@ def _seen(moment: Moment, rays: np.ndarray, rows: _Rows, pixels: np.ndarray) -> 
 
 
 def _surfaces(moment: Moment) -> np.ndarray:
-    """A number per triangle that neighbours on one smooth surface share (material, body, tint); last row: the sky."""
+    """Id per triangle, shared by neighbours on a smooth surface (material, body, tint); last row: sky."""
     mesh = moment.mesh
     tint = (mesh.tint[:, 0] * 977 + mesh.tint[:, 2] * 131).astype(np.int64)
     return np.append((mesh.instance.astype(np.int64) * 64 + mesh.material) * 4096 + tint, -1)
@@ -104,8 +104,7 @@ def render(
     moment: Moment, view: View, sun: Float[np.ndarray, " 3"], rng: np.random.Generator, *, night: bool = False
 ) -> np.ndarray:
     """BGR image, uint8."""
-    # Sun and sky add up to about 1 on a white surface facing the sun; at night only a street-lamp glow is left.
-    # Under a ceiling there are lamps for a sky.
+    # Sun and sky sum to about 1 on a white surface facing the sun; at night only a street-lamp glow remains.
     day = (0.0, 0.5, 1.0) if moment.landscape.ceiling_m else (0.95, 0.42, 1.0)
     light = Light(sun.astype(np.float32), *((0.01, 0.06, 0.006) if night else day))
     if view.shutter is None:
@@ -117,7 +116,7 @@ def render(
 
 
 def _lit_in_bands(moment: Moment, view: View, shutter: RollingShutter, light: Light) -> np.ndarray:
-    """Rows that are exposed together see light and bodies of their own time."""
+    """Rows exposed together are rendered with light and bodies at their own time."""
     rows = len(view.full)
     delays, T_map_camera = shutter.delays_s(rows), shutter.poses(moment.t_s, rows)
     parts = []
@@ -145,7 +144,7 @@ def _lit(moment: Moment, sight: Sight, light: Light) -> np.ndarray:
 
 
 def _footprint(T_map_actor: np.ndarray, origin: np.ndarray, kind: str) -> list[float]:
-    """Soft dark patch that a body throws on the ground: x, y, cos, sin, half length, half width, height, -."""
+    """Soft dark patch under a body on the ground: x, y, cos, sin, half length, half width, height, unused."""
     sizes = {
         "car": (2.2, 0.9),
         "van": (2.8, 1.0),
@@ -161,7 +160,7 @@ def _footprint(T_map_actor: np.ndarray, origin: np.ndarray, kind: str) -> list[f
 
 @lru_cache(maxsize=1)
 def _grain() -> np.ndarray:
-    """Unit noise to cut windows from; drawing normals for each pixel of each frame would cost more than the rays."""
+    """Unit noise to take windows from, because drawing it per frame would cost more than the rays."""
     return np.random.default_rng(5).standard_normal((1400, 2400, 3), dtype=np.float32)
 
 

@@ -1,4 +1,4 @@
-"""When sensors without a common trigger measure: each at its own rate and phase."""
+"""Stamps of sensors without a common trigger: each with its own rate and phase."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from pipeline.simulate.sensors.rig_spec import RigSpec
 
 __all__ = ["Ticks", "free_clocks"]
 
-# Of a rate against its nominal value: mechanical lidars hold theirs to some parts in a thousand, quartzes to a hundred
-# in a million. Without it 30 and 10 Hz would keep one gap for a whole drive, as if they were triggered.
+# Relative rate errors: mechanical lidars keep theirs to some parts in a thousand, quartzes to a hundred in a
+# million. Without them, 30 and 10 Hz would keep a constant gap for a whole drive, as if triggered.
 _RATE_SD: Final = {"camera": 1e-4, "lidar": 3e-3, "radar": 1e-4}
 
 
@@ -31,11 +31,11 @@ class Ticks:
 
 
 def free_clocks(rig: RigSpec, rng: np.random.Generator) -> dict[str, Ticks]:
-    """Clocks, for one drive, of the sensors that run freely: none knows of another.
+    """Independent clocks of the free-running sensors for one drive.
 
     Args:
-        rig: what is mounted.
-        rng: draws phases and what the rates are off by.
+        rig: rig of the vehicle.
+        rng: draws phases and rate errors.
     """
     free = {s.name: (s.rate_hz, _RATE_SD[s.kind]) for s in rig.sensors if s.rate_hz is not None}
     rates, sd = np.array([*free.values()]).reshape(-1, 2).T

@@ -1,4 +1,4 @@
-"""What a sensor's data sheet says of it: camera, lidar and radar of the simulated rigs."""
+"""Data sheets of cameras, lidars and radars of the simulated rigs."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ __all__ = ["CameraSpec", "LidarSpec", "RadarSpec"]
 
 @dataclass(frozen=True)
 class CameraSpec:
-    """A camera; `equidistant` is f-theta: the angle from the axis grows linearly with the distance from the centre.
+    """A camera; `equidistant` is f-theta: image radius proportional to the angle from the axis.
 
-    The angles of a pinhole camera are those that it would show without its distortion. Of a rolling shutter the rows
-    are exposed from the top to the bottom during `readout_s`; its stamp is that of the row in the middle.
+    Angles of a pinhole camera are without distortion. The rows of a rolling shutter are exposed from top to
+    bottom during `readout_s`; the stamp is that of the middle row.
     """
 
     width_px: int = 1824
@@ -45,8 +45,9 @@ class CameraSpec:
 class LidarSpec:
     """A scanning lidar; all beams of a column fire together, columns from left to right during `sweep_s`.
 
-    Rows are spread evenly over `elevation_deg`, unless `row_elevation_deg` names them, the lowest first. With the
-    pattern `rosette` the columns are firings of `rows` lasers behind two turning prisms: no sweep repeats another.
+    Rows are spaced evenly over `elevation_deg`, or at `row_elevation_deg` if given, the lowest first. In the
+    pattern `rosette` the columns are firings of `rows` lasers behind two rotating prisms: no sweep repeats
+    another.
     """
 
     azimuth_deg: tuple[float, float] = (-30.0, 30.0)
@@ -69,10 +70,11 @@ class LidarSpec:
 
 @dataclass(frozen=True)
 class RadarSpec:
-    """An FMCW MIMO radar: resolution cells and what the estimator inside it makes of them.
+    """An FMCW MIMO radar: resolution cells and accuracy of its estimator.
 
-    `road_mirror` is the share of echoes that reach the radar by way of the road, too, and whose elevation lies between
-    the thing and its image (`multipath.py`); 0 is a road that bends elevations up as often as down.
+    `road_mirror` is the share of echoes that also reach the radar by way of the road, with an elevation
+    between the object and its mirror image (`multipath.py`); 0 is a road that changes elevations up as often
+    as down.
     """
 
     azimuth_deg: float = 30.0  # half field of view
@@ -89,7 +91,7 @@ class RadarSpec:
     has_elevation: bool = True
     rays: int = 9000
     road_mirror: float = 0.0
-    elevation_noise: float = 1.0  # times what resolution and signal to noise leave of a single target
+    elevation_noise: float = 1.0  # factor on the noise of a single target from resolution and signal to noise
 
     @property
     def cell(self) -> np.ndarray:

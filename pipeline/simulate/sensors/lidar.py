@@ -1,4 +1,4 @@
-"""What a scanning lidar measures: each beam from where we are, and at what it meets, at the beam's own time."""
+"""Measurements of a scanning lidar: each beam from the sensor's position at the beam's own time."""
 
 from __future__ import annotations
 
@@ -20,21 +20,22 @@ __all__ = ["Sweep", "sweep_lidar"]
 
 _VEGETATION: Final = LABELS.index("vegetation")
 _ROAD: Final = LABELS.index("road")
-# Where the infrared shows nothing that the eye sees: one reflectivity of all that is road, stains at other places.
+# The infrared shows no markings or repairs: one reflectivity for the road, with stains at other places.
 _UNTOLD: Final = 0.14
 _STAINS: Final = TABLE.texture[material("asphalt")]
 _ELSEWHERE_M: Final = 1000.0
-# Echo of a frontal white wall at 100 m is 1; what is weaker is lost (asphalt at about 50 m from 1.8 m height).
+# The echo of a frontal white wall at 100 m is 1; weaker echoes are lost (asphalt at about 50 m from 1.8 m
+# height).
 _FAINTEST: Final = 0.018
-_MOST_PASSED: Final = 6  # panes and leaves that one beam passes
+_MOST_PASSED: Final = 6  # maximum number of panes and leaves that one beam passes
 _SKIN_M: Final = 0.01
 
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """Points in the lidar frame at their own times; `label` is the truth, for tests, and goes into no log.
+    """Points in the lidar frame at their own times; `label` is the truth for tests and is not logged.
 
-    `ring` is the laser: a row of a scanner, and no row at all where prisms turn the beams.
+    `ring` is the laser: the row of a scanner; rotating prisms have no rows.
     """
 
     xyz_m: np.ndarray
@@ -60,7 +61,7 @@ def sweep_lidar(
     R, origin = T[:, :3, :3], T[:, :3, 3] - moment.standing.origin
     delay = (end_s + column_time - moment.t_s)[column]
     parts = []
-    # A beam has a footprint: a second ray inside it finds the edges where two surfaces share one beam.
+    # A beam has a footprint: a second ray in it finds edges where two surfaces share one beam.
     for spread in (0.0, np.radians(spec.divergence_deg)):
         a = angles + spread * rng.uniform(-1, 1, angles.shape) if spread else angles
         body = from_spherical(np.concatenate([a, np.ones((len(a), 1))], 1))
@@ -87,7 +88,7 @@ def sweep_lidar(
 def _met(
     moment: Moment, origins: np.ndarray, rays: np.ndarray, delay: np.ndarray, rng: np.random.Generator
 ) -> Hits:
-    """What the rays meet at last: through windows, wire and leaves some go on, fewer the more they graze."""
+    """Final hits of the rays: some pass windows, wire and leaves, fewer at grazing angles."""
     hits, on = moment.cast(origins, rays, delay), np.arange(len(rays))
     for _ in range(_MOST_PASSED):
         k = hits.triangle[on]
@@ -107,13 +108,13 @@ def _met(
 def _echo(
     moment: Moment, hits: Hits, rays: np.ndarray, spec: LidarSpec, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(range, reflectivity as measured, label) per ray; infinite range where nothing comes back."""
+    """(range, measured reflectivity, label) per ray; infinite range without an echo."""
     found = np.flatnonzero(hits.triangle >= 0)
     k, r = hits.triangle[found], hits.range_m[found].astype(np.float64)
     m = moment.mesh.material[k]
     label = TABLE.label[m]
     cosine = np.abs(np.einsum("ij,ij->i", moment.normals[k], rays[found].astype(np.float32)))
-    # Dark paint and cloth are dark to the lidar too, though less so.
+    # Dark paint and cloth are dark to the lidar too, but less so.
     reflectivity = TABLE.reflectivity[m] * (0.25 + 0.75 * np.minimum(moment.mesh.tint[k].mean(1), 1.0))
     at = _surface_coordinates(moment, k, hits.barycentric[found])
     gain, glass = textures(TABLE.texture[m], at)
@@ -121,7 +122,7 @@ def _echo(
         on_road = label == _ROAD
         reflectivity[on_road] = _UNTOLD
         gain[on_road] = textures(np.full(on_road.sum(), _STAINS), at[on_road] + _ELSEWHERE_M)[0]
-    reflectivity = reflectivity * (0.4 + 0.6 * gain)  # what is worn for the eye is partly so in the infrared
+    reflectivity = reflectivity * (0.4 + 0.6 * gain)  # visible wear is partly visible in the infrared
     pane = rng.random(len(k)) < np.maximum(TABLE.glass[m], glass)
     r = np.where(
         label == _VEGETATION, r + rng.exponential(0.15, len(k)), r
@@ -153,13 +154,13 @@ def _mixed(
     two: tuple[np.ndarray, np.ndarray, np.ndarray],
     rng: np.random.Generator,
 ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
-    """One return per beam out of two parts of its footprint."""
+    """One return per beam from two parts of its footprint."""
     n = len(one[0])
     first = np.where(np.isfinite(one[0]), one[0], two[0])
     other = np.where(np.isfinite(two[0]), two[0], one[0])
     seen = np.isfinite(one[0]) | (np.isfinite(two[0]) & (rng.random(n) < 0.5))
     gap = np.abs(np.where(seen, first, 0.0) - np.where(np.isfinite(other), other, 0.0))
-    # Echoes closer than the pulse is long merge into one in between; farther apart, one of the two is taken.
+    # Echoes closer than the pulse length merge; of echoes farther apart, one is chosen.
     blend = (gap > 0.15) & (gap < 1.3) & (rng.random(n) < 0.6)
     switch = (gap >= 1.3) & (rng.random(n) < 0.35) & np.isfinite(two[0])
     w = rng.random(n)

@@ -1,4 +1,4 @@
-"""Where a vehicle's sensors are on one day, what is true of each, and what its log says."""
+"""True and logged mounting of a vehicle's sensors on one day."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ class Mounted:
 
     Args:
         T_vehicle: true pose, T_vehicle_sensor.
-        T_vehicle_nominal: as /tf_static has it.
-        delay_s: its stamp of an event less the reference lidar's.
-        phase_s: of its stamps after the moment that they belong to, beside jitter.
+        T_vehicle_nominal: pose in /tf_static.
+        delay_s: its stamp of an event minus the reference lidar's.
+        phase_s: constant offset of its stamps after the moment, without jitter.
         camera: true intrinsics of a camera.
-        nominal_camera: those that the log states.
+        nominal_camera: logged intrinsics.
         errors: constant errors of a radar.
-        turned_rad: by which a radar's software turns its points, positive to the left.
-        stated_rad: what a radar states of its own alignment in azimuth.
+        turned_rad: rotation of points by a radar's software, positive to the left.
+        stated_rad: misalignment in azimuth that a radar reports.
     """
 
     T_vehicle: np.ndarray
@@ -49,12 +49,12 @@ class Mounted:
 
     @property
     def R_turned(self) -> Float[np.ndarray, "3 3"]:
-        """What a radar's software does to its points."""
+        """Rotation of points by a radar's software."""
         return exp_so3(np.array([0.0, 0.0, self.turned_rad]))
 
     @property
     def T_points(self) -> Float[np.ndarray, "4 4"]:
-        """T_vehicle_points: of the axes that points are given in, which a radar's software may have turned."""
+        """T_vehicle_points: pose of the axes of the points, which a radar's software may have rotated."""
         if not self.turned_rad:
             return self.T_vehicle
         return self.T_vehicle @ from_rotation_translation(self.R_turned.T, np.zeros(3))
@@ -71,11 +71,11 @@ class Mounting:
         return self.sensors[name]
 
     def between(self, parent: str, child: str) -> Float[np.ndarray, "4 4"]:
-        """True T_parent_child of two sensors, of the axes that their points are given in."""
+        """True T_parent_child of two sensors, between the axes of their points."""
         return inverse(self[parent].T_points) @ self[child].T_points
 
     def camera(self, name: str) -> tuple[Camera, Camera]:
-        """Intrinsics of a camera: true, and as its log states them."""
+        """Intrinsics of a camera: true, and as logged."""
         mounted = self[name]
         assert mounted.camera is not None
         assert mounted.nominal_camera is not None
@@ -83,7 +83,7 @@ class Mounting:
 
 
 def mounting_of(rig: RigSpec, seed: int, vehicle: int, day: int) -> Mounting:
-    """Mounting of a vehicle on a day: CAD, then how this vehicle was built, then how the day's remount left it."""
+    """Mounting of a vehicle on a day: CAD plus deviations of this vehicle and of the day's remount."""
     built = np.random.default_rng([seed, vehicle, 41])
     remount = np.random.default_rng([seed, vehicle, day, 42])
     poses = {s.name: _poses(rig, s, built, remount) for s in rig.sensors}
@@ -141,5 +141,5 @@ def _turned(rpy_deg: Triple) -> np.ndarray:
 
 
 def _disturbed(T: np.ndarray, rotation_rad: np.ndarray, translation_m: np.ndarray) -> np.ndarray:
-    """Turned about the vehicle's axes at the sensor's own place, and shifted along them."""
+    """Rotated about the vehicle's axes at the sensor's position, and shifted along them."""
     return from_rotation_translation(exp_so3(rotation_rad) @ T[:3, :3], T[:3, 3] + translation_m)

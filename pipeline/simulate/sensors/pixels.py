@@ -1,4 +1,4 @@
-"""Which triangle each pixel shows: from half size to full size, and the boxes of what is visible; compiled."""
+"""Visible triangle per pixel, from half size to full size, and boxes of visible objects; compiled."""
 # numba infers the types of the arguments; `no_type_check` keeps the tests' shape checks out of compiled code.
 # ruff: noqa: ANN001, ANN201
 # mypy: disable-error-code="no-untyped-def,no-untyped-call"
@@ -18,7 +18,7 @@ _jit = numba.njit(cache=True)
 @no_type_check
 @_jit
 def upsampled(coarse, surface, height, width):
-    """Triangles at full size, and flat indices of pixels where the half-size neighbourhood is not of one surface."""
+    """Triangles at full size, and flat indices of pixels with several surfaces in their neighbourhood."""
     h, w = coarse.shape
     out = np.empty((height, width), np.int32)
     unsure = np.empty(height * width, np.int64)

@@ -1,6 +1,7 @@
-"""What an FMCW radar reports: scatterers from cast rays, merged by resolution cell, bent by the road's mirror, aliased.
+"""FMCW radar: scatterers from cast rays, merged by resolution cell, with road reflections and aliasing.
 
-Source: Skolnik, Radar Handbook, ch. 2 (equation, fluctuation); Barton 1974, "Low-angle radar tracking" (glint).
+Source: Skolnik, Radar Handbook, ch. 2 (equation, fluctuation); Barton 1974, "Low-angle radar tracking"
+(glint).
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ class RadarErrors:
 class Scan:
     """Detections in the radar frame; range rate positive = receding, quantised and aliased.
 
-    `origin` is the truth and goes into no log: 0 standing, 1 moving, 2 ghost, 3 clutter.
+    `origin` is the truth and is not logged: 0 standing, 1 moving, 2 ghost, 3 clutter.
     """
 
     xyz_m: np.ndarray
@@ -54,7 +55,7 @@ class Scan:
 
 @dataclass(frozen=True, eq=False)
 class _Cells:
-    """Azimuth, elevation, range of echoes in the radar frame, range rate, signal to noise, class, moving or not."""
+    """Azimuth, elevation, range of echoes (radar frame), range rate, signal to noise, class, moving flag."""
 
     aer: np.ndarray
     rate: np.ndarray
@@ -73,17 +74,17 @@ def scan_radar(
     mirrors_m: tuple[float, ...] = (),
     beacons_map: Float[np.ndarray, "N 3"] | None = None,
 ) -> Scan:
-    """One scan at the moment's time.
+    """One scan at the time of the moment.
 
     Args:
         moment: the world.
-        ego: how the vehicle moves.
+        ego: motion of the vehicle.
         T_vehicle_radar: mounting.
         spec: data sheet.
         errors: constant errors.
         rng: noise.
-        mirrors_m: offsets to the left of the vehicle of long walls and rails that mirror targets.
-        beacons_map: corner reflectors, so strong that every scan sees them.
+        mirrors_m: offsets to the left of the vehicle of long walls and rails that reflect targets.
+        beacons_map: corner reflectors, strong enough to be detected in every scan.
     """
     T_map_vehicle = ego.poses(np.array([moment.t_s]))[0]
     T_map_radar = T_map_vehicle @ T_vehicle_radar
@@ -134,7 +135,7 @@ def _scatterers(
     m = moment.mesh.material[k]
     label = TABLE.label[m]
     cosine = np.abs(np.einsum("ij,ij->i", moment.normals[k], rays[near].astype(np.float32)))
-    # Bodies are full of corners: part of the echo does not care about the angle, part is a mirror's.
+    # Bodies have many corners: part of the echo is independent of the angle, part is specular.
     shape = np.where(np.isin(label, _GROUND), cosine**2, 0.2 + 0.8 * cosine**4)
     body = np.isin(label, _BODIES)
     inside = np.where(body & (rng.random(len(k)) < 0.45), rng.exponential(0.6, len(k)), 0.0)
@@ -143,7 +144,8 @@ def _scatterers(
     v = v * np.where(np.isin(m, _WHEELS), rng.uniform(0.3, 1.7, len(k)), 1.0)[:, None]
     v += np.where(np.isin(label, _SOFT), 0.2, 0.0)[:, None] * rng.standard_normal((len(k), 3))
     rate = np.einsum("ij,ij->i", v - velocity_radar, rays[near])
-    # Power per ray: gain x solid angle / r^2; 9,000 rays of gain 1 at 120 m make a signal-to-noise ratio of 1 each.
+    # Power per ray: gain x solid angle / r^2; 9,000 rays of gain 1 at 120 m make a signal-to-noise ratio of 1
+    # each.
     snr = (
         TABLE.radar_gain[m]
         * shape
@@ -158,7 +160,7 @@ def _scatterers(
 
 
 def _merged(echoes: _Cells, T_vehicle_radar: np.ndarray, spec: RadarSpec, rng: np.random.Generator) -> _Cells:
-    """One detection per resolution cell whose echoes together exceed the threshold, at their power-weighted mean."""
+    """One detection per resolution cell with enough total power, at the power-weighted mean of its echoes."""
     size = spec.cell
     index = np.floor(
         np.concatenate([echoes.aer / size, echoes.rate[:, None] / spec.doppler_resolution_mps], 1)
@@ -191,7 +193,7 @@ def _merged(echoes: _Cells, T_vehicle_radar: np.ndarray, spec: RadarSpec, rng: n
 
 
 def _peaks(cells: _Cells, size: np.ndarray) -> _Cells:
-    """Local maxima: of two detections closer than the resolution in all four dimensions, the weaker one is not seen."""
+    """Local maxima: drops the weaker of two detections closer than the resolution in all four dimensions."""
     strongest = np.argsort(-cells.snr)
     x = (np.concatenate([cells.aer, cells.rate[:, None]], 1) / size)[strongest]
     keep = strongest[_unsuppressed(x)]
@@ -201,7 +203,7 @@ def _peaks(cells: _Cells, size: np.ndarray) -> _Cells:
 @no_type_check
 @numba.njit(cache=True)  # `no_type_check` keeps the tests' shape checks out of compiled code
 def _unsuppressed(x: np.ndarray) -> np.ndarray:
-    """True for echoes, the strongest first, that no kept one stands before within a resolution cell in each axis."""
+    """Mask of echoes (strongest first) without a stronger kept one within a resolution cell in each axis."""
     keep = np.ones(len(x), np.bool_)
     for i in range(len(x)):
         if keep[i]:
@@ -215,7 +217,7 @@ def _unsuppressed(x: np.ndarray) -> np.ndarray:
 
 
 def _bounced(cells: _Cells, T_vehicle_radar: np.ndarray, spec: RadarSpec, rng: np.random.Generator) -> _Cells:
-    """Let the road mirror targets: unresolved, the image bends the elevation; resolved, it is a second detection."""
+    """Road reflections: an unresolved image changes the elevation; a resolved one is a second detection."""
     height, aer_image = image_in_road(cells.aer, T_vehicle_radar)
     radar_height = T_vehicle_radar[2, 3]
     n = len(cells.snr)
@@ -227,7 +229,7 @@ def _bounced(cells: _Cells, T_vehicle_radar: np.ndarray, spec: RadarSpec, rng: n
     bend = np.clip(np.real(mirror / (1 + mirror)), -1.0, 1.0) * apart
     aer = cells.aer.copy()
     aer[:, 1] += np.where(resolved, 0.0, bend)
-    # The path over the road is longer by about 2 h1 h2 / r; half of it shows in the range.
+    # The path over the road is longer by about 2 h1 h2 / r; half of it adds to the range.
     aer[:, 2] += np.where(
         resolved, 0.0, np.abs(mirror) ** 2 * np.maximum(height, 0) * radar_height / np.maximum(aer[:, 2], 5.0)
     )
@@ -245,7 +247,7 @@ def _with_beacons(echoes: _Cells, xyz_radar: np.ndarray) -> _Cells:
 def _ghosts(
     cells: _Cells, mirrors_m: tuple[float, ...], T_vehicle_radar: np.ndarray, rng: np.random.Generator
 ) -> _Cells:
-    """Mirror images behind rails and walls, and second trips between a target and ourselves."""
+    """Mirror images behind rails and walls, and double reflections between a target and the ego vehicle."""
     strong = cells.moving & (cells.snr > 60)
     mirrored = take_rows(cells, strong & (rng.random(len(strong)) < (0.12 if mirrors_m else 0.0)))
     doubled = take_rows(cells, strong & (rng.random(len(strong)) < 0.03))
@@ -263,7 +265,7 @@ def _ghosts(
 
 
 def _clutter(spec: RadarSpec, rng: np.random.Generator) -> _Cells:
-    """False alarms, anywhere in the data cube."""
+    """False alarms, uniform in the data cube."""
     n = int(rng.poisson(5))
     half = np.radians([spec.azimuth_deg, spec.elevation_deg])
     aer = np.stack(
@@ -281,9 +283,9 @@ def _clutter(spec: RadarSpec, rng: np.random.Generator) -> _Cells:
 def _measured(
     seen: _Cells, spec: RadarSpec, errors: RadarErrors, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Azimuth, elevation, range and range rate: noise by signal strength, constant errors, grids, Doppler aliasing."""
-    # Single-target accuracy: resolution / (1.6 sqrt(2 snr)) (Skolnik, ch. 9), never better than a tenth: the array's
-    # own calibration leaves that much.
+    """Measured azimuth, elevation, range and range rate: noise, constant errors, grids, Doppler aliasing."""
+    # Single-target accuracy: resolution / (1.6 sqrt(2 snr)) (Skolnik, ch. 9), at least a tenth of the
+    # resolution, because of the array's calibration.
     sigma = spec.cell * np.maximum(1 / (1.6 * np.sqrt(2 * seen.snr)), 0.1)[:, None]
     sigma[:, 1] *= spec.elevation_noise
     aer = (

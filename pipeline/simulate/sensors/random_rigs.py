@@ -1,7 +1,7 @@
-"""Rigs that a seed draws, for networks that must not learn one car by heart: every number between stated limits.
+"""Rigs drawn from a seed, so that networks do not learn one car by heart: every number within stated limits.
 
-The limits are those of sensors that are sold and of places where cars carry them; no number is a sensor's own. Pixels
-and beams are kept few enough that a frame costs about as much as one of the rig `demo`.
+The limits are those of available sensors and their usual places on cars, not of one product. The number of
+pixels and beams is limited so that a frame costs about as much as one of the rig `demo`.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from pipeline.simulate.sensors.rig_spec import RigSpec, short_rig
 __all__ = ["random_rig"]
 
 _PIXELS: Final = (300_000, 520_000)
-_PINHOLE_DEG: Final = (48.0, 84.0)  # beyond it lenses are no pinholes any more
+_PINHOLE_DEG: Final = (48.0, 84.0)  # wider lenses have no pinhole model
 _F_THETA_DEG: Final = (80.0, 150.0)
-_ASPECT: Final = (1.3, 3.4)  # width over height: 4:3 to a strip that was cut out
+_ASPECT: Final = (1.3, 3.4)  # width over height: 4:3 to a strip cut from the image
 # Rows, the lowest and the highest elevation, azimuth to each side, step between columns.
 _SPARSE_ROWS: Final = (16, 16, 20, 24, 32, 32, 40)
 _DENSE_ROWS: Final = (48, 64, 64, 80, 96, 128)
-_SPARSE_SHARE: Final = 0.5  # 16 rings are what networks of dense lidars fail on
+_SPARSE_SHARE: Final = 0.5  # networks trained on dense lidars fail on 16 rings
 
 
 def random_rig(seed: int) -> RigSpec:
@@ -78,7 +78,7 @@ def _camera(rng: np.random.Generator) -> CameraSpec:
         centre_error_px=float(rng.uniform(0.0, 1.0)),
         jpeg_quality=int(rng.integers(55, 96)),
         model="plumb_bob" if pinhole else "equidistant",
-        # The second coefficient takes most of the first's bend back at the corners, as lens makers see to it.
+        # The second coefficient compensates most of the first one at the corners, as in real lenses.
         distortion=(k1, -0.3 * k1, 0.0, 0.0, 0.0) if pinhole else (0.0, 0.0, 0.0, 0.0),
     )  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""What a rig is: the data sheets of its sensors, where the drawings put them, and how far cars differ from that."""
+"""Specification of a rig: data sheets of its sensors, nominal poses, and deviations of cars from them."""
 
 from __future__ import annotations
 
@@ -17,15 +17,16 @@ Sheet = CameraSpec | LidarSpec | RadarSpec
 
 @dataclass(frozen=True)
 class SensorSpec:
-    """One sensor: its data sheet, its nominal pose in the vehicle frame (rear axle, on the ground), its clock.
+    """One sensor: data sheet, nominal pose in the vehicle frame (rear axle, on the ground), clock.
 
     Args:
         name: unique in the rig.
-        sheet: what it measures, and how well.
-        xyz_m: where it is.
-        rpy_deg: turn about the vehicle's axes: roll first, then pitch (positive = nose down), then yaw (to the left).
-        delay_s: its stamp of an event less the reference lidar's.
-        rate_hz: of a sensor that runs freely; None = the reference lidar triggers it.
+        sheet: data sheet.
+        xyz_m: position.
+        rpy_deg: rotation about the vehicle's axes: roll first, then pitch (positive = nose down), then yaw
+            (to the left).
+        delay_s: its stamp of an event minus the reference lidar's.
+        rate_hz: rate of a free-running sensor; None = triggered by the reference lidar.
     """
 
     name: str
@@ -45,18 +46,19 @@ class SensorSpec:
 
 @dataclass(frozen=True)
 class RigSpec:
-    """Sensors of a model of car, and how far its cars differ from the drawings.
+    """Sensors of a model of car, and deviations of its cars from the drawings.
 
     Args:
-        name: of the rig.
-        sensors: cameras, lidars and radars; the first lidar is the reference, whose sweeps are the moments logged.
-        delay_sd_s: sd per vehicle of each delay.
+        name: name of the rig.
+        sensors: cameras, lidars and radars; the first lidar is the reference, whose sweeps define the
+            moments.
+        delay_sd_s: standard deviation (sd) per vehicle of each delay.
         sync_jitter_s: sd of the stamps of triggered sensors.
         prior_rotation_deg: sd per vehicle and sensor of the mounting against CAD, angle.
         prior_translation_m: sd per axis.
         remount_rotation_deg: sd per day and axis.
         remount_translation_m: sd per day and axis.
-        behind_m: how far the world reaches behind the vehicle.
+        behind_m: extent of the world behind the vehicle.
     """
 
     name: str
@@ -70,7 +72,7 @@ class RigSpec:
     behind_m: float = 60.0
 
     def __getitem__(self, name: str) -> SensorSpec:
-        """The sensor of that name; KeyError where there is none."""
+        """The sensor with this name; raises KeyError if there is none."""
         return {s.name: s for s in self.sensors}[name]
 
     def of_kind(self, kind: Kind) -> tuple[SensorSpec, ...]:
@@ -84,11 +86,11 @@ class RigSpec:
 
     @property
     def is_short(self) -> bool:
-        """Whether its sensors are called camera, lidar and radar."""
+        """True if its sensors are named camera, lidar and radar."""
         return all(s.name == s.kind for s in self.sensors)
 
     def changed(self, change: Callable[[SensorSpec], SensorSpec]) -> RigSpec:
-        """The rig with every sensor changed."""
+        """The rig with `change` applied to every sensor."""
         return replace(self, sensors=tuple(map(change, self.sensors)))
 
     def with_sheet(self, name: str, sheet: Sheet) -> RigSpec:
@@ -108,18 +110,18 @@ def short_rig(
     free_hz: Triple | None = None,
     **car: Any,
 ) -> RigSpec:
-    """A rig of three sensors called camera, lidar and radar.
+    """A rig of three sensors named camera, lidar and radar.
 
     Args:
-        name: of the rig.
+        name: name of the rig.
         camera: its data sheet.
-        lidar: likewise.
-        radar: likewise.
-        xyz_m: of camera, lidar, radar.
-        rpy_deg: likewise.
-        delay_s: of camera and radar.
-        free_hz: rates of camera, lidar and radar that run freely; None = the lidar triggers both.
-        **car: as RigSpec's.
+        lidar: its data sheet.
+        radar: its data sheet.
+        xyz_m: positions of camera, lidar, radar.
+        rpy_deg: rotations of camera, lidar, radar.
+        delay_s: delays of camera and radar.
+        free_hz: rates of free-running camera, lidar and radar; None = the lidar triggers both.
+        **car: fields of RigSpec.
     """
     rates, delays = free_hz or (None,) * 3, (delay_s[0], 0.0, delay_s[1])
     rows = zip(

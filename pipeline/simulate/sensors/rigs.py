@@ -1,4 +1,4 @@
-"""What is mounted on vehicles: rigs by name."""
+"""Simulated rigs by name."""
 
 from __future__ import annotations
 
@@ -16,14 +16,16 @@ from pipeline.simulate.sensors.van import DUO, VAN
 
 __all__ = ["RIGS", "rig_named"]
 
-RANDOM: Final = "random-"  # begins the names of rigs that a seed draws
+RANDOM: Final = "random-"  # prefix of rigs drawn from a seed
 
 
-# Half the pixels of the paper's camera, and a lidar and a radar to match: as good for most purposes, and much faster.
+# Half the pixels of the paper's camera, with a matching lidar and radar: sufficient for most purposes, and
+# much faster.
 _CAMERA, _LIDAR, _RADAR = CameraSpec(912, 470), LidarSpec(columns=160, rows=64), RadarSpec(rays=6000)
 # All around, as on a roof: 0.4 deg by 1.3 deg.
 _SPINNING: Final = LidarSpec((-180.0, 180.0), (-25.0, 15.0), 900, 32, 0.1, 0.8, 100.0)
-# Steps of data sheets with 128 channels: 0.125 deg around the horizon, 0.5 deg above and below, 1 deg at the ends.
+# Steps of data sheets with 128 channels: 0.125 deg around the horizon, 0.5 deg above and below, 1 deg at the
+# ends.
 _ROWS_128: Final = (
     *np.arange(-25.0, -14.0, 1.0).tolist(),
     *np.arange(-14.0, -7.0, 0.5).tolist(),
@@ -43,15 +45,15 @@ def _demo(
     radar: RadarSpec = _RADAR,
     **where: Any,
 ) -> RigSpec:
-    """The demo's rig with other sensors, or in other places."""
+    """The rig demo with other sensors, or with sensors in other places."""
     return short_rig(name, camera, lidar, radar, **where)
 
 
 _ALL: Final = (
     short_rig("paper", *_PAPER),
-    # One clock without delays, as the paper's car has it: what methods without time offsets are owed.
+    # One clock without delays, as in the paper's car: required by methods without time offsets.
     short_rig("paper-one-clock", *_PAPER, delay_s=(0.0, 0.0), delay_sd_s=0.0),
-    # No common trigger: every sensor at its own rate and phase, as on most cars.
+    # No common trigger: every sensor with its own rate and phase, as on most cars.
     short_rig("paper-free", *_PAPER, free_hz=(30.0, 10.0, 13.0)),
     _demo("demo"),
     _demo(
@@ -59,7 +61,7 @@ _ALL: Final = (
         lidar=LidarSpec((-180.0, 180.0), (-15.0, 15.0), 1800, 16, 0.1, 0.8, 100.0),
         radar=RadarSpec(rays=6000, doppler_period_mps=10.394, doppler_positive="approaching"),
     ),
-    # Radars of the bumper's corners look past what a forward lidar sees.
+    # Radars at the corners of the bumper look beyond the view of a forward lidar.
     _demo(
         "corner-left", lidar=_SPINNING, radar=_CORNER,
         xyz_m=(_CAMERA_M, _LIDAR_M, (3.60, 0.80, 0.60)), rpy_deg=(_LEVEL, _LEVEL, (0.0, 0.0, 45.0)),
@@ -74,7 +76,7 @@ _ALL: Final = (
             (-180.0, 180.0), (-25.0, 15.0), 1200, 128, 0.1, 0.8, 120.0, row_elevation_deg=_ROWS_128
         ),
     ),
-    # A narrow strip of an image under a lidar of 64 rows all around, 1/3 deg apart above and 1/2 deg below.
+    # A narrow image strip and a 360 deg lidar of 64 rows, 1/3 deg apart above and 1/2 deg below.
     _demo(
         "hdl64",
         camera=CameraSpec(1242, 376, 81.4, 29.2, model="plumb_bob", distortion=(0.0,) * 5),
@@ -84,7 +86,8 @@ _ALL: Final = (
         ),
         xyz_m=((1.62, 0.06, 1.65), (1.35, 0.0, 1.73), (3.60, 0.0, 0.60)),
     ),
-    # A lidar of 24 x 10 deg in the middle of an image of 150 deg, and one all around under an image of 32 deg.
+    # A lidar of 24 x 10 deg in the middle of an image of 150 deg, and a 360 deg lidar with an image of 32
+    # deg.
     _demo(
         "keyhole",
         camera=CameraSpec(1024, 512, 150.0, 75.0),
@@ -95,7 +98,7 @@ _ALL: Final = (
         camera=CameraSpec(960, 540, 32.0, 18.3, model="plumb_bob", distortion=(0.0,) * 5),
         lidar=replace(_SPINNING, columns=1800),
     ),
-    # 240,000 beams a second over 82 x 25 deg, as Livox' Horizon has them; six lasers behind the same prisms.
+    # 240,000 beams a second over 82 x 25 deg, as in Livox' Horizon; six lasers behind the same prisms.
     _demo(
         "rosette",
         lidar=LidarSpec((-41.0, 41.0), (-14.5, 10.5), 4000, 6, 0.1, 1.0, 100.0, pattern="rosette"),
@@ -108,7 +111,7 @@ _ALL: Final = (
         ),
     ),
     _demo("rolling", camera=replace(_CAMERA, readout_s=0.03)),
-    # A cab: everything high up but the radar, and looking down.
+    # A cab: all sensors except the radar are high and look down.
     _demo(
         "truck", lidar=replace(_LIDAR, elevation_deg=(-21.0, 3.0)),
         xyz_m=((2.10, 0.10, 2.55), (1.90, 0.0, 3.00), (2.60, -0.15, 0.65)),
@@ -121,8 +124,8 @@ _ALL: Final = (
     DUO,
 )  # fmt: skip
 RIGS: Final = {rig.name: rig for rig in _ALL}
-# How the radars of a rig are changed by what stands behind its name. Dirty ones: matched to two real-like days by
-# statistics that need no truth (tests/benchmarks/studies/radar_dirt.py).
+# Suffixes of rig names, and their changes of the radars. `-dirty` matches two real-like days by statistics
+# that need no truth (tests/benchmarks/studies/radar_dirt.py).
 _RADARS: Final[dict[str, dict[str, Any]]] = {
     "-flat": {"has_elevation": False},
     "-dirty": {"road_mirror": 0.3, "elevation_noise": 2.0},
@@ -130,7 +133,7 @@ _RADARS: Final[dict[str, dict[str, Any]]] = {
 
 
 def rig_named(name: str) -> RigSpec:
-    """One of RIGS, or `random-SEED`; behind the name `-flat` takes the radars' elevation away, `-dirty` spoils it.
+    """One of RIGS, or `random-SEED`; suffix `-flat` removes elevation from the radars, `-dirty` degrades it.
 
     Raises:
         ConfigError: no such rig.

@@ -1,4 +1,4 @@
-"""When each row of an image is exposed, and where the camera is then."""
+"""Exposure times of image rows, and the camera's pose at those times."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _BANDS: Final = 12
 
 @dataclass(frozen=True, eq=False)
 class RollingShutter:
-    """Rows are exposed from the top to the bottom during `readout_s`, the middle of the image at the frame's time."""
+    """Rows are exposed from top to bottom during `readout_s`, the middle of the image at the frame's time."""
 
     ego: Motion
     T_vehicle_camera: np.ndarray
@@ -30,10 +30,10 @@ class RollingShutter:
         return ((np.arange(rows) + 0.5) / rows - 0.5) * self.readout_s
 
     def poses(self, t_s: float, rows: int) -> Float64[np.ndarray, "H 4 4"]:
-        """T_map_camera of each row of an image that is taken at `t_s` of the drive."""
+        """T_map_camera of each row of an image taken at `t_s` of the drive."""
         return np.asarray(self.ego.poses(t_s + self.delays_s(rows)) @ self.T_vehicle_camera)
 
     def bands(self, rows: int) -> list[slice]:
-        """Rows that are lit together."""
+        """Bands of rows lit at one time."""
         edges = np.linspace(0, rows, _BANDS + 1).round().astype(int).tolist()
         return [slice(a, b) for a, b in pairwise(edges) if b > a]

@@ -1,7 +1,7 @@
-"""What networks in the car would have made of the image: a label map and road-user boxes, with the errors they make.
+"""Outputs of perception networks in the car: a label map and road-user boxes, with typical errors.
 
-Labels: boundaries wander and swell by about a pixel, thin things break, whole regions get a confused class.
-Boxes: small and hidden road users are missed, edges jitter with the size, some boxes are invented.
+Labels: boundaries wander and grow by about a pixel, thin objects break, whole regions have a confused class.
+Boxes: small and hidden road users are missed, edges jitter with the size, some boxes are false.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _COCO: Final = {
     "bicycle": "bicycle",
     "motorcycle": "motorcycle",
 }
-# What a class is taken for when a network errs; after the confusion matrices that Cityscapes networks publish.
+# Class -> classes it is confused with, from published confusion matrices of Cityscapes networks.
 _CONFUSED: Final = {
     "road": "sidewalk",
     "sidewalk": "road",
@@ -74,12 +74,12 @@ _PRONENESS: Final = {
 
 @dataclass(frozen=True)
 class SemanticsSpec:
-    """How well the networks work."""
+    """Error rates of the networks."""
 
     boundary_px: float = 0.9  # sd of the wandering, half-size pixels
-    swell: float = 0.45  # share of boundary where things grow by a pixel
+    swell: float = 0.45  # share of boundary where objects grow by a pixel
     confusion: float = 0.05  # share of the area outside the sky with a wrong class
-    miss: float = 0.04  # of road users that are large and free
+    miss: float = 0.04  # for road users that are large and unoccluded
     box_jitter: float = 0.022  # of the box's size, per edge
     false_boxes: float = 0.12  # per image
 
@@ -112,10 +112,10 @@ def _field(shape: tuple[int, int], cell_px: float, rng: np.random.Generator) -> 
 def noisy_labels(
     true: UInt8[np.ndarray, "h w"], spec: SemanticsSpec, rng: np.random.Generator
 ) -> UInt8[np.ndarray, "h w"]:
-    """Labels as a network would give them."""
+    """Labels as a network would output them."""
     h, w = true.shape
     x, y = np.meshgrid(np.arange(w, dtype=np.float32), np.arange(h, dtype=np.float32))
-    # Mostly slow wandering of whole outlines, a little fray.
+    # Mostly slow variation of whole outlines, with some noise.
     dx, dy = (
         spec.boundary_px * (0.85 * _field((h, w), 14.0, rng) + 0.45 * _field((h, w), 4.0, rng)) for _ in "xy"
     )
@@ -131,12 +131,12 @@ def noisy_labels(
     swell = (
         (grown > 0) & (things == 0) & (_field((h, w), 12.0, rng) > float(np.sqrt(2)) * _quantile(spec.swell))
     )
-    out = cv2.medianBlur(np.where(swell, grown, out), 3)  # what stays thinner than two pixels breaks
+    out = cv2.medianBlur(np.where(swell, grown, out), 3)  # removes parts thinner than two pixels
     return _confused(out, spec.confusion, rng)
 
 
 def _quantile(share: float) -> float:
-    """Threshold, in sqrt 2 sigma, that a share of a normal field exceeds (inverse error function, rational fit)."""
+    """Threshold, in sqrt 2 sigma, exceeded by a share of a normal field (inverse error function)."""
     u = np.clip(1 - 2 * share, -0.999, 0.999)
     log = np.log(1 - u * u)
     inner = 2 / (np.pi * 0.147) + log / 2  # Winitzki 2008
@@ -144,11 +144,11 @@ def _quantile(share: float) -> float:
 
 
 def _confused(labels: np.ndarray, share: float, rng: np.random.Generator) -> np.ndarray:
-    """Give patches of a few dozen pixels the class that theirs is taken for."""
+    """Change the class of patches of a few dozen pixels to one it is confused with."""
     table = np.arange(256, dtype=np.uint8)
     for name, other in _CONFUSED.items():
         table[LABELS.index(name)] = LABELS.index(other)
-    # Roads are hardly ever mistaken, walls and fences often: share of each class, 1 = the mean.
+    # Roads are rarely confused, walls and fences often: share of each class, 1 = the mean.
     proneness = np.ones(256)
     for name, factor in _PRONENESS.items():
         proneness[LABELS.index(name)] = factor
@@ -159,7 +159,7 @@ def _confused(labels: np.ndarray, share: float, rng: np.random.Generator) -> np.
 
 
 def boxes_of(moment: Moment, coarse: Int32[np.ndarray, "h w"]) -> list[tuple[Box, int]]:
-    """Tight boxes of the visible parts of road users, with their visible half-size pixels."""
+    """Tight boxes of the visible parts of road users, with their number of visible half-size pixels."""
     mesh = moment.mesh
     bodies = np.flatnonzero(mesh.instance > 0)
     who = mesh.instance[bodies].astype(np.int64) * 32 + TABLE.label[mesh.material[bodies]]
@@ -189,12 +189,12 @@ def boxes_of(moment: Moment, coarse: Int32[np.ndarray, "h w"]) -> list[tuple[Box
 def noisy_boxes(
     true: list[tuple[Box, int]], size_px: tuple[int, int], spec: SemanticsSpec, rng: np.random.Generator
 ) -> list[Box]:
-    """Boxes as a detector would give them; size_px = (width, height)."""
+    """Boxes as a detector would output them; size_px = (width, height)."""
     width, height = size_px
     out = []
     for box, pixels in true:
         w, h = box.x1 - box.x0, box.y1 - box.y0
-        filled = 4.0 * pixels / max(w * h, 1.0)  # little where something stands before it
+        filled = 4.0 * pixels / max(w * h, 1.0)  # low if occluded
         visible = np.clip((h / height - 0.012) / 0.025, 0, 1) * np.clip((filled - 0.18) / 0.25, 0, 1)
         if rng.random() > (1 - spec.miss) * visible:
             continue

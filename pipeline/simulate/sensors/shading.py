@@ -1,4 +1,4 @@
-"""Colour of each pixel: texture, sun, sky, shadows, mirrors, haze, and what the sensor makes of it; compiled."""
+"""Colour of each pixel: texture, sun, sky, shadows, mirrors, haze, and sensor response; compiled."""
 # numba infers the types of the arguments; `no_type_check` keeps the tests' shape checks out of compiled code.
 # ruff: noqa: ANN001, ANN201, ANN202, C901, PLR0915, PLR1714
 # mypy: disable-error-code="no-untyped-def,no-untyped-call"
@@ -18,7 +18,7 @@ _fast = numba.njit(cache=True, fastmath=True)
 
 
 class Sight(NamedTuple):
-    """What each pixel sees: triangle H W (-1 = sky), direction H W 3 in the map, where all rays begin [m]."""
+    """Visible triangle per pixel H W (-1 = sky), direction H W 3 in the map, start of all rays [m]."""
 
     seen: np.ndarray
     rays: np.ndarray
@@ -26,7 +26,7 @@ class Sight(NamedTuple):
 
 
 class Surfaces(NamedTuple):
-    """T triangles: corners T 3 3 [m], unit normals T 3, material T, tint T 3, surface coordinates T 3 2 [m]."""
+    """Triangles: corners T 3 3 [m], unit normals T 3, material T, tint T 3, texture coordinates T 3 2 [m]."""
 
     corners: np.ndarray
     normals: np.ndarray
@@ -36,7 +36,7 @@ class Surfaces(NamedTuple):
 
 
 class Light(NamedTuple):
-    """Direction to the sun in the map; irradiance of a surface that faces it, of the sky; brightness of the sky."""
+    """Direction to the sun in the map; irradiance from sun (facing it) and sky; brightness of the sky."""
 
     sun: np.ndarray
     sun_light: float
@@ -52,7 +52,7 @@ def _sky(x, y, z, sx, sy, sz):
     a = np.sqrt(up)
     r, g, b = 0.74 - 0.52 * a, 0.80 - 0.40 * a, 0.88 - 0.18 * a
     if up > 0.01:
-        px, py = x / (up + 0.12) + 97.0 * sx, y / (up + 0.12)  # other clouds on every drive
+        px, py = x / (up + 0.12) + 97.0 * sx, y / (up + 0.12)  # other clouds in every drive
         n = (
             0.55 * value_noise(px * 1.3 + 31, py * 1.3)
             + 0.3 * value_noise(px * 3.1, py * 3.1 + 9)
@@ -70,15 +70,15 @@ def shade(sight, surfaces, materials, light, shadows, blobs):
     """Linear RGB of each pixel, float32, H W 3.
 
     Args:
-        sight: what each pixel sees.
+        sight: visible triangle and ray per pixel.
         surfaces: the triangles.
         materials: a MaterialTable.
-        light: of sun and sky.
+        light: sun and sky.
         shadows: a ShadowMap.
-        blobs: the patches under road users, B 8: x, y [m], cosine and sine of the heading, half length, half width,
-            height of the ground [m], unused.
+        blobs: patches under road users, B 8: x, y [m], cosine and sine of the heading, half length, half
+            width, height of the ground [m], unused.
     """
-    # One long body, for some thirty scalars of a pixel pass from each of its steps to the next.
+    # One long body, because some thirty scalars of a pixel are shared by its steps.
     seen, rays, origin = sight
     corners, normals, material, tint, uv = surfaces
     label, albedo, _, _, kind, glass, glow, _, _ = materials
@@ -105,7 +105,8 @@ def shade(sight, surfaces, materials, light, shadows, blobs):
             bu = (tx * px + ty * py + tz * pz) * inv
             qx, qy, qz = ty * e1z - tz * e1y, tz * e1x - tx * e1z, tx * e1y - ty * e1x
             bv = (dx * qx + dy * qy + dz * qz) * inv
-            # At the horizon a neighbour's triangle can be edge on, and its plane lie behind: no haze there.
+            # At the horizon a neighbour's triangle can be edge on, with its plane behind the camera: no haze
+            # there.
             t = max((e2x * qx + e2y * qy + e2z * qz) * inv, 0.0)
             bw = 1.0 - bu - bv
             su = bw * uv[k, 0, 0] + bu * uv[k, 1, 0] + bv * uv[k, 2, 0]
@@ -116,12 +117,12 @@ def shade(sight, surfaces, materials, light, shadows, blobs):
                 nx, ny, nz, facing = -nx, -ny, -nz, -facing
             m = material[k]
             gain, pane = texture(kind[m], su, sv)
-            # Texture finer than a pixel averages out: fade its contrast with distance.
+            # Texture finer than a pixel averages out: its contrast fades with distance.
             fade = min(1.0, 22.0 / max(t, 1.0)) if kind[m] != 4 else 1.0
             gain = 1.0 + (gain - 1.0) * fade
             mirror = max(glass[m], pane)
             lit = max(nx * sun[0] + ny * sun[1] + nz * sun[2], 0.0)
-            if kind[m] == 3:  # leaves face everywhere: a crown is lit more evenly than its outline
+            if kind[m] == 3:  # leaves face all directions: a crown is lit more evenly than its outline
                 lit = (0.25 + 0.45 * lit) * (0.5 + value_noise(su * 1.7, sv * 1.7))
             shade, ambient = 1.0, 0.55 + 0.45 * nz
             lab = label[m]

@@ -1,4 +1,4 @@
-"""One moment, from the world to what the sensors deliver."""
+"""Measurements of all sensors at one moment of the world."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ __all__ = ["Image", "Scene", "Seat", "SimulatedFrame", "frame_of", "scene_of", "
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """An image and what networks make of it; `true_labels` goes into no log."""
+    """An image with the outputs of networks; `true_labels` is not logged."""
 
     jpeg: bytes
     labels_png: bytes
@@ -42,7 +42,7 @@ class Image:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedFrame:
-    """What sensors deliver for one moment, by name; stamps in seconds of the drive."""
+    """Measurements of the sensors at one moment, by name; stamps in seconds of the drive."""
 
     stamps_s: Mapping[str, float]
     images: Mapping[str, Image]
@@ -52,7 +52,7 @@ class SimulatedFrame:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What is around a vehicle, beside meshes: its motion, the light, and what mirrors or outshines for the radar."""
+    """Surroundings of a vehicle besides meshes: ego motion, light, radar mirrors and strong reflectors."""
 
     ego: Motion
     sun: np.ndarray
@@ -71,7 +71,7 @@ def scene_of(drive: Drive) -> Scene:
 
 @dataclass(frozen=True, eq=False)
 class Seat:
-    """From where a moment is looked at: the world at that time, what is around, and what the vehicle carries."""
+    """Inputs of one moment: world at that time, surroundings, and the vehicle's sensors."""
 
     moment: Moment
     scene: Scene
@@ -82,10 +82,10 @@ class Seat:
 def frame_of(
     seat: Seat, stamps_s: Mapping[str, float], rng: np.random.Generator, semantics: SemanticsSpec
 ) -> SimulatedFrame:
-    """What the named sensors deliver with these stamps, each measured its delay before its stamp.
+    """Measurements of the named sensors with these stamps, each measured its delay before its stamp.
 
-    The moment should be near the middle of the reference lidar's sweep. Days are their random draws: lidars come first,
-    then what cameras see, radars, and last what networks make of the images.
+    The moment should be near the middle of the reference lidar's sweep. The order of random draws defines a
+    day: lidars, then camera images, radars, and last the networks' outputs.
     """
 
     def at(kind: Kind) -> dict[str, float]:
@@ -104,7 +104,7 @@ def frame_of(
 def triggered_stamps(
     rig: RigSpec, mounting: Mounting, stamp_s: float, rng: np.random.Generator
 ) -> dict[str, float]:
-    """Stamps of all sensors that the reference lidar's sweep triggers, its own among them."""
+    """Stamps of all sensors triggered by the reference lidar's sweep, and of the lidar itself."""
     others = [s for s in rig.sensors if s != rig.reference]
     jitter = np.clip(rng.normal(0, rig.sync_jitter_s, len(others)), -0.0045, 0.0045)
     stamps = stamp_s + jitter

@@ -1,7 +1,7 @@
-"""A delivery van with six cameras, two lidars and five radars, each on a clock of its own, and a part of it.
+"""A delivery van with six cameras, two lidars and five radars, each with its own clock; and a subset, `duo`.
 
-Everything around the car is seen: the roof lidar shares its view with every camera, the cameras overlap their
-neighbours, and the rear corner radars share theirs with the cameras that look back.
+The sensors cover all directions: the roof lidar overlaps with every camera, cameras overlap their neighbours,
+and the rear corner radars overlap with the rear cameras.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from pipeline.simulate.sensors.rig_spec import RigSpec, SensorSpec, Sheet
 
 __all__ = ["DUO", "VAN"]
 
-# Lens and pixels of surround cameras at about a third of their resolution; the lens maker's distortion is logged.
+# Lens and pixels of surround cameras at about a third of their resolution; lens distortion is logged.
 _SIDE: Final = CameraSpec(
     800, 500, 84.0, 58.7, model="plumb_bob", distortion=(-0.20, 0.05, 3e-4, -2e-4, -0.004)
 )
 _FRONT: Final = CameraSpec(912, 470)
 _FISHEYE: Final = CameraSpec(720, 540, 186.0, 139.5)
-# 0.4 by 1.3 deg all around; a flash in the grille that looks ahead, 120 by 25 deg.
+# 0.4 by 1.3 deg over 360 deg; a flash lidar in the grille that looks ahead, 120 by 25 deg.
 _ROOF: Final = LidarSpec((-180.0, 180.0), (-25.0, 15.0), 900, 32, 0.1, 1.2, 100.0)
 _GRILLE: Final = LidarSpec((-60.0, 60.0), (-12.5, 12.5), 300, 40, 0.05, 1.0, 90.0)
 _LONG: Final = RadarSpec(azimuth_deg=45.0, max_range_m=100.0, rays=7000)
@@ -54,7 +54,7 @@ VAN: Final = RigSpec(
     behind_m=150.0,
 )
 
-# What the demo can afford: as quick as a rig of three.
+# For the demo: as fast as a three-sensor rig.
 _SMALL: Final[dict[str, Sheet]] = {
     "front": CameraSpec(608, 312),
     "left": CameraSpec(480, 300, 84.0, 58.7, model="plumb_bob", distortion=_SIDE.distortion),

@@ -1,1 +1,1 @@
-"""The world along a road: meshes, traffic, and the rays that meet them."""
+"""The world along a road: meshes, traffic, and ray casting."""

@@ -16,7 +16,7 @@ __all__ = ["ACTOR_KINDS", "CAR_COLOURS", "HOLLOW", "actor_mesh"]
 ACTOR_KINDS: Final = ("car", "van", "truck", "bus", "cyclist", "pedestrian")
 VARIANTS: Final = {"car": 24, "van": 6, "truck": 8, "bus": 3, "cyclist": 6, "pedestrian": 12}
 HOLLOW: Final = (
-    1000  # added to a variant: the same road user with windows that beams pass through, and open loads
+    1000  # added to a variant: the same road user with windows transparent to beams, and open loads
 )
 CAR_COLOURS: Final = (
     (0.70, 0.70, 0.70),

@@ -1,4 +1,4 @@
-"""Cars as meshes, closed or with seats behind windows that beams pass through; seats of a bus, loads of lorries."""
+"""Cars as meshes, closed or with seats behind transparent windows; seats of a bus, loads of lorries."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def add_car(b: MeshBuilder, rng: np.random.Generator, colour: Colour, *, hollow:
 
 
 def _open_deck(b: MeshBuilder, shape: _CarShape, colour: Colour) -> None:
-    """Bonnet, boot lid and shelf around the cabin's hole; dashboard, and two rows of seats with headrests."""
+    """Bonnet, boot lid and shelf around the open cabin; dashboard, and two rows of seats with headrests."""
     half, w, belt = shape.half, shape.w - 0.06, shape.belt
     front, floor = half - shape.bonnet, 0.44 * shape.height
     for x0, x1 in ((front, half - 0.35), (-half + 0.10, shape.tail)):
@@ -92,7 +92,7 @@ def _open_deck(b: MeshBuilder, shape: _CarShape, colour: Colour) -> None:
 def add_seats(
     b: MeshBuilder, x_m: float, half_width_m: float, height_m: tuple[float, float], gap_m: float
 ) -> None:
-    """Add two seats side by side with a gap between them: cushions, backs up to a height, headrests above it."""
+    """Add two seats side by side: cushions, backs up to a height, headrests above it."""
     low, high = height_m
     for side in (-1, 1):
         middle, width = side * (half_width_m + gap_m / 2) / 2, half_width_m - gap_m / 2
@@ -127,7 +127,7 @@ def add_load(
 
 
 def glazed(mesh: Mesh, share: float) -> Mesh:
-    """The mesh in lacquer, with windows that let a share of the beams pass for panes that let none."""
+    """The mesh with lacquer, and with windows that transmit a share of the beams."""
     pane = np.isin(mesh.material, list(_PANES))
     tint = np.where(pane[:, None], np.float32(share), mesh.tint)
     return replace(mesh, material=_HOLLOW[mesh.material], tint=tint)
@@ -140,7 +140,7 @@ def _car_cabin(b: MeshBuilder, shape: _CarShape, colour: Colour) -> None:
     roof = (rear, front, -w + 0.24, w - 0.24, height)
     faces = dict.fromkeys(("front", "rear", "left", "right"), "car_glass") | {"top": "car_paint"}
     b.frustum(foot, roof, faces, colour)
-    for side in (-1, 1):  # pillars stand a little outside the glass
+    for side in (-1, 1):  # pillars are a little outside the glass
         for x in (0.30, 0.62):
             low = np.array([foot[0] + x * (foot[1] - foot[0]), side * (w - 0.07), belt])
             high = np.array([roof[0] + x * (roof[1] - roof[0]), side * (w - 0.24), height])

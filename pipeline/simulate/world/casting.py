@@ -1,7 +1,7 @@
-"""Rays against the world: Embree on a sliding window of the standing world and on each road user apart.
+"""Ray casting: Embree on a sliding window of the static world and on each road user separately.
 
-Road users are hit in their own frame with the ray moved to the ray's own time, so a sweep that takes 100 ms sees
-each of them where it was when the beam came by, and no mesh is ever rebuilt for a frame.
+For road users, rays are transformed to the user's frame at the ray's own time. A sweep of 100 ms thus hits
+each user where it was when the beam passed, and no mesh is rebuilt per frame.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ __all__ = ["Hits", "Moment", "ShadowMap", "Standing", "World", "shadow_map", "st
 
 _AHEAD_M: Final = 170.0
 _BEHIND_M: Final = 60.0
-_SHADOWS_BEHIND_M: Final = 8.0  # of an ordinary window: who looks ahead sees no others
-_ONE_PLACE_M: Final = 6.0  # rays that begin further apart than a car moves in a sweep form no cone
+_SHADOWS_BEHIND_M: Final = 8.0  # of an ordinary window: cameras that look ahead see no others
+_ONE_PLACE_M: Final = 6.0  # rays whose origins are further apart than a car moves in a sweep form no cone
 _POPULATED_M, _UNPOPULATED_M = 150.0, 15.0  # road users ahead; the last stretch behind that is empty
 
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """What N rays met: range along the ray, row of the moment's triangles (-1 = nothing), barycentric coordinates."""
+    """Hits of N rays: range, row of the moment's triangles (-1 = nothing), barycentric coordinates."""
 
     range_m: np.ndarray
     triangle: np.ndarray
@@ -54,7 +54,7 @@ class ShadowMap(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Standing:
-    """The standing world around us; map coordinates less `origin` (single precision is exact to 0.1 mm near 0)."""
+    """The static world around the vehicle, in map coordinates minus `origin` (float32: 0.1 mm near 0)."""
 
     origin: np.ndarray
     mesh: Mesh
@@ -64,7 +64,7 @@ class Standing:
 
 
 class World:
-    """The world of one drive, so far behind the vehicle; holds one window of it at a time."""
+    """The world of one drive; holds one window of it at a time, up to a distance behind the vehicle."""
 
     def __init__(self, drive: Drive, behind_m: float = _BEHIND_M) -> None:
         self.drive, self._behind_m = drive, behind_m
@@ -73,7 +73,7 @@ class World:
         self._standing: Standing | None = None
 
     def around(self, s_m: float) -> Standing:
-        """The standing world to 170 m ahead of an arc length."""
+        """The static world up to 170 m ahead of an arc length."""
         window = int((s_m - self._behind_m) // CHUNK_M), int((s_m + _AHEAD_M) // CHUNK_M)
         if self._standing is None or window != self._window:
             self._chunks = {
@@ -95,7 +95,7 @@ class World:
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """The world at one time; for rays at other times, road users move on with constant velocity."""
+    """The world at one time; for rays at other times, road users move with constant velocity."""
 
     standing: Standing
     actors: list[Actor]
@@ -103,12 +103,12 @@ class Moment:
     landscape: Landscape = LANDSCAPES["urban"]
 
     def advanced(self, t_s: float) -> Moment:
-        """The same world some milliseconds later or earlier."""
+        """The world some milliseconds later or earlier."""
         return replace(self, actors=[a.advanced(t_s - self.t_s) for a in self.actors], t_s=t_s)
 
     @cached_property
     def mesh(self) -> Mesh:
-        """All triangles, in map coordinates less the window's origin: the standing ones, then actor by actor."""
+        """All triangles, in map coordinates minus the window's origin: static ones, then actor by actor."""
         parts = [self.standing.mesh]
         for actor in self.actors:
             T = actor.T_map_actor.copy()
@@ -147,7 +147,7 @@ class Moment:
         directions: Float[np.ndarray, "N 3"],
         delay_s: Float[np.ndarray, " N"],
     ) -> Hits:
-        """First hits of rays given in map coordinates less the window's origin, `delay_s` after this moment."""
+        """First hits of rays in map coordinates minus the window's origin, `delay_s` after this moment."""
         origins = np.ascontiguousarray(origins, np.float32)
         directions = np.ascontiguousarray(directions, np.float32)
         delay = delay_s.astype(np.float32)
@@ -175,7 +175,7 @@ class Moment:
 
 @dataclass(frozen=True, eq=False)
 class _Prototype:
-    """An actor's scene and normals in its own frame, and the sphere around it."""
+    """An actor's scene and normals in its own frame, and its bounding sphere."""
 
     scene: EmbreeScene
     normals: np.ndarray
@@ -198,14 +198,14 @@ def _normals(corners: np.ndarray) -> np.ndarray:
 
 
 def _cone(directions: np.ndarray) -> tuple[np.ndarray, float]:
-    """Middle of some unit vectors, and the cosine of the widest angle from it."""
+    """Mean direction of unit vectors, and cosine of the largest angle from it."""
     axis = directions[:: max(len(directions) // 512, 1)].mean(0)
     axis /= max(float(np.linalg.norm(axis)), 1e-6)
     return axis, float((directions @ axis).min())
 
 
 def _may_be_seen(centre: np.ndarray, reach_m: float, axis: np.ndarray, cosine: float) -> bool:
-    """Whether a sphere can meet a cone of rays from the origin."""
+    """True if a sphere may intersect a cone of rays from the origin."""
     distance = float(np.linalg.norm(centre))
     if distance <= reach_m or cosine < 0:
         return True
@@ -216,7 +216,7 @@ def _may_be_seen(centre: np.ndarray, reach_m: float, axis: np.ndarray, cosine: f
 def _scene(mesh: Mesh) -> EmbreeScene:
     scene = EmbreeScene()
     corners = np.ascontiguousarray(mesh.corners.reshape(-1, 3), np.float32)
-    # The scene keeps the mesh.
+    # The scene holds a reference to the mesh.
     TriangleMesh(scene, corners, np.arange(len(corners), dtype=np.int32).reshape(-1, 3))
     return scene
 
@@ -224,7 +224,7 @@ def _scene(mesh: Mesh) -> EmbreeScene:
 def _cast(
     scene: EmbreeScene, origins: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Range (inf = nothing met), triangle (-1 = nothing met) and barycentric coordinates of each ray's first hit."""
+    """Range (inf = no hit), triangle (-1 = no hit) and barycentric coordinates of each ray's first hit."""
     found = scene.run(
         np.ascontiguousarray(origins, np.float32), np.ascontiguousarray(directions, np.float32), output=True
     )
@@ -241,7 +241,7 @@ def shadow_map(
     s_m: float,
     behind_m: float,
 ) -> ShadowMap:
-    """Cast the ground around an arc length towards the sun; once per window, not per image."""
+    """Cast shadow rays from the ground around an arc length; once per window, not per image."""
     cell, half = 0.4, 22.0
     s0 = s_m - behind_m
     s, d = np.meshgrid(np.arange(s0, s_m + 95.0, cell), np.arange(-half, half, cell), indexing="ij")
@@ -260,7 +260,7 @@ def standing_of(
     s_m: float,
     shadows_behind_m: float = _SHADOWS_BEHIND_M,
 ) -> Standing:
-    """A standing world of a mesh given in the map."""
+    """A static world from a mesh in the map."""
     corners = (mesh.corners - origin.astype(np.float32)).astype(np.float32)
     local = replace(mesh, corners=corners)
     scene = _scene(local)

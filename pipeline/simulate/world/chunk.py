@@ -1,4 +1,4 @@
-"""A piece of the standing world while it is built: what bends with the road, and what is placed as it is."""
+"""A piece of the static world under construction: geometry that follows the road, and rigid meshes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Span = tuple[float, float]
 
 @dataclass
 class Chunk:
-    """Two ways of adding: `along` bends with the road (corners are s, d, h), `rigid` is placed as it is."""
+    """Two ways of adding: `along` follows the road (corners are s, d, h), `rigid` stays rigid."""
 
     drive: Drive
     index: int
@@ -28,7 +28,7 @@ class Chunk:
 
     @property
     def s0(self) -> float:
-        """Where the chunk begins."""
+        """Arc length at the start of the chunk."""
         return self.index * CHUNK_M
 
     def strip(self, d: Span, h: Span, name: str, step: float = 5.0) -> None:
@@ -36,12 +36,12 @@ class Chunk:
         self.band((self.s0, self.s0 + CHUNK_M), d, h, name, step)
 
     def band(self, s: Span, d: Span, h: Span, name: str, step: float = 5.0, tint: Colour = (1, 1, 1)) -> None:
-        """Add a band of a material along the road, in pieces of about `step` [m] that bend with it.
+        """Add a band of a material along the road, in pieces of about `step` [m] that follow its curve.
 
         Args:
-            s: arc lengths between which it lies.
+            s: arc lengths of its ends.
             d: offsets of its two sides, to the left of the centre line.
-            h: heights of its two sides; a band that rises more than it is wide has its texture upright.
+            h: heights of its two sides; a band steeper than 45 deg has upright texture.
             name: material.
             step: length of a piece.
             tint: factor of the albedo.
@@ -67,7 +67,7 @@ class Chunk:
         self.rigid.append(placed(mesh, self.drive.road.pose(s, d, h, yaw), instance))
 
     def every(self, step: float, jitter: float = 0.0, chance: float = 1.0) -> list[float]:
-        """Places along the chunk on a grid that goes on in the next chunk."""
+        """Places along the chunk on a grid that continues in the next chunk."""
         first = int(np.ceil(self.s0 / step))
         grid = [k * step for k in range(first, int(np.ceil((self.s0 + CHUNK_M) / step)))]
         return [float(s + self.rng.uniform(-jitter, jitter)) for s in grid if self.rng.random() < chance]

@@ -1,7 +1,7 @@
-"""One drive: the road it follows, how the vehicle moves along it, and who else is on the road.
+"""One drive: road, motion of the vehicle, and traffic.
 
-Everything is a function of time and of the drive's seed, so a drive of any length needs no memory, and frames that
-follow one another look at the same world.
+Everything is a function of time and of the drive's seed. A drive of any length needs no memory, and
+consecutive frames show the same world.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class RoadLayout:
     lane_m: float
     lanes_own: tuple[float, ...]  # lane centres in our direction, ours first
     lanes_oncoming: tuple[float, ...]
-    right_edge: float  # where the asphalt ends
+    right_edge: float  # edge of the asphalt
     left_edge: float
     parking_m: float  # width of the parking strip inside each edge, 0 = none
 
@@ -58,7 +58,7 @@ def layout_of(landscape: Landscape, seed: int) -> RoadLayout:
 
 @dataclass(frozen=True)
 class Road:
-    """Centre line in the map: x, y, z and heading over arc length, smooth and without end."""
+    """Endless smooth centre line in the map: x, y, z and heading over arc length."""
 
     seed: int
     fast: bool
@@ -98,7 +98,7 @@ class Road:
         return at[0], at[1], at[2], at[3]
 
     def to_map(self, s_d_h: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-        """Map coordinates of points along the road (arc length, offset to the left, height above the centre line)."""
+        """Map coordinates of points (arc length, offset to the left, height above the centre line)."""
         x, y, z, heading = self.centre(s_d_h[..., 0])
         d = s_d_h[..., 1]
         return np.stack([x - d * np.sin(heading), y + d * np.cos(heading), z + s_d_h[..., 2]], -1)
@@ -106,7 +106,7 @@ class Road:
     def pose(
         self, s_m: float, d_m: float, h_m: float = 0.0, yaw_rad: float = 0.0
     ) -> Float[np.ndarray, "4 4"]:
-        """T_map_thing of something that stands on the road, turned by yaw against its direction."""
+        """T_map_thing of an object on the road, rotated by yaw relative to its direction."""
         p = self.to_map(np.array([[s_m - 1.0, d_m, h_m], [s_m, d_m, h_m], [s_m + 1.0, d_m, h_m]]))
         grade = np.arctan2(p[2, 2] - p[0, 2], 2.0) * np.cos(yaw_rad)
         heading = float(self.centre(np.array([s_m]))[3][0]) + yaw_rad
@@ -133,7 +133,7 @@ def _rotation(yaw: np.ndarray, pitch: np.ndarray, roll: np.ndarray) -> np.ndarra
 
 @runtime_checkable
 class Motion(Protocol):
-    """How a vehicle moves."""
+    """Interface for the motion of a vehicle."""
 
     def poses(self, t_s: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N 4 4"]:
         """T_map_vehicle at times."""
@@ -148,7 +148,7 @@ class Motion(Protocol):
 
 @dataclass(frozen=True)
 class Parked:
-    """A vehicle that stands at the map's origin."""
+    """A vehicle standing at the map's origin."""
 
     def poses(self, t_s: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N 4 4"]:
         """T_map_vehicle: always the identity."""
@@ -162,7 +162,7 @@ class Parked:
 
 
 class _Profile(NamedTuple):
-    """Arc length, lateral offset and slope dd/ds of our way over time."""
+    """Arc length, lateral offset and slope dd/ds of the ego vehicle's path over time."""
 
     t_s: np.ndarray
     s_m: np.ndarray
@@ -178,7 +178,7 @@ def _smoothed(values: np.ndarray, half: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class EgoMotion:
-    """How our vehicle moves along its road, from time 0 to `duration_s`."""
+    """Motion of the ego vehicle along its road, from time 0 to `duration_s`."""
 
     road: Road
     layout: RoadLayout
@@ -193,7 +193,7 @@ class EgoMotion:
         s += 30.0 - np.interp(0.0, t, s)
         d = self._offset(s, rng)
         ds, dd = np.gradient(s), np.gradient(d)
-        rolling = ds > 0.3 * _STEP_S  # slower, the wheels keep the direction that they had
+        rolling = ds > 0.3 * _STEP_S  # at lower speed, the wheels keep their direction
         slope = np.interp(t, t[rolling], dd[rolling] / ds[rolling])
         return _Profile(t, s, d, _smoothed(slope, 25))
 
@@ -215,7 +215,7 @@ class EgoMotion:
         return _smoothed(np.maximum(speed, 0.0), 50)
 
     def _offset(self, s: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Lateral offset [m] at arc lengths: we wander inside the lane and now and then change it."""
+        """Lateral offset [m] at arc lengths: the car wanders in its lane and sometimes changes it."""
         lanes = self.layout.lanes_own
         d = np.full_like(s, lanes[0])
         for period in (17.0, 7.0):
@@ -279,7 +279,7 @@ class EgoMotion:
 
 @dataclass(frozen=True)
 class Drive:
-    """A stretch of driving: where, when, and in what light."""
+    """A stretch of driving: place, time and light."""
 
     seed: int
     environment: str
@@ -289,7 +289,7 @@ class Drive:
 
     @cached_property
     def landscape(self) -> Landscape:
-        """What the world along the road is like."""
+        """The landscape along the road."""
         return landscape_named(self.environment)
 
     @cached_property
@@ -305,7 +305,7 @@ class Drive:
 
     @cached_property
     def ego(self) -> EgoMotion:
-        """Our motion on it."""
+        """Ego motion on the road."""
         return EgoMotion(self.road, self.layout, self.seed, self.duration_s)
 
     @cached_property
@@ -313,7 +313,7 @@ class Drive:
         """Direction to the sun in the map."""
         rng = np.random.default_rng([self.seed, 14])
         azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(*self.landscape.sun_deg))
-        if self.landscape.side_light:  # within 30 deg of straight aside
+        if self.landscape.side_light:  # within 30 deg of straight to the side
             azimuth = (azimuth % np.pi) / 3 + np.pi / 3 + (np.pi if azimuth > np.pi else 0.0)
         return np.array(
             [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]

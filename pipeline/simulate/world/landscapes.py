@@ -1,4 +1,4 @@
-"""What worlds are like: named ones, and those that a seed draws between the limits of the named ones."""
+"""Landscapes: named ones, and random ones between the limits of those."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pipeline.errors import ConfigError
 
 __all__ = ["LANDSCAPES", "WORLD", "Landscape", "landscape_named"]
 
-WORLD: Final = "world-"  # begins the names of worlds that a seed draws
+WORLD: Final = "world-"  # prefix of landscapes drawn from a seed
 
 Fence = Literal["none", "wall", "slats", "mesh", "hedge"]
 Surface = Literal["asphalt", "cobbles", "gravel"]
@@ -19,38 +19,38 @@ Surface = Literal["asphalt", "cobbles", "gravel"]
 
 @dataclass(frozen=True)
 class Landscape:
-    """Everything about a world that is no matter of chance along the way.
+    """Parameters of a landscape; everything else is random along the road.
 
     Args:
-        name: of the environment.
-        base: the named one that a seed changed.
-        fast: a motorway's curves, speeds, traffic and banks; else a street's.
-        plain: the sides of the street are those of `urban`, as it always was.
+        name: name of the environment.
+        base: the named landscape that a seed changed.
+        fast: curves, speeds, traffic and banks of a motorway; else of a street.
+        plain: the roadsides of `urban`.
         pace: factor of the usual speed.
         lane_m: width of a lane.
-        one_way: no lane but ours.
-        two_lanes: share of drives with two lanes in our direction.
+        one_way: only the ego lane.
+        two_lanes: share of drives with two lanes in the ego direction.
         parking: share of drives with cars parked along the kerb.
-        traffic: factor of how many places of a stream of road users are taken.
+        traffic: factor of the number of occupied places in a stream of road users.
         spacing: factor of the distance between these places.
-        kinds: of vehicles on the road; none = as is usual there.
-        walk_m: between these lies the width of the pavement; 0 = a verge of grass.
-        fences: weights of what stands along a plot.
+        kinds: kinds of vehicles on the road; none = the usual ones.
+        walk_m: limits of the width of the pavement; 0 = a verge of grass.
+        fences: weights of the kinds of boundaries of a plot.
         houses: share of plots with a house.
         setback_m: distances of a house from the pavement.
-        storeys: of houses.
+        storeys: numbers of storeys of houses.
         green: trees and bushes per plot.
         trees_m: distance of trees in a row beside the road, 0 = no row.
-        poles_m: likewise of poles.
+        poles_m: distance of poles in a row beside the road, 0 = no row.
         ceiling_m: height of a ceiling, 0 = the sky.
-        inner_m: from the road's edge to the walls under the ceiling.
-        columns_m: distance of the columns that carry the ceiling, 0 = none.
+        inner_m: distance from the road's edge to the walls under the ceiling.
+        columns_m: distance between the columns of the ceiling, 0 = none.
         surface: material of the road.
         markings: whether the road is marked.
-        infrared: whether a lidar sees markings and repairs; else a pattern that no eye sees.
-        glass: windows, meshes and hedges let beams pass, and lorries have open loads.
-        sun_deg: between these lies the height of the sun.
-        side_light: the sun stands to the left or the right of where the road begins.
+        infrared: whether lidar intensity shows markings and repairs; else it has an independent pattern.
+        glass: windows, meshes and hedges transmit beams, and lorries have open loads.
+        sun_deg: limits of the sun's elevation.
+        side_light: the sun is to the left or the right of the road's initial direction.
     """
 
     name: str
@@ -90,10 +90,10 @@ _GARDENS: Final[tuple[tuple[Fence, float], ...]] = (
 _ALL: Final = (
     Landscape("urban", plain=True, glass=False),
     Landscape("highway", fast=True, plain=True, glass=False),
-    # As residential streets are: gardens, cars on both sides, few lanes.
+    # Like residential streets: gardens, cars on both sides, few lanes.
     Landscape("suburb", two_lanes=0.0, parking=1.0, traffic=0.8, fences=_GARDENS, houses=0.8, green=2.0, poles_m=30.0),
-    # Cars and vans close by, before and beside us, hardly moving, and little else: all that stands before and behind
-    # one another has one label.
+    # Cars and vans close ahead and beside, hardly moving, and little else: objects behind one another have
+    # one label.
     Landscape(
         "jam", pace=0.08, two_lanes=1.0, parking=1.0, traffic=1.4, spacing=0.38,
         kinds=("car", "van", "car", "van", "van"), walk_m=(2.0, 4.0), houses=0.1,
@@ -135,7 +135,7 @@ def landscape_named(name: str) -> Landscape:
 
 
 def _drawn(seed: int) -> Landscape:
-    """The landscape of a seed: one of the named ones, with other rows, fences, surfaces, light and traffic."""
+    """The landscape of a seed: a named one, with other rows, fences, surfaces, light and traffic."""
     rng = np.random.default_rng([seed, 62])
     base = LANDSCAPES[str(rng.choice(_DRAWN_FROM))]
 

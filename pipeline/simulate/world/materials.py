@@ -1,6 +1,6 @@
-"""What surfaces are made of: label, colour, texture, lidar reflectivity, radar strength.
+"""Materials of surfaces: label, colour, texture, lidar reflectivity, radar strength.
 
-Labels are Cityscapes train ids. Reflectivity is the fraction of lidar light (905 nm) that comes back from a frontal
+Labels are Cityscapes train ids. Reflectivity is the fraction of lidar light (905 nm) returned from a frontal
 hit; retro-reflectors exceed 1 (asphalt 0.1-0.2, concrete 0.3, grass 0.4-0.6 in the near infrared).
 """
 
@@ -28,11 +28,11 @@ _PLAIN, _ASPHALT, _GRASS, _FOLIAGE, _FACADE, _PAVING, _SLATS, _CONCRETE, _WORN, 
 
 @dataclass(frozen=True)
 class Material:
-    """One surface.
+    """One surface material.
 
-    `radar_gain`: radar echo per solid angle; `glass`: share of light that it mirrors or lets through; `passes`: share
-    of a lidar's beams that go on behind it, times the triangle's tint; `gloss`: lacquer, from which beams that graze it
-    do not come back.
+    `radar_gain`: radar echo per solid angle; `glass`: share of light that it mirrors or transmits; `passes`:
+    share of a lidar's beams transmitted, times the triangle's tint; `gloss`: lacquer, without echoes at
+    grazing angles.
     """
 
     name: str
@@ -90,7 +90,7 @@ MATERIALS: Final = (
     Material("bus_tyre", "bus", (0.025, 0.025, 0.027), 0.05, 4.0),
     Material("bike_metal", "bicycle", (0.12, 0.12, 0.14), 0.25, 8.0),
     Material("bike_tyre", "bicycle", (0.03, 0.03, 0.03), 0.08, 1.0),
-    # All ways through a trihedral are as long as the one to its apex: its echo is a beacon there, not its plates.
+    # All paths in a trihedral are as long as the one to its apex: a beacon there replaces the plates' echo.
     Material("corner_reflector", "pole", (0.65, 0.65, 0.66), 0.85, 0.0),
     Material("tripod", "pole", (0.05, 0.05, 0.05), 0.12, 0.3),
     Material("car_window", "car", (0.03, 0.035, 0.04), 0.05, 2.0, glass=0.75, passes=0.85),
@@ -138,5 +138,5 @@ TABLE: Final = MaterialTable(
 
 
 def material(name: str) -> int:
-    """Index of a material; KeyError where there is none of that name."""
+    """Index of a material; raises KeyError for an unknown name."""
     return _INDEX[name]

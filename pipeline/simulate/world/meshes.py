@@ -1,4 +1,4 @@
-"""Triangle meshes with a material, a tint, an instance and surface coordinates per triangle, and how to build them."""
+"""Triangle meshes with material, tint, instance and texture coordinates per triangle, and their builder."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def join(meshes: list[Mesh]) -> Mesh:
 
 
 def placed(mesh: Mesh, T_map_mesh: Float[np.ndarray, "4 4"], instance: int | None = None) -> Mesh:
-    """The mesh moved rigidly, as one instance where a number is given."""
+    """The mesh moved rigidly; one instance if a number is given."""
     corners = mesh.corners @ T_map_mesh[:3, :3].T.astype(np.float32) + T_map_mesh[:3, 3].astype(np.float32)
     ids = mesh.instance if instance is None else np.full(len(mesh), instance, np.int32)
     return replace(mesh, corners=corners, instance=ids)
@@ -68,7 +68,7 @@ def placed(mesh: Mesh, T_map_mesh: Float[np.ndarray, "4 4"], instance: int | Non
 
 @dataclass
 class MeshBuilder:
-    """Collects quads; everything else is made of them."""
+    """Collects quads; all shapes consist of them."""
 
     _parts: list[Mesh] = field(default_factory=list)
 
@@ -186,7 +186,7 @@ class MeshBuilder:
         )
 
     def mesh(self, instance: int = 0) -> Mesh:
-        """The triangles so far, degenerate ones left out."""
+        """The triangles so far, without degenerate ones."""
         every = join(self._parts)
         a, b, c = every.corners.swapaxes(0, 1)
         kept = take_rows(every, np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-8)

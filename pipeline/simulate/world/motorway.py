@@ -1,4 +1,4 @@
-"""What lies beside a highway: banks, guard rails, noise walls, delineators, trees, gantries, farms."""
+"""Roadsides of a motorway: banks, guard rails, noise walls, delineators, trees, gantries, farms."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["add_motorway"]
 
 
 def add_motorway(c: Chunk) -> None:
-    """Both sides of a motorway, the rail between the carriageways, now and then a gantry or a farm."""
+    """Both sides of a motorway, the rail between the carriageways, sometimes a gantry or a farm."""
     rng = c.rng
     style = np.random.default_rng([c.drive.seed, 34])
     _guard_rail(c, 0.0, both=True)
@@ -30,7 +30,7 @@ def add_motorway(c: Chunk) -> None:
 
 
 def _verge(c: Chunk, side: int, style: np.random.Generator) -> float:
-    """Banks, rail and noise wall of one side; returns how high the bank rises [m]."""
+    """Banks, rail and noise wall of one side; returns the height of the bank [m]."""
     edge = side * c.drive.layout.left_edge
     walled, railed = style.random() < 0.35, style.random() < 0.75
     foot, slope = edge + side * 3.0, float(style.uniform(-1.0, 2.5))

@@ -1,4 +1,4 @@
-"""What lies beside roads as their landscape has it: plots with fences and houses, halls, rows of trees and poles."""
+"""Roadsides of a landscape: plots with fences and houses, halls, rows of trees and poles."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["add_halls", "add_plots", "add_rows"]
 
 
 def add_plots(c: Chunk) -> None:
-    """Both sides of a street or a country road: pavement or verge, parked cars, plots with what stands on them."""
+    """Both sides of a street or a country road: pavement or verge, parked cars, plots with their objects."""
     layout, landscape = c.drive.layout, c.drive.landscape
     style = np.random.default_rng([c.drive.seed, 35])
     walk = float(style.uniform(*landscape.walk_m))
@@ -33,7 +33,7 @@ def add_plots(c: Chunk) -> None:
 
 
 def _plots(c: Chunk, side: int, d: float) -> None:
-    """Plots of about 13 m: a fence, perhaps a house behind it, trees and bushes."""
+    """Plots of about 13 m: a fence, sometimes a house behind it, trees and bushes."""
     rng, landscape, s = c.rng, c.drive.landscape, c.s0
     kinds, weights = zip(*landscape.fences, strict=True)
     while s < c.s0 + CHUNK_M - 4.0:
@@ -58,7 +58,7 @@ def _plots(c: Chunk, side: int, d: float) -> None:
 
 
 def _fence(c: Chunk, s: Span, side: int, d: float, kind: Fence) -> None:
-    """What stands between a plot and the pavement."""
+    """Boundary between a plot and the pavement."""
     rng = c.rng
     height, thick = float(rng.uniform(1.0, 2.0)), float(rng.uniform(0.5, 1.0))
     tint = tuple(rng.uniform(0.7, 1.2, 3).tolist())
@@ -85,7 +85,7 @@ def _post(height_m: float) -> Mesh:
 
 
 def add_rows(c: Chunk) -> None:
-    """Trees and poles at even distances along both sides, nearer to the road than anything else."""
+    """Trees and poles at even distances along both sides, closer to the road than other objects."""
     landscape = c.drive.landscape
     beside = c.drive.layout.left_edge + (1.6 if landscape.fast else 0.6)
     for side in (-1, 1):
@@ -103,7 +103,7 @@ def _pole() -> Mesh:
 
 
 def add_halls(c: Chunk) -> None:
-    """Walls and a ceiling with lamps, from the road's edge `inner_m` away; between columns stand cars, nose in."""
+    """Walls and a ceiling with lamps, `inner_m` from the road's edge; cars between columns, nose in."""
     landscape, edge = c.drive.landscape, c.drive.layout.left_edge
     wall, top, s = edge + landscape.inner_m, landscape.ceiling_m, (c.s0, c.s0 + CHUNK_M)
     c.band(s, (-wall, wall), (top, top), "ceiling")
@@ -126,7 +126,7 @@ def _column(top_m: float) -> Mesh:
 
 
 def _bays(c: Chunk, side: int, s: float, d: float) -> None:
-    """Up to two cars beside each other, across the way."""
+    """Up to two cars side by side, perpendicular to the road."""
     for k in range(2):
         if c.rng.random() < 0.6:
             mesh = actor_mesh("car", int(c.rng.integers(VARIANTS["car"])) + HOLLOW * c.drive.landscape.glass)

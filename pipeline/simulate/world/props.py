@@ -1,4 +1,4 @@
-"""Things along a road as meshes, made once: lights, signs, lamps, posts, trees; origin on the ground."""
+"""Objects along a road as meshes, made once: lights, signs, lamps, posts, trees; origin on the ground."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def rail_post() -> Mesh:
 
 @lru_cache(maxsize=64)
 def tree(variant: int) -> Mesh:
-    """Tree; variants repeat nothing but themselves."""
+    """Tree; each variant is different."""
     rng = np.random.default_rng([61, variant])
     b = MeshBuilder()
     scale = rng.uniform(0.8, 1.6)

@@ -1,4 +1,4 @@
-"""Which rays can meet a moving body, so that only those are cast against it; compiled."""
+"""Selection of rays that may hit a moving body, so that only those are cast; compiled."""
 # numba infers the types of the arguments; `no_type_check` keeps the tests' shape checks out of compiled code.
 # ruff: noqa: ANN001, ANN201
 # mypy: disable-error-code="no-untyped-def,no-untyped-call"
@@ -18,10 +18,10 @@ _jit = numba.njit(cache=True)
 @no_type_check
 @_jit
 def rays_near(origins, directions, delay, centre, velocity, radius, limit):
-    """Indices of the rays that pass within `radius` of a moving point, before what they have hit already.
+    """Indices of the rays that pass within `radius` of a moving point, before their previous hits.
 
     Args:
-        origins: N 3, where the rays begin [m].
+        origins: N 3, start of the rays [m].
         directions: N 3, unit vectors.
         delay: N, time of each ray after that of `centre` [s].
         centre: of a sphere around the body [m].

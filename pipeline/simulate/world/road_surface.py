@@ -1,4 +1,4 @@
-"""The road itself: asphalt, repairs, manholes, paint."""
+"""The road surface: asphalt, repairs, manholes, paint."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def add_asphalt(c: Chunk) -> None:
     """Asphalt with repairs and manholes, lane markings, crossings with their signals."""
     layout, lift = c.drive.layout, 0.004
     c.strip((layout.right_edge, layout.left_edge), (0.0, 0.0), c.drive.landscape.surface)
-    for _ in range(int(c.rng.integers(0, 4))):  # repairs: dark to the eye, less so to the lidar
+    for _ in range(int(c.rng.integers(0, 4))):  # repairs: dark in the image, less so for the lidar
         s, d = (
             c.s0 + c.rng.uniform(2, 30),
             c.rng.uniform(layout.right_edge + 1, max(layout.left_edge, 3.0) - 3),

@@ -1,4 +1,4 @@
-"""The standing world along a road, made chunk by chunk, so that a drive of any length needs no memory."""
+"""The static world along a road, made chunk by chunk, so that a drive of any length needs no memory."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["chunk_mesh"]
 
 
 def chunk_mesh(drive: Drive, index: int) -> Mesh:
-    """The standing world between arc lengths `index * CHUNK_M` and `(index + 1) * CHUNK_M`, in the map."""
+    """The static world between arc lengths `index * CHUNK_M` and `(index + 1) * CHUNK_M`, in the map."""
     chunk = Chunk(drive, index, np.random.default_rng([drive.seed, 31, index + 1000]))
     add_asphalt(chunk)
     if drive.landscape.ceiling_m:

@@ -1,4 +1,4 @@
-"""What lies beside an urban road: kerbs, pavements, lamps, trees, house fronts, parked cars."""
+"""Roadsides of an urban road: kerbs, pavements, lamps, trees, house fronts, parked cars."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["add_house", "add_parked", "add_pavement", "add_street"]
 
 
 def add_street(c: Chunk) -> None:
-    """Both sides of a street: kerb, pavement and what stands on it, houses, parked cars."""
+    """Both sides of a street: kerb, pavement with its objects, houses, parked cars."""
     layout = c.drive.layout
     style = np.random.default_rng([c.drive.seed, 32])
     walk = style.uniform(2.6, 4.2)
@@ -95,7 +95,7 @@ def _frontage(c: Chunk, side: int, d: float) -> None:
 def add_house(
     c: Chunk, side: int, s: float, width: float, d: float, storeys: tuple[int, ...] = (1, 2, 2, 3, 4)
 ) -> None:
-    """A house whose front stands `d` beside the centre line, with one of these numbers of storeys."""
+    """A house with its front `d` from the centre line, with a number of storeys drawn from the given ones."""
     rng = c.rng
     top, depth, gap = (
         3.0 * int(rng.choice(storeys)) + 0.6,

@@ -1,4 +1,4 @@
-"""What surfaces look like near by: asphalt, grass, leaves, house fronts, paving, boards, worn paint; compiled."""
+"""Textures of surfaces: asphalt, grass, leaves, house fronts, paving, boards, worn paint; compiled."""
 # numba infers the types of the arguments; `no_type_check` keeps the tests' shape checks out of compiled code.
 # ruff: noqa: ANN001, ANN202, ANN201, C901, PLR0911
 # mypy: disable-error-code="no-untyped-def,no-untyped-call"
@@ -19,7 +19,7 @@ _fast = numba.njit(cache=True, fastmath=True)
 @no_type_check
 @_fast
 def _lattice(ix, iy):
-    """Reproducible number in [0, 1) of an integer lattice point (integer hash after Wang 2007)."""
+    """Reproducible number in [0, 1) for an integer lattice point (integer hash after Wang 2007)."""
     h = (ix * 374761393 + iy * 668265263) & 0xFFFFFFFF
     h = ((h ^ (h >> 13)) * 1274126177) & 0xFFFFFFFF
     return ((h ^ (h >> 16)) & 0xFFFF) / 65536.0
@@ -79,7 +79,7 @@ def texture(kind, u, v):
         x = u / 0.12 + 0.5 * (int(row) % 2)
         a, b = x - np.floor(x), v / 0.12 - row
         return (0.5 if a < 0.1 or b < 0.1 else 0.7 + 0.6 * _lattice(int(np.floor(x)), int(row))), 0.0
-    if kind == 10:  # wire in meshes of 6 cm, and the dark between
+    if kind == 10:  # wire with a mesh of 6 cm, dark between the wires
         return (
             1.6 if u / 0.06 - np.floor(u / 0.06) < 0.2 or v / 0.06 - np.floor(v / 0.06) < 0.2 else 0.6
         ), 0.0

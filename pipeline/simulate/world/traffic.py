@@ -1,4 +1,4 @@
-"""Who else is on the road at a moment: endless streams per lane, leaders that drive as we do, people on pavements."""
+"""Road users at a moment: endless streams per lane, vehicles ahead in the ego lane, people on pavements."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Actor:
     velocity_map: np.ndarray
 
     def advanced(self, dt_s: float) -> Actor:
-        """Where it is a moment later, at constant velocity."""
+        """The actor some time later, at constant velocity."""
         T = self.T_map_actor.copy()
         T[:3, 3] += dt_s * self.velocity_map
         return replace(self, T_map_actor=T)
@@ -33,7 +33,7 @@ class Actor:
 
 @dataclass(frozen=True)
 class _Stream:
-    """Road users one behind the other with a common speed; every `spacing_m` a place that may be empty."""
+    """Road users in a line with a common speed; a place every `spacing_m`, which may be empty."""
 
     number: int
     offset_m: float
@@ -46,7 +46,7 @@ class _Stream:
 
 @dataclass(frozen=True)
 class _Place:
-    """Where along the road somebody is, and how fast; the speed is along the road, negative = oncoming."""
+    """Position and speed of a road user along the road; negative speed = oncoming."""
 
     s_m: float
     d_m: float
@@ -56,7 +56,7 @@ class _Place:
 
 
 def actors_at(drive: Drive, t_s: float, within_m: tuple[float, float] = (45.0, 150.0)) -> list[Actor]:
-    """Road users from `within_m[0]` behind us to `within_m[1]` ahead."""
+    """Road users from `within_m[0]` behind the ego vehicle to `within_m[1]` ahead."""
     here = drive.ego.arc(t_s)
     actors = _leaders(drive, t_s, here, within_m)
     for stream in _streams(drive):
@@ -73,7 +73,7 @@ def _streams(drive: Drive) -> list[_Stream]:
 
 
 def _dense(stream: _Stream, landscape: Landscape) -> _Stream:
-    """A stream on the road, as dense and as fast as the landscape has it; people on pavements stay as they are."""
+    """A stream on the road with the landscape's density and speed; people on pavements do not change."""
     return replace(
         stream,
         speed_mps=stream.speed_mps * landscape.pace,
@@ -85,7 +85,7 @@ def _dense(stream: _Stream, landscape: Landscape) -> _Stream:
 
 def _highway_streams(layout: RoadLayout, rng: np.random.Generator) -> list[_Stream]:
     streams = []
-    for i, d in enumerate(layout.lanes_own[1:], 1):  # our own lane has leaders
+    for i, d in enumerate(layout.lanes_own[1:], 1):  # the ego lane has leading vehicles
         slow = d == min(layout.lanes_own)
         kinds = ("truck", "truck", "car", "van") if slow else ("car", "car", "car", "van")
         speed = rng.uniform(21, 25) if slow else rng.uniform(27, 36)
@@ -99,7 +99,7 @@ def _highway_streams(layout: RoadLayout, rng: np.random.Generator) -> list[_Stre
 def _urban_streams(layout: RoadLayout, rng: np.random.Generator) -> list[_Stream]:
     streams = []
     own, oncoming = ("car", "car", "car", "van", "bus"), ("car", "car", "van", "truck", "bus")
-    for i, d in enumerate(layout.lanes_own[1:], 1):  # our own lane has leaders
+    for i, d in enumerate(layout.lanes_own[1:], 1):  # the ego lane has leading vehicles
         streams.append(_Stream(i, d, rng.uniform(7, 13), rng.uniform(18, 28), 0.7, own))
     for i, d in enumerate(layout.lanes_oncoming):
         streams.append(_Stream(10 + i, d, -rng.uniform(7, 13), rng.uniform(20, 32), 0.7, oncoming))
@@ -114,7 +114,7 @@ def _urban_streams(layout: RoadLayout, rng: np.random.Generator) -> list[_Stream
 
 
 def _member(drive: Drive, stream: _Stream, k: int, t_s: float) -> tuple[float, float, float, str, int] | None:
-    """(arc length, offset, speed, kind, variant) of the k-th place of a stream, None where it is empty."""
+    """(arc length, offset, speed, kind, variant) of the k-th place of a stream; None if it is empty."""
     rng = np.random.default_rng([drive.seed, 22, stream.number, k + 1_000_000])
     if rng.random() > stream.occupancy:
         return None
@@ -150,7 +150,7 @@ def _members(
 
 
 def _leaders(drive: Drive, t_s: float, here_m: float, within_m: tuple[float, float]) -> list[Actor]:
-    """Vehicles before (and behind) us in our lane do what we shall do (did) some seconds later (earlier)."""
+    """Vehicles ahead (behind) in the ego lane repeat the ego motion some seconds earlier (later)."""
     rng = np.random.default_rng([drive.seed, 23])
     actors: list[Actor] = []
     for sign in (1, -1):
@@ -178,7 +178,7 @@ def _actor(drive: Drive, key: int, kind: str, variant: int, at: _Place) -> Actor
 
 
 def _apart(actors: list[Actor], T_map_vehicle: Float[np.ndarray, "4 4"]) -> list[Actor]:
-    """Leave out whoever would stand inside another or inside us (streams know nothing of one another)."""
+    """Remove actors that overlap with another one or with the ego vehicle (streams are independent)."""
     kept: list[Actor] = []
     places = [(T_map_vehicle[:2, 3] + 1.3 * T_map_vehicle[:2, 0], T_map_vehicle[:2, 0], 3.5)]
     reach = {"car": 2.6, "van": 3.2, "truck": 7.4, "bus": 6.2, "cyclist": 1.0, "pedestrian": 0.4}
