@@ -1,1 +1,1 @@
-"""What the tables hold: columns with units, versions, and the row types that the stages exchange."""
+"""Tables: columns with units, versions, and row types."""

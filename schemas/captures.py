@@ -117,7 +117,7 @@ class Scan(ScanColumns, Capture):
     """One row of `scans`."""
 
 
-_ONE = "of one {}, in order of stamp; a file per {}. Moments say which rows belong together."
+_ONE = "of one {}, in order of stamp; a file per {}. Table moments joins the rows of a moment."
 IMAGES = TableSchema(
     Image, "images", 1, "Images " + _ONE.format("camera", "camera"), made_by="ingest", of_sensor=True
 )

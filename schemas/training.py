@@ -1,18 +1,16 @@
-"""Table `training`: what a network learns from, one row per frame, ready to stack. From prepare, for train.
+"""Table `training`: samples for networks, one row per frame, ready to stack; written by prepare, read by train.
 
-Every row of a lake has the same sizes: arrays are padded to a fixed count, and a column ending in `_count`
-says how many of their rows are real. The camera is resampled once onto an equirectangular grid in its own
-optical frame (only intrinsics are needed for that, no extrinsics); lidar and radar stay points, so that they
-can be rendered at any guess.
+All rows of a lake have the same sizes: arrays are padded to a fixed number of rows, and columns `*_count` are the
+number of valid ones. Images are resampled once onto an equirectangular grid in the camera's optical frame, which
+needs intrinsics but no extrinsics. Lidar and radar stay points, so that they can be rendered at any guess.
 
-The grid: cells are square angles of `grid_step_deg`, centred on the optical axis. The centre of row i, column
-j lies at
+The grid: cells are square angles of `grid_step_deg`, centred on the optical axis. The centre of row i, column j is
     azimuth to the LEFT  a = (W/2 - j - 1/2) step      elevation UPWARDS  e = (H/2 - i - 1/2) step
     direction in the optical frame (x right, y down, z forward) = (-sin a cos e, -sin e, cos a cos e),
 so azimuth and elevation are those of `pipeline.geometry.spherical.camera_direction_angles`.
 
-No column knows a true transform, and no lidar column knows a camera's class: edges come from ranges, ground
-from a plane fitted to the sweep.
+No column depends on a true transform, and no lidar column on the camera: edges come from ranges, ground from a
+plane fitted to the sweep.
 """
 
 from __future__ import annotations
@@ -98,8 +96,8 @@ class TrainingRow:
     image: np.ndarray = array(
         "|u1", (3, "N"), "red, green, blue; each H W row by row, area-averaged; 0 outside the image"
     )
-    grid_class: np.ndarray = per_point("H W: index into GRID_CLASSES, by majority; UNKNOWN_CLASS", "|u1")
-    grid_seen: np.ndarray = per_point("H W: 1 where the image shows the whole cell", "|u1")
+    grid_class: np.ndarray = per_point("H W: index into GRID_CLASSES, by majority, or UNKNOWN_CLASS", "|u1")
+    grid_seen: np.ndarray = per_point("H W: 1 if the image shows the whole cell", "|u1")
     class_distance: np.ndarray = array(
         "|u1",
         (6, "N"),
@@ -109,7 +107,7 @@ class TrainingRow:
     edge_offset: np.ndarray = array(
         "|i1",
         (4, "N"),
-        "by EDGE_LEFT/RIGHT/ABOVE/BELOW of observations, each H W: signed way from the cell's centre to the "
+        "by EDGE_LEFT/RIGHT/ABOVE/BELOW of observations, each H W: signed angle from the cell's centre to the "
         "nearest mask boundary of that direction, along the row (left, right; positive = to the right) or "
         "column (above, below; positive = downwards) [0.05 deg]; NO_EDGE = none within 6.35 deg",
     )
@@ -120,7 +118,7 @@ class TrainingRow:
         "road users: azimuth left, elevation top, azimuth right, elevation bottom of the box (azimuth to the "
         "left and elevation upwards are positive)",
     )
-    detection_count: int = column("road users among the 24 rows", kind="int32")
+    detection_count: int = column("number of valid rows of detection_box_rad, of 24", kind="int32")
     # lidar
     lidar_xyz_m: np.ndarray = points(
         "sweep thinned evenly over directions, lidar frame; input of the network"
@@ -129,23 +127,23 @@ class TrainingRow:
         "rank of the reflectivity in its sweep, 0..255; 0 if not logged", "|u1"
     )
     lidar_flags: np.ndarray = per_point("POINT_IS_EDGE | POINT_IS_GROUND", "|u1")
-    lidar_count: int = column("points among the rows of lidar_*", kind="int32")
+    lidar_count: int = column("number of valid rows of lidar_*", kind="int32")
     cluster_xyz_m: np.ndarray = points(
         "uniform sample of the object clusters' points, lidar frame; for losses"
     )
     cluster_id: np.ndarray = per_point("row in cluster_centre_m, -1 = not among its rows", "<i2")
-    cluster_point_count: int = column("points among the rows of cluster_xyz_m", kind="int32")
+    cluster_point_count: int = column("number of valid rows of cluster_xyz_m", kind="int32")
     cluster_centre_m: np.ndarray = array(
         "<f4", (48, 3), "centres of the largest object clusters, lidar frame"
     )
-    cluster_count: int = column("clusters among the 48 rows", kind="int32")
+    cluster_count: int = column("number of valid rows of cluster_centre_m, of 48", kind="int32")
     edge_xyz_m: np.ndarray = points("depth jumps, lidar frame; for losses")
     edge_side: np.ndarray = per_point("EDGE_LEFT/RIGHT/ABOVE/BELOW: side of the foreground", "|u1")
-    edge_count: int = column("jumps among the rows of edge_*", kind="int32")
+    edge_count: int = column("number of valid rows of edge_*", kind="int32")
     drivable_xyz_m: np.ndarray = array(
-        "<f4", (512, 3), "sample of the drivable ground's 1 m cells ahead, lidar frame"
+        "<f4", (512, 3), "sample of 1 m cells of drivable ground ahead, lidar frame"
     )
-    drivable_count: int = column("cells among the 512 rows", kind="int32")
+    drivable_count: int = column("number of valid rows of drivable_xyz_m, of 512", kind="int32")
     drivable_area_m2: float = column("area that these cells represent")
     ground_plane: np.ndarray = array(
         "<f8", (4,), "n.p + d = 0 in the lidar frame, n up; zeros if none was found"
@@ -157,25 +155,25 @@ class TrainingRow:
         "<f4", (384,), "power or RCS minus its median in the scan; 0 if not logged"
     )
     radar_motion: np.ndarray = array("|u1", (384,), "0 static, 1 moving, 2 undecided")
-    radar_count: int = column("detections among the 384 rows", kind="int32")
-    radar_has_elevation: bool = column("False where all elevations are 0")
+    radar_count: int = column("number of valid rows of radar_*, of 384", kind="int32")
+    radar_has_elevation: bool = column("False if all elevations are 0")
     track_xyz_m: np.ndarray = array("<f4", (24, 3), "centres of tracked moving clusters, radar frame")
-    track_count: int = column("tracks among the 24 rows", kind="int32")
+    track_count: int = column("number of valid rows of track_xyz_m, of 24", kind="int32")
     radar_drivable: np.ndarray = array(
         "|u1",
         (80, 160),
-        "drivable by radar, soft, 255 = surely: x ahead by rows, y from right to left by columns, cells of 1 "
+        "drivable area by radar, 255 = certain: x ahead by rows, y from right to left by columns, cells of 1 "
         "m (row r, column c: x = r + 1/2, y = c - 79.5)",
     )
     # the whole
     ego_speed_mps: float = column("as in perceived; 0 if unknown")
     camera_lag_s: float = column("camera_stamp - stamp")
     radar_lag_s: float = column("radar_stamp - stamp")
-    camera_model: str = column("as in frames, for reference")
-    camera_K: np.ndarray = array("<f8", (3, 3), "as in frames [px]")
-    camera_D: np.ndarray = array("<f8", ("N",), "as in frames")
-    image_width_px: int = column("as in frames", kind="int32")
-    image_height_px: int = column("as in frames", kind="int32")
+    camera_model: str = column("as in images, for reference")
+    camera_K: np.ndarray = array("<f8", (3, 3), "as in images [px]")
+    camera_D: np.ndarray = array("<f8", ("N",), "as in images")
+    image_width_px: int = column("as in images", kind="int32")
+    image_height_px: int = column("as in images", kind="int32")
     prior_camera_lidar_qw: float = column(_PRIOR_CAMERA_LIDAR)
     prior_camera_lidar_qx: float = column(_PRIOR_CAMERA_LIDAR)
     prior_camera_lidar_qy: float = column(_PRIOR_CAMERA_LIDAR)

@@ -1,19 +1,17 @@
 """The file of picked reflectors, written by `boresight simulate --reflectors` and read by `evaluate`.
 
-    {"vehicle": "vehicle-1", "day": "2026-03-02",        whose mounting it shows; left out: that of every
-    record
-     "frames": 150,                                      of the standing recording
-     "reflector": {"edge_m": 0.35},                      optional: trihedral, edges that meet in its apex; it
-     opens
-                                                         towards the lidar, one edge upright, to 2 deg
+    {"vehicle": "vehicle-1", "day": "2026-03-02",        vehicle-day with this mounting; left out: every one
+     "frames": 150,                                      number of frames of the recording
+     "reflector": {"edge_m": 0.35},                      optional: length of a trihedral's edges at the apex;
+                                                         opens towards the lidar, one edge upright, to 2 deg
      "camera": {"model", "K", "D", "width_px", "height_px"},
      "targets": [{"pixel": [u, v], "lidar_m": [x, y, z], "radar_m": [x, y, z],
                   "spread": {"pixel": [su, sv], "lidar_m": [sx, sy, sz], "radar_m": [sx, sy, sz]},
                   "frames": {"pixel": 1, "lidar_m": 1, "radar_m": 150}}, ...]}
 
-Pixels refer to the full image, (0, 0) the centre of its first pixel; metres in each sensor's own frame.
-`spread` (optional) is the standard deviation of one pick, `frames` how many picks the position is the mean
-of: its standard error is spread / sqrt(frames). Further keys, such as the simulator's `truth`, are not read.
+Pixels refer to the full image, (0, 0) is the centre of its first pixel; metres are in each sensor's frame. `spread`
+(optional) is the standard deviation of one pick, `frames` the number of picks in the mean position: its standard error
+is spread / sqrt(frames). Other keys, such as the simulator's `truth`, are ignored.
 """
 
 from __future__ import annotations

@@ -74,7 +74,7 @@ def _content(path: Path) -> dict[str, object]:
     except (OSError, ValueError) as err:
         raise ConfigError(str(path), "", f"no readable JSON: {err}") from err
     if not isinstance(content, dict):
-        raise ConfigError(str(path), "", "holds no object")
+        raise ConfigError(str(path), "", "is not a JSON object")
     return content
 
 
@@ -86,7 +86,7 @@ def _star(
     if not isinstance(reference, str) or reference not in nodes:
         raise ConfigError(str(path), "reference", f"{reference!r} is none of {', '.join(nodes)}")
     if not isinstance(given, dict):
-        raise ConfigError(str(path), "T", "is no object of 4x4 matrices by sensor")
+        raise ConfigError(str(path), "T", "is not an object of 4x4 matrices by sensor")
     poses = {name: _rigid(path, f"T.{name}", T) for name, T in given.items()}
     own = poses.pop(reference, np.eye(4))
     if np.abs(own - np.eye(4)).max() > _SAME:
@@ -134,7 +134,7 @@ def _rigid(path: Path, key: str, value: object) -> np.ndarray:
     except (TypeError, ValueError) as err:
         raise ConfigError(str(path), key, "is no 4x4 matrix") from err
     if not np.all(np.isfinite(T)):
-        raise ConfigError(str(path), key, "holds a number that is not finite")
+        raise ConfigError(str(path), key, "has a number that is not finite")
     if T.shape != (4, 4) or not np.allclose(T[3], [0, 0, 0, 1]):
         raise ConfigError(str(path), key, "is no 4x4 matrix with the last row 0 0 0 1")
     R = T[:3, :3]

@@ -52,7 +52,7 @@ class Sensor:
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
-            raise ValueError(f"{self.name}: no kind of sensor is called {self.kind!r}")
+            raise ValueError(f"{self.name}: unknown kind of sensor {self.kind!r}")
 
 
 BASE: Final = Sensor("base", "base")

@@ -215,14 +215,14 @@ class Rig(Section):
     @classmethod
     def _one_reference(cls, value: Any) -> Any:
         if value is not None and not isinstance(value, str):
-            raise ValueError(f"poses refer to one sensor: name one, not {value}")
+            raise ValueError(f"the reference is one sensor, not {value}")
         return value
 
     @model_validator(mode="after")
     def _names_are_its_own(self) -> Rig:
         for name, kind in ((name, kind) for kind, of in self._of_kind.items() for name in of):
             if not _NAME.fullmatch(name):
-                raise ValueError(f"{SECTIONS[kind]}.{name}: a sensor's name is of letters, digits and _")
+                raise ValueError(f"{SECTIONS[kind]}.{name}: a sensor's name may have letters, digits and _")
             if name in KINDS and name != kind:
                 raise ValueError(
                     f"{SECTIONS[kind]}.{name}: {name} stands for something else; rename the {kind}"
@@ -230,7 +230,7 @@ class Rig(Section):
         twice = sorted({name for name in self.sensors if self.sensors.count(name) > 1})
         if twice:
             raise ValueError(
-                f"two sensors are called {', '.join(twice)}: records know them by name, so rename one"
+                f"two sensors are called {', '.join(twice)}: records identify sensors by name, so rename one"
             )
         return self
 
@@ -238,12 +238,12 @@ class Rig(Section):
     def _reference_is_a_sensor(self) -> Rig:
         if self.reference is not None and self.reference not in self.sensors:
             raise ValueError(
-                f"reference = {self.reference!r} is no sensor of the rig, which has {_listed(self.sensors)}"
+                f"reference = {self.reference!r} is not a sensor of the rig, which has {_listed(self.sensors)}"
             )
         if self.reference is not None:
             kept = next(of[self.reference] for of in self._of_kind.values() if self.reference in of)
             if "prior" in kept.model_fields_set:
-                raise ValueError(f"{self.reference} is the reference, which has no prior: leave its out")
+                raise ValueError(f"{self.reference} is the reference, which has no prior: remove its prior")
         return self
 
     @model_validator(mode="after")
@@ -273,7 +273,7 @@ class Rig(Section):
     def _heights_are_over_the_road_under_base(self) -> Rig:
         if self.base is None and (self.measured_heights or self.road_z_m):
             key = "road_z_m" if self.road_z_m else f"lidars.{next(iter(self.measured_heights))}.height_m"
-            raise ValueError(f"{key} is of the vehicle's frame: name that, base = ...")
+            raise ValueError(f"{key} needs the vehicle frame: set base = ...")
         return self
 
     @model_validator(mode="after")
@@ -283,7 +283,7 @@ class Rig(Section):
         if twice is not None:
             raise ValueError(f"edge [{_listed(sorted(twice))}] stands twice")
         if self.edges == ():
-            raise ValueError("edges names none: leave it out to have them found")
+            raise ValueError("edges is empty: remove it to find edges from overlap")
         return self
 
     @model_validator(mode="after")
@@ -303,7 +303,7 @@ class Rig(Section):
             roles.setdefault(topic, []).append(role)
         twice = [f"{topic} ({' and '.join(of)})" for topic, of in sorted(roles.items()) if len(of) > 1]
         if twice:
-            raise ValueError(f"one topic stands for two things: {', '.join(twice)}")
+            raise ValueError(f"one topic has two roles: {', '.join(twice)}")
         return self
 
     def _topics(self) -> Iterator[tuple[str, str]]:

@@ -96,7 +96,7 @@ def parse_faults(text: str, days: list[str], rig: RigSpec = RIGS["demo"]) -> tup
     """Parse a list of faults; a day is one of `days` or its number, a sensor one of the rig's.
 
     Raises:
-        ConfigError: wrong number of parts, unknown day, sensor or kind, or an amount that is not a number.
+        ConfigError: wrong number of parts, unknown day, sensor or kind, or an amount that is no number.
     """
     faults = []
     for item in filter(None, re.split(r"[,\s]+", text)):
@@ -118,7 +118,7 @@ def parse_faults(text: str, days: list[str], rig: RigSpec = RIGS["demo"]) -> tup
         try:
             fault = Fault(vehicle, number, sensor, kind, float(size), float(after) if at else 0.0)
         except ValueError as err:
-            raise ConfigError("--faults", item, f"amount {amount!r} is not a number") from err
+            raise ConfigError("--faults", item, f"amount {amount!r} is no number") from err
         whole = kind in set(_DAY_ONLY) - set(_SENT) or kind.startswith(_WARM)
         if at and (whole or not 0 <= fault.after < 1):
             raise ConfigError("--faults", item, f"{kind} cannot begin after {after} of its day")
