@@ -238,7 +238,7 @@ class Rig(Section):
     def _reference_is_a_sensor(self) -> Rig:
         if self.reference is not None and self.reference not in self.sensors:
             raise ValueError(
-                f"reference = {self.reference!r} is not a sensor of the rig, which has {_listed(self.sensors)}"
+                f"reference = {self.reference!r} is no sensor of the rig, which has {_listed(self.sensors)}"
             )
         if self.reference is not None:
             kept = next(of[self.reference] for of in self._of_kind.values() if self.reference in of)

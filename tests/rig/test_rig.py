@@ -123,7 +123,7 @@ def test_who_thinks_in_three_sensors_is_told_where_there_are_more(tmp_path):
         (('reference = "top"', 'reference = "base"'), "reference = 'base' is no sensor"),
         (
             ('reference = "top"', 'reference = ["top", "nose"]'),
-            "van.reference: poses refer to one",
+            "van.reference: the reference is one sensor",
         ),
         (('reference = "top"', 'reference = "corner_fl"'), "corner_fl is the reference"),
         (
@@ -134,14 +134,14 @@ def test_who_thinks_in_three_sensors_is_told_where_there_are_more(tmp_path):
         (('base = "base_link"', 'edges = [["front", "left"]]'), "cannot be calibrated against each other"),
         (('base = "base_link"', 'edges = [["top", "base"]]'), "no base (set base ="),
         (('base = "base_link"', 'edges = [["top", "left"], ["left", "top"]]'), "[left, top] stands twice"),
-        (('base = "base_link"', "edges = []"), "edges names none"),
+        (('base = "base_link"', "edges = []"), "edges is empty"),
         (
             ('base = "base_link"', 'three = ["front", "top", "nose"]'),
             "three = [front, top, nose]: name a camera",
         ),
         (('base = "base_link"', 'three = ["front", "top"]'), "van.three"),
         (('base = "base_link"', 'base = ""'), "van.base"),
-        (('base = "base_link"', "road_z_m = -0.3"), "road_z_m is of the vehicle's frame"),
+        (('base = "base_link"', "road_z_m = -0.3"), "road_z_m needs the vehicle frame"),
         (
             ('points = "/top/points"', 'points = "/top/points"\nheight_m = 1.8'),
             "height_m and height_sigma_m go",
