@@ -167,7 +167,6 @@ def measured_estimate(
     T: Float[np.ndarray, "4 4"],
     information: Float[np.ndarray, "6 6"],
     bias_sigma: Float[np.ndarray, " 6"],
-    bias: Float[np.ndarray, "6 6"],
     T_prior: Float[np.ndarray, "4 4"],
     prior_covariance: Float[np.ndarray, "6 6"],
     frames: int,
@@ -178,15 +177,14 @@ def measured_estimate(
         pair: which.
         T: the peak of frames and prior together.
         information: of the frames alone, left twist; may be singular.
-        bias_sigma: of what frames err by alike on all days, (bearing rotation [rad], translation [m]).
-        bias: covariance of what they err by alike besides, by the day itself, left twist.
+        bias_sigma: of what frames err by alike, (bearing rotation [rad], translation [m]).
         T_prior: the prior.
         prior_covariance: of it.
         frames: that the fit rests on.
     """
     S = _bearing_of_twist(T)
     back = np.linalg.inv(S)
-    P, bias = S @ prior_covariance @ S.T, np.diag(np.square(bias_sigma)) + S @ bias @ S.T
+    P, bias = S @ prior_covariance @ S.T, np.diag(np.square(bias_sigma))
     precision, own = np.linalg.inv(P), back.T @ information @ back
     m0 = S @ log_se3(T_prior @ inverse(T))
     # (own^-1 + bias)^-1 and what it says, without the inverse of what may be flat; at the peak own z = -precision m0.

@@ -6,8 +6,7 @@ Poses that pilot frames answered are candidates, all frames vote among them, and
 
 Points of a frame are not independent, so the sum is no likelihood. What it is worth is read off the day, for each kind
 of evidence (classes, edges on boundaries, paint): a likelihood's curvature is the scatter of its gradient from scene to
-scene (Pauli, Racugno and Ventura 2011). At the peak of all kinds together each kind has a gradient left that all scenes
-share. What scenes do not explain of it is a bias of the kind, and the covariance of the pose that it leaves is stated.
+scene (Pauli, Racugno and Ventura 2011).
 """
 
 from __future__ import annotations
@@ -41,9 +40,6 @@ class JointFit:
 
     T: Float[np.ndarray, "4 4"]
     information: Float[np.ndarray, "6 6"]  # of the frames alone
-    bias: Float[
-        np.ndarray, "6 6"
-    ]  # covariance of what frames err by alike, by how far kinds of evidence disagree
     frames: int
 
 
@@ -98,17 +94,14 @@ def fit_of(
     for _ in range(2):
         T = climbed(frames, T, T_prior, prior_covariance, worth)
         H, gradient = _curvature(frames, T), scores(frames, T)[1]
-        kinds = range(len(worth))
-        own = np.array([_worth(H[e], _scatter(gradient[:, e], block)) for e in kinds])
-        together = np.einsum("e,fei->fi", own, gradient)
+        common = _worth(H.sum(0), _scatter(gradient.sum(1), block)) or _FIRST_WORTH
+        own = np.array([_worth(H[e], _scatter(gradient[:, e], block)) for e in range(len(worth))])
+        # Halfway between what each shows and what all show: of few scenes one kind may seem sure by chance.
+        share = np.sqrt(own / common)
+        together = _scatter(np.einsum("e,fei->fi", share, gradient), block)
         # Kinds of one scene err together too.
-        worth = own * _worth(np.einsum("e,eij->ij", own, H), _scatter(together, block))
-    information = _positive_part(np.einsum("e,eij->ij", worth, H))
-    weighed = worth[:, None] * gradient
-    left = weighed.sum(0)
-    noise = sum(_scatter(weighed[:, e], block) for e in kinds)
-    known = np.linalg.inv(information + np.linalg.inv(prior_covariance))
-    return JointFit(T, information, known @ _positive_part(left.T @ left - noise) @ known, len(frames))
+        worth = share * _worth(np.einsum("e,eij->ij", share, H), together)
+    return JointFit(T, _positive_part(np.einsum("e,eij->ij", worth, H)), len(frames))
 
 
 def rival_score(
