@@ -260,6 +260,20 @@ def test_pages_open_without_a_complaint_and_fit_a_laptop(
 
 
 @pytest.mark.browser
+def test_on_a_phone_the_words_of_the_fleet_have_room(browser: Any, fleet: tuple[Lake, Path, Path]) -> None:
+    phone = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
+    browser.call("Emulation.setDeviceMetricsOverride", **phone)
+    try:
+        assert browser.open(fleet[1]) == []
+        assert browser.evaluate("document.documentElement.scrollWidth") <= 390
+        widths = "[...document.querySelectorAll('td.words')].map(cell => cell.getBoundingClientRect().width)"
+        assert len(found := browser.evaluate(widths)) > 4
+        assert min(found) > 280
+    finally:
+        browser.call("Emulation.clearDeviceMetricsOverride")
+
+
+@pytest.mark.browser
 def test_a_page_can_be_used_by_keyboard_alone(
     browser: Any, fleet: tuple[Lake, Path, Path], tmp_path: Path
 ) -> None:
