@@ -96,9 +96,8 @@ class CameraPrior:
     # one or two pixels (Zhang 2000, table 2); these are the better of those values.
     focal_sigma: float = 0.003
     centre_sigma_px: float = 1.0
-    centre_is_stated: bool = (
-        False  # False = a default: enough to doubt a day, not enough to certify the camera's rotation
-    )
+    # False = a default: enough to doubt a day, not enough to certify the camera's rotation.
+    centre_is_stated: bool = False
 
 
 class SensorPrior(Section):

@@ -51,7 +51,7 @@ class Ledger:
     """Reads the lake's rows of a night's vehicle-days once, and commits the night's new rows.
 
     Args:
-        lake: with the tables.
+        lake: the lake with the tables.
         partitions: the night's vehicle-days.
 
     Raises:
@@ -61,9 +61,7 @@ class Ledger:
     def __init__(self, lake: Lake, partitions: Sequence[Partition]) -> None:
         for schema in TABLES.values():
             if schema.is_record_table:
-                open_table(
-                    lake, schema
-                )  # an unwritable table is reported before the night's work, not after it
+                open_table(lake, schema)  # reports an unwritable table before the night's work
         self._lake = lake
         # Commit order: a calibration's poses are committed before it, and outcomes come last.
         self._waiting = [_Waiting(t) for t in (RADAR_ALIGNMENTS, POSES, CALIBRATIONS, OUTCOMES)]

@@ -136,7 +136,9 @@ def _assumed_sign(radar: RadarTopics, sign: int) -> tuple[str, ...]:
     if radar.velocity_fields is not None or "doppler_positive" in radar.model_fields_set:
         return ()
     absent = f'fleet.toml does not set doppler_positive, so "{radar.doppler_positive}" is assumed'
-    shown = {1: "the log shows that it is", -1: "the log shows the opposite", 0: "this log cannot tell"}[sign]
+    shown = {1: "the log shows that it is", -1: "the log shows the opposite", 0: "this log does not show it"}[
+        sign
+    ]
     return (f"{absent}; {shown}: write it down" if sign else f"{absent}; {shown}: drive, or look it up",)
 
 
@@ -170,7 +172,7 @@ def _turned_round(frames: Sequence[Frame], sign: int) -> str:
     # If the Doppler confirms the radar's heading, the lidar is turned.
     who = {1: "the lidar", -1: "the radar", 0: "the lidar or the radar"}[sign]
     met = f"{turned:.0%} of the detections meet what the sweeps show where it is turned round"
-    return f"{who} looks the other way: {met}, {given:.0%} by the prior; mend its transform"
+    return f"{who} looks the other way: {met}, {given:.0%} by the prior; correct its transform"
 
 
 def _met(frame: Frame) -> list[float]:

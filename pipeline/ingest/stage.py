@@ -242,7 +242,7 @@ def _topic_of(rig: Rig, sensor: str) -> str:
 
 
 def _nothing_on(topics: str) -> str:
-    return f"no usable message on {topics}: mend the topics in fleet.toml (see `boresight check`)"
+    return f"no usable message on {topics}: correct the topics in fleet.toml (see `boresight check`)"
 
 
 def _no_intrinsics(topic: str) -> str:

@@ -170,7 +170,7 @@ def read_file(
     """Requested columns that a data file has; None, with an entry in `lake.damage`, if it is unreadable.
 
     Args:
-        lake: with the table.
+        lake: the lake with the table.
         schema: of the table.
         name: of the file.
         columns: names; "MAP.KEY" is one value of a column of maps, as float64, null where a row has none.
@@ -269,7 +269,7 @@ def merge_rows(lake: Lake, schema: TableSchema, rows: pa.Table, *, insert: bool 
     """Add rows whose work is not recorded; for the others update only `asserted_at`, if it is later.
 
     Args:
-        lake: with the table.
+        lake: the lake with the table.
         schema: of the table.
         rows: with all columns of `stored_schema`, without duplicates of key and work.
         insert: False = only update `asserted_at`.

@@ -145,7 +145,7 @@ def joined(
     """Moments of a vehicle-day in order, with rows by sensor; one row group of each file is in memory.
 
     Args:
-        lake: with the tables.
+        lake: the lake with the tables.
         schema: of the joining table.
         partition: the vehicle-day.
         sensors: sensors to read; None = all.

@@ -64,7 +64,7 @@ def read_records(
     Damaged or missing files are left out and listed in `lake.damage`.
 
     Args:
-        lake: with the table.
+        lake: the lake with the table.
         schema: of the table.
         row_type: its dataclass.
         vehicle: only records of this vehicle, or of these.
@@ -97,7 +97,7 @@ def read_columns(
     For thousands of vehicles, whose records would be gigabytes as rows.
 
     Args:
-        lake: with the table.
+        lake: the lake with the table.
         schema: of the table.
         columns: names; "diagnostics.disproved" is one value of a column of maps, null where a record has
             none. A column unknown to all releases that wrote to the lake is null in every row.
@@ -126,7 +126,7 @@ class RecordIndex(Generic[Row]):
     A year of a thousand vehicles is a few hundred megabytes as columns, and gigabytes as rows.
 
     Args:
-        lake: with the table.
+        lake: the lake with the table.
         schema: of the table.
         row_type: its dataclass.
         first: first day.
@@ -192,7 +192,7 @@ def read_latest(
     That day is found from three columns; the other columns are read for those days only.
 
     Args:
-        lake: with the table.
+        lake: the lake with the table.
         schema: of the table.
         row_type: its dataclass.
         first: earlier days are ignored.
@@ -245,7 +245,7 @@ def read_last(
     """Rows that a stage of the whole fleet asserted last for a method, together, by `commit_last`.
 
     Args:
-        lake: with the table.
+        lake: the lake with the table.
         schema: of the table.
         row_type: its dataclass.
         method: of the records.

@@ -56,7 +56,7 @@ class RemoteLog:
         return False
 
     def stat(self) -> _About:
-        """Its size."""
+        """Size of the object [bytes]."""
         return _About(self._size_and_tag[0])
 
     def open(self, mode: str) -> RangeReader:

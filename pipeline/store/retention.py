@@ -32,7 +32,7 @@ def collect(
     the day of deletion, and a night with the logs makes the rows again. Damaged files are deleted completely.
 
     Args:
-        lake: with the tables.
+        lake: the lake with the tables.
         schema: of a table that joins the files of sensors; its predecessor of older releases is deleted
             completely.
         before: first day to keep, YYYY-MM-DD.

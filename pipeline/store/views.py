@@ -82,7 +82,7 @@ def frames_of(
     """Frames of a vehicle-day in order of time; one row group of each sensor is in memory.
 
     Args:
-        lake: with the tables.
+        lake: the lake with the tables.
         partition: the vehicle-day.
         moments: moments to read; None = all.
         chosen: sensors of the frames; None = the first camera, lidar and radar of the day. Moments with fewer

@@ -18,7 +18,7 @@ MOST_CHUNK_BYTES = 512 << 20
 
 
 class OversizedError(ValueError):
-    """The data would decompress to more than real data of this packed size can hold."""
+    """Raised for data that would decompress to more than is plausible for its packed size."""
 
 
 def most_bytes(packed_bytes: int) -> int:

@@ -108,7 +108,7 @@ def _value(channel: Channel, message: Any, path: str) -> float:
         if not hasattr(value, name):
             has = ", ".join(n for n in getattr(value, "__dataclass_fields__", {}) if not n.startswith("__"))
             problem = (
-                f"{channel.msgtype} has no {name} there, only {has or 'a number'}: mend alignment_fields"
+                f"{channel.msgtype} has no {name} there, only {has or 'a number'}: correct alignment_fields"
             )
             raise LogError("", problem, topic=channel.topic, field=path.lstrip("-"))
         value = getattr(value, name)

@@ -52,7 +52,7 @@ def cloud_columns(message: Any) -> np.ndarray:
     """All points of a sensor_msgs/PointCloud2 as one structured array (a view where rows are not padded).
 
     Raises:
-        ValueError: the layout contradicts itself or the data is shorter than the layout says.
+        ValueError: the layout is inconsistent, or the data is shorter than it requires.
     """
     height, width, step, row_step = (
         int(v) for v in (message.height, message.width, message.point_step, message.row_step)

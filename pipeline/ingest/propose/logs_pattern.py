@@ -26,7 +26,7 @@ def logs_pattern(logs: Sequence[Path]) -> str:
 
 
 def nightly_command(fleet: Path, logs: Sequence[Path]) -> list[str]:
-    """The night's command for these logs, behind what must be done first where their names tell no vehicle or day."""
+    """Nightly command for these logs; before it, a step to move logs without vehicle or day in their path."""
     pattern = logs_pattern(logs)
     first = (
         [] if pattern else [f"move each log to logs/VEHICLE/DAY/, as logs/car-1/2026-05-31/{logs[0].name}"]

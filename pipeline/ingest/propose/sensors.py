@@ -120,7 +120,7 @@ def _find_alignments(survey: Survey, found: FoundSensors) -> None:
         own = [t.name for t in topics if len(radars) == 1 or t.frame_id == radar.frame_id]
         radars[k] = replace(radar, alignment=tuple(own))
     named = {name for radar in radars for name in radar.alignment}
-    found.passed_over += [f"{t.name} (of which radar?)" for t in topics if t.name not in named]
+    found.passed_over += [f"{t.name} (which radar?)" for t in topics if t.name not in named]
 
 
 def _columns(message: Any) -> np.ndarray:
