@@ -163,7 +163,7 @@ def _through_stages(task: Task, progress: Progress) -> DayOutcome:
 
 
 def _jobs(night: Night, days: Sequence[VehicleDay], ledger: Ledger) -> Sequence[_Job]:
-    """Items for the workers."""
+    """One job per vehicle-day for the workers, built on access."""
 
     def job(index: int) -> _Job:
         day, fleet = days[index], night.fleet

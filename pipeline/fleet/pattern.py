@@ -101,7 +101,7 @@ def _matcher(pattern: str) -> re.Pattern[str]:
 
 
 def _day(match: re.Match[str]) -> str:
-    """As YYYY-MM-DD; loggers also write YYYYMMDD."""
+    """Day of a match as YYYY-MM-DD; loggers also write YYYYMMDD."""
     day = match["day"]
     return day if "-" in day else f"{day[:4]}-{day[4:6]}-{day[6:]}"
 

@@ -129,7 +129,7 @@ def plan_sweeps(
 def rare_topics(timeline: Timeline, roles: Mapping[str, Role]) -> tuple[dict[str, Role], Stretches]:
     """Topics that a driver may log only once, at the start, with their roles.
 
-    And the spans of their first messages.
+    Also returns the spans of their first messages.
     """
     rare = {
         topic: role

@@ -143,7 +143,7 @@ def _complain_of_date(index: DayIndex, day: str) -> None:
 def pick_moments(index: DayIndex, rig: Rig, config: IngestConfig) -> tuple[list[Anchored], Counter[str]]:
     """Captures by moment, in order of time, thinned evenly to `max_frames`.
 
-    And counts of unused sweeps by reason.
+    Also returns counts of unused sweeps by reason.
     """
     found, drives = find_moments(index, rig, config), _drives(index)
     picked = _spread(len(found.anchor), config.max_frames)

@@ -245,7 +245,7 @@ def _together(
 ) -> tuple[Bool[np.ndarray, "S N"], dict[int, tuple[int, int]]]:
     """Captures within the gate by moment; the farthest from the anchor is removed until all pairs fit.
 
-    Also the pair that did not fit, by moment.
+    Also returns the pair that did not fit, by moment.
     """
     kept, apart = has.copy(), {}
     low, high = np.where(kept, gap, 0).min(0, initial=0), np.where(kept, gap, 0).max(0, initial=0)

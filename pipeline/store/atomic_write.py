@@ -59,7 +59,7 @@ def naming(path: object) -> Iterator[None]:
 def remove_abandoned(folder: Path) -> None:
     """Remove temporary files of killed writers.
 
-    Of dead processes of this machine at once, others after a day.
+    Files of dead processes of this machine go at once, others after a day.
     """
     for temporary in folder.glob(".writing-*.tmp"):
         with suppress(OSError):  # another writer may have removed it

@@ -154,7 +154,7 @@ def prior_of(record: CalibrationRecord) -> Float[np.ndarray, "4 4"] | None:
 def targets_of(record: CalibrationRecord) -> Float[np.ndarray, "N 3"]:
     """Targets for which a record's sigmas are stated, in the child's frame [m].
 
-    Else those of older releases.
+    A record without targets has those of older releases.
     """
     return DEFAULT_TARGETS if record.targets_m is None else np.asarray(record.targets_m)
 

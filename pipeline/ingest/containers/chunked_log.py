@@ -1,6 +1,6 @@
 """Common code for MCAP files and ROS 1 bags.
 
-Messages in chunks, listed in an index at the end of the file.
+Both hold messages in chunks, listed in an index at the end of the file.
 """
 
 from __future__ import annotations

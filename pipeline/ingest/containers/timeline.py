@@ -208,7 +208,7 @@ def _counted(
 ) -> dict[str, Counted]:
     """Messages of each topic by chunk.
 
-    Counts of the index if it has them, else by the chunk's share of bytes.
+    Uses counts of the index if it has them, else the chunk's share of bytes.
     """
     bytes_of = Counter[int]()
     for chunk in chunks:

@@ -74,7 +74,7 @@ def _camera_calibration(message: Any) -> Any:
 
 
 def _upper(message: Any, name: str) -> Any:
-    """ROS 2 writes field names in lower case."""
+    """Value of a field that protobuf names in upper case and ROS 2 in lower case."""
     return getattr(message, name) if hasattr(message, name) else getattr(message, name.lower())
 
 

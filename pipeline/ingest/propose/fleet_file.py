@@ -1,6 +1,6 @@
 """Text of a fleet.toml for the sensors that were found.
 
-Reliable values as lines, uncertain ones as comments.
+Reliable values are lines, uncertain ones are comments.
 """
 
 from __future__ import annotations

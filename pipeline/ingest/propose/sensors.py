@@ -239,7 +239,7 @@ def _label_values(topic: Topic) -> np.ndarray | None:
 def _has_areas(pixels: np.ndarray) -> bool:
     """Whether most pixels equal their right neighbour, as in a label image.
 
-    In a grey picture one in ten does.
+    In a grey picture only one in ten does.
     """
     return bool(np.mean(pixels[:, 1:] == pixels[:, :-1]) > 0.8)
 
