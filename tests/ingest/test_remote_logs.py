@@ -122,7 +122,7 @@ def test_a_log_that_is_not_there_is_a_usage_error(s3, run_ingest):
 
 @pytest.mark.parametrize("place", ["gs://bucket/a.mcap", "s3://bucket", "s3:///a.mcap"])
 def test_a_place_that_is_no_object_is_a_usage_error(place):
-    with pytest.raises(ConfigError, match="no s3://BUCKET/KEY"):
+    with pytest.raises(ConfigError, match="nor s3://BUCKET/KEY"):
         log_at(place)
 
 
