@@ -159,9 +159,14 @@ def _export_onnx(out: Path, run: Path | None, notes: Path | None) -> list[Path]:
     from jobs.extras import require
 
     require("train")
-    from pipeline.learn.export.model_card import card_of_run
+    from jobs.terminal.logging import logger
+    from pipeline.learn.export.model_card import UNFIT, card_of_run
     from pipeline.learn.export.onnx_file import export_onnx
     from pipeline.learn.train.run_state import network_of_run
 
-    export_onnx(network_of_run(run), out, card_of_run(run, notes))
+    card = card_of_run(run, notes)
+    export_onnx(network_of_run(run), out, card)
+    for limit in card["limits"]:
+        if str(limit).startswith(UNFIT):
+            logger().warning(limit, run=str(run))
     return [out, out.with_suffix(".json"), out.with_suffix(".md")]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from pipeline.learn.train.metrics import read_metrics
 
 __all__ = ["LIMITS", "card_of_run", "write_card"]
 
+UNFIT = "Not fit for use"
 LIMITS = (
     "Trained without ground truth: answers inherit the losses' biases, which no average over the fleet takes out.",
     "Looks 38 deg to each side of the camera's axis; guesses within about 5 deg, best with 2 or 3 passes.",
@@ -50,9 +52,16 @@ def card_of_run(folder: Path, notes: Path | None = None) -> dict[str, Any]:
         "seeds": [config["seed"]],
         "time": {"steps": last["step"], "minutes": round(last.get("trained_s", 0.0) / 60, 1)},
         "results": validation,
-        "limits": list(LIMITS),
+        "limits": [*_unfit(last["step"], config["validate_every"], validation), *LIMITS],
         "training": config,
     } | _notes(notes)
+
+
+def _unfit(steps: int, validate_every: int, validation: Mapping[str, float]) -> list[str]:
+    """Why nobody should use a network whose training ended before it was due to be validated for the first time."""
+    if validation and steps >= validate_every:
+        return []
+    return [f"{UNFIT}: trained for {steps} steps, and validated from step {validate_every} on."]
 
 
 def write_card(model: Path, card: dict[str, Any]) -> None:

@@ -1,6 +1,7 @@
 """`boresight export onnx`: a run's best weights become a file that runs, with a card that says where they come from."""
 
 import json
+import shutil
 from dataclasses import asdict
 
 import pytest
@@ -11,7 +12,7 @@ from pipeline.learn.infer.single_frame import SingleFrameCalibrator
 from pipeline.learn.network.calibration_network import build_network
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import NetworkConfig
-from pipeline.learn.train.checkpoints import BEST, LAST, save_checkpoint
+from pipeline.learn.train.checkpoints import BEST, LAST, load_checkpoint, save_checkpoint
 from pipeline.learn.train.settings import TrainConfig
 
 
@@ -55,6 +56,19 @@ def test_a_run_becomes_a_file_with_its_card(run, tmp_path, capsys):
     assert card["time"] == {"steps": 60, "minutes": 2.0}
     assert card["held_out_days"] == {"azimuth_deg": 0.1}
     assert card["limits"]
+
+
+@pytest.mark.parametrize(("steps", "is_told"), [(6, True), (500, False)])
+def test_a_network_that_was_hardly_trained_is_called_unfit_on_the_screen_and_on_its_card(
+    run, tmp_path, capsys, steps, is_told
+):
+    hardly = tmp_path / "hardly"
+    shutil.copytree(run, hardly)
+    save_checkpoint(hardly / LAST, load_checkpoint(run / LAST) | {"step": steps})
+    assert main(["export", "onnx", "--run", str(hardly), "--out", str(tmp_path / "m.onnx")]) == 0
+    assert ("Not fit for use" in capsys.readouterr().err) == is_told
+    card = json.loads((tmp_path / "m.json").read_text())
+    assert card["limits"][0].startswith(f"Not fit for use: trained for {steps} steps") == is_told
 
 
 @pytest.mark.parametrize(
