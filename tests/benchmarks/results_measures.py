@@ -79,22 +79,23 @@ def inside(lines: Lines, _row: Row) -> str:
 def found(lines: Lines, row: Row) -> str:
     """Days that end in the right basin by the size of the start's error; the bound is of the worst size.
 
-    Of camera-lidar and lidar-radar; with `everything = true` of all pairs, azimuth and elevation, to the limits of the
-    study `priors`.
+    Of camera-lidar and lidar-radar, or of `pairs`; with `everything = true` of all pairs, azimuth and elevation, to the
+    limits of the study `priors`.
     """
     sizes: dict[float, list[bool]] = {}
     for r in lines:
-        sizes.setdefault(r["prior"][1], []).append(_is_home(r["pairs"], bool(row.get("everything"))))
+        sizes.setdefault(r["prior"][1], []).append(_is_home(r["pairs"], row))
     hits = [sum(home) for _, home in sorted(sizes.items())]
     [trials] = {len(home) for home in sizes.values()}
     return f"{', '.join(map(str, hits))} of {trials} (> {100 * interval(min(hits), trials)[0]:.0f} %)"
 
 
-def _is_home(pairs: Mapping[str, Any], everything: bool) -> bool:
-    if everything:
+def _is_home(pairs: Mapping[str, Any], row: Row) -> bool:
+    if row.get("everything"):
         angles = ("az_deg", "el_deg")
         return all(pairs.get(pair, {}).get(a, np.inf) < LIMIT_DEG[pair] for pair in PAIRS for a in angles)
-    return all(in_basin(pair, pairs.get(pair, {})) for pair in ("camera_lidar", "lidar_radar"))
+    asked = row.get("pairs", ("camera_lidar", "lidar_radar"))
+    return all(in_basin(pair, pairs.get(pair, {})) for pair in asked)
 
 
 def clocks(lines: Lines, row: Row) -> str:
