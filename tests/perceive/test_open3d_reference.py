@@ -1,0 +1,56 @@
+"""Clusters and planes of a sweep against open3d's, where the extra [view] is installed."""
+
+import numpy as np
+import pytest
+
+from pipeline.perceive.dbscan import dbscan
+from pipeline.perceive.ground import find_ground
+
+open3d = pytest.importorskip(
+    "open3d", reason="needs the extra [view]: open3d is the reference", exc_type=ImportError
+)
+
+
+def cloud(points):
+    return open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
+
+
+def scattered(rng):
+    """Dense blobs of several sizes in thin noise."""
+    blobs = [
+        c + rng.normal(0, s, (n, 3))
+        for c, s, n in zip(
+            rng.uniform(-30, 30, (25, 3)), rng.uniform(0.1, 0.6, 25), rng.integers(5, 80, 25), strict=True
+        )
+    ]
+    return np.concatenate([*blobs, rng.uniform(-30, 30, (300, 3))])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_clusters_are_those_of_open3d(seed):
+    """The same noise, and cores together and apart alike; a border point between clusters is anybody's."""
+    points, eps, least = scattered(np.random.default_rng(seed)), 0.7, 6
+    ours, theirs = dbscan(points, eps, least), np.asarray(cloud(points).cluster_dbscan(eps, least))
+    np.testing.assert_array_equal(ours == -1, theirs == -1)
+    near = np.linalg.norm(points[:, None] - points, axis=-1) <= eps
+    core = near.sum(axis=1) >= least
+    pairs = set(zip(ours[core].tolist(), theirs[core].tolist(), strict=True))
+    assert len(pairs) == len(set(ours[core])) == len(set(theirs[core])) > 5
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_road_is_the_plane_of_open3d(seed):
+    """A tilted road with walls beside it: both find it within .1 deg and 3 cm at the car."""
+    rng = np.random.default_rng(seed)
+    road = np.column_stack([rng.uniform(3, 40, 4000), rng.uniform(-8, 8, 4000), np.zeros(4000)])
+    road[:, 2] = -1.8 + 0.02 * road[:, 0] - 0.01 * road[:, 1] + rng.normal(0, 0.01, 4000)
+    walls = np.column_stack(
+        [rng.uniform(3, 40, 1500), rng.choice([-9.0, 9.0], 1500), rng.uniform(-1, 4, 1500)]
+    )
+    points = np.concatenate([road, walls]).astype(np.float32)
+    found = find_ground(points, 0.15, np.random.default_rng(1))
+    theirs, _ = cloud(points.astype(float)).segment_plane(0.05, 3, 1000)
+    theirs = np.asarray(theirs) * np.sign(theirs[2])
+    assert found.plane is not None
+    assert np.degrees(np.arccos(min(1.0, found.plane[:3] @ theirs[:3]))) < 0.1
+    assert abs(found.plane[3] - theirs[3]) < 0.03
