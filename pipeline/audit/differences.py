@@ -30,7 +30,7 @@ _NEWEST, _OLDER = 6, 4
 # Days apart that tell how alike they are, beside neighbours: a working week has them.
 APART = 3
 # Share of a normal distribution beyond three sigmas, and the differences that it is worth.
-_NORMAL, _FAR_WORTH = 0.0027, 200.0
+_NORMAL, _FAR_WORTH = 0.0027, 400.0
 _JUMP = 4.0  # sigmas of a difference that is no scatter
 _TAKEN_BACK = 0.25  # share of a day's error that the next day lacks, at least: days err alike by 0.6
 
