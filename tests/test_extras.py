@@ -146,7 +146,7 @@ def ends_without_extras(tmp_path_factory):
     """How each call ends where no extra is installed: exit code and what stderr says."""
     code = (
         "import io, json, sys; from contextlib import redirect_stderr, redirect_stdout;"
-        "sys.modules |= dict.fromkeys(['embreex', 'torch', 'ray', 'tensorboard']);"
+        "sys.modules |= dict.fromkeys(['embreex', 'open3d', 'torch', 'ray', 'tensorboard']);"
         "from jobs.cli import main\n"
         "for name, call in json.loads(sys.argv[1]).items():\n"
         "    with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()) as said:\n"
