@@ -39,7 +39,7 @@ DAYS = {
 
 def table() -> dict[str, list[str]]:
     """The README's words by what they are of, without what stands in brackets."""
-    rows = re.findall(r"^\| ((?:a|an|what) [^|]+) \| ([^|]+) \|", README.read_text(), re.MULTILINE)
+    rows = re.findall(r"^\| ((?:a|an|the) [^|]+) \| ([^|]+) \|", README.read_text(), re.MULTILINE)
     return {what: re.sub(r" \([^)]*\)", "", words).split(", ") for what, words in rows}
 
 
@@ -50,7 +50,7 @@ def test_the_table_lists_the_words_that_the_code_has():
     assert set(listed["an exported calibration"]) == set(DAYS)
     assert listed["a stage of a vehicle-day"] == list(OUTCOME_STATUSES)
     assert set(listed["a vehicle"]) == set(DRIFT_STATUSES)
-    assert all(word in STATES.column("status").doc for word in listed["what a pair should load"])
+    assert all(word in STATES.column("status").doc for word in listed["the state of a pair"])
     assert len(listed) == 6
     assert {*DAY_WORDS, "cached"} - {"missing"} == set(_MARKS)
     assert set(RECORD_WORDS) | set(DRIFT_STATUSES) <= set(STATUS_STYLES)

@@ -63,7 +63,7 @@ def test_a_day_of_a_lake_is_taken_by_its_poses(fleet, tmp_path):
 
 
 def test_what_is_no_calibration_is_refused_in_words(fleet, tmp_path):
-    with pytest.raises(ConfigError, match="is no FORMAT:FILE"):
+    with pytest.raises(ConfigError, match="is neither FORMAT:FILE nor"):
         in_use(fleet, tmp_path, "car.urdf")
     files = exported(tmp_path, "urdf", OTHERS[:1])
     (tmp_path / "urdf" / "sensors.urdf").write_text('<robot name="r"><link name="a"/></robot>')
