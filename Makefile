@@ -3,6 +3,8 @@ PYTHON ?= python3.11
 BIN := .venv/bin
 STAMP := .venv/.ready
 WORKERS ?= 2
+EVERYTHING ?=
+comma := ,
 # As the night's workers run: waiting threads of BLAS would count as CPU time.
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 
@@ -24,9 +26,9 @@ view: setup ## open3d beside it (a gigabyte): the 3D view of a vehicle-day, and 
 demo: setup ## synthetic fleet to HTML report, in minutes
 	$(BIN)/boresight demo --out demo || [ $$? -eq 3 ] # 3: done, and something was held, as it should be
 
-test: setup browser ## every test, with shapes and types of the annotations checked
+test: setup browser ## tests of less than ten seconds; EVERYTHING=1 adds the rest and checks shapes and types
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --durations 25 --ignore tests/benchmarks \
-		--jaxtyping-packages=schemas,pipeline,beartype.beartype
+		$(if $(EVERYTHING),--jaxtyping-packages=schemas$(comma)pipeline$(comma)beartype.beartype,-m "not slow")
 
 # Page tests want Chromium. It is installed where that is allowed without asking, and nowhere else; tests without it are
 # named in the last lines of `make test`.

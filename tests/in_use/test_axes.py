@@ -209,6 +209,7 @@ def test_a_sensor_whose_edges_contradict_each_other_or_that_is_not_in_the_calibr
     assert {c.reason for c in checks} == {"the calibration in use has no pose of it"}
 
 
+@pytest.mark.slow
 def test_right_calibrations_of_a_large_rig_are_called_wrong_as_rarely_as_those_of_one_axis():
     """26 axes at three sigmas each were wrong on 4 % of right rigs; the limits of size play no part at this sigma."""
     rng = np.random.default_rng(11)

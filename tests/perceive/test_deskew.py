@@ -56,6 +56,7 @@ def farthest(found, frame):
     return apart.min(1).max()
 
 
+@pytest.mark.slow
 def test_a_sweep_without_odometry_is_moved_by_the_radar_s_velocity(made_frame):
     right, frame = skewed(made_frame)
     found = perceived(frame)

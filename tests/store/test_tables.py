@@ -228,6 +228,7 @@ def assert_whole(lake):
     assert lake.damage == []
 
 
+@pytest.mark.slow
 def test_a_writer_killed_at_any_moment_never_leaves_a_bad_read(lake, rng):
     server = subprocess.Popen(
         [sys.executable, "-m", "tests.store.writer_to_kill", str(lake.root)],

@@ -80,6 +80,7 @@ CLOSED = [*HUB, *((f"cam{k}", f"rad{k}") for k in range(3))]
 EIGHT = ("cam0", "cam1", "cam2", "cam3", "rad0", "rad1", "rad2")
 
 
+@pytest.mark.slow
 def test_chi_squared_of_all_unknowns_is_what_it_should_be_over_150_rigs():
     rng, squares = np.random.default_rng(0), []
     for _ in range(150):

@@ -54,6 +54,7 @@ def day():
     return street_day(40)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rotation_deg", "shift_m"), [(2, 0.1), (5, 0.3), (10, 0.3)])
 def test_wrong_priors_lead_to_the_truth(day, rotation_deg, shift_m):
     for seed in range(2):

@@ -46,6 +46,7 @@ def test_a_fleet_that_names_no_network_gets_the_one_that_fits_what_it_is_shown(d
     assert model_files("joint-ssl", day.fleet.changed(learn={"camera": "image"})) == {"joint": MODEL}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("camera", ["both", "image"])
 def test_one_frame_puts_sensors_right_that_were_knocked_by_five_degrees(day, camera):
     """Median over frames, of a rig that neither network learned from."""

@@ -79,6 +79,7 @@ def stop_at(step):
     return report
 
 
+@pytest.mark.slow
 def test_a_run_that_was_stopped_goes_on_to_the_same_bits(data, tmp_path):
     whole = train(TrainRequest(data, tmp_path / "whole", "cpu"), config())
     assert (whole.status, whole.step) == ("done", 20)
