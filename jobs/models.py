@@ -79,8 +79,10 @@ def fetch(*names: str, into: Path = Path("models"), mirror: str | None = None) -
         with progress_reporter(f"fetch {model.name}") as progress:
             came = download(url, into / f"{model.name}.onnx", model.size_bytes, model.sha256, progress)
         (fetched if came else there).append(model.name)
-        with atomic_write(into / f"{model.name}.toml") as file:
-            file.write(manifest_text(model).encode())
+        manifest = into / f"{model.name}.toml"
+        if came or not manifest.exists():  # what a user changed in it stays
+            with atomic_write(manifest) as file:
+                file.write(manifest_text(model).encode())
     print_summary(
         "models fetch",
         "done",

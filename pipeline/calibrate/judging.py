@@ -79,7 +79,9 @@ class Judging:
         targets = seen_targets(pair, self.prior, self._views)
         unseen = [] if targets is not None else [unseen_failure(pair)]
         if active and not held_out:
-            unseen.append(FailedCheck("the day has too few frames to fit and to judge: none judges"))
+            unseen.append(
+                FailedCheck("the day has too few frames to hold any out: nothing checks the result")
+            )
         targets = DEFAULT_TARGETS if targets is None else targets
         test, claims = self._held_out(estimate, held_out, limits, mounting, targets)
         verdict = judge(

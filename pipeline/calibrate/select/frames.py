@@ -101,7 +101,7 @@ def select_frames(
         candidates = _few_of_each([i for i in usable if held_out[i] is False], scene)
         silent = _silent(pair, observations, absent or {})
         least = SHORTEST if pair == "camera_lidar" and not paper and silent is None else MIN_FRAMES
-        if len(candidates) < least == SHORTEST:  # too few to fit and to judge: all fit, and none judges
+        if len(candidates) < least == SHORTEST:  # too few to hold any out: all fit, and the record is held
             judges, candidates = [], _few_of_each(usable, scene)
         ideal = [i for i in candidates if not reasons[i]]
         contents = contents_of(observations, pair)

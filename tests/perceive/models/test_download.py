@@ -176,6 +176,10 @@ def test_the_command_shows_the_licence_places_manifests_and_says_the_line(
     entered = tomllib.loads(said["enter_in_fleet_toml"])["rigs"]["NAME"]["camera"]["semantics"]
     assert all(Path(entered[key]).exists() for key in ("segmenter", "detector"))
     assert main(["models", "fetch", "no-such"]) == 2
+    changed = tmp_path / "models" / f"{CATALOGUE[0].name}.toml"
+    changed.write_text(changed.read_text().replace("[512, 1024]", "[256, 512]"))
+    assert main(["models", "fetch", "--into", str(tmp_path / "models"), "--mirror", mirror]) == 0
+    assert "[256, 512]" in changed.read_text()
 
 
 def test_manifests_of_the_catalogue_are_read():

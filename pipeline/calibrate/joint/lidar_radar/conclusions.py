@@ -29,10 +29,9 @@ class ObservabilityAnalysis:
     covariance: np.ndarray  # P P, of all unknowns, turns about the radar
     common: np.ndarray  # P P, of the covariance what all days of a vehicle err by alike
     bias: np.ndarray  # 7 7, of the common part what was added to all else
-    floors: (
-        np.ndarray
-    )  # P P, what all frames of this day err by alike, in the weights of elevation's witnesses
-    floors_alike: np.ndarray  # P P, of that what is common to all days
+    # P P: what all frames of the day err by alike, in the weights of elevation's sources; of that, what all days share.
+    floors: np.ndarray
+    floors_alike: np.ndarray
     fixed: np.ndarray  # P, bool
     observability: np.ndarray  # 7, of pose and dt
     witnesses: tuple[Witness, ...]  # of pitch, asked where the car's way had no say yet

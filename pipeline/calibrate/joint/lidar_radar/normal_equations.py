@@ -166,10 +166,9 @@ class Linear:
     witnesses: tuple[Witness, ...]  # of pitch
     travel_frames: int
     travel_scatter_rad: float  # of the frames' ways beyond their own sigmas
-    floors: (
-        np.ndarray
-    )  # P P, scatter of the total gradient by what all frames of witnesses of elevation err by
-    floors_alike: np.ndarray  # P P, of that what they err by on every day
+    # P P: scatter of the total gradient by what all frames of elevation's sources err by; of that, what all days share.
+    floors: np.ndarray
+    floors_alike: np.ndarray
 
 
 @dataclass(eq=False)
