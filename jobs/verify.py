@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Any
 from jobs.frame_options import FrameOptions
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
 
     from pipeline.config import FleetConfig
-    from pipeline.in_use.axes import AxisCheck
+    from pipeline.in_use.one_axis import AxisCheck
     from pipeline.results import Progress
     from pipeline.rig.graph import Sensor
-    from pipeline.rig.prior import RigPrior
     from pipeline.store.partitions import Lake, Partition
 
 __all__ = ["verify"]
@@ -68,6 +67,7 @@ def verify(
     from pipeline.errors import ConfigError
     from pipeline.extrinsics.prior import require_named_files
     from pipeline.in_use.axes import answer_of, answer_of_sensors, answers_by_sensor
+    from pipeline.in_use.one_log import for_one_look
     from pipeline.store.partitions import Lake
 
     if not logs:
@@ -75,7 +75,10 @@ def verify(
     config = load_fleet(fleet)
     name = _vehicle(config, vehicle)
     with TemporaryDirectory(prefix="boresight-verify-") as folder:
-        config, of_sensors = _for_one_look(config, frames), not config.rig_of(name).is_one_of_each
+        config, of_sensors = (
+            for_one_look(config, frames, (camera_lidar_deg, radar_deg)),
+            not config.rig_of(name).is_one_of_each,
+        )
         lacking: tuple[Sensor, ...] = ()
         if calibration is not None and of_sensors:
             config, lacking = _of_poses(
@@ -115,13 +118,6 @@ def _vehicle(config: FleetConfig, vehicle: str | None) -> str:
     return config.named_vehicles[0]
 
 
-def _for_one_look(config: FleetConfig, frames: int) -> FleetConfig:
-    """The configuration with few frames, spread over the log, and with every pair estimated."""
-    return config.changed(
-        ingest={"max_frames": frames}, select={"frames": frames}, trigger={"when": "always"}
-    )
-
-
 def _as_prior(folder: Path, calibration: str, lake: str | None, vehicle: str, named: FrameOptions) -> Path:
     """Write the calibration of `--calibration` as a prior file; raises before the first log is opened."""
     from jobs.calibration_sources import read_sides
@@ -139,11 +135,10 @@ def _as_prior(folder: Path, calibration: str, lake: str | None, vehicle: str, na
 def _of_poses(
     folder: Path, config: FleetConfig, vehicle: str, calibration: str, lake: str | None, named: FrameOptions
 ) -> tuple[FleetConfig, tuple[Sensor, ...]]:
-    """The configuration with the calibration in use of a rig of many sensors, and the sensors that it lacks.
+    """Configuration with the calibration in use of a rig of many sensors, and the sensors without a pose.
 
     Raises:
-        ConfigError: neither a file nor a lake, or fewer than two sensors; raised before the first log is
-            opened.
+        ConfigError: neither a file nor a lake, or fewer than two sensors; raised before a log is opened.
     """
     from jobs.calibration_sources import poses_in_use
     from pipeline.errors import ConfigError
@@ -177,51 +172,32 @@ def _checked(
     `of`: the vehicle, and for a rig of many sensors those without a pose in the calibration in use.
     """
     from pipeline.in_use.axes import check_axes, limits_of
+    from pipeline.in_use.one_log import check_poses, prior_in_use
     from pipeline.store.partitions import Partition
     from pipeline.store.records import read_records
     from schemas.calibrations import CALIBRATIONS, CalibrationRecord
+    from schemas.poses import POSES, PoseRow
 
     vehicle, lacking = of
     partition = Partition(vehicle, _DAY)
     _calibrate(config, lake, partition, logs, progress)
     records = read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle=vehicle)
     if lacking is None:
-        checks = [c for r in records for c in check_axes(r, limits_of(r.pair, config.verify, asked_deg))]
+        checks = [
+            c
+            for r in records
+            for c in check_axes(r, limits_of(r.pair, config.verify, asked_deg), config.verify)
+        ]
     else:
-        checks = _checked_poses(config, lake, partition, lacking, asked_deg)
+        poses, prior = (
+            read_records(lake, POSES, PoseRow, vehicle=vehicle),
+            prior_in_use(config, lake, partition),
+        )
+        checks = check_poses(poses, prior, lacking, config.verify, asked_deg, records)
     if page is not None:
         _write_page(config, lake, partition, checks, page)
     reasons = {r.reason for r in records if r.status == "refused"}
     return checks, "; ".join(sorted(reasons))
-
-
-def _checked_poses(
-    config: FleetConfig,
-    lake: Lake,
-    partition: Partition,
-    lacking: Sequence[Sensor],
-    asked_deg: tuple[float, float],
-) -> list[AxisCheck]:
-    """Check every axis of every sensor except the reference."""
-    from pipeline.in_use.axes import check_pose, kind_of_pose, limits_of, shared_sigmas
-    from pipeline.store.records import read_records
-    from schemas.poses import POSES, PoseRow
-
-    rows = [
-        r for r in read_records(lake, POSES, PoseRow, vehicle=partition.vehicle) if r.sensor != r.reference
-    ]
-    prior = _prior(config, lake, partition)
-    known = {row.sensor: None if prior is None else prior.between(row.reference, row.sensor) for row in rows}
-    rows += [
-        PoseRow(
-            vehicle=partition.vehicle, day=partition.day, method="joint", sensor=n.name, kind=n.kind, reference="",
-            status="refused", reason="", code_version="",
-        )
-        for n in lacking
-    ]  # fmt: skip
-    limits = {row.sensor: limits_of(kind_of_pose(row.kind), config.verify, asked_deg) for row in rows}
-    beyond = shared_sigmas(sum(len(limits[sensor]) for sensor in known))
-    return [c for row in rows for c in check_pose(row, known.get(row.sensor), limits[row.sensor], beyond)]
 
 
 def _calibrate(
@@ -230,59 +206,17 @@ def _calibrate(
     """Calibrate from the log, with the calibration in use as prior."""
     from dataclasses import replace
 
+    from pipeline.in_use.one_log import prior_in_use, with_prior
     from pipeline.stages import CALIBRATE, INGEST, PERCEIVE
     from pipeline.work import Task
 
     task = Task(config, lake, partition, method="joint", logs=logs, progress=progress)
     for stage in (INGEST, PERCEIVE):
         stage.run(task)
-    CALIBRATE.run(replace(task, fleet=_spelled_alike(config, lake, partition)))
-
-
-def _prior(config: FleetConfig, lake: Lake, partition: Partition) -> RigPrior | None:
-    """The calibration in use; None if there is none: calibrate then refuses the log and gives the reason."""
-    from pipeline.errors import SolveError
-    from pipeline.extrinsics.prior import rig_prior
-    from pipeline.store.views import perceived
-    from schemas.moments import PRIOR
-
-    manifest = perceived(lake, partition)
-    if manifest is None:
-        return None
-    try:
-        return rig_prior(manifest.extra.get(PRIOR, ()), config, config.rig_of(partition.vehicle))
-    except SolveError:
-        return None
-
-
-def _spelled_alike(config: FleetConfig, lake: Lake, partition: Partition) -> FleetConfig:
-    """The configuration with the calibration in use rounded to a grid: its last digits change no result.
-
-    A search may end elsewhere if its start differs by less than a measurement can: with starts 3e-8 apart,
-    results were .14 and .09 deg off.
-    """
-    from pipeline.export.texts import to_json
-    from pipeline.in_use.spelling import on_grid
-    from schemas.calibrations import FRAMES_OF_PAIR
-
-    prior, rig = _prior(config, lake, partition), config.rig_of(partition.vehicle)
-    if prior is None or prior.untied:  # a sensor is silent: its prior stays as logged
-        return config
-    if rig.is_one_of_each:
-        kinds = {node.name: node.kind for node in rig.nodes}
-        ends = {(kinds[a], kinds[b]): T for (a, b), T in prior.T.items()}
-        said: dict[str, Any] = {
-            f"T_{pair}": on_grid(ends[of]).tolist() for pair, of in FRAMES_OF_PAIR.items() if of in ends
-        }
-    else:
-        poses = prior.extrinsics()
-        said = {
-            "reference": prior.reference.name,
-            "T": {n: on_grid(poses.T[n]).tolist() for n in poses.order},
-        }
-    file = lake.local_root / "on_grid.json"
-    file.write_bytes(to_json(said))
-    return config.with_prior_file(partition.vehicle, file)
+    prior = prior_in_use(config, lake, partition)
+    known = prior is not None and not prior.untied  # a sensor is silent: its prior stays as logged
+    started = with_prior(config, lake, partition.vehicle, prior) if prior is not None and known else config
+    CALIBRATE.run(replace(task, fleet=started))
 
 
 def _write_page(

@@ -4,7 +4,7 @@ The log is calibrated independently, starting from the calibration in use; `off`
 two, `sigma` the uncertainty of the log's result. An axis fails if the distance is significant (beyond three
 sigmas, which a correct calibration exceeds by chance once in 370 times) and large enough to matter (beyond
 the limit of `[verify]`). The detection power is the probability that an error of the requested size would
-have failed. Without enough power an axis is inconclusive, however small its distance.
+have failed (`one_axis.py`). Without enough power an axis is inconclusive, however small its distance.
 
 For a rig of many sensors, poses are compared, one sensor at a time; each pose combines all edges of its
 sensor. To keep the false-alarm rate over all axes constant, the threshold grows: three sigmas for one axis
@@ -18,32 +18,31 @@ not judged here.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import ndtr, ndtri
 from scipy.stats import norm
 
-from pipeline.config import VerifyConfig
+from pipeline.config import FleetConfig, VerifyConfig
 from pipeline.geometry.changes import change_between, change_covariance
 from pipeline.geometry.se3 import adjoint, inverse, log_se3
 from pipeline.geometry.target_sigmas import target_jacobian, target_sigmas
 from pipeline.geometry.targets import DEFAULT_TARGETS
+from pipeline.in_use.one_axis import AxisCheck, AxisLimits, HeldOut, checked, silent
 from pipeline.rig.edges import edge_of, words_of
 from pipeline.store.current import prior_of, targets_of, transform_of
-from schemas.calibrations import CalibrationRecord
+from schemas.calibrations import PROBE_Z, CalibrationRecord
 from schemas.poses import PoseRow
 
 __all__ = [
     "NEEDED_AXES",
-    "AxisCheck",
-    "AxisLimits",
     "answer_of",
     "answer_of_sensors",
     "answers_by_sensor",
+    "asking",
     "check_axes",
     "check_pose",
+    "held_out_of",
     "kind_of_pose",
     "limits_of",
     "shared_sigmas",
@@ -52,9 +51,6 @@ __all__ = [
 # False alarm once in 370 correct calibrations; rarer if the limit, which must be exceeded too, is larger than
 # that.
 CONTRADICTION_SIGMAS = 3.0
-# The smallest detectable error of a log would have failed with this probability.
-SHOWN_POWER = 0.95
-_SHOWN_SIGMAS = float(ndtri(SHOWN_POWER))
 _ROLL = 2  # component of a camera pose's change: about the optical axis
 
 # Axes that each kind of pair must determine; the elevation of a radar is optional.
@@ -68,46 +64,10 @@ NEEDED_AXES: Mapping[str, tuple[str, ...]] = {
 }
 
 
-@dataclass(frozen=True)
-class AxisLimits:
-    """Limits of one axis: error that makes a calibration wrong, and error that must not go undetected [rad].
-
-    For a pass, an error of `asked_rad` would have failed with probability `confidence`.
-    """
-
-    limit_rad: float
-    asked_rad: float
-    confidence: float
-
-
-@dataclass(frozen=True)
-class AxisCheck:
-    """Result of one axis of one pair; angles [rad] are nan if the log gives no estimate.
-
-    `pair` is the kind of the pair, or the names of its sensors if they differ from their kinds; for a rig of
-    many sensors, the name of the sensor.
-    """
-
-    pair: str
-    kind: str
-    axis: str
-    status: str  # pass, warn, fail or inconclusive
-    reason: str
-    off_rad: float
-    sigma_rad: float
-    limit_rad: float
-    asked_rad: float
-    power: float  # probability that an error of `asked_rad` would have failed
-    shown_rad: float  # smallest error that would have failed with probability SHOWN_POWER
-
-
 def limits_of(pair: str, verify: VerifyConfig, asked_deg: tuple[float, float]) -> dict[str, AxisLimits]:
-    """Limits of the judged axes of a pair: azimuth and elevation, and for camera-lidar the camera's roll.
+    """Limits of a pair's axes: azimuth and elevation, and the camera's roll for camera-lidar.
 
-    Args:
-        pair: kind of the pair.
-        verify: sizes of errors that matter, and the confidence.
-        asked_deg: errors of camera-lidar, and of pairs with the radar, that must not go undetected.
+    `asked_deg` are errors of camera-lidar, and of pairs with the radar, that must not go undetected.
     """
     has_radar = "radar" in pair
     azimuth = verify.radar_limit_deg if has_radar else verify.camera_lidar_limit_deg
@@ -121,20 +81,42 @@ def limits_of(pair: str, verify: VerifyConfig, asked_deg: tuple[float, float]) -
     }
 
 
-def check_axes(record: CalibrationRecord, limits: Mapping[str, AxisLimits]) -> list[AxisCheck]:
+def check_axes(
+    record: CalibrationRecord, limits: Mapping[str, AxisLimits], verify: VerifyConfig | None = None
+) -> list[AxisCheck]:
     """Check every axis in `limits`, from the log's record, whose prior is the calibration in use."""
     in_use, found = prior_of(record), transform_of(record)
     blocked = _why_not(record)
     if in_use is None or found is None or record.covariance is None:
         pair = _pair(record), record.pair
-        return [_silent(pair, axis, of, blocked or record.reason) for axis, of in limits.items()]
+        return [silent(pair, axis, of, blocked or record.reason) for axis, of in limits.items()]
     off = _off(record.pair, in_use, found, np.asarray(record.covariance), targets_of(record))
+    common = _off(record.pair, in_use, found, _common(record), targets_of(record))
     of = _pair(record), record.pair
     return [
-        _checked(of, axis, limits[axis], off[axis], blocked, CONTRADICTION_SIGMAS)
+        checked(of, axis, limits[axis], (*off[axis], common[axis][1]), blocked, CONTRADICTION_SIGMAS, said)
         for axis in limits
         if axis in off
+        for said in [held_out_of([record], verify or VerifyConfig(), axis)]
     ]
+
+
+def asking(config: FleetConfig, asked_deg: tuple[float, float], sizes: Sequence[float]) -> FleetConfig:
+    """The configuration that asks held-out frames about turns, as multiples of the errors asked for."""
+    probe_deg = tuple(tuple(deg * size for size in sizes) for deg in asked_deg)
+    return config.changed(verify={"probe_deg": probe_deg})
+
+
+def held_out_of(records: Sequence[CalibrationRecord], verify: VerifyConfig, axis: str) -> HeldOut:
+    """What held-out frames say of an axis, by the pair whose frames tell it best."""
+    start = f"{PROBE_Z}{axis}_"
+    found = [
+        z
+        for r in records
+        if (z := {float(k.removeprefix(start)): z for k, z in r.diagnostics.items() if k.startswith(start)})
+    ]
+    best = min(found, key=lambda z: sum(z.values()), default={})
+    return HeldOut(best, verify.better_alignment_z, verify.prior_agreement_sigmas)
 
 
 def kind_of_pose(kind: str) -> str:
@@ -148,26 +130,38 @@ def shared_sigmas(axes: int) -> float:
 
 
 def check_pose(
-    row: PoseRow, in_use: Float[np.ndarray, "4 4"] | None, limits: Mapping[str, AxisLimits], beyond: float
+    row: PoseRow,
+    in_use: Float[np.ndarray, "4 4"] | None,
+    limits: Mapping[str, AxisLimits],
+    beyond: float,
+    held_out: Mapping[str, HeldOut] | None = None,
 ) -> list[AxisCheck]:
     """Check every axis in `limits` of one sensor, from its pose in the log.
 
     Args:
-        row: pose of the sensor from the log.
+        row: the pose.
         in_use: T_reference_sensor of the calibration in use; None if it has none.
-        limits: of the axes.
+        limits: by axis.
         beyond: threshold in sigmas, from `shared_sigmas`.
+        held_out: by axis, what held-out frames say of turns; None = nothing.
     """
     of, found = (row.sensor, kind_of_pose(row.kind)), transform_of(row)
     why = f"the log gives no estimate: {row.reason}" if row.faults or found is None else ""
     why = why if in_use is not None else "the calibration in use has no pose of it"
     if in_use is None or found is None or row.covariance is None:
-        return [_silent(of, axis, limit, why) for axis, limit in limits.items()]
+        return [silent(of, axis, limit, why) for axis, limit in limits.items()]
     T = inverse(found)  # the sensor's directions are in its own frame
     A = adjoint(T)
     targets = DEFAULT_TARGETS if row.targets_m is None else np.asarray(row.targets_m)
     off = _off(f"{row.kind}_of", inverse(in_use), T, A @ np.asarray(row.covariance) @ A.T, targets)
-    return [_checked(of, axis, limits[axis], off[axis], why, beyond) for axis in limits if axis in off]
+    common = _off(f"{row.kind}_of", inverse(in_use), T, A @ _common(row) @ A.T, targets)
+    return [
+        checked(
+            of, axis, limits[axis], (*off[axis], common[axis][1]), why, beyond, (held_out or {}).get(axis)
+        )
+        for axis in limits
+        if axis in off
+    ]
 
 
 def answers_by_sensor(checks: Sequence[AxisCheck]) -> dict[str, str]:
@@ -215,56 +209,20 @@ def _off(
     covariance: Float[np.ndarray, "6 6"],
     targets: Float[np.ndarray, "N 3"],
 ) -> dict[str, tuple[float, float]]:
-    """Distance of the calibration in use from the log's estimate, and its sigma, by axis [rad]."""
-    xi = log_se3(in_use @ inverse(found))
-    distance = np.sqrt(np.mean((target_jacobian(pair, found, targets) @ xi) ** 2, axis=1))
+    """Signed distance of the calibration in use from the log's estimate, and its sigma, by axis [rad]."""
+    moved = target_jacobian(pair, found, targets) @ log_se3(in_use @ inverse(found))  # N 2
+    distance = np.sqrt(np.mean(moved**2, axis=1)) * np.sign(np.mean(moved, axis=1))
     sigma = target_sigmas(pair, found, covariance, targets)
     off = {name: (float(distance[i]), float(sigma[i])) for i, name in enumerate(("azimuth", "elevation"))}
     if pair.startswith("camera"):
         roll_sigma = np.sqrt(change_covariance(found, covariance)[_ROLL, _ROLL])
-        off["roll"] = abs(float(change_between(found, in_use)[_ROLL])), float(roll_sigma)
+        off["roll"] = float(change_between(found, in_use)[_ROLL]), float(roll_sigma)
     return off
 
 
-def _checked(
-    of: tuple[str, str], axis: str, limits: AxisLimits, off: tuple[float, float], blocked: str, beyond: float
-) -> AxisCheck:
-    """Check one axis of a pair or sensor, `of` its text and kind; `off` is the distance and its sigma."""
-    off_rad, sigma_rad = off
-    threshold = max(limits.limit_rad, beyond * sigma_rad)
-    power = float(ndtr((limits.asked_rad - threshold) / sigma_rad))
-    shown = threshold + _SHOWN_SIGMAS * sigma_rad
-    measured = off_rad > beyond * sigma_rad
-    status, reason = (
-        ("inconclusive", blocked)
-        if blocked
-        else _status(off_rad, sigma_rad, limits, power, measured=measured)
-    )
-    numbers = (off_rad, sigma_rad, limits.limit_rad, limits.asked_rad)
-    return AxisCheck(*of, axis, status, reason, *numbers, 0.0 if blocked else power, shown)
-
-
-def _status(
-    off_rad: float, sigma_rad: float, limits: AxisLimits, power: float, *, measured: bool
-) -> tuple[str, str]:
-    distance = f"{_deg(off_rad)} off, known to {_deg(sigma_rad)}"
-    if measured and off_rad > limits.limit_rad:
-        return "fail", f"{distance}: beyond {_deg(limits.limit_rad)} and beyond chance"
-    if power < limits.confidence:
-        return "inconclusive", (
-            f"{distance}: an error of {_deg(limits.asked_rad)} would have been seen with probability {power:.1%}"
-        )
-    if measured:
-        return "warn", f"{distance}: beyond chance, within {_deg(limits.limit_rad)}"
-    return "pass", distance
-
-
-def _silent(of: tuple[str, str], axis: str, limits: AxisLimits, reason: str) -> AxisCheck:
-    nan = float("nan")
-    return AxisCheck(
-        *of, axis, "inconclusive", reason, nan, nan, limits.limit_rad, limits.asked_rad,
-        0.0, nan,
-    )  # fmt: skip
+def _common(row: CalibrationRecord | PoseRow) -> Float[np.ndarray, "6 6"]:
+    """The part of a covariance that all logs of a vehicle share."""
+    return np.zeros((6, 6)) if row.common_covariance is None else np.asarray(row.common_covariance)
 
 
 def _pair(record: CalibrationRecord) -> str:
@@ -279,7 +237,3 @@ def _why_not(record: CalibrationRecord) -> str:
     if record.status == "accepted" or (record.status == "held" and record.diagnostics.get("unsure_only")):
         return ""
     return f"the log gives no estimate: {record.reason}"
-
-
-def _deg(angle_rad: float) -> str:
-    return f"{np.degrees(angle_rad):.2f} deg"

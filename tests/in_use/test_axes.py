@@ -8,7 +8,6 @@ import pytest
 from pipeline.config import VerifyConfig
 from pipeline.geometry.se3 import exp_se3, inverse, to_quaternion
 from pipeline.in_use.axes import (
-    AxisLimits,
     answer_of,
     answer_of_sensors,
     answers_by_sensor,
@@ -18,6 +17,7 @@ from pipeline.in_use.axes import (
     limits_of,
     shared_sigmas,
 )
+from pipeline.in_use.one_axis import AxisLimits, HeldOut, power_of
 from schemas.calibrations import FRAMES_OF_PAIR, CalibrationRecord
 from schemas.poses import PoseRow
 from tests.makers.solve_scenes import T_CAMERA_LIDAR
@@ -224,3 +224,28 @@ def test_right_calibrations_of_a_large_rig_are_called_wrong_as_rarely_as_those_o
             wrong[shared] += any(c.status == "fail" for row in rows for c in check_pose(*row, limits, beyond))
     assert wrong[True] <= 4
     assert wrong[False] >= 8
+
+
+def test_power_counts_what_held_out_frames_would_confirm():
+    size, limit, sigma = 0.5 * DEG, 0.2 * DEG, 0.04 * DEG
+    assert power_of(size, limit, sigma, 3.0) > 0.999
+    blind = HeldOut({0.5: -0.1, -0.5: 0.2})
+    assert power_of(size, limit, sigma, 3.0, blind) < 0.01
+    # One sign would be confirmed, the other not: an error of either sign is as likely.
+    assert power_of(size, limit, sigma, 3.0, HeldOut({0.5: -4.0, -0.5: 0.2})) == pytest.approx(0.5, abs=0.01)
+    # What lies within some sigmas of the calibration in use needs no confirmation.
+    wide = 0.14 * DEG
+    assert power_of(size, limit, wide, 3.0, blind) == pytest.approx(0.716 - 0.334, abs=0.005)
+
+
+def test_an_axis_that_held_out_frames_do_not_see_is_inconclusive_and_says_so():
+    probes = {f"probe_z_{axis}_{deg:+g}": -5.0 for axis in ("azimuth", "elevation") for deg in (0.5, -0.5)}
+    probes |= {"probe_z_roll_+0.5": 0.1, "probe_z_roll_-0.5": -0.2}
+    found = axes(record(off_deg=0.02, diagnostics=probes))
+    assert {axis: c.status for axis, c in found.items()} == {
+        "azimuth": "pass", "elevation": "pass", "roll": "inconclusive",
+    }  # fmt: skip
+    assert "held-out frames hardly tell" in found["roll"].reason
+    assert np.isnan(found["roll"].shown_rad)
+    # Turns of 0.5 deg were tried, and an error of that size would have failed.
+    assert found["azimuth"].shown_rad <= np.radians(0.5)
