@@ -25,8 +25,11 @@ def with_road(rows):
     ]
 
 
-def kerbs_and_cars(rng, share, T=T_LIDAR_RADAR, noise_deg=1.0):
-    """A frame of low things; so large a share of the detections lies between the thing and its image in the road."""
+def kerbs_and_cars(rng, share, T=T_LIDAR_RADAR, noise_deg=1.0, image=0.0, stray=0.0):
+    """A frame of low things; so large a share of the detections lies between the thing and its image in the road.
+
+    Others are the image itself, or anywhere.
+    """
     [o] = with_road(street_day(1, int(rng.integers(1000)), dt_s=0.0))
     foot = np.stack([rng.uniform(8, 45, 60), rng.uniform(-12, 12, 60)], 1)
     top = rng.uniform(0.2, 2.2, 60)
@@ -41,6 +44,9 @@ def kerbs_and_cars(rng, share, T=T_LIDAR_RADAR, noise_deg=1.0):
     seen = things[rng.integers(0, len(things), 150)]
     s = np.where(rng.random(150) < share, rng.random(150), 0.0)
     seen[:, 2] *= 1 - 2 * s
+    kind = np.random.default_rng(0).permutation(150) / 150
+    seen[:, 2] = np.where(kind < image, -seen[:, 2], seen[:, 2])
+    seen[:, 2] = np.where(kind > 1 - stray, 14 * kind[::-1] - 6, seen[:, 2])
     for p in (things, ground, seen):
         p[:, 2] += GROUND_M
     noise = np.radians([0.2, noise_deg, 0.0]) * rng.standard_normal((150, 3))
@@ -61,6 +67,43 @@ def test_displaced_detections_turn_nothing_and_their_share_is_found(share):
     assert abs(np.degrees(found.turn_rad)) < 0.15
     assert abs(found.displaced - share) < 0.15
     assert abs(np.degrees(found.turn_rad)) < 4 * np.degrees(found.frames.information.sum() ** -0.5)
+
+
+def test_images_that_a_radar_resolves_are_not_taken_for_displaced_things():
+    # As many are seen below the road on both days.
+    rng = np.random.default_rng(5)
+    images, between = (
+        displaced_heights(
+            [kerbs_and_cars(rng, q, image=p, noise_deg=0.5) for _ in range(15)], T_LIDAR_RADAR, 0.0, rng
+        )
+        for q, p in ((0.0, 0.3), (0.6, 0.0))
+    )
+    assert images.below < 0.5 * between.below
+    assert abs(np.degrees(images.turn_rad)) < 0.15
+
+
+def test_noise_alone_puts_nothing_below_the_road():
+    rng = np.random.default_rng(6)
+    found = displaced_heights(
+        [kerbs_and_cars(rng, 0.0, noise_deg=2.0) for _ in range(15)], T_LIDAR_RADAR, 0.0, rng
+    )
+    assert found.below < 0.02
+
+
+def test_a_day_whose_detections_come_from_anywhere_tells_pitch_less_surely():
+    rng = np.random.default_rng(7)
+    right, strays = (
+        displaced_heights([kerbs_and_cars(rng, 0.3, stray=s) for _ in range(15)], T_LIDAR_RADAR, 0.0, rng)
+        for s in (0.0, 0.6)
+    )
+    assert right.explained > 0.9
+    assert strays.floor_rad > 1.4 * right.floor_rad
+
+
+def test_a_pitch_at_the_end_of_the_search_is_not_taken_for_measured():
+    rng = np.random.default_rng(8)
+    rows = [kerbs_and_cars(rng, 0.0) for _ in range(8)]
+    assert displaced_heights(rows, turned(T_LIDAR_RADAR, np.radians(9.0)), 0.0, rng) is None
 
 
 def test_a_radar_that_points_down_is_turned_up_by_as_much():

@@ -128,6 +128,7 @@ def street():
     return street_day(3)
 
 
+@pytest.mark.slow
 def test_value_and_gradient_are_the_kernels_on_streets(street):
     check_static(street, T_LIDAR_RADAR)
 

@@ -5,10 +5,10 @@ cannot resolve both, anything between: a share in (0, 1] of the way that is anot
 things lie too low in the mean, and whoever matches them with lidar points turns the radar up, by degrees on some days.
 What lies on the road is not displaced, and what is displaced grows with h / r: pitch is what they have in common.
 
-Each detection is drawn from the lidar points near its azimuth and range: direct, displaced by a share that is uniform,
-or from anywhere (more often where the lidar sees bare road). Their shares and the noise of elevations are unknowns
-beside pitch and roll. Tall things are left out: radars see their lower parts, leaves, what is behind. A detection is
-compared at any elevation, so nothing is cut off.
+Each detection is drawn from the lidar points near its azimuth and range: direct, the image in the road, displaced by a
+share that is uniform, or from anywhere (more often where the lidar sees bare road). Their shares and the noise of
+elevations are unknowns beside pitch and roll. Tall things are left out: radars see their lower parts, leaves, what is
+behind. A detection is compared at any elevation, so nothing is cut off.
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ from pipeline.geometry.spherical import to_spherical
 from pipeline.objective.radar.frame_equations import rows_of_frames
 from schemas.observations import Observation
 
-__all__ = ["HEIGHTS_PITCH_FLOOR_RAD", "Heights", "displaced_heights"]
+__all__ = ["Heights", "displaced_heights"]
 
-# Errors of pitch on 12 simulated days of six dirty rigs and three of clean ones (seeds 120 to 131, 40 frames), and on
-# two days that were not simulated here (-.3 both; one is of a given calibration that is doubtful by .25): .20 deg RMS,
-# .02 in the mean, where the frames' scatter gave .07; on 28 further dirty days (seeds 132 to 159) .21 and .03. Other
-# windows and heights up to 3.5 m: .19 to .30 RMS. Not .20, for the other sources of pitch err to one side: with that 24
-# fresh days (5400 to 5423) erred by 1.22 sigma, those of highways by 1.5.
-HEIGHTS_PITCH_FLOOR_RAD = np.radians(0.25)
+# Errors of pitch at the true height on 12 simulated days of six dirty rigs and three of clean ones (seeds 120 to 131,
+# 40 frames), and on two days that were not simulated here (-.3 both; one is of a given calibration that is doubtful by
+# .25): .20 deg RMS. On 28 more dirty days (seeds 132 to 159) .21, .03 in the mean, where the frames' scatter gave .07.
+# Other windows and heights up to 3.5 m: .19 to .30 RMS.
+_PITCH_FLOOR_RAD = np.radians(0.20)
 _RANGE_M = (5.0, 60.0)
 _TALLEST_M = 2.0  # cars, rails, kerbs
 _NEAR = np.array([np.radians(1.0), 0.6])  # azimuth and range about a detection: three sigmas of car radars
 _LEAST_POINTS, _POINTS = 2, 8  # lidar points: needed near a detection, and taken of them
 _MOST = 8000  # detections of a day
 _FEWEST, _FEWEST_FRAMES = 200, 5
-# Pitch, roll [rad], logit of the displaced, log sigma; logit of those from anywhere: where things stand, on bare road.
-_START = np.array([0.0, 0.0, -0.5, np.log(np.radians(1.5)), -3.0, -3.0])
+# Pitch, roll [rad], logit of the displaced, log sigma; logits of those from anywhere: where things stand, on bare road;
+# of images.
+_START = np.array([0.0, 0.0, -0.5, np.log(np.radians(1.5)), -3.0, -3.0, -3.0])
 _BOUNDS = [
     (-0.1, 0.1),
     (-0.2, 0.2),
@@ -50,11 +50,15 @@ _BOUNDS = [
     (np.log(np.radians(0.3)), np.log(np.radians(6.0))),
     (-6.0, 1.0),
     (-6.0, 6.0),
+    (-6.0, 3.0),
 ]
-_STEP = np.array([1e-4, 1e-4, 1e-3, 1e-3, 1e-3, 1e-3])
+_STEP = np.array([1e-4, 1e-4, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3])
 # Over which detections from anywhere are spread: about things a radar's whole view, so that few of the displaced are
 # taken for such; over bare road what radars see there and lidars do not, as the elevations themselves are spread.
 _VIEW_RAD, _LEAST_VIEW_RAD = np.radians(24.0), np.radians(5.0)
+_NORMAL = np.sqrt(2 * np.pi)
+_DISPLACED, _ANYWHERE = 2, 3  # of the four kinds of detections
+_BELOW_M = 0.3  # under the road: clearly below it
 _NARROWEST = 0.3  # sigmas: nearer to its image a thing is one with it
 
 
@@ -74,8 +78,26 @@ class Heights:
     turn_rad: float  # by which they would turn the radar, nose down positive
     T_lidar_radar: Float[np.ndarray, "4 4"]  # before that turn
     displaced: float  # share of the detections
+    explained: float  # share of them that come from where the lidar sees something
+    below: float  # share of them that lie below the road because they are displaced, not by noise, image or clutter
     per_height_radpm: float  # by how much further it turns a radar that is taken for so much higher
     frames: HeightScores
+
+    @property
+    def floor_rad(self) -> float:
+        """Sigma of pitch that no number of frames lowers.
+
+        Where much comes from anywhere (ceilings, crowns of trees), so may what is taken for the rest.
+        """
+        return float(_PITCH_FLOOR_RAD / self.explained)
+
+    def seen_low(self, below: Float[np.ndarray, " D"]) -> float:
+        """One sigma of the share of their height by which things are seen too low.
+
+        No more than the share of detections below the road (of moving frames, given), and than what the mixture takes
+        for displaced there, twice, for as many are displaced and still over it.
+        """
+        return min(float(np.mean(below)), 2 * self.below)
 
     def of_frames(self, frames: Int64[np.ndarray, " S"]) -> Heights:
         """The same of some observations, which are numbered anew in the order given."""
@@ -127,22 +149,34 @@ def displaced_heights(
         *(np.concatenate(column) for column in zip(*(vars(d).values() for d in each), strict=True))
     )
     x = minimize(lambda x: -_log_likelihood(day, x).sum(), _START, method="L-BFGS-B", bounds=_BOUNDS).x
+    if any(abs(x[k]) >= _BOUNDS[k][1] for k in (0, 1)):  # the end of a search, not what was measured
+        return None
     per_height, scores = _scores(day, x)
-    return Heights(float(x[0]), T_lidar_radar, _share(x[2]), per_height, scores)
+    each_kind, turned = _densities(day, x)
+    kind = each_kind / each_kind.sum(0)
+    below = float(np.mean(kind[_DISPLACED] * (turned < -_BELOW_M / day.range_m)))
+    explained = float(1 - kind[_ANYWHERE].mean())
+    return Heights(float(x[0]), T_lidar_radar, _share(x[2]), explained, below, per_height, scores)
 
 
 def _log_likelihood(day: _Detections, x: np.ndarray) -> np.ndarray:
     """Of each detection, at unknowns as _START."""
-    displaced, sigma = _share(x[2]), float(np.exp(x[3]))
+    return np.asarray(np.log(_densities(day, x)[0].sum(0)))
+
+
+def _densities(day: _Detections, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of each detection as direct, image, displaced and from anywhere (4 N), and its elevation as turned (N)."""
+    displaced, image, sigma = _share(x[2]), _share(x[6]), float(np.exp(x[3]))
     anywhere = np.where(day.stands, _share(x[4]), _share(x[5]))
     view_rad = np.where(day.stands, _VIEW_RAD, max(np.sqrt(12.0) * np.std(day.elevation), _LEAST_VIEW_RAD))
     turned = day.elevation - x[0] * np.cos(day.azimuth) + x[1] * np.sin(day.azimuth)
     z, m = turned[:, None] / sigma, day.mirror / sigma
-    direct = np.exp(-0.5 * (z - m) ** 2) / np.sqrt(2 * np.pi)
     half = np.maximum(m, _NARROWEST)
     between = (ndtr(z + half) - ndtr(z - half)) / (2 * half)
-    near = ((1 - displaced) * direct + displaced * between).mean(1) / sigma
-    return np.asarray(np.log((1 - anywhere) * near + anywhere / view_rad))
+    shares = ((1 - image) * (1 - displaced), image, (1 - image) * displaced)
+    kinds = (np.exp(-0.5 * (z - m) ** 2) / _NORMAL, np.exp(-0.5 * (z + m) ** 2) / _NORMAL, between)
+    near = [share * (1 - anywhere) * kind.mean(1) / sigma for share, kind in zip(shares, kinds, strict=True)]
+    return np.stack([*near, anywhere / view_rad]), turned
 
 
 def _share(logit: float) -> float:

@@ -1,8 +1,8 @@
 """Moving radar clusters against lidar object clusters, and against the centres of camera boxes, in azimuth.
 
-A moving cluster of detections is a road user; so is, nearly always, the lidar cluster at its place and the box at its
-azimuth. Only azimuth is compared: ranges differ, because the radar sees 0.2-0.3 m into objects, and elevations suffer
-from bounces off the ground.
+A moving cluster of detections is a road user; so is, nearly always, the lidar cluster at its place and the
+box at its azimuth. Only azimuth is compared: ranges differ, because the radar sees 0.2-0.3 m into objects,
+and elevations suffer from bounces off the ground.
 """
 
 from __future__ import annotations
@@ -139,11 +139,10 @@ def lidar_azimuth_residuals(
     T_lidar_radar: Float[np.ndarray, "4 4"],
     dt_s: float,
 ) -> tuple[Float[np.ndarray, " B"], Float[np.ndarray, "B 6"], Int64[np.ndarray, " B"]]:
-    """Azimuth of the nearest lidar cluster minus the radar cluster's, seen from the radar, and its Jacobian.
+    """Azimuth of the nearest lidar cluster minus the radar cluster's, from the radar, and its Jacobian.
 
-    Returns:
-        Residuals [rad] of the clusters that found a partner within a gate in the plane, d/d(left twist of
-        T_lidar_radar), and the frames that they belong to.
+    Residuals [rad] of clusters with a partner within a gate in the plane, d/d(left twist of T_lidar_radar),
+    frames.
     """
     points = clusters.at_lidar_time(dt_s)
     in_lidar = transform_points(T_lidar_radar, points)
@@ -166,10 +165,9 @@ def camera_azimuth_residuals(
     T_camera_radar: Float[np.ndarray, "4 4"],
     gate_rad: float,
 ) -> tuple[Float[np.ndarray, " B"], Float[np.ndarray, "B 6"], Int64[np.ndarray, " B"]]:
-    """Azimuth of each moving cluster minus that of the nearest box of fitting size, as the camera sees them.
+    """Azimuth of each moving cluster minus that of the nearest box of fitting size, in the camera.
 
-    Returns:
-        Residuals [rad] of the clusters that found a box within `gate_rad`, d/d(left twist of T_camera_radar), frames.
+    Residuals [rad] of clusters with a box within `gate_rad`, d/d(left twist of T_camera_radar), frames.
     """
     in_camera = transform_points(T_camera_radar, clusters.at_image_time())
     azimuth = camera_direction_angles(in_camera)[:, 0]

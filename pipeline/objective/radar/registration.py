@@ -1,15 +1,18 @@
 """Static radar detections against the lidar map: whitened soft assignment in the radar's azimuth, elevation, range.
 
-Each static detection is drawn from one of the lidar points near it (or their mirror images below the ground, or
-nothing): weights are Gaussian in azimuth, elevation and range with the radar's own sigmas. The ground stays in the map.
-A static lidar point p appears at `q = T_radar_lidar p - v tau - w x q tau` to a radar that looks `tau` later, where
-`tau = stamp_radar + dt - stamp_lidar` and v is the radar's own velocity; so dt is an unknown wherever the car moves,
-and so is a constant added to all ranges, which a wide field of view distinguishes from a translation.
+Each static detection is drawn from one of the lidar points near it (or their mirror images below the ground,
+or nothing): weights are Gaussian in azimuth, elevation and range with the radar's own sigmas. The ground
+stays in the map. A static lidar point p appears at `q = T_radar_lidar p - v tau - w x q tau` to a radar that
+looks `tau` later, where `tau = stamp_radar + dt - stamp_lidar` and v is the radar's own velocity; so dt is an
+unknown wherever the car moves, and so is a constant added to all ranges, which a wide field of view
+distinguishes from a translation.
 
-Normal equations are kept apart for (azimuth, range) and for elevation, and the caller weighs the latter: on sparse
-lidars elevation says little although its residuals are small, because points collapse onto the lidar's rings.
+Normal equations are kept apart for (azimuth, range) and for elevation, and the caller weighs the latter: on
+sparse lidars elevation says little although its residuals are small, because points collapse onto the lidar's
+rings.
 
-Source: Granger & Pennec 2002, "Multi-scale EM-ICP"; Louis 1982 for the information that uncertain assignment leaves.
+Source: Granger & Pennec 2002, "Multi-scale EM-ICP"; Louis 1982 for the information that uncertain assignment
+leaves.
 """
 
 from __future__ import annotations
@@ -103,7 +106,7 @@ class RegistrationFrames:
 class NormalEquations:
     """Per frame, for (azimuth and range) and for elevation; unknowns: left twist, dt [s], range bias [m].
 
-    `H` and `g` move the pose (step = -H^-1 g); `information` is what the frame really says (assignment is uncertain).
+    `H` and `g` move the pose (step = -H^-1 g); `information` is that under uncertain assignment.
     """
 
     H: Float[np.ndarray, "2 F 8 8"]
@@ -121,13 +124,10 @@ def registration_frames(
     rng: np.random.Generator,
     radar_points: int = _RADAR_POINTS,
 ) -> RegistrationFrames:
-    """Collect what the registration needs; frames without static detections or without lidar map are left out.
+    """Inputs of the registration, of frames with static detections and a lidar map.
 
-    Args:
-        observations: any frames.
-        T_lidar_radar: a guess, good enough to cut the lidar map to the radar's field of view.
-        rng: picks detections where a frame has more than `radar_points`.
-        radar_points: most detections per frame.
+    `T_lidar_radar` is a guess, accurate enough to cut the lidar map to the radar's field of view. A frame has
+    at most `radar_points` detections, drawn at random.
     """
     radar, lidar, rows = [], [], []
     for index, o in enumerate(observations):
@@ -164,13 +164,10 @@ def normal_equations(
     """Assign softly at this pose and linearise.
 
     Args:
-        frames: from `registration_frames`.
-        T_lidar_radar: pose.
         dt_s: time offset, stamp_lidar = stamp_radar + dt.
         sigma: of azimuth [rad], elevation [rad], range [m]; wider ones make a wider basin.
         bounce_prior: prior probability of a detection by way of the ground.
         outlier: weight of "no lidar point", in units of one lidar point at distance 0.
-        stride: use every n-th detection.
         range_bias_m: measured minus true range (the radar's own offset, and how far it sees into things).
     """
     about = (frames, T_lidar_radar, dt_s, sigma, bounce_prior, outlier, stride, range_bias_m)
@@ -287,9 +284,10 @@ def _elevation_limits(observations: Sequence[Observation]) -> np.ndarray:
 
 
 def _comparable_elevations(limits_rad: np.ndarray, sigma_rad: float) -> np.ndarray:
-    """Tangents of the elevations between which a detection's elevation can be compared with the lidar's.
+    """Tangents of the limits between which a detection's elevation can be compared with the lidar's.
 
-    What lies outside the lidar's field of view would be matched to its edge, always from the same side: a bias.
+    Detections outside the lidar's field of view would be matched to its edge, always from the same side: a
+    bias.
     """
     margin = VIEW_MARGIN_RAD + min(2 * sigma_rad, 0.25 * float(limits_rad[1] - limits_rad[0]))
     return np.tan(np.clip(limits_rad + np.array([margin, -margin]), -1.5, 1.5))

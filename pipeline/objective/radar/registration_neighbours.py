@@ -1,8 +1,8 @@
-"""Which lidar points may be what a radar detection saw: seen by the radar, sorted into cells, with their elevations.
+"""Candidate lidar points of a radar detection: in the radar's view, sorted into cells, with elevations.
 
-A frame has some hundred detections and thousands of lidar points, most of them near none. So what is asked of every
-point is free of branches and library calls, to become vector instructions: its azimuth and range, and its cell of a
-coarse grid. Points in cells that some detection reaches are sorted by cell; only these get an elevation.
+A frame has some hundred detections and thousands of lidar points, most of them near none. Computations on
+every point (azimuth, range, cell of a coarse grid) therefore have no branches or library calls, and become
+vector instructions. Points in cells near a detection are sorted by cell; only these get an elevation.
 """
 # numba infers the types of the arguments; annotations would only repeat RegistrationFrames.
 # ruff: noqa: ANN001, ANN201, ANN202

@@ -1,26 +1,27 @@
 """The way the car drives, in radar axes by Doppler and in lidar axes by the road: a witness of the radar's pitch.
 
-It needs no camera, and no detection to be matched with the lidar point that it came from. A static detection in
-direction u has the range rate `-u . v`, so three components of v follow from a scan, and on average the car drives
-along its road.
+It needs no camera, and no detection to be matched with the lidar point that it came from. A static detection
+in direction u has the range rate `-u . v`, so three components of v follow from a scan, and on average the
+car drives along its road.
 
-The vertical component is where care is due. Elevations are the noisiest thing a radar measures, and least squares on
-them pulls v towards the mean elevation of the detections (errors in variables: by half a degree in simulation, by more
-where noise is as large as the spread). So the equations are weighed by instruments: the mean elevation of what the
-lidar sees at the detection's azimuth and range, whatever its height. That follows the true elevation and knows nothing
-of the radar's noise.
+The vertical component is where care is due. Elevations are the noisiest thing a radar measures, and least
+squares on them pulls v towards the mean elevation of the detections (errors in variables: by half a degree in
+simulation, by more where noise is as large as the spread). So the equations are weighed by instruments: the
+mean elevation of what the lidar sees at the detection's azimuth and range, whatever its height. That follows
+the true elevation and knows nothing of the radar's noise.
 
-What the radar sees too low, between a thing and its image in the road, instruments do not mend, for high things are
-displaced by more: with heights seen too low by a tenth the velocity points lower by .3 to .9 deg. How much that is on a
-day nobody knows; the share of detections below the road says how much it may be, and sigma holds it (`bias_rad`).
+What the radar sees too low, between a thing and its image in the road, instruments do not mend, for high
+things are displaced by more: with heights seen too low by a tenth the velocity points lower by .3 to .9 deg.
+How much that is on a day nobody knows; the share of detections below the road says how much it may be.
 
-The road is a parabola along the way, and its slope is taken under the car: a plane through what lies 7 to 35 m ahead
-was 0.3 to 0.5 deg off the way on hilly streets.
+The road is a parabola along the way, and its slope is taken under the car: a plane through what lies 7 to 35
+m ahead was 0.3 to 0.5 deg off the way on hilly streets.
 
-A constant error of all elevations turns v in radar axes as it turns the detections: this is where detections point.
+A constant error of all elevations turns v in radar axes as it turns the detections: this is where detections
+point.
 
-Source: Kellner et al. 2014, "Instantaneous ego-motion estimation using multiple Doppler radars", for three components
-from one; Durbin 1954, "Errors in variables", for instruments.
+Source: Kellner et al. 2014, "Instantaneous ego-motion estimation using multiple Doppler radars", for three
+components from one; Durbin 1954, "Errors in variables", for instruments.
 """
 
 from __future__ import annotations
@@ -70,6 +71,7 @@ _ROW = np.dtype(
         ("slope", "f8"),
         ("per_displaced", "f8"),
         ("below", "f8"),
+        ("height_rad", "f8"),
         ("frame", "i8"),
     ]
 )
@@ -85,6 +87,7 @@ class TravelDirections:
     # By how much the velocity points higher [rad] per share of their height that detections are seen too low.
     per_displaced: Float[np.ndarray, " D"]
     below: Float[np.ndarray, " D"]  # share of the detections that are seen below the road
+    height_rad: Float[np.ndarray, " D"]  # of the detections over the road, mean angle as the radar sees it
     frame: Int64[np.ndarray, " D"]  # index into the observations given
 
     @property
@@ -92,16 +95,15 @@ class TravelDirections:
         """Number of frames."""
         return len(self.frame)
 
-    @property
-    def bias_rad(self) -> float:
-        """Sigma of pitch that no number of frames lowers: what is seen too low turns the velocity.
+    def bias_rad(self, share: float | None = None) -> float:
+        """Sigma of pitch that no number of frames lowers, with things seen too low by such a share of their height.
 
-        The share seen below the road is one sigma of the share of their height that detections are seen too low.
+        Unless one is given, it is the share of detections below the road.
         """
         if not self.count:
             return float(DOPPLER_PITCH_FLOOR_RAD)
-        displaced = abs(float(np.median(self.per_displaced))) * float(np.mean(self.below))
-        return float(np.hypot(DOPPLER_PITCH_FLOOR_RAD, displaced))
+        share = float(np.mean(self.below)) if share is None else share
+        return float(np.hypot(DOPPLER_PITCH_FLOOR_RAD, np.median(self.per_displaced) * share))
 
     def of_frames(self, frames: Int64[np.ndarray, " S"]) -> TravelDirections:
         """Those of some observations, which are numbered anew in the order given."""
@@ -111,12 +113,9 @@ class TravelDirections:
 def travel_directions(
     observations: Sequence[Observation], T_lidar_radar: Float[np.ndarray, "4 4"], dt_s: float
 ) -> TravelDirections:
-    """Measure what moving frames show; standing ones, flat radars and empty streets are left out.
+    """Directions of travel from moving frames, without flat radars and empty streets.
 
-    Args:
-        observations: any frames.
-        T_lidar_radar: a pose, good to a degree of azimuth: it says only which lidar points lie near a detection.
-        dt_s: time offset, stamp_lidar = stamp_radar + dt.
+    `T_lidar_radar`, good to a degree of azimuth, only selects lidar points near a detection.
     """
     rows = []
     for index, o in enumerate(observations):
@@ -143,7 +142,8 @@ def travel_directions(
             sigma = float(np.sqrt(up @ covariance @ up) / size)
             per_displaced = float(up @ (velocity - righted[0])) / size / _DISPLACED
             below = float(np.mean(height_m < _BELOW_M))
-            rows.append((velocity, sigma, road[1], per_displaced, below, index))
+            height_rad = float(np.mean(height_m / np.linalg.norm(scan.xyz_m, axis=1)))
+            rows.append((velocity, sigma, road[1], per_displaced, below, height_rad, index))
     return TravelDirections(**columns_of(rows, _ROW))
 
 
@@ -164,8 +164,7 @@ def pitch_equations(
 ) -> tuple[Float[np.ndarray, "F 2 2"], Float[np.ndarray, "F 2"], float]:
     """Per frame, information and gradient of the robust (Cauchy) cost for roll and pitch, and the scatter [rad].
 
-    That is what frames differ by beyond their own sigmas, and it is added to these. NaN, and nothing said, where they
-    are too few.
+    The scatter is that of frames beyond their sigmas, and is added to these; NaN for too few frames.
     """
     if travel.count < _LEAST_FRAMES:
         return np.zeros((frames, 2, 2)), np.zeros((frames, 2)), float("nan")

@@ -1,8 +1,8 @@
-"""Radar detections inside the camera's vehicle boxes: the term that gives a radar's roll and pitch.
+"""Radar detections inside the camera's vehicle boxes: the term that determines a radar's roll and pitch.
 
-Detections between the sides of a box, at the range that its height suggests, belong to that vehicle. Their elevation in
-the camera frame is the box's elevation up to a constant per class (returns lie below the box's centre). Roll appears as
-a slope of the difference over azimuth, whatever that constant is; pitch cannot be told from it.
+Detections between the sides of a box, at the range given by its height, belong to that vehicle. Their
+elevation in the camera frame is the box's elevation up to a constant per class (returns lie below the box's
+centre). Roll is a slope of the difference over azimuth, for any constant; pitch cannot be separated from it.
 """
 
 from __future__ import annotations
@@ -107,13 +107,10 @@ def box_pairs(
     T_camera_radar: Float[np.ndarray, "4 4"],
     elevation_gate_rad: float,
 ) -> BoxPairs:
-    """Find the detections of each unoccluded vehicle box.
+    """Find the detections of each unoccluded vehicle box (`vehicle_boxes` of the same frames).
 
-    Args:
-        observations: frames.
-        boxes: from `vehicle_boxes` of the same frames.
-        T_camera_radar: a pose whose azimuth is right to about a box's width.
-        elevation_gate_rad: detections farther from the box's centre belong to something else.
+    The azimuth of `T_camera_radar` is right to about a box's width; detections farther than
+    `elevation_gate_rad` from the box's centre are left out.
     """
     rows = []
     turns = scan_to_image_s(observations) * [o.ego_yaw_rate_radps or 0.0 for o in observations]

@@ -56,7 +56,7 @@ def test_what_is_fixed_stays_at_the_prior(scored):
     assert (end.dt_s, end.focal) == (start.dt_s, start.focal)
 
 
-@pytest.mark.parametrize("slid_s", [0.5, -0.5])
+@pytest.mark.parametrize("slid_s", [0.5, pytest.param(-0.5, marks=pytest.mark.slow)])
 def test_a_camera_whose_clock_is_half_a_second_off_is_seen_from_where_nothing_matches(slid_s):
     day = traced_day(DENSE, 12, seed=5, dt_s=0.02)
     terms = prepare_terms(day, T_TRUE, lidar_velocities(day, np.eye(4)), reach_rad=np.radians(8.0))

@@ -1,4 +1,4 @@
-"""Errors that all frames share: boundaries beside their jumps, and a clock along which a camera's own x slides."""
+"""Errors that all frames share: labels too wide, borders of other things, and a clock a camera slides along."""
 
 from dataclasses import replace
 
@@ -7,44 +7,82 @@ import pytest
 
 from pipeline.calibrate.joint.camera_lidar.observability import along_the_way
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState
-from pipeline.calibrate.joint.camera_lidar.side_bias import side_biases
+from pipeline.calibrate.joint.camera_lidar.side_bias import SidesApart, sides_apart
+from pipeline.calibrate.numerics.bias_floors import EDGE_SIDE_ALONE, SIDES_APART_RANGE_M
+from pipeline.objective.camera_lidar.label_width import OUTWARD, label_width_px, widened
 from pipeline.objective.camera_lidar.score import KernelSettings, prepare_terms
-from schemas.observations import EDGE_BELOW
+from schemas.observations import EDGE_BELOW, EDGE_LEFT
 from tests.makers.traced_scenes import DENSE, T_TRUE, traced_day
 
-ONLY_TURNS = np.arange(8) > 2
 STATE = AlignmentState(T_TRUE)
+NONE = np.zeros(8, bool)
 
 
 @pytest.fixture(scope="module")
 def terms():
-    day = traced_day(DENSE, 6, seed=1)
+    day = traced_day(DENSE, 8, seed=1)
     return prepare_terms(day, T_TRUE, np.zeros((len(day), 3)), reach_rad=0.03)
 
 
-def biases_of(terms):
-    kernel = terms.fitted(STATE.alone, KernelSettings.wide(1.5, 2), np.random.default_rng(0))
-    kernel = replace(kernel, marking_weight=0.0)
-    curvature = terms.gradient(STATE.alone, kernel)[1].sum(0) + np.eye(8)
-    return side_biases(terms, STATE, kernel, curvature, ONLY_TURNS)
+@pytest.fixture(scope="module")
+def kernel(terms):
+    return terms.fitted(STATE.alone, KernelSettings.wide(1.5, 2), np.random.default_rng(0))
 
 
-def test_boundaries_that_all_lie_aside_turn_the_camera_by_as_much(terms):
-    rows = biases_of(terms)
-    assert rows.shape == (6, 8)  # left, right and tops, alike and apart: nothing floats over the ground
-    assert (rows[:, ONLY_TURNS] == 0).all()
+def chosen(terms, keep):
+    return replace(terms, edges=terms.edges.chosen(keep))
+
+
+def test_widened_edges_lie_in_the_image_as_far_outward_as_the_labels_are_wide(terms):
+    def pixels(some):
+        q = some.edges.xyz_m @ T_TRUE[:3, :3].T + T_TRUE[:3, 3]
+        return some.maps.camera.project(q)[0]
+
+    moved_px = pixels(widened(terms, T_TRUE, 2.0)) - pixels(terms)
+    outward_px = (moved_px * OUTWARD[terms.edges.side]).sum(axis=1)
+    seen = np.isfinite(outward_px)
+    assert np.median(outward_px[seen]) == pytest.approx(2.0, abs=0.1)
+
+
+@pytest.mark.parametrize("yaw_px", [0.0, 1.0])
+def test_the_width_is_what_all_objects_are_narrower_by_whatever_the_yaw(terms, kernel, yaw_px):
     px_rad = 1 / float(terms.camera[1])
-    # All boundaries of left and right seen to the right turn it to the left, tops seen lower turn it up.
-    yaw, pitch = rows[[0, 2]].sum(0)[1], rows[4][0]
-    assert -1.0 * px_rad < yaw < -0.1 * px_rad
-    assert 0.1 * px_rad < pitch < 2.0 * px_rad
+    turned = AlignmentState(STATE.changed(np.eye(8)[None, 1] * yaw_px * px_rad).T_camera_lidar[0])
+    as_drawn = label_width_px(terms, turned.alone, kernel)
+    narrower = label_width_px(widened(terms, T_TRUE, -1.5), turned.alone, kernel)
+    assert as_drawn == pytest.approx(0.25, abs=0.5)
+    assert narrower - as_drawn == pytest.approx(1.5, abs=0.5)
 
 
-def test_one_kind_of_edge_alone_is_its_own_bias(terms):
-    tops = replace(terms, edges=terms.edges.chosen(terms.edges.side == EDGE_BELOW))
-    assert len(biases_of(tops)) == 2
-    none = replace(terms, edges=terms.edges.chosen(np.zeros(len(terms.edges.xyz_m), bool)))
-    assert biases_of(none).shape == (0, 8)
+def test_a_day_without_left_or_right_edges_tells_no_width(terms, kernel):
+    assert label_width_px(chosen(terms, terms.edges.side != EDGE_LEFT), STATE.alone, kernel) == 0
+
+
+def test_far_edges_that_lie_beside_their_borders_leave_the_yaw_open(terms, kernel):
+    edges = terms.edges
+    good = sides_apart(terms, STATE, kernel)
+    assert good.pitch_px >= EDGE_SIDE_ALONE  # tops alone: nothing floats over the ground
+    assert good.yaw_px < 0.5
+    without = chosen(terms, edges.side != EDGE_BELOW)
+    assert sides_apart(without, STATE, kernel).pitch_px == 0  # edges tell nothing of it
+    is_left = edges.side == EDGE_LEFT
+    range_m = np.linalg.norm(edges.xyz_m, axis=1)
+    is_far_left = is_left & (range_m > np.median(range_m[is_left]))
+    aside = widened(terms, T_TRUE, 3.0).edges.xyz_m
+    moved = replace(edges, xyz_m=np.where(is_far_left[:, None], aside, edges.xyz_m))
+    assert sides_apart(replace(terms, edges=moved), STATE, kernel).yaw_px > good.yaw_px + 1.0
+
+
+def test_what_sides_leave_open_turns_about_a_point_ahead_and_nothing_that_is_fixed():
+    apart = SidesApart(pitch_px=1.0, yaw_px=2.0, px_rad=0.002)
+    point = np.array([0.0, 0.0, SIDES_APART_RANGE_M])
+    for row in apart.biases(NONE)[:2]:
+        moved = np.cross(row[:3], point) + row[3:6]
+        assert np.allclose(moved, 0, atol=1e-12)
+        assert np.linalg.norm(row[:3]) > 0
+    only_turns = np.arange(8) > 2
+    assert (apart.biases(only_turns)[:, 3:] == 0).all()
+    assert apart.biases(NONE)[1, 1] == pytest.approx(2 * apart.biases(NONE)[0, 0])
 
 
 def test_a_camera_that_looks_aside_slides_along_its_own_x_with_the_clock():

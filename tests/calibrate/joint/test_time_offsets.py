@@ -5,7 +5,7 @@ import pytest
 
 from pipeline.calibrate.joint.lidar_radar import time_offset
 from pipeline.calibrate.joint.lidar_radar.elevation_spread import ElevationSpread
-from pipeline.calibrate.joint.lidar_radar.normal_equations import RadarProblem, RadarState
+from pipeline.calibrate.joint.lidar_radar.problem import RadarProblem, RadarState
 from pipeline.calibrate.joint.lidar_radar.schedule import SCHEDULE
 from pipeline.calibrate.joint.lidar_radar.time_offset import dips
 from pipeline.extrinsics.estimates import Prior

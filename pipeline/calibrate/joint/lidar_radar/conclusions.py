@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.calibrate.joint.lidar_radar.normal_equations import DT, RANGE, Linear, RadarState
+from pipeline.calibrate.joint.lidar_radar.problem import DT, RANGE, Linear, RadarState
 from pipeline.calibrate.joint.lidar_radar.witnesses import Witness, contradiction, own_numbers
 from pipeline.calibrate.numerics.bias_floors import RADAR_ELEVATION_BIAS_RAD, RANGE_BIAS_SIGMA_M
 from pipeline.geometry.changes import change_between
-from pipeline.objective.radar.heights import HEIGHTS_PITCH_FLOOR_RAD, Heights
+from pipeline.objective.radar.heights import Heights
 
 __all__ = ["ObservabilityAnalysis", "diagnostics_of", "notes_of"]
 
@@ -64,8 +64,8 @@ def notes_of(analysis: ObservabilityAnalysis, *, has_elevation: bool) -> list[st
     if analysis.heights is not None:
         notes.append(
             f"radar pitch allows for detections between things and their mirror images in the road: a share of "
-            f"{analysis.heights.displaced:.2f} of those of low things, which no day tells better than to "
-            f"{np.degrees(HEIGHTS_PITCH_FLOOR_RAD):.2f} deg of pitch"
+            f"{analysis.heights.displaced:.2f} of those of low things, which this day tells no better than to "
+            f"{np.degrees(analysis.heights.floor_rad):.2f} deg of pitch"
         )
     disagreement = contradiction(analysis.witnesses)
     if disagreement is not None:

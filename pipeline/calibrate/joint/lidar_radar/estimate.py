@@ -16,21 +16,22 @@ from jaxtyping import Bool, Float
 
 from pipeline.calibrate.joint.lidar_radar.conclusions import ObservabilityAnalysis, diagnostics_of, notes_of
 from pipeline.calibrate.joint.lidar_radar.elevation_spread import beam_spacing, elevation_spread
+from pipeline.calibrate.joint.lidar_radar.elevation_terms import height_opinion, travel_opinion
 from pipeline.calibrate.joint.lidar_radar.measured_curvature import with_measured_curvature
-from pipeline.calibrate.joint.lidar_radar.normal_equations import (
+from pipeline.calibrate.joint.lidar_radar.own_position import own_position
+from pipeline.calibrate.joint.lidar_radar.problem import (
     AZIMUTH_RANGE_DOF,
     DT,
     ELEVATION_DOF,
+    SEEN_LOW,
     Linear,
     RadarProblem,
     RadarState,
-    height_opinion,
-    travel_opinion,
 )
-from pipeline.calibrate.joint.lidar_radar.own_position import own_position
 from pipeline.calibrate.joint.lidar_radar.radar_velocity import contradicts_odometry, turns_unmeasured
 from pipeline.calibrate.joint.lidar_radar.schedule import SCHEDULE
 from pipeline.calibrate.joint.lidar_radar.search import NONE_FIXED, anneal, finish, last_step, scan
+from pipeline.calibrate.joint.lidar_radar.seen_low import seen_low_of
 from pipeline.calibrate.joint.lidar_radar.tilt_floors import following_tilt, radar_tilt_axes
 from pipeline.calibrate.joint.lidar_radar.time_offset import (
     better_time_offset,
@@ -227,20 +228,17 @@ def _with_way(
     # Elevations move z with pitch: a radar .1 m too high sees all .4 deg too high at 15 m. z is the prior's knowledge.
     level = state.T_lidar_radar.copy()
     level[2, 3] = problem.prior.T_lidar_radar[2, 3]
-    seeing = replace(
-        problem,
-        travel=travel_directions(*about) if "doppler" in problem.terms else None,
-        heights=displaced_heights(about[0], level, about[2], rng.spawn(1)[0])
-        if "static" in problem.terms
-        else None,
-    )
+    travel = travel_directions(*about) if "doppler" in problem.terms else None
+    has_static = "static" in problem.terms
+    heights = displaced_heights(about[0], level, about[2], rng.spawn(1)[0]) if has_static else None
+    seeing = replace(problem, travel=travel, heights=heights, seen_low=seen_low_of(travel, heights))
     added = travel_opinion(seeing, state), height_opinion(seeing, state)
-    witnesses = (*linear.witnesses, *(w for w in added if w is not None))
+    witnesses = [seeing.seen_low.expected(w) for w in (*linear.witnesses, *added) if w is not None]
     doubt_rad = doubted(witnesses)
-    wider = [
+    wider = tuple(
         replace(w, sigma_rad=float(np.hypot(w.sigma_rad, doubt_rad.get(w.name, 0.0)))) for w in witnesses
-    ]
-    return replace(seeing, doubt_rad=doubt_rad), state, tuple(wider)
+    )
+    return replace(seeing, doubt_rad=doubt_rad), replace(state, seen_low=seeing.seen_low.mean), wider
 
 
 def _with_witnesses(
@@ -331,7 +329,10 @@ def _analyse_observability(
         follow @ _left_by(scatter, curvature, fixed) @ follow.T
         for scatter in (linear.floors, linear.floors_alike)
     )
-    common = alike + prior_share(full, np.diag(1 / variance))
+    # How low things are seen is the radar's and its roads': it is no less a bias for being estimated.
+    alike = alike + np.outer(full[SEEN_LOW], full[SEEN_LOW]) / variance[SEEN_LOW]
+    others = np.arange(len(variance)) != SEEN_LOW
+    common = alike + prior_share(full, np.diag(others / variance))
     for covariance in (full, common):
         covariance[np.arange(DT + 1), np.arange(DT + 1)] += bias
     return ObservabilityAnalysis(

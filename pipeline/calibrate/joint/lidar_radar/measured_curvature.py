@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.calibrate.joint.lidar_radar.normal_equations import (
+from pipeline.calibrate.joint.lidar_radar.normal_equations import linearise
+from pipeline.calibrate.joint.lidar_radar.problem import (
     AZIMUTH_RANGE_DOF,
     STEP_LIMIT,
     UNKNOWNS,
     RadarProblem,
     RadarState,
-    linearise,
 )
 
 __all__ = ["with_measured_curvature"]
@@ -22,9 +22,10 @@ _MEASURED_SHARE = (0.02, 1.0)  # range of the measured curvature, as a share of 
 def with_measured_curvature(
     problem: RadarProblem, state: RadarState, information: Float[np.ndarray, "F P P"]
 ) -> Float[np.ndarray, "F P P"]:
-    """Information with the cost's own curvature over yaw, x, y, dt and range bias, from differences of its gradient.
+    """Information with the cost's measured curvature over yaw, x, y, dt and range bias.
 
-    On days of one speed, x, dt and the range bias share a valley that is far flatter than soft assignment predicts.
+    On days of one speed, x, dt and the range bias share a valley that is far flatter than soft assignment
+    predicts.
     """
     dof = AZIMUTH_RANGE_DOF
     total = information.sum(0)[np.ix_(dof, dof)]

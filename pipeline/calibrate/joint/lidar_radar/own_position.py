@@ -1,12 +1,13 @@
 """Where the day itself puts the radar along the ground, its prior left out: for an alarm, no estimate.
 
-While a car drives, x shifts detections as the time offset does, so a day of few speeds leaves x at the prior. A prior
-half a metre wrong is then hidden: the time offset takes it up, .05 s of it, and azimuths follow by .2 deg. Frames of
-other speeds contradict that all the same. So x, y and the time offset are solved again without the prior of position.
+While a car drives, x shifts detections as the time offset does, so a day of few speeds leaves x at the prior.
+A prior half a metre wrong is then hidden: the time offset takes it up, .05 s of it, and azimuths follow by .2
+deg. Frames of other speeds contradict that all the same. So x, y and the time offset are solved again without
+the prior of position.
 
-That alone would accuse good days: where the car keeps one speed the three wander off along their valley, by .8 m on a
-simulated motorway, because the cost has a slope along the car's way that has nothing to do with time. A true optimum is
-a dip: the frames align better there than at the prior, and better than as far beyond.
+That alone would accuse good days: where the car keeps one speed the three wander off along their valley, by
+.8 m on a simulated motorway, because the cost has a slope along the car's way that has nothing to do with
+time. A true optimum is a dip: the frames align better there than at the prior, and better than as far beyond.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 
 from pipeline.calibrate.joint.lidar_radar.measured_curvature import with_measured_curvature
-from pipeline.calibrate.joint.lidar_radar.normal_equations import DT, RadarProblem, RadarState
+from pipeline.calibrate.joint.lidar_radar.problem import DT, RadarProblem, RadarState
 from pipeline.calibrate.joint.lidar_radar.search import finish
 from pipeline.calibrate.joint.lidar_radar.time_offset import comparison_cost
 from pipeline.calibrate.numerics.covariance import bootstrap_covariance
@@ -35,17 +36,11 @@ def own_position(
     fixed: Bool[np.ndarray, " P"],
     block: Int64[np.ndarray, " F"],
 ) -> dict[str, float]:
-    """Shift from the prior along each ground axis that was fixed, its sigma, and how clearly the frames prefer it.
+    """Shift from the prior along each ground axis that was fixed, its sigma, and its significance.
 
-    Args:
-        problem: the day.
-        state: the solution.
-        fixed: unknowns that the day left to the prior.
-        block: of observations that share a scene.
-
-    Returns:
-        By name: `own_tx_m`, `own_tx_sigma_m` (or ty), and the normal deviates by which frames align better there,
-        `own_z_prior` and `own_z_beyond`; nothing where the day determined both axes.
+    Returns by name `own_tx_m`, `own_tx_sigma_m` (or ty), and the normal deviates by which frames align better
+    there than at the prior (`own_z_prior`) and as far beyond (`own_z_beyond`); empty if the day determined
+    both axes.
     """
     asked = [k for k in _GROUND if fixed[k]]
     if not asked:

@@ -1,8 +1,9 @@
 """Frames whose radar velocity is wrong: it decides which detections are static, and where points are a moment later.
 
-A radar's own velocity is that on which most detections agree. Beside a convoy that is the convoy's: on a simulated
-highway 18 of 67 frames were 3 to 9 m/s off, their moving vehicles taken for static ones, and moved x by 0.2 to 1.5 m
-at a sigma of 0.09. The car's odometry contradicts such frames, and so does a direction of travel that never changes.
+A radar's own velocity is that on which most detections agree. Beside a convoy that is the convoy's: on a
+simulated highway 18 of 67 frames were 3 to 9 m/s off, their moving vehicles taken for static ones, and moved
+x by 0.2 to 1.5 m at a sigma of 0.09. The car's odometry contradicts such frames, and so does a direction of
+travel that never changes.
 """
 
 from __future__ import annotations
@@ -30,11 +31,11 @@ _PASSES = 8  # of fitting lever arm and mounting in turn
 
 
 def turns_unmeasured(observations: Sequence[Observation]) -> Bool[np.ndarray, " F"]:
-    """Frames taken in a turn that no odometry measured.
+    """Frames taken in a turn without a measured yaw rate.
 
-    A radar ahead of the rear axle moves sideways in a turn, by yaw rate times lever arm. Without the yaw rate neither
-    the lidar's sweep nor the gap between the stamps is turned back: on a real day one such turn of eleven frames moved
-    yaw by 0.25 deg, x by 15 cm and dt by 10 ms against all other streets.
+    A radar ahead of the rear axle moves sideways in a turn, by yaw rate times lever arm. Without the yaw rate
+    neither the lidar's sweep nor the gap between the stamps is corrected: on a real day one such turn of
+    eleven frames moved yaw by 0.25 deg, x by 15 cm and dt by 10 ms against all other streets.
     """
     unmeasured = np.array([o.ego_yaw_rate_radps is None for o in observations], bool)
     return unmeasured & (np.abs(_travel(observations)[:, 1]) > _SIDEWAYS_MPS)
@@ -43,8 +44,9 @@ def turns_unmeasured(observations: Sequence[Observation]) -> Bool[np.ndarray, " 
 def contradicts_odometry(observations: Sequence[Observation]) -> Bool[np.ndarray, " F"]:
     """Frames whose radar velocity is impossible on this car, by its speed or its yaw rate.
 
-    Sideways the radar moves by yaw rate times a lever arm, the same all day; an odometer may count a constant share too
-    much. What the car does not log cannot be contradicted, and an odometry that most frames contradict is itself wrong.
+    Sideways the radar moves by yaw rate times a lever arm, the same all day; an odometer may count a constant
+    share too much. What the car does not log cannot be contradicted, and an odometry that most frames
+    contradict is itself wrong.
     """
     travel = _travel(observations)
     radar_mps = np.hypot(travel[:, 0], travel[:, 1])
@@ -60,9 +62,9 @@ def contradicts_odometry(observations: Sequence[Observation]) -> Bool[np.ndarray
 
 
 def _travel(observations: Sequence[Observation]) -> Float[np.ndarray, "F 2"]:
-    """Velocities along the day's direction of travel, and across it beyond what the measured turn explains.
+    """Velocities along the day's direction of travel, and across it beyond the effect of the measured turn.
 
-    NaN where a frame has no velocity, and everywhere where too few frames move to show the direction.
+    NaN for a frame without velocity, and for all if too few frames move to determine the direction.
     """
     velocity = np.array(
         [

@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipeline.calibrate.joint.lidar_radar.normal_equations import (
+from pipeline.calibrate.joint.lidar_radar.normal_equations import linearise
+from pipeline.calibrate.joint.lidar_radar.problem import (
     DT,
     STEP_LIMIT,
     UNKNOWNS,
     Linear,
     RadarProblem,
     RadarState,
-    linearise,
 )
 from pipeline.calibrate.joint.lidar_radar.schedule import SCHEDULE
 from pipeline.calibrate.joint.lidar_radar.time_offset import scan_time_offset
@@ -82,13 +82,9 @@ def finish(
     fixed: Bool[np.ndarray, " P"] = NONE_FIXED,
     sharpen: bool = False,
 ) -> tuple[RadarState, Linear]:
-    """All detections: steps until nothing moves, and the equations there.
+    """All detections: steps until convergence, and the equations there.
 
-    Args:
-        problem: the day.
-        state: start.
-        fixed: unknowns of the pose and dt that keep the prior's value.
-        sharpen: let the radar's sigmas follow the residuals; else they stay.
+    Unknowns in `fixed` keep the prior's value; with `sharpen` the radar's sigmas follow the residuals.
     """
     state = state.with_fixed(problem.prior, fixed)
     pairs = _boxes(problem, state, BOX_ELEVATION_GATES_RAD[1])
@@ -143,8 +139,8 @@ def _next_step(
 ) -> tuple[Float[np.ndarray, " P"], _Valley]:
     """EM's step (`em_share` 1), or nearly Newton's with the information that soft assignment leaves (near 0).
 
-    On days of one speed dt, x and the range bias share a valley that is far flatter than either predicts: along dt,
-    with the others following, the step is the secant's.
+    On days of one speed dt, x and the range bias share a valley that is far flatter than either predicts:
+    along dt, with the others following, the step is the secant's.
     """
     H = em_share * linear.H.sum(0) + (1 - em_share) * linear.information.sum(0) + linear.prior_information
     g = linear.g.sum(0) + linear.prior_gradient

@@ -1,11 +1,11 @@
-"""Roll and pitch of a radar that looks anywhere: floors of what elevations say of them, and what follows their errors.
+"""Roll and pitch of a radar in any direction: floors of elevations, and errors that follow from them.
 
-A radar's elevations tell its pitch, the tilt of where it looks, three times better than its roll about that direction,
-and floors are stated so. Along the lidar's axes the two are mixed as the radar is turned: a corner radar's weak roll
-taken for its roll about the car's axis puts floors where they do not belong.
+Elevations determine a radar's pitch, the tilt of its viewing direction, three times better than its roll
+about that direction, and floors are stated so. Along the lidar's axes the two are mixed by the radar's yaw: a
+corner radar's weak roll is not its roll about the car's axis.
 
-Azimuths and ranges are solved with roll, pitch and z as elevations have them. So they err with them: a roll that is a
-degree off turns yaw by 0.1 deg and shifts y by 3 cm where what is matched lies below the radar.
+Azimuths and ranges are solved with roll, pitch and z from elevations, and err with them: a roll that is a
+degree off rotates yaw by 0.1 deg and shifts y by 3 cm if the matched objects are below the radar.
 """
 
 from __future__ import annotations
@@ -65,15 +65,10 @@ def following_tilt(
     follows: Int64[np.ndarray, " A"],
     given: Int64[np.ndarray, " B"],
 ) -> Float[np.ndarray, "P P"]:
-    """How errors of all unknowns follow from errors of a solution whose equations take the `given` ones as exact.
+    """Errors of all unknowns from errors of the `given` ones, which the equations H take as exact.
 
-    Args:
-        H: of the equations that take them so, with their share in the `given` unknowns.
-        prior_information: of the prior.
-        follows: unknowns that these equations solve for.
-        given: the others.
-
-    Source: Schmidt 1966 (parameters considered, not solved for).
+    `follows` are the unknowns that these equations solve for. Source: Schmidt 1966 (parameters considered,
+    not solved for).
     """
     out = np.eye(len(H))
     block = np.ix_(follows, follows)

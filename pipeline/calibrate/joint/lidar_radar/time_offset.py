@@ -1,9 +1,9 @@
-"""The radar's time offset among many: the one at which the registration's cost dips, not where it is lowest.
+"""The radar's time offset among many: the one at which the registration's cost dips, not its lowest value.
 
-Along the car's way the cost has a slope that has nothing to do with time: a cloud has more points near the car than far
-away, so detections moved towards it meet more of them. On a simulated highway (30 m/s, 16 rings) the cost so fell by
-half from 0 to -130 ms, and only a dip of three steps marked the true 20 ms. What counts is the cost below that of its
-surroundings.
+Along the car's way the cost has a slope that is unrelated to time: a cloud has more points near the car, so
+detections moved towards it meet more of them. On a simulated highway (30 m/s, 16 rings) the cost fell by half
+from 0 to -130 ms, and only a dip of three steps marked the true 20 ms. The criterion is therefore the cost
+below that of its surroundings.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import median_filter
 
-from pipeline.calibrate.joint.lidar_radar.normal_equations import RadarProblem, RadarState
+from pipeline.calibrate.joint.lidar_radar.problem import RadarProblem, RadarState
 from pipeline.calibrate.joint.lidar_radar.schedule import SCHEDULE
 from pipeline.calibrate.numerics.bias_floors import OUTLIER_DENSITY, REGISTRATION_COMPARISON_SIGMA
 from pipeline.objective.radar.registration import SIGMA_START, RegistrationFrames, registration_cost
@@ -37,7 +37,8 @@ def dips(cost: Float[np.ndarray, "K F"]) -> Float[np.ndarray, "K F"]:
 def scan_time_offset(problem: RadarProblem, state: RadarState, widen: float) -> RadarState:
     """The time offset at which most detections meet the lidar, by the medium cost of some frames.
 
-    At 30 m/s 25 ms are 0.75 m: posts and signs are then out of reach of sharp sigmas, and guard rails meet themselves.
+    At 30 m/s 25 ms are 0.75 m: posts and signs are then out of reach of sharp sigmas, and guard rails meet
+    themselves.
     """
     frames = problem.frames
     step_s = _step_s(frames, SCHEDULE.dt_scan_step_m)
@@ -57,10 +58,10 @@ def scan_time_offset(problem: RadarProblem, state: RadarState, widen: float) -> 
 
 
 def better_time_offset(problem: RadarProblem, state: RadarState) -> RadarState | None:
-    """The state with another time offset, where the frames' cost dips clearly deeper than at the solution's own.
+    """The state with another time offset, if the frames' cost dips clearly deeper there.
 
-    Sharp sigmas reach half a metre: at 30 m/s a time offset that is 20 ms off is beyond that, and would stay there.
-    Dips are asked for twice: at sigmas that are alike for all states, and where these see none, at the radar's own.
+    Sharp sigmas reach half a metre: at 30 m/s an error of 20 ms is beyond that, and would stay. Dips are
+    searched twice: at equal sigmas for all states, and, without a result, at the radar's own.
     """
     step_s = _step_s(problem.frames, SCHEDULE.dt_compare_step_m)
     count = int((2 * problem.dt_sigma_s + abs(state.dt_s)) / step_s) + SCHEDULE.dt_dip_steps
@@ -78,11 +79,10 @@ def better_time_offset(problem: RadarProblem, state: RadarState) -> RadarState |
 
 
 def far_time_offset(problem: RadarProblem, state: RadarState) -> dict[str, float]:
-    """The time offset within a second at which the frames' cost dips deepest, however far from what is expected.
+    """The time offset within a second at which the frames' cost dips deepest, at any distance.
 
-    Returns:
-        `own_dt_s`, as a record counts it, and `own_dt_z`, by how many standard errors the dip is deeper than the
-        solution's: 0 where it is the solution's.
+    Returns `own_dt_s`, as in a record, and `own_dt_z`: by how many standard errors the dip is deeper than the
+    solution's, 0 if it is the solution's.
     """
     some = problem.of_frames(np.arange(0, problem.frames.count, _FAR_STRIDE))
     step_s = _step_s(some.frames, SCHEDULE.dt_scan_step_m)

@@ -34,13 +34,10 @@ class Contradiction:
 def own_opinion(
     name: str, H: Float[np.ndarray, "P P"], g: Float[np.ndarray, " P"], floor_rad: float
 ) -> Witness | None:
-    """Where equations of pitch (the first unknown) and nuisances would turn it; None where they say nothing of it.
+    """Pitch correction from these equations alone, with sigma; None if pitch is unconstrained.
 
-    Args:
-        name: of the witness.
-        H: information.
-        g: gradient.
-        floor_rad: sigma of what all of its frames err by alike.
+    Pitch is the first unknown, the others are nuisances; `floor_rad` is the sigma of errors common to all
+    frames.
     """
     scale = np.sqrt(np.maximum(np.diag(H), _SINGULAR))
     if H[0, 0] <= _SINGULAR or np.linalg.eigvalsh(H / np.outer(scale, scale))[0] < _SINGULAR:
@@ -53,8 +50,8 @@ def own_opinion(
 def doubted(witnesses: Sequence[Witness]) -> dict[str, float]:
     """Sigmas beyond their own [rad] of witnesses that take things for seen where they are, where these are seen lower.
 
-    Such witnesses turn the radar up. Only `heights` knows of displaced detections: whoever turns it further up than
-    both sigmas allow errs by as much.
+    Such witnesses turn the radar up. Only `heights` knows of displaced detections: whoever turns it further
+    up than both sigmas allow errs by as much.
     """
     right = next((w for w in witnesses if w.name == "heights"), None)
     if right is None:
@@ -65,7 +62,7 @@ def doubted(witnesses: Sequence[Witness]) -> dict[str, float]:
 
 
 def contradiction(witnesses: Sequence[Witness]) -> Contradiction | None:
-    """The witnesses that contradict the mean of the others, and by how much that widens pitch; None where none does.
+    """Sources that contradict the mean of the others, and the factor on pitch's sigma; None if all agree.
 
     The factor is the square root of chi-squared per degree of freedom, at least one.
 

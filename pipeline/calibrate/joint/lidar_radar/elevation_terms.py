@@ -1,0 +1,216 @@
+"""Terms of lidar-radar that elevations and the car's way add to roll, pitch and z, each with what its frames err by.
+
+The registration's elevations contribute no more than the lidar's own beam spacing allows (points collapse
+onto the rings, repeatably and with the lowest residual); the camera's vehicle boxes determine roll, and pitch
+up to their constant. The way that the car drives adds pitch: Doppler knows it in radar axes, the road in
+lidar axes. Displaced heights add pitch as the radar's height makes it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Int64
+
+from pipeline.calibrate.joint.lidar_radar.problem import (
+    CLASSES,
+    ELEVATION_DOF,
+    SEEN_LOW,
+    RadarProblem,
+    RadarState,
+    Sums,
+)
+from pipeline.calibrate.joint.lidar_radar.seen_low import added_share
+from pipeline.calibrate.joint.lidar_radar.tilt_floors import (
+    along_radar,
+    floor_scatter,
+    radar_tilt_axes,
+    tempered,
+    tilt_of,
+)
+from pipeline.calibrate.joint.lidar_radar.witnesses import Witness, own_opinion
+from pipeline.calibrate.numerics.bias_floors import BOX_ROLL_FLOOR_LIDAR_RAD
+from pipeline.geometry.changes import change_between
+from pipeline.objective.radar.heights import Heights
+from pipeline.objective.radar.registration import NormalEquations
+from pipeline.objective.radar.travel import DOPPLER_PITCH_FLOOR_RAD, pitch_equations
+from pipeline.objective.radar.vehicle_boxes import BIAS_SIGMA_RAD, BOX_CLASSES, BoxPairs, box_equations
+
+__all__ = [
+    "add_boxes",
+    "add_elevations",
+    "add_heights",
+    "add_travel",
+    "height_opinion",
+    "travel_opinion",
+    "turned",
+]
+
+# Roll and pitch of the boxes, and their constants: pitch has unknowns of its own.
+_BOX_FLOOR = np.array([BOX_ROLL_FLOOR_LIDAR_RAD, 0.0] + [0.0] * len(BOX_CLASSES))
+
+
+def add_boxes(
+    problem: RadarProblem,
+    state: RadarState,
+    pairs: BoxPairs | None,
+    about_radar: np.ndarray,
+    sums: Sums,
+) -> tuple[float, Witness | None]:
+    """Add the camera's vehicle boxes; returns an elevation's sigma in its box [rad], and what they say of pitch."""
+    if pairs is None or problem.T_camera_lidar is None:
+        return float("nan"), None
+    F = len(sums.g)
+    Hb, gb, sigma = box_equations(pairs, problem.T_camera_lidar, state.T_lidar_radar, state.bias_rad, F)
+    Hb, gb = turned(about_radar, Hb, gb)
+    # Roll, pitch and the biases only: a constant offset below the centre in metres would look like z, and boxes were
+    # matched by azimuth at this pose.
+    own = np.array([0, 1, *range(6, 6 + len(BOX_CLASSES))])
+    Hb, gb = Hb[:, own[:, None], own], gb[:, own]
+    prior = np.diag([0.0, *[1 / BIAS_SIGMA_RAD**2] * len(BOX_CLASSES)])
+    H_own, g_own = tilt_of(state.T_lidar_radar, Hb.sum(0), gb.sum(0))
+    witness = own_opinion("boxes", H_own[1:, 1:] + prior, g_own[1:] + prior @ [0.0, *state.bias_rad], 0.0)
+    doubt_rad = problem.doubt_rad.get("boxes", 0.0)
+    floor = along_radar(state.T_lidar_radar, _BOX_FLOOR + doubt_rad * (np.arange(len(_BOX_FLOOR)) == 1))
+    columns = np.array([0, 1, *range(CLASSES.start, CLASSES.stop)])
+    _add_tilts(problem, state, "boxes", columns, Hb, gb, floor, sums)
+    return sigma, witness
+
+
+def add_travel(problem: RadarProblem, state: RadarState, sums: Sums) -> tuple[float, Witness | None]:
+    """Add the car's way by Doppler and road; returns its scatter over the frames [rad], and what it says of pitch."""
+    if problem.travel is None:
+        return float("nan"), None
+    H, g, scatter = pitch_equations(problem.travel, state.T_lidar_radar, len(sums.g))
+    witness = travel_opinion(problem, state)
+    floor = (DOPPLER_PITCH_FLOOR_RAD**2 + problem.doubt_rad.get("doppler", 0.0) ** 2) * np.eye(2)
+    _add_tilts(problem, state, "doppler", np.arange(2), H, g, floor, sums)
+    return scatter, witness
+
+
+def travel_opinion(problem: RadarProblem, state: RadarState) -> Witness | None:
+    """What the car's way says of pitch at a state; None where it says nothing."""
+    if problem.travel is None:
+        return None
+    H, g, _ = pitch_equations(problem.travel, state.T_lidar_radar, len(problem.observations))
+    H_own, g_own = tilt_of(state.T_lidar_radar, H.sum(0), g.sum(0))
+    return own_opinion("doppler", H_own[1:, 1:], g_own[1:], DOPPLER_PITCH_FLOOR_RAD)
+
+
+def add_heights(problem: RadarProblem, state: RadarState, sums: Sums) -> Witness | None:
+    """Add what static elevations say of pitch that may be displaced; returns what they say of it at this state."""
+    if problem.heights is None:
+        return None
+    H, g = _height_equations(problem.heights, state.T_lidar_radar, len(sums.g))
+    witness = height_opinion(problem, state)
+    floor = problem.heights.floor_rad**2 * np.diag([1.0, 1.0, 0.0])
+    _add_tilts(problem, state, "heights", ELEVATION_DOF, H, g, floor, sums)
+    return witness
+
+
+def height_opinion(problem: RadarProblem, state: RadarState) -> Witness | None:
+    """What displaced heights say of pitch at a state; None where they say nothing."""
+    if problem.heights is None:
+        return None
+    H, g = _height_equations(problem.heights, state.T_lidar_radar, len(problem.observations))
+    H_own, g_own = tilt_of(state.T_lidar_radar, H.sum(0), g.sum(0))
+    by_height = problem.heights.per_height_radpm * problem.prior.translation_sigma_m
+    floor_rad = float(np.hypot(problem.heights.floor_rad, by_height))
+    return own_opinion("heights", H_own[1:2, 1:2], g_own[1:2], floor_rad)
+
+
+def _height_equations(
+    heights: Heights, T_lidar_radar: np.ndarray, frames: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Information (F 3 3) and gradient (F 3) of rotations about the lidar's x and y and of z.
+
+    One number is measured: pitch as a function of the radar's height. A radar lower than assumed is rotated
+    too far down, by the angle that keeps targets some 20 m away in place.
+    """
+    axis = radar_tilt_axes(T_lidar_radar)[:, 1]
+    turned = float(change_between(heights.T_lidar_radar, T_lidar_radar)[:2] @ axis)
+    higher_m = T_lidar_radar[2, 3] - heights.T_lidar_radar[2, 3]
+    residual = turned - heights.turn_rad - heights.per_height_radpm * higher_m
+    J = np.append(axis, -heights.per_height_radpm)
+    H, g = np.zeros((frames, 3, 3)), np.zeros((frames, 3))
+    each = heights.frames
+    H[each.frame] = each.information[:, None, None] * np.outer(J, J)
+    g[each.frame] = (each.score + each.information * residual)[:, None] * J
+    return H, g
+
+
+def add_elevations(
+    problem: RadarProblem,
+    state: RadarState,
+    equations: NormalEquations,
+    stride: int,
+    floor: np.ndarray,
+    sums: Sums,
+) -> np.ndarray:
+    """Roll, pitch and z from the registration's elevations as one measurement with covariance `H^-1 + floor^2`.
+
+    Floors and what is returned, where these elevations alone would move roll, pitch and z, are along the
+    radar's axes.
+    """
+    at, shape = problem.frames.frame, (len(sums.g), len(ELEVATION_DOF), len(ELEVATION_DOF))
+    block = np.ix_(np.arange(len(at)), ELEVATION_DOF, ELEVATION_DOF)
+    He, Ie, ge = np.zeros(shape), np.zeros(shape), np.zeros(shape[:2])
+    He[at], Ie[at] = stride * equations.H[1][block], stride * equations.information[1][block]
+    ge[at] = stride * equations.g[1][:, ELEVATION_DOF]
+    # Roll follows from what stands left and right of the road: four edges of three vehicles scattered by .15 deg over
+    # their 15 days, about a mean of .02, where the floor is .2. Pitch erred by .11 about -.13.
+    floors, roll = (along_radar(state.T_lidar_radar, floor * part) for part in (np.ones(3), np.eye(3)[0]))
+    _add_tilts(problem, state, "registration", ELEVATION_DOF, He, ge, floors, sums, Ie, roll)
+    H_own, g_own = tilt_of(state.T_lidar_radar, He.sum(0), ge.sum(0))
+    return np.asarray(-np.linalg.pinv(H_own, rcond=1e-6) @ g_own)
+
+
+def _add_tilts(
+    problem: RadarProblem,
+    state: RadarState,
+    name: str,
+    columns: Int64[np.ndarray, " C"],
+    H: Float[np.ndarray, "F C C"],
+    g: Float[np.ndarray, "F C"],
+    floor: Float[np.ndarray, "C C"],
+    sums: Sums,
+    information: Float[np.ndarray, "F C C"] | None = None,
+    of_day: Float[np.ndarray, "C C"] | None = None,
+) -> None:
+    """Add what a witness says of turns about x and y and of more, as one measurement with covariance `H^-1 + floor`.
+
+    What it takes for seen where it is turns it up by the share that is seen too low.
+
+    Args:
+        problem: the day.
+        state: where the equations were linearised.
+        name: of the witness.
+        columns: its unknowns, turns first.
+        H: EM's information of each frame, for steps.
+        g: gradient.
+        floor: of what all frames err by alike.
+        sums: what it is added to.
+        information: what uncertain assignment leaves of H; None = all.
+        of_day: of the floor, what is another on every day; None = nothing.
+    """
+    axis = radar_tilt_axes(state.T_lidar_radar)[:, 1]
+    J = added_share(axis, problem.seen_low.per_share_rad.get(name, 0.0), len(columns))
+    information = H if information is None else information
+    # By as much as the gradient would follow a turn: where assignment follows it too, that is less than H says.
+    g = g + state.seen_low * information @ J[:, -1]
+    left = tempered(information, g, floor)[0]
+    H, g = tempered(H, g, floor)
+    columns = np.append(columns, SEEN_LOW)
+    block, every = np.ix_(columns, columns), np.ix_(np.arange(len(g)), columns, columns)
+    sums.H[every] += J.T @ H @ J
+    sums.information[every] += J.T @ left @ J
+    sums.g[:, columns] += g @ J
+    sums.floors[block] += J.T @ floor_scatter(H, floor) @ J
+    if of_day is not None:
+        sums.of_day[block] += J.T @ floor_scatter(H, of_day) @ J
+
+
+def turned(about_radar: np.ndarray, H: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Equations of a left twist as equations of (turn about the radar, shift); further unknowns stay."""
+    M = np.eye(g.shape[-1])
+    M[:6, :6] = about_radar
+    return M.T @ H @ M, g @ M

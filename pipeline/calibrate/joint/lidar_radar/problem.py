@@ -1,0 +1,160 @@
+"""Unknowns of lidar-radar, the constant inputs of the solution, and the equations at one state.
+
+The unknowns are about the radar itself: a rotation R <- exp(r) R and a shift t <- t + s along the lidar's
+axes, as in the record. A rotation about the lidar's origin would move the radar by its lever arm, and pass an
+error of pitch on to z.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from pipeline.calibrate.joint.lidar_radar.elevation_spread import ElevationSpread
+from pipeline.calibrate.joint.lidar_radar.seen_low import SeenLow
+from pipeline.calibrate.joint.lidar_radar.witnesses import Witness
+from pipeline.config import TERMS
+from pipeline.extrinsics.estimates import Prior
+from pipeline.geometry.se3 import exp_so3, from_rotation_translation, log_so3
+from pipeline.objective.radar.heights import Heights
+from pipeline.objective.radar.moving_clusters import MovingClusters
+from pipeline.objective.radar.registration import NormalEquations, RegistrationFrames
+from pipeline.objective.radar.travel import TravelDirections
+from pipeline.objective.radar.vehicle_boxes import BOX_CLASSES, VehicleBoxes
+from schemas.observations import Observation
+
+__all__ = [
+    "AZIMUTH_RANGE_DOF",
+    "CLASSES",
+    "DT",
+    "ELEVATION_DOF",
+    "RANGE",
+    "SEEN_LOW",
+    "STEP_LIMIT",
+    "UNKNOWNS",
+    "Linear",
+    "RadarProblem",
+    "RadarState",
+    "Sums",
+]
+
+DT, RANGE = 6, 7
+CLASSES = slice(8, 8 + len(BOX_CLASSES))
+SEEN_LOW = CLASSES.stop
+UNKNOWNS = SEEN_LOW + 1
+STEP_LIMIT = np.array([0.05] * 3 + [0.15] * 3 + [0.03, 0.1] + [0.05] * len(BOX_CLASSES) + [0.5])
+AZIMUTH_RANGE_DOF = np.array([2, 3, 4, 6, 7])
+ELEVATION_DOF = np.array([0, 1, 5])
+
+
+@dataclass(frozen=True, eq=False)
+class RadarState:
+    """The unknowns as estimated so far, and the radar's sigmas."""
+
+    T_lidar_radar: np.ndarray  # 4 4
+    dt_s: float
+    range_bias_m: float
+    bias_rad: np.ndarray  # elevation of returns from the box's centre, by class
+    sigma: np.ndarray  # 3: azimuth [rad], elevation [rad], range [m]
+    bounce: float  # share of detections that are mirrored in the road
+    seen_low: float = 0.0  # share of their height by which detections are seen too low
+
+    def moved(self, step: Float[np.ndarray, " P"]) -> RadarState:
+        """The state after a step."""
+        T = self.T_lidar_radar
+        return replace(
+            self,
+            T_lidar_radar=from_rotation_translation(exp_so3(step[:3]) @ T[:3, :3], T[:3, 3] + step[3:6]),
+            dt_s=self.dt_s + float(step[DT]),
+            range_bias_m=self.range_bias_m + float(step[RANGE]),
+            bias_rad=self.bias_rad + step[CLASSES],
+            seen_low=self.seen_low + float(step[SEEN_LOW]),
+        )
+
+    def with_fixed(self, prior: Prior, fixed: Bool[np.ndarray, " P"]) -> RadarState:
+        """The state with its fixed unknowns (rotation vector from the prior, position, dt) back at the prior."""
+        if not fixed.any():
+            return self
+        T0, T = prior.T_lidar_radar, self.T_lidar_radar
+        turn = np.where(fixed[:3], 0.0, log_so3(T[:3, :3] @ T0[:3, :3].T))
+        position = np.where(fixed[3:6], T0[:3, 3], T[:3, 3])
+        return replace(
+            self,
+            T_lidar_radar=from_rotation_translation(exp_so3(turn) @ T0[:3, :3], position),
+            dt_s=0.0 if fixed[DT] else self.dt_s,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class RadarProblem:
+    """All that stays the same while the state changes."""
+
+    observations: Sequence[Observation]
+    frames: RegistrationFrames
+    movers: MovingClusters
+    boxes: VehicleBoxes
+    T_camera_lidar: np.ndarray | None
+    prior: Prior
+    dt_sigma_s: float
+    spacing_rad: float  # of the lidar's beams, vertically
+    spread: ElevationSpread
+    terms: Sequence[str] = TERMS  # that take part
+    # Of the stamps [s], taken out of all frames' gaps: the state's dt counts from minus it, as if the clocks were off.
+    constant_gap_s: float = 0.0
+    travel: TravelDirections | None = None  # None until the pose is near enough to measure them
+    heights: Heights | None = None  # likewise
+    seen_low: SeenLow = field(default_factory=SeenLow)
+    doubt_rad: Mapping[str, float] = field(default_factory=dict)  # of pitch, beyond a witness's own sigma
+
+    def of_frames(self, index: np.ndarray) -> RadarProblem:
+        """The same with part of the registration's frames (and of the observations behind them)."""
+        chosen = self.frames.frame[index]
+        part = [self.observations[i] for i in chosen]
+        frames = replace(self.frames.subset(index), frame=np.arange(len(index), dtype=np.int64))
+        return replace(
+            self,
+            observations=part,
+            frames=frames,
+            movers=self.movers.of_frames(chosen),
+            boxes=self.boxes.of_frames(chosen),
+            travel=None if self.travel is None else self.travel.of_frames(chosen),
+            heights=None if self.heights is None else self.heights.of_frames(chosen),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """Normal equations per observation at one state, and what came with them."""
+
+    H: np.ndarray  # F P P, EM's: for steps
+    information: np.ndarray  # F P P, what uncertain assignment leaves of it
+    g: np.ndarray  # F P, gradient of the cost
+    prior_information: np.ndarray  # P P
+    prior_gradient: np.ndarray  # P
+    registration: NormalEquations
+    box_sigma_rad: float
+    boxes: int
+    mover_sigma_rad: float
+    # 3: where the registration's elevations alone would move roll, pitch (about the radar's own axes), z
+    registration_step: np.ndarray
+    floor: np.ndarray  # 3: sigma that those elevations leave of roll, pitch [rad] and z [m]
+    witnesses: tuple[Witness, ...]  # of pitch
+    travel_frames: int
+    travel_scatter_rad: float  # of the frames' ways beyond their own sigmas
+    # P P: scatter of the total gradient by what all frames of elevation's sources err by; of that, what all days share.
+    floors: np.ndarray
+    floors_alike: np.ndarray
+
+
+@dataclass(eq=False)
+class Sums:
+    """Equations per observation while terms are added."""
+
+    H: np.ndarray  # F P P
+    information: np.ndarray  # F P P
+    g: np.ndarray  # F P
+    floors: np.ndarray  # P P
+    of_day: np.ndarray  # P P, of the floors what is another on every day
