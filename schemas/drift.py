@@ -6,6 +6,7 @@ it there and do not compute another.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from shlex import quote
@@ -135,24 +136,58 @@ def kind_of_sensor(name: str, findings: Sequence[DriftFinding]) -> str:
 
 # Ends of reasons that resolve themselves with more days: no action is needed yet.
 DAYS_WILL_TELL = "will tell"
+# Of reasons of UNKNOWN, how many days a chart has to have, and the days it has where the reason says so.
+_DAYS_NEEDED = (
+    re.compile(r"(?P<has>\d+) days? of data, (?P<needs>\d+) needed"),
+    re.compile(r"that size after about (?P<needs>\d+) days?"),
+)
 
 
-def next_step(vehicle: str, stored: VehicleStatus, lake: str = "LAKE") -> str:
-    """Next action for a vehicle that is RED or YELLOW, with the command; empty if no action is needed."""
-    if stored.status not in ("RED", "YELLOW"):
+def next_step(findings: Sequence[DriftFinding], lake: str) -> str:
+    """Next action for a vehicle that is not GREEN, with commands that run as printed; empty if none is needed.
+
+    Args:
+        findings: current rows of one vehicle and method.
+        lake: folder or URL of the tables.
+    """
+    stored = status_of(findings)
+    if not findings or stored.status == "GREEN":
         return ""
+    vehicle, day = findings[0].vehicle, findings[0].day
     of = f"--lake {quote(lake)} --vehicle {quote(vehicle)}"
-    sensor = stored.sensor or "all"
-    load = f"load the state of tonight, which rests on the days since: `boresight export FORMAT {of} --out FOLDER`"
-    if stored.status == "RED":
-        what = f"how the {stored.sensor} is mounted" if stored.sensor else "how all sensors are mounted"
-        service = f"`boresight service {of} --day YYYY-MM-DD --kind repair --sensor {sensor}`"
-        return (
-            f"{vehicle}: inspect {what}; when it is mended, run {service} with that day. Until then {load}."
-        )
-    if DAYS_WILL_TELL in stored.reason:
-        return f"{vehicle}: nothing yet but to drive on; look again tomorrow: `boresight status --lake {quote(lake)}`."
+    look_again = f"look again tomorrow: `boresight status {of}`"
+    if stored.status == "UNKNOWN":
+        return f"{vehicle}: {_until_it_is_known(findings, stored.reason, of, quote(lake), look_again)}"
+    if stored.status == "YELLOW" and DAYS_WILL_TELL in stored.reason:
+        return f"{vehicle}: nothing yet but to drive on; {look_again}."
+    load = (
+        f"load the state of tonight, which rests on the days since: `boresight export ros2 {of} "
+        f"--out {quote(f'tonight/{vehicle}')}` (`boresight export --help` lists other formats)"
+    )
     what = f"the {stored.sensor}" if stored.sensor else "all sensors"
-    service = f"`boresight service {of} --day YYYY-MM-DD --kind re-mount --sensor {sensor}`"
-    look = f"If somebody moved {what}, run {service} with that day; else look at the mounting at the next service."
+    is_red = stored.status == "RED"
+    kind, done = ("repair", day) if is_red else ("re-mount", stored.since or day)
+    service = f"`boresight service {of} --day {done} --kind {kind} --sensor {quote(stored.sensor or 'all')}`"
+    if is_red:
+        mounted = f"inspect how {what} {'is' if stored.sensor else 'are'} mounted"
+        when = f"{day} is the last audited day: put the day of the repair if it was a later one"
+        return f"{vehicle}: {mounted}; when it is mended, run {service} ({when}). Until then {load}."
+    when = f"{done} is the first day that shows it: put the day of the work if it was an earlier one"
+    look = f"If somebody moved {what}, run {service} ({when}); else look at the mounting at the next service."
     return f"{vehicle}: {load}. {look}"
+
+
+def _until_it_is_known(
+    findings: Sequence[DriftFinding], reason: str, of: str, lake: str, look_again: str
+) -> str:
+    """What a vehicle that is UNKNOWN needs: another audit, a repair of tables, more days, or a look at its days."""
+    if findings[0].vehicle_status is None:
+        return f"audit again: `boresight audit --fleet FLEET --lake {lake}`, with your fleet.toml for FLEET."
+    if "cannot be read" in reason:
+        return f"restore what can be restored of the tables: `boresight repair --lake {lake}`."
+    asked = next((found for pattern in _DAYS_NEEDED if (found := pattern.search(reason))), None)
+    if asked is None:
+        return f"see which days gave no estimate, and which check failed: `boresight status {of}`."
+    has = int(asked.groupdict().get("has") or max(f.days_used for f in findings))
+    more = max(int(asked["needs"]) - has, 1)
+    return f"nothing but to drive on: it needs {more} more accepted {'day' if more == 1 else 'days'}; {look_again}."

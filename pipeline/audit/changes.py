@@ -1,4 +1,4 @@
-"""One chart cut into levels: where it changed, between which days, at once or slowly, by how much."""
+"""One chart cut into levels: times of change, sudden or slow, and sizes."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def _where_the_reference_is(
 ) -> tuple[float, float] | None:
     """How far the last level lies from the fixed reference alone, where it is back there, with its sigma.
 
-    A few days that were off may pass for days of the first level, which then lies off the reference itself.
+    A few far-off days may be taken for days of the first level, which then differs from the reference.
     """
     if not chart.has_reference[0] or len(spans) < 2 or spans[0][1] < 2:
         return None

@@ -1,4 +1,4 @@
-"""Many control charts at once: did a value change at any split of its days, seen through the noise that days have.
+"""Many control charts at once: test for a change at any split of the days, given their noise.
 
 The statistic is the largest step or drift from any split on, in units of its sigma (`scan.py`; the likelihood ratio of
 one change against none, Hinkley 1970, Biometrika 57(1)). Three things that real days do are part of it: successive days
@@ -68,7 +68,7 @@ class Charts:
 
 
 def clipped(charts: Charts, scale: Float[np.ndarray, " M"]) -> Float[np.ndarray, "M N"]:
-    """Values, none further than some sigmas from the median of itself and its neighbours (at an end: of three)."""
+    """Values, limited to some sigmas about the median of each and its neighbours (at an end: of three)."""
     M, N = charts.value.shape
     out = charts.value.copy()
     if N < 3:
@@ -115,7 +115,7 @@ def thresholds(
 
 @lru_cache(maxsize=16384)
 def _threshold(count: int, freedom: int, probability: float, autocorrelation: float, of: str) -> float:
-    # As many independent splits as the bound for known sigmas says, each with Student's t: the scale is not known.
+    # As many independent splits as in the bound for known sigmas, each with Student's t: the scale is unknown.
     one = norm.sf(alarm_threshold(np.ones(count), probability, autocorrelation, of))
     return float(student_t.isf(one, freedom))
 
@@ -156,7 +156,7 @@ def _correlation(sigma: Float[np.ndarray, " N"], autocorrelation: float, of: str
     """Correlation of the estimates of steps, or drifts, at neighbouring splits, none below 0."""
     lag = np.arange(len(sigma))[:, None] - np.arange(len(sigma))
     W = np.linalg.inv(autocorrelation ** np.abs(lag) * np.outer(sigma, sigma))
-    # Column s: what a change after day s adds to each day.
+    # Column s: effect of a change after day s on each day.
     design = np.clip(lag, 0, 1 if of == "step" else None)[:, :-1].astype(np.float64)
     level = W.sum(axis=0)
     C = design.T @ (W - np.outer(level, level) / level.sum()) @ design

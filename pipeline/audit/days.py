@@ -42,17 +42,13 @@ FEWEST_DAYS = 14  # of a window, however far back they lie
 
 @dataclass(frozen=True, eq=False)
 class PairDays:
-    """Day estimates of one edge. Held days are among them: a large knock is just what the verdict holds.
+    """Day estimates of one edge. Includes held days: a large knock makes the verdict hold the record.
 
     Args:
-        day: ordinals of the calendar, rising.
-        T: estimates of T_parent_child.
         change: from the origin to each estimate (rotation vector [rad], shift of the child's origin [m]).
-        spread: covariance of the changes that varies from day to day, larger where a day was held; what a day did not
-            determine has the prior's.
+        spread: covariance of the changes that varies from day to day, larger where a day was held; what a day
+            did not determine has the prior's.
         observable: per day and DoF; what a day did not determine is not on the charts.
-        accepted: False for held days.
-        origin: T_parent_child that changes count from.
         reference_days: days that the first one stands for where it is a fixed reference, else 0.
     """
 
@@ -92,13 +88,10 @@ class PairDays:
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """Where an edge was when it was last known to be right: the mean of its first accepted days.
+    """Mean pose of an edge's first accepted days since it was last known to be right.
 
-    Args:
-        days: ordinals of the days that it rests on.
-        T: their mean pose.
-        spread: covariance of the mean, of changes, if its days were independent.
-        observable: DoF that at least one of them determined.
+    `spread` is the covariance of the mean for independent days, of changes; `observable` are DoF determined
+    by at least one of them.
     """
 
     days: tuple[int, ...]
@@ -115,28 +108,22 @@ def pair_days(
     observable: Bool[np.ndarray, "N 6"],
     accepted: Bool[np.ndarray, " N"],
 ) -> PairDays:
-    """Day estimates of an edge, changes from the first.
+    """Day estimates of an edge, with changes from the first.
 
-    Args:
-        day: ordinals, rising.
-        T: estimates.
-        covariance: theirs, of left perturbations.
-        common: the part of it that all days err by alike; zero where a record does not say.
-        observable: what each day determined.
-        accepted: False for held days.
+    `common` is the part of `covariance` from errors common to all days, zero if a record does not have it.
     """
     J = change_jacobian(T)
     total = J @ covariance @ J.swapaxes(1, 2)
     spread = J @ (covariance - common) @ J.swapaxes(1, 2)
     varying, all_of_it = np.einsum("nii->ni", spread), np.einsum("nii->ni", total)
-    # A day adds nothing to what it does not determine: there it is as unsure as it says in all.
+    # A DoF that the day does not determine has its total variance, hence no weight.
     missing = np.where(observable, np.maximum(_LEAST_VARYING * all_of_it - varying, 0.0), all_of_it)
     spread[:, np.arange(6), np.arange(6)] += missing
     return PairDays(day, T, change_between(T[0], T), spread, observable, accepted, T[0])
 
 
 def reference_of(days: PairDays, count: int) -> Reference | None:
-    """The first accepted days as one; None where there are fewer than two."""
+    """Mean of the first accepted days; None for fewer than two."""
     rows = np.flatnonzero(days.accepted)[:count]
     first = days.at(rows)
     first = first.at(slice(0, _step(first, np.ones(DOFS))))  # before something moved among these already
@@ -153,11 +140,9 @@ def reference_of(days: PairDays, count: int) -> Reference | None:
 
 
 def last_level(days: PairDays, scale: Float[np.ndarray, " 6"]) -> PairDays:
-    """The days since something last moved, as far as they themselves show it: of too few days for a chart.
+    """The days since the last visible change, for an edge with too few days for a chart.
 
-    Args:
-        days: accepted ones.
-        scale: by DoF, how much more the vehicle's days scatter than they say.
+    `scale` is the ratio of the vehicle's scatter to its sigmas by DoF.
     """
     while (step := _step(days, scale)) is not None:
         days = days.at(slice(step, None))
@@ -165,7 +150,7 @@ def last_level(days: PairDays, scale: Float[np.ndarray, " 6"]) -> PairDays:
 
 
 def _step(days: PairDays, scale: Float[np.ndarray, " 6"]) -> int | None:
-    """How many days lie before the clearest step; None where there is none."""
+    """Number of days before the clearest step; None if there is none."""
     if len(days.day) < 4:
         return None
     found = scan(_as_charts(days), _clipped(days).T, scale, _ALIKE * np.ones(DOFS))
@@ -174,7 +159,7 @@ def _step(days: PairDays, scale: Float[np.ndarray, " 6"]) -> int | None:
 
 
 def _as_charts(days: PairDays) -> Charts:
-    """All six DoF, what a day did not determine with the prior's sigma."""
+    """All six DoF; an undetermined one has the prior's sigma."""
     N = len(days.day)
     return Charts(
         np.broadcast_to(days.day, (DOFS, N)),
@@ -197,16 +182,10 @@ def _clipped(days: PairDays) -> Float[np.ndarray, "N 6"]:
 
 
 def charted(days: PairDays, first: int, last: int, reference: Reference | None) -> PairDays:
-    """The days of a window, beside the fixed reference where that lies before it.
+    """The days of a window, with the fixed reference if that is older.
 
-    A vehicle that drives once a week has four days in a window of four weeks: its window reaches back to as many days
-    as tell something. Where it reaches into the reference, that is not one day but those that it rests on.
-
-    Args:
-        days: of one edge, since commissioning or the last service event; what the window and the reference take.
-        first: first day of the window, an ordinal.
-        last: its last day.
-        reference: of the edge; None where too few days were accepted.
+    A vehicle that drives once a week has four days in a window of four weeks: its window is extended to
+    earlier days. If it reaches into the reference, the reference's days replace its mean.
     """
     until = days.between(0, last)
     if len(until.day) <= FEWEST_DAYS:
@@ -241,12 +220,7 @@ def edges_of_fleet(fleet: Sequence[Mapping[Edge, PairDays]]) -> tuple[Edge, ...]
 
 
 def charts_of_fleet(fleet: Sequence[Mapping[Edge, PairDays]], edges: Sequence[Edge]) -> Charts:
-    """Charts of all vehicles, in order of vehicle, edge and DoF; one without days is empty.
-
-    Args:
-        fleet: by vehicle, day estimates by edge.
-        edges: `edges_of_fleet`.
-    """
+    """Charts of all vehicles, in order of vehicle, edge and DoF; one without days is empty."""
     longest = max((len(d.day) for own in fleet for d in own.values()), default=0)
     shape = (len(fleet), len(edges), DOFS, max(longest, 1))
     day, value = np.zeros(shape, np.int64), np.zeros(shape)
@@ -280,7 +254,7 @@ def charts_of_fleet(fleet: Sequence[Mapping[Edge, PairDays]], edges: Sequence[Ed
         reference_days.ravel(),
         count.ravel(),
     )
-    # Beyond its days, a chart's last day goes on, so that no gap is negative.
+    # Columns beyond a chart's days repeat its last day, so that no gap is negative.
     last = np.take_along_axis(charts.day, np.maximum(charts.count - 1, 0)[:, None], 1)
     beyond = np.arange(flat[1]) >= charts.count[:, None]
     return replace(charts, day=np.where(beyond, last, charts.day))

@@ -1,6 +1,7 @@
-"""Differences between days of a fleet's charts, from which it is learnt how days scatter.
+"""Differences between days of a fleet's charts, which show the scatter of days.
 
-A few real changes do not move them: variances are winsorised, what spans a jump is left out, and the newest days are.
+A few real changes do not affect them: variances are winsorised, spans over a jump and the newest days are
+left out.
 """
 
 from __future__ import annotations
@@ -68,18 +69,18 @@ class Differences:
         )
 
     def in_sigmas(self, phi: np.ndarray | float) -> Float[np.ndarray, "V P D S"]:
-        """Differences in units of what days that err alike by phi say."""
+        """Differences in units of their sigmas for days with autocorrelation phi."""
         rho = np.asarray(phi)[..., None] ** self.gap
         return self.size / np.sqrt(np.maximum(self.square - 2 * rho * self.product, 1e-12 * self.square))
 
 
 def older_days(charts: Charts) -> Int[np.ndarray, " M"]:
-    """How many days of each chart tell how days are; the newest are judged by what these show."""
+    """Number of days of each chart that teach the scatter by which the newest are judged."""
     return np.asarray(charts.count - np.minimum(charts.count // _OLDER, _NEWEST))
 
 
 def leave_out_steps(near: Differences, far: Differences) -> None:
-    """What spans a jump that no day explains says nothing of days, and would make them look alike."""
+    """Leave out spans over a jump: they show no scatter of days, and would make days look alike."""
     z = near.in_sigmas(0.0)
     sigma = np.sqrt(winsorised_variance(np.moveaxis(z, 0, 2).reshape(*z.shape[1:3], -1))[0])
     with np.errstate(invalid="ignore"):
@@ -93,7 +94,7 @@ def leave_out_steps(near: Differences, far: Differences) -> None:
 def far_off(z: Float[np.ndarray, "V P D S"]) -> Float[np.ndarray, " P"]:
     """Share of an edge's differences beyond three sigmas, drawn towards the normal distribution's.
 
-    One of which neither difference beside it takes back a part is a change that stays, and no day far off.
+    A difference that no neighbouring difference takes back in part is a lasting change, not a far-off day.
     """
     sigma = np.sqrt(winsorised_variance(np.moveaxis(z, 0, 2).reshape(*z.shape[1:3], -1))[0])
     beside = np.pad(z, ((0, 0),) * 3 + ((1, 1),), constant_values=np.nan)
@@ -105,7 +106,7 @@ def far_off(z: Float[np.ndarray, "V P D S"]) -> Float[np.ndarray, " P"]:
 
 
 def winsorised_variance(values: Float[np.ndarray, "*rows N"]) -> tuple[np.ndarray, np.ndarray]:
-    """Winsorised variance about zero along the last axis (nan where nothing is), and how many numbers there are."""
+    """Winsorised variance about zero along the last axis (nan if empty), and the number of values."""
     size = np.abs(values)
     ordered = np.sort(size, axis=-1)  # nan comes last
     count = np.isfinite(values).sum(axis=-1)

@@ -1,4 +1,4 @@
-"""Records of a fleet as columns, and what each day of them may say, as far as its checks allow."""
+"""Records of a fleet as columns, each day used as far as its checks allow."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 _SHIFTS = tuple(f"diagnostics.holdout_{n}_shift_rad" for n in ("azimuth", "elevation"))
 _DISPROVED = "diagnostics.disproved"
 _UNCHECKED = tuple(f"diagnostics.unchecked_{dof}_sigmas" for dof in DOF_NAMES)
-# What is asked of a record besides what identifies it.
+# Columns of a record beside its identity.
 COLUMNS = (
     "status",
     *_POSE,
@@ -61,24 +61,21 @@ class Estimates:
     A year of a fleet as rows would be gigabytes; a record is 700 bytes here.
 
     Args:
-        vehicles: names, in order.
         owner: which of them a record is of.
         day: ordinals of the calendar.
         edges: that any record is of, in order.
         edge: which of them a record is of; -1: none.
-        status: places in STATUSES; -1: none of them.
         pose: of T_parent_child: quaternion (scalar first), translation [m].
         has_estimate: neither pose nor covariance is null.
-        covariance: of left perturbations.
         common: the part of it that all days err by alike.
         has_common: a record of an older release does not say.
-        observable: what the day determined; all of it where a record does not say.
         disproved: a check shows that the pose is wrong.
         shown_wrong_rad: the angle that the checks of a held record found it off by.
-        unchecked_sigmas: by DoF, how far it lies from the prior where that is far and nothing checks it, else 0.
-        half_days: of a day within which a sensor moved, changes from the pose and their sigmas, by part of the day.
+        unchecked_sigmas: by DoF, how far it lies from the prior where that is far and nothing checks it, else
+            0.
+        half_days: of a day within which a sensor moved, changes from the pose and their sigmas, by part of
+            the day.
         targets: that its sigmas are stated at, in the child's frame; not finite in rows of older releases.
-        work_key: of each record.
     """
 
     vehicles: list[str]
@@ -117,7 +114,7 @@ class Estimates:
         return self.edge == self.edges.index(edge) if edge in self.edges else np.zeros(len(self.edge), bool)
 
     def own_edges(self) -> list[Edge]:
-        """Edges of these records, in order."""
+        """Edges of these records, sorted."""
         return [self.edges[e] for e in np.unique(self.edge).tolist() if e >= 0]
 
     @property
@@ -127,7 +124,7 @@ class Estimates:
 
     @property
     def refused(self) -> Bool[np.ndarray, " N"]:
-        """Days that could not say anything."""
+        """Days without an estimate."""
         return self.status == _REFUSED
 
     @property
@@ -148,11 +145,7 @@ _PER_RECORD = [f.name for f in fields(Estimates) if f.name not in ("vehicles", "
 
 
 def estimates_of(table: pa.Table | None) -> Estimates:
-    """The current ones of the records in a table that has COLUMNS and what tells which are current.
-
-    Args:
-        table: records of one method, in any order; None = none.
-    """
+    """Current records of a table that has COLUMNS and the key columns; None = no records."""
     if table is None:
         table = CALIBRATIONS.arrow_schema().empty_table()
         for name in (_DISPROVED, *_SHIFTS, *_UNCHECKED):
@@ -162,13 +155,7 @@ def estimates_of(table: pa.Table | None) -> Estimates:
 
 
 def estimates_at(found: pa.Table, edges: tuple[Edge, ...], edge: Int[np.ndarray, " N"]) -> Estimates:
-    """Current rows as columns.
-
-    Args:
-        found: rows in order of vehicle, with COLUMNS.
-        edges: that they are of, in order.
-        edge: which of them each row is of; -1: none.
-    """
+    """Current rows, in order of vehicle, as columns; `edge` is -1 for a row without edge."""
     names = found["vehicle"].combine_chunks().dictionary_encode()
     owner, day = np.asarray(names.indices).astype(np.int64), ordinals(found["day"])
     order = np.lexsort((edge, day, owner))  # edges of a day side by side
@@ -190,11 +177,7 @@ def estimates_at(found: pa.Table, edges: tuple[Edge, ...], edge: Int[np.ndarray,
 
 
 def joined(parts: Sequence[Estimates]) -> Estimates:
-    """Records of several parts, none of which is in two of them, as one; vehicles without any are left out.
-
-    Args:
-        parts: one at least.
-    """
+    """Records of several disjoint parts as one, without vehicles that have none."""
     vehicles = sorted({part.vehicles[v] for part in parts for v in np.unique(part.owner)})
     place = {vehicle: v for v, vehicle in enumerate(vehicles)}
     owner = np.concatenate(
@@ -215,19 +198,14 @@ def joined(parts: Sequence[Estimates]) -> Estimates:
 
 
 def days_of(records: Estimates, held_sigma_factor: float) -> dict[Edge, PairDays]:
-    """Estimates by edge; refused and disproved days are gaps, held ones are less sure.
-
-    Args:
-        records: of one vehicle, none with a fault.
-        held_sigma_factor: by which a held day is less sure at least.
-    """
+    """Estimates by edge; refused and disproved days are gaps, sigmas of held days grow by the factor."""
     days, usable = {}, records.usable
     for edge in records.own_edges():
         rows = np.flatnonzero(usable & records.is_of(edge))
         if not len(rows):
             continue
         own = records.at(rows)
-        # Where an older release did not say what is common, all of it counts as varying.
+        # Without a common part (older releases), all of the covariance counts as varying.
         common = np.where(own.has_common[:, None, None], own.common, 0.0)
         covariance, held = own.covariance.copy(), ~own.accepted
         covariance[held] = common[held] + (covariance - common)[held] * held_sigma_factor**2
@@ -245,7 +223,7 @@ def _since_it_moved(
 ) -> tuple[Float[np.ndarray, "N 4 4"], Float[np.ndarray, "N 6 6"]]:
     """Estimates of the last part of days within which a sensor moved: a mean of two places is neither.
 
-    Days after it are held against that part, days before it against their own: so the day of the change is this one.
+    Later days are compared with that part, earlier days with the first one, so the change is on this day.
     """
     change, sigma = last[:, 0], last[:, 1]
     there = changed(T, change)
@@ -254,12 +232,7 @@ def _since_it_moved(
 
 
 def faults_of(records: Estimates, latest_day: str) -> dict[int, str]:
-    """Why records cannot be used, in words, by row. A refused day is no fault.
-
-    Args:
-        records: any.
-        latest_day: the last day that a drive can be of.
-    """
+    """Reasons why records cannot be used, by row; a refused day is no fault, a future one is."""
     future = records.day > dt.date.fromisoformat(latest_day).toordinal()
     unknown = (records.edge < 0) | (records.status < 0)
     looked_at = ~future & ~unknown & ~records.refused
@@ -290,5 +263,5 @@ def faults_of(records: Estimates, latest_day: str) -> dict[int, str]:
 
 @lru_cache(maxsize=4096)
 def day_name(ordinal: int) -> str:
-    """YYYY-MM-DD of an ordinal of the calendar."""
+    """Day as YYYY-MM-DD from its ordinal in the calendar."""
     return dt.date.fromordinal(ordinal).isoformat()

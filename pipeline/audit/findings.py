@@ -25,7 +25,7 @@ __all__ = ["VehicleAudit", "vehicle_findings"]
 
 @dataclass(frozen=True)
 class VehicleAudit:
-    """What the rows of one audit of one vehicle have in common; fields are columns of `drift`."""
+    """Common columns of `drift` of all rows of one audit of one vehicle."""
 
     vehicle: str
     day: str
@@ -43,16 +43,10 @@ def vehicle_findings(
     before: Mapping[tuple[Edge, str], DriftFinding] | None = None,
     edges: Sequence[Edge] = (),
 ) -> list[DriftFinding]:
-    """Rows in order of edge and DoF; a DoF without a chart says why. An edge that the vehicle has not has none.
+    """Rows in order of edge and DoF; a DoF without a chart has a reason. Only edges of the vehicle have rows.
 
-    Args:
-        audit: what all rows have in common.
-        records: the vehicle's current records of the window, in order of day.
-        verdict: on its charts.
-        config: limits.
-        remarks: by edge and DoF, what a chart's reason says besides.
-        before: by edge and DoF, the latest earlier audit's rows: they knew days that have left the window since.
-        edges: those that its rig can have, of a vehicle of which nothing is known yet.
+    `before` are the latest earlier audit's rows, which include days that have left the window. `edges` are
+    those of the rig, for a vehicle without records.
     """
     findings = []
     known = {*records.own_edges(), *(edge for edge, _ in before or ())} or {*edges}

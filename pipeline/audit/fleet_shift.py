@@ -1,7 +1,7 @@
-"""A change that most vehicles of a fleet show on the same day: a release, or something else that no bracket did.
+"""Changes that most vehicles of a fleet show on the same day: a release, or another common cause.
 
-It is taken out of all vehicles' days, and they are judged again by what is left: a vehicle that was knocked on that day
-too still stands out.
+They are removed from all vehicles' days, which are judged again: a vehicle that was also knocked on that day
+still stands out.
 """
 
 from __future__ import annotations
@@ -39,12 +39,9 @@ class FleetShift:
 def judge_without_fleet_shifts(
     fleet: Sequence[Mapping[Edge, PairDays]], config: AuditConfig, models: Sequence[str] = ()
 ) -> tuple[list[VehicleVerdict], dict[tuple[Edge, str], FleetShift]]:
-    """Verdicts on all vehicles, and by (edge, dof) what was taken out of all of them before.
+    """Verdicts on all vehicles, and the removed changes by (edge, dof).
 
-    Args:
-        fleet: by vehicle, day estimates by edge.
-        config: limits and the false-alarm budget.
-        models: by vehicle, the rig whose days its own are like; none = all are of one.
+    `models` has the rig of each vehicle; empty = all are of one.
     """
     verdicts = judge_fleet(fleet, config, models)
     shifts = _shifts(fleet, verdicts)
@@ -71,7 +68,7 @@ def _shifts(
 
 
 def _size(pairs: Mapping[Edge, PairDays], key: tuple[Edge, str], day: int) -> float | None:
-    """Median after less median before of one vehicle; None where it has no two days on either side."""
+    """Median after minus median before, of one vehicle; None with fewer than two days on a side."""
     days = pairs.get(key[0])
     if days is None:
         return None

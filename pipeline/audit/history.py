@@ -1,7 +1,7 @@
-"""What an audit reads of a lake: the window, and the first accepted days of vehicles whose reference is not kept yet.
+"""Records for an audit: the window, and the first accepted days of vehicles without a stored reference.
 
-A month is held at a time, as columns, and reading ends as soon as no vehicle lacks days. References that are made
-stand in table states, and so does the first accepted day of those that are not: a night reads no more of the past.
+One month is in memory at a time, as columns, and reading ends when no vehicle lacks days. References, and
+first accepted days, are stored in table states: a night reads no more of the past.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _FIRST_DAYS = 14  # of a lake, read before the rest of its first month: a refere
 
 
 def last_audited_day(lake: Lake, tomorrow: str) -> str | None:
-    """The last day that has a record and has come; None where there is none."""
+    """The last day with a record, without future days; None if there is none."""
     last = last_day(lake, CALIBRATIONS)
     if last is None or last <= tomorrow:
         return last
@@ -43,19 +43,15 @@ def last_audited_day(lake: Lake, tomorrow: str) -> str | None:
 
 
 def models_of(fleet: FleetConfig, vehicles: Iterable[str]) -> list[str]:
-    """By vehicle the name of its rig; of one that fleet.toml does not know, none."""
+    """Name of each vehicle's rig, if fleet.toml has the vehicle."""
     return [fleet.vehicle(vehicle).rig if fleet.knows(vehicle) else "" for vehicle in vehicles]
 
 
 @dataclass
 class History:
-    """Reads the current records of a method, and names those that nothing can be made of.
+    """Reads the current records of a method, and lists unusable ones in `left_out`.
 
-    Args:
-        lake: where they are.
-        method: of them.
-        latest: the last day that a drive can be of.
-        left_out: what was not usable, in words, each once.
+    `latest` is the last day that a drive can have.
     """
 
     lake: Lake
@@ -70,10 +66,9 @@ class History:
         enough: tuple[int, int],
         asked: Collection[str] = (),
     ) -> tuple[Estimates, dict[tuple[str, Edge], Reference]]:
-        """The records that charts need, and the references that need none: by vehicle and edge.
+        """Records for the charts, and references that need no records, by vehicle and edge.
 
         Args:
-            window: first and last day.
             events: by vehicle; what lies before them is not asked for.
             enough: days that a chart needs at least, and accepted days that a reference takes.
             asked: vehicles that are wanted though they may not have driven in the window.
@@ -92,7 +87,7 @@ class History:
         kept = read_kept(self.lake, self.method, window, events, count)
         known = joined(parts)
         usable = known.at(np.flatnonzero(known.usable))
-        # A chart of few days shows the reference's own days among them.
+        # A chart of few days shows the days of the reference too, instead of their mean.
         often = {key for key, days in Counter(_edges(usable)).items() if days > fewest}
         made = {
             key: kept[key].reference
@@ -111,14 +106,10 @@ class History:
         count: int,
         asked: Mapping[tuple[str, Edge], str | None],
     ) -> Iterator[Estimates]:
-        """Records of the first accepted days of edges since they were last serviced.
+        """Records of the first accepted days of edges since their last service event.
 
-        Args:
-            begin: day from which each vehicle's records are known already.
-            window: see `window`.
-            events: likewise.
-            count: accepted days.
-            asked: edges that are asked for, with the day before which none was accepted; None = there is none yet.
+        `begin` is the day from which each vehicle's records are known already; `asked` has the edges, with
+        the first day from which to search (None = no accepted day is known).
         """
         until, last = window
         restart = {key: restart_of(events.get(key[0], ()), key[1], last) for key in asked}
@@ -174,7 +165,7 @@ def _edges(records: Estimates) -> list[tuple[str, Edge]]:
 
 
 def _days_driven(records: Estimates) -> Counter[str]:
-    """How many days each vehicle has a record of."""
+    """Number of days with a record, by vehicle."""
     owner = np.unique(np.stack([records.owner, records.day]), axis=1)[0]
     return Counter(
         {records.vehicles[v]: int(n) for v, n in zip(*np.unique(owner, return_counts=True), strict=True)}
@@ -182,7 +173,7 @@ def _days_driven(records: Estimates) -> Counter[str]:
 
 
 def _months_until(lake: Lake, day: str) -> Iterator[tuple[str, str]]:
-    """Months before a day, the earliest first, from the lake's first days on: in them lie most vehicles' references."""
+    """Months before a day, the earliest first, in which most vehicles' references are."""
     months = list(months_before(day, 12 * _YEARS_BACK))
     begun = first_day(lake, CALIBRATIONS) or day
     for month, end in reversed([m for m in months if m[1] >= begun]):

@@ -68,7 +68,7 @@ class Noise:
     """Of each chart: factor on its sigmas (>= 1), the degrees of freedom it is known to, and the autocorrelation.
 
     Args:
-        far: share of days' differences beyond three sigmas, without changes that stay.
+        far: share of days' differences beyond three sigmas, without changes that stay: of the edge that has most.
         wander: variance that a level gains a day, though nothing changed; None = none.
         less_alike: the same with the least autocorrelation that the days allow; None where there is one answer.
     """
@@ -82,7 +82,7 @@ class Noise:
 
     @property
     def heavy(self) -> Bool[np.ndarray, " M"]:
-        """Charts of edges whose single days are often far off."""
+        """Charts of fleets whose single days are often far off."""
         return self.far > _OFTEN
 
     @property
@@ -122,7 +122,8 @@ def estimate_noise(
     for model in np.unique(model_of):
         own = np.flatnonzero(model_of == model)
         near, far = (found.at(own) for found in differences)
-        out[:, 3, own] = far_off(near.in_sigmas(0.0))[:, None]
+        # An edge composed of two others is less often far off than they are, and errs with them.
+        out[:, 3, own] = far_off(near.in_sigmas(0.0)).max()
         leave_out_steps(near, far)
         for k, most in enumerate((prior.autocorrelation, 0.0)):
             phi = _autocorrelation(near, far, most, prior)
@@ -160,7 +161,7 @@ def _autocorrelation(
 
 
 def _alike(z: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Autocorrelation of neighbours and of days further apart, and how many differences told it."""
+    """Autocorrelation of neighbouring and more distant days, and the number of differences."""
     (near, seen), (far, fewer) = (winsorised_variance(part) for part in z)
     with np.errstate(invalid="ignore", divide="ignore"):
         return 0.5 * (np.sqrt(np.maximum(4 * far / near - 3, 0)) - 1), np.minimum(seen, fewer)

@@ -1,8 +1,7 @@
-"""One rig per vehicle: the accepted days of every sensor's pose since it last moved, as one estimate each.
+"""One rig per vehicle: accepted days of every sensor's pose since it last moved, fused per sensor.
 
-A day's poses are one adjustment of all its edges, so what is fused here is what all of them say together. A sensor's
-pose begins anew where the sensor itself moved, or the reference that all poses refer to; that another sensor moved
-through whose edges it is known leaves it where it was.
+A day's poses are one adjustment of all its edges, so all edges take part. A sensor's pose restarts if the
+sensor itself moved, or the reference; not if another sensor moved whose edges it rests on.
 """
 
 from __future__ import annotations
@@ -52,8 +51,8 @@ class Poses:
     """Poses of a fleet over a window of days.
 
     Args:
-        estimates: by tie of sensor and reference; their T is T_reference_sensor, whichever is the tie's parent.
-        references: by vehicle, what the poses of its last day refer to.
+        estimates: by tie of sensor and reference; their T is T_reference_sensor, whichever is the tie's
+            parent.
         last_words: by vehicle and sensor, the day, status and reason of its last row.
         other_days: by vehicle, days that are left out because their poses refer to another sensor.
     """
@@ -65,11 +64,7 @@ class Poses:
 
 
 def read_poses(lake: Lake, method: str, first: str, last: str) -> Poses:
-    """The current poses of a window of days; the reference's own rows only say what the others refer to.
-
-    Raises:
-        ContractError: a row was written with another schema version.
-    """
+    """The current poses of a window of days; rows of the reference give the reference of the others."""
     asked = [c for c in COLUMNS if c in _OF_POSES]
     table = read_columns(lake, POSES, [*asked, "kind", "reference", "reason"], first=first, last=last)
     if table is None:
@@ -119,14 +114,9 @@ def pose_states(
     scales: Mapping[Edge, Float[np.ndarray, " 6"]],
     verify: VerifyConfig,
 ) -> list[StateRow]:
-    """A row per sensor of one vehicle, the reference's first; none where no rig of it was adjusted.
+    """A row per sensor of one vehicle, the reference's first; none if no rig of it was adjusted.
 
-    Args:
-        about: vehicle, last day and method.
-        poses: of the window.
-        known: what was done to the vehicle, and what the last audit found.
-        scales: by tie and DoF, how much more its days scatter than they say.
-        verify: limits.
+    `scales` are the ratios of its days' scatter to their sigmas, by tie and DoF.
     """
     vehicle, last, method = about
     if vehicle not in poses.references:
@@ -187,9 +177,9 @@ def _row(
 def _since_it_lies_here(
     own: Estimates, scale: Float[np.ndarray, " 6"]
 ) -> tuple[Estimates, tuple[str, str] | None]:
-    """The days since the pose last changed, as they themselves show it, and how that is said.
+    """The days since the pose last changed, by the days themselves, and the reason in words.
 
-    A chart takes two weeks of days; until then a mean of days before and after a knock would be neither.
+    A chart needs two weeks of days; until then a mean over a knock would be neither pose.
     """
     for days in days_of(own, 1.0).values():  # of one tie
         rest = last_level(days, scale)
@@ -203,7 +193,7 @@ def _since_it_lies_here(
 
 
 def _words(why: str, poses: Poses, of: tuple[str, str], is_none: bool) -> str:
-    """Why a pose rests on the days that it rests on; of none, what its last day says."""
+    """Reason for the days of a pose; without days, the reason of its last day."""
     others = poses.other_days.get(of[0], ())
     apart = f"not counted, for their poses refer to another sensor: {', '.join(others)}" if others else ""
     day, status, reason = poses.last_words[of]

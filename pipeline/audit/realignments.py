@@ -1,8 +1,7 @@
-"""Radars that align themselves: a step of their own estimate turns their points, and moves no mount.
+"""Radars that align themselves: a step of their own estimate rotates their points, and moves no mount.
 
-Charts and states of such a radar begin anew, as after a service event, and the event names the radar's software. That
-is asked of the calibrations too: a step that does not fit how the radar's edges changed begins nothing anew, so that a
-knock is not taken for it.
+Charts and states of such a radar restart, as after a service event that names the radar's software. A step
+that does not fit the change of the radar's edges restarts nothing, so that a knock is not mistaken for it.
 """
 
 from __future__ import annotations
@@ -41,12 +40,7 @@ _DAYS_BEFORE = 14  # of the radar's edges, that a step is compared with
 
 @dataclass(frozen=True)
 class Realignments:
-    """What a window of days shows.
-
-    Args:
-        events: re-alignments that the table of service events does not have yet.
-        remarks: by vehicle and radar, the last step that does not fit how its edges changed, in words.
-    """
+    """Re-alignments of a window that service events do not have yet; and, by radar, steps that do not fit."""
 
     events: tuple[ServiceEvent, ...]
     remarks: Mapping[tuple[str, str], str]
@@ -70,16 +64,7 @@ def find_realignments(
     records: Estimates,
     config: AuditConfig,
 ) -> Realignments:
-    """Steps of radars' own estimates within a window of days.
-
-    Args:
-        lake: where the tables are.
-        method: of the records.
-        window: first and last day.
-        events: noted ones, by vehicle: a radar's estimate is followed from the last one on.
-        records: of the window, what the calibrations found.
-        config: what size of change matters.
-    """
+    """Steps of radars' own estimates within a window of days, each followed from its last noted event on."""
     table = read_columns(
         lake, RADAR_ALIGNMENTS, ("azimuth_rad", "elevation_rad", *_COLUMNS), first=window[0], last=window[1]
     )
@@ -123,10 +108,10 @@ def _by_radar(rows: pa.Table) -> list[tuple[tuple[str, str], list[dict[str, Any]
 
 
 def _steps(days: Sequence[Mapping[str, Any]], least_rad: float) -> list[_Step]:
-    """Where the estimate left the level that it had since the window began or since the last step.
+    """Steps of the estimate from its level since the window began or since the last step.
 
-    It counts from half of what matters on, so that what stays in the charts cannot alarm by itself, and beyond what
-    its days scatter by.
+    A step counts from half of the limit on, so that smaller ones cannot alarm by themselves, and beyond its
+    days' scatter.
     """
     levels = np.array([_levels(day) for day in days]).reshape(-1, 2, 2)  # day, morning and evening, axis
     least = np.maximum(least_rad, _SIGMAS * np.sqrt(2) * _day_sigma(days, levels))
@@ -160,7 +145,7 @@ def _day_sigma(
 
 
 def _median(values: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, " 2"]:
-    """Of each column, what is NaN left out; 0 of a column without a number."""
+    """Median of each column without NaN; 0 for an empty column."""
     columns = [column[~np.isnan(column)] for column in values.T]
     return np.array([np.median(column) if len(column) else 0.0 for column in columns])
 
@@ -168,9 +153,9 @@ def _median(values: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, " 2"]:
 def _turned(
     sensor: str, edges: Mapping[Edge, PairDays], step: _Step
 ) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]] | None:
-    """Azimuth and elevation by which the radar seems turned since the step, by its best edge, and sigmas.
+    """Azimuth and elevation of the radar's apparent rotation since the step, by its best edge, and sigmas.
 
-    None where no edge has days on both sides.
+    None if no edge has days on both sides.
     """
     first, last = (dt.date.fromisoformat(day).toordinal() for day in (step.first_new, step.last_old))
     own = [e for e in edges if e.kind in _BEST_FIRST and sensor in (s.name for s in e.sensors)]
@@ -187,7 +172,7 @@ def _turned(
         variances = np.einsum("nii->ni", spread)
         (before, early), (after, late) = (_mean(turns[side], variances[side]) for side in sides)
         off = (turns[sides[0]] - before) ** 2 / variances[sides[0]]
-        # Days scatter by more than they say; one alone does not show it.
+        # Days scatter by more than their sigmas; one alone does not show it.
         excess = np.maximum(off.sum(axis=0) / max(len(off) - 1, 1), 1.0)
         return after - before, np.sqrt(excess * (early + late))
     return None
@@ -206,8 +191,8 @@ def _fits(
 ) -> bool:
     """Whether software that turned the points explains how the edges changed, better than a mount or nothing that did.
 
-    It need not explain what cannot alarm by itself. Points that turn to the left look as a radar does that was turned
-    to the right. Of makers that publish no sign either is the software's.
+    It need not explain what cannot alarm by itself. Points that turn to the left look as a radar does that
+    was turned to the right. Of makers that publish no sign either is the software's.
     """
     known = ~np.isnan(step.size_rad)
     off = {sign: np.abs(turned - sign * step.size_rad)[known] for sign in (-1, 0, 1)}

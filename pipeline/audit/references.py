@@ -1,7 +1,7 @@
-"""Fixed references as table states keeps them, so that a night need not read vehicles' first days again.
+"""Fixed references in table states, so that a night need not read vehicles' first days again.
 
-What is kept counts as long as nothing that it rests on can have changed: same service event, same setting, and no
-record of an older day became current since.
+A stored reference is valid with the same service event and setting, unless a record of an older day became
+current.
 """
 
 from __future__ import annotations
@@ -35,13 +35,7 @@ _MARGIN = dt.timedelta(days=1)
 
 @dataclass(frozen=True, eq=False)
 class Kept:
-    """What is known of an edge's reference.
-
-    Args:
-        since: day of the service event before it; empty where there was none.
-        days: the first accepted days since then, rising, no more than a reference takes.
-        reference: what they make; None until there are as many as it takes.
-    """
+    """Stored reference of an edge: last service event, first accepted days since, mean of enough days."""
 
     since: str
     days: tuple[str, ...]
@@ -55,15 +49,7 @@ def read_kept(
     events: Mapping[str, Sequence[ServiceEvent]],
     count: int,
 ) -> dict[tuple[str, Edge], Kept]:
-    """What the last states keep, by vehicle and edge, as far as it still counts.
-
-    Args:
-        lake: where they are.
-        method: of the records.
-        window: first and last day of the records that are read anyway.
-        events: by vehicle.
-        count: accepted days that a reference takes.
-    """
+    """Valid references of the last states, by vehicle and edge."""
     first, last = window
     eve = days_after(first, -1)
     rows = read_latest(lake, STATES, StateRow, first=eve, last=last, columns=_COLUMNS)
@@ -84,20 +70,14 @@ def read_kept(
 
 
 def first_accepted(kept: Kept | None) -> str | None:
-    """The day before which no accepted one is to be looked for; None where none is known to have been."""
+    """First day from which to search for accepted days; None if no accepted day is known."""
     if kept is None:
         return ""
     return kept.days[0] if kept.days else None
 
 
 def kept_of(days: PairDays | None, since: str, count: int) -> Kept:
-    """What an edge's days make.
-
-    Args:
-        days: all from the service event to tonight, or those from the first accepted one on.
-        since: day of the event; empty where there was none.
-        count: accepted days that a reference takes.
-    """
+    """Reference of an edge from its days since the service event `since` (empty = none)."""
     if days is None:
         return Kept(since, ())
     accepted = days.day[days.accepted][:count]

@@ -25,7 +25,7 @@ from pipeline.audit.noise import Noise
 
 __all__ = ["Scan", "alike", "errors_of", "scan", "scan_by"]
 
-_WEEK = 7  # days that show a level
+_FIRST = 3  # days that show a level: as many as are no chance where single days are often far off
 _SAME = 0.02  # autocorrelations that differ by no more say the same
 
 
@@ -46,7 +46,7 @@ class Scan:
     drift_sigma: Float[np.ndarray, "M S"]
 
     def row(self, m: int, days: int) -> Scan:
-        """Of one chart of so many days."""
+        """A Scan of one chart with this number of days."""
         at = slice(m, m + 1), slice(0, days - 1)
         return Scan(self.size[at], self.sigma[at], self.drift[at], self.drift_sigma[at])
 
@@ -80,15 +80,16 @@ def scan(
         scale: factor on the sigmas.
         autocorrelation: of days that follow each other, below 1; it falls with the power of the days between.
         wander: variance that the level gains a day besides; None = none.
-        reach: sigmas beyond which what a day brings that no day before showed counts as that, once a first week or a
-            reference has shown the level; None = all of it. Sizes are then too small, what they are in sigmas is not.
+        reach: sigmas that what a day brings may count for, once a few days or a reference have shown the level; None =
+            any. The rest is taken for an error of that day that dies away as errors do: it explains the next days too,
+            and only if they do not come back as it says do they add to a step. Sizes are then too small.
     """
     h, own = errors_of(charts, autocorrelation)
     walk = (np.zeros(len(scale)) if wander is None else wander) / scale**2
     # A mean of days that wandered lies off the last of them by a third of what they wandered.
     own[:, 0] += walk * charts.reference_days / 3
     most = np.full(len(scale), np.inf) if reach is None else reach * scale
-    first = np.where(charts.has_reference, 0, _WEEK)
+    first = np.where(charts.has_reference, 0, _FIRST)
     gap = np.diff(charts.day, axis=1).clip(min=0)
     rho = autocorrelation[:, None] ** gap
     out = np.zeros((4, len(gap), gap.shape[1]))
@@ -101,7 +102,7 @@ def scan(
 def errors_of(
     charts: Charts, autocorrelation: Float[np.ndarray, " M"]
 ) -> tuple[Float[np.ndarray, "M N"], Float[np.ndarray, "M N"]]:
-    """Of each day, the sigma of what is alike from day to day, and the variance of what is its own."""
+    """Per day, the sigma common to all days, and the variance of its own part."""
     held, known = charts.has_reference, np.isfinite(charts.sigma)
     known[:, 0] &= ~held
     ordered = np.sort(np.where(known, charts.sigma, np.inf), axis=1)
@@ -157,7 +158,10 @@ def _scan(value, h, own, gap, rho, walk, reach, first, count, scale, out):  # no
             surprise[t] = value[m, t] - level - k * u
             if t > first[m]:
                 far = reach[m] / np.sqrt(weight[t])
-                surprise[t] = min(max(surprise[t], -far), far)
+                beyond = surprise[t] - min(max(surprise[t], -far), far)
+                surprise[t] -= beyond
+                if k > 0:
+                    u += beyond / k  # an innovation of u of any size, as the days of a heavy tail have
             gain[t], slow_gain[t] = both * weight[t], slow * weight[t]
             level, u = level + gain[t] * surprise[t], u + slow_gain[t] * surprise[t]
             p11, p13, p33 = p11 - gain[t] * both, p13 - gain[t] * slow, p33 - slow_gain[t] * slow

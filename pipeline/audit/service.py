@@ -1,4 +1,4 @@
-"""Service events: what a workshop or a release did to a vehicle, after which its references begin anew."""
+"""Service events: work on a vehicle or a release, after which its references restart."""
 
 from __future__ import annotations
 
@@ -14,12 +14,7 @@ __all__ = ["events_until", "restart_of", "what_was_done", "with_events"]
 
 
 def events_until(lake: Lake, last: str | None) -> dict[str, list[ServiceEvent]]:
-    """Events that count, by vehicle in order of day: each as it was last noted, none that was withdrawn.
-
-    Args:
-        lake: where they are.
-        last: later events are not known yet; None = there is no last day.
-    """
+    """Valid events by vehicle in order of day: the last version of each, without withdrawn or later ones."""
     events: dict[str, list[ServiceEvent]] = {}
     for event in current_events(read_records(lake, SERVICE_EVENTS, ServiceEvent, last=last)):
         events.setdefault(event.vehicle, []).append(event)
@@ -29,7 +24,7 @@ def events_until(lake: Lake, last: str | None) -> dict[str, list[ServiceEvent]]:
 def with_events(
     events: Mapping[str, Sequence[ServiceEvent]], more: Sequence[ServiceEvent]
 ) -> dict[str, list[ServiceEvent]]:
-    """Events by vehicle, with some more."""
+    """Events by vehicle, with new ones added."""
     found = {vehicle: list(own) for vehicle, own in events.items()}
     for event in more:
         found.setdefault(event.vehicle, []).append(event)
@@ -37,14 +32,9 @@ def with_events(
 
 
 def restart_of(events: Sequence[ServiceEvent], edge: Edge, last_day: str) -> ServiceEvent | None:
-    """The last event that moved an edge, or may have; None where there was none.
+    """The last event that moved an edge, or may have; None if there was none.
 
-    The day of the event itself belongs to neither side: nobody knows whether it drove before or after.
-
-    Args:
-        events: of one vehicle.
-        edge: of two sensors.
-        last_day: later events are not known yet.
+    The day of the event belongs to neither side, because the drive may be before or after it.
     """
     names = {"all", *(sensor.name for sensor in edge.sensors)}
     touching = [e for e in events if e.day <= last_day and e.sensor in names]

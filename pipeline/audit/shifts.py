@@ -1,7 +1,8 @@
 """By how much an edge changed, and on which day: all six degrees of freedom at once, through days that err alike.
 
-Generalised least squares over whole covariances, as `scan.py` does for one degree of freedom: a day that is less sure
-than most errs by more than they do for reasons of its own, a fixed reference is the mean of days long ago.
+Generalised least squares over whole covariances, as `scan.py` does for one degree of freedom: a day that is
+less sure than most errs by more than they do for reasons of its own, a fixed reference is the mean of days
+long ago.
 """
 
 from __future__ import annotations
@@ -25,13 +26,9 @@ _LEAST = 1e-6  # of what varies: the floor of a combination of DoF that a covari
 
 @dataclass(frozen=True, eq=False)
 class Whitened:
-    """Days of one edge, in units and combinations in which all errors are independent and of variance 1.
+    """Days of one edge, in combinations in which all errors are independent and of variance 1.
 
-    Args:
-        days: ordinals.
-        origin: T_parent_child that changes count from.
-        change: whitened (6 N).
-        root: lower triangle L of the covariance (6 N, 6 N).
+    `change` is whitened (6 N), from `origin`; `root` is the lower triangle of the covariance (6 N, 6 N).
     """
 
     days: Int[np.ndarray, " N"]
@@ -70,11 +67,9 @@ class Whitened:
         return cls(days.day, days.origin, solve_triangular(L, days.change.ravel(), lower=True), L)
 
     def shift(self, shape: Float[np.ndarray, " N"], others: Sequence[Whitened] = ()) -> PairShift:
-        """The change whose share of each day is given, 0 before it and 1 where it is whole.
+        """The change with this share on each day: 0 before it, 1 where it is complete.
 
-        Args:
-            shape: by day.
-            others: what the days' errors may be instead; the change is as sure as under the worst of all.
+        `others` are alternative errors of the days; the sigma is the largest of all.
         """
         X = self._designed(np.stack([np.ones(len(shape)), shape], axis=1))
         gain = np.linalg.solve(X.T @ X, X.T)[DOFS:]

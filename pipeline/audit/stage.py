@@ -42,14 +42,14 @@ from schemas.versions import CODE_VERSION
 
 __all__ = ["work"]
 
-# What is asked of an earlier audit's rows.
+# Columns read of an earlier audit's rows.
 _OF_BEFORE = ("start_day", "start_day_earliest", "start_day_latest", "kind")
 _NAMED = 5  # records that an outcome names where they were left out; the others it counts
 
 
 @dataclass(frozen=True)
 class _Vehicle:
-    """What the audit looks at: sound records until the window's end, and what was done to the vehicle."""
+    """Input of the audit: valid records until the window's end, and service events."""
 
     records: Estimates
     events: Sequence[ServiceEvent]
@@ -116,7 +116,7 @@ def _judged(
     realigned: Realignments,
     progress: Progress,
 ) -> Generator[Records, None, None]:
-    """Newly found re-alignments, then the findings of one vehicle after the other, judged side by side."""
+    """Newly found re-alignments, then the findings of each vehicle, judged together."""
     yield Records(realigned.events)
     fleet, (first, _, method) = task.fleet, window
     begin = dt.date.fromisoformat(first).toordinal()
@@ -132,7 +132,7 @@ def _judged(
 
 
 def _charted(vehicle: _Vehicle, window: tuple[str, str, str], config: AuditConfig) -> dict[Edge, PairDays]:
-    """The window's days of each edge beside its reference, none from before what was last done to it."""
+    """The window's days of each edge with its reference, since the last service event."""
     first, last = (dt.date.fromisoformat(day).toordinal() for day in window[:2])
     charts = {}
     for edge, days in days_of(vehicle.records, config.held_sigma_factor).items():
@@ -228,7 +228,7 @@ def _found_before(
 def _remarks(
     vehicle: _Vehicle, last: str, shifts: Mapping[tuple[Edge, str], FleetShift]
 ) -> dict[tuple[Edge, str], str]:
-    """What a reader of a chart should know besides: where it begins, and what was taken out of it."""
+    """Remarks on a chart: its first day, and values left out."""
     remarks: dict[tuple[Edge, str], str] = {}
     for edge in vehicle.records.own_edges():
         restart = restart_of(vehicle.events, edge, last)

@@ -14,14 +14,14 @@ from schemas.states import STATES
 
 __all__ = ["said_before", "standing"]
 
-# From what needs nobody's eye to what does.
+# From least to most urgent.
 _CALMEST_FIRST = ("GREEN", "UNKNOWN", "YELLOW", "RED")
 _LESS = "some of its records cannot be read"
 _KEPT = f"kept, for {_LESS}"
 
 
 def said_before(lake: Lake, method: str) -> Mapping[str, list[DriftFinding]]:
-    """By vehicle, what the last audit said of those of which records may be among what could not be read."""
+    """Last audit's findings of vehicles whose records may be among the unreadable ones."""
     lost = [rows for rows in lake.lost if rows.table in (CALIBRATIONS.name, STATES.name)]
     said: dict[str, list[DriftFinding]] = {}
     for finding in read_last(lake, DRIFT, DriftFinding, method) if lost else ():
@@ -33,13 +33,10 @@ def said_before(lake: Lake, method: str) -> Mapping[str, list[DriftFinding]]:
 def standing(
     found: list[DriftFinding], said: Sequence[DriftFinding], events: Sequence[ServiceEvent], day: str
 ) -> list[DriftFinding]:
-    """The findings of a vehicle that hold tonight, with the reason: the last audit's where tonight's are calmer.
+    """The findings of a vehicle that hold tonight, with the reason: the last audit's if tonight's are calmer.
 
-    Args:
-        found: tonight's, of the records that could be read.
-        said: the last audit's; none where all of the vehicle's records could be read.
-        events: what was done to the vehicle; what was noted since the last audit ends what that said.
-        day: tonight's.
+    `said` is empty if all of the vehicle's records could be read; events noted since the last audit end its
+    findings.
     """
     if not said or any(event.recorded_at > said[0].asserted_at for event in events):
         return found

@@ -4,7 +4,8 @@ What varies from day to day averages down, less where days err alike; what all d
 
     x = sum_i G_i x_i,   G_i = (sum_j V_j^-1)^-1 V_i^-1,   covariance = f (sum_j V_j^-1)^-1 + sum_i G_i B_i
 
-with V_i what varies, scaled by the vehicle's own scatter, B_i what is common and f what AR(1) leaves of a mean.
+with V_i what varies, scaled by the vehicle's own scatter, B_i what is common and f what AR(1) leaves of a
+mean.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ _MOST_SIGMAS = 4.0  # of one DoF, beyond which a day does not belong to the othe
 class DayEstimate:
     """One accepted day: T_parent_child, covariance (left perturbation), what of it is common, what it determined.
 
-    `common` None: the record does not say. All of it then counts as varying where days are weighed, and as common where
-    the result's covariance is stated.
+    `common` None: the record does not say. All of it then counts as varying where days are weighed, and as
+    common where the result's covariance is stated.
     """
 
     day: str
@@ -53,13 +54,10 @@ class State:
 def fuse(
     days: Sequence[DayEstimate], *, scale: Float[np.ndarray, " 6"] | None = None, autocorrelation: float = 0.0
 ) -> State | None:
-    """One estimate from several days; None where there is no day.
+    """One estimate from several accepted days since the last change; None without days.
 
-    Args:
-        days: accepted ones since the last change, rising.
-        scale: by DoF of a change (rotation vector, shift of the child's origin), by which factor days scatter more than
-            they say; None = by no more.
-        autocorrelation: of successive days.
+    `scale` is, by DoF of a change (rotation vector, shift of the child's origin), the ratio of the days'
+    scatter to their sigmas; None = 1.
     """
     if not days:
         return None
@@ -94,7 +92,7 @@ def fuse(
 def _belonging(
     x: Float[np.ndarray, "N 6"], varying: Float[np.ndarray, "N 6 6"], seen: Bool[np.ndarray, "N 6"]
 ) -> list[int]:
-    """Days that lie no further from the median of all than their sigmas allow; all of them where there are two."""
+    """Days within their sigmas of the median of all; all if there are two."""
     if len(x) < 3:
         return list(range(len(x)))
     sigma = np.sqrt(np.einsum("nii->ni", varying))
@@ -110,7 +108,7 @@ def _belonging(
 
 
 def _varying(days: Sequence[DayEstimate]) -> Float[np.ndarray, "N 6 6"]:
-    """What varies; what a day did not determine has all of its variance, so that it does not weigh."""
+    """Varying part of the covariance; an undetermined DoF has all of it, hence no weight."""
     covariance = np.stack([d.covariance for d in days])
     varying = covariance - np.stack([np.zeros((6, 6)) if d.common is None else d.common for d in days])
     own, left = (np.einsum("nii->ni", matrices) for matrices in (covariance, varying))

@@ -30,12 +30,7 @@ _OFTEN = 0.5  # share of a state's days: one day in 300 lies that far from the p
 
 
 def fused(own: Estimates, scale: Float[np.ndarray, " 6"] | None) -> State | None:
-    """Accepted records about the same as one estimate; None where there is none.
-
-    Args:
-        own: the records, rising in days.
-        scale: by DoF, how much more the vehicle's days scatter than they say.
-    """
+    """Accepted records of one edge as one estimate; None without records. `scale` as in `state.fuse`."""
     days = [
         DayEstimate(day_name(day), T, covariance, common if has_common else None, observable)
         for day, T, covariance, common, has_common, observable in zip(
@@ -47,7 +42,7 @@ def fused(own: Estimates, scale: Float[np.ndarray, " 6"] | None) -> State | None
 
 
 def fused_as_they_differ(own: Estimates, scale: Float[np.ndarray, " 6"]) -> tuple[State | None, str]:
-    """Accepted records as one, as unsure as their days differ, and the words where that is more than they say."""
+    """Accepted records fused, with at least the sigma of their scatter, and a remark if that is larger."""
     found = fused(own, scale)
     if found is None or len(found.days) < 2:
         return found, ""
@@ -75,13 +70,8 @@ def with_state(
 ) -> StateRow:
     """The row with its estimate.
 
-    Args:
-        base: what it is about, and why it rests on these days.
-        found: the days as one.
-        records: that were fused.
-        seen: kinds of two sensors, as camera_lidar, and T of the second in the first with its covariance, as which the
-            sigmas of targets are stated.
-        verify: limits.
+    `seen` has the kinds of two sensors, as camera_lidar, and T of the second in the first with its
+    covariance, for the sigmas of targets.
     """
     own = records.at(np.flatnonzero([day_name(day) in found.days for day in records.day.tolist()]))
     sigma = target_sigmas(*seen, _targets(own))
@@ -118,7 +108,7 @@ def pose_columns(T: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
 
 
 def _targets(days: Estimates) -> Float[np.ndarray, "N 3"]:
-    """Where the sensors look, as the last of the days that says it has it."""
+    """Targets of the last day that has them."""
     known = np.flatnonzero(np.isfinite(days.targets).all(axis=(1, 2)))
     return days.targets[known[-1]] if len(known) else DEFAULT_TARGETS
 

@@ -1,4 +1,4 @@
-"""Stage state: calibrations, and what the audit said of them, to what each vehicle should load tonight."""
+"""Stage state: from calibrations and the audit's findings to the calibration to load tonight."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ _CHANGE = ("start_day", "start_day_latest", "moved_sensor")  # what is asked of 
 
 
 def work(task: Task) -> Work:
-    """The state of every vehicle that has a record in the window: a row per edge, and per sensor of an adjusted rig.
+    """State of every vehicle with a record in the window: a row per edge, and per sensor of an adjusted rig.
 
-    A state rests on the accepted days since the last of: the vehicle's first day, a service event, a change that the
-    latest audit found. The window ends as the audit's does.
+    A state is the mean of the accepted days since the last of: the vehicle's first day, a service event, a
+    change found by the latest audit. The window ends as the audit's does.
 
     Raises:
         ContractError: a record was written with another schema version.
@@ -91,7 +91,7 @@ def _references(
     events: Mapping[str, Sequence[ServiceEvent]],
     config: AuditConfig,
 ) -> dict[tuple[str, Edge], Kept]:
-    """The fixed reference of every vehicle and edge, as far as there is one: kept, or made of its first days."""
+    """The fixed reference of every vehicle and edge: stored, or made of its first days."""
     first, last = window
     count = config.reference_days
     kept = read_kept(history.lake, history.method, window, events, count)
@@ -112,7 +112,7 @@ def _references(
 
 
 def _scales(records: Estimates, fleet: FleetConfig) -> list[dict[Edge, Float[np.ndarray, " 6"]]]:
-    """By vehicle, edge and DoF of a change, how much more its days scatter than they say, as the charts see it."""
+    """By vehicle, edge and DoF, the ratio of its days' scatter to their sigmas, from the charts."""
     held = fleet.audit.held_sigma_factor
     days = [days_of(records.of(vehicle), held) for vehicle in records.vehicles]
     edges = edges_of_fleet(days)

@@ -1,4 +1,4 @@
-"""The status of a vehicle, decided here and nowhere else, from what its charts say."""
+"""The status of a vehicle from its charts; the only place that decides it."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ _COMPOSED_WITHIN = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class VehicleVerdict:
-    """Verdicts by (edge, dof), and what moved; `attribution` is None where no chart alarms."""
+    """Verdicts by (edge, dof), and the sensor that moved; `attribution` is None without an alarm."""
 
     charts: dict[tuple[Edge, str], ChartVerdict]
     attribution: Attribution | None
@@ -48,13 +48,7 @@ def limit_of(edge: Edge, dof: str, config: AuditConfig) -> float:
 def judge_fleet(
     fleet: Sequence[Mapping[Edge, PairDays]], config: AuditConfig, models: Sequence[str] = ()
 ) -> list[VehicleVerdict]:
-    """Judge all charts of all vehicles.
-
-    Args:
-        fleet: by vehicle, day estimates by edge; vehicles may have other edges than each other.
-        config: limits and the false-alarm budget.
-        models: by vehicle, the rig whose days its own are like; none = all are of one.
-    """
+    """Judge all charts of all vehicles; `models` has the rig of each vehicle (empty = all are of one)."""
     edges = edges_of_fleet(fleet)
     if not edges:
         return [VehicleVerdict({}, None) for _ in fleet]
@@ -93,7 +87,7 @@ def _noise_of(noise: Noise, v: int, edges: Sequence[Edge]) -> dict[Edge, Noise]:
 def _judged(
     own: Mapping[Edge, PairDays], verdicts: Sequence[ChartVerdict], noise: Mapping[Edge, Noise]
 ) -> VehicleVerdict:
-    """One vehicle: what its charts say, with the start that they share, and the sensor that moved."""
+    """One vehicle: verdicts of its charts with their common start, and the sensor that moved."""
     keys = [(edge, dof) for edge in noise for dof in DOF_NAMES]
     charts = {
         key: _name_undetermined_days(verdict, len(own[key[0]].day))
@@ -144,12 +138,7 @@ def _name_undetermined_days(verdict: ChartVerdict, days: int) -> ChartVerdict:
 
 
 def independent_edges(own: Mapping[Edge, PairDays], days: Int[np.ndarray, " N"]) -> dict[Edge, PairDays]:
-    """Edges whose errors are their own: one of camera and radar is left out where it is composed of two others.
-
-    Args:
-        own: days by edge of one vehicle.
-        days: that all of them have.
-    """
+    """Edges with independent errors: without camera-radar edges that are composed of two others."""
     if not len(days):
         return dict(own)
     T = {edge: found.T[np.searchsorted(found.day, days[-1])] for edge, found in own.items()}
@@ -194,7 +183,7 @@ def _attribute(
     noise: Mapping[Edge, Noise],
     days: Int[np.ndarray, " N"],
 ) -> Attribution:
-    """By what all edges shifted, estimated in the way that is surest whatever the autocorrelation may be."""
+    """Attribution from the shifts of all edges, by the estimator that is best for any autocorrelation."""
     shape = (days >= change.day).astype(float)
     if not shape.any() or shape.all():
         return Attribution("the pairs have no common days before and after")
@@ -222,10 +211,10 @@ def _strongest(verdicts: Sequence[ChartVerdict]) -> Change:
 def _with_common_days(
     own: Mapping[Edge, PairDays], start: int
 ) -> tuple[dict[Edge, PairDays], Int[np.ndarray, " N"]]:
-    """Edges, and the days that all of them have: those without which there are days on both sides of a start.
+    """Edges, and their common days, without edges that have no days on both sides of a start.
 
-    An edge that fell silent before the change, or was added after it, says nothing of it, and must not hide what the
-    others say.
+    An edge that ended before the change, or began after it, has no information on it, and must not hide the
+    others.
     """
     left = dict(own)
     days = _common_days(left)
@@ -239,7 +228,7 @@ def _with_common_days(
 
 
 def _sides(day: Int[np.ndarray, " N"], start: int) -> tuple[int, int]:
-    """How many days lie before a start and from it on."""
+    """Numbers of days before and from a start on."""
     before = int(np.searchsorted(day, start))
     return before, len(day) - before
 

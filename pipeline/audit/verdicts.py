@@ -1,8 +1,8 @@
 """What one chart says tonight: is the value where it was when the reference was taken, and if not, since when.
 
-A chart whose days hold no change is judged at a glance. One that does is cut into levels, and what counts is the last
-of them against the first: a value that came back (a repair without a service event) is no change any more, one that
-stayed off is RED for as long as it does.
+A chart without a change needs no further analysis. One with a change is cut into levels, and the last is
+compared with the first: a value that came back (a repair without a service event) is no change any more, one
+that stayed off is RED as long as it does.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from schemas.drift import DAYS_WILL_TELL
 __all__ = ["ChartVerdict", "judge_charts"]
 
 _VISIBLE_SIGMAS = 2.0  # a chart shows a change that is at least this many sigmas of its best-placed split
-# RED says that a change is of a size that matters, not that it may be: with 95 %.
+# RED: a change larger than the limit with a probability of 95 %.
 _SURELY = 1.645
 # Degrees of freedom of a scale that is as good as known: where a person only looks again, what it lacks is not counted
 # of a chart whose own days tell how they scatter. Of one with fewer days it is: their scatter is a guess.
@@ -42,7 +42,7 @@ _BEGUN = f"a change may have begun: the next days {DAYS_WILL_TELL}"
 
 @dataclass(frozen=True)
 class ChartVerdict:
-    """What one chart says; `change` is None where there is no alarm."""
+    """Verdict of one chart; `change` is None without an alarm."""
 
     status: str
     reason: str
@@ -128,11 +128,11 @@ def judge_charts(
 
 
 def _last_day(charts: Charts, noise: Noise) -> tuple[np.ndarray, np.ndarray]:
-    """How far each chart's last day lies from the median of the two before it, in sigmas and in its unit."""
+    """Distance of each chart's last day from the median of the two before it, in sigmas and in its unit."""
     rows, last = np.arange(len(charts.count)), charts.count - 1
     at = [charts.value[rows, np.maximum(last - k, 0)] for k in range(3)]
     sigma = charts.sigma[rows, np.maximum(last, 0)] * noise.scale
-    # With three days, the middle one is what the other two are held against.
+    # With three days, the other two are compared with the middle one.
     nearest = np.where(np.abs(at[0] - at[1]) < np.abs(at[0] - at[2]), at[0] - at[1], at[0] - at[2])
     size = np.where(charts.count > 2, nearest, at[0] - at[1])
     size = np.where(charts.count > 1, size, 0.0)
@@ -159,7 +159,7 @@ def _verdict(seen: _Judged, m: int) -> ChartVerdict:
 
 
 def _changed(seen: _Judged, m: int, levels: Levels) -> ChartVerdict | None:
-    """The alarm of a chart whose last level is not its first; None where it is."""
+    """Alarm of a chart whose last level is not its first; else None."""
     if levels.statistic <= levels.threshold:
         return None
     change, limit = describe(levels), float(seen.limit[m])

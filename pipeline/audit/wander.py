@@ -76,7 +76,7 @@ def _wander(
 
 
 def _then_and_now(charts: Charts, noise: Noise) -> tuple[np.ndarray, ...]:
-    """By chart, days of now less those long ago, the variance by chance, days to wander over, the clearest step."""
+    """By chart: recent minus early days, the variance by chance, days to wander over, the clearest step."""
     column, count = np.arange(charts.value.shape[1]), older_days(charts)
     part = np.where(charts.has_reference, 1, (_SHARE * count).astype(int))
     first = np.where(charts.has_reference, 1, count - part)

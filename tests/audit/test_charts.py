@@ -452,6 +452,15 @@ def test_a_change_that_stays_is_no_day_far_off() -> None:
     assert _fleet_noise(single).far[0] > 2 * quiet
 
 
+def test_edges_of_a_fleet_are_as_often_far_off_as_the_one_that_is_most() -> None:
+    values = np.random.default_rng(11).normal(size=(4, 6, 20))
+    values[:, 0, 2:-2:5] += 30
+    charts = _charts(values.reshape(24, 20))
+    noise = estimate_noise(charts, 1, 6)
+    assert noise.heavy.all()
+    assert len(np.unique(noise.far)) == 1
+
+
 def test_a_change_that_may_have_begun_takes_more_where_few_days_say_how_they_scatter() -> None:
     verdicts = []
     for before in (2, 14):
@@ -517,6 +526,23 @@ def test_an_error_that_dies_away_is_no_change_where_days_are_often_far_off_and_o
     assert [v.status for v in verdicts] == ["GREEN", "RED"]
     assert verdicts[1].change is not None
     assert verdicts[1].change.size == pytest.approx(6, abs=0.6)
+
+
+@pytest.mark.parametrize("size", [10.0, 40.0])
+def test_a_day_far_off_explains_the_days_that_come_back_from_it_however_far_it_is(size: float) -> None:
+    rng = np.random.default_rng(5)
+    error = np.zeros((200, 11))
+    for k in range(1, 11):
+        error[:, k] = 0.6 * error[:, k - 1] + 0.8 * rng.normal(size=200)
+    dying, lasting = error.copy(), error
+    dying[:, 6:] += size * 0.6 ** np.arange(5)
+    lasting[:, 6:] += size
+    charts = _charts([*dying, *lasting])
+    noise = replace(_known(charts, 0.6), far=np.full(400, 0.02))
+    z = np.abs(scan_by(charts, charts.value, noise, noise.reach).z).max(axis=1)
+    # A day counts for 3.5 sigmas, and chance for some more over the days; a step adds a part of itself every day.
+    assert np.quantile(z[:200], 0.99) < 5.2
+    assert np.quantile(z[200:], 0.1) > 5.2
 
 
 @pytest.mark.parametrize(("far", "status"), [(0.0027, "YELLOW"), (0.02, "GREEN")])
