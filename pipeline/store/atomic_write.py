@@ -16,6 +16,9 @@ __all__ = ["NO_SPACE", "atomic_write", "naming", "remove_abandoned"]
 
 # No vehicle-day takes a day: an older temporary file was left by a killed writer on another machine.
 _ABANDONED_S = 24 * 3600.0
+# To list a folder of 10,000 files before each takes longer than to write them; by folder and process.
+_LARGE = 200
+_large: set[tuple[Path, int]] = set()
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # a disk, a quota or a limit is exhausted
 
 
@@ -24,9 +27,9 @@ def atomic_write(path: Path) -> Iterator[BinaryIO]:
     """A stream whose content replaces `path` when the block ends; on an error `path` stays as it was.
 
     The temporary file does not end in .parquet, so that no glob of a table matches it. A killed writer leaves
-    it behind; the next writer in that folder removes it.
+    it behind; the next writer in that folder removes it, in a large folder the next process that writes there.
     """
-    remove_abandoned(path.parent)
+    _tidy(path.parent)
     temporary = path.parent / f".writing-{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex}.tmp"
     try:
         # "x" and not mkstemp: the file gets the permissions of the umask, so that others can read the lake.
@@ -43,11 +46,7 @@ def atomic_write(path: Path) -> Iterator[BinaryIO]:
 
 @contextmanager
 def naming(path: object) -> Iterator[None]:
-    """Add the path to an error for lack of space; errors of writes to an open file have none.
-
-    Raises:
-        OSError: with the path.
-    """
+    """Add the path to an OSError for lack of space; errors of writes to an open file have none."""
     try:
         yield
     except OSError as err:
@@ -56,15 +55,21 @@ def naming(path: object) -> Iterator[None]:
         raise OSError(err.errno, os.strerror(err.errno), str(path)) from err
 
 
-def remove_abandoned(folder: Path) -> None:
-    """Remove temporary files of killed writers.
+def _tidy(folder: Path) -> None:
+    """Remove files of killed writers, in a large folder only before this process's first file."""
+    if (folder, os.getpid()) not in _large and remove_abandoned(folder) > _LARGE:
+        _large.add((folder, os.getpid()))
 
-    Files of dead processes of this machine go at once, others after a day.
-    """
-    for temporary in folder.glob(".writing-*.tmp"):
-        with suppress(OSError):  # another writer may have removed it
-            if _is_abandoned(temporary):
-                temporary.unlink()
+
+def remove_abandoned(folder: Path) -> int:
+    """Remove files of killed writers: of this machine at once, others after a day; returns the number of files."""
+    files = list(folder.iterdir())
+    for temporary in files:
+        if temporary.name.startswith(".writing-") and temporary.suffix == ".tmp":
+            with suppress(OSError):  # another writer may have removed it
+                if _is_abandoned(temporary):
+                    temporary.unlink()
+    return len(files)
 
 
 def _is_abandoned(temporary: Path) -> bool:

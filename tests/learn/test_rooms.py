@@ -14,7 +14,7 @@ STANDS_ON = {
     "frames": {"prepare"},
     "batches": {"sample", "prepare"},
     "network": {"sample", "batches"},
-    "train": {"sample", "batches", "network"},
+    "train": {"sample", "prepare", "batches", "network"},
     "export": {"sample", "network", "train"},
     "infer": {"sample"},
     "perception": {"train", "export"},

@@ -1,4 +1,4 @@
-"""A batch of training frames as tensors: what the loader yields and networks, losses and augmentation take."""
+"""A batch of training frames as tensors: from the loader to networks, losses and augmentation."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class TrainingBatch:
         return self._map(lambda t: t.to(device, non_blocking=non_blocking))
 
     def pin_memory(self) -> TrainingBatch:
-        """The same batch in page-locked memory, from where a GPU fetches it by itself."""
+        """The batch in page-locked memory, which a GPU reads directly."""
         return self._map(torch.Tensor.pin_memory)
 
     def __getitem__(self, rows: slice) -> TrainingBatch:

@@ -44,11 +44,7 @@ _NUMBERS = ("ego_speed_mps", "camera_lag_s", "radar_lag_s", "drivable_area_m2")
 
 
 def collate(rows: Sequence[TrainingRow]) -> TrainingBatch:
-    """Stack rows of one table.
-
-    Raises:
-        ContractError: the rows do not have the same grid or counts: the table was made by two configurations.
-    """
+    """Stack rows of one table; raises ContractError if they differ in grid or counts."""
     height, width, step = rows[0].grid_height, rows[0].grid_width, rows[0].grid_step_deg
     if any((r.grid_height, r.grid_width, r.grid_step_deg) != (height, width, step) for r in rows):
         raise ContractError(

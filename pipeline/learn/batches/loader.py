@@ -1,8 +1,9 @@
 """Batches of table `training`: shuffled by row group, the same for the same seed, resumed to the frame.
 
-The order of an epoch is decided before anything is read: row groups in random order, cut into windows, and the frames
-of each window in random order. So a place in the stream is two numbers (epoch, frames taken), and a loader that resumes
-there gives the same batches as one that never stopped. The next window is read while the current one is used.
+The order of an epoch is decided before anything is read: row groups in random order, cut into windows, and
+the frames of each window in random order. A position in the stream is therefore two numbers (epoch, frames
+taken), and a resumed loader gives the same batches as one that never stopped. The next window is read while
+one is used.
 """
 
 from __future__ import annotations
@@ -39,8 +40,6 @@ class TrainingLoader:
     """Batches of side train, epoch after epoch without end.
 
     Args:
-        lake: where table `training` lies.
-        batch_size: frames of a batch, on this rank.
         seed: of the frames' order, the same on all ranks.
         rank_of: rank of this process and number of processes; each takes its own row groups.
         window_groups: row groups that are mixed with each other and held in memory, twice (5-10 MB each).
@@ -101,11 +100,7 @@ class TrainingLoader:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on where `state_dict` was asked.
-
-        Raises:
-            ContractError: the table or the order is not the one that the place was in.
-        """
+        """Continue at a `state_dict`; raises ContractError if the table or the order differs."""
         here = self.state_dict()
         for name, what in (("data", "table training has changed"), ("order", "seed or ranks are others")):
             if list(state[name]) != list(here[name]):
@@ -143,7 +138,7 @@ class TrainingLoader:
         return self._held[group].result()[row]
 
     def _read_ahead(self, position: int) -> None:
-        """Hold the position's window and the one behind it; let go of all others."""
+        """Keep the current window and the next one in memory; drop all others."""
         at = max(i for i, (start, _) in enumerate(self._windows) if start <= position)
         wanted = [group for _, window in self._windows[at : at + 2] for group in window]
         self._held = {g: f for g, f in self._held.items() if g in set(wanted)}
@@ -166,7 +161,7 @@ def load_split(lake: Lake, split: str, *, limit: int | None = None) -> TrainingB
 
 
 def _find_chunks(lake: Lake, split: str) -> tuple[list[_Chunk], list[str]]:
-    """Row groups that hold frames of the split, in order, and the work keys of what was found."""
+    """Row groups with frames of the split, in order, and their work keys."""
     leaks = read_leaks(lake)
     chunks, keys = [], []
     for partition in lake.partitions(TRAINING.name):

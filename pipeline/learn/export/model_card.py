@@ -1,4 +1,4 @@
-"""A model's card: what it says of the run that it comes from, and its two files, JSON and Markdown."""
+"""A model's card: facts of its training run, as JSON and Markdown."""
 
 from __future__ import annotations
 
@@ -28,7 +28,6 @@ def card_of_run(folder: Path, notes: Path | None = None) -> dict[str, Any]:
     """The card of a run of `boresight train`.
 
     Args:
-        folder: of the run.
         notes: JSON object whose entries come on top: what was measured after training, what the data was.
 
     Raises:
@@ -58,14 +57,14 @@ def card_of_run(folder: Path, notes: Path | None = None) -> dict[str, Any]:
 
 
 def _unfit(steps: int, validate_every: int, validation: Mapping[str, float]) -> list[str]:
-    """Why nobody should use a network whose training ended before it was due to be validated for the first time."""
+    """Warning for a network whose training ended before its first validation."""
     if validation and steps >= validate_every:
         return []
     return [f"{UNFIT}: trained for {steps} steps, and validated from step {validate_every} on."]
 
 
 def write_card(model: Path, card: dict[str, Any]) -> None:
-    """Write the card beside the model's file, as .json for programs and .md for people; it tells size and sha256."""
+    """Write the card beside the model's file as .json and .md, with size and sha256."""
     content = model.read_bytes()
     told = {"file": model.name, "bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
     card = told | {key: value for key, value in card.items() if key not in told}

@@ -1,8 +1,8 @@
 """A trained network as one ONNX file, with its card inside.
 
-The graph is what depends on weights: sensors rendered through a guess in, corrections out (`RenderedView` names the
-inputs). Rendering stays outside, in compiled code. `camera_log_likelihood` is an output so that a caller can cut the
-graph there and encode the camera once for several refinements (`infer/single_frame.py` does).
+The graph is the part that depends on weights: from rendered sensors to corrections (`RenderedView` names the
+inputs). Compiled code renders outside it. `camera_log_likelihood` is an output, so that a caller can cut the
+graph there and encode the camera once for several refinements (`infer/single_frame.py`).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ __all__ = ["export_onnx"]
 
 
 class _Graph(nn.Module):
-    """The core with tensors for arguments, which is what the exporter can trace."""
+    """The core with tensors as arguments, as the exporter requires."""
 
     def __init__(self, network: CalibrationNetwork) -> None:
         super().__init__()
@@ -57,13 +57,7 @@ class _Graph(nn.Module):
 
 
 def export_onnx(network: CalibrationNetwork, out: Path, card: dict[str, Any] | None = None) -> Path:
-    """Write the network (batch 1) to `out`, and its card beside it as JSON and Markdown.
-
-    Args:
-        network: trained; left in evaluation mode.
-        out: the .onnx file.
-        card: what is known of data, seeds, time, results and limits; goes into the file's metadata too.
-    """
+    """Write the network (batch 1) to `out`, and its card into the metadata and beside it (JSON, Markdown)."""
     network.eval()
     examples = _examples(network.config)
     graph = _Graph(network)

@@ -19,9 +19,9 @@ OPSET = 18
 def trace_to_onnx(
     graph: nn.Module, examples: tuple[Tensor, ...], path: Path, inputs: Sequence[str], outputs: Sequence[str]
 ) -> onnx.ModelProto:
-    """Trace the graph on example inputs, write it to `path`, and read it back, unchecked.
+    """Trace the graph on example inputs, write it to `path`, and read it back unchecked.
 
-    The tracing exporter is all that these graphs need; torch's newer one would add onnxscript to the dependencies.
+    Uses the tracing exporter, because torch's newer one needs onnxscript.
     """
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", category=DeprecationWarning)

@@ -1,4 +1,4 @@
-"""The card of an export: what was kept, what was left out and why, which calibration, how sure; and how to open it."""
+"""The card of an export: frames kept and left out with reasons, calibration and its sigmas, how to open it."""
 
 from __future__ import annotations
 
@@ -60,23 +60,17 @@ def write_card(
     days: Sequence[Partition],
     left_out: Sequence[Mapping[str, str]],
 ) -> dict[str, Any]:
-    """Write card.json and README.md from what the finished days say; returns the card.
-
-    Args:
-        output: the export.
-        settings: of the export, as its plan has them.
-        days: that are finished.
-        left_out: vehicle-days without a frame here: vehicle, day and reason.
-    """
+    """Write card.json and README.md of an export from its finished days; returns the card."""
     done = [told for day in days if (told := output.done(day)) is not None]
     frames, lost, sensors = Counter[str](), Counter[str](), Counter[str]()
-    files: dict[str, list[str]] = {split: [] for split in SPLITS}
     for told in done:
         frames.update(told["frames"])
         lost.update(told["left_out"])
         sensors.update(told["sensors"])
-        for split in SPLITS:
-            files[split] += told["parts"].get(split, [])
+    files: dict[str, list[str]] = {split: [] for split in SPLITS}
+    for part, row in (found for day in days for found in output.rows(day)):
+        if part in files:
+            files[part].append(row)
     card = {
         "made_by": f"Boresight {CODE_VERSION}",
         "settings": dict(settings),
@@ -108,7 +102,7 @@ def _page(card: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
         f"# Frames of {len({d['vehicle'] for d in days})} vehicles, {len(days)} vehicle-days",
         f"Made by {card['made_by']}; all of this page is in card.json too.\n",
         "| split | frames |\n|---|---|\n" + "\n".join(f"| {s} | {n} |" for s, n in card["frames"].items()),
-        f"\nNo two splits share a {', '.join(settings['split_by'])}. {_SYNCHRONISED}",
+        f"\nNo two splits share a {', '.join(settings['split']['split_by'])}. {_SYNCHRONISED}",
         "\n## Left out\n" + (_listed(card["frames_left_out"]) or "No frame."),
         *(f"- {d['vehicle']} {d['day']}: {d['reason']}" for d in card["vehicle_days_left_out"]),
         *_without_pose(days),
@@ -130,7 +124,7 @@ def _listed(counts: Mapping[str, int]) -> str:
 
 
 def _without_pose(days: Sequence[Mapping[str, Any]]) -> list[str]:
-    """A line for each reason why poses are not given out, with the vehicle-days that it is of."""
+    """A line for each reason why poses are missing, with its vehicle-days."""
     of: dict[str, list[str]] = {}
     for day in days:
         for name, reason in day["calibration"]["left_out"].items():

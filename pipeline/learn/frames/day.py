@@ -1,4 +1,4 @@
-"""One vehicle-day of an export: its frames written by a format, then a marker that says that it is whole."""
+"""One vehicle-day of an export: its frames in a format, then a marker that it is complete."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from pipeline.errors import BoresightError
 from pipeline.learn.frames.frame import Frame, Mounting, Perturbation, Place, read_frames
 from pipeline.learn.frames.kitti import KittiWriter
 from pipeline.learn.frames.nuscenes import NuScenesWriter
-from pipeline.learn.frames.output import Output
+from pipeline.learn.frames.output import DayOutput, Output
 from pipeline.learn.frames.shards import ShardWriter
 from pipeline.results import Progress
 from pipeline.store.partitions import Lake, Partition, work_key
@@ -33,11 +32,11 @@ class FrameWriter(Protocol):
         ...
 
     def close(self) -> None:
-        """Write what is held."""
+        """Write the rest."""
         ...
 
 
-FORMATS: dict[str, Callable[[Output, ExitStack], FrameWriter]] = {
+FORMATS: dict[str, Callable[[DayOutput, ExitStack], FrameWriter]] = {
     "webdataset": lambda output, stack: ShardWriter(output, stack, "tar"),
     "parquet": lambda output, stack: ShardWriter(output, stack, "parquet"),
     "kitti": KittiWriter,
@@ -49,7 +48,7 @@ NEEDED = {"kitti": frozenset({"camera", "lidar"})}  # kinds without which a form
 
 @dataclass(frozen=True)
 class DayTask:
-    """What a worker needs of a vehicle-day."""
+    """Input of a worker for one vehicle-day."""
 
     lake: Lake
     partition: Partition
@@ -63,18 +62,12 @@ class DayTask:
 
 def export_day(task: DayTask, progress: Progress) -> str:
     """Write a vehicle-day unless it is there from the same data, calibration and plan: 'done' or 'cached'."""
-    output = Output(task.output.root, task.output.files)
-    key = _key(task)
+    output, key = task.output, _key(task)
     before = output.done(task.partition)
     if before is not None and before["work_key"] == key:
         return "cached"
-    output.forget(task.partition)
-    try:
-        told = _write(task, output, progress)
-    except BoresightError:
-        for name in output.parts.get("files", []):
-            output.files.delete(output.root / name)
-        raise
+    with output.writing(task.partition, task.places) as own:
+        told = _write(task, own, progress)
     mounting = task.mounting
     poses = {
         n: {"T_reference_sensor": T.tolist()} | dict(mounting.about.get(n, {})) for n, T in mounting.T.items()
@@ -86,12 +79,12 @@ def export_day(task: DayTask, progress: Progress) -> str:
     }
     calibration["left_out"] = dict(mounting.left_out)
     about = {"work_key": key, "vehicle": task.partition.vehicle, "day": task.partition.day}
-    output.finish(task.partition, about | told | {"calibration": calibration, "parts": output.parts})
+    output.finish(task.partition, about | told | {"calibration": calibration})
     return "done"
 
 
-def _write(task: DayTask, output: Output, progress: Progress) -> dict[str, dict[str, int]]:
-    """Write the frames; counts of those by split, of those left out by reason, and of what sensors show."""
+def _write(task: DayTask, output: DayOutput, progress: Progress) -> dict[str, dict[str, int]]:
+    """Write the frames; counts by split, of those left out by reason, and of sensors' data."""
     kept, lost, sensors = Counter[str](), Counter(task.lost), Counter[str]()
     with ExitStack() as stack:
         writer = FORMATS[task.format](output, stack)

@@ -1,4 +1,4 @@
-"""How the car moves, as frames have it: its pose at a sensor's own stamp, and what of a radar's Doppler is its own."""
+"""Ego motion of frames: the car's pose at a sensor's stamp, and its part of a radar's Doppler."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ __all__ = ["T_root_sensor", "compensated_range_rate", "pose_at"]
 
 
 def T_root_sensor(frame: Frame, T_reference_sensor: np.ndarray) -> Float[np.ndarray, "4 4"]:
-    """A pose on the car; on the reference where nobody knows where that sits on the car."""
+    """A pose on the car, or on the reference if its pose on the car is unknown."""
     T_base = frame.mounting.T_base_reference
     return T_reference_sensor if T_base is None else T_base @ T_reference_sensor
 
 
 def pose_at(frame: Frame, stamp_ns: int) -> Float[np.ndarray, "4 4"] | None:
-    """T_odom_vehicle at a stamp near the moment's, by its speed and yaw rate; None where no odometry was logged."""
+    """T_odom_vehicle at a stamp near the moment's, by speed and yaw rate; None without odometry."""
     T, speed, turn = frame.T_odom_vehicle, frame.moment.ego_speed_mps, frame.moment.ego_yaw_rate_radps
     if T is None or speed is None or turn is None:
         return None
@@ -28,7 +28,7 @@ def pose_at(frame: Frame, stamp_ns: int) -> Float[np.ndarray, "4 4"] | None:
 
 
 def compensated_range_rate(frame: Frame, sensor: str, scan: Scan) -> Float[np.ndarray, " M"]:
-    """Range rates less what the car's own motion makes of them: 0 for what stands still; NaN where it is not known."""
+    """Range rates without the car's own motion: 0 for static objects; NaN if it is unknown."""
     speed, turn = frame.moment.ego_speed_mps, frame.moment.ego_yaw_rate_radps
     if speed is None or turn is None:
         return np.full(len(scan.radar_x_m), np.nan)

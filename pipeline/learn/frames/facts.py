@@ -1,4 +1,4 @@
-"""What stands beside a frame's pictures and points as JSON: stamps, poses and their sigmas, intrinsics, boxes."""
+"""A frame's metadata as JSON: stamps, poses with sigmas, intrinsics, boxes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A frame as others get it: what each sensor measured at a moment, where the sensors are, and how sure that is."""
+"""A frame for export: data of each sensor at a moment, poses of the sensors, and their sigmas."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -24,6 +25,7 @@ __all__ = [
     "Mounting",
     "Perturbation",
     "Place",
+    "day_key",
     "points_of",
     "read_frames",
 ]
@@ -35,16 +37,7 @@ _KIND: dict[type, str] = {Image: "camera", Sweep: "lidar", Scan: "radar"}
 
 @dataclass(frozen=True, eq=False)
 class Mounting:
-    """Where the sensors of a vehicle-day are, by one calibration.
-
-    Args:
-        source: the calibration in words, as "state of 2026-03-02".
-        reference: the sensor that poses refer to.
-        T: T_reference_sensor of each sensor whose pose is known, the reference too.
-        about: by sensor what is known of the pose in plain values: status, sigmas, axes kept at the prior.
-        T_base_reference: where the reference sits on the car; None where nobody knows.
-        left_out: why sensors have no pose here, by pair or sensor.
-    """
+    """Poses of the sensors of a vehicle-day by one calibration."""
 
     source: str
     reference: str
@@ -78,7 +71,7 @@ class Perturbation:
     per: str  # "frame" or "day": what has one draw
 
     def moved(self, mounting: Mounting, *names: str) -> dict[str, Float[np.ndarray, "4 4"]]:
-        """T_reference_sensor, moved; the same for the same names of vehicle, day and frame, whatever the order."""
+        """T_reference_sensor, moved by a draw that depends on vehicle, day and frame only."""
         out = {}
         for sensor, T in mounting.T.items():
             text = "\0".join((str(self.seed), *names, sensor))
@@ -105,12 +98,8 @@ class Frame:
     """One moment of a vehicle-day.
 
     Args:
-        partition: the vehicle-day.
         at: number, split and place.
-        moment: stamps and odometry.
-        captures: what each sensor measured, by name.
         seen: labels and boxes of cameras, by name.
-        mounting: the calibration.
         T: T_reference_sensor as it is given out, of these sensors.
         answer: the same as the calibration has it; None where `T` is that.
     """
@@ -127,8 +116,7 @@ class Frame:
     @property
     def key(self) -> str:
         """A name that no other frame has, without a dot."""
-        vehicle = self.partition.vehicle.replace(".", "-")
-        return f"{vehicle}_{self.partition.day}_{self.moment.moment:06d}"
+        return f"{day_key(self.partition)}_{self.moment.moment:06d}"
 
     @property
     def kinds(self) -> frozenset[str]:
@@ -137,12 +125,17 @@ class Frame:
 
     @property
     def T_odom_vehicle(self) -> Float[np.ndarray, "4 4"] | None:
-        """The car's pose at the moment by odometry; None where none was logged."""
+        """The car's pose at the moment by odometry, or None."""
         m = self.moment
         values = (m.ego_qw, m.ego_qx, m.ego_qy, m.ego_qz, m.ego_tx_m, m.ego_ty_m, m.ego_tz_m)
         if any(v is None for v in values):
             return None
         return from_quaternion(np.array(values[:4], np.float64), np.array(values[4:], np.float64))
+
+
+def day_key(partition: Partition) -> str:
+    """A name that no other vehicle-day has, without a dot: WebDataset ends a key at the first one."""
+    return f"{quote(partition.vehicle, safe=' ').replace('.', '%2E')}_{partition.day}"
 
 
 def points_of(capture: Sweep | Scan) -> Float32[np.ndarray, "N C"]:
@@ -162,10 +155,7 @@ def read_frames(
     mounting: Mounting,
     perturbation: Perturbation | None,
 ) -> Iterator[Frame | None]:
-    """Wanted frames of a vehicle-day in order, a row group of each sensor in memory at a time.
-
-    None stands for a frame that shows fewer than two of the sensors whose pose is known.
-    """
+    """Wanted frames of a vehicle-day in order; None for a frame with fewer than two posed sensors."""
     moments, sensors = [p.moment for p in places], list(mounting.T)
     seen = joined(lake, PERCEIVED, partition, sensors, moments)
     day = (partition.vehicle, partition.day)

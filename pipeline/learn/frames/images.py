@@ -1,4 +1,4 @@
-"""Images, labels and boxes as a camera without distortion would have them, for formats that know no other."""
+"""Images, labels and boxes of a camera without distortion, for formats that have none."""
 
 from __future__ import annotations
 
@@ -31,18 +31,14 @@ class Undistortion:
     )  # where in the image each pixel comes from; None: it has no distortion
 
     def pixels(self, data: bytes) -> UInt8[np.ndarray, "H W 3"]:
-        """An image, decoded; black where the camera saw nothing.
-
-        Raises:
-            ConfigError: it cannot be decoded.
-        """
+        """Decoded image, black where the camera saw nothing; raises ConfigError if it cannot be decoded."""
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         if image is None:
             raise ConfigError("lake", "images", "an image cannot be decoded")
         return image if self.maps is None else cv2.remap(image, *self.maps, cv2.INTER_LINEAR)
 
     def encoded(self, image: Image, suffix: str) -> bytes:
-        """An image as a file; as logged, byte for byte, where it is of that kind and has no distortion."""
+        """An image as a file; as logged, byte for byte, if it has that format and no distortion."""
         if self.maps is None and {"jpeg": ".jpg", "png": ".png"}[image.image_format] == suffix:
             return image.image
         options = [cv2.IMWRITE_JPEG_QUALITY, 95] if suffix == ".jpg" else [cv2.IMWRITE_PNG_COMPRESSION, 1]
@@ -60,7 +56,7 @@ class Undistortion:
         return cv2.imencode(".png", full)[1].tobytes()
 
     def boxes(self, found: ImageFeatureColumns) -> Boxes:
-        """Boxes about where the corners of the logged ones, and the middles of their sides, come to lie."""
+        """Boxes around the undistorted corners and edge centres of the logged ones."""
         told = zip(found.road_user_boxes_px, found.road_user_classes, found.road_user_scores, strict=True)
         moved = [(self._box(box), name, float(score)) for box, name, score in told]
         return [(box, name, score) for box, name, score in moved if box is not None]
@@ -82,11 +78,7 @@ class Undistortion:
 
 
 def undistortion_of(image: CameraColumns, sensor: str) -> Undistortion:
-    """How images of a camera become those of a pinhole camera; made once for equal intrinsics.
-
-    Raises:
-        ConfigError: the camera sees more than a plane can show.
-    """
+    """Maps to a pinhole camera, cached; raises ConfigError if the camera sees more than a plane shows."""
     c = camera_of(image)
     return _made(sensor, c.model, c.K.tobytes(), c.D.tobytes(), c.width_px, c.height_px)
 

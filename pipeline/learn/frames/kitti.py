@@ -1,7 +1,7 @@
 """Frames as a KITTI object folder: one camera, one lidar, up to one radar, with View-of-Delft's rows and V2X's line.
 
-Source: KITTI object development kit, readme (label_2: DontCare values of boxes without 3D; calib: row-major 3x4);
-View-of-Delft development kit (radar rows, pose); V2X-Radar (Tr_radar_to_velo).
+Source: KITTI object development kit, readme (label_2: DontCare values of boxes without 3D; calib: row-major
+3x4); View-of-Delft development kit (radar rows, pose); V2X-Radar (Tr_radar_to_velo).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pipeline.learn.frames.ego import T_root_sensor, compensated_range_rate
 from pipeline.learn.frames.facts import facts_of, to_json
 from pipeline.learn.frames.frame import Frame, points_of
 from pipeline.learn.frames.images import undistortion_of
-from pipeline.learn.frames.output import Output
+from pipeline.learn.frames.output import DayOutput, Output
 from pipeline.store.partitions import Partition
 from schemas.captures import Image, Scan, Sweep
 from schemas.training import SPLITS
@@ -31,16 +31,12 @@ _NO_3D = "-1 -1 -10 {box} -1 -1 -1 -1000 -1000 -1000 -10 {score:.4f}"
 class KittiWriter:
     """Writes training/FOLDER/NNNNNN.* of each frame; a frame without camera or lidar has no place in KITTI."""
 
-    def __init__(self, output: Output, stack: ExitStack) -> None:
+    def __init__(self, output: DayOutput, stack: ExitStack) -> None:
         del stack  # files are whole when they are written
         self._output = output
 
     def add(self, frame: Frame) -> None:
-        """Write a frame.
-
-        Raises:
-            ConfigError: the rig has several sensors of a kind, or a camera that cannot be undistorted.
-        """
+        """Write a frame; ConfigError if a kind has two sensors, or a camera is too wide."""
         names = _one_of_each(frame)
         name = f"{frame.at.number:06d}"
         camera, sweep = frame.captures[names["camera"]], frame.captures[names["lidar"]]
@@ -116,9 +112,10 @@ def finish_kitti(output: Output, days: Sequence[Partition]) -> None:
     names: dict[str, list[str]] = {split: [] for split in SPLITS}
     with output.replacing("frames.jsonl") as stream:
         for day in days:
-            parts = (output.done(day) or {"parts": {}})["parts"]
-            stream.writelines(to_json(row) + b"\n" for row in parts.get("frames", []))
-            for split in SPLITS:
-                names[split] += parts.get(split, [])
+            for part, row in output.rows(day):
+                if part == "frames":
+                    stream.write(to_json(row) + b"\n")
+                elif part in names:
+                    names[part].append(row)
     for split, own in names.items():
         output.write(f"ImageSets/{split}.txt", "".join(f"{name}\n" for name in sorted(own)).encode())

@@ -1,9 +1,11 @@
 """Frames as a nuScenes folder: tables in v1.0-boresight, files in samples; every frame is a sample.
 
-nuScenes' lidar looks along y, with x to the right. Its radar has a velocity vector: here what was measured, along the
-ray. Boxes are in nuImages' table object_ann, as nuScenes' own has boxes in space, which nobody measured here.
+nuScenes' lidar looks along y, with x to the right. Its radar has a velocity vector: here the measured
+component along the ray. Boxes are in nuImages' table object_ann, because they are boxes in images and
+nuScenes' own are in space.
 
-Source: nuscenes-devkit, docs/schema_nuscenes.md, docs/schema_nuimages.md, utils/data_classes.py, utils/splits.py.
+Source: nuscenes-devkit, docs/schema_nuscenes.md, docs/schema_nuimages.md, utils/data_classes.py,
+utils/splits.py.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from pipeline.learn.frames.ego import T_root_sensor, compensated_range_rate, pos
 from pipeline.learn.frames.frame import Frame
 from pipeline.learn.frames.images import undistortion_of
 from pipeline.learn.frames.nuscenes_tables import token_of
-from pipeline.learn.frames.output import Output
+from pipeline.learn.frames.output import DayOutput
 from schemas.captures import Image, Scan, Sweep
 
 __all__ = ["NuScenesWriter"]
@@ -37,15 +39,16 @@ _UNAMBIGUOUS = 3
 
 
 class NuScenesWriter:
-    """Writes files of samples as they come, and rows of tables for the end.
+    """Writes files and rows as frames come; a scene is one log, drive and split.
 
-    A scene is what one log, drive and split show in a row.
+    A row goes out when the next of its chain is known, which it names.
     """
 
-    def __init__(self, output: Output, stack: ExitStack) -> None:
+    def __init__(self, output: DayOutput, stack: ExitStack) -> None:
         del stack  # files are whole when they are written
         self._output = output
-        self._samples: list[dict[str, Any]] = []
+        self._count = 0  # samples of the scene that is open
+        self._last: dict[str, Any] = {}
         self._scene: tuple[Any, ...] = ()
         self._latest: dict[str, dict[str, Any]] = {}  # row of sample_data by channel
         self._known: set[str] = set()
@@ -61,33 +64,32 @@ class NuScenesWriter:
         if scene != self._scene:
             self.close()
             self._scene = scene
-        before = self._samples[-1] if self._samples else None
         sample = {
             "token": token_of("sample", frame.key),
             "timestamp": _us(frame.moment.stamp_ns),
             "scene_token": "",
-            "prev": "" if before is None else before["token"],
+            "prev": self._last.get("token", ""),
             "next": "",
         }
-        if before is None:
+        if not self._count:
             self._first = frame
-        else:
-            before["next"] = sample["token"]
         sample["scene_token"] = token_of("scene", self._first.key)
-        self._samples.append(sample)
-        self._output.list("sample", sample)
+        self._follow("sample", self._last, sample["token"])
+        self._last, self._count = sample, self._count + 1
         for name in frame.captures:
             self._sample_data(frame, name, str(sample["token"]))
 
     def close(self) -> None:
         """Write the scene that is open."""
-        if not self._samples:
+        if not self._count:
             return
+        for table, row in (("sample", self._last), *(("sample_data", row) for row in self._latest.values())):
+            self._follow(table, row, "")
         at, first = self._first.partition, self._first.key
         log = token_of("log", at.folder, self._first.moment.log)
         scene = {
-            "token": token_of("scene", first), "log_token": log, "nbr_samples": len(self._samples), "name": first,
-            "first_sample_token": self._samples[0]["token"], "last_sample_token": self._samples[-1]["token"],
+            "token": token_of("scene", first), "log_token": log, "nbr_samples": self._count, "name": first,
+            "first_sample_token": token_of("sample", first), "last_sample_token": self._last["token"],
             "description": f"{self._first.at.split}, {self._first.moment.log}, {self._first.at.environment}",
         }  # fmt: skip
         row = {
@@ -99,7 +101,12 @@ class NuScenesWriter:
         self._output.list("scene", scene)
         self._output.list(self._first.at.split, first)
         self._once("log", row | {"location": "unknown"})
-        self._samples, self._latest = [], {}
+        self._last, self._latest, self._count = {}, {}, 0
+
+    def _follow(self, table: str, row: dict[str, Any], following: Any) -> None:
+        """List a row, if there is one, with the token of the one that follows it."""
+        if row:
+            self._output.list(table, row | {"next": following})
 
     def _sample_data(self, frame: Frame, name: str, sample: str) -> None:
         capture, channel = frame.captures[name], _channel(frame, name)
@@ -107,21 +114,19 @@ class NuScenesWriter:
         if T_odom_ego is None:
             problem = "nuScenes needs the car's pose at each sample, and the logs have no odometry: take another format"
             raise SolveError(problem)
-        token, before = token_of("data", frame.key, channel), self._latest.get(channel)
+        token, before = token_of("data", frame.key, channel), self._latest.get(channel, {})
         data, suffix = _file(frame, name)
         path = f"samples/{channel}/{frame.key}{suffix}"
         self._output.put(path, data)
         row = {
             "token": token, "sample_token": sample, "ego_pose_token": token, "timestamp": _us(capture.stamp_ns),
             "calibrated_sensor_token": self._calibrated(frame, name, channel), "fileformat": suffix.strip("."),
-            "is_key_frame": True, "filename": path, "next": "", "prev": "" if before is None else before["token"],
+            "is_key_frame": True, "filename": path, "next": "", "prev": before.get("token", ""),
             "height": capture.image_height_px if isinstance(capture, Image) else 0,
             "width": capture.image_width_px if isinstance(capture, Image) else 0,
         }  # fmt: skip
-        if before is not None:
-            before["next"] = token
+        self._follow("sample_data", before, token)
         self._latest[channel] = row
-        self._output.list("sample_data", row)
         self._output.list(
             "ego_pose", {"token": token, "timestamp": _us(capture.stamp_ns)} | _pose(T_odom_ego)
         )

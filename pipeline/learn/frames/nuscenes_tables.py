@@ -1,6 +1,6 @@
-"""Tables of a nuScenes folder out of the rows that its vehicle-days hold, and its splits by scene.
+"""Tables of a nuScenes folder from the rows of its vehicle-days, and its splits by scene.
 
-Source: nuscenes-devkit, docs/schema_nuscenes.md, utils/splits.py (splits.json of one's own).
+Source: nuscenes-devkit, docs/schema_nuscenes.md, utils/splits.py (custom splits.json).
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _SHARED = {"sensor", "category"}
 
 
 def finish_nuscenes(output: Output, days: Sequence[Partition]) -> None:
-    """Write all tables, and the splits by scene; the rows of one vehicle-day are in memory at a time."""
+    """Write all tables, and the splits by scene; one row is in memory at a time."""
     splits: dict[str, list[str]] = {split: [] for split in SPLITS}
     logs: list[str] = []
     known: set[str] = set()  # of tables whose rows several days share
@@ -49,17 +49,15 @@ def finish_nuscenes(output: Output, days: Sequence[Partition]) -> None:
         }
         began = set[str]()
         for day in days:
-            parts = (output.done(day) or {"parts": {}})["parts"]
-            for split in SPLITS:
-                splits[split] += parts.get(split, [])
-            logs += [row["token"] for row in parts.get("log", [])]
-            for table in _TABLES:
-                for row in parts.get(table, []):
-                    if table in _SHARED and row["token"] in known:
-                        continue
-                    known |= {row["token"]} if table in _SHARED else set()
-                    streams[table].write((b",\n" if table in began else b"[\n") + to_json(row))
-                    began.add(table)
+            for table, row in output.rows(day):
+                if table in splits:
+                    splits[table].append(row)
+                if table not in streams or row["token"] in known:
+                    continue
+                known |= {row["token"]} if table in _SHARED else set()
+                logs += [row["token"]] if table == "log" else []
+                streams[table].write((b",\n" if table in began else b"[\n") + to_json(row))
+                began.add(table)
         streams["map"].write(b"[\n" + to_json({
             "token": token_of("map"), "log_tokens": logs, "category": "none", "filename": "maps/none.png",
         }))  # fmt: skip

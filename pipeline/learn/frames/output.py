@@ -1,43 +1,37 @@
-"""Where an export goes, a folder or a bucket: its files, what each vehicle-day has written, and the plan of all."""
+"""Destination of an export, a folder or a bucket: its files, the rows of each vehicle-day, the plan."""
 
 from __future__ import annotations
 
 import json
-from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import PurePath
 from typing import Any, BinaryIO
 
 from pipeline.learn.frames.facts import to_json
+from pipeline.learn.frames.frame import Place, day_key
 from pipeline.store.files import Files
 from pipeline.store.partitions import Lake, Partition
+from schemas.training import SPLITS
 
-__all__ = ["FRAMES_PER_SHARD", "Output"]
+__all__ = ["FRAMES_PER_SHARD", "DayOutput", "Output"]
 
 FRAMES_PER_SHARD = 128  # of a real car 100 to 250 MB: what loaders of shards advise
+_FOLDERS = ("training", "samples", "labels", *SPLITS)  # where formats put the files of frames
 
 
 @dataclass(frozen=True)
 class Output:
-    """The root of an export, and what one vehicle-day adds to its lists.
-
-    Args:
-        root: the folder, or the prefix of a bucket.
-        files: of either.
-        parts: rows by the list that they belong to: shards and names of each split, rows of tables.
-    """
+    """Root of an export: a folder, or a prefix of a bucket."""
 
     root: PurePath
     files: Files
-    parts: dict[str, list[Any]] = field(default_factory=dict)
 
     @classmethod
     def at(cls, location: str) -> Output:
-        """The export at a folder or at s3://BUCKET/PREFIX.
-
-        Raises:
-            ConfigError: no such place can be.
-        """
+        """The export at a folder or at s3://BUCKET/PREFIX; raises ConfigError if the place is invalid."""
         lake = Lake.at(location)
         return cls(lake.root, lake.files)
 
@@ -51,7 +45,7 @@ class Output:
             stream.write(data)
 
     def read(self, name: str) -> dict[str, Any] | None:
-        """A JSON file; None where there is none."""
+        """A JSON file, or None."""
         try:
             with self.files.opened(self.root / name) as stream:
                 found: dict[str, Any] = json.loads(stream.read())
@@ -59,30 +53,85 @@ class Output:
             return None
         return found
 
-    def put(self, name: str, data: bytes, of: str = "files") -> None:
-        """Write a file of a frame, which a later export of the same day may take away."""
-        self.write(name, data)
-        self.list(of, name)
+    def delete(self, name: str) -> None:
+        """Remove a file, if it exists."""
+        self.files.delete(self.root / name)
+
+    def done(self, partition: Partition) -> dict[str, Any] | None:
+        """Summary of a finished vehicle-day."""
+        return self.read(_of(partition, "done.json"))
+
+    def finish(self, partition: Partition, told: dict[str, Any]) -> None:
+        """Mark a vehicle-day as finished; before, none of its frames count."""
+        self.write(_of(partition, "done.json"), to_json(told))
+        self.delete(_of(partition, "begun.json"))
+
+    def rows(self, partition: Partition) -> Iterator[tuple[str, Any]]:
+        """Rows of a vehicle-day, each with the name of its list; one row is in memory."""
+        try:
+            with self.files.opened(self.root / _of(partition, "rows.jsonl")) as stream:
+                for line in stream:
+                    name, row = json.loads(line)
+                    yield name, row
+        except FileNotFoundError:
+            return
+
+    @contextmanager
+    def writing(self, partition: Partition, places: Sequence[Place]) -> Iterator[DayOutput]:
+        """Output of a vehicle-day in place of its earlier files; an error leaves none of the new ones."""
+        self._forget(partition)
+        numbers = [places[0].number, places[-1].number] if places else []
+        self.write(_of(partition, "begun.json"), to_json({"numbers": numbers}))
+        try:
+            with self.replacing(_of(partition, "rows.jsonl")) as stream:
+                yield DayOutput(self, stream)
+        except BaseException:
+            with suppress(OSError):  # the next run does it
+                self._forget(partition)
+            raise
+
+    def _forget(self, partition: Partition) -> None:
+        """Remove the files of a vehicle-day, finished or stopped anywhere. The marker goes first."""
+        self.delete(_of(partition, "done.json"))
+        for part, name in self.rows(partition):
+            if part == "files":
+                self.delete(name)
+        self.delete(_of(partition, "rows.jsonl"))
+        begun = self.read(_of(partition, "begun.json"))
+        if begun is not None:
+            self._sweep(partition, begun["numbers"])
+            self.delete(_of(partition, "begun.json"))
+
+    def _sweep(self, partition: Partition, numbers: Sequence[int]) -> None:
+        """Remove what a killed writer left: files that are called by the day's key or by its numbers."""
+        own = re.compile(re.escape(day_key(partition)) + r"[_-]\d{6,}")
+        for path in [p for folder in _FOLDERS for p in self.files.find(self.root / folder, "**/*")]:
+            stem = path.name.partition(".")[0]
+            of_number = stem.isdecimal() and numbers and numbers[0] <= int(stem) <= numbers[-1]
+            if of_number or own.fullmatch(stem):
+                self.files.delete(path)
+
+
+@dataclass(frozen=True)
+class DayOutput:
+    """Output of one vehicle-day: files, and rows that go to disk as they come."""
+
+    output: Output
+    stream: BinaryIO
+
+    def replacing(self, name: str) -> AbstractContextManager[BinaryIO]:
+        """A stream whose content becomes the file of that name as a whole."""
+        return self.output.replacing(name)
+
+    def put(self, name: str, data: bytes) -> None:
+        """Write a file of a frame."""
+        self.output.write(name, data)
+        self.list("files", name)
 
     def list(self, part: str, row: Any) -> None:
         """Add a row to one of the lists."""
-        self.parts.setdefault(part, []).append(row)
-
-    def done(self, partition: Partition) -> dict[str, Any] | None:
-        """What a finished vehicle-day says of itself."""
-        return self.read(_marker(partition))
-
-    def finish(self, partition: Partition, told: dict[str, Any]) -> None:
-        """Say that a vehicle-day is finished: until then nothing of it counts."""
-        self.write(_marker(partition), to_json(told))
-
-    def forget(self, partition: Partition) -> None:
-        """Take away what an earlier export wrote of a vehicle-day."""
-        before = self.done(partition)
-        self.files.delete(self.root / _marker(partition))
-        for name in [] if before is None else before["parts"].get("files", []):
-            self.files.delete(self.root / name)
+        self.stream.write(to_json([part, row]) + b"\n")
 
 
-def _marker(partition: Partition) -> str:
-    return f"days/{partition.folder}/done.json"
+def _of(partition: Partition, name: str) -> str:
+    return f"days/{partition.folder}/{name}"

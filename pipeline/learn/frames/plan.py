@@ -1,7 +1,8 @@
-"""Which frames of which vehicle-days go out and to which split; kept beside the export, so that later runs agree."""
+"""Frames of an export by vehicle-day and split, stored beside the export so that later runs agree."""
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -11,8 +12,8 @@ from pipeline.errors import ConfigError
 from pipeline.learn.frames.facts import to_json
 from pipeline.learn.frames.frame import Place
 from pipeline.learn.frames.output import Output
-from pipeline.learn.prepare.sides import frame_sides
-from pipeline.learn.prepare.stage import decided_sides
+from pipeline.learn.prepare.decided import SPLIT_SETTINGS, decided_sides
+from pipeline.learn.prepare.sides import frame_sides, settled_keys
 from pipeline.learn.prepare.survey import plan_days, survey_day
 from pipeline.results import Progress
 from pipeline.store.partitions import Lake, Partition
@@ -31,26 +32,28 @@ def plan_frames(
     output: Output,
     settings: Mapping[str, Any],
     progress: Progress,
-) -> Planned:
-    """Divide the frames of all days as `[prepare]` says; what an earlier run of this export decided stays decided.
+) -> tuple[Planned, dict[str, Any]]:
+    """Divide the frames of all days by `[prepare]`; splits of earlier runs and of table `training` stay.
 
-    Vehicles, days and places that the table `training` has given to a split keep it.
+    Returns the frames, and the settings of the export with those of its splits.
 
     Raises:
-        ConfigError: the place holds an export with other settings, or a split that is wanted is empty.
+        ConfigError: the export was begun with other settings, or a requested split is empty.
     """
     before = output.read(_FILE)
-    if before is not None and before["settings"] != settings:
-        changed = [n for n in settings if before["settings"].get(n) != settings[n]]
-        raise ConfigError("command line", "out", f"holds an export with another {', '.join(changed)}")
-    decided, first = decided_sides(lake, config), {}
     if before is not None:
-        decided = {(kind, value): side for kind, value, side in before["sides"]}
-        first = before["first"]
+        config = _as_begun(config, settings, before["settings"])
     surveys = []
     for done, day in enumerate(days):
         progress(done, len(days), f"{day.vehicle} {day.day}")
         surveys.append(survey_day(day, lake, config))
+    decided, first = {}, {}
+    if before is not None:
+        decided = {(kind, value): side for kind, value, side in before["sides"]}
+        first = before["first"]
+    else:
+        config = config.model_copy(update={"split_by": settled_keys(surveys, config, lake)})
+        decided = decided_sides(lake, config)
     plan = plan_days(surveys, config, decided)
     following = max((number + count for number, count in first.values()), default=0)
     planned: Planned = {}
@@ -71,12 +74,32 @@ def plan_frames(
         )
     _require_splits(config, planned)
     all_sides = sorted([kind, value, side] for (kind, value), side in (decided | dict(plan.sides)).items())
-    output.write(_FILE, to_json({"settings": dict(settings), "sides": all_sides, "first": first}))
-    return planned
+    whole = _with_split(settings, config)
+    output.write(_FILE, to_json({"settings": whole, "sides": all_sides, "first": first}))
+    return planned, whole
+
+
+def _as_begun(config: PrepareConfig, settings: Mapping[str, Any], begun: Mapping[str, Any]) -> PrepareConfig:
+    """The configuration with the keys of the export that was begun; ConfigError if anything else differs."""
+    if "split_by" not in config.model_fields_set:
+        config = config.model_copy(update={"split_by": tuple(begun["split"]["split_by"])})
+    now = _with_split(settings, config)
+    changed = [n for n in settings if begun.get(n) != now[n]]
+    changed += [f"[prepare] {n}" for n in SPLIT_SETTINGS if begun["split"][n] != now["split"][n]]
+    if changed:
+        raise ConfigError("command line", "out", f"holds an export with another {', '.join(changed)}")
+    return config
+
+
+def _with_split(settings: Mapping[str, Any], config: PrepareConfig) -> dict[str, Any]:
+    """The settings with those by which places get their names: other places of the same name would leak."""
+    split = {name: getattr(config, name) for name in SPLIT_SETTINGS}
+    whole: dict[str, Any] = json.loads(to_json({**settings, "split": split}))
+    return whole
 
 
 def _require_splits(config: PrepareConfig, planned: Planned) -> None:
-    """Raise ConfigError where a split that is asked for has no frame."""
+    """Raise ConfigError if a requested split has no frame."""
     counts = Counter(place.split for places, _ in planned.values() for place in places)
     shares = dict(zip(SPLITS, (1.0, config.val_fraction, config.test_fraction), strict=True))
     empty = [side for side, share in shares.items() if share > 0 and not counts[side]]

@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 
 from pipeline.learn.frames.facts import facts_of, to_json
 from pipeline.learn.frames.frame import LIDAR_FIELDS, RADAR_FIELDS, Frame, points_of
-from pipeline.learn.frames.output import FRAMES_PER_SHARD, Output
+from pipeline.learn.frames.output import FRAMES_PER_SHARD, DayOutput
 from schemas.captures import Image, Sweep
 
 __all__ = ["ShardWriter"]
@@ -29,7 +29,7 @@ class _Shard(Protocol):
 class ShardWriter:
     """Writes frames of a vehicle-day; one shard of each split is open at a time."""
 
-    def __init__(self, output: Output, stack: ExitStack, suffix: str) -> None:
+    def __init__(self, output: DayOutput, stack: ExitStack, suffix: str) -> None:
         self._output, self._stack, self._suffix = output, stack, suffix
         self._open: dict[str, tuple[_Shard, ExitStack]] = {}
         self._count: dict[str, int] = {}
@@ -68,7 +68,7 @@ class TarShard:
     """
 
     def __init__(self, stream: BinaryIO) -> None:
-        self._tar = tarfile.open(fileobj=stream, mode="w", format=tarfile.USTAR_FORMAT)  # noqa: SIM115 - `close`
+        self._tar = tarfile.open(fileobj=stream, mode="w", format=tarfile.GNU_FORMAT)  # noqa: SIM115 - `close`
 
     def add(self, frame: Frame) -> None:
         """Write the files of a frame, one after the other, as loaders need them."""

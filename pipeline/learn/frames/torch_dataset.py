@@ -24,7 +24,7 @@ class Frames(torch.utils.data.Dataset[dict[str, Any]]):
         return len(self.rows)
 
     def __getitem__(self, i: int) -> dict[str, Any]:
-        """What README.md says of a frame; of its sensors `points` [N x fields] or `image` and `labels_png`, coded."""
+        """A frame (see README.md): per sensor `points` [N x fields], or coded `image` and `labels_png`."""
         file, group = self.rows[i]
         [row] = pq.ParquetFile(file).read_row_group(group).to_pylist()
         frame: dict[str, Any] = json.loads(row["about"])

@@ -1,20 +1,20 @@
-"""From a network's answers on single frames to one pair's estimate with an honest covariance.
+"""One pair's estimate with its covariance from a network's answers on single frames.
 
-A network that has learned nothing returns its guess, and then all answers to one guess agree. So every frame gets a
-guess of its own: guesses are scattered on purpose, and a robust regression separates what the answers owe to the frame
-from what they owe to the guess:
+A network that has learned nothing returns its guess, and all answers to one guess then agree. Every frame
+therefore gets a guess of its own, and a robust regression separates the part of the answers that comes from
+the frame from the part that comes from the guess:
 
     answer_i = H x + (1 - H) guess_i + noise_i,
 
-with x the true pose; all poses are twists about a common centre. H is the gain: 1 where the network determines a
-degree of freedom, 0 where it repeats its guess. The day's estimate is the linear-Gaussian update of the prior by the
-measurement H x; where H is 0 the prior stays, value and sigma.
+with x the true pose; all poses are twists about a common centre. H is the gain: 1 where the network
+determines a degree of freedom, 0 where it repeats its guess. The day's estimate is the linear-Gaussian update
+of the prior by the measurement H x; where H is 0 the prior stays, value and sigma.
 
-The regression works on (bearing rotation, translation) in place of (rotation, translation). The bearing rotation of a
-twist is the rotation that, by least squares, turns the directions to points 15 to 40 m ahead as the twist does. A
-network that aligns directions makes up for a wrong translation by a rotation of about shift over distance; its bearing
-rotation is right all the same. So H is nearly diagonal in these coordinates, and few noisy frames suffice for it.
-Where the translation keeps its prior, the rotation follows from both.
+The regression uses (bearing rotation, translation) in place of (rotation, translation). The bearing rotation
+of a twist is the rotation that turns the directions to points 15 to 40 m ahead as the twist does, by least
+squares. A network that aligns directions compensates a wrong translation by a rotation of about shift over
+distance; its bearing rotation is right all the same. In these coordinates H is nearly diagonal, and few noisy
+frames suffice for it. Where the translation keeps its prior, the rotation follows from both.
 """
 
 from __future__ import annotations
@@ -101,16 +101,11 @@ def day_estimate(
     rng: np.random.Generator,
     unobservable: Bool[np.ndarray, " 6"] | None = None,
 ) -> PairEstimate:
-    """The pair's transform and covariance from the prior and all answers.
+    """Transform and covariance of a pair from the prior and all answers.
 
     Args:
-        pair: camera_lidar, camera_radar or lidar_radar.
-        answers: at scattered guesses.
-        T_prior: the prior.
-        prior_covariance: its covariance, left perturbation.
-        rng: draws the bootstrap's blocks.
-        unobservable: degrees of freedom that the sensors cannot tell, whatever the network answers: those of elevation
-            with a radar that measures none.
+        unobservable: degrees of freedom that the sensors cannot tell, whatever the network answers: those of
+            elevation with a radar that measures none.
     """
     S = _bearing_of_twist(answers.T_centre)
     twist_of_bearing = np.linalg.inv(S)
@@ -171,16 +166,12 @@ def measured_estimate(
     prior_covariance: Float[np.ndarray, "6 6"],
     frames: int,
 ) -> PairEstimate:
-    """What a fit of all frames under the prior says, once frames may err alike.
+    """Estimate of a pair from a fit of all frames under the prior, with an error common to all frames.
 
     Args:
-        pair: which.
         T: the peak of frames and prior together.
         information: of the frames alone, left twist; may be singular.
         bias_sigma: of what frames err by alike, (bearing rotation [rad], translation [m]).
-        T_prior: the prior.
-        prior_covariance: of it.
-        frames: that the fit rests on.
     """
     S = _bearing_of_twist(T)
     back = np.linalg.inv(S)
@@ -213,7 +204,7 @@ def measured_estimate(
 def mean_answer(
     answers: Answers, T_prior: Float[np.ndarray, "4 4"], prior_covariance: Float[np.ndarray, "6 6"]
 ) -> Float[np.ndarray, "4 4"]:
-    """The answers' mean without what they owe to their guesses; at most 3 prior sigmas from the prior."""
+    """The answers' mean without the part due to their guesses; at most 3 prior sigmas from the prior."""
     fit = _robust_regression(answers)
     from_prior = log_se3(exp_se3(fit.coefficients[0]) @ answers.T_centre @ inverse(T_prior))
     limit = _FARTHEST_SIGMAS * np.sqrt(np.diag(prior_covariance))
@@ -237,7 +228,7 @@ def _bearing_of_twist(T_centre: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "
 
 
 def _spread(pair: str, answers: Answers, draws: np.ndarray, ignored: np.ndarray) -> Float[np.ndarray, "6 6"]:
-    """Covariance of the mean answer: of the bootstrap, but no less than the network predicts, plus the bias."""
+    """Covariance of the mean answer: bootstrap, at least the network's prediction, plus the bias."""
     spread = np.cov(draws[:, 0].T)
     predicted = np.median(answers.variance, axis=0) / answers.frames
     bias = _bias_sigma(pair, answers)
@@ -296,7 +287,7 @@ def _solve(
 
 
 def _bootstrap(answers: Answers, fit: _Fit, rng: np.random.Generator) -> Float[np.ndarray, "S 7 6"]:
-    """Coefficients of days made of the same blocks drawn with replacement."""
+    """Coefficients of resampled days: blocks drawn with replacement."""
     blocks = [np.flatnonzero(answers.block == b) for b in np.unique(answers.block)]
     draws = np.empty((_RESAMPLES, 7, 6))
     for s in range(_RESAMPLES):

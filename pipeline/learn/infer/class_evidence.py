@@ -1,7 +1,7 @@
-"""What one frame says of camera-lidar at any pose: classes of lidar points on the camera's map of class likelihoods.
+"""Camera-lidar evidence of one frame at any pose: classes of lidar points on the camera's class likelihoods.
 
-A network looks at shifts of whole cells within one frame. Here the same maps and the same points are scored at a pose,
-with the score's gradient, so that all frames of a day can be asked about one pose at a time (`joint_fit`).
+A network looks at shifts of whole cells within one frame. This module scores the same maps and points at a
+pose, with the gradient of the score, so that `joint_fit` can use all frames of a day at one pose.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def scores(
 ) -> tuple[Float[np.ndarray, "F E"], Float[np.ndarray, "F E 6"]]:
     """Mean expected log-likelihood of each frame's points by kind of evidence, and its gradient.
 
-    The gradient is by a twist on the left (per rad, per m). All frames have the same kinds.
+    The gradient is by a left twist (per rad, per m). All frames have the same kinds.
     """
     kinds = frames[0].kinds
     value, gradient = np.zeros((len(frames), kinds[-1] + 1)), np.zeros((len(frames), kinds[-1] + 1, 6))
@@ -75,7 +75,7 @@ def _score(points, probability, worth, maps, T, limits, kinds, value, gradient):
             value[0] += w * _BEHIND
             continue
         flat = np.sqrt(x * x + z * z)
-        # Values stand at the centres of cells; beyond the outer ones goes on what stands there.
+        # Values are at the centres of cells; beyond the outer ones the border value continues.
         row = (limits[0] - np.arctan(-y / flat)) / cell - 0.5
         column = (limits[1] - np.arctan(-x / z)) / cell - 0.5
         row_in, column_in = min(max(row, 0.0), height - 1.0), min(max(column, 0.0), width - 1.0)

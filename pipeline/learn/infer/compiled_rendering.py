@@ -1,4 +1,4 @@
-"""One frame's sensors through a guess without torch: what `network.views.render` does, compiled, for inference."""
+"""One frame's sensors at a guess without torch: compiled version of `network.views.render`, for inference."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class FrameSensors:
         return np.concatenate([self.camera, classes])[None]
 
     def without_image(self) -> FrameSensors:
-        """The same with a grey image: what is seen is known, and nothing of its colours."""
+        """A copy with a grey image: visibility stays, colours are removed."""
         camera = self.camera.copy()
         camera[:-1] = 0
         return replace(self, camera=camera)
@@ -73,15 +73,10 @@ class FrameSensors:
 def frame_sensors(
     row: TrainingRow, grid: Grid, classes: Float32[np.ndarray, "C H W"] | None = None
 ) -> FrameSensors:
-    """Inputs from a row of table `training` (see `frame_sample.make_row`), whose grid contains the network's.
+    """Inputs from a row of table `training`; raises ValueError if its grid does not contain the network's.
 
-    Args:
-        row: one frame.
-        grid: the network's.
-        classes: what a segmenter says of the grid (`camera_maps.class_likelihood`); None where there is none.
-
-    Raises:
-        ValueError: cells of another size, or a grid that does not contain the network's.
+    `classes` is the likelihood of a segmenter's classes on the grid (`camera_maps.class_likelihood`), or
+    None.
     """
     shape = (row.grid_height, row.grid_width)
     part = grid.window(shape, row.grid_step_deg)

@@ -1,4 +1,4 @@
-"""What a vehicle-day asks of a network: one frame and a guess in, transforms with their variances out."""
+"""Interface of a network to a vehicle-day: from one frame and a guess to transforms with variances."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class FrameNetwork(Protocol):
 
     @property
     def composed(self) -> bool:
-        """True where it composes camera_radar of the other two pairs before it corrects it."""
+        """True if camera_radar is the product of the other two pairs before its correction."""
         ...
 
     @property
@@ -47,11 +47,11 @@ class FrameNetwork(Protocol):
         ...
 
     def sensors(self, frame: Frame, observation: Observation, prior: Prior) -> Any:
-        """What `answer` needs of a frame; raises SampleRejectedError where the frame shows too little."""
+        """Inputs of `answer` from a frame; raises SampleRejectedError if it shows too little."""
         ...
 
     def evidence(self, sensors: Any, T_camera_lidar: np.ndarray) -> FrameEvidence | None:
-        """What camera and lidar are matched by, points chosen through a guess; None where the network does not say."""
+        """Matching evidence of camera and lidar, points chosen at a guess; None if the network returns none."""
         ...
 
     def answer(self, sensors: Any, guess: Mapping[str, np.ndarray]) -> FrameAnswer:

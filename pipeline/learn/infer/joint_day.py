@@ -1,4 +1,4 @@
-"""Camera-lidar of a vehicle-day by all frames together: candidates, the vote, the climb, and what it is worth."""
+"""Camera-lidar of a vehicle-day from all frames together: candidates, vote, climb, covariance."""
 
 from __future__ import annotations
 
@@ -58,13 +58,12 @@ def fitted_day(
     candidates: Sequence[Float[np.ndarray, "4 4"]],
     prior: Prior,
 ) -> JointDay | None:
-    """Vote, climb, and choose points anew until the fit stands; None where the network shows no evidence.
+    """Vote, climb and choose points anew until the fit is stable; None if the network shows no evidence.
 
     Args:
         evidence: of all frames, points chosen through a pose.
-        block: scene of each frame.
-        candidates: poses that rounds and single frames found; the first ones are on no better footing than others.
-        prior: of the day.
+        candidates: poses that rounds and single frames found; the first ones are on no better footing than
+            others.
     """
     T_prior, covariance = prior.of("camera_lidar"), prior.covariance("camera_lidar")
     frames = evidence(candidates[-1])

@@ -1,12 +1,13 @@
-"""Camera-lidar of a day from all its frames at once: where the classes of all sweeps fit all images best.
+"""Camera-lidar of a day from all its frames at once: the pose at which all sweeps' classes fit the images.
 
-A frame alone tells rotation to half a degree and hardly any shift, and sometimes it fits in two places. The sum over
-frames has one peak: wrong places of single frames do not meet, and near and far points tell the shift by parallax.
-Poses that pilot frames answered are candidates, all frames vote among them, and the winner climbs the sum.
+A single frame determines rotation to half a degree and hardly any shift, and sometimes it fits in two places.
+The sum over frames has one peak: wrong places of single frames differ, and near and far points determine the
+shift by parallax. Candidates are the poses of pilot frames; all frames vote among them, and the best one
+climbs the sum.
 
-Points of a frame are not independent, so the sum is no likelihood. What it is worth is read off the day, for each kind
-of evidence (classes, edges on boundaries, paint): a likelihood's curvature is the scatter of its gradient from scene to
-scene (Pauli, Racugno and Ventura 2011).
+Points of a frame are not independent, so the sum is no likelihood. Its weight is measured on the day, for
+each kind of evidence (classes, edges on boundaries, paint): a likelihood's curvature is the scatter of its
+gradient from scene to scene (Pauli, Racugno and Ventura 2011).
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ APART_RAD = np.radians(0.5)  # a candidate farther away may lie on another peak
 
 @dataclass(frozen=True, eq=False)
 class JointFit:
-    """Where prior and frames together have their peak, and how well they know it (left twist [rad, m])."""
+    """Peak of prior and frames together, with its covariance (left twist [rad, m])."""
 
     T: Float[np.ndarray, "4 4"]
     information: Float[np.ndarray, "6 6"]  # of the frames alone
@@ -59,7 +60,7 @@ def climbed(
     prior_covariance: Float[np.ndarray, "6 6"],
     worth: float | Float[np.ndarray, " E"] = _FIRST_WORTH,
 ) -> Float[np.ndarray, "4 4"]:
-    """The peak above a start, of the frames and the prior together; `worth` is of each kind of evidence."""
+    """Peak above a start, of frames and prior together; `worth` weights each kind of evidence."""
     precision = np.linalg.inv(prior_covariance)
 
     def cost(step: np.ndarray) -> tuple[float, np.ndarray]:
@@ -81,22 +82,14 @@ def fit_of(
     T_prior: Float[np.ndarray, "4 4"],
     prior_covariance: Float[np.ndarray, "6 6"],
 ) -> JointFit:
-    """Climb from a start and tell how well the place of the peak is known.
-
-    Args:
-        frames: of the day, made near the start.
-        block: scene of each frame; frames of one scene err alike.
-        T_start: on the slope of the right peak.
-        T_prior: see `climbed`.
-        prior_covariance: likewise.
-    """
+    """Climb from `T_start`, and estimate the sigma of the peak; frames of one `block` (scene) err alike."""
     T, worth = T_start, np.full(frames[0].kinds[-1] + 1, _FIRST_WORTH)
     for _ in range(2):
         T = climbed(frames, T, T_prior, prior_covariance, worth)
         H, gradient = _curvature(frames, T), scores(frames, T)[1]
         common = _worth(H.sum(0), _scatter(gradient.sum(1), block)) or _FIRST_WORTH
         own = np.array([_worth(H[e], _scatter(gradient[:, e], block)) for e in range(len(worth))])
-        # Halfway between what each shows and what all show: of few scenes one kind may seem sure by chance.
+        # Mean of each kind and of all: with few scenes one kind may seem certain by chance.
         share = np.sqrt(own / common)
         together = _scatter(np.einsum("e,fei->fi", share, gradient), block)
         # Kinds of one scene err together too.
@@ -119,7 +112,7 @@ def rival_score(
 
 
 def _worth(H: np.ndarray, J: np.ndarray) -> float:
-    """Curvature over the gradient's scatter, mean over the directions in which the sum is curved; 0 where none is."""
+    """Curvature over the gradient's scatter, mean over curved directions; 0 if there are none."""
     values, vectors = np.linalg.eigh(H * np.outer(_UNIT, _UNIT))
     curved = (values > _LEAST_CURVED * values[-1]) & (values > 0)
     scatter = np.einsum("ik,ij,jk->k", vectors, J * np.outer(_UNIT, _UNIT), vectors)
@@ -141,7 +134,7 @@ def _curvature(frames: Sequence[FrameEvidence], T: np.ndarray) -> Float[np.ndarr
 
 
 def _positive_part(M: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"]:
-    """Of a symmetric matrix of twists: negative eigenvalues of a curvature are what no frame tells."""
+    """Symmetric matrix without its negative eigenvalues, which carry no information."""
     values, vectors = np.linalg.eigh(M * np.outer(_UNIT, _UNIT))
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T / np.outer(_UNIT, _UNIT))
 

@@ -37,12 +37,12 @@ _NOBODY = About("", "", "", "", "", "")
 
 
 def model_files(method: str, fleet: FleetConfig) -> dict[str, Path]:
-    """Files of a method's networks by what they estimate: those of fleet.toml, else those that are shipped.
+    """Files of a method's networks by pairs: those of fleet.toml, else the shipped ones.
 
-    Of shipped networks the one that takes classes comes first, but for fleets that want images alone.
+    The shipped network with classes comes first, unless the fleet asks for images alone.
 
     Raises:
-        ConfigError: a file is missing; the message says which key names another.
+        ConfigError: a file is missing; the message has the key that names another.
     """
     config = fleet.learn
     if method == "joint-ssl":
@@ -74,10 +74,10 @@ def models_key(files: Mapping[str, Path]) -> str:
 def open_networks(
     files: Mapping[str, Path], config: LearnConfig, prepare: PrepareConfig
 ) -> list[OnnxNetwork]:
-    """The networks, ready to be asked; together they estimate each pair once.
+    """The networks, loaded; together they estimate each pair once.
 
     Raises:
-        ModelError: a file is no network, or estimates another pair than it was named for.
+        ModelError: a file is no network, or estimates another pair than its name.
     """
     rows = _LastRow()
     networks = [OnnxNetwork(path, config, prepare, rows) for path in files.values()]
@@ -113,11 +113,7 @@ class OnnxNetwork:
         return self._calibrator.config.composed
 
     def sensors(self, frame: Frame, observation: Observation, prior: Prior) -> FrameSensors:
-        """The frame as the network takes it, with the classes of its labels where it takes some and there are any.
-
-        Raises:
-            SampleRejectedError: the frame shows too little.
-        """
+        """The network's inputs from a frame; raises SampleRejectedError if it shows too little."""
         row = self._rows.of(frame, observation, prior, self._prepare)
         classes, sees = None, self._camera != "classes"
         if self._calibrator.config.takes_classes and self._camera != "image" and observation.labels_png:
@@ -127,15 +123,11 @@ class OnnxNetwork:
         return sensors if sees or classes is None else sensors.without_image()
 
     def evidence(self, sensors: FrameSensors, T_camera_lidar: np.ndarray) -> FrameEvidence | None:
-        """What camera and lidar are matched by; None where the file does not say."""
+        """Matching evidence of camera and lidar; None if the file has no such output."""
         return self._calibrator.evidence(sensors, T_camera_lidar)
 
     def answer(self, sensors: FrameSensors, guess: Mapping[str, np.ndarray]) -> FrameAnswer:
-        """The last pass's transforms.
-
-        Raises:
-            ModelError: the file wants other inputs than this version renders.
-        """
+        """Transforms of the last pass; raises ModelError for inputs that this version does not render."""
         three = (guess["camera_lidar"], guess["lidar_radar"], guess["camera_radar"])
         try:
             last = self._calibrator.estimate(sensors, *three, self._iterations)[-1]
@@ -164,11 +156,7 @@ class _LastRow:
 
 
 def _bias_of_card(path: Path, card: str) -> dict[str, np.ndarray]:
-    """`bias_sigma` of a card: by pair, three angles [deg] and three shifts [m].
-
-    Raises:
-        ModelError: something else stands there.
-    """
+    """`bias_sigma` of a card: by pair, three angles [deg] and three shifts [m]; else ModelError."""
     try:
         given = json.loads(card).get("bias_sigma", {})
         found = {pair: np.array(values, np.float64) for pair, values in given.items()}

@@ -1,7 +1,7 @@
 """Single-frame inference with onnxruntime: render at the guess, compute, correct, up to three times. No torch.
 
-No semantics are needed either: what the encoders know is in the file; those that take classes use them where there are
-some. What the camera alone decides is computed once (`split_graph`).
+No semantics are needed; networks with a class input use them if the frame has some. The part of the graph
+that depends on the camera alone is computed once (`split_graph`).
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ _ANSWERS = ["corrections", "log_variance"]
 
 @dataclass(frozen=True, eq=False)
 class FrameEstimate:
-    """Extrinsics from one frame after one pass, and how sure the network is of them.
+    """Extrinsics from one frame after one pass, with the network's variances.
 
-    `log_variance` has rows as PAIRS, columns a twist on the left (rotation vector [rad], translation [m]); pairs
-    that the network does not estimate keep their guess, and `estimated` does not name them.
+    `log_variance` has a row per pair of PAIRS and a column per component of a left twist (rotation vector
+    [rad], translation [m]). Pairs that are not in `estimated` keep their guess.
     """
 
     T_camera_lidar: Float[np.ndarray, "4 4"]
@@ -55,15 +55,7 @@ class FrameEstimate:
 
 
 class SingleFrameCalibrator:
-    """A model file, ready to run.
-
-    Args:
-        path: file of `boresight export onnx`.
-        threads: that one pass may use.
-
-    Raises:
-        ModelError: the file is no such model.
-    """
+    """A model file of `boresight export onnx`, loaded; raises ModelError if it is no such file."""
 
     def __init__(self, path: Path, threads: int = 1) -> None:
         try:
@@ -92,12 +84,9 @@ class SingleFrameCalibrator:
         T_camera_radar: Float[np.ndarray, "4 4"] | None = None,
         iterations: int = 3,
     ) -> list[FrameEstimate]:
-        """Estimates after each pass, each rendered where the one before turned to (as `CalibrationNetwork.refine`).
+        """Estimates after each pass, rendered at the last rotation (`CalibrationNetwork.refine`).
 
         Args:
-            sensors: one frame.
-            T_camera_lidar: the guess.
-            T_lidar_radar: the guess.
             T_camera_radar: the guess; the product of the other two where left out.
             iterations: passes; two for guesses within 3 deg, three beyond.
         """
@@ -119,7 +108,7 @@ class SingleFrameCalibrator:
     def evidence(
         self, sensors: FrameSensors, T_camera_lidar: Float[np.ndarray, "4 4"]
     ) -> FrameEvidence | None:
-        """What the frame is matched by, its points chosen through a guess; None: the file does not put it out."""
+        """Matching evidence, points chosen at a guess; None if the file has no such output."""
         if self._evidence is None:
             return None
         away = np.eye(4)  # of the radar, which has no part in it
@@ -138,7 +127,7 @@ class SingleFrameCalibrator:
         )
 
     def _of_camera(self, sensors: FrameSensors) -> dict[str, np.ndarray]:
-        """What the camera alone decides, by name."""
+        """Outputs that depend on the camera alone, by name."""
         if self._once is None:
             return {}
         values = self._once.run(None, {"camera": sensors.camera_channels(self._channels)})
@@ -155,11 +144,7 @@ class SingleFrameCalibrator:
 
 
 def config_from_metadata(path: Path, metadata: Mapping[str, str]) -> NetworkConfig:
-    """The configuration that a file was built with.
-
-    Raises:
-        ModelError: the file does not say.
-    """
+    """Configuration that a file was built with; raises ModelError if its metadata lack it."""
     try:
         values = json.loads(metadata["network"])
         if tuple(json.loads(metadata["pairs"])) != PAIRS:
@@ -170,7 +155,7 @@ def config_from_metadata(path: Path, metadata: Mapping[str, str]) -> NetworkConf
 
 
 def _evidence_session(model: onnx.ModelProto, threads: int) -> onnxruntime.InferenceSession | None:
-    """A session of what frames are matched by; None for files that do not name it, as none did before 0.12."""
+    """Session for the matching evidence; None for files without it (before 0.12)."""
     if not {o.name for o in model.graph.output}.issuperset(EVIDENCE):
         return None
     cut = onnx.utils.Extractor(onnx.shape_inference.infer_shapes(model, data_prop=True))

@@ -1,7 +1,7 @@
-"""A graph cut in two: what depends on the camera alone, and what depends on the guess.
+"""A graph cut in two: the part that depends on the camera alone, and the part that depends on the guess.
 
-A frame is refined over several passes, and its image is the same in all of them. Where to cut is read off the graph,
-so files of any version gain by it.
+A frame is refined over several passes, and its image is the same in all of them. The cut is found from the
+graph, so it works on files of any version.
 """
 
 from __future__ import annotations
@@ -18,16 +18,7 @@ __all__ = ["split_graph"]
 def split_graph(
     model: onnx.ModelProto, fixed: str, answers: Sequence[str]
 ) -> tuple[onnx.ModelProto | None, onnx.ModelProto]:
-    """Two models that together put out `answers`: the second takes what the first puts out, under the same names.
-
-    Args:
-        model: checked, its nodes in topological order.
-        fixed: the input that stays the same over passes.
-        answers: outputs that are wanted.
-
-    Returns:
-        What `fixed` alone decides (None where that is nothing), and the rest.
-    """
+    """Two models that together compute `answers`: the part of input `fixed` alone (or None), the rest."""
     others = [i.name for i in model.graph.input if i.name != fixed]
     first, passed_on = _crossing(model.graph, fixed, others)
     cut = onnx.utils.Extractor(onnx.shape_inference.infer_shapes(model, data_prop=True))

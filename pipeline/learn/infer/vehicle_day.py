@@ -35,7 +35,7 @@ _BLOCKS = 8  # of the bootstrap, at least
 _GUESSES_OF_ONE_FRAME, _FEWEST_GUESSES = 16, 8  # a regression on fewer answers has no scatter
 _STARTS_OF_ONE_FRAME, _SEARCH_ROUNDS = 12, 2  # as many passes as pilot frames take, spread over the prior
 _HALVES_SIGMAS = 4.0  # beyond it two halves of a day disagree
-# Degrees of freedom that only elevations tell: unobservable with a radar that measures none.
+# Degrees of freedom that need elevations: unobservable with a radar that measures none.
 _BY_ELEVATION = {
     "camera_lidar": np.zeros(6, bool),
     "camera_radar": np.array([1, 0, 1, 0, 1, 0], bool),
@@ -58,13 +58,7 @@ def solve_by_networks(
 
     Args:
         observations: selected frames per pair; each is used for all pairs.
-        prior: start, and what stays where the networks know nothing.
         networks: together they estimate each pair once.
-        frames: the day's frames.
-        method: name of the solution.
-        seed: of guesses and bootstrap.
-        triggered: pairs to estimate.
-        progress: called for every frame.
 
     Raises:
         SolveError: too few frames can be shown to the networks.
@@ -104,10 +98,10 @@ def single_frame_solution(
     method: str,
     seed: int,
 ) -> Solution:
-    """The same from one frame: its answers at many guesses, with no less than the variance that the network predicts.
+    """Solution from one frame: its answers at many guesses, with at least the predicted variance.
 
     Raises:
-        SolveError: the frame cannot be shown to the networks.
+        SolveError: the network rejects the frame.
     """
     try:
         sensors = [n.sensors(frame, observation, prior) for n in networks]
@@ -127,9 +121,9 @@ def single_frame_solution(
 
 
 def _searched(asked: _Asked, rng: np.random.Generator) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Where searches from all over the prior end on one frame: by pair their median, and each end.
+    """Ends of searches from starts all over the prior on one frame: by pair their median, and each end.
 
-    From guesses near each other a frame that looks alike from several places ends in one of them; only far ones tell.
+    Only far starts show that a frame fits in several places: near ones all end in the same place.
     """
     prior, networks = asked.prior, asked.networks
     starts = _scattered(_STARTS_OF_ONE_FRAME, rng, prior.rotation_sigma_rad, prior.translation_sigma_m)
@@ -173,9 +167,9 @@ def _asked_day(
     rng: np.random.Generator,
     progress: Progress,
 ) -> tuple[_Asked, dict[str, Answers], Counter[str], JointDay | None]:
-    """Prepare all frames, iterate the guess on pilot frames, fit camera-lidar to all, ask about all.
+    """Prepare all frames, iterate the guess on pilot frames, fit camera-lidar to all frames, run all frames.
 
-    Also counts rejected frames by reason. The fit is None where no network says what it matches.
+    Also counts rejected frames by reason. The fit is None if no network returns its evidence.
     """
     chosen = _chosen(observations)
     rejected: Counter[str] = Counter()
@@ -203,7 +197,7 @@ def _asked_day(
 
 
 def _fitted_together(asked: _Asked, candidates: Sequence[np.ndarray]) -> JointDay | None:
-    """Camera-lidar by all frames at once, where a network says what it matches."""
+    """Camera-lidar by all frames at once, if a network returns its evidence."""
     which = next((i for i, n in enumerate(asked.networks) if "camera_lidar" in n.pairs), None)
     if which is None:
         return None
@@ -228,7 +222,7 @@ def _chosen(observations: Mapping[str, Sequence[Observation]]) -> list[Observati
 def _pilot_centre(asked: _Asked, rng: np.random.Generator) -> tuple[dict[str, np.ndarray], list[np.ndarray]]:
     """Iterate the guess on pilot frames until it moves less than 0.3 deg: answers are best near the truth.
 
-    Also returns where camera-lidar was by each round and by each pilot frame's own answers.
+    Also returns candidates for camera-lidar: the centre of each round and the answer of each pilot frame.
     """
     count, prior = len(asked.sensors), asked.prior
     centre = {pair: prior.of(pair) for pair in PAIRS}
@@ -303,7 +297,7 @@ def _guess(
 
 
 def _blocks(drives: Sequence[int]) -> Int[np.ndarray, " N"]:
-    """Blocks of the bootstrap: drives, or equal stretches of the day where there are too few of them."""
+    """Blocks of the bootstrap: drives, or equal parts of a day with too few drives."""
     if len(set(drives)) >= _BLOCKS:
         return np.array(drives)
     return np.arange(len(drives)) * _BLOCKS // max(len(drives), 1)

@@ -2,10 +2,11 @@
 
 A network finds the radar's elevation by where detections lie among the lidar's objects. With a radar whose elevations
 are noisier than scenes are tall that is off by a degree and more, alike in every frame, and no averaging shows it. The
-velocity by Doppler and the road (`pipeline.objective.radar.travel`) need no match. So a day's answer is updated by the
-way's, by information. Where the two are farther apart than their sigmas allow, the network gives way: its part of the
-pitch is weighed as Cauchy's distribution has it, the way's is not. That asymmetry is deliberate. The way's sigma comes
-from this day's own frames, the network's bias from vehicles that it was judged on before.
+velocity by Doppler and the road (`pipeline.objective.radar.travel`) need no match. What the radar sees too low turns it
+too, and a day's sigma holds that. So a day's answer is updated by the way's, by information. Where the two are farther
+apart than their sigmas allow, the network gives way: its part of the pitch is weighed as Cauchy's distribution has it,
+the way's is not. That asymmetry is deliberate. The way's sigma comes from this day's own frames, the network's bias
+from vehicles that it was judged on before.
 
 Only the radar's turn about one axis is updated, its position stays; all else is considered (Schmidt 1966).
 """
@@ -22,8 +23,8 @@ from pipeline.extrinsics.common_share import common_part
 from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
 from pipeline.geometry.se3 import exp_so3, inverse, log_se3
 from pipeline.learn.infer.aggregate import OBSERVABLE
+from pipeline.objective.radar.heights import displaced_heights
 from pipeline.objective.radar.travel import (
-    DOPPLER_PITCH_FLOOR_RAD,
     TravelDirections,
     pitch_equations,
     pitch_residuals,
@@ -50,7 +51,7 @@ class WayTurn:
     axis: Float[np.ndarray, " 3"]  # unit vector
     turn_rad: float  # from the pose that was asked about
     variance: float  # of this day's frames, without the floor
-    floor: float  # variance of what all days err by alike
+    floor: float  # variance of what all frames err by alike
     frames: int
 
     @property
@@ -112,7 +113,16 @@ def way_turn(observations: Sequence[Observation], T_lidar_radar: Float[np.ndarra
         turn_rad -= float(gradient.sum() / information)
     blocks = np.unique([o.drive for o in observations], return_inverse=True)[1].ravel()
     between = float(np.square(np.bincount(blocks, gradient)).sum()) / information**2
-    return WayTurn(axis, turn_rad, max(1 / information, between), DOPPLER_PITCH_FLOOR_RAD**2, travel.count)
+    floor = _floor(observations, _turned(T_lidar_radar, axis * turn_rad))
+    return WayTurn(axis, turn_rad, max(1 / information, between), floor, travel.count)
+
+
+def _floor(observations: Sequence[Observation], T_lidar_radar: Float[np.ndarray, "4 4"]) -> float:
+    """Variance that what is seen too low leaves, at the pose that the way asks for."""
+    travel = travel_directions(observations, T_lidar_radar, 0.0)
+    heights = displaced_heights(observations, T_lidar_radar, 0.0, np.random.default_rng(0))
+    share = 0.0 if heights is None or not travel.count else heights.seen_low(travel.below)
+    return travel.bias_rad(share) ** 2
 
 
 def _frame_turn(travel: TravelDirections, T_lidar_radar: Float[np.ndarray, "4 4"]) -> WayTurn | None:
@@ -121,7 +131,7 @@ def _frame_turn(travel: TravelDirections, T_lidar_radar: Float[np.ndarray, "4 4"
     residual, J = pitch_residuals(travel, T_lidar_radar)
     axis = -np.append(J[0, :2], 0.0) / np.linalg.norm(J[0, :2])
     variance = float(travel.sigma_rad[0] ** 2) + _FRAME_SCATTER_RAD**2
-    return WayTurn(axis, float(residual[0]), variance, DOPPLER_PITCH_FLOOR_RAD**2, 1)
+    return WayTurn(axis, float(residual[0]), variance, travel.bias_rad(0.0) ** 2, 1)
 
 
 def updated_by_way(

@@ -1,7 +1,8 @@
-"""The networks: sensor data and a guess in, better extrinsics and their log variances out.
+"""The networks: from sensor data and a guess to corrected extrinsics and their log variances.
 
-`matching` computes correspondences explicitly and learns what classes look like, how sharp evidence is, and residuals;
-`concat` is the paper's: encode, concatenate, fuse, regress. Both come for all pairs at once (joint) or for one alone.
+`matching` computes correspondences explicitly and learns the appearance of classes, the sharpness of
+evidence, and residuals. `concat` is the paper's: encode, concatenate, fuse, regress. Both exist for all pairs
+(joint) or one pair.
 """
 
 from __future__ import annotations
@@ -47,16 +48,17 @@ class CalibrationNetwork(nn.Module):
         return self._predictions(inputs, self.core(view), index)
 
     def encode(self, inputs: NetworkInputs) -> Predictions:
-        """Class logits alone, at the guess: what teaches the encoders of `matching`."""
+        """Class logits alone, at the guess: training signal of the encoders of `matching`."""
         assert isinstance(self.core, MatchingCore)
         view, index = self._render(inputs)
         return self._predictions(inputs, self.core.encode(view), index)
 
     def refine(self, inputs: NetworkInputs, iterations: int) -> list[Predictions]:
-        """Several passes with the same weights, each rendered where the last one turned to; the camera is encoded once.
+        """Several passes with the same weights, each rendered at the last rotation; the camera is encoded once.
 
-        Only turns are handed on: one frame tells little of a shift, and what it tells by mistake would add up over
-        passes. Every answer holds its own pass's shift. Gradients do not flow from one pass into the one before.
+        Only rotations are handed on: one frame hardly determines a shift, and errors of shifts would add up
+        over passes. Every answer holds the shift of its pass. Gradients do not flow from one pass into the
+        one before.
         """
         found: list[Predictions] = []
         likelihood: Tensor | None = None
@@ -118,8 +120,8 @@ def compose(
 ) -> tuple[Float[Tensor, "B 4 4"], Float[Tensor, "B 4 4"], Float[Tensor, "B 4 4"]]:
     """Corrected transforms (camera-lidar, camera-radar, lidar-radar).
 
-    With `composed` the camera-radar correction stands on the other two's product instead of on the guess: radar is
-    matched to the lidar six times better than to the image.
+    With `composed` the camera-radar correction is applied to the product of the other two instead of to the
+    guess: radar is matched to the lidar six times better than to the image.
     """
     camera_lidar = corrections[:, 0] @ T_camera_lidar
     lidar_radar = corrections[:, 2] @ T_lidar_radar
@@ -128,7 +130,7 @@ def compose(
 
 
 def build_network(config: NetworkConfig, seed: int = 0) -> CalibrationNetwork:
-    """A fresh network; the same seed gives the same weights, whatever else used torch's generator."""
+    """A fresh network; the same seed gives the same weights, independent of torch's generator."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return CalibrationNetwork(config)

@@ -1,11 +1,11 @@
-"""Where does a cloud of classified points fit into an image of class likelihoods? Correlation, coarse to fine.
+"""The pose at which classified points fit an image of class likelihoods best: correlation, coarse to fine.
 
-Every point looks up the log-likelihood of its classes around the cell it falls into. Summed over points, that gives
-a surface over shifts; strips of azimuth see a roll as shifts of opposite sign in elevation, near and far points see a
-translation as different shifts. Rotations are found level by level and applied to the points themselves, so no map is
-ever warped and a point's place within its cell counts.
+Every point looks up the log-likelihood of its classes around its cell. The sum over points is a surface over
+shifts. Strips of azimuth see a roll as shifts of opposite sign in elevation; near and far points see a
+translation as different shifts. Rotations are found level by level and applied to the points, so no map is
+warped and a point's position within its cell counts.
 
-Source: the cost volume is LCCNet's idea (Lv et al. 2021); the search over class likelihoods is this project's own.
+Source: the cost volume is from LCCNet (Lv et al. 2021); the search over class likelihoods is new here.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def levels_for(grid: Grid) -> tuple[Level, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """What a matcher found: twist on the left in the optical frame, its variance, and the surfaces it saw last."""
+    """Result of a matcher: left twist in the optical frame, its variance, and the last surfaces."""
 
     twist: Float[Tensor, "B 6"]  # rotation vector [rad], translation [m]
     variance: Float[Tensor, "B 6"]
@@ -57,7 +57,7 @@ class Match:
 
 
 class ClassMatcher(nn.Module):
-    """Turns points until their classes lie on the camera's; three or four temperatures and a few sigmas are learned."""
+    """Rotates points until their classes match the camera's; a few temperatures and sigmas are learned."""
 
     def __init__(self, grid: Grid) -> None:
         super().__init__()
@@ -65,7 +65,7 @@ class ClassMatcher(nn.Module):
         self.levels = levels_for(grid)
         # exp: how many independent observations a frame's mean log-likelihood is worth; 150 by the oracle's spread.
         self.log_sharpness = nn.Parameter(torch.full((len(self.levels),), float(np.log(150.0))))
-        # Of what the last step may still turn [rad], and of the translation [m].
+        # Prior sigmas of the last step: rotation [rad] and translation [m].
         self.log_prior_sigma = nn.Parameter(torch.log(torch.tensor([0.01] * 3 + [0.03] * 3)))
         self.log_error_floor = nn.Parameter(torch.tensor(float(np.log(0.001))))  # [rad] of a group's shift
 
@@ -85,8 +85,6 @@ class ClassMatcher(nn.Module):
 
         Args:
             log_likelihood: of each class in the camera's cells, NEUTRAL where it sees nothing.
-            points_camera: points seen through the guess [m].
-            probability: of each point's classes.
             weight: of each point, 0 = absent.
         """
         R = torch.eye(3, device=points_camera.device).expand(len(points_camera), 3, 3)
@@ -108,7 +106,7 @@ class ClassMatcher(nn.Module):
         return self._finish(self.levels[-1], by_group, _centres(sums), sharpness, omega, R)
 
     def _pyramid(self, log_likelihood: Tensor) -> list[Tensor]:
-        """Maps per level, padded by what a point at the border can reach, classes last: of a cell and of the next."""
+        """Maps per level, padded by the reach of a border point, classes last: of a cell and the next."""
         maps = []
         for level in self.levels:
             pooled = log_likelihood
@@ -196,7 +194,7 @@ class ClassMatcher(nn.Module):
         self, level: Level, by_group: Tensor, centre: tuple[Tensor, Tensor], sharpness: Tensor,
         omega: Tensor, R: Tensor,
     ) -> Match:  # fmt: skip
-        """Least squares over the groups' own shifts: what is left to turn, and the translation that parallax tells."""
+        """Least squares over the groups' shifts: the remaining rotation, and the translation by parallax."""
         cell = float(np.radians(self.grid.cell_deg * level.factor))
         size = 2 * level.reach + 1
         log_posterior = torch.log_softmax((by_group * sharpness[:, None, None, None]).flatten(2), -1)
@@ -208,7 +206,7 @@ class ClassMatcher(nn.Module):
         )  # azimuth (columns), elevation (rows)
         mean = (marginals * shift).sum(-1)
         spread = (marginals * (shift * shift)).sum(-1) - mean * mean + torch.exp(2 * self.log_error_floor)
-        # The window itself is a prior of its own width; a flat surface must tell nothing.
+        # The window itself is a prior with its width; a flat surface must have no information.
         window = float((shift * shift).mean()) + torch.exp(2 * self.log_error_floor)
         information = (1 / spread - 1 / window).clamp(min=0)
         J = angular_jacobian(*centre)

@@ -23,7 +23,7 @@ _STD = 1e-2  # heads start near no correction
 
 
 class ConcatCore(nn.Module):
-    """What is computed from one rendered view, for those sensors that the pairs need."""
+    """Network on one rendered view, for the sensors of its pairs."""
 
     def __init__(self, grid: Grid, pairs: tuple[str, ...], width: int, hidden: int) -> None:
         super().__init__()

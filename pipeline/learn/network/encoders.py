@@ -17,8 +17,8 @@ _LEAST_LIKELIHOOD = 0.005  # a segmenter that is surer than one mistake in 200 c
 class CameraEncoder(nn.Module):
     """A mini U-net: 1/2 to 1/16 of the grid and back to 1/2, then logits for every cell by pixel shuffle.
 
-    Where the camera comes with classes, what it puts out is added to their log-likelihood times a learned scale: a
-    segmenter that saw photographs is right more often than a network that has only seen rendered ones.
+    If the camera comes with classes, the output is added to their log-likelihood times a learned scale: a
+    segmenter trained on photographs is right more often than a network trained on rendered images.
     """
 
     def __init__(self, classes: int, width: int, channels: int = CAMERA_CHANNELS) -> None:
@@ -36,8 +36,8 @@ class CameraEncoder(nn.Module):
     def forward(self, camera: Float[Tensor, "B C H W"]) -> Float[Tensor, "B K H W"]:
         """Logits per cell of the grid, whose sides are multiples of 16.
 
-        Colours are standardised over the part of the grid that the image shows, so that exposure, gain and
-        another camera's black level do not matter.
+        Colours are standardised over the part of the grid that the image shows, so exposure, gain and black
+        level of the camera do not matter.
         """
         x = standardised(camera[:, :CAMERA_CHANNELS])
         if self.trust is not None:
@@ -73,20 +73,13 @@ class LidarEncoder(nn.Module):
         return F.pixel_shuffle(self.logits(features), 2) + self.own(rendered)
 
     def features(self, rendered: Float[Tensor, "B C H W"]) -> Float[Tensor, "B F h w"]:
-        """What the convolutions make of the sweep, by squares of four cells."""
+        """Convolutional features of the sweep, by squares of four cells."""
         return _down_and_up(rendered, self.down, self.up)
 
     def logits_at(
         self, features: Tensor, rendered: Tensor, row: Int64[Tensor, "B N"], column: Int64[Tensor, "B N"]
     ) -> Float[Tensor, "B N K"]:
-        """The same as `forward` at single cells, which are far fewer.
-
-        Args:
-            features: B F H/2 W/2, of the sweep.
-            rendered: B C H W, the sweep.
-            row: of each cell.
-            column: of each cell.
-        """
+        """Logits as of `forward`, at single cells (row, column), which are far fewer."""
         width = rendered.shape[-1]
         square = cell_values(features, row // 2 * (width // 2) + column // 2)
         four = F.linear(square, self.logits.weight[:, :, 0, 0], self.logits.bias)
@@ -125,7 +118,7 @@ def cell_values(maps: Float[Tensor, "B K H W"], cell: Int64[Tensor, "B N"]) -> F
 
 
 def standardised(camera: Float[Tensor, "B 4 H W"]) -> Float[Tensor, "B 4 H W"]:
-    """Colours less their mean over their standard deviation, 0 where the camera sees nothing; the mask stays."""
+    """Colours minus mean, over standard deviation, 0 where the camera sees nothing; the mask stays."""
     colours, seen = camera[:, :3], camera[:, 3:]
     count = seen.sum((2, 3), keepdim=True).clamp(min=1.0)
     mean = (colours * seen).sum((2, 3), keepdim=True) / count
@@ -135,7 +128,7 @@ def standardised(camera: Float[Tensor, "B 4 H W"]) -> Float[Tensor, "B 4 H W"]:
 
 
 def _down_and_up(x: Tensor, down: nn.ModuleList, up: nn.ModuleList) -> Tensor:
-    """Halve the grid block by block, and double it again beside what it was at that size."""
+    """Halve the grid block by block, then double it, with skip connections."""
     skips = []
     for block in down:
         x = block(x)

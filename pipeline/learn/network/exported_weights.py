@@ -1,7 +1,7 @@
-"""The weights of an exported file, to train on from: of the network that is shipped there is nothing else.
+"""The weights of an exported file, as the start of further training: shipped networks exist only in this form.
 
-A graph holds weights under numbers, turned or folded into others. The file's metadata says where each lies; the few
-small ones that are folded stand there themselves.
+A graph holds weights under numbers, transposed or folded into others. The file's metadata map them; the few
+small ones that are folded are stored there.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Place = Mapping[str, Any]
 
 
 def weight_places(state: Mapping[str, Tensor], model: onnx.ModelProto) -> dict[str, Place]:
-    """Where each weight lies in the graph: an initializer's name, and whether it is turned; or its values."""
+    """Location of each weight in the graph: initializer and whether it is transposed; or its values."""
     lying: dict[bytes, Place] = {}
     for initializer in model.graph.initializer:
         values = numpy_helper.to_array(initializer)
@@ -44,11 +44,7 @@ def weight_places(state: Mapping[str, Tensor], model: onnx.ModelProto) -> dict[s
 
 
 def network_of_file(path: Path) -> CalibrationNetwork:
-    """The network of a file of `boresight export onnx`, on the CPU.
-
-    Raises:
-        ModelError: the file does not say where its weights lie, as none did before 0.8.0.
-    """
+    """The network of a file of `boresight export onnx`, on the CPU; ModelError for files older than 0.8.0."""
     try:
         model = onnx.load(str(path))
         metadata = {entry.key: entry.value for entry in model.metadata_props}
@@ -77,5 +73,5 @@ def _weight(place: Place, held: Mapping[str, np.ndarray], shape: torch.Size) -> 
 
 
 def _digest(values: np.ndarray) -> bytes:
-    """Shapes differ by axes of length one only, so numbers in order tell weights apart."""
+    """Hash of the numbers in order: shapes of equal weights differ by axes of length one only."""
     return np.ascontiguousarray(values, np.float32).tobytes()

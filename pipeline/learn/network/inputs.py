@@ -1,4 +1,4 @@
-"""What a network is given: sensor data that no guess enters, and the guess."""
+"""Inputs of a network: sensor data independent of the guess, and the guess."""
 
 from __future__ import annotations
 
@@ -21,10 +21,11 @@ __all__ = ["NetworkInputs", "SensorInputs", "crop", "given_classes", "sensor_inp
 class SensorInputs:
     """One frame of each sensor, B frames; nothing here depends on the extrinsics.
 
-    `camera` is red, green, blue (0..1) and 1 where the image shows the whole cell. Features are those named in
-    LIDAR_FEATURES and RADAR_FEATURES, of the order of one on any rig: ranks, heights over the ground in units of
-    3 m, Doppler residuals in units of 5 m/s, power over the scan's median in units of 20 dB. `classes` is what a
-    segmenter makes of the image: the likelihood of each of GRID_CLASSES and 1 where it is known, all 0 elsewhere.
+    `camera` is red, green, blue (0..1) and 1 where the image shows the whole cell. Features are those named
+    in LIDAR_FEATURES and RADAR_FEATURES, of the order of one on any rig: ranks, heights over the ground in
+    units of 3 m, Doppler residuals in units of 5 m/s, power over the scan's median in units of 20 dB.
+    `classes` is what a segmenter makes of the image: the likelihood of each of GRID_CLASSES and 1 where it is
+    known, all 0 elsewhere.
     """
 
     camera: Float[Tensor, "B 4 H W"]
@@ -92,7 +93,7 @@ def given_classes(grid_class: UInt8[Tensor, "B H W"]) -> Float[Tensor, "B C H W"
 def radar_features(
     residual_mps: Float[Tensor, "B M"], power_db: Float[Tensor, "B M"], moving: Bool[Tensor, "B M"]
 ) -> Float32[Tensor, "B M 3"]:
-    """RADAR_FEATURES from Doppler residuals, power over the scan's median, and what perception says moves."""
+    """RADAR_FEATURES from Doppler residuals, power over the scan's median, and perception's motion."""
     speed = (residual_mps.abs() / FEATURE_UNITS["speed"]).clamp(max=2.0)
     power = (power_db / FEATURE_UNITS["power"]).clamp(-2.0, 2.0)
     return torch.stack([speed, power, moving.to(speed.dtype)], -1).float()
@@ -101,7 +102,7 @@ def radar_features(
 def heights(
     xyz_m: Float[Tensor, "B N 3"], valid: Bool[Tensor, "B N"], plane: Float[Tensor, "B 4"]
 ) -> Float32[Tensor, "B N"]:
-    """Height over the ground plane [m]; over the frame's lowest points where no plane was found (zeros)."""
+    """Height over the ground plane [m], or over the frame's lowest points without a plane (zeros)."""
     known = plane[:, :3].norm(dim=-1, keepdim=True) > 0.5
     above_plane = (xyz_m * plane[:, None, :3].to(xyz_m.dtype)).sum(-1) + plane[:, 3:].to(xyz_m.dtype)
     z = xyz_m[..., 2]
@@ -114,10 +115,6 @@ def heights(
 def crop(
     stored: Float[Tensor, "B C Y X"] | Tensor, step_deg: float, grid: Grid
 ) -> Float[Tensor, "B C H W"] | Tensor:
-    """The part of maps on the stored grid (centred on the optical axis) that the network's grid shows.
-
-    Raises:
-        ValueError: cells of another size, or a stored grid that does not contain the network's.
-    """
+    """Part of maps on the stored grid that the network's grid shows; ValueError if not contained."""
     rows, columns = grid.window((stored.shape[-2], stored.shape[-1]), step_deg)
     return stored[..., rows, columns]

@@ -24,11 +24,9 @@ def inverse_spd(H: Float[Tensor, "B P P"]) -> Float[Tensor, "B P P"]:
 def angular_jacobian(
     directions: Float[Tensor, "B N 3"], inverse_range: Float[Tensor, "B N"]
 ) -> Float[Tensor, "B N 2 6"]:
-    """d(azimuth, elevation) of points in the optical frame by a twist (rotation vector, translation) on the left.
+    """d(azimuth, elevation) of points in the optical frame by a left twist (rotation vector, translation).
 
-    Args:
-        directions: unit vectors, optical frame; not on the axis of the poles.
-        inverse_range: 1/range [1/m].
+    `directions` are unit vectors, not on the axis of the poles; `inverse_range` is in 1/m.
     """
     x, y, z = directions.unbind(-1)
     h = torch.sqrt(x * x + z * z)
@@ -66,7 +64,7 @@ def _with_rotation(by_direction: Tensor, directions: Tensor, inverse_range: Tens
 
 
 def small_rotation_vector(R: Float[Tensor, "B 3 3"]) -> Float[Tensor, "B 3"]:
-    """Rotation vector of rotations well below 90 deg, where the sine tells all."""
+    """Rotation vector of rotations well below 90 deg, from the sine alone."""
     skew = torch.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], -1) / 2
     square = (skew * skew).sum(-1, keepdim=True).clamp(max=0.998)
     # asin(s)/s by its series to s^7: below 1e-8 up to 12 deg, 1e-5 up to 30 deg, and smooth at zero.

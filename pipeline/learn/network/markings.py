@@ -1,11 +1,11 @@
 """Lane paint and other bright ground: reflectivity of the sweep against brightness of the image.
 
-Ground is most of what both sensors see, and its classes say least. Paint returns more light than the asphalt beside
-it, to a lidar and to a camera: lines that hold pitch, roll and yaw where a sweep has few rows. Both sides are high-pass
-filters along the row, in units of their own spread, so gains, exposures and scales of reflectivity do not matter.
+Ground fills most of both views, and its classes constrain the pose least. Paint returns more light than the
+asphalt beside it, to a lidar and to a camera: such lines constrain pitch, roll and yaw of sweeps with few
+rows. Both sides are high-pass filters along the row, in units of their own spread, so gains, exposures and
+scales do not matter.
 
-Source: nighttime lane registration is old; that it is what decides on real sweeps of 16 rings was measured for the
-optimiser (`pipeline/objective/camera_lidar`), whose term this is on the network's grid.
+Source: the reflectivity term of `pipeline/objective/camera_lidar`, on the network's grid.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ _ROAD, _VERGE = 0, 1  # of GRID_CLASSES
 
 
 def mark_strength(lidar_grid: Float[Tensor, "B C H W"]) -> Float[Tensor, "B H W"]:
-    """How far each cell's ground stands out of the row beside it: 0 up to one sigma, 1 at MARK_SIGMAS and beyond.
+    """Contrast of each cell's ground to the row beside it: 0 up to one sigma, 1 from MARK_SIGMAS on.
 
-    Zero everywhere where no reflectivity is logged.
+    Zero everywhere if no reflectivity is logged.
     """
     ground = lidar_grid[:, _OCCUPIED : _OCCUPIED + 1] * lidar_grid[:, _GROUND : _GROUND + 1]
     above = _above_beside(lidar_grid[:, _INTENSITY : _INTENSITY + 1], ground, (1, MARK_WINDOW))
@@ -41,11 +41,9 @@ def mark_strength(lidar_grid: Float[Tensor, "B C H W"]) -> Float[Tensor, "B H W"
 def log_markings(
     camera: Float[Tensor, "B C H W"], likelihood: Float[Tensor, "B K H W"]
 ) -> tuple[Float[Tensor, "B 1 H W"], Float[Tensor, " B"]]:
-    """Log-likelihood of bright ground in the image's cells, and 1 where there is road enough to look for it.
+    """Log-likelihood of bright ground in the image's cells, and 1 where there is enough road around.
 
-    Args:
-        camera: red, green, blue, and where the image shows the cell.
-        likelihood: logarithms, of GRID_CLASSES.
+    `camera` is red, green, blue and visibility; `likelihood` holds logarithms, of GRID_CLASSES.
     """
     road = torch.exp(likelihood[:, _ROAD : _VERGE + 1]).sum(1, keepdim=True).clamp(max=1.0) * camera[:, 3:4]
     above = _above_beside(camera[:, :3].mean(1, keepdim=True), road, (_HIGH, _WIDE))
@@ -55,7 +53,7 @@ def log_markings(
 
 
 def _above_beside(values: Tensor, mask: Tensor, window: tuple[int, int]) -> Tensor:
-    """Values less their mean over the masked cells of a window about them, over the spread of that; 0 off the mask."""
+    """Values minus the mean of the masked cells in a window, over their spread; 0 off the mask."""
     pad = (window[0] // 2, window[1] // 2)
     share = F.avg_pool2d(mask, window, 1, pad)
     beside = F.avg_pool2d(values * mask, window, 1, pad) / share.clamp(min=MARK_LEAST_SHARE)

@@ -49,7 +49,7 @@ _AXES_CAMERA_OF_LIDAR = (1, 2, 0)
 
 
 class MatchingCore(nn.Module):
-    """What is computed from one rendered view; `pairs` says which of the three matchers exist."""
+    """Network on one rendered view; `pairs` selects its matchers."""
 
     confusions: Tensor | None
 
@@ -67,9 +67,9 @@ class MatchingCore(nn.Module):
         if "camera_lidar" in pairs:
             self.lidar_encoder = LidarEncoder(LIDAR_CHANNELS, _CLASSES, width)
             self.lidar_matcher = ClassMatcher(grid)
-            # exp: what an edge of the sweep on a boundary is worth, against a point of one class.
+            # exp: weight of an edge of the sweep on a boundary, relative to a point of one class.
             self.log_edge_worth = nn.Parameter(torch.zeros(())) if channels > CAMERA_CHANNELS else None
-            # exp: what bright ground on paint is worth, against a point of one class.
+            # exp: weight of bright ground on paint, relative to a point of one class.
             self.log_mark_worth = nn.Parameter(torch.zeros(())) if marks else None
             sizes.append(self.lidar_matcher.surface_size + 12)
         if "lidar_radar" in pairs:
@@ -106,8 +106,8 @@ class MatchingCore(nn.Module):
     ) -> Float[Tensor, "B L H W"]:
         """Log-probability of classes, and behind them 1 where the camera sees the cell.
 
-        Beyond the image's border goes on what is seen at it. Were all classes alike there, points would gain by
-        leaving what is classified well: a narrow image would push a sweep out of itself.
+        Beyond the border the values at the border continue. If all classes were alike there, points would
+        gain by leaving well-classified cells: a narrow image would push the sweep out.
         """
         # Classes last: runtimes are five times slower along another axis.
         probability = torch.softmax(logits.detach().permute(0, 2, 3, 1), -1).clamp(min=float(np.exp(FLOOR)))
@@ -168,10 +168,10 @@ class MatchingCore(nn.Module):
         return CoreOutputs(corrections, log_variance, likelihood, *logits_of, evidence)
 
     def encode_lidar(self, rendered: Float[Tensor, "B C H W"]) -> Float[Tensor, "B K H W"]:
-        """Class logits of a rendered sweep; in training every other frame is seen in a mirror.
+        """Class logits of a rendered sweep; in training every other frame is mirrored.
 
-        Classes reach the lidar through guesses that are wrong by some angle. An encoder that learns where classes
-        end would learn that angle with them; for mirrored frames it is the opposite one.
+        Lidar labels come through guesses that are wrong by some angle, and an encoder that learns the borders
+        of classes would learn that angle. In mirrored frames the angle is the opposite one.
         """
         if not self.training:
             return self.lidar_encoder(rendered)
@@ -180,7 +180,7 @@ class MatchingCore(nn.Module):
         return torch.where(mirrored, logits.flip(-1), logits)
 
     def _with_edges(self, maps: Tensor, probability: Tensor, edge: Tensor) -> tuple[Tensor, Tensor]:
-        """Boundaries as one more class, that of the sweep's edges: they hold whatever the points are taken for."""
+        """Boundaries as one more class, matched by the sweep's edges whatever the points' classes are."""
         if self.log_edge_worth is None:
             return maps, probability
         worth = torch.exp(self.log_edge_worth) * edge
@@ -206,7 +206,7 @@ class MatchingCore(nn.Module):
         return self.lidar_encoder.logits_of(features, rendered), at_points
 
     def _worth(self, likelihood: Tensor, points_camera: Tensor) -> Tensor:
-        """B N: what a point counts by where the guess puts it, fixed before it moves: no move can raise it."""
+        """B N: weight of a point at the guess, fixed before it moves, so that no motion can raise it."""
         row, column, inside = self._cells(points_camera)
         seen = cell_values(likelihood[:, -1:], row * self.grid.width + column)[..., 0]
         return _UNSEEN_WORTH + (1 - _UNSEEN_WORTH) * seen * inside.to(likelihood.dtype)
@@ -240,11 +240,9 @@ class MatchingCore(nn.Module):
 
 
 def confusions_of(alike: float, solid: float) -> Float[Tensor, "K K"]:
-    """Probability that a point on something of one class (row) is taken for another (column).
+    """Probability that a point on something of one class (row) is classified as another (column).
 
-    Args:
-        alike: share that is spread evenly over the classes of the same kind.
-        solid: of what stands on the ground, share that is spread over all of it.
+    `alike` is the share spread over classes of the same kind, `solid` over all that stands on the ground.
     """
     found = torch.eye(_CLASSES)
     for kind in _ALIKE:
@@ -259,9 +257,9 @@ def confusions_of(alike: float, solid: float) -> Float[Tensor, "K K"]:
 def continued_beyond(
     maps: Float[Tensor, "B K H W"], seen: Float[Tensor, "B 1 H W"]
 ) -> Float[Tensor, "B K H W"]:
-    """The maps with the nearest seen cell's values where nothing is seen: up and down first, then to the sides.
+    """The maps, with the nearest seen cell's values in unseen cells: first vertically, then horizontally.
 
-    Images are convex on the grid or nearly so: between two seen cells of a column all are seen.
+    Images are nearly convex on the grid: between two seen cells of a column all are seen.
     """
     height, width = maps.shape[2:]
     rows = torch.arange(height, device=maps.device)[None, :, None]

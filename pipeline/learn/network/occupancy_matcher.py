@@ -1,8 +1,9 @@
 """Lidar and radar: radar detections against the density of lidar object points in azimuth, elevation and range.
 
-Radar azimuth is precise and elevation noisy, so the search goes yaw first, then pitch (and roll, from how
-pitch changes with azimuth), each by the likelihood of the detections under the lidar's kernel density; a step of damped
-least squares over soft associations finishes all six degrees of freedom. Clutter meets a floor of the likelihood.
+Radar azimuth is precise and elevation noisy. The search therefore finds yaw first, then pitch (and roll, from
+the change of pitch with azimuth), each by the likelihood of the detections under the lidar's kernel density.
+A step of damped least squares over soft associations finishes all six degrees of freedom. A floor of the
+likelihood bounds the cost of clutter.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ _FARTHEST = 37.0
 
 @dataclass(frozen=True, eq=False)
 class OccupancyMatch:
-    """What was found: twist on the left in the lidar frame, its variance, and likelihood profiles."""
+    """Result: left twist in the lidar frame, its variance, and likelihood profiles."""
 
     twist: Float[Tensor, "B 6"]  # rotation vector [rad], translation [m]
     variance: Float[Tensor, "B 6"]
@@ -85,11 +86,8 @@ class OccupancyMatcher(nn.Module):
 
         Args:
             radar_lidar: detections seen through the guess, lidar frame [m].
-            radar_features: as in SensorInputs.
-            radar_valid: which of them are real.
             has_elevation: False where the radar measures none: then pitch and roll stay.
             objects: lidar points off the ground, lidar frame [m].
-            object_weight: 0 = absent.
         """
         weight = torch.sigmoid(self.weigh(radar_features))[..., 0] * 2 * radar_valid.to(radar_lidar.dtype)
         total = weight.sum(1, keepdim=True).clamp(min=1e-3)
@@ -128,7 +126,7 @@ class OccupancyMatcher(nn.Module):
         shifts: Tensor,
         axis: int,
     ) -> Tensor:
-        """B M S: log-likelihood of each detection at each shift of one angle, `away` of the others (`_away`).
+        """B M S: log-likelihood of each detection at each shift of one angle, `away` from the others (`_away`).
 
         The density is tabulated over absolute angles once (a matrix product) and looked up per detection.
         """
@@ -205,7 +203,7 @@ class OccupancyMatcher(nn.Module):
 
 def _away(columns: Tensor, rows: Tensor, width: Tensor | float = 1.0) -> Tensor:
     """B R C: half the squared distance of all pairs along one axis, in widths of the kernel."""
-    # Scaled before they are paired, and halved there too: what is done to all pairs is what costs.
+    # Scaled before pairing, and halved there too: operations on all pairs dominate the cost.
     scale = _HALF / width
     gap = (columns * scale)[..., None, :] - (rows * scale)[..., None]
     return gap * gap

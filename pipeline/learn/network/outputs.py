@@ -1,4 +1,4 @@
-"""What networks put out, and the heads that all of them share."""
+"""Outputs of networks, and the heads that all of them share."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _LOG_VARIANCE = (-10.5, -10.5, -10.5, -6.0, -6.0, -6.0)
 
 @dataclass(frozen=True, eq=False)
 class ClassEvidence:
-    """What camera and lidar are matched by: points take part in the order of points_camera, marks_camera."""
+    """Matching evidence of camera and lidar: points in the order points_camera, marks_camera."""
 
     maps: Float[
         Tensor, "B K H W"
@@ -31,7 +31,7 @@ class ClassEvidence:
 
 @dataclass(frozen=True, eq=False)
 class CoreOutputs:
-    """What the exported graph computes; rows of corrections are PAIRS, identity for pairs that it does not estimate."""
+    """Outputs of the exported graph; rows of corrections are PAIRS, identity for pairs not estimated."""
 
     corrections: Float[Tensor, "B 3 4 4"]
     log_variance: Float[Tensor, "B 3 6"]
@@ -46,11 +46,11 @@ class CoreOutputs:
 
 @dataclass(frozen=True, eq=False)
 class Predictions:
-    """Better extrinsics, and how sure they are.
+    """Corrected extrinsics, and their variances.
 
-    `log_variance` is of a twist on the left of each transform (rotation vector [rad], translation [m]), rows as PAIRS.
-    Logits are there for distillation: camera and lidar per cell of the grid (None in `concat` and in pairs that do
-    not use them), radar per detection; `lidar_index` is the lidar point that each cell shows, -1 where none is.
+    `log_variance` is of a left twist of each transform (rotation vector [rad], translation [m]), rows as
+    PAIRS. Logits serve distillation: camera and lidar per cell of the grid (None in `concat` and in pairs
+    without that sensor), radar per detection; `lidar_index` is the lidar point shown by each cell, or -1.
     """
 
     T_camera_lidar: Float[Tensor, "B 4 4"]
@@ -84,7 +84,7 @@ class Heads(nn.Module):
     def forward(
         self, features: Float[Tensor, "B F"]
     ) -> dict[str, tuple[Float[Tensor, "B 4 4"], Float[Tensor, "B 6"]]]:
-        """By pair: correction on the left, and what its log variance differs from the start's by."""
+        """By pair: left correction, and the change of its log variance from the start."""
         found = {}
         for pair, layer in self.layers.items():
             raw = layer(features)

@@ -1,7 +1,7 @@
-"""Lidar and radar points on the camera's grid, seen through a guess: for training; inference has compiled_rendering.
+"""Lidar and radar points on the camera's grid at a guess: for training; inference uses compiled_rendering.
 
-Per cell the nearest point wins. Both versions decide by the same integer key, so they agree wherever the cell of a
-point is the same; rounding leaves that open only for points within 1e-5 cells of a border.
+Per cell the nearest point wins. Both versions decide by the same integer key, so they agree wherever the cell
+of a point is the same: all but points within 1e-5 cells of a border.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ __all__ = ["grid_cells", "nearest_points", "paint", "sphere"]
 def sphere(points_camera: Float[Tensor, "B N 3"]) -> Float[Tensor, "B N 3"]:
     """Azimuth (left), elevation (up) [rad] and range [m] of points in the optical frame.
 
-    By arctangents of quotients, which every ONNX runtime has; points behind the camera land at +-90 deg.
+    Computed by arctangents of quotients, which every ONNX runtime has; points behind the camera get +-90 deg.
     """
     x, y, z = points_camera.unbind(-1)
     ahead = torch.clamp(z, min=1e-3)
@@ -42,7 +42,7 @@ def grid_cells(
 def nearest_points(
     points_camera: Float[Tensor, "B N 3"], valid: Bool[Tensor, "B N"], grid: Grid
 ) -> Int64[Tensor, "B HW"]:
-    """Index of the nearest point in each cell (row by row), -1 where there is none."""
+    """Index of the nearest point in each cell (row by row), -1 if the cell is empty."""
     height, width = grid.height, grid.width
     angles = sphere(points_camera)
     row, column = grid_cells(angles, grid)

@@ -1,4 +1,4 @@
-"""Sensor data as seen through a guess: what the networks compute on, rendered anew at every refinement."""
+"""Sensor data rendered at a guess: input of the networks, rendered anew at every refinement."""
 
 from __future__ import annotations
 
@@ -56,10 +56,7 @@ class RenderedView:
 def render(
     inputs: NetworkInputs, grid: Grid, *, classes: bool = False
 ) -> tuple[RenderedView, Int64[Tensor, "B HW"]]:
-    """The view through the inputs' guess, and which lidar point each cell shows (-1 = none).
-
-    With `classes` the camera is its image and the classes that a segmenter gave.
-    """
+    """View at the inputs' guess, with a segmenter's classes if given; lidar point of each cell, or -1."""
     sensors = inputs.sensors
     lidar_camera = transform_points(inputs.T_camera_lidar, sensors.lidar_xyz_m)
     radar_camera = transform_points(inputs.T_camera_radar, sensors.radar_xyz_m)
@@ -118,7 +115,7 @@ def _in_view(points_camera: Tensor, grid: Grid) -> Tensor:
 
 
 def _best(score: Tensor, allowed: Tensor, count: int) -> Tensor:
-    """Rows of the highest scores, allowed ones first; as many as there are where fewer than `count`."""
+    """Rows of the `count` highest scores, allowed ones first; fewer if there are fewer."""
     ranked = torch.where(allowed, score, score - 10.0)
     return torch.topk(ranked, min(count, ranked.shape[1]), dim=1).indices
 

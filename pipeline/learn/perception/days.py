@@ -1,4 +1,4 @@
-"""The vehicle-days of a lake that perception's networks learn from, and which of them are held out."""
+"""Vehicle-days of a lake for training perception's networks, and which of them are held out."""
 
 from __future__ import annotations
 
@@ -13,11 +13,7 @@ _HELD_OUT_EVERY = 5  # vehicle-days
 
 
 def vehicle_days(fleet: FleetConfig, lake: Lake, least: int) -> list[Partition]:
-    """Perceived vehicle-days of the fleet.
-
-    Raises:
-        ContractError: fewer than `least`.
-    """
+    """Perceived vehicle-days of the fleet; raises ContractError if there are fewer than `least`."""
     days = [p for p in perceived_days(lake) if fleet.knows(p.vehicle)]
     if len(days) < least:
         problem = f"{len(days)} vehicle-days with observations of vehicles in fleet.toml, {least} needed"

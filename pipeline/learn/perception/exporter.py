@@ -25,19 +25,9 @@ def export_model(
     manifest: str,
     card: dict[str, Any],
 ) -> Path:
-    """Write NAME.onnx, NAME.toml (the manifest), NAME.json and NAME.md (the card) into a folder.
+    """Write NAME.onnx, NAME.toml (the manifest), NAME.json and NAME.md (the card); returns the manifest.
 
-    Args:
-        module: of one input and one output, in evaluation mode.
-        example: an input of the right shape.
-        names: of the file's input and output.
-        folder: made where it is missing.
-        name: of all four files, without suffix.
-        manifest: what the manifest says after path and sha256: the task, and the layout of input and output.
-        card: what is known of data, training, results and limits.
-
-    Returns:
-        The manifest.
+    `manifest` holds its entries after path and sha256: the task, and the layout of input and output.
     """
     folder.mkdir(parents=True, exist_ok=True)
     model, unfinished = folder / f"{name}.onnx", folder / f"{name}.part"

@@ -24,7 +24,7 @@ __all__ = ["Task", "TrainingConfig", "hash_of_arrays", "run_training"]
 
 
 class TrainingConfig(DescentConfig):
-    """How to train; a run goes on only with the same."""
+    """Training settings; a run continues only with the same ones."""
 
     steps: Count
     width: Count  # channels of the network's first layer
@@ -40,9 +40,7 @@ class Task:
     """What one network learns.
 
     Args:
-        network: fresh, in training mode.
         data_key: hash of the samples; a run goes on only with the same ones.
-        loss: of a batch drawn with the generator given; differentiable, a scalar.
         scores: of the network in evaluation mode on held-out samples, by name.
         metric: name of a score in metrics.jsonl, with {} for the score's own name.
     """
@@ -57,14 +55,12 @@ class Task:
 def run_training(
     task: Task, out: Path, config: TrainingConfig, time_limit_s: float | None, progress: Progress = silent
 ) -> TrainResult:
-    """Train the task's network, or go on with the run in `out`; leaves last.pt and metrics.jsonl there.
-
-    The result reports the scores.
+    """Train the task's network, or continue the run in `out`; leaves last.pt and metrics.jsonl there.
 
     Raises:
         ContractError: the run was begun on other samples.
         ConfigError: the run was begun with another configuration.
-        DivergedError: the loss is no number or has grown too far.
+        DivergedError: the loss is not finite or has grown too far.
     """
     out.mkdir(parents=True, exist_ok=True)
     run = _TaskRun(task, config)
@@ -79,7 +75,7 @@ def run_training(
 
 
 def hash_of_arrays(*arrays: np.ndarray) -> str:
-    """Sixteen hexadecimal digits that say whether samples are the same, bit for bit."""
+    """Sixteen hexadecimal digits that are equal if the arrays are, bit for bit."""
     digest = hashlib.sha256()
     for array in arrays:
         digest.update(np.ascontiguousarray(array).data)

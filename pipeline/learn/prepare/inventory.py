@@ -1,6 +1,6 @@
-"""What table `training` holds as a whole: counts by side and environment, and frames that look alike on two sides.
+"""Counts of table `training` by side and environment, and frames of two sides that look alike.
 
-The split keeps vehicles, days and places apart; this looks at the pictures, because a place can have two names.
+The split keeps vehicles, days and places apart; this compares pictures, because a place can have two names.
 """
 
 from __future__ import annotations
@@ -14,13 +14,22 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
+from pipeline.errors import ContractError
 from pipeline.store.atomic_write import atomic_write
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.row_groups import read_columns
 from pipeline.store.tables import read_manifest
 from schemas.training import SPLITS, TRAINING
 
-__all__ = ["MANIFEST_FILE", "Inventory", "alike", "read_leaks", "take_inventory", "write_inventory"]
+__all__ = [
+    "MANIFEST_FILE",
+    "Inventory",
+    "alike",
+    "read_leaks",
+    "require_sides",
+    "take_inventory",
+    "write_inventory",
+]
 
 MANIFEST_FILE = "manifest.json"
 _CHUNK = 4096
@@ -40,12 +49,7 @@ class Inventory:
 
 
 def take_inventory(lake: Lake, duplicate_bits: int) -> Inventory:
-    """Look over all partitions of the table.
-
-    Args:
-        lake: the lake.
-        duplicate_bits: fingerprints that differ in fewer bits show the same view; 0 = do not look.
-    """
+    """Inventory of all partitions; frames with fewer differing bits look alike (0 = not tested)."""
     rejected: Counter[str] = Counter()
     frames: dict[str, list[tuple[str, str, str, int]]] = {side: [] for side in SPLITS}  # environment first
     views: dict[str, list[np.ndarray]] = {side: [] for side in SPLITS}
@@ -81,7 +85,7 @@ def alike(
 
 
 def write_inventory(lake: Lake, inventory: Inventory, about: dict[str, Any]) -> Path:
-    """Write `training/manifest.json` beside the partitions; `about` adds what the run knows."""
+    """Write `training/manifest.json` beside the partitions, with the run's facts in `about`."""
     path = lake.local_root / TRAINING.name / MANIFEST_FILE
     path.parent.mkdir(parents=True, exist_ok=True)
     content = about | inventory.__dict__
@@ -91,13 +95,28 @@ def write_inventory(lake: Lake, inventory: Inventory, about: dict[str, Any]) -> 
 
 
 def read_leaks(lake: Lake) -> dict[Partition, set[int]]:
-    """Frames that must not be used, by partition; empty where no inventory was written."""
+    """Frames that must not be used, by partition; empty without an inventory."""
     path = lake.local_root / TRAINING.name / MANIFEST_FILE
     out: dict[Partition, set[int]] = {}
     if path.exists():
         for vehicle, day, index in json.loads(path.read_text())["leaks"]:
             out.setdefault(Partition(vehicle, day), set()).add(int(index))
     return out
+
+
+def require_sides(lake: Lake) -> None:
+    """Raise ContractError if the inventory has no frame to train on, or none of the validation that was asked for."""
+    path = lake.local_root / TRAINING.name / MANIFEST_FILE
+    if not path.exists():
+        return
+    told = json.loads(path.read_text())
+    wanted = ["train", *(["val"] if told["settings"]["val_fraction"] > 0 else [])]
+    if empty := [side for side in wanted if not told["frames"][side]]:
+        problem = (
+            f"no frames on side {', '.join(empty)}: prepare again with more vehicle-days or another [prepare] "
+            "split_by (`boresight prepare` names one); val_fraction = 0 trains without validation"
+        )
+        raise ContractError(str(path), problem)
 
 
 def _leaks(

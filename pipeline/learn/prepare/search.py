@@ -5,10 +5,10 @@ A frame is kept where all of its keys lie on one side. What an assignment is wor
 where a side without frames counts less than anything. Frames that can all be kept come out in the wanted shares; where
 every cut costs frames, twice the frames to validate on are worth 8 % of the training frames (share 0.1 against 0.8).
 
-The best assignment is a graph cut with more than two sides (NP-hard), so it is searched for: all keys of a kind in turn
-go where they are worth most (their frames do not depend on one another), until nothing changes; then frames are pulled
-over to another side with all of their keys, and what gains is kept. On fleets small enough to try everything, the
-search finds what trying everything finds (tests/learn/prepare/test_split.py).
+The best assignment is a graph cut with more than two sides (NP-hard), so it is searched for: all keys of a
+kind in turn go where they are worth most (their frames do not depend on one another), until nothing changes;
+then frames are pulled over to another side with all of their keys, and what gains is kept. On fleets small
+enough to try everything, the search finds what trying everything finds (tests/learn/prepare/test_split.py).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _GAIN = 1e-9  # rounding of a sum of logarithms lies far below
 
 @dataclass(frozen=True)
 class Cut:
-    """What is to be divided. Keys are numbered; kinds (vehicle, day, place) are columns."""
+    """Units to divide. Keys are numbered; kinds (vehicle, day, place) are columns."""
 
     unit_keys: Int[np.ndarray, "N K"]  # key of each unit by kind; -1 = a key that no other unit has
     frames: Int[np.ndarray, " N"]
@@ -41,19 +41,14 @@ class Cut:
 
 
 def worth(frames: Float[np.ndarray, " S"], shares: Float[np.ndarray, " S"], total: int) -> float:
-    """Worth of an assignment by the frames that each side keeps, of `total` that there are."""
+    """Worth of an assignment by the frames kept on each side, out of `total`."""
     return float(_worth(frames, shares, total))
 
 
 def search_sides(cut: Cut, starts: Sequence[Int[np.ndarray, " M"]], seed: int) -> Int[np.ndarray, " M"]:
-    """The best sides found from any start; of equally good ones, those that give earlier sides more frames.
+    """The best sides found from any of the `starts`; of equal ones, earlier sides get more frames.
 
-    The same input gives the same answer.
-
-    Args:
-        cut: what is to be divided.
-        starts: side of every key to begin from, one at least; fixed keys alike in all.
-        seed: of further starts, and of the order in which units are pulled.
+    The same input gives the same result. `starts` has the side of every key, with fixed keys alike in all.
     """
     problem = (cut.unit_keys, cut.frames, cut.shares)
     rng = np.random.default_rng(seed)
@@ -72,7 +67,7 @@ def _looks(cut: Cut) -> int:
 
 
 def _pulls(cut: Cut, rng: np.random.Generator) -> Int[np.ndarray, "P 2"]:
-    """Units and sides in a drawn order: all of them, or as many as a large fleet leaves time for."""
+    """Units and sides in random order: all of them, or a limited number for a large fleet."""
     count = len(cut.frames) * len(cut.shares)
     wanted = max(_LEAST_PULLS, min(count, _looks(cut) // len(cut.frames)))
     drawn = np.concatenate([rng.permutation(count) for _ in range(-(-wanted // count))])[:wanted]
@@ -89,7 +84,7 @@ def _pull(
     sides: np.ndarray,
     pulls: np.ndarray,
 ) -> np.ndarray:
-    """Pull units to other sides, keys and all, and keep what gains, until none gains or all were tried."""
+    """Pull units to other sides with all their keys, and keep gains, until none gains."""
     total = frames.sum()
     _climb(unit_keys, frames, shares, fixed, sides)
     value = _worth(_frames(unit_keys, frames, shares, sides), shares, total)
@@ -116,7 +111,7 @@ def _pull(
 def _climb(
     unit_keys: np.ndarray, frames: np.ndarray, shares: np.ndarray, held: np.ndarray, sides: np.ndarray
 ) -> None:
-    """Each key that is not held to where it is worth most, kind by kind, until none moves; `sides` is changed."""
+    """Move each free key to its best side, kind by kind, until none moves; changes `sides`."""
     total = frames.sum()
     now = _frames(unit_keys, frames, shares, sides)
     moved = True
@@ -146,7 +141,7 @@ def _climb(
 def _frames_by_key(
     unit_keys: np.ndarray, frames: np.ndarray, shares: np.ndarray, sides: np.ndarray, kind: int
 ) -> np.ndarray:
-    """Frames that each key of a kind would keep on each side, as the other kinds lie: M S."""
+    """Frames that each key of a kind would keep on each side, other kinds unchanged: M S."""
     out = np.zeros((len(sides), len(shares)))
     for unit in range(len(frames)):
         own = unit_keys[unit, kind]
@@ -172,7 +167,7 @@ def _frames(unit_keys: np.ndarray, frames: np.ndarray, shares: np.ndarray, sides
 @no_type_check
 @numba.njit(cache=True)
 def _extremes(keys: np.ndarray, sides: np.ndarray, count: int, without: int) -> tuple[int, int]:
-    """Least and greatest side among a unit's keys, but of one kind; `count` and -1 where there are none."""
+    """Lowest and highest side among a unit's keys except one kind's; `count` and -1 if none."""
     low, high = count, -1
     for kind in range(len(keys)):
         if kind != without and keys[kind] >= 0:

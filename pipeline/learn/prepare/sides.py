@@ -1,4 +1,4 @@
-"""Side of every frame by a plan, what is lost and why; and what other ways to split the same days would cost."""
+"""Side of every frame by a plan, frames lost with reasons, and the cost of other splits of the same days."""
 
 from __future__ import annotations
 
@@ -6,24 +6,36 @@ import itertools
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from pipeline.config import PrepareConfig
+from pipeline.learn.prepare.decided import decided_sides
 from pipeline.learn.prepare.split import SplitPlan
 from pipeline.learn.prepare.survey import Survey, plan_days
 from pipeline.learn.sample.frame_sample import SampleReason
+from pipeline.store.partitions import Lake
 from schemas.training import SPLITS
 
-__all__ = ["Choice", "frame_sides", "price_choices"]
+__all__ = ["Choice", "frame_sides", "price_choices", "settled_keys"]
 
+Key = Literal["vehicle", "day", "place"]
+_FEW = 0.2  # of the frames
+_BETWEEN = (SampleReason.SPLIT_CONFLICT, SampleReason.NEXT_TO_OTHER_SPLIT)
 # What a question may need: nothing shared at all, or unseen vehicles, days, streets.
-_CHOICES = (("vehicle", "day", "place"), ("vehicle", "place"), ("vehicle",), ("day",), ("place",))
+_CHOICES: tuple[tuple[Key, ...], ...] = (
+    ("vehicle", "day", "place"),
+    ("vehicle", "place"),
+    ("vehicle",),
+    ("day",),
+    ("place",),
+)
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What a way to split costs: frames that each side gets, frames lost by reason, vehicle-days without a frame."""
+    """Cost of a split: frames of each side, frames lost by reason, vehicle-days without a frame."""
 
     split_by: tuple[str, ...]
     frames: dict[str, int]
@@ -33,9 +45,9 @@ class Choice:
 
 
 def price_choices(surveys: Sequence[Survey], plan: SplitPlan, config: PrepareConfig) -> list[Choice]:
-    """The plan at hand, then the other ways to split as if the table were made anew.
+    """The plan at hand, then the other ways to split if the table were made anew.
 
-    A frame that no sample can be made of for what it shows (no prior, say) counts as kept here: nothing was read yet.
+    Frames without a sample (no prior, for example) count as kept, because nothing was read yet.
     """
     ways = [tuple(plan.by), *(c for c in _CHOICES if set(c) != set(plan.by))]
     out = []
@@ -46,17 +58,37 @@ def price_choices(surveys: Sequence[Survey], plan: SplitPlan, config: PrepareCon
     return out
 
 
+def settled_keys(surveys: Sequence[Survey], config: PrepareConfig, lake: Lake) -> tuple[Key, ...]:
+    """Keys to split by: as set, else as table `training` has them, else the strictest that cost little.
+
+    Little: no side is empty, and at most a fifth of the usable frames is between the sides. Where no choice is
+    that cheap, vehicle, day and place.
+    """
+    if "split_by" in config.model_fields_set:
+        return config.split_by
+    ways = {way: config.model_copy(update={"split_by": way}) for way in _CHOICES}
+    for way, settings in ways.items():
+        if decided_sides(lake, settings):
+            return way
+    wanted = [s for s, f in zip(SPLITS, (1, config.val_fraction, config.test_fraction), strict=True) if f > 0]
+    for way, settings in ways.items():
+        price = _price(surveys, plan_days(surveys, settings, {}), settings, True)
+        cut = sum(price.lost.get(reason.value, 0) for reason in _BETWEEN)
+        if all(price.frames[s] for s in wanted) and cut <= _FEW * (sum(price.frames.values()) + cut):
+            return way
+    return _CHOICES[0]
+
+
 def frame_sides(
     survey: Survey, plan: SplitPlan, config: PrepareConfig
 ) -> tuple[list[str | None], Counter[str]]:
-    """Side of each frame, None where it is left out, and how many are left out by reason."""
+    """Side of each frame (None = left out), and the number left out by reason."""
     vehicle, day = survey.partition.vehicle, survey.partition.day
     sides = np.array([plan.side_of(vehicle, day, place) or "" for place in survey.place])
     reasons = np.full(len(sides), "", object)
     reasons[sides == ""] = SampleReason.SPLIT_CONFLICT.value
-    reasons[(reasons == "") & _near_other_side(survey, sides, config.guard_s)] = (
-        SampleReason.NEXT_TO_OTHER_SPLIT.value
-    )
+    near = _near_other_side(survey, sides, config.guard_s) | _near_other_place(survey, sides, plan, config)
+    reasons[(reasons == "") & near] = SampleReason.NEXT_TO_OTHER_SPLIT.value
     reasons[~survey.moved] = SampleReason.HARDLY_MOVED.value
     reasons[~survey.perceived] = SampleReason.NOT_PERCEIVED.value
     kept = np.flatnonzero(reasons == "")
@@ -70,11 +102,24 @@ def frame_sides(
 def _near_other_side(survey: Survey, sides: np.ndarray, guard_s: float) -> np.ndarray:
     """True where a frame of the same day on another side is nearer in time than the guard."""
     near = np.zeros(len(sides), bool)
-    for i, j in itertools.pairwise(range(len(sides))):
+    for i, j in itertools.pairwise(np.flatnonzero(sides != "")):  # what no side has is near to none
         if sides[i] == sides[j]:
             continue
         border = (survey.stamp_s[i] + survey.stamp_s[j]) / 2
         near |= np.abs(survey.stamp_s - border) < guard_s / 2
+    return near
+
+
+def _near_other_place(
+    survey: Survey, sides: np.ndarray, plan: SplitPlan, config: PrepareConfig
+) -> np.ndarray:
+    """True where a square of `guard_m` around a frame reaches a cell of another side: also of another pass."""
+    near = np.zeros(len(sides), bool)
+    if "place" not in plan.by or not config.guard_m:
+        return near
+    for i in np.flatnonzero(sides != ""):
+        beside = {plan.sides.get(("place", place), sides[i]) for place in survey.reached(int(i), config)}
+        near[i] = beside != {sides[i]}
     return near
 
 

@@ -1,10 +1,12 @@
 """Which frames train, validate and test a network: no vehicle, day or place on two sides.
 
-Frames are linked by what they share. Where the links leave separate groups, whole groups are dealt out and no frame is
-lost. Where everything hangs together (every vehicle drives every day), vehicles, days and places are divided so that
-the sides that come out are worth most (`search`), and a frame counts only where all of its keys agree.
+Frames are linked by what they share. Where the links leave separate groups, whole groups are dealt out and no
+frame is lost. Where everything hangs together (every vehicle drives every day), vehicles, days and places are
+divided so that the sides that come out are worth most (`search`), and a frame counts only where all of its
+keys agree.
 
-What an earlier run decided stays decided: a lake grows, and a frame that tested one network must not train the next.
+What an earlier run decided stays decided: a lake grows, and a frame that tested one network must not train
+the next.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ from schemas.training import SPLITS
 __all__ = ["SplitPlan", "Unit", "environment_of_speeds", "plan_split"]
 
 TRAIN, VAL, TEST = SPLITS
-# As calibration_records: 72 km/h is beyond what towns allow.
+# As calibration_records: 72 km/h is above the limit in towns.
 _FAST_MPS, _MOVING_MPS = 20.0, 1.0
 
 
@@ -37,7 +39,7 @@ class Unit:
     frames: int = 1
 
     def keys(self, by: Iterable[str]) -> list[tuple[str, str]]:
-        """What links it with other units."""
+        """Keys that link it with other units."""
         return [(kind, getattr(self, kind)) for kind in by]
 
 
@@ -65,11 +67,9 @@ def plan_split(
     """Divide units; the same input gives the same plan.
 
     Args:
-        units: what there is.
         by: kinds of keys that no two sides may share: vehicle, day, place.
         val_fraction: share of the frames that choose the best weights.
         test_fraction: share of the frames that test a finished network.
-        seed: of the draw.
         decided: sides of keys that earlier runs gave.
     """
     shares = {TRAIN: 1 - val_fraction - test_fraction, VAL: val_fraction, TEST: test_fraction}
@@ -81,7 +81,7 @@ def plan_split(
 
 
 def environment_of_speeds(speeds_mps: Sequence[float | None]) -> str:
-    """Highway, urban, mixed or unknown from the speeds of a drive, as calibration records say it of a day."""
+    """Highway, urban, mixed or unknown by the speeds of a drive, as in calibration records."""
     known = [abs(s) for s in speeds_mps if s is not None]
     moving = [s for s in known if s > _MOVING_MPS]
     if 2 * len(known) < len(speeds_mps) or not moving:
@@ -178,7 +178,7 @@ def _searched(
 
 
 def _without_riders(keys: Int[np.ndarray, "N K"], known: Bool[np.ndarray, " M"]) -> Int[np.ndarray, "N K"]:
-    """Keys of each unit, -1 for those that no other unit has and nobody decided: they follow; one key stays."""
+    """Keys of each unit; -1 for undecided keys of one unit only, which follow its other keys."""
     alone = (np.bincount(keys.ravel(), minlength=len(known)) == 1) & ~known
     out = np.where(alone[keys], -1, keys)
     nothing = (out < 0).all(axis=1)

@@ -1,7 +1,7 @@
 """Stage prepare: frames and observations of a vehicle-day to table `training`, a row group at a time.
 
-Whoever prepares a fleet looks over all its days first (`survey_day`: a few plain columns), divides them (`plan_days`)
-and then has each day written by whichever worker is free (`work`): no row depends on another day's.
+A fleet is prepared in three steps: survey all days (`survey_day`: a few plain columns), divide them
+(`plan_days`), and write each day on any worker (`work`): no row depends on another day's.
 """
 
 from __future__ import annotations
@@ -11,48 +11,29 @@ from collections.abc import Generator, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from pipeline.config import PrepareConfig, config_hash
+from pipeline.config import PrepareConfig
 from pipeline.errors import SolveError
 from pipeline.extrinsics.estimates import Prior
 from pipeline.extrinsics.prior import prior_key, read_prior
+from pipeline.learn.prepare.decided import split_rule
 from pipeline.learn.prepare.sides import frame_sides
 from pipeline.learn.prepare.split import SplitPlan, Unit
 from pipeline.learn.prepare.survey import Survey, survey_day
 from pipeline.learn.sample.frame_sample import About, SampleReason, SampleRejectedError, make_row
-from pipeline.store.partitions import Lake
-from pipeline.store.tables import read_manifest
 from pipeline.store.views import Chosen, frames_of, observations_of
 from pipeline.work import Run, Task, Work
 from schemas.calibrations import PAIRS, SENSORS
 from schemas.frames import Frame
 from schemas.observations import Observation
-from schemas.training import SAMPLED, TRAINING, TrainingRow
+from schemas.training import SAMPLED, TrainingRow
 
-__all__ = ["decided_sides", "work"]
+__all__ = ["work"]
 
 _SAME = 1e-6  # rad and m: logged priors repeat numbers, they do not measure
 
 
-def decided_sides(lake: Lake, config: PrepareConfig) -> dict[tuple[str, str], str]:
-    """Sides of the vehicles, days and places that the lake's table `training` has given away already.
-
-    A table that was split by other keys, shares or seed decides nothing: it is made anew as a whole.
-    """
-    sides: dict[tuple[str, str], str] = {}
-    for partition in lake.partitions(TRAINING.name):
-        manifest = read_manifest(lake, TRAINING, partition)
-        if manifest is None or manifest.extra.get("split_rule") != _split_rule(config):
-            continue
-        sides |= {(kind, value): side for kind, value, side in manifest.extra.get("sides", [])}
-    return sides
-
-
 def work(task: Task) -> Work:
-    """The samples of a vehicle-day, divided as the plan says that the task is given (`SplitPlan`).
-
-    Raises:
-        ConfigError: the vehicle or its prior file is not as fleet.toml says, or of several sensors it names no three.
-    """
+    """Samples of a vehicle-day, divided by the task's `SplitPlan`; ConfigError if rig or prior are unusable."""
     config, plan, vehicle = task.fleet.prepare, task.given, task.partition.vehicle
     rig = task.fleet.rig_of(vehicle)
     prior, chosen = rig.prior, rig.one_of_each("training")
@@ -62,7 +43,7 @@ def work(task: Task) -> Work:
     settings |= {} if rig.three is None else {"three": rig.three}
     about = _about(survey, task.fleet.vehicle(vehicle).rig, sides)
     extra = {
-        "split_rule": _split_rule(config),
+        "split_rule": split_rule(config),
         "sides": _sides_given(survey, plan),
         "grid": {"step_deg": config.grid_step_deg, "shape": list(config.grid_shape)},
         SAMPLED: chosen,
@@ -81,7 +62,7 @@ def work(task: Task) -> Work:
 
 
 def _about(survey: Survey, rig: str, sides: Sequence[str | None]) -> dict[int, About]:
-    """What is said of each frame that is kept, by row of table frames."""
+    """Facts of each kept frame, by row of table frames."""
     vehicle, day = survey.partition.vehicle, survey.partition.day
     told = zip(sides, survey.place, survey.environment, strict=True)
     return {
@@ -94,7 +75,7 @@ def _about(survey: Survey, rig: str, sides: Sequence[str | None]) -> dict[int, A
 def _samples(
     task: Task, about: Mapping[int, About], chosen: Chosen, rejected: Counter[str]
 ) -> Iterator[TrainingRow | None]:
-    """The row of each wanted frame in order, None (counted in `rejected`) where it is no sample."""
+    """The row of each wanted frame in order; None, counted in `rejected`, if it gives no sample."""
     if not about:
         return
     lake, partition, fleet = task.lake, task.partition, task.fleet
@@ -153,8 +134,3 @@ def _sides_given(survey: Survey, plan: SplitPlan) -> list[list[str]]:
     places = {place for place, usable in zip(survey.place, survey.usable, strict=True) if usable}
     keys = {key for place in places for key in Unit(vehicle, day, place).keys(plan.by)}
     return [[kind, value, plan.sides[kind, value]] for kind, value in sorted(keys & plan.sides.keys())]
-
-
-def _split_rule(config: PrepareConfig) -> str:
-    names = ("split_by", "val_fraction", "test_fraction", "positions", "place_m", "place_s", "seed")
-    return config_hash({name: getattr(config, name) for name in names})

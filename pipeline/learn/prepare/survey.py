@@ -1,7 +1,8 @@
-"""What a plan needs of each vehicle-day: where and when its frames were taken, and which can become samples."""
+"""Survey of a vehicle-day for the plan: place and time of its frames, and which can become samples."""
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ _LIGHT = ("moment", "log", "drive", "stamp_ns", "ego_speed_mps", "ego_tx_m", "eg
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """What a plan needs of one vehicle-day, one entry per frame in order of time."""
+    """Survey of one vehicle-day, one entry per frame in order of time."""
 
     partition: Partition
     stamp_s: np.ndarray
@@ -29,6 +30,8 @@ class Survey:
     perceived: np.ndarray  # bool: the frame has an observation
     moved: np.ndarray  # bool: the vehicle moved since the last frame that counts
     place: list[str]
+    x_m: np.ndarray  # by odometry; NaN without
+    y_m: np.ndarray
     environment: list[str]  # of the frame's drive
 
     @property
@@ -36,13 +39,18 @@ class Survey:
         """Frames that can become samples."""
         return self.perceived & self.moved
 
+    def reached(self, frame: int, config: PrepareConfig) -> set[str]:
+        """Places that a square of `guard_m` around a frame reaches, its own among them."""
+        x, y, half = self.x_m[frame], self.y_m[frame], config.guard_m / 2
+        if not (np.isfinite(x) and np.isfinite(y)):
+            return {self.place[frame]}
+        home, colon, _ = self.place[frame].rpartition(":")
+        steps = itertools.product((-half, 0.0, half), repeat=2)
+        return {home + colon + _cell_of(x + dx, y + dy, config.place_m) for dx, dy in steps}
+
 
 def survey_day(partition: Partition, lake: Lake, config: PrepareConfig) -> Survey:
-    """Look over a vehicle-day without reading an image or a point.
-
-    Raises:
-        ContractError: the day has no frames or no observations yet.
-    """
+    """Survey a vehicle-day without reading images or points; raises ContractError if it was not perceived."""
     light = read_columns(lake, MOMENTS, partition, _LIGHT)
     perceived = set(read_columns(lake, PERCEIVED, partition, ["moment"])["moment"])
     stamp = np.array(light["stamp_ns"], np.int64) * 1e-9
@@ -61,6 +69,8 @@ def survey_day(partition: Partition, lake: Lake, config: PrepareConfig) -> Surve
         np.array([i in perceived for i in light["moment"]], bool),
         _moved(stamp, drive, np.nan_to_num(speed, nan=np.inf), config.min_step_m),
         _places(partition, light["log"], drive, stamp, x, y, config),
+        x,
+        y,
         [environments[int(d)] for d in drive],
     )
 
@@ -79,8 +89,13 @@ def plan_days(
     return plan_split(units, config.split_by, config.val_fraction, config.test_fraction, config.seed, decided)
 
 
+def _cell_of(x_m: float, y_m: float, side_m: float) -> str:
+    """Name of the square cell of the map that holds a position."""
+    return f"{int(x_m // side_m)},{int(y_m // side_m)}"  # of -0.0 a float would print -0, another name
+
+
 def _moved(stamp: np.ndarray, drive: np.ndarray, speed: np.ndarray, step_m: float) -> np.ndarray:
-    """True for frames that lie `step_m` of way or more behind the last such frame; unknown speeds count as fast."""
+    """True for frames at least `step_m` of driving behind the last such frame; unknown speeds count as fast."""
     out = np.ones(len(stamp), bool)
     way = 0.0
     for i in range(1, len(stamp)):
@@ -109,7 +124,7 @@ def _places(
     for i in range(len(stamp)):
         home = "" if config.positions == "map" else f"{partition.vehicle}/{partition.day}/{log[i]}:"
         if np.isfinite(x[i]) and np.isfinite(y[i]):
-            names.append(f"{home}{x[i] // config.place_m:.0f},{y[i] // config.place_m:.0f}")
+            names.append(home + _cell_of(x[i], y[i], config.place_m))
         else:
             stretch = int((stamp[i] - begin[int(drive[i])]) // config.place_s)
             names.append(f"{partition.vehicle}/{partition.day}/drive {drive[i]}, stretch {stretch}")

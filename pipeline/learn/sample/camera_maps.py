@@ -1,8 +1,8 @@
-"""What the labels of one image say on the camera's grid: classes, distances, boundaries, depth inside the sky.
+"""Maps of one label image on the camera's grid: classes, distances, boundaries, depth inside the sky.
 
-Everything is measured on a fine grid of 0.1 deg and then looked up at the centres of the cells, so that the size of a
-cell blurs no boundary. On such a grid a step to the side is shorter than one upwards by the cosine of the elevation:
-3 % at 14 deg, which no loss is sensitive to.
+Everything is measured on a fine grid of 0.1 deg and looked up at the centres of the cells, so the size of a
+cell blurs no boundary. On such a grid a step to the side is shorter than one upwards by the cosine of the
+elevation: 3 % at 14 deg, to which no loss is sensitive.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def camera_features(labels: UInt8[np.ndarray, "Y X"], camera: Camera, grid: Grid
 def class_likelihood(
     labels: UInt8[np.ndarray, "Y X"], camera: Camera, grid: Grid
 ) -> Float32[np.ndarray, "C H W"]:
-    """What a network that takes classes is given of a label image: see `likelihood_of_shares`.
+    """Class input of a network from a label image: see `likelihood_of_shares`.
 
     A cell that a boundary crosses has shares of both classes; `camera` belongs to the full image.
     """
@@ -100,7 +100,7 @@ def _sample_finely(labels: np.ndarray, camera: Camera, grid: Grid) -> _FineLabel
 def _pixels(
     camera_key: tuple[str, bytes, bytes, int, int], size: tuple[int, int], grid: Grid
 ) -> tuple[Int32[np.ndarray, "Y X"], Bool[np.ndarray, "Y X"]]:
-    """Flat index of the label pixel under each fine cell, and where there is one."""
+    """Flat index of the label pixel under each fine cell, and whether it exists."""
     model, K, D, width, height = camera_key
     camera = Camera(model, np.frombuffer(K).reshape(3, 3), np.frombuffer(D), width, height)
     small = camera.scaled(size[1] / width)
@@ -123,7 +123,7 @@ def _group_distance(classes: np.ndarray, names: tuple[str, ...], per_cell: int) 
 
 
 def _sky_depth(classes: np.ndarray, seen: np.ndarray, per_cell: int) -> np.ndarray:
-    """Angle from each cell's centre out of the sky; beyond the image the sky goes on."""
+    """Angle from each cell's centre to the border of the sky; beyond the image the sky continues."""
     inside = ((classes == GRID_CLASSES.index("sky")) | ~seen).astype(np.uint8)
     if inside.all():
         height, width = classes.shape

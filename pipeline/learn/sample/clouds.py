@@ -30,15 +30,7 @@ _JUMP_M, _JUMP_FRACTION, _JUMP_STEPS = 0.8, 0.06, 2.6
 
 @dataclass(frozen=True)
 class View:
-    """The part of the world that matters: the camera's grid and a margin, seen through a guess.
-
-    Args:
-        T_camera_lidar: the guess.
-        half_width_rad: of the grid.
-        half_height_rad: of the grid.
-        margin_rad: how wrong the guess may be.
-        step_rad: size of a cell.
-    """
+    """The camera's grid with a margin, at the guess T_camera_lidar; the margin covers errors of the guess."""
 
     T_camera_lidar: np.ndarray
     half_width_rad: float
@@ -71,9 +63,9 @@ def lidar_columns(
 def input_points(
     frame: Frame, observation: Observation, view: View, count: int, rng: np.random.Generator
 ) -> dict[str, Any]:
-    """What the network sees of the sweep: at most one point per cell of the grid, then others while there is room.
+    """Input points of the sweep: at most one per cell of the grid, then others while there is room.
 
-    Nothing here depends on the camera's image; `view` decides only which points are kept.
+    Nothing depends on the camera's image; `view` decides only which points are kept.
     """
     xyz = frame.lidar_xyz_m
     flags = range_edges(xyz, frame.lidar_ring).astype(np.uint8) * POINT_IS_EDGE
@@ -94,10 +86,10 @@ def input_points(
 def range_edges(
     xyz_m: Float[np.ndarray, "N 3"], ring: Integer[np.ndarray, " N"] | None
 ) -> Bool[np.ndarray, " N"]:
-    """True for points that stand in front of their neighbour along the ring by a jump in range.
+    """True for points in front of their neighbour along the ring by a jump in range.
 
-    From ranges alone: the class of an object would tell the network where its mask ends. Nothing where the sweep has no
-    rows: neighbours differ in elevation there, and the ground alone jumps.
+    From ranges alone: the class of an object would give away its mask. False if the sweep has no rows:
+    neighbours differ in elevation there, and the ground alone jumps.
     """
     out = np.zeros(len(xyz_m), bool)
     finite = np.flatnonzero(np.isfinite(xyz_m).all(axis=1))
@@ -162,7 +154,7 @@ def _thinned(
 
 
 def _ground_flags(xyz_m: np.ndarray, observation: Observation) -> np.ndarray:
-    """1 where perception's map, which holds one point per voxel, says ground."""
+    """1 for ground in perception's map, which has one point per voxel."""
     if not len(observation.lidar_map_xyz_m) or not len(xyz_m):
         return np.zeros(len(xyz_m), np.uint8)
     distance, nearest = cKDTree(observation.lidar_map_xyz_m).query(xyz_m, distance_upper_bound=_SAME_POINT_M)

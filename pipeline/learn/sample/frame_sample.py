@@ -1,4 +1,4 @@
-"""One frame and what perception found in it, as a row of table `training`."""
+"""One frame with its features, as a row of table `training`."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class SampleRejectedError(Exception):
 
 @dataclass(frozen=True)
 class About:
-    """What a row says of its frame that neither frame nor observation knows."""
+    """Facts of a row that neither frame nor observation contains."""
 
     vehicle: str
     day: str
@@ -78,11 +78,7 @@ class About:
 def make_row(
     frame: Frame, observation: Observation, prior: Prior, about: About, config: PrepareConfig
 ) -> TrainingRow:
-    """The row of one frame; the same frame gives the same row.
-
-    Raises:
-        SampleRejectedError: the frame shows too little.
-    """
+    """The row of one frame, deterministic; raises SampleRejectedError if the frame shows too little."""
     sensors = sensor_row(frame, observation, prior, about, config)
     grid = stored_grid(config.grid_shape, config.grid_step_deg)
     camera = camera_of(observation)
@@ -100,14 +96,9 @@ def make_row(
 def sensor_row(
     frame: Frame, observation: Observation, prior: Prior, about: About, config: PrepareConfig
 ) -> TrainingRow:
-    """A row whose columns for losses alone (semantics) are 0: what a network needs to be asked, not taught.
+    """A row for inference: columns that only losses use (semantics) are 0.
 
-    Args:
-        frame: image and sweep.
-        observation: what geometry alone says of lidar and radar: ground, clusters, motion.
-        prior: decides which lidar points are in view, and is the row's reference.
-        about: whose frame it is.
-        config: the grid and the counts.
+    `prior` is the row's reference, and decides which lidar points are in view.
 
     Raises:
         SampleRejectedError: the frame shows too little.
@@ -147,10 +138,10 @@ def sensor_row(
 
 
 def decode_small(frame: Frame, cell_deg: float) -> UInt8[np.ndarray, "Y X 3"]:
-    """The image as BGR, JPEG reduced while it is decoded as far as two pixels per cell remain.
+    """The image as BGR, JPEG reduced while decoding to at least two pixels per cell.
 
     Raises:
-        SampleRejectedError: undecodable, or not of the size that the intrinsics refer to.
+        SampleRejectedError: undecodable, or another size than that of the intrinsics.
     """
     focal_px = float(max(frame.camera_K[0, 0], frame.camera_K[1, 1]))
     per_cell = np.radians(cell_deg) * focal_px

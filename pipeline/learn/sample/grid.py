@@ -1,10 +1,9 @@
-"""The equirectangular grid that all networks see: directions of the camera's optical frame, in equal angles.
+"""The equirectangular grid of all networks: directions of the camera's optical frame, in equal angles.
 
-A camera is resampled onto it once; lidar and radar are rendered onto it through the current guess, so that a
-rotation error is a shift of cells whatever the lens. Column 0 is the leftmost, row 0 the highest; the centre of
-cell (v, u) has azimuth `left - (u + 1/2) c` and elevation `top - (v + 1/2) c`, c the size of a cell.
-
-Azimuth is positive to the left, elevation upwards, as in `geometry.spherical.camera_direction_angles`.
+A camera is resampled onto it once; lidar and radar are rendered onto it at the current guess, so a rotation
+error is a shift of cells for any lens. Column 0 is the leftmost, row 0 the highest; the centre of cell (v, u)
+has azimuth `left - (u + 1/2) c` and elevation `top - (v + 1/2) c`, c the size of a cell. Azimuth is positive
+to the left, elevation upwards, as in `geometry.spherical.camera_direction_angles`.
 """
 
 from __future__ import annotations
@@ -22,15 +21,10 @@ __all__ = ["Grid", "grid_rays", "resample_camera"]
 
 @dataclass(frozen=True)
 class Grid:
-    """What part of the camera's directions is looked at, and how finely.
+    """Part of the camera's directions in cells of `cell_deg`: 0.4 for a CPU, 0.2 for a GPU.
 
-    Args:
-        cell_deg: size of a cell; 0.4 is the CPU budget's, 0.2 the GPU's.
-        left_deg: azimuth of the left border (the right one is its mirror image).
-        top_deg: elevation of the upper border.
-        bottom_deg: elevation of the lower border.
-
-    The default is the paper rig's lidar (60 x 24 deg) and 8 deg around it.
+    `left_deg` is the azimuth of the left border; the right one is its mirror image. The default is the paper
+    rig's lidar (60 x 24 deg) and 8 deg around it.
     """
 
     cell_deg: float = 0.4
@@ -67,11 +61,7 @@ class Grid:
         return _Level(self.cell_deg / factor, self.left_deg, self.top_deg, self.bottom_deg)
 
     def window(self, stored: tuple[int, int], step_deg: float) -> tuple[slice, slice]:
-        """Rows and columns of this view in maps of (height, width) cells about the optical axis.
-
-        Raises:
-            ValueError: cells of another size, or maps that do not contain this view.
-        """
+        """Rows and columns of this view in centred maps of (height, width) cells; else ValueError."""
         if abs(step_deg - self.cell_deg) > 1e-9:
             raise ValueError(f"the data has cells of {step_deg} deg, the network wants {self.cell_deg} deg")
         rows, columns = stored
@@ -107,7 +97,7 @@ def grid_rays(grid: Grid) -> Float[np.ndarray, "H W 3"]:
 
 
 def _pixels(camera: Camera, grid: Grid, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Pixel (float32) of each cell in an image of (height, width) that shows what the camera's does, and if any."""
+    """Pixel (float32) of each cell in the camera's image at size (height, width), and whether it exists."""
     uv, valid = camera.project(grid_rays(grid))
     seen = np.asarray(valid & camera.contains(uv))
     # By axis: sides are rounded to whole pixels, and 0.07 cells of elevation were lost to one factor for both.
@@ -120,8 +110,8 @@ def resample_camera(
 ) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"]]:
     """The image in the grid's cells, and 1 where the camera sees the whole cell.
 
-    Colours are averaged over the cell: the image is first reduced to about half a cell per pixel, then sampled
-    twice per cell and axis. `camera` may belong to another size of the same image (pre-reduced images).
+    Colours are averaged over the cell: the image is first reduced to about half a cell per pixel, then
+    sampled twice per cell and axis. `camera` may belong to another size of the same image.
     """
     fine = grid.finer(2)
     pitch_rad = 1.0 / max(camera.focal_px) * camera.width_px / image.shape[1]

@@ -59,15 +59,13 @@ EVIDENCE = ("class_maps", "point_probability", "point_worth")
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """What is built.
+    """Structure of a network.
 
     Args:
-        architecture: explicit matching, or the paper's concatenation.
-        pairs: all three pairs in one network, or one pair.
-        grid: part of the camera's directions that is looked at.
         width: channels of the encoders' first stage.
         hidden: features per pair before fusion (matching), fused features (concat).
-        takes_classes: the camera is its image and what a segmenter makes of it, where there is one (matching).
+        takes_classes: the camera is its image and what a segmenter makes of it, where there is one
+            (matching).
         marks: bright ground of the sweep is matched with the image's (matching); files before 0.9.0 do not.
     """
 

@@ -11,13 +11,7 @@ __all__ = ["accelerate"]
 
 
 def accelerate(network: nn.Module, *, half: bool, compiled: bool) -> None:
-    """Run the network's image encoders in bfloat16, compiled, or both; parameters and outputs stay float32.
-
-    Args:
-        network: changed in place.
-        half: bfloat16 where the device has it in hardware.
-        compiled: by torch.compile.
-    """
+    """Set the image encoders to bfloat16, compile them, or both; parameters and outputs stay float32."""
     for module in network.modules():
         if isinstance(module, CameraEncoder | LidarEncoder):
             if half:

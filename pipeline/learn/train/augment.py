@@ -1,11 +1,12 @@
 """Random wrong guesses and turned camera views, so that a network does not memorise the mounting of one rig.
 
-To move a cloud by A and look at it through T is to look at it as it is through T A; so clouds stay, and the guesses
-move. Lidar and radar move independently, the three guesses close the loop. A turned view is the same image on a grid
-turned by R: poses into the turned camera are R T, and the losses, which keep the unturned maps, are given R^-1 T.
+A cloud moved by A and seen at T looks like the cloud seen at T A, so the guesses move instead of the clouds.
+Lidar and radar move independently; the three guesses close the loop. A turned view is the same image on a
+grid turned by R: poses into the turned camera are R T, and the losses, which keep the unturned maps, get R^-1
+T.
 
-Source: paper section 4.5.4 (random rotation and translation of lidar and radar clouds); turning the camera's view as
-well is this project's own.
+Source: paper section 4.5.4 (random rotation and translation of lidar and radar clouds); turned views are new
+here.
 """
 
 from __future__ import annotations
@@ -42,13 +43,7 @@ class Guess:
 
 
 def random_guess(batch: TrainingBatch, config: AugmentConfig, generator: torch.Generator) -> Guess:
-    """Guesses about the batch's reference poses.
-
-    Args:
-        batch: frames with their reference.
-        config: sizes.
-        generator: of the CPU, whatever the batch's device: the same numbers everywhere.
-    """
+    """Guesses about the batch's reference poses; a generator of the CPU gives the same on every device."""
     count = len(batch)
 
     def even(*shape: int) -> Tensor:
@@ -68,9 +63,9 @@ def random_guess(batch: TrainingBatch, config: AugmentConfig, generator: torch.G
 
 
 def turned_view(batch: TrainingBatch, R_turned_camera: Float[Tensor, "B 3 3"]) -> TrainingBatch:
-    """The batch with image, classes and visibility as a turned camera sees them; all else, losses' maps too, stays.
+    """The batch with image, classes and visibility of a turned camera; other columns stay.
 
-    Cells that the stored grid does not show are unseen and of unknown class.
+    Cells outside the stored grid are unseen and of unknown class.
     """
     height, width = batch.sky_depth.shape[1:]
     step = batch.grid_step_deg * _RAD

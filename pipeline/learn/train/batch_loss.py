@@ -1,4 +1,4 @@
-"""The loss of one batch: random wrong guesses, the network's answers, and what they are worth."""
+"""The loss of one batch: random wrong guesses, and errors of the network's answers."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _DEG = 180.0 / torch.pi
 
 
 class Passes(nn.Module):
-    """The network's passes as one forward call, which is what data parallelism wraps."""
+    """The network's passes as one forward call, which data parallelism wraps."""
 
     def __init__(self, network: CalibrationNetwork, iterations: int) -> None:
         super().__init__()
@@ -44,7 +44,7 @@ class Passes(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class StepLoss:
-    """What to descend, and what to report (means over the batch, of the last pass)."""
+    """The loss, and values to report (means over the batch, of the last pass)."""
 
     loss: Float[Tensor, ""]
     report: dict[str, Tensor]
@@ -65,11 +65,7 @@ def batch_loss(
 
     Args:
         passes: a `Passes` of the network, bare or wrapped for data parallelism.
-        batch: frames on the network's device.
-        config: of the run.
         day_means: running mean of each day's answers; the batch's answers join it.
-        generator: of everything random here.
-        network: of the passes, for its grid.
         matched: whether poses are estimated and judged, or encoders learn classes only.
         paper: where `loss.definition` is "paper": what its losses are computed from.
     """
@@ -101,7 +97,7 @@ def _alignment(
     config: TrainConfig,
     paper: PaperFrames | None,
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """What the answers are worth, mean over frames and passes, and the terms of the last pass."""
+    """Loss of the answers, mean over frames and passes, and the terms of the last pass."""
     objective, pairs = None if paper else frame_objective(batch), PAIRS_OF[config.pairs]
     total = torch.zeros((), device=batch.T_camera_lidar.device)
     terms: dict[str, Tensor] = {}

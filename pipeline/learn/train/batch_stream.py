@@ -15,10 +15,7 @@ __all__ = ["BatchStream"]
 
 
 class BatchStream:
-    """The loader's batches of the split `train` for this process, without end.
-
-    On a GPU the next one is fetched while the current one is used. Raises ContractError where there are none.
-    """
+    """Endless batches of split `train` for this process, prefetched on a GPU; else ContractError."""
 
     def __init__(self, data: str, config: TrainConfig, processes: Processes) -> None:
         rank_of = (processes.rank, processes.count)
@@ -52,7 +49,7 @@ class BatchStream:
         self._place = state
 
     def close(self) -> None:
-        """Let go of threads and memory."""
+        """Release threads and memory."""
         if self._ahead is not None:
             self._ahead.shutdown(wait=True, cancel_futures=True)
         self._loader.close()

@@ -27,11 +27,7 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
 
 
 def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
-    """Read a checkpoint, without running any code that it might hold.
-
-    Raises:
-        ContractError: it is no checkpoint of this format.
-    """
+    """Read a checkpoint without running code in it; raises ContractError if it has another format."""
     try:
         state: dict[str, Any] = torch.load(path, map_location=device, weights_only=True)
     except FileNotFoundError:

@@ -1,9 +1,9 @@
-"""What training minimises for a batch: terms of the three pairs and the loop, as in the estimator's objective.
+"""Training loss of a batch: terms of the three pairs and the loop, as in the estimator's objective.
 
-Angles in degrees, translations in metres, per-frame means over what is valid. No term uses a true transform: the
-reference only says which points the camera sees for certain.
+Angles in degrees, translations in metres, per-frame means over valid rows. No term uses a true transform: the
+reference only decides which points the camera sees for certain.
 
-Source: paper section 4.4 (SSL minimises L_P + L_G); edges, static points and the prior's term are this project's own.
+Source: paper section 4.4 (SSL minimises L_P + L_G); edges, static points and the prior's term are new here.
 """
 
 from __future__ import annotations
@@ -173,9 +173,9 @@ def _from_prior(
 ) -> Float[Tensor, "*batch"]:
     """Distance of a pose to the day's prior: absolute angles [deg] and shifts (a metre as in the loop), smooth at 0.
 
-    Absolute values, not squares: over a fleet, the priors' errors cancel in the median. The gradient is small and
-    constant. It keeps at the prior what frames do not determine (a shift along the camera's axis, a radar's height),
-    which the bias of some other term would move; what frames determine has larger gradients.
+    Absolute values, not squares: over a fleet, the priors' errors cancel in the median. The small constant
+    gradient keeps undetermined axes at the prior (a shift along the camera's axis, a radar's height), which
+    the bias of another term would move; determined axes have larger gradients.
     """
     twist = twist_between(T, T_prior.to(T.dtype))
     scaled = torch.cat([twist[..., :3] * DEG, twist[..., 3:] * _LOOP_METRE], -1)
@@ -199,9 +199,9 @@ def _weight(weights: LossConfig, name: str) -> float:
 
 
 def _at_lag(batch: TrainingBatch, points: Float[Tensor, "B N 3"], lag_s: Float[Tensor, " B"]) -> Tensor:
-    """Static points in the lidar frame `lag_s` later, when another sensor measures: the car has moved towards them.
+    """Static points in the lidar frame `lag_s` later, when another sensor measures: the car has moved.
 
-    A constant time offset that the stamps do not show remains in the answer as a shift along the direction of travel.
+    A constant time offset that stamps do not show remains as a shift along the direction of travel.
     """
     ahead = (batch.ego_speed_mps * lag_s)[:, None]
     return torch.stack([points[..., 0] - ahead, points[..., 1], points[..., 2]], -1)

@@ -1,7 +1,7 @@
 """The training loop of every network: resumable, within a time limit, stopped by a signal between two steps.
 
-A run can be stopped at any moment and goes on where its last checkpoint was. On one CPU thread it then gives the same
-weights, bit for bit, as one that was never stopped: everything random in a step comes from (seed, step, rank).
+A run can be stopped at any moment and continues at its last checkpoint. On one CPU thread it then gives the
+same weights, bit for bit, as a run without a stop: all randomness of a step comes from (seed, step, rank).
 """
 
 from __future__ import annotations
@@ -39,14 +39,7 @@ class TrainResult:
 
 
 class Run(ABC):
-    """What a step changes.
-
-    Args:
-        network: in training mode.
-        config: rates and limits.
-        steps: in all.
-        processes: this process among those that train together.
-    """
+    """State that a step changes; the network is in training mode."""
 
     def __init__(
         self, network: nn.Module, config: DescentConfig, steps: int, processes: Processes = ALONE
@@ -65,12 +58,12 @@ class Run(ABC):
 
     @property
     def finished(self) -> bool:
-        """True when there is nothing left to train."""
+        """True if the run has no steps left."""
         return self.step >= self.steps or self.progress >= 1
 
     @abstractmethod
     def losses(self) -> dict[str, Tensor]:
-        """The next step's `loss`, differentiable, and what else is reported."""
+        """The next step's `loss`, differentiable, and further values to report."""
 
     def comparable(self) -> bool:
         """Whether the next step's loss may be compared with earlier ones, to see a run diverge."""
@@ -80,7 +73,7 @@ class Run(ABC):
         """Called after every step."""
 
     def state(self) -> dict[str, Any]:
-        """What a checkpoint holds; every process must call."""
+        """Content of a checkpoint; every process must call this."""
         return {
             "network": self.network.state_dict(),
             "optimiser": self.optimiser.state_dict(),
@@ -103,7 +96,7 @@ class Run(ABC):
             save_checkpoint(folder / LAST, state)
 
     def descend(self) -> dict[str, Tensor]:
-        """One step of Adam; returns what to report."""
+        """One step of Adam; returns values to report."""
         config, comparable = self.descent, self.comparable()
         rate = cosine_rate(self.progress, config.learning_rate, config.final_learning_rate)
         for group in self.optimiser.param_groups:
@@ -128,15 +121,12 @@ def run_loop(
     time_limit_s: float | None,
     progress: Progress,
 ) -> TrainResult:
-    """Train until the run is finished, the time is up or a signal asks to stop; leaves last.pt in the folder.
+    """Train until the run is finished, the time is up or a signal stops it; leaves last.pt in the folder.
 
     Args:
-        run: fresh or resumed.
-        folder: of the run.
         log: of the process that leads; None in the others.
         stops: signals received, see `stop_signals`.
         time_limit_s: of this call; None = no limit.
-        progress: called at every report.
 
     Raises:
         DivergedError: the loss is no number or has grown too far; the last checkpoint is from before.

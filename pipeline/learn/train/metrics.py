@@ -1,4 +1,4 @@
-"""What a run reports: metrics.jsonl, one line per report, and TensorBoard events beside it."""
+"""Reports of a run: metrics.jsonl, one line per report, and TensorBoard events beside it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ class MetricsLog:
     """Appends reports of a run; after a resume, lines beyond the checkpoint are dropped first, so none is doubled.
 
     Args:
-        folder: of the run.
         from_step: reports of later steps are dropped.
         events: whether to write TensorBoard events as well, where TensorBoard is installed.
     """
@@ -27,7 +26,7 @@ class MetricsLog:
         self._events = _writer(folder / "events", from_step) if events else None
 
     def report(self, step: int, values: dict[str, float]) -> None:
-        """One report; what is no number becomes null."""
+        """One report; values that are not finite become null."""
         plain = {k: v if math.isfinite(v) else None for k, v in values.items()}
         self._file.write(json.dumps({"step": step} | plain) + "\n")
         self._file.flush()
@@ -43,7 +42,7 @@ class MetricsLog:
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:
-    """All whole lines of a run's reports, oldest first; none where there are none."""
+    """All complete lines of a run's reports, oldest first."""
     path = folder / "metrics.jsonl"
     if not path.exists():
         return []

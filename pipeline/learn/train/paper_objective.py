@@ -1,7 +1,7 @@
-"""The paper's own loss for a batch: the objective of `joint-optimisation`, frame by frame, as training can descend it.
+"""The paper's own loss of a batch: the objective of `joint-optimisation`, frame by frame, with gradients.
 
-Table `training` holds maps in equal angles for this project's loss. The paper's is computed from table `observations`
-instead, by the same preparation as the optimiser's: the numbers are those of `pipeline.objective.paper`, to rounding
+Table `training` holds maps in equal angles for this project's loss. The paper's loss is computed from table
+`observations`, by the same preparation as the optimiser's, and equals `pipeline.objective.paper` to rounding
 (tests/learn/train/test_paper_objective.py). Frames are prepared on first use and kept, 0.5 MB each.
 
 Source: paper, sections 4.3 (pairs), 4.4 (loop) and "Loss function" (L = L_P + L_G, all weights one).
@@ -56,10 +56,10 @@ class PairLoss(Protocol):
 
 
 class PaperFrames:
-    """Prepared frames of a lake's vehicle-days, those asked for last."""
+    """Prepared frames of a lake's vehicle-days, the last used ones."""
 
     def __init__(self, lake: Lake) -> None:
-        """Frames of a lake that has observations beside its table `training`."""
+        """Frames of a lake with observations beside its table `training`."""
         self._lake = lake
         self._days: OrderedDict[Partition, dict[int, dict[str, PairLoss]]] = OrderedDict()
 
@@ -71,10 +71,10 @@ class PaperFrames:
         T_lidar_radar: Float[Tensor, "B 4 4"],
         pairs: tuple[str, ...],
     ) -> dict[str, Float[Tensor, " B"]]:
-        """Every loss of the pairs, and of the loop where `joint` is among them; their sum is the paper's L.
+        """Losses of the pairs, and of the loop if `joint` is among them; their sum is the paper's L.
 
         Raises:
-            ContractError: a frame of the batch has no observation any more.
+            ContractError: a frame of the batch no longer has an observation.
         """
         frames = [self._frame(batch, i) for i in range(len(batch))]
         poses = {"camera_lidar": T_camera_lidar, "camera_radar": T_camera_radar, "lidar_radar": T_lidar_radar}
@@ -116,7 +116,7 @@ def paper_frame(
     T_camera_lidar: Float[np.ndarray, "4 4"],
     T_camera_radar: Float[np.ndarray, "4 4"],
 ) -> dict[str, PairLoss]:
-    """The losses of one frame by pair; the poses (the day's prior) only say which points are asked to lie in view."""
+    """The losses of one frame by pair; the day's prior decides which points must lie in view."""
     margin = np.radians(SolveConfig().search_rotation_deg)
     return {
         "camera_lidar": folded_tensors(camera_lidar_loss([observation], T_camera_lidar, margin).frames),
@@ -126,7 +126,7 @@ def paper_frame(
 
 
 def with_paper_inputs(network: CalibrationNetwork) -> None:
-    """Make an untrained `concat` network blind to what is no measurement: its weights of those channels stay zero."""
+    """Set the weights of channels that are not measured to zero in an untrained `concat` network."""
     assert isinstance(network.core, ConcatCore)
     features = {"lidar": LIDAR_FEATURES, "radar": RADAR_FEATURES}
     for sensor, names in _DERIVED.items():

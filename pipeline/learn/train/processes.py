@@ -58,13 +58,9 @@ ALONE = Processes(0, 1, torch.device("cpu"))
 
 @contextmanager
 def joined(device: str) -> Iterator[Processes]:
-    """Join the process group that torchrun (or Ray) has described in the environment, or train alone.
+    """Join the process group that torchrun or Ray described in the environment, or train alone.
 
-    Args:
-        device: cpu, cuda (this process's own GPU) or auto.
-
-    Raises:
-        ConfigError: no such device here.
+    `device` is cpu, cuda (the GPU of this process) or auto; ConfigError if there is none.
     """
     rank, count = int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
     chosen = _device(device, int(os.environ.get("LOCAL_RANK", "0")))

@@ -35,7 +35,7 @@ def train_on_ray(request: TrainRequest, config: TrainConfig, workers: int) -> Tr
         from ray.train.torch import TorchTrainer  # noqa: PLC0415
     except ImportError as err:
         raise MissingExtraError("train-ray", "ray.train") from err
-    # Workers run elsewhere: what is relative here is another place there.
+    # Workers run in other folders, where relative paths differ.
     request = replace(request, out=request.out.absolute(), data=_absolute(request.data))
     request.out.mkdir(parents=True, exist_ok=True)
     (request.out / _RESULT).unlink(missing_ok=True)
@@ -60,7 +60,7 @@ def _absolute(data: str) -> str:
 
 
 def _cause(out: Path, error: Exception) -> BoresightError:
-    """What a worker of ours complained of, where Ray tells; otherwise Ray's own words."""
+    """The worker's own error if Ray reports it; otherwise Ray's message."""
     failures = getattr(error, "worker_failures", None) or {}
     for found in [*failures.values(), error]:
         cause: BaseException | None = found

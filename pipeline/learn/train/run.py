@@ -10,6 +10,7 @@ from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipeline.learn.prepare.inventory import require_sides
 from pipeline.learn.train.loop import TrainResult, run_loop
 from pipeline.learn.train.metrics import MetricsLog
 from pipeline.learn.train.processes import joined
@@ -17,20 +18,19 @@ from pipeline.learn.train.run_state import begin_run
 from pipeline.learn.train.settings import TrainConfig
 from pipeline.learn.train.stop_signals import stop_signals
 from pipeline.results import Progress, silent
+from pipeline.store.partitions import Lake
 
 __all__ = ["TrainRequest", "train"]
 
 
 @dataclass(frozen=True)
 class TrainRequest:
-    """What a command asks for beside the configuration.
+    """Options of a training command in addition to the configuration.
 
     Args:
         data: folder of a lake with table `training`.
         out: folder of the run; an unfinished run in it goes on.
-        device: cpu, cuda or auto.
         time_limit_s: stop with a checkpoint after so long in this call; None = no limit.
-        compiled: compile the encoders.
         start: run or exported file whose weights a fresh run begins with; a run that goes on has its own.
     """
 
@@ -46,12 +46,14 @@ def train(request: TrainRequest, config: TrainConfig, progress: Progress = silen
     """Train, or go on training, until the run is finished, the time is up or a signal asks to stop.
 
     Raises:
-        ConfigError: the run in `out` was begun with another configuration; no such device; `start` has another kind
-            of network.
-        ContractError: no training data, or other data than the run began with; nothing trained in `start`.
+        ConfigError: the run in `out` was begun with another configuration; no such device; `start` has
+            another kind of network.
+        ContractError: no training data, an empty side, or other data than the run began with; nothing trained
+            in `start`.
         DivergedError: the loss is no number or has grown too far; the last checkpoint is from before.
     """
     out = request.out
+    require_sides(Lake.at(request.data))
     out.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         processes = stack.enter_context(joined(request.device))

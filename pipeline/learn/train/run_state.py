@@ -62,7 +62,7 @@ class RunState(Run):
 
     @property
     def progress(self) -> float:
-        """Share of the run that is done, by time where time is what ends it."""
+        """Share of the run that is done, by time if time ends it."""
         if self.config.budget_minutes is not None:
             return self.trained_s / (60 * self.config.budget_minutes)
         return super().progress
@@ -106,18 +106,14 @@ class RunState(Run):
             save_checkpoint(folder / BEST, self._about() | content)
 
     def state(self) -> dict[str, Any]:
-        """What a checkpoint holds; every process must call."""
+        """Content of a checkpoint; every process must call this."""
         # "consensus": name of the running day means in checkpoints of format 1.
         own = {"stream": self.stream.state_dict(), "consensus": self.day_means.state_dict()}
         everyone = {"processes": self.processes.gather(own), "best": self.best}
         return super().state() | self._about() | everyone
 
     def load(self, state: dict[str, Any]) -> None:
-        """Go on from a checkpoint.
-
-        Raises:
-            ConfigError: it was written by another number of processes.
-        """
+        """Continue from a checkpoint; raises ConfigError if another number of processes wrote it."""
         if len(state["processes"]) != self.processes.count:
             problem = f"begun by {len(state['processes'])}, now {self.processes.count}"
             raise ConfigError("train", "processes", f"a run goes on with as many as it was {problem}")
@@ -157,11 +153,7 @@ def begin_run(
 
 
 def network_of_run(folder: Path, *, best: bool = True) -> CalibrationNetwork:
-    """The trained network of a run, on the CPU, for inference: the best on validation frames, else the last.
-
-    Raises:
-        ContractError: no readable checkpoint.
-    """
+    """Network of a run, on the CPU: the best on validation frames, else the last, else ContractError."""
     path = folder / (BEST if best and (folder / BEST).exists() else LAST)
     if not path.exists():
         raise ContractError(str(folder), f"no run: there is neither {BEST} nor {LAST}")

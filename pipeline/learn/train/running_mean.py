@@ -1,7 +1,7 @@
-"""Running mean of each vehicle-day's answers: the reference that teaches single frames their variance, without truth.
+"""Running mean of each vehicle-day's answers: the reference from which single frames learn their variance.
 
-The variance that a network predicts for a frame should be that of single frames about their day's mean. A bias that all
-frames of a day share does not show in it, and cannot without truth.
+The variance that a network predicts for a frame should be that of single frames about their day's mean. A
+bias common to all frames of a day is not part of it, and cannot be learned without truth.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class DayMeans:
         return [self._count.get(day, 0) >= _LEAST_ANSWERS for day in days]
 
     def pose(self, days: list[str], pair: int, references: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B 4 4"]:
-        """Each day's mean answer for a pair; its reference where no answer is known."""
+        """Each day's mean answer for a pair, or its reference without answers."""
         none = torch.zeros(3, 6)
         twist = torch.stack([self._mean.get(day, none)[pair] for day in days])
         return _moved(twist.to(references), references)

@@ -1,4 +1,4 @@
-"""How the learning rate falls, and when a run has gone wrong.
+"""Schedule of the learning rate, and detection of divergence.
 
 Source: paper section 4.5.4: cosine from 3e-4 to 3e-7.
 """
@@ -16,7 +16,7 @@ _SMOOTHING = 0.05  # of the loss: about the last twenty reports count
 
 
 class DivergedError(BoresightError):
-    """Training that would only get worse: `step` and what was seen."""
+    """Training that diverges: `step` and the loss."""
 
     def __init__(self, step: int, reason: str) -> None:
         self.step, self.reason = step, reason
@@ -30,7 +30,7 @@ def cosine_rate(progress: float, first: float, last: float) -> float:
 
 
 class DivergenceGuard:
-    """Watches the loss: raises where it is no number, or grows to a multiple of its smallest smoothed value."""
+    """Raises if the loss is not finite, or a multiple of its smallest smoothed value."""
 
     def __init__(self, factor: float) -> None:
         self._factor = factor
@@ -39,11 +39,7 @@ class DivergenceGuard:
         self._seen = 0
 
     def check(self, step: int, loss: float, gradient_norm: float) -> None:
-        """Report one step.
-
-        Raises:
-            DivergedError: see the class.
-        """
+        """Check the loss of one step."""
         if not math.isfinite(loss):
             raise DivergedError(step, f"the loss is {loss}")
         if not math.isfinite(gradient_norm):

@@ -1,8 +1,8 @@
-"""The encoders' loss: the precomputed classes of the camera, carried to lidar and radar points by a guess.
+"""Loss of the encoders: the camera's precomputed classes, carried to lidar and radar points by a guess.
 
-Lidar semantics are not needed: a point takes the class of the image cell that it falls into. A wrong guess blurs these
-labels, but over a fleet it does not bias them. Once the network's own estimate is better than the day's prior, it is
-the better guess.
+Lidar semantics are not needed: a point takes the class of its image cell. A wrong guess blurs these labels,
+but does not bias them over a fleet. Once the network's own estimate is better than the day's prior, it is the
+guess.
 """
 
 from __future__ import annotations
@@ -43,13 +43,10 @@ def semantics_loss(
     lidar_class: Int64[Tensor, "B N"],
     radar_class: Int64[Tensor, "B M"],
 ) -> Float[Tensor, ""]:
-    """Cross-entropy of all encoders that the predictions of one pass come from; 0 for networks without any.
+    """Cross-entropy of all encoders of one pass; 0 for networks without any.
 
-    Args:
-        predictions: of the pass.
-        grid_class: the camera's classes on the network's grid (cropped as its image was).
-        lidar_class: of the points in SensorInputs, by `class_of_points`.
-        radar_class: of the detections, likewise.
+    `grid_class` is cropped as the image was; the classes of lidar points and detections are by
+    `class_of_points`.
     """
     loss = torch.zeros((), device=grid_class.device)
     if predictions.camera_logits is not None:

@@ -1,4 +1,4 @@
-"""train.toml as frozen values: what is trained, how long and how; unknown keys and impossible values are errors.
+"""train.toml as frozen values; unknown keys and impossible values are errors.
 
 The defaults are the paper's recipe where it gives one: Adam (0.9, 0.999), batch 4, cosine from 3e-4 to 3e-7.
 """
@@ -71,10 +71,10 @@ class LossConfig(_Section):
 
 
 class AugmentConfig(_Section):
-    """How wrong the guess is made, and how far the camera's view is turned, in training.
+    """Sizes of the random errors of the guess and of the turned camera view in training.
 
-    The paper moves the lidar's and the radar's clouds at random. Turning the camera's view as well keeps a network from
-    memorising one viewpoint.
+    The paper moves the lidar's and the radar's clouds at random. Turning the camera's view as well keeps a
+    network from memorising one viewpoint.
     """
 
     rotation_deg: NotNegative = 3.0  # per axis, even
@@ -85,9 +85,9 @@ class AugmentConfig(_Section):
 
 
 class StrangeConfig(_Section):
-    """How strange what is shown is made in training, so that nothing of one renderer, segmenter or lidar is learned.
+    """Domain randomisation: nothing of one renderer, segmenter or lidar is to be learned.
 
-    Nothing of it touches what the losses compare. All off: a fleet's own logs look as they will look tomorrow.
+    Inputs of the losses stay as they are. All off by default, for a fleet's own logs.
     """
 
     image: NotNegative = (
@@ -107,7 +107,7 @@ class StrangeConfig(_Section):
 
 
 class DescentConfig(_Section):
-    """How any network descends: what the training loop reads."""
+    """Settings of the training loop for any network."""
 
     batch_size: Count = 4  # frames per process
     steps: Count | None = None
@@ -188,7 +188,7 @@ class TrainConfig(DescentConfig):
 
 
 def load_train_config(path: Path | None, overrides: Mapping[str, object]) -> TrainConfig:
-    """Read and validate train.toml; `overrides` (from the command line) win, None means not given.
+    """Read and validate train.toml; `overrides` of the command line win, None means not given.
 
     Raises:
         ConfigError: missing file, no TOML, unknown key, impossible value; the message names the key.

@@ -15,9 +15,8 @@ __all__ = ["stop_signals"]
 def stop_signals() -> Iterator[list[int]]:
     """Collect SIGTERM and SIGINT instead of ending the process in the middle of a step.
 
-    Yields:
-        The numbers of the signals that have arrived so far; empty while nobody asked to stop. Always empty outside
-        the main thread: Ray's workers receive no signals of their own.
+    Yields a list of the signals so far. It stays empty outside the main thread: Ray's workers receive no
+    signals.
     """
     received: list[int] = []
     if threading.current_thread() is not threading.main_thread():

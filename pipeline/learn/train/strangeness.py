@@ -1,7 +1,6 @@
-"""Sensors made strange, so that a network learns what holds on every car: shapes and classes, not one renderer's look.
+"""Domain randomisation of sensor data, so that a network learns shapes and classes, not one renderer's look.
 
-Source: Tobin et al. 2017 (domain randomisation). What is drawn is the same on every device: numbers come from a
-generator of the CPU.
+Source: Tobin et al. 2017. Draws are the same on every device, because the generator is the CPU's.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ _NEARER = 1.0  # trees 15 m away were taken for lorries, as simulated trees stan
 
 
 def made_strange(sensors: SensorInputs, config: StrangeConfig, generator: torch.Generator) -> SensorInputs:
-    """The sensors with everything that the configuration asks for."""
+    """The sensors with all configured randomisations."""
     camera, classes = sensors.camera, sensors.classes
     true = classes
     if config.classes > 0:
@@ -57,7 +56,7 @@ def strange_image(
     strength: float,
     generator: torch.Generator,
 ) -> Float[Tensor, "B 4 H W"]:
-    """Another light, other colours (of each class for itself), other surfaces, another lens and sensor."""
+    """Random light, colours per class, surfaces, lens and sensor."""
     count, _, height, width = camera.shape
     draw = _Draw(generator, camera.device)
     colours, seen = camera[:, :3], camera[:, 3:]
@@ -83,7 +82,7 @@ def strange_image(
 def strange_classes(
     classes: Float[Tensor, "B C H W"], strength: float, generator: torch.Generator
 ) -> Float[Tensor, "B C H W"]:
-    """Another segmenter's: outlines wander, things swell, patches are confused or missing, it is more or less sure."""
+    """Random segmenter: outlines wander, objects grow, patches are confused or missing, confidence varies."""
     count, channels, height, width = classes.shape
     draw = _Draw(generator, classes.device)
     # A quarter of the frames keeps the labels' own errors only.
@@ -164,7 +163,7 @@ def _chosen(count: int, share: float, generator: torch.Generator, device: torch.
 
 
 def _normal_quantile(share: float) -> float:
-    """What a standard normal variable exceeds in this share of cases."""
+    """Value that a standard normal variable exceeds with this probability."""
     return float(torch.special.ndtri(torch.tensor(1 - share)))
 
 

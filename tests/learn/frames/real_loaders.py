@@ -2,7 +2,7 @@
 
 python tests/learn/frames/real_loaders.py NUSCENES_FOLDER WEBDATASET_FOLDER    prints JSON: what they find
 
-The Python is that of tests/export/real_readers.py, with webdataset beside it.
+The Python is that of tests/export/real_readers.py.
 """
 
 import json

@@ -48,16 +48,23 @@ def lake(tmp_path_factory):
     return folder
 
 
-def export(lake, out, form, *more, code=0):
-    call = ["export", "frames", "--fleet", str(lake / "fleet.toml"), "--lake", str(lake), "--out", str(out)]
-    call += [
-        "--format",
-        form,
-        "--executor",
-        "inline",
-        *(more if "--calibration" in more else ("--calibration", "prior", *more)),
+def command(lake, out, form, of=None):
+    call = [
+        "export",
+        "frames",
+        "--fleet",
+        str(lake / "fleet.toml"),
+        "--lake",
+        str(of or lake),
+        "--out",
+        str(out),
     ]
-    assert main(call) == code
+    return [*call, "--format", form, "--executor", "inline", "--calibration", "prior"]
+
+
+def export(lake, out, form, *more, code=0):
+    call = command(lake, out, form)
+    assert main([*(call[:-2] if "--calibration" in more else call), *more]) == code
     return None if code else json.loads((Path(out) / "card.json").read_text())
 
 
@@ -219,7 +226,76 @@ def test_a_stopped_export_counts_nothing_half_and_is_completed_to_the_same_bytes
     assert {p: p.stat().st_mtime_ns for p in old} == old  # what was whole was not made again
 
 
-def test_a_later_vehicle_takes_no_frame_from_a_split_that_has_it(lake, tmp_path):
+def killed_export(lake, out, form, at, function="os.fsync", of=None):
+    """Begin an export in a process that is killed, as by `kill -9`, in its n-th call of what writes a file."""
+    module, _, name = function.rpartition(".")
+    code = (
+        f"import os, signal, sys, {module}\nwrite, seen = {function}, []\n"
+        "def dies(*given):\n    seen.append(1)\n"
+        f"    return os.kill(os.getpid(), signal.SIGKILL) if len(seen) == {at} else write(*given)\n"
+        f"{module}.{name} = dies\nfrom jobs.cli import main\nmain(sys.argv[1:])\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, *command(lake, out, form, of)], capture_output=True, check=False
+    )
+    assert done.returncode == -9
+
+
+@pytest.mark.parametrize("form", ["webdataset", "kitti", "nuscenes"])
+def test_an_export_killed_in_the_middle_of_a_file_goes_on_to_the_same_bytes(
+    lake, tmp_path, monkeypatch, form
+):
+    flushes, flush = [], os.fsync
+    monkeypatch.setattr(os, "fsync", lambda handle: flushes.append(1) or flush(handle))
+    export(lake, tmp_path / "whole", form)
+    monkeypatch.undo()
+    wanted = contents(tmp_path / "whole")
+    assert not [name for name in wanted if "begun" in name]
+    killed_export(lake, tmp_path / "out", form, len(flushes) // 2)
+    assert list((tmp_path / "out").rglob("*.tmp"))
+    assert 0 < len(list((tmp_path / "out").rglob("done.json"))) < 6
+    export(lake, tmp_path / "out", form)
+    assert contents(tmp_path / "out") == wanted
+
+
+@pytest.mark.parametrize(("form", "later", "at"), [("kitti", 6, 60), ("kitti", 3, 60), ("nuscenes", 3, 34)])
+def test_files_of_a_killed_export_do_not_stay_when_its_days_are_planned_anew(tmp_path, form, later, at):
+    own = tmp_path / "lake"
+    own.mkdir()
+    one = SECTION.replace("vehicle", "day").replace("0.2", "0")
+    (own / "fleet.toml").write_text(fleet_toml("a", sections=one))
+    training_lakes.fill(Lake.at(own), "a", DAYS[0], frames=4, **EGO)
+    killed_export(own, tmp_path / "out", form, at)
+    before = {p for p in contents(tmp_path / "out") if p.startswith(("training", "samples"))}
+    training_lakes.fill(Lake.at(own), "a", DAYS[0], frames=later, seed=3, **EGO)
+    export(own, tmp_path / "out", form)
+    export(own, tmp_path / "fresh", form)
+    count = [
+        len([p for p in contents(tmp_path / o) if p.startswith(("training", "samples"))])
+        for o in ("out", "fresh")
+    ]
+    assert len(before) > 8
+    assert count[0] == count[1]
+
+
+def test_vehicles_whose_names_differ_in_a_dot_do_not_share_a_file(tmp_path):
+    names = ("a.b", "a-b", "a%2Eb")
+    one = SECTION.replace("vehicle", "day").replace("0.2", "0")
+    (tmp_path / "fleet.toml").write_text(fleet_toml(*names, sections=one))
+    for name in names:
+        training_lakes.fill(Lake.at(tmp_path), name, DAYS[0], frames=3, **EGO)
+    card = export(tmp_path, tmp_path / "out", "webdataset")
+    assert len(set(card["files"]["train"])) == 3
+    found = set()
+    for name in card["files"]["train"]:
+        with tarfile.open(tmp_path / "out" / name) as tar:
+            about = [json.load(tar.extractfile(m)) for m in tar if m.name.split(".", 1)[1] == "json"]
+        found |= {(a["vehicle"], a["key"]) for a in about}
+    assert {v for v, _ in found} == set(names)
+    assert len(found) == 9
+
+
+def test_a_later_vehicle_takes_no_frame_from_a_split_that_has_it(lake, tmp_path, capsys):
     few = tmp_path / "few.toml"
     few.write_text(fleet_toml(*VEHICLES, sections=SECTION))
     call = ["export", "frames", "--fleet", str(few), "--lake", str(lake), "--out", str(tmp_path / "out")]
@@ -230,6 +306,11 @@ def test_a_later_vehicle_takes_no_frame_from_a_split_that_has_it(lake, tmp_path)
     assert [side for side in first if side[0] == "vehicle"] == first
     assert json.loads((tmp_path / "out" / "plan.json").read_text())["sides"] == first
     assert main([*call, "--seed", "4"]) == 2  # another export has another place
+    few.write_text(
+        fleet_toml(*VEHICLES, sections=f"{SECTION}\nplace_m = 50")
+    )  # cells of the same names elsewhere
+    assert main(call) == 2
+    assert "another [prepare] place_m" in capsys.readouterr().out
 
 
 def test_moved_poses_are_exactly_as_far_off_as_is_said_and_the_answer_stands_beside_them(lake, tmp_path):
@@ -351,6 +432,7 @@ def test_an_empty_split_is_an_error_before_anything_is_written(lake, tmp_path, c
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_from_a_bucket_to_a_bucket_the_same_bytes_as_between_folders(lake, tmp_path, monkeypatch):
     export(lake, tmp_path / "out", "webdataset")
     with running() as s3:
@@ -361,17 +443,9 @@ def test_from_a_bucket_to_a_bucket_the_same_bytes_as_between_folders(lake, tmp_p
         for path, data in contents(lake).items():
             with remote.files.replacing(remote.root / path) as stream:
                 stream.write(data)
-        call = [
-            "export",
-            "frames",
-            "--fleet",
-            str(lake / "fleet.toml"),
-            "--lake",
-            str(remote),
-            "--out",
-            str(to),
-        ]
-        assert main([*call, "--format", "webdataset", "--calibration", "prior", "--executor", "inline"]) == 0
+        killed_export(lake, to, "webdataset", 9, "obstore.put", of=remote)
+        assert 0 < len([p for p in to.files.find(to.root, "**/*") if p.name == "done.json"]) < 6
+        assert main(command(lake, to, "webdataset", of=remote)) == 0
         found = {}
         for path in to.files.find(to.root, "**/*"):
             with to.files.opened(path) as stream:
@@ -383,7 +457,7 @@ def test_from_a_bucket_to_a_bucket_the_same_bytes_as_between_folders(lake, tmp_p
 def test_nuscenes_devkit_and_webdataset_open_what_is_written(lake, tmp_path):
     python = os.environ.get("BORESIGHT_READERS")
     if not python:
-        pytest.skip("BORESIGHT_READERS names no Python with the loaders (tests/learn/frames/real_loaders.py)")
+        pytest.skip("BORESIGHT_READERS names no Python with the loaders: make readers")
     card = export(lake, tmp_path / "shards", "webdataset")
     export(lake, tmp_path / "nuscenes", "nuscenes")
     call = [

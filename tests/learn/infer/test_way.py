@@ -9,7 +9,7 @@ from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse, log_se3
 from pipeline.learn.infer.way import WayTurn, informed_by_way, updated_by_way, way_turn
 from schemas.calibrations import PAIRS
-from tests.makers.doppler_streets import T_LIDAR_RADAR, day_of, scene, turned
+from tests.makers.doppler_streets import GROUND_M, T_LIDAR_RADAR, day_of, scene, turned
 from tests.makers.solve_scenes import T_CAMERA_LIDAR
 
 SIGMA = np.array([*np.radians([0.5, 0.3, 0.1]), 0.02, 0.02, 0.1])
@@ -52,6 +52,18 @@ def test_the_way_alone_finds_by_how_much_a_radar_is_pitched(street, pitch_deg):
     assert abs(way.turn_rad + np.radians(pitch_deg)) < 3 * way.sigma_rad
     assert np.degrees(way.sigma_rad) < 0.4
     assert way.axis @ [0, 1, 0] > 0.99
+
+
+def test_the_more_a_radar_sees_below_the_road_the_less_surely_the_way_tells_its_pitch(street):
+    days = (street, day_of(3, 16, noise_deg=2.0), day_of(3, 16, noise_deg=0.5, displaced=0.4))
+    plane = np.array([0.0, 0.0, 1.0, -GROUND_M])
+    bare, noisy, low = (
+        way_turn([replace(o, ground_plane=p) for o in day], T_LIDAR_RADAR)
+        for day, p in zip(days, (None, plane, plane), strict=True)
+    )
+    assert noisy.floor < 1.5 * bare.floor
+    assert low.floor > 4 * noisy.floor
+    assert abs(low.turn_rad) < 3 * low.sigma_rad
 
 
 def test_standing_cars_flat_radars_and_few_frames_change_nothing(street):

@@ -104,6 +104,7 @@ def test_a_turn_of_the_prior_by_whole_directions_turns_the_labels_by_as_many():
     assert np.mean(label_grid(observation, PRIOR) == label_grid(observation, turned)) < 0.99
 
 
+@pytest.mark.slow
 def test_the_network_beats_geometry_and_the_best_guess_on_roads_that_it_has_not_seen(samples, tmp_path):
     torch.set_num_threads(1)
     train, held_out = samples

@@ -11,14 +11,15 @@ from pipeline.config import load_fleet
 from pipeline.errors import ContractError
 from pipeline.geometry.se3 import exp_se3
 from pipeline.learn.prepare.inventory import alike, read_leaks, take_inventory, write_inventory
-from pipeline.learn.prepare.survey import survey_day
+from pipeline.learn.prepare.sides import frame_sides
+from pipeline.learn.prepare.survey import plan_days, survey_day
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_manifest, read_rows
-from pipeline.store.views import observations_of
+from pipeline.store.views import frames_of, observations_of, perceived_days
 from schemas.training import SPLITS, TRAINING, TrainingRow
 from tests.makers import training_lakes
 from tests.makers.fleet_files import fleet_toml
-from tests.makers.lakes import write_observations
+from tests.makers.lakes import write_frames, write_observations
 
 VEHICLES = ("a", "b", "c", "d", "e")
 
@@ -84,6 +85,89 @@ def test_cells_of_the_map_keep_vehicles_apart_that_drive_the_same_street(tmp_pat
     rows = rows_of(lake)
     assert_sides_apart(rows, ("place",))
     assert len({r.split for r in rows if r.vehicle in "acd"}) == 1  # a, c and d meet in one cell
+
+
+@pytest.mark.parametrize("positions", ["map", "local"])
+def test_frames_of_two_sides_are_far_apart_also_over_the_border_of_a_cell_and_on_another_pass(
+    tmp_path, positions
+):
+    lake, rng = Lake.at(tmp_path), np.random.default_rng(5)
+    for vehicle in "ab":  # up and down the same street, at any time
+        training_lakes.fill(lake, vehicle, "2026-01-01", 120)
+        east, north = rng.uniform(0, 900, 120), rng.uniform(0, 30, 120)
+        frames = [
+            replace(f, ego_tx_m=float(east[i]), ego_ty_m=float(north[i]), log="one")
+            for i, f in enumerate(frames_of(lake, Partition(vehicle, "2026-01-01")))
+        ]
+        write_frames(lake, Partition(vehicle, "2026-01-01"), frames, "crossed")
+    fleet = training_lakes.fleet_of(
+        "ab", positions=positions, split_by=["place"], val_fraction=0.3, test_fraction=0.3, guard_s=0
+    )
+    surveys = [survey_day(p, lake, fleet.prepare) for p in perceived_days(lake)]
+    plan = plan_days(surveys, fleet.prepare, {})
+    at = []
+    for survey in surveys:
+        sides, lost = frame_sides(survey, plan, fleet.prepare)
+        home = survey.partition.vehicle if positions == "local" else ""
+        at += [(home, s, survey.x_m[i], survey.y_m[i]) for i, s in enumerate(sides) if s is not None]
+        assert lost["next_to_other_split"] > 0
+    apart = [np.hypot(a[2] - b[2], a[3] - b[3]) for a in at for b in at if a[0] == b[0] and a[1] != b[1]]
+    assert min(apart) > fleet.prepare.guard_m / np.sqrt(2)
+    assert len(at) > 120
+
+
+def test_a_position_of_minus_zero_is_in_the_cell_of_zero(tmp_path):
+    lake = Lake.at(tmp_path)
+    for vehicle, east in (("a", 0.0), ("b", -0.0)):
+        training_lakes.fill(lake, vehicle, "2026-01-01", 3, ego_tx_m=east, ego_ty_m=0.0)
+    fleet = training_lakes.fleet_of("ab", positions="map", split_by=["place"])
+    a, b = (survey_day(Partition(v, "2026-01-01"), lake, fleet.prepare).place for v in "ab")
+    assert a == b
+
+
+def test_three_vehicles_on_two_days_keep_four_fifths_of_their_frames_without_a_setting(tmp_path, capsys):
+    own = tmp_path / "fleet.toml"
+    small = "\n".join(f"{name} = {value}" for name, value in training_lakes.SMALL.items())
+    own.write_text(fleet_toml(*"abc", sections=f"[prepare]\n{small}"))
+    for seed, (vehicle, day) in enumerate((v, f"2026-01-0{d}") for v in "abc" for d in (1, 2)):
+        training_lakes.fill(Lake.at(tmp_path), vehicle, day, 6, seed=seed)
+    assert main(["prepare", "--fleet", str(own), "--lake", str(tmp_path), "--executor", "inline"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert sum(told["frames"].values()) >= 0.8 * 36
+    assert all(told["frames"].values())
+    assert told["choices"][0]["split_by"] == ["vehicle", "place"]
+    assert told["leaks"] == 0
+    rows = rows_of(Lake.at(tmp_path))
+    assert_sides_apart(rows, ("vehicle", "place"))
+    # Another day does not change the keys, and moves nothing.
+    before = {(r.vehicle, r.day, r.frame_index): r.split for r in rows}
+    training_lakes.fill(Lake.at(tmp_path), "c", "2026-01-03", 6, seed=9)
+    assert main(["prepare", "--fleet", str(own), "--lake", str(tmp_path), "--executor", "inline"]) == 0
+    after = {(r.vehicle, r.day, r.frame_index): r.split for r in rows_of(Lake.at(tmp_path))}
+    assert before.items() <= after.items()
+    assert len(after) == 42
+
+
+def test_an_empty_side_is_an_error_before_training(tmp_path, capsys):
+    own = tmp_path / "fleet.toml"
+    own.write_text(fleet_toml(*"abc", sections=PREPARE))
+    training_lakes.fleet_lake(tmp_path, "abc", frames=3)
+    call = [
+        "prepare",
+        "--fleet",
+        str(own),
+        "--lake",
+        str(tmp_path),
+        "--executor",
+        "inline",
+        "--vehicles",
+        "a",
+    ]
+    assert main(call) == 3
+    capsys.readouterr()
+    assert main(["train", "--data", str(tmp_path), "--out", str(tmp_path / "run")]) == 1
+    assert "no frames on side val: prepare again" in capsys.readouterr().out
+    assert not (tmp_path / "run").exists()
 
 
 def test_the_same_work_is_done_once_and_what_is_lost_comes_back_the_same(tmp_path):
@@ -185,6 +269,7 @@ def test_prepare_without_perception_says_what_to_run(tmp_path):
         survey_day(Partition("a", "2026-01-01"), lake, training_lakes.fleet_of(["a"]).prepare)
 
 
+@pytest.mark.slow
 def test_any_number_of_workers_writes_the_same_rows(tmp_path, capsys):
     fleet = tmp_path / "fleet.toml"
     fleet.write_text(fleet_toml(*"abc", sections=PREPARE))

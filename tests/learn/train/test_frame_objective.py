@@ -35,6 +35,7 @@ def few(batch):
     return batch[slice(0, 4)]
 
 
+@pytest.mark.slow
 def test_the_minimum_over_a_fleet_is_at_the_truth_in_all_that_it_determines(batch, day):
     found = minima(batch, day.truth, DATA_ALONE)
     determined = {

@@ -171,6 +171,7 @@ def test_the_guard_knows_no_number_and_growth_but_not_noise():
             guard.check(step, 500.0, 1.0)
 
 
+@pytest.mark.slow
 def test_two_processes_train_one_network(data, tmp_path):
     (tmp_path / "train.toml").write_text("\n".join(f"{k} = {v}" for k, v in SMALL.items()))
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]

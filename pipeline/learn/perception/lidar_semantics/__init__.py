@@ -1,1 +1,1 @@
-"""What lidar points are, by a small range-image network that learns from the camera: samples, training, export."""
+"""Classes of lidar points by a range-image network, trained from the camera: samples, training, export."""

@@ -1,10 +1,11 @@
-"""Labels of lidar points, projected from the camera's semantics: weak, since calibration and semantics err.
+"""Labels of lidar points, projected from the camera's semantics: weak, because calibration and semantics err.
 
-A point takes the class of the pixel that it falls on, where all pixels around that one agree: near boundaries, a small
-error of the calibration or the other sensor's viewpoint would give it its neighbour's. What the camera cannot see, for
-something stands before it that the lidar looks over or past, has none.
+A point takes the class of its pixel if all pixels around agree: near boundaries, a small error of the
+calibration or the distance between the sensors would give it the neighbour's class. Points hidden from the
+camera have no label.
 
-Source: paper, section 4.2 (RangeNet++); labels of SemanticKITTI, so that larger networks can take this one's place.
+Source: paper, section 4.2 (RangeNet++); labels of SemanticKITTI, so that larger networks can replace this
+one.
 """
 
 from __future__ import annotations
@@ -60,13 +61,7 @@ def project_labels(
     T_camera_lidar: Float[np.ndarray, "4 4"],
     xyz_m: Float32[np.ndarray, "N 3"],
 ) -> UInt8[np.ndarray, " N"]:
-    """Label of each point of the frame's sweep (lidar frame), UNLABELLED where the camera does not say.
-
-    Args:
-        observation: holds the label image and the camera.
-        T_camera_lidar: the current calibration, never a truth.
-        xyz_m: finite points.
-    """
+    """Label of each point of the sweep (finite points, lidar frame); UNLABELLED if the camera shows none."""
     image = labels_of(observation)
     camera = camera_of(observation).scaled(observation.label_scale)
     half = max(1, round(np.radians(_MARGIN_DEG) * camera.focal_px[0]))
@@ -97,7 +92,7 @@ def standing_points(xyz_m: Float32[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]
 def hidden_points(
     points_camera: Float[np.ndarray, "N 3"], standing: Bool[np.ndarray, " N"]
 ) -> Bool[np.ndarray, " N"]:
-    """Points that lie behind something that stands, as the camera sees it (optical frame)."""
+    """Points hidden from the camera by standing objects (optical frame)."""
     range_m = np.linalg.norm(points_camera, axis=1)
     ahead = points_camera[:, 2] > 0
     angles = np.stack(

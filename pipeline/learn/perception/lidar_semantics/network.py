@@ -62,11 +62,7 @@ def build_sweep_network(width: int, seed: int) -> SweepNetwork:
 def export_sweeps(
     network: SweepNetwork, layout: SweepLayout, normal: Normal, folder: Path, card: dict[str, Any]
 ) -> Path:
-    """Write lidar_semantics.onnx, .toml (the manifest), .json and .md (the card) into a folder.
-
-    Returns:
-        The manifest.
-    """
+    """Write lidar_semantics.onnx, .toml, .json and .md into a folder; returns the manifest."""
     about = {"purpose": PURPOSE, "command": "boresight train-lidar-semantics", **card, "limits": LIMITS}
     example, names = torch.zeros(1, 5, *layout.size), ("points", "logits")
     return export_model(network.eval(), example, names, folder, NAME, _manifest(layout, normal), about)

@@ -1,4 +1,4 @@
-"""What the range-image network learns from: sweeps as images, of which the part that the camera sees has labels."""
+"""Training samples of the range-image network: sweeps as images, labelled where the camera sees them."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class SweepLayout:
 
 @dataclass(frozen=True, eq=False)
 class SweepImages:
-    """Range, x, y, z [m], remission of the pixels around the labels; EMPTY in all five where no point is."""
+    """Range, x, y, z [m], remission of the pixels around the labels; EMPTY in all five without a point."""
 
     channels: Float16[np.ndarray, "N 5 H W"]
     label: UInt8[np.ndarray, "N H W"]
@@ -71,7 +71,7 @@ class Normal:
     std: tuple[float, ...]
 
     def apply(self, channels: np.ndarray) -> Float32[np.ndarray, "N 5 H W"]:
-        """Normalised channels, 0 where no point is."""
+        """Normalised channels, 0 in empty pixels."""
         mean, std = (np.array(v, np.float32)[:, None, None] for v in (self.mean, self.std))
         filled = channels[:, :1] != EMPTY
         return np.where(filled, (channels.astype(np.float32) - mean) / std, 0).astype(np.float32)
@@ -79,7 +79,7 @@ class Normal:
 
 @dataclass(frozen=True, eq=False)
 class SweepSamples:
-    """What a lake teaches: sweeps to learn from, held-out sweeps, their layout, and their numbers for the card."""
+    """Training sweeps, held-out sweeps, their layout, and their numbers for the card."""
 
     train: SweepImages
     held_out: SweepImages
@@ -93,12 +93,6 @@ def labelled_sweeps(
     """Sweeps of all vehicle-days with observations; every fifth day is held out.
 
     Each day by its accepted camera-lidar calibration where the lake has one, else by its prior.
-
-    Args:
-        fleet: says where each vehicle's prior comes from.
-        lake: with frames and observations, and perhaps calibrations.
-        size: rows and columns of the range image.
-        frames_per_day: at most, evenly spread.
 
     Raises:
         ContractError: fewer than two vehicle-days of vehicles in fleet.toml.
@@ -173,12 +167,7 @@ def day_images(
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Channels and labels, whole images, of at most `limit` frames of a vehicle-day, evenly spread.
 
-    Args:
-        frames: in their order; those that perception rejected have no observation and are left out.
-        observations: of the same day.
-        T_camera_lidar: the current calibration, never a truth.
-        layout: of the images.
-        limit: how many to keep.
+    Frames that perception rejected are left out. `T_camera_lidar` is the current calibration, never a truth.
     """
     chosen = np.linspace(0, len(observations) - 1, min(limit, len(observations))).astype(int)
     wanted = {observations[i].frame_index: observations[i] for i in chosen}

@@ -72,7 +72,7 @@ def train_sweeps(
 
 
 def held_out_scores(network: SweepNetwork, images: SweepImages, normal: Normal) -> dict[str, float]:
-    """Share of labelled pixels whose kind is right, and IoU of ground and of each kind that the labels know."""
+    """Share of labelled pixels of the right kind, and IoU of ground and of each labelled kind."""
     with torch.no_grad():
         found = np.concatenate(
             [
@@ -109,7 +109,7 @@ def _loss(
 def _varied(batch: SweepImages, rng: np.random.Generator) -> tuple[np.ndarray, Int[np.ndarray, "N H W"]]:
     """Each sweep turned about the vertical, mirrored or not, brighter or darker.
 
-    Labels come from where the camera looks; turned, they teach what stands on any side.
+    Labels exist only where the camera looks; turned sweeps teach objects on all sides.
     """
     channels, label = batch.channels.astype(np.float32), batch.label.astype(np.int64)
     for i in range(len(batch)):

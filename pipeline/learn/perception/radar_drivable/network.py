@@ -62,11 +62,7 @@ class _Graph(nn.Module):
 
 
 def export_drivable(network: DrivableNetwork, folder: Path, card: dict[str, Any]) -> Path:
-    """Write radar_drivable.onnx, .toml (the manifest), .json and .md (the card) into a folder.
-
-    Returns:
-        The manifest.
-    """
+    """Write radar_drivable.onnx, .toml, .json and .md into a folder; returns the manifest."""
     about = {"purpose": PURPOSE, "command": "boresight train-radar-drivable", **card, "limits": LIMITS}
     example, names = torch.zeros(1, len(CHANNELS), *SHAPE), ("features", "drivable")
     layout = "".join(f"{key} = {json.dumps(value)}\n" for key, value in grid_layout().items())

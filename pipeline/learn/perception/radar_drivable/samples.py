@@ -1,8 +1,8 @@
-"""What the network for the radar's drivable area learns from: radar grids, labelled by the lidar.
+"""Training samples of the radar's drivable area: radar grids, labelled by the lidar.
 
-The label is the lidar's drivable ground, brought into the radar frame by the day's prior, the only calibration that
-is known before calibrating; where the lidar saw nothing there is no label. A wrong prior shifts labels; the
-network sees many vehicles and mirrored scans, so that shifts to the sides cancel.
+The label is the lidar's drivable ground, in the radar frame by the day's prior, the only calibration known
+before calibrating; cells that the lidar did not see have no label. A wrong prior shifts labels; shifts to the
+sides cancel over many vehicles and mirrored scans.
 
 Source: paper, section 4.2 (weak supervision across sensors).
 """
@@ -59,9 +59,9 @@ class DrivableSamples:
 def drivable_samples(
     fleet: FleetConfig, lake: Lake, frames_per_day: int
 ) -> tuple[DrivableSamples, DrivableSamples, dict[str, int]]:
-    """Samples to learn from, held-out samples (every fifth vehicle-day), and their numbers for the card.
+    """Training samples, held-out samples (every fifth vehicle-day), and their numbers for the card.
 
-    A single day is cut in time: its first 0.7 teach, its last 0.2 are held out.
+    Of a single day, the first 0.7 are for training and the last 0.2 are held out.
 
     Raises:
         ContractError: no observations of a vehicle in fleet.toml.
@@ -91,12 +91,10 @@ def samples_of_day(fleet: FleetConfig, lake: Lake, day: Partition, frames_per_da
 def day_samples(
     observations: Sequence[Observation], T_lidar_radar: Float[np.ndarray, "4 4"], limit: int
 ) -> DrivableSamples:
-    """Samples of a vehicle-day, at most `limit`, evenly spread; frames without drivable ground are none.
+    """Samples of a vehicle-day, at most `limit`, evenly spread, of frames with drivable ground.
 
-    Args:
-        observations: in the order of their stamps: earlier scans show in later samples.
-        T_lidar_radar: the day's prior, never a truth.
-        limit: how many to keep.
+    `observations` are in the order of their stamps, because earlier scans appear in later samples.
+    `T_lidar_radar` is the day's prior, never a truth.
     """
     usable = [i for i, o in enumerate(observations) if len(o.lidar_drivable_xyz_m)]
     kept = {usable[k] for k in np.linspace(0, len(usable) - 1, min(limit, len(usable))).astype(int)}
@@ -124,8 +122,7 @@ def scan_of(observation: Observation) -> Scan:
 def label_grid(observation: Observation, T_lidar_radar: Float[np.ndarray, "4 4"]) -> UInt8[np.ndarray, "A R"]:
     """FREE, BLOCKED or UNKNOWN by the lidar, at each cell of the radar's grid.
 
-    Heights are left out: a cell's centre is looked up where it lies at the radar's height, which a tilt of 2 deg moves
-    by centimetres.
+    A cell's centre is looked up at the radar's height, which a tilt of 2 deg moves by centimetres.
     """
     free, seen = _occupied(observation.lidar_drivable_xyz_m), _occupied(observation.lidar_map_xyz_m)
     azimuth, ranges = cell_centres()

@@ -44,14 +44,14 @@ def train_drivable(
     time_limit_s: float | None = None,
     progress: Progress = silent,
 ) -> tuple[DrivableNetwork, TrainResult]:
-    """Train, or go on with the run in `out`, until it is finished, the time is up or a signal asks to stop.
+    """Train, or continue the run in `out`, until it is finished, the time is up or a signal stops it.
 
-    The result's scores are those of `held_out_iou`.
+    Returns the scores of `held_out_iou`.
 
     Raises:
         ContractError: no samples on one side, or others than the run began with.
         ConfigError: the run was begun with another configuration.
-        DivergedError: the loss is no number or has grown too far.
+        DivergedError: the loss is not finite or has grown too far.
     """
     if not len(train) or not len(held_out):
         problem = f"{len(train)} samples to learn from and {len(held_out)} held out: both are needed"
@@ -70,9 +70,9 @@ def train_drivable(
 def held_out_iou(
     network: DrivableNetwork, train: DrivableSamples, held_out: DrivableSamples
 ) -> dict[str, float]:
-    """IoU with the lidar's labels on held-out samples: of the network, the geometric fallback and a constant answer.
+    """IoU with the lidar's labels on held-out samples, of the network and two simple answers.
 
-    The constant answer is the best one that ignores the scan: each cell as it mostly is in the training samples.
+    These are the geometric fallback, and the best constant answer: the most frequent label of each cell.
     """
     free, known = (train.label == FREE).sum(axis=0), (train.label != UNKNOWN).sum(axis=0)
     guess = np.broadcast_to(2 * free > known, held_out.label.shape)
@@ -103,7 +103,7 @@ def probabilities(network: DrivableNetwork, samples: DrivableSamples) -> Float[n
 
 def _loss(network: DrivableNetwork, batch: DrivableSamples, rng: np.random.Generator) -> Float[Tensor, ""]:
     """Binary cross-entropy per labelled cell, by the root of the cell's area; half of the scans are mirrored."""
-    # A mirrored world is as good a world, and it undoes what a wrong prior shifts to one side.
+    # A mirrored world is equally valid, and cancels the shift of a wrong prior to one side.
     mirror = rng.random(len(batch)) < 0.5
     features = np.where(mirror[:, None, None, None], batch.features[:, :, ::-1], batch.features)
     label = np.where(mirror[:, None, None], batch.label[:, ::-1], batch.label)
