@@ -1,0 +1,1 @@
+"""What the vehicles of one model line share, and what each vehicle's answer is with and without it."""

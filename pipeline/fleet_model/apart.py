@@ -1,0 +1,113 @@
+"""Shared errors of sensors in the sensor's own terms, and whether data tell them from a common error of all mounts.
+
+Records of one kind determine only the sum of both: every camera of a line mounted 0.2 deg too low looks like a
+segmenter whose labels lie 0.2 deg too high. A direction of the shared error is told apart where its sigma is less than
+half of what was known before; in the others its prior is kept, and nobody's answer gets surer there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.fleet_model.line import LineModel
+
+__all__ = ["SharedError", "shared_axes", "shared_errors", "told_apart"]
+
+_TOLD = 0.5  # of the prior's sigma
+
+
+@dataclass(frozen=True)
+class SharedError:
+    """An error that all vehicles of a line share, along one direction.
+
+    Args:
+        name: in the sensor's own terms.
+        value: estimate [rad or m]; of what is not told apart, mostly its prior.
+        sigma: of it.
+        total: the error with the common error of mounts along the same direction: what records determine.
+        total_sigma: of it.
+        prior_sigma: before any data.
+        told: data tell it from a common error of mounts.
+    """
+
+    name: str
+    value: float
+    sigma: float
+    total: float
+    total_sigma: float
+    prior_sigma: float
+    told: bool
+
+
+def shared_axes(kind: str, R_parent_child: Float[np.ndarray, "3 3"]) -> dict[str, Float[np.ndarray, " 6"]]:
+    """Directions of shared errors of an edge, as changes of T_parent_child that they look like.
+
+    A radar that measures elevations too high by e looks like one whose x axis points e higher. A segmenter whose
+    labels lie too far right or down, and a principal point that is off, look like a camera that is turned.
+
+    Args:
+        kind: of the edge, as camera_lidar; of a pose, kind of its sensor with the reference's.
+        R_parent_child: rotation of the drawing.
+    """
+    zero = np.zeros(3)
+    axes: dict[str, np.ndarray] = {}
+    parent, child = kind.split("_")
+    for name, R in ((parent, np.eye(3)), (child, R_parent_child)):
+        if name == "radar":
+            axes["radar elevation"] = np.r_[-R[:, 1], zero]
+            axes["radar azimuth"] = np.r_[R[:, 2], zero]
+            axes["radar range"] = np.r_[zero, R[:, 0]]
+        elif name == "camera":
+            axes["camera labels or principal point, vertical"] = np.r_[R[:, 0], zero]
+            axes["camera labels or principal point, horizontal"] = np.r_[R[:, 1], zero]
+    return axes
+
+
+def shared_errors(model: LineModel, axes: dict[str, Float[np.ndarray, " 6"]]) -> list[SharedError]:
+    """Shared errors along named directions."""
+    M = len(model.prior.mount)
+    found = []
+    for name, h in axes.items():
+        if not len(model.prior.bias):
+            continue
+        both = np.r_[h, h]
+        sigma = _root(h @ model.covariance[M:, M:] @ h)
+        before = _root(h @ model.prior.bias @ h)
+        found.append(
+            SharedError(
+                name, float(h @ model.mean[M:]), sigma, float(both @ model.mean),
+                _root(both @ model.covariance @ both), before, sigma < _TOLD * before,
+            )
+        )  # fmt: skip
+    return found
+
+
+def told_apart(model: LineModel) -> tuple[Float[np.ndarray, " G"], Float[np.ndarray, "G G"]]:
+    """Mean and covariance of what is common, without what priors alone say of directions that are not told apart.
+
+    In these the shared error keeps its prior, zero and as unsure as records say, whatever the prior of mounts is: the
+    distribution of all else given it stays (Jeffrey's rule).
+    """
+    M, P = len(model.prior.mount), len(model.prior.bias)
+    if not P:
+        return model.mean, model.covariance
+    root = np.linalg.cholesky(model.prior.bias)
+    white = np.linalg.solve(root, np.linalg.solve(root, model.covariance[M:, M:]).T)
+    size, directions = np.linalg.eigh(0.5 * (white + white.T))
+    unknown = directions[:, size >= _TOLD**2]
+    if not unknown.shape[1]:
+        return model.mean, model.covariance
+    pick = np.zeros((unknown.shape[1], M + P))
+    pick[:, M:] = np.linalg.solve(root.T, unknown).T  # whitened coordinates of the untold directions
+    of_pick = model.covariance @ pick.T
+    gain = np.linalg.solve(pick @ of_pick, of_pick.T).T
+    mean = model.mean - gain @ (pick @ model.mean)
+    covariance = model.covariance - gain @ of_pick.T + gain @ gain.T
+    return mean, 0.5 * (covariance + covariance.T)
+
+
+def _root(square: float) -> float:
+    return float(np.sqrt(max(square, 0.0)))

@@ -1,0 +1,120 @@
+"""What the vehicles of a line show of one edge: information without prior, which a night adds to.
+
+Days of a few frames determine few directions, mostly none along an axis. So evidence is information, which is zero
+along directions that days leave open, and a vehicle is compared with others by the score of a shift along one axis.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+__all__ = ["LineEvidence", "LinePrior", "evidence_of_days", "shifts_in_sigmas"]
+
+_DETERMINED = 0.5  # of the prior's variance: an axis that a vehicle's days leave at less
+_NOTHING = 1e-9  # of the prior's information: a direction with less is open
+
+
+@dataclass(frozen=True, eq=False)
+class LineEvidence:
+    """Observations of N vehicles.
+
+    Args:
+        value: changes from the line's drawing (rotation vector [rad], shift [m]), then further observations; of what
+            a vehicle does not determine any number.
+        information: of what varies, without what all vehicles have in common and without a prior; zero along
+            directions that a vehicle does not determine.
+        to_mount: A, from a mount to what is observed of it.
+        to_bias: B, from shared errors to what is observed.
+        remounted: a workshop set the mount, not the factory.
+    """
+
+    value: Float[np.ndarray, "N O"]
+    information: Float[np.ndarray, "N O O"]
+    to_mount: Float[np.ndarray, "O M"]
+    to_bias: Float[np.ndarray, "O P"]
+    remounted: Bool[np.ndarray, " N"]
+
+    def at(self, rows: np.ndarray) -> LineEvidence:
+        """Some of the vehicles."""
+        return replace(
+            self, value=self.value[rows], information=self.information[rows], remounted=self.remounted[rows]
+        )
+
+    def weights(self, spread: Float[np.ndarray, "*N O O"]) -> Float[np.ndarray, "N O O"]:
+        """Inverse covariances of observations whose expected value scatters by `spread` besides."""
+        return np.linalg.solve(np.eye(self.value.shape[1]) + self.information @ spread, self.information)
+
+    def alone(self, prior: LinePrior) -> tuple[Float[np.ndarray, "N M"], Float[np.ndarray, "N M M"]]:
+        """Each vehicle's mount by its own estimates and the drawing, and what it varies by.
+
+        The first M observations are its estimates.
+        """
+        M = len(prior.mount)
+        own = self.information[:, :M, :M]
+        covariance = np.linalg.inv(own + np.linalg.inv(prior.mount))
+        return np.einsum("nmk,nkj,nj->nm", covariance, own, self.value[:, :M], optimize=True), covariance
+
+    def determined(self, prior: LinePrior) -> Bool[np.ndarray, "N M"]:
+        """Axes that vehicles know better than the drawing does."""
+        _, covariance = self.alone(prior)
+        return np.asarray(np.einsum("nmm->nm", covariance) < _DETERMINED * np.diag(prior.mount))
+
+
+@dataclass(frozen=True, eq=False)
+class LinePrior:
+    """Covariance of the common error of all mounts (about the drawing) and of the shared errors of sensors."""
+
+    mount: Float[np.ndarray, "M M"]
+    bias: Float[np.ndarray, "P P"]
+
+
+def evidence_of_days(
+    information: Float[np.ndarray, "N M M"],
+    pull: Float[np.ndarray, "N M"],
+    days: Float[np.ndarray, " N"],
+    scale: Float[np.ndarray, "N M"],
+    autocorrelation: Float[np.ndarray, "N M"],
+    prior: LinePrior,
+) -> LineEvidence:
+    """Evidence of vehicles whose mounts the factory set, from sums over their days.
+
+    Days scatter by more than they say, and err alike: information shrinks by both, direction by direction, so that
+    what days leave open stays open.
+
+    Args:
+        information: sum over days, of changes from the line's drawing.
+        pull: sum over days of information times change.
+        days: number of them.
+        scale: factor on the days' sigmas, by axis.
+        autocorrelation: of the errors of neighbouring days, by axis.
+        prior: of the line; its sigmas are the units.
+    """
+    unit = np.sqrt(np.diag(prior.mount))
+    size, directions = np.linalg.eigh(information * np.outer(unit, unit))
+    open_ = size < _NOTHING
+    inverse = np.where(open_, 0.0, 1 / np.where(open_, 1.0, size))
+    value = np.einsum("nmk,nk,njk,nj->nm", directions, inverse, directions, pull * unit, optimize=True) * unit
+    variance = scale**2 * _mean_of(days[:, None], autocorrelation)
+    along = np.einsum("nmk,nm->nk", directions**2, variance, optimize=True)
+    left = np.where(open_, 0.0, size) / along
+    whole = np.einsum("nmk,nk,njk->nmj", directions, left, directions, optimize=True) / np.outer(unit, unit)
+    M = len(unit)
+    return LineEvidence(value, whole, np.eye(M), np.eye(M), np.zeros(len(days), bool))
+
+
+def _mean_of(days: Float[np.ndarray, "N 1"], phi: Float[np.ndarray, "N M"]) -> Float[np.ndarray, "N M"]:
+    """Variance of the mean of AR(1) errors in that of independent ones."""
+    n = np.maximum(days, 1.0)
+    return np.asarray((1 + phi) / (1 - phi) - 2 * phi * (1 - phi**n) / (n * (1 - phi) ** 2))
+
+
+def shifts_in_sigmas(
+    W: Float[np.ndarray, "N O O"], residual: Float[np.ndarray, "N O"], A: Float[np.ndarray, "O M"]
+) -> Float[np.ndarray, "N M"]:
+    """Score of a shift of each vehicle's mount along each axis alone, in sigmas; zero where it shows nothing."""
+    score = np.einsum("om,nop,np->nm", A, W, residual, optimize=True)
+    size = np.einsum("om,nop,pm->nm", A, W, A, optimize=True)
+    return np.where(size > 0, score / np.sqrt(np.where(size > 0, size, 1.0)), 0.0)
