@@ -23,6 +23,26 @@ $(STAMP): pyproject.toml constraints.txt
 view: setup ## open3d beside it (a gigabyte): the 3D view of a vehicle-day, and the tests of it
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[view]'
 
+# Other programs that open what is written, in environments of their own: their pins agree neither with ours nor with
+# each other. `make test` runs what needs them once they are there.
+READERS := .venv-readers
+DATA_READERS := nuscenes-devkit==1.2.0 t4-devkit==0.1.0 yourdfpy==0.0.60 xacro==2.1.1 webdataset==1.0.2 "pyarrow<20" "pandas<3"
+BARE_READERS := vcd==6.0.3 pykitti==0.3.1 vod-tudelft==1.0.3# without their requirements, of which reading needs none
+SCHEDULERS := apache-airflow==3.3.2 dagster==1.13.29 kubernetes-validate==1.37.0
+install_data = $(1) $(DATA_READERS) && $(1) --no-deps $(BARE_READERS)
+install_schedulers = $(1) $(SCHEDULERS)
+export BORESIGHT_READERS ?= $(wildcard $(CURDIR)/$(READERS)/data/bin/python)
+export BORESIGHT_SCHEDULERS ?= $(wildcard $(CURDIR)/$(READERS)/schedulers/bin/python)
+
+readers: setup $(READERS)/data $(READERS)/schedulers ## data sets' devkits, Airflow, Dagster, Ray's trainer (1.5 GB), and the tests of them
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[train-ray]'
+
+# An environment appears whole or not at all; pip names what it did not find, and `make test` what it leaves out for that.
+$(READERS)/%: Makefile
+	rm -rf $@ $@.new
+	$(PYTHON) -m venv $@.new
+	$(call install_$*,$@.new/bin/python -m pip install --quiet) && mv $@.new $@ || echo "$@ is not there: tests that need it are left out"
+
 demo: setup ## synthetic fleet to HTML report, in minutes
 	$(BIN)/boresight demo --out demo || [ $$? -eq 3 ] # 3: done, and something was held, as it should be
 
@@ -72,6 +92,6 @@ audit-dependencies: $(LOOKERS)/.ready ## known vulnerabilities of what constrain
 	$(LOOKERS)/bin/pip-audit --strict --no-deps --disable-pip -r constraints.txt
 
 clean: ## remove what the other targets made
-	rm -rf .venv $(LOOKERS) sbom.json demo .pytest_cache .mypy_cache .ruff_cache
+	rm -rf .venv $(LOOKERS) $(READERS) sbom.json demo .pytest_cache .mypy_cache .ruff_cache
 
-.PHONY: help setup view demo test browser lint bench bench-accept results accuracy-accept licenses sbom audit-dependencies clean
+.PHONY: help setup view readers demo test browser lint bench bench-accept results accuracy-accept licenses sbom audit-dependencies clean
