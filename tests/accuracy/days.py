@@ -53,7 +53,8 @@ class FixedDay:
 FIXED = (
     FixedDay("demo", DaySpec(171, "urban", 32, "demo")),
     FixedDay("paper, town", DaySpec(174, "urban", 40, "paper")),
-    FixedDay("paper, highway", DaySpec(172, "highway", 40, "paper")),
+    # Near and far edges lie apart: azimuth is known to 0.08 deg and errs by 0.06.
+    FixedDay("paper, highway", DaySpec(172, "highway", 40, "paper"), held=("camera_lidar",)),
     # Camera-lidar of 16 rings is known to 0.09 deg, which 0.2 deg at 99.5 % does not allow.
     FixedDay("ring16", DaySpec(173, "mixed", 40, "ring16"), held=("camera_lidar", "camera_radar")),
     # A world that a seed drew (a parking deck) and that no tuning saw; its elevation errs by two of its sigmas.

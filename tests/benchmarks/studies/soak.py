@@ -202,9 +202,11 @@ def contents(lake: Lake) -> dict[str, Any]:
     report = lake.root / "report"
     for path in lake.files.find(report, "**/*"):
         if path.suffix in (".html", ".js"):
-            # Pages of days name the audit that they were drawn after, which a killed night's may be.
+            # Pages of days name the audit that they were drawn after, which a killed night's may be. Commands of the
+            # fleet's page name its own lake.
             with lake.files.opened(path) as stream:
-                same = hashlib.sha256(stream.read()).hexdigest() if path.parent == report else ""
+                text = stream.read().replace(str(lake.root).encode(), b"LAKE")
+                same = hashlib.sha256(text).hexdigest() if path.parent == report else ""
             found[f"page {path.relative_to(report)}"] = same
     return found
 
