@@ -103,18 +103,21 @@ def _calibrate_day(task: Task) -> int:
 
 def _calibrate_frame(task: Task, frame: int, page: Path | None) -> int:
     """Calibrate one frame, print its transforms, and write its page if a path is given."""
-    from jobs.terminal.summary import print_summary
+    from jobs.terminal.summary import print_summary, progress_reporter
     from pipeline.calibrate.networks import calibrate_frame
 
-    found = calibrate_frame(task, frame)
     partition = task.partition
-    if page is not None:
-        from pipeline.report.frame import write_frame_page
-        from pipeline.report.reading import scene_of
+    with progress_reporter(f"calibrate {partition.vehicle} {partition.day}") as progress:
+        progress(0, 0, f"frame {frame}")
+        found = calibrate_frame(task, frame)
+        if page is not None:
+            from pipeline.report.frame import write_frame_page
+            from pipeline.report.reading import scene_of
 
-        title = f"{partition.vehicle}, {partition.day}, frame {found.frame.frame_index}"
-        scene = scene_of(found.frame, found.observation, task.fleet.report)
-        write_frame_page(page, scene, found.prior, found.solution, title)
+            progress(0, 0, "page")
+            title = f"{partition.vehicle}, {partition.day}, frame {found.frame.frame_index}"
+            scene = scene_of(found.frame, found.observation, task.fleet.report)
+            write_frame_page(page, scene, found.prior, found.solution, title)
     estimates = {
         pair: {
             "T": estimate.T,
@@ -141,20 +144,12 @@ def _calibrate_frame(task: Task, frame: int, page: Path | None) -> int:
 
 
 def parse_perturb(text: str | None) -> tuple[float, float] | None:
-    """Parse "ROT_DEG,TRANS_M" to (degrees, metres); None stays None.
-
-    Raises:
-        ConfigError: not two numbers >= 0.
-    """
+    """Parse "ROT_DEG,TRANS_M" to (degrees, metres); None stays None; else ConfigError."""
     return None if text is None else parse_pair(text, "perturb")
 
 
 def parse_pair(text: str, option: str) -> tuple[float, float]:
-    """Parse "ROT_DEG,TRANS_M" to (degrees, metres); `option` is the option's name in errors.
-
-    Raises:
-        ConfigError: not two numbers >= 0.
-    """
+    """Parse "ROT_DEG,TRANS_M" to (degrees, metres); a ConfigError names `option`."""
     from pipeline.errors import ConfigError
 
     try:

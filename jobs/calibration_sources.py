@@ -35,12 +35,9 @@ def read_calibration(
     own_frames: bool,
     mount: str | None,
 ) -> ExportedCalibration:
-    """Read a day's records (without a day: the vehicle's state), ready to be written to a file.
+    """Read a day's records (without a day: the vehicle's state) for a file; ConfigError if there are none.
 
-    `own_frames`: frames that no option names get their names from the logs.
-
-    Raises:
-        ConfigError: the lake has no such calibration.
+    With `own_frames`, frames that no option names get their names from the logs.
     """
     from jobs.terminal.summary import left_out as tell_damage
     from pipeline.export.calibration import ExportedCalibration
@@ -107,11 +104,7 @@ def _listed(value: object) -> list[object]:
 
 
 def mounting(text: str, names: FrameNames, edges: tuple[Edge, ...]) -> np.ndarray:
-    """Read T_base_lidar of the reference sensor of these edges from log:FILE (/tf_static) or FORMAT:FILE.
-
-    Raises:
-        ConfigError: `text` has another form, or the file has no chain of transforms between the two frames.
-    """
+    """Read T_base_lidar of the reference sensor from log:FILE (/tf_static) or FORMAT:FILE."""
     from pipeline.export.calibration import reference_of
     from pipeline.export.files import read_files
     from pipeline.export.formats import format_named

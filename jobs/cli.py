@@ -34,6 +34,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "jobs.verify:verify",
         "Check the calibration that a car uses now against one log.",
     ),
+    "verify-set": (
+        "jobs.verify_set:verify_set",
+        "Judge the calibrations that a data set ships, over all of its logs.",
+    ),
     "nightly": (
         "jobs.nightly:nightly",
         "Ingest, perceive, calibrate and audit all vehicle-days of a fleet.",

@@ -6,12 +6,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
     from pipeline.convert.recording import Recording
     from pipeline.rig.graph import Kind
 
-__all__ = ["convert"]
+__all__ = ["DataSet", "convert", "models_of", "recordings_of", "write_fleet"]
 
 DataSet = Literal["nuscenes", "vod", "kitti"]
+RADAR_COLUMNS = "x,y,z,power,doppler"
 
 
 def convert(
@@ -25,7 +28,7 @@ def convert(
     camera: str | None = None,
     lidar: str | None = None,
     radar: str | None = None,
-    radar_columns: str = "x,y,z,power,doppler",
+    radar_columns: str = RADAR_COLUMNS,
     segmenter: str | None = None,
     detector: str | None = None,
 ) -> int:
@@ -49,38 +52,70 @@ def convert(
         detector: model manifest for fleet.toml.
     """
     from jobs.terminal.summary import print_summary, progress_reporter
-    from pipeline.convert.kitti_shaped import read_kitti, read_view_of_delft
-    from pipeline.convert.log_file import fleet_text, write_log
-    from pipeline.convert.nuscenes import read_nuscenes
-    from pipeline.errors import ConfigError
+    from pipeline.convert.log_file import write_log
     from pipeline.store.partitions import Partition
 
-    if (segmenter is None) != (detector is None):
-        raise ConfigError("command line", "segmenter, detector", "give both or neither")
+    models = models_of(segmenter, detector)
     owner = vehicle or str(data_set)
     Partition(owner, day)  # raises for invalid names
-    if data_set == "nuscenes":
-        named: dict[Kind, str | None] = {"camera": camera, "lidar": lidar, "radar": radar}
-        recordings = read_nuscenes(folder, {k: c.split(",") for k, c in named.items() if c is not None})
-    elif data_set == "vod":
-        recordings = read_view_of_delft(folder, owner, day)
-    else:
-        recordings = read_kitti(folder, owner, day, radar_columns.split(","))
-    paths = [_path_of(out, r) for r in recordings]
     messages = 0
     with progress_reporter("convert") as progress:
+        progress(0, 0, f"tables of {folder}")
+        named: dict[Kind, str | None] = {"camera": camera, "lidar": lidar, "radar": radar}
+        recordings = recordings_of(data_set, folder, owner, day, named, radar_columns)
+        paths = [_path_of(out, r) for r in recordings]
         for done, (path, recording) in enumerate(zip(paths, recordings, strict=True)):
             progress(done, len(paths), recording.name)
             messages += write_log(path, recording)
-    models = None if segmenter is None or detector is None else (segmenter, detector)
-    has_ego = all(any(e.sensor == "ego" for e in r.events) for r in recordings)
-    vehicles = sorted({r.vehicle for r in recordings})
-    fleet = out / "fleet.toml"
-    kinds = {name: kind for r in recordings for name, kind in r.kinds.items()}
-    base = data_set == "nuscenes"  # the others give poses in a sensor's frame
-    fleet.write_text(fleet_text(data_set, vehicles, kinds, models, ego=has_ego, base=base))
+    fleet = write_fleet(out, data_set, recordings, models)
     print_summary("convert", "done", fleet=fleet, logs=paths, messages=messages)
     return 0
+
+
+def models_of(segmenter: str | None, detector: str | None) -> tuple[str, str] | None:
+    """Manifests of both models, or None; ConfigError for one of them."""
+    from pipeline.errors import ConfigError
+
+    if segmenter is None and detector is None:
+        return None
+    if segmenter is None or detector is None:
+        raise ConfigError("command line", "segmenter, detector", "give both or neither")
+    return segmenter, detector
+
+
+def recordings_of(
+    data_set: DataSet,
+    folder: Path,
+    owner: str,
+    day: str,
+    named: Mapping[Kind, str | None],
+    radar_columns: str = RADAR_COLUMNS,
+) -> list[Recording]:
+    """Recordings of a data set's folder; `named` has channels of nuScenes, separated by commas."""
+    from pipeline.convert.kitti_shaped import read_kitti, read_view_of_delft
+    from pipeline.convert.nuscenes import read_nuscenes
+
+    if data_set == "nuscenes":
+        return read_nuscenes(folder, {k: c.split(",") for k, c in named.items() if c is not None})
+    if data_set == "vod":
+        return read_view_of_delft(folder, owner, day)
+    return read_kitti(folder, owner, day, radar_columns.split(","))
+
+
+def write_fleet(
+    out: Path, data_set: DataSet, recordings: Sequence[Recording], models: tuple[str, str] | None
+) -> Path:
+    """Write fleet.toml for recordings."""
+    from pipeline.convert.log_file import fleet_text
+
+    has_ego = all(any(e.sensor == "ego" for e in r.events) for r in recordings)
+    vehicles = sorted({r.vehicle for r in recordings})
+    kinds = {name: kind for r in recordings for name, kind in r.kinds.items()}
+    base = data_set == "nuscenes"  # the others give poses in a sensor's frame
+    out.mkdir(parents=True, exist_ok=True)
+    fleet = out / "fleet.toml"
+    fleet.write_text(fleet_text(data_set, vehicles, kinds, models, ego=has_ego, base=base))
+    return fleet
 
 
 def _path_of(out: Path, recording: Recording) -> Path:

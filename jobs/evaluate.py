@@ -53,7 +53,7 @@ def evaluate(
     import sys
 
     from jobs.calibrate import parse_pair
-    from jobs.terminal.summary import print_summary
+    from jobs.terminal.summary import print_summary, progress_reporter
     from pipeline.evaluate.recording import ReflectorFiles
     from pipeline.evaluate.runs import compare_runs
     from pipeline.evaluate.table import as_markdown, table_rows
@@ -67,12 +67,16 @@ def evaluate(
     recording = (recording_lake or lake, recording_day) if recording_lake or recording_day else None
     files = ReflectorFiles(reflectors, recording)
     rotation_deg, translation_m = parse_pair(truth_sigma, "truth-sigma")
-    compared, counts = compare_runs(records, truth, files, (math.radians(rotation_deg), translation_m))
+    with progress_reporter("evaluate") as progress:
+        progress(0, len(records), "records")
+        compared, counts = compare_runs(records, truth, files, (math.radians(rotation_deg), translation_m))
     notes = files.notes()
     comparisons = [c.comparison for c in compared]
     sys.stderr.write("\n".join(as_markdown(table_rows(comparisons), comparisons, notes).values()))
     if out is not None:
-        _write(out, compared, notes, tables)
+        with progress_reporter("evaluate") as progress:
+            progress(0, 0, "tables and figures")
+            _write(out, compared, notes, tables)
     print_summary(
         "evaluate", "done" if compared else "refused", runs=len(compared), **counts, positions=notes, out=out
     )

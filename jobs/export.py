@@ -160,12 +160,14 @@ def _export_onnx(out: Path, run: Path | None, notes: Path | None) -> list[Path]:
 
     require("train")
     from jobs.terminal.logging import logger
+    from jobs.terminal.summary import progress_reporter
     from pipeline.learn.export.model_card import UNFIT, card_of_run
     from pipeline.learn.export.onnx_file import export_onnx
     from pipeline.learn.train.run_state import network_of_run
 
-    card = card_of_run(run, notes)
-    export_onnx(network_of_run(run), out, card)
+    with progress_reporter("export onnx"):
+        card = card_of_run(run, notes)
+        export_onnx(network_of_run(run), out, card)
     for limit in card["limits"]:
         if str(limit).startswith(UNFIT):
             logger().warning(limit, run=str(run))

@@ -27,20 +27,12 @@ def export_foxglove(
 ) -> list[Path]:
     """Write the MCAP file `out` and a viewer layout beside it.
 
-    Args:
-        calibration: calibration of the day.
-        location: folder or URL of the lake.
-        day: day of the drive, YYYY-MM-DD.
-        out: MCAP file to write.
-        most_frames: maximum number of frames, evenly spaced.
-        sensors: names of the sensors to show; empty = all.
-
     Raises:
         MissingExtraError: foxglove-sdk is not installed.
-        ConfigError: `out` does not end in .mcap, a sensor does not exist, or the lake has no frames of that
-            day.
+        ConfigError: `out` does not end in .mcap, a sensor does not exist, or the day has no frames.
     """
     from jobs.extras import require
+    from jobs.terminal.summary import progress_reporter
 
     require("viz")
     if out.suffix != ".mcap":
@@ -70,12 +62,12 @@ def export_foxglove(
             )
             for s in shown
         }
-        with atomic_write(out) as stream:
+        with progress_reporter("export foxglove"), atomic_write(out) as stream:
             write_foxglove_rig(stream, calibration, before, of_rig)
         text = layout_of_rig(shown, reference.name, calibration.names.of(reference.name))
     else:
         priors = {name: pair.T for name, pair in known.items()}
-        with atomic_write(out) as stream:
+        with progress_reporter("export foxglove"), atomic_write(out) as stream:
             write_foxglove(stream, calibration, priors, read_scenes(lake, partition, most_frames))
         text = layout_of(TOPICS, calibration.names)
     with atomic_write(layout) as stream:
@@ -84,11 +76,7 @@ def export_foxglove(
 
 
 def _shown(calibration: ExportedCalibration, sensors: Sequence[str]) -> list[Sensor]:
-    """The sensors with these names, or all sensors if no name is given.
-
-    Raises:
-        ConfigError: a name is unknown.
-    """
+    """The sensors with these names, or all without a name; ConfigError if a name is unknown."""
     there = {s.name: s for s in calibration.sensors}
     unknown = [name for name in sensors if name not in there]
     if unknown:

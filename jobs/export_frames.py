@@ -88,9 +88,8 @@ def export_frames(
         "seed": seed,
     }
     settings |= {"perturb": None if perturb is None else list(perturb), "perturb_per": perturb_per}
-    settings |= {"split_by": list(config.prepare.split_by)}
     with progress_reporter("plan") as progress:
-        planned = plan_frames(tables, list(known), config.prepare, output, settings, progress)
+        planned, settings = plan_frames(tables, list(known), config.prepare, output, settings, progress)
     tasks = [
         DayTask(tables, day, output, format, places, dict(lost), known[day], moved)
         for day, (places, lost) in planned.items()

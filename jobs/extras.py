@@ -38,11 +38,7 @@ def needs(extra: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
 
 
 def require(extra: str) -> None:
-    """Check for an extra before any work, so that no file is half-written and no worker process fails.
-
-    Raises:
-        MissingExtraError: the extra is not installed.
-    """
+    """Raise MissingExtraError before any work, so that no file is half-written."""
     from pipeline.errors import MissingExtraError
 
     if find_spec(EXTRAS[extra]) is None:

@@ -34,11 +34,7 @@ class FrameOptions:
     ] = ()
 
     def names(self, known: Mapping[str, str] | None = None) -> FrameNames:
-        """Frame names for the pipeline; `known` has names for frames without an option.
-
-        Raises:
-            ConfigError: a name is not valid.
-        """
+        """Frame names for the pipeline; `known` has names for frames without an option; else ConfigError."""
         from pipeline.errors import ConfigError
         from pipeline.export.calibration import FrameNames
 
@@ -51,11 +47,7 @@ class FrameOptions:
         return FrameNames.named({**(known or {}), **asked})
 
     def names_in(self, files: Iterable[str | Path]) -> FrameNames:
-        """Frame names for reading files: from options, else those that an export wrote in or beside them.
-
-        Raises:
-            ConfigError: a name is not valid.
-        """
+        """Frame names for reading files: from options, else from an export's notes in or beside them."""
         from pipeline.export.files import noted_frames
 
         return self.names(noted_frames([Path(file) for file in files]))

@@ -23,7 +23,7 @@ def gc(
     """
     import datetime as dt
 
-    from jobs.terminal.summary import print_summary
+    from jobs.terminal.summary import print_summary, progress_reporter
     from pipeline.errors import ConfigError
     from pipeline.store.partitions import Lake
     from pipeline.store.retention import collect, collect_pages, first_day_kept
@@ -34,13 +34,14 @@ def gc(
             raise ConfigError("command line", name, f"{days} is less than one")
     tables, today = Lake.existing(lake), dt.datetime.now(dt.UTC).date()
     kept = {MOMENTS: images_days} | ({} if observations_days is None else {PERCEIVED: observations_days})
-    gone = {
-        schema.name: list(
-            collect(tables, schema, first_day_kept(today, days), today.isoformat(), dry_run=dry_run)
-        )
-        for schema, days in kept.items()
-    }
-    pages = collect_pages(tables, first_day_kept(today, images_days), dry_run=dry_run)
+    with progress_reporter("gc") as progress:
+        gone = {}
+        for schema, days in kept.items():
+            progress(0, 0, schema.name)
+            found = collect(tables, schema, first_day_kept(today, days), today.isoformat(), dry_run=dry_run)
+            gone[schema.name] = list(found)
+        progress(0, 0, "pages")
+        pages = collect_pages(tables, first_day_kept(today, images_days), dry_run=dry_run)
     print_summary(
         "gc",
         "planned" if dry_run else "done" if pages or any(gone.values()) else "cached",

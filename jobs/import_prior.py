@@ -64,11 +64,7 @@ def _of_rig(
     of: tuple[Path, str | None],
     frames: FrameOptions,
 ) -> list[str]:
-    """Write the prior file of all sensors of a rig; returns the sensors found in the files.
-
-    Raises:
-        ConfigError: a sensor is missing or present twice, or the fleet has no such rig.
-    """
+    """Write the prior file of all sensors of a rig; returns them; ConfigError if one is missing or twice."""
     from pipeline.config import load_fleet
     from pipeline.errors import ConfigError
     from pipeline.export.files import noted_frames, write_files

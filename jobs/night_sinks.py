@@ -26,13 +26,7 @@ _STOPPED_WITHIN_S = 2.0  # the same after an order to stop
 
 
 class NightSinks:
-    """Receives each vehicle-day as it ends, and the end of the night.
-
-    Args:
-        night: what its vehicle-days share.
-        metrics: Prometheus text file to replace; None = no metrics.
-        lineage: lineage events and their destination; None = no lineage.
-    """
+    """Receives each vehicle-day as it ends, and the end of the night; None = no metrics, no lineage."""
 
     def __init__(
         self, night: Night, metrics: Path | None, lineage: tuple[NightLineage, LineageSink] | None

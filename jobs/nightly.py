@@ -173,7 +173,7 @@ def watch_night(
     workers: int | None,
     take: Callable[[DayOutcome], None] = lambda _: None,
 ) -> list[DayOutcome]:
-    """Run the night with a progress display; returns outcomes in order of completion, without their records.
+    """Run the night with a progress display; returns outcomes as they complete, without records.
 
     `take` receives each complete outcome.
     """
@@ -200,11 +200,8 @@ class Drawing:
     """Settings for drawing the pages of a night.
 
     Args:
-        report: HTML page of the fleet; None = report/fleet.html in the lake.
         pictures: False = pages without images of public roads.
-        executor: executor that draws the pages of days.
         workers: processes or tasks at a time; None = one per CPU that the executor finds.
-        truth: true extrinsics of a simulated fleet; None for real logs.
     """
 
     report: Path | None = None

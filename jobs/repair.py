@@ -15,13 +15,17 @@ def repair(*, lake: str) -> int:
     Args:
         lake: folder of the tables.
     """
-    from jobs.terminal.summary import print_summary
+    from jobs.terminal.summary import print_summary, progress_reporter
     from pipeline.store.partitions import Lake
     from pipeline.store.repair import repair_table
     from schemas.versions import TABLES
 
-    tables = Lake.existing(lake)
-    done = {s.name: repair_table(tables, s) for s in TABLES.values() if s.is_record_table}
+    tables, done = Lake.existing(lake), {}
+    records = [s for s in TABLES.values() if s.is_record_table]
+    with progress_reporter("repair") as progress:
+        for count, schema in enumerate(records):
+            progress(count, len(records), schema.name)
+            done[schema.name] = repair_table(tables, schema)
     lost = {name: d.lost for name, d in done.items() if d.lost}
     print_summary(
         "repair",

@@ -34,7 +34,7 @@ def report(
             --day.
         pictures: --no-pictures draws pages without images of public roads.
     """
-    from jobs.terminal.summary import print_summary
+    from jobs.terminal.summary import print_summary, progress_reporter
     from pipeline.config import load_fleet
     from pipeline.errors import ConfigError
     from pipeline.report.stage import Pages, write_day_picture
@@ -50,9 +50,12 @@ def report(
     config, tables = load_fleet(fleet), Lake.existing(lake)
     of = Partition(vehicle, day) if vehicle is not None and day is not None else Window()
     pages = Pages(out, read_truth(truth) if truth is not None else None, pictures)
-    outcome = REPORT.run(Task(config, tables, of, method, given=pages))
-    outputs = [*outcome.outputs]
-    if picture is not None and isinstance(of, Partition):
-        outputs.append(str(write_day_picture(tables, of, config, picture, method)))
+    with progress_reporter("report") as progress:
+        progress(0, 0, f"page of {vehicle} {day}" if day else "pages")
+        outcome = REPORT.run(Task(config, tables, of, method, given=pages, progress=progress))
+        outputs = [*outcome.outputs]
+        if picture is not None and isinstance(of, Partition):
+            progress(0, 0, "picture")
+            outputs.append(str(write_day_picture(tables, of, config, picture, method)))
     print_summary("report", outcome.status, report=out, outputs=outputs)
     return 0

@@ -57,7 +57,8 @@ def train_lidar_semantics(  # options of the command
 
     limit = None if time_limit is None else parse_duration(time_limit, "time-limit")
     config = SweepTraining(steps=steps, batch_size=batch_size, learning_rate=learning_rate, seed=seed)
-    samples = labelled_sweeps(load_fleet(fleet), Lake.at(lake), (rows, columns), frames_per_day)
+    with progress_reporter("samples"):
+        samples = labelled_sweeps(load_fleet(fleet), Lake.at(lake), (rows, columns), frames_per_day)
     torch.set_num_threads(threads)
     with progress_reporter(f"train {out.name}") as progress:
         network, result = train_sweeps(samples.train, samples.held_out, out, config, limit, progress)

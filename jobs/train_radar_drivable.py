@@ -52,7 +52,8 @@ def train_radar_drivable(  # options of the command
 
     limit = None if time_limit is None else parse_duration(time_limit, "time-limit")
     config = DrivableTraining(steps=steps, batch_size=batch_size, learning_rate=learning_rate, seed=seed)
-    train, held_out, data = drivable_samples(load_fleet(fleet), Lake.at(lake), frames_per_day)
+    with progress_reporter("samples"):
+        train, held_out, data = drivable_samples(load_fleet(fleet), Lake.at(lake), frames_per_day)
     torch.set_num_threads(threads)
     with progress_reporter(f"train {out.name}") as progress:
         network, result = train_drivable(train, held_out, out, config, limit, progress)

@@ -98,11 +98,7 @@ def _draw(rig: Rig, shown: Shown, title: str, state: str, out: Path) -> None:
 
 
 def _rig(lake: Lake, vehicle: str, day: str, method: str) -> Rig:
-    """Poses before and after the day; a sensor without an estimate stays where it was before.
-
-    Raises:
-        ConfigError: the day has no record, or no sensor has a pose.
-    """
+    """Poses before and after the day; a sensor without an estimate keeps its prior pose; else ConfigError."""
     from dataclasses import replace
 
     import numpy as np

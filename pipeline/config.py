@@ -113,13 +113,7 @@ class FleetConfig(Section):
         return self._file
 
     def require_files(self) -> None:
-        """Check that all files exist that the vehicles' rigs or [learn] name.
-
-        For commands that read logs: the error then comes before the first log is opened.
-
-        Raises:
-            ConfigError: a file is missing; the message names the key of the first one.
-        """
+        """Raise ConfigError for a missing file of the vehicles' rigs or [learn], before a log is opened."""
         for key, name in self._named_files():
             if not self.path_of(name).is_file():
                 raise ConfigError(str(self._file), key, f"no such file: {self.path_of(name)}")
@@ -146,14 +140,7 @@ class FleetConfig(Section):
         return copy
 
     def changed(self, **sections: dict[str, Any]) -> FleetConfig:
-        """Copy with other values in some sections, validated as on loading; the file path stays.
-
-        Args:
-            sections: as `select={"frames": 16}`; keys that are not named keep their value.
-
-        Raises:
-            ConfigError: no such section or key, or an impossible value; the message names the key.
-        """
+        """Copy with other values in some sections, as `select={"frames": 16}`, validated as on loading."""
         new: dict[str, Any] = {}
         for name, values in sections.items():
             section = getattr(self, name, None)
@@ -174,11 +161,7 @@ class FleetConfig(Section):
         return bool(self._entries_for(vehicle))
 
     def vehicle(self, vehicle: str) -> Vehicle:
-        """Entry of a vehicle in [vehicles]: the one of this name, else the longest pattern that matches.
-
-        Raises:
-            ConfigError: no entry matches.
-        """
+        """Entry of a vehicle in [vehicles]: its name, else the longest matching pattern; else ConfigError."""
         entries = self._entries_for(vehicle)
         if not entries:
             problem = f"unknown vehicle; the file has {sorted(self.vehicles)}"
@@ -205,20 +188,12 @@ class FleetConfig(Section):
 
 
 def load_fleet(path: Path) -> FleetConfig:
-    """Read and validate fleet.toml.
-
-    Raises:
-        ConfigError: missing file, no TOML, unknown key, impossible value; the message names the key.
-    """
+    """Read and validate fleet.toml; a ConfigError names the key."""
     return validated(FleetConfig, read_toml(path), str(path)).read_from(path)
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Content of a TOML file.
-
-    Raises:
-        ConfigError: missing file, or not TOML.
-    """
+    """Content of a TOML file; raises ConfigError if it is missing, or not TOML."""
     try:
         return tomllib.loads(path.read_text())
     except FileNotFoundError as err:
@@ -228,11 +203,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def validated(kind: type[_Kind], values: dict[str, Any], file: str, *above: str) -> _Kind:
-    """Section of a file, validated; `above` names the sections that contain it.
-
-    Raises:
-        ConfigError: unknown key, impossible value; the message names the key.
-    """
+    """Section of a file, validated; `above` names the sections around it; a ConfigError names the key."""
     whole = FleetConfig if above else kind
     try:
         return kind.model_validate(values)

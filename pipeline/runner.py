@@ -33,8 +33,6 @@ class Stage:
     """One step of the nightly run.
 
     Args:
-        name: of its command and its outcomes.
-        reads: tables that it reads.
         writes: table that it writes, then the tables of sensors that belong to it; empty if it writes files.
         function: import path of `work(task) -> Work`.
         needs_inputs: True if a missing input table is an error. False if the stage reads what the task's

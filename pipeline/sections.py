@@ -161,7 +161,7 @@ class PrepareConfig(Section):
     # Shortest distance driven between frames: a frame from the same place adds nothing new.
     min_step_m: Annotated[float, Field(ge=0)] = 0.5
     # What training, validation and test must not share; in fleet.toml also one word: "vehicle", "day",
-    # "place", "all".
+    # "place", "all". Where it is not set, jobs take the strictest keys that cost at most a fifth of the frames.
     split_by: tuple[Literal["vehicle", "day", "place"], ...] = ("vehicle", "day", "place")
     val_fraction: Annotated[float, Field(ge=0, le=0.4)] = 0.1
     test_fraction: Annotated[float, Field(ge=0, le=0.4)] = 0.1
@@ -170,6 +170,9 @@ class PrepareConfig(Section):
     place_s: Positive = 20.0  # part of a drive that counts as one place if the log has no positions
     # Frames of one drive that are closer in time than this to another split are left out.
     guard_s: Annotated[float, Field(ge=0)] = 3.0
+    # Frames are left out that are nearer than half of this to a place of another split: what one sees, its
+    # neighbour sees too. Half on each side, so that frames of two splits are about so far apart.
+    guard_m: Annotated[float, Field(ge=0)] = 30.0
     # Two views are the same if fewer than this many of their 256 fingerprint bits differ.
     duplicate_bits: Annotated[int, Field(ge=0, le=128)] = 16
     seed: Annotated[int, Field(ge=0)] = 0
@@ -241,6 +244,9 @@ class VerifyConfig(Section):
     heading_change_prior_sigmas: Positive = 3.0
     # ... and the record is held if the effect exceeds this share of `camera_lidar_limit_deg`.
     max_heading_error_share: Fraction = 0.25
+    # Turns of the result that held-out frames are asked about, of camera-lidar and of lidar-radar; for
+    # `verify`, and of no influence on a record's verdict.
+    probe_deg: tuple[tuple[Positive, ...], tuple[Positive, ...]] = Field(default=((), ()), exclude=True)
 
 
 class LearnConfig(Section):

@@ -32,8 +32,6 @@ class Task:
     """One call of a stage.
 
     Args:
-        fleet: the whole configuration, including the path of its file.
-        lake: location of the tables.
         of: a vehicle-day, or the window of days for a stage of the whole fleet.
         method: of calibration records; None = the stage's default.
         seed: for all random numbers; None = `solve.seed`.

@@ -15,6 +15,7 @@ __all__ = [
     "FRAMES_OF_PAIR",
     "METHODS",
     "PAIRS",
+    "PROBE_Z",
     "SENSORS",
     "STATUSES",
     "CalibrationRecord",
@@ -32,6 +33,8 @@ METHODS = ("joint", "tracking", "pairwise-optimisation", "joint-optimisation", "
 STATUSES = ("accepted", "held", "refused")
 # Beginnings and parts of reasons that more frames may clear: too few frames, or a sigma above the limit.
 ASKS_FOR_FRAMES = ("too few frames", "too few held-out frames", "(1 sigma), not within ")
+# Start of the names in diagnostics of what held-out frames say of a turn of the result, e.g. probe_z_roll_-0.5 [deg].
+PROBE_Z = "probe_z_"
 # Order of the covariance and of every per-DoF list: left perturbation T <- exp(xi) T, rotation vector then
 # translation, both along the axes of the parent frame.
 DOF_NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")

@@ -160,13 +160,7 @@ class TableSchema:
 
 
 def column(doc: str, *, kind: str = "", **default: Any) -> Any:
-    """A dataclass field for a scalar column.
-
-    Args:
-        doc: description of the content.
-        kind: type, if the annotation leaves it open (int32); else derived from the annotation.
-        default: `default` or `default_factory`, as for a dataclass.
-    """
+    """A dataclass field for a scalar column; `kind` is its type if the annotation leaves it open (int32)."""
     return field(**default, metadata={"doc": doc, "kind": kind})
 
 

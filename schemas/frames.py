@@ -19,13 +19,10 @@ class Seen:
 
     Args:
         frame_index: row of `moments`.
-        log: file name of the log with this moment.
         drive: continuous stretch of driving: the block of the bootstrap.
         sensors: the sensors present, of camera, lidar and radar. For an absent one, arrays and bytes are
             empty, camera_K is NaN and the stamp is the moment's.
         stamp_ns: stamp of the sweep; without a sweep, of the moment.
-        camera_stamp_ns: stamp of the image.
-        radar_stamp_ns: stamp of the scan.
         priors: T_parent_child before the day, by pair; camera_radar only if the lidar does not connect the
             two.
     """

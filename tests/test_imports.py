@@ -22,6 +22,7 @@ FOUNDATIONS = {
     "names",
     "sections",
     "results",
+    "fleet_model",
     "geometry",
     "store",
     "objective",

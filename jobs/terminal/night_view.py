@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Protocol
 
 from jobs.terminal.logging import logger
-from jobs.terminal.summary import is_terminal
+from jobs.terminal.summary import LOG_EVERY_S, is_terminal
 
 if TYPE_CHECKING:
     from pipeline.fleet.nightly import DayOutcome
@@ -67,7 +67,7 @@ def night_view(names: list[str], total: int, title: str = "night") -> Iterator[N
 
 
 class _Lines:
-    """Lines for a log file, updated five times a second: a shorter stage may get no line."""
+    """Lines for a log file, updated five times a second: a shorter stage may get no line, a long one gets several."""
 
     def __init__(self, names: list[str], total: int, title: str) -> None:
         from pipeline.stages import STAGES
@@ -75,14 +75,17 @@ class _Lines:
         self._names, self._total, self._title, self._ended = names, total, title, 0
         self._stages = {stage.name for stage in STAGES}
         self._in_work: dict[int, str] = {}
+        self._last = time.monotonic()  # of any line
 
     def watch(self, index: int, done: int, total: int, what: str) -> None:
-        del done, total
-        stage = what.partition(" ")[0]
+        stage, (vehicle, _, day) = what.partition(" ")[0], self._names[index].rpartition(" ")
         if stage in self._stages and self._in_work.get(index) != stage:
             self._in_work[index] = stage
-            vehicle, _, day = self._names[index].rpartition(" ")
+            self._last = time.monotonic()
             logger().info("stage", vehicle=vehicle, day=day, stage=stage)
+        elif time.monotonic() - self._last >= LOG_EVERY_S:
+            self._last = time.monotonic()
+            logger().info("progress", vehicle=vehicle, day=day, what=what, done=done, total=total)
 
     def finished(self, outcome: DayOutcome) -> None:
         self._ended += 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import threading
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -14,9 +15,17 @@ from pipeline.results import Progress, plain
 if TYPE_CHECKING:
     from pipeline.store.partitions import Lake
 
-__all__ = ["exit_code", "is_terminal", "left_out", "print_json", "print_summary", "progress_reporter"]
+__all__ = [
+    "LOG_EVERY_S",
+    "exit_code",
+    "is_terminal",
+    "left_out",
+    "print_json",
+    "print_summary",
+    "progress_reporter",
+]
 
-_LOG_EVERY_S = 5.0  # without a terminal: often enough for a watchdog, rare enough for a log store
+LOG_EVERY_S = 5.0  # without a terminal: often enough for a watchdog, rare enough for a log store
 
 
 def print_summary(command: str, status: str, **fields: Any) -> None:
@@ -60,7 +69,7 @@ def is_terminal() -> bool:
 
 @contextmanager
 def progress_reporter(title: str) -> Iterator[Progress]:
-    """A `Progress` for a stage: a bar on a terminal, otherwise a log line every few seconds."""
+    """A `Progress` for a stage: a bar on a terminal, otherwise a log line every few seconds, if it reports or not."""
     with _bar(title) if is_terminal() else _lines(title) as report:
         yield report
 
@@ -90,15 +99,23 @@ def _bar(title: str) -> Iterator[Progress]:
 
 @contextmanager
 def _lines(title: str) -> Iterator[Progress]:
+    """Log from a thread, because the steps of some stages take longer than the time between two lines."""
     from jobs.terminal.logging import logger
 
-    last = time.monotonic()
+    at: dict[str, Any] = {"done": 0, "total": 0, "what": ""}
+    ended, began = threading.Event(), time.monotonic()
 
     def report(done: int, total: int, what: str) -> None:
-        nonlocal last
-        now = time.monotonic()
-        if now - last >= _LOG_EVERY_S:
-            last = now
-            logger().info("progress", job=title, done=done, total=total, what=what)
+        at.update(done=done, total=total, what=what)
 
-    yield report
+    def log() -> None:
+        while not ended.wait(LOG_EVERY_S):
+            logger().info("progress", job=title, **at, seconds=round(time.monotonic() - began))
+
+    thread = threading.Thread(target=log, daemon=True)
+    thread.start()
+    try:
+        yield report
+    finally:
+        ended.set()
+        thread.join()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from shlex import quote
 from typing import Any
 
 from jobs.terminal.record_tables import STATUS_STYLES
@@ -11,6 +12,8 @@ from schemas.drift import DRIFT_STATUSES, DriftFinding, VehicleStatus, next_step
 from schemas.service_events import SERVICE_EVENTS
 
 __all__ = ["count_statuses", "moved_sensors", "next_steps", "realigned_radars", "status_lines"]
+
+_STEPS = 40  # vehicles whose next steps are printed; the others are counted
 
 
 def status_lines(findings: Sequence[DriftFinding]) -> list[str]:
@@ -46,13 +49,22 @@ def realigned_radars(outcomes: Sequence[Outcome]) -> dict[str, list[dict[str, st
 
 
 def next_steps(findings: Sequence[DriftFinding], lake: str) -> list[str]:
-    """A sentence with the next command for each vehicle that needs action."""
-    steps = [next_step(vehicle, stored, lake) for vehicle, stored in _statuses(findings).items()]
-    return [step for step in steps if step]
+    """A sentence with the next command for each vehicle that is not GREEN, the most urgent first."""
+    rows = _by_vehicle(findings)
+    urgent = sorted(rows, key=lambda v: (DRIFT_STATUSES.index(status_of(rows[v]).status), v))
+    steps = [step for vehicle in urgent if (step := next_step(rows[vehicle], lake))]
+    left = len(steps) - _STEPS
+    more = [f"and {left} other vehicles: `boresight status --lake {quote(lake)} --vehicle VEHICLE`"]
+    return steps[:_STEPS] + more * (left > 0)
 
 
 def _statuses(findings: Sequence[DriftFinding]) -> dict[str, VehicleStatus]:
+    rows = _by_vehicle(findings)
+    return {vehicle: status_of(rows[vehicle]) for vehicle in sorted(rows)}
+
+
+def _by_vehicle(findings: Sequence[DriftFinding]) -> dict[str, list[DriftFinding]]:
     rows: dict[str, list[DriftFinding]] = {}
     for finding in findings:
         rows.setdefault(finding.vehicle, []).append(finding)
-    return {vehicle: status_of(rows[vehicle]) for vehicle in sorted(rows)}
+    return rows

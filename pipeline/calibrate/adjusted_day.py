@@ -1,7 +1,7 @@
-"""What the pairs of a day show together: one adjustment over their evidence, and each pair judged again where it ends.
+"""Joint adjustment of a day's pairs over their evidence; each pair is judged again at the result.
 
-An edge that failed a check is left out and keeps its own pose and verdict. One that shows too little to be judged by
-itself, as camera and radar mostly do, is certified by what the adjustment makes of it.
+An edge that failed a check is left out and keeps its pose and verdict. An edge with too little data to be
+judged alone, as camera-radar mostly is, is certified at the adjusted pose.
 """
 
 from __future__ import annotations
@@ -30,13 +30,7 @@ _SIGMAS = 3.0  # by which an edge that is left out contradicts the rest
 
 
 def evidence_of_day(day: SolvedDay, edges: Mapping[str, Edge], fleet: FleetConfig) -> list[EdgeEvidence]:
-    """What pairs hand over: their evidence, and why not to use it where one was held for more than a wide sigma.
-
-    Args:
-        day: solved.
-        edges: of the rig, by pair.
-        fleet: sigma of clocks.
-    """
+    """Evidence of the pairs, and the reason for leaving out pairs held for more than a wide sigma."""
     return [
         evidence_of(
             estimate, edges[pair], day.prior, fleet.solve.time_offset_sigma_s, _checks(day.judged[pair])
@@ -54,7 +48,7 @@ def _checks(judged: Judged) -> list[FailedCheck]:
 
 
 def clocks_of(day: SolvedDay, edges: Mapping[str, Edge]) -> dict[Edge, float]:
-    """What was expected of the time offset of pairs that time a sensor."""
+    """Expected time offset of pairs that estimate one."""
     expected = {edges[p]: e.time_offset_prior_s for p, e in day.solution.pairs.items()}
     return {edge: dt_s for edge, dt_s in expected.items() if dt_s is not None}
 
@@ -69,11 +63,8 @@ def adjusted_rig(
     """The rig adjusted over evidence; None where there is none.
 
     Args:
-        graph: of it; sensors without a prior pose are left out, for nobody knows where to begin.
         prior: of all sensors that have one.
-        evidence: of its edges.
         clocks: what is expected of the time offset of edges that time a sensor.
-        clock_sigma_s: of that.
     """
     known = [e for e in evidence if {s.name for s in e.edge.sensors} <= set(prior.T)]
     if not known:
@@ -86,13 +77,7 @@ def adjusted_rig(
 
 
 def judged_together(day: SolvedDay, rig: AdjustedRig | None, edges: Mapping[str, Edge]) -> SolvedDay:
-    """The day at the adjusted poses.
-
-    Args:
-        day: pairs estimated and judged apart.
-        rig: adjusted over their evidence.
-        edges: of the rig, by pair.
-    """
+    """The day at the adjusted poses."""
     if rig is None:
         return day
     pairs, verdicts = dict(day.solution.pairs), dict(day.judged)
@@ -115,9 +100,9 @@ def judged_together(day: SolvedDay, rig: AdjustedRig | None, edges: Mapping[str,
 
 
 def _contradictions(edge: Edge, rig: AdjustedRig, own: Judged) -> list[FailedCheck]:
-    """What other edges have against this one, those that were left out too, unless they are known to be wrong.
+    """Contradictions of other edges to this one, of edges left out too unless they are known to be wrong.
 
-    Camera-lidar is not asked: its own held-out frames would show an error of the size that a radar's edges can show.
+    Camera-lidar is not checked: its held-out frames would show any error that a radar's edges can show.
     """
     if edge.kind == "camera_lidar" and own.verdict.status == "accepted":
         return []
@@ -135,7 +120,7 @@ def _contradictions(edge: Edge, rig: AdjustedRig, own: Judged) -> list[FailedChe
 
 
 def _of_rig(own: PairEstimate, edge: Edge, rig: AdjustedRig, solution: Solution) -> PairEstimate:
-    """A pair's estimate with the adjusted pose; what its own frames tell beside it stays."""
+    """A pair's estimate at the adjusted pose, with the other results of its own frames."""
     parent, child = (s.name for s in edge.sensors)
     observability = rig.observability(parent, child)
     others = [e.frames_used for p, e in solution.pairs.items() if p != own.pair]
@@ -155,7 +140,7 @@ def _of_rig(own: PairEstimate, edge: Edge, rig: AdjustedRig, solution: Solution)
 
 
 def _expected_clocks(graph: RigGraph, clocks: Mapping[Edge, float]) -> dict[str, float]:
-    """What is expected of each clock against the reference's, along the edges that time a sensor."""
+    """Expected offset of each clock to the reference's, along edges that estimate one."""
     timed = graph.with_edges(clocks)
     found = {graph.reference.name: 0.0}
     for sensor in graph.sensors:

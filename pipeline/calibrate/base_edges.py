@@ -1,6 +1,6 @@
-"""Edges that are no pair of camera, lidar and radar: a lidar or radar on the vehicle frame, two lidars.
+"""Edges other than pairs of camera, lidar and radar: lidar or radar to the vehicle frame, two lidars.
 
-Their estimators take plain arrays; this is where a day's rows become those, and evidence a record.
+Their estimators take plain arrays; this module converts a day's rows to arrays, and evidence to records.
 """
 
 from __future__ import annotations
@@ -38,10 +38,6 @@ class BaseEdges:
     """Solves edges to the vehicle frame on one day.
 
     Args:
-        prior: of the rig.
-        lidars: names of all of them.
-        radars: likewise.
-        rows: observations of chosen sensors.
         road_z_m: where the road lies in axes of the base.
         heights: of lidars over the road by name, as somebody measured them, with sigmas [m].
     """
@@ -54,11 +50,7 @@ class BaseEdges:
     heights: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def solve(self, edge: Edge) -> tuple[EdgeEvidence, int]:
-        """What the day shows of an edge, and of how many frames.
-
-        Raises:
-            SolveError: too few frames show it.
-        """
+        """Evidence of an edge, and its number of frames; raises SolveError if there are too few."""
         if edge.kind == "lidar_base":
             return self._lidar_base(edge)
         if edge.kind == "lidar_lidar":

@@ -61,7 +61,7 @@ def calibrate_observations(
 
 
 def records_of(about: Inputs, day: DayOfPairs) -> list[CalibrationRecord]:
-    """One record per pair, whatever the verdict."""
+    """One record per pair, for any verdict."""
     return [
         day.refused[pair] if day.solved is None or pair in day.refused else record_of(about, pair, day.solved)
         for pair in about.pairs
@@ -70,9 +70,9 @@ def records_of(about: Inputs, day: DayOfPairs) -> list[CalibrationRecord]:
 
 @dataclass(frozen=True, eq=False)
 class DayOfPairs:
-    """A day whose pairs were each solved and judged: records of those that were refused, and what there is of others.
+    """A day whose pairs were solved and judged each: records of refused pairs, and the others.
 
-    `solved` is None where every pair was refused.
+    `solved` is None if every pair was refused.
     """
 
     refused: Mapping[str, CalibrationRecord]
@@ -87,11 +87,7 @@ def solve_day(
     progress: Progress = silent,
     solver: Solver | None = None,
 ) -> DayOfPairs:
-    """Select, trigger, solve, judge; each pair by its own frames. Arguments as of `calibrate_observations`.
-
-    Raises:
-        SolveError: the day cannot be calibrated.
-    """
+    """Select, trigger, solve, judge, each pair by its own frames; as `calibrate_observations`."""
     motion = compared_sources(observations, prior.T_lidar_radar)
     try:
         return _solved(observations, prior, fleet, about, motion, progress, solver)
@@ -100,7 +96,7 @@ def solve_day(
 
 
 def _named(refusal: SolveError, wrong: Sequence[FailedCheck]) -> SolveError:
-    """A refusal that says first which source of motion is wrong, where one is."""
+    """A refusal whose reason begins with a wrong source of motion, if there is one."""
     if not wrong:
         return refusal
     return SolveError("; ".join([*(check.sentence for check in wrong), refusal.reason]), wrong[0].fault)
@@ -184,7 +180,7 @@ def _judging(
     active: Sequence[str],
     motion: MotionFindings,
 ) -> tuple[Mapping[str, Sequence[FailedCheck]], Judging]:
-    """Failed checks of all pairs, and what they are judged by."""
+    """Failed checks of all pairs, and inputs of their verdicts."""
     seen_by = next((o for o in observations if "camera" in o.sensors), None)
     turn = None if seen_by is None else camera_turn_sigma_rad(solution, prior.camera, seen_by.camera_K)
     about = FoundDay(observations, selection, prior, solution, fleet, limits_of(fleet), motion)
@@ -224,7 +220,7 @@ def _refused(
 
 
 def _sync_gate_s(method: Method, fleet: FleetConfig) -> float | None:
-    """The gate of ingest; where that is by motion, the paper's methods, which know of none, keep the paper's."""
+    """The gate of ingest; the paper's gate for its methods if ingest gates by motion."""
     gate_s = fleet.ingest.sync_gate_s
     return PAPER_SYNC_GATE_S if gate_s is None and method.paper_selection else gate_s
 
@@ -232,7 +228,7 @@ def _sync_gate_s(method: Method, fleet: FleetConfig) -> float | None:
 def _to_calibrate(method: Method, fired: Mapping[str, Sequence[str]], when: str) -> list[str]:
     """Pairs to estimate and to judge: all, or those with a metric beyond its threshold.
 
-    Camera and radar hardly know their pose but by the other two: where it is asked for, so are they.
+    Camera-radar depends on the other two pairs, so it includes them.
     """
     wanted = {p for p in fired if fired[p] or when == "always"}
     if "camera_radar" in wanted and (method.composed or method.name == "joint"):

@@ -1,4 +1,4 @@
-"""What an earlier day of the same vehicle found: a place for today's search to look at, and nothing more."""
+"""Result of an earlier day of the same vehicle, as one more start of today's search."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["accepted_before"]
 
 # Days with records that are looked at: a vehicle that was held for longer has no state worth a look.
 _DAYS_BACK = 10
-# A vehicle that drives once a week has ten days in a quarter; what lies further back is not read.
+# A vehicle that drives once a week has ten days in a quarter; older days are not read.
 _CALENDAR_DAYS_BACK = 92
 _TRANSFORM = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 
@@ -23,10 +23,10 @@ _TRANSFORM = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 def accepted_before(
     lake: Lake, partition: Partition, method: str, edge: Edge
 ) -> Float[np.ndarray, "4 4"] | None:
-    """T_parent_child of an edge on the vehicle's latest earlier day on which it was accepted; None where there is none.
+    """T_parent_child of an edge on its latest earlier accepted day; None if there is none.
 
-    No information about today's pose, so no part of the work key: the search looks there only where the day
-    alone does not decide, and what it finds there is judged like anything else.
+    It carries no information about today's pose and is no part of the work key: the search starts there only
+    if the day alone does not decide, and the result is judged like any other.
     """
     found = read_records(
         lake,

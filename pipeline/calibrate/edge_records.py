@@ -1,4 +1,4 @@
-"""Record of an edge of which there is evidence and no estimate of a pair: the evidence with its own prior."""
+"""Record of an edge with evidence but without a pair's estimate: the evidence with its prior."""
 
 from __future__ import annotations
 
@@ -35,16 +35,7 @@ def record_of_evidence(
     fleet: FleetConfig,
     frames_total: int,
 ) -> CalibrationRecord:
-    """The edge as it is by its own data and its prior alone.
-
-    Args:
-        about: vehicle, day, method and provenance.
-        evidence: of the edge.
-        prior: of the rig.
-        views: by sensor's name.
-        fleet: limits.
-        frames_total: of the day.
-    """
+    """Record of an edge from its own data and its prior alone."""
     edge, limits = evidence.edge, AdjustmentLimits(fleet.solve.time_offset_sigma_s)
     before = _prior_of(edge, prior)
     alone = adjust(

@@ -1,4 +1,4 @@
-"""What a day within which a sensor moved says before and after that, as changes of the record's estimate."""
+"""Changes of a record's estimate before and after a sensor moved within the day."""
 
 from __future__ import annotations
 
@@ -18,12 +18,9 @@ __all__ = ["half_days_of"]
 def half_days_of(
     pair: str, estimates: Mapping[str, PairEstimate], faults: Mapping[str, Sequence[str]]
 ) -> Float[np.ndarray, "2 2 6"] | None:
-    """Changes of a pair from its estimate to its first and its last part, and their sigmas; None where it stayed.
+    """Changes of a pair from its estimate to its first and last part, with sigmas; None if it did not move.
 
-    Args:
-        pair: which one; camera_radar changes as the other two do.
-        estimates: by pair.
-        faults: that the verdict of each pair names.
+    Camera_radar changes as the other two do. `faults` are those of each pair's verdict.
     """
     parts, own = (
         {p: _parts(e, "moved_in_day" in faults.get(p, ())) for p, e in estimates.items()},
@@ -44,7 +41,7 @@ def half_days_of(
 
 
 def _parts(estimate: PairEstimate, has_moved: bool) -> tuple[list[np.ndarray], Float[np.ndarray, "2 3"]]:
-    """Poses of the two parts and sigmas of their turns; the estimate itself where it stayed."""
+    """Poses of the two parts and sigmas of their rotations; the estimate itself if it did not move."""
     if estimate.parts is None or not has_moved:
         return [estimate.T, estimate.T], np.zeros((2, 3))
     compared = np.isin(np.arange(3), estimate.parts.tested)

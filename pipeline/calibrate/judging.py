@@ -1,4 +1,4 @@
-"""Verdict and evidence of each pair of a solved day: its held-out frames, what it claims, the checks that it failed."""
+"""Verdict and evidence of each pair of a solved day: held-out frames, claim, failed checks."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from pipeline.calibrate.verify.held_out_test import HeldOutTest, paired_test
 from pipeline.calibrate.verify.held_out_update import held_out_update
 from pipeline.calibrate.verify.limits import VerdictLimits
 from pipeline.calibrate.verify.mounting import mounting_covariance
+from pipeline.calibrate.verify.probes import probe_numbers
 from pipeline.calibrate.verify.seen_targets import seen_targets, unseen_failure, views_of
 from pipeline.calibrate.verify.target_accuracy import Claim, claims_of
 from pipeline.calibrate.verify.verdict import Evidence, Verdict, judge
@@ -38,17 +39,16 @@ class Judged:
     claims: Mapping[str, Claim]
     mounting_covariance: np.ndarray | None = None  # 6 6; None where nothing says how the camera hangs
     targets: np.ndarray = field(default_factory=lambda: DEFAULT_TARGETS)  # 3 3, in the child's frame
+    probes: Mapping[str, float] = field(default_factory=dict)  # of `probe_numbers`
 
 
 @dataclass(frozen=True, eq=False)
 class Judging:
-    """What the pairs of a day are judged by.
+    """Inputs of the verdicts of a day's pairs.
 
     Args:
-        observations: of the day.
         selection: frames that took no part in the fit.
         prior: what stays current.
-        fleet: limits.
         active: pairs that were to be calibrated.
         camera_turn_sigma_rad: of the camera's pitch and yaw, by its principal point.
     """
@@ -65,13 +65,7 @@ class Judging:
         return views_of(self.observations)
 
     def pair(self, estimate: PairEstimate, failed: Sequence[FailedCheck], *, together: bool) -> Judged:
-        """Judge one pair.
-
-        Args:
-            estimate: of it.
-            failed: checks.
-            together: whether other pairs have a say in its pose; see `judge`.
-        """
+        """Judge one pair; `together` is true if other pairs take part in its pose (see `judge`)."""
         pair, limits = estimate.pair, limits_of(self.fleet)
         active = pair in self.active
         held_out = [self.observations[i] for i in self.selection.holdout[pair]] if active else []
@@ -83,7 +77,7 @@ class Judging:
                 FailedCheck("the day has too few frames to hold any out: nothing checks the result")
             )
         targets = DEFAULT_TARGETS if targets is None else targets
-        test, claims = self._held_out(estimate, held_out, limits, mounting, targets)
+        test, claims, probes = self._held_out(estimate, held_out, limits, mounting, targets)
         verdict = judge(
             estimate,
             self.prior,
@@ -93,7 +87,7 @@ class Judging:
             triggered=active,
             together=together,
         )
-        return Judged(verdict, test, claims, mounting, targets)
+        return Judged(verdict, test, claims, mounting, targets, probes)
 
     def _held_out(
         self,
@@ -102,19 +96,21 @@ class Judging:
         limits: VerdictLimits,
         mounting: np.ndarray | None,
         targets: np.ndarray,
-    ) -> tuple[HeldOutTest | None, Mapping[str, Claim]]:
-        """Held-out frames at the prior and at the result, and what they leave to claim."""
+    ) -> tuple[HeldOutTest | None, Mapping[str, Claim], dict[str, float]]:
+        """Held-out frames at the prior and at the result, the remaining claim, and known turns of the result."""
         pair, verify, prior = estimate.pair, self.fleet.verify, self.prior
         azimuth_deg, elevation_deg = (
             (verify.camera_lidar_limit_deg, verify.camera_lidar_limit_deg)
             if pair == "camera_lidar"
             else (verify.radar_limit_deg, verify.radar_elevation_limit_deg)
         )
-        test = update = None
+        test, update, probes = None, None, dict[str, float]()
         if held_out:
             score = held_out_score(estimate, held_out, prior, self.fleet.solve)
             blocks = scene_blocks(held_out)
             test = paired_test(score.cost(prior.of(pair)), score.cost(estimate.T), blocks)
+            sizes_deg = verify.probe_deg["radar" in pair]
+            probes = probe_numbers(pair, estimate.T, score.cost, blocks, sizes_deg)
             covariance = np.diag([*np.zeros(6), *score.extra_variance])
             covariance[:6, :6] = estimate.covariance
             update = held_out_update(score.derivatives, covariance, score.bias, blocks, limits)
@@ -130,7 +126,7 @@ class Judging:
             mounting,
             targets,
         )
-        return test, claims
+        return test, claims, probes
 
 
 def limits_of(fleet: FleetConfig) -> VerdictLimits:

@@ -19,7 +19,7 @@ __all__ = ["METHODS", "Method", "Solver", "method_named"]
 
 @runtime_checkable
 class Solver(Protocol):
-    """What a method is: selected frames per pair and a prior in, a solution of these pairs out."""
+    """Interface of a method: from selected frames per pair and a prior to a solution."""
 
     def __call__(  # noqa: D102
         self,
@@ -35,14 +35,13 @@ class Solver(Protocol):
 
 @dataclass(frozen=True)
 class Method:
-    """What sets a method apart.
+    """Properties of a method.
 
     Args:
-        name: on the command line and in records.
         run: import path of its `Solver`; of `(method's name, task, chosen) -> Solver` where it needs images.
         composed: pairs that it composes of the other two instead of estimating them.
-        frames: "selected" takes `select.frames` of a day; "all" takes all that are not held out, since it follows
-            objects from frame to frame.
+        frames: "selected" takes `select.frames` of a day; "all" takes all that are not held out, since it
+            follows objects from frame to frame.
         paper_selection: takes the paper's frame conditions (section 4.5.1).
         needs_images: looks at images and sweeps (table frames) by networks, and not at observations alone.
         needs_all: estimates all three pairs or none; else a pair without frames costs the others nothing.
@@ -65,11 +64,7 @@ class Method:
         return solver
 
     def solver_of(self, task: Task, chosen: Mapping[str, str] | None = None) -> Solver:
-        """The solver for one vehicle-day.
-
-        Args:
-            task: which day.
-            chosen: names of its camera, lidar and radar by kind; None = the rig has one of each at most.
+        """The solver for one vehicle-day; `chosen` are names of its sensors by kind, if the rig has several.
 
         Raises:
             ConfigError: a network that the method needs does not exist.
@@ -80,7 +75,7 @@ class Method:
         return solver
 
     def settings_of(self, task: Task) -> dict[str, Any]:
-        """What the answer depends on besides observations and the sections of fleet.toml, for the work key."""
+        """Further inputs of the result beside observations and sections of fleet.toml, for the work key."""
         return {} if self.settings is None else dict(_resolved(self.settings)(self.name, task))
 
 
@@ -107,11 +102,7 @@ METHODS = (
 
 
 def method_named(name: str) -> Method:
-    """The method of a name.
-
-    Raises:
-        ConfigError: no such method.
-    """
+    """The method of a name; raises ConfigError if there is none."""
     for method in METHODS:
         if method.name == name:
             return method

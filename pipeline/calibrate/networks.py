@@ -1,4 +1,4 @@
-"""The methods `pairwise-ssl` and `joint-ssl`: brings networks, frames and, where asked for, the optimiser together."""
+"""The methods `pairwise-ssl` and `joint-ssl`: networks, frames and, on request, the optimiser."""
 
 from __future__ import annotations
 
@@ -41,11 +41,7 @@ class FrameCalibration:
 
 
 def ssl_settings(method: str, task: Task) -> dict[str, str]:
-    """What a network's answer depends on besides frames and observations, for the work key.
-
-    Raises:
-        ConfigError: there is no such network.
-    """
+    """Settings and files that a network's answer depends on, for the work key; else ConfigError."""
     return {
         "models": models_key(model_files(method, task.fleet)),
         "learn": config_hash(task.fleet.learn, task.fleet.prepare),
@@ -89,14 +85,10 @@ def ssl_solver(method: str, task: Task, chosen: Chosen | None = None) -> Solver:
 
 
 def calibrate_frame(task: Task, frame: int) -> FrameCalibration:
-    """Calibrate from one frame, as after an abrupt change. Nothing is recorded: nothing can judge one frame.
-
-    Args:
-        task: a vehicle-day with frames and observations; the method must look at images.
-        frame: frame_index, or a stamp_ns.
+    """Calibrate from one frame (frame_index or stamp_ns), as after an abrupt change; records nothing.
 
     Raises:
-        ConfigError: no such frame, or a method that needs more than one.
+        ConfigError: no such frame, or a method that needs several.
         SolveError: the frame shows too little.
     """
     method, fleet, partition = method_named(task.method or "joint-ssl"), task.fleet, task.partition

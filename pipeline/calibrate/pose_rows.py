@@ -1,4 +1,4 @@
-"""Rows of table `poses`: where each sensor of an adjusted rig is, and what that is good for."""
+"""Rows of table `poses`: pose and certified axes of each sensor of an adjusted rig."""
 
 from __future__ import annotations
 
@@ -41,13 +41,10 @@ def pose_rows(
     """A row for each sensor; the reference's says that poses refer to it.
 
     Args:
-        about: vehicle, day, method and provenance.
-        graph: the rig.
         adjusted: its poses; None where no edge had evidence.
         views: what each sensor sees, by name: a pose is certified where its sensor looks.
-        verify: limits.
-        judged: by sensor, the record of its edge to the reference where that was judged at the adjusted pose, on
-            held-out frames too: what it says of the pose holds.
+        judged: by sensor, the record of its edge to the reference where that was judged at the adjusted pose,
+            on held-out frames too: what it says of the pose holds.
     """
     rows = [_row(about, graph, sensor, adjusted, views, verify) for sensor in graph.sensors]
     return [_as_judged(row, (judged or {}).get(row.sensor)) for row in rows]
@@ -160,7 +157,7 @@ def _claims(
 def _verdict(
     sensor: Sensor, found: AdjustedSensor, claims: Mapping[str, Claim], determined: Sequence[str]
 ) -> tuple[str, str]:
-    """Status and reason: a radar is worth its azimuth alone, other sensors need both directions."""
+    """Status and reason: a radar needs azimuth only, other sensors need both directions."""
     doubts = ", ".join(e.name for e in found.doubts)
     if doubts:
         return "held", f"its edges contradict each other and nothing tells which is wrong: {doubts}"
@@ -179,7 +176,7 @@ def _verdict(
 
 
 def _azimuth_seen(view: View, sensor: Sensor) -> float:
-    """Width in azimuth of what a sensor sees near its horizon [rad]."""
+    """Width in azimuth of a sensor's view near its horizon [rad]."""
     azimuth, elevation = np.radians(np.arange(-179.5, 180.0)), np.radians([-10.0, 0.0, 10.0])
     points = from_spherical(
         np.stack([*np.meshgrid(azimuth, elevation, indexing="ij"), np.full((360, 3), 25.0)], -1)

@@ -1,8 +1,8 @@
-"""Whose prior pose is wrong: that of the sensor which all edges share that lie far from the prior.
+"""Detection of a wrong prior pose: that of the sensor shared by all edges that lie far from the prior.
 
-Such an edge is left out, for it may have found a wrong minimum. Where it is the prior that is wrong, all that still
-rests on that prior is as far off, with the prior's small sigma: on a van whose reference lidar was logged .3 m too far
-ahead, three edges said so, and three radars whose day shows no position were accepted half a degree off.
+Such an edge is left out, because it may be in a wrong minimum. If the prior is wrong, everything that rests
+on it is as far off, with the prior's small sigma: on a van whose reference lidar was logged .3 m too far
+ahead, three edges showed it, and three radars without a measured position were accepted half a degree off.
 """
 
 from __future__ import annotations
@@ -21,13 +21,9 @@ _FAULT = "prior"
 def hold_doubted(
     rows: Sequence[PoseRow], records: Sequence[CalibrationRecord]
 ) -> tuple[list[PoseRow], list[CalibrationRecord]]:
-    """Poses, held where edges contradict the prior of their sensor, or of the reference that all are told by.
+    """Poses, held if edges contradict the prior of their sensor or of the reference.
 
-    So are the records of such a sensor's edges whose own data do not show where it stands.
-
-    Args:
-        rows: of a vehicle-day.
-        records: of its edges.
+    Records of such a sensor's edges are held too, if their own data do not determine its position.
     """
     against = [r for r in records if _FAULT in r.faults]
     ends = [{r.parent_frame, r.child_frame} for r in against]
@@ -52,7 +48,7 @@ def _held(row: PoseRow, said: str) -> PoseRow:
 
 
 def _held_record(record: CalibrationRecord, said: str) -> CalibrationRecord:
-    """Of an edge that knows x and y by itself the prior may be as wrong as it likes."""
+    """Record of an edge, held unless its own data determine x and y."""
     if record.status != "accepted" or all((record.observable or [False] * 6)[3:5]):
         return record
     reason = f"{said}; {record.reason}" if record.reason else said

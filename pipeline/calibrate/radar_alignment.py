@@ -1,4 +1,4 @@
-"""Rows of table `radar_alignments`: what radars state of their own alignment beside what the day's edges found."""
+"""Rows of table `radar_alignments`: alignment stated by radars beside the day's edges."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from schemas.radar_alignments import RadarAlignment
 
 __all__ = ["with_alignments"]
 
-# Of edges that hold a radar, the one that tells its direction best.
+# Edge that determines a radar's direction best, of those with the radar.
 _BEST_FIRST = ("lidar_radar", "radar_base", "camera_radar")
 _STATUSES = ("accepted", "held")
 
@@ -30,13 +30,7 @@ _STATUSES = ("accepted", "held")
 def with_alignments(
     found: Sequence[CalibrationRecord | PoseRow], manifest: Manifest | None, about: Inputs
 ) -> list[CalibrationRecord | PoseRow | RadarAlignment]:
-    """Rows of a day with those of its radars' own alignment; a step within the day is noted where the radar is named.
-
-    Args:
-        found: records of edges, and poses.
-        manifest: of the day's moments.
-        about: the day.
-    """
+    """Rows of a day with those of its radars' own alignment; a step within the day is noted at the radar."""
     stated = {} if manifest is None else manifest.extra.get(RADAR_ALIGNMENT, {})
     records = [r for r in found if isinstance(r, CalibrationRecord)]
     rows = [_row(about, name, columns, records) for name, columns in stated.items()]

@@ -1,4 +1,4 @@
-"""Calibration records from what select, solve and verify returned."""
+"""Calibration records from the results of select, solve and verify."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ __all__ = [
     "transform_fields",
 ]
 
-# Speeds that tell a highway from a town [m/s]: 20 m/s = 72 km/h is beyond what towns allow.
+# Speeds that separate a highway from a town [m/s]: 20 m/s = 72 km/h is above town limits.
 _FAST_MPS = 20.0
 _MOVING_MPS = 1.0
 _OF_K = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}
@@ -42,7 +42,7 @@ _OF_K = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}
 
 @dataclass(frozen=True)
 class Inputs:
-    """What identifies a calibration: the same inputs give the same record."""
+    """Identity of a calibration: the same inputs give the same record."""
 
     partition: Partition
     method: str
@@ -90,6 +90,7 @@ def record_of(about: Inputs, pair: str, day: SolvedDay) -> CalibrationRecord:
         drive_missing=selection.missing.get(pair, []),
         diagnostics=dict(estimate.diagnostics)
         | _test_numbers(test)
+        | dict(judged.probes)
         | _claim_numbers(judged)
         | _camera_numbers(pair, day.observations)
         | dict(day.numbers)
@@ -182,7 +183,7 @@ def _unobservable(observable: np.ndarray) -> list[str]:
 
 
 def _assumed(estimate: PairEstimate, observations: Sequence[Observation]) -> list[str]:
-    """What every method takes as known, and what an error of it is worth."""
+    """Assumptions of every method, and the effect of errors in them."""
     rigid = "sensors are rigid over the day"
     if estimate.parts is not None:
         sigmas = float(np.abs(estimate.parts.sigmas(PART_FLOOR_RAD)).max())
@@ -227,7 +228,7 @@ def _test_numbers(test: HeldOutTest | None) -> dict[str, float]:
 
 
 def _claim_numbers(judged: Judged) -> dict[str, float]:
-    """Score, what is certified and what nothing checks, what held-out frames would change, the sigma they leave."""
+    """Score, certified and unchecked axes, innovation of held-out frames, resulting sigma."""
     certified = judged.verdict.determined
     numbers = {
         "confidence": judged.verdict.score,
@@ -250,7 +251,7 @@ def _claim_numbers(judged: Judged) -> dict[str, float]:
 
 
 def _estimate_fields(estimate: PairEstimate, judged: Judged) -> dict[str, Any]:
-    """What a refused record does not have: the transform and how well the day determines it."""
+    """Fields that a refused record lacks: the transform and its covariance."""
     sigma = {name: claim.sigma_rad for name, claim in judged.claims.items()}
     return {
         "covariance": estimate.covariance,
@@ -265,7 +266,7 @@ def _estimate_fields(estimate: PairEstimate, judged: Judged) -> dict[str, Any]:
 
 
 def _mounting_fields(judged: Judged) -> dict[str, Any]:
-    """How surely the record knows what is mounted; nothing where nobody knows the principal point."""
+    """Covariance of the mounting; empty if the principal point is unknown."""
     if judged.mounting_covariance is None:
         return {}
     sigmas = {f"mounting_{n}_sigma_rad": claim.mounting_sigma_rad for n, claim in judged.claims.items()}
@@ -273,7 +274,7 @@ def _mounting_fields(judged: Judged) -> dict[str, Any]:
 
 
 def _camera_numbers(pair: str, observations: Sequence[Observation]) -> dict[str, float]:
-    """The CameraInfo that the record's directions hold with, so that days of another one are told apart."""
+    """The CameraInfo of the record's directions, to distinguish days with another one."""
     o = next((o for o in observations if "camera" in o.sensors), None)
     if "camera" not in FRAMES_OF_PAIR[pair] or o is None:
         return {}

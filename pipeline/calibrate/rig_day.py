@@ -1,8 +1,9 @@
 """A day of a rig: each edge by its own frames, then one adjustment over all of them.
 
-An edge of two sensors is solved and judged as any pair is. What it finds enters the adjustment without its prior; an
-edge that failed a check of its own is left out. The adjusted poses are the answer. Of a rig with one sensor of each
-kind, whose frames are at hand together, records are of the adjusted poses too; else they are the edges' own evidence.
+An edge of two sensors is solved and judged as any pair is. What it finds enters the adjustment without its
+prior; an edge that failed a check of its own is left out. The adjusted poses are the answer. Of a rig with
+one sensor of each kind, whose frames are at hand together, records are of the adjusted poses too; else they
+are the edges' own evidence.
 """
 
 from __future__ import annotations
@@ -53,11 +54,9 @@ class RigDay:
     """What a day has of a rig.
 
     Args:
-        rig: as fleet.toml has it.
-        graph: its edges.
-        prior: of all sensors.
         views: what each sensor sees, by name.
-        rows: observations of chosen sensors, in order of time; read when an edge is solved, and let go after it.
+        rows: observations of chosen sensors, in order of time; read when an edge is solved, and let go after
+            it.
         before: T_parent_child of an edge as an earlier day found it; None where none did.
     """
 
@@ -88,12 +87,9 @@ class RigDay:
 
 @dataclass(frozen=True, eq=False)
 class CalibratedRig:
-    """Records of all edges, and the adjusted rig.
+    """Records of all edges, and the adjusted rig (None if no edge has evidence).
 
-    Args:
-        records: of every edge.
-        adjusted: None where no edge has evidence.
-        judged: records that were judged at the adjusted poses, by their sensor, of edges to the reference.
+    `judged` has the records of edges to the reference that were judged at the adjusted poses, by sensor.
     """
 
     records: list[CalibrationRecord]
@@ -102,14 +98,7 @@ class CalibratedRig:
 
 
 def calibrate_rig(day: RigDay, fleet: FleetConfig, about: Inputs, progress: Progress) -> CalibratedRig:
-    """Solve and judge each edge, then adjust poses and clocks of all sensors.
-
-    Args:
-        day: of the rig.
-        fleet: limits and effort.
-        about: what identifies the records.
-        progress: told about each edge.
-    """
+    """Solve and judge each edge, then adjust poses and clocks of all sensors."""
     measured = day.rig.road_z_m, day.rig.measured_heights
     others = BaseEdges(day.prior, tuple(day.rig.lidars), tuple(day.rig.radars), day.rows, *measured)
     found, done = _Found(), 0
@@ -146,7 +135,7 @@ def calibrate_rig(day: RigDay, fleet: FleetConfig, about: Inputs, progress: Prog
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """What edges gave so far: records that are concluded, evidence, and days to be judged at the adjusted poses."""
+    """Results of edges so far: concluded records, evidence, and days to judge at the adjusted poses."""
 
     records: list[CalibrationRecord] = field(default_factory=list)
     evidence: list[EdgeEvidence] = field(default_factory=list)
@@ -192,7 +181,7 @@ def _solve_pairs(
 
 
 def _add_heading(edge: Edge, rows: Sequence[Observation], found: _Found) -> None:
-    """What a radar's Doppler shows of the car's way in a lidar's axes, once the radar's turn in them is known."""
+    """Direction of travel by a radar's Doppler in a lidar's axes, if the radar's rotation is known."""
     estimate, evidence = found.estimates[edge], found.evidence[-1]
     if edge.kind != "lidar_radar" or evidence.checks or not estimate.observable[2]:
         return
@@ -241,7 +230,7 @@ def _edge_of(record: CalibrationRecord, graph: RigGraph) -> Edge:
 def _with_innovation(
     record: CalibrationRecord, graph: RigGraph, adjusted: AdjustedRig | None
 ) -> CalibrationRecord:
-    """The record with how far its edge is from what the others show, and whether the rig rests on it."""
+    """The record with the innovation of its edge, and whether the rig uses the edge."""
     found = None if adjusted is None else adjusted.edges.get(_edge_of(record, graph))
     if found is None:
         return record

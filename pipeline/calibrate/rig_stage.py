@@ -1,4 +1,4 @@
-"""What calibrate reads of a rig of several sensors of a kind: its prior, its views, its edges, rows of each edge."""
+"""Inputs of calibrate for a rig of several sensors of a kind: prior, views, edges, rows of each edge."""
 
 from __future__ import annotations
 
@@ -39,11 +39,7 @@ __all__ = ["refused_edges", "rig_rows", "three_of_day", "three_rows"]
 
 
 def rig_rows(task: Task, about: Inputs, progress: Progress) -> list[CalibrationRecord | PoseRow]:
-    """Records of all edges of a vehicle-day, and a pose of each sensor.
-
-    Raises:
-        SolveError: the day cannot be calibrated at all.
-    """
+    """Records of all edges of a vehicle-day, and a pose of each sensor; SolveError if none can be made."""
     fleet, rig = task.fleet, task.fleet.rig_of(task.partition.vehicle)
     day = _read(task, rig, about.seed)
     found = calibrate_rig(day, fleet, about, progress)
@@ -53,11 +49,7 @@ def rig_rows(task: Task, about: Inputs, progress: Progress) -> list[CalibrationR
 
 
 def three_rows(task: Task, about: Inputs, progress: Progress) -> list[CalibrationRecord]:
-    """Records of three sensors of the rig, by a method that knows one of each kind.
-
-    Raises:
-        SolveError: no three share a view, or the day has no prior.
-    """
+    """Records of three sensors of the rig, by a method for one of each kind; errors as `three_of_day`."""
     chosen, prior = three_of_day(task, about.seed)
     rows, of_three = _rows(task, chosen), replace(about, chosen=chosen, pairs=pairs_of(chosen))
     try:

@@ -1,4 +1,4 @@
-"""A day whose pairs were solved and judged: what its records are made of."""
+"""A day with solved and judged pairs: input of its records."""
 
 from __future__ import annotations
 
@@ -16,15 +16,10 @@ __all__ = ["SolvedDay"]
 
 @dataclass(frozen=True, eq=False)
 class SolvedDay:
-    """What went in, what came out, and how each pair was judged.
+    """A day's inputs, results and verdicts.
 
     Args:
-        observations: of the day.
-        selection: frames of each pair.
-        prior: that it began with.
         solution: of the pairs that were not refused.
-        judged: verdicts by pair.
-        failed: checks of the day that each pair failed.
         judging: what verdicts rest on.
         trigger_sample: frames that triggers look at.
         trigger_before: metrics of each pair at the prior.

@@ -41,8 +41,7 @@ _UNLABELLED = (
 def work(task: Task) -> Work:
     """The records of a vehicle-day, one per pair.
 
-    A day that cannot be calibrated gets refused records with the reason. So does a day that another stage refused:
-    the task is given that stage's outcome, and the records say its reason.
+    A day that cannot be calibrated, or that an earlier stage refused, gets refused records with the reason.
 
     Raises:
         ConfigError: no such vehicle, method or network, or an impossible seed or prior file.
@@ -86,12 +85,12 @@ def work(task: Task) -> Work:
 
 
 def _known_cameras(rig: Rig) -> dict[str, Any]:
-    """What calibration takes as known of the rig's cameras, for the work key."""
+    """Assumed calibration of the rig's cameras, for the work key."""
     return {name: asdict(camera.known) for name, camera in rig.cameras.items()}
 
 
 def _refusal(refused: Outcome, partition: Partition, method: Method, seed: int, rig: Rig) -> Work:
-    """Records of a day that never reached the solver, so that whoever reads the lake finds the reason."""
+    """Records of a day that was refused before the solver, with the reason."""
     reason = f"{refused.stage}: {refused.reason}"
 
     def rows(run: Run) -> Generator[Records, None, None]:
@@ -104,7 +103,7 @@ def _refusal(refused: Outcome, partition: Partition, method: Method, seed: int, 
 
 
 def _absent(lake: Lake, partition: Partition) -> dict[str, str]:
-    """Why frames lack a sensor, by the manifests of perceive and of ingest, which says more."""
+    """Reasons why frames lack a sensor, from the manifests of perceive and ingest."""
     told, told_before = perceived(lake, partition), ingested(lake, partition)
     found, counts = {}, {} if told is None else told.rejected
     for sensor in SENSORS if told is None else (*SENSORS, *sensors_of(told)):

@@ -1,4 +1,4 @@
-"""Which camera, lidar and radar a method works on that knows one of each: the paper's, tracks and networks."""
+"""Choice of one camera, lidar and radar, for the paper's methods, tracking and networks."""
 
 from __future__ import annotations
 
@@ -12,11 +12,7 @@ __all__ = ["three_sensors"]
 
 
 def three_sensors(method: str, rig: Rig, overlaps: Sequence[Overlap]) -> Mapping[str, str]:
-    """Names by kind: those that the rig names, else the three that share most; of a rig with one of each, these.
-
-    Raises:
-        SolveError: no three of the rig share a view.
-    """
+    """Names by kind: those that the rig names, else the three with the largest overlap; else SolveError."""
     sensors = [node for node in rig.nodes if node.kind != "base"]
     only: Mapping[str, str] = {sensor.kind: sensor.name for sensor in sensors}
     if len(only) == len(sensors):

@@ -17,11 +17,7 @@ _PCD_TYPES = {"F": "f", "I": "i", "U": "u"}
 
 
 def read_bytes(path: Path) -> bytes:
-    """Content of a file.
-
-    Raises:
-        ConfigError: it cannot be read.
-    """
+    """Content of a file; raises ConfigError if it cannot be read."""
     try:
         return path.read_bytes()
     except OSError as err:
@@ -29,11 +25,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def read_json(path: Path) -> Any:
-    """Value of a JSON file.
-
-    Raises:
-        ConfigError: it cannot be read, or is not JSON.
-    """
+    """Value of a JSON file; raises ConfigError if it cannot be read, or is not JSON."""
     try:
         return json.loads(read_bytes(path))
     except ValueError as err:
@@ -41,11 +33,7 @@ def read_json(path: Path) -> Any:
 
 
 def read_float_rows(path: Path, columns: int) -> Float32[np.ndarray, "N C"]:
-    """Rows of little-endian float32 without a header, as in .bin files of KITTI and nuScenes.
-
-    Raises:
-        ConfigError: the size is not a multiple of a row.
-    """
+    """Rows of little-endian float32, as in KITTI's .bin; raises ConfigError if the size does not fit."""
     data = read_bytes(path)
     if len(data) % (4 * columns):
         raise ConfigError(str(path), "", f"{len(data)} bytes are not rows of {columns} float32")
@@ -53,11 +41,7 @@ def read_float_rows(path: Path, columns: int) -> Float32[np.ndarray, "N C"]:
 
 
 def read_pcd(path: Path) -> np.ndarray:
-    """Points of a binary PCD 0.7 file as a structured array.
-
-    Raises:
-        ConfigError: no such file, or its header does not fit its size.
-    """
+    """Points of a binary PCD 0.7 file; raises ConfigError if missing, or its header does not fit its size."""
     data = read_bytes(path)
     head, separator, body = data.partition(b"DATA binary\n")
     lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]

@@ -44,12 +44,9 @@ class Layout:
     Args:
         images: folders of images by camera name, files named by frame; P2 in calib is of image_2, P3 of
             image_3.
-        lidar: folder of .bin.
         radar: folder of .bin; empty = none.
-        calib: folder of .txt.
         radar_calib: folder of the radar's own, with the radar's transform as Tr_velo_to_cam; empty =
             Tr_radar_to_velo in calib.
-        poses: folder of .json; may be missing.
         radar_columns: of a row; columns with empty names are left out.
     """
 
@@ -63,11 +60,7 @@ class Layout:
 
 
 def read_view_of_delft(folder: Path, vehicle: str, day: str) -> list[Recording]:
-    """The single recording of a View-of-Delft folder (with `lidar` and `radar` in it).
-
-    Raises:
-        ConfigError: no frame is complete, or a file has another format.
-    """
+    """Recording of a View-of-Delft folder (`lidar`, `radar`); ConfigError if no frame is complete."""
     lidar, radar = "lidar/training", "radar/training"
     layout = Layout(
         {"camera": f"{lidar}/image_2"},
@@ -135,10 +128,7 @@ def _images(folder: Path) -> dict[str, Path]:
 def _calibration(
     folder: Path, layout: Layout, frame: str, images: Mapping[str, Path]
 ) -> tuple[dict[str, Camera], dict[str, Float[np.ndarray, "4 4"]]]:
-    """Cameras by name, and T_lidar_sensor of all sensors.
-
-    The lidar is the base, as its pose on the car is unknown.
-    """
+    """Cameras by name, and T_lidar_sensor of all sensors: the lidar's pose on the car is unknown."""
     path = folder / layout.calib / f"{frame}.txt"
     lines = _lines(path)
     cameras, T_lidar = {}, {}
@@ -167,10 +157,7 @@ def _camera(image: Path, P: Float[np.ndarray, "4 4"]) -> Camera:
 
 
 def _rectified(path: Path, lines: Mapping[str, Sequence[float]], P: np.ndarray) -> Float[np.ndarray, "4 4"]:
-    """Transform from the reference camera to the camera of P.
-
-    Rectification and baseline (K^-1 P's last column).
-    """
+    """Transform from the reference camera to that of P: rectification and baseline (K^-1 P's last column)."""
     T = np.eye(4)
     T[:3, 3] = np.linalg.solve(P[:3, :3], P[:3, 3])
     R = np.eye(4)

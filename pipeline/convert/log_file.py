@@ -17,7 +17,7 @@ __all__ = ["fleet_text", "write_log"]
 
 
 def write_log(path: Path, recording: Recording) -> int:
-    """Write a recording, with one message in memory at a time; returns the number of messages.
+    """Write a recording; returns the number of messages. One message is in memory at a time.
 
     Raises:
         ConfigError: a file of the data set violates its format; then no log is left.
@@ -63,12 +63,8 @@ def fleet_text(
     """Text of fleet.toml for converted logs.
 
     Args:
-        name: of the fleet.
-        vehicles: all with the same rig.
-        kinds: of the rig's sensors, by name.
         models: manifests of a segmenter and a detector; None = topics for semantics, which the logs do not
             have yet.
-        ego: whether the logs have odometry.
         base: whether the frame of the poses is the vehicle's.
     """
     is_short = all(sensor == kind for sensor, kind in kinds.items())

@@ -40,7 +40,6 @@ def read_nuscenes(folder: Path, channels: Mapping[Kind, Sequence[str]]) -> list[
     kinds.
 
     Args:
-        folder: contains one folder of tables (such as v1.0-mini), samples and sweeps.
         channels: channels to use, by kind; all channels of a kind that is not given.
 
     Raises:

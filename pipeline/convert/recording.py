@@ -26,10 +26,7 @@ class EgoMotion(NamedTuple):
 
 
 class Event(NamedTuple):
-    """One measurement of a sensor.
-
-    `load` returns JPEG or PNG bytes, columns of points by name, or an EgoMotion.
-    """
+    """One measurement; `load` returns JPEG or PNG bytes, columns of points by name, or an EgoMotion."""
 
     stamp_ns: int
     sensor: str  # name of the sensor, or ego
@@ -41,13 +38,9 @@ class Recording:
     """One drive.
 
     Args:
-        vehicle: its id.
-        day: YYYY-MM-DD.
-        name: of the log.
-        kinds: of its sensors, by name.
-        cameras: intrinsics, by name.
         T_base: T_base_sensor of cameras (optical), lidars and radars (both x forward, y left, z up), by name.
-        events: in order of their stamps; radar columns hold x, y, z, doppler (range rate, positive = receding).
+        events: in order of their stamps; radar columns hold x, y, z, doppler (range rate, positive =
+            receding).
     """
 
     vehicle: str
@@ -60,10 +53,7 @@ class Recording:
 
 
 def ego_events(stamps_ns: Sequence[int], T_odom_base: Sequence[Float[np.ndarray, "4 4"]]) -> list[Event]:
-    """Odometry from poses at increasing stamps.
-
-    Motion between the neighbours, at the ends to the only neighbour.
-    """
+    """Odometry from poses at increasing stamps: motion between neighbours."""
     events = []
     for k, (stamp, T) in enumerate(zip(stamps_ns, T_odom_base, strict=True)):
         before, after = max(k - 1, 0), min(k + 1, len(stamps_ns) - 1)

@@ -52,8 +52,6 @@ def compare(
 
     Args:
         run: records with one work key, by pair.
-        truth: T of each pair.
-        picks: reflector positions, instead of a truth.
         truth_sigma: uncertainty of the truth, per axis: rotation [rad], translation [m].
     """
     if set(run) != set(PAIRS) or any(r.qw is None for r in run.values()):

@@ -9,9 +9,9 @@
                   "spread": {"pixel": [su, sv], "lidar_m": [sx, sy, sz], "radar_m": [sx, sy, sz]},
                   "frames": {"pixel": 1, "lidar_m": 1, "radar_m": 150}}, ...]}
 
-Pixels refer to the full image, (0, 0) is the centre of its first pixel; metres are in each sensor's frame. `spread`
-(optional) is the standard deviation of one pick, `frames` the number of picks in the mean position: its standard error
-is spread / sqrt(frames). Other keys, such as the simulator's `truth`, are ignored.
+Pixels refer to the full image, (0, 0) is the centre of its first pixel; metres are in each sensor's frame.
+`spread` (optional) is the standard deviation of one pick, `frames` the number of picks in the mean position:
+its standard error is spread / sqrt(frames). Other keys, such as the simulator's `truth`, are ignored.
 """
 
 from __future__ import annotations
@@ -50,11 +50,7 @@ class ReflectorFile:
 
 
 def read_reflectors(path: Path) -> ReflectorFile:
-    """Read a file of picked reflectors.
-
-    Raises:
-        ConfigError: no such file, invalid JSON, or another form.
-    """
+    """Read a file of picked reflectors; raises ConfigError if missing or of another form."""
     try:
         content = json.loads(path.read_text())
         c, targets = content["camera"], content["targets"]
@@ -98,7 +94,6 @@ def find_again(
         file: picks, used as initial guesses.
         lidar: points and intensities of each frame; None if the log has no intensity.
         radar: points and power of each frame; None if the log has no power.
-        where: name of the recording, for `sources`.
     """
     picks, edge = file.picks, file.edge_m
     in_lidar = [find_in_lidar(lidar, at, edge) if lidar else None for at in picks.lidar_m]

@@ -19,7 +19,6 @@ class ReflectorFiles:
     """Reflector files by vehicle-day; each file is read, and its recording searched, once.
 
     Args:
-        path: a file, or a folder with VEHICLE/DAY.json; None = no files.
         recording: lake with the ingested recordings, and their day if it differs from that of the picks.
     """
 
@@ -66,7 +65,7 @@ class ReflectorFiles:
 
 
 def standing_echoes(lake: Lake, partition: Partition) -> tuple[list[Echoes] | None, list[Echoes] | None]:
-    """Points and intensities of every frame, of lidar and radar; None for a sensor without logged intensity.
+    """Points and intensities of every frame, of lidar and radar; None for a sensor without intensity.
 
     Raises:
         ContractError: there is no such partition, or the car moves in it.

@@ -88,7 +88,6 @@ def find_in_lidar(
 
     Args:
         frames: points and intensities of each standing frame, lidar frame.
-        guess_m: approximate position.
         edge_m: length of the edges that meet in the apex. The reflector opens towards the sensor with one
             edge upright, to 2 deg per axis; the fit may rotate it within that.
 

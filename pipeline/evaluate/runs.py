@@ -25,9 +25,7 @@ def compare_runs(
     """Compare every current run that has a truth; also returns the number of runs without a truth or result.
 
     Args:
-        records: of any vehicles, days and methods.
         truth: JSON with transforms, or a folder with VEHICLE/DAY.json; None if `files` has reflectors.
-        files: reflector positions.
         truth_sigma: uncertainty of the truth, per axis: rotation [rad], translation [m].
     """
     compared, counts = [], {"refused_runs": 0, "runs_without_truth": 0}

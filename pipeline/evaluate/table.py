@@ -107,13 +107,7 @@ def table_rows(comparisons: Sequence[Comparison]) -> list[TableRow]:
 def as_markdown(
     rows: Sequence[TableRow], comparisons: Sequence[Comparison], notes: Sequence[str] = ()
 ) -> dict[str, str]:
-    """Markdown of each table by title; below Table 1, the calibration of the sigmas.
-
-    Args:
-        rows: from `table_rows`.
-        comparisons: the comparisons that the rows were made from.
-        notes: sentences on the source of the truth, printed below Table 1.
-    """
+    """Markdown of each table by title; below Table 1, the calibration of the sigmas and the notes."""
     texts = {}
     for title in dict.fromkeys(_TABLES.values()):
         lines = [f"## {title}", "", *_HEADER, *(_line(r) for r in rows if r.table == title), ""]

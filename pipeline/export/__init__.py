@@ -1,4 +1,1 @@
-"""Export of calibrations to formats of cars, simulators and viewers; import.
-
-Comparison of two calibrations.
-"""
+"""Export of calibrations to formats of cars, simulators and viewers; import; comparison."""

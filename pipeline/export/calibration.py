@@ -48,11 +48,9 @@ def is_frame(name: str) -> bool:
 
 @dataclass(frozen=True)
 class FrameNames:
-    """Frame names of the sensors in the exported file; `base` is used if its pose is known.
+    """Frame names by sensor in the exported file; sensors that are not in `others` keep their names.
 
-    Args:
-        camera, lidar, radar, base: frames of the sensors of these names.
-        others: frames by sensor name; a sensor that is not listed uses its name as its frame.
+    `base` is used if its pose is known.
     """
 
     camera: str = "camera"
@@ -74,11 +72,7 @@ class FrameNames:
 
     @classmethod
     def named(cls, frames: Mapping[str, str]) -> FrameNames:
-        """Frame names from a mapping by sensor.
-
-        Raises:
-            ConfigError: invalid frame names.
-        """
+        """Frame names from a mapping by sensor; raises ConfigError if they are invalid."""
         known = {sensor: name for sensor, name in frames.items() if sensor in _KINDS}
         return cls(**known, others={s: n for s, n in frames.items() if s not in _KINDS})
 
@@ -100,17 +94,13 @@ class ExportedPair:
 
     Args:
         pair: name of the edge: camera_lidar, camera_radar, lidar_radar, or sensor names such as front-top.
-        T: T_parent_child.
         covariance: 6x6 of the left perturbation, rx ry rz tx ty tz in parent axes [rad, m]; None if unknown.
-        status: of the record or state.
-        reason: in words.
         observable: per DoF, whether the data determined it; the other DoF keep the prior.
         certified: whether azimuth and elevation are within their limits.
         common: part of the covariance that is common to all days of a vehicle; None if unknown.
         details: more about its origin, in plain values (work key, days, time offset, notes).
         unchecked: distance from the prior in sigmas, of DoF that are far from it and that no check covers.
         resting: DoF of `unchecked` that were reset to the prior.
-        of: the edge; None = taken from the name `pair`.
     """
 
     pair: str
@@ -144,10 +134,7 @@ class ExportedPair:
     def resting_at(
         self, T_prior: Float[np.ndarray, "4 4"], prior_covariance: Float[np.ndarray, "6 6"]
     ) -> ExportedPair:
-        """Copy with the unchecked DoF reset to the prior and its covariance.
-
-        The other DoF follow by correlation.
-        """
+        """Copy with the unchecked DoF reset to the prior and its covariance; others follow by correlation."""
         rows = [DOF_NAMES.index(dof) for dof in self.unchecked]
         if not rows or self.covariance is None:
             return self
@@ -173,19 +160,13 @@ class ExportedCalibration:
     """A calibration to be exported.
 
     Args:
-        vehicle: its id.
-        source: in words, such as "record of 2026-03-02".
-        method: of the calibration.
-        code_version: of Boresight.
         pairs: edges by name. A file holds poses relative to the reference along edges with a lidar. An edge
             of camera and radar contributes its sigma only, unless no other edge connects them.
         camera: intrinsics of the only camera, if known.
-        names: of the frames.
         T_base_lidar: pose of the reference on the car; None = from an edge to base, or the reference is the
             root.
         left_out: reason by name, for edges that are not in `pairs`.
         word: status of the record or state as a whole, one of DAY_WORDS.
-        cameras: intrinsics by camera name, for several cameras.
         known: all edges of the vehicle, those left out included; empty = those of camera, lidar and radar.
     """
 
@@ -248,10 +229,7 @@ class ExportedCalibration:
         return found[0] if T_base is None else T_base @ found[0]
 
     def way(self, a: str, b: str) -> tuple[Edge, ...] | None:
-        """Chain of edges from one sensor to another, with or without estimates.
-
-        None if they are not connected.
-        """
+        """Chain of edges from one sensor to another, with or without estimates; None if not connected."""
         nodes = {s.name: s for edge in self.edges for s in edge.sensors}
         if a not in nodes or b not in nodes:
             return () if a == b else None
@@ -263,10 +241,7 @@ class ExportedCalibration:
     def between(
         self, a: str, b: str
     ) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "6 6"] | None] | None:
-        """T_a_b and its covariance in axes of a (None if unknown).
-
-        None if the calibration does not have it.
-        """
+        """T_a_b and its covariance in axes of a (None if unknown); None if there is no estimate."""
         pairs, way = {pair.edge: pair for pair in self.pairs.values()}, self.way(a, b)
         if way is None or any(edge not in pairs for edge in way):
             return None
@@ -284,10 +259,7 @@ class ExportedCalibration:
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Pose of a sensor: T maps coordinates from frame `child` to frame `parent`.
-
-    Covariance in parent axes.
-    """
+    """Pose of a sensor: T maps from frame `child` to frame `parent`, whose axes the covariance has."""
 
     sensor: str
     parent: str
@@ -341,11 +313,7 @@ def sigmas_of(
 
 
 def cameras_of(calibration: ExportedCalibration, by: str) -> list[str]:
-    """Cameras with a known pose, for formats that require a camera.
-
-    Raises:
-        ConfigError: there is none; the message gives the reason for a camera that is left out.
-    """
+    """Cameras with a known pose; raises ConfigError, with the reason for a camera left out, if none."""
     reference = calibration.reference.name
     cameras = [s.name for s in calibration.sensors if s.kind == "camera"]
     found = [name for name in cameras if calibration.between(reference, name) is not None]
@@ -358,11 +326,7 @@ def cameras_of(calibration: ExportedCalibration, by: str) -> list[str]:
 
 
 def needed_camera(calibration: ExportedCalibration, by: str, sensor: str) -> Camera:
-    """Intrinsics of a camera, for formats that require them.
-
-    Raises:
-        ConfigError: they are unknown.
-    """
+    """Intrinsics of a camera, for formats that require them; raises ConfigError if unknown."""
     camera = calibration.camera_of(sensor)
     if camera is None:
         problem = "the format needs intrinsics, and the observations of these days are no longer in the lake"

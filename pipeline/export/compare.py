@@ -24,8 +24,6 @@ class Side:
     """One of the two calibrations.
 
     Args:
-        title: for the user.
-        pairs: its pairs by name.
         vehicle: id; empty if a file does not contain it.
         days: days of its data; empty if a file does not contain them.
         missing: reason for each missing pair, by name.

@@ -32,11 +32,7 @@ _MOST_BYTES = 1 << 30  # a calibration has kilobytes; a log that is read for /tf
 
 
 def written_files(form: Format, calibration: ExportedCalibration, out: Path) -> dict[Path, bytes]:
-    """Content by path: `out` itself for a format of one file and `out` with a suffix, else files in it.
-
-    Raises:
-        ConfigError: the format can only be read, or cannot hold the calibration.
-    """
+    """Content by path: `out` itself for a format of one file and `out` with a suffix, else files in it."""
     if form.write is None:
         raise ConfigError("command line", "format", f"{form.name} can only be imported")
     files = form.write(calibration)
@@ -53,11 +49,7 @@ def written_files(form: Format, calibration: ExportedCalibration, out: Path) -> 
 def updated_file(
     form: Format, calibration: ExportedCalibration, template: Path, out: Path
 ) -> dict[Path, bytes]:
-    """Content by path: the user's file with new poses, written as `out`, and the side file.
-
-    Raises:
-        ConfigError: the format does not support updates, or the file has none of these frames.
-    """
+    """Content by path: the user's file with new poses, written as `out`, and the side file."""
     if form.update is None:
         raise ConfigError("command line", "update", f"{form.name} does not support --update")
     [(name, content)] = read_files([template]).items()
@@ -75,11 +67,7 @@ def write_files(files: Mapping[Path, bytes]) -> None:
 
 
 def read_files(paths: Sequence[Path]) -> dict[str, bytes]:
-    """Content by path, without side files.
-
-    Raises:
-        ConfigError: a file cannot be read.
-    """
+    """Content by path, without side files; raises ConfigError if a file cannot be read."""
     found = {}
     for path in paths:
         if path.name.endswith(SIDE_FILE):
@@ -117,11 +105,7 @@ def _within(content: object, key: str) -> object:
 
 
 def prior_text(pairs: Mapping[str, np.ndarray], form: str, files: Sequence[str]) -> bytes:
-    """Prior file (`[rigs.*.prior] source = "file"`) of both transforms, with identical bits.
-
-    Raises:
-        ConfigError: a transform is missing.
-    """
+    """Prior file of both transforms, bit for bit; raises ConfigError if a transform is missing."""
     missing = [pair for pair in ESTIMATED_PAIRS if pair not in pairs]
     if missing:
         problem = "missing, but a prior needs it: give a prior file that has it with --also"

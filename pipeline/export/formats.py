@@ -51,12 +51,7 @@ class Format:
     def pairs(
         self, files: Files, names: FrameNames, edges: Sequence[Edge] = ESTIMATED_EDGES
     ) -> dict[str, np.ndarray]:
-        """T_parent_child of those edges that the files hold, by edge name.
-
-        Args:
-            files: content by file name.
-            names: of the frames.
-            edges: the edges to read, in the given direction, such as T_camera_lidar and T_lidar_radar.
+        """T_parent_child of those `edges` (in the given direction) that the files hold, by edge name.
 
         Raises:
             ConfigError: no edge found, or the files cannot be read; the message has file and field.
@@ -92,11 +87,7 @@ FORMATS = {
 
 
 def format_named(name: str) -> Format:
-    """The format of this name.
-
-    Raises:
-        ConfigError: unknown name.
-    """
+    """The format of this name; raises ConfigError if there is none."""
     if name not in FORMATS:
         raise ConfigError("command line", "format", f"{name!r} is none of {', '.join(FORMATS)}")
     module, value = FORMATS[name].split(":")

@@ -71,16 +71,10 @@ def write_foxglove(
     priors: Mapping[str, Float[np.ndarray, "4 4"]],
     scenes: Iterable[Scene],
 ) -> int:
-    """Write the scenes as an MCAP.
+    """Write the scenes, in order of stamp, as an MCAP to a seekable stream; returns their number.
 
-    Args:
-        stream: seekable.
-        calibration: drawn as calibrated; for a missing pair only the prior is drawn.
-        priors: T_camera_lidar and T_lidar_radar before the day, if known.
-        scenes: frames in order of stamp, with their features (None if perception left the frame out).
-
-    Returns:
-        Number of scenes written.
+    Of a pair without calibration only the prior is drawn. Features are None for frames that perception left
+    out.
     """
     context = foxglove.Context()
     topics = _Topics(context)
@@ -216,10 +210,7 @@ def intrinsics_message(camera: Camera, frame_id: str, at: fg.Timestamp) -> fg.Ca
 
 
 def cloud_columns(frame: Frame, kind: str) -> tuple[dict[str, np.ndarray], int]:
-    """Points of the frame's lidar or radar by field, and their stamp [ns].
-
-    Range rate is positive = receding.
-    """
+    """Points of the frame's lidar or radar by field, and their stamp [ns]; range rate positive = receding."""
     columns = {axis: getattr(frame, f"{kind}_{axis}_m") for axis in "xyz"}
     if kind == "lidar":
         more = {"intensity": frame.lidar_intensity}

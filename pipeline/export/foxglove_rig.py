@@ -64,16 +64,10 @@ def write_foxglove_rig(
     before: ExportedCalibration,
     scenes: Mapping[Sensor, Iterable[Scene]],
 ) -> int:
-    """Write the scenes of all sensors as an MCAP.
+    """Write the scenes of all sensors as an MCAP to a seekable stream; returns their number.
 
-    Args:
-        stream: seekable.
-        calibration: drawn as calibrated; for a missing sensor only the prior is drawn.
-        before: the same edges before the day, if known.
-        scenes: by sensor, in order of moments; those of a camera include the reference lidar.
-
-    Returns:
-        Number of scenes written.
+    Of a sensor without calibration only the prior (`before`) is drawn. Scenes of a camera include the
+    reference lidar.
     """
     context = foxglove.Context()
     logged, count, moment = _Channels(context), 0, -1
@@ -168,13 +162,7 @@ def _log_cloud(logged: _Channels, drive: _Drive, sensor: Sensor, scene: Scene) -
 
 
 def layout_of_rig(sensors: Sequence[Sensor], reference: str, follow: str) -> bytes:
-    """Foxglove layout: an image panel per camera with the lidar's edges, the scene from above, the sigmas.
-
-    Args:
-        sensors: sensors in the file.
-        reference: reference sensor of the poses.
-        follow: frame that the scene panel follows.
-    """
+    """Foxglove layout: an image per camera with the lidar's edges, the scene from above, the sigmas."""
     pictures = [_picture(sensor.name, reference) for sensor in sensors if sensor.kind == "camera"]
     clouds = {
         f"/{s.name}/{topic}": layouts.BaseRendererPointCloudTopicSettings(

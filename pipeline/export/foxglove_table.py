@@ -42,10 +42,7 @@ TABLE_SCHEMA: dict[str, Any] = {
 def table_of(
     calibration: ExportedCalibration, priors: Mapping[str, Float[np.ndarray, "4 4"]]
 ) -> dict[str, Any]:
-    """One row per pair and axis.
-
-    Rotation and shift from the prior along the parent's axes, with sigma [deg, cm].
-    """
+    """A row per pair and axis: change from the prior along the parent's axes, with sigma [deg, cm]."""
     rows = [row for pair in calibration.pairs.values() for row in _rows(pair, priors.get(pair.pair))]
     told = {"vehicle": calibration.vehicle, "source": calibration.source, "method": calibration.method}
     return told | {"warnings": warnings_of(calibration), "rows": rows}
@@ -71,10 +68,7 @@ def _rows(pair: ExportedPair, prior: Float[np.ndarray, "4 4"] | None) -> list[di
 
 
 def layout_of(topics: Mapping[str, str], names: FrameNames) -> bytes:
-    """Foxglove layout for these topics.
-
-    Image with lidar and overlay, scene from the lidar, table of sigmas.
-    """
+    """Foxglove layout: image with lidar and overlay, scene from the lidar, table of sigmas."""
 
     def cloud(name: str, field: str, *, visible: bool) -> tuple[str, Any]:
         settings = layouts.BaseRendererPointCloudTopicSettings(

@@ -72,11 +72,7 @@ def _distortion(name: str, camera: Camera) -> tuple[str, list[float]]:
 
 
 def _read(files: Files, edges: Sequence[Edge], names: FrameNames) -> dict[str, np.ndarray]:
-    """Transforms relative to the first lidar. Cameras are identified by topic, else by order of names.
-
-    Raises:
-        ConfigError: the topics match no camera, and the numbers of cameras differ.
-    """
+    """Transforms relative to the first lidar; cameras by topic, or by order of names if no topic matches."""
     found: dict[str, np.ndarray] = {}
     for file, content in files.items():
         chain = load_yaml(file, content)

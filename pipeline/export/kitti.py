@@ -120,10 +120,7 @@ def _numbers(file: str, name: str, words: Iterable[str]) -> list[float]:
 
 
 def _rectified(file: str, lines: dict[str, list[float]]) -> np.ndarray:
-    """Transform from the reference camera to the camera of image_2.
-
-    It consists of the rectification, and of the baseline between the cameras, which is in P2's last column.
-    """
+    """Transform from the reference camera to image_2's: rectification, and baseline by P2's last column."""
     T = np.eye(4)
     if (rectification := lines.get(_RECTIFIED)) is not None:
         if len(rectification) != 9:

@@ -103,11 +103,7 @@ def _pair_of_pose(row: PoseRow | StateRow, sensor: str, edge: Edge) -> ExportedP
 
 
 def priors_of_day(lake: Lake, vehicle: str, day: str, method: str) -> dict[str, ExportedPair | str]:
-    """Priors of the day's records by edge name, or the reason why there is none.
-
-    Raises:
-        ConfigError: as `pairs_of_day`.
-    """
+    """Priors of the day's records by edge name, or the reason for none; errors as `pairs_of_day`."""
     found: dict[str, ExportedPair | str] = {}
     for record in _records(lake, vehicle, day, method):
         T, edge = prior_of(record), edge_of(record)
@@ -143,11 +139,7 @@ def _records(lake: Lake, vehicle: str, day: str, method: str) -> list[Calibratio
 
 
 def pairs_of_state(lake: Lake, vehicle: str, method: str) -> dict[str, ExportedPair | str]:
-    """Edges that a vehicle should load tonight, by name, or the reason why there is none.
-
-    Raises:
-        ConfigError: no state of that vehicle and method is stored.
-    """
+    """Edges that a vehicle should load tonight, by name, or the reason for none; else ConfigError."""
     return _pairs(_states(lake, vehicle, method))
 
 
@@ -251,10 +243,7 @@ def read_cameras(lake: Lake, vehicle: str, days: Iterable[str], cameras: Sequenc
 
 
 def read_frame_ids(lake: Lake, vehicle: str, days: Iterable[str]) -> dict[str, str]:
-    """Frame of each sensor in the logs of the latest of these days.
-
-    Sensors with several frame names are left out.
-    """
+    """Frame of each sensor in the logs of the latest of these days, unless it has several."""
     for day in sorted(days, reverse=True):
         try:
             manifest = ingested(lake, Partition(vehicle, day))

@@ -81,9 +81,7 @@ def not_certified(calibration: ExportedCalibration) -> dict[str, str]:
 def comment_lines(calibration: ExportedCalibration, camera_axes: str | None = None) -> list[str]:
     """Provenance and warnings as printable single lines, for formats with comments.
 
-    Args:
-        calibration: the calibration to write.
-        camera_axes: axes of the format's camera frame, if it is not the optical frame.
+    `camera_axes` describes the format's camera frame, if it is not the optical frame.
     """
     frames = _frames(calibration)
     if camera_axes is not None:

@@ -48,11 +48,7 @@ def from_ties(ties: Mapping[Edge, np.ndarray], reference: Sensor) -> dict[str, F
 def require_all(
     poses: Mapping[str, np.ndarray], files: Sequence[str], names: FrameNames, rig: Rig
 ) -> dict[str, Float[np.ndarray, "4 4"]]:
-    """The poses in the rig's order.
-
-    Raises:
-        ConfigError: sensors are missing; the message has their names and the frames that were searched for.
-    """
+    """The poses in the rig's order; raises ConfigError that lists sensors that are missing."""
     reference = reference_of_rig(rig)
     missing = [n.name for n in rig.nodes if n != reference and n.name not in poses]
     if missing:

@@ -38,11 +38,7 @@ _NORM_TOLERANCE = 0.01  # as `TransformTree`: largest deviation of a quaternion'
 
 
 def text_of(file: str, content: bytes) -> str:
-    """Text of a file.
-
-    Raises:
-        ConfigError: not UTF-8.
-    """
+    """Text of a file; raises ConfigError if it is not UTF-8."""
     try:
         return content.decode()
     except UnicodeDecodeError as err:
@@ -55,11 +51,7 @@ def to_json(value: Any) -> bytes:
 
 
 def load_json(file: str, content: bytes) -> Any:
-    """Value of a JSON file.
-
-    Raises:
-        ConfigError: not JSON.
-    """
+    """Value of a JSON file; raises ConfigError if it is not JSON."""
     try:
         return json.loads(text_of(file, content))
     except (ValueError, RecursionError) as err:
@@ -78,11 +70,7 @@ def to_yaml(value: Mapping[str, Any], comments: Sequence[str]) -> bytes:
 
 
 def load_yaml(file: str, content: bytes) -> Any:
-    """Value of a YAML file; skips OpenCV's first line `%YAML:1.0`, which strict readers refuse.
-
-    Raises:
-        ConfigError: not YAML.
-    """
+    """Value of a YAML file without OpenCV's first line `%YAML:1.0`; raises ConfigError if it is not YAML."""
     text = text_of(file, content)
     if text.startswith("%YAML:"):
         text = text.partition("\n")[2]
@@ -93,11 +81,7 @@ def load_yaml(file: str, content: bytes) -> Any:
 
 
 def edit_yaml(file: str, content: bytes, edit: Callable[[Any], None]) -> bytes:
-    """Change values of a YAML file in place; other values, their order and all comments stay.
-
-    Raises:
-        ConfigError: not YAML.
-    """
+    """Change values of a YAML file in place; other values, their order and all comments stay."""
     yaml = YAML()
     yaml.Representer = _Representer
     yaml.preserve_quotes = True
@@ -113,11 +97,7 @@ def edit_yaml(file: str, content: bytes, edit: Callable[[Any], None]) -> bytes:
 
 
 def field_of(file: str, value: Any, *path: str | int) -> Any:
-    """Value at a path of keys and indices.
-
-    Raises:
-        ConfigError: there is none; the message has the path up to the missing part.
-    """
+    """Value at a path of keys and indices; raises ConfigError with the path up to the missing part."""
     for depth, key in enumerate(path):
         where = ".".join(str(p) for p in path[: depth + 1])
         try:
@@ -128,11 +108,7 @@ def field_of(file: str, value: Any, *path: str | int) -> Any:
 
 
 def number_of(file: str, value: Any, *path: str | int) -> float:
-    """Finite number at a path.
-
-    Raises:
-        ConfigError: there is none.
-    """
+    """Finite number at a path; raises ConfigError if there is none."""
     found = field_of(file, value, *path)
     where = ".".join(str(p) for p in path)
     if isinstance(found, bool) or not isinstance(found, int | float):
@@ -143,11 +119,7 @@ def number_of(file: str, value: Any, *path: str | int) -> float:
 
 
 def matrix_of(file: str, key: str, values: Any) -> Float[np.ndarray, "4 4"]:
-    """T from 3x4 or 4x4 numbers, nested or flat, row-major, bit for bit.
-
-    Raises:
-        ConfigError: not a rigid transform.
-    """
+    """T from 3x4 or 4x4 numbers, nested or flat, bit for bit; raises ConfigError if not rigid."""
     try:
         flat = np.array(values, np.float64).reshape(-1)
     except (TypeError, ValueError) as err:
@@ -166,11 +138,7 @@ def matrix_of(file: str, key: str, values: Any) -> Float[np.ndarray, "4 4"]:
 def pose_of_quaternion(
     file: str, key: str, q_wxyz: Sequence[float], t_m: Sequence[float]
 ) -> Float[np.ndarray, "4 4"]:
-    """T from a quaternion, scalar first, and a translation [m].
-
-    Raises:
-        ConfigError: not a unit quaternion, or a number is not finite.
-    """
+    """T from a unit quaternion, scalar first, and a translation [m]; else ConfigError."""
     q, t = np.array(q_wxyz, np.float64), np.array(t_m, np.float64)
     if q.shape != (4,) or t.shape != (3,) or not np.all(np.isfinite([*q, *t])):
         raise ConfigError(file, key, "needs four and three finite numbers")

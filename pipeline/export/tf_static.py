@@ -56,11 +56,7 @@ def _tree(files: Files) -> TransformTree:
 
 
 def read_static_transforms(file: str, content: bytes, tree: TransformTree) -> None:
-    """Add every transform on /tf_static of a ROS 2 MCAP to a tree.
-
-    Raises:
-        ConfigError: not such a file.
-    """
+    """Add every transform on /tf_static of a ROS 2 MCAP to a tree; else ConfigError."""
     if len(content) > _MOST_BYTES:
         raise ConfigError(
             file, "", f"is larger than {_MOST_BYTES >> 30} GiB: give a file with /tf_static alone"

@@ -49,11 +49,7 @@ def pairs_of_tree(
 
 
 def require_frames(file: str, parent: object, child: object) -> tuple[str, str]:
-    """Two frame names of a file, without ROS 1's leading slash.
-
-    Raises:
-        ConfigError: invalid or equal names.
-    """
+    """Two frame names of a file, without ROS 1's leading slash; ConfigError if invalid or equal."""
     if not (isinstance(parent, str) and isinstance(child, str)):
         raise ConfigError(file, "parent, child", f"{parent!r} and {child!r} are not frame names")
     parent, child = parent.lstrip("/"), child.lstrip("/")

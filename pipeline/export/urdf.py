@@ -35,10 +35,7 @@ def _write_urdf(calibration: ExportedCalibration) -> dict[str, bytes]:
 
 
 def _write_xacro(calibration: ExportedCalibration) -> dict[str, bytes]:
-    """A macro with all links and joints below the root, and one call of it.
-
-    The including file defines the root.
-    """
+    """A macro with all links and joints below the root, and one call; the including file has the root."""
     edges = poses_of(calibration)
     robot = ET.Element("robot", {"xmlns:xacro": _XACRO, "name": _identifier(calibration.vehicle)})
     macro = ET.SubElement(robot, "xacro:macro", name=_MACRO, params=f"parent:={calibration.root}")
@@ -61,10 +58,7 @@ def joint_of(edge: Pose, parent: str | None = None) -> ET.Element:
 
 
 def xml_of(root: ET.Element, comments: Sequence[str]) -> bytes:
-    """Indented document with comments on its first lines.
-
-    Double hyphens, which end a comment, are separated.
-    """
+    """Indented document with comments on its first lines; double hyphens are separated."""
     safe = [line.replace("--", "- -").replace("--", "- -") for line in comments]
     for line in reversed(safe):
         root.insert(0, ET.Comment(f" {line} "))

@@ -18,14 +18,11 @@ __all__ = ["read_scenes"]
 def read_scenes(
     lake: Lake, partition: Partition, most: int, chosen: Chosen | None = None
 ) -> Iterator[tuple[Frame, Observation | None]]:
-    """At most `most` frames, evenly spread, in order of stamp; None beside a frame that perception left out.
-
-    `chosen`: sensors of the frames; None = the first camera, lidar and radar of the day.
+    """At most `most` frames, evenly spread, in order of stamp; features are None if perception left it out.
 
     Raises:
         ConfigError: the lake has no frames of that day.
-        DamagedError: a file of the day cannot be read.
-        CollectedError: the day's rows were deleted at the end of their retention.
+        DamagedError, CollectedError: a file of the day is damaged or was deleted after its retention.
     """
     manifest = ingested(lake, partition)
     if manifest is None:

@@ -100,8 +100,6 @@ def attribute(shifts: Mapping[Edge, PairShift], known_by: float = np.inf) -> Att
     """Decide which sensors of a rig moved.
 
     Args:
-        shifts: changes by edge, with independent errors; at least two edges, otherwise no decision is
-            possible.
         known_by: degrees of freedom of the estimated scale of the covariances; inf = the scale is known.
     """
     if len(shifts) < 2:

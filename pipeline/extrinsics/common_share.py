@@ -17,12 +17,7 @@ __all__ = ["common_of", "common_part", "prior_share"]
 def prior_share(
     covariance: Float[np.ndarray, "P P"], prior_information: Float[np.ndarray, "P P"]
 ) -> Float[np.ndarray, "P P"]:
-    """Covariance of a MAP estimate due to its prior, whose error adds `C P^-1 (prior's error)` to it.
-
-    Args:
-        covariance: C, of the estimate, without floors.
-        prior_information: P^-1.
-    """
+    """Covariance of a MAP estimate C due to its prior P, whose error adds `C P^-1 (prior's error)` to it."""
     share = covariance @ prior_information @ covariance
     return 0.5 * (share + share.T)
 
@@ -30,12 +25,7 @@ def prior_share(
 def common_part(
     common: Float[np.ndarray, "P P"], covariance: Float[np.ndarray, "P P"]
 ) -> Float[np.ndarray, "P P"]:
-    """`common`, limited to `covariance` in every direction, so that the difference is a covariance too.
-
-    Args:
-        common: approximate covariance of the common errors.
-        covariance: covariance of the estimate, positive definite.
-    """
+    """`common`, limited to `covariance` in every direction, so that the difference is a covariance too."""
     scale = 1 / np.sqrt(np.diag(covariance))
     L = np.linalg.cholesky(covariance * np.outer(scale, scale))
     W = np.linalg.solve(L, np.linalg.solve(L, common * np.outer(scale, scale)).T)
@@ -49,11 +39,5 @@ def common_of(
     prior_covariance: Float[np.ndarray, "6 6"],
     bias: Float[np.ndarray, "6 6"],
 ) -> Float[np.ndarray, "6 6"]:
-    """Common covariance of an estimate with one bias floor and one prior.
-
-    Args:
-        covariance: total covariance of the estimate.
-        prior_covariance: covariance of the prior.
-        bias: covariance of the bias floor.
-    """
+    """Common covariance of an estimate with one bias floor (a covariance) and one prior."""
     return common_part(bias + prior_share(covariance, np.linalg.inv(prior_covariance)), covariance)

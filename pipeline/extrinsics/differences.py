@@ -21,8 +21,6 @@ class PairDifference:
     """Change from A's estimate of a pair to B's.
 
     Args:
-        edge: edge between the two sensors.
-        statuses: of A and B.
         change: rotation vector [rad], shift of the child's origin [m], along the axes of the parent.
         sigma: sigmas of the change; None if neither side has any.
         determined: per DoF, determined by the data of both sides, or given.

@@ -49,8 +49,6 @@ def rig_prior(rows: Iterable[Mapping[str, Any]], fleet: FleetConfig, rig: Rig) -
 
     Args:
         rows: `schemas.moments.PRIOR` of ingest's manifest.
-        fleet: configuration; file paths are relative to it.
-        rig: the rig, with sigmas of its sensors or one for all.
 
     Raises:
         SolveError: the logs have no transform between any two sensors, or one changes over the day.
@@ -149,11 +147,7 @@ def prior_key(fleet: FleetConfig, vehicle: str) -> str:
 
 
 def require_named_files(fleet: FleetConfig) -> None:
-    """Raise ConfigError for a missing model or prior file in the configuration, or an invalid prior file.
-
-    Commands that read logs call it before they open the first one, so that the error does not come after a
-    night.
-    """
+    """Raise ConfigError for a missing model or prior file, before the first log is opened."""
     fleet.require_files()
     for rig in {v.rig for v in fleet.vehicles.values()}:
         file = fleet.rigs[rig].prior.file

@@ -18,7 +18,6 @@ def turn_of_radar(edge: Edge, T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, 
 
     Args:
         edge: edge with a radar at one end; if both are radars, the child is used.
-        T: T_parent_child.
     """
     if edge.child.kind == "radar":
         axes = T[:3, :3].T  # parent's axes to the radar's

@@ -59,9 +59,6 @@ class Turns:
     """Order of work: first the fresh items, then one at a time the items whose worker died.
 
     An item that kills its worker twice while alone is given up, so a night loses only that item.
-
-    Args:
-        items: number of items.
     """
 
     def __init__(self, items: int) -> None:

@@ -29,10 +29,7 @@ _ROWS = 3000
 
 @dataclass(frozen=True)
 class Known:
-    """One vehicle-day in the lake.
-
-    Its records (without columns that outcomes do not have), and its outcomes.
-    """
+    """One vehicle-day in the lake: records (without columns that outcomes lack) and outcomes."""
 
     records: tuple[CalibrationRecord | PoseRow | RadarAlignment, ...] = ()
     outcomes: tuple[OutcomeRow, ...] = ()
@@ -49,10 +46,6 @@ class _Waiting:
 
 class Ledger:
     """Reads the lake's rows of a night's vehicle-days once, and commits the night's new rows.
-
-    Args:
-        lake: the lake with the tables.
-        partitions: the night's vehicle-days.
 
     Raises:
         DamagedLogError: a table cannot be written to.
@@ -85,11 +78,7 @@ class Ledger:
         return Known((*found[0], *found[1], *found[2]), tuple(self._outcomes.of(*of)))
 
     def add(self, outcome: Outcome, method: str) -> None:
-        """Add an outcome and its records; commit all waiting rows if it is time.
-
-        Raises:
-            OSError: the storage does not answer; the rows are kept for the next commit.
-        """
+        """Add an outcome and its records, and commit if it is time; on an OSError the rows are kept."""
         alignments, poses, records, outcomes = self._waiting
         of = (outcome.vehicle, outcome.day)
         if outcome.records:
@@ -103,11 +92,7 @@ class Ledger:
             self.commit()
 
     def commit(self) -> None:
-        """Commit all waiting rows.
-
-        Raises:
-            OSError: the storage does not answer; the rows are kept.
-        """
+        """Commit all waiting rows; on an OSError they are kept."""
         self._committed_at = time.monotonic()
         for waiting in self._waiting:
             if waiting.new:
@@ -119,21 +104,12 @@ class Ledger:
 
 
 def record_outcome(lake: Lake, outcome: Outcome, method: str = "") -> None:
-    """Record the outcome of a stage that was run by a command of its own.
-
-    Raises:
-        OSError: the storage does not answer.
-    """
+    """Record the outcome of a stage that was run by a command of its own."""
     commit_records(lake, OUTCOMES, [outcome_row(outcome, method)])
 
 
 def outcome_row(outcome: Outcome, method: str) -> OutcomeRow:
-    """Row of table `outcomes` for an outcome.
-
-    Args:
-        outcome: of a stage on a vehicle-day.
-        method: of the calibration; empty for other stages.
-    """
+    """Row of table `outcomes` for an outcome; `method` is of the calibration, empty for other stages."""
     effort = outcome.effort
     return OutcomeRow(
         vehicle=outcome.vehicle,
@@ -158,10 +134,7 @@ def outcome_row(outcome: Outcome, method: str) -> OutcomeRow:
 
 
 def _sort(waiting: _Waiting, rows: Sequence[Any], recorded: Sequence[Any]) -> None:
-    """Sort rows: unrecorded rows are new.
-
-    Recorded rows that others have replaced are to become current again.
-    """
+    """Sort rows: unrecorded rows are new; recorded rows that were replaced become current again."""
     about_of = waiting.schema.about_of
     last = {about_of(r): r.work_key for r in recorded}
     keys = {(about_of(r), r.work_key) for r in recorded}

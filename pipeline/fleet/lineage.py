@@ -41,12 +41,7 @@ def run_id_of(stage: str, vehicle: str, day: str, work_key: str) -> str:
 
 @dataclass(frozen=True)
 class NightLineage:
-    """The events of one night.
-
-    Args:
-        night: settings shared by its vehicle-days.
-        logs: of each vehicle-day.
-    """
+    """The events of one night."""
 
     night: Night
     logs: Mapping[Partition, tuple[LogPath, ...]] = field(repr=False)
@@ -69,10 +64,7 @@ class NightLineage:
         return self._event(RunState(state), at, self._night_run(), self._job("nightly"))
 
     def of_day(self, outcome: DayOutcome) -> Iterator[RunEvent]:
-        """Two events for each stage that did work.
-
-        A stage that is up to date has been reported by its run.
-        """
+        """Two events for each stage that did work; a stage that is up to date was reported by its run."""
         for result in outcome.results:
             if result.status != "cached" and result.effort.began_at:
                 yield from self._of_stage(result)

@@ -1,7 +1,4 @@
-"""Sends OpenLineage events to a file or a server in a thread.
-
-A slow or dead sink does not delay the night.
-"""
+"""Sends OpenLineage events to a file or a server in a thread, so that a dead sink delays nothing."""
 
 from __future__ import annotations
 
@@ -48,10 +45,7 @@ class LineageSink:
             self._lost, self._problem = self._lost + 1, self._problem or "it is too slow"
 
     def close(self, timeout_s: float) -> str:
-        """Wait until all events are sent, at most `timeout_s`.
-
-        Returns the problem in words, or an empty text.
-        """
+        """Wait until all events are sent, at most `timeout_s`; returns the problem in words, or ""."""
         until = time.monotonic() + timeout_s
         try:
             self._events.put(None, timeout=timeout_s)

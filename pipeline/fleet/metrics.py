@@ -1,7 +1,4 @@
-"""A night's counts as a Prometheus text file for node_exporter's textfile collector.
-
-Needs the extra [ops].
-"""
+"""A night's counts as a Prometheus text file for node_exporter's textfile collector (extra [ops])."""
 
 from __future__ import annotations
 
@@ -28,9 +25,6 @@ class NightEnd:
     """End of a night.
 
     Args:
-        exit_code: of the command.
-        began_s: Unix time.
-        ended_s: Unix time.
         vehicles: number by status (GREEN, YELLOW, RED, UNKNOWN), after the audit.
         moved: vehicle, sensor and first day ("since") of each sensor that moved.
     """
@@ -47,9 +41,6 @@ def write_metrics(path: Path, fleet: str, tally: Tally, end: NightEnd) -> None:
 
     Args:
         path: read by node_exporter, so NAME.prom; its folder must exist.
-        fleet: the fleet's name, label of every metric.
-        tally: the night's counts.
-        end: how the night ended.
 
     Raises:
         OSError: the file cannot be written; it stays as it was.

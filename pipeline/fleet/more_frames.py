@@ -21,11 +21,7 @@ MOST_TIMES_MORE = 2
 
 
 def asks_for_more(results: Sequence[Outcome]) -> bool:
-    """Whether there are unread sweeps and a pair, or the whole day, lacks nothing but frames.
-
-    Args:
-        results: of the day's stages.
-    """
+    """Whether there are unread sweeps and a pair, or the whole day, lacks nothing but frames."""
     read = next((r for r in results if r.stage == INGEST.name), None)
     if read is None or read.kept.get(SWEEPS_LOGGED, 0) <= read.kept.get(SWEEPS_PLANNED, 0):
         return False

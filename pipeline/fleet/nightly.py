@@ -74,9 +74,6 @@ def run_night(
     """Outcomes of vehicle-days in order of completion; unknown vehicles and future days are refused.
 
     Args:
-        night: settings shared by the vehicle-days.
-        days: to process.
-        executor: a key of EXECUTORS.
         workers: processes or tasks at a time; None = as many as the executor finds CPUs for.
         watch: called with the progress of the i-th of the days known to fleet.toml.
     """
@@ -109,15 +106,9 @@ def refused_at_once(night: Night, of: Partition) -> str:
 
 
 def run_vehicle_day(night: Night, work: VehicleDay, known: Known, progress: Progress) -> DayOutcome:
-    """Ingest, perceive and calibrate one vehicle-day; if a stage refuses it, the result is a refused record.
+    """Ingest, perceive and calibrate one vehicle-day; a refusal is a refused record.
 
-    Its records are in the outcome, for the caller to commit.
-
-    Args:
-        night: the configuration, reduced to this vehicle.
-        work: the day and its logs.
-        known: the day's records and outcomes in the lake.
-        progress: called with the progress.
+    Its records are in the outcome, for the caller to commit. `known` are records and outcomes in the lake.
     """
     task = task_of(night, work, known, progress)
     outcome = _through_stages(task, progress)

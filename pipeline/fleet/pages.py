@@ -16,12 +16,7 @@ _FEW = 3  # for fewer items, starting a pool (about two seconds) takes longer th
 
 @dataclass(frozen=True)
 class OnWorkers:
-    """Runs a function on many items by an executor; reports every item's outcome, success or error.
-
-    Args:
-        executor: a key of EXECUTORS.
-        workers: processes or tasks at a time; None = as many as the executor finds CPUs for.
-    """
+    """Runs a function on many items by an executor; reports every item's outcome, success or error."""
 
     executor: str
     workers: int | None

@@ -49,8 +49,6 @@ def find_vehicle_days(
             ("s3://BUCKET/{vehicle}/{day}/*.mcap") each matching object is a log. A bag folder is one log if
             all of its files match for the same vehicle-day; in a folder shared by vehicles or days, each file
             is a log.
-        from_day: first day, None = from the beginning.
-        to_day: last day, None = until the end.
 
     Raises:
         ConfigError: a placeholder is missing or unknown, a day is invalid, or nothing matches.
@@ -138,10 +136,7 @@ def _owned(pattern: str) -> dict[str, _Owner]:
 
 
 def _logs_by_owner(owner: dict[str, _Owner]) -> dict[_Owner, set[Path]]:
-    """Logs of each vehicle-day.
-
-    The folder of a recording is one log if all of its files are of that vehicle-day.
-    """
+    """Logs of each vehicle-day; a folder is one log if all of its files are of that vehicle-day."""
     folders: dict[str, list[str]] = defaultdict(list)
     for log in owner:
         folders[os.path.dirname(log)].append(log)

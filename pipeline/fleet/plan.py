@@ -20,10 +20,7 @@ _ORDER = (INGEST, PERCEIVE, CALIBRATE)
 
 @dataclass(frozen=True)
 class DayPlan:
-    """Stages that would run on a vehicle-day, in order, and the reason of the first.
-
-    No stage = up to date.
-    """
+    """Stages that would run on a vehicle-day, in order, and the reason of the first; none = up to date."""
 
     vehicle: str
     day: str

@@ -26,22 +26,14 @@ _ANSWER_S = 10.0  # a connection takes milliseconds
 
 @dataclass(frozen=True)
 class Cluster:
-    """A connected cluster.
-
-    Args:
-        ray: the module.
-        is_shared: True for the cluster in $RAY_ADDRESS; False for a cluster of this process on this machine.
-    """
+    """A connected cluster; `is_shared` if it is the one in $RAY_ADDRESS."""
 
     ray: ModuleType
     is_shared: bool
 
     @property
     def environment(self) -> dict[str, str]:
-        """Environment that tasks need for imports.
-
-        A shared cluster must have the same installation instead.
-        """
+        """Environment that tasks need for imports; a shared cluster must have the same installation."""
         return {} if self.is_shared else {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
 
     def beside_the_driver(self, kind: type[Any]) -> Any:
@@ -100,10 +92,7 @@ def _require_answer(address: str) -> None:
 
 @contextmanager
 def _signals_stay() -> Iterator[None]:
-    """Keep the process's SIGTERM handler.
-
-    Ray replaces it and would end the process with another exit code.
-    """
+    """Keep the process's SIGTERM handler: Ray's would end it with another exit code."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -74,9 +74,7 @@ class _Crew:
     """Tasks in flight, with the state of the tasks and of their nodes.
 
     Args:
-        cluster: connected.
         function: of all tasks; put into the object store once.
-        items: its arguments; each is built when its turn comes.
         watch: called with the progress of each item.
     """
 
@@ -170,11 +168,7 @@ class _Crew:
                 self._reading, self._read_at = self._board.read.remote(), now
 
     def _count(self) -> None:
-        """Count the CPUs of the cluster.
-
-        Raises:
-            ConfigError: no node has had room for a task for a long time.
-        """
+        """Count the CPUs of the cluster; ConfigError if no node has had room for a task for a long time."""
         now = time.monotonic()
         if now - self._counted_at < min(_COUNT_S, _NO_NODE_S):
             return

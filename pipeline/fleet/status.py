@@ -18,12 +18,8 @@ class DayStatus:
     """One vehicle-day and method.
 
     Args:
-        vehicle: vehicle id.
-        day: YYYY-MM-DD.
         method: of the calibration; empty if no calibration was reached.
-        status: one of DAY_WORDS.
         stage: last stage; empty if no stage ran.
-        reason: in words.
         pairs: number of accepted, held and refused pairs.
         asserted_at: time at which a night last confirmed it.
         seconds: duration of its stages in their last runs.
@@ -47,14 +43,10 @@ class DayStatus:
 
 
 def day_statuses(rows: Sequence[OutcomeRow], method: str | None = None) -> list[DayStatus]:
-    """Every vehicle on every day on which any vehicle was processed, in order of day, vehicle and method.
+    """Every vehicle on every day of any night, in order of day, vehicle and method (None = every method).
 
     A vehicle without outcome on a day on which others have one is "missing": no logs of it were found. A day
-    whose night ended before its last stage is "missing" too.
-
-    Args:
-        rows: as `read_records` returns them, the last asserted last.
-        method: one entry per vehicle-day, for this method; None = one per method.
+    whose night ended before its last stage is "missing" too. `rows` are in order of assertion.
     """
     stages: dict[tuple[str, str], dict[tuple[str, str], OutcomeRow]] = {}
     for row in rows:

@@ -16,12 +16,10 @@ class Tally:
     """Counts of a night.
 
     Args:
-        vehicle_days: by status.
         records: current calibration records, by pair and status.
         stages: by stage and status.
         seconds: by stage, of the workers; for audit, state and report, of the driver.
         bytes_read: by stage, page cache included.
-        bytes_written: likewise.
     """
 
     vehicle_days: Counter[str] = field(default_factory=Counter)

@@ -27,11 +27,9 @@ class Camera:
     """Intrinsics of one camera.
 
     Args:
-        model: one of CAMERA_MODELS.
         K: camera matrix [px]; skew is not supported.
         D: distortion in ROS order: k1 k2 p1 p2 [k3 [k4 k5 k6]], or k1..k4 for equidistant. Empty = none.
         width_px: image width that K refers to.
-        height_px: image height.
     """
 
     model: str
@@ -224,10 +222,5 @@ class Camera:
 
 
 def camera_of(row: CameraColumns) -> Camera:
-    """The camera of a row, at the size of the full image.
-
-    Raises:
-        ValueError: the columns are not a valid camera (unknown model, wrong number of coefficients, focal
-            length not positive).
-    """
+    """The camera of a row, at the size of the full image; raises ValueError if the columns are invalid."""
     return Camera(row.camera_model, row.camera_K, row.camera_D, row.image_width_px, row.image_height_px)

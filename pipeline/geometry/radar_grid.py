@@ -44,7 +44,6 @@ class Scan:
     """One radar scan after Doppler compensation.
 
     Args:
-        stamp_ns: stamp of the scan.
         drive: drive number; scans of different drives are not combined.
         xyz_m: detections, radar frame.
         power_db: power or RCS as logged; None = not logged.
@@ -52,7 +51,6 @@ class Scan:
         motion: 0 static, 1 moving, 2 undecided.
         has_elevation: False if the radar measures no heights.
         velocity_mps: x and y velocity of the radar; None = unknown.
-        yaw_rate_radps: None = unknown.
     """
 
     stamp_ns: int

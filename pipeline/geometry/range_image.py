@@ -37,13 +37,10 @@ class RangeImage:
 def project(
     xyz_m: Float32[np.ndarray, "N 3"], size: tuple[int, int], fov_up_deg: float, fov_down_deg: float
 ) -> RangeImage:
-    """Spherical projection of a sweep (lidar frame: x forward, y left, z up).
+    """Spherical projection of a sweep of finite points (lidar frame: x forward, y left, z up).
 
-    Args:
-        xyz_m: finite points.
-        size: rows, columns; the columns cover 360 deg.
-        fov_up_deg: elevation of the upper edge, positive above the horizon.
-        fov_down_deg: elevation of the lower edge, negative below the horizon.
+    `size` is rows and columns; columns cover 360 deg. Edges of the field of view are elevations above the
+    horizon.
     """
     rows, columns = size
     points = xyz_m.astype(np.float64)
@@ -92,9 +89,6 @@ def vote_of_neighbours(
     Azimuth wraps around. Label 0, unlabelled, wins only without other votes.
 
     Args:
-        image: projected sweep.
-        labels: labels of the pixels, 0..classes - 1.
-        classes: number of labels.
         neighbours: maximum number of voting pixels.
         search: side of the square search window [px], odd.
         sigma_px: sigma of the Gaussian that weights range differences by pixel distance.

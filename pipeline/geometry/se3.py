@@ -148,11 +148,7 @@ def to_quaternion(T: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*bat
 def from_quaternion(
     q_wxyz: Float[np.ndarray, "*batch 4"], t: Float[np.ndarray, "*batch 3"]
 ) -> Float[np.ndarray, "*batch 4 4"]:
-    """Transform of a quaternion (w, x, y, z), normalised here, and a translation [m].
-
-    Raises:
-        ValueError: the quaternion is zero or not finite.
-    """
+    """Transform of a quaternion (w, x, y, z), normalised here, and a translation [m]; else ValueError."""
     norm = np.linalg.norm(q_wxyz, axis=-1, keepdims=True)
     if not np.all(np.isfinite(norm)) or np.any(norm < 1e-6):
         raise ValueError(f"no rotation: quaternion (w, x, y, z) = {q_wxyz}")

@@ -27,7 +27,7 @@ _FEWEST = 3  # fewest messages on either side of a step
 def day_alignments(index: DayIndex, rig: Rig) -> dict[str, dict[str, Any]]:
     """Columns of table `radar_alignments` by radar, for radars with a usable message.
 
-    Unreadable messages are counted, and added to the index's problems with file, topic and field.
+    Unreadable messages are counted and reported with file, topic and field.
     """
     found = {name: _of_radar(index, name, radar) for name, radar in rig.radars.items() if radar.alignment}
     return {name: columns for name, columns in found.items() if columns["messages"]}

@@ -36,13 +36,7 @@ _PLACE_M = 200.0  # side of a place's cell: a lidar sees the same scene within i
 
 @dataclass(frozen=True, eq=False)
 class PossibleBursts:
-    """Bursts that can be read, in order of time.
-
-    Args:
-        spans_ns: first and last moment of each.
-        middle_ns: the middle sweep of each, with the sweeps before and after it.
-        sweeps: number of sweeps of each.
-    """
+    """Bursts that can be read, in order of time: first and last moment, sweep in the middle, sweeps."""
 
     spans_ns: Int64[np.ndarray, "M 2"]
     middle_ns: Int64[np.ndarray, "M 3"]
@@ -72,8 +66,6 @@ def possible_bursts(
     bursts are shorter: one group or several.
 
     Args:
-        sweeps_ns: log time of each sweep, to the accuracy of the index; in order.
-        budget: number of sweeps to read.
         is_motion_known: False if bursts cannot be compared; then only as many are returned as will be read.
     """
     sweeps = len(sweeps_ns)
@@ -100,12 +92,7 @@ def possible_bursts(
 
 
 def choose_bursts(motion: BurstMotion, count: int) -> list[int]:
-    """The `count` best bursts as a set, in order of time; all of them if there are no more.
-
-    Args:
-        motion: of the possible bursts, in order of time.
-        count: number of bursts to read.
-    """
+    """The `count` best bursts as a set, in order of time; all of them if there are no more."""
     classes = _classes(motion, count)
     possible, kinds = classes.shape
     if possible <= count:

@@ -1,7 +1,4 @@
-"""One message of a sensor to one row of its table.
-
-Only here are payloads decoded, only those of kept moments.
-"""
+"""One message of a sensor to one row of its table; only payloads of kept moments are decoded."""
 
 from __future__ import annotations
 
@@ -54,8 +51,6 @@ class Read:
     """A row of a sensor's table, with further values for ingest.
 
     Args:
-        capture: the row.
-        frame_id: of the message.
         measured: raw measurement, to detect a sensor that repeats itself.
         dropped: number of dropped points by reason.
     """
@@ -71,21 +66,14 @@ class CaptureReader(Protocol):
     """Reads the messages of one sensor as rows."""
 
     def read(self, place: int, moment: int) -> Read:
-        """Read a message, given by its index in the sensor's stream, as a row of a moment.
-
-        Raises:
-            Rejected: the payload is damaged or incomplete; missing values are never replaced.
-        """
+        """Row of a message, by its index in the sensor's stream; raises Rejected if damaged or incomplete."""
         ...
 
 
 def readers_of(
     index: DayIndex, rig: Rig, ingest: IngestConfig, counts: Counter[str]
 ) -> dict[str, CaptureReader]:
-    """Reader of each sensor of a rig, by name.
-
-    `counts` collects dropped points and missing parts of captures.
-    """
+    """Reader of each sensor of a rig, by name; `counts` collects dropped points and missing parts."""
     readers: dict[str, CaptureReader] = {}
     for name, camera in rig.cameras.items():
         readers[name] = _Images(_Messages(index, name), camera, counts)

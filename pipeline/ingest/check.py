@@ -92,11 +92,7 @@ def check_logs(
     fleet: FleetConfig,
     progress: Progress = silent,
 ) -> CheckReport:
-    """Check logs without writing anything.
-
-    Raises:
-        ConfigError: a log does not exist, or the prior file is unusable.
-    """
+    """Check logs without writing; raises ConfigError for a missing log or an unusable prior file."""
     missing = [str(p) for p in logs if not p.exists()]
     if missing:
         raise ConfigError("command line", "LOG", f"no such file: {', '.join(missing)}")

@@ -20,7 +20,6 @@ def deskew(
     """Points in the lidar frame at the stamp, for a vehicle of constant speed and yaw rate during the sweep.
 
     Args:
-        points_lidar: each in the lidar frame at its own time [m].
         time_s: of each point, relative to the stamp.
         speed_mps: forward speed of the vehicle frame's origin.
         yaw_rate_radps: positive to the left.

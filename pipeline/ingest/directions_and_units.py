@@ -176,10 +176,7 @@ def _turned_round(frames: Sequence[Frame], sign: int) -> str:
 
 
 def _met(frame: Frame) -> list[float]:
-    """Share of a scan's detections in occupied cells of the sweep.
-
-    Three shares: with the prior, with the radar turned round, and with the lidar turned round.
-    """
+    """Share of a scan's detections in occupied cells: at the prior, with the radar or the lidar turned."""
     points = frame.lidar_xyz_m.astype(np.float64)
     points = points[np.isfinite(points).all(1)]
     cells, index = np.unique(np.floor(points[:, :2] / _CELL_M).astype(np.int64), axis=0, return_inverse=True)

@@ -86,9 +86,7 @@ class Stream:
 class DayIndex:
     """Index of a day's logs; `problems` describes and `damage` counts unreadable parts.
 
-    Args:
-        kinds: of the rig's sensors by name; the lidar that the others are matched to comes first of the
-            lidars.
+    In `kinds`, the lidar that the others are matched to comes first of the lidars.
     """
 
     kinds: dict[str, str] = field(default_factory=dict)
@@ -156,8 +154,6 @@ def index_logs(
     """Scan the logs once; of images and clouds only the stamp is read. Unreadable logs become problems.
 
     Args:
-        paths: the day's logs.
-        rig: its topics are indexed.
         survey: count the messages of every topic in `surveyed`.
         budget: largest number of sweeps; a longer day is read in bursts. None = read the whole day.
     """
@@ -254,10 +250,7 @@ def _take_bursts(index: DayIndex, timelines: Sequence[Timeline | None], budget: 
 
 
 def _allow_open_files() -> None:
-    """Raise this process's soft limit of open files to its hard one.
-
-    A day in a thousand logs opens them all.
-    """
+    """Raise this process's soft limit of open files to its hard one, for days in many logs."""
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     most = _MOST_OPEN_FILES if hard == resource.RLIM_INFINITY else min(hard, _MOST_OPEN_FILES)
     with suppress(ValueError, OSError):  # if not allowed, logs that cannot be opened are counted and reported

@@ -26,12 +26,7 @@ class LoggedPrior:
         self.frame_ids: dict[str, list[str]] = {}
 
     def take(self, log: int, ids: Mapping[str, str]) -> bool:
-        """Look up the poses of the sensors of a moment; returns whether all of them are connected.
-
-        Args:
-            log: number of the moment's log.
-            ids: frame id of each sensor's message, by sensor.
-        """
+        """Look up the poses of a moment's sensors by frame id; returns whether all of them are connected."""
         key = (log, tuple(ids.items()))
         if key not in self._stars:
             for sensor, frame_id in ids.items():
@@ -46,10 +41,7 @@ class LoggedPrior:
         return self._stars[key][1]
 
     def rows(self) -> list[dict[str, Any]]:
-        """Rows for the manifest.
-
-        Each transform of each log once, in the layout of `schemas.moments.PRIOR`.
-        """
+        """Rows for the manifest: each transform of each log once, in the layout of `schemas.moments.PRIOR`."""
         rows = {}
         for (log, _), (star, _) in self._stars.items():
             for row in to_rows([star]):

@@ -32,13 +32,7 @@ __all__ = ["Anchored", "MomentBuilder"]
 
 @dataclass(frozen=True, slots=True)
 class Anchored:
-    """Captures that belong to one moment.
-
-    Args:
-        places: index in its stream, for each sensor of the moment.
-        anchor: sensor whose stamp is the moment's stamp.
-        drive: number of the continuous stretch of driving.
-    """
+    """Captures of one moment (indices by sensor), the sensor that stamps it, and its stretch of driving."""
 
     places: Mapping[str, int]
     anchor: str
@@ -60,11 +54,7 @@ class MomentBuilder:
         self._whole_ns = -SAME_SCENE_NS  # stamp of the last moment with all sensors
 
     def build(self, at: Anchored, moment: int) -> tuple[Moment, dict[str, Capture]]:
-        """Row of a moment, and rows of its sensors by name; call in order of time.
-
-        Raises:
-            Rejected: fewer than two sensors have a usable payload, or a complete moment shows the same scene.
-        """
+        """Rows of a moment and its sensors, called in order of time; raises Rejected if it is not kept."""
         missing: dict[str, Rejected] = {}
         parts = {s: part for s in self._readers if (part := self._part(s, at, moment, missing)) is not None}
         stream = self._index.captures(at.anchor)

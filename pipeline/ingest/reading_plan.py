@@ -34,14 +34,9 @@ _FIT_SHARE = 1 / 3  # of a scan's detections; below it the Doppler speed is inva
 
 @dataclass(frozen=True)
 class Reading:
-    """Parts of a day to read.
+    """Parts of a day to read: bursts of moments by log time, and `around` them everything to read.
 
-    Args:
-        bursts: log time of the sweeps that become moments.
-        around: log time of everything to read: images and scans of these sweeps may be logged before or after
-            them.
-        sweeps: number of sweeps in the logs, from their indices.
-        planned: number of sweeps of as many bursts of full length.
+    `sweeps` counts those in the logs, `planned` those of as many bursts of full length.
     """
 
     bursts: Stretches
@@ -59,10 +54,7 @@ class _Day:
     roles: Mapping[str, Role]  # by topic
 
     def messages(self, roles: Collection[Role], within: Stretches) -> Iterator[tuple[Role, RawMessage]]:
-        """Messages of some roles with their role.
-
-        A log that cannot be read is skipped here and counted later.
-        """
+        """Messages of some roles with their role; unreadable logs are skipped here and counted later."""
         topics = {topic for topic, role in self.roles.items() if role in roles}
         for log in self.logs:
             with suppress(OSError):
@@ -76,13 +68,7 @@ def plan_reading(
     """Bursts to read; None if the whole day is to be read.
 
     The whole day is read if it has no more sweeps than the budget, if most logs have no index, or if log time
-    is unrelated to stamps.
-
-    Args:
-        logs: with the timelines of their indices.
-        rig: for Doppler, if there is no odometry.
-        roles: of the rig's topics.
-        budget: number of sweeps to read.
+    is unrelated to stamps. Without odometry, the rig's Doppler gives the motion.
     """
     indexed = {log: t for log, t in logs.items() if t is not None}
     held = {
@@ -112,14 +98,7 @@ def plan_reading(
 def plan_sweeps(
     logged_ns: Int64[np.ndarray, " N"], stamps_ns: Int64[np.ndarray, " N"], ego: EgoTrack, budget: int
 ) -> Reading:
-    """Bursts of a day that had to be read whole because its logs have no index.
-
-    Args:
-        logged_ns: log time of each sweep.
-        stamps_ns: their stamps.
-        ego: the day's odometry.
-        budget: number of sweeps to use.
-    """
+    """Bursts of a day that had to be read whole because its logs have no index."""
     order = np.argsort(logged_ns, kind="stable")
     possible = possible_bursts(logged_ns[order], budget, is_motion_known=len(ego) > 0)
     stamps = stamps_ns[order][np.searchsorted(logged_ns[order], possible.middle_ns[:, 1])]
@@ -127,10 +106,7 @@ def plan_sweeps(
 
 
 def rare_topics(timeline: Timeline, roles: Mapping[str, Role]) -> tuple[dict[str, Role], Stretches]:
-    """Topics that a driver may log only once, at the start, with their roles.
-
-    Also returns the spans of their first messages.
-    """
+    """Topics that a driver may log only once, with their roles; and spans of their first messages."""
     rare = {
         topic: role
         for topic, role in roles.items()
@@ -227,10 +203,7 @@ def _between(middle_ns: Int64[np.ndarray, "M 3"]) -> Int64[np.ndarray, " M-1"]:
 
 
 def _glances(middle_ns: Int64[np.ndarray, "M 3"], half_ns: int) -> Stretches:
-    """Stretch about each middle sweep.
-
-    Extended to its neighbours, because the index gives its time only between them.
-    """
+    """Stretch about each middle sweep, to its neighbours: the index gives its time between them."""
     begin = np.minimum(middle_ns[:, 0], middle_ns[:, 1] - half_ns)
     end = np.maximum(middle_ns[:, 2], middle_ns[:, 1] + half_ns)
     far = _MOST_MARGIN_NS

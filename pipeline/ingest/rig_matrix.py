@@ -20,14 +20,8 @@ class PairFinding:
     """One pair of sensors.
 
     Args:
-        parent: a sensor.
-        child: another, or base.
-        kind: of their edge, e.g. camera_lidar.
         share: common share of the smaller field of view, at the prior; None if unknown, and for base.
         moments: number with both sensors; for base, number with the sensor.
-        is_edge: whether they are calibrated against each other.
-        why_not: reason, if they are not.
-        verdicts: for each class of DoF of an edge.
     """
 
     parent: str
@@ -56,14 +50,7 @@ def rig_finding(
     moments: Sequence[Collection[str]],
     verdicts: Mapping[Edge, list[DofVerdict]],
 ) -> RigFinding:
-    """Matrix of a rig.
-
-    Args:
-        graph: with the edges that are calibrated.
-        overlaps: of sensors with data and a prior.
-        moments: for each moment, the sensors with data.
-        verdicts: of the graph's edges.
-    """
+    """Matrix of a rig: `moments` has the sensors with data of each moment."""
     seen = {o.edge: o for o in overlaps}
     pairs = []
     for edge in possible_edges(graph.sensors):

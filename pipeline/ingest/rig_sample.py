@@ -38,11 +38,9 @@ class RigSample:
     """Sampled moments of a day.
 
     Args:
-        rig: the rig.
         built: usable moments of the sample, in order of time.
         looked: number of sampled moments, unusable ones included.
         present: for each moment of the day, the sensors that have a stamp.
-        stars: transforms in the logs, by log.
         prior: of all sensors; None if there is none.
         missing: by sensor, the topics without usable messages and the reason.
     """

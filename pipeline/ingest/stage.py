@@ -128,10 +128,7 @@ def _rows(
 
 
 def _complain_of_date(index: DayIndex, day: str) -> None:
-    """Report a day whose sweeps are stamped on another day.
-
-    Allows for time zones and drives over midnight.
-    """
+    """Report a day whose sweeps have another date, but for time zones and drives over midnight."""
     stamps_ns = index.captures(index.anchor).stamps_ns
     stamped = dt.datetime.fromtimestamp(float(np.median(stamps_ns)) * 1e-9, dt.UTC)
     if abs(stamped - dt.datetime.fromisoformat(f"{day}T12:00+00:00")) > _FAR_FROM_DAY:
@@ -141,10 +138,7 @@ def _complain_of_date(index: DayIndex, day: str) -> None:
 
 
 def pick_moments(index: DayIndex, rig: Rig, config: IngestConfig) -> tuple[list[Anchored], Counter[str]]:
-    """Captures by moment, in order of time, thinned evenly to `max_frames`.
-
-    Also returns counts of unused sweeps by reason.
-    """
+    """Captures by moment, in order of time, at most `max_frames`; and unused sweeps by reason."""
     found, drives = find_moments(index, rig, config), _drives(index)
     picked = _spread(len(found.anchor), config.max_frames)
     places = {index.anchor: found.anchor, **found.others}
@@ -178,10 +172,7 @@ def find_moments(index: DayIndex, rig: Rig, config: IngestConfig) -> Matched:
 
 
 def _tied(rig: Rig, anchor: str) -> set[str] | None:
-    """Sensors that can have an edge to the anchor, also by way of the vehicle.
-
-    None for a rig with one of each kind.
-    """
+    """Sensors that can have an edge to the anchor, also by way of the vehicle; None for one of each kind."""
     sensors = [node for node in rig.nodes if node.kind != "base"]
     if len({node.kind for node in sensors}) == len(sensors):
         return None
@@ -262,11 +253,7 @@ def _near_enough(config: IngestConfig) -> str:
 
 
 def read_file_prior(rig: Rig, fleet: FleetConfig) -> Star | None:
-    """Transforms of a prior file; None if the prior comes from static transforms.
-
-    Raises:
-        ConfigError: no such file, or it lacks the rigid 4x4 transforms that the rig needs.
-    """
+    """Transforms of a prior file; None if the prior comes from static transforms."""
     return None if rig.prior.file is None else read_star(fleet.path_of(rig.prior.file), rig)
 
 

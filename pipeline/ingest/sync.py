@@ -65,9 +65,7 @@ class Matched:
     `len(anchor) + sum(rejected.values())` is the number of anchors.
 
     Args:
-        anchor: indices of the sweeps that define the moments.
         others: by sensor, -1 if a moment does not have it.
-        rejected: anchors that became no moment, by reason.
         constant_ns: by sensor, the constant gap of its stamps to the anchor's, found before gating.
     """
 
@@ -148,9 +146,6 @@ def match_by_motion(
     a period, so that an anchor without a partner does not take a neighbour's.
 
     Args:
-        anchor_ns: stamps of the sensor that defines the moments, in any order; of equal ones the first
-            counts.
-        others_ns: of the others by name, likewise.
         gates_ns: per anchor, the largest gap between two captures of its moment, constant gaps removed.
         tied: for a rig with several sensors of a kind, those that can be calibrated against the anchor. A
             moment then needs one of them, each within the gate of the anchor, and may lack others: every edge
@@ -168,13 +163,9 @@ def match_by_motion(
 
 
 def constant_gap_ns(lidar_ns: Int[np.ndarray, " L"], stamps_ns: Int[np.ndarray, " M"]) -> int:
-    """Constant gap of a triggered sensor's stamps after the sweeps' stamps [ns]; 0 for a free-running sensor.
+    """Constant gap of a triggered sensor's stamps after the sweeps' stamps [ns]; 0 if free-running.
 
     It is ambiguous by whole periods of the sensor; the value nearest to 0 is returned.
-
-    Args:
-        lidar_ns: stamps of the sweeps.
-        stamps_ns: of the sensor, distinct, in order.
     """
     period = _period_ns(stamps_ns)
     if period is None or not len(lidar_ns):
@@ -243,10 +234,7 @@ def _gated(
 def _together(
     gap: Int64[np.ndarray, "S N"], has: Bool[np.ndarray, "S N"], gates: Int64[np.ndarray, " N"]
 ) -> tuple[Bool[np.ndarray, "S N"], dict[int, tuple[int, int]]]:
-    """Captures within the gate by moment; the farthest from the anchor is removed until all pairs fit.
-
-    Also returns the pair that did not fit, by moment.
-    """
+    """Captures within the gate by moment, and pairs that did not fit; the farthest from the anchor go first."""
     kept, apart = has.copy(), {}
     low, high = np.where(kept, gap, 0).min(0, initial=0), np.where(kept, gap, 0).max(0, initial=0)
     for i in np.flatnonzero(high - low > gates):
@@ -273,10 +261,7 @@ def _at(places: np.ndarray, index: np.ndarray) -> np.ndarray:
 
 
 def number_drives(stamps_ns: Sequence[int], logs: Sequence[int]) -> Int64[np.ndarray, " N"]:
-    """Number of the continuous stretch of driving of each sweep (in order of time), from 0.
-
-    It grows where the log changes or where the stamps gap by more than 10 s.
-    """
+    """Number of each sweep's stretch of driving, from 0: new where the log changes or stamps gap by 10 s."""
     if not len(stamps_ns):
         return np.zeros(0, np.int64)
     new = (np.diff(np.asarray(stamps_ns, np.int64)) > _DRIVE_GAP_NS) | (

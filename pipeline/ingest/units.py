@@ -14,12 +14,7 @@ _NEAREST_M, _MOST = (1.0, 60.0), 0.9
 
 
 def unit_that_fits(distance: Float[np.ndarray, " N"], reach_m: float) -> str:
-    """Name of the unit at which the points have plausible distances; empty for metres or no match.
-
-    Args:
-        distance: of all points as logged, including those without a return.
-        reach_m: largest plausible distance.
-    """
+    """Unit at which distances are plausible (at most `reach_m`); empty for metres or no match."""
     distance = distance[np.isfinite(distance) & (distance > 0)]
     if not len(distance):
         return ""

@@ -1,12 +1,12 @@
 """Motion of the vehicle frame, moment by moment, from all radars' Doppler and from odometry: one value for all edges.
 
-A radar measures its own velocity: the base's, and the yaw rate times its lever arm. What sources leave open is filled
-by what a car does: its rear axle does not slip, so one radar ahead of it shows the yaw rate.
+A radar measures its own velocity: the base's, and the yaw rate times its lever arm. What sources leave open
+is filled by what a car does: its rear axle does not slip, so one radar ahead of it shows the yaw rate.
 
-Radars are turned on their brackets: each is turned back by what its own direction of travel differs from that of all, a
-constant of the day that no average over moments lowers (`heading_sigma_rad`). A source whose speed is another than that
-of the others in most moments is left out and named; of two that differ nobody can say which, and
-`calibrate/verify/motion_sources` asks the lidar's sweeps.
+Radars are turned on their brackets: each is turned back by what its own direction of travel differs from that
+of all, a constant of the day that no average over moments lowers (`heading_sigma_rad`). A source whose speed
+is another than that of the others in most moments is left out and named; of two that differ nobody can say
+which, and `calibrate/verify/motion_sources` asks the lidar's sweeps.
 
 Source: Kellner et al. 2014, "Instantaneous ego-motion estimation using multiple Doppler radars".
 """
@@ -52,12 +52,7 @@ _CAUCHY, _PASSES, _ROUNDS = 2.5, 5, 3
 class DopplerMotion:
     """A radar's own velocity by its Doppler, per moment, in its axes; NaN where a scan shows none.
 
-    Args:
-        name: of the radar.
-        velocity_mps: F 3.
-        covariance: F 3 3.
-        T_base_radar: as far as it is known.
-        yaw_sigma_rad: of that.
+    `T_base_radar` is the known mounting, `yaw_sigma_rad` its uncertainty.
     """
 
     name: str
@@ -110,7 +105,7 @@ def motion_of(
 ) -> tuple[DopplerMotion, Odometry]:
     """The Doppler and the odometry of frames with one radar.
 
-    A speed that is logged without a yaw rate is odometry only where the radar shows no velocity: else it is Doppler's.
+    A speed without a yaw rate is odometry only if the radar has no velocity; else it is Doppler's.
     """
     nothing = np.full(3, np.nan)
     velocity = [nothing if o.radar_velocity_mps is None else o.radar_velocity_mps for o in observations]
@@ -140,8 +135,8 @@ def ego_motion(
     Args:
         radars: of the same moments; none, where odometry shows all.
         odometry: all NaN where none is logged.
-        heading: azimuth in axes of the base in which the car drives straight on, and its sigma [rad]: (0, 0) for a
-            vehicle frame; None = as the radars' mountings say, for a base that is a sensor.
+        heading: azimuth in axes of the base in which the car drives straight on, and its sigma [rad]: (0, 0)
+            for a vehicle frame; None = as the radars' mountings say, for a base that is a sensor.
         axle_behind_m: how far the rear axle, which does not slip, lies behind the base's origin.
     """
     speeds = {r.name: r.level()[0][:, 0] for r in radars} | {"odometry": odometry.speed_mps}
@@ -181,8 +176,8 @@ def shown_heading(
 ) -> float | None:
     """Azimuth of the car's way in axes of the base, as a radar's Doppler shows it; None where it does not.
 
-    A single frame's is noisier than it varies, and the radar's vertical velocity is no measurement. Which way along it
-    is the speed's sign: the base's x axis points ahead, and a Doppler's sign may be wrong.
+    A single frame's is noisier than it varies, and the radar's vertical velocity is no measurement. Which way
+    along it is the speed's sign: the base's x axis points ahead, and a Doppler's sign may be wrong.
     """
     moving = [
         o.radar_velocity_mps
@@ -206,7 +201,7 @@ def mean_heading(headings: Sequence[tuple[float, float]]) -> tuple[float, float]
 
 
 def contradicting(speeds_mps: Mapping[str, Float[np.ndarray, " F"]]) -> dict[str, str]:
-    """Sources whose speed is not that of the others, where these agree with each other; and a sentence on each."""
+    """Sources whose speed contradicts the others', if these agree with each other; and a sentence on each."""
     found: dict[str, str] = {}
     known = {n: v for n, v in speeds_mps.items() if np.sum(np.abs(v) > _MOVING_MPS) >= _FEWEST}
     if len(known) < 3:
@@ -234,12 +229,12 @@ def agreed_share(speed_mps: Float[np.ndarray, " F"], other_mps: Float[np.ndarray
 def is_same(
     speed_mps: Float[np.ndarray, " F"], expected_mps: Float[np.ndarray, " F"]
 ) -> Bool[np.ndarray, " F"]:
-    """Where a speed is what another source expects."""
+    """Whether a speed agrees with another source's."""
     return np.asarray(np.abs(speed_mps - expected_mps) < _SAME_MPS + _SAME_SHARE * np.abs(expected_mps))
 
 
 def _direction(radar: DopplerMotion, turn: np.ndarray) -> float:
-    """Median azimuth, in axes of the base, of the way of the radar less what turns move it aside."""
+    """Median azimuth of the radar's direction of travel in axes of the base, without the effect of turns."""
     velocity, _ = radar.level()
     x, y = radar.T_base_radar[:2, 3]
     at_base = velocity + turn[:, None] * [y, -x]
@@ -259,7 +254,7 @@ def _mean(angles: Sequence[float], sigmas: Sequence[float]) -> tuple[float, floa
 
 
 def _scatter(radars: Sequence[DopplerMotion], odometry: Odometry) -> float:
-    """What a speed of odometry is good for [m/s], by how it differs from the radars'."""
+    """Sigma of odometry's speed [m/s], from its differences to the radars' speeds."""
     apart = [r.level()[0][:, 0] - odometry.speed_mps for r in radars]
     known = np.concatenate(apart)[np.isfinite(np.concatenate(apart))] if apart else np.zeros(0)
     if len(known) < _FEWEST:
@@ -270,7 +265,7 @@ def _scatter(radars: Sequence[DopplerMotion], odometry: Odometry) -> float:
 def _of_the_car(
     odometry: Odometry, speed_sigma_mps: float, way_rad: float, axle_behind_m: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Equations of each moment by odometry, and by what a rear axle does: it does not slip."""
+    """Equations of each moment by odometry, and by a rear axle without side slip."""
     F = len(odometry.speed_mps)
     axle = np.array([-np.tan(way_rad), 1.0, -axle_behind_m])
     H = np.tile(np.outer(axle, axle) / _ASIDE_SIGMA_MPS**2 + np.diag(_HARDLY), (F, 1, 1))
@@ -284,7 +279,7 @@ def _of_the_car(
 
 
 def _turned(radar: DopplerMotion, by_rad: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Jacobian of a radar's velocity by the base's motion; the velocity and covariance, turned as all others go."""
+    """Jacobian of a radar's velocity by the base's motion; velocity and covariance at the common heading."""
     velocity, covariance = radar.level()
     c, s = np.cos(by_rad), np.sin(by_rad)
     R = np.array([[c, -s], [s, c]])
@@ -294,7 +289,7 @@ def _turned(radar: DopplerMotion, by_rad: float) -> tuple[np.ndarray, np.ndarray
 
 
 def _equations(J: np.ndarray, v: np.ndarray, C: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A radar's part, less of it where its scan contradicts the motion so far (a convoy's, not the road's)."""
+    """A radar's part; scans that contradict the motion so far (a convoy's) have less weight."""
     known = np.isfinite(v).all(1)
     information = np.linalg.inv(np.where(known[:, None, None], C, np.eye(2)))
     r = np.where(known[:, None], v - u @ J.T, 0.0)

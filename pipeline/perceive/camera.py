@@ -1,4 +1,4 @@
-"""What the camera saw: a Cityscapes label image and road users, from logged topics or from ONNX models."""
+"""Camera semantics: a Cityscapes label image and road users, from logged topics or ONNX models."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class SemanticsSource(Protocol):
     """Where semantics come from."""
 
     def read(self, frame: ImageColumns) -> CameraSemantics:
-        """Semantics of one frame; FrameRejectedError where there are none."""
+        """Semantics of one frame; raises FrameRejectedError if there are none."""
         ...
 
 
@@ -84,7 +84,7 @@ class BatchedSource(SemanticsSource, Protocol):
     provider: str
 
     def look_ahead(self, frames: Sequence[ImageColumns]) -> None:
-        """Do what `read` is asked for next."""
+        """Prepare the next calls of `read`."""
         ...
 
 
@@ -120,11 +120,10 @@ def label_size(width_px: int, height_px: int, scale: float) -> tuple[int, int]:
 
 
 def resize_labels(labels: UInt8[np.ndarray, "H W"], size: tuple[int, int]) -> UInt8[np.ndarray, "h w"]:
-    """Label image at another size (rows, columns); pixel centres stay aligned, so that no boundary shifts.
+    """Label image at another size (rows, columns); pixel centres stay aligned, so no boundary shifts.
 
-    Reducing by two takes the majority of each 2x2 block, with ties to the smaller id: the nearest pixel would
-    be a choice among four equally near ones, and taking always the same of them shifts every boundary by half
-    a pixel.
+    Reducing by two takes the majority of each 2x2 block, with ties to the smaller id: of four equally near
+    pixels, always taking the same one would shift every boundary by half a pixel.
     """
     rows, columns = size
     if labels.shape == (rows, columns):
@@ -138,20 +137,12 @@ def resize_labels(labels: UInt8[np.ndarray, "H W"], size: tuple[int, int]) -> UI
 
 
 def decode_colour(frame: ImageColumns) -> UInt8[np.ndarray, "H W 3"]:
-    """The frame's image as BGR.
-
-    Raises:
-        FrameRejectedError: undecodable, or not of the size that the intrinsics refer to.
-    """
+    """The frame's image as BGR; raises FrameRejectedError if undecodable or of another size."""
     return _sized(_decode(frame.image, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION), frame, 1.0)
 
 
 def decode_grey(frame: ImageColumns, scale: float) -> UInt8[np.ndarray, "h w"]:
-    """The frame's image as grey at label size; JPEG is decoded at half size where that is enough.
-
-    Raises:
-        FrameRejectedError: undecodable, or not of the size that the intrinsics refer to.
-    """
+    """The frame's image as grey at label size, JPEG reduced if possible; errors as `decode_colour`."""
     half = scale <= 0.5 and frame.image_format == "jpeg"  # only JPEG saves time by it
     flag = cv2.IMREAD_REDUCED_GRAYSCALE_2 if half else cv2.IMREAD_GRAYSCALE
     grey = _sized(_decode(frame.image, flag | cv2.IMREAD_IGNORE_ORIENTATION), frame, 0.5 if half else 1.0)
@@ -162,7 +153,7 @@ def decode_grey(frame: ImageColumns, scale: float) -> UInt8[np.ndarray, "h w"]:
 
 
 def encode_png(image: UInt8[np.ndarray, "H W"]) -> bytes:
-    """PNG mono8; lossless. Label images are mostly flat: runs of equal pixels say it, filters cost and gain nothing."""
+    """PNG mono8, lossless: runs of equal pixels compress label images; filters cost time and gain nothing."""
     ok, blob = cv2.imencode(".png", image, _FLAT_PNG)
     assert ok, "OpenCV cannot encode a grey PNG"
     return bytes(blob)

@@ -1,13 +1,13 @@
 """Depth jumps of a lidar cloud: where the silhouette of a nearer surface ends, and on which side it lies.
 
-Along a ring the beams are close together, so a jump is a sharp edge (EDGE_LEFT, EDGE_RIGHT). Between rings it is
-only an interval, as wide as the rings are apart (EDGE_ABOVE, EDGE_BELOW with `gap_rad`): 0.25 deg on one lidar,
-2 deg on another. A sweep without rows (a rosette) has neither: there each point looks at its neighbours, see
-`scattered_edges.py`.
+Along a ring the beams are close together, so a jump is a sharp edge (EDGE_LEFT, EDGE_RIGHT). Between rings it
+is only an interval, as wide as the rings are apart (EDGE_ABOVE, EDGE_BELOW with `gap_rad`): 0.25 deg on one
+lidar, 2 deg on another. A sweep without rows (a rosette) has neither: there each point looks at its
+neighbours, see `scattered_edges.py`.
 
-Source: the foreground range at mid-beam direction is where the silhouette is expected, because the last foreground
-beam lies anywhere between 0 and one beam inside it; jumps as in Levinson, Thrun 2013, "Automatic online calibration
-of cameras and lasers".
+Source: the foreground range at mid-beam direction is where the silhouette is expected, because the last
+foreground beam lies anywhere between 0 and one beam inside it; jumps as in Levinson, Thrun 2013, "Automatic
+online calibration of cameras and lasers".
 """
 
 from __future__ import annotations
@@ -56,14 +56,11 @@ def lidar_edges(
     cluster: Int32[np.ndarray, " N"],
     config: PerceiveConfig,
 ) -> LidarEdges:
-    """Find depth jumps between neighbouring beams.
+    """Find depth jumps between neighbouring beams of a sweep.
 
-    Args:
-        xyz_m: one sweep, lidar frame, de-skewed or not.
-        ring: beam number as logged, which need not be a row; without it rows are found from the elevations.
-        cluster: object cluster of each point, -1 = none. Only clustered points make edges between rings, because
-            there the ground alone jumps from ring to ring.
-        config: `edge_jump_m` and `edge_jump_fraction`; a jump must exceed both.
+    `ring` is the beam number as logged, which need not be a row; without it rows are found from elevations.
+    Only points of a `cluster` make edges between rings, because there the ground alone jumps. A jump must
+    exceed both `edge_jump_m` and `edge_jump_fraction` of the range.
     """
     aer = to_spherical(xyz_m.astype(np.float64))
     keep = np.flatnonzero(np.isfinite(aer).all(1) & (aer[:, 2] > _MIN_RANGE_M))
@@ -120,7 +117,7 @@ def _between_rings(
     """Jumps between a clustered point and the beam of the next ring above or below it."""
     start = np.searchsorted(row, np.arange(row.max() + 2))
     found = []
-    # The foreground lies below what the ring above it sees.
+    # The foreground lies below the points of the ring above it.
     for side, up in ((EDGE_BELOW, 1), (EDGE_ABOVE, -1)):
         here = np.flatnonzero(cluster >= 0)
         there = _nearest_in_row(aer[:, 0], row, start, here, up)
@@ -165,7 +162,7 @@ def _nearest_in_row(
 
 
 def _edges(found: list[Jumps], keep: np.ndarray, cluster: np.ndarray, *, has_rows: bool) -> LidarEdges:
-    """Stack what was found among the points `keep`; `points` counts the foreground's cluster."""
+    """Stack the edges of the points `keep`; `points` counts the foreground's cluster."""
     found = found or [Jumps(np.empty((0, 3)), EDGE_LEFT, np.empty(0), np.empty(0), np.empty(0, np.int64))]
     own = cluster[keep[np.concatenate([f.foreground for f in found])]]
     sizes = np.bincount(cluster[cluster >= 0]) if (cluster >= 0).any() else np.ones(1, np.int64)

@@ -1,10 +1,8 @@
-"""How far the road is free in each direction, seen by the radar.
+"""Free range of the road in each direction, seen by the radar.
 
-The static returns of a road scene lie on kerbs, rails, walls and parked cars; the asphalt itself scatters
-away. The free sector of a direction ends at its nearest static return that is no loner. Geometry, where no
-model of the paper's weakly supervised network is given.
-
-Source: paper, section 4.2 (radar drivable area), as the geometric fallback of the design.
+The static returns of a road scene lie on kerbs, rails, walls and parked cars; the asphalt scatters away. The
+free sector of a direction ends at its nearest static return that has neighbours. This geometry is the
+fallback for the paper's weakly supervised network (section 4.2).
 """
 
 from __future__ import annotations
@@ -44,7 +42,7 @@ class FreeSector:
 
 @runtime_checkable
 class DrivableSource(Protocol):
-    """Who tells the radar's drivable area in place of geometry, scan by scan of a vehicle-day."""
+    """Source of the radar's drivable area in place of geometry, scan by scan of a vehicle-day."""
 
     provenance: dict[str, Any]  # what of it belongs into the work key
 
@@ -56,10 +54,7 @@ class DrivableSource(Protocol):
 def free_sector(
     xyz_m: Float32[np.ndarray, "M 3"], motion: UInt8[np.ndarray, " M"], has_elevation: bool
 ) -> FreeSector:
-    """Range to the nearest supported static return per azimuth bin.
-
-    Moving road users stand on the road and don't end it.
-    """
+    """Range to the nearest supported static return per azimuth bin; moving road users do not end it."""
     points = _supported(xyz_m[_could_bound(xyz_m, motion, has_elevation)])
     azimuth = np.arctan2(points[:, 1], points[:, 0])
     bins = round(2 * _HALF_SECTOR_RAD / _BIN_RAD)
@@ -91,7 +86,7 @@ def _supported(points_m: np.ndarray) -> np.ndarray:
 
 
 def _bridge_gaps(centres_rad: np.ndarray, nearest_m: np.ndarray) -> FreeSector:
-    """Bins without a return lie on the line between their neighbours; in a wide gap they say nothing."""
+    """Bins without a return are interpolated between their neighbours; wide gaps stay empty."""
     seen = np.flatnonzero(np.isfinite(nearest_m))
     if not seen.size:
         return FreeSector(np.zeros(0, np.float32), np.zeros(0, np.float32))

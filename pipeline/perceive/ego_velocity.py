@@ -1,12 +1,12 @@
-"""The radar's own velocity from the Doppler of the static world, and what moves in it.
+"""The radar's own velocity from the Doppler of the static world, and the moving detections.
 
-Range rate of a static point in direction u seen from a radar with velocity v: `-u . v`, known only modulo
-the Doppler period where the radar is ambiguous. Wide fields of view lift that: points at 30 deg to the side
-see 13 % less than points ahead, so a wrong multiple of the period does not fit.
+Range rate of a static point in direction u seen from a radar with velocity v: `-u . v`, known only modulo the
+Doppler period if the radar is ambiguous. Wide fields of view resolve that: points at 30 deg to the side see
+13 % less than points ahead, so a wrong multiple of the period does not fit.
 
-The search lies about the direction of travel that the mounting prior gives, so a radar that looks to a corner or back
-is none different from one that looks ahead. Where there is no prior, or nothing is found there, it goes wider, and
-where still nothing is found, it goes without odometry and prior: these may be wrong.
+The search lies about the direction of travel from the mounting prior, so corner and rear radars need no
+special case. Without a prior, or without a result, it widens; at last it ignores odometry and prior, which
+may be wrong.
 
 Source: Kellner et al. 2013, "Instantaneous ego-motion estimation using Doppler radar" (their sine fit, here
 with wrapped residuals and a grid of hypotheses instead of RANSAC, which makes it deterministic).
@@ -51,7 +51,7 @@ _NOISE_FLOOR_MPS = 0.03
 
 @dataclass(frozen=True)
 class Travel:
-    """What is known of the radar's own velocity before the scan is looked at; None = unknown."""
+    """Prior knowledge of the radar's own velocity; None = unknown."""
 
     speed_mps: float | None = None  # forward, from odometry; good to 1.5 m/s + 5 %
     heading_rad: float | None = None  # azimuth in radar axes of the car's way ahead, from the mounting prior
@@ -59,7 +59,7 @@ class Travel:
 
 @dataclass(frozen=True, eq=False)
 class RadarMotion:
-    """Outcome for one scan; velocity is None, and all undecided, where no static world was found."""
+    """Result for one scan; velocity is None, and all undecided, if no static world was found."""
 
     velocity_mps: Float[np.ndarray, " 3"] | None
     velocity_cov: Float[np.ndarray, "3 3"] | None
@@ -78,17 +78,14 @@ def radar_motion(
     config: PerceiveConfig,
     rng: np.random.Generator,
 ) -> RadarMotion:
-    """Fit the radar's own velocity, tell static from moving detections and cluster the moving ones.
+    """Fit the radar's own velocity, separate static from moving detections and cluster the moving ones.
 
     Args:
-        xyz_m: detections, radar frame (x forward, y left, z up).
         range_rate_mps: positive = receding, not ego-compensated.
         power_db: strong detections are preferred in the search for the velocity; None = all alike.
         period_mps: range rates are known modulo this; None = unambiguous.
         travel: where to search; a wrong heading costs time, and is left where the scan contradicts it.
         has_elevation: False leaves elevations out (vertical velocity is then 0, with its prior variance).
-        config: gates and cluster size.
-        rng: picks the detections that the search looks at.
 
     Returns:
         Velocity with covariance in radar axes, residuals (measured minus static, wrapped), motion, clusters.
@@ -134,7 +131,7 @@ _Fit = tuple[np.ndarray, np.ndarray, float]  # velocity, covariance, noise
 
 @dataclass(frozen=True, eq=False)
 class _Doppler:
-    """Directions and range rates of a scan; `gate` is what the static world fits within."""
+    """Directions and range rates of a scan; `gate` is the tolerance of the static world."""
 
     u: np.ndarray
     rate: np.ndarray
@@ -142,7 +139,7 @@ class _Doppler:
     gate: float
 
     def residual(self, velocity: np.ndarray) -> np.ndarray:
-        """Measured less static range rates, wrapped."""
+        """Measured minus static range rates, wrapped."""
         return wrapped(self.rate + self.u @ velocity, self.period)
 
     def static_share(self, fit: _Fit) -> float:
@@ -160,10 +157,10 @@ class _Doppler:
 
 
 def _fit(scan: _Doppler, power: np.ndarray | None, travel: Travel, rng: np.random.Generator) -> _Fit | None:
-    """The fit of the static world as odometry and mounting suggest, or as the scan alone shows where they mislead.
+    """Fit of the static world near odometry and mounting, or from the scan alone if that fits much better.
 
-    A wrong odometry, mounting or sign of the Doppler would else be filled with what little of the scan fits it; what
-    the scan alone shows tells which of them is wrong (`calibrate/verify/motion_sources.py`).
+    A wrong odometry, mounting or Doppler sign would otherwise select the few detections that fit it;
+    `calibrate/verify/motion_sources.py` finds out which one is wrong.
     """
     fit = _fit_static_world(scan, power, travel, rng)
     share = 0.0 if fit is None else scan.static_share(fit)
@@ -178,7 +175,7 @@ def _fit(scan: _Doppler, power: np.ndarray | None, travel: Travel, rng: np.rando
 def _fit_static_world(
     scan: _Doppler, power: np.ndarray | None, travel: Travel, rng: np.random.Generator
 ) -> _Fit | None:
-    """Velocity, covariance and noise of the hypothesis that explains most; None where too little."""
+    """Velocity, covariance and noise of the best hypothesis; None if too few detections fit."""
     chosen = _search_points(scan.u, power, rng)
     u, rate = scan.u[chosen], scan.rate[chosen]
     best = scan.best_fit(_starts(u, rate, _ahead(travel), scan.period, _GRID_SIGMA_MPS))
@@ -190,13 +187,13 @@ def _fit_static_world(
     if best is None:
         return None
     share = scan.static_share(best)
-    # A bus alongside may answer with most detections of a scan; odometry tells which of the others stand still.
+    # A bus alongside may have most detections of a scan; odometry identifies the static others.
     least = _MIN_STATIC_FRACTION if travel.speed_mps is None else _MIN_STATIC_FRACTION_WITH_HINT
     return best if share * len(scan.u) >= _MIN_POINTS - 0.5 and share >= least else None
 
 
 def _ahead(travel: Travel) -> np.ndarray:
-    """Velocities (K 2) to try: any speed along the heading (ahead where it is unknown), a little aside."""
+    """Velocities (K 2) to try: any speed near the heading (ahead if unknown)."""
     along = np.arange(*_SPEED_MPS, _GRID_STEP_MPS)
     if travel.speed_mps is not None:
         along = along[np.abs(along - travel.speed_mps) <= _speed_margin(travel.speed_mps)]
@@ -227,7 +224,7 @@ def _speed_margin(speed_mps: float) -> float:
 def _starts(
     u: np.ndarray, rate: np.ndarray, velocities: np.ndarray, period: float, sigma: float
 ) -> np.ndarray:
-    """The few velocities (K 2) that explain most and lie at least 1 m/s apart."""
+    """The few velocities (K 2) with most support, at least 1 m/s apart."""
     score = _scores(u, rate, velocities, period, sigma)
     peaks = []
     for _ in range(_PEAKS):
@@ -284,7 +281,7 @@ def _refine(scan: _Doppler, velocity: np.ndarray) -> _Fit:
         noise = min(max(1.4826 * _median(near), _NOISE_FLOOR_MPS), gate) if len(near) else gate
         scale = max(0.6 * scale, 2.5 * noise)
         w = (1 + (r / scale) ** 2) ** -2
-        # Poor elevations say nothing about the vertical: the prior keeps it from running away.
+        # Poor elevations leave the vertical component free: the prior bounds it.
         vertical = 1 / (0.05 + _VERTICAL_SLOPE * np.hypot(velocity[0], velocity[1])) ** 2
         information = (u.T * w) @ u / noise**2 + np.diag([1e-6, 1e-6, vertical])
         step = np.linalg.solve(information, -(u.T @ (w * r)) / noise**2 - [0, 0, vertical * velocity[2]])

@@ -1,4 +1,4 @@
-"""What one image, one sweep or one scan shows: a function per kind of sensor, from captures to features."""
+"""Features of one image, sweep or scan: a function per kind of sensor, from captures to features."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _CAMERA = ("image_width_px", "image_height_px", "camera_model", "camera_K", "cam
 
 
 def why_unusable(capture: Capture) -> FrameReason | None:
-    """Why the columns of an image, a sweep or a scan say too little; the image itself is not looked at."""
+    """Reason why the columns of an image, a sweep or a scan are insufficient; the image is not decoded."""
     if isinstance(capture, CameraColumns):
         try:
             camera_of(capture)
@@ -58,11 +58,7 @@ def why_unusable(capture: Capture) -> FrameReason | None:
 
 
 def perceive_image(image: Image, source: SemanticsSource, config: PerceiveConfig) -> ImageFeatures:
-    """Labels and road users of an image.
-
-    Raises:
-        FrameRejectedError: no image, labels or detections that could be read.
-    """
+    """Labels and road users of an image; raises FrameRejectedError if any cannot be read."""
     semantics = source.read(image)
     grey = decode_grey(image, config.label_scale)
     users = semantics.detections
@@ -156,14 +152,9 @@ def motion_of(
     config: PerceiveConfig,
     rng: np.random.Generator,
 ) -> RadarMotion:
-    """What moves in a scan, and the radar's own velocity.
+    """Motion of a scan's detections, and the radar's velocity, searched near odometry and heading.
 
-    Args:
-        scan: the scan.
-        speed_mps: the car's by odometry; None = unknown.
-        heading: azimuth of the way ahead in radar axes; None = unknown.
-        config: gates.
-        rng: of the search.
+    `heading` is the azimuth of the direction of travel in radar axes; None = unknown, like `speed_mps`.
     """
     return radar_motion(
         scan.radar_xyz_m, scan.radar_range_rate_mps, scan.radar_power_db, scan.doppler_period_mps,
@@ -172,7 +163,7 @@ def motion_of(
 
 
 def heading_of(T_lidar_radar: Float[np.ndarray, "4 4"] | None) -> float | None:
-    """Azimuth in radar axes of a lidar's x axis, which points ahead; None where nobody knows the radar's place."""
+    """Azimuth of a lidar's x axis, which points ahead, in radar axes; None if the radar's pose is unknown."""
     if T_lidar_radar is None:
         return None
     ahead = T_lidar_radar[0, :3]
@@ -180,7 +171,7 @@ def heading_of(T_lidar_radar: Float[np.ndarray, "4 4"] | None) -> float | None:
 
 
 def deskewed(sweep: Sweep, motion: RadarMotion, heading: float | None) -> Sweep:
-    """The sweep with its points moved to the stamp by a radar's velocity; itself where that is unknown."""
+    """The sweep, moved to its stamp by a radar's velocity if that is known."""
     time_s = sweep.lidar_time_s
     if motion.velocity_mps is None or heading is None or time_s is None:
         return sweep
@@ -192,7 +183,7 @@ def deskewed(sweep: Sweep, motion: RadarMotion, heading: float | None) -> Sweep:
 def speed_of(
     moment: Moment, motions: Mapping[str, RadarMotion], headings: Mapping[str, float | None]
 ) -> float | None:
-    """The car's speed ahead: by odometry, else by the first radar that knows its velocity."""
+    """The car's forward speed: by odometry, else by the first radar with a velocity."""
     known = (r for r, m in motions.items() if m.velocity_mps is not None)
     radar = next(known, None)
     if moment.ego_speed_mps is not None or radar is None:
@@ -218,7 +209,7 @@ class _Finite:
 def _finite(sweep: SweepColumns) -> _Finite:
     xyz = sweep.lidar_xyz_m
     finite = np.isfinite(xyz).all(axis=1)
-    # Of points as logged, nobody can tell whether the driver de-skewed them.
+    # It is unknown whether the driver de-skewed the points that it logged.
     times = sweep.lidar_time_s if sweep.lidar_deskewed else None
     columns = (sweep.lidar_intensity, sweep.lidar_ring, times)
     if finite.all():

@@ -1,13 +1,11 @@
-"""The ground under the vehicle in one lidar sweep: a plane, the points on it, and how far it is free.
+"""Ground under the vehicle in one lidar sweep: a plane, its points, and the free ground around.
 
-RANSAC sees only the lowest point of each cell of a grid over the ground, so that neither the dense rings
-around the vehicle nor walls outvote the road; then each sector follows the surface outwards, because roads
-bend and crown.
+RANSAC uses the lowest point of each cell of a grid over the ground, so that neither the dense rings around
+the vehicle nor walls outvote the road. Then each sector follows the surface outwards, because roads bend and
+crown. With a point model, RANSAC uses road points only, the surface has no object points, and the drivable
+area ends with the road.
 
-Where a model tells what points are, RANSAC sees its road only, the surface carries no point of an object, and
-the drivable area ends where its road does.
-
-Source: paper, section 4.2 (RangeNet++ and RANSAC successively; geometry alone where no model is given).
+Source: paper, section 4.2 (RangeNet++ and RANSAC successively; geometry alone without a model).
 """
 
 from __future__ import annotations
@@ -40,7 +38,7 @@ _FREE_BINS = 360
 
 
 class PointKind(IntEnum):
-    """What a model may say of a lidar point; of unknown ones geometry decides."""
+    """Class of a lidar point by a model; geometry decides unknown ones."""
 
     UNKNOWN = 0
     ROAD = 1
@@ -51,7 +49,7 @@ class PointKind(IntEnum):
 
 @runtime_checkable
 class PointSource(Protocol):
-    """Who tells what lidar points are, sweep by sweep."""
+    """Source of point classes, sweep by sweep."""
 
     provenance: dict[str, Any]  # what of it belongs into the work key
 
@@ -64,9 +62,9 @@ class PointSource(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """`plane` (n, d) with n.p + d = 0, n up, lidar frame; None where none was found.
+    """`plane` (n, d) with n.p + d = 0, n up, lidar frame; None if none was found.
 
-    `is_road` are the ground points that a model calls road, all of them without a model.
+    `is_road` are the ground points that a model classifies as road; all of them without a model.
     """
 
     plane: Float[np.ndarray, " 4"] | None
@@ -83,11 +81,8 @@ def find_ground(
 ) -> Ground:
     """Plane, ground points and reachable ground on a 1 m grid of one sweep (lidar frame, z roughly up).
 
-    Args:
-        xyz_m: finite points.
-        inlier_m: how far ground points lie from the surface, near the vehicle.
-        rng: of RANSAC.
-        kind: the PointKind of each point by a model; None = geometry alone.
+    `inlier_m` is the largest distance of ground points from the surface, near the vehicle. `kind` is the
+    PointKind of each point by a model; None = geometry alone.
     """
     every = np.ones(len(xyz_m), bool)
     road = every if kind is None else kind == PointKind.ROAD
@@ -101,7 +96,7 @@ def find_ground(
     above_local = _follow_surface(xyz_m, height_over(plane, xyz_m), inlier_m, may_be_ground)
     # Range noise on a grazing beam and ring tilt show as height: 0.3 % of the range.
     on_surface = np.abs(above_local) < inlier_m + 0.003 * range_m
-    # Grass is rough, and a model knows it for ground; what stands higher it mistook.
+    # Grass is rough, and a model classifies it as ground; higher points are mistakes.
     near_surface = np.abs(above_local) < _OBSTACLE_M[0] + 0.003 * range_m
     is_ground = seen & np.where(labelled, near_surface, on_surface & may_be_ground)
     is_road = seen & road & on_surface
@@ -168,7 +163,7 @@ def _support(
 ) -> np.ndarray:
     """Weight of the points in each plane, less half of that of points under it.
 
-    The ground is the floor: what lies under a plane speaks against it (a plane through bonnets and hedges).
+    The ground is the lowest surface: points below rule out a plane (through bonnets or hedges).
     """
     score = np.zeros(len(normal))
     for h in range(len(normal)):
@@ -198,7 +193,7 @@ def _refine(low: np.ndarray, weight: np.ndarray, plane: np.ndarray, inlier_m: fl
 def _follow_surface(
     xyz_m: np.ndarray, height_m: np.ndarray, inlier_m: float, may_be_ground: np.ndarray
 ) -> np.ndarray:
-    """Height over the local ground: each sector carries the height of what may be ground outwards."""
+    """Height over the local ground: each sector follows possible ground outwards."""
     azimuth = np.arctan2(xyz_m[:, 1], xyz_m[:, 0])
     sector = np.minimum(((azimuth + np.pi) / (2 * np.pi) * _SECTORS).astype(np.int32), _SECTORS - 1)
     ring = (np.hypot(xyz_m[:, 0], xyz_m[:, 1]) / _BIN_M).astype(np.int32)
@@ -223,7 +218,7 @@ def _walk(height: np.ndarray, start: np.ndarray, sectors: int, bins: int, inlier
         for b in range(bins):
             cell = height[start[s * bins + b] : start[s * bins + b + 1]]
             reach = inlier_m + _SLOPE * _BIN_M * min(gap, 4)
-            # Upwards half as much: what rises out of a gap without ground is more often a bonnet than a hill.
+            # Upwards half as much: behind a gap without ground, a bonnet is more frequent than a hill.
             fits = np.sort(cell[(cell - level > -reach) & (cell - level < (inlier_m + reach) / 2)])
             if fits.size >= 2:
                 # The lower part: the upper one may be the foot of an object.
@@ -244,7 +239,7 @@ def _reachable(xyz_m: np.ndarray, range_m: np.ndarray, blocks: np.ndarray) -> np
 
 
 def _second_nearest(direction: np.ndarray, range_m: np.ndarray) -> np.ndarray:
-    """Per direction the second shortest range (one return may be snow), infinity where there is none."""
+    """Second shortest range per direction (one return may be snow), infinity if there is none."""
     order = np.lexsort((range_m, direction))
     direction, range_m = direction[order], range_m[order]
     limit = np.full(_FREE_BINS, np.inf)

@@ -1,9 +1,9 @@
-"""Image gradients across the borders of the labels: shows labels that lie beside their picture, without extrinsics.
+"""Image gradients across the borders of the labels: they show labels that are displaced, without extrinsics.
 
-Along a border the gradients of the image are summed with their sign, so that noise cancels. Their size, by distance
-from the border, has its maximum at the picture's own border. Sums are kept by side of the foreground: labels that are
-too wide move the maxima of opposite sides apart, a shift moves them the same way. They are kept by place too: a slip
-of scale moves the two ends of the image apart.
+Gradients of the image are summed along a border with their sign, so that noise cancels. Their size by
+distance from the label's border is largest at the image's own border. Sums are kept by side of the
+foreground: labels that are too wide move the maxima of opposite sides apart, a shift moves them alike. They
+are kept by place too: a wrong scale moves the two ends of the image apart.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ _SKY, _BACKDROP, _OBJECT, _GROUND = (10,), (2, 3, 4, 8), (5, 6, 7, 11, 12, 13, 1
 def _foregrounds() -> UInt8[np.ndarray, "256 256"]:
     """Nearer side of a border between labels a (left or above) and b: 1 = a, 2 = b, 0 = not used.
 
-    Not used: two labels of a group, and the ground before walls and plants. There kerbs and shadows lie beside the
-    border: on eight simulated days and the real car they moved the vertical offset by .1 to .6 px.
+    Not used: two labels of a group, and the ground before walls and plants. There kerbs and shadows lie
+    beside the border: on eight simulated days and the real car they moved the vertical offset by .1 to .6 px.
     """
     nearer = np.zeros((256, 256), np.uint8)
     for far, near in ((_SKY, _BACKDROP), (_SKY, _OBJECT), (_BACKDROP, _OBJECT), (_GROUND, _OBJECT)):
@@ -48,12 +48,9 @@ def label_gradients(
 ) -> Float32[np.ndarray, "4 6 33"]:
     """Sums of normalised gradients across borders, by EDGE_* side, place and distance from the border.
 
-    Args:
-        grey: the image at label size.
-        labels: Cityscapes train ids.
-
     Returns:
-        Element d is the gradient between the pixels d - REACH_PX before and one pixel further, counted from the border
+        Element d is the gradient between the pixels d - REACH_PX before and one pixel further, counted from
+            the border
         to the right (left, right) or down (above, below). Each run of border counts by its length.
     """
     out = np.zeros((4, BINS, 2 * REACH_PX + 1), np.float32)

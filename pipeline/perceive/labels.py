@@ -1,6 +1,6 @@
-"""Semantic classes: label sets become Cityscapes train ids, detectors' names become eight road users.
+"""Semantic classes: from label sets to Cityscapes train ids, from detectors' names to eight road users.
 
-Sources: Cityscapes `labels.py` (train ids); ADE20K `objectInfo150` (ids from 0, as SegFormer puts them out);
+Sources: Cityscapes `labels.py` (train ids); ADE20K `objectInfo150` (ids from 0, as in SegFormer's output);
 COCO-Stuff `labels.md` (182 ids, here from 0, 255 = void); COCO detection's 80 consecutive ids.
 """
 
@@ -73,10 +73,7 @@ _ALIASES = {
 
 
 def to_cityscapes(label_set: str | Mapping[StreetClass, tuple[int, ...]]) -> UInt8[np.ndarray, " 256"]:
-    """Lookup table from labels of a set (its name, or what it means) to Cityscapes train ids.
-
-    What has no counterpart becomes VOID_ID.
-    """
+    """Lookup table from labels of a set (name or meanings) to Cityscapes train ids; others are VOID_ID."""
     table = np.full(256, VOID_ID, np.uint8)
     meaning: Mapping[str, tuple[int, ...]] = (
         LABEL_SETS[label_set] if isinstance(label_set, str) else {str(k): v for k, v in label_set.items()}
@@ -92,6 +89,6 @@ def detector_names(label_set: str) -> dict[int, str]:
 
 
 def road_user_name(logged: str) -> str | None:
-    """The road user that a logged class name means, None where it means none (traffic light, dog)."""
+    """Road user of a logged class name; None for other classes (traffic light, dog)."""
     name = logged.strip().lower().replace("_", " ")
     return name if name in ROAD_USERS else _ALIASES.get(name)

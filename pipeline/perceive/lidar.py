@@ -1,4 +1,4 @@
-"""Objects of one lidar sweep: clusters of what stands on the ground, their boxes, and a uniform sample.
+"""Objects of one lidar sweep: clusters above the ground, their boxes, and a uniform sample.
 
 Source: paper, section 4.2 (uniform sampling, DBSCAN).
 """
@@ -33,10 +33,10 @@ class Boxes:
 def cluster_objects(
     xyz_m: Float32[np.ndarray, "N 3"], is_ground: Bool[np.ndarray, " N"], eps_m: float, min_points: int
 ) -> Int32[np.ndarray, " N"]:
-    """DBSCAN label of each point, 0..K-1 in order of size (largest first), -1 = ground, own vehicle or noise.
+    """DBSCAN label of each point, 0..K-1 in order of size (largest first), -1 = ground, own car or noise.
 
-    Distances are measured after shrinking the radius logarithmically beyond 12 m, so that `eps_m` grows with
-    the gap between beams, and with heights halved (see _VERTICAL).
+    Beyond 12 m ranges are compressed logarithmically, so that `eps_m` grows with the gap between beams;
+    heights are halved (see _VERTICAL).
     """
     label = np.full(len(xyz_m), -1, np.int32)
     range_m = np.linalg.norm(xyz_m, axis=1)
@@ -63,10 +63,9 @@ def cluster_boxes(xyz_m: Float32[np.ndarray, "N 3"], label: Int32[np.ndarray, " 
 
 
 def sample_uniformly(xyz_m: Float32[np.ndarray, "N 3"], voxel_m: float) -> Int[np.ndarray, " M"]:
-    """Rows of one measured point per voxel, the nearest to the voxel's mean; the own vehicle is left out.
+    """Rows of one measured point per voxel, the nearest to the voxel's mean, without the own vehicle.
 
-    A measured point, not the mean: means lie beside surfaces, and a row keeps its ring, cluster and
-    reflectivity.
+    Means would lie beside surfaces; a measured point keeps its ring, cluster and reflectivity.
     """
     rows = np.flatnonzero(np.linalg.norm(xyz_m, axis=1) > _NEAR_M)
     if not rows.size:

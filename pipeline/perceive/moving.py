@@ -20,16 +20,8 @@ def cluster_moving(
 ) -> Int32[np.ndarray, " M"]:
     """Density clusters (DBSCAN) of moving detections in x, y and Doppler; -1 = none.
 
-    `eps_m` metres count as 1 m/s; lengths shrink with range, as azimuth noise spreads far objects sideways.
-
-    Args:
-        xyz_m: detections [m].
-        residual_mps: range rate over ground; compared modulo `period_mps` where that is positive.
-        is_moving: which detections take part.
-        period_mps: 0 = unambiguous.
-        eps_m: neighbourhood near the car.
-
-    Source: Ester et al. 1996.
+    `eps_m` metres count as 1 m/s; lengths shrink with range, because azimuth noise spreads far objects
+    sideways. Residuals are range rates over ground, compared modulo `period_mps` if that is positive.
     """
     label = np.full(len(xyz_m), -1, np.int32)
     index = np.flatnonzero(is_moving)
@@ -41,7 +33,7 @@ def cluster_moving(
     doppler = np.abs(wrapped(residual_mps[index][:, None] - residual_mps[index][None], period_mps))
     near = np.hypot(distance, doppler) <= 1.0
     core = near.sum(1) >= _CORE_POINTS
-    # Cores are numbered by their first detection; what is no core joins the first of the clusters that reach it.
+    # Cores are numbered by their first detection; others join the first cluster that reaches them.
     of_core = connected_components(near[core][:, core], directed=False)[1] if core.any() else np.zeros(0, int)
     reached = np.where(near[:, core], of_core, len(index)).min(axis=1, initial=len(index))
     label[index] = np.where(reached < len(index), reached, -1)

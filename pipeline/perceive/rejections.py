@@ -8,7 +8,7 @@ __all__ = ["FrameReason", "FrameRejectedError"]
 
 
 class FrameReason(StrEnum):
-    """What makes a frame useless for calibration; the value is the key of the counts."""
+    """Reasons against a frame; the value is the key of the counts."""
 
     UNDECODABLE_IMAGE = "image_undecodable"
     IMAGE_SIZE = "image_size_differs_from_camera_info"
@@ -24,7 +24,7 @@ class FrameReason(StrEnum):
 
 
 class FrameRejectedError(Exception):
-    """One frame cannot be used; `reason` says why. Never leaves the stage."""
+    """One frame cannot be used, for `reason`; handled within the stage."""
 
     def __init__(self, reason: FrameReason) -> None:
         self.reason = reason

@@ -1,4 +1,4 @@
-"""Paint on the road, as lidar reflectivity and as image brightness: what sparse lidars know of pitch and roll."""
+"""Road paint as lidar reflectivity and as image brightness: it determines pitch and roll of sparse lidars."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Float32, UInt8, UInt16
 
 __all__ = ["Markings", "lidar_markings", "road_contrast"]
 
-# Points that do not stand out tell what the plain road looks like; every fourth of them is enough for that.
+# Other points show the plain road; every fourth of them is enough for that.
 _PLAIN_Z = 1.5
 _PLAIN_STRIDE = 4
 _MIN_BAND_POINTS = 20
@@ -34,11 +34,11 @@ def lidar_markings(
     ring: UInt16[np.ndarray, " N"] | None,
     is_ground: Bool[np.ndarray, " N"],
 ) -> Markings:
-    """Ground points and how far their reflectivity stands out of the road at the same ring or range.
+    """Ground points and the contrast of their reflectivity to the road at the same ring or range.
 
-    Reflectivity falls with range and incidence and differs from beam to beam, so it is compared only within
-    a band: a ring, or 15 % of range where rings are not logged (rings near the horizon are split by range
-    too). Nothing without intensity.
+    Reflectivity falls with range and incidence and differs from beam to beam, so it is compared only within a
+    band: a ring, or 15 % of range if rings are not logged (rings near the horizon are split by range too).
+    Empty without intensity.
     """
     range_m = np.hypot(xyz_m[:, 0], xyz_m[:, 1])
     if intensity is None or not is_ground.any():
@@ -77,11 +77,9 @@ def _medians(value: np.ndarray, group: np.ndarray, count: np.ndarray) -> np.ndar
 def road_contrast(
     grey: UInt8[np.ndarray, "H W"], road_mask: Bool[np.ndarray, "H W"]
 ) -> UInt8[np.ndarray, "H W"]:
-    """Top-hat contrast inside the road mask, 0 outside: how much brighter a pixel is than the road to its sides.
+    """Top-hat contrast inside the road mask, 0 outside: brightness above the road to both sides.
 
-    Args:
-        grey: image at the size of the label image.
-        road_mask: pixels labelled road.
+    `grey` is the image at the size of the label image.
     """
     width = max(9, round(grey.shape[1] * _PAINT_FRACTION) | 1)
     # Along rows only: paint is narrow across the road, and the row is where the road's own brightness

@@ -1,9 +1,9 @@
 """Depth jumps of a sweep without rows: between each point and its nearest neighbours to the four sides.
 
-What lies between two neighbours is a silhouette wherever the nearer one belongs to something that stands and the
-farther one does not belong to it. No row is assumed: a neighbour to the left lies left, not exactly, but within half as
-much up or down as to the side. Which way the silhouette faces, all neighbours behind it tell together: beside a post's
-left edge the beam above may miss the post too, and is no upper edge.
+A silhouette lies between two neighbours if the nearer one belongs to a standing object and the farther one
+does not belong to it. A neighbour to the left lies left within half as much up or down. The side of the
+silhouette is decided by all neighbours behind it: beside a post's left edge the beam above may miss the post
+too, and is no upper edge.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _SIDES: Final = ((EDGE_RIGHT, 0, 1.0), (EDGE_LEFT, 0, -1.0), (EDGE_BELOW, 1, 1.0
 
 
 class Jumps(NamedTuple):
-    """Jumps of one side: where the silhouette is expected (azimuth, elevation, range), and what made it."""
+    """Jumps of one side: expected silhouette (azimuth, elevation, range), and their points."""
 
     at_aer: Float[np.ndarray, "E 3"]
     side: int
@@ -38,7 +38,7 @@ class Jumps(NamedTuple):
 
 
 class _Neighbours(NamedTuple):
-    """The nearest points of each point but itself, and (azimuth, elevation) [rad] from it to them."""
+    """The nearest other points of each point, and (azimuth, elevation) [rad] to them."""
 
     point: np.ndarray
     offset_rad: np.ndarray
@@ -51,14 +51,11 @@ def jumps_between_neighbours(
     edge_jump_m: float,
     edge_jump_fraction: float,
 ) -> list[Jumps]:
-    """Jumps in range from clustered points to what is not of their cluster, side by side.
+    """Jumps in range from clustered points to neighbours that are not of their cluster.
 
-    Args:
-        aer: azimuth, elevation [rad] and range [m] of the points.
-        cluster: object cluster of each point, -1 = none. Only clustered points make edges: neighbours differ in
-            elevation, and then the ground alone jumps.
-        edge_jump_m: a jump must exceed this,
-        edge_jump_fraction: and this share of the nearer range.
+    `aer` is azimuth, elevation [rad] and range [m]. Unclustered points make no edges: neighbours differ in
+    elevation, and the ground alone jumps. A jump must exceed `edge_jump_m`, and `edge_jump_fraction` of the
+    nearer range.
     """
     if len(aer) <= _NEIGHBOURS:
         return []

@@ -52,15 +52,15 @@ _Joined = tuple[Moment, dict[str, Any]]
 
 
 def work(task: Task) -> Work:
-    """What a day's moments show: the partition of `perceived`, and the features of each sensor.
+    """Features of a day's moments: the partition of `perceived`, and the features of each sensor.
 
-    A sensor that cannot be used is left out of its moment, a moment without two sensors is left out, counted by reason.
-    Where none is left, the partition is empty and the outcome "refused". A camera without semantics is left out, and
-    the remarks say what to do; moments of the sensors that are left are kept, even where that is one lidar.
+    Unusable sensors are left out of their moment; moments without two sensors are left out, counted by
+    reason. If none is left, the partition is empty and the outcome "refused". A camera without semantics is
+    left out with a remark, and moments of the other sensors are kept, even of one lidar.
 
     Raises:
-        ConfigError: the vehicle or a model manifest is not as fleet.toml says.
-        ModelError: a model does not do what its manifest says.
+        ConfigError: the vehicle is unknown or a manifest is missing.
+        ModelError: a model contradicts its manifest.
     """
     rig = task.fleet.rig_of(task.partition.vehicle)
     sources, keys = _sources(rig, task.fleet)
@@ -75,7 +75,7 @@ def work(task: Task) -> Work:
 def _rows(
     task: Task, sources: Sources, section: str, run: Run
 ) -> Generator[tuple[Perceived, dict[str, Capture]], None, None]:
-    """The day's moments with what they show, a row group of each sensor in memory at a time."""
+    """The day's moments with their features, one row group of each sensor in memory at a time."""
     ingested = task.inputs[MOMENTS.name]
     stars, kinds = logged_stars(ingested.extra.get(PRIOR, ())), sensors_of(ingested)
     blind = [s for s, kind in kinds.items() if kind == "camera" and s not in sources.cameras]
@@ -116,14 +116,9 @@ def _ahead(moments: Iterator[_Joined], sources: Sources) -> Generator[_Joined, N
 
 @dataclass(frozen=True, eq=False)
 class Sources:
-    """By sensor's name, what its captures are looked at with.
+    """Models and settings by sensor's name; None = geometry.
 
-    Args:
-        cameras: where labels and road users come from; of cameras that have any.
-        lidars: a model that tells what points are; None = geometry.
-        radars: a network for the drivable area, which remembers the scans before; None = geometry.
-        config: gates and sizes.
-        deskew: sweeps that ingest had no odometry for, by a radar's velocity.
+    `deskew` has the sweeps without odometry, which a radar's velocity moves to their stamps.
     """
 
     cameras: Mapping[str, SemanticsSource]
@@ -164,7 +159,7 @@ class Shown:
 
 
 class Found(NamedTuple):
-    """What one moment shows, and the tracks of its radars after it."""
+    """Features of one moment, and the tracks of its radars after it."""
 
     moment: Perceived
     features: dict[str, Any]
@@ -176,19 +171,15 @@ class Found(NamedTuple):
 def perceive_moment(
     shown: Shown, sources: Sources, tracks: Mapping[str, TrackState], *, alone: bool = True
 ) -> Found:
-    """Everything that one moment shows, and the radars' tracks carried on.
+    """Features of a moment, and the radars' tracks carried on.
 
-    Args:
-        shown: the next moment of the day.
-        sources: what its sensors are looked at with.
-        tracks: by radar, from the moment before.
-        alone: no moment with all its sensors shows the same scene; else one that lacks a sensor is not worth having in
-            a rig with one sensor of each kind.
+    `alone` is true if no complete moment shows the same scene; otherwise a moment without one of its sensors
+    is rejected for a rig with one sensor of each kind.
 
     Raises:
-        ModelError: a model does not do what its manifest says.
-        FrameRejectedError: a sensor cannot be used, and not two are left that show anything together (one, where all
-            others are cameras without semantics), or the moment is not alone.
+        ModelError: a model contradicts its manifest.
+        FrameRejectedError: fewer than two usable sensors (one, if all others are cameras without semantics),
+            or the moment is not alone.
     """
     moment, config = shown.moment, sources.config
     asked = {s: c for s, c in shown.captures.items() if shown.kinds[s] != "camera" or s in sources.cameras}
@@ -233,7 +224,7 @@ def perceive_moment(
 
 
 def _is_worth_having(shown: Shown, usable: Collection[str], *, alone: bool) -> bool:
-    """Whether what is left of a moment shows what no other does."""
+    """Whether an incomplete moment shows a scene that no other moment shows."""
     if len(set(shown.kinds.values())) == len(shown.kinds):
         return alone
     return bool(possible_edges([BASE, *(Sensor(s, cast("Kind", shown.kinds[s])) for s in usable)]))
@@ -256,7 +247,7 @@ def _is_skewed(capture: Any) -> bool:
 
 
 def _deskewed(shown: Shown, lidar: str, sweep: Sweep, motions: Mapping[str, RadarMotion]) -> Sweep:
-    """The sweep, moved by the first radar's velocity that is known; itself where none is."""
+    """The sweep, moved by the first known radar velocity, if any."""
     if not _is_skewed(sweep):
         return sweep
     moved = (deskewed(sweep, motion, shown.heading(radar, lidar)) for radar, motion in motions.items())
@@ -264,7 +255,7 @@ def _deskewed(shown: Shown, lidar: str, sweep: Sweep, motions: Mapping[str, Rada
 
 
 def _sources(rig: Rig, fleet: FleetConfig) -> tuple[Sources, dict[str, Any]]:
-    """What sensors are looked at with, and what of it belongs into the work key."""
+    """Sources of each sensor, and their part of the work key."""
     keys: dict[str, Any] = {}
     cameras = {}
     for name, camera in rig.cameras.items():
@@ -279,7 +270,7 @@ def _sources(rig: Rig, fleet: FleetConfig) -> tuple[Sources, dict[str, Any]]:
 def _source(
     wanted: TopicSemantics | OnnxSemantics, fleet: FleetConfig
 ) -> tuple[SemanticsSource, dict[str, Any]]:
-    """Where semantics come from, and what of it belongs into the work key."""
+    """Source of semantics, and its part of the work key."""
     if isinstance(wanted, TopicSemantics):
         keyed = wanted.model_dump(mode="json", include={"source", "label_set", "classes"})
         return TopicSource(wanted, fleet.perceive), keyed

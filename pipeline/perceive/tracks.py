@@ -1,7 +1,7 @@
-"""Moving radar clusters followed from frame to frame, each at constant velocity over ground.
+"""Moving radar clusters tracked over frames, each at constant velocity over ground.
 
-Where Doppler is ambiguous, a new track is several hypotheses, one per wrap of its range rate; the next frames decide.
-Association is on gated likelihoods of position and (wrapped) range rate.
+If Doppler is ambiguous, a new track has several hypotheses, one per wrap of its range rate; the next frames
+decide. Association is on gated likelihoods of position and (wrapped) range rate.
 
 Source: paper, section 4.2 (tracking to distinguish moving objects).
 """
@@ -54,7 +54,7 @@ class EgoMotion:
 
 @dataclass(frozen=True, eq=False)
 class TrackState:
-    """What is carried from frame to frame."""
+    """State between frames."""
 
     stamp_ns: int | None = None
     drive: int = -1
@@ -110,10 +110,10 @@ def advance_tracks(
     returns: ClusterReturns,
     period_mps: float | None,
 ) -> tuple[TrackState, Tracks]:
-    """Carry all tracks to `stamp_ns`, match the scan's clusters to them, start tracks for the others.
+    """Predict all tracks to `stamp_ns`, match the scan's clusters to them, start tracks for the others.
 
-    A new drive, a gap above 2.5 s or an unknown ego velocity forgets all tracks: nothing links the scans
-    then. Identities are never used twice.
+    A new drive, a gap above 2.5 s or an unknown ego velocity deletes all tracks, because nothing links the
+    scans then. Identities are never used twice.
     """
     filters = Filters.none()
     if state.stamp_ns is not None and state.drive == drive:
@@ -132,7 +132,7 @@ def _mean_yaw_rate(a: EgoMotion, b: EgoMotion) -> tuple[float, float]:
 
 
 def _measured(returns: ClusterReturns, stamp_ns: int, period_mps: float | None) -> Measurements:
-    """Position and range rate of each cluster, its line of sight taken as known."""
+    """Position and range rate of each cluster, with an exact line of sight."""
     centre = returns.centre_m.astype(np.float64)
     plane, distance = centre[:, :2], np.linalg.norm(centre[:, :2], axis=1)
     u = lines_of_sight(plane)
@@ -162,7 +162,7 @@ def _born(measured: Measurements, fresh: np.ndarray, first_identity: int) -> Fil
 
 
 def _across(u: np.ndarray) -> np.ndarray:
-    """Unit vectors turned to the left."""
+    """Unit vectors rotated by 90 deg to the left."""
     return np.stack([-u[:, 1], u[:, 0]], axis=1)
 
 

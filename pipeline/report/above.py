@@ -23,10 +23,7 @@ _HIGH_M = 4.0  # end of the height colours: a lorry's roof
 
 
 def top_view(scene: Scene, before: Extrinsics, after: Extrinsics, labels: tuple[str, str]) -> Markup:
-    """Bird's-eye view in the lidar frame: radar left of the car at `before`, right of it at `after`.
-
-    One label for both means one state for both.
-    """
+    """Bird's-eye view in the lidar frame: radar left of the car at `before`, right of it at `after`."""
     plot = Plot(44.0, 8.0, 540.0, 567.0, (-_SIDE_M, _SIDE_M), (-_BEHIND_M, _AHEAD_M))
     uri = png_uri(top_bitmap(scene, before, after))
     plot.parts.append(

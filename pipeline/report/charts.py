@@ -1,7 +1,7 @@
-"""The numbers of a fleet's control charts, which the page draws when somebody looks at a vehicle.
+"""Numbers of a fleet's control charts, which the page draws when a vehicle is opened.
 
-Ten thousand vehicles have 180,000 charts: drawn, they are hundreds of megabytes that nobody opens; as numbers they are
-some ten kilobytes per vehicle, in files that hold a few dozen vehicles each.
+Ten thousand vehicles have 180,000 charts: hundreds of megabytes as drawings, some ten kilobytes per vehicle
+as numbers, in files of a few dozen vehicles each.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ def fleet_charts(window: FleetWindow, verdicts: FleetVerdicts) -> Iterator[tuple
     """Every audited vehicle with its charts, for `templates/fleet.js`.
 
     A chart is [edge, dof, status, limit, start, values, sigmas]: places in `charted_edges`, DOF_NAMES and
-    DRIFT_STATUSES; the limit, and per day value and sigma, in 1e-4 deg or 1e-4 m, null where the day does not say; the
-    start as days of the calendar (first, earliest, latest), null where nothing changed. Values are relative to the
-    level before the change.
-    `days` are ordinals of the calendar; `pairs` has a letter per edge and day: accepted, held, refused, "." none.
+    DRIFT_STATUSES; the limit, and per day value and sigma, in 1e-4 deg or 1e-4 m, null where the day does not
+    say; the start as days of the calendar (first, earliest, latest), null where nothing changed. Values are
+    relative to the level before the change. `days` are ordinals of the calendar; `pairs` has a letter per
+    edge and day: accepted, held, refused, "." none.
     """
     first = _spans(window.owner, len(window.vehicles))
     of_chart = _spans(verdicts.charts.owner, len(verdicts.vehicles))
@@ -68,12 +68,9 @@ def _vehicle(
     """Numbers of one vehicle.
 
     Args:
-        window: records.
-        verdicts: of the charts.
         values: of all records.
         of: its rows among the records, and among the charts.
         shown: places of their edges on the page.
-        edges: of the page.
     """
     (rows, charts), (pair, of_chart) = of, shown
     days, column = np.unique(window.day[rows], return_inverse=True)

@@ -64,7 +64,7 @@ def _view(p: PairDifference) -> dict[str, object]:
 
 
 def _bar(z: float) -> Markup:
-    """A bar from 0 to z; the band of three sigmas is grey behind it, and what passes six is cut there."""
+    """A bar from 0 to z, cut at six sigmas; the band of three sigmas is grey behind it."""
     middle, unit = _WIDTH / 2, _WIDTH / 2 / _REACH
     end = middle + float(np.clip(z, -_REACH, _REACH)) * unit
     left, width = min(middle, end), max(abs(end - middle), 1.0)

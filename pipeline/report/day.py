@@ -13,6 +13,7 @@ from pipeline.geometry.changes import change_between, change_covariance
 from pipeline.report.words import AXIS_NAMES, dof_title, motion_in_words, scaled, unit_of
 from pipeline.rig.graph import Kind, Sensor, is_one_of_each
 from pipeline.store.current import prior_of, transform_of
+from pipeline.store.partitions import Lake
 from schemas.calibrations import DOF_NAMES, CalibrationRecord
 from schemas.drift import DriftFinding, kind_of_sensor, next_step, status_of
 from schemas.faults import in_words
@@ -188,9 +189,10 @@ class Answered:
 
 
 def answered(views: Sequence[PairView | Answered], poses: Sequence[PoseRow]) -> Sequence[PairView | Answered]:
-    """Sensors where the day has poses of them, the reference left out; else edges.
+    """Sensors if the day has poses of them, without the reference; else edges.
 
-    Of a rig with one sensor of each kind records are of the same poses: what nothing checks there, nothing checks here.
+    Records of a rig with one sensor of each kind hold the same poses, so unchecked axes there are unchecked
+    here.
     """
     one_of_each = is_one_of_each([Sensor(p.sensor, cast("Kind", p.kind)) for p in poses])
     unchecked = {frozenset(v.sensors): v.unchecked for v in views if one_of_each}
@@ -214,7 +216,6 @@ def answer_for(
 
     Args:
         views: the day's edges, or its sensors.
-        day: the page's day; a sensor that moved after it makes what is of it outdated.
         findings: the vehicle's current findings.
     """
     accepted = [v.title for v in views if v.status == "accepted"]
@@ -251,15 +252,18 @@ def _not_in(views: Sequence[PairView | Answered]) -> str:
 
 
 def _azimuth_only(views: Sequence[PairView | Answered]) -> str:
-    """A sentence on accepted pairs whose elevation nobody certifies; empty where there is none."""
+    """A sentence on accepted pairs without a certified elevation; empty if there are none."""
     limited = [
         v.title for v in views if v.status == "accepted" and v.certified and "elevation" not in v.certified
     ]
     return f" Certified in azimuth only: {', '.join(limited)}." if limited else ""
 
 
-def status_sentence(findings: Sequence[DriftFinding]) -> tuple[str, str]:
-    """The vehicle's stored status, and its reason as a sentence, with the sensor's motion where one moved."""
+def status_sentence(findings: Sequence[DriftFinding], lake: Lake) -> tuple[str, str]:
+    """The vehicle's stored status, its reason as a sentence, and the motion of a sensor that moved.
+
+    `lake` is named in the commands of the next step.
+    """
     stored = status_of(findings)
     sentence = f"{stored.reason[:1].upper()}{stored.reason[1:]}."
     moved = clearest_alarm(findings)
@@ -267,7 +271,7 @@ def status_sentence(findings: Sequence[DriftFinding]) -> tuple[str, str]:
         kind = kind_of_sensor(moved.moved_sensor, findings)
         motion = motion_in_words(kind, moved.moved_motion or [], moved.moved_motion_sigma or [])
         sentence = f"{sentence} Its motion: {motion}."
-    step = next_step(findings[0].vehicle, stored) if findings else ""
+    step = next_step(findings, str(lake.absolute()))
     return stored.status, f"{sentence} To do for {step}" if step else sentence
 
 

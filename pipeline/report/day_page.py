@@ -69,10 +69,6 @@ def write_day_page(
 
     Args:
         lake: holds calibrations; observations and frames where there shall be pictures.
-        partition: the vehicle-day.
-        fleet: names the fleet and the default method.
-        out: the HTML file.
-        method: None = `fleet.audit.method`.
         fleet_link: relative link to the fleet page; empty = none.
         pictures: False = none, and none of what is drawn from frames.
         read: the day's records and the vehicle's findings, where the caller has read them; None = read here.
@@ -102,14 +98,10 @@ def write_day_page(
 def write_day_picture(
     lake: Lake, partition: Partition, fleet: FleetConfig, out: Path, method: str | None = None
 ) -> Path:
-    """Write the day's richest frame as a picture: a still of prior and result, or one that moves between them.
+    """Write the day's richest frame as a still of prior and result, or as a picture that moves between them.
 
     Args:
-        lake: holds calibrations, observations and frames.
-        partition: the vehicle-day.
-        fleet: names the default method.
         out: .jpg or .png: still; .webp (smaller) or .gif: moving.
-        method: None = `fleet.audit.method`.
 
     Raises:
         ConfigError: the day has no record of the method, nothing to draw, or `out` has another suffix.
@@ -149,7 +141,7 @@ def _content(
     return {
         "environment": next(iter(records.values())).environment,
         "answer": answer_for(answered(views, poses), partition.day, findings),
-        "drift": _as_of(findings),
+        "drift": _as_of(findings, lake),
         "pairs": views,
         "labels": labels,
         "scenes": drawn,
@@ -165,9 +157,9 @@ def _content(
     }
 
 
-def _as_of(findings: Sequence[DriftFinding]) -> tuple[str, str]:
+def _as_of(findings: Sequence[DriftFinding], lake: Lake) -> tuple[str, str]:
     """The vehicle's status, and the audit that said so: pages of days are not drawn anew for every audit."""
-    status, sentence = status_sentence(findings)
+    status, sentence = status_sentence(findings, lake)
     return status, f"{sentence} (Audit until {findings[0].day}.)" if findings else sentence
 
 

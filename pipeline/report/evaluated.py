@@ -27,7 +27,6 @@ def page_of_runs(lake: Lake, compared: Sequence[ComparedRun], texts: Mapping[str
 
     Args:
         lake: of the runs; frames and observations are read for the pictures.
-        compared: what the tables are means of.
         texts: tables as Markdown, by title; lines that begin with "- " are notes.
     """
     by_method: dict[str, list[np.ndarray]] = {}

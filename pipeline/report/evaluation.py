@@ -1,7 +1,4 @@
-"""The page of `evaluate`: the paper's tables beside its printed numbers, and views like its figures 1 to 4.
-
-Plain values in, HTML out; who compared what with which truth is not known here.
-"""
+"""The page of `evaluate`: the paper's tables beside its printed numbers, and views like its figures 1 to 4."""
 
 from __future__ import annotations
 
@@ -88,12 +85,9 @@ def evaluation_page(
     """HTML of the whole page, no outside resources.
 
     Args:
-        tables: Table 1 and extended data table 1.
-        runs: what the tables are means of.
-        views: frames to draw, like the paper's figures 1, 3 and 4.
-        normalised: by method, errors over their own sigmas of all observable DoF; empty where truth is positions.
+        normalised: by method, errors over their own sigmas of all observable DoF; empty where truth is
+            positions.
         notes: where the truth comes from, and what else must be known to read the tables.
-        no_views: why there are none.
     """
     methods = [m for m in _COLOURS if any(r.method == m for r in runs)]
     return render(

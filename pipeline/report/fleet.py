@@ -16,6 +16,7 @@ from pipeline.report.names import page_stem
 from pipeline.report.verdicts import FleetVerdicts
 from pipeline.report.window import FleetWindow
 from pipeline.report.words import motion_in_words, with_sigma
+from pipeline.store.partitions import Lake
 from schemas.calibrations import STATUSES
 from schemas.drift import DRIFT_STATUSES, DriftFinding, kind_of_sensor, status_of
 from schemas.words import DAY_WORDS, day_word
@@ -43,9 +44,6 @@ class VehicleRow:
     """One vehicle of the table.
 
     Args:
-        vehicle: its name.
-        status: of DRIFT_STATUSES.
-        sentence: why.
         sensor: that moved; empty where none did or nobody knows.
         since: first day after the change; empty where there was none.
         days: a letter of DAY_LETTERS per day of the table, capital where the day has a page.
@@ -78,16 +76,12 @@ class FindingView:
 
 
 def fleet_rows(
-    window: FleetWindow, verdicts: FleetVerdicts, pages: Collection[tuple[str, str]]
+    window: FleetWindow, verdicts: FleetVerdicts, pages: Collection[tuple[str, str]], lake: Lake
 ) -> tuple[list[str], list[VehicleRow]]:
-    """The table's days, and its vehicles: what a person should look at first comes first.
+    """The table's days, and its vehicles: the most urgent first.
 
-    RED before YELLOW, UNKNOWN and GREEN; what changed last before what has been known for long.
-
-    Args:
-        window: records.
-        verdicts: of the last audit.
-        pages: vehicle-days that have a page.
+    RED before YELLOW, UNKNOWN and GREEN; the latest changes first. `lake` is named in the commands of the
+    next steps.
     """
     ordinals, letters = _letters(window)
     names = [dt.date.fromordinal(day).isoformat() for day in ordinals.tolist()]
@@ -95,7 +89,7 @@ def fleet_rows(
     first = max(0, len(names) - _COLUMNS)
     rows = []
     for vehicle in sorted({*window.vehicles, *verdicts.vehicles}):
-        status, sentence = status_sentence(verdicts.findings.get(vehicle, []))
+        status, sentence = status_sentence(verdicts.findings.get(vehicle, []), lake)
         stored = status_of(verdicts.findings.get(vehicle, []))
         shown = letters[place[vehicle]] if vehicle in place else "." * len(names)
         marked = [
@@ -154,7 +148,7 @@ def headline_for(verdicts: FleetVerdicts, views: Sequence[FindingView]) -> tuple
     statuses = [status_of(own).status for own in verdicts.findings.values()]
     vehicles = _count(len(statuses), "vehicle")
     if not statuses:
-        return "UNKNOWN", "No audit yet: run boresight audit."
+        return "UNKNOWN", "No audit yet: run `boresight audit`."
     worst = min(statuses, key=DRIFT_STATUSES.index)
     if worst == "GREEN":
         return worst, f"No sensor moved on {vehicles}."

@@ -49,12 +49,9 @@ def render_fleet_page(
 
     Args:
         album: where it is, and what it is about.
-        window: records.
-        verdicts: of the last audit.
-        pages: vehicle-days that have a page.
         truth: true extrinsics by (vehicle, day) and pair, where a simulated fleet has them.
     """
-    days, rows = fleet_rows(window, verdicts, pages)
+    days, rows = fleet_rows(window, verdicts, pages, album.lake)
     views = finding_views(verdicts.findings)
     edges, charts = charted_edges(window, verdicts), fleet_charts(window, verdicts)
     records = fleet_records(album.lake, album.method, album.fleet.audit.window_days) if truth else []
@@ -121,7 +118,7 @@ def _write_charts(
 ) -> list[str]:
     """Write the charts' numbers in files of a few dozen vehicles; returns the file of each vehicle.
 
-    A vehicle stays in its file when others come and go.
+    A vehicle stays in its file if others come and go.
     """
     count = 1 << max(0, (len(rows) - 1) // _VEHICLES_A_FILE).bit_length()
     file_of = {row.vehicle: f"{count}-{zlib.crc32(row.vehicle.encode()) % count:04d}.js" for row in rows}

@@ -20,15 +20,7 @@ _LABELS = ("before", "from this frame")
 
 
 def write_frame_page(path: Path, scene: Scene, prior: Prior, solution: Solution, title: str) -> Path:
-    """Write pictures at the prior and at the solution, and how sure one frame is of each pair.
-
-    Args:
-        path: the HTML file.
-        scene: what was calibrated from, and what perception found in it.
-        prior: start.
-        solution: result.
-        title: vehicle, day and frame.
-    """
+    """Write pictures at the prior and at the solution, and the sigmas of each pair from one frame."""
     before = Extrinsics(*(prior.of(pair) for pair in PAIRS))
     after = Extrinsics(*(solution.pairs[pair].T for pair in PAIRS))
     views = [

@@ -15,10 +15,10 @@ _READABLE = 60  # letters of an odd name that are kept; what a name differs in m
 
 
 def page_stem(vehicle: str) -> str:
-    """What a vehicle's pages are called, without the ending: its name where that is plain.
+    """File name of a vehicle's pages, without the ending: the vehicle's name if that is plain.
 
-    Case, accents and signs look alike on one file system or another ("Car" and "car", "a b" and "a_b"): such a name
-    gets "~" and a hash of the whole, and no plain name has a "~".
+    Case, accents and signs look alike on some file systems ("Car" and "car", "a b" and "a_b"): such a name
+    gets "~" and a hash of the whole; no plain name has a "~".
     """
     if _PLAIN.fullmatch(vehicle) and not _DEVICES.fullmatch(vehicle):
         return vehicle

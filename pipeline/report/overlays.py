@@ -116,10 +116,7 @@ def lidar_view(scene: Scene, state: Extrinsics, window: Window, label: str) -> I
 
 
 def lidar_window(scene: Scene, state: Extrinsics) -> Window:
-    """What the lidar sees of the image: all but its outermost hundredths, and a margin.
-
-    The whole image where the lidar sees none of it.
-    """
+    """Part of the image that the lidar covers without its outermost hundredths, with a margin; else all."""
     camera = camera_of(scene.frame)
     uv, _ = _project(camera, state.T_camera_lidar, scene.frame.lidar_xyz_m)
     if not len(uv):

@@ -32,15 +32,10 @@ def between(before: Extrinsics, after: Extrinsics, share: float) -> Extrinsics:
 def write_picture(
     out: Path, scene: Scene, before: Extrinsics, after: Extrinsics, labels: tuple[str, str]
 ) -> Path:
-    """Write the scene's camera image with lidar and moving radar in it, at two states.
+    """Write the scene's camera image with lidar and moving radar at two states, with labels.
 
-    Args:
-        out: .jpg or .png: a still, its left half at `before`, its right half at `after`; .webp or .gif: a picture that
-            moves from `before` to `after`, then over again. Its folder is made.
-        scene: the frame.
-        before: as far as the prior knows.
-        after: as far as the result knows.
-        labels: names of both states.
+    .jpg and .png are stills, left half `before`, right half `after`; .webp and .gif move between the two. The
+    folder is created.
 
     Raises:
         ConfigError: another suffix.

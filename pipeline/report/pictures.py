@@ -43,7 +43,7 @@ class ScenePictures:
 
 
 def close_ups_of(scene: Scene, before: Extrinsics, after: Extrinsics) -> CloseUps:
-    """Windows where the lidar has most to say, enlarged, at both states."""
+    """Windows with most lidar edges at silhouettes, enlarged, at both states."""
     windows = choose_windows(scene.observation, after.T_camera_lidar, _CLOSE_UPS)
     width = windows[0].size_px[0] if windows else 1
     zoom = max(2, round(_CLOSE_UP_WIDTH_PX / width))

@@ -1,7 +1,7 @@
-"""People and number plates made unrecognisable in pictures: road users in mosaic.
+"""Pictures with people and number plates made unrecognisable: road users in mosaic.
 
-What hides is what perception found: the pixels of its classes and its detections, grown by a margin. A person whom
-neither the segmenter nor the detector found stays visible; where that may not be, pages go without pictures.
+The mosaic covers pixels of road users' classes and detections, grown by a margin. A person found by neither
+segmenter nor detector stays visible; if that must not happen, draw pages without pictures.
 """
 
 from __future__ import annotations

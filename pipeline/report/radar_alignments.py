@@ -12,11 +12,7 @@ __all__ = ["alignment_lines"]
 
 
 def alignment_lines(row: Mapping[str, Any]) -> list[dict[str, str]]:
-    """A line for each axis that a row of table `radar_alignments` states, cells by their headings.
-
-    Args:
-        row: of the table, by column.
-    """
+    """A line for each axis that a row of table `radar_alignments` states, cells by their headings."""
     first, last = (_clock(row[f"{end}_stamp_ns"]) for end in ("first", "last"))
     lines = []
     for axis in ("azimuth", "elevation"):

@@ -48,11 +48,7 @@ _FRAMES_LOOKED_AT = 60  # evenly spread; more dots say nothing more
 
 
 def day_records(lake: Lake, partition: Partition, method: str) -> dict[str, CalibrationRecord]:
-    """Current records of a vehicle-day by edge, in order of edges.
-
-    Raises:
-        ConfigError: the day has no record of the method.
-    """
+    """Current records of a vehicle-day in order of edges; raises ConfigError if there are none."""
     found = read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle=partition.vehicle, day=partition.day)
     records = _by_edge(r for r in found if r.method == method)
     if not records:
@@ -119,11 +115,9 @@ def _by_edge(records: Iterable[CalibrationRecord]) -> dict[str, CalibrationRecor
 def drawn_records(
     records: Mapping[str, CalibrationRecord], camera: str | None = None
 ) -> dict[str, CalibrationRecord]:
-    """By pair, the records that pictures of one camera, one lidar and one radar are drawn from: the first of each kind.
+    """Records by pair for pictures of one camera, lidar and radar: the first of each kind.
 
-    Args:
-        records: of a vehicle-day, as `day_records` gives them.
-        camera: which one, and its lidar alone; None = the first, and a radar.
+    With `camera`, that camera and its lidar alone.
     """
     chosen: dict[str, CalibrationRecord] = {}
     # Of each kind the sensor that is drawn.
@@ -137,7 +131,7 @@ def drawn_records(
 
 
 def names_drawn(drawn: Mapping[str, CalibrationRecord]) -> Chosen | None:
-    """The sensors of such records by kind; None of a vehicle whose sensors are called by their kinds."""
+    """The sensors of such records by kind; None for a vehicle whose sensors are named camera, lidar and radar."""
     names = {
         kind: name
         for record in drawn.values()
@@ -161,9 +155,9 @@ def drift_of(lake: Lake, method: str, vehicle: str) -> list[DriftFinding]:
 
 
 def states_of(records: Mapping[str, CalibrationRecord]) -> tuple[Extrinsics, Extrinsics] | None:
-    """Extrinsics at the prior and at the result; a pair without a result stays at its prior, one without either is NaN.
+    """Extrinsics at prior and result; None if no pair has either.
 
-    None where no pair has either.
+    A pair without a result stays at its prior; one without either is NaN.
     """
     prior = {p: prior_of(r) for p, r in records.items()}
     result = {p: transform_of(r) for p, r in records.items()}

@@ -1,8 +1,8 @@
-"""How well the sensors agree in each frame, before and after: for the eye, never for the verdict.
+"""Agreement of the sensors in each frame, before and after: for the reader, not for the verdict.
 
 A low residual is not accuracy: a calibration can be repeatable, fit best and still be wrong. The verdict
-rests on held-out frames, restarts and sigmas (pipeline.calibrate.verify); these numbers show what a person can check
-in the pictures.
+rests on held-out frames, restarts and sigmas (pipeline.calibrate.verify); these numbers can be checked in the
+pictures.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from schemas.observations import EDGE_LEFT, EDGE_RIGHT, Observation
 
 __all__ = ["MEASURES", "at_pixels", "boundary_distance_px", "frame_residuals"]
 
-# pair -> what is measured; more is better
+# pair -> measured quantity; more is better
 MEASURES = {
     "camera_lidar": "lidar edges on a silhouette [%]",
     "camera_radar": "moving radar inside a road user's box [%]",
@@ -60,11 +60,9 @@ def frame_residuals(
 
 
 def boundary_distance_px(observation: Observation, only: Sequence[int] = ()) -> Float[np.ndarray, "H W"]:
-    """Distance of each label pixel to the nearest sideways change of label, in full-image pixels; inf without one.
+    """Distance of each label pixel to the nearest sideways change of label [full-image px], or inf.
 
-    Args:
-        observation: holds the label image.
-        only: labels of which one must lie at the change; empty = any.
+    `only` are labels of which one must lie at the change; empty = any.
     """
     labels = _decode_labels(observation)
     change = np.zeros(labels.shape, bool)

@@ -42,8 +42,6 @@ class DrawnSensor:
     """A sensor of the drawing.
 
     Args:
-        name: in the rig.
-        kind: camera, lidar, radar or base.
         T_body_sensor: its pose in axes x forward, y left, z up.
         width_rad: of its field of view, about where it looks; 2 pi = all around.
         status: accepted, held, refused or none.
@@ -93,12 +91,7 @@ def rig_figure(sensors: Sequence[DrawnSensor], edges: Sequence[DrawnEdge]) -> Ma
 
 
 def rig_of_day(poses: Sequence[PoseRow], records: Iterable[CalibrationRecord]) -> Markup:
-    """The rig as a day's poses have it; empty without them.
-
-    Args:
-        poses: of one vehicle-day, current ones.
-        records: of its edges.
-    """
+    """The rig by a day's current poses and edges; empty without poses."""
     T = {p.sensor: pose for p in poses if (pose := transform_of(p)) is not None}
     by_name = {p.sensor: p for p in poses}
     if len(T) < 2:

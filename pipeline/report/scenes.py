@@ -33,10 +33,10 @@ def choose_frames(observations: Sequence[Observation], T_camera_lidar: np.ndarra
 
 
 def choose_windows(observation: Observation, T_camera_lidar: np.ndarray, count: int) -> list[Window]:
-    """Windows in which many sideways depth jumps of near objects have a silhouette to lie on: vehicles, poles, signs.
+    """Windows with many sideways depth jumps of near objects at silhouettes: vehicles, poles, signs.
 
-    Chosen on the calibrated state, so that before and after show the same window; a window says how well the two states
-    agree with the picture only because a person looks at it.
+    Chosen at the calibrated state, so that before and after show the same window. A person must judge the
+    agreement.
     """
     uv, weight = _weighted_edges(observation, T_camera_lidar)
     focal_px = camera_of(observation).focal_px[0]

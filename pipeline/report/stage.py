@@ -25,13 +25,11 @@ __all__ = ["Pages", "work", "write_day_page", "write_day_picture", "write_fleet_
 
 @dataclass(frozen=True)
 class Pages:
-    """What a task of this stage is given.
+    """Inputs of a task of this stage.
 
     Args:
-        out: the HTML file to write.
         truth: of a simulated fleet.
         pictures: False = pages without images of public roads.
-        files: where `out` is.
         also: vehicle-days that get a page however long ago they were: those that a night ran.
         fan_out: where pages of days are drawn.
     """

@@ -1,8 +1,7 @@
-"""Time offsets in pictures: sweep, image and scan of a frame were taken some time apart, and the car drove on.
+"""Time offsets in pictures: motion of the car between sweep, image and scan of a frame.
 
-That time is the gap of the frame's stamps and the offset of the clocks together.
-
-At 15 m/s an offset of 30 ms is half a metre: pictures of a calibration without its time offsets look worse than it is.
+The time is the gap of the frame's stamps plus the offset of the clocks. At 15 m/s, 30 ms are half a metre:
+without offsets, pictures of a calibration look worse than it is.
 """
 
 from __future__ import annotations
@@ -41,9 +40,9 @@ def time_offsets_of(records: Mapping[str, CalibrationRecord]) -> TimeOffsets:
 
 
 def as_stamped(state: Extrinsics, observation: Observation, offsets: TimeOffsets) -> Extrinsics:
-    """Transforms between data of one frame, for what stands still: the poses and the car's own way over the offsets.
+    """Transforms between data of one frame, for static objects: poses and the car's motion over the offsets.
 
-    T_camera_radar stays as it is: it draws moving clusters only, whose way is their own.
+    T_camera_radar stays, because it draws moving clusters only.
     """
     v, yaw_rate = _velocity_lidar(state, observation), observation.ego_yaw_rate_radps or 0.0
     camera_gap_s, radar_gap_s = (
@@ -65,7 +64,7 @@ def _way(
 
 
 def _velocity_lidar(state: Extrinsics, observation: Observation) -> Float[np.ndarray, " 3"]:
-    """Own velocity in lidar axes: the radar's heading, level; straight ahead where the radar saw none."""
+    """Own velocity in lidar axes: the radar's heading, level; straight ahead without a radar velocity."""
     speed_mps = observation.ego_speed_mps or 0.0
     ahead = np.array([1.0, 0.0, 0.0])
     if observation.radar_velocity_mps is not None and speed_mps:

@@ -61,7 +61,7 @@ def _poses(content: Mapping[str, Any]) -> dict[str, np.ndarray]:
     if "T_base_sensor" in content:
         of = content["T_base_sensor"]
         return {name: np.array(T, dtype=float) for name, T in of.items()} | {"base": np.eye(4)}
-    # Nothing else is asked of the base, so the camera can stand for it.
+    # Only relative poses are used, so the camera can replace the base.
     seen = {n: np.array(content[f"T_camera_{n}"], dtype=float) for n in ("lidar", "radar")}
     return {"camera": np.eye(4)} | seen
 

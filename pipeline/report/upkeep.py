@@ -53,9 +53,6 @@ class Album:
     """The pages of a report's vehicle-days: `LAKE/report/fleet_days/2026-03-01/car-1.html`.
 
     Args:
-        lake: what they are drawn from.
-        fleet: names the fleet.
-        method: of the records.
         page: the fleet page beside whose folder they lie.
         files: where it is.
         pictures: False = pages without images of public roads.
@@ -102,11 +99,9 @@ def draw_days(
     What could not be drawn is named in `lake.damage`.
 
     Args:
-        album: the pages.
         stamps: what each vehicle-day's page would be drawn from (`stamp_of`).
         findings: of the last audit, by vehicle.
         fan_out: where drawing is done.
-        progress: told how far it is.
     """
     by_day: dict[str, dict[str, str]] = {}
     for (vehicle, day), stamp in stamps.items():
@@ -134,10 +129,9 @@ def draw_days(
 
 
 def stamp_of(album: Album, work_keys: Iterable[str], findings: Sequence[DriftFinding]) -> str:
-    """What a day's page is drawn from: it is drawn again where that changed.
+    """Inputs of a day's page; it is drawn again if they changed.
 
-    A sensor that moved is among it, since it makes the numbers of days before unsafe; what else an audit says of the
-    vehicle changes nightly and is on the fleet page.
+    A sensor that moved is included, because it invalidates the numbers of days before.
     """
     stored = status_of(findings)
     moved = [stored.sensor, stored.since] if stored.status == "RED" else None

@@ -1,4 +1,4 @@
-"""What the last audit said of a whole fleet, as columns; whole rows only of the vehicles where something changed."""
+"""The last audit's findings of a whole fleet, as columns; whole rows only of vehicles with a change."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from schemas.drift import DRIFT, DRIFT_STATUSES, DriftFinding
 
 __all__ = ["ChartVerdicts", "FleetVerdicts", "read_verdicts"]
 
-# `inputs` is most of a row and says nothing that a page shows.
+# `inputs` is most of a row, and no page shows it.
 _COLUMNS = tuple(c.name for c in DRIFT.columns if c.name not in {"inputs", "recorded_at"})
 _ALARMS = ("RED", "YELLOW")
 
@@ -55,11 +55,9 @@ class FleetVerdicts:
     """Findings of every vehicle's last audit.
 
     Args:
-        vehicles: audited ones, in order of name.
-        findings: by vehicle: all of its findings where something changed, else one, which has the vehicle's status.
-        charts: all of them.
+        findings: by vehicle: all of its findings where something changed, else one, which has the vehicle's
+            status.
         audited: days that the audits ended with.
-        work_keys: of the audits.
     """
 
     vehicles: list[str]
@@ -70,12 +68,7 @@ class FleetVerdicts:
 
 
 def read_verdicts(lake: Lake, method: str) -> FleetVerdicts:
-    """The findings of the last audit of the method; audits look at all vehicles.
-
-    Args:
-        lake: where they are.
-        method: of the audited records.
-    """
+    """The findings of the last audit of the method; audits look at all vehicles."""
     found = read_last_columns(lake, DRIFT, method, _COLUMNS)
     if found is None:
         none = np.zeros(0, np.int64)

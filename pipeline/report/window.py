@@ -1,7 +1,7 @@
-"""The last days of a whole fleet as columns: what the fleet page and its charts are made of.
+"""The last days of a whole fleet as columns: input of the fleet page and its charts.
 
-Ten thousand vehicles have a million records in four weeks: as rows they would be gigabytes, as columns they are some
-hundred megabytes.
+Ten thousand vehicles have a million records in four weeks: gigabytes as rows, some hundred megabytes as
+columns.
 """
 
 from __future__ import annotations
@@ -39,17 +39,13 @@ class FleetWindow:
     """Current records of a method, in order of vehicle, day and edge.
 
     Args:
-        vehicles: names, in order.
         owner: which of them a record is of.
         day: ordinals of the calendar.
         edges: that any record is of, in order.
         edge: which of them a record is of.
-        status: places in STATUSES.
         T: T_parent_child; not finite where the day was refused.
         sigma: of (rotation vector [rad], origin [m]); not finite where the day was refused.
         observable: per DoF, whether the day determined it.
-        work_key: of each record.
-        code_versions: of all of them.
     """
 
     vehicles: list[str]
@@ -77,8 +73,6 @@ def read_window(lake: Lake, method: str, window_days: int, latest: str) -> Fleet
     """The last `window_days` days that have a record of the method, and of vehicles that drive rarely more.
 
     Args:
-        lake: where the records are.
-        method: of them.
         window_days: days of the calendar.
         latest: days after it are to come, and left out.
     """

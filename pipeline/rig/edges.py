@@ -21,16 +21,7 @@ _COLUMNS: Final = ("pair", "parent_frame", "child_frame")
 
 
 def edge_named(pair: str, parent: str, child: str) -> Edge:
-    """The edge of the given kind between two sensors.
-
-    Args:
-        pair: kind of the edge, e.g. camera_lidar.
-        parent: name of a sensor.
-        child: name of another sensor.
-
-    Raises:
-        ValueError: unknown kind, or both names are the same.
-    """
+    """The edge of kind `pair` between two sensors; ValueError if the kind is unknown or the names equal."""
     if pair not in EDGE_KINDS:
         raise ValueError(f"no edge is of the kind {pair!r}: there are {', '.join(EDGE_KINDS)}")
     kinds = [cast("Kind", kind) for kind in pair.split("_")]
@@ -60,11 +51,7 @@ def words_of(edge: Edge) -> str:
 
 
 def edges_of_rows(rows: pa.Table) -> tuple[tuple[Edge, ...], Int[np.ndarray, " N"]]:
-    """Unique sorted edges of rows, and the index of each row's edge among them (-1 if the row has none).
-
-    Args:
-        rows: table with columns pair, parent_frame and child_frame.
-    """
+    """Unique sorted edges of rows (pair, parent_frame, child_frame), and each row's edge, or -1."""
     names = [pc.fill_null(rows[name], "").combine_chunks() for name in _COLUMNS]
     coded = pc.binary_join_element_wise(*names, "\0").dictionary_encode()
     found = [_edge_or_none(*text.split("\0")) for text in coded.dictionary.to_pylist()]

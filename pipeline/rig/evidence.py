@@ -24,20 +24,15 @@ class EdgeEvidence:
     information.
 
     Args:
-        edge: the edge.
-        T: T_parent_child at the point of linearisation.
         dt_s: clock offset at that point.
         information: 7 7, from the data alone, robust (it includes the scatter between scenes).
         gradient: 7, descent: without a prior the step is information^-1 gradient.
         bias: covariances 6 6 of errors common to all frames, by owner: a sensor's name (error of its
             intrinsics or elevation, as an apparent rotation in the sensor's axes), or EDGE (in the parent's
             axes).
-        frames_used: number of frames used.
-        frames_rejected: number of frames not used, by reason.
         checks: failed checks of this edge: basin, halves, held-out frames. Such an edge is left out of the
             adjustment.
         diagnostics: numbers for the record, names with units.
-        notes: remarks for the record.
     """
 
     edge: Edge

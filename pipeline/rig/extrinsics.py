@@ -22,8 +22,6 @@ class Extrinsics:
     [m]. The reference has the identity, and no rows in the covariance.
 
     Args:
-        reference: reference sensor of all poses.
-        T: by sensor name, reference included.
         order: sensors in the order of the covariance's rows, six rows each, without the reference.
         covariance: of all perturbations jointly.
         common: part of the covariance from errors common to all days of a vehicle.

@@ -40,12 +40,7 @@ TIE_KINDS: Final = (*EDGE_KINDS, "camera_camera", "radar_radar", "camera_base")
 
 @dataclass(frozen=True, order=True)
 class Sensor:
-    """A node of the rig.
-
-    Args:
-        name: unique in the rig, for all kinds together.
-        kind: camera, lidar, radar, or base for the vehicle frame.
-    """
+    """A node of the rig; its name is unique for all kinds together; base is the vehicle frame."""
 
     name: str
     kind: Kind
@@ -60,11 +55,7 @@ BASE: Final = Sensor("base", "base")
 
 @dataclass(frozen=True, order=True)
 class Edge:
-    """Two nodes with an estimated T_parent_child: calibrated directly, or through other nodes (`tie`).
-
-    Raises:
-        ValueError: both nodes are the same, or in the wrong order.
-    """
+    """Two nodes with an estimated T_parent_child: calibrated directly, or through other nodes (`tie`)."""
 
     parent: Sensor
     child: Sensor
@@ -102,11 +93,7 @@ def possible_edges(nodes: Sequence[Sensor]) -> tuple[Edge, ...]:
 
 
 def edge_between(a: Sensor, b: Sensor) -> Edge:
-    """The edge between two sensors, given in any order.
-
-    Raises:
-        ValueError: these kinds cannot be calibrated against each other.
-    """
+    """The edge between two sensors in any order; ValueError if their kinds have no calibration."""
     found = tie(a, b)
     if found.kind not in EDGE_KINDS:
         raise ValueError(_no_edge(*found.sensors))
@@ -114,11 +101,7 @@ def edge_between(a: Sensor, b: Sensor) -> Edge:
 
 
 def tie(a: Sensor, b: Sensor) -> Edge:
-    """An edge between two nodes of any kinds and in any order, for relative poses from any method.
-
-    Raises:
-        ValueError: both nodes are the same.
-    """
+    """An edge between two different nodes of any kinds and in any order, for relative poses of any method."""
     return Edge(*sorted((a, b), key=lambda s: (KINDS.index(s.kind), s.name)))
 
 
@@ -139,9 +122,7 @@ class RigGraph:
     """Sensors, edges and the reference sensor of the poses.
 
     Args:
-        sensors: with unique names.
         edges: between sensors of the rig, each once.
-        reference: one of the sensors.
 
     Raises:
         ValueError: a duplicate name, a duplicate edge, or an edge or reference with a sensor outside the rig.

@@ -27,13 +27,7 @@ _DIRECTIONS = 10_000  # about 2 deg apart, the resolution of a view's borders
 
 @dataclass(frozen=True)
 class Overlap:
-    """Overlap of the views of two sensors.
-
-    Args:
-        edge: edge between the two sensors.
-        share: share of the directions of the smaller view, mean over 15, 25 and 40 m.
-        shared_sr: solid angle of the overlap.
-    """
+    """Solid angle of the overlap of two sensors; its share of the smaller view, mean of 15, 25, 40 m."""
 
     edge: Edge
     share: float
@@ -78,8 +72,6 @@ def find_edges(
     reference form other components of the graph. A rig with one sensor of each kind has all pairs as edges.
 
     Args:
-        prior: prior of the rig, with its nodes.
-        overlaps: overlaps of its sensors.
         named: edges from fleet.toml; if given, the graph has only these.
         reference: reference sensor from fleet.toml; None = the lidar with most edges, or a radar in a rig
             without lidar.

@@ -56,8 +56,6 @@ class RigPrior:
     mounting error is part of all poses in it. Without a vehicle frame, sensors are mounted on the reference.
 
     Args:
-        nodes: sensors, and `base` if the rig has it.
-        reference: reference sensor of the poses.
         T: transforms of the stars, by (parent, child).
         sigmas: sigma of each sensor's mounting: rotation [rad] and translation [m], isotropic about the
             sensor.
@@ -125,9 +123,7 @@ def star_of(
 ) -> dict[tuple[str, str], Float[np.ndarray, "4 4"]]:
     """Stars of known transforms: one about the middle, another for nodes that it does not reach, and so on.
 
-    Args:
-        nodes: nodes with some known transform, e.g. frames of logged data.
-        transform: T_a_b for two names, None if no chain of transforms connects them.
+    `transform` returns T_a_b for two names, None if no chain of transforms connects them.
     """
     found, left = dict[tuple[str, str], np.ndarray](), list(nodes)
     while any(n.kind in _MIDDLES for n in left):
@@ -153,11 +149,7 @@ def to_rows(stars: Iterable[Star]) -> list[dict[str, Any]]:
 
 
 def from_rows(rows: Iterable[Mapping[str, Any]]) -> dict[tuple[str, str], Float[np.ndarray, "4 4"]]:
-    """The star common to all logs of the day.
-
-    Raises:
-        SolveError: a transform changes over the day.
-    """
+    """The star common to all logs of the day; raises SolveError if a transform changes over the day."""
     ordered = sorted(rows, key=lambda row: (*row["q"], *row["t_m"]))
     return agreed({(row["parent"], row["child"]): transform_of_row(row)} for row in ordered)
 
@@ -168,11 +160,7 @@ def transform_of_row(row: Mapping[str, Any]) -> Float[np.ndarray, "4 4"]:
 
 
 def agreed(stars: Iterable[Star]) -> dict[tuple[str, str], Float[np.ndarray, "4 4"]]:
-    """The common star of several, with the numbers of the first.
-
-    Raises:
-        SolveError: a transform changes over the day.
-    """
+    """The common star of several, with the first one's numbers; SolveError if a transform changes."""
     found: dict[tuple[str, str], list[np.ndarray]] = {}
     for ends, T in (item for star in stars for item in star.items()):
         found.setdefault(ends, []).append(T)

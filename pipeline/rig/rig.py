@@ -105,10 +105,7 @@ class Rig(Section):
         return tuple(edge_between(nodes[a], nodes[b]) for a, b in self.edges)
 
     def one_of_each(self, what: str) -> dict[str, str]:
-        """Sensor names by kind, for a consumer of one camera, one lidar and one radar.
-
-        Args:
-            what: name of the consumer, for the error.
+        """Sensor names by kind, for a consumer `what` of one camera, one lidar and one radar.
 
         Raises:
             ConfigError: the rig has several sensors of a kind, and `three` names none of them.

@@ -41,11 +41,7 @@ def view_of_camera(camera: Camera) -> View:
 
 
 def view_of_clouds(clouds: Sequence[Float[np.ndarray, "_ 3"]]) -> View | None:
-    """View of a lidar or radar from sweeps or scans of its day; None if there are too few points.
-
-    Args:
-        clouds: evenly spaced over the day, ideally FRAMES of them; in the sensor's frame [m].
-    """
+    """View of a lidar or radar from sweeps or scans over its day [m]; None if there are too few points."""
     if sum(len(c) for c in clouds) < _FEWEST:
         return None
     return _of_points(np.concatenate([c[:: max(len(c) // _POINTS, 1)] for c in clouds]).astype(np.float64))

@@ -93,11 +93,7 @@ class DayFaults:
 
 
 def parse_faults(text: str, days: list[str], rig: RigSpec = RIGS["demo"]) -> tuple[Fault, ...]:
-    """Parse a list of faults; a day is one of `days` or its number, a sensor one of the rig's.
-
-    Raises:
-        ConfigError: wrong number of parts, unknown day, sensor or kind, or an amount that is no number.
-    """
+    """Parse a list of faults; a day is one of `days` or its number. ConfigError if one is invalid."""
     faults = []
     for item in filter(None, re.split(r"[,\s]+", text)):
         parts = item.split(":")

@@ -105,11 +105,7 @@ def vehicle_names(spec: FleetSpec) -> list[str]:
 
 
 def day_names(first_day: str, days: int) -> list[str]:
-    """Consecutive days as YYYY-MM-DD.
-
-    Raises:
-        ConfigError: `first_day` is not a valid day.
-    """
+    """Consecutive days as YYYY-MM-DD; raises ConfigError if `first_day` is not a valid day."""
     try:
         first = date.fromisoformat(first_day)
     except ValueError as err:
@@ -120,11 +116,7 @@ def day_names(first_day: str, days: int) -> list[str]:
 def simulate_fleet(
     spec: FleetSpec, out: Path, progress: Progress = silent, workers: int = 1
 ) -> dict[str, Any]:
-    """Write `logs/<vehicle>/<day>/`, `truth/<vehicle>/<day>.json` and `fleet.toml` under `out`.
-
-    Returns:
-        Counts and paths, for a summary.
-    """
+    """Write `logs/VEHICLE/DAY/`, `truth/VEHICLE/DAY.json` and `fleet.toml` to `out`; returns a summary."""
     vehicles, days = vehicle_names(spec), day_names(spec.first_day, spec.days)
     out.mkdir(parents=True, exist_ok=True)
     (out / "fleet.toml").write_text(

@@ -43,11 +43,7 @@ _SUN: Final = np.array([0.35, 0.55, 0.76]) / np.linalg.norm([0.35, 0.55, 0.76])
 def simulate_reflectors(
     spec: FleetSpec, vehicle: int, day: int, out: Path, frames: int = 150, progress: Progress = silent
 ) -> Path:
-    """Write `reflectors/<vehicle>/<day>.mcap` and `<day>.json` (picked positions, and separately the truth).
-
-    Returns:
-        Path of the JSON file.
-    """
+    """Write `reflectors/<vehicle>/<day>.mcap` and `<day>.json` (picks and truth); returns the latter."""
     name, day_name = vehicle_names(spec)[vehicle], day_names(spec.first_day, spec.days)[day]
     rig, mounting = rig_of(spec, vehicle), mounting_on(spec, vehicle, day)
     rng = np.random.default_rng([spec.seed, vehicle, day, 71])

@@ -23,13 +23,10 @@ __all__ = ["assert_records", "commit_last", "commit_records"]
 
 
 def commit_records(lake: Lake, schema: TableSchema, rows: Iterable[Any]) -> int:
-    """Add records as one commit, and make them current for their keys.
+    """Add records as one commit, and make them current for their keys; returns how many changed.
 
     A row whose work is recorded already is not added again; if another row became current since, the recorded
     one becomes current once more. `recorded_at` and `asserted_at` are set here unless the row has them.
-
-    Returns:
-        Number of rows that were added or became current again.
 
     Raises:
         ContractError: the lake is of another release, or a row breaks its table's contract.
@@ -55,13 +52,10 @@ def commit_records(lake: Lake, schema: TableSchema, rows: Iterable[Any]) -> int:
 
 
 def commit_last(lake: Lake, schema: TableSchema, rows: Sequence[Any]) -> int:
-    """Add rows of a stage of the whole fleet, all with one stamp later than any before; see `read_last`.
+    """Add rows of a stage of the whole fleet, with one stamp later than any before; see `read_last`.
 
-    Returns:
-        Number of rows that were added or became current again; 0 if the same rows were the last already.
-
-    Raises:
-        ContractError, OSError: as `commit_records`.
+    Returns the number of rows that became current; 0 if the same rows were the last already. Raises as
+    `commit_records`.
     """
     if not rows:
         return 0
@@ -74,11 +68,7 @@ def commit_last(lake: Lake, schema: TableSchema, rows: Sequence[Any]) -> int:
 
 
 def assert_records(lake: Lake, schema: TableSchema, rows: Sequence[Any]) -> int:
-    """Make recorded rows current again if others with the same key became current since; adds nothing.
-
-    Returns:
-        Number of rows that became current again.
-    """
+    """Make recorded rows current again if others became current since; returns how many did."""
     known = _known(lake, schema, rows)
     now = dt.datetime.now(dt.UTC)
     changed = []

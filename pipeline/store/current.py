@@ -39,29 +39,17 @@ _Said = TypeVar("_Said", DriftFinding, StateRow)
 
 
 def current_records(records: Sequence[CalibrationRecord]) -> list[CalibrationRecord]:
-    """The current record of each (vehicle, day, method, edge), in this order.
-
-    Args:
-        records: as `read_records` returns them, the last asserted last.
-    """
+    """The current record of each (vehicle, day, method, edge), in this order; `records` by assertion."""
     return _last_of_each(records, CALIBRATIONS)
 
 
 def current_poses(poses: Sequence[PoseRow]) -> list[PoseRow]:
-    """The current pose of each (vehicle, day, method, sensor), in this order.
-
-    Args:
-        poses: as `read_records` returns them, the last asserted last.
-    """
+    """The current pose of each (vehicle, day, method, sensor), in this order; `poses` by assertion."""
     return _last_of_each(poses, POSES)
 
 
 def current_alignments(rows: Sequence[RadarAlignment]) -> list[RadarAlignment]:
-    """The current row of each (vehicle, day, method, radar), in this order.
-
-    Args:
-        rows: as `read_records` returns them, the last asserted last.
-    """
+    """The current row of each (vehicle, day, method, radar), in this order; `rows` by assertion."""
     return _last_of_each(rows, RADAR_ALIGNMENTS)
 
 
@@ -71,11 +59,9 @@ def _last_of_each(rows: Sequence[_Row], schema: TableSchema) -> list[_Row]:
 
 
 def current_rows(table: pa.Table, schema: TableSchema) -> pa.Table:
-    """Current row of each key of a record table, as columns, in order of key.
+    """Current row of each key (`schema.about`) of a record table, as columns, in order of key.
 
-    Args:
-        table: with the columns `schema.about` (the key), `asserted_at` and `work_key`, in any order of rows.
-        schema: of the table.
+    `table` has the key, `asserted_at` and `work_key`, in any order of rows.
     """
     if not table.num_rows:
         return table
@@ -98,20 +84,12 @@ def _ranks(column: pa.DictionaryArray) -> np.ndarray:
 
 
 def current_drift(findings: Sequence[DriftFinding]) -> list[DriftFinding]:
-    """Findings of the last audit that included a vehicle, by vehicle and method, in order.
-
-    Args:
-        findings: as `read_records` returns them.
-    """
+    """Findings of the last audit that included a vehicle, by vehicle and method, in order."""
     return sorted(_asserted_last(findings), key=lambda f: (f.vehicle, f.method, *_edge(f), f.dof))
 
 
 def current_states(states: Sequence[StateRow]) -> list[StateRow]:
-    """States of a vehicle from the last night that included it, by vehicle and method, in order.
-
-    Args:
-        states: as `read_records` returns them.
-    """
+    """States of a vehicle from the last night that included it, by vehicle and method, in order."""
     return sorted(_asserted_last(states), key=lambda s: (s.vehicle, s.method, *_edge(s)))
 
 
@@ -129,11 +107,7 @@ def _asserted_last(rows: Sequence[_Said]) -> list[_Said]:
 
 
 def current_events(events: Sequence[ServiceEvent]) -> list[ServiceEvent]:
-    """Latest version of each event, without withdrawn events.
-
-    Args:
-        events: as `read_records` returns them, the last asserted last.
-    """
+    """Latest version of each event, without withdrawn events; `events` by assertion."""
     noted = {(e.vehicle, e.day, e.sensor, e.kind): e for e in events}
     return [event for event in noted.values() if not event.withdrawn]
 
@@ -152,10 +126,7 @@ def prior_of(record: CalibrationRecord) -> Float[np.ndarray, "4 4"] | None:
 
 
 def targets_of(record: CalibrationRecord) -> Float[np.ndarray, "N 3"]:
-    """Targets for which a record's sigmas are stated, in the child's frame [m].
-
-    A record without targets has those of older releases.
-    """
+    """Targets of a record's sigmas, in the child's frame [m]; those of older releases if it has none."""
     return DEFAULT_TARGETS if record.targets_m is None else np.asarray(record.targets_m)
 
 

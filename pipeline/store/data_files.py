@@ -16,12 +16,7 @@ __all__ = ["data_files", "files_there", "once"]
 
 
 def data_files(lake: Lake, schema: TableSchema) -> list[LiveFile]:
-    """Data files of a table; if its log cannot be read, all existing files, with a note in `lake.damage`.
-
-    Raises:
-        ContractError: the lake is of another release.
-        OSError: the storage does not answer.
-    """
+    """Data files of a table; if its log is damaged, all existing ones, with a note in `lake.damage`."""
     try:
         table = open_table(lake, schema)
     except DamagedLogError as err:

@@ -170,9 +170,6 @@ def read_file(
     """Requested columns that a data file has; None, with an entry in `lake.damage`, if it is unreadable.
 
     Args:
-        lake: the lake with the table.
-        schema: of the table.
-        name: of the file.
         columns: names; "MAP.KEY" is one value of a column of maps, as float64, null where a row has none.
         wanted: skips row groups without such rows; other rows of the remaining groups are returned too.
     """
@@ -266,11 +263,9 @@ def _values_of(maps: pa.ChunkedArray | None, key: str, rows: int) -> pa.Array:
 
 
 def merge_rows(lake: Lake, schema: TableSchema, rows: pa.Table, *, insert: bool = True) -> None:
-    """Add rows whose work is not recorded; for the others update only `asserted_at`, if it is later.
+    """Add rows whose work is not recorded; for others update only `asserted_at`, if it is later.
 
     Args:
-        lake: the lake with the table.
-        schema: of the table.
         rows: with all columns of `stored_schema`, without duplicates of key and work.
         insert: False = only update `asserted_at`.
 
@@ -352,10 +347,7 @@ def create_table(lake: Lake, schema: TableSchema) -> DeltaTable:
 
 
 def set_aside_damaged(lake: Lake, schema: TableSchema) -> list[str]:
-    """Move unreadable files of the table into `_damaged` beside its months; returns their names.
-
-    The next night with the logs makes their content again.
-    """
+    """Move unreadable files of the table into `_damaged` beside its months; returns their names."""
     table = open_table(lake, schema)
     bad = []
     for file in live_files(table) if table is not None else []:
@@ -369,9 +361,9 @@ def set_aside_damaged(lake: Lake, schema: TableSchema) -> list[str]:
 
 
 def tidy_table(lake: Lake, schema: TableSchema) -> Iterator[str]:
-    """Maintenance after a night: move damaged files away, compact small files, remove files no longer in use.
+    """Maintenance after a night: move damaged files away, compact, remove unused files; yields the actions.
 
-    Yields a description of each action. A concurrent writer only makes this compaction fail.
+    A concurrent writer only makes this compaction fail.
     """
     table = open_table(lake, schema)
     if table is None:

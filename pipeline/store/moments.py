@@ -43,10 +43,7 @@ _KINDS = {t.name: kind for tables in (CAPTURES, FEATURES) for kind, t in tables.
 
 
 class MomentWriter:
-    """Streams moments and the rows of their sensors.
-
-    Nothing is visible until the block ends without an error.
-    """
+    """Streams moments and the rows of their sensors; they appear when the block ends without error."""
 
     def __init__(self, stack: ExitStack, lake: Lake, partition: Partition, index: PartitionWriter) -> None:
         self._stack, self._lake, self._partition, self._index = stack, lake, partition, index
@@ -91,8 +88,7 @@ def write_moments(
 ) -> Iterator[MomentWriter]:
     """Replace the moments of a vehicle-day and the files of its sensors; on an error the old ones stay.
 
-    A writer that is killed during the final renames leaves a day without moments, which the next one makes
-    again.
+    A writer killed during the final renames leaves a day without moments, which the next one makes again.
     """
     path = lake.file(schema.name, partition)
     with ExitStack() as stack:
@@ -144,13 +140,6 @@ def joined(
 ) -> Iterator[tuple[Any, dict[str, Any]]]:
     """Moments of a vehicle-day in order, with rows by sensor; one row group of each file is in memory.
 
-    Args:
-        lake: the lake with the tables.
-        schema: of the joining table.
-        partition: the vehicle-day.
-        sensors: sensors to read; None = all.
-        moments: moments to read; None = all.
-
     Raises:
         ContractError: the lake has none of that day, or they are of another release.
         DamagedError: a file cannot be read.
@@ -176,11 +165,7 @@ def joined(
 def _rows_of(
     lake: Lake, schema: TableSchema, partition: Partition, sensor: str, index: Manifest, rows: Sequence[int]
 ) -> Iterator[Any]:
-    """Rows of a sensor's file, in order.
-
-    Raises:
-        ContractError: the file is not of the same work as the table that names its rows.
-    """
+    """Rows of a sensor's file, in order; raises ContractError if it is of other work than the index."""
     if not rows:
         return
     found = read_manifest(lake, schema, partition, sensor)

@@ -59,10 +59,7 @@ class Bucket:
         return True
 
     def find(self, folder: PurePath, pattern: str) -> Iterator[PurePath]:
-        """Keys below a folder that match a pattern with as many parts.
-
-        All keys if the pattern begins with **.
-        """
+        """Keys below a folder that match a pattern with as many parts; all keys if it begins with **."""
         parts = pattern.split("/")
         literal = list(takewhile(lambda part: not set(part) & set("*?["), parts))
         for key, _, _ in self.listed(folder.joinpath(*literal)):
@@ -72,42 +69,24 @@ class Bucket:
 
     @contextmanager
     def opened(self, key: PurePath) -> Iterator[BinaryIO]:
-        """A reader of an object, which fetches only the requested bytes.
-
-        Raises:
-            FileNotFoundError: no such object.
-            OSError: the store does not answer.
-        """
+        """A reader of an object, which fetches only the requested bytes; raises OSError."""
         with self._as_os_errors(key):
             reader = obstore.open_reader(_store(self.name), str(key), buffer_size=_BUFFER_BYTES)
         yield cast("BinaryIO", io.BufferedReader(_Reader(self, key, reader), _BUFFER_BYTES))
 
     def read_range(self, key: PurePath, start: int, length: int) -> bytes:
-        """Byte range of an object, fetched by one request.
-
-        Raises:
-            OSError: the store does not answer, or there is no such object.
-        """
+        """Byte range of an object, fetched by one request; raises OSError."""
         with self._as_os_errors(key):
             return bytes(obstore.get_range(_store(self.name), str(key), start=start, length=length))
 
     def size_and_tag(self, key: PurePath) -> tuple[int, str]:
-        """Size [bytes] and entity tag of an object; the tag changes with the content.
-
-        Raises:
-            FileNotFoundError: no such object.
-            OSError: the store does not answer.
-        """
+        """Size [bytes] and entity tag of an object, which changes with the content; raises OSError."""
         with self._as_os_errors(key):
             about = obstore.head(_store(self.name), str(key))
             return int(about["size"]), str(about["e_tag"])
 
     def listed(self, folder: PurePath) -> Iterator[tuple[str, int, str]]:
-        """Key, size and tag of all objects below a folder, in order of key.
-
-        Raises:
-            OSError: the store does not answer.
-        """
+        """Key, size and tag of all objects below a folder, in order of key; raises OSError."""
         prefix = "" if str(folder) == "." else f"{folder}/"
         with self._as_os_errors(folder):
             for page in obstore.list(_store(self.name), prefix or None, chunk_size=1000):

@@ -1,7 +1,6 @@
 """Parquet files of a lake, opened so that no Arrow thread ever holds a Python object.
 
-If such a thread released the object during interpreter shutdown, the process would abort after its work was
-done.
+If such a thread released it during interpreter shutdown, the process would abort after its work.
 """
 
 from __future__ import annotations

@@ -93,8 +93,6 @@ class Lake:
     """Root of the tables: a folder, or a prefix of a bucket.
 
     Args:
-        root: a `Path` for a folder; for a bucket the prefix, which is not a local path.
-        files: file operations at that location.
         migrating: True during migration, when records of an older release exist beside the new ones.
         damage: filled while reading: file and reason of everything left out because it is unreadable.
         lost: days and vehicles of the records left out.
@@ -108,11 +106,7 @@ class Lake:
 
     @classmethod
     def at(cls, location: str | Path) -> Lake:
-        """The lake at a folder or at "s3://BUCKET/PREFIX"; made by the first write.
-
-        Raises:
-            ConfigError: an object store without a bucket or a prefix, or one that is not S3.
-        """
+        """The lake at a folder or "s3://BUCKET/PREFIX", made by the first write; ConfigError if invalid."""
         scheme, separator, rest = str(location).partition("://")
         if not separator:
             return cls(Path(location))
@@ -125,11 +119,7 @@ class Lake:
 
     @classmethod
     def existing(cls, location: str | Path) -> Lake:
-        """The existing lake at a location, for commands that read: a mistyped name is an error.
-
-        Raises:
-            ConfigError: no such lake, or not a valid location (see `at`).
-        """
+        """The existing lake at a location, for commands that read; ConfigError for a mistyped name."""
         lake = cls.at(location)
         if not lake.exists():
             raise ConfigError("command line", "lake", f"no such folder: {location}")
@@ -140,11 +130,7 @@ class Lake:
 
     @property
     def local_root(self) -> Path:
-        """The folder, for code that works on folders only.
-
-        Raises:
-            ConfigError: the lake is in an object store.
-        """
+        """The folder, for code that works on folders only; ConfigError for an object store."""
         if not isinstance(self.root, Path):
             raise ConfigError("command line", "lake", f"{self} is not a folder, and this command needs one")
         return self.root

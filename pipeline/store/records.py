@@ -64,13 +64,6 @@ def read_records(
     Damaged or missing files are left out and listed in `lake.damage`.
 
     Args:
-        lake: the lake with the table.
-        schema: of the table.
-        row_type: its dataclass.
-        vehicle: only records of this vehicle, or of these.
-        day: only of this day.
-        first: only from this day on.
-        last: only until this day.
         columns: columns to read, of those with a default in `row_type`; the others keep their default. None =
             all.
 
@@ -92,22 +85,14 @@ def read_columns(
     vehicle: str | AbstractSet[str] | None = None,
     asserted_after: str | None = None,
 ) -> pa.Table | None:
-    """Columns of the records of a window of days, unordered, plus those that `current_rows` needs.
+    """Columns of the records of a window of days, unordered, plus those that `current_rows` needs; else None.
 
     For thousands of vehicles, whose records would be gigabytes as rows.
 
     Args:
-        lake: the lake with the table.
-        schema: of the table.
         columns: names; "diagnostics.disproved" is one value of a column of maps, null where a record has
             none. A column unknown to all releases that wrote to the lake is null in every row.
-        first: only from this day on.
-        last: only until this day.
-        vehicle: only records of this vehicle, or of these.
         asserted_after: only records that became current after this moment.
-
-    Returns:
-        None if there is no record.
     """
     asked = dict.fromkeys([*schema.about, "asserted_at", "work_key", *columns])
     wanted = replace(_wanted(vehicle, first, last), asserted_after=asserted_after)
@@ -124,14 +109,6 @@ class RecordIndex(Generic[Row]):
     """Records of a window of days as of its creation; those of a vehicle-day become rows when requested.
 
     A year of a thousand vehicles is a few hundred megabytes as columns, and gigabytes as rows.
-
-    Args:
-        lake: the lake with the table.
-        schema: of the table.
-        row_type: its dataclass.
-        first: first day.
-        last: last day.
-        columns: see `read_records`.
     """
 
     def __init__(
@@ -190,14 +167,6 @@ def read_latest(
     """Records of the last recorded day of each vehicle and method, in the order of `read_records`.
 
     That day is found from three columns; the other columns are read for those days only.
-
-    Args:
-        lake: the lake with the table.
-        schema: of the table.
-        row_type: its dataclass.
-        first: earlier days are ignored.
-        last: later days are ignored.
-        columns: see `read_records`.
     """
     keys = _rows_of(lake, schema, ["vehicle", "method", "day"], _wanted(None, first, last))
     if keys is None:
@@ -242,16 +211,7 @@ def read_last(
     vehicle: str | AbstractSet[str] | None = None,
     columns: Sequence[str] | None = None,
 ) -> list[Row]:
-    """Rows that a stage of the whole fleet asserted last for a method, together, by `commit_last`.
-
-    Args:
-        lake: the lake with the table.
-        schema: of the table.
-        row_type: its dataclass.
-        method: of the records.
-        vehicle: only rows of this vehicle, or of these.
-        columns: see `read_records`.
-    """
+    """Rows that a stage of the whole fleet asserted last for a method, together, by `commit_last`."""
     last = last_assertion(lake, schema, method)
     if last is None:
         return []

@@ -65,11 +65,7 @@ class RemoteLog:
         return RangeReader(self)
 
     def content(self, start: int, length: int) -> bytes:
-        """Bytes from a position on.
-
-        Raises:
-            StorageError: the store does not answer.
-        """
+        """Bytes from a position on."""
         try:
             return Bucket(self.bucket).read_range(PurePosixPath(self.key), start, length)
         except OSError as err:
@@ -116,11 +112,7 @@ class RangeReader(io.RawIOBase):
         return True
 
     def read(self, size: int = -1) -> bytes:
-        """The next `size` bytes, fewer at the end.
-
-        Raises:
-            StorageError: the store does not answer.
-        """
+        """The next `size` bytes, fewer at the end."""
         left = max(self._size - self._at, 0)
         size = left if size < 0 else min(size, left)
         begin = self._at - self._start
@@ -135,11 +127,7 @@ class RangeReader(io.RawIOBase):
 
 
 def log_at(place: str) -> LogPath:
-    """The log at a path or at "s3://BUCKET/KEY".
-
-    Raises:
-        ConfigError: another scheme, or no key.
-    """
+    """The log at a path or at "s3://BUCKET/KEY"; raises ConfigError if it is neither."""
     scheme, separator, rest = place.partition("://")
     if not separator:
         return Path(place)
@@ -150,11 +138,7 @@ def log_at(place: str) -> LogPath:
 
 
 def find_remote_logs(prefix: str) -> Iterator[RemoteLog]:
-    """All objects whose names begin with "s3://BUCKET/FOLDER/", in order of key.
-
-    Raises:
-        StorageError: the store does not answer.
-    """
+    """All objects whose names begin with "s3://BUCKET/FOLDER/", in order of key."""
     bucket, _, folder = prefix.removeprefix("s3://").partition("/")
     try:
         for key, size, tag in Bucket(bucket).listed(PurePosixPath(folder)):

@@ -26,18 +26,10 @@ class Collected:
 def collect(
     lake: Lake, schema: TableSchema, before: str, today: str, *, dry_run: bool = False
 ) -> Iterator[Collected]:
-    """Delete the rows of partitions of days before `before`.
+    """Delete the rows of partitions of days before `before` (YYYY-MM-DD); `dry_run` only lists them.
 
     The manifest stays, so that the same logs are not treated as new: reading the rows raises an error with
     the day of deletion, and a night with the logs makes the rows again. Damaged files are deleted completely.
-
-    Args:
-        lake: the lake with the tables.
-        schema: of a table that joins the files of sensors; its predecessor of older releases is deleted
-            completely.
-        before: first day to keep, YYYY-MM-DD.
-        today: stored as the day of deletion.
-        dry_run: only list what would be deleted.
     """
     days = [p for p in lake.partitions(schema.name) if p.day < before]
     yield from (c for p in days if (c := _collect_day(lake, schema, p, today, dry_run=dry_run)) is not None)

@@ -44,22 +44,14 @@ def read_columns(
 
 
 def row_groups(lake: Lake, schema: TableSchema, partition: Partition) -> list[RowGroup]:
-    """The row groups of a partition, in order.
-
-    Raises:
-        ContractError: there is no such partition, or it was written with another schema version.
-    """
+    """The row groups of a partition, in order; raises ContractError if missing or of another version."""
     with opened_parquet(lake.files, _checked(lake, schema, partition)) as file:
         metadata = file.metadata
     return [RowGroup(partition, i, metadata.row_group(i).num_rows) for i in range(metadata.num_row_groups)]
 
 
 def read_group(lake: Lake, schema: TableSchema, group: RowGroup, row_type: type[Row]) -> list[Row]:
-    """All rows of a group; arrays are views into one buffer.
-
-    Raises:
-        ContractError: the partition is gone, or not of this schema.
-    """
+    """All rows of a group, arrays as views into one buffer; errors as `row_groups`."""
     path = lake.file(schema.name, group.partition)
     try:
         with naming_damage(path), opened_parquet(lake.files, path) as file:

@@ -19,11 +19,7 @@ Row = TypeVar("Row")
 
 
 def to_table(rows: Sequence[Any], schema: TableSchema) -> pa.Table:
-    """Arrow table of row dataclasses whose fields are the schema's columns.
-
-    Raises:
-        ContractError: an array of the wrong shape, or None in a column that may not be null.
-    """
+    """Arrow table of row dataclasses; raises ContractError for a wrong shape, or None in a full column."""
     columns = []
     for column in schema.columns:
         values = [_encode(getattr(row, column.name), column, schema.name) for row in rows]
@@ -67,10 +63,7 @@ def with_what_follows(found: pa.Table, schema: TableSchema, asked: Sequence[str]
 
 
 def _filled(values: list[Any], column: Column, field: Field[Any]) -> list[Any]:
-    """Values of a column.
-
-    Null becomes the field's default if the column was added later and is not nullable.
-    """
+    """Values of a column; null becomes the default if the column was added later and is not nullable."""
     if column.nullable or column.is_array or None not in values:
         return values
     if field.default_factory is MISSING:

@@ -58,10 +58,7 @@ class Manifest:
 
 
 class PartitionWriter:
-    """Streams rows of one partition into a temporary file.
-
-    Nothing is visible until the block ends without an error.
-    """
+    """Streams rows of one partition; they appear when the block ends without an error."""
 
     def __init__(self, writer: pq.ParquetWriter, schema: TableSchema) -> None:
         self._writer, self.schema = writer, schema
@@ -247,11 +244,7 @@ def _writer_options(schema: TableSchema) -> dict[str, Any]:
 
 @contextmanager
 def naming_damage(path: PurePath) -> Iterator[None]:
-    """Turn reader errors caused by a file's content into an error that names the file.
-
-    Raises:
-        DamagedError: the file is incomplete or damaged.
-    """
+    """Turn reader errors caused by a file's content into a DamagedError that names the file."""
     try:
         yield
     except pa.ArrowException as err:

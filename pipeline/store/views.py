@@ -46,29 +46,17 @@ _FOUND = {"camera": ImageFeatureColumns, "lidar": SweepFeatureColumns, "radar": 
 
 
 def ingested(lake: Lake, partition: Partition) -> Manifest | None:
-    """Ingest manifest of a vehicle-day; None if it is not in the lake.
-
-    Raises:
-        ContractError: it is damaged, or of another release.
-    """
+    """Ingest manifest of a vehicle-day, or None; ContractError if damaged or of another release."""
     return read_manifest(lake, MOMENTS, partition)
 
 
 def perceived(lake: Lake, partition: Partition) -> Manifest | None:
-    """Perceive manifest of a vehicle-day; None if it is not in the lake.
-
-    Raises:
-        ContractError: it is damaged, or of another release.
-    """
+    """Perceive manifest of a vehicle-day, or None; ContractError if damaged or of another release."""
     return read_manifest(lake, PERCEIVED, partition)
 
 
 def perceived_days(lake: Lake) -> list[Partition]:
-    """Vehicle-days that were perceived, in order.
-
-    Raises:
-        ContractError: all were perceived by an older release.
-    """
+    """Vehicle-days that were perceived, in order; ContractError if all are of an older release."""
     days = lake.partitions(PERCEIVED.name)
     if not days and lake.partitions(PERCEIVED.before):
         problem = f"table {PERCEIVED.before} was made by a release before 0.11: run `boresight ingest` and `perceive`"
@@ -81,12 +69,8 @@ def frames_of(
 ) -> Iterator[Frame]:
     """Frames of a vehicle-day in order of time; one row group of each sensor is in memory.
 
-    Args:
-        lake: the lake with the tables.
-        partition: the vehicle-day.
-        moments: moments to read; None = all.
-        chosen: sensors of the frames; None = the first camera, lidar and radar of the day. Moments with fewer
-            than two of several chosen sensors are left out.
+    `moments` selects moments (None = all), `chosen` sensors (None = the first camera, lidar and radar).
+    Moments with fewer than two of several chosen sensors are left out.
 
     Raises:
         ContractError: the lake has none of that day, or they are of another release.
@@ -100,13 +84,7 @@ def frames_of(
 def observations_of(
     lake: Lake, partition: Partition, moments: Sequence[int] | None = None, chosen: Chosen | None = None
 ) -> Iterator[Observation]:
-    """Observations of a vehicle-day; see `frames_of`.
-
-    Raises:
-        ContractError: the lake has none of that day, or they are of another release.
-        DamagedError: a file cannot be read.
-        CollectedError: the rows were deleted at the end of their retention.
-    """
+    """Observations of a vehicle-day; arguments and errors as `frames_of`."""
     for moment, rows, priors in _seen(lake, PERCEIVED, partition, moments, chosen):
         yield Observation(
             **_stamps(moment, rows), priors=priors, ego_speed_mps=moment.ego_speed_mps,
@@ -123,10 +101,7 @@ def frame_of(moment: Moment, rows: Mapping[str, Any], priors: Mapping[str, np.nd
 
 
 def priors_of(star: Star, chosen: Chosen) -> dict[str, np.ndarray]:
-    """Transforms of the pairs of chosen sensors.
-
-    Camera-radar only if it does not follow from the other two.
-    """
+    """Transforms of the pairs of chosen sensors; camera-radar only if not given by the other two."""
     found = {}
     for pair in PAIRS:
         a, b = (chosen.get(kind) for kind in FRAMES_OF_PAIR[pair])
@@ -139,11 +114,7 @@ def priors_of(star: Star, chosen: Chosen) -> dict[str, np.ndarray]:
 
 
 def logged_stars(rows: Iterable[Mapping[str, Any]]) -> Mapping[str, Star]:
-    """Transforms in each log, by log name; the first ones if a log has several.
-
-    Args:
-        rows: of a manifest's extra, under `schemas.moments.PRIOR`.
-    """
+    """Transforms in each log (`rows` of a manifest's PRIOR), by log name; the first ones of several."""
     found: dict[str, dict[tuple[str, str], np.ndarray]] = {}
     for row in rows:
         found.setdefault(row["log"], {}).setdefault((row["parent"], row["child"]), transform_of_row(row))

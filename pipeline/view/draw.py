@@ -26,7 +26,7 @@ _BEHIND_M, _ABOVE_M, _AHEAD_M = 11.0, 6.5, 12.0
 
 @contextmanager
 def quiet_stdout() -> Iterator[None]:
-    """Send what the renderer prints to stderr: stdout ends with the summary and holds nothing else."""
+    """Send the renderer's output to stderr: stdout ends with the summary."""
     sys.stdout.flush()
     kept = os.dup(1)
     os.dup2(2, 1)
@@ -52,7 +52,7 @@ def viewpoint(
 
 
 def add_layers(scene: Any, layers: Iterable[Layer], parts: Iterable[str], scale: float = 1.0) -> None:
-    """Draw these parts in an empty scene of open3d; names are left out: they are not in its geometry."""
+    """Draw these parts in an empty scene of open3d, without names, which are no geometry."""
     wanted = set(parts)
     for number, layer in enumerate(layers):
         if layer.part in wanted and not isinstance(layer, Name):

@@ -1,4 +1,4 @@
-"""What is drawn, as arrays: dots, strokes, pictures and names, in the car's axes (x forward, y left, z up, metres)."""
+"""Drawing as arrays: dots, strokes, pictures and names, in the car's axes (x forward, y left, z up, metres)."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Dots:
 
 @dataclass(frozen=True, eq=False)
 class Strokes:
-    """Straight lines, each from one end to the other."""
+    """Straight lines between two ends each."""
 
     part: str
     ends: Float[np.ndarray, "N 2 3"]
@@ -57,7 +57,7 @@ class Strokes:
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """An image on a bent surface: corners of triangles, and where each lies in the image (0..1, v downwards)."""
+    """An image on a bent surface: corners of triangles, and their image coordinates (0..1, v downwards)."""
 
     part: str
     xyz: Float[np.ndarray, "V 3"]
@@ -68,7 +68,7 @@ class Picture:
 
 @dataclass(frozen=True, eq=False)
 class Name:
-    """Words at a place."""
+    """Text at a position."""
 
     part: str
     text: str
@@ -81,7 +81,7 @@ Layer = Dots | Strokes | Picture | Name
 
 @dataclass(frozen=True, eq=False)
 class _Eye:
-    """A camera at its place with its picture, at the size that its intrinsics refer to."""
+    """A camera at its pose with its picture, at the size of its intrinsics."""
 
     name: str
     camera: Camera
@@ -118,7 +118,7 @@ def layers_of(shown: Shown, rig: Rig, T_car: Mapping[str, Float[np.ndarray, "4 4
 
 
 def colours_seen(xyz: Float[np.ndarray, "N 3"], eyes: list[_Eye]) -> Float[np.ndarray, "N 3"]:
-    """The colour that the first camera which sees a point has there; grey by height where none does."""
+    """Colour of each point in the first camera that sees it; grey by height if none does."""
     low = np.percentile(xyz[:, 2], 2) if len(xyz) else 0.0
     share = np.clip((xyz[:, 2:] - low) / _HIGH_M, 0, 1)
     rgb = _LOW + share * (_HIGH - _LOW)
@@ -145,7 +145,7 @@ def _eye(name: str, image: Image, shown: Shown, T_car_camera: np.ndarray) -> _Ey
 
 
 def _detections(scan: Scan, found: ScanFeatures | None, T: Float[np.ndarray, "4 4"]) -> list[Layer]:
-    """Detections, and an arrow along the beam for each that moves: over ground where perception knows it."""
+    """Detections, with an arrow along the beam for moving ones: over ground if perception has it."""
     radar = scan.radar_xyz_m.astype(np.float64) if found is None else found.radar_xyz_m.astype(np.float64)
     speed = (scan.radar_range_rate_mps if found is None else found.radar_residual_mps).astype(np.float64)
     if found is not None:
@@ -162,7 +162,7 @@ def _detections(scan: Scan, found: ScanFeatures | None, T: Float[np.ndarray, "4 
 def _arrows(
     start: Float[np.ndarray, "N 3"], way: Float[np.ndarray, "N 3"], rgb: Float[np.ndarray, "N 3"]
 ) -> tuple[Float[np.ndarray, "M 2 3"], Float[np.ndarray, "M 3"]]:
-    """Shafts and two barbs each, which lie level."""
+    """Horizontal shafts with two barbs each."""
     tip, aside = start + way, np.cross(way, [0.0, 0.0, 1.0])
     barbs = [np.stack([tip, tip - 0.25 * way + sign * 0.15 * aside], axis=1) for sign in (-1, 1)]
     return np.concatenate([np.stack([start, tip], axis=1), *barbs]), np.tile(rgb, (3, 1))
@@ -175,7 +175,7 @@ _EDGES = np.array([(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b).
 
 
 def _boxes(found: SweepFeatures, T: Float[np.ndarray, "4 4"], eyes: list[_Eye]) -> Strokes:
-    """Boxes around the lidar's clusters; those that lie in a camera's road user stand out."""
+    """Boxes around the lidar's clusters; those in a camera's road user are highlighted."""
     low, high = found.lidar_cluster_min_m.astype(np.float64), found.lidar_cluster_max_m.astype(np.float64)
     corners = transform_points(T, np.where(_CORNERS, high[:, None], low[:, None]))
     is_user = np.zeros(len(low), bool)

@@ -1,4 +1,4 @@
-"""What the 3D view shows: one moment of a vehicle-day, and where its sensors are before and after the calibration."""
+"""Content of the 3D view: one moment of a vehicle-day, and the sensors' poses before and after calibration."""
 
 from __future__ import annotations
 
@@ -28,14 +28,7 @@ _LOOKED_AT = 12  # moments, spread over the day, of which the one with most road
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Where the sensors are.
-
-    Args:
-        kinds: camera, lidar or radar, by sensor.
-        T_car_reference: axes of the drawing, x forward, y left, z up.
-        poses: by state (prior, calibrated) T_reference_sensor of each sensor whose pose is known.
-        status: by sensor what the record says of it: accepted, held, ...
-    """
+    """Kinds of sensors, T_car_reference (drawing's axes), poses by state (prior, calibrated), status."""
 
     kinds: Mapping[str, str]
     T_car_reference: Float[np.ndarray, "4 4"]
@@ -56,7 +49,7 @@ class Rig:
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """A moment: its number of so many, what each sensor measured, and what perception found there, by sensor."""
+    """A moment: its number and the total, data and features by sensor."""
 
     number: int
     stamp_ns: int
@@ -65,11 +58,7 @@ class Shown:
 
 
 def count_moments(lake: Lake, partition: Partition) -> int:
-    """Moments of a vehicle-day.
-
-    Raises:
-        ConfigError: the lake has none.
-    """
+    """Moments of a vehicle-day; raises ConfigError if the lake has none."""
     manifest = ingested(lake, partition)
     if manifest is None or not manifest.rows:
         problem = f"the lake has no moments of {partition.vehicle} {partition.day}: run `boresight ingest`"
@@ -78,17 +67,11 @@ def count_moments(lake: Lake, partition: Partition) -> int:
 
 
 def read_moment(lake: Lake, partition: Partition, number: int | None = None) -> Shown:
-    """One moment with all its sensors.
-
-    Args:
-        lake: where the tables are.
-        partition: the vehicle-day.
-        number: of the moment; None = of those with most sensors one with many road users.
+    """One moment with all its sensors; None = of those with most sensors, one with many road users.
 
     Raises:
         ConfigError: the day has no such moment.
-        DamagedError: a file cannot be read.
-        CollectedError: the day's rows left the lake after their time.
+        DamagedError, CollectedError: a file is damaged, or was deleted after its retention.
     """
     count = count_moments(lake, partition)
     chosen = _rich_moment(lake, partition) if number is None else number

@@ -1,6 +1,6 @@
-"""Whether this machine has what open3d needs beside its wheel: system libraries, a Vulkan driver, a display.
+"""Check for system libraries, Vulkan driver and display, which open3d needs beside its wheel.
 
-Asked first, because open3d's renderer ends the whole process where one of them is missing.
+Checked first, because open3d's renderer ends the whole process if one of them is missing.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pipeline.errors import MissingLibraryError
 
 __all__ = ["import_open3d", "require_display", "require_renderer"]
 
-# Debian and Ubuntu's packages of what open3d 0.20 links.
+# Debian's and Ubuntu's packages of the libraries that open3d 0.20 links.
 _PACKAGES = {
     "libEGL.so.1": "libegl1",
     "libGL.so.1": "libgl1",
@@ -43,11 +43,7 @@ class _InstanceInfo(ctypes.Structure):
 
 
 def import_open3d() -> Any:
-    """The module open3d.
-
-    Raises:
-        MissingLibraryError: a system library that it links is not installed.
-    """
+    """The module open3d; MissingLibraryError if a system library that it links is not installed."""
     try:
         import open3d  # noqa: PLC0415 - its failure is what is asked for
     except (ImportError, OSError) as err:
@@ -60,11 +56,7 @@ def import_open3d() -> Any:
 
 
 def require_renderer() -> None:
-    """Ask for a Vulkan driver, which open3d draws with, on a screen or off it.
-
-    Raises:
-        MissingLibraryError: there is none.
-    """
+    """Check for a Vulkan driver, which open3d draws with; MissingLibraryError if there is none."""
     try:
         vulkan = ctypes.CDLL("libvulkan.so.1")
     except OSError as err:
@@ -79,11 +71,7 @@ def require_renderer() -> None:
 
 
 def require_display() -> None:
-    """Ask for a display that a window can open on.
-
-    Raises:
-        MissingLibraryError: there is none; the message names --out.
-    """
+    """Check for a display that a window can open on; MissingLibraryError, naming --out, if none."""
     if os.environ.get("WAYLAND_DISPLAY"):
         return
     try:

@@ -1,4 +1,4 @@
-"""The window: a scene to turn, a key between prior and calibrated, moments, parts, and a slider that turns a sensor."""
+"""The window: a rotatable scene, keys for prior or calibrated and for moments, and a slider that rotates a sensor."""
 
 from __future__ import annotations
 
@@ -19,14 +19,7 @@ _PANEL_EM = 16
 
 
 class Viewer:
-    """One window on a vehicle-day.
-
-    Args:
-        title: of the window.
-        rig: where the sensors are.
-        shown: the moment that is shown first.
-        read: another moment by its number; None where the day has none of it.
-    """
+    """One window on a vehicle-day; `read` returns another moment by its number, or None."""
 
     def __init__(self, title: str, rig: Rig, shown: Shown, read: Callable[[int], Shown | None]) -> None:
         self._title, self._rig, self._shown, self._read = title, rig, shown, read
@@ -49,7 +42,7 @@ class Viewer:
         self._scene.look_at(*viewpoint(T, cameras), [0, 0, 1])
 
     def press(self, event: Any) -> bool:
-        """Space: prior or calibrated; left, right: the moment before, after. True where it is such a key."""
+        """Space: prior or calibrated; left, right: the moment before, after. True for these keys."""
         if event.type != gui.KeyEvent.Type.DOWN:
             return False
         if event.key == gui.KeyName.SPACE:
@@ -63,7 +56,7 @@ class Viewer:
         return True
 
     def turn(self, sensor: str, axis: str, angle_deg: float) -> None:
-        """Show a sensor turned about an axis of the car."""
+        """Show a sensor rotated about an axis of the car."""
         self.turned, self.axis, self.angle_deg = sensor, axis, angle_deg
         self._draw()
 

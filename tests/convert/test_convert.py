@@ -240,7 +240,7 @@ def transform_in(frame, prefix):
 def found_by_devkits(tmp_path_factory):
     python = os.environ.get("BORESIGHT_READERS")
     if not python:
-        pytest.skip("BORESIGHT_READERS names no Python with the devkits (tests/convert/real_devkits.py)")
+        pytest.skip("BORESIGHT_READERS names no Python with the devkits: make readers")
     folder = tmp_path_factory.mktemp("devkits")
     paths = [str(MAKERS[name](folder / name)) for name in ("nuscenes", "vod")]
     script = Path(__file__).parent / "real_devkits.py"

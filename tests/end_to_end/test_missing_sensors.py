@@ -18,6 +18,8 @@ from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, PAIRS, SENSORS, C
 from schemas.drift import DRIFT, DriftFinding
 from schemas.states import STATES, StateRow
 
+pytestmark = pytest.mark.slow  # a night of four vehicles
+
 DAY = "2026-03-02"
 GONE = {"no-camera": "camera", "no-lidar": "lidar", "no-radar": "radar"}
 PAIR = {"no-camera": "lidar_radar", "no-lidar": "camera_radar", "no-radar": "camera_lidar"}

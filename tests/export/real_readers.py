@@ -2,9 +2,7 @@
 
 python tests/export/real_readers.py FOLDER    prints JSON: format -> reader and version, and the transforms it found
 
-    python -m venv readers && readers/bin/pip install nuscenes-devkit t4-devkit yourdfpy xacro "pyarrow<20" "pandas<3"
-    readers/bin/pip install --no-deps vcd pykitti vod-tudelft
-    BORESIGHT_READERS=readers/bin/python make test
+`make readers` installs them, and `make test` names their Python in BORESIGHT_READERS.
 """
 
 import json

@@ -110,9 +110,7 @@ def test_the_camera_chain_passes_kalibr_s_own_checks(sent):
 def read_by_others(tmp_path_factory):
     python = os.environ.get("BORESIGHT_READERS")
     if not python:
-        pytest.skip(
-            "BORESIGHT_READERS names no Python with the other programs (tests/export/real_readers.py)"
-        )
+        pytest.skip("BORESIGHT_READERS names no Python with the other programs: make readers")
     rng = np.random.default_rng(6)
     sent, folder = calibration(random_transform(rng), random_transform(rng)), tmp_path_factory.mktemp("files")
     for name in READERS:

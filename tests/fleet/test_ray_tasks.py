@@ -81,6 +81,7 @@ def test_a_lost_node_loses_nothing(nodes, behave, tmp_path):
     assert sorted(f.value[0] for f in found) == [f"wait-{i} done" for i in (1, 2, 3)]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("nodes")
 def test_who_is_there_whenever_a_node_goes_is_given_up_in_the_end_and_the_others_are_not(
     behave, tmp_path, monkeypatch

@@ -1,4 +1,5 @@
 import json
+import time
 
 from jobs.terminal.night_view import night_view
 from pipeline.fleet.nightly import DayOutcome
@@ -46,6 +47,19 @@ def test_without_a_terminal_every_stage_that_begins_is_one_json_line(capsys):
     told = [(line["vehicle"], line["day"], line["stage"]) for line in lines_of(capsys)]
     car, bus = ("car", "2026-03-02"), ("bus", "2026-03-02")
     assert told == [(*car, "ingest"), (*bus, "ingest"), (*car, "perceive")]
+
+
+def test_without_a_terminal_a_stage_that_takes_long_has_a_line_every_few_seconds(capsys, monkeypatch):
+    monkeypatch.setattr("jobs.terminal.night_view.LOG_EVERY_S", 0.05)
+    with night_view(NAMES, 3) as view:
+        view.watch(0, 0, 9, "perceive frames")
+        view.watch(0, 1, 9, "perceive frames")  # at once: no line
+        time.sleep(0.06)
+        view.watch(0, 2, 9, "perceive frames")
+    told = [
+        (line["event"], line["vehicle"], line.get("done"), line.get("total")) for line in lines_of(capsys)
+    ]
+    assert told == [("stage", "car", None, None), ("progress", "car", 2, 9)]
 
 
 def test_what_is_simulated_is_no_stage(capsys):

@@ -1,4 +1,5 @@
 import json
+import time
 from pathlib import Path
 
 import numpy as np
@@ -43,13 +44,26 @@ def test_the_worst_status_decides_the_exit_code(statuses, code):
     assert exit_code(statuses) == code
 
 
-def test_progress_without_a_terminal_is_a_json_line_now_and_then(capsys, monkeypatch):
-    now = [0.0]
-    monkeypatch.setattr("time.monotonic", lambda: now[0])
+def test_without_a_terminal_a_json_line_comes_every_few_seconds_even_where_a_step_takes_longer(
+    capsys, monkeypatch
+):
+    monkeypatch.setattr("jobs.terminal.summary.LOG_EVERY_S", 0.05)
+    text, deadline = "", time.monotonic() + 20
     with progress_reporter("ingest") as progress:
-        for second in range(12):
-            now[0] = float(second)
-            progress(second, 12, "frame")
-    lines = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
-    assert [line["done"] for line in lines] == [5, 10]
-    assert lines[0]["job"] == "ingest"
+        progress(3, 12, "frame")
+        while text.count("\n") < 2 and time.monotonic() < deadline:
+            time.sleep(0.02)
+            text += capsys.readouterr().err
+    found = {
+        tuple(json.loads(line)[k] for k in ("job", "done", "total", "what")) for line in text.splitlines()
+    }
+    assert found == {("ingest", 3, 12, "frame")}
+    capsys.readouterr()
+    time.sleep(0.15)
+    assert capsys.readouterr().err == ""  # nothing after the end
+
+
+def test_a_command_of_less_than_the_time_between_lines_has_none(capsys):
+    with progress_reporter("ingest") as progress:
+        progress(3, 12, "frame")
+    assert capsys.readouterr().err == ""

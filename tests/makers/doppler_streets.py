@@ -13,8 +13,21 @@ T_LIDAR_RADAR = from_rotation_translation(exp_so3(np.array([0.02, -0.02, 0.03]))
 TEMPLATE = make_day(frames=1)[0]
 
 
-def scene(rng, *, T=T_LIDAR_RADAR, noise_deg=2.0, mirrored=0.0, bias_deg=0.0, curvature=0.0, speed=SPEED_MPS):
-    """One frame: poles and kerbs; elevations are noisy, some are those of the image in the road, all may be off."""
+def scene(
+    rng,
+    *,
+    T=T_LIDAR_RADAR,
+    noise_deg=2.0,
+    mirrored=0.0,
+    displaced=0.0,
+    bias_deg=0.0,
+    curvature=0.0,
+    speed=SPEED_MPS,
+):
+    """One frame: poles and kerbs; elevations are noisy, some are those of the image in the road, all may be off.
+
+    `displaced` is the share that is seen, in direction and Doppler, anywhere between the thing and its image.
+    """
     foot = np.stack([rng.uniform(8, 45, 40), rng.choice([-1, 1], 40) * rng.uniform(5, 14, 40)], -1)
     foot = np.concatenate([foot, foot @ [[0.0, -1], [1, 0]]])  # a street that crosses
     top = rng.uniform(0.1, 6.0, len(foot))
@@ -36,6 +49,11 @@ def scene(rng, *, T=T_LIDAR_RADAR, noise_deg=2.0, mirrored=0.0, bias_deg=0.0, cu
         np.where(w, from_spherical(image) / image[:, 2:], from_spherical(aer) / aer[:, 2:])
         for w in (there, back)
     ]
+    if displaced:
+        seen_m = height * np.where(
+            rng.random(height.shape) < displaced, rng.uniform(-1, 1, height.shape), 1.0
+        )
+        aer = to_spherical(transform_points(inverse(T), world - (height - seen_m) * [0.0, 0.0, 1.0]))
     rate = -0.5 * (ways[0] + ways[1]) @ velocity + rng.normal(0, 0.06, len(world))
     aer[:, 1] = np.where(back[:, 0], image[:, 1], aer[:, 1])
     aer += np.radians([0.3, noise_deg, 0.0]) * rng.normal(size=aer.shape) + np.radians([0.0, bias_deg, 0.0])

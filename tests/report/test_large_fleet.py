@@ -52,6 +52,7 @@ def weight(page):
     return page.stat().st_size, sum(f.stat().st_size for f in page.parent.rglob("*.js"))
 
 
+@pytest.mark.slow
 def test_a_page_of_ten_thousand_vehicles_weighs_little_and_ten_times_that_of_a_thousand(
     kinds, large, tmp_path
 ):

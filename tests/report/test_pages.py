@@ -14,6 +14,7 @@ import pytest
 
 from pipeline.config import FleetConfig
 from pipeline.errors import ConfigError
+from pipeline.report.page import commands
 from pipeline.report.stage import Pages, write_day_page, write_fleet_report
 from pipeline.report.truth import read_truth
 from pipeline.store.commits import commit_records
@@ -260,7 +261,9 @@ def test_pages_open_without_a_complaint_and_fit_a_laptop(
 
 
 @pytest.mark.browser
-def test_on_a_phone_the_words_of_the_fleet_have_room(browser: Any, fleet: tuple[Lake, Path, Path]) -> None:
+def test_on_a_phone_the_words_of_the_fleet_have_room_and_a_day_fits(
+    browser: Any, fleet: tuple[Lake, Path, Path]
+) -> None:
     phone = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
     browser.call("Emulation.setDeviceMetricsOverride", **phone)
     try:
@@ -269,8 +272,38 @@ def test_on_a_phone_the_words_of_the_fleet_have_room(browser: Any, fleet: tuple[
         widths = "[...document.querySelectorAll('td.words')].map(cell => cell.getBoundingClientRect().width)"
         assert len(found := browser.evaluate(widths)) > 4
         assert min(found) > 280
+        day = fleet[1].parent / f"{fleet[1].stem}_days" / "2026-03-04" / "b.html"
+        assert browser.open(day) == []
+        assert browser.evaluate("document.documentElement.scrollWidth") <= 390
     finally:
         browser.call("Emulation.clearDeviceMetricsOverride")
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize("place", ["#vehicles-table", "#charts"])
+def test_commands_of_the_next_steps_are_code_that_a_button_copies(
+    browser: Any, fleet: tuple[Lake, Path, Path], place: str
+) -> None:
+    assert browser.open(fleet[1]) == []
+    browser.evaluate(
+        "document.addEventListener('copy', () => { window.copied = document.activeElement.value; })"
+    )
+    code = browser.evaluate(
+        f"(window.button = document.querySelector('{place} button.copy')).previousElementSibling.textContent"
+    )
+    assert code.startswith("boresight ")
+    assert "`" not in browser.evaluate(f"document.querySelector('{place}').textContent")
+    browser.evaluate("window.button.focus()")
+    browser.press("Enter")
+    assert browser.evaluate("[window.copied, window.button.textContent]") == [code, "Copied"]
+
+
+def test_what_stands_between_backticks_is_code_and_only_our_commands_have_a_button() -> None:
+    made = commands("run `boresight audit --lake '<x>'` or `ls`; a lone ` stays")
+    assert made == (
+        "run <code>boresight audit --lake &#39;&lt;x&gt;&#39;</code>"
+        '<button type="button" class="copy">Copy</button> or <code>ls</code>; a lone ` stays'
+    )
 
 
 @pytest.mark.browser
@@ -283,7 +316,7 @@ def test_a_page_can_be_used_by_keyboard_alone(
     assert "Skip" in browser.evaluate("document.activeElement.textContent")
     for _ in range(40):
         browser.press("Tab")
-        if browser.evaluate("document.activeElement.tagName") == "BUTTON":
+        if browser.evaluate("document.activeElement.dataset.copy"):
             break
     assert browser.evaluate("document.activeElement.dataset.copy") == "json-camera_lidar"
     browser.press("Enter")

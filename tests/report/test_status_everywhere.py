@@ -1,5 +1,6 @@
 """A vehicle's status is the audit's: the table, the pages, the terminal and `show` all say the same."""
 
+import html
 import json
 import re
 import shlex
@@ -16,11 +17,13 @@ from jobs.cli import main
 from jobs.show import show
 from jobs.terminal.vehicle_status import count_statuses, moved_sensors, next_steps, status_lines
 from pipeline.report.stage import write_day_page
+from pipeline.stages import STATE
 from pipeline.store.commits import commit_records
 from pipeline.store.current import current_drift
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
-from schemas.drift import DRIFT, DRIFT_STATUSES, DriftFinding, VehicleStatus, next_step, status_of
+from pipeline.work import Task, Window
+from schemas.drift import DRIFT, DRIFT_STATUSES, DriftFinding, next_step, status_of
 from tests.makers.fleet_pages import write_fleet_page
 from tests.makers.stages import audit_fleet
 from tests.report.test_pages import KNOCK, _config, _store
@@ -106,34 +109,85 @@ def test_the_summary_counts_vehicles_and_names_each_moved_sensor_once(lake: Lake
 
 def test_a_red_vehicle_says_what_to_do_with_the_commands(lake: Lake, tmp_path: Path) -> None:
     rows = [f for own in stored(lake).values() for f in own]
-    step, of_yellow = next_steps(rows, "my lake")
-    assert "how the radar is mounted" in step
-    command = "--vehicle red --day YYYY-MM-DD --kind repair --sensor radar"
-    assert f"boresight service --lake 'my lake' {command}" in step
-    assert "boresight export FORMAT --lake 'my lake' --vehicle red --out FOLDER" in step
-    assert of_yellow.startswith("yellow: ")
+    steps = next_steps(rows, "my lake")
+    assert [step.split(":")[0] for step in steps] == ["red", "yellow", "blind", "unknown"]
+    assert "how the radar is mounted" in steps[0]
+    command = "--vehicle red --day 2026-03-06 --kind repair --sensor radar"
+    assert f"boresight service --lake 'my lake' {command}" in steps[0]
+    assert "boresight export ros2 --lake 'my lake' --vehicle red --out tonight/red" in steps[0]
     page = write_fleet_page(lake, _config(), tmp_path / "fleet.html")
-    assert f"boresight service --lake LAKE {command}" in page
+    assert f"boresight service --lake {lake.root} {command}" in page
     own = Lake.at(shutil.copytree(lake.root, tmp_path / "lake"))
-    command = next_steps(rows, str(own.root))[0].split("`")[1].replace("YYYY-MM-DD", "2026-03-06")
+    command = next_steps(rows, str(own.root))[0].split("`")[1]
     assert main(shlex.split(command)[1:]) == 0
     audit_fleet(own, _config())
     assert status_of(stored(own)["red"]).status == "UNKNOWN"  # its charts begin anew
 
 
+def _row(status: str | None, reason: str, **rest: object) -> list[DriftFinding]:
+    """The row of a chart of a vehicle of this status."""
+    about = {"vehicle": "v", "day": "2026-03-09", "method": "joint", "pair": "camera_lidar", "dof": "rx"}
+    known = {
+        "parent_frame": "camera",
+        "child_frame": "lidar",
+        "status": "UNKNOWN",
+        "reason": reason,
+        "limit": 0.1,
+    }
+    of = {"vehicle_status": status, "vehicle_reason": reason, "days_used": 4}
+    return [DriftFinding(**{**about, **known, **of, **rest})]
+
+
 def test_of_yellow_what_the_next_days_decide_is_told_from_what_is_sure() -> None:
-    seen = VehicleStatus(
-        "YELLOW", "the camera moved on 2026-03-04: one day stands out: the next day will tell", "camera"
-    )
-    assert "look again tomorrow: `boresight status --lake L`" in next_step("v", seen, "L")
-    sure = VehicleStatus(
-        "YELLOW", "the camera has been drifting: a change below the size that matters", "camera"
-    )
-    step = next_step("v", sure, "L")
-    assert "`boresight export FORMAT --lake L --vehicle v --out FOLDER`" in step
-    assert "`boresight service --lake L --vehicle v --day YYYY-MM-DD --kind re-mount --sensor camera`" in step
-    for calm in ("GREEN", "UNKNOWN"):
-        assert next_step("v", VehicleStatus(calm, "no sensor moved"), "L") == ""
+    seen = _row("YELLOW", "the camera moved on 2026-03-04: one day stands out: the next day will tell")
+    assert "look again tomorrow: `boresight status --lake L --vehicle v`" in next_step(seen, "L")
+    reason = "the camera has been drifting: a change below the size that matters"
+    step = next_step(_row("YELLOW", reason, vehicle_sensor="camera", vehicle_since="2026-03-04"), "L")
+    assert "`boresight export ros2 --lake L --vehicle v --out tonight/v`" in step
+    assert "`boresight service --lake L --vehicle v --day 2026-03-04 --kind re-mount --sensor camera`" in step
+    assert next_step(_row("GREEN", "no sensor moved"), "L") == ""
+    assert next_step([], "L") == ""
+
+
+@pytest.mark.parametrize(
+    ("status", "reason", "step"),
+    [
+        (
+            "UNKNOWN",
+            "camera-lidar rx: 3 days of data, 5 needed",
+            "2 more accepted days; look again tomorrow: `",
+        ),
+        (
+            "UNKNOWN",
+            "and that size after about 5 days like these",
+            "1 more accepted day; look again tomorrow: `",
+        ),
+        (
+            "UNKNOWN",
+            "too little data to say whether a sensor moved",
+            "failed: `boresight status --lake L --v",
+        ),
+        ("UNKNOWN", "no change; some of its records cannot be read", "`boresight repair --lake L`"),
+        (None, "", "audit again: `boresight audit --fleet FLEET --lake L`, with your fleet.toml for FLEET"),
+    ],
+)
+def test_a_vehicle_that_is_unknown_has_a_next_step_too(status: str | None, reason: str, step: str) -> None:
+    assert step in next_step(_row(status, reason), "L")
+
+
+def test_each_command_of_the_next_steps_runs_as_it_is_printed(
+    lake: Lake, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = Lake.at(shutil.copytree(lake.root, tmp_path / "a lake"))
+    STATE.run(Task(_config(), own, Window()))
+    monkeypatch.chdir(tmp_path)
+    page = html.unescape(write_fleet_page(own, _config(), tmp_path / "fleet.html"))
+    on_page = set(re.findall(r"`(boresight [^`]*)`", page))
+    assert {c.split()[1] for c in on_page} == {"service", "export", "status"}
+    for command in sorted(on_page):  # exports before the events that begin charts anew
+        assert main(shlex.split(command)[1:]) in (0, 3), command
+    assert sorted(p.name for p in (tmp_path / "tonight").iterdir()) == ["red"]
+    assert "red" in capsys.readouterr().out
 
 
 def test_records_of_a_release_that_stored_no_status_stay_readable(lake: Lake, tmp_path: Path) -> None:

@@ -107,6 +107,7 @@ def test_records_of_days_to_come_hide_nobody_s_days(maker, tmp_path):
     assert "2099" not in text
 
 
+@pytest.mark.slow
 def test_workers_draw_what_this_process_draws(maker, tmp_path):
     lake = Lake.at(tmp_path / "lake")
     commit_records(lake, CALIBRATIONS, days_of(maker, "a", 2) + days_of(maker, "b", 2))
@@ -141,6 +142,7 @@ def test_a_page_that_cannot_be_drawn_is_named_and_drawn_the_next_time(maker, tmp
     assert len(report(lake, out, fan_out=one_by_one)) == 1 + 6
 
 
+@pytest.mark.slow
 def test_a_lake_in_a_bucket_is_sent_no_page_that_it_has(maker, monkeypatch, drawn):
     with running() as s3:
         for name, value in s3.environment.items():

@@ -98,6 +98,7 @@ def test_doppler_signs_follow_the_fleet_file(tmp_path, read, the_log):
     assert np.abs(rates["ring16"][0]).max() <= 10.394 / 2 + 0.1
 
 
+@pytest.mark.slow
 def test_workers_give_what_one_process_gives(mcap_day, tmp_path, the_log):
     done = []
     simulate_fleet(

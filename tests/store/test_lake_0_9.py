@@ -118,11 +118,11 @@ def everything(lake, folder):
     found["drift.jsonl"] = rows_of(told("show", "drift", "--current", "--json", "--lake", lake)[1])
     found["states.jsonl"] = rows_of(told("state", "--json", "--lake", lake)[1])
     found["status.txt"] = plain(told("status", "--lake", lake, "--json")[1].replace(str(lake), "LAKE"))
-    found["fleet_page.txt"] = words_of(page.read_text())
+    found["fleet_page.txt"] = words_of(page.read_text().replace(str(lake), "LAKE"))
     fleet = load_fleet(HERE / "fleet.toml")
     for vehicle, day in DAYS:
         drawn = write_day_page(Lake.existing(lake), Partition(vehicle, day), fleet, folder / "day.html")
-        found[f"day_{vehicle}_{day}.txt"] = words_of(drawn.read_text())
+        found[f"day_{vehicle}_{day}.txt"] = words_of(drawn.read_text().replace(str(lake), "LAKE"))
     sides = ("2026-03-05", "2026-03-07")
     found["compare.json"] = told("compare", *sides, "--lake", lake, "--vehicle", "vehicle-2", "--json")[1]
     return found | {f"export_{name}.txt": exported(lake, folder, *rest) for name, rest in EXPORTED.items()}

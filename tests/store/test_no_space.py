@@ -58,7 +58,9 @@ def night(folder, lake):
     return ["nightly", "--fleet", f"{folder}/fleet.toml", *options]
 
 
-@pytest.mark.parametrize(("spare", "table"), [(40, "sweeps"), (200, "features")])
+@pytest.mark.parametrize(
+    ("spare", "table"), [(40, "sweeps"), pytest.param(200, "features", marks=pytest.mark.slow)]
+)
 def test_a_partition_without_space_is_named(spare, table, on_full_disk, tmp_path):
     rig_of(tmp_path, car="default")
     lake = on_full_disk.disk / "lake"

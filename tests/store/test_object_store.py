@@ -225,6 +225,7 @@ for i in range(4):
 """
 
 
+@pytest.mark.slow
 def test_two_writers_at_once_both_get_their_records_in(lake):
     environment = os.environ | {"PYTHONPATH": str(REPO)}
     commands = [[sys.executable, "-c", _COMMITS, str(lake), name] for name in "ab"]

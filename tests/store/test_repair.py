@@ -26,7 +26,7 @@ def server():
         yield s3
 
 
-@pytest.fixture(params=["folder", "bucket"])
+@pytest.fixture(params=["folder", pytest.param("bucket", marks=pytest.mark.slow)])
 def lake(request, tmp_path, monkeypatch):
     """Five commits and an assertion, which replaced the first file."""
     if request.param == "bucket":

@@ -17,6 +17,7 @@ def curves_of(folder, environment):
     return {side: excess / excess.max() for side, excess in found.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("environment", "rises"), [("jam", True), ("urban", False)])
 def test_what_shines_through_windows_rises_where_nothing_else_does(tmp_path, environment, rises):
     curves = curves_of(tmp_path, environment)

@@ -1,4 +1,4 @@
-"""What the adjustment of a rig returns."""
+"""Result of the adjustment of a rig."""
 
 from __future__ import annotations
 
@@ -20,11 +20,9 @@ __all__ = ["AdjustedEdge", "AdjustedRig", "AdjustedSensor", "AdjustmentLimits"]
 
 @dataclass(frozen=True)
 class AdjustmentLimits:
-    """What the adjustment takes for granted.
+    """Assumptions of the adjustment: each sensor's clock sigma, and the limit of an edge's innovation.
 
-    Args:
-        clock_sigma_s: of each sensor's clock before the day, about the prior's.
-        innovation_sigmas: beyond which an edge contradicts the others; of a whole rig, however many edges it has.
+    `innovation_sigmas` holds for a whole rig, however many edges it has.
     """
 
     clock_sigma_s: float
@@ -40,10 +38,11 @@ class AdjustedEdge:
     """An edge beside the adjusted rig.
 
     Args:
-        evidence: what its data show.
-        innovation_sigmas: how far it is from what all other edges in use say; None = nothing but the prior checks it.
+        innovation_sigmas: how far it is from what all other edges in use say; None = nothing but the prior
+            checks it.
         failed: why it is left out; empty = the rig rests on it.
-        doubts: edges one of which is wrong, without a way to tell which: the rig goes on with all but one of them.
+        doubts: edges one of which is wrong, without a way to tell which: the rig goes on with all but one of
+            them.
     """
 
     evidence: EdgeEvidence
@@ -59,17 +58,15 @@ class AdjustedEdge:
 
 @dataclass(frozen=True, eq=False)
 class AdjustedSensor:
-    """How surely a sensor's pose to the reference is known.
+    """Uncertainty of a sensor's pose to the reference.
 
     Degrees of freedom: rotation vector about the reference's axes, then the sensor's origin in them.
 
     Args:
-        observability: 6, as `AdjustedRig.observability` of reference and sensor.
         determined: 6, bool; the others rest on the prior.
         rests_on: edges that its pose rests on: without one of them it is less sure.
         untied: why the day says nothing of its pose to the reference; empty = it does.
         doubts: edges that it rests on, one of which is wrong, without a way to tell which.
-        dt_sigma_s: of its clock.
     """
 
     observability: np.ndarray
@@ -82,14 +79,11 @@ class AdjustedSensor:
 
 @dataclass(frozen=True, eq=False)
 class AdjustedRig:
-    """Poses and clocks of all sensors, and what each edge and each sensor is worth.
+    """Poses and clocks of all sensors, with each edge and each sensor's certainty.
 
     Args:
         poses: with the covariance of all at once.
         of_prior: part of that covariance that is the error of the prior.
-        before: poses as the prior has them.
-        sensors: by name, less the reference.
-        edges: every edge that had evidence.
     """
 
     poses: Extrinsics
@@ -99,12 +93,13 @@ class AdjustedRig:
     edges: Mapping[Edge, AdjustedEdge]
 
     def observability(self, a: str, b: str) -> Float[np.ndarray, " 6"]:
-        """Share of each variance of T_a_b (rotation vector in a's axes, b's origin) that the day has removed.
+        """Share of each variance of T_a_b (rotation vector in a's axes, b's origin) that the day removed.
 
-        Of a turn 1 - posterior/prior, the prior being what it is with all other sensors in place: that the reference
-        was found to be turned says nothing of another sensor's own turn. Of a position it is the share of the variance
-        that is not the prior's error: a position that the prior knows given its turn is not determined because the day
-        found the turn. The other way round a turn may be found to a hundredth of the prior and rest on a position.
+        For a rotation it is 1 - posterior/prior, with the other sensors at their poses: a rotated reference
+        is no information on another sensor's rotation. For a position it is the share of the variance that is
+        not the prior's error: a position that the prior determines given the rotation does not count because
+        the day found the rotation. A rotation may be found to a hundredth of the prior and rest on a
+        position.
         """
         J = change_jacobian(self.poses.between(a, b)) @ self.poses.jacobian_between(a, b)
         variance = np.diag(J @ self.poses.covariance @ J.T)

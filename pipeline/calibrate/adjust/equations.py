@@ -1,10 +1,10 @@
-"""Normal equations of a rig: evidence of edges and the prior of each sensor once, by poses and clocks of all sensors.
+"""Normal equations of a rig: evidence of edges, and the prior of each sensor once, for all poses and clocks.
 
-Unknowns are the left perturbations of T_reference_sensor [rad, m], six a sensor, then a clock [s] a sensor, both in the
-prior's order, then six for every sensor whose edges share a bias, in sigmas of it. Were it only added to the
-covariance, it would not lower the weight of the edges that have it: an edge of .05 deg with a bias
-of .25 deg then made a yaw of .037 deg, which another edge knew, one of .046. A bias of an edge alone is part of its
-noise.
+Unknowns are the left perturbations of T_reference_sensor [rad, m], six per sensor, then a clock [s] per
+sensor, both in the prior's order, then six for every sensor whose edges share a bias, in sigmas of it. If a
+bias were only added to the covariance, it would not lower the weight of its edges: an edge of .05 deg with a
+bias of .25 deg then changed a yaw of .037 deg from another edge to .046 deg. A bias of one edge is part of
+its noise.
 """
 
 from __future__ import annotations
@@ -34,11 +34,8 @@ class Rig:
     """Where all sensors are, and what was known of them before the day.
 
     Args:
-        poses: T of each sensor, and its clock; its covariances are those of `prior`.
         prior: before the day.
-        clock_sigma_s: of each sensor's clock before the day, about the prior's dt.
         biased: sensors whose edges share a bias.
-        biases: of all of them, in sigmas.
     """
 
     poses: Extrinsics
@@ -49,13 +46,13 @@ class Rig:
 
     @classmethod
     def at(cls, prior: Extrinsics, clock_sigma_s: float, evidence: Sequence[EdgeEvidence]) -> Rig:
-        """The prior, and room for the biases that this evidence states."""
+        """The prior as a start, with zeros for the biases of this evidence."""
         biased = tuple(sorted({owner for e in evidence for owner in e.bias} - {EDGE}))
         return cls(prior, prior, clock_sigma_s, biased, np.zeros(6 * len(biased)))
 
     @property
     def unknowns(self) -> int:
-        """Six a sensor and its clock, less the reference's; six a bias."""
+        """Six per sensor and its clock, without the reference's; six per bias."""
         return 7 * len(self.prior.order) + len(self.biases)
 
     @property
@@ -114,7 +111,7 @@ class LinearEdge:
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """Normal equations H d = g of a rig, and what they consist of."""
+    """Normal equations H d = g of a rig, and their parts."""
 
     H: np.ndarray  # N N
     g: np.ndarray  # N
@@ -122,17 +119,12 @@ class Equations:
     edges: tuple[LinearEdge, ...]
 
     def without(self, left_out: LinearEdge) -> Equations:
-        """The equations less one edge."""
+        """The equations without one edge."""
         J, edges = left_out.J, tuple(e for e in self.edges if e is not left_out)
         return replace(self, H=self.H - J.T @ left_out.W @ J, g=self.g - J.T @ left_out.descent, edges=edges)
 
     def common(self, C: Float[np.ndarray, "N N"], rig: Rig) -> Float[np.ndarray, "N N"]:
-        """Part of the solution's covariance that all days err by alike: the prior's and that of biases.
-
-        Args:
-            C: inverse of H.
-            rig: whose prior says which part of it that is.
-        """
+        """Part of the solution's covariance C from errors common to all days: the prior's and the biases'."""
         alike = rig.prior_covariance
         poses = len(rig.prior.covariance)
         alike[:poses, :poses] = rig.prior.common

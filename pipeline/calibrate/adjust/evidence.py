@@ -1,9 +1,9 @@
-"""What the data alone show, of a pair's estimate that has the prior in it: what the adjustment adds up.
+"""Information of the data alone, from a pair's estimate that includes the prior.
 
-A pair's estimate is the best of data and prior together. Summed over a graph as it is, the prior would count once for
-every edge. So the prior is taken out again, along the directions in which estimate and prior differ: where the estimate
-has a share c of the prior's variance, the data alone have 1/c - 1 of its information. What the day left at the prior
-has c = 1 and no information; nothing is lost to cancellation where c is small.
+An estimate combines data and prior. Summed over a graph, the prior would count once for every edge, so it is
+removed along the directions in which estimate and prior differ: if the estimate has a share c of the prior's
+variance, the data alone have 1/c - 1 of its information. Directions left at the prior have c = 1 and no
+information; small c lose nothing to cancellation.
 """
 
 from __future__ import annotations
@@ -39,8 +39,6 @@ def evidence_of(
     """The estimate without its prior.
 
     Args:
-        estimate: of one pair, its covariance with prior and biases.
-        edge: the pair's sensors.
         prior: that the estimate has in it.
         clock_sigma_s: of the time offset before the day.
         checks: that the estimate failed beside its own.
@@ -71,7 +69,7 @@ def evidence_of(
 def _of_pose(
     estimate: PairEstimate, prior: Prior
 ) -> tuple[Float[np.ndarray, "6 6"], Float[np.ndarray, " 6"], Float[np.ndarray, "6 6"]]:
-    """Information and gradient of the left perturbation, biases not in them; of these, what the weights had in them."""
+    """Information and gradient of the left perturbation without biases, and biases in the weights."""
     to_change = change_jacobian(estimate.T)
     before = prior.covariance(estimate.pair)
     added = sum(estimate.bias.values(), np.zeros((6, 6)))
@@ -82,7 +80,7 @@ def _of_pose(
         return np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6))
     V, c = directions[:, shown], np.maximum(shares[shown], _LEAST_SHARE)
     within = np.zeros((6, 6)) if estimate.bias_in_weights is None else estimate.bias_in_weights
-    # The prior had its say in the estimate, and with it against these biases.
+    # The prior took part in the estimate, also against these biases.
     to_data = (V / (1 - c)).T @ to_change
     biases = to_data @ within @ to_data.T
     W = V @ np.linalg.inv(_less(np.diag(c / (1 - c)), biases))
@@ -93,7 +91,7 @@ def _of_pose(
 
 
 def _less(variance: np.ndarray, biases: np.ndarray) -> np.ndarray:
-    """A covariance less what biases have in it; what is left is noise, and nowhere less than a share of it all."""
+    """A covariance without its biases: the noise, at least a share of the total."""
     values, vectors = eigh(biases, variance)
     root = variance @ vectors
     return (root * np.maximum(1 - values, _LEAST_NOISE)) @ root.T

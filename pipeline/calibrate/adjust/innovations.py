@@ -1,7 +1,7 @@
-"""Each edge against what all others say of it: the innovation of leaving it out.
+"""Innovation of each edge: its distance to all others, in sigmas.
 
-An edge without a second way between its sensors has none: what is left to compare with is the prior. Along a direction
-that neither the edge nor the others know better than the prior did, a comparison says nothing and is left out.
+An edge without a second path between its sensors is compared with the prior. Directions that neither the edge
+nor the others know better than the prior are left out.
 """
 
 from __future__ import annotations
@@ -23,15 +23,9 @@ _NONE = 1e-6
 def innovation(
     edge: LinearEdge, others: Equations, prior_covariance: Float[np.ndarray, "N N"]
 ) -> tuple[float, float] | None:
-    """Chi-squared of the edge against the others and the prior, and the sigmas of a normal as improbable.
+    """Chi-squared of the edge against others and prior, and the equivalent normal sigmas.
 
-    Args:
-        edge: linearised where the others are.
-        others: equations without it.
-        prior_covariance: of all unknowns before the day.
-
-    Returns:
-        None where edge and others together know no direction better than the prior.
+    None if edge and others together know no direction better than the prior.
     """
     C = inverse_of_information(others.H)
     before = edge.J @ prior_covariance @ edge.J.T
@@ -47,6 +41,6 @@ def innovation(
 
 
 def _sigmas(square: float, freedom: int) -> float:
-    """Of a normal that strays so far as seldom; the root of chi-squared where that is too seldom for a number."""
+    """Normal deviate of equal probability; the root of chi-squared if that is below the number range."""
     log_probability = float(chi2.logsf(square, freedom))
     return float(-ndtri_exp(log_probability - np.log(2))) if np.isfinite(log_probability) else square**0.5

@@ -1,9 +1,9 @@
-"""One solve over a rig: poses and clocks of all sensors, edges that contradict the others left out.
+"""One solve over a rig: poses and clocks of all sensors, without edges that contradict the others.
 
-Edges whose own checks failed are left out first: inside a cycle of edges an innovation tells that one of them is wrong,
-hardly ever which. Then the edge that contradicts the others most goes, as long as one does beyond the limit, and the
-rest is solved again. Where several explain the contradiction about as well, the one goes that the poses lose least by,
-and all of them are named.
+Edges that failed a check are left out first: within a cycle, an innovation shows that one edge is wrong, but
+rarely which one. Then the edge with the largest innovation beyond the limit is removed, and the rest is
+solved again. If several edges explain a contradiction about as well, the one that costs the poses least goes,
+and all are named.
 """
 
 from __future__ import annotations
@@ -48,13 +48,12 @@ def adjust(
     """Solve poses and clocks of all sensors.
 
     Args:
-        graph: the rig; edges without evidence say nothing.
         prior: where all sensors are, each once; the part that all days err by alike is its `common`.
         evidence: of edges of the graph, each once.
-        limits: what is taken for granted.
 
     Raises:
-        ValueError: evidence of an edge that the graph lacks, or twice; a prior that is not of the graph's sensors.
+        ValueError: evidence of an edge that the graph lacks, or twice; a prior that is not of the graph's
+            sensors.
     """
     _check(graph, prior, evidence)
     failed = {e.edge: e.checks for e in evidence if e.checks}
@@ -122,7 +121,7 @@ def _innovations(
 def _worst(
     graph: RigGraph, equations: Equations, found: Mapping[Edge, tuple[float, float]], limits: AdjustmentLimits
 ) -> tuple[Edge, tuple[Edge, ...], float] | None:
-    """The edge to leave out, those that it cannot be told from, and its sigmas; None where none contradicts."""
+    """Edge to leave out, indistinguishable ones, and its sigmas; None if none contradicts the others."""
     tested = {e.evidence.edge: e for e in equations.edges if e.evidence.edge in found}
     if not tested:
         return None
@@ -141,7 +140,7 @@ def _worst(
 
 
 def _left(equations: Equations, edge: LinearEdge) -> float:
-    """Logarithm of the information that is left without an edge."""
+    """Logarithm of the remaining information without an edge."""
     return float(np.linalg.slogdet(equations.without(edge).H)[1])
 
 
@@ -156,7 +155,7 @@ def _contradiction(edge: Edge, rivals: Collection[Edge], sigmas: float) -> Faile
 def _concluded(
     graph: RigGraph, rig: Rig, equations: Equations, edges: Mapping[Edge, AdjustedEdge]
 ) -> AdjustedRig:
-    """The rig with its covariances, and what each sensor is worth."""
+    """The rig with covariances and the state of each sensor."""
     n, order = 6 * len(rig.prior.order), rig.prior.order
     C = inverse_of_information(equations.H)
     follow = C[:n, :n] @ equations.prior_information[:n, :n]
@@ -183,7 +182,7 @@ def _concluded(
 
 
 def _rests_on(equations: Equations, C: Float[np.ndarray, "N N"], sensors: int) -> list[dict[Edge, float]]:
-    """By sensor, how much the variance of its pose grows without each edge, along the axis where it grows most."""
+    """By sensor, largest growth of its pose's variance without each edge, over all axes."""
     found: list[dict[Edge, float]] = [{} for _ in range(sensors)]
     for edge in equations.edges:
         without = inverse_of_information(equations.without(edge).H)

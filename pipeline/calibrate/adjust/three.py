@@ -24,11 +24,9 @@ def three_sensors(pairs: Collection[str]) -> RigGraph:
 
 
 def poses_of(prior: Prior, dt_s: dict[str, float]) -> Extrinsics:
-    """Poses in the lidar; of each transform turn and position are known independently, about the parent's axes.
+    """Poses relative to the lidar; rotation and position of each transform are independent, in parent axes.
 
-    Args:
-        prior: knows camera_lidar and lidar_radar.
-        dt_s: what is expected of the clocks of camera and radar against the lidar's.
+    `dt_s` are the expected clock offsets of camera and radar to the lidar.
     """
     T_lidar_camera = inverse(prior.T_camera_lidar)
     covariance = np.zeros((12, 12))

@@ -1,11 +1,10 @@
-"""Edge lidar-base: how a lidar stands on the car, by the road under it and the way that it drives.
+"""Edge lidar-base: mounting of a lidar on the car, from the road under it and its direction of travel.
 
-The road shows roll, pitch and height; the direction of travel shows yaw, and pitch a second time, sharper: the rear
-axle follows the road. Both are means over scenes: slopes, bends and bumps come and go, and what the car nods and leans
-under acceleration is fitted along with its acceleration. x and y are shown by neither; they have no information.
-
-So base is the frame that the road and the wheels define: z up from the road, x along the way of straight driving. One
-that is fixed to the body differs by how the car stands (load, springs) and rolls (toe); `STANCE` says by how much.
+The road determines roll, pitch and height. The direction of travel determines yaw, and pitch more sharply,
+because the rear axle follows the road. Both are means over scenes, so slopes, bends and bumps cancel; nodding
+and leaning under acceleration are fitted with the acceleration. x and y have no information. Base is thus the
+frame of road and wheels: z up from the road, x along straight driving. A frame fixed to the body differs by
+the car's stance (load, springs) and rolling direction (toe); `STANCE` is the size of this difference.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ _AXES = ("roll", "pitch", "yaw", "height")
 
 @dataclass(frozen=True, eq=False)
 class _Shown:
-    """What the day shows of the pose of a lidar in its base, each None where it shows nothing."""
+    """Evidence of a lidar's pose in its base; None for parts without data."""
 
     roll: Regression | None
     pitch_by_road: Regression | None
@@ -87,11 +86,8 @@ def estimate_lidar_base(
     """What a day shows of T_lidar_base.
 
     Args:
-        edge: lidar, base.
-        sweeps: one per moment.
         ego: motion of the base at these moments.
         T_base_lidar: the start; nothing of it enters the information.
-        scenes: of the moments.
         T_base_lidar_deskewed: pose by which sweeps were de-skewed; None = the start.
         road_z_m: where the road lies in axes of the base: 0 for one on the ground.
         height_m: the lidar's height over the road as somebody measured it, and the sigma of that.
@@ -124,12 +120,12 @@ def _solved(
     scenes: Scenes,
     road_z_m: float,
 ) -> tuple[np.ndarray, SweepTravel, RoadUnder, _Shown]:
-    """The pose to which road and way lead, and what they show there."""
+    """Pose by road and direction of travel, and their evidence there."""
     start = T
     skewed = ego.at_sensor(assumed)
     travel = sweep_travel(deskewed_again(sweeps, skewed, ego.at_sensor(T)), ego, T)
     for again in range(3):
-        # The road is asked again once sweeps are de-skewed along the way; the way hardly depends on that.
+        # The road is fitted again after de-skewing along the way; the way hardly depends on that.
         now = deskewed_again(sweeps, skewed, ego.at_sensor(T))
         if again and _angle(start, T) > _AGAIN_RAD:
             start, travel = T, sweep_travel(now, ego, T)
@@ -141,7 +137,7 @@ def _solved(
 
 
 def _shown(travel: SweepTravel, roads: RoadUnder, ego: EgoMotion, scenes: Scenes, road_z_m: float) -> _Shown:
-    """Regressions on what the car nods, leans and turns by; signs are those of the pose's change."""
+    """Regressions on nodding, leaning and turning; signs are those of the pose's change."""
     azimuth, elevation = travel.angles_rad.T
     one, free = np.ones(len(azimuth)), np.inf
     block, sigma = travel.bend, 1 / np.minimum(travel.way_m, _LONGEST_WAY_M)
@@ -185,7 +181,7 @@ def _with_measured(
 
 
 def _halves(shown: _Shown) -> list[FailedCheck]:
-    """Axes in which one half of the scenes contradicts the other, beyond what a car's stance leaves."""
+    """Axes in which the two halves of the scenes contradict each other, beyond the car's stance."""
     of = {"roll": shown.roll, "pitch": shown.pitch_by_way, "yaw": shown.yaw, "height": shown.height}
     checks = []
     for (name, fit), stance in zip(of.items(), STANCE, strict=True):
@@ -208,7 +204,7 @@ def _by_left_perturbation(
 
 
 def _biases(edge: Edge, T: np.ndarray) -> dict[str, np.ndarray]:
-    """What all days err by alike: the car's stance, the lidar's ranges, the matching."""
+    """Errors common to all days: the car's stance, the lidar's ranges, the matching."""
     up = inverse(T)[:3, :3] @ [0.0, 0.0, 1.0]
     of_lidar = np.zeros((6, 6))
     of_lidar[3:, 3:] = _RANGES_M**2 * np.outer(up, up)

@@ -1,9 +1,9 @@
-"""Edge lidar-lidar: two lidars of one car that see the same, by registration of what stands, all moments at once.
+"""Edge lidar-lidar: registration of standing objects in the overlap of two lidars, all moments at once.
 
-The points of the child are laid on the surfaces of the parent, moved by what the car drove between both stamps; the
-clocks are an unknown that moving cars show. Every moment has its own robust scale, and how the moments' gradients
-scatter over scenes says how sure the pose is. Lidars that share nothing have no edge: they meet through the base, or
-through a camera.
+Points of the child are aligned with surfaces of the parent, moved by the car's motion between both stamps;
+moving cars determine the clock offset. Every moment has its own robust scale, and the scatter of the
+gradients over scenes gives the covariance. Lidars without overlap have no edge: they are connected through
+the base, or a camera.
 """
 
 from __future__ import annotations
@@ -61,8 +61,6 @@ class LidarPair:
     """Two lidars' sweeps of the same moments.
 
     Args:
-        parent: sweeps of the parent.
-        child: of the child, in the same order.
         T_base_parent: of the parent on the car, good to a degree: says where is up, and ahead.
         deskewed: T_base_sensor by which sweeps of parent and child were de-skewed.
         base_sigma_rad: of T_base_parent: de-skewing goes along it.
@@ -101,17 +99,10 @@ class _End:
 def estimate_lidar_lidar(
     edge: Edge, pair: LidarPair, ego: EgoMotion, T_parent_child: Float[np.ndarray, "4 4"], scenes: Scenes
 ) -> EdgeEvidence:
-    """What a day shows of T_parent_child and of the child's clock.
-
-    Args:
-        edge: both lidars.
-        pair: their sweeps.
-        ego: motion of the base at these moments.
-        T_parent_child: the start, good to some 5 deg and a metre; nothing of it enters the information.
-        scenes: of the moments.
+    """Evidence of T_parent_child and the child's clock, from a start good to 5 deg and a metre.
 
     Raises:
-        SolveError: too few moments in which both see the same.
+        SolveError: too few moments with overlap.
     """
     block_of, A = scenes.block, pair.T_base_parent
     moments = _moments(pair, ego, T_parent_child, scenes)
@@ -221,7 +212,7 @@ def _other_ends(ends: Sequence[_End]) -> tuple[FailedCheck, ...]:
 
 
 def _floor(pair: LidarPair, moments: Sequence[_Moment]) -> np.ndarray:
-    """What all moments err by alike: ranges, and sweeps that were de-skewed along a base that is off."""
+    """Errors common to all moments: ranges, and de-skewing with a wrong base."""
     speed = float(np.sqrt(np.mean([m.motion[3] ** 2 + m.motion[4] ** 2 for m in moments])))
     lifted = (
         speed
@@ -232,7 +223,7 @@ def _floor(pair: LidarPair, moments: Sequence[_Moment]) -> np.ndarray:
 
 
 def _evidence(end: _End, blocks: np.ndarray, A: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Information and gradient for T_parent_child: what blocks scatter by, of the directions that they show."""
+    """Information and gradient for T_parent_child, from the scatter of blocks, in observed directions."""
     H, unit = end.H.sum(0), _UNITS
     curvature, axes = np.linalg.eigh(H / np.outer(unit, unit))
     names = np.unique(blocks)

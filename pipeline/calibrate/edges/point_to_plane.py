@@ -1,10 +1,10 @@
-"""Registration of one sampled cloud to the surfaces of another: point to plane, robust, from a start that is near.
+"""Registration of a sampled cloud to the surfaces of another: point to plane, robust, from a near start.
 
-Ground and ceilings hold height and tilt only. Their normals are noisy, and a noisy normal holds a point where the
-start put it: on an empty square that passes for knowledge of the way driven.
+Ground and ceilings constrain height and tilt only: their noisy normals hold points at the start, which on an
+empty square looks like information along the way.
 
-Source: Chen and Medioni 1992, "Object modelling by registration of multiple range images"; Geman-McClure weights with
-a scale that follows the residuals.
+Source: Chen and Medioni 1992, "Object modelling by registration of multiple range images"; Geman-McClure
+weights with a scale that follows the residuals.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _LEAST_SCATTER_M = 0.01  # no car lidar measures better
 
 
 class Surfaces:
-    """Points with the normals of what they lie on."""
+    """Points with the normals of their surfaces."""
 
     def __init__(self, xyz_m: Float[np.ndarray, "N 3"]) -> None:
         self.xyz_m = xyz_m
@@ -49,7 +49,7 @@ class Surfaces:
 
 @dataclass(frozen=True, eq=False)
 class PlaneEquations:
-    """Of points near surfaces, for a left perturbation (rotation, shift) of where they are."""
+    """Equations of points near surfaces, for a left perturbation (rotation, shift)."""
 
     information: np.ndarray  # 6 6
     gradient: np.ndarray  # 6, downhill
@@ -75,9 +75,6 @@ def register(
     """Find T_target_source.
 
     Args:
-        source_m: points.
-        target: surfaces, in axes whose z is about vertical.
-        start: T_target_source, within the first gate.
         sigmas: of the start, for left perturbations: what no surface holds stays there.
         gates_m: points further from all others stand for nothing; one round for each.
 

@@ -1,11 +1,11 @@
 """Edge radar-base: how a radar stands on the car, by its own velocity against the way that the car drives.
 
-Straight on, the way is the base's x axis: its azimuth in radar axes is yaw. In turns a radar ahead of the rear axle
-goes sideways by the yaw rate times its lever arm; that and the slip of the axle are one slope over curvature, so x
-stays without information: no log tells them apart. Pitch needs elevations, and least squares on them is pulled towards
-their mean; the velocities of `objective/radar/travel`, which a lidar with the same view mends, show it, and a radar
-that shares its view with none has no pitch. Roll and position turn or shift nothing of the way. Changes of speed show
-the clock. The motion must be of other sources than this radar.
+Straight on, the way is the base's x axis: its azimuth in radar axes is yaw. In turns a radar ahead of the
+rear axle goes sideways by the yaw rate times its lever arm; that and the slip of the axle are one slope over
+curvature, so x stays without information: no log tells them apart. Pitch needs elevations, and least squares
+on them is pulled towards their mean; the velocities of `objective/radar/travel`, which a lidar with the same
+view mends, show it, and a radar that shares its view with none has no pitch. Roll and position turn or shift
+nothing of the way. Changes of speed show the clock. The motion must be of other sources than this radar.
 """
 
 from __future__ import annotations
@@ -62,11 +62,8 @@ def estimate_radar_base(
     """What a day shows of T_radar_base and of the base's clock.
 
     Args:
-        edge: radar, base.
         radar: its Doppler, and the start; nothing of its rotation enters the information.
         ego: motion of the base at the same moments, by other sources.
-        stamps: of the moments.
-        scenes: of the moments.
         directions: velocities by a lidar's elevations; None of a radar that shares its view with none.
     """
     T = radar.T_base_radar
@@ -84,7 +81,7 @@ def estimate_radar_base(
     moments = int(np.sum(_moving(radar, ego)))
     return EdgeEvidence(
         edge, inverse(T), 0.0 if clock is None else float(clock.value[0]), (J.T / variance) @ J, np.zeros(7),
-        _biases(T, 0.0 if directions is None else directions.bias_rad),
+        _biases(T, 0.0 if directions is None else directions.bias_rad()),
         frames_used=moments, diagnostics=_numbers(yaw, moments), notes=_notes(yaw, pitch, clock),
     )  # fmt: skip
 
@@ -97,7 +94,7 @@ def _moving(radar: DopplerMotion, ego: EgoMotion) -> np.ndarray:
 def _by_doppler(
     radar: DopplerMotion, T: np.ndarray, ego: EgoMotion, stamps: Stamps
 ) -> tuple[Regression | None, Regression | None]:
-    """Change of yaw, and the clock: stamp of the radar less that of the base."""
+    """Change of yaw, and the clock: stamp of the radar minus that of the base."""
     use = _moving(radar, ego)
     R, ways = T[:2, :3], np.copysign(1.0, ego.velocity_mps[use, :1])
     seen = radar.velocity_mps[use] @ R.T

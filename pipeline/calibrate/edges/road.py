@@ -1,8 +1,8 @@
-"""The road under the car, sweep by sweep: height, slope and cross slope in axes of the base.
+"""The road under the car, per sweep: height, slope and cross slope in axes of the base.
 
-A strip as wide as the car is what its wheels stand on. Beyond it lie kerbs and pavements: a plane through all ground
-within 35 m leaned by 0.1 to 0.4 deg towards the nearer pavement on simulated streets, and the strip by 0.03. Along the
-way the strip is a parabola, for roads bend, and it is asked at the base's origin.
+The fit uses a strip as wide as the car. Beyond it are kerbs and pavements: a plane through all ground within
+35 m leaned by 0.1 to 0.4 deg towards the nearer pavement on simulated streets, the strip by 0.03. Along the
+way the strip is a parabola, because roads bend; it is evaluated at the base's origin.
 """
 
 from __future__ import annotations
@@ -41,13 +41,7 @@ class RoadUnder:
 
 
 def road_under(sweeps: Sequence[Sweep], T_base_lidar: Float[np.ndarray, "4 4"], road_z_m: float) -> RoadUnder:
-    """Fit the road in each sweep that shows enough of it.
-
-    Args:
-        sweeps: of one lidar.
-        T_base_lidar: its pose, good to a few degrees.
-        road_z_m: where the road lies in axes of the base.
-    """
+    """Fit the road in each sweep that shows enough of it; `T_base_lidar` is good to a few degrees."""
     rows = [
         (float(k), *fit) for k, s in enumerate(sweeps) if (fit := _fit(s, T_base_lidar, road_z_m)) is not None
     ]

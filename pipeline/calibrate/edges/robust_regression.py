@@ -1,4 +1,4 @@
-"""Robust linear regression whose covariance is what blocks of frames differ by."""
+"""Robust linear regression with a covariance from the scatter of blocks of frames."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _FEW = 4
 
 @dataclass(frozen=True, eq=False)
 class Regression:
-    """Coefficients, their covariance, and what single rows scatter by (in units of their sigmas)."""
+    """Coefficients, their covariance, and the scatter of single rows (in units of their sigmas)."""
 
     value: np.ndarray  # P
     covariance: np.ndarray  # P P
@@ -35,11 +35,10 @@ def regress(
 ) -> Regression | None:
     """Fit y = A x.
 
-    The covariance is the larger one, by coefficient, of what blocks show (sandwich) and what independent rows would.
+    The covariance is the larger one, by coefficient, of what blocks show (sandwich) and what independent rows
+    would.
 
     Args:
-        A: rows of the design.
-        y: values.
         sigma: of the rows against each other; their common scale is estimated.
         blocks: rows of one block may err alike.
         prior_sigmas: of coefficients about 0; infinite ones are free.
@@ -66,7 +65,7 @@ def regress(
 
 
 def _small_sample(blocks: int) -> float:
-    """By how much few blocks understate a variance: what Student's t has over the normal, and the mean taken off."""
+    """Factor by which few blocks understate a variance: Student's t over the normal, and the removed mean."""
     return blocks / (blocks - 1) * ((blocks - 1) / (blocks - 3) if blocks > _FEW else _FEW)
 
 
@@ -91,7 +90,7 @@ def _median(values: np.ndarray, share: np.ndarray) -> float:
 
 
 def _halves(A: np.ndarray, y: np.ndarray, blocks: np.ndarray, held: np.ndarray, share: np.ndarray) -> float:
-    """How far the first coefficient of even blocks lies from the mean of even and odd ones; NaN of too few."""
+    """Distance of the first coefficient of even blocks to the mean of even and odd ones; NaN for too few."""
     even = np.unique(blocks, return_inverse=True)[1] % 2 == 0
     if min(even.sum(), (~even).sum()) <= 2 * A.shape[1]:
         return float("nan")

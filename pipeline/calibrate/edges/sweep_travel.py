@@ -1,8 +1,8 @@
-"""The way a lidar travels, in its own axes, from pairs of its sweeps: no radar, and no heading of anyone's.
+"""Direction of travel of a lidar in its own axes, from pairs of its sweeps; no radar or heading is needed.
 
-What stands is registered from one sweep to the next. The transform between them is a screw, and a car's rear axle
-does not slip sideways or hop: the direction in which it travels is the vehicle's x axis. Odometry says only where to
-look, and how far the way was where walls do not tell (a tunnel).
+Standing objects are registered from one sweep to the next. The transform is a screw; a car's rear axle does
+not slip sideways or hop, so the direction of travel is the vehicle's x axis. Odometry gives the start of the
+search, and the distance where walls do not determine it (a tunnel).
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def _pairs(sweeps: Sequence[Sweep], ego: EgoMotion) -> Int64[np.ndarray, "P 2"]:
 def _between(
     sweeps: Sequence[Sweep], ego: EgoMotion, T_base_lidar: np.ndarray, i: int, j: int
 ) -> tuple[float, ...] | None:
-    """A row of SweepTravel; None where the sweeps do not tell."""
+    """A row of SweepTravel; None if the sweeps do not determine it."""
     gap_s = (sweeps[j].stamp_ns - sweeps[i].stamp_ns) * 1e-9
     before, after = (transform_points(T_base_lidar, sweeps[k].xyz_m) for k in (i, j))
     surfaces = Surfaces.of(before[:: max(1, len(before) // _MOST_SURFACES)])
@@ -115,7 +115,7 @@ def _between(
 
 
 def _sigmas_m(information: np.ndarray, way_m: float) -> tuple[float, float]:
-    """Of the way's end aside and up, as the way's direction has it: half of a turn on the way goes with it."""
+    """Sigmas of the way's end to the side and up; half of a rotation on the way is included."""
     held = np.diag(_START_SIGMAS**-2.0) * np.diag([1, 1, 1, 1, _NO_SHARE, _NO_SHARE])
     C = np.linalg.inv(information + held)
     aside = np.array([0.0, 0.0, way_m / 2, 0.0, 1.0, 0.0])

@@ -1,4 +1,4 @@
-"""What edges look at of one lidar's sweeps, whichever table holds it, and its de-skewing done again."""
+"""Sweeps of one lidar for the edges, from any table, and repeated de-skewing."""
 
 from __future__ import annotations
 
@@ -20,9 +20,7 @@ class Sweep:
     """The uniform sample of one sweep, lidar axes, de-skewed to its stamp.
 
     Args:
-        stamp_ns: of the lidar's clock.
         drive: continuous stretch of driving.
-        xyz_m: N 3.
         is_ground: N, on the drivable ground.
         may_move: N, on something of a vehicle's size.
         time_s: N, when each point was measured, against the stamp; None where nobody knows.
@@ -63,10 +61,10 @@ def vehicle_sized(
 def deskewed_again(
     sweeps: Sequence[Sweep], assumed_mps: Float[np.ndarray, "F 3"], velocity_mps: Float[np.ndarray, "F 3"]
 ) -> list[Sweep]:
-    """Points moved along what the lidar's velocity is, in place of what de-skewing assumed (both in lidar axes).
+    """Points moved along the lidar's velocity in place of that assumed by de-skewing (both in lidar axes).
 
-    A mounting that is a degree off lifts one side of a sweep by 5 cm on a motorway, which is a tenth of a degree of
-    roll. Sweeps whose points have no times stay.
+    A mounting error of a degree lifts one side of a sweep by 5 cm on a motorway: a tenth of a degree of roll.
+    Sweeps without times of points stay.
     """
     return [
         s

@@ -1,7 +1,8 @@
 """Camera-radar without the lidar: moving clusters against boxes in azimuth, detections in boxes in elevation.
 
-Its translation stays at the prior (angles of far objects hardly depend on it), and its azimuth is known to a quarter of
-a degree: alone it is held, in the adjustment it checks the lidar's pairs and gives a radar its roll.
+Its translation stays at the prior (angles of far objects hardly depend on it), and its azimuth has a sigma of
+a quarter of a degree: alone it is held; in the adjustment it checks the lidar's pairs and determines a
+radar's roll.
 """
 
 from __future__ import annotations
@@ -104,10 +105,6 @@ def estimate_camera_radar(
     """Estimate the rotation of T_camera_radar from what camera and radar both see; never uses the lidar.
 
     Args:
-        observations: frames.
-        prior: start and prior; translation stays there.
-        config: search range, resampling.
-        rng: resamples.
         boxes: whether elevations in vehicle boxes take part; without them pitch and roll stay at the prior.
     """
     seen = _Seen(observations, moving_clusters(observations), vehicle_boxes(observations if boxes else []))
@@ -191,8 +188,8 @@ def camera_radar_cost(
 ) -> Float[np.ndarray, " F"]:
     """Cost of each held-out frame at a pose: robust azimuth distance of moving clusters to boxes, 0..1.
 
-    Clusters in the camera's view count, those without any box within 3 deg as 1. NaN where a frame has none or no
-    boxes.
+    Clusters in the camera's view count, those without any box within 3 deg as 1. NaN where a frame has none
+    or no boxes.
     """
     clusters = moving_clusters(observations)
     out = np.full(len(observations), np.nan)
@@ -208,10 +205,9 @@ def camera_radar_cost(
 
 
 def _scan_azimuth(clusters: MovingClusters, T0: np.ndarray, config: SolveConfig) -> tuple[np.ndarray, float]:
-    """The turn about the camera's vertical under which most moving clusters meet a box, near turns first.
+    """The rotation about the camera's vertical at which most moving clusters meet a box, near ones first.
 
-    Returns:
-        The pose, and how many clusters the best turn elsewhere matches, as a share of this one's.
+    Also returns the matches of the best other rotation, as a share of this one's.
     """
     reach = np.radians(_SCHEDULE.scan_reach * config.search_rotation_deg)
     turns = np.arange(-np.ceil(reach / _SCAN_STEP_RAD), np.ceil(reach / _SCAN_STEP_RAD) + 1) * _SCAN_STEP_RAD

@@ -14,7 +14,7 @@ from pipeline.extrinsics.estimates import PairEstimate
 __all__ = ["lidar_radar_failures"]
 
 _SIGMAS = 3.0
-# Restarts end before the last steps: only what would be another basin counts, and only in what is claimed.
+# Restarts end before the last steps: only another basin counts, and only in certified axes.
 _RESTART_ROTATION_RAD, _RESTART_SHIFT_M = np.radians(0.15), 0.05
 _HALVES_FACTOR = 2  # two halves differ by twice the error of the whole, if their errors are independent
 _NAMES = ("roll", "pitch", "yaw", "x", "y", "z")

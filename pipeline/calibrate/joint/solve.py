@@ -1,11 +1,10 @@
-"""Method `joint`: each pair by the two sensors that it is of; what they show together is the adjustment's to say.
+"""Method `joint`: each pair from its two sensors alone; the adjustment combines them.
 
-Nothing that two pairs could show is put into both: vehicle boxes belong to camera-radar alone. One number goes from
-pair to pair: camera-lidar's time offset moves the cloud along the car's way, whose direction in lidar axes the radar's
-Doppler shows (`objective/ego_motion`), as surely as the radar's own turn is known.
-
-Where a sensor is missing, the pairs of the others are solved as they are: camera-lidar along the lidar's own x axis.
-A CameraInfo that the day contradicts holds camera-lidar: with a better one its pose is another.
+No evidence enters two pairs: vehicle boxes belong to camera-radar alone. One number is passed on:
+camera-lidar's time offset moves the cloud along the car's way, whose direction in lidar axes comes from the
+radar's Doppler (`objective/ego_motion`), with the uncertainty of the radar's rotation. If a sensor is
+missing, the other pairs are solved as they are: camera-lidar along the lidar's own x axis. A CameraInfo that
+the day contradicts holds camera-lidar, because its pose depends on it.
 """
 
 from __future__ import annotations
@@ -49,18 +48,9 @@ def solve_joint(
     triggered: Sequence[str] = PAIRS,
     progress: Progress = silent,
 ) -> Solution:
-    """Solve the pairs that have frames.
+    """Solve the pairs that have frames, if triggered; others keep the prior.
 
-    Args:
-        observations: selected frames per pair.
-        prior: start and weak prior.
-        config: effort.
-        seed: decides everything random.
-        triggered: pairs to estimate; others keep the prior.
-        progress: told about each pair.
-
-    Returns:
-        The solution; a pair that the day cannot determine keeps its prior, with a failed check that says why.
+    A pair that the day cannot determine keeps its prior too, with a failed check that gives the reason.
     """
     prior, config = _without_terms(prior, config)
     found: dict[str, _Found] = {}
@@ -96,15 +86,15 @@ def _solved(
     heading = _heading(observations, before.get("lidar_radar"), prior)
     found = analyse_camera_lidar(aligned, np.random.default_rng([seed, 3]), heading=heading)
     found = replace(found, disproved=aligned.basin.doubt)
-    # Of a basin that is lost, nobody knows what its intrinsics are worth.
+    # Intrinsics of a lost basin have no known accuracy.
     told = [] if found.disproved else contradictions(aligned.intrinsics, prior.camera)
     return found, [*told, *found.failed_checks]
 
 
 def _with_loop(solution: Solution) -> Solution:
-    """The solution with how far its three pairs' turns are from closing, over those that camera and radar determined.
+    """The solution with the rotation of its open loop, over the rotations that camera and radar determined.
 
-    Their position is the prior's, so the loop has no shift.
+    Positions are the prior's, so the loop has no shift.
     """
     if len(solution.pairs) < len(PAIRS) or not solution.pairs["camera_radar"].observable[:3].any():
         return solution

@@ -1,1 +1,1 @@
-"""What several methods share: searches, response surfaces, covariance, bias floors."""
+"""Shared numerics of the methods: searches, response surfaces, covariance, bias floors."""

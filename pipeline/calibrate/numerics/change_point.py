@@ -1,9 +1,9 @@
 """A day in two parts, cut where a sensor may have moved, and how far the parts are apart.
 
-At the solution of the whole day the gradients of all frames sum to nothing. If a sensor moved, those before the change
-pull to one side and those after it to the other, so that the running sum is furthest from zero at the change. Each part
-is then solved by itself; where the two contradict each other, the cut is moved to where the frames begin to score
-better at the last part's solution.
+At the solution of the whole day the gradients of all frames sum to nothing. If a sensor moved, those before
+the change pull to one side and those after it to the other, so that the running sum is furthest from zero at
+the change. Each part is then solved by itself; where the two contradict each other, the cut is moved to where
+the frames begin to score better at the last part's solution.
 
 Source: Page 1954 (cumulative sums); Hinkley 1970 (one step at an unknown time, and its likelihood).
 """
@@ -48,9 +48,6 @@ def parts_of_day(
     """First and last part of a day; None where it is too short, or shows too few scenes, to be cut.
 
     Args:
-        gradient: of each frame at the solution of all, in order of time, by what may have changed.
-        stamp_ns: of each frame.
-        solve: some frames alone.
         score: of each frame at a solution, higher is better.
         tested: rotations (0, 1, 2) that are compared.
         scene: of each frame; a part of fewer than three knows nothing of its own spread.
@@ -74,7 +71,7 @@ def parts_of_day(
 
 
 def with_parts(estimate: PairEstimate, parts: DayParts | None) -> PairEstimate:
-    """The estimate with its parts: where they lie far apart for its sigmas, these take up half of the way."""
+    """The estimate with its parts; sigmas grow to half of the distance if the parts are far apart."""
     if parts is None:
         return estimate
     covariance, tested = estimate.covariance.copy(), list(parts.tested)
@@ -85,12 +82,7 @@ def with_parts(estimate: PairEstimate, parts: DayParts | None) -> PairEstimate:
 
 
 def likeliest_cut(gradient: Float[np.ndarray, "F P"], scene: Int[np.ndarray, " F"]) -> int | None:
-    """Number of frames before the likeliest change; None where there are too few frames or scenes on either side.
-
-    Args:
-        gradient: of each frame, in order of time, by what may have changed.
-        scene: of each frame.
-    """
+    """Number of frames before the likeliest change; None if there are too few frames or scenes on a side."""
     F, k = len(gradient), _cuts(scene)
     if not len(k):
         return None
@@ -103,7 +95,7 @@ def likeliest_cut(gradient: Float[np.ndarray, "F P"], scene: Int[np.ndarray, " F
 
 
 def _cuts(scene: Int[np.ndarray, " F"]) -> Int[np.ndarray, " K"]:
-    """Numbers of frames that may lie before a cut."""
+    """Possible numbers of frames before a cut."""
     frames = len(scene)
     least = max(FEWEST_SCENES, int(np.ceil(_LEAST_SHARE * frames)))
     cuts = np.arange(least, frames - least + 1)

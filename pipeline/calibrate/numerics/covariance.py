@@ -1,15 +1,15 @@
 """How sure a pose is: information matrix, block bootstrap over drives, and a stated bias floor.
 
-The inverse of an information matrix alone is too small (on real logs 6 times in yaw): residuals of one scene err
-together. Blocks of frames that share no scene are resampled instead: each resampled day moves the estimate by one
-Newton step, and the spread of these steps, plus what the prior leaves open, is the covariance. A block that makes up
-much of the day draws the estimate to itself and so seems to err little: its step counts as if it had been left out. Few
-blocks do not know their own spread: it is as much wider as Student's t is. No direction becomes
-surer than the information allows. A bias common to all frames, which no resampling shows, is added as a floor per
-degree of freedom.
+The inverse of an information matrix alone is too small (on real logs 6 times in yaw): residuals of one scene
+err together. Blocks of frames that share no scene are resampled instead: each resampled day moves the
+estimate by one Newton step, and the spread of these steps, plus what the prior leaves open, is the
+covariance. A block that makes up much of the day draws the estimate to itself and so seems to err little: its
+step counts as if it had been left out. Few blocks do not know their own spread: it is as much wider as
+Student's t is. No direction becomes surer than the information allows. A bias common to all frames, which no
+resampling shows, is added as a floor per degree of freedom.
 
-Source: Efron & Tibshirani 1993, ch. 8 (blocks); White 1982 (the sandwich that one Newton step per resample tends to);
-MacKinnon & White 1985 (HC3, what is left out); Satterthwaite 1946 (blocks of unequal weight).
+Source: Efron & Tibshirani 1993, ch. 8 (blocks); White 1982 (the sandwich that one Newton step per resample
+tends to); MacKinnon & White 1985 (HC3, what is left out); Satterthwaite 1946 (blocks of unequal weight).
 """
 
 from __future__ import annotations
@@ -60,17 +60,17 @@ def bootstrap_covariance(
 
     Args:
         information: of each frame (second derivative of its cost), at the estimate.
-        score: gradient of each frame's cost, at the estimate.
-        prior_information: of the prior; zero where there is none (then the frames must determine that parameter).
+        prior_information: of the prior; zero where there is none (then the frames must determine that
+            parameter).
         block: frames with the same number are drawn together.
-        rng: draws the blocks.
-        resamples: number of resampled days.
-        degrees: of freedom with which the information already says how much blocks scatter; 0 where it takes frames to
-            err apart.
+        degrees: of freedom with which the information already says how much blocks scatter; 0 where it takes
+            frames to err apart.
 
     Returns:
-        Spread of the resampled estimates plus the prior's share, nowhere below the inverse of all information. A single
-        block has no spread: it is what the information says, or, where that knows nothing of blocks, the inverse
+        Spread of the resampled estimates plus the prior's share, nowhere below the inverse of all
+            information. A single
+        block has no spread: it is what the information says, or, where that knows nothing of blocks, the
+            inverse
         widened as for two.
     """
     P = score.shape[1]
@@ -123,17 +123,13 @@ def covariance_with_fixed(
     """Covariance of a MAP estimate some of whose parameters were fixed at the prior.
 
     Args:
-        information: of each frame, as for `bootstrap_covariance`.
-        score: gradient of each frame's cost.
         prior_variance: of every parameter, independent.
         curvature: of the whole cost, prior included: how far the others follow a fixed parameter.
         fixed: parameters that the frames did not move.
-        block: frames with the same number are drawn together.
-        rng: draws the blocks.
-        degrees: as for `bootstrap_covariance`.
 
     Returns:
-        The free parameters' covariance given the fixed ones, plus what the prior leaves open in the fixed ones, for
+        The free parameters' covariance given the fixed ones, plus what the prior leaves open in the fixed
+            ones, for
         them and for all that follow them.
     """
     at = np.ix_(~fixed, ~fixed)
@@ -165,12 +161,7 @@ def spread_to_covariance(
 def with_ends(
     covariance: Float[np.ndarray, "P P"], apart: Float[np.ndarray, " P"]
 ) -> Float[np.ndarray, "P P"]:
-    """Covariance of an estimate that two starts see differently: their scatter is added, if it is beyond one sigma.
-
-    Args:
-        covariance: of the estimate.
-        apart: from where one start ended to where the other did; the day rejects neither.
-    """
+    """Covariance of an estimate, plus the scatter of two starts' ends (`apart`) if it is beyond one sigma."""
     if np.all(np.abs(apart) <= np.sqrt(np.diag(covariance))):
         return covariance
     return covariance + np.outer(apart, apart) / 2  # the variance of two values
@@ -184,12 +175,11 @@ def posterior(
     """Add the bias floor and compare with the prior.
 
     Args:
-        covariance: from `bootstrap_covariance`, the pose's six.
-        prior_covariance: before the day.
         bias_floor: sigma per DoF of errors common to all frames [rad, m].
 
     Returns:
-        Observability 1 - posterior/prior variance (0 = the day added nothing); a DoF below 0.5 is not observable, and
+        Observability 1 - posterior/prior variance (0 = the day added nothing); a DoF below 0.5 is not
+            observable, and
         its sigma is at least the prior's.
     """
     full = covariance + np.diag(bias_floor**2)

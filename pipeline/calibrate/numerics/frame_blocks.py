@@ -1,10 +1,10 @@
 """Scenes of a day by what is seen, and blocks of frames for resampling and scatter: scenes count, not frames.
 
-A car that waits at a light for a minute shows one scene, however many frames it logs. A scene ends where the car has
-driven or turned on, by its own speed and yaw rate. Speeds can lie (they are missing, or wrap with an ambiguous
-Doppler), so the lidar's depth edges are asked as well: those of a standing car lie where they lay, a metre further on
-most of them do not. A view that returns, because the car stands there again or because a log was copied, is the scene
-that it was.
+A car that waits at a light for a minute shows one scene, however many frames it logs. A scene ends where the
+car has driven or turned on, by its own speed and yaw rate. Speeds can lie (they are missing, or wrap with an
+ambiguous Doppler), so the lidar's depth edges are asked as well: those of a standing car lie where they lay,
+a metre further on most of them do not. A view that returns, because the car stands there again or because a
+log was copied, is the scene that it was.
 """
 
 from __future__ import annotations
@@ -75,8 +75,8 @@ class Scenes:
     def scatter(self, gradient: Float[np.ndarray, "F P"]) -> float:
         """Variance of the gradients' sum, over all unknowns: of blocks, for frames of one scene err together.
 
-        Few blocks hardly show it. What frames show is taken with it, as much larger as scenes are wont to make it
-        (Smyth 2004, moderated variances); never less than of frames that err apart.
+        Few blocks hardly show it. What frames show is taken with it, as much larger as scenes are wont to
+        make it (Smyth 2004, moderated variances); never less than of frames that err apart.
         """
         return self.inflation(gradient) * _apart(gradient)
 
@@ -93,11 +93,7 @@ class Scenes:
 
 
 def scenes_of(observations: Sequence[Observation]) -> Int64[np.ndarray, " F"]:
-    """Scene of each frame, counted from 0 in order of time; frames of one number show the same view.
-
-    Args:
-        observations: any frames of one vehicle-day, in order of time.
-    """
+    """Scene of each frame, counted from 0 in order of time; equal numbers show the same view."""
     F = len(observations)
     if F == 0:
         return np.zeros(0, np.int64)
@@ -125,12 +121,9 @@ def blocks_of(observations: Sequence[Observation], most: int = 24) -> Int64[np.n
 def bootstrap_blocks(
     drive: Int[np.ndarray, " F"], scene: Int[np.ndarray, " F"], most: int = 24
 ) -> Int64[np.ndarray, " F"]:
-    """Block number of each frame, for resampling: blocks of about equal size. Long drives are cut, short ones joined.
+    """Block of each frame for resampling, about `most` of equal size: long drives are cut, short ones joined.
 
-    Args:
-        drive: drive of each frame, in order of time.
-        scene: of each frame, as `scenes_of` tells them; all frames of one are in one block.
-        most: about so many blocks; at least 8 where there are as many scenes.
+    All frames of a scene are in one block; there are at least 8 blocks if there are as many scenes.
     """
     F = len(drive)
     if F == 0:
@@ -153,7 +146,8 @@ def scene_blocks(
 ) -> Int[np.ndarray, " F"]:
     """Block name of each frame, for scatter over scenes: its drive, whatever its length.
 
-    Where the day has fewer drives than `at_least`, that many stretches of equally many frames, cut between scenes.
+    Where the day has fewer drives than `at_least`, that many stretches of equally many frames, cut between
+    scenes.
     """
     drives, scene = np.array([o.drive for o in observations]), scenes_of(observations)
     first = np.unique(scene, return_index=True)[1]  # frame that each scene begins with
@@ -170,11 +164,9 @@ def _apart(gradient: Float[np.ndarray, "F P"]) -> float:
 def _moved(
     observations: Sequence[Observation], alike: Float[np.ndarray, " F"]
 ) -> tuple[Float[np.ndarray, " F"], Float[np.ndarray, " F"]]:
-    """Way [m] and turn [rad] since the frame before, by speeds and by edges, whichever tells of more.
+    """Way [m] and turn [rad] since the frame before, the larger of speeds and edges.
 
-    Args:
-        observations: frames.
-        alike: share of edges that lie where the frame before had them; not finite where one has hardly any.
+    `alike` is the share of edges that stayed in place; not finite for a frame with hardly any.
     """
     stamp_s = np.array([o.stamp_ns for o in observations]) * 1e-9
     speed = np.array([np.nan if o.ego_speed_mps is None else abs(o.ego_speed_mps) for o in observations])
@@ -191,7 +183,7 @@ def _moved(
 
 
 def _alike(observations: Sequence[Observation]) -> Float[np.ndarray, "F F"]:
-    """Share of the edges of any two frames that lie in the same cells; not finite where one has hardly any."""
+    """Share of the edges of any two frames in the same cells; not finite for frames with hardly any."""
     edges = [np.asarray(o.lidar_edge_xyz_m, np.float64).reshape(-1, 3) for o in observations]
     frame = np.repeat(np.arange(len(edges)), [len(e) for e in edges])
     points = np.concatenate(edges)

@@ -52,10 +52,7 @@ def minimise(
     """Minimise over the box: differential evolution (best1bin) on whole generations, then Nelder-Mead from its best.
 
     Args:
-        objective: costs of a batch of parameter vectors.
-        config: box and effort.
         start: member of the first population, and its centre.
-        rng: decides everything random.
         spread: size of the first population as a share of the box, 1 = all of it.
     """
     half = half_widths(config, len(start) // 6)
@@ -100,7 +97,7 @@ def minimise(
 
 
 def at_border(x: Float[np.ndarray, " D"], half_widths: Float[np.ndarray, " D"]) -> bool:
-    """Whether a minimum lies so near the border of the box that the true one may lie outside."""
+    """Whether a minimum is so near the border of the box that the true one may be outside."""
     return bool(np.any(np.abs(x) > _BORDER * half_widths))
 
 

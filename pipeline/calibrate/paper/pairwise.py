@@ -1,6 +1,7 @@
 """Method `pairwise-optimisation`: each pair alone minimises the paper's loss.
 
-Source: sections 4.3 and 4.5.3, the row "pairwise optimization" of Table 1. Where the paper leaves open or we differ:
+Source: sections 4.3 and 4.5.3, the row "pairwise optimization" of Table 1. Where the paper leaves open or we
+differ:
 
 - distances are `d^2 / (d^2 + s^2)` and terms are means per frame with weight 1: the paper says "smooth" and "summed",
   and names neither function, scale nor weights;
@@ -96,16 +97,7 @@ def solve_pairwise(
     triggered: Sequence[str] = PAIRS,
     progress: Progress = silent,
 ) -> Solution:
-    """Calibrate each triggered pair alone; the others keep the prior.
-
-    Args:
-        observations: selected frames of each pair; others are left out.
-        prior: start and centre of the search box.
-        config: box and effort.
-        seed: decides everything random; each pair draws from a stream of its own.
-        triggered: pairs to calibrate.
-        progress: told after each pair.
-    """
+    """Calibrate each triggered pair alone, each with its own random stream; others keep the prior."""
     pairs = {}
     for k, pair in enumerate(PAIRS):
         if pair not in observations:
@@ -160,7 +152,7 @@ def estimate_of(
 
 
 def loop_size(pairs: Mapping[str, PairEstimate]) -> tuple[float | None, float | None]:
-    """Angle [rad] and translation [m] of the loop of the pair estimates; None where there are not three."""
+    """Angle [rad] and translation [m] of the loop of the pair estimates; None without three."""
     if len(pairs) < len(PAIRS):
         return None, None
     loop = loop_transform(pairs["camera_lidar"].T, pairs["lidar_radar"].T, pairs["camera_radar"].T)

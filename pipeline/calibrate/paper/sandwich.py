@@ -31,8 +31,6 @@ def sandwich_covariance(
 
     Args:
         frame_losses: (P, 4, 4) -> (P, F).
-        T: the minimum.
-        blocks: block of each frame.
         prior_covariance: caps what is not determined: beyond it the prior knows better.
         floor: bias floor, rotation [rad] and translation [m].
 
@@ -71,7 +69,7 @@ def _curvature(
 
 
 def _godambe(H: np.ndarray, S: np.ndarray) -> np.ndarray:
-    """H S^-1 H, the inverse of the sandwich: 0 along what the losses do not see, for there both H and S vanish."""
+    """H S^-1 H, the inverse of the sandwich; 0 in directions in which both H and S vanish."""
     scale = _STEP[:, None] * _STEP[None]
     values, vectors = np.linalg.eigh(H * scale)
     positive = (vectors * np.maximum(values, 0)) @ vectors.T

@@ -1,8 +1,8 @@
-"""What a frame shows of a pair's view, cell by cell: to choose frames for information, and to name what is missing.
+"""Coverage of a pair's view by cells: for choosing frames by information, and for naming gaps.
 
-A cell is a stretch of azimuth, of elevation and of range. The hundredth edge of a cell adds less than its first, so a
-set of frames is worth the sum over cells of log(1 + points); the frame that adds most comes next (submodular: greedy is
-within 1 - 1/e of the best choice, Nemhauser et al. 1978).
+A cell is an interval of azimuth, elevation and range. The hundredth edge in a cell adds less than the first,
+so a set of frames is worth the sum over cells of log(1 + points); the frame that adds most comes next
+(submodular: greedy is within 1 - 1/e of the best choice, Nemhauser et al. 1978).
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def choose_for_information(
 
 
 def missing_in_view(observations: Sequence[Observation], pair: str) -> list[str]:
-    """Parts of the view that hold next to nothing of what the pair is calibrated from, in words."""
+    """Nearly empty parts of the view, in words."""
     missing = []
     for kind in _KINDS[pair]:
         views = [_seen(o, kind) for o in observations]
@@ -99,7 +99,7 @@ def _cells(observation: Observation, kind: _Kind) -> Float[np.ndarray, " C"]:
 
 
 def _seen(observation: Observation, kind: _Kind) -> Float[np.ndarray, "N 3"]:
-    """Azimuth, elevation [rad] and range [m]; in the camera only what lies before it."""
+    """Azimuth, elevation [rad] and range [m]; for the camera only points ahead."""
     points = np.asarray(getattr(observation, kind.name), np.float64).reshape(-1, 3)
     o = observation
     if kind.camera_axes and "camera_lidar" in o.priors:

@@ -1,13 +1,11 @@
-"""Which frames a calibration is made from, which ones judge it, and why the others are not used.
+"""Selection of frames for fit and judgement, and reasons against the others.
 
-The paper's conditions (section 4.5.1) per pair, read as: camera-lidar needs sky, drivable area and road
-users; camera-radar needs sky, road users and dynamic radar clusters; lidar-radar needs drivable area and
-dynamic clusters; all need stamps within 5 ms, which the paper's methods keep also where ingest gates by
-motion. Where they leave fewer frames than a calibration takes, the frames that come nearest to them fill up,
-and the selection notes it: a narrow camera may never see 20 % of sky.
-
-Method `joint` does not need the paper's conditions; there they are only counted, and frames are chosen for what
-they add to the view that the others cover (image, azimuth, elevation, range).
+The paper's conditions (section 4.5.1) per pair: camera-lidar needs sky, drivable area and road users;
+camera-radar needs sky, road users and dynamic radar clusters; lidar-radar needs drivable area and dynamic
+clusters. All need stamps within 5 ms, which the paper's methods keep even if ingest gates by motion. If too
+few frames meet them, the nearest ones are added, with a note: a narrow camera may never see 20 % of sky. For
+method `joint` the conditions are only counted; its frames are chosen for what they add to the view covered by
+others (image, azimuth, elevation, range).
 """
 
 from __future__ import annotations
@@ -79,13 +77,10 @@ def select_frames(
     """Choose frames to fit and to judge, the same way whenever it is asked; pair by pair, of frames that have both.
 
     Args:
-        observations: the day in order of time.
-        config: thresholds, number of frames, share held out.
         paper: prefer frames that meet the paper's conditions; else choose by content alone.
         sync_gate_s: largest difference of a pair's stamps; None = any that ingest let in.
-        motion_gate: how far the car may drive and turn [m, rad] between a pair's stamps, their constant gap aside.
-        pairs: those of the rig. One for which fewer than MIN_FRAMES frames are left (SHORTEST of camera-lidar by
-            content) is refused.
+        motion_gate: how far the car may drive and turn [m, rad] between a pair's stamps, their constant gap
+            aside.
         absent: why frames lack a sensor, in words by sensor, as far as the caller knows.
     """
     scene = scenes_of(observations)
@@ -152,9 +147,9 @@ def unmet_conditions(
 def _apart(
     observations: Sequence[Observation], pair: str, move_m: float, turn_rad: float
 ) -> Bool[np.ndarray, " F"]:
-    """Frames in which the car moved further between a pair's captures than it may.
+    """Frames in which the car moved too far between a pair's captures.
 
-    Ingest asks that of each sensor and the moment; two of a large rig can lie on either side of it.
+    Ingest checks each sensor against the moment; two sensors of a large rig can lie on either side of it.
     """
     speed, yaw_rate = (
         np.array([getattr(o, name) for o in observations], np.float64)
@@ -178,7 +173,7 @@ def _stamps_ns(observation: Observation, pair: str) -> tuple[int, int]:
 
 
 def missing_content(observations: Sequence[Observation], pair: str) -> list[str]:
-    """What the chosen frames lack for a pair, in words: what to drive next time."""
+    """Content that the chosen frames lack for a pair, in words: what to drive next time."""
     missing = []
     speeds = np.array([abs(o.ego_speed_mps) for o in observations if o.ego_speed_mps is not None])
     if len(speeds) and np.mean(speeds > _BRISK_MPS) < _SCARCE:
@@ -215,10 +210,11 @@ def hold_out(
 ) -> list[bool | None]:
     """Split a day into blocks of time: True = judges, False = fits, None = too near in time to a frame of the fit.
 
-    Every k-th block judges, so that both parts see all of the day; blocks never cross a drive, and a scene is in one of
-    them as a whole, with its first frame, however often the car returns to it. Of several lengths of block the split is
-    taken that comes nearest to the fraction, loses few frames next to the fit, and judges by at least _JUDGING_BLOCKS
-    blocks. A day of one scene is split within it: nothing that it judges is proof, and the record says so.
+    Every k-th block judges, so that both parts see all of the day; blocks never cross a drive, and a scene is
+    in one of them as a whole, with its first frame, however often the car returns to it. Of several lengths
+    of block the split is taken that comes nearest to the fraction, loses few frames next to the fit, and
+    judges by at least _JUDGING_BLOCKS blocks. A day of one scene is split within it: nothing that it judges
+    is proof, and the record says so.
     """
     if not observations:
         return []
@@ -247,7 +243,7 @@ def hold_out(
 
 
 def _near(stamps: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """True where one of `others` lies within _GUARD_S."""
+    """True if one of `others` is within _GUARD_S."""
     if not len(others):
         return np.zeros(len(stamps), bool)
     others = np.sort(others)
@@ -284,7 +280,7 @@ def _notes(pair: str, passed: int, below: Sequence[int], chosen: int, *, paper: 
 
 
 def _silent(pair: str, observations: Sequence[Observation], absent: Mapping[str, str]) -> SolveError | None:
-    """What refuses a pair of which a sensor has too few frames; None where both have enough."""
+    """Reason to refuse a pair with too few frames of a sensor, or None."""
     known = [absent[sensor] for sensor in FRAMES_OF_PAIR[pair] if sensor in absent]
     unlabelled = next((why for why in known if _fault_in(why) == "no_labels"), None)
     if unlabelled is not None and not any(set(FRAMES_OF_PAIR[pair]) <= set(o.sensors) for o in observations):
@@ -303,7 +299,7 @@ def _silent(pair: str, observations: Sequence[Observation], absent: Mapping[str,
 
 
 def _fault_in(why: str) -> str:
-    """The fault that words state: whoever knows it begins with its sentence."""
+    """Fault whose sentence the words begin with."""
     return next((code for code, sentence in FAULTS.items() if why.startswith(sentence)), "silent_sensor")
 
 

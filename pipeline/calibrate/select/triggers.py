@@ -1,13 +1,14 @@
 """The paper's signs of misalignment (section 4.5.2), measured at any calibration, and the decision to calibrate.
 
 Counts are means per frame where the paper speaks of counts: it does not say over how many frames it sums, and
-a sum over a day exceeds 1 for every calibration. A dynamic detection is a moving cluster that the tracker has seen
-before, within the paper's 80 m: a cluster of a single scan may be noise. "The entire point cloud" is what lies in
-the image: the paper's lidar sees less than its camera, a 360 deg lidar would drown what is misplaced.
+a sum over a day exceeds 1 for every calibration. A dynamic detection is a moving cluster that the tracker has
+seen before, within the paper's 80 m: a cluster of a single scan may be noise. "The entire point cloud" is
+what lies in the image: the paper's lidar sees less than its camera, a 360 deg lidar would drown what is
+misplaced.
 
-How they react on simulated days of the paper's rig: the camera's two metrics grow by half or more with 1 deg, the
-lidar's boxes with 1 deg of pitch only. The drivable metric measures how far the radar's free space falls short of
-the lidar's (behind parked cars, 8 % to 47 %), hardly its turn; at 1 % it fires at the truth as well.
+How they react on simulated days of the paper's rig: the camera's two metrics grow by half or more with 1 deg,
+the lidar's boxes with 1 deg of pitch only. The drivable metric measures how far the radar's free space falls
+short of the lidar's (behind parked cars, 8 % to 47 %), hardly its turn; at 1 % it fires at the truth as well.
 """
 
 from __future__ import annotations
@@ -42,12 +43,7 @@ _BOX_MARGIN_M = 0.5  # an axis-aligned box of the visible surface is smaller tha
 def trigger_metrics(
     observations: Sequence[Observation], transforms: Mapping[str, Float[np.ndarray, "4 4"]]
 ) -> dict[str, dict[str, float]]:
-    """The metrics of each pair at its transform; a metric that no frame can show is left out.
-
-    Args:
-        observations: frames to look at.
-        transforms: T of each pair to measure.
-    """
+    """The metrics of each pair at its transform, without those that no frame can show."""
     found: dict[str, dict[str, list[float]]] = {
         pair: {m: [] for m in THRESHOLDS[pair]} for pair in transforms
     }
@@ -101,7 +97,7 @@ def _radar_outside_image(
 
 
 def _classes(camera: Camera, labels: np.ndarray, points_camera: np.ndarray) -> np.ndarray:
-    """Classes under the points that lie in the image."""
+    """Classes under the points in the image."""
     uv, valid = camera.project(points_camera)
     pixel = np.round(uv[valid & camera.contains(uv)]).astype(int)
     return np.asarray(labels[pixel[:, 1], pixel[:, 0]])
@@ -127,7 +123,7 @@ def _radar_outside_lidar(observation: Observation, T_lidar_radar: np.ndarray) ->
 
 
 def _drivable_outside(observation: Observation, T_lidar_radar: np.ndarray) -> float | None:
-    """Share of the lidar's drivable cells in the radar's sector that lie outside the radar's drivable area."""
+    """Share of the lidar's drivable cells in the radar's sector outside the radar's drivable area."""
     azimuth = observation.radar_drivable_azimuth_rad
     if len(azimuth) < 2 or not len(observation.lidar_drivable_xyz_m):
         return None

@@ -1,11 +1,13 @@
 """Which track of one sensor is which track of another: by how they move first, by where they are last.
 
-Range and range rate over ground do not depend on how a sensor is turned; nor does the course of the bearing, up to a
-constant. The constant itself, the mean difference of the bearings, may be as large as the prior is uncertain. All are
-compared over the frames that both tracks share. No sighting belongs to two pairs; but a track may continue another
-sensor's track after that one broke off, so one track may have several partners, one after the other.
+Range and range rate over ground do not depend on how a sensor is turned; nor does the course of the bearing,
+up to a constant. The constant itself, the mean difference of the bearings, may be as large as the prior is
+uncertain. All are compared over the frames that both tracks share. No sighting belongs to two pairs; but a
+track may continue another sensor's track after that one broke off, so one track may have several partners,
+one after the other.
 
-Source: Persic et al. 2021, "calibration-agnostic track to track association"; the measure is our reading of it.
+Source: Persic et al. 2021, "calibration-agnostic track to track association"; the measure is our reading of
+it.
 """
 
 from __future__ import annotations
@@ -70,8 +72,6 @@ def associate(
 
     Args:
         shared: what reference and other sensor saw in the same frames, level axes.
-        T_other_reference: transform between the level axes, as estimated so far.
-        rotation_sigma_rad: how uncertain its rotation is per axis.
         elevation: False where one of the two measures none.
     """
     kept = np.zeros(0, np.int64)
@@ -111,12 +111,12 @@ def shared_sightings(reference: Sequence[Track], other: Sequence[Track]) -> Shar
 
 
 def bearing_sigma_rad(range_m: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
-    """How far apart two sensors' bearings of one object may lie: half a metre on it, and half a degree."""
+    """Sigma of the difference of two sensors' bearings to one object: half a metre and half a degree."""
     return np.hypot(_ANGLE_SIGMA_RAD, _CENTRE_SIGMA_M / np.maximum(range_m, 1.0))
 
 
 def _without_conflict(shared: Shared, score: Float[np.ndarray, " P"]) -> Int64[np.ndarray, " K"]:
-    """The best pairs first; another pair with a track of theirs only where it claims none of its sightings again."""
+    """The best pairs first; further pairs of a track must not share its sightings."""
     taken: set[tuple[int, int, int]] = set()
     kept = []
     for k in np.argsort(-score, kind="stable"):
@@ -137,9 +137,9 @@ def _without_conflict(shared: Shared, score: Float[np.ndarray, " P"]) -> Int64[n
 def _scores(
     shared: Shared, T_b_a: np.ndarray, rotation_sigma_rad: float, *, elevation: bool
 ) -> Float[np.ndarray, " P"]:
-    """Evidence for each pair of tracks that both are one object; 0 outside the gates.
+    """Evidence that each pair of tracks is one object; 0 outside the gates.
 
-    It is what the gate leaves over the mean squared deviation, times sightings, less the constant's square.
+    The gate's margin over the mean squared deviation, times sightings, less the constant's square.
     """
     a, b, first, count = shared.of_reference, shared.of_other, shared.first, shared.count
     expected = to_spherical(transform_points(T_b_a, a.position_m))

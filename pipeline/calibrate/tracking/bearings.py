@@ -4,8 +4,8 @@ The reference sensor knows where an object is, the other one in which direction.
 prior: bearings of distant objects hardly see them. Geman-McClure weights, from wide to narrow, turn wrong
 pairs of tracks down.
 
-Source: Persic et al. 2021 (graph-based rotation calibration, decalibration detection; their translations are known);
-Yang et al. 2020, "Graduated non-convexity for robust spatial perception"; Hotelling 1931 (the test).
+Source: Persic et al. 2021 (graph-based rotation calibration, decalibration detection; their translations are
+known); Yang et al. 2020, "Graduated non-convexity for robust spatial perception"; Hotelling 1931 (the test).
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class Bearings:
     """Sightings of objects by both sensors.
 
     `inverted` False: T takes reference points to the other sensor (q = R p + t); True: T takes the other
-    sensor's points to the reference (q = R^T (p - t)). `level` turns the other sensor's axes level (x forward,
-    y left, z up).
+    sensor's points to the reference (q = R^T (p - t)). `level` turns the other sensor's axes level (x
+    forward, y left, z up).
     """
 
     point_m: Float[np.ndarray, "N 3"]  # reference axes
@@ -73,7 +73,7 @@ class Bearings:
 
 @dataclass(frozen=True, eq=False)
 class AlignedBearings:
-    """The rotation found, and what it rests on."""
+    """The rotation, and the sightings used."""
 
     T: Float[np.ndarray, "4 4"]
     covariance: Float[np.ndarray, "6 6"]  # without a bias floor; translation is the prior's
@@ -85,7 +85,7 @@ class AlignedBearings:
 
 @dataclass(frozen=True)
 class Consistency:
-    """Does the prior explain the bearings? Squared distance in sigmas, and what chance reaches once in 1000."""
+    """Whether the prior explains the bearings: squared distance in sigmas, and its 99.9 % quantile."""
 
     statistic: float
     threshold: float
@@ -102,14 +102,7 @@ def align_bearings(
     prior_covariance: Float[np.ndarray, "6 6"],
     rng: np.random.Generator,
 ) -> AlignedBearings:
-    """Turn T_prior until the bearings agree; its translation stays.
-
-    Args:
-        bearings: at least one sighting.
-        T_prior: start, and centre of the weak prior on the rotation.
-        prior_covariance: of the prior, left perturbation.
-        rng: resamples tracks for the covariance.
-    """
+    """Turn T_prior until the bearings agree; its translation stays."""
     T, prior_information = T_prior, np.linalg.inv(prior_covariance[:3, :3])
     count = np.bincount(bearings.track, minlength=bearings.tracks)[bearings.track]
     share = 1 / (1 + _INTRACLASS * (count - 1))  # sightings of one track err together
@@ -149,8 +142,6 @@ def consistency(
     and not the bias makes up the sigma (effective degrees of freedom after Welch and Satterthwaite).
 
     Args:
-        aligned: result of `align_bearings`.
-        T_prior: what stands.
         bias_floor_rad: sigma per axis of what is common to all tracks.
     """
     turned = log_so3(aligned.T[:3, :3] @ T_prior[:3, :3].T)
@@ -191,7 +182,7 @@ def _covariance(
     prior_covariance: np.ndarray,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Bootstrap over tracks of the rotation, with what the fixed translation's own sigma does to it, and without."""
+    """Bootstrap covariance of the rotation over tracks, with and without the fixed translation's sigma."""
     K = bearings.tracks
     H6, g6 = np.zeros((K, 6, 6)), np.zeros((K, 6))
     np.add.at(H6, bearings.track, np.einsum("n,nai,naj->nij", weight, J, J))

@@ -1,10 +1,10 @@
 """Detections of one sensor followed from frame to frame, in its own level axes (x forward, y left, z up).
 
-No other sensor's pose is needed: the own motion between two frames comes from the car. The filter lives in the ground
-plane; heights are reported as measured.
+No other sensor's pose is needed: the own motion between two frames comes from the car. The filter lives in
+the ground plane; heights are reported as measured.
 
-Source: Persic, Petrovic, Markovic, Petrovic, "Online multi-sensor calibration based on moving object tracking",
-Advanced Robotics 35, 2021 (detection and tracking of moving objects per sensor).
+Source: Persic, Petrovic, Markovic, Petrovic, "Online multi-sensor calibration based on moving object
+tracking", Advanced Robotics 35, 2021 (detection and tracking of moving objects per sensor).
 """
 
 from __future__ import annotations
@@ -71,13 +71,9 @@ class Track:
 
 
 def follow(scans: Sequence[Scan]) -> list[Track]:
-    """Tracks of at least two sightings; a new drive, a gap above 2.5 s or unknown own motion ends all of them.
+    """Tracks of at least two sightings, in order; a new drive, a gap above 2.5 s or unknown motion ends all.
 
-    Args:
-        scans: in order of time.
-
-    Returns:
-        Tracks in order of their first sighting. Positions are the measured ones, without the filter's lag.
+    Positions are the measured ones, without the filter's lag. `scans` are in order of time.
     """
     filters, count, before = Filters.none(), 0, None
     sightings: list[list[tuple[Scan, int, np.ndarray, float]]] = []
@@ -121,7 +117,7 @@ def _rate_sigma(filters: Filters, row: int) -> float:
 
 
 def _track(sightings: Sequence[tuple[Scan, int, np.ndarray, float]]) -> Track:
-    """Sightings as arrays; the first one takes the second one's velocity, for it had none of its own."""
+    """Sightings as arrays; the first one has no velocity and takes the second one's."""
     scans, rows, velocities, sigmas = zip(*sightings, strict=True)
     velocity = np.pad(np.array(velocities), ((0, 0), (0, 1)))
     sigma = np.array(sigmas)

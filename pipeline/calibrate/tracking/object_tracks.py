@@ -1,9 +1,9 @@
 """Road users as radar, lidar and camera see them: tracks in each sensor's own level axes.
 
 Radar: the tracked moving clusters of perception. Lidar: clusters of a road user's size and height above the
-ground, followed here; against the radar only those that move over ground. Camera: boxes of road users, their range
-by the usual height of their class, as a monocular 3D detector would guess it (about 20 %); parked ones are boxes too,
-and pass by the sensors like any other.
+ground, followed here; against the radar only those that move over ground. Camera: boxes of road users, their
+range by the usual height of their class, as a monocular 3D detector would guess it (about 20 %); parked ones
+are boxes too, and pass by the sensors like any other.
 
 Source: Persic et al. 2021, whose lidar and camera detections come from 3D networks; clusters and sized boxes
 stand for these here.
@@ -85,13 +85,9 @@ def motions(observations: Sequence[Observation], prior: Prior) -> list[Motion]:
 def turn_between(
     before_m: Float[np.ndarray, "A 3"], now_m: Float[np.ndarray, "B 3"], moved_m: float, dt_s: float
 ) -> float | None:
-    """Angle [rad] by which the car turned, so that clusters seen before lie at clusters seen now; None where too few.
+    """Rotation of the car [rad] that aligns clusters of two scans; None if there are too few.
 
-    Args:
-        before_m: cluster centres in the axes of then.
-        now_m: in the axes of now.
-        moved_m: way driven in between.
-        dt_s: time in between.
+    Centres are in the axes of their time; the car moved by `moved_m` in between.
     """
     if min(len(before_m), len(now_m)) < _LEAST_CLUSTERS:
         return None
@@ -150,7 +146,7 @@ def moves_over_ground(track: Track) -> bool:
 
 
 def passes_by(track: Track) -> bool:
-    """Seen in places more than 2 m apart: what stands before a standing car could be any other thing there."""
+    """True if seen in places more than 2 m apart; a static object could be any other one."""
     way_m = np.linalg.norm(track.position_m - track.position_m[0], axis=1)
     return bool(way_m.max() > _LEAST_WAY_M)
 
@@ -173,10 +169,10 @@ def camera_tracks(observations: Sequence[Observation], motion: Sequence[Motion])
 
 
 def box_centres(track: Track, observations: Sequence[Observation]) -> Float[np.ndarray, "N 3"]:
-    """Centre of the box about a lidar track's cluster at each sighting, let down to the ground where that is known.
+    """Centre of the box about a lidar track's cluster at each sighting, lowered to a known ground.
 
-    An object's lowest part is cut off with the ground, its highest lies above the topmost beam that meets it; a 3D
-    detector's box stands on the ground and is as high as road users are.
+    The lowest part of an object is removed with the ground, its highest lies above the top beam; a 3D
+    detector's box stands on the ground and has the usual height.
     """
     centres = np.empty((track.sightings, 3))
     for k, (i, row) in enumerate(zip(track.frame, track.detection, strict=True)):

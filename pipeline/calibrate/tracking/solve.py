@@ -1,13 +1,14 @@
 """Method `tracking`: moving objects tracked by each sensor, tracks paired, each sensor turned to the lidar's.
 
-The baseline of the paper's Table 1. The lidar is the reference: it alone knows where an object is in all three
-dimensions. Camera and radar are each calibrated against it, camera-radar is composed. As in the source only
-rotations are calibrated; translations keep the prior and its sigma. Association and alignment take turns until
-the pairs stay the same.
+The baseline of the paper's Table 1. The lidar is the reference: it alone knows where an object is in all
+three dimensions. Camera and radar are each calibrated against it, camera-radar is composed. As in the source
+only rotations are calibrated; translations keep the prior and its sigma. Association and alignment take turns
+until the pairs stay the same.
 
-Source: Persic, Petrovic, Markovic, Petrovic, "Online multi-sensor calibration based on moving object tracking",
-Advanced Robotics 35, 2021 (reference 60 of the paper). Its lidar and camera detectors are 3D networks;
-perception's clusters and boxes stand for them here. Known to us are its abstract and outline, not its constants.
+Source: Persic, Petrovic, Markovic, Petrovic, "Online multi-sensor calibration based on moving object
+tracking", Advanced Robotics 35, 2021 (reference 60 of the paper). Its lidar and camera detectors are 3D
+networks; perception's clusters and boxes stand for them here. Known to us are its abstract and outline, not
+its constants.
 """
 
 from __future__ import annotations
@@ -84,11 +85,8 @@ def solve_tracking(
 
     Args:
         observations: selected frames per pair; tracks are followed through all of them.
-        prior: start; its translations are kept.
         config: not used beyond the interface: the method has no search box.
-        seed: decides the bootstrap, the only thing random.
         triggered: pairs to calibrate; camera_radar follows from the other two. Others keep the prior.
-        progress: told about each step.
 
     Raises:
         SolveError: neither the camera nor the radar shares enough moving objects with the lidar.
@@ -146,10 +144,7 @@ def calibrate_pair(
     """Associate and align in turns, from the prior's gate to a narrow one.
 
     Args:
-        pair: camera_lidar or lidar_radar.
         tracks: of both sensors.
-        prior: start.
-        rng: of the bootstrap.
         frames: rows whose sightings may be used; None = all.
 
     Raises:
@@ -178,9 +173,9 @@ def calibrate_pair(
 
 
 def _tracked(frames: Sequence[Observation], prior: Prior) -> dict[str, PairTracks]:
-    """Tracks of all three sensors: box centres for the camera, which sees boxes, points' centres for the radar.
+    """Tracks of all three sensors: box centres for the camera, centres of points for the radar.
 
-    The radar's tracks all move, so of the lidar's only those that move can be theirs; the camera sees parked cars too.
+    Radar tracks all move, so only moving lidar tracks can match them; the camera sees parked cars too.
     """
     motion = motions(frames, prior)
     lidar = [t for t in lidar_tracks(frames, motion) if passes_by(t)]

@@ -1,8 +1,8 @@
-"""Whether sensors stayed where they were over the day: its first part against its last, and which sensor moved.
+"""Check that sensors stayed in place over the day: its first part against its last, and which sensor moved.
 
-All else that is asked of a day mixes its hours: even frames against odd ones, held-out blocks between the others. A
-sensor that is knocked at noon is in both sides alike. So each pair is solved from the first and from the last part of
-the day as well (`numerics/change_point`). Two pairs that shift and one that stays tell which sensor it was.
+Other checks mix the hours of a day: even frames against odd ones, held-out blocks between the others. A knock
+at noon is in both sides alike. Each pair is therefore also solved from the first and the last part of the day
+(`numerics/change_point`). Two pairs that shift and one that does not identify the sensor.
 """
 
 from __future__ import annotations
@@ -43,12 +43,7 @@ def constancy_failures(estimates: Mapping[str, PairEstimate]) -> dict[str, list[
 def moved_failures(
     estimates: Mapping[Edge, PairEstimate], edges: Collection[Edge]
 ) -> dict[Edge, list[FailedCheck]]:
-    """Edges whose parts contradict each other, and the other edges of the sensors that may have moved.
-
-    Args:
-        estimates: by edge; those without parts say nothing.
-        edges: all that the rig has.
-    """
+    """Edges whose parts contradict each other, and the other edges of the sensors that may have moved."""
     parts = {edge: e.parts for edge, e in estimates.items() if e.parts is not None and e.observable.any()}
     size = {edge: float(np.abs(p.sigmas(PART_FLOOR_RAD)).max()) for edge, p in parts.items()}
     moved = [edge for edge in parts if size[edge] > MOVED_SIGMAS]
@@ -86,7 +81,8 @@ def _shift(parts: DayParts, is_tilt_known: bool) -> PairShift:
 
     Args:
         parts: of a pair.
-        is_tilt_known: a radar's witnesses of elevation show a part of a tilt only: one that they do not show may be.
+        is_tilt_known: a radar's witnesses of elevation show a part of a tilt only: one that they do not show
+            may be.
     """
     change, covariance = np.zeros(6), np.eye(6) * _ANY_M**2
     change[:3] = parts.step

@@ -48,7 +48,7 @@ def _motion(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:
 
 
 def _solver(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:
-    """What the solver's own checks found."""
+    """Failed checks of the solver."""
     return day.solution.failed_checks
 
 

@@ -1,6 +1,6 @@
-"""Checks of a solution as a whole, which no single pair can make: does the loop close, was the heading right?
+"""Checks of a solution as a whole: closure of the loop, and the heading.
 
-Each returns one value per failed check for `judge`; none where all is well.
+Each returns one value per failed check for `judge`; none if all pass.
 """
 
 from __future__ import annotations
@@ -48,16 +48,15 @@ def heading_failures(
 ) -> list[FailedCheck]:
     """Camera-lidar solved along a heading that lidar-radar then turned.
 
-    A camera's time offset moves the cloud along the car's heading, which the radar's prior mounting gives. Where
-    lidar-radar turns the radar by many of the prior's sigmas, that heading was wrong, and camera-lidar is off to the
-    side by time offset times speed times the turn.
+    A camera's time offset moves the cloud along the car's heading, which the radar's prior mounting gives.
+    Where lidar-radar turns the radar by many of the prior's sigmas, that heading was wrong, and camera-lidar
+    is off to the side by time offset times speed times the turn.
 
     Args:
-        solution: without camera-lidar or lidar-radar no check fails.
         prior: whose T_lidar_radar gave the heading.
-        observations: for the car's speed.
         limit_rad: largest error that camera-lidar may have at the targets.
-        limits: from where on the heading is wrong, and what share of `limit_rad` that may cost; None = the defaults.
+        limits: from where on the heading is wrong, and what share of `limit_rad` that may cost; None = the
+            defaults.
     """
     limits = limits or VerdictLimits()
     if not {"camera_lidar", "lidar_radar"} <= solution.pairs.keys():

@@ -1,9 +1,9 @@
 """How well held-out frames align at a pose, whatever method found it: costs that compare two poses, and derivatives.
 
-All methods are judged by the same scores: sharp edges and road markings for camera-lidar, the registration likelihood
-of method `joint` for lidar-radar (azimuth and range only: its elevations are misled by the lidar's rings), azimuths of
-moving clusters against road users' boxes for camera-radar. The paper's losses cannot judge: their minimum lies off the
-truth. Maps are prepared once for all poses that are asked about.
+All methods are judged by the same scores: sharp edges and road markings for camera-lidar, the registration
+likelihood of method `joint` for lidar-radar (azimuth and range only: its elevations are misled by the lidar's
+rings), azimuths of moving clusters against road users' boxes for camera-radar. The paper's losses cannot
+judge: their minimum lies off the truth. Maps are prepared once for all poses that are asked about.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from pipeline.config import SolveConfig
 from pipeline.extrinsics.estimates import PairEstimate, Prior
 from pipeline.geometry.changes import change_jacobian
 from pipeline.geometry.se3 import exp_se3, exp_so3, from_rotation_translation, log_so3, rotation_angle_rad
+from pipeline.objective.camera_lidar.label_width import widened
 from pipeline.objective.camera_lidar.score import (
     Alignments,
     KernelSettings,
@@ -82,7 +83,6 @@ def held_out_score(
 
     Args:
         estimate: the result that they judge.
-        observations: the held-out frames, of one camera.
         prior: the pose to compare with; it also turns the radar's own velocity into lidar axes.
         config: sigma of a time offset that a method did not estimate.
     """
@@ -113,6 +113,7 @@ def _camera_lidar(
     )
     # The same points at every pose that is compared: rows that a prior a few degrees off would change by a tenth.
     terms = terms.telling().exposed_at(Alignments(estimate.T[None], np.array([dt_s]), np.array([focal])))
+    terms = widened(terms, estimate.T, estimate.diagnostics.get("label_width_px", 0.0))
     has_points = np.array([len(o.lidar_edge_xyz_m) + len(o.marking_xyz_m) > 0 for o in observations])
     sharp = KernelSettings.wide(_SHARP_PX, _SHARP_CONTRAST)
 
@@ -179,8 +180,8 @@ def _lidar_radar(
 def _trend_along_axis(T: np.ndarray, value: _FrameCosts) -> Float[np.ndarray, " F"]:
     """Slope [1/m] of each frame's cost along the radar's axis, from so far that no detection meets its own point.
 
-    The cost falls towards where the lidar has more points, which is near the car, whatever the radar sees. By its value
-    alone a pose some centimetres too near beats the right one on streets that are dense nearby.
+    The cost falls towards where the lidar has more points, which is near the car, whatever the radar sees. By
+    its value alone a pose some centimetres too near beats the right one on streets that are dense nearby.
     """
     ahead, behind = (
         [value(from_rotation_translation(T[:3, :3], T[:3, 3] + sign * m * T[:3, 0])) for m in _TREND_M]
@@ -191,7 +192,7 @@ def _trend_along_axis(T: np.ndarray, value: _FrameCosts) -> Float[np.ndarray, " 
 
 
 def _with_planar(T: np.ndarray, T_planar: np.ndarray) -> np.ndarray:
-    """A pose of the radar with another one's yaw, x and y."""
+    """A pose of the radar with the yaw, x and y of another one."""
     turn = log_so3(T_planar[:3, :3] @ T[:3, :3].T)
     R = exp_so3(np.array([0.0, 0.0, turn[2]])) @ T[:3, :3]
     return from_rotation_translation(R, np.append(T_planar[:2, 3], T[2, 3]))

@@ -1,7 +1,7 @@
-"""Alignment of held-out frames at the prior and at the result: a paired test over scenes, each of equal weight.
+"""Alignment of held-out frames at the prior and at the result: a paired test over scenes of equal weight.
 
-A car that stands logs one scene many times: 13 of 40 held-out frames of the real day are two seconds of it, and
-weighed by frames they alone kept a result unproved that every other scene preferred to its prior.
+A standing car logs one scene many times: 13 of 40 held-out frames of the real day are two seconds of it, and
+weighted by frames they alone rejected a result that improved every other scene.
 """
 
 from __future__ import annotations
@@ -43,18 +43,10 @@ class HeldOutTest:
 def paired_test(
     before: Float[np.ndarray, " F"], after: Float[np.ndarray, " F"], blocks: Int[np.ndarray, " F"]
 ) -> HeldOutTest | None:
-    """Compare the costs of the same frames at two calibrations.
+    """Compare the costs of the same frames at two calibrations (lower is better); None without frames.
 
-    Frames with a cost that is not finite at either calibration are left out. Blocks, not frames, are independent and
-    count once each, by their mean; where there is a single one, its frames do.
-
-    Args:
-        before: cost of each frame at the prior (lower is better).
-        after: the same at the result.
-        blocks: frames of equal number share a scene.
-
-    Returns:
-        The test, or None where no frame has both costs.
+    Frames with a cost that is not finite are left out. Blocks (scenes), not frames, are independent and count
+    once each, by their mean; a single block counts by its frames.
     """
     both = np.isfinite(before) & np.isfinite(after)
     if not both.any():

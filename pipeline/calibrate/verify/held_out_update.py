@@ -1,12 +1,13 @@
 """An innovation test on frames that took no part in the fit: how far they would move the result, and how surely.
 
-That held-out frames align better at the result than at a prior two degrees off says little of the result. Where their
-own optimum lies says much: it must be near the result, by the sigmas of both. So the result, with its covariance, is
-taken as the prior of a Kalman update by the held-out frames. Their scores are sums of log likelihoods of points that
-err together within a scene, so their information is too large: it is divided by the ratio of the gradients' scatter
-over scenes to that information.
+That held-out frames align better at the result than at a prior two degrees off says little of the result.
+Where their own optimum lies says much: it must be near the result, by the sigmas of both. So the result, with
+its covariance, is taken as the prior of a Kalman update by the held-out frames. Their scores are sums of log
+likelihoods of points that err together within a scene, so their information is too large: it is divided by
+the ratio of the gradients' scatter over scenes to that information.
 
-Source: Varin, Reid, Firth 2011, section 2.3 (composite likelihoods); Kalman 1960 for the update and its innovation.
+Source: Varin, Reid, Firth 2011, section 2.3 (composite likelihoods); Kalman 1960 for the update and its
+innovation.
 """
 
 from __future__ import annotations
@@ -61,7 +62,6 @@ def held_out_update(
     """Update the result by the held-out frames.
 
     Args:
-        derivatives: gradient and information of each held-out frame's log likelihood.
         covariance: of the result, its time offset and nuisance.
         bias: sigma of errors that are common to all held-out frames.
         blocks: frames of equal number share a scene.
@@ -110,7 +110,7 @@ def _positive_part(H: np.ndarray) -> np.ndarray:
 
 
 def _inflation(g: np.ndarray, information: np.ndarray, blocks: np.ndarray, sigmas: float) -> float:
-    """Scatter of the gradients over blocks, divided by what the information predicts; at least 1."""
+    """Scatter of the gradients over blocks, divided by the information's prediction; at least 1."""
     names, index = np.unique(blocks, return_inverse=True)
     B = len(names)
     sums = np.zeros((B, g.shape[1]))

@@ -1,7 +1,7 @@
-"""Offset of a day's labels against its pictures, and what it does to camera-lidar: no extrinsics are used.
+"""Offset of a day's labels to its images, and its effect on camera-lidar, without extrinsics.
 
-Fit, halves and held-out frames all match depth edges to the same label borders, so a shift of all labels (padding, a
-resize) turns the camera and shows in none of them. The picture's gradients (`perceive.label_gradients`) stay in place.
+Fit, halves and held-out frames all match depth edges to the same label borders, so a shift of all labels
+(padding, a resize) rotates the camera unseen. The image gradients (`perceive.label_gradients`) show it.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _FIT = np.linalg.pinv(
 
 @dataclass(frozen=True, eq=False)
 class LabelOffset:
-    """Where the picture's borders lie, seen from the labels': label pixels to the right and down."""
+    """Offset of the picture's borders from the labels': label pixels to the right and down."""
 
     shift_px: np.ndarray  # 2
     shift_sigma_px: np.ndarray  # 2
@@ -57,12 +57,12 @@ class LabelOffset:
 
     @property
     def open_px(self) -> Float[np.ndarray, " 2"]:
-        """Sigma of a shift that the day would not show; 0 where it would show one of a pixel."""
+        """Sigma of a shift that the day would not show; 0 if it would show one of a pixel."""
         return np.sqrt(np.maximum(self.shift_sigma_px**2 - (_SEEN_PX / _SIGMAS) ** 2, 0.0))
 
     @property
     def sentence(self) -> str:
-        """What is off, by how much."""
+        """The offset in words."""
         (u, v), (su, sv), (a, b), (sa, sb) = (
             self.shift_px, self.shift_sigma_px, self.ends_px, self.ends_sigma_px
         )  # fmt: skip
@@ -187,7 +187,7 @@ def _bounded(curvature: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
 
 
 def _half_width_px(day: Float[np.ndarray, "1 2 B E"], at: Float[np.ndarray, " 3"]) -> float:
-    """Of the maximum, at half its height over what lies around it; all of the range where there is none."""
+    """Width of the maximum at half its height over the surroundings; the whole range if there is none."""
     along = np.arange(-8, 8.01, 1 / _FINE)
     height = _heights(day, at + np.outer(along, [1, 0, 0]))[0]
     half = (height.max() + np.quantile(height, 0.15)) / 2

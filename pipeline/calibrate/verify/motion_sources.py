@@ -1,8 +1,8 @@
 """Odometry, the radar's Doppler and the lidar's own sweeps against each other: speed, sign, yaw rate and lag.
 
-What bridges the time between two sensors, and within a sweep, rests on the car's motion. A wrong source shows up as a
-wrong time offset, range or CameraInfo, so it is asked first. Of three sources the odd one is named; of two, the one
-that drives backwards or is off by the factor of a unit, else the odometry.
+What bridges the time between two sensors, and within a sweep, rests on the car's motion. A wrong source shows
+up as a wrong time offset, range or CameraInfo, so it is asked first. Of three sources the odd one is named;
+of two, the one that drives backwards or is off by the factor of a unit, else the odometry.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _NAMES = {"odometry": "odometry", "doppler": "the radar's Doppler", "lidar": "th
 
 @dataclass(frozen=True, eq=False)
 class MotionFindings:
-    """What is wrong with which source of motion, and the numbers behind it."""
+    """Wrong sources of motion with reasons, and the numbers."""
 
     wrong: list[FailedCheck] = field(default_factory=list)
     numbers: dict[str, float] = field(default_factory=dict)
@@ -53,7 +53,7 @@ class MotionFindings:
     of_radar: list[FailedCheck] = field(default_factory=list)
 
     def of(self, pair: str) -> list[FailedCheck]:
-        """What makes a pair wrong."""
+        """Reasons against a pair."""
         return [c for c in self.wrong if "radar" in pair or c not in self.of_radar]
 
 
@@ -69,13 +69,13 @@ class _Slope:
     fits: float  # a factor with a name that most points agree to, else the slope
 
     def is_off(self, expected: float, allowed: float) -> bool:
-        """Whether it is not what is expected, beyond what is allowed and its own sigma."""
+        """Whether it differs from the expectation, beyond the tolerance and its own sigma."""
         return abs(self.slope - expected) > allowed + _SIGMAS * self.sigma
 
 
 @dataclass(frozen=True, eq=False)
 class _Sources:
-    """The day's motion by each source, by frame; NaN where it is silent. Speeds along the lidar's x axis."""
+    """The day's motion by each source, by frame; NaN if missing. Speeds along the lidar's x axis."""
 
     odometry_mps: Float[np.ndarray, " F"]
     yaw_rate_radps: Float[np.ndarray, " F"]
@@ -85,11 +85,9 @@ class _Sources:
 def compared_sources(
     observations: Sequence[Observation], T_lidar_radar: Float[np.ndarray, "4 4"]
 ) -> MotionFindings:
-    """Compare what the day's observations know of the car's motion.
+    """Compare speeds and yaw rates of the day's observations, in order of time.
 
-    Args:
-        observations: of the day, in order of time.
-        T_lidar_radar: the prior; turns the Doppler's velocities into lidar axes, whose x points ahead.
+    `T_lidar_radar` is the prior; it rotates Doppler velocities into lidar axes, whose x points ahead.
     """
     if not observations:
         return MotionFindings()
@@ -146,7 +144,7 @@ def _wrong_speeds(slopes: dict[str, _Slope], doppler_mps: np.ndarray) -> list[Fa
     forward = doppler_mps[np.abs(doppler_mps) > _MOVING_MPS]
     is_backwards = len(forward) >= _FEWEST and bool(np.mean(forward < 0) > 2 / 3)
     if between is None and is_backwards and "doppler" not in by_lidar:
-        # Where nothing else tells: no car drives backwards for most of a day.
+        # Without other evidence: no car drives backwards for most of a day.
         return [
             FailedCheck(f"by the radar's Doppler the car drives backwards: {_hint(-1.0)}{_KEY}", "doppler")
         ]
@@ -180,7 +178,7 @@ def _wrong_speed(name: str, against: str, found: _Slope) -> FailedCheck:
 
 
 def _hint(ratio: float) -> str:
-    """What fits: a sign, a unit, or nothing that has a name."""
+    """Explanation that fits: a sign, a unit, or none."""
     fits = ["the other sign"] if ratio < 0 else []
     fits += [unit for factor, unit in _FACTORS if abs(abs(ratio) / factor - 1) < _NEAR]
     return f"{' and '.join(fits)} fits" if fits else "its scale is wrong"
@@ -227,7 +225,7 @@ def _lidar_agrees(slopes: dict[str, _Slope]) -> bool:
 
 
 def _has_odometry(observations: Sequence[Observation]) -> bool:
-    """Whether a speed is logged: one beside a yaw rate, or where the radar's Doppler shows none."""
+    """Whether a speed is logged: with a yaw rate, or where the radar's Doppler has none."""
     return any(
         o.ego_speed_mps is not None and (o.ego_yaw_rate_radps is not None or o.radar_velocity_mps is None)
         for o in observations
@@ -235,7 +233,7 @@ def _has_odometry(observations: Sequence[Observation]) -> bool:
 
 
 def _met(observations: Sequence[Observation], T_lidar_radar: np.ndarray) -> float:
-    """Share of the static detections of some frames that lie where the lidar shows what stands."""
+    """Share of the static detections of some frames near the lidar's standing objects."""
     picked = np.unique(np.linspace(0, len(observations) - 1, _SAMPLE).astype(int))
     shares = []
     for o in (observations[i] for i in picked):
@@ -246,7 +244,7 @@ def _met(observations: Sequence[Observation], T_lidar_radar: np.ndarray) -> floa
 
 
 def _lag(observations: Sequence[Observation], sources: _Sources) -> _Slope | None:
-    """By how much odometry lags the Doppler [s]: what they differ by, over the acceleration."""
+    """Delay of odometry after the Doppler [s]: their difference over the acceleration."""
     stamps_s = np.array([o.stamp_ns for o in observations], np.int64) * 1e-9
     drives = np.array([o.drive for o in observations])
     span_s, speed = stamps_s[2:] - stamps_s[:-2], sources.odometry_mps
@@ -257,7 +255,7 @@ def _lag(observations: Sequence[Observation], sources: _Sources) -> _Slope | Non
     acceleration, behind = acceleration[both], behind[both]
     if not len(behind):
         return None
-    # A scale that is a little wrong is no lag: what counts is how both vary.
+    # A slightly wrong scale is no lag: only the variation of both counts.
     return _slope(behind - np.median(behind), acceleration - np.median(acceleration), _ACCELERATING_MPS2)
 
 

@@ -1,11 +1,12 @@
 """How surely a record knows the mounting, beside where things appear: covariances of the two, one out of the other.
 
-A principal point wrong by d pixels is, but for second order, a camera turned by d / f. No alignment tells the two
-apart, and whoever projects with the same CameraInfo gets the right pixel all the same: through camera-radar as well,
-where both factors see through the same camera, and in lidar-radar, whose boxes are read through it. So what is
-certified in the image does not say how the camera hangs. That is known as surely as the principal point: as fleet.toml
-states it (`centre_sigma_px`), else as the day itself measures it, else not at all. Likewise a radar's own constant
-elevation error turns its detections, which a record is about, and not its mounting.
+A principal point wrong by d pixels is, but for second order, a camera turned by d / f. No alignment tells the
+two apart, and whoever projects with the same CameraInfo gets the right pixel all the same: through
+camera-radar as well, where both factors see through the same camera, and in lidar-radar, whose boxes are read
+through it. So what is certified in the image does not say how the camera hangs. That is known as surely as
+the principal point: as fleet.toml states it (`centre_sigma_px`), else as the day itself measures it, else not
+at all. Likewise a radar's own constant elevation error turns its detections, which a record is about, and not
+its mounting.
 """
 
 from __future__ import annotations
@@ -24,9 +25,9 @@ __all__ = ["camera_turn_sigma_rad", "mounting_covariance"]
 def camera_turn_sigma_rad(
     solution: Solution, known: CameraPrior, K: Float[np.ndarray, "3 3"]
 ) -> Float[np.ndarray, " 2"] | None:
-    """Sigmas of the camera's pitch and yaw (turns about its x and y) that the principal point leaves open.
+    """Sigmas of the camera's pitch and yaw (about its x and y) due to the principal point.
 
-    As the method measured them on the day; of one that measures none as stated, and None where nobody stated any.
+    As measured on the day, else as stated in fleet.toml, else None.
     """
     camera_lidar = solution.pairs.get("camera_lidar")
     measured = {} if camera_lidar is None else camera_lidar.diagnostics
@@ -42,13 +43,10 @@ def mounting_covariance(
     covariance: Float[np.ndarray, "6 6"],
     turn_sigma_rad: Float[np.ndarray, " 2"] | None,
 ) -> Float[np.ndarray, "6 6"] | None:
-    """Covariance of an estimate as the pose of what is mounted; None where nothing says how the camera hangs.
+    """Covariance of an estimate as a mounting pose; None if the camera's principal point is unknown.
 
-    Args:
-        pair: which one.
-        T: the estimate.
-        covariance: of its left perturbation, for whoever uses the same CameraInfo and the radar's detections.
-        turn_sigma_rad: of the camera, about its x and y.
+    `covariance` is for users of the same CameraInfo and of the radar's detections; `turn_sigma_rad` is the
+    camera's.
     """
     wider = np.array(covariance, np.float64)
     if pair.startswith("camera"):

@@ -39,7 +39,7 @@ _LIDAR_PAIRS = ("camera_lidar", "lidar_radar")
 def prior_alarms(
     pairs: Mapping[str, PairEstimate], prior: Prior, limits: VerdictLimits
 ) -> dict[str, list[FailedCheck]]:
-    """Positions left to the prior that the day itself puts elsewhere."""
+    """Positions left at the prior that the day's data contradict."""
     sigma_m = f"{prior.translation_sigma_m:g}"
     return {
         pair: [
@@ -63,7 +63,7 @@ def _own_positions(estimate: PairEstimate) -> dict[int, tuple[float, float]]:
 
 
 def _is_far(estimate: PairEstimate, k: int, prior: Prior, limits: VerdictLimits) -> bool:
-    """Whether the day's own position lies many sigmas of prior and day off."""
+    """Whether the day's position is many sigmas (prior and day) off."""
     z = [estimate.diagnostics[n] for n in ("own_z_prior", "own_z_beyond") if n in estimate.diagnostics]
     shift, own = _own_positions(estimate)[k]
     many = limits.max_move_prior_sigmas
@@ -74,7 +74,7 @@ def _is_far(estimate: PairEstimate, k: int, prior: Prior, limits: VerdictLimits)
 def clock_alarms(
     pairs: Mapping[str, PairEstimate], sigma_s: float, limits: VerdictLimits
 ) -> dict[str, list[FailedCheck]]:
-    """Time offsets beyond what `time_offset_sigma_s` allows, estimated or further out than a solution is looked for."""
+    """Time offsets beyond `time_offset_sigma_s`, estimated or at the end of the search range."""
     out = {}
     for pair, estimate in pairs.items():
         dt_s, own_s, found = estimate.time_offset_s, estimate.time_offset_sigma_s or 0.0, estimate.diagnostics
@@ -116,7 +116,7 @@ def edge_alarms(
 
 
 def _contradicted(estimate: PairEstimate, prior: Prior, limits: VerdictLimits) -> Float[np.ndarray, " 6"]:
-    """The change from the prior where it is many sigmas; 0 elsewhere."""
+    """The change from the prior if it is many sigmas; else 0."""
     step = change_between(prior.of(estimate.pair), estimate.T)
     far = limits.max_move_prior_sigmas * np.sqrt(np.diag(prior.covariance(estimate.pair)))
     step = np.where(estimate.observable & (np.abs(step) > far), step, 0.0)
@@ -126,7 +126,7 @@ def _contradicted(estimate: PairEstimate, prior: Prior, limits: VerdictLimits) -
 
 
 def _kept(resting: PairEstimate, hidden: Float[np.ndarray, " 6"]) -> Bool[np.ndarray, " 6"]:
-    """What the pair left to a prior that would be wrong by a good part of what the other pair found."""
+    """Axes that the pair left at a prior contradicted by the other pair."""
     size = np.repeat([np.linalg.norm(hidden[:3]), np.linalg.norm(hidden[3:])], 3)
     return ~resting.observable & (np.abs(hidden) > 0.3 * size)
 
@@ -148,7 +148,7 @@ def _rests_on(
     J = target_jacobian(resting.pair, resting.T) @ np.linalg.inv(change_jacobian(resting.T))
     effect = np.zeros(J.shape[:2])
     for axis in np.flatnonzero(_kept(resting, hidden)):
-        # All others follow what is kept at the prior.
+        # All others follow the unknowns kept at the prior.
         effect += J @ (covariance[:, axis] / covariance[axis, axis] * hidden[axis])
     sigmas = target_sigmas(resting.pair, resting.T, resting.covariance)
     return bool(np.any(np.sqrt((effect**2).mean(1)) > sigmas))

@@ -14,11 +14,7 @@ __all__ = ["scene_failures"]
 
 
 def scene_failures(fitted: Sequence[Observation]) -> list[FailedCheck]:
-    """A fit to few scenes: what they have in common passes for the calibration, and no held-out frame shows it.
-
-    Args:
-        fitted: frames that a pair was estimated from, in order of time.
-    """
+    """A failed check for a fit to few scenes: errors common to them are in held-out frames too."""
     scenes = len(np.unique(scenes_of(fitted)))
     if scenes >= FEWEST_SCENES or not fitted:
         return []

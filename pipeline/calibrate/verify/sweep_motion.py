@@ -36,7 +36,7 @@ _DISTINCT = 1.1
 
 @dataclass(frozen=True, eq=False)
 class SweepMotion:
-    """Motion between pairs of sweeps, of those pairs that tell it. Lidar axes: x ahead, positive yaw to the left."""
+    """Motion between pairs of sweeps that determine it. Lidar axes: x ahead, positive yaw to the left."""
 
     first: Int64[np.ndarray, " P"]  # place of the earlier observation
     last: Int64[np.ndarray, " P"]
@@ -69,7 +69,7 @@ def _pairs(observations: Sequence[Observation]) -> Int64[np.ndarray, "P 2"]:
 
 
 def _motion(before: Observation, after: Observation) -> tuple[float, float] | None:
-    """Speed and yaw rate from one sweep to the other; None where they do not tell."""
+    """Speed and yaw rate from one sweep to the other; None if undetermined."""
     still, moved = _standing(before), _standing(after)
     if min(len(still), len(moved)) < _FEWEST_POINTS:
         return None
@@ -94,7 +94,7 @@ def _arcs(yaw_rad: Float[np.ndarray, " W"], way_m: Float[np.ndarray, " V"]) -> F
 
 
 def _standing(o: Observation) -> Float[np.ndarray, "N 2"]:
-    """What stands on the ground around the lidar, one point a cell."""
+    """Standing objects around the lidar, one point per cell."""
     xy = o.lidar_map_xyz_m[o.lidar_map_is_ground == 0, :2].astype(np.float64)
     far_m = np.hypot(*xy.T)
     xy = xy[(far_m > _NEAREST_M) & (far_m < _REACH_M)]
@@ -103,7 +103,7 @@ def _standing(o: Observation) -> Float[np.ndarray, "N 2"]:
 
 
 def occupancy(xy_m: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "C C"]:
-    """What is occupied around the lidar, 0 to 1, on a grid of half-metre cells."""
+    """Occupancy around the lidar, 0 to 1, on a grid of half-metre cells."""
     size = int(2 * _REACH_M / _CELL_M)
     grid = np.zeros((size, size))
     row, column = np.floor((xy_m + _REACH_M) / _CELL_M).astype(np.int64).T
@@ -112,7 +112,7 @@ def occupancy(xy_m: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "C C"]:
 
 
 def occupied_share(o: Observation, xy_lidar_m: Float[np.ndarray, "N 2"]) -> float:
-    """How much of what another sensor shows lies where this sweep shows what stands, 0 to 1."""
+    """Share of another sensor's points in occupied cells, 0 to 1."""
     return float(_scores(xy_lidar_m, occupancy(_standing(o)), np.zeros((1, 3)), _CELL_M, _REACH_M)[0])
 
 

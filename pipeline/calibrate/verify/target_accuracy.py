@@ -126,7 +126,7 @@ def claims_of(
                 float(np.sqrt(np.einsum("ni,ij,nj->n", J, C, J).mean()))
                 for C in (update.shift_covariance, update.covariance, update.bias)
             )
-            # Held-out frames miss what the method misses: nothing becomes surer by them than their common bias.
+            # Held-out frames share the method's bias: no sigma becomes smaller than their common bias.
             remaining = min(sigma, max(updated, bias))
             shift = float(np.sqrt(np.mean((J @ update.shift) ** 2)))
         claims[name] = Claim(

@@ -48,7 +48,7 @@ _FAILED = -1.0  # margin of a check that yields no number
 
 @dataclass(frozen=True)
 class Evidence:
-    """What speaks for and against one pair's estimate."""
+    """Evidence for and against one pair's estimate."""
 
     held_out: HeldOutTest | None  # held-out frames at prior and result; None where none has both costs
     claims: Mapping[str, Claim]  # of azimuth and elevation at the targets
@@ -80,7 +80,7 @@ class _Check:
     margin: float
     reason: str
     disproves: bool = False  # where it fails, the pose is wrong, not only unproved
-    # Where it fails, the pose may be as good as its sigma says; that is not good enough.
+    # If it fails, the pose may still be within its sigma, but the sigma is too large.
     of_sigma: bool = False
     fault: str = ""  # key of schemas.faults.FAULTS that it names
 
@@ -148,7 +148,7 @@ def judge(
 def _moves_little(
     estimate: PairEstimate, prior: Prior, search: SearchRange, limits: VerdictLimits
 ) -> list[_Check]:
-    """Within what was searched, and within what the prior allows."""
+    """Within the search range, and within the prior's sigmas."""
     step = change_between(prior.of(estimate.pair), estimate.T)
     rotation, translation = float(np.linalg.norm(step[:3])), float(np.abs(step[3:]).max())
     # The searched box has half-widths per axis: its corners lie sqrt(3) further out.
@@ -202,7 +202,7 @@ def _aligns_better(
 def _aligns_no_worse(
     estimate: PairEstimate, prior: Prior, test: HeldOutTest | None, limits: VerdictLimits
 ) -> list[_Check]:
-    """Where others have a say in the pose: no worse than a prior that the result, by its sigma, contradicts."""
+    """If other pairs take part in the pose: no worse than a prior that the result contradicts."""
     if test is None:
         return []
     _, ratio = _largest_move(estimate, prior)
@@ -218,7 +218,7 @@ def _largest_move(estimate: PairEstimate, prior: Prior) -> tuple[str, float]:
 
 
 def _moves(estimate: PairEstimate, prior: Prior) -> np.ndarray:
-    """How far each degree of freedom moved from the prior, in sigmas of the result; 0 where it was not determined."""
+    """Distance of each degree of freedom from the prior, in sigmas of the result; 0 if not determined."""
     sigma = np.sqrt(np.diag(change_covariance(estimate.T, estimate.covariance)))
     step = change_between(prior.of(estimate.pair), estimate.T)
     return np.asarray(np.where(estimate.observable, np.abs(step) / sigma, 0.0))
@@ -241,7 +241,7 @@ def _worse(test: HeldOutTest) -> str:
 
 
 def _claims_hold(estimate: PairEstimate, claims: Mapping[str, Claim]) -> list[_Check]:
-    """Held-out frames must not contradict the result, and what the pair is good for must be known well enough."""
+    """Held-out frames must not contradict the result, and its claim must be certain enough."""
     checks = []
     for name, claim in claims.items():
         checks.append(
@@ -269,7 +269,7 @@ def _differences(pair: str, unchecked: Mapping[int, float]) -> list[str]:
 
 
 def _reservations(estimate: PairEstimate, claims: Mapping[str, Claim]) -> list[str]:
-    """What an accepted record does not certify."""
+    """Axes that an accepted record does not certify."""
     open_claims = [
         f"{name} not certified: {_known(claim)}" for name, claim in claims.items() if claim.margin < 0
     ]

@@ -47,25 +47,13 @@ def unpack_zstd(data: bytes | memoryview, limit_bytes: int) -> bytes:
 
 
 def unpack_lz4(data: bytes | memoryview, limit_bytes: int) -> bytes:
-    """Content of an lz4 frame of at most `limit_bytes`.
-
-    Raises:
-        OversizedError: decompresses to more than `most_bytes`.
-        ValueError: larger than `limit_bytes`.
-        RuntimeError: not an lz4 frame.
-    """
+    """Content of an lz4 frame of at most `limit_bytes`; errors as `unpack_zstd`, or RuntimeError."""
     _check_ratio(data, limit_bytes)
     return _at_most(limit_bytes, lz4.frame.LZ4FrameDecompressor().decompress(data, limit_bytes + 1))
 
 
 def unpack_bz2(data: bytes | memoryview, limit_bytes: int) -> bytes:
-    """Content of bz2 data of at most `limit_bytes`.
-
-    Raises:
-        OversizedError: decompresses to more than `most_bytes`.
-        ValueError: larger than `limit_bytes`.
-        OSError: not bz2 data.
-    """
+    """Content of bz2 data of at most `limit_bytes`; errors as `unpack_zstd`, or OSError."""
     _check_ratio(data, limit_bytes)
     return _at_most(limit_bytes, bz2.BZ2Decompressor().decompress(data, limit_bytes + 1))
 

@@ -1,7 +1,4 @@
-"""Common code for MCAP files and ROS 1 bags.
-
-Both hold messages in chunks, listed in an index at the end of the file.
-"""
+"""Common code for MCAP files and ROS 1 bags: both hold chunks, with an index at the end of the file."""
 
 from __future__ import annotations
 

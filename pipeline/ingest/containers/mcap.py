@@ -99,10 +99,7 @@ class McapLog(ChunkedLog):
     # -- records ------------------------------------------------------------
 
     def _records(self) -> Iterator[tuple[int, int, int]]:
-        """(opcode, start of content, length) of records.
-
-        After a damaged part, continues at the next known chunk.
-        """
+        """(opcode, start of content, length) of records; continues at the next chunk after damage."""
         position = _MAGIC_SIZE
         while True:
             head = self._content(position, _RECORD.size)
@@ -134,10 +131,7 @@ class McapLog(ChunkedLog):
             position = end
 
     def _read_summary(self) -> list[Chunk]:
-        """Chunks listed in the summary, none if it is lost or damaged.
-
-        Also reads schemas, channels and counts.
-        """
+        """Chunks listed in the summary, none if it is lost; also reads schemas, channels and counts."""
         try:
             tail = self._content(max(self._size - _FOOTER_SIZE - _MAGIC_SIZE, 0), _FOOTER_SIZE)
             footer = Footer.read(ReadDataStream(BytesIO(tail[_RECORD.size :])))

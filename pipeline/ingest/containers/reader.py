@@ -78,16 +78,11 @@ class LogReader(Protocol):
     ) -> Iterator[RawMessage]:
         """All complete messages of the topics (None = every topic) in file order.
 
-        With `within`, only those logged in these stretches; if the log has an index, only their chunks are
-        read.
+        `within` selects stretches of log time; if the log has an index, only their chunks are read.
         """
 
     def read(self, position: Position) -> memoryview:
-        """Payload of a message found by a scan.
-
-        Raises:
-            LogError: the log changed since the scan.
-        """
+        """Payload of a message found by a scan; raises LogError if the log changed since the scan."""
 
     def close(self) -> None:
         """Close all files."""

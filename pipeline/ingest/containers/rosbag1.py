@@ -95,10 +95,7 @@ class BagLog(ChunkedLog):
             position = record[1] + record[2]
 
     def _read_index(self) -> list[Chunk]:
-        """Chunks in the index at the bag's end, none if it is lost.
-
-        Also reads its connections and their counts.
-        """
+        """Chunks in the index at the bag's end, none if it is lost; also reads connections and counts."""
         chunks: list[Chunk] = []
         try:
             first = self._record(_FIRST_RECORD)
@@ -118,10 +115,7 @@ class BagLog(ChunkedLog):
         return sorted(chunks, key=lambda c: c.position)
 
     def _indexed(self, header: dict[str, bytes], counts: bytes) -> Chunk:
-        """Chunk of an index record, with its message counts.
-
-        The position is kept even if the counts are damaged.
-        """
+        """Chunk of an index record, with its message counts; its position even if the counts are damaged."""
         position = struct.unpack("<Q", header["chunk_pos"])[0]
         try:
             messages = dict(_PAIR.iter_unpack(counts))

@@ -160,10 +160,7 @@ class FetchedLog(_CopiedLog):
 
 
 def _remove_left_behind() -> None:
-    """Remove files that killed processes left more than a day ago.
-
-    Not sooner: containers may share the folder, and processes of other containers are not visible here.
-    """
+    """Remove a killed process's files after a day: other containers may share the folder."""
     for folder in Path(tempfile.gettempdir()).glob(f"{_UNPACKED}*-*"):
         pid = folder.name.removeprefix(_UNPACKED).partition("-")[0]
         with suppress(FileNotFoundError):  # another process removed it first

@@ -134,10 +134,7 @@ class Db3Log:
                 self.damage["damaged_rows"] += 1
 
     def _has_time_index(self) -> bool:
-        """Whether there is an index on time stamps, as rosbag2 makes it.
-
-        Without it each query would read all rows.
-        """
+        """Whether there is an index on time stamps; without it each query would read all rows."""
         try:
             rows = self._db.execute("SELECT sql FROM sqlite_master WHERE type = 'index'").fetchall()
         except (apsw.Error, UnicodeDecodeError):

@@ -39,10 +39,7 @@ class Stretches:
 
     @classmethod
     def of_times(cls, times_ns: Int64[np.ndarray, " N"]) -> Stretches:
-        """Stretches of messages from their times, in order.
-
-        One stretch for all messages without a pause between them.
-        """
+        """Stretches of messages from their times, in order; one for all messages without a pause."""
         if not len(times_ns):
             return cls(())
         ends = np.flatnonzero(np.diff(times_ns) > PAUSE_NS)
@@ -69,10 +66,7 @@ class Stretches:
 
 @dataclass(frozen=True, eq=False)
 class Counted:
-    """Message counts of an index: start, end and number of each span.
-
-    A fraction if only their existence is known.
-    """
+    """Message counts of an index: start, end and number of each span; fractions if only estimated."""
 
     start_ns: Int64[np.ndarray, " K"]
     end_ns: Int64[np.ndarray, " K"]
@@ -91,11 +85,7 @@ class Counted:
         return cls(*(np.concatenate(column) for column in columns))
 
     def evened(self, recorded: Stretches) -> Counted:
-        """Counts with one span for each stretch of steady messages.
-
-        The ends of chunks depend only on their size, so a steady topic is better described by the whole
-        stretch.
-        """
+        """Counts with one span per stretch of steady messages: chunks end by size, not by time."""
         begins, kept = (
             np.array([start for start, _ in recorded.spans_ns], np.int64),
             list[tuple[int, int, float]](),
@@ -177,13 +167,7 @@ class Chunk:
 def timeline_of_chunks(
     chunks: Iterable[Chunk], topics: Mapping[int, str], messages: Mapping[int, int]
 ) -> Timeline:
-    """Timeline of a chunked log.
-
-    Args:
-        chunks: from the log's index.
-        topics: by channel.
-        messages: number of messages by channel.
-    """
+    """Timeline of a log from the chunks of its index; `topics` and `messages` are by channel."""
     counts: dict[str, int] = {}
     for channel, count in messages.items():
         if channel in topics:
@@ -206,10 +190,7 @@ def timeline_of_chunks(
 def _counted(
     chunks: Sequence[Chunk], topics: Mapping[int, str], messages: Mapping[int, int], typical_ns: int
 ) -> dict[str, Counted]:
-    """Messages of each topic by chunk.
-
-    Uses counts of the index if it has them, else the chunk's share of bytes.
-    """
+    """Messages of each topic by chunk: counts of the index, else the chunk's share of bytes."""
     bytes_of = Counter[int]()
     for chunk in chunks:
         bytes_of.update(dict.fromkeys(_channels(chunk, topics), max(chunk.length, 1)))

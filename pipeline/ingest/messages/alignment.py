@@ -1,9 +1,9 @@
 """Radar misalignment from radar messages; angles in radians, positive to the left and upwards.
 
 Sources: off_highway_premium_radar_msgs (angles in rad, left and up positive for a radar mounted upright, NaN
-if there is no estimate), continental_msgs of Nebula and ars548_messages (rad: neither states a unit; both copy
-the number that the radar sends, and Nebula's decoder of the ARS548, nebula_decoders_continental, asserts -pi to
-pi of it as of the angles beside it; neither states the sign), delphi_esr_msgs, delphi_mrr_msgs and
+if there is no estimate), continental_msgs of Nebula and ars548_messages (rad: neither states a unit; both
+copy the number that the radar sends, and Nebula's decoder of the ARS548, nebula_decoders_continental, asserts
+-pi to pi of it as of the angles beside it; neither states the sign), delphi_esr_msgs, delphi_mrr_msgs and
 delphi_srr_msgs (deg, in steps of 0.0625).
 """
 
@@ -63,16 +63,10 @@ class Misalignment:
 
 
 def read_alignment(channel: Channel, data: memoryview, fields: AlignmentFields | None = None) -> Misalignment:
-    """Misalignment stated in a message.
-
-    Args:
-        channel: of the message.
-        data: its bytes.
-        fields: names of its fields; None = those of its known type.
+    """Misalignment stated in a message; `fields` are names of its fields, None = those of its type.
 
     Raises:
-        LogError: unknown type without field names, a field is missing or not a number, or the bytes do not
-            fit the definition.
+        LogError: unknown type without field names, a field is missing or no number, or damaged bytes.
     """
     known = fields or ALIGNMENT_MESSAGES.get(channel.msgtype)
     if known is None:

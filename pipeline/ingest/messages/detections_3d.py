@@ -35,15 +35,12 @@ _Thing = tuple[Any, Any, str, float]  # pose, size, class, score
 def read_detections_3d(
     message: Any, camera: Camera, camera_frame: str
 ) -> tuple[Float32[np.ndarray, "N 4"], list[str], Float32[np.ndarray, " N"], int]:
-    """Boxes in the image, classes, scores, and number of detections without box or class or out of view.
+    """Boxes in the image, classes, scores, and the number of detections that give none.
 
-    Args:
-        message: vision_msgs/Detection3DArray or Autoware's DetectedObjects.
-        camera: of the image.
-        camera_frame: frame id of the image, an optical frame.
+    `message` is a vision_msgs/Detection3DArray or Autoware's DetectedObjects.
 
     Raises:
-        ValueError: the boxes are given in another frame.
+        ValueError: the boxes are not in `camera_frame`, the image's optical frame.
     """
     frame = str(message.header.frame_id).lstrip("/")
     if frame != camera_frame:
@@ -81,10 +78,7 @@ def _autoware(message: Any) -> Iterator[_Thing]:
 
 
 def _box(pose: Any, size: Any, camera: Camera) -> Float[np.ndarray, " 4"] | None:
-    """Upright box of the visible part, in the image.
-
-    None if the box is invalid or partly behind the camera.
-    """
+    """Upright box of the visible part, in the image; None if the box is invalid or partly behind the camera."""
     p, q = pose.position, pose.orientation
     t, q_wxyz = np.array([p.x, p.y, p.z], np.float64), np.array([q.w, q.x, q.y, q.z], np.float64)
     sides = np.array([size.x, size.y, size.z], np.float64)

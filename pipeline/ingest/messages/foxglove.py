@@ -37,7 +37,7 @@ def as_ros(msgtype: str, message: Any) -> Any:
     """A Foxglove message with the attributes of its ROS counterpart; other messages unchanged.
 
     Raises:
-        ValueError: a cloud with a pose other than identity in its frame, or without the size of its points.
+        ValueError: a cloud with a pose other than identity, or without the size of its points.
     """
     package, _, kind = msgtype.replace("/msg/", ".").rpartition(".")
     twin = _TWINS.get(kind) if package in {"foxglove", "foxglove_msgs"} else None

@@ -18,12 +18,7 @@ _LONGEST_NAME = 1024
 
 
 def encoding_fault(channel: Channel, data: memoryview) -> str:
-    """Reason why a message with a header cannot be read as its log claims, and the remedy; empty if it can.
-
-    Args:
-        channel: with the encoding that the log claims.
-        data: the message.
-    """
+    """Reason why a message with a header is not in its log's encoding, and the remedy; else empty."""
     said = channel.encoding
     if said == PROTOBUF:
         return ""

@@ -16,11 +16,7 @@ __all__ = ["decode_other"]
 
 
 def decode_other(data: bytes, check_size: Callable[[int, int], object]) -> np.ndarray:
-    """Pixels as 8 bit grey or BGR.
-
-    Args:
-        data: the whole file.
-        check_size: called with width and height before decoding; raises if they are implausible for a camera.
+    """Pixels as 8 bit grey or BGR; `check_size` sees width and height first, and raises if implausible.
 
     Raises:
         ValueError: another format, or damaged.

@@ -101,9 +101,7 @@ def read_lidar(message: Any, stamp_ns: int, max_range_m: float) -> LidarCloud:
     """Finite points of a sweep within range; intensity, ring and time if the cloud has them.
 
     Args:
-        message: sensor_msgs/PointCloud2 with x, y, z [m] in the lidar frame.
         stamp_ns: the sweep's stamp; times become seconds relative to it, for all conventions of the log.
-        max_range_m: points beyond are dropped and counted.
 
     Raises:
         ValueError: no x, y, z, or an inconsistent layout.

@@ -14,11 +14,7 @@ _LAST_S = 2**33  # beyond it nanoseconds overflow int64: a damaged number
 
 
 def parse(channel: Channel, data: memoryview) -> Any:
-    """Decode a message by its schema.
-
-    Raises:
-        ValueError: invalid schema or bytes.
-    """
+    """Decode a message by its schema; raises ValueError if schema or bytes are invalid."""
     from google.protobuf.message import DecodeError  # noqa: PLC0415  # logs of ROS alone need no protobuf
 
     try:

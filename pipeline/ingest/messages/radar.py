@@ -37,12 +37,8 @@ class RadarCloud:
 def read_radar(message: Any, msgtype: str, config: RadarTopics) -> RadarCloud:
     """Detections of one radar message; those that are not finite or have zero range are dropped and counted.
 
-    Args:
-        message: decoded by the log's own definition.
-        msgtype: PointCloud2, RadarScan or RadarTracks.
-        config: name and sign of the Doppler field, sign of RadarScan's azimuth. Velocities of a RadarTrack,
-            and the components in `velocity_fields`, need no sign: they are relative to the sensor, and their
-            component along the line of sight is the range rate.
+    Velocities of a RadarTrack, and the components in `velocity_fields`, need no sign: they are relative to
+    the sensor, and their component along the line of sight is the range rate.
 
     Raises:
         ValueError: a field is missing (the message lists the existing ones), or the layout is inconsistent.
@@ -131,10 +127,7 @@ def _tracks(message: Any, _config: RadarTopics) -> _Columns:
 
 
 def _along(xyz: Float[np.ndarray, "N 3"], velocity: Float[np.ndarray, "N K"]) -> Float[np.ndarray, " N"]:
-    """Component along the line of sight of velocities relative to the sensor.
-
-    With two components the third is 0.
-    """
+    """Component along the line of sight of relative velocities; of two components, the third is 0."""
     return np.einsum("ij,ij->i", xyz[:, : velocity.shape[1]], velocity) / np.linalg.norm(xyz, axis=1)
 
 

@@ -37,10 +37,7 @@ def video_codec(format_: str) -> str | None:
 class VideoPictures:
     """Images of a video stream by message index; fast if read in order.
 
-    Args:
-        read: returns format and data of the message of an index.
-        stamps_ns: of all messages in order of logging; nothing is decoded across a gap that shows a missing
-            message.
+    `read` returns format and data of a message. Nothing is decoded across a gap in `stamps_ns`.
     """
 
     def __init__(self, read: Callable[[int], tuple[str, bytes]], stamps_ns: Int64[np.ndarray, " N"]) -> None:
@@ -55,8 +52,7 @@ class VideoPictures:
         """The image of a message as BGR.
 
         Raises:
-            ValueError: no key frame before it, a packet that is damaged or missing, or a stream with B
-                frames.
+            ValueError: no key frame before it, a damaged or missing packet, or a stream with B frames.
             MissingExtraError: PyAV is not installed.
         """
         av = _pyav()

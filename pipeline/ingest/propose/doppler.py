@@ -45,12 +45,7 @@ def doppler_period(frames: Sequence[Frame]) -> float | None:
 
 
 def doppler_sign(frames: Sequence[Frame], rig: Rig) -> str:
-    """The `doppler_positive` that fits the frames; "" if undetermined.
-
-    Args:
-        frames: with the radar's scans, and odometry if the log has it.
-        rig: of this radar, with the `doppler_positive` that the frames were read with.
-    """
+    """The `doppler_positive` that fits frames read with that of `rig`; "" if undetermined."""
     if rig.radar is None:
         return ""
     tried = rig.radar.doppler_positive

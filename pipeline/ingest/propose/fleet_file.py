@@ -1,7 +1,4 @@
-"""Text of a fleet.toml for the sensors that were found.
-
-Reliable values are lines, uncertain ones are comments.
-"""
+"""Text of a fleet.toml for the sensors that were found: reliable values as lines, others as comments."""
 
 from __future__ import annotations
 
@@ -34,10 +31,8 @@ class Facts:
     """Content of the text in addition to the sensors.
 
     Args:
-        static_topic: of the static transforms, "" if the logs have none.
         untied: sensors that no chain of transforms reaches, with their frame ids.
         vehicle_frames: frames of the transforms that may be the vehicle's.
-        meanings: Doppler of each radar in the log.
     """
 
     static_topic: str

@@ -13,10 +13,9 @@ _DAY = re.compile(r"\d{4}-?\d{2}-?\d{2}")
 
 
 def logs_pattern(logs: Sequence[Path]) -> str:
-    """Pattern of the logs for `boresight nightly --logs`; "" if the names contain no vehicle or day.
+    """Pattern for `boresight nightly --logs`; "" if the names contain no vehicle or day.
 
-    Files that are not logs (a licence beside them, a calibration) are ignored: a shell's `logs/*` includes
-    them.
+    Files that are not logs are ignored: a shell's `logs/*` includes them.
     """
     paths = [path for path in logs if path.is_dir() or path.suffix in _SUFFIXES]
     patterns = {_pattern(path) for path in paths}

@@ -44,12 +44,7 @@ class Proposal:
 
 
 def propose_fleet(logs: Sequence[Path], fleet: str, progress: Progress = silent) -> Proposal:
-    """Write a fleet.toml for logs of vehicles of one build.
-
-    Args:
-        logs: some of them; a minute of each is read.
-        fleet: name of the fleet.
-        progress: called for each log, and for moments.
+    """A fleet.toml for logs of vehicles of one build, of which a minute each is read.
 
     Raises:
         ConfigError: the logs have fewer than two sensors.

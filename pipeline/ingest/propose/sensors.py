@@ -1,7 +1,4 @@
-"""Assignment of topics to sensors: by types, frame ids, fields and sizes.
-
-By topic names only if undecided.
-"""
+"""Assignment of topics to sensors: by types, frame ids, fields and sizes, then by topic names."""
 
 from __future__ import annotations
 
@@ -237,10 +234,7 @@ def _label_values(topic: Topic) -> np.ndarray | None:
 
 
 def _has_areas(pixels: np.ndarray) -> bool:
-    """Whether most pixels equal their right neighbour, as in a label image.
-
-    In a grey picture only one in ten does.
-    """
+    """Whether most pixels equal their right neighbour: in label images; in grey ones one in ten does."""
     return bool(np.mean(pixels[:, 1:] == pixels[:, :-1]) > 0.8)
 
 

@@ -24,10 +24,7 @@ _KNOWN = {kind for kinds in ACCEPTED_TYPES.values() for kind in kinds}
 
 @dataclass(eq=False)
 class Topic:
-    """A topic of a type that Boresight reads.
-
-    `frame_id` is that of its last decoded message, "" if it has none.
-    """
+    """A topic of a type that Boresight reads, with the frame id of its last decoded message, else ""."""
 
     name: str
     msgtype: str
@@ -55,12 +52,7 @@ class Survey:
 
 
 def survey_logs(logs: Sequence[Path], progress: Progress = silent) -> Survey:
-    """Read the first minute of each log.
-
-    Args:
-        logs: of one or several vehicles of the same build.
-        progress: called for each log.
-    """
+    """Read the first minute of each log."""
     survey = Survey()
     for done, path in enumerate(logs):
         progress(done, len(logs), f"looking through {path.name}")

@@ -1,10 +1,11 @@
 """Directed edges: depth jumps of the lidar against mask boundaries of the same direction.
 
-Each projected jump has a nearest boundary of its own direction class at the signed distance r along that boundary's
-axis. Only some jumps match (on real logs one in five more than by chance), so the score is not a sum of squares but the
-log likelihood ratio of a mixture, `pi k(r; s) + (1 - pi) c(r)`, against chance alone, `c(r)`: the density of distances
-from random pixels to their nearest boundary. k is the kernel (1 + (r/s)^2)^-2, normalised. The share of matches pi is
-estimated per kind of edge: a kind that matches no better than chance gets a small pi and so loses its weight.
+Each projected jump has a nearest boundary of its own direction class at the signed distance r along that
+boundary's axis. Only some jumps match (on real logs one in five more than by chance), so the score is not a
+sum of squares but the log likelihood ratio of a mixture, `pi k(r; s) + (1 - pi) c(r)`, against chance alone,
+`c(r)`: the density of distances from random pixels to their nearest boundary. k is the kernel (1 +
+(r/s)^2)^-2, normalised. The share of matches pi is estimated per kind of edge: a kind that matches no better
+than chance gets a small pi and so loses its weight.
 """
 
 from __future__ import annotations
@@ -43,8 +44,8 @@ def edge_scores(
     Args:
         camera: `camera_parameters` at label size.
         offsets: `boundary_offsets` of each frame.
-        edges: depth jumps of all frames. The angle between a jump's two beams, `gap_rad`, widens its kernel by the
-            standard deviation of an even distribution over it.
+        edges: depth jumps of all frames. The angle between a jump's two beams, `gap_rad`, widens its kernel
+            by the standard deviation of an even distribution over it.
         poses: rows of the 3x4 transform into the camera, per pose and frame (frames differ by time offset
             times speed).
         focal: focal length in units of the camera's, by pose.
@@ -82,9 +83,9 @@ def edge_gradients(
 ) -> tuple[Float64[np.ndarray, "F 11"], Float64[np.ndarray, "F 11 11"]]:
     """Gradient of each frame's score at ONE pose, and its information.
 
-    By left perturbation of T_camera_lidar (rotation [rad], translation [m]), time offset [s], focal scale, principal
-    point [px of the label image] and readout time [s]. The information is Gauss-Newton's: residuals weighted by how
-    likely they are matches (iterated re-weighting).
+    By left perturbation of T_camera_lidar (rotation [rad], translation [m]), time offset [s], focal scale,
+    principal point [px of the label image] and readout time [s]. The information is Gauss-Newton's: residuals
+    weighted by how likely they are matches (iterated re-weighting).
 
     Args:
         camera: as for `edge_scores`.
@@ -121,9 +122,9 @@ def edge_residuals(
     focal: np.float32,
     shift_px: Float32[np.ndarray, "N 2"],
 ) -> Float32[np.ndarray, " N"]:
-    """Signed distance [px] of each jump, moved by `shift_px`, to its boundary at ONE pose.
+    """Signed distance [px] of each jump, moved by `shift_px`, to its boundary at ONE pose; 127 without one.
 
-    NaN outside the image, 127 where no boundary is in reach.
+    NaN outside the image.
     """
     at = (edges.xyz_m, edges.side, edges.start, edges.image)
     return _residual_loop(camera, offsets, *at, poses, focal, shift_px)
@@ -147,8 +148,8 @@ def _edge_loop(
 ) -> np.ndarray:
     """The sum of log(base + gain sharpness (1 + (r sharpness)^2)^-2) over each frame's points.
 
-    Steps of few arrays each, without branches, become vector instructions; whether a point finds a boundary is nothing
-    that a processor could foresee, and was two thirds of the time.
+    Steps over few arrays without branches become vector instructions; unpredictable branches took two thirds
+    of the time.
     """
     count, frames = poses.shape[0], poses.shape[1]
     height, width = offsets.shape[2], offsets.shape[3]

@@ -1,7 +1,7 @@
-"""What camera-lidar terms look up in an image: offsets to mask boundaries by direction, road contrast, labels.
+"""Image maps of the camera-lidar terms: offsets to mask boundaries by direction, road contrast, labels.
 
-All maps are at label size. Boundaries lie between pixels, so an offset is stored as the integer k of k + 1/2 pixels
-from a pixel's centre along the boundary's axis: exact in one byte, and good for every kernel width.
+All maps are at label size. Boundaries lie between pixels, so an offset is stored as the integer k of k + 1/2
+pixels from a pixel's centre along the boundary's axis: exact in one byte, for every kernel width.
 """
 
 from __future__ import annotations
@@ -59,9 +59,9 @@ class CameraMaps:
 
 
 def _foreground_table() -> UInt8[np.ndarray, "256 256"]:
-    """What lies nearer at a boundary between labels a (left or above) and b: bit 0 says a, bit 1 says b.
+    """Nearer side of a boundary between labels a (left or above) and b: bit 0 is a, bit 1 is b.
 
-    Two objects may both. Two backdrops, or two kinds of ground, say nothing, and unknown labels neither.
+    Both for two objects; none for two backdrops, two kinds of ground, or unknown labels.
     """
     a, b = _DEPTH_ORDER[:, None].astype(np.int64), _DEPTH_ORDER[None].astype(np.int64)
     objects = (a == b) & (a == _OBJECT)
@@ -77,7 +77,7 @@ _FOREGROUND = _foreground_table()
 def _scan(foreground: np.ndarray, labels: np.ndarray, out: np.ndarray) -> None:
     """Fill out[4, H, W] with offsets to the nearest boundary of each direction class along its axis.
 
-    Sides of objects stretch by stretch along each row; their tops and feet by one sweep down and one up, row by row.
+    Sides of objects by stretches of each row; tops and feet by one pass down and one up.
     """
     height, width = labels.shape
     last = np.full((2, width), -10000, np.int32)
@@ -119,7 +119,7 @@ def _note_below(foreground: np.ndarray, labels: np.ndarray, i: int, along: np.nd
 @no_type_check
 @numba.njit(cache=True, nogil=True)
 def _along_row(foreground: np.ndarray, row: np.ndarray, out: np.ndarray) -> None:
-    """Offsets along one row [2, W]: every stretch between two boundaries of a class knows both its ends."""
+    """Offsets along one row [2, W], for every stretch between two boundaries of a class."""
     width = row.shape[0]
     for side in range(2):
         begin, behind = 0, -10000
@@ -138,10 +138,7 @@ def _along_row(foreground: np.ndarray, row: np.ndarray, out: np.ndarray) -> None
 
 
 def boundary_offsets(labels: UInt8[np.ndarray, "H W"]) -> Int8[np.ndarray, "4 H W"]:
-    """Offsets to boundaries by direction class.
-
-    The boundary lies at pixel + offset + 1/2; NO_BOUNDARY where none is in reach.
-    """
+    """Offsets to boundaries by direction class: at pixel + offset + 1/2, or NO_BOUNDARY out of reach."""
     out = np.empty((4, *labels.shape), np.int8)
     _scan(_FOREGROUND, labels, out)
     return out
@@ -204,7 +201,7 @@ def _standardise(
 
 
 def _blurred(x: np.ndarray, sigma_px: float) -> np.ndarray:
-    """Gaussian blur, by two boxes where it is wide (their cost does not grow with the width)."""
+    """Gaussian blur, by two box filters if it is wide (their cost does not grow with the width)."""
     if sigma_px < 2.0:
         return cv2.GaussianBlur(x, (2 * round(2.5 * sigma_px) + 1,) * 2, sigma_px)
     size = (round(np.sqrt(6 * sigma_px**2 + 1)) | 1,) * 2  # each box has half of the variance

@@ -1,4 +1,4 @@
-"""Kernel settings of the camera-lidar score: how sharp it is, and what it presumes of matches and chance."""
+"""Kernel settings of the camera-lidar score: width, and assumed shares of matches and chance."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""Mutual information of what the lidar says of a point (height, range) and the label it falls on: finds the basin.
+"""Mutual information of a lidar point's height and range with its label: finds the basin.
 
 Biased by half a degree of pitch on real logs, so it has no part in the final estimate.
 
 Source: Pandey, McBride, Savarese, Eustice 2015, "Automatic extrinsic calibration of vision and lidar by
-    maximizing mutual information", with semantic classes in place of brightness.
+maximizing mutual information", with semantic classes in place of brightness.
 """
 
 from __future__ import annotations

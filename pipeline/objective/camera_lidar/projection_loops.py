@@ -1,7 +1,8 @@
 """Projection inside the compiled loops that look up images: one camera model as a flat parameter vector.
 
-What a kernel calls with fast arithmetic is inlined (`forceinline`). Else each caller holds a copy that rounds in its
-own way, and which of them is linked differs between a process that compiles kernels and one that loads them.
+What a kernel calls with fast arithmetic is inlined (`forceinline`). Else each caller holds a copy that rounds
+in its own way, and which of them is linked differs between a process that compiles kernels and one that loads
+them.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ def camera_parameters(camera: Camera) -> np.ndarray:
     """The camera as float32[18] for compiled loops.
 
     Model, fx, fy, cx, cy, largest tangent squared (or smallest cosine), 10 coefficients, two spare.
-    Coefficients: k1 k2 p1 p2 k3 k4 k5 k6 of the pinhole models, or the polynomial k(c) of `Camera.fast_polynomial`.
+    Coefficients: k1 k2 p1 p2 k3 k4 k5 k6 of the pinhole models, or the polynomial k(c) of
+    `Camera.fast_polynomial`.
     """
     out = np.zeros(18, np.float32)
     out[1:3], out[3:5] = camera.focal_px, camera.centre_px
@@ -109,9 +111,9 @@ def project_points(
     u: np.ndarray,
     v: np.ndarray,
 ) -> None:
-    """Fill u, v [px] of points xyz[3, begin:end] by the rows of a 3x4 transform; u = -1 where a point cannot be seen.
+    """Fill u, v [px] of points xyz[3, begin:end] by the rows of a 3x4 transform; u = -1 if not visible.
 
-    The loops are free of branches, so that they compile to vector instructions: 1 ns a point. `focal` scales the
+    The loops have no branches, so that they compile to vector instructions: 1 ns a point. `focal` scales the
     image about its principal point.
     """
     one, away = np.float32(1.0), np.float32(-1.0)
@@ -239,8 +241,8 @@ def along_motion(
 ) -> float:
     """Derivative by the time offset of what depends on a point (x, y, z) of the camera frame by (dx, dy, dz).
 
-    `pose` has the rows of the transform from lidar to camera; `motion` the velocity in camera axes [m/s] of what lies
-    at its translation, and the yaw rate [rad/s], which turns points about the lidar's vertical.
+    `pose` has the rows of the transform from lidar to camera; `motion` the velocity in camera axes [m/s] of
+    what lies at its translation, and the yaw rate [rad/s], which turns points about the lidar's vertical.
     """
     a, b, c = x - pose[3], y - pose[7], z - pose[11]
     up0, up1, up2, turn = pose[2], pose[6], pose[10], motion[3]

@@ -65,7 +65,7 @@ def _weighted_sum(
     height: int,
     place: np.ndarray,
 ) -> float:
-    """Weighted sum of a flat map's values between pixels; without branches, which nobody could foresee."""
+    """Weighted sum of a flat map's values between pixels; branch-free, because branches are unpredictable."""
     zero = np.float32(0)
     u_max, v_max = np.float32(width - 1.01), np.float32(height - 1.01)
     across = np.int32(width)

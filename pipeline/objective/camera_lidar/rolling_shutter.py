@@ -61,7 +61,7 @@ def exposed(
         rows = poses[frame].reshape(-1, 3, 4).astype(np.float64)
         uv, valid = camera.project(np.einsum("nij,nj->ni", rows[:, :, :3], moved) + rows[:, :, 3])
         exposure_s = np.where(valid, row_delays_s(uv[:, 1], camera.height_px, readout_s), 0.0)
-        # The car was there `exposure_s` later, so what stands still lay that much less far ahead.
+        # The car was there `exposure_s` later, so static objects were nearer by its motion.
         moved = _turned(still - velocity * exposure_s[:, None], -turn * exposure_s)
     return replace(
         points,

@@ -52,7 +52,7 @@ __all__ = [
 ]
 
 CONTRAST_BLURS_PX = (6.0, 3.0, 1.5)
-# By so much an image is shifted [label px] to see what the same points score in it by chance.
+# Shifts of the image [label px] that give the chance score of the same points.
 _SHIFTS_PX = tuple((u, v) for u in (-47.0, -31.0, 29.0, 43.0) for v in (-37.0, 0.0, 41.0))
 _CHANCE_SHIFT_PX = 60.0  # far enough to be elsewhere, near enough to see the same scene
 
@@ -91,7 +91,7 @@ class Terms:
 
     @cached_property
     def narrow(self) -> Terms:
-        """With edges alone, of them those that say within MAX_GAP_PX where a silhouette lies."""
+        """With edges alone that localise a silhouette within MAX_GAP_PX."""
         return replace(self.of_kinds(edges=False, markings=False), edges=self.edges.chosen(~self._is_wide))
 
     @cached_property
@@ -113,9 +113,9 @@ class Terms:
         return replace(self, edges=self.edges.chosen(narrow))
 
     def telling(self) -> Terms:
-        """Without wide edges, unless most of those between rows are: then nothing else may tell of pitch.
+        """Without wide edges, unless most edges between rows are wide: then only they determine pitch.
 
-        Without those wider than WIDEST_GAP_RAD in any case.
+        Edges wider than WIDEST_GAP_RAD are always left out.
         """
         between = self.edges.side >= EDGE_ABOVE
         mostly_wide = 2 * np.count_nonzero(between & self._is_wide) > np.count_nonzero(between)
@@ -135,8 +135,9 @@ class Terms:
     def seen_throughout(self, at: Alignments) -> Terms:
         """With the edges that each of some alignments puts into the image.
 
-        An edge out of sight scores 0, one in sight more than that on average, matched or not: rails beside the car
-        match wherever on them they are seen. What scores with the edges that come into sight is drawn to where more do.
+        An edge out of sight scores 0, one in sight more on average, matched or not: rails beside the car
+        match anywhere along them. A score over edges that come into sight would therefore be drawn to poses
+        with more edges.
         """
         still = np.zeros((len(self.edges.xyz_m), 2), np.float32)
         is_seen = np.ones(len(still), bool)
@@ -167,7 +168,7 @@ class Terms:
         )
 
     def gaps_beyond(self, constant_s: float) -> Terms:
-        """With gaps less a constant, so that time offsets count from it."""
+        """With gaps minus a constant, so that time offsets are relative to it."""
         return replace(self, gap_s=self.gap_s - constant_s)
 
     def exposed_at(self, at: Alignments, velocity_lidar: Float[np.ndarray, "F 3"] | None = None) -> Terms:
@@ -189,15 +190,15 @@ class Terms:
     def poses(self, at: Alignments) -> Float32[np.ndarray, "P F 12"]:
         """Rows of the transform from each frame's lidar points to its image [P, F, 12].
 
-        By the lidar's clock the image was taken dt before its stamp (stamp_camera = stamp_lidar + dt), which is the
-        frame's gap after the sweep's. The car was then tau = dt - gap earlier on its way, so what stands still lay tau
-        times the own velocity further ahead: p' = Rz(yaw_rate tau) (p + v tau).
+        By the lidar's clock the image was taken dt before its stamp (stamp_camera = stamp_lidar + dt), which
+        is the frame's gap after the sweep's. The car was then tau = dt - gap earlier on its way, so what
+        stands still lay tau times the own velocity further ahead: p' = Rz(yaw_rate tau) (p + v tau).
         """
         R, t = at.T_camera_lidar[:, :3, :3], at.T_camera_lidar[:, :3, 3]
         return _moving_poses(R, t, at.dt_s, self.gap_s, self.velocity_lidar, self.yaw_rate)
 
     def edge_score(self, at: Alignments, settings: KernelSettings) -> Float32[np.ndarray, "P F"]:
-        """Log likelihood ratio of the edges, in which the wide ones weigh as the settings say."""
+        """Log likelihood ratio of the edges, wide ones weighted by the settings."""
         focal, poses = at.focal.astype(np.float32), self.poses(at)
         score = np.zeros((len(at.dt_s), self.frames), np.float32)
         for edges, weight in self._weighted_edges(settings):
@@ -225,7 +226,8 @@ class Terms:
     ) -> Float[np.ndarray, "P F"]:
         """Edge score minus what the same edges score when the image is shifted: 0 for a pose that matches by chance.
 
-        This makes poses comparable that see different numbers of edges: turning edges out of view gains nothing.
+        This makes poses comparable that see different numbers of edges: turning edges out of view gains
+        nothing.
         """
         return self._beyond_chance(Terms.edge_score, at, settings, shifts_px)
 
@@ -309,7 +311,7 @@ class Terms:
         return gradient, information
 
     def mean_match(self, settings: KernelSettings) -> Float[np.ndarray, " 4"]:
-        """Share of matching edges by direction, over the edges that there are."""
+        """Share of matching edges, mean over the directions with edges."""
         share = settings.match[self.edges.kind]
         counts = np.bincount(self.edges.side, minlength=4)
         return np.bincount(self.edges.side, share, minlength=4) / np.maximum(counts, 1)
@@ -383,7 +385,8 @@ def lidar_velocities(
 
     Args:
         observations: whose speeds are taken, 0 where unknown.
-        T_lidar_radar: turns the radar's Doppler into the heading; where no radar shows it, it is the lidar's x axis.
+        T_lidar_radar: turns the radar's Doppler into the heading; where no radar shows it, it is the lidar's
+            x axis.
         heading_rad: azimuth of the heading where it is known otherwise.
     """
     speed = np.array([o.ego_speed_mps if o.ego_speed_mps is not None else 0.0 for o in observations])
@@ -401,7 +404,8 @@ def prepare_terms(
 ) -> Terms:
     """Decode maps and gather the points that can come into view within `reach_rad` of a pose.
 
-    `readout_s` is the rolling shutter's, from the first image row to the last; `Terms.exposed_at` brings it to bear.
+    `readout_s` is the rolling shutter's, from the first image row to the last; `Terms.exposed_at` brings it
+    to bear.
     """
     maps = prepare_maps(observations, CONTRAST_BLURS_PX)
     view = (observations, T_camera_lidar, maps.camera, reach_rad)

@@ -1,1 +1,1 @@
-"""The losses of `pipeline.objective` once more in torch, differentiable in the poses: what learning minimises."""
+"""The losses of `pipeline.objective` in torch, differentiable in the poses, for training."""

@@ -49,7 +49,7 @@ def nearest_pixel(
 def masked_mean(
     values: Float[Tensor, "*batch F N"], present: Bool[Tensor, "F N"]
 ) -> Float[Tensor, "*batch F"]:
-    """Mean over a frame's own points, 0 where it has none."""
+    """Mean over the valid points of a frame, 0 without any."""
     weight = present.to(values.dtype)
     return (values * weight).sum(-1) / weight.sum(-1).clamp_min(1)
 

@@ -1,8 +1,8 @@
-"""The paper's three pairwise losses in torch: the same definition as the compiled ones, from the same preparation.
+"""The paper's three pairwise losses in torch: the compiled losses, written so that autograd works.
 
-Points, maps, weights and limits come from `camera_lidar`, `camera_radar` and `lidar_radar` of `pipeline.objective`;
-only the way from a pose to a loss is written again, so that autograd can follow it. Poses are `*batch #F 4 4`: one per
-frame, or a stack of poses that all frames share (`T[:, None]`).
+Points, maps, weights and limits come from `camera_lidar`, `camera_radar` and `lidar_radar` of
+`pipeline.objective`. Poses are `*batch #F 4 4`: one per frame, or a stack of poses for all frames (`T[:,
+None]`).
 
 Source: paper section 4.3.
 """
@@ -162,7 +162,7 @@ def lidar_radar_tensors(loss: LidarRadarLoss, dtype: torch.dtype = torch.float32
 
 
 def padded(arrays: Sequence[np.ndarray], dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """Frames' points one under the other, filled with zeros, and which of them are points."""
+    """Points of frames, stacked and padded with zeros, and which of them are valid."""
     longest = max([1, *(len(a) for a in arrays)])
     points = np.zeros((len(arrays), longest, 3))
     present = np.zeros((len(arrays), longest), bool)
@@ -172,11 +172,7 @@ def padded(arrays: Sequence[np.ndarray], dtype: torch.dtype) -> tuple[Tensor, Te
 
 
 def folded_tensors(frames: FoldedFrames, dtype: torch.dtype = torch.float32) -> FoldedTensors:
-    """Points and byte maps as tensors.
-
-    Raises:
-        ValueError: the cameras differ in size or kind of model.
-    """
+    """Points and byte maps as tensors; ValueError if the cameras differ in size or kind of model."""
     sizes = {(c.height_px, c.width_px) for c in frames.cameras}
     if len(sizes) != 1:
         raise ValueError(f"the maps of a batch must have one size, not {sorted(sizes)}")

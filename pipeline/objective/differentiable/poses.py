@@ -1,7 +1,7 @@
 """Rigid transforms as torch tensors, differentiable everywhere: twists, Euler angles, the loop of the three pairs.
 
-The same conventions as `pipeline.geometry.se3`: twist = (rotation vector [rad], translation [m]), perturbations on
-the left. Shapes are `*batch`, whatever the caller's batch is.
+The same conventions as `pipeline.geometry.se3`: twist = (rotation vector [rad], translation [m]),
+perturbations on the left. Shapes are `*batch`, whatever the caller's batch is.
 
 Source: paper section 4.4, equation 1, for the loop loss; Sola et al. 2018 for the exponential maps.
 """
@@ -96,14 +96,9 @@ def loop_loss(
     angle_unit: float = 1.0,
     metre_unit: float = 1.0,
 ) -> Float[Tensor, "*batch"]:
-    """l1 norm of the Euler angles and the translation of the loop T_camera_lidar T_lidar_radar T_camera_radar^-1.
+    """l1 norm of Euler angles and translation of the loop T_camera_lidar T_lidar_radar T_camera_radar^-1.
 
-    Args:
-        T_camera_lidar: the three estimates.
-        T_lidar_radar: the three estimates.
-        T_camera_radar: the three estimates.
-        angle_unit: factor of the angles [1/rad]; the paper names no units, so 1 as in `pipeline.objective.paper.loop`.
-        metre_unit: factor of the translation [1/m].
+    The units are factors [1/rad] and [1/m]; the paper names none, so 1 as in `pipeline.objective.paper.loop`.
     """
     loop = T_camera_lidar @ T_lidar_radar @ inverse(T_camera_radar)
     return angle_unit * euler_angles(loop).abs().sum(-1) + metre_unit * loop[..., :3, 3].abs().sum(-1)

@@ -1,7 +1,8 @@
 """Projection of points into images of several frames, differentiable: camera models and the equirectangular grid.
 
-Either one takes a frame's points to map pixels (u right, v down, (0, 0) = centre of the first pixel), whatever
-the map is. Models are exact, as in `pipeline.geometry.cameras`; the compiled kernels fit polynomials to them.
+Either one takes a frame's points to map pixels (u right, v down, (0, 0) = centre of the first pixel),
+whatever the map is. Models are exact, as in `pipeline.geometry.cameras`; the compiled kernels fit polynomials
+to them.
 """
 
 from __future__ import annotations
@@ -69,11 +70,7 @@ class GridProjection:
 
 
 def camera_projection(cameras: Sequence[Camera], dtype: torch.dtype = torch.float32) -> CameraProjection:
-    """The cameras of F frames as tensors.
-
-    Raises:
-        ValueError: cameras of different models (equidistant or not).
-    """
+    """The cameras of F frames as tensors; raises ValueError for cameras of different models."""
     kinds = {c.model == "equidistant" for c in cameras}
     if len(kinds) != 1:
         raise ValueError("the cameras of a batch must all be equidistant, or none of them")

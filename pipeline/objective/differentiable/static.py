@@ -1,7 +1,7 @@
 """Static radar detections against lidar points in torch: the likelihood that `registration` maximises, at no time lag.
 
-The same neighbours (within three sigmas of azimuth and range), the same ground bounce, the same elevations that count;
-frames are thinned first, because every detection is compared with every point.
+The same neighbours (within three sigmas of azimuth and range), the same ground bounce, the same elevations
+that count; frames are thinned first, because every detection is compared with every point.
 
 Source: `pipeline.objective.radar.registration`, which has the reasons, and whose constants are used here.
 """
@@ -35,7 +35,7 @@ _NEVER = -1e4  # log weight of a point that the detection cannot have come from
 
 @dataclass(frozen=True, eq=False)
 class StaticFrames:
-    """What F frames show of standing things."""
+    """Static detections and lidar points of F frames."""
 
     radar: Float[Tensor, "F M 3"]  # detections, radar frame
     radar_present: Bool[Tensor, "F M"]  # which of them stand still
@@ -58,12 +58,8 @@ def static_cost(
     """Minus the mean log likelihood of a frame's static detections, each drawn from a lidar point or its mirror image.
 
     Args:
-        T_lidar_radar: poses.
-        frames: detections and points.
         outlier: weight of "no lidar point", in units of one lidar point at distance 0.
         bounce_prior: prior probability of a detection by way of the ground.
-        detections: most detections of a frame; more are strided.
-        points: most lidar points of a frame; more are strided.
     """
     # Rows are in no order that matters once they are strided: each stands for its neighbours.
     thin, sparse = -(-frames.radar.shape[1] // detections), -(-frames.lidar.shape[1] // points)
@@ -99,14 +95,9 @@ def tells_elevation(
 ) -> Bool[Tensor, "*batch F M"]:
     """Detections whose elevation can be compared with the lidar's: others would be matched to the edge of its view.
 
-    The registration decides this anew at every pose and takes the decision as constant in its step. A minimiser of the
-    value should decide once: a rotation that moves detections out of the limits would lower the cost by itself.
-
-    Args:
-        T_lidar_radar: poses.
-        radar: detections, radar frame.
-        has_elevation: whether the radar measures it.
-        limits_rad: lowest and highest elevation that the lidar sees.
+    The registration decides this anew at every pose and takes the decision as constant in its step. A
+    minimiser of the value should decide once: a rotation that moves detections out of the limits would lower
+    the cost by itself.
     """
     limits_rad = limits_rad.to(radar.dtype)
     reach = (0.25 * (limits_rad[:, 1] - limits_rad[:, 0])).clamp_max(2 * float(SIGMA_START[1]))
@@ -120,10 +111,9 @@ def tells_elevation(
 def elevation_limits(
     lidar: Float[Tensor, "F N 3"], lidar_present: Bool[Tensor, "F N"]
 ) -> Float[Tensor, "F 2"]:
-    """Lowest and highest elevation [rad] of each frame's points, without a few stray ones.
+    """Lowest and highest elevation [rad] of each frame's points, without a few outliers.
 
-    The estimator takes the limits of a whole day; a single frame shows less of the lidar's view, and fewer elevations
-    count.
+    The estimator uses the limits of a whole day; a single frame covers less of the lidar's view.
     """
     angle = torch.atan2(lidar[..., 2], lidar[..., :2].norm(dim=-1))
     away = torch.full_like(angle, torch.inf)

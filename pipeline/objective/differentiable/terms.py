@@ -1,7 +1,7 @@
 """Terms of self-supervision on the equirectangular grid: what `joint` uses, as smooth costs of one frame each.
 
-Angles in degrees, distances in metres, per-frame means over what is valid, so that terms and frames compare. Every
-function takes the poses of its own pair, `*batch #F 4 4`, and tensors of F frames.
+Angles in degrees, distances in metres, per-frame means over what is valid, so that terms and frames compare.
+Every function takes the poses of its own pair, `*batch #F 4 4`, and tensors of F frames.
 
 Source: the project's evidence on self-supervision, section 3 (which terms have their minimum at the truth).
 """
@@ -66,7 +66,7 @@ class GridMaps:
     def pixels(
         self, T_camera_points: Float[Tensor, "*batch #F 4 4"], points: Float[Tensor, "F N 3"]
     ) -> tuple[Float[Tensor, "*batch F N 2"], Bool[Tensor, "*batch F N"]]:
-        """Cells of points, and which of them the camera sees."""
+        """Cells of points, and whether the camera sees them."""
         uv, valid = self.projection.project(transform_points(T_camera_points, points))
         row, column, inside = nearest_pixel(self.size, uv, valid)
         frame = torch.arange(len(self.seen), device=uv.device)[:, None]
@@ -83,16 +83,11 @@ def cluster_class_cost(
 ) -> Float[Tensor, "*batch F"]:
     """Each lidar cluster lies on objects of ONE reflecting class, whichever suits it best at this pose [deg].
 
-    Steeper than the union of the classes where neighbours differ, and needs no semantics of the lidar. A point out of
-    view costs as much as one far from any object.
+    Steeper than the union of the classes where neighbours differ, and needs no semantics of the lidar. A
+    point out of view costs as much as one far from any object.
 
     Args:
-        maps: of the frames.
-        T_camera_lidar: poses.
-        points: points of object clusters, lidar frame.
         cluster: which cluster, below `clusters`; -1 counts as a cluster of its own kind.
-        present: which rows are points.
-        clusters: most clusters of a frame.
     """
     uv, seen = maps.pixels(T_camera_lidar, points)
     distance = bilinear_groups(maps.class_distance, uv, seen) * DISTANCE_STEP_DEG
@@ -147,9 +142,6 @@ def edge_residuals_px(
 
     Args:
         offsets: way from a pixel's centre to the boundary, in steps.
-        uv: projected jumps.
-        seen: which of them mean something.
-        side: direction class, EDGE_LEFT/RIGHT/ABOVE/BELOW.
         step_px: pixels per step of `offsets`.
         shift_px: what to add; the kernels' maps hold k for k + 1/2.
 
@@ -172,7 +164,7 @@ def sky_cost(
     present: Bool[Tensor, "F N"],
     free_deg: float = 0.0,
 ) -> Float[Tensor, "*batch F"]:
-    """Nothing that returned an echo lies in the sky: depth inside the sky's mask beyond `free_deg`, 0 outside [deg].
+    """Depth of points inside the sky's mask beyond `free_deg`, 0 outside [deg]: the sky has no echoes.
 
     A guard, not an alignment term: it pushes down only.
     """
@@ -200,9 +192,8 @@ class RadarTracks:
         """Mean over the tracks of the soft smallest clamped distance; 0 where a frame lacks either side.
 
         Args:
-            flat: distance of every track to every target in azimuth or in the plane, squared.
-            upwards: in elevation or height, signed; weighted by how precise a radar's elevation is beside its azimuth.
-            target_present: which targets there are.
+            upwards: in elevation or height, signed; weighted by how precise a radar's elevation is beside its
+                azimuth.
             tau: of the soft minimum, in units of the distances.
             clamp: largest distance.
         """
@@ -218,7 +209,7 @@ def track_detection_cost(
     centres_rad: Float[Tensor, "F G 2"],
     present: Bool[Tensor, "F G"],
 ) -> Float[Tensor, "*batch F"]:
-    """Tracked clusters lie at road users' box centres, which lie so far to the left and upwards of the camera [deg]."""
+    """Distance of tracked clusters to road users' box centres, by azimuth (left) and elevation (up) [deg]."""
     directions_rad = torch.stack(directions(transform_points(T_camera_radar, tracks.xyz_m)), -1)
     off = (directions_rad[..., :, None, :] - centres_rad[:, None]) * DEG
     return tracks.nearest_cost(
@@ -232,7 +223,7 @@ def track_cluster_cost(
     centres: Float[Tensor, "F K 3"],
     present: Bool[Tensor, "F K"],
 ) -> Float[Tensor, "*batch F"]:
-    """Tracked clusters lie at lidar clusters' centres [m]."""
+    """Distance of tracked clusters to lidar clusters' centres [m]."""
     off = transform_points(T_lidar_radar, tracks.xyz_m)[..., :, None, :] - centres[:, None]
     flat = off[..., :2].square().sum(-1)
     return tracks.nearest_cost(flat, off[..., 2], present, CLUSTER_TAU_M, CLUSTER_CLAMP_M)
@@ -257,7 +248,7 @@ def soft_minimum(values: Float[Tensor, "*batch N"], tau: float) -> Float[Tensor,
 
 
 def soft_clamp(values: Float[Tensor, "*shape"], limit: float) -> Float[Tensor, "*shape"]:
-    """The value itself where it is small, saturating smoothly at `limit`; for values >= 0."""
+    """Nearly the value itself if small, saturating smoothly at `limit`; for values >= 0."""
     return limit * torch.tanh(values / limit)
 
 

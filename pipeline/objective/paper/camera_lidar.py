@@ -58,13 +58,7 @@ class CameraLidarLoss:
 def camera_lidar_loss(
     observations: Sequence[Observation], T_prior: Float[np.ndarray, "4 4"], margin_rad: float
 ) -> CameraLidarLoss:
-    """Prepare the loss of these frames.
-
-    Args:
-        observations: frames.
-        T_prior: T_camera_lidar that decides which points are asked to lie in view.
-        margin_rad: how far the pose may turn away from it.
-    """
+    """Prepare the loss of these frames, of points within `margin_rad` of the view at `T_prior`."""
     points, costs, cameras = [], [], []
     for observation in observations:
         labels = labels_of(observation)

@@ -1,4 +1,4 @@
-"""What the paper's losses and triggers share: classes, robust distance, points in view, stacks of poses."""
+"""Shared code of the paper's losses and triggers: classes, robust distance, points in view, stacks of poses."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def camera_at_label_size(observation: Observation, labels: UInt8[np.ndarray, "H 
 
 
 def distance_cost(distance: Float[np.ndarray, "*shape"], scale: float) -> Float[np.ndarray, "*shape"]:
-    """Smooth robust distance d^2 / (d^2 + s^2), 0..1: the paper asks for smooth losses and names no function."""
+    """Smooth robust distance d^2 / (d^2 + s^2), 0..1; the paper names no function."""
     d2 = distance * distance
     return d2 / (d2 + scale * scale)
 
@@ -54,11 +54,11 @@ def distance_cost(distance: Float[np.ndarray, "*shape"], scale: float) -> Float[
 def safely_in_view(
     camera: Camera, points_camera: Float[np.ndarray, "N 3"], margin_rad: float
 ) -> Bool[np.ndarray, " N"]:
-    """True for points inside the image by a margin: an angle, but at most a quarter of the image's half extent.
+    """True for points inside the image by a margin: an angle, at most a quarter of the image's half extent.
 
-    The paper's lidar and radar see less than its camera, so all of their points must fall into the image.
-    Where a sensor sees more (a 360 deg lidar), only points that stay in view when the prior is off by the
-    margin may be asked to; else the out-of-view penalty biases the pose.
+    The paper's lidar and radar see less than its camera, so all of their points must fall into the image. If
+    a sensor sees more (a 360 deg lidar), only points that stay in view with a prior wrong by the margin must
+    do so; otherwise the penalty biases the pose.
     """
     uv, valid = camera.project(points_camera)
     size = np.array([camera.width_px, camera.height_px])

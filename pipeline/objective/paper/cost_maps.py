@@ -1,8 +1,8 @@
 """Cost of projected points in the frames' cost maps, for many poses at once.
 
-A cost map holds robust distance, sky penalty and whatever else a pixel can say, as one byte per pixel. The four bytes
-that bilinear interpolation needs lie in one 32-bit word ("quad"), so a point costs one gather. Points outside the
-image, or behind the camera, cost the out-of-view penalty.
+A cost map holds robust distance, sky penalty and whatever else a pixel can say, as one byte per pixel. The
+four bytes that bilinear interpolation needs lie in one 32-bit word ("quad"), so a point costs one gather.
+Points outside the image, or behind the camera, cost the out-of-view penalty.
 
 Order of loops: frame, tile of points, pose, point. A tile stays in the L1 cache while all poses pass over it.
 """
@@ -74,13 +74,9 @@ def fold_frames(
     cameras: Sequence[Camera],
     penalty: float,
 ) -> FoldedFrames:  # fmt: skip
-    """Lay out frames for `frame_costs`.
+    """Lay out frames for `frame_costs`: points in the child frame [m], cost maps >= 0, scaled cameras.
 
-    Args:
-        points: points of each frame, in the child frame of the poses that come later [m].
-        costs: cost map of each frame, >= 0, at the size of its camera.
-        cameras: camera of each frame, scaled to the map.
-        penalty: cost of a point out of view or behind the camera.
+    `penalty` is the cost of a point out of view or behind the camera.
     """
     quads, steps = [], []
     for cost, camera in zip(costs, cameras, strict=True):

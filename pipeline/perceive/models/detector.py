@@ -42,9 +42,8 @@ class Detector:
         """Road users in full-image pixels, the best score first.
 
         Raises:
-            ModelError: the output has another shape than its layout says.
-            ModelOutputError: it has other classes than its label set says, is no number, or the same for several
-                pictures on end.
+            ModelError: another shape than the layout's.
+            ModelOutputError: other classes than the label set's, not finite, or the same for several images.
         """
         if not self._manifest.input.tile_scales:
             found = [self._of_tile(image_bgr, 1.0, 0, 0, image_bgr.shape)]

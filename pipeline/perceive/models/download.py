@@ -1,4 +1,4 @@
-"""Files from the web that appear whole and checked, or not at all; broken downloads go on where they broke."""
+"""Downloads that appear complete and checked, or not at all, and resume."""
 
 from __future__ import annotations
 
@@ -31,21 +31,14 @@ def download(
     *,
     pause_s: float = 1.0,
 ) -> bool:
-    """Make sure that a file of this content is there; False where it already was.
+    """Make sure that a file of this content exists; False if it already did.
 
-    What has come stands in `.NAME.part` until it is whole and has the right hash. After a break the rest is asked for,
-    three times here and by the next call; servers without ranges send all of it again.
-
-    Args:
-        url: http or https; redirects are followed.
-        file: where to; its folder is made.
-        size_bytes: of the whole file.
-        sha256: of the whole file.
-        progress: told bytes so far and in all.
-        pause_s: before the second try; twice as long before the third.
+    A partial download is kept as `.NAME.part` until it is whole and has the right hash. It is resumed three
+    times here, after `pause_s` and twice as long each time, and by the next call; servers without ranges send
+    all of it again.
 
     Raises:
-        DownloadError: no network, no such file, or other content than this; nothing is placed then.
+        DownloadError: no network, no such file, or other content; the file is then not written.
     """
     if file.exists() and _digest(file) == sha256:
         return False
@@ -101,7 +94,7 @@ def _complete(url: str, stream: IO[bytes], size_bytes: int, progress: Progress, 
 
 
 def _append(url: str, stream: IO[bytes], size_bytes: int, progress: Progress) -> None:
-    """What the server sends, from where the part ends; from its begin where the server knows no ranges."""
+    """Download from the part's end on; from the beginning if the server has no ranges."""
     asked = urllib.request.Request(url, headers={"User-Agent": "boresight"})  # noqa: S310 - see download
     if stream.tell():
         asked.add_header("Range", f"bytes={stream.tell()}-")

@@ -1,7 +1,6 @@
-"""Model manifests: a small TOML file beside each ONNX file says what goes in and what comes out.
+"""Model manifests: a small TOML file beside each ONNX file describes its input, output and hash.
 
-It also holds the hash of the one file that it describes. Whole examples, for a detector and a segmenter:
-`pipeline/perceive/README.md`.
+Examples for a detector and a segmenter: `pipeline/perceive/README.md`.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ class Section(BaseModel):
 
 
 class ModelFile(Section):
-    """What every manifest says: which file it means."""
+    """Common entries of all manifests: the model file."""
 
     path: str
     sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
@@ -66,7 +65,7 @@ class InputSpec(Section):
 
 
 class OutputSpec(Section):
-    """What the model puts out."""
+    """Output of a model."""
 
     layout: Literal["yolox", "yolov5", "yolov8", "logits", "labels"]
     label_set: str
@@ -99,9 +98,8 @@ def load_manifest(file: Path, task: Literal["detect", "segment"]) -> Manifest:
     """Read and check a manifest and the hash of its model.
 
     Raises:
-        ModelError: missing file, unknown key, impossible value, wrong task, or another model than the
-        manifest means;
-            the message names the manifest and the key.
+        ModelError: missing file, unknown key, impossible value, wrong task or hash; names the manifest and
+            the key.
     """
     manifest = read_manifest(file, Manifest)
     if manifest.task != task:
@@ -110,10 +108,10 @@ def load_manifest(file: Path, task: Literal["detect", "segment"]) -> Manifest:
 
 
 def read_manifest(file: Path, kind: type[_Kind]) -> _Kind:
-    """A manifest of this kind whose model is there; its field `file` becomes the path that it was read from.
+    """A manifest of this kind; its field `file` becomes the path that it was read from.
 
     Raises:
-        ModelError: missing file, unknown key, impossible value, or another model than the manifest means.
+        ModelError: missing file, unknown key, impossible value, or a model with another hash.
     """
     try:
         raw = tomllib.loads(file.read_text())

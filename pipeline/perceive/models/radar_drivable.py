@@ -1,6 +1,6 @@
 """The radar's drivable area by a small network, in place of the geometric one.
 
-Its manifest, as `boresight train-radar-drivable` writes it, names the model and the grid that it was trained on.
+`boresight train-radar-drivable` writes its manifest, which names the model and its grid.
 
 Source: paper, section 4.2 (a weakly supervised network segments the radar's drivable area).
 """
@@ -33,11 +33,7 @@ class RadarDrivable:
     """A model behind its manifest, and the scans of the day so far: one object per vehicle-day."""
 
     def __init__(self, manifest_file: Path) -> None:
-        """Load manifest and model.
-
-        Raises:
-            ModelError: missing, wrong, made for another grid, or not the model that the hash says.
-        """
+        """Load manifest and model; raises ModelError if missing, for another grid, or of another hash."""
         manifest = read_manifest(manifest_file, _Manifest)
         for key, value in grid_layout().items():
             if manifest.grid.get(key) != value:
@@ -51,18 +47,14 @@ class RadarDrivable:
 
     @classmethod
     def load(cls, wanted: OnnxDrivable, fleet: FleetConfig) -> RadarDrivable:
-        """The model that fleet.toml names; its path is relative to it.
-
-        Raises:
-            ModelError: see the constructor.
-        """
+        """The model named in fleet.toml, relative to it; errors as the constructor."""
         return cls(fleet.path_of(wanted.model))
 
     def probability(self, scan: Scan) -> Float[np.ndarray, "A R"]:
-        """How likely each cell is drivable; the scan is remembered for those that follow.
+        """Probability that each cell is drivable; the scan is kept for the following ones.
 
         Raises:
-            ModelError: the model does not run, or answers with another grid.
+            ModelError: the model does not run, or returns another grid.
         """
         answer = self._session.run(self._memory.features(scan)[None])
         if answer.shape != (1, *SHAPE):
@@ -70,9 +62,5 @@ class RadarDrivable:
         return np.asarray(answer[0], np.float32)
 
     def free_sector(self, scan: Scan) -> FreeSector:
-        """Free ranges by direction; scans come in the order of their stamps.
-
-        Raises:
-            ModelError: see `probability`.
-        """
+        """Free ranges by direction, for scans in the order of their stamps; errors as `probability`."""
         return FreeSector(*sector_of(self.probability(scan)))

@@ -121,17 +121,12 @@ class RangeImageManifest(ModelFile):
 
 
 class RangeImageSegmenter:
-    """A model behind its manifest; it judges each sweep by itself."""
+    """A model with its manifest; sweeps are independent of each other."""
 
     def __init__(self, manifest_file: Path, remission_scale: float = 1.0) -> None:
-        """Load manifest and model.
+        """Load manifest and model; raises ModelError if missing or of another hash.
 
-        Args:
-            manifest_file: where it lies, the model beside it.
-            remission_scale: makes logged intensity what the model was trained on (0..1 for SemanticKITTI).
-
-        Raises:
-            ModelError: missing, wrong, or not the model that the hash says.
+        `remission_scale` maps logged intensity to that of the training data (0..1 for SemanticKITTI).
         """
         manifest = read_manifest(manifest_file, RangeImageManifest)
         self._manifest, self._file, self._scale = manifest, str(manifest_file), remission_scale
@@ -142,11 +137,7 @@ class RangeImageSegmenter:
 
     @classmethod
     def load(cls, wanted: OnnxPointSemantics, fleet: FleetConfig) -> RangeImageSegmenter:
-        """The model that fleet.toml names; its path is relative to it.
-
-        Raises:
-            ModelError: see the constructor.
-        """
+        """The model named in fleet.toml, relative to it; errors as the constructor."""
         return cls(fleet.path_of(wanted.segmenter), wanted.remission_scale)
 
     def kinds(
@@ -154,10 +145,10 @@ class RangeImageSegmenter:
     ) -> UInt8[np.ndarray, " N"]:
         """The PointKind of each point of a sweep; unknown outside the model's field of view.
 
-        Where the log has no intensity, the model is shown the mean of its training.
+        Without logged intensity, the input is the mean of the training data.
 
         Raises:
-            ModelError: the model does not run, or its output has another shape than the manifest says.
+            ModelError: the model does not run, or its output has another shape than the manifest's.
         """
         spec, knn = self._manifest.input, self._manifest.knn
         image = project(xyz_m, spec.size, spec.fov_up_deg, spec.fov_down_deg)

@@ -32,19 +32,15 @@ class Segmenter:
         """Cityscapes train ids at `size` (rows, columns).
 
         Raises:
-            ModelOutputError: the output has another shape or other classes than its layout and label set say, is no
-                number, or the same for several pictures on end.
+            ModelOutputError: another shape or classes than the manifest's, not finite, or the same for
+                several images.
         """
         return self.segment_each([image_bgr], [size])[0]
 
     def segment_each(
         self, images_bgr: Sequence[UInt8[np.ndarray, "H W 3"]], sizes: Sequence[tuple[int, int]]
     ) -> list[UInt8[np.ndarray, "h w"]]:
-        """The same of several images, in one run where the model takes batches.
-
-        Raises:
-            ModelOutputError: as `segment`.
-        """
+        """Train ids of several images, in one run if the model takes batches; errors as `segment`."""
         fitted = [fit_image(image, self._manifest.input) for image in images_bgr]
         outputs = self._session.run_each([tensor for tensor, _ in fitted])
         return [
@@ -64,7 +60,7 @@ class Segmenter:
         return self._table[labels]
 
     def _check_classes(self, logits: np.ndarray) -> None:
-        """Of another number of classes, each would mean another thing than its set says."""
+        """Raise if the number of classes is not the label set's."""
         counts = LABEL_COUNTS[self._manifest.output.label_set]
         if logits.ndim != 4 or logits.shape[0] != 1 or logits.shape[1] not in counts:
             wanted = " or ".join(map(str, counts))

@@ -25,7 +25,7 @@ _MOST_ALIKE = 3  # successive answers that are the same to the last bit though t
 
 @dataclass(frozen=True)
 class Fit:
-    """Where an image lies inside a model's input: `input = pixel * scale + offset` for pixel edges (x, y)."""
+    """Placement of an image in a model's input: `input = pixel * scale + offset` for pixel edges (x, y)."""
 
     scale_x: float
     scale_y: float
@@ -43,11 +43,7 @@ class AlikeCheck:
         self._shown, self._before, self._alike = 0, np.zeros(0), 0
 
     def __call__(self, shown: np.ndarray, answer: np.ndarray) -> None:
-        """Take the next input and its answer.
-
-        Raises:
-            ModelOutputError: the same answer came for several different inputs on end.
-        """
+        """Take the next input and output; raises ModelOutputError if several inputs had the same output."""
         own = zlib.crc32(shown.tobytes())
         if own != self._shown:
             self._alike = self._alike + 1 if np.array_equal(answer, self._before) else 0
@@ -58,12 +54,10 @@ class AlikeCheck:
 
 
 class Session:
-    """One model on one execution provider.
+    """One model on the first available of ONNX Runtime's providers; () = CUDA if available, else the CPU.
 
     Args:
-        manifest: of the model.
         shape: of one input, without the axis of the batch: channels, rows, columns.
-        providers: of ONNX Runtime, the first that can be had is taken; () = CUDA where it can be had, else the CPU.
     """
 
     def __init__(
@@ -80,15 +74,15 @@ class Session:
 
         Raises:
             ModelError: the model does not run on this input.
-            ModelOutputError: it answers with what is no number, or with the same for several inputs on end.
+            ModelOutputError: the output is not finite, or the same for several inputs.
         """
         return self._checked(tensor, self._first_output(tensor))
 
     def run_each(self, tensors: Sequence[Float32[np.ndarray, "1 C H W"]]) -> list[np.ndarray]:
-        """First output for each of several inputs, in one run where the axis of the batch is free.
+        """First output for each of several inputs, in one run if the batch axis is free.
 
         Raises:
-            ModelError: as `run`, or the output has no axis of the batch although the input has.
+            ModelError: as `run`, or only the input has a batch axis.
             ModelOutputError: as `run`.
         """
         if len(tensors) < 2 or not self._takes_batches:
@@ -133,11 +127,7 @@ class Session:
 def open_session(
     model_file: Path, manifest_file: Path, providers: Sequence[str] = ()
 ) -> ort.InferenceSession:
-    """A session on the first provider that can be had.
-
-    Raises:
-        ModelError: none of the providers can be had, or onnxruntime cannot load the model.
-    """
+    """A session on the first available provider; raises ModelError if there is none, or no model."""
     options = ort.SessionOptions()
     options.inter_op_num_threads, options.intra_op_num_threads = 1, model_threads()
     # Workers run side by side, and a spinning pool would steal their cores.
@@ -178,7 +168,7 @@ def model_threads() -> int:
 def fit_image(
     image_bgr: UInt8[np.ndarray, "H W 3"], spec: InputSpec
 ) -> tuple[Float32[np.ndarray, "1 3 h w"], Fit]:
-    """The model's input for an image, and where the image lies in it."""
+    """The model's input for an image, and the image's placement."""
     rows, columns = spec.size
     height, width = image_bgr.shape[:2]
     scale_x, scale_y = columns / width, rows / height

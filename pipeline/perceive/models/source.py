@@ -20,10 +20,10 @@ __all__ = ["ModelSource", "check_models"]
 
 
 def check_models(rig: Rig, fleet: FleetConfig) -> None:
-    """Make sure that every model that a rig names is there and is the one that its manifest means; nothing is run.
+    """Check that every model of a rig exists with the hash of its manifest, without running it.
 
     Raises:
-        ModelError: a manifest or model is missing, wrong, or not the one that its hash says.
+        ModelError: a manifest or model is missing, wrong, or has another hash.
     """
     for camera in rig.cameras.values():
         if isinstance(camera.semantics, OnnxSemantics):
@@ -46,11 +46,7 @@ class ModelSource:
 
     @classmethod
     def load(cls, wanted: OnnxSemantics, fleet: FleetConfig) -> ModelSource:
-        """Load the models that fleet.toml names; their paths are relative to it.
-
-        Raises:
-            ModelError: a manifest or model is missing, wrong, or not the one that its hash says.
-        """
+        """Load the models named in fleet.toml, relative to it; raises ModelError as `check_models`."""
         segmenter = load_manifest(fleet.path_of(wanted.segmenter), "segment")
         detector = load_manifest(fleet.path_of(wanted.detector), "detect")
         return cls(segmenter, detector, fleet.perceive)
@@ -60,7 +56,7 @@ class ModelSource:
 
         Raises:
             FrameRejectedError: the image is undecodable or of the wrong size.
-            ModelError: a model does not do what its manifest says.
+            ModelError: a model contradicts its manifest.
         """
         if id(frame) not in self._known:
             self.look_ahead([frame])
@@ -70,7 +66,7 @@ class ModelSource:
         return found
 
     def look_ahead(self, frames: Sequence[ImageColumns]) -> None:
-        """Run the models on frames that `read` is asked for next, together; errors are raised there."""
+        """Run the models on the next frames together; errors are raised by `read`."""
         self._known, images = {}, {}
         for frame in frames:
             try:

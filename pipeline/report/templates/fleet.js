@@ -14,6 +14,11 @@ function escape(text) {
   return String(text).replace(/[&<>"']/g, c => "&#" + c.charCodeAt(0) + ";");
 }
 
+function commands(text) {  // as the filter of this name in pipeline/report/page.py
+  const copy = '<button type="button" class="copy">Copy</button>';
+  return escape(text).replace(/`([^`]*)`/g, (_, code) => `<code>${code}</code>${code.startsWith("boresight ") ? copy : ""}`);
+}
+
 // ---------------------------------------------------------------- the table
 function chip(row, day, letter, label) {
   const word = fleet.words[letter.toLowerCase()], text = label ? day + " " + word[1] : word[1];
@@ -24,11 +29,11 @@ function chip(row, day, letter, label) {
 }
 
 function rowHtml(row, place) {
-  const status = fleet.statuses[row[STATUS]], sentence = escape(fleet.sentences[row[SENTENCE]]);
+  const status = fleet.statuses[row[STATUS]], sentence = fleet.sentences[row[SENTENCE]];
   const days = fleet.days.map((day, i) => chip(row, day, row[DAYS][i])).join("");
   return `<tr aria-rowindex="${place + 2}"><td><a href="#charts-${escape(row[NAME])}">${escape(row[NAME])}</a></td>` +
     `<td class="status ${status}">${status}</td><td>${escape(row[SENSOR])}</td><td class="w">${row[SINCE]}</td>` +
-    `<td class="days">${days}</td><td class="words" title="${sentence}">${sentence}</td></tr>`;
+    `<td class="days">${days}</td><td class="words" title="${escape(sentence)}">${commands(sentence)}</td></tr>`;
 }
 
 const haystack = [];  // what a row is searched by, made when it is searched first
@@ -193,7 +198,7 @@ function figure(name, found) {
 
 function told(row) {
   const days = (row[OLDER] || []).concat(fleet.days.map((day, i) => [day, row[DAYS][i]])).filter(d => d[1] !== ".");
-  const change = row[CHANGE], parts = [`<p>${escape(fleet.sentences[row[SENTENCE]])}</p>`];
+  const change = row[CHANGE], parts = [`<p>${commands(fleet.sentences[row[SENTENCE]])}</p>`];
   if (change) parts.push(`<p class="soft">${escape([change[0], change[2], "charts: " + change[3].join("; ")].join(" · "))}</p>`);
   parts.push(`<p class="days">${days.map(d => chip(row, d[0], d[1], true)).join(" ") || "No record in the window."}</p>`);
   return parts.join("");

@@ -17,13 +17,7 @@ def fleet_toml(fleet: str, rig_name: str, rig: RigSpec, vehicles: list[str]) -> 
 
 
 def mixed_fleet_toml(fleet: str, rigs: Mapping[str, RigSpec], states_alignment: bool = False) -> str:
-    """Text of fleet.toml for vehicles with a rig each, by vehicle.
-
-    Args:
-        fleet: name of the fleet.
-        rigs: rigs by vehicle.
-        states_alignment: radars send messages with their alignment.
-    """
+    """Text of fleet.toml for vehicles with a rig each."""
     return _text(
         fleet, {r.name: r for r in rigs.values()}, {v: r.name for v, r in rigs.items()}, states_alignment
     )

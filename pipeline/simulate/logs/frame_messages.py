@@ -30,10 +30,7 @@ Sent = tuple[int, str, Any]  # log time [ns], topic, message
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """A vehicle at one moment: rig, mounting, quality of its label networks, faults.
-
-    `states_alignment`: its radars send messages with their alignment.
-    """
+    """A vehicle at one moment: rig, mounting, label networks, faults, and whether radars state alignment."""
 
     rig: RigSpec
     mounting: Mounting
@@ -45,15 +42,7 @@ class Setup:
 def messages_of(
     messages: RosMessages, frame: SimulatedFrame, setup: Setup, at: At, rng: np.random.Generator
 ) -> list[Sent]:
-    """The messages of one frame; a missing sensor has none.
-
-    Args:
-        messages: message factory.
-        frame: measurements of the sensors.
-        setup: rig and faults of the day.
-        at: stamp for a time of the drive.
-        rng: permutes classes if the day's labels have that fault.
-    """
+    """The messages of one frame, `at` giving stamps by time of the drive; a missing sensor has none."""
     sent: list[Sent] = []
     for sensor in setup.rig.sensors:
         name = sensor.name

@@ -46,16 +46,7 @@ def record_drive(
     rng: np.random.Generator,
     tick: Callable[[int], None],
 ) -> None:
-    """Write one drive.
-
-    Args:
-        log: open for writing.
-        world: world of the drive.
-        setups: state of the vehicle at each moment to write.
-        rate_hz: moments per second.
-        rng: noise.
-        tick: called with the number of moments written, after each.
-    """
+    """Write one drive to an open log; `setups` has the vehicle's state at each moment to write."""
     drive, messages, rig = world.drive, log.messages, setups[0].rig
 
     def at(t_s: float) -> int:
@@ -130,8 +121,7 @@ def nominal_poses(mounting: Mounting) -> dict[str, np.ndarray]:
 def _labelled_in_the_dark(spec: SemanticsSpec, today: DayFaults) -> SemanticsSpec:
     """Errors of day-trained networks at night: outlines three times as noisy, half of the boxes missed.
 
-    At dusk: outlines 2 label pixels noisier, half of the boxes missed; classes of visible objects are as
-    reliable as by day.
+    At dusk outlines are 2 label pixels noisier; classes of visible objects are as reliable as by day.
     """
     if today.has("dusk"):
         return replace(spec, boundary_px=spec.boundary_px + 2.0, miss=0.5)

@@ -24,7 +24,7 @@ __all__ = ["View", "encode_jpeg", "render", "view_of"]
 class View:
     """Visible triangle per pixel, at half size (`coarse`) and at full size, and the rays.
 
-    `origin` is the start of all rays; with a rolling shutter, of those in the middle row.
+    All rays start at `origin`; with a rolling shutter, those of the middle row.
     """
 
     coarse: Int32[np.ndarray, "h w"]

@@ -31,12 +31,7 @@ class Ticks:
 
 
 def free_clocks(rig: RigSpec, rng: np.random.Generator) -> dict[str, Ticks]:
-    """Independent clocks of the free-running sensors for one drive.
-
-    Args:
-        rig: rig of the vehicle.
-        rng: draws phases and rate errors.
-    """
+    """Independent clocks of the free-running sensors for one drive: random phases and rate errors."""
     free = {s.name: (s.rate_hz, _RATE_SD[s.kind]) for s in rig.sensors if s.rate_hz is not None}
     rates, sd = np.array([*free.values()]).reshape(-1, 2).T
     periods = 1 / (rates * (1 + rng.normal(0, sd)))

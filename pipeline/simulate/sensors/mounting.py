@@ -30,9 +30,7 @@ class Mounted:
         T_vehicle_nominal: pose in /tf_static.
         delay_s: its stamp of an event minus the reference lidar's.
         phase_s: constant offset of its stamps after the moment, without jitter.
-        camera: true intrinsics of a camera.
         nominal_camera: logged intrinsics.
-        errors: constant errors of a radar.
         turned_rad: rotation of points by a radar's software, positive to the left.
         stated_rad: misalignment in azimuth that a radar reports.
     """

@@ -27,11 +27,8 @@ def faded_by_road(
 ) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, " N"]]:
     """Power of every echo relative to its mean, and its position between object (0) and mirror image (1).
 
-    Args:
-        height_m: above the road; objects on the road have no image.
-        mirrored: share of echoes with smooth, empty road at the reflection point; it varies from scan to scan
-            by half.
-        rng: places and phases.
+    Only objects above the road (`height_m`) have an image. `mirrored` is the share of echoes with smooth,
+    empty road at the reflection point; it varies from scan to scan by half.
     """
     direct, image = (rng.standard_normal((2, len(height_m), 2)) @ [1.0, 1j]) / np.sqrt(2.0)
     smooth = rng.random(len(height_m)) < mirrored * rng.uniform(0.5, 1.5)

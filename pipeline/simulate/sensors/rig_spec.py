@@ -20,9 +20,6 @@ class SensorSpec:
     """One sensor: data sheet, nominal pose in the vehicle frame (rear axle, on the ground), clock.
 
     Args:
-        name: unique in the rig.
-        sheet: data sheet.
-        xyz_m: position.
         rpy_deg: rotation about the vehicle's axes: roll first, then pitch (positive = nose down), then yaw
             (to the left).
         delay_s: its stamp of an event minus the reference lidar's.
@@ -49,7 +46,6 @@ class RigSpec:
     """Sensors of a model of car, and deviations of its cars from the drawings.
 
     Args:
-        name: name of the rig.
         sensors: cameras, lidars and radars; the first lidar is the reference, whose sweeps define the
             moments.
         delay_sd_s: standard deviation (sd) per vehicle of each delay.
@@ -110,18 +106,9 @@ def short_rig(
     free_hz: Triple | None = None,
     **car: Any,
 ) -> RigSpec:
-    """A rig of three sensors named camera, lidar and radar.
+    """A rig of three sensors named camera, lidar and radar, in this order in the arguments.
 
-    Args:
-        name: name of the rig.
-        camera: its data sheet.
-        lidar: its data sheet.
-        radar: its data sheet.
-        xyz_m: positions of camera, lidar, radar.
-        rpy_deg: rotations of camera, lidar, radar.
-        delay_s: delays of camera and radar.
-        free_hz: rates of free-running camera, lidar and radar; None = the lidar triggers both.
-        **car: fields of RigSpec.
+    `delay_s` is of camera and radar; `free_hz` None = the lidar triggers both; `**car` are fields of RigSpec.
     """
     rates, delays = free_hz or (None,) * 3, (delay_s[0], 0.0, delay_s[1])
     rows = zip(

@@ -133,11 +133,7 @@ _RADARS: Final[dict[str, dict[str, Any]]] = {
 
 
 def rig_named(name: str) -> RigSpec:
-    """One of RIGS, or `random-SEED`; suffix `-flat` removes elevation from the radars, `-dirty` degrades it.
-
-    Raises:
-        ConfigError: no such rig.
-    """
+    """One of RIGS or `random-SEED`; `-flat` removes radar elevation, `-dirty` degrades it. ConfigError."""
     plain, change = name, None
     for ending, spoil in _RADARS.items():
         if name.endswith(ending):

@@ -70,11 +70,6 @@ def shade(sight, surfaces, materials, light, shadows, blobs):
     """Linear RGB of each pixel, float32, H W 3.
 
     Args:
-        sight: visible triangle and ray per pixel.
-        surfaces: the triangles.
-        materials: a MaterialTable.
-        light: sun and sky.
-        shadows: a ShadowMap.
         blobs: patches under road users, B 8: x, y [m], cosine and sine of the heading, half length, half
             width, height of the ground [m], unused.
     """

@@ -36,15 +36,10 @@ class Chunk:
         self.band((self.s0, self.s0 + CHUNK_M), d, h, name, step)
 
     def band(self, s: Span, d: Span, h: Span, name: str, step: float = 5.0, tint: Colour = (1, 1, 1)) -> None:
-        """Add a band of a material along the road, in pieces of about `step` [m] that follow its curve.
+        """Add a band of a material between arc lengths `s` and lateral offsets `d` (left) at heights `h`.
 
-        Args:
-            s: arc lengths of its ends.
-            d: offsets of its two sides, to the left of the centre line.
-            h: heights of its two sides; a band steeper than 45 deg has upright texture.
-            name: material.
-            step: length of a piece.
-            tint: factor of the albedo.
+        It follows the road's curve in pieces of about `step` [m]; a band steeper than 45 deg has upright
+        texture.
         """
         ends = np.linspace(s[0], s[1], max(2, round((s[1] - s[0]) / step) + 1))
         n = len(ends) - 1

@@ -22,19 +22,15 @@ class Landscape:
     """Parameters of a landscape; everything else is random along the road.
 
     Args:
-        name: name of the environment.
         base: the named landscape that a seed changed.
         fast: curves, speeds, traffic and banks of a motorway; else of a street.
         plain: the roadsides of `urban`.
         pace: factor of the usual speed.
-        lane_m: width of a lane.
-        one_way: only the ego lane.
         two_lanes: share of drives with two lanes in the ego direction.
         parking: share of drives with cars parked along the kerb.
         traffic: factor of the number of occupied places in a stream of road users.
         spacing: factor of the distance between these places.
         kinds: kinds of vehicles on the road; none = the usual ones.
-        walk_m: limits of the width of the pavement; 0 = a verge of grass.
         fences: weights of the kinds of boundaries of a plot.
         houses: share of plots with a house.
         setback_m: distances of a house from the pavement.
@@ -45,8 +41,6 @@ class Landscape:
         ceiling_m: height of a ceiling, 0 = the sky.
         inner_m: distance from the road's edge to the walls under the ceiling.
         columns_m: distance between the columns of the ceiling, 0 = none.
-        surface: material of the road.
-        markings: whether the road is marked.
         infrared: whether lidar intensity shows markings and repairs; else it has an independent pattern.
         glass: windows, meshes and hedges transmit beams, and lorries have open loads.
         sun_deg: limits of the sun's elevation.
@@ -121,11 +115,7 @@ _DRAWN_FROM: Final = ("suburb", "jam", "alley", "country", "country", "deck", "t
 
 
 def landscape_named(name: str) -> Landscape:
-    """One of LANDSCAPES, or `world-SEED`.
-
-    Raises:
-        ConfigError: no such environment.
-    """
+    """One of LANDSCAPES, or `world-SEED`; raises ConfigError if there is none."""
     seed = name.removeprefix(WORLD)
     found = _drawn(int(seed)) if seed != name and seed.isdecimal() else LANDSCAPES.get(name)
     if found is None:

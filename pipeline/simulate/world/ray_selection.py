@@ -18,16 +18,9 @@ _jit = numba.njit(cache=True)
 @no_type_check
 @_jit
 def rays_near(origins, directions, delay, centre, velocity, radius, limit):
-    """Indices of the rays that pass within `radius` of a moving point, before their previous hits.
+    """Indices of the rays (unit vectors) that pass within `radius` of a moving point, before their `limit`.
 
-    Args:
-        origins: N 3, start of the rays [m].
-        directions: N 3, unit vectors.
-        delay: N, time of each ray after that of `centre` [s].
-        centre: of a sphere around the body [m].
-        velocity: of the body [m/s].
-        radius: of the sphere [m].
-        limit: N, range up to which each ray is free [m].
+    `delay` is the time of each ray after that of `centre` [s].
     """
     out = np.empty(len(directions), np.int64)
     n = 0

@@ -183,6 +183,7 @@ def law_holds(estimate, prior):
     np.testing.assert_allclose(again, sigma, rtol=0.15)
 
 
+@pytest.mark.slow
 def test_the_law_holds_of_lidar_radar_on_a_street():
     rng = np.random.default_rng(5)
     T = perturb_exactly(T_LIDAR_RADAR, np.radians(2.0), 0.05, rng)
@@ -190,6 +191,7 @@ def test_the_law_holds_of_lidar_radar_on_a_street():
     law_holds(estimate_lidar_radar(street_day(20), prior, None, SolveConfig(), rng), prior)
 
 
+@pytest.mark.slow
 def test_the_law_holds_of_camera_lidar_on_a_street():
     rng = np.random.default_rng(6)
     T = perturb_exactly(T_TRUE, np.radians(2.0), 0.05, rng)

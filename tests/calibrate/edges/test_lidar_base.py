@@ -52,7 +52,12 @@ def errors(evidence, T_base_lidar):
 
 
 @pytest.mark.parametrize(
-    ("seed", "kind", "spec"), [(32, "urban", None), (33, "highway", None), (34, "urban", AROUND)]
+    ("seed", "kind", "spec"),
+    [
+        (32, "urban", None),
+        pytest.param(33, "highway", None, marks=pytest.mark.slow),
+        pytest.param(34, "urban", AROUND, marks=pytest.mark.slow),
+    ],
 )
 def test_a_pose_of_known_truth_comes_out_within_its_sigma(seed, kind, spec):
     mounted = Mounted(T_BASE_TOP) if spec is None else Mounted(T_BASE_TOP, spec)

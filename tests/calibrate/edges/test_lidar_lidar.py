@@ -54,8 +54,8 @@ def errors(evidence, T):
     ("seed", "spec", "T_base_side", "kind", "off_deg"),
     [
         (51, FORWARD, pose(3.6, 0.1, 0.7), "urban", 5.0),
-        (52, SOLID, pose(2.5, 0.9, 1.0, yaw_deg=60.0), "urban", 2.0),
-        (53, FORWARD, pose(1.5, 0, 1.6, pitch_deg=4.0), "highway", 2.0),
+        pytest.param(52, SOLID, pose(2.5, 0.9, 1.0, yaw_deg=60.0), "urban", 2.0, marks=pytest.mark.slow),
+        pytest.param(53, FORWARD, pose(1.5, 0, 1.6, pitch_deg=4.0), "highway", 2.0, marks=pytest.mark.slow),
     ],
 )
 def test_pose_and_clock_of_known_truth_come_out_within_sigma(seed, spec, T_base_side, kind, off_deg):

@@ -112,7 +112,7 @@ def test_velocities_with_a_lidars_elevations_show_pitch():
     T_true = mounted(0.0, pitch_deg=1.5)
     radar, ego = day(T_true, off_deg=1.0)
     v = radar.velocity_mps + np.random.default_rng(2).normal(0, [0, 0, 0.1], (F, 3))
-    told = TravelDirections(v, np.full(F, 0.01), *np.zeros((3, F)), np.arange(F))
+    told = TravelDirections(v, np.full(F, 0.01), *np.zeros((4, F)), np.arange(F))
     level = replace(radar, T_base_radar=mounted(1.0))
     evidence = estimate_radar_base(EDGE, level, ego, STAMPS, ALL, told)
     T, sigma = by_axis(evidence)

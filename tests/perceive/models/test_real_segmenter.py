@@ -68,6 +68,7 @@ def with_a_free_batch(model):
     return model
 
 
+@pytest.mark.slow
 def test_several_images_in_one_run_get_the_labels_that_each_gets_alone(real_logs, real_segmenter, tmp_path):
     onnx.save(with_a_free_batch(onnx.load(real_segmenter)), tmp_path / "batches.onnx")
     both = [manifest_of(path, tmp_path) for path in (real_segmenter, tmp_path / "batches.onnx")]

@@ -1,10 +1,10 @@
-"""What each term of the camera-lidar score shows of a pose, in units of what the day's wrong poses show by chance.
+"""Evidence of each term of the camera-lidar score for a pose, in units of its values at wrong poses.
 
-Edges, markings and classes are sums of log likelihood ratios whose points err together, each term's by another factor:
-on a day of another simulator, bright paint on bright stretches of road was worth thousands of nats at poses 12 deg off
-and nothing at the truth. So poses far and wide are drawn, nearly all of which are wrong, and each term is counted in
-units of the upper tail that it has over them. A term that knows a place of its own stands many tails out there. One
-that knows nothing of the day stands out nowhere, and cannot outvote the others.
+Edges, markings and classes are sums of log likelihood ratios whose points err together, each term's by
+another factor: on a day of another simulator, bright paint on bright road scored thousands of nats at poses
+12 deg off and nothing at the truth. Random, hence nearly always wrong, poses are therefore drawn, and each
+term is counted in units of its upper tail over them. A term with a clear maximum stands many tails out; a
+term without information stands out nowhere, and cannot outvote the others.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def wrong_poses(
 
 
 def by_chance(poses: int, terms: int) -> float:
-    """Evidence of so many terms together that the best of so many wrong poses has: tails are exponential.
+    """Combined evidence of `terms` at the best of so many wrong poses; tails are exponential.
 
     A sum of `terms` exponentials exceeds x with probability e^-x (1 + x + .. + x^(terms-1) / (terms-1)!).
     """
@@ -53,8 +53,8 @@ def by_chance(poses: int, terms: int) -> float:
 class Evidence:
     """The terms of a day at one kernel, each in units of chance.
 
-    Without `shifts_px` an edge counts what it scores beyond `per_edge`, the median wrong pose's edges: cheaper, and
-    less sure where images differ from place to place.
+    Without `shifts_px` an edge counts its score beyond `per_edge`, the median wrong pose's edges: cheaper,
+    and less certain if images differ from place to place.
     """
 
     terms: Terms

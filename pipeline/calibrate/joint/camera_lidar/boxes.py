@@ -1,7 +1,7 @@
-"""Where detected road users lie beside the lidar's objects: evidence of a network that the label maps do not share.
+"""Offsets of detected road users from the lidar's objects: evidence of a network other than the segmenter.
 
-A lidar's object is projected by the pose in question; where one box surrounds about the same part of the image, and no
-other, both show one road user. A detector that is trained apart from the segmenter errs in another way.
+A lidar's object is projected by the pose; if exactly one box surrounds about the same part of the image, both
+show one road user. A detector trained apart from the segmenter has other errors.
 """
 
 from __future__ import annotations
@@ -26,11 +26,9 @@ _Boxes = Float[np.ndarray, "_ 4"]  # u0 v0 u1 v1
 def box_offsets(
     observations: Sequence[Observation], T_camera_lidar: Float[np.ndarray, "F 4 4"]
 ) -> tuple[Int64[np.ndarray, " M"], Float[np.ndarray, "M 2"]]:
-    """Turns about the camera's x and y that lay objects into their boxes [rad], and their frames.
+    """Rotations about the camera's x and y that move objects into their boxes [rad], and their frames.
 
-    Args:
-        observations: of the day.
-        T_camera_lidar: from each frame's lidar points to its image.
+    `T_camera_lidar` is from each frame's lidar points to its image.
     """
     frame, offset = list[int](), list[Float[np.ndarray, " 2"]]()
     for k, (o, T) in enumerate(zip(observations, T_camera_lidar, strict=True)):

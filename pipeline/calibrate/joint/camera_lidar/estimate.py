@@ -42,6 +42,7 @@ from pipeline.calibrate.joint.camera_lidar.refine import (
     weighted,
 )
 from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
+from pipeline.calibrate.joint.camera_lidar.side_bias import sides_apart
 from pipeline.calibrate.joint.camera_lidar.time_offset import FOCAL, far_time_offset, s_per_metre
 from pipeline.calibrate.joint.camera_lidar.witnesses import (
     Witness,
@@ -64,6 +65,7 @@ from pipeline.errors import SolveError
 from pipeline.extrinsics.common_share import common_part
 from pipeline.extrinsics.estimates import PairEstimate, Prior
 from pipeline.geometry.changes import change_jacobian
+from pipeline.objective.camera_lidar.label_width import label_width_px, widened
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms, lidar_velocities, prepare_terms
 from pipeline.objective.stamp_gaps import camera_gaps_s, constant_gap_s
 from pipeline.rig.evidence import EDGE
@@ -96,6 +98,9 @@ class Aligned:
     kernel: KernelSettings
     expected_dt_s: float  # the state's time offset counts from it: the constant part of the stamps' gaps
     intrinsics: DayIntrinsics
+    label_width_px: (
+        float  # by which labels are wider than their objects, and the problem's edges moved outward
+    )
 
     @property
     def T_camera_lidar(self) -> Float[np.ndarray, "4 4"]:
@@ -105,7 +110,9 @@ class Aligned:
     @property
     def covariance(self) -> Float[np.ndarray, "6 6"]:
         """Of the pose, by left perturbation."""
-        of_changes = day_covariance(self.problem, self.state, self.kernel, IS_TZ).covariance[:6, :6]
+        biases = sides_apart(self.problem.terms, self.state, self.kernel).biases(IS_TZ)
+        of_day = day_covariance(self.problem, self.state, self.kernel, IS_TZ)
+        of_changes = of_day.beside(biases).covariance[:6, :6]
         to_left = np.linalg.inv(change_jacobian(self.state.T_camera_lidar))
         return to_left @ of_changes @ to_left.T
 
@@ -182,8 +189,9 @@ def align_camera_lidar(
     if (rival := ends.get("rival")) is not None:
         basin = settled(basin, Scored(sharp, kernel, prior, config, limits), state, rival)
         second = second or rival
+    width_px = label_width_px(sharp, state.alone, kernel)
     problem = CameraLidarProblem(
-        sharp,
+        widened(sharp, state.T_camera_lidar, width_px),
         prior,
         config,
         scenes,
@@ -193,7 +201,9 @@ def align_camera_lidar(
     )
     intrinsics = measure_intrinsics(problem, state, kernel, frames[0].label_scale, rng)
     expected_dt_s = constant_gap_s(camera_gaps_s(frames))
-    return Aligned(problem, frames, rejected, basin, state, second, kernel, expected_dt_s, intrinsics)
+    return Aligned(
+        problem, frames, rejected, basin, state, second, kernel, expected_dt_s, intrinsics, width_px
+    )
 
 
 def analyse_camera_lidar(
@@ -230,6 +240,11 @@ def analyse_camera_lidar(
     diagnostics = _diagnostics(problem.terms, analysis, aligned.basin, halves, starts)
     own_tz = analysis.profile.shift_from(float(problem.prior.T_camera_lidar[2, 3]))
     own_dt_s, z = far_time_offset(problem.terms, analysis.state, analysis.kernel, rng)
+    diagnostics |= {
+        "label_width_px": aligned.label_width_px,
+        "sides_apart_pitch_px": analysis.apart.pitch_px,
+        "sides_apart_yaw_px": analysis.apart.yaw_px,
+    }
     diagnostics |= {"own_dt_s": aligned.expected_dt_s + own_dt_s, "own_dt_z": z}
     if analysis.observability[5] < OBSERVABLE and own_tz is not None:
         diagnostics |= {"own_tz_m": own_tz[0], "own_tz_sigma_m": own_tz[1]}

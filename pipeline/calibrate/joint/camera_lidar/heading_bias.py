@@ -1,9 +1,10 @@
-"""How a wrong heading of the car in the lidar's axes biases T_camera_lidar: an error that more frames do not lower.
+"""Bias of T_camera_lidar from a wrong heading of the car in lidar axes, which more frames do not reduce.
 
-A sweep takes a tenth of a second; de-skewing moves its points along the car's velocity, whose direction in lidar axes
-follows from the prior's mounting. A mounting that is off by a degree then lifts one side of the sweep and lowers the
-other, in proportion to speed: on highways that is a tenth of a degree of roll, in edges and markings alike. The
-camera's time offset moves the cloud along the same velocity, whose heading comes from the radar and its prior.
+A sweep takes a tenth of a second; de-skewing moves its points along the car's velocity, whose direction in
+lidar axes follows from the prior's mounting. A mounting error of a degree then lifts one side of the sweep
+and lowers the other, in proportion to speed: on highways a tenth of a degree of roll, in edges and markings
+alike. The camera's time offset moves the cloud along the same velocity, whose heading comes from the radar
+and its prior.
 
 Source: Schmidt 1966 (parameters that are considered, not solved for).
 """
@@ -53,17 +54,10 @@ def motion_biases(
     fixed: Bool[np.ndarray, " 8"],
     sigmas: MotionSigmas,
 ) -> Float[np.ndarray, "5 8"]:
-    """How far one sigma of each unknown of the motion moves the solution (coordinates of `changed`).
+    """Change of the solution (coordinates of `changed`) by one sigma of each unknown of the motion.
 
-    Rows: heading of the velocities; yaw and pitch of the mounting, each by azimuth and by the sweep's mean time.
-
-    Args:
-        terms: points and velocities.
-        state: the solution.
-        kernel: of the gradients.
-        curvature: of the cost, in the coordinates of `changed`.
-        fixed: unknowns that do not follow.
-        sigmas: of the heading, and a sweep's duration.
+    Rows: heading of the velocities; yaw and pitch of the mounting, each by azimuth and by the sweep's mean
+    time. Unknowns in `fixed` stay; `sigmas` are of the heading, and a sweep's duration.
     """
     across = terms.velocity_lidar @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     up = np.linalg.norm(terms.velocity_lidar, axis=1)[:, None] * np.array([0.0, 0.0, 1.0])

@@ -1,11 +1,11 @@
-"""Initial pose: which basin of the camera-lidar score the day shows, and whether its evidence leads over all others.
+"""Initial pose: the basin of the camera-lidar score, and whether its evidence leads over all others.
 
-One search can be misled, and so can one term: on a day of another simulator markings alone put the camera 12 deg off,
-and outvoted the edges. So candidates come from the prior, from a grid of rotations by all terms together and by each
-alone, and from the vehicle's state; each climbs at the same kernel within the search range, and their ends are compared
-by what each term shows beyond chance (`beyond_chance`). The best end is found where it shows more than the best of all
-chance poses of the search would, where the day rejects every end elsewhere, and where no term that knows a place of its
-own puts it elsewhere.
+One search can be misled, and so can one term: on a day of another simulator markings alone put the camera 12
+deg off and outvoted the edges. Candidates therefore come from the prior, from a grid of rotations by all
+terms together and by each alone, and from the vehicle's state. Each climbs at the same kernel within the
+search range, and their ends are compared by each term's evidence beyond chance (`beyond_chance`). The best
+end is accepted if it leads over the best of all chance poses of the search, if the day rejects every other
+end, and if no term with a clear maximum contradicts it.
 """
 
 from __future__ import annotations
@@ -49,10 +49,7 @@ _CONTRADICTED = (
 
 @dataclass(frozen=True, eq=False)
 class Basin:
-    """The best end of all candidates, and the evidence that it is right.
-
-    `doubt` says why it cannot be taken for right; empty where it can.
-    """
+    """The best end of all candidates, its evidence, and in `doubt` the reason against it (or empty)."""
 
     state: AlignmentState
     second: AlignmentState | None  # the best one of another candidate that agrees with it
@@ -89,10 +86,8 @@ def find_basin(terms: Terms, scored: Scored, rng: np.random.Generator) -> Basin:
     """Climb from candidates until the best end is found, or no candidate is left.
 
     Args:
-        terms: all points, for the grid.
-        scored: few sharp points, the kernel at which ends are compared, the prior that is the centre of the search,
-            and the config with the least search range.
-        rng: decides everything random.
+        scored: few sharp points, the kernel at which ends are compared, the prior that is the centre of the
+            search, and the config with the least search range.
     """
     prior, (reach, shift) = scored.prior, search_range(scored.prior, scored.config)
     wrong = wrong_poses(prior, reach, min(shift, _SHIFT_SIGMAS * prior.translation_sigma_m), rng)
@@ -110,9 +105,10 @@ def find_basin(terms: Terms, scored: Scored, rng: np.random.Generator) -> Basin:
 
 
 def settled(basin: Basin, scored: Scored, best: AlignmentState, rival: AlignmentState) -> Basin:
-    """The basin once its best end and the rival have arrived at a sharper kernel.
+    """The basin after its best end and the rival have climbed at a sharper kernel.
 
-    At the kernel of the search an end a degree away scores much alike; it leads to the same place, or is rejected.
+    At the kernel of the search an end a degree away scores much alike; it leads to the same pose, or is
+    rejected.
     """
     apart = _apart_rad(scored.terms, best, rival)
     lower = np.subtract(*(scored.terms.score(s.alone, scored.kernel)[0] for s in (best, rival)))
@@ -258,9 +254,9 @@ def _rejected(best: _End, other: _End) -> float:
 
 
 def _apart_rad(terms: Terms, a: AlignmentState, b: AlignmentState) -> float:
-    """Median angle by which the day's edges and markings lie elsewhere in the image.
+    """Median angle between the day's edges and markings in the image at two poses.
 
-    Not a distance of poses: a turn and a shift that move the points alike are one optimum's valley.
+    Not a distance of poses: a rotation and a shift that move the points alike are in one valley.
     """
     points = np.concatenate([terms.edges.xyz_m, terms.markings.xyz_m])
     points = points[:: max(1, len(points) // _POINTS)]

@@ -1,24 +1,26 @@
 """What the day says of the camera's focal length and principal point: for report and alarm, not for the pose.
 
-Freeing them in the pose costs more than it gains: focal length, tz and the time offset share a valley, and a principal
-point wrong by d pixels is, over most of an image, a camera turned by d/f. So the pose stays that of CameraInfo, which
-is right for whoever uses image directions with the same CameraInfo, and the intrinsics are measured beside it: all
-unknowns free together, Gauss-Newton on the points' re-weighted residuals from the aligned pose. Response surfaces,
-which solve for the pose, lose themselves in that valley; analytic slopes, which do not see the steps of the maps, do
-not. They still end in a maximum of their own, so they begin twice, at CameraInfo's focal length and the expected clock
-and where the alignment had both, and the edges say which end is better: from the first alone, a highway whose camera
-was 60 ms late showed a focal length 6 % off.
+Freeing them in the pose costs more than it gains: focal length, tz and the time offset share a valley, and a
+principal point wrong by d pixels is, over most of an image, a camera turned by d/f. So the pose stays that of
+CameraInfo, which is right for whoever uses image directions with the same CameraInfo, and the intrinsics are
+measured beside it: all unknowns free together, Gauss-Newton on the points' re-weighted residuals from the
+aligned pose. Response surfaces, which solve for the pose, lose themselves in that valley; analytic slopes,
+which do not see the steps of the maps, do not. They still end in a maximum of their own, so they begin twice,
+at CameraInfo's focal length and the expected clock and where the alignment had both, and the edges say which
+end is better: from the first alone, a highway whose camera was 60 ms late showed a focal length 6 % off.
 
-Edges alone say the focal length, with the principal point held. Markings run along the car's way and grow with it as
-with the focal length: with them it was 0.8 % off where edges were 0.5 % off. The principal point needs them, for they
-reach the image's lower corners.
+Edges alone say the focal length, with the principal point held. Markings run along the car's way and grow
+with it as with the focal length: with them it was 0.8 % off where edges were 0.5 % off. The principal point
+needs them, for they reach the image's lower corners.
 
-What contradicts CameraInfo is asked twice more before it holds a record: the first and the second half of the frames
-must each say so by itself, and where less weight for the markings moves the principal point, it is not known better
-than it moves. Of 64 days whose CameraInfo was right five were contradicted before: highways whose halves ended in
-different corners of the valley, and dusk, when markings alone drew the principal point up by 40 px.
+What contradicts CameraInfo is asked twice more before it holds a record: the first and the second half of the
+frames must each say so by itself, and where less weight for the markings moves the principal point, it is not
+known better than it moves. Of 64 days whose CameraInfo was right five were contradicted before: highways
+whose halves ended in different corners of the valley, and dusk, when markings alone drew the principal point
+up by 40 px.
 
-Source: Triggs et al. 2000, section 4 (Gauss-Newton with robust weights); the sigmas are measured, see their constants.
+Source: Triggs et al. 2000, section 4 (Gauss-Newton with robust weights); the sigmas are measured, see their
+constants.
 """
 
 from __future__ import annotations
@@ -61,9 +63,10 @@ _FOCAL, _CENTRE, _UNKNOWNS = 7, slice(8, 10), 10
 
 @dataclass(frozen=True, eq=False)
 class DayIntrinsics:
-    """The day's own measurement, with sigmas in which CameraInfo does not count.
+    """The day's own measurement, with sigmas that exclude CameraInfo.
 
-    Focal length in units of CameraInfo's; principal point (right, down) less CameraInfo's [px of the full image].
+    Focal length in units of CameraInfo's; principal point (right, down) minus CameraInfo's [px of the full
+    image].
     """
 
     focal: float
@@ -157,11 +160,8 @@ def measure_intrinsics(
     """Solve for pose, time offset, focal length and principal point together, from an aligned pose.
 
     Args:
-        problem: sharp points of the day, and the prior.
-        state: aligned.
         kernel: whose weights edges and markings have.
         label_scale: label pixels per image pixel.
-        rng: draws points and chance densities.
     """
     day = _measured(problem, state, kernel, label_scale, rng)
     if not contradictions(day, problem.prior.camera):
@@ -194,7 +194,7 @@ def _measured(
     focal, dt_s = best.at.alignment.focal, best.at.alignment.dt_s
     apart = 0.0 if is_decided else focal - other.at.alignment.focal
     reach_px = _CENTRE_REACH * problem.terms.maps.camera.width_px
-    # From the aligned pose again: the edges of 16 rings know nothing of pitch.
+    # From the aligned pose again: the edges of 16 rings do not determine pitch.
     begin = _State(AlignmentState(state.T_camera_lidar, dt_s, focal), np.zeros(2))
     end = _solved(some, begin, kernel, reach_px, rng)
     centre_sigma = DAY_CENTRE_SIGMAS * np.sqrt(np.diag(np.linalg.inv(end.information))[_CENTRE])

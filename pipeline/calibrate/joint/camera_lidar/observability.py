@@ -23,7 +23,7 @@ from pipeline.calibrate.joint.camera_lidar.refine import (
     weighted,
 )
 from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
-from pipeline.calibrate.joint.camera_lidar.side_bias import side_biases
+from pipeline.calibrate.joint.camera_lidar.side_bias import SidesApart, sides_apart
 from pipeline.calibrate.joint.camera_lidar.time_offset import (
     DT,
     FOCAL,
@@ -92,6 +92,7 @@ class ObservabilityAnalysis:
     floors: np.ndarray  # 8 8, of the common part what is no prior's
     observability: np.ndarray  # 6
     profile: TzProfile
+    apart: SidesApart  # how far near and far edges lie apart there
 
 
 def analyse_observability(
@@ -178,8 +179,20 @@ def _fix_unobservable(
         if more_fixed.sum() == fixed.sum():
             break
         fixed = more_fixed
+    apart = sides_apart(problem.terms, state, kernel)
+    # Labels that are off make an answer unsure. They do not make the prior the better answer: after what is fixed.
+    day = day.beside(apart.biases(fixed))
     return ObservabilityAnalysis(
-        problem.prior, state, kernel, fixed, day.covariance, day.common, day.floors, observability, profile
+        problem.prior,
+        state,
+        kernel,
+        fixed,
+        day.covariance,
+        day.common,
+        day.floors,
+        observability,
+        profile,
+        apart,
     )
 
 
@@ -218,6 +231,13 @@ class DayCovariance:
     floors: np.ndarray  # 8 8, of the common part what is no prior's
     observability: np.ndarray  # 6
 
+    def beside(self, biases: Float[np.ndarray, "_ 8"]) -> DayCovariance:
+        """With errors that all days err by alike: one sigma of each a row, as `AlignmentState.changed` has them."""
+        more = biases.T @ biases
+        return DayCovariance(
+            self.covariance + more, self.common + more, self.floors + more, self.observability
+        )
+
 
 def day_covariance(
     problem: CameraLidarProblem, state: AlignmentState, kernel: KernelSettings, fixed: Bool[np.ndarray, " 8"]
@@ -241,13 +261,11 @@ def day_covariance(
     )
     floor = np.where(fixed, 0.0, np.append(CAMERA_LIDAR_BIAS, [CAMERA_LIDAR_DT_FLOOR_S, 0.0]))
     motion = motion_biases(terms, state, kernel, curvature, fixed, problem.motion)
-    sides = side_biases(terms, state, kernel, curvature, fixed)
     # Masks, intrinsics and the lidar's mounting are the same every day.
-    floors = np.diag(floor**2) + motion.T @ motion + sides.T @ sides
-    prior_information = np.diag(problem.common_share / prior_variance)
-    common = floors + prior_share(covariance, prior_information)
+    floors = np.diag(floor**2) + motion.T @ motion
+    observability = np.clip(1 - np.diag(covariance + floors) / prior_variance, 0.0, 1.0)[:6]
+    common = floors + prior_share(covariance, np.diag(problem.common_share / prior_variance))
     covariance = covariance + floors
-    observability = np.clip(1 - np.diag(covariance) / prior_variance, 0.0, 1.0)[:6]
     return DayCovariance(covariance, common, floors, observability)
 
 

@@ -1,13 +1,13 @@
 """Position along the optical axis (tz): a profile of the score, wide enough that its roughness does not matter.
 
-Fast cars hardly tell tz from the time offset, and the focal length follows both: a valley decimetres long, in which the
-score is rough at the scale of a response surface. Its gradients scatter in every direction and predict a sigma of
-centimetres, which the valley does not bear out. So tz is stepped through the valley, the other unknowns are solved
-again at each step, and a parabola says where the score is highest and how surely.
+On fast cars tz hardly differs from the time offset, and the focal length follows both: a valley decimetres
+long, in which the score is rough at the scale of a response surface. Its gradients scatter in every direction
+and predict a sigma of centimetres, which is too small. tz is therefore stepped through the valley, the other
+unknowns are solved again at each step, and a parabola gives the maximum and its sigma.
 
-Edges and markings are compared on the same path. They err differently (lane paint slides along its lane and blurs with
-distance): with independent errors of equal size, the mean of both errs by half of their difference, and where one of
-them hardly depends on tz, the other's bias is not known better than that.
+Edges and markings are compared on the same path, because they err differently (lane paint slides along its
+lane and blurs with distance). With independent errors of equal size, the mean of both errs by half of their
+difference; if one of them hardly depends on tz, the other's bias is not known better than that.
 
 Sources: profile likelihood: Murphy & van der Vaart 2000; disagreement beyond the sigmas: Birge 1932.
 """
@@ -61,10 +61,7 @@ class TzProfile:
 def profile_tz(scored: Scored, state: AlignmentState, follow: Float[np.ndarray, " 8"]) -> TzProfile:
     """Step tz away from a solution to both sides and solve the others at each step.
 
-    Args:
-        scored: points, a sharp weighted kernel, and the prior of the other unknowns.
-        state: a solution with tz free.
-        follow: how far the others move when tz moves by one metre.
+    `follow` is the change of the others per metre of tz.
     """
     fixed = np.arange(8) == TZ
     centre = float(state.T_camera_lidar[2, 3])

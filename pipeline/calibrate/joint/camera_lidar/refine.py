@@ -53,7 +53,8 @@ class AlignmentState:
     def changed(self, x: Float[np.ndarray, "P 8"]) -> Alignments:
         """Candidates at changes (rotation about the camera's axes, shift of the lidar's origin, dt, focal scale).
 
-        The coordinates of the record: what the day cannot determine keeps its value in them, whatever else moves.
+        The coordinates of the record: what the day cannot determine keeps its value in them, whatever else
+        moves.
         """
         R = exp_so3(x[:, :3]) @ self.T_camera_lidar[:3, :3]
         T = from_rotation_translation(R, self.T_camera_lidar[:3, 3] + x[:, 3:6])
@@ -89,7 +90,7 @@ class AlignmentState:
 
 @dataclass(frozen=True, eq=False)
 class Scored:
-    """What a refinement maximises: the terms' score at a kernel plus the prior's log density.
+    """Objective of a refinement: the terms' score at a kernel plus the prior's log density.
 
     `limits` is the range about the prior that it does not leave; None = no limit.
     """
@@ -122,8 +123,6 @@ def refine(
     """Maximise by Newton steps on response surfaces, for the score is rough at the scale of a pixel.
 
     Args:
-        scored: what is maximised.
-        state: start.
         steps: at most so many: valleys are long, as fast cars hardly tell tz from the time offset.
         fixed: degrees of freedom that stay; those of the pose at the prior.
     """
@@ -163,10 +162,10 @@ def _surface(
 ) -> tuple[Float[np.ndarray, " 8"], Float[np.ndarray, "8 8"]]:
     """Gradient and curvature (positive definite) of score and prior over a ball of radius `scale`, in units of it.
 
-    The curvature is at least half of what the scatter of the frames' gradients predicts (Fisher scoring): in a
-    direction that roughness makes flat or convex, a Newton step could end anywhere. The scatter is taken about the
-    mean: a mean that differs from zero is distance still to go, not curvature; counted as such, it shortened steps so
-    much that time offsets stayed where they began.
+    The curvature is at least half of the prediction from the scatter of the frames' gradients (Fisher
+    scoring): in a direction that is flat or convex by roughness, a Newton step could end anywhere. The
+    scatter is about the mean, because a mean other than zero is distance to go: counted as curvature, it
+    shortened steps so much that time offsets stayed at their start.
     """
     at = state.changed(DESIGN * scale)
     gradient, H = fit_quadratics(scored.terms.score(at, scored.kernel))
@@ -187,8 +186,8 @@ def derivatives(
 def weighted(terms: Terms, state: AlignmentState, kernel: KernelSettings, scenes: Scenes) -> KernelSettings:
     """Weight markings, narrow and wide edges so that the curvature of each equals its gradient's scatter over scenes.
 
-    Points of one frame err together (one mask boundary, one lane line), and frames of one scene do, so the curvature of
-    a sum of log likelihood ratios is too large, by another factor for each term.
+    Points of one frame err together (one mask boundary, one lane line), and so do frames of one scene. The
+    curvature of a sum of log likelihood ratios is therefore too large, by another factor for each term.
     """
     scale = scales(terms, kernel)
     weights = []

@@ -1,10 +1,11 @@
-"""Brute force over rotations: what edges, markings and classes show on a grid of turns about a pose.
+"""Brute force over rotations: edges, markings and classes on a grid of rotations about a pose.
 
-Sharp scores have many maxima, coarse ones lie; a kernel of half a degree has the truth well above all else, and over
-rotations alone a grid that fine is affordable: some thousands of poses at a few nanoseconds per point. Shifts within
-the prior's sigma turn most points by less than the kernel. A few points show which poses are worth all of them.
+Sharp scores have many maxima, coarse ones are biased; at a kernel of half a degree the truth is well above
+all else, and over rotations alone a grid that fine is affordable: some thousands of poses at a few
+nanoseconds per point. Shifts within the prior's sigma move most points by less than the kernel. A few points
+select the poses to score by all.
 
-Source: OpenCalib's CalibAnything (Luo et al. 2023) searches rotations by brute force too, and loses no start of 5 deg.
+Source: OpenCalib's CalibAnything (Luo et al. 2023) searches rotations by brute force too.
 """
 
 from __future__ import annotations
@@ -32,17 +33,11 @@ def grid_maxima(
     wrong: Float[np.ndarray, "P 4 4"],
     rng: np.random.Generator,
 ) -> list[tuple[str, Float[np.ndarray, "4 4"]]]:
-    """The best poses of a grid of turns about the camera's axes, each the best of its surroundings.
+    """The best poses of a grid of rotations about the camera's axes, each the best of its surroundings.
 
-    By all terms together the best first, then each term's own best, then what is left of all terms together; with the
-    terms that they are the best by.
-
-    Args:
-        terms: points of the day.
-        prior: centre of the grid, and how likely its turns are; its translation is kept.
-        reach_rad: half-width of the grid per axis.
-        wrong: poses that show what chance is worth.
-        rng: thins the points.
+    The best by all terms together first, then each term's best, then others by all terms; with the terms by
+    which they are best. The prior is the centre of the grid and keeps its translation; `wrong` are poses for
+    the values of chance.
     """
     kernel_rad = grid_kernel_rad(reach_rad)
     kernel = KernelSettings.wide(kernel_rad * float(terms.camera[1]), 0, match=SCHEDULE.coarse_match)

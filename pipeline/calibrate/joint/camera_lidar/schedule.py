@@ -58,7 +58,7 @@ class Schedule:
     time_offset_reach_s: float = 0.05
     time_offset_resamples: int = 200
 
-    # Where another start led, with what the day fixed.
+    # End of another start, with the same unknowns fixed.
     start_steps: int = 3
     # Disjoint halves, from the solution of the whole.
     half_steps: int = 3

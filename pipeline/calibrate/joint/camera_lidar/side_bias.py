@@ -1,80 +1,65 @@
-"""How far boundaries that lie beside what the lidar sees bias T_camera_lidar: an error that more frames do not lower.
+"""How far labels bias T_camera_lidar, as near and far edges of each side show it: an error that frames do not lower.
 
-Labels are wider than what they show, and a jump lies anywhere between two beams: at the true pose the boundaries of
-one side lie a pixel or two beside its jumps. Where both sides are alike and equally far away that cancels. A camera
-that looks aside sees the feet of near things and the tops of far ones: then it is a height, and a pitch.
-
-Source: Schmidt 1966 (parameters that are considered, not solved for).
+At the solution near and far edges of both sides should lie at their borders alike. Where they do not, some borders are
+not those of what the lidar sees: the roof above a car's window, the tree behind a hedge, the wheels below a sill. All
+scenes share that, so that neither their scatter nor halves of the day show it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState
 from pipeline.calibrate.numerics.bias_floors import (
-    EDGE_SIDE_ALIKE,
-    EDGE_SIDE_APART,
+    EDGE_SIDE_ALONE,
     EDGE_SIDE_MOST_OF_GAP,
     EDGE_SIDE_MOST_PX,
+    SIDES_APART_RANGE_M,
+    SIDES_APART_SHARE,
 )
-from pipeline.geometry.changes import change_jacobian
+from pipeline.objective.camera_lidar.label_width import SHIFTS_PX, shift_score
 from pipeline.objective.camera_lidar.points import Points
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
 
-__all__ = ["most_offset_rad", "side_biases"]
+__all__ = ["SidesApart", "most_offset_rad", "sides_apart"]
 
-# Of the image, across a side's boundaries.
-_AXIS = {EDGE_LEFT: 0, EDGE_RIGHT: 0, EDGE_ABOVE: 1, EDGE_BELOW: 1}
-
-
-def side_biases(
-    terms: Terms,
-    state: AlignmentState,
-    kernel: KernelSettings,
-    curvature: Float[np.ndarray, "8 8"],
-    fixed: Bool[np.ndarray, " 8"],
-) -> Float[np.ndarray, "_ 8"]:
-    """How far one sigma of each side's offset, near and far alike and apart, moves the solution (as `changed` has it).
-
-    Args:
-        terms: points, of which edges count.
-        state: the solution.
-        kernel: of the gradients.
-        curvature: of the cost, in the coordinates of `changed`.
-        fixed: unknowns that do not follow.
-    """
-    to_left = np.eye(8)
-    to_left[:6, :6] = np.linalg.inv(change_jacobian(state.T_camera_lidar))
-    only_edges, free = replace(kernel, marking_weight=0.0), ~fixed
-    out = []
-    for near, far, axis in _sides(terms.edges):
-        by_near, by_far = (
-            to_left.T @ _pull(replace(terms, edges=edges), state, only_edges, axis) for edges in (near, far)
-        )
-        for pull in (EDGE_SIDE_ALIKE * (by_near + by_far), EDGE_SIDE_APART * (by_near - by_far)):
-            row = np.zeros(8)
-            row[free] = np.linalg.solve(curvature[np.ix_(free, free)], pull[free])
-            out.append(row)
-    return np.array(out).reshape(-1, 8)
+_SIDES: Final = {0: (EDGE_ABOVE, EDGE_BELOW), 1: (EDGE_LEFT, EDGE_RIGHT)}  # of pitch, of yaw
+_FEWEST = 60  # edges, near or far, of a side
+# So wide is what an offset is looked for in [px]: without it the offset of few edges is that of one chance border.
+_OFFSET_SIGMA_PX = 4.0
 
 
-def _pull(terms: Terms, state: AlignmentState, kernel: KernelSettings, axis: int) -> Float[np.ndarray, " 8"]:
-    """Gradient by boundaries that lie as far aside as they ever do: they pull like a principal point that does.
+@dataclass(frozen=True)
+class SidesApart:
+    """How far near and far edges of both sides lie apart, at a solution."""
 
-    Read off at half of that to both sides: of those far beside their jumps only chance is left.
-    """
-    focal_px = float(terms.camera[1])
-    half_px = most_offset_rad(terms.edges, 1 / focal_px) * focal_px / 2
-    there, back = (
-        _seen_off(terms, axis, sign * half_px).gradient(state.alone, kernel)[0].sum(0) for sign in (1, -1)
-    )
-    return np.asarray(there - back)
+    pitch_px: float  # of the label image; edges above and below a foreground
+    yaw_px: float  # edges left and right of a foreground
+    px_rad: float
+
+    def biases(self, fixed: Bool[np.ndarray, " 8"]) -> Float[np.ndarray, "3 8"]:
+        """One sigma of what that leaves open in pitch and in yaw, with them in height and in x, and in roll.
+
+        Near edges hold the picture together, so that the camera turns as if about a point 10 m ahead. Coordinates as
+        `AlignmentState.changed` has them.
+        """
+        rows = np.zeros((3, 8))
+        rows[2, 2] = SIDES_APART_SHARE * self.pitch_px * self.px_rad
+        for axis, (apart_px, shift, sign) in enumerate(((self.pitch_px, 4, 1), (self.yaw_px, 3, -1))):
+            turn_rad = SIDES_APART_SHARE * apart_px * self.px_rad
+            rows[axis, [axis, shift]] = turn_rad, sign * SIDES_APART_RANGE_M * turn_rad
+        return np.where(fixed, 0.0, rows)
+
+
+def sides_apart(terms: Terms, state: AlignmentState, kernel: KernelSettings) -> SidesApart:
+    """What the edges of a day show at a solution; 0 about an axis of which edges tell nothing."""
+    pitch_px, yaw_px = (_apart_px(terms, state, kernel, sides) for sides in _SIDES.values())
+    return SidesApart(pitch_px, yaw_px, 1 / float(terms.camera[1]))
 
 
 def most_offset_rad(edges: Points, px_rad: float) -> float:
@@ -82,18 +67,29 @@ def most_offset_rad(edges: Points, px_rad: float) -> float:
     return float(np.hypot(EDGE_SIDE_MOST_PX * px_rad, EDGE_SIDE_MOST_OF_GAP * np.median(edges.gap_rad)))
 
 
-def _sides(edges: Points) -> Iterator[tuple[Points, Points, int]]:
-    """Edges of each side, near ones and far ones, and the image's axis across which their boundaries lie."""
-    range_m = np.linalg.norm(edges.xyz_m, axis=1)
-    for side, axis in _AXIS.items():
-        mine = edges.side == side
-        is_near = mine & (range_m < np.median(range_m[mine])) if mine.any() else mine
-        if is_near.any():
-            yield edges.chosen(is_near), edges.chosen(mine & ~is_near), axis
+def _apart_px(terms: Terms, state: AlignmentState, kernel: KernelSettings, sides: tuple[int, int]) -> float:
+    """Far less near, RMS over the sides; 0 where no side has enough edges to pull the solution."""
+    range_m, focal_px = np.linalg.norm(terms.edges.xyz_m, axis=1), float(terms.camera[1])
+    far_less_near, gap_px = [], 0.0
+    for side in sides:
+        mine = terms.edges.side == side
+        if kernel.edge_weight <= 0 or np.count_nonzero(mine) < 2 * _FEWEST:
+            continue
+        is_far = range_m >= np.median(range_m[mine])
+        near_px, far_px = (
+            _offset_px(shift_score(terms, state.alone, kernel, side, keep), kernel.edge_weight)
+            for keep in (mine & ~is_far, mine & is_far)
+        )
+        far_less_near.append(far_px - near_px)
+        gap_px = float(np.median(terms.edges.gap_rad[mine])) * focal_px
+    if not far_less_near:
+        return 0.0
+    one_sided_px = EDGE_SIDE_ALONE * float(np.hypot(1.0, gap_px)) if len(far_less_near) == 1 else 0.0
+    return float(np.hypot(np.sqrt(np.mean(np.square(far_less_near))), one_sided_px))
 
 
-def _seen_off(terms: Terms, axis: int, off_px: float) -> Terms:
-    """With the principal point moved along one axis of the image."""
-    camera = terms.camera.copy()
-    camera[3 + axis] += np.float32(off_px)
-    return replace(terms, camera=camera)
+def _offset_px(score: Float[np.ndarray, " S"], weight: float) -> float:
+    """Mean offset by a score that weighs as much as it does in the fit."""
+    log_density = min(weight, 1.0) * score - 0.5 * (SHIFTS_PX / _OFFSET_SIGMA_PX) ** 2
+    density = np.exp(log_density - log_density.max())
+    return float(density @ SHIFTS_PX / density.sum())

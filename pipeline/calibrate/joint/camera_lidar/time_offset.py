@@ -1,14 +1,14 @@
 """The camera's time offset: the score's profile over it, with the log's focal length.
 
-What the car passes grows in the image with the time offset as it does with focal length and with tz. Left free
-together, the three wander along their valley: on simulated highways the focal length by 2 %, six of its sigmas, and the
-time offset by 20 to 30 ms. With the focal length at the log's and tz fixed, edges determine the time offset to a few
-milliseconds. So it is stepped both ways through its valley, the pose is solved again at each step, and what focal
-length and tz leave open is carried into its sigma.
+Images of passed objects grow with the time offset as with focal length and with tz. Free together, the three
+drift along their valley: on simulated highways the focal length by 2 %, six of its sigmas, and the time
+offset by 20 to 30 ms. With the log's focal length and a fixed tz, edges determine the time offset to a few
+milliseconds. It is therefore stepped through its valley, the pose is solved again at each step, and the
+uncertainty of focal length and tz is added to its sigma.
 
-The profile is that of edges which are in sight at every offset that may be (`Terms.seen_throughout`). With the others a
-fisheye on a highway was 110 to 160 ms off, at a sigma of 10: pushed ahead by four metres, the rails beside the car came
-into view and matched, as rails do wherever on them one looks.
+The profile is of edges in sight at every possible offset (`Terms.seen_throughout`). With the others a fisheye
+on a highway was 110 to 160 ms off, at a sigma of 10: four metres ahead, the rails beside the car came into
+view and matched, as rails do everywhere.
 
 Sources: profile likelihood: Murphy & van der Vaart 2000; parameters considered, not solved for: Schmidt 1966.
 """
@@ -53,12 +53,9 @@ def s_per_metre(terms: Terms, state: AlignmentState) -> float:
 def profile_time_offset(
     scored: Scored, state: AlignmentState, fixed: Bool[np.ndarray, " 8"]
 ) -> TimeOffsetProfile:
-    """Step the time offset away from a solution to both sides, as long as that helps; solve the pose at each step.
+    """Step the time offset to both sides of a solution while the score rises; solve the pose at each step.
 
-    Args:
-        scored: points, a sharp weighted kernel, and the prior of pose and time offset.
-        state: a solution; its focal length is put back to the log's.
-        fixed: of the pose, besides time offset and focal length.
+    `fixed` are unknowns of the pose besides time offset and focal length; the focal length is the log's.
     """
     speed_mps = float(np.sqrt(np.mean(np.sum(scored.terms.velocity_lidar**2, axis=1))))
     step_s = min(SCHEDULE.time_offset_step_m / max(speed_mps, 1.0), SCHEDULE.time_offset_max_step_s)
@@ -99,11 +96,9 @@ def _ends(
 def far_time_offset(
     terms: Terms, state: AlignmentState, kernel: KernelSettings, rng: np.random.Generator
 ) -> tuple[float, float]:
-    """The time offset within a second at which edges match far better than around it, however far from the state's.
+    """Time offset within a second at which edges match far better than around it [s], at any distance.
 
-    Returns:
-        The state's dt there [s], and by how many standard errors it stands out more than the state's own; 0 where it is
-        the state's own.
+    Also returns its lead over the state's own in standard errors; 0 if it is the state's own.
     """
     some = terms.at_most(_FAR_EDGES, rng).of_kinds(edges=True, markings=False)
     speed_mps = float(np.sqrt(np.mean(np.sum(terms.velocity_lidar**2, axis=1))))
@@ -133,10 +128,10 @@ def _maximum(value: Float[np.ndarray, "S N"]) -> Float[np.ndarray, " S"]:
 def _frame_scores(scored: Scored, state: AlignmentState) -> Float[np.ndarray, " F"]:
     """Score of each frame, mean over a ball in which it is rough, and its share of the prior.
 
-    Of the edges alone, where there are any. Markings run along the car's way and hardly tell where on it they are; what
-    they say of time is how many of them come into sight, a slope that put three days of 16 rings 30 to 60 ms off, where
-    edges were 1 to 12 ms off (tuning days 110 to 121: RMS 23 ms by both, 4.3 by edges). Nor are wide edges asked,
-    where there are others.
+    By edges alone, if there are any. Markings run along the car's way and hardly determine the time: only
+    their number in sight depends on it, a slope that put three days of 16 rings 30 to 60 ms off, where edges
+    were 1 to 12 ms off (tuning days 110 to 121: RMS 23 ms by both, 4.3 by edges). Wide edges are left out
+    too, if there are others.
     """
     terms = scored.terms
     if len(terms.edges.xyz_m) and scored.kernel.edge_weight > 0:

@@ -1,8 +1,8 @@
-"""Parts of camera-lidar's evidence against each other: where each alone would put pitch and yaw.
+"""Parts of camera-lidar's evidence against each other: pitch and yaw by each alone.
 
-The fit takes their mean, and its sigma is as small as if they agreed. Where a surface of the cloud has no border in the
-labels (the sill of a car's window, whose nearest border is the roof), one kind of edge is biased by a degree, and
-neither halves nor held-out frames show it: they share the bias.
+The fit takes their mean, and its sigma is as small as if they agreed. If a surface of the cloud has no border
+in the labels (the sill of a car's window, whose nearest border is the roof), one kind of edge is biased by a
+degree; halves and held-out frames do not show it, because they share the bias.
 """
 
 from __future__ import annotations
@@ -76,10 +76,11 @@ def ask_witnesses(
     seed: int,
     fit_sigma_rad: Sequence[float],
 ) -> list[Witness]:
-    """Where each side of the edges, the markings, and detected boxes would turn the solution about camera x and y.
+    """Rotations about camera x and y by each side of the edges, the markings, and detected boxes alone.
 
-    Each score's maximum within 2 deg, the other unknowns as they are, and the boxes' median; sigma by resampling blocks
-    of frames, so that a score of several maxima is unsure. The fit itself is among them, with its sigmas of pitch, yaw.
+    Each score's maximum within 2 deg, other unknowns unchanged, and the boxes' median; sigmas by resampling
+    blocks of frames, so that a score of several maxima is uncertain. The fit itself is included, with its
+    sigmas of pitch and yaw.
     """
     px_rad = 1 / float(terms.camera[1])
     steps = int(_REACH_RAD / (_STEP_PX * px_rad))
@@ -110,7 +111,7 @@ def _boxes(
     blocks: Int[np.ndarray, " F"],
     seed: int,
 ) -> list[Witness]:
-    """Where boxes of a detector, which knows no label map, would turn the solution."""
+    """Rotation of the solution by boxes of a detector, which are independent of the label maps."""
     T = np.tile(np.eye(4), (len(poses), 1, 1))
     T[:, :3] = poses.reshape(-1, 3, 4)
     frame, offset = box_offsets(observations, T)
@@ -182,10 +183,10 @@ def _maximum(
     blocks: Int[np.ndarray, " F"],
     rng: np.random.Generator,
 ) -> tuple[float, float]:
-    """Turn at the highest score, and its scatter over resampled blocks [rad].
+    """Rotation at the highest score, and its scatter over resampled blocks [rad].
 
-    A maximum that leads over the fit's own place by a few nats is none: where no paint is, its score is flat, and the
-    same few points put its maximum 1 to 2 deg off in every resample (worlds whose lidar is blind to markings).
+    A maximum must lead over the fit's own place by a few nats. Without paint the score is flat, and the same
+    few points put its maximum 1 to 2 deg off in every resample (worlds whose lidar is blind to markings).
     """
     names, index = np.unique(blocks, return_inverse=True)
     if len(names) < _FEWEST_BLOCKS:
