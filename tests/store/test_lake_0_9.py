@@ -56,7 +56,7 @@ _OF_A_RUN = ("work_key", "recorded_at", "asserted_at", "inputs")
 _RETIRED = ("trio",)  # columns that are no more
 _NUMBER = re.compile(r"[-+]?\d+\.\d+(?:[eE][-+]?\d+)?|[-+]?\d+[eE][-+]?\d+")
 _STAMP = re.compile(r"20\d\d-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{6}Z")
-_KEY = re.compile(r"\b[0-9a-f]{20}\b")
+_KEY = re.compile(r"(?<!\.)\b[0-9a-f]{20}\b")  # no decimals of a number
 
 
 def told(*arguments):
