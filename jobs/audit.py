@@ -38,9 +38,9 @@ def audit(
     )
     from pipeline.calibrate.methods import method_named
     from pipeline.config import load_fleet
+    from pipeline.stage_work import Task, Window
     from pipeline.stages import AUDIT, REPORT, STATE
     from pipeline.store.partitions import Lake
-    from pipeline.work import Task, Window
     from schemas.drift import DRIFT, DRIFT_STATUSES
 
     if method is not None:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from pipeline.work import Task
+    from pipeline.stage_work import Task
 
 __all__ = ["calibrate", "parse_pair", "parse_perturb"]
 
@@ -46,8 +46,8 @@ def calibrate(
     from pipeline.config import load_fleet
     from pipeline.errors import ConfigError
     from pipeline.extrinsics.prior import require_named_files
+    from pipeline.stage_work import Task
     from pipeline.store.partitions import Lake, Partition
-    from pipeline.work import Task
 
     if page is not None and frame is None:
         raise ConfigError(

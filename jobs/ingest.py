@@ -23,10 +23,10 @@ def ingest(*logs: str, fleet: Path, lake: str, vehicle: str, day: str) -> int:
     from pipeline.errors import ConfigError
     from pipeline.extrinsics.prior import require_named_files
     from pipeline.fleet.ledger import record_outcome
+    from pipeline.stage_work import Task
     from pipeline.stages import INGEST
     from pipeline.store.partitions import Lake, Partition, last_possible_day
     from pipeline.store.remote_logs import log_at
-    from pipeline.work import Task
 
     if not logs:
         raise ConfigError("command line", "LOG", "name at least one log of the day")

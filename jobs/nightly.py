@@ -226,10 +226,10 @@ def close_night(
     from jobs.terminal.summary import progress_reporter
     from pipeline.fleet.pages import OnWorkers
     from pipeline.report.stage import Pages
+    from pipeline.stage_work import Task, Window
     from pipeline.stages import AUDIT, REPORT, STATE
     from pipeline.store.files import LocalFiles
     from pipeline.store.partitions import Partition
-    from pipeline.work import Task, Window
     from schemas.drift import DRIFT
 
     with progress_reporter("audit") as progress:

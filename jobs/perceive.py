@@ -20,9 +20,9 @@ def perceive(*, fleet: Path, lake: str, vehicle: str, day: str) -> int:
     from pipeline.config import load_fleet
     from pipeline.extrinsics.prior import require_named_files
     from pipeline.fleet.ledger import record_outcome
+    from pipeline.stage_work import Task
     from pipeline.stages import PERCEIVE
     from pipeline.store.partitions import Lake, Partition
-    from pipeline.work import Task
 
     config = load_fleet(fleet)
     require_named_files(config)

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from pipeline.learn.prepare.inventory import Inventory
     from pipeline.learn.prepare.sides import Choice
     from pipeline.results import Outcome
+    from pipeline.stage_work import Task
     from pipeline.store.partitions import Lake, Partition
-    from pipeline.work import Task
 
 __all__ = ["days_with_observations", "prepare"]
 
@@ -120,7 +120,7 @@ def _plan(
     from pipeline.learn.prepare.sides import price_choices, settled_keys
     from pipeline.learn.prepare.split import SplitPlan, Unit
     from pipeline.learn.prepare.survey import plan_days, survey_day
-    from pipeline.work import Task
+    from pipeline.stage_work import Task
 
     surveys = []
     with progress_reporter("survey") as progress:

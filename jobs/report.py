@@ -39,9 +39,9 @@ def report(
     from pipeline.errors import ConfigError
     from pipeline.report.stage import Pages, write_day_picture
     from pipeline.report.truth import read_truth
+    from pipeline.stage_work import Task, Window
     from pipeline.stages import REPORT
     from pipeline.store.partitions import Lake, Partition
-    from pipeline.work import Task, Window
 
     if (vehicle is None) != (day is None):
         raise ConfigError("command line", "vehicle, day", "a day's page needs both --vehicle and --day")

@@ -45,9 +45,9 @@ def train_radar_drivable(  # options of the command
     from jobs.terminal.summary import progress_reporter
     from jobs.train import parse_duration, report_training
     from pipeline.config import load_fleet
-    from pipeline.learn.perception.radar_drivable.network import export_drivable
-    from pipeline.learn.perception.radar_drivable.samples import drivable_samples
-    from pipeline.learn.perception.radar_drivable.training import DrivableTraining, train_drivable
+    from pipeline.learn.perception_training.radar_drivable.network import export_drivable
+    from pipeline.learn.perception_training.radar_drivable.samples import drivable_samples
+    from pipeline.learn.perception_training.radar_drivable.training import DrivableTraining, train_drivable
     from pipeline.store.partitions import Lake
 
     limit = None if time_limit is None else parse_duration(time_limit, "time-limit")

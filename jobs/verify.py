@@ -11,10 +11,10 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pipeline.config import FleetConfig
-    from pipeline.in_use.one_axis import AxisCheck
     from pipeline.results import Progress
     from pipeline.rig.graph import Sensor
     from pipeline.store.partitions import Lake, Partition
+    from pipeline.verify.one_axis import AxisCheck
 
 __all__ = ["verify"]
 
@@ -66,9 +66,9 @@ def verify(
     from pipeline.config import load_fleet
     from pipeline.errors import ConfigError
     from pipeline.extrinsics.prior import require_named_files
-    from pipeline.in_use.axes import answer_of, answer_of_sensors, answers_by_sensor
-    from pipeline.in_use.one_log import for_one_look
     from pipeline.store.partitions import Lake
+    from pipeline.verify.axes import answer_of, answer_of_sensors, answers_by_sensor
+    from pipeline.verify.one_log import for_one_look
 
     if not logs:
         raise ConfigError("command line", "LOG", "name at least one log of the car")
@@ -171,10 +171,10 @@ def _checked(
 
     `of`: the vehicle, and for a rig of many sensors those without a pose in the calibration in use.
     """
-    from pipeline.in_use.axes import check_axes, limits_of
-    from pipeline.in_use.one_log import check_poses, prior_in_use
     from pipeline.store.partitions import Partition
     from pipeline.store.records import read_records
+    from pipeline.verify.axes import check_axes, limits_of
+    from pipeline.verify.one_log import check_poses, prior_in_use
     from schemas.calibrations import CALIBRATIONS, CalibrationRecord
     from schemas.poses import POSES, PoseRow
 
@@ -206,9 +206,9 @@ def _calibrate(
     """Calibrate from the log, with the calibration in use as prior."""
     from dataclasses import replace
 
-    from pipeline.in_use.one_log import prior_in_use, with_prior
+    from pipeline.stage_work import Task
     from pipeline.stages import CALIBRATE, INGEST, PERCEIVE
-    from pipeline.work import Task
+    from pipeline.verify.one_log import prior_in_use, with_prior
 
     task = Task(config, lake, partition, method="joint", logs=logs, progress=progress)
     for stage in (INGEST, PERCEIVE):
@@ -222,9 +222,9 @@ def _calibrate(
 def _write_page(
     config: FleetConfig, lake: Lake, partition: Partition, checks: list[AxisCheck], page: Path
 ) -> None:
-    from pipeline.in_use.axes import answer_of
     from pipeline.report.in_use import in_use_view
     from pipeline.report.stage import write_day_page
+    from pipeline.verify.axes import answer_of
 
     view = in_use_view(answer_of(checks), [_told(c) for c in checks])
     write_day_page(lake, partition, config, page, "joint", in_use=view)

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
     from pipeline.convert.recording import Recording
     from pipeline.fleet.pattern import VehicleDay
-    from pipeline.in_use.log_set import LogJob, SetSettings
     from pipeline.store.partitions import Lake
+    from pipeline.verify.log_set import LogJob, SetSettings
     from schemas.set_checks import SetCheck
 
 __all__ = ["verify_set"]
@@ -74,14 +74,14 @@ def verify_set(
     from pipeline.config import load_fleet
     from pipeline.errors import ConfigError
     from pipeline.extrinsics.prior import require_named_files
-    from pipeline.in_use.claims import judged_claims, register
-    from pipeline.in_use.log_set import SetSettings
-    from pipeline.in_use.one_log import for_one_look
-    from pipeline.in_use.rates import looks_of
-    from pipeline.in_use.together import one_verdict_each
     from pipeline.stages import CALIBRATE, INGEST, PERCEIVE
     from pipeline.store.partitions import Lake
     from pipeline.store.records import read_records
+    from pipeline.verify.claims import judged_claims, register
+    from pipeline.verify.log_set import SetSettings
+    from pipeline.verify.one_log import for_one_look
+    from pipeline.verify.rates import looks_of
+    from pipeline.verify.together import one_verdict_each
     from schemas.set_checks import SET_CHECKS, SetCheck
 
     if executor == "ray":
@@ -152,7 +152,7 @@ def _job_of(folder: Path, recording: Recording) -> LogJob:
     from functools import partial
 
     from pipeline.convert.log_file import write_log
-    from pipeline.in_use.log_set import LogJob
+    from pipeline.verify.log_set import LogJob
 
     cameras = {n: (c.K.tolist(), c.D.tolist()) for n, c in recording.cameras.items()}
     told = {n: T.tolist() for n, T in recording.T_base.items()}, cameras
@@ -172,8 +172,8 @@ def _jobs(
     from dataclasses import replace
 
     from pipeline.errors import BoresightError
-    from pipeline.in_use.log_set import LogJob, key_of_log
     from pipeline.ingest.containers.reader import content_identity
+    from pipeline.verify.log_set import LogJob, key_of_log
 
     done = defaultdict(list)
     for row in before:
@@ -209,7 +209,7 @@ def _ask(
     """Rows of all logs; those that are recorded whole are not asked again."""
     from jobs.terminal.night_view import night_view
     from pipeline.fleet.executor import EXECUTORS
-    from pipeline.in_use.log_set import ask_set, is_complete
+    from pipeline.verify.log_set import ask_set, is_complete
 
     rows = [row for job in jobs if is_complete(settings, job) for row in job.done]
     todo = [job for job in jobs if not is_complete(settings, job)]
@@ -224,7 +224,7 @@ def _ask(
 def _summary(rows: Sequence[SetCheck], looks: Sequence[Any], together: Sequence[Any]) -> dict[str, Any]:
     from collections import Counter
 
-    from pipeline.in_use.rates import by_fault, by_sensor, by_shipped, by_turn
+    from pipeline.verify.rates import by_fault, by_sensor, by_shipped, by_turn
 
     silent = [r for r in rows if not r.sensor]
     return {

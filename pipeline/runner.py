@@ -16,12 +16,12 @@ from pipeline.config import config_hash
 from pipeline.errors import BoresightError, ContractError, DamagedError, TooMuchMemoryError
 from pipeline.memory import at_most
 from pipeline.results import Outcome, Progress, measured
+from pipeline.stage_work import NothingUsable, Run, Task, Window, Work
 from pipeline.store.commits import assert_records, commit_last, commit_records
 from pipeline.store.moments import MomentWriter, is_whole, write_moments
 from pipeline.store.partitions import Partition, work_key
 from pipeline.store.records import read_records
 from pipeline.store.tables import Manifest, PartitionWriter, absence, read_manifest, write_partition
-from pipeline.work import NothingUsable, Run, Task, Window, Work
 from schemas.columns import TableSchema
 from schemas.versions import CODE_VERSION
 

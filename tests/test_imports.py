@@ -34,11 +34,11 @@ FOUNDATIONS = {
     "rows",
     "shipped_models",
     "third_party_models",
-    "work",
+    "stage_work",
 }
 # Folders of commands.
 ROOMS = {
-    "ingest", "perceive", "calibrate", "evaluate", "audit", "report", "fleet", "simulate", "learn", "in_use",
+    "ingest", "perceive", "calibrate", "evaluate", "audit", "report", "fleet", "simulate", "learn", "verify",
     "export", "convert", "view",
 }  # fmt: skip
 # Beside the rooms: the table of contents, which knows them all, and what runs a stage of it.

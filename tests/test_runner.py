@@ -20,12 +20,12 @@ from pipeline.learn.prepare.split import SplitPlan
 from pipeline.report.stage import Pages
 from pipeline.results import Outcome
 from pipeline.runner import Stage, try_stage, why_to_run
+from pipeline.stage_work import NothingUsable, Records, Run, Task, Told, Window, Work
 from pipeline.stages import CALIBRATE, PERCEIVE, PREPARE, REPORT, STAGES
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
 from pipeline.store.tables import read_manifest
 from pipeline.store.views import observations_of, perceived
-from pipeline.work import NothingUsable, Records, Run, Task, Told, Window, Work
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from schemas.features import FEATURES
 from schemas.moments import FILES, PERCEIVED
@@ -147,7 +147,7 @@ from pathlib import Path
 from pipeline.config import load_fleet
 from pipeline.runner import Stage
 from pipeline.store.partitions import Lake, Partition
-from pipeline.work import Task, Work
+from pipeline.stage_work import Task, Work
 from schemas.features import FEATURES
 from schemas.moments import PERCEIVED
 from tests.makers.lakes import joined_of

@@ -24,6 +24,7 @@ from pipeline.errors import ConfigError
 from pipeline.results import Progress
 from pipeline.rig.edges import edge_of
 from pipeline.rig.graph import EDGE_KINDS, KINDS, Edge, edge_between
+from pipeline.stage_work import Records, Task, Told, Window, Work
 from pipeline.store.partitions import (
     Lake,
     Partition,
@@ -34,7 +35,6 @@ from pipeline.store.partitions import (
     work_key,
 )
 from pipeline.store.records import read_last
-from pipeline.work import Records, Task, Told, Window, Work
 from schemas.calibrations import DOF_NAMES
 from schemas.drift import DRIFT, DriftFinding
 from schemas.service_events import ServiceEvent

@@ -19,9 +19,9 @@ from pipeline.audit.service import events_until, restart_of, what_was_done
 from pipeline.audit.state_rows import fused, with_state
 from pipeline.config import AuditConfig, FleetConfig, config_hash
 from pipeline.rig.graph import Edge
+from pipeline.stage_work import Records, Run, Task, Told, Window, Work
 from pipeline.store.partitions import Partition, content_hash, days_after, last_possible_day, work_key
 from pipeline.store.records import last_day, read_last
-from pipeline.work import Records, Run, Task, Told, Window, Work
 from schemas.calibrations import CALIBRATIONS
 from schemas.drift import DRIFT, DriftFinding
 from schemas.service_events import ServiceEvent

@@ -11,7 +11,7 @@ from pipeline.config import SolveConfig
 from pipeline.errors import ConfigError
 from pipeline.extrinsics.estimates import Prior, Solution
 from pipeline.results import Progress
-from pipeline.work import Task
+from pipeline.stage_work import Task
 from schemas.observations import Observation
 
 __all__ = ["METHODS", "Method", "Solver", "method_named"]

@@ -15,13 +15,13 @@ from pipeline.errors import ConfigError, SolveError
 from pipeline.extrinsics.estimates import Prior, Solution
 from pipeline.extrinsics.prior import perturbed, read_prior
 from pipeline.learn.infer.onnx_networks import model_files, models_key, open_networks
+from pipeline.learn.infer.pitch_by_travel import informed_by_way
 from pipeline.learn.infer.vehicle_day import single_frame_solution, solve_by_networks
-from pipeline.learn.infer.way import informed_by_way
 from pipeline.results import Progress
+from pipeline.stage_work import Task
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.row_groups import read_columns
 from pipeline.store.views import Chosen, frames_of, ingested, observations_of, perceived
-from pipeline.work import Task
 from schemas.calibrations import PAIRS
 from schemas.frames import Frame
 from schemas.moments import PERCEIVED

@@ -27,9 +27,9 @@ from pipeline.rig.overlap import find_edges, overlaps_of
 from pipeline.rig.prior import RigPrior, middle_of, moved
 from pipeline.rig.rig import Rig
 from pipeline.rig.views import FRAMES, View
+from pipeline.stage_work import Task
 from pipeline.store.moments import sensors_of
 from pipeline.store.views import Chosen, observations_of, perceived
-from pipeline.work import Task
 from schemas.calibrations import SENSORS, CalibrationRecord, pairs_of
 from schemas.moments import PRIOR
 from schemas.observations import Observation

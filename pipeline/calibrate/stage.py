@@ -17,10 +17,10 @@ from pipeline.extrinsics.prior import prior_key
 from pipeline.results import Outcome
 from pipeline.rig.edges import edge_of, words_of
 from pipeline.rig.rig import Rig
+from pipeline.stage_work import Records, Run, Task, Told, Work
 from pipeline.store.moments import sensors_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import ingested, perceived
-from pipeline.work import Records, Run, Task, Told, Work
 from schemas.calibrations import (
     SENSORS,
     STATUSES,

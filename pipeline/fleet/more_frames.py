@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from pipeline.results import Effort, Outcome
+from pipeline.stage_work import Task
 from pipeline.stages import CALIBRATE, INGEST
-from pipeline.work import Task
 from schemas.calibrations import ASKS_FOR_FRAMES
 from schemas.moments import SWEEPS_LOGGED, SWEEPS_PLANNED
 from schemas.radar_alignments import RadarAlignment

@@ -25,9 +25,9 @@ from pipeline.fleet.pattern import VehicleDay
 from pipeline.results import MadeWhenAsked, Outcome, Progress, silent
 from pipeline.rig.edges import edge_of, words_of
 from pipeline.runner import Stage, try_stage
+from pipeline.stage_work import Task
 from pipeline.stages import CALIBRATE, INGEST, PERCEIVE
 from pipeline.store.partitions import Lake, Partition, last_possible_day
-from pipeline.work import Task
 from schemas.calibrations import CalibrationRecord
 from schemas.words import day_word
 

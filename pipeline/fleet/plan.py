@@ -10,8 +10,8 @@ from pipeline.fleet.ledger import Ledger
 from pipeline.fleet.nightly import Night, refused_at_once, task_of
 from pipeline.fleet.pattern import VehicleDay
 from pipeline.runner import why_to_run
+from pipeline.stage_work import Task
 from pipeline.stages import CALIBRATE, INGEST, PERCEIVE
-from pipeline.work import Task
 
 __all__ = ["DayPlan", "plan_night"]
 

@@ -34,7 +34,7 @@ from pipeline.results import Progress
 from pipeline.rig.graph import possible_edges
 from pipeline.rig.prior import Star
 from pipeline.rig.rig import Rig
-from pipeline.work import NothingUsable, Run, Task, Work
+from pipeline.stage_work import NothingUsable, Run, Task, Work
 from schemas.captures import Capture
 from schemas.faults import FAULTS
 from schemas.moments import (

@@ -31,9 +31,9 @@ from pipeline.rig.graph import BASE, Kind, Sensor, possible_edges
 from pipeline.rig.prior import Star, between
 from pipeline.rig.rig import Rig
 from pipeline.rigs import LidarTopics, OnnxSemantics, RadarTopics, TopicSemantics
+from pipeline.stage_work import NothingUsable, Run, Task, Work
 from pipeline.store.moments import joined, sensors_of
 from pipeline.store.views import logged_stars
-from pipeline.work import NothingUsable, Run, Task, Work
 from schemas.captures import Capture, Sweep
 from schemas.faults import FAULTS
 from schemas.moments import MOMENTS, PRIOR, SAME_SCENE_NS, SENSORS_ABSENT, Moment, Perceived

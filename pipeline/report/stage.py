@@ -16,9 +16,9 @@ from pipeline.report.upkeep import Album, FanOut, draw_days, one_by_one, stamp_o
 from pipeline.report.verdicts import read_verdicts
 from pipeline.report.window import read_window
 from pipeline.results import Progress, silent
+from pipeline.stage_work import Run, Task, Work
 from pipeline.store.files import Files, LocalFiles
 from pipeline.store.partitions import Lake, Partition, last_possible_day
-from pipeline.work import Run, Task, Work
 
 __all__ = ["Pages", "work", "write_day_page", "write_day_picture", "write_fleet_report"]
 

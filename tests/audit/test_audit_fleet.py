@@ -13,12 +13,12 @@ from pipeline.config import AuditConfig, FleetConfig
 from pipeline.errors import ConfigError
 from pipeline.geometry.changes import change_between
 from pipeline.geometry.se3 import exp_so3, from_quaternion, from_rotation_translation, to_quaternion
+from pipeline.stage_work import Task, Window
 from pipeline.stages import AUDIT
 from pipeline.store.commits import commit_records
 from pipeline.store.current import current_drift
 from pipeline.store.partitions import Lake
 from pipeline.store.records import read_records
-from pipeline.work import Task, Window
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.drift import DRIFT, DriftFinding
 from schemas.service_events import SERVICE_EVENTS, ServiceEvent

@@ -8,11 +8,11 @@ import pytest
 from jobs.service import service
 from pipeline.config import load_fleet
 from pipeline.errors import ConfigError
+from pipeline.stage_work import Task, Window
 from pipeline.stages import AUDIT, STATE
 from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake
 from pipeline.store.records import read_records
-from pipeline.work import Task, Window
 from schemas.calibrations import CALIBRATIONS
 from schemas.drift import DriftFinding
 from schemas.service_events import SERVICE_EVENTS, ServiceEvent

@@ -14,10 +14,10 @@ from jobs.show import show
 from jobs.terminal.vehicle_status import count_statuses
 from pipeline.config import FleetConfig
 from pipeline.errors import ConfigError
+from pipeline.stage_work import Task, Window
 from pipeline.stages import AUDIT, STATE
 from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake
-from pipeline.work import Task, Window
 from schemas.calibrations import CALIBRATIONS
 from schemas.drift import DriftFinding
 from tests.makers.fleet_pages import write_fleet_page

@@ -11,12 +11,12 @@ import pytest
 
 from jobs.cli import main
 from pipeline.config import FleetConfig
+from pipeline.stage_work import Task, Window
 from pipeline.stages import AUDIT, STATE
 from pipeline.store.commits import commit_records
 from pipeline.store.current import current_events
 from pipeline.store.partitions import Lake
 from pipeline.store.records import read_records
-from pipeline.work import Task, Window
 from schemas.calibrations import CALIBRATIONS
 from schemas.drift import DRIFT, DriftFinding
 from schemas.radar_alignments import RADAR_ALIGNMENTS, RadarAlignment

@@ -9,11 +9,11 @@ from pipeline.audit import history
 from pipeline.audit.estimates import day_name
 from pipeline.audit.references import read_kept
 from pipeline.rig.edges import EDGE_OF_PAIR
+from pipeline.stage_work import Task, Window
 from pipeline.stages import AUDIT, STATE
 from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake
 from pipeline.store.records import read_records
-from pipeline.work import Task, Window
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.service_events import ServiceEvent
 from schemas.states import STATES, StateRow

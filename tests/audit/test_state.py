@@ -14,10 +14,10 @@ from jobs.state import state
 from pipeline.audit.state import DayEstimate, fuse
 from pipeline.config import FleetConfig
 from pipeline.geometry.se3 import exp_se3, inverse, log_se3
+from pipeline.stage_work import Task, Window
 from pipeline.stages import AUDIT, STATE
 from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake
-from pipeline.work import Task, Window
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.service_events import SERVICE_EVENTS, ServiceEvent
 from schemas.states import StateRow

@@ -15,11 +15,11 @@ from pipeline.ingest.index import DayIndex
 from pipeline.simulate.faults import parse_faults
 from pipeline.simulate.fleet import FleetSpec, simulate_fleet
 from pipeline.simulate.sensors.rigs import rig_named
+from pipeline.stage_work import Task
 from pipeline.stages import CALIBRATE
 from pipeline.store.moments import sensors_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import frames_of, ingested, observations_of, perceived
-from pipeline.work import Task
 from schemas.calibrations import CalibrationRecord
 from schemas.moments import PRIOR, SENSORS_ABSENT
 from schemas.poses import PoseRow

@@ -8,11 +8,11 @@ import pytest
 from pipeline.config import load_fleet
 from pipeline.geometry.se3 import inverse, log_se3
 from pipeline.simulate.fleet import FleetSpec, simulate_fleet
+from pipeline.stage_work import Task
 from pipeline.stages import CALIBRATE
 from pipeline.store.current import current_poses, transform_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
-from pipeline.work import Task
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.poses import POSES, PoseRow
 from tests.makers.stages import ingest_day, perceive_day

@@ -14,12 +14,12 @@ from pipeline.config import FleetConfig
 from pipeline.export.calibration import ExportedPair
 from pipeline.geometry.changes import change_between, change_covariance
 from pipeline.geometry.se3 import exp_se3, inverse
+from pipeline.stage_work import Task, Window
 from pipeline.stages import AUDIT, STATE
 from pipeline.store.commits import commit_records
 from pipeline.store.current import transform_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
-from pipeline.work import Task, Window
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.poses import POSES, PoseRow
 from tests.audit.fleet_records import T_LIDAR_RADAR, vehicle_records

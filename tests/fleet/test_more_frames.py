@@ -18,9 +18,9 @@ from pipeline.fleet.nightly import Night, run_night
 from pipeline.fleet.pattern import VehicleDay
 from pipeline.results import Effort, Outcome
 from pipeline.runner import Stage, why_to_run
+from pipeline.stage_work import Task
 from pipeline.stages import INGEST
 from pipeline.store.partitions import Lake, Partition
-from pipeline.work import Task
 from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, CalibrationRecord
 from schemas.moments import SWEEPS_LOGGED, SWEEPS_PLANNED
 from tests.fleet.test_nightly import DAY, FLEET

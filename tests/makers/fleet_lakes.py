@@ -17,12 +17,12 @@ from pipeline.config import FleetConfig
 from pipeline.fleet.ledger import outcome_row
 from pipeline.geometry.se3 import adjoint, exp_se3, to_quaternion
 from pipeline.results import Outcome
+from pipeline.stage_work import Task, Window
 from pipeline.stages import AUDIT, STATE
 from pipeline.store.commits import commit_records
 from pipeline.store.delta import merge_rows, open_table, stored_schema, tidy_table
 from pipeline.store.partitions import Lake
 from pipeline.store.rows import to_table
-from pipeline.work import Task, Window
 from schemas.calibrations import CALIBRATIONS, PAIRS
 from schemas.drift import DRIFT
 from schemas.outcomes import OUTCOMES

@@ -8,10 +8,10 @@ import pytest
 
 from pipeline.config import load_fleet
 from pipeline.report.stage import write_day_page
+from pipeline.stage_work import Task, Window
 from pipeline.stages import AUDIT
 from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake, Partition
-from pipeline.work import Task, Window
 from schemas.calibrations import CALIBRATIONS
 from tests.audit.fleet_records import vehicle_records
 from tests.audit.test_many_sensors import RIGS, TURN

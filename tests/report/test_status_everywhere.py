@@ -17,12 +17,12 @@ from jobs.cli import main
 from jobs.show import show
 from jobs.terminal.vehicle_status import count_statuses, moved_sensors, next_steps, status_lines
 from pipeline.report.stage import write_day_page
+from pipeline.stage_work import Task, Window
 from pipeline.stages import STATE
 from pipeline.store.commits import commit_records
 from pipeline.store.current import current_drift
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
-from pipeline.work import Task, Window
 from schemas.drift import DRIFT, DRIFT_STATUSES, DriftFinding, next_step, status_of
 from tests.makers.fleet_pages import write_fleet_page
 from tests.makers.stages import audit_fleet

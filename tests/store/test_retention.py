@@ -12,13 +12,13 @@ from pipeline.config import load_fleet
 from pipeline.errors import CollectedError, ConfigError
 from pipeline.report.reading import has_frames
 from pipeline.runner import Stage
+from pipeline.stage_work import Task, Work
 from pipeline.store.moments import sensor_files
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.retention import collect, first_day_kept
 from pipeline.store.row_groups import read_columns
 from pipeline.store.tables import write_partition
 from pipeline.store.views import frames_of, ingested, observations_of
-from pipeline.work import Task, Work
 from schemas.captures import CAPTURES
 from schemas.moments import MOMENTS
 from tests.makers.fleet_files import fleet_toml

@@ -2,9 +2,9 @@
 
 import datetime as dt
 
+from pipeline.stage_work import Task, Window
 from pipeline.stages import AUDIT
 from pipeline.store.partitions import Lake
-from pipeline.work import Task, Window
 from schemas.calibrations import CALIBRATIONS, PAIRS
 from schemas.drift import DRIFT
 from schemas.outcomes import OUTCOMES

@@ -20,8 +20,8 @@ from pipeline.learn.prepare.sides import frame_sides
 from pipeline.learn.prepare.split import SplitPlan, Unit
 from pipeline.learn.prepare.survey import Survey, survey_day
 from pipeline.learn.sample.frame_sample import About, SampleReason, SampleRejectedError, make_row
+from pipeline.stage_work import Run, Task, Work
 from pipeline.store.views import Chosen, frames_of, observations_of
-from pipeline.work import Run, Task, Work
 from schemas.calibrations import PAIRS, SENSORS
 from schemas.frames import Frame
 from schemas.observations import Observation

@@ -15,12 +15,12 @@ from pipeline.learn.network.outputs import Predictions
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import PAIRS
 from pipeline.learn.train.augment import Guess, random_guess, turned_view
+from pipeline.learn.train.domain_randomisation import made_strange
 from pipeline.learn.train.frame_objective import frame_objective, weighted
 from pipeline.learn.train.paper_objective import PaperFrames
 from pipeline.learn.train.running_mean import DayMeans, uncertainty_loss
 from pipeline.learn.train.semantics_loss import class_of_points, semantics_loss
 from pipeline.learn.train.settings import PAIRS_OF, TrainConfig
-from pipeline.learn.train.strangeness import made_strange
 from pipeline.objective.differentiable.poses import pose, transform_points
 
 __all__ = ["Passes", "StepLoss", "batch_loss"]

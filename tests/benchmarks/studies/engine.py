@@ -29,10 +29,10 @@ from pipeline.extrinsics.estimates import Prior
 from pipeline.extrinsics.prior import perturbed, read_prior
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation
 from pipeline.geometry.targets import loop_errors
-from pipeline.in_use.axes import check_axes, limits_of
-from pipeline.learn.perception.radar_drivable.samples import scan_of
+from pipeline.learn.perception_training.radar_drivable.samples import scan_of
 from pipeline.perceive.models.radar_drivable import RadarDrivable
 from pipeline.store.partitions import Partition
+from pipeline.verify.axes import check_axes, limits_of
 from schemas.calibrations import PAIRS, CalibrationRecord
 from schemas.observations import Observation
 from tests.benchmarks.studies.commits import accept_argument, commit_now, is_accepted

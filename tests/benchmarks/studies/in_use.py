@@ -15,7 +15,7 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-from pipeline.in_use.axes import NEEDED_AXES
+from pipeline.verify.axes import NEEDED_AXES
 from schemas.calibrations import PAIRS
 from tests.benchmarks.studies.days import SETS
 from tests.benchmarks.studies.engine import IN_USE_ASKED_DEG, Run, run_study, study_arguments

@@ -30,9 +30,9 @@ from pipeline.simulate.faults import parse_faults
 from pipeline.simulate.fleet import FleetSpec, day_names, simulate_vehicle_day, vehicle_names
 from pipeline.simulate.logs.fleet_toml import fleet_toml
 from pipeline.simulate.sensors.rigs import rig_named
+from pipeline.stage_work import Task, Window
 from pipeline.stages import AUDIT, STATE
 from pipeline.store.partitions import Lake
-from pipeline.work import Task, Window
 from schemas.drift import status_of
 from tests.benchmarks.studies.commits import commit_now
 

@@ -38,11 +38,11 @@ from pipeline.fleet.pages import OnWorkers
 from pipeline.fleet.status import day_statuses
 from pipeline.report.stage import Pages, write_fleet_report
 from pipeline.results import Outcome
+from pipeline.stage_work import Task, Window
 from pipeline.stages import AUDIT, STATE
 from pipeline.store.delta import live_files, open_table
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import last_day, read_records
-from pipeline.work import Task, Window
 from schemas.calibrations import CALIBRATIONS
 from schemas.drift import DRIFT
 from schemas.outcomes import OUTCOMES, OutcomeRow

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.learn.perception.lidar_semantics.training import kind_scores
+from pipeline.learn.perception_training.lidar_semantics.training import kind_scores
 from pipeline.perceive.ground import PointKind, find_ground
 from pipeline.perceive.models.range_image import RangeImageSegmenter
 from pipeline.simulate.fleet import drive_of, mounting_on

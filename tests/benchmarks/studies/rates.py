@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pipeline.in_use.rates import interval
+from pipeline.verify.rates import interval
 
 __all__ = ["interval", "rate"]
 

@@ -18,7 +18,7 @@ from pipeline.geometry.targets import errors_at_targets, loop_errors
 from pipeline.learn.infer.onnx_networks import OnnxNetwork, open_networks
 from pipeline.learn.infer.single_frame import SingleFrameCalibrator
 from pipeline.learn.sample.frame_sample import SampleRejectedError
-from pipeline.work import Task
+from pipeline.stage_work import Task
 from schemas.calibrations import PAIRS
 from schemas.frames import Frame
 from schemas.observations import Observation

@@ -25,8 +25,8 @@ from pipeline.extrinsics.estimates import Prior, Solution
 from pipeline.geometry.targets import errors_at_targets
 from pipeline.learn.infer.frame_network import FrameNetwork
 from pipeline.learn.infer.onnx_networks import open_networks
+from pipeline.learn.infer.pitch_by_travel import informed_by_way
 from pipeline.learn.infer.vehicle_day import single_frame_solution, solve_by_networks
-from pipeline.learn.infer.way import informed_by_way
 from pipeline.store.views import frames_of
 from schemas.calibrations import PAIRS
 from tests.benchmarks.studies.commits import commit_now

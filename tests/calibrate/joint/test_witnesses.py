@@ -7,8 +7,8 @@ from pipeline.calibrate.joint.lidar_radar.witnesses import (
     Witness,
     contradiction,
     doubted,
+    own_equations,
     own_numbers,
-    own_opinion,
 )
 
 
@@ -46,21 +46,21 @@ def test_errors_as_large_as_their_sigmas_seldom_contradict():
     assert 0.01 < np.mean([f is not None for f in found]) < 0.15
 
 
-def test_an_opinion_is_the_step_with_nuisances_following():
+def test_equations_give_the_step_with_nuisances_following():
     H, g = np.array([[4.0, 2.0], [2.0, 3.0]]), np.array([1.0, -1.0])
-    opinion = own_opinion("boxes", H, g, 0.1)
-    assert opinion.offset_rad == pytest.approx(-np.linalg.solve(H, g)[0])
-    assert opinion.sigma_rad == pytest.approx(np.hypot(np.sqrt(3 / 8), 0.1))
-    assert own_numbers([opinion]) == {
-        "boxes_pitch_offset_rad": opinion.offset_rad,
-        "boxes_pitch_sigma_rad": opinion.sigma_rad,
+    equations = own_equations("boxes", H, g, 0.1)
+    assert equations.offset_rad == pytest.approx(-np.linalg.solve(H, g)[0])
+    assert equations.sigma_rad == pytest.approx(np.hypot(np.sqrt(3 / 8), 0.1))
+    assert own_numbers([equations]) == {
+        "boxes_pitch_offset_rad": equations.offset_rad,
+        "boxes_pitch_sigma_rad": equations.sigma_rad,
     }
 
 
-def test_who_has_seen_nothing_has_no_opinion():
-    assert own_opinion("doppler", np.zeros((1, 1)), np.zeros(1), 0.1) is None
+def test_without_data_there_are_no_equations():
+    assert own_equations("doppler", np.zeros((1, 1)), np.zeros(1), 0.1) is None
     # Pitch and its constant cannot be told apart without a prior on the constant.
-    assert own_opinion("boxes", np.ones((2, 2)), np.ones(2), 0.1) is None
+    assert own_equations("boxes", np.ones((2, 2)), np.ones(2), 0.1) is None
 
 
 def test_who_turns_the_radar_further_up_than_displaced_heights_errs_by_that_and_nobody_else():

@@ -9,7 +9,7 @@ from pipeline.calibrate.networks import calibrate_frame
 from pipeline.config import LearnConfig, PrepareConfig
 from pipeline.geometry.targets import errors_at_targets
 from pipeline.learn.infer.onnx_networks import SHIPPED, model_files, open_networks
-from pipeline.work import Task
+from pipeline.stage_work import Task
 from schemas.calibrations import PAIRS
 from tests.makers.simulated_days import simulated_day
 

@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse, log_se3
-from pipeline.learn.infer.way import WayTurn, informed_by_way, updated_by_way, way_turn
+from pipeline.learn.infer.pitch_by_travel import WayTurn, informed_by_way, updated_by_way, way_turn
 from schemas.calibrations import PAIRS
 from tests.makers.doppler_streets import GROUND_M, T_LIDAR_RADAR, day_of, scene, turned
 from tests.makers.solve_scenes import T_CAMERA_LIDAR

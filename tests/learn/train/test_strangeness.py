@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from pipeline.learn.network.inputs import SensorInputs, given_classes
+from pipeline.learn.train.domain_randomisation import made_strange
 from pipeline.learn.train.settings import StrangeConfig, TrainConfig
-from pipeline.learn.train.strangeness import made_strange
 
 FRAMES = 24
 ALL = StrangeConfig(image=1, classes=1, no_classes=0.3, no_image=0.3, lidar=1, fewer_rows=0.5)

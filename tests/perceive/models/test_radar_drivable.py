@@ -10,9 +10,13 @@ import torch
 from pipeline.config import FleetConfig, config_hash
 from pipeline.errors import ModelError
 from pipeline.geometry.radar_grid import SHAPE, sector_of
-from pipeline.learn.perception.radar_drivable.network import build_drivable_network, export_drivable
-from pipeline.learn.perception.radar_drivable.samples import day_samples, scan_of
-from pipeline.learn.perception.radar_drivable.training import DrivableTraining, probabilities, train_drivable
+from pipeline.learn.perception_training.radar_drivable.network import build_drivable_network, export_drivable
+from pipeline.learn.perception_training.radar_drivable.samples import day_samples, scan_of
+from pipeline.learn.perception_training.radar_drivable.training import (
+    DrivableTraining,
+    probabilities,
+    train_drivable,
+)
 from pipeline.perceive.models.radar_drivable import RadarDrivable
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import observations_of

@@ -27,7 +27,7 @@ from pipeline.calibrate.joint.lidar_radar.tilt_floors import (
     tempered,
     tilt_of,
 )
-from pipeline.calibrate.joint.lidar_radar.witnesses import Witness, own_opinion
+from pipeline.calibrate.joint.lidar_radar.witnesses import Witness, own_equations
 from pipeline.calibrate.numerics.bias_floors import BOX_ROLL_FLOOR_LIDAR_RAD
 from pipeline.geometry.changes import change_between
 from pipeline.objective.radar.heights import Heights
@@ -40,8 +40,8 @@ __all__ = [
     "add_elevations",
     "add_heights",
     "add_travel",
-    "height_opinion",
-    "travel_opinion",
+    "height_equations",
+    "travel_equations",
     "turned",
 ]
 
@@ -68,7 +68,7 @@ def add_boxes(
     Hb, gb = Hb[:, own[:, None], own], gb[:, own]
     prior = np.diag([0.0, *[1 / BIAS_SIGMA_RAD**2] * len(BOX_CLASSES)])
     H_own, g_own = tilt_of(state.T_lidar_radar, Hb.sum(0), gb.sum(0))
-    witness = own_opinion("boxes", H_own[1:, 1:] + prior, g_own[1:] + prior @ [0.0, *state.bias_rad], 0.0)
+    witness = own_equations("boxes", H_own[1:, 1:] + prior, g_own[1:] + prior @ [0.0, *state.bias_rad], 0.0)
     doubt_rad = problem.doubt_rad.get("boxes", 0.0)
     floor = along_radar(state.T_lidar_radar, _BOX_FLOOR + doubt_rad * (np.arange(len(_BOX_FLOOR)) == 1))
     columns = np.array([0, 1, *range(CLASSES.start, CLASSES.stop)])
@@ -81,19 +81,19 @@ def add_travel(problem: RadarProblem, state: RadarState, sums: Sums) -> tuple[fl
     if problem.travel is None:
         return float("nan"), None
     H, g, scatter = pitch_equations(problem.travel, state.T_lidar_radar, len(sums.g))
-    witness = travel_opinion(problem, state)
+    witness = travel_equations(problem, state)
     floor = (DOPPLER_PITCH_FLOOR_RAD**2 + problem.doubt_rad.get("doppler", 0.0) ** 2) * np.eye(2)
     _add_tilts(problem, state, "doppler", np.arange(2), H, g, floor, sums)
     return scatter, witness
 
 
-def travel_opinion(problem: RadarProblem, state: RadarState) -> Witness | None:
+def travel_equations(problem: RadarProblem, state: RadarState) -> Witness | None:
     """What the car's way says of pitch at a state; None where it says nothing."""
     if problem.travel is None:
         return None
     H, g, _ = pitch_equations(problem.travel, state.T_lidar_radar, len(problem.observations))
     H_own, g_own = tilt_of(state.T_lidar_radar, H.sum(0), g.sum(0))
-    return own_opinion("doppler", H_own[1:, 1:], g_own[1:], DOPPLER_PITCH_FLOOR_RAD)
+    return own_equations("doppler", H_own[1:, 1:], g_own[1:], DOPPLER_PITCH_FLOOR_RAD)
 
 
 def add_heights(problem: RadarProblem, state: RadarState, sums: Sums) -> Witness | None:
@@ -101,13 +101,13 @@ def add_heights(problem: RadarProblem, state: RadarState, sums: Sums) -> Witness
     if problem.heights is None:
         return None
     H, g = _height_equations(problem.heights, state.T_lidar_radar, len(sums.g))
-    witness = height_opinion(problem, state)
+    witness = height_equations(problem, state)
     floor = problem.heights.floor_rad**2 * np.diag([1.0, 1.0, 0.0])
     _add_tilts(problem, state, "heights", ELEVATION_DOF, H, g, floor, sums)
     return witness
 
 
-def height_opinion(problem: RadarProblem, state: RadarState) -> Witness | None:
+def height_equations(problem: RadarProblem, state: RadarState) -> Witness | None:
     """What displaced heights say of pitch at a state; None where they say nothing."""
     if problem.heights is None:
         return None
@@ -115,7 +115,7 @@ def height_opinion(problem: RadarProblem, state: RadarState) -> Witness | None:
     H_own, g_own = tilt_of(state.T_lidar_radar, H.sum(0), g.sum(0))
     by_height = problem.heights.per_height_radpm * problem.prior.translation_sigma_m
     floor_rad = float(np.hypot(problem.heights.floor_rad, by_height))
-    return own_opinion("heights", H_own[1:2, 1:2], g_own[1:2], floor_rad)
+    return own_equations("heights", H_own[1:2, 1:2], g_own[1:2], floor_rad)
 
 
 def _height_equations(

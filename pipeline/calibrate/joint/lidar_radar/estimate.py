@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 
 from pipeline.calibrate.joint.lidar_radar.conclusions import ObservabilityAnalysis, diagnostics_of, notes_of
 from pipeline.calibrate.joint.lidar_radar.elevation_spread import beam_spacing, elevation_spread
-from pipeline.calibrate.joint.lidar_radar.elevation_terms import height_opinion, travel_opinion
+from pipeline.calibrate.joint.lidar_radar.elevation_terms import height_equations, travel_equations
 from pipeline.calibrate.joint.lidar_radar.measured_curvature import with_measured_curvature
 from pipeline.calibrate.joint.lidar_radar.own_position import own_position
 from pipeline.calibrate.joint.lidar_radar.problem import (
@@ -232,7 +232,7 @@ def _with_way(
     has_static = "static" in problem.terms
     heights = displaced_heights(about[0], level, about[2], rng.spawn(1)[0]) if has_static else None
     seeing = replace(problem, travel=travel, heights=heights, seen_low=seen_low_of(travel, heights))
-    added = travel_opinion(seeing, state), height_opinion(seeing, state)
+    added = travel_equations(seeing, state), height_equations(seeing, state)
     witnesses = [seeing.seen_low.expected(w) for w in (*linear.witnesses, *added) if w is not None]
     doubt_rad = doubted(witnesses)
     wider = tuple(

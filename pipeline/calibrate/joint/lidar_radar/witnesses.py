@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-__all__ = ["Contradiction", "Witness", "contradiction", "doubted", "own_numbers", "own_opinion"]
+__all__ = ["Contradiction", "Witness", "contradiction", "doubted", "own_equations", "own_numbers"]
 
 _SIGMAS = 2.0  # from which two witnesses contradict each other
 _SINGULAR = 1e-9
@@ -31,7 +31,7 @@ class Contradiction:
     sentence: str
 
 
-def own_opinion(
+def own_equations(
     name: str, H: Float[np.ndarray, "P P"], g: Float[np.ndarray, " P"], floor_rad: float
 ) -> Witness | None:
     """Pitch correction from these equations alone, with sigma; None if pitch is unconstrained.

@@ -12,10 +12,16 @@ from torch.nn import functional
 
 from pipeline.errors import ContractError
 from pipeline.geometry.range_image import EMPTY
-from pipeline.learn.perception.lidar_semantics.labels import GROUND, KIND_OF_LABEL, KINDS, LABELS, UNLABELLED
-from pipeline.learn.perception.lidar_semantics.network import SweepNetwork, build_sweep_network
-from pipeline.learn.perception.lidar_semantics.samples import Normal, SweepImages, normal_of
-from pipeline.learn.perception.trainer import (
+from pipeline.learn.perception_training.lidar_semantics.labels import (
+    GROUND,
+    KIND_OF_LABEL,
+    KINDS,
+    LABELS,
+    UNLABELLED,
+)
+from pipeline.learn.perception_training.lidar_semantics.network import SweepNetwork, build_sweep_network
+from pipeline.learn.perception_training.lidar_semantics.samples import Normal, SweepImages, normal_of
+from pipeline.learn.perception_training.trainer import (
     Task,
     TrainingConfig,
     hash_of_arrays,

@@ -17,8 +17,8 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from pipeline.errors import ConfigError
-from pipeline.in_use.rates import Look, interval
 from pipeline.store.atomic_write import atomic_write
+from pipeline.verify.rates import Look, interval
 
 __all__ = ["judged_claims", "register"]
 

@@ -14,8 +14,8 @@ from pipeline.config import load_fleet
 from pipeline.errors import ConfigError, ContractError
 from pipeline.geometry.radar_grid import cell_centres, sector_mask, sector_of
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation
-from pipeline.learn.perception.radar_drivable.network import build_drivable_network
-from pipeline.learn.perception.radar_drivable.samples import (
+from pipeline.learn.perception_training.radar_drivable.network import build_drivable_network
+from pipeline.learn.perception_training.radar_drivable.samples import (
     BLOCKED,
     FREE,
     UNKNOWN,
@@ -23,7 +23,11 @@ from pipeline.learn.perception.radar_drivable.samples import (
     label_grid,
     samples_of_day,
 )
-from pipeline.learn.perception.radar_drivable.training import DrivableTraining, area_iou, train_drivable
+from pipeline.learn.perception_training.radar_drivable.training import (
+    DrivableTraining,
+    area_iou,
+    train_drivable,
+)
 from pipeline.learn.train.checkpoints import load_checkpoint
 from pipeline.perceive.drivable import free_sector
 from pipeline.rows import take_rows

@@ -12,7 +12,12 @@ from pipeline.config import FleetConfig, VerifyConfig
 from pipeline.errors import SolveError
 from pipeline.extrinsics.prior import rig_prior
 from pipeline.geometry.sensor_turns import TURN_AXES
-from pipeline.in_use.axes import (
+from pipeline.rig.edges import edge_of
+from pipeline.rig.graph import Sensor
+from pipeline.rig.prior import RigPrior
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.views import perceived
+from pipeline.verify.axes import (
     asking,
     check_axes,
     check_pose,
@@ -21,13 +26,8 @@ from pipeline.in_use.axes import (
     limits_of,
     shared_sigmas,
 )
-from pipeline.in_use.one_axis import AxisCheck, HeldOut
-from pipeline.in_use.spelling import on_grid
-from pipeline.rig.edges import edge_of
-from pipeline.rig.graph import Sensor
-from pipeline.rig.prior import RigPrior
-from pipeline.store.partitions import Lake, Partition
-from pipeline.store.views import perceived
+from pipeline.verify.one_axis import AxisCheck, HeldOut
+from pipeline.verify.spelling import on_grid
 from schemas.calibrations import FRAMES_OF_PAIR, CalibrationRecord
 from schemas.moments import PRIOR
 from schemas.poses import PoseRow

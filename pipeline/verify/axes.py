@@ -28,9 +28,9 @@ from pipeline.geometry.changes import change_between, change_covariance
 from pipeline.geometry.se3 import adjoint, inverse, log_se3
 from pipeline.geometry.target_sigmas import target_jacobian, target_sigmas
 from pipeline.geometry.targets import DEFAULT_TARGETS
-from pipeline.in_use.one_axis import AxisCheck, AxisLimits, HeldOut, checked, silent
 from pipeline.rig.edges import edge_of, words_of
 from pipeline.store.current import prior_of, targets_of, transform_of
+from pipeline.verify.one_axis import AxisCheck, AxisLimits, HeldOut, checked, silent
 from schemas.calibrations import PROBE_Z, CalibrationRecord
 from schemas.poses import PoseRow
 

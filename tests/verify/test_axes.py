@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.config import VerifyConfig
 from pipeline.geometry.se3 import exp_se3, inverse, to_quaternion
-from pipeline.in_use.axes import (
+from pipeline.verify.axes import (
     answer_of,
     answer_of_sensors,
     answers_by_sensor,
@@ -17,7 +17,7 @@ from pipeline.in_use.axes import (
     limits_of,
     shared_sigmas,
 )
-from pipeline.in_use.one_axis import AxisLimits, HeldOut, power_of
+from pipeline.verify.one_axis import AxisLimits, HeldOut, power_of
 from schemas.calibrations import FRAMES_OF_PAIR, CalibrationRecord
 from schemas.poses import PoseRow
 from tests.makers.solve_scenes import T_CAMERA_LIDAR

@@ -19,7 +19,7 @@ from pipeline.config import FleetConfig
 from pipeline.extrinsics.prior import read_prior
 from pipeline.geometry.radar_grid import CHANNELS, SHAPE, Scan, ScanMemory, cell_centres, sector_mask
 from pipeline.geometry.se3 import transform_points
-from pipeline.learn.perception.days import is_held_out, vehicle_days
+from pipeline.learn.perception_training.days import is_held_out, vehicle_days
 from pipeline.rows import columns_of, join_rows, take_rows
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import observations_of

@@ -19,20 +19,20 @@ import numpy as np
 from pipeline.config import FleetConfig, config_hash
 from pipeline.errors import BoresightError
 from pipeline.extrinsics.prior import prior_key
-from pipeline.in_use.axes import answers_by_sensor
-from pipeline.in_use.faults import Fault, copy_with_fault, faults_of_log
-from pipeline.in_use.one_axis import AxisCheck
-from pipeline.in_use.one_log import check_poses, check_sensors, prior_in_use, with_prior
-from pipeline.in_use.shared_errors import passes_of, reads_of
-from pipeline.in_use.turns import Turn, turns_of_log
 from pipeline.results import Outcome, Progress
 from pipeline.rig.prior import RigPrior
 from pipeline.rigs import OnnxSemantics, TopicSemantics
+from pipeline.stage_work import Task
 from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake, Partition, work_key
 from pipeline.store.remote_logs import LogPath
 from pipeline.store.views import observations_of
-from pipeline.work import Task
+from pipeline.verify.axes import answers_by_sensor
+from pipeline.verify.faults import Fault, copy_with_fault, faults_of_log
+from pipeline.verify.one_axis import AxisCheck
+from pipeline.verify.one_log import check_poses, check_sensors, prior_in_use, with_prior
+from pipeline.verify.shared_errors import passes_of, reads_of
+from pipeline.verify.turns import Turn, turns_of_log
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.poses import POSES
 from schemas.set_checks import SET_CHECKS, SetCheck

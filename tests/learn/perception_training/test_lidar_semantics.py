@@ -12,7 +12,7 @@ import torch
 from pipeline.errors import ConfigError, ContractError
 from pipeline.geometry.range_image import EMPTY
 from pipeline.geometry.se3 import transform_points
-from pipeline.learn.perception.lidar_semantics.labels import (
+from pipeline.learn.perception_training.lidar_semantics.labels import (
     KIND_OF_LABEL,
     KINDS,
     LABELS,
@@ -21,15 +21,15 @@ from pipeline.learn.perception.lidar_semantics.labels import (
     project_labels,
     standing_points,
 )
-from pipeline.learn.perception.lidar_semantics.network import build_sweep_network, export_sweeps
-from pipeline.learn.perception.lidar_semantics.samples import (
+from pipeline.learn.perception_training.lidar_semantics.network import build_sweep_network, export_sweeps
+from pipeline.learn.perception_training.lidar_semantics.samples import (
     SweepLayout,
     cut,
     day_images,
     layout_of,
     normal_of,
 )
-from pipeline.learn.perception.lidar_semantics.training import (
+from pipeline.learn.perception_training.lidar_semantics.training import (
     SweepTraining,
     kind_scores,
     train_sweeps,

@@ -13,8 +13,8 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.in_use.axes import answers_by_sensor
-from pipeline.in_use.one_axis import AxisCheck, AxisLimits, HeldOut, checked, power_of, silent
+from pipeline.verify.axes import answers_by_sensor
+from pipeline.verify.one_axis import AxisCheck, AxisLimits, HeldOut, checked, power_of, silent
 from schemas.set_checks import SetCheck
 
 __all__ = ["one_verdict_each", "scatter"]

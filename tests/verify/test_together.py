@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.in_use.together import one_verdict_each, scatter
+from pipeline.verify.together import one_verdict_each, scatter
 from schemas.set_checks import SetCheck
 
 DEG = np.pi / 180

@@ -11,9 +11,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from pipeline.learn.perception.exporter import export_model
-from pipeline.learn.perception.lidar_semantics.labels import LABELS
-from pipeline.learn.perception.lidar_semantics.samples import Normal, SweepLayout
+from pipeline.learn.perception_training.exporter import export_model
+from pipeline.learn.perception_training.lidar_semantics.labels import LABELS
+from pipeline.learn.perception_training.lidar_semantics.samples import Normal, SweepLayout
 
 __all__ = ["LIMITS", "NAME", "SweepNetwork", "build_sweep_network", "export_sweeps"]
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import beta
 
-from pipeline.in_use.faults import FAULTS_OF
-from pipeline.in_use.one_axis import HeldOut, power_of
+from pipeline.verify.faults import FAULTS_OF
+from pipeline.verify.one_axis import HeldOut, power_of
 from schemas.set_checks import SetCheck
 
 __all__ = ["Look", "by_fault", "by_sensor", "by_shipped", "by_turn", "interval", "looks_of"]

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.geometry.sensor_turns import TURN_AXES, sensor_turn
-from pipeline.in_use.one_axis import AxisCheck
+from pipeline.verify.one_axis import AxisCheck
 
 __all__ = ["Turn", "turns_of_log"]
 

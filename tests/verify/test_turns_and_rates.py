@@ -8,12 +8,12 @@ import pytest
 
 from pipeline.config import VerifyConfig
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation, to_quaternion
-from pipeline.in_use.axes import check_pose, limits_of
-from pipeline.in_use.claims import judged_claims
-from pipeline.in_use.one_axis import AxisCheck
-from pipeline.in_use.rates import by_sensor, by_turn, looks_of
-from pipeline.in_use.shared_errors import reads_of
-from pipeline.in_use.turns import Turn, turns_of_log
+from pipeline.verify.axes import check_pose, limits_of
+from pipeline.verify.claims import judged_claims
+from pipeline.verify.one_axis import AxisCheck
+from pipeline.verify.rates import by_sensor, by_turn, looks_of
+from pipeline.verify.shared_errors import reads_of
+from pipeline.verify.turns import Turn, turns_of_log
 from schemas.poses import PoseRow
 from schemas.set_checks import SetCheck
 

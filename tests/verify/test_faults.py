@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.in_use.faults import FAULTS_OF, Fault, copy_with_fault, faults_of_log
 from pipeline.rig.graph import Sensor
 from pipeline.store.moments import joined
 from pipeline.store.partitions import Lake
+from pipeline.verify.faults import FAULTS_OF, Fault, copy_with_fault, faults_of_log
 from schemas.moments import MOMENTS
 from tests.makers.simulated_days import simulated_day
 

@@ -12,9 +12,9 @@ from torch.nn import functional
 
 from pipeline.errors import ContractError
 from pipeline.geometry.radar_grid import cell_centres, sector_mask, sector_of
-from pipeline.learn.perception.radar_drivable.network import DrivableNetwork, build_drivable_network
-from pipeline.learn.perception.radar_drivable.samples import FREE, UNKNOWN, DrivableSamples
-from pipeline.learn.perception.trainer import (
+from pipeline.learn.perception_training.radar_drivable.network import DrivableNetwork, build_drivable_network
+from pipeline.learn.perception_training.radar_drivable.samples import FREE, UNKNOWN, DrivableSamples
+from pipeline.learn.perception_training.trainer import (
     Task,
     TrainingConfig,
     hash_of_arrays,
