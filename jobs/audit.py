@@ -39,7 +39,7 @@ def audit(
     from pipeline.calibrate.methods import method_named
     from pipeline.config import load_fleet
     from pipeline.stage_work import Task, Window
-    from pipeline.stages import AUDIT, REPORT, STATE
+    from pipeline.stages import AUDIT, LINES, REPORT, STATE
     from pipeline.store.partitions import Lake
     from schemas.drift import DRIFT, DRIFT_STATUSES
 
@@ -50,6 +50,7 @@ def audit(
     with progress_reporter("audit") as progress:
         task = Task(config, tables, Window(from_day, to_day), method, progress=progress)
         outcome = AUDIT.run(task)
+        LINES.run(task)
         STATE.run(task)
     findings = DRIFT.rows_among(outcome.records)
     charts = [f.status for f in findings]

@@ -227,7 +227,7 @@ def close_night(
     from pipeline.fleet.pages import OnWorkers
     from pipeline.report.stage import Pages
     from pipeline.stage_work import Task, Window
-    from pipeline.stages import AUDIT, REPORT, STATE
+    from pipeline.stages import AUDIT, LINES, REPORT, STATE
     from pipeline.store.files import LocalFiles
     from pipeline.store.partitions import Partition
     from schemas.drift import DRIFT
@@ -236,6 +236,7 @@ def close_night(
         task = Task(night.fleet, night.lake, Window(None, to_day), night.method, progress=progress)
         audit = AUDIT.run(task)
         told(audit)
+        told(LINES.run(task))
         told(STATE.run(task))
     findings = DRIFT.rows_among(audit.records)
     if not findings:

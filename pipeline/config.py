@@ -25,6 +25,7 @@ from pipeline.rigs import Positive, Section
 from pipeline.sections import (
     TERMS,
     AuditConfig,
+    FleetModelConfig,
     IngestConfig,
     LearnConfig,
     PerceiveConfig,
@@ -41,6 +42,7 @@ __all__ = [
     "TERMS",
     "AuditConfig",
     "FleetConfig",
+    "FleetModelConfig",
     "IngestConfig",
     "LearnConfig",
     "PerceiveConfig",
@@ -61,9 +63,15 @@ _SHORT = {(section, kind) for kind, section in SECTIONS.items()}
 
 
 class Vehicle(Section):
-    """One vehicle and the name of its rig."""
+    """One vehicle: the name of its rig, and of its model line if it is not the rig's."""
 
     rig: str = "default"
+    model: str | None = None
+
+    @property
+    def line(self) -> str:
+        """Name of the model line, whose vehicles are taken to be built alike."""
+        return self.model or self.rig
 
 
 class FleetSection(Section):
@@ -91,6 +99,7 @@ class FleetConfig(Section):
     prepare: PrepareConfig = PrepareConfig()
     learn: LearnConfig = LearnConfig()
     audit: AuditConfig = AuditConfig()
+    fleet_model: FleetModelConfig = FleetModelConfig()
     report: ReportConfig = ReportConfig()
     _file: Path = PrivateAttr(default=Path("fleet.toml"))  # not a key of the file: neither dumped nor hashed
 
@@ -104,6 +113,13 @@ class FleetConfig(Section):
             if vehicle.rig not in self.rigs:
                 raise ValueError(
                     f"vehicles.{name}.rig = {vehicle.rig!r}, but rigs has only {sorted(self.rigs)}"
+                )
+        rig_of: dict[str, str] = {}
+        for name, vehicle in self.vehicles.items():
+            if rig_of.setdefault(vehicle.line, vehicle.rig) != vehicle.rig:
+                raise ValueError(
+                    f"vehicles.{name}: model {vehicle.line!r} has the rig {vehicle.rig!r} here and "
+                    f"{rig_of[vehicle.line]!r} elsewhere; vehicles of one model have one rig"
                 )
         return self
 

@@ -66,6 +66,14 @@ class DriftFinding(Recorded):
     )
     moved_motion_sigma: list[float] | None = column("sigmas of moved_motion", default=None)
     inputs: list[str] = column("work keys of the records on the chart", default_factory=list)
+    day_scale: float | None = column(
+        "ratio of the days' scatter to their sigmas on this chart, learnt from the model line and the vehicle; null "
+        "before version 4",
+        default=None,
+    )
+    day_autocorrelation: float | None = column(
+        "autocorrelation of the errors of neighbouring days, learnt likewise", default=None
+    )
     vehicle_status: str | None = column(
         "status of the whole vehicle, equal in all its rows of one audit: RED or YELLOW if a chart is, "
         "GREEN if a rotation of any sensor would have been detected, else UNKNOWN; null in rows of releases before 0.4",
@@ -82,9 +90,9 @@ class DriftFinding(Recorded):
 DRIFT = TableSchema(
     DriftFinding,
     "drift",
-    3,
+    4,
     made_by="audit",
-    reads_versions=(1, 2),
+    reads_versions=(1, 2, 3),
     about=("vehicle", "day", "method", "pair", "parent_frame", "child_frame", "dof"),
     follows={
         name: ("pair", {pair: frames[k] for pair, frames in FRAMES_OF_PAIR.items()})

@@ -1,7 +1,7 @@
-"""Changes that most vehicles of a fleet show on the same day: a release, or another common cause.
+"""Changes that nearly all vehicles of a model line show on the same day: a release, or another common cause.
 
-They are removed from all vehicles' days, which are judged again: a vehicle that was also knocked on that day
-still stands out.
+They are removed from the days of the line's vehicles, which are judged again: a vehicle that was also knocked on that
+day still stands out. A change of half of a line is removed from nobody: no majority says which half is right.
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ from pipeline.config import AuditConfig
 from pipeline.rig.graph import Edge
 from schemas.calibrations import DOF_NAMES
 
-__all__ = ["FleetShift", "judge_without_fleet_shifts"]
+__all__ = ["FleetShift", "judge_without_fleet_shifts", "shifts_of"]
 
 # Fewer vehicles are no fleet: three knocked on one day may have met the same kerb.
 _FEWEST_VEHICLES = 6
-_SHARE = 0.5  # of the vehicles with days on both sides, that show the change
+_ALARMS = 0.3  # share of the vehicles with days on both sides whose charts show the change
+_SHARE = 0.8  # of them that lie nearer to the common change than to none
 _DAYS_APART = 1  # of the days on which they show it: not all drive daily
 
 
@@ -38,16 +39,29 @@ class FleetShift:
 
 def judge_without_fleet_shifts(
     fleet: Sequence[Mapping[Edge, PairDays]], config: AuditConfig, models: Sequence[str] = ()
-) -> tuple[list[VehicleVerdict], dict[tuple[Edge, str], FleetShift]]:
-    """Verdicts on all vehicles, and the removed changes by (edge, dof).
+) -> tuple[list[VehicleVerdict], dict[tuple[str, Edge, str], FleetShift]]:
+    """Verdicts on all vehicles, and the removed changes by (model line, edge, dof).
 
-    `models` has the rig of each vehicle; empty = all are of one.
+    `models` has the model line of each vehicle; empty = all are of one.
     """
     verdicts = judge_fleet(fleet, config, models)
-    shifts = _shifts(fleet, verdicts)
+    names = list(models) or [""] * len(fleet)
+    shifts = {}
+    for model in sorted(set(names)):
+        rows = [v for v, name in enumerate(names) if name == model]
+        found = _shifts([fleet[v] for v in rows], [verdicts[v] for v in rows])
+        shifts |= {(model, *key): shift for key, shift in found.items()}
     if not shifts:
         return verdicts, {}
-    return judge_fleet([_without(pairs, shifts) for pairs in fleet], config, models), shifts
+    without = [_without(pairs, shifts_of(name, shifts)) for name, pairs in zip(names, fleet, strict=True)]
+    return judge_fleet(without, config, models), shifts
+
+
+def shifts_of(
+    model: str, shifts: Mapping[tuple[str, Edge, str], FleetShift]
+) -> dict[tuple[Edge, str], FleetShift]:
+    """Changes of one model line."""
+    return {(edge, dof): shift for (of, edge, dof), shift in shifts.items() if of == model}
 
 
 def _shifts(
@@ -61,9 +75,13 @@ def _shifts(
             continue
         day, up = max(starts, key=lambda start: (starts[start], start))
         vehicles = sum(n for (d, u), n in starts.items() if u == up and abs(d - day) <= _DAYS_APART)
-        sizes = [s for pairs in fleet if (s := _size(pairs, key, day)) is not None]
-        if vehicles >= max(_FEWEST_VEHICLES, _SHARE * len(sizes)):
-            found[key] = FleetShift(day, float(np.median(sizes)), vehicles, len(sizes))
+        sizes = np.array([s for pairs in fleet if (s := _size(pairs, key, day)) is not None])
+        if vehicles < max(_FEWEST_VEHICLES, _ALARMS * len(sizes)):
+            continue
+        size = float(np.median(sizes))
+        alike = int((np.abs(sizes - size) < np.abs(sizes)).sum())
+        if alike >= _SHARE * len(sizes):
+            found[key] = FleetShift(day, size, alike, len(sizes))
     return found
 
 

@@ -6,11 +6,12 @@ from collections.abc import Mapping, Sequence
 
 from pipeline.rig.graph import Edge
 from pipeline.store.current import current_events
-from pipeline.store.partitions import Lake
+from pipeline.store.partitions import Lake, days_after
 from pipeline.store.records import read_records
+from schemas.drift import DriftFinding
 from schemas.service_events import REALIGNED, SERVICE_EVENTS, ServiceEvent
 
-__all__ = ["events_until", "restart_of", "what_was_done", "with_events"]
+__all__ = ["events_until", "restart_of", "since_of", "what_was_done", "with_events"]
 
 
 def events_until(lake: Lake, last: str | None) -> dict[str, list[ServiceEvent]]:
@@ -47,3 +48,21 @@ def what_was_done(event: ServiceEvent) -> str:
         return f"re-alignment of the {event.sensor} by its own software ({event.note})"
     of = "all sensors" if event.sensor == "all" else f"the {event.sensor}"
     return f"{event.kind} of {of} on {event.day}"
+
+
+def since_of(
+    edge: Edge, events: Sequence[ServiceEvent], findings: Sequence[DriftFinding], last: str
+) -> tuple[str, str]:
+    """First day that may count for an edge, and why; empty where all days may."""
+    first, why = "", ""
+    event = restart_of(events, edge, last)
+    if event is not None:
+        first = days_after(event.day, 1)
+        why = f"after the {what_was_done(event)}"
+    for finding in findings:
+        is_own = (finding.parent_frame, finding.child_frame) == (edge.parent.name, edge.child.name)
+        changed = is_own and finding.status in ("RED", "YELLOW") and finding.start_day
+        if changed and (finding.start_day_latest or "") > first:
+            first = finding.start_day_latest or ""
+            why = f"after a change that the audit found since {finding.start_day}"
+    return first, why

@@ -13,7 +13,7 @@ import numpy as np
 from pipeline.audit.days import FEWEST_DAYS, PairDays, Reference, charted, reference_of
 from pipeline.audit.estimates import Estimates, days_of
 from pipeline.audit.findings import VehicleAudit, vehicle_findings
-from pipeline.audit.fleet_shift import FleetShift, judge_without_fleet_shifts
+from pipeline.audit.fleet_shift import FleetShift, judge_without_fleet_shifts, shifts_of
 from pipeline.audit.history import History, last_audited_day, models_of
 from pipeline.audit.realignments import Realignments, find_realignments
 from pipeline.audit.service import events_until, restart_of, what_was_done, with_events
@@ -123,11 +123,13 @@ def _judged(
     if not any(v.said or (v.records.day >= begin).any() for v in vehicles.values()):
         return
     days = [_charted(vehicle, window, fleet.audit) for vehicle in vehicles.values()]
-    verdicts, shifts = judge_without_fleet_shifts(days, fleet.audit, models_of(fleet, vehicles))
+    models = models_of(fleet, vehicles)
+    verdicts, shifts = judge_without_fleet_shifts(days, fleet.audit, models)
+    of_line = {model: shifts_of(model, shifts) for model in set(models)}
     before = _found_before(task.lake, method, dict(zip(vehicles, verdicts, strict=True)), first)
     for done, ((name, vehicle), verdict) in enumerate(zip(vehicles.items(), verdicts, strict=True)):
         progress(done, len(vehicles), name)
-        yield _findings(fleet, name, vehicle, verdict, window, (shifts, before.get(name, {})))
+        yield _findings(fleet, name, vehicle, verdict, window, (of_line[models[done]], before.get(name, {})))
     progress(len(vehicles), len(vehicles), "")
 
 

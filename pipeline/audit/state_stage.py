@@ -12,10 +12,11 @@ from jaxtyping import Float
 from pipeline.audit.days import DOFS, charts_of_fleet, edges_of_fleet
 from pipeline.audit.estimates import Estimates, days_of, estimates_of, joined
 from pipeline.audit.history import History, models_of
+from pipeline.audit.line_states import answers_of, with_its_line
 from pipeline.audit.noise import estimate_noise
 from pipeline.audit.pose_states import pose_states, read_poses
 from pipeline.audit.references import Kept, first_accepted, kept_columns, kept_of, read_kept
-from pipeline.audit.service import events_until, restart_of, what_was_done
+from pipeline.audit.service import events_until, restart_of, since_of
 from pipeline.audit.state_rows import fused, with_state
 from pipeline.config import AuditConfig, FleetConfig, config_hash
 from pipeline.rig.graph import Edge
@@ -56,6 +57,7 @@ def work(task: Task) -> Work:
     changes: dict[str, list[DriftFinding]] = {}
     for finding in read_last(task.lake, DRIFT, DriftFinding, method, columns=_CHANGE):
         changes.setdefault(finding.vehicle, []).append(finding)
+    answers = answers_of(task.lake, method, last)
     references = _references(history, records, (first, last), events, fleet.audit) if last else {}
 
     def rows(run: Run) -> Generator[Records, None, None]:
@@ -65,21 +67,27 @@ def work(task: Task) -> Work:
             run.progress(done, len(records.vehicles), vehicle)
             of_vehicle = records.of(vehicle)
             edges = of_vehicle.own_edges()
-            since = {e: _since(e, events.get(vehicle, ()), changes.get(vehicle, ()), last) for e in edges}
+            since = {e: since_of(e, events.get(vehicle, ()), changes.get(vehicle, ()), last) for e in edges}
             own = _states(fleet, (vehicle, last, method), of_vehicle, since, scales[done])
             kept = [references[vehicle, edge] for edge in edges]
             count = fleet.audit.reference_days
             whole = [replace(r, **kept_columns(k, count)) for r, k in zip(own.rows, kept, strict=True)]
+            whole = [
+                with_its_line(r, answers.get((vehicle, edge)), fleet.fleet_model.use)
+                for r, edge in zip(whole, edges, strict=True)
+            ]
             known = events.get(vehicle, ()), changes.get(vehicle, ())
             about = vehicle, last, method
             whole += pose_states(about, poses, known, own_scales.get(vehicle, {}), fleet.verify)
             begun = {edge.name: first for edge, first in since.items()}
-            config = config_hash(fleet.audit, fleet.verify, {"to": last, "method": method, "since": begun})
+            config = config_hash(
+                fleet.audit, fleet.verify, fleet.fleet_model, {"to": last, "method": method, "since": begun}
+            )
             inputs = sorted({*(own.inputs or ()), *(key for row in whole for key in row.inputs)})
             key = work_key("state", CODE_VERSION, config, [*inputs, content_hash(whole)])
             yield replace(own, rows=[replace(r, work_key=key) for r in whole], work_key=key, inputs=inputs)
 
-    settings = (fleet.audit, fleet.verify, {"to": last, "method": method})
+    settings = (fleet.audit, fleet.verify, fleet.fleet_model, {"to": last, "method": method})
     read = tuple(sorted({*records.keys(), *poses.estimates.keys()}))
     return Work(settings, rows, inputs=read, tell=_told, again=True)
 
@@ -120,24 +128,6 @@ def _scales(records: Estimates, fleet: FleetConfig) -> list[dict[Edge, Float[np.
     models = models_of(fleet, records.vehicles)
     scale = estimate_noise(charts, DOFS, len(edges), models).scale if edges else np.ones(0)
     return [dict(zip(edges, s, strict=True)) for s in scale.reshape(len(days), len(edges), DOFS)]
-
-
-def _since(
-    edge: Edge, events: Sequence[ServiceEvent], findings: Sequence[DriftFinding], last: str
-) -> tuple[str, str]:
-    """First day that may count for an edge, and why; empty where all days may."""
-    first, why = "", ""
-    event = restart_of(events, edge, last)
-    if event is not None:
-        first = days_after(event.day, 1)
-        why = f"after the {what_was_done(event)}"
-    for finding in findings:
-        is_own = (finding.parent_frame, finding.child_frame) == (edge.parent.name, edge.child.name)
-        changed = is_own and finding.status in ("RED", "YELLOW") and finding.start_day
-        if changed and (finding.start_day_latest or "") > first:
-            first = finding.start_day_latest or ""
-            why = f"after a change that the audit found since {finding.start_day}"
-    return first, why
 
 
 def _states(

@@ -46,13 +46,20 @@ class Answers:
     axis: np.ndarray
 
 
-def with_line(model: LineModel, evidence: LineEvidence, common: Float[np.ndarray, "N M M"]) -> Answers:
+def with_line(
+    model: LineModel,
+    evidence: LineEvidence,
+    common: Float[np.ndarray, "N M M"],
+    own_prior: Float[np.ndarray, "N M"] | None = None,
+) -> Answers:
     """Answers with the line.
 
     Args:
         model: of the line.
         evidence: of the vehicles; the first M observations are their own estimates, A and B are identities there.
-        common: what each vehicle's record says that all days have in common.
+        common: covariance of what all days of each vehicle have in common, by its records.
+        own_prior: change from the drawing to each vehicle's prior; None = the drawing is the prior of all. It decides
+            along axes that the days of too few vehicles determine.
     """
     mean, covariance = told_apart(model)
     M, B, own_mean = len(model.variance), evidence.to_bias, ~evidence.remounted[:, None]
@@ -62,13 +69,14 @@ def with_line(model: LineModel, evidence: LineEvidence, common: Float[np.ndarray
     change, spread = _on_the_line(model, evidence, residual, covariance, distance)
     change = change + expected
     corrected = replace(evidence, value=evidence.value - B @ mean[M:])
-    alone, own = corrected.alone(model.prior)
+    alone, own = corrected.alone(model.prior, own_prior)
+    change = np.where(model.learnt, change, alone)
     allowed = _limited(change - alone, own + common, model.prior)
     kept = change - alone - allowed
     doubt = np.clip(distance - _DOUBTED, 0.0, 1.0)[:, None] * allowed
     spread = spread + _square(kept) + _square(doubt) + _beyond(common, model.prior.bias[:M, :M])
     shared = distance < OUTSIDE
-    change = np.where(shared[:, None], alone + allowed, evidence.alone(model.prior)[0])
+    change = np.where(shared[:, None], alone + allowed, evidence.alone(model.prior, own_prior)[0])
     spread = np.where(shared[:, None, None], spread, own + common)
     return Answers(change, 0.5 * (spread + spread.swapaxes(1, 2)), shared, distance, axis)
 

@@ -43,42 +43,44 @@ class SharedError:
 
 
 def shared_axes(kind: str, R_parent_child: Float[np.ndarray, "3 3"]) -> dict[str, Float[np.ndarray, " 6"]]:
-    """Directions of shared errors of an edge, as changes of T_parent_child that they look like.
+    """Directions of shared errors of an edge: the change of T_parent_child that an error of one looks like.
 
-    A radar that measures elevations too high by e looks like one whose x axis points e higher. A segmenter whose
-    labels lie too far right or down, and a principal point that is off, look like a camera that is turned.
+    A radar that measures elevations too high looks like one mounted too low: points of its own are moved, so that a
+    child's error shows with the opposite sign, in the parent's axes, and a parent's error as it is. Positive: too
+    high, too far left, too far away; of labels and principal point: too far down, too far right.
 
     Args:
-        kind: of the edge, as camera_lidar; of a pose, kind of its sensor with the reference's.
+        kind: of the edge, as camera_lidar.
         R_parent_child: rotation of the drawing.
     """
     zero = np.zeros(3)
     axes: dict[str, np.ndarray] = {}
     parent, child = kind.split("_")
-    for name, R in ((parent, np.eye(3)), (child, R_parent_child)):
+    for name, R in ((parent, np.eye(3)), (child, -R_parent_child)):
         if name == "radar":
             axes["radar elevation"] = np.r_[-R[:, 1], zero]
             axes["radar azimuth"] = np.r_[R[:, 2], zero]
             axes["radar range"] = np.r_[zero, R[:, 0]]
         elif name == "camera":
-            axes["camera labels or principal point, vertical"] = np.r_[R[:, 0], zero]
+            axes["camera labels or principal point, vertical"] = np.r_[-R[:, 0], zero]
             axes["camera labels or principal point, horizontal"] = np.r_[R[:, 1], zero]
     return axes
 
 
 def shared_errors(model: LineModel, axes: dict[str, Float[np.ndarray, " 6"]]) -> list[SharedError]:
     """Shared errors along named directions."""
-    M = len(model.prior.mount)
+    M, P = len(model.prior.mount), len(model.prior.bias)
     found = []
     for name, h in axes.items():
-        if not len(model.prior.bias):
+        if not P:
             continue
-        both = np.r_[h, h]
-        sigma = _root(h @ model.covariance[M:, M:] @ h)
-        before = _root(h @ model.prior.bias @ h)
+        of_bias = np.r_[h, np.zeros(P - M)]  # witnesses have errors of their own behind it
+        both = np.r_[h, of_bias]
+        sigma = _root(of_bias @ model.covariance[M:, M:] @ of_bias)
+        before = _root(of_bias @ model.prior.bias @ of_bias)
         found.append(
             SharedError(
-                name, float(h @ model.mean[M:]), sigma, float(both @ model.mean),
+                name, float(of_bias @ model.mean[M:]), sigma, float(both @ model.mean),
                 _root(both @ model.covariance @ both), before, sigma < _TOLD * before,
             )
         )  # fmt: skip

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-__all__ = ["LineEvidence", "LinePrior", "evidence_of_days", "shifts_in_sigmas"]
+__all__ = ["LineEvidence", "LinePrior", "evidence_of_days", "shifts_in_sigmas", "with_witness"]
 
 _DETERMINED = 0.5  # of the prior's variance: an axis that a vehicle's days leave at less
 _NOTHING = 1e-9  # of the prior's information: a direction with less is open
@@ -47,15 +47,21 @@ class LineEvidence:
         """Inverse covariances of observations whose expected value scatters by `spread` besides."""
         return np.linalg.solve(np.eye(self.value.shape[1]) + self.information @ spread, self.information)
 
-    def alone(self, prior: LinePrior) -> tuple[Float[np.ndarray, "N M"], Float[np.ndarray, "N M M"]]:
-        """Each vehicle's mount by its own estimates and the drawing, and what it varies by.
+    def alone(
+        self, prior: LinePrior, own_prior: Float[np.ndarray, "N M"] | None = None
+    ) -> tuple[Float[np.ndarray, "N M"], Float[np.ndarray, "N M M"]]:
+        """Each vehicle's mount by its own estimates and its prior, and what it varies by.
 
-        The first M observations are its estimates.
+        The first M observations are its estimates. `own_prior` is the change from the drawing to each vehicle's prior;
+        None = the drawing is the prior of all.
         """
         M = len(prior.mount)
-        own = self.information[:, :M, :M]
-        covariance = np.linalg.inv(own + np.linalg.inv(prior.mount))
-        return np.einsum("nmk,nkj,nj->nm", covariance, own, self.value[:, :M], optimize=True), covariance
+        own, before = self.information[:, :M, :M], np.linalg.inv(prior.mount)
+        covariance = np.linalg.inv(own + before)
+        pull = np.einsum("nkj,nj->nk", own, self.value[:, :M])
+        if own_prior is not None:
+            pull = pull + own_prior @ before
+        return np.einsum("nmk,nk->nm", covariance, pull), covariance
 
     def determined(self, prior: LinePrior) -> Bool[np.ndarray, "N M"]:
         """Axes that vehicles know better than the drawing does."""
@@ -103,6 +109,40 @@ def evidence_of_days(
     whole = np.einsum("nmk,nk,njk->nmj", directions, left, directions, optimize=True) / np.outer(unit, unit)
     M = len(unit)
     return LineEvidence(value, whole, np.eye(M), np.eye(M), np.zeros(len(days), bool))
+
+
+def with_witness(
+    evidence: LineEvidence,
+    axis: Float[np.ndarray, " M"],
+    value: Float[np.ndarray, " N"],
+    information: Float[np.ndarray, " N"],
+    *,
+    of_its_own: bool,
+) -> LineEvidence:
+    """Evidence with one more observation of each vehicle's mount, without the shared errors of sensors.
+
+    Args:
+        evidence: so far.
+        axis: direction of a change along which the mount is observed.
+        value: change along it [rad].
+        information: inverse variance; zero for vehicles without the observation.
+        of_its_own: all observations of this kind have an error in common, another than the sensors': a further shared
+            error, the last one, as a radar that reports its mount in the vehicle does not know the lidar's.
+    """
+    N, O = evidence.value.shape
+    P = evidence.to_bias.shape[1]
+    whole = np.zeros((N, O + 1, O + 1))
+    whole[:, :O, :O], whole[:, O, O] = evidence.information, information
+    to_bias = np.zeros((O + 1, P + of_its_own))
+    to_bias[:O, :P] = evidence.to_bias
+    to_bias[O, P:] = 1.0
+    return replace(
+        evidence,
+        value=np.column_stack([evidence.value, np.where(information > 0, value, 0.0)]),
+        information=whole,
+        to_mount=np.vstack([evidence.to_mount, axis]),
+        to_bias=to_bias,
+    )
 
 
 def _mean_of(days: Float[np.ndarray, "N 1"], phi: Float[np.ndarray, "N M"]) -> Float[np.ndarray, "N M"]:

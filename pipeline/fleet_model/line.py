@@ -67,6 +67,11 @@ class LineModel:
     axis: np.ndarray
 
     @property
+    def learnt(self) -> Bool[np.ndarray, " M"]:
+        """Axes whose scatter was learnt, because the days of enough vehicles determine them."""
+        return self.variance_sigma > 0
+
+    @property
     def safe_variance(self) -> Float[np.ndarray, " M"]:
         """Variance of mounts that answers rest on: one sigma above the estimate, so that few vehicles share less."""
         return self.variance + self.variance_sigma

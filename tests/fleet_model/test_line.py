@@ -11,6 +11,8 @@ from pipeline.fleet_model.answers import DIFFERS_SIGMAS, largest_change_without_
 from pipeline.fleet_model.apart import shared_axes, shared_errors, told_apart
 from pipeline.fleet_model.contradictions import contradiction_of, motion_of
 from pipeline.fleet_model.line import LinePrior, learn_line
+from pipeline.geometry.changes import changed
+from pipeline.geometry.se3 import exp_se3, transform_points
 from tests.makers.lines import COMMON, DEG, DRAWING, NOISE, Line, make_line
 
 LABELS = np.array([0.0, 0.04 * DEG, 0.0, 0.0, 0.0, 0.0])
@@ -73,10 +75,41 @@ def test_what_no_data_tell_apart_keeps_the_sigma_that_records_state():
     errors = shared_errors(model, shared_axes("lidar_radar", np.eye(3)))
     assert not any(e.told for e in errors)
     elevation = errors[0]
-    assert elevation.total == pytest.approx(-0.8 * DEG, abs=3 * elevation.total_sigma)
+    assert elevation.total == pytest.approx(0.8 * DEG, abs=3 * elevation.total_sigma)
     assert elevation.total_sigma < 0.02 * DEG
     assert (sigmas(found) > 0.99 * np.sqrt(np.diag(line.prior.bias))).all()
     np.testing.assert_allclose(told_apart(model)[0][6:], 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["lidar_radar", "camera_radar", "radar_base", "camera_lidar"])
+def test_a_shared_error_looks_like_the_change_that_brings_its_points_back(kind):
+    rng = np.random.default_rng(2)
+    e, parent = 1e-4, kind.split("_")[0]
+    T = exp_se3(np.r_[0.3 * rng.normal(size=3), rng.normal(size=3)])
+    for name, h in shared_axes(kind, T[:3, :3]).items():
+        ahead = rng.normal(size=(50, 3)) + ([0, 0, 30] if name.startswith("camera") else [30, 0, 0])
+        if name.startswith("camera"):
+            step = [0, e, 0] if "vertical" in name else [e, 0, 0]
+            seen = ahead + ahead[:, 2:] * step
+        else:
+            left, up = (e, 0) if "azimuth" in name else (0, e if "elevation" in name else 0)
+            seen = ahead + ahead[:, :1] * [0, left, up]
+            if "range" in name:
+                seen = ahead * (1 + e / np.linalg.norm(ahead, axis=1, keepdims=True))
+        other = transform_points(np.linalg.inv(T) if name.startswith(parent) else T, ahead)
+        found = changed(T, e * h)
+        # The changed transform brings what is seen to where the other sensor sees it.
+        brought = (
+            transform_points(found, other) - seen
+            if name.startswith(parent)
+            else transform_points(found, seen) - other
+        )
+        before = (
+            transform_points(T, other) - seen
+            if name.startswith(parent)
+            else transform_points(T, seen) - other
+        )
+        assert np.abs(brought).max() < 0.2 * np.abs(before).max()
 
 
 def test_a_witness_of_the_mount_tells_a_shared_error_from_a_common_mount_error():
@@ -85,7 +118,7 @@ def test_a_witness_of_the_mount_tells_a_shared_error_from_a_common_mount_error()
     model, found = answers(line)
     elevation = shared_errors(model, shared_axes("lidar_radar", np.eye(3)))[0]
     assert elevation.told
-    assert elevation.value == pytest.approx(-0.8 * DEG, rel=0.15)
+    assert elevation.value == pytest.approx(0.8 * DEG, rel=0.15)
     assert model.mean[1] == pytest.approx(0.3 * DEG, abs=0.06 * DEG)
     off = found.change[:, 1] - line.mounts[:, 1]
     assert np.abs(off.mean()) < 0.1 * DEG

@@ -1,0 +1,309 @@
+"""What each vehicle's days show, summed night by night from the records that are new."""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from jaxtyping import Bool, Float
+
+from pipeline.audit.days import DOFS
+from pipeline.audit.estimates import COLUMNS, Estimates, day_name, estimates_at, faults_of
+from pipeline.fleet_model.sums import DaySums, day_evidence, packed, unpacked
+from pipeline.geometry.changes import change_between, change_covariance, changed
+from pipeline.geometry.se3 import from_quaternion
+from pipeline.rig.edges import edge_named, edges_of_rows
+from pipeline.rig.graph import Edge
+from pipeline.store.columns import matrices, there
+from pipeline.store.current import current_rows
+from pipeline.store.partitions import Lake, days_after
+from pipeline.store.records import read_columns, read_last
+from schemas.calibrations import CALIBRATIONS
+from schemas.fleet_model import LINE_ANSWERS, LineAnswer
+
+__all__ = ["Counted", "DaysOfLines", "Drawing", "Key"]
+
+Key = tuple[str, Edge]  # vehicle and edge
+
+_PRIOR = tuple(f"prior_{n}" for n in ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m"))
+_UNSURE = "diagnostics.unsure_only"
+_AT_A_TIME = 7  # days that are in memory together
+_CLOCKS_DIFFER = dt.timedelta(hours=1)  # of machines that commit records
+
+
+@dataclass(frozen=True, eq=False)
+class Drawing:
+    """Pose T_parent_child from which changes of a line's edge count, and variances of its vehicles' priors by axis."""
+
+    T: Float[np.ndarray, "4 4"]
+    prior_variance: Float[np.ndarray, " 6"]
+
+
+@dataclass(eq=False)
+class Counted:
+    """Sums of days by vehicle and edge, and what the next night must know to go on from them.
+
+    Args:
+        place: row of a vehicle and edge in `sums` and the lists.
+        line: model line of the vehicle when its days were counted.
+        restart: first day that might count; empty = any.
+        last_key: work key of the last day's record.
+        read_until: stamp of the last record of any vehicle that was read.
+    """
+
+    place: dict[Key, int] = field(default_factory=dict)
+    sums: DaySums = field(default_factory=lambda: DaySums.empty(0))
+    line: list[str] = field(default_factory=list)
+    restart: list[str] = field(default_factory=list)
+    last_key: list[str] = field(default_factory=list)
+    read_until: str = ""
+
+    @classmethod
+    def read(cls, lake: Lake, method: str) -> Counted:
+        """What the last night counted; empty on the first."""
+        rows = [r for r in read_last(lake, LINE_ANSWERS, LineAnswer, method) if r.sums is not None]
+        if not rows:
+            return cls()
+        place = {
+            (r.vehicle, edge_named(r.pair, r.parent_frame, r.child_frame)): k for k, r in enumerate(rows)
+        }
+        when = np.array([[_ordinal(r.first_day), _ordinal(r.last_day), r.away] for r in rows], np.int64)
+        days = np.array([[r.days, r.recent_days] for r in rows])
+        sums = unpacked(np.stack([np.asarray(r.sums) for r in rows]), days, when)
+        until = max(r.read_until for r in rows)
+        return cls(
+            place, sums, *([getattr(r, n) for r in rows] for n in ("line", "restart", "last_key")), until
+        )
+
+    def columns(self, k: int) -> dict[str, Any]:
+        """Columns of a row of `line_answers` that the next night goes on from."""
+        sums = self.sums.at(np.array([k]))
+        return {
+            "line": self.line[k],
+            "sums": packed(sums)[0],
+            "days": float(sums.days[0]),
+            "recent_days": float(sums.recent_days[0]),
+            "first_day": day_name(int(sums.first[0])),
+            "last_day": day_name(int(sums.last[0])),
+            "away": int(sums.away[0]),
+            "restart": self.restart[k],
+            "last_key": self.last_key[k],
+            "read_until": self.read_until,
+        }
+
+    def rows_for(self, keys: Collection[tuple[Key, str, str]]) -> None:
+        """Add empty sums for new vehicles and edges, given with line and first day that may count."""
+        new = [key for key in keys if key[0] not in self.place]
+        for key, line, restart in new:
+            self.place[key] = len(self.line)
+            self.line.append(line)
+            self.restart.append(restart)
+            self.last_key.append("")
+        grown = DaySums.empty(len(self.line))
+        self.sums = grown.replaced(np.arange(len(self.line) - len(new)), self.sums)
+
+    def forget(self, keys: Collection[Key]) -> None:
+        """Remove the days of some vehicles and edges, which are counted anew."""
+        kept = [key for key in self.place if key not in keys]
+        rows = np.array([self.place[key] for key in kept], np.int64)
+        self.sums = self.sums.at(rows)
+        for name in ("line", "restart", "last_key"):
+            values = getattr(self, name)
+            setattr(self, name, [values[k] for k in rows])
+        self.place = {key: k for k, key in enumerate(kept)}
+
+
+@dataclass(frozen=True, eq=False)
+class _Read:
+    """Current records, in order of vehicle, day and edge, with their priors."""
+
+    records: Estimates
+    prior: Float[np.ndarray, "N 4 4"]
+    prior_covariance: Float[np.ndarray, "N 6 6"]
+    usable: Bool[np.ndarray, " N"]
+    until: str
+
+    def keys(self) -> list[Key]:
+        """Vehicle and edge of each record that can be used."""
+        names, edges = self.records.vehicles, self.records.edges
+        of = zip(self.records.owner.tolist(), self.records.edge.tolist(), strict=True)
+        return [(names[v], edges[e]) for v, e in of]
+
+
+@dataclass(frozen=True, eq=False)
+class DaysOfLines:
+    """Counts the days of a fleet; the maps hold what is known of vehicles and edges.
+
+    Args:
+        window: first and last day that may count.
+        line_of: model line of a vehicle; empty: none of its days counts.
+        restart: first day that may count after a service event or a change, where there was one.
+        scale: ratio of days' scatter to their sigmas, by axis.
+        drawings: by line and edge; those of new lines are added.
+    """
+
+    lake: Lake
+    method: str
+    window: tuple[str, str]
+    line_of: Callable[[str], str]
+    restart: Mapping[Key, str]
+    scale: Mapping[Key, Float[np.ndarray, " 6"]]
+    drawings: dict[tuple[str, Edge], Drawing]
+
+    def count(self, counted: Counted) -> Counted:
+        """Add the days that became current since the last night.
+
+        Days are counted anew, from all records of a vehicle, after a change or a service event, and where a record
+        of a day that is counted already was replaced.
+        """
+        first, last = self.window
+        since = _before(counted.read_until)
+        gone = _ordinal(first)
+        counted.forget({key for key, k in counted.place.items() if counted.sums.last[k] < gone})
+        anew = {key for key, k in counted.place.items() if self._is_stale(counted, key, k)}
+        for week in [(first, last)] if since else list(_weeks(first, last)):
+            new = self._read(*week, asserted_after=since)
+            if new is None:
+                continue
+            counted.read_until = max(counted.read_until, new.until)
+            anew |= _replaced(new, counted)
+            self._add(new, counted, leave=anew)
+        counted.forget(anew)
+        vehicles = {vehicle for vehicle, _ in anew}
+        for week in _weeks(first, last) if vehicles else ():
+            part = self._read(*week, among=vehicles)
+            if part is not None:
+                self._add(part, counted, among=anew)
+        return counted
+
+    def _is_stale(self, counted: Counted, key: Key, k: int) -> bool:
+        line = self.line_of(key[0])
+        if (line, key[1]) not in self.drawings or line != counted.line[k]:
+            return True
+        return self.restart.get(key, "") != counted.restart[k]
+
+    def _read(
+        self,
+        first: str,
+        last: str,
+        *,
+        asserted_after: str | None = None,
+        among: Collection[str] | None = None,
+    ) -> _Read | None:
+        names = (*COLUMNS, *_PRIOR, "prior_covariance", _UNSURE)
+        vehicle = None if among is None else frozenset(among)
+        table = read_columns(
+            self.lake,
+            CALIBRATIONS,
+            names,
+            first=first,
+            last=last,
+            vehicle=vehicle,
+            asserted_after=asserted_after,
+        )
+        if table is None:
+            return None
+        until = pc.max(table["asserted_at"]).as_py()
+        found = current_rows(table.filter(pc.equal(table["method"], self.method)), CALIBRATIONS)
+        edges, edge = edges_of_rows(found)
+        rank = pa.array(edge)
+        order = pc.sort_indices(
+            found.append_column("edge", rank), [(n, "ascending") for n in ("vehicle", "day", "edge")]
+        )
+        found, edge = found.take(order), edge[np.asarray(order)]
+        records = estimates_at(found, edges, edge)
+        pose = np.stack([found[name].to_numpy() for name in _PRIOR], axis=1)
+        P = matrices(found["prior_covariance"])
+        known = np.all([there(found[name]) for name in _PRIOR], axis=0) & np.isfinite(P).all(axis=(1, 2))
+        unsure = pc.fill_null(found[_UNSURE], 0.0).to_numpy() > 0
+        usable = records.usable & (records.accepted | unsure) & records.has_common & known & (edge >= 0)
+        usable[list(faults_of(records, self.window[1]))] = False
+        prior = np.broadcast_to(np.eye(4), (len(known), 4, 4)).copy()
+        prior[known] = from_quaternion(pose[known, :4], pose[known, 4:])
+        return _Read(records, prior, P, usable, until or "")
+
+    def _add(
+        self,
+        read: _Read,
+        counted: Counted,
+        *,
+        leave: Collection[Key] = (),
+        among: Collection[Key] | None = None,
+    ) -> None:
+        """Count the days of records, in order, of all vehicles and edges but some, or of some."""
+        self._draw(read)
+        keys, records = read.keys(), read.records
+        lines = [self.line_of(vehicle) for vehicle, _ in keys]
+        begin = [_ordinal(self.restart.get(key)) for key in keys]
+        counts = read.usable & (records.day >= np.array(begin, np.int64))
+        counts &= np.array([line != "" for line in lines], bool)
+        counts &= np.array([(key not in leave) and (among is None or key in among) for key in keys], bool)
+        rows = np.flatnonzero(counts)
+        counted.rows_for({(keys[r], lines[r], self.restart.get(keys[r], "")) for r in rows})
+        place = np.array([counted.place.get(key, -1) for key in keys], np.int64)
+        scale = np.array([self.scale.get(key, np.ones(DOFS)) for key in keys]).reshape(-1, DOFS)
+        work = records.work_key.to_pylist()
+        for day in np.unique(records.day[rows]):
+            of_day = rows[(records.day[rows] == day) & (counted.sums.last[place[rows]] < day)]
+            for line, edge in {(lines[r], keys[r][1]) for r in of_day}:
+                own = np.array([r for r in of_day if (lines[r], keys[r][1]) == (line, edge)], np.int64)
+                at = records.at(own)
+                evidence = day_evidence(
+                    self.drawings[line, edge].T,
+                    (at.transforms(), at.covariance, at.common),
+                    (read.prior[own], read.prior_covariance[own]),
+                )
+                sums = counted.sums.at(place[own]).with_day(evidence, int(day), scale[own])
+                counted.sums = counted.sums.replaced(place[own], sums)
+            for r in of_day:
+                counted.last_key[place[r]] = work[r]
+
+    def _draw(self, read: _Read) -> None:
+        """Drawings of lines and edges: the median prior of the first night; sigmas of priors are those of the last."""
+        keys = read.keys()
+        of_line: dict[tuple[str, Edge], list[int]] = {}
+        for r in np.flatnonzero(read.usable).tolist():
+            line = self.line_of(keys[r][0])
+            if line:
+                of_line.setdefault((line, keys[r][1]), []).append(r)
+        for of, rows in of_line.items():
+            prior = read.prior[rows]
+            variance = np.einsum("nii->ni", change_covariance(prior, read.prior_covariance[rows]))
+            known = self.drawings.get(of)
+            middle = np.median(change_between(prior[0], prior), axis=0)
+            T = changed(prior[0], middle) if known is None else known.T
+            self.drawings[of] = Drawing(T, np.median(variance, axis=0))
+
+
+def _replaced(read: _Read, counted: Counted) -> set[Key]:
+    """Vehicles and edges with a new record of a day that is counted already."""
+    found = set()
+    rows = zip(read.keys(), read.records.day.tolist(), read.records.work_key.to_pylist(), strict=True)
+    for key, day, work in rows:
+        k = counted.place.get(key)
+        last = 0 if k is None else int(counted.sums.last[k])
+        if k is not None and day <= last and (day, work) != (last, counted.last_key[k]):
+            found.add(key)
+    return found
+
+
+def _ordinal(day: str | None) -> int:
+    return dt.date.fromisoformat(day).toordinal() if day else 0
+
+
+def _before(stamp: str) -> str | None:
+    if not stamp:
+        return None
+    moment = dt.datetime.fromisoformat(stamp) - _CLOCKS_DIFFER
+    return moment.isoformat(timespec="microseconds").replace("+00:00", "Z")
+
+
+def _weeks(first: str, last: str) -> Iterator[tuple[str, str]]:
+    while first <= last:
+        yield first, min(days_after(first, _AT_A_TIME - 1), last)
+        first = days_after(first, _AT_A_TIME)

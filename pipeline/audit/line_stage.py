@@ -1,0 +1,231 @@
+"""Stage lines: what the vehicles of a model line share, and each vehicle's answer with it.
+
+Runs after the audit, whose changes restart a vehicle's sums, and before the states, which may load the answers.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from jaxtyping import Float
+
+from pipeline.audit.days import DOFS
+from pipeline.audit.line_days import Counted, DaysOfLines, Drawing, Key
+from pipeline.audit.line_rows import LineOfEdge, Witnesses, as_answers, line_rows
+from pipeline.audit.service import events_until, since_of
+from pipeline.config import FleetConfig, config_hash
+from pipeline.geometry.se3 import from_quaternion
+from pipeline.rig.edges import edge_named, edge_order
+from pipeline.rig.graph import Edge
+from pipeline.stage_work import Records, Run, Task, Told, Window, Work
+from pipeline.store.current import current_rows
+from pipeline.store.partitions import Lake, content_hash, days_after, last_possible_day, work_key
+from pipeline.store.records import last_assertion, last_day, read_columns, read_last_columns, read_records
+from schemas.calibrations import CALIBRATIONS, DOF_NAMES
+from schemas.drift import DRIFT, DriftFinding
+from schemas.fleet_model import FLEET_MODEL, LINE_ANSWERS, FleetModelRow, LineAnswer
+from schemas.radar_alignments import RADAR_ALIGNMENTS
+from schemas.service_events import ServiceEvent
+from schemas.versions import CODE_VERSION
+
+__all__ = ["work"]
+
+_DAYS_BACK = 60  # as states look back
+_EDGE = ("pair", "parent_frame", "child_frame")
+_OF_DRIFT = ("vehicle", *_EDGE, "dof", "status", "start_day", "start_day_latest", "moved_sensor",
+             "day_scale", "day_autocorrelation")  # fmt: skip
+_ANGLES = ("azimuth", "elevation")
+_OF_RADARS = (
+    "vehicle", "sensor", "own_edge", "sign_is_published",
+    *(f"{name}_{what}" for name in _ANGLES for what in ("rad", "sigma_rad", "scatter_rad")),
+)  # fmt: skip
+_SUREST_RAD = float(np.radians(0.05))  # a radar's own alignment is not taken to be surer
+
+
+def work(task: Task) -> Work:
+    """Model of every line and edge with days, and an answer of each vehicle.
+
+    Sums of the last night go on with the records that became current since.
+
+    Raises:
+        ContractError: a record was written with another schema version.
+    """
+    assert isinstance(task.of, Window), "lines are of all vehicles"
+    fleet, method, lake = task.fleet, task.method or task.fleet.audit.method, task.lake
+    last = task.of.last or min(last_day(lake, CALIBRATIONS) or "", last_possible_day())
+    window = (days_after(last, 1 - _DAYS_BACK), last) if last else ("", "")
+    settings = (fleet.audit, fleet.verify, fleet.fleet_model, {"to": last, "method": method})
+    before = last_assertion(lake, LINE_ANSWERS, method)
+    going_on = before is None or before.day <= last  # an earlier window is counted by itself
+    counted = Counted.read(lake, method) if last and going_on else Counted()
+
+    def rows(run: Run) -> Generator[Records, None, None]:
+        if not last:
+            return
+        yield from _rows(task, method, window, counted, run)
+
+    return Work(settings, rows, inputs=(), tell=_told, again=True)
+
+
+def _rows(
+    task: Task, method: str, window: tuple[str, str], counted: Counted, run: Run
+) -> Generator[Records, None, None]:
+    fleet, lake, last = task.fleet, task.lake, window[1]
+    changes, scale, alike = _of_audit(lake, method)
+    events = events_until(lake, last)
+    line_of = _line_of(fleet)
+    known = {*counted.place, *scale}
+    restart = {
+        key: since
+        for key in known
+        if (since := since_of(key[1], events.get(key[0], ()), changes.get(key[0], ()), last)[0])
+    }
+    drawings = _drawings(lake, method)
+    run.progress(0, 0, "days")
+    days = DaysOfLines(lake, method, window, line_of, restart, scale, drawings)
+    counted = days.count(counted)
+    told = _by_line(counted)
+    config = config_hash(fleet.audit, fleet.verify, fleet.fleet_model, {"to": last, "method": method})
+    witnesses = _witnesses(lake, method, window)
+    for done, ((line, edge), keys) in enumerate(told.items()):
+        run.progress(done, len(told), f"{line} {edge.name}")
+        rows = np.array([counted.place[key] for key in keys], np.int64)
+        about = {
+            "day": last, "method": method, "line": line, "pair": edge.kind,
+            "parent_frame": edge.parent.name, "child_frame": edge.child.name,
+        }  # fmt: skip
+        vehicles = [vehicle for vehicle, _ in keys]
+        of_edge = LineOfEdge(
+            about, edge, vehicles, drawings[line, edge], counted.sums.at(rows), _stacked(scale, keys, 1.0),
+            _stacked(alike, keys, 0.0),
+            np.array([_is_remounted(edge, events.get(v, ())) for v in vehicles], bool),
+            np.array([_has_changed(edge, changes.get(v, ())) for v in vehicles], bool),
+            _witnesses_of(witnesses, keys),
+        )  # fmt: skip
+        row, columns = line_rows(of_edge, fleet.fleet_model, fleet.verify)
+        answers = as_answers(of_edge, columns, [counted.columns(k) for k in rows])
+        key = work_key("lines", CODE_VERSION, config, [content_hash([*answers, row])])
+        yield Records([replace(r, work_key=key) for r in (*answers, row)], None, key, [])
+
+
+def _line_of(fleet: FleetConfig) -> Callable[[str], str]:
+    @cache
+    def line(vehicle: str) -> str:
+        return fleet.vehicle(vehicle).line if fleet.knows(vehicle) else ""
+
+    return line
+
+
+def _by_line(counted: Counted) -> dict[tuple[str, Edge], list[Key]]:
+    """Vehicles with days, by line and edge."""
+    found: dict[tuple[str, Edge], list[Key]] = {}
+    for key, k in sorted(counted.place.items(), key=lambda item: item[0][0]):
+        if counted.sums.days[k] > 0:
+            found.setdefault((counted.line[k], key[1]), []).append(key)
+    return dict(sorted(found.items(), key=lambda item: (item[0][0], edge_order(item[0][1]))))
+
+
+def _stacked(
+    values: Mapping[Key, Float[np.ndarray, " 6"]], keys: Sequence[Key], default: float
+) -> Float[np.ndarray, "N 6"]:
+    return np.array([values.get(key, np.full(DOFS, default)) for key in keys]).reshape(-1, DOFS)
+
+
+def _of_audit(
+    lake: Lake, method: str
+) -> tuple[dict[str, list[DriftFinding]], dict[Key, np.ndarray], dict[Key, np.ndarray]]:
+    """The last audit's changes by vehicle, and scatter and autocorrelation of days by vehicle and edge."""
+    table = read_last_columns(lake, DRIFT, method, _OF_DRIFT)
+    if table is None:
+        return {}, {}, {}
+    alarm = pc.and_(pc.is_in(table["status"], pa.array(["RED", "YELLOW"])), pc.is_valid(table["start_day"]))
+    changes: dict[str, list[DriftFinding]] = {}
+    for row in table.filter(alarm).select(list(_OF_DRIFT)).to_pylist():
+        finding = DriftFinding(day="", method=method, reason="", days_used=0, limit=0.0, **row)
+        changes.setdefault(row["vehicle"], []).append(finding)
+    scale: dict[Key, np.ndarray] = {}
+    alike: dict[Key, np.ndarray] = {}
+    noisy = table.filter(pc.is_valid(table["day_scale"]))
+    names = ("vehicle", *_EDGE, "dof", "day_scale", "day_autocorrelation")
+    edges: dict[tuple[str, str, str], Edge] = {}
+    for vehicle, *of, dof, size, phi in zip(*(noisy[n].to_pylist() for n in names), strict=True):
+        name = (of[0], of[1], of[2])
+        edge = edges.get(name) or edges.setdefault(name, edge_named(*name))
+        k = DOF_NAMES.index(dof)
+        scale.setdefault((vehicle, edge), np.ones(DOFS))[k] = size
+        alike.setdefault((vehicle, edge), np.zeros(DOFS))[k] = phi or 0.0
+    return changes, scale, alike
+
+
+def _drawings(lake: Lake, method: str) -> dict[tuple[str, Edge], Drawing]:
+    """Drawings from which the sums of the last night count."""
+    last = last_assertion(lake, FLEET_MODEL, method)
+    if last is None:
+        return {}
+    rows = read_records(lake, FLEET_MODEL, FleetModelRow, day=last.day)
+    found = {}
+    for r in rows:
+        if r.method == method and r.drawing_qw is not None and r.prior_sigma is not None:
+            pose = [getattr(r, f"drawing_{n}") for n in ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")]
+            T, variance = (
+                from_quaternion(np.array(pose[:4]), np.array(pose[4:])),
+                np.array(r.prior_sigma) ** 2,
+            )
+            found[r.line, edge_named(r.pair, r.parent_frame, r.child_frame)] = Drawing(T, variance)
+    return found
+
+
+def _is_remounted(edge: Edge, events: Sequence[ServiceEvent]) -> bool:
+    names = {"all", *(sensor.name for sensor in edge.sensors)}
+    return any(e.kind == "re-mount" and e.sensor in names for e in events)
+
+
+def _has_changed(edge: Edge, changes: Sequence[DriftFinding]) -> bool:
+    of = (edge.kind, edge.parent.name, edge.child.name)
+    return any(c.status == "RED" and (c.pair, c.parent_frame, c.child_frame) == of for c in changes)
+
+
+_Reports = dict[tuple[str, str], dict[str, list[tuple[float, float]]]]
+
+
+def _witnesses(lake: Lake, method: str, window: tuple[str, str]) -> _Reports:
+    """Angles and sigmas that radars report of their own mounts, by vehicle and edge, where their signs are known."""
+    table = read_columns(lake, RADAR_ALIGNMENTS, _OF_RADARS, first=window[0], last=window[1])
+    found: _Reports = {}
+    if table is None:
+        return found
+    rows = current_rows(table.filter(pc.equal(table["method"], method)), RADAR_ALIGNMENTS)
+    for row in rows.select(list(_OF_RADARS)).to_pylist():
+        if not row["sign_is_published"] or row["own_edge"] is None:
+            continue
+        for name in _ANGLES:
+            if row[f"{name}_rad"] is not None:
+                sizes = (row[f"{name}_sigma_rad"] or 0.0, row[f"{name}_scatter_rad"] or 0.0, _SUREST_RAD)
+                of = found.setdefault((row["vehicle"], row["own_edge"]), {})
+                of.setdefault(f"radar {name}", []).append((row[f"{name}_rad"], max(sizes)))
+    return found
+
+
+def _witnesses_of(reports: _Reports, keys: Sequence[Key]) -> Witnesses:
+    """Mean of each vehicle's reports; their errors are taken to be the same every day."""
+    value = {f"radar {name}": np.zeros(len(keys)) for name in _ANGLES}
+    information = {name: np.zeros(len(keys)) for name in value}
+    for k, (vehicle, edge) in enumerate(keys):
+        for name, days in reports.get((vehicle, edge.name), {}).items():
+            angle, sigma = np.array(days).mean(axis=0)
+            value[name][k], information[name][k] = angle, 1 / sigma**2
+    return Witnesses(value, information)
+
+
+def _told(rows: Sequence[LineAnswer]) -> Told:
+    counts = Counter(r.status for r in rows)
+    differ = [r for r in rows if r.differs]
+    named = ", ".join(f"{r.vehicle} ({r.pair} {r.distance_axis})" for r in differ[:5])
+    more = f" and {len(differ) - 5} more" if len(differ) > 5 else ""
+    return Told(dict(counts), reason=f"differ from their line: {named}{more}" if differ else "")

@@ -1,0 +1,103 @@
+"""Model lines in words: what their vehicles share, and which of them differ."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pipeline.rig.edges import edge_named, words_of
+from pipeline.store.partitions import Lake
+from pipeline.store.records import last_assertion, read_last, read_records
+from schemas.fleet_model import FLEET_MODEL, LINE_ANSWERS, LINE_STATUSES, FleetModelRow, LineAnswer
+
+__all__ = ["AnswerView", "LineView", "line_views", "scatter_words", "shared_words"]
+
+_DEG = 180 / math.pi
+_NAMED = 12  # vehicles that a page names; the others it counts
+_OF_ANSWERS = (
+    "azimuth_sigma_rad",
+    "alone_covariance",
+    "moved_by",
+    "distance_sigmas",
+    "distance_axis",
+    "differs",
+)
+
+
+@dataclass(frozen=True)
+class LineView:
+    """One edge of a model line, as a row of the fleet page."""
+
+    line: str
+    edge: str
+    status: str
+    vehicles: int
+    scatter: str
+    shared: tuple[str, ...]
+    outside: tuple[str, ...]
+    reason: str
+
+
+@dataclass(frozen=True)
+class AnswerView:
+    """A vehicle that differs from its line."""
+
+    vehicle: str
+    line: str
+    edge: str
+    reason: str
+
+
+def line_views(lake: Lake, method: str) -> tuple[list[LineView], list[AnswerView], int]:
+    """Lines of the last night, the most urgent first; vehicles that differ, the first ones; and how many do."""
+    last = last_assertion(lake, LINE_ANSWERS, method)
+    if last is None:
+        return [], [], 0
+    rows = [r for r in read_records(lake, FLEET_MODEL, FleetModelRow, day=last.day) if r.method == method]
+    current = {(r.line, r.pair, r.parent_frame, r.child_frame): r for r in rows}
+    ordered = sorted(current.values(), key=lambda r: (LINE_STATUSES.index(r.status), r.line))
+    lines = [
+        LineView(
+            r.line, _edge_of(r), r.status, r.vehicles, scatter_words(r.scatter), tuple(shared_words(vars(r))),
+            tuple(r.outside[:_NAMED]), r.reason,
+        )
+        for r in ordered
+    ]  # fmt: skip
+    differ = [r for r in read_last(lake, LINE_ANSWERS, LineAnswer, method, columns=_OF_ANSWERS) if r.differs]
+    differ.sort(key=lambda r: -(r.distance_sigmas or 0.0))
+    views = [AnswerView(r.vehicle, r.line, _edge_of(r), r.reason) for r in differ[:_NAMED]]
+    return lines, views, len(differ)
+
+
+def scatter_words(scatter: Sequence[float] | None) -> str:
+    """Scatter of a line's mounts (1 sigma) by axis."""
+    if scatter is None:
+        return ""
+    turns = " ".join(f"{s * _DEG:.2f}" for s in scatter[:3])
+    shifts = " ".join(f"{s:.3f}" for s in scatter[3:])
+    return f"{turns} deg, {shifts} m"
+
+
+def shared_words(row: Mapping[str, Any]) -> list[str]:
+    """Errors that all vehicles of a line have in common, with one sigma, and of what they are."""
+    words = []
+    for name, total in row["totals"].items():
+        told = name in (row["told_apart"] or ())
+        value, sigma = (
+            (row["shared_errors"][name], row["shared_error_sigmas"][name])
+            if told
+            else (total, row["total_sigmas"][name])
+        )
+        size = (
+            f"{value:+.3f} +- {sigma:.3f} m"
+            if name.endswith("range")
+            else f"{value * _DEG:+.2f} +- {sigma * _DEG:.2f} deg"
+        )
+        words.append(f"{name} {size}{'' if told else ', or all mounts by as much'}")
+    return words
+
+
+def _edge_of(row: FleetModelRow | LineAnswer) -> str:
+    return words_of(edge_named(row.pair, row.parent_frame, row.child_frame))

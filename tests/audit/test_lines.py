@@ -1,0 +1,197 @@
+"""Stage lines: from records to what a line shares and to each vehicle's answer, night by night."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.config import FleetConfig
+from pipeline.geometry.changes import change_covariance
+from pipeline.stage_work import Task, Window
+from pipeline.stages import AUDIT, LINES, STATE
+from pipeline.store.commits import commit_records
+from pipeline.store.current import transform_of
+from pipeline.store.partitions import Lake
+from pipeline.store.records import read_last, read_records
+from schemas.calibrations import CALIBRATIONS
+from schemas.fleet_model import FLEET_MODEL, LINE_ANSWERS, FleetModelRow, LineAnswer
+from tests.makers.fleet_lakes import one_rig_fleet
+from tests.makers.line_records import DEG, MadeLine, change_of, line_records
+
+
+def fleet_of(**sections):
+    return FleetConfig.model_validate(
+        one_rig_fleet().model_dump(exclude_defaults=True) | {"vehicles": {"*": {"rig": "default"}}} | sections
+    )
+
+
+def lines(lake, fleet, last=None):
+    """The audit and the lines of a night: (rows of lines, answers by vehicle and pair)."""
+    task = Task(fleet, lake, Window(None, last))
+    AUDIT.run(task)
+    LINES.run(task)
+    answers = {(a.vehicle, a.pair): a for a in read_last(lake, LINE_ANSWERS, LineAnswer, "joint")}
+    day = next(iter(answers.values())).day
+    rows = read_records(lake, FLEET_MODEL, FleetModelRow, day=day)
+    return {r.pair: r for r in rows}, answers
+
+
+def night(folder, line, **sections):
+    lake = Lake.at(folder)
+    commit_records(lake, CALIBRATIONS, line_records(line))
+    return lines(lake, fleet_of(**sections))
+
+
+def errors(line, answers, pair, of="answer"):
+    """Errors of answers as changes, and their sigmas."""
+    mounts, off, sigma = line.mounts()[pair], [], []
+    for v in range(line.vehicles):
+        answer = answers[line.vehicle(v), pair]
+        T = transform_of(answer)
+        found = change_of(T, pair)
+        covariance = answer.covariance
+        if of == "alone":
+            found, covariance = found - answer.moved_by, answer.alone_covariance
+        if of == "record":
+            found, covariance = found + answer.record_change, answer.record_covariance
+        off.append(found - mounts[v] - line.bias.get(pair, 0.0))
+        sigma.append(np.sqrt(np.diag(change_covariance(T, covariance))))
+    return np.array(off), np.array(sigma)
+
+
+def test_equal_mounts_make_a_day_of_few_frames_surer_and_the_sigmas_hold(tmp_path):
+    line = MadeLine(60, 3, seed=1)
+    rows, answers = night(tmp_path, line)
+    assert {r.status for r in rows.values()} == {"GREEN"}
+    for pair, axes in (("camera_lidar", [0, 1, 2]), ("lidar_radar", [1, 2])):
+        off, sigma = errors(line, answers, pair)
+        alone, alone_sigma = errors(line, answers, pair, "alone")
+        z = (off / sigma)[:, axes]
+        assert np.mean(np.abs(z) < 3) > 0.99
+        assert np.sqrt(np.mean(alone[:, axes] ** 2)) > np.sqrt(np.mean(off[:, axes] ** 2))
+        # A vehicle that the line may not move as far as it would is less sure than alone: few of them.
+        assert np.mean((sigma <= alone_sigma * 1.001)[:, axes]) > 0.9
+        assert rows[pair].most_without_one < 0.2
+    off, sigma = errors(line, answers, "lidar_radar", "record")
+    alone = np.sqrt(
+        [np.diag(answers[line.vehicle(v), "lidar_radar"].record_alone_covariance)[1] for v in range(60)]
+    )
+    assert np.median(sigma[:, 1]) < 0.6 * np.median(alone)
+    assert np.mean(np.abs(off / sigma)[:, 1] < 3) > 0.98
+
+
+def test_a_night_that_adds_its_day_counts_what_all_days_at_once_do(tmp_path):
+    line, fleet = MadeLine(12, 6, seed=2), fleet_of()
+    records = line_records(line)
+    lake = Lake.at(tmp_path / "nights")
+    for last in sorted({r.day for r in records}):
+        commit_records(lake, CALIBRATIONS, [r for r in records if r.day == last])
+        by_night = lines(lake, fleet, last)[1]
+    lake = Lake.at(tmp_path / "at-once")
+    commit_records(lake, CALIBRATIONS, records)
+    at_once = lines(lake, fleet)[1]
+    assert by_night.keys() == at_once.keys()
+    for key, answer in at_once.items():
+        other = by_night[key]
+        np.testing.assert_allclose(other.sums, answer.sums, rtol=2e-3, atol=1e-6 * np.abs(answer.sums).max())
+        assert (other.days, other.first_day, other.last_day) == (
+            pytest.approx(answer.days), answer.first_day, answer.last_day,
+        )  # fmt: skip
+        np.testing.assert_allclose(transform_of(other), transform_of(answer), atol=1e-5)
+
+
+def test_a_record_of_a_day_that_is_counted_already_is_counted_once_and_as_it_is_now(tmp_path):
+    line, fleet = MadeLine(8, 3, seed=3), fleet_of()
+    records, lake = line_records(line), Lake.at(tmp_path)
+    commit_records(lake, CALIBRATIONS, records)
+    before = lines(lake, fleet)[1]
+    assert (
+        lines(lake, fleet)[1][line.vehicle(0), "camera_lidar"].days
+        == before[line.vehicle(0), "camera_lidar"].days
+    )
+    again = [
+        replace(r, work_key=f"{r.work_key}-again", status="refused")
+        for r in records
+        if r.vehicle == line.vehicle(0)
+    ]
+    commit_records(lake, CALIBRATIONS, [r for r in again if r.day == "2026-03-02"])
+    after = lines(lake, fleet)[1]
+    assert after[line.vehicle(0), "camera_lidar"].days == pytest.approx(2, abs=0.1)
+    assert after[line.vehicle(1), "camera_lidar"].days == before[line.vehicle(1), "camera_lidar"].days
+
+
+def test_a_vehicle_outside_its_line_is_named_on_its_first_day_and_answers_as_alone(tmp_path):
+    knock = np.array([0, 0, 1.5 * DEG, 0, 0, 0])
+    line = MadeLine(40, 1, seed=4, motion=lambda v, _: {"lidar_radar": knock} if v == 7 else {})
+    rows, answers = night(tmp_path, line)
+    assert rows["lidar_radar"].outside == [line.vehicle(7)]
+    answer = answers[line.vehicle(7), "lidar_radar"]
+    assert (answer.status, answer.differs, answer.distance_axis) == ("outside", True, "rz")
+    np.testing.assert_allclose(answer.moved_by, 0.0, atol=1e-12)
+    np.testing.assert_allclose(answer.covariance, answer.alone_covariance, rtol=1e-6)
+
+
+def test_a_shared_error_is_stated_and_nobody_s_certainty_rests_on_it(tmp_path):
+    bias = np.array([0, 0.8 * DEG, 0, -0.1, 0, 0])
+    line = MadeLine(50, 5, seed=5, bias={"lidar_radar": bias})
+    rows, answers = night(tmp_path, line)
+    row = rows["lidar_radar"]
+    assert row.told_apart == []
+    assert row.totals["radar elevation"] == pytest.approx(0.8 * DEG, rel=0.15)
+    assert row.totals["radar range"] == pytest.approx(0.1, rel=0.15)
+    _, sigma = errors(line, answers, "lidar_radar")
+    assert (sigma[:, 1] > 0.19 * DEG).all()  # the common part of its records
+
+
+def test_a_line_of_which_half_drifts_together_is_red_and_has_no_part_in_answers(tmp_path):
+    drift = np.array([0, 0, 0.3 * DEG, 0, 0, 0])
+    line = MadeLine(
+        40, 12, seed=6, motion=lambda v, d: {"camera_lidar": drift * max(d - 5, 0)} if v % 2 else {}
+    )
+    rows, answers = night(tmp_path, line)
+    assert rows["camera_lidar"].status == "RED"
+    assert "of 40 vehicles" in rows["camera_lidar"].reason
+    assert {a.status for (_, pair), a in answers.items() if pair == "camera_lidar"} == {"alone"}
+
+
+def test_five_vehicles_are_no_line_and_the_row_says_how_many_are_needed(tmp_path):
+    rows, answers = night(tmp_path, MadeLine(5, 2, seed=7))
+    assert rows["camera_lidar"].status == "UNKNOWN"
+    assert rows["camera_lidar"].reason == "5 vehicles with days, 6 needed"
+    assert {a.status for a in answers.values()} == {"alone"}
+
+
+def test_lines_of_two_models_share_nothing_with_each_other(tmp_path):
+    bias = np.array([0, 1.0 * DEG, 0, 0, 0, 0])
+    lake = Lake.at(tmp_path)
+    a, b = MadeLine(8, 8, seed=8), MadeLine(9, 8, seed=9, name="van", bias={"lidar_radar": bias})
+    commit_records(lake, CALIBRATIONS, [*line_records(a), *line_records(b)])
+    vehicles = {"car-*": {"rig": "default"}, "van-*": {"rig": "default", "model": "van"}}
+    task = Task(fleet_of(vehicles=vehicles), lake, Window())
+    AUDIT.run(task)
+    LINES.run(task)
+    rows = read_records(lake, FLEET_MODEL, FleetModelRow)
+    assert {(r.line, r.pair): r.vehicles for r in rows} == {
+        (line, pair): count for line, count in (("default", 8), ("van", 9)) for pair in ("camera_lidar", "lidar_radar")
+    }  # fmt: skip
+    total = {r.line: r.totals.get("radar elevation") for r in rows if r.pair == "lidar_radar"}
+    assert total["van"] - total["default"] == pytest.approx(1.0 * DEG, abs=0.4 * DEG)
+
+
+def test_states_load_the_answer_with_the_line_where_fleet_toml_asks_for_it(tmp_path):
+    line = MadeLine(30, 3, seed=10)
+    lake = Lake.at(tmp_path)
+    commit_records(lake, CALIBRATIONS, line_records(line))
+    for use in ("report", "states"):
+        fleet = fleet_of(fleet_model={"use": use})
+        _, answers = lines(lake, fleet)
+        state = {(s.vehicle, s.pair): s for s in STATE.run(Task(fleet, lake, Window())).records}
+        own = state[line.vehicle(3), "lidar_radar"]
+        answer = answers[line.vehicle(3), "lidar_radar"]
+        assert own.line_status == "shared"
+        np.testing.assert_allclose(own.line_covariance, answer.covariance)
+        if use == "report":
+            assert own.status == "none"  # no day of it was accepted
+        else:
+            assert own.status == "current"
+            np.testing.assert_allclose(transform_of(own), transform_of(answer), atol=1e-9)
