@@ -32,6 +32,7 @@ def audit(
     from jobs.terminal.summary import exit_code, left_out, print_summary, progress_reporter
     from jobs.terminal.vehicle_status import (
         count_statuses,
+        model_lines,
         moved_sensors,
         next_steps,
         realigned_radars,
@@ -50,7 +51,7 @@ def audit(
     with progress_reporter("audit") as progress:
         task = Task(config, tables, Window(from_day, to_day), method, progress=progress)
         outcome = AUDIT.run(task)
-        LINES.run(task)
+        lines = LINES.run(task)
         STATE.run(task)
     findings = DRIFT.rows_among(outcome.records)
     charts = [f.status for f in findings]
@@ -72,6 +73,7 @@ def audit(
         charts={s: charts.count(s) for s in DRIFT_STATUSES},
         moved=moved_sensors(findings),
         **realigned_radars([outcome]),
+        **model_lines([lines]),
         next_steps=next_steps(findings, lake),
         damaged=damaged,
         report=report,

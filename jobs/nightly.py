@@ -64,7 +64,7 @@ def nightly(
     from jobs.extras import require
     from jobs.night_sinks import night_sinks
     from jobs.terminal.summary import exit_code
-    from jobs.terminal.vehicle_status import realigned_radars
+    from jobs.terminal.vehicle_status import model_lines, realigned_radars
     from pipeline.calibrate.methods import method_named
     from pipeline.config import load_fleet
     from pipeline.extrinsics.prior import require_named_files
@@ -96,7 +96,7 @@ def nightly(
         tidy(tables)
         code = exit_code([*night_statuses(outcomes, config), *(["incomplete"] if tables.damage else [])])
         sinks.ended(code, findings)
-    realigned = realigned_radars(closed)
+    realigned = realigned_radars(closed) | model_lines(closed)
     _print_end(tables, code, outcomes, findings, pages, rigs_to_mend(outcomes, config), realigned)
     return held_exit_code if code == 3 else code
 

@@ -27,6 +27,7 @@ def simulate(
     container: Literal["mcap", "ros1", "db3", "mixed"] = "mcap",
     faults: str = "",
     remount_deg: float | None = None,
+    alike_deg: float | None = None,
     reflectors: bool = False,
     seed: int = 1,
     workers: int = 1,
@@ -54,6 +55,8 @@ def simulate(
             intrinsics, centre, centre-v [px], labels, night, dusk, few.
         remount_deg: standard deviation per axis of the mounting's change from day to day, for a rig that is
             taken off every evening; default: the change of a fixed sensor, some hundredths of a degree.
+        alike_deg: standard deviation per axis by which the vehicles' mounts differ from each other, all of them
+            deviating from the drawing alike; default: each deviates by itself, as far as its prior is unsure.
         reflectors: record three corner reflectors on every vehicle's last day too, under OUT/reflectors.
         seed: random seed; the same seed gives the same logs.
         workers: number of processes.
@@ -81,6 +84,7 @@ def simulate(
         faults=named,
         seed=seed,
         remount_deg=remount_deg,
+        alike_deg=alike_deg,
     )
     return _write(spec, out, reflectors, workers)
 

@@ -9,9 +9,10 @@ from typing import Any
 from jobs.terminal.record_tables import STATUS_STYLES
 from pipeline.results import Outcome
 from schemas.drift import DRIFT_STATUSES, DriftFinding, VehicleStatus, next_step, status_of
+from schemas.fleet_model import FLEET_MODEL, LINE_ANSWERS
 from schemas.service_events import SERVICE_EVENTS
 
-__all__ = ["count_statuses", "moved_sensors", "next_steps", "realigned_radars", "status_lines"]
+__all__ = ["count_statuses", "model_lines", "moved_sensors", "next_steps", "realigned_radars", "status_lines"]
 
 _STEPS = 40  # vehicles whose next steps are printed; the others are counted
 
@@ -46,6 +47,15 @@ def realigned_radars(outcomes: Sequence[Outcome]) -> dict[str, list[dict[str, st
     events = SERVICE_EVENTS.rows_among(row for outcome in outcomes for row in outcome.records)
     found = [{"vehicle": e.vehicle, "sensor": e.sensor, "what": e.note} for e in events]
     return {"realigned": found} if found else {}
+
+
+def model_lines(outcomes: Sequence[Outcome]) -> dict[str, dict[str, Any]]:
+    """Under key `lines`: status of each line and edge, and vehicles that differ from theirs; empty without lines."""
+    rows = [row for outcome in outcomes for row in outcome.records]
+    lines = {f"{r.line} {r.parent_frame}-{r.child_frame}": r.status for r in FLEET_MODEL.rows_among(rows)}
+    differ = sorted({a.vehicle for a in LINE_ANSWERS.rows_among(rows) if a.differs})
+    left = [f"and {len(differ) - _STEPS} more"] if len(differ) > _STEPS else []
+    return {"lines": {"status": lines, "vehicles_that_differ": differ[:_STEPS] + left}} if lines else {}
 
 
 def next_steps(findings: Sequence[DriftFinding], lake: str) -> list[str]:

@@ -22,6 +22,7 @@ from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.drift import DRIFT, DriftFinding
 from schemas.service_events import SERVICE_EVENTS, ServiceEvent
+from tests.makers.fleet_lakes import one_rig_fleet
 from tests.makers.lakes import write_records
 from tests.makers.stages import audit_fleet
 
@@ -342,3 +343,18 @@ def test_a_knock_within_a_day_is_found_on_that_day(tmp_path: Path, maker: Module
     red = [f for f in audit_fleet(lake, _fleet("a"), None, None, "joint") if f.status == "RED"]
     assert {f.moved_sensor for f in red} == {"radar"}
     assert {f.start_day for f in red} == {"2026-03-05"}
+
+
+@pytest.mark.parametrize("share", [0.5, 1.0])
+def test_a_step_of_a_whole_line_is_one_event_and_one_of_half_of_it_is_taken_from_nobody(
+    tmp_path: Path, maker: ModuleType, share: float
+) -> None:
+    rng, vehicles = np.random.default_rng(31), [f"v{k:02d}" for k in range(10)]
+    knock = {"radar": np.array([0.0, 0.0, np.radians(1.0), 0.0, 0.0, 0.0])}
+    lake, moved = Lake.at(tmp_path), vehicles[: int(share * len(vehicles))]
+    for vehicle in vehicles:
+        motion = (lambda d: knock if d > 9 else {}) if vehicle in moved else (lambda _: {})
+        commit_records(lake, CALIBRATIONS, maker.vehicle_records(vehicle, 20, rng, motion=motion))
+    found = {f.vehicle: f.vehicle_status for f in audit_fleet(lake, one_rig_fleet())}
+    expected = {v: "RED" if v in moved and share < 1 else "GREEN" for v in vehicles}
+    assert found == expected
