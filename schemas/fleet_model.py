@@ -64,9 +64,13 @@ class FleetModelRow(Recorded):
         default=None,
     )
     scatter: list[float] | None = column(
-        f"scatter of the vehicles' mounts about the mean (1 sigma), by axis of {_CHANGE}", default=None
+        f"scatter of the vehicles' mounts about the mean (1 sigma), by axis of {_CHANGE}; nan where too few "
+        "vehicles determine the axis",
+        default=None,
     )
-    scatter_sigma: list[float] | None = column("sigma of the squares' roots of scatter", default=None)
+    scatter_most: list[float] | None = column(
+        "scatter that answers rest on: one sigma above, so that few vehicles share less", default=None
+    )
     day_scale: list[float] | None = column(
         "ratio of the days' scatter to their sigmas, by axis: median of the vehicles' charts", default=None
     )

@@ -125,8 +125,8 @@ def _has_reference(edge: Edge) -> bool:
     return "base" not in (edge.parent.kind, edge.child.kind)
 
 
-def _evidence(line: LineOfEdge, prior: LinePrior, days: str) -> LineEvidence:
-    """Evidence of all days, or of each vehicle's last day."""
+def _evidence(line: LineOfEdge, prior: LinePrior, days: str, *, alike: bool = True) -> LineEvidence:
+    """Evidence of all days, or of each vehicle's last day; `alike`: neighbouring days err as charts take them to."""
     sums = line.sums
     information, pull, count = (
         (sums.information, sums.pull, sums.days)
@@ -134,7 +134,8 @@ def _evidence(line: LineOfEdge, prior: LinePrior, days: str) -> LineEvidence:
         else (sums.day_information, sums.day_pull, np.ones(len(sums.days)))
     )
     own = LinePrior(prior.mount, prior.bias[:6, :6])
-    evidence = evidence_of_days(information, pull, count, line.scale, line.autocorrelation, own)
+    autocorrelation = line.autocorrelation if alike else np.zeros_like(line.autocorrelation)
+    evidence = evidence_of_days(information, pull, count, line.scale, autocorrelation, own)
     evidence = LineEvidence(
         evidence.value, evidence.information, evidence.to_mount, evidence.to_bias, line.remounted
     )
@@ -157,7 +158,9 @@ def _model(line: LineOfEdge, evidence: LineEvidence, prior: LinePrior) -> _Found
         reason = f"{count} vehicles with days, {FEWEST_VEHICLES} needed"
         return _Found("UNKNOWN", reason, prior, None, motion, None)
     motion = _motion(line, prior)
-    model = learn_line(evidence, prior)
+    # How far days err alike is hardly known of few days. Where it is less than assumed, mounts scatter by more.
+    apart = _evidence(line, prior, days="all", alike=False)
+    model = learn_line(evidence, prior, learn_line(apart, prior).variance)
     answers = with_line(model, evidence, line.sums.common, line.sums.own_prior)
     contradiction = contradiction_of(evidence, model)
     alarms = int(line.changed.sum())
@@ -216,14 +219,13 @@ def _model_columns(line: LineOfEdge, found: _Found) -> dict[str, Any]:
     if model is None:
         return noise
     scatter = np.sqrt(model.variance)
+    known = model.learnt
     errors = shared_errors(model, shared_axes(line.edge.kind, line.drawing.T[:3, :3]))
     return noise | {
         "mean": model.mean,
         "mean_covariance": model.covariance.ravel(),
-        "scatter": scatter.tolist(),
-        "scatter_sigma": (
-            model.variance_sigma / (2 * np.maximum(scatter, np.sqrt(model.variance_sigma) / 2 + 1e-12))
-        ).tolist(),
+        "scatter": np.where(known, scatter, np.nan).tolist(),
+        "scatter_most": np.where(known, np.sqrt(model.safe_variance), np.nan).tolist(),
         "shared_errors": {e.name: e.value for e in errors},
         "shared_error_sigmas": {e.name: e.sigma for e in errors},
         "totals": {e.name: e.total for e in errors},

@@ -88,12 +88,16 @@ class _Terms:
     residual: np.ndarray
 
 
-def learn_line(evidence: LineEvidence, prior: LinePrior) -> LineModel:
+def learn_line(
+    evidence: LineEvidence, prior: LinePrior, at_least: Float[np.ndarray, " M"] | None = None
+) -> LineModel:
     """What the vehicles of a line share.
 
     Args:
         evidence: of FEWEST_VEHICLES or more vehicles.
         prior: of what they have in common.
+        at_least: variance of mounts that is certain to be there, as where days err less alike than `evidence` has it:
+            what days do not err by, mounts scatter by.
 
     Raises:
         ValueError: fewer vehicles.
@@ -116,6 +120,8 @@ def learn_line(evidence: LineEvidence, prior: LinePrior) -> LineModel:
         moved, variance = np.abs(new - variance), new
         if (moved <= _CONVERGED * sigma + 1e-18)[seen].all():
             break
+    if at_least is not None:
+        variance = np.where(seen, np.clip(at_least, variance, most), variance)
     terms = _solved(evidence, prior, value, variance, weight)
     distance, axis = _distances(evidence, terms)
     return LineModel(
@@ -238,6 +244,7 @@ def without_each(
     mean = np.linalg.solve(terms.information - own, (total - pull)[..., None])[..., 0] - terms.mean
     score, information = _scatter_equations(evidence, terms, w)
     left = score.sum(axis=0) - score
-    step = left @ _inverse(information)
+    # Where the variance is not the likeliest but one that is certain to be there, only the vehicle's own part counts.
+    step = (left - np.where(model.variance > 0, score.sum(axis=0), 0.0)) @ _inverse(information)
     step = np.where((model.variance_sigma <= 0) | (model.variance <= 0) & (left <= 0), 0.0, step)
     return mean, np.maximum(step, -model.variance)

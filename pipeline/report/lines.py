@@ -72,11 +72,11 @@ def line_views(lake: Lake, method: str) -> tuple[list[LineView], list[AnswerView
 
 
 def scatter_words(scatter: Sequence[float] | None) -> str:
-    """Scatter of a line's mounts (1 sigma) by axis."""
+    """Scatter of a line's mounts (1 sigma) by axis; - where it is not known."""
     if scatter is None:
         return ""
-    turns = " ".join(f"{s * _DEG:.2f}" for s in scatter[:3])
-    shifts = " ".join(f"{s:.3f}" for s in scatter[3:])
+    turns = " ".join("-" if math.isnan(s) else f"{s * _DEG:.2f}" for s in scatter[:3])
+    shifts = " ".join("-" if math.isnan(s) else f"{s:.3f}" for s in scatter[3:])
     return f"{turns} deg, {shifts} m"
 
 

@@ -195,3 +195,10 @@ def test_states_load_the_answer_with_the_line_where_fleet_toml_asks_for_it(tmp_p
         else:
             assert own.status == "current"
             np.testing.assert_allclose(transform_of(own), transform_of(answer), atol=1e-9)
+
+
+def test_mounts_scatter_by_what_they_do_though_few_days_hardly_tell_how_alike_days_err(tmp_path):
+    rows, _ = night(tmp_path, MadeLine(80, 4, seed=11, scatter=np.array([0.2 * DEG] * 3 + [0.005] * 3)))
+    found = np.degrees(rows["camera_lidar"].scatter[:3])
+    assert (np.abs(found - 0.2) < 0.06).all()
+    assert np.isnan(rows["lidar_radar"].scatter[0])  # roll of the radar: no vehicle determines it
