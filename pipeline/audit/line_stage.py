@@ -42,7 +42,7 @@ _OF_DRIFT = ("vehicle", *_EDGE, "dof", "status", "start_day", "start_day_latest"
              "day_scale", "day_autocorrelation")  # fmt: skip
 _ANGLES = ("azimuth", "elevation")
 _OF_RADARS = (
-    "vehicle", "sensor", "own_edge", "sign_is_published",
+    "vehicle", "sensor", "sign_is_published",
     *(f"{name}_{what}" for name in _ANGLES for what in ("rad", "sigma_rad", "scatter_rad")),
 )  # fmt: skip
 _SUREST_RAD = float(np.radians(0.05))  # a radar's own alignment is not taken to be surer
@@ -195,19 +195,19 @@ _Reports = dict[tuple[str, str], dict[str, list[tuple[float, float]]]]
 
 
 def _witnesses(lake: Lake, method: str, window: tuple[str, str]) -> _Reports:
-    """Angles and sigmas that radars report of their own mounts, by vehicle and edge, where their signs are known."""
+    """Angles and sigmas that radars report of their own mounts, by vehicle and radar, where their signs are known."""
     table = read_columns(lake, RADAR_ALIGNMENTS, _OF_RADARS, first=window[0], last=window[1])
     found: _Reports = {}
     if table is None:
         return found
     rows = current_rows(table.filter(pc.equal(table["method"], method)), RADAR_ALIGNMENTS)
     for row in rows.select(list(_OF_RADARS)).to_pylist():
-        if not row["sign_is_published"] or row["own_edge"] is None:
+        if not row["sign_is_published"]:
             continue
         for name in _ANGLES:
             if row[f"{name}_rad"] is not None:
                 sizes = (row[f"{name}_sigma_rad"] or 0.0, row[f"{name}_scatter_rad"] or 0.0, _SUREST_RAD)
-                of = found.setdefault((row["vehicle"], row["own_edge"]), {})
+                of = found.setdefault((row["vehicle"], row["sensor"]), {})
                 of.setdefault(f"radar {name}", []).append((row[f"{name}_rad"], max(sizes)))
     return found
 
@@ -217,7 +217,9 @@ def _witnesses_of(reports: _Reports, keys: Sequence[Key]) -> Witnesses:
     value = {f"radar {name}": np.zeros(len(keys)) for name in _ANGLES}
     information = {name: np.zeros(len(keys)) for name in value}
     for k, (vehicle, edge) in enumerate(keys):
-        for name, days in reports.get((vehicle, edge.name), {}).items():
+        radars = [sensor.name for sensor in (edge.parent, edge.child) if sensor.kind == "radar"]
+        of_radar = reports.get((vehicle, radars[0]), {}) if len(radars) == 1 else {}
+        for name, days in of_radar.items():
             angle, sigma = np.array(days).mean(axis=0)
             value[name][k], information[name][k] = angle, 1 / sigma**2
     return Witnesses(value, information)

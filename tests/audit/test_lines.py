@@ -15,6 +15,7 @@ from pipeline.store.partitions import Lake
 from pipeline.store.records import read_last, read_records
 from schemas.calibrations import CALIBRATIONS
 from schemas.fleet_model import FLEET_MODEL, LINE_ANSWERS, FleetModelRow, LineAnswer
+from schemas.radar_alignments import RADAR_ALIGNMENTS, RadarAlignment
 from tests.makers.fleet_lakes import one_rig_fleet
 from tests.makers.line_records import DEG, MadeLine, change_of, line_records
 
@@ -202,3 +203,30 @@ def test_mounts_scatter_by_what_they_do_though_few_days_hardly_tell_how_alike_da
     found = np.degrees(rows["camera_lidar"].scatter[:3])
     assert (np.abs(found - 0.2) < 0.06).all()
     assert np.isnan(rows["lidar_radar"].scatter[0])  # roll of the radar: no vehicle determines it
+
+
+@pytest.mark.parametrize("pair", ["radar_base", "lidar_radar"])
+def test_radars_that_report_their_mount_in_the_vehicle_tell_a_shared_error_there_and_not_on_other_edges(
+    tmp_path, pair
+):
+    sign = -1 if pair == "radar_base" else 1  # what a parent measures wrongly shows as it is
+    bias = {pair: np.array([0, sign * 0.8 * DEG, 0, 0, 0, 0])}
+    line, lake = MadeLine(40, 5, seed=12, bias=bias, pairs=(pair,)), Lake.at(tmp_path)
+    commit_records(lake, CALIBRATIONS, line_records(line))
+    turned_up = -sign * line.mounts()[pair][:, 1]
+    rows = [
+        RadarAlignment(
+            vehicle=line.vehicle(v), day="2026-03-05", method="joint", sensor="radar", topics=["/alignment"],
+            sign_is_published=True, messages=9, first_stamp_ns=0, last_stamp_ns=1, own_edge="lidar-radar",
+            elevation_rad=float(turned_up[v]), elevation_sigma_rad=0.1 * DEG, work_key=f"a{v}",
+        )
+        for v in range(line.vehicles)
+    ]  # fmt: skip
+    commit_records(lake, RADAR_ALIGNMENTS, rows)
+    row = lines(lake, fleet_of())[0][pair]
+    assert row.totals["radar elevation"] == pytest.approx(0.8 * DEG, rel=0.2)
+    if pair == "radar_base":
+        assert row.told_apart == ["radar elevation"]
+        assert row.shared_errors["radar elevation"] == pytest.approx(0.8 * DEG, rel=0.15)
+    else:  # the lidar may be mounted otherwise on all vehicles
+        assert row.told_apart == []

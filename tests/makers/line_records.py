@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pipeline.geometry.changes import change_between, change_jacobian, changed
-from pipeline.geometry.se3 import to_quaternion
+from pipeline.geometry.se3 import from_rotation_translation, to_quaternion
 from schemas.calibrations import CalibrationRecord
 from tests.audit.fleet_records import T_CAMERA_LIDAR, T_LIDAR_RADAR
 
@@ -17,15 +17,21 @@ __all__ = ["DEG", "FIRST_DAY", "MadeLine", "line_records"]
 
 DEG = np.pi / 180
 FIRST_DAY = dt.date(2026, 3, 1)
-_DRAWINGS = {"camera_lidar": T_CAMERA_LIDAR, "lidar_radar": T_LIDAR_RADAR}
+_DRAWINGS = {
+    "camera_lidar": T_CAMERA_LIDAR,
+    "lidar_radar": T_LIDAR_RADAR,
+    "radar_base": from_rotation_translation(np.eye(3), np.array([-3.5, 0.0, -0.6])),
+}
 # What one day of ten frames varies by, along axes of the parent; of a radar's x, and of height, it shows nothing.
 _SIGMA = {
     "camera_lidar": np.array([0.12 * DEG, 0.12 * DEG, 0.2 * DEG, 0.03, 0.03, np.inf]),
     "lidar_radar": np.array([np.inf, 0.6 * DEG, 0.15 * DEG, 0.04, 0.04, np.inf]),
+    "radar_base": np.array([np.inf, 0.4 * DEG, 0.1 * DEG, np.inf, np.inf, np.inf]),
 }
 _COMMON = {
     "camera_lidar": np.array([0.03 * DEG, 0.03 * DEG, 0.03 * DEG, 0.005, 0.005, 0.005]),
     "lidar_radar": np.array([0.1 * DEG, 0.2 * DEG, 0.05 * DEG, 0.02, 0.02, 0.02]),
+    "radar_base": np.array([0.1 * DEG, 0.4 * DEG, 0.05 * DEG, 0.02, 0.02, 0.02]),
 }
 _PRIOR = np.array([2 * DEG] * 3 + [0.05] * 3)
 
@@ -54,6 +60,7 @@ class MadeLine:
     sigma: Mapping[str, np.ndarray] = field(default_factory=lambda: _SIGMA)
     motion: Callable[[int, int], Mapping[str, np.ndarray]] = lambda _vehicle, _day: {}
     name: str = "car"
+    pairs: tuple[str, ...] = ("camera_lidar", "lidar_radar")
 
     def vehicle(self, number: int) -> str:
         """Name of a vehicle."""
@@ -62,13 +69,14 @@ class MadeLine:
     def mounts(self) -> dict[str, np.ndarray]:
         """Changes of the factory's mounts from the drawing, by edge and vehicle."""
         rng = np.random.default_rng([self.seed, 1])
-        return {pair: self.scatter * rng.normal(size=(self.vehicles, 6)) for pair in _DRAWINGS}
+        return {pair: self.scatter * rng.normal(size=(self.vehicles, 6)) for pair in self.pairs}
 
 
 def line_records(line: MadeLine, first: int = 0) -> list[CalibrationRecord]:
     """Records of all vehicles, from the day numbered `first` on."""
     mounts, found = line.mounts(), []
-    for pair, drawing in _DRAWINGS.items():
+    for pair in line.pairs:
+        drawing = _DRAWINGS[pair]
         rng = np.random.default_rng([line.seed, 2, list(_DRAWINGS).index(pair)])
         sigma = line.sigma[pair]
         finite = np.isfinite(sigma)
