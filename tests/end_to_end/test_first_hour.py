@@ -12,9 +12,10 @@ from torch.utils.data import DataLoader
 from jobs.cli import main
 from pipeline.learn.frames.torch_dataset import Frames
 from pipeline.rig.topics import TOPICS
-from pipeline.simulate.fleet import FleetSpec, simulate_fleet
+from pipeline.simulate.fleet import FleetSpec
 from tests.conftest import SHARED
 from tests.makers import data_sets
+from tests.makers.kept_days import kept_fleet
 from tests.makers.real_models import write_real_manifests
 
 pytestmark = pytest.mark.slow
@@ -60,7 +61,7 @@ def said(capsys, *arguments, codes=(0,)):
 
 
 def simulated(folder):
-    simulate_fleet(FleetSpec(vehicles=1, days=1, frames=12, drives=1), folder / "made")
+    kept_fleet(FleetSpec(vehicles=1, days=1, frames=12, drives=1), folder / "made")
     return sorted((folder / "made" / "logs").glob("*/*/*"))
 
 
