@@ -77,8 +77,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         items.sort(key=lambda item: rank.get(item.path.relative_to(REPO / "tests").parts[0], len(rank)))
 
 
-# `make test` promises tests of less than ten seconds each. A busy machine makes seconds of CPU longer, and the first test
-# of a process pays for imports and compiled loops.
+# `make test` promises tests of less than ten seconds each. On a busy machine the same work takes more CPU time, and the
+# first test of a process pays for imports and compiled loops.
 QUICK_CPU_S = 15.0
 COST = "cpu_s"
 BEGAN_CPU_S = pytest.StashKey[float]()
