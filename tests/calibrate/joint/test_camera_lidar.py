@@ -89,6 +89,7 @@ def test_starts_that_end_apart_widen_sigma_unless_the_day_rejects_one():
     np.testing.assert_array_equal(both.covariance, alone.covariance)
 
 
+@pytest.mark.slow
 def test_stamps_that_are_all_late_by_as_much_change_the_time_offset_by_it_and_nothing_else():
     late_ns, solved = 60_000_000, []
     day = traced_day(DENSE, 8, seed=1, dt_s=0.01)
