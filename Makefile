@@ -29,6 +29,7 @@ READERS := .venv-readers
 DATA_READERS := nuscenes-devkit==1.2.0 t4-devkit==0.1.0 yourdfpy==0.0.60 xacro==2.1.1 webdataset==1.0.2 "pyarrow<20" "pandas<3"
 BARE_READERS := vcd==6.0.3 pykitti==0.3.1 vod-tudelft==1.0.3# without their requirements, of which reading needs none
 SCHEDULERS := apache-airflow==3.3.2 dagster==1.13.29 kubernetes-validate==1.37.0
+# --no-compile: most of it is never imported.
 install_data = $(1) $(DATA_READERS) && $(1) --no-deps $(BARE_READERS)
 install_schedulers = $(1) $(SCHEDULERS)
 export BORESIGHT_READERS ?= $(wildcard $(CURDIR)/$(READERS)/data/bin/python)
@@ -38,17 +39,25 @@ readers: setup $(READERS)/data $(READERS)/schedulers ## data sets' devkits, Airf
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[train-ray]'
 
 # An environment appears whole or not at all; pip names what it did not find, and `make test` what it leaves out for that.
+# Under CI nothing may be left out.
 $(READERS)/%: Makefile
 	rm -rf $@ $@.new
 	$(PYTHON) -m venv $@.new
-	$(call install_$*,$@.new/bin/python -m pip install --quiet) && mv $@.new $@ || echo "$@ is not there: tests that need it are left out"
+	$(call install_$*,$@.new/bin/python -m pip install --quiet --no-compile) && mv $@.new $@ \
+		|| { echo "$@ is not there: tests that need it are left out"; test -z "$$CI"; }
 
 demo: setup ## synthetic fleet to HTML report, in minutes
 	$(BIN)/boresight demo --out demo || [ $$? -eq 3 ] # 3: done, and something was held, as it should be
 
-test: setup browser ## tests of less than ten seconds; EVERYTHING=1 adds the rest and checks shapes and types
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --durations 25 --ignore tests/benchmarks \
-		$(if $(EVERYTHING),--jaxtyping-packages=schemas$(comma)pipeline$(comma)beartype.beartype,-m "not slow")
+# Files go to workers whole, for what their tests share; tests/conftest.py puts the heaviest first.
+PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder --durations 25 \
+	--ignore tests/benchmarks
+SHAPES := --jaxtyping-packages=schemas$(comma)pipeline$(comma)beartype.beartype
+
+# Checks of shapes double what heavy tests cost, so these run without them.
+test: setup browser ## tests of less than ten seconds; EVERYTHING=1 checks shapes and types in them, and runs the slow ones
+	$(if $(EVERYTHING),@code=0; $(PYTEST) -m "not slow" $(SHAPES) || code=$$?; \
+		$(PYTEST) -m slow || code=$$?; exit $$code,$(PYTEST) -m "not slow")
 
 # Page tests want Chromium. It is installed where that is allowed without asking, and nowhere else; tests without it are
 # named in the last lines of `make test`.

@@ -34,6 +34,7 @@ def export_frames(
     from_day: Annotated[str | None, Parameter(name="--from")] = None,
     to_day: Annotated[str | None, Parameter(name="--to")] = None,
     vehicles: Annotated[list[str] | None, Parameter(consume_multiple=True)] = None,
+    unsplit: Annotated[bool, Parameter(negative=())] = False,
     executor: Literal["process", "inline"] = "process",
     workers: int | None = None,
 ) -> int:
@@ -60,6 +61,7 @@ def export_frames(
         from_day: first day, YYYY-MM-DD.
         to_day: last day.
         vehicles: only these vehicles; default: all vehicles of fleet.toml in the lake.
+        unsplit: put every frame in the split train. A single vehicle-day cannot be split without a leak.
         executor: process (a pool) or inline (one after the other in this process).
         workers: processes at a time; default: one per CPU that this process may use.
     """
@@ -88,8 +90,10 @@ def export_frames(
         "seed": seed,
     }
     settings |= {"perturb": None if perturb is None else list(perturb), "perturb_per": perturb_per}
+    whole = {"val_fraction": 0.0, "test_fraction": 0.0} if unsplit else {}
+    prepare = config.prepare.model_copy(update=whole)
     with progress_reporter("plan") as progress:
-        planned, settings = plan_frames(tables, list(known), config.prepare, output, settings, progress)
+        planned, settings = plan_frames(tables, list(known), prepare, output, settings, progress)
     tasks = [
         DayTask(tables, day, output, format, places, dict(lost), known[day], moved)
         for day, (places, lost) in planned.items()

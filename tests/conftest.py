@@ -2,6 +2,7 @@
 
 import os
 from collections import Counter
+from collections.abc import Generator
 from pathlib import Path
 
 # One thread per process: the suite may run on several workers, and nested thread pools starve small machines.
@@ -55,12 +56,68 @@ def real_segmenter() -> Path:
     return path
 
 
+# Where the heavy files are, so that no worker begins one when the other has nothing left. Others keep their order.
+HEAVIEST_FIRST = (
+    "accuracy",
+    "end_to_end",
+    "test_wheel.py",
+    "learn",
+    "calibrate",
+    "jobs",
+    "simulate",
+    "verify",
+)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Under xdist, which hands out files in the order of their first tests, begin with the heavy rooms."""
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        rank = {name: i for i, name in enumerate(HEAVIEST_FIRST)}
+        items.sort(key=lambda item: rank.get(item.path.relative_to(REPO / "tests").parts[0], len(rank)))
+
+
+# `make test` promises tests of less than ten seconds each. On a busy machine the same work takes more CPU time, and the
+# first test of a process pays for imports and compiled loops.
+QUICK_CPU_S = 15.0
+COST = "cpu_s"
+BEGAN_CPU_S = pytest.StashKey[float]()
+
+
+def cpu_s() -> float:
+    """CPU time of this process and of the children it has waited for: wall time would name busy machines."""
+    return sum(os.times()[:4])
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """Begin to count what a test costs, its fixtures included."""
+    item.stash[BEGAN_CPU_S] = cpu_s()
+    return (yield)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item,
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Note on the report of a test without the mark `slow` what it cost (workers send their reports)."""
+    report = yield
+    if report.when == "call" and "slow" not in item.keywords:
+        report.user_properties.append((COST, cpu_s() - item.stash[BEGAN_CPU_S]))
+    return report
+
+
 @pytest.hookimpl(trylast=True)
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Say last, and without being asked, which tests were left out and how to have them."""
+    """Say last, and without being asked, which tests were left out and how to have them, and which are too slow."""
     left_out: Counter[tuple[str, str]] = Counter()
     for report in terminalreporter.stats.get("skipped", []):
         reason = report.longrepr[2] if isinstance(report.longrepr, (tuple, list)) else str(report.longrepr)
         left_out[report.nodeid.partition("::")[0], reason.removeprefix("Skipped: ")] += 1
     for (file, reason), tests in sorted(left_out.items()):
         terminalreporter.write_line(f"left out of {file}: {tests} ({reason})")
+    reports = [*terminalreporter.stats.get("passed", []), *terminalreporter.stats.get("failed", [])]
+    costs = {r.nodeid: value for r in reports for name, value in r.user_properties if name == COST}
+    for test, cost in sorted(costs.items(), key=lambda item: -item[1]):
+        if cost > QUICK_CPU_S:
+            terminalreporter.write_line(f"not quick, and not marked slow: {test} ({cost:.0f} s of CPU)")

@@ -8,7 +8,8 @@ import sys
 import numpy as np
 import pytest
 
-from pipeline.simulate.fleet import FleetSpec, simulate_fleet
+from pipeline.simulate.fleet import FleetSpec
+from tests.makers.kept_days import kept_fleet
 from tests.makers.s3_server import BUCKET, running
 
 BORESIGHT = f"{sys.prefix}/bin/boresight"
@@ -23,7 +24,7 @@ def run(environment, *arguments):
 
 @pytest.mark.slow
 def test_a_night_on_a_bucket_records_what_a_night_on_a_folder_does(tmp_path):
-    simulate_fleet(FleetSpec(vehicles=1, days=1, frames=12, drives=2), tmp_path)
+    kept_fleet(FleetSpec(vehicles=1, days=1, frames=12, drives=2), tmp_path)
     logs = f"{tmp_path}/logs/{{vehicle}}/{{day}}/*"
     common = ["--fleet", f"{tmp_path}/fleet.toml", "--executor", "inline", "--logs", logs, "--no-pictures"]
     records = {}

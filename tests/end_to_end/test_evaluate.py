@@ -9,12 +9,14 @@ import pyarrow.parquet as pq
 import pytest
 
 from pipeline.geometry.se3 import exp_so3, to_quaternion
-from pipeline.simulate.fleet import FleetSpec, simulate_fleet
+from pipeline.simulate.fleet import FleetSpec
 from pipeline.simulate.reflectors import simulate_reflectors
 from pipeline.store.partitions import Lake
 from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, PAIRS, CalibrationRecord
+from tests.makers.kept_days import kept_fleet
 from tests.makers.lakes import write_records
 
+pytestmark = pytest.mark.slow
 BORESIGHT = f"{sys.prefix}/bin/boresight"
 VEHICLE, DAY = "vehicle-1", "2026-03-02"
 YAW_DEG = 0.6  # put into camera-lidar, and into nothing else
@@ -42,7 +44,7 @@ def folder(tmp_path_factory):
     """A day's logs, its reflector recording ingested into a lake of its own, and records with one known error."""
     out = tmp_path_factory.mktemp("evaluate")
     spec = FleetSpec(vehicles=1, days=1, first_day=DAY, frames=3, drives=1)
-    simulate_fleet(spec, out)
+    kept_fleet(spec, out)
     simulate_reflectors(spec, 0, 0, out, frames=20)
     code, summary, stderr = boresight(
         "ingest", out / f"reflectors/{VEHICLE}/{DAY}.mcap", "--fleet", out / "fleet.toml",

@@ -13,7 +13,7 @@ from pipeline.extrinsics.prior import prior_of_three, rig_prior
 from pipeline.geometry.se3 import inverse, log_se3
 from pipeline.ingest.index import DayIndex
 from pipeline.simulate.faults import parse_faults
-from pipeline.simulate.fleet import FleetSpec, simulate_fleet
+from pipeline.simulate.fleet import FleetSpec
 from pipeline.simulate.sensors.rigs import rig_named
 from pipeline.stage_work import Task
 from pipeline.stages import CALIBRATE
@@ -23,6 +23,7 @@ from pipeline.store.views import frames_of, ingested, observations_of, perceived
 from schemas.calibrations import CalibrationRecord
 from schemas.moments import PRIOR, SENSORS_ABSENT
 from schemas.poses import PoseRow
+from tests.makers.kept_days import kept_fleet
 from tests.makers.stages import ingest_day, perceive_day
 
 DAY, MOMENTS = Partition("vehicle-1", "2026-03-02"), 8
@@ -38,7 +39,7 @@ def day(tmp_path_factory):
     spec = FleetSpec(
         vehicles=1, days=1, frames=MOMENTS, drives=1, rig="duo", environments="urban", seed=5, faults=faults
     )
-    simulate_fleet(spec, out)
+    kept_fleet(spec, out)
     fleet, lake = load_fleet(out / "fleet.toml"), Lake.at(out / "lake")
     logs = sorted((out / "logs" / DAY.vehicle / DAY.day).iterdir())
     outcomes = ingest_day(logs, DAY, fleet, lake), perceive_day(DAY, fleet, lake)
@@ -82,6 +83,7 @@ def test_what_is_damaged_of_one_camera_costs_that_camera_alone(day, tmp_path, mo
     assert lost == counts
 
 
+@pytest.mark.slow
 def test_a_camera_without_semantics_is_counted_and_told_what_to_set_and_the_others_go_on(day, tmp_path):
     lake, fleet, _, (_, before) = day
     copy = Lake.at(tmp_path / "lake")

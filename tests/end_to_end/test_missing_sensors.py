@@ -10,13 +10,14 @@ import pytest
 
 from jobs.cli import main
 from pipeline.geometry.se3 import from_quaternion, log_so3
-from pipeline.simulate.fleet import FleetSpec, simulate_fleet
+from pipeline.simulate.fleet import FleetSpec
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
 from pipeline.store.views import observations_of
 from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, PAIRS, SENSORS, CalibrationRecord
 from schemas.drift import DRIFT, DriftFinding
 from schemas.states import STATES, StateRow
+from tests.makers.kept_days import kept_fleet
 
 pytestmark = pytest.mark.slow  # a night of four vehicles
 
@@ -41,9 +42,7 @@ def fleet_text(text):
 def night(tmp_path_factory):
     """The folder of a night's lake and pages, and the night's summary."""
     out = tmp_path_factory.mktemp("rigs")
-    simulate_fleet(
-        FleetSpec(vehicles=1, days=1, first_day=DAY, frames=32, seed=21, environments="urban"), out
-    )
+    kept_fleet(FleetSpec(vehicles=1, days=1, first_day=DAY, frames=32, seed=21, environments="urban"), out)
     fleet = out / "fleet.toml"
     fleet.write_text(fleet_text(fleet.read_text()))
     for name in (*GONE, "silent"):

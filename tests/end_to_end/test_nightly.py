@@ -13,11 +13,13 @@ from pathlib import Path
 import psutil
 import pytest
 
-from pipeline.simulate.fleet import FleetSpec, simulate_fleet
+from pipeline.simulate.fleet import FleetSpec
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
 from pipeline.store.views import ingested, observations_of, perceived
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
+from tests.makers.fleet_files import fleet_toml
+from tests.makers.kept_days import kept_fleet
 from tests.makers.ray_clusters import two_nodes
 
 BORESIGHT = f"{sys.prefix}/bin/boresight"
@@ -28,7 +30,7 @@ DAYS = ("2026-03-02", "2026-03-03")
 def fleet(tmp_path_factory):
     """Two vehicles for two days in three containers, one poisoned log, one vehicle that fleet.toml does not know."""
     out = tmp_path_factory.mktemp("fleet")
-    simulate_fleet(FleetSpec(vehicles=2, days=2, frames=12, drives=2, container="mixed"), out)
+    kept_fleet(FleetSpec(vehicles=2, days=2, frames=12, drives=2, container="mixed"), out)
     poisoned = out / "logs" / "vehicle-3" / DAYS[0]
     poisoned.mkdir(parents=True)
     (poisoned / "a.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(range(256)) * 100)
@@ -266,7 +268,11 @@ def test_sigterm_stops_the_night_cleanly_and_the_next_one_goes_on(fleet, tmp_pat
     assert good_days(lake) >= WANTED
 
 
-def test_days_outside_the_window_are_not_touched(fleet, tmp_path):
-    code, summary, _ = run(*command(fleet, tmp_path / "lake", "--from", "2027-01-01"))
+def test_days_outside_the_window_are_not_touched(tmp_path):
+    (tmp_path / "fleet.toml").write_text(fleet_toml("vehicle-1"))
+    log = tmp_path / "logs" / "vehicle-1" / DAYS[0] / "a.mcap"
+    log.parent.mkdir(parents=True)
+    log.write_bytes(b"of a day that nobody opens")
+    code, summary, _ = run(*command(tmp_path, tmp_path / "lake", "--from", "2027-01-01"))
     assert (code, summary["vehicle_days"]) == (0, 0)
     assert not list((tmp_path / "lake").rglob("*.parquet"))

@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.config import load_fleet
 from pipeline.geometry.se3 import inverse, log_se3
-from pipeline.simulate.fleet import FleetSpec, simulate_fleet
+from pipeline.simulate.fleet import FleetSpec
 from pipeline.stage_work import Task
 from pipeline.stages import CALIBRATE
 from pipeline.store.current import current_poses, transform_of
@@ -15,6 +15,7 @@ from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.poses import POSES, PoseRow
+from tests.makers.kept_days import kept_fleet
 from tests.makers.stages import ingest_day, perceive_day
 
 pytestmark = pytest.mark.slow
@@ -24,7 +25,7 @@ DAY, MOMENTS = Partition("vehicle-1", "2026-03-02"), 60
 @pytest.fixture(scope="module")
 def day(tmp_path_factory):
     out = tmp_path_factory.mktemp("duo")
-    simulate_fleet(
+    kept_fleet(
         FleetSpec(vehicles=1, days=1, frames=MOMENTS, drives=2, rig="duo", environments="mixed", seed=31), out
     )
     fleet, lake = load_fleet(out / "fleet.toml"), Lake.at(out / "lake")

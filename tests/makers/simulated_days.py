@@ -8,10 +8,11 @@ import numpy as np
 
 from pipeline.config import FleetConfig, load_fleet
 from pipeline.simulate.faults import parse_faults
-from pipeline.simulate.fleet import FleetSpec, simulate_fleet
+from pipeline.simulate.fleet import FleetSpec
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import observations_of
 from schemas.observations import Observation
+from tests.makers.kept_days import kept_fleet
 from tests.makers.stages import ingest_day, perceive_day
 
 DATE = "2026-03-02"
@@ -40,7 +41,7 @@ def simulated_day(
     faults: str = "",
 ) -> SimulatedDay:
     """Simulate, ingest and perceive one day into a folder: about 0.3 CPU seconds a frame for the demo rig."""
-    simulate_fleet(
+    kept_fleet(
         FleetSpec(
             vehicles=1,
             days=1,

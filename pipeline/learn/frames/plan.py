@@ -106,6 +106,6 @@ def _require_splits(config: PrepareConfig, planned: Planned) -> None:
     if empty:
         problem = (
             f"no frames for {', '.join(empty)}: too few vehicles, days and places to keep splits apart by "
-            f'{", ".join(config.split_by)}; set split_by = "place", or val_fraction and test_fraction to 0'
+            f'{", ".join(config.split_by)}; set split_by = "place", or export with --unsplit: all into train'
         )
         raise ConfigError("fleet.toml", "prepare.split_by", problem)

@@ -70,6 +70,7 @@ def test_a_pose_of_known_truth_comes_out_within_its_sigma(seed, kind, spec):
     assert not evidence.checks
 
 
+@pytest.mark.slow
 def test_a_start_five_degrees_off_leads_to_the_same_pose(street, evidence):
     far = perturb_exactly(street.nominal["top"], np.radians(5.0), 0.1, np.random.default_rng(3))
     T, sigma = by_axis(evidence)

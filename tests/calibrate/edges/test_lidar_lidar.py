@@ -72,6 +72,7 @@ def test_pose_and_clock_of_known_truth_come_out_within_sigma(seed, spec, T_base_
     assert not evidence.checks
 
 
+@pytest.mark.slow
 def test_lidars_without_overlap_have_no_edge(street):
     back = [replace(s, xyz_m=s.xyz_m - [400.0, 0, 0]) for s in street.sweeps["side"]]
     with pytest.raises(SolveError, match="lies on what the other one sees"):

@@ -59,6 +59,7 @@ def test_frames_with_gaps_of_their_own_are_solved_as_well_as_frames_without(rig)
     assert abs(e.time_offset_s - 0.03) < 0.015
 
 
+@pytest.mark.slow
 def test_starts_that_end_apart_widen_sigma_unless_the_day_rejects_one():
     """Where half of the frames show another pose, the score has two maxima; on a whole day the second one is lower."""
     turn, day = exp_so3(np.radians([0.0, 0.0, 1.5])), traced_day(DENSE, 12, seed=1)
@@ -88,6 +89,7 @@ def test_starts_that_end_apart_widen_sigma_unless_the_day_rejects_one():
     np.testing.assert_array_equal(both.covariance, alone.covariance)
 
 
+@pytest.mark.slow
 def test_stamps_that_are_all_late_by_as_much_change_the_time_offset_by_it_and_nothing_else():
     late_ns, solved = 60_000_000, []
     day = traced_day(DENSE, 8, seed=1, dt_s=0.01)

@@ -48,6 +48,7 @@ def day():
     return traced_day(DENSE, 12, seed=1)
 
 
+@pytest.mark.slow
 def test_cars_without_windows_leave_edges_and_paint_in_agreement(day):
     found = solved(day)
     assert found.failed_checks == []

@@ -454,22 +454,25 @@ def test_from_a_bucket_to_a_bucket_the_same_bytes_as_between_folders(lake, tmp_p
     assert found == contents(tmp_path / "out")
 
 
-def test_nuscenes_devkit_and_webdataset_open_what_is_written(lake, tmp_path):
+def test_nuscenes_devkit_webdataset_and_pykitti_open_what_is_written(lake, tmp_path):
     python = os.environ.get("BORESIGHT_READERS")
     if not python:
         pytest.skip("BORESIGHT_READERS names no Python with the loaders: make readers")
     card = export(lake, tmp_path / "shards", "webdataset")
-    export(lake, tmp_path / "nuscenes", "nuscenes")
+    for form in ("nuscenes", "kitti"):
+        export(lake, tmp_path / form, form)
     call = [
         python,
         str(Path(__file__).parent / "real_loaders.py"),
         str(tmp_path / "nuscenes"),
         str(tmp_path / "shards"),
+        str(tmp_path / "kitti"),
     ]
     found = json.loads(
         subprocess.run(call, capture_output=True, text=True, check=True).stdout.splitlines()[-1]
     )
-    first = lake_frames(lake)["a", DAYS[0], 0]
+    frames = lake_frames(lake)
+    first = frames["a", DAYS[0], 0]
     assert found["nuscenes"]["samples"] == 24
     assert found["nuscenes"]["lidar"] == len(first.lidar_x_m)
     assert found["nuscenes"]["radar"] == len(first.radar_x_m)
@@ -477,3 +480,13 @@ def test_nuscenes_devkit_and_webdataset_open_what_is_written(lake, tmp_path):
     assert all(found["nuscenes"]["scenes"].values())
     assert len(found["webdataset"]) == card["frames"]["train"]
     assert {tuple(shape[1:]) for shape in found["webdataset"].values()} == {(4, 320, 640, 3)}
+    told = [json.loads(line) for line in (tmp_path / "kitti" / "frames.jsonl").read_text().splitlines()]
+    assert {t["name"] for t in told} == found["kitti"].keys()
+    for facts in told:
+        read, frame = found["kitti"][facts["name"]], frames[facts["vehicle"], facts["day"], facts["moment"]]
+        assert (read["points"], read["size"]) == (len(frame.lidar_x_m), [640, 320])
+        assert read["first"][:3] == [frame.lidar_x_m[0], frame.lidar_y_m[0], frame.lidar_z_m[0]]
+        T = {name: np.array(facts["sensors"][name]["T_reference_sensor"]) for name in ("camera", "lidar")}
+        T_camera_lidar = (inverse(T["camera"]) @ T["lidar"])[:3]
+        np.testing.assert_allclose(read["T_camera_lidar"], T_camera_lidar, atol=1e-12)
+        assert read["in_image"] > 100

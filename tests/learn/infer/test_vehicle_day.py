@@ -226,7 +226,8 @@ def run(lake, capsys, *more):
     return code, json.loads(capsys.readouterr().out.splitlines()[-1])
 
 
-@pytest.mark.parametrize("method", ["joint-ssl", pytest.param("pairwise-ssl", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["joint-ssl", "pairwise-ssl"])
 def test_untrained_networks_make_records_that_nobody_would_drive_by(lake, capsys, method):
     code, told = run(lake, capsys, "--method", method)
     records = [

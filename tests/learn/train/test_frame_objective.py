@@ -31,8 +31,10 @@ def batch(day):
 
 
 @pytest.fixture(scope="module")
-def few(batch):
-    return batch[slice(0, 4)]
+def few(tmp_path_factory):
+    """Four frames of a short day: quick tests do not wait for the long one."""
+    day = simulated_day(tmp_path_factory.mktemp("short"), frames=6, environment="mixed")
+    return with_true_clocks(day_batch(day.lake, day.partition, day.fleet_file), day.told)[slice(0, 4)]
 
 
 @pytest.mark.slow
@@ -53,6 +55,7 @@ def test_the_minimum_over_a_fleet_is_at_the_truth_in_all_that_it_determines(batc
     assert abs(yaw.offset) < 3 * yaw.error
 
 
+@pytest.mark.slow
 def test_all_six_together_come_back_to_the_truth(batch, day):
     """Descending from a degree and 5 cm away, on all six of camera-lidar at once."""
     half = batch[slice(0, len(batch), 2)]

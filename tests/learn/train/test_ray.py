@@ -38,6 +38,7 @@ def data(tmp_path_factory):
     return str(root)
 
 
+@pytest.mark.slow  # in processes of Ray, whose time is not counted as its own
 @pytest.mark.usefixtures("cluster")
 # Ray itself leaves files and sockets to the garbage collector.
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")

@@ -1,0 +1,75 @@
+"""`export frames` needs no more memory for four times the frames."""
+
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from pipeline.store.partitions import Lake
+from tests.makers import training_lakes
+from tests.makers.fleet_files import fleet_toml
+
+FRAMES, MOST_MIB = 40, 12  # were they held, four times the frames would be 45 MiB more: see `picture`
+POSE = {"ego_qw": 1.0, "ego_qx": 0.0, "ego_qy": 0.0, "ego_qz": 0.0, "ego_ty_m": 0.0, "ego_tz_m": 0.0}
+EXPORT = """
+import sys
+from jobs.cli import main
+assert main(sys.argv[1:]) == 0
+# Not ru_maxrss: a child inherits its parent's.
+peak = next(line for line in open("/proc/self/status") if line.startswith("VmHWM"))
+print(int(peak.split()[1]) / 1024)
+"""
+
+
+@pytest.fixture(scope="module")
+def lakes(tmp_path_factory):
+    """A lake of one vehicle-day, and one of a day four times as long."""
+    noise = np.random.default_rng(0).integers(0, 255, (320, 640, 3)).astype(np.uint8)
+    picture = cv2.imencode(".jpg", noise, [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes()
+    assert len(picture) > 4e5
+    made = []
+    for frames in (FRAMES, 4 * FRAMES):
+        folder = tmp_path_factory.mktemp("lake")
+        (folder / "fleet.toml").write_text(fleet_toml("a"))
+        about = {"image": picture, "ego_speed_mps": 10.0, "ego_yaw_rate_radps": 0.0, "ego_tx_m": 0.0, **POSE}
+        training_lakes.fill(Lake.at(folder), "a", "2026-01-01", frames, **about)
+        made.append((frames, folder))
+    return made
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("form", ["parquet", "nuscenes"])
+def test_memory_does_not_grow_with_the_number_of_frames(lakes, form, tmp_path):
+    peaks_mib = []
+    for frames, lake in lakes:
+        out = tmp_path / str(frames)
+        call = [
+            sys.executable,
+            "-c",
+            EXPORT,
+            "export",
+            "frames",
+            "--fleet",
+            lake / "fleet.toml",
+            "--lake",
+            lake,
+        ]
+        call += [
+            "--out",
+            out,
+            "--format",
+            form,
+            "--calibration",
+            "prior",
+            "--unsplit",
+            "--executor",
+            "inline",
+        ]
+        done = subprocess.run(call, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        assert f'"train": {frames}' in (out / "card.json").read_text()
+        peaks_mib.append(float(done.stdout.splitlines()[-1]))
+    few, many = peaks_mib
+    assert many - few < MOST_MIB, peaks_mib
