@@ -23,8 +23,10 @@ from pipeline.names import is_pattern, is_vehicle, matches
 from pipeline.rig.rig import SECTIONS, Rig
 from pipeline.rigs import Positive, Section
 from pipeline.sections import (
+    MOVED,
     TERMS,
     AuditConfig,
+    ChecksConfig,
     IngestConfig,
     LearnConfig,
     PerceiveConfig,
@@ -40,6 +42,7 @@ from pipeline.shipped_models import PREFIX, shipped_manifest
 __all__ = [
     "TERMS",
     "AuditConfig",
+    "ChecksConfig",
     "FleetConfig",
     "IngestConfig",
     "LearnConfig",
@@ -52,6 +55,7 @@ __all__ = [
     "VerifyConfig",
     "config_hash",
     "load_fleet",
+    "moved_keys",
     "read_toml",
     "validated",
 ]
@@ -192,6 +196,17 @@ def load_fleet(path: Path) -> FleetConfig:
     return validated(FleetConfig, read_toml(path), str(path)).read_from(path)
 
 
+def moved_keys(path: Path) -> dict[str, str]:
+    """Keys of a fleet.toml that a newer section holds, and their names there; both are read."""
+    file = read_toml(path)
+    return {
+        f"{outer}.{old}": f"{outer}.{section}.{name}"
+        for outer in ("prepare", "verify")
+        for (section, name), old in MOVED.items()
+        if old in file.get(outer, {})
+    }
+
+
 def read_toml(path: Path) -> dict[str, Any]:
     """Content of a TOML file; raises ConfigError if it is missing, or not TOML."""
     try:
@@ -227,6 +242,8 @@ def _written(loc: Sequence[str | int], values: Any) -> Sequence[str | int]:
     for i, key in enumerate(loc):
         if not isinstance(values, dict):
             break
+        if MOVED.get(tuple(loc[i : i + 2])) in values:
+            return (*loc[:i], MOVED[tuple(loc[i : i + 2])], *loc[i + 2 :])
         if key not in values and tuple(loc[i : i + 2]) in _SHORT:
             return (*loc[:i], *loc[i + 1 :])
         values = values.get(key)

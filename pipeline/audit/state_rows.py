@@ -25,7 +25,7 @@ __all__ = ["fused", "fused_as_they_differ", "pose_columns", "with_state"]
 # Of successive accepted days: the most that the charts' budget is proved for. A state promises no more than such days
 # can give.
 _AUTOCORRELATION = 0.6
-_BY_CHANCE = 1e-3  # once in a thousand axes, days that differ as they say would be called too far apart
+_BY_CHANCE = 1e-3  # once in a thousand axes, days that differ by chance alone would count as too far apart
 _OFTEN = 0.5  # share of a state's days: one day in 300 lies that far from the prior by chance
 
 

@@ -29,7 +29,7 @@ class Look:
 
     @property
     def row(self) -> SetCheck:
-        """Any of the axes, for what they share."""
+        """The row of one axis, for the columns that all axes of a look have in common."""
         return self.axes[0]
 
     @property
