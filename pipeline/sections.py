@@ -246,7 +246,7 @@ class ChecksConfig(Section):
     max_heading_error_share: Fraction = 0.25
 
 
-# (section, key): name of the key in files up to 0.12, which had it in the section around it. Both are read.
+# (section, key): name of the key in files up to 0.11, which had it in the section around it. Both are read.
 MOVED = (
     {("split", name): name for name in SplitConfig.model_fields}
     | {("split", "by"): "split_by"}
@@ -256,7 +256,7 @@ MOVED = (
 
 
 def _moved(values: object, *sections: str) -> object:
-    """Values with keys of 0.12 in the sections where they are now; ValueError for a key that is set twice."""
+    """Values with keys of 0.11 in the sections where they are now; ValueError for a key that is set twice."""
     if not isinstance(values, Mapping):
         return values
     new = dict(values)
@@ -285,7 +285,7 @@ class PrepareConfig(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _keys_of_0_12(cls, values: object) -> object:
+    def _keys_of_0_11(cls, values: object) -> object:
         return _moved(values, "split", "grid")
 
     def split_with(self, **values: Any) -> PrepareConfig:
@@ -306,7 +306,7 @@ class VerifyConfig(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _keys_of_0_12(cls, values: object) -> object:
+    def _keys_of_0_11(cls, values: object) -> object:
         return _moved(values, "checks")
 
 

@@ -93,7 +93,7 @@ max_move_prior_sigmas = 6
 """
 
 
-def test_keys_of_0_12_mean_what_they_meant_and_check_names_their_new_places(tmp_path):
+def test_keys_of_0_11_mean_what_they_meant_and_check_names_their_new_places(tmp_path):
     old = load(tmp_path, GOOD + OLD)
     new = load(
         tmp_path,

@@ -121,7 +121,7 @@ def require_sides(lake: Lake) -> None:
 
 
 def _val_fraction(settings: Mapping[str, Any]) -> float:
-    """`val_fraction` in the settings of an inventory, which have no sections up to 0.12."""
+    """`val_fraction` in the settings of an inventory, which have no sections up to 0.11."""
     return float(settings.get("split", settings)["val_fraction"])
 
 

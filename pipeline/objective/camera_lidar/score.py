@@ -147,7 +147,7 @@ class Terms:
         return replace(self, edges=self.edges.chosen(is_seen))
 
     def at_most(self, points: int, rng: np.random.Generator) -> Terms:
-        """The terms with about `points` narrow edges, wide edges, markings and points of classes at most, drawn at random."""
+        """The terms with at most about `points` of each: narrow edges, wide edges, markings, points of classes."""
         kept = []
         for p, is_wide in ((self.edges, self._is_wide), (self.markings, None), (self.classes, None)):
             group = np.zeros(len(p.xyz_m), np.intp) if is_wide is None else is_wide.astype(np.intp)
