@@ -98,7 +98,7 @@ class Estimates:
     work_key: pa.Array
 
     def at(self, rows: slice | np.ndarray) -> Estimates:
-        """Some of the records, in their order."""
+        """A selection of the records, in the same order."""
         keys = self.work_key[rows] if isinstance(rows, slice) else self.work_key.take(pa.array(rows))
         return replace(self, work_key=keys, **{name: getattr(self, name)[rows] for name in _PER_RECORD})
 

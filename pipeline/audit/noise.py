@@ -176,7 +176,7 @@ def _drawn(alike: tuple[np.ndarray, np.ndarray], towards: np.ndarray, worth: flo
 def _scatter(
     near: Differences, phi: np.ndarray, prior: Prior
 ) -> tuple[Float[np.ndarray, "V P D"], Float[np.ndarray, "V P D"]]:
-    """Factor on sigmas, and the degrees of freedom that it is known to."""
+    """Ratio of the days' scatter to their sigmas, and the degrees of freedom of its estimate."""
     z = near.in_sigmas(phi)
     V, P, D, S = z.shape
     found, seen = winsorised_variance(np.moveaxis(z, 0, 2).reshape(P, D, V * S))

@@ -229,7 +229,7 @@ def _what_could_hide(days: int, times: float) -> str:
     needed = math.ceil(days * times**2)
     return (
         f"no change seen, but these days are too inaccurate to exclude one of the size that matters: {times:.1f} times "
-        f"that size would be seen now, that size itself after about {_count(needed)} more"
+        f"that size would be seen now, that size itself with about {_count(needed)} like these"
     )
 
 

@@ -114,21 +114,8 @@ def _solved(
 ) -> DayOfPairs:
     """A day whose sources of motion were compared."""
     progress(0, 4, "select frames")
-    method, select = method_named(about.method), fleet.select
-    if method.frames == "all":
-        select = select.model_copy(update={"frames": max(len(observations), 1)})
-    sync_gate_s, by_motion = _sync_gate_s(method, fleet), fleet.ingest
-    selection = select_frames(
-        observations,
-        select,
-        paper=method.paper_selection,
-        sync_gate_s=sync_gate_s,
-        motion_gate=None
-        if sync_gate_s
-        else (by_motion.sync_gate_m, float(np.radians(by_motion.sync_gate_deg))),
-        pairs=about.pairs,
-        absent=about.absent,
-    )
+    method = method_named(about.method)
+    selection = _selection(observations, method, fleet, about)
     refused = {p: _named(e, motion.of(p)) for p, e in _refused(method, about.pairs, selection, prior).items()}
     pairs = [pair for pair in about.pairs if pair not in refused]
     refusals = {
@@ -173,6 +160,26 @@ def _solved(
     )
     progress(4, 4, "done")
     return DayOfPairs(refusals, day)
+
+
+def _selection(
+    observations: Sequence[Observation], method: Method, fleet: FleetConfig, about: Inputs
+) -> Selection:
+    """Frames to fit and frames to judge, of each pair, within the method's limit of stamp differences."""
+    select, gates, gate_s = fleet.select, fleet.ingest, fleet.ingest.sync_gate_s
+    if method.frames == "all":
+        select = select.model_copy(update={"frames": max(len(observations), 1)})
+    if gate_s is None and method.paper_selection:
+        gate_s = PAPER_SYNC_GATE_S
+    return select_frames(
+        observations,
+        select,
+        paper=method.paper_selection,
+        sync_gate_s=gate_s,
+        motion_gate=None if gate_s else (gates.sync_gate_m, float(np.radians(gates.sync_gate_deg))),
+        pairs=about.pairs,
+        absent=about.absent,
+    )
 
 
 def _judging(
@@ -223,12 +230,6 @@ def _refused(
         alone = SolveError(f"method {method.name} needs camera, lidar and radar: {why}")
         refused = {pair: refused.get(pair, alone) for pair in pairs}
     return {pair: refused[pair] for pair in pairs if pair in refused}
-
-
-def _sync_gate_s(method: Method, fleet: FleetConfig) -> float | None:
-    """The gate of ingest; the paper's gate for its methods if ingest gates by motion."""
-    gate_s = fleet.ingest.sync_gate_s
-    return PAPER_SYNC_GATE_S if gate_s is None and method.paper_selection else gate_s
 
 
 def _to_calibrate(method: Method, fired: Mapping[str, Sequence[str]], when: str) -> list[str]:

@@ -114,7 +114,7 @@ def _square(vector: Float[np.ndarray, "N M"]) -> Float[np.ndarray, "N M M"]:
 def _distances(
     model: LineModel, evidence: LineEvidence, residual: np.ndarray, covariance: np.ndarray
 ) -> tuple[Float[np.ndarray, " N"], np.ndarray]:
-    """Largest shift along an axis in sigmas, and the axis; a workshop's mount is no member of what a factory made."""
+    """Largest distance of a mount from the line along an axis, in sigmas, and the axis; 0 for a remounted vehicle."""
     both = np.concatenate([evidence.to_mount, evidence.to_bias], axis=1)
     line = evidence.to_mount @ np.diag(model.variance) @ evidence.to_mount.T + both @ covariance @ both.T
     z = np.abs(shifts_in_sigmas(evidence.weights(line), residual, evidence.to_mount))

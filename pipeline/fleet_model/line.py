@@ -68,7 +68,7 @@ class LineModel:
 
     @property
     def safe_variance(self) -> Float[np.ndarray, " M"]:
-        """Variance of mounts that answers rest on: one sigma above the estimate, so that few vehicles share less."""
+        """Variance of mounts for the answers: estimate plus one sigma, so that a line of few vehicles counts less."""
         return self.variance + self.variance_sigma
 
 
@@ -213,7 +213,7 @@ def _inverse(information: np.ndarray) -> np.ndarray:
 def _nonnegative_step(
     variance: np.ndarray, score: np.ndarray, information: np.ndarray, seen: np.ndarray
 ) -> np.ndarray:
-    """One step of Fisher scoring along the axes that are seen; one at zero whose score points below stays there."""
+    """One step of Fisher scoring of variances; a variance of zero with a negative score stays zero."""
     free = ~((variance <= 0) & (score <= 0)) & (np.diag(information) > 0) & seen
     step = np.zeros(len(variance))
     if free.any():

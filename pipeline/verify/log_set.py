@@ -1,4 +1,4 @@
-"""The calibrations that a data set ships: every log is asked, as shipped and with known turns."""
+"""Check of the calibrations of a data set: every log is verified, as shipped and with known turns."""
 
 from __future__ import annotations
 

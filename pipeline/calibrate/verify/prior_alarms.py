@@ -134,7 +134,7 @@ def _kept(resting: PairEstimate, hidden: Float[np.ndarray, " 6"]) -> Bool[np.nda
 def _rests_on(
     resting: PairEstimate, prior: Prior, hidden: Float[np.ndarray, " 6"], limits: ChecksConfig
 ) -> bool:
-    """Whether the prior's error would move targets by more than their sigma, and nothing in this pair denies it."""
+    """Whether an error of the prior would move targets by more than their sigma, and the pair does not measure it."""
     far = limits.max_move_prior_sigmas * np.sqrt(np.diag(prior.covariance(resting.pair)))
     own = change_between(prior.of(resting.pair), resting.T)
     sigma = np.sqrt(np.diag(change_covariance(resting.T, resting.covariance)))
