@@ -242,9 +242,10 @@ def _written(loc: Sequence[str | int], values: Any) -> Sequence[str | int]:
     for i, key in enumerate(loc):
         if not isinstance(values, dict):
             break
-        if MOVED.get(tuple(loc[i : i + 2])) in values:
-            return (*loc[:i], MOVED[tuple(loc[i : i + 2])], *loc[i + 2 :])
-        if key not in values and tuple(loc[i : i + 2]) in _SHORT:
+        two: Any = tuple(loc[i : i + 2])
+        if MOVED.get(two) in values:
+            return (*loc[:i], MOVED[two], *loc[i + 2 :])
+        if key not in values and two in _SHORT:
             return (*loc[:i], *loc[i + 1 :])
         values = values.get(key)
     return loc

@@ -220,7 +220,7 @@ def _drawn_to_fleet(
 
 
 def _independent(z: Float[np.ndarray, "V P D S"]) -> Float[np.ndarray, " P"]:
-    """How many of an edge's degrees of freedom err by themselves: they share scenes."""
+    """Effective number of independent degrees of freedom of an edge: those of one day share its scenes."""
     rows = np.moveaxis(np.clip(np.nan_to_num(z), -WINSOR, WINSOR), 2, -1).swapaxes(0, 1)
     rows = rows.reshape(z.shape[1], -1, z.shape[2])
     square = np.einsum("pna,pnb->pab", rows, rows)

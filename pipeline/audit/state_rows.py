@@ -114,6 +114,6 @@ def _targets(days: Estimates) -> Float[np.ndarray, "N 3"]:
 
 
 def _unchecked(days: Estimates) -> dict[str, float]:
-    """DoF that at least half of the days found far from the prior, with nothing to check them: the most sigmas."""
+    """Largest move [sigma] from the prior by DoF, of DoF that at least half of the days left unchecked."""
     often = np.mean(days.unchecked_sigmas > 0, axis=0) >= _OFTEN
     return {dof: float(days.unchecked_sigmas[:, k].max()) for k, dof in enumerate(DOF_NAMES) if often[k]}

@@ -174,7 +174,7 @@ def _status(
         why = (
             ""
             if confirmed >= limits.confidence
-            else ", for held-out frames hardly tell such a turn from none"
+            else ", because held-out frames hardly distinguish such a turn from none"
         )
         return "inconclusive", f"{distance}: {seen}{why}"
     if measured:

@@ -90,8 +90,8 @@ def test_one_record_per_pair_with_every_column_filled(solved):
 
 
 def test_trigger_metrics_are_measured_for_the_papers_methods_and_where_they_decide(tmp_path, day):
-    lake = lake_with(tmp_path, day)
     for when, measured in (("always", False), ("triggered", True)):
+        lake = lake_with(tmp_path / when, day)
         calibrate_day(DAY, fleet_of(trigger={"when": when}), lake, method="joint")
         assert {bool(r.trigger_before) for r in records_of(lake)} == {measured}
 

@@ -46,7 +46,7 @@ def heading_failures(
     limit_rad: float,
     limits: ChecksConfig | None = None,
 ) -> list[FailedCheck]:
-    """Camera-lidar solved along a heading that lidar-radar then turned.
+    """Failed check of camera-lidar if it was solved with a heading that lidar-radar contradicts.
 
     A camera's time offset moves the cloud along the car's heading, which the radar's prior mounting gives.
     Where lidar-radar turns the radar by many of the prior's sigmas, that heading was wrong, and camera-lidar

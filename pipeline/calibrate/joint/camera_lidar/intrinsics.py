@@ -227,7 +227,7 @@ class _State:
         return _State(self.alignment.stepped(x[:8]), self.centre_px + x[_CENTRE])
 
     def seen(self, terms: Terms) -> Terms:
-        """The terms with the principal point where this state has it."""
+        """The terms with the principal point shifted as in this state."""
         camera = terms.camera.copy()
         camera[3:5] += self.centre_px.astype(np.float32)
         return replace(terms, camera=camera)
