@@ -32,8 +32,9 @@ def prepare(
 ) -> int:
     """Make the table training: samples for a network, on sides train, val and test without leaks.
 
-    Prints how many frames the split loses, and how many a split by other keys would lose. Without [prepare]
-    split_by it takes the strictest keys that leave no side empty and cost at most a fifth of the frames.
+    Prints how many frames the split loses, and how many a split by other keys would lose. Without
+    `by` in [prepare.split] it takes the strictest keys that leave no side empty and cost at most a fifth of
+    the frames.
 
     Args:
         fleet: fleet.toml; section [prepare] sets the spacing of frames and the split.
@@ -60,7 +61,7 @@ def prepare(
     results = _run(planned, executor, workers)
     with progress_reporter("inventory") as progress:
         progress(0, 0, "compare views")
-        inventory = take_inventory(tables, config.prepare.duplicate_bits)
+        inventory = take_inventory(tables, config.prepare.split.duplicate_bits)
     path = write_inventory(tables, inventory, _about(config) | {"choices": [asdict(c) for c in choices]})
     print_choices(choices)
     statuses = [r.status for r in results] + (["held"] if _empty_sides(config, inventory) else [])
@@ -127,7 +128,8 @@ def _plan(
         for done, day in enumerate(days):
             progress(done, len(days), f"{day.vehicle} {day.day}")
             surveys.append(survey_day(day, lake, config.prepare))
-    config = config.changed(prepare={"split_by": settled_keys(surveys, config.prepare, lake)})
+    split = config.prepare.split_with(by=settled_keys(surveys, config.prepare, lake))
+    config = config.model_copy(update={"prepare": split})
     plan = plan_days(surveys, config.prepare, decided_sides(lake, config.prepare))
     work = []
     for survey in surveys:
@@ -190,7 +192,8 @@ def _empty_sides(config: FleetConfig, inventory: Inventory) -> list[str]:
 
 
 def _wanted_sides(config: FleetConfig) -> list[str]:
-    shares = {"train": 1.0, "val": config.prepare.val_fraction, "test": config.prepare.test_fraction}
+    split = config.prepare.split
+    shares = {"train": 1.0, "val": split.val_fraction, "test": split.test_fraction}
     return [side for side, share in shares.items() if share > 0]
 
 
@@ -205,10 +208,9 @@ def _next_steps(
         if all(choice.frames[side] for side in wanted):
             by = ", ".join(f'"{name}"' for name in choice.split_by)
             frames = ", ".join(f"{choice.frames[side]} {side}" for side in wanted)
-            return [f"set split_by = [{by}] under [prepare] in {fleet}: {frames} frames; then prepare again"]
-    return [
-        f"set val_fraction and test_fraction to 0 under [prepare] in {fleet}, or add days; then prepare again"
-    ]
+            return [f"set by = [{by}] under [prepare.split] in {fleet}: {frames} frames; then prepare again"]
+    without = "val_fraction and test_fraction to 0 under [prepare.split]"
+    return [f"set {without} in {fleet}, or add days; then prepare again"]
 
 
 def _problems(config: FleetConfig, results: Sequence[Outcome], inventory: Inventory) -> list[dict[str, str]]:
@@ -217,12 +219,12 @@ def _problems(config: FleetConfig, results: Sequence[Outcome], inventory: Invent
         for r in results
         if r.status not in ("done", "cached")
     ]
-    by = ", ".join(config.prepare.split_by)
+    by = ", ".join(config.prepare.split.by)
     return found + [
         {
             "side": side,
             "status": "held",
-            "reason": f"no frames: too few to split them by {by} (prepare.split_by)",
+            "reason": f"no frames: too few to split them by {by} (prepare.split.by)",
         }
         for side in _empty_sides(config, inventory)
     ]

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from pipeline.config import FleetConfig
     from pipeline.results import Progress
     from pipeline.rig.graph import Sensor
+    from pipeline.stage_work import Probes
     from pipeline.store.partitions import Lake, Partition
     from pipeline.verify.one_axis import AxisCheck
 
@@ -75,10 +76,8 @@ def verify(
     config = load_fleet(fleet)
     name = _vehicle(config, vehicle)
     with TemporaryDirectory(prefix="boresight-verify-") as folder:
-        config, of_sensors = (
-            for_one_look(config, frames, (camera_lidar_deg, radar_deg)),
-            not config.rig_of(name).is_one_of_each,
-        )
+        of_sensors = not config.rig_of(name).is_one_of_each
+        config = for_one_look(config, frames)
         lacking: tuple[Sensor, ...] = ()
         if calibration is not None and of_sensors:
             config, lacking = _of_poses(
@@ -173,14 +172,14 @@ def _checked(
     """
     from pipeline.store.partitions import Partition
     from pipeline.store.records import read_records
-    from pipeline.verify.axes import check_axes, limits_of
+    from pipeline.verify.axes import check_axes, limits_of, probes
     from pipeline.verify.one_log import check_poses, prior_in_use
     from schemas.calibrations import CALIBRATIONS, CalibrationRecord
     from schemas.poses import POSES, PoseRow
 
     vehicle, lacking = of
     partition = Partition(vehicle, _DAY)
-    _calibrate(config, lake, partition, logs, progress)
+    _calibrate(config, lake, partition, logs, probes(asked_deg), progress)
     records = read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle=vehicle)
     if lacking is None:
         checks = [
@@ -201,7 +200,12 @@ def _checked(
 
 
 def _calibrate(
-    config: FleetConfig, lake: Lake, partition: Partition, logs: tuple[Path, ...], progress: Progress
+    config: FleetConfig,
+    lake: Lake,
+    partition: Partition,
+    logs: tuple[Path, ...],
+    probe_deg: Probes,
+    progress: Progress,
 ) -> None:
     """Calibrate from the log, with the calibration in use as prior."""
     from dataclasses import replace
@@ -210,7 +214,7 @@ def _calibrate(
     from pipeline.stages import CALIBRATE, INGEST, PERCEIVE
     from pipeline.verify.one_log import prior_in_use, with_prior
 
-    task = Task(config, lake, partition, method="joint", logs=logs, progress=progress)
+    task = Task(config, lake, partition, "joint", probe_deg=probe_deg, logs=logs, progress=progress)
     for stage in (INGEST, PERCEIVE):
         stage.run(task)
     prior = prior_in_use(config, lake, partition)

@@ -92,7 +92,7 @@ def verify_set(
     fleet, days = _source(data_set, folder, fleet, logs, out, (segmenter, detector))
     config = load_fleet(fleet)
     require_named_files(config)
-    config = for_one_look(config.read_from(fleet.resolve()), frames, (camera_lidar_deg, radar_deg), sizes)
+    config = for_one_look(config.read_from(fleet.resolve()), frames)
     stages = (INGEST.run, PERCEIVE.run, CALIBRATE.run)
     settings = SetSettings(config, (camera_lidar_deg, radar_deg), sizes, turns, faults, stages)
     tables = Lake.at(out)

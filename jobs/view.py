@@ -138,7 +138,7 @@ def _status(found: ExportedCalibration, sensor: str) -> str:
 
 
 def _upright(kind: str) -> np.ndarray:
-    """T_car_reference of a sensor that looks ahead, where nobody knows how it sits on the car."""
+    """T_car_reference of a sensor that looks ahead, if its pose on the car is unknown."""
     import numpy as np
 
     T = np.eye(4)

@@ -23,8 +23,10 @@ from pipeline.names import is_pattern, is_vehicle, matches
 from pipeline.rig.rig import SECTIONS, Rig
 from pipeline.rigs import Positive, Section
 from pipeline.sections import (
+    MOVED,
     TERMS,
     AuditConfig,
+    ChecksConfig,
     FleetModelConfig,
     IngestConfig,
     LearnConfig,
@@ -41,6 +43,7 @@ from pipeline.shipped_models import PREFIX, shipped_manifest
 __all__ = [
     "TERMS",
     "AuditConfig",
+    "ChecksConfig",
     "FleetConfig",
     "FleetModelConfig",
     "IngestConfig",
@@ -54,6 +57,7 @@ __all__ = [
     "VerifyConfig",
     "config_hash",
     "load_fleet",
+    "moved_keys",
     "read_toml",
     "validated",
 ]
@@ -208,6 +212,17 @@ def load_fleet(path: Path) -> FleetConfig:
     return validated(FleetConfig, read_toml(path), str(path)).read_from(path)
 
 
+def moved_keys(path: Path) -> dict[str, str]:
+    """Keys of a fleet.toml that a newer section holds, and their names there; both are read."""
+    file = read_toml(path)
+    return {
+        f"{outer}.{old}": f"{outer}.{section}.{name}"
+        for outer in ("prepare", "verify")
+        for (section, name), old in MOVED.items()
+        if old in file.get(outer, {})
+    }
+
+
 def read_toml(path: Path) -> dict[str, Any]:
     """Content of a TOML file; raises ConfigError if it is missing, or not TOML."""
     try:
@@ -243,7 +258,10 @@ def _written(loc: Sequence[str | int], values: Any) -> Sequence[str | int]:
     for i, key in enumerate(loc):
         if not isinstance(values, dict):
             break
-        if key not in values and tuple(loc[i : i + 2]) in _SHORT:
+        two: Any = tuple(loc[i : i + 2])
+        if MOVED.get(two) in values:
+            return (*loc[:i], MOVED[two], *loc[i + 2 :])
+        if key not in values and two in _SHORT:
             return (*loc[:i], *loc[i + 1 :])
         values = values.get(key)
     return loc

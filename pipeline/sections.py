@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal, get_args
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
@@ -10,8 +11,10 @@ from pipeline.rigs import Positive, Section
 from schemas.calibrations import METHODS
 
 __all__ = [
+    "MOVED",
     "TERMS",
     "AuditConfig",
+    "ChecksConfig",
     "IngestConfig",
     "LearnConfig",
     "PerceiveConfig",
@@ -146,23 +149,12 @@ class SolveConfig(Section):
         return self
 
 
-class PrepareConfig(Section):
-    """Training data: grid of the camera, points per cloud, and how frames are split."""
+class SplitConfig(Section):
+    """How frames are split into training, validation and test, and when two of them are too much alike."""
 
-    grid_step_deg: Annotated[float, Field(ge=0.1, le=0.5)] = 0.4
-    # A lidar's 60 x 24 deg, plus 8 deg on each side for an error of the guess, plus 6 deg by which training
-    # turns the camera.
-    grid_width_deg: Annotated[float, Field(ge=20, le=160)] = 89.6
-    grid_height_deg: Annotated[float, Field(ge=10, le=90)] = 51.2
-    lidar_points: Annotated[int, Field(ge=256)] = 8192
-    cluster_points: Annotated[int, Field(ge=64)] = 1024
-    edge_points: Annotated[int, Field(ge=64)] = 768
-    max_frames: Annotated[int, Field(gt=0)] | None = None  # per vehicle-day, evenly spread; None = all
-    # Shortest distance driven between frames: a frame from the same place adds nothing new.
-    min_step_m: Annotated[float, Field(ge=0)] = 0.5
-    # What training, validation and test must not share; in fleet.toml also one word: "vehicle", "day",
-    # "place", "all". Where it is not set, jobs take the strictest keys that cost at most a fifth of the frames.
-    split_by: tuple[Literal["vehicle", "day", "place"], ...] = ("vehicle", "day", "place")
+    # What the splits must not share; in fleet.toml also one word: "vehicle", "day", "place", "all". Where it
+    # is not set, jobs take the strictest keys that cost at most a fifth of the frames.
+    by: tuple[Literal["vehicle", "day", "place"], ...] = ("vehicle", "day", "place")
     val_fraction: Annotated[float, Field(ge=0, le=0.4)] = 0.1
     test_fraction: Annotated[float, Field(ge=0, le=0.4)] = 0.1
     positions: Literal["local", "map"] = "local"  # map: odometry of all logs is in one frame (GNSS, a map)
@@ -175,47 +167,55 @@ class PrepareConfig(Section):
     guard_m: Annotated[float, Field(ge=0)] = 30.0
     # Two views are the same if fewer than this many of their 256 fingerprint bits differ.
     duplicate_bits: Annotated[int, Field(ge=0, le=128)] = 16
-    seed: Annotated[int, Field(ge=0)] = 0
 
-    @field_validator("split_by", mode="before")
+    @field_validator("by", mode="before")
     @classmethod
     def _one_word_will_do(cls, value: object) -> object:
         if value == "all":
             return ("vehicle", "day", "place")
         return (value,) if isinstance(value, str) else value
 
-    @model_validator(mode="after")
-    def _splits_make_sense(self) -> PrepareConfig:
-        if not self.split_by or len(set(self.split_by)) != len(self.split_by):
-            raise ValueError("split_by must name at least one of vehicle, day, place, each once")
-        if abs(self.grid_step_deg * 10 - round(self.grid_step_deg * 10)) > 1e-9:
-            raise ValueError("grid_step_deg must be a multiple of 0.1: distances are stored in such steps")
-        return self
+    @field_validator("by")
+    @classmethod
+    def _names_each_once(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        if not value or len(set(value)) != len(value):
+            raise ValueError("must name at least one of vehicle, day, place, each once")
+        return value
+
+
+class GridConfig(Section):
+    """Grid of the camera in training data: square cells about the optical axis."""
+
+    step_deg: Annotated[float, Field(ge=0.1, le=0.5)] = 0.4
+    # A lidar's 60 x 24 deg, plus 8 deg on each side for an error of the guess, plus 6 deg by which training
+    # turns the camera.
+    width_deg: Annotated[float, Field(ge=20, le=160)] = 89.6
+    height_deg: Annotated[float, Field(ge=10, le=90)] = 51.2
+
+    @field_validator("step_deg")
+    @classmethod
+    def _is_stored_exactly(cls, value: float) -> float:
+        if abs(value * 10 - round(value * 10)) > 1e-9:
+            raise ValueError("must be a multiple of 0.1: distances are stored in such steps")
+        return value
 
     @property
-    def grid_shape(self) -> tuple[int, int]:
+    def shape(self) -> tuple[int, int]:
         """(height, width) in cells, multiples of 16: networks halve them four times."""
-        sides = (self.grid_height_deg, self.grid_width_deg)
-        height, width = (16 * max(1, round(side / self.grid_step_deg / 16)) for side in sides)
+        sides = (self.height_deg, self.width_deg)
+        height, width = (16 * max(1, round(side / self.step_deg / 16)) for side in sides)
         return height, width
 
 
-class VerifyConfig(Section):
-    """Accuracy that an accepted calibration must have, and thresholds of the checks of a pair.
+class ChecksConfig(Section):
+    """Thresholds of the checks of a pair.
 
-    Limits apply to the errors of azimuth and elevation at targets 15 to 40 m away. The thresholds below the
-    limits were chosen on simulated days (seeds 140 to 145, demo and paper rig, 40 frames; 24 good days and 28
+    They were chosen on simulated days (seeds 140 to 145, demo and paper rig, 40 frames; 24 good days and 28
     with faults), and on one real day, with results of methods that are wrong by 0.3 to 0.8 deg.
     `prior_sigmas` are sigmas of the prior, other `sigmas` are sigmas of the quantity itself; `z` is a
     one-sided normal deviate of the paired test on held-out frames.
     """
 
-    camera_lidar_limit_deg: Positive = 0.2
-    radar_limit_deg: Positive = 0.4
-    # For the elevation of a radar, which is less accurate than its azimuth: its antenna is small in height.
-    radar_elevation_limit_deg: Positive = 0.6
-    # Smallest probability that an error is within its limit, for a direction to be certified.
-    confidence: Annotated[float, Field(gt=0.5, lt=1)] = 0.995
     # Largest move from the prior. It is exceeded once in 16,000 days if the prior's sigma is right.
     max_move_prior_sigmas: Positive = 4.0
     # The check fails if held-out frames align worse than at the prior by more than this z. One-sided 1 %: a
@@ -242,11 +242,72 @@ class VerifyConfig(Section):
     # Camera-lidar is solved with the heading of the prior. That heading was wrong if it changed by more than
     # this many of its sigmas ...
     heading_change_prior_sigmas: Positive = 3.0
-    # ... and the record is held if the effect exceeds this share of `camera_lidar_limit_deg`.
+    # ... and the record is held if the effect exceeds this share of `verify.camera_lidar_limit_deg`.
     max_heading_error_share: Fraction = 0.25
-    # Turns of the result that held-out frames are asked about, of camera-lidar and of lidar-radar; for
-    # `verify`, and of no influence on a record's verdict.
-    probe_deg: tuple[tuple[Positive, ...], tuple[Positive, ...]] = Field(default=((), ()), exclude=True)
+
+
+# (section, key): name of the key in files up to 0.11, which had it in the section around it. Both are read.
+MOVED = (
+    {("split", name): name for name in SplitConfig.model_fields}
+    | {("split", "by"): "split_by"}
+    | {("grid", name): f"grid_{name}" for name in GridConfig.model_fields}
+    | {("checks", name): name for name in ChecksConfig.model_fields}
+)
+
+
+def _moved(values: object, *sections: str) -> object:
+    """Values with keys of 0.11 in the sections where they are now; ValueError for a key that is set twice."""
+    if not isinstance(values, Mapping):
+        return values
+    new = dict(values)
+    for (section, name), old in MOVED.items():
+        within = new.get(section, {})
+        if section not in sections or old not in new or not isinstance(within, Mapping):
+            continue
+        if name in within:
+            raise ValueError(f"{old} is the old name of {section}.{name}, which is set too")
+        new[section] = {**within, name: new.pop(old)}
+    return new
+
+
+class PrepareConfig(Section):
+    """Training data: points per cloud, frames per vehicle-day, the split, and the camera's grid."""
+
+    lidar_points: Annotated[int, Field(ge=256)] = 8192
+    cluster_points: Annotated[int, Field(ge=64)] = 1024
+    edge_points: Annotated[int, Field(ge=64)] = 768
+    max_frames: Annotated[int, Field(gt=0)] | None = None  # per vehicle-day, evenly spread; None = all
+    # Shortest distance driven between frames: a frame from the same place adds nothing new.
+    min_step_m: Annotated[float, Field(ge=0)] = 0.5
+    seed: Annotated[int, Field(ge=0)] = 0
+    split: SplitConfig = SplitConfig()
+    grid: GridConfig = GridConfig()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _keys_of_0_11(cls, values: object) -> object:
+        return _moved(values, "split", "grid")
+
+    def split_with(self, **values: Any) -> PrepareConfig:
+        """Copy with other values in [prepare.split]; they are not validated."""
+        return self.model_copy(update={"split": self.split.model_copy(update=values)})
+
+
+class VerifyConfig(Section):
+    """Accuracy that an accepted calibration must have: errors of azimuth and elevation at 15 to 40 m."""
+
+    camera_lidar_limit_deg: Positive = 0.2
+    radar_limit_deg: Positive = 0.4
+    # For the elevation of a radar, which is less accurate than its azimuth: its antenna is small in height.
+    radar_elevation_limit_deg: Positive = 0.6
+    # Smallest probability that an error is within its limit, for a direction to be certified.
+    confidence: Annotated[float, Field(gt=0.5, lt=1)] = 0.995
+    checks: ChecksConfig = ChecksConfig()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _keys_of_0_11(cls, values: object) -> object:
+        return _moved(values, "checks")
 
 
 class LearnConfig(Section):

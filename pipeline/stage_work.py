@@ -16,7 +16,11 @@ from pipeline.store.remote_logs import LogPath
 from pipeline.store.tables import Manifest
 from schemas.outcomes import OutcomeRow
 
-__all__ = ["NothingUsable", "Records", "Run", "Task", "Told", "Window", "Work"]
+__all__ = ["NO_PROBES", "NothingUsable", "Probes", "Records", "Run", "Task", "Told", "Window", "Work"]
+
+
+Probes = tuple[tuple[float, ...], tuple[float, ...]]
+NO_PROBES: Probes = ((), ())
 
 
 @dataclass(frozen=True)
@@ -37,6 +41,8 @@ class Task:
         seed: for all random numbers; None = `solve.seed`.
         perturb: calibrate only: rotation [deg] and shift [m] that are added to the prior on purpose, exact in
             size.
+        probe_deg: calibrate only: turns [deg] of the result at which held-out frames are compared with it, of
+            camera-lidar and of lidar-radar. For `verify`; they change no verdict, so no work key has them.
         logs: ingest only: files, ROS 2 bag folders or bucket objects of the day, in any order.
         given: input of one particular stage; documented at its function.
         progress: called with the progress of the stage.
@@ -52,6 +58,7 @@ class Task:
     method: str | None = None
     seed: int | None = None
     perturb: tuple[float, float] | None = None
+    probe_deg: Probes = NO_PROBES
     logs: tuple[LogPath, ...] = ()
     given: Any = None
     progress: Progress = silent

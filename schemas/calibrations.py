@@ -111,7 +111,8 @@ class CalibrationRecord(Posed):
         default=None,
     )
     trigger_before: dict[str, float] = column(
-        "trigger metrics of the paper at the prior", default_factory=dict
+        "trigger metrics of the paper at the prior; empty unless the method is the paper's or triggers decide",
+        default_factory=dict,
     )
     trigger_after: dict[str, float] = column(
         "trigger metrics of the paper at the result", default_factory=dict

@@ -169,11 +169,6 @@ class TrainingRow:
     ego_speed_mps: float = column("as in perceived; 0 if unknown")
     camera_lag_s: float = column("camera_stamp - stamp")
     radar_lag_s: float = column("radar_stamp - stamp")
-    camera_model: str = column("as in images, for reference")
-    camera_K: np.ndarray = array("<f8", (3, 3), "as in images [px]")
-    camera_D: np.ndarray = array("<f8", ("N",), "as in images")
-    image_width_px: int = column("as in images", kind="int32")
-    image_height_px: int = column("as in images", kind="int32")
     prior_camera_lidar_qw: float = column(_PRIOR_CAMERA_LIDAR)
     prior_camera_lidar_qx: float = column(_PRIOR_CAMERA_LIDAR)
     prior_camera_lidar_qy: float = column(_PRIOR_CAMERA_LIDAR)
@@ -193,8 +188,8 @@ class TrainingRow:
 TRAINING = TableSchema(
     TrainingRow,
     "training",
-    3,
+    4,
     "One frame per row. Padded rows of arrays are 0.",
     made_by="prepare",
-    reads_versions=(1, 2),  # these have additional columns, which are not read
+    reads_versions=(1, 2, 3),  # these have additional columns, which are not read
 )

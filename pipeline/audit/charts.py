@@ -2,7 +2,7 @@
 
 The statistic is the largest step or drift from any split on, in units of its sigma (`scan.py`; the likelihood ratio of
 one change against none, Hinkley 1970, Biometrika 57(1)). Three things that real days do are part of it: successive days
-err alike (AR(1), `autocorrelation`), a vehicle's days scatter more than they say (`scale`, known to `freedom` degrees
+err alike (AR(1), `autocorrelation`), a vehicle's days scatter more than their sigmas (`scale`, with `freedom` degrees
 of freedom), and single days are far off (`clipped`). All arrays have a row per chart and a column
 per day; a chart's days stand at the left, what is beyond its `count` weighs nothing.
 """
@@ -68,7 +68,7 @@ class Charts:
 
 
 def clipped(charts: Charts, scale: Float[np.ndarray, " M"]) -> Float[np.ndarray, "M N"]:
-    """Values, limited to some sigmas about the median of each and its neighbours (at an end: of three)."""
+    """Values limited to some sigmas about the median of each value and its two neighbours."""
     M, N = charts.value.shape
     out = charts.value.copy()
     if N < 3:

@@ -35,7 +35,7 @@ DOFS = len(DOF_NAMES)
 _ALIKE = 0.6
 # Share of a day's variance that is never taken as common to all days: sigmas are estimates themselves.
 _LEAST_VARYING = 0.01
-# Sigmas of a step among the reference's own days, which then ends before it; of days whose scatter nobody knows yet.
+# Sigmas of a step among the reference's own days, which then ends before it; days have no estimated scatter yet.
 _MOVED_SIGMAS = 6.0
 FEWEST_DAYS = 14  # of a window, however far back they lie
 
@@ -199,7 +199,7 @@ def charted(days: PairDays, first: int, last: int, reference: Reference | None) 
 
 
 def with_reference(days: PairDays, reference: Reference) -> PairDays:
-    """The days with the reference as their first, in place of the days that it rests on; changes count from it."""
+    """The days with the reference as first day, instead of the days it was made of; changes are relative to it."""
     own = days.at(~np.isin(days.day, reference.days))
     T = np.concatenate([reference.T[None], own.T])
     return PairDays(

@@ -28,7 +28,7 @@ _WINSORED = 0.9205  # of the variance of a normal distribution that is left by t
 # The newest days of a chart, a quarter of them at most, are judged by what older ones show: what begins on all
 # vehicles at once is no scatter.
 _NEWEST, _OLDER = 6, 4
-# Days apart that tell how alike they are, beside neighbours: a working week has them.
+# Lags [days] of the autocorrelation, beside neighbours: a working week has them.
 APART = 3
 # Share of a normal distribution beyond three sigmas, and the differences that it is worth.
 _NORMAL, _FAR_WORTH = 0.0027, 400.0

@@ -68,7 +68,7 @@ class Estimates:
         pose: of T_parent_child: quaternion (scalar first), translation [m].
         has_estimate: neither pose nor covariance is null.
         common: the part of it that all days err by alike.
-        has_common: a record of an older release does not say.
+        has_common: records of older releases do not have it.
         disproved: a check shows that the pose is wrong.
         shown_wrong_rad: the angle that the checks of a held record found it off by.
         unchecked_sigmas: by DoF, how far it lies from the prior where that is far and nothing checks it, else
@@ -98,7 +98,7 @@ class Estimates:
     work_key: pa.Array
 
     def at(self, rows: slice | np.ndarray) -> Estimates:
-        """Some of the records, in their order."""
+        """A selection of the records, in the same order."""
         keys = self.work_key[rows] if isinstance(rows, slice) else self.work_key.take(pa.array(rows))
         return replace(self, work_key=keys, **{name: getattr(self, name)[rows] for name in _PER_RECORD})
 

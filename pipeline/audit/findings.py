@@ -83,7 +83,7 @@ def vehicle_findings(
 
 
 def _change_columns(chart: ChartVerdict, edge: Edge, found: Attribution | None) -> dict[str, Any]:
-    """Columns of a chart with an alarm; none for another."""
+    """Columns of `drift` about a change that a chart shows; empty without an alarm."""
     change = chart.change
     if change is None:
         return {}
@@ -134,7 +134,7 @@ def _begun_before(chart: ChartVerdict, before: DriftFinding | None) -> ChartVerd
 
 
 def _last_estimate(records: Estimates, edge: Edge) -> str:
-    """The day of an edge's last estimate, where the vehicle drove on after it; else empty."""
+    """Day of an edge's last estimate, if the vehicle has newer records without one; else empty."""
     days = records.day[records.is_of(edge) & ~records.refused]
     return day_name(int(days.max())) if len(days) and days.max() < records.day.max() else ""
 

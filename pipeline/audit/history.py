@@ -138,7 +138,7 @@ class History:
 
     def read(self, first: str | None, last: str | None, among: AbstractSet[str] | None = None) -> Estimates:
         """Sound records of a span of days, of all vehicles or of some."""
-        if among is not None:  # few, who may have driven on few of its days: which, is told by a few columns
+        if among is not None:  # few, who may have driven on few of its days: a few columns show which
             known = read_columns(self.lake, CALIBRATIONS, (), first=first, last=last, vehicle=among)
             if known is None:
                 return estimates_of(None)

@@ -1,4 +1,4 @@
-"""How days really scatter: by which factor more than they say, and how far the next day errs like the last.
+"""Scatter of the days: its ratio to their sigmas, and the correlation of errors from day to day.
 
 Both are learnt from differences between days, which a few real changes do not move, for each model of vehicle, edge
 and degree of freedom. What is known of a fleet that nobody has seen (`Prior`) gives way to what the fleet's days show,
@@ -29,7 +29,7 @@ __all__ = ["Noise", "Prior", "estimate_noise"]
 
 # Of n differences of neighbouring days, degrees of freedom of their variance: they share days, and are winsorised.
 _EFFICIENCY = 0.6
-# Days that scatter more than this times what they say do not scatter: something moves, and is to be found. Four
+# Days that scatter more than this times their sigmas do not scatter: something moves, and is to be found. Four
 # standard deviations of sigmas that are wrong by a log-normal factor of 0.25.
 _MOST_SCALE = 3.0
 _MOST_AUTOCORRELATION = 0.9
@@ -48,7 +48,7 @@ class Prior:
     """What is known before any day was seen; a larger fleet's, or that of a model, where one is known.
 
     Args:
-        variance: of days, in what they say.
+        variance: of days, relative to the square of their sigmas.
         freedom: of the chi-squared that vehicles' variances differ by: sigmas that are wrong by a log-normal factor of
             0.25, whose variances are 1 / (2 0.25^2) = 8 degrees of freedom.
         vehicles: that `freedom` is worth.
@@ -91,7 +91,7 @@ class Noise:
         return np.where(self.heavy, _REACH, np.inf)
 
     def at(self, rows: slice) -> Noise:
-        """Of some charts."""
+        """The noise of a selection of the charts."""
         other = None if self.less_alike is None else self.less_alike.at(rows)
         wander = None if self.wander is None else self.wander[rows]
         return Noise(
@@ -176,7 +176,7 @@ def _drawn(alike: tuple[np.ndarray, np.ndarray], towards: np.ndarray, worth: flo
 def _scatter(
     near: Differences, phi: np.ndarray, prior: Prior
 ) -> tuple[Float[np.ndarray, "V P D"], Float[np.ndarray, "V P D"]]:
-    """Factor on sigmas, and the degrees of freedom that it is known to."""
+    """Ratio of the days' scatter to their sigmas, and the degrees of freedom of its estimate."""
     z = near.in_sigmas(phi)
     V, P, D, S = z.shape
     found, seen = winsorised_variance(np.moveaxis(z, 0, 2).reshape(P, D, V * S))
@@ -191,7 +191,7 @@ def _scatter(
     own = np.minimum(own, most / of_fleet)
     variance, freedom = _drawn_to_fleet(own, _EFFICIENCY * seen, vehicle[0][..., None], prior)
     scale = np.sqrt(np.clip(of_fleet[None] * variance, 1.0, _MOST_SCALE**2))
-    # How alike days are is known no better than so many of them tell, and the scatter rests on it.
+    # The autocorrelation is uncertain with few days, and the scatter depends on it.
     alike = _OF_ONE / (worth / _EFFICIENCY + _OF_ONE / _AXES_DIFFER**2) / (2 * (1 - phi) ** 2)
     known = 1 / (1 / freedom + 1 / vehicle[1][..., None] + alike)
     return scale, np.minimum(known, _MOST_FREEDOM)
@@ -220,7 +220,7 @@ def _drawn_to_fleet(
 
 
 def _independent(z: Float[np.ndarray, "V P D S"]) -> Float[np.ndarray, " P"]:
-    """How many of an edge's degrees of freedom err by themselves: they share scenes."""
+    """Effective number of independent degrees of freedom of an edge: those of one day share its scenes."""
     rows = np.moveaxis(np.clip(np.nan_to_num(z), -WINSOR, WINSOR), 2, -1).swapaxes(0, 1)
     rows = rows.reshape(z.shape[1], -1, z.shape[2])
     square = np.einsum("pna,pnb->pab", rows, rows)

@@ -177,7 +177,7 @@ def _row(
 def _since_it_lies_here(
     own: Estimates, scale: Float[np.ndarray, " 6"]
 ) -> tuple[Estimates, tuple[str, str] | None]:
-    """The days since the pose last changed, by the days themselves, and the reason in words.
+    """Days since the last change of the pose that the days themselves show, and the reason in words.
 
     A chart needs two weeks of days; until then a mean over a knock would be neither pose.
     """

@@ -1,6 +1,6 @@
 """Did a value change at any split of its days: at once or slowly, through errors that are alike from day to day.
 
-What a day says is a level that stays, an error that is AR(1) from day to day, and what single days err by besides:
+The value of a day is a constant level, an error that is AR(1) from day to day, and independent errors of days:
 
     y_i = level_i + h_i u_i + e_i,   u_i = rho_i u_{i-1} + w_i,   rho_i = autocorrelation ** (days between)
 
@@ -8,7 +8,7 @@ The level itself may be a random walk, by as much as such levels wander. A step 
 drift to its slope. Both are likelihood ratios against no change, by one run of a Kalman filter and one of its smoother
 over all charts at once: a shock to a state at a split has the estimate `r / N` and the variance `1 / N` of the
 smoother's cumulants (de Jong & Penzer 1998, J. Am. Stat. Assoc. 93(442)). That is generalised least squares: with days
-that err alike, the day of a jump tells most.
+that err alike, the day of a jump is the most informative.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from pipeline.audit.noise import Noise
 __all__ = ["Scan", "alike", "errors_of", "scan", "scan_by"]
 
 _FIRST = 3  # days that show a level: as many as are no chance where single days are often far off
-_SAME = 0.02  # autocorrelations that differ by no more say the same
+_SAME = 0.02  # autocorrelations that differ by less are equivalent
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +124,7 @@ def scan_by(
 ) -> Scan:
     """Steps and drifts, each as sure as it is by the autocorrelation under which it is less so.
 
-    Where days are taken for more alike than they are, one jump says too much; where for less, a mean of many does.
+    If the autocorrelation is too high, one jump counts too much; if it is too low, a mean of many days does.
     """
     found = scan(charts, value, noise.scale, noise.autocorrelation, noise.wander, reach)
     other = noise.less_alike
@@ -187,7 +187,7 @@ def _scan(value, h, own, gap, rho, walk, reach, first, count, scale, out):  # no
 
 
 def alike(days: Int[np.ndarray, " M"], autocorrelation: Float[np.ndarray, " M"]) -> Float[np.ndarray, " M"]:
-    """Variance of a mean of AR(1) days in that of independent ones."""
+    """Variance of the mean of `days` AR(1) days, divided by the variance of a mean of independent days."""
     lag = np.arange(1, days.max(initial=1))
     share = np.maximum(1 - lag / days[:, None], 0.0)
     return np.asarray(1 + 2 * (share * autocorrelation[:, None] ** lag).sum(axis=1))

@@ -43,7 +43,7 @@ class Whitened:
         autocorrelation: Float[np.ndarray, " 6"],
         wander: Float[np.ndarray, " 6"] | None = None,
     ) -> Whitened:
-        """Days of which each errs like the last by as much, axis by axis, and wanders by that variance a day."""
+        """Days with errors of this autocorrelation by axis, and a level that walks by variance `wander` a day."""
         N, sigma = len(days.day), days.sigma
         correlation = days.spread / (sigma[:, :, None] * sigma[:, None, :])
         values, vectors = np.linalg.eigh(correlation)

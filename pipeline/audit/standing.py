@@ -1,4 +1,4 @@
-"""Verdicts that stand although records that they rested on cannot be read: with fewer rows none gets better."""
+"""Earlier verdicts that are kept when some of their records cannot be read: missing records make none better."""
 
 from __future__ import annotations
 

@@ -119,7 +119,7 @@ def _varying(days: Sequence[DayEstimate]) -> Float[np.ndarray, "N 6 6"]:
 
 
 def _positive(matrix: np.ndarray) -> np.ndarray:
-    """The nearest symmetric matrix without negative directions, in units in which its diagonal is 1."""
+    """The nearest positive semidefinite matrix, in units in which the diagonal is 1."""
     scale = np.sqrt(np.maximum(np.diag(matrix), 1e-18))
     values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T) / np.outer(scale, scale))
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(scale, scale))

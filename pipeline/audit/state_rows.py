@@ -25,7 +25,7 @@ __all__ = ["fused", "fused_as_they_differ", "pose_columns", "with_state"]
 # Of successive accepted days: the most that the charts' budget is proved for. A state promises no more than such days
 # can give.
 _AUTOCORRELATION = 0.6
-_BY_CHANCE = 1e-3  # once in a thousand axes, days that differ as they say would be called too far apart
+_BY_CHANCE = 1e-3  # once in a thousand axes, days that differ by chance alone would count as too far apart
 _OFTEN = 0.5  # share of a state's days: one day in 300 lies that far from the prior by chance
 
 
@@ -114,6 +114,6 @@ def _targets(days: Estimates) -> Float[np.ndarray, "N 3"]:
 
 
 def _unchecked(days: Estimates) -> dict[str, float]:
-    """DoF that at least half of the days found far from the prior, with nothing to check them: the most sigmas."""
+    """Largest move [sigma] from the prior by DoF, of DoF that at least half of the days left unchecked."""
     often = np.mean(days.unchecked_sigmas > 0, axis=0) >= _OFTEN
     return {dof: float(days.unchecked_sigmas[:, k].max()) for k, dof in enumerate(DOF_NAMES) if often[k]}

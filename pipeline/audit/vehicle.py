@@ -24,7 +24,7 @@ __all__ = ["VehicleVerdict", "independent_edges", "judge_fleet", "limit_of"]
 # Share of vehicle-nights with a YELLOW that nothing caused, for a change that may have begun: a person looks again the
 # next day, nobody opens a car.
 _YELLOW = 0.02
-_SAME = 0.02  # autocorrelations that differ by no more say the same
+_SAME = 0.02  # autocorrelations that differ by less are equivalent
 # A camera-radar edge is composed of two others where it is nearer to them than this [rad, m].
 _COMPOSED_WITHIN = 1e-6
 
@@ -112,7 +112,7 @@ def _judged(
 
 
 def _as_alike_as_may_be(noise: Mapping[Edge, Noise]) -> list[Mapping[Edge, Noise]]:
-    """How alike days may be at most, and at least, where that is another answer."""
+    """The noise with the highest plausible autocorrelation, and that with the lowest if it differs."""
     less = {edge: found.less_alike or found for edge, found in noise.items()}
     if all(np.allclose(noise[e].autocorrelation, less[e].autocorrelation, atol=_SAME) for e in noise):
         return [noise]

@@ -1,4 +1,4 @@
-"""What one chart says tonight: is the value where it was when the reference was taken, and if not, since when.
+"""Verdict of one chart tonight: is the value where it was when the reference was taken, and if not, since when.
 
 A chart without a change needs no further analysis. One with a change is cut into levels, and the last is
 compared with the first: a value that came back (a repair without a service event) is no change any more, one
@@ -26,7 +26,7 @@ _VISIBLE_SIGMAS = 2.0  # a chart shows a change that is at least this many sigma
 # RED: a change larger than the limit with a probability of 95 %.
 _SURELY = 1.645
 # Degrees of freedom of a scale that is as good as known: where a person only looks again, what it lacks is not counted
-# of a chart whose own days tell how they scatter. Of one with fewer days it is: their scatter is a guess.
+# for a chart with enough days to estimate their scatter. With fewer it is: their scatter is assumed.
 _KNOWN = 240.0
 _HEAVY = 2 / 3  # of the sigmas that one day may lie off, where single days are often far off
 _TAIL = 4.0  # power by which days far off fall with the distance: Student's t with four degrees of freedom
@@ -87,7 +87,7 @@ def judge_charts(
         noise: how they scatter.
         limit: size of a change that matters [rad or m].
         probability: of each chart where nothing changed: of an alarm tonight, and of a change that may have begun.
-        baseline_days: a chart says nothing, unless it alarms, until it has one day more than this.
+        baseline_days: a chart without an alarm has no verdict until it has one day more than this.
 
     Returns:
         RED: a lasting change that is surely larger than `limit`. YELLOW: a smaller one, one that rests on a single day
@@ -225,11 +225,11 @@ def _one_day(seen: _Judged, m: int) -> ChartVerdict:
 
 
 def _what_could_hide(days: int, times: float) -> str:
-    """`times`: what a chart of so many days shows, in sizes that matter. It shrinks with the root of the days."""
+    """`times`: smallest visible change, as a multiple of the size that matters; it falls with the root of the days."""
     needed = math.ceil(days * times**2)
     return (
-        f"no change seen, but one of the size that matters could hide: {times:.1f} times as much would show, and "
-        f"that size after about {_count(needed)} like these"
+        f"no change seen, but these days are too inaccurate to exclude one of the size that matters: {times:.1f} times "
+        f"that size would be seen now, that size itself with about {_count(needed)} like these"
     )
 
 

@@ -1,8 +1,8 @@
-"""How far a sensor wanders in its bracket over weeks, as it does with the season, though nothing happened to it.
+"""Variance of the slow motion of a sensor in its bracket, as with the seasons, without any fault.
 
-A level that stays is one hypothesis; what stands against a step is a random walk beside it. By how much a day it walks
-is what the charts of a fleet show beyond their days' scatter: the mean of the days long ago against those of now. What
-a few vehicles show is a change, what all show is how such sensors sit.
+The test of a step has two null hypotheses: a constant level, and a random walk. The walk's variance per day comes from
+all charts of a fleet: the mean of recent days minus the mean of days long ago, beyond the days' scatter. A motion of a
+few vehicles is a change; a motion of all is how such sensors are mounted.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pipeline.audit.scan import errors_of, scan
 
 __all__ = ["with_wander"]
 
-_FEWEST = 14  # days of a chart that can tell
+_FEWEST = 14  # days of a chart, to estimate it
 _WORTH = 8.0  # vehicles that a fleet without a swing is worth: as many as `Prior.vehicles`
 _SHARE = 1 / 3  # of a chart's days at either end, where no reference stands for the first of them
 # Sigmas of a step, if nothing wandered, that is a change and no wandering: all vehicles of a fleet may do it at once.

@@ -9,11 +9,11 @@ import numpy as np
 
 from pipeline.calibrate.adjust.three import EDGES, poses_of, three_sensors
 from pipeline.calibrate.adjusted_day import adjusted_rig, clocks_of, evidence_of_day, judged_together
-from pipeline.calibrate.judging import Judged, Judging, limits_of
+from pipeline.calibrate.judging import Judged, Judging
 from pipeline.calibrate.methods import Method, Solver, method_named
+from pipeline.calibrate.paper.triggers import exceeded, trigger_metrics
 from pipeline.calibrate.records import Inputs, record_of, refused_record
 from pipeline.calibrate.select.frames import PAPER_SYNC_GATE_S, Selection, select_frames
-from pipeline.calibrate.select.triggers import exceeded, trigger_metrics
 from pipeline.calibrate.solved import SolvedDay
 from pipeline.calibrate.verify.day_checks import FoundDay, checks_of_day
 from pipeline.calibrate.verify.label_offset import with_label_offset
@@ -25,6 +25,7 @@ from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.estimates import Prior, Solution
 from pipeline.extrinsics.prior import no_prior
 from pipeline.results import Progress, silent
+from pipeline.stage_work import Probes
 from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, SENSORS, CalibrationRecord
 from schemas.observations import Observation
 
@@ -113,21 +114,8 @@ def _solved(
 ) -> DayOfPairs:
     """A day whose sources of motion were compared."""
     progress(0, 4, "select frames")
-    method, select = method_named(about.method), fleet.select
-    if method.frames == "all":
-        select = select.model_copy(update={"frames": max(len(observations), 1)})
-    sync_gate_s, by_motion = _sync_gate_s(method, fleet), fleet.ingest
-    selection = select_frames(
-        observations,
-        select,
-        paper=method.paper_selection,
-        sync_gate_s=sync_gate_s,
-        motion_gate=None
-        if sync_gate_s
-        else (by_motion.sync_gate_m, float(np.radians(by_motion.sync_gate_deg))),
-        pairs=about.pairs,
-        absent=about.absent,
-    )
+    method = method_named(about.method)
+    selection = _selection(observations, method, fleet, about)
     refused = {p: _named(e, motion.of(p)) for p, e in _refused(method, about.pairs, selection, prior).items()}
     pairs = [pair for pair in about.pairs if pair not in refused]
     refusals = {
@@ -137,7 +125,8 @@ def _solved(
     if not pairs:
         return DayOfPairs(refusals, None)
     frames = {pair: [observations[i] for i in selection.fit[pair]] for pair in pairs}
-    sample = _spread(observations, frames)
+    measured = method.paper_selection or fleet.trigger.when == "triggered"
+    sample = _spread(observations, frames) if measured else []
     before = trigger_metrics(sample, {pair: prior.of(pair) for pair in pairs})
     fired = {pair: exceeded(before[pair], fleet.trigger) for pair in pairs}
     active = _to_calibrate(method, fired, fleet.trigger.when)
@@ -153,7 +142,9 @@ def _solved(
     if "camera_lidar" in active:
         solution = with_label_offset(solution, observations)
     progress(2, 4, "judge on held-out frames")
-    failed, judging = _judging(observations, selection, prior, solution, fleet, active, motion)
+    failed, judging = _judging(
+        observations, selection, prior, solution, fleet, active, motion, about.probe_deg
+    )
     day = SolvedDay(
         observations,
         selection,
@@ -171,6 +162,26 @@ def _solved(
     return DayOfPairs(refusals, day)
 
 
+def _selection(
+    observations: Sequence[Observation], method: Method, fleet: FleetConfig, about: Inputs
+) -> Selection:
+    """Frames to fit and frames to judge, of each pair, within the method's limit of stamp differences."""
+    select, gates, gate_s = fleet.select, fleet.ingest, fleet.ingest.sync_gate_s
+    if method.frames == "all":
+        select = select.model_copy(update={"frames": max(len(observations), 1)})
+    if gate_s is None and method.paper_selection:
+        gate_s = PAPER_SYNC_GATE_S
+    return select_frames(
+        observations,
+        select,
+        paper=method.paper_selection,
+        sync_gate_s=gate_s,
+        motion_gate=None if gate_s else (gates.sync_gate_m, float(np.radians(gates.sync_gate_deg))),
+        pairs=about.pairs,
+        absent=about.absent,
+    )
+
+
 def _judging(
     observations: Sequence[Observation],
     selection: Selection,
@@ -179,12 +190,14 @@ def _judging(
     fleet: FleetConfig,
     active: Sequence[str],
     motion: MotionFindings,
+    probe_deg: Probes,
 ) -> tuple[Mapping[str, Sequence[FailedCheck]], Judging]:
     """Failed checks of all pairs, and inputs of their verdicts."""
     seen_by = next((o for o in observations if "camera" in o.sensors), None)
     turn = None if seen_by is None else camera_turn_sigma_rad(solution, prior.camera, seen_by.camera_K)
-    about = FoundDay(observations, selection, prior, solution, fleet, limits_of(fleet), motion)
-    return checks_of_day(about), Judging(observations, selection, prior, fleet, active, turn)
+    about = FoundDay(observations, selection, prior, solution, fleet, fleet.verify.checks, motion)
+    judging = Judging(observations, selection, prior, fleet, active, turn, probe_deg)
+    return checks_of_day(about), judging
 
 
 def _judged(
@@ -217,12 +230,6 @@ def _refused(
         alone = SolveError(f"method {method.name} needs camera, lidar and radar: {why}")
         refused = {pair: refused.get(pair, alone) for pair in pairs}
     return {pair: refused[pair] for pair in pairs if pair in refused}
-
-
-def _sync_gate_s(method: Method, fleet: FleetConfig) -> float | None:
-    """The gate of ingest; the paper's gate for its methods if ingest gates by motion."""
-    gate_s = fleet.ingest.sync_gate_s
-    return PAPER_SYNC_GATE_S if gate_s is None and method.paper_selection else gate_s
 
 
 def _to_calibrate(method: Method, fired: Mapping[str, Sequence[str]], when: str) -> list[str]:

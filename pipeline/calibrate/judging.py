@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -14,20 +14,20 @@ from pipeline.calibrate.select.frames import Selection
 from pipeline.calibrate.verify.held_out_score import held_out_score
 from pipeline.calibrate.verify.held_out_test import HeldOutTest, paired_test
 from pipeline.calibrate.verify.held_out_update import held_out_update
-from pipeline.calibrate.verify.limits import VerdictLimits
 from pipeline.calibrate.verify.mounting import mounting_covariance
 from pipeline.calibrate.verify.probes import probe_numbers
 from pipeline.calibrate.verify.seen_targets import seen_targets, unseen_failure, views_of
 from pipeline.calibrate.verify.target_accuracy import Claim, claims_of
 from pipeline.calibrate.verify.verdict import Evidence, Verdict, judge
-from pipeline.config import FleetConfig
+from pipeline.config import ChecksConfig, FleetConfig
 from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.estimates import PairEstimate, Prior
 from pipeline.geometry.targets import DEFAULT_TARGETS
 from pipeline.rig.views import View
+from pipeline.stage_work import NO_PROBES, Probes
 from schemas.observations import Observation
 
-__all__ = ["Judged", "Judging", "limits_of"]
+__all__ = ["Judged", "Judging"]
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Judged:
     verdict: Verdict
     test: HeldOutTest | None
     claims: Mapping[str, Claim]
-    mounting_covariance: np.ndarray | None = None  # 6 6; None where nothing says how the camera hangs
+    mounting_covariance: np.ndarray | None = None  # 6 6; None if the camera's mounting is unknown
     targets: np.ndarray = field(default_factory=lambda: DEFAULT_TARGETS)  # 3 3, in the child's frame
     probes: Mapping[str, float] = field(default_factory=dict)  # of `probe_numbers`
 
@@ -51,6 +51,7 @@ class Judging:
         prior: what stays current.
         active: pairs that were to be calibrated.
         camera_turn_sigma_rad: of the camera's pitch and yaw, by its principal point.
+        probe_deg: as `Task.probe_deg`.
     """
 
     observations: Sequence[Observation]
@@ -59,6 +60,7 @@ class Judging:
     fleet: FleetConfig
     active: Collection[str]
     camera_turn_sigma_rad: np.ndarray | None
+    probe_deg: Probes = NO_PROBES
 
     @cached_property
     def _views(self) -> dict[str, View]:
@@ -66,7 +68,7 @@ class Judging:
 
     def pair(self, estimate: PairEstimate, failed: Sequence[FailedCheck], *, together: bool) -> Judged:
         """Judge one pair; `together` is true if other pairs take part in its pose (see `judge`)."""
-        pair, limits = estimate.pair, limits_of(self.fleet)
+        pair, limits = estimate.pair, self.fleet.verify.checks
         active = pair in self.active
         held_out = [self.observations[i] for i in self.selection.holdout[pair]] if active else []
         mounting = mounting_covariance(pair, estimate.T, estimate.covariance, self.camera_turn_sigma_rad)
@@ -93,7 +95,7 @@ class Judging:
         self,
         estimate: PairEstimate,
         held_out: Sequence[Observation],
-        limits: VerdictLimits,
+        limits: ChecksConfig,
         mounting: np.ndarray | None,
         targets: np.ndarray,
     ) -> tuple[HeldOutTest | None, Mapping[str, Claim], dict[str, float]]:
@@ -109,8 +111,7 @@ class Judging:
             score = held_out_score(estimate, held_out, prior, self.fleet.solve)
             blocks = scene_blocks(held_out)
             test = paired_test(score.cost(prior.of(pair)), score.cost(estimate.T), blocks)
-            sizes_deg = verify.probe_deg["radar" in pair]
-            probes = probe_numbers(pair, estimate.T, score.cost, blocks, sizes_deg)
+            probes = probe_numbers(pair, estimate.T, score.cost, blocks, self.probe_deg["radar" in pair])
             covariance = np.diag([*np.zeros(6), *score.extra_variance])
             covariance[:6, :6] = estimate.covariance
             update = held_out_update(score.derivatives, covariance, score.bias, blocks, limits)
@@ -127,8 +128,3 @@ class Judging:
             targets,
         )
         return test, claims, probes
-
-
-def limits_of(fleet: FleetConfig) -> VerdictLimits:
-    """The thresholds that `[verify]` of fleet.toml names as the verdict does."""
-    return VerdictLimits(**{f.name: getattr(fleet.verify, f.name) for f in fields(VerdictLimits)})

@@ -38,7 +38,7 @@ def pose_rows(
     verify: VerifyConfig,
     judged: Mapping[str, CalibrationRecord] | None = None,
 ) -> list[PoseRow]:
-    """A row for each sensor; the reference's says that poses refer to it.
+    """A row for each sensor, the reference included.
 
     Args:
         adjusted: its poses; None where no edge had evidence.

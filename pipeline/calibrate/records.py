@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.calibrate.half_days import half_days_of
 from pipeline.calibrate.judging import Judged
-from pipeline.calibrate.select.triggers import trigger_metrics
+from pipeline.calibrate.paper.triggers import trigger_metrics
 from pipeline.calibrate.solved import SolvedDay
 from pipeline.calibrate.verify.constancy import PART_FLOOR_RAD
 from pipeline.calibrate.verify.failed_checks import loop_sigmas
@@ -20,6 +20,7 @@ from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
 from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.se3 import to_quaternion
 from pipeline.geometry.spherical import camera_direction_angles
+from pipeline.stage_work import NO_PROBES, Probes
 from pipeline.store.partitions import Partition
 from schemas.calibrations import DOF_NAMES, FRAMES_OF_PAIR, PAIRS, CalibrationRecord
 from schemas.observations import Observation
@@ -53,6 +54,7 @@ class Inputs:
     absent: Mapping[str, str] = field(default_factory=dict)  # why frames lack a sensor, in words by sensor
     # Names of the sensors that play camera, lidar and radar; those left out are called by their kinds.
     chosen: Mapping[str, str] = field(default_factory=dict)
+    probe_deg: Probes = NO_PROBES  # as `Task.probe_deg`
 
 
 def record_of(about: Inputs, pair: str, day: SolvedDay) -> CalibrationRecord:

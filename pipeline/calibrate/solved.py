@@ -21,7 +21,8 @@ class SolvedDay:
     Args:
         solution: of the pairs that were not refused.
         judging: what verdicts rest on.
-        trigger_sample: frames that triggers look at.
+        trigger_sample: frames for the trigger metrics; empty for a method that is not the paper's, unless
+            `trigger.when` asks for them.
         trigger_before: metrics of each pair at the prior.
         triggered: by pair, whether one of them is beyond its threshold.
         numbers: of checks of the day, for every record.

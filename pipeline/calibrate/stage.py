@@ -67,8 +67,9 @@ def work(task: Task) -> Work:
     def rows(run: Run) -> Generator[Records, None, None]:
         absent = _absent(task.lake, task.partition)
         about = Inputs(
-            task.partition, method.name, run.work_key, seed, run.inputs, pairs_of(rig.kinds), absent
-        )
+            task.partition, method.name, run.work_key, seed, run.inputs, pairs_of(rig.kinds), absent,
+            probe_deg=task.probe_deg,
+        )  # fmt: skip
         calibrated = rig_rows if method.name == "joint" else three_rows
         try:
             found = calibrated(task, about, run.progress)

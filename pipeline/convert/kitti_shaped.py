@@ -188,7 +188,7 @@ def _matrix(path: Path, lines: Mapping[str, Sequence[float]], name: str) -> Floa
 
 
 def _pose(path: Path) -> Float[np.ndarray, "4 4"] | None:
-    """T_odom_camera of a pose file; its key reads the other way round, this follows the development kit."""
+    """T_odom_camera of a pose file. Its key is `odomToCamera`, but the development kit uses it in this direction."""
     if not path.is_file():
         return None
     for line in read_bytes(path).decode("utf-8", "replace").splitlines():

@@ -1,6 +1,6 @@
-"""A vehicle's answer with its line, beside its own.
+"""Mount of each vehicle, estimated from its own days with the other vehicles of its production line as prior.
 
-The line's part of an answer is limited: it moves no axis by more than one sigma of the vehicle's own days (limited
+The effect of the line is limited: it moves no axis by more than one sigma of the vehicle's own days (limited
 translation, Efron and Morris 1971, JASA 66), and what it is kept from moving widens the sigma. A vehicle outside of its
 line answers as it does alone.
 """
@@ -52,7 +52,7 @@ def with_line(
     common: Float[np.ndarray, "N M M"],
     own_prior: Float[np.ndarray, "N M"] | None = None,
 ) -> Answers:
-    """Answers with the line.
+    """Each vehicle's mount, with the other vehicles of its model line as prior.
 
     Args:
         model: of the line.
@@ -88,7 +88,7 @@ def _on_the_line(
     covariance: np.ndarray,
     distance: np.ndarray,
 ) -> tuple[Float[np.ndarray, "N M"], Float[np.ndarray, "N M M"]]:
-    """Mounts relative to the line's mean given what vehicles show, and their covariance with the mean's."""
+    """Posterior mounts of the vehicles relative to the line's mean, and their covariance (the mean's included)."""
     A, B, M = evidence.to_mount, evidence.to_bias, len(model.variance)
     remounted = evidence.remounted[:, None, None]
     weight = np.clip((OUTSIDE - distance) / (OUTSIDE - DOUBTED), _LEAST_WEIGHT, 1.0)
@@ -122,7 +122,7 @@ def _square(vector: Float[np.ndarray, "N M"]) -> Float[np.ndarray, "N M M"]:
 def _distances(
     model: LineModel, evidence: LineEvidence, residual: np.ndarray, covariance: np.ndarray
 ) -> tuple[Float[np.ndarray, " N"], np.ndarray]:
-    """Largest shift along an axis in sigmas, and the axis; a workshop's mount is no member of what a factory made."""
+    """Largest distance of a mount from the line along an axis, in sigmas, and the axis; 0 for a remounted vehicle."""
     both = np.concatenate([evidence.to_mount, evidence.to_bias], axis=1)
     line = evidence.to_mount @ np.diag(model.variance) @ evidence.to_mount.T + both @ covariance @ both.T
     z = np.abs(shifts_in_sigmas(evidence.weights(line), residual, evidence.to_mount))
@@ -131,7 +131,7 @@ def _distances(
 
 
 def _beyond(common: np.ndarray, of_line: np.ndarray) -> np.ndarray:
-    """What a vehicle's common errors exceed the line's by, in every direction."""
+    """Positive part of the vehicle's common covariance minus the line's."""
     size, directions = np.linalg.eigh(common - of_line)
     return np.asarray((directions * size.clip(min=0.0)[:, None, :]) @ directions.swapaxes(1, 2))
 

@@ -1,4 +1,4 @@
-"""Shared errors of sensors in the sensor's own terms, and whether data tell them from a common error of all mounts.
+"""Shared errors of sensors in the sensor's own terms, and whether data separate them from a common error of all mounts.
 
 Records of one kind determine only the sum of both: every camera of a line mounted 0.2 deg too low looks like a
 segmenter whose labels lie 0.2 deg too high. A direction of the shared error is told apart where its sigma is less than
@@ -88,7 +88,7 @@ def shared_errors(model: LineModel, axes: dict[str, Float[np.ndarray, " 6"]]) ->
 
 
 def told_apart(model: LineModel) -> tuple[Float[np.ndarray, " G"], Float[np.ndarray, "G G"]]:
-    """Mean and covariance of what is common, without what priors alone say of directions that are not told apart.
+    """Mean and covariance of the line's mount and bias; along directions that data do not separate, of the data alone.
 
     In these the shared error keeps its prior, zero and as unsure as records say, whatever the prior of mounts is: the
     distribution of all else given it stays (Jeffrey's rule).

@@ -1,4 +1,4 @@
-"""What the vehicles of a line show of one edge: information without prior, which a night adds to.
+"""Estimates of one edge by all vehicles of a line, as information without prior; each night adds to it.
 
 Days of a few frames determine few directions, mostly none along an axis. So evidence is information, which is zero
 along directions that days leave open, and a vehicle is compared with others by the score of a shift along one axis.
@@ -38,7 +38,7 @@ class LineEvidence:
     remounted: Bool[np.ndarray, " N"]
 
     def at(self, rows: np.ndarray) -> LineEvidence:
-        """Some of the vehicles."""
+        """The evidence of a selection of the vehicles."""
         return replace(
             self, value=self.value[rows], information=self.information[rows], remounted=self.remounted[rows]
         )
@@ -64,7 +64,7 @@ class LineEvidence:
         return np.einsum("nmk,nk->nm", covariance, pull), covariance
 
     def determined(self, prior: LinePrior) -> Bool[np.ndarray, "N M"]:
-        """Axes that vehicles know better than the drawing does."""
+        """Axes along which a vehicle's estimates are more accurate than the drawing."""
         _, covariance = self.alone(prior)
         return np.asarray(np.einsum("nmm->nm", covariance) < _DETERMINED * np.diag(prior.mount))
 
@@ -146,7 +146,7 @@ def with_witness(
 
 
 def _mean_of(days: Float[np.ndarray, "N 1"], phi: Float[np.ndarray, "N M"]) -> Float[np.ndarray, "N M"]:
-    """Variance of the mean of AR(1) errors in that of independent ones."""
+    """Variance of the mean of AR(1) errors, divided by that of independent errors."""
     n = np.maximum(days, 1.0)
     return np.asarray((1 + phi) / (1 - phi) - 2 * phi * (1 - phi**n) / (n * (1 - phi) ** 2))
 

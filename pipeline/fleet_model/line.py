@@ -7,7 +7,7 @@
 
 S = diag(scatter^2) is learnt by Fisher scoring of the restricted likelihood (Patterson and Thompson 1971), m and b
 are solved with it. Vehicles far from their line have no weight. Where only records are there (A = B = I), data
-determine m + b; what tells m from b is a second kind of observation: A and B then have further rows.
+determine m + b; what separates m from b is a second kind of observation: A and B then have further rows.
 
 Days of a few frames determine few directions, mostly none along an axis. So all is computed from information, where
 an undetermined direction is zero, and a vehicle is compared with its line by the score of a shift along one axis.
@@ -73,7 +73,7 @@ class LineModel:
 
     @property
     def safe_variance(self) -> Float[np.ndarray, " M"]:
-        """Variance of mounts that answers rest on: one sigma above the estimate, so that few vehicles share less."""
+        """Variance of mounts for the answers: estimate plus one sigma, so that a line of few vehicles counts less."""
         return self.variance + self.variance_sigma
 
 
@@ -159,12 +159,12 @@ def _weights(distance: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
 def _mount_variance(
     variance: Float[np.ndarray, " M"], prior: LinePrior, remounted: Bool[np.ndarray, " N"]
 ) -> Float[np.ndarray, "N M M"]:
-    """Covariance of mounts: a workshop's is as far from the drawing as a whole line may be."""
+    """Covariance of each vehicle's mount; that of a remounted one has the prior's covariance of a whole line added."""
     return np.diag(variance) + remounted[:, None, None] * prior.mount
 
 
 def _design_of(evidence: LineEvidence) -> Float[np.ndarray, "N O G"]:
-    """From what is common to what is observed: mounts that a workshop set do not share the factory's error."""
+    """Jacobian of observations by the line's mean mount and bias; 0 by the mount of a vehicle that was remounted."""
     N, M = len(evidence.value), evidence.to_mount.shape[1]
     both = np.concatenate([evidence.to_mount, evidence.to_bias], axis=1)
     design = np.broadcast_to(both, (N, *both.shape)).copy()
@@ -224,7 +224,7 @@ def _inverse(information: np.ndarray) -> np.ndarray:
 def _nonnegative_step(
     variance: np.ndarray, score: np.ndarray, information: np.ndarray, seen: np.ndarray
 ) -> np.ndarray:
-    """One step of Fisher scoring along the axes that are seen; one at zero whose score points below stays there."""
+    """One step of Fisher scoring of variances; a variance of zero with a negative score stays zero."""
     free = ~((variance <= 0) & (score <= 0)) & (np.diag(information) > 0) & seen
     step = np.zeros(len(variance))
     if free.any():

@@ -4,7 +4,8 @@
 left: `T' = exp(xi) T`, so xi lives in the axes of the parent frame a.
 
 Source: Sola, Deray, Atchuthan 2018, "A micro Lie theory for state estimation in robotics", section IV and
-appendix D (their twist is translation first; here rotation comes first).
+appendix D (their twist is translation first; here rotation comes first). By hand because SciPy's rotations have
+neither adjoints nor covariances of composed and inverted poses.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from pipeline.ingest.containers.timeline import PAUSE_NS
 
 __all__ = ["BURST_TRIOS", "BurstMotion", "PossibleBursts", "choose_bursts", "possible_bursts"]
 
-# Tracks of moving clusters count from their second scan on (`calibrate/select/triggers.py`), and Doppler
+# Tracks of moving clusters count from their second scan on (`calibrate/paper/triggers.py`), and Doppler
 # aliases are resolved within a few more scans; 20 scans are 2 s at 10 Hz, shorter than the blocks of held-out
 # frames. Bursts of 10 were as good on two simulated days of three, and one radar was held on the third.
 BURST_TRIOS = 20

@@ -5,7 +5,7 @@ is filled by what a car does: its rear axle does not slip, so one radar ahead of
 
 Radars are turned on their brackets: each is turned back by what its own direction of travel differs from that
 of all, a constant of the day that no average over moments lowers (`heading_sigma_rad`). A source whose speed
-is another than that of the others in most moments is left out and named; of two that differ nobody can say
+is another than that of the others in most moments is left out and named; of two that differ it is unknown
 which, and `calibrate/verify/motion_sources` asks the lidar's sweeps.
 
 Source: Kellner et al. 2014, "Instantaneous ego-motion estimation using multiple Doppler radars".
@@ -136,7 +136,7 @@ def ego_motion(
         radars: of the same moments; none, where odometry shows all.
         odometry: all NaN where none is logged.
         heading: azimuth in axes of the base in which the car drives straight on, and its sigma [rad]: (0, 0)
-            for a vehicle frame; None = as the radars' mountings say, for a base that is a sensor.
+            for a vehicle frame; None = from the radars' mountings, for a base that is a sensor.
         axle_behind_m: how far the rear axle, which does not slip, lies behind the base's origin.
     """
     speeds = {r.name: r.level()[0][:, 0] for r in radars} | {"odometry": odometry.speed_mps}

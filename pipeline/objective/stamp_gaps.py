@@ -1,10 +1,10 @@
 """How far the stamps of one frame lie apart, and what part of that is the same all day.
 
-The sensors of a frame measured at different times: their stamps tell by how much, up to a time offset that all stamps
-of a sensor share. Terms bridge the gaps of each frame by the car's motion, and solve for the offset. Where a sensor is
-triggered by the lidar, its gaps are constant: then it measured with the lidar and its clock is off, or both clocks are
-right and it measured later. The first is expected, with the prior's sigma for the time offset, and there the estimate
-starts. Gaps of sensors that run freely have a median near 0.
+The sensors of a frame measure at different times: their stamps give the differences, up to a time offset that all
+stamps of a sensor share. Terms bridge the gaps of each frame by the car's motion, and solve for the offset. If a
+sensor is triggered by the lidar, its gaps are constant: either it measured with the lidar and its clock is off, or both
+clocks are right and it measured later. The first is expected, with the prior's sigma for the time offset, and there the
+estimate starts. Gaps of sensors that run freely have a median near 0.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def camera_gaps_s(observations: Sequence[Observation]) -> Float[np.ndarray, " F"
 
 
 def radar_gaps_s(observations: Sequence[Observation]) -> Float[np.ndarray, " F"]:
-    """Scan stamp minus sweep stamp of each frame [s]; the others' median of a frame without a radar."""
+    """Scan stamp minus sweep stamp of each frame [s]; frames without a radar get the median of the others."""
     gaps = np.array([(o.radar_stamp_ns - o.stamp_ns) * 1e-9 for o in observations], np.float64)
     return _filled(gaps, "radar", observations)
 
@@ -40,7 +40,7 @@ def constant_gap_s(gaps_s: Float[np.ndarray, " F"]) -> float:
 
 
 def scan_to_image_s(observations: Sequence[Observation]) -> Float[np.ndarray, " F"]:
-    """By how much each scan was taken after its image [s], if the constant gaps of both are errors of their clocks."""
+    """Time from each image to its scan [s], with constant gaps removed as errors of the clocks."""
     radar, camera = radar_gaps_s(observations), camera_gaps_s(observations)
     return (radar - constant_gap_s(radar)) - (camera - constant_gap_s(camera))
 

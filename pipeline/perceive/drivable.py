@@ -76,7 +76,7 @@ def _could_bound(xyz_m: np.ndarray, motion: np.ndarray, has_elevation: bool) -> 
 
 
 def _supported(points_m: np.ndarray) -> np.ndarray:
-    """Those with enough others near by: clutter and multipath come alone."""
+    """Points with enough neighbours: clutter and multipath are single points."""
     if not len(points_m):
         return points_m
     plane = points_m[:, :2].astype(np.float64)

@@ -116,7 +116,7 @@ def height_over(
 
 
 def _lowest_of_cells(xyz_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest point of each cell, and how much it counts as a witness of the ground under the vehicle."""
+    """Lowest point of each cell, and its weight in the fit of the ground under the vehicle."""
     range_m = np.hypot(xyz_m[:, 0], xyz_m[:, 1])
     near = xyz_m[(range_m > _NEAR_M) & (range_m < _PLANE_REACH_M)].astype(np.float64)
     if not len(near):

@@ -152,7 +152,7 @@ class Shown:
         return {s: c for s, c in usable.items() if self.kinds[s] == kind}
 
     def heading(self, radar: str, lidar: str | None = None) -> float | None:
-        """Azimuth of the way ahead in a radar's axes, as a lidar looks; the first whose place is known."""
+        """Azimuth in a radar's axes of the forward axis of a lidar: the given one, else the first with a known pose."""
         lidars = [s for s, kind in self.kinds.items() if kind == "lidar"] if lidar is None else [lidar]
         known = (between(self.star, name, radar) for name in lidars)
         return heading_of(next((T for T in known if T is not None), None))
@@ -171,7 +171,7 @@ class Found(NamedTuple):
 def perceive_moment(
     shown: Shown, sources: Sources, tracks: Mapping[str, TrackState], *, alone: bool = True
 ) -> Found:
-    """Features of a moment, and the radars' tracks carried on.
+    """Features of a moment, and the radars' tracks updated with it.
 
     `alone` is true if no complete moment shows the same scene; otherwise a moment without one of its sensors
     is rejected for a rig with one sensor of each kind.

@@ -94,7 +94,7 @@ def _vehicle(
 
 
 def _values(window: FleetWindow, verdicts: FleetVerdicts) -> Float[np.ndarray, "N 6"]:
-    """Changes [rad, m] of every record from its edge's level before the change; not finite where it does not say."""
+    """Changes [rad, m] of every record from its edge's level before the change; not finite where it has none."""
     seen = np.isfinite(window.sigma) & window.observable
     group = window.owner * len(window.edges) + window.edge
     origin = _first_of_each(group, seen.any(axis=1))[group]

@@ -1,4 +1,4 @@
-"""What the page of one vehicle-day says, from its records: plain values for the template, no HTML."""
+"""Content of the page of one vehicle-day, from its records: plain values for the template, no HTML."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def sigmas_of(record: CalibrationRecord) -> tuple[np.ndarray | None, np.ndarray 
 
 
 def pair_view(record: CalibrationRecord) -> PairView:
-    """Everything that the page says of one edge."""
+    """Content of the page about one edge."""
     T, T_prior = transform_of(record), prior_of(record)
     prior_sigma, sigma = sigmas_of(record)
     observable = record.observable or [sigma is not None] * 6
@@ -179,7 +179,7 @@ def _unchecked(record: CalibrationRecord) -> str:
 
 @dataclass(frozen=True)
 class Answered:
-    """What the first sentence of a page says of a sensor: attributes as those of `PairView`."""
+    """Content of the first sentence about a sensor; attributes as those of `PairView`."""
 
     title: str
     status: str

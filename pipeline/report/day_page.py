@@ -46,7 +46,7 @@ P = TypeVar("P", bound=PurePath)
 
 @dataclass(frozen=True)
 class DayRead:
-    """What the page of a vehicle-day tells: its current records by edge, and the vehicle's current findings."""
+    """Input of the page of a vehicle-day: its current records by edge, and the vehicle's current findings."""
 
     records: Mapping[str, CalibrationRecord]
     findings: Sequence[DriftFinding]
@@ -125,7 +125,7 @@ def write_day_picture(
 def _content(
     lake: Lake, partition: Partition, read: DayRead, pictures: ReportConfig | None
 ) -> dict[str, Any]:
-    """What the records, the findings and the frames of a day tell, by the names that the template uses."""
+    """Values for the template, by name, from the records, the findings and the frames of a day."""
     records, findings = read.records, read.findings
     poses = day_poses(lake, partition, records)
     views = [pair_view(record) for record in records.values()]
@@ -158,7 +158,7 @@ def _content(
 
 
 def _as_of(findings: Sequence[DriftFinding], lake: Lake) -> tuple[str, str]:
-    """The vehicle's status, and the audit that said so: pages of days are not drawn anew for every audit."""
+    """The vehicle's status and the day of its audit: pages of days are not redrawn for every audit."""
     status, sentence = status_sentence(findings, lake)
     return status, f"{sentence} (Audit until {findings[0].day}.)" if findings else sentence
 

@@ -22,7 +22,7 @@ def jpeg_uri(image_bgr: UInt8[np.ndarray, "H W 3"], width_px: int | None = None)
 
 
 def png_uri(image_bgr: UInt8[np.ndarray, "H W 3"]) -> str:
-    """A bitmap with sharp dots."""
+    """Image as a PNG data URI: lossless, so that single dots stay sharp."""
     return _uri("png", image_bgr, [cv2.IMWRITE_PNG_COMPRESSION, 6])
 
 

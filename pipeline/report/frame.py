@@ -44,7 +44,7 @@ def write_frame_page(path: Path, scene: Scene, prior: Prior, solution: Solution,
 
 
 def _told(pair: str, prior: Prior, solution: Solution) -> dict[str, str]:
-    """What the page says of a pair, in words."""
+    """Text of the page about a pair."""
     estimate, T = solution.pairs[pair], prior.of(pair)
     R = estimate.T[:3, :3] @ T[:3, :3].T
     turned_deg = np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1.0, 1.0)))

@@ -1,4 +1,4 @@
-"""What the page about the calibration in use says first: the answer in a sentence, and a line per axis."""
+"""Top of the page about the calibration in use: the answer in a sentence, and a line per axis."""
 
 from __future__ import annotations
 

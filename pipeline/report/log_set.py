@@ -37,7 +37,7 @@ def log_set_page(
 
 
 def _headline(told: Mapping[str, Any]) -> tuple[str, str, str]:
-    """Mood, headline and sentence."""
+    """Colour class of the headline, its text, and the sentence below it."""
     right, wrong, open_ = (told["answers"].get(a, 0) for a in ("right", "wrong", "undecided"))
     silent = sum(told["no_answer"].values())
     mood, words = (

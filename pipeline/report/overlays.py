@@ -42,7 +42,7 @@ _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 @dataclass(frozen=True, eq=False)
 class Extrinsics:
-    """Where the sensors sit, as far as one state (prior or calibrated) knows."""
+    """Poses of the sensors in one state (prior or calibrated), as far as known."""
 
     T_camera_lidar: np.ndarray
     T_camera_radar: np.ndarray

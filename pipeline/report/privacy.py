@@ -45,7 +45,7 @@ def without_road_users(frame: Frame, observation: Observation) -> Frame:
 
 
 def road_user_mask(observation: Observation, size_px: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
-    """Pixels of the full image (width, height) where labels or detections say that a road user is, and around."""
+    """Pixels of the full image (width, height) of road users by labels or detections, with a margin."""
     labels: UInt8[np.ndarray, "h w"] | None = cv2.imdecode(
         np.frombuffer(observation.labels_png, np.uint8), cv2.IMREAD_GRAYSCALE
     )

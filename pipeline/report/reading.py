@@ -107,7 +107,7 @@ def records_of_day(
 
 
 def _by_edge(records: Iterable[CalibrationRecord]) -> dict[str, CalibrationRecord]:
-    """Current ones of a vehicle-day by the words of their edges: the kind of edge, or the names of its sensors."""
+    """Current records of a vehicle-day by the name of their edge: its kind, or the names of its sensors."""
     edges = {edge_of(r): r for r in current_records(list(records))}
     return {words_of(edge): edges[edge] for edge in sorted(edges, key=edge_order)}
 
@@ -150,7 +150,7 @@ def other_cameras(
 
 
 def drift_of(lake: Lake, method: str, vehicle: str) -> list[DriftFinding]:
-    """What the last audit said of a vehicle."""
+    """Findings of the last audit about a vehicle."""
     return read_last(lake, DRIFT, DriftFinding, method, vehicle=vehicle)
 
 
@@ -169,7 +169,7 @@ def states_of(records: Mapping[str, CalibrationRecord]) -> tuple[Extrinsics, Ext
 
 
 def has_frames(lake: Lake, partition: Partition) -> bool:
-    """Whether the lake still holds what pictures are drawn from."""
+    """Whether the lake still holds the images and sweeps for pictures."""
     found = (ingested(lake, partition), perceived(lake, partition))
     return all(manifest is not None and COLLECTED not in manifest.extra for manifest in found)
 

@@ -39,7 +39,7 @@ _MIN_POINTS = 5  # shares of fewer say nothing
 def frame_residuals(
     observations: Sequence[Observation], states: Sequence[Extrinsics], offsets: Sequence[TimeOffsets] = ()
 ) -> list[dict[str, Float[np.ndarray, " F"]]]:
-    """Measure per state, pair and frame, as MEASURES says; NaN where a frame has too little to tell.
+    """Measure per state, pair and frame, as in MEASURES; NaN for a frame with too little data.
 
     `offsets` are the states' time offsets; without them all are 0.
     """

@@ -57,12 +57,12 @@ class DrawnSensor:
 
     @property
     def at_m(self) -> Float[np.ndarray, " 2"]:
-        """Forward and left."""
+        """Position of the sensor in the body frame: forward and left."""
         return self.T_body_sensor[:2, 3]
 
     @property
     def heading_rad(self) -> float:
-        """Where it looks, from forward to the left: a camera along z, the others along x."""
+        """Azimuth of the line of sight, counted from forward to the left: a camera's z axis, else the x axis."""
         x, y = self.T_body_sensor[:2, 2 if self.kind == "camera" else 0]
         return float(np.arctan2(y, x))
 

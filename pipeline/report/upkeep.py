@@ -42,7 +42,7 @@ class FanOut(Protocol):
 def one_by_one(
     function: Callable[[Any, Progress], Any], items: Sequence[Any], progress: Progress
 ) -> Iterator[tuple[Any, Any, str]]:
-    """In this process; an error ends it."""
+    """Apply a function to all items in this process; an error stops the rest."""
     for done, item in enumerate(items):
         progress(done, len(items), str(item))
         yield item, function(item, silent), ""

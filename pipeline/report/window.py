@@ -70,7 +70,7 @@ class FleetWindow:
 
 
 def read_window(lake: Lake, method: str, window_days: int, latest: str) -> FleetWindow:
-    """The last `window_days` days that have a record of the method, and of vehicles that drive rarely more.
+    """Records of the last `window_days` days; vehicles that drive rarely get their older records too.
 
     Args:
         window_days: days of the calendar.

@@ -104,11 +104,11 @@ class RangeReader(io.RawIOBase):
         return self._at
 
     def seekable(self) -> bool:
-        """Yes."""
+        """Whether random access works: always true here."""
         return True
 
     def readable(self) -> bool:
-        """Yes."""
+        """Whether it can be read: always true here."""
         return True
 
     def read(self, size: int = -1) -> bytes:

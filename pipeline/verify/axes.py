@@ -23,12 +23,13 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import norm
 
-from pipeline.config import FleetConfig, VerifyConfig
+from pipeline.config import VerifyConfig
 from pipeline.geometry.changes import change_between, change_covariance
 from pipeline.geometry.se3 import adjoint, inverse, log_se3
 from pipeline.geometry.target_sigmas import target_jacobian, target_sigmas
 from pipeline.geometry.targets import DEFAULT_TARGETS
 from pipeline.rig.edges import edge_of, words_of
+from pipeline.stage_work import Probes
 from pipeline.store.current import prior_of, targets_of, transform_of
 from pipeline.verify.one_axis import AxisCheck, AxisLimits, HeldOut, checked, silent
 from schemas.calibrations import PROBE_Z, CalibrationRecord
@@ -39,12 +40,12 @@ __all__ = [
     "answer_of",
     "answer_of_sensors",
     "answers_by_sensor",
-    "asking",
     "check_axes",
     "check_pose",
     "held_out_of",
     "kind_of_pose",
     "limits_of",
+    "probes",
     "shared_sigmas",
 ]
 
@@ -101,14 +102,15 @@ def check_axes(
     ]
 
 
-def asking(config: FleetConfig, asked_deg: tuple[float, float], sizes: Sequence[float]) -> FleetConfig:
-    """The configuration that asks held-out frames about turns, as multiples of the errors asked for."""
-    probe_deg = tuple(tuple(deg * size for size in sizes) for deg in asked_deg)
-    return config.changed(verify={"probe_deg": probe_deg})
+def probes(asked_deg: tuple[float, float], sizes: Sequence[float] = (0.5, 1.0, 2.0)) -> Probes:
+    """Turns for `Task.probe_deg`: the errors asked for, and multiples of them."""
+    wanted = sorted({1.0, *sizes})
+    of_camera, of_radar = (tuple(deg * size for size in wanted) for deg in asked_deg)
+    return of_camera, of_radar
 
 
 def held_out_of(records: Sequence[CalibrationRecord], verify: VerifyConfig, axis: str) -> HeldOut:
-    """What held-out frames say of an axis, by the pair whose frames tell it best."""
+    """Held-out test of turns about an axis, from the pair with the strongest test."""
     start = f"{PROBE_Z}{axis}_"
     found = [
         z
@@ -116,7 +118,7 @@ def held_out_of(records: Sequence[CalibrationRecord], verify: VerifyConfig, axis
         if (z := {float(k.removeprefix(start)): z for k, z in r.diagnostics.items() if k.startswith(start)})
     ]
     best = min(found, key=lambda z: sum(z.values()), default={})
-    return HeldOut(best, verify.better_alignment_z, verify.prior_agreement_sigmas)
+    return HeldOut(best, verify.checks.better_alignment_z, verify.checks.prior_agreement_sigmas)
 
 
 def kind_of_pose(kind: str) -> str:
@@ -143,7 +145,7 @@ def check_pose(
         in_use: T_reference_sensor of the calibration in use; None if it has none.
         limits: by axis.
         beyond: threshold in sigmas, from `shared_sigmas`.
-        held_out: by axis, what held-out frames say of turns; None = nothing.
+        held_out: by axis, the held-out test of turns; None = there is none.
     """
     of, found = (row.sensor, kind_of_pose(row.kind)), transform_of(row)
     why = f"the log gives no estimate: {row.reason}" if row.faults or found is None else ""

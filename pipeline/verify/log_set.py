@@ -1,4 +1,4 @@
-"""The calibrations that a data set ships: every log is asked, as shipped and with known turns."""
+"""Check of the calibrations of a data set: every log is verified, as shipped and with known turns."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake, Partition, work_key
 from pipeline.store.remote_logs import LogPath
 from pipeline.store.views import observations_of
-from pipeline.verify.axes import answers_by_sensor
+from pipeline.verify.axes import answers_by_sensor, probes
 from pipeline.verify.faults import Fault, copy_with_fault, faults_of_log
 from pipeline.verify.one_axis import AxisCheck
 from pipeline.verify.one_log import check_poses, check_sensors, prior_in_use, with_prior
@@ -48,7 +48,7 @@ __all__ = [
     "key_of_log",
 ]
 
-# Answers about a log that says nothing of any sensor; those of _AGAIN are not recorded, the next run tries again.
+# Answers about a log that has none for any sensor; those of _AGAIN are not recorded, the next run tries again.
 NO_ANSWER = ("unreadable", "no rig", "unusable", "no calibration")
 _AGAIN = NO_ANSWER[:2]
 _EVERY_S = 30.0  # between two commits
@@ -114,7 +114,7 @@ def key_of_log(settings: SetSettings, job: LogJob) -> str:
         for name in (camera.semantics.segmenter, camera.semantics.detector)
     ]
     told: dict[str, Any] = {
-        "asked": (settings.asked_deg, fleet.verify.probe_deg),
+        "asked": (settings.asked_deg, probes(settings.asked_deg, settings.sizes)),
         "file": prior_key(fleet, job.vehicle),
         "models": models,
     }
@@ -163,7 +163,17 @@ def ask_log(settings: SetSettings, job: LogJob, progress: Progress) -> list[SetC
         return [replace(job.row, answer="no rig", reason=why)]
     with TemporaryDirectory(prefix="boresight-set-") as temporary:
         lake, partition = Lake.at(Path(temporary) / "lake"), Partition(job.vehicle, job.day)
-        task = Task(fleet, lake, partition, "joint", logs=job.logs, progress=progress, commit=False)
+        probe_deg = probes(settings.asked_deg, settings.sizes)
+        task = Task(
+            fleet,
+            lake,
+            partition,
+            "joint",
+            probe_deg=probe_deg,
+            logs=job.logs,
+            progress=progress,
+            commit=False,
+        )
         try:
             if job.make is not None:
                 progress(0, 0, "convert")

@@ -2,7 +2,7 @@
 
 An error fails if it is measured (beyond so many sigmas, and beyond its limit) and if held-out frames confirm
 the log's answer: a record many sigmas from its prior is held where they align no better than at the prior.
-What they would say is known from turns of the answer (`calibrate/verify/probes.py`).
+Turns of the answer show whether they would (`calibrate/verify/probes.py`).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from pipeline.config import VerifyConfig
+from pipeline.config import ChecksConfig
 
 __all__ = ["AxisCheck", "AxisLimits", "HeldOut", "checked", "power_of", "shown_from", "silent"]
 
@@ -40,7 +40,7 @@ class AxisLimits:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """What held-out frames say of known turns of a log's answer; nothing where they were not asked.
+    """Held-out test of known turns of a log's answer; empty where none was made.
 
     Args:
         z: deviate of the paired test by turn [deg], negative = they prefer the answer.
@@ -49,8 +49,8 @@ class HeldOut:
     """
 
     z: Mapping[float, float] = field(default_factory=dict)
-    better_z: float = VerifyConfig.model_fields["better_alignment_z"].default
-    agreement: float = VerifyConfig.model_fields["prior_agreement_sigmas"].default
+    better_z: float = ChecksConfig().better_alignment_z
+    agreement: float = ChecksConfig().prior_agreement_sigmas
 
     def confirms(self, deg: float) -> float:
         """Probability that they confirm the answer against an error of this size, either sign equally likely."""
@@ -133,7 +133,7 @@ def checked(
         off: signed distance, its sigma, and the part of that which all logs share.
         blocked: why the log's answer cannot be compared; empty if it can.
         beyond: threshold in sigmas.
-        held_out: what held-out frames say of turns.
+        held_out: the held-out test of turns.
     """
     signed_rad, sigma_rad, common_rad = off
     off_rad = abs(signed_rad)
@@ -174,7 +174,7 @@ def _status(
         why = (
             ""
             if confirmed >= limits.confidence
-            else ", for held-out frames hardly tell such a turn from none"
+            else ", because held-out frames hardly distinguish such a turn from none"
         )
         return "inconclusive", f"{distance}: {seen}{why}"
     if measured:

@@ -18,7 +18,6 @@ from pipeline.rig.prior import RigPrior
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import perceived
 from pipeline.verify.axes import (
-    asking,
     check_axes,
     check_pose,
     held_out_of,
@@ -35,20 +34,11 @@ from schemas.poses import PoseRow
 __all__ = ["check_poses", "check_sensors", "for_one_look", "prior_in_use", "with_prior"]
 
 
-def for_one_look(
-    config: FleetConfig,
-    frames: int,
-    asked_deg: tuple[float, float],
-    sizes: Sequence[float] = (0.5, 1.0, 2.0),
-) -> FleetConfig:
-    """The configuration with few frames, spread over the log, with every pair estimated.
-
-    Held-out frames are asked about turns of `asked_deg` (camera-lidar, radar) times `sizes`.
-    """
-    config = config.changed(
+def for_one_look(config: FleetConfig, frames: int) -> FleetConfig:
+    """The configuration with few frames, spread over the log, with every pair estimated."""
+    return config.changed(
         ingest={"max_frames": frames}, select={"frames": frames}, trigger={"when": "always"}
     )
-    return asking(config, asked_deg, sorted({1.0, *sizes}))
 
 
 def prior_in_use(config: FleetConfig, lake: Lake, partition: Partition) -> RigPrior | None:
@@ -127,7 +117,7 @@ def check_poses(
         lacking: sensors of which it has no pose.
         verify: sizes of errors that matter, and the confidence.
         asked_deg: errors of camera-lidar, and of pairs with the radar, that must not go undetected.
-        records: of the log's pairs, for what held-out frames say of turns.
+        records: of the log's pairs, for their held-out tests of turns.
     """
     own = [row for row in rows if row.sensor != row.reference]
     known = {row.sensor: None if prior is None else prior.between(row.reference, row.sensor) for row in own}
@@ -149,7 +139,7 @@ def check_poses(
 
 
 def _held_out(row: PoseRow, records: Sequence[CalibrationRecord], verify: VerifyConfig) -> dict[str, HeldOut]:
-    """By axis, what held-out frames of a sensor's pairs with lidars say; they turn the camera or the radar."""
+    """Held-out test by axis, from a sensor's pairs with lidars; their turns are of the camera or the radar."""
     pair = {"camera": "camera_lidar", "radar": "lidar_radar"}.get(row.kind)
     own = [r for r in records if r.pair == pair and row.sensor in {r.parent_frame, r.child_frame}]
     return {axis: held_out_of(own, verify, axis) for axis in TURN_AXES}

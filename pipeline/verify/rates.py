@@ -29,7 +29,7 @@ class Look:
 
     @property
     def row(self) -> SetCheck:
-        """Any of the axes, for what they share."""
+        """The row of one axis, for the columns that all axes of a look have in common."""
         return self.axes[0]
 
     @property
@@ -184,7 +184,7 @@ def _status(look: Look, axis: str) -> str:
 
 
 def _stated(look: Look, axis: str) -> float:
-    """Probability, by sigma and held-out frames as shipped, that a turn of this size is called wrong."""
+    """Probability that a turn of this size is called wrong, from the sigma and held-out test as shipped."""
     check = next((c for c in look.shipped if c.axis == axis), None)
     if (
         check is None

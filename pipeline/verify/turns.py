@@ -25,11 +25,11 @@ class Turn:
 
     @property
     def name(self) -> str:
-        """Sensor, axis and degrees."""
+        """Name of the turn: sensor, axis and degrees."""
         return f"{self.sensor} {self.axis} {self.deg:+g}"
 
     def transform(self) -> Float[np.ndarray, "4 4"]:
-        """T_sensor_turned."""
+        """The turn as T_sensor_turned: from axes of the turned sensor to axes of the sensor."""
         return sensor_turn(self.axis, float(np.radians(self.deg)), of_camera=self.kind == "camera_lidar")
 
 

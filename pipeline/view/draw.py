@@ -40,7 +40,7 @@ def quiet_stdout() -> Iterator[None]:
 def viewpoint(
     T_car: Mapping[str, Float[np.ndarray, "4 4"]], cameras: Iterable[str]
 ) -> tuple[Float[np.ndarray, 3], Float[np.ndarray, 3]]:
-    """Where to look at and from where: from behind and above, the way the cameras look on the whole, else ahead."""
+    """Target and eye of the view: from behind and above, along the mean direction of the cameras, else forward."""
     looks = [T_car[name][:3, 2] for name in cameras if name in T_car]
     way = np.array([1.0, 0.0, 0.0]) if not looks else np.mean(looks, axis=0) * [1, 1, 0]
     # Cameras all around look nowhere on the whole.
@@ -66,7 +66,7 @@ def render(
     size_px: tuple[int, int],
     title: str,
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """A picture with names and a title, red green blue."""
+    """Picture (RGB) with names of sensors and a title."""
     width, height = size_px
     with quiet_stdout():
         renderer = rendering.OffscreenRenderer(width, height)

@@ -31,8 +31,8 @@ def lake(tmp_path_factory):
 
 
 def usual_fleet():
-    usual = {"grid_width_deg": 89.6, "grid_height_deg": 51.2, "lidar_points": 8192}
-    return training_lakes.fleet_of("ab", split_by=["vehicle"], val_fraction=0, test_fraction=0, **usual)
+    usual = {"grid": {"width_deg": 89.6, "height_deg": 51.2}, "lidar_points": 8192}
+    return training_lakes.fleet_of("ab", by=["vehicle"], val_fraction=0, test_fraction=0, **usual)
 
 
 def decode_per_sample(lake, fleet):

@@ -1,12 +1,11 @@
 """The stage: observations in a lake to records, refused days included, the same work never twice."""
 
-from dataclasses import asdict, fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from pipeline.calibrate.records import environment_of
-from pipeline.calibrate.verify.limits import VerdictLimits
 from pipeline.config import FleetConfig
 from pipeline.errors import ConfigError
 from pipeline.geometry.se3 import from_quaternion, rotation_angle_rad
@@ -88,6 +87,13 @@ def test_one_record_per_pair_with_every_column_filled(solved):
         assert record.trigger_before
         assert set(record.trigger_before) == set(record.trigger_after)
         assert record.diagnostics["holdout_frames"] >= 3
+
+
+def test_trigger_metrics_are_measured_for_the_papers_methods_and_where_they_decide(tmp_path, day):
+    for when, measured in (("always", False), ("triggered", True)):
+        lake = lake_with(tmp_path / when, day)
+        calibrate_day(DAY, fleet_of(trigger={"when": when}), lake, method="joint")
+        assert {bool(r.trigger_before) for r in records_of(lake)} == {measured}
 
 
 def test_the_perturbed_prior_is_off_by_exactly_what_was_asked(solved):
@@ -234,10 +240,8 @@ def test_unknown_vehicle_or_method_is_a_usage_error(tmp_path):
 
 
 def test_the_verdicts_thresholds_are_those_of_the_configuration(tmp_path, day):
-    defaults = FleetConfig.model_validate({"fleet": {"name": "f"}, "rigs": {}}).verify
-    assert {f.name: getattr(defaults, f.name) for f in fields(VerdictLimits)} == asdict(VerdictLimits())
     lake = lake_with(tmp_path, day)
-    strict = fleet_of(verify={"max_move_prior_sigmas": 1e-6})
+    strict = fleet_of(verify={"checks": {"max_move_prior_sigmas": 1e-6}})
     result = calibrate_day(DAY, strict, lake, method="pairwise-optimisation")
     assert result.kept["accepted"] == 0
     assert all("prior sigmas" in r.reason for r in result.records)

@@ -9,9 +9,9 @@ import pytest
 from pipeline.calibrate.numerics.search_range import SearchRange
 from pipeline.calibrate.select.frames import _too_few
 from pipeline.calibrate.verify.held_out_test import HeldOutTest
-from pipeline.calibrate.verify.limits import VerdictLimits
 from pipeline.calibrate.verify.target_accuracy import Claim
 from pipeline.calibrate.verify.verdict import Evidence, judge
+from pipeline.config import ChecksConfig
 from pipeline.extrinsics.estimates import PairEstimate, Prior
 from pipeline.fleet.more_frames import MOST_TIMES_MORE, _lacks_frames, asks_for_more, spent_before
 from pipeline.fleet.nightly import Night, run_night
@@ -35,7 +35,7 @@ FEW = _too_few("camera_lidar", [1, 2], [["sky"]] * 9, 5)
 def held_for(claim, frames):
     """The reason of a verdict on a result that is right but for what is given."""
     evidence = Evidence(HeldOutTest(1.0, 0.8, 0.02, frames, 10), {"azimuth": claim})
-    found = judge(ESTIMATE, PRIOR, evidence, SearchRange(0.1, 0.3), VerdictLimits())
+    found = judge(ESTIMATE, PRIOR, evidence, SearchRange(0.1, 0.3), ChecksConfig())
     assert found.status == "held"
     return found.reason
 

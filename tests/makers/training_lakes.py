@@ -26,19 +26,23 @@ TOPICS = {
     "radar": {"points": "/radar"},
 }  # fmt: skip
 SMALL = {
-    "lidar_points": 1024, "cluster_points": 256, "edge_points": 128, "grid_width_deg": 51.2, "grid_height_deg": 25.6,
+    "lidar_points": 1024, "cluster_points": 256, "edge_points": 128,
+    "grid": {"width_deg": 51.2, "height_deg": 25.6},
 }  # fmt: skip
+_OF_POINTS = ("lidar_points", "cluster_points", "edge_points", "max_frames", "min_step_m", "seed")
 PALETTE = np.random.default_rng(7).integers(0, 255, (256, 3)).astype(np.uint8)
 
 
-def fleet_of(vehicles, **prepare) -> FleetConfig:
-    """A configuration that knows these vehicles, with small rows."""
+def fleet_of(vehicles, grid=None, **prepare) -> FleetConfig:
+    """A configuration that knows these vehicles, with small rows; keys of [prepare] and of [prepare.split]."""
+    points = {name: value for name, value in prepare.items() if name in _OF_POINTS}
+    split = {name: value for name, value in prepare.items() if name not in points}
     return FleetConfig.model_validate(
         {
             "fleet": {"name": "tests"},
             "rigs": {"default": TOPICS},
             "vehicles": {v: {"rig": "default"} for v in vehicles},
-            "prepare": SMALL | prepare,
+            "prepare": SMALL | points | {"split": split, "grid": SMALL["grid"] | (grid or {})},
         }
     )
 

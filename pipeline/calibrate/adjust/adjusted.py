@@ -38,10 +38,10 @@ class AdjustedEdge:
     """An edge beside the adjusted rig.
 
     Args:
-        innovation_sigmas: how far it is from what all other edges in use say; None = nothing but the prior
+        innovation_sigmas: distance from the pose by all other edges in use; None = only the prior
             checks it.
         failed: why it is left out; empty = the rig rests on it.
-        doubts: edges one of which is wrong, without a way to tell which: the rig goes on with all but one of
+        doubts: edges one of which is wrong, unknown which: the rig goes on with all but one of
             them.
     """
 
@@ -65,8 +65,8 @@ class AdjustedSensor:
     Args:
         determined: 6, bool; the others rest on the prior.
         rests_on: edges that its pose rests on: without one of them it is less sure.
-        untied: why the day says nothing of its pose to the reference; empty = it does.
-        doubts: edges that it rests on, one of which is wrong, without a way to tell which.
+        untied: why the day does not determine its pose to the reference; empty = it does.
+        doubts: edges that it rests on, one of which is wrong, unknown which.
     """
 
     observability: np.ndarray

@@ -35,7 +35,7 @@ __all__ = ["adjust"]
 
 # Gauss-Newton of quadratic costs: four steps from a prior 5 deg away, to 1e-9 rad, m and s.
 _MOST_STEPS, _STILL = 20, 1e-9
-# Two edges are told apart where the better explanation is twenty times as probable: what attribution asks for.
+# Two edges are distinguished where the better explanation is twenty times as probable: what attribution asks for.
 _CLEAR = 2 * np.log(20.0)
 _MATTERS = 1.01  # a variance that grows by more than this share rests on the edge that was left out
 # An edge five sigmas wrong draws a pose by one sigma that rests on it by a fifth, whose variance grows by a quarter.

@@ -157,7 +157,7 @@ def _shown(travel: SweepTravel, roads: RoadUnder, ego: EgoMotion, scenes: Scenes
 
 
 def _moved(T: np.ndarray, change: Sequence[float]) -> np.ndarray:
-    """Turned at the lidar's own place, and lifted."""
+    """The pose with the lidar turned about its own origin, and lifted by the last number [m]."""
     return from_rotation_translation(
         exp_so3(np.array(change[:3])) @ T[:3, :3], T[:3, 3] + [0.0, 0.0, change[3]]
     )

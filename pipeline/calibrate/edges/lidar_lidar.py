@@ -61,7 +61,7 @@ class LidarPair:
     """Two lidars' sweeps of the same moments.
 
     Args:
-        T_base_parent: of the parent on the car, good to a degree: says where is up, and ahead.
+        T_base_parent: of the parent on the car, good to a degree: gives the directions up and ahead.
         deskewed: T_base_sensor by which sweeps of parent and child were de-skewed.
         base_sigma_rad: of T_base_parent: de-skewing goes along it.
     """

@@ -2,7 +2,7 @@
 
 Straight on, the way is the base's x axis: its azimuth in radar axes is yaw. In turns a radar ahead of the
 rear axle goes sideways by the yaw rate times its lever arm; that and the slip of the axle are one slope over
-curvature, so x stays without information: no log tells them apart. Pitch needs elevations, and least squares
+curvature, so x stays without information: no log separates them. Pitch needs elevations, and least squares
 on them is pulled towards their mean; the velocities of `objective/radar/travel`, which a lidar with the same
 view mends, show it, and a radar that shares its view with none has no pitch. Roll and position turn or shift
 nothing of the way. Changes of speed show the clock. The motion must be of other sources than this radar.
@@ -35,7 +35,7 @@ _SCALE_SIGMA = 0.02  # of an odometer
 _LEAST_AZIMUTH_RAD = np.radians(0.1)
 _LEAST_SPEED_SIGMA_MPS = 0.05
 _BEND_M = 50.0  # in one bend a car slips the same way
-_LONGEST_S = 2.0  # between moments from which accelerations are told
+_LONGEST_S = 2.0  # between moments from which accelerations are computed
 _YAW_FLOOR_RAD = np.radians(0.02)  # errors of 8 tuning days were 0.018 deg RMS
 _CLOCK_FLOOR_S = 0.004  # 12 ms RMS, as scenes scatter; of no clock less is promised
 _NO_CLOCK_S = 1.0  # a clock that is not known to half of this is not known

@@ -25,7 +25,7 @@ _FEWEST_CELLS, _FEWEST_POINTS = 15, 60
 _LEAST_LENGTH_M, _LEAST_WIDTH_M = (
     8.0,
     2.0,
-)  # of what is seen: less does not tell slope from bend, or left from right
+)  # of what is seen: less does not separate slope from bend, or left from right
 _FLAT_M = 0.01
 _PASSES = 8
 

@@ -23,7 +23,7 @@ class Sweep:
         drive: continuous stretch of driving.
         is_ground: N, on the drivable ground.
         may_move: N, on something of a vehicle's size.
-        time_s: N, when each point was measured, against the stamp; None where nobody knows.
+        time_s: N, when each point was measured, against the stamp; None if unknown.
     """
 
     stamp_ns: int

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
 
 from pipeline.calibrate.joint.lidar_radar.tilt_floors import tempered
 from pipeline.calibrate.numerics.bias_floors import (
@@ -25,10 +24,10 @@ from pipeline.calibrate.numerics.frame_blocks import blocks_of
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.common_share import common_of
 from pipeline.extrinsics.estimates import PairEstimate, Prior
-from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.changes import change_jacobian
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation, log_so3, transform_points
+from pipeline.geometry.se3 import exp_so3, from_rotation_translation, log_so3
 from pipeline.objective.radar.moving_clusters import (
+    MATCH_RAD,
     MovingClusters,
     azimuth_equations_camera,
     camera_azimuth_residuals,
@@ -44,9 +43,8 @@ from pipeline.objective.radar.vehicle_boxes import (
 )
 from schemas.observations import Observation
 
-__all__ = ["camera_radar_cost", "estimate_camera_radar"]
+__all__ = ["estimate_camera_radar"]
 
-_MATCH_RAD = np.radians(1.0)  # half a car at 40 m
 _BOX_FLOOR = np.array([0.0, 0.0, BOX_ROLL_FLOOR_CAMERA_RAD, 0.0, 0.0, 0.0, *[0.0] * len(BOX_CLASSES)])
 _YAW = 1  # of a turn about the camera's axes: its vertical
 _FIXED = np.arange(6 + len(BOX_CLASSES)) // 3 == 1  # the position: angles of far objects hardly depend on it
@@ -183,27 +181,6 @@ def _solve(
     return T, equations
 
 
-def camera_radar_cost(
-    observations: Sequence[Observation], T_camera_radar: Float[np.ndarray, "4 4"]
-) -> Float[np.ndarray, " F"]:
-    """Cost of each held-out frame at a pose: robust azimuth distance of moving clusters to boxes, 0..1.
-
-    Clusters in the camera's view count, those without any box within 3 deg as 1. NaN where a frame has none
-    or no boxes.
-    """
-    clusters = moving_clusters(observations)
-    out = np.full(len(observations), np.nan)
-    if not clusters.count:
-        return out
-    visible = _in_view(clusters, observations, T_camera_radar)
-    residual, _, frame = camera_azimuth_residuals(clusters, T_camera_radar, 3 * _MATCH_RAD)
-    gain = np.bincount(frame, 1 / (1 + (residual / _MATCH_RAD) ** 2), minlength=len(observations))
-    total = np.bincount(clusters.frame[visible], minlength=len(observations))
-    informative = (total > 0) & np.array([len(o.road_user_classes) > 0 for o in observations])
-    out[informative] = 1 - np.minimum(gain[informative] / total[informative], 1.0)
-    return out
-
-
 def _scan_azimuth(clusters: MovingClusters, T0: np.ndarray, config: SolveConfig) -> tuple[np.ndarray, float]:
     """The rotation about the camera's vertical at which most moving clusters meet a box, near ones first.
 
@@ -216,10 +193,10 @@ def _scan_azimuth(clusters: MovingClusters, T0: np.ndarray, config: SolveConfig)
     ]
     scores = []
     for T, turn in zip(poses, turns, strict=True):
-        residual, _, _ = camera_azimuth_residuals(clusters, T, 3 * _MATCH_RAD)
+        residual, _, _ = camera_azimuth_residuals(clusters, T, 3 * MATCH_RAD)
         # The search box as a weak prior: chance matches must not decide where nothing moves.
         prior = _SCHEDULE.scan_prior * (turn / reach) ** 2
-        scores.append(float(np.sum(1 / (1 + (residual / _MATCH_RAD) ** 2))) - prior)
+        scores.append(float(np.sum(1 / (1 + (residual / MATCH_RAD) ** 2))) - prior)
     best = int(np.argmax(scores))
     elsewhere = np.abs(turns - turns[best]) >= np.radians(_SCHEDULE.rival_apart_deg)
     rival = max((s for s, far in zip(scores, elsewhere, strict=True) if far), default=0.0)
@@ -246,18 +223,3 @@ def _equations(seen: _Seen, T: np.ndarray, bias: np.ndarray, step: int) -> _Equa
     Hb[:, :6, :6] += A.T @ Ha @ A
     gb[:, :6] += ga @ A
     return _Equations(Hb, gb, box_sigma, azimuth_sigma, pairs.count)
-
-
-def _in_view(
-    clusters: MovingClusters, observations: Sequence[Observation], T_camera_radar: np.ndarray
-) -> np.ndarray:
-    """Clusters whose azimuth the camera covers."""
-    points = transform_points(T_camera_radar, clusters.at_image_time())
-    out = np.zeros(clusters.count, bool)
-    for f in np.unique(clusters.frame):
-        o = observations[f]
-        camera = camera_of(o)
-        index = np.flatnonzero(clusters.frame == f)
-        uv, valid = camera.project(points[index])
-        out[index] = valid & (uv[:, 0] > 0) & (uv[:, 0] < o.image_width_px - 1)
-    return out

@@ -1,7 +1,7 @@
 """Method `joint`: each pair from its two sensors alone; the adjustment combines them.
 
 No evidence enters two pairs: vehicle boxes belong to camera-radar alone. One number is passed on:
-camera-lidar's time offset moves the cloud along the car's way, whose direction in lidar axes comes from the
+camera-lidar's time offset moves the cloud along the driving direction, which in lidar axes comes from the
 radar's Doppler (`objective/ego_motion`), with the uncertainty of the radar's rotation. If a sensor is
 missing, the other pairs are solved as they are: camera-lidar along the lidar's own x axis. A CameraInfo that
 the day contradicts holds camera-lidar, because its pose depends on it.
@@ -119,7 +119,7 @@ def _without_terms(prior: Prior, config: SolveConfig) -> tuple[Prior, SolveConfi
 def _heading(
     observations: Sequence[Observation], lidar_radar: _Found | None, prior: Prior
 ) -> tuple[float, float] | None:
-    """The car's way in lidar axes, as surely as the radar's own turn is known; else what the prior says of it."""
+    """Driving direction in lidar axes [rad] and its sigma, from the radar's Doppler and the prior; None if unknown."""
     if lidar_radar is None or lidar_radar[1] or not lidar_radar[0].observable[2]:
         return prior.heading
     shown = shown_heading(observations, lidar_radar[0].T)

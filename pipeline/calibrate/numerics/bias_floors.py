@@ -58,7 +58,7 @@ CAMERA_LIDAR_BIAS = np.array([np.radians(0.03)] * 3 + [0.01, 0.006, 0.01])
 CAMERA_LIDAR_DT_FLOOR_S = 0.004
 # How far boundaries of one side (left, right, feet, tops) lie beside its jumps: labels are too wide, and edges anywhere
 # between two beams. At most, on 34 good days of thirteen rigs: one label pixel and .4 of the angle between beams; what
-# the witnesses of one day are asked with.
+# the sources of one day are compared with.
 EDGE_SIDE_MOST_PX, EDGE_SIDE_MOST_OF_GAP = 1.0, 0.4
 # Of how far near and far edges of both sides lie apart at the solution, the share that one sigma of each angle is, of
 # pitch and yaw about a point so far ahead. On 52 drawn worlds (seeds 60 to 75, 6400 to 6435), where they are .4 px
@@ -96,7 +96,7 @@ TYPICAL_RANGE_M, TYPICAL_SPEED_MPS = 12.0, 8.0
 
 # A radar's own constant elevation error looks like pitch: a thirtieth of a car radar's resolution cell. For whoever
 # uses its detections it is a turn of the radar, so the record's pitch is where detections point, and this widens
-# nothing: it is what the record's assumptions say of the mounting.
+# nothing: the record's assumptions include it for the mounting.
 RADAR_ELEVATION_BIAS_RAD = np.radians(0.2)
 # Unobserved roll tilts azimuths; radars see into objects. Yaw, x and y: what the errors of 16 simulated days with known
 # truth (40 frames; 0.021 deg, 0.029 m, 0.015 m) leave beyond resampling's 0.027 deg, 0.018 m and 0.010 m. Pitch: the

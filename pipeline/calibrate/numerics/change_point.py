@@ -50,7 +50,7 @@ def parts_of_day(
     Args:
         score: of each frame at a solution, higher is better.
         tested: rotations (0, 1, 2) that are compared.
-        scene: of each frame; a part of fewer than three knows nothing of its own spread.
+        scene: of each frame; a part of fewer than three has no estimate of its spread.
     """
     cut = likeliest_cut(gradient, scene)
     if cut is None:

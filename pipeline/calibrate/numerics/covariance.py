@@ -63,7 +63,7 @@ def bootstrap_covariance(
         prior_information: of the prior; zero where there is none (then the frames must determine that
             parameter).
         block: frames with the same number are drawn together.
-        degrees: of freedom with which the information already says how much blocks scatter; 0 where it takes
+        degrees: of freedom of the scatter over blocks that the information already contains; 0 where it takes
             frames to err apart.
 
     Returns:

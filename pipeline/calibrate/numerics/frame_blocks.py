@@ -28,13 +28,13 @@ __all__ = [
     "scenes_of",
 ]
 
-FEWEST_SCENES = 3  # of two one can only say that they differ
+FEWEST_SCENES = 3  # two blocks only show that they differ
 
 # What is known of a scene's frames before the day shows it: how much their gradients correlate, with so many degrees of
 # freedom. On fourteen tuning days .0 to .2 where the car drives on within a scene, .30 and .38 of cars that stand, .7
 # in single unknowns of those.
 _CORRELATION, SCENE_DEGREES = 0.4, 4.0
-_FEWEST_BLOCKS = 8  # with fewer, neither a bootstrap nor a scatter over blocks knows its own spread
+_FEWEST_BLOCKS = 8  # fewer are too few for a bootstrap or a scatter over blocks
 # A street looks otherwise after this way, or from a turn that brings in a third of a camera's view.
 _SCENE_M, _SCENE_RAD = 10.0, float(np.radians(20.0))
 # Share of a frame's depth edges that lie where those of another do. On eleven days of nine sensors (simulated, Astyx,
@@ -61,7 +61,7 @@ class Scenes:
         return Scenes(scene, bootstrap_blocks(np.array([o.drive for o in observations]), scene, most))
 
     def of_frames(self, frames: Int[np.ndarray, " G"]) -> Scenes:
-        """Of some of the frames, numbered anew."""
+        """The scenes and blocks of a selection of the frames, renumbered."""
         scene, block = (
             np.unique(of[frames], return_inverse=True)[1].ravel() for of in (self.scene, self.block)
         )
@@ -69,19 +69,19 @@ class Scenes:
 
     @property
     def weight(self) -> Float[np.ndarray, " F"]:
-        """Of each frame, so that scenes weigh alike."""
+        """Weight of each frame: one over the number of frames of its scene, so that scenes have equal weight."""
         return np.asarray(1 / np.bincount(self.scene)[self.scene])
 
     def scatter(self, gradient: Float[np.ndarray, "F P"]) -> float:
-        """Variance of the gradients' sum, over all unknowns: of blocks, for frames of one scene err together.
+        """Variance of the sum of gradients, over all unknowns, with the errors of a block's frames correlated.
 
-        Few blocks hardly show it. What frames show is taken with it, as much larger as scenes are wont to
-        make it (Smyth 2004, moderated variances); never less than of frames that err apart.
+        A few blocks determine it badly, so it is combined with the variance of independent frames times the
+        usual inflation by scenes (Smyth 2004, moderated variances); it is at least that of independent frames.
         """
         return self.inflation(gradient) * _apart(gradient)
 
     def inflation(self, gradient: Float[np.ndarray, "F P"]) -> float:
-        """By how much `scatter` is larger than if all frames erred apart."""
+        """Ratio of `scatter` to the same variance for frames with independent errors."""
         apart = gradient - gradient.mean(0)
         size, blocks = np.bincount(self.scene), int(self.block.max()) + 1
         known = 1 + _CORRELATION * (float((size**2).sum()) / len(self.scene) - 1)

@@ -2,7 +2,7 @@
 
 The paper gives no uncertainty. The sandwich `H^-1 S H^-1` (H: curvature of the mean loss, S: scatter of the
 gradients over blocks of frames that share a scene) is what resampling whole blocks converges to, at the price
-of a few evaluations; its inverse is added to the prior's information. It knows nothing of bias, and these
+of a few evaluations; its inverse is added to the prior's information. It does not include bias, and these
 losses are biased (their minimum lies below the truth's value): a floor measured in simulation is added.
 """
 
@@ -31,7 +31,7 @@ def sandwich_covariance(
 
     Args:
         frame_losses: (P, 4, 4) -> (P, F).
-        prior_covariance: caps what is not determined: beyond it the prior knows better.
+        prior_covariance: upper limit for what is not determined.
         floor: bias floor, rotation [rad] and translation [m].
 
     Returns:

@@ -40,7 +40,7 @@ __all__ = [
 PAPER_SYNC_GATE_S = 0.005  # section 4.5.1
 
 MIN_FRAMES = 8  # fewer are not accepted: 10 frames already scatter by 0.1 deg (evidence on the real logs)
-# With so many camera-lidar of method `joint` says how sure it is (README); it is held.
+# With so many, camera-lidar of method `joint` has a covariance (README); it is held.
 SHORTEST = 5
 _HARD = frozenset(
     {"sync", "empty", *(f"no_{sensor}" for sensor in SENSORS)}
@@ -81,7 +81,7 @@ def select_frames(
         sync_gate_s: largest difference of a pair's stamps; None = any that ingest let in.
         motion_gate: how far the car may drive and turn [m, rad] between a pair's stamps, their constant gap
             aside.
-        absent: why frames lack a sensor, in words by sensor, as far as the caller knows.
+        absent: why frames lack a sensor, in words by sensor, if known.
     """
     scene = scenes_of(observations)
     held_out = hold_out(observations, config.holdout_fraction, scene)
@@ -214,7 +214,7 @@ def hold_out(
     in one of them as a whole, with its first frame, however often the car returns to it. Of several lengths
     of block the split is taken that comes nearest to the fraction, loses few frames next to the fit, and
     judges by at least _JUDGING_BLOCKS blocks. A day of one scene is split within it: nothing that it judges
-    is proof, and the record says so.
+    is proof, and the record has it as reason.
     """
     if not observations:
         return []

@@ -1,6 +1,6 @@
 """Rotation between two sensors from the bearings of objects that both track, robustly; and whether it has changed.
 
-The reference sensor knows where an object is, the other one in which direction. Translations stay at the
+The reference sensor measures the position of an object, the other one its direction. Translations stay at the
 prior: bearings of distant objects hardly see them. Geman-McClure weights, from wide to narrow, turn wrong
 pairs of tracks down.
 

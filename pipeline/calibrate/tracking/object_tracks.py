@@ -60,7 +60,7 @@ _RADAR_AGE, _RADAR_POINTS = 2, 2
 _RADAR_RATE_SIGMA_MPS, _RADAR_RANGE_SIGMA_M = 0.6, 0.7
 _MAX_YAW_RATE_RADPS, _YAW_STEPS = 0.4, 81
 _TURN_SCALE_M = 0.6
-_LEAST_CLUSTERS = 6  # to tell a turn from the standing world
+_LEAST_CLUSTERS = 6  # to separate a turn from the standing world
 
 
 def motions(observations: Sequence[Observation], prior: Prior) -> list[Motion]:

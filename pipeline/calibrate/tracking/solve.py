@@ -1,6 +1,6 @@
 """Method `tracking`: moving objects tracked by each sensor, tracks paired, each sensor turned to the lidar's.
 
-The baseline of the paper's Table 1. The lidar is the reference: it alone knows where an object is in all
+The baseline of the paper's Table 1. The lidar is the reference: it alone measures an object in all
 three dimensions. Camera and radar are each calibrated against it, camera-radar is composed. As in the source
 only rotations are calibrated; translations keep the prior and its sigma. Association and alignment take turns
 until the pairs stay the same.

@@ -13,11 +13,10 @@ import numpy as np
 from pipeline.calibrate.select.frames import Selection
 from pipeline.calibrate.verify.constancy import constancy_failures
 from pipeline.calibrate.verify.failed_checks import heading_failures, loop_failures
-from pipeline.calibrate.verify.limits import VerdictLimits
 from pipeline.calibrate.verify.motion_sources import MotionFindings
 from pipeline.calibrate.verify.prior_alarms import clock_alarms, edge_alarms, prior_alarms
 from pipeline.calibrate.verify.scene_count import scene_failures
-from pipeline.config import FleetConfig
+from pipeline.config import ChecksConfig, FleetConfig
 from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.estimates import Prior, Solution
 from schemas.calibrations import PAIRS
@@ -35,7 +34,7 @@ class FoundDay:
     prior: Prior
     solution: Solution
     fleet: FleetConfig
-    limits: VerdictLimits
+    limits: ChecksConfig
     motion: MotionFindings
 
 

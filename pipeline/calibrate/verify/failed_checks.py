@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.calibrate.verify.limits import VerdictLimits
+from pipeline.config import ChecksConfig
 from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.estimates import Prior, Solution
 from pipeline.geometry.changes import change_between
@@ -21,9 +21,9 @@ from schemas.observations import Observation
 __all__ = ["heading_failures", "loop_failures", "loop_sigmas"]
 
 
-def loop_failures(solution: Solution, limits: VerdictLimits | None = None) -> list[FailedCheck]:
+def loop_failures(solution: Solution, limits: ChecksConfig | None = None) -> list[FailedCheck]:
     """A loop of independent estimates that does not close within its sigma: an error of any pair, so all fail."""
-    limits = limits or VerdictLimits()
+    limits = limits or ChecksConfig()
     found = loop_sigmas(solution)
     if found is None or solution.loop_rotation_rad is None or solution.loop_translation_m is None:
         return []
@@ -44,9 +44,9 @@ def heading_failures(
     prior: Prior,
     observations: Sequence[Observation],
     limit_rad: float,
-    limits: VerdictLimits | None = None,
+    limits: ChecksConfig | None = None,
 ) -> list[FailedCheck]:
-    """Camera-lidar solved along a heading that lidar-radar then turned.
+    """Failed check of camera-lidar if it was solved with a heading that lidar-radar contradicts.
 
     A camera's time offset moves the cloud along the car's heading, which the radar's prior mounting gives.
     Where lidar-radar turns the radar by many of the prior's sigmas, that heading was wrong, and camera-lidar
@@ -58,7 +58,7 @@ def heading_failures(
         limits: from where on the heading is wrong, and what share of `limit_rad` that may cost; None = the
             defaults.
     """
-    limits = limits or VerdictLimits()
+    limits = limits or ChecksConfig()
     if not {"camera_lidar", "lidar_radar"} <= solution.pairs.keys():
         return []
     dt_s, expected_s = (

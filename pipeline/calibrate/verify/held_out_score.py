@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.calibrate.joint.camera_radar import camera_radar_cost
 from pipeline.calibrate.numerics.bias_floors import (
     FOCAL_SIGMA,
     HELD_OUT_BIAS,
@@ -38,7 +37,11 @@ from pipeline.objective.camera_lidar.score import (
     lidar_velocities,
     prepare_terms,
 )
-from pipeline.objective.radar.moving_clusters import azimuth_equations_camera, moving_clusters
+from pipeline.objective.radar.moving_clusters import (
+    azimuth_equations_camera,
+    camera_radar_cost,
+    moving_clusters,
+)
 from pipeline.objective.radar.registration import (
     RegistrationFrames,
     normal_equations,

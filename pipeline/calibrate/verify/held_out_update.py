@@ -1,7 +1,7 @@
 """An innovation test on frames that took no part in the fit: how far they would move the result, and how surely.
 
-That held-out frames align better at the result than at a prior two degrees off says little of the result.
-Where their own optimum lies says much: it must be near the result, by the sigmas of both. So the result, with
+If held-out frames align better at the result than at a prior two degrees off, that proves little.
+Their own optimum proves more: it must be near the result, by the sigmas of both. So the result, with
 its covariance, is taken as the prior of a Kalman update by the held-out frames. Their scores are sums of log
 likelihoods of points that err together within a scene, so their information is too large: it is divided by
 the ratio of the gradients' scatter over scenes to that information.
@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import ndtr, stdtrit
 
-from pipeline.calibrate.verify.limits import VerdictLimits
+from pipeline.config import ChecksConfig
 
 __all__ = ["FrameDerivatives", "HeldOutUpdate", "held_out_update"]
 
@@ -57,7 +57,7 @@ def held_out_update(
     covariance: Float[np.ndarray, "P P"],
     bias: Float[np.ndarray, " P"],
     blocks: Int[np.ndarray, " F"],
-    limits: VerdictLimits | None = None,
+    limits: ChecksConfig | None = None,
 ) -> HeldOutUpdate | None:
     """Update the result by the held-out frames.
 
@@ -70,7 +70,7 @@ def held_out_update(
     Returns:
         None where fewer than `min_held_out_blocks` blocks have a gradient.
     """
-    limits = limits or VerdictLimits()
+    limits = limits or ChecksConfig()
     prior = np.linalg.inv(covariance)
     x, J, inflation, count = np.zeros(len(bias)), np.zeros_like(covariance), 1.0, 0
     for width in _SCHEDULE.widths:

@@ -1,4 +1,4 @@
-"""How surely a record knows the mounting, beside where things appear: covariances of the two, one out of the other.
+"""Covariance of the mounting pose, from that of the projection, and the reverse.
 
 A principal point wrong by d pixels is, but for second order, a camera turned by d / f. No alignment tells the
 two apart, and whoever projects with the same CameraInfo gets the right pixel all the same: through

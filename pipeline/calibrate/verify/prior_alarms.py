@@ -14,7 +14,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipeline.calibrate.verify.limits import VerdictLimits
+from pipeline.config import ChecksConfig
 from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.estimates import PairEstimate, Prior
 from pipeline.geometry.changes import change_between, change_covariance, change_jacobian
@@ -37,7 +37,7 @@ _LIDAR_PAIRS = ("camera_lidar", "lidar_radar")
 
 
 def prior_alarms(
-    pairs: Mapping[str, PairEstimate], prior: Prior, limits: VerdictLimits
+    pairs: Mapping[str, PairEstimate], prior: Prior, limits: ChecksConfig
 ) -> dict[str, list[FailedCheck]]:
     """Positions left at the prior that the day's data contradict."""
     sigma_m = f"{prior.translation_sigma_m:g}"
@@ -62,7 +62,7 @@ def _own_positions(estimate: PairEstimate) -> dict[int, tuple[float, float]]:
     return {k: (d[f"{name}_m"], d[f"{name}_sigma_m"]) for k, name in keys.items() if f"{name}_m" in d}
 
 
-def _is_far(estimate: PairEstimate, k: int, prior: Prior, limits: VerdictLimits) -> bool:
+def _is_far(estimate: PairEstimate, k: int, prior: Prior, limits: ChecksConfig) -> bool:
     """Whether the day's position is many sigmas (prior and day) off."""
     z = [estimate.diagnostics[n] for n in ("own_z_prior", "own_z_beyond") if n in estimate.diagnostics]
     shift, own = _own_positions(estimate)[k]
@@ -72,7 +72,7 @@ def _is_far(estimate: PairEstimate, k: int, prior: Prior, limits: VerdictLimits)
 
 
 def clock_alarms(
-    pairs: Mapping[str, PairEstimate], sigma_s: float, limits: VerdictLimits
+    pairs: Mapping[str, PairEstimate], sigma_s: float, limits: ChecksConfig
 ) -> dict[str, list[FailedCheck]]:
     """Time offsets beyond `time_offset_sigma_s`, estimated or at the end of the search range."""
     out = {}
@@ -95,7 +95,7 @@ def clock_alarms(
 
 
 def edge_alarms(
-    pairs: Mapping[str, PairEstimate], prior: Prior, limits: VerdictLimits
+    pairs: Mapping[str, PairEstimate], prior: Prior, limits: ChecksConfig
 ) -> dict[str, list[FailedCheck]]:
     """Camera-lidar or lidar-radar, where the other one contradicts the lidar's mounting and this one rests on it."""
     out = {}
@@ -115,7 +115,7 @@ def edge_alarms(
     return out
 
 
-def _contradicted(estimate: PairEstimate, prior: Prior, limits: VerdictLimits) -> Float[np.ndarray, " 6"]:
+def _contradicted(estimate: PairEstimate, prior: Prior, limits: ChecksConfig) -> Float[np.ndarray, " 6"]:
     """The change from the prior if it is many sigmas; else 0."""
     step = change_between(prior.of(estimate.pair), estimate.T)
     far = limits.max_move_prior_sigmas * np.sqrt(np.diag(prior.covariance(estimate.pair)))
@@ -132,9 +132,9 @@ def _kept(resting: PairEstimate, hidden: Float[np.ndarray, " 6"]) -> Bool[np.nda
 
 
 def _rests_on(
-    resting: PairEstimate, prior: Prior, hidden: Float[np.ndarray, " 6"], limits: VerdictLimits
+    resting: PairEstimate, prior: Prior, hidden: Float[np.ndarray, " 6"], limits: ChecksConfig
 ) -> bool:
-    """Whether the prior's error would move targets by more than their sigma, and nothing in this pair denies it."""
+    """Whether an error of the prior would move targets by more than their sigma, and the pair does not measure it."""
     far = limits.max_move_prior_sigmas * np.sqrt(np.diag(prior.covariance(resting.pair)))
     own = change_between(prior.of(resting.pair), resting.T)
     sigma = np.sqrt(np.diag(change_covariance(resting.T, resting.covariance)))

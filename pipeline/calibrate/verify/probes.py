@@ -1,4 +1,4 @@
-"""What held-out frames say of known turns of the result: whether they would confirm it against such a prior.
+"""Held-out frames at known turns of the result: would they confirm the result against a prior turned like that?
 
 A record that lies many sigmas from its prior is held unless held-out frames align better at the result than at
 the prior. Whoever asks how large an error of the prior would be shown needs this answer for errors that the

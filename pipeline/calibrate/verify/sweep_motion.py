@@ -2,7 +2,7 @@
 
 What stands in one sweep is moved along an arc until it meets what stands in another, half a second later: all speeds
 and yaw rates of a car are tried on a grid, so there is no start to be wrong about. Rails and walls meet themselves at
-any speed; a pair whose best arc is hardly better than others far away says nothing.
+any speed; a pair whose best arc is hardly better than others far away is not used.
 
 Source: Olson 2009, "Real-time correlative scan matching" (here with one arc for three unknowns).
 """
@@ -87,7 +87,7 @@ def _motion(before: Observation, after: Observation) -> tuple[float, float] | No
 
 
 def _arcs(yaw_rad: Float[np.ndarray, " W"], way_m: Float[np.ndarray, " V"]) -> Float[np.ndarray, "W*V 3"]:
-    """Yaw, x and y at the ends of all arcs of so much turn and way: the chord is as short as a circle makes it."""
+    """Yaw, x and y at the ends of circular arcs, for all combinations of turn and arc length."""
     yaw, way = (a.ravel() for a in np.meshgrid(yaw_rad, way_m, indexing="ij"))
     chord = way * np.sinc(yaw / (2 * np.pi))
     return np.stack([yaw, chord * np.cos(yaw / 2), chord * np.sin(yaw / 2)], 1)

@@ -5,7 +5,7 @@ see (`seen_targets.py`) are linear in the pose, so its covariance gives their si
 every degree of freedom that the day left to the prior. A direction is certified where its error stays, by that sigma,
 within the limit of `[verify]` with the probability asked for there.
 
-Held-out frames can contradict a claim and never sharpen it. The pose does not move by what they say, and where the fit
+Held-out frames can contradict a claim and never sharpen it. They do not move the pose, and where the fit
 called a direction undetermined their curvature once certified it all the same: a radar that repeats one scan all day
 was .55 deg off at a sigma of 1.19 deg, accepted. Nor do they know better on good days. The real car's forward shift
 stays where the prior has it, for it moves points as the clock does; held-out frames call it known, for their update
@@ -23,7 +23,7 @@ from scipy.optimize import brentq
 from scipy.special import ndtr, ndtri
 
 from pipeline.calibrate.verify.held_out_update import HeldOutUpdate
-from pipeline.calibrate.verify.limits import VerdictLimits
+from pipeline.config import ChecksConfig
 from pipeline.geometry.target_sigmas import target_jacobian, target_sigmas
 from pipeline.geometry.targets import DEFAULT_TARGETS
 
@@ -42,7 +42,7 @@ class Claim:
     remaining_sigma_rad: float  # of the estimate if held-out frames were to update it: for diagnostics
     limit_rad: float  # largest error that the purpose allows
     confidence: float  # probability with which the error must stay within the limit
-    contradiction_sigmas: float = VerdictLimits.held_out_contradiction_sigmas
+    contradiction_sigmas: float = ChecksConfig().held_out_contradiction_sigmas
     mounting_sigma_rad: float = np.inf  # of the estimate as the pose of what is mounted: see `mounting.py`
 
     @property
@@ -93,7 +93,7 @@ def claims_of(
     update: HeldOutUpdate | None,
     limit_rad: float,
     confidence: float,
-    contradiction_sigmas: float = VerdictLimits.held_out_contradiction_sigmas,
+    contradiction_sigmas: float = ChecksConfig().held_out_contradiction_sigmas,
     elevation_limit_rad: float | None = None,
     mounting: Float[np.ndarray, "6 6"] | None = None,
     targets: Float[np.ndarray, "N 3"] = DEFAULT_TARGETS,
@@ -104,12 +104,12 @@ def claims_of(
         pair: which one.
         T: the estimate.
         covariance: of its left perturbation.
-        update: of the estimate by held-out frames; None where they say nothing.
+        update: of the estimate by held-out frames; None if they do not determine one.
         limit_rad: largest error that the purpose allows.
         confidence: probability with which an error has to stay within it.
         contradiction_sigmas: sigmas of the shift from which held-out frames contradict the estimate.
         elevation_limit_rad: for elevation, where it differs from azimuth's.
-        mounting: covariance of the estimate as the pose of what is mounted; None where nobody knows it.
+        mounting: covariance of the estimate as the pose of what is mounted; None if unknown.
         targets: in the child's frame, where both sensors see them.
     """
     limits_rad = (limit_rad, limit_rad if elevation_limit_rad is None else elevation_limit_rad)

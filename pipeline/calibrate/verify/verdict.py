@@ -16,8 +16,8 @@ import numpy as np
 from pipeline.calibrate.numerics.search_range import SearchRange
 from pipeline.calibrate.select.frames import SHORTEST
 from pipeline.calibrate.verify.held_out_test import HeldOutTest
-from pipeline.calibrate.verify.limits import UNCHECKED_MOVE_SIGMAS, VerdictLimits
 from pipeline.calibrate.verify.target_accuracy import Claim
+from pipeline.config import ChecksConfig
 from pipeline.extrinsics.checks import FailedCheck, faults_of
 from pipeline.extrinsics.estimates import PairEstimate, Prior
 from pipeline.geometry.changes import change_between, change_covariance
@@ -37,12 +37,15 @@ _SCORED = {
     "camera_radar": np.array([False, True, False, False, False, False]),
     "lidar_radar": np.array([False, False, True, True, True, False]),
 }
-# What nothing vouches for where elevation is not certified, by index.
+# Degrees of freedom that are unchecked where elevation is not certified, by index.
 _UNCHECKED = {
     "camera_lidar": {},
     "camera_radar": {0: "pitch", 2: "roll"},
     "lidar_radar": {0: "roll", 1: "pitch", 5: "height"},
 }
+# Own sigmas from which a move that is unchecked is named: chance causes it once in 370 records. The prior's sigma is no
+# excuse: whoever loads the result replaces the prior by it.
+_UNCHECKED_MOVE_SIGMAS = 3.0
 _FAILED = -1.0  # margin of a check that yields no number
 
 
@@ -90,7 +93,7 @@ def judge(
     prior: Prior,
     evidence: Evidence,
     search: SearchRange,
-    limits: VerdictLimits,
+    limits: ChecksConfig,
     *,
     triggered: bool = True,
     together: bool = False,
@@ -104,7 +107,7 @@ def judge(
         search: how far from the prior the solver looked.
         limits: thresholds.
         triggered: False where no trigger asked for this pair, so that it was not estimated.
-        together: whether other pairs have a say in the pose. How far the pair moved is checked where each of them was
+        together: whether other pairs take part in the pose. How far the pair moved is checked where each of them was
             judged apart, and it need not align better on its own held-out frames; but it may not align worse, nor may
             they contradict it.
     """
@@ -146,7 +149,7 @@ def judge(
 
 
 def _moves_little(
-    estimate: PairEstimate, prior: Prior, search: SearchRange, limits: VerdictLimits
+    estimate: PairEstimate, prior: Prior, search: SearchRange, limits: ChecksConfig
 ) -> list[_Check]:
     """Within the search range, and within the prior's sigmas."""
     step = change_between(prior.of(estimate.pair), estimate.T)
@@ -177,7 +180,7 @@ def _moves_little(
 
 
 def _aligns_better(
-    estimate: PairEstimate, prior: Prior, test: HeldOutTest | None, limits: VerdictLimits
+    estimate: PairEstimate, prior: Prior, test: HeldOutTest | None, limits: ChecksConfig
 ) -> _Check:
     """Held-out frames align better than at the prior, or as well where the result agrees with the prior."""
     if test is None or test.frames < limits.min_held_out_frames:
@@ -200,7 +203,7 @@ def _aligns_better(
 
 
 def _aligns_no_worse(
-    estimate: PairEstimate, prior: Prior, test: HeldOutTest | None, limits: VerdictLimits
+    estimate: PairEstimate, prior: Prior, test: HeldOutTest | None, limits: ChecksConfig
 ) -> list[_Check]:
     """If other pairs take part in the pose: no worse than a prior that the result contradicts."""
     if test is None:
@@ -211,7 +214,7 @@ def _aligns_no_worse(
 
 
 def _largest_move(estimate: PairEstimate, prior: Prior) -> tuple[str, float]:
-    """Of the degrees of freedom that held-out frames score, the one that moved most, in sigmas of the result."""
+    """Largest move of a degree of freedom that held-out frames score, in sigmas of the result."""
     ratio = np.where(_SCORED[estimate.pair], _moves(estimate, prior), 0.0)
     worst = int(np.argmax(ratio))
     return DOF_NAMES[worst], float(ratio[worst])
@@ -232,7 +235,7 @@ def _unchecked(estimate: PairEstimate, prior: Prior, certified: Sequence[str]) -
     if "elevation" in certified:
         return {}
     moves = _moves(estimate, prior)
-    return {k: float(moves[k]) for k in _UNCHECKED[estimate.pair] if moves[k] > UNCHECKED_MOVE_SIGMAS}
+    return {k: float(moves[k]) for k in _UNCHECKED[estimate.pair] if moves[k] > _UNCHECKED_MOVE_SIGMAS}
 
 
 def _worse(test: HeldOutTest) -> str:

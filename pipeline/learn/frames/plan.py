@@ -12,7 +12,7 @@ from pipeline.errors import ConfigError
 from pipeline.learn.frames.facts import to_json
 from pipeline.learn.frames.frame import Place
 from pipeline.learn.frames.output import Output
-from pipeline.learn.prepare.decided import SPLIT_SETTINGS, decided_sides
+from pipeline.learn.prepare.decided import decided_sides, split_settings
 from pipeline.learn.prepare.sides import frame_sides, settled_keys
 from pipeline.learn.prepare.survey import plan_days, survey_day
 from pipeline.results import Progress
@@ -22,6 +22,7 @@ from schemas.training import SPLITS
 __all__ = ["Planned", "plan_frames"]
 
 _FILE = "plan.json"
+_KEYS = {"split_by": "[prepare.split] by", "seed": "[prepare] seed"}  # in fleet.toml, of `split_settings`
 Planned = dict[Partition, tuple[list[Place], Counter[str]]]  # wanted frames, and those left out by reason
 
 
@@ -52,7 +53,7 @@ def plan_frames(
         decided = {(kind, value): side for kind, value, side in before["sides"]}
         first = before["first"]
     else:
-        config = config.model_copy(update={"split_by": settled_keys(surveys, config, lake)})
+        config = config.split_with(by=settled_keys(surveys, config, lake))
         decided = decided_sides(lake, config)
     plan = plan_days(surveys, config, decided)
     following = max((number + count for number, count in first.values()), default=0)
@@ -81,11 +82,15 @@ def plan_frames(
 
 def _as_begun(config: PrepareConfig, settings: Mapping[str, Any], begun: Mapping[str, Any]) -> PrepareConfig:
     """The configuration with the keys of the export that was begun; ConfigError if anything else differs."""
-    if "split_by" not in config.model_fields_set:
-        config = config.model_copy(update={"split_by": tuple(begun["split"]["split_by"])})
+    if "by" not in config.split.model_fields_set:
+        config = config.split_with(by=tuple(begun["split"]["split_by"]))
     now = _with_split(settings, config)
     changed = [n for n in settings if begun.get(n) != now[n]]
-    changed += [f"[prepare] {n}" for n in SPLIT_SETTINGS if begun["split"][n] != now["split"][n]]
+    changed += [
+        _KEYS.get(n, f"[prepare.split] {n}")
+        for n, value in now["split"].items()
+        if begun["split"][n] != value
+    ]
     if changed:
         raise ConfigError("command line", "out", f"holds an export with another {', '.join(changed)}")
     return config
@@ -93,19 +98,18 @@ def _as_begun(config: PrepareConfig, settings: Mapping[str, Any], begun: Mapping
 
 def _with_split(settings: Mapping[str, Any], config: PrepareConfig) -> dict[str, Any]:
     """The settings with those by which places get their names: other places of the same name would leak."""
-    split = {name: getattr(config, name) for name in SPLIT_SETTINGS}
-    whole: dict[str, Any] = json.loads(to_json({**settings, "split": split}))
+    whole: dict[str, Any] = json.loads(to_json({**settings, "split": split_settings(config)}))
     return whole
 
 
 def _require_splits(config: PrepareConfig, planned: Planned) -> None:
     """Raise ConfigError if a requested split has no frame."""
     counts = Counter(place.split for places, _ in planned.values() for place in places)
-    shares = dict(zip(SPLITS, (1.0, config.val_fraction, config.test_fraction), strict=True))
+    shares = dict(zip(SPLITS, (1.0, config.split.val_fraction, config.split.test_fraction), strict=True))
     empty = [side for side, share in shares.items() if share > 0 and not counts[side]]
     if empty:
         problem = (
             f"no frames for {', '.join(empty)}: too few vehicles, days and places to keep splits apart by "
-            f'{", ".join(config.split_by)}; set split_by = "place", or export with --unsplit: all into train'
+            f'{", ".join(config.split.by)}; set by = "place", or export with --unsplit: all into train'
         )
-        raise ConfigError("fleet.toml", "prepare.split_by", problem)
+        raise ConfigError("fleet.toml", "prepare.split.by", problem)

@@ -104,7 +104,7 @@ def day_estimate(
     """Transform and covariance of a pair from the prior and all answers.
 
     Args:
-        unobservable: degrees of freedom that the sensors cannot tell, whatever the network answers: those of
+        unobservable: degrees of freedom that the sensors do not determine, whatever the network answers: those of
             elevation with a radar that measures none.
     """
     S = _bearing_of_twist(answers.T_centre)

@@ -20,7 +20,7 @@ __all__ = ["JOINT_BIAS_SIGMA", "JointDay", "fitted_day"]
 _ROUNDS, _CONVERGED_RAD = 3, np.radians(0.1)  # of choosing points anew where the fit has turned
 _CLEAR_SIGMAS = 3.0  # by which frames must prefer the fit to the best other place
 # Sigma of what all frames err by alike, (bearing rotation [rad], translation [m]) in the camera's frame: chosen by how
-# far days of several rigs err beyond what they tell. Ahead they err by 0.1 m, to one side: labels reach beyond their
+# far days of several rigs err beyond their sigma. Ahead they err by 0.1 m, to one side: labels reach beyond their
 # things. How far kinds of evidence disagree on a day was tried in its place: in the valleys of few scenes it explodes.
 JOINT_BIAS_SIGMA = np.array([*np.radians([0.05, 0.03, 0.1]), 0.015, 0.015, 0.15])
 

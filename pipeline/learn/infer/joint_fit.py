@@ -31,7 +31,7 @@ _STEP = np.array([0.0035] * 3 + [0.05] * 3)
 _FIRST_WORTH = 30.0  # of a frame's mean log-likelihood, before the day tells it
 _LEAST_CURVED = 0.02  # of the greatest curvature: flatter directions do not tell what the sum is worth
 _CLIMB = 60  # steps at most
-_VOTERS = 40  # frames that tell candidates apart
+_VOTERS = 40  # frames for the comparison of candidates
 APART_RAD = np.radians(0.5)  # a candidate farther away may lie on another peak
 
 

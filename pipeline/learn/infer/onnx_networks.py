@@ -177,5 +177,6 @@ def _prepare_for(grid: Grid, config: PrepareConfig) -> PrepareConfig:
         return 16 * math.ceil(2 * half_deg / grid.cell_deg / 16 - 1e-9) * grid.cell_deg
 
     tallest = max(abs(grid.top_deg), abs(grid.bottom_deg))
-    sides = {"grid_width_deg": side_deg(grid.left_deg), "grid_height_deg": side_deg(tallest)}
-    return config.model_copy(update={"grid_step_deg": grid.cell_deg, **sides})
+    sides = {"width_deg": side_deg(grid.left_deg), "height_deg": side_deg(tallest)}
+    own = config.grid.model_copy(update={"step_deg": grid.cell_deg, **sides})
+    return config.model_copy(update={"grid": own})

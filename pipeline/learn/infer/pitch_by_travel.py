@@ -1,14 +1,15 @@
-"""The car's way as a second witness of the radar's pitch: networks match detections, which may point wrong.
+"""A second measurement of the radar's pitch, from the direction of travel.
 
-A network finds the radar's elevation by where detections lie among the lidar's objects. With a radar whose elevations
-are noisier than scenes are tall that is off by a degree and more, alike in every frame, and no averaging shows it. The
-velocity by Doppler and the road (`pipeline.objective.radar.travel`) need no match. What the radar sees too low turns it
-too, and a day's sigma holds that. So a day's answer is updated by the way's, by information. Where the two are farther
-apart than their sigmas allow, the network gives way: its part of the pitch is weighed as Cauchy's distribution has it,
-the way's is not. That asymmetry is deliberate. The way's sigma comes from this day's own frames, the network's bias
-from vehicles that it was judged on before.
+A network finds the radar's elevation by matching detections with the lidar's objects. If elevations are noisier than
+scenes are tall, its answer is wrong by a degree or more, equally in all frames, so averaging does not help. The
+direction of travel needs no match: Doppler gives the velocity in radar axes, and the road gives the direction of the
+velocity (`pipeline.objective.radar.travel`). Reflections from below the road bias it; its sigma includes that.
 
-Only the radar's turn about one axis is updated, its position stays; all else is considered (Schmidt 1966).
+The network's answer for a day is fused with this measurement by their covariances. If the two differ by more than
+their sigmas allow, the network's variance is increased (Cauchy weights) and the measurement's is not: its sigma comes
+from this day's frames, the network's from other vehicles.
+
+Only the rotation about one axis changes; all other unknowns enter as considered parameters (Schmidt 1966).
 """
 
 from __future__ import annotations
@@ -34,39 +35,39 @@ from schemas.observations import Observation
 
 __all__ = ["WayTurn", "informed_by_way", "updated_by_way", "way_turn"]
 
-# What ways differ by beyond the sigma of their scan: 0.3 to 0.6 deg on four simulated tuning days (3 on a log of
-# the real car).
+# Scatter of the measurement between frames, beyond the sigma of a scan: 0.3 to 0.6 deg on four simulated tuning days
+# (3 on a log of the real car).
 _FRAME_SCATTER_RAD = np.radians(0.6)
 _STEPS = 12  # of the robust mean; it gains a digit in two
 _ROUNDS = 30  # of re-weighting the network
-_CAUCHY = 2.0  # sigmas, as for the way's own frames
-_CONTRADICTION_SIGMAS = 2.0  # as between the witnesses of method `joint`
-_LEAST_SHARE = 0.7  # of a degree of freedom's axis in the turn, for the way to have determined it
+_CAUCHY = 2.0  # sigmas, as for the frames of the measurement
+_CONTRADICTION_SIGMAS = 2.0  # as between the sources of method `joint`
+_LEAST_SHARE = 0.7  # of the axis along a degree of freedom, above which the measurement determines it
 
 
 @dataclass(frozen=True, eq=False)
 class WayTurn:
-    """Which turn about an axis of the parent's frame the way asks for; about other axes it says nothing."""
+    """Measured rotation of the radar about one axis of the parent's frame; other axes are not measured."""
 
     axis: Float[np.ndarray, " 3"]  # unit vector
-    turn_rad: float  # from the pose that was asked about
-    variance: float  # of this day's frames, without the floor
-    floor: float  # variance of what all frames err by alike
+    turn_rad: float  # relative to the pose at which it was measured
+    variance: float  # from the scatter of this day's frames, without the floor
+    floor: float  # variance of the error that all frames have in common
     frames: int
 
     @property
     def sigma_rad(self) -> float:
-        """Of the turn, all included."""
+        """Sigma of the rotation, floor included."""
         return float(np.sqrt(self.variance + self.floor))
 
 
 def informed_by_way(solution: Solution, observations: Sequence[Observation], prior: Prior) -> Solution:
-    """The solution with what the car's way says of the radar's pitch, in the pairs that have frames.
+    """The solution with the radar's pitch fused with the direction of travel, in the pairs that have frames.
 
     Args:
-        solution: by networks; camera_radar is told by way of its camera_lidar, of a day and not of one frame.
-        observations: the frames that it rests on, or others of the day.
-        prior: what the shares of observability refer to.
+        solution: by networks; camera_radar is updated through camera_lidar, for a day and not for one frame.
+        observations: the frames of the solution, or others of the day.
+        prior: for the observability, which compares the covariance with the prior's.
     """
     lidar_radar, camera_lidar = solution.pairs["lidar_radar"], solution.pairs["camera_lidar"]
     way = way_turn(observations, lidar_radar.T)
@@ -88,9 +89,9 @@ def informed_by_way(solution: Solution, observations: Sequence[Observation], pri
 
 
 def way_turn(observations: Sequence[Observation], T_lidar_radar: Float[np.ndarray, "4 4"]) -> WayTurn | None:
-    """What a day's way says of a pose; None where too few frames show it.
+    """Rotation that the direction of travel measures at a pose; None if too few frames show it.
 
-    The variance is that of the robust mean, no less than what differences between drives give. A single frame shows no
+    The variance is that of the robust mean, at least that from differences between drives. A single frame has no
     scatter and gets the usual one.
     """
     travel = travel_directions(observations, T_lidar_radar, 0.0)
@@ -118,7 +119,7 @@ def way_turn(observations: Sequence[Observation], T_lidar_radar: Float[np.ndarra
 
 
 def _floor(observations: Sequence[Observation], T_lidar_radar: Float[np.ndarray, "4 4"]) -> float:
-    """Variance that what is seen too low leaves, at the pose that the way asks for."""
+    """Variance of the bias by detections below the road, at the measured pose."""
     travel = travel_directions(observations, T_lidar_radar, 0.0)
     heights = displaced_heights(observations, T_lidar_radar, 0.0, np.random.default_rng(0))
     share = 0.0 if heights is None or not travel.count else heights.seen_low(travel.below)
@@ -137,11 +138,11 @@ def _frame_turn(travel: TravelDirections, T_lidar_radar: Float[np.ndarray, "4 4"
 def updated_by_way(
     estimate: PairEstimate, way: WayTurn, prior_covariance: Float[np.ndarray, "6 6"]
 ) -> PairEstimate:
-    """The estimate turned towards the way about its axis and the child's origin, with covariance and what it shares."""
+    """The estimate fused with the measurement: pose turned about the child's origin, covariance, common covariance."""
     row = np.append(way.axis, np.zeros(3))
     direction = np.append(way.axis, np.cross(estimate.T[:3, 3], way.axis))
     own, measured = float(row @ estimate.covariance @ row), way.variance + way.floor
-    # One frame's way is no better than one frame's network: bumps, bridges, passing trucks.
+    # In one frame the measurement is no better than the network: bumps, bridges, passing trucks.
     doubt = _doubt(way.turn_rad, own, measured) if way.frames > 1 else 0.0
     gain = (own + doubt) / (own + doubt + measured)
     step, keep = gain * direction, np.eye(6) - gain * np.outer(direction, row)
@@ -174,7 +175,7 @@ def updated_by_way(
 
 
 def _doubt(turn_rad: float, own: float, measured: float) -> float:
-    """Variance that is added to the network's, so that it counts as Cauchy's distribution lets it."""
+    """Variance to add to the network's so that its residual has the weight of a Cauchy distribution."""
     doubt = (turn_rad / _CAUCHY) ** 2
     for _ in range(_ROUNDS):
         moved = turn_rad * (own + doubt) / (own + doubt + measured)
@@ -185,7 +186,7 @@ def _doubt(turn_rad: float, own: float, measured: float) -> float:
 def _seen_by_camera(
     way: WayTurn, camera_lidar: PairEstimate, T_lidar_radar: np.ndarray, T_camera_radar: np.ndarray
 ) -> WayTurn:
-    """The same way, asked about camera_radar: camera_lidar's own error about the axis is added."""
+    """The measurement for camera_radar: through camera_lidar, whose variance about the axis is added."""
     axis = camera_lidar.T[:3, :3] @ way.axis
     wanted = camera_lidar.T @ _turned(T_lidar_radar, way.turn_rad * way.axis)
     turn_rad = float(axis @ log_se3(wanted @ inverse(T_camera_radar))[:3])
@@ -202,7 +203,7 @@ def _turned(T: Float[np.ndarray, "4 4"], omega: Float[np.ndarray, " 3"]) -> Floa
 
 def _sentence(way: WayTurn, sigmas: float) -> str:
     return (
-        f"the car's way (Doppler against the road, {way.frames} frames) lies {np.degrees(way.turn_rad):+.2f} +- "
-        f"{np.degrees(way.sigma_rad):.2f} deg of pitch from what the network matches, {abs(sigmas):.1f} sigmas: "
-        "the way counts, and the network as far as it does not contradict it"
+        f"the direction of travel (Doppler, road, {way.frames} frames) differs by {np.degrees(way.turn_rad):+.2f} +- "
+        f"{np.degrees(way.sigma_rad):.2f} deg of pitch from the network's answer, {abs(sigmas):.1f} sigmas: "
+        "the network's answer has less weight"
     )

@@ -28,7 +28,7 @@ __all__ = ["single_frame_solution", "solve_by_networks"]
 
 # Guesses are scattered by this much (standard deviation per axis): several times the scatter of one frame's answers.
 _SCATTER_RAD, _SCATTER_M = np.radians(0.4), 0.03
-_PILOT_FRAMES = 24  # on which the guess is iterated before all frames are asked about
+_PILOT_FRAMES = 24  # on which the guess is iterated before all frames are used
 _PILOT_ROUNDS, _CONVERGED_RAD = 3, np.radians(0.3)
 _MIN_FRAMES, _MAX_FRAMES = 8, 160
 _BLOCKS = 8  # of the bootstrap, at least
@@ -115,7 +115,9 @@ def single_frame_solution(
         pair: _estimate(pair, replace(found[pair], ends=twists_about(centre[pair], ends[pair])), asked, rng)
         for pair in PAIRS
     }
-    if not estimates["camera_lidar"].observable.any():  # the picture cannot tell: nor can it about the radar
+    if not estimates[
+        "camera_lidar"
+    ].observable.any():  # the picture does not determine it, so nor the radar's pose
         estimates["camera_radar"] = PairEstimate.at_prior("camera_radar", prior)
     return Solution(method, estimates)
 

@@ -224,7 +224,7 @@ class ClassMatcher(nn.Module):
 
 
 def _sums(groups: Tensor, points: Tensor) -> Tensor:
-    """B G 5: of directions, inverse ranges and weights over each group."""
+    """Sums over each group of directions (3), inverse ranges and weights: B G 5."""
     inverse = 1 / points.norm(dim=-1, keepdim=True).clamp(min=0.5)
     return groups @ torch.cat([points * inverse, inverse, torch.ones_like(inverse)], -1)
 

@@ -146,7 +146,7 @@ class OccupancyMatcher(nn.Module):
     def _tilt(
         self, logits: Tensor, azimuth: Tensor, weight: Tensor, total: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Pitch surface, elevation shift ahead and roll: sectors of azimuth vote together."""
+        """Score over pitch, elevation shift ahead and roll, from the scores of sectors of azimuth."""
         edges = torch.tensor([-3.2, -10 * np.pi / 180, 10 * np.pi / 180, 3.2], device=logits.device)
         member = torch.stack(
             [

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from pipeline.config import PrepareConfig, config_hash
 from pipeline.store.partitions import Lake
 from pipeline.store.tables import read_manifest
 from schemas.training import TRAINING
 
-__all__ = ["SPLIT_SETTINGS", "decided_sides", "split_rule"]
+__all__ = ["decided_sides", "split_rule", "split_settings"]
 
-# By which places get their names and keys their sides.
-SPLIT_SETTINGS = ("split_by", "val_fraction", "test_fraction", "positions", "place_m", "place_s", "seed")
+_OF_SPLIT = ("val_fraction", "test_fraction", "positions", "place_m", "place_s")
 
 
 def decided_sides(lake: Lake, config: PrepareConfig) -> dict[tuple[str, str], str]:
@@ -28,5 +29,11 @@ def decided_sides(lake: Lake, config: PrepareConfig) -> dict[tuple[str, str], st
 
 
 def split_rule(config: PrepareConfig) -> str:
-    """A hash of the settings by which places get their names and keys their sides."""
-    return config_hash({name: getattr(config, name) for name in SPLIT_SETTINGS})
+    """Hash of `split_settings`."""
+    return config_hash(split_settings(config))
+
+
+def split_settings(config: PrepareConfig) -> dict[str, Any]:
+    """Settings that determine the names of places and the sides of keys, by the names that lakes store."""
+    split = {name: getattr(config.split, name) for name in _OF_SPLIT}
+    return {"split_by": config.split.by, **split, "seed": config.seed}

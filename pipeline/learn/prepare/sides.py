@@ -53,7 +53,7 @@ def price_choices(surveys: Sequence[Survey], plan: SplitPlan, config: PrepareCon
     out = []
     for way in ways:
         chosen = way == tuple(plan.by)
-        settings = config if chosen else config.model_copy(update={"split_by": way})
+        settings = config if chosen else config.split_with(by=way)
         out.append(_price(surveys, plan if chosen else plan_days(surveys, settings, {}), settings, chosen))
     return out
 
@@ -64,13 +64,14 @@ def settled_keys(surveys: Sequence[Survey], config: PrepareConfig, lake: Lake) -
     Little: no side is empty, and at most a fifth of the usable frames is between the sides. Where no choice is
     that cheap, vehicle, day and place.
     """
-    if "split_by" in config.model_fields_set:
-        return config.split_by
-    ways = {way: config.model_copy(update={"split_by": way}) for way in _CHOICES}
+    if "by" in config.split.model_fields_set:
+        return config.split.by
+    ways = {way: config.split_with(by=way) for way in _CHOICES}
     for way, settings in ways.items():
         if decided_sides(lake, settings):
             return way
-    wanted = [s for s, f in zip(SPLITS, (1, config.val_fraction, config.test_fraction), strict=True) if f > 0]
+    shares = (1, config.split.val_fraction, config.split.test_fraction)
+    wanted = [side for side, share in zip(SPLITS, shares, strict=True) if share > 0]
     for way, settings in ways.items():
         price = _price(surveys, plan_days(surveys, settings, {}), settings, True)
         cut = sum(price.lost.get(reason.value, 0) for reason in _BETWEEN)
@@ -87,7 +88,9 @@ def frame_sides(
     sides = np.array([plan.side_of(vehicle, day, place) or "" for place in survey.place])
     reasons = np.full(len(sides), "", object)
     reasons[sides == ""] = SampleReason.SPLIT_CONFLICT.value
-    near = _near_other_side(survey, sides, config.guard_s) | _near_other_place(survey, sides, plan, config)
+    near = _near_other_side(survey, sides, config.split.guard_s) | _near_other_place(
+        survey, sides, plan, config
+    )
     reasons[(reasons == "") & near] = SampleReason.NEXT_TO_OTHER_SPLIT.value
     reasons[~survey.moved] = SampleReason.HARDLY_MOVED.value
     reasons[~survey.perceived] = SampleReason.NOT_PERCEIVED.value
@@ -115,7 +118,7 @@ def _near_other_place(
 ) -> np.ndarray:
     """True where a square of `guard_m` around a frame reaches a cell of another side: also of another pass."""
     near = np.zeros(len(sides), bool)
-    if "place" not in plan.by or not config.guard_m:
+    if "place" not in plan.by or not config.split.guard_m:
         return near
     for i in np.flatnonzero(sides != ""):
         beside = {plan.sides.get(("place", place), sides[i]) for place in survey.reached(int(i), config)}

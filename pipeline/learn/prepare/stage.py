@@ -45,7 +45,7 @@ def work(task: Task) -> Work:
     extra = {
         "split_rule": split_rule(config),
         "sides": _sides_given(survey, plan),
-        "grid": {"step_deg": config.grid_step_deg, "shape": list(config.grid_shape)},
+        "grid": {"step_deg": config.grid.step_deg, "shape": list(config.grid.shape)},
         SAMPLED: chosen,
     }
 

@@ -41,12 +41,12 @@ class Survey:
 
     def reached(self, frame: int, config: PrepareConfig) -> set[str]:
         """Places that a square of `guard_m` around a frame reaches, its own among them."""
-        x, y, half = self.x_m[frame], self.y_m[frame], config.guard_m / 2
+        x, y, half = self.x_m[frame], self.y_m[frame], config.split.guard_m / 2
         if not (np.isfinite(x) and np.isfinite(y)):
             return {self.place[frame]}
         home, colon, _ = self.place[frame].rpartition(":")
         steps = itertools.product((-half, 0.0, half), repeat=2)
-        return {home + colon + _cell_of(x + dx, y + dy, config.place_m) for dx, dy in steps}
+        return {home + colon + _cell_of(x + dx, y + dy, config.split.place_m) for dx, dy in steps}
 
 
 def survey_day(partition: Partition, lake: Lake, config: PrepareConfig) -> Survey:
@@ -86,7 +86,8 @@ def plan_days(
         if usable
     )
     units = [Unit(*key, frames) for key, frames in sorted(counts.items())]
-    return plan_split(units, config.split_by, config.val_fraction, config.test_fraction, config.seed, decided)
+    split = config.split
+    return plan_split(units, split.by, split.val_fraction, split.test_fraction, config.seed, decided)
 
 
 def _cell_of(x_m: float, y_m: float, side_m: float) -> str:
@@ -122,10 +123,10 @@ def _places(
     begin = {int(d): float(stamp[drive == d].min()) for d in np.unique(drive)}
     names = []
     for i in range(len(stamp)):
-        home = "" if config.positions == "map" else f"{partition.vehicle}/{partition.day}/{log[i]}:"
+        home = "" if config.split.positions == "map" else f"{partition.vehicle}/{partition.day}/{log[i]}:"
         if np.isfinite(x[i]) and np.isfinite(y[i]):
-            names.append(home + _cell_of(x[i], y[i], config.place_m))
+            names.append(home + _cell_of(x[i], y[i], config.split.place_m))
         else:
-            stretch = int((stamp[i] - begin[int(drive[i])]) // config.place_s)
+            stretch = int((stamp[i] - begin[int(drive[i])]) // config.split.place_s)
             names.append(f"{partition.vehicle}/{partition.day}/drive {drive[i]}, stretch {stretch}")
     return names

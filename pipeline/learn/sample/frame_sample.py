@@ -80,7 +80,7 @@ def make_row(
 ) -> TrainingRow:
     """The row of one frame, deterministic; raises SampleRejectedError if the frame shows too little."""
     sensors = sensor_row(frame, observation, prior, about, config)
-    grid = stored_grid(config.grid_shape, config.grid_step_deg)
+    grid = stored_grid(config.grid.shape, config.grid.step_deg)
     camera = camera_of(observation)
     features = camera_features(labels_of(observation), camera, grid)
     return replace(
@@ -105,9 +105,9 @@ def sensor_row(
     """
     # One generator per frame: the row does not depend on which frames came before.
     rng = np.random.default_rng([frame.stamp_ns & 0x7FFFFFFFFFFFFFFF, frame.frame_index, config.seed])
-    height, width = config.grid_shape
-    grid = stored_grid((height, width), config.grid_step_deg)
-    small, seen = resample_camera(decode_small(frame, config.grid_step_deg), camera_of(observation), grid)
+    height, width = config.grid.shape
+    grid = stored_grid((height, width), config.grid.step_deg)
+    small, seen = resample_camera(decode_small(frame, config.grid.step_deg), camera_of(observation), grid)
     if seen.mean() < _MIN_SEEN:
         raise SampleRejectedError(SampleReason.NARROW_VIEW)
     lidar = lidar_columns(frame, observation, _view(prior, grid), config, rng)
@@ -120,7 +120,7 @@ def sensor_row(
         drive=frame.drive,
         stamp_ns=frame.stamp_ns,
         fingerprint=fingerprint(small),
-        grid_step_deg=config.grid_step_deg,
+        grid_step_deg=config.grid.step_deg,
         grid_height=height,
         grid_width=width,
         image=small[..., ::-1].transpose(2, 0, 1).reshape(3, -1),  # OpenCV decodes blue first
@@ -203,10 +203,6 @@ def _reference_columns(observation: Observation, prior: Prior) -> dict[str, Any]
         "ego_speed_mps": observation.ego_speed_mps or 0.0,
         "camera_lag_s": (observation.camera_stamp_ns - observation.stamp_ns) * 1e-9,
         "radar_lag_s": (observation.radar_stamp_ns - observation.stamp_ns) * 1e-9,
-        **{
-            name: getattr(observation, name)
-            for name in ("camera_model", "camera_K", "camera_D", "image_width_px", "image_height_px")
-        },
     }
     for pair in ("camera_lidar", "lidar_radar"):
         values = (*to_quaternion(prior.of(pair)), *prior.of(pair)[:3, 3])

@@ -72,7 +72,7 @@ class RunState(Run):
         return (self.step + 1) % self.config.matched_every == 0
 
     def losses(self) -> dict[str, Tensor]:
-        """Of the step's batch, from random guesses."""
+        """Losses of the step's batch, from random guesses."""
         found = batch_loss(
             self.passes, self.stream.batch(), self.config, self.day_means,
             _generator(self.config.seed, self.step, self.processes.rank), self.network,

@@ -28,7 +28,7 @@ from pipeline.objective.camera_lidar.projection_loops import (
 
 __all__ = ["chance_of", "edge_gradients", "edge_residuals", "edge_scores", "fit_match_share"]
 
-_FEWEST_OF_KIND = 40  # fewer tell no share from chance
+_FEWEST_OF_KIND = 40  # fewer do not separate a share from chance
 
 
 def edge_scores(
@@ -341,7 +341,7 @@ def _residual_loop(
 def chance_of(
     residual_px: Float32[np.ndarray, " N"], kind: UInt8[np.ndarray, " N"], kinds: int
 ) -> Float32[np.ndarray, "K B"]:
-    """Density of |r| at random places by kind, smoothed and never 0; the last bin holds "no boundary"."""
+    """Histogram density of |residual_px| at random image positions, per kind; the last bin is "no boundary"."""
     out = np.empty((kinds, CHANCE_BINS), np.float32)
     kernel = np.ones(9) / 9
     for c in range(kinds):

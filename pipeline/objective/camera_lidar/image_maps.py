@@ -214,7 +214,7 @@ def _row_sums(x: np.ndarray) -> np.ndarray:
 
 
 def _over_rows(x: np.ndarray) -> np.ndarray:
-    """Each value of a column and, with falling weight, those about it."""
+    """Gaussian blur along the columns."""
     return cv2.GaussianBlur(x, (1, 25), 0, sigmaY=4.0)
 
 

@@ -2,7 +2,7 @@
 
 A label's border lies half a pixel to two pixels outside of its object. Left and right edges, which are alike in number,
 average that away. Tops and feet are not: on days whose edges are mostly tops of cars it is a pitch. Left and right
-together tell the width, whatever the yaw, and it holds for tops and feet.
+together determine the width, whatever the yaw, and it holds for tops and feet.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def label_width_px(terms: Terms, at: Alignments, kernel: KernelSettings) -> floa
 
 
 def widened(terms: Terms, T_camera_lidar: Float[np.ndarray, "4 4"], width_px: float) -> Terms:
-    """With edges moved away from their foreground by a width [px of the label image], as labels are."""
+    """The terms with edges moved away from their foreground by the width of the labels' margin [label px]."""
     edges = terms.edges
     R = T_camera_lidar[:3, :3]
     range_m = np.linalg.norm(edges.xyz_m @ R.T + T_camera_lidar[:3, 3], axis=1)

@@ -34,7 +34,7 @@ EDGE_KINDS = 4 * (len(_HEIGHTS_M) + 1) * (len(_SIZE_QUANTILES) + 1)
 _CLASS_HEIGHTS_M = (0.25, 1.0, 2.5, 5.0)
 _CLASS_RANGES_M = (12.0, 25.0)
 CLASSES = (len(_CLASS_HEIGHTS_M) + 1) * (len(_CLASS_RANGES_M) + 1)
-_CLASS_STRIDE = 8  # of the sampled cloud: neighbours say the same
+_CLASS_STRIDE = 8  # of the sampled cloud: neighbours are redundant
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +156,7 @@ def _kinds(observations: Sequence[Observation]) -> list[np.ndarray]:
     limits = np.quantile(sizes, _SIZE_QUANTILES) if len(sizes) else np.zeros(len(_SIZE_QUANTILES))
     out = []
     for o in observations:
-        if o.ground_plane is None:  # the middle class says least
+        if o.ground_plane is None:  # the middle class is the least informative
             height = np.full(len(o.lidar_edge_side), np.mean(_HEIGHTS_M))
         else:
             height = o.lidar_edge_xyz_m @ o.ground_plane[:3] + o.ground_plane[3]

@@ -124,7 +124,7 @@ class Terms:
         return replace(self, edges=self.edges.chosen(self.edges.gap_rad <= WIDEST_GAP_RAD))
 
     def in_view(self, T_camera_lidar: Float[np.ndarray, "4 4"], margin_rad: float) -> Terms:
-        """With the edges and markings that a pose puts into the image, or within a margin of it."""
+        """The terms with only the edges and markings that a pose puts into the image, or within a margin of it."""
         bounds = view_bounds(self.maps.camera)
         edges, markings = (
             p.chosen(is_near_view(p.xyz_m, T_camera_lidar, bounds, margin_rad))
@@ -133,7 +133,7 @@ class Terms:
         return replace(self, edges=edges, markings=markings)
 
     def seen_throughout(self, at: Alignments) -> Terms:
-        """With the edges that each of some alignments puts into the image.
+        """The terms with only those edges that are in the image at every one of these alignments.
 
         An edge out of sight scores 0, one in sight more on average, matched or not: rails beside the car
         match anywhere along them. A score over edges that come into sight would therefore be drawn to poses
@@ -147,7 +147,7 @@ class Terms:
         return replace(self, edges=self.edges.chosen(is_seen))
 
     def at_most(self, points: int, rng: np.random.Generator) -> Terms:
-        """With about this many narrow and wide edges, markings, points of classes, at most, drawn at random."""
+        """The terms with at most about `points` of each: narrow edges, wide edges, markings, points of classes."""
         kept = []
         for p, is_wide in ((self.edges, self._is_wide), (self.markings, None), (self.classes, None)):
             group = np.zeros(len(p.xyz_m), np.intp) if is_wide is None else is_wide.astype(np.intp)
@@ -156,7 +156,7 @@ class Terms:
         return replace(self, edges=kept[0], markings=kept[1], classes=kept[2])
 
     def of_frames(self, frames: np.ndarray) -> Terms:
-        """Some of the frames, which look at the same maps."""
+        """The terms of a selection of the frames; maps are shared."""
         return replace(
             self,
             edges=self.edges.of_frames(frames),

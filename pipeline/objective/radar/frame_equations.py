@@ -54,7 +54,7 @@ def robust_equations(
 ) -> tuple[Float[np.ndarray, "F P P"], Float[np.ndarray, "F P"], float]:
     """Per frame, information and gradient of the robust (Cauchy) cost of angles, and the residuals' own sigma [rad].
 
-    Nothing is said, and sigma is NaN, where residuals are too few to show their spread.
+    Equations are zero, and sigma is NaN, where residuals are too few to show their spread.
     """
     if len(residual) < _LEAST_ROWS:
         none = np.zeros(0)

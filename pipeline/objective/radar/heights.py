@@ -64,7 +64,7 @@ _NARROWEST = 0.3  # sigmas: nearer to its image a thing is one with it
 
 @dataclass(frozen=True, eq=False)
 class HeightScores:
-    """What each frame says of the radar's own pitch."""
+    """Normal equations of each frame for the radar's own pitch."""
 
     information: Float[np.ndarray, " D"]
     score: Float[np.ndarray, " D"]  # gradient of the cost; the day's sum is 0
@@ -73,7 +73,7 @@ class HeightScores:
 
 @dataclass(frozen=True, eq=False)
 class Heights:
-    """What static elevations say of the radar's own pitch, at the pose that they were measured with."""
+    """The radar's own pitch from static elevations, at the pose that they were measured with."""
 
     turn_rad: float  # by which they would turn the radar, nose down positive
     T_lidar_radar: Float[np.ndarray, "4 4"]  # before that turn

@@ -25,14 +25,17 @@ from pipeline.rows import columns_of
 from schemas.observations import Observation
 
 __all__ = [
+    "MATCH_RAD",
     "MovingClusters",
     "azimuth_equations_camera",
     "azimuth_equations_lidar",
     "camera_azimuth_residuals",
+    "camera_radar_cost",
     "lidar_azimuth_residuals",
     "moving_clusters",
 ]
 
+MATCH_RAD = np.radians(1.0)  # cluster to box: half a car at 40 m
 _GATE_M = 2.5  # lidar cluster centre to radar cluster centre: half a car, twice
 _APART_M = 1e3
 _LEAST_DETECTIONS = 2
@@ -240,3 +243,39 @@ def _object_centres(o: Observation) -> np.ndarray:
     """Centres of lidar clusters that can be road users."""
     size = np.max(o.lidar_cluster_max_m[:, :2] - o.lidar_cluster_min_m[:, :2], axis=1, initial=0.0)
     return o.lidar_cluster_centre_m[size <= _LARGEST_M].astype(np.float64)
+
+
+def camera_radar_cost(
+    observations: Sequence[Observation], T_camera_radar: Float[np.ndarray, "4 4"]
+) -> Float[np.ndarray, " F"]:
+    """Cost of each held-out frame at a pose: robust azimuth distance of moving clusters to boxes, 0..1.
+
+    Clusters in the camera's view count, those without any box within 3 deg as 1. NaN where a frame has none
+    or no boxes.
+    """
+    clusters = moving_clusters(observations)
+    out = np.full(len(observations), np.nan)
+    if not clusters.count:
+        return out
+    visible = _in_view(clusters, observations, T_camera_radar)
+    residual, _, frame = camera_azimuth_residuals(clusters, T_camera_radar, 3 * MATCH_RAD)
+    gain = np.bincount(frame, 1 / (1 + (residual / MATCH_RAD) ** 2), minlength=len(observations))
+    total = np.bincount(clusters.frame[visible], minlength=len(observations))
+    informative = (total > 0) & np.array([len(o.road_user_classes) > 0 for o in observations])
+    out[informative] = 1 - np.minimum(gain[informative] / total[informative], 1.0)
+    return out
+
+
+def _in_view(
+    clusters: MovingClusters, observations: Sequence[Observation], T_camera_radar: np.ndarray
+) -> np.ndarray:
+    """Clusters whose azimuth the camera covers."""
+    points = transform_points(T_camera_radar, clusters.at_image_time())
+    out = np.zeros(clusters.count, bool)
+    for f in np.unique(clusters.frame):
+        o = observations[f]
+        camera = camera_of(o)
+        index = np.flatnonzero(clusters.frame == f)
+        uv, valid = camera.project(points[index])
+        out[index] = valid & (uv[:, 0] > 0) & (uv[:, 0] < o.image_width_px - 1)
+    return out

@@ -8,7 +8,7 @@ unknown wherever the car moves, and so is a constant added to all ranges, which 
 distinguishes from a translation.
 
 Normal equations are kept apart for (azimuth, range) and for elevation, and the caller weighs the latter: on
-sparse lidars elevation says little although its residuals are small, because points collapse onto the lidar's
+sparse lidars elevation is uninformative although its residuals are small, because points collapse onto the lidar's
 rings.
 
 Source: Granger & Pennec 2002, "Multi-scale EM-ICP"; Louis 1982 for the information that uncertain assignment
@@ -50,7 +50,7 @@ _SIGMA_MOST = np.array([np.radians(1.5), np.radians(5.0), 0.60])
 BOUNCE_PRIOR = 0.12
 _BOUNCE_MOST = 0.3
 RANGE_M = (3.0, 60.0)  # over ground; nearer is the car's own clutter; farther the lidar has too few points
-_RADAR_POINTS = 500  # per frame; more say the same again
+_RADAR_POINTS = 500  # per frame; more are redundant
 SIDE_RAD = 1.25
 STRAY = 200  # one in so many lidar points may lie outside the lidar's view
 VIEW_MARGIN_RAD = np.radians(1.0)  # about half the elevation cell of a wide-angle radar

@@ -1,4 +1,4 @@
-"""The way the car drives, in radar axes by Doppler and in lidar axes by the road: a witness of the radar's pitch.
+"""Direction of travel, in radar axes by Doppler and in lidar axes by the road: it determines the radar's pitch.
 
 It needs no camera, and no detection to be matched with the lidar point that it came from. A static detection
 in direction u has the range rate `-u . v`, so three components of v follow from a scan, and on average the
@@ -12,7 +12,7 @@ the true elevation and knows nothing of the radar's noise.
 
 What the radar sees too low, between a thing and its image in the road, instruments do not mend, for high
 things are displaced by more: with heights seen too low by a tenth the velocity points lower by .3 to .9 deg.
-How much that is on a day nobody knows; the share of detections below the road says how much it may be.
+Its size on a day is unknown; the share of detections below the road limits it.
 
 The road is a parabola along the way, and its slope is taken under the car: a plane through what lies 7 to 35
 m ahead was 0.3 to 0.5 deg off the way on hilly streets.

@@ -40,7 +40,7 @@ _RANGE_FACTOR = 1.8  # box height to range: vans to low cars, poor boxes
 _RANGE_M = (3.0, 60.0)
 _DEPTH_M = 3.5  # detections of one vehicle lie within this range interval
 _LEAST_HEIGHT_PX = 12.0
-_LEAST_DETECTIONS = 2  # fewer tell nothing
+_LEAST_DETECTIONS = 2  # fewer are not used
 _PAIR = np.dtype(  # of BoxPairs
     [
         ("point_radar_m", "f8", 3),

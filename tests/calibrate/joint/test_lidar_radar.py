@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.joint import camera_radar
-from pipeline.calibrate.joint.camera_radar import camera_radar_cost, estimate_camera_radar
+from pipeline.calibrate.joint.camera_radar import estimate_camera_radar
 from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
 from pipeline.calibrate.verify.constancy import MOVED_SIGMAS, PART_FLOOR_RAD
 from pipeline.config import SolveConfig
@@ -15,6 +15,7 @@ from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.changes import change_between, change_covariance
 from pipeline.geometry.se3 import exp_se3, exp_so3, log_se3, perturb_exactly
 from pipeline.geometry.spherical import from_spherical, to_spherical
+from pipeline.objective.radar.moving_clusters import camera_radar_cost
 from tests.makers.radar_errors import bounced, elevated
 from tests.makers.radar_scenes import DT_S, GROUND_M, T_LIDAR_RADAR, street_day
 from tests.makers.solve_scenes import T_CAMERA_LIDAR

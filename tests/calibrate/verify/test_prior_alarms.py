@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
-from pipeline.calibrate.verify.limits import VerdictLimits
 from pipeline.calibrate.verify.prior_alarms import clock_alarms, edge_alarms, prior_alarms
-from pipeline.config import SolveConfig
+from pipeline.config import ChecksConfig, SolveConfig
 from pipeline.extrinsics.estimates import PairEstimate, Prior
 from pipeline.geometry.changes import change_jacobian
 from tests.makers.radar_scenes import T_LIDAR_RADAR, street_day
 from tests.makers.solve_scenes import T_CAMERA_LIDAR
 
-LIMITS = VerdictLimits()
+LIMITS = ChecksConfig()
 SIGMA_M = 0.03
 PRIOR = Prior(T_CAMERA_LIDAR, T_LIDAR_RADAR, np.radians(1.2), SIGMA_M)
 

@@ -8,9 +8,9 @@ import pytest
 from pipeline.calibrate.numerics.search_range import SearchRange
 from pipeline.calibrate.verify.failed_checks import heading_failures, loop_failures
 from pipeline.calibrate.verify.held_out_test import HeldOutTest, paired_test
-from pipeline.calibrate.verify.limits import VerdictLimits
 from pipeline.calibrate.verify.target_accuracy import DIRECTIONS, Claim
 from pipeline.calibrate.verify.verdict import Evidence, judge
+from pipeline.config import ChecksConfig
 from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
 from pipeline.geometry.se3 import exp_se3, exp_so3, from_rotation_translation
@@ -38,7 +38,7 @@ SURE = {name: Claim(0.001, 0.0, 0.001, 0.001, np.radians(0.2), 0.995) for name i
 def verdict(result, test, failed=(), claims=SURE, limits=None, **changes):
     checks = [f if isinstance(f, FailedCheck) else FailedCheck(f) for f in failed]
     evidence = Evidence(test, claims, checks)
-    return judge(result, PRIOR, evidence, SEARCH, limits or VerdictLimits(), **changes)
+    return judge(result, PRIOR, evidence, SEARCH, limits or ChecksConfig(), **changes)
 
 
 def test_a_better_alignment_is_accepted_without_remark():
@@ -229,7 +229,7 @@ def test_an_untriggered_pair_keeps_the_prior():
 def test_each_limit_of_the_verdict_decides(change, turn_deg, after, words):
     test = replace(BETTER, after=after)
     assert verdict(estimate(turn_deg), test).status == "accepted"
-    strict = verdict(estimate(turn_deg), test, limits=VerdictLimits(**change))
+    strict = verdict(estimate(turn_deg), test, limits=ChecksConfig(**change))
     assert strict.status != "accepted"
     assert words in strict.reason
 

@@ -24,7 +24,7 @@ def lake(tmp_path_factory):
     lake = training_lakes.fleet_lake(tmp_path_factory.mktemp("lake"), VEHICLES, frames=10)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pipeline.store.tables._GROUP_ROWS", 4)
-        training_lakes.prepare_all(lake, training_lakes.fleet_of(VEHICLES, split_by=["vehicle"]))
+        training_lakes.prepare_all(lake, training_lakes.fleet_of(VEHICLES, by=["vehicle"]))
     return lake
 
 
@@ -128,7 +128,7 @@ def test_a_changed_table_or_another_order_refuses_to_resume(lake, tmp_path):
     with pytest.raises(ContractError, match="seed or ranks"):
         TrainingLoader(lake, 3, seed=2).load_state_dict(state)
     other = training_lakes.fleet_lake(tmp_path, VEHICLES[:3], frames=3)
-    training_lakes.prepare_all(other, training_lakes.fleet_of(VEHICLES, split_by=["vehicle"]))
+    training_lakes.prepare_all(other, training_lakes.fleet_of(VEHICLES, by=["vehicle"]))
     with pytest.raises(ContractError, match="changed"):
         TrainingLoader(other, 3, seed=1).load_state_dict(state)
 
@@ -143,7 +143,7 @@ def test_too_little_data_is_said(lake, tmp_path):
 def test_rows_of_two_grids_are_refused(tmp_path):
     other = training_lakes.fleet_lake(tmp_path, VEHICLES[:2], frames=2)
     for vehicle, step in zip(VEHICLES[:2], (0.4, 0.3), strict=True):
-        fleet = training_lakes.fleet_of([vehicle], split_by=["vehicle"], val_fraction=0, grid_step_deg=step)
+        fleet = training_lakes.fleet_of([vehicle], by=["vehicle"], val_fraction=0, grid={"step_deg": step})
         survey = survey_day(Partition(vehicle, "2026-01-01"), other, fleet.prepare)
         prepare_day(survey.partition, fleet, other, plan_days([survey], fleet.prepare, {}))
     with pytest.raises(ContractError, match="different grids"):

@@ -34,7 +34,7 @@ EGO = {
     "ego_tx_m": 5.0, "ego_ty_m": 7.0, "ego_tz_m": 0.0,
 }  # fmt: skip
 NO_POSE = dict.fromkeys(("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m", "covariance"))
-SECTION = '[prepare]\nsplit_by = "vehicle"\nval_fraction = 0.2\ntest_fraction = 0.2'
+SECTION = '[prepare.split]\nby = "vehicle"\nval_fraction = 0.2\ntest_fraction = 0.2'
 
 
 @pytest.fixture(scope="module")
@@ -147,7 +147,7 @@ def test_two_workers_of_torch_read_parquet_by_the_copy_of_the_dataset_that_lies_
 def test_frames_come_back_through_convert_and_ingest(lake, tmp_path, form):
     toml = tmp_path / "fleet.toml"
     toml.write_text(
-        fleet_toml("a", sections='[prepare]\nsplit_by = "day"\nval_fraction = 0\ntest_fraction = 0')
+        fleet_toml("a", sections='[prepare.split]\nby = "day"\nval_fraction = 0\ntest_fraction = 0')
     )
     call = [
         "export",
@@ -310,7 +310,7 @@ def test_a_later_vehicle_takes_no_frame_from_a_split_that_has_it(lake, tmp_path,
         fleet_toml(*VEHICLES, sections=f"{SECTION}\nplace_m = 50")
     )  # cells of the same names elsewhere
     assert main(call) == 2
-    assert "another [prepare] place_m" in capsys.readouterr().out
+    assert "another [prepare.split] place_m" in capsys.readouterr().out
 
 
 def test_moved_poses_are_exactly_as_far_off_as_is_said_and_the_answer_stands_beside_them(lake, tmp_path):
@@ -356,7 +356,7 @@ def states(lake, moved_on=None):
 def test_tonight_s_state_goes_out_with_its_sigmas_and_not_with_days_before_a_sensor_moved(tmp_path):
     for day in DAYS:
         training_lakes.fill(Lake.at(tmp_path), "a", day, frames=4, **EGO)
-    one = '[prepare]\nsplit_by = "day"\nval_fraction = 0\ntest_fraction = 0'
+    one = '[prepare.split]\nby = "day"\nval_fraction = 0\ntest_fraction = 0'
     (tmp_path / "fleet.toml").write_text(fleet_toml("a", sections=one))
     priors = states(tmp_path)
     card = export(tmp_path, tmp_path / "out", "parquet", "--calibration", "state")
@@ -418,7 +418,7 @@ def test_a_camera_that_a_plane_cannot_show_is_refused_in_a_sentence(lake, tmp_pa
     eye["camera_K"][0, 0] = eye["camera_K"][1, 1] = frame.image_width_px / 2 / np.radians(95)
     training_lakes.fill(wide, "a", DAYS[0], frames=3, **EGO, **eye)
     (tmp_path / "wide" / "fleet.toml").write_text(
-        fleet_toml("a", sections='[prepare]\nsplit_by = "day"\nval_fraction = 0\ntest_fraction = 0')
+        fleet_toml("a", sections='[prepare.split]\nby = "day"\nval_fraction = 0\ntest_fraction = 0')
     )
     export(tmp_path / "wide", tmp_path / "kitti", "kitti", code=1)
     assert "sees 190 deg, and an undistorted image can show 170 at most" in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""The car's way beside networks: it tells a radar's pitch by itself, and outweighs a network that contradicts it."""
+"""Direction of travel beside networks: it measures a radar's pitch, and outweighs a network that contradicts it."""
 
 from dataclasses import replace
 
@@ -99,7 +99,7 @@ def test_a_network_whose_detections_point_wrong_gives_way_in_both_radar_pairs(st
         sigma = np.sqrt(np.diag(told[pair].covariance)[:3])
         assert np.degrees(np.abs(error)).max() < 0.4
         assert np.all(np.abs(error) < 3 * sigma)
-        assert "the way counts" in told[pair].notes[0]
+        assert "the network's answer has less weight" in told[pair].notes[0]
         np.testing.assert_allclose(told[pair].T[:3, 3], solution.pairs[pair].T[:3, 3], atol=1e-12)
     assert told["camera_lidar"] is solution.pairs["camera_lidar"]
 

@@ -62,7 +62,7 @@ def test_one_day_is_split_by_stretches_with_a_guard_between_them(tmp_path):
     lake = Lake.at(tmp_path)
     training_lakes.fill(lake, "a", "2026-01-01", frames=40)  # 1 s apart, drives of 8 frames 30 s apart
     fleet = training_lakes.fleet_of(
-        ["a"], split_by=["place"], place_s=4, guard_s=2.5, val_fraction=0.2, test_fraction=0.2
+        ["a"], by=["place"], place_s=4, guard_s=2.5, val_fraction=0.2, test_fraction=0.2
     )
     result = training_lakes.prepare_all(lake, fleet)[Partition("a", "2026-01-01")]
     rows = rows_of(lake)
@@ -80,7 +80,7 @@ def test_cells_of_the_map_keep_vehicles_apart_that_drive_the_same_street(tmp_pat
         for day in ("2026-01-01", "2026-01-02"):
             east = 1000.0 * "aabbe".index(vehicle[0]) if vehicle in "abe" else 50.0
             training_lakes.fill(lake, vehicle, day, 3, ego_tx_m=east, ego_ty_m=0.0)
-    fleet = training_lakes.fleet_of(VEHICLES, positions="map", split_by=["place"])
+    fleet = training_lakes.fleet_of(VEHICLES, positions="map", by=["place"])
     training_lakes.prepare_all(lake, fleet)
     rows = rows_of(lake)
     assert_sides_apart(rows, ("place",))
@@ -101,7 +101,7 @@ def test_frames_of_two_sides_are_far_apart_also_over_the_border_of_a_cell_and_on
         ]
         write_frames(lake, Partition(vehicle, "2026-01-01"), frames, "crossed")
     fleet = training_lakes.fleet_of(
-        "ab", positions=positions, split_by=["place"], val_fraction=0.3, test_fraction=0.3, guard_s=0
+        "ab", positions=positions, by=["place"], val_fraction=0.3, test_fraction=0.3, guard_s=0
     )
     surveys = [survey_day(p, lake, fleet.prepare) for p in perceived_days(lake)]
     plan = plan_days(surveys, fleet.prepare, {})
@@ -112,7 +112,7 @@ def test_frames_of_two_sides_are_far_apart_also_over_the_border_of_a_cell_and_on
         at += [(home, s, survey.x_m[i], survey.y_m[i]) for i, s in enumerate(sides) if s is not None]
         assert lost["next_to_other_split"] > 0
     apart = [np.hypot(a[2] - b[2], a[3] - b[3]) for a in at for b in at if a[0] == b[0] and a[1] != b[1]]
-    assert min(apart) > fleet.prepare.guard_m / np.sqrt(2)
+    assert min(apart) > fleet.prepare.split.guard_m / np.sqrt(2)
     assert len(at) > 120
 
 
@@ -120,15 +120,16 @@ def test_a_position_of_minus_zero_is_in_the_cell_of_zero(tmp_path):
     lake = Lake.at(tmp_path)
     for vehicle, east in (("a", 0.0), ("b", -0.0)):
         training_lakes.fill(lake, vehicle, "2026-01-01", 3, ego_tx_m=east, ego_ty_m=0.0)
-    fleet = training_lakes.fleet_of("ab", positions="map", split_by=["place"])
+    fleet = training_lakes.fleet_of("ab", positions="map", by=["place"])
     a, b = (survey_day(Partition(v, "2026-01-01"), lake, fleet.prepare).place for v in "ab")
     assert a == b
 
 
 def test_three_vehicles_on_two_days_keep_four_fifths_of_their_frames_without_a_setting(tmp_path, capsys):
     own = tmp_path / "fleet.toml"
-    small = "\n".join(f"{name} = {value}" for name, value in training_lakes.SMALL.items())
-    own.write_text(fleet_toml(*"abc", sections=f"[prepare]\n{small}"))
+    small = "\n".join(f"{n} = {value}" for n, value in training_lakes.SMALL.items() if n != "grid")
+    grid = "\n".join(f"{n} = {value}" for n, value in training_lakes.SMALL["grid"].items())
+    own.write_text(fleet_toml(*"abc", sections=f"[prepare]\n{small}\n[prepare.grid]\n{grid}"))
     for seed, (vehicle, day) in enumerate((v, f"2026-01-0{d}") for v in "abc" for d in (1, 2)):
         training_lakes.fill(Lake.at(tmp_path), vehicle, day, 6, seed=seed)
     assert main(["prepare", "--fleet", str(own), "--lake", str(tmp_path), "--executor", "inline"]) == 0
@@ -172,7 +173,7 @@ def test_an_empty_side_is_an_error_before_training(tmp_path, capsys):
 
 def test_the_same_work_is_done_once_and_what_is_lost_comes_back_the_same(tmp_path):
     lake = training_lakes.fleet_lake(tmp_path, VEHICLES[:3], frames=3)
-    fleet = training_lakes.fleet_of(VEHICLES, split_by=["vehicle"])
+    fleet = training_lakes.fleet_of(VEHICLES, by=["vehicle"])
     training_lakes.prepare_all(lake, fleet)
     before = {r.vehicle: r for r in rows_of(lake)}
     assert {r.status for r in training_lakes.prepare_all(lake, fleet).values()} == {"cached"}
@@ -187,7 +188,7 @@ def test_the_same_work_is_done_once_and_what_is_lost_comes_back_the_same(tmp_pat
 
 def test_a_growing_fleet_moves_no_frame_to_another_side(tmp_path):
     lake = training_lakes.fleet_lake(tmp_path, VEHICLES[:3], frames=2)
-    fleet = training_lakes.fleet_of([*VEHICLES, "f", "g", "h"], split_by=["vehicle"])
+    fleet = training_lakes.fleet_of([*VEHICLES, "f", "g", "h"], by=["vehicle"])
     training_lakes.prepare_all(lake, fleet)
     before = {r.vehicle: r.split for r in rows_of(lake)}
     training_lakes.fleet_lake(tmp_path, [*VEHICLES[3:], "f", "g", "h"], frames=4)
@@ -200,7 +201,7 @@ def test_a_growing_fleet_moves_no_frame_to_another_side(tmp_path):
 def test_frames_without_way_between_them_are_one_sample(tmp_path):
     lake = Lake.at(tmp_path)
     training_lakes.fill(lake, "a", "2026-01-01", 6, ego_speed_mps=0.3)  # 0.3 m between frames
-    fleet = training_lakes.fleet_of(["a"], split_by=["vehicle"], min_step_m=0.5)
+    fleet = training_lakes.fleet_of(["a"], by=["vehicle"], min_step_m=0.5)
     result = training_lakes.prepare_all(lake, fleet)[Partition("a", "2026-01-01")]
     assert (result.rows, result.rejected) == (3, {"hardly_moved": 3})
 
@@ -214,7 +215,7 @@ def test_frames_that_perception_refused_or_that_changed_their_prior_are_counted(
     priors = observations[4].priors | {"camera_lidar": moved}
     observations[4] = replace(observations[4], log="b.mcap", priors=priors)
     write_observations(lake, partition, [o for o in observations if o.frame_index != 2], "other")
-    result = training_lakes.prepare_all(lake, training_lakes.fleet_of(["a"], split_by=["vehicle"]))[partition]
+    result = training_lakes.prepare_all(lake, training_lakes.fleet_of(["a"], by=["vehicle"]))[partition]
     assert (result.rows, result.rejected) == (4, {"not_perceived": 1, "prior_changed": 1})
 
 
@@ -227,7 +228,7 @@ def test_a_day_without_prior_is_refused_with_its_reason(tmp_path):
         for o in list(observations_of(lake, partition))
     ]
     write_observations(lake, partition, rows, "other")
-    result = training_lakes.prepare_all(lake, training_lakes.fleet_of(["a"], split_by=["vehicle"]))[partition]
+    result = training_lakes.prepare_all(lake, training_lakes.fleet_of(["a"], by=["vehicle"]))[partition]
     assert result.status == "refused"
     assert result.reason == "no sample: 3 no_prior"
 
@@ -237,7 +238,7 @@ def test_views_that_come_back_on_another_side_are_found_and_barred(tmp_path):
     for number, vehicle in enumerate(VEHICLES):
         seed = 77 if vehicle in "ab" else None  # a and b show the same scenes under two names
         training_lakes.fill(lake, vehicle, f"2026-01-0{number + 1}", 3, seed=seed)
-    fleet = training_lakes.fleet_of(VEHICLES, split_by=["vehicle"], val_fraction=0.3, test_fraction=0.3)
+    fleet = training_lakes.fleet_of(VEHICLES, by=["vehicle"], val_fraction=0.3, test_fraction=0.3)
     training_lakes.prepare_all(lake, fleet)
     split = {r.vehicle: r.split for r in rows_of(lake)}
     inventory = take_inventory(lake, 16)
@@ -289,7 +290,8 @@ PREPARE = """
 lidar_points = 512
 cluster_points = 64
 edge_points = 64
-split_by = ["vehicle"]
+[prepare.split]
+by = ["vehicle"]
 """
 
 
@@ -307,7 +309,7 @@ def test_the_job_tells_counts_and_exit_codes(tmp_path, capsys):
     assert (code, told["status"]) == (3, "held")  # two vehicles fill two sides
     assert [p["side"] for p in told["problems"]] == ["test"]
     assert told["next_steps"] == [
-        f"set val_fraction and test_fraction to 0 under [prepare] in {fleet}, or add days; then prepare again"
+        f"set val_fraction and test_fraction to 0 under [prepare.split] in {fleet}, or add days; then prepare again"
     ]
     code, told = run()
     assert (code, told["status"], told["done"], told["cached"]) == (0, "done", 1, 2)

@@ -34,7 +34,7 @@ def data(tmp_path_factory):
     vehicles = [f"v{i}" for i in range(6)]
     for i, vehicle in enumerate(vehicles):
         fill(Lake.at(root), vehicle, f"2026-01-{i + 1:02d}", 4)
-    prepare_all(Lake.at(root), fleet_of(vehicles, grid_width_deg=89.6, grid_height_deg=51.2))
+    prepare_all(Lake.at(root), fleet_of(vehicles, grid={"width_deg": 89.6, "height_deg": 51.2}))
     return str(root)
 
 

@@ -57,7 +57,7 @@ def _frame_offsets(o: Observation, T: Float[np.ndarray, "4 4"]) -> Iterator[Floa
 
 
 def _objects(o: Observation, T: Float[np.ndarray, "4 4"]) -> _Boxes:
-    """What each object of the lidar covers in the image."""
+    """Bounding box in the image of each lidar cluster."""
     xyz = o.lidar_map_xyz_m.astype(np.float64) @ T[:3, :3].T + T[:3, 3]
     uv, is_seen = camera_of(o).project(xyz)
     found = []

@@ -1,7 +1,7 @@
 """Camera-lidar half of method `joint`: T_camera_lidar and the camera's time offset from a day of observations.
 
 Candidates of several origins climb until one leads (`initialise`), annealed response surfaces find the optimum, and the
-frames' own curvatures and gradients say how sure it is. Weights of the terms come from the data: the share of matching
+frames' own curvatures and gradients give its covariance. Weights of the terms come from the data: the share of matching
 edges, the contrast under markings, and the scatter of a term's gradient from frame to frame compared with its curvature
 (composite likelihood: Varin, Reid, Firth 2011, section 2.3). A degree of freedom that the day does not determine is
 then fixed at the prior and the others are solved again; their covariance includes what the prior leaves open in it.
@@ -284,7 +284,7 @@ def _terms(
 def _usable(observations: Sequence[Observation]) -> tuple[list[int], dict[str, int]]:
     """Frames that share the first frame's camera and label size, and whose own speed is known where most are.
 
-    Where it is not, nothing tells how far the car drove between sweep and image: taken for a car that stands, 10 frames
+    If it is not, the distance driven between sweep and image is unknown: taken for a car that stands, 10 frames
     of 32 on a simulated highway moved the time offset by 30 ms.
     """
     if not observations:

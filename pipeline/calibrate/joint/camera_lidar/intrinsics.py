@@ -1,4 +1,4 @@
-"""What the day says of the camera's focal length and principal point: for report and alarm, not for the pose.
+"""Focal length and principal point of the camera from the day: for report and alarm, not for the pose.
 
 Freeing them in the pose costs more than it gains: focal length, tz and the time offset share a valley, and a
 principal point wrong by d pixels is, over most of an image, a camera turned by d/f. So the pose stays that of
@@ -9,7 +9,7 @@ which do not see the steps of the maps, do not. They still end in a maximum of t
 at CameraInfo's focal length and the expected clock and where the alignment had both, and the edges say which
 end is better: from the first alone, a highway whose camera was 60 ms late showed a focal length 6 % off.
 
-Edges alone say the focal length, with the principal point held. Markings run along the car's way and grow
+Edges alone determine the focal length, with the principal point held. Markings run along the car's way and grow
 with it as with the focal length: with them it was 0.8 % off where edges were 0.5 % off. The principal point
 needs them, for they reach the image's lower corners.
 
@@ -56,7 +56,7 @@ _MARKING_DAMPING = 3.0
 # Weak priors that keep undetermined directions in place: focal scale, and principal point in shares of the image.
 _FOCAL_REACH, _CENTRE_REACH = 0.05, 0.13
 _HELD_PX = 1e-3  # sigma of a principal point that stays
-_LESS_MARKING = 0.25  # of their weight: enough to let edges decide where these say anything
+_LESS_MARKING = 0.25  # of their weight: enough to let edges decide where they are informative
 _DECIDED_SIGMAS = 3.0  # of the frames' scatter: where two ends score alike, half of their distance is sigma
 _FOCAL, _CENTRE, _UNKNOWNS = 7, slice(8, 10), 10
 
@@ -95,7 +95,7 @@ class DayIntrinsics:
         }
 
     def notes(self, known: CameraPrior) -> list[str]:
-        """In words: what was assumed, and what the day could have told."""
+        """The assumption in words, and the smallest error of it that the day would have shown."""
         yaw, pitch = np.degrees(self._turn_sigma_rad(known))
         source = (
             "centre_sigma_px and the day" if known.centre_is_stated else "the day, without centre_sigma_px"
@@ -227,7 +227,7 @@ class _State:
         return _State(self.alignment.stepped(x[:8]), self.centre_px + x[_CENTRE])
 
     def seen(self, terms: Terms) -> Terms:
-        """The terms with the principal point where this state has it."""
+        """The terms with the principal point shifted as in this state."""
         camera = terms.camera.copy()
         camera[3:5] += self.centre_px.astype(np.float32)
         return replace(terms, camera=camera)

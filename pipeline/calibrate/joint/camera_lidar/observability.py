@@ -140,7 +140,7 @@ def along_the_way(
     velocity_lidar: Float[np.ndarray, "F 3"],
     fixed: Bool[np.ndarray, " 8"],
 ) -> Float[np.ndarray, " 8"]:
-    """How the lidar's origin moves along the car's way as the time offset shrinks by 1 s: at one speed nothing tells.
+    """Motion of the lidar's origin along the driving direction per second of time offset: unobservable at one speed.
 
     A camera that looks ahead has that in its tz, which is at its prior or as its profile has it; one that looks aside
     has it in its x.
@@ -232,7 +232,7 @@ class DayCovariance:
     observability: np.ndarray  # 6
 
     def beside(self, biases: Float[np.ndarray, "_ 8"]) -> DayCovariance:
-        """With errors that all days err by alike: one sigma of each a row, as `AlignmentState.changed` has them."""
+        """Covariance with further errors that all days share: one sigma each, rows as in `AlignmentState.changed`."""
         more = biases.T @ biases
         return DayCovariance(
             self.covariance + more, self.common + more, self.floors + more, self.observability

@@ -34,14 +34,14 @@ _REACH = 2  # spans, within which a parabola's top is looked for
 
 @dataclass(frozen=True, eq=False)
 class TzProfile:
-    """What the day alone says of tz: value, variance from the profile's shape, bias from edges against markings."""
+    """tz by the day alone: value, variance from the profile's shape, bias from edges against markings."""
 
     tz_m: float
     variance_m2: float  # infinite where the profile has no maximum
     bias_m: float
     kinds_apart_m: float  # tz by markings alone less tz by edges alone
     kinds_sigma_m: float
-    is_beyond: bool = False  # the parabola's top is further off than it can tell
+    is_beyond: bool = False  # the parabola's top is too far off to be used
 
     def shift_from(self, tz_m: float) -> tuple[float, float] | None:
         """How far the day alone puts tz from a prior, and that shift's sigma [m]; None where it does not know."""

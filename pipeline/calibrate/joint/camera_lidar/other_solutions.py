@@ -1,4 +1,4 @@
-"""The day's solution against others of the same day: where another start led, and what its first and last part say."""
+"""The day's solution against others of the same day: where another start led, and those of its first and last part."""
 
 from __future__ import annotations
 

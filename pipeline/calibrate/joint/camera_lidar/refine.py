@@ -123,7 +123,7 @@ def refine(
     """Maximise by Newton steps on response surfaces, for the score is rough at the scale of a pixel.
 
     Args:
-        steps: at most so many: valleys are long, as fast cars hardly tell tz from the time offset.
+        steps: at most so many: valleys are long, because at high speed tz and the time offset are hardly separable.
         fixed: degrees of freedom that stay; those of the pose at the prior.
     """
     scale = _SURFACE_SIZE * scales(scored.terms, scored.kernel)

@@ -57,18 +57,18 @@ class SidesApart:
 
 
 def sides_apart(terms: Terms, state: AlignmentState, kernel: KernelSettings) -> SidesApart:
-    """What the edges of a day show at a solution; 0 about an axis of which edges tell nothing."""
+    """Offsets of far edges minus near edges at a solution, in pitch and yaw; 0 where there are too few edges."""
     pitch_px, yaw_px = (_apart_px(terms, state, kernel, sides) for sides in _SIDES.values())
     return SidesApart(pitch_px, yaw_px, 1 / float(terms.camera[1]))
 
 
 def most_offset_rad(edges: Points, px_rad: float) -> float:
-    """How far boundaries of one side lie beside its jumps at most; `px_rad` is the angle of a label pixel."""
+    """Largest plausible angle between jumps in range and boundaries of one side; `px_rad`: angle of a label pixel."""
     return float(np.hypot(EDGE_SIDE_MOST_PX * px_rad, EDGE_SIDE_MOST_OF_GAP * np.median(edges.gap_rad)))
 
 
 def _apart_px(terms: Terms, state: AlignmentState, kernel: KernelSettings, sides: tuple[int, int]) -> float:
-    """Far less near, RMS over the sides; 0 where no side has enough edges to pull the solution."""
+    """Offset of far edges minus offset of near edges, RMS over the sides; 0 where every side has too few edges."""
     range_m, focal_px = np.linalg.norm(terms.edges.xyz_m, axis=1), float(terms.camera[1])
     far_less_near, gap_px = [], 0.0
     for side in sides:

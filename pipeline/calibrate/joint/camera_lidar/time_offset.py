@@ -76,7 +76,7 @@ def profile_time_offset(
 def _ends(
     scored: Scored, state: AlignmentState, step_s: float, fixed: Bool[np.ndarray, " 8"]
 ) -> dict[int, tuple[AlignmentState, np.ndarray]]:
-    """By number of steps from the start: the state solved there, and each frame's score at it."""
+    """The solved state and each frame's score at time offsets on a grid, by number of steps from the start."""
     start = refine(scored, replace(state, focal=1.0), steps=SCHEDULE.profile_start_steps, fixed=fixed)
     ends = {0: (start, _frame_scores(scored, start))}
     reach_s = SCHEDULE.time_offset_reach_s

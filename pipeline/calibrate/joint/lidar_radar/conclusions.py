@@ -1,4 +1,4 @@
-"""What is said of a lidar-radar solution beside the pose: what it rests on, what was assumed, numbers for checks."""
+"""Conclusions about a lidar-radar solution beside the pose: its data, its assumptions, numbers for checks."""
 
 from __future__ import annotations
 

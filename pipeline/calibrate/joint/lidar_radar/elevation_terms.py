@@ -2,7 +2,7 @@
 
 The registration's elevations contribute no more than the lidar's own beam spacing allows (points collapse
 onto the rings, repeatably and with the lowest residual); the camera's vehicle boxes determine roll, and pitch
-up to their constant. The way that the car drives adds pitch: Doppler knows it in radar axes, the road in
+up to their constant. The direction of travel adds pitch: Doppler gives it in radar axes, the road in
 lidar axes. Displaced heights add pitch as the radar's height makes it.
 """
 
@@ -56,7 +56,7 @@ def add_boxes(
     about_radar: np.ndarray,
     sums: Sums,
 ) -> tuple[float, Witness | None]:
-    """Add the camera's vehicle boxes; returns an elevation's sigma in its box [rad], and what they say of pitch."""
+    """Add the camera's vehicle boxes; returns an elevation's sigma in its box [rad], and their pitch."""
     if pairs is None or problem.T_camera_lidar is None:
         return float("nan"), None
     F = len(sums.g)
@@ -77,7 +77,7 @@ def add_boxes(
 
 
 def add_travel(problem: RadarProblem, state: RadarState, sums: Sums) -> tuple[float, Witness | None]:
-    """Add the car's way by Doppler and road; returns its scatter over the frames [rad], and what it says of pitch."""
+    """Add the direction of travel by Doppler and road; returns its scatter over frames [rad], and its pitch."""
     if problem.travel is None:
         return float("nan"), None
     H, g, scatter = pitch_equations(problem.travel, state.T_lidar_radar, len(sums.g))
@@ -88,7 +88,7 @@ def add_travel(problem: RadarProblem, state: RadarState, sums: Sums) -> tuple[fl
 
 
 def travel_equations(problem: RadarProblem, state: RadarState) -> Witness | None:
-    """What the car's way says of pitch at a state; None where it says nothing."""
+    """Pitch correction from the direction of travel alone, with sigma; None if it does not determine pitch."""
     if problem.travel is None:
         return None
     H, g, _ = pitch_equations(problem.travel, state.T_lidar_radar, len(problem.observations))
@@ -97,7 +97,7 @@ def travel_equations(problem: RadarProblem, state: RadarState) -> Witness | None
 
 
 def add_heights(problem: RadarProblem, state: RadarState, sums: Sums) -> Witness | None:
-    """Add what static elevations say of pitch that may be displaced; returns what they say of it at this state."""
+    """Add static elevations, which may be displaced; returns their pitch correction at this state."""
     if problem.heights is None:
         return None
     H, g = _height_equations(problem.heights, state.T_lidar_radar, len(sums.g))
@@ -108,7 +108,7 @@ def add_heights(problem: RadarProblem, state: RadarState, sums: Sums) -> Witness
 
 
 def height_equations(problem: RadarProblem, state: RadarState) -> Witness | None:
-    """What displaced heights say of pitch at a state; None where they say nothing."""
+    """Pitch correction from displaced heights alone, with sigma; None if they do not determine pitch."""
     if problem.heights is None:
         return None
     H, g = _height_equations(problem.heights, state.T_lidar_radar, len(problem.observations))
@@ -176,14 +176,14 @@ def _add_tilts(
     information: Float[np.ndarray, "F C C"] | None = None,
     of_day: Float[np.ndarray, "C C"] | None = None,
 ) -> None:
-    """Add what a witness says of turns about x and y and of more, as one measurement with covariance `H^-1 + floor`.
+    """Add a source's turns about x and y, and its other unknowns, as a measurement with covariance `H^-1 + floor`.
 
     What it takes for seen where it is turns it up by the share that is seen too low.
 
     Args:
         problem: the day.
         state: where the equations were linearised.
-        name: of the witness.
+        name: of the source.
         columns: its unknowns, turns first.
         H: EM's information of each frame, for steps.
         g: gradient.
@@ -195,7 +195,7 @@ def _add_tilts(
     axis = radar_tilt_axes(state.T_lidar_radar)[:, 1]
     J = added_share(axis, problem.seen_low.per_share_rad.get(name, 0.0), len(columns))
     information = H if information is None else information
-    # By as much as the gradient would follow a turn: where assignment follows it too, that is less than H says.
+    # By as much as the gradient would follow a turn: where the assignment follows it too, that is less than H.
     g = g + state.seen_low * information @ J[:, -1]
     left = tempered(information, g, floor)[0]
     H, g = tempered(H, g, floor)

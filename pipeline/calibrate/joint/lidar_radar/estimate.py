@@ -218,7 +218,7 @@ def _start_of_part(part: RadarProblem, start: RadarState, unknowns: int) -> Rada
 def _with_way(
     problem: RadarProblem, state: RadarState, rng: np.random.Generator
 ) -> tuple[RadarProblem, RadarState, tuple[Witness, ...]]:
-    """The problem with the car's way and displaced heights, the solution without them, and what all say of its pitch.
+    """The problem with direction of travel and displaced heights, the solution without them, and the pitch of each.
 
     They are asked there, and the radar's sigmas are estimated there: a wrong way would draw the pose along, and the
     registration would then take what contradicts it for noise.
@@ -244,7 +244,7 @@ def _with_way(
 def _with_witnesses(
     analysis: ObservabilityAnalysis, witnesses: tuple[Witness, ...] | None, asked_at: RadarState
 ) -> ObservabilityAnalysis:
-    """The analysis with what witnesses say of its pitch, which is less sure where they contradict each other."""
+    """The analysis with the variance of pitch increased where its sources contradict each other."""
     if witnesses is None:
         return analysis
     axes = radar_tilt_axes(analysis.state.T_lidar_radar)
@@ -376,7 +376,7 @@ def _observability(variance: np.ndarray, bias: np.ndarray, before: np.ndarray) -
         bias: squared bias floor of the day's information.
         before: variance of the prior.
     """
-    # The floor is an error of the day's information alone: it does not widen what the prior knows.
+    # The floor is an error of the day's information alone: it does not widen the prior.
     day = 1 / np.maximum(1 / variance - 1 / before, 1e-9 / before) + bias
     return before / (before + day)
 
@@ -390,7 +390,7 @@ def _conclude(
 ) -> PairEstimate:
     state, fixed = analysis.state, analysis.fixed
     notes = notes_of(analysis, has_elevation=bool(problem.frames.has_elevation.any()))
-    # Elevation has witnesses of its own.
+    # Elevation has sources of its own.
     compared = np.isin(np.arange(6), (_YAW, 3, 4)) & ~fixed[:6]
     apart = change_between(ends[-1].T_lidar_radar, ends[0].T_lidar_radar)
     covariance = with_ends(analysis.covariance[:6, :6], np.where(compared, apart, 0.0))

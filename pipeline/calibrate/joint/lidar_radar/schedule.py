@@ -13,7 +13,7 @@ __all__ = ["SCHEDULE", "Schedule"]
 class Schedule:
     """Steps, sigmas and frames of each stage, in the order in which they run."""
 
-    # Scan of turns about the vertical, by the cost of a few frames: enough to tell basins apart.
+    # Scan of turns about the vertical, by the cost of a few frames: enough to separate basins.
     scan_step_deg: float = 1.5
     scan_least_deg: float = 6.0  # searched at least
     scan_reach: float = 1.7  # times the search range: corners of the box

@@ -119,11 +119,11 @@ class _Valley:
     flatness: float = 1.0  # curvature seen, as a share of what soft assignment predicts
 
     def forgetting(self) -> _Valley:
-        """Only the curvature: the gradient belonged to other sigmas."""
+        """The valley with its curvature alone: the gradient was computed with other sigmas."""
         return replace(self, dt_s=None)
 
     def seen(self, dt_s: float, gradient: float, predicted: float) -> _Valley:
-        """With one more point."""
+        """The valley with one more point."""
         flatness = self.flatness
         if self.dt_s is not None and abs(dt_s - self.dt_s) > _LEAST_DT_S:
             flatness = float(np.clip((gradient - self.gradient) / (dt_s - self.dt_s) / predicted, *_FLATNESS))

@@ -1,4 +1,4 @@
-"""Detections that are seen too low, by an unknown share of their height: what witnesses of pitch err by together.
+"""Detections that are seen too low, by an unknown share of their height: the common error of the sources of pitch.
 
 A radar sees things between where they are and their mirror images in the road. Who takes them for seen where they are
 turns the radar up, all of them at once: the registration and boxes by the share times the height of what they see over
@@ -29,7 +29,7 @@ _LEAST_SHARE = 1e-3
 
 @dataclass(frozen=True)
 class SeenLow:
-    """What is known of the share before a day's elevations are compared, and what it does to each witness."""
+    """Expected share and its sigma before a day's elevations are compared, and its effect on each source of pitch."""
 
     mean: float = 0.0
     sigma: float = _LEAST_SHARE
@@ -37,7 +37,7 @@ class SeenLow:
     per_share_rad: Mapping[str, float] = field(default_factory=dict)
 
     def expected(self, witness: Witness) -> Witness:
-        """The witness, if the share is what it is taken for."""
+        """The source's pitch if the share has its expected value."""
         per_rad = self.per_share_rad.get(witness.name, 0.0)
         sigma_rad = float(np.hypot(witness.sigma_rad, per_rad * self.sigma))
         return replace(witness, offset_rad=witness.offset_rad + per_rad * self.mean, sigma_rad=sigma_rad)
@@ -57,12 +57,12 @@ def seen_low_of(travel: TravelDirections | None, heights: Heights | None) -> See
 def added_share(
     axis: Float[np.ndarray, " 2"], per_share_rad: float, unknowns: int
 ) -> Float[np.ndarray, "P Q"]:
-    """Derivative of a witness's unknowns, of which the first two are turns, by themselves and by the share behind them.
+    """Derivative of a source's unknowns, of which the first two are turns, by themselves and by the share.
 
     Args:
         axis: of the radar's pitch.
-        per_share_rad: by how much the share turns this witness up.
-        unknowns: of the witness.
+        per_share_rad: turn upwards of this source per share.
+        unknowns: of the source.
     """
     J = np.eye(unknowns, unknowns + 1)
     J[:2, -1] = -per_share_rad * axis

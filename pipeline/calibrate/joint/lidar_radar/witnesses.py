@@ -1,4 +1,4 @@
-"""Witnesses of radar pitch: what each says by itself, and what is made of it where they contradict each other."""
+"""Independent sources of radar pitch: the pitch of each alone, and a wider sigma where they contradict each other."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from jaxtyping import Float
 
 __all__ = ["Contradiction", "Witness", "contradiction", "doubted", "own_equations", "own_numbers"]
 
-_SIGMAS = 2.0  # from which two witnesses contradict each other
+_SIGMAS = 2.0  # from which two sources contradict each other
 _SINGULAR = 1e-9
 
 
 @dataclass(frozen=True)
 class Witness:
-    """What one source says of pitch, all other unknowns as they were solved."""
+    """Pitch by one source alone, with all other unknowns at the solution."""
 
     name: str
-    offset_rad: float  # from the solution to where this witness alone would turn it
-    sigma_rad: float  # of the witness, its own bias included
+    offset_rad: float  # from the solution to the pitch by this source alone
+    sigma_rad: float  # of this source, its own bias included
 
 
 @dataclass(frozen=True)
 class Contradiction:
     """Witnesses are farther apart than their sigmas allow."""
 
-    factor: float  # by which pitch is less sure than they say together
+    factor: float  # to add to their combined sigma of pitch
     sentence: str
 
 
@@ -48,10 +48,10 @@ def own_equations(
 
 
 def doubted(witnesses: Sequence[Witness]) -> dict[str, float]:
-    """Sigmas beyond their own [rad] of witnesses that take things for seen where they are, where these are seen lower.
+    """Sigmas [rad] to add to sources of pitch that displaced detections bias: those that are seen too low.
 
-    Such witnesses turn the radar up. Only `heights` knows of displaced detections: whoever turns it further
-    up than both sigmas allow errs by as much.
+    Such sources turn the radar up. `heights` models displaced detections: a source that turns it further up
+    than both sigmas allow is wrong by as much.
     """
     right = next((w for w in witnesses if w.name == "heights"), None)
     if right is None:
@@ -84,7 +84,7 @@ def contradiction(witnesses: Sequence[Witness]) -> Contradiction | None:
 
 
 def own_numbers(witnesses: Sequence[Witness]) -> dict[str, float]:
-    """Offset and sigma of each witness, for a record's diagnostics."""
+    """Offset and sigma of each source, for a record's diagnostics."""
     numbers: dict[str, float] = {}
     for w in witnesses:
         numbers |= {

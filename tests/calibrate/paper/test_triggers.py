@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.calibrate.select.triggers import exceeded, trigger_metrics
+from pipeline.calibrate.paper.triggers import exceeded, trigger_metrics
 from pipeline.config import TriggerConfig
 from pipeline.geometry.se3 import exp_so3
 from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day

@@ -1,6 +1,6 @@
 """The paper's signs of misalignment (section 4.5.2), measured at any calibration, and the decision to calibrate.
 
-Counts are means per frame where the paper speaks of counts: it does not say over how many frames it sums, and
+Counts are means per frame: the paper has sums over an unstated number of frames, and
 a sum over a day exceeds 1 for every calibration. A dynamic detection is a moving cluster that the tracker has
 seen before, within the paper's 80 m: a cluster of a single scan may be noise. "The entire point cloud" is
 what lies in the image: the paper's lidar sees less than its camera, a 360 deg lidar would drown what is
