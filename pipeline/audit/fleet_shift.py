@@ -46,7 +46,7 @@ def judge_without_fleet_shifts(
     """
     verdicts = judge_fleet(fleet, config, models)
     names = list(models) or [""] * len(fleet)
-    shifts = {}
+    shifts: dict[tuple[str, Edge, str], FleetShift] = {}
     for model in sorted(set(names)):
         rows = [v for v, name in enumerate(names) if name == model]
         found = _shifts([fleet[v] for v in rows], [verdicts[v] for v in rows])

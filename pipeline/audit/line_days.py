@@ -77,7 +77,7 @@ class Counted:
         sums = unpacked(np.stack([np.asarray(r.sums) for r in rows]), days, when)
         until = max(r.read_until for r in rows)
         return cls(
-            place, sums, *([getattr(r, n) for r in rows] for n in ("line", "restart", "last_key")), until
+            place, sums, [r.line for r in rows], [r.restart for r in rows], [r.last_key for r in rows], until
         )
 
     def columns(self, k: int) -> dict[str, Any]:
