@@ -334,7 +334,7 @@ SETS: dict[str, list[DaySpec]] = {
     ],
     # Highways alone, whose convoys leave a scan little that stands still.
     "radar-convoys": [
-        DaySpec(5450 + i, "highway", rig=f"{rig}-dirty")
+        DaySpec(5450 + i, "highway", 20, rig=f"{rig}-dirty")
         for i, rig in enumerate(("paper", "ring16", "demo", "truck", "bumper", "spin128"))
     ],
     "dev-dirty": [
