@@ -332,6 +332,11 @@ SETS: dict[str, list[DaySpec]] = {
         DaySpec(5400 + i, ("urban", "highway")[i // 6 % 2], rig=f"{rig}-dirty")
         for i, rig in enumerate(8 * ("paper", "ring16", "demo", "truck", "bumper", "spin128"))
     ],
+    # Highways alone, whose convoys leave a scan little that stands still.
+    "radar-convoys": [
+        DaySpec(5450 + i, "highway", 20, rig=f"{rig}-dirty")
+        for i, rig in enumerate(("paper", "ring16", "demo", "truck", "bumper", "spin128"))
+    ],
     "dev-dirty": [
         DaySpec(120 + i, ("urban", "highway")[i // 6 % 2], rig=f"{rig}-dirty")
         for i, rig in enumerate(2 * ("paper", "ring16", "demo", "truck", "bumper", "spin128"))

@@ -34,6 +34,7 @@ from pipeline.objective.radar import travel
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import observations_of
 from schemas.observations import Observation
+from tests.benchmarks.studies.commits import commit_now
 
 Array = NDArray[np.float64]
 RANGES_M = (8.0, 15.0, 25.0, 40.0, 60.0)
@@ -53,6 +54,7 @@ def main() -> None:
     )
     parser.add_argument("folders", type=Path, nargs="+")
     ranges = ", ".join(f"{a:.0f}-{b:.0f} m" for a, b in pairwise(RANGES_M))
+    print(f"Measured by commit {commit_now()}\n")
     print(
         f"| day | static a scan | below by range ({ranges}) | height | noise [deg] | alone | "
         "Doppler plain, moved [deg] | Doppler by instruments, moved [deg] | repeats |"

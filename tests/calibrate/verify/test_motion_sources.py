@@ -158,6 +158,24 @@ def test_scans_that_no_velocity_explains_are_named(day):
     assert told(day[:20] + silent[20:]) == []
 
 
+@pytest.mark.parametrize("fits", ["what stands", "chance"])
+def test_a_convoy_that_fills_the_scans_is_no_wrong_doppler_and_a_fit_by_chance_is_one(day, fits):
+    rng = np.random.default_rng(4)
+    filled = []
+    for o in day:
+        standing = o.radar_xyz_m[:25]
+        cars = np.repeat(rng.uniform([10, -8, -1], [60, 8, 1], (10, 3)), 12, axis=0).astype(np.float32)
+        own = rng.normal(0, 0.07, len(standing))
+        speeds = np.repeat(rng.uniform(-12, -2, 10), 12) + rng.normal(0, 0.1, len(cars))
+        if fits == "chance":
+            own, speeds = rng.uniform(-0.4, 0.4, len(own)), rng.uniform(0.4, 2.4, len(cars))
+        xyz, off = np.concatenate([standing, cars]), np.append(own, speeds).astype(np.float32)
+        motion = np.repeat([0, 1], [len(standing), len(cars)]).astype(np.uint8)
+        filled.append(replace(o, radar_xyz_m=xyz, radar_motion=motion, radar_residual_mps=off))
+    assert max(np.mean(o.radar_motion == 0) for o in filled) < 0.2
+    assert [f for f, _ in told(filled)] == ([] if fits == "what stands" else ["doppler"])
+
+
 def test_a_lidar_mounted_backwards_is_named(day):
     back = [replace(o, lidar_map_xyz_m=o.lidar_map_xyz_m * np.float32([-1, -1, 1])) for o in day]
     assert [f for f, _ in told(back)] == ["orientation"]
