@@ -28,7 +28,7 @@ def dbscan(points: Float[np.ndarray, "N D"], eps: float, min_points: int) -> Int
     flat = np.zeros((len(points), 3))
     flat[:, : points.shape[1]] = points
     # Cells of eps: all neighbours of a point lie in the 27 cells around it.
-    order, start, key, steps = in_cells(np.floor((flat - flat.min(axis=0)) / eps).astype(np.int64))
+    order, start, key, steps = in_cells(flat, np.array([column.min() for column in flat.T]), eps)
     # Three cells in a row of the last axis have consecutive keys: 9 runs instead of 27 cells.
     first, last = _neighbour_runs(key, *steps)
     sorted_label = _dbscan(np.ascontiguousarray(flat[order]), start, first, last, eps * eps, min_points)
@@ -40,24 +40,27 @@ def dbscan(points: Float[np.ndarray, "N D"], eps: float, min_points: int) -> Int
 _Cells = tuple[np.ndarray, np.ndarray, np.ndarray, tuple[int, int]]
 
 
-def in_cells(cell: Int[np.ndarray, "N 3"]) -> _Cells:
-    """Order of points cell by cell, in their own order within each.
+def in_cells(points: Float[np.ndarray, "N 3"], origin: Float[np.ndarray, " 3"], edge: float) -> _Cells:
+    """Order of points cell by cell, in their own order within each; a cell begins at `origin`.
 
     Returns:
         The order; where each occupied cell begins in it, and the end; the key of each occupied cell, ascending; by
         how much the key of the next cell in x, and in y, is larger. The next in z follows by one.
     """
-    cell = cell - cell.min(axis=0)
-    room = [int(n) + 3 for n in cell.max(axis=0)]  # one cell more on each side: neighbours never wrap
-    if room[0] * room[1] * room[2] * len(cell) >= 1 << 63:
+    cell = [np.floor((points[:, k] - origin[k]) / edge).astype(np.int64) for k in range(3)]
+    cell = [c - c.min() for c in cell]
+    room = [int(c.max()) + 3 for c in cell]  # one cell more on each side: neighbours never wrap
+    if room[0] * room[1] * room[2] * len(points) >= 1 << 63:
         # A point astray, kilometres off: wide gaps between occupied layers shrink to one empty layer.
-        cell = np.stack([_closed_up(c) for c in cell.T], axis=1)
-        room = [int(n) + 3 for n in cell.max(axis=0)]
+        cell = [_closed_up(c) for c in cell]
+        room = [int(c.max()) + 3 for c in cell]
     steps = room[1] * room[2], room[2]
-    key = (cell[:, 0] + 1) * steps[0] + (cell[:, 1] + 1) * steps[1] + cell[:, 2] + 1
-    if room[0] * steps[0] * len(cell) < 1 << 63:
+    key = (cell[0] + 1) * steps[0] + (cell[1] + 1) * steps[1] + cell[2] + 1
+    bits = len(key).bit_length()
+    if room[0] * steps[0] < 1 << (63 - bits):
         # Sorting numbers takes a seventh of the time of sorting places by them stably.
-        key, order = np.divmod(np.sort(key * len(cell) + np.arange(len(cell))), len(cell))
+        together = np.sort((key << bits) | np.arange(len(key)))
+        key, order = together >> bits, together & ((1 << bits) - 1)
     else:
         order = np.argsort(key, kind="stable")
         key = key[order]
@@ -105,8 +108,13 @@ def _dbscan(
     for c in range(cells):
         for i in range(start[c], start[c + 1]):
             if core[i]:
-                _join_earlier(p, i, c, start, first[c], last[c], eps2, core, parent, witness)
-        witness[c] = _common_core(start[c], start[c + 1], core, parent)
+                for r in range(9):
+                    for other in range(first[c, r], min(last[c, r], c)):
+                        _join(p, i, start[other], start[other + 1], witness[other], eps2, core, parent)
+                is_split = _join(p, i, start[c], i, witness[c], eps2, core, parent)
+                # Whether the cell's core points so far are united changes with this one only.
+                if witness[c] < 0 or is_split:
+                    witness[c] = _common_core(start[c], i + 1, core, parent)
     label = np.full(n, -1, np.int32)
     for c in range(cells):
         for i in range(start[c], start[c + 1]):
@@ -118,24 +126,25 @@ def _dbscan(
 
 @no_type_check
 @numba.njit(cache=True)
-def _join_earlier(
-    p: np.ndarray, i: int, c: int, start: np.ndarray, first: np.ndarray, last: np.ndarray, eps2: float,
-    core: np.ndarray, parent: np.ndarray, witness: np.ndarray,
-) -> None:  # fmt: skip
-    """Unite a core point with the core points in reach that come before it: each pair once."""
+def _join(
+    p: np.ndarray, i: int, begin: int, end: int, witness: int, eps2: float, core: np.ndarray, parent: np.ndarray
+) -> bool:
+    """Unite a core point with those in reach among some of a cell; False if a `witness` of all is united with it."""
     own = _root(parent, i)
-    for r in range(9):
-        for cell in range(first[r], min(last[r], c + 1)):
-            # Most cells are united with this one already: that costs no look at their points.
-            if witness[cell] >= 0 and _root(parent, witness[cell]) == own:
-                continue
-            for j in range(start[cell], min(start[cell + 1], i)):
-                if core[j] and parent[j] != own and _distance2(p, i, j) <= eps2:
-                    other = _root(parent, j)
-                    parent[max(own, other)] = min(own, other)
-                    own = min(own, other)
-                    if witness[cell] >= 0:
-                        break
+    # Most cells are united with this point already: that costs no look at their points.
+    if witness >= 0 and _root(parent, witness) == own:
+        return False
+    for j in range(end - 1, begin - 1, -1):
+        if not core[j] or parent[j] == own:
+            continue
+        other = _root(parent, j)
+        parent[j] = other
+        if other != own and _distance2(p, i, j) <= eps2:
+            own, other = min(own, other), max(own, other)
+            parent[other] = own
+            if witness >= 0:
+                return False
+    return True
 
 
 @no_type_check
@@ -197,10 +206,16 @@ def _root(parent: np.ndarray, i: int) -> int:
     return i
 
 
+@no_type_check
+@numba.njit(cache=True)
 def _renumber(label: np.ndarray) -> np.ndarray:
     """Roots to 0..K-1 in order of first appearance."""
-    kept = label[label >= 0]
-    roots, first = np.unique(kept, return_index=True)
-    number = np.full(int(label.max(initial=-1)) + 2, -1, np.int32)
-    number[roots[np.argsort(first)]] = np.arange(len(roots))
-    return number[label]
+    number, found = np.full(len(label), -1, np.int32), np.full(len(label), -1, np.int32)
+    clusters = 0
+    for i in range(len(label)):
+        if label[i] >= 0:
+            if number[label[i]] < 0:
+                number[label[i]] = clusters
+                clusters += 1
+            found[i] = number[label[i]]
+    return found

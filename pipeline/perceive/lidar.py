@@ -81,7 +81,7 @@ def sample_uniformly(xyz_m: Float32[np.ndarray, "N 3"], voxel_m: float) -> Int[n
     if not rows.size:
         return rows
     points = xyz_m[rows].astype(np.float64)
-    order, start, *_ = in_cells(np.floor(points / voxel_m).astype(np.int64))
+    order, start, *_ = in_cells(points, np.zeros(3), voxel_m)
     return np.sort(rows[order[_nearest_to_means(points[order], start)]])
 
 
