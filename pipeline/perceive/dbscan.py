@@ -9,7 +9,7 @@ from typing import no_type_check
 
 import numba
 import numpy as np
-from jaxtyping import Float, Int, Int32
+from jaxtyping import Float, Int32
 
 __all__ = ["dbscan", "in_cells"]
 
@@ -103,18 +103,7 @@ def _dbscan(
     for c in range(cells):
         for i in range(start[c], start[c + 1]):
             core[i] = _neighbours_reach(p, i, start, first[c], last[c], eps2, min_points)
-    parent = np.arange(n)
-    witness = np.full(cells, -1)  # a core point of each cell whose core points are all united
-    for c in range(cells):
-        for i in range(start[c], start[c + 1]):
-            if core[i]:
-                for r in range(9):
-                    for other in range(first[c, r], min(last[c, r], c)):
-                        _join(p, i, start[other], start[other + 1], witness[other], eps2, core, parent)
-                is_split = _join(p, i, start[c], i, witness[c], eps2, core, parent)
-                # Whether the cell's core points so far are united changes with this one only.
-                if witness[c] < 0 or is_split:
-                    witness[c] = _common_core(start[c], i + 1, core, parent)
+    parent = _united(p, start, first, last, eps2, core)
     label = np.full(n, -1, np.int32)
     for c in range(cells):
         for i in range(start[c], start[c + 1]):
@@ -126,8 +115,36 @@ def _dbscan(
 
 @no_type_check
 @numba.njit(cache=True)
+def _united(
+    p: np.ndarray, start: np.ndarray, first: np.ndarray, last: np.ndarray, eps2: float, core: np.ndarray
+) -> np.ndarray:
+    """Trees of core points in reach of each other: a parent of each, earlier than itself or its own."""
+    parent = np.arange(len(p))
+    witness = np.full(len(start) - 1, -1)  # a core point of each cell whose core points are all united
+    for c in range(len(start) - 1):
+        for i in range(start[c], start[c + 1]):
+            if core[i]:
+                for r in range(9):
+                    for other in range(first[c, r], min(last[c, r], c)):
+                        _join(p, i, start[other], start[other + 1], witness[other], eps2, core, parent)
+                is_split = _join(p, i, start[c], i, witness[c], eps2, core, parent)
+                # Whether the cell's core points so far are united changes with this one only.
+                if witness[c] < 0 or is_split:
+                    witness[c] = _common_core(start[c], i + 1, core, parent)
+    return parent
+
+
+@no_type_check
+@numba.njit(cache=True)
 def _join(
-    p: np.ndarray, i: int, begin: int, end: int, witness: int, eps2: float, core: np.ndarray, parent: np.ndarray
+    p: np.ndarray,
+    i: int,
+    begin: int,
+    end: int,
+    witness: int,
+    eps2: float,
+    core: np.ndarray,
+    parent: np.ndarray,
 ) -> bool:
     """Unite a core point with those in reach among some of a cell; False if a `witness` of all is united with it."""
     own = _root(parent, i)
@@ -164,7 +181,13 @@ def _common_core(begin: int, end: int, core: np.ndarray, parent: np.ndarray) -> 
 @no_type_check
 @numba.njit(cache=True)
 def _nearest_core(
-    p: np.ndarray, i: int, start: np.ndarray, first: np.ndarray, last: np.ndarray, eps2: float, core: np.ndarray
+    p: np.ndarray,
+    i: int,
+    start: np.ndarray,
+    first: np.ndarray,
+    last: np.ndarray,
+    eps2: float,
+    core: np.ndarray,
 ) -> int:
     nearest, best = -1, eps2
     for r in range(9):

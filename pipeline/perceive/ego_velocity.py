@@ -226,7 +226,9 @@ def _starts(
     u: np.ndarray, rate: np.ndarray, velocities: np.ndarray, period: float, sigma: float
 ) -> np.ndarray:
     """The few velocities (K 2) with most support, at least 1 m/s apart."""
-    score = _scores(*np.ascontiguousarray(u[:, :2].T), rate, *np.ascontiguousarray(velocities.T), period, sigma)
+    score = _scores(
+        *np.ascontiguousarray(u[:, :2].T), rate, *np.ascontiguousarray(velocities.T), period, sigma
+    )
     peaks = []
     for _ in range(_PEAKS):
         if not len(score) or score.max() <= 0:

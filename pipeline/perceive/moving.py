@@ -49,11 +49,7 @@ def _linked(x: np.ndarray, y: np.ndarray, scale: np.ndarray, rate: np.ndarray, p
                 doppler -= period * np.rint(doppler / period)
             if np.hypot(np.sqrt(dx * dx + dy * dy) / reach, doppler) <= 1.0:
                 is_alone[i] = is_alone[j] = False
-                a, b = i, j
-                while first[a] != a:
-                    a = first[a]
-                while first[b] != b:
-                    b = first[b]
+                a, b = _first_of(first, i), _first_of(first, j)
                 first[max(a, b)] = min(a, b)
     label = np.full(len(x), -1, np.int32)
     groups = 0
@@ -66,6 +62,14 @@ def _linked(x: np.ndarray, y: np.ndarray, scale: np.ndarray, rate: np.ndarray, p
         else:  # its first is earlier, and numbered
             label[i] = label[first[i]]
     return label
+
+
+@no_type_check
+@njit(cache=True)
+def _first_of(first: np.ndarray, i: int) -> int:
+    while first[i] != i:
+        i = first[i]
+    return i
 
 
 def wrapped(value: np.ndarray, period: float) -> np.ndarray:
