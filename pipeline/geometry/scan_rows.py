@@ -9,12 +9,13 @@ false depth jumps on the ground.
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple, no_type_check
 
 import numpy as np
-from jaxtyping import Float, Int32, UInt16
+from jaxtyping import Float, Int, Int32, UInt16
+from numba import njit
 
-__all__ = ["rows_of"]
+__all__ = ["ScanRows", "rows_of"]
 
 # Elevation changes little from beam to beam in a row: rows of automotive scanners are calibrated to
 # hundredths of a degree, de-skewing bends them by less than a tenth, and a sagging raster changes by degrees
@@ -30,10 +31,17 @@ _ONE_SENSE: Final = 0.999
 _BESIDE: Final = 6  # points on each side whose mean elevations are compared
 
 
+class ScanRows(NamedTuple):
+    """Row of each point, from the lowest row up, and the points' order by row, then by azimuth."""
+
+    row: Int32[np.ndarray, " N"]
+    order: Int[np.ndarray, " N"]
+
+
 def rows_of(
     azimuth_elevation_range: Float[np.ndarray, "N 3"], ring: UInt16[np.ndarray, " N"] | None
-) -> Int32[np.ndarray, " N"] | None:
-    """Row numbers from the lowest row up; None if the sweep has no rows.
+) -> ScanRows | None:
+    """Rows of a sweep; None if it has none.
 
     Args:
         azimuth_elevation_range: of each point [rad, rad, m].
@@ -44,18 +52,42 @@ def rows_of(
     azimuth, elevation, _ = azimuth_elevation_range.T
     told = (_by_height(ring, elevation),) if ring is not None else ()
     for row in told or (_by_order(azimuth, elevation), _by_elevation(elevation)):
-        if row is not None and _are_rows(azimuth, elevation, row):
-            return row
+        if row is not None:
+            # NumPy's fast sort, then rows apart: a stable one by two keys takes ten times as long.
+            order = _row_by_row(np.argsort(azimuth), azimuth, row, int(row.max()) + 1)
+            if _are_rows(elevation[order], row[order]):
+                return ScanRows(row, order)
     return None
+
+
+@no_type_check  # keeps the tests' shape checks out of compiled code
+@njit(cache=True)
+def _row_by_row(by_azimuth: np.ndarray, azimuth: np.ndarray, row: np.ndarray, rows: int) -> np.ndarray:
+    """The points in order of row, then azimuth, then place."""
+    place = np.zeros(rows + 1, np.int64)
+    for i in range(len(row)):
+        place[row[i] + 1] += 1
+    place = np.cumsum(place)
+    start, order = place.copy(), np.empty(len(row), np.int64)
+    for i in by_azimuth:
+        k = place[row[i]]
+        # Points at the same azimuth came in any order.
+        while k > start[row[i]] and azimuth[order[k - 1]] == azimuth[i] and order[k - 1] > i:
+            order[k] = order[k - 1]
+            k -= 1
+        order[k] = i
+        place[row[i]] += 1
+    return order
 
 
 def _by_height(ring: np.ndarray, elevation: np.ndarray) -> np.ndarray:
     """Ring numbers renumbered from the lowest beam up (drivers number beams in firing order)."""
-    rings, inverse = np.unique(ring, return_inverse=True)
-    mean = np.bincount(inverse, elevation) / np.bincount(inverse)
-    rank = np.empty(len(rings), np.int32)
-    rank[np.argsort(mean, kind="stable")] = np.arange(len(rings), dtype=np.int32)
-    return rank[inverse]
+    count = np.bincount(ring)
+    rings = np.flatnonzero(count)
+    mean = np.bincount(ring, elevation)[rings] / count[rings]
+    rank = np.empty(len(count), np.int32)
+    rank[rings[np.argsort(mean, kind="stable")]] = np.arange(len(rings), dtype=np.int32)
+    return rank[ring]
 
 
 def _by_elevation(elevation: np.ndarray) -> np.ndarray | None:
@@ -94,8 +126,7 @@ def _beginning(way: np.ndarray, elevation: np.ndarray) -> float:
     return float(place[np.argmax(np.abs(np.median(after - before, axis=0)))])
 
 
-def _are_rows(azimuth: np.ndarray, elevation: np.ndarray, row: np.ndarray) -> bool:
-    """True if neighbours in a row have the same elevation; rows of a single point are ignored."""
-    order = np.lexsort((azimuth, row))
-    step = np.abs(np.diff(elevation[order]))[np.diff(row[order]) == 0]
+def _are_rows(elevation: np.ndarray, row: np.ndarray) -> bool:
+    """True if neighbours in a row, in order, have the same elevation; rows of a single point are ignored."""
+    step = np.abs(np.diff(elevation))[np.diff(row) == 0]
     return len(step) == 0 or bool(np.median(step) < _SAME_ROW_RAD)

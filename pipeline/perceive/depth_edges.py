@@ -63,16 +63,15 @@ def lidar_edges(
     exceed both `edge_jump_m` and `edge_jump_fraction` of the range.
     """
     aer = to_spherical(xyz_m.astype(np.float64))
-    keep = np.flatnonzero(np.isfinite(aer).all(1) & (aer[:, 2] > _MIN_RANGE_M))
+    keep = np.flatnonzero(np.isfinite(aer[:, 2]) & (aer[:, 2] > _MIN_RANGE_M))
     if keep.size < 2:
         return _edges([], keep, cluster, has_rows=False)
     aer = aer[keep]
-    row = rows_of(aer, None if ring is None else ring[keep])
-    if row is None:
+    rows = rows_of(aer, None if ring is None else ring[keep])
+    if rows is None:
         found = jumps_between_neighbours(aer, cluster[keep], config.edge_jump_m, config.edge_jump_fraction)
         return _edges(found, keep, cluster, has_rows=False)
-    order = np.lexsort((aer[:, 0], row))
-    aer, row, keep = aer[order], row[order], keep[order]
+    aer, row, keep = aer[rows.order], rows.row[rows.order], keep[rows.order]
     step_rad = _azimuth_step(aer[:, 0], row)
     along = _along_rings(aer, row, step_rad, config)
     between = _between_rings(aer, row, cluster[keep], step_rad, config)
@@ -119,17 +118,10 @@ def _between_rings(
     found = []
     # The foreground lies below the points of the ring above it.
     for side, up in ((EDGE_BELOW, 1), (EDGE_ABOVE, -1)):
-        here = np.flatnonzero(cluster >= 0)
-        there = _nearest_in_row(aer[:, 0], row, start, here, up)
-        here, there = here[there >= 0], there[there >= 0]
-        jump = aer[there, 2] - aer[here, 2]
-        ok = (
-            (np.abs(aer[there, 0] - aer[here, 0]) <= _SAME_COLUMN_STEPS * step_rad)
-            & (np.abs(aer[there, 1] - aer[here, 1]) <= _MAX_ROW_GAP_RAD)
-            & (jump > np.maximum(config.edge_jump_m, config.edge_jump_fraction * aer[here, 2]))
-            & ((cluster[there] < 0) | (cluster[there] != cluster[here]))
-        )
-        here, there = here[ok], there[ok]
+        here, there = _jumps_to_row(
+            aer, row, cluster, start, up, _SAME_COLUMN_STEPS * step_rad, config.edge_jump_m,
+            config.edge_jump_fraction,
+        )  # fmt: skip
         at = np.column_stack([aer[here, 0], (aer[here, 1] + aer[there, 1]) / 2, aer[here, 2]])
         gap = np.abs(aer[there, 1] - aer[here, 1])
         found.append(Jumps(at, side, aer[there, 2] - aer[here, 2], gap, here))
@@ -138,27 +130,34 @@ def _between_rings(
 
 @no_type_check  # keeps the tests' shape checks out of compiled code
 @njit(cache=True)
-def _nearest_in_row(
-    azimuth: np.ndarray, row: np.ndarray, start: np.ndarray, here: np.ndarray, up: int
-) -> np.ndarray:
-    """For each point of `here`, sorted by row and azimuth, that next to it `up` rows further; -1 without one."""
-    there = np.full(len(here), -1)
-    rows = len(start) - 1
+def _jumps_to_row(
+    aer: np.ndarray, row: np.ndarray, cluster: np.ndarray, start: np.ndarray, up: int, column_rad: float,
+    jump_m: float, jump_fraction: float,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Clustered points, by row and azimuth, and those next to them `up` rows further, where these lie behind."""
+    here, there = np.empty(len(row), np.int64), np.empty(len(row), np.int64)
+    count, rows = 0, len(start) - 1
     after, before_row = 0, -1
-    for k in range(len(here)):
-        i = here[k]
+    for i in range(len(row)):
         other = int(row[i]) + up
-        if other < 0 or other >= rows or start[other] == start[other + 1]:
+        if cluster[i] < 0 or other < 0 or other >= rows or start[other] == start[other + 1]:
             continue
         if row[i] != before_row:
             after, before_row = start[other], row[i]
         end = start[other + 1]
-        while after < end and azimuth[after] < azimuth[i]:
+        while after < end and aer[after, 0] < aer[i, 0]:
             after += 1
         left, right = max(after - 1, start[other]), min(after, end - 1)
-        is_left = azimuth[i] - azimuth[left] <= azimuth[right] - azimuth[i]
-        there[k] = left if is_left else right
-    return there
+        j = left if aer[i, 0] - aer[left, 0] <= aer[right, 0] - aer[i, 0] else right
+        if (
+            abs(aer[j, 0] - aer[i, 0]) <= column_rad
+            and abs(aer[j, 1] - aer[i, 1]) <= _MAX_ROW_GAP_RAD
+            and aer[j, 2] - aer[i, 2] > max(jump_m, jump_fraction * aer[i, 2])
+            and cluster[j] != cluster[i]
+        ):
+            here[count], there[count] = i, j
+            count += 1
+    return here[:count], there[:count]
 
 
 def _edges(found: list[Jumps], keep: np.ndarray, cluster: np.ndarray, *, has_rows: bool) -> LidarEdges:

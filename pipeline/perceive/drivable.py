@@ -8,11 +8,11 @@ fallback for the paper's weakly supervised network (section 4.2).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, no_type_check, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, UInt8
-from scipy.spatial import cKDTree
+from numba import njit
 
 from pipeline.geometry.radar_grid import Scan
 
@@ -81,8 +81,28 @@ def _supported(points_m: np.ndarray) -> np.ndarray:
         return points_m
     plane = points_m[:, :2].astype(np.float64)
     radius = _NEIGHBOUR_M + _NEIGHBOUR_FRACTION * np.linalg.norm(plane, axis=1)
-    count = cKDTree(plane).query_ball_point(plane, radius, return_length=True)
-    return points_m[count > _NEIGHBOURS]
+    order = np.argsort(plane[:, 0], kind="stable")
+    keep = np.empty(len(plane), bool)
+    keep[order] = _have_others(plane[order], radius[order], _NEIGHBOURS)
+    return points_m[keep]
+
+
+@no_type_check  # keeps the tests' shape checks out of compiled code
+@njit(cache=True)
+def _have_others(xy: np.ndarray, radius: np.ndarray, wanted: int) -> np.ndarray:
+    """Whether more than so many points, itself among them, lie in each one's radius; sorted by x."""
+    enough = np.zeros(len(xy), np.bool_)
+    for i in range(len(xy)):
+        found = 1
+        for way in (-1, 1):
+            j = i + way
+            while found <= wanted and 0 <= j < len(xy) and abs(xy[j, 0] - xy[i, 0]) <= radius[i]:
+                dx, dy = xy[j, 0] - xy[i, 0], xy[j, 1] - xy[i, 1]
+                if dx * dx + dy * dy <= radius[i] * radius[i]:
+                    found += 1
+                j += way
+        enough[i] = found > wanted
+    return enough
 
 
 def _bridge_gaps(centres_rad: np.ndarray, nearest_m: np.ndarray) -> FreeSector:

@@ -23,6 +23,7 @@ from numba import njit
 
 from pipeline.config import PerceiveConfig
 from pipeline.perceive.moving import cluster_moving, wrapped
+from pipeline.perceive.selection import median_of
 
 __all__ = ["MOVING", "STATIC", "UNDECIDED", "RadarMotion", "Travel", "radar_motion"]
 
@@ -225,7 +226,9 @@ def _starts(
     u: np.ndarray, rate: np.ndarray, velocities: np.ndarray, period: float, sigma: float
 ) -> np.ndarray:
     """The few velocities (K 2) with most support, at least 1 m/s apart."""
-    score = _scores(u, rate, velocities, period, sigma)
+    score = _scores(
+        *np.ascontiguousarray(u[:, :2].T), rate, *np.ascontiguousarray(velocities.T), period, sigma
+    )
     peaks = []
     for _ in range(_PEAKS):
         if not len(score) or score.max() <= 0:
@@ -255,14 +258,17 @@ def _search_points(u: np.ndarray, power: np.ndarray | None, rng: np.random.Gener
 
 @no_type_check  # keeps the tests' shape checks out of compiled code
 @njit(cache=True, fastmath=True)
-def _scores(u: np.ndarray, rate: np.ndarray, v: np.ndarray, period: float, sigma: float) -> np.ndarray:
+def _scores(
+    ux: np.ndarray, uy: np.ndarray, rate: np.ndarray, vx: np.ndarray, vy: np.ndarray, period: float,
+    sigma: float,
+) -> np.ndarray:  # fmt: skip
     """Sum of (1 + (r / sigma)^2)^-2 over detections for each velocity."""
-    out = np.zeros(len(v))
+    out = np.zeros(len(vx))
     inverse_period = 1 / period if period > 0 else 0.0
-    for i in range(len(v)):
+    for i in range(len(vx)):
         total = 0.0
-        for k in range(len(u)):
-            r = rate[k] + u[k, 0] * v[i, 0] + u[k, 1] * v[i, 1]
+        for k in range(len(ux)):
+            r = rate[k] + ux[k] * vx[i] + uy[k] * vy[i]
             r -= period * np.floor(r * inverse_period + 0.5)
             t = 1 / (1 + (r / sigma) ** 2)
             total += t * t
@@ -272,25 +278,75 @@ def _scores(u: np.ndarray, rate: np.ndarray, v: np.ndarray, period: float, sigma
 
 def _refine(scan: _Doppler, velocity: np.ndarray) -> _Fit:
     """Reweighted least squares (Geman-McClure, from the gate to the noise), weak prior on the vertical."""
-    u, gate = scan.u, scan.gate
-    scale = max(gate, _GRID_SIGMA_MPS)
-    noise, information = scale, np.eye(3)
-    for _ in range(12):
-        r = scan.residual(velocity)
-        near = np.abs(r[np.abs(r) < gate])
-        noise = min(max(1.4826 * _median(near), _NOISE_FLOOR_MPS), gate) if len(near) else gate
-        scale = max(0.6 * scale, 2.5 * noise)
-        w = (1 + (r / scale) ** 2) ** -2
-        # Poor elevations leave the vertical component free: the prior bounds it.
-        vertical = 1 / (0.05 + _VERTICAL_SLOPE * np.hypot(velocity[0], velocity[1])) ** 2
-        information = (u.T * w) @ u / noise**2 + np.diag([1e-6, 1e-6, vertical])
-        step = np.linalg.solve(information, -(u.T @ (w * r)) / noise**2 - [0, 0, vertical * velocity[2]])
-        velocity = velocity + step
+    velocity, information, noise = _reweighted(scan.u, scan.rate, scan.period, scan.gate, velocity)
     return velocity, np.linalg.inv(information), noise
 
 
-def _median(value: np.ndarray) -> float:
-    """np.median, without the half of its time that it spends on axes and NaN."""
-    low, high = (len(value) - 1) // 2, len(value) // 2
-    part = np.partition(value, (low, high))
-    return float(part[low] + part[high]) / 2
+@no_type_check
+@njit(cache=True)
+def _reweighted(
+    u: np.ndarray, rate: np.ndarray, period: float, gate: float, velocity: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Velocity after twelve steps; information matrix and noise of the last one."""
+    v, A, g = velocity.copy(), np.zeros((3, 3)), np.zeros(3)
+    residual, near = np.empty(len(rate)), np.empty(len(rate))
+    scale = noise = max(gate, _GRID_SIGMA_MPS)
+    for _ in range(12):
+        count = 0
+        for k in range(len(rate)):
+            r = rate[k] + (u[k, 0] * v[0] + u[k, 1] * v[1] + u[k, 2] * v[2])
+            if period > 0:
+                r -= period * np.rint(r / period)
+            residual[k] = r
+            if abs(r) < gate:
+                near[count] = abs(r)
+                count += 1
+        noise = min(max(1.4826 * median_of(near, count), _NOISE_FLOOR_MPS), gate) if count else gate
+        scale = max(0.6 * scale, 2.5 * noise)
+        A[:], g[:] = 0.0, 0.0
+        for k in range(len(rate)):
+            r = residual[k]
+            t = 1 / (1 + (r / scale) ** 2)
+            x, y, z, w = u[k, 0], u[k, 1], u[k, 2], t * t
+            A[0, 0] += w * x * x
+            A[0, 1] += w * x * y
+            A[0, 2] += w * x * z
+            A[1, 1] += w * y * y
+            A[1, 2] += w * y * z
+            A[2, 2] += w * z * z
+            g[0] -= w * x * r
+            g[1] -= w * y * r
+            g[2] -= w * z * r
+        # Poor elevations leave the vertical component free: the prior bounds it.
+        vertical = 1 / (0.05 + _VERTICAL_SLOPE * np.hypot(v[0], v[1])) ** 2
+        A[1, 0], A[2, 0], A[2, 1] = A[0, 1], A[0, 2], A[1, 2]
+        A /= noise**2
+        g /= noise**2
+        A[0, 0] += 1e-6
+        A[1, 1] += 1e-6
+        A[2, 2] += vertical
+        g[2] -= vertical * v[2]
+        v += _solved(A, g)
+    return v, A, noise
+
+
+@no_type_check
+@njit(cache=True)
+def _solved(A: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Solution of A x = b with A symmetric and positive definite, 3 by 3, by its Cholesky factor."""
+    L, x = np.zeros((3, 3)), b.copy()
+    for i in range(3):
+        for j in range(i + 1):
+            rest = A[i, j]
+            for k in range(j):
+                rest -= L[i, k] * L[j, k]
+            L[i, j] = np.sqrt(rest) if i == j else rest / L[j, j]
+    for i in range(3):
+        for k in range(i):
+            x[i] -= L[i, k] * x[k]
+        x[i] /= L[i, i]
+    for i in range(2, -1, -1):
+        for k in range(i + 1, 3):
+            x[i] -= L[k, i] * x[k]
+        x[i] /= L[i, i]
+    return x

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from pipeline.config import PerceiveConfig
 from pipeline.geometry.cameras import camera_of
@@ -50,7 +50,7 @@ def why_unusable(capture: Capture) -> FrameReason | None:
             camera_of(capture)
         except ValueError:
             return FrameReason.CAMERA_MODEL
-    if isinstance(capture, Sweep) and np.isfinite(capture.lidar_xyz_m).all(axis=1).sum() < _MIN_LIDAR_POINTS:
+    if isinstance(capture, Sweep) and np.count_nonzero(_is_finite(capture)) < _MIN_LIDAR_POINTS:
         return FrameReason.FEW_LIDAR_POINTS
     if isinstance(capture, Scan) and not len(capture.radar_x_m):
         return FrameReason.FEW_RADAR_POINTS
@@ -207,14 +207,17 @@ class _Finite:
 
 
 def _finite(sweep: SweepColumns) -> _Finite:
-    xyz = sweep.lidar_xyz_m
-    finite = np.isfinite(xyz).all(axis=1)
+    xyz, finite = sweep.lidar_xyz_m, _is_finite(sweep)
     # It is unknown whether the driver de-skewed the points that it logged.
     times = sweep.lidar_time_s if sweep.lidar_deskewed else None
     columns = (sweep.lidar_intensity, sweep.lidar_ring, times)
     if finite.all():
         return _Finite(xyz, *columns)
     return _Finite(xyz[finite], *(None if column is None else column[finite] for column in columns))
+
+
+def _is_finite(sweep: SweepColumns) -> Bool[np.ndarray, " N"]:
+    return np.isfinite(sweep.lidar_x_m) & np.isfinite(sweep.lidar_y_m) & np.isfinite(sweep.lidar_z_m)
 
 
 def _begin(capture: Capture) -> dict[str, Any]:

@@ -18,11 +18,14 @@ import numba
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
+from pipeline.perceive.selection import kth_smallest
+
 __all__ = ["Ground", "PointKind", "PointSource", "find_ground", "height_over"]
 
 _NEAR_M = 2.5  # nearer returns are the vehicle itself
 _FAR_M = 60.0  # a 0.2 deg grazing angle and less: no ground returns worth a plane
 _CELL_M = 1.0
+_GRID_CELLS = 2 * (int(_FAR_M / _CELL_M) + 1)
 _PLANE_REACH_M = 35.0  # further out a plane is a poor model of a road
 _MAX_TILT_RAD = 0.26  # 15 deg: mounting plus road; a steeper "ground" is a bank or a wall
 _HEIGHT_RANGE_M = (0.3, 4.0)  # lidar above the road: bumper to truck roof
@@ -88,12 +91,13 @@ def find_ground(
     road = every if kind is None else kind == PointKind.ROAD
     labelled = ~every if kind is None else road | (kind == PointKind.FLAT)
     may_be_ground = every if kind is None else labelled | (kind == PointKind.UNKNOWN)
-    range_m = np.hypot(xyz_m[:, 0], xyz_m[:, 1])
+    azimuth, range_m = np.arctan2(xyz_m[:, 1], xyz_m[:, 0]), np.hypot(xyz_m[:, 0], xyz_m[:, 1])
     seen = (range_m > _NEAR_M) & (range_m < _FAR_M)
-    plane = _fit_plane(*_lowest_of_cells(xyz_m[road]), inlier_m, rng)
+    near = road & (range_m > _NEAR_M) & (range_m < _PLANE_REACH_M)
+    plane = _fit_plane(*_lowest_of_cells(xyz_m, near), inlier_m, rng)
     if plane is None:  # too little road: what a model calls ground is no object all the same
         return Ground(None, labelled & seen, labelled & road & seen, np.zeros((0, 3), np.float32))
-    above_local = _follow_surface(xyz_m, height_over(plane, xyz_m), inlier_m, may_be_ground)
+    above_local = _follow_surface(azimuth, range_m, height_over(plane, xyz_m), inlier_m, may_be_ground)
     # Range noise on a grazing beam and ring tilt show as height: 0.3 % of the range.
     on_surface = np.abs(above_local) < inlier_m + 0.003 * range_m
     # Grass is rough, and a model classifies it as ground; higher points are mistakes.
@@ -104,8 +108,8 @@ def find_ground(
     if kind is not None:  # a road user blocks by its feet and wheels too
         user = (kind == PointKind.ROAD_USER) & (above_local < _OBSTACLE_M[1])
         blocks = (blocks & ~is_ground) | user
-    free = _reachable(xyz_m, range_m, blocks)
-    return Ground(plane, is_ground, is_road, _on_grid(xyz_m[is_road & free]))
+    free = _reachable(azimuth, range_m, blocks)
+    return Ground(plane, is_ground, is_road, _on_grid(xyz_m, is_road & free))
 
 
 def height_over(
@@ -115,21 +119,30 @@ def height_over(
     return (xyz_m @ plane[:3].astype(np.float32) + np.float32(plane[3])).astype(np.float32)
 
 
-def _lowest_of_cells(xyz_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _lowest_of_cells(xyz_m: np.ndarray, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Lowest point of each cell, and its weight in the fit of the ground under the vehicle."""
-    range_m = np.hypot(xyz_m[:, 0], xyz_m[:, 1])
-    near = xyz_m[(range_m > _NEAR_M) & (range_m < _PLANE_REACH_M)].astype(np.float64)
-    if not len(near):
-        return near, np.zeros(0)
-    cell = _cells(near)
-    order = np.lexsort((near[:, 2], cell))
-    first = np.flatnonzero(np.append(True, np.diff(cell[order]) != 0))
-    low = near[order[first]]
-    top_m = near[order[np.append(first[1:], len(order)) - 1], 2]
+    row, top_m = _ends_of_cells(xyz_m, chosen)
+    low = xyz_m[row].astype(np.float64)
     # The vehicle stands on the ground that is wanted: cells near it and along its way count more than ditches
     # and banks beside the road; cells with something standing in them, whose lowest point may be a bumper, less.
     weight = 1 / (1 + (low[:, 0] / _TRUSTED_AHEAD_M) ** 2 + (low[:, 1] / _TRUSTED_ASIDE_M) ** 2)
     return low, np.where(top_m - low[:, 2] < _FLAT_M, weight, 0.2 * weight)
+
+
+@no_type_check  # keeps the tests' shape checks out of compiled code
+@numba.njit(cache=True)
+def _ends_of_cells(xyz: np.ndarray, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Row of the lowest point of each cell, and height of the highest; cells in order of x, then y."""
+    lowest = np.full(_GRID_CELLS * _GRID_CELLS, -1)
+    top = np.full(len(lowest), -np.inf)
+    for i in range(len(xyz)):
+        if chosen[i]:
+            c, z = _cell(xyz[i, 0], xyz[i, 1]), xyz[i, 2]
+            if lowest[c] < 0 or z < xyz[lowest[c], 2]:
+                lowest[c] = i
+            top[c] = max(top[c], z)
+    occupied = np.flatnonzero(lowest >= 0)
+    return lowest[occupied], top[occupied]
 
 
 def _fit_plane(
@@ -178,10 +191,14 @@ def _support(
 
 def _refine(low: np.ndarray, weight: np.ndarray, plane: np.ndarray, inlier_m: float) -> np.ndarray | None:
     """Weighted least squares on the plane's inliers, repeated with the inliers that it then has."""
+    before = np.zeros(len(low), bool)
     for _ in range(8):
         inside = np.abs(low @ plane[:3] + plane[3]) < inlier_m
-        if np.sum(inside) < _MIN_SUPPORT:
+        if np.count_nonzero(inside) < _MIN_SUPPORT:
             return None
+        if np.array_equal(inside, before):  # and so would be all that follows
+            break
+        before = inside
         points, share = low[inside], weight[inside, None] / weight[inside].sum()
         centre = np.sum(share * points, axis=0)
         normal = np.linalg.svd(np.sqrt(share) * (points - centre), full_matrices=False)[2][2]
@@ -191,72 +208,107 @@ def _refine(low: np.ndarray, weight: np.ndarray, plane: np.ndarray, inlier_m: fl
 
 
 def _follow_surface(
-    xyz_m: np.ndarray, height_m: np.ndarray, inlier_m: float, may_be_ground: np.ndarray
+    azimuth: np.ndarray, range_m: np.ndarray, height_m: np.ndarray, inlier_m: float, may_be_ground: np.ndarray
 ) -> np.ndarray:
     """Height over the local ground: each sector follows possible ground outwards."""
-    azimuth = np.arctan2(xyz_m[:, 1], xyz_m[:, 0])
     sector = np.minimum(((azimuth + np.pi) / (2 * np.pi) * _SECTORS).astype(np.int32), _SECTORS - 1)
-    ring = (np.hypot(xyz_m[:, 0], xyz_m[:, 1]) / _BIN_M).astype(np.int32)
     bins = int(np.ceil(_FAR_M / _BIN_M)) + 1
-    ring = np.minimum(ring, bins - 1)
+    ring = np.minimum((range_m / _BIN_M).astype(np.int32), bins - 1)
     cell = sector * bins + ring
-    order = np.argsort(cell, kind="stable")
-    order = order[may_be_ground[order]]
-    start = np.searchsorted(cell[order], np.arange(_SECTORS * bins + 1))
-    surface = _walk(height_m[order].astype(np.float64), start, _SECTORS, bins, inlier_m)
+    height, start = _by_cell(height_m.astype(np.float64), cell, may_be_ground, _SECTORS * bins)
+    surface = _walk(height, start, _SECTORS, bins, inlier_m)
     # Neighbouring sectors see the same road: their median drops the sector that climbed onto a car.
-    surface = np.median(np.stack([np.roll(surface, s, axis=0) for s in (-2, -1, 0, 1, 2)]), axis=0)
-    return (height_m - surface[sector, ring]).astype(np.float32)
+    surface = np.sort(np.stack([np.roll(surface, s, axis=0) for s in (-2, -1, 0, 1, 2)], axis=-1))[..., 2]
+    return (height_m - surface.ravel()[cell]).astype(np.float32)
+
+
+@no_type_check  # keeps the tests' shape checks out of compiled code
+@numba.njit(cache=True)
+def _by_cell(
+    value: np.ndarray, cell: np.ndarray, chosen: np.ndarray, cells: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Chosen values cell by cell, and where each cell begins."""
+    start = np.zeros(cells + 1, np.int64)
+    for i in range(len(value)):
+        if chosen[i]:
+            start[cell[i] + 1] += 1
+    start = np.cumsum(start)
+    found, place = np.empty(start[-1]), start[:-1].copy()
+    for i in range(len(value)):
+        if chosen[i]:
+            found[place[cell[i]]] = value[i]
+            place[cell[i]] += 1
+    return found, start
 
 
 @no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True)
 def _walk(height: np.ndarray, start: np.ndarray, sectors: int, bins: int, inlier_m: float) -> np.ndarray:
-    surface = np.zeros((sectors, bins))
+    surface, fits = np.zeros((sectors, bins)), np.empty(len(height))
     for s in range(sectors):
         level, gap = 0.0, 1
         for b in range(bins):
-            cell = height[start[s * bins + b] : start[s * bins + b + 1]]
             reach = inlier_m + _SLOPE * _BIN_M * min(gap, 4)
             # Upwards half as much: behind a gap without ground, a bonnet is more frequent than a hill.
-            fits = np.sort(cell[(cell - level > -reach) & (cell - level < (inlier_m + reach) / 2)])
-            if fits.size >= 2:
+            count = 0
+            for i in range(start[s * bins + b], start[s * bins + b + 1]):
+                if height[i] - level > -reach and height[i] - level < (inlier_m + reach) / 2:
+                    fits[count] = height[i]
+                    count += 1
+            if count >= 2:
                 # The lower part: the upper one may be the foot of an object.
-                level, gap = fits[int(0.3 * (fits.size - 1))], 1
+                level, gap = kth_smallest(fits, count, int(0.3 * (count - 1))), 1
             else:
                 gap += 1
             surface[s, b] = level
     return surface
 
 
-def _reachable(xyz_m: np.ndarray, range_m: np.ndarray, blocks: np.ndarray) -> np.ndarray:
+def _reachable(azimuth: np.ndarray, range_m: np.ndarray, blocks: np.ndarray) -> np.ndarray:
     """True where nothing that blocks stands nearer in the same direction; the own vehicle does not."""
-    azimuth = np.arctan2(xyz_m[:, 1], xyz_m[:, 0])
     direction = np.minimum(((azimuth + np.pi) / (2 * np.pi) * _FREE_BINS).astype(np.int32), _FREE_BINS - 1)
     blocks = blocks & (range_m > _NEAR_M)
-    limit = _second_nearest(direction[blocks], range_m[blocks])
+    limit = _second_nearest(direction, range_m, blocks)
     return range_m < limit[direction]
 
 
-def _second_nearest(direction: np.ndarray, range_m: np.ndarray) -> np.ndarray:
+@no_type_check  # keeps the tests' shape checks out of compiled code
+@numba.njit(cache=True)
+def _second_nearest(direction: np.ndarray, range_m: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     """Second shortest range per direction (one return may be snow), infinity if there is none."""
-    order = np.lexsort((range_m, direction))
-    direction, range_m = direction[order], range_m[order]
-    limit = np.full(_FREE_BINS, np.inf)
-    second = np.flatnonzero(direction[1:] == direction[:-1]) + 1
-    directions, first = np.unique(direction[second], return_index=True)
-    limit[directions] = range_m[second[first]]
-    return limit
+    first, second = np.full(_FREE_BINS, np.inf), np.full(_FREE_BINS, np.inf)
+    for i in range(len(direction)):
+        if chosen[i]:
+            d, r = direction[i], range_m[i]
+            if r < first[d]:
+                first[d], second[d] = r, first[d]
+            elif r < second[d]:
+                second[d] = r
+    return second
 
 
-def _on_grid(ground_m: np.ndarray) -> np.ndarray:
-    """Mean ground point of each occupied cell."""
-    _, index, count = np.unique(_cells(ground_m), return_inverse=True, return_counts=True)
-    sums = np.stack([np.bincount(index, ground_m[:, k], len(count)) for k in range(3)], axis=1)
-    return (sums / count[:, None]).astype(np.float32)
+@no_type_check
+@numba.njit(cache=True)
+def _on_grid(xyz: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """Mean of the chosen points of each occupied cell."""
+    total, count = np.zeros((_GRID_CELLS * _GRID_CELLS, 3)), np.zeros(_GRID_CELLS * _GRID_CELLS, np.int64)
+    for i in range(len(xyz)):
+        if chosen[i]:
+            c = _cell(xyz[i, 0], xyz[i, 1])
+            count[c] += 1
+            for k in range(3):
+                total[c, k] += xyz[i, k]
+    occupied = np.flatnonzero(count)
+    mean = np.empty((len(occupied), 3), np.float32)
+    for j, c in enumerate(occupied):
+        mean[j] = total[c] / count[c]
+    return mean
 
 
-def _cells(xyz_m: np.ndarray) -> np.ndarray:
-    """Number of each point's cell, which grows with x, then with y."""
-    x, y = (np.floor(xyz_m[:, k] / _CELL_M).astype(np.int64) for k in (0, 1))
-    return (x << 32) + y
+@no_type_check
+@numba.njit(cache=True)
+def _cell(x: float, y: float) -> int:
+    """Number of the cell of a point that is seen; it grows with x, then with y."""
+    return (int(np.floor(x / _CELL_M)) + _GRID_CELLS // 2) * _GRID_CELLS + (
+        int(np.floor(y / _CELL_M)) + _GRID_CELLS // 2
+    )

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int, Int32
 from numba import njit
 
-from pipeline.perceive.dbscan import dbscan
+from pipeline.perceive.dbscan import dbscan, in_cells
 
 __all__ = ["Boxes", "cluster_boxes", "cluster_objects", "sample_uniformly"]
 
@@ -39,7 +39,7 @@ def cluster_objects(
     heights are halved (see _VERTICAL).
     """
     label = np.full(len(xyz_m), -1, np.int32)
-    range_m = np.linalg.norm(xyz_m, axis=1)
+    range_m = _lengths(xyz_m)
     rows = np.flatnonzero(~is_ground & (range_m > _NEAR_M))
     if len(rows) >= min_points:
         label[rows] = dbscan(_evenly_spaced(xyz_m[rows], range_m[rows]), eps_m, min_points)
@@ -48,18 +48,28 @@ def cluster_objects(
 
 def cluster_boxes(xyz_m: Float32[np.ndarray, "N 3"], label: Int32[np.ndarray, " N"]) -> Boxes:
     """Boxes of all clusters, row k for label k."""
-    rows = np.flatnonzero(label >= 0)
-    if not rows.size:
+    if not (label >= 0).any():
         none = np.zeros((0, 3), np.float32)
         return Boxes(none, none, none)
-    order = rows[np.argsort(label[rows], kind="stable")]
-    points = xyz_m[order]
-    start = np.flatnonzero(np.diff(label[order], prepend=-1))
-    count = np.diff(np.append(start, len(order)))[:, None]
-    centre = np.add.reduceat(points.astype(np.float64), start) / count
-    return Boxes(
-        centre.astype(np.float32), np.minimum.reduceat(points, start), np.maximum.reduceat(points, start)
-    )
+    return Boxes(*_boxes(xyz_m, label, int(label.max()) + 1))
+
+
+@no_type_check  # keeps the tests' shape checks out of compiled code
+@njit(cache=True)
+def _boxes(xyz: np.ndarray, label: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean, least and greatest coordinates of each label."""
+    total, points = np.zeros((count, 3)), np.zeros(count)
+    low = np.full((count, 3), np.inf, np.float32)
+    high = np.full((count, 3), -np.inf, np.float32)
+    for i in range(len(xyz)):
+        k = label[i]
+        if k < 0:
+            continue
+        points[k] += 1
+        for a in range(3):
+            total[k, a] += xyz[i, a]
+            low[k, a], high[k, a] = min(low[k, a], xyz[i, a]), max(high[k, a], xyz[i, a])
+    return (total / points.reshape(-1, 1)).astype(np.float32), low, high
 
 
 def sample_uniformly(xyz_m: Float32[np.ndarray, "N 3"], voxel_m: float) -> Int[np.ndarray, " M"]:
@@ -67,15 +77,12 @@ def sample_uniformly(xyz_m: Float32[np.ndarray, "N 3"], voxel_m: float) -> Int[n
 
     Means would lie beside surfaces; a measured point keeps its ring, cluster and reflectivity.
     """
-    rows = np.flatnonzero(np.linalg.norm(xyz_m, axis=1) > _NEAR_M)
+    rows = np.flatnonzero(_lengths(xyz_m) > _NEAR_M)
     if not rows.size:
         return rows
     points = xyz_m[rows].astype(np.float64)
-    cell = np.floor(points / voxel_m).astype(np.int64) + (1 << 20)
-    key = (cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2]
-    order = np.argsort(key, kind="stable")
-    start = np.flatnonzero(np.diff(key[order], prepend=-1))
-    return np.sort(rows[order[_nearest_to_means(points[order], np.append(start, len(order)))]])
+    order, start, *_ = in_cells(points, np.zeros(3), voxel_m)
+    return np.sort(rows[order[_nearest_to_means(points[order], start)]])
 
 
 @no_type_check  # keeps the tests' shape checks out of compiled code
@@ -95,6 +102,12 @@ def _nearest_to_means(points: np.ndarray, start: np.ndarray) -> np.ndarray:
             if d < best:
                 best, chosen[v] = d, i
     return chosen
+
+
+def _lengths(xyz_m: np.ndarray) -> np.ndarray:
+    """Ranges; np.linalg.norm takes five times as long along so short an axis."""
+    x, y, z = xyz_m.T
+    return np.sqrt(x * x + y * y + z * z)
 
 
 def _evenly_spaced(xyz_m: np.ndarray, range_m: np.ndarray) -> np.ndarray:

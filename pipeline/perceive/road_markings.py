@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import no_type_check
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8, UInt16
+from jaxtyping import Bool, Float, Float32, Int, UInt8, UInt16
+from numba import njit
+
+from pipeline.perceive.selection import median_of
 
 __all__ = ["Markings", "lidar_markings", "road_contrast"]
 
@@ -55,23 +59,32 @@ def lidar_markings(
     return Markings(xyz_m[keep[chosen]].astype(np.float32), z[chosen].astype(np.float32))
 
 
-def _robust_z(value: Float[np.ndarray, " M"], band: np.ndarray) -> Float[np.ndarray, " M"]:
+def _robust_z(value: Float[np.ndarray, " M"], band: Int[np.ndarray, " M"]) -> Float[np.ndarray, " M"]:
     """(value - median)/robust sd within each band; NaN in bands too small to have either."""
-    _, inverse, count = np.unique(band, return_inverse=True, return_counts=True)
-    middle = _medians(value, inverse, count)
-    off = np.abs(value - middle[inverse])
     # 1.4826 MAD = sd of a normal law; at least one count, as logged intensities are small integers.
     one_count = 1.0 if value.max(initial=0.0) > 1.5 else 1 / 255
-    spread = np.maximum(1.4826 * _medians(off, inverse, count), one_count)
-    is_large = count >= _MIN_BAND_POINTS
-    return np.where(is_large[inverse], (value - middle[inverse]) / spread[inverse], np.nan)
+    order = np.argsort(band)
+    start = np.flatnonzero(np.diff(band[order], prepend=band.min(initial=0) - 1))
+    return _z_within(value, order, np.append(start, len(order)), one_count)
 
 
-def _medians(value: np.ndarray, group: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Median of each group 0, 1, ... of so many values."""
-    in_order = value[np.lexsort((value, group))]
-    first = np.cumsum(count) - count
-    return (in_order[first + (count - 1) // 2] + in_order[first + count // 2]) / 2
+@no_type_check  # keeps the tests' shape checks out of compiled code
+@njit(cache=True)
+def _z_within(value: np.ndarray, order: np.ndarray, start: np.ndarray, least_spread: float) -> np.ndarray:
+    z, held = np.full(len(value), np.nan), np.empty(len(value))
+    for b in range(len(start) - 1):
+        rows = order[start[b] : start[b + 1]]
+        if len(rows) < _MIN_BAND_POINTS:
+            continue
+        for i in range(len(rows)):
+            held[i] = value[rows[i]]
+        middle = median_of(held, len(rows))
+        for i in range(len(rows)):
+            held[i] = abs(value[rows[i]] - middle)
+        spread = max(1.4826 * median_of(held, len(rows)), least_spread)
+        for i in rows:
+            z[i] = (value[i] - middle) / spread
+    return z
 
 
 def road_contrast(
@@ -87,4 +100,4 @@ def road_contrast(
     top_hat = cv2.morphologyEx(grey, cv2.MORPH_TOPHAT, np.ones((1, width), np.uint8))
     # The mask's border has the contrast of kerb and cars, not of paint.
     inside = cv2.erode(road_mask.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
-    return np.where(inside > 0, top_hat, 0).astype(np.uint8)
+    return np.multiply(top_hat, inside, dtype=np.uint8)

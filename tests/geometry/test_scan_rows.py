@@ -25,13 +25,13 @@ def test_rows_that_are_logged_are_rows_whatever_their_numbering(shape):
     aer, row = scanner(**shape)
     numbering = np.random.default_rng(1).permutation(row.max() + 1).astype(np.uint16)
     shuffled = np.random.default_rng(2).permutation(len(row))
-    found = rows_of(aer[shuffled], numbering[row][shuffled])
+    found = rows_of(aer[shuffled], numbering[row][shuffled]).row
     np.testing.assert_array_equal(found, row[shuffled])
 
 
 def test_rows_that_are_not_logged_are_crowds_of_elevations():
     aer, row = scanner(rows=4, jitter_deg=0.002)
-    np.testing.assert_array_equal(rows_of(aer, None), row)
+    np.testing.assert_array_equal(rows_of(aer, None).row, row)
 
 
 def test_rows_that_run_into_each_other_and_are_not_logged_are_none():
@@ -57,11 +57,11 @@ def turns_stored_one_after_the_other(begin_deg, missing):
 @pytest.mark.parametrize("begin_deg", [0.0, -180.0, 75.0])
 def test_turns_that_are_stored_one_after_the_other_are_rows(begin_deg):
     aer, row = turns_stored_one_after_the_other(begin_deg, missing=0.2)
-    assert np.mean(rows_of(aer, None) != row) < 1e-3
+    assert np.mean(rows_of(aer, None).row != row) < 1e-3
     clockwise = aer * [-1, 1, 1]
-    assert np.mean(rows_of(clockwise, None) != row) < 1e-3
+    assert np.mean(rows_of(clockwise, None).row != row) < 1e-3
     shuffled = np.random.default_rng(4).permutation(len(row))
-    found = rows_of(aer[shuffled], None)
+    found = rows_of(aer[shuffled], None).row
     assert found is None or np.mean(found != row[shuffled]) > 0.1  # it was the order that told
 
 
@@ -77,3 +77,10 @@ def test_lasers_of_a_rosette_are_no_rows():
 def test_no_points_have_no_rows():
     assert rows_of(np.zeros((0, 3)), None) is None
     assert rows_of(np.zeros((0, 3)), np.zeros(0, np.uint16)) is None
+
+
+def test_the_order_is_by_row_then_by_azimuth_then_as_stored():
+    aer, _ = scanner(rows=4, columns=40)
+    twice = np.random.default_rng(3).permutation(np.repeat(np.arange(len(aer)), 2))
+    found = rows_of(aer[twice], None)
+    np.testing.assert_array_equal(found.order, np.lexsort((aer[twice, 0], found.row)))

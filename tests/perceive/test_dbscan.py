@@ -68,3 +68,11 @@ def test_no_points_and_lone_points_make_no_cluster():
     assert dbscan(np.zeros((0, 3)), 1.0, 2).shape == (0,)
     assert dbscan(np.array([[0.0, 0, 0], [5, 0, 0]]), 1.0, 2).tolist() == [-1, -1]
     assert dbscan(np.array([[0.0, 0, 0], [1, 0, 0]]), 1.0, 2).tolist() == [0, 0]  # eps itself is near
+
+
+def test_points_kilometres_astray_change_no_cluster():
+    points = np.random.default_rng(5).uniform(0, 20, (600, 3))
+    astray = np.array([[1e9, 0, 0], [0, -1e9, 0], [0, 0, 1e9]])
+    found = dbscan(np.concatenate([points, astray]), 1.2, 4)
+    assert found.max() > 0
+    np.testing.assert_array_equal(found, [*dbscan(points, 1.2, 4), -1, -1, -1])
