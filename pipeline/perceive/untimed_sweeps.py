@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Final, Protocol
 
 import numpy as np
+from jaxtyping import UInt16
 
 from pipeline.geometry.scan_rows import rows_of
 from pipeline.geometry.spherical import to_spherical
@@ -63,7 +64,9 @@ class Turning:
             return timed, BY_AZIMUTH
         xyz = sweep.lidar_xyz_m.astype(np.float64)
         x, y, z = (xyz + time_s[:, None] * velocity_of(xyz, motion)).astype(np.float32).T
-        return replace(timed, lidar_x_m=x, lidar_y_m=y, lidar_z_m=z), BY_AZIMUTH
+        # Moved points lie in no order and at no common elevation: rows are those that were measured.
+        moved = replace(timed, lidar_x_m=x, lidar_y_m=y, lidar_z_m=z, lidar_ring=_rows_of(sweep))
+        return moved, BY_AZIMUTH
 
 
 def turning_of(sweeps: Iterable[tuple[Seen, Sweep]], told: LidarTurn | None) -> Turning | None:
@@ -88,9 +91,19 @@ def turning_of(sweeps: Iterable[tuple[Seen, Sweep]], told: LidarTurn | None) -> 
 
 def _spins(sweep: Sweep) -> bool:
     """Whether a sweep has rows, all around."""
+    azimuth = np.arctan2(sweep.lidar_y_m, sweep.lidar_x_m)
+    around = len(np.unique(np.floor(np.degrees(azimuth[np.isfinite(azimuth)]))))
+    return around > 360 * _FULL_TURN and _rows_of(sweep) is not None
+
+
+def _rows_of(sweep: Sweep) -> UInt16[np.ndarray, " N"] | None:
+    """Rings as they were logged, or the row of each point; points that are not finite are put into row 0."""
+    if sweep.lidar_ring is not None:
+        return sweep.lidar_ring
     xyz = sweep.lidar_xyz_m.astype(np.float64)
     finite = np.isfinite(xyz).all(axis=1)
-    aer = to_spherical(xyz[finite])
-    around = len(np.unique(np.floor(np.degrees(aer[:, 0]))))
-    ring = sweep.lidar_ring
-    return around > 360 * _FULL_TURN and rows_of(aer, None if ring is None else ring[finite]) is not None
+    row, found = np.zeros(len(xyz), np.uint16), rows_of(to_spherical(xyz[finite]), None)
+    if found is None:
+        return None
+    row[finite] = found
+    return row

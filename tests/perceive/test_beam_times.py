@@ -20,7 +20,7 @@ from pipeline.simulate.world.drives import Drive
 from schemas.captures import Sweep
 from tests.makers.swept_streets import AROUND, pose
 
-GAP_S, SWEEPS, LEFT, RIGHT = 0.3, 18, 1.0, -1.0
+GAP_S, SWEEPS, LEFT, RIGHT = 0.5, 14, 1.0, -1.0
 MOUNTED = pose(1.2, 0.0, 1.9)
 
 
@@ -38,8 +38,8 @@ class Seen:
 @cache
 def drive():
     """Sweeps as they were measured, and as they would look from where the car was in the middle of each."""
-    rng, out = np.random.default_rng(31), []
-    street = Drive(31, "urban", 3.0 + SWEEPS * GAP_S, 0)
+    rng, out = np.random.default_rng(33), []
+    street = Drive(33, "urban", 3.0 + SWEEPS * GAP_S, 0)
     world = World(street)
     for k in range(SWEEPS):
         middle_s = 1.0 + k * GAP_S
