@@ -66,7 +66,11 @@ class BeamTimes:
 
 
 class Found(NamedTuple):
-    """What a day's sweeps say: how the lidar turns, if they tell, and its motion at sweeps that have a neighbour."""
+    """What a day's sweeps say: how the lidar turns, if they tell, and how it moves at each sweep.
+
+    Between sweeps that do not show how it turns, motion may be wrong (rails lie along themselves): then it is what was
+    told.
+    """
 
     turn: BeamTimes | None
     motion: Mapping[int, Arc]
@@ -82,17 +86,21 @@ _TIMES: Final = np.array([h.at(_CENTRES) for h in _HYPOTHESES])
 
 
 def beam_times(
-    surfaces: Mapping[int, Surfaces], pairs: Sequence[tuple[int, int, float]], period_s: float = PERIOD_S
+    surfaces: Mapping[int, Surfaces],
+    pairs: Sequence[tuple[int, int, float]],
+    told: Mapping[int, Arc],
+    period_s: float = PERIOD_S,
 ) -> Found:
     """How a lidar turns, from pairs of its sweeps as they were logged.
 
     Args:
         surfaces: of each sweep, by its number.
         pairs: earlier and later sweep, and the time between their stamps [s].
+        told: motion per second at a sweep, where odometry has it.
         period_s: of a turn.
     """
-    arcs = registered(surfaces, pairs)
-    motion = _motions(arcs, pairs)
+    arcs = registered(surfaces, pairs, told)
+    motion = {**_motions(arcs, pairs), **told}
     moving = [
         (i, j, arc)
         for (i, j, _), arc in zip(pairs, arcs, strict=True)
@@ -102,7 +110,7 @@ def beam_times(
         moving[k] for k in np.unique(np.linspace(0, len(moving) - 1, _MOST_PAIRS).astype(int)) if moving
     ]
     if len(moving) < _FEWEST_PAIRS:
-        return Found(None, motion)
+        return Found(None, told)
     times, best = np.zeros(_SECTORS), 0
     for _ in range(_STEPS):
         N, b = _systems(surfaces, moving, motion, times)
@@ -112,7 +120,8 @@ def beam_times(
         lasts_s = PERIOD_S * along[best] / curvature[best]
         times = lasts_s / PERIOD_S * _TIMES[best]
     is_one = _LASTS[0] * period_s < lasts_s < _LASTS[1] * period_s
-    return Found(_decided(N, b, best, period_s) if is_one else None, motion)
+    turn = _decided(N, b, best, period_s) if is_one else None
+    return Found(turn, motion if turn is not None else told)
 
 
 def velocity_of(xyz_m: Float[np.ndarray, "N 3"], motion: Arc) -> Float[np.ndarray, "N 3"]:

@@ -25,6 +25,7 @@ _FLAT, _UPRIGHT, _ROAD = (
 _MOST_POINTS, _COARSE_POINTS, _COARSE_OTHERS = 4000, 500, 20_000
 _FASTEST_MPS, _BACKWARDS_M, _STEP_M, _TURNS_RAD = 45.0, 2.0, 0.5, (-0.06, -0.02, 0.02, 0.06)
 _COARSE_M, _WIDE_M, _CLOSE_M = 0.7, (2.0, 1.0, 0.5, 0.5, 0.5), (0.5, 0.5, 0.5)
+_APART_M, _DISTINCT = 1.5, 1.1  # as in calibrate's sweep_motion: so much better than ways so far away
 _SIGMA_M: Final = 0.05  # of a rest while registering; beyond it weighs less (Cauchy)
 _FEWEST: Final = 200
 
@@ -96,21 +97,27 @@ def surfaces_of(xyz_m: np.ndarray) -> Surfaces:
     return Surfaces(xyz[flat], normal[flat], xyz[up < _ROAD], cKDTree(xyz[flat]))
 
 
-def registered(surfaces: Mapping[int, Surfaces], pairs: Sequence[tuple[int, int, float]]) -> list[Arc | None]:
-    """Arc of each pair (earlier, later, seconds between); None where too little stands in both."""
+def registered(
+    surfaces: Mapping[int, Surfaces], pairs: Sequence[tuple[int, int, float]], told: Mapping[int, Arc]
+) -> list[Arc | None]:
+    """Arc of each pair (earlier, later, seconds between); None where too little stands in both.
+
+    `told` is the motion per second at a sweep, where odometry has it. Without it the best of a grid must stand out:
+    along the rails of a motorway every way is as good.
+    """
     arcs: list[Arc | None] = []
     before: tuple[int, Arc, float] | None = None
     for i, j, gap_s in pairs:
         first, last = surfaces[i], surfaces[j]
-        if min(len(first.xyz_m), len(last.xyz_m)) < _FEWEST:
-            arcs.append(None)
-            continue
-        starts = [_coarse(first, last, gap_s)]
-        if before is not None and before[0] == i:
-            starts.append(Arc(*(v * gap_s / before[2] for v in before[1])))
-        found = min((matched(first, last, s, _WIDE_M) for s in starts), key=lambda m: m.cost)
-        arcs.append(found.arc if len(found.rest_m) >= _FEWEST else None)
-        before = (j, found.arc, gap_s) if arcs[-1] is not None else None
+        start = None
+        if min(len(first.xyz_m), len(last.xyz_m)) >= _FEWEST:
+            if i in told and j in told:
+                start = Arc(*(np.mean([told[i], told[j]], axis=0) * gap_s))
+            elif (start := _coarse(first, last, gap_s)) is None and before is not None and before[0] == i:
+                start = Arc(*(v * gap_s / before[2] for v in before[1]))
+        found = None if start is None else matched(first, last, start, _WIDE_M)
+        arcs.append(found.arc if found is not None and len(found.rest_m) >= _FEWEST else None)
+        before = None if arcs[-1] is None else (j, arcs[-1], gap_s)
     return arcs
 
 
@@ -136,16 +143,18 @@ def matched(first: Surfaces, last: Surfaces, start: Arc, reach_m: Sequence[float
     return Matched(before, near, some[at], n, rest, J, cost)
 
 
-def _coarse(first: Surfaces, last: Surfaces, gap_s: float) -> Arc:
-    """The best of a grid of arcs."""
+def _coarse(first: Surfaces, last: Surfaces, gap_s: float) -> Arc | None:
+    """The best of a grid of arcs, if those of other ways are clearly worse."""
     tree, few = cKDTree(_thinned(first.others, _COARSE_OTHERS)), _thinned(last.others, _COARSE_POINTS)
 
-    def cost(arc: Arc) -> float:
-        return float(
-            np.minimum(tree.query(arc.moved(few), distance_upper_bound=_COARSE_M)[0], _COARSE_M).mean()
-        )
+    def score(arc: Arc) -> float:
+        distance = tree.query(arc.moved(few), distance_upper_bound=_COARSE_M)[0]
+        return float(1 - np.minimum(distance / _COARSE_M, 1.0).mean())
 
-    return min(_grid(gap_s), key=cost)
+    scores = {arc: score(arc) for arc in _grid(gap_s)}
+    best = max(scores, key=lambda arc: scores[arc])
+    far = max(s for arc, s in scores.items() if abs(arc.x - best.x) > _APART_M)
+    return best if scores[best] > _DISTINCT * far else None
 
 
 def _grid(gap_s: float) -> Iterator[Arc]:

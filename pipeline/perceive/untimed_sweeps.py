@@ -48,11 +48,9 @@ class Turning:
     def timed(self, seen: Seen, sweep: Sweep) -> tuple[Sweep, str]:
         """The sweep with times, at its stamp if its motion is known, and what the manifest counts of it.
 
-        The motion is that between sweeps, or else the odometry's; where both lack, a radar's Doppler may move it.
+        The motion is the odometry's, or else that between sweeps; where both lack, a radar's Doppler may move it.
         """
-        motion = self.motion.get(seen.moment)
-        if motion is None and seen.ego_speed_mps is not None:
-            motion = Arc(seen.ego_speed_mps, 0.0, seen.ego_yaw_rate_radps or 0.0)
+        motion = _told(seen) or self.motion.get(seen.moment)
         stands = motion is not None and motion.way < MOVES_MPS and abs(motion.yaw_rad) < _STANDS_RADPS
         if self.turn is None:
             return sweep, "" if stands else WITHOUT_TIMES
@@ -71,22 +69,31 @@ class Turning:
 
 def turning_of(sweeps: Iterable[tuple[Seen, Sweep]], told: LidarTurn | None) -> Turning | None:
     """How a lidar turns, from fleet.toml or from its sweeps; None where they have times, or it does not spin."""
-    surfaces, pairs = {}, []
+    surfaces, pairs, moves = {}, [], {}
     before: Seen | None = None
     for seen, sweep in sweeps:
         if before is None and (sweep.lidar_deskewed or sweep.lidar_time_s is not None or not _spins(sweep)):
             return None
+        if (motion := _told(seen)) is not None:
+            moves[seen.moment] = motion
         surfaces[seen.moment] = surfaces_of(sweep.lidar_xyz_m)
         if before is not None and before.drive == seen.drive:
             gap_s = (seen.stamp_ns - before.stamp_ns) * 1e-9
             pairs += [(before.moment, seen.moment, gap_s)] if 0 < gap_s < _NEIGHBOUR_S else []
         before = seen
-    found = beam_times(surfaces, pairs)
+    found = beam_times(surfaces, pairs, moves)
     if told is None:
         return Turning(found.turn, found.motion)
     sense = 1.0 if told.sense == "left" else -1.0
     turn = BeamTimes(sense, float(np.radians(told.begins_deg)), told.period_s, _OF_STAMP[told.stamp])
     return Turning(turn, found.motion)
+
+
+def _told(seen: Seen) -> Arc | None:
+    """The odometry's motion; lidars look ahead."""
+    if seen.ego_speed_mps is None:
+        return None
+    return Arc(seen.ego_speed_mps, 0.0, seen.ego_yaw_rate_radps or 0.0)
 
 
 def _spins(sweep: Sweep) -> bool:

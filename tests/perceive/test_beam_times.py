@@ -56,7 +56,7 @@ def drive():
 
 def found_of(clouds, gap_s=GAP_S):
     surfaces = {k: surfaces_of(xyz) for k, xyz in enumerate(clouds)}
-    return beam_times(surfaces, [(k, k + 1, gap_s) for k in range(len(clouds) - 1)])
+    return beam_times(surfaces, [(k, k + 1, gap_s) for k in range(len(clouds) - 1)], {})
 
 
 def mirrored(xyz):
@@ -106,8 +106,9 @@ def test_a_car_that_stands_tells_nothing_and_its_points_stay():
     clouds = [(still + rng.normal(0, 0.01, still.shape)).astype(np.float32) for _ in range(10)]
     found = found_of(clouds)
     assert found.turn is None
-    assert Turning(None, found.motion).timed(Seen(0, 0), sweep(clouds[0]))[1] == ""
-    timed, _ = Turning(BeamTimes(LEFT, 0.0), found.motion).timed(Seen(0, 0), sweep(clouds[0]))
+    stands = Seen(0, 0, ego_speed_mps=0.0)
+    assert Turning(None, found.motion).timed(stands, sweep(clouds[0]))[1] == ""
+    timed, _ = Turning(BeamTimes(LEFT, 0.0), found.motion).timed(stands, sweep(clouds[0]))
     np.testing.assert_array_equal(timed.lidar_xyz_m, clouds[0])
 
 
