@@ -160,8 +160,17 @@ class OnnxPointSemantics(Section):
     remission_scale: Positive = 1.0
 
 
+class LidarTurn(Section):
+    """How a lidar turns, seen from above: for clouds without a time per point. The azimuth grows to the left."""
+
+    sense: Literal["left", "right"]
+    begins_deg: Annotated[float, Field(ge=-180, le=180)]
+    period_s: Positive = 0.1
+    stamp: Literal["begin", "middle", "end"] = "middle"  # of the turn
+
+
 class LidarTopics(_Sensor):
-    """Topic of a lidar, and its height if measured."""
+    """Topic of a lidar, its height if measured, and how it turns if its clouds do not tell."""
 
     points: Topic
     # None = from geometry. Left out of dumps: only perception uses it, so a change must not ingest a rig's
@@ -170,6 +179,8 @@ class LidarTopics(_Sensor):
     # Measured height above the road and its sigma, for the edge to the vehicle frame.
     height_m: Positive | None = Field(default=None, exclude=True)
     height_sigma_m: Positive | None = Field(default=None, exclude=True)
+    # Only perception uses it, like `semantics`. None = from the sweeps of a car that moves.
+    turn: LidarTurn | None = Field(default=None, exclude=True)
 
     @model_validator(mode="after")
     def _height_has_a_sigma(self) -> LidarTopics:

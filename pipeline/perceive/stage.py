@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Generator, Iterator, Mapping
+from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any, Final, NamedTuple, cast
@@ -27,6 +27,7 @@ from pipeline.perceive.features import (
 from pipeline.perceive.ground import PointSource
 from pipeline.perceive.rejections import FrameReason, FrameRejectedError
 from pipeline.perceive.tracks import TrackState
+from pipeline.perceive.untimed_sweeps import Turning, turning_of
 from pipeline.rig.graph import BASE, Kind, Sensor, possible_edges
 from pipeline.rig.prior import Star, between
 from pipeline.rig.rig import Rig
@@ -81,8 +82,11 @@ def _rows(
     blind = [s for s, kind in kinds.items() if kind == "camera" and s not in sources.cameras]
     tracks: dict[str, TrackState] = {}
     whole_ns = -SAME_SCENE_NS
+    turning = _turning(task, [s for s, kind in kinds.items() if kind == "lidar"]) if sources.deskew else {}
     moments = _ahead(joined(task.lake, MOMENTS, task.partition), sources)
-    for seen, (moment, captures) in enumerate(moments, 1):
+    for seen, (moment, as_logged) in enumerate(moments, 1):
+        timed = {s: turning[s].timed(moment, c) for s, c in as_logged.items() if s in turning}
+        captures = as_logged | {s: sweep for s, (sweep, _) in timed.items()}
         shown = Shown(moment, captures, kinds, stars.get(moment.log, {}))
         found: Found | None = None
         try:
@@ -96,12 +100,23 @@ def _rows(
         if found is not None:
             tracks = tracks | found.tracks
             whole_ns = whole_ns if found.unusable else moment.stamp_ns
-            run.kept.update(found.notes)
+            run.kept.update([*found.notes, *(note for _, note in timed.values() if note)])
             run.rejected.update(f"without_{sensor}_{why.value}" for sensor, why in found.unusable.items())
             yield found.moment, found.features
     told = {s: f"{FAULTS['no_labels']}, {s}: {_REMEDY.format(section.replace('NAME', s))}" for s in blind}
     run.remarks = "; ".join([*told.values(), *sources.remarks()])
     run.extra |= {PRIOR: ingested.extra.get(PRIOR, []), SENSORS_ABSENT: told}
+
+
+def _turning(task: Task, lidars: Sequence[str]) -> dict[str, Turning]:
+    """How lidars turn whose sweeps have no times, by name."""
+    rig, found = task.fleet.rig_of(task.partition.vehicle), {}
+    for name in lidars:
+        moments = joined(task.lake, MOMENTS, task.partition, [name])
+        turning = turning_of(((m, c[name]) for m, c in moments if name in c), rig.lidars[name].turn)
+        if turning is not None:
+            found[name] = turning
+    return found
 
 
 def _ahead(moments: Iterator[_Joined], sources: Sources) -> Generator[_Joined, None, None]:
@@ -263,6 +278,9 @@ def _sources(rig: Rig, fleet: FleetConfig) -> tuple[Sources, dict[str, Any]]:
             cameras[name], keys[name] = _source(camera.semantics, fleet)
     lidars = {name: _points(lidar, fleet) for name, lidar in rig.lidars.items()}
     radars = {name: _drivable(radar, fleet) for name, radar in rig.radars.items()}
+    keys |= {
+        f"{s} turn": of.turn.model_dump(mode="json") for s, of in rig.lidars.items() if of.turn is not None
+    }
     keys |= {name: model.provenance for name, model in (lidars | radars).items() if model is not None}
     return Sources(cameras, lidars, radars, fleet.perceive, fleet.ingest.deskew), keys
 

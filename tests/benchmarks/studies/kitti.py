@@ -1,0 +1,112 @@
+"""Study: camera-lidar of one street of KITTI, from 2 and 5 deg, of 26 and 5 frames: how far off, and does it say so?
+
+    python tests/benchmarks/studies/kitti.py --root DAYS --lake FOLDER
+
+FOLDER has the fleet.toml of `boresight convert kitti` and a lake that was perceived. Starts are moved by exactly
+2 deg / 5 cm and 5 deg / 10 cm in random directions, as they are stated, four seeds each. The reference is the
+calibration that KITTI gives, which is known to about .1 deg; `z` is the error in sigmas of both. A line per
+start: errors of azimuth and elevation at the targets with their sigmas [deg], status and reason.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from pipeline.calibrate.day import calibrate_observations
+from pipeline.calibrate.records import Inputs
+from pipeline.config import FleetConfig, load_fleet
+from pipeline.extrinsics.estimates import Prior
+from pipeline.extrinsics.prior import perturbed, read_prior
+from pipeline.geometry.targets import errors_at_targets
+from pipeline.store.current import targets_of
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.views import observations_of
+from schemas.calibrations import CalibrationRecord
+from schemas.observations import Observation
+from tests.benchmarks.studies.commits import commit_now
+from tests.benchmarks.studies.engine import RESULTS
+from tests.benchmarks.studies.metrics import rms, share, transform_of
+
+__all__ = ["GIVEN_SIGMA_DEG", "line_of", "summary"]
+
+GIVEN_SIGMA_DEG: Final = 0.1  # how well the given calibration is known
+_STARTS: Final = ((2.0, 0.05), (5.0, 0.1))
+_FRAMES: Final = (26, 5)
+_PAIR: Final = "camera_lidar"
+
+
+def main() -> None:
+    """Write a line per start and print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--lake", type=Path, required=True, help="folder with fleet.toml and lake")
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(range(4)))
+    parser.add_argument("--out", type=Path, default=RESULTS / "kitti.jsonl")
+    args = parser.parse_args()
+    lake, fleet = Lake.at(args.lake / "lake"), load_fleet(args.lake / "fleet.toml")
+    [day] = lake.partitions("perceived")
+    rows = list(observations_of(lake, day))
+    given, lines = read_prior(rows, fleet, day.vehicle), []
+    about = {"commit": commit_now(), "date": time.strftime("%Y-%m-%d")}
+    for frames in _FRAMES:
+        for start in _STARTS:
+            for seed in args.seeds:
+                found = _calibrated(rows, perturbed(given, start, seed), fleet, day, (frames, seed))
+                line = {"start_deg": start[0], "frames": frames, "seed": seed}
+                lines.append(about | line | found[1] | line_of(found[0], given))
+                print(json.dumps(lines[-1]), flush=True)
+    args.out.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    print(summary(lines))
+
+
+def _calibrated(
+    rows: Sequence[Observation], prior: Prior, fleet: FleetConfig, day: Partition, of: tuple[int, int]
+) -> tuple[CalibrationRecord, dict[str, float]]:
+    """The record of so many frames with a seed, and its CPU time [s]."""
+    began = time.process_time()
+    inputs = Inputs(day, "joint", "study", of[1], (), pairs=(_PAIR,))
+    [record] = calibrate_observations(rows, prior, fleet.changed(select={"frames": of[0]}), inputs)
+    return record, {"cpu_s": round(time.process_time() - began, 1)}
+
+
+def line_of(record: CalibrationRecord, given: Prior) -> dict[str, Any]:
+    """What a record says beside the given calibration; without numbers where nothing was computed."""
+    told = {"status": record.status, "reason": record.reason, "frames_used": record.frames_used}
+    T = transform_of(record)
+    if T is None or record.azimuth_sigma_rad is None or record.elevation_sigma_rad is None:
+        return told
+    off = np.degrees(errors_at_targets(_PAIR, T, given.of(_PAIR), targets_of(record))[:2])
+    sigma = np.degrees([record.azimuth_sigma_rad, record.elevation_sigma_rad])
+    names = ("az_deg", "el_deg", "az_sigma_deg", "el_sigma_deg", "az_z", "el_z")
+    values = [*off, *sigma, *(off / np.hypot(sigma, GIVEN_SIGMA_DEG))]
+    return told | {name: round(float(v), 3) for name, v in zip(names, values, strict=True)}
+
+
+def summary(lines: Sequence[dict[str, Any]]) -> str:
+    """A row per start and number of frames."""
+    text = ["| start | frames | azimuth, mean, worst [deg] | elevation | RMS z | within 3 | accepted |"]
+    text.append("|---|---|---|---|---|---|---|")
+    for start, frames in dict.fromkeys((r["start_deg"], r["frames"]) for r in lines):
+        mine = [r for r in lines if (r["start_deg"], r["frames"]) == (start, frames)]
+        known = [r for r in mine if "el_z" in r]
+        off = (
+            f"{np.mean([r[k] for r in known]):.2f}, {max(r[k] for r in known):.2f}"
+            for k in ("az_deg", "el_deg")
+        )
+        z = [r[k] for r in known for k in ("az_z", "el_z")]
+        cells = [*(off if known else ("-", "-")), f"{rms(z):.2f}", share(v <= 3 for v in z)]
+        cells.append(share(r["status"] == "accepted" for r in mine))
+        text.append(f"| {start:g} deg | {frames} | {' | '.join(cells)} |")
+    return "\n".join(text)
+
+
+if __name__ == "__main__":
+    main()
