@@ -57,6 +57,14 @@ def test_an_unknown_rig_is_refused_with_those_that_exist():
             rig_named(unknown)
 
 
+def test_a_rig_named_by_its_rows_has_so_many_over_so_many_degrees():
+    sheet = rig_named("rows-32-60-dirty")["lidar"].sheet
+    assert (sheet.rows, sheet.azimuth_deg) == (32, (-30.0, 30.0))
+    assert np.diff(sheet.elevation_deg)[0] / (sheet.rows - 1) == 1.0
+    with pytest.raises(ConfigError, match="rows-ROWS-DEGREES"):
+        rig_named("rows-32")
+
+
 def test_random_rigs_are_of_all_kinds_and_a_seed_s_own():
     rigs = [rig_named(f"random-{seed}") for seed in range(40)]
     assert rigs[7] == rig_named("random-7")

@@ -122,7 +122,7 @@ def _camera_lidar(
 
     def cost(T: np.ndarray) -> np.ndarray:
         at = Alignments(T[None], np.array([dt_s]), np.array([focal]))
-        score = (terms.edge_excess(at, sharp) + terms.marking_score(at, sharp))[0]
+        score = (terms.edge_excess(at, sharp) + terms.marking_excess(at, sharp))[0]
         return np.where(has_points, -score, np.nan)
 
     def derivatives(step: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:

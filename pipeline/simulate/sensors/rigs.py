@@ -17,6 +17,7 @@ from pipeline.simulate.sensors.van import DUO, VAN
 __all__ = ["RIGS", "rig_named"]
 
 RANDOM: Final = "random-"  # prefix of rigs drawn from a seed
+ROWS: Final = "rows-"  # `rows-32-60`: the rig demo with a lidar of 32 rows over 60 deg
 
 
 # Half the pixels of the paper's camera, with a matching lidar and radar: sufficient for most purposes, and
@@ -133,17 +134,31 @@ _RADARS: Final[dict[str, dict[str, Any]]] = {
 
 
 def rig_named(name: str) -> RigSpec:
-    """One of RIGS or `random-SEED`; `-flat` removes radar elevation, `-dirty` degrades it. ConfigError."""
+    """One of RIGS, `random-SEED` or `rows-ROWS-DEGREES`, perhaps with a suffix. ConfigError.
+
+    `-flat` removes radar elevation, `-dirty` degrades it.
+    """
     plain, change = name, None
     for ending, spoil in _RADARS.items():
         if name.endswith(ending):
             plain, change = name.removesuffix(ending), spoil
     seed = plain.removeprefix(RANDOM)
-    base = random_rig(int(seed)) if plain != seed and seed.isdecimal() else RIGS.get(plain)
+    base = random_rig(int(seed)) if plain != seed and seed.isdecimal() else RIGS.get(plain) or _by_rows(plain)
     if base is None:
-        known = f"{', '.join(RIGS)}, {RANDOM}SEED, each also with {' or '.join(_RADARS)} behind it"
+        known = f"{', '.join(RIGS)}, {RANDOM}SEED, {ROWS}ROWS-DEGREES, each also with {' or '.join(_RADARS)} behind it"
         raise ConfigError("simulate", "rig", f"{name!r} is not one of {known}")
     return base if change is None else replace(base.changed(partial(_with_radar, change)), name=name)
+
+
+def _by_rows(name: str) -> RigSpec | None:
+    """The rig of a name that begins with ROWS, None of another name."""
+    asked = name.removeprefix(ROWS).split("-")
+    if not name.startswith(ROWS) or len(asked) != 2 or not all(part.isdecimal() for part in asked):
+        return None
+    rows, degrees = (int(part) for part in asked)
+    # 32 rows are 1 deg apart; columns are 0.3 deg apart whatever the width.
+    sheet = LidarSpec((-degrees / 2, degrees / 2), (-20.0, 11.0), round(degrees / 0.3), rows, 0.1, 0.8, 100.0)
+    return _demo(name, lidar=sheet)
 
 
 def _with_radar(change: dict[str, Any], sensor: SensorSpec) -> SensorSpec:

@@ -214,6 +214,12 @@ def _worlds(first: int, count: int) -> list[DaySpec]:
     return [DaySpec(seed, f"world-{seed}", 60, f"random-{seed}") for seed in range(first, first + count)]
 
 
+def _rows(first: int) -> list[DaySpec]:
+    """Lidars of few rows and of many, narrow and full turns, a street and a motorway each."""
+    rigs = [f"rows-{rows}-{degrees}" for rows in (16, 32, 64, 128) for degrees in (60, 360)]
+    return [DaySpec(first + i, ("urban", "highway")[i // 8], 60, rig) for i, rig in enumerate(2 * rigs)]
+
+
 REAL = DaySpec(0, "real", 0, "real")
 
 # Seeds below 200 are for tuning. Seeds 200 to 804 were the test days of 0.3.0: the estimator was changed on what they
@@ -280,6 +286,7 @@ SETS: dict[str, list[DaySpec]] = {
         )
     ],
     "worlds": _worlds(6400, 128),
+    "rows": _rows(6600),
     "day-cost": [DaySpec(3800, "urban", 100), DaySpec(3801, "highway", 100)],
     "table1": [DaySpec(4600 + i, "urban" if i < 5 else "highway", 100) for i in range(10)],
     "one-clock": [

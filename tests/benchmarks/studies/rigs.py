@@ -4,11 +4,14 @@
     python tests/benchmarks/studies/rigs.py --root DAYS
     python tests/benchmarks/studies/days.py generate --root DAYS --sets worlds
     python tests/benchmarks/studies/rigs.py --root DAYS --set worlds --out tests/benchmarks/results/worlds.jsonl
+    python tests/benchmarks/studies/days.py generate --root DAYS --sets rows
+    python tests/benchmarks/studies/rigs.py --root DAYS --set rows --out tests/benchmarks/results/lidar_rows.jsonl
 
-`dev-rigs`: one day of each rig, and of faults of the camera, on `demo`, 40 frames, town and highway mixed. `worlds`: a
-world and a rig drawn by each seed, 60 frames, seeds that no tuning saw (`dev-worlds`: tuning seeds). The prior is drawn
-with 2 deg and 5 cm. One day says that a rig works or stumbles, and nothing of how often. `far` counts the sigmas of the
-DoF that is the farthest off: 3 and more say that a record does not know how wrong it is.
+`dev-rigs`: one day of each rig, and of faults of the camera, on `demo`, 40 frames, town and highway mixed.
+`worlds`: a world and a rig drawn by each seed, 60 frames, seeds that no tuning saw (`dev-worlds`: tuning
+seeds). The prior is drawn with 2 deg and 5 cm. `rows`: lidars of 16 to 128 rows over 60 and 360 deg, on a
+street and a motorway. One day says that a rig works or stumbles, and nothing of how often. `far` counts the
+sigmas of the DoF that is the farthest off: 3 and more say that a record does not know how wrong it is.
 """
 
 from __future__ import annotations
@@ -28,7 +31,7 @@ def main() -> None:
     """Run what is missing, then print the table."""
     parser = study_arguments(__doc__ or "", "rigs")
     parser.add_argument(
-        "--set", choices=["dev-rigs", "dev-views", "dev-worlds", "worlds"], default="dev-rigs"
+        "--set", choices=["dev-rigs", "dev-views", "dev-worlds", "worlds", "rows"], default="dev-rigs"
     )
     args = parser.parse_args()
     run_study([Run(day, seed=day.seed) for day in SETS[args.set]], args, summary)

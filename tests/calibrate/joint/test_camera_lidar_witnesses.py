@@ -19,12 +19,16 @@ from tests.makers.traced_scenes import DENSE, GROUND_M, T_TRUE, traced_day
 ROOF_M = GROUND_M + 1.6  # of the cars
 
 
-def with_windows(day, depth_rad=0.02, sills=3):
-    """Beams go through rear windows: their sills are edges above a foreground, and no label ends there."""
+def with_windows(day, depth_rad=0.02, sills=3, within_m=np.inf):
+    """Beams go through rear windows: their sills are edges above a foreground, and no label ends there.
+
+    Cars further off than `within_m` are of a kind without windows.
+    """
     out = []
     for o in day:
         xyz, side = o.lidar_edge_xyz_m, o.lidar_edge_side
-        roof = np.flatnonzero((side == EDGE_BELOW) & (np.abs(xyz[:, 2] - ROOF_M) < 0.2))
+        is_roof = (side == EDGE_BELOW) & (np.abs(xyz[:, 2] - ROOF_M) < 0.2)
+        roof = np.flatnonzero(is_roof & (xyz[:, 0] < within_m))
         more = np.repeat(roof, sills)
         changed = {
             name: np.concatenate([getattr(o, name), getattr(o, name)[more]])
@@ -67,6 +71,25 @@ def test_cars_with_windows_are_held_and_pitch_is_as_unsure_as_the_evidence_is_ap
     # The search ends at the truth, and the sills would turn it by more than a degree: nothing says which is right.
     assert np.degrees(abs(turn[0])) < 0.1
     assert np.degrees(np.sqrt(found.covariance[0, 0])) > 0.4
+
+
+@pytest.mark.parametrize(("within_m", "faults"), [(0.0, []), (18.0, ["witnesses_disagree"])])
+def test_windows_in_cars_of_one_kind_only_are_seen_where_no_paint_tells(within_m, faults):
+    day = traced_day(DENSE, 12, seed=1, reflective=False)
+    found = solved(with_windows(day, sills=2, within_m=within_m))
+    assert [check.fault for check in found.failed_checks] == faults
+    turn_deg = np.degrees(abs(log_so3((found.T @ inverse(T_TRUE))[:3, :3])[0]))
+    assert (turn_deg > 0.5) == bool(faults)  # the fit follows the sills
+    assert turn_deg < 3 * np.degrees(np.sqrt(found.covariance[0, 0]))
+    for check in found.failed_checks:
+        assert "low edges above a foreground" in check.sentence
+        assert "high edges above a foreground" in check.sentence
+
+
+def test_a_half_of_a_side_testifies_against_the_other_half_alone():
+    halves = [replace(witness(name, deg), part_of="side") for name, deg in (("low", 0.0), ("high", 1.2))]
+    assert "low" in disagreement(halves)[0].sentence
+    assert disagreement([halves[1], witness("side", 0.0), replace(witness("c", 0.0), part_of="other")]) == []
 
 
 def witness(name, offset_deg, scatter_deg=0.02, floor_deg=0.1, axis=0):

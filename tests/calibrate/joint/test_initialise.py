@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.calibrate.joint.camera_lidar import initialise
 from pipeline.calibrate.joint.camera_lidar.beyond_chance import TERMS, Evidence, by_chance, wrong_poses
-from pipeline.calibrate.joint.camera_lidar.initialise import difference, find_basin
+from pipeline.calibrate.joint.camera_lidar.initialise import Basin, difference, find_basin
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, Scored, refine
 from pipeline.calibrate.joint.camera_lidar.rotation_grid import grid_maxima
 from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
@@ -56,7 +56,7 @@ def searched(terms, prior, limits=None):
     config = SolveConfig()
     limits = limits or search_range(prior, config)
     thin = Scored(terms.sharp(MAX_GAP_PX), kernel, prior, config, limits)
-    return find_basin(terms, thin, np.random.default_rng(0))
+    return find_basin(terms, thin, np.random.default_rng(0), np.arange(terms.frames))
 
 
 def off_by(degrees, metres, seed):
@@ -134,15 +134,26 @@ def test_an_end_that_the_frames_do_not_tell_from_another_is_doubted(terms, monke
     assert "fits the frames as well" in searched(terms, off_by(1.0, 0.02, 5)).doubt
 
 
-def test_an_end_that_a_term_with_a_place_of_its_own_contradicts_is_doubted(terms):
-    prior = off_by(1.0, 0.02, 5)
-    basin = searched(terms, prior)
-    search = initialise._Search.__new__(initialise._Search)
-    search.poses = 1000
-    rival = initialise._End("edges", basin.state, np.array([60.0, 0.0, 0.0]), np.zeros(3), 0.0)
-    contradicted = replace(basin, evidence=(10.0, 70.0, 20.0))
-    assert search._doubt(contradicted, [rival]).startswith("edges contradict")
-    assert not search._doubt(replace(basin, evidence=(40.0, 70.0, 20.0)), [rival])
+@pytest.mark.parametrize(("frames", "said"), [(10, "markings contradict"), (1, "")])
+def test_a_term_contradicts_an_end_only_where_its_own_lead_holds_over_the_frames(terms, frames, said):
+    """A lidar that is blind to paint has its brightest places somewhere too: in one frame, and so in their sum."""
+    prior, kernel = off_by(1.0, 0.02, 5), KernelSettings.wide(*SCHEDULE.kernels[0])
+    wrong = wrong_poses(prior, REACH_RAD, 0.05, np.random.default_rng(0))
+    elsewhere = turned(T_TRUE, np.radians([0.0, 0.0, 7.0]))
+    bright = bright_on_bright(terms, elsewhere)
+    misled = replace(terms, markings=bright.chosen(np.arange(len(bright.xyz_m)) < frames * _BRIGHT))
+    evidence = Evidence(misled, kernel, ((40.0, 30.0), (-40.0, -30.0))).measured(wrong)
+    scored = Scored(misled, kernel, prior, SolveConfig())
+    search = initialise._Search(scored, evidence, np.arange(terms.frames))
+    best, rival = (search._end("edges", AlignmentState(T)) for T in (T_TRUE, elsewhere))
+    basin = Basin(best.state, None, kernel, "edges", 2, (40.0, 0.0, 0.0), 13.0, 0.1, np.inf)
+    ahead = replace(rival, evidence=np.array([0.0, 30.0, 0.0]))
+    doubt = search._doubt(basin, [ahead], is_last=True)
+    assert doubt.startswith(said)
+    assert bool(doubt) == bool(said)
+    assert search._doubt(basin, [ahead], is_last=False)  # candidates are left to ask
+    led = replace(basin, evidence=(70.0, 0.0, 0.0))
+    assert not search._doubt(led, [ahead], is_last=True)  # the others lead by far more
 
 
 def test_a_term_without_data_weighs_nothing(terms):

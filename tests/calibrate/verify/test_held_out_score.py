@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -14,7 +15,7 @@ from pipeline.extrinsics.estimates import PairEstimate, Prior
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation, log_so3
 from pipeline.geometry.spherical import from_spherical
 from tests.makers.radar_scenes import DT_S, GROUND_M, T_LIDAR_RADAR, street_day
-from tests.makers.traced_scenes import DENSE, SPARSE, T_TRUE, traced_day
+from tests.makers.traced_scenes import DENSE, ROAD, SPARSE, T_TRUE, TERRAIN, traced_day
 
 SIGMA = np.array([*np.radians([0.05] * 3), 0.02, 0.02, 0.02])
 LIMIT = np.radians(0.4)
@@ -137,3 +138,31 @@ def test_camera_lidar_costs_prefer_the_truth(traced):
     assert np.isnan(cost[0])
     assert np.isfinite(cost[1:]).all()
     assert np.degrees(np.linalg.norm(log_so3(wrong[:3, :3] @ T_TRUE[:3, :3].T))) == pytest.approx(2.0)
+
+
+def on_a_square_brighter_to_the_right(day, times):
+    """As many more markings, all without paint: the ground is road as far as one sees, brighter from left to right."""
+    out = []
+    for o in day:
+        labels = cv2.imdecode(np.frombuffer(o.labels_png, np.uint8), cv2.IMREAD_GRAYSCALE)
+        labels[labels == TERRAIN] = ROAD
+        rising = np.broadcast_to(np.linspace(1, 255, labels.shape[1]), labels.shape)
+        bright = np.where(labels == ROAD, rising, 0).astype(np.uint8)
+        out.append(
+            replace(
+                o,
+                labels_png=cv2.imencode(".png", labels)[1].tobytes(),
+                road_contrast_png=cv2.imencode(".png", bright)[1].tobytes(),
+                marking_xyz_m=np.repeat(o.marking_xyz_m, times, axis=0),
+                marking_z=np.repeat(o.marking_z, times, axis=0),
+            )
+        )
+    return out
+
+
+def test_markings_that_are_bright_everywhere_decide_no_comparison():
+    day = on_a_square_brighter_to_the_right(traced_day(DENSE, 8, seed=7), 100)
+    prior = Prior(turned(T_TRUE, 1, 1.0), np.eye(4), np.radians(2), 0.1)
+    cost = held_out_score(result("camera_lidar", T_TRUE, 0.0), day, prior, SolveConfig()).cost
+    for degrees in (-2.0, 2.0):
+        assert cost(T_TRUE).sum() < cost(turned(T_TRUE, 1, degrees)).sum()

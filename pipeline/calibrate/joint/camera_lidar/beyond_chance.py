@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation
@@ -94,6 +94,16 @@ class Evidence:
     def by_frame(self, at: Alignments) -> Float[np.ndarray, " F"]:
         """Of edges and markings together at ONE alignment, up to a constant."""
         return _in_tails(np.stack([x[0] for x in self._excess(at)], -1), self.tail[:2]).sum(1)
+
+    def by_block(self, at: Alignments, block: Int[np.ndarray, " F"]) -> Float[np.ndarray, "B 3"]:
+        """What each block of frames alone shows of each term at ONE alignment, up to a constant."""
+        edges, markings = (x[0] for x in self._excess(at))
+        shown = []
+        for name in np.unique(block):
+            rows = np.flatnonzero(block == name)
+            classes = self.terms.of_frames(rows).class_information(at)[0]
+            shown.append([edges[rows].sum(), markings[rows].sum(), classes])
+        return _in_tails(np.array(shown), self.tail)
 
     def _excess(self, at: Alignments) -> tuple[np.ndarray, np.ndarray]:
         how = (at, self.kernel, self.shifts_px)

@@ -168,7 +168,8 @@ def align_camera_lidar(
     sharp = terms.telling()
     limits = search_range(prior, config)
     thin = Scored(sharp.at_most(SCHEDULE.wide_points, rng), first, prior, config, limits)
-    basin = find_basin(terms, thin, rng)
+    scenes = Scenes.of(frames, config.bootstrap_blocks)
+    basin = find_basin(terms, thin, rng, scenes.block)
     thin = replace(thin, terms=thin.terms.exposed_at(basin.state.alone), kernel=basin.kernel)
     sharp = sharp.in_view(basin.state.T_camera_lidar, MARGIN_RAD).at_most(SCHEDULE.sharp_points, rng)
     # Wide kernels are biased along the optical axis: where the prior is better than that, start at its tz.
@@ -178,7 +179,7 @@ def align_camera_lidar(
     ends = {name: start for name, start in starts.items() if start is not None}
     ends = {k: _at_prior_tz(end, prior, terms) if near else end for k, end in ends.items()}
     ends = {k: refine(thin, end, steps=SCHEDULE.first_steps, fixed=fixed) for k, end in ends.items()}
-    kernel, scenes = basin.kernel, Scenes.of(frames, config.bootstrap_blocks)
+    kernel = basin.kernel
     for sigma_px, contrast in SCHEDULE.kernels[1:]:
         sharp = sharp.exposed_at(ends["best"].alone)
         fitted = sharp.fitted(ends["best"].alone, KernelSettings.wide(sigma_px, contrast), rng)

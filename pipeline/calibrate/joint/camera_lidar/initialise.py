@@ -5,7 +5,8 @@ deg off and outvoted the edges. Candidates therefore come from the prior, from a
 terms together and by each alone, and from the vehicle's state. Each climbs at the same kernel within the
 search range, and their ends are compared by each term's evidence beyond chance (`beyond_chance`). The best
 end is accepted if it leads over the best of all chance poses of the search, if the day rejects every other
-end, and if no term with a clear maximum contradicts it.
+end, and if no term with a clear maximum contradicts it, block by block of its frames: a lidar that is blind to
+paint has its brightest places somewhere too.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from pipeline.calibrate.joint.camera_lidar.beyond_chance import TERMS, Evidence, by_chance, wrong_poses
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, Scored, prior_value, refine
@@ -25,7 +26,7 @@ from pipeline.calibrate.joint.camera_lidar.rotation_grid import (
     grid_turns,
 )
 from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
-from pipeline.calibrate.numerics.covariance import CLEARLY
+from pipeline.calibrate.numerics.covariance import CLEARLY, widening
 from pipeline.calibrate.numerics.search_range import search_range
 from pipeline.geometry.se3 import inverse, log_so3, transform_points
 from pipeline.objective.camera_lidar.kernel_settings import MAX_GAP_PX
@@ -82,12 +83,14 @@ class _End:
         return float(self.evidence.sum()) + self.prior
 
 
-def find_basin(terms: Terms, scored: Scored, rng: np.random.Generator) -> Basin:
+def find_basin(terms: Terms, scored: Scored, rng: np.random.Generator, block: Int[np.ndarray, " F"]) -> Basin:
     """Climb from candidates until the best end is found, or no candidate is left.
 
     Args:
         scored: few sharp points, the kernel at which ends are compared, the prior that is the centre of the
             search, and the config with the least search range.
+        rng: decides everything random.
+        block: of each frame; blocks err apart.
     """
     prior, (reach, shift) = scored.prior, search_range(scored.prior, scored.config)
     wrong = wrong_poses(prior, reach, min(shift, _SHIFT_SIGMAS * prior.translation_sigma_m), rng)
@@ -96,12 +99,12 @@ def find_basin(terms: Terms, scored: Scored, rng: np.random.Generator) -> Basin:
     compared = scored.terms.at_most(SCHEDULE.compared_points, rng)
     evidence = Evidence(compared, kernel, GRID_SHIFTS_PX).measured(wrong)
     scored = replace(scored, kernel=evidence.weighted())
-    search = _Search(scored, evidence)
+    search = _Search(scored, evidence, block)
     for origin, start, decides in _candidates(terms, scored, reach, wrong, rng):
         search.climb(origin, start)
         if decides and not (basin := search.conclude()).doubt and basin.rival is None:
             return basin
-    return search.conclude()
+    return search.conclude(is_last=True)
 
 
 def settled(basin: Basin, scored: Scored, best: AlignmentState, rival: AlignmentState) -> Basin:
@@ -167,8 +170,8 @@ def _climbed(scored: Scored, start: AlignmentState) -> AlignmentState:
 class _Search:
     """The ends so far."""
 
-    def __init__(self, scored: Scored, evidence: Evidence) -> None:
-        self.scored, self.evidence = scored, evidence
+    def __init__(self, scored: Scored, evidence: Evidence, block: Int[np.ndarray, " F"]) -> None:
+        self.scored, self.evidence, self.block = scored, evidence, block
         self.ends: list[_End] = []
         kernel_rad = scored.kernel.sigma_px / float(scored.terms.camera[1])
         self.same_rad = max(_SAME_OPTIMUM_RAD, _SAME_OPTIMUM_KERNELS * kernel_rad)
@@ -183,8 +186,8 @@ class _Search:
         if near < _ENDS_THAT_TELL:
             self.ends.append(self._end(origin, _climbed(self.scored, start)))
 
-    def conclude(self) -> Basin:
-        """The best end, and what speaks against it."""
+    def conclude(self, *, is_last: bool = False) -> Basin:
+        """The best end, and what speaks against it; as long as candidates are left, the sum of a term's data does."""
         highest = max(self.ends, key=lambda e: e.total)
         best = self._finished(highest)
         # Ends elsewhere that are near, or that the day does not reject, may not have arrived yet.
@@ -206,11 +209,10 @@ class _Search:
             np.inf if rival is None else _rejected(best, rival),
         )
         is_near = rival is not None and basin.rival_z < CLEARLY and basin.rival_rad < MARGIN_RAD
-        return replace(
-            basin, rival=rival.state if rival and is_near else None, doubt=self._doubt(basin, rivals)
-        )
+        doubt = self._doubt(basin, rivals, is_last=is_last)
+        return replace(basin, rival=rival.state if rival and is_near else None, doubt=doubt)
 
-    def _doubt(self, basin: Basin, rivals: Sequence[_End]) -> str:
+    def _doubt(self, basin: Basin, rivals: Sequence[_End], *, is_last: bool) -> str:
         """Why the best end cannot be taken for right."""
         if (total := sum(basin.evidence)) < basin.needed:
             return (
@@ -222,10 +224,24 @@ class _Search:
         alone = by_chance(self.poses, 1)
         for rival in rivals:
             lead = np.array(basin.evidence) - rival.evidence
-            for k, name in enumerate(TERMS):
-                if rival.evidence[k] > alone and -lead[k] > _CONTRADICTED * (lead.sum() - lead[k]):
-                    return f"{name} contradict the best end of the search ({basin.origin}): they show another place"
+            is_ahead = (rival.evidence > alone) & (-lead > _CONTRADICTED * (lead.sum() - lead))
+            if is_last and is_ahead.any():
+                is_ahead &= self._holds(rival.state, basin.state)
+            if is_ahead.any():
+                name = TERMS[int(np.argmax(is_ahead))]
+                return (
+                    f"{name} contradict the best end of the search ({basin.origin}): they show another place"
+                )
         return ""
+
+    def _holds(self, there: AlignmentState, here: AlignmentState) -> Bool[np.ndarray, " 3"]:
+        """Whether each term's own data prefer `there` to `here`, clearly by the scatter over blocks of frames."""
+        of_there, of_here = (self.evidence.by_block(s.alone, self.block) for s in (there, here))
+        lead, blocks = of_there - of_here, len(of_here)
+        if blocks < 2:
+            return np.zeros(len(TERMS), bool)
+        error = lead.std(axis=0, ddof=1) / np.sqrt(blocks) * widening(blocks)
+        return lead.mean(0) > CLEARLY * error
 
     def _arrived(self, end: _End, best: _End) -> _End:
         apart = self._apart(end.state, best.state)

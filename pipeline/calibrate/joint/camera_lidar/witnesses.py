@@ -2,7 +2,8 @@
 
 The fit takes their mean, and its sigma is as small as if they agreed. If a surface of the cloud has no border
 in the labels (the sill of a car's window, whose nearest border is the roof), one kind of edge is biased by a
-degree; halves and held-out frames do not show it, because they share the bias.
+degree; halves and held-out frames do not show it, because they share the bias. If only some cars have windows
+and no paint tells, the whole side follows the sills: only its low edges against its high ones show that.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from pipeline.calibrate.joint.camera_lidar.side_bias import most_offset_rad
 from pipeline.calibrate.numerics.bias_floors import CAMERA_LIDAR_BIAS
 from pipeline.calibrate.numerics.covariance import CLEARLY
 from pipeline.extrinsics.checks import FailedCheck
+from pipeline.objective.camera_lidar.points import Points
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT, Observation
 
@@ -55,6 +57,7 @@ class Witness:
     offset_rad: float
     scatter_rad: float  # over blocks of frames
     floor_rad: float  # of what all scenes share: labels too wide, beams too far apart
+    part_of: str = ""  # the side of which this is a half: it testifies against the other half alone
 
     @property
     def sigma_rad(self) -> float:
@@ -76,7 +79,7 @@ def ask_witnesses(
     seed: int,
     fit_sigma_rad: Sequence[float],
 ) -> list[Witness]:
-    """Rotations about camera x and y by each side of the edges, the markings, and detected boxes alone.
+    """Rotations about camera x and y by each side of the edges, its halves, the markings, and detected boxes alone.
 
     Each score's maximum within 2 deg, other unknowns unchanged, and the boxes' median; sigmas by resampling
     blocks of frames, so that a score of several maxima is uncertain. The fit itself is included, with its
@@ -87,22 +90,33 @@ def ask_witnesses(
     turn_rad = np.arange(-steps, steps + 1) * _STEP_PX * px_rad
     found = []
 
-    def ask(name: str, axis: int, score: np.ndarray, floor_rad: float) -> None:
+    def ask(name: str, axis: int, score: np.ndarray, floor_rad: float, part_of: str = "") -> None:
         rng = np.random.default_rng(seed)
         offset, scatter = _maximum(turn_rad, score.astype(np.float64), blocks, rng)
-        found.append(Witness(name, axis, offset, scatter, floor_rad))
+        found.append(Witness(name, axis, offset, scatter, floor_rad, part_of))
 
     for axis, sides in _SIDES.items():
         at = state.changed(turn_rad[:, None] * (np.arange(8) == axis))
         for name, side in sides:
             edges = terms.edges.chosen(terms.edges.side == side)
-            if kernel.edge_weight > 0 and len(edges.xyz_m) >= _FEWEST:
-                floor_rad = most_offset_rad(edges, px_rad)
-                ask(name, axis, replace(terms, edges=edges).edge_score(at, kernel), floor_rad)
+            if kernel.edge_weight <= 0 or len(edges.xyz_m) < _FEWEST:
+                continue
+            halves = {k: replace(terms, edges=half) for k, half in _by_height(edges).items()}
+            scores = {k: half.edge_score(at, kernel) for k, half in halves.items()}
+            ask(name, axis, sum(scores.values(), np.zeros(1)), most_offset_rad(edges, px_rad))
+            for k, half in halves.items():
+                if len(half.edges.xyz_m) >= _FEWEST:
+                    ask(f"{k} {name}", axis, scores[k], most_offset_rad(half.edges, px_rad), name)
         if kernel.marking_weight > 0 and len(terms.markings.xyz_m) >= _FEWEST:
             ask("paint", axis, terms.marking_score(at, kernel), _PAINT_FLOOR_PX * px_rad)
     fit = [Witness(_FIT, axis, 0.0, fit_sigma_rad[axis], float(CAMERA_LIDAR_BIAS[axis])) for axis in _SIDES]
     return fit + found + _boxes(observations, terms.poses(state.alone)[0], blocks, seed)
+
+
+def _by_height(edges: Points) -> dict[str, Points]:
+    """Edges below and above their median height, in lidar axes."""
+    is_high = edges.xyz_m[:, 2] > np.median(edges.xyz_m[:, 2])
+    return {"low": edges.chosen(~is_high), "high": edges.chosen(is_high)}
 
 
 def _boxes(
@@ -156,7 +170,7 @@ def witness_numbers(witnesses: Sequence[Witness]) -> dict[str, float]:
     return {
         f"{w.name.replace(' ', '_')}_{_AXES[w.axis]}_{what}_rad": value
         for w in witnesses
-        if w.name != _FIT
+        if w.name != _FIT and not w.part_of
         for what, value in (("offset", w.offset_rad), ("sigma", w.sigma_rad))
     }
 
@@ -167,6 +181,8 @@ def _contradictions(witnesses: Sequence[Witness], sigmas: float) -> list[tuple[W
     for a, b in combinations(witnesses, 2):
         if _FIT in (a.name, b.name) and _BOXES not in (a.name, b.name):
             continue  # sides and paint are parts of the fit
+        if a.part_of != b.part_of:
+            continue
         apart = abs(a.offset_rad - b.offset_rad)
         least = max(
             sigmas * float(np.hypot(a.sigma_rad, b.sigma_rad)),
