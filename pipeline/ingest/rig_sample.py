@@ -225,5 +225,5 @@ def _rings(frame: Frame) -> int:
         return 0
     xyz = frame.lidar_xyz_m.astype(np.float64)
     finite = np.isfinite(xyz).all(axis=1)
-    row = rows_of(to_spherical(xyz[finite]), frame.lidar_ring[finite])
-    return 0 if row is None else int(row.max()) + 1
+    rows = rows_of(to_spherical(xyz[finite]), frame.lidar_ring[finite])
+    return 0 if rows is None else int(rows.row.max()) + 1

@@ -112,5 +112,5 @@ def _rows_of(sweep: Sweep) -> UInt16[np.ndarray, " N"] | None:
     row, found = np.zeros(len(xyz), np.uint16), rows_of(to_spherical(xyz[finite]), None)
     if found is None:
         return None
-    row[finite] = found
+    row[finite] = found.row
     return row

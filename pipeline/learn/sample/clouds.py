@@ -96,11 +96,11 @@ def range_edges(
     if len(finite) < 2:
         return out
     aer = to_spherical(xyz_m[finite].astype(np.float64))
-    row = rows_of(aer, None if ring is None else ring[finite].astype(np.uint16))
-    if row is None:
+    rows = rows_of(aer, None if ring is None else ring[finite].astype(np.uint16))
+    if rows is None:
         return out
     azimuth, _, distance = aer.T
-    order = np.lexsort((azimuth, row))
+    row, order = rows
     step = np.diff(azimuth[order])
     along = np.diff(row[order]) == 0
     nominal = np.median(step[along & (step > 1e-5)]) if np.any(along & (step > 1e-5)) else 0.0
