@@ -191,8 +191,10 @@ def _motions(arcs: Sequence[Arc | None], pairs: Sequence[tuple[int, int, float]]
     """Motion per second at each sweep of a pair: the mean of its pairs."""
     held: dict[int, list[Arc]] = {}
     for arc, (i, j, gap_s) in zip(arcs, pairs, strict=True):
-        for k in (i, j) if arc is not None else ():
-            held.setdefault(k, []).append(Arc(arc.x / gap_s, arc.y / gap_s, arc.yaw_rad / gap_s))
+        if arc is not None:
+            per_second = Arc(arc.x / gap_s, arc.y / gap_s, arc.yaw_rad / gap_s)
+            for k in (i, j):
+                held.setdefault(k, []).append(per_second)
     return {k: Arc(*np.mean(of, axis=0)) for k, of in held.items()}
 
 

@@ -31,11 +31,16 @@ _OF_STAMP: Final = {"begin": 0.0, "middle": 0.5, "end": 1.0}
 class Seen(Protocol):
     """What this needs of a moment."""
 
-    moment: int
-    drive: int
-    stamp_ns: int
-    ego_speed_mps: float | None
-    ego_yaw_rate_radps: float | None
+    @property
+    def moment(self) -> int: ...
+    @property
+    def drive(self) -> int: ...
+    @property
+    def stamp_ns(self) -> int: ...
+    @property
+    def ego_speed_mps(self) -> float | None: ...
+    @property
+    def ego_yaw_rate_radps(self) -> float | None: ...
 
 
 @dataclass(frozen=True, eq=False)

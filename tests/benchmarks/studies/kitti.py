@@ -1,11 +1,9 @@
 """Study: camera-lidar of one street of KITTI, from 2 and 5 deg, of 26 and 5 frames: how far off, and does it say so?
 
-    python tests/benchmarks/studies/kitti.py --root DAYS --lake FOLDER
+    python tests/benchmarks/studies/kitti.py --lake FOLDER
 
-FOLDER has the fleet.toml of `boresight convert kitti` and a lake that was perceived. Starts are moved by exactly
-2 deg / 5 cm and 5 deg / 10 cm in random directions, as they are stated, four seeds each. The reference is the
-calibration that KITTI gives, which is known to about .1 deg; `z` is the error in sigmas of both. A line per
-start: errors of azimuth and elevation at the targets with their sigmas [deg], status and reason.
+FOLDER has the fleet.toml of `boresight convert kitti` and a lake that was perceived. Starts are 2 deg / 5 cm and
+5 deg / 10 cm off as they state, four seeds each. `z` is the error against KITTI's calibration in sigmas of both.
 """
 
 from __future__ import annotations
@@ -59,9 +57,9 @@ def main() -> None:
     for frames in _FRAMES:
         for start in _STARTS:
             for seed in args.seeds:
-                found = _calibrated(rows, perturbed(given, start, seed), fleet, day, (frames, seed))
-                line = {"start_deg": start[0], "frames": frames, "seed": seed}
-                lines.append(about | line | found[1] | line_of(found[0], given))
+                record, cost = _calibrated(rows, perturbed(given, start, seed), fleet, day, (frames, seed))
+                line = {"start_deg": start[0], "frames": frames, "seed": seed} | cost
+                lines.append(about | line | line_of(record, given))
                 print(json.dumps(lines[-1]), flush=True)
     args.out.write_text("".join(json.dumps(line) + "\n" for line in lines))
     print(summary(lines))
@@ -92,8 +90,8 @@ def line_of(record: CalibrationRecord, given: Prior) -> dict[str, Any]:
 
 def summary(lines: Sequence[dict[str, Any]]) -> str:
     """A row per start and number of frames."""
-    text = ["| start | frames | azimuth, mean, worst [deg] | elevation | RMS z | within 3 | accepted |"]
-    text.append("|---|---|---|---|---|---|---|")
+    head = "| start | frames | azimuth, mean, worst [deg] | elevation | RMS z | within 3 | accepted |"
+    text = [head, "|---" * 7 + "|"]
     for start, frames in dict.fromkeys((r["start_deg"], r["frames"]) for r in lines):
         mine = [r for r in lines if (r["start_deg"], r["frames"]) == (start, frames)]
         known = [r for r in mine if "el_z" in r]
@@ -102,8 +100,8 @@ def summary(lines: Sequence[dict[str, Any]]) -> str:
             for k in ("az_deg", "el_deg")
         )
         z = [r[k] for r in known for k in ("az_z", "el_z")]
-        cells = [*(off if known else ("-", "-")), f"{rms(z):.2f}", share(v <= 3 for v in z)]
-        cells.append(share(r["status"] == "accepted" for r in mine))
+        shares = (share(v <= 3 for v in z), share(r["status"] == "accepted" for r in mine))
+        cells = [*(off if known else ("-", "-")), f"{rms(z):.2f}", *shares]
         text.append(f"| {start:g} deg | {frames} | {' | '.join(cells)} |")
     return "\n".join(text)
 
