@@ -68,9 +68,10 @@ def test_cars_with_windows_are_held_and_pitch_is_as_unsure_as_the_evidence_is_ap
     assert "on pitch" in check.sentence
     assert "edges above a foreground" in check.sentence
     turn = log_so3((found.T @ inverse(T_TRUE))[:3, :3])
-    # The search ends at the truth, and the sills would turn it by more than a degree: nothing says which is right.
-    assert np.degrees(abs(turn[0])) < 0.1
-    assert np.degrees(np.sqrt(found.covariance[0, 0])) > 0.4
+    # The search ends beside the truth, and the sills would turn it by more than a degree: nothing tells which is right.
+    sigma = np.sqrt(found.covariance[0, 0])
+    assert abs(turn[0]) < 0.25 * sigma
+    assert np.degrees(sigma) > 0.4
 
 
 @pytest.mark.parametrize(("within_m", "faults"), [(0.0, []), (18.0, ["witnesses_disagree"])])
