@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Final, Protocol
+from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import UInt16
@@ -28,6 +28,7 @@ _STANDS_RADPS: Final = 0.01
 _OF_STAMP: Final = {"begin": 0.0, "middle": 0.5, "end": 1.0}
 
 
+@runtime_checkable
 class Seen(Protocol):
     """What this needs of a moment."""
 
