@@ -199,10 +199,10 @@ def _state_cells(row: dict[str, Any]) -> dict[str, str]:
 
 def _line_words(row: dict[str, Any]) -> str:
     """Answer with the model line: its sigmas, and the turn from the vehicle's answer alone to it."""
-    if row["line_status"] is None:
+    if row["line_status"] in (None, "alone"):
         return ""
-    if row["line_status"] != "shared":
-        return str(row["line_status"])
+    if row["line_status"] == "outside":
+        return f"outside: {row['line_reason']}"
     sigmas = (row["line_azimuth_sigma_rad"], row["line_elevation_sigma_rad"])
     sure = "/".join(f"{s * 180 / math.pi:.3f}" for s in sigmas)
     turn = " ".join(f"{v * 180 / math.pi:+.3f}" for v in row["line_moved_by"][:3])
