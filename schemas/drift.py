@@ -147,7 +147,8 @@ DAYS_WILL_TELL = "will tell"
 # Of reasons of UNKNOWN, how many days a chart has to have, and the days it has where the reason says so.
 _DAYS_NEEDED = (
     re.compile(r"(?P<has>\d+) days? of data, (?P<needs>\d+) needed"),
-    re.compile(r"that size after about (?P<needs>\d+) days?"),
+    re.compile(r"that size itself with about (?P<needs>\d+) days?"),
+    re.compile(r"that size after about (?P<needs>\d+) days?"),  # as 0.12 and older releases put it
 )
 
 

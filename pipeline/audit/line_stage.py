@@ -109,7 +109,7 @@ def _rows(
             _witnesses_of(witnesses, keys),
         )  # fmt: skip
         row, columns = line_rows(of_edge, fleet.fleet_model, fleet.verify)
-        answers = as_answers(of_edge, columns, [counted.columns(k) for k in rows])
+        answers = as_answers(of_edge, columns, [counted.columns(k) for k in rows.tolist()])
         key = work_key("lines", CODE_VERSION, config, [content_hash([*answers, row])])
         yield Records([replace(r, work_key=key) for r in (*answers, row)], None, key, [])
 
@@ -230,4 +230,6 @@ def _told(rows: Sequence[LineAnswer]) -> Told:
     differ = [r for r in rows if r.differs]
     named = ", ".join(f"{r.vehicle} ({r.pair} {r.distance_axis})" for r in differ[:5])
     more = f" and {len(differ) - 5} more" if len(differ) > 5 else ""
+    if not rows:
+        return Told({}, reason="no calibration record", refused=True)
     return Told(dict(counts), reason=f"differ from their line: {named}{more}" if differ else "")

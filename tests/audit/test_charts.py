@@ -313,7 +313,7 @@ def test_a_chart_that_cannot_tell_yet_says_after_how_many_days_it_can(sigma: flo
     if blind.status == "GREEN":
         assert days >= 9  # only then is the sigma small enough
         return
-    found = re.search(r"after about (\d+) days", blind.reason)
+    found = re.search(r"itself with about (\d+) days", blind.reason)
     assert found is not None
     needed = int(found[1])
     # An odd number of days splits unevenly, three of them by an eighth of sigma squared: "about".

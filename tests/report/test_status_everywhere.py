@@ -159,6 +159,11 @@ def test_of_yellow_what_the_next_days_decide_is_told_from_what_is_sure() -> None
         ),
         (
             "UNKNOWN",
+            "that size itself with about 5 days like these",
+            "1 more accepted day; look again tomorrow: `",
+        ),
+        (  # as earlier releases put it
+            "UNKNOWN",
             "and that size after about 5 days like these",
             "1 more accepted day; look again tomorrow: `",
         ),

@@ -34,11 +34,13 @@ def test_without_time_offsets_none_is_estimated():
         assert abs(pairs[pair].time_offset_s - 1e-3) < 1e-4
 
 
-def test_without_the_position_prior_a_position_goes_further_from_it_than_its_sigma():
+def test_without_the_position_prior_positions_are_less_sure_and_what_the_day_leaves_open_is_open():
     kept, free = solve_without(), solve_without("translation_prior")
     for pair in ("camera_lidar", "lidar_radar"):
-        shift = [np.linalg.norm(s.pairs[pair].T[:3, 3] - PRIOR.of(pair)[:3, 3]) for s in (kept, free)]
-        assert shift[1] > shift[0]
+        sigma = [np.sqrt(np.diag(s.pairs[pair].covariance)[3:]) for s in (kept, free)]
+        assert (sigma[1] > sigma[0]).all()
+    assert not free.pairs["camera_lidar"].observable[5]  # along the camera's axis
+    assert sigma[0].max() < 0.06
 
 
 def test_without_static_detections_the_registration_says_nothing():

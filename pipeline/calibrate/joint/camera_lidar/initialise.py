@@ -240,7 +240,7 @@ class _Search:
         lead, blocks = of_there - of_here, len(of_here)
         if blocks < 2:
             return np.zeros(len(TERMS), bool)
-        error = lead.std(axis=0, ddof=1) / np.sqrt(blocks) * widening(blocks)
+        error = lead.std(axis=0, ddof=1) / np.sqrt(blocks) * widening(float(blocks))
         return lead.mean(0) > CLEARLY * error
 
     def _arrived(self, end: _End, best: _End) -> _End:
