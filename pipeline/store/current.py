@@ -15,6 +15,7 @@ from pipeline.geometry.targets import DEFAULT_TARGETS
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.columns import TableSchema
 from schemas.drift import DriftFinding
+from schemas.fleet_model import LineAnswer
 from schemas.poses import POSES, PoseRow
 from schemas.radar_alignments import RADAR_ALIGNMENTS, RadarAlignment
 from schemas.service_events import ServiceEvent
@@ -112,7 +113,9 @@ def current_events(events: Sequence[ServiceEvent]) -> list[ServiceEvent]:
     return [event for event in noted.values() if not event.withdrawn]
 
 
-def transform_of(record: CalibrationRecord | StateRow | PoseRow) -> Float[np.ndarray, "4 4"] | None:
+def transform_of(
+    record: CalibrationRecord | StateRow | PoseRow | LineAnswer,
+) -> Float[np.ndarray, "4 4"] | None:
     """T_parent_child of a record or state, T_reference_sensor of a pose; None without an estimate."""
     return _transform(record.qw, record.qx, record.qy, record.qz, record.tx_m, record.ty_m, record.tz_m)
 
