@@ -91,7 +91,7 @@ def export_frames(
     }
     settings |= {"perturb": None if perturb is None else list(perturb), "perturb_per": perturb_per}
     whole = {"val_fraction": 0.0, "test_fraction": 0.0} if unsplit else {}
-    prepare = config.prepare.model_copy(update=whole)
+    prepare = config.prepare.split_with(**whole)
     with progress_reporter("plan") as progress:
         planned, settings = plan_frames(tables, list(known), prepare, output, settings, progress)
     tasks = [
