@@ -11,7 +11,8 @@ from pipeline.store.partitions import Lake
 from tests.makers import training_lakes
 from tests.makers.fleet_files import fleet_toml
 
-FRAMES, MOST_MIB = 40, 12  # were they held, four times the frames would be 45 MiB more: see `picture`
+# Were they held, four times the frames would be 45 MiB more (see `picture`); allocators differ by 5 to 12 between runs.
+FRAMES, MOST_MIB = 40, 22
 POSE = {"ego_qw": 1.0, "ego_qx": 0.0, "ego_qy": 0.0, "ego_qz": 0.0, "ego_ty_m": 0.0, "ego_tz_m": 0.0}
 EXPORT = """
 import sys
