@@ -54,6 +54,7 @@ class Counted:
         restart: first day that might count; empty = any.
         last_key: work key of the last day's record.
         read_until: stamp of the last record of any vehicle that was read.
+        day: last day of the window that was read; empty = none was.
     """
 
     place: dict[Key, int] = field(default_factory=dict)
@@ -62,6 +63,7 @@ class Counted:
     restart: list[str] = field(default_factory=list)
     last_key: list[str] = field(default_factory=list)
     read_until: str = ""
+    day: str = ""
 
     @classmethod
     def read(cls, lake: Lake, method: str) -> Counted:
@@ -77,7 +79,13 @@ class Counted:
         sums = unpacked(np.stack([np.asarray(r.sums) for r in rows]), days, when)
         until = max(r.read_until for r in rows)
         return cls(
-            place, sums, [r.line for r in rows], [r.restart for r in rows], [r.last_key for r in rows], until
+            place,
+            sums,
+            [r.line for r in rows],
+            [r.restart for r in rows],
+            [r.last_key for r in rows],
+            until,
+            rows[0].day,
         )
 
     def columns(self, k: int) -> dict[str, Any]:
@@ -162,12 +170,15 @@ class DaysOfLines:
         of a day that is counted already was replaced.
         """
         first, last = self.window
-        since = _before(counted.read_until)
+        since, day = _before(counted.read_until), counted.day
         gone = _ordinal(first)
         counted.forget({key for key, k in counted.place.items() if counted.sums.last[k] < gone})
         anew = {key for key, k in counted.place.items() if self._is_stale(counted, key, k)}
-        for week in [(first, last)] if since else list(_weeks(first, last)):
-            new = self._read(*week, asserted_after=since)
+        # Days after the last window's may have been recorded before it was read, as after an audit of an earlier one.
+        spans = [(first, min(day, last), since)] if since else []
+        spans += [(*week, None) for week in _weeks(max(first, days_after(day, 1)) if day else first, last)]
+        for begin, end, asserted_after in spans:
+            new = self._read(begin, end, asserted_after=asserted_after)
             if new is None:
                 continue
             counted.read_until = max(counted.read_until, new.until)

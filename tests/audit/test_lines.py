@@ -101,6 +101,21 @@ def test_a_night_that_adds_its_day_counts_what_all_days_at_once_do(tmp_path):
         np.testing.assert_allclose(transform_of(other), transform_of(answer), atol=1e-5)
 
 
+def test_days_that_were_recorded_before_an_audit_of_an_earlier_window_are_counted_after_it(tmp_path):
+    line, fleet = MadeLine(8, 6, seed=14), fleet_of()
+    records, lake = line_records(line), Lake.at(tmp_path)
+    days = sorted({r.day for r in records})
+    # The later days were recorded first, each day at a time of its own.
+    order = [days.index(d) for d in (*days[3:], *days[:3])]
+    stamp = {days[k]: f"2026-03-{20 + n}T00:00:00.000000Z" for n, k in enumerate(order)}
+    records = [replace(r, recorded_at=stamp[r.day], asserted_at=stamp[r.day]) for r in records]
+    commit_records(lake, CALIBRATIONS, records)
+    lines(lake, fleet, days[2])
+    answer = lines(lake, fleet)[1][line.vehicle(0), "camera_lidar"]
+    assert answer.last_day == days[-1]
+    assert answer.days == pytest.approx(6, abs=0.5)
+
+
 def test_a_record_of_a_day_that_is_counted_already_is_counted_once_and_as_it_is_now(tmp_path):
     line, fleet = MadeLine(8, 3, seed=3), fleet_of()
     records, lake = line_records(line), Lake.at(tmp_path)
