@@ -51,11 +51,16 @@ def realigned_radars(outcomes: Sequence[Outcome]) -> dict[str, list[dict[str, st
 
 def model_lines(outcomes: Sequence[Outcome]) -> dict[str, dict[str, Any]]:
     """Under key `lines`: status of each line and edge, and vehicles that differ from theirs; empty without lines."""
+    from pipeline.report.lines import too_few
+
     rows = [row for outcome in outcomes for row in outcome.records]
-    lines = {f"{r.line} {r.parent_frame}-{r.child_frame}": r.status for r in FLEET_MODEL.rows_among(rows)}
+    found = FLEET_MODEL.rows_among(rows)
+    few = too_few(found)
+    status = {f"{r.line} {r.parent_frame}-{r.child_frame}": r.status for r in found if r.line not in few}
     differ = sorted({a.vehicle for a in LINE_ANSWERS.rows_among(rows) if a.differs})
     left = [f"and {len(differ) - _STEPS} more"] if len(differ) > _STEPS else []
-    return {"lines": {"status": lines, "vehicles_that_differ": differ[:_STEPS] + left}} if lines else {}
+    told = {"status": status, "vehicles_that_differ": differ[:_STEPS] + left, "too_few_vehicles": few}
+    return {"lines": told} if found else {}
 
 
 def next_steps(findings: Sequence[DriftFinding], lake: str) -> list[str]:

@@ -125,7 +125,8 @@ def _distances(
     """Largest distance of a mount from the line along an axis, in sigmas, and the axis; 0 for a remounted vehicle."""
     both = np.concatenate([evidence.to_mount, evidence.to_bias], axis=1)
     line = evidence.to_mount @ np.diag(model.variance) @ evidence.to_mount.T + both @ covariance @ both.T
-    z = np.abs(shifts_in_sigmas(evidence.weights(line), residual, evidence.to_mount))
+    unit = np.sqrt(np.diag(model.prior.mount))
+    z = np.abs(shifts_in_sigmas(evidence.weights(line), residual, evidence.to_mount, unit))
     z[evidence.remounted] = 0.0
     return z.max(axis=1), z.argmax(axis=1)
 

@@ -77,7 +77,7 @@ def _shifts(evidence: LineEvidence, model: LineModel) -> tuple[np.ndarray, np.nd
     residual = evidence.value - A @ model.mean[:M] - evidence.to_bias @ model.mean[M:]
     size = np.einsum("om,nop,pm->nm", A, W, A, optimize=True)
     sure = (size > 0) & (size >= _AS_SURE * np.quantile(size, 0.75, axis=0))
-    score = shifts_in_sigmas(W, residual, A)
+    score = shifts_in_sigmas(W, residual, A, np.sqrt(np.diag(model.prior.mount)))
     return np.where(sure, score / np.sqrt(np.where(size > 0, size, 1.0)), 0.0), sure
 
 

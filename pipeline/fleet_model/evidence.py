@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 __all__ = ["LineEvidence", "LinePrior", "evidence_of_days", "shifts_in_sigmas", "with_witness"]
 
 _DETERMINED = 0.5  # of the prior's variance: an axis that a vehicle's days leave at less
+_SHOWN = 0.05  # of the prior's information along an axis: with less a vehicle shows nothing of it
 _NOTHING = 1e-9  # of the prior's information: a direction with less is open
 
 
@@ -152,9 +153,21 @@ def _mean_of(days: Float[np.ndarray, "N 1"], phi: Float[np.ndarray, "N M"]) -> F
 
 
 def shifts_in_sigmas(
-    W: Float[np.ndarray, "N O O"], residual: Float[np.ndarray, "N O"], A: Float[np.ndarray, "O M"]
+    W: Float[np.ndarray, "N O O"],
+    residual: Float[np.ndarray, "N O"],
+    A: Float[np.ndarray, "O M"],
+    unit: Float[np.ndarray, "*N M"],
 ) -> Float[np.ndarray, "N M"]:
-    """Score of a shift of each vehicle's mount along each axis alone, in sigmas; zero where it shows nothing."""
+    """Score of a shift of each vehicle's mount along each axis alone, in sigmas; zero where it shows nothing.
+
+    Args:
+        W: inverse covariances of what is observed.
+        residual: of what is observed.
+        A: from a mount to what is observed.
+        unit: sigmas of the prior, against which information along an axis counts or does not. Rounding leaks a
+            thousandth of a millionth of one axis into another, where a score divided by its sigma would be as large.
+    """
     score = np.einsum("om,nop,np->nm", A, W, residual, optimize=True)
     size = np.einsum("om,nop,pm->nm", A, W, A, optimize=True)
-    return np.where(size > 0, score / np.sqrt(np.where(size > 0, size, 1.0)), 0.0)
+    shown = size * unit**2 > _SHOWN
+    return np.where(shown, score / np.sqrt(np.where(shown, size, 1.0)), 0.0)

@@ -111,7 +111,7 @@ def learn_line(
     weight = _first_weights(evidence, prior, known, variance)
     for _ in range(_ROUNDS):
         terms = _solved(evidence, prior, value, variance, weight)
-        distance, axis = _distances(evidence, terms)
+        distance, axis = _distances(evidence, terms, prior)
         weight = _weights(distance)
         score, information = _scatter_equations(evidence, terms, weight)
         sigma = np.sqrt(np.diag(_inverse(information)))
@@ -123,7 +123,7 @@ def learn_line(
     if at_least is not None:
         variance = np.where(seen, np.clip(at_least, variance, most), variance)
     terms = _solved(evidence, prior, value, variance, weight)
-    distance, axis = _distances(evidence, terms)
+    distance, axis = _distances(evidence, terms, prior)
     return LineModel(
         terms.mean, np.linalg.inv(terms.information), variance, np.where(seen, np.minimum(sigma, most), 0.0),
         prior, _weights(distance), distance, axis,
@@ -193,9 +193,10 @@ def _solved(
     return _Terms(W, design, information, mean, value - design @ mean)
 
 
-def _distances(evidence: LineEvidence, terms: _Terms) -> tuple[np.ndarray, np.ndarray]:
+def _distances(evidence: LineEvidence, terms: _Terms, prior: LinePrior) -> tuple[np.ndarray, np.ndarray]:
     """By vehicle, the largest shift along an axis in sigmas, and the axis."""
-    z = np.abs(shifts_in_sigmas(terms.W, terms.residual, evidence.to_mount))
+    unit = np.sqrt(np.diag(prior.mount))
+    z = np.abs(shifts_in_sigmas(terms.W, terms.residual, evidence.to_mount, unit))
     return z.max(axis=1), z.argmax(axis=1)
 
 

@@ -168,7 +168,8 @@ class DaySums:
         before = np.einsum("nij,nj->ni", mine, self.pull)
         W = np.linalg.solve(np.eye(6) + day.information @ mine, day.information)
         own = np.einsum("nij,nj->ni", np.linalg.inv(day.information + weak), day.pull)
-        z = shifts_in_sigmas(W, own - before, np.eye(6)) / scale
+        unit = np.sqrt(np.einsum("nii->ni", day.prior))
+        z = shifts_in_sigmas(W, own - before, np.eye(6), unit) / scale
         return np.asarray(np.abs(z).max(axis=1, initial=0.0))
 
 

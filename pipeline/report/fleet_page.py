@@ -15,7 +15,7 @@ import numpy as np
 from pipeline.config import FleetConfig
 from pipeline.report.charts import charted_edges, fleet_charts
 from pipeline.report.fleet import DAY_LETTERS, VehicleRow, finding_views, fleet_rows, headline_for, index_row
-from pipeline.report.lines import line_views
+from pipeline.report.lines import fleet_lines
 from pipeline.report.names import page_stem
 from pipeline.report.page import render, write_page
 from pipeline.report.reading import fleet_records
@@ -60,7 +60,6 @@ def render_fleet_page(
     ends = [window.day.min(), window.day.max()] if len(window.day) else []
     dates = [dt.date.fromordinal(int(day)).isoformat() for day in ends]
     counts = {s: sum(r.status == s for r in rows) for s in DRIFT_STATUSES}
-    lines, differ, differing = line_views(album.lake, album.method)
     html = render(
         "fleet.html",
         fleet=album.fleet.fleet.name,
@@ -79,9 +78,7 @@ def render_fleet_page(
         shown=rows[:_CHARTS],
         index=json.dumps(_index(album, days, rows, {v.vehicle: v for v in views}, (edges, charts))),
         dofs=[f"{d} [{'deg' if d.startswith('r') else 'm'}]" for d in DOF_NAMES],
-        lines=lines,
-        differ=differ,
-        differ_left=differing - len(differ),
+        models=fleet_lines(album.lake, album.method),
         loads_lines=album.fleet.fleet_model.use == "states",
         truth=known,
         truth_summary=truth_summary(known),

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 from pipeline.rig.edges import edge_named, words_of
@@ -12,7 +12,7 @@ from pipeline.store.partitions import Lake
 from pipeline.store.records import last_assertion, read_last, read_records
 from schemas.fleet_model import FLEET_MODEL, LINE_ANSWERS, LINE_STATUSES, FleetModelRow, LineAnswer
 
-__all__ = ["AnswerView", "LineView", "line_views", "scatter_words", "shared_words"]
+__all__ = ["AnswerView", "FleetLines", "LineView", "fleet_lines", "scatter_words", "shared_words", "too_few"]
 
 _DEG = 180 / math.pi
 _NAMED = 12  # vehicles that a page names; the others it counts
@@ -50,14 +50,44 @@ class AnswerView:
     reason: str
 
 
-def line_views(lake: Lake, method: str) -> tuple[list[LineView], list[AnswerView], int]:
-    """Lines of the last night, the most urgent first; vehicles that differ, the first ones; and how many do."""
+@dataclass(frozen=True)
+class FleetLines:
+    """Lines of the last night, the most urgent first.
+
+    Args:
+        lines: those with enough vehicles.
+        too_few: vehicles of the others, by name.
+        differ: vehicles that differ from their line, the first ones.
+        differing: how many do.
+    """
+
+    lines: list[LineView] = field(default_factory=list)
+    too_few: dict[str, int] = field(default_factory=dict)
+    differ: list[AnswerView] = field(default_factory=list)
+    differing: int = 0
+
+
+def too_few(rows: Iterable[FleetModelRow]) -> dict[str, int]:
+    """Vehicles of the lines that have no edge with enough of them, by name."""
+    most: dict[str, int] = {}
+    enough = set()
+    for r in rows:
+        most[r.line] = max(most.get(r.line, 0), r.vehicles)
+        if r.mean is not None:
+            enough.add(r.line)
+    return {line: count for line, count in sorted(most.items()) if line not in enough}
+
+
+def fleet_lines(lake: Lake, method: str) -> FleetLines:
+    """Lines of the last night as the fleet page shows them."""
     last = last_assertion(lake, LINE_ANSWERS, method)
     if last is None:
-        return [], [], 0
+        return FleetLines()
     rows = [r for r in read_records(lake, FLEET_MODEL, FleetModelRow, day=last.day) if r.method == method]
     current = {(r.line, r.pair, r.parent_frame, r.child_frame): r for r in rows}
-    ordered = sorted(current.values(), key=lambda r: (LINE_STATUSES.index(r.status), r.line))
+    few = too_few(current.values())
+    known = [r for r in current.values() if r.line not in few]
+    ordered = sorted(known, key=lambda r: (LINE_STATUSES.index(r.status), r.line))
     lines = [
         LineView(
             r.line, _edge_of(r), r.status, r.vehicles, scatter_words(r.scatter), tuple(shared_words(vars(r))),
@@ -68,7 +98,7 @@ def line_views(lake: Lake, method: str) -> tuple[list[LineView], list[AnswerView
     differ = [r for r in read_last(lake, LINE_ANSWERS, LineAnswer, method, columns=_OF_ANSWERS) if r.differs]
     differ.sort(key=lambda r: -(r.distance_sigmas or 0.0))
     views = [AnswerView(r.vehicle, r.line, _edge_of(r), r.reason) for r in differ[:_NAMED]]
-    return lines, views, len(differ)
+    return FleetLines(lines, few, views, len(differ))
 
 
 def scatter_words(scatter: Sequence[float] | None) -> str:

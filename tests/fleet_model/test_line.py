@@ -276,6 +276,21 @@ def test_an_axis_that_no_vehicle_determines_leaves_the_others_alone():
     assert model.variance[5] == pytest.approx(DRAWING[5] ** 2)
 
 
+def test_an_axis_of_which_rounding_alone_tells_is_not_the_one_that_is_named():
+    line = make_line(50, 0.5, 41)
+    information = line.evidence.information.copy()
+    information[:, 0, :] = information[:, :, 0] = 0.0
+    information[:, 0, 0] = 1e-9
+    leak = 1e-7 * information[:, 2, 2]
+    information[:, 0, 2] = information[:, 2, 0] = leak
+    information[:, 0, 0] += 1e-7 * leak
+    value = line.evidence.value.copy()
+    value[7, 2] += 2 * DEG
+    evidence = replace(line.evidence, value=value, information=information)
+    found = with_line(learn_line(evidence, line.prior), evidence, line.common)
+    assert (found.distance[7] > DIFFERS_SIGMAS, found.axis[7]) == (True, 2)
+
+
 def test_four_times_the_vehicles_cost_about_four_times_as_much():
     def cost_s(vehicles):
         line = make_line(vehicles, 1.0, 43)
