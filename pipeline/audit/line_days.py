@@ -175,7 +175,7 @@ class DaysOfLines:
         counted.forget({key for key, k in counted.place.items() if counted.sums.last[k] < gone})
         anew = {key for key, k in counted.place.items() if self._is_stale(counted, key, k)}
         # Days after the last window's may have been recorded before it was read, as after an audit of an earlier one.
-        spans = [(first, min(day, last), since)] if since else []
+        spans: list[tuple[str, str, str | None]] = [(first, min(day, last), since)] if since else []
         spans += [(*week, None) for week in _weeks(max(first, days_after(day, 1)) if day else first, last)]
         for begin, end, asserted_after in spans:
             new = self._read(begin, end, asserted_after=asserted_after)
