@@ -16,6 +16,11 @@ LINE_STATUSES = ("RED", "UNKNOWN", "GREEN")
 OF_ALL = "*"  # in column `vehicle` of rows about all vehicles of a line
 
 _CHANGE = "changes: rotation vector [rad], shift of the child's origin [m], in the parent's axes"
+_PAIR = (
+    "kind of the edge: kinds of its two sensors, e.g. camera_lidar; 'pose' in rows of an adjusted rig's poses"
+)
+_KINDS = "kinds of frames a and b, e.g. lidar_camera: those of pair, but for poses"
+_RELEASE = "boresight version that learnt it, from records of its own release alone"
 _DRAWING = (
     "drawing T_parent_child: the median of the vehicles' priors when the line began; changes count from it"
 )
@@ -29,9 +34,11 @@ class FleetModelRow(Recorded):
     day: str = column("last day of the window, YYYY-MM-DD")
     method: str = column("method of the records")
     line: str = column("model line: `model` of the vehicles in fleet.toml, or else their rig")
-    pair: str = column("kind of the edge: kinds of its two sensors, e.g. camera_lidar")
-    parent_frame: str = column("frame a of T_a_b: name of a sensor, or base")
+    pair: str = column(_PAIR)
+    kinds: str = column(_KINDS)
+    parent_frame: str = column("frame a of T_a_b: name of a sensor, or base; for poses the reference")
     child_frame: str = column("frame b of T_a_b: name of a sensor, or base")
+    code_version: str = column(_RELEASE)
     status: str = column(
         "GREEN (vehicles share what they have in common), UNKNOWN (too few vehicles, or they contradict each other), "
         "RED (part of the line moved together); only a GREEN line has a part in its vehicles' answers"
@@ -40,6 +47,9 @@ class FleetModelRow(Recorded):
     vehicles: int = column("number of vehicles with days")
     outside: list[str] = column("vehicles that differ from the line", default_factory=list)
     since: str | None = column("first day of any vehicle that counts", default=None)
+    other_releases: list[str] = column(
+        "releases whose records were read and do not count: each errs in its own way", default_factory=list
+    )
     drawing_qw: float | None = column(_DRAWING, default=None)
     drawing_qx: float | None = column(_DRAWING, default=None)
     drawing_qy: float | None = column(_DRAWING, default=None)
@@ -114,9 +124,11 @@ class LineAnswer(Posed):
     day: str = column("last day of the window, YYYY-MM-DD")
     method: str = column("method of the records")
     line: str = column("model line")
-    pair: str = column("kind of the edge: kinds of its two sensors, e.g. camera_lidar")
-    parent_frame: str = column("frame a of T_a_b: name of a sensor, or base")
+    pair: str = column(_PAIR)
+    kinds: str = column(_KINDS)
+    parent_frame: str = column("frame a of T_a_b: name of a sensor, or base; for poses the reference")
     child_frame: str = column("frame b of T_a_b: name of a sensor, or base")
+    code_version: str = column(_RELEASE)
     status: str = column(
         "shared (the line has a part in the answer), outside (the vehicle differs from its line: its answer is that of "
         "the vehicle alone) or alone (the line is not GREEN)"

@@ -11,6 +11,8 @@ from schemas.columns import Posed, TableSchema, array, column, row
 
 __all__ = ["POSES", "PoseRow"]
 
+_PRIOR = "prior transform T_reference_sensor; null without a pose and before version 3"
+
 
 @row(eq=False)
 class PoseRow(Posed):
@@ -47,6 +49,18 @@ class PoseRow(Posed):
     view_azimuth_rad: float | None = column(
         "horizontal field of view of the sensor, from its data; null if unknown", default=None
     )
+    prior_qw: float | None = column(_PRIOR, default=None)
+    prior_qx: float | None = column(_PRIOR, default=None)
+    prior_qy: float | None = column(_PRIOR, default=None)
+    prior_qz: float | None = column(_PRIOR, default=None)
+    prior_tx_m: float | None = column(_PRIOR, default=None)
+    prior_ty_m: float | None = column(_PRIOR, default=None)
+    prior_tz_m: float | None = column(_PRIOR, default=None)
+    prior_covariance: np.ndarray | None = array("<f8", (6, 6), "prior covariance, same order", default=None)
+    unsure_only: bool = column(
+        "held for nothing but a sigma that is too large for the limits: model lines count such days",
+        default=False,
+    )
     notes: list[str] = column("remarks", default_factory=list)
     code_version: str = column("boresight version")
     inputs: list[str] = column("work keys or paths of the inputs", default_factory=list)
@@ -55,9 +69,9 @@ class PoseRow(Posed):
 POSES = TableSchema(
     PoseRow,
     "poses",
-    2,
+    3,
     "One row per sensor and method, the reference too. boresight show poses --json prints these names plus T, 4x4.",
     made_by="calibrate",
-    reads_versions=(1,),
+    reads_versions=(1, 2),
     about=("vehicle", "day", "method", "sensor"),
 )

@@ -77,7 +77,7 @@ class StateRow(Posed):
     )
     line_status: str | None = column(
         "shared (the model line has a part in the line_ pose), outside (the vehicle differs from its line) or alone "
-        "(the line is not GREEN); null before version 6 and in rows of sensors",
+        "(the line is not GREEN, or was not learnt tonight); null before version 6",
         default=None,
     )
     line_reason: str | None = column("reason for line_status", default=None)

@@ -187,7 +187,7 @@ def _state_cells(row: dict[str, Any]) -> dict[str, str]:
     days = row["days"]
     return {
         "vehicle": row["vehicle"],
-        "pair": _edge(row) if row["sensor"] is None else f"{row['sensor']} in {row['parent_frame']}",
+        "pair": _edge(row),
         "state": row["status"],
         **_pose_cells(row["T"], row["T_prior"]),
         **_sure_cells(row),
@@ -247,7 +247,9 @@ def _named(row: dict[str, Any], *names: str) -> dict[str, str]:
 
 
 def _edge(row: dict[str, Any]) -> str:
-    """Kinds of the two sensors, or their names if they differ from the kinds."""
-    from pipeline.rig.edges import edge_named, words_of
+    """Kinds of the two sensors, or their names if they differ from the kinds, as in `words_of`."""
+    from pipeline.rig.edges import POSE, edge_named, words_of
 
+    if row["pair"] == POSE:
+        return f"{row['child_frame']} in {row['parent_frame']}"
     return words_of(edge_named(row["pair"], row["parent_frame"], row["child_frame"]))

@@ -50,17 +50,21 @@ def realigned_radars(outcomes: Sequence[Outcome]) -> dict[str, list[dict[str, st
 
 
 def model_lines(outcomes: Sequence[Outcome]) -> dict[str, dict[str, Any]]:
-    """Under key `lines`: status of each line and edge, and vehicles that differ from theirs; empty without lines."""
+    """Under key `lines`: status of each line and edge, and vehicles that differ; or why no line was learnt."""
     from pipeline.report.lines import too_few
+    from pipeline.rig.edges import line_edge, words_of
 
     rows = [row for outcome in outcomes for row in outcome.records]
     found = FLEET_MODEL.rows_among(rows)
     few = too_few(found)
-    status = {f"{r.line} {r.parent_frame}-{r.child_frame}": r.status for r in found if r.line not in few}
+    status = {f"{r.line} {words_of(line_edge(r))}": r.status for r in found if r.line not in few}
     differ = sorted({a.vehicle for a in LINE_ANSWERS.rows_among(rows) if a.differs})
     left = [f"and {len(differ) - _STEPS} more"] if len(differ) > _STEPS else []
     told = {"status": status, "vehicles_that_differ": differ[:_STEPS] + left, "too_few_vehicles": few}
-    return {"lines": told} if found else {}
+    if found:
+        return {"lines": told}
+    why = [outcome.reason for outcome in outcomes if outcome.stage == "lines" and outcome.reason]
+    return {"lines": {"not_learnt": why[0]}} if why else {}
 
 
 def next_steps(findings: Sequence[DriftFinding], lake: str) -> list[str]:

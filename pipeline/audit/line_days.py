@@ -3,35 +3,29 @@
 from __future__ import annotations
 
 import datetime as dt
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from pipeline.audit.days import DOFS
-from pipeline.audit.estimates import COLUMNS, Estimates, day_name, estimates_at, faults_of
+from pipeline.audit.estimates import day_name
+from pipeline.audit.line_records import Asked, LineRecords, read_line_records, release_of
 from pipeline.fleet_model.sums import DaySums, day_evidence, packed, unpacked
 from pipeline.geometry.changes import change_between, change_covariance, changed
-from pipeline.geometry.se3 import from_quaternion
-from pipeline.rig.edges import edge_named, edges_of_rows
+from pipeline.rig.edges import line_edge
 from pipeline.rig.graph import Edge
-from pipeline.store.columns import matrices, there
-from pipeline.store.current import current_rows
 from pipeline.store.partitions import Lake, days_after
-from pipeline.store.records import read_columns, read_last
-from schemas.calibrations import CALIBRATIONS
+from pipeline.store.records import read_last
 from schemas.fleet_model import LINE_ANSWERS, LineAnswer
+from schemas.versions import CODE_VERSION
 
 __all__ = ["Counted", "DaysOfLines", "Drawing", "Key"]
 
-Key = tuple[str, Edge]  # vehicle and edge
+Key = tuple[str, Edge]  # vehicle, and edge or pose
 
-_PRIOR = tuple(f"prior_{n}" for n in ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m"))
-_UNSURE = "diagnostics.unsure_only"
 _AT_A_TIME = 7  # days that are in memory together
 _CLOCKS_DIFFER = dt.timedelta(hours=1)  # of machines that commit records
 
@@ -55,6 +49,8 @@ class Counted:
         last_key: work key of the last day's record.
         read_until: stamp of the last record of any vehicle that was read.
         day: last day of the window that was read; empty = none was.
+        other_releases: of records that were read and do not count.
+        changed_line: vehicles whose line was another one last night, and that line.
     """
 
     place: dict[Key, int] = field(default_factory=dict)
@@ -64,16 +60,16 @@ class Counted:
     last_key: list[str] = field(default_factory=list)
     read_until: str = ""
     day: str = ""
+    other_releases: set[str] = field(default_factory=set)
+    changed_line: dict[str, str] = field(default_factory=dict)
 
     @classmethod
     def read(cls, lake: Lake, method: str) -> Counted:
-        """What the last night counted; empty on the first."""
+        """What the last night of this release counted; empty on its first."""
         rows = [r for r in read_last(lake, LINE_ANSWERS, LineAnswer, method) if r.sums is not None]
-        if not rows:
+        if not rows or release_of(rows[0].code_version) != release_of(CODE_VERSION):
             return cls()
-        place = {
-            (r.vehicle, edge_named(r.pair, r.parent_frame, r.child_frame)): k for k, r in enumerate(rows)
-        }
+        place = {(r.vehicle, line_edge(r)): k for k, r in enumerate(rows)}
         when = np.array([[_ordinal(r.first_day), _ordinal(r.last_day), r.away] for r in rows], np.int64)
         days = np.array([[r.days, r.recent_days] for r in rows])
         sums = unpacked(np.stack([np.asarray(r.sums) for r in rows]), days, when)
@@ -127,30 +123,13 @@ class Counted:
 
 
 @dataclass(frozen=True, eq=False)
-class _Read:
-    """Current records, in order of vehicle, day and edge, with their priors."""
-
-    records: Estimates
-    prior: Float[np.ndarray, "N 4 4"]
-    prior_covariance: Float[np.ndarray, "N 6 6"]
-    usable: Bool[np.ndarray, " N"]
-    until: str
-
-    def keys(self) -> list[Key]:
-        """Vehicle and edge of each record that can be used."""
-        names, edges = self.records.vehicles, self.records.edges
-        of = zip(self.records.owner.tolist(), self.records.edge.tolist(), strict=True)
-        return [(names[v], edges[e]) for v, e in of]
-
-
-@dataclass(frozen=True, eq=False)
 class DaysOfLines:
-    """Counts the days of a fleet; the maps hold what is known of vehicles and edges.
+    """Counts the days of a fleet.
 
     Args:
         window: first and last day that may count.
         line_of: model line of a vehicle; empty: none of its days counts.
-        restart: first day that may count after a service event or a change, where there was one.
+        restart: first day that may count after a service event or a change; empty where there was none.
         scale: ratio of days' scatter to their sigmas, by axis.
         drawings: by line and edge; those of new lines are added.
     """
@@ -159,8 +138,8 @@ class DaysOfLines:
     method: str
     window: tuple[str, str]
     line_of: Callable[[str], str]
-    restart: Mapping[Key, str]
-    scale: Mapping[Key, Float[np.ndarray, " 6"]]
+    restart: Callable[[Key], str]
+    scale: Callable[[Key], Float[np.ndarray, " 6"]]
     drawings: dict[tuple[str, Edge], Drawing]
 
     def count(self, counted: Counted) -> Counted:
@@ -170,25 +149,26 @@ class DaysOfLines:
         of a day that is counted already was replaced.
         """
         first, last = self.window
-        since, day = _before(counted.read_until), counted.day
+        since, day, until = _before(counted.read_until), counted.day, counted.read_until
         gone = _ordinal(first)
         counted.forget({key for key, k in counted.place.items() if counted.sums.last[k] < gone})
         anew = {key for key, k in counted.place.items() if self._is_stale(counted, key, k)}
+        before = {key[0]: counted.line[counted.place[key]] for key in anew}
+        counted.changed_line = {v: line for v, line in before.items() if self.line_of(v) != line}
         # Days after the last window's may have been recorded before it was read, as after an audit of an earlier one.
         spans: list[tuple[str, str, str | None]] = [(first, min(day, last), since)] if since else []
         spans += [(*week, None) for week in _weeks(max(first, days_after(day, 1)) if day else first, last)]
         for begin, end, asserted_after in spans:
-            new = self._read(begin, end, asserted_after=asserted_after)
-            if new is None:
-                continue
-            counted.read_until = max(counted.read_until, new.until)
-            anew |= _replaced(new, counted)
-            self._add(new, counted, leave=anew)
+            for new in self._read(begin, end, asserted_after=asserted_after):
+                until = max(until, new.until)
+                counted.other_releases |= new.other_releases
+                anew |= _replaced(new, counted)
+                self._add(new, counted, leave=anew)
+        counted.read_until = until
         counted.forget(anew)
         vehicles = {vehicle for vehicle, _ in anew}
         for week in _weeks(first, last) if vehicles else ():
-            part = self._read(*week, among=vehicles)
-            if part is not None:
+            for part in self._read(*week, among=vehicles):
                 self._add(part, counted, among=anew)
         return counted
 
@@ -196,7 +176,7 @@ class DaysOfLines:
         line = self.line_of(key[0])
         if (line, key[1]) not in self.drawings or line != counted.line[k]:
             return True
-        return self.restart.get(key, "") != counted.restart[k]
+        return self.restart(key) != counted.restart[k]
 
     def _read(
         self,
@@ -205,42 +185,14 @@ class DaysOfLines:
         *,
         asserted_after: str | None = None,
         among: Collection[str] | None = None,
-    ) -> _Read | None:
-        names = (*COLUMNS, *_PRIOR, "prior_covariance", _UNSURE)
-        vehicle = None if among is None else frozenset(among)
-        table = read_columns(
-            self.lake,
-            CALIBRATIONS,
-            names,
-            first=first,
-            last=last,
-            vehicle=vehicle,
-            asserted_after=asserted_after,
-        )
-        if table is None:
-            return None
-        until = pc.max(table["asserted_at"]).as_py()
-        found = current_rows(table.filter(pc.equal(table["method"], self.method)), CALIBRATIONS)
-        edges, edge = edges_of_rows(found)
-        rank = pa.array(edge)
-        order = pc.sort_indices(
-            found.append_column("edge", rank), [(n, "ascending") for n in ("vehicle", "day", "edge")]
-        )
-        found, edge = found.take(order), edge[np.asarray(order)]
-        records = estimates_at(found, edges, edge)
-        pose = np.stack([found[name].to_numpy() for name in _PRIOR], axis=1)
-        P = matrices(found["prior_covariance"])
-        known = np.all([there(found[name]) for name in _PRIOR], axis=0) & np.isfinite(P).all(axis=(1, 2))
-        unsure = pc.fill_null(found[_UNSURE], 0.0).to_numpy() > 0
-        usable = records.usable & (records.accepted | unsure) & records.has_common & known & (edge >= 0)
-        usable[list(faults_of(records, self.window[1]))] = False
-        prior = np.broadcast_to(np.eye(4), (len(known), 4, 4)).copy()
-        prior[known] = from_quaternion(pose[known, :4], pose[known, 4:])
-        return _Read(records, prior, P, usable, until or "")
+    ) -> Iterator[LineRecords]:
+        vehicles = None if among is None else frozenset(among)
+        asked = Asked(self.method, self.window[1], vehicles, asserted_after)
+        yield from read_line_records(self.lake, first, last, asked)
 
     def _add(
         self,
-        read: _Read,
+        read: LineRecords,
         counted: Counted,
         *,
         leave: Collection[Key] = (),
@@ -250,14 +202,14 @@ class DaysOfLines:
         self._draw(read)
         keys, records = read.keys(), read.records
         lines = [self.line_of(vehicle) for vehicle, _ in keys]
-        begin = [_ordinal(self.restart.get(key)) for key in keys]
+        begin = [_ordinal(self.restart(key)) for key in keys]
         counts = read.usable & (records.day >= np.array(begin, np.int64))
         counts &= np.array([line != "" for line in lines], bool)
         counts &= np.array([(key not in leave) and (among is None or key in among) for key in keys], bool)
         rows = np.flatnonzero(counts)
-        counted.rows_for({(keys[r], lines[r], self.restart.get(keys[r], "")) for r in rows})
+        counted.rows_for({(keys[r], lines[r], self.restart(keys[r])) for r in rows})
         place = np.array([counted.place.get(key, -1) for key in keys], np.int64)
-        scale = np.array([self.scale.get(key, np.ones(DOFS)) for key in keys]).reshape(-1, DOFS)
+        scale = np.array([self.scale(key) for key in keys]).reshape(-1, DOFS)
         work = records.work_key.to_pylist()
         for day in np.unique(records.day[rows]):
             of_day = rows[(records.day[rows] == day) & (counted.sums.last[place[rows]] < day)]
@@ -274,7 +226,7 @@ class DaysOfLines:
             for r in of_day:
                 counted.last_key[place[r]] = work[r]
 
-    def _draw(self, read: _Read) -> None:
+    def _draw(self, read: LineRecords) -> None:
         """Drawings of lines and edges: the median prior of the first night; sigmas of priors are those of the last."""
         keys = read.keys()
         of_line: dict[tuple[str, Edge], list[int]] = {}
@@ -291,7 +243,7 @@ class DaysOfLines:
             self.drawings[of] = Drawing(T, np.median(variance, axis=0))
 
 
-def _replaced(read: _Read, counted: Counted) -> set[Key]:
+def _replaced(read: LineRecords, counted: Counted) -> set[Key]:
     """Vehicles and edges with a new record of a day that is counted already."""
     found = set()
     rows = zip(read.keys(), read.records.day.tolist(), read.records.work_key.to_pylist(), strict=True)

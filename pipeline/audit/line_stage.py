@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 
 import numpy as np
@@ -17,12 +17,14 @@ from jaxtyping import Float
 
 from pipeline.audit.days import DOFS
 from pipeline.audit.line_days import Counted, DaysOfLines, Drawing, Key
+from pipeline.audit.line_records import release_of
 from pipeline.audit.line_rows import LineOfEdge, Witnesses, as_answers, line_rows
+from pipeline.audit.pose_states import since_of_pose
 from pipeline.audit.service import events_until, since_of
 from pipeline.config import FleetConfig, config_hash
 from pipeline.geometry.se3 import from_quaternion
-from pipeline.rig.edges import edge_named, edge_order
-from pipeline.rig.graph import Edge
+from pipeline.rig.edges import edge_named, edge_order, line_edge, pair_of
+from pipeline.rig.graph import Edge, RigPose, tie
 from pipeline.stage_work import Records, Run, Task, Told, Window, Work
 from pipeline.store.current import current_rows
 from pipeline.store.partitions import Lake, content_hash, days_after, last_possible_day, work_key
@@ -77,18 +79,15 @@ def _rows(
     task: Task, method: str, window: tuple[str, str], counted: Counted, run: Run
 ) -> Generator[Records, None, None]:
     fleet, lake, last = task.fleet, task.lake, window[1]
-    changes, scale, alike = _of_audit(lake, method)
+    changes, noise = _of_audit(lake, method)
     events = events_until(lake, last)
-    line_of = _line_of(fleet)
-    known = {*counted.place, *scale}
-    restart = {
-        key: since
-        for key in known
-        if (since := since_of(key[1], events.get(key[0], ()), changes.get(key[0], ()), last)[0])
-    }
-    drawings = _drawings(lake, method)
+    drawings, others = _of_last_night(lake, method)
+
+    def restart(key: Key) -> str:
+        return _since(key[1], events.get(key[0], ()), changes.get(key[0], ()), last)
+
     run.progress(0, 0, "days")
-    days = DaysOfLines(lake, method, window, line_of, restart, scale, drawings)
+    days = DaysOfLines(lake, method, window, _line_of(fleet), cache(restart), noise.scale_of, drawings)
     counted = days.count(counted)
     told = _by_line(counted)
     config = config_hash(fleet.audit, fleet.verify, fleet.fleet_model, {"to": last, "method": method})
@@ -97,19 +96,22 @@ def _rows(
         run.progress(done, len(told), f"{line} {edge.name}")
         rows = np.array([counted.place[key] for key in keys], np.int64)
         about = {
-            "day": last, "method": method, "line": line, "pair": edge.kind,
-            "parent_frame": edge.parent.name, "child_frame": edge.child.name,
+            "day": last, "method": method, "line": line, "pair": pair_of(edge), "kinds": edge.kind,
+            "parent_frame": edge.parent.name, "child_frame": edge.child.name, "code_version": CODE_VERSION,
         }  # fmt: skip
         vehicles = [vehicle for vehicle, _ in keys]
         of_edge = LineOfEdge(
-            about, edge, vehicles, drawings[line, edge], counted.sums.at(rows), _stacked(scale, keys, 1.0),
-            _stacked(alike, keys, 0.0),
+            about, edge, vehicles, drawings[line, edge], counted.sums.at(rows),
+            np.array([noise.scale_of(key) for key in keys]).reshape(-1, DOFS),
+            np.array([noise.alike_of(key) for key in keys]).reshape(-1, DOFS),
             np.array([_is_remounted(edge, events.get(v, ())) for v in vehicles], bool),
             np.array([_has_changed(edge, changes.get(v, ())) for v in vehicles], bool),
             _witnesses_of(witnesses, keys),
         )  # fmt: skip
         row, columns = line_rows(of_edge, fleet.fleet_model, fleet.verify)
+        row = _with_other_releases(row, sorted(others | counted.other_releases))
         answers = as_answers(of_edge, columns, [counted.columns(k) for k in rows.tolist()])
+        answers = [_with_line_before(a, counted.changed_line.get(a.vehicle)) for a in answers]
         key = work_key("lines", CODE_VERSION, config, [content_hash([*answers, row])])
         yield Records([replace(r, work_key=key) for r in (*answers, row)], None, key, [])
 
@@ -131,26 +133,44 @@ def _by_line(counted: Counted) -> dict[tuple[str, Edge], list[Key]]:
     return dict(sorted(found.items(), key=lambda item: (item[0][0], edge_order(item[0][1]))))
 
 
-def _stacked(
-    values: Mapping[Key, Float[np.ndarray, " 6"]], keys: Sequence[Key], default: float
-) -> Float[np.ndarray, "N 6"]:
-    return np.array([values.get(key, np.full(DOFS, default)) for key in keys]).reshape(-1, DOFS)
+@dataclass(frozen=True, eq=False)
+class _Noise:
+    """Ratio of days' scatter to their sigmas, and autocorrelation, by vehicle and edge as the audit charts them."""
+
+    scale: dict[Key, Float[np.ndarray, " 6"]] = field(default_factory=dict)
+    alike: dict[Key, Float[np.ndarray, " 6"]] = field(default_factory=dict)
+
+    def scale_of(self, key: Key) -> Float[np.ndarray, " 6"]:
+        """Of an edge, or of a pose by the edge of its two sensors."""
+        return _as_charted(self.scale, key, 1.0)
+
+    def alike_of(self, key: Key) -> Float[np.ndarray, " 6"]:
+        """Of an edge, or of a pose by the edge of its two sensors."""
+        return _as_charted(self.alike, key, 0.0)
 
 
-def _of_audit(
-    lake: Lake, method: str
-) -> tuple[dict[str, list[DriftFinding]], dict[Key, np.ndarray], dict[Key, np.ndarray]]:
-    """The last audit's changes by vehicle, and scatter and autocorrelation of days by vehicle and edge."""
+def _as_charted(values: Mapping[Key, np.ndarray], key: Key, default: float) -> Float[np.ndarray, " 6"]:
+    vehicle, edge = key
+    if not isinstance(edge, RigPose):
+        return values.get(key, np.full(DOFS, default))
+    charted = values.get((vehicle, tie(*edge.sensors)))
+    if charted is None:
+        return np.full(DOFS, default)
+    # The edge may have other axes than the reference: the largest of the three holds along any.
+    return np.repeat(charted.reshape(2, 3).max(axis=1), 3)
+
+
+def _of_audit(lake: Lake, method: str) -> tuple[dict[str, list[DriftFinding]], _Noise]:
+    """The last audit's changes by vehicle, and noise of days."""
     table = read_last_columns(lake, DRIFT, method, _OF_DRIFT)
     if table is None:
-        return {}, {}, {}
+        return {}, _Noise()
     alarm = pc.and_(pc.is_in(table["status"], pa.array(["RED", "YELLOW"])), pc.is_valid(table["start_day"]))
     changes: dict[str, list[DriftFinding]] = {}
     for row in table.filter(alarm).select(list(_OF_DRIFT)).to_pylist():
         finding = DriftFinding(day="", method=method, reason="", days_used=0, limit=0.0, **row)
         changes.setdefault(row["vehicle"], []).append(finding)
-    scale: dict[Key, np.ndarray] = {}
-    alike: dict[Key, np.ndarray] = {}
+    noise = _Noise()
     noisy = table.filter(pc.is_valid(table["day_scale"]))
     names = ("vehicle", *_EDGE, "dof", "day_scale", "day_autocorrelation")
     edges: dict[tuple[str, str, str], Edge] = {}
@@ -158,27 +178,46 @@ def _of_audit(
         name = (of[0], of[1], of[2])
         edge = edges.get(name) or edges.setdefault(name, edge_named(*name))
         k = DOF_NAMES.index(dof)
-        scale.setdefault((vehicle, edge), np.ones(DOFS))[k] = size
-        alike.setdefault((vehicle, edge), np.zeros(DOFS))[k] = phi or 0.0
-    return changes, scale, alike
+        noise.scale.setdefault((vehicle, edge), np.ones(DOFS))[k] = size
+        noise.alike.setdefault((vehicle, edge), np.zeros(DOFS))[k] = phi or 0.0
+    return changes, noise
 
 
-def _drawings(lake: Lake, method: str) -> dict[tuple[str, Edge], Drawing]:
-    """Drawings from which the sums of the last night count."""
+def _of_last_night(lake: Lake, method: str) -> tuple[dict[tuple[str, Edge], Drawing], set[str]]:
+    """Drawings from which the sums of the last night count, and releases whose records it read and did not count."""
     last = last_assertion(lake, FLEET_MODEL, method)
     if last is None:
-        return {}
+        return {}, set()
     rows = read_records(lake, FLEET_MODEL, FleetModelRow, day=last.day)
-    found = {}
-    for r in rows:
-        if r.method == method and r.drawing_qw is not None and r.prior_sigma is not None:
+    found: dict[tuple[str, Edge], Drawing] = {}
+    others: set[str] = set()
+    for r in (r for r in rows if r.method == method):
+        others.update(r.other_releases)
+        if r.drawing_qw is not None and r.prior_sigma is not None:
             pose = [getattr(r, f"drawing_{n}") for n in ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")]
-            T, variance = (
-                from_quaternion(np.array(pose[:4]), np.array(pose[4:])),
-                np.array(r.prior_sigma) ** 2,
-            )
-            found[r.line, edge_named(r.pair, r.parent_frame, r.child_frame)] = Drawing(T, variance)
-    return found
+            T = from_quaternion(np.array(pose[:4]), np.array(pose[4:]))
+            found[r.line, line_edge(r)] = Drawing(T, np.array(r.prior_sigma) ** 2)
+    return found, others - {release_of(CODE_VERSION)}
+
+
+def _with_other_releases(row: FleetModelRow, others: Sequence[str]) -> FleetModelRow:
+    words = f"records of release {', '.join(others)} do not count" if others else ""
+    reason = "; ".join(text for text in (row.reason, words) if text)
+    return replace(row, other_releases=list(others), reason=reason)
+
+
+def _with_line_before(answer: LineAnswer, line: str | None) -> LineAnswer:
+    if line is None:
+        return answer
+    words = f"its line was {line or 'none'} until now: all of its days count with {answer.line}"
+    return replace(answer, reason="; ".join(text for text in (words, answer.reason) if text))
+
+
+def _since(edge: Edge, events: Sequence[ServiceEvent], changes: Sequence[DriftFinding], last: str) -> str:
+    """First day that may count, after a service event or a change; empty where all days may."""
+    if isinstance(edge, RigPose):
+        return since_of_pose(edge.child, edge, events, changes, last)[0]
+    return since_of(edge, events, changes, last)[0]
 
 
 def _is_remounted(edge: Edge, events: Sequence[ServiceEvent]) -> bool:
@@ -187,8 +226,11 @@ def _is_remounted(edge: Edge, events: Sequence[ServiceEvent]) -> bool:
 
 
 def _has_changed(edge: Edge, changes: Sequence[DriftFinding]) -> bool:
+    red = [c for c in changes if c.status == "RED"]
+    if isinstance(edge, RigPose):
+        return since_of_pose(edge.child, edge, (), red, "")[0] != ""
     of = (edge.kind, edge.parent.name, edge.child.name)
-    return any(c.status == "RED" and (c.pair, c.parent_frame, c.child_frame) == of for c in changes)
+    return any((c.pair, c.parent_frame, c.child_frame) == of for c in red)
 
 
 _Reports = dict[tuple[str, str], dict[str, list[tuple[float, float]]]]
@@ -231,5 +273,5 @@ def _told(rows: Sequence[LineAnswer]) -> Told:
     named = ", ".join(f"{r.vehicle} ({r.pair} {r.distance_axis})" for r in differ[:5])
     more = f" and {len(differ) - 5} more" if len(differ) > 5 else ""
     if not rows:
-        return Told({}, reason="no calibration record", refused=True)
+        return Told({}, reason="no calibration record of this release counts", refused=True)
     return Told(dict(counts), reason=f"differ from their line: {named}{more}" if differ else "")

@@ -2,32 +2,61 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Literal
 
-from pipeline.rig.edges import edge_named
+from pipeline.audit.line_records import release_of
+from pipeline.rig.edges import line_edge
 from pipeline.rig.graph import Edge
 from pipeline.store.partitions import Lake
 from pipeline.store.records import last_assertion, read_last
 from schemas.fleet_model import LINE_ANSWERS, LineAnswer
 from schemas.states import StateRow
+from schemas.versions import CODE_VERSION
 
-__all__ = ["answers_of", "with_its_line"]
+__all__ = ["LineAnswers", "answers_of", "with_its_line"]
 
 _POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 
 
-def answers_of(lake: Lake, method: str, day: str) -> dict[tuple[str, Edge], LineAnswer]:
-    """Tonight's answers by vehicle and edge; empty where the last ones are of another day."""
+@dataclass(frozen=True, eq=False)
+class LineAnswers:
+    """The last answers with a line, by vehicle and edge or pose; none where `refused` says why they are not used."""
+
+    of: Mapping[tuple[str, Edge], LineAnswer]
+    refused: str = ""
+
+
+def answers_of(lake: Lake, method: str, day: str) -> LineAnswers:
+    """Answers of a night. Those of another day or release are refused: the vehicle may have changed since."""
     last = last_assertion(lake, LINE_ANSWERS, method)
-    if last is None or last.day != day:
-        return {}
+    if last is None:
+        return LineAnswers({}, "no model line was learnt yet")
+    if last.day != day:
+        return LineAnswers(
+            {}, f"model lines were learnt for {last.day}, not for {day}; run the audit of that day"
+        )
     rows = read_last(lake, LINE_ANSWERS, LineAnswer, method)
-    return {(r.vehicle, edge_named(r.pair, r.parent_frame, r.child_frame)): r for r in rows}
+    of_others = sorted(
+        {r.code_version for r in rows if release_of(r.code_version) != release_of(CODE_VERSION)}
+    )
+    if of_others:
+        why = f"model lines were learnt by boresight {', '.join(of_others)}, not by {CODE_VERSION}; run the audit again"
+        return LineAnswers({}, why)
+    return LineAnswers({(r.vehicle, line_edge(r)): r for r in rows})
 
 
-def with_its_line(state: StateRow, answer: LineAnswer | None, use: Literal["report", "states"]) -> StateRow:
+def with_its_line(
+    state: StateRow, edge: Edge, answers: LineAnswers, use: Literal["report", "states"]
+) -> StateRow:
     """A state with the answer of its line beside it, or in its place if it is to be loaded and the line has a part."""
+    answer = answers.of.get((state.vehicle, edge))
+    if answers.refused and use == "states":
+        reason = "; ".join(
+            text for text in (state.reason, f"loads the vehicle alone: {answers.refused}") if text
+        )
+        return replace(state, line_status="alone", line_reason=answers.refused, reason=reason)
     if answer is None:
         return state
     beside = replace(

@@ -40,7 +40,7 @@ from schemas.poses import POSES
 from schemas.service_events import ServiceEvent
 from schemas.states import StateRow
 
-__all__ = ["Poses", "pose_states", "read_poses"]
+__all__ = ["Poses", "pose_states", "read_poses", "since_of_pose"]
 
 _OF_POSES = {c.name for c in POSES.columns}
 _NO_VALUE = pa.float64()  # of what records of edges say besides
@@ -155,7 +155,7 @@ def _row(
     """The state of one sensor's pose."""
     reference = poses.references[empty.vehicle]
     sensor = edge.other(reference.name)
-    first, why = _since(sensor, edge, *known, empty.day)
+    first, why = since_of_pose(sensor, edge, *known, empty.day)
     begin = dt.date.fromisoformat(first).toordinal() if first else 0
     usable = records.is_of(edge) & records.accepted & records.has_estimate & (records.day >= begin)
     own, moved = _since_it_lies_here(records.at(np.flatnonzero(usable)), scale)
@@ -202,7 +202,7 @@ def _words(why: str, poses: Poses, of: tuple[str, str], is_none: bool) -> str:
     return "; ".join(text for text in (none, said, apart) if text)
 
 
-def _since(
+def since_of_pose(
     sensor: Sensor, edge: Edge, events: Sequence[ServiceEvent], findings: Sequence[DriftFinding], last: str
 ) -> tuple[str, str]:
     """First day that may count for a sensor's pose to the reference, and why; empty where all days may."""

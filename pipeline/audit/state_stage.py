@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime as dt
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 from jaxtyping import Float
@@ -19,7 +20,7 @@ from pipeline.audit.references import Kept, first_accepted, kept_columns, kept_o
 from pipeline.audit.service import events_until, restart_of, since_of
 from pipeline.audit.state_rows import fused, with_state
 from pipeline.config import AuditConfig, FleetConfig, config_hash
-from pipeline.rig.graph import Edge
+from pipeline.rig.graph import Edge, Kind, RigPose, Sensor
 from pipeline.stage_work import Records, Run, Task, Told, Window, Work
 from pipeline.store.partitions import Partition, content_hash, days_after, last_possible_day, work_key
 from pipeline.store.records import last_day, read_last
@@ -72,13 +73,15 @@ def work(task: Task) -> Work:
             kept = [references[vehicle, edge] for edge in edges]
             count = fleet.audit.reference_days
             whole = [replace(r, **kept_columns(k, count)) for r, k in zip(own.rows, kept, strict=True)]
-            whole = [
-                with_its_line(r, answers.get((vehicle, edge)), fleet.fleet_model.use)
-                for r, edge in zip(whole, edges, strict=True)
-            ]
             known = events.get(vehicle, ()), changes.get(vehicle, ())
             about = vehicle, last, method
-            whole += pose_states(about, poses, known, own_scales.get(vehicle, {}), fleet.verify)
+            use = fleet.fleet_model.use
+            whole = [with_its_line(r, edge, answers, use) for r, edge in zip(whole, edges, strict=True)]
+            whole += [
+                r if edge is None else with_its_line(r, edge, answers, use)
+                for r in pose_states(about, poses, known, own_scales.get(vehicle, {}), fleet.verify)
+                for edge in [_pose_of(r, poses.references[vehicle])]
+            ]
             begun = {edge.name: first for edge, first in since.items()}
             config = config_hash(
                 fleet.audit, fleet.verify, fleet.fleet_model, {"to": last, "method": method, "since": begun}
@@ -90,6 +93,13 @@ def work(task: Task) -> Work:
     settings = (fleet.audit, fleet.verify, fleet.fleet_model, {"to": last, "method": method})
     read = tuple(sorted({*records.keys(), *poses.estimates.keys()}))
     return Work(settings, rows, inputs=read, tell=_told, again=True)
+
+
+def _pose_of(row: StateRow, reference: Sensor) -> RigPose | None:
+    """What a row of a sensor is about; None for the reference itself."""
+    if row.kind is None or row.child_frame == reference.name:
+        return None
+    return RigPose(reference, Sensor(row.child_frame, cast("Kind", row.kind)))
 
 
 def _references(

@@ -61,6 +61,7 @@ def _as_judged(row: PoseRow, record: CalibrationRecord | None) -> PoseRow:
         determined=record.determined or [],
         azimuth_sigma_rad=record.azimuth_sigma_rad,
         elevation_sigma_rad=record.elevation_sigma_rad,
+        unsure_only=bool(record.diagnostics.get("unsure_only")),
     )
 
 
@@ -107,6 +108,9 @@ def _row(
     return PoseRow(
         **told,
         **transform_fields("", poses.T[sensor.name]),
+        **transform_fields("prior_", adjusted.before.T[sensor.name]),
+        prior_covariance=adjusted.before.covariance_between(reference, sensor.name),
+        unsure_only=status == "held" and not found.doubts,
         covariance=poses.covariance_between(reference, sensor.name),
         common_covariance=poses.covariance_between(reference, sensor.name, common=True),
         observability=[float(v) for v in found.observability],

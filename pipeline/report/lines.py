@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from pipeline.rig.edges import edge_named, words_of
+from pipeline.rig.edges import line_edge, words_of
 from pipeline.store.partitions import Lake
 from pipeline.store.records import last_assertion, read_last, read_records
 from schemas.fleet_model import FLEET_MODEL, LINE_ANSWERS, LINE_STATUSES, FleetModelRow, LineAnswer
@@ -17,6 +17,7 @@ __all__ = ["AnswerView", "FleetLines", "LineView", "fleet_lines", "scatter_words
 _DEG = 180 / math.pi
 _NAMED = 12  # vehicles that a page names; the others it counts
 _OF_ANSWERS = (
+    "kinds",
     "azimuth_sigma_rad",
     "alone_covariance",
     "moved_by",
@@ -84,7 +85,7 @@ def fleet_lines(lake: Lake, method: str) -> FleetLines:
     if last is None:
         return FleetLines()
     rows = [r for r in read_records(lake, FLEET_MODEL, FleetModelRow, day=last.day) if r.method == method]
-    current = {(r.line, r.pair, r.parent_frame, r.child_frame): r for r in rows}
+    current = {(r.line, line_edge(r)): r for r in rows}
     few = too_few(current.values())
     known = [r for r in current.values() if r.line not in few]
     ordered = sorted(known, key=lambda r: (LINE_STATUSES.index(r.status), r.line))
@@ -130,4 +131,4 @@ def shared_words(row: Mapping[str, Any]) -> list[str]:
 
 
 def _edge_of(row: FleetModelRow | LineAnswer) -> str:
-    return words_of(edge_named(row.pair, row.parent_frame, row.child_frame))
+    return words_of(line_edge(row))

@@ -10,13 +10,25 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from jaxtyping import Int
 
-from pipeline.rig.graph import EDGE_KINDS, TIE_KINDS, Edge, Kind, Sensor
+from pipeline.rig.graph import EDGE_KINDS, TIE_KINDS, Edge, Kind, RigPose, Sensor
 from schemas.calibrations import FRAMES_OF_PAIR, CalibrationRecord
 from schemas.drift import DriftFinding
+from schemas.fleet_model import FleetModelRow, LineAnswer
 from schemas.states import StateRow
 
-__all__ = ["EDGE_OF_PAIR", "edge_named", "edge_of", "edge_order", "edges_of_rows", "words_of"]
+__all__ = [
+    "EDGE_OF_PAIR",
+    "POSE",
+    "edge_named",
+    "edge_of",
+    "edge_order",
+    "edges_of_rows",
+    "line_edge",
+    "pair_of",
+    "words_of",
+]
 
+POSE: Final = "pose"  # in column `pair` of rows about a sensor's pose
 _COLUMNS: Final = ("pair", "parent_frame", "child_frame")
 
 
@@ -33,6 +45,19 @@ def edge_of(row: CalibrationRecord | StateRow | DriftFinding) -> Edge:
     return edge_named(row.pair, row.parent_frame, row.child_frame)
 
 
+def line_edge(row: FleetModelRow | LineAnswer) -> Edge:
+    """What a row of a model line is about: an edge, or a sensor's pose."""
+    if row.pair != POSE:
+        return edge_named(row.pair, row.parent_frame, row.child_frame)
+    kinds = [cast("Kind", kind) for kind in row.kinds.split("_")]
+    return RigPose(Sensor(row.parent_frame, kinds[0]), Sensor(row.child_frame, kinds[1]))
+
+
+def pair_of(edge: Edge) -> str:
+    """Column `pair` of rows about an edge or a sensor's pose."""
+    return POSE if isinstance(edge, RigPose) else edge.kind
+
+
 # Edges of a rig whose sensors are named after their kinds, as in a short fleet.toml and in all records until
 # 0.10.
 EDGE_OF_PAIR: Final[Mapping[str, Edge]] = {
@@ -41,12 +66,15 @@ EDGE_OF_PAIR: Final[Mapping[str, Edge]] = {
 
 
 def edge_order(edge: Edge) -> tuple[int, str, str]:
-    """Sort key of an edge: kinds in the order of TIE_KINDS, then names."""
-    return TIE_KINDS.index(edge.kind), edge.parent.name, edge.child.name
+    """Sort key of an edge: kinds in the order of TIE_KINDS, then names; poses are last."""
+    kind = len(TIE_KINDS) if isinstance(edge, RigPose) else TIE_KINDS.index(edge.kind)
+    return kind, edge.parent.name, edge.child.name
 
 
 def words_of(edge: Edge) -> str:
-    """Text for an edge: its kind if the sensors are named after their kinds, else their names."""
+    """Text for an edge: its kind if the sensors are named after their kinds, else their names; or of a pose."""
+    if isinstance(edge, RigPose):
+        return f"{edge.child.name} in {edge.parent.name}"
     return edge.kind if edge == EDGE_OF_PAIR.get(edge.kind) else edge.name
 
 

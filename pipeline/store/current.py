@@ -120,8 +120,8 @@ def transform_of(
     return _transform(record.qw, record.qx, record.qy, record.qz, record.tx_m, record.ty_m, record.tz_m)
 
 
-def prior_of(record: CalibrationRecord) -> Float[np.ndarray, "4 4"] | None:
-    """Prior T_parent_child of a record; None if none was given."""
+def prior_of(record: CalibrationRecord | PoseRow) -> Float[np.ndarray, "4 4"] | None:
+    """Prior T_parent_child of a record, or of a pose; None if none was given."""
     return _transform(
         record.prior_qw, record.prior_qx, record.prior_qy, record.prior_qz,
         record.prior_tx_m, record.prior_ty_m, record.prior_tz_m,

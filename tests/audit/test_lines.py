@@ -7,6 +7,7 @@ import pytest
 
 from pipeline.config import FleetConfig
 from pipeline.geometry.changes import change_covariance
+from pipeline.geometry.se3 import exp_se3, from_quaternion, inverse, log_se3
 from pipeline.stage_work import Task, Window
 from pipeline.stages import AUDIT, LINES, STATE
 from pipeline.store.commits import commit_records
@@ -15,9 +16,13 @@ from pipeline.store.partitions import Lake
 from pipeline.store.records import read_last, read_records
 from schemas.calibrations import CALIBRATIONS
 from schemas.fleet_model import FLEET_MODEL, LINE_ANSWERS, FleetModelRow, LineAnswer
+from schemas.poses import POSES
 from schemas.radar_alignments import RADAR_ALIGNMENTS, RadarAlignment
+from schemas.states import STATES, StateRow
+from schemas.versions import CODE_VERSION
 from tests.makers.fleet_lakes import one_rig_fleet
 from tests.makers.line_records import DEG, MadeLine, change_of, line_records
+from tests.makers.rig_records import T_TOP, pose_rows, rig_records
 
 
 def fleet_of(**sections):
@@ -245,3 +250,119 @@ def test_radars_that_report_their_mount_in_the_vehicle_tell_a_shared_error_there
         assert row.shared_errors["radar elevation"] == pytest.approx(0.8 * DEG, rel=0.15)
     else:  # the lidar may be mounted otherwise on all vehicles
         assert row.told_apart == []
+
+
+MOUNTS = np.r_[np.radians([0.02] * 3), 0.004, 0.004, 0.004]
+
+
+def rigs(lake, vehicles, days, *, version=CODE_VERSION, moved=None):
+    """Records of rigs with five sensors whose mounts hardly differ: motion of each sensor by vehicle."""
+    motions = {}
+    for v in range(vehicles):
+        rng = np.random.default_rng([7, v])
+        motion = {s: MOUNTS * rng.normal(size=6) for s in ("front", "left", "bumper", "corner")}
+        motion |= (moved or {}).get(v, {})
+        name = f"v{v:02d}"
+        motions[name] = motion
+        edges = rig_records(name, days, rng, motion=lambda _, m=motion: m)
+        made_by = {"code_version": version, "work_key": f"{name} {version}"}
+        commit_records(lake, CALIBRATIONS, [replace(r, **made_by) for r in edges])
+        commit_records(
+            lake, POSES, pose_rows(name, days, rng, motion=lambda _, m=motion: m, code_version=version)
+        )
+    return motions
+
+
+def pose_states_of(lake, **sections):
+    """States of sensors by vehicle and sensor, after a night."""
+    lines(lake, fleet_of(**sections))
+    STATE.run(Task(fleet_of(**sections), lake, Window()))
+    return {(r.vehicle, r.sensor): r for r in read_last(lake, STATES, StateRow, "joint") if r.sensor}
+
+
+def test_poses_of_a_rig_are_surer_with_their_line_and_a_knocked_camera_keeps_its_own(tmp_path):
+    lake = Lake.at(tmp_path)
+    knock = {3: {"front": np.r_[0, np.radians(1.0), 0, 0, 0, 0]}}
+    motions = rigs(lake, 20, 2, moved=knock)
+    states = pose_states_of(lake, fleet_model={"use": "states"})
+    squares, sigmas, alone = [], [], []
+    for (vehicle, sensor), row in states.items():
+        if sensor == "top":
+            assert row.line_status is None
+            continue
+        is_knocked = (vehicle, sensor) == ("v03", "front")
+        assert (row.loads, row.line_status) == (("alone", "outside") if is_knocked else ("line", "shared"))
+        true = T_TOP[sensor] @ exp_se3(motions[vehicle][sensor])
+        off = log_se3(transform_of(row) @ inverse(true))
+        squares.append(off @ np.linalg.solve(row.covariance, off))
+        if not is_knocked:
+            sigmas.append(np.sqrt(np.diag(row.covariance)))
+            alone.append(np.sqrt(np.diag(row.alone_covariance)))
+            assert "with default, its model line" in row.reason
+    assert np.median(sigmas, axis=0)[:3] == pytest.approx(0.7 * np.median(alone, axis=0)[:3], rel=0.25)
+    assert 1.0 < np.mean(squares) < 9.0
+    assert max(squares) < 30.0  # six axes: beyond it one in 25,000
+
+
+def test_a_drawing_of_a_pose_has_kinds_and_its_edge_between_the_same_sensors_is_another_row(tmp_path):
+    lake = Lake.at(tmp_path)
+    rigs(lake, 6, 1)
+    lines(lake, fleet_of())
+    rows = {
+        (r.pair, r.parent_frame, r.child_frame): r
+        for r in read_last(lake, FLEET_MODEL, FleetModelRow, "joint")
+    }
+    pose, edge = rows["pose", "top", "front"], rows["camera_lidar", "front", "top"]
+    assert (pose.kinds, edge.kinds) == ("lidar_camera", "camera_lidar")
+    np.testing.assert_allclose(drawing_of(pose), inverse(drawing_of(edge)), atol=2e-3)
+    assert {name for pair, _, name in rows if pair == "pose"} == {"front", "left", "bumper", "corner"}
+
+
+def test_records_of_another_release_do_not_count_and_the_row_names_it(tmp_path):
+    lake = Lake.at(tmp_path)
+    rigs(lake, 6, 3, version="0.9.0")
+    rigs(lake, 6, 1)
+    rows, answers = lines(lake, fleet_of())
+    row = rows["camera_lidar"]
+    assert (row.other_releases, row.reason) == (["0.9"], "records of release 0.9 do not count")
+    assert {a.days for a in answers.values()} == {1.0}
+
+
+def test_a_vehicle_whose_line_changes_counts_with_the_new_one_and_says_which_it_had(tmp_path):
+    line = MadeLine(8, 2, seed=31)
+    lake = Lake.at(tmp_path)
+    commit_records(lake, CALIBRATIONS, line_records(line))
+    lines(lake, fleet_of())
+    vehicles = {"car-0003": {"rig": "default", "model": "long"}, "*": {"rig": "default"}}
+    _, answers = lines(lake, fleet_of(vehicles=vehicles))
+    answer = answers["car-0003", "camera_lidar"]
+    assert (answer.line, answer.days) == ("long", pytest.approx(2.0, rel=0.05))
+    assert answer.reason.startswith("its line was default until now: all of its days count with long")
+    assert answers["car-0004", "camera_lidar"].reason == ""
+
+
+@pytest.mark.parametrize(
+    ("last", "version", "words"),
+    [
+        ("2026-03-04", CODE_VERSION, "model lines were learnt for 2026-03-02, not for 2026-03-04"),
+        ("2026-03-02", "0.9.0", "model lines were learnt by boresight 0.9.0"),
+    ],
+)
+def test_states_refuse_lines_of_another_day_or_release_and_say_so(
+    tmp_path, monkeypatch, last, version, words
+):
+    line, lake = MadeLine(8, 4, seed=32), Lake.at(tmp_path)
+    fleet = fleet_of(fleet_model={"use": "states"})
+    commit_records(lake, CALIBRATIONS, [replace(r, status="accepted", reason="") for r in line_records(line)])
+    monkeypatch.setattr("pipeline.audit.line_stage.CODE_VERSION", version)
+    lines(lake, fleet, "2026-03-02")
+    STATE.run(Task(fleet, lake, Window(None, last)))
+    rows = read_last(lake, STATES, StateRow, "joint")
+    assert {(r.loads, r.line_status, r.status) for r in rows} == {("alone", "alone", "current")}
+    assert all(f"loads the vehicle alone: {words}" in r.reason for r in rows)
+
+
+def drawing_of(row):
+    names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+    pose = np.array([getattr(row, f"drawing_{n}") for n in names])
+    return from_quaternion(pose[:4], pose[4:])

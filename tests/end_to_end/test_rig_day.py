@@ -4,13 +4,16 @@ import json
 
 import numpy as np
 import pytest
+from scipy.linalg import eigh
 
+from pipeline.audit.line_records import Asked, read_line_records
 from pipeline.config import load_fleet
 from pipeline.geometry.se3 import inverse, log_se3
+from pipeline.rig.graph import RigPose
 from pipeline.simulate.fleet import FleetSpec
 from pipeline.stage_work import Task
 from pipeline.stages import CALIBRATE
-from pipeline.store.current import current_poses, transform_of
+from pipeline.store.current import current_poses, prior_of, transform_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
@@ -61,6 +64,33 @@ def test_what_is_accepted_is_right(day):
         off = log_se3(inverse(truth["top"]) @ truth[name] @ inverse(transform_of(pose)))
         sigma = np.sqrt(np.diag(pose.covariance))
         assert (np.abs(off) <= np.maximum(4 * sigma, np.radians(0.1))).all(), name
+
+
+def test_a_pose_has_the_prior_that_is_in_it_and_is_surer_along_every_direction(day):
+    task, _, truth = day
+    checked = 0
+    for name, pose in poses_of(task).items():
+        if pose.status == "refused" or name == "top":
+            assert pose.prior_covariance is None
+            continue
+        off = log_se3(inverse(truth["top"]) @ truth.get(name, np.eye(4)) @ inverse(prior_of(pose)))
+        assert np.sqrt(off @ np.linalg.solve(pose.prior_covariance, off)) < 5.0, name
+        shares = eigh(pose.covariance - pose.common_covariance, pose.prior_covariance, eigvals_only=True)
+        assert shares.max() < 1.01, name
+        assert shares.min() < 0.1, name
+        checked += 1
+    assert checked >= 3
+    counted = {
+        edge.child.name
+        for read in read_line_records(task.lake, DAY.day, DAY.day, Asked("joint", DAY.day))
+        for (_, edge), is_usable in zip(read.keys(), read.usable, strict=True)
+        if is_usable and isinstance(edge, RigPose)
+    }
+    assert counted == {
+        name
+        for name, pose in poses_of(task).items()
+        if name != "top" and (pose.status == "accepted" or pose.unsure_only)
+    }
 
 
 def test_a_front_camera_is_known_to_a_tenth_of_a_degree(day):

@@ -92,6 +92,7 @@ def pose_rows(vehicle, days, rng, *, motion=lambda _day: {}, reference="top", **
             T = inverse(moved[reference]) @ moved[name]
             if name != reference:
                 T = exp_se3(np.sqrt(0.9) * POSE_SIGMA * rng.normal(size=6)) @ T
+            prior = inverse(T_TOP[reference]) @ T_TOP[name]
             names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
             is_other = float(name != reference)
             own = {
@@ -101,6 +102,9 @@ def pose_rows(vehicle, days, rng, *, motion=lambda _day: {}, reference="top", **
                 "determined": ["azimuth", "elevation"], "covariance": is_other * np.diag(POSE_SIGMA**2),
                 "common_covariance": is_other * 0.1 * np.diag(POSE_SIGMA**2),
                 **dict(zip(names, (*to_quaternion(T).tolist(), *T[:3, 3].tolist()), strict=True)),
+                **dict(zip((f"prior_{n}" for n in names), (*to_quaternion(prior).tolist(), *prior[:3, 3].tolist()),
+                           strict=True)),
+                "prior_covariance": np.diag([np.radians(2.0) ** 2] * 3 + [0.05**2] * 3),
             }  # fmt: skip
             rows.append(PoseRow(**own | columns | of_one.get((day, name), {})))
     return rows

@@ -61,7 +61,7 @@ def test_a_line_of_too_few_vehicles_is_one_sentence_on_the_page_and_a_count_in_t
     words, told = night
     assert "Too few vehicles to learn from (six are needed): van has 4." in words
     assert told == {
-        "status": {"default camera-lidar": "GREEN", "default lidar-radar": "GREEN"},
+        "status": {"default camera_lidar": "GREEN", "default lidar_radar": "GREEN"},
         "vehicles_that_differ": ["car-0007"],
         "too_few_vehicles": {"van": 4},
     }

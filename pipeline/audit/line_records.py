@@ -1,0 +1,147 @@
+"""Records that model lines count: edges, and poses of adjusted rigs, with the priors that are in them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from jaxtyping import Bool, Float, Int
+
+from pipeline.audit.estimates import COLUMNS, Estimates, estimates_at, faults_of
+from pipeline.geometry.se3 import from_quaternion
+from pipeline.rig.edges import edge_order, edges_of_rows
+from pipeline.rig.graph import Edge, RigPose, Sensor, is_one_of_each
+from pipeline.store.columns import matrices, there
+from pipeline.store.current import current_rows
+from pipeline.store.partitions import Lake
+from pipeline.store.records import read_columns
+from schemas.calibrations import CALIBRATIONS
+from schemas.columns import TableSchema
+from schemas.poses import POSES
+from schemas.versions import CODE_VERSION
+
+__all__ = ["Asked", "LineRecords", "read_line_records", "release_of"]
+
+_PRIOR = tuple(f"prior_{n}" for n in ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m"))
+_UNSURE = "diagnostics.unsure_only"
+_OF_POSES = {c.name for c in POSES.columns}
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What is read: days of a method, later ones than `last` are faults; of some vehicles, or asserted later."""
+
+    method: str
+    last: str
+    vehicles: frozenset[str] | None = None
+    asserted_after: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class LineRecords:
+    """Current records of one table, in order of vehicle, day and edge.
+
+    Args:
+        usable: records of this release that are accepted, or held for nothing but their sigma.
+        other_releases: of records that are not usable for that alone.
+        until: when the last record was asserted.
+    """
+
+    records: Estimates
+    prior: Float[np.ndarray, "N 4 4"]
+    prior_covariance: Float[np.ndarray, "N 6 6"]
+    usable: Bool[np.ndarray, " N"]
+    other_releases: frozenset[str]
+    until: str
+
+    def keys(self) -> list[tuple[str, Edge]]:
+        """Vehicle and edge of each record."""
+        names, edges = self.records.vehicles, self.records.edges
+        of = zip(self.records.owner.tolist(), self.records.edge.tolist(), strict=True)
+        return [(names[v], edges[e]) for v, e in of]
+
+
+def release_of(version: str) -> str:
+    """Releases that differ in the third number err alike."""
+    return ".".join(version.split(".")[:2])
+
+
+def read_line_records(lake: Lake, first: str, last: str, asked: Asked) -> Iterator[LineRecords]:
+    """Edges, then poses of rigs that have more than one sensor of a kind, from `first` to `last`."""
+    for schema in (CALIBRATIONS, POSES):
+        is_of_poses = schema is POSES
+        more = ("sensor", "kind", "reference", "unsure_only") if is_of_poses else (_UNSURE,)
+        own = tuple(c for c in COLUMNS if c in _OF_POSES or not is_of_poses)
+        table = read_columns(
+            lake, schema, (*own, *_PRIOR, "prior_covariance", "code_version", *more),
+            first=first, last=last, vehicle=asked.vehicles, asserted_after=asked.asserted_after,
+        )  # fmt: skip
+        if table is None:
+            continue
+        until = pc.max(table["asserted_at"]).as_py()
+        found = current_rows(table.filter(pc.equal(table["method"], asked.method)), schema)
+        edges, edge = _poses_of(found) if is_of_poses else edges_of_rows(found)
+        if is_of_poses:
+            found, edge = found.filter(pa.array(edge >= 0)), edge[edge >= 0]
+            found = _with_missing(found)
+        yield _in_order(found, edges, edge, schema, asked.last, until or "")
+
+
+def _in_order(
+    found: pa.Table,
+    edges: tuple[Edge, ...],
+    edge: Int[np.ndarray, " N"],
+    schema: TableSchema,
+    last: str,
+    until: str,
+) -> LineRecords:
+    by = [(name, "ascending") for name in ("vehicle", "day", "edge")]
+    order = pc.sort_indices(found.append_column("edge", pa.array(edge)), by)
+    found, edge = found.take(order), edge[np.asarray(order)]
+    records = estimates_at(found, edges, edge)
+    pose = np.stack([found[name].to_numpy() for name in _PRIOR], axis=1)
+    P = matrices(found["prior_covariance"])
+    known = np.all([there(found[name]) for name in _PRIOR], axis=0) & np.isfinite(P).all(axis=(1, 2))
+    unsure = found["unsure_only" if schema is POSES else _UNSURE].cast(pa.float64())
+    unsure = pc.fill_null(unsure, 0.0).to_numpy() > 0
+    usable = records.usable & (records.accepted | unsure) & records.has_common & known & (edge >= 0)
+    usable[list(faults_of(records, last))] = False
+    versions = found["code_version"].to_pylist()
+    is_own = np.array([release_of(v or "") == release_of(CODE_VERSION) for v in versions], bool)
+    others = frozenset(release_of(versions[r] or "") for r in np.flatnonzero(usable & ~is_own))
+    prior = np.broadcast_to(np.eye(4), (len(known), 4, 4)).copy()
+    prior[known] = from_quaternion(pose[known, :4], pose[known, 4:])
+    return LineRecords(records, prior, P, usable & is_own, others, until)
+
+
+def _poses_of(rows: pa.Table) -> tuple[tuple[Edge, ...], Int[np.ndarray, " N"]]:
+    """The pose that each row is of, or -1: references, and rigs whose records are of the adjusted poses already."""
+    names = ("vehicle", "day", "sensor", "kind", "reference")
+    values = list(zip(*(rows[name].to_pylist() for name in names), strict=True))
+    kinds: dict[tuple[str, str], dict[str, str]] = {}
+    for vehicle, day, sensor, kind, _ in values:
+        kinds.setdefault((vehicle, day), {})[sensor] = kind
+    of_rig = {
+        key: not is_one_of_each([Sensor(name, kind) for name, kind in own.items()])  # type: ignore[arg-type]
+        for key, own in kinds.items()
+    }
+    found: list[RigPose | None] = []
+    for vehicle, day, sensor, kind, reference in values:
+        own = kinds[vehicle, day]
+        is_pose = of_rig[vehicle, day] and sensor != reference and reference in own
+        found.append(RigPose(Sensor(reference, own[reference]), Sensor(sensor, kind)) if is_pose else None)  # type: ignore[arg-type]
+    edges = tuple(sorted({pose for pose in found if pose is not None}, key=edge_order))
+    place = {pose: k for k, pose in enumerate(edges)}
+    return edges, np.array([-1 if pose is None else place[pose] for pose in found], np.int64)
+
+
+def _with_missing(poses: pa.Table) -> pa.Table:
+    """Rows of poses with the columns that records of edges say besides, empty."""
+    for name in COLUMNS:
+        if name not in _OF_POSES:
+            kind = pa.binary() if name == "half_days" else pa.float64()
+            poses = poses.append_column(name, pa.nulls(poses.num_rows, kind))
+    return poses
