@@ -21,9 +21,8 @@ from pipeline.fleet_model.evidence import LineEvidence, LinePrior, evidence_of_d
 from pipeline.fleet_model.line import FEWEST_VEHICLES, LineModel, learn_line
 from pipeline.fleet_model.sums import DaySums
 from pipeline.geometry.changes import change_jacobian, changed
-from pipeline.geometry.se3 import adjoint, inverse
-from pipeline.geometry.target_sigmas import target_sigmas
 from pipeline.rig.graph import Edge, RigPose
+from pipeline.rig.sigmas import direction_sigmas
 from schemas.calibrations import DOF_NAMES
 from schemas.fleet_model import OF_ALL, FleetModelRow, LineAnswer
 
@@ -297,12 +296,8 @@ def _standing(found: _Found, shared: bool, k: int) -> dict[str, Any]:
 
 def _sure(edge: Edge, T: np.ndarray, covariance: np.ndarray, verify: VerifyConfig) -> dict[str, Any]:
     """Sigmas of azimuth and elevation, and which of them lie within their limits."""
-    kind, has_radar = edge.kind, "radar" in edge.kind
-    if isinstance(edge, RigPose):  # directions that the sensor sees, as states have them
-        kind, has_radar = f"{edge.child.kind}_{edge.parent.kind}", edge.child.kind == "radar"
-        T = inverse(T)
-        covariance = adjoint(T) @ covariance @ adjoint(T).T
-    sigma = target_sigmas(kind, T, covariance)
+    has_radar = "radar" in (edge.child.kind if isinstance(edge, RigPose) else edge.kind)
+    sigma = direction_sigmas(edge, T, covariance)
     limits = (
         (verify.radar_limit_deg, verify.radar_elevation_limit_deg)
         if has_radar

@@ -78,7 +78,7 @@ def render_fleet_page(
         shown=rows[:_CHARTS],
         index=json.dumps(_index(album, days, rows, {v.vehicle: v for v in views}, (edges, charts))),
         dofs=[f"{d} [{'deg' if d.startswith('r') else 'm'}]" for d in DOF_NAMES],
-        models=fleet_lines(album.lake, album.method),
+        models=fleet_lines(album.lake, album.method, [row.vehicle for row in rows[:_CHARTS]]),
         loads_lines=album.fleet.fleet_model.use == "states",
         truth=known,
         truth_summary=truth_summary(known),

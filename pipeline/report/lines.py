@@ -7,24 +7,37 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
+from pipeline.geometry.changes import changed
 from pipeline.rig.edges import line_edge, words_of
+from pipeline.rig.graph import Edge
+from pipeline.rig.sigmas import direction_sigmas
+from pipeline.store.current import transform_of
 from pipeline.store.partitions import Lake
 from pipeline.store.records import last_assertion, read_last, read_records
 from schemas.fleet_model import FLEET_MODEL, LINE_ANSWERS, LINE_STATUSES, FleetModelRow, LineAnswer
 
-__all__ = ["AnswerView", "FleetLines", "LineView", "fleet_lines", "scatter_words", "shared_words", "too_few"]
+__all__ = [
+    "AnswerView",
+    "FleetLines",
+    "LineView",
+    "answer_cells",
+    "fleet_lines",
+    "last_answers",
+    "scatter_words",
+    "shared_words",
+    "too_few",
+]
 
 _DEG = 180 / math.pi
 _NAMED = 12  # vehicles that a page names; the others it counts
-_OF_ANSWERS = (
-    "kinds",
-    "azimuth_sigma_rad",
-    "alone_covariance",
-    "moved_by",
-    "distance_sigmas",
-    "distance_axis",
-    "differs",
-)
+_OF_ANSWERS = ("line", "kinds", "reason", "distance_sigmas", "differs")
+_POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+_BOTH = (
+    "line", "kinds", "status", "reason", *_POSE, "covariance", "alone_covariance", "moved_by", "record_day",
+    "record_change", "record_covariance", "record_alone_covariance",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -60,12 +73,14 @@ class FleetLines:
         too_few: vehicles of the others, by name.
         differ: vehicles that differ from their line, the first ones.
         differing: how many do.
+        both: cells of the vehicles that were asked for, alone and with their line.
     """
 
     lines: list[LineView] = field(default_factory=list)
     too_few: dict[str, int] = field(default_factory=dict)
     differ: list[AnswerView] = field(default_factory=list)
     differing: int = 0
+    both: list[dict[str, str]] = field(default_factory=list)
 
 
 def too_few(rows: Iterable[FleetModelRow]) -> dict[str, int]:
@@ -79,8 +94,43 @@ def too_few(rows: Iterable[FleetModelRow]) -> dict[str, int]:
     return {line: count for line, count in sorted(most.items()) if line not in enough}
 
 
-def fleet_lines(lake: Lake, method: str) -> FleetLines:
-    """Lines of the last night as the fleet page shows them."""
+def last_answers(lake: Lake, method: str, vehicles: Iterable[str]) -> list[LineAnswer]:
+    """Answers of some vehicles on the last night, for `answer_cells`."""
+    among = frozenset(vehicles)
+    return read_last(lake, LINE_ANSWERS, LineAnswer, method, vehicle=among, columns=_BOTH) if among else []
+
+
+def answer_cells(answer: LineAnswer, *, of_day: bool) -> dict[str, str] | None:
+    """Cells by their headings: an answer alone and with its line; None where the line has no answer.
+
+    Args:
+        of_day: the answer of its last day, in place of all days since the last change.
+    """
+    T, edge = transform_of(answer), line_edge(answer)
+    alone, with_line, moved = answer.alone_covariance, answer.covariance, answer.moved_by
+    if T is None or answer.status == "alone":
+        return None
+    if of_day:
+        alone, with_line = answer.record_alone_covariance, answer.record_covariance
+        T = changed(T, np.asarray(answer.record_change)) if answer.record_change is not None else None
+    if T is None or alone is None or with_line is None or moved is None:
+        return None
+    cells = {"edge": words_of(edge), "alone (1 sigma)": _known_to(edge, T, alone)}
+    cells |= {"with its line (1 sigma)": _known_to(edge, T, with_line)}
+    if not of_day:
+        turn, shift = np.linalg.norm(moved[:3]) * _DEG, np.linalg.norm(moved[3:])
+        cells |= {"the line moves it by": f"{turn:.2f} deg, {shift:.3f} m"}
+    said = "differs from its line" if answer.status == "outside" else ""
+    return cells | {"reason": "; ".join(text for text in (said, answer.reason) if text)}
+
+
+def _known_to(edge: Edge, T: np.ndarray, covariance: np.ndarray) -> str:
+    azimuth, elevation = direction_sigmas(edge, T, np.asarray(covariance)) * _DEG
+    return f"azimuth {azimuth:.3f}, elevation {elevation:.3f} deg"
+
+
+def fleet_lines(lake: Lake, method: str, shown: Iterable[str] = ()) -> FleetLines:
+    """Lines of the last night as the fleet page shows them; `shown`: vehicles that are shown alone and with theirs."""
     last = last_assertion(lake, LINE_ANSWERS, method)
     if last is None:
         return FleetLines()
@@ -99,7 +149,13 @@ def fleet_lines(lake: Lake, method: str) -> FleetLines:
     differ = [r for r in read_last(lake, LINE_ANSWERS, LineAnswer, method, columns=_OF_ANSWERS) if r.differs]
     differ.sort(key=lambda r: -(r.distance_sigmas or 0.0))
     views = [AnswerView(r.vehicle, r.line, _edge_of(r), r.reason) for r in differ[:_NAMED]]
-    return FleetLines(lines, few, views, len(differ))
+    both = [
+        {"vehicle": answer.vehicle} | cells
+        for answer in last_answers(lake, method, shown)
+        for cells in [answer_cells(answer, of_day=False)]
+        if cells is not None
+    ]
+    return FleetLines(lines, few, views, len(differ), both)
 
 
 def scatter_words(scatter: Sequence[float] | None) -> str:

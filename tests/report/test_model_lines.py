@@ -7,15 +7,16 @@ import pytest
 
 from jobs.terminal.vehicle_status import model_lines
 from pipeline.config import FleetConfig
-from pipeline.report.stage import Pages, write_fleet_report
+from pipeline.report.stage import Pages, write_day_page, write_fleet_report
 from pipeline.stage_work import Task, Window
 from pipeline.stages import AUDIT, LINES
 from pipeline.store.commits import commit_records
-from pipeline.store.partitions import Lake
+from pipeline.store.partitions import Lake, Partition
 from schemas.calibrations import CALIBRATIONS
 from tests.makers.fleet_lakes import one_rig_fleet
 from tests.makers.line_records import DEG, MadeLine, line_records
 
+LAST = "2026-03-03"
 VEHICLES = {"car-*": {"rig": "default"}, "van-*": {"rig": "default", "model": "van"}}
 
 
@@ -43,12 +44,22 @@ def night(tmp_path_factory):
     told = model_lines([LINES.run(task)])
     page = folder / "fleet.html"
     write_fleet_report(lake, fleet, Pages(page), "joint")
-    words = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", page.read_text()))
-    return words[words.index("What vehicles of a model") :], told["lines"]
+    words = words_of(page)
+    day = words_of(write_day_page(lake, Partition("car-0003", LAST), fleet, folder / "day.html", "joint"))
+    before = write_day_page(lake, Partition("car-0003", "2026-03-02"), fleet, folder / "before.html", "joint")
+    return (
+        words[words.index("What vehicles of a model") :],
+        told["lines"],
+        (day, words_of(before)),
+    )
+
+
+def words_of(page):
+    return re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", page.read_text()))
 
 
 def test_the_page_states_what_a_line_shares_and_names_the_vehicle_that_differs(night):
-    words, _ = night
+    words, _, _ = night
     found = re.search(r"radar elevation \+(\d\.\d+) \+- 0\.\d+ deg, or all mounts by as much", words)
     assert found is not None
     assert float(found[1]) == pytest.approx(0.8, abs=0.25)
@@ -58,10 +69,27 @@ def test_the_page_states_what_a_line_shares_and_names_the_vehicle_that_differs(n
 
 
 def test_a_line_of_too_few_vehicles_is_one_sentence_on_the_page_and_a_count_in_the_summary(night):
-    words, told = night
+    words, told, _ = night
     assert "Too few vehicles to learn from (six are needed): van has 4." in words
     assert told == {
         "status": {"default camera_lidar": "GREEN", "default lidar_radar": "GREEN"},
         "vehicles_that_differ": ["car-0007"],
         "too_few_vehicles": {"van": 4},
     }
+
+
+KNOWN = r"azimuth (\d\.\d+), elevation (\d\.\d+) deg "
+
+
+def test_the_pages_show_each_answer_alone_and_with_its_line_and_what_the_line_changes(night):
+    words, _, (day, before) = night
+    found = re.search(rf"car-0003 camera_lidar {KNOWN}{KNOWN}(\d\.\d+) deg, (\d\.\d+) m", words)
+    alone, with_line, moved = (np.array([float(found[k]) for k in pair]) for pair in ((1, 2), (3, 4), (5, 6)))
+    assert np.all(with_line < alone)
+    assert np.all((moved > 0) & (moved < 0.3))
+    assert re.search(rf"car-0007 lidar_radar {KNOWN}{KNOWN}0\.00 deg, 0\.000 m differs from its line", words)
+    of_day = re.search(rf"and with the vehicle's model line .*camera_lidar {KNOWN}{KNOWN}", day)
+    single = np.array([float(of_day[k]) for k in (1, 2)])
+    assert np.all(single > alone)  # one day of three
+    assert np.all(np.array([float(of_day[k]) for k in (3, 4)]) < single)
+    assert "model line" not in before  # an earlier day: the line's answer is of the last one
