@@ -110,6 +110,20 @@ class FleetModelRow(Recorded):
     moved_axis: str | None = column("axis of the clearest motion", default=None)
     moved_size: float | None = column("mean motion of all vehicles along it [rad or m]", default=None)
     moved_vehicles: int = column("vehicles that moved by more than 3 of their sigmas", default=0)
+    clock_mean_s: float | None = column(
+        "time offset of the line, stamp_parent = stamp_child + dt, from the last 14 days; null without enough "
+        "vehicles that estimate it",
+        default=None,
+    )
+    clock_sigma_s: float | None = column("its sigma", default=None)
+    clock_scatter_s: float | None = column(
+        "scatter of the vehicles' offsets about it (1 sigma)", default=None
+    )
+    clock_outside: list[str] = column("vehicles whose offset differs from the line's", default_factory=list)
+    clock_step_s: float | None = column(
+        "step of all offsets in the last 3 days, as of a software release; null = none is seen", default=None
+    )
+    clock_step_sigma_s: float | None = column("its sigma", default=None)
     most_without_one: float | None = column(
         "largest change of any vehicle's answer, in its sigmas, if any one other vehicle is left out",
         default=None,

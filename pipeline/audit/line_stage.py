@@ -16,6 +16,7 @@ import pyarrow.compute as pc
 from jaxtyping import Float
 
 from pipeline.audit.days import DOFS
+from pipeline.audit.line_clocks import clocks_of_lines
 from pipeline.audit.line_days import Counted, DaysOfLines, Drawing, Key
 from pipeline.audit.line_records import release_of
 from pipeline.audit.line_rows import LineOfEdge, Witnesses, as_answers, line_rows
@@ -86,12 +87,13 @@ def _rows(
     def restart(key: Key) -> str:
         return _since(key[1], events.get(key[0], ()), changes.get(key[0], ()), last)
 
+    line_of = _line_of(fleet)
     run.progress(0, 0, "days")
-    days = DaysOfLines(lake, method, window, _line_of(fleet), cache(restart), noise.scale_of, drawings)
+    days = DaysOfLines(lake, method, window, line_of, cache(restart), noise.scale_of, drawings)
     counted = days.count(counted)
     told = _by_line(counted)
     config = config_hash(fleet.audit, fleet.verify, fleet.fleet_model, {"to": last, "method": method})
-    witnesses = _witnesses(lake, method, window)
+    witnesses, clocks = _witnesses(lake, method, window), clocks_of_lines(lake, method, last, line_of)
     for done, ((line, edge), keys) in enumerate(told.items()):
         run.progress(done, len(told), f"{line} {edge.name}")
         rows = np.array([counted.place[key] for key in keys], np.int64)
@@ -109,6 +111,7 @@ def _rows(
             _witnesses_of(witnesses, keys),
         )  # fmt: skip
         row, columns = line_rows(of_edge, fleet.fleet_model, fleet.verify)
+        row = replace(row, **clocks.get((line, edge), {}))
         row = _with_other_releases(row, sorted(others | counted.other_releases))
         answers = as_answers(of_edge, columns, [counted.columns(k) for k in rows.tolist()])
         answers = [_with_line_before(a, counted.changed_line.get(a.vehicle)) for a in answers]

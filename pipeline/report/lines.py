@@ -183,6 +183,22 @@ def shared_words(row: Mapping[str, Any]) -> list[str]:
             else f"{value * _DEG:+.2f} +- {sigma * _DEG:.2f} deg"
         )
         words.append(f"{name} {size}{'' if told else ', or all mounts by as much'}")
+    return words + _clock_words(row)
+
+
+def _clock_words(row: Mapping[str, Any]) -> list[str]:
+    """Time offset of the vehicles, a step of it, and who differs."""
+    if row["clock_mean_s"] is None:
+        return []
+    of = f"stamps of {row['parent_frame']} minus {row['child_frame']}"
+    size = f"{row['clock_mean_s']:+.4f} +- {row['clock_sigma_s']:.4f} s"
+    words = [f"{of} {size}, vehicles scatter by {row['clock_scatter_s']:.4f} s"]
+    if row["clock_step_s"] is not None:
+        step = f"{row['clock_step_s']:+.4f} +- {row['clock_step_sigma_s']:.4f} s"
+        words.append(f"they stepped by {step} in the last 3 days, as with a software release")
+    if row["clock_outside"]:
+        names, more = row["clock_outside"][:_NAMED], len(row["clock_outside"]) - _NAMED
+        words.append(f"they differ on {', '.join(names)}{f' and {more} more' if more > 0 else ''}")
     return words
 
 

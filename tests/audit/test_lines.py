@@ -8,6 +8,7 @@ import pytest
 from pipeline.config import FleetConfig
 from pipeline.geometry.changes import change_covariance
 from pipeline.geometry.se3 import exp_se3, from_quaternion, inverse, log_se3
+from pipeline.report.lines import shared_words
 from pipeline.stage_work import Task, Window
 from pipeline.stages import AUDIT, LINES, STATE
 from pipeline.store.commits import commit_records
@@ -360,6 +361,25 @@ def test_states_refuse_lines_of_another_day_or_release_and_say_so(
     rows = read_last(lake, STATES, StateRow, "joint")
     assert {(r.loads, r.line_status, r.status) for r in rows} == {("alone", "alone", "current")}
     assert all(f"loads the vehicle alone: {words}" in r.reason for r in rows)
+
+
+def test_offsets_of_a_line_and_a_vehicle_that_differs_stand_in_its_row(tmp_path):
+    line, lake = MadeLine(10, 5, seed=33), Lake.at(tmp_path)
+    rng = np.random.default_rng(33)
+    records = [
+        replace(
+            r,
+            time_offset_s=0.02 + 0.002 * rng.normal() + 0.03 * (r.vehicle == "car-0004"),
+            time_offset_sigma_s=0.002,
+        )
+        for r in line_records(line)
+    ]
+    commit_records(lake, CALIBRATIONS, records)
+    rows, _ = lines(lake, fleet_of())
+    row = rows["camera_lidar"]
+    assert abs(row.clock_mean_s - 0.02) < 4 * row.clock_sigma_s
+    assert (row.clock_outside, row.clock_step_s) == (["car-0004"], None)
+    assert f"stamps of camera minus lidar {row.clock_mean_s:+.4f}" in " ".join(shared_words(vars(row)))
 
 
 def drawing_of(row):
