@@ -26,7 +26,7 @@ from schemas.versions import CODE_VERSION
 __all__ = ["Asked", "LineRecords", "read_line_records", "release_of"]
 
 _PRIOR = tuple(f"prior_{n}" for n in ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m"))
-_UNSURE = "diagnostics.unsure_only"
+_UNSURE = ("diagnostics.unsure_only", "diagnostics.few_only")
 _OF_POSES = {c.name for c in POSES.columns}
 
 
@@ -45,7 +45,8 @@ class LineRecords:
     """Current records of one table, in order of vehicle, day and edge.
 
     Args:
-        usable: records of this release that are accepted, or held for nothing but their sigma.
+        usable: records of this release that are accepted, or held for nothing but their sigma, or too few frames
+            or scenes.
         other_releases: of records that are not usable for that alone.
         until: when the last record was asserted.
     """
@@ -73,7 +74,7 @@ def read_line_records(lake: Lake, first: str, last: str, asked: Asked) -> Iterat
     """Edges, then poses of rigs that have more than one sensor of a kind, from `first` to `last`."""
     for schema in (CALIBRATIONS, POSES):
         is_of_poses = schema is POSES
-        more = ("sensor", "kind", "reference", "unsure_only") if is_of_poses else (_UNSURE,)
+        more = ("sensor", "kind", "reference", "unsure_only") if is_of_poses else _UNSURE
         own = tuple(c for c in COLUMNS if c in _OF_POSES or not is_of_poses)
         table = read_columns(
             lake, schema, (*own, *_PRIOR, "prior_covariance", "code_version", *more),
@@ -105,8 +106,8 @@ def _in_order(
     pose = np.stack([found[name].to_numpy() for name in _PRIOR], axis=1)
     P = matrices(found["prior_covariance"])
     known = np.all([there(found[name]) for name in _PRIOR], axis=0) & np.isfinite(P).all(axis=(1, 2))
-    unsure = found["unsure_only" if schema is POSES else _UNSURE].cast(pa.float64())
-    unsure = pc.fill_null(unsure, 0.0).to_numpy() > 0
+    names = ("unsure_only",) if schema is POSES else _UNSURE
+    unsure = np.any([pc.fill_null(found[n].cast(pa.float64()), 0.0).to_numpy() > 0 for n in names], axis=0)
     usable = records.usable & (records.accepted | unsure) & records.has_common & known & (edge >= 0)
     usable[list(faults_of(records, last))] = False
     versions = found["code_version"].to_pylist()

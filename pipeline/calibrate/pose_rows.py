@@ -61,7 +61,7 @@ def _as_judged(row: PoseRow, record: CalibrationRecord | None) -> PoseRow:
         determined=record.determined or [],
         azimuth_sigma_rad=record.azimuth_sigma_rad,
         elevation_sigma_rad=record.elevation_sigma_rad,
-        unsure_only=bool(record.diagnostics.get("unsure_only")),
+        unsure_only=any(record.diagnostics.get(name) for name in ("unsure_only", "few_only")),
     )
 
 

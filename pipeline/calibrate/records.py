@@ -236,6 +236,7 @@ def _claim_numbers(judged: Judged) -> dict[str, float]:
         "confidence": judged.verdict.score,
         "disproved": float(judged.verdict.disproved),
         "unsure_only": float(judged.verdict.unsure_only),
+        "few_only": float(judged.verdict.few_only),
         "vouched_az": float("azimuth" in certified),
         "vouched_el": float("elevation" in certified),
         "elevation_limit_rad": judged.claims["elevation"].limit_rad,

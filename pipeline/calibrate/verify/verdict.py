@@ -70,6 +70,9 @@ class Verdict:
     # Of an accepted record: degrees of freedom that contradict the prior and that nothing checks, how far in sigmas.
     unchecked: Mapping[str, float] = field(default_factory=dict)
     unsure_only: bool = False  # held, but for nothing more than a sigma that is too large for the limits
+    few_only: bool = (
+        False  # held for nothing more than that, or too few frames or scenes to judge the day by itself
+    )
     mounting: tuple[
         str, ...
     ] = ()  # of the certified directions, those in which the mounting is within the limit too
@@ -85,6 +88,9 @@ class _Check:
     disproves: bool = False  # where it fails, the pose is wrong, not only unproved
     # If it fails, the pose may still be within its sigma, but the sigma is too large.
     of_sigma: bool = False
+    of_number: bool = (
+        False  # If it fails, too little was seen for a verdict; nothing speaks against the pose.
+    )
     fault: str = ""  # key of schemas.faults.FAULTS that it names
 
 
@@ -120,8 +126,11 @@ def judge(
         sentences = [check.sentence for check in evidence.failed_checks]
         if estimate.pair != "camera_lidar" or estimate.frames_used < SHORTEST:
             return Verdict("refused", "; ".join([*sentences, few]), _FAILED, faults=tuple(faults))
-        checks.append(_Check(_FAILED, few))
-    checks += [_Check(_FAILED, check.sentence, check.disproves) for check in evidence.failed_checks]
+        checks.append(_Check(_FAILED, few, of_number=True))
+    checks += [
+        _Check(_FAILED, check.sentence, check.disproves, of_number=check.fault == "few_scenes")
+        for check in evidence.failed_checks
+    ]
     if estimate.disproved:
         checks.append(_Check(_FAILED, estimate.disproved, disproves=True))
     if together:
@@ -136,10 +145,21 @@ def judge(
     failed = [c for c in checks if c.margin < 0]
     if failed:
         disproved = any(c.disproves for c in failed)
-        unsure_only = all(c.of_sigma for c in failed)
+        unsure_only, few_only = (
+            all(c.of_sigma for c in failed),
+            all(c.of_sigma or c.of_number for c in failed),
+        )
         reasons = "; ".join(c.reason for c in failed)
         named = tuple(faults | dict.fromkeys(c.fault for c in failed if c.fault))
-        return Verdict("held", reasons, score, disproved=disproved, unsure_only=unsure_only, faults=named)
+        return Verdict(
+            "held",
+            reasons,
+            score,
+            disproved=disproved,
+            unsure_only=unsure_only,
+            few_only=few_only,
+            faults=named,
+        )
     certified = tuple(name for name, claim in evidence.claims.items() if claim.margin >= 0)
     unchecked = _unchecked(estimate, prior, certified)
     reason = "; ".join([*_reservations(estimate, evidence.claims), *_differences(estimate.pair, unchecked)])
@@ -185,9 +205,8 @@ def _aligns_better(
     """Held-out frames align better than at the prior, or as well where the result agrees with the prior."""
     if test is None or test.frames < limits.min_held_out_frames:
         found = 0 if test is None else test.frames
-        return _Check(
-            _FAILED, f"too few held-out frames to judge: {found}, needs {limits.min_held_out_frames}"
-        )
+        few = f"too few held-out frames to judge: {found}, needs {limits.min_held_out_frames}"
+        return _Check(_FAILED, few, of_number=True)
     if test.z > limits.worse_alignment_z:
         # The radar's registration cost has slopes of its own (`lidar_radar/time_offset`): a right result near a prior
         # may score worse. That leaves it unproved, no more.

@@ -211,6 +211,27 @@ def test_too_few_frames_are_refused():
     assert why == "hardly any depth edges; too few frames: 0, needs 8"
 
 
+def test_a_day_that_is_held_for_too_few_frames_or_scenes_alone_is_told_from_one_that_something_speaks_against():
+    unsure = {name: claim(0.15) for name in DIRECTIONS}
+    few = replace(estimate(0.2), frames_used=7)
+    scenes = FailedCheck("too few scenes: its 7 frames show 2", "few_scenes")
+    for result, test, failed in (
+        (few, SAME, ()),
+        (few, None, (scenes,)),
+        (estimate(1.0), replace(BETTER, frames=2), (scenes,)),
+    ):
+        found = verdict(result, test, failed, unsure)
+        assert (found.status, found.unsure_only, found.few_only) == ("held", False, True)
+    assert verdict(estimate(0.2), SAME, (), unsure).few_only
+    for result, test, failed in (
+        (few, WORSE, ()),
+        (replace(few, disproved="nobody vouches for it"), SAME, ()),
+        (few, SAME, ("disjoint halves disagree",)),
+        (replace(estimate(1.0), frames_used=7), SAME, ()),  # moved, and nothing confirms it
+    ):
+        assert not verdict(result, test, failed, unsure).few_only
+
+
 def test_an_untriggered_pair_keeps_the_prior():
     assert verdict(estimate(0.0), SAME, triggered=False).reason == "not triggered: the prior stays"
 
