@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from pipeline.audit.days import DOFS
 from pipeline.audit.estimates import day_name
@@ -84,21 +84,25 @@ class Counted:
             rows[0].day,
         )
 
-    def columns(self, k: int) -> dict[str, Any]:
-        """Columns of a row of `line_answers` that the next night goes on from."""
-        sums = self.sums.at(np.array([k]))
-        return {
-            "line": self.line[k],
-            "sums": packed(sums)[0],
-            "days": float(sums.days[0]),
-            "recent_days": float(sums.recent_days[0]),
-            "first_day": day_name(int(sums.first[0])),
-            "last_day": day_name(int(sums.last[0])),
-            "away": int(sums.away[0]),
-            "restart": self.restart[k],
-            "last_key": self.last_key[k],
-            "read_until": self.read_until,
-        }
+    def columns(self, rows: Int[np.ndarray, " R"]) -> list[dict[str, Any]]:
+        """Columns of rows of `line_answers` that the next night goes on from."""
+        sums = self.sums.at(rows)
+        whole = packed(sums)
+        return [
+            {
+                "line": self.line[k],
+                "sums": whole[r],
+                "days": float(sums.days[r]),
+                "recent_days": float(sums.recent_days[r]),
+                "first_day": day_name(int(sums.first[r])),
+                "last_day": day_name(int(sums.last[r])),
+                "away": int(sums.away[r]),
+                "restart": self.restart[k],
+                "last_key": self.last_key[k],
+                "read_until": self.read_until,
+            }
+            for r, k in enumerate(rows.tolist())
+        ]
 
     def rows_for(self, keys: Collection[tuple[Key, str, str]]) -> None:
         """Add empty sums for new vehicles and edges, given with line and first day that may count."""
@@ -109,7 +113,8 @@ class Counted:
             self.restart.append(restart)
             self.last_key.append("")
         grown = DaySums.empty(len(self.line))
-        self.sums = grown.replaced(np.arange(len(self.line) - len(new)), self.sums)
+        grown.put(np.arange(len(self.line) - len(new)), self.sums)
+        self.sums = grown
 
     def forget(self, keys: Collection[Key]) -> None:
         """Remove the days of some vehicles and edges, which are counted anew."""
@@ -213,8 +218,12 @@ class DaysOfLines:
         work = records.work_key.to_pylist()
         for day in np.unique(records.day[rows]):
             of_day = rows[(records.day[rows] == day) & (counted.sums.last[place[rows]] < day)]
-            for line, edge in {(lines[r], keys[r][1]) for r in of_day}:
-                own = np.array([r for r in of_day if (lines[r], keys[r][1]) == (line, edge)], np.int64)
+            of_line: dict[tuple[str, Edge], list[int]] = {}
+            for r in of_day.tolist():
+                of_line.setdefault((lines[r], keys[r][1]), []).append(r)
+                counted.last_key[place[r]] = work[r]
+            for (line, edge), which in of_line.items():
+                own = np.array(which, np.int64)
                 at = records.at(own)
                 evidence = day_evidence(
                     self.drawings[line, edge].T,
@@ -222,9 +231,7 @@ class DaysOfLines:
                     (read.prior[own], read.prior_covariance[own]),
                 )
                 sums = counted.sums.at(place[own]).with_day(evidence, int(day), scale[own])
-                counted.sums = counted.sums.replaced(place[own], sums)
-            for r in of_day:
-                counted.last_key[place[r]] = work[r]
+                counted.sums.put(place[own], sums)
 
     def _draw(self, read: LineRecords) -> None:
         """Drawings of lines and edges: the median prior of the first night; sigmas of priors are those of the last."""

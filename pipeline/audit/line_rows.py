@@ -21,6 +21,7 @@ from pipeline.fleet_model.evidence import LineEvidence, LinePrior, evidence_of_d
 from pipeline.fleet_model.line import FEWEST_VEHICLES, LineModel, learn_line
 from pipeline.fleet_model.sums import DaySums
 from pipeline.geometry.changes import change_jacobian, changed
+from pipeline.geometry.se3 import to_quaternion
 from pipeline.rig.graph import Edge, RigPose
 from pipeline.rig.sigmas import direction_sigmas
 from schemas.calibrations import DOF_NAMES
@@ -30,6 +31,7 @@ __all__ = ["LineOfEdge", "Witnesses", "as_answers", "line_rows"]
 
 # Vehicles of a line with a change that matters on one edge: more are no chance, and no majority says who is right.
 _ALARMS, _FEWEST_ALARMS = 0.1, 3
+_POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 _WORDS = {"two groups": "form two groups", "many outside": "lie outside of the others"}
 
 
@@ -259,13 +261,16 @@ def _answer_columns(
     covariance, alone_covariance, common = twist(covariance), twist(alone_covariance), twist(sums.common)
     day_covariance = twist(day_alone[1] + sums.common)
     day_shared = None if day_with is None else twist(day_with[1])
+    pose = np.concatenate([to_quaternion(T), T[:, :3, 3]], axis=1).tolist()
+    sigma = direction_sigmas(line.edge, line.drawing.T, covariance)
+    moved_by = (change - alone).tolist()
     rows = []
     for k in range(len(T)):
         columns: dict[str, Any] = {
-            **pose_columns(T[k]), "covariance": covariance[k], "common_covariance": common[k],
-            "alone_covariance": alone_covariance[k], "moved_by": (change[k] - alone[k]).tolist(),
+            **dict(zip(_POSE, pose[k], strict=True)), "covariance": covariance[k], "common_covariance": common[k],
+            "alone_covariance": alone_covariance[k], "moved_by": moved_by[k],
             "record_day": day_name(int(sums.last[k])), "record_alone_covariance": day_covariance[k],
-            **_sure(line.edge, T[k], covariance[k], verify), **_standing(found, bool(shared[k]), k),
+            **_sure(line.edge, sigma[k], verify), **_standing(found, bool(shared[k]), k),
         }  # fmt: skip
         if day_with is not None and day_shared is not None:
             columns |= {
@@ -294,10 +299,9 @@ def _standing(found: _Found, shared: bool, k: int) -> dict[str, Any]:
     }
 
 
-def _sure(edge: Edge, T: np.ndarray, covariance: np.ndarray, verify: VerifyConfig) -> dict[str, Any]:
+def _sure(edge: Edge, sigma: Float[np.ndarray, " 2"], verify: VerifyConfig) -> dict[str, Any]:
     """Sigmas of azimuth and elevation, and which of them lie within their limits."""
     has_radar = "radar" in (edge.child.kind if isinstance(edge, RigPose) else edge.kind)
-    sigma = direction_sigmas(edge, T, covariance)
     limits = (
         (verify.radar_limit_deg, verify.radar_elevation_limit_deg)
         if has_radar

@@ -113,7 +113,7 @@ def _rows(
         row, columns = line_rows(of_edge, fleet.fleet_model, fleet.verify)
         row = replace(row, **clocks.get((line, edge), {}))
         row = _with_other_releases(row, sorted(others | counted.other_releases))
-        answers = as_answers(of_edge, columns, [counted.columns(k) for k in rows.tolist()])
+        answers = as_answers(of_edge, columns, counted.columns(rows))
         answers = [_with_line_before(a, counted.changed_line.get(a.vehicle)) for a in answers]
         key = work_key("lines", CODE_VERSION, config, [content_hash([*answers, row])])
         yield Records([replace(r, work_key=key) for r in (*answers, row)], None, key, [])

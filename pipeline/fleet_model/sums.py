@@ -105,9 +105,9 @@ class DaySums:
     @classmethod
     def empty(cls, vehicles: int) -> DaySums:
         """No day of any vehicle."""
-        m, v, s = np.zeros((vehicles, 6, 6)), np.zeros((vehicles, 6)), np.zeros(vehicles)
-        i = np.zeros(vehicles, np.int64)
-        return cls(m, v, s, m, v, s, m, v, m, v, i, i, i)
+        sizes = ((6, 6), (6,), ()) * 2 + ((6, 6), (6,)) * 2
+        when = (np.zeros(vehicles, np.int64) for _ in range(3))
+        return cls(*(np.zeros((vehicles, *size)) for size in sizes), *when)
 
     def at(self, rows: np.ndarray) -> DaySums:
         """Sums of some of the vehicles."""
@@ -119,6 +119,11 @@ class DaySums:
         for name, values in out.items():
             values[rows] = getattr(new, name)
         return DaySums(**out)
+
+    def put(self, rows: np.ndarray, new: DaySums) -> None:
+        """Set the sums of some vehicles, in place."""
+        for f in fields(self):
+            getattr(self, f.name)[rows] = getattr(new, f.name)
 
     def with_day(self, day: DayEvidence, ordinal: int, scale: Float[np.ndarray, "N 6"]) -> DaySums:
         """The sums with a later day of each vehicle.

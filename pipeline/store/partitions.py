@@ -193,5 +193,7 @@ def work_key(stage: str, code_version: str, config: str, inputs: list[str]) -> s
 
 def content_hash(rows: Sequence[Any]) -> str:
     """Hash of the content of record rows, arrays included."""
-    plain = [[v.tolist() if isinstance(v, np.ndarray) else v for v in vars(row).values()] for row in rows]
+    plain = [
+        [v.tobytes().hex() if isinstance(v, np.ndarray) else v for v in vars(row).values()] for row in rows
+    ]
     return hashlib.sha256(json.dumps(plain).encode()).hexdigest()[:20]
