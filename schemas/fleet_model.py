@@ -48,7 +48,8 @@ class FleetModelRow(Recorded):
     outside: list[str] = column("vehicles that differ from the line", default_factory=list)
     since: str | None = column("first day of any vehicle that counts", default=None)
     other_releases: list[str] = column(
-        "releases whose records were read and do not count: each errs in its own way", default_factory=list
+        "releases whose records do not count, as each errs in its own way, and their last days",
+        default_factory=list,
     )
     drawing_qw: float | None = column(_DRAWING, default=None)
     drawing_qx: float | None = column(_DRAWING, default=None)
@@ -144,8 +145,9 @@ class LineAnswer(Posed):
     child_frame: str = column("frame b of T_a_b: name of a sensor, or base")
     code_version: str = column(_RELEASE)
     status: str = column(
-        "shared (the line has a part in the answer), outside (the vehicle differs from its line: its answer is that of "
-        "the vehicle alone) or alone (the line is not GREEN)"
+        "shared (the line has a part in the answer), outside (the vehicle differs from its line, its last days lie "
+        "elsewhere, or the line makes it no surer: its answer is that of the vehicle alone) or alone (the line is not "
+        "GREEN)"
     )
     reason: str = column("reason for the status")
     distance_sigmas: float | None = column(
@@ -174,9 +176,9 @@ class LineAnswer(Posed):
         "<f8", (6, 6), "covariance of that day's estimate alone, left perturbation [rad, m]", default=None
     )
     sums: np.ndarray | None = array(
-        "<f4", (4, 27),
+        "<f4", (5, 27),
         "sums over days for the next night: information (lower triangle) and pull of all days, of the last days, of "
-        "the last day; common covariance and own prior",
+        "the last day; common covariance and change from the drawing to the prior; covariance of the prior",
         default=None,
     )  # fmt: skip
     days: float = column("number of days, older ones counted less", default=0.0)
@@ -187,7 +189,10 @@ class LineAnswer(Posed):
     restart: str = column(
         "first day that may count, after a service event or a change; empty = any", default=""
     )
-    last_key: str = column("work key of the last day's record", default="")
+    recent_keys: list[str] = column(
+        "day, asserted_at and work key of counted records that the next night may read again",
+        default_factory=list,
+    )
     read_until: str = column(
         "asserted_at of the last record of any vehicle that was read: a later night reads later ones",
         default="",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import datetime as dt
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,11 +14,12 @@ from pipeline.audit.days import DOFS
 from pipeline.audit.estimates import day_name
 from pipeline.audit.line_records import Asked, LineRecords, read_line_records, release_of
 from pipeline.fleet_model.sums import DaySums, day_evidence, packed, unpacked
-from pipeline.geometry.changes import change_between, change_covariance, changed
+from pipeline.geometry.changes import change_between, changed
 from pipeline.rig.edges import line_edge
 from pipeline.rig.graph import Edge
 from pipeline.store.partitions import Lake, days_after
-from pipeline.store.records import read_last
+from pipeline.store.records import first_day, read_last
+from schemas.calibrations import CALIBRATIONS
 from schemas.fleet_model import LINE_ANSWERS, LineAnswer
 from schemas.versions import CODE_VERSION
 
@@ -26,16 +27,16 @@ __all__ = ["Counted", "DaysOfLines", "Drawing", "Key"]
 
 Key = tuple[str, Edge]  # vehicle, and edge or pose
 
-_AT_A_TIME = 7  # days that are in memory together
-_CLOCKS_DIFFER = dt.timedelta(hours=1)  # of machines that commit records
+_AT_A_TIME = 7  # days of a fleet that are in memory together
+_FEW_VEHICLES = 300  # of which all days are
+_CLOCKS_DIFFER = dt.timedelta(hours=24)  # of machines that commit records, as for all record tables
 
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """Pose T_parent_child from which changes of a line's edge count, and variances of its vehicles' priors by axis."""
+    """Pose T_parent_child from which changes of a line's edge count."""
 
     T: Float[np.ndarray, "4 4"]
-    prior_variance: Float[np.ndarray, " 6"]
 
 
 @dataclass(eq=False)
@@ -46,10 +47,10 @@ class Counted:
         place: row of a vehicle and edge in `sums` and the lists.
         line: model line of the vehicle when its days were counted.
         restart: first day that might count; empty = any.
-        last_key: work key of the last day's record.
+        recent: by day, stamp and work key of counted records that the next night may read again.
         read_until: stamp of the last record of any vehicle that was read.
         day: last day of the window that was read; empty = none was.
-        other_releases: of records that were read and do not count.
+        other_releases: of records that do not count: their last days, by line and edge.
         changed_line: vehicles whose line was another one last night, and that line.
     """
 
@@ -57,10 +58,10 @@ class Counted:
     sums: DaySums = field(default_factory=lambda: DaySums.empty(0))
     line: list[str] = field(default_factory=list)
     restart: list[str] = field(default_factory=list)
-    last_key: list[str] = field(default_factory=list)
+    recent: list[dict[int, tuple[str, str]]] = field(default_factory=list)
     read_until: str = ""
     day: str = ""
-    other_releases: set[str] = field(default_factory=set)
+    other_releases: dict[tuple[str, Edge], dict[str, int]] = field(default_factory=dict)
     changed_line: dict[str, str] = field(default_factory=dict)
 
     @classmethod
@@ -79,7 +80,7 @@ class Counted:
             sums,
             [r.line for r in rows],
             [r.restart for r in rows],
-            [r.last_key for r in rows],
+            [_recent_of(r.recent_keys) for r in rows],
             until,
             rows[0].day,
         )
@@ -98,7 +99,7 @@ class Counted:
                 "last_day": day_name(int(sums.last[r])),
                 "away": int(sums.away[r]),
                 "restart": self.restart[k],
-                "last_key": self.last_key[k],
+                "recent_keys": [f"{day_name(d)} {stamp} {key}" for d, (stamp, key) in self.recent[k].items()],
                 "read_until": self.read_until,
             }
             for r, k in enumerate(rows.tolist())
@@ -111,7 +112,7 @@ class Counted:
             self.place[key] = len(self.line)
             self.line.append(line)
             self.restart.append(restart)
-            self.last_key.append("")
+            self.recent.append({})
         grown = DaySums.empty(len(self.line))
         grown.put(np.arange(len(self.line) - len(new)), self.sums)
         self.sums = grown
@@ -121,7 +122,7 @@ class Counted:
         kept = [key for key in self.place if key not in keys]
         rows = np.array([self.place[key] for key in kept], np.int64)
         self.sums = self.sums.at(rows)
-        for name in ("line", "restart", "last_key"):
+        for name in ("line", "restart", "recent"):
             values = getattr(self, name)
             setattr(self, name, [values[k] for k in rows])
         self.place = {key: k for k, key in enumerate(kept)}
@@ -133,6 +134,7 @@ class DaysOfLines:
 
     Args:
         window: first and last day that may count.
+        gone: vehicles that were last seen before this day are left out.
         line_of: model line of a vehicle; empty: none of its days counts.
         restart: first day that may count after a service event or a change; empty where there was none.
         scale: ratio of days' scatter to their sigmas, by axis.
@@ -142,6 +144,7 @@ class DaysOfLines:
     lake: Lake
     method: str
     window: tuple[str, str]
+    gone: str
     line_of: Callable[[str], str]
     restart: Callable[[Key], str]
     scale: Callable[[Key], Float[np.ndarray, " 6"]]
@@ -150,32 +153,45 @@ class DaysOfLines:
     def count(self, counted: Counted) -> Counted:
         """Add the days that became current since the last night.
 
-        Days are counted anew, from all records of a vehicle, after a change or a service event, and where a record
-        of a day that is counted already was replaced.
+        All days of a vehicle are counted anew after a change or a service event, where a record of a day that is
+        counted already was replaced, and where the vehicle was not counted the last night.
         """
         first, last = self.window
+        first = max(first, first_day(self.lake, CALIBRATIONS) or last)
         since, day, until = _before(counted.read_until), counted.day, counted.read_until
-        gone = _ordinal(first)
+        gone = _ordinal(self.gone)
         counted.forget({key for key, k in counted.place.items() if counted.sums.last[k] < gone})
         anew = {key for key, k in counted.place.items() if self._is_stale(counted, key, k)}
         before = {key[0]: counted.line[counted.place[key]] for key in anew}
         counted.changed_line = {v: line for v, line in before.items() if self.line_of(v) != line}
+        known = frozenset(counted.place)
         # Days after the last window's may have been recorded before it was read, as after an audit of an earlier one.
         spans: list[tuple[str, str, str | None]] = [(first, min(day, last), since)] if since else []
-        spans += [(*week, None) for week in _weeks(max(first, days_after(day, 1)) if day else first, last)]
+        spans += [(*week, None) for week in _spans(max(first, days_after(day, 1)) if day else first, last)]
         for begin, end, asserted_after in spans:
             for new in self._read(begin, end, asserted_after=asserted_after):
-                until = max(until, new.until)
-                counted.other_releases |= new.other_releases
+                until = max([until, *new.asserted])
+                self._note_other_releases(new, counted)
                 anew |= _replaced(new, counted)
+                if day:
+                    anew |= {key for key, ok in zip(new.keys(), new.usable, strict=True) if ok} - known
                 self._add(new, counted, leave=anew)
-        counted.read_until = until
         counted.forget(anew)
         vehicles = {vehicle for vehicle, _ in anew}
-        for week in _weeks(first, last) if vehicles else ():
-            for part in self._read(*week, among=vehicles):
+        at_a_time = _AT_A_TIME if len(vehicles) > _FEW_VEHICLES else None
+        for span in _spans(first, last, at_a_time) if vehicles else ():
+            for part in self._read(*span, among=vehicles):
                 self._add(part, counted, among=anew)
+        counted.read_until = until
+        again = _before(until) or ""
+        counted.recent = [{d: of for d, of in own.items() if of[0] >= again} for own in counted.recent]
         return counted
+
+    def _note_other_releases(self, read: LineRecords, counted: Counted) -> None:
+        for (vehicle, edge), days in read.other_releases.items():
+            line = self.line_of(vehicle)
+            of = counted.other_releases.setdefault((line, edge), {}) if line else {}
+            of.update({release: max(day, of.get(release, 0)) for release, day in days.items()})
 
     def _is_stale(self, counted: Counted, key: Key, k: int) -> bool:
         line = self.line_of(key[0])
@@ -221,7 +237,7 @@ class DaysOfLines:
             of_line: dict[tuple[str, Edge], list[int]] = {}
             for r in of_day.tolist():
                 of_line.setdefault((lines[r], keys[r][1]), []).append(r)
-                counted.last_key[place[r]] = work[r]
+                counted.recent[place[r]][int(day)] = read.asserted[r], work[r]
             for (line, edge), which in of_line.items():
                 own = np.array(which, np.int64)
                 at = records.at(own)
@@ -234,32 +250,35 @@ class DaysOfLines:
                 counted.sums.put(place[own], sums)
 
     def _draw(self, read: LineRecords) -> None:
-        """Drawings of lines and edges: the median prior of the first night; sigmas of priors are those of the last."""
+        """Drawings of new lines and edges: the median prior of the first vehicles."""
         keys = read.keys()
         of_line: dict[tuple[str, Edge], list[int]] = {}
         for r in np.flatnonzero(read.usable).tolist():
             line = self.line_of(keys[r][0])
-            if line:
+            if line and (line, keys[r][1]) not in self.drawings:
                 of_line.setdefault((line, keys[r][1]), []).append(r)
         for of, rows in of_line.items():
             prior = read.prior[rows]
-            variance = np.einsum("nii->ni", change_covariance(prior, read.prior_covariance[rows]))
-            known = self.drawings.get(of)
             middle = np.median(change_between(prior[0], prior), axis=0)
-            T = changed(prior[0], middle) if known is None else known.T
-            self.drawings[of] = Drawing(T, np.median(variance, axis=0))
+            self.drawings[of] = Drawing(changed(prior[0], middle))
 
 
 def _replaced(read: LineRecords, counted: Counted) -> set[Key]:
-    """Vehicles and edges with a new record of a day that is counted already."""
+    """Vehicles and edges with a new record of a day that is counted already, or was passed over."""
     found = set()
     rows = zip(read.keys(), read.records.day.tolist(), read.records.work_key.to_pylist(), strict=True)
     for key, day, work in rows:
         k = counted.place.get(key)
-        last = 0 if k is None else int(counted.sums.last[k])
-        if k is not None and day <= last and (day, work) != (last, counted.last_key[k]):
+        if k is None or day > int(counted.sums.last[k]):
+            continue
+        if counted.recent[k].get(day, ("", ""))[1] != work:
             found.add(key)
     return found
+
+
+def _recent_of(texts: Sequence[str]) -> dict[int, tuple[str, str]]:
+    parts = [text.split(" ") for text in texts]
+    return {_ordinal(day): (stamp, key) for day, stamp, key in parts}
 
 
 def _ordinal(day: str | None) -> int:
@@ -273,7 +292,8 @@ def _before(stamp: str) -> str | None:
     return moment.isoformat(timespec="microseconds").replace("+00:00", "Z")
 
 
-def _weeks(first: str, last: str) -> Iterator[tuple[str, str]]:
+def _spans(first: str, last: str, days: int | None = _AT_A_TIME) -> Iterator[tuple[str, str]]:
     while first <= last:
-        yield first, min(days_after(first, _AT_A_TIME - 1), last)
-        first = days_after(first, _AT_A_TIME)
+        end = last if days is None else min(days_after(first, days - 1), last)
+        yield first, end
+        first = days_after(end, 1)

@@ -14,7 +14,7 @@ from pipeline.audit.estimates import COLUMNS, Estimates, estimates_at, faults_of
 from pipeline.geometry.se3 import from_quaternion
 from pipeline.rig.edges import edge_order, edges_of_rows
 from pipeline.rig.graph import Edge, RigPose, Sensor, is_one_of_each
-from pipeline.store.columns import matrices, there
+from pipeline.store.columns import matrices
 from pipeline.store.current import current_rows
 from pipeline.store.partitions import Lake
 from pipeline.store.records import read_columns
@@ -27,6 +27,8 @@ __all__ = ["Asked", "LineRecords", "read_line_records", "release_of"]
 
 _PRIOR = tuple(f"prior_{n}" for n in ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m"))
 _UNSURE = ("diagnostics.unsure_only", "diagnostics.few_only")
+_ROUNDING = 1e-3  # of a quaternion's length
+_LEAST = 1e-9  # eigenvalue of a correlation matrix: with less a covariance knows a direction exactly
 _OF_POSES = {c.name for c in POSES.columns}
 
 
@@ -47,16 +49,16 @@ class LineRecords:
     Args:
         usable: records of this release that are accepted, or held for nothing but their sigma, or too few frames
             or scenes.
-        other_releases: of records that are not usable for that alone.
-        until: when the last record was asserted.
+        asserted: when each was.
+        other_releases: of records that are not usable for that alone: their last days, by vehicle and edge.
     """
 
     records: Estimates
     prior: Float[np.ndarray, "N 4 4"]
     prior_covariance: Float[np.ndarray, "N 6 6"]
     usable: Bool[np.ndarray, " N"]
-    other_releases: frozenset[str]
-    until: str
+    asserted: list[str]
+    other_releases: dict[tuple[str, Edge], dict[str, int]]
 
     def keys(self) -> list[tuple[str, Edge]]:
         """Vehicle and edge of each record."""
@@ -82,13 +84,10 @@ def read_line_records(lake: Lake, first: str, last: str, asked: Asked) -> Iterat
         )  # fmt: skip
         if table is None:
             continue
-        until = pc.max(table["asserted_at"]).as_py()
         found = current_rows(table.filter(pc.equal(table["method"], asked.method)), schema)
         edges, edge = _poses_of(found) if is_of_poses else edges_of_rows(found)
-        if is_of_poses:
-            found, edge = found.filter(pa.array(edge >= 0)), edge[edge >= 0]
-            found = _with_missing(found)
-        yield _in_order(found, edges, edge, schema, asked.last, until or "")
+        found, edge = found.filter(pa.array(edge >= 0)), edge[edge >= 0]  # an unknown pair is not counted
+        yield _in_order(_with_missing(found) if is_of_poses else found, edges, edge, schema, asked.last)
 
 
 def _in_order(
@@ -97,25 +96,41 @@ def _in_order(
     edge: Int[np.ndarray, " N"],
     schema: TableSchema,
     last: str,
-    until: str,
 ) -> LineRecords:
     by = [(name, "ascending") for name in ("vehicle", "day", "edge")]
     order = pc.sort_indices(found.append_column("edge", pa.array(edge)), by)
     found, edge = found.take(order), edge[np.asarray(order)]
     records = estimates_at(found, edges, edge)
-    pose = np.stack([found[name].to_numpy() for name in _PRIOR], axis=1)
+    pose = np.stack([found[name].cast(pa.float64()).to_numpy() for name in _PRIOR], axis=1)
     P = matrices(found["prior_covariance"])
-    known = np.all([there(found[name]) for name in _PRIOR], axis=0) & np.isfinite(P).all(axis=(1, 2))
+    unit_length = np.abs((np.nan_to_num(pose[:, :4]) ** 2).sum(axis=1) - 1) < _ROUNDING
+    known = unit_length & np.isfinite(pose).all(axis=1) & _is_positive(P) & _is_positive(records.covariance)
     names = ("unsure_only",) if schema is POSES else _UNSURE
     unsure = np.any([pc.fill_null(found[n].cast(pa.float64()), 0.0).to_numpy() > 0 for n in names], axis=0)
-    usable = records.usable & (records.accepted | unsure) & records.has_common & known & (edge >= 0)
+    usable = records.usable & (records.accepted | unsure) & records.has_common & known
     usable[list(faults_of(records, last))] = False
-    versions = found["code_version"].to_pylist()
-    is_own = np.array([release_of(v or "") == release_of(CODE_VERSION) for v in versions], bool)
-    others = frozenset(release_of(versions[r] or "") for r in np.flatnonzero(usable & ~is_own))
+    versions = [release_of(v or "") for v in found["code_version"].to_pylist()]
+    is_own = np.array([v == release_of(CODE_VERSION) for v in versions], bool)
     prior = np.broadcast_to(np.eye(4), (len(known), 4, 4)).copy()
     prior[known] = from_quaternion(pose[known, :4], pose[known, 4:])
-    return LineRecords(records, prior, P, usable & is_own, others, until)
+    read = LineRecords(records, prior, P, usable & is_own, found["asserted_at"].to_pylist(), {})
+    if not is_own.all():
+        keys = read.keys()
+        for r in np.flatnonzero(usable & ~is_own).tolist():
+            of = read.other_releases.setdefault(keys[r], {})
+            of[versions[r]] = max(of.get(versions[r], 0), int(records.day[r]))
+    return read
+
+
+def _is_positive(covariance: Float[np.ndarray, "N 6 6"]) -> Bool[np.ndarray, " N"]:
+    """Whether covariances are finite, and positive definite beyond rounding."""
+    finite = np.isfinite(covariance).all(axis=(1, 2))
+    C = np.where(finite[:, None, None], covariance, np.eye(6))
+    diagonal = np.einsum("nii->ni", C)
+    finite &= (diagonal > 0).all(axis=1)
+    scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    least = np.linalg.eigvalsh(C * scale[:, :, None] * scale[:, None, :])[:, 0] if len(C) else np.zeros(0)
+    return np.asarray(finite & (least > _LEAST))
 
 
 def _poses_of(rows: pa.Table) -> tuple[tuple[Edge, ...], Int[np.ndarray, " N"]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,13 @@ from pipeline.config import FleetModelConfig, VerifyConfig
 from pipeline.fleet_model.answers import DIFFERS_SIGMAS, Answers, largest_change_without_one, with_line
 from pipeline.fleet_model.apart import shared_axes, shared_errors
 from pipeline.fleet_model.contradictions import Motion, contradiction_of, motion_of
-from pipeline.fleet_model.evidence import LineEvidence, LinePrior, evidence_of_days, with_witness
+from pipeline.fleet_model.evidence import (
+    LineEvidence,
+    LinePrior,
+    OwnPriors,
+    evidence_of_days,
+    with_witness,
+)
 from pipeline.fleet_model.line import FEWEST_VEHICLES, LineModel, learn_line
 from pipeline.fleet_model.sums import DaySums
 from pipeline.geometry.changes import change_jacobian, changed
@@ -32,6 +38,9 @@ __all__ = ["LineOfEdge", "Witnesses", "as_answers", "line_rows"]
 # Vehicles of a line with a change that matters on one edge: more are no chance, and no majority says who is right.
 _ALARMS, _FEWEST_ALARMS = 0.1, 3
 _POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+_NO_SURER = 1.2  # times the sigma alone: an answer that is so much less sure with the line is of no use
+_OBSERVABLE = 0.5  # of the prior's variance: with less an axis counts as determined
+_PRIORS_APART = 3.0  # ratio of the largest sigma of a vehicle's prior to the smallest, which is said
 _WORDS = {"two groups": "form two groups", "many outside": "lie outside of the others"}
 
 
@@ -96,9 +105,10 @@ def line_rows(
     most = None
     if found.model is not None and found.status == "GREEN":
         most = largest_change_without_one(found.model, evidence, line.sums.common)
+    reason = "; ".join(text for text in (found.reason, _priors_apart(line)) if text)
     first = line.sums.first[line.sums.first > 0]
     row = FleetModelRow(
-        vehicle=OF_ALL, **line.about, status=found.status, reason=found.reason, vehicles=len(names), outside=outside,
+        vehicle=OF_ALL, **line.about, status=found.status, reason=reason, vehicles=len(names), outside=outside,
         since=day_name(int(first.min())) if len(first) else None, most_without_one=most,
         **{f"drawing_{name}": value for name, value in pose_columns(line.drawing.T).items()},
         **_model_columns(line, found), **_motion_columns(found.motion),
@@ -107,19 +117,48 @@ def line_rows(
 
 
 def _prior(line: LineOfEdge, config: FleetModelConfig) -> LinePrior:
-    variance = line.drawing.prior_variance.copy()
+    own = _prior_variance(line)
+    variance = own.copy()
     if config.common_mount_sigma_deg is not None:
         variance[:3] = np.radians(config.common_mount_sigma_deg) ** 2
     if config.common_mount_sigma_m is not None:
         variance[3:] = config.common_mount_sigma_m**2
     # What is common to all days of a vehicle cannot be zero: it is inverted.
-    bias = line.sums.common.mean(axis=0) + np.diag(1e-8 * line.drawing.prior_variance)
-    used = [name for name, own in line.witnesses.information.items() if (own > 0).any()]
+    bias = _usual_common(line.sums.common, own) + np.diag(1e-8 * own)
+    used = [name for name, reports in line.witnesses.information.items() if (reports > 0).any()]
     if not _has_reference(line.edge) or not used:
         return LinePrior(np.diag(variance), bias)
     more = np.zeros((6 + len(used), 6 + len(used)))
     more[:6, :6], more[6:, 6:] = bias, np.eye(len(used)) * variance[:3].max()
     return LinePrior(np.diag(variance), more)
+
+
+def _prior_variance(line: LineOfEdge) -> Float[np.ndarray, " 6"]:
+    """By axis, of the vehicles' priors: their median."""
+    return np.asarray(np.median(np.einsum("nii->ni", line.sums.prior), axis=0))
+
+
+def _own_priors(line: LineOfEdge) -> OwnPriors:
+    return OwnPriors(line.sums.own_prior, line.sums.prior)
+
+
+def _usual_common(
+    common: Float[np.ndarray, "N 6 6"], unit: Float[np.ndarray, " 6"]
+) -> Float[np.ndarray, "6 6"]:
+    """Mean of the middle half of the vehicles by size: one that states far more widens nobody else's answer."""
+    size = (np.einsum("nii->ni", common) / unit).sum(axis=1)
+    low, high = np.quantile(size, [0.25, 0.75], method="nearest")
+    return np.asarray(common[(size >= low) & (size <= high)].mean(axis=0))
+
+
+def _priors_apart(line: LineOfEdge) -> str:
+    """Words where priors of vehicles differ, as those of two configurations under one name."""
+    sigma = np.sqrt(np.einsum("nii->ni", line.sums.prior))
+    ratio = sigma.max(axis=0) / sigma.min(axis=0)
+    axis = int(np.argmax(ratio))
+    if ratio[axis] < _PRIORS_APART:
+        return ""
+    return f"priors of its vehicles differ, along {DOF_NAMES[axis]} by {ratio[axis]:.1f} times"
 
 
 def _has_reference(edge: Edge) -> bool:
@@ -163,7 +202,7 @@ def _model(line: LineOfEdge, evidence: LineEvidence, prior: LinePrior) -> _Found
     # How far days err alike is hardly known of few days. Where it is less than assumed, mounts scatter by more.
     apart = _evidence(line, prior, days="all", alike=False)
     model = learn_line(evidence, prior, learn_line(apart, prior).variance)
-    answers = with_line(model, evidence, line.sums.common, line.sums.own_prior)
+    answers = with_line(model, evidence, line.sums.common, _own_priors(line))
     contradiction = contradiction_of(evidence, model)
     alarms = int(line.changed.sum())
     if alarms >= max(_FEWEST_ALARMS, _ALARMS * count):
@@ -195,7 +234,7 @@ def _motion(line: LineOfEdge, prior: LinePrior) -> Motion:
             (sums.recent_information, sums.recent_pull, sums.recent_days),
         )
     ]
-    (before, spread), (lately, wider) = (part.alone(own, sums.own_prior) for part in parts)
+    (before, spread), (lately, wider) = (part.alone(own, _own_priors(line)) for part in parts)
     seen = np.logical_and(*(part.determined(own) for part in parts)) & (sums.days > 2)[:, None]
     return motion_of(lately - before, spread + wider, seen)
 
@@ -213,7 +252,7 @@ def _motion_columns(motion: Motion) -> dict[str, Any]:
 
 def _model_columns(line: LineOfEdge, found: _Found) -> dict[str, Any]:
     noise = {
-        "prior_sigma": np.sqrt(line.drawing.prior_variance).tolist(),
+        "prior_sigma": np.sqrt(_prior_variance(line)).tolist(),
         "day_scale": np.median(line.scale, axis=0).tolist(),
         "day_autocorrelation": np.median(line.autocorrelation, axis=0).tolist(),
     }
@@ -239,64 +278,98 @@ def _model_columns(line: LineOfEdge, found: _Found) -> dict[str, Any]:
 def _answer_columns(
     line: LineOfEdge, prior: LinePrior, evidence: LineEvidence, found: _Found, verify: VerifyConfig
 ) -> list[dict[str, Any]]:
-    sums = line.sums
+    sums, owns = line.sums, _own_priors(line)
     own = LinePrior(prior.mount, prior.bias[:6, :6])
-    alone, spread = evidence.alone(own, sums.own_prior)
+    alone, spread = evidence.alone(own, owns)
     alone_covariance = spread + sums.common
-    change, covariance = alone, alone_covariance
-    shared = np.zeros(len(sums.days), bool)
     of_day = _evidence(line, prior, days="last")
-    day_alone = of_day.alone(own, sums.own_prior)
-    day_with: tuple[np.ndarray, np.ndarray] | None = None
+    day_change, day_spread = of_day.alone(own, owns)
+    day_alone_covariance = day_spread + sums.common
+    change, covariance, day_covariance = alone, alone_covariance, day_alone_covariance
+    standing = _Standing(found, sums.away, np.ones(len(alone), bool))
     if found.status == "GREEN" and found.model is not None and found.answers is not None:
-        change, covariance, shared = found.answers.change, found.answers.covariance, found.answers.shared
-        day = with_line(found.model, of_day, sums.common, sums.own_prior)
-        day_with = day.change, day.covariance
+        answers = found.answers
+        sigma, sigma_alone = (
+            direction_sigmas(line.edge, line.drawing.T, _twist(line, of))
+            for of in (answers.covariance, alone_covariance)
+        )
+        standing = replace(standing, surer=np.asarray((sigma <= _NO_SURER * sigma_alone).all(axis=1)))
+        shared = standing.shared()[:, None]
+        change = np.where(shared, answers.change, alone)
+        covariance = np.where(shared[:, None], answers.covariance, alone_covariance)
+        day = with_line(found.model, of_day, sums.common, owns)
+        day_change = np.where(shared, day.change, day_change)
+        day_covariance = np.where(shared[:, None], day.covariance, day_alone_covariance)
     T = changed(line.drawing.T, change)
-    back = np.linalg.inv(change_jacobian(T))
-
-    def twist(of: np.ndarray) -> np.ndarray:
-        return np.asarray(back @ of @ back.swapaxes(1, 2))
-
-    covariance, alone_covariance, common = twist(covariance), twist(alone_covariance), twist(sums.common)
-    day_covariance = twist(day_alone[1] + sums.common)
-    day_shared = None if day_with is None else twist(day_with[1])
+    observable = np.einsum("nii->ni", covariance) < _OBSERVABLE * np.einsum("nii->ni", sums.prior)
+    covariance, alone_covariance, common, day_covariance, day_alone_covariance = (
+        _twist(line, of, T)
+        for of in (covariance, alone_covariance, sums.common, day_covariance, day_alone_covariance)
+    )
     pose = np.concatenate([to_quaternion(T), T[:, :3, 3]], axis=1).tolist()
     sigma = direction_sigmas(line.edge, line.drawing.T, covariance)
-    moved_by = (change - alone).tolist()
-    rows = []
-    for k in range(len(T)):
-        columns: dict[str, Any] = {
+    moved_by, of_record = (change - alone).tolist(), (day_change - change).tolist()
+    return [
+        {
             **dict(zip(_POSE, pose[k], strict=True)), "covariance": covariance[k], "common_covariance": common[k],
-            "alone_covariance": alone_covariance[k], "moved_by": moved_by[k],
-            "record_day": day_name(int(sums.last[k])), "record_alone_covariance": day_covariance[k],
-            **_sure(line.edge, sigma[k], verify), **_standing(found, bool(shared[k]), k),
-        }  # fmt: skip
-        if day_with is not None and day_shared is not None:
-            columns |= {
-                "record_change": (day_with[0][k] - change[k]).tolist(),
-                "record_covariance": day_shared[k],
-            }
-        rows.append(columns)
-    return rows
+            "observable": observable[k].tolist(), "alone_covariance": alone_covariance[k], "moved_by": moved_by[k],
+            "record_day": day_name(int(sums.last[k])), "record_alone_covariance": day_alone_covariance[k],
+            "record_change": of_record[k], "record_covariance": day_covariance[k],
+            **_sure(line.edge, sigma[k], verify), **standing.of(k),
+        }
+        for k in range(len(T))
+    ]  # fmt: skip
 
 
-def _standing(found: _Found, shared: bool, k: int) -> dict[str, Any]:
-    """Status of one vehicle's answer, and how far it lies from the line."""
-    if found.answers is None:
-        return {"status": "alone", "reason": found.reason}
-    distance, axis = float(found.answers.distance[k]), DOF_NAMES[int(found.answers.axis[k])]
-    differs = distance > DIFFERS_SIGMAS
-    far = f"{distance:.1f} sigmas from its line along {axis}" if differs else ""
-    status = ("shared" if shared else "outside") if found.status == "GREEN" else "alone"
-    reason = "; ".join(text for text in (found.reason, far) if text)
-    return {
-        "status": status,
-        "reason": reason,
-        "distance_sigmas": distance,
-        "distance_axis": axis,
-        "differs": differs,
-    }
+def _twist(
+    line: LineOfEdge, covariance: np.ndarray, T: np.ndarray | None = None
+) -> Float[np.ndarray, "N 6 6"]:
+    """Covariances of changes as those of left perturbations, at the poses or at the drawing."""
+    back = np.linalg.inv(change_jacobian(line.drawing.T if T is None else T))
+    return np.asarray(back @ covariance @ back.swapaxes(-1, -2))
+
+
+@dataclass(frozen=True, eq=False)
+class _Standing:
+    """Which answers the line has a part in, and why not in the others.
+
+    Args:
+        away: last days of a vehicle that lie elsewhere and are left out of its sums.
+        surer: vehicles whose directions are as sure with the line as alone.
+    """
+
+    found: _Found
+    away: np.ndarray
+    surer: Bool[np.ndarray, " N"]
+
+    def shared(self) -> Bool[np.ndarray, " N"]:
+        """Vehicles whose answer the line has a part in."""
+        if self.found.status != "GREEN" or self.found.answers is None:
+            return np.zeros(len(self.away), bool)
+        return np.asarray(self.found.answers.shared & (self.away == 0) & self.surer)
+
+    def of(self, k: int) -> dict[str, Any]:
+        """Status of one vehicle's answer, and how far it lies from the line."""
+        found = self.found
+        if found.answers is None:
+            return {"status": "alone", "reason": found.reason}
+        distance, axis = float(found.answers.distance[k]), DOF_NAMES[int(found.answers.axis[k])]
+        differs = distance > DIFFERS_SIGMAS
+        told = [found.reason, f"{distance:.1f} sigmas from its line along {axis}" if differs else ""]
+        status = "alone"
+        if found.status == "GREEN":
+            status = "shared" if self.shared()[k] else "outside"
+            if self.away[k]:
+                told.append(f"its last {self.away[k]} days lie elsewhere, and are left out of its answer")
+            elif not self.surer[k]:
+                told.append("with its line it would be much less sure")
+        return {
+            "status": status,
+            "reason": "; ".join(text for text in told if text),
+            "distance_sigmas": distance,
+            "distance_axis": axis,
+            "differs": differs,
+        }
 
 
 def _sure(edge: Edge, sigma: Float[np.ndarray, " 2"], verify: VerifyConfig) -> dict[str, Any]:

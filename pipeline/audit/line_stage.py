@@ -5,6 +5,7 @@ Runs after the audit, whose changes restart a vehicle's sums, and before the sta
 
 from __future__ import annotations
 
+import datetime as dt
 from collections import Counter
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -16,6 +17,7 @@ import pyarrow.compute as pc
 from jaxtyping import Float
 
 from pipeline.audit.days import DOFS
+from pipeline.audit.estimates import day_name
 from pipeline.audit.line_clocks import clocks_of_lines
 from pipeline.audit.line_days import Counted, DaysOfLines, Drawing, Key
 from pipeline.audit.line_records import release_of
@@ -29,7 +31,7 @@ from pipeline.rig.graph import Edge, RigPose, tie
 from pipeline.stage_work import Records, Run, Task, Told, Window, Work
 from pipeline.store.current import current_rows
 from pipeline.store.partitions import Lake, content_hash, days_after, last_possible_day, work_key
-from pipeline.store.records import last_assertion, last_day, read_columns, read_last_columns, read_records
+from pipeline.store.records import last_assertion, last_day, read_columns, read_last, read_last_columns
 from schemas.calibrations import CALIBRATIONS, DOF_NAMES
 from schemas.drift import DRIFT, DriftFinding
 from schemas.fleet_model import FLEET_MODEL, LINE_ANSWERS, FleetModelRow, LineAnswer
@@ -39,13 +41,15 @@ from schemas.versions import CODE_VERSION
 
 __all__ = ["work"]
 
-_DAYS_BACK = 60  # as states look back
+# Older days count for less than a sixtieth, so that it hardly matters whether a night counts all days anew.
+_DAYS_BACK = 180
+_GONE_DAYS = 60  # a vehicle that was not seen for so long is of no line, as it has no state
 _EDGE = ("pair", "parent_frame", "child_frame")
 _OF_DRIFT = ("vehicle", *_EDGE, "dof", "status", "start_day", "start_day_latest", "moved_sensor",
              "day_scale", "day_autocorrelation")  # fmt: skip
 _ANGLES = ("azimuth", "elevation")
 _OF_RADARS = (
-    "vehicle", "sensor", "sign_is_published",
+    "vehicle", "sensor", "day", "sign_is_published",
     *(f"{name}_{what}" for name in _ANGLES for what in ("rad", "sigma_rad", "scatter_rad")),
 )  # fmt: skip
 _SUREST_RAD = float(np.radians(0.05))  # a radar's own alignment is not taken to be surer
@@ -87,9 +91,13 @@ def _rows(
     def restart(key: Key) -> str:
         return _since(key[1], events.get(key[0], ()), changes.get(key[0], ()), last)
 
-    line_of = _line_of(fleet)
+    since, line_of = cache(restart), _line_of(fleet)
     run.progress(0, 0, "days")
-    days = DaysOfLines(lake, method, window, line_of, cache(restart), noise.scale_of, drawings)
+    gone = days_after(last, 1 - _GONE_DAYS)
+    counted.other_releases = {
+        of: {r: d for r, d in own.items() if day_name(d) >= gone} for of, own in others.items()
+    }
+    days = DaysOfLines(lake, method, window, gone, line_of, since, noise.scale_of, drawings)
     counted = days.count(counted)
     told = _by_line(counted)
     config = config_hash(fleet.audit, fleet.verify, fleet.fleet_model, {"to": last, "method": method})
@@ -108,11 +116,11 @@ def _rows(
             np.array([noise.alike_of(key) for key in keys]).reshape(-1, DOFS),
             np.array([_is_remounted(edge, events.get(v, ())) for v in vehicles], bool),
             np.array([_has_changed(edge, changes.get(v, ())) for v in vehicles], bool),
-            _witnesses_of(witnesses, keys),
+            _witnesses_of(witnesses, keys, since),
         )  # fmt: skip
         row, columns = line_rows(of_edge, fleet.fleet_model, fleet.verify)
         row = replace(row, **clocks.get((line, edge), {}))
-        row = _with_other_releases(row, sorted(others | counted.other_releases))
+        row = _with_other_releases(row, counted.other_releases.get((line, edge), {}))
         answers = as_answers(of_edge, columns, counted.columns(rows))
         answers = [_with_line_before(a, counted.changed_line.get(a.vehicle)) for a in answers]
         key = work_key("lines", CODE_VERSION, config, [content_hash([*answers, row])])
@@ -186,27 +194,31 @@ def _of_audit(lake: Lake, method: str) -> tuple[dict[str, list[DriftFinding]], _
     return changes, noise
 
 
-def _of_last_night(lake: Lake, method: str) -> tuple[dict[tuple[str, Edge], Drawing], set[str]]:
-    """Drawings from which the sums of the last night count, and releases whose records it read and did not count."""
-    last = last_assertion(lake, FLEET_MODEL, method)
-    if last is None:
-        return {}, set()
-    rows = read_records(lake, FLEET_MODEL, FleetModelRow, day=last.day)
-    found: dict[tuple[str, Edge], Drawing] = {}
-    others: set[str] = set()
-    for r in (r for r in rows if r.method == method):
-        others.update(r.other_releases)
-        if r.drawing_qw is not None and r.prior_sigma is not None:
+def _of_last_night(
+    lake: Lake, method: str
+) -> tuple[dict[tuple[str, Edge], Drawing], dict[tuple[str, Edge], dict[str, int]]]:
+    """Drawings from which the sums of the last night count, and last days of other releases, by line and edge."""
+    drawings: dict[tuple[str, Edge], Drawing] = {}
+    others: dict[tuple[str, Edge], dict[str, int]] = {}
+    for r in read_last(lake, FLEET_MODEL, FleetModelRow, method):
+        of = r.line, line_edge(r)
+        pairs = [text.split(" until ") for text in r.other_releases]
+        others[of] = {
+            release: dt.date.fromisoformat(day).toordinal()
+            for release, day in pairs
+            if release != release_of(CODE_VERSION)
+        }
+        if r.drawing_qw is not None:
             pose = [getattr(r, f"drawing_{n}") for n in ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")]
-            T = from_quaternion(np.array(pose[:4]), np.array(pose[4:]))
-            found[r.line, line_edge(r)] = Drawing(T, np.array(r.prior_sigma) ** 2)
-    return found, others - {release_of(CODE_VERSION)}
+            drawings[of] = Drawing(from_quaternion(np.array(pose[:4]), np.array(pose[4:])))
+    return drawings, others
 
 
-def _with_other_releases(row: FleetModelRow, others: Sequence[str]) -> FleetModelRow:
-    words = f"records of release {', '.join(others)} do not count" if others else ""
+def _with_other_releases(row: FleetModelRow, others: Mapping[str, int]) -> FleetModelRow:
+    texts = [f"{release} until {day_name(day)}" for release, day in sorted(others.items())]
+    words = f"records of release {', '.join(texts)} do not count" if texts else ""
     reason = "; ".join(text for text in (row.reason, words) if text)
-    return replace(row, other_releases=list(others), reason=reason)
+    return replace(row, other_releases=texts, reason=reason)
 
 
 def _with_line_before(answer: LineAnswer, line: str | None) -> LineAnswer:
@@ -236,7 +248,7 @@ def _has_changed(edge: Edge, changes: Sequence[DriftFinding]) -> bool:
     return any((c.pair, c.parent_frame, c.child_frame) == of for c in red)
 
 
-_Reports = dict[tuple[str, str], dict[str, list[tuple[float, float]]]]
+_Reports = dict[tuple[str, str], dict[str, list[tuple[str, float, float]]]]  # of days
 
 
 def _witnesses(lake: Lake, method: str, window: tuple[str, str]) -> _Reports:
@@ -253,19 +265,22 @@ def _witnesses(lake: Lake, method: str, window: tuple[str, str]) -> _Reports:
             if row[f"{name}_rad"] is not None:
                 sizes = (row[f"{name}_sigma_rad"] or 0.0, row[f"{name}_scatter_rad"] or 0.0, _SUREST_RAD)
                 of = found.setdefault((row["vehicle"], row["sensor"]), {})
-                of.setdefault(f"radar {name}", []).append((row[f"{name}_rad"], max(sizes)))
+                of.setdefault(f"radar {name}", []).append((row["day"], row[f"{name}_rad"], max(sizes)))
     return found
 
 
-def _witnesses_of(reports: _Reports, keys: Sequence[Key]) -> Witnesses:
-    """Mean of each vehicle's reports; their errors are taken to be the same every day."""
+def _witnesses_of(reports: _Reports, keys: Sequence[Key], since: Callable[[Key], str]) -> Witnesses:
+    """Mean of each vehicle's reports since it changed; their errors are taken to be the same every day."""
     value = {f"radar {name}": np.zeros(len(keys)) for name in _ANGLES}
     information = {name: np.zeros(len(keys)) for name in value}
     for k, (vehicle, edge) in enumerate(keys):
         radars = [sensor.name for sensor in (edge.parent, edge.child) if sensor.kind == "radar"]
         of_radar = reports.get((vehicle, radars[0]), {}) if len(radars) == 1 else {}
         for name, days in of_radar.items():
-            angle, sigma = np.array(days).mean(axis=0)
+            own = [(angle, sigma) for day, angle, sigma in days if day >= since((vehicle, edge))]
+            if not own:
+                continue
+            angle, sigma = np.array(own).mean(axis=0)
             value[name][k], information[name][k] = angle, 1 / sigma**2
     return Witnesses(value, information)
 

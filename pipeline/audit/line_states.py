@@ -58,7 +58,12 @@ def with_its_line(
         )
         return replace(state, line_status="alone", line_reason=answers.refused, reason=reason)
     if answer is None:
-        return state
+        if use != "states":
+            return state
+        why = "no day of it counts in a model line"
+        return replace(
+            state, line_status="alone", line_reason=why, reason="; ".join(filter(None, (state.reason, why)))
+        )
     beside = replace(
         state,
         line_status=answer.status,
@@ -85,7 +90,7 @@ def with_its_line(
         reason="; ".join(text for text in (line, none, state.reason if not none else "") if text),
         covariance=answer.covariance,
         common_covariance=answer.common_covariance,
-        observable=[True] * 6 if state.observable is None else state.observable,
+        observable=answer.observable if state.observable is None else state.observable,
         determined=answer.determined,
         azimuth_sigma_rad=answer.azimuth_sigma_rad,
         elevation_sigma_rad=answer.elevation_sigma_rad,

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from scipy.special import ndtri
 
 from pipeline.fleet_model.apart import told_apart
-from pipeline.fleet_model.evidence import LineEvidence, LinePrior, shifts_in_sigmas
+from pipeline.fleet_model.evidence import LineEvidence, LinePrior, OwnPriors, shifts_in_sigmas
 from pipeline.fleet_model.line import DOUBTED, OUTSIDE, LineModel, without_each
 
 __all__ = ["DIFFERS_SIGMAS", "Answers", "largest_change_without_one", "with_line"]
@@ -50,7 +50,7 @@ def with_line(
     model: LineModel,
     evidence: LineEvidence,
     common: Float[np.ndarray, "N M M"],
-    own_prior: Float[np.ndarray, "N M"] | None = None,
+    own: OwnPriors | None = None,
 ) -> Answers:
     """Each vehicle's mount, with the other vehicles of its model line as prior.
 
@@ -58,41 +58,47 @@ def with_line(
         model: of the line.
         evidence: of the vehicles; the first M observations are their own estimates, A and B are identities there.
         common: covariance of what all days of each vehicle have in common, by its records.
-        own_prior: change from the drawing to each vehicle's prior; None = the drawing is the prior of all. It decides
-            along axes that the days of too few vehicles determine.
+        own: prior of each vehicle; None = all have the line's. It decides along axes that the days of too few vehicles
+            determine.
     """
     mean, covariance = told_apart(model)
     M, B, own_mean = len(model.variance), evidence.to_bias, ~evidence.remounted[:, None]
     expected = np.where(own_mean, mean[:M], 0.0)
     residual = evidence.value - expected @ evidence.to_mount.T - B @ mean[M:]
     distance, axis = _distances(model, evidence, residual, covariance)
-    change, spread = _on_the_line(model, evidence, residual, covariance, distance)
+    open_variance = np.diag(model.prior.mount) if own is None else np.einsum("nmm->nm", own.covariance)
+    mounts = np.where(model.learnt, model.safe_variance, open_variance)
+    change, spread = _on_the_line((model, mounts), evidence, residual, covariance, distance)
     change = change + expected
     corrected = replace(evidence, value=evidence.value - B @ mean[M:])
-    alone, own = corrected.alone(model.prior, own_prior)
+    alone, own_spread = corrected.alone(model.prior, own)
     change = np.where(model.learnt, change, alone)
-    allowed = _limited(change - alone, own + common, model.prior)
+    allowed = _limited(change - alone, own_spread + common, model.prior)
     kept = change - alone - allowed
     doubt = np.clip(distance - _DOUBTED, 0.0, 1.0)[:, None] * allowed
     spread = spread + _square(kept) + _square(doubt) + _beyond(common, model.prior.bias[:M, :M])
     shared = distance < OUTSIDE
-    change = np.where(shared[:, None], alone + allowed, evidence.alone(model.prior, own_prior)[0])
-    spread = np.where(shared[:, None, None], spread, own + common)
+    change = np.where(shared[:, None], alone + allowed, evidence.alone(model.prior, own)[0])
+    spread = np.where(shared[:, None, None], spread, own_spread + common)
     return Answers(change, 0.5 * (spread + spread.swapaxes(1, 2)), shared, distance, axis)
 
 
 def _on_the_line(
-    model: LineModel,
+    line: tuple[LineModel, np.ndarray],
     evidence: LineEvidence,
     residual: np.ndarray,
     covariance: np.ndarray,
     distance: np.ndarray,
 ) -> tuple[Float[np.ndarray, "N M"], Float[np.ndarray, "N M M"]]:
-    """Posterior mounts of the vehicles relative to the line's mean, and their covariance (the mean's included)."""
+    """Posterior mounts of the vehicles relative to the line's mean, and their covariance (the mean's included).
+
+    `line`: with the variances by which mounts scatter, of all or of each vehicle.
+    """
+    model, variance = line
     A, B, M = evidence.to_mount, evidence.to_bias, len(model.variance)
     remounted = evidence.remounted[:, None, None]
     weight = np.clip((OUTSIDE - distance) / (OUTSIDE - DOUBTED), _LEAST_WEIGHT, 1.0)
-    S = (np.diag(model.safe_variance) + remounted * model.prior.mount) / weight[:, None, None]
+    S = (np.eye(M) * variance[..., None] + remounted * model.prior.mount) / weight[:, None, None]
     K = S @ A.T @ evidence.weights(A @ S @ A.T)
     keep = np.eye(M) - K @ A
     to_answer = np.concatenate([keep * ~remounted, -K @ np.broadcast_to(B, (len(S), *B.shape))], axis=2)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-__all__ = ["LineEvidence", "LinePrior", "evidence_of_days", "shifts_in_sigmas", "with_witness"]
+__all__ = ["LineEvidence", "LinePrior", "OwnPriors", "evidence_of_days", "shifts_in_sigmas", "with_witness"]
 
 _DETERMINED = 0.5  # of the prior's variance: an axis that a vehicle's days leave at less
 _SHOWN = 0.05  # of the prior's information along an axis: with less a vehicle shows nothing of it
@@ -49,19 +49,19 @@ class LineEvidence:
         return np.linalg.solve(np.eye(self.value.shape[1]) + self.information @ spread, self.information)
 
     def alone(
-        self, prior: LinePrior, own_prior: Float[np.ndarray, "N M"] | None = None
+        self, prior: LinePrior, own: OwnPriors | None = None
     ) -> tuple[Float[np.ndarray, "N M"], Float[np.ndarray, "N M M"]]:
         """Each vehicle's mount by its own estimates and its prior, and what it varies by.
 
-        The first M observations are its estimates. `own_prior` is the change from the drawing to each vehicle's prior;
-        None = the drawing is the prior of all.
+        The first M observations are its estimates. `own`: each vehicle's prior; None = all have the line's.
         """
         M = len(prior.mount)
-        own, before = self.information[:, :M, :M], np.linalg.inv(prior.mount)
-        covariance = np.linalg.inv(own + before)
-        pull = np.einsum("nkj,nj->nk", own, self.value[:, :M])
-        if own_prior is not None:
-            pull = pull + own_prior @ before
+        own_information = self.information[:, :M, :M]
+        before = np.linalg.inv(prior.mount if own is None else own.covariance)
+        covariance = np.linalg.inv(own_information + before)
+        pull = np.einsum("nkj,nj->nk", own_information, self.value[:, :M])
+        if own is not None:
+            pull = pull + np.einsum("nkj,nj->nk", before, own.change)
         return np.einsum("nmk,nk->nm", covariance, pull), covariance
 
     def determined(self, prior: LinePrior) -> Bool[np.ndarray, "N M"]:
@@ -76,6 +76,14 @@ class LinePrior:
 
     mount: Float[np.ndarray, "M M"]
     bias: Float[np.ndarray, "P P"]
+
+
+@dataclass(frozen=True, eq=False)
+class OwnPriors:
+    """Priors of N vehicles: change from the line's drawing, and covariance of it."""
+
+    change: Float[np.ndarray, "N M"]
+    covariance: Float[np.ndarray, "N M M"]
 
 
 def evidence_of_days(

@@ -40,6 +40,7 @@ FEWEST_VEHICLES = 6
 DOUBTED, OUTSIDE = 3.0, 4.5
 _ROUNDS = 40
 _CONVERGED = 1e-4  # of a scatter's own sigma
+_NOTHING = 1e-3  # of the prior's variance as a sigma of a scatter's variance: less is rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +115,7 @@ def learn_line(
         distance, axis = _distances(evidence, terms, prior)
         weight = _weights(distance)
         score, information = _scatter_equations(evidence, terms, weight)
-        sigma = np.sqrt(np.diag(_inverse(information)))
+        sigma = np.sqrt(np.diag(_inverse(information, prior)))
         new = np.where(seen, _nonnegative_step(variance, score.sum(axis=0), information, seen), most)
         new = np.minimum(new, most)
         moved, variance = np.abs(new - variance), new
@@ -124,6 +125,7 @@ def learn_line(
         variance = np.where(seen, np.clip(at_least, variance, most), variance)
     terms = _solved(evidence, prior, value, variance, weight)
     distance, axis = _distances(evidence, terms, prior)
+    sigma = np.sqrt(np.diag(_inverse(_scatter_equations(evidence, terms, weight)[1], prior)))
     return LineModel(
         terms.mean, np.linalg.inv(terms.information), variance, np.where(seen, np.minimum(sigma, most), 0.0),
         prior, _weights(distance), distance, axis,
@@ -215,10 +217,14 @@ def _scatter_equations(
     return score, 0.5 * np.einsum("n,nmk->mk", weight, AWA**2)
 
 
-def _inverse(information: np.ndarray) -> np.ndarray:
-    """Inverse along the axes that have information, whatever their units."""
+def _inverse(information: np.ndarray, prior: LinePrior) -> np.ndarray:
+    """Inverse along the axes that have information, whatever their units; zero along the others.
+
+    Rounding leaves some along axes that no vehicle determines, whose correlations with the others are random.
+    """
     size = np.sqrt(np.diag(information))
-    unit = np.where(size > 0, 1 / np.where(size > 0, size, 1.0), 0.0)
+    told = size * np.diag(prior.mount) > _NOTHING
+    unit = np.where(told, 1 / np.where(told, size, 1.0), 0.0)
     return np.asarray(np.linalg.pinv(information * np.outer(unit, unit), rcond=1e-10) * np.outer(unit, unit))
 
 
@@ -246,6 +252,6 @@ def without_each(
     score, information = _scatter_equations(evidence, terms, w)
     left = score.sum(axis=0) - score
     # Where the variance is not the likeliest but one that is certain to be there, only the vehicle's own part counts.
-    step = (left - np.where(model.variance > 0, score.sum(axis=0), 0.0)) @ _inverse(information)
+    step = (left - np.where(model.variance > 0, score.sum(axis=0), 0.0)) @ _inverse(information, model.prior)
     step = np.where((model.variance_sigma <= 0) | (model.variance <= 0) & (left <= 0), 0.0, step)
     return mean, np.maximum(step, -model.variance)

@@ -59,7 +59,7 @@ def day_evidence(
     T, total, common = estimates
     x, own_prior = change_between(drawing, T), change_between(drawing, priors[0])
     total, common, P = change_covariance(T, total), change_covariance(T, common), change_covariance(*priors)
-    V = total - (1 - _LEAST_VARYING) * common
+    V = _varying(total, common)
     root = np.linalg.cholesky(P)
     white = np.linalg.solve(root, np.linalg.solve(root, V).swapaxes(1, 2))
     size, U = np.linalg.eigh(0.5 * (white + white.swapaxes(1, 2)))
@@ -73,6 +73,17 @@ def day_evidence(
     return DayEvidence(information, np.einsum("nki,ni->nk", to_change, pull), common, own_prior, P)
 
 
+def _varying(
+    total: Float[np.ndarray, "N 6 6"], common: Float[np.ndarray, "N 6 6"]
+) -> Float[np.ndarray, "N 6 6"]:
+    """The part of covariances that is not common to all days, at least a share of all along every direction."""
+    root = np.linalg.cholesky(total)
+    white = np.linalg.solve(root, np.linalg.solve(root, common).swapaxes(1, 2))
+    size, U = np.linalg.eigh(0.5 * (white + white.swapaxes(1, 2)))
+    half = root @ (U * np.sqrt(np.clip(1 - size, _LEAST_VARYING, 1.0))[:, None, :])
+    return half @ half.swapaxes(1, 2)
+
+
 @dataclass(frozen=True, eq=False)
 class DaySums:
     """Sums over the days of N vehicles since each last changed.
@@ -84,6 +95,7 @@ class DaySums:
         day_information: and `day_pull`, of the last day alone.
         common: mean covariance of what all days have in common.
         own_prior: change from the drawing to the last day's prior.
+        prior: covariance of that prior.
         first, last: ordinals of the first and the last day; 0 without a day.
         away: days in a row that were left out.
     """
@@ -98,6 +110,7 @@ class DaySums:
     day_pull: Float[np.ndarray, "N 6"]
     common: Float[np.ndarray, "N 6 6"]
     own_prior: Float[np.ndarray, "N 6"]
+    prior: Float[np.ndarray, "N 6 6"]
     first: Int[np.ndarray, " N"]
     last: Int[np.ndarray, " N"]
     away: Int[np.ndarray, " N"]
@@ -105,7 +118,7 @@ class DaySums:
     @classmethod
     def empty(cls, vehicles: int) -> DaySums:
         """No day of any vehicle."""
-        sizes = ((6, 6), (6,), ()) * 2 + ((6, 6), (6,)) * 2
+        sizes = ((6, 6), (6,), ()) * 2 + ((6, 6), (6,)) * 2 + ((6, 6),)
         when = (np.zeros(vehicles, np.int64) for _ in range(3))
         return cls(*(np.zeros((vehicles, *size)) for size in sizes), *when)
 
@@ -152,6 +165,7 @@ class DaySums:
             day_pull=day.pull,
             common=kept.common + (day.common - kept.common) / counted[:, None, None],
             own_prior=day.own_prior,
+            prior=day.prior,
             first=np.where(kept.first > 0, kept.first, ordinal),
             last=np.full(len(gap), ordinal),
             away=np.zeros(len(gap), np.int64),
@@ -181,28 +195,29 @@ class DaySums:
 _AT = np.tril_indices(6)
 
 
-def packed(sums: DaySums) -> Float32[np.ndarray, "N 4 27"]:
+def packed(sums: DaySums) -> Float32[np.ndarray, "N 5 27"]:
     """Matrices and vectors of sums in a few hundred bytes a vehicle."""
     pairs = (
         (sums.information, sums.pull),
         (sums.recent_information, sums.recent_pull),
         (sums.day_information, sums.day_pull),
         (sums.common, sums.own_prior),
+        (sums.prior, np.zeros_like(sums.own_prior)),
     )
     return np.stack([np.concatenate([m[:, *_AT], v], axis=1) for m, v in pairs], axis=1).astype(np.float32)
 
 
 def unpacked(
-    values: Float32[np.ndarray, "N 4 27"],
+    values: Float32[np.ndarray, "N 5 27"],
     days: Float[np.ndarray, "N 2"],
     when: Int[np.ndarray, "N 3"],
 ) -> DaySums:
     """Sums from their packed matrices, the numbers of days (all, recent), and (first, last, away)."""
     whole = np.asarray(values, np.float64)
-    matrix = np.zeros((len(whole), 4, 6, 6))
+    matrix = np.zeros((len(whole), 5, 6, 6))
     matrix[:, :, _AT[0], _AT[1]] = matrix[:, :, _AT[1], _AT[0]] = whole[:, :, :21]
     m, v = matrix.swapaxes(0, 1), whole[:, :, 21:].swapaxes(0, 1)
     return DaySums(
-        m[0], v[0], days[:, 0], m[1], v[1], days[:, 1], m[2], v[2], m[3], v[3],
+        m[0], v[0], days[:, 0], m[1], v[1], days[:, 1], m[2], v[2], m[3], v[3], m[4],
         when[:, 0], when[:, 1], when[:, 2],
     )  # fmt: skip

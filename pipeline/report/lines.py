@@ -15,7 +15,7 @@ from pipeline.rig.graph import Edge
 from pipeline.rig.sigmas import direction_sigmas
 from pipeline.store.current import transform_of
 from pipeline.store.partitions import Lake
-from pipeline.store.records import last_assertion, read_last, read_records
+from pipeline.store.records import read_last
 from schemas.fleet_model import FLEET_MODEL, LINE_ANSWERS, LINE_STATUSES, FleetModelRow, LineAnswer
 
 __all__ = [
@@ -112,7 +112,7 @@ def answer_cells(answer: LineAnswer, *, of_day: bool) -> dict[str, str] | None:
         return None
     if of_day:
         alone, with_line = answer.record_alone_covariance, answer.record_covariance
-        T = changed(T, np.asarray(answer.record_change)) if answer.record_change is not None else None
+        T = None if answer.record_change is None else changed(T, np.asarray(answer.record_change))
     if T is None or alone is None or with_line is None or moved is None:
         return None
     cells = {"edge": words_of(edge), "alone (1 sigma)": _known_to(edge, T, alone)}
@@ -120,8 +120,8 @@ def answer_cells(answer: LineAnswer, *, of_day: bool) -> dict[str, str] | None:
     if not of_day:
         turn, shift = np.linalg.norm(moved[:3]) * _DEG, np.linalg.norm(moved[3:])
         cells |= {"the line moves it by": f"{turn:.2f} deg, {shift:.3f} m"}
-    said = "differs from its line" if answer.status == "outside" else ""
-    return cells | {"reason": "; ".join(text for text in (said, answer.reason) if text)}
+    said = "as alone" if answer.status == "outside" else ""
+    return cells | {"reason": ": ".join(text for text in (said, answer.reason) if text)}
 
 
 def _known_to(edge: Edge, T: np.ndarray, covariance: np.ndarray) -> str:
@@ -131,13 +131,11 @@ def _known_to(edge: Edge, T: np.ndarray, covariance: np.ndarray) -> str:
 
 def fleet_lines(lake: Lake, method: str, shown: Iterable[str] = ()) -> FleetLines:
     """Lines of the last night as the fleet page shows them; `shown`: vehicles that are shown alone and with theirs."""
-    last = last_assertion(lake, LINE_ANSWERS, method)
-    if last is None:
+    rows = read_last(lake, FLEET_MODEL, FleetModelRow, method)
+    if not rows:
         return FleetLines()
-    rows = [r for r in read_records(lake, FLEET_MODEL, FleetModelRow, day=last.day) if r.method == method]
-    current = {(r.line, line_edge(r)): r for r in rows}
-    few = too_few(current.values())
-    known = [r for r in current.values() if r.line not in few]
+    few = too_few(rows)
+    known = [r for r in rows if r.line not in few]
     ordered = sorted(known, key=lambda r: (LINE_STATUSES.index(r.status), r.line))
     lines = [
         LineView(

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from pipeline.config import FleetConfig
-from pipeline.geometry.changes import change_covariance
+from pipeline.geometry.changes import change_between, change_covariance
 from pipeline.geometry.se3 import exp_se3, from_quaternion, inverse, log_se3
 from pipeline.report.lines import shared_words
 from pipeline.stage_work import Task, Window
 from pipeline.stages import AUDIT, LINES, STATE
 from pipeline.store.commits import commit_records
 from pipeline.store.current import transform_of
-from pipeline.store.partitions import Lake
+from pipeline.store.partitions import Lake, days_after
 from pipeline.store.records import read_last, read_records
 from schemas.calibrations import CALIBRATIONS
 from schemas.fleet_model import FLEET_MODEL, LINE_ANSWERS, FleetModelRow, LineAnswer
@@ -87,24 +87,153 @@ def test_equal_mounts_make_a_day_of_few_frames_surer_and_the_sigmas_hold(tmp_pat
     assert np.mean(np.abs(off / sigma)[:, 1] < 3) > 0.98
 
 
-def test_a_night_that_adds_its_day_counts_what_all_days_at_once_do(tmp_path):
-    line, fleet = MadeLine(12, 6, seed=2), fleet_of()
-    records = line_records(line)
-    lake = Lake.at(tmp_path / "nights")
-    for last in sorted({r.day for r in records}):
+def stamped(records):
+    """Records that were asserted in the night after their day."""
+    stamp = {r.day: f"{days_after(r.day, 1)}T02:00:00.000000Z" for r in records}
+    return [replace(r, recorded_at=stamp[r.day], asserted_at=stamp[r.day]) for r in records]
+
+
+def by_night(lake, records, fleet, **of_night):
+    """The last night of nights that each commit their day; `of_night`: fleets of some of them, by number."""
+    found = {}
+    for k, last in enumerate(sorted({r.day for r in records})):
         commit_records(lake, CALIBRATIONS, [r for r in records if r.day == last])
-        by_night = lines(lake, fleet, last)[1]
-    lake = Lake.at(tmp_path / "at-once")
+        found = lines(lake, of_night.get(f"night_{k}", fleet), last)
+    return found
+
+
+def at_once(lake, records, fleet):
     commit_records(lake, CALIBRATIONS, records)
-    at_once = lines(lake, fleet)[1]
-    assert by_night.keys() == at_once.keys()
-    for key, answer in at_once.items():
-        other = by_night[key]
+    return lines(lake, fleet)
+
+
+def largest_difference(some, others):
+    """Of answers with the same keys, in sigmas of their axes."""
+    assert some.keys() == others.keys()
+    return max(
+        np.abs(
+            change_between(transform_of(a), transform_of(others[key]))
+            / np.sqrt(np.diag(change_covariance(transform_of(a), a.covariance)))
+        ).max()
+        for key, a in some.items()
+    )
+
+
+@pytest.mark.parametrize("is_stamped", [True, False])
+def test_a_night_that_adds_its_day_counts_what_all_days_at_once_do(tmp_path, is_stamped):
+    line, fleet = MadeLine(12, 6, seed=2), fleet_of()
+    records = stamped(line_records(line)) if is_stamped else line_records(line)
+    _, nights = by_night(Lake.at(tmp_path / "nights"), records, fleet)
+    _, whole = at_once(Lake.at(tmp_path / "at-once"), records, fleet)
+    assert largest_difference(nights, whole) < 0.005
+    for key, answer in whole.items():
+        other = nights[key]
         np.testing.assert_allclose(other.sums, answer.sums, rtol=2e-3, atol=1e-6 * np.abs(answer.sums).max())
         assert (other.days, other.first_day, other.last_day) == (
             pytest.approx(answer.days), answer.first_day, answer.last_day,
         )  # fmt: skip
-        np.testing.assert_allclose(transform_of(other), transform_of(answer), atol=1e-5)
+
+
+def test_a_vehicle_that_one_night_did_not_know_counts_with_all_of_its_days(tmp_path):
+    line, fleet = MadeLine(8, 5, seed=34), fleet_of()
+    records = stamped(line_records(line))
+    seven = {f"car-000{k}": {"rig": "default"} for k in range(7)}
+    fewer = fleet_of(vehicles=seven)
+    _, nights = by_night(Lake.at(tmp_path / "nights"), records, fleet, night_3=fewer)
+    assert nights["car-0007", "camera_lidar"].days == pytest.approx(nights["car-0000", "camera_lidar"].days)
+    _, whole = at_once(Lake.at(tmp_path / "at-once"), records, fleet)
+    assert largest_difference(nights, whole) < 0.005
+
+
+def test_a_vehicle_whose_last_day_lies_elsewhere_answers_as_alone_and_says_so(tmp_path):
+    knock = {"lidar_radar": np.array([0, 0, 1.5 * DEG, 0, 0, 0])}
+    line = MadeLine(
+        20, 8, seed=35, pairs=("lidar_radar",), motion=lambda v, d: knock if (v, d) == (7, 7) else {}
+    )
+    lake, fleet = Lake.at(tmp_path), fleet_of(fleet_model={"use": "states"})
+    _, answers = at_once(lake, line_records(line), fleet)
+    answer = answers["car-0007", "lidar_radar"]
+    assert (answer.status, answer.away) == ("outside", 1)
+    assert "its last 1 days lie elsewhere" in answer.reason
+    STATE.run(Task(fleet, lake, Window()))
+    states = {r.vehicle: r for r in read_last(lake, STATES, StateRow, "joint")}
+    assert (states["car-0007"].loads, states["car-0007"].status) == ("alone", "none")
+    assert states["car-0006"].loads == "line"
+
+
+def test_a_vehicle_with_a_wide_prior_stays_unsure_where_its_days_are_silent_though_its_line_has_a_narrow_one(
+    tmp_path,
+):
+    wide, narrow = MadeLine(6, 2, seed=36), MadeLine(10, 2, seed=37, name="van")
+    records = line_records(wide)
+    for r in line_records(narrow):
+        # A prior of a tenth of a degree and 5 mm: what days leave open stays as sure as that.
+        P, C = np.diag([(0.1 * DEG) ** 2] * 3 + [0.005**2] * 3), r.common_covariance
+        own = np.linalg.inv(
+            np.linalg.inv(r.covariance - C) - np.linalg.inv(r.prior_covariance) + np.linalg.inv(P)
+        )
+        records.append(replace(r, prior_covariance=P, covariance=own + C))
+    rows, answers = at_once(
+        Lake.at(tmp_path), records, fleet_of(vehicles={"*": {"rig": "default", "model": "all"}})
+    )
+    roll = {v: np.sqrt(a.covariance[0, 0]) / DEG for (v, pair), a in answers.items() if pair == "lidar_radar"}
+    assert 1.9 < roll["car-0001"] < 3.0
+    assert roll["van-0001"] < 0.3
+    assert "priors of its vehicles differ" in rows["lidar_radar"].reason
+
+
+def test_one_vehicle_that_states_a_wide_common_error_widens_nobody_else_s_answer(tmp_path):
+    records = line_records(MadeLine(12, 3, seed=38))
+    wide = [
+        replace(
+            r,
+            covariance=r.covariance + 399 * r.common_covariance,
+            common_covariance=400 * r.common_covariance,
+        )
+        if r.vehicle == "car-0007"
+        else r
+        for r in records
+    ]
+    (_, before), (_, after) = (
+        at_once(Lake.at(tmp_path / name), own, fleet_of()) for name, own in (("a", records), ("b", wide))
+    )
+    for pair in ("camera_lidar", "lidar_radar"):
+        ratio = after["car-0001", pair].elevation_sigma_rad / before["car-0001", pair].elevation_sigma_rad
+        assert 0.8 < ratio < 1.25
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"prior_covariance": np.diag([0.0, 1, 1, 1, 1, 1])},
+        {"prior_qw": 0.0, "prior_qx": 0.0, "prior_qy": 0.0, "prior_qz": 0.0},
+        {"prior_qw": float("nan")},
+        {"covariance": np.ones((6, 6))},
+        {"pair": "camera_sonar"},
+    ],
+)
+def test_a_record_that_cannot_be_counted_costs_the_others_nothing(tmp_path, damage):
+    records = line_records(MadeLine(8, 2, seed=39))
+    bad = records[3]
+    lake = Lake.at(tmp_path)
+    commit_records(lake, CALIBRATIONS, [replace(r, **damage) if r is bad else r for r in records])
+    rows, answers = lines(lake, fleet_of())
+    assert rows["camera_lidar"].status == "GREEN"
+    assert len([a for a in answers.values() if a.days > 1.5]) == 15
+
+
+def test_nights_of_a_hundred_days_count_nearly_what_all_at_once_do(tmp_path):
+    records = stamped(line_records(MadeLine(6, 100, seed=40, pairs=("camera_lidar",))))
+    lake = Lake.at(tmp_path / "nights")
+    days = sorted({r.day for r in records})
+    for last in (days[49], days[74], days[99]):
+        commit_records(lake, CALIBRATIONS, [r for r in records if r.day <= last])
+        _, nights = lines(lake, fleet_of(), last)
+    _, whole = at_once(Lake.at(tmp_path / "at-once"), records, fleet_of())
+    assert (
+        nights["car-0001", "camera_lidar"].first_day == whole["car-0001", "camera_lidar"].first_day == days[0]
+    )
+    assert largest_difference(nights, whole) < 0.02
 
 
 def test_days_that_were_recorded_before_an_audit_of_an_earlier_window_are_counted_after_it(tmp_path):
@@ -325,7 +454,8 @@ def test_records_of_another_release_do_not_count_and_the_row_names_it(tmp_path):
     rigs(lake, 6, 1)
     rows, answers = lines(lake, fleet_of())
     row = rows["camera_lidar"]
-    assert (row.other_releases, row.reason) == (["0.9"], "records of release 0.9 do not count")
+    assert row.other_releases == ["0.9 until 2026-03-03"]
+    assert row.reason == "records of release 0.9 until 2026-03-03 do not count"
     assert {a.days for a in answers.values()} == {1.0}
 
 

@@ -87,7 +87,9 @@ def test_the_pages_show_each_answer_alone_and_with_its_line_and_what_the_line_ch
     alone, with_line, moved = (np.array([float(found[k]) for k in pair]) for pair in ((1, 2), (3, 4), (5, 6)))
     assert np.all(with_line < alone)
     assert np.all((moved > 0) & (moved < 0.3))
-    assert re.search(rf"car-0007 lidar_radar {KNOWN}{KNOWN}0\.00 deg, 0\.000 m differs from its line", words)
+    assert re.search(
+        rf"car-0007 lidar_radar {KNOWN}{KNOWN}0\.00 deg, 0\.000 m as alone: \d+\.\d sigmas", words
+    )
     of_day = re.search(rf"and with the vehicle's model line .*camera_lidar {KNOWN}{KNOWN}", day)
     single = np.array([float(of_day[k]) for k in (1, 2)])
     assert np.all(single > alone)  # one day of three
