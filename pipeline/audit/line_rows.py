@@ -124,7 +124,7 @@ def _prior(line: LineOfEdge, config: FleetModelConfig) -> LinePrior:
     if config.common_mount_sigma_m is not None:
         variance[3:] = config.common_mount_sigma_m**2
     # What is common to all days of a vehicle cannot be zero: it is inverted.
-    bias = _usual_common(line.sums.common, own) + np.diag(1e-8 * own)
+    bias = _least_common(line.sums.common, own) + np.diag(1e-8 * own)
     used = [name for name, reports in line.witnesses.information.items() if (reports > 0).any()]
     if not _has_reference(line.edge) or not used:
         return LinePrior(np.diag(variance), bias)
@@ -142,13 +142,12 @@ def _own_priors(line: LineOfEdge) -> OwnPriors:
     return OwnPriors(line.sums.own_prior, line.sums.prior)
 
 
-def _usual_common(
+def _least_common(
     common: Float[np.ndarray, "N 6 6"], unit: Float[np.ndarray, " 6"]
 ) -> Float[np.ndarray, "6 6"]:
-    """Mean of the middle half of the vehicles by size: one that states far more widens nobody else's answer."""
+    """Mean of the quarter of the vehicles that state least; what others state beyond it is their own."""
     size = (np.einsum("nii->ni", common) / unit).sum(axis=1)
-    low, high = np.quantile(size, [0.25, 0.75], method="nearest")
-    return np.asarray(common[(size >= low) & (size <= high)].mean(axis=0))
+    return np.asarray(common[size <= np.quantile(size, 0.25, method="higher")].mean(axis=0))
 
 
 def _priors_apart(line: LineOfEdge) -> str:

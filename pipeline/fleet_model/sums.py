@@ -32,7 +32,7 @@ class DayEvidence:
     Args:
         information: of what varies from day to day, without the prior.
         pull: information times the change that the data alone show.
-        common: covariance of what all days have in common.
+        common: covariance of what all days have in common, without the prior's error.
         own_prior: change from the drawing to the vehicle's prior.
         prior: covariance of that prior.
     """
@@ -59,29 +59,40 @@ def day_evidence(
     T, total, common = estimates
     x, own_prior = change_between(drawing, T), change_between(drawing, priors[0])
     total, common, P = change_covariance(T, total), change_covariance(T, common), change_covariance(*priors)
-    V = _varying(total, common)
     root = np.linalg.cholesky(P)
-    white = np.linalg.solve(root, np.linalg.solve(root, V).swapaxes(1, 2))
-    size, U = np.linalg.eigh(0.5 * (white + white.swapaxes(1, 2)))
     # In units of the prior's sigmas: its own information is one along each direction.
+    size, whole, U = _by_data_and_prior(_in_units(root, total), _in_units(root, common))
     added = 1 / np.maximum(size, 1e-12) - 1
     told = added > _LEAST
     to_change = np.linalg.solve(root.swapaxes(1, 2), U)  # columns: directions of the information
     information = (to_change * np.where(told, added, 0.0)[:, None, :]) @ to_change.swapaxes(1, 2)
     along, prior_along = (np.einsum("nki,nk->ni", to_change, change) for change in (x, own_prior))
     pull = np.where(told, (added + 1) * along - prior_along, 0.0)
-    return DayEvidence(information, np.einsum("nki,ni->nk", to_change, pull), common, own_prior, P)
+    of_floors = root @ U
+    floors = (of_floors * (whole - size)[:, None, :]) @ of_floors.swapaxes(1, 2)
+    return DayEvidence(information, np.einsum("nki,ni->nk", to_change, pull), floors, own_prior, P)
 
 
-def _varying(
-    total: Float[np.ndarray, "N 6 6"], common: Float[np.ndarray, "N 6 6"]
+def _in_units(
+    root: Float[np.ndarray, "N 6 6"], covariance: Float[np.ndarray, "N 6 6"]
 ) -> Float[np.ndarray, "N 6 6"]:
-    """The part of covariances that is not common to all days, at least a share of all along every direction."""
-    root = np.linalg.cholesky(total)
-    white = np.linalg.solve(root, np.linalg.solve(root, common).swapaxes(1, 2))
-    size, U = np.linalg.eigh(0.5 * (white + white.swapaxes(1, 2)))
-    half = root @ (U * np.sqrt(np.clip(1 - size, _LEAST_VARYING, 1.0))[:, None, :])
-    return half @ half.swapaxes(1, 2)
+    white = np.linalg.solve(root, np.linalg.solve(root, covariance).swapaxes(1, 2))
+    return np.asarray(0.5 * (white + white.swapaxes(1, 2)))
+
+
+def _by_data_and_prior(
+    total: Float[np.ndarray, "N 6 6"], common: Float[np.ndarray, "N 6 6"]
+) -> tuple[Float[np.ndarray, "N 6"], Float[np.ndarray, "N 6"], Float[np.ndarray, "N 6 6"]]:
+    """Variances by data and prior alone, stated variances, and their directions (columns); in the prior's units.
+
+    Records count the prior's error as common, beside floors B: total = S + B and common = S^2 + B. So total - common is
+    S - S^2, of which total tells the root: a direction that is left at the prior has S = 1.
+    """
+    stated, U = np.linalg.eigh(total)
+    varying = np.einsum("nik,nij,njk->nk", U, total - common, U, optimize=True)
+    half = 0.5 * np.sqrt(1 - 4 * np.clip(varying, 0.0, 0.25))
+    size = np.where(stated >= 0.5 + half, 0.5 + half, 0.5 - half)
+    return np.clip(size, _LEAST_VARYING * stated, stated), stated, U
 
 
 @dataclass(frozen=True, eq=False)

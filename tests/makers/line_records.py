@@ -47,6 +47,7 @@ class MadeLine:
         wider: factor by which days scatter more than their sigmas.
         freedom: of the t distribution of days' errors, scaled to their sigmas; None = Gaussian.
         motion: change of a vehicle's mount on a day: (vehicle number, day) -> by edge; none by default.
+        prior: sigmas of each vehicle's prior about the drawing, by axis [rad, m].
     """
 
     vehicles: int
@@ -60,6 +61,7 @@ class MadeLine:
     sigma: Mapping[str, np.ndarray] = field(default_factory=lambda: _SIGMA)
     motion: Callable[[int, int], Mapping[str, np.ndarray]] = lambda _vehicle, _day: {}
     name: str = "car"
+    prior: np.ndarray = field(default_factory=lambda: _PRIOR)
     pairs: tuple[str, ...] = ("camera_lidar", "lidar_radar")
 
     def vehicle(self, number: int) -> str:
@@ -107,11 +109,13 @@ def _record(
     """Posterior of what a day shows and the prior, which is the drawing."""
     finite = np.isfinite(sigma)
     information = np.where(finite, 1 / np.where(finite, sigma, 1.0) ** 2, 0.0)
-    variance = 1 / (information + 1 / _PRIOR**2)
+    variance = 1 / (information + 1 / line.prior**2)
     T = changed(drawing, variance * information * seen)
     back = np.linalg.inv(change_jacobian(T))
-    common = back @ np.diag(_COMMON[pair] ** 2) @ back.T
-    covariance = back @ np.diag(variance) @ back.T + common
+    # As in records of the pipeline: the prior's error is common to all days, beside the floors.
+    floors = back @ np.diag(_COMMON[pair] ** 2) @ back.T
+    common = back @ np.diag(variance**2 / line.prior**2) @ back.T + floors
+    covariance = back @ np.diag(variance) @ back.T + floors
     prior_back = np.linalg.inv(change_jacobian(drawing))
     parent, child = pair.split("_")
     name = line.vehicle(v)
@@ -124,7 +128,7 @@ def _record(
         reason="elevation known to 0.12 deg (1 sigma), not within 0.2 deg", seed=0, code_version="0.12.0",
         work_key=f"{name}-{day}", **pose, covariance=covariance, common_covariance=common,
         **{f"prior_{n}": value for n, value in prior}, observable=finite.tolist(),
-        prior_covariance=prior_back @ np.diag(_PRIOR**2) @ prior_back.T, diagnostics={"unsure_only": 1.0},
+        prior_covariance=prior_back @ np.diag(line.prior**2) @ prior_back.T, diagnostics={"unsure_only": 1.0},
     )  # fmt: skip
 
 
