@@ -188,7 +188,7 @@ def _since_it_lies_here(
             day = day_name(int(rest.day[0]))
             return own.at(slice(len(days.day) - len(rest.day), None)), (
                 day,
-                f"its days lie elsewhere since {day}, though there are too few yet for a chart",
+                f"its days show another pose since {day}; a chart needs more days",
             )
     return own, None
 
@@ -196,7 +196,7 @@ def _since_it_lies_here(
 def _words(why: str, poses: Poses, of: tuple[str, str], is_none: bool) -> str:
     """Reason for the days of a pose; without days, the reason of its last day."""
     others = poses.other_days.get(of[0], ())
-    apart = f"not counted, for their poses refer to another sensor: {', '.join(others)}" if others else ""
+    apart = f"not counted, because their poses refer to another sensor: {', '.join(others)}" if others else ""
     day, status, reason = poses.last_words[of]
     none = f"no accepted day {why}".rstrip() if is_none else why
     said = f"{day} {status}: {reason}" if is_none and status != "accepted" else ""

@@ -43,9 +43,7 @@ class Whitened:
         autocorrelation: Float[np.ndarray, " 6"],
         wander: Float[np.ndarray, " 6"] | None = None,
     ) -> Whitened:
-        """Whitened days, for errors with this autocorrelation per axis and a level that gains variance
-        `wander` a day.
-        """
+        """Days whitened for this autocorrelation per axis and for a level that gains variance `wander` a day."""
         N, sigma = len(days.day), days.sigma
         correlation = days.spread / (sigma[:, :, None] * sigma[:, None, :])
         values, vectors = np.linalg.eigh(correlation)

@@ -222,7 +222,7 @@ class Rig(Section):
                 raise ValueError(f"{SECTIONS[kind]}.{name}: a sensor's name may have letters, digits and _")
             if name in KINDS and name != kind:
                 raise ValueError(
-                    f"{SECTIONS[kind]}.{name}: {name} stands for something else; rename the {kind}"
+                    f"{SECTIONS[kind]}.{name}: {name} is the name of another kind; rename the {kind}"
                 )
         twice = sorted({name for name in self.sensors if self.sensors.count(name) > 1})
         if twice:

@@ -128,7 +128,7 @@ def test_too_few_days_for_a_chart_still_show_a_knock_and_the_state_is_that_of_af
     rows = states(lake, knocked)
     assert rows["front"].days == days(4, 5)
     assert rows["front"].since == "2026-03-04"
-    assert "lie elsewhere since 2026-03-04" in rows["front"].reason
+    assert "show another pose since 2026-03-04" in rows["front"].reason
     assert np.abs(error(rows["front"], TURN)).max() < 3
     assert rows["left"].days == days(1, 2, 3, 4, 5)
 

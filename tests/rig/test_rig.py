@@ -114,8 +114,8 @@ def test_who_thinks_in_three_sensors_is_told_where_there_are_more(tmp_path):
     [
         (("lidars.nose", "lidars.front"), "two sensors are called front"),
         (("lidars.nose", "lidar"), "both lidar and lidars"),
-        (("lidars.nose", "lidars.base"), "lidars.base: base stands for something else"),
-        (("lidars.nose", "lidars.radar"), "lidars.radar: radar stands for something else"),
+        (("lidars.nose", "lidars.base"), "lidars.base: base is the name of another kind"),
+        (("lidars.nose", "lidars.radar"), "lidars.radar: radar is the name of another kind"),
         (("lidars.nose", 'lidars."a/b"'), "letters, digits and _"),
         (("/nose/points", "/fl/points"), "/fl/points (points of nose and points of corner_fl)"),
         (("/left/info", "/front/info"), "/front/info (info of front and info of left)"),
