@@ -61,9 +61,10 @@ class _Vehicle:
 def work(task: Task) -> Work:
     """Every vehicle's charts over the task's window, as findings that are added to table drift.
 
-    The window ends with its last day (None = the last day that any vehicle has a record for) and begins with its first
+    The window ends with its last day (None = the last day that any vehicle has a record for) and begins with
+    its first
     (None = `audit.window_days` before its end). The configuration's vehicles are audited even where they have no
-    record. One finding per vehicle, edge and DoF, in that order; none where the lake has no record in the window.
+    record. One finding per vehicle, edge and DoF, in that order; none if the lake has no record in the window.
     Records that nothing can be made of, and those of days to come, are named in the outcome and left out.
 
     Raises:

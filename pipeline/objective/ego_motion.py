@@ -174,7 +174,7 @@ def _fused(
 def shown_heading(
     observations: Sequence[Observation], T_base_radar: Float[np.ndarray, "4 4"]
 ) -> float | None:
-    """Azimuth of the car's way in axes of the base, as a radar's Doppler shows it; None where it does not.
+    """Azimuth of the car's way in axes of the base, as a radar's Doppler shows it; None if it does not.
 
     A single frame's is noisier than it varies, and the radar's vertical velocity is no measurement. Which way
     along it is the speed's sign: the base's x axis points ahead, and a Doppler's sign may be wrong.

@@ -100,7 +100,7 @@ def surfaces_of(xyz_m: np.ndarray) -> Surfaces:
 def registered(
     surfaces: Mapping[int, Surfaces], pairs: Sequence[tuple[int, int, float]], told: Mapping[int, Arc]
 ) -> list[Arc | None]:
-    """Arc of each pair (earlier, later, seconds between); None where too little stands in both.
+    """Arc of each pair (earlier, later, seconds between); None if too little stands in both.
 
     `told` is the motion per second at a sweep, where odometry has it. Without it the best of a grid must stand out:
     along the rails of a motorway every way is as good.

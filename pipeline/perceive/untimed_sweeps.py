@@ -74,7 +74,7 @@ class Turning:
 
 
 def turning_of(sweeps: Iterable[tuple[Seen, Sweep]], told: LidarTurn | None) -> Turning | None:
-    """How a lidar turns, from fleet.toml or from its sweeps; None where they have times, or it does not spin."""
+    """How a lidar turns, from fleet.toml or from its sweeps; None if they have times, or it does not spin."""
     surfaces, pairs, moves = {}, [], {}
     before: Seen | None = None
     for seen, sweep in sweeps:

@@ -85,7 +85,7 @@ def evaluation_page(
     """HTML of the whole page, no outside resources.
 
     Args:
-        normalised: by method, errors over their own sigmas of all observable DoF; empty where truth is
+        normalised: by method, errors over their own sigmas of all observable DoF; empty if truth is
             positions.
         notes: where the truth comes from, and what else must be known to read the tables.
     """

@@ -44,10 +44,10 @@ class VehicleRow:
     """One vehicle of the table.
 
     Args:
-        sensor: that moved; empty where none did or nobody knows.
-        since: first day after the change; empty where there was none.
+        sensor: that moved; empty if none did or nobody knows.
+        since: first day after the change; empty if there was none.
         days: a letter of DAY_LETTERS per day of the table, capital where the day has a page.
-        last_day: the last one with a record; empty where there is none.
+        last_day: the last one with a record; empty if there is none.
         older: days before those of the table, with their letters.
     """
 

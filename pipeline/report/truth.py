@@ -67,7 +67,7 @@ def _poses(content: Mapping[str, Any]) -> dict[str, np.ndarray]:
 
 
 def true_transform(truth: Truth, record: CalibrationRecord) -> Float[np.ndarray, "4 4"] | None:
-    """T_parent_child of a record's day; None where it is not known."""
+    """T_parent_child of a record's day; None if it is not known."""
     poses = truth.get((record.vehicle, record.day), {})
     if record.parent_frame not in poses or record.child_frame not in poses:
         return None

@@ -40,7 +40,7 @@ class AxisLimits:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Held-out test of known turns of a log's answer; empty where none was made.
+    """Held-out test of known turns of a log's answer; empty if none was made.
 
     Args:
         z: deviate of the paired test by turn [deg], negative = they prefer the answer.

@@ -51,7 +51,7 @@ class SplitPlan:
     sides: Mapping[tuple[str, str], str] = field(default_factory=dict)
 
     def side_of(self, vehicle: str, day: str, place: str) -> str | None:
-        """train, val or test; None where the keys do not agree."""
+        """train, val or test; None if the keys do not agree."""
         sides = {self.sides.get(key) for key in Unit(vehicle, day, place).keys(self.by)}
         return sides.pop() if len(sides) == 1 else None
 

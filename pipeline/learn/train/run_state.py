@@ -212,7 +212,7 @@ def _steps(config: TrainConfig, frames: int, processes: int) -> int:
 
 
 def _held_out(data: str, config: TrainConfig) -> TrainingBatch | None:
-    """Frames to validate on; None where the data has none."""
+    """Frames to validate on; None if the data has none."""
     try:
         return load_split(Lake.at(data), "val", limit=config.validation_frames)
     except ContractError:

@@ -166,7 +166,7 @@ def _kinds(observations: Sequence[Observation]) -> list[np.ndarray]:
 
 
 def _height_classes(o: Observation) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Every eighth point of the sampled cloud with its class; none where the road was not found."""
+    """Every eighth point of the sampled cloud with its class; none if the road was not found."""
     xyz = o.lidar_map_xyz_m[::_CLASS_STRIDE] if o.ground_plane is not None else o.lidar_map_xyz_m[:0]
     plane = o.ground_plane if o.ground_plane is not None else np.zeros(4)
     height = np.digitize(xyz @ plane[:3] + plane[3], _CLASS_HEIGHTS_M)

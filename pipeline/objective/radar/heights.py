@@ -1,11 +1,14 @@
 """Static elevations by what the lidar shows to stand there: direct, or displaced towards the mirror image in the road.
 
 Of a thing of height h over the road a radar sees the elevation of the thing, of its image (height -h), or, where it
-cannot resolve both, anything between: a share in (0, 1] of the way that is another in every scan. So detections of high
-things lie too low in the mean, and whoever matches them with lidar points turns the radar up, by degrees on some days.
+cannot resolve both, anything between: a share in (0, 1] of the way that is another in every scan. So
+detections of high
+things lie too low in the mean, and whoever matches them with lidar points turns the radar up, by degrees on
+some days.
 What lies on the road is not displaced, and what is displaced grows with h / r: pitch is what they have in common.
 
-Each detection is drawn from the lidar points near its azimuth and range: direct, the image in the road, displaced by a
+Each detection is drawn from the lidar points near its azimuth and range: direct, the image in the road,
+displaced by a
 share that is uniform, or from anywhere (more often where the lidar sees bare road). Their shares and the noise of
 elevations are unknowns beside pitch and roll. Tall things are left out: radars see their lower parts, leaves, what is
 behind. A detection is compared at any elevation, so nothing is cut off.
@@ -126,7 +129,7 @@ def displaced_heights(
     dt_s: float,
     rng: np.random.Generator,
 ) -> Heights | None:
-    """Pitch by the mixture; None where elevations, road or things that stand on it are too few.
+    """Pitch by the mixture; None if elevations, road or things that stand on it are too few.
 
     Args:
         observations: any frames.

@@ -186,7 +186,7 @@ class _Scan:
 
 
 def _scan(o: Observation, T_lidar_radar: np.ndarray, dt_s: float) -> _Scan | None:
-    """Detections of one scan; None where too few have an instrument."""
+    """Detections of one scan; None if too few have an instrument."""
     assert o.radar_velocity_mps is not None
     static = o.radar_motion == 0
     xyz, residual = o.radar_xyz_m[static].astype(np.float64), o.radar_residual_mps[static].astype(np.float64)
@@ -200,7 +200,7 @@ def _scan(o: Observation, T_lidar_radar: np.ndarray, dt_s: float) -> _Scan | Non
 
 
 def _velocity(scan: _Scan, near_mps: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Velocity and covariance of one scan by instruments, from a velocity near it; None where they show too little."""
+    """Velocity and covariance of one scan by instruments, from a velocity near it; None if they show too little."""
     u = scan.xyz_m / np.linalg.norm(scan.xyz_m, axis=1, keepdims=True)
     azimuth = np.arctan2(scan.xyz_m[:, 1], scan.xyz_m[:, 0])
     flat = np.stack([np.cos(azimuth), np.sin(azimuth), np.tan(scan.lidar_rad)], 1)

@@ -1,4 +1,4 @@
-"""Conclusions about a lidar-radar solution beside the pose: its data, its assumptions, numbers for checks."""
+"""Conclusions about a lidar-radar solution other than the pose: its data, its assumptions, numbers for checks."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class ObservabilityAnalysis:
 
 
 def notes_of(analysis: ObservabilityAnalysis, *, has_elevation: bool) -> list[str]:
-    """What was not determined, and what was assumed."""
+    """Notes on undetermined unknowns and on assumptions."""
     fixed, linear = analysis.fixed, analysis.linear
     notes = []
     if fixed[:6].any():
@@ -90,7 +90,7 @@ def notes_of(analysis: ObservabilityAnalysis, *, has_elevation: bool) -> list[st
 def diagnostics_of(
     analysis: ObservabilityAnalysis, ends: list[RadarState], halves: list[RadarState]
 ) -> dict[str, float]:
-    """Numbers of a solution, of the ends of its starts and of the day's halves; what is no number is left out."""
+    """Numbers of a solution, of the ends of its starts and of the day's halves; non-finite values are left out."""
     state, linear = analysis.state, analysis.linear
     half = change_between(halves[1].T_lidar_radar, halves[0].T_lidar_radar)
     apart = change_between(ends[-1].T_lidar_radar, ends[0].T_lidar_radar)
