@@ -1,4 +1,4 @@
-"""What radars state of their own alignment beside what the day's calibration found, in words."""
+"""Text with the alignment stated by radars next to the day's calibration."""
 
 from __future__ import annotations
 

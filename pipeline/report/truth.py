@@ -1,4 +1,4 @@
-"""True extrinsics of a simulated fleet, for the table beside the estimates. Only pages read them, no estimator."""
+"""True extrinsics of a simulated fleet, for the table next to the estimates. Only pages read them, no estimator."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class TruthRow:
 def read_truth(folder: Path) -> Truth:
     """Read `<folder>/<vehicle>/<day>.json`: T_base_sensor, by sensor, as 4x4 lists.
 
-    Of releases before 0.11.0: T_camera_lidar and T_camera_radar.
+    Files of releases before 0.11.0 have T_camera_lidar and T_camera_radar.
 
     Raises:
         ConfigError: the folder holds no such file, or one lacks a transform.
@@ -85,7 +85,7 @@ def truth_rows(records: Sequence[CalibrationRecord], truth: Truth) -> list[Truth
 
 
 def truth_summary(rows: Sequence[TruthRow]) -> str:
-    """How many of the determined axes of accepted days lie within three of their sigmas."""
+    """Number of determined axes of accepted days with errors within three of their sigmas."""
     axes = [
         w for r in rows if r.status == "accepted" for w, d in zip(r.within, r.determined, strict=True) if d
     ]

@@ -1,10 +1,12 @@
-"""Lidar reflectivity against image brightness on the road: what gives pitch, roll and yaw with only 16 rings.
+"""Lidar reflectivity against image brightness on the road; it determines pitch, roll and yaw with only 16 rings.
 
-Ground points that reflect more than the rest of their ring should project to pixels that are brighter than the rest of
+Ground points that reflect more than the rest of their ring should project to pixels that are brighter than
+the rest of
 their row of the road. The score is the log likelihood ratio of two normal distributions of unit variance whose means
-differ by `delta` (how much brighter the image is under marked points): `delta c - delta^2/2`, linear in the contrast c.
-`delta` is estimated from the data, so the term loses its weight where the lidar has no useful intensity or the road no
-paint.
+differ by `delta` (how much brighter the image is under marked points): `delta c - delta^2/2`, linear in the
+contrast c.
+`delta` is estimated from the data, so the term loses its weight if the lidar has no useful intensity or the
+road has no paint.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""What lidar points are, by a range-image ONNX model in RangeNet++'s convention.
+"""Classes of lidar points by a range-image ONNX model in RangeNet++'s convention.
 
-A manifest beside the model says what goes in and what comes out:
+A manifest next to the model describes its input and output:
 
 ```toml
 path = "darknet53.onnx"           # relative to the manifest
