@@ -1,4 +1,4 @@
-"""`boresight simulate`: logs of a synthetic fleet, with the true extrinsics beside them."""
+"""`boresight simulate`: logs of a synthetic fleet, with its true extrinsics."""
 
 from __future__ import annotations
 

@@ -46,8 +46,9 @@ def verify_set(
     """Judge the calibrations that a data set ships: right, wrong or undecided per log and sensor.
 
     Every log is asked as by `verify`, then again with known turns of what it ships: the page says which share of
-    them is called wrong. A run that was stopped goes on where it was. Exit code 0: every sensor of every log is
-    right; 1: a log could not be read; 3: one is wrong or undecided, or a claim is refuted or does not count.
+    them is called wrong. A stopped run continues from its recorded rows. Exit code 0: every sensor of every
+    log is right; 1: a log could not be read; 3: one is wrong or undecided, or a claim is refuted or does not
+    count.
 
     Args:
         data_set: nuscenes, vod or kitti, whose folder follows: its drives are converted one by one on the way.
@@ -206,7 +207,7 @@ def _jobs(
 def _ask(
     settings: SetSettings, jobs: Sequence[LogJob], tables: Lake, executor: str, workers: int | None
 ) -> list[SetCheck]:
-    """Rows of all logs; those that are recorded whole are not asked again."""
+    """Rows of all logs; completely recorded logs are not checked again."""
     from jobs.terminal.night_view import night_view
     from pipeline.fleet.executor import EXECUTORS
     from pipeline.verify.log_set import ask_set, is_complete

@@ -265,7 +265,7 @@ def edges_message(
     colour: tuple[float, ...],
     at: fg.Timestamp,
 ) -> fg.ImageAnnotations:
-    """Depth jumps of the lidar in the image; with a good calibration they lie on silhouettes."""
+    """Depth jumps of the lidar in the image; with a good calibration they are on silhouettes."""
     camera = camera_of(observation)
     uv, valid = camera.project(
         transform_points(T_camera_lidar, observation.lidar_edge_xyz_m.astype(np.float64))

@@ -278,7 +278,7 @@ class Rig(Section):
         ends = [frozenset(edge) for edge in self.edges or ()]
         twice = next((end for end in ends if ends.count(end) > 1), None)
         if twice is not None:
-            raise ValueError(f"edge [{_listed(sorted(twice))}] stands twice")
+            raise ValueError(f"edge [{_listed(sorted(twice))}] occurs twice")
         if self.edges == ():
             raise ValueError("edges is empty: remove it to find edges from overlap")
         return self

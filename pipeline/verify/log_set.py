@@ -64,7 +64,7 @@ class SetSettings:
 
     Args:
         fleet: configuration for one look at a log (`for_one_look`).
-        asked_deg: errors of camera-lidar, and of pairs with the radar, that must not go undetected.
+        asked_deg: errors of camera-lidar, and of pairs with the radar, that must be detected.
         sizes: sizes of the turns, as multiples of these errors.
         turns: number of turns per log.
         faults: number of faults per log.

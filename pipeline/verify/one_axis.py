@@ -28,7 +28,7 @@ _Z_SCATTER = 0.3
 
 @dataclass(frozen=True)
 class AxisLimits:
-    """Limits of one axis: error that makes a calibration wrong, and error that must not go undetected [rad].
+    """Limits of one axis: error that makes a calibration wrong, and error that must be detected [rad].
 
     For a pass, an error of `asked_rad` would have failed with probability `confidence`.
     """

@@ -116,7 +116,7 @@ def check_poses(
         prior: the calibration in use.
         lacking: sensors without a pose in the prior.
         verify: limits of errors, and the confidence.
-        asked_deg: errors of camera-lidar, and of pairs with the radar, that must not go undetected.
+        asked_deg: errors of camera-lidar, and of pairs with the radar, that must be detected.
         records: records of the log's pairs, for their held-out tests of turns.
     """
     own = [row for row in rows if row.sensor != row.reference]

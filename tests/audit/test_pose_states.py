@@ -138,7 +138,7 @@ def test_two_days_that_contradict_each_other_make_a_state_as_unsure_as_that(lake
     sigma = np.degrees(np.sqrt(np.diag(rows["left"].covariance)[:3]))
     assert sigma.max() > 0.2  # half a degree lies between them
     assert rows["left"].determined != ["azimuth", "elevation"]
-    assert "its days differ more than they say" in rows["left"].reason
+    assert "its days differ by more than their sigmas" in rows["left"].reason
     assert rows["front"].reason == ""
 
 

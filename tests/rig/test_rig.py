@@ -133,7 +133,7 @@ def test_who_thinks_in_three_sensors_is_told_where_there_are_more(tmp_path):
         (('base = "base_link"', 'edges = [["top", "top"]]'), "[top, top]: an edge joins two sensors"),
         (('base = "base_link"', 'edges = [["front", "left"]]'), "cannot be calibrated against each other"),
         (('base = "base_link"', 'edges = [["top", "base"]]'), "no base (set base ="),
-        (('base = "base_link"', 'edges = [["top", "left"], ["left", "top"]]'), "[left, top] stands twice"),
+        (('base = "base_link"', 'edges = [["top", "left"], ["left", "top"]]'), "[left, top] occurs twice"),
         (('base = "base_link"', "edges = []"), "edges is empty"),
         (
             ('base = "base_link"', 'three = ["front", "top", "nose"]'),

@@ -64,7 +64,7 @@ def _unfit(steps: int, validate_every: int, validation: Mapping[str, float]) -> 
 
 
 def write_card(model: Path, card: dict[str, Any]) -> None:
-    """Write the card beside the model's file as .json and .md, with size and sha256."""
+    """Write the card next to the model's file as .json and .md, with size and sha256."""
     content = model.read_bytes()
     told = {"file": model.name, "bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
     card = told | {key: value for key, value in card.items() if key not in told}
