@@ -50,8 +50,8 @@ class Levels:
         start: column at which it left the first level for good; 0 if it returned, or drifts.
         size: last level minus first level.
         sigma: sigma of the size.
-        threshold: threshold on size over sigma. returned: True if the chart left the first level and the last
-            level equals it again.
+        threshold: threshold on size over sigma.
+        returned: True if the chart left the first level and the last level equals it again.
     """
 
     chart: Charts

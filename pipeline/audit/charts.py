@@ -100,10 +100,11 @@ def thresholds(
     """Threshold on max |z| of each chart; infinite for fewer than two days.
 
     Args:
-        count: number of days. freedom: degrees of freedom of the scale.
-        probability: probability of an alarm without a change. autocorrelation: correlation of errors on
-            successive days. of: "step" or "drift"; drifts that start on neighbouring days are more
-            correlated.
+        count: number of days.
+        freedom: degrees of freedom of the scale.
+        probability: probability of an alarm without a change.
+        autocorrelation: correlation of errors on successive days.
+        of: "step" or "drift"; drifts that start on neighbouring days are more correlated.
     """
     freedom = np.rint(_MOST_FREEDOM / np.rint(_MOST_FREEDOM / np.clip(freedom, 1, _MOST_FREEDOM)))
     phi = np.broadcast_to(np.rint(10 * np.asarray(autocorrelation)) / 10, count.shape)

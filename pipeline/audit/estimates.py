@@ -63,7 +63,8 @@ class Estimates:
     Args:
         owner: vehicle of each record, as an index.
         day: ordinals of the calendar.
-        edges: edges of all records, in order. edge: edge of each record, as an index; -1: none.
+        edges: edges of all records, in order.
+        edge: edge of each record, as an index; -1: none.
         pose: T_parent_child as quaternion (scalar first) and translation [m].
         has_estimate: neither pose nor covariance is null.
         common: part of the covariance from errors common to all days.
@@ -71,7 +72,8 @@ class Estimates:
         disproved: a check shows that the pose is wrong.
         shown_wrong_rad: angular error that the checks of a held record found.
         unchecked_sigmas: distance of each DoF from the prior if it is large and unchecked, else 0.
-        half_days: for a day within which a sensor moved, changes from the pose and their sigmas, by part of the day.
+        half_days: for a day within which a sensor moved, changes from the pose and their sigmas, by part of
+            the day.
         targets: targets of its sigmas, in the child's frame; not finite in rows of older releases.
     """
 

@@ -68,7 +68,8 @@ class Noise:
     """For each chart: factor on its sigmas (>= 1), degrees of freedom of this factor, and the autocorrelation.
 
     Args:
-        far: share of differences between days above three sigmas, without lasting changes; the largest of all edges.
+        far: share of differences between days above three sigmas, without lasting changes; the largest of all
+            edges.
         wander: variance that a level gains per day without a change; None = none.
         less_alike: the noise with the smallest autocorrelation that the days allow; None if it is the same.
     """

@@ -34,7 +34,8 @@ class Scan:
     """Every split of every chart: split s lies between columns s and s + 1. Sigma is infinite where there is none.
 
     Args:
-        size: size of a step.        sigma: its standard deviation.
+        size: size of a step.
+        sigma: its standard deviation.
         drift: size on the last day of a drift that starts at the split.
         drift_sigma: its standard deviation.
     """

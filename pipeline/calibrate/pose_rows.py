@@ -41,10 +41,10 @@ def pose_rows(
     """A row for each sensor, the reference included.
 
     Args:
-        adjusted: the adjusted rig; None if no edge had evidence. views: view of each sensor, by name; a pose
-            is certified for directions in this view. judged: by sensor, the record of its edge to the
-            reference if that was judged at the adjusted pose, with held-out frames; its verdict is used for
-            the pose.
+        adjusted: the adjusted rig; None if no edge had evidence.
+        views: view of each sensor, by name; a pose is certified for directions in this view.
+        judged: by sensor, the record of its edge to the reference if that was judged at the adjusted pose,
+            with held-out frames; its verdict is used for the pose.
     """
     rows = [_row(about, graph, sensor, adjusted, views, verify) for sensor in graph.sensors]
     return [_as_judged(row, (judged or {}).get(row.sensor)) for row in rows]

@@ -2,7 +2,7 @@
 
 A scanner measures in rows: the log has the row of each point (`ring`), or elevations cluster around one value
 per row. If the beams of a row are staggered, elevations do not cluster; but clouds are often stored turn by turn. A
-lidar with rotating prisms draws a rosette: drivers number its lasers, which readers treat as rings, but
+lidar with rotating prisms draws a rosette: drivers number its lasers, which readers treat as rings. But
 points of one laser that are neighbours in azimuth differ by degrees in elevation. As rows they would make
 false depth jumps on the ground.
 """

@@ -1,12 +1,11 @@
 """Differences between the stamps of one frame, and the part that is constant over the day.
 
-The sensors of a frame measure at different times: their stamps give the differences, up to a time offset that all
-stamps of a sensor share. Terms bridge the gaps of each frame by the car's motion, and solve for the offset. If a
-sensor is triggered by the lidar, its gaps are constant: either it measured with the lidar and its clock is
-off, or both
-clocks are right and it measured later. The first is expected, with the prior's sigma for the time offset, and
-there the
-estimate starts. Gaps of sensors that run freely have a median near 0.
+The sensors of a frame measure at different times: their stamps give the differences, up to a time offset that
+all stamps of a sensor share. Terms bridge the gaps of each frame by the car's motion, and solve for the
+offset. If a sensor is triggered by the lidar, its gaps are constant: either it measured with the lidar and
+its clock is off, or both clocks are right and it measured later. The first is expected, with the prior's
+sigma for the time offset, and there the estimate starts. Gaps of sensors that run freely have a median near
+0.
 """
 
 from __future__ import annotations

@@ -44,8 +44,8 @@ class VehicleRow:
     """One vehicle of the table.
 
     Args:
-        sensor: sensor that moved; empty if none did or it is unknown. since: first day after the change;
-            empty if there was none.
+        sensor: sensor that moved; empty if none did or it is unknown.
+        since: first day after the change; empty if there was none.
         days: a letter of DAY_LETTERS per day of the table, capital if the day has a page.
         last_day: last day with a record; empty if there is none.
         older: earlier days than those of the table, with their letters.

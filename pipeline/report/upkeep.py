@@ -55,7 +55,8 @@ class Album:
     """The pages of a report's vehicle-days: `LAKE/report/fleet_days/2026-03-01/car-1.html`.
 
     Args:
-        page: the fleet page, next to the folder of day pages. files: storage of the fleet page.
+        page: the fleet page, next to the folder of day pages.
+        files: storage of the fleet page.
         pictures: False = pages without images of public roads.
     """
 
@@ -100,8 +101,9 @@ def draw_days(
     `lake.damage` lists pages that could not be drawn.
 
     Args:
-        stamps: inputs of each vehicle-day's page (`stamp_of`). findings: findings of the last audit, by
-            vehicle. fan_out: executor that draws the pages.
+        stamps: inputs of each vehicle-day's page (`stamp_of`).
+        findings: findings of the last audit, by vehicle.
+        fan_out: executor that draws the pages.
     """
     by_day: dict[str, dict[str, str]] = {}
     for (vehicle, day), stamp in stamps.items():

@@ -41,9 +41,10 @@ class FleetWindow:
     Args:
         owner: vehicle of each record, as an index.
         day: ordinals of the calendar.
-        edges: edges of all records, in order. edge: edge of each record, as an index.
-        T: T_parent_child; not finite if the day was refused. sigma: sigmas of (rotation vector [rad], origin
-            [m]); not finite if the day was refused.
+        edges: edges of all records, in order.
+        edge: edge of each record, as an index.
+        T: T_parent_child; not finite if the day was refused.
+        sigma: sigmas of (rotation vector [rad], origin [m]); not finite if the day was refused.
         observable: per DoF, whether the day determined it.
     """
 

@@ -102,9 +102,12 @@ def faults_of_log(
     """Faults for a log: sensors and faults alternate over the logs of a set.
 
     Args:
-        sensors: sensors of the rig. count: number of faults.
-        identity: hexadecimal identity of the log, which determines the first of its faults in the list of all.
-        labelled: whether the log has labels; labels computed by a model are not in the log and cannot be shifted.
+        sensors: sensors of the rig.
+        count: number of faults.
+        identity: hexadecimal identity of the log, which determines the first of its faults in the list of
+            all.
+        labelled: whether the log has labels; labels computed by a model are not in the log and cannot be
+            shifted.
     """
     every = [
         Fault(s.name, s.kind, words)
@@ -121,7 +124,9 @@ def copy_with_fault(lake: Lake, partition: Partition, fault: Fault, asked_rad: f
     """Copy a vehicle-day's captures with a fault into another lake, for stage perceive.
 
     Args:
-        lake: lake with the captures. partition: vehicle-day. fault: fault to add.
+        lake: lake with the captures.
+        partition: vehicle-day.
+        fault: fault to add.
         asked_rad: error that must be detected, for faults that have a size.
         target: lake without that vehicle-day.
     """

@@ -38,8 +38,7 @@ class AdjustedEdge:
     """An edge, compared with the adjusted rig.
 
     Args:
-        innovation_sigmas: distance from the pose by all other edges in use; None = only the prior
-            checks it.
+        innovation_sigmas: distance from the pose by all other edges in use; None = only the prior checks it.
         failed: reason for leaving it out; empty = it is used.
         doubts: edges of which one, unknown which, is wrong; all but one of them are used.
     """

@@ -61,7 +61,8 @@ class LidarPair:
     """Two lidars' sweeps of the same moments.
 
     Args:
-        T_base_parent: pose of the parent on the car, accurate to a degree; defines the directions up and ahead.
+        T_base_parent: pose of the parent on the car, accurate to a degree; defines the directions up and
+            ahead.
         deskewed: T_base_sensor with which sweeps of parent and child were de-skewed.
         base_sigma_rad: sigma of T_base_parent, which affects de-skewing.
     """

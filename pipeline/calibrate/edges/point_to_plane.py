@@ -75,7 +75,8 @@ def register(
     """Find T_target_source.
 
     Args:
-        sigmas: sigmas of the start, for left perturbations; directions that no surface constrains stay at the start.
+        sigmas: sigmas of the start, for left perturbations; directions that no surface constrains stay at the
+            start.
         gates_m: points farther than this from all others are not used; one round for each gate.
 
     Returns:

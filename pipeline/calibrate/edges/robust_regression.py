@@ -40,9 +40,9 @@ def regress(
 
     Args:
         sigma: relative sigmas of the rows; their common scale is estimated.
-        blocks: block of each row; errors within a block may be correlated. prior_sigmas: sigmas of
-            coefficients about 0; infinite ones are free. share: weight of each row; the rows of one scene add
-            up to one.
+        blocks: block of each row; errors within a block may be correlated.
+        prior_sigmas: sigmas of coefficients about 0; infinite ones are free.
+        share: weight of each row; the rows of one scene add up to one.
 
     Returns:
         None for fewer than three blocks, or if there are no more rows than free coefficients.

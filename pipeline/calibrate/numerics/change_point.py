@@ -2,8 +2,8 @@
 
 At the solution of the whole day, the gradients of all frames sum to zero. If a sensor moved, gradients before
 and after the change have opposite signs, so the running sum is farthest from zero at the change. Each part is
-then solved by itself; where the two contradict each other, the cut is moved to where
-the frames begin to score better at the last part's solution.
+then solved by itself; where the two contradict each other, the cut is moved to where the frames begin to
+score better at the last part's solution.
 
 Source: Page 1954 (cumulative sums); Hinkley 1970 (one step at an unknown time, and its likelihood).
 """

@@ -122,7 +122,8 @@ def covariance_with_fixed(
 
     Args:
         prior_variance: of every parameter, independent.
-        curvature: curvature of the whole cost, prior included; gives the change of the others with a fixed parameter.
+        curvature: curvature of the whole cost, prior included; gives the change of the others with a fixed
+            parameter.
         fixed: parameters that the frames did not move.
 
     Returns:

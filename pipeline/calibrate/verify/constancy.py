@@ -2,8 +2,7 @@
 
 Other checks mix the hours of a day: even frames against odd ones, held-out blocks between the others. A knock
 at noon affects both sides equally. Each pair is therefore also solved from the first and the last part of the
-day
-(`numerics/change_point`). Two pairs that shift and one that does not identify the sensor.
+day (`numerics/change_point`). Two pairs that shift and one that does not identify the sensor.
 """
 
 from __future__ import annotations

@@ -101,8 +101,10 @@ def claims_of(
     """Claim for each direction, by name.
 
     Args:
-        pair: name of the pair. T: the estimate. covariance: covariance of its left perturbation. update:
-            update of the estimate by held-out frames; None if they do not determine one.
+        pair: name of the pair.
+        T: the estimate.
+        covariance: covariance of its left perturbation.
+        update: update of the estimate by held-out frames; None if they do not determine one.
         limit_rad: largest error that the purpose allows.
         confidence: probability with which an error has to stay within it.
         contradiction_sigmas: sigmas of the shift from which held-out frames contradict the estimate.

@@ -28,7 +28,8 @@ def card_of_run(folder: Path, notes: Path | None = None) -> dict[str, Any]:
     """The card of a run of `boresight train`.
 
     Args:
-        notes: JSON object whose entries are placed first: measurements after training, and facts about the data.
+        notes: JSON object whose entries are placed first: measurements after training, and facts about the
+            data.
 
     Raises:
         ContractError: no readable checkpoint.

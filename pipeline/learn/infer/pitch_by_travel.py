@@ -65,7 +65,8 @@ def informed_by_way(solution: Solution, observations: Sequence[Observation], pri
     """The solution with the radar's pitch fused with the direction of travel, in the pairs that have frames.
 
     Args:
-        solution: solution by networks; camera_radar is updated through camera_lidar, for a day but not for one frame.
+        solution: solution by networks; camera_radar is updated through camera_lidar, for a day but not for
+            one frame.
         observations: the frames of the solution, or others of the day.
         prior: for the observability, which compares the covariance with the prior's.
     """

@@ -29,8 +29,8 @@ class TrainRequest:
 
     Args:
         data: folder of a lake with table `training`.
-        out: folder of the run; an unfinished run in it continues. time_limit_s: duration after which this
-            call stops with a checkpoint; None = no limit.
+        out: folder of the run; an unfinished run in it continues.
+        time_limit_s: duration after which this call stops with a checkpoint; None = no limit.
         start: run or exported file with the first weights of a new run; a continued run has its own.
     """
 

@@ -37,8 +37,10 @@ def shift_score(
 
     Args:
         terms: points, of which only edges are used.
-        at: the alignment. kernel: kernel of the score. side: side of the edges. keep: mask of the edges to
-            use, all of that side.
+        at: the alignment.
+        kernel: kernel of the score.
+        side: side of the edges.
+        keep: mask of the edges to use, all of that side.
     """
     some = replace(terms, edges=terms.edges.chosen(keep))
     axis = int(np.argmax(np.abs(OUTWARD[side])))

@@ -51,8 +51,7 @@ def exposed(
         velocity_lidar: own velocity in lidar axes [m/s]; the one that an earlier call had.
         yaw_rate: own [rad/s].
         readout_s: from the first row to the last (negative: from the last to the first); 0 puts the points
-        back to the
-            time of the middle row.
+            back to the time of the middle row.
     """
     frame = np.repeat(np.arange(len(poses)), np.diff(points.start))
     velocity, turn = velocity_lidar[frame], yaw_rate[frame]

@@ -1,8 +1,8 @@
 """Terms of self-supervision on the equirectangular grid: the terms of `joint`, as smooth costs of single frames.
 
 Angles are in degrees, distances in metres. Costs are means per frame over valid entries, so that terms and
-frames are comparable.
-Every function takes the poses of its own pair, `*batch #F 4 4`, and tensors of F frames.
+frames are comparable. Every function takes the poses of its own pair, `*batch #F 4 4`, and tensors of F
+frames.
 
 Source: the project's study of self-supervision, section 3 (which terms have their minimum at the truth).
 """

@@ -2,26 +2,13 @@
 
 A manifest next to the model describes its input and output:
 
-```toml
-path = "darknet53.onnx"           # relative to the manifest
-sha256 = "..."
-task = "segment_points"
-[input]                           # float32 1x5xHxW: range, x, y, z [m], remission
-size = [64, 2048]                 # rows, columns
-fov_up_deg = 3.0
-fov_down_deg = -25.0
-mean = [12.12, 10.88, 0.23, -1.04, 0.21]
-std = [12.32, 11.47, 6.91, 0.86, 0.16]
-empty = "zero"                    # pixels without a point, once normalised; or "minus_one", before that
-[output]
-layout = "logits"                 # 1xCxHxW; probabilities do as well
-label_set = "semantickitti"       # 20 labels, 0 = unlabelled
-[knn]                             # optional: how pixels' labels become points' labels
-neighbours = 5
-search = 5
-sigma_px = 1.0
-cutoff_m = 1.0
-```
+```toml path = "darknet53.onnx"           # relative to the manifest sha256 = "..." task = "segment_points"
+[input]                           # float32 1x5xHxW: range, x, y, z [m], remission size = [64, 2048]
+# rows, columns fov_up_deg = 3.0 fov_down_deg = -25.0 mean = [12.12, 10.88, 0.23, -1.04, 0.21] std = [12.32,
+11.47, 6.91, 0.86, 0.16] empty = "zero"                    # pixels without a point, once normalised; or
+"minus_one", before that [output] layout = "logits"                 # 1xCxHxW; probabilities do as well
+label_set = "semantickitti"       # 20 labels, 0 = unlabelled [knn]                             # optional:
+how pixels' labels become points' labels neighbours = 5 search = 5 sigma_px = 1.0 cutoff_m = 1.0 ```
 
 Source: Milioto et al., RangeNet++ (IROS 2019); paper, section 4.2 (RangeNet++ and RANSAC successively).
 """

@@ -131,8 +131,7 @@ def estimate_camera_lidar(
     Args:
         observations: the day's frames; those with another camera or label size than the first are left out.
         prior: start, and weak information about pose; dt is expected to be the constant part of the stamps'
-        gaps, with
-            `time_offset_sigma_s`.
+            gaps, with `time_offset_sigma_s`.
         config: search box and resampling.
         rng: source of all random numbers.
         velocity_lidar: own velocity per observation in lidar axes [m/s]; by default the speed along the

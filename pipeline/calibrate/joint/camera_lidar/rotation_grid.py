@@ -36,8 +36,7 @@ def grid_maxima(
     """Local maxima of a grid of rotations about the camera's axes, with the terms for which they are maxima.
 
     The order is: the best by all terms together, then each term's best, then others by all terms. The prior
-    is the centre of the grid and keeps its translation; `wrong` are poses for
-    the values of chance.
+    is the centre of the grid and keeps its translation; `wrong` are poses for the values of chance.
     """
     kernel_rad = grid_kernel_rad(reach_rad)
     kernel = KernelSettings.wide(kernel_rad * float(terms.camera[1]), 0, match=SCHEDULE.coarse_match)

@@ -131,8 +131,7 @@ def _frame_scores(scored: Scored, state: AlignmentState) -> Float[np.ndarray, " 
     Only edges are used, if there are any. Markings run along the direction of travel and hardly determine the
     time: only their number in view depends on it. This slope moved three days of 16 rings 30 to 60 ms off,
     while edges were 1 to 12 ms off (tuning days 110 to 121: RMS 23 ms by both, 4.3 by edges). Wide edges are
-    left out
-    too, if there are others.
+    left out too, if there are others.
     """
     terms = scored.terms
     if len(terms.edges.xyz_m) and scored.kernel.edge_weight > 0:

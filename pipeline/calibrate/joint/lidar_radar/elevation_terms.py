@@ -182,10 +182,14 @@ def _add_tilts(
     Args:
         problem: the day.
         state: where the equations were linearised.
-        name: name of the source. columns: its unknowns, rotations first. H: EM's information of each frame,
-            for steps. g: gradient. floor: covariance of errors common to all frames. sums: equations to which
-            it is added. information: H reduced for uncertain assignment; None = H. of_day: part of the floor
-            that differs from day to day; None = nothing.
+        name: name of the source.
+        columns: its unknowns, rotations first.
+        H: EM's information of each frame, for steps.
+        g: gradient.
+        floor: covariance of errors common to all frames.
+        sums: equations to which it is added.
+        information: H reduced for uncertain assignment; None = H.
+        of_day: part of the floor that differs from day to day; None = nothing.
     """
     axis = radar_tilt_axes(state.T_lidar_radar)[:, 1]
     J = added_share(axis, problem.seen_low.per_share_rad.get(name, 0.0), len(columns))
