@@ -155,7 +155,7 @@ def _told(
     if left_out:
         more = f" and {len(left_out) - _NAMED} more" if len(left_out) > _NAMED else ""
         reasons.append(f"left out: {'; '.join(left_out[:_NAMED])}{more}")
-    rejected = {"record that nothing can be made of": len(left_out)} if left_out else {}
+    rejected = {"unusable record": len(left_out)} if left_out else {}
     return Told(dict(counts), rejected, "; ".join(reasons), refused=not findings)
 
 
@@ -168,7 +168,7 @@ def _window(task: Task, audited: str | None) -> tuple[str, str]:
     days = task.fleet.audit.window_days
     first = task.of.first or days_after(last, 1 - days)
     if first > last:
-        raise ConfigError("command line", "from", f"{first} lies after the window's last day {last}")
+        raise ConfigError("command line", "from", f"{first} is after the window's last day {last}")
     return first, last
 
 

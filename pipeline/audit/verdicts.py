@@ -173,7 +173,7 @@ def _changed(seen: _Judged, m: int, levels: Levels) -> ChartVerdict | None:
         status, reason = "YELLOW", _MAYBE
     elif levels.doubtful_sides:
         # Held days agree by chance only within their enlarged sigmas, so two of them stand for an accepted one.
-        reason = _LASTING + "; rests on days whose calibration was held"
+        reason = _LASTING + "; depends on days whose calibration was held"
     return ChartVerdict(
         status,
         reason,

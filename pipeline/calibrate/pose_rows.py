@@ -166,7 +166,7 @@ def _verdict(
     if doubts:
         return "held", f"its edges contradict each other and nothing tells which is wrong: {doubts}"
     if not found.determined.any():
-        return "held", "the day determines no degree of freedom: it stays where the prior has it"
+        return "held", "the day determines no degree of freedom: the pose stays at the prior"
     needed = ("azimuth",) if sensor.kind == "radar" else tuple(claims)
     unsure = {name: claim for name, claim in claims.items() if name not in determined}
     words = "; ".join(

@@ -14,7 +14,7 @@ _MOODS = {"pass": "good", "warn": "partly", "fail": "bad", "inconclusive": "none
 _ANSWERS = {
     "right": ("good", "Yes, as far as it matters"),
     "wrong": ("bad", "No"),
-    "inconclusive": ("partly", "This log cannot tell"),
+    "inconclusive": ("partly", "This log does not decide"),
 }
 
 

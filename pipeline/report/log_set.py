@@ -45,7 +45,7 @@ def _headline(told: Mapping[str, Any]) -> tuple[str, str, str]:
         if wrong
         else ("partly" if open_ else "good", "No log calls a sensor wrong")
         if right
-        else ("none", "These logs decide nothing")
+        else ("none", "These logs do not decide")
     )
     counts = f"answers about one sensor of one log: {right} right, {wrong} wrong, {open_} undecided."
     named = f" {silent} logs gave no answer at all; they are named below." if silent else ""

@@ -51,7 +51,7 @@ def read_truth(folder: Path) -> Truth:
         try:
             truth[(path.parent.name, path.stem)] = _poses(json.loads(path.read_text()))
         except (KeyError, ValueError, TypeError, AttributeError) as err:
-            raise ConfigError(str(path), "", f"holds no true extrinsics: {err}") from err
+            raise ConfigError(str(path), "", f"has no true extrinsics: {err}") from err
     if not truth:
         raise ConfigError(str(folder), "truth", "holds no <vehicle>/<day>.json")
     return truth
@@ -91,7 +91,7 @@ def truth_summary(rows: Sequence[TruthRow]) -> str:
     ]
     if not axes:
         return "no accepted estimate"
-    return f"{sum(axes)} of {len(axes)} determined axes lie within three sigmas"
+    return f"{sum(axes)} of {len(axes)} determined axes are within three sigmas"
 
 
 def _row(record: CalibrationRecord, T_true: np.ndarray) -> TruthRow:

@@ -169,7 +169,7 @@ def _status(
     if measured and off_rad > limits.limit_rad:
         return "fail", f"{distance}: beyond {_deg(limits.limit_rad)} and beyond chance"
     if power < limits.confidence:
-        seen = f"an error of {_deg(limits.asked_rad)} would have been seen with probability {power:.1%}"
+        seen = f"an error of {_deg(limits.asked_rad)} would have been detected with probability {power:.1%}"
         confirmed = held_out.confirms(float(np.degrees(limits.asked_rad)))
         why = (
             ""

@@ -91,7 +91,7 @@ def _together(rows: Sequence[SetCheck], confidence: float) -> tuple[AxisCheck, i
     power = _power(used, w, common, limits, beyond)
     if check.status in {"pass", "warn"} and power < confidence:
         asked = np.degrees(limits.asked_rad)
-        why = f"an error of {asked:.2f} deg would have been seen with probability {power:.1%}"
+        why = f"an error of {asked:.2f} deg would have been detected with probability {power:.1%}"
         check = replace(check, status="inconclusive", reason=f"{check.reason}: {why}")
     return replace(
         check, power=power, shown_rad=check.shown_rad if power >= confidence else float("nan")

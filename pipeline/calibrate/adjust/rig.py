@@ -147,7 +147,7 @@ def _left(equations: Equations, edge: LinearEdge) -> float:
 def _contradiction(edge: Edge, rivals: Collection[Edge], sigmas: float) -> FailedCheck:
     others = "" if not rivals else f", or {', '.join(e.name for e in rivals)} is wrong"
     return FailedCheck(
-        f"{edge.name} contradicts what the other edges say of it by {sigmas:.1f} sigmas{others}",
+        f"{edge.name} contradicts the other edges by {sigmas:.1f} sigmas{others}",
         "witnesses_disagree",
     )
 

@@ -235,6 +235,6 @@ def _numbers(travel: SweepTravel, roads: RoadUnder, shown: _Shown) -> dict[str, 
 
 def _notes(variance: np.ndarray) -> tuple[str, ...]:
     missing = [name for name, v in zip(_AXES, variance, strict=True) if not np.isfinite(v)]
-    why = {"yaw": "no pair of sweeps shows the way driven"}
+    why = {"yaw": "no pair of sweeps determines the motion"}
     notes = [f"{name} to the base: {why.get(name, 'too little road is seen')}" for name in missing]
-    return (*notes, "x, y to the base: neither road nor way shows them")
+    return (*notes, "x, y to the base: neither road nor motion determines them")

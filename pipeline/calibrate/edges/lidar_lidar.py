@@ -208,7 +208,7 @@ def _other_ends(ends: Sequence[_End]) -> tuple[FailedCheck, ...]:
         for other in ends[1:]
         if rotation_angle_rad(inverse(best.X) @ other.X) > _APART_RAD and other.share > _NEARLY * best.share
     ]
-    told = "another start leads to another pose, on which as many points lie"
+    told = "another start leads to another pose with as many matching points"
     return (FailedCheck(told, "witnesses_disagree"),) if apart else ()
 
 
@@ -244,5 +244,7 @@ def _evidence(end: _End, blocks: np.ndarray, A: np.ndarray) -> tuple[np.ndarray,
 
 def _notes(information: np.ndarray) -> tuple[str, ...]:
     return (
-        () if information[6, 6] > 1.0 else ("clocks of both lidars: the car drives too slowly to show them",)
+        ()
+        if information[6, 6] > 1.0
+        else ("clocks of both lidars: the car drives too slowly to determine them",)
     )

@@ -164,11 +164,11 @@ def _numbers(yaw: Regression | None, moments: int) -> dict[str, float]:
 
 def _notes(yaw: Regression | None, pitch: Regression | None, clock: Regression | None) -> tuple[str, ...]:
     shown = {
-        "yaw to the base: the radar shows too little of the way": yaw,
+        "yaw to the base: too few scans determine the direction of travel": yaw,
         "pitch to the base: no lidar shares the radar's view": pitch,
         "clock against the base: the car hardly changes its speed": clock,
     }
     return (
         *(told for told, fit in shown.items() if fit is None),
-        "roll, x, y, z to the base: no way shows them",
+        "roll, x, y, z to the base: the motion does not determine them",
     )

@@ -189,7 +189,7 @@ def missing_content(observations: Sequence[Observation], pair: str) -> list[str]
         missing.append("hardly any road users in the images")
     if len(np.unique(scenes_of(observations))) < FEWEST_SCENES:
         missing.append(
-            "hardly any way: the frames show the same street from the same place, drive on for some 100 m"
+            "hardly any distance: the frames show the same street from the same place; drive some 100 m further"
         )
     return missing + missing_in_view(observations, pair)
 

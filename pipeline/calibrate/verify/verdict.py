@@ -288,7 +288,7 @@ def _known(claim: Claim) -> str:
 
 def _differences(pair: str, unchecked: Mapping[int, float]) -> list[str]:
     far = "sigma from the prior, and no held-out frame checks it: not certified"
-    return [f"{_UNCHECKED[pair][k]} lies {sigmas:.1f} {far}" for k, sigmas in unchecked.items()]
+    return [f"{_UNCHECKED[pair][k]} is {sigmas:.1f} {far}" for k, sigmas in unchecked.items()]
 
 
 def _reservations(estimate: PairEstimate, claims: Mapping[str, Claim]) -> list[str]:

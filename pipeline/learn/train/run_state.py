@@ -116,7 +116,7 @@ class RunState(Run):
         """Continue from a checkpoint; raises ConfigError if another number of processes wrote it."""
         if len(state["processes"]) != self.processes.count:
             problem = f"begun by {len(state['processes'])}, now {self.processes.count}"
-            raise ConfigError("train", "processes", f"a run goes on with as many as it was {problem}")
+            raise ConfigError("train", "processes", f"a run continues with as many as it was {problem}")
         super().load(state)
         own = state["processes"][self.processes.rank]
         self.stream.load_state_dict(own["stream"])

@@ -62,7 +62,7 @@ class _Input(Section):
         if min(self.std) <= 0:
             raise ValueError("std must be positive")
         if self.fov_up_deg <= self.fov_down_deg:
-            raise ValueError("fov_up_deg must lie above fov_down_deg (which is negative below the horizon)")
+            raise ValueError("fov_up_deg must be above fov_down_deg (which is negative below the horizon)")
         return self
 
 

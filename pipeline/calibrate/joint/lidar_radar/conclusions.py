@@ -53,10 +53,10 @@ def notes_of(analysis: ObservabilityAnalysis, *, has_elevation: bool) -> list[st
         )
     if linear.boxes < _FEWEST_BOXES:
         notes.append(
-            "no vehicle boxes with radar elevations: roll and pitch rest on the registration and the prior"
+            "no vehicle boxes with radar elevations: roll and pitch depend on the registration and the prior"
         )
     else:
-        notes.append("radar pitch assumes that returns lie at a constant angle (0 +- 1 deg) from box centres")
+        notes.append("radar pitch assumes that returns are at a constant angle (0 +- 1 deg) from box centres")
     if linear.travel_frames:
         notes.append(
             "radar pitch assumes that the car drives along its road, as the lidar sees it under the car"
@@ -74,8 +74,8 @@ def notes_of(analysis: ObservabilityAnalysis, *, has_elevation: bool) -> list[st
     if has_elevation:
         own_deg = float(np.degrees(RADAR_ELEVATION_BIAS_RAD))
         notes.append(
-            "pitch says where the radar's detections point: its mounting differs by the radar's own constant elevation"
-            f" error (0 +- {own_deg:.2f} deg)"
+            "pitch is the direction of the radar's detections: its mounting differs by the radar's own constant"
+            f" elevation error (0 +- {own_deg:.2f} deg)"
         )
     else:
         notes.append(

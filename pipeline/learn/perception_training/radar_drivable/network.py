@@ -18,8 +18,8 @@ __all__ = ["LIMITS", "NAME", "DrivableNetwork", "build_drivable_network", "expor
 NAME = "radar_drivable"
 PURPOSE = "drivable area of a radar's scan (paper, section 4.2): radar.drivable of a rig"
 LIMITS = (
-    "Learned from the lidar's drivable ground through each day's prior: it is wrong where lidar and prior are.",
-    "Knows no more radars, roads and weathers than its samples show.",
+    "Learned from the lidar's drivable ground through each day's prior, with the errors of both.",
+    "Valid for the radars, roads and weather of its samples only.",
     "Cells without lidar returns were not used in training: large free ranges are extrapolated.",
 )
 _DILATIONS = ((1, 1), (1, 2), (2, 4), (2, 8), (1, 1))  # directions, ranges
