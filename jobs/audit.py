@@ -27,7 +27,7 @@ def audit(
         from_day: first day of the window, YYYY-MM-DD; default: audit.window_days before the last day.
         to_day: last day of the window; default: the last day with a record.
         method: calibration method of the audited records; default: audit.method.
-        report: fleet page to write as well, with a page per vehicle-day in a folder beside it.
+        report: fleet page to write as well, with a page per vehicle-day in a folder next to it.
     """
     from jobs.terminal.summary import exit_code, left_out, print_summary, progress_reporter
     from jobs.terminal.vehicle_status import (

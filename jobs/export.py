@@ -55,8 +55,8 @@ def export(
         day: YYYY-MM-DD: export the records of this day; default: the vehicle's state.
         method: calibration method.
         force: write held pairs too, marked as held; the exit code stays 3.
-        unchecked: write axes that lie far from the prior and that no check covers; default: write the prior
-            for them.
+        unchecked: write axes that are far from the prior and not covered by a check; default: write the prior
+        for them.
         mount: pose of the reference lidar on the car (from --base-frame to the lidar's frame): log:FILE (its
             /tf_static) or FORMAT:FILE, as in urdf:car.urdf; default: the lidar is the root of the tree.
         update: for "autoware": your sensor_kit_calibration.yaml; --out is a copy of it with new numbers for

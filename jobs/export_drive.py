@@ -25,7 +25,7 @@ def export_foxglove(
     most_frames: int,
     sensors: Sequence[str],
 ) -> list[Path]:
-    """Write the MCAP file `out` and a viewer layout beside it.
+    """Write the MCAP file `out` and a viewer layout next to it.
 
     Raises:
         MissingExtraError: foxglove-sdk is not installed.

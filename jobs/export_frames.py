@@ -52,7 +52,7 @@ def export_frames(
         calibration: state (the one that each vehicle loads tonight; days before a sensor moved are left out),
             day (the records of each day), or prior (the prior of each day).
         perturb: DEG M: move the pose of each sensor by exactly this much; the unperturbed pose is written
-            beside it.
+            too.
         perturb_per: draw a perturbation per frame or per day.
         seed: random seed of the perturbations.
         sensor: only this sensor; repeat for several; default: all.

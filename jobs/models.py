@@ -1,4 +1,4 @@
-"""`boresight models`: networks that ship and networks to download: what for, under which licence, and whether whole."""
+"""`boresight models`: shipped networks and networks to download, with purpose, licence and integrity."""
 
 from __future__ import annotations
 
@@ -58,8 +58,8 @@ def models(*, json: bool = False) -> int:
 def fetch(*names: str, into: Path = Path("models"), mirror: str | None = None) -> int:
     """Download models of other people, with manifests, for cameras whose labels nobody logs.
 
-    Address, size and licence are shown first. The sha256 is checked before a file appears. A broken download goes on
-    where it broke.
+    Address, size and licence are shown first. The sha256 is checked before a file appears. An interrupted
+    download continues.
 
     Args:
         names: of `boresight models list`; default: a segmenter and a detector, which a camera needs both.

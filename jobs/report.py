@@ -24,11 +24,11 @@ def report(
     Args:
         fleet: fleet.toml.
         lake: folder of the tables.
-        out: HTML file to write; pages of days go into a folder beside it.
+        out: HTML file to write; pages of days are written to a folder next to it.
         vehicle: vehicle id.
         day: YYYY-MM-DD.
         method: calibration method of the records; default: audit.method.
-        truth: JSON with the true extrinsics of a simulated fleet, shown beside the estimates.
+        truth: JSON with the true extrinsics of a simulated fleet, shown next to the estimates.
         picture: picture file to write as well, of the frame with most features: .jpg or .png is a still (left
             half: prior, right half: result); .webp or .gif moves from one to the other. Needs --vehicle and
             --day.

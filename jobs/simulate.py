@@ -1,4 +1,4 @@
-"""`boresight simulate`: logs of a synthetic fleet, with the true extrinsics beside them."""
+"""`boresight simulate`: logs of a synthetic fleet, with its true extrinsics."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ def simulate(
         rig: sensors: demo, paper, paper-one-clock, paper-free, ring16, corner-left, corner-right, spin128,
             rosette, hdl64, keyhole, telephoto, fisheye, pinhole, rolling, truck, bumper, tilted, van (6
             cameras, 2 lidars, 5 radars) or duo (2, 1, 2); append `-flat` for radars without elevation, or
-            `-dirty` for radars with strong road reflections and twice the noise.
-            pipeline/simulate/README.md describes each rig.
+            `-dirty` for radars with strong road reflections and twice the noise. pipeline/simulate/README.md
+            describes each rig.
         environments: surroundings of the drives: urban and highway in turn (mixed), one of them, suburb, jam,
             alley, country, deck, tunnel, or world-SEED, drawn from SEED.
         container: ROS 2 MCAP, ROS 1 bag, ROS 2 bag folder, or each in turn.
@@ -55,8 +55,8 @@ def simulate(
             intrinsics, centre, centre-v [px], labels, night, dusk, few.
         remount_deg: standard deviation per axis of the mounting's change from day to day, for a rig that is
             taken off every evening; default: the change of a fixed sensor, some hundredths of a degree.
-        alike_deg: standard deviation per axis by which the vehicles' mounts differ from each other, all of them
-            deviating from the drawing alike; default: each deviates by itself, as far as its prior is unsure.
+        alike_deg: standard deviation per axis between the vehicles' mounts, about a deviation from the
+            drawing common to all; default: independent deviations with the sigmas of the prior.
         reflectors: record three corner reflectors on every vehicle's last day too, under OUT/reflectors.
         seed: random seed; the same seed gives the same logs.
         workers: number of processes.

@@ -45,25 +45,27 @@ def verify_set(
 ) -> int:
     """Judge the calibrations that a data set ships: right, wrong or undecided per log and sensor.
 
-    Every log is asked as by `verify`, then again with known turns of what it ships: the page says which share of
-    them is called wrong. A run that was stopped goes on where it was. Exit code 0: every sensor of every log is
-    right; 1: a log could not be read; 3: one is wrong or undecided, or a claim is refuted or does not count.
+    The calibration of every log is checked as by `verify`, and again with known turns: the page gives the
+    share of turns that are called wrong. A stopped run continues from its recorded rows. Exit code 0: every
+    sensor of every log is right; 1: a log could not be read; 3: a sensor is wrong or undecided, or a claim is
+    refuted or does not count.
 
     Args:
-        data_set: nuscenes, vod or kitti, whose folder follows: its drives are converted one by one on the way.
+        data_set: nuscenes, vod or kitti, followed by its folder; drives are converted one by one during the
+            run.
         folder: folder of the data set.
-        fleet: instead of a data set: fleet.toml; what a log ships is its tf_static, or the file that fleet.toml
+        fleet: instead of a data set: fleet.toml; a log ships its tf_static, or the file that fleet.toml
             names.
-        logs: with it: pattern such as "logs/{vehicle}/{day}/*.mcap"; quoted.
-        out: folder for set.html, set_checks.parquet and what is recorded on the way.
+        logs: with --fleet: pattern such as "logs/{vehicle}/{day}/*.mcap"; quoted.
+        out: folder for set.html, set_checks.parquet and rows recorded during the run.
         segmenter: model manifest for the data set's images; without models its cameras are undecided.
-        detector: likewise; `boresight models fetch` downloads both.
+        detector: model manifest of a detector; `boresight models fetch` downloads both.
         claims: TOML file with [[claims]], registered with its hash before the first log is opened.
         per: log: each log alone; day: the logs of a vehicle-day together.
-        turns: known turns per log; sensors, axes and sizes take turns over the logs of the set.
-        faults: known faults per log, as shifted labels or a wrong CameraInfo; they take turns likewise.
-        sizes: of the turns, as multiples of --camera-lidar-deg or --radar-deg.
-        camera_lidar_deg: an axis passes only if an error of this size would have made it fail.
+        turns: known turns per log; sensors, axes and sizes alternate over the logs of the set.
+        faults: known faults per log, as shifted labels or a wrong CameraInfo; they alternate too.
+        sizes: sizes of the turns, as multiples of --camera-lidar-deg or --radar-deg.
+        camera_lidar_deg: an axis passes only if an error of this size would have been detected.
         radar_deg: the same limit for pairs with the radar.
         frames: number of frames of a log to use.
         executor: process, inline or ray, as for `nightly`.
@@ -206,7 +208,7 @@ def _jobs(
 def _ask(
     settings: SetSettings, jobs: Sequence[LogJob], tables: Lake, executor: str, workers: int | None
 ) -> list[SetCheck]:
-    """Rows of all logs; those that are recorded whole are not asked again."""
+    """Rows of all logs; completely recorded logs are not checked again."""
     from jobs.terminal.night_view import night_view
     from pipeline.fleet.executor import EXECUTORS
     from pipeline.verify.log_set import ask_set, is_complete

@@ -77,7 +77,7 @@ class SweepFeatureColumns:
     lidar_edge_side: np.ndarray = per_point("EDGE_LEFT/RIGHT/ABOVE/BELOW: side of the foreground", "|u1")
     lidar_edge_jump_m: np.ndarray = per_point("background range minus foreground range")
     lidar_edge_gap_rad: np.ndarray = per_point(
-        "angle between the two beams: the edge lies within +- half of it"
+        "angle between the two beams: the edge is within +- half of it"
     )
     lidar_edge_points: np.ndarray = per_point(
         "number of points in the foreground's cluster, a weight; 1 if unknown", "<i4"

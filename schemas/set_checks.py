@@ -1,6 +1,6 @@
 """Table `set_checks`: answers of a data set's logs about the calibrations that it ships. Append-only.
 
-It lies in the folder of `boresight verify-set`, which is no fleet's lake.
+It is in the folder of `boresight verify-set`, which is not the lake of a fleet.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class SetCheck(Recorded):
         "part of sigma_rad that all logs of a vehicle share: it does not average out", default=None
     )
     limit_rad: float | None = column("error that makes a calibration wrong", default=None)
-    asked_rad: float | None = column("error that must not go undetected", default=None)
+    asked_rad: float | None = column("error that must be detected", default=None)
     power: float | None = column(
         "probability, by sigma and held-out frames, that an error of asked_rad would have failed",
         default=None,
@@ -60,7 +60,7 @@ class SetCheck(Recorded):
         "by turn of the log's answer [deg]: z of held-out frames, negative = they prefer the answer",
         default_factory=dict,
     )
-    reads: list[str] = column("what the log's answer was computed from", default_factory=list)
+    reads: list[str] = column("inputs of the log's answer", default_factory=list)
     passes_rad: dict[str, float] = column(
         "by source: error of that source alone that no check of the log shows", default_factory=dict
     )

@@ -52,7 +52,7 @@ class StateRow(Posed):
     )
     reference_count: int = column("audit.reference_days: number of days needed for the reference", default=0)
     reference_used: int = column(
-        "number of reference_days in the mean: those before the first step among them", default=0
+        "number of reference_days in the mean: only days before the first step count", default=0
     )
     reference_qw: float | None = column(_REFERENCE, default=None)
     reference_qx: float | None = column(_REFERENCE, default=None)

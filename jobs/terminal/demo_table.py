@@ -31,7 +31,7 @@ def print_comparison(
     day: str,
     findings: Sequence[DriftFinding],
 ) -> list[dict[str, Any]]:
-    """Print the records of one day beside the truth, and the findings of the audit.
+    """Print the records of one day next to the truth, and the findings of the audit.
 
     Both are shown as differences from the prior (the nominal pose): rotation vector [deg] and shift of the
     child's origin [cm], in the axes of the pair's parent sensor. An estimate in brackets is a DoF that the

@@ -210,10 +210,8 @@ def _line_words(row: dict[str, Any]) -> str:
 
 
 def _unchecked(sigmas: dict[str, float]) -> str:
-    """Unchecked axes, as `rx lies 3.3 sigma from the prior and nothing checks it`."""
-    return "; ".join(
-        f"{d} lies {s:.1f} sigma from the prior and nothing checks it" for d, s in sigmas.items()
-    )
+    """Unchecked axes, as `rx is 3.3 sigma from the prior and not checked`."""
+    return "; ".join(f"{d} is {s:.1f} sigma from the prior and not checked" for d, s in sigmas.items())
 
 
 def _outcome_cells(row: dict[str, Any]) -> dict[str, str]:

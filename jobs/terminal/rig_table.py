@@ -1,4 +1,4 @@
-"""A rig as a printed matrix of its edges, followed by what the edges lack."""
+"""A rig as a printed matrix of its edges, followed by the data that edges lack."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A split as a printed table: frames of each side and frames lost, beside those of other splits."""
+"""A split as a printed table: frames of each side and frames lost, compared with other splits."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ _BACK = 2.0  # sigmas from the fixed reference within which a level is where tha
 
 @dataclass(frozen=True)
 class Change:
-    """One change: `day` is the first with the new value; the true one is in [earliest, latest] with 95 %."""
+    """One change: `day` is the first day with the new value; [earliest, latest] contains the true one with 95 %."""
 
     day: int
     earliest: int
@@ -40,18 +40,18 @@ class Change:
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """The last level of a chart against its first; of a chart without levels, what it has drifted by.
+    """Difference of a chart's last level from its first; for a chart without levels, the size of its drift.
 
     Args:
         chart: one row.
         value: its clipped values.
-        noise: of it.
-        whole: the scan of all of it.
-        start: column at which it left the first level for good; 0 where it is back there, or drifts.
-        size: last level less first.
-        sigma: of the size.
-        threshold: on size over sigma.
-        returned: it had left the first level, and the last one is there again.
+        noise: noise of this chart.
+        whole: the scan of the whole chart.
+        start: column at which it left the first level for good; 0 if it returned, or drifts.
+        size: last level minus first level.
+        sigma: sigma of the size.
+        threshold: threshold on size over sigma.
+        returned: True if the chart left the first level and the last level equals it again.
     """
 
     chart: Charts
@@ -74,7 +74,7 @@ class Levels:
 
 
 def levels_of(chart: Charts, value: Float[np.ndarray, " N"], noise: Noise, threshold: float) -> Levels:
-    """Cut a chart into levels and hold the last against the first.
+    """Cut a chart into levels, and compare the last with the first.
 
     Args:
         chart: one row.
@@ -118,9 +118,9 @@ def levels_of(chart: Charts, value: Float[np.ndarray, " N"], noise: Noise, thres
 def _where_the_reference_is(
     chart: Charts, value: np.ndarray, spans: Sequence[tuple[int, int]], noise: Noise
 ) -> tuple[float, float] | None:
-    """How far the last level lies from the fixed reference alone, where it is back there, with its sigma.
+    """Distance of a returned last level from the fixed reference alone, with its sigma.
 
-    A few far-off days may be taken for days of the first level, which then differs from the reference.
+    The first level may include a few outlying days, and then it differs from the reference.
     """
     if not chart.has_reference[0] or len(spans) < 2 or spans[0][1] < 2:
         return None
@@ -129,7 +129,7 @@ def _where_the_reference_is(
 
 
 def describe(levels: Levels) -> Change:
-    """Kind, start with its interval, and size of the change that a chart is left with."""
+    """Kind, start with its interval, and size of a chart's remaining change."""
     chart, whole, day = levels.chart, levels.whole, levels.chart.day[0]
     drift_gain = whole.drift_z[0] ** 2
     if not levels.start or drift_gain.max() > (whole.z[0] ** 2).max() + _CLEAR_ODDS:
@@ -152,14 +152,14 @@ def clearest(
     threshold: Float[np.ndarray, " 2"],
     days_after: int = 1,
 ) -> Change | None:
-    """The surest step or drift beyond a size and a threshold; None where there is none.
+    """The most significant step or drift above a size and a threshold; None if there is none.
 
     Args:
         whole: the scan of one chart.
-        day: of its columns.
+        day: day of each column.
         limit: size of a change that matters [rad or m].
-        threshold: on size over sigma, of a step and of a drift.
-        days_after: that it must have lasted at least.
+        threshold: thresholds on size over sigma, for a step and for a drift.
+        days_after: minimum number of days since the change.
     """
     last = len(day) - days_after
     step, drift = (

@@ -1,10 +1,10 @@
 """Many control charts at once: test for a change at any split of the days, given their noise.
 
-The statistic is the largest step or drift from any split on, in units of its sigma (`scan.py`; the likelihood ratio of
-one change against none, Hinkley 1970, Biometrika 57(1)). Three things that real days do are part of it: successive days
-err alike (AR(1), `autocorrelation`), a vehicle's days scatter more than their sigmas (`scale`, with `freedom` degrees
-of freedom), and single days are far off (`clipped`). All arrays have a row per chart and a column
-per day; a chart's days stand at the left, what is beyond its `count` weighs nothing.
+The statistic is the largest step or drift over all splits, in units of its sigma (`scan.py`; the likelihood
+ratio of one change against none, Hinkley 1970, Biometrika 57(1)). It models three properties of real days:
+errors of successive days are correlated (AR(1), `autocorrelation`), a vehicle's days scatter more than their
+sigmas (`scale`, with `freedom` degrees of freedom), and single days are outliers (`clipped`). All arrays have
+a row per chart and a column per day. A chart's days are at the left; columns from `count` on have no weight.
 """
 
 from __future__ import annotations
@@ -32,13 +32,14 @@ class Charts:
     """Day estimates of one degree of freedom each.
 
     Args:
-        day: ordinals of the calendar, rising along a row; a fixed reference stands first, as if it were one day.
+        day: calendar ordinals, increasing along a row; a fixed reference comes first, like a day.
         value: estimates [rad or m], relative to any fixed value.
-        sigma: what varies from day to day; infinite beyond `count`.
+        sigma: sigma of the part that varies from day to day; infinite beyond `count`.
         accepted: False for days that were held.
-        reference_days: days that the first column of a row stands for where it is a fixed reference (its sigma is that
-            of their mean if they were independent), which is never clipped; 0 where it is a day like the others.
-        count: days of each row.
+        reference_days: number of days in the fixed reference in the first column of a row; 0 if that column
+            is an ordinary day. A reference has the sigma of the mean of independent days, and is never
+            clipped.
+        count: number of days of each row.
     """
 
     day: Int[np.ndarray, "M N"]
@@ -96,14 +97,14 @@ def thresholds(
     autocorrelation: Float[np.ndarray, " M"] | float = 0.0,
     of: str = "step",
 ) -> Float[np.ndarray, " M"]:
-    """Threshold on max |z| of each chart; infinite where there are fewer than two days.
+    """Threshold on max |z| of each chart; infinite for fewer than two days.
 
     Args:
-        count: days.
-        freedom: degrees of freedom that the scale is known to.
-        probability: of an alarm without a change.
-        autocorrelation: of days.
-        of: "step" or "drift": drifts that set in on neighbouring days share more.
+        count: number of days.
+        freedom: degrees of freedom of the scale.
+        probability: probability of an alarm without a change.
+        autocorrelation: correlation of errors on successive days.
+        of: "step" or "drift"; drifts that start on neighbouring days are more correlated.
     """
     freedom = np.rint(_MOST_FREEDOM / np.rint(_MOST_FREEDOM / np.clip(freedom, 1, _MOST_FREEDOM)))
     phi = np.broadcast_to(np.rint(10 * np.asarray(autocorrelation)) / 10, count.shape)
@@ -131,7 +132,7 @@ def alarm_threshold(
     P(max > h) <= P(|z_1| > h) + sum P(|z_s-1| <= h < |z_s|): the first split above h is either the first of
     all or follows one below h. Neighbouring splits share their days, so the second terms are small; they
     are exact for the known correlation through Owen's T function: P(X > h >= Y) = 2 T(h, sqrt((1 - r)/(1 +
-    r))) for r >= 0. Of days that err alike, neighbouring splits share less.
+    r))) for r >= 0. If errors of days are correlated, neighbouring splits share less.
 
     Source: the upcrossing bound as in Worsley 1983, Biometrika 70(2) 455-464 (his Bonferroni improvement).
 
@@ -153,7 +154,7 @@ def alarm_threshold(
 
 
 def _correlation(sigma: Float[np.ndarray, " N"], autocorrelation: float, of: str) -> Float[np.ndarray, " R"]:
-    """Correlation of the estimates of steps, or drifts, at neighbouring splits, none below 0."""
+    """Correlation of the estimates of steps, or drifts, at neighbouring splits, at least 0."""
     lag = np.arange(len(sigma))[:, None] - np.arange(len(sigma))
     W = np.linalg.inv(autocorrelation ** np.abs(lag) * np.outer(sigma, sigma))
     # Column s: effect of a change after day s on each day.

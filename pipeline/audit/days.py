@@ -1,4 +1,4 @@
-"""An edge's day estimates as numbers to chart, its fixed reference, and the charts of a whole fleet side by side."""
+"""An edge's day estimates as numbers for charts, its fixed reference, and the charts of a whole fleet."""
 
 from __future__ import annotations
 
@@ -46,10 +46,10 @@ class PairDays:
 
     Args:
         change: from the origin to each estimate (rotation vector [rad], shift of the child's origin [m]).
-        spread: covariance of the changes that varies from day to day, larger where a day was held; what a day
-            did not determine has the prior's.
-        observable: per day and DoF; what a day did not determine is not on the charts.
-        reference_days: days that the first one stands for where it is a fixed reference, else 0.
+        spread: part of the changes' covariance that varies from day to day, larger for held days;
+            undetermined DoF have the prior's.
+        observable: per day and DoF; undetermined DoF of a day are not on the charts.
+        reference_days: number of days in the first one if that is a fixed reference, else 0.
     """
 
     day: Int[np.ndarray, " N"]
@@ -63,7 +63,7 @@ class PairDays:
 
     @property
     def sigma(self) -> Float[np.ndarray, "N 6"]:
-        """Of each change."""
+        """Sigma of each change."""
         return np.sqrt(np.einsum("nii->ni", self.spread))
 
     def between(self, first: int, last: int) -> PairDays:
@@ -172,7 +172,7 @@ def _as_charts(days: PairDays) -> Charts:
 
 
 def clipped_days(days: PairDays, scale: Float[np.ndarray, " 6"]) -> PairDays:
-    """Days as the charts see them: no single one far from its neighbours, sigmas by their scatter."""
+    """Days as used by the charts: clipped near their neighbours, with sigmas scaled to their scatter."""
     change = clipped(_as_charts(days), scale).T
     return replace(days, change=change, spread=days.spread * np.outer(scale, scale))
 
@@ -199,7 +199,7 @@ def charted(days: PairDays, first: int, last: int, reference: Reference | None) 
 
 
 def with_reference(days: PairDays, reference: Reference) -> PairDays:
-    """The days with the reference as first day, instead of the days it was made of; changes are relative to it."""
+    """The days with the reference as first day, in place of the days that it averages; changes are relative to it."""
     own = days.at(~np.isin(days.day, reference.days))
     T = np.concatenate([reference.T[None], own.T])
     return PairDays(

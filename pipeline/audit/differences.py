@@ -38,7 +38,7 @@ _TAKEN_BACK = 0.25  # share of a day's error that the next day lacks, at least: 
 
 @dataclass(frozen=True, eq=False)
 class Differences:
-    """Differences of days that stand `lag` apart on a chart (nan: none), days between them, and their sigmas."""
+    """Differences of days `lag` columns apart on a chart (nan: none), days between them, and their sigmas."""
 
     lag: int
     size: Float[np.ndarray, "V P D S"]
@@ -48,7 +48,7 @@ class Differences:
 
     @classmethod
     def of(cls, charts: Charts, lag: int, shape: tuple[int, int, int]) -> Differences:
-        """Of all charts of a fleet, by vehicle, edge and degree of freedom; none with a chart's newest days."""
+        """Differences of all charts of a fleet by vehicle, edge and degree of freedom, without the newest days."""
         sigma = np.where(np.isfinite(charts.sigma), charts.sigma, 1.0)
         there = np.arange(lag, sigma.shape[1]) < older_days(charts)[:, None]
         there[:, :1] &= ~charts.has_reference[:, None]
@@ -63,7 +63,7 @@ class Differences:
         return cls(lag, *(part.reshape(*shape, -1) for part in parts))
 
     def at(self, vehicles: np.ndarray) -> Differences:
-        """Of some vehicles."""
+        """Differences of some vehicles."""
         return Differences(
             self.lag, self.size[vehicles], self.gap[vehicles], self.square[vehicles], self.product[vehicles]
         )
@@ -75,12 +75,15 @@ class Differences:
 
 
 def older_days(charts: Charts) -> Int[np.ndarray, " M"]:
-    """Number of days of each chart that teach the scatter by which the newest are judged."""
+    """Number of older days of each chart.
+
+    Their scatter is used to judge the newest days.
+    """
     return np.asarray(charts.count - np.minimum(charts.count // _OLDER, _NEWEST))
 
 
 def leave_out_steps(near: Differences, far: Differences) -> None:
-    """Leave out spans over a jump: they show no scatter of days, and would make days look alike."""
+    """Leave out spans over a jump: it is not scatter, and would increase the autocorrelation."""
     z = near.in_sigmas(0.0)
     sigma = np.sqrt(winsorised_variance(np.moveaxis(z, 0, 2).reshape(*z.shape[1:3], -1))[0])
     with np.errstate(invalid="ignore"):
@@ -92,9 +95,9 @@ def leave_out_steps(near: Differences, far: Differences) -> None:
 
 
 def far_off(z: Float[np.ndarray, "V P D S"]) -> Float[np.ndarray, " P"]:
-    """Share of an edge's differences beyond three sigmas, drawn towards the normal distribution's.
+    """Share of an edge's differences beyond three sigmas, shrunk towards that of the normal distribution.
 
-    A difference that no neighbouring difference takes back in part is a lasting change, not a far-off day.
+    A difference without an opposite neighbouring difference is a lasting change, not an outlying day.
     """
     sigma = np.sqrt(winsorised_variance(np.moveaxis(z, 0, 2).reshape(*z.shape[1:3], -1))[0])
     beside = np.pad(z, ((0, 0),) * 3 + ((1, 1),), constant_values=np.nan)

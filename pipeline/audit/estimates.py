@@ -56,26 +56,25 @@ _ACCEPTED, _HELD, _REFUSED = (STATUSES.index(name) for name in ("accepted", "hel
 
 @dataclass(frozen=True, eq=False)
 class Estimates:
-    """Current records of one method in order of vehicle, day and edge; what a record lacks is not finite.
+    """Current records of one method in order of vehicle, day and edge; missing numbers of a record are not finite.
 
-    A year of a fleet as rows would be gigabytes; a record is 700 bytes here.
+    As rows, a year of a fleet would take gigabytes; here a record takes 700 bytes.
 
     Args:
-        owner: which of them a record is of.
+        owner: vehicle of each record, as an index.
         day: ordinals of the calendar.
-        edges: that any record is of, in order.
-        edge: which of them a record is of; -1: none.
-        pose: of T_parent_child: quaternion (scalar first), translation [m].
+        edges: edges of all records, in order.
+        edge: edge of each record, as an index; -1: none.
+        pose: T_parent_child as quaternion (scalar first) and translation [m].
         has_estimate: neither pose nor covariance is null.
-        common: the part of it that all days err by alike.
+        common: part of the covariance from errors common to all days.
         has_common: records of older releases do not have it.
         disproved: a check shows that the pose is wrong.
-        shown_wrong_rad: the angle that the checks of a held record found it off by.
-        unchecked_sigmas: by DoF, how far it lies from the prior where that is far and nothing checks it, else
-            0.
-        half_days: of a day within which a sensor moved, changes from the pose and their sigmas, by part of
+        shown_wrong_rad: angular error that the checks of a held record found.
+        unchecked_sigmas: distance of each DoF from the prior if it is large and unchecked, else 0.
+        half_days: for a day within which a sensor moved, changes from the pose and their sigmas, by part of
             the day.
-        targets: that its sigmas are stated at, in the child's frame; not finite in rows of older releases.
+        targets: targets of its sigmas, in the child's frame; not finite in rows of older releases.
     """
 
     vehicles: list[str]
@@ -129,11 +128,11 @@ class Estimates:
 
     @property
     def usable(self) -> Bool[np.ndarray, " N"]:
-        """Records with a pose that no check disproved: a lost basin is 0.7 m off at a sigma of millimetres."""
+        """Records with a pose that no check disproved; a wrong minimum was 0.7 m off at a sigma of millimetres."""
         return ~self.refused & self.has_estimate & ~self.disproved
 
     def transforms(self) -> Float[np.ndarray, "N 4 4"]:
-        """T_parent_child; not finite where a record has none."""
+        """T_parent_child; not finite for a record without a pose."""
         return from_quaternion(self.pose[:, :4], self.pose[:, 4:])
 
     def keys(self) -> list[str]:
@@ -177,7 +176,7 @@ def estimates_at(found: pa.Table, edges: tuple[Edge, ...], edge: Int[np.ndarray,
 
 
 def joined(parts: Sequence[Estimates]) -> Estimates:
-    """Records of several disjoint parts as one, without vehicles that have none."""
+    """Records of several disjoint parts combined, without vehicles that have no records."""
     vehicles = sorted({part.vehicles[v] for part in parts for v in np.unique(part.owner)})
     place = {vehicle: v for v, vehicle in enumerate(vehicles)}
     owner = np.concatenate(
@@ -221,7 +220,7 @@ def days_of(records: Estimates, held_sigma_factor: float) -> dict[Edge, PairDays
 def _since_it_moved(
     T: Float[np.ndarray, "N 4 4"], covariance: Float[np.ndarray, "N 6 6"], last: Float[np.ndarray, "N 2 6"]
 ) -> tuple[Float[np.ndarray, "N 4 4"], Float[np.ndarray, "N 6 6"]]:
-    """Estimates of the last part of days within which a sensor moved: a mean of two places is neither.
+    """Estimates of the last part of days within which a sensor moved, because a mean of two poses matches neither.
 
     Later days are compared with that part, earlier days with the first one, so the change is on this day.
     """
@@ -254,7 +253,7 @@ def faults_of(records: Estimates, latest_day: str) -> dict[int, str]:
         (looked_at & ~records.has_estimate & (records.status != _HELD), "has no pose"),
         (estimated & ~rigid, "holds no rigid transform"),
         (estimated & ~said, "holds no covariance"),
-        (estimated & ~common, "holds no covariance of what all days err by alike"),
+        (estimated & ~common, "has no covariance of the errors common to all days"),
     ):
         for row in np.flatnonzero(wrong).tolist():
             faults.setdefault(row, why)

@@ -1,4 +1,4 @@
-"""Verdicts to rows of table drift: one per edge and DoF, the status of the vehicle in each."""
+"""Conversion of verdicts to rows of table drift: one row per edge and DoF, each with the status of the vehicle."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ __all__ = ["VehicleAudit", "vehicle_findings"]
 
 @dataclass(frozen=True)
 class VehicleAudit:
-    """Common columns of `drift` of all rows of one audit of one vehicle."""
+    """Columns of `drift` common to all rows of one audit of one vehicle."""
 
     vehicle: str
     day: str
@@ -45,8 +45,8 @@ def vehicle_findings(
 ) -> list[DriftFinding]:
     """Rows in order of edge and DoF; a DoF without a chart has a reason. Only edges of the vehicle have rows.
 
-    `before` are the latest earlier audit's rows, which include days that have left the window. `edges` are
-    those of the rig, for a vehicle without records.
+    `before` are rows of the latest earlier audit, which include days before the window. `edges` are the edges
+    of the rig, for a vehicle without records.
     """
     findings = []
     known = {*records.own_edges(), *(edge for edge, _ in before or ())} or {*edges}
@@ -83,7 +83,7 @@ def vehicle_findings(
 
 
 def _change_columns(chart: ChartVerdict, edge: Edge, found: Attribution | None) -> dict[str, Any]:
-    """Columns of `drift` about a change that a chart shows; empty without an alarm."""
+    """Columns of `drift` that describe a chart's change; empty without an alarm."""
     change = chart.change
     if change is None:
         return {}
@@ -120,7 +120,7 @@ def _noise_columns(verdict: VehicleVerdict, edge: Edge, dof: str) -> dict[str, f
 
 
 def _begun_before(chart: ChartVerdict, before: DriftFinding | None) -> ChartVerdict:
-    """The start that an earlier audit found, where the window has moved past it and tonight's interval allows it."""
+    """An earlier audit's start of the change, if it lies before the window and agrees with tonight's interval."""
     change = chart.change
     if change is None or before is None or before.start_day is None or change.kind != before.kind:
         return chart

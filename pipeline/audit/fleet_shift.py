@@ -1,7 +1,8 @@
 """Changes that nearly all vehicles of a model line show on the same day: a release, or another common cause.
 
-They are removed from the days of the line's vehicles, which are judged again: a vehicle that was also knocked on that
-day still stands out. A change of half of a line is removed from nobody: no majority says which half is right.
+They are removed from the days of the line's vehicles, which are judged again, so a vehicle that was also
+knocked on that day still shows a change. A change of half of a line is not removed, because no majority
+determines which half is right.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ def judge_without_fleet_shifts(
 ) -> tuple[list[VehicleVerdict], dict[tuple[str, Edge, str], FleetShift]]:
     """Verdicts on all vehicles, and the removed changes by (model line, edge, dof).
 
-    `models` has the model line of each vehicle; empty = all are of one.
+    `models` has the model line of each vehicle; empty = all vehicles have the same one.
     """
     verdicts = judge_fleet(fleet, config, models)
     names = list(models) or [""] * len(fleet)

@@ -69,9 +69,9 @@ class History:
         """Records for the charts, and references that need no records, by vehicle and edge.
 
         Args:
-            events: by vehicle; what lies before them is not asked for.
-            enough: days that a chart needs at least, and accepted days that a reference takes.
-            asked: vehicles that are wanted though they may not have driven in the window.
+            events: service events by vehicle; earlier days are not needed.
+            enough: smallest number of days of a chart, and number of accepted days of a reference.
+            asked: vehicles to include even if they did not drive in the window.
         """
         (first, last), (fewest, count) = window, enough
         parts = [self.read(first, last)]

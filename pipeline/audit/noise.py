@@ -1,9 +1,9 @@
 """Scatter of the days: its ratio to their sigmas, and the correlation of errors from day to day.
 
-Both are learnt from differences between days, which a few real changes do not move, for each model of vehicle, edge
-and degree of freedom. What is known of a fleet that nobody has seen (`Prior`) gives way to what the fleet's days show,
-and that to what a vehicle's own days show: by how much vehicles differ is learnt too (Smyth 2004, Stat. Appl. Genet.
-Mol. Biol. 3(1), moments of log-variances), and one that differs by far more stands for itself.
+Both are learnt for each vehicle model, edge and degree of freedom, from differences between days, which a few
+real changes hardly affect. A `Prior` for an unknown fleet is updated by the fleet's days, and this by a
+vehicle's own days. The spread between vehicles is learnt too (Smyth 2004, Stat. Appl. Genet. Mol. Biol. 3(1),
+moments of log-variances). An outlying vehicle uses its own days only.
 """
 
 from __future__ import annotations
@@ -45,15 +45,15 @@ _MOST_FREEDOM = 1000.0  # as good as known
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known before any day was seen; a larger fleet's, or that of a model, where one is known.
+    """Prior knowledge before any day; it may come from a larger fleet or from the same model.
 
     Args:
-        variance: of days, relative to the square of their sigmas.
-        freedom: of the chi-squared that vehicles' variances differ by: sigmas that are wrong by a log-normal factor of
-            0.25, whose variances are 1 / (2 0.25^2) = 8 degrees of freedom.
-        vehicles: that `freedom` is worth.
-        autocorrelation: the most that days are taken to err alike.
-        autocorrelation_sigma: by how much vehicles and fleets differ in it.
+        variance: variance of days, relative to the square of their sigmas.
+        freedom: degrees of freedom of the chi-squared distribution of variances over vehicles. If sigmas are
+            wrong by a log-normal factor of 0.25, variances have 1 / (2 0.25^2) = 8 degrees of freedom.
+        vehicles: weight of `freedom`, as a number of vehicles.
+        autocorrelation: largest assumed correlation of errors on successive days.
+        autocorrelation_sigma: its standard deviation over vehicles and fleets.
     """
 
     variance: float = 1.0
@@ -65,12 +65,13 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Of each chart: factor on its sigmas (>= 1), the degrees of freedom it is known to, and the autocorrelation.
+    """For each chart: factor on its sigmas (>= 1), degrees of freedom of this factor, and the autocorrelation.
 
     Args:
-        far: share of days' differences beyond three sigmas, without changes that stay: of the edge that has most.
-        wander: variance that a level gains a day, though nothing changed; None = none.
-        less_alike: the same with the least autocorrelation that the days allow; None where there is one answer.
+        far: share of differences between days above three sigmas, without lasting changes; the largest of all
+            edges.
+        wander: variance that a level gains per day without a change; None = none.
+        less_alike: the noise with the smallest autocorrelation that the days allow; None if it is the same.
     """
 
     scale: Float[np.ndarray, " M"]
@@ -82,12 +83,12 @@ class Noise:
 
     @property
     def heavy(self) -> Bool[np.ndarray, " M"]:
-        """Charts of fleets whose single days are often far off."""
+        """Charts of fleets whose single days are often outliers."""
         return self.far > _OFTEN
 
     @property
     def reach(self) -> Float[np.ndarray, " M"]:
-        """Sigmas that a day may bring that no day before showed; of normal days any."""
+        """Limit of a day's innovation in sigmas; infinite for normally distributed days."""
         return np.where(self.heavy, _REACH, np.inf)
 
     def at(self, rows: slice) -> Noise:
@@ -110,10 +111,10 @@ def estimate_noise(
 
     Args:
         charts: rows in order of vehicle, edge and degree of freedom; a chart without days has count 0.
-        dofs: degrees of freedom of an edge.
-        edges: that any vehicle has; those of the same name are of one kind of place on every vehicle of a model.
-        models: by vehicle, which it is of; none = all are of one.
-        prior: what is known besides.
+        dofs: number of degrees of freedom of an edge.
+        edges: edges of all vehicles; an edge has the same name and position on every vehicle of a model.
+        models: model of each vehicle; none = all are of one model.
+        prior: prior knowledge of the noise.
     """
     vehicles = len(charts.count) // (edges * dofs)
     _, model_of = np.unique(list(models) or [""] * vehicles, return_inverse=True)
@@ -141,9 +142,10 @@ def _noise(columns: tuple[np.ndarray, ...], less_alike: Noise | None = None) -> 
 def _autocorrelation(
     near: Differences, far: Differences, most: float, prior: Prior
 ) -> Float[np.ndarray, "V P D"]:
-    """By vehicle, edge and axis, from how much more days differ that lie three days apart: by 1 + phi + phi^2.
+    """Autocorrelation phi by vehicle, edge and axis.
 
-    Each is drawn towards that of its axis in the fleet, that to its edge's, and that to `most`.
+    Over three days, the variance of differences increases by 1 + phi + phi^2. Each value is shrunk towards
+    that of its axis in the fleet, this towards that of its edge, and this towards `most`.
     """
     z = [np.where(d.gap == d.lag, d.size / np.sqrt(d.square), np.nan) for d in (near, far)]
     V, P, D, _ = near.size.shape
@@ -200,7 +202,7 @@ def _scatter(
 def _drawn_to_fleet(
     found: np.ndarray, freedom: np.ndarray, fleet: np.ndarray | float, prior: Prior
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Variances drawn towards the fleet's by how little vehicles differ, and their degrees of freedom."""
+    """Variances shrunk towards the fleet's, more so if vehicles differ little, and their degrees of freedom."""
     known = (freedom > 1) & (found > 0)
     d = np.where(known, freedom, 1.0)
     off = np.log(np.where(known, found / fleet, 1.0)) - digamma(d / 2) + np.log(d / 2)
@@ -220,7 +222,7 @@ def _drawn_to_fleet(
 
 
 def _independent(z: Float[np.ndarray, "V P D S"]) -> Float[np.ndarray, " P"]:
-    """Effective number of independent degrees of freedom of an edge: those of one day share its scenes."""
+    """Effective number of independent degrees of freedom of an edge, because those of a day share its scenes."""
     rows = np.moveaxis(np.clip(np.nan_to_num(z), -WINSOR, WINSOR), 2, -1).swapaxes(0, 1)
     rows = rows.reshape(z.shape[1], -1, z.shape[2])
     square = np.einsum("pna,pnb->pab", rows, rows)

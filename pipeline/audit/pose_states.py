@@ -1,7 +1,8 @@
 """One rig per vehicle: accepted days of every sensor's pose since it last moved, fused per sensor.
 
 A day's poses are one adjustment of all its edges, so all edges take part. A sensor's pose restarts if the
-sensor itself moved, or the reference; not if another sensor moved whose edges it rests on.
+sensor itself or the reference moved. It does not restart if another sensor moved, even one whose edges
+determine it.
 """
 
 from __future__ import annotations
@@ -53,8 +54,8 @@ class Poses:
     Args:
         estimates: by tie of sensor and reference; their T is T_reference_sensor, whichever is the tie's
             parent.
-        last_words: by vehicle and sensor, the day, status and reason of its last row.
-        other_days: by vehicle, days that are left out because their poses refer to another sensor.
+        last_words: day, status and reason of the last row, by vehicle and sensor.
+        other_days: days left out because their poses refer to another sensor, by vehicle.
     """
 
     estimates: Estimates
@@ -64,7 +65,7 @@ class Poses:
 
 
 def read_poses(lake: Lake, method: str, first: str, last: str) -> Poses:
-    """The current poses of a window of days; rows of the reference give the reference of the others."""
+    """Current poses in a window of days; rows of the reference sensor name the reference of the other poses."""
     asked = [c for c in COLUMNS if c in _OF_POSES]
     table = read_columns(lake, POSES, [*asked, "kind", "reference", "reason"], first=first, last=last)
     if table is None:
@@ -114,9 +115,9 @@ def pose_states(
     scales: Mapping[Edge, Float[np.ndarray, " 6"]],
     verify: VerifyConfig,
 ) -> list[StateRow]:
-    """A row per sensor of one vehicle, the reference's first; none if no rig of it was adjusted.
+    """One row per sensor of a vehicle, the reference's first; no rows if no rig of the vehicle was adjusted.
 
-    `scales` are the ratios of its days' scatter to their sigmas, by tie and DoF.
+    `scales` are ratios of the scatter of its days to their sigmas, by tie and DoF.
     """
     vehicle, last, method = about
     if vehicle not in poses.references:
@@ -177,9 +178,9 @@ def _row(
 def _since_it_lies_here(
     own: Estimates, scale: Float[np.ndarray, " 6"]
 ) -> tuple[Estimates, tuple[str, str] | None]:
-    """Days since the last change of the pose that the days themselves show, and the reason in words.
+    """Days since the last change of the pose that is visible in the days, and the reason in words.
 
-    A chart needs two weeks of days; until then a mean over a knock would be neither pose.
+    A chart needs two weeks of days. Until then, a mean over days before and after a knock would match neither pose.
     """
     for days in days_of(own, 1.0).values():  # of one tie
         rest = last_level(days, scale)
@@ -187,7 +188,7 @@ def _since_it_lies_here(
             day = day_name(int(rest.day[0]))
             return own.at(slice(len(days.day) - len(rest.day), None)), (
                 day,
-                f"its days lie elsewhere since {day}, though there are too few yet for a chart",
+                f"its days show another pose since {day}; a chart needs more days",
             )
     return own, None
 
@@ -195,7 +196,7 @@ def _since_it_lies_here(
 def _words(why: str, poses: Poses, of: tuple[str, str], is_none: bool) -> str:
     """Reason for the days of a pose; without days, the reason of its last day."""
     others = poses.other_days.get(of[0], ())
-    apart = f"not counted, for their poses refer to another sensor: {', '.join(others)}" if others else ""
+    apart = f"not counted, because their poses refer to another sensor: {', '.join(others)}" if others else ""
     day, status, reason = poses.last_words[of]
     none = f"no accepted day {why}".rstrip() if is_none else why
     said = f"{day} {status}: {reason}" if is_none and status != "accepted" else ""
@@ -205,7 +206,7 @@ def _words(why: str, poses: Poses, of: tuple[str, str], is_none: bool) -> str:
 def since_of_pose(
     sensor: Sensor, edge: Edge, events: Sequence[ServiceEvent], findings: Sequence[DriftFinding], last: str
 ) -> tuple[str, str]:
-    """First day that may count for a sensor's pose to the reference, and why; empty where all days may."""
+    """First day from which a sensor's pose to the reference may be averaged, and why; empty if all days may be."""
     first, why = "", ""
     event = restart_of(events, edge, last)
     if event is not None:

@@ -117,7 +117,7 @@ def _kept(state: StateRow) -> Kept:
 
 
 def _changed_since(lake: Lake, last: str, recorded_at: Mapping[str, str]) -> dict[str, str]:
-    """Of each vehicle the first day, until `last`, of which a record became current since its states were recorded."""
+    """For each vehicle, the first day until `last` with a record that became current after its states were recorded."""
     if not recorded_at:
         return {}
     after = {vehicle: _before(stamp) for vehicle, stamp in recorded_at.items()}

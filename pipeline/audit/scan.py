@@ -1,14 +1,14 @@
-"""Did a value change at any split of its days: at once or slowly, through errors that are alike from day to day.
+"""Test for a step or a drift at every split of a chart's days, with errors correlated from day to day.
 
 The value of a day is a constant level, an error that is AR(1) from day to day, and independent errors of days:
 
     y_i = level_i + h_i u_i + e_i,   u_i = rho_i u_{i-1} + w_i,   rho_i = autocorrelation ** (days between)
 
-The level itself may be a random walk, by as much as such levels wander. A step adds to the level between two days, a
-drift to its slope. Both are likelihood ratios against no change, by one run of a Kalman filter and one of its smoother
-over all charts at once: a shock to a state at a split has the estimate `r / N` and the variance `1 / N` of the
-smoother's cumulants (de Jong & Penzer 1998, J. Am. Stat. Assoc. 93(442)). That is generalised least squares: with days
-that err alike, the day of a jump is the most informative.
+The level itself may be a random walk (`wander`). A step changes the level between two days, a drift changes
+its slope. Both are tested by their likelihood ratios against no change. One run of a Kalman filter and one of
+its smoother cover all charts at once: a shock to a state at a split has the estimate `r / N` and the variance
+`1 / N`, with the smoother's cumulants r and N (de Jong & Penzer 1998, J. Am. Stat. Assoc. 93(442)). This
+equals generalised least squares: if errors of days are correlated, the day of a jump is the most informative.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ class Scan:
     """Every split of every chart: split s lies between columns s and s + 1. Sigma is infinite where there is none.
 
     Args:
-        size: of a step.
-        sigma: of that.
-        drift: by how much a drift that sets in at the split has grown by the last day.
-        drift_sigma: of that.
+        size: size of a step.
+        sigma: its standard deviation.
+        drift: size on the last day of a drift that starts at the split.
+        drift_sigma: its standard deviation.
     """
 
     size: Float[np.ndarray, "M S"]
@@ -71,18 +71,19 @@ def scan(
 ) -> Scan:
     """Steps and drifts at every split.
 
-    A day that is less sure than most of its chart errs by more than they do for reasons of its own: the rest of its
-    variance is not alike. A fixed reference is the mean of days long ago.
+    If a day has a larger sigma than most days of its chart, the additional variance is taken as independent
+    of the other days. A fixed reference is the mean of earlier days.
 
     Args:
-        charts: the days.
-        value: theirs, clipped or not.
+        charts: charts of days.
+        value: their values, clipped or not.
         scale: factor on the sigmas.
-        autocorrelation: of days that follow each other, below 1; it falls with the power of the days between.
-        wander: variance that the level gains a day besides; None = none.
-        reach: sigmas that what a day brings may count for, once a few days or a reference have shown the level; None =
-            any. The rest is taken for an error of that day that dies away as errors do: it explains the next days too,
-            and only if they do not come back as it says do they add to a step. Sizes are then too small.
+        autocorrelation: correlation of errors on successive days, below 1; over n days it is its n-th power.
+        wander: variance that the level gains per day; None = none.
+        reach: limit of a day's innovation in sigmas, after a few days or a reference have shown the level;
+            None = no limit. The rest is treated as an error of that day that decays as errors do. It then
+            also explains the next days; only what it does not explain there adds to a step. Sizes are then
+            too small.
     """
     h, own = errors_of(charts, autocorrelation)
     walk = (np.zeros(len(scale)) if wander is None else wander) / scale**2
@@ -102,7 +103,7 @@ def scan(
 def errors_of(
     charts: Charts, autocorrelation: Float[np.ndarray, " M"]
 ) -> tuple[Float[np.ndarray, "M N"], Float[np.ndarray, "M N"]]:
-    """Per day, the sigma common to all days, and the variance of its own part."""
+    """Sigma that all days have in common, and the variance of each day's additional independent error."""
     held, known = charts.has_reference, np.isfinite(charts.sigma)
     known[:, 0] &= ~held
     ordered = np.sort(np.where(known, charts.sigma, np.inf), axis=1)
@@ -122,7 +123,7 @@ def scan_by(
     noise: Noise,
     reach: Float[np.ndarray, " M"] | None = None,
 ) -> Scan:
-    """Steps and drifts, each as sure as it is by the autocorrelation under which it is less so.
+    """Steps and drifts, each from the one of two autocorrelations that gives it the lower significance.
 
     If the autocorrelation is too high, one jump counts too much; if it is too low, a mean of many days does.
     """
@@ -143,7 +144,7 @@ def scan_by(
 @no_type_check
 @njit(cache=True)
 def _scan(value, h, own, gap, rho, walk, reach, first, count, scale, out):  # noqa: ANN001, ANN202 (types by numba)
-    """Fill `out` (size, sigma, drift, its sigma; chart; split): forward the filter, backward the smoother."""
+    """Fill `out` (size, sigma, drift, its sigma; chart; split): Kalman filter forward, smoother backward."""
     most = value.shape[1]
     surprise, weight, gain, slow_gain = (np.zeros(most), np.zeros(most), np.zeros(most), np.zeros(most))
     for m in range(len(value)):

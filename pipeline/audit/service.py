@@ -53,7 +53,7 @@ def what_was_done(event: ServiceEvent) -> str:
 def since_of(
     edge: Edge, events: Sequence[ServiceEvent], findings: Sequence[DriftFinding], last: str
 ) -> tuple[str, str]:
-    """First day that may count for an edge, and why; empty where all days may."""
+    """First day that may count for an edge, and why; empty if all days may."""
     first, why = "", ""
     event = restart_of(events, edge, last)
     if event is not None:

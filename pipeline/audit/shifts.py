@@ -1,8 +1,8 @@
-"""By how much an edge changed, and on which day: all six degrees of freedom at once, through days that err alike.
+"""Size and day of an edge's change, in all six degrees of freedom at once, for days with correlated errors.
 
-Generalised least squares over whole covariances, as `scan.py` does for one degree of freedom: a day that is
-less sure than most errs by more than they do for reasons of its own, a fixed reference is the mean of days
-long ago.
+Generalised least squares with full covariances; `scan.py` does the same for one degree of freedom. If a day
+has a larger sigma than most, the additional variance is independent of the other days. A fixed reference is
+the mean of earlier days.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _LEAST = 1e-6  # of what varies: the floor of a combination of DoF that a covari
 
 @dataclass(frozen=True, eq=False)
 class Whitened:
-    """Days of one edge, in combinations in which all errors are independent and of variance 1.
+    """Days of one edge, transformed so that all errors are independent with variance 1.
 
     `change` is whitened (6 N), from `origin`; `root` is the lower triangle of the covariance (6 N, 6 N).
     """
@@ -43,7 +43,7 @@ class Whitened:
         autocorrelation: Float[np.ndarray, " 6"],
         wander: Float[np.ndarray, " 6"] | None = None,
     ) -> Whitened:
-        """Days with errors of this autocorrelation by axis, and a level that walks by variance `wander` a day."""
+        """Days whitened for this autocorrelation per axis and for a level that gains variance `wander` a day."""
         N, sigma = len(days.day), days.sigma
         correlation = days.spread / (sigma[:, :, None] * sigma[:, None, :])
         values, vectors = np.linalg.eigh(correlation)
@@ -67,9 +67,9 @@ class Whitened:
         return cls(days.day, days.origin, solve_triangular(L, days.change.ravel(), lower=True), L)
 
     def shift(self, shape: Float[np.ndarray, " N"], others: Sequence[Whitened] = ()) -> PairShift:
-        """The change with this share on each day: 0 before it, 1 where it is complete.
+        """The change, from its share on each day: 0 before it, 1 once it is complete.
 
-        `others` are alternative errors of the days; the sigma is the largest of all.
+        `others` are alternative error models of the days; the largest of all their sigmas is returned.
         """
         X = self._designed(np.stack([np.ones(len(shape)), shape], axis=1))
         gain = np.linalg.solve(X.T @ X, X.T)[DOFS:]
@@ -94,5 +94,5 @@ class Whitened:
         )
 
     def _designed(self, columns: Float[np.ndarray, "N K"]) -> Float[np.ndarray, "X Y"]:
-        """Whitened design of changes by each column's share, six degrees of freedom each."""
+        """Whitened design matrix of the changes given by each column's share, six degrees of freedom each."""
         return np.asarray(solve_triangular(self.root, np.kron(columns, np.eye(DOFS)), lower=True))

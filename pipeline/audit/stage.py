@@ -61,13 +61,13 @@ class _Vehicle:
 def work(task: Task) -> Work:
     """Every vehicle's charts over the task's window, as findings that are added to table drift.
 
-    The window ends with its last day (None = the last day that any vehicle has a record for) and begins with its first
-    (None = `audit.window_days` before its end). The configuration's vehicles are audited even where they have no
-    record. One finding per vehicle, edge and DoF, in that order; none where the lake has no record in the window.
-    Records that nothing can be made of, and those of days to come, are named in the outcome and left out.
+    The window ends with its last day (None = the last day with a record of any vehicle) and begins with its
+    first (None = `audit.window_days` before its end). The configuration's vehicles are audited even if they
+    have no record. There is one finding per vehicle, edge and DoF, in that order, and none if the lake has no
+    record in the window. The outcome lists unusable records and records of future days, which are left out.
 
     Raises:
-        ConfigError: a day is no day, or the window is empty.
+        ConfigError: a day is invalid, or the window is empty.
         ContractError: a record was written with another schema version.
     """
     assert isinstance(task.of, Window), "an audit looks at all vehicles"
@@ -155,7 +155,7 @@ def _told(
     if left_out:
         more = f" and {len(left_out) - _NAMED} more" if len(left_out) > _NAMED else ""
         reasons.append(f"left out: {'; '.join(left_out[:_NAMED])}{more}")
-    rejected = {"record that nothing can be made of": len(left_out)} if left_out else {}
+    rejected = {"unusable record": len(left_out)} if left_out else {}
     return Told(dict(counts), rejected, "; ".join(reasons), refused=not findings)
 
 
@@ -168,7 +168,7 @@ def _window(task: Task, audited: str | None) -> tuple[str, str]:
     days = task.fleet.audit.window_days
     first = task.of.first or days_after(last, 1 - days)
     if first > last:
-        raise ConfigError("command line", "from", f"{first} lies after the window's last day {last}")
+        raise ConfigError("command line", "from", f"{first} is after the window's last day {last}")
     return first, last
 
 
@@ -197,7 +197,7 @@ def _findings(
 
 
 def _possible_edges(fleet: FleetConfig, name: str) -> list[Edge]:
-    """Edges that a vehicle without any record is UNKNOWN on: its rig's, of a large one those at its reference."""
+    """Edges that are UNKNOWN for a vehicle without records: those of its rig, in a large rig those at its reference."""
     rig = fleet.rig_of(name)
     if rig.named_edges is not None:
         return list(rig.named_edges)
@@ -212,7 +212,7 @@ def _possible_edges(fleet: FleetConfig, name: str) -> list[Edge]:
 def _found_before(
     lake: Lake, method: str, verdicts: Mapping[str, VehicleVerdict], first: str
 ) -> dict[str, dict[tuple[Edge, str], DriftFinding]]:
-    """By vehicle, the last audit's rows, where a change may have begun before the window did."""
+    """Rows of the last audit by vehicle, for changes that may have begun before the window."""
     window = dt.date.fromisoformat(first).toordinal()
     asked = {
         name

@@ -1,4 +1,4 @@
-"""Earlier verdicts that are kept when some of their records cannot be read: missing records make none better."""
+"""Earlier verdicts that are kept if some of their records cannot be read: missing records do not improve a status."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ def said_before(lake: Lake, method: str) -> Mapping[str, list[DriftFinding]]:
 def standing(
     found: list[DriftFinding], said: Sequence[DriftFinding], events: Sequence[ServiceEvent], day: str
 ) -> list[DriftFinding]:
-    """The findings of a vehicle that hold tonight, with the reason: the last audit's if tonight's are calmer.
+    """The valid findings of a vehicle tonight, with the reason: the last audit's if tonight's are less severe.
 
-    `said` is empty if all of the vehicle's records could be read; events noted since the last audit end its
+    `said` is empty if all of the vehicle's records could be read. Service events since the last audit end its
     findings.
     """
     if not said or any(event.recorded_at > said[0].asserted_at for event in events):

@@ -1,11 +1,11 @@
-"""What a vehicle should load tonight: the accepted days since its last change as one estimate.
+"""The calibration that a vehicle should load tonight: one estimate from the accepted days since its last change.
 
-What varies from day to day averages down, less where days err alike; what all days have in common does not.
+Errors that vary from day to day average out, less so if they are correlated. Errors common to all days do not.
 
     x = sum_i G_i x_i,   G_i = (sum_j V_j^-1)^-1 V_i^-1,   covariance = f (sum_j V_j^-1)^-1 + sum_i G_i B_i
 
-with V_i what varies, scaled by the vehicle's own scatter, B_i what is common and f what AR(1) leaves of a
-mean.
+V_i is the varying part of the covariance, scaled by the vehicle's own scatter, B_i the common part, and f the
+factor of AR(1) errors on the variance of a mean.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ _MOST_SIGMAS = 4.0  # of one DoF, beyond which a day does not belong to the othe
 
 @dataclass(frozen=True, eq=False)
 class DayEstimate:
-    """One accepted day: T_parent_child, covariance (left perturbation), what of it is common, what it determined.
+    """One accepted day: T_parent_child, covariance (left perturbation), its common part, determined DoF.
 
-    `common` None: the record does not say. All of it then counts as varying where days are weighed, and as
-    common where the result's covariance is stated.
+    `common` None: the record does not have it. The whole covariance then counts as varying in the weights of
+    days, and as common in the covariance of the result.
     """
 
     day: str
@@ -41,7 +41,7 @@ class DayEstimate:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """The days as one: transform, covariance, its common part, DoF that at least one day determined, and the days."""
+    """The fused days: transform, covariance, its common part, DoF that at least one day determined, and the days."""
 
     T: Float[np.ndarray, "4 4"]
     covariance: Float[np.ndarray, "6 6"]
@@ -56,8 +56,8 @@ def fuse(
 ) -> State | None:
     """One estimate from several accepted days since the last change; None without days.
 
-    `scale` is, by DoF of a change (rotation vector, shift of the child's origin), the ratio of the days'
-    scatter to their sigmas; None = 1.
+    `scale` is the ratio of the days' scatter to their sigmas by DoF of a change (rotation vector, shift of
+    the child's origin); None = 1.
     """
     if not days:
         return None
@@ -92,7 +92,7 @@ def fuse(
 def _belonging(
     x: Float[np.ndarray, "N 6"], varying: Float[np.ndarray, "N 6 6"], seen: Bool[np.ndarray, "N 6"]
 ) -> list[int]:
-    """Days within their sigmas of the median of all; all if there are two."""
+    """Days consistent with the median of all by their sigmas; all days if there are two."""
     if len(x) < 3:
         return list(range(len(x)))
     sigma = np.sqrt(np.einsum("nii->ni", varying))

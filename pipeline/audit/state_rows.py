@@ -58,7 +58,7 @@ def fused_as_they_differ(own: Estimates, scale: Float[np.ndarray, " 6"]) -> tupl
     axes = ", ".join(f"{dof} {by:.1f}" for dof, by in zip(DOF_NAMES, wider, strict=True) if by > 1)
     return fused(
         kept, scale * wider
-    ), f"its days differ more than they say, so its sigma is wider: {axes} times"
+    ), f"its days differ by more than their sigmas, so its sigma is increased: {axes} times"
 
 
 def with_state(

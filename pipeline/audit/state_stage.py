@@ -96,7 +96,7 @@ def work(task: Task) -> Work:
 
 
 def _pose_of(row: StateRow, reference: Sensor) -> RigPose | None:
-    """What a row of a sensor is about; None for the reference itself."""
+    """The edge or pose that a row of a sensor describes; None for the reference itself."""
     if row.kind is None or row.child_frame == reference.name:
         return None
     return RigPose(reference, Sensor(row.child_frame, cast("Kind", row.kind)))
@@ -109,7 +109,7 @@ def _references(
     events: Mapping[str, Sequence[ServiceEvent]],
     config: AuditConfig,
 ) -> dict[tuple[str, Edge], Kept]:
-    """The fixed reference of every vehicle and edge: stored, or made of its first days."""
+    """The fixed reference of every vehicle and edge: stored, or computed from its first days."""
     first, last = window
     count = config.reference_days
     kept = read_kept(history.lake, history.method, window, events, count)
@@ -130,7 +130,7 @@ def _references(
 
 
 def _scales(records: Estimates, fleet: FleetConfig) -> list[dict[Edge, Float[np.ndarray, " 6"]]]:
-    """By vehicle, edge and DoF, the ratio of its days' scatter to their sigmas, from the charts."""
+    """Ratio of the days' scatter to their sigmas by vehicle, edge and DoF, from the charts."""
     held = fleet.audit.held_sigma_factor
     days = [days_of(records.of(vehicle), held) for vehicle in records.vehicles]
     edges = edges_of_fleet(days)

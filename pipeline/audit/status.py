@@ -29,7 +29,7 @@ _WATCHING: Mapping[str, tuple[tuple[str, ...], ...]] = {
 
 
 def _watched(edges: Collection[Edge]) -> dict[str, tuple[Edge, ...]]:
-    """Edges of which one that is GREEN excludes a turn of the sensors named, as `front or top`."""
+    """Groups of edges: one GREEN edge of a group excludes a rotation of its named sensors, such as `front or top`."""
     ordered = sorted(edges, key=lambda e: ("base" in e.kind, e.kind == "camera_radar", edge_order(e)))
     by_edges: dict[tuple[Edge, ...], list[str]] = {}
     sensors = sorted({s for e in edges for s in e.sensors}, key=lambda s: (KINDS.index(s.kind), s.name))
@@ -45,18 +45,18 @@ def _watched(edges: Collection[Edge]) -> dict[str, tuple[Edge, ...]]:
 def decide_status(findings: Sequence[DriftFinding]) -> VehicleStatus:
     """Decide the status of a vehicle, and which sensor moved, from all its charts.
 
-    RED: at least one chart is RED, a lasting change of a size that matters.
-    YELLOW: none is RED, at least one is YELLOW: a smaller change, or one that rests on a single day.
-    GREEN: no chart alarms, and a turn of any sensor by the size that matters would have shown: of the edges that the
-        vehicle has, each camera's pitch and yaw against a lidar are GREEN, and so is each radar's yaw against a lidar
-        or a camera. Charts that say UNKNOWN beside these do not take GREEN away: they belong to what the days
-        cannot determine (radar roll, heights, on most roads), and would say UNKNOWN for ever. The reason says how many
-        charts are GREEN.
-    UNKNOWN: no chart alarms, but on one of those charts a change that matters could hide: too few days, sigmas too
-        large, or a change that may have begun.
+    RED: at least one chart is RED: a lasting change larger than the limit.
+    YELLOW: no chart is RED, at least one is YELLOW: a smaller change, or one supported by a single day.
+    GREEN: no chart alarms, and a rotation of any sensor by its limit would have been detected. For this, of
+        the edges that the vehicle has, each camera's pitch and yaw against a lidar must be GREEN, and each
+        radar's yaw against a lidar or a camera. Other charts may be UNKNOWN: the days cannot determine them
+        on most roads (radar roll, heights), so they would stay UNKNOWN. The reason gives the number of GREEN
+        charts.
+    UNKNOWN: no chart alarms, but one of those charts could miss a change above the limit: it has too few
+        days, its sigmas are too large, or a change may have begun.
 
-    The sensor, the day and the reason are those of the clearest alarm: RED before YELLOW, one whose sensor is known
-    before one without, then the largest statistic in units of its threshold.
+    The sensor, the day and the reason are those of the strongest alarm. RED comes before YELLOW, an alarm
+    with a known sensor before one without, then the largest ratio of statistic to threshold.
 
     Args:
         findings: one row per edge and DoF of one vehicle, in any order; `vehicle_*` are not read.

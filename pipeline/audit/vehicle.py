@@ -33,7 +33,7 @@ _COMPOSED_WITHIN = 1e-6
 class VehicleVerdict:
     """Verdicts by (edge, dof), and the sensor that moved; `attribution` is None without an alarm.
 
-    `noise` has, by edge, how its days scatter.
+    `noise` has the noise of days by edge.
     """
 
     charts: dict[tuple[Edge, str], ChartVerdict]
@@ -52,7 +52,7 @@ def limit_of(edge: Edge, dof: str, config: AuditConfig) -> float:
 def judge_fleet(
     fleet: Sequence[Mapping[Edge, PairDays]], config: AuditConfig, models: Sequence[str] = ()
 ) -> list[VehicleVerdict]:
-    """Judge all charts of all vehicles; `models` has the rig of each vehicle (empty = all are of one)."""
+    """Judge all charts of all vehicles; `models` has the rig of each vehicle (empty = all have the same one)."""
     edges = edges_of_fleet(fleet)
     if not edges:
         return [VehicleVerdict({}, None) for _ in fleet]
@@ -82,7 +82,7 @@ def judge_fleet(
 
 
 def _noise_of(noise: Noise, v: int, edges: Sequence[Edge]) -> dict[Edge, Noise]:
-    """Of one vehicle, by edge: six charts each."""
+    """Noise of one vehicle by edge, six charts each."""
     first = v * len(edges) * DOFS
     parts = [slice(first + k * DOFS, first + (k + 1) * DOFS) for k in range(len(edges))]
     return {edge: noise.at(at) for edge, at in zip(edges, parts, strict=True)}

@@ -1,8 +1,8 @@
-"""Verdict of one chart tonight: is the value where it was when the reference was taken, and if not, since when.
+"""Verdict of one chart tonight: whether its value differs from the reference, and since when.
 
-A chart without a change needs no further analysis. One with a change is cut into levels, and the last is
-compared with the first: a value that came back (a repair without a service event) is no change any more, one
-that stayed off is RED as long as it does.
+A chart without a change needs no further analysis. A chart with a change is cut into levels, and the last
+level is compared with the first. If the value returned (a repair without a service event), there is no change
+any more. If it did not, the chart stays RED.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class ChartVerdict:
 
 @dataclass(frozen=True, eq=False)
 class _Judged:
-    """Of all charts: clipped values, their scan, and numbers by chart."""
+    """Clipped values of all charts, their scan, and numbers by chart."""
 
     charts: Charts
     value: np.ndarray
@@ -84,15 +84,16 @@ def judge_charts(
 
     Args:
         charts: day estimates.
-        noise: how they scatter.
+        noise: their noise.
         limit: size of a change that matters [rad or m].
-        probability: of each chart where nothing changed: of an alarm tonight, and of a change that may have begun.
-        baseline_days: a chart without an alarm has no verdict until it has one day more than this.
+        probability: false-alarm probabilities of each chart: of an alarm tonight, and of a change that may
+        have begun.
+        baseline_days: a chart without an alarm has no verdict until it has one more day than this.
 
     Returns:
-        RED: a lasting change that is surely larger than `limit`. YELLOW: a smaller one, one that rests on a single day
-            or one that may have begun. GREEN: no change, and one of size `limit` would be seen. UNKNOWN: too few days,
-            or sigmas too large to see one.
+        RED: a lasting change larger than `limit` with 95 % probability. YELLOW: a smaller change, one
+            supported by a single day, or one that may have begun. GREEN: no change, and one of size `limit`
+            would be detected. UNKNOWN: too few days, or sigmas too large to detect one.
     """
     if not len(charts.count):
         return []
@@ -128,7 +129,7 @@ def judge_charts(
 
 
 def _last_day(charts: Charts, noise: Noise) -> tuple[np.ndarray, np.ndarray]:
-    """Distance of each chart's last day from the median of the two before it, in sigmas and in its unit."""
+    """Distance of each chart's last day from the median of the two days before, in sigmas and in the chart's unit."""
     rows, last = np.arange(len(charts.count)), charts.count - 1
     at = [charts.value[rows, np.maximum(last - k, 0)] for k in range(3)]
     sigma = charts.sigma[rows, np.maximum(last, 0)] * noise.scale
@@ -159,7 +160,7 @@ def _verdict(seen: _Judged, m: int) -> ChartVerdict:
 
 
 def _changed(seen: _Judged, m: int, levels: Levels) -> ChartVerdict | None:
-    """Alarm of a chart whose last level is not its first; else None."""
+    """Alarm of a chart whose last level differs from its first; else None."""
     if levels.statistic <= levels.threshold:
         return None
     change, limit = describe(levels), float(seen.limit[m])
@@ -172,7 +173,7 @@ def _changed(seen: _Judged, m: int, levels: Levels) -> ChartVerdict | None:
         status, reason = "YELLOW", _MAYBE
     elif levels.doubtful_sides:
         # Held days agree by chance only within their enlarged sigmas, so two of them stand for an accepted one.
-        reason = _LASTING + "; rests on days whose calibration was held"
+        reason = _LASTING + "; depends on days whose calibration was held"
     return ChartVerdict(
         status,
         reason,
@@ -185,12 +186,12 @@ def _changed(seen: _Judged, m: int, levels: Levels) -> ChartVerdict | None:
 
 
 def _more(seen: _Judged, m: int) -> int:
-    """Days more than after a change that are believed before it: a chance among the first days lasts for weeks."""
+    """Additional days required before a change, because a chance outlier among the first days persists for weeks."""
     return int(seen.believed[m] > _TAME and not seen.charts.has_reference[m])
 
 
 def _unchanged(seen: _Judged, m: int, levels: Levels | None) -> ChartVerdict:
-    """No alarm: GREEN, or why not."""
+    """Verdict without an alarm: GREEN, or UNKNOWN with a reason."""
     days, limit, visible = int(seen.charts.count[m]), float(seen.limit[m]), float(seen.visible[m])
     statistic = float(seen.statistic[m])
     if levels is not None:
@@ -214,7 +215,7 @@ def _unchanged(seen: _Judged, m: int, levels: Levels | None) -> ChartVerdict:
 
 
 def _one_day(seen: _Judged, m: int) -> ChartVerdict:
-    """The last day stands alone: whether it lasts is not known before the next one."""
+    """Verdict for an outlying last day: the next day decides whether the change lasts."""
     charts, last = seen.charts, int(seen.charts.count[m]) - 1
     day = int(charts.day[m, last])
     sigma = float(charts.sigma[m, last] * seen.noise.scale[m] * np.sqrt(2))
@@ -225,7 +226,7 @@ def _one_day(seen: _Judged, m: int) -> ChartVerdict:
 
 
 def _what_could_hide(days: int, times: float) -> str:
-    """`times`: smallest visible change, as a multiple of the size that matters; it falls with the root of the days."""
+    """`times`: smallest visible change as a multiple of `limit`; it decreases with the square root of the days."""
     needed = math.ceil(days * times**2)
     return (
         f"no change seen, but these days are too inaccurate to exclude one of the size that matters: {times:.1f} times "

@@ -1,8 +1,8 @@
 """Variance of the slow motion of a sensor in its bracket, as with the seasons, without any fault.
 
-The test of a step has two null hypotheses: a constant level, and a random walk. The walk's variance per day comes from
-all charts of a fleet: the mean of recent days minus the mean of days long ago, beyond the days' scatter. A motion of a
-few vehicles is a change; a motion of all is how such sensors are mounted.
+The test of a step has two null hypotheses: a constant level, and a random walk. The walk's variance per day
+comes from all charts of a fleet: the mean of recent days minus the mean of early days, in excess of the days'
+scatter. A motion of a few vehicles is a change; a motion of all is a property of such mounts.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ def with_wander(
     shape: tuple[int, int, int],
     models: Sequence[str] = (),
 ) -> Noise:
-    """The noise of all charts of a fleet, with what their levels wander by.
+    """The noise of all charts of a fleet, with the variance of their levels per day.
 
     Args:
         charts: rows in order of vehicle, edge and degree of freedom.
-        noise: how their days scatter.
+        noise: noise of their days.
         limit: size of a change that matters [rad or m].
         shape: vehicles, edges, degrees of freedom.
-        models: by vehicle, which it is of; none = all are of one.
+        models: model of each vehicle; none = all are of one model.
     """
     _, model_of = np.unique(list(models) or [""] * shape[0], return_inverse=True)
     less = noise.less_alike
@@ -59,7 +59,7 @@ def _wander(
     shape: tuple[int, int, int],
     model_of: np.ndarray,
 ) -> Float[np.ndarray, " M"]:
-    """Variance that a level gains a day."""
+    """Variance that a level gains per day."""
     off, chance, lever, step = (part.reshape(shape) for part in _then_and_now(charts, noise))
     most = (_MOST * limit.reshape(shape)) ** 2 / lever
     out = np.zeros(shape)
@@ -76,7 +76,7 @@ def _wander(
 
 
 def _then_and_now(charts: Charts, noise: Noise) -> tuple[np.ndarray, ...]:
-    """By chart: recent minus early days, the variance by chance, days to wander over, the clearest step."""
+    """For each chart: recent minus early days, the variance by chance, days between, the clearest step."""
     column, count = np.arange(charts.value.shape[1]), older_days(charts)
     part = np.where(charts.has_reference, 1, (_SHARE * count).astype(int))
     first = np.where(charts.has_reference, 1, count - part)

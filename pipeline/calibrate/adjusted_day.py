@@ -60,7 +60,7 @@ def adjusted_rig(
     clocks: Mapping[Edge, float],
     clock_sigma_s: float,
 ) -> AdjustedRig | None:
-    """The rig adjusted over evidence; None where there is none.
+    """The rig adjusted over evidence; None if there is none.
 
     Args:
         prior: of all sensors that have one.

@@ -244,7 +244,7 @@ def _to_calibrate(method: Method, fired: Mapping[str, Sequence[str]], when: str)
 
 
 def _composed_of(method: Method, pairs: Collection[str]) -> tuple[str, ...]:
-    """Pairs that the method composes of the others: none where one of these is missing."""
+    """Pairs that the method composes of the others: none if one of these is missing."""
     return method.composed if len(pairs) == len(PAIRS) else ()
 
 

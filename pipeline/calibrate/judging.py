@@ -76,7 +76,7 @@ class Judging:
         unseen = [] if targets is not None else [unseen_failure(pair)]
         if active and not held_out:
             unseen.append(
-                FailedCheck("the day has too few frames to hold any out: nothing checks the result")
+                FailedCheck("the day has too few frames to hold any out, so the result is not checked")
             )
         targets = DEFAULT_TARGETS if targets is None else targets
         test, claims, probes = self._held_out(estimate, held_out, limits, mounting, targets)

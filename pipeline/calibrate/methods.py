@@ -40,12 +40,12 @@ class Method:
     Args:
         run: import path of its `Solver`; of `(method's name, task, chosen) -> Solver` where it needs images.
         composed: pairs that it composes of the other two instead of estimating them.
-        frames: "selected" takes `select.frames` of a day; "all" takes all that are not held out, since it
-            follows objects from frame to frame.
+        frames: "selected" takes `select.frames` of a day; "all" takes all frames that are not held out, to
+            track objects from frame to frame.
         paper_selection: takes the paper's frame conditions (section 4.5.1).
-        needs_images: looks at images and sweeps (table frames) by networks, and not at observations alone.
+        needs_images: uses images and sweeps (table frames) in networks, not only observations.
         needs_all: estimates all three pairs or none; else a pair without frames costs the others nothing.
-        settings: import path of `(method's name, task) -> dict`: what else its answer depends on.
+        settings: import path of `(method's name, task) -> dict`: further inputs of its result.
     """
 
     name: str
@@ -58,7 +58,7 @@ class Method:
     settings: str | None = None
 
     def solver(self) -> Solver:
-        """The solver of a method that looks at observations alone."""
+        """The solver of a method that uses observations alone."""
         assert not self.needs_images, f"{self.name} needs frames: ask `solver_of` a task"
         solver: Solver = _resolved(self.run)
         return solver
@@ -75,7 +75,7 @@ class Method:
         return solver
 
     def settings_of(self, task: Task) -> dict[str, Any]:
-        """Further inputs of the result beside observations and sections of fleet.toml, for the work key."""
+        """Inputs of the result other than observations and sections of fleet.toml, for the work key."""
         return {} if self.settings is None else dict(_resolved(self.settings)(self.name, task))
 
 

@@ -41,10 +41,10 @@ def pose_rows(
     """A row for each sensor, the reference included.
 
     Args:
-        adjusted: its poses; None where no edge had evidence.
-        views: what each sensor sees, by name: a pose is certified where its sensor looks.
-        judged: by sensor, the record of its edge to the reference where that was judged at the adjusted pose,
-            on held-out frames too: what it says of the pose holds.
+        adjusted: the adjusted rig; None if no edge had evidence.
+        views: view of each sensor, by name; a pose is certified for directions in this view.
+        judged: by sensor, the record of its edge to the reference if that was judged at the adjusted pose,
+            with held-out frames; its verdict is used for the pose.
     """
     rows = [_row(about, graph, sensor, adjusted, views, verify) for sensor in graph.sensors]
     return [_as_judged(row, (judged or {}).get(row.sensor)) for row in rows]
@@ -129,7 +129,7 @@ def _row(
 
 
 def _targets(sensor: Sensor, poses: Extrinsics, views: Mapping[str, View]) -> Float[np.ndarray, "3 3"]:
-    """Targets where the sensor looks, in the reference's frame."""
+    """Targets in the sensor's view, in the reference's frame."""
     found = targets_of(poses.between(sensor.name, poses.reference.name), views.get(sensor.name), None)
     return DEFAULT_TARGETS if found is None else found
 
@@ -137,7 +137,7 @@ def _targets(sensor: Sensor, poses: Extrinsics, views: Mapping[str, View]) -> Fl
 def _claims(
     sensor: Sensor, poses: Extrinsics, targets: Float[np.ndarray, "3 3"], verify: VerifyConfig
 ) -> dict[str, Claim]:
-    """How well directions of the reference's points are known in the sensor, at these targets."""
+    """Claims for directions of the reference's points in the sensor, at these targets."""
     reference = poses.reference.name
     T = poses.between(sensor.name, reference)
     camera_deg = verify.camera_lidar_limit_deg
@@ -166,7 +166,7 @@ def _verdict(
     if doubts:
         return "held", f"its edges contradict each other and nothing tells which is wrong: {doubts}"
     if not found.determined.any():
-        return "held", "the day determines no degree of freedom: it stays where the prior has it"
+        return "held", "the day determines no degree of freedom: the pose stays at the prior"
     needed = ("azimuth",) if sensor.kind == "radar" else tuple(claims)
     unsure = {name: claim for name, claim in claims.items() if name not in determined}
     words = "; ".join(

@@ -1,8 +1,9 @@
-"""Detection of a wrong prior pose: that of the sensor shared by all edges that lie far from the prior.
+"""Detection of a wrong prior pose: the one of the sensor common to all edges that differ greatly from the prior.
 
-Such an edge is left out, because it may be in a wrong minimum. If the prior is wrong, everything that rests
-on it is as far off, with the prior's small sigma: on a van whose reference lidar was logged .3 m too far
-ahead, three edges showed it, and three radars without a measured position were accepted half a degree off.
+An edge far from the prior is left out, because it may be in a wrong minimum. But if the prior is wrong, all
+poses that depend on it have the same error, with the prior's small sigma. On a van whose reference lidar was
+logged .3 m too far ahead, three edges showed the error, and three radars without a measured position were
+accepted half a degree off.
 """
 
 from __future__ import annotations

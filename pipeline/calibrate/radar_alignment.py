@@ -1,4 +1,4 @@
-"""Rows of table `radar_alignments`: alignment stated by radars beside the day's edges."""
+"""Rows of table `radar_alignments`: alignment stated by radars, with the day's edges."""
 
 from __future__ import annotations
 

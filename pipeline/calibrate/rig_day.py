@@ -1,9 +1,9 @@
-"""A day of a rig: each edge by its own frames, then one adjustment over all of them.
+"""A day of a rig: each edge from its own frames, then one adjustment over all edges.
 
-An edge of two sensors is solved and judged as any pair is. What it finds enters the adjustment without its
-prior; an edge that failed a check of its own is left out. The adjusted poses are the answer. Of a rig with
-one sensor of each kind, whose frames are at hand together, records are of the adjusted poses too; else they
-are the edges' own evidence.
+An edge of two sensors is solved and judged like any pair. Its evidence without the prior enters the
+adjustment; an edge that failed a check of its own is left out. The adjusted poses are the result. For a rig
+with one sensor of each kind, whose frames are loaded together, records have the adjusted poses too; otherwise
+they have each edge's own evidence.
 """
 
 from __future__ import annotations
@@ -51,13 +51,12 @@ Headings = Mapping[str, Sequence[tuple[float, float]]]
 
 @dataclass(frozen=True, eq=False)
 class RigDay:
-    """What a day has of a rig.
+    """Data of a day for a rig.
 
     Args:
-        views: what each sensor sees, by name.
-        rows: observations of chosen sensors, in order of time; read when an edge is solved, and let go after
-            it.
-        before: T_parent_child of an edge as an earlier day found it; None where none did.
+        views: view of each sensor, by name.
+        rows: observations of chosen sensors, in order of time; read for each edge, and then released.
+        before: T_parent_child of an edge from an earlier day; None if there is none.
     """
 
     rig: Rig
@@ -68,7 +67,7 @@ class RigDay:
     before: Callable[[Edge], Float[np.ndarray, "4 4"] | None] = lambda _: None
 
     def prior_of(self, chosen: Chosen, edges: Sequence[Edge], headings: Headings) -> Prior:
-        """Of up to one camera, one lidar and one radar, where the car is known to drive in the lidar's axes."""
+        """Prior of up to one camera, one lidar and one radar, with the direction of travel in the lidar's axes."""
         prior = prior_of_three(self.prior, self.rig, *(chosen.get(kind) for kind in SENSORS))
         at = next((e for e in edges if e.kind == "camera_lidar"), None)
         if at is None:
@@ -77,7 +76,7 @@ class RigDay:
         return replace(prior, T_camera_lidar_before=self.before(at), heading=heading)
 
     def _mounted(self, lidar: str, headings: Headings) -> Sequence[tuple[float, float]]:
-        """Headings in a lidar's axes; by its mounting on the vehicle frame where the day shows none."""
+        """Headings in a lidar's axes; from its mounting on the vehicle frame if the day does not determine one."""
         found = headings.get(lidar, [])
         T = self.prior.between(lidar, BASE.name) if BASE in self.graph.sensors else None
         if found or T is None:
@@ -146,7 +145,7 @@ class _Found:
 
 
 def _groups(graph: RigGraph) -> list[tuple[Edge, ...]]:
-    """Edges that are solved from one reading: all pairs of a rig with one sensor of each kind, else each alone."""
+    """Groups of edges solved from one reading: all pairs of a rig with one sensor of each kind, else single edges."""
     pairs = [edge for edge in graph.edges if edge.kind in PAIR_KINDS]
     sensors = {sensor for edge in pairs for sensor in edge.sensors}
     if not pairs or len({sensor.kind for sensor in sensors}) < len(sensors):
@@ -194,7 +193,7 @@ def _add_heading(edge: Edge, rows: Sequence[Observation], found: _Found) -> None
 def _solve_other(
     day: RigDay, fleet: FleetConfig, about: Inputs, others: BaseEdges, edge: Edge, found: _Found
 ) -> None:
-    """An edge that is no pair of camera, lidar and radar."""
+    """Solve an edge that is not a pair of camera, lidar and radar."""
     try:
         shown, frames = others.solve(edge)
     except SolveError as err:
@@ -210,12 +209,12 @@ def _solve_other(
 
 
 def _azimuth(T_lidar_base: Float[np.ndarray, "4 4"]) -> float:
-    """Of the vehicle frame's x axis [rad]."""
+    """Azimuth of the vehicle frame's x axis [rad]."""
     return float(np.arctan2(T_lidar_base[1, 0], T_lidar_base[0, 0]))
 
 
 def _without_moved(record: CalibrationRecord, moved: Sequence[FailedCheck]) -> CalibrationRecord:
-    """The record, held where a sensor of its edge moved during the day: as other edges show, it may not show it."""
+    """The record, held if other edges show that a sensor of its edge moved during the day."""
     if not moved or record.status == "refused" or "moved_in_day" in record.faults:
         return record
     reason = "; ".join([*(check.sentence for check in moved), *([record.reason] if record.reason else [])])

@@ -19,13 +19,13 @@ class SolvedDay:
     """A day's inputs, results and verdicts.
 
     Args:
-        solution: of the pairs that were not refused.
-        judging: what verdicts rest on.
-        trigger_sample: frames for the trigger metrics; empty for a method that is not the paper's, unless
-            `trigger.when` asks for them.
+        solution: solution of the pairs that were not refused.
+        judging: data that verdicts depend on.
+        trigger_sample: frames for the trigger metrics; empty for methods other than the paper's, unless
+            `trigger.when` needs them.
         trigger_before: metrics of each pair at the prior.
-        triggered: by pair, whether one of them is beyond its threshold.
-        numbers: of checks of the day, for every record.
+        triggered: by pair, whether one of the metrics exceeds its threshold.
+        numbers: numbers of checks of the day, for every record.
     """
 
     observations: Sequence[Observation]

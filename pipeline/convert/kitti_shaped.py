@@ -45,9 +45,9 @@ class Layout:
         images: folders of images by camera name, files named by frame; P2 in calib is of image_2, P3 of
             image_3.
         radar: folder of .bin; empty = none.
-        radar_calib: folder of the radar's own, with the radar's transform as Tr_velo_to_cam; empty =
+        radar_calib: folder of separate calib files with the radar's transform as Tr_velo_to_cam; empty =
             Tr_radar_to_velo in calib.
-        radar_columns: of a row; columns with empty names are left out.
+        radar_columns: names of a row's columns; columns with empty names are left out.
     """
 
     images: Mapping[str, str]
@@ -157,7 +157,7 @@ def _camera(image: Path, P: Float[np.ndarray, "4 4"]) -> Camera:
 
 
 def _rectified(path: Path, lines: Mapping[str, Sequence[float]], P: np.ndarray) -> Float[np.ndarray, "4 4"]:
-    """Transform from the reference camera to that of P: rectification and baseline (K^-1 P's last column)."""
+    """Transform from the reference camera to the camera of P: rectification and baseline (K^-1 P's last column)."""
     T = np.eye(4)
     T[:3, 3] = np.linalg.solve(P[:3, :3], P[:3, 3])
     R = np.eye(4)

@@ -99,7 +99,7 @@ def find_again(
     in_lidar = [find_in_lidar(lidar, at, edge) if lidar else None for at in picks.lidar_m]
     in_radar = [find_in_radar(radar, at) if radar else None for at in picks.radar_m]
     moved = _moved(_moved(picks, "lidar_m", in_lidar), "radar_m", in_radar)
-    how = f"apex of a {edge:g} m trihedral" if edge else "centre of the bright echoes, its apex lies deeper,"
+    how = f"apex of a {edge:g} m trihedral" if edge else "centre of the bright echoes, its apex is deeper,"
     sources = (
         file.sources[0],
         _source(f"lidar: {how}", in_lidar, where, file.sources[1]),

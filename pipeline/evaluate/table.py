@@ -1,7 +1,7 @@
-"""Table 1 and extended data table 1 of the paper: our rows beside the printed ones, in Markdown or Parquet.
+"""Table 1 and extended data table 1 of the paper: our rows next to the printed ones, in Markdown or Parquet.
 
 The printed rows come from other sensors on other roads ("other data"). They show the meaning and the order of
-magnitude of the rows; they are no ranking. Methods without a record have a row with dashes.
+magnitude of the rows; the table is not a ranking. Methods without a record have a row with dashes.
 """
 
 from __future__ import annotations

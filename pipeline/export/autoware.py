@@ -108,7 +108,7 @@ def _entry(T: np.ndarray) -> dict[str, float]:
 
 
 def _xacro(children: list[str]) -> ET.Element:
-    """`sensor_kit_macro`, which Autoware's vehicles include: links and joints only."""
+    """Xacro with the macro `sensor_kit_macro`, which Autoware's vehicles include; it has links and joints only."""
     robot = ET.Element("robot", {"xmlns:xacro": "http://ros.org/wiki/xacro"})
     macro = ET.SubElement(
         robot, "xacro:macro", name="sensor_kit_macro", params="parent x y z roll pitch yaw config_dir:=."

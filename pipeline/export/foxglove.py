@@ -1,9 +1,9 @@
 """A vehicle-day as a Foxglove MCAP: sensor data at the prior and at the calibration, and the uncertainty.
 
 Frames: the lidar is the root (or base, if its pose is known); camera and radar are its children, as
-calibrated. The prior has frames of its own with the same points again: `lidar_prior`, child of the camera,
-and `radar_prior`, child of the lidar. A viewer shows both, and either can be hidden. Source: foxglove-sdk
-0.30, schemas of the same names.
+calibrated. The same points are also written in separate frames at the prior: `lidar_prior`, child of the
+camera, and `radar_prior`, child of the lidar. A viewer shows both, and either can be hidden. Source:
+foxglove-sdk 0.30, schemas of the same names.
 """
 
 from __future__ import annotations
@@ -73,8 +73,7 @@ def write_foxglove(
 ) -> int:
     """Write the scenes, in order of stamp, as an MCAP to a seekable stream; returns their number.
 
-    Of a pair without calibration only the prior is drawn. Features are None for frames that perception left
-    out.
+    For a pair without calibration, only the prior is drawn. Features are None for frames that perception left out.
     """
     context = foxglove.Context()
     topics = _Topics(context)
@@ -266,7 +265,7 @@ def edges_message(
     colour: tuple[float, ...],
     at: fg.Timestamp,
 ) -> fg.ImageAnnotations:
-    """Depth jumps of the lidar in the image; with a good calibration they lie on silhouettes."""
+    """Depth jumps of the lidar in the image; with a good calibration they are on silhouettes."""
     camera = camera_of(observation)
     uv, valid = camera.project(
         transform_points(T_camera_lidar, observation.lidar_edge_xyz_m.astype(np.float64))

@@ -2,8 +2,7 @@
 
 Row-major numbers after a name: P0 to P3 (3x4), R0_rect (3x3), Tr_velo_to_cam, Tr_imu_to_velo,
 Tr_radar_to_velo (3x4). Tr_a_to_b maps coordinates from a to b. Tr_velo_to_cam = T_camera_lidar if image_2's
-camera is the reference; in KITTI's own files the reference is another camera beside it, and reading corrects
-for that.
+camera is the reference; in KITTI's own files the reference is another camera, and reading corrects for that.
 
 Source: KITTI object development kit, readme and matlab/; V2X-Radar (Tr_radar_to_velo).
 """

@@ -1,4 +1,4 @@
-"""ASAM OpenLABEL 1.0: coordinate systems and streams; provenance under metadata, sigma beside each pose.
+"""ASAM OpenLABEL 1.0: coordinate systems and streams; provenance under metadata, sigma with each pose.
 
 `pose_wrt_parent` maps coordinates from child to parent: X_parent = pose X_child.
 

@@ -64,7 +64,7 @@ def _far(pair: ExportedPair, dof: str, sigmas: float) -> str:
         if dof in pair.resting
         else "written as estimated (--unchecked)"
     )
-    return f"{dof} lies {sigmas:.1f} sigma from the prior and no check covers it: {became}"
+    return f"{dof} is {sigmas:.1f} sigma from the prior and no check covers it: {became}"
 
 
 def not_certified(calibration: ExportedCalibration) -> dict[str, str]:

@@ -19,8 +19,8 @@ T_LINK_OPTICAL = from_rotation_translation(
 def rpy_of(R: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 3"]:
     """Roll, pitch, yaw [rad] about fixed axes x, y, z: R = Rz(yaw) Ry(pitch) Rx(roll).
 
-    Each angle is computed from the rest that the previous ones leave. So the three reproduce R to rounding,
-    also at a pitch of +-90 deg, where roll and yaw are not unique.
+    Each angle is computed from the rotation that remains after the previous ones. So the three reproduce R to
+    rounding, even at a pitch of +-90 deg, where roll and yaw are not unique.
     """
     yaw = np.arctan2(R[1, 0], R[0, 0])
     c, s = np.cos(yaw), np.sin(yaw)

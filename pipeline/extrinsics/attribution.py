@@ -104,7 +104,9 @@ def attribute(shifts: Mapping[Edge, PairShift], known_by: float = np.inf) -> Att
     """
     if len(shifts) < 2:
         names = [sensor.name for edge in shifts for sensor in edge.sensors]
-        return Attribution(f"{' or '.join(names) or 'any sensor'}: one pair alone has data, which both share")
+        return Attribution(
+            f"{' or '.join(names) or 'any sensor'}: only one pair has data, which does not tell its sensors apart"
+        )
     total = sum(float(s.xi @ np.linalg.solve(s.covariance, s.xi)) for s in shifts.values())
     sensors = sorted(
         {s for edge in shifts for s in edge.sensors}, key=lambda s: (KINDS.index(s.kind), s.name)

@@ -40,7 +40,7 @@ def write_metrics(path: Path, fleet: str, tally: Tally, end: NightEnd) -> None:
     """Replace the file atomically; the time of the last successful night is kept if this night failed.
 
     Args:
-        path: read by node_exporter, so NAME.prom; its folder must exist.
+        path: file NAME.prom, because node_exporter reads only this suffix; its folder must exist.
 
     Raises:
         OSError: the file cannot be written; it stays as it was.

@@ -113,7 +113,7 @@ def _shell_token(token: str) -> str:
 
 
 def _owned(pattern: str) -> dict[str, _Owner]:
-    """Vehicle-day of each log file and bag folder that matches, or that lies in a matching folder.
+    """Vehicle-day of each log file and bag folder that matches, or that is in a matching folder.
 
     Folders are listed once each, so the work grows with the number of files. A symbolic link to a log that
     was already found in the same vehicle-day is ignored: a link to its own parent would repeat every log

@@ -1,7 +1,7 @@
 """Items as plain tasks of a Ray cluster: the one in $RAY_ADDRESS, or a small one on this machine.
 
 Ray runs every task in a process of its own, so a dead worker affects no other task. If a node is lost, its
-tasks are tried again elsewhere, without blame. Needs the extra [ray]; see README.md beside this file.
+tasks are tried again elsewhere, without blame. Needs the extra [ray]; see README.md in this folder.
 """
 
 from __future__ import annotations

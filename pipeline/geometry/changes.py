@@ -2,7 +2,7 @@
 
 A change is (rotation vector, shift of the child's origin), both along the axes of the parent frame. Unlike
 the twist of the left perturbation, its translation is the plain difference of the columns tx_m, ty_m, tz_m:
-a sensor that only rotated in its bracket has no shift, whatever its lever arm.
+a sensor that only rotated in its bracket has no shift, for any lever arm.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 A scanner measures in rows: the log has the row of each point (`ring`), or elevations cluster around one value
 per row. If the beams of a row are staggered, elevations do not cluster; but clouds are often stored turn by turn. A
-lidar with rotating prisms draws a rosette: drivers number its lasers, which readers treat as rings, but
+lidar with rotating prisms draws a rosette: drivers number its lasers, which readers treat as rings. But
 points of one laser that are neighbours in azimuth differ by degrees in elevation. As rows they would make
 false depth jumps on the ground.
 """
@@ -115,7 +115,7 @@ def _by_order(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray | None:
 def _beginning(way: np.ndarray, elevation: np.ndarray) -> float:
     """Start of the turns, as fraction of a turn: the elevation steps there from row to row.
 
-    It lies between the last and the first point, which are close together if turns are complete.
+    It is between the last and the first point, which are close together if turns are complete.
     """
     place = np.arange(1.0, way[-1] % 1.0, -1 / 720)
     crossing = np.searchsorted(way, place + np.arange(int(way[-1]))[:, None])

@@ -1,7 +1,7 @@
 """Rigid transforms as 4x4 arrays, with their covariances.
 
-`T_a_b` takes coordinates in b to a. A twist is (rotation vector, translation). Perturbations stand on the
-left: `T' = exp(xi) T`, so xi lives in the axes of the parent frame a.
+`T_a_b` takes coordinates in b to a. A twist is (rotation vector, translation). Perturbations are on the left:
+`T' = exp(xi) T`, so xi is in the axes of the parent frame a.
 
 Source: Sola, Deray, Atchuthan 2018, "A micro Lie theory for state estimation in robotics", section IV and
 appendix D (their twist is translation first; here rotation comes first). By hand because SciPy's rotations have
@@ -170,8 +170,7 @@ def perturb_exactly(
 ) -> Float[np.ndarray, "4 4"]:
     """Rotate T by exactly `rotation_rad` and shift it by exactly `translation_m`, in random directions.
 
-    The rotation acts about the parent's axes on the rotation part alone: both amounts are exact whatever the
-    lever arm.
+    The rotation acts about the parent's axes on the rotation part alone: both amounts are exact for any lever arm.
     """
     axis, direction = rng.normal(size=3), rng.normal(size=3)
     R = exp_so3(rotation_rad * axis / np.linalg.norm(axis)) @ T[:3, :3]

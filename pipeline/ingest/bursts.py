@@ -1,4 +1,4 @@
-"""Choice of what to read of a long day: bursts of moments, spread over time, speed, turn and place.
+"""Selection of the parts of a long day to read: bursts of moments, spread over time, speed, turn and place.
 
 A calibration takes about a hundred frames, and consecutive frames of a drive are similar. The day is divided
 into parts with equal numbers of sweeps, with one possible burst in the middle of each. Bursts are then chosen
@@ -62,7 +62,7 @@ def possible_bursts(
 ) -> PossibleBursts:
     """Bursts that can be read, in order of time, all with the same number of sweeps.
 
-    A burst lies within a stretch without pauses if one is long enough. If most sweeps come in short groups,
+    A burst is within a stretch without pauses if one is long enough. If most sweeps come in short groups,
     bursts are shorter: one group or several.
 
     Args:

@@ -171,7 +171,7 @@ def _turned_round(frames: Sequence[Frame], sign: int) -> str:
         return ""
     # If the Doppler confirms the radar's heading, the lidar is turned.
     who = {1: "the lidar", -1: "the radar", 0: "the lidar or the radar"}[sign]
-    met = f"{turned:.0%} of the detections meet what the sweeps show where it is turned round"
+    met = f"{turned:.0%} of the detections match the sweeps if it is turned round"
     return f"{who} looks the other way: {met}, {given:.0%} by the prior; correct its transform"
 
 

@@ -1,4 +1,4 @@
-"""Readiness: what logs can calibrate, per pair and class of DoF, and what is missing."""
+"""Readiness: classes of DoF that logs can calibrate, per pair, and missing data."""
 
 from __future__ import annotations
 

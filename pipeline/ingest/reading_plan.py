@@ -1,4 +1,4 @@
-"""Plan of what to read of a long day's logs, from their indices and short samples of the car's motion."""
+"""Plan of the parts of a long day's logs to read, from their indices and short samples of the car's motion."""
 
 from __future__ import annotations
 

@@ -172,7 +172,7 @@ def find_moments(index: DayIndex, rig: Rig, config: IngestConfig) -> Matched:
 
 
 def _tied(rig: Rig, anchor: str) -> set[str] | None:
-    """Sensors that can have an edge to the anchor, also by way of the vehicle; None for one of each kind."""
+    """Sensors that can have an edge to the anchor, also through the vehicle frame; None for one of each kind."""
     sensors = [node for node in rig.nodes if node.kind != "base"]
     if len({node.kind for node in sensors}) == len(sensors):
         return None

@@ -234,7 +234,7 @@ def _gated(
 def _together(
     gap: Int64[np.ndarray, "S N"], has: Bool[np.ndarray, "S N"], gates: Int64[np.ndarray, " N"]
 ) -> tuple[Bool[np.ndarray, "S N"], dict[int, tuple[int, int]]]:
-    """Captures within the gate by moment, and pairs that did not fit; the farthest from the anchor go first."""
+    """Captures within the gate by moment, and pairs outside; the farthest from the anchor are left out first."""
     kept, apart = has.copy(), {}
     low, high = np.where(kept, gap, 0).min(0, initial=0), np.where(kept, gap, 0).max(0, initial=0)
     for i in np.flatnonzero(high - low > gates):

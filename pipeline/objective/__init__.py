@@ -1,1 +1,1 @@
-"""What is minimised: one definition that solvers and learning share."""
+"""Objective functions: one definition shared by solvers and learning."""

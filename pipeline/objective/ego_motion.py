@@ -1,12 +1,13 @@
-"""Motion of the vehicle frame, moment by moment, from all radars' Doppler and from odometry: one value for all edges.
+"""Motion of the vehicle frame per moment, from all radars' Doppler and from odometry: one value for all edges.
 
-A radar measures its own velocity: the base's, and the yaw rate times its lever arm. What sources leave open
-is filled by what a car does: its rear axle does not slip, so one radar ahead of it shows the yaw rate.
+A radar measures its own velocity: the base's, plus the yaw rate times its lever arm. A constraint of the car
+completes the sources: its rear axle does not slip, so one radar ahead of it determines the yaw rate.
 
-Radars are turned on their brackets: each is turned back by what its own direction of travel differs from that
-of all, a constant of the day that no average over moments lowers (`heading_sigma_rad`). A source whose speed
-is another than that of the others in most moments is left out and named; of two that differ it is unknown
-which, and `calibrate/verify/motion_sources` asks the lidar's sweeps.
+Radars have rotation errors in their brackets. Each is corrected by the difference of its own direction of
+travel from that of all radars. This is a constant of the day that averaging over moments does not reduce
+(`heading_sigma_rad`). A source whose speed differs from that of the others in most moments is left out and
+reported. If there are only two, it is unknown which one is wrong, and `calibrate/verify/motion_sources`
+compares both with the lidar's sweeps.
 
 Source: Kellner et al. 2014, "Instantaneous ego-motion estimation using multiple Doppler radars".
 """
@@ -50,7 +51,7 @@ _CAUCHY, _PASSES, _ROUNDS = 2.5, 5, 3
 
 @dataclass(frozen=True, eq=False)
 class DopplerMotion:
-    """A radar's own velocity by its Doppler, per moment, in its axes; NaN where a scan shows none.
+    """A radar's own velocity from its Doppler, per moment, in its axes; NaN for a scan that does not determine it.
 
     `T_base_radar` is the known mounting, `yaw_sigma_rad` its uncertainty.
     """
@@ -77,14 +78,15 @@ class Odometry:
 
 @dataclass(frozen=True, eq=False)
 class EgoMotion:
-    """Level motion of the base, per moment; NaN where nothing shows it.
+    """Level motion of the base, per moment; NaN where no source determines it.
 
     Args:
-        velocity_mps: F 2, of the base's origin: ahead, to the left.
+        velocity_mps: F 2, velocity of the base's origin: ahead, to the left.
         yaw_rate_radps: F, positive to the left.
-        covariance: F 3 3, of both; moments err apart.
-        heading_sigma_rad: of the direction of all velocities together, by the mountings that they rest on.
-        left_out: sources that contradict the others, and by what.
+        covariance: F 3 3, of both; errors of different moments are independent.
+        heading_sigma_rad: sigma of the direction of all velocities together, due to the mountings that they
+        depend on.
+        left_out: sources that contradict the others, with reasons.
     """
 
     velocity_mps: np.ndarray
@@ -130,14 +132,14 @@ def ego_motion(
     heading: tuple[float, float] | None = None,
     axle_behind_m: float = 0.0,
 ) -> EgoMotion:
-    """Fuse what radars and odometry show.
+    """Fuse the motion by radars and odometry.
 
     Args:
-        radars: of the same moments; none, where odometry shows all.
-        odometry: all NaN where none is logged.
+        radars: motion by radars at the same moments; none if odometry is complete.
+        odometry: motion by odometry; all NaN if none is logged.
         heading: azimuth in axes of the base in which the car drives straight on, and its sigma [rad]: (0, 0)
             for a vehicle frame; None = from the radars' mountings, for a base that is a sensor.
-        axle_behind_m: how far the rear axle, which does not slip, lies behind the base's origin.
+        axle_behind_m: distance of the rear axle, which does not slip, behind the base's origin.
     """
     speeds = {r.name: r.level()[0][:, 0] for r in radars} | {"odometry": odometry.speed_mps}
     left_out = contradicting(speeds)
@@ -174,10 +176,11 @@ def _fused(
 def shown_heading(
     observations: Sequence[Observation], T_base_radar: Float[np.ndarray, "4 4"]
 ) -> float | None:
-    """Azimuth of the car's way in axes of the base, as a radar's Doppler shows it; None where it does not.
+    """Azimuth of the direction of travel in axes of the base, from a radar's Doppler; None if it does not determine it.
 
-    A single frame's is noisier than it varies, and the radar's vertical velocity is no measurement. Which way
-    along it is the speed's sign: the base's x axis points ahead, and a Doppler's sign may be wrong.
+    One value for all frames is used, because its noise in a single frame is larger than its variation. The
+    radar's vertical velocity is not used. The sign follows from the speed, because the base's x axis points
+    ahead, and a Doppler's sign may be wrong.
     """
     moving = [
         o.radar_velocity_mps
@@ -192,7 +195,7 @@ def shown_heading(
 
 
 def mean_heading(headings: Sequence[tuple[float, float]]) -> tuple[float, float] | None:
-    """Weighted mean of azimuths with sigmas [rad]; None of none."""
+    """Weighted mean of azimuths with sigmas [rad]; None without azimuths."""
     if not headings:
         return None
     first = headings[0][0]
@@ -217,7 +220,7 @@ def contradicting(speeds_mps: Mapping[str, Float[np.ndarray, " F"]]) -> dict[str
 
 
 def agreed_share(speed_mps: Float[np.ndarray, " F"], other_mps: Float[np.ndarray, " F"]) -> float:
-    """Share of the moving moments of both in which two speeds are the same; 1 of none."""
+    """Share of the moments with motion by both sources in which the speeds agree; 1 without such moments."""
     both = np.isfinite(speed_mps) & np.isfinite(other_mps)
     a, b = speed_mps[both], other_mps[both]
     moving = np.abs(b) > _MOVING_MPS
@@ -229,7 +232,7 @@ def agreed_share(speed_mps: Float[np.ndarray, " F"], other_mps: Float[np.ndarray
 def is_same(
     speed_mps: Float[np.ndarray, " F"], expected_mps: Float[np.ndarray, " F"]
 ) -> Bool[np.ndarray, " F"]:
-    """Whether a speed agrees with another source's."""
+    """True where a speed agrees with another source's."""
     return np.asarray(np.abs(speed_mps - expected_mps) < _SAME_MPS + _SAME_SHARE * np.abs(expected_mps))
 
 
@@ -246,7 +249,7 @@ def _direction(radar: DopplerMotion, turn: np.ndarray) -> float:
 
 
 def _mean(angles: Sequence[float], sigmas: Sequence[float]) -> tuple[float, float]:
-    """Weighted mean, and its sigma; straight ahead and unknown of none."""
+    """Weighted mean, and its sigma; 0 with an infinite sigma without values."""
     if not angles:
         return 0.0, float(np.pi)
     weight = np.array(sigmas) ** -2.0
@@ -289,7 +292,7 @@ def _turned(radar: DopplerMotion, by_rad: float) -> tuple[np.ndarray, np.ndarray
 
 
 def _equations(J: np.ndarray, v: np.ndarray, C: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A radar's part; scans that contradict the motion so far (a convoy's) have less weight."""
+    """Equations of a radar; scans that contradict the motion so far (in a convoy) have less weight."""
     known = np.isfinite(v).all(1)
     information = np.linalg.inv(np.where(known[:, None, None], C, np.eye(2)))
     r = np.where(known[:, None], v - u @ J.T, 0.0)

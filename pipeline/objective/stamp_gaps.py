@@ -1,10 +1,11 @@
-"""How far the stamps of one frame lie apart, and what part of that is the same all day.
+"""Differences between the stamps of one frame, and the part that is constant over the day.
 
-The sensors of a frame measure at different times: their stamps give the differences, up to a time offset that all
-stamps of a sensor share. Terms bridge the gaps of each frame by the car's motion, and solve for the offset. If a
-sensor is triggered by the lidar, its gaps are constant: either it measured with the lidar and its clock is off, or both
-clocks are right and it measured later. The first is expected, with the prior's sigma for the time offset, and there the
-estimate starts. Gaps of sensors that run freely have a median near 0.
+The sensors of a frame measure at different times: their stamps give the differences, up to a time offset that
+all stamps of a sensor share. Terms bridge the gaps of each frame by the car's motion, and solve for the
+offset. If a sensor is triggered by the lidar, its gaps are constant: either it measured with the lidar and
+its clock is off, or both clocks are right and it measured later. The first is expected, with the prior's
+sigma for the time offset, and there the estimate starts. Gaps of sensors that run freely have a median near
+0.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ _UNKNOWN_MPS, _UNKNOWN_RADPS, _OTHERS_MPS = 40.0, float(np.radians(30.0)), 10.0
 
 
 def camera_gaps_s(observations: Sequence[Observation]) -> Float[np.ndarray, " F"]:
-    """Image stamp minus sweep stamp of each frame [s]; the others' median of a frame without a camera."""
+    """Image stamp minus sweep stamp of each frame [s]; frames without a camera get the median of the others."""
     gaps = np.array([(o.camera_stamp_ns - o.stamp_ns) * 1e-9 for o in observations], np.float64)
     return _filled(gaps, "camera", observations)
 
@@ -53,7 +54,7 @@ def motion_gates_ns(
 ) -> Int64[np.ndarray, " L"]:
     """Per sweep, the time in which the car drives `move_m` or turns `turn_rad`, whichever comes first [ns].
 
-    Speeds and yaw rates that are unknown (NaN) are taken for as high as a car's are.
+    Unknown speeds and yaw rates (NaN) are replaced by the maximum of a car.
     """
     speed = np.maximum(np.where(np.isnan(speed_mps), _UNKNOWN_MPS, np.abs(speed_mps)), _OTHERS_MPS)
     turn = np.where(np.isnan(yaw_rate_radps), _UNKNOWN_RADPS, np.abs(yaw_rate_radps))
@@ -61,6 +62,6 @@ def motion_gates_ns(
 
 
 def _filled(gaps_s: np.ndarray, sensor: str, observations: Sequence[Observation]) -> np.ndarray:
-    """The gaps, with the constant one where the sensor is absent, so that it counts for nothing."""
+    """The gaps; frames without the sensor get the constant gap, so that they have no effect."""
     there = np.array([sensor in o.sensors for o in observations], bool)
     return gaps_s if there.all() else np.where(there, gaps_s, constant_gap_s(gaps_s[there]))

@@ -1,11 +1,12 @@
-"""When a spinning lidar measured each point, from its azimuth: for clouds that come without a time per point.
+"""Times of a spinning lidar's points from their azimuth, for clouds without a time per point.
 
-A turn takes a tenth of a second, in which a car drives a metre or three. Which way a lidar turns and where a turn
-begins is seldom written down. Pairs of sweeps of a moving car show it: after the best motion between them, what
-stands still lies off where either sweep measured it early or late. These rests are linear in the times, so one
-system over all pairs weighs every sense, begin and length of a turn against every other.
+A turn takes a tenth of a second, in which a car drives one to three metres. The direction of rotation and the
+start of a turn are seldom documented. They are estimated from pairs of sweeps of a moving car: after the best
+motion between two sweeps, static points still have residuals where either sweep measured them early or late.
+These residuals are linear in the times, so one system over all pairs compares all directions, starts and
+durations of a turn.
 
-A time that all points share moves a cloud as a whole, which no pair of sweeps shows. It is part of the time offset
+A time common to all points moves a cloud as a whole, which pairs of sweeps do not show. It is part of the time offset
 between sensors, which calibration finds.
 
 Source: Zhang, Singh 2014, "LOAM: Lidar Odometry and Mapping in Real-time" (points to planes, times from azimuths).
@@ -44,10 +45,10 @@ class BeamTimes:
     """How a lidar turns.
 
     Args:
-        sense: 1 to the left, as azimuth grows; -1 to the right (seen from above).
+        sense: 1 to the left, in the direction of increasing azimuth; -1 to the right (seen from above).
         begin_rad: azimuth of the first beam of a turn.
         period_s: duration of a turn.
-        stamp_share: of the turn that is over at the stamp.
+        stamp_share: share of the turn that is complete at the stamp.
     """
 
     sense: float
@@ -66,10 +67,10 @@ class BeamTimes:
 
 
 class Found(NamedTuple):
-    """What a day's sweeps say: how the lidar turns, if they tell, and how it moves at each sweep.
+    """Result of a day's sweeps: the lidar's rotation, if determined, and its motion at each sweep.
 
-    Between sweeps that do not show how it turns, motion may be wrong (rails lie along themselves): then it is what was
-    told.
+    For sweeps that do not determine the rotation, their motion may be wrong too (rails match anywhere along
+    them); the given motion is then used.
     """
 
     turn: BeamTimes | None
@@ -91,13 +92,13 @@ def beam_times(
     told: Mapping[int, Arc],
     period_s: float = PERIOD_S,
 ) -> Found:
-    """How a lidar turns, from pairs of its sweeps as they were logged.
+    """Estimate a lidar's rotation from pairs of its sweeps as logged.
 
     Args:
-        surfaces: of each sweep, by its number.
+        surfaces: surfaces of each sweep, by its number.
         pairs: earlier and later sweep, and the time between their stamps [s].
-        told: motion per second at a sweep, where odometry has it.
-        period_s: of a turn.
+        told: motion per second at a sweep, if odometry has it.
+        period_s: duration of a turn.
     """
     arcs = registered(surfaces, pairs, told)
     motion = {**_motions(arcs, pairs), **told}
@@ -125,7 +126,7 @@ def beam_times(
 
 
 def velocity_of(xyz_m: Float[np.ndarray, "N 3"], motion: Arc) -> Float[np.ndarray, "N 3"]:
-    """Of standing points, as the lidar drives: added for the time since the stamp, they lie as at the stamp."""
+    """Velocity of standing points relative to the lidar; with it, points are moved by their time to the stamp."""
     x = motion.x - motion.yaw_rad * xyz_m[:, 1]
     return np.stack([x, motion.yaw_rad * xyz_m[:, 0], np.zeros(len(xyz_m))], axis=1)
 
@@ -133,7 +134,7 @@ def velocity_of(xyz_m: Float[np.ndarray, "N 3"], motion: Arc) -> Float[np.ndarra
 def _decided(
     N: Float[np.ndarray, "P S S"], b: Float[np.ndarray, "P S"], best: int, period_s: float
 ) -> BeamTimes | None:
-    """The best hypothesis, if it beats those of the other sense, of other begins, and that of no turn at all."""
+    """The best hypothesis, if it is better than those of the other direction, of other starts, and of no rotation."""
     found, scale = _HYPOTHESES[best], period_s / PERIOD_S
     gain = _gain(N, b, scale * _TIMES[best])
     others = [
@@ -148,12 +149,12 @@ def _decided(
 def _gain(
     N: Float[np.ndarray, "P S S"], b: Float[np.ndarray, "P S"], times: Float[np.ndarray, " S"]
 ) -> Float[np.ndarray, " P"]:
-    """By how much these times lower the squares of each pair's rests."""
+    """Decrease of the sum of squared residuals of each pair by these times."""
     return np.asarray(2 * b @ times - np.einsum("pst,s,t->p", N, times, times))
 
 
 def _z(gain: Float[np.ndarray, " P"]) -> float:
-    """Sum over pairs in standard errors of it; no pair counts for more than three usual ones."""
+    """Sum over pairs in units of its standard error; a pair counts at most like three typical ones."""
     most = _USUAL * np.median(np.abs(gain))
     held = np.clip(gain, -most, most)
     return float(held.sum() / max(held.std(ddof=1) * np.sqrt(len(held)), 1e-9))
@@ -165,7 +166,7 @@ def _systems(
     motion: Mapping[int, Arc],
     times: Float[np.ndarray, " S"],
 ) -> tuple[Float[np.ndarray, "P S S"], Float[np.ndarray, "P S"]]:
-    """Normal equations of the sectors' times, pair by pair, about `times`; motion between the sweeps is left free."""
+    """Normal equations of the sectors' times, pair by pair, about `times`; motion between the sweeps is free."""
     skew = {k: velocity_of(surfaces[k].xyz_m, motion[k]) for pair in pairs for k in pair[:2]}
     moved = {k: surfaces[k].moved(times[_sector(surfaces[k].xyz_m)][:, None] * v) for k, v in skew.items()}
     N, b = np.zeros((len(pairs), _SECTORS, _SECTORS)), np.zeros((len(pairs), _SECTORS))

@@ -46,7 +46,7 @@ class Detections:
     scores: Float32[np.ndarray, " N"]
 
     def at_least(self, min_score: float) -> Detections:
-        """Those with at least this score."""
+        """Detections with at least this score."""
         keep = np.flatnonzero(self.scores >= min_score)
         return Detections(self.boxes_px[keep], [self.classes[i] for i in keep], self.scores[keep])
 
@@ -80,7 +80,7 @@ class SemanticsSource(Protocol):
 
 @runtime_checkable
 class BatchedSource(SemanticsSource, Protocol):
-    """A source of semantics that does several images at once, on an execution provider of ONNX Runtime."""
+    """A source of semantics that processes several images at once, on an execution provider of ONNX Runtime."""
 
     provider: str
 
@@ -90,7 +90,7 @@ class BatchedSource(SemanticsSource, Protocol):
 
 
 class TopicSource:
-    """Semantics that the car logged."""
+    """Semantics from logged topics."""
 
     def __init__(self, topics: TopicSemantics, config: PerceiveConfig) -> None:
         self._table = to_cityscapes(topics.label_set)
@@ -180,7 +180,7 @@ def _sized(image: np.ndarray | None, frame: ImageColumns, scale: float) -> np.nd
 
 
 def _same_aspect(shape: tuple[int, ...], size: tuple[int, int]) -> bool:
-    """Whole-pixel rounding of either side may differ; a crop or another camera may not."""
+    """True if aspect ratios are equal up to rounding to whole pixels; False for a crop or another camera."""
     scale_rows, scale_columns = shape[0] / size[0], shape[1] / size[1]
     return abs(scale_rows - scale_columns) <= max(1 / size[0], 1 / size[1]) * max(scale_rows, scale_columns)
 
@@ -205,7 +205,7 @@ def _logged_detections(frame: ImageColumns, own_classes: Mapping[str, RoadUser])
 @no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True)
 def _majority_of_blocks(labels: np.ndarray) -> np.ndarray:
-    """The most frequent of each 2x2 pixels; the smallest where several are."""
+    """The most frequent label of each 2x2 pixels; the smallest of equally frequent ones."""
     out = np.empty((labels.shape[0] // 2, labels.shape[1] // 2), np.uint8)
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):

@@ -148,7 +148,7 @@ def _join(
     core: np.ndarray,
     parent: np.ndarray,
 ) -> bool:
-    """Unite a core point with those in reach among some of a cell; False if a `witness` of all is united with it."""
+    """Unite a core point with those in reach in a cell; False if `witness`, united with all, is united with it."""
     own = _root(parent, i)
     # Most cells are united with this point already: that costs no look at their points.
     if witness >= 0 and _root(parent, witness) == own:

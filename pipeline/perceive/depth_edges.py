@@ -1,9 +1,9 @@
-"""Depth jumps of a lidar cloud: where the silhouette of a nearer surface ends, and on which side it lies.
+"""Depth jumps of a lidar cloud: the end of a nearer surface's silhouette, and the side of that surface.
 
 Along a ring the beams are close together, so a jump is a sharp edge (EDGE_LEFT, EDGE_RIGHT). Between rings it
-is only an interval, as wide as the rings are apart (EDGE_ABOVE, EDGE_BELOW with `gap_rad`): 0.25 deg on one
-lidar, 2 deg on another. A sweep without rows (a rosette) has neither: there each point looks at its
-neighbours, see `scattered_edges.py`.
+is only an interval with the width of the gap (EDGE_ABOVE, EDGE_BELOW with `gap_rad`): 0.25 deg on one lidar,
+2 deg on another. A sweep without rows (a rosette) has neither; there, each point is compared with its
+neighbours (`scattered_edges.py`).
 
 Source: the foreground range at mid-beam direction is where the silhouette is expected, because the last
 foreground beam lies anywhere between 0 and one beam inside it; jumps as in Levinson, Thrun 2013, "Automatic
@@ -40,7 +40,7 @@ _MIN_RANGE_M = 1.0  # nearer returns are the own vehicle
 
 @dataclass(frozen=True, eq=False)
 class LidarEdges:
-    """Depth jumps, one row each: the columns `lidar_edge_*` of table observations. Whether the sweep has rows."""
+    """Depth jumps, one row each, as in the columns `lidar_edge_*` of table observations; whether the sweep has rows."""
 
     xyz_m: Float32[np.ndarray, "E 3"]
     side: UInt8[np.ndarray, " E"]
@@ -59,7 +59,7 @@ def lidar_edges(
     """Find depth jumps between neighbouring beams of a sweep.
 
     `ring` is the beam number as logged, which need not be a row; without it rows are found from elevations.
-    Only points of a `cluster` make edges between rings, because there the ground alone jumps. A jump must
+    Only points of a `cluster` make edges between rings, because even the ground has jumps there. A jump must
     exceed both `edge_jump_m` and `edge_jump_fraction` of the range.
     """
     aer = to_spherical(xyz_m.astype(np.float64))
@@ -134,7 +134,7 @@ def _jumps_to_row(
     aer: np.ndarray, row: np.ndarray, cluster: np.ndarray, start: np.ndarray, up: int, column_rad: float,
     jump_m: float, jump_fraction: float,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Clustered points, by row and azimuth, and those next to them `up` rows further, where these lie behind."""
+    """Clustered points, by row and azimuth, and the points behind them in the same direction, `up` rows further."""
     here, there = np.empty(len(row), np.int64), np.empty(len(row), np.int64)
     count, rows = 0, len(start) - 1
     after, before_row = 0, -1

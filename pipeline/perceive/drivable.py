@@ -1,8 +1,8 @@
 """Free range of the road in each direction, seen by the radar.
 
-The static returns of a road scene lie on kerbs, rails, walls and parked cars; the asphalt scatters away. The
-free sector of a direction ends at its nearest static return that has neighbours. This geometry is the
-fallback for the paper's weakly supervised network (section 4.2).
+The static returns of a road scene come from kerbs, rails, walls and parked cars; the asphalt reflects away
+from the radar. The free sector of a direction ends at its nearest static return that has neighbours. This
+geometry is the fallback for the paper's weakly supervised network (section 4.2).
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def _supported(points_m: np.ndarray) -> np.ndarray:
 @no_type_check  # keeps the tests' shape checks out of compiled code
 @njit(cache=True)
 def _have_others(xy: np.ndarray, radius: np.ndarray, wanted: int) -> np.ndarray:
-    """Whether more than so many points, itself among them, lie in each one's radius; sorted by x."""
+    """True for points with more than so many points, including itself, within their radius; sorted by x."""
     enough = np.zeros(len(xy), np.bool_)
     for i in range(len(xy)):
         found = 1

@@ -4,7 +4,7 @@ Range rate of a static point in direction u seen from a radar with velocity v: `
 Doppler period if the radar is ambiguous. Wide fields of view resolve that: points at 30 deg to the side see
 13 % less than points ahead, so a wrong multiple of the period does not fit.
 
-The search lies about the direction of travel from the mounting prior, so corner and rear radars need no
+The search is centred on the direction of travel from the mounting prior, so corner and rear radars need no
 special case. Without a prior, or without a result, it widens; at last it ignores odometry and prior, which
 may be wrong.
 
@@ -83,9 +83,10 @@ def radar_motion(
 
     Args:
         range_rate_mps: positive = receding, not ego-compensated.
-        power_db: strong detections are preferred in the search for the velocity; None = all alike.
+        power_db: power; the search for the velocity prefers strong detections; None = equal weights.
         period_mps: range rates are known modulo this; None = unambiguous.
-        travel: where to search; a wrong heading costs time, and is left where the scan contradicts it.
+        travel: centre of the search; a wrong heading only costs time, because the search is widened if the
+            scan contradicts it.
         has_elevation: False leaves elevations out (vertical velocity is then 0, with its prior variance).
 
     Returns:
@@ -122,7 +123,7 @@ def radar_motion(
 
 
 def _directions(xyz: np.ndarray, has_elevation: bool) -> np.ndarray:
-    """Unit vectors; flat ones where elevations mean nothing."""
+    """Unit vectors; horizontal ones if elevations are not measured."""
     xyz = xyz if has_elevation else xyz * [1.0, 1.0, 0.0]
     return xyz / np.linalg.norm(xyz, axis=1, keepdims=True)
 

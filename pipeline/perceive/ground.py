@@ -1,7 +1,7 @@
 """Ground under the vehicle in one lidar sweep: a plane, its points, and the free ground around.
 
 RANSAC uses the lowest point of each cell of a grid over the ground, so that neither the dense rings around
-the vehicle nor walls outvote the road. Then each sector follows the surface outwards, because roads bend and
+the vehicle nor walls dominate the road. Then each sector follows the surface outwards, because roads bend and
 crown. With a point model, RANSAC uses road points only, the surface has no object points, and the drivable
 area ends with the road.
 
@@ -265,7 +265,7 @@ def _walk(height: np.ndarray, start: np.ndarray, sectors: int, bins: int, inlier
 
 
 def _reachable(azimuth: np.ndarray, range_m: np.ndarray, blocks: np.ndarray) -> np.ndarray:
-    """True where nothing that blocks stands nearer in the same direction; the own vehicle does not."""
+    """True for cells without a nearer obstacle in the same direction; the own vehicle is not an obstacle."""
     direction = np.minimum(((azimuth + np.pi) / (2 * np.pi) * _FREE_BINS).astype(np.int32), _FREE_BINS - 1)
     blocks = blocks & (range_m > _NEAR_M)
     limit = _second_nearest(direction, range_m, blocks)

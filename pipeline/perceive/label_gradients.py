@@ -1,9 +1,9 @@
-"""Image gradients across the borders of the labels: they show labels that are displaced, without extrinsics.
+"""Image gradients across the borders of the labels, to find displaced labels without extrinsics.
 
 Gradients of the image are summed along a border with their sign, so that noise cancels. Their size by
-distance from the label's border is largest at the image's own border. Sums are kept by side of the
-foreground: labels that are too wide move the maxima of opposite sides apart, a shift moves them alike. They
-are kept by place too: a wrong scale moves the two ends of the image apart.
+distance from the label's border is largest at the image's own border. There is one sum per side of the
+foreground, because too wide labels move the maxima of opposite sides apart, while a shift moves them equally.
+There is also one sum per region of the image, because a wrong scale moves the two ends of the image apart.
 """
 
 from __future__ import annotations
@@ -31,8 +31,9 @@ _SKY, _BACKDROP, _OBJECT, _GROUND = (10,), (2, 3, 4, 8), (5, 6, 7, 11, 12, 13, 1
 def _foregrounds() -> UInt8[np.ndarray, "256 256"]:
     """Nearer side of a border between labels a (left or above) and b: 1 = a, 2 = b, 0 = not used.
 
-    Not used: two labels of a group, and the ground before walls and plants. There kerbs and shadows lie
-    beside the border: on eight simulated days and the real car they moved the vertical offset by .1 to .6 px.
+    Borders of two labels of a group, and of the ground before walls and plants, are not used. Kerbs and
+    shadows are next to the latter: on eight simulated days and the real car they moved the vertical offset by
+    .1 to .6 px.
     """
     nearer = np.zeros((256, 256), np.uint8)
     for far, near in ((_SKY, _BACKDROP), (_SKY, _OBJECT), (_BACKDROP, _OBJECT), (_GROUND, _OBJECT)):
@@ -62,7 +63,7 @@ def label_gradients(
 
 
 def _borders(labels: np.ndarray) -> np.ndarray:
-    """Places (flat) whose right neighbour has another label; few, and NumPy compares 64 at once."""
+    """Flat indices of pixels whose right neighbour has another label; NumPy compares 64 at once."""
     differs = np.zeros(labels.shape, bool)
     np.not_equal(
         labels[:, REACH_PX : -REACH_PX - 1], labels[:, REACH_PX + 1 : -REACH_PX],

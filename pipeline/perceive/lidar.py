@@ -75,7 +75,7 @@ def _boxes(xyz: np.ndarray, label: np.ndarray, count: int) -> tuple[np.ndarray, 
 def sample_uniformly(xyz_m: Float32[np.ndarray, "N 3"], voxel_m: float) -> Int[np.ndarray, " M"]:
     """Rows of one measured point per voxel, the nearest to the voxel's mean, without the own vehicle.
 
-    Means would lie beside surfaces; a measured point keeps its ring, cluster and reflectivity.
+    A mean of points need not lie on a surface. A measured point does, and keeps its ring, cluster and reflectivity.
     """
     rows = np.flatnonzero(_lengths(xyz_m) > _NEAR_M)
     if not rows.size:
@@ -88,7 +88,7 @@ def sample_uniformly(xyz_m: Float32[np.ndarray, "N 3"], voxel_m: float) -> Int[n
 @no_type_check  # keeps the tests' shape checks out of compiled code
 @njit(cache=True)
 def _nearest_to_means(points: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Row of the point nearest to the mean of each run of points; the first where several are."""
+    """Row of the point nearest to the mean of each run of points; the first of equally near ones."""
     chosen = np.empty(len(start) - 1, np.int64)
     for v in range(len(chosen)):
         begin, end = start[v], start[v + 1]

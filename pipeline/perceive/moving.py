@@ -73,5 +73,5 @@ def _first_of(first: np.ndarray, i: int) -> int:
 
 
 def wrapped(value: np.ndarray, period: float) -> np.ndarray:
-    """The value nearest to zero that differs by whole periods; unchanged where the period is 0."""
+    """The value nearest to zero that differs by whole periods; unchanged if the period is 0."""
     return value - period * np.round(value / period) if period > 0 else value

@@ -1,9 +1,9 @@
 """Depth jumps of a sweep without rows: between each point and its nearest neighbours to the four sides.
 
-A silhouette lies between two neighbours if the nearer one belongs to a standing object and the farther one
-does not belong to it. A neighbour to the left lies left within half as much up or down. The side of the
-silhouette is decided by all neighbours behind it: beside a post's left edge the beam above may miss the post
-too, and is no upper edge.
+A silhouette is between two neighbours if the nearer one belongs to a standing object and the farther one does
+not belong to it. A neighbour counts as left if its vertical distance is at most half of its horizontal one.
+All neighbours behind the silhouette determine its side: at a post's left edge, the beam above may miss the
+post too, but this is not an upper edge.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def jumps_between_neighbours(
     """Jumps in range from clustered points to neighbours that are not of their cluster.
 
     `aer` is azimuth, elevation [rad] and range [m]. Unclustered points make no edges: neighbours differ in
-    elevation, and the ground alone jumps. A jump must exceed `edge_jump_m`, and `edge_jump_fraction` of the
+    elevation, so even the ground has jumps. A jump must exceed `edge_jump_m`, and `edge_jump_fraction` of the
     nearer range.
     """
     if len(aer) <= _NEIGHBOURS:

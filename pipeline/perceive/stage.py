@@ -109,7 +109,7 @@ def _rows(
 
 
 def _turning(task: Task, lidars: Sequence[str]) -> dict[str, Turning]:
-    """How lidars turn whose sweeps have no times, by name."""
+    """Rotation of lidars whose sweeps have no times, by name."""
     rig, found = task.fleet.rig_of(task.partition.vehicle), {}
     for name in lidars:
         moments = joined(task.lake, MOMENTS, task.partition, [name])

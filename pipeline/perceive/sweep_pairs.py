@@ -1,6 +1,6 @@
-"""Motion on the level between two sweeps of a lidar, by what stands upright in both: points to surfaces.
+"""Planar motion between two sweeps of a lidar, from upright surfaces in both: points to surfaces.
 
-Source: Chen, Medioni 1992 (point to plane); a first place by trying ways and turns (Olson 2009).
+Source: Chen, Medioni 1992 (point to plane); the start comes from a grid of distances and rotations (Olson 2009).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _FEWEST: Final = 200
 
 
 class Arc(NamedTuple):
-    """Where the lidar of the later sweep is in the earlier one [m, rad]; or how fast that changes, per second."""
+    """Pose of the lidar of the later sweep in the earlier one [m, rad], or its rate per second."""
 
     x: float
     y: float
@@ -39,7 +39,7 @@ class Arc(NamedTuple):
 
     @property
     def rotation(self) -> Float[np.ndarray, "3 3"]:
-        """Turns the later sweep's axes into the earlier one's."""
+        """Rotation from the later sweep's axes to the earlier one's."""
         c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
         return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
@@ -49,13 +49,13 @@ class Arc(NamedTuple):
         return float(np.hypot(self.x, self.y))
 
     def moved(self, xyz_m: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
-        """Points of the later sweep, in the earlier one."""
+        """Points of the later sweep, in the frame of the earlier one."""
         return np.asarray(xyz_m @ self.rotation.T + [self.x, self.y, 0.0])
 
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """Points of a sweep on upright surfaces; `others` has all that is no road, thinned."""
+    """Points of a sweep on upright surfaces; `others` has all points except the road, thinned."""
 
     xyz_m: Float[np.ndarray, "N 3"]
     normal: Float[np.ndarray, "N 3"]
@@ -63,7 +63,7 @@ class Surfaces:
     tree: cKDTree
 
     def moved(self, by_m: Float[np.ndarray, "N 3"]) -> Surfaces:
-        """With every point elsewhere."""
+        """The surfaces with moved points."""
         xyz_m = self.xyz_m + by_m
         return replace(self, xyz_m=xyz_m, tree=cKDTree(xyz_m))
 
@@ -100,10 +100,10 @@ def surfaces_of(xyz_m: np.ndarray) -> Surfaces:
 def registered(
     surfaces: Mapping[int, Surfaces], pairs: Sequence[tuple[int, int, float]], told: Mapping[int, Arc]
 ) -> list[Arc | None]:
-    """Arc of each pair (earlier, later, seconds between); None where too little stands in both.
+    """Arc of each pair (earlier, later, seconds between); None if the sweeps do not determine it.
 
-    `told` is the motion per second at a sweep, where odometry has it. Without it the best of a grid must stand out:
-    along the rails of a motorway every way is as good.
+    `told` is the motion per second at a sweep, if odometry has it. Without it, the best arc of a grid must be
+    clearly better than others, because along the rails of a motorway all distances fit equally well.
     """
     arcs: list[Arc | None] = []
     before: tuple[int, Arc, float] | None = None
@@ -122,7 +122,7 @@ def registered(
 
 
 def matched(first: Surfaces, last: Surfaces, start: Arc, reach_m: Sequence[float] = _CLOSE_M) -> Matched:
-    """The best arc near a start, by robust least squares, a step for each reach of matches."""
+    """The best arc near a start, by robust least squares, with one step for each matching distance."""
     some = _thinned(np.arange(len(last.xyz_m)), _MOST_POINTS)
     arc = start
     for reach in reach_m:
@@ -144,7 +144,7 @@ def matched(first: Surfaces, last: Surfaces, start: Arc, reach_m: Sequence[float
 
 
 def _coarse(first: Surfaces, last: Surfaces, gap_s: float) -> Arc | None:
-    """The best of a grid of arcs, if those of other ways are clearly worse."""
+    """The best of a grid of arcs, if arcs of other distances are clearly worse."""
     tree, few = cKDTree(_thinned(first.others, _COARSE_OTHERS)), _thinned(last.others, _COARSE_POINTS)
 
     def score(arc: Arc) -> float:

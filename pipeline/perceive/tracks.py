@@ -46,7 +46,7 @@ class ClusterReturns:
 
 @dataclass(frozen=True)
 class EgoMotion:
-    """The radar's own velocity [m/s, radar frame] and yaw rate [rad/s]; None where unknown."""
+    """The radar's own velocity [m/s, radar frame] and yaw rate [rad/s]; None if unknown."""
 
     velocity_mps: tuple[float, float] | None
     yaw_rate_radps: float | None

@@ -1,4 +1,4 @@
-"""Sweeps of spinning lidars that come without a time per point: timed by their azimuth, and moved to the stamp."""
+"""Sweeps of spinning lidars without a time per point: times from azimuths, and points moved to the stamp."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _OF_STAMP: Final = {"begin": 0.0, "middle": 0.5, "end": 1.0}
 
 @runtime_checkable
 class Seen(Protocol):
-    """What this needs of a moment."""
+    """Data of a moment that this module uses."""
 
     @property
     def moment(self) -> int: ...
@@ -46,15 +46,15 @@ class Seen(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Turning:
-    """How a lidar turns, None if nobody tells; and its motion per second in its own axes, by moment."""
+    """A lidar's rotation, None if unknown; and its motion per second in its own axes, by moment."""
 
     turn: BeamTimes | None
     motion: Mapping[int, Arc]
 
     def timed(self, seen: Seen, sweep: Sweep) -> tuple[Sweep, str]:
-        """The sweep with times, at its stamp if its motion is known, and what the manifest counts of it.
+        """The sweep with times, moved to its stamp if its motion is known, and the counts for the manifest.
 
-        The motion is the odometry's, or else that between sweeps; where both lack, a radar's Doppler may move it.
+        The motion is the odometry's, or else that between sweeps. Without both, a radar's Doppler may move it later.
         """
         motion = _told(seen) or self.motion.get(seen.moment)
         stands = motion is not None and motion.way < MOVES_MPS and abs(motion.yaw_rad) < _STANDS_RADPS
@@ -74,7 +74,7 @@ class Turning:
 
 
 def turning_of(sweeps: Iterable[tuple[Seen, Sweep]], told: LidarTurn | None) -> Turning | None:
-    """How a lidar turns, from fleet.toml or from its sweeps; None where they have times, or it does not spin."""
+    """A lidar's rotation, from fleet.toml or from its sweeps; None if they have times, or it does not spin."""
     surfaces, pairs, moves = {}, [], {}
     before: Seen | None = None
     for seen, sweep in sweeps:
@@ -96,7 +96,7 @@ def turning_of(sweeps: Iterable[tuple[Seen, Sweep]], told: LidarTurn | None) -> 
 
 
 def _told(seen: Seen) -> Arc | None:
-    """The odometry's motion; lidars look ahead."""
+    """The odometry's motion; lidars are assumed to look ahead."""
     if seen.ego_speed_mps is None:
         return None
     return Arc(seen.ego_speed_mps, 0.0, seen.ego_yaw_rate_radps or 0.0)
@@ -110,7 +110,7 @@ def _spins(sweep: Sweep) -> bool:
 
 
 def _rows_of(sweep: Sweep) -> UInt16[np.ndarray, " N"] | None:
-    """Rings as they were logged, or the row of each point; points that are not finite are put into row 0."""
+    """Rings as logged, or the row of each point; non-finite points get row 0."""
     if sweep.lidar_ring is not None:
         return sweep.lidar_ring
     xyz = sweep.lidar_xyz_m.astype(np.float64)

@@ -88,7 +88,7 @@ class PairView:
 
 
 def sigmas_of(record: CalibrationRecord) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Sigmas (rotation [rad], origin [m]) of the prior and of the estimate; None where there is none."""
+    """Sigmas (rotation [rad], origin [m]) of the prior and of the estimate; None if there is none."""
     T_prior, T = prior_of(record), transform_of(record)
     prior = None
     if T_prior is not None and record.prior_covariance is not None:
@@ -143,7 +143,7 @@ def pair_view(record: CalibrationRecord) -> PairView:
 
 
 def _certified(record: CalibrationRecord) -> str:
-    """Directions that an accepted record certifies, and its score; empty where it was never judged."""
+    """Directions that an accepted record certifies, and its score; empty if it was never judged."""
     if record.score is None or record.limit_rad is None:
         return ""
     limits = {
@@ -159,7 +159,7 @@ def _certified(record: CalibrationRecord) -> str:
 
 
 def _mounting(record: CalibrationRecord) -> str:
-    """Directions that the record certifies of what is mounted, and how surely; empty where it was never judged."""
+    """Directions of the mounting that the record certifies, with their probability; empty if it was never judged."""
     if record.score is None or record.limit_rad is None:
         return ""
     azimuth, elevation = record.mounting_azimuth_sigma_rad, record.mounting_elevation_sigma_rad
@@ -212,7 +212,7 @@ def answered(views: Sequence[PairView | Answered], poses: Sequence[PoseRow]) -> 
 def answer_for(
     views: Sequence[PairView | Answered], day: str, findings: Sequence[DriftFinding]
 ) -> tuple[str, str]:
-    """The first thing on the page: (good, partly or bad; a sentence) on whether these numbers may go on the car.
+    """The headline of the page: (good, partly or bad; a sentence) on whether these numbers may be used on the car.
 
     Args:
         views: the day's edges, or its sensors.
@@ -276,7 +276,7 @@ def status_sentence(findings: Sequence[DriftFinding], lake: Lake) -> tuple[str, 
 
 
 def clearest_alarm(findings: Sequence[DriftFinding]) -> DriftFinding | None:
-    """The chart on which the vehicle's stored status rests; None where no sensor moved."""
+    """The chart that determines the vehicle's stored status; None if no sensor moved."""
     stored = status_of(findings)
     wanted = (stored.status, stored.sensor, stored.since)
     rests_on = [f for f in findings if stored.since and (f.status, f.moved_sensor, f.start_day) == wanted]

@@ -73,10 +73,10 @@ def write_day_page(
     Args:
         lake: holds calibrations; observations and frames where there shall be pictures.
         fleet_link: relative link to the fleet page; empty = none.
-        pictures: False = none, and none of what is drawn from frames.
-        read: the day's records and the vehicle's findings, where the caller has read them; None = read here.
-        in_use: what `boresight verify` found: the page then answers its question first.
-        files: where `out` is; None = this machine.
+        pictures: False = no pictures, and nothing else that is drawn from frames.
+        read: the day's records and the vehicle's findings, if the caller has read them; None = read here.
+        in_use: result of `boresight verify`, which the page then shows first.
+        files: storage of `out`; None = this machine.
 
     Raises:
         ConfigError: the day has no record of the method.
@@ -140,7 +140,7 @@ def _content(
     drawn, residual_svg, no_pictures = (
         _pictures(lake, partition, of_three, labels, pictures)
         if pictures is not None
-        else ([], "", "this page was asked for without pictures")
+        else ([], "", "this page was requested without pictures")
     )
     if pictures is not None:
         for camera in other_cameras(records, of_three):

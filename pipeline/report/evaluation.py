@@ -1,4 +1,4 @@
-"""The page of `evaluate`: the paper's tables beside its printed numbers, and views like its figures 1 to 4."""
+"""The page of `evaluate`: the paper's tables with its printed numbers, and views like its figures 1 to 4."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _AHEAD_M = 50.0
 
 @dataclass(frozen=True)
 class TableView:
-    """One table; lines of the paper's printed numbers are set apart."""
+    """One table; lines with the paper's printed numbers are marked."""
 
     title: str
     header: Sequence[str]
@@ -42,7 +42,7 @@ class TableView:
 
 @dataclass(frozen=True, eq=False)
 class EvaluatedRun:
-    """One run's errors: by pair azimuth and elevation [deg] and range [m]; and where it puts the reflectors."""
+    """One run's errors, by pair: azimuth and elevation [deg] and range [m]; and its positions of the reflectors."""
 
     label: str
     method: str
@@ -85,9 +85,9 @@ def evaluation_page(
     """HTML of the whole page, no outside resources.
 
     Args:
-        normalised: by method, errors over their own sigmas of all observable DoF; empty where truth is
+        normalised: by method, errors over their own sigmas of all observable DoF; empty if truth is
             positions.
-        notes: where the truth comes from, and what else must be known to read the tables.
+        notes: source of the truth, and other notes on the tables.
     """
     methods = [m for m in _COLOURS if any(r.method == m for r in runs)]
     return render(
@@ -169,11 +169,13 @@ def _setup(run: EvaluatedRun) -> Markup:
         mark = "<circle cx='600' cy='{}' r='5'" if k else "<path d='M600 23l7 12h-14z'"
         plot.parts.append(f"{mark.format(30 + 20 * k)} fill='{colour}'/>")
         plot.text(612.0, 34.0 + 20.0 * k, word)
-    return document(720.0, 490.0, plot.parts, "Reflectors from above, and where prior and result put them")
+    return document(
+        720.0, 490.0, plot.parts, "Reflectors from above, and their positions by prior and result"
+    )
 
 
 def _coverage(normalised: dict[str, np.ndarray]) -> Markup:
-    """Share of errors within k sigma against k, per method; grey: what honest sigmas give."""
+    """Share of errors within k sigma against k, per method; grey: the shares for correct sigmas."""
     plot = Plot(48.0, 16.0, 560.0, 260.0, (0.0, 4.0), (0.0, 1.0))
     plot.frame([(float(k), f"{k}") for k in range(5)], [(q, f"{q:.0%}") for q in (0.0, 0.25, 0.5, 0.75, 1.0)])
     plot.text(328.0, 308.0, "error within this many of its own sigmas", anchor="middle")

@@ -21,7 +21,7 @@ _COLUMNS, _SIGMA_HEIGHT = 3, 272.0  # edges side by side, and the height of a ro
 
 @dataclass(frozen=True, eq=False)
 class SigmaPanel:
-    """One edge of the figure: its title and kind, sigmas of prior and result (None = there is none), what was seen."""
+    """One edge of the figure: title and kind, sigmas of prior and result (None = there is none), observed DoF."""
 
     title: str
     pair: str
@@ -31,7 +31,7 @@ class SigmaPanel:
 
 
 def sigma_figure(panels: Sequence[SigmaPanel]) -> Markup:
-    """Sigma of each DoF beside that of the prior, on a log scale; hollow where the day did not determine it."""
+    """Sigma of each DoF next to that of the prior, on a log scale; hollow if the day did not determine it."""
     parts: list[str] = []
     for place, panel in enumerate(panels):
         left, above = place % _COLUMNS * 410.0, place // _COLUMNS * _SIGMA_HEIGHT

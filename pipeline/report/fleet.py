@@ -1,4 +1,4 @@
-"""What the fleet page says, from table calibrations and table drift: plain values for the template, no HTML."""
+"""Content of the fleet page from tables calibrations and drift: plain values for the template, no HTML."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ class VehicleRow:
     """One vehicle of the table.
 
     Args:
-        sensor: that moved; empty where none did or nobody knows.
-        since: first day after the change; empty where there was none.
-        days: a letter of DAY_LETTERS per day of the table, capital where the day has a page.
-        last_day: the last one with a record; empty where there is none.
-        older: days before those of the table, with their letters.
+        sensor: sensor that moved; empty if none did or it is unknown.
+        since: first day after the change; empty if there was none.
+        days: a letter of DAY_LETTERS per day of the table, capital if the day has a page.
+        last_day: last day with a record; empty if there is none.
+        older: earlier days than those of the table, with their letters.
     """
 
     vehicle: str
@@ -113,7 +113,7 @@ def fleet_rows(
 
 
 def index_row(row: VehicleRow, sentences: dict[str, int], finding: FindingView | None) -> list[Any]:
-    """A vehicle as `templates/fleet.js` reads it; sentences are told once, by their place."""
+    """A vehicle as `templates/fleet.js` reads it; sentences are stored once and referenced by index."""
     stem = page_stem(row.vehicle)
     said = sentences.setdefault(row.sentence, len(sentences))
     change = [finding.kind, finding.motion, finding.sure, finding.charts] if finding is not None else 0
@@ -134,7 +134,7 @@ def index_row(row: VehicleRow, sentences: dict[str, int], finding: FindingView |
 
 
 def finding_views(findings: Mapping[str, Sequence[DriftFinding]]) -> list[FindingView]:
-    """What changed, vehicle by vehicle: RED before YELLOW, the latest change first."""
+    """Changes by vehicle: RED before YELLOW, the latest change first."""
     views = []
     for vehicle, own in findings.items():
         clearest = clearest_alarm(own)
@@ -172,7 +172,7 @@ def _attention(row: VehicleRow | FindingView) -> tuple[int, int, str]:
 
 
 def _letters(window: FleetWindow) -> tuple[Int[np.ndarray, " D"], list[str]]:
-    """Days that any vehicle has a record of, and each vehicle's letters of DAY_LETTERS on them."""
+    """Days with a record of any vehicle, and each vehicle's letters of DAY_LETTERS on them."""
     days, column = np.unique(window.day, return_inverse=True)
     cell = window.owner * len(days) + column
     size = len(window.vehicles) * len(days)

@@ -1,4 +1,4 @@
-"""The page of a whole fleet, and the files beside it that its charts are read from when somebody looks at them."""
+"""The page of a whole fleet, and files next to it with the charts, which are loaded on demand."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ def render_fleet_page(
     pages: Collection[tuple[str, str]],
     truth: Truth | None = None,
 ) -> PurePath:
-    """Write the page, and the files of its charts where the fleet is not small.
+    """Write the page, and the files of its charts unless the fleet is small.
 
     Args:
-        album: where it is, and what it is about.
-        truth: true extrinsics by (vehicle, day) and pair, where a simulated fleet has them.
+        album: location and content of the page.
+        truth: true extrinsics by (vehicle, day) and pair, for a simulated fleet.
     """
     days, rows = fleet_rows(window, verdicts, pages, album.lake)
     views = finding_views(verdicts.findings)
@@ -94,7 +94,7 @@ def _index(
     views: Mapping[str, Any],
     charted: tuple[Sequence[Edge], Iterable[tuple[str, dict[str, Any]]]],
 ) -> dict[str, Any]:
-    """What `templates/fleet.js` is given; `charted`: edges, and each vehicle's charts of them."""
+    """Input of `templates/fleet.js`; `charted`: edges, and each vehicle's charts of them."""
     edges, charts = charted
     sentences: dict[str, int] = {}
     told = [index_row(row, sentences, views.get(row.vehicle)) for row in rows]

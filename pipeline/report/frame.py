@@ -1,4 +1,4 @@
-"""A page about one frame: what a network makes of an abrupt change, as the paper's figure 4."""
+"""A page about one frame: a network's estimate after an abrupt change, like the paper's figure 4."""
 
 from __future__ import annotations
 

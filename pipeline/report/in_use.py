@@ -14,19 +14,19 @@ _MOODS = {"pass": "good", "warn": "partly", "fail": "bad", "inconclusive": "none
 _ANSWERS = {
     "right": ("good", "Yes, as far as it matters"),
     "wrong": ("bad", "No"),
-    "inconclusive": ("partly", "This log cannot tell"),
+    "inconclusive": ("partly", "This log does not decide"),
 }
 
 
 def in_use_view(answer: str, checks: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The page's first screen, from the answer and the checks of `boresight verify`, as its JSON has them."""
+    """The page's first screen, from the answer and the checks in the JSON of `boresight verify`."""
     rows = [_row(check) for check in checks]
     mood, headline = _ANSWERS[answer]
     wrong, unsure = (
         ", ".join(f"{r['pair']} {r['axis']}" for r in rows if r["status"] == status)
         for status in ("fail", "inconclusive")
     )
-    sentences = [f"Wrong: {wrong}."] * bool(wrong) + [f"Not to be told from this log: {unsure}."] * bool(
+    sentences = [f"Wrong: {wrong}."] * bool(wrong) + [f"This log does not determine: {unsure}."] * bool(
         unsure
     )
     explained = " ".join(sentences) or "Every axis that is judged passes."

@@ -1,4 +1,4 @@
-"""The page of `boresight verify-set`: are the calibrations that a data set ships right, and how sure is that?"""
+"""The page of `boresight verify-set`: whether the calibrations that a data set ships are right, with uncertainty."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ def log_set_page(
     """HTML of a judged data set.
 
     Args:
-        name: of the fleet.
+        name: name of the fleet.
         told: summary of the command: counts, sensors, shipped, turns, named, copies.
         shipped: rows of the shipped calibrations.
-        claims: with their verdicts.
+        claims: claims with their verdicts.
     """
     kinds = dict.fromkeys(_kind(s["kind"]) for s in told["sensors"])
     logs = _not_right(shipped)
@@ -45,7 +45,7 @@ def _headline(told: Mapping[str, Any]) -> tuple[str, str, str]:
         if wrong
         else ("partly" if open_ else "good", "No log calls a sensor wrong")
         if right
-        else ("none", "These logs decide nothing")
+        else ("none", "These logs do not decide")
     )
     counts = f"answers about one sensor of one log: {right} right, {wrong} wrong, {open_} undecided."
     named = f" {silent} logs gave no answer at all; they are named below." if silent else ""

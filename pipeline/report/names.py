@@ -1,4 +1,4 @@
-"""File names of pages: readable, and no two alike on any file system."""
+"""File names of pages: readable, and unique on any file system."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ _READABLE = 60  # letters of an odd name that are kept; what a name differs in m
 def page_stem(vehicle: str) -> str:
     """File name of a vehicle's pages, without the ending: the vehicle's name if that is plain.
 
-    Case, accents and signs look alike on some file systems ("Car" and "car", "a b" and "a_b"): such a name
-    gets "~" and a hash of the whole; no plain name has a "~".
+    Some file systems do not distinguish case, accents and signs ("Car" and "car", "a b" and "a_b"). Such a
+    name gets "~" and a hash of the whole name; no plain name has a "~".
     """
     if _PLAIN.fullmatch(vehicle) and not _DEVICES.fullmatch(vehicle):
         return vehicle

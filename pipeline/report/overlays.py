@@ -51,7 +51,7 @@ class Extrinsics:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """One frame with what perception found in it."""
+    """One frame with its features."""
 
     frame: Frame
     observation: Observation
@@ -94,7 +94,7 @@ def front_view(scene: Scene, before: Extrinsics, after: Extrinsics, labels: tupl
 
 
 def whole_view(scene: Scene, state: Extrinsics, label: str) -> Image:
-    """The same with all of the image at one state, for changes so large that halves show different things."""
+    """The whole image at one state, for changes so large that the halves would show different objects."""
     image = _drawn(scene, state)
     _tag(image, label, (14, 34))
     _colour_bar(image)
@@ -130,7 +130,7 @@ def lidar_window(scene: Scene, state: Extrinsics) -> Window:
 def close_up(scene: Scene, state: Extrinsics, window: Window, zoom: int) -> Image:
     """An enlarged window of the image: the sweep as small dots, its depth jumps ringed.
 
-    On a good calibration the dots change colour, and the rings lie, where the picture has a silhouette.
+    With a good calibration, the dots change colour at silhouettes of the image, and the rings are there too.
     """
     camera = camera_of(scene.frame)
     width, height = window.size_px
@@ -150,7 +150,7 @@ def close_up(scene: Scene, state: Extrinsics, window: Window, zoom: int) -> Imag
 
 
 def _drawn(scene: Scene, state: Extrinsics) -> np.ndarray:
-    """The image, dimmed, `_CANVAS_PX` wide, with what lidar and radar saw."""
+    """The image, dimmed, `_CANVAS_PX` wide, with lidar and radar data."""
     scale = _CANVAS_PX / scene.frame.image_width_px
     camera = camera_of(scene.frame).scaled(scale)
     size = (camera.width_px, camera.height_px)
@@ -175,7 +175,7 @@ def _draw(image: np.ndarray, scene: Scene, camera: Camera, scale: float, state: 
 
 
 def _moving_centres(observation: Observation) -> Float[np.ndarray, "N 3"]:
-    """Centres of tracks, or of moving clusters where the drive is too short for tracks."""
+    """Centres of tracks, or of moving clusters if the drive is too short for tracks."""
     if len(observation.radar_track_xyz_m):
         return observation.radar_track_xyz_m.astype(np.float64)
     cluster = np.where(observation.radar_motion == _MOVING, observation.radar_cluster, -1)
@@ -212,7 +212,7 @@ def _range_colours(distance_m: np.ndarray) -> list[list[int]]:
 
 
 def _dimmed(image: np.ndarray, brightness: float = 0.7) -> np.ndarray:
-    """Less colour and an even brightness, so that coloured dots stand out on dusk and snow alike."""
+    """The image with less colour and an even brightness, so that coloured dots are visible both at dusk and on snow."""
     grey = cv2.cvtColor(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR)
     gain = float(np.clip(120 * brightness / max(float(grey.mean()), 1.0), 0.6, 1.8))
     return cv2.addWeighted(image, 0.35 * gain, grey, 0.65 * gain, 0)

@@ -39,7 +39,7 @@ def write_page(path: P, html: str, files: Files | None = None) -> P:
 
 
 def commands(text: str) -> Markup:
-    """HTML of a sentence: what stands between backticks as code, a command of this program with a button to copy it.
+    """HTML of a sentence: text between backticks as code, and a command of this program with a button to copy it.
 
     `templates/fleet.js` does the same to the sentences that it is given.
     """

@@ -24,7 +24,7 @@ _STILL = {".jpg": (cv2.IMWRITE_JPEG_QUALITY, 85), ".png": ()}
 
 
 def between(before: Extrinsics, after: Extrinsics, share: float) -> Extrinsics:
-    """The state on the way from one to the other: share 0 is `before`, 1 is `after`, each pair on its own screw."""
+    """The state between the two: share 0 is `before`, 1 is `after`, with each pair interpolated along its own screw."""
     pairs = zip(vars(before).values(), vars(after).values(), strict=True)
     return Extrinsics(*(exp_se3(share * log_se3(T @ inverse(T_before))) @ T_before for T_before, T in pairs))
 

@@ -30,7 +30,7 @@ class CloseUps:
 
 @dataclass(frozen=True)
 class ScenePictures:
-    """One frame on the page; pictures as data URIs, empty where the frame lacks a sensor that they need."""
+    """One frame on the page; pictures as data URIs, empty if the frame lacks a sensor that they need."""
 
     frame_index: int
     log: str

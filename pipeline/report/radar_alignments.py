@@ -1,4 +1,4 @@
-"""What radars state of their own alignment beside what the day's calibration found, in words."""
+"""Text with the alignment stated by radars next to the day's calibration."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def alignment_lines(row: Mapping[str, Any]) -> list[dict[str, str]]:
 
 
 def _angle(angle_rad: float | None, sigma_rad: float | None) -> str:
-    """As `+0.31 ± 0.05 deg`; empty where there is none."""
+    """As `+0.31 ± 0.05 deg`; empty if there is none."""
     if angle_rad is None:
         return ""
     sigma = "" if sigma_rad is None else f" ± {scaled(sigma_rad, 'rx'):.3f}"

@@ -1,4 +1,4 @@
-"""What pages read from a lake: records, findings, and the frames that are worth a picture."""
+"""Data that pages read from a lake: records, findings, and frames for pictures."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def day_records(lake: Lake, partition: Partition, method: str) -> dict[str, Cali
 
 
 def day_poses(lake: Lake, partition: Partition, records: Mapping[str, CalibrationRecord]) -> list[PoseRow]:
-    """Current poses of a vehicle-day, of the method of its records; none of a rig whose sensors are named by kind."""
+    """Current poses of a vehicle-day, by the method of its records; none for a rig whose sensors are named by kind."""
     methods = {r.method for r in records.values() if {r.parent_frame, r.child_frame} - set(SENSORS)}
     if not methods:
         return []
@@ -72,14 +72,14 @@ def day_poses(lake: Lake, partition: Partition, records: Mapping[str, Calibratio
 def day_alignments(
     lake: Lake, partition: Partition, records: Mapping[str, CalibrationRecord]
 ) -> list[RadarAlignment]:
-    """What radars state of their own alignment on a vehicle-day, beside records of the same method."""
+    """Alignment stated by radars on a vehicle-day, stored with records of the same method."""
     methods = {r.method for r in records.values()}
     found = read_records(lake, RADAR_ALIGNMENTS, RadarAlignment, vehicle=partition.vehicle, day=partition.day)
     return [a for a in current_alignments(found) if a.method in methods]
 
 
 def fleet_records(lake: Lake, method: str, window_days: int) -> list[CalibrationRecord]:
-    """Current records of the last `window_days` days, with what a comparison with the truth asks for."""
+    """Current records of the last `window_days` days, with the columns for a comparison with the truth."""
     last = last_day(lake, CALIBRATIONS)
     if last is None:
         return []
@@ -143,7 +143,7 @@ def names_drawn(drawn: Mapping[str, CalibrationRecord]) -> Chosen | None:
 def other_cameras(
     records: Mapping[str, CalibrationRecord], drawn: Mapping[str, CalibrationRecord]
 ) -> list[str]:
-    """Cameras beside the one that is drawn already, that have an edge with a lidar."""
+    """Cameras with a lidar edge, other than the one that is drawn already."""
     named = [r.parent_frame for r in records.values() if r.pair == "camera_lidar"]
     done = {r.parent_frame for r in drawn.values() if r.pair.startswith("camera")}
     return [name for name in dict.fromkeys(named) if name not in done]
@@ -184,7 +184,7 @@ def spread_observations(lake: Lake, partition: Partition, chosen: Chosen | None 
 
 
 def scene_of(frame: Frame, observation: Observation, config: ReportConfig) -> Scene:
-    """A frame to be drawn, its road users hidden where the fleet wants that."""
+    """A frame to be drawn, with hidden road users if fleet.toml requires it."""
     is_hidden = config.road_users == "hidden"
     return Scene(without_road_users(frame, observation) if is_hidden else frame, observation)
 
@@ -198,7 +198,7 @@ def scenes_among(
     config: ReportConfig,
     sensors: Chosen | None = None,
 ) -> list[Scene]:
-    """Frames with much to see, spread over the given observations with most sensors, read from the lake."""
+    """Frames with much content, spread over the given observations with most sensors, read from the lake."""
     most = max((len(o.sensors) for o in observations), default=0)
     observations = [o for o in observations if len(o.sensors) == most]
     chosen = [observations[i] for i in choose_frames(observations, T_camera_lidar, count)]

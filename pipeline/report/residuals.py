@@ -1,8 +1,8 @@
-"""Agreement of the sensors in each frame, before and after: for the reader, not for the verdict.
+"""Agreement of the sensors in each frame, before and after calibration; shown to readers, not used by the verdict.
 
-A low residual is not accuracy: a calibration can be repeatable, fit best and still be wrong. The verdict
-rests on held-out frames, restarts and sigmas (pipeline.calibrate.verify); these numbers can be checked in the
-pictures.
+A low residual does not prove accuracy: a calibration can be repeatable, have the best fit and still be wrong.
+The verdict depends on held-out frames, restarts and sigmas (pipeline.calibrate.verify). The numbers of this
+module can be compared with the pictures.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _MIN_POINTS = 5  # shares of fewer say nothing
 def frame_residuals(
     observations: Sequence[Observation], states: Sequence[Extrinsics], offsets: Sequence[TimeOffsets] = ()
 ) -> list[dict[str, Float[np.ndarray, " F"]]]:
-    """Measure per state, pair and frame, as in MEASURES; NaN for a frame with too little data.
+    """Measures of MEASURES per state, pair and frame; NaN for a frame with too little data.
 
     `offsets` are the states' time offsets; without them all are 0.
     """
@@ -60,9 +60,9 @@ def frame_residuals(
 
 
 def boundary_distance_px(observation: Observation, only: Sequence[int] = ()) -> Float[np.ndarray, "H W"]:
-    """Distance of each label pixel to the nearest sideways change of label [full-image px], or inf.
+    """Distance of each label pixel to the nearest horizontal change of label [full-image px], or inf.
 
-    `only` are labels of which one must lie at the change; empty = any.
+    One of the labels `only` must be at the change; empty = any label.
     """
     labels = _decode_labels(observation)
     change = np.zeros(labels.shape, bool)
@@ -78,7 +78,7 @@ def boundary_distance_px(observation: Observation, only: Sequence[int] = ()) -> 
 def at_pixels(
     label_map: Float[np.ndarray, "H W"], observation: Observation, uv: Float[np.ndarray, "N 2"]
 ) -> Float[np.ndarray, " N"]:
-    """Values of a map at label size at full-image pixels; the nearest one beyond the border."""
+    """Values of a map of label size, looked up at full-image pixels; outside the image, the nearest value."""
     at = np.round((uv + 0.5) * observation.label_scale - 0.5).astype(int)
     column, row = (np.clip(at[:, k], 0, label_map.shape[1 - k] - 1) for k in (0, 1))
     return label_map[row, column].astype(np.float64)

@@ -1,4 +1,4 @@
-"""The rig from above: where each sensor sits, which way and how wide it looks, and which edges tie it to the others."""
+"""The rig from above: position, orientation and field of view of each sensor, and the edges between sensors."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ class DrawnSensor:
 
     Args:
         T_body_sensor: its pose in axes x forward, y left, z up.
-        width_rad: of its field of view, about where it looks; 2 pi = all around.
+        width_rad: width of its field of view, centred on its line of sight; 2 pi = all around.
         status: accepted, held, refused or none.
-        sentence: what is known of it, beside its name.
+        sentence: text beside its name: the accuracy of its pose.
     """
 
     name: str
@@ -78,7 +78,7 @@ class DrawnEdge:
 
 
 def rig_figure(sensors: Sequence[DrawnSensor], edges: Sequence[DrawnEdge]) -> Markup:
-    """The rig from above, forward up: names and what is known of each sensor left and right of it."""
+    """The rig from above, forward up; the names and sentences of the sensors are on the left and right."""
     height = max(_PICTURE, _ROW * (len(sensors) / 2 + 2)) + _ROW
     place = _places(sensors, height)
     parts = [_view(s, place[s.name]) for s in sorted(sensors, key=lambda s: -s.width_rad)]
@@ -91,7 +91,7 @@ def rig_figure(sensors: Sequence[DrawnSensor], edges: Sequence[DrawnEdge]) -> Ma
 
 
 def rig_of_day(poses: Sequence[PoseRow], records: Iterable[CalibrationRecord]) -> Markup:
-    """The rig by a day's current poses and edges; empty without poses."""
+    """The rig according to a day's current poses and edges; empty without poses."""
     T = {p.sensor: pose for p in poses if (pose := transform_of(p)) is not None}
     by_name = {p.sensor: p for p in poses}
     if len(T) < 2:
@@ -129,7 +129,7 @@ def _upright(kind: str) -> Float[np.ndarray, "4 4"]:
 
 
 def _known(pose: PoseRow) -> str:
-    """How well directions in the sensor are known."""
+    """Text with the accuracy of directions in the sensor."""
     if pose.azimuth_sigma_rad is None or pose.elevation_sigma_rad is None:
         return pose.reason
     azimuth_deg, elevation_deg = np.degrees([pose.azimuth_sigma_rad, pose.elevation_sigma_rad])
@@ -183,7 +183,7 @@ def _dot(sensor: DrawnSensor, place: tuple[float, float]) -> str:
 
 
 def _on_side(sensors: Sequence[DrawnSensor], side: str) -> list[DrawnSensor]:
-    """Half of the sensors for each column, by how far left they sit and look; front ones first."""
+    """Half of the sensors for each column, by their lateral position and line of sight; front ones first."""
     by_left = sorted(sensors, key=lambda s: (-s.at_m[1] - 0.5 * np.sin(s.heading_rad), s.name))
     half = (len(sensors) + 1) // 2
     taken = by_left[:half] if side == "left" else by_left[half:]
@@ -213,7 +213,7 @@ def _column(
 
 
 def _legend(sensors: Sequence[DrawnSensor], height: float) -> list[str]:
-    """Which way is forward, and what colours mean."""
+    """Legend: the forward direction, and the colour of each kind of sensor."""
     kinds = [k for k in _COLOURS if any(s.kind == k for s in sensors)]
     u, parts = _WIDTH / 2 - 34.0 * len(kinds), []
     for kind in kinds:

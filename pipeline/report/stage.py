@@ -28,10 +28,10 @@ class Pages:
     """Inputs of a task of this stage.
 
     Args:
-        truth: of a simulated fleet.
+        truth: truth of a simulated fleet.
         pictures: False = pages without images of public roads.
-        also: vehicle-days that get a page however long ago they were: those that a night ran.
-        fan_out: where pages of days are drawn.
+        also: vehicle-days processed by a night, which get a page at any age.
+        fan_out: executor that draws pages of days.
     """
 
     out: PurePath
@@ -43,7 +43,7 @@ class Pages:
 
 
 def work(task: Task) -> Work:
-    """The page of a vehicle-day, or those of the fleet with all its days, as `Pages` that the task is given says."""
+    """The page of a vehicle-day, or the pages of the fleet and all its days, depending on the task's `Pages`."""
     pages: Pages = task.given
     settings = ({"method": task.method or task.fleet.audit.method, "of": str(task.of)},)
 
@@ -61,10 +61,10 @@ def work(task: Task) -> Work:
 def write_fleet_report(
     lake: Lake, fleet: FleetConfig, pages: Pages, method: str | None = None, *, progress: Progress = silent
 ) -> list[PurePath]:
-    """Write the pages of vehicle-days, in a folder beside the fleet page, then the fleet page, which comes first.
+    """Write the pages of vehicle-days, in a folder next to the fleet page, then the fleet page (returned first).
 
-    A day's page that lies there already, of the same records, is not drawn again. Days are those of the last
-    `audit.window_days`, more of vehicles that drive rarely, and `pages.also`.
+    An existing page of a day is not drawn again for the same records. Days are those of the last
+    `audit.window_days`, more for vehicles that drive rarely, and `pages.also`.
     """
     album = Album(lake, fleet, method or fleet.audit.method, pages.out, pages.files, pages.pictures)
     window = read_window(lake, album.method, fleet.audit.window_days, last_possible_day())
@@ -77,7 +77,7 @@ def write_fleet_report(
 
 
 def _keys_of(album: Album, days: Iterable[Partition]) -> dict[tuple[str, str], list[str]]:
-    """Work keys of vehicle-days that the window does not have."""
+    """Work keys of vehicle-days outside the window."""
     by_day: dict[str, list[str]] = {}
     for partition in days:
         by_day.setdefault(partition.day, []).append(partition.vehicle)

@@ -22,19 +22,19 @@ __all__ = ["TimeOffsets", "as_stamped", "time_offsets_of"]
 
 @dataclass(frozen=True)
 class TimeOffsets:
-    """What to add to a child's stamp to have it on the parent's clock [s]; None = unknown: drawn as taken at once."""
+    """Time [s] to add to a child's stamp to convert it to the parent's clock; None = unknown, drawn as simultaneous."""
 
     camera_lidar_s: float | None = None
     lidar_radar_s: float | None = None
 
     def in_words(self) -> str:
-        """Both in milliseconds; empty where neither is known."""
+        """Text with both offsets in milliseconds; empty if neither is known."""
         known = (("camera", self.camera_lidar_s), ("radar", self.lidar_radar_s))
         return ", ".join(f"{sensor} {1e3 * dt_s:+.0f} ms" for sensor, dt_s in known if dt_s)
 
 
 def time_offsets_of(records: Mapping[str, CalibrationRecord]) -> TimeOffsets:
-    """The estimated offsets of a run, by pair; None where a method or a day gave none."""
+    """The estimated offsets of a run, by pair; None if a method or a day has no estimate."""
     offset_s = {pair: r.time_offset_s for pair, r in records.items()}
     return TimeOffsets(offset_s.get("camera_lidar"), offset_s.get("lidar_radar"))
 
@@ -42,7 +42,7 @@ def time_offsets_of(records: Mapping[str, CalibrationRecord]) -> TimeOffsets:
 def as_stamped(state: Extrinsics, observation: Observation, offsets: TimeOffsets) -> Extrinsics:
     """Transforms between data of one frame, for static objects: poses and the car's motion over the offsets.
 
-    T_camera_radar stays, because it draws moving clusters only.
+    T_camera_radar is not changed, because it is used for moving clusters only.
     """
     v, yaw_rate = _velocity_lidar(state, observation), observation.ego_yaw_rate_radps or 0.0
     camera_gap_s, radar_gap_s = (
@@ -58,7 +58,7 @@ def as_stamped(state: Extrinsics, observation: Observation, offsets: TimeOffsets
 def _way(
     velocity_mps: Float[np.ndarray, " 3"], yaw_rate_radps: float, dt_s: float
 ) -> Float[np.ndarray, "4 4"]:
-    """Where what stands lay dt earlier, in lidar coordinates: p' = Rz(yaw_rate dt) (p + v dt), as in the objective."""
+    """Transform of static points to their lidar coordinates dt earlier, p' = Rz(yaw_rate dt) (p + v dt)."""
     R = exp_so3(np.array([0.0, 0.0, yaw_rate_radps * dt_s]))
     return from_rotation_translation(R, R @ velocity_mps * dt_s)
 

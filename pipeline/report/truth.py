@@ -1,4 +1,4 @@
-"""True extrinsics of a simulated fleet, for the table beside the estimates. Only pages read them, no estimator."""
+"""True extrinsics of a simulated fleet, for the table next to the estimates. Only pages read them, no estimator."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class TruthRow:
 def read_truth(folder: Path) -> Truth:
     """Read `<folder>/<vehicle>/<day>.json`: T_base_sensor, by sensor, as 4x4 lists.
 
-    Of releases before 0.11.0: T_camera_lidar and T_camera_radar.
+    Files of releases before 0.11.0 have T_camera_lidar and T_camera_radar.
 
     Raises:
         ConfigError: the folder holds no such file, or one lacks a transform.
@@ -51,7 +51,7 @@ def read_truth(folder: Path) -> Truth:
         try:
             truth[(path.parent.name, path.stem)] = _poses(json.loads(path.read_text()))
         except (KeyError, ValueError, TypeError, AttributeError) as err:
-            raise ConfigError(str(path), "", f"holds no true extrinsics: {err}") from err
+            raise ConfigError(str(path), "", f"has no true extrinsics: {err}") from err
     if not truth:
         raise ConfigError(str(folder), "truth", "holds no <vehicle>/<day>.json")
     return truth
@@ -67,7 +67,7 @@ def _poses(content: Mapping[str, Any]) -> dict[str, np.ndarray]:
 
 
 def true_transform(truth: Truth, record: CalibrationRecord) -> Float[np.ndarray, "4 4"] | None:
-    """T_parent_child of a record's day; None where it is not known."""
+    """T_parent_child of a record's day; None if it is not known."""
     poses = truth.get((record.vehicle, record.day), {})
     if record.parent_frame not in poses or record.child_frame not in poses:
         return None
@@ -85,13 +85,13 @@ def truth_rows(records: Sequence[CalibrationRecord], truth: Truth) -> list[Truth
 
 
 def truth_summary(rows: Sequence[TruthRow]) -> str:
-    """How many of the determined axes of accepted days lie within three of their sigmas."""
+    """Number of determined axes of accepted days with errors within three of their sigmas."""
     axes = [
         w for r in rows if r.status == "accepted" for w, d in zip(r.within, r.determined, strict=True) if d
     ]
     if not axes:
         return "no accepted estimate"
-    return f"{sum(axes)} of {len(axes)} determined axes lie within three sigmas"
+    return f"{sum(axes)} of {len(axes)} determined axes are within three sigmas"
 
 
 def _row(record: CalibrationRecord, T_true: np.ndarray) -> TruthRow:

@@ -1,4 +1,4 @@
-"""Pages of vehicle-days kept up to date: which are to be drawn, and drawing them, here or by workers."""
+"""Pages of vehicle-days kept up to date: selection of outdated pages, and drawing them, here or by workers."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _DRAWN = "drawn.json"  # of each day's folder: what its pages were drawn from, b
 
 @runtime_checkable
 class FanOut(Protocol):
-    """Runs a function on many items, wherever; ends of items come in any order."""
+    """Runs a function on many items, here or elsewhere; results come in any order."""
 
     def __call__(
         self, function: Callable[[Any, Progress], Any], items: Sequence[Any], progress: Progress
@@ -55,8 +55,8 @@ class Album:
     """The pages of a report's vehicle-days: `LAKE/report/fleet_days/2026-03-01/car-1.html`.
 
     Args:
-        page: the fleet page beside whose folder they lie.
-        files: where it is.
+        page: the fleet page, next to the folder of day pages.
+        files: storage of the fleet page.
         pictures: False = pages without images of public roads.
     """
 
@@ -69,7 +69,7 @@ class Album:
 
     @property
     def folder(self) -> PurePath:
-        """Where the pages are."""
+        """Folder of the pages."""
         return self.page.parent / f"{self.page.stem}_days"
 
     def path(self, vehicle: str, day: str) -> PurePath:
@@ -79,7 +79,7 @@ class Album:
 
 @dataclass(frozen=True)
 class DayJob:
-    """A page to draw: all that a worker needs to know."""
+    """A page to draw, with all inputs of a worker."""
 
     album: Album
     partition: Partition
@@ -96,14 +96,14 @@ def draw_days(
     fan_out: FanOut,
     progress: Progress,
 ) -> dict[tuple[str, str], PurePath]:
-    """Draw the pages that are not there or were drawn from something else; returns all that are there then.
+    """Draw missing pages, and pages drawn from other inputs; returns all pages that exist then.
 
-    What could not be drawn is named in `lake.damage`.
+    `lake.damage` lists pages that could not be drawn.
 
     Args:
-        stamps: what each vehicle-day's page would be drawn from (`stamp_of`).
-        findings: of the last audit, by vehicle.
-        fan_out: where drawing is done.
+        stamps: inputs of each vehicle-day's page (`stamp_of`).
+        findings: findings of the last audit, by vehicle.
+        fan_out: executor that draws the pages.
     """
     by_day: dict[str, dict[str, str]] = {}
     for (vehicle, day), stamp in stamps.items():
@@ -143,7 +143,7 @@ def stamp_of(album: Album, work_keys: Iterable[str], findings: Sequence[DriftFin
 
 
 def _drawn(album: Album, day: str) -> dict[str, str]:
-    """What the day's pages were drawn from, as far as they are there."""
+    """Inputs of the day's existing pages."""
     folder = album.folder / day
     known: dict[str, str] = {}
     with suppress(OSError, ValueError), album.files.opened(folder / _DRAWN) as stream:
@@ -153,7 +153,7 @@ def _drawn(album: Album, day: str) -> dict[str, str]:
 
 
 def _draw(job: DayJob, progress: Progress) -> list[str]:
-    """Draw one page; returns what could not be read for it."""
+    """Draw one page; returns files that could not be read for it."""
     progress(0, 1, str(job))
     album = job.album
     if not job.read.records:  # its file went bad meanwhile: whoever read it has said so

@@ -39,12 +39,12 @@ class FleetWindow:
     """Current records of a method, in order of vehicle, day and edge.
 
     Args:
-        owner: which of them a record is of.
+        owner: vehicle of each record, as an index.
         day: ordinals of the calendar.
-        edges: that any record is of, in order.
-        edge: which of them a record is of.
-        T: T_parent_child; not finite where the day was refused.
-        sigma: of (rotation vector [rad], origin [m]); not finite where the day was refused.
+        edges: edges of all records, in order.
+        edge: edge of each record, as an index.
+        T: T_parent_child; not finite if the day was refused.
+        sigma: sigmas of (rotation vector [rad], origin [m]); not finite if the day was refused.
         observable: per DoF, whether the day determined it.
     """
 
@@ -74,7 +74,7 @@ def read_window(lake: Lake, method: str, window_days: int, latest: str) -> Fleet
 
     Args:
         window_days: days of the calendar.
-        latest: days after it are to come, and left out.
+        latest: last day; later days are in the future, and left out.
     """
     last = last_day(lake, CALIBRATIONS)
     if last is None:
@@ -111,7 +111,7 @@ def _read(
 
 
 def _rare(parts: list[pa.Table]) -> list[str]:
-    """Vehicles of whose days there are too few."""
+    """Vehicles with too few days in the window."""
     keys = pa.concat_tables([part.select(["vehicle", "day"]) for part in parts])
     days = keys.group_by(["vehicle"]).aggregate([("day", "count_distinct")])
     few: list[str] = days.filter(pc.less(days["day_count_distinct"], FEWEST_DAYS))["vehicle"].to_pylist()
@@ -145,7 +145,7 @@ def _window_of(table: pa.Table | None) -> FleetWindow:
 
 
 def _estimates(found: pa.Table) -> tuple[Float[np.ndarray, "N 4 4"], Float[np.ndarray, "N 6"]]:
-    """Poses and the sigmas of what a mechanic can measure; not finite where a record has none."""
+    """Poses and the sigmas of quantities that a mechanic can measure; not finite for records without them."""
     pose = np.stack([found[name].to_numpy() for name in _POSE], axis=1)
     covariance = matrices(found["covariance"])
     is_there = np.isfinite(pose).all(axis=1) & there(found["covariance"])

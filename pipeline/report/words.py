@@ -36,7 +36,7 @@ def scaled(value: float, dof: str) -> float:
 
 
 def with_sigma(value: float, sigma: float, dof: str) -> str:
-    """As `+1.02 ± 0.05 deg`, with as many digits as the sigma deserves."""
+    """As `+1.02 ± 0.05 deg`, with the digits that are significant for this sigma."""
     v, s = scaled(value, dof), scaled(sigma, dof)
     digits = int(np.clip(1 - np.floor(np.log10(max(s, 1e-9))), 1, 4))
     return f"{v:+.{digits}f} ± {s:.{digits}f} {unit_of(dof)}"
@@ -49,14 +49,14 @@ def dof_title(pair: str, dof: str) -> str:
 
 
 def significant_motion(motion: list[float], sigma: list[float]) -> list[int]:
-    """Components of a motion that stand out of their sigma, largest ratio first."""
+    """Components of a motion that exceed their sigma significantly, largest ratio first."""
     ratio = np.abs(motion) / np.maximum(sigma, 1e-12)
     return [int(k) for k in np.argsort(-ratio) if ratio[k] >= _CLEAR_SIGMAS]
 
 
 def motion_in_words(kind: str, motion: list[float], sigma: list[float]) -> str:
-    """As `yaw +1.02 ± 0.05 deg, left +0.031 ± 0.010 m`: what stands out, in the axes of a sensor of this kind."""
+    """Significant components, as `yaw +1.02 ± 0.05 deg, left +0.031 ± 0.010 m`, in axes of this kind of sensor."""
     names = AXIS_NAMES[kind]
     shown = significant_motion(motion, sigma)
     parts = [f"{names[k]} {with_sigma(motion[k], sigma[k], DOF_NAMES[k])}" for k in shown]
-    return ", ".join(parts) or "no single axis stands out"
+    return ", ".join(parts) or "no single axis is significant"

@@ -46,7 +46,7 @@ def edge_of(row: CalibrationRecord | StateRow | DriftFinding) -> Edge:
 
 
 def line_edge(row: FleetModelRow | LineAnswer) -> Edge:
-    """What a row of a model line is about: an edge, or a sensor's pose."""
+    """The edge, or the sensor's pose, that a row of a model line describes."""
     if row.pair != POSE:
         return edge_named(row.pair, row.parent_frame, row.child_frame)
     kinds = [cast("Kind", kind) for kind in row.kinds.split("_")]
@@ -72,7 +72,7 @@ def edge_order(edge: Edge) -> tuple[int, str, str]:
 
 
 def words_of(edge: Edge) -> str:
-    """Text for an edge: its kind if the sensors are named after their kinds, else their names; or of a pose."""
+    """Text for an edge or a pose: an edge's kind if its sensors are named after their kinds, else their names."""
     if isinstance(edge, RigPose):
         return f"{edge.child.name} in {edge.parent.name}"
     return edge.kind if edge == EDGE_OF_PAIR.get(edge.kind) else edge.name

@@ -154,7 +154,7 @@ class RigGraph:
             if unknown:
                 raise ValueError(f"edge {edge.name}: the rig has no {', '.join(unknown)}")
             if ends.count(end) > 1:
-                raise ValueError(f"edge {edge.name} stands twice")
+                raise ValueError(f"edge {edge.name} occurs twice")
 
     def __getitem__(self, name: str) -> Sensor:
         """The sensor with this name; raises KeyError if there is none."""

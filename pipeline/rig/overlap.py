@@ -123,7 +123,7 @@ def _clearness(best_first: Sequence[Overlap], best: int) -> float:
 
 
 def _most_tied(nodes: Sequence[Sensor], edges: Sequence[Edge]) -> Sensor:
-    """The first of the lidars with most edges; without lidars of the radars, then of the cameras."""
+    """The first lidar with the most edges; without lidars the first such radar, then the first such camera."""
     kind = next(k for k in ("lidar", "radar", "camera") if any(n.kind == k for n in nodes))
     return max((n for n in nodes if n.kind == kind), key=lambda n: sum(n in e.sensors for e in edges))
 

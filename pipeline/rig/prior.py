@@ -160,7 +160,7 @@ def transform_of_row(row: Mapping[str, Any]) -> Float[np.ndarray, "4 4"]:
 
 
 def agreed(stars: Iterable[Star]) -> dict[tuple[str, str], Float[np.ndarray, "4 4"]]:
-    """The common star of several, with the first one's numbers; SolveError if a transform changes."""
+    """One star from several equal ones, with the numbers of the first; SolveError if a transform changes."""
     found: dict[tuple[str, str], list[np.ndarray]] = {}
     for ends, T in (item for star in stars for item in star.items()):
         found.setdefault(ends, []).append(T)

@@ -222,7 +222,7 @@ class Rig(Section):
                 raise ValueError(f"{SECTIONS[kind]}.{name}: a sensor's name may have letters, digits and _")
             if name in KINDS and name != kind:
                 raise ValueError(
-                    f"{SECTIONS[kind]}.{name}: {name} stands for something else; rename the {kind}"
+                    f"{SECTIONS[kind]}.{name}: {name} is the name of another kind; rename the {kind}"
                 )
         twice = sorted({name for name in self.sensors if self.sensors.count(name) > 1})
         if twice:
@@ -278,7 +278,7 @@ class Rig(Section):
         ends = [frozenset(edge) for edge in self.edges or ()]
         twice = next((end for end in ends if ends.count(end) > 1), None)
         if twice is not None:
-            raise ValueError(f"edge [{_listed(sorted(twice))}] stands twice")
+            raise ValueError(f"edge [{_listed(sorted(twice))}] occurs twice")
         if self.edges == ():
             raise ValueError("edges is empty: remove it to find edges from overlap")
         return self

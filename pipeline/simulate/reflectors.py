@@ -1,6 +1,6 @@
 """The paper's controlled recording: a standing car and three trihedral corner reflectors on a level lot.
 
-The JSON beside the recording is the input of `boresight evaluate --reflectors`; pipeline/evaluate/picks.py
+The JSON next to the recording is the input of `boresight evaluate --reflectors`; pipeline/evaluate/picks.py
 describes its format. The truth is under `truth`, which evaluate does not read.
 
 Source: paper, section 2.1 (150 frames, positions picked by hand in each sensor's data) and figure 2.

@@ -347,7 +347,7 @@ def create_table(lake: Lake, schema: TableSchema) -> DeltaTable:
 
 
 def set_aside_damaged(lake: Lake, schema: TableSchema) -> list[str]:
-    """Move unreadable files of the table into `_damaged` beside its months; returns their names."""
+    """Move unreadable files of the table into `_damaged` next to its months; returns their names."""
     table = open_table(lake, schema)
     bad = []
     for file in live_files(table) if table is not None else []:

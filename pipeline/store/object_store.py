@@ -97,7 +97,7 @@ class Bucket:
     def replacing(self, key: PurePath) -> Iterator[BinaryIO]:
         """A stream whose content becomes the object when the block ends; on an error the object stays.
 
-        The content goes through a local file, so that readers of the store see the whole object or none.
+        The content is first written to a local file, so that readers of the store see the whole object or none.
         """
         with naming(tempfile.gettempdir()), tempfile.TemporaryFile() as stream:
             yield cast("BinaryIO", stream)

@@ -93,7 +93,7 @@ class Lake:
     """Root of the tables: a folder, or a prefix of a bucket.
 
     Args:
-        migrating: True during migration, when records of an older release exist beside the new ones.
+        migrating: True during migration, when records of an older release exist in addition to the new ones.
         damage: filled while reading: file and reason of everything left out because it is unreadable.
         lost: days and vehicles of the records left out.
     """

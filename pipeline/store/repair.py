@@ -70,7 +70,7 @@ def repair_table(lake: Lake, schema: TableSchema) -> Repaired:
         done.found = (
             done.found or f"{done.files} files that its log does not know, {len(bad)} that cannot be read"
         )
-    done.lost = [words.get(name) or f"{name}: rows about which nothing is known" for name in sorted(bad)]
+    done.lost = [words.get(name) or f"{name}: rows without known content" for name in sorted(bad)]
     return done
 
 

@@ -68,7 +68,7 @@ NEEDED_AXES: Mapping[str, tuple[str, ...]] = {
 def limits_of(pair: str, verify: VerifyConfig, asked_deg: tuple[float, float]) -> dict[str, AxisLimits]:
     """Limits of a pair's axes: azimuth and elevation, and the camera's roll for camera-lidar.
 
-    `asked_deg` are errors of camera-lidar, and of pairs with the radar, that must not go undetected.
+    `asked_deg` are errors of camera-lidar, and of pairs with the radar, that must be detected.
     """
     has_radar = "radar" in pair
     azimuth = verify.radar_limit_deg if has_radar else verify.camera_lidar_limit_deg

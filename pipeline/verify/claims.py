@@ -1,7 +1,8 @@
-"""Claims about a data set that are registered before its logs are asked, and what became of them.
+"""Claims about a data set, registered before its logs are checked, and their outcomes.
 
-A file of claims is registered with its hash, its text and the time before the first log is opened. A registered claim
-stays on the page whatever happens to the file; it counts if no log had been asked and the file is what it was.
+A file of claims is registered with its hash, its text and the time before the first log is opened. A
+registered claim stays on the page even if the file changes or disappears. It counts if no log had been
+checked before and the file is unchanged.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ _OF_TURNS = {"caught": "wrong", "missed": "right", "left open": "undecided"}
 
 
 class _Claim(BaseModel):
-    """Of the looks at a sensor, at least or at most a share has the answer."""
+    """At least or at most a given share of the looks at a sensor has the given answer."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -58,12 +59,12 @@ class _Claim(BaseModel):
 
 
 def register(kept: Path, claims: Path | None, asked_before: int) -> list[dict[str, Any]]:
-    """All registered files; that of this run is added if none was registered at its path before.
+    """All registered files; the file of this run is added if none was registered at its path before.
 
     Args:
-        kept: where they are kept.
+        kept: file in which registered claims are stored.
         claims: file of this run; None = only those of earlier runs.
-        asked_before: number of logs that have been asked already.
+        asked_before: number of logs that have been checked already.
 
     Raises:
         ConfigError: the file of this run cannot be read or holds no valid claims.
@@ -95,7 +96,7 @@ def judged_claims(registered: Sequence[Mapping[str, Any]], looks: Sequence[Look]
 
 
 def _claims(text: str, path: str) -> list[_Claim]:
-    """The claims of a TOML text with [[claims]]; raises ConfigError naming the claim that is not valid."""
+    """The claims of a TOML text with [[claims]]; ConfigError names an invalid claim."""
     try:
         entries = tomllib.loads(text).get("claims")
     except tomllib.TOMLDecodeError as err:
@@ -135,9 +136,12 @@ def _judged(claim: _Claim, looks: Sequence[Look], why_not: str) -> dict[str, Any
 
 
 def _why_not(registered: Mapping[str, Any]) -> str:
-    """Reason why the claims of a file do not count; empty if they do. Of a file that is gone the kept text counts."""
+    """Reason why the claims of a file do not count; empty if they do.
+
+    If the file is missing, the stored text counts.
+    """
     if registered["asked_before"]:
-        return f"registered after {registered['asked_before']} logs had been asked"
+        return f"registered after {registered['asked_before']} logs had been checked"
     file = Path(registered["path"])
     is_same = not file.exists() or hashlib.sha256(file.read_bytes()).hexdigest() == registered["sha256"]
     return "" if is_same else "the file changed after the run began"

@@ -1,7 +1,7 @@
-"""Known faults that are put into a log's captures, to see which ones its answer would pass.
+"""Known faults added to a log's captures, to find those that its answer does not detect.
 
-Not the calibration is wrong then, but what it is checked with.
-A camera's faults are as large as the error that must not go undetected, where they have a size.
+The calibration stays the same, but the data that check it are wrong. A camera's fault, if it has a size, is
+as large as the error that must be detected.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _EVERY = 3  # frames, of which one shows another place
 
 
 def _labels(image: Image, _: Image, asked_rad: float) -> Image | None:
-    """Labels and boxes moved to the right: as if they were of a camera that is turned."""
+    """Labels and boxes moved to the right, like those of a rotated camera."""
     if image.labels_png is None:
         return None
     labels = cv2.imdecode(np.frombuffer(image.labels_png, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -99,13 +99,15 @@ class Fault:
 def faults_of_log(
     sensors: Sequence[Sensor], count: int, identity: str, *, labelled: bool = True
 ) -> list[Fault]:
-    """Faults for a log: sensors and faults take turns over the logs of a set.
+    """Faults for a log: sensors and faults alternate over the logs of a set.
 
     Args:
-        sensors: of the rig.
+        sensors: sensors of the rig.
         count: number of faults.
-        identity: of the log, a hexadecimal number: where in the list of all faults to begin.
-        labelled: whether the log has labels; those that a model makes are not there to be shifted.
+        identity: hexadecimal identity of the log, which determines the first of its faults in the list of
+            all.
+        labelled: whether the log has labels; labels computed by a model are not in the log and cannot be
+            shifted.
     """
     every = [
         Fault(s.name, s.kind, words)
@@ -119,13 +121,13 @@ def faults_of_log(
 
 
 def copy_with_fault(lake: Lake, partition: Partition, fault: Fault, asked_rad: float, target: Lake) -> None:
-    """Copy a vehicle-day's captures with a fault into another lake; perceive reads them there as any others.
+    """Copy a vehicle-day's captures with a fault into another lake, for stage perceive.
 
     Args:
-        lake: with the captures.
+        lake: lake with the captures.
         partition: vehicle-day.
-        fault: to put into them.
-        asked_rad: error that must not go undetected, for faults that have a size.
+        fault: fault to add.
+        asked_rad: error that must be detected, for faults that have a size.
         target: lake without that vehicle-day.
     """
     manifest = read_manifest(lake, MOMENTS, partition)

@@ -64,8 +64,8 @@ class SetSettings:
 
     Args:
         fleet: configuration for one look at a log (`for_one_look`).
-        asked_deg: errors of camera-lidar, and of pairs with the radar, that must not go undetected.
-        sizes: of the turns, as multiples of these errors.
+        asked_deg: errors of camera-lidar, and of pairs with the radar, that must be detected.
+        sizes: sizes of the turns, as multiples of these errors.
         turns: number of turns per log.
         faults: number of faults per log.
         stages: ingest, perceive and calibrate.
@@ -83,7 +83,7 @@ class SetSettings:
 class LogJob:
     """One log, or all logs of a vehicle-day together: identity of their content (hexadecimal), recorded rows.
 
-    `make` writes the log, which is then deleted after its answer; None = it is there.
+    `make` writes the log, which is then deleted after its answer; None = the log exists.
     """
 
     vehicle: str
@@ -136,9 +136,9 @@ def ask_set(
     workers: int | None,
     watch: Callable[[int, int, int, str], None],
 ) -> Iterator[tuple[LogJob, list[SetCheck]]]:
-    """Each log with its rows, in order of completion; rows are committed on the way.
+    """Each log with its rows, in order of completion; rows are committed during the run.
 
-    A log goes on with the turns that it lacks; give those that are complete (`is_complete`) to nobody.
+    Only the turns that a log lacks are checked. Do not pass complete logs (`is_complete`).
     """
     waiting, committed_at = list[SetCheck](), time.monotonic()
     try:
@@ -156,7 +156,7 @@ def ask_set(
 
 
 def ask_log(settings: SetSettings, job: LogJob, progress: Progress) -> list[SetCheck]:
-    """Rows of a log: of the calibration as shipped, and of every turn; those recorded already come first."""
+    """Rows of a log for the calibration as shipped and for every turn; rows recorded earlier come first."""
     fleet = settings.fleet
     if not fleet.knows(job.vehicle):
         why = f"{fleet.file} has no vehicle {job.vehicle!r}"
@@ -202,7 +202,7 @@ def is_complete(settings: SetSettings, job: LogJob) -> bool:
 
 
 def _faults(settings: SetSettings, job: LogJob, rows: Sequence[SetCheck]) -> list[Fault]:
-    """Faults to put into a log, of sensors that its own answer is about or refers to."""
+    """Faults to add to a log, of sensors that its own answer is about or refers to."""
     rig = settings.fleet.rig_of(job.vehicle)
     asked = {r.sensor for r in rows if not r.turn and r.sigma_rad is not None}
     lidars = [n.name for n in rig.nodes if n.kind == "lidar"]
@@ -213,7 +213,7 @@ def _faults(settings: SetSettings, job: LogJob, rows: Sequence[SetCheck]) -> lis
 
 
 def _check_of(row: SetCheck) -> AxisCheck:
-    """What `turns_of_log` reads of a check."""
+    """The part of a check that `turns_of_log` reads."""
     nan = float("nan")
     numbers = (nan, nan, row.limit_rad or nan, row.asked_rad or nan, 0.0, nan)
     return AxisCheck(row.sensor, row.kind, row.axis, row.status, row.reason, *numbers)
@@ -252,7 +252,7 @@ class _Look:
     one_of_each: bool
 
     def rows_with(self, fault: Fault) -> list[SetCheck]:
-        """Rows with a fault in the log's data, which is perceived anew."""
+        """Rows with a fault in the log's data, which is perceived again."""
         with TemporaryDirectory(prefix="boresight-fault-") as folder:
             asked_rad = float(np.radians(self.settings.asked_deg[0]))
             faulty = replace(self.task, lake=Lake.at(folder))
@@ -297,7 +297,7 @@ class _Look:
         return replace(self.prior, nodes=nodes, T={e: T for e, T in self.prior.T.items() if set(e) <= names})
 
     def _base(self, turn: Turn | Fault | None) -> SetCheck:
-        """What all rows of one look share."""
+        """Fields common to all rows of one look."""
         rig = self.task.fleet.vehicle(self.job.vehicle).rig
         about = replace(self.job.row, rig=rig, shipped=_hash_of(self._tied))
         if turn is None:
@@ -312,7 +312,7 @@ def _hash_of_text(text: str) -> str:
 
 
 def _hash_of(prior: RigPrior) -> str:
-    """Of poses to .1 mm and 1e-4: logs that ship the same calibration have the same."""
+    """Hash of poses rounded to .1 mm and 1e-4; logs that ship the same calibration have the same hash."""
     poses = prior.extrinsics().T
     numbers = {name: np.round(T, 4).tolist() for name, T in sorted(poses.items())}
     return _hash_of_text(json.dumps(numbers))

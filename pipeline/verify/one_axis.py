@@ -28,7 +28,7 @@ _Z_SCATTER = 0.3
 
 @dataclass(frozen=True)
 class AxisLimits:
-    """Limits of one axis: error that makes a calibration wrong, and error that must not go undetected [rad].
+    """Limits of one axis: error that makes a calibration wrong, and error that must be detected [rad].
 
     For a pass, an error of `asked_rad` would have failed with probability `confidence`.
     """
@@ -40,7 +40,7 @@ class AxisLimits:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Held-out test of known turns of a log's answer; empty where none was made.
+    """Held-out test of known turns of a log's answer; empty if none was made.
 
     Args:
         z: deviate of the paired test by turn [deg], negative = they prefer the answer.
@@ -169,7 +169,7 @@ def _status(
     if measured and off_rad > limits.limit_rad:
         return "fail", f"{distance}: beyond {_deg(limits.limit_rad)} and beyond chance"
     if power < limits.confidence:
-        seen = f"an error of {_deg(limits.asked_rad)} would have been seen with probability {power:.1%}"
+        seen = f"an error of {_deg(limits.asked_rad)} would have been detected with probability {power:.1%}"
         confirmed = held_out.confirms(float(np.degrees(limits.asked_rad)))
         why = (
             ""

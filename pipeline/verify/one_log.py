@@ -1,4 +1,4 @@
-"""The calibration that a log brings along, and the log's own answer about it."""
+"""The calibration that a log ships, and the log's own answer about it."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def for_one_look(config: FleetConfig, frames: int) -> FleetConfig:
 
 
 def prior_in_use(config: FleetConfig, lake: Lake, partition: Partition) -> RigPrior | None:
-    """The calibration in use; None if there is none: calibrate then refuses the log and gives the reason."""
+    """The calibration in use; None if there is none. Stage calibrate then refuses the log and gives the reason."""
     manifest = perceived(lake, partition)
     if manifest is None:
         return None
@@ -59,17 +59,17 @@ def with_prior(
     prior: RigPrior,
     turned: Mapping[str, np.ndarray] | None = None,
 ) -> FleetConfig:
-    """The configuration with the calibration in use rounded to a grid: its last digits change no result.
+    """The configuration with the calibration in use rounded to a grid, so that its last digits do not change a result.
 
-    A search may end elsewhere if its start differs by less than a measurement can: with starts 3e-8 apart,
-    results were .14 and .09 deg off.
+    A search can have different results for starts that differ by less than any measurement error: for two
+    starts 3e-8 apart, errors were .14 and .09 deg.
 
     Args:
-        config: of the vehicle, whose rig has a pose of every sensor in the prior.
+        config: configuration of the vehicle, whose rig has a pose of every sensor in the prior.
         lake: a local folder, for the file of the prior.
         vehicle: its name.
         prior: the calibration in use.
-        turned: turns 4 4 by sensor, T_sensor_turned, that are put into the calibration on purpose.
+        turned: known turns (4x4, T_sensor_turned) to apply to the calibration, by sensor.
     """
     rig = config.rig_of(vehicle)
     if rig.is_one_of_each and not turned:
@@ -90,7 +90,7 @@ def with_prior(
 def check_sensors(
     records: Sequence[CalibrationRecord], verify: VerifyConfig, asked_deg: tuple[float, float]
 ) -> list[AxisCheck]:
-    """Check one camera, one lidar and one radar as sensors: each by its pair with the lidar, if there is one."""
+    """Check one camera, one lidar and one radar as sensors: each by its pair with the lidar, if there is a lidar."""
     direct = [r for r in records if "lidar" in r.pair] or records
     checks = []
     for record in direct:
@@ -114,10 +114,10 @@ def check_poses(
     Args:
         rows: poses from the log.
         prior: the calibration in use.
-        lacking: sensors of which it has no pose.
-        verify: sizes of errors that matter, and the confidence.
-        asked_deg: errors of camera-lidar, and of pairs with the radar, that must not go undetected.
-        records: of the log's pairs, for their held-out tests of turns.
+        lacking: sensors without a pose in the prior.
+        verify: limits of errors, and the confidence.
+        asked_deg: errors of camera-lidar, and of pairs with the radar, that must be detected.
+        records: records of the log's pairs, for their held-out tests of turns.
     """
     own = [row for row in rows if row.sensor != row.reference]
     known = {row.sensor: None if prior is None else prior.between(row.reference, row.sensor) for row in own}
@@ -139,7 +139,7 @@ def check_poses(
 
 
 def _held_out(row: PoseRow, records: Sequence[CalibrationRecord], verify: VerifyConfig) -> dict[str, HeldOut]:
-    """Held-out test by axis, from a sensor's pairs with lidars; their turns are of the camera or the radar."""
+    """Held-out test by axis, from a sensor's pairs with lidars; the camera or the radar is turned."""
     pair = {"camera": "camera_lidar", "radar": "lidar_radar"}.get(row.kind)
     own = [r for r in records if r.pair == pair and row.sensor in {r.parent_frame, r.child_frame}]
     return {axis: held_out_of(own, verify, axis) for axis in TURN_AXES}

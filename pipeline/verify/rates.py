@@ -1,4 +1,4 @@
-"""Counts of a judged data set: right, wrong, undecided; and which share of known turns was called wrong."""
+"""Counts of a checked data set: right, wrong, undecided; and the share of known turns that were called wrong."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Look:
 
     @property
     def row(self) -> SetCheck:
-        """The row of one axis, for the columns that all axes of a look have in common."""
+        """The row of one axis, to read columns that are the same for all axes of a look."""
         return self.axes[0]
 
     @property
@@ -53,7 +53,7 @@ def looks_of(rows: Iterable[SetCheck]) -> list[Look]:
 
 
 def interval(hits: int, trials: int) -> tuple[float, float]:
-    """Clopper and Pearson's 95 % interval of a rate; of none or all the one-sided one (some 3 / trials wide)."""
+    """Clopper and Pearson's 95 % interval of a rate; one-sided if none or all succeed (about 3 / trials wide)."""
     if not 0 <= hits <= trials or trials < 1:
         raise ValueError(f"{hits} of {trials} is no rate")
     outside = 1 - _CONFIDENCE if hits in {0, trials} else (1 - _CONFIDENCE) / 2
@@ -63,7 +63,7 @@ def interval(hits: int, trials: int) -> tuple[float, float]:
 
 
 def by_sensor(looks: Sequence[Look]) -> list[dict[str, Any]]:
-    """For each sensor of each rig: answers as shipped, medians of each axis, what was read, and what would pass."""
+    """For each sensor of each rig: answers as shipped, medians of each axis, inputs read, and undetected errors."""
     found = []
     shipped = [k for k in looks if not k.row.turn]
     for (rig, sensor), own in _grouped(shipped, lambda k: (k.row.rig, k.row.sensor)):
@@ -80,18 +80,18 @@ def by_sensor(looks: Sequence[Look]) -> list[dict[str, Any]]:
 
 
 def by_shipped(looks: Sequence[Look]) -> list[dict[str, Any]]:
-    """For each distinct calibration that is shipped, and each of its sensors: the answers of its logs."""
+    """For each distinct shipped calibration and each of its sensors: the answers of its logs."""
     grouped = _grouped([k for k in looks if not k.row.turn], lambda k: (k.row.shipped, k.row.sensor))
     return [{"shipped": shipped, "sensor": sensor, **_counts(own)} for (shipped, sensor), own in grouped]
 
 
 def by_turn(looks: Sequence[Look]) -> list[dict[str, Any]]:
-    """For each sensor, axis and size of a turn: how many were called wrong, right or undecided.
+    """For each sensor, axis and size of a turn: numbers of answers wrong, right and undecided.
 
-    `axis_open` of those called right are inconclusive in the turned axis. Sensors that are called wrong as shipped
-    are left out and counted (`left_out`): a turn may lead back to what is
-    right. `stated` is the share that the sigmas as shipped promise to call wrong, `blamed` how many turns made
-    another sensor wrong that was not.
+    `axis_open` is the number of right answers that are inconclusive in the turned axis. Sensors that are
+    wrong as shipped are left out and counted (`left_out`), because a turn may lead back to the right pose.
+    `stated` is the share of wrong answers predicted by the sigmas as shipped. `blamed` is the number of turns
+    after which another sensor became wrong.
     """
     blamed = {
         _log(k)
@@ -121,10 +121,10 @@ def by_turn(looks: Sequence[Look]) -> list[dict[str, Any]]:
 
 
 def by_fault(looks: Sequence[Look]) -> list[dict[str, Any]]:
-    """For each fault and sensor that it touches: how many were called wrong, undecided, or still right.
+    """For each fault and sensor that it affects: numbers of answers wrong, undecided, and still right.
 
-    A camera's fault touches the camera, a lidar's every sensor. Sensors that are called wrong as shipped are left
-    out and counted; `lost` were right as shipped and are not with the fault.
+    A camera's fault affects the camera, a lidar's fault every sensor. Sensors that are wrong as shipped are
+    left out and counted. `lost` is the number of sensors that were right as shipped, but not with the fault.
     """
     found = []
     touched = [
@@ -184,7 +184,7 @@ def _status(look: Look, axis: str) -> str:
 
 
 def _stated(look: Look, axis: str) -> float:
-    """Probability that a turn of this size is called wrong, from the sigma and held-out test as shipped."""
+    """Probability that a turn of this size is called wrong, from the sigma and the held-out test as shipped."""
     check = next((c for c in look.shipped if c.axis == axis), None)
     if (
         check is None

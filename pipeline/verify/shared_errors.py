@@ -1,6 +1,6 @@
-"""What an answer about a shipped calibration was computed from, and how large an error of that alone would pass.
+"""Inputs of an answer about a shipped calibration, and the largest undetected error of each input alone.
 
-A check that reads the same labels and CameraInfo as the estimate errs with it; the page lists these checks.
+A check that uses the same labels and CameraInfo as the estimate has the same errors; the page lists these checks.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ _READS: Final[Mapping[str, tuple[str, ...]]] = {
 
 
 def reads_of(pair: str, edges: Iterable[str], kinds: Mapping[str, str]) -> list[str]:
-    """What the answer about a sensor was computed from.
+    """Inputs of the answer about a sensor.
 
     Args:
         pair: kind of the pair whose limits apply.
-        edges: edges that its pose rests on, as "front-top"; empty = the pair alone.
+        edges: edges that determine its pose, as "front-top"; empty = the pair alone.
         kinds: kind of each sensor by name.
     """
     found = ["_".join(kinds.get(end, end) for end in edge.split("-")) for edge in edges] or [pair]
@@ -39,10 +39,10 @@ def reads_of(pair: str, edges: Iterable[str], kinds: Mapping[str, str]) -> list[
 
 
 def passes_of(record: CalibrationRecord | None, frame: Observation | None) -> dict[str, float]:
-    """By source, the error [rad] that turns a camera and that the log's own checks would not show.
+    """For each source, the error [rad] that rotates a camera without being detected by the log's own checks.
 
     Args:
-        record: of the camera and a lidar; None or without numbers gives nothing.
+        record: record of the camera and a lidar; if it is None or has no numbers, the result is empty.
         frame: any frame of the log, for the scale of its labels.
     """
     d, found = {} if record is None else record.diagnostics, {}

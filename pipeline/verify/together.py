@@ -1,8 +1,8 @@
 """One verdict for all logs that ship the same calibration: the evidence of a vehicle's logs, summed per axis.
 
-Frames of a log are correlated, which its sigma has in it. Logs are not repetitions of each other either: the part
-of a sigma that all logs of a vehicle share (`common_rad`) is not averaged, and where answers scatter by more than
-the rest allows, this scatter is added to every log, so that few sure logs do not outvote the others.
+The correlation of a log's frames is included in its sigma. Logs are not independent either: the part of a
+sigma common to all logs of a vehicle (`common_rad`) is not averaged. If answers scatter by more than the rest
+of their sigmas, this scatter is added to every log, so that a few logs with small sigmas do not dominate.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ __all__ = ["one_verdict_each", "scatter"]
 def one_verdict_each(rows: Sequence[SetCheck], confidence: float) -> list[SetCheck]:
     """Rows of the verdicts over all logs of a vehicle with the same calibration, as shipped and with each turn.
 
-    Only of two logs or more; a turn is judged where every log of the calibration was turned so.
+    There are verdicts for two or more logs only; a turn is judged if it was applied to every log of the calibration.
     """
     groups: dict[tuple[str, ...], list[SetCheck]] = {}
     for r in rows:
@@ -71,7 +71,7 @@ def _row(own: Sequence[SetCheck], c: AxisCheck, used: int, logs: int, answers: M
 
 
 def _together(rows: Sequence[SetCheck], confidence: float) -> tuple[AxisCheck, int]:
-    """Verdict of one axis, and the number of logs whose answers are in it."""
+    """Verdict of one axis, and the number of logs with answers used for it."""
     first = rows[0]
     limits = AxisLimits(first.limit_rad or np.nan, first.asked_rad or np.nan, confidence)
     of = first.sensor, first.kind
@@ -91,7 +91,7 @@ def _together(rows: Sequence[SetCheck], confidence: float) -> tuple[AxisCheck, i
     power = _power(used, w, common, limits, beyond)
     if check.status in {"pass", "warn"} and power < confidence:
         asked = np.degrees(limits.asked_rad)
-        why = f"an error of {asked:.2f} deg would have been seen with probability {power:.1%}"
+        why = f"an error of {asked:.2f} deg would have been detected with probability {power:.1%}"
         check = replace(check, status="inconclusive", reason=f"{check.reason}: {why}")
     return replace(
         check, power=power, shown_rad=check.shown_rad if power >= confidence else float("nan")
@@ -104,7 +104,7 @@ def _says(row: SetCheck) -> bool:
 
 
 def scatter(x: Float[np.ndarray, " L"], v: Float[np.ndarray, " L"]) -> float:
-    """Variance of answers `x` beyond their own variances `v`, by DerSimonian and Laird; 0 where they agree."""
+    """Variance of answers `x` in excess of their own variances `v`, by DerSimonian and Laird; 0 if they agree."""
     w = 1 / v
     q = float(w @ (x - w @ x / w.sum()) ** 2)
     spare = float(w.sum() - (w**2).sum() / w.sum())
@@ -116,7 +116,7 @@ def _power(
 ) -> float:
     """Probability that an error of `asked_rad` would have failed.
 
-    A log that lies many sigmas off counts where its held-out frames confirm it; at least one log must be left.
+    A log with an answer many sigmas off counts only if its held-out frames confirm it; at least one log must count.
     """
     deg = float(np.degrees(limits.asked_rad))
     stays = np.array([_stays(r, limits.asked_rad, deg) for r in rows])
@@ -129,7 +129,7 @@ def _power(
 
 
 def _stays(row: SetCheck, size_rad: float, deg: float) -> float:
-    """Probability that a log's answer would not be held for want of confirmation."""
+    """Probability that a log's answer would not be held for lack of confirmation by held-out frames."""
     said = HeldOut({float(d): z for d, z in row.held_out_z.items()})
     return 1.0 if size_rad < said.agreement * (row.sigma_rad or 0.0) else said.confirms(deg)
 

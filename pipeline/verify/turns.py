@@ -1,4 +1,4 @@
-"""Known turns that are put into a shipped calibration, to see which ones are called wrong."""
+"""Known turns applied to a shipped calibration, to find those that are called wrong."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["Turn", "turns_of_log"]
 
 @dataclass(frozen=True)
 class Turn:
-    """A turn of one sensor about an axis of its own; `kind` is of the pair whose limits apply."""
+    """A turn of one sensor about an axis of its own; `kind` is the kind of pair whose limits apply."""
 
     sensor: str
     kind: str
@@ -36,13 +36,13 @@ class Turn:
 def turns_of_log(
     checks: Sequence[AxisCheck], sizes: Sequence[float], count: int, identity: str
 ) -> list[Turn]:
-    """Turns for a log: every size, axis and sensor in turn over the logs of a set, both signs in the same log.
+    """Turns for a log: sizes, axes and sensors alternate over the logs of a set; a log has both signs of a turn.
 
     Args:
-        checks: of the calibration as shipped.
-        sizes: of the turns, as multiples of the error that must not go undetected.
+        checks: checks of the calibration as shipped.
+        sizes: sizes of the turns, as multiples of the error that must be detected.
         count: number of turns.
-        identity: of the log, a hexadecimal number: where in the list of all turns to begin.
+        identity: hexadecimal identity of the log, which determines the first of its turns in the list of all.
     """
     every = [
         Turn(c.pair, c.kind, axis, sign * round(float(np.degrees(c.asked_rad)) * size, 6))

@@ -52,7 +52,7 @@ def viewpoint(
 
 
 def add_layers(scene: Any, layers: Iterable[Layer], parts: Iterable[str], scale: float = 1.0) -> None:
-    """Draw these parts in an empty scene of open3d, without names, which are no geometry."""
+    """Draw these parts in an empty scene of open3d, except names, which are not geometry."""
     wanted = set(parts)
     for number, layer in enumerate(layers):
         if layer.part in wanted and not isinstance(layer, Name):

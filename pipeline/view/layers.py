@@ -91,7 +91,7 @@ class _Eye:
 
 
 def layers_of(shown: Shown, rig: Rig, T_car: Mapping[str, Float[np.ndarray, "4 4"]]) -> list[Layer]:
-    """Everything of a moment, at these poses T_car_sensor; a sensor without one is left out."""
+    """All layers of a moment, at these poses T_car_sensor; a sensor without a pose is left out."""
     eyes = [
         _eye(n, c, shown, T_car[n]) for n, c in shown.captures.items() if isinstance(c, Image) and n in T_car
     ]
@@ -175,7 +175,7 @@ _EDGES = np.array([(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b).
 
 
 def _boxes(found: SweepFeatures, T: Float[np.ndarray, "4 4"], eyes: list[_Eye]) -> Strokes:
-    """Boxes around the lidar's clusters; those in a camera's road user are highlighted."""
+    """Boxes around the lidar's clusters; clusters inside a camera's box of a road user are highlighted."""
     low, high = found.lidar_cluster_min_m.astype(np.float64), found.lidar_cluster_max_m.astype(np.float64)
     corners = transform_points(T, np.where(_CORNERS, high[:, None], low[:, None]))
     is_user = np.zeros(len(low), bool)

@@ -38,7 +38,7 @@ class Rig:
     def placed(
         self, state: str, turned: str | None = None, axis: str = "yaw", angle_rad: float = 0.0
     ) -> dict[str, Float[np.ndarray, "4 4"]]:
-        """T_car_sensor by sensor, one of them turned about an axis of the car through its own origin."""
+        """T_car_sensor by sensor; one sensor is rotated about an axis of the car through the sensor's origin."""
         placed = {name: self.T_car_reference @ T for name, T in self.poses[state].items()}
         if turned in placed:
             T = placed[turned].copy()
@@ -67,7 +67,7 @@ def count_moments(lake: Lake, partition: Partition) -> int:
 
 
 def read_moment(lake: Lake, partition: Partition, number: int | None = None) -> Shown:
-    """One moment with all its sensors; None = of those with most sensors, one with many road users.
+    """One moment with all its sensors; number None = of the moments with most sensors, one with many road users.
 
     Raises:
         ConfigError: the day has no such moment.
@@ -85,7 +85,7 @@ def read_moment(lake: Lake, partition: Partition, number: int | None = None) -> 
 
 
 def _rich_moment(lake: Lake, partition: Partition) -> int:
-    """Of the moments with most sensors the one with most road users among some that are spread over the day."""
+    """Of some moments with most sensors, spread over the day, the one with most road users."""
     manifest = perceived(lake, partition)
     schema, kind = (MOMENTS, Moment) if manifest is None else (PERCEIVED, Perceived)
     moments: list[Any] = read_rows(lake, schema, partition, kind)

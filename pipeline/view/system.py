@@ -1,6 +1,6 @@
-"""Check for system libraries, Vulkan driver and display, which open3d needs beside its wheel.
+"""Check for system libraries, Vulkan driver and display, which open3d needs in addition to its wheel.
 
-Checked first, because open3d's renderer ends the whole process if one of them is missing.
+The check comes first, because open3d's renderer ends the whole process if one of them is missing.
 """
 
 from __future__ import annotations

@@ -42,7 +42,7 @@ class Viewer:
         self._scene.look_at(*viewpoint(T, cameras), [0, 0, 1])
 
     def press(self, event: Any) -> bool:
-        """Space: prior or calibrated; left, right: the moment before, after. True for these keys."""
+        """Space: switch between prior and calibrated; left, right: previous, next moment. True for these keys."""
         if event.type != gui.KeyEvent.Type.DOWN:
             return False
         if event.key == gui.KeyName.SPACE:

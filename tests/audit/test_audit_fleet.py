@@ -126,7 +126,7 @@ def test_a_knock_so_large_that_every_later_day_is_held_is_still_told(
     )  # fmt: skip
     yaw = next(f for f in audit_fleet(lake, _fleet("v")) if (f.pair, f.dof) == ("lidar_radar", "rz"))
     assert (yaw.status, yaw.start_day, yaw.moved_sensor) == ("RED", "2026-03-04", "radar")
-    assert "rests on days whose calibration was held" in yaw.reason
+    assert "depends on days whose calibration was held" in yaw.reason
 
 
 def test_a_vehicle_that_drives_on_without_estimates_says_so(tmp_path: Path, maker: ModuleType) -> None:

@@ -128,7 +128,7 @@ def test_too_few_days_for_a_chart_still_show_a_knock_and_the_state_is_that_of_af
     rows = states(lake, knocked)
     assert rows["front"].days == days(4, 5)
     assert rows["front"].since == "2026-03-04"
-    assert "lie elsewhere since 2026-03-04" in rows["front"].reason
+    assert "show another pose since 2026-03-04" in rows["front"].reason
     assert np.abs(error(rows["front"], TURN)).max() < 3
     assert rows["left"].days == days(1, 2, 3, 4, 5)
 
@@ -138,7 +138,7 @@ def test_two_days_that_contradict_each_other_make_a_state_as_unsure_as_that(lake
     sigma = np.degrees(np.sqrt(np.diag(rows["left"].covariance)[:3]))
     assert sigma.max() > 0.2  # half a degree lies between them
     assert rows["left"].determined != ["azimuth", "elevation"]
-    assert "its days differ more than they say" in rows["left"].reason
+    assert "its days differ by more than their sigmas" in rows["left"].reason
     assert rows["front"].reason == ""
 
 

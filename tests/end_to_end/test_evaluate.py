@@ -106,7 +106,7 @@ def test_the_picks_that_simulate_wrote_are_read_as_they_are(folder):
         "No pictures: the lake no longer has",
     ):
         assert words in page
-    assert "Are the sigmas honest?" not in page  # positions are no truth for each axis
+    assert "Are the sigmas right?" not in page  # positions are no truth for each axis
     one_file = folder / "one.md"
     path = folder / f"reflectors/{VEHICLE}/{DAY}.json"
     assert boresight("evaluate", "--lake", folder / "lake", "--reflectors", path, "--out", one_file)[0] == 0

@@ -157,4 +157,4 @@ def test_the_page_escapes_names_and_says_when_nobody_states_a_sigma():
     )
     page = comparison_page("<b>a</b>", "b & c", [view], ["a < b"])
     assert "<b>a</b>" not in page
-    assert "neither side states a sigma" in page
+    assert "neither side has a sigma" in page

@@ -68,7 +68,7 @@ def test_logs_that_give_no_answer_are_counted_and_named_and_the_rest_goes_on(rou
     # Four frames decide nothing, and say why.
     assert told["answers"] == {"undecided": 2}
     page = (rough_set / "out" / "set.html").read_text()
-    for word in ("These logs decide nothing", "broken.mcap", "same content as another log", "no calibration"):
+    for word in ("These logs do not decide", "broken.mcap", "same content as another log", "no calibration"):
         assert word in page
     assert {row["answer"] for row in rows_of(rough_set)} == {
         "undecided",

@@ -113,7 +113,7 @@ def test_pages_have_no_outside_resources(fleet: tuple[Lake, Path, Path]) -> None
 
 
 def test_the_truth_table_counts_the_axes_within_three_sigmas(fleet: tuple[Lake, Path, Path]) -> None:
-    found = re.search(r"(\d+) of (\d+) determined axes lie within three sigmas", fleet[1].read_text())
+    found = re.search(r"(\d+) of (\d+) determined axes are within three sigmas", fleet[1].read_text())
     assert found is not None
     assert int(found[2]) == 4 * (6 + 6 + 4)
     assert int(found[1]) >= int(found[2]) - 2

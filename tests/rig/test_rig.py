@@ -114,8 +114,8 @@ def test_who_thinks_in_three_sensors_is_told_where_there_are_more(tmp_path):
     [
         (("lidars.nose", "lidars.front"), "two sensors are called front"),
         (("lidars.nose", "lidar"), "both lidar and lidars"),
-        (("lidars.nose", "lidars.base"), "lidars.base: base stands for something else"),
-        (("lidars.nose", "lidars.radar"), "lidars.radar: radar stands for something else"),
+        (("lidars.nose", "lidars.base"), "lidars.base: base is the name of another kind"),
+        (("lidars.nose", "lidars.radar"), "lidars.radar: radar is the name of another kind"),
         (("lidars.nose", 'lidars."a/b"'), "letters, digits and _"),
         (("/nose/points", "/fl/points"), "/fl/points (points of nose and points of corner_fl)"),
         (("/left/info", "/front/info"), "/front/info (info of front and info of left)"),
@@ -133,7 +133,7 @@ def test_who_thinks_in_three_sensors_is_told_where_there_are_more(tmp_path):
         (('base = "base_link"', 'edges = [["top", "top"]]'), "[top, top]: an edge joins two sensors"),
         (('base = "base_link"', 'edges = [["front", "left"]]'), "cannot be calibrated against each other"),
         (('base = "base_link"', 'edges = [["top", "base"]]'), "no base (set base ="),
-        (('base = "base_link"', 'edges = [["top", "left"], ["left", "top"]]'), "[left, top] stands twice"),
+        (('base = "base_link"', 'edges = [["top", "left"], ["left", "top"]]'), "[left, top] occurs twice"),
         (('base = "base_link"', "edges = []"), "edges is empty"),
         (
             ('base = "base_link"', 'three = ["front", "top", "nose"]'),

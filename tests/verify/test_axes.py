@@ -97,7 +97,7 @@ def test_an_error_that_is_measured_but_does_not_matter_is_a_warning():
 def test_a_log_that_would_not_have_shown_the_error_asked_for_is_inconclusive_and_never_passes():
     azimuth = axes(record(0.0, 0.2))["azimuth"]
     assert azimuth.status == "inconclusive"
-    assert "would have been seen with probability" in azimuth.reason
+    assert "would have been detected with probability" in azimuth.reason
 
 
 def test_a_radars_limits_are_its_own():

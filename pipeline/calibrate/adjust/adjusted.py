@@ -35,14 +35,12 @@ class AdjustmentLimits:
 
 @dataclass(frozen=True, eq=False)
 class AdjustedEdge:
-    """An edge beside the adjusted rig.
+    """An edge, compared with the adjusted rig.
 
     Args:
-        innovation_sigmas: distance from the pose by all other edges in use; None = only the prior
-            checks it.
-        failed: why it is left out; empty = the rig rests on it.
-        doubts: edges one of which is wrong, unknown which: the rig goes on with all but one of
-            them.
+        innovation_sigmas: distance from the pose by all other edges in use; None = only the prior checks it.
+        failed: reason for leaving it out; empty = it is used.
+        doubts: edges of which one, unknown which, is wrong; all but one of them are used.
     """
 
     evidence: EdgeEvidence
@@ -52,7 +50,7 @@ class AdjustedEdge:
 
     @property
     def used(self) -> bool:
-        """Whether the rig rests on it."""
+        """Whether the rig uses it."""
         return not self.failed
 
 
@@ -63,10 +61,10 @@ class AdjustedSensor:
     Degrees of freedom: rotation vector about the reference's axes, then the sensor's origin in them.
 
     Args:
-        determined: 6, bool; the others rest on the prior.
-        rests_on: edges that its pose rests on: without one of them it is less sure.
-        untied: why the day does not determine its pose to the reference; empty = it does.
-        doubts: edges that it rests on, one of which is wrong, unknown which.
+        determined: 6, bool; the other degrees of freedom depend on the prior.
+        rests_on: edges that its pose depends on: without one of them, its covariance is larger.
+        untied: reason why the day does not determine its pose to the reference; empty = it does.
+        doubts: edges that it depends on, of which one, unknown which, is wrong.
     """
 
     observability: np.ndarray
@@ -79,10 +77,10 @@ class AdjustedSensor:
 
 @dataclass(frozen=True, eq=False)
 class AdjustedRig:
-    """Poses and clocks of all sensors, with each edge and each sensor's certainty.
+    """Poses and clocks of all sensors, with the state of each edge and the uncertainty of each sensor.
 
     Args:
-        poses: with the covariance of all at once.
+        poses: all poses, with their joint covariance.
         of_prior: part of that covariance that is the error of the prior.
     """
 
@@ -95,11 +93,11 @@ class AdjustedRig:
     def observability(self, a: str, b: str) -> Float[np.ndarray, " 6"]:
         """Share of each variance of T_a_b (rotation vector in a's axes, b's origin) that the day removed.
 
-        For a rotation it is 1 - posterior/prior, with the other sensors at their poses: a rotated reference
-        is no information on another sensor's rotation. For a position it is the share of the variance that is
-        not the prior's error: a position that the prior determines given the rotation does not count because
-        the day found the rotation. A rotation may be found to a hundredth of the prior and rest on a
-        position.
+        For a rotation it is 1 - posterior/prior, with the other sensors at their poses, because a rotated
+        reference gives no information on another sensor's rotation. For a position it is the share of the
+        variance that is not the prior's error. So a position that only the prior determines, given the
+        rotation, does not count as observed. A rotation may be found to a hundredth of the prior and depend
+        on a position.
         """
         J = change_jacobian(self.poses.between(a, b)) @ self.poses.jacobian_between(a, b)
         variance = np.diag(J @ self.poses.covariance @ J.T)
@@ -108,7 +106,7 @@ class AdjustedRig:
         return np.clip(share, 0.0, 1.0)
 
     def _turns_before(self, a: str, b: str) -> Float[np.ndarray, " 3"]:
-        """Variances of the turn between two sensors by the prior, the others in place [rad^2]."""
+        """Prior variances of the rotation between two sensors, with the others in place [rad^2]."""
         own = [6 * k + i for k, name in enumerate(self.before.order) if name in (a, b) for i in range(6)]
         information = inverse_of_information(self.before.covariance)
         given_others = inverse_of_information(information[np.ix_(own, own)])
@@ -117,5 +115,5 @@ class AdjustedRig:
 
     @property
     def left_out(self) -> tuple[Edge, ...]:
-        """Edges that the rig does not rest on though they had evidence."""
+        """Edges with evidence that the rig does not use."""
         return tuple(e for e, found in self.edges.items() if not found.used)

@@ -31,10 +31,10 @@ __all__ = [
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Where all sensors are, and what was known of them before the day.
+    """Poses and clocks of all sensors, and their prior.
 
     Args:
-        prior: before the day.
+        prior: the prior, before the day.
         biased: sensors whose edges share a bias.
     """
 
@@ -52,12 +52,12 @@ class Rig:
 
     @property
     def unknowns(self) -> int:
-        """Six per sensor and its clock, without the reference's; six per bias."""
+        """Number of unknowns: six per sensor and its clock, without the reference's; six per bias."""
         return 7 * len(self.prior.order) + len(self.biases)
 
     @property
     def prior_covariance(self) -> Float[np.ndarray, "N N"]:
-        """Of all unknowns, around the prior."""
+        """Covariance of all unknowns around the prior."""
         P = np.eye(self.unknowns)
         poses, moving = 6 * len(self.prior.order), 7 * len(self.prior.order)
         P[:poses, :poses] = self.prior.covariance
@@ -65,7 +65,7 @@ class Rig:
         return P
 
     def clock(self, name: str) -> int | None:
-        """Place of a sensor's clock among the unknowns; None = the reference."""
+        """Index of a sensor's clock among the unknowns; None = the reference."""
         order = self.prior.order
         return None if name == self.prior.reference.name else 6 * len(order) + order.index(name)
 
@@ -80,7 +80,7 @@ class Rig:
         return replace(self, poses=replace(poses, T=kept | T, dt_s=dt_s), biases=biases)
 
     def from_prior(self) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, "N N"]]:
-        """Where the rig is, as perturbation of the prior, and its derivative by the unknowns."""
+        """The rig as a perturbation of the prior, and its derivative by the unknowns."""
         order, J = self.prior.order, np.eye(self.unknowns)
         x = np.zeros(self.unknowns)
         for k, name in enumerate(order):
@@ -145,7 +145,7 @@ def equations_at(rig: Rig, evidence: Sequence[EdgeEvidence]) -> Equations:
 
 
 def left_jacobian_inverse(xi: Float[np.ndarray, " 6"]) -> Float[np.ndarray, "6 6"]:
-    """J with log(exp(d) exp(xi)) = xi + J d to first order; exact to 1e-9 for turns below 0.3 rad.
+    """J with log(exp(d) exp(xi)) = xi + J d to first order; exact to 1e-9 for rotations below 0.3 rad.
 
     The series of Bernoulli's numbers (Sola, Deray, Atchuthan 2018, eq. 144, has it in closed form).
     """
@@ -183,7 +183,7 @@ def _linear_edge(rig: Rig, evidence: EdgeEvidence) -> LinearEdge:
 
 
 def _with_own_bias(evidence: EdgeEvidence) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Information and gradient of an edge whose own bias is part of its noise, and that bias's sigma (7 6)."""
+    """Information and gradient of an edge, with its own bias as part of the noise, and that bias's sigma (7 6)."""
     own = _rows_of_seven(_root(evidence.bias.get(EDGE, np.zeros((6, 6)))))
     # (W^-1 + B)^-1 = W (1 + B W)^-1, which also holds where W is singular; its minimum stays where it was.
     follow = np.linalg.inv(np.eye(7) + own @ own.T @ evidence.information)
@@ -192,18 +192,18 @@ def _with_own_bias(evidence: EdgeEvidence) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def _shared(evidence: EdgeEvidence) -> dict[str, np.ndarray]:
-    """How the edge errs (7 6) by one sigma of a sensor's bias: it seems to be turned in its own axes."""
+    """Error of the edge (7 6) due to one sigma of a sensor's bias: an apparent rotation in the sensor's own axes."""
     parent, child = evidence.edge.sensors
     seen = {parent.name: -np.eye(6), child.name: adjoint(evidence.T)}
     return {n: _rows_of_seven(seen[n] @ _root(B)) for n, B in evidence.bias.items() if n != EDGE}
 
 
 def _rows_of_seven(of_pose: np.ndarray) -> np.ndarray:
-    """The same with a row of zeros for the clock."""
+    """The matrix with a row of zeros for the clock."""
     return np.vstack([of_pose, np.zeros((1, 6))])
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:
-    """Symmetric root: edges that state an owner's bias at different sizes still err by it alike."""
+    """Symmetric root, so that errors of edges with different sizes of the same bias remain fully correlated."""
     values, vectors = np.linalg.eigh(covariance)
     return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)

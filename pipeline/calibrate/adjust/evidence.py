@@ -41,7 +41,7 @@ def evidence_of(
     Args:
         prior: that the estimate has in it.
         clock_sigma_s: of the time offset before the day.
-        checks: that the estimate failed beside its own.
+        checks: that the estimate failed in addition to its own.
     """
     information, gradient = np.zeros((7, 7)), np.zeros(7)
     information[:6, :6], gradient[:6], in_weights = _of_pose(estimate, prior)
@@ -98,7 +98,7 @@ def _less(variance: np.ndarray, biases: np.ndarray) -> np.ndarray:
 
 
 def _clock(estimate: PairEstimate, clock_sigma_s: float) -> tuple[float, float]:
-    """Information and gradient of the time offset; none where its sigma is the prior's."""
+    """Information and gradient of the time offset; none if its sigma is the prior's."""
     dt_s, expected_s = estimate.time_offset_s, estimate.time_offset_prior_s
     sigma_s = estimate.time_offset_sigma_s
     if dt_s is None or sigma_s is None or expected_s is None or sigma_s >= _NOTHING * clock_sigma_s:

@@ -2,8 +2,8 @@
 
 Edges that failed a check are left out first: within a cycle, an innovation shows that one edge is wrong, but
 rarely which one. Then the edge with the largest innovation beyond the limit is removed, and the rest is
-solved again. If several edges explain a contradiction about as well, the one that costs the poses least goes,
-and all are named.
+solved again. If several edges explain a contradiction about equally well, the one whose removal loses least
+information is removed, and all are listed.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ def adjust(
     """Solve poses and clocks of all sensors.
 
     Args:
-        prior: where all sensors are, each once; the part that all days err by alike is its `common`.
-        evidence: of edges of the graph, each once.
+        prior: poses of all sensors, each once; its `common` is the part of the errors common to all days.
+        evidence: evidence of edges of the graph, each once.
 
     Raises:
-        ValueError: evidence of an edge that the graph lacks, or twice; a prior that is not of the graph's
-            sensors.
+        ValueError: an edge with evidence is not in the graph, or occurs twice; the prior has other sensors
+            than the graph.
     """
     _check(graph, prior, evidence)
     failed = {e.edge: e.checks for e in evidence if e.checks}
@@ -93,7 +93,7 @@ def _check(graph: RigGraph, prior: Extrinsics, evidence: Sequence[EdgeEvidence])
 
 
 def _solved(rig: Rig, evidence: Sequence[EdgeEvidence]) -> tuple[Rig, Equations]:
-    """The rig that prior and edges agree on, and the equations there."""
+    """The rig at the optimum of prior and edges, and the equations there."""
     for _ in range(_MOST_STEPS):
         equations = equations_at(rig, evidence)
         step = inverse_of_information(equations.H) @ equations.g
@@ -106,7 +106,7 @@ def _solved(rig: Rig, evidence: Sequence[EdgeEvidence]) -> tuple[Rig, Equations]
 def _innovations(
     graph: RigGraph, rig: Rig, equations: Equations, left_out: Sequence[EdgeEvidence]
 ) -> dict[Edge, tuple[float, float]]:
-    """Chi-squared and sigmas of each edge against those in use, where these tie its sensors."""
+    """Chi-squared and sigmas of each edge against the edges in use, if these connect its sensors."""
     found = {}
     in_use = graph.with_edges([e.evidence.edge for e in equations.edges])
     apart = [(e, equations) for e in equations_at(rig, left_out).edges]
@@ -121,7 +121,7 @@ def _innovations(
 def _worst(
     graph: RigGraph, equations: Equations, found: Mapping[Edge, tuple[float, float]], limits: AdjustmentLimits
 ) -> tuple[Edge, tuple[Edge, ...], float] | None:
-    """Edge to leave out, indistinguishable ones, and its sigmas; None if none contradicts the others."""
+    """Edge to leave out, equally suspect edges, and its sigmas; None if no edge contradicts the others."""
     tested = {e.evidence.edge: e for e in equations.edges if e.evidence.edge in found}
     if not tested:
         return None
@@ -147,7 +147,7 @@ def _left(equations: Equations, edge: LinearEdge) -> float:
 def _contradiction(edge: Edge, rivals: Collection[Edge], sigmas: float) -> FailedCheck:
     others = "" if not rivals else f", or {', '.join(e.name for e in rivals)} is wrong"
     return FailedCheck(
-        f"{edge.name} contradicts what the other edges say of it by {sigmas:.1f} sigmas{others}",
+        f"{edge.name} contradicts the other edges by {sigmas:.1f} sigmas{others}",
         "witnesses_disagree",
     )
 
@@ -182,7 +182,7 @@ def _concluded(
 
 
 def _rests_on(equations: Equations, C: Float[np.ndarray, "N N"], sensors: int) -> list[dict[Edge, float]]:
-    """By sensor, largest growth of its pose's variance without each edge, over all axes."""
+    """For each sensor, the largest growth over all axes of its pose's variance without each edge."""
     found: list[dict[Edge, float]] = [{} for _ in range(sensors)]
     for edge in equations.edges:
         without = inverse_of_information(equations.without(edge).H)
@@ -193,7 +193,7 @@ def _rests_on(equations: Equations, C: Float[np.ndarray, "N N"], sensors: int) -
 
 
 def _untied(graph: RigGraph, sensor: Sensor, used: Sequence[Edge]) -> str:
-    """Why nothing ties a sensor to the reference; empty where an edge in use does."""
+    """Reason why no edge connects a sensor to the reference; empty if an edge in use does."""
     in_use = graph.with_edges(used)
     if in_use.path(graph.reference, sensor) is not None:
         return ""

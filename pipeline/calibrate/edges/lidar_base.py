@@ -1,10 +1,11 @@
 """Edge lidar-base: mounting of a lidar on the car, from the road under it and its direction of travel.
 
 The road determines roll, pitch and height. The direction of travel determines yaw, and pitch more sharply,
-because the rear axle follows the road. Both are means over scenes, so slopes, bends and bumps cancel; nodding
-and leaning under acceleration are fitted with the acceleration. x and y have no information. Base is thus the
-frame of road and wheels: z up from the road, x along straight driving. A frame fixed to the body differs by
-the car's stance (load, springs) and rolling direction (toe); `STANCE` is the size of this difference.
+because the rear axle follows the road. Both are means over scenes, so slopes, bends and bumps cancel. Pitch
+and roll of the body under acceleration are fitted as functions of the acceleration. x and y have no
+information. Base is thus the frame of road and wheels: z up from the road, x along straight driving. A frame
+fixed to the body differs by the car's stance (load, springs) and rolling direction (toe); `STANCE` is the
+size of this difference.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ class _Shown:
     height: Regression | None
 
     def axis(self, name: str) -> tuple[float, float] | None:
-        """Change of an axis that the data ask for, and its variance."""
+        """Change of an axis estimated from the data, and its variance."""
         if name != "pitch":
             one = getattr(self, name)
             return None if one is None else (one.value[0], one.covariance[0, 0])
@@ -83,14 +84,14 @@ def estimate_lidar_base(
     road_z_m: float = 0.0,
     height_m: tuple[float, float] | None = None,
 ) -> EdgeEvidence:
-    """What a day shows of T_lidar_base.
+    """Evidence of a day on T_lidar_base.
 
     Args:
         ego: motion of the base at these moments.
-        T_base_lidar: the start; nothing of it enters the information.
-        T_base_lidar_deskewed: pose by which sweeps were de-skewed; None = the start.
-        road_z_m: where the road lies in axes of the base: 0 for one on the ground.
-        height_m: the lidar's height over the road as somebody measured it, and the sigma of that.
+        T_base_lidar: the start; it does not contribute to the information.
+        T_base_lidar_deskewed: pose with which sweeps were de-skewed; None = the start.
+        road_z_m: height of the road in axes of the base; 0 for a base on the ground.
+        height_m: the lidar's measured height over the road, and its sigma.
     """
     assumed = T_base_lidar if T_base_lidar_deskewed is None else T_base_lidar_deskewed
     T, travel, roads, shown = _solved(sweeps, ego, T_base_lidar, assumed, scenes, road_z_m)
@@ -120,7 +121,7 @@ def _solved(
     scenes: Scenes,
     road_z_m: float,
 ) -> tuple[np.ndarray, SweepTravel, RoadUnder, _Shown]:
-    """Pose by road and direction of travel, and their evidence there."""
+    """Pose from road and direction of travel, and their evidence there."""
     start = T
     skewed = ego.at_sensor(assumed)
     travel = sweep_travel(deskewed_again(sweeps, skewed, ego.at_sensor(T)), ego, T)
@@ -137,7 +138,7 @@ def _solved(
 
 
 def _shown(travel: SweepTravel, roads: RoadUnder, ego: EgoMotion, scenes: Scenes, road_z_m: float) -> _Shown:
-    """Regressions on nodding, leaning and turning; signs are those of the pose's change."""
+    """Regressions on longitudinal and lateral acceleration and curvature; signs are those of the pose's change."""
     azimuth, elevation = travel.angles_rad.T
     one, free = np.ones(len(azimuth)), np.inf
     block, sigma = travel.bend, 1 / np.minimum(travel.way_m, _LONGEST_WAY_M)
@@ -157,7 +158,7 @@ def _shown(travel: SweepTravel, roads: RoadUnder, ego: EgoMotion, scenes: Scenes
 
 
 def _moved(T: np.ndarray, change: Sequence[float]) -> np.ndarray:
-    """The pose with the lidar turned about its own origin, and lifted by the last number [m]."""
+    """The pose with the lidar rotated about its own origin, and lifted by the last number [m]."""
     return from_rotation_translation(
         exp_so3(np.array(change[:3])) @ T[:3, :3], T[:3, 3] + [0.0, 0.0, change[3]]
     )
@@ -170,7 +171,7 @@ def _angle(a: np.ndarray, b: np.ndarray) -> float:
 def _with_measured(
     change: float, variance: float, off_m: float, sigma_m: float
 ) -> tuple[float, float, list[FailedCheck]]:
-    """The height by the road and a measured one together."""
+    """The height from the road combined with a measured one."""
     if not np.isfinite(variance):
         return off_m, sigma_m**2, []
     apart = abs(off_m - change) / np.sqrt(variance + sigma_m**2 + STANCE[3] ** 2 + _RANGES_M**2)
@@ -234,6 +235,6 @@ def _numbers(travel: SweepTravel, roads: RoadUnder, shown: _Shown) -> dict[str, 
 
 def _notes(variance: np.ndarray) -> tuple[str, ...]:
     missing = [name for name, v in zip(_AXES, variance, strict=True) if not np.isfinite(v)]
-    why = {"yaw": "no pair of sweeps shows the way driven"}
+    why = {"yaw": "no pair of sweeps determines the motion"}
     notes = [f"{name} to the base: {why.get(name, 'too little road is seen')}" for name in missing]
-    return (*notes, "x, y to the base: neither road nor way shows them")
+    return (*notes, "x, y to the base: neither road nor motion determines them")

@@ -61,9 +61,10 @@ class LidarPair:
     """Two lidars' sweeps of the same moments.
 
     Args:
-        T_base_parent: of the parent on the car, good to a degree: gives the directions up and ahead.
-        deskewed: T_base_sensor by which sweeps of parent and child were de-skewed.
-        base_sigma_rad: of T_base_parent: de-skewing goes along it.
+        T_base_parent: pose of the parent on the car, accurate to a degree; defines the directions up and
+            ahead.
+        deskewed: T_base_sensor with which sweeps of parent and child were de-skewed.
+        base_sigma_rad: sigma of T_base_parent, which affects de-skewing.
     """
 
     parent: Sequence[Sweep]
@@ -75,7 +76,7 @@ class LidarPair:
 
 @dataclass(frozen=True, eq=False)
 class _Moment:
-    """In axes of the base: the parent's surfaces, the child's points by the start, and the car's motion."""
+    """The parent's surfaces, the child's points at the start, and the car's motion, all in axes of the base."""
 
     surfaces: Surfaces
     points_m: np.ndarray
@@ -86,7 +87,7 @@ class _Moment:
 
 @dataclass(frozen=True, eq=False)
 class _End:
-    """Where a start led: turn and shift of the child in axes of the base, its clock, and the moments' equations."""
+    """Result of one start: rotation and shift of the child in base axes, its clock, and the moments' equations."""
 
     X: np.ndarray
     dt_s: float
@@ -99,7 +100,7 @@ class _End:
 def estimate_lidar_lidar(
     edge: Edge, pair: LidarPair, ego: EgoMotion, T_parent_child: Float[np.ndarray, "4 4"], scenes: Scenes
 ) -> EdgeEvidence:
-    """Evidence of T_parent_child and the child's clock, from a start good to 5 deg and a metre.
+    """Evidence on T_parent_child and the child's clock, from a start accurate to 5 deg and a metre.
 
     Raises:
         SolveError: too few moments with overlap.
@@ -125,7 +126,7 @@ def estimate_lidar_lidar(
 
 
 def _moments(pair: LidarPair, ego: EgoMotion, T_parent_child: np.ndarray, scenes: Scenes) -> list[_Moment]:
-    """At most thirty, spread over the day's scenes."""
+    """At most thirty moments, spread over the day's scenes."""
     A = pair.T_base_parent
     parents = deskewed_again(pair.parent, ego.at_sensor(pair.deskewed[0]), ego.at_sensor(A))
     children = deskewed_again(pair.child, ego.at_sensor(pair.deskewed[1]), ego.at_sensor(A @ T_parent_child))
@@ -158,14 +159,14 @@ def _chosen(pair: LidarPair, scenes: Scenes) -> list[int]:
 
 
 def _standing(sweep: Sweep, T_base_lidar: np.ndarray, most: int, speed_mps: float) -> np.ndarray:
-    """Some points in axes of the base; on motorways without vehicles: one that drives by is another clock."""
+    """Some points in axes of the base; on motorways without vehicles, because passing ones shift the clock."""
     keep = ~sweep.may_move if speed_mps > _MOTORWAY_MPS else np.ones(len(sweep.xyz_m), bool)
     xyz_m = sweep.xyz_m[keep]
     return transform_points(T_base_lidar, xyz_m[:: max(1, -(-len(xyz_m) // most))])
 
 
 def _climbed(moments: Sequence[_Moment], turn_rad: float) -> _End:
-    """From the start, turned about the vertical, down through all gates."""
+    """Registration from the start, rotated about the vertical, with decreasing gates."""
     X, dt = from_rotation_translation(exp_so3(np.array([0.0, 0.0, turn_rad])), np.zeros(3)), 0.0
     # Nothing holds a direction that the scenes do not show but a damping that never decides between ends.
     damped = np.diag(_UNITS**2) * 1e-3
@@ -200,14 +201,14 @@ def _equations(moments: Sequence[_Moment], X: np.ndarray, dt_s: float, gate_m: f
 
 
 def _other_ends(ends: Sequence[_End]) -> tuple[FailedCheck, ...]:
-    """Whether another start leads elsewhere, and as well."""
+    """Whether another start leads to a different pose with an equally good fit."""
     best = ends[0]
     apart = [
         other
         for other in ends[1:]
         if rotation_angle_rad(inverse(best.X) @ other.X) > _APART_RAD and other.share > _NEARLY * best.share
     ]
-    told = "another start leads to another pose, on which as many points lie"
+    told = "another start leads to another pose with as many matching points"
     return (FailedCheck(told, "witnesses_disagree"),) if apart else ()
 
 
@@ -243,5 +244,7 @@ def _evidence(end: _End, blocks: np.ndarray, A: np.ndarray) -> tuple[np.ndarray,
 
 def _notes(information: np.ndarray) -> tuple[str, ...]:
     return (
-        () if information[6, 6] > 1.0 else ("clocks of both lidars: the car drives too slowly to show them",)
+        ()
+        if information[6, 6] > 1.0
+        else ("clocks of both lidars: the car drives too slowly to determine them",)
     )

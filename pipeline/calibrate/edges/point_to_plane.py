@@ -1,7 +1,7 @@
 """Registration of a sampled cloud to the surfaces of another: point to plane, robust, from a near start.
 
-Ground and ceilings constrain height and tilt only: their noisy normals hold points at the start, which on an
-empty square looks like information along the way.
+Ground and ceilings constrain height and tilt only. Otherwise their noisy normals would keep points at the
+start, which looks like information on horizontal motion on an empty square.
 
 Source: Chen and Medioni 1992, "Object modelling by registration of multiple range images"; Geman-McClure
 weights with a scale that follows the residuals.
@@ -43,7 +43,7 @@ class Surfaces:
 
     @classmethod
     def of(cls, xyz_m: Float[np.ndarray, "N 3"]) -> Surfaces | None:
-        """The surfaces of a cloud; None of one with hardly any points."""
+        """The surfaces of a cloud; None for a cloud with too few points."""
         return cls(xyz_m) if len(xyz_m) >= _FEWEST else None
 
 
@@ -75,11 +75,12 @@ def register(
     """Find T_target_source.
 
     Args:
-        sigmas: of the start, for left perturbations: what no surface holds stays there.
-        gates_m: points further from all others stand for nothing; one round for each.
+        sigmas: sigmas of the start, for left perturbations; directions that no surface constrains stay at the
+            start.
+        gates_m: points farther than this from all others are not used; one round for each gate.
 
     Returns:
-        None where hardly any point meets a surface.
+        None if hardly any point meets a surface.
     """
     T, held = start, np.diag(sigmas**-2.0)
     found = None
@@ -99,7 +100,7 @@ def register(
 def plane_equations(
     moved_m: Float[np.ndarray, "N 3"], target: Surfaces, gate_m: float
 ) -> PlaneEquations | None:
-    """Robust equations of the points that meet a plane within the gate; None of hardly any."""
+    """Robust equations of the points with a plane within the gate; None if there are too few."""
     distance, index = target.tree.query(moved_m, distance_upper_bound=gate_m)
     meets = np.isfinite(distance)
     meets[meets] = target.is_planar[index[meets]]

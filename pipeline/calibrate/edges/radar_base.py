@@ -1,11 +1,12 @@
-"""Edge radar-base: how a radar stands on the car, by its own velocity against the way that the car drives.
+"""Edge radar-base: mounting of a radar on the car, from its own velocity and the car's direction of travel.
 
-Straight on, the way is the base's x axis: its azimuth in radar axes is yaw. In turns a radar ahead of the
-rear axle goes sideways by the yaw rate times its lever arm; that and the slip of the axle are one slope over
-curvature, so x stays without information: no log separates them. Pitch needs elevations, and least squares
-on them is pulled towards their mean; the velocities of `objective/radar/travel`, which a lidar with the same
-view mends, show it, and a radar that shares its view with none has no pitch. Roll and position turn or shift
-nothing of the way. Changes of speed show the clock. The motion must be of other sources than this radar.
+In straight driving, the direction of travel is the base's x axis, and its azimuth in radar axes is yaw. In
+turns, a radar ahead of the rear axle moves sideways by the yaw rate times its lever arm. This and the slip of
+the axle have one common slope over curvature. No log separates them, so x has no information. Pitch needs
+elevations, but least squares on them is biased towards their mean. The velocities of
+`objective/radar/travel`, corrected by a lidar with the same view, determine pitch; a radar without a view in
+common with a lidar has no pitch. Roll and position do not affect the direction of travel. Changes of speed
+determine the clock. The motion must come from sources other than this radar.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ _PASSES = 3
 
 @dataclass(frozen=True, eq=False)
 class Stamps:
-    """When moments and a radar's scans were: each by its own clock; and the drives."""
+    """Times of moments and of a radar's scans, each by its own clock, and the drives."""
 
     moment_ns: np.ndarray  # F
     scan_ns: np.ndarray  # F
@@ -59,12 +60,13 @@ def estimate_radar_base(
     scenes: Scenes,
     directions: TravelDirections | None = None,
 ) -> EdgeEvidence:
-    """What a day shows of T_radar_base and of the base's clock.
+    """Evidence of a day on T_radar_base and on the base's clock.
 
     Args:
-        radar: its Doppler, and the start; nothing of its rotation enters the information.
-        ego: motion of the base at the same moments, by other sources.
-        directions: velocities by a lidar's elevations; None of a radar that shares its view with none.
+        radar: its Doppler, and the start, whose rotation does not contribute to the information.
+        ego: motion of the base at the same moments, from other sources.
+        directions: velocities corrected by a lidar's elevations; None for a radar without a view in common
+            with a lidar.
     """
     T = radar.T_base_radar
     for _ in range(_PASSES):
@@ -120,7 +122,7 @@ def _by_doppler(
 
 
 def _pitch(directions: TravelDirections, T: np.ndarray, scenes: Scenes) -> Regression | None:
-    """Change of pitch that lays the velocities into the base's level."""
+    """Change of pitch that makes the velocities level in the base."""
     v = directions.velocity_mps @ T[:3, :3].T
     elevation = np.arctan2(v[:, 2], np.hypot(v[:, 0], v[:, 1])) * np.copysign(1.0, v[:, 0])
     return regress(
@@ -130,14 +132,14 @@ def _pitch(directions: TravelDirections, T: np.ndarray, scenes: Scenes) -> Regre
 
 
 def _bends(ego: EgoMotion, stamps: Stamps) -> Int64[np.ndarray, " F"]:
-    """Block of each moment, by the way driven."""
+    """Block of each moment, by the distance driven."""
     gap_s = np.diff(stamps.moment_ns, prepend=stamps.moment_ns[:1]) * 1e-9
     way_m = np.abs(np.nan_to_num(ego.velocity_mps[:, 0])) * np.clip(gap_s, 0.0, _LONGEST_S)
     return np.asarray(np.cumsum(way_m) // _BEND_M, np.int64)
 
 
 def _accelerations(ego: EgoMotion, stamps: Stamps) -> Float[np.ndarray, " F"]:
-    """Forward acceleration of each moment by its neighbours; NaN at ends of drives and across gaps."""
+    """Forward acceleration of each moment from its neighbours; NaN at ends of drives and across gaps."""
     found = np.full(len(stamps.drive), np.nan)
     span_s = (stamps.moment_ns[2:] - stamps.moment_ns[:-2]) * 1e-9
     near = (stamps.drive[2:] == stamps.drive[:-2]) & (span_s > 0) & (span_s < _LONGEST_S)
@@ -147,7 +149,7 @@ def _accelerations(ego: EgoMotion, stamps: Stamps) -> Float[np.ndarray, " F"]:
 
 
 def _biases(T: np.ndarray, pitch_rad: float) -> dict[str, np.ndarray]:
-    """The car's stance, and what the matching leaves: of pitch, what detections seen too low do to the velocity."""
+    """Biases: the car's stance, and the matching; for pitch, the effect of detections measured too low."""
     axes = np.zeros((4, 6))
     axes[[0, 1, 2, 3], [0, 1, 2, 5]] = 1.0
     floor = np.diag([0.0, pitch_rad, _YAW_FLOOR_RAD, 0.0, 0.0, 0.0]) ** 2
@@ -162,11 +164,11 @@ def _numbers(yaw: Regression | None, moments: int) -> dict[str, float]:
 
 def _notes(yaw: Regression | None, pitch: Regression | None, clock: Regression | None) -> tuple[str, ...]:
     shown = {
-        "yaw to the base: the radar shows too little of the way": yaw,
+        "yaw to the base: too few scans determine the direction of travel": yaw,
         "pitch to the base: no lidar shares the radar's view": pitch,
         "clock against the base: the car hardly changes its speed": clock,
     }
     return (
         *(told for told, fit in shown.items() if fit is None),
-        "roll, x, y, z to the base: no way shows them",
+        "roll, x, y, z to the base: the motion does not determine them",
     )

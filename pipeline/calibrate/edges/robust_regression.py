@@ -35,17 +35,17 @@ def regress(
 ) -> Regression | None:
     """Fit y = A x.
 
-    The covariance is the larger one, by coefficient, of what blocks show (sandwich) and what independent rows
-    would.
+    The covariance is, for each coefficient, the larger one of the sandwich estimate over blocks and that of
+    independent rows.
 
     Args:
-        sigma: of the rows against each other; their common scale is estimated.
-        blocks: rows of one block may err alike.
-        prior_sigmas: of coefficients about 0; infinite ones are free.
-        share: by which a row counts: rows of one scene together for one.
+        sigma: relative sigmas of the rows; their common scale is estimated.
+        blocks: block of each row; errors within a block may be correlated.
+        prior_sigmas: sigmas of coefficients about 0; infinite ones are free.
+        share: weight of each row; the rows of one scene add up to one.
 
     Returns:
-        None of fewer than three blocks, or no more rows than free coefficients.
+        None for fewer than three blocks, or if there are no more rows than free coefficients.
     """
     names = np.unique(blocks)
     if len(names) < 3 or len(y) <= A.shape[1]:
@@ -65,14 +65,14 @@ def regress(
 
 
 def _small_sample(blocks: int) -> float:
-    """Factor by which few blocks understate a variance: Student's t over the normal, and the removed mean."""
+    """Correction of a variance from few blocks: Student's t over the normal distribution, and the removed mean."""
     return blocks / (blocks - 1) * ((blocks - 1) / (blocks - 3) if blocks > _FEW else _FEW)
 
 
 def _fitted(
     A: np.ndarray, y: np.ndarray, held: np.ndarray, share: np.ndarray
 ) -> tuple[np.ndarray, float, np.ndarray]:
-    """Coefficients, robust scale and Cauchy weights of rows of unit sigma, from the least absolute deviations on."""
+    """Coefficients, robust scale and Cauchy weights for rows of unit sigma, starting from least absolute deviations."""
     weight, scale, x = share, 1.0, np.zeros(A.shape[1])
     for k in range(_PASSES):
         x = np.linalg.solve((A.T * weight) @ A / scale**2 + held, (A.T * weight) @ y / scale**2)
@@ -90,7 +90,7 @@ def _median(values: np.ndarray, share: np.ndarray) -> float:
 
 
 def _halves(A: np.ndarray, y: np.ndarray, blocks: np.ndarray, held: np.ndarray, share: np.ndarray) -> float:
-    """Distance of the first coefficient of even blocks to the mean of even and odd ones; NaN for too few."""
+    """Difference between the first coefficient of even blocks and the mean of even and odd blocks; NaN for too few."""
     even = np.unique(blocks, return_inverse=True)[1] % 2 == 0
     if min(even.sum(), (~even).sum()) <= 2 * A.shape[1]:
         return float("nan")

@@ -36,7 +36,7 @@ _BEND_M = 50.0  # simulated cars slip by up to 0.1 deg for so long, and so do re
 
 @dataclass(frozen=True, eq=False)
 class SweepTravel:
-    """Motion of the base between pairs of sweeps, in axes of the base by the pose that was given."""
+    """Motion of the base between pairs of sweeps, in axes of the base according to the given pose."""
 
     moment: np.ndarray  # M, of the earlier sweep
     velocity_mps: np.ndarray  # M 3
@@ -47,22 +47,22 @@ class SweepTravel:
 
     @property
     def angles_rad(self) -> Float[np.ndarray, "M 2"]:
-        """Azimuth and elevation of the way, or of its opposite where the car reverses: zero where the pose is right."""
+        """Azimuth and elevation of the motion, or of its opposite in reverse; zero if the pose is right."""
         x, y, z = (self.velocity_mps * np.copysign(1.0, self.velocity_mps[:, :1])).T
         return np.stack([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))], -1)
 
     @property
     def bend(self) -> Int64[np.ndarray, " M"]:
-        """Block of each pair: in one bend a car slips the same way."""
+        """Block of each pair: within one bend, a car has the same slip."""
         return np.asarray(np.cumsum(self.way_m) // _BEND_M, np.int64)
 
     @property
     def curvature_radpm(self) -> Float[np.ndarray, " M"]:
-        """Turn per way, positive to the left."""
+        """Rotation per distance, positive to the left."""
         return np.asarray(self.turn_radps[:, 2] / self.velocity_mps[:, 0])
 
     def seen_from(self, T_new_old: Float[np.ndarray, "4 4"]) -> SweepTravel:
-        """The same ways in axes of the base by another pose, which is turned; a lever arm's change is left out."""
+        """The motion in axes of the base according to another, rotated pose; a change of the lever arm is neglected."""
         R = T_new_old[:3, :3]
         return replace(self, velocity_mps=self.velocity_mps @ R.T, turn_radps=self.turn_radps @ R.T)
 
@@ -115,7 +115,7 @@ def _between(
 
 
 def _sigmas_m(information: np.ndarray, way_m: float) -> tuple[float, float]:
-    """Sigmas of the way's end to the side and up; half of a rotation on the way is included."""
+    """Sigmas of the end point to the side and up; they include half of the rotation between the sweeps."""
     held = np.diag(_START_SIGMAS**-2.0) * np.diag([1, 1, 1, 1, _NO_SHARE, _NO_SHARE])
     C = np.linalg.inv(information + held)
     aside = np.array([0.0, 0.0, way_m / 2, 0.0, 1.0, 0.0])

@@ -1,8 +1,8 @@
 """Camera-radar without the lidar: moving clusters against boxes in azimuth, detections in boxes in elevation.
 
-Its translation stays at the prior (angles of far objects hardly depend on it), and its azimuth has a sigma of
-a quarter of a degree: alone it is held; in the adjustment it checks the lidar's pairs and determines a
-radar's roll.
+The translation stays at the prior (angles of far objects hardly depend on it). The azimuth has a sigma of a
+quarter of a degree, so this pair alone is held. In the adjustment it checks the lidar's pairs and determines
+a radar's roll.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ _SCAN_STEP_RAD = np.radians(_SCHEDULE.scan_step_deg)
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """What camera and radar both see in the day's frames."""
+    """Objects in view of both camera and radar in the day's frames."""
 
     observations: Sequence[Observation]
     clusters: MovingClusters
@@ -83,7 +83,7 @@ class _Seen:
 
 @dataclass(frozen=True, eq=False)
 class _Equations:
-    """Normal equations by (turn about the radar, shift, box biases), and what came with them."""
+    """Normal equations by (rotation about the radar, shift, box biases), and further results."""
 
     H: np.ndarray  # F P P
     g: np.ndarray  # F P
@@ -100,7 +100,7 @@ def estimate_camera_radar(
     *,
     boxes: bool = True,
 ) -> PairEstimate:
-    """Estimate the rotation of T_camera_radar from what camera and radar both see; never uses the lidar.
+    """Estimate the rotation of T_camera_radar from objects in view of both camera and radar, without the lidar.
 
     Args:
         boxes: whether elevations in vehicle boxes take part; without them pitch and roll stay at the prior.
@@ -147,7 +147,7 @@ def estimate_camera_radar(
 
 
 def _with_open_azimuth(after: Posterior, prior_covariance: np.ndarray) -> Posterior:
-    """The same where the turn about the camera's vertical is as unknown as before the day."""
+    """The result with the prior uncertainty of the rotation about the camera's vertical."""
     covariance, observability = after.covariance.copy(), after.observability.copy()
     covariance[_YAW, :] = covariance[:, _YAW] = 0.0
     covariance[_YAW, _YAW] = prior_covariance[_YAW, _YAW]
@@ -182,7 +182,7 @@ def _solve(
 
 
 def _scan_azimuth(clusters: MovingClusters, T0: np.ndarray, config: SolveConfig) -> tuple[np.ndarray, float]:
-    """The rotation about the camera's vertical at which most moving clusters meet a box, near ones first.
+    """The rotation about the camera's vertical at which most moving clusters match a box, near ones first.
 
     Also returns the matches of the best other rotation, as a share of this one's.
     """

@@ -1,6 +1,6 @@
 """Checks of method `joint` on its own estimates: restarts, halves, elevations.
 
-Each returns one value per failed check; none where all is well.
+Each returns one value per failed check; none if all is well.
 """
 
 from __future__ import annotations

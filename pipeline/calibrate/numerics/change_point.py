@@ -1,9 +1,9 @@
-"""A day in two parts, cut where a sensor may have moved, and how far the parts are apart.
+"""A day in two parts, cut where a sensor may have moved, and the difference between the parts.
 
-At the solution of the whole day the gradients of all frames sum to nothing. If a sensor moved, those before
-the change pull to one side and those after it to the other, so that the running sum is furthest from zero at
-the change. Each part is then solved by itself; where the two contradict each other, the cut is moved to where
-the frames begin to score better at the last part's solution.
+At the solution of the whole day, the gradients of all frames sum to zero. If a sensor moved, gradients before
+and after the change have opposite signs, so the running sum is farthest from zero at the change. Each part is
+then solved by itself; where the two contradict each other, the cut is moved to where the frames begin to
+score better at the last part's solution.
 
 Source: Page 1954 (cumulative sums); Hinkley 1970 (one step at an unknown time, and its likelihood).
 """
@@ -45,12 +45,12 @@ def parts_of_day(
     tested: tuple[int, ...],
     scene: Int[np.ndarray, " F"],
 ) -> DayParts | None:
-    """First and last part of a day; None where it is too short, or shows too few scenes, to be cut.
+    """First and last part of a day; None if the day is too short or has too few scenes.
 
     Args:
-        score: of each frame at a solution, higher is better.
+        score: score of each frame at a solution; higher is better.
         tested: rotations (0, 1, 2) that are compared.
-        scene: of each frame; a part of fewer than three has no estimate of its spread.
+        scene: scene of each frame; a part of fewer than three scenes has no estimate of its spread.
     """
     cut = likeliest_cut(gradient, scene)
     if cut is None:
@@ -104,7 +104,7 @@ def _cuts(scene: Int[np.ndarray, " F"]) -> Int[np.ndarray, " K"]:
 
 
 def _seen(scene: Int[np.ndarray, " F"]) -> Int[np.ndarray, " F"]:
-    """How many different scenes were seen up to each frame."""
+    """Number of different scenes up to each frame."""
     is_new = np.zeros(len(scene), np.int64)
     is_new[np.unique(scene, return_index=True)[1]] = 1
     return np.cumsum(is_new)

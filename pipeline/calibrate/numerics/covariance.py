@@ -1,12 +1,12 @@
-"""How sure a pose is: information matrix, block bootstrap over drives, and a stated bias floor.
+"""Covariance of a pose: information matrix, block bootstrap over drives, and a bias floor.
 
-The inverse of an information matrix alone is too small (on real logs 6 times in yaw): residuals of one scene
-err together. Blocks of frames that share no scene are resampled instead: each resampled day moves the
-estimate by one Newton step, and the spread of these steps, plus what the prior leaves open, is the
-covariance. A block that makes up much of the day draws the estimate to itself and so seems to err little: its
-step counts as if it had been left out. Few blocks do not know their own spread: it is as much wider as
-Student's t is. No direction becomes surer than the information allows. A bias common to all frames, which no
-resampling shows, is added as a floor per degree of freedom.
+The inverse of an information matrix alone is too small (on real logs by a factor of 6 in yaw), because
+residuals of one scene are correlated. Instead, blocks of frames without a common scene are resampled. Each
+resampled day moves the estimate by one Newton step, and the covariance is the spread of these steps plus the
+prior's uncertainty. A block that makes up much of the day pulls the estimate towards itself, so its error
+seems small; its step counts as if the block had been left out. The spread of few blocks is uncertain, so it
+is widened like Student's t. No variance is smaller than the information allows. A bias common to all frames,
+which resampling does not show, is added as a floor per degree of freedom.
 
 Source: Efron & Tibshirani 1993, ch. 8 (blocks); White 1982 (the sandwich that one Newton step per resample
 tends to); MacKinnon & White 1985 (HC3, what is left out); Satterthwaite 1946 (blocks of unequal weight).
@@ -59,19 +59,17 @@ def bootstrap_covariance(
     """Covariance of a MAP estimate by resampling blocks of frames.
 
     Args:
-        information: of each frame (second derivative of its cost), at the estimate.
-        prior_information: of the prior; zero where there is none (then the frames must determine that
-            parameter).
+        information: information of each frame (second derivative of its cost), at the estimate.
+        prior_information: information of the prior; zero if there is none (the frames must then determine
+            that parameter).
         block: frames with the same number are drawn together.
-        degrees: of freedom of the scatter over blocks that the information already contains; 0 where it takes
-            frames to err apart.
+        degrees: degrees of freedom of the scatter over blocks that the information already contains; 0 if it
+            treats frames as independent.
 
     Returns:
-        Spread of the resampled estimates plus the prior's share, nowhere below the inverse of all
-            information. A single
-        block has no spread: it is what the information says, or, where that knows nothing of blocks, the
-            inverse
-        widened as for two.
+        Spread of the resampled estimates plus the prior's share, at least the inverse of all information. A
+        single block has no spread: the result is then the inverse, widened as for two blocks if the
+        information treats frames as independent.
     """
     P = score.shape[1]
     count = int(block.max()) + 1 if len(block) else 0
@@ -95,14 +93,14 @@ def bootstrap_covariance(
 
 
 def widening(blocks: float) -> float:
-    """By how much Student's t reaches further than a normal does, for the spread over so many equal blocks."""
+    """Ratio of the widths of Student's t and a normal distribution, for the spread over so many equal blocks."""
     return float(stdtrit(max(blocks - 1, 1.0), _WIDENED_AT) / ndtri(_WIDENED_AT))
 
 
 def response(
     curvature: Float[np.ndarray, "P P"], given: Bool[np.ndarray, " P"], fixed: Bool[np.ndarray, " P"]
 ) -> Float[np.ndarray, "P G"]:
-    """How far the optimum follows when the `given` parameters are moved by one unit; `fixed` ones stay."""
+    """Change of the optimum when the `given` parameters move by one unit; `fixed` ones stay."""
     out = np.zeros((len(given), int(given.sum())))
     out[given] = np.eye(out.shape[1])
     free = ~given & ~fixed
@@ -124,13 +122,13 @@ def covariance_with_fixed(
 
     Args:
         prior_variance: of every parameter, independent.
-        curvature: of the whole cost, prior included: how far the others follow a fixed parameter.
+        curvature: curvature of the whole cost, prior included; gives the change of the others with a fixed
+            parameter.
         fixed: parameters that the frames did not move.
 
     Returns:
-        The free parameters' covariance given the fixed ones, plus what the prior leaves open in the fixed
-            ones, for
-        them and for all that follow them.
+        The free parameters' covariance given the fixed ones, plus the prior uncertainty of the fixed ones,
+        propagated to all parameters.
     """
     at = np.ix_(~fixed, ~fixed)
     out = np.zeros((len(fixed), len(fixed)))

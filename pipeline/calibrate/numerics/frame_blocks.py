@@ -1,10 +1,10 @@
-"""Scenes of a day by what is seen, and blocks of frames for resampling and scatter: scenes count, not frames.
+"""Scenes of a day, and blocks of frames for resampling and scatter: scenes are counted instead of frames.
 
-A car that waits at a light for a minute shows one scene, however many frames it logs. A scene ends where the
-car has driven or turned on, by its own speed and yaw rate. Speeds can lie (they are missing, or wrap with an
-ambiguous Doppler), so the lidar's depth edges are asked as well: those of a standing car lie where they lay,
-a metre further on most of them do not. A view that returns, because the car stands there again or because a
-log was copied, is the scene that it was.
+A car that waits at a traffic light for a minute shows one scene, however many frames it logs. A scene ends
+when the car has driven or turned on, by its own speed and yaw rate. Speeds can be wrong (missing, or wrapped
+by an ambiguous Doppler), so the lidar's depth edges are compared as well. For a standing car they stay in
+place; after one metre, most of them have moved. If a view returns, because the car stands there again or
+because a log was copied, it belongs to its earlier scene.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ _FEWEST_CELLS = 20  # with edges in fewer, a frame is not compared
 
 @dataclass(frozen=True, eq=False)
 class Scenes:
-    """Which frames show the same: a standing car counts once, and blocks err apart."""
+    """Scenes and blocks of frames: a standing car is one scene; errors of different blocks are independent."""
 
     scene: Int64[np.ndarray, " F"]
     block: Int64[np.ndarray, " F"]
@@ -114,14 +114,14 @@ def scenes_of(observations: Sequence[Observation]) -> Int64[np.ndarray, " F"]:
 
 
 def blocks_of(observations: Sequence[Observation], most: int = 24) -> Int64[np.ndarray, " F"]:
-    """`bootstrap_blocks` of a day's frames."""
+    """`bootstrap_blocks` for the frames of a day."""
     return Scenes.of(observations, most).block
 
 
 def bootstrap_blocks(
     drive: Int[np.ndarray, " F"], scene: Int[np.ndarray, " F"], most: int = 24
 ) -> Int64[np.ndarray, " F"]:
-    """Block of each frame for resampling, about `most` of equal size: long drives are cut, short ones joined.
+    """Block of each frame for resampling, about `most` blocks of equal size: long drives are cut, short ones joined.
 
     All frames of a scene are in one block; there are at least 8 blocks if there are as many scenes.
     """
@@ -144,10 +144,10 @@ def bootstrap_blocks(
 def scene_blocks(
     observations: Sequence[Observation], at_least: int = _FEWEST_BLOCKS
 ) -> Int[np.ndarray, " F"]:
-    """Block name of each frame, for scatter over scenes: its drive, whatever its length.
+    """Block name of each frame, for scatter over scenes: its drive, of any length.
 
-    Where the day has fewer drives than `at_least`, that many stretches of equally many frames, cut between
-    scenes.
+    If the day has fewer drives than `at_least`, it is cut between scenes into that many stretches with equal
+    numbers of frames.
     """
     drives, scene = np.array([o.drive for o in observations]), scenes_of(observations)
     first = np.unique(scene, return_index=True)[1]  # frame that each scene begins with
@@ -164,7 +164,7 @@ def _apart(gradient: Float[np.ndarray, "F P"]) -> float:
 def _moved(
     observations: Sequence[Observation], alike: Float[np.ndarray, " F"]
 ) -> tuple[Float[np.ndarray, " F"], Float[np.ndarray, " F"]]:
-    """Way [m] and turn [rad] since the frame before, the larger of speeds and edges.
+    """Distance [m] and rotation [rad] since the previous frame, the larger of the values by speed and by edges.
 
     `alike` is the share of edges that stayed in place; not finite for a frame with hardly any.
     """

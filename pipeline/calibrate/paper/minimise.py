@@ -1,7 +1,7 @@
 """Differential evolution, then Nelder-Mead: the paper's optimiser (section 4.5.3) over poses about a start.
 
 A pose is six numbers about its start: a rotation vector in the parent's axes [rad] on the rotation part
-alone, and a shift of the origin [m]. The box that is searched means the same whatever the lever arm.
+alone, and a shift of the origin [m]. The search range has the same meaning for any lever arm.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@ The paper's conditions (section 4.5.1) per pair: camera-lidar needs sky, drivabl
 camera-radar needs sky, road users and dynamic radar clusters; lidar-radar needs drivable area and dynamic
 clusters. All need stamps within 5 ms, which the paper's methods keep even if ingest gates by motion. If too
 few frames meet them, the nearest ones are added, with a note: a narrow camera may never see 20 % of sky. For
-method `joint` the conditions are only counted; its frames are chosen for what they add to the view covered by
-others (image, azimuth, elevation, range).
+method `joint` the conditions are only counted; its frames are chosen to extend the coverage (image, azimuth,
+elevation, range).
 """
 
 from __future__ import annotations
@@ -74,14 +74,13 @@ def select_frames(
     pairs: Sequence[str] = PAIRS,
     absent: Mapping[str, str] | None = None,
 ) -> Selection:
-    """Choose frames to fit and to judge, the same way whenever it is asked; pair by pair, of frames that have both.
+    """Choose frames for the fit and held-out frames for each pair, deterministically, from frames with both sensors.
 
     Args:
         paper: prefer frames that meet the paper's conditions; else choose by content alone.
-        sync_gate_s: largest difference of a pair's stamps; None = any that ingest let in.
-        motion_gate: how far the car may drive and turn [m, rad] between a pair's stamps, their constant gap
-            aside.
-        absent: why frames lack a sensor, in words by sensor, if known.
+        sync_gate_s: largest difference of a pair's stamps; None = any that ingest accepted.
+        motion_gate: largest motion of the car [m, rad] between a pair's stamps, without their constant gap.
+        absent: reasons why frames lack a sensor, by sensor, if known.
     """
     scene = scenes_of(observations)
     held_out = hold_out(observations, config.holdout_fraction, scene)
@@ -126,7 +125,7 @@ def unmet_conditions(
 ) -> list[str]:
     """The paper's conditions that a frame does not meet for a pair, by name.
 
-    "empty" where it has nothing to align; "no_radar" and the like alone where it lacks a sensor.
+    "empty" if it has nothing to align; only "no_radar" and the like if it lacks a sensor.
     """
     camera, lidar, radar = (s in FRAMES_OF_PAIR[pair] for s in ("camera", "lidar", "radar"))
     first_ns, second_ns = _stamps_ns(observation, pair)
@@ -149,7 +148,7 @@ def _apart(
 ) -> Bool[np.ndarray, " F"]:
     """Frames in which the car moved too far between a pair's captures.
 
-    Ingest checks each sensor against the moment; two sensors of a large rig can lie on either side of it.
+    Ingest checks each sensor against the moment; two sensors of a large rig can be on either side of it.
     """
     speed, yaw_rate = (
         np.array([getattr(o, name) for o in observations], np.float64)
@@ -173,7 +172,7 @@ def _stamps_ns(observation: Observation, pair: str) -> tuple[int, int]:
 
 
 def missing_content(observations: Sequence[Observation], pair: str) -> list[str]:
-    """Content that the chosen frames lack for a pair, in words: what to drive next time."""
+    """Text with content that the chosen frames lack for a pair, and that the next drive should contain."""
     missing = []
     speeds = np.array([abs(o.ego_speed_mps) for o in observations if o.ego_speed_mps is not None])
     if len(speeds) and np.mean(speeds > _BRISK_MPS) < _SCARCE:
@@ -190,13 +189,13 @@ def missing_content(observations: Sequence[Observation], pair: str) -> list[str]
         missing.append("hardly any road users in the images")
     if len(np.unique(scenes_of(observations))) < FEWEST_SCENES:
         missing.append(
-            "hardly any way: the frames show the same street from the same place, drive on for some 100 m"
+            "hardly any distance: the frames show the same street from the same place; drive some 100 m further"
         )
     return missing + missing_in_view(observations, pair)
 
 
 def _few_of_each(candidates: Sequence[int], scene: np.ndarray) -> list[int]:
-    """At most MIN_FRAMES of a scene, evenly spread: a wait at a light would outweigh the day that it interrupts."""
+    """At most MIN_FRAMES of a scene, evenly spread, because a wait at a light would outweigh the rest of the day."""
     kept = []
     for number in np.unique(scene[list(candidates)]):
         of_scene = [i for i in candidates if scene[i] == number]
@@ -208,13 +207,13 @@ def _few_of_each(candidates: Sequence[int], scene: np.ndarray) -> list[int]:
 def hold_out(
     observations: Sequence[Observation], fraction: float, scene: Int[np.ndarray, " F"] | None = None
 ) -> list[bool | None]:
-    """Split a day into blocks of time: True = judges, False = fits, None = too near in time to a frame of the fit.
+    """Split a day into blocks of time: True = held out, False = fit, None = too near in time to a frame of the fit.
 
-    Every k-th block judges, so that both parts see all of the day; blocks never cross a drive, and a scene is
-    in one of them as a whole, with its first frame, however often the car returns to it. Of several lengths
-    of block the split is taken that comes nearest to the fraction, loses few frames next to the fit, and
-    judges by at least _JUDGING_BLOCKS blocks. A day of one scene is split within it: nothing that it judges
-    is proof, and the record has it as reason.
+    Every k-th block is held out, so that both parts cover all of the day. Blocks never cross a drive, and a
+    scene is in one block as a whole, with its first frame, even if the car returns to it. Of several lengths
+    of block, the split is chosen that comes nearest to the fraction, loses few frames next to the fit, and
+    holds out at least _JUDGING_BLOCKS blocks. A day of one scene is split within the scene; its held-out
+    frames then prove nothing, and the record gives this as a reason.
     """
     if not observations:
         return []
@@ -299,7 +298,7 @@ def _silent(pair: str, observations: Sequence[Observation], absent: Mapping[str,
 
 
 def _fault_in(why: str) -> str:
-    """Fault whose sentence the words begin with."""
+    """The fault whose sentence is at the beginning of the text."""
     return next((code for code, sentence in FAULTS.items() if why.startswith(sentence)), "silent_sensor")
 
 

@@ -1,10 +1,10 @@
-"""Which track of one sensor is which track of another: by how they move first, by where they are last.
+"""Association of tracks of two sensors, mainly by their motion and last by their position.
 
-Range and range rate over ground do not depend on how a sensor is turned; nor does the course of the bearing,
-up to a constant. The constant itself, the mean difference of the bearings, may be as large as the prior is
-uncertain. All are compared over the frames that both tracks share. No sighting belongs to two pairs; but a
-track may continue another sensor's track after that one broke off, so one track may have several partners,
-one after the other.
+Range and range rate over ground do not depend on a sensor's rotation. Neither does the bearing as a function
+of time, up to a constant. The constant, the mean difference of the bearings, may be as large as the
+uncertainty of the prior. All are compared over the frames that both tracks share. A sighting belongs to one
+pair only. If a track of one sensor is interrupted, one track of the other sensor may have several successive
+partners.
 
 Source: Persic et al. 2021, "calibration-agnostic track to track association"; the measure is our reading of
 it.
@@ -51,7 +51,7 @@ class Association:
 
 @dataclass(frozen=True, eq=False)
 class Shared:
-    """Sightings in the same frames, by pairs of tracks seen by both at least twice, one pair after the other."""
+    """Sightings in common frames of all pairs of tracks with at least two such frames, one pair after the other."""
 
     reference: Int64[np.ndarray, " P"]
     other: Int64[np.ndarray, " P"]
@@ -68,11 +68,11 @@ def associate(
     *,
     elevation: bool = True,
 ) -> Association:
-    """Pair tracks, best scores first, none with a sighting that a better pair has; nothing outside the gates.
+    """Pair tracks inside the gates, best scores first; a pair must not use a sighting of a better pair.
 
     Args:
-        shared: what reference and other sensor saw in the same frames, level axes.
-        elevation: False where one of the two measures none.
+        shared: sightings by the reference and the other sensor in common frames, in levelled axes.
+        elevation: False if one of the two does not measure elevation.
     """
     kept = np.zeros(0, np.int64)
     if len(shared.first):
@@ -86,7 +86,7 @@ def associate(
 
 
 def shared_sightings(reference: Sequence[Track], other: Sequence[Track]) -> Shared:
-    """All pairs of tracks of one drive that were seen in at least two frames by both."""
+    """All pairs of tracks of one drive with at least two common frames."""
     rows = [(i, k, t.drive, int(f)) for i, t in enumerate(reference) for k, f in enumerate(t.frame)]
     at: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for j, t in enumerate(other):
@@ -139,7 +139,8 @@ def _scores(
 ) -> Float[np.ndarray, " P"]:
     """Evidence that each pair of tracks is one object; 0 outside the gates.
 
-    The gate's margin over the mean squared deviation, times sightings, less the constant's square.
+    It is the margin between the gate and the mean squared deviation, times the sightings, minus the square of
+    the constant.
     """
     a, b, first, count = shared.of_reference, shared.of_other, shared.first, shared.count
     expected = to_spherical(transform_points(T_b_a, a.position_m))
@@ -169,7 +170,7 @@ def _scores(
 
 
 def _medians(value: np.ndarray, first: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Median of each stretch of values."""
+    """Median of each segment of values."""
     ordered = value[np.lexsort((value, np.repeat(np.arange(len(first)), count)))]
     return 0.5 * (ordered[first + (count - 1) // 2] + ordered[first + count // 2])
 

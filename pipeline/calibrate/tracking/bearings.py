@@ -1,8 +1,8 @@
-"""Rotation between two sensors from the bearings of objects that both track, robustly; and whether it has changed.
+"""Robust rotation between two sensors from bearings of objects that both track, and a test whether it has changed.
 
 The reference sensor measures the position of an object, the other one its direction. Translations stay at the
-prior: bearings of distant objects hardly see them. Geman-McClure weights, from wide to narrow, turn wrong
-pairs of tracks down.
+prior, because bearings of distant objects hardly depend on them. Geman-McClure weights with a decreasing
+width reject wrong pairs of tracks.
 
 Source: Persic et al. 2021 (graph-based rotation calibration, decalibration detection; their translations are
 known); Yang et al. 2020, "Graduated non-convexity for robust spatial perception"; Hotelling 1931 (the test).
@@ -37,8 +37,8 @@ class Bearings:
     """Sightings of objects by both sensors.
 
     `inverted` False: T takes reference points to the other sensor (q = R p + t); True: T takes the other
-    sensor's points to the reference (q = R^T (p - t)). `level` turns the other sensor's axes level (x
-    forward, y left, z up).
+    sensor's points to the reference (q = R^T (p - t)). `level` rotates the other sensor's axes to level ones
+    (x forward, y left, z up).
     """
 
     point_m: Float[np.ndarray, "N 3"]  # reference axes
@@ -54,7 +54,10 @@ class Bearings:
         return int(self.track.max(initial=-1)) + 1
 
     def residuals(self, T: Float[np.ndarray, "4 4"]) -> tuple[np.ndarray, np.ndarray]:
-        """Expected minus seen bearings [rad] (N A), d/d(left turn of T's rotation, shift of its origin) (N A 6)."""
+        """Expected minus measured bearings [rad] (N A), and derivatives (N A 6).
+
+        Derivatives are by a left perturbation of T's rotation and a shift of its origin.
+        """
         R, t = T[:3, :3], T[:3, 3]
         if self.inverted:
             L = self.level @ R.T
@@ -92,7 +95,7 @@ class Consistency:
 
     @property
     def miscalibrated(self) -> bool:
-        """The rotation differs from the prior by more than chance and bias."""
+        """True if the rotation differs from the prior by more than chance and bias."""
         return self.statistic > self.threshold
 
 
@@ -102,7 +105,7 @@ def align_bearings(
     prior_covariance: Float[np.ndarray, "6 6"],
     rng: np.random.Generator,
 ) -> AlignedBearings:
-    """Turn T_prior until the bearings agree; its translation stays."""
+    """Rotate T_prior until the bearings agree; its translation is kept."""
     T, prior_information = T_prior, np.linalg.inv(prior_covariance[:3, :3])
     count = np.bincount(bearings.track, minlength=bearings.tracks)[bearings.track]
     share = 1 / (1 + _INTRACLASS * (count - 1))  # sightings of one track err together
@@ -138,11 +141,12 @@ def consistency(
 ) -> Consistency:
     """Test whether the rotation found differs from the prior's by more than its own uncertainty.
 
-    Hotelling's threshold rather than chi^2: with few tracks their spread itself is uncertain, in so far as it
-    and not the bias makes up the sigma (effective degrees of freedom after Welch and Satterthwaite).
+    The threshold is Hotelling's instead of chi^2, because the spread of few tracks is itself uncertain.
+    Effective degrees of freedom after Welch and Satterthwaite account for the part of the sigma that is
+    spread and the part that is bias.
 
     Args:
-        bias_floor_rad: sigma per axis of what is common to all tracks.
+        bias_floor_rad: sigma per axis of the error common to all tracks.
     """
     turned = log_so3(aligned.T[:3, :3] @ T_prior[:3, :3].T)
     covariance = aligned.covariance[:3, :3] + np.diag(bias_floor_rad**2)
@@ -182,7 +186,7 @@ def _covariance(
     prior_covariance: np.ndarray,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Bootstrap covariance of the rotation over tracks, with and without the fixed translation's sigma."""
+    """Bootstrap covariance of the rotation over tracks, with and without the sigma of the fixed translation."""
     K = bearings.tracks
     H6, g6 = np.zeros((K, 6, 6)), np.zeros((K, 6))
     np.add.at(H6, bearings.track, np.einsum("n,nai,naj->nij", weight, J, J))

@@ -53,7 +53,7 @@ class Scan:
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """One object as one sensor saw it: a row per sighting, in the sensor's level axes, velocity over ground."""
+    """Track of one object by one sensor: a row per sighting, in levelled sensor axes, with velocity over ground."""
 
     drive: int
     frame: Int64[np.ndarray, " N"]  # index into the observations

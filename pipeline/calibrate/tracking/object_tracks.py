@@ -1,9 +1,9 @@
-"""Road users as radar, lidar and camera see them: tracks in each sensor's own level axes.
+"""Tracks of road users by radar, lidar and camera, each in the sensor's own levelled axes.
 
-Radar: the tracked moving clusters of perception. Lidar: clusters of a road user's size and height above the
-ground, followed here; against the radar only those that move over ground. Camera: boxes of road users, their
-range by the usual height of their class, as a monocular 3D detector would guess it (about 20 %); parked ones
-are boxes too, and pass by the sensors like any other.
+Radar: the moving clusters that perception tracks. Lidar: clusters of a road user's size and height above the
+ground, tracked here; against the radar, only those that move over ground. Camera: boxes of road users, with a
+range from the usual height of their class, as a monocular 3D detector would estimate it (about 20 %). Boxes
+of parked road users are included; they pass by the sensors like any other.
 
 Source: Persic et al. 2021, whose lidar and camera detections come from 3D networks; clusters and sized boxes
 stand for these here.
@@ -64,7 +64,7 @@ _LEAST_CLUSTERS = 6  # to separate a turn from the standing world
 
 
 def motions(observations: Sequence[Observation], prior: Prior) -> list[Motion]:
-    """Own motion at each frame: speed as observed, yaw rate from odometry or from the lidar's standing clusters."""
+    """Ego motion at each frame: measured speed, and yaw rate from odometry or from the lidar's static clusters."""
     speeds = [_speed(o, prior) for o in observations]
     found = []
     for i, o in enumerate(observations):
@@ -104,7 +104,7 @@ def turn_between(
 
 
 def radar_tracks(observations: Sequence[Observation]) -> list[Track]:
-    """Moving clusters that perception followed for at least two scans and saw with at least two detections."""
+    """Moving clusters that perception tracked over at least two scans, with at least two detections."""
     rows: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for i, o in enumerate(observations):
         for k in np.flatnonzero(o.radar_track_points >= _RADAR_POINTS):
@@ -127,7 +127,7 @@ def radar_tracks(observations: Sequence[Observation]) -> list[Track]:
 
 
 def lidar_tracks(observations: Sequence[Observation], motion: Sequence[Motion]) -> list[Track]:
-    """Clusters that can be road users. Sightings are those of the clusters' points' centres."""
+    """Tracks of clusters that can be road users; a sighting is the centre of a cluster's points."""
     scans, kept = [], []
     for i, o in enumerate(observations):
         rows = _road_users(o)
@@ -139,7 +139,7 @@ def lidar_tracks(observations: Sequence[Observation], motion: Sequence[Motion]) 
 
 
 def moves_over_ground(track: Track) -> bool:
-    """Faster over ground than 2 m/s and than its sigma explains, over the later half of its sightings."""
+    """True if the median speed over the later half of the sightings exceeds 2 m/s and several of its sigmas."""
     later = take_rows(track, np.arange(track.sightings // 2, track.sightings))
     speed = np.median(np.linalg.norm(later.velocity_mps[:, :2], axis=1))
     return bool(speed > max(_LEAST_SPEED_MPS, _SPEED_SIGMAS * float(np.median(later.rate_sigma_mps))))
@@ -152,7 +152,7 @@ def passes_by(track: Track) -> bool:
 
 
 def camera_tracks(observations: Sequence[Observation], motion: Sequence[Motion]) -> list[Track]:
-    """Boxes of road users, followed in the camera's level axes (x forward, y left, z up)."""
+    """Boxes of road users, tracked in the camera's levelled axes (x forward, y left, z up)."""
     scans = []
     for i, o in enumerate(observations):
         angles, range_m = _boxes(o)
@@ -169,9 +169,9 @@ def camera_tracks(observations: Sequence[Observation], motion: Sequence[Motion])
 
 
 def box_centres(track: Track, observations: Sequence[Observation]) -> Float[np.ndarray, "N 3"]:
-    """Centre of the box about a lidar track's cluster at each sighting, lowered to a known ground.
+    """Centre of the box around a lidar track's cluster at each sighting, extended down to the ground if known.
 
-    The lowest part of an object is removed with the ground, its highest lies above the top beam; a 3D
+    The lowest part of an object is removed with the ground, and its highest part lies above the top beam. A 3D
     detector's box stands on the ground and has the usual height.
     """
     centres = np.empty((track.sightings, 3))
@@ -211,7 +211,7 @@ def _no_larger_than_a_lorry(o: Observation) -> Bool[np.ndarray, " K"]:
 
 
 def _road_users(o: Observation) -> Int64[np.ndarray, " K"]:
-    """Rows of the clusters that can be road users: of their size, standing on the ground where that is known."""
+    """Rows of clusters that can be road users: of their size, and on the ground if it is known."""
     possible = _no_larger_than_a_lorry(o)
     if o.ground_plane is not None:
         n, d = o.ground_plane[:3], o.ground_plane[3]
@@ -223,13 +223,13 @@ def _road_users(o: Observation) -> Int64[np.ndarray, " K"]:
 
 
 def _renumbered(track: Track, kept: Sequence[np.ndarray]) -> Track:
-    """Detections numbered as the observation's clusters, not as the ones that were followed."""
+    """Detections with the cluster numbers of the observation instead of those of the tracked clusters."""
     rows = np.array([kept[i][k] for i, k in zip(track.frame, track.detection, strict=True)])
     return replace(track, detection=rows)
 
 
 def _boxes(o: Observation) -> tuple[np.ndarray, np.ndarray]:
-    """Azimuth and elevation [rad] of box centres, and ranges [m] by height; boxes cut by the border are left out."""
+    """Azimuth and elevation [rad] of box centres, ranges [m] from heights; boxes cut by the border are left out."""
     x0, y0, x1, y1 = o.road_user_boxes_px.astype(np.float64).reshape(-1, 4).T
     camera = camera_of(o)
     inside = (x0 > _BORDER_PX) & (y0 > _BORDER_PX)

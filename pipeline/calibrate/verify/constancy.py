@@ -1,8 +1,8 @@
-"""Check that sensors stayed in place over the day: its first part against its last, and which sensor moved.
+"""Check that sensors stayed in place over the day, by comparing its first and last part, and which sensor moved.
 
 Other checks mix the hours of a day: even frames against odd ones, held-out blocks between the others. A knock
-at noon is in both sides alike. Each pair is therefore also solved from the first and the last part of the day
-(`numerics/change_point`). Two pairs that shift and one that does not identify the sensor.
+at noon affects both sides equally. Each pair is therefore also solved from the first and the last part of the
+day (`numerics/change_point`). Two pairs that shift and one that does not identify the sensor.
 """
 
 from __future__ import annotations
@@ -77,12 +77,11 @@ def _failure(edge: Edge, parts: DayParts, sigmas: float, sensors: list[str]) -> 
 
 
 def _shift(parts: DayParts, is_tilt_known: bool) -> PairShift:
-    """The step as a twist; positions are open by what a turn in a bracket shifts.
+    """The step as a twist; positions have the uncertainty of the shift by a rotation in a bracket.
 
     Args:
-        parts: of a pair.
-        is_tilt_known: a radar's witnesses of elevation show a part of a tilt only: one that they do not show
-            may be.
+        parts: first and last part of a pair.
+        is_tilt_known: False for a radar, whose sources of elevation show only a part of a tilt.
     """
     change, covariance = np.zeros(6), np.eye(6) * _ANY_M**2
     change[:3] = parts.step

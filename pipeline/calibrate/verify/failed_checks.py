@@ -49,14 +49,13 @@ def heading_failures(
     """Failed check of camera-lidar if it was solved with a heading that lidar-radar contradicts.
 
     A camera's time offset moves the cloud along the car's heading, which the radar's prior mounting gives.
-    Where lidar-radar turns the radar by many of the prior's sigmas, that heading was wrong, and camera-lidar
-    is off to the side by time offset times speed times the turn.
+    If lidar-radar rotates the radar by many of the prior's sigmas, that heading was wrong. Camera-lidar then
+    has a lateral error of time offset times speed times this rotation.
 
     Args:
-        prior: whose T_lidar_radar gave the heading.
+        prior: prior whose T_lidar_radar gave the heading.
         limit_rad: largest error that camera-lidar may have at the targets.
-        limits: from where on the heading is wrong, and what share of `limit_rad` that may cost; None = the
-            defaults.
+        limits: threshold for a wrong heading, and its allowed share of `limit_rad`; None = the defaults.
     """
     limits = limits or ChecksConfig()
     if not {"camera_lidar", "lidar_radar"} <= solution.pairs.keys():
@@ -80,7 +79,7 @@ def heading_failures(
 
 
 def loop_sigmas(solution: Solution) -> tuple[float, float] | None:
-    """Sigma of the loop's angle [rad] and translation [m] where all three pairs were estimated independently."""
+    """Sigma of the loop's angle [rad] and translation [m] if all three pairs were estimated independently."""
     if solution.loop_rotation_rad is None or solution.loop_translation_m is None:
         return None
     covariance = _loop_covariance(solution)
@@ -88,7 +87,7 @@ def loop_sigmas(solution: Solution) -> tuple[float, float] | None:
 
 
 def _loop_covariance(solution: Solution) -> np.ndarray:
-    """Of T_camera_lidar T_lidar_radar T_radar_camera (6 6), with independent factors (first order)."""
+    """Covariance (6 6) of T_camera_lidar T_lidar_radar T_radar_camera, with independent factors (first order)."""
     cl, lr, cr = (solution.pairs[p] for p in ("camera_lidar", "lidar_radar", "camera_radar"))
     A = adjoint(cl.T)
     B = adjoint(cl.T @ lr.T @ inverse(cr.T))

@@ -1,9 +1,9 @@
-"""How well held-out frames align at a pose, whatever method found it: costs that compare two poses, and derivatives.
+"""Alignment of held-out frames at a pose of any method: costs to compare two poses, and derivatives.
 
 All methods are judged by the same scores: sharp edges and road markings for camera-lidar, the registration
 likelihood of method `joint` for lidar-radar (azimuth and range only: its elevations are misled by the lidar's
-rings), azimuths of moving clusters against road users' boxes for camera-radar. The paper's losses cannot
-judge: their minimum lies off the truth. Maps are prepared once for all poses that are asked about.
+rings), azimuths of moving clusters against road users' boxes for camera-radar. The paper's losses are not
+used, because their minimum is not at the truth. Maps are prepared once for all poses.
 """
 
 from __future__ import annotations
@@ -85,8 +85,8 @@ def held_out_score(
     """Prepare frames that took no part in the fit.
 
     Args:
-        estimate: the result that they judge.
-        prior: the pose to compare with; it also turns the radar's own velocity into lidar axes.
+        estimate: the result to be judged.
+        prior: the pose to compare with; it also rotates the radar's own velocity into lidar axes.
         config: sigma of a time offset that a method did not estimate.
     """
     prepare = {"camera_lidar": _camera_lidar, "lidar_radar": _lidar_radar, "camera_radar": _camera_radar}
@@ -181,10 +181,11 @@ def _lidar_radar(
 
 
 def _trend_along_axis(T: np.ndarray, value: _FrameCosts) -> Float[np.ndarray, " F"]:
-    """Slope [1/m] of each frame's cost along the radar's axis, from so far that no detection meets its own point.
+    """Slope [1/m] of each frame's cost along the radar's axis, at shifts too large for detections to match.
 
-    The cost falls towards where the lidar has more points, which is near the car, whatever the radar sees. By
-    its value alone a pose some centimetres too near beats the right one on streets that are dense nearby.
+    The cost decreases towards regions with more lidar points, which are near the car, for any radar data. By
+    the cost alone, a pose some centimetres too near is better than the right one on streets that are dense
+    nearby.
     """
     ahead, behind = (
         [value(from_rotation_translation(T[:3, :3], T[:3, 3] + sign * m * T[:3, 0])) for m in _TREND_M]

@@ -1,7 +1,7 @@
 """Alignment of held-out frames at the prior and at the result: a paired test over scenes of equal weight.
 
-A standing car logs one scene many times: 13 of 40 held-out frames of the real day are two seconds of it, and
-weighted by frames they alone rejected a result that improved every other scene.
+A standing car logs one scene many times: 13 of 40 held-out frames of the real day are from two seconds. With
+equal weights of frames, they alone rejected a result that improved every other scene.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ __all__ = ["HeldOutTest", "paired_test"]
 
 @dataclass(frozen=True)
 class HeldOutTest:
-    """Mean over blocks of the cost at the prior and at the result, of frames that have both, and how sure it is."""
+    """Mean over blocks of the cost at the prior and at the result, of frames with both, and its significance."""
 
     before: float
     after: float
@@ -29,8 +29,8 @@ class HeldOutTest:
     def z(self) -> float:
         """Significance of after - before as a normal deviate: negative = better aligned, 0 where nothing changed.
 
-        Student's t with one degree of freedom less than blocks, converted to the normal deviate of the same
-        probability: two blocks that agree by chance are no 30-sigma proof. Within +-8.
+        Student's t with one degree of freedom less than blocks is converted to the normal deviate of the same
+        probability, so that a chance agreement of two blocks is not a 30-sigma result. Limited to +-8.
         """
         difference = self.after - self.before
         if difference == 0:

@@ -1,10 +1,10 @@
-"""An innovation test on frames that took no part in the fit: how far they would move the result, and how surely.
+"""An innovation test on held-out frames: the move of the result that they would cause, and its sigma.
 
-If held-out frames align better at the result than at a prior two degrees off, that proves little.
-Their own optimum proves more: it must be near the result, by the sigmas of both. So the result, with
-its covariance, is taken as the prior of a Kalman update by the held-out frames. Their scores are sums of log
-likelihoods of points that err together within a scene, so their information is too large: it is divided by
-the ratio of the gradients' scatter over scenes to that information.
+A better alignment of held-out frames at the result than at a prior two degrees off proves little. Their own
+optimum proves more: it must be near the result, by the sigmas of both. So the result, with its covariance, is
+the prior of a Kalman update by the held-out frames. Their scores are sums of log likelihoods of points whose
+errors are correlated within a scene, so their information is too large. It is divided by the ratio of the
+gradients' scatter over scenes to that information.
 
 Source: Varin, Reid, Firth 2011, section 2.3 (composite likelihoods); Kalman 1960 for the update and its
 innovation.
@@ -62,13 +62,13 @@ def held_out_update(
     """Update the result by the held-out frames.
 
     Args:
-        covariance: of the result, its time offset and nuisance.
+        covariance: covariance of the result, its time offset and nuisance.
         bias: sigma of errors that are common to all held-out frames.
         blocks: frames of equal number share a scene.
-        limits: least number of blocks, and how many sigmas contradict; None = the defaults.
+        limits: smallest number of blocks, and the number of sigmas of a contradiction; None = the defaults.
 
     Returns:
-        None where fewer than `min_held_out_blocks` blocks have a gradient.
+        None if fewer than `min_held_out_blocks` blocks have a gradient.
     """
     limits = limits or ChecksConfig()
     prior = np.linalg.inv(covariance)

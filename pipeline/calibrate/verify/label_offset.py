@@ -67,7 +67,7 @@ class LabelOffset:
             self.shift_px, self.shift_sigma_px, self.ends_px, self.ends_sigma_px
         )  # fmt: skip
         return (
-            f"labels lie beside their picture: it is {u:+.1f} +- {su:.1f} label px right and {v:+.1f} +- {sv:.1f} "
+            f"labels are offset from their image: it is {u:+.1f} +- {su:.1f} label px right and {v:+.1f} +- {sv:.1f} "
             f"down of them in the middle, {a:+.1f} +- {sa:.1f} and {b:+.1f} +- {sb:.1f} more at the right and lower "
             "end (padding, resize or another image in the segmenter?)"
         )
@@ -97,7 +97,7 @@ def _applied(solution: Solution, offset: LabelOffset, focal_px: Float[np.ndarray
 
 
 def _widened(estimate: PairEstimate, offset: LabelOffset, focal_px: Float[np.ndarray, " 2"]) -> PairEstimate:
-    """Labels that lie to the right turn the camera about its y axis, labels further down about its x axis."""
+    """Labels that are too far right rotate the camera about its y axis, labels too far down about its x axis."""
     yaw, pitch = offset.open_px / focal_px
     numbers = {
         f"label_{name}_{axis}{sigma}_px": float(value)

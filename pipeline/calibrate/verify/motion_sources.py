@@ -1,8 +1,9 @@
-"""Odometry, the radar's Doppler and the lidar's own sweeps against each other: speed, sign, yaw rate and lag.
+"""Comparison of odometry, the radar's Doppler and the lidar's own sweeps: speed, sign, yaw rate and lag.
 
-What bridges the time between two sensors, and within a sweep, rests on the car's motion. A wrong source shows
-up as a wrong time offset, range or CameraInfo, so it is asked first. Of three sources the odd one is named;
-of two, the one that drives backwards or is off by the factor of a unit, else the odometry.
+Motion compensation between two sensors, and within a sweep, depends on the car's motion. A wrong source has
+the effect of a wrong time offset, range or CameraInfo, so this check comes first. Of three sources, the one
+that differs is reported. Of two, it is the one that drives backwards or is wrong by the factor of a unit,
+else the odometry.
 """
 
 from __future__ import annotations
@@ -117,7 +118,7 @@ def _sources(observations: Sequence[Observation], T_lidar_radar: np.ndarray) -> 
 
 
 def _slopes(observations: Sequence[Observation], sources: _Sources) -> dict[str, _Slope]:
-    """Ratios and lag of the sources that moving and turning frames show."""
+    """Ratios and lag of the sources, from moving and turning frames."""
     lidar = sweep_motion(observations)
     odometry, turn, doppler = (
         np.array([values[i : j + 1].mean() for i, j in zip(lidar.first, lidar.last, strict=True)], np.float64)
@@ -134,7 +135,7 @@ def _slopes(observations: Sequence[Observation], sources: _Sources) -> dict[str,
 
 
 def _wrong_speeds(slopes: dict[str, _Slope], doppler_mps: np.ndarray) -> list[FailedCheck]:
-    """The source whose speed is the odd one."""
+    """The source whose speed differs from the others."""
     by_lidar = {n: s for n in ("odometry", "doppler") if (s := slopes.get(f"{n}_by_lidar")) is not None}
     off = {name: s for name, s in by_lidar.items() if s.same < _MET and s.points >= _FEWEST_PAIRS}
     between = slopes.get("odometry_by_doppler")
@@ -157,7 +158,7 @@ def _wrong_speeds(slopes: dict[str, _Slope], doppler_mps: np.ndarray) -> list[Fa
 
 
 def _against_the_lidar(odometry: _Slope, *, agreed: bool) -> list[FailedCheck]:
-    """Where the lidar contradicts odometry and Doppler, which agree with each other or not."""
+    """Reasons if the lidar contradicts odometry and Doppler, which may agree with each other or not."""
     if agreed and odometry.fits == -1:
         return [
             FailedCheck(
@@ -179,7 +180,7 @@ def _wrong_speed(name: str, against: str, found: _Slope) -> FailedCheck:
 
 
 def _hint(ratio: float) -> str:
-    """Explanation that fits: a sign, a unit, or none."""
+    """An explanation that fits: a sign, a unit, or none."""
     fits = ["the other sign"] if ratio < 0 else []
     fits += [unit for factor, unit in _FACTORS if abs(abs(ratio) / factor - 1) < _NEAR]
     return f"{' and '.join(fits)} fits" if fits else "its scale is wrong"
@@ -196,10 +197,10 @@ def _silent_doppler(observations: Sequence[Observation]) -> list[FailedCheck]:
 
 
 def _is_explained(o: Observation) -> bool:
-    """Whether the velocity of a scan is no chance.
+    """Whether the velocity of a scan is significant.
 
-    In a convoy little stands still. But what stands crowds about the velocity, where what fits by chance lies
-    as densely beside it.
+    In a convoy few objects stand still. But residuals of static detections concentrate at the velocity, while
+    chance matches have the same density around it.
     """
     stands = o.radar_motion == 0
     if o.radar_velocity_mps is None or np.mean(stands) > _EXPLAINED:
@@ -212,7 +213,7 @@ def _is_explained(o: Observation) -> bool:
 
 
 def _wrong_axes(observations: Sequence[Observation], T_lidar_radar: np.ndarray) -> list[FailedCheck]:
-    """A sensor that is turned round or mirrored: only so its detections meet the lidar."""
+    """A sensor that is turned round or mirrored, if its detections match the lidar only then."""
     swap = np.diag([1.0, -1.0, 1.0, 1.0])
     turn = from_rotation_translation(exp_so3(np.array([0.0, 0.0, np.pi])), np.zeros(3))
     tried = {
@@ -238,7 +239,7 @@ def _lidar_agrees(slopes: dict[str, _Slope]) -> bool:
 
 
 def _has_odometry(observations: Sequence[Observation]) -> bool:
-    """Whether a speed is logged: with a yaw rate, or where the radar's Doppler has none."""
+    """Whether a speed is logged, with a yaw rate, or without a speed by the radar's Doppler."""
     return any(
         o.ego_speed_mps is not None and (o.ego_yaw_rate_radps is not None or o.radar_velocity_mps is None)
         for o in observations
@@ -273,7 +274,7 @@ def _lag(observations: Sequence[Observation], sources: _Sources) -> _Slope | Non
 
 
 def _slope(y: np.ndarray, x: np.ndarray, least: float) -> _Slope | None:
-    """Slope by the weighted median, of where x is at least so large; None of too few."""
+    """Slope by the weighted median over values with sufficiently large x; None for too few."""
     use = np.isfinite(y) & np.isfinite(x)
     use[use] &= np.abs(x[use]) >= least
     if use.sum() < _FEWEST:

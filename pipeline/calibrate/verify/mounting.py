@@ -1,12 +1,12 @@
 """Covariance of the mounting pose, from that of the projection, and the reverse.
 
-A principal point wrong by d pixels is, but for second order, a camera turned by d / f. No alignment tells the
-two apart, and whoever projects with the same CameraInfo gets the right pixel all the same: through
-camera-radar as well, where both factors see through the same camera, and in lidar-radar, whose boxes are read
-through it. So what is certified in the image does not say how the camera hangs. That is known as surely as
-the principal point: as fleet.toml states it (`centre_sigma_px`), else as the day itself measures it, else not
-at all. Likewise a radar's own constant elevation error turns its detections, which a record is about, and not
-its mounting.
+To first order, a principal point wrong by d pixels has the effect of a camera rotated by d / f. No alignment
+separates the two, and users of the same CameraInfo still get the right pixel. This also holds through
+camera-radar, where both factors use the same camera, and in lidar-radar, whose boxes come from it. So a
+certified direction in the image does not certify the mounting of the camera. The mounting is known only as
+well as the principal point: as stated in fleet.toml (`centre_sigma_px`), else as measured by the day, else
+not at all. Likewise, a radar's own constant elevation error rotates its detections, which a record describes,
+but not its mounting.
 """
 
 from __future__ import annotations

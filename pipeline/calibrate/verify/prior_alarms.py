@@ -1,10 +1,11 @@
 """Alarms: a mounting or a clock that the day puts many sigmas from its prior.
 
-What the day leaves to the prior is as wrong as the prior is, and its sigma says that it is not. So each source that
-knows something of such a prior is asked: the pair's own day with the prior left out, which is too unsure to be a result
-and may still be ten sigmas away, and the other pair of the same sensor. Where the camera finds the lidar .3 m lower
-than tf_static has it, either of the two is mounted elsewhere; if it is the lidar, then the radar's height above it is
-wrong by as much, and nothing in lidar-radar shows that.
+A degree of freedom that the day leaves at the prior has the prior's error, even if that exceeds the stated
+sigma. So each other source of information on such a prior is compared with it. One is the pair's own day
+without the prior, which is too uncertain to be a result but may still be ten sigmas away. The other is the
+other pair of the same sensor. If the camera finds the lidar .3 m lower than tf_static, one of the two is
+mounted elsewhere; if it is the lidar, the radar's height above it has the same error, and nothing in
+lidar-radar shows it.
 """
 
 from __future__ import annotations
@@ -56,14 +57,14 @@ def prior_alarms(
 
 
 def _own_positions(estimate: PairEstimate) -> dict[int, tuple[float, float]]:
-    """By index, the day's own shift from a prior that it could not better, and its sigma [m]."""
+    """The day's own shift from a prior that it could not improve, and its sigma [m], by index."""
     d = estimate.diagnostics
     keys = {k: f"own_{DOF_NAMES[k]}" for k in range(3, 6)}
     return {k: (d[f"{name}_m"], d[f"{name}_sigma_m"]) for k, name in keys.items() if f"{name}_m" in d}
 
 
 def _is_far(estimate: PairEstimate, k: int, prior: Prior, limits: ChecksConfig) -> bool:
-    """Whether the day's position is many sigmas (prior and day) off."""
+    """Whether the day's position differs from the prior by many sigmas (of prior and day)."""
     z = [estimate.diagnostics[n] for n in ("own_z_prior", "own_z_beyond") if n in estimate.diagnostics]
     shift, own = _own_positions(estimate)[k]
     many = limits.max_move_prior_sigmas
@@ -97,7 +98,7 @@ def clock_alarms(
 def edge_alarms(
     pairs: Mapping[str, PairEstimate], prior: Prior, limits: ChecksConfig
 ) -> dict[str, list[FailedCheck]]:
-    """Camera-lidar or lidar-radar, where the other one contradicts the lidar's mounting and this one rests on it."""
+    """Alarms for camera-lidar or lidar-radar if the other one contradicts the lidar's mounting on which it depends."""
     out = {}
     for seen, resting in (_LIDAR_PAIRS, _LIDAR_PAIRS[::-1]):
         if not {seen, resting} <= pairs.keys() or pairs[seen].disproved:
@@ -126,7 +127,7 @@ def _contradicted(estimate: PairEstimate, prior: Prior, limits: ChecksConfig) ->
 
 
 def _kept(resting: PairEstimate, hidden: Float[np.ndarray, " 6"]) -> Bool[np.ndarray, " 6"]:
-    """Axes that the pair left at a prior contradicted by the other pair."""
+    """Axes that the pair left at a prior that the other pair contradicts."""
     size = np.repeat([np.linalg.norm(hidden[:3]), np.linalg.norm(hidden[3:])], 3)
     return ~resting.observable & (np.abs(hidden) > 0.3 * size)
 

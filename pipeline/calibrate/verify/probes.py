@@ -1,8 +1,8 @@
-"""Held-out frames at known turns of the result: would they confirm the result against a prior turned like that?
+"""Held-out frames at known rotations of the result: a test whether they would reject a prior rotated like this.
 
 A record that lies many sigmas from its prior is held unless held-out frames align better at the result than at
-the prior. Whoever asks how large an error of the prior would be shown needs this answer for errors that the
-prior does not have.
+the prior. To find the smallest error of the prior that would be detected, this test is made for errors that
+the prior does not have.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ def probe_numbers(
     """Deviate z of the paired test by turn, negative = held-out frames prefer the result; for diagnostics.
 
     Args:
-        pair: its camera or radar is turned.
+        pair: pair whose camera or radar is rotated.
         T: the result.
-        cost: of each held-out frame at a pose of the pair.
+        cost: cost of each held-out frame at a pose of the pair.
         blocks: scene of each held-out frame.
-        sizes_deg: of the turns; both signs are tried.
+        sizes_deg: sizes of the rotations; both signs are tested.
     """
     found, after = dict[str, float](), cost(T) if sizes_deg else np.zeros(0)
     for axis in _PROBED.get(pair, ()):

@@ -1,9 +1,10 @@
-"""Targets that both sensors of a pair see, from their views of the day: what a pair is certified by.
+"""Targets in view of both sensors of a pair, at which a pair is certified.
 
-What an error of the pose costs depends on where it puts things. A camera that looks to the left sees nothing before the
-lidar, where its pitch is a roll: certified there, it would be certified by what it never sees. So targets lie where the
-views overlap at the prior: the camera's image through CameraInfo, and directions in which the lidar has points and the
-radar detections, holes of the scene filled.
+The effect of a pose error depends on the direction of a target. For a camera that looks to the left, a target
+ahead of the lidar would turn its pitch into a roll: it would be certified at a target that it never sees. So
+targets are placed where the views overlap at the prior. The view of a camera is its image by CameraInfo. The
+view of a lidar or radar is the set of directions in which it has points or detections on the day, with holes
+of the scene filled.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ _WIDE_RAD = np.radians(12.5)  # half-width from which they lie as far apart as t
 
 
 def views_of(observations: Sequence[Observation]) -> dict[str, View]:
-    """By sensor, which points of its own frame it sees; a sensor without data of its own is left out."""
+    """View of each sensor, for points in its own frame; a sensor without data is left out."""
     some = observations[:: max(len(observations) // FRAMES, 1)]
     clouds = {
         "lidar": [o.lidar_map_xyz_m for o in some if "lidar" in o.sensors],
@@ -46,7 +47,7 @@ def views_of(observations: Sequence[Observation]) -> dict[str, View]:
 
 
 def seen_targets(pair: str, prior: Prior, views: dict[str, View]) -> Float[np.ndarray, "3 3"] | None:
-    """Targets of a pair of camera, lidar and radar; a sensor without a view passes for one that sees everything."""
+    """Targets of a pair of camera, lidar and radar; a sensor without a view is taken to see everything."""
     parent, child = FRAMES_OF_PAIR[pair]
     return targets_of(prior.of(pair), views.get(parent), views.get(child))
 
@@ -54,10 +55,10 @@ def seen_targets(pair: str, prior: Prior, views: dict[str, View]) -> Float[np.nd
 def targets_of(
     T_parent_child: Float[np.ndarray, "4 4"], parent: View | None, child: View | None
 ) -> Float[np.ndarray, "3 3"] | None:
-    """Three targets 15, 25 and 40 m away, in the child's frame; None where the two see no direction in common.
+    """Three targets 15, 25 and 40 m away, in the child's frame; None if the views do not overlap.
 
-    About the middle of what both see, as far apart as before cars that look ahead, or closer where the views are
-    narrow; as level as the views allow. None in place of a view sees everything.
+    They surround the middle of the common view, as level as the views allow. Their spacing is that of sensors
+    that look ahead, or less in narrow views. A view None sees everything.
     """
     # Near and far: a sensor a metre aside sees them two to four degrees apart.
     ranges_m = [_RANGES_M.min(), _RANGES_M.max()]
@@ -86,6 +87,6 @@ def targets_of(
 
 
 def unseen_failure(pair: str) -> FailedCheck:
-    """Why a pair without any common direction cannot be accepted."""
+    """Reason why a pair without overlapping views cannot be accepted."""
     parent, child = FRAMES_OF_PAIR[pair]
     return FailedCheck(f"{parent} and {child} see no direction in common at the prior: nothing to certify")

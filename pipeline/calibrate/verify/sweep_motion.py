@@ -1,8 +1,9 @@
-"""How fast the lidar drives and turns, by pairs of its own sweeps: from no odometry, no Doppler and no calibration.
+"""Speed and yaw rate of the lidar from pairs of its own sweeps, without odometry, Doppler or calibration.
 
-What stands in one sweep is moved along an arc until it meets what stands in another, half a second later: all speeds
-and yaw rates of a car are tried on a grid, so there is no start to be wrong about. Rails and walls meet themselves at
-any speed; a pair whose best arc is hardly better than others far away is not used.
+Standing objects of one sweep are moved along an arc and compared with those of another sweep half a second
+later. All speeds and yaw rates of a car are tested on a grid, so there is no start that could be wrong. Rails
+and walls match themselves at any speed; so a pair is not used if other, distant arcs are nearly as good as
+the best one.
 
 Source: Olson 2009, "Real-time correlative scan matching" (here with one arc for three unknowns).
 """
@@ -56,7 +57,7 @@ def sweep_motion(observations: Sequence[Observation]) -> SweepMotion:
 
 
 def _pairs(observations: Sequence[Observation]) -> Int64[np.ndarray, "P 2"]:
-    """Places of observations of one drive whose sweeps are nearest to half a second apart."""
+    """Indices of observations of one drive whose sweeps are nearest to half a second apart."""
     stamps_s = np.array([o.stamp_ns for o in observations], np.int64) * 1e-9
     drives = np.array([o.drive for o in observations], np.int64)
     out = []

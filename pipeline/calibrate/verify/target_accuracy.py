@@ -1,16 +1,16 @@
-"""What a record may claim: how far off targets 15 to 40 m away can be, and how sure that is.
+"""The claim of a record: the error at targets 15 to 40 m away, with a probability.
 
-What an error of the pose costs depends on where it puts things. Azimuth and elevation at the targets that both sensors
-see (`seen_targets.py`) are linear in the pose, so its covariance gives their sigmas, with every correlation and
-every degree of freedom that the day left to the prior. A direction is certified where its error stays, by that sigma,
-within the limit of `[verify]` with the probability asked for there.
+Azimuth and elevation at the targets that both sensors see (`seen_targets.py`) are linear in the pose. So its
+covariance gives their sigmas, with all correlations and all degrees of freedom that the day left to the
+prior. A direction is certified if its error, by that sigma, is within the limit of `[verify]` with the
+required probability.
 
-Held-out frames can contradict a claim and never sharpen it. They do not move the pose, and where the fit
-called a direction undetermined their curvature once certified it all the same: a radar that repeats one scan all day
-was .55 deg off at a sigma of 1.19 deg, accepted. Nor do they know better on good days. The real car's forward shift
-stays where the prior has it, for it moves points as the clock does; held-out frames call it known, for their update
-starts from a pose and a clock that err independently. With their bound one of 27 azimuths of good days that it
-certified lay beyond it, at 99.5 %.
+Held-out frames can contradict a claim, but never make it stronger. They do not move the pose. Their curvature
+once certified a direction that the fit called undetermined: a radar that repeats one scan all day was .55 deg
+off at a sigma of 1.19 deg, and accepted. They are not better on good days either. The real car's forward
+shift stays at the prior, because it moves points as the clock does; held-out frames call it determined,
+because their update starts from independent errors of pose and clock. One of 27 azimuths of good days that
+their bound certified exceeded it, at 99.5 %.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Claim:
 
     @property
     def bound_rad(self) -> float:
-        """The error is smaller than this with the probability asked for, by the estimate's own sigma.
+        """Bound of the error with the required probability, by the estimate's own sigma.
 
         A shift by which held-out frames contradict the estimate counts as error.
         """
@@ -98,19 +98,19 @@ def claims_of(
     mounting: Float[np.ndarray, "6 6"] | None = None,
     targets: Float[np.ndarray, "N 3"] = DEFAULT_TARGETS,
 ) -> dict[str, Claim]:
-    """What can be claimed of each direction, by name.
+    """Claim for each direction, by name.
 
     Args:
-        pair: which one.
+        pair: name of the pair.
         T: the estimate.
-        covariance: of its left perturbation.
-        update: of the estimate by held-out frames; None if they do not determine one.
+        covariance: covariance of its left perturbation.
+        update: update of the estimate by held-out frames; None if they do not determine one.
         limit_rad: largest error that the purpose allows.
         confidence: probability with which an error has to stay within it.
         contradiction_sigmas: sigmas of the shift from which held-out frames contradict the estimate.
-        elevation_limit_rad: for elevation, where it differs from azimuth's.
-        mounting: covariance of the estimate as the pose of what is mounted; None if unknown.
-        targets: in the child's frame, where both sensors see them.
+        elevation_limit_rad: limit for elevation, if it differs from that for azimuth.
+        mounting: covariance of the estimate as a mounting pose; None if unknown.
+        targets: targets in view of both sensors, in the child's frame.
     """
     limits_rad = (limit_rad, limit_rad if elevation_limit_rad is None else elevation_limit_rad)
     own = target_sigmas(pair, T, covariance, targets)

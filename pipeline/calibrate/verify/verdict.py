@@ -1,9 +1,9 @@
 """Accept, hold or refuse: each check has a margin, the smallest is the score, and one below zero holds the record.
 
-Accepted: the record certifies what it names in `determined` (azimuth, and elevation where the day shows it, of targets
-15 to 40 m away), within its stated limit: in the image with this CameraInfo, and as the sensors are mounted where
-`mounting` names it. Held: computed and recorded, but a check failed and the prior stays current. Refused: too little to
-compute from.
+Accepted: the record certifies the directions listed in `determined` (azimuth, and elevation if the day
+determines it, of targets 15 to 40 m away) within the stated limit. This applies to the image with this
+CameraInfo, and to the mounting of the sensors for directions listed in `mounting`. Held: computed and
+recorded, but a check failed and the prior stays current. Refused: not enough data.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class _Check:
-    """One condition: margin 1 = far inside, 0 = at the limit; the reason is given where the margin is negative."""
+    """One condition: margin 1 = far inside, 0 = at the limit; the reason is given if the margin is negative."""
 
     margin: float
     reason: str
@@ -108,14 +108,14 @@ def judge(
 
     Args:
         estimate: the result.
-        prior: what stays current without it.
+        prior: the pose that stays current without it.
         evidence: held-out frames, claims and failed checks.
-        search: how far from the prior the solver looked.
+        search: search range of the solver about the prior.
         limits: thresholds.
-        triggered: False where no trigger asked for this pair, so that it was not estimated.
-        together: whether other pairs take part in the pose. How far the pair moved is checked where each of them was
-            judged apart, and it need not align better on its own held-out frames; but it may not align worse, nor may
-            they contradict it.
+        triggered: False if no trigger is active for this pair, so that it was not estimated.
+        together: whether other pairs contribute to the pose. The move of the pair is then checked in its
+            separate verdict, and it need not align better on its own held-out frames. But it must not align
+            worse, and they must not contradict it.
     """
     if not triggered:
         return Verdict("held", "not triggered: the prior stays", _FAILED)
@@ -202,7 +202,7 @@ def _moves_little(
 def _aligns_better(
     estimate: PairEstimate, prior: Prior, test: HeldOutTest | None, limits: ChecksConfig
 ) -> _Check:
-    """Held-out frames align better than at the prior, or as well where the result agrees with the prior."""
+    """Held-out frames align better than at the prior, or equally well if the result agrees with the prior."""
     if test is None or test.frames < limits.min_held_out_frames:
         found = 0 if test is None else test.frames
         few = f"too few held-out frames to judge: {found}, needs {limits.min_held_out_frames}"
@@ -224,7 +224,7 @@ def _aligns_better(
 def _aligns_no_worse(
     estimate: PairEstimate, prior: Prior, test: HeldOutTest | None, limits: ChecksConfig
 ) -> list[_Check]:
-    """If other pairs take part in the pose: no worse than a prior that the result contradicts."""
+    """If other pairs contribute to the pose: alignment no worse than at a prior that the result contradicts."""
     if test is None:
         return []
     _, ratio = _largest_move(estimate, prior)
@@ -247,9 +247,10 @@ def _moves(estimate: PairEstimate, prior: Prior) -> np.ndarray:
 
 
 def _unchecked(estimate: PairEstimate, prior: Prior, certified: Sequence[str]) -> dict[int, float]:
-    """What clearly left the prior in a record that is good for its azimuth alone, by index: how many sigmas it moved.
+    """DoF of a record certified for its azimuth alone that moved far from the prior: sigmas of the move by index.
 
-    Where elevation is certified its witnesses are sure, and right rolls move by many of their sigmas.
+    Records with a certified elevation are left out: their sources of elevation are precise, and right rolls
+    move by many of their sigmas.
     """
     if "elevation" in certified:
         return {}
@@ -287,7 +288,7 @@ def _known(claim: Claim) -> str:
 
 def _differences(pair: str, unchecked: Mapping[int, float]) -> list[str]:
     far = "sigma from the prior, and no held-out frame checks it: not certified"
-    return [f"{_UNCHECKED[pair][k]} lies {sigmas:.1f} {far}" for k, sigmas in unchecked.items()]
+    return [f"{_UNCHECKED[pair][k]} is {sigmas:.1f} {far}" for k, sigmas in unchecked.items()]
 
 
 def _reservations(estimate: PairEstimate, claims: Mapping[str, Claim]) -> list[str]:

@@ -180,7 +180,7 @@ class ChunkCache:
             self.put(key, chunk)
 
     def put(self, key: tuple[str, int], chunk: bytes) -> None:
-        """Keep a chunk; at least the last one stays, whatever its size."""
+        """Keep a chunk; at least the last one is kept, of any size."""
         self._chunks[key] = chunk
         self._bytes += len(chunk)
         while self._bytes > self._max_bytes and len(self._chunks) > 1:

@@ -1,4 +1,4 @@
-"""ROS 1 bags (format 2.0), read chunk by chunk; a truncated bag without index is read as far as it goes.
+"""ROS 1 bags (format 2.0), read chunk by chunk; a truncated bag without index is read up to its end.
 
 Source: http://wiki.ros.org/Bags/Format/2.0
 """

@@ -1,4 +1,4 @@
-"""Content of a container's index, and stretches of log time, for reading parts of a log."""
+"""The content of a container's index and stretches of log time, for reading parts of a log."""
 
 from __future__ import annotations
 
@@ -211,7 +211,7 @@ def _channels(chunk: Chunk, topics: Mapping[int, str]) -> Iterable[int]:
 def _without_pause(chunk: Chunk, typical_ns: int) -> list[tuple[int, int]]:
     """Recorded stretches of a chunk, estimated from its span: chunks hold equal amounts of data.
 
-    A chunk that took much longer to fill than others began before a pause and ended after it.
+    If a chunk took much longer to fill than the others, its span includes a pause.
     """
     if chunk.end_ns - chunk.start_ns <= 3 * typical_ns + PAUSE_NS:
         return [(chunk.start_ns, chunk.end_ns)]

@@ -1,7 +1,7 @@
 """Road users logged as 3D boxes in the camera's own frame, projected to 2D boxes.
 
-Boxes in any other frame are refused: projecting them needs the calibration that is to be estimated, and they
-would confirm whatever prior they were made with.
+Boxes in any other frame are refused: their projection needs the calibration to be estimated, and they would
+confirm any prior that was used.
 """
 
 from __future__ import annotations

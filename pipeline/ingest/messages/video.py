@@ -84,7 +84,7 @@ class VideoPictures:
                 return packets
             if self._is_broken[i]:
                 break
-        raise ValueError("video has no key frame before this picture in what was read")
+        raise ValueError("no video key frame before this image was read")
 
 
 def _is_key(format_: str, data: bytes) -> bool:

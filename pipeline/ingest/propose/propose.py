@@ -44,7 +44,7 @@ class Proposal:
 
 
 def propose_fleet(logs: Sequence[Path], fleet: str, progress: Progress = silent) -> Proposal:
-    """A fleet.toml for logs of vehicles of one build, of which a minute each is read.
+    """A fleet.toml for logs of vehicles of one build; one minute of each log is read.
 
     Raises:
         ConfigError: the logs have fewer than two sensors.

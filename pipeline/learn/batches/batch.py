@@ -18,8 +18,8 @@ Tensor = torch.Tensor
 class TrainingBatch:
     """B frames; columns of table `training` (see `schemas/training.py` for grid, units and frames).
 
-    Arrays keep the types they are stored in, to be small on their way to the device. Padded rows hold zeros;
-    the masks `*_valid` are true for rows that are not padding.
+    Arrays keep their stored types, so that less data is copied to the device. Padded rows hold zeros; the
+    masks `*_valid` are true for rows that are not padding.
     """
 
     grid_step_deg: float

@@ -1,4 +1,4 @@
-"""A model's card: facts of its training run, as JSON and Markdown."""
+"""A model's card: facts about its training run, as JSON and Markdown."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ __all__ = ["LIMITS", "card_of_run", "write_card"]
 
 UNFIT = "Not fit for use"
 LIMITS = (
-    "Trained without ground truth: answers inherit the losses' biases, which no average over the fleet takes out.",
+    "Trained without ground truth: answers have the losses' biases, which averaging over a fleet does not reduce.",
     "Looks 38 deg to each side of the camera's axis; guesses within about 5 deg, best with 2 or 3 passes.",
-    "Rotations of camera-lidar are what a single frame tells best; translations move little from their guess.",
-    "Log variances are of single frames; they say how much frames scatter, not what all frames share.",
-    "Nothing was learned of rigs, lenses or weather that the data does not show.",
+    "A single frame determines rotations of camera-lidar best; translations stay close to their guess.",
+    "Log variances describe the scatter between frames; they do not include errors common to all frames.",
+    "Rigs, lenses or weather that are not in the data were not learned.",
 )
 
 
@@ -28,7 +28,8 @@ def card_of_run(folder: Path, notes: Path | None = None) -> dict[str, Any]:
     """The card of a run of `boresight train`.
 
     Args:
-        notes: JSON object whose entries come on top: what was measured after training, what the data was.
+        notes: JSON object whose entries are placed first: measurements after training, and facts about the
+            data.
 
     Raises:
         ContractError: no readable checkpoint.
@@ -64,7 +65,7 @@ def _unfit(steps: int, validate_every: int, validation: Mapping[str, float]) -> 
 
 
 def write_card(model: Path, card: dict[str, Any]) -> None:
-    """Write the card beside the model's file as .json and .md, with size and sha256."""
+    """Write the card next to the model's file as .json and .md, with size and sha256."""
     content = model.read_bytes()
     told = {"file": model.name, "bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
     card = told | {key: value for key, value in card.items() if key not in told}

@@ -57,7 +57,7 @@ class _Graph(nn.Module):
 
 
 def export_onnx(network: CalibrationNetwork, out: Path, card: dict[str, Any] | None = None) -> Path:
-    """Write the network (batch 1) to `out`, and its card into the metadata and beside it (JSON, Markdown)."""
+    """Write the network (batch 1) to `out`, and its card into the metadata and next to it (JSON, Markdown)."""
     network.eval()
     examples = _examples(network.config)
     graph = _Graph(network)

@@ -1,4 +1,4 @@
-"""A torch module as an ONNX file, by the exporter that traces."""
+"""A torch module as an ONNX file, by torch's tracing exporter."""
 
 from __future__ import annotations
 

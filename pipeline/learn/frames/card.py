@@ -38,17 +38,17 @@ _OPEN = {
         "NaN where the log has no value."
     ),
     "kitti": (
-        "KITTI object folders in training/, splits in ImageSets/*.txt; frames.jsonl says which frame is which. Images "
-        "are undistorted with the logged K. label_2 has boxes in the image and none in space (KITTI's -1, -10, -1000); "
-        "radar/*.bin are View-of-Delft's rows (x y z RCS v_r v_r_compensated time), NaN where the car's speed is not "
-        "known. Tr_imu_to_velo is the identity where nobody knows where the lidar sits on the car. semantic/*.png are "
+        "KITTI object folders in training/, splits in ImageSets/*.txt; frames.jsonl has the facts of each frame. "
+        "Images are undistorted with the logged K. label_2 has boxes in the image and none in space (KITTI's -1, -10, "
+        "-1000); radar/*.bin are View-of-Delft's rows (x y z RCS v_r v_r_compensated time), NaN where the car's speed "
+        "is not known. Tr_imu_to_velo is the identity if the lidar's pose on the car is unknown. semantic/*.png are "
         "labels. Intensity is NaN where the log has none."
     ),
     "nuscenes": (
         'NuScenes("v1.0-boresight", "."); splits by scene are in v1.0-boresight/splits.json. Images are undistorted '
         "with the logged K. object_ann.json (nuImages' table) has boxes in the image, labels/CHANNEL/*.png labels; "
-        "there are no boxes in space and no map (a grey pixel stands for it). Where nobody knows where the reference "
-        "sits on the car, the ego frame is the reference. Rings and intensities that are not logged are 0."
+        "there are no boxes in space and no map (a grey pixel replaces it). If the reference's pose on the car is "
+        "unknown, the ego frame is the reference. Rings and intensities that are not logged are 0."
     ),
 }
 _FINISH = {"kitti": finish_kitti, "nuscenes": finish_nuscenes}

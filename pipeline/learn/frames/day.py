@@ -61,7 +61,7 @@ class DayTask:
 
 
 def export_day(task: DayTask, progress: Progress) -> str:
-    """Write a vehicle-day unless it is there from the same data, calibration and plan: 'done' or 'cached'."""
+    """Write a vehicle-day unless it exists from the same data, calibration and plan: 'done' or 'cached'."""
     output, key = task.output, _key(task)
     before = output.done(task.partition)
     if before is not None and before["work_key"] == key:

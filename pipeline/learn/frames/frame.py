@@ -101,7 +101,7 @@ class Frame:
         at: number, split and place.
         seen: labels and boxes of cameras, by name.
         T: T_reference_sensor as it is given out, of these sensors.
-        answer: the same as the calibration has it; None where `T` is that.
+        answer: the unperturbed poses of the calibration; None if `T` has them.
     """
 
     partition: Partition

@@ -41,7 +41,7 @@ _UNAMBIGUOUS = 3
 class NuScenesWriter:
     """Writes files and rows as frames come; a scene is one log, drive and split.
 
-    A row goes out when the next of its chain is known, which it names.
+    A row is written when the next row of its chain, to which it refers, is known.
     """
 
     def __init__(self, output: DayOutput, stack: ExitStack) -> None:

@@ -103,7 +103,7 @@ class Output:
             self.delete(_of(partition, "begun.json"))
 
     def _sweep(self, partition: Partition, numbers: Sequence[int]) -> None:
-        """Remove what a killed writer left: files that are called by the day's key or by its numbers."""
+        """Remove files of a killed writer, which are named by the day's key or its numbers."""
         own = re.compile(re.escape(day_key(partition)) + r"[_-]\d{6,}")
         for path in [p for folder in _FOLDERS for p in self.files.find(self.root / folder, "**/*")]:
             stem = path.name.partition(".")[0]
@@ -114,7 +114,7 @@ class Output:
 
 @dataclass(frozen=True)
 class DayOutput:
-    """Output of one vehicle-day: files, and rows that go to disk as they come."""
+    """Output of one vehicle-day: files, and rows that are written to disk one by one."""
 
     output: Output
     stream: BinaryIO

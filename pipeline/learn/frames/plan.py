@@ -1,4 +1,4 @@
-"""Frames of an export by vehicle-day and split, stored beside the export so that later runs agree."""
+"""Frames of an export by vehicle-day and split, stored with the export so that later runs agree."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def _as_begun(config: PrepareConfig, settings: Mapping[str, Any], begun: Mapping
 
 
 def _with_split(settings: Mapping[str, Any], config: PrepareConfig) -> dict[str, Any]:
-    """The settings with those by which places get their names: other places of the same name would leak."""
+    """The settings, and those that name places, because different places with the same name would leak."""
     whole: dict[str, Any] = json.loads(to_json({**settings, "split": split_settings(config)}))
     return whole
 

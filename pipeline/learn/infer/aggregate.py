@@ -104,8 +104,8 @@ def day_estimate(
     """Transform and covariance of a pair from the prior and all answers.
 
     Args:
-        unobservable: degrees of freedom that the sensors do not determine, whatever the network answers: those of
-            elevation with a radar that measures none.
+        unobservable: degrees of freedom that the sensors cannot determine for any answer of the network:
+            those of elevation with a radar that does not measure it.
     """
     S = _bearing_of_twist(answers.T_centre)
     twist_of_bearing = np.linalg.inv(S)
@@ -171,7 +171,7 @@ def measured_estimate(
     Args:
         T: the peak of frames and prior together.
         information: of the frames alone, left twist; may be singular.
-        bias_sigma: of what frames err by alike, (bearing rotation [rad], translation [m]).
+        bias_sigma: sigmas of the error common to all frames, (bearing rotation [rad], translation [m]).
     """
     S = _bearing_of_twist(T)
     back = np.linalg.inv(S)

@@ -58,7 +58,7 @@ def fitted_day(
     candidates: Sequence[Float[np.ndarray, "4 4"]],
     prior: Prior,
 ) -> JointDay | None:
-    """Vote, climb and choose points anew until the fit is stable; None if the network shows no evidence.
+    """Vote, optimise and select points again until the fit is stable; None if the network has no evidence.
 
     Args:
         evidence: of all frames, points chosen through a pose.

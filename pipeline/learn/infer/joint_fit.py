@@ -1,9 +1,9 @@
 """Camera-lidar of a day from all its frames at once: the pose at which all sweeps' classes fit the images.
 
-A single frame determines rotation to half a degree and hardly any shift, and sometimes it fits in two places.
-The sum over frames has one peak: wrong places of single frames differ, and near and far points determine the
-shift by parallax. Candidates are the poses of pilot frames; all frames vote among them, and the best one
-climbs the sum.
+A single frame determines rotation to half a degree and hardly any shift, and sometimes two poses fit. The sum
+over frames has one peak: wrong places of single frames differ, and near and far points determine the shift by
+parallax. Candidates are the poses of pilot frames; all frames vote among them, and the best one climbs the
+sum.
 
 Points of a frame are not independent, so the sum is no likelihood. Its weight is measured on the day, for
 each kind of evidence (classes, edges on boundaries, paint): a likelihood's curvature is the scatter of its
@@ -82,7 +82,7 @@ def fit_of(
     T_prior: Float[np.ndarray, "4 4"],
     prior_covariance: Float[np.ndarray, "6 6"],
 ) -> JointFit:
-    """Climb from `T_start`, and estimate the sigma of the peak; frames of one `block` (scene) err alike."""
+    """Optimise from `T_start`, and estimate the peak's sigma; errors within a `block` (scene) are correlated."""
     T, worth = T_start, np.full(frames[0].kinds[-1] + 1, _FIRST_WORTH)
     for _ in range(2):
         T = climbed(frames, T, T_prior, prior_covariance, worth)

@@ -39,7 +39,7 @@ _NOBODY = About("", "", "", "", "", "")
 def model_files(method: str, fleet: FleetConfig) -> dict[str, Path]:
     """Files of a method's networks by pairs: those of fleet.toml, else the shipped ones.
 
-    The shipped network with classes comes first, unless the fleet asks for images alone.
+    The shipped network with classes comes first, unless fleet.toml selects images alone.
 
     Raises:
         ConfigError: a file is missing; the message has the key that names another.

@@ -65,7 +65,8 @@ def informed_by_way(solution: Solution, observations: Sequence[Observation], pri
     """The solution with the radar's pitch fused with the direction of travel, in the pairs that have frames.
 
     Args:
-        solution: by networks; camera_radar is updated through camera_lidar, for a day and not for one frame.
+        solution: solution by networks; camera_radar is updated through camera_lidar, for a day but not for
+            one frame.
         observations: the frames of the solution, or others of the day.
         prior: for the observability, which compares the covariance with the prior's.
     """
@@ -89,10 +90,10 @@ def informed_by_way(solution: Solution, observations: Sequence[Observation], pri
 
 
 def way_turn(observations: Sequence[Observation], T_lidar_radar: Float[np.ndarray, "4 4"]) -> WayTurn | None:
-    """Rotation that the direction of travel measures at a pose; None if too few frames show it.
+    """Rotation measured by the direction of travel at a pose; None if too few frames determine it.
 
-    The variance is that of the robust mean, at least that from differences between drives. A single frame has no
-    scatter and gets the usual one.
+    The variance is that of the robust mean, at least that from differences between drives. A single frame has
+    no scatter and gets a typical one.
     """
     travel = travel_directions(observations, T_lidar_radar, 0.0)
     if len(observations) == 1:
@@ -119,7 +120,7 @@ def way_turn(observations: Sequence[Observation], T_lidar_radar: Float[np.ndarra
 
 
 def _floor(observations: Sequence[Observation], T_lidar_radar: Float[np.ndarray, "4 4"]) -> float:
-    """Variance of the bias by detections below the road, at the measured pose."""
+    """Variance of the bias due to detections below the road, at the measured pose."""
     travel = travel_directions(observations, T_lidar_radar, 0.0)
     heights = displaced_heights(observations, T_lidar_radar, 0.0, np.random.default_rng(0))
     share = 0.0 if heights is None or not travel.count else heights.seen_low(travel.below)
@@ -138,7 +139,7 @@ def _frame_turn(travel: TravelDirections, T_lidar_radar: Float[np.ndarray, "4 4"
 def updated_by_way(
     estimate: PairEstimate, way: WayTurn, prior_covariance: Float[np.ndarray, "6 6"]
 ) -> PairEstimate:
-    """The estimate fused with the measurement: pose turned about the child's origin, covariance, common covariance."""
+    """The estimate fused with the measurement: pose rotated about the child's origin, covariance, common covariance."""
     row = np.append(way.axis, np.zeros(3))
     direction = np.append(way.axis, np.cross(estimate.T[:3, 3], way.axis))
     own, measured = float(row @ estimate.covariance @ row), way.variance + way.floor
@@ -195,7 +196,7 @@ def _seen_by_camera(
 
 
 def _turned(T: Float[np.ndarray, "4 4"], omega: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "4 4"]:
-    """T turned about the child's own origin, by a rotation vector in parent axes."""
+    """T rotated about the child's own origin, by a rotation vector in parent axes."""
     out = T.copy()
     out[:3, :3] = exp_so3(omega) @ T[:3, :3]
     return out

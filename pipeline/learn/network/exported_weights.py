@@ -52,9 +52,7 @@ def network_of_file(path: Path) -> CalibrationNetwork:
         values = json.loads(metadata["network"])
         config = NetworkConfig(**(values | {"grid": Grid(**values["grid"])}))
     except Exception as err:  # protobuf has its own exceptions, different by version
-        raise ModelError(
-            str(path), "does not say where its weights lie: nothing can be trained on from it"
-        ) from err
+        raise ModelError(str(path), "does not list its weights, so training cannot continue from it") from err
     held = {i.name: numpy_helper.to_array(i) for i in model.graph.initializer}
     network = CalibrationNetwork(config)
     network.load_state_dict(

@@ -24,8 +24,8 @@ class SensorInputs:
     `camera` is red, green, blue (0..1) and 1 where the image shows the whole cell. Features are those named
     in LIDAR_FEATURES and RADAR_FEATURES, of the order of one on any rig: ranks, heights over the ground in
     units of 3 m, Doppler residuals in units of 5 m/s, power over the scan's median in units of 20 dB.
-    `classes` is what a segmenter makes of the image: the likelihood of each of GRID_CLASSES and 1 where it is
-    known, all 0 elsewhere.
+    `classes` is the result of a segmenter: the likelihood of each of GRID_CLASSES, and 1 where it is known;
+    all 0 elsewhere.
     """
 
     camera: Float[Tensor, "B 4 H W"]

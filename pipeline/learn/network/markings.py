@@ -1,7 +1,7 @@
 """Lane paint and other bright ground: reflectivity of the sweep against brightness of the image.
 
 Ground fills most of both views, and its classes constrain the pose least. Paint returns more light than the
-asphalt beside it, to a lidar and to a camera: such lines constrain pitch, roll and yaw of sweeps with few
+asphalt next to it, to a lidar and to a camera. Such lines constrain pitch, roll and yaw of sweeps with few
 rows. Both sides are high-pass filters along the row, in units of their own spread, so gains, exposures and
 scales do not matter.
 
@@ -29,7 +29,7 @@ _ROAD, _VERGE = 0, 1  # of GRID_CLASSES
 
 
 def mark_strength(lidar_grid: Float[Tensor, "B C H W"]) -> Float[Tensor, "B H W"]:
-    """Contrast of each cell's ground to the row beside it: 0 up to one sigma, 1 from MARK_SIGMAS on.
+    """Contrast of each cell's ground with its neighbours in the row: 0 up to one sigma, 1 from MARK_SIGMAS on.
 
     Zero everywhere if no reflectivity is logged.
     """

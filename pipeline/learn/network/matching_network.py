@@ -106,7 +106,7 @@ class MatchingCore(nn.Module):
     ) -> Float[Tensor, "B L H W"]:
         """Log-probability of classes, and behind them 1 where the camera sees the cell.
 
-        Beyond the border the values at the border continue. If all classes were alike there, points would
+        Beyond the border the values at the border continue. If all classes were equal there, points would
         gain by leaving well-classified cells: a narrow image would push the sweep out.
         """
         # Classes last: runtimes are five times slower along another axis.
@@ -180,7 +180,7 @@ class MatchingCore(nn.Module):
         return torch.where(mirrored, logits.flip(-1), logits)
 
     def _with_edges(self, maps: Tensor, probability: Tensor, edge: Tensor) -> tuple[Tensor, Tensor]:
-        """Boundaries as one more class, matched by the sweep's edges whatever the points' classes are."""
+        """Boundaries as one more class, matched with the sweep's edges for any class of their points."""
         if self.log_edge_worth is None:
             return maps, probability
         worth = torch.exp(self.log_edge_worth) * edge
@@ -242,7 +242,7 @@ class MatchingCore(nn.Module):
 def confusions_of(alike: float, solid: float) -> Float[Tensor, "K K"]:
     """Probability that a point on something of one class (row) is classified as another (column).
 
-    `alike` is the share spread over classes of the same kind, `solid` over all that stands on the ground.
+    `alike` is the share spread over classes of the same kind, `solid` over all classes of objects on the ground.
     """
     found = torch.eye(_CLASSES)
     for kind in _ALIKE:

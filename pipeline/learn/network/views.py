@@ -1,4 +1,4 @@
-"""Sensor data rendered at a guess: input of the networks, rendered anew at every refinement."""
+"""Sensor data rendered at a guess: input of the networks, rendered again at every refinement."""
 
 from __future__ import annotations
 

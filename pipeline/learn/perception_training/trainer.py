@@ -1,4 +1,4 @@
-"""How perception's networks are trained: by the loop of all networks, judged on held-out samples."""
+"""Training of perception's networks, by the loop of all networks, with scores on held-out samples."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ class TrainingConfig(DescentConfig):
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What one network learns.
+    """Training task of one network.
 
     Args:
-        data_key: hash of the samples; a run goes on only with the same ones.
-        scores: of the network in evaluation mode on held-out samples, by name.
+        data_key: hash of the samples; a run continues only with the same ones.
+        scores: scores of the network in evaluation mode on held-out samples, by name.
         metric: name of a score in metrics.jsonl, with {} for the score's own name.
     """
 
@@ -60,7 +60,7 @@ def run_training(
     Raises:
         ContractError: the run was begun on other samples.
         ConfigError: the run was begun with another configuration.
-        DivergedError: the loss is not finite or has grown too far.
+        DivergedError: the loss is not finite or has grown too much.
     """
     out.mkdir(parents=True, exist_ok=True)
     run = _TaskRun(task, config)
@@ -94,7 +94,7 @@ class _TaskRun(Run):
         return super().state() | {"config": self.config.model_dump(), "data_key": self.task.data_key}
 
     def resume(self, path: Path) -> None:
-        """Go on where the checkpoint was written."""
+        """Continue from a checkpoint."""
         state = load_checkpoint(path)
         if state["config"] != self.config.model_dump():
             problem = f"this run was begun with {state['config']}: take another folder"

@@ -1,4 +1,4 @@
-"""Sides that earlier runs gave, which stay: a frame that tested one network must not train the next."""
+"""Sides from earlier runs, which are kept, because a frame that tested one network must not train the next."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _OF_SPLIT = ("val_fraction", "test_fraction", "positions", "place_m", "place_s")
 def decided_sides(lake: Lake, config: PrepareConfig) -> dict[tuple[str, str], str]:
     """Sides of the vehicles, days and places in the lake's table `training`.
 
-    Empty for a table split by other keys, shares or seed: it is made anew as a whole.
+    Empty for a table split by other keys, shares or seed, which is made again as a whole.
     """
     sides: dict[tuple[str, str], str] = {}
     for partition in lake.partitions(TRAINING.name):

@@ -1,6 +1,6 @@
-"""Counts of table `training` by side and environment, and frames of two sides that look alike.
+"""Counts of table `training` by side and environment, and similar frames of two sides.
 
-The split keeps vehicles, days and places apart; this compares pictures, because a place can have two names.
+The split separates vehicles, days and places. This module compares images, because a place can have two names.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _COLUMNS = ("frame_index", "split", "environment", "fingerprint")
 
 @dataclass(frozen=True)
 class Inventory:
-    """Counts of a whole table; `leaks` are frames of val and test that look like one of an earlier side."""
+    """Counts of a whole table; `leaks` are frames of val and test that are similar to one of an earlier side."""
 
     frames: dict[str, int]
     environments: dict[str, dict[str, int]]
@@ -50,7 +50,7 @@ class Inventory:
 
 
 def take_inventory(lake: Lake, duplicate_bits: int) -> Inventory:
-    """Inventory of all partitions; frames with fewer differing bits look alike (0 = not tested)."""
+    """Inventory of all partitions; frames with fewer differing bits are similar (0 = not tested)."""
     rejected: Counter[str] = Counter()
     frames: dict[str, list[tuple[str, str, str, int]]] = {side: [] for side in SPLITS}  # environment first
     views: dict[str, list[np.ndarray]] = {side: [] for side in SPLITS}
@@ -86,7 +86,7 @@ def alike(
 
 
 def write_inventory(lake: Lake, inventory: Inventory, about: dict[str, Any]) -> Path:
-    """Write `training/manifest.json` beside the partitions, with the run's facts in `about`."""
+    """Write `training/manifest.json` next to the partitions, with the run's facts in `about`."""
     path = lake.local_root / TRAINING.name / MANIFEST_FILE
     path.parent.mkdir(parents=True, exist_ok=True)
     content = about | inventory.__dict__
@@ -106,7 +106,7 @@ def read_leaks(lake: Lake) -> dict[Partition, set[int]]:
 
 
 def require_sides(lake: Lake) -> None:
-    """Raise ContractError if the inventory has no frame to train on, or none of the validation that was asked for."""
+    """Raise ContractError if the inventory has no training frame, or lacks requested validation frames."""
     path = lake.local_root / TRAINING.name / MANIFEST_FILE
     if not path.exists():
         return

@@ -1,14 +1,15 @@
-"""Which side every vehicle, day and place goes to, so that the sides are worth most and least is lost.
+"""Assignment of every vehicle, day and place to a side, with the largest worth and few lost frames.
 
-A frame is kept where all of its keys lie on one side. What an assignment is worth is the sum over the sides of
+A frame is kept if all of its keys are on one side. The worth of an assignment is the sum over the sides of
     share * ln(frames)
-where a side without frames counts less than anything. Frames that can all be kept come out in the wanted shares; where
-every cut costs frames, twice the frames to validate on are worth 8 % of the training frames (share 0.1 against 0.8).
+Any assignment with an empty side is worth less than one without. If all frames can be kept, the sides get the
+requested shares. If every cut loses frames, doubling the validation frames is worth 8 % of the training
+frames (share 0.1 against 0.8).
 
-The best assignment is a graph cut with more than two sides (NP-hard), so it is searched for: all keys of a
-kind in turn go where they are worth most (their frames do not depend on one another), until nothing changes;
-then frames are pulled over to another side with all of their keys, and what gains is kept. On fleets small
-enough to try everything, the search finds what trying everything finds (tests/learn/prepare/test_split.py).
+The best assignment is a graph cut with more than two sides (NP-hard), so it is found by a search. All keys of
+a kind move to their best side in turn (their frames do not depend on one another), until nothing changes.
+Then frames are moved to another side with all of their keys, and gains are kept. On small fleets, the search
+finds the same result as an exhaustive search (tests/learn/prepare/test_split.py).
 """
 
 from __future__ import annotations
@@ -41,14 +42,14 @@ class Cut:
 
 
 def worth(frames: Float[np.ndarray, " S"], shares: Float[np.ndarray, " S"], total: int) -> float:
-    """Worth of an assignment by the frames kept on each side, out of `total`."""
+    """Worth of an assignment from the frames kept on each side, out of `total`."""
     return float(_worth(frames, shares, total))
 
 
 def search_sides(cut: Cut, starts: Sequence[Int[np.ndarray, " M"]], seed: int) -> Int[np.ndarray, " M"]:
-    """The best sides found from any of the `starts`; of equal ones, earlier sides get more frames.
+    """The best sides found from any of the `starts`; among equal ones, earlier sides get more frames.
 
-    The same input gives the same result. `starts` has the side of every key, with fixed keys alike in all.
+    The same input gives the same result. `starts` has the side of every key; fixed keys are the same in all.
     """
     problem = (cut.unit_keys, cut.frames, cut.shares)
     rng = np.random.default_rng(seed)
@@ -84,7 +85,7 @@ def _pull(
     sides: np.ndarray,
     pulls: np.ndarray,
 ) -> np.ndarray:
-    """Pull units to other sides with all their keys, and keep gains, until none gains."""
+    """Move units to other sides with all their keys, and keep gains, until no move gains."""
     total = frames.sum()
     _climb(unit_keys, frames, shares, fixed, sides)
     value = _worth(_frames(unit_keys, frames, shares, sides), shares, total)
@@ -111,7 +112,7 @@ def _pull(
 def _climb(
     unit_keys: np.ndarray, frames: np.ndarray, shares: np.ndarray, held: np.ndarray, sides: np.ndarray
 ) -> None:
-    """Move each free key to its best side, kind by kind, until none moves; changes `sides`."""
+    """Move each free key to its best side, kind by kind, until none moves; modifies `sides`."""
     total = frames.sum()
     now = _frames(unit_keys, frames, shares, sides)
     moved = True
@@ -141,7 +142,7 @@ def _climb(
 def _frames_by_key(
     unit_keys: np.ndarray, frames: np.ndarray, shares: np.ndarray, sides: np.ndarray, kind: int
 ) -> np.ndarray:
-    """Frames that each key of a kind would keep on each side, other kinds unchanged: M S."""
+    """Frames (M S) that each key of a kind would keep on each side, with other kinds unchanged."""
     out = np.zeros((len(sides), len(shares)))
     for unit in range(len(frames)):
         own = unit_keys[unit, kind]
@@ -155,7 +156,7 @@ def _frames_by_key(
 @no_type_check
 @numba.njit(cache=True)
 def _frames(unit_keys: np.ndarray, frames: np.ndarray, shares: np.ndarray, sides: np.ndarray) -> np.ndarray:
-    """Frames that each side keeps: S."""
+    """Frames (S) that each side keeps."""
     out = np.zeros(len(shares))
     for unit in range(len(frames)):
         low, high = _extremes(unit_keys[unit], sides, len(shares), -1)

@@ -45,9 +45,9 @@ class Choice:
 
 
 def price_choices(surveys: Sequence[Survey], plan: SplitPlan, config: PrepareConfig) -> list[Choice]:
-    """The plan at hand, then the other ways to split if the table were made anew.
+    """The current plan, then the alternatives for a new table.
 
-    Frames without a sample (no prior, for example) count as kept, because nothing was read yet.
+    Frames without a sample (without a prior, for example) count as kept, because nothing has been read yet.
     """
     ways = [tuple(plan.by), *(c for c in _CHOICES if set(c) != set(plan.by))]
     out = []
@@ -59,10 +59,10 @@ def price_choices(surveys: Sequence[Survey], plan: SplitPlan, config: PrepareCon
 
 
 def settled_keys(surveys: Sequence[Survey], config: PrepareConfig, lake: Lake) -> tuple[Key, ...]:
-    """Keys to split by: as set, else as table `training` has them, else the strictest that cost little.
+    """Keys to split by: as set, else those of table `training`, else the strictest keys that lose few frames.
 
-    Little: no side is empty, and at most a fifth of the usable frames is between the sides. Where no choice is
-    that cheap, vehicle, day and place.
+    That is: no side is empty, and at most a fifth of the usable frames is lost between the sides. If no
+    choice meets this, the keys are vehicle, day and place.
     """
     if "by" in config.split.model_fields_set:
         return config.split.by
@@ -103,7 +103,7 @@ def frame_sides(
 
 
 def _near_other_side(survey: Survey, sides: np.ndarray, guard_s: float) -> np.ndarray:
-    """True where a frame of the same day on another side is nearer in time than the guard."""
+    """True for frames with a frame of the same day on another side nearer in time than the guard."""
     near = np.zeros(len(sides), bool)
     for i, j in itertools.pairwise(np.flatnonzero(sides != "")):  # what no side has is near to none
         if sides[i] == sides[j]:
@@ -116,7 +116,7 @@ def _near_other_side(survey: Survey, sides: np.ndarray, guard_s: float) -> np.nd
 def _near_other_place(
     survey: Survey, sides: np.ndarray, plan: SplitPlan, config: PrepareConfig
 ) -> np.ndarray:
-    """True where a square of `guard_m` around a frame reaches a cell of another side: also of another pass."""
+    """True for frames with a cell of another side, also of another pass, within a square of `guard_m`."""
     near = np.zeros(len(sides), bool)
     if "place" not in plan.by or not config.split.guard_m:
         return near

@@ -1,12 +1,10 @@
-"""Which frames train, validate and test a network: no vehicle, day or place on two sides.
+"""Split of frames for training, validation and test of a network: no vehicle, day or place is on two sides.
 
-Frames are linked by what they share. Where the links leave separate groups, whole groups are dealt out and no
-frame is lost. Where everything hangs together (every vehicle drives every day), vehicles, days and places are
-divided so that the sides that come out are worth most (`search`), and a frame counts only where all of its
-keys agree.
+Frames with a common key are linked. If the links form separate groups, whole groups are assigned and no frame
+is lost. If all frames are linked (every vehicle drives every day), vehicles, days and places are divided so
+that the sides have the largest worth (`search`), and a frame is used only if all of its keys agree.
 
-What an earlier run decided stays decided: a lake grows, and a frame that tested one network must not train
-the next.
+Decisions of earlier runs are kept: a lake grows, and a frame that tested one network must not train the next.
 """
 
 from __future__ import annotations
@@ -45,13 +43,13 @@ class Unit:
 
 @dataclass(frozen=True)
 class SplitPlan:
-    """The side of every vehicle, day and place that frames are split by."""
+    """The side of every vehicle, day and place used for the split."""
 
     by: tuple[str, ...]
     sides: Mapping[tuple[str, str], str] = field(default_factory=dict)
 
     def side_of(self, vehicle: str, day: str, place: str) -> str | None:
-        """train, val or test; None where the keys do not agree."""
+        """train, val or test; None if the keys do not agree."""
         sides = {self.sides.get(key) for key in Unit(vehicle, day, place).keys(self.by)}
         return sides.pop() if len(sides) == 1 else None
 
@@ -118,7 +116,7 @@ def _deal_groups(
     seed: int,
     known: Mapping[tuple[str, str], str],
 ) -> dict[tuple[str, str], str]:
-    """Whole groups, the largest first, to the side that lacks most; every side gets one at least."""
+    """Assign whole groups, the largest first, to the side that lacks most; every side gets at least one."""
     total = sum(u.frames for g in groups for u in g)
     have: Counter[str] = Counter()
     sides: dict[tuple[str, str], str] = {}
@@ -159,7 +157,7 @@ def _searched(
     known: Mapping[tuple[str, str], str],
     dealt: Mapping[tuple[str, str], str],
 ) -> dict[tuple[str, str], str]:
-    """Sides of all keys by search from two starts: whole groups dealt out, and everything on the first side."""
+    """Sides of all keys by a search from two starts: whole groups assigned, and all keys on the first side."""
     if not units:
         return {}
     names = list(shares)

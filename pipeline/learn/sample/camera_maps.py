@@ -1,8 +1,8 @@
 """Maps of one label image on the camera's grid: classes, distances, boundaries, depth inside the sky.
 
-Everything is measured on a fine grid of 0.1 deg and looked up at the centres of the cells, so the size of a
-cell blurs no boundary. On such a grid a step to the side is shorter than one upwards by the cosine of the
-elevation: 3 % at 14 deg, to which no loss is sensitive.
+Maps are computed on a fine grid of 0.1 deg and sampled at the centres of the cells, so large cells do not
+blur boundaries. On this grid a horizontal step is shorter than a vertical one by the cosine of the elevation:
+3 % at 14 deg, to which no loss is sensitive.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _EDGE_STEPS = 2  # boundaries are stored in halves of a fine cell: centres of ce
 
 @dataclass(frozen=True, eq=False)
 class CameraFeatures:
-    """Columns of table `training` that labels give, as maps of the grid."""
+    """Columns of table `training` computed from labels, as maps on the grid."""
 
     grid_class: UInt8[np.ndarray, "H W"]
     class_distance: UInt8[np.ndarray, "6 H W"]
@@ -76,7 +76,7 @@ def class_likelihood(
 
 
 def likelihood_of_shares(share: Float32[np.ndarray, "K H W"]) -> Float32[np.ndarray, "C H W"]:
-    """Likelihood of each class, and behind them 1 where at least half of the cell has one; 0 where not."""
+    """Likelihood of each class, then one more channel: 1 if at least half of the cell has a class, else 0."""
     total = share.sum(axis=0)
     known = (total >= 0.5).astype(np.float32)
     doubt = np.float32((1 - CLASS_CONFIDENCE) / len(share))
@@ -112,7 +112,7 @@ def _pixels(
 
 
 def _group_distance(classes: np.ndarray, names: tuple[str, ...], per_cell: int) -> np.ndarray:
-    """Angle from each cell's centre to the nearest pixel of the group, in fine steps, 0..255."""
+    """Angle from each cell's centre to the nearest pixel of the group, in steps of the fine grid, 0..255."""
     others = np.ones(classes.shape, np.uint8)
     for name in names:
         others[classes == GRID_CLASSES.index(name)] = 0
@@ -135,7 +135,7 @@ def _sky_depth(classes: np.ndarray, seen: np.ndarray, per_cell: int) -> np.ndarr
 
 
 def _distance(mask: np.ndarray) -> np.ndarray:
-    """Distance to the border of the zeros: it lies half a pixel before the first centre."""
+    """Distance to the border of the zeros, which is half a pixel before the centre of the first zero."""
     to_centre = cv2.distanceTransform(mask, cv2.DIST_L2, cv2.DIST_MASK_5)
     return np.maximum(to_centre - 0.5, 0.0)
 
@@ -153,7 +153,7 @@ def _at_centres(fine: np.ndarray, per_cell: int) -> np.ndarray:
 
 
 def _edge_offsets(labels: np.ndarray, per_cell: int) -> np.ndarray:
-    """Signed way from each cell's centre to the nearest boundary by direction, in halves of a fine cell."""
+    """Signed distance from each cell's centre to the nearest boundary by direction, in halves of a fine cell."""
     middle = per_cell // 2
     offsets = boundary_offsets(labels)[:, middle::per_cell, middle::per_cell].astype(np.int16)
     # A boundary lies half a fine cell behind pixel + offset, and the cell's centre (per_cell - 1) / 2 - middle

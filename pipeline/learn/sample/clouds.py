@@ -1,4 +1,4 @@
-"""Lidar and radar of one frame as arrays of fixed size: thinned evenly, flagged from ranges, padded with zeros."""
+"""Lidar and radar points of one frame as arrays of fixed size: thinned evenly, with flags, padded with zeros."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class View:
 def lidar_columns(
     frame: Frame, observation: Observation, view: View, config: PrepareConfig, rng: np.random.Generator
 ) -> dict[str, Any]:
-    """The columns of table `training` that the lidar gives."""
+    """Columns of table `training` computed from the lidar."""
     return (
         input_points(frame, observation, view, config.lidar_points, rng)
         | _cluster_columns(observation, view, config.cluster_points, rng)
@@ -63,9 +63,9 @@ def lidar_columns(
 def input_points(
     frame: Frame, observation: Observation, view: View, count: int, rng: np.random.Generator
 ) -> dict[str, Any]:
-    """Input points of the sweep: at most one per cell of the grid, then others while there is room.
+    """Input points of the sweep: at most one per cell of the grid, then others up to the array's size.
 
-    Nothing depends on the camera's image; `view` decides only which points are kept.
+    The result does not depend on the camera's image; `view` only determines which points are kept.
     """
     xyz = frame.lidar_xyz_m
     flags = range_edges(xyz, frame.lidar_ring).astype(np.uint8) * POINT_IS_EDGE
@@ -88,8 +88,8 @@ def range_edges(
 ) -> Bool[np.ndarray, " N"]:
     """True for points in front of their neighbour along the ring by a jump in range.
 
-    From ranges alone: the class of an object would give away its mask. False if the sweep has no rows:
-    neighbours differ in elevation there, and the ground alone jumps.
+    Only ranges are used, because the class of an object would reveal its mask. All are False if the sweep has
+    no rows: neighbours then differ in elevation, so even the ground has jumps in range.
     """
     out = np.zeros(len(xyz_m), bool)
     finite = np.flatnonzero(np.isfinite(xyz_m).all(axis=1))
@@ -114,7 +114,7 @@ def range_edges(
 
 
 def radar_columns(observation: Observation, rng: np.random.Generator) -> dict[str, Any]:
-    """The columns of table `training` that the radar gives."""
+    """Columns of table `training` computed from the radar."""
     picked = _some(len(observation.radar_xyz_m), _DETECTIONS, rng)
     power = observation.radar_power_db
     relative = np.zeros(len(picked)) if power is None else power[picked] - np.nanmedian(power)
@@ -135,7 +135,7 @@ def radar_columns(observation: Observation, rng: np.random.Generator) -> dict[st
 
 
 def padded_rows(values: np.ndarray, count: int) -> np.ndarray:
-    """The values, and zeros behind them."""
+    """The values, followed by zeros."""
     out = np.zeros((count, *values.shape[1:]), values.dtype)
     out[: len(values)] = values
     return out
@@ -144,7 +144,7 @@ def padded_rows(values: np.ndarray, count: int) -> np.ndarray:
 def _thinned(
     rows: np.ndarray, angles: np.ndarray, step_rad: float, count: int, rng: np.random.Generator
 ) -> np.ndarray:
-    """At most `count` of the rows in order: a random one of each cell first, then random others."""
+    """At most `count` row numbers in order: first one random row per cell, then random others."""
     rows = rng.permutation(rows)
     cell = np.floor(angles[rows] / step_rad).astype(np.int64)
     _, first = np.unique(cell[:, 0] * 100_000 + cell[:, 1], return_index=True)
@@ -154,7 +154,7 @@ def _thinned(
 
 
 def _ground_flags(xyz_m: np.ndarray, observation: Observation) -> np.ndarray:
-    """1 for ground in perception's map, which has one point per voxel."""
+    """1 for ground points of perception's map, which has one point per voxel."""
     if not len(observation.lidar_map_xyz_m) or not len(xyz_m):
         return np.zeros(len(xyz_m), np.uint8)
     distance, nearest = cKDTree(observation.lidar_map_xyz_m).query(xyz_m, distance_upper_bound=_SAME_POINT_M)

@@ -155,7 +155,7 @@ def decode_small(frame: Frame, cell_deg: float) -> UInt8[np.ndarray, "Y X 3"]:
 
 
 def fingerprint(image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, " 32"]:
-    """256 bits, whether each of 16 x 16 patches is darker than its right neighbour: alike for the same view."""
+    """256 bits, whether each of 16 x 16 patches is darker than its right neighbour; similar for the same view."""
     grey = cv2.resize(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), (17, 16), interpolation=cv2.INTER_AREA)
     return np.packbits(grey[:, 1:] > grey[:, :-1])
 

@@ -68,7 +68,7 @@ class Grid:
         top, left = rows / 2 - self.top_deg / step_deg, columns / 2 - self.left_deg / step_deg
         row, column = round(top), round(left)
         if max(abs(top - row), abs(left - column)) > 1e-6:
-            raise ValueError("the network's grid lies between the cells of the data's")
+            raise ValueError("the network's grid is between the cells of the data's grid")
         if min(row, column) < 0 or row + self.height > rows or column + self.width > columns:
             raise ValueError(f"the data's grid of {rows} x {columns} cells does not contain the network's")
         return slice(row, row + self.height), slice(column, column + self.width)

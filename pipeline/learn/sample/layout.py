@@ -64,8 +64,7 @@ class NetworkConfig:
     Args:
         width: channels of the encoders' first stage.
         hidden: features per pair before fusion (matching), fused features (concat).
-        takes_classes: the camera is its image and what a segmenter makes of it, where there is one
-            (matching).
+        takes_classes: the camera input is the image and, if there is a segmenter, its classes (matching).
         marks: bright ground of the sweep is matched with the image's (matching); files before 0.9.0 do not.
     """
 
@@ -89,5 +88,5 @@ class NetworkConfig:
 
     @property
     def composed(self) -> bool:
-        """Whether the camera-radar correction stands on the product of the other two instead of on the guess."""
+        """Whether the camera-radar correction applies to the product of the other two instead of the guess."""
         return self.architecture == "matching" and self.pairs == "joint"

@@ -67,7 +67,7 @@ def batch_loss(
         passes: a `Passes` of the network, bare or wrapped for data parallelism.
         day_means: running mean of each day's answers; the batch's answers join it.
         matched: whether poses are estimated and judged, or encoders learn classes only.
-        paper: where `loss.definition` is "paper": what its losses are computed from.
+        paper: if `loss.definition` is "paper": the inputs of its losses.
     """
     grid = network.config.grid
     guess = random_guess(batch, config.augment, generator)

@@ -1,4 +1,4 @@
-"""Reports of a run: metrics.jsonl, one line per report, and TensorBoard events beside it."""
+"""Reports of a run: metrics.jsonl, one line per report, and TensorBoard events in the same folder."""
 
 from __future__ import annotations
 

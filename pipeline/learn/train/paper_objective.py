@@ -59,7 +59,7 @@ class PaperFrames:
     """Prepared frames of a lake's vehicle-days, the last used ones."""
 
     def __init__(self, lake: Lake) -> None:
-        """Frames of a lake with observations beside its table `training`."""
+        """Frames of a lake that has observations in addition to its table `training`."""
         self._lake = lake
         self._days: OrderedDict[Partition, dict[int, dict[str, PairLoss]]] = OrderedDict()
 
@@ -116,7 +116,7 @@ def paper_frame(
     T_camera_lidar: Float[np.ndarray, "4 4"],
     T_camera_radar: Float[np.ndarray, "4 4"],
 ) -> dict[str, PairLoss]:
-    """The losses of one frame by pair; the day's prior decides which points must lie in view."""
+    """The losses of one frame by pair; the day's prior determines which points must be in view."""
     margin = np.radians(SolveConfig().search_rotation_deg)
     return {
         "camera_lidar": folded_tensors(camera_lidar_loss([observation], T_camera_lidar, margin).frames),

@@ -25,7 +25,7 @@ def train_on_ray(request: TrainRequest, config: TrainConfig, workers: int) -> Tr
     Raises:
         ConfigError: `workers` is below 1.
         MissingExtraError: Ray's trainer is not installed.
-        BoresightError: what `train` raised in a worker.
+        BoresightError: an error that `train` raised in a worker.
         ContractError: a worker failed otherwise, or was lost.
     """
     if workers < 1:

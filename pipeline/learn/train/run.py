@@ -29,9 +29,9 @@ class TrainRequest:
 
     Args:
         data: folder of a lake with table `training`.
-        out: folder of the run; an unfinished run in it goes on.
-        time_limit_s: stop with a checkpoint after so long in this call; None = no limit.
-        start: run or exported file whose weights a fresh run begins with; a run that goes on has its own.
+        out: folder of the run; an unfinished run in it continues.
+        time_limit_s: duration after which this call stops with a checkpoint; None = no limit.
+        start: run or exported file with the first weights of a new run; a continued run has its own.
     """
 
     data: str
@@ -43,14 +43,14 @@ class TrainRequest:
 
 
 def train(request: TrainRequest, config: TrainConfig, progress: Progress = silent) -> TrainResult:
-    """Train, or go on training, until the run is finished, the time is up or a signal asks to stop.
+    """Train, or continue training, until the run is finished, the time is up or a stop signal arrives.
 
     Raises:
         ConfigError: the run in `out` was begun with another configuration; no such device; `start` has
             another kind of network.
-        ContractError: no training data, an empty side, or other data than the run began with; nothing trained
-            in `start`.
-        DivergedError: the loss is no number or has grown too far; the last checkpoint is from before.
+        ContractError: no training data, an empty side, or other data than at the start of the run; no trained
+            weights in `start`.
+        DivergedError: the loss is not finite or has grown too much; the last checkpoint is from before.
     """
     out = request.out
     require_sides(Lake.at(request.data))

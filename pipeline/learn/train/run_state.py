@@ -1,4 +1,4 @@
-"""Everything that a training step changes: begun anew, or read from a run's last checkpoint."""
+"""The state that a training step changes: new, or read from a run's last checkpoint."""
 
 from __future__ import annotations
 
@@ -62,13 +62,13 @@ class RunState(Run):
 
     @property
     def progress(self) -> float:
-        """Share of the run that is done, by time if time ends it."""
+        """Share of the run that is done, by time if its end is set by time."""
         if self.config.budget_minutes is not None:
             return self.trained_s / (60 * self.config.budget_minutes)
         return super().progress
 
     def comparable(self) -> bool:
-        """Losses of the encoders alone are of another size."""
+        """Whether losses are comparable; those of the encoders alone have another size."""
         return (self.step + 1) % self.config.matched_every == 0
 
     def losses(self) -> dict[str, Tensor]:
@@ -81,7 +81,7 @@ class RunState(Run):
         return found.report | {"loss": found.loss}
 
     def validate(self, folder: Path, log: MetricsLog | None) -> None:
-        """Every so often report the losses of held-out frames from the same guesses; keep the best weights."""
+        """At intervals, report the losses of held-out frames from the same guesses; keep the best weights."""
         frames, sums = self.held_out, dict[str, float]()
         if frames is None or not (self.step % self.config.validate_every == 0 or self.finished):
             return
@@ -116,7 +116,7 @@ class RunState(Run):
         """Continue from a checkpoint; raises ConfigError if another number of processes wrote it."""
         if len(state["processes"]) != self.processes.count:
             problem = f"begun by {len(state['processes'])}, now {self.processes.count}"
-            raise ConfigError("train", "processes", f"a run goes on with as many as it was {problem}")
+            raise ConfigError("train", "processes", f"a run continues with as many as it was {problem}")
         super().load(state)
         own = state["processes"][self.processes.rank]
         self.stream.load_state_dict(own["stream"])
@@ -136,7 +136,7 @@ def begin_run(
     compiled: bool,
     start: Path | None = None,
 ) -> RunState:
-    """A fresh run, or the one in the folder where its last checkpoint left it; arguments and errors as of `train`."""
+    """A new run, or the run in the folder at its last checkpoint; arguments and errors as of `train`."""
     stream = BatchStream(data, config, processes)
     try:
         run = RunState(data, config, processes, stream, compiled=compiled)
@@ -180,7 +180,7 @@ def _take_weights(network: CalibrationNetwork, start: Path) -> None:
 
 
 def _widened(trained: dict[str, Tensor], fresh: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The weights with zeros for channels that the network they come from has not: it answers as before."""
+    """The weights, with zeros for channels that their source network lacks, so that its answers do not change."""
     found = {}
     for name, value in fresh.items():
         weight = trained.get(name, value)
@@ -212,7 +212,7 @@ def _steps(config: TrainConfig, frames: int, processes: int) -> int:
 
 
 def _held_out(data: str, config: TrainConfig) -> TrainingBatch | None:
-    """Frames to validate on; None where the data has none."""
+    """Frames to validate on; None if the data has none."""
     try:
         return load_split(Lake.at(data), "val", limit=config.validation_frames)
     except ContractError:

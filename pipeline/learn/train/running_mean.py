@@ -69,7 +69,7 @@ class DayMeans:
         return out.to(answers.device)
 
     def known(self, days: list[str]) -> list[bool]:
-        """Whether each day's mean rests on enough answers."""
+        """Whether each day's mean has enough answers."""
         return [self._count.get(day, 0) >= _LEAST_ANSWERS for day in days]
 
     def pose(self, days: list[str], pair: int, references: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B 4 4"]:
@@ -91,7 +91,7 @@ class DayMeans:
 def uncertainty_loss(
     log_variance: Float[Tensor, "B 3 6"], scatter: Float[Tensor, "B 3 6"], known: Float[Tensor, " B"]
 ) -> Float[Tensor, ""]:
-    """Negative log-likelihood of the scatter; only the variances learn from it, for the scatter has no gradient."""
+    """Negative log-likelihood of the scatter; only the variances learn from it, because the scatter has no gradient."""
     bounded = log_variance.clamp(*_LOG_VARIANCE)
     per_frame = 0.5 * (scatter.square() * torch.exp(-bounded) + bounded).mean((1, 2))
     return (per_frame * known).sum() / known.sum().clamp_min(1)

@@ -1,8 +1,9 @@
-"""How much wider than their objects a segmenter's labels are, and edges of the lidar moved outward by as much.
+"""Excess width of a segmenter's labels over their objects, and lidar edges moved outward by it.
 
-A label's border lies half a pixel to two pixels outside of its object. Left and right edges, which are alike in number,
-average that away. Tops and feet are not: on days whose edges are mostly tops of cars it is a pitch. Left and right
-together determine the width, whatever the yaw, and it holds for tops and feet.
+The border of a label is half a pixel to two pixels outside of its object. For left and right edges, which
+have equal numbers, the effect cancels. For tops and feet it does not: on days whose edges are mostly tops of
+cars it causes an error of pitch. Left and right edges together determine the width for any yaw, and it is
+also used for tops and feet.
 """
 
 from __future__ import annotations
@@ -35,11 +36,11 @@ def shift_score(
     """Score of some edges of one side at ONE alignment, with all of them moved by SHIFTS_PX right, or down.
 
     Args:
-        terms: points, of which edges count.
+        terms: points, of which only edges are used.
         at: the alignment.
-        kernel: of the score.
-        side: of the edges.
-        keep: which edges of the terms are meant, all of that side.
+        kernel: kernel of the score.
+        side: side of the edges.
+        keep: mask of the edges to use, all of that side.
     """
     some = replace(terms, edges=terms.edges.chosen(keep))
     axis = int(np.argmax(np.abs(OUTWARD[side])))
@@ -52,9 +53,9 @@ def shift_score(
 
 
 def label_width_px(terms: Terms, at: Alignments, kernel: KernelSettings) -> float:
-    """By how much labels are wider than their objects on each side [px of the label image].
+    """Excess width of labels over their objects on each side [px of the label image].
 
-    The width at which left and right edges score best together, at whatever yaw; 0 where a side has too few edges.
+    It is the width at which left and right edges score best together, for any yaw; 0 if a side has too few edges.
     """
     sides = [(side, terms.edges.side == side) for side in (EDGE_LEFT, EDGE_RIGHT)]
     if kernel.edge_weight <= 0 or min(np.count_nonzero(mine) for _, mine in sides) < _FEWEST:

@@ -41,9 +41,9 @@ _CLASS_STRIDE = 8  # of the sampled cloud: neighbours are redundant
 class Points:
     """Points of F frames, one after the other: frame f has rows start[f]:start[f+1]; lidar frame.
 
-    Frame f looks at the maps of row image[f]: of some frames of a day the maps need not be copied.
+    Frame f uses the maps of row image[f], so that maps need not be copied for a selection of frames.
 
-    `exposure_s` is how long after the image's middle row their own row saw them, where they were moved to that time
+    `exposure_s` is the time of a point's image row after the middle row, if points were moved to that time
     (`rolling_shutter.exposed`).
     """
 
@@ -105,7 +105,7 @@ def gather_markings(
     camera: Camera,
     reach_rad: float,
 ) -> Points:
-    """Ground points that stand out of the road by their reflectivity."""
+    """Ground points with a higher reflectivity than the road."""
     bright = [o.marking_xyz_m[o.marking_z > _MARKING_Z] for o in observations]
     plain = [np.zeros(len(b), np.uint8) for b in bright]
     return _gather(list(zip(bright, plain, plain, plain, strict=True)), T_camera_lidar, camera, reach_rad)
@@ -143,7 +143,7 @@ def is_near_view(
     bounds: Float[np.ndarray, " 4"],
     reach_rad: float,
 ) -> Bool[np.ndarray, " N"]:
-    """Whether points [N, 3] lie within `reach_rad` of the view bounds."""
+    """True for points [N, 3] within `reach_rad` of the view bounds."""
     q = xyz_m @ T_camera_lidar[:3, :3].T + T_camera_lidar[:3, 3]
     a, e = np.arctan2(q[:, 0], q[:, 2]), np.arctan2(q[:, 1], np.hypot(q[:, 0], q[:, 2]))
     inside = (a > bounds[0] - reach_rad) & (a < bounds[1] + reach_rad)
@@ -166,7 +166,7 @@ def _kinds(observations: Sequence[Observation]) -> list[np.ndarray]:
 
 
 def _height_classes(o: Observation) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Every eighth point of the sampled cloud with its class; none where the road was not found."""
+    """Every eighth point of the sampled cloud with its class; none if the road was not found."""
     xyz = o.lidar_map_xyz_m[::_CLASS_STRIDE] if o.ground_plane is not None else o.lidar_map_xyz_m[:0]
     plane = o.ground_plane if o.ground_plane is not None else np.zeros(4)
     height = np.digitize(xyz @ plane[:3] + plane[3], _CLASS_HEIGHTS_M)

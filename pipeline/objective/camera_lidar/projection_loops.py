@@ -1,8 +1,7 @@
 """Projection inside the compiled loops that look up images: one camera model as a flat parameter vector.
 
-What a kernel calls with fast arithmetic is inlined (`forceinline`). Else each caller holds a copy that rounds
-in its own way, and which of them is linked differs between a process that compiles kernels and one that loads
-them.
+Functions called by kernels with fast arithmetic are inlined (`forceinline`). Otherwise each caller has a copy
+with different rounding, and a process that compiles kernels links another copy than one that loads them.
 """
 
 from __future__ import annotations
@@ -239,10 +238,10 @@ def along_motion(
     dy: float,
     dz: float,
 ) -> float:
-    """Derivative by the time offset of what depends on a point (x, y, z) of the camera frame by (dx, dy, dz).
+    """Derivative by the time offset of a quantity with derivatives (dx, dy, dz) by a camera point (x, y, z).
 
-    `pose` has the rows of the transform from lidar to camera; `motion` the velocity in camera axes [m/s] of
-    what lies at its translation, and the yaw rate [rad/s], which turns points about the lidar's vertical.
+    `pose` has the rows of the transform from lidar to camera; `motion` is the velocity in camera axes [m/s]
+    at its translation, and the yaw rate [rad/s], which rotates points about the lidar's vertical.
     """
     a, b, c = x - pose[3], y - pose[7], z - pose[11]
     up0, up1, up2, turn = pose[2], pose[6], pose[10], motion[3]

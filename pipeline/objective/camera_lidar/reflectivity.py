@@ -1,10 +1,10 @@
-"""Lidar reflectivity against image brightness on the road: what gives pitch, roll and yaw with only 16 rings.
+"""Lidar reflectivity against image brightness on the road; it determines pitch, roll and yaw with only 16 rings.
 
-Ground points that reflect more than the rest of their ring should project to pixels that are brighter than the rest of
-their row of the road. The score is the log likelihood ratio of two normal distributions of unit variance whose means
-differ by `delta` (how much brighter the image is under marked points): `delta c - delta^2/2`, linear in the contrast c.
-`delta` is estimated from the data, so the term loses its weight where the lidar has no useful intensity or the road no
-paint.
+Ground points that reflect more than the rest of their ring should project to pixels that are brighter than
+the rest of their row of the road. The score is the log likelihood ratio of two normal distributions of unit
+variance whose means differ by `delta` (how much brighter the image is under marked points): `delta c -
+delta^2/2`, linear in the contrast c. `delta` is estimated from the data, so the term loses its weight if the
+lidar has no useful intensity or the road has no paint.
 """
 
 from __future__ import annotations
@@ -100,9 +100,9 @@ def marking_gradients(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Gradient [F, 11] of each frame's score and its information [F, 11, 11].
 
-    By rotation, translation, time offset, focal scale, principal point and readout time.
-    As in `edge_gradients`. The score is linear in the contrast, so the information is that of the
-    likelihood: the outer product of each point's gradient.
+    By rotation, translation, time offset, focal scale, principal point and readout time. As in
+    `edge_gradients`. The score is linear in the contrast, so the information is that of the likelihood: the
+    outer product of each point's gradient.
     """
     frames = poses.shape[0]
     height, width = contrast.shape[1], contrast.shape[2]

@@ -1,11 +1,12 @@
 """Rolling shutter: each lidar point as the image row that shows it saw it.
 
 The rows of an image are exposed from the top to the bottom during the readout time; the frame's time is that of the
-middle row. What lies on row v of h was seen ((v + 1/2)/h - 1/2) readouts later, by a car that had driven on. Stamps
-that mean the first or the last row are half a readout off, which the time offset takes up like any other clock.
+middle row. A point on row v of h was exposed ((v + 1/2)/h - 1/2) readouts later, after the car had moved on.
+Stamps that mean the first or the last row are half a readout off, which the time offset takes up like any
+other clock.
 
-Points are moved once for a pose, not in the loops over poses: what a pose changes of a point's row changes its delay by
-a few hundredths of that.
+Points are moved once for one pose, not in the loops over poses, because the change of a point's row between
+poses changes its delay by only a few hundredths.
 
 Source: Meingast, Geyer, Sastry 2005, section 3 (projection along a row's own pose).
 """
@@ -49,8 +50,8 @@ def exposed(
         camera: at the size of the label images.
         velocity_lidar: own velocity in lidar axes [m/s]; the one that an earlier call had.
         yaw_rate: own [rad/s].
-        readout_s: from the first row to the last (negative: from the last to the first); 0 puts the points back to the
-            time of the middle row.
+        readout_s: from the first row to the last (negative: from the last to the first); 0 puts the points
+            back to the time of the middle row.
     """
     frame = np.repeat(np.arange(len(poses)), np.diff(points.start))
     velocity, turn = velocity_lidar[frame], yaw_rate[frame]

@@ -135,9 +135,9 @@ class Terms:
     def seen_throughout(self, at: Alignments) -> Terms:
         """The terms with only those edges that are in the image at every one of these alignments.
 
-        An edge out of sight scores 0, one in sight more on average, matched or not: rails beside the car
-        match anywhere along them. A score over edges that come into sight would therefore be drawn to poses
-        with more edges.
+        An edge out of view scores 0. An edge in view scores more on average, even if the match is wrong:
+        rails match anywhere along them. A score over edges that come into sight would therefore be drawn to
+        poses with more edges.
         """
         still = np.zeros((len(self.edges.xyz_m), 2), np.float32)
         is_seen = np.ones(len(still), bool)
@@ -191,8 +191,8 @@ class Terms:
         """Rows of the transform from each frame's lidar points to its image [P, F, 12].
 
         By the lidar's clock the image was taken dt before its stamp (stamp_camera = stamp_lidar + dt), which
-        is the frame's gap after the sweep's. The car was then tau = dt - gap earlier on its way, so what
-        stands still lay tau times the own velocity further ahead: p' = Rz(yaw_rate tau) (p + v tau).
+        is the frame's gap after the sweep's. The image was taken tau = dt - gap earlier, when static points
+        were farther ahead by tau times the own velocity: p' = Rz(yaw_rate tau) (p + v tau).
         """
         R, t = at.T_camera_lidar[:, :3, :3], at.T_camera_lidar[:, :3, 3]
         return _moving_poses(R, t, at.dt_s, self.gap_s, self.velocity_lidar, self.yaw_rate)
@@ -224,7 +224,7 @@ class Terms:
         settings: KernelSettings,
         shifts_px: Sequence[tuple[float, float]] = _SHIFTS_PX,
     ) -> Float[np.ndarray, "P F"]:
-        """Edge score minus what the same edges score when the image is shifted: 0 for a pose that matches by chance.
+        """Edge score minus the score of the same edges in shifted images: 0 for a pose that matches by chance.
 
         This makes poses comparable that see different numbers of edges: turning edges out of view gains
         nothing.

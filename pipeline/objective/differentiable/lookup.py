@@ -55,7 +55,7 @@ def masked_mean(
 
 
 def _cell(height: int, width: int, uv: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Index of the upper left neighbour, the way from it to the right and down, and whether inside."""
+    """Index of the upper left neighbour, distances from it to the right and down, and a mask of points inside."""
     u, v = uv.unbind(-1)
     inside = valid & (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
     u, v = (torch.where(inside, q, torch.zeros_like(q)) for q in (u, v))

@@ -1,8 +1,7 @@
 """Projection of points into images of several frames, differentiable: camera models and the equirectangular grid.
 
-Either one takes a frame's points to map pixels (u right, v down, (0, 0) = centre of the first pixel),
-whatever the map is. Models are exact, as in `pipeline.geometry.cameras`; the compiled kernels fit polynomials
-to them.
+Both take a frame's points to map pixels (u right, v down, (0, 0) = centre of the first pixel), for any kind
+of map. Models are exact, as in `pipeline.geometry.cameras`; the compiled kernels fit polynomials to them.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ class CameraProjection:
     def project(
         self, points_camera: Float[Tensor, "*batch F N 3"]
     ) -> tuple[Float[Tensor, "*batch F N 2"], Bool[Tensor, "*batch F N"]]:
-        """Pixels of points, and where they are valid."""
+        """Pixels of points, and a mask of valid ones."""
         distort = _equidistant if self.model == "equidistant" else _pinhole
         xy, valid = distort(points_camera, self.distortion[:, None], self.max_angle_rad[:, None])
         return xy * self.focal[:, None] + self.centre[:, None], valid
@@ -58,7 +57,7 @@ class GridProjection:
     def project(
         self, points_camera: Float[Tensor, "*batch F N 3"]
     ) -> tuple[Float[Tensor, "*batch F N 2"], Bool[Tensor, "*batch F N"]]:
-        """Cells of points; valid wherever the point is not on the axis of the poles."""
+        """Cells of points, and a mask of valid ones: points on the axis through the poles have no azimuth."""
         x, y, z = points_camera.unbind(-1)
         h2 = x * x + z * z
         valid = (h2 > NEAR_M**2) & (z > 0)
@@ -70,7 +69,7 @@ class GridProjection:
 
 
 def camera_projection(cameras: Sequence[Camera], dtype: torch.dtype = torch.float32) -> CameraProjection:
-    """The cameras of F frames as tensors; raises ValueError for cameras of different models."""
+    """The cameras of F frames as tensors; ValueError for cameras of different models."""
     kinds = {c.model == "equidistant" for c in cameras}
     if len(kinds) != 1:
         raise ValueError("the cameras of a batch must all be equidistant, or none of them")

@@ -1,9 +1,9 @@
-"""Static radar detections against lidar points in torch: the likelihood that `registration` maximises, at no time lag.
+"""Static radar detections against lidar points in torch: the likelihood of `registration`, without time lag.
 
 The same neighbours (within three sigmas of azimuth and range), the same ground bounce, the same elevations
 that count; frames are thinned first, because every detection is compared with every point.
 
-Source: `pipeline.objective.radar.registration`, which has the reasons, and whose constants are used here.
+Source: `pipeline.objective.radar.registration`, which gives the reasons and the constants.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def static_cost(
 
     Args:
         outlier: weight of "no lidar point", in units of one lidar point at distance 0.
-        bounce_prior: prior probability of a detection by way of the ground.
+        bounce_prior: prior probability of a detection by reflection on the ground.
     """
     # Rows are in no order that matters once they are strided: each stands for its neighbours.
     thin, sparse = -(-frames.radar.shape[1] // detections), -(-frames.lidar.shape[1] // points)
@@ -95,9 +95,9 @@ def tells_elevation(
 ) -> Bool[Tensor, "*batch F M"]:
     """Detections whose elevation can be compared with the lidar's: others would be matched to the edge of its view.
 
-    The registration decides this anew at every pose and takes the decision as constant in its step. A
-    minimiser of the value should decide once: a rotation that moves detections out of the limits would lower
-    the cost by itself.
+    The registration decides this at every pose and keeps the decision constant in its step. A minimiser of
+    the value should decide only once, because a rotation that moves detections out of the limits would reduce
+    the cost.
     """
     limits_rad = limits_rad.to(radar.dtype)
     reach = (0.25 * (limits_rad[:, 1] - limits_rad[:, 0])).clamp_max(2 * float(SIGMA_START[1]))
@@ -125,7 +125,7 @@ def elevation_limits(
 
 
 def _useful(radar: Tensor) -> Tensor:
-    """Detections that the registration takes."""
+    """Detections that the registration uses."""
     over_ground = radar[..., :2].norm(dim=-1)
     ahead = torch.atan2(radar[..., 1], radar[..., 0]).abs() < SIDE_RAD
     return (over_ground > RANGE_M[0]) & (over_ground < RANGE_M[1]) & ahead

@@ -1,9 +1,10 @@
-"""Terms of self-supervision on the equirectangular grid: what `joint` uses, as smooth costs of one frame each.
+"""Terms of self-supervision on the equirectangular grid: the terms of `joint`, as smooth costs of single frames.
 
-Angles in degrees, distances in metres, per-frame means over what is valid, so that terms and frames compare.
-Every function takes the poses of its own pair, `*batch #F 4 4`, and tensors of F frames.
+Angles are in degrees, distances in metres. Costs are means per frame over valid entries, so that terms and
+frames are comparable. Every function takes the poses of its own pair, `*batch #F 4 4`, and tensors of F
+frames.
 
-Source: the project's evidence on self-supervision, section 3 (which terms have their minimum at the truth).
+Source: the project's study of self-supervision, section 3 (which terms have their minimum at the truth).
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ class GridMaps:
     def pixels(
         self, T_camera_points: Float[Tensor, "*batch #F 4 4"], points: Float[Tensor, "F N 3"]
     ) -> tuple[Float[Tensor, "*batch F N 2"], Bool[Tensor, "*batch F N"]]:
-        """Cells of points, and whether the camera sees them."""
+        """Cells of points, and a mask of those that the camera sees."""
         uv, valid = self.projection.project(transform_points(T_camera_points, points))
         row, column, inside = nearest_pixel(self.size, uv, valid)
         frame = torch.arange(len(self.seen), device=uv.device)[:, None]
@@ -81,10 +82,10 @@ def cluster_class_cost(
     present: Bool[Tensor, "F N"],
     clusters: int,
 ) -> Float[Tensor, "*batch F"]:
-    """Each lidar cluster lies on objects of ONE reflecting class, whichever suits it best at this pose [deg].
+    """Distance of lidar clusters to objects of the ONE reflecting class that fits each cluster best at this pose [deg].
 
-    Steeper than the union of the classes where neighbours differ, and needs no semantics of the lidar. A
-    point out of view costs as much as one far from any object.
+    If neighbouring objects differ in class, this cost is steeper than that of the union of classes. It needs
+    no lidar semantics. A point out of view costs as much as one far from any object.
 
     Args:
         cluster: which cluster, below `clusters`; -1 counts as a cluster of its own kind.
@@ -112,7 +113,7 @@ def edge_cost(
     side: Int64[Tensor, "F N"],
     present: Bool[Tensor, "F N"],
 ) -> Float[Tensor, "*batch F"]:
-    """Depth jumps lie on mask boundaries of their own direction: distance along that direction's axis, robust."""
+    """Robust distance of depth jumps to mask boundaries of the same direction, along that direction's axis."""
     uv, seen = maps.pixels(T_camera_lidar, points)
     step_deg = maps.projection.step_rad * DEG
     residual, found = edge_residuals_px(
@@ -136,14 +137,14 @@ def edge_residuals_px(
     step_px: float = 1.0,
     shift_px: float = 0.5,
 ) -> tuple[Float[Tensor, "*batch F N"], Bool[Tensor, "*batch F N"]]:
-    """Signed way along its own axis from each jump to the nearest boundary of its direction class.
+    """Signed distance along its own axis from each jump to the nearest boundary of its direction class.
 
-    As in `pipeline.objective.camera_lidar.edges`, which has the reasons.
+    As in `pipeline.objective.camera_lidar.edges`, which gives the reasons.
 
     Args:
-        offsets: way from a pixel's centre to the boundary, in steps.
+        offsets: distance from a pixel's centre to the boundary, in steps.
         step_px: pixels per step of `offsets`.
-        shift_px: what to add; the kernels' maps hold k for k + 1/2.
+        shift_px: offset to add, because the kernels' maps store k for k + 1/2.
 
     Returns:
         Residuals [px], and which jumps lie in the image with a boundary in reach.
@@ -166,7 +167,7 @@ def sky_cost(
 ) -> Float[Tensor, "*batch F"]:
     """Depth of points inside the sky's mask beyond `free_deg`, 0 outside [deg]: the sky has no echoes.
 
-    A guard, not an alignment term: it pushes down only.
+    It is a constraint, not an alignment term, because it only moves points downwards.
     """
     uv, seen = maps.pixels(T_camera_points, points)
     depth = bilinear_groups(maps.sky_depth[:, None], uv, seen)[..., 0] * DISTANCE_STEP_DEG
@@ -189,12 +190,12 @@ class RadarTracks:
         tau: float,
         clamp: float,
     ) -> Float[Tensor, "*batch F"]:
-        """Mean over the tracks of the soft smallest clamped distance; 0 where a frame lacks either side.
+        """Mean over the tracks of the soft minimum of clamped distances; 0 for a frame without tracks or targets.
 
         Args:
-            upwards: in elevation or height, signed; weighted by how precise a radar's elevation is beside its
-                azimuth.
-            tau: of the soft minimum, in units of the distances.
+            upwards: signed difference in elevation or height, weighted by the precision of a radar's
+                elevation relative to its azimuth.
+            tau: width of the soft minimum, in units of the distances.
             clamp: largest distance.
         """
         weight = _ELEVATION_WEIGHT * self.has_elevation.to(upwards.dtype)[:, None, None]
@@ -248,7 +249,7 @@ def soft_minimum(values: Float[Tensor, "*batch N"], tau: float) -> Float[Tensor,
 
 
 def soft_clamp(values: Float[Tensor, "*shape"], limit: float) -> Float[Tensor, "*shape"]:
-    """Nearly the value itself if small, saturating smoothly at `limit`; for values >= 0."""
+    """Nearly the value itself if small, with a smooth saturation at `limit`; for values >= 0."""
     return limit * torch.tanh(values / limit)
 
 

@@ -1,9 +1,8 @@
 """The paper's camera-lidar loss: lidar clusters lie on reflecting objects, not in the sky, not out of view.
 
 Per frame: mean over the points of object clusters of `d^2 / (d^2 + s^2) + [sky]`, d = distance in the image
-to the nearest pixel of a reflecting class, s = 1.5 deg; a point out of view costs 1 as one in the sky does.
-The paper names neither weights nor units: means make frames and pairs comparable whatever the number of
-points.
+to the nearest pixel of a reflecting class, s = 1.5 deg; a point out of view costs 1, like one in the sky. The
+paper gives neither weights nor units; means make frames and pairs comparable for any number of points.
 
 Source: section 4.3.
 """

@@ -1,8 +1,8 @@
 """The paper's camera-radar loss: tracked clusters lie at road users' centres; no detection in the sky or out of view.
 
 Per frame: mean over tracked clusters of `d^2 / (d^2 + s^2)`, d = angle in the image to the nearest detected
-road user's box centre, s = 2 deg, plus the mean over radar detections of [sky or out of view]. Weights 1: the
-paper names none.
+road user's box centre, s = 2 deg, plus the mean over radar detections of [sky or out of view]. Weights are 1,
+because the paper gives none.
 
 Source: section 4.3.
 """

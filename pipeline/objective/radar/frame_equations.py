@@ -18,7 +18,7 @@ _LEAST_SIGMA_RAD = np.radians(0.3)  # box edges are no better
 
 
 def rows_of_frames(rows: _Rows, frames: Int64[np.ndarray, " S"]) -> _Rows:
-    """The rows whose `frame` is one of these, which are numbered anew in the order given."""
+    """The rows of these frames, which are renumbered in the given order."""
     held: Any = rows
     place = np.full(int(max(held.frame.max(initial=-1), frames.max(initial=-1))) + 1, -1, np.int64)
     place[frames] = np.arange(len(frames))

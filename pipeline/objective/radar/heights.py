@@ -1,14 +1,16 @@
-"""Static elevations by what the lidar shows to stand there: direct, or displaced towards the mirror image in the road.
+"""Static elevations compared with lidar heights: direct, or displaced towards the mirror image in the road.
 
-Of a thing of height h over the road a radar sees the elevation of the thing, of its image (height -h), or, where it
-cannot resolve both, anything between: a share in (0, 1] of the way that is another in every scan. So detections of high
-things lie too low in the mean, and whoever matches them with lidar points turns the radar up, by degrees on some days.
-What lies on the road is not displaced, and what is displaced grows with h / r: pitch is what they have in common.
+For an object of height h over the road, a radar measures the elevation of the object, of its image (height
+-h), or, if it cannot resolve both, a value in between. This displacement is a share in (0, 1] of the distance
+to the image, and changes from scan to scan. So detections of high objects are too low on average. Matching
+them with lidar points rotates the estimated radar upwards, by degrees on some days. Detections on the road
+are not displaced, and the displacement grows with h / r, whereas pitch affects all of them equally.
 
-Each detection is drawn from the lidar points near its azimuth and range: direct, the image in the road, displaced by a
-share that is uniform, or from anywhere (more often where the lidar sees bare road). Their shares and the noise of
-elevations are unknowns beside pitch and roll. Tall things are left out: radars see their lower parts, leaves, what is
-behind. A detection is compared at any elevation, so nothing is cut off.
+Each detection is drawn from the lidar points near its azimuth and range: direct, the image in the road,
+displaced by a uniform share, or from anywhere (more often where the lidar sees bare road). The shares of
+these and the noise of elevations are unknowns, like pitch and roll. Tall objects are left out, because radars
+measure their lower parts, leaves, or objects behind. A detection is compared at any elevation, so that no cut
+causes a bias.
 """
 
 from __future__ import annotations
@@ -85,22 +87,22 @@ class Heights:
 
     @property
     def floor_rad(self) -> float:
-        """Sigma of pitch that no number of frames lowers.
+        """Sigma of pitch that more frames do not reduce.
 
-        Where much comes from anywhere (ceilings, crowns of trees), so may what is taken for the rest.
+        If many detections come from anywhere (ceilings, crowns of trees), the others may be wrong as well.
         """
         return float(_PITCH_FLOOR_RAD / self.explained)
 
     def seen_low(self, below: Float[np.ndarray, " D"]) -> float:
-        """One sigma of the share of their height by which things are seen too low.
+        """Sigma of the share of their height by which objects are measured too low.
 
-        No more than the share of detections below the road (of moving frames, given), and than what the mixture takes
-        for displaced there, twice, for as many are displaced and still over it.
+        It is at most the given share of detections below the road (of moving frames), and at most twice the
+        mixture's share of displaced ones there, because as many are displaced but still above the road.
         """
         return min(float(np.mean(below)), 2 * self.below)
 
     def of_frames(self, frames: Int64[np.ndarray, " S"]) -> Heights:
-        """The same of some observations, which are numbered anew in the order given."""
+        """The part of some observations, which are renumbered in the given order."""
         return replace(self, frames=rows_of_frames(self.frames, frames))
 
 
@@ -116,7 +118,7 @@ class _Detections:
 
     @property
     def stands(self) -> Bool[np.ndarray, " N"]:
-        """Whether the lidar shows a thing there, or bare road."""
+        """True if the lidar shows an object there, False for bare road."""
         return np.asarray(self.mirror.any(1))
 
 
@@ -126,13 +128,13 @@ def displaced_heights(
     dt_s: float,
     rng: np.random.Generator,
 ) -> Heights | None:
-    """Pitch by the mixture; None where elevations, road or things that stand on it are too few.
+    """Pitch by the mixture; None if there are too few elevations, road points or objects on the road.
 
     Args:
         observations: any frames.
-        T_lidar_radar: a pose, good to some degrees.
+        T_lidar_radar: a pose, accurate to some degrees.
         dt_s: time offset, stamp_lidar = stamp_radar + dt.
-        rng: picks detections and lidar points where there are many.
+        rng: selects detections and lidar points if there are many.
     """
     use = [
         k
@@ -160,12 +162,12 @@ def displaced_heights(
 
 
 def _log_likelihood(day: _Detections, x: np.ndarray) -> np.ndarray:
-    """Of each detection, at unknowns as _START."""
+    """Log likelihood of each detection, for unknowns in the order of _START."""
     return np.asarray(np.log(_densities(day, x)[0].sum(0)))
 
 
 def _densities(day: _Detections, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of each detection as direct, image, displaced and from anywhere (4 N), and its elevation as turned (N)."""
+    """Density of each detection as direct, image, displaced and from anywhere (4 N), and its rotated elevation (N)."""
     displaced, image, sigma = _share(x[2]), _share(x[6]), float(np.exp(x[3]))
     anywhere = np.where(day.stands, _share(x[4]), _share(x[5]))
     view_rad = np.where(day.stands, _VIEW_RAD, max(np.sqrt(12.0) * np.std(day.elevation), _LEAST_VIEW_RAD))
@@ -184,9 +186,9 @@ def _share(logit: float) -> float:
 
 
 def _scores(day: _Detections, x: np.ndarray) -> tuple[float, HeightScores]:
-    """How pitch follows the radar's height, and its information and score with all else following.
+    """Derivative of pitch by the radar's height, and information and score of pitch with the other unknowns eliminated.
 
-    It is as sure as the frames scatter.
+    The information is scaled to the scatter of the frames.
     """
     steps = np.diag(_STEP)
     S = np.stack(
@@ -212,7 +214,7 @@ def _scores(day: _Detections, x: np.ndarray) -> tuple[float, HeightScores]:
 def _detections(
     o: Observation, frame: int, T_lidar_radar: np.ndarray, dt_s: float, most: int, rng: np.random.Generator
 ) -> _Detections:
-    """Static detections of one frame with lidar points near them, none of which is tall."""
+    """Static detections of one frame with nearby lidar points, none of which belongs to a tall object."""
     assert o.radar_velocity_mps is not None
     assert o.ground_plane is not None
     moved = o.radar_velocity_mps * ((o.radar_stamp_ns - o.stamp_ns) * 1e-9 + dt_s)

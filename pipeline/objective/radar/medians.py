@@ -1,4 +1,4 @@
-"""Medians of a handful of rows: `np.median` spends 80 us on what a sort does in 5, thousands of times a day."""
+"""Medians of a few rows by sorting: 5 us instead of 80 us with `np.median`, called thousands of times a day."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Moving radar clusters against lidar object clusters, and against the centres of camera boxes, in azimuth.
 
-A moving cluster of detections is a road user; so is, nearly always, the lidar cluster at its place and the
+A moving cluster of detections is a road user. Nearly always, so are the lidar cluster at its position and the
 box at its azimuth. Only azimuth is compared: ranges differ, because the radar sees 0.2-0.3 m into objects,
 and elevations suffer from bounces off the ground.
 """
@@ -57,7 +57,7 @@ _CLUSTER = np.dtype(
 
 @dataclass(frozen=True, eq=False)
 class MovingClusters:
-    """Centres of moving clusters in radar axes, with what is needed to bring them to lidar's and camera's time."""
+    """Centres of moving clusters in radar axes, with the data to move them to the lidar's and the camera's time."""
 
     point_radar_m: Float[np.ndarray, "B 3"]
     relative_mps: Float[np.ndarray, "B 3"]  # velocity relative to the radar along the line of sight
@@ -80,13 +80,13 @@ class MovingClusters:
 
     @cached_property
     def centres(self) -> cKDTree:
-        """All lidar clusters in the plane; those of different observations lie far apart in the third coordinate."""
+        """All lidar clusters in the plane; different observations are far apart in the third coordinate."""
         frame = np.repeat(np.arange(len(self.lidar_centres_m)), [len(c) for c in self.lidar_centres_m])
         flat = np.concatenate([*self.lidar_centres_m, np.zeros((0, 3))])[:, :2]
         return cKDTree(np.column_stack([flat, _APART_M * frame]))
 
     def of_frames(self, frames: Int64[np.ndarray, " S"]) -> MovingClusters:
-        """Those of some observations, which are numbered anew in the order given."""
+        """The part of some observations, which are renumbered in the given order."""
         return replace(
             rows_of_frames(self, frames),
             lidar_centres_m=[self.lidar_centres_m[f] for f in frames],
@@ -94,15 +94,15 @@ class MovingClusters:
         )
 
     def at_lidar_time(self, dt_s: float) -> Float[np.ndarray, "B 3"]:
-        """Where they were at the lidar's stamp, radar axes; stamp_lidar = stamp_radar + dt."""
+        """Positions at the lidar's stamp, radar axes; stamp_lidar = stamp_radar + dt."""
         return self._earlier(self.stamp_gap_s + dt_s)
 
     def at_image_time(self) -> Float[np.ndarray, "B 3"]:
-        """Where they were when the image was taken, radar axes, with clocks off by the stamps' constant gaps."""
+        """Positions at the time of the image, radar axes, for clocks off by the stamps' constant gaps."""
         return self._earlier(self.after_image_s)
 
     def _earlier(self, by_s: Float[np.ndarray, " B"]) -> Float[np.ndarray, "B 3"]:
-        """Back along the line of sight, and turned as the own turn had not yet turned them."""
+        """Positions at an earlier time: moved back along the line of sight, and by the car's rotation."""
         p = self.point_radar_m - self.relative_mps * by_s[:, None]
         turn = self.yaw_rate_radps * by_s
         c, s = np.cos(turn), np.sin(turn)

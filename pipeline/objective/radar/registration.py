@@ -7,12 +7,11 @@ looks `tau` later, where `tau = stamp_radar + dt - stamp_lidar` and v is the rad
 unknown wherever the car moves, and so is a constant added to all ranges, which a wide field of view
 distinguishes from a translation.
 
-Normal equations are kept apart for (azimuth, range) and for elevation, and the caller weighs the latter: on
-sparse lidars elevation is uninformative although its residuals are small, because points collapse onto the lidar's
-rings.
+Normal equations are separate for (azimuth, range) and for elevation, and the caller weights the latter: on
+sparse lidars elevation is uninformative although its residuals are small, because points collapse onto the
+lidar's rings.
 
-Source: Granger & Pennec 2002, "Multi-scale EM-ICP"; Louis 1982 for the information that uncertain assignment
-leaves.
+Source: Granger & Pennec 2002, "Multi-scale EM-ICP"; Louis 1982 for the information under uncertain assignment.
 """
 
 from __future__ import annotations
@@ -166,7 +165,7 @@ def normal_equations(
     Args:
         dt_s: time offset, stamp_lidar = stamp_radar + dt.
         sigma: of azimuth [rad], elevation [rad], range [m]; wider ones make a wider basin.
-        bounce_prior: prior probability of a detection by way of the ground.
+        bounce_prior: prior probability of a detection by reflection on the ground.
         outlier: weight of "no lidar point", in units of one lidar point at distance 0.
         range_bias_m: measured minus true range (the radar's own offset, and how far it sees into things).
     """
@@ -248,7 +247,7 @@ def _accumulated(
 def updated_sigma(
     equations: NormalEquations, sigma: Float[np.ndarray, " 3"], bounce_prior: float
 ) -> tuple[Float[np.ndarray, " 3"], float]:
-    """Sigmas and bounce probability that the assigned residuals show, within what radars do (one EM step)."""
+    """Sigmas and bounce probability from the assigned residuals, within plausible limits (one EM step)."""
     # EM shrinks wide sigmas slowly (every lidar point within reach is a partner): take twice its step in logarithms.
     shown = sigma * np.maximum(equations.second_moment, 1e-6)
     bounce = float(np.clip(equations.bounced, 0.01, _BOUNCE_MOST)) if bounce_prior > 0 else 0.0

@@ -136,7 +136,7 @@ def _add_row(j, weight, mean, known, H, g, info):
 @no_type_check
 @_called
 def _linearise(sums, outlier, tells, J, sigma, H, g, info, stats):
-    """Add a detection's rows (derivatives J) to its frame's equations, and what it shows of the radar's sigmas."""
+    """Add a detection's rows (derivatives J) to its frame's equations, and its squared residuals to the sigmas."""
     direct, total = sums[0], sums[1]
     gamma = total / (total + outlier)
     share = direct / total
@@ -167,9 +167,9 @@ def accumulate_frames(
 ) -> None:  # fmt: skip
     """Normal equations of each frame: H (F, 2, 8, 8) and g (F, 2, 8) for (azimuth and range, elevation), information.
 
-    `info` is H less what the uncertain assignment takes away (Louis 1982), row by row. A detection whose elevation in
-    lidar axes is not inside `limits` (tangents, low and high) is assigned by azimuth and range alone. Without
-    `with_equations` only the first two of `stats` are filled: log likelihood and detections.
+    `info` is H minus the loss by uncertain assignment (Louis 1982), row by row. A detection whose elevation
+    in lidar axes is not inside `limits` (tangents, low and high) is assigned by azimuth and range alone.
+    Without `with_equations` only the first two of `stats` are filled: log likelihood and detections.
     """
     # One body for all frames: its buffers are made once.
     R, t = np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy()

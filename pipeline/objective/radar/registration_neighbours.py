@@ -215,7 +215,7 @@ def spherical(R, t, radar, limits, has_elevation, sph, tells):
 @no_type_check
 @_called
 def cells_of(sigma, max_range):
-    """Number of cells (by azimuth, by range) of the grid, and how many of them per radian and per metre."""
+    """Number of cells of the grid (in azimuth, in range), and number of cells per radian and per metre."""
     cell_a = max(_CELL * sigma[0], 2 * _SIDE_RAD / _MOST_CELLS[0])
     cell_r = max(_CELL * sigma[2], max_range / _MOST_CELLS[1])
     cells = (int(2 * _SIDE_RAD / cell_a) + 1, int(max_range / cell_r) + 1)

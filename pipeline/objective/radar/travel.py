@@ -1,24 +1,23 @@
 """Direction of travel, in radar axes by Doppler and in lidar axes by the road: it determines the radar's pitch.
 
-It needs no camera, and no detection to be matched with the lidar point that it came from. A static detection
-in direction u has the range rate `-u . v`, so three components of v follow from a scan, and on average the
-car drives along its road.
+It needs neither a camera nor a match of detections with lidar points. A static detection in direction u has
+the range rate `-u . v`, so a scan gives three components of v. On average the car drives along its road.
 
-The vertical component is where care is due. Elevations are the noisiest thing a radar measures, and least
-squares on them pulls v towards the mean elevation of the detections (errors in variables: by half a degree in
-simulation, by more where noise is as large as the spread). So the equations are weighed by instruments: the
-mean elevation of what the lidar sees at the detection's azimuth and range, whatever its height. That follows
-the true elevation and knows nothing of the radar's noise.
+The vertical component is difficult. Elevations have the largest noise of all radar measurements, and least
+squares on them biases v towards the mean elevation of the detections (errors in variables: by half a degree
+in simulation, by more if noise is as large as the spread). So the equations use an instrumental variable: the
+mean elevation of lidar points at the detection's azimuth and range, at any height. It is correlated with the
+true elevation and independent of the radar's noise.
 
-What the radar sees too low, between a thing and its image in the road, instruments do not mend, for high
-things are displaced by more: with heights seen too low by a tenth the velocity points lower by .3 to .9 deg.
+Instruments do not correct detections measured too low, between an object and its image in the road, because
+high objects are displaced more. With heights too low by a tenth, the velocity points lower by .3 to .9 deg.
 Its size on a day is unknown; the share of detections below the road limits it.
 
-The road is a parabola along the way, and its slope is taken under the car: a plane through what lies 7 to 35
-m ahead was 0.3 to 0.5 deg off the way on hilly streets.
+The road is modelled as a parabola in the direction of travel, with its slope under the car. A plane through
+points 7 to 35 m ahead had an error of 0.3 to 0.5 deg on hilly streets.
 
-A constant error of all elevations turns v in radar axes as it turns the detections: this is where detections
-point.
+A constant error of all elevations rotates v in radar axes like the detections, so the result is the pitch of
+the detections.
 
 Source: Kellner et al. 2014, "Instantaneous ego-motion estimation using multiple Doppler radars", for three
 components from one; Durbin 1954, "Errors in variables", for instruments.
@@ -96,9 +95,9 @@ class TravelDirections:
         return len(self.frame)
 
     def bias_rad(self, share: float | None = None) -> float:
-        """Sigma of pitch that no number of frames lowers, with things seen too low by such a share of their height.
+        """Sigma of pitch that more frames do not reduce, for objects measured too low by this share of their height.
 
-        Unless one is given, it is the share of detections below the road.
+        The default is the share of detections below the road.
         """
         if not self.count:
             return float(DOPPLER_PITCH_FLOOR_RAD)
@@ -106,7 +105,7 @@ class TravelDirections:
         return float(np.hypot(DOPPLER_PITCH_FLOOR_RAD, np.median(self.per_displaced) * share))
 
     def of_frames(self, frames: Int64[np.ndarray, " S"]) -> TravelDirections:
-        """Those of some observations, which are numbered anew in the order given."""
+        """The part of some observations, which are renumbered in the given order."""
         return rows_of_frames(self, frames)
 
 
@@ -150,7 +149,7 @@ def travel_directions(
 def pitch_residuals(
     travel: TravelDirections, T_lidar_radar: Float[np.ndarray, "4 4"]
 ) -> tuple[Float[np.ndarray, " D"], Float[np.ndarray, "D 3"]]:
-    """How far the velocity points above the road [rad], and the Jacobian for a turn R <- exp(r) R."""
+    """Angle of the velocity above the road [rad], and its Jacobian for a rotation R <- exp(r) R."""
     v = travel.velocity_mps @ T_lidar_radar[:3, :3].T
     x, y, z = v.T
     h = np.hypot(x, y)
@@ -162,9 +161,9 @@ def pitch_residuals(
 def pitch_equations(
     travel: TravelDirections, T_lidar_radar: Float[np.ndarray, "4 4"], frames: int
 ) -> tuple[Float[np.ndarray, "F 2 2"], Float[np.ndarray, "F 2"], float]:
-    """Per frame, information and gradient of the robust (Cauchy) cost for roll and pitch, and the scatter [rad].
+    """Information and gradient per frame of the robust (Cauchy) cost for roll and pitch, and the scatter [rad].
 
-    The scatter is that of frames beyond their sigmas, and is added to these; NaN for too few frames.
+    The scatter is that of frames in excess of their sigmas, to which it is added; NaN for too few frames.
     """
     if travel.count < _LEAST_FRAMES:
         return np.zeros((frames, 2, 2)), np.zeros((frames, 2)), float("nan")
@@ -186,7 +185,7 @@ class _Scan:
 
 
 def _scan(o: Observation, T_lidar_radar: np.ndarray, dt_s: float) -> _Scan | None:
-    """Detections of one scan; None where too few have an instrument."""
+    """Detections of one scan; None if too few have an instrument."""
     assert o.radar_velocity_mps is not None
     static = o.radar_motion == 0
     xyz, residual = o.radar_xyz_m[static].astype(np.float64), o.radar_residual_mps[static].astype(np.float64)
@@ -200,7 +199,7 @@ def _scan(o: Observation, T_lidar_radar: np.ndarray, dt_s: float) -> _Scan | Non
 
 
 def _velocity(scan: _Scan, near_mps: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Velocity and covariance of one scan by instruments, from a velocity near it; None where they show too little."""
+    """Velocity and covariance of one scan by instruments, from a velocity near it; None if undetermined."""
     u = scan.xyz_m / np.linalg.norm(scan.xyz_m, axis=1, keepdims=True)
     azimuth = np.arctan2(scan.xyz_m[:, 1], scan.xyz_m[:, 0])
     flat = np.stack([np.cos(azimuth), np.sin(azimuth), np.tan(scan.lidar_rad)], 1)
@@ -218,14 +217,14 @@ def _velocity(scan: _Scan, near_mps: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _heights(xyz_m: np.ndarray, T_lidar_radar: np.ndarray, road: np.ndarray, ahead: np.ndarray) -> np.ndarray:
-    """Height of detections over the plane that the road is under the car."""
+    """Height of detections over the plane of the road under the car."""
     x, y, z = transform_points(T_lidar_radar, xyz_m).T
     along, aside = x * ahead[0] + y * ahead[1], y * ahead[0] - x * ahead[1]
     return np.asarray(z - road[0] - road[1] * along - road[3] * aside)
 
 
 def _lidar_elevation(o: Observation, T_lidar_radar: np.ndarray, dt_s: float, xyz_m: np.ndarray) -> np.ndarray:
-    """Mean elevation [rad] of lidar points around each detection's azimuth and range, at any height; NaN of none."""
+    """Mean elevation [rad] of lidar points around each detection's azimuth and range; NaN without points."""
     assert o.radar_velocity_mps is not None
     lidar = transform_points(inverse(T_lidar_radar), o.lidar_map_xyz_m.astype(np.float64))
     lidar -= o.radar_velocity_mps * ((o.radar_stamp_ns - o.stamp_ns) * 1e-9 + dt_s)
@@ -245,7 +244,7 @@ def _lidar_elevation(o: Observation, T_lidar_radar: np.ndarray, dt_s: float, xyz
 
 
 def _cells(xyz_m: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cell of azimuth and of range of each point, and whether it lies within the useful view."""
+    """Cell of azimuth and of range of each point, and whether the point is within the useful view."""
     row = np.floor((np.arctan2(xyz_m[:, 1], xyz_m[:, 0]) + SIDE_RAD) / _CELL_RAD).astype(np.int64)
     range_m = np.linalg.norm(xyz_m, axis=1)
     column = np.floor(range_m / _CELL_M).astype(np.int64)

@@ -1,8 +1,9 @@
 """Radar detections inside the camera's vehicle boxes: the term that determines a radar's roll and pitch.
 
 Detections between the sides of a box, at the range given by its height, belong to that vehicle. Their
-elevation in the camera frame is the box's elevation up to a constant per class (returns lie below the box's
-centre). Roll is a slope of the difference over azimuth, for any constant; pitch cannot be separated from it.
+elevation in the camera frame is the box's elevation up to a constant per class (returns come from below the
+box's centre). Roll is a slope of the difference over azimuth, for any constant; pitch cannot be separated
+from it.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ class VehicleBoxes:
     frame: Int64[np.ndarray, " B"]  # index into the observations given
 
     def of_frames(self, frames: Int64[np.ndarray, " S"]) -> VehicleBoxes:
-        """Those of some observations, which are numbered anew in the order given."""
+        """The part of some observations, which are renumbered in the given order."""
         return rows_of_frames(self, frames)
 
 
@@ -195,7 +196,7 @@ def _boxes_of_frame(o: Observation) -> np.ndarray:
 
 
 def _is_occluded(boxes: np.ndarray, b: int) -> bool:
-    """Something that stands nearer (its foot is lower) covers part of the box."""
+    """True if a nearer object (with a lower foot) covers part of the box."""
     x0, _, x1, y1 = boxes.T
     overlap = np.minimum(x1, x1[b]) - np.maximum(x0, x0[b])
     return bool(np.any((y1 > y1[b] + 1) & (overlap > 0.3 * (x1[b] - x0[b]))))

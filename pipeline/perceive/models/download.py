@@ -56,13 +56,13 @@ def download(
         except DownloadError as err:
             if not stream.tell():
                 part.unlink()
-            told = f"{err.problem}; or bring the file from another machine to {file}, and call again"
+            told = f"{err.problem}; or copy the file from another machine to {file}, and call again"
             raise DownloadError(url, told) from err
         found = _digest(part)
         if found != sha256:
             part.unlink()
             told = (
-                f"its sha256 is {found}, not {sha256}: another file than this release means; nothing was kept"
+                f"its sha256 is {found}, not {sha256}: this is not the file of this release; nothing was kept"
             )
             raise DownloadError(url, told)
         part.replace(file)
@@ -89,7 +89,7 @@ def _complete(url: str, stream: IO[bytes], size_bytes: int, progress: Progress, 
         if stream.tell() != size_bytes and attempt < _TRIES - 1:
             time.sleep(pause_s * 2**attempt)
     if stream.tell() != size_bytes:
-        came = f"; {stream.tell():,} of {size_bytes:,} bytes have come, and the next call goes on from there"
+        came = f"; {stream.tell():,} of {size_bytes:,} bytes were received, and the next call continues from there"
         raise DownloadError(url, problem + (came if stream.tell() else ""))
 
 

@@ -1,4 +1,4 @@
-"""Model manifests: a small TOML file beside each ONNX file describes its input, output and hash.
+"""Model manifests: a small TOML file next to each ONNX file describes its input, output and hash.
 
 Examples for a detector and a segmenter: `pipeline/perceive/README.md`.
 """

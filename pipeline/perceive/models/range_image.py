@@ -1,27 +1,14 @@
-"""What lidar points are, by a range-image ONNX model in RangeNet++'s convention.
+"""Classes of lidar points by a range-image ONNX model in RangeNet++'s convention.
 
-A manifest beside the model says what goes in and what comes out:
+A manifest next to the model describes its input and output:
 
-```toml
-path = "darknet53.onnx"           # relative to the manifest
-sha256 = "..."
-task = "segment_points"
-[input]                           # float32 1x5xHxW: range, x, y, z [m], remission
-size = [64, 2048]                 # rows, columns
-fov_up_deg = 3.0
-fov_down_deg = -25.0
-mean = [12.12, 10.88, 0.23, -1.04, 0.21]
-std = [12.32, 11.47, 6.91, 0.86, 0.16]
-empty = "zero"                    # pixels without a point, once normalised; or "minus_one", before that
-[output]
-layout = "logits"                 # 1xCxHxW; probabilities do as well
-label_set = "semantickitti"       # 20 labels, 0 = unlabelled
-[knn]                             # optional: how pixels' labels become points' labels
-neighbours = 5
-search = 5
-sigma_px = 1.0
-cutoff_m = 1.0
-```
+```toml path = "darknet53.onnx"           # relative to the manifest sha256 = "..." task = "segment_points"
+[input]                           # float32 1x5xHxW: range, x, y, z [m], remission size = [64, 2048]
+# rows, columns fov_up_deg = 3.0 fov_down_deg = -25.0 mean = [12.12, 10.88, 0.23, -1.04, 0.21] std = [12.32,
+11.47, 6.91, 0.86, 0.16] empty = "zero"                    # pixels without a point, once normalised; or
+"minus_one", before that [output] layout = "logits"                 # 1xCxHxW; probabilities do as well
+label_set = "semantickitti"       # 20 labels, 0 = unlabelled [knn]                             # optional:
+how pixels' labels become points' labels neighbours = 5 search = 5 sigma_px = 1.0 cutoff_m = 1.0 ```
 
 Source: Milioto et al., RangeNet++ (IROS 2019); paper, section 4.2 (RangeNet++ and RANSAC successively).
 """
@@ -75,7 +62,7 @@ class _Input(Section):
         if min(self.std) <= 0:
             raise ValueError("std must be positive")
         if self.fov_up_deg <= self.fov_down_deg:
-            raise ValueError("fov_up_deg must lie above fov_down_deg (which is negative below the horizon)")
+            raise ValueError("fov_up_deg must be above fov_down_deg (which is negative below the horizon)")
         return self
 
 

@@ -36,7 +36,7 @@ class Fit:
 
 
 class AlikeCheck:
-    """Refuses a model that answers several different inputs alike: it looks at none of them."""
+    """Refuses a model with equal outputs for several different inputs, because it does not use its input."""
 
     def __init__(self, manifest_file: object) -> None:
         self._file = str(manifest_file)

@@ -72,9 +72,9 @@ class LidarSpec:
 class RadarSpec:
     """An FMCW MIMO radar: resolution cells and accuracy of its estimator.
 
-    `road_mirror` is the share of echoes that also reach the radar by way of the road, with an elevation
-    between the object and its mirror image (`multipath.py`); 0 is a road that changes elevations up as often
-    as down.
+    `road_mirror` is the share of echoes that also reach the radar by reflection on the road, with an
+    elevation between the object and its mirror image (`multipath.py`); with 0, the road changes elevations up
+    as often as down.
     """
 
     azimuth_deg: float = 30.0  # half field of view

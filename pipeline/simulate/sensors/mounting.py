@@ -83,8 +83,8 @@ class Mounting:
 def mounting_of(rig: RigSpec, seed: int, vehicle: int, day: int, alike_deg: float | None = None) -> Mounting:
     """Mounting of a vehicle on a day: CAD plus deviations of this vehicle and of the day's remount.
 
-    `alike_deg`: all vehicles deviate from CAD alike, and from each other by this standard deviation per axis (and by a
-    centimetre per degree); None = each deviates by itself.
+    `alike_deg`: standard deviation per axis between vehicles (and a centimetre per degree), about a deviation
+        from CAD that all share; None = independent deviations.
     """
     built = np.random.default_rng([seed, vehicle, 41])
     remount = np.random.default_rng([seed, vehicle, day, 42])

@@ -52,7 +52,7 @@ class SimulatedFrame:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Surroundings of a vehicle besides meshes: ego motion, light, radar mirrors and strong reflectors."""
+    """Surroundings of a vehicle other than meshes: ego motion, light, radar mirrors and strong reflectors."""
 
     ego: Motion
     sun: np.ndarray
@@ -62,7 +62,7 @@ class Scene:
 
 
 def scene_of(drive: Drive) -> Scene:
-    """Scene of a drive; rails (highway) and house fronts (urban) mirror."""
+    """Scene of a drive; rails (highway) and house fronts (urban) are radar mirrors."""
     layout = drive.layout
     right = layout.right_edge - 0.8 - layout.lanes_own[0]
     mirrors = (right, -layout.lanes_own[0]) if drive.landscape.fast else (right - 3.0,)
@@ -82,7 +82,7 @@ class Seat:
 def frame_of(
     seat: Seat, stamps_s: Mapping[str, float], rng: np.random.Generator, semantics: SemanticsSpec
 ) -> SimulatedFrame:
-    """Measurements of the named sensors with these stamps, each measured its delay before its stamp.
+    """Measurements of the named sensors with these stamps; a sensor measures earlier than its stamp by its delay.
 
     The moment should be near the middle of the reference lidar's sweep. The order of random draws defines a
     day: lidars, then camera images, radars, and last the networks' outputs.

@@ -36,8 +36,8 @@ class Landscape:
         setback_m: distances of a house from the pavement.
         storeys: numbers of storeys of houses.
         green: trees and bushes per plot.
-        trees_m: distance of trees in a row beside the road, 0 = no row.
-        poles_m: distance of poles in a row beside the road, 0 = no row.
+        trees_m: distance between trees in a row along the road, 0 = no row.
+        poles_m: distance between poles in a row along the road, 0 = no row.
         ceiling_m: height of a ceiling, 0 = the sky.
         inner_m: distance from the road's edge to the walls under the ceiling.
         columns_m: distance between the columns of the ceiling, 0 = none.

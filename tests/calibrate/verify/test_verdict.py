@@ -173,9 +173,7 @@ def test_a_roll_that_contradicts_the_prior_and_that_nothing_checks_is_named_in_a
     azimuth_only = SURE | {"elevation": claim(0.5)}
     found = verdict(rolled(3.3), BETTER, claims=azimuth_only)
     assert (found.status, found.unchecked) == ("accepted", {"rx": pytest.approx(3.3)})
-    assert (
-        "roll lies 3.3 sigma from the prior, and no held-out frame checks it: not certified" in found.reason
-    )
+    assert "roll is 3.3 sigma from the prior, and no held-out frame checks it: not certified" in found.reason
     assert verdict(rolled(2.9), BETTER, claims=azimuth_only).unchecked == {}
     pitched = verdict(estimate(1.0, pair="lidar_radar"), BETTER, claims=azimuth_only)
     assert list(pitched.unchecked) == ["ry"]

@@ -105,7 +105,7 @@ def test_a_break_in_the_middle_goes_on_from_there(server, tmp_path):
 
 def test_after_the_last_try_the_next_call_goes_on(server, tmp_path):
     server.breaks = 3
-    with pytest.raises(DownloadError, match="the next call goes on from there"):
+    with pytest.raises(DownloadError, match="the next call continues from there"):
         fetched(server, tmp_path / "model.onnx")
     assert not (tmp_path / "model.onnx").exists()
     assert fetched(server, tmp_path / "model.onnx")
@@ -123,7 +123,7 @@ def test_a_server_without_ranges_sends_all_of_it_again(server, tmp_path):
 def test_another_file_is_not_kept_and_leaves_the_one_before(how, server, tmp_path):
     (tmp_path / "model.onnx").write_bytes(b"of an earlier release")
     server.content = CONTENT[::-1] if how == "other" else CONTENT + b"more"
-    words = {"other": f"not {SHA256}: another file", "longer": "more than 1,024,000 bytes come"}[how]
+    words = {"other": f"not {SHA256}: this is not the file", "longer": "more than 1,024,000 bytes come"}[how]
     with pytest.raises(DownloadError, match=words):
         fetched(server, tmp_path / "model.onnx")
     assert (tmp_path / "model.onnx").read_bytes() == b"of an earlier release"
@@ -147,7 +147,7 @@ def test_without_a_network_the_error_says_what_to_do(tmp_path):
         with pytest.raises(DownloadError, match="no connection") as told:
             download(url, tmp_path / "model.onnx", 10, SHA256, pause_s=0.001)
     assert not list(tmp_path.iterdir())
-    assert f"bring the file from another machine to {tmp_path / 'model.onnx'}" in str(told.value)
+    assert f"copy the file from another machine to {tmp_path / 'model.onnx'}" in str(told.value)
     (tmp_path / "model.onnx").write_bytes(CONTENT)
     assert not download(url, tmp_path / "model.onnx", len(CONTENT), SHA256)
 

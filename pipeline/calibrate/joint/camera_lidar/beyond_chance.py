@@ -1,10 +1,10 @@
 """Evidence of each term of the camera-lidar score for a pose, in units of its values at wrong poses.
 
-Edges, markings and classes are sums of log likelihood ratios whose points err together, each term's by
-another factor: on a day of another simulator, bright paint on bright road scored thousands of nats at poses
-12 deg off and nothing at the truth. Random, hence nearly always wrong, poses are therefore drawn, and each
-term is counted in units of its upper tail over them. A term with a clear maximum stands many tails out; a
-term without information stands out nowhere, and cannot outvote the others.
+Edges, markings and classes are sums of log likelihood ratios of points with correlated errors, to a different
+degree for each term. On a day of another simulator, bright paint on bright road scored thousands of nats at
+poses 12 deg off and nothing at the truth. So random poses are drawn, which are nearly always wrong, and each
+term is measured in units of its upper tail over them. A term with a clear maximum exceeds many tails. A term
+without information has no outlier, and cannot dominate the others.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _BATCH = 512  # poses at a time: their rows of 3x4 transforms by frame stay in t
 def wrong_poses(
     prior: Prior, rotation_rad: float, shift_m: float, rng: np.random.Generator
 ) -> Float[np.ndarray, "P 4 4"]:
-    """Poses drawn about the prior so far and wide that nearly all of them are wrong."""
+    """Random poses about the prior, with a spread so wide that nearly all of them are wrong."""
     reach = max(rotation_rad, _LEAST_TURN_RAD)
     R = exp_so3(rng.uniform(-reach, reach, (_POSES, 3))) @ prior.T_camera_lidar[:3, :3]
     t = prior.T_camera_lidar[:3, 3] + rng.uniform(-shift_m, shift_m, (_POSES, 3))
@@ -65,7 +65,7 @@ class Evidence:
     tail: tuple[float, ...] = (1.0, 1.0, 1.0)
 
     def measured(self, wrong: Float[np.ndarray, "P 4 4"]) -> Evidence:
-        """With what wrong poses show of each term; a term that shows nothing anywhere has no tail."""
+        """The evidence with the tail of each term at wrong poses; a term without values has no tail."""
         raw = self if self.shifts_px else replace(self, per_edge=self._median_edge(wrong))
         shown = raw.of(wrong)
         begin = np.quantile(shown, _TAIL, axis=0)
@@ -74,13 +74,13 @@ class Evidence:
         return replace(raw, middle=tuple(np.median(shown, axis=0)), tail=tuple(tail))
 
     def weighted(self) -> KernelSettings:
-        """The kernel with edges and markings weighted alike in units of chance, the larger weight 1."""
+        """The kernel with equal weights of edges and markings in units of chance; the larger weight is 1."""
         weight = np.array([1 / t if t > 0 else 0.0 for t in self.tail[:2]])
         edges, markings = weight / max(weight.max(), 1e-12)
         return replace(self.kernel, edge_weight=float(edges), marking_weight=float(markings))
 
     def of(self, poses: Float[np.ndarray, "P 4 4"]) -> Float[np.ndarray, "P 3"]:
-        """Evidence for poses by term, the clock as logged."""
+        """Evidence for poses by term, with the logged clock."""
         return np.concatenate([self.at(at) for at in _batches(poses)])
 
     def at(self, at: Alignments) -> Float[np.ndarray, "P 3"]:
@@ -92,11 +92,11 @@ class Evidence:
         return _in_tails(shown - self.middle, self.tail)
 
     def by_frame(self, at: Alignments) -> Float[np.ndarray, " F"]:
-        """Of edges and markings together at ONE alignment, up to a constant."""
+        """Evidence of edges and markings together for each frame at ONE alignment, up to a constant."""
         return _in_tails(np.stack([x[0] for x in self._excess(at)], -1), self.tail[:2]).sum(1)
 
     def by_block(self, at: Alignments, block: Int[np.ndarray, " F"]) -> Float[np.ndarray, "B 3"]:
-        """What each block of frames alone shows of each term at ONE alignment, up to a constant."""
+        """Evidence of each block of frames for each term at ONE alignment, up to a constant."""
         edges, markings = (x[0] for x in self._excess(at))
         shown = []
         for name in np.unique(block):

@@ -1,10 +1,11 @@
 """Camera-lidar half of method `joint`: T_camera_lidar and the camera's time offset from a day of observations.
 
-Candidates of several origins climb until one leads (`initialise`), annealed response surfaces find the optimum, and the
-frames' own curvatures and gradients give its covariance. Weights of the terms come from the data: the share of matching
-edges, the contrast under markings, and the scatter of a term's gradient from frame to frame compared with its curvature
-(composite likelihood: Varin, Reid, Firth 2011, section 2.3). A degree of freedom that the day does not determine is
-then fixed at the prior and the others are solved again; their covariance includes what the prior leaves open in it.
+Candidates of several origins are optimised until one leads (`initialise`). Annealed response surfaces find
+the optimum, and the frames' own curvatures and gradients give its covariance. Weights of the terms come from
+the data: the share of matching edges, the contrast under markings, and the scatter of a term's gradient from
+frame to frame compared with its curvature (composite likelihood: Varin, Reid, Firth 2011, section 2.3). A
+degree of freedom that the day does not determine is then fixed at the prior, and the others are solved again;
+their covariance includes its prior uncertainty.
 """
 
 from __future__ import annotations
@@ -87,7 +88,7 @@ _UNKNOWN_SHARE = 0.7  # of the prior's sigma: from there on the day's speeds did
 
 @dataclass(frozen=True, eq=False)
 class Aligned:
-    """An alignment good to a tenth of a degree: `analyse_camera_lidar` continues, maybe with better velocities."""
+    """An alignment accurate to a tenth of a degree, from which `analyse_camera_lidar` continues."""
 
     problem: CameraLidarProblem
     frames: list[Observation]
@@ -109,7 +110,7 @@ class Aligned:
 
     @property
     def covariance(self) -> Float[np.ndarray, "6 6"]:
-        """Of the pose, by left perturbation."""
+        """Covariance of the pose, by left perturbation."""
         biases = sides_apart(self.problem.terms, self.state, self.kernel).biases(IS_TZ)
         of_day = day_covariance(self.problem, self.state, self.kernel, IS_TZ)
         of_changes = of_day.beside(biases).covariance[:6, :6]
@@ -129,10 +130,10 @@ def estimate_camera_lidar(
 
     Args:
         observations: the day's frames; those with another camera or label size than the first are left out.
-        prior: start, and weak information about pose; dt is expected to be the constant part of the stamps' gaps, with
-            `time_offset_sigma_s`.
+        prior: start, and weak information about pose; dt is expected to be the constant part of the stamps'
+            gaps, with `time_offset_sigma_s`.
         config: search box and resampling.
-        rng: decides everything random.
+        rng: source of all random numbers.
         velocity_lidar: own velocity per observation in lidar axes [m/s]; by default the speed along the
             heading that the radar's Doppler and the prior T_lidar_radar show.
 
@@ -151,7 +152,7 @@ def align_camera_lidar(
     *,
     velocity_lidar: Float[np.ndarray, "F 3"] | None = None,
 ) -> Aligned:
-    """Find the basin and refine in it, from wide kernels to sharp ones; arguments as of `estimate_camera_lidar`."""
+    """Find the basin and refine in it, from wide to narrow kernels; arguments as of `estimate_camera_lidar`."""
     used, rejected = _usable(observations)
     heading_sigma = HEADING_SIGMA_RAD
     if velocity_lidar is None:
@@ -213,13 +214,13 @@ def analyse_camera_lidar(
     *,
     heading: tuple[float, float] | None = None,
 ) -> PairEstimate:
-    """The estimate: tz, the time offset, what the day determines and how surely.
+    """The estimate with tz, time offset, observability and covariance.
 
     Args:
-        aligned: where to begin.
-        rng: of the chance densities and the points of the time offset's profile.
-        heading: azimuth of the car's way in lidar axes, and its sigma [rad]; by default the velocities stay those of
-            `aligned`.
+        aligned: the start.
+        rng: for the chance densities and the points of the time offset's profile.
+        heading: azimuth of the direction of travel in lidar axes, and its sigma [rad]; by default the
+        velocities are those of `aligned`.
     """
     problem = aligned.problem
     if heading is not None:
@@ -271,7 +272,7 @@ def analyse_camera_lidar(
 def _terms(
     frames: Sequence[Observation], velocity_lidar: np.ndarray, prior: Prior, config: SolveConfig
 ) -> Terms:
-    """The terms that the config asks for, with all points that the search range can bring into view."""
+    """The terms selected in the config, with all points that can come into view within the search range."""
     reach = search_range(prior, config).rotation_rad + MARGIN_RAD
     readout_s = prior.camera.readout_s
     terms = prepare_terms(frames, prior.T_camera_lidar, velocity_lidar, reach_rad=reach, readout_s=readout_s)
@@ -285,8 +286,8 @@ def _terms(
 def _usable(observations: Sequence[Observation]) -> tuple[list[int], dict[str, int]]:
     """Frames that share the first frame's camera and label size, and whose own speed is known where most are.
 
-    If it is not, the distance driven between sweep and image is unknown: taken for a car that stands, 10 frames
-    of 32 on a simulated highway moved the time offset by 30 ms.
+    Without the speed, the distance driven between sweep and image is unknown. When such frames were treated
+    as standing, 10 frames of 32 on a simulated highway moved the time offset by 30 ms.
     """
     if not observations:
         return [], {}
@@ -386,13 +387,13 @@ def _conclude(
 
 
 def _biases(analysis: ObservabilityAnalysis) -> dict[str, Float[np.ndarray, "6 6"]]:
-    """What all frames err by alike, by owner: masks and intrinsics turn the camera, whatever it is paired with."""
+    """Errors common to all frames, by owner: masks and intrinsics rotate the camera in all of its pairs."""
     turns = np.diag(np.where(analysis.fixed[:6] | (np.arange(6) > 2), 0.0, CAMERA_LIDAR_BIAS) ** 2)
     return {"camera": turns, EDGE: analysis.floors[:6, :6] - turns}
 
 
 def _tz_bias(analysis: ObservabilityAnalysis) -> Float[np.ndarray, " 6"]:
-    """Variance of tz by what edges and markings err by alike, as its profile weighs it against the prior."""
+    """Variance of tz due to common errors of edges and markings, with the weight of its profile against the prior."""
     weight = max(float(analysis.observability[TZ]), 0.0)
     known = weight >= OBSERVABLE
     variance = weight**2 * (analysis.profile.bias_m**2 + TZ_COMMON_BIAS_M**2) if known else 0.0

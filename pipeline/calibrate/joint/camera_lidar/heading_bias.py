@@ -2,9 +2,9 @@
 
 A sweep takes a tenth of a second; de-skewing moves its points along the car's velocity, whose direction in
 lidar axes follows from the prior's mounting. A mounting error of a degree then lifts one side of the sweep
-and lowers the other, in proportion to speed: on highways a tenth of a degree of roll, in edges and markings
-alike. The camera's time offset moves the cloud along the same velocity, whose heading comes from the radar
-and its prior.
+and lowers the other, in proportion to speed. On highways this is a tenth of a degree of roll, for both edges
+and markings. The camera's time offset moves the cloud along the same velocity, whose heading comes from the
+radar and its prior.
 
 Source: Schmidt 1966 (parameters that are considered, not solved for).
 """
@@ -31,7 +31,7 @@ _STAMP_SIGMA_S = SWEEP_S / np.sqrt(12)  # a sweep's stamp may be of its begin, m
 
 @dataclass(frozen=True)
 class MotionSigmas:
-    """How surely the car's motion is known in the lidar's axes, and how long a sweep takes."""
+    """Sigmas of the car's motion in the lidar's axes, and the duration of a sweep."""
 
     heading_rad: float  # one sigma of the velocities that the terms have
     s_per_rad: float  # time of a sweep per azimuth

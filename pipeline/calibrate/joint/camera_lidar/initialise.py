@@ -1,12 +1,12 @@
 """Initial pose: the basin of the camera-lidar score, and whether its evidence leads over all others.
 
-One search can be misled, and so can one term: on a day of another simulator markings alone put the camera 12
-deg off and outvoted the edges. Candidates therefore come from the prior, from a grid of rotations by all
-terms together and by each alone, and from the vehicle's state. Each climbs at the same kernel within the
+A single search or a single term can be wrong: on a day of another simulator, markings alone moved the camera
+12 deg off, against the edges. Candidates therefore come from the prior, from a grid of rotations by all terms
+together and by each alone, and from the vehicle's state. Each is optimised with the same kernel within the
 search range, and their ends are compared by each term's evidence beyond chance (`beyond_chance`). The best
 end is accepted if it leads over the best of all chance poses of the search, if the day rejects every other
-end, and if no term with a clear maximum contradicts it, block by block of its frames: a lidar that is blind to
-paint has its brightest places somewhere too.
+end, and if no term with a clear maximum contradicts it. The last test is made over blocks of frames, because
+a lidar that does not see paint also has a brightest place somewhere.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Basin:
 
 @dataclass(frozen=True, eq=False)
 class _End:
-    """Where the climb from a candidate ended, and what the terms show there at the common kernel."""
+    """End of the optimisation from a candidate, and the terms' evidence there with the common kernel."""
 
     origin: str
     state: AlignmentState
@@ -84,13 +84,13 @@ class _End:
 
 
 def find_basin(terms: Terms, scored: Scored, rng: np.random.Generator, block: Int[np.ndarray, " F"]) -> Basin:
-    """Climb from candidates until the best end is found, or no candidate is left.
+    """Optimise candidates until the best end is found, or no candidate is left.
 
     Args:
-        scored: few sharp points, the kernel at which ends are compared, the prior that is the centre of the
-            search, and the config with the least search range.
+        scored: a few sharp points, the kernel with which ends are compared, the prior (centre of the search),
+            and the config with the smallest search range.
         rng: decides everything random.
-        block: of each frame; blocks err apart.
+        block: block of each frame; errors of different blocks are independent.
     """
     prior, (reach, shift) = scored.prior, search_range(scored.prior, scored.config)
     wrong = wrong_poses(prior, reach, min(shift, _SHIFT_SIGMAS * prior.translation_sigma_m), rng)
@@ -108,10 +108,10 @@ def find_basin(terms: Terms, scored: Scored, rng: np.random.Generator, block: In
 
 
 def settled(basin: Basin, scored: Scored, best: AlignmentState, rival: AlignmentState) -> Basin:
-    """The basin after its best end and the rival have climbed at a sharper kernel.
+    """The basin after its best end and the rival were optimised with a narrower kernel.
 
-    At the kernel of the search an end a degree away scores much alike; it leads to the same pose, or is
-    rejected.
+    With the kernel of the search, an end a degree away has a similar score; it now leads to the same pose, or
+    is rejected.
     """
     apart = _apart_rad(scored.terms, best, rival)
     lower = np.subtract(*(scored.terms.score(s.alone, scored.kernel)[0] for s in (best, rival)))
@@ -143,7 +143,7 @@ def difference(a: AlignmentState, b: AlignmentState) -> Float[np.ndarray, " 8"]:
 def _candidates(
     terms: Terms, scored: Scored, reach: float, wrong: np.ndarray, rng: np.random.Generator
 ) -> Iterator[tuple[str, AlignmentState, bool]]:
-    """Starts, their origins, and whether the search may end with them: not before each term was asked."""
+    """Starts, their origins, and whether the search may end with them, which requires that each term was searched."""
     prior = scored.prior
     yield "prior", AlignmentState(prior.T_camera_lidar), False
     found = grid_maxima(terms.sharp(MAX_GAP_PX), prior, reach, wrong, rng)
@@ -156,7 +156,7 @@ def _candidates(
 
 
 def _climbed(scored: Scored, start: AlignmentState) -> AlignmentState:
-    """Where a start leads: at the grid's kernel first, where that is the wider one, then at the common kernel."""
+    """End of a start, first with the grid's kernel if that is wider, then with the common kernel."""
     sigma_px = np.radians(SCHEDULE.grid_kernel_deg) * float(scored.terms.camera[1])
     if sigma_px > scored.kernel.sigma_px:
         wider = replace(scored, kernel=replace(scored.kernel, sigma_px=sigma_px))
@@ -180,14 +180,17 @@ class _Search:
         self.poses, self.candidates = len(grid_turns(reach)), 0
 
     def climb(self, origin: str, start: AlignmentState) -> None:
-        """Add the end of a candidate, unless it begins where two others ended: one more says what those two do."""
+        """Add the end of a candidate, unless it starts where two others ended, and would only repeat them."""
         self.candidates += 1
         near = sum(self._apart(start, e.state) < self.leads_there_rad for e in self.ends)
         if near < _ENDS_THAT_TELL:
             self.ends.append(self._end(origin, _climbed(self.scored, start)))
 
     def conclude(self, *, is_last: bool = False) -> Basin:
-        """The best end, and what speaks against it; as long as candidates are left, the sum of a term's data does."""
+        """The best end, and the reason against it.
+
+        As long as candidates are left, the sum of a term's data suffices as a reason.
+        """
         highest = max(self.ends, key=lambda e: e.total)
         best = self._finished(highest)
         # Ends elsewhere that are near, or that the day does not reject, may not have arrived yet.
@@ -213,7 +216,7 @@ class _Search:
         return replace(basin, rival=rival.state if rival and is_near else None, doubt=doubt)
 
     def _doubt(self, basin: Basin, rivals: Sequence[_End], *, is_last: bool) -> str:
-        """Why the best end cannot be taken for right."""
+        """Reason why the best end cannot be accepted."""
         if (total := sum(basin.evidence)) < basin.needed:
             return (
                 f"no end of the search stands out from chance: the best one ({basin.origin}) shows {total:.0f} "
@@ -261,7 +264,7 @@ class _Search:
 
 
 def _rejected(best: _End, other: _End) -> float:
-    """Standard errors by which the day rejects an end: those of its frames, or those that its evidence stands for."""
+    """Standard errors by which the day rejects an end, from its frames or equivalent to its evidence."""
     lower = best.by_frame - other.by_frame
     error = lower.std(ddof=1) / np.sqrt(len(lower)) if len(lower) > 1 else np.inf
     by_frames = float(lower.mean() / error) if error > 0 else np.inf
@@ -272,7 +275,7 @@ def _rejected(best: _End, other: _End) -> float:
 def _apart_rad(terms: Terms, a: AlignmentState, b: AlignmentState) -> float:
     """Median angle between the day's edges and markings in the image at two poses.
 
-    Not a distance of poses: a rotation and a shift that move the points alike are in one valley.
+    This is not a distance of poses: a rotation and a shift with the same effect on points are in one valley.
     """
     points = np.concatenate([terms.edges.xyz_m, terms.markings.xyz_m])
     points = points[:: max(1, len(points) // _POINTS)]

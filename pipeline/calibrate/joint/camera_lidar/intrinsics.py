@@ -1,23 +1,24 @@
 """Focal length and principal point of the camera from the day: for report and alarm, not for the pose.
 
-Freeing them in the pose costs more than it gains: focal length, tz and the time offset share a valley, and a
-principal point wrong by d pixels is, over most of an image, a camera turned by d/f. So the pose stays that of
-CameraInfo, which is right for whoever uses image directions with the same CameraInfo, and the intrinsics are
-measured beside it: all unknowns free together, Gauss-Newton on the points' re-weighted residuals from the
-aligned pose. Response surfaces, which solve for the pose, lose themselves in that valley; analytic slopes,
-which do not see the steps of the maps, do not. They still end in a maximum of their own, so they begin twice,
-at CameraInfo's focal length and the expected clock and where the alignment had both, and the edges say which
-end is better: from the first alone, a highway whose camera was 60 ms late showed a focal length 6 % off.
+Free intrinsics would make the pose worse: focal length, tz and the time offset share a flat valley, and a
+principal point wrong by d pixels has, over most of an image, the effect of a camera rotated by d/f. So the
+pose is that for CameraInfo, which is right for all users of image directions with the same CameraInfo. The
+intrinsics are measured separately: all unknowns are free, with Gauss-Newton on the points' re-weighted
+residuals from the aligned pose. Response surfaces, which solve for the pose, do not converge in that valley;
+analytic slopes, which ignore the steps of the maps, do. They may still end in a local maximum, so there are
+two starts: CameraInfo's focal length with the expected clock, and the values of the alignment. The edges
+select the better end. From the first start alone, a highway whose camera was 60 ms late gave a focal length 6
+% off.
 
-Edges alone determine the focal length, with the principal point held. Markings run along the car's way and grow
-with it as with the focal length: with them it was 0.8 % off where edges were 0.5 % off. The principal point
-needs them, for they reach the image's lower corners.
+Edges alone determine the focal length, with the principal point held. Markings run along the direction of
+travel, where motion and focal length have the same effect: with them it was 0.8 % off, by edges 0.5 % off.
+The principal point needs markings, because they reach the image's lower corners.
 
-What contradicts CameraInfo is asked twice more before it holds a record: the first and the second half of the
-frames must each say so by itself, and where less weight for the markings moves the principal point, it is not
-known better than it moves. Of 64 days whose CameraInfo was right five were contradicted before: highways
-whose halves ended in different corners of the valley, and dusk, when markings alone drew the principal point
-up by 40 px.
+A contradiction of CameraInfo must pass two more tests before it holds a record. The first and the second half
+of the frames must each show it separately. If a smaller weight of the markings moves the principal point, its
+sigma is at least this change. Before, five of 64 days with a right CameraInfo were contradicted: highways
+whose halves ended at different ends of the valley, and dusk, when markings alone moved the principal point up
+by 40 px.
 
 Source: Triggs et al. 2000, section 4 (Gauss-Newton with robust weights); the sigmas are measured, see their
 constants.
@@ -78,7 +79,7 @@ class DayIntrinsics:
     halves: tuple[DayIntrinsics, ...] = ()
 
     def diagnostics(self, known: CameraPrior) -> dict[str, float]:
-        """Numbers of the record; `mounting_*` is what the principal point leaves open in the camera's turn."""
+        """Numbers of the record; `mounting_*` is the camera's rotation sigma due to the principal point."""
         yaw_rad, pitch_rad = self._turn_sigma_rad(known)
         return {
             "day_focal_scale": self.focal,
@@ -95,7 +96,7 @@ class DayIntrinsics:
         }
 
     def notes(self, known: CameraPrior) -> list[str]:
-        """The assumption in words, and the smallest error of it that the day would have shown."""
+        """Text of the assumption, and the smallest error of it that the day would have detected."""
         yaw, pitch = np.degrees(self._turn_sigma_rad(known))
         source = (
             "centre_sigma_px and the day" if known.centre_is_stated else "the day, without centre_sigma_px"
@@ -113,18 +114,18 @@ class DayIntrinsics:
                 f"{down:+.0f} +- {down_sigma:.0f} px down of it"
             ),
             # By a profile like the time offset's it errs by tens of ms: study `intrinsics.py`.
-            f"image rows are exposed within {1e3 * known.readout_s:.0f} ms (readout_s): a day does not tell",
+            f"image rows are exposed within {1e3 * known.readout_s:.0f} ms (readout_s): a day does not determine it",
         ]
 
     def _turn_sigma_rad(self, known: CameraPrior) -> tuple[float, float]:
-        """Of the camera's yaw and pitch, as far as the principal point is known: a default promises nothing."""
+        """Sigma of the camera's yaw and pitch, if the principal point is known; a default value does not count."""
         stated_px = known.centre_sigma_px if known.centre_is_stated else np.inf
         yaw, pitch = _together(self.centre_sigma_px, stated_px) / np.array(self.focal_px)
         return float(yaw), float(pitch)
 
 
 def contradictions(day: DayIntrinsics, known: CameraPrior) -> list[FailedCheck]:
-    """One failed check for each intrinsic of CameraInfo that the day, and each half of it by itself, shows wrong."""
+    """One failed check for each intrinsic of CameraInfo that the day, and each half of it separately, contradicts."""
     off = _off_by_sigmas(day, known)
     is_wrong = np.abs(off) > INTRINSICS_CONTRADICTION_SIGMAS
     for half in day.halves:
@@ -160,7 +161,7 @@ def measure_intrinsics(
     """Solve for pose, time offset, focal length and principal point together, from an aligned pose.
 
     Args:
-        kernel: whose weights edges and markings have.
+        kernel: kernel with the weights of edges and markings.
         label_scale: label pixels per image pixel.
     """
     day = _measured(problem, state, kernel, label_scale, rng)
@@ -184,7 +185,7 @@ def _measured(
     label_scale: float,
     rng: np.random.Generator,
 ) -> DayIntrinsics:
-    """By the problem's frames; arguments as of `measure_intrinsics`."""
+    """The measurement from the problem's frames; arguments as of `measure_intrinsics`."""
     some = replace(problem, terms=problem.terms.at_most(_POINTS, rng))
     expected, aligned = (
         _focal_end(some, start, kernel, rng) for start in (AlignmentState(state.T_camera_lidar), state)
@@ -217,7 +218,7 @@ class _State:
     centre_px: np.ndarray
 
     def off(self, prior: Prior) -> Float[np.ndarray, " 10"]:
-        """All unknowns, in the coordinates of `AlignmentState.changed`, less what is expected of them."""
+        """All unknowns minus their expected values, in the coordinates of `AlignmentState.changed`."""
         a = self.alignment
         pose = change_between(prior.T_camera_lidar, a.T_camera_lidar)
         return np.concatenate([pose, [a.dt_s, a.focal - 1], self.centre_px])
@@ -235,7 +236,7 @@ class _State:
 
 @dataclass(frozen=True, eq=False)
 class _End:
-    """Where steps ended, the information there, prior included, and the kernel of the last of them."""
+    """End of the steps, the information there, prior included, and the kernel of the last step."""
 
     at: _State
     information: np.ndarray
@@ -245,13 +246,13 @@ class _End:
 def _focal_end(
     problem: CameraLidarProblem, start: AlignmentState, weights: KernelSettings, rng: np.random.Generator
 ) -> _End:
-    """By the edges alone, with the principal point held."""
+    """The end by edges alone, with the principal point fixed."""
     only_edges = replace(weights, marking_weight=0.0)
     return _solved(problem, _State(start, np.zeros(2)), only_edges, _HELD_PX, rng)
 
 
 def _lead(problem: CameraLidarProblem, end: _End, other: _End) -> tuple[float, bool]:
-    """By how much the edges score better at one end than at another, and whether the frames agree that they do."""
+    """Lead of the edges' score at one end over another, and whether it is significant over frames."""
     apart = np.zeros(problem.terms.frames)
     for kernel in (end.kernel, other.kernel):  # each was fitted at its own end
         here, there = (
@@ -311,12 +312,12 @@ def _equations(
 
 
 def _off_by_sigmas(day: DayIntrinsics, known: CameraPrior) -> Float[np.ndarray, " 3"]:
-    """Focal length and principal point (right, down) off CameraInfo's, in sigmas of day and CameraInfo together."""
+    """Focal length and principal point (right, down) minus CameraInfo's, in combined sigmas of day and CameraInfo."""
     off = np.concatenate([[day.focal - 1], day.centre_px])
     sigma = np.concatenate([[day.focal_sigma], day.centre_sigma_px])
     return off / np.hypot(sigma, [known.focal_sigma, known.centre_sigma_px, known.centre_sigma_px])
 
 
 def _together(day_px: Float[np.ndarray, " 2"], stated_px: float) -> Float[np.ndarray, " 2"]:
-    """Sigma of the principal point by what is stated (infinite: nothing) and the day together."""
+    """Sigma of the principal point from the stated value (infinite: none) and the day together."""
     return day_px / np.hypot(1.0, day_px / stated_px) if stated_px else np.zeros(2)

@@ -1,8 +1,8 @@
-"""Observability analysis of camera-lidar: which degrees of freedom the day determines, and how surely.
+"""Observability analysis of camera-lidar: the degrees of freedom that the day determines, and their covariance.
 
-tz and the time offset are determined by their profiles, the others by local refinement. A degree of freedom that the
-day does not determine is fixed at the prior and the others are solved again; their covariance includes what the prior
-leaves open in it.
+tz and the time offset are determined by their profiles, the others by local refinement. A degree of freedom
+that the day does not determine is fixed at the prior, and the others are solved again; their covariance
+includes its prior uncertainty.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ IS_TZ, _IS_DT, _IS_FOCAL = (np.arange(8) == k for k in (TZ, DT, FOCAL))
 
 @dataclass(frozen=True, eq=False)
 class CameraLidarProblem:
-    """What every solution of one day shares."""
+    """Data and settings common to all solutions of one day."""
 
     terms: Terms
     prior: Prior
@@ -71,7 +71,7 @@ class CameraLidarProblem:
 
     @property
     def common_share(self) -> Float[np.ndarray, " 8"]:
-        """Share of what the gradients are not asked for that is the same every day: all of a prior, part of tz's."""
+        """Share of the variance not from gradients that is common to all days: all of a prior's, part of tz's."""
         return np.where(IS_TZ, self.tz_common_share, 1.0)
 
     def scored(self, kernel: KernelSettings) -> Scored:
@@ -98,10 +98,10 @@ class ObservabilityAnalysis:
 def analyse_observability(
     problem: CameraLidarProblem, state: AlignmentState, kernel: KernelSettings, rng: np.random.Generator
 ) -> ObservabilityAnalysis:
-    """Fix tz by its profile, then solve again with what the day does not determine fixed at the prior.
+    """Fix tz by its profile, then solve again with undetermined degrees of freedom fixed at the prior.
 
-    Left free, such a degree of freedom wanders as far as its prior lets it and drags others along: lane lines
-    move tz, and with it dt, by decimetres.
+    A free one would move as far as its prior allows and change others: lane lines move tz, and with it dt, by
+    decimetres.
     """
     at_own_tz = replace(problem, prior=with_tz(problem.prior, float(state.T_camera_lidar[2, 3])))
     follow = response(_curvature(problem, state, kernel), IS_TZ, np.zeros(8, bool))[:, 0]
@@ -142,8 +142,8 @@ def along_the_way(
 ) -> Float[np.ndarray, " 8"]:
     """Motion of the lidar's origin along the driving direction per second of time offset: unobservable at one speed.
 
-    A camera that looks ahead has that in its tz, which is at its prior or as its profile has it; one that looks aside
-    has it in its x.
+    For a camera that looks ahead this is its tz, which is at its prior or from its profile; for one that
+    looks to the side it is its x.
     """
     out = np.zeros(8)
     out[3:6] = T_camera_lidar[:3, :3] @ velocity_lidar.mean(0)
@@ -159,7 +159,7 @@ def _fix_unobservable(
 ) -> ObservabilityAnalysis:
     """Solve again and again until all degrees of freedom are determined or fixed.
 
-    To fix one can leave another undetermined whose optimum follows it, so one pass is not enough.
+    Fixing one can make another undetermined if its optimum depends on the first, so one pass is not enough.
     """
     fixed, observability = IS_TZ, np.ones(6)
     while True:
@@ -199,7 +199,7 @@ def _fix_unobservable(
 def _timed(
     problem: CameraLidarProblem, state: AlignmentState, kernel: KernelSettings, rng: np.random.Generator
 ) -> TimeOffsetProfile:
-    """The time offset's profile, by some of the points: edges that are in sight at every offset that may be."""
+    """The time offset's profile from a part of the points: edges that are in view at every possible offset."""
     reach_s = _REACH_SIGMAS * problem.config.time_offset_sigma_s
     ends = replace(state, dt_s=0.0, focal=1.0).changed(np.outer([-reach_s, reach_s], _IS_DT))
     terms = problem.terms.seen_throughout(ends).at_most(SCHEDULE.time_offset_points, rng)
@@ -215,7 +215,7 @@ def _timed(
 def time_offset_variance(
     problem: CameraLidarProblem, state: AlignmentState, kernel: KernelSettings, timed: TimeOffsetProfile
 ) -> float:
-    """Of the profile, its floor, and what tz and the focal length leave open [s2]; at most the prior's."""
+    """Variance of the profile, its floor, and the uncertainty due to tz and focal length [s2]; at most the prior's."""
     of_tz = s_per_metre(problem.terms, state) ** 2 * problem.tz_variance
     of_focal = response(_curvature(problem, state, kernel), _IS_FOCAL, IS_TZ)[DT, 0] * FOCAL_SIGMA
     day_variance = timed.variance_s2 + CAMERA_LIDAR_DT_FLOOR_S**2 + of_tz + of_focal**2
@@ -224,7 +224,7 @@ def time_offset_variance(
 
 @dataclass(frozen=True, eq=False)
 class DayCovariance:
-    """How sure one day's solution is."""
+    """Covariance and observability of one day's solution."""
 
     covariance: np.ndarray  # 8 8
     common: np.ndarray  # 8 8, of the covariance what all days of a vehicle err by alike
@@ -242,7 +242,10 @@ class DayCovariance:
 def day_covariance(
     problem: CameraLidarProblem, state: AlignmentState, kernel: KernelSettings, fixed: Bool[np.ndarray, " 8"]
 ) -> DayCovariance:
-    """Covariance of a solution and observability; what is fixed has its prior's variance, and the others follow it."""
+    """Covariance of a solution, and observability.
+
+    Fixed unknowns have their prior's variance, which is propagated to the others.
+    """
     terms, prior_variance = problem.terms, _prior_variance(problem)
     scale, curvature = scales(terms, kernel), _curvature(problem, state, kernel)
     gradient = derivatives(terms, state, kernel, scale)[0] / scale
@@ -270,7 +273,7 @@ def day_covariance(
 
 
 def _prior_variance(problem: CameraLidarProblem) -> Float[np.ndarray, " 8"]:
-    """Of every unknown before the frames' gradients are asked; of tz what its profile left."""
+    """Variance of every unknown before the frames' gradients are used; for tz, that of its profile."""
     rotation, translation = problem.prior.rotation_sigma_rad, problem.prior.translation_sigma_m
     others = [problem.config.time_offset_sigma_s, FOCAL_SIGMA]
     sigma = np.array([rotation] * 3 + [translation] * 3 + others)

@@ -1,13 +1,13 @@
-"""Position along the optical axis (tz): a profile of the score, wide enough that its roughness does not matter.
+"""Position along the optical axis (tz), by a profile of the score that is wide compared with its roughness.
 
 On fast cars tz hardly differs from the time offset, and the focal length follows both: a valley decimetres
 long, in which the score is rough at the scale of a response surface. Its gradients scatter in every direction
 and predict a sigma of centimetres, which is too small. tz is therefore stepped through the valley, the other
 unknowns are solved again at each step, and a parabola gives the maximum and its sigma.
 
-Edges and markings are compared on the same path, because they err differently (lane paint slides along its
-lane and blurs with distance). With independent errors of equal size, the mean of both errs by half of their
-difference; if one of them hardly depends on tz, the other's bias is not known better than that.
+Edges and markings are compared on the same path, because their biases differ (lane paint is uniform along its
+lane and blurs with distance). If both have independent errors of equal size, the error of the mean is half of
+their difference. If one of them hardly depends on tz, the other's bias is not known better than that.
 
 Sources: profile likelihood: Murphy & van der Vaart 2000; disagreement beyond the sigmas: Birge 1932.
 """
@@ -34,7 +34,7 @@ _REACH = 2  # spans, within which a parabola's top is looked for
 
 @dataclass(frozen=True, eq=False)
 class TzProfile:
-    """tz by the day alone: value, variance from the profile's shape, bias from edges against markings."""
+    """tz from the day alone: value, variance from the profile, bias from the difference of edges and markings."""
 
     tz_m: float
     variance_m2: float  # infinite where the profile has no maximum
@@ -44,12 +44,12 @@ class TzProfile:
     is_beyond: bool = False  # the parabola's top is too far off to be used
 
     def shift_from(self, tz_m: float) -> tuple[float, float] | None:
-        """How far the day alone puts tz from a prior, and that shift's sigma [m]; None where it does not know."""
+        """Shift of the day's own tz from a prior, and its sigma [m]; None if the day does not determine it."""
         sigma = float(np.sqrt(self.variance_m2 + self.bias_m**2 + TZ_COMMON_BIAS_M**2))
         return None if self.is_beyond or not np.isfinite(sigma) else (self.tz_m - tz_m, sigma)
 
     def with_prior(self, tz_m: float, sigma_m: float) -> tuple[float, float, float]:
-        """Value [m] and variance [m2] together with a prior, and the share of it that is the same every day."""
+        """Value [m] and variance [m2] combined with a prior, and the share of the variance common to all days."""
         bias = self.bias_m**2 + TZ_COMMON_BIAS_M**2
         variance = self.variance_m2 + bias
         weight = 1 / (1 + variance / sigma_m**2)
@@ -90,14 +90,14 @@ def profile_tz(scored: Scored, state: AlignmentState, follow: Float[np.ndarray, 
 
 
 def with_tz(prior: Prior, tz_m: float) -> Prior:
-    """A prior with another tz, at which a fixed tz stays."""
+    """A prior with another tz, at which tz is fixed."""
     T = prior.T_camera_lidar.copy()
     T[2, 3] = tz_m
     return replace(prior, T_camera_lidar=T)
 
 
 def _smooth_values(scored: Scored, state: AlignmentState) -> tuple[float, float, float]:
-    """Score of edges and of markings, means over a ball in which the score is rough, and the others' prior."""
+    """Scores of edges and of markings, averaged over a ball because they are rough, and the prior of the others."""
     terms, kernel = scored.terms, scored.kernel
     at = state.changed(DESIGN * np.where(np.arange(8) == TZ, 0.0, scales(terms, kernel)))
     edges = kernel.edge_weight * float(terms.edge_score(at, kernel).sum(1, dtype=np.float64).mean())
@@ -106,7 +106,7 @@ def _smooth_values(scored: Scored, state: AlignmentState) -> tuple[float, float,
 
 
 def _maximum(x: Float[np.ndarray, " N"], value: Float[np.ndarray, " N"]) -> tuple[float, float]:
-    """Where a parabola through a rough profile is highest, within twice the span, and the variance of that place."""
+    """Maximum of a parabola through a rough profile, within twice the span, and its variance."""
     A = np.column_stack([np.ones_like(x), x, -0.5 * x * x])
     (_, slope, curvature), residual, *_ = np.linalg.lstsq(A, value, rcond=None)
     if curvature <= 0:

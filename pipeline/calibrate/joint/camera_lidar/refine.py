@@ -53,8 +53,7 @@ class AlignmentState:
     def changed(self, x: Float[np.ndarray, "P 8"]) -> Alignments:
         """Candidates at changes (rotation about the camera's axes, shift of the lidar's origin, dt, focal scale).
 
-        The coordinates of the record: what the day cannot determine keeps its value in them, whatever else
-        moves.
+        These are the coordinates of the record: in them, a fixed unknown keeps its value when others move.
         """
         R = exp_so3(x[:, :3]) @ self.T_camera_lidar[:3, :3]
         T = from_rotation_translation(R, self.T_camera_lidar[:3, 3] + x[:, 3:6])
@@ -92,7 +91,7 @@ class AlignmentState:
 class Scored:
     """Objective of a refinement: the terms' score at a kernel plus the prior's log density.
 
-    `limits` is the range about the prior that it does not leave; None = no limit.
+    `limits` is the allowed range about the prior; None = no limit.
     """
 
     terms: Terms
@@ -123,8 +122,9 @@ def refine(
     """Maximise by Newton steps on response surfaces, for the score is rough at the scale of a pixel.
 
     Args:
-        steps: at most so many: valleys are long, because at high speed tz and the time offset are hardly separable.
-        fixed: degrees of freedom that stay; those of the pose at the prior.
+        steps: maximum number of steps; valleys are long, because at high speed tz and the time offset are
+            hardly separable.
+        fixed: degrees of freedom that are fixed; those of the pose at the prior.
     """
     scale = _SURFACE_SIZE * scales(scored.terms, scored.kernel)
     free = np.flatnonzero(~fixed)
@@ -164,8 +164,8 @@ def _surface(
 
     The curvature is at least half of the prediction from the scatter of the frames' gradients (Fisher
     scoring): in a direction that is flat or convex by roughness, a Newton step could end anywhere. The
-    scatter is about the mean, because a mean other than zero is distance to go: counted as curvature, it
-    shortened steps so much that time offsets stayed at their start.
+    scatter is about the mean, because a nonzero mean is the remaining distance. When it was counted as
+    curvature, steps were so short that time offsets stayed at their start.
     """
     at = state.changed(DESIGN * scale)
     gradient, H = fit_quadratics(scored.terms.score(at, scored.kernel))
@@ -186,8 +186,9 @@ def derivatives(
 def weighted(terms: Terms, state: AlignmentState, kernel: KernelSettings, scenes: Scenes) -> KernelSettings:
     """Weight markings, narrow and wide edges so that the curvature of each equals its gradient's scatter over scenes.
 
-    Points of one frame err together (one mask boundary, one lane line), and so do frames of one scene. The
-    curvature of a sum of log likelihood ratios is therefore too large, by another factor for each term.
+    Errors of points of one frame are correlated (one mask boundary, one lane line), and so are those of
+    frames of one scene. The curvature of a sum of log likelihood ratios is therefore too large, by another
+    factor for each term.
     """
     scale = scales(terms, kernel)
     weights = []

@@ -1,9 +1,9 @@
-"""Brute force over rotations: edges, markings and classes on a grid of rotations about a pose.
+"""Exhaustive search over rotations: edges, markings and classes on a grid of rotations about a pose.
 
-Sharp scores have many maxima, coarse ones are biased; at a kernel of half a degree the truth is well above
-all else, and over rotations alone a grid that fine is affordable: some thousands of poses at a few
-nanoseconds per point. Shifts within the prior's sigma move most points by less than the kernel. A few points
-select the poses to score by all.
+Scores with a narrow kernel have many maxima, scores with a wide one are biased. With a kernel of half a
+degree, the score at the truth is well above all others. Over rotations alone, a grid of this resolution is
+affordable: some thousands of poses at a few nanoseconds per point. Shifts within the prior's sigma move most
+points by less than the kernel. A few points select the poses that are scored with all points.
 
 Source: OpenCalib's CalibAnything (Luo et al. 2023) searches rotations by brute force too.
 """
@@ -33,11 +33,10 @@ def grid_maxima(
     wrong: Float[np.ndarray, "P 4 4"],
     rng: np.random.Generator,
 ) -> list[tuple[str, Float[np.ndarray, "4 4"]]]:
-    """The best poses of a grid of rotations about the camera's axes, each the best of its surroundings.
+    """Local maxima of a grid of rotations about the camera's axes, with the terms for which they are maxima.
 
-    The best by all terms together first, then each term's best, then others by all terms; with the terms by
-    which they are best. The prior is the centre of the grid and keeps its translation; `wrong` are poses for
-    the values of chance.
+    The order is: the best by all terms together, then each term's best, then others by all terms. The prior
+    is the centre of the grid and keeps its translation; `wrong` are poses for the values of chance.
     """
     kernel_rad = grid_kernel_rad(reach_rad)
     kernel = KernelSettings.wide(kernel_rad * float(terms.camera[1]), 0, match=SCHEDULE.coarse_match)
@@ -60,7 +59,7 @@ def grid_maxima(
 
 
 def grid_kernel_rad(reach_rad: float) -> float:
-    """Width of the kernel; a wider range is searched with a wider one."""
+    """Width of the kernel; a wider search range has a wider kernel."""
     is_wide = reach_rad > np.radians(SCHEDULE.wide_box_deg)
     return float(np.radians(SCHEDULE.wide_grid_kernel_deg if is_wide else SCHEDULE.grid_kernel_deg))
 
@@ -75,7 +74,7 @@ def grid_turns(reach_rad: float) -> Float[np.ndarray, "P 3"]:
 
 
 def _highest(evidence: Float[np.ndarray, "P 3"], likely: Float[np.ndarray, " P"]) -> np.ndarray:
-    """Indices of the poses that are worth all points: highest by all terms together, and by each alone."""
+    """Indices of the poses to score with all points: highest by all terms together, and by each alone."""
     some, few = (-min(n, len(evidence)) for n in SCHEDULE.grid_chosen)
     by_term = [np.argsort(evidence[:, k])[few:] for k in range(len(TERMS))]
     return np.unique(np.concatenate([np.argsort(evidence.sum(1) + likely)[some:], *by_term]))
@@ -84,7 +83,7 @@ def _highest(evidence: Float[np.ndarray, "P 3"], likely: Float[np.ndarray, " P"]
 def _separate(
     turns: Float[np.ndarray, "P 3"], score: Float[np.ndarray, " P"], apart_rad: float, most: int
 ) -> list[int]:
-    """Indices of the highest scores that lie so far apart."""
+    """Indices of the highest scores with a minimum distance from each other."""
     score = score.copy()
     found = []
     for _ in range(most):

@@ -1,8 +1,9 @@
-"""How far labels bias T_camera_lidar, as near and far edges of each side show it: an error that frames do not lower.
+"""Bias of T_camera_lidar due to labels, from near and far edges of each side; more frames do not reduce it.
 
-At the solution near and far edges of both sides should lie at their borders alike. Where they do not, some borders are
-not those of what the lidar sees: the roof above a car's window, the tree behind a hedge, the wheels below a sill. All
-scenes share that, so that neither their scatter nor halves of the day show it.
+At the solution, near and far edges of both sides should have the same offset from their label borders. If
+not, some borders belong to other objects than the lidar's edges: the roof above a car's window, the tree
+behind a hedge, the wheels below a sill. This is the same in all scenes, so neither their scatter nor halves
+of the day show it.
 """
 
 from __future__ import annotations
@@ -36,17 +37,17 @@ _OFFSET_SIGMA_PX = 4.0
 
 @dataclass(frozen=True)
 class SidesApart:
-    """How far near and far edges of both sides lie apart, at a solution."""
+    """Differences between the offsets of near and far edges of both sides, at a solution."""
 
     pitch_px: float  # of the label image; edges above and below a foreground
     yaw_px: float  # edges left and right of a foreground
     px_rad: float
 
     def biases(self, fixed: Bool[np.ndarray, " 8"]) -> Float[np.ndarray, "3 8"]:
-        """One sigma of what that leaves open in pitch and in yaw, with them in height and in x, and in roll.
+        """One sigma of the resulting bias of pitch and yaw, with height and x, and of roll.
 
-        Near edges hold the picture together, so that the camera turns as if about a point 10 m ahead. Coordinates as
-        `AlignmentState.changed` has them.
+        Near edges keep their position in the image, so the camera rotates as if about a point 10 m ahead.
+        Coordinates are those of `AlignmentState.changed`.
         """
         rows = np.zeros((3, 8))
         rows[2, 2] = SIDES_APART_SHARE * self.pitch_px * self.px_rad
@@ -89,7 +90,7 @@ def _apart_px(terms: Terms, state: AlignmentState, kernel: KernelSettings, sides
 
 
 def _offset_px(score: Float[np.ndarray, " S"], weight: float) -> float:
-    """Mean offset by a score that weighs as much as it does in the fit."""
+    """Mean offset by a score with the same weights as in the fit."""
     log_density = min(weight, 1.0) * score - 0.5 * (SHIFTS_PX / _OFFSET_SIGMA_PX) ** 2
     density = np.exp(log_density - log_density.max())
     return float(density @ SHIFTS_PX / density.sum())

@@ -6,9 +6,9 @@ offset by 20 to 30 ms. With the log's focal length and a fixed tz, edges determi
 milliseconds. It is therefore stepped through its valley, the pose is solved again at each step, and the
 uncertainty of focal length and tz is added to its sigma.
 
-The profile is of edges in sight at every possible offset (`Terms.seen_throughout`). With the others a fisheye
-on a highway was 110 to 160 ms off, at a sigma of 10: four metres ahead, the rails beside the car came into
-view and matched, as rails do everywhere.
+The profile uses edges that are in view at every possible offset (`Terms.seen_throughout`). With the others, a
+fisheye on a highway was 110 to 160 ms off, at a sigma of 10: four metres ahead, the rails at the side of the
+car came into view and matched, because rails match anywhere.
 
 Sources: profile likelihood: Murphy & van der Vaart 2000; parameters considered, not solved for: Schmidt 1966.
 """
@@ -98,7 +98,7 @@ def far_time_offset(
 ) -> tuple[float, float]:
     """Time offset within a second at which edges match far better than around it [s], at any distance.
 
-    Also returns its lead over the state's own in standard errors; 0 if it is the state's own.
+    Also returns its lead over the state's time offset in standard errors; 0 if both are equal.
     """
     some = terms.at_most(_FAR_EDGES, rng).of_kinds(edges=True, markings=False)
     speed_mps = float(np.sqrt(np.mean(np.sum(terms.velocity_lidar**2, axis=1))))
@@ -117,7 +117,7 @@ def far_time_offset(
 
 
 def _maximum(value: Float[np.ndarray, "S N"]) -> Float[np.ndarray, " S"]:
-    """Where each row is highest, in steps: the top of the parabola through the highest value and its neighbours."""
+    """Maximum of each row, in steps: the top of the parabola through the highest value and its neighbours."""
     k = np.argmax(value, axis=1)
     inner = np.clip(k, 1, value.shape[1] - 2)
     before, at, after = (value[np.arange(len(value)), inner + d] for d in (-1, 0, 1))
@@ -126,12 +126,12 @@ def _maximum(value: Float[np.ndarray, "S N"]) -> Float[np.ndarray, " S"]:
 
 
 def _frame_scores(scored: Scored, state: AlignmentState) -> Float[np.ndarray, " F"]:
-    """Score of each frame, mean over a ball in which it is rough, and its share of the prior.
+    """Score of each frame, averaged over a ball because it is rough, and its share of the prior.
 
-    By edges alone, if there are any. Markings run along the car's way and hardly determine the time: only
-    their number in sight depends on it, a slope that put three days of 16 rings 30 to 60 ms off, where edges
-    were 1 to 12 ms off (tuning days 110 to 121: RMS 23 ms by both, 4.3 by edges). Wide edges are left out
-    too, if there are others.
+    Only edges are used, if there are any. Markings run along the direction of travel and hardly determine the
+    time: only their number in view depends on it. This slope moved three days of 16 rings 30 to 60 ms off,
+    while edges were 1 to 12 ms off (tuning days 110 to 121: RMS 23 ms by both, 4.3 by edges). Wide edges are
+    left out too, if there are others.
     """
     terms = scored.terms
     if len(terms.edges.xyz_m) and scored.kernel.edge_weight > 0:

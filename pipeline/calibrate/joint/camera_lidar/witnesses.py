@@ -1,9 +1,10 @@
-"""Parts of camera-lidar's evidence against each other: pitch and yaw by each alone.
+"""Comparison of parts of camera-lidar's evidence: pitch and yaw from each part alone.
 
 The fit takes their mean, and its sigma is as small as if they agreed. If a surface of the cloud has no border
 in the labels (the sill of a car's window, whose nearest border is the roof), one kind of edge is biased by a
 degree; halves and held-out frames do not show it, because they share the bias. If only some cars have windows
-and no paint tells, the whole side follows the sills: only its low edges against its high ones show that.
+and there is no paint, the whole side follows the sills; only the difference between its low and its high
+edges shows that.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ _BOXES: Final = "boxes"
 
 @dataclass(frozen=True)
 class Witness:
-    """What one part of the evidence alone would turn the solution by."""
+    """Rotation of the solution by one part of the evidence alone."""
 
     name: str
     axis: int  # 0 pitch, 1 yaw: about the camera's x and y
@@ -61,12 +62,12 @@ class Witness:
 
     @property
     def sigma_rad(self) -> float:
-        """Of the offset."""
+        """Sigma of the offset."""
         return float(np.hypot(self.scatter_rad, self.floor_rad))
 
     @property
     def sentence(self) -> str:
-        """Who, by how much."""
+        """Sentence with the name of the part and its rotation."""
         return f"{self.name} by {np.degrees(self.offset_rad):+.2f} +- {np.degrees(self.sigma_rad):.2f} deg"
 
 
@@ -154,9 +155,9 @@ def disagreement(witnesses: Sequence[Witness]) -> list[FailedCheck]:
 
 
 def widening(witnesses: Sequence[Witness]) -> Float[np.ndarray, " 2"]:
-    """Sigma of pitch and of yaw [rad] to add: half of what two differ by, if more than two sigmas, else 0.
+    """Sigma of pitch and of yaw [rad] to add: half of a difference of more than two sigmas, else 0.
 
-    Boxes are coarse: they count from three sigmas on.
+    Boxes are coarse, so their difference must exceed three sigmas.
     """
     sigma = np.zeros(2)
     fine = [w for w in witnesses if w.name != _BOXES]
@@ -176,7 +177,7 @@ def witness_numbers(witnesses: Sequence[Witness]) -> dict[str, float]:
 
 
 def _contradictions(witnesses: Sequence[Witness], sigmas: float) -> list[tuple[Witness, Witness]]:
-    """Of each axis the two that differ most, if by more than so many sigmas and three of their floors."""
+    """The two parts that differ most in each axis, if by more than so many sigmas and three of their floors."""
     worst: dict[int, tuple[float, tuple[Witness, Witness]]] = {}
     for a, b in combinations(witnesses, 2):
         if _FIT in (a.name, b.name) and _BOXES not in (a.name, b.name):
@@ -201,8 +202,9 @@ def _maximum(
 ) -> tuple[float, float]:
     """Rotation at the highest score, and its scatter over resampled blocks [rad].
 
-    A maximum must lead over the fit's own place by a few nats. Without paint the score is flat, and the same
-    few points put its maximum 1 to 2 deg off in every resample (worlds whose lidar is blind to markings).
+    The score of a maximum must exceed that of the fit by a few nats. Without paint the score is flat, and the
+    same few points put its maximum 1 to 2 deg off in every resample (worlds whose lidar is blind to
+    markings).
     """
     names, index = np.unique(blocks, return_inverse=True)
     if len(names) < _FEWEST_BLOCKS:

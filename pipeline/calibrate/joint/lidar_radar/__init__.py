@@ -1,1 +1,1 @@
-"""Lidar-radar half of method `joint`: search, registration, what the day determines."""
+"""Lidar-radar half of method `joint`: search, registration, observability."""

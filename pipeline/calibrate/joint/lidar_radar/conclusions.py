@@ -1,4 +1,4 @@
-"""Conclusions about a lidar-radar solution beside the pose: its data, its assumptions, numbers for checks."""
+"""Conclusions about a lidar-radar solution other than the pose: its data, its assumptions, numbers for checks."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class ObservabilityAnalysis:
 
 
 def notes_of(analysis: ObservabilityAnalysis, *, has_elevation: bool) -> list[str]:
-    """What was not determined, and what was assumed."""
+    """Notes on undetermined unknowns and on assumptions."""
     fixed, linear = analysis.fixed, analysis.linear
     notes = []
     if fixed[:6].any():
@@ -53,10 +53,10 @@ def notes_of(analysis: ObservabilityAnalysis, *, has_elevation: bool) -> list[st
         )
     if linear.boxes < _FEWEST_BOXES:
         notes.append(
-            "no vehicle boxes with radar elevations: roll and pitch rest on the registration and the prior"
+            "no vehicle boxes with radar elevations: roll and pitch depend on the registration and the prior"
         )
     else:
-        notes.append("radar pitch assumes that returns lie at a constant angle (0 +- 1 deg) from box centres")
+        notes.append("radar pitch assumes that returns are at a constant angle (0 +- 1 deg) from box centres")
     if linear.travel_frames:
         notes.append(
             "radar pitch assumes that the car drives along its road, as the lidar sees it under the car"
@@ -74,8 +74,8 @@ def notes_of(analysis: ObservabilityAnalysis, *, has_elevation: bool) -> list[st
     if has_elevation:
         own_deg = float(np.degrees(RADAR_ELEVATION_BIAS_RAD))
         notes.append(
-            "pitch says where the radar's detections point: its mounting differs by the radar's own constant elevation"
-            f" error (0 +- {own_deg:.2f} deg)"
+            "pitch is the direction of the radar's detections: its mounting differs by the radar's own constant"
+            f" elevation error (0 +- {own_deg:.2f} deg)"
         )
     else:
         notes.append(
@@ -90,7 +90,7 @@ def notes_of(analysis: ObservabilityAnalysis, *, has_elevation: bool) -> list[st
 def diagnostics_of(
     analysis: ObservabilityAnalysis, ends: list[RadarState], halves: list[RadarState]
 ) -> dict[str, float]:
-    """Numbers of a solution, of the ends of its starts and of the day's halves; what is no number is left out."""
+    """Numbers of a solution, of the ends of its starts and of the day's halves; non-finite values are left out."""
     state, linear = analysis.state, analysis.linear
     half = change_between(halves[1].T_lidar_radar, halves[0].T_lidar_radar)
     apart = change_between(ends[-1].T_lidar_radar, ends[0].T_lidar_radar)

@@ -1,4 +1,4 @@
-"""How the static detections of a day are spread, and what elevation noise makes of roll, pitch and z then."""
+"""Distribution of a day's static detections, and the resulting effect of elevation noise on roll, pitch and z."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ class ElevationSpread:
     azimuth_rad: float
 
     def floor(self, noise_rad: float, spacing_rad: float) -> np.ndarray:
-        """Sigma of roll, pitch [rad] and z [m] that such elevation noise leaves to the registration."""
+        """Sigma of roll, pitch [rad] and z [m] of the registration due to this elevation noise."""
         angle = np.hypot(noise_rad**2 / self.elevation_rad, _RING_SHARE * spacing_rad)
         roll, z_m = _ROLL_FACTOR * angle / self.azimuth_rad, np.hypot(_Z_DISTANCE_M * angle, _Z_FLOOR_M)
         return np.array([roll, np.hypot(angle, _NOISE_SHARE * noise_rad), z_m])
 
 
 def beam_spacing(observations: Sequence[Observation]) -> float:
-    """Vertical spacing of the lidar's beams [rad], as its depth jumps between rings show it."""
+    """Vertical spacing of the lidar's beams [rad], from its depth jumps between rings."""
     gaps = [
         o.lidar_edge_gap_rad[(o.lidar_edge_side == EDGE_ABOVE) | (o.lidar_edge_side == EDGE_BELOW)]
         for o in observations

@@ -1,9 +1,9 @@
-"""Terms of lidar-radar that elevations and the car's way add to roll, pitch and z, each with what its frames err by.
+"""Terms for roll, pitch and z of lidar-radar from elevations and the direction of travel, with their errors.
 
 The registration's elevations contribute no more than the lidar's own beam spacing allows (points collapse
 onto the rings, repeatably and with the lowest residual); the camera's vehicle boxes determine roll, and pitch
 up to their constant. The direction of travel adds pitch: Doppler gives it in radar axes, the road in
-lidar axes. Displaced heights add pitch as the radar's height makes it.
+lidar axes. Displaced heights add pitch as a function of the radar's height.
 """
 
 from __future__ import annotations
@@ -148,8 +148,7 @@ def add_elevations(
 ) -> np.ndarray:
     """Roll, pitch and z from the registration's elevations as one measurement with covariance `H^-1 + floor^2`.
 
-    Floors and what is returned, where these elevations alone would move roll, pitch and z, are along the
-    radar's axes.
+    Floors and the returned correction of roll, pitch and z by these elevations alone are along the radar's axes.
     """
     at, shape = problem.frames.frame, (len(sums.g), len(ELEVATION_DOF), len(ELEVATION_DOF))
     block = np.ix_(np.arange(len(at)), ELEVATION_DOF, ELEVATION_DOF)
@@ -176,21 +175,21 @@ def _add_tilts(
     information: Float[np.ndarray, "F C C"] | None = None,
     of_day: Float[np.ndarray, "C C"] | None = None,
 ) -> None:
-    """Add a source's turns about x and y, and its other unknowns, as a measurement with covariance `H^-1 + floor`.
+    """Add a source's rotations about x and y, and its other unknowns, as a measurement with covariance `H^-1 + floor`.
 
-    What it takes for seen where it is turns it up by the share that is seen too low.
+    Detections measured too low rotate it upwards by their share (`seen_low`).
 
     Args:
         problem: the day.
         state: where the equations were linearised.
-        name: of the source.
-        columns: its unknowns, turns first.
+        name: name of the source.
+        columns: its unknowns, rotations first.
         H: EM's information of each frame, for steps.
         g: gradient.
-        floor: of what all frames err by alike.
-        sums: what it is added to.
-        information: what uncertain assignment leaves of H; None = all.
-        of_day: of the floor, what is another on every day; None = nothing.
+        floor: covariance of errors common to all frames.
+        sums: equations to which it is added.
+        information: H reduced for uncertain assignment; None = H.
+        of_day: part of the floor that differs from day to day; None = nothing.
     """
     axis = radar_tilt_axes(state.T_lidar_radar)[:, 1]
     J = added_share(axis, problem.seen_low.per_share_rad.get(name, 0.0), len(columns))
@@ -210,7 +209,7 @@ def _add_tilts(
 
 
 def turned(about_radar: np.ndarray, H: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Equations of a left twist as equations of (turn about the radar, shift); further unknowns stay."""
+    """Equations of a left twist as equations of (rotation about the radar, shift); further unknowns are unchanged."""
     M = np.eye(g.shape[-1])
     M[:6, :6] = about_radar
     return M.T @ H @ M, g @ M

@@ -1,9 +1,9 @@
 """Lidar-radar half of method `joint`: T_lidar_radar and the radar's time offset from a day of observations.
 
-What the day cannot determine keeps the prior: after the first solution, every unknown of the pose whose variance the
-day did not halve, and likewise the time offset, is fixed at the prior's value and sigma, the others are solved again,
-and what the fixed ones leave open is part of their covariance. A weakly determined unknown would otherwise follow any
-weak structure of the scene, by many sigmas of the prior.
+Unknowns that the day does not determine keep the prior. After the first solution, each unknown of the pose,
+and the time offset, is fixed at the prior's value and sigma unless the day halved its variance. The others
+are solved again, and their covariance includes the uncertainty of the fixed ones. Otherwise a weakly
+determined unknown would follow any weak structure of the scene, by many sigmas of the prior.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ _YAW, _ANY_RAD = 2, np.radians(20.0)
 
 @dataclass(frozen=True, eq=False)
 class _Camera:
-    """Camera-lidar's pose and covariance, which bring the camera's vehicle boxes in."""
+    """Pose and covariance of camera-lidar, needed to use the camera's vehicle boxes."""
 
     T_camera_lidar: np.ndarray | None
     covariance: np.ndarray | None
@@ -97,12 +97,13 @@ def estimate_lidar_radar(
 
     Args:
         observations: the day's frames.
-        prior: start, and weak information; it loses weight where the data contradict it by many sigmas, and decides
-            where they show little.
-        T_camera_lidar: brings the camera's boxes in; None leaves roll and pitch to the registration and the prior.
+        prior: start, and weak information. It loses weight if the data contradict it by many sigmas, and
+            dominates where the data have little information.
+        T_camera_lidar: needed to use the camera's boxes; without it, roll and pitch come from the
+            registration and the prior.
         config: search range, sigma of the time offset, resampling.
-        rng: picks detections and resamples.
-        covariance_camera_lidar: of T_camera_lidar; None = exact.
+        rng: selects detections and resamples.
+        covariance_camera_lidar: covariance of T_camera_lidar; None = exact.
 
     Raises:
         SolveError: too few frames with static detections and a lidar map.
@@ -145,7 +146,7 @@ def _problem(
     config: SolveConfig,
     rng: np.random.Generator,
 ) -> tuple[RadarProblem, dict[str, int]]:
-    """Usable frames and what they show, and the counts of rejected ones by reason."""
+    """The problem from usable frames, and counts of rejected frames by reason."""
     given, observations = len(observations), _consistent_with_odometry(observations)
     frames = registration_frames(observations, prior.T_lidar_radar, rng)
     found = frames.count
@@ -181,7 +182,7 @@ def _problem(
 def _parts(
     problem: RadarProblem, analysis: ObservabilityAnalysis, config: SolveConfig, rng: np.random.Generator
 ) -> DayParts | None:
-    """First and last part of the day, turned alone, compared in the turns that the day determines."""
+    """Rotations of the first and the last part of the day, compared in the axes that the day determines."""
     frames, start = problem.frames.frame, analysis.state
     about = replace(problem, prior=replace(problem.prior, T_lidar_radar=start.T_lidar_radar))
     fixed = analysis.fixed | np.isin(np.arange(len(analysis.fixed)), (3, 4, 5))
@@ -210,7 +211,7 @@ def _parts(
 
 
 def _start_of_part(part: RadarProblem, start: RadarState, unknowns: int) -> RadarState:
-    """The day's solution, or one turned in yaw that the part's frames prefer: a knock may be wide."""
+    """Start for a part: the day's solution, or a yaw rotation of it that fits better (after a large knock)."""
     turned = [start.moved(angle * (np.arange(unknowns) == _YAW)) for angle in (0.0, *_KNOCKS_RAD)]
     return min(turned, key=lambda state: float(comparison_cost(part, state).sum()))
 
@@ -220,8 +221,8 @@ def _with_way(
 ) -> tuple[RadarProblem, RadarState, tuple[Witness, ...]]:
     """The problem with direction of travel and displaced heights, the solution without them, and the pitch of each.
 
-    They are asked there, and the radar's sigmas are estimated there: a wrong way would draw the pose along, and the
-    registration would then take what contradicts it for noise.
+    Pitches and the radar's sigmas are computed at the solution without them. Otherwise, a wrong direction of
+    travel would also move the pose, and the registration would treat the discrepancy as noise.
     """
     state, linear = finish(problem, state, sharpen=True)
     about = problem.observations, state.T_lidar_radar, state.dt_s - problem.constant_gap_s
@@ -244,7 +245,7 @@ def _with_way(
 def _with_witnesses(
     analysis: ObservabilityAnalysis, witnesses: tuple[Witness, ...] | None, asked_at: RadarState
 ) -> ObservabilityAnalysis:
-    """The analysis with the variance of pitch increased where its sources contradict each other."""
+    """The analysis with an increased variance of pitch if its sources contradict each other."""
     if witnesses is None:
         return analysis
     axes = radar_tilt_axes(analysis.state.T_lidar_radar)
@@ -263,7 +264,7 @@ def _with_witnesses(
 def _usable_camera(
     T_camera_lidar: np.ndarray | None, covariance: np.ndarray | None, config: SolveConfig
 ) -> _Camera:
-    """The camera, unless `terms` leaves its boxes out or its own error would go into roll and pitch."""
+    """The camera; None if `terms` leaves its boxes out, or if its own error would affect roll and pitch."""
     unsure = covariance is not None and np.diag(covariance)[:3].max() > _CAMERA_SIGMA_RAD**2
     if unsure or "boxes" not in config.terms:
         return _Camera(None, covariance)
@@ -277,7 +278,7 @@ def _consistent_with_odometry(observations: Sequence[Observation]) -> list[Obser
 
 
 def _second_best(ends: list[RadarState], costs: list[np.ndarray]) -> RadarState:
-    """The end of another start whose cost is not clearly higher than the best one's; else the best one itself."""
+    """The end of another start if its cost is not clearly higher than the best one; else the best end."""
     best = int(np.argmin([c.mean() for c in costs]))
     for end, cost in zip(ends, costs, strict=True):
         worse = cost - costs[best]
@@ -351,7 +352,7 @@ def _analyse_observability(
 
 
 def _following_tilt(linear: Linear, fixed: Bool[np.ndarray, " P"]) -> Float[np.ndarray, "P P"]:
-    """How yaw, x, y, dt and range bias follow errors of roll, pitch and z, which their equations take as exact."""
+    """Dependence of yaw, x, y, dt and range bias on errors of roll, pitch, z, which are fixed in their equations."""
     H = np.zeros_like(linear.prior_information)
     H[:8, :8] = linear.registration.H[0].sum(0)
     follows = AZIMUTH_RANGE_DOF[~fixed[AZIMUTH_RANGE_DOF]]
@@ -361,7 +362,7 @@ def _following_tilt(linear: Linear, fixed: Bool[np.ndarray, " P"]) -> Float[np.n
 def _left_by(
     scatter: Float[np.ndarray, "P P"], curvature: Float[np.ndarray, "P P"], fixed: Bool[np.ndarray, " P"]
 ) -> Float[np.ndarray, "P P"]:
-    """Covariance of the free unknowns that a scatter of the total gradient leaves."""
+    """Covariance of the free unknowns from the scatter of the total gradient."""
     out, free = np.zeros_like(curvature), np.ix_(~fixed, ~fixed)
     follow = np.linalg.inv(curvature[free])
     out[free] = follow @ scatter[free] @ follow.T
@@ -372,7 +373,7 @@ def _observability(variance: np.ndarray, bias: np.ndarray, before: np.ndarray) -
     """Fraction of prior variance removed, bias floor included.
 
     Args:
-        variance: of the estimate, day and prior together, without bias.
+        variance: variance of the estimate, day and prior together, without bias.
         bias: squared bias floor of the day's information.
         before: variance of the prior.
     """
@@ -416,12 +417,12 @@ def _conclude(
 
 
 def _remaining_dt(linear: Linear, state: RadarState, fixed: np.ndarray) -> float:
-    """Ten times the step of dt that was still to come [s]: in a flat valley many small steps may follow."""
+    """Ten times the next step of dt [s], because many small steps may follow in a flat valley."""
     return float(_REMAINING_STEPS * last_step(linear, state, fixed)[DT])
 
 
 def _camera_share(camera: _Camera) -> np.ndarray:
-    """Covariance (2 2) of roll and pitch that the boxes bring in from the camera-lidar rotation."""
+    """Covariance (2 2) of roll and pitch due to the camera-lidar rotation, through the boxes."""
     if camera.covariance is None or camera.T_camera_lidar is None:
         return np.zeros((2, 2))
     R = camera.T_camera_lidar[:3, :3]

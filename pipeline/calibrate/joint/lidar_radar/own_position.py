@@ -1,13 +1,14 @@
-"""Where the day itself puts the radar along the ground, its prior left out: for an alarm, no estimate.
+"""Horizontal position of the radar from the day alone, without its prior; for an alarm, not an estimate.
 
-While a car drives, x shifts detections as the time offset does, so a day of few speeds leaves x at the prior.
-A prior half a metre wrong is then hidden: the time offset takes it up, .05 s of it, and azimuths follow by .2
-deg. Frames of other speeds contradict that all the same. So x, y and the time offset are solved again without
-the prior of position.
+While a car drives, x has the same effect on detections as the time offset, so a day of few speeds leaves x at
+the prior. A prior half a metre wrong is then hidden: the time offset compensates it by .05 s, and azimuths
+change by .2 deg. But frames of other speeds contradict this. So x, y and the time offset are solved again
+without the prior of position.
 
-That alone would accuse good days: where the car keeps one speed the three wander off along their valley, by
-.8 m on a simulated motorway, because the cost has a slope along the car's way that has nothing to do with
-time. A true optimum is a dip: the frames align better there than at the prior, and better than as far beyond.
+This alone would raise false alarms. If the car keeps one speed, the three unknowns move along their valley,
+by .8 m on a simulated motorway, because the cost has a slope along the direction of travel that is unrelated
+to time. A true optimum is a dip: the frames align better there than at the prior, and better than at the same
+distance beyond.
 """
 
 from __future__ import annotations

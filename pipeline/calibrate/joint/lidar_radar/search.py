@@ -34,7 +34,7 @@ _SCAN_STEP_RAD = np.radians(SCHEDULE.scan_step_deg)
 
 
 def scan(problem: RadarProblem, config: SolveConfig) -> list[RadarState]:
-    """The prior, and the best turn about the vertical that is not next to it, by the wide cost of a few frames."""
+    """The prior, and the best rotation about the vertical that is not next to it, by the wide cost of a few frames."""
     reach = np.radians(max(config.search_rotation_deg, SCHEDULE.scan_least_deg)) * SCHEDULE.scan_reach
     turns = np.arange(-np.ceil(reach / _SCAN_STEP_RAD), np.ceil(reach / _SCAN_STEP_RAD) + 1) * _SCAN_STEP_RAD
     few = np.unique(np.linspace(0, problem.frames.count - 1, SCHEDULE.scan_frames).astype(int))
@@ -82,7 +82,7 @@ def finish(
     fixed: Bool[np.ndarray, " P"] = NONE_FIXED,
     sharpen: bool = False,
 ) -> tuple[RadarState, Linear]:
-    """All detections: steps until convergence, and the equations there.
+    """Steps with all detections until convergence, and the equations there.
 
     Unknowns in `fixed` keep the prior's value; with `sharpen` the radar's sigmas follow the residuals.
     """
@@ -112,7 +112,7 @@ def _sharpened(linear: Linear, state: RadarState) -> RadarState:
 
 @dataclass(frozen=True)
 class _Valley:
-    """What past steps showed of the cost's curvature along dt, all other unknowns following."""
+    """Curvature of the cost along dt from past steps, with all other unknowns at their optimum."""
 
     dt_s: float | None = None
     gradient: float = 0.0
@@ -140,7 +140,7 @@ def _next_step(
     """EM's step (`em_share` 1), or nearly Newton's with the information that soft assignment leaves (near 0).
 
     On days of one speed dt, x and the range bias share a valley that is far flatter than either predicts:
-    along dt, with the others following, the step is the secant's.
+    along dt, with the others at their optimum, the step is the secant's.
     """
     H = em_share * linear.H.sum(0) + (1 - em_share) * linear.information.sum(0) + linear.prior_information
     g = linear.g.sum(0) + linear.prior_gradient
@@ -158,7 +158,7 @@ def _next_step(
 
 
 def last_step(linear: Linear, state: RadarState, fixed: Bool[np.ndarray, " P"]) -> Float[np.ndarray, " P"]:
-    """The step that soft assignment would still take."""
+    """The remaining step with soft assignment."""
     return _next_step(linear, state, _Valley(), SCHEDULE.final_em_share, fixed)[0]
 
 

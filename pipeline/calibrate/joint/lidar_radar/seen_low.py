@@ -1,11 +1,13 @@
-"""Detections that are seen too low, by an unknown share of their height: the common error of the sources of pitch.
+"""A common error of all sources of pitch: detections measured too low, by an unknown share of their height.
 
-A radar sees things between where they are and their mirror images in the road. Who takes them for seen where they are
-turns the radar up, all of them at once: the registration and boxes by the share times the height of what they see over
-its range, the car's way by the share times what it does to the velocity. So the share is one unknown of all of them.
+A radar measures an object between its true position and its mirror image in the road. If this is ignored, all
+sources rotate the estimated radar upwards at once. The registration and the vehicle boxes do so by the share
+times the mean ratio of height to range of the objects they use; the Doppler velocity does so by the share
+times its own sensitivity. Therefore the share is one unknown, common to all of them.
 
-Nothing is seen too high, so its prior is half of a normal distribution. One sigma of that is the share of detections
-below the road, where nothing stands, without those that noise, whole images and strays put there (`heights`).
+Nothing is measured too high, so the prior of the share is a half-normal distribution. Its sigma is the
+fraction of detections below the road, without those that noise, full mirror images and strays explain
+(`heights`).
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ _LEAST_SHARE = 1e-3
 
 @dataclass(frozen=True)
 class SeenLow:
-    """Expected share and its sigma before a day's elevations are compared, and its effect on each source of pitch."""
+    """Prior mean and sigma of the share, and its effect on each source of pitch."""
 
     mean: float = 0.0
     sigma: float = _LEAST_SHARE
@@ -37,14 +39,14 @@ class SeenLow:
     per_share_rad: Mapping[str, float] = field(default_factory=dict)
 
     def expected(self, witness: Witness) -> Witness:
-        """The source's pitch if the share has its expected value."""
+        """The source's pitch, corrected for the prior mean of the share."""
         per_rad = self.per_share_rad.get(witness.name, 0.0)
         sigma_rad = float(np.hypot(witness.sigma_rad, per_rad * self.sigma))
         return replace(witness, offset_rad=witness.offset_rad + per_rad * self.mean, sigma_rad=sigma_rad)
 
 
 def seen_low_of(travel: TravelDirections | None, heights: Heights | None) -> SeenLow:
-    """The share by what the moving frames show; none where there are none."""
+    """The prior of the share, from the moving frames; no share without moving frames."""
     if travel is None or not travel.count:
         return SeenLow()
     below = float(np.mean(travel.below)) if heights is None else heights.seen_low(travel.below)
@@ -57,12 +59,12 @@ def seen_low_of(travel: TravelDirections | None, heights: Heights | None) -> See
 def added_share(
     axis: Float[np.ndarray, " 2"], per_share_rad: float, unknowns: int
 ) -> Float[np.ndarray, "P Q"]:
-    """Derivative of a source's unknowns, of which the first two are turns, by themselves and by the share.
+    """Derivative of a source's unknowns with respect to themselves and the share; the first two are rotations.
 
     Args:
-        axis: of the radar's pitch.
-        per_share_rad: turn upwards of this source per share.
-        unknowns: of the source.
+        axis: axis of the radar's pitch.
+        per_share_rad: rotation upwards that this source gives per unit of the share.
+        unknowns: number of unknowns of the source.
     """
     J = np.eye(unknowns, unknowns + 1)
     J[:2, -1] = -per_share_rad * axis

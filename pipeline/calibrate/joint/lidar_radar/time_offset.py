@@ -1,9 +1,9 @@
 """The radar's time offset among many: the one at which the registration's cost dips, not its lowest value.
 
-Along the car's way the cost has a slope that is unrelated to time: a cloud has more points near the car, so
-detections moved towards it meet more of them. On a simulated highway (30 m/s, 16 rings) the cost fell by half
-from 0 to -130 ms, and only a dip of three steps marked the true 20 ms. The criterion is therefore the cost
-below that of its surroundings.
+Along the direction of travel the cost has a slope that is unrelated to time: a cloud has more points near the
+car, so detections moved towards the car match more of them. On a simulated highway (30 m/s, 16 rings) the
+cost fell by half from 0 to -130 ms, and only a dip of three steps marked the true 20 ms. The criterion is
+therefore the cost below that of its surroundings.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def far_time_offset(problem: RadarProblem, state: RadarState) -> dict[str, float
 
 
 def _own_cost(problem: RadarProblem, state: RadarState) -> Float[np.ndarray, " F"]:
-    """Cost of each frame at the radar's own sigmas: of few detections, for it only confirms."""
+    """Cost of each frame at the radar's own sigmas, from few detections, because it is used for confirmation only."""
     sigma = np.maximum(state.sigma, 0.5 * REGISTRATION_COMPARISON_SIGMA)  # dips as wide as steps
     T, dt_s = state.T_lidar_radar, state.dt_s
     return registration_cost(problem.frames, T, dt_s, sigma, OUTLIER_DENSITY, _OWN_STRIDE, state.range_bias_m)
@@ -116,6 +116,6 @@ def comparison_cost(problem: RadarProblem, state: RadarState) -> Float[np.ndarra
 
 
 def _step_s(frames: RegistrationFrames, step_m: float) -> float:
-    """Step of time in which the car drives so far."""
+    """Step of time in which the car drives the given distance."""
     speed_mps = float(np.sqrt(np.mean(np.sum(frames.velocity_mps**2, axis=1))))
     return step_m / max(speed_mps, SCHEDULE.least_scan_speed_mps)

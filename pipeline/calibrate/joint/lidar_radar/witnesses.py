@@ -1,4 +1,4 @@
-"""Independent sources of radar pitch: the pitch of each alone, and a wider sigma where they contradict each other."""
+"""Independent sources of radar pitch: the pitch from each alone, and a larger sigma if they are inconsistent."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _SINGULAR = 1e-9
 
 @dataclass(frozen=True)
 class Witness:
-    """Pitch by one source alone, with all other unknowns at the solution."""
+    """Pitch from one source alone, with all other unknowns at the solution."""
 
     name: str
     offset_rad: float  # from the solution to the pitch by this source alone
@@ -25,7 +25,7 @@ class Witness:
 
 @dataclass(frozen=True)
 class Contradiction:
-    """Witnesses are farther apart than their sigmas allow."""
+    """Sources of pitch that differ by more than their sigmas allow."""
 
     factor: float  # to add to their combined sigma of pitch
     sentence: str
@@ -48,10 +48,10 @@ def own_equations(
 
 
 def doubted(witnesses: Sequence[Witness]) -> dict[str, float]:
-    """Sigmas [rad] to add to sources of pitch that displaced detections bias: those that are seen too low.
+    """Sigmas [rad] to add to sources of pitch that are biased by detections measured too low.
 
-    Such sources turn the radar up. `heights` models displaced detections: a source that turns it further up
-    than both sigmas allow is wrong by as much.
+    Such detections rotate the estimated radar upwards. `heights` models them. If another source gives a
+    higher pitch than both sigmas allow, its difference from `heights` is taken as its error.
     """
     right = next((w for w in witnesses if w.name == "heights"), None)
     if right is None:
@@ -62,7 +62,7 @@ def doubted(witnesses: Sequence[Witness]) -> dict[str, float]:
 
 
 def contradiction(witnesses: Sequence[Witness]) -> Contradiction | None:
-    """Sources that contradict the mean of the others, and the factor on pitch's sigma; None if all agree.
+    """Sources that are inconsistent with the mean of the others, and the factor on pitch's sigma; None if all agree.
 
     The factor is the square root of chi-squared per degree of freedom, at least one.
 
@@ -84,7 +84,7 @@ def contradiction(witnesses: Sequence[Witness]) -> Contradiction | None:
 
 
 def own_numbers(witnesses: Sequence[Witness]) -> dict[str, float]:
-    """Offset and sigma of each source, for a record's diagnostics."""
+    """Offset and sigma of each source, for the diagnostics of a record."""
     numbers: dict[str, float] = {}
     for w in witnesses:
         numbers |= {

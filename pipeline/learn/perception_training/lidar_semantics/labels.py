@@ -1,4 +1,4 @@
-"""Labels of lidar points, projected from the camera's semantics: weak, because calibration and semantics err.
+"""Labels of lidar points from the camera's semantics; they are weak, due to errors of calibration and semantics.
 
 A point takes the class of its pixel if all pixels around agree: near boundaries, a small error of the
 calibration or the distance between the sensors would give it the neighbour's class. Points hidden from the
@@ -78,7 +78,7 @@ def project_labels(
 
 
 def standing_points(xyz_m: Float32[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
-    """Points of things that stand up: others of the same direction and range are higher or lower (lidar frame)."""
+    """Points of upright objects: other points of the same direction and range are higher or lower (lidar frame)."""
     azimuth = np.floor(np.arctan2(xyz_m[:, 1], xyz_m[:, 0]) / _CELL_RAD).astype(np.int64)
     ring = np.floor(np.hypot(xyz_m[:, 0], xyz_m[:, 1]) / _CELL_M).astype(np.int64)
     _, cell = np.unique(azimuth * 100_000 + ring, return_inverse=True)

@@ -20,9 +20,9 @@ __all__ = ["LIMITS", "NAME", "SweepNetwork", "build_sweep_network", "export_swee
 NAME = "lidar_semantics"
 PURPOSE = "classes of lidar points (paper, section 4.2): lidar.semantics of a rig"
 LIMITS = (
-    "Learned from the camera's classes through a calibration: it is wrong where either is.",
-    "Thin things are taught by their middles only; what the camera never saw, by nothing.",
-    "Knows no more lidars, roads and weathers than its samples show; remission is taken as these lidars log it.",
+    "Learned from the camera's classes through a calibration, with the errors of both.",
+    "Thin objects were learned from their middles only; objects outside the camera's view were not learned.",
+    "Valid for the lidars, roads and weather of its samples only; remission must be logged as by these lidars.",
 )
 _CHANNELS = 5
 _DILATIONS = ((1, 1), (1, 2), (2, 4), (1, 1))  # rows, columns

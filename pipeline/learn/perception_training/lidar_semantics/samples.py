@@ -39,7 +39,7 @@ _EDGE_PX = 8  # beyond the labels: what their pixels' neighbourhoods show
 
 @dataclass(frozen=True)
 class SweepLayout:
-    """Geometry of the images, as in the model's manifest; the columns go all the way round."""
+    """Geometry of the images, as in the model's manifest; the columns cover 360 deg."""
 
     rows: int
     columns: int

@@ -53,12 +53,12 @@ def train_sweeps(
     time_limit_s: float | None = None,
     progress: Progress = silent,
 ) -> tuple[SweepNetwork, TrainResult]:
-    """Train, or go on with the run in `out`, until it is finished, the time is up or a signal asks to stop.
+    """Train, or continue the run in `out`, until it is finished, the time is up or a stop signal arrives.
 
     Raises:
         ContractError: no labels on one side, or other samples than the run began with.
         ConfigError: the run was begun with another configuration.
-        DivergedError: the loss is no number or has grown too far.
+        DivergedError: the loss is not finite or has grown too much.
     """
     for side, name in ((train, "to learn from"), (held_out, "held out")):
         if not np.any(side.label != UNLABELLED):
@@ -78,7 +78,7 @@ def train_sweeps(
 
 
 def held_out_scores(network: SweepNetwork, images: SweepImages, normal: Normal) -> dict[str, float]:
-    """Share of labelled pixels of the right kind, and IoU of ground and of each labelled kind."""
+    """Share of labelled pixels with the right kind, and IoU of ground and of each labelled kind."""
     with torch.no_grad():
         found = np.concatenate(
             [
@@ -91,7 +91,7 @@ def held_out_scores(network: SweepNetwork, images: SweepImages, normal: Normal) 
 
 
 def kind_scores(found: UInt8[np.ndarray, " N"], wanted: UInt8[np.ndarray, " N"]) -> dict[str, float]:
-    """Accuracy of kinds, IoU of ground and of each kind that is wanted anywhere."""
+    """Accuracy of kinds, IoU of ground and of each kind that occurs in the labels."""
     scores = {"accuracy": float(np.mean(found == wanted))}
     sets = {"ground": GROUND} | {KINDS[k]: (k,) for k in range(1, len(KINDS))}
     for name, kinds in sets.items():
@@ -113,9 +113,9 @@ def _loss(
 
 
 def _varied(batch: SweepImages, rng: np.random.Generator) -> tuple[np.ndarray, Int[np.ndarray, "N H W"]]:
-    """Each sweep turned about the vertical, mirrored or not, brighter or darker.
+    """Each sweep rotated about the vertical, possibly mirrored, brighter or darker.
 
-    Labels exist only where the camera looks; turned sweeps teach objects on all sides.
+    Labels exist only in the camera's view; with rotated sweeps, objects on all sides are learned.
     """
     channels, label = batch.channels.astype(np.float32), batch.label.astype(np.int64)
     for i in range(len(batch)):

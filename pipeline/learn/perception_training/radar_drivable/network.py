@@ -1,4 +1,4 @@
-"""The network: convolutions over the polar grid that see far along a direction, and little to its sides; its export."""
+"""The network and its export: convolutions over the polar grid, long in range and narrow in azimuth."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ __all__ = ["LIMITS", "NAME", "DrivableNetwork", "build_drivable_network", "expor
 NAME = "radar_drivable"
 PURPOSE = "drivable area of a radar's scan (paper, section 4.2): radar.drivable of a rig"
 LIMITS = (
-    "Learned from the lidar's drivable ground through each day's prior: it is wrong where lidar and prior are.",
-    "Knows no more radars, roads and weathers than its samples show.",
-    "Cells that no lidar saw taught nothing: free ranges far out are extrapolated.",
+    "Learned from the lidar's drivable ground through each day's prior, with the errors of both.",
+    "Valid for the radars, roads and weather of its samples only.",
+    "Cells without lidar returns were not used in training: large free ranges are extrapolated.",
 )
 _DILATIONS = ((1, 1), (1, 2), (2, 4), (2, 8), (1, 1))  # directions, ranges
 
@@ -44,7 +44,7 @@ class DrivableNetwork(nn.Module):
 
 
 def build_drivable_network(width: int, seed: int) -> DrivableNetwork:
-    """Fresh weights; the caller's random state stays as it was."""
+    """New weights; the caller's random state is not changed."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return DrivableNetwork(width)
