@@ -38,15 +38,16 @@ def test_the_page_of_a_day_shows_both_with_both_sigmas(lake, tmp_path):
     commit_records(lake, RADAR_ALIGNMENTS, [ROW])
     page = write_day_page(lake, DAY, FLEET, tmp_path / "day.html").read_text()
     for words in (
-        "+0.312 ± 0.050 deg", "+0.280 ± 0.060 deg (lidar-radar)", "-0.200 deg (no sigma stated)",
-        "-0.500 ± 0.300 deg (lidar-radar)", "+0.300 deg, at 12:01", "300, 12:00 to 13:00 UTC",
+        "Alignment stated by radars", "+0.312 ± 0.050 deg", "+0.280 ± 0.060 deg (lidar-radar)",
+        "-0.200 deg (no sigma stated)", "-0.500 ± 0.300 deg (lidar-radar)", "+0.300 deg, at 12:01",
+        "300, 12:00 to 13:00 UTC",
     ):  # fmt: skip
         assert words in page, words
 
 
 def test_a_day_without_such_messages_has_no_such_table(lake, tmp_path):
     page = write_day_page(lake, DAY, FLEET, tmp_path / "day.html").read_text()
-    assert "of their own alignment" not in page
+    assert "Alignment stated by radars" not in page
 
 
 def test_show_prints_a_line_for_each_axis_and_the_current_row_alone_where_asked(lake, capsys):
