@@ -141,7 +141,7 @@ def test_a_day_of_one_scene_certifies_nothing_and_says_what_to_drive(day):
         (check,) = scene_failures([standing[i] for i in fit])
         assert check.fault == "few_scenes"
         assert "1 different scene," in check.sentence
-        assert any("drive on" in what for what in chosen.missing[pair])
+        assert any("drive some 100 m further" in what for what in chosen.missing[pair])
     assert scene_failures(day) == []
 
 
