@@ -28,6 +28,7 @@ __all__ = ["Counted", "DaysOfLines", "Drawing", "Key"]
 Key = tuple[str, Edge]  # vehicle, and edge or pose
 
 _AT_A_TIME = 7  # days of a fleet that are in memory together
+_AT_A_TIME_AGAIN = 28  # of which few have new records
 _FEW_VEHICLES = 300  # of which all days are
 _CLOCKS_DIFFER = dt.timedelta(hours=24)  # of machines that commit records, as for all record tables
 
@@ -166,7 +167,8 @@ class DaysOfLines:
         counted.changed_line = {v: line for v, line in before.items() if self.line_of(v) != line}
         known = frozenset(counted.place)
         # Days after the last window's may have been recorded before it was read, as after an audit of an earlier one.
-        spans: list[tuple[str, str, str | None]] = [(first, min(day, last), since)] if since else []
+        again = _spans(first, min(day, last), _AT_A_TIME_AGAIN) if since else ()
+        spans: list[tuple[str, str, str | None]] = [(*span, since) for span in again]
         spans += [(*week, None) for week in _spans(max(first, days_after(day, 1)) if day else first, last)]
         for begin, end, asserted_after in spans:
             for new in self._read(begin, end, asserted_after=asserted_after):
@@ -183,8 +185,8 @@ class DaysOfLines:
             for part in self._read(*span, among=vehicles):
                 self._add(part, counted, among=anew)
         counted.read_until = until
-        again = _before(until) or ""
-        counted.recent = [{d: of for d, of in own.items() if of[0] >= again} for own in counted.recent]
+        kept = _before(until) or ""
+        counted.recent = [{d: of for d, of in own.items() if of[0] >= kept} for own in counted.recent]
         return counted
 
     def _note_other_releases(self, read: LineRecords, counted: Counted) -> None:
