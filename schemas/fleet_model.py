@@ -176,7 +176,7 @@ class LineAnswer(Posed):
         "<f8", (6, 6), "covariance of that day's estimate alone, left perturbation [rad, m]", default=None
     )
     sums: np.ndarray | None = array(
-        "<f4", (5, 27),
+        "<f8", (5, 27),
         "sums over days for the next night: information (lower triangle) and pull of all days, of the last days, of "
         "the last day; common covariance and change from the drawing to the prior; covariance of the prior",
         default=None,

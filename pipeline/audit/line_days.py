@@ -184,6 +184,10 @@ class DaysOfLines:
         for span in _spans(first, last, at_a_time) if vehicles else ():
             for part in self._read(*span, among=vehicles):
                 self._add(part, counted, among=anew)
+        # As the next night reads them, so that it has the same answers, to the last bit, if there is nothing new.
+        sums = counted.sums
+        days, when = (sums.days, sums.recent_days), (sums.first, sums.last, sums.away)
+        counted.sums = unpacked(packed(sums), np.stack(days, axis=1), np.stack(when, axis=1))
         counted.read_until = until
         kept = _before(until) or ""
         counted.recent = [{d: of for d, of in own.items() if of[0] >= kept} for own in counted.recent]

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Float, Int
 
 from pipeline.fleet_model.evidence import shifts_in_sigmas
 from pipeline.geometry.changes import change_between, change_covariance
@@ -206,8 +206,8 @@ class DaySums:
 _AT = np.tril_indices(6)
 
 
-def packed(sums: DaySums) -> Float32[np.ndarray, "N 5 27"]:
-    """Matrices and vectors of sums in a few hundred bytes a vehicle."""
+def packed(sums: DaySums) -> Float[np.ndarray, "N 5 27"]:
+    """Matrices and vectors of sums in a thousand bytes a vehicle."""
     pairs = (
         (sums.information, sums.pull),
         (sums.recent_information, sums.recent_pull),
@@ -215,11 +215,11 @@ def packed(sums: DaySums) -> Float32[np.ndarray, "N 5 27"]:
         (sums.common, sums.own_prior),
         (sums.prior, np.zeros_like(sums.own_prior)),
     )
-    return np.stack([np.concatenate([m[:, *_AT], v], axis=1) for m, v in pairs], axis=1).astype(np.float32)
+    return np.stack([np.concatenate([m[:, *_AT], v], axis=1) for m, v in pairs], axis=1)
 
 
 def unpacked(
-    values: Float32[np.ndarray, "N 5 27"],
+    values: Float[np.ndarray, "N 5 27"],
     days: Float[np.ndarray, "N 2"],
     when: Int[np.ndarray, "N 3"],
 ) -> DaySums:

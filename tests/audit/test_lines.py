@@ -134,6 +134,14 @@ def test_a_night_that_adds_its_day_counts_what_all_days_at_once_do(tmp_path, is_
         )  # fmt: skip
 
 
+def test_a_night_without_anything_new_has_the_same_rows_to_the_last_bit(tmp_path):
+    records = stamped(line_records(MadeLine(8, 3, seed=42)))
+    lake, fleet = Lake.at(tmp_path), fleet_of()
+    _, first = at_once(lake, records, fleet)
+    _, again = lines(lake, fleet)
+    assert {k: a.work_key for k, a in first.items()} == {k: a.work_key for k, a in again.items()}
+
+
 def test_a_vehicle_that_one_night_did_not_know_counts_with_all_of_its_days(tmp_path):
     line, fleet = MadeLine(8, 5, seed=34), fleet_of()
     records = stamped(line_records(line))
