@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -293,7 +294,7 @@ def _answer_columns(
             for of in (answers.covariance, alone_covariance)
         )
         standing = replace(standing, surer=np.asarray((sigma <= _NO_SURER * sigma_alone).all(axis=1)))
-        shared = standing.shared()[:, None]
+        shared = standing.shared[:, None]
         change = np.where(shared, answers.change, alone)
         covariance = np.where(shared[:, None], answers.covariance, alone_covariance)
         day = with_line(found.model, of_day, sums.common, owns)
@@ -341,6 +342,7 @@ class _Standing:
     away: np.ndarray
     surer: Bool[np.ndarray, " N"]
 
+    @cached_property
     def shared(self) -> Bool[np.ndarray, " N"]:
         """Vehicles whose answer the line has a part in."""
         if self.found.status != "GREEN" or self.found.answers is None:
@@ -357,9 +359,10 @@ class _Standing:
         told = [found.reason, f"{distance:.1f} sigmas from its line along {axis}" if differs else ""]
         status = "alone"
         if found.status == "GREEN":
-            status = "shared" if self.shared()[k] else "outside"
+            status = "shared" if self.shared[k] else "outside"
             if self.away[k]:
-                told.append(f"its last {self.away[k]} days lie elsewhere, and are left out of its answer")
+                days = "its last day lies" if self.away[k] == 1 else f"its last {self.away[k]} days lie"
+                told.append(f"left out of its answer: {days} far from the others")
             elif not self.surer[k]:
                 told.append("with its line it would be much less sure")
         return {

@@ -162,7 +162,7 @@ def test_a_vehicle_whose_last_day_lies_elsewhere_answers_as_alone_and_says_so(tm
     _, answers = at_once(lake, line_records(line), fleet)
     answer = answers["car-0007", "lidar_radar"]
     assert (answer.status, answer.away) == ("outside", 1)
-    assert "its last 1 days lie elsewhere" in answer.reason
+    assert "left out of its answer: its last day lies far from the others" in answer.reason
     STATE.run(Task(fleet, lake, Window()))
     states = {r.vehicle: r for r in read_last(lake, STATES, StateRow, "joint")}
     assert (states["car-0007"].loads, states["car-0007"].status) == ("alone", "none")
