@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import pyarrow.compute as pc
 from jaxtyping import Float, Int
 
 from pipeline.audit.days import DOFS
@@ -15,21 +16,24 @@ from pipeline.audit.estimates import day_name
 from pipeline.audit.line_records import Asked, LineRecords, read_line_records, release_of
 from pipeline.fleet_model.sums import DaySums, day_evidence, packed, unpacked
 from pipeline.geometry.changes import change_between, changed
-from pipeline.rig.edges import line_edge
+from pipeline.rig.edges import line_edges
 from pipeline.rig.graph import Edge
+from pipeline.store.columns import matrices, ordinals
 from pipeline.store.partitions import Lake, days_after
-from pipeline.store.records import first_day, read_last
+from pipeline.store.records import first_day, read_last_columns
 from schemas.calibrations import CALIBRATIONS
-from schemas.fleet_model import LINE_ANSWERS, LineAnswer
+from schemas.fleet_model import LINE_ANSWERS
 from schemas.versions import CODE_VERSION
 
 __all__ = ["Counted", "DaysOfLines", "Drawing", "Key"]
 
 Key = tuple[str, Edge]  # vehicle, and edge or pose
 
-_AT_A_TIME = 7  # days of a fleet that are in memory together
-_AT_A_TIME_AGAIN = 28  # of which few have new records
-_FEW_VEHICLES = 300  # of which all days are
+_OF_ANSWERS = (
+    *("vehicle", "day", "line", "pair", "kinds", "parent_frame", "child_frame", "code_version"),
+    *("sums", "days", "recent_days", "first_day", "last_day", "away", "restart", "recent_keys", "read_until"),
+)
+_IN_ORDER = [(name, "ascending") for name in ("vehicle", "pair", "parent_frame", "child_frame")]
 _CLOCKS_DIFFER = dt.timedelta(hours=24)  # of machines that commit records, as for all record tables
 
 
@@ -68,22 +72,26 @@ class Counted:
     @classmethod
     def read(cls, lake: Lake, method: str) -> Counted:
         """What the last night of this release counted; empty on its first."""
-        rows = [r for r in read_last(lake, LINE_ANSWERS, LineAnswer, method) if r.sums is not None]
-        if not rows or release_of(rows[0].code_version) != release_of(CODE_VERSION):
+        table = read_last_columns(lake, LINE_ANSWERS, method, _OF_ANSWERS)
+        rows = None if table is None else table.filter(pc.is_valid(table["sums"])).sort_by(_IN_ORDER)
+        if (
+            rows is None
+            or not len(rows)
+            or release_of(rows["code_version"][0].as_py()) != release_of(CODE_VERSION)
+        ):
             return cls()
-        place = {(r.vehicle, line_edge(r)): k for k, r in enumerate(rows)}
-        when = np.array([[_ordinal(r.first_day), _ordinal(r.last_day), r.away] for r in rows], np.int64)
-        days = np.array([[r.days, r.recent_days] for r in rows])
-        sums = unpacked(np.stack([np.asarray(r.sums) for r in rows]), days, when)
-        until = max(r.read_until for r in rows)
+        vehicles, edges = rows["vehicle"].to_pylist(), line_edges(rows)
+        place = {key: k for k, key in enumerate(zip(vehicles, edges, strict=True))}
+        when = [ordinals(rows["first_day"]), ordinals(rows["last_day"]), rows["away"].to_numpy()]
+        days = np.stack([rows[name].to_numpy() for name in ("days", "recent_days")], axis=1)
         return cls(
             place,
-            sums,
-            [r.line for r in rows],
-            [r.restart for r in rows],
-            [_recent_of(r.recent_keys) for r in rows],
-            until,
-            rows[0].day,
+            unpacked(matrices(rows["sums"], (5, 27)), days, np.stack(when, axis=1)),
+            rows["line"].to_pylist(),
+            rows["restart"].to_pylist(),
+            [_recent_of(texts) for texts in rows["recent_keys"].to_pylist()],
+            pc.max(rows["read_until"]).as_py(),
+            rows["day"][0].as_py(),
         )
 
     def columns(self, rows: Int[np.ndarray, " R"]) -> list[dict[str, Any]]:
@@ -167,9 +175,8 @@ class DaysOfLines:
         counted.changed_line = {v: line for v, line in before.items() if self.line_of(v) != line}
         known = frozenset(counted.place)
         # Days after the last window's may have been recorded before it was read, as after an audit of an earlier one.
-        again = _spans(first, min(day, last), _AT_A_TIME_AGAIN) if since else ()
-        spans: list[tuple[str, str, str | None]] = [(*span, since) for span in again]
-        spans += [(*week, None) for week in _spans(max(first, days_after(day, 1)) if day else first, last)]
+        spans: list[tuple[str, str, str | None]] = [(first, min(day, last), since)] if since else []
+        spans.append((max(first, days_after(day, 1)) if day else first, last, None))
         for begin, end, asserted_after in spans:
             for new in self._read(begin, end, asserted_after=asserted_after):
                 until = max([until, *new.asserted])
@@ -180,10 +187,8 @@ class DaysOfLines:
                 self._add(new, counted, leave=anew)
         counted.forget(anew)
         vehicles = {vehicle for vehicle, _ in anew}
-        at_a_time = _AT_A_TIME if len(vehicles) > _FEW_VEHICLES else None
-        for span in _spans(first, last, at_a_time) if vehicles else ():
-            for part in self._read(*span, among=vehicles):
-                self._add(part, counted, among=anew)
+        for part in self._read(first, last, among=vehicles) if vehicles else ():
+            self._add(part, counted, among=anew)
         # As the next night reads them, so that it has the same answers, to the last bit, if there is nothing new.
         sums = counted.sums
         days, when = (sums.days, sums.recent_days), (sums.first, sums.last, sums.away)
@@ -296,10 +301,3 @@ def _before(stamp: str) -> str | None:
         return None
     moment = dt.datetime.fromisoformat(stamp) - _CLOCKS_DIFFER
     return moment.isoformat(timespec="microseconds").replace("+00:00", "Z")
-
-
-def _spans(first: str, last: str, days: int | None = _AT_A_TIME) -> Iterator[tuple[str, str]]:
-    while first <= last:
-        end = last if days is None else min(days_after(first, days - 1), last)
-        yield first, end
-        first = days_after(end, 1)

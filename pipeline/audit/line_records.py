@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,8 +16,8 @@ from pipeline.rig.edges import edge_order, edges_of_rows
 from pipeline.rig.graph import Edge, RigPose, Sensor, is_one_of_each
 from pipeline.store.columns import matrices
 from pipeline.store.current import current_rows
-from pipeline.store.partitions import Lake
-from pipeline.store.records import read_columns
+from pipeline.store.partitions import Lake, days_after
+from pipeline.store.records import count_of_days, read_columns
 from schemas.calibrations import CALIBRATIONS
 from schemas.columns import TableSchema
 from schemas.poses import POSES
@@ -29,6 +29,8 @@ _PRIOR = tuple(f"prior_{n}" for n in ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "t
 _UNSURE = ("diagnostics.unsure_only", "diagnostics.few_only")
 _ROUNDING = 1e-3  # of a quaternion's length
 _LEAST = 1e-9  # eigenvalue of a correlation matrix: with less a covariance knows a direction exactly
+_AT_A_TIME = 10_000  # records in memory together: they take 12 kB each while they are read
+_COUNTED_DAYS = 28  # days whose records are counted together
 _OF_POSES = {c.name for c in POSES.columns}
 
 
@@ -73,21 +75,70 @@ def release_of(version: str) -> str:
 
 
 def read_line_records(lake: Lake, first: str, last: str, asked: Asked) -> Iterator[LineRecords]:
-    """Edges, then poses of rigs that have more than one sensor of a kind, from `first` to `last`."""
+    """Edges, then poses of rigs that have more than one sensor of a kind, from `first` to `last`.
+
+    Parts of whole days, in order; days of many records come in parts of whole vehicles.
+    """
     for schema in (CALIBRATIONS, POSES):
-        is_of_poses = schema is POSES
-        more = ("sensor", "kind", "reference", "unsure_only") if is_of_poses else _UNSURE
-        own = tuple(c for c in COLUMNS if c in _OF_POSES or not is_of_poses)
-        table = read_columns(
-            lake, schema, (*own, *_PRIOR, "prior_covariance", "code_version", *more),
-            first=first, last=last, vehicle=asked.vehicles, asserted_after=asked.asserted_after,
-        )  # fmt: skip
-        if table is None:
-            continue
-        found = current_rows(table.filter(pc.equal(table["method"], asked.method)), schema)
-        edges, edge = _poses_of(found) if is_of_poses else edges_of_rows(found)
-        found, edge = found.filter(pa.array(edge >= 0)), edge[edge >= 0]  # an unknown pair is not counted
-        yield _in_order(_with_missing(found) if is_of_poses else found, edges, edge, schema, asked.last)
+        for begin, end, vehicles in _parts(lake, schema, (first, last), asked):
+            read = _read(lake, schema, (begin, end), vehicles, asked)
+            if read is not None:
+                yield read
+
+
+def _read(
+    lake: Lake, schema: TableSchema, days: tuple[str, str], vehicles: frozenset[str] | None, asked: Asked
+) -> LineRecords | None:
+    is_of_poses = schema is POSES
+    more = ("sensor", "kind", "reference", "unsure_only") if is_of_poses else _UNSURE
+    own = tuple(c for c in COLUMNS if c in _OF_POSES or not is_of_poses)
+    table = read_columns(
+        lake, schema, (*own, *_PRIOR, "prior_covariance", "code_version", *more),
+        first=days[0], last=days[1], vehicle=vehicles, asserted_after=asked.asserted_after,
+    )  # fmt: skip
+    if table is None:
+        return None
+    found = current_rows(table.filter(pc.equal(table["method"], asked.method)), schema)
+    edges, edge = _poses_of(found) if is_of_poses else edges_of_rows(found)
+    found, edge = found.filter(pa.array(edge >= 0)), edge[edge >= 0]  # an unknown pair is not counted
+    return _in_order(_with_missing(found) if is_of_poses else found, edges, edge, schema, asked.last)
+
+
+def _parts(
+    lake: Lake, schema: TableSchema, days: tuple[str, str], asked: Asked
+) -> Iterator[tuple[str, str, frozenset[str] | None]]:
+    """Days, and some of the vehicles or None for all asked ones, with few enough records for the memory."""
+    begin, last = days
+    while begin <= last:
+        end = min(days_after(begin, _COUNTED_DAYS - 1), last)
+        found = count_of_days(
+            lake, schema, first=begin, last=end, vehicle=asked.vehicles, asserted_after=asked.asserted_after
+        )
+        for first, until, records in _spans_of(found):
+            parts = -(-records // _AT_A_TIME)
+            if parts == 1:
+                yield first, until, asked.vehicles
+                continue
+            of_day = read_columns(
+                lake, schema, (), first=first, last=first, vehicle=asked.vehicles,
+                asserted_after=asked.asserted_after,
+            )  # fmt: skip
+            names = sorted(pc.unique(of_day["vehicle"]).to_pylist()) if of_day is not None else []
+            for part in np.array_split(np.array(names, object), parts):
+                yield first, until, frozenset(part.tolist())
+        begin = days_after(end, 1)
+
+
+def _spans_of(records: Mapping[str, int]) -> Iterator[tuple[str, str, int]]:
+    """First and last days of spans with at most `_AT_A_TIME` records, or of one day, and their records."""
+    first, until, together = "", "", 0
+    for day, number in sorted(records.items()):
+        if first and together + number > _AT_A_TIME:
+            yield first, until, together
+            first = ""
+        first, until, together = (first, day, together + number) if first else (day, day, number)
+    if first:
+        yield first, until, together
 
 
 def _in_order(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from typing import Final, cast
 
 import numpy as np
@@ -24,6 +25,7 @@ __all__ = [
     "edge_order",
     "edges_of_rows",
     "line_edge",
+    "line_edges",
     "pair_of",
     "words_of",
 ]
@@ -47,10 +49,21 @@ def edge_of(row: CalibrationRecord | StateRow | DriftFinding) -> Edge:
 
 def line_edge(row: FleetModelRow | LineAnswer) -> Edge:
     """The edge, or the sensor's pose, that a row of a model line describes."""
-    if row.pair != POSE:
-        return edge_named(row.pair, row.parent_frame, row.child_frame)
-    kinds = [cast("Kind", kind) for kind in row.kinds.split("_")]
-    return RigPose(Sensor(row.parent_frame, kinds[0]), Sensor(row.child_frame, kinds[1]))
+    return _line_edge(row.pair, row.kinds, row.parent_frame, row.child_frame)
+
+
+def line_edges(rows: pa.Table) -> list[Edge]:
+    """`line_edge` of each row of a table."""
+    known = cache(_line_edge)
+    names = (rows[name].to_pylist() for name in ("pair", "kinds", "parent_frame", "child_frame"))
+    return [known(*of) for of in zip(*names, strict=True)]
+
+
+def _line_edge(pair: str, kinds: str, parent: str, child: str) -> Edge:
+    if pair != POSE:
+        return edge_named(pair, parent, child)
+    of_parent, of_child = (cast("Kind", kind) for kind in kinds.split("_"))
+    return RigPose(Sensor(parent, of_parent), Sensor(child, of_child))
 
 
 def pair_of(edge: Edge) -> str:

@@ -193,7 +193,9 @@ def work_key(stage: str, code_version: str, config: str, inputs: list[str]) -> s
 
 def content_hash(rows: Sequence[Any]) -> str:
     """Hash of the content of record rows, arrays included."""
-    plain = [
-        [v.tobytes().hex() if isinstance(v, np.ndarray) else v for v in vars(row).values()] for row in rows
-    ]
-    return hashlib.sha256(json.dumps(plain).encode()).hexdigest()[:20]
+    found = hashlib.sha256(b"[")
+    for k, row in enumerate(rows):  # one by one: the text of a fleet's rows would be hundreds of megabytes
+        plain = [v.tobytes().hex() if isinstance(v, np.ndarray) else v for v in vars(row).values()]
+        found.update((", " * (k > 0) + json.dumps(plain)).encode())
+    found.update(b"]")
+    return found.hexdigest()[:20]

@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import pipeline.audit.line_records as line_records_of_audit
+from pipeline.audit.line_records import Asked, read_line_records
 from pipeline.config import FleetConfig
 from pipeline.geometry.changes import change_between, change_covariance
 from pipeline.geometry.se3 import exp_se3, from_quaternion, inverse, log_se3
@@ -140,6 +142,23 @@ def test_a_night_without_anything_new_has_the_same_rows_to_the_last_bit(tmp_path
     _, first = at_once(lake, records, fleet)
     _, again = lines(lake, fleet)
     assert {k: a.work_key for k, a in first.items()} == {k: a.work_key for k, a in again.items()}
+
+
+@pytest.mark.parametrize("most", [50, 10])
+def test_records_are_read_in_parts_that_memory_holds_and_count_as_all_at_once_do(tmp_path, monkeypatch, most):
+    line, fleet = MadeLine(12, 5, seed=52), fleet_of()
+    _, whole = at_once(Lake.at(tmp_path / "whole"), line_records(line), fleet)
+    monkeypatch.setattr(line_records_of_audit, "_AT_A_TIME", most)
+    lake = Lake.at(tmp_path / "parts")
+    _, answers = at_once(lake, line_records(line), fleet)
+    assert largest_difference(answers, whole) < 0.005
+    days = sorted({r.day for r in line_records(line)})
+    parts = list(read_line_records(lake, days[0], days[-1], Asked("joint", days[-1])))
+    sizes = [len(part.records.day) for part in parts]
+    assert sum(sizes) == 12 * 5 * 2
+    assert max(sizes) <= most
+    seen = [part.records.day.max() for part in parts]
+    assert seen == sorted(seen), "days come in order, as sums need them"
 
 
 def test_a_vehicle_that_one_night_did_not_know_counts_with_all_of_its_days(tmp_path):
