@@ -77,14 +77,16 @@ def decide_status(findings: Sequence[DriftFinding]) -> VehicleStatus:
     count = f"{green} of {len(findings)} charts would show a change that matters"
     if not unwatched:
         return VehicleStatus("GREEN", f"no sensor moved ({count})")
-    if max((f.days_used for f in findings), default=0) > 1:
+    most = max((f.days_used for f in findings), default=0)
+    if most > 1:
         hidden = " and of the ".join(unwatched)
         first = watched[unwatched[0]][0]  # where there is a choice
         own = [f for f in findings if edge_of(f) == first and f.dof in _WATCHED[first.kind]]
         blind = [f for f in own if f.status != "GREEN"]
         why = "".join(f"; {words_of(first)} {f.dof}: {f.reason}" for f in blind[:1])
         return VehicleStatus("UNKNOWN", f"a turn of the {hidden} could hide ({count}){why}")
-    return VehicleStatus("UNKNOWN", "too little data to say whether a sensor moved")
+    why = next((f": {f.reason}" for f in findings if most and f.days_used == most), "")
+    return VehicleStatus("UNKNOWN", f"too little data to say whether a sensor moved{why}")
 
 
 def _clarity(alarm: DriftFinding) -> tuple[bool, bool, float]:

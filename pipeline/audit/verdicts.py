@@ -144,7 +144,9 @@ def _last_day(charts: Charts, noise: Noise) -> tuple[np.ndarray, np.ndarray]:
 def _verdict(seen: _Judged, m: int) -> ChartVerdict:
     days = int(seen.charts.count[m])
     if days < 2:
-        return ChartVerdict("UNKNOWN", f"{_count(days)} of data", days, None, None, None, None)
+        # A chart without any day may never have one, so no number of days is promised.
+        needed = f", {max(seen.baseline_days + 1, 2)} needed" if days else ""
+        return ChartVerdict("UNKNOWN", f"{_count(days)} of data{needed}", days, None, None, None, None)
     levels = None
     if seen.statistic[m] > seen.threshold[m]:
         levels = levels_of(

@@ -172,6 +172,11 @@ def test_of_yellow_what_the_next_days_decide_is_told_from_what_is_sure() -> None
             "too little data to say whether a sensor moved",
             "failed: `boresight status --lake L --v",
         ),
+        (
+            "UNKNOWN",
+            "too little data to say whether a sensor moved: 1 day of data, 5 needed",
+            "4 more accepted days; look again tomorrow: `",
+        ),
         ("UNKNOWN", "no change; some of its records cannot be read", "`boresight repair --lake L`"),
         (None, "", "audit again: `boresight audit --fleet FLEET --lake L`, with your fleet.toml for FLEET"),
     ],
