@@ -1,0 +1,53 @@
+"""Camera-lidar of a camera without semantics: the truth within the sigma, and nothing wrong from a start far off."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from pipeline.calibrate.joint.camera_lidar.estimate import estimate_camera_lidar
+from pipeline.config import SolveConfig
+from pipeline.extrinsics.estimates import Prior
+from pipeline.geometry.se3 import inverse, log_so3, perturb_exactly
+from tests.makers.traced_scenes import DENSE, SPARSE, T_TRUE, traced_day, without_labels
+
+
+def found_from(day, degrees, seed):
+    T = perturb_exactly(T_TRUE, np.radians(degrees), 0.05, np.random.default_rng(seed))
+    prior = Prior(T, np.eye(4), float(np.radians(2.0)), 0.05)
+    return estimate_camera_lidar(day, prior, SolveConfig(), np.random.default_rng(0))
+
+
+def error_and_sigma_deg(found):
+    turn = log_so3((found.T @ inverse(T_TRUE))[:3, :3])
+    return np.degrees(turn), np.degrees(np.sqrt(np.diag(found.covariance))[:3])
+
+
+@pytest.mark.parametrize(
+    ("rig", "frames"),
+    [(SPARSE, 16), pytest.param(DENSE, 8, marks=pytest.mark.slow)],
+    ids=["16 rings", "dense"],
+)
+def test_a_day_without_labels_shows_the_pose_within_its_sigma(rig, frames):
+    found = found_from(without_labels(traced_day(rig, frames, seed=1)), 2.0, 0)
+    error, sigma = error_and_sigma_deg(found)
+    assert np.abs(error).max() < 0.35
+    assert (np.abs(error) < 3 * sigma).all()
+    assert not found.disproved
+
+
+def test_steps_of_other_places_do_not_pass_for_the_right_ones():
+    day = without_labels(traced_day(SPARSE, 16, seed=1))
+    other = [
+        replace(o, steps_png=mirrored(o.steps_png), road_contrast_png=mirrored(o.road_contrast_png))
+        for o in day
+    ]
+    found = found_from(other, 2.0, 0)
+    error, sigma = error_and_sigma_deg(found)
+    assert found.disproved or found.failed_checks or (np.abs(error) < 3 * sigma).all()
+
+
+def mirrored(png):
+    image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE)
+    return cv2.imencode(".png", np.ascontiguousarray(image[:, ::-1]))[1].tobytes()
