@@ -19,6 +19,7 @@ __all__ = ["brightness_steps"]
 _BLUR_PX = 1.0
 _STRONGEST = 0.07  # share of the pixels
 _SHORTEST_RUN_PX = 8
+_GAP_PX = 4  # in a run, where another border crosses it
 _LEAST_STEP = 0.5  # grey levels: in a plain image the strongest steps are rounding
 _LEAST_ACROSS = 0.7  # of the step along the other axis: a step belongs to the axis that it crosses
 
@@ -39,7 +40,8 @@ def _steps_along_rows(grey: UInt8[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]
     is_step[:, 1:-1] &= (along[:, 1:-1] >= along[:, :-2]) & (along[:, 1:-1] > along[:, 2:])
     is_step[:, [0, -1]] = False
     is_step &= along > _LEAST_ACROSS * across
-    _, run, stats, _ = cv2.connectedComponentsWithStats(is_step.astype(np.uint8), connectivity=8)
+    closed = cv2.morphologyEx(is_step.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((_GAP_PX + 1, 1), np.uint8))
+    _, run, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
     is_long = stats[:, cv2.CC_STAT_HEIGHT] >= _SHORTEST_RUN_PX
     is_long[0] = False  # the background
     return np.asarray(is_long[run])

@@ -134,9 +134,6 @@ def _without_labels(o: Observation) -> Observation:
     grey = GREY[labels]
     grey[contrast > 60] = 200  # paint
     grey = cv2.GaussianBlur(grey, (3, 3), 0.7)
-    on_ground = np.column_stack(
-        [o.lidar_drivable_xyz_m[:, :2], np.full(len(o.lidar_drivable_xyz_m), GROUND_M)]
-    )
     none = {"road_user_boxes_px": np.zeros((0, 4), np.float32), "road_user_classes": [],
             "road_user_scores": np.zeros(0, np.float32), "sky_fraction": 0.0, "drivable_fraction": 0.0}  # fmt: skip
     return replace(
@@ -144,8 +141,22 @@ def _without_labels(o: Observation) -> Observation:
         labels_png=cv2.imencode(".png", np.full(labels.shape, VOID, np.uint8))[1].tobytes(),
         steps_png=cv2.imencode(".png", brightness_steps(grey))[1].tobytes(),
         road_contrast_png=cv2.imencode(".png", road_contrast(grey, np.ones(grey.shape, bool)))[1].tobytes(),
-        lidar_drivable_xyz_m=on_ground.astype(np.float32),
+        lidar_drivable_xyz_m=free_ground(o).astype(np.float32),
     )  # fmt: skip
+
+
+def free_ground(o: Observation) -> np.ndarray:
+    """Road on a 1 m grid, as far as no object stands in the way, lidar frame."""
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(4.0, 60), np.arange(-5.0, 6)))
+    objects = o.lidar_map_xyz_m[o.lidar_map_is_ground == 0]
+    reach_m = np.full(181, np.inf)
+    np.minimum.at(reach_m, _degrees_of(objects[:, 0], objects[:, 1]), np.hypot(objects[:, 0], objects[:, 1]))
+    is_free = np.hypot(x, y) < reach_m[_degrees_of(x, y)]
+    return np.column_stack([x, y, np.full(len(x), GROUND_M)])[is_free]
+
+
+def _degrees_of(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return np.round(np.degrees(np.arctan2(y, x))).astype(int) + 90
 
 
 def scatter_boxes(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
