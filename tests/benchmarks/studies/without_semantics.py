@@ -44,7 +44,7 @@ __all__ = ["LOGS", "day_of", "found_from", "summary"]
 _PAIR: Final = "camera_lidar"
 _M_PER_DEG: Final = 0.025
 _DATE: Final = "2026-03-02"
-_FRAMES: Final = 80
+_FRAMES: Final = 60
 _CAMERA_AND_LIDAR: Final = """
 [rigs.default.camera]
 image = "/camera/front/image/compressed"
