@@ -118,7 +118,7 @@ def _solved(
     method = method_named(about.method)
     selection = _selection(observations, method, fleet, about)
     unlabelled = unlabelled_pairs(observations, about.chosen, needs_labels=method.needs_labels)
-    known = {**unlabelled, **selection.refused}
+    known = {**selection.refused, **unlabelled}  # no frames are enough for pairs that need labels
     refused = {p: _named(e, motion.of(p)) for p, e in _refused(method, about.pairs, known, prior).items()}
     pairs = [pair for pair in about.pairs if pair not in refused]
     refusals = {
