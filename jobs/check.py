@@ -69,7 +69,7 @@ def _following(report: CheckReport, fleet: Path, logs: tuple[Path, ...]) -> list
     """Commands to type next: `models fetch` if cameras lack labels, `nightly` if logs can be calibrated."""
     from pipeline.ingest.propose.logs_pattern import nightly_command
 
-    unlabelled = any(why.startswith("no semantic labels") for v in report.verdicts for why in v.reasons)
+    unlabelled = any("boresight models fetch" in why for v in report.verdicts for why in v.reasons)
     fetch = ["boresight models fetch"] if unlabelled else []
     return fetch if report.answer == "no" else [*fetch, *nightly_command(fleet, logs)]
 

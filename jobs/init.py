@@ -35,7 +35,7 @@ def init(*logs: Path, out: Path = Path("fleet.toml"), name: str = "fleet", force
         file.write(proposal.text.encode())
     read = proposal.logs
     some = " ".join(str(p) for p in read[:2]) + (" ..." if len(read) > 2 else "")
-    unlabelled = any(what.endswith(": semantics") for what in proposal.missing)
+    unlabelled = any(": semantics" in what for what in proposal.missing)
     fetch = ["boresight models fetch"] if unlabelled else []
     print_summary(
         "init",

@@ -31,7 +31,8 @@ class ImageFeatureColumns(CameraColumns):
     """Features of an image, and the intrinsics of its camera."""
 
     labels_png: bytes = column(
-        "PNG mono8 of Cityscapes train ids (0 road .. 18 bicycle, 255 void), usually at half size"
+        "PNG mono8 of Cityscapes train ids (0 road .. 18 bicycle, 255 void), usually at half size; all void without "
+        "semantics"
     )
     label_scale: float = column("label pixels per image pixel (0.5 = half size)")
     sky_fraction: float = column("share of the image with label sky")
@@ -42,13 +43,19 @@ class ImageFeatureColumns(CameraColumns):
     road_user_classes: list[str] = column("person, rider, car, truck, bus, train, motorcycle, bicycle")
     road_user_scores: np.ndarray = per_point("0..1")
     road_contrast_png: bytes | None = column(
-        "PNG mono8: top-hat contrast inside the road mask (0 outside), at label size; null without an image"
+        "PNG mono8: top-hat contrast inside the road mask (0 outside), at label size; without semantics of the "
+        "whole image; null without an image"
     )
     label_gradients: np.ndarray | None = array(
         "<f4",
         (4, 6, 33),
         "image gradients across the labels' borders: by EDGE_* side, sixth of the image and distance from -16"
-        " to 16 label pixels; null without an image",
+        " to 16 label pixels; null without an image or semantics",
+        default=None,
+    )
+    steps_png: bytes | None = column(
+        "PNG mono8 at label size, of a camera without semantics: where brightness steps, as bits STEP_RIGHT and "
+        "STEP_BELOW; null with labels",
         default=None,
     )
 
@@ -136,8 +143,8 @@ class ScanFeatures(ScanFeatureColumns, Capture):
 
 _ONE = "; a file per {}, joined by the table perceived."
 IMAGE_FEATURES = TableSchema(
-    ImageFeatures, "image_features", 1, "Features of a camera's images" + _ONE.format("camera"),
-    made_by="perceive", of_sensor=True,
+    ImageFeatures, "image_features", 2, "Features of a camera's images" + _ONE.format("camera"),
+    made_by="perceive", of_sensor=True, reads_versions=(1,),
 )  # fmt: skip
 SWEEP_FEATURES = TableSchema(
     SweepFeatures, "sweep_features", 1, "Features of a lidar's sweeps" + _ONE.format("lidar"),

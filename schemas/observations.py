@@ -6,12 +6,25 @@ from schemas.columns import row
 from schemas.features import ImageFeatureColumns, ScanFeatureColumns, SweepFeatureColumns
 from schemas.frames import Seen
 
-__all__ = ["EDGE_ABOVE", "EDGE_BELOW", "EDGE_LEFT", "EDGE_RIGHT", "Observation"]
+__all__ = [
+    "EDGE_ABOVE",
+    "EDGE_BELOW",
+    "EDGE_LEFT",
+    "EDGE_RIGHT",
+    "STEP_BELOW",
+    "STEP_RIGHT",
+    "WITHOUT_LABELS",
+    "Observation",
+]
 
 # Direction class of a depth jump or mask boundary as seen in the image: the side of the boundary on which the
 # FOREGROUND lies (the nearer surface, or the object's mask). Only jumps and boundaries of the same class
 # match.
 EDGE_LEFT, EDGE_RIGHT, EDGE_ABOVE, EDGE_BELOW = 0, 1, 2, 3
+# Bits of `steps_png`: brightness steps between a pixel and the next one of its row, or of its column.
+STEP_RIGHT, STEP_BELOW = 1, 2
+# What records, poses and pages state of a camera without semantics.
+WITHOUT_LABELS = "no labels: borders are steps of brightness"
 
 
 @row()
@@ -25,3 +38,8 @@ class Observation(ImageFeatureColumns, SweepFeatureColumns, ScanFeatureColumns, 
 
     ego_speed_mps: float | None
     ego_yaw_rate_radps: float | None
+
+    @property
+    def is_unlabelled(self) -> bool:
+        """Whether it has an image of a camera without semantics: steps of brightness, no labels, no road users."""
+        return self.steps_png is not None

@@ -15,6 +15,7 @@ from pipeline.calibrate.paper.triggers import exceeded, trigger_metrics
 from pipeline.calibrate.records import Inputs, record_of, refused_record
 from pipeline.calibrate.select.frames import PAPER_SYNC_GATE_S, Selection, select_frames
 from pipeline.calibrate.solved import SolvedDay
+from pipeline.calibrate.unlabelled import unlabelled_pairs
 from pipeline.calibrate.verify.day_checks import FoundDay, checks_of_day
 from pipeline.calibrate.verify.label_offset import with_label_offset
 from pipeline.calibrate.verify.motion_sources import MotionFindings, compared_sources
@@ -27,7 +28,7 @@ from pipeline.extrinsics.prior import no_prior
 from pipeline.results import Progress, silent
 from pipeline.stage_work import Probes
 from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, SENSORS, CalibrationRecord
-from schemas.observations import Observation
+from schemas.observations import WITHOUT_LABELS, Observation
 
 __all__ = ["DayOfPairs", "calibrate_observations", "records_of", "solve_day"]
 
@@ -116,7 +117,9 @@ def _solved(
     progress(0, 4, "select frames")
     method = method_named(about.method)
     selection = _selection(observations, method, fleet, about)
-    refused = {p: _named(e, motion.of(p)) for p, e in _refused(method, about.pairs, selection, prior).items()}
+    unlabelled = unlabelled_pairs(observations, about.chosen, needs_labels=method.needs_labels)
+    known = {**selection.refused, **unlabelled}  # no frames are enough for pairs that need labels
+    refused = {p: _named(e, motion.of(p)) for p, e in _refused(method, about.pairs, known, prior).items()}
     pairs = [pair for pair in about.pairs if pair not in refused]
     refusals = {
         pair: refused_record(about, pair, why, observations, prior, selection.rejected[pair])
@@ -129,6 +132,8 @@ def _solved(
     sample = _spread(observations, frames) if measured else []
     before = trigger_metrics(sample, {pair: prior.of(pair) for pair in pairs})
     fired = {pair: exceeded(before[pair], fleet.trigger) for pair in pairs}
+    if measured and "camera_lidar" in pairs and any(o.is_unlabelled for o in sample):
+        fired["camera_lidar"] = [WITHOUT_LABELS]  # nothing shows that it need not be calibrated
     active = _to_calibrate(method, fired, fleet.trigger.when)
     progress(1, 4, f"solve by {about.method}")
     solution = (solver or method.solver())(
@@ -219,10 +224,10 @@ def _judged(
 
 
 def _refused(
-    method: Method, pairs: Sequence[str], selection: Selection, prior: Prior
+    method: Method, pairs: Sequence[str], known: Mapping[str, SolveError], prior: Prior
 ) -> dict[str, SolveError]:
-    """Pairs that the day cannot calibrate: too few frames, no prior, or a method that needs what is missing."""
-    refused = dict(selection.refused)
+    """Pairs that the day cannot calibrate: those known, no prior, or a method that needs what is missing."""
+    refused = dict(known)
     refused |= {p: SolveError(no_prior(p)) for p in pairs if p not in refused and not prior.knows(p)}
     if method.needs_all and (refused or len(pairs) < len(PAIRS)):
         missing = [s for s in SENSORS if not any(s in FRAMES_OF_PAIR[p] for p in pairs)]

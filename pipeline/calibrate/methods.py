@@ -45,6 +45,7 @@ class Method:
         paper_selection: takes the paper's frame conditions (section 4.5.1).
         needs_images: uses images and sweeps (table frames) in networks, not only observations.
         needs_all: estimates all three pairs or none; else a pair without frames costs the others nothing.
+        needs_labels: of cameras in all their pairs; else camera-lidar can do with steps of brightness.
         settings: import path of `(method's name, task) -> dict`: further inputs of its result.
     """
 
@@ -55,6 +56,7 @@ class Method:
     paper_selection: bool = False
     needs_images: bool = False
     needs_all: bool = False
+    needs_labels: bool = True
     settings: str | None = None
 
     def solver(self) -> Solver:
@@ -81,7 +83,7 @@ class Method:
 
 _NETWORKS, _FILES = "pipeline.calibrate.networks:ssl_solver", "pipeline.calibrate.networks:ssl_settings"
 METHODS = (
-    Method("joint", "pipeline.calibrate.joint.solve:solve_joint"),
+    Method("joint", "pipeline.calibrate.joint.solve:solve_joint", needs_labels=False),
     Method(
         "tracking",
         "pipeline.calibrate.tracking.solve:solve_tracking",

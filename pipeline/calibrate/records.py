@@ -12,6 +12,7 @@ from pipeline.calibrate.half_days import half_days_of
 from pipeline.calibrate.judging import Judged
 from pipeline.calibrate.paper.triggers import trigger_metrics
 from pipeline.calibrate.solved import SolvedDay
+from pipeline.calibrate.unlabelled import notes_of_pair
 from pipeline.calibrate.verify.constancy import PART_FLOOR_RAD
 from pipeline.calibrate.verify.failed_checks import loop_sigmas
 from pipeline.calibrate.verify.held_out_test import HeldOutTest
@@ -87,7 +88,11 @@ def record_of(about: Inputs, pair: str, day: SolvedDay) -> CalibrationRecord:
         alignment_after=test.after if test else None,
         time_offset_s=estimate.time_offset_s,
         time_offset_sigma_s=estimate.time_offset_sigma_s,
-        notes=[*selection.notes.get(pair, []), *_unobservable(estimate.observable)],
+        notes=[
+            *notes_of_pair(pair, day.observations),
+            *selection.notes.get(pair, []),
+            *_unobservable(estimate.observable),
+        ],
         assumptions=[*_assumed(estimate, day.observations), *estimate.notes],
         drive_missing=selection.missing.get(pair, []),
         diagnostics=dict(estimate.diagnostics)

@@ -17,6 +17,7 @@ from pipeline.calibrate.prior_doubts import hold_doubted
 from pipeline.calibrate.records import Inputs, refused_records
 from pipeline.calibrate.rig_day import RigDay, calibrate_rig
 from pipeline.calibrate.three_sensors import three_sensors
+from pipeline.calibrate.unlabelled import noted
 from pipeline.calibrate.verify.seen_targets import views_of
 from pipeline.errors import SolveError
 from pipeline.extrinsics.estimates import Prior
@@ -45,7 +46,7 @@ def rig_rows(task: Task, about: Inputs, progress: Progress) -> list[CalibrationR
     found = calibrate_rig(day, fleet, about, progress)
     poses = pose_rows(about, day.graph, found.adjusted, day.views, fleet.verify, found.judged)
     poses, records = hold_doubted(poses, found.records)
-    return [*records, *poses]
+    return [*records, *noted(poses, records)]
 
 
 def three_rows(task: Task, about: Inputs, progress: Progress) -> list[CalibrationRecord]:

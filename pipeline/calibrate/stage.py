@@ -29,6 +29,7 @@ from schemas.calibrations import (
 )
 from schemas.faults import FAULTS
 from schemas.moments import SENSORS_ABSENT
+from schemas.observations import WITHOUT_LABELS
 
 __all__ = ["work"]
 
@@ -121,10 +122,12 @@ def _absent(lake: Lake, partition: Partition) -> dict[str, str]:
 
 def _told(records: Sequence[CalibrationRecord]) -> Told:
     counts = {status: sum(r.status == status for r in records) for status in STATUSES}
+    unlabelled = [f"{r.parent_frame}: {WITHOUT_LABELS}" for r in records if WITHOUT_LABELS in r.notes]
+    reasons = [f"{words_of(edge_of(r))}: {r.reason}" for r in records if r.reason]
     return Told(
         counts,
         dict(records[0].frames_rejected) if records else {},
-        "; ".join(dict.fromkeys(f"{words_of(edge_of(r))}: {r.reason}" for r in records if r.reason)),
+        "; ".join(dict.fromkeys([*unlabelled, *reasons])),
         refused=counts["refused"] == len(records),
         faults=tuple(dict.fromkeys(fault for r in records for fault in r.faults)),
     )

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
+from schemas.observations import WITHOUT_LABELS
+
 __all__ = ["DofVerdict", "Evidence", "in_order", "judge", "judge_edge", "overall"]
 
 # 30 frames give camera-lidar within 0.1 deg and lidar-radar yaw within 0.15 deg on real logs; 10 give twice
@@ -12,6 +14,7 @@ __all__ = ["DofVerdict", "Evidence", "in_order", "judge", "judge_edge", "overall
 _ENOUGH_FRAMES, _FEW_FRAMES = 30, 10
 _MOVING_SHARE = 0.2  # time offsets are observable only while the car moves
 _ORDER = ("camera_lidar", "lidar_radar", "camera_radar")  # display order; other kinds come after these
+_GET_LABELS = "log labels and detections, or name models (`boresight models fetch`)"
 _DENSE_RINGS = 32  # with fewer rings, pitch depends on reflectivity of the road
 
 
@@ -20,7 +23,8 @@ class Evidence:
     """Facts that a verdict is based on; shares are of the sampled frames, and meaningless without frames.
 
     `missing` has the topics without usable messages (none, or of another type) by sensor. `frames_of` counts
-    the frames with both sensors by pair of the rig; None = all frames have all sensors.
+    the frames with both sensors by pair of the rig; None = all frames have all sensors. Without
+    `names_semantics`, fleet.toml has a camera and no source of its labels and road users.
     """
 
     frames: int
@@ -36,6 +40,7 @@ class Evidence:
     wrong: tuple[str, ...] = ()  # other sources of motion and directions that are certainly wrong
     missing: tuple[str, ...] = ()
     frames_of: Mapping[str, int] | None = None
+    names_semantics: bool = True
 
 
 @dataclass(frozen=True)
@@ -77,6 +82,7 @@ def _needs(evidence: Evidence) -> list[tuple[str, str, _Needs]]:
     pitch = ground + camera + _pitch_needs(evidence)
     tilt = ground + radar + _elevation_needs(evidence)
     moving = ground + _moving_needs(evidence)
+    boxes = camera + _box_needs(evidence)
     shift = [("weak", "far objects constrain shifts weakly: the prior provides part of it")]
     return [
         ("camera_lidar", "yaw and roll", ground + camera),
@@ -86,9 +92,9 @@ def _needs(evidence: Evidence) -> list[tuple[str, str, _Needs]]:
         ("lidar_radar", "yaw, x and y", ground + radar),
         ("lidar_radar", "roll, pitch and z", tilt + camera),
         ("lidar_radar", "time offset", moving + radar),
-        ("camera_radar", "yaw", ground + camera + radar),
-        ("camera_radar", "roll and pitch", tilt + camera),
-        ("camera_radar", "translation", ground + camera + radar + shift),
+        ("camera_radar", "yaw", ground + boxes + radar),
+        ("camera_radar", "roll and pitch", tilt + boxes),
+        ("camera_radar", "translation", ground + boxes + radar + shift),
         ("lidar_lidar", "roll, pitch and yaw", ground),
         ("lidar_lidar", "translation", ground),
         ("lidar_lidar", "time offset", moving),
@@ -130,9 +136,17 @@ def _common_needs(e: Evidence) -> _Needs:
 
 
 def _camera_needs(e: Evidence) -> _Needs:
+    if not e.names_semantics:
+        return [("weak", f"{WITHOUT_LABELS}; better {_GET_LABELS}")]
     if e.labels_share == 0:
-        return [("no", "no semantic labels: log them, or name models (`boresight models fetch`)")]
+        return [("no", f"no semantic labels: {_GET_LABELS}")]
     return [("weak", f"labels on {e.labels_share:.0%} of the frames only")] if e.labels_share < 0.5 else []
+
+
+def _box_needs(e: Evidence) -> _Needs:
+    if e.names_semantics:
+        return []
+    return [("no", f"no boxes of road users to compare with the radar: {_GET_LABELS}")]
 
 
 def _pitch_needs(e: Evidence) -> _Needs:

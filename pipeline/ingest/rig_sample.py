@@ -216,6 +216,7 @@ def _evidence(frames: list[Frame], rig: Rig, motion: Motion) -> Evidence:
         doppler_problem=motion.doppler_problem,
         doppler_is_wrong=motion.doppler_is_wrong,
         wrong=motion.wrong,
+        names_semantics=rig.camera is None or rig.semantics is not None,
     )
 
 

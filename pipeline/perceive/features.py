@@ -7,19 +7,20 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 
 from pipeline.config import PerceiveConfig
 from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.radar_grid import Scan as RadarScan
-from pipeline.perceive.camera import SemanticsSource, decode_grey, encode_png
+from pipeline.perceive.brightness import brightness_steps
+from pipeline.perceive.camera import CameraSemantics, SemanticsSource, decode_grey, encode_png
 from pipeline.perceive.depth_edges import lidar_edges
 from pipeline.perceive.deskew import deskew_straight, velocity_ahead
 from pipeline.perceive.drivable import DrivableSource, free_sector
 from pipeline.perceive.ego_velocity import RadarMotion, Travel, radar_motion
 from pipeline.perceive.ground import PointSource, find_ground
 from pipeline.perceive.label_gradients import label_gradients
-from pipeline.perceive.labels import ROAD_ID
+from pipeline.perceive.labels import ROAD_ID, VOID_ID
 from pipeline.perceive.lidar import cluster_boxes, cluster_objects, sample_uniformly
 from pipeline.perceive.rejections import FrameReason
 from pipeline.perceive.road_markings import lidar_markings, road_contrast
@@ -57,24 +58,49 @@ def why_unusable(capture: Capture) -> FrameReason | None:
     return None
 
 
-def perceive_image(image: Image, source: SemanticsSource, config: PerceiveConfig) -> ImageFeatures:
-    """Labels and road users of an image; raises FrameRejectedError if any cannot be read."""
-    semantics = source.read(image)
+def perceive_image(image: Image, source: SemanticsSource | None, config: PerceiveConfig) -> ImageFeatures:
+    """Labels and road users of an image, or steps of its brightness without a source of semantics.
+
+    Raises:
+        FrameRejectedError: something cannot be read.
+    """
+    semantics = None if source is None else source.read(image)
     grey = decode_grey(image, config.label_scale)
-    users = semantics.detections
+    shown = _without_semantics(grey) if semantics is None else _with_semantics(grey, semantics)
     return ImageFeatures(
         **_begin(image),
         **{name: getattr(image, name) for name in _CAMERA},
-        labels_png=encode_png(semantics.labels),
         label_scale=config.label_scale,
-        sky_fraction=semantics.sky_fraction,
-        drivable_fraction=semantics.drivable_fraction,
-        road_user_boxes_px=users.boxes_px,
-        road_user_classes=users.classes,
-        road_user_scores=users.scores,
-        road_contrast_png=encode_png(road_contrast(grey, semantics.labels == ROAD_ID)),
-        label_gradients=label_gradients(grey, semantics.labels),
+        **shown,
     )
+
+
+def _with_semantics(grey: UInt8[np.ndarray, "H W"], semantics: CameraSemantics) -> dict[str, Any]:
+    users = semantics.detections
+    return {
+        "labels_png": encode_png(semantics.labels),
+        "sky_fraction": semantics.sky_fraction,
+        "drivable_fraction": semantics.drivable_fraction,
+        "road_user_boxes_px": users.boxes_px,
+        "road_user_classes": users.classes,
+        "road_user_scores": users.scores,
+        "road_contrast_png": encode_png(road_contrast(grey, semantics.labels == ROAD_ID)),
+        "label_gradients": label_gradients(grey, semantics.labels),
+    }
+
+
+def _without_semantics(grey: UInt8[np.ndarray, "H W"]) -> dict[str, Any]:
+    """Where the road is depends on the camera's pose, which features must not use: contrast is of the whole image."""
+    return {
+        "labels_png": encode_png(np.full(grey.shape, VOID_ID, np.uint8)),
+        "sky_fraction": 0.0,
+        "drivable_fraction": 0.0,
+        "road_user_boxes_px": np.empty((0, 4), np.float32),
+        "road_user_classes": [],
+        "road_user_scores": np.empty(0, np.float32),
+        "road_contrast_png": encode_png(road_contrast(grey, np.ones(grey.shape, bool))),
+        "steps_png": encode_png(brightness_steps(grey)),
+    }
 
 
 def perceive_sweep(

@@ -13,7 +13,6 @@ class FrameReason(StrEnum):
     UNDECODABLE_IMAGE = "image_undecodable"
     IMAGE_SIZE = "image_size_differs_from_camera_info"
     CAMERA_MODEL = "camera_model_invalid"
-    NO_SEMANTICS = "no_semantics"
     NO_LABELS = "labels_missing"
     UNDECODABLE_LABELS = "labels_undecodable"
     LABELS_SHAPE = "labels_aspect_differs_from_image"

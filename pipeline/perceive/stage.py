@@ -37,7 +37,8 @@ from pipeline.store.moments import joined, sensors_of
 from pipeline.store.views import logged_stars
 from schemas.captures import Capture, Sweep
 from schemas.faults import FAULTS
-from schemas.moments import MOMENTS, PRIOR, SAME_SCENE_NS, SENSORS_ABSENT, Moment, Perceived
+from schemas.moments import MOMENTS, PRIOR, SAME_SCENE_NS, Moment, Perceived
+from schemas.observations import WITHOUT_LABELS
 
 __all__ = ["AS_LOGGED", "BY_DOPPLER", "WITHOUT_ROWS", "Found", "Shown", "Sources", "perceive_moment", "work"]
 
@@ -46,8 +47,8 @@ WITHOUT_ROWS: Final = "frames_without_lidar_rows"
 # Likewise, of sweeps that no odometry de-skewed: moved by a radar's velocity, or left, for that was unknown.
 BY_DOPPLER: Final = "frames_deskewed_by_doppler"
 AS_LOGGED: Final = "frames_not_deskewed"
-# What to do about a camera without semantics, with its section of fleet.toml.
-_REMEDY: Final = "name its topics or models in {} (`boresight models fetch` downloads two models)"
+# Remark on cameras without semantics, with the section of fleet.toml that would give them some.
+_REMEDY: Final = "to have labels, name topics or models in {} (`boresight models fetch` downloads two models)"
 
 _Joined = tuple[Moment, dict[str, Any]]
 
@@ -56,8 +57,8 @@ def work(task: Task) -> Work:
     """Features of a day's moments: the partition of `perceived`, and the features of each sensor.
 
     Unusable sensors are left out of their moment; moments without two sensors are left out, counted by
-    reason. If none is left, the partition is empty and the outcome "refused". A camera without semantics is
-    left out with a remark, and moments of the other sensors are kept, even of one lidar.
+    reason. If none is left, the partition is empty and the outcome "refused". Of a camera without semantics,
+    steps of brightness take the place of labels, with a remark.
 
     Raises:
         ConfigError: the vehicle is unknown or a manifest is missing.
@@ -79,7 +80,6 @@ def _rows(
     """The day's moments with their features, one row group of each sensor in memory at a time."""
     ingested = task.inputs[MOMENTS.name]
     stars, kinds = logged_stars(ingested.extra.get(PRIOR, ())), sensors_of(ingested)
-    blind = [s for s, kind in kinds.items() if kind == "camera" and s not in sources.cameras]
     tracks: dict[str, TrackState] = {}
     whole_ns = -SAME_SCENE_NS
     turning = _turning(task, [s for s, kind in kinds.items() if kind == "lidar"]) if sources.deskew else {}
@@ -96,16 +96,16 @@ def _rows(
         except ModelOutputError as err:
             raise NothingUsable(f"{FAULTS['model_output']}: {err}", "model_output") from err
         run.progress(seen, ingested.rows, "perceive")
-        run.rejected.update(f"without_{s}_{FrameReason.NO_SEMANTICS.value}" for s in blind if s in captures)
         if found is not None:
             tracks = tracks | found.tracks
             whole_ns = whole_ns if found.unusable else moment.stamp_ns
             run.kept.update([*found.notes, *(note for _, note in timed.values() if note)])
             run.rejected.update(f"without_{sensor}_{why.value}" for sensor, why in found.unusable.items())
             yield found.moment, found.features
-    told = {s: f"{FAULTS['no_labels']}, {s}: {_REMEDY.format(section.replace('NAME', s))}" for s in blind}
-    run.remarks = "; ".join([*told.values(), *sources.remarks()])
-    run.extra |= {PRIOR: ingested.extra.get(PRIOR, []), SENSORS_ABSENT: told}
+    unlabelled = [s for s, kind in kinds.items() if kind == "camera" and sources.cameras[s] is None]
+    told = [f"{s}: {WITHOUT_LABELS}; {_REMEDY.format(section.replace('NAME', s))}" for s in unlabelled]
+    run.remarks = "; ".join([*told, *sources.remarks()])
+    run.extra |= {PRIOR: ingested.extra.get(PRIOR, [])}
 
 
 def _turning(task: Task, lidars: Sequence[str]) -> dict[str, Turning]:
@@ -131,12 +131,12 @@ def _ahead(moments: Iterator[_Joined], sources: Sources) -> Generator[_Joined, N
 
 @dataclass(frozen=True, eq=False)
 class Sources:
-    """Models and settings by sensor's name; None = geometry.
+    """Models and settings by sensor's name; None = geometry, of a camera steps of brightness.
 
     `deskew` has the sweeps without odometry, which a radar's velocity moves to their stamps.
     """
 
-    cameras: Mapping[str, SemanticsSource]
+    cameras: Mapping[str, SemanticsSource | None]
     lidars: Mapping[str, PointSource | None]
     radars: Mapping[str, DrivableSource | None]
     config: PerceiveConfig
@@ -193,11 +193,10 @@ def perceive_moment(
 
     Raises:
         ModelError: a model contradicts its manifest.
-        FrameRejectedError: fewer than two usable sensors (one, if all others are cameras without semantics),
-            or the moment is not alone.
+        FrameRejectedError: fewer than two usable sensors, or the moment is not alone.
     """
     moment, config = shown.moment, sources.config
-    asked = {s: c for s, c in shown.captures.items() if shown.kinds[s] != "camera" or s in sources.cameras}
+    asked = shown.captures
     unusable = {s: why for s, c in asked.items() if (why := why_unusable(c)) is not None}
     features: dict[str, Any] = {}
     for camera, image in shown.of("camera", _less(asked, unusable)).items():
@@ -206,9 +205,7 @@ def perceive_moment(
         except FrameRejectedError as why:
             unusable[camera] = why.reason
     usable = _less(asked, unusable)
-    # A camera without semantics joins no edge; a lidar that is left with it shows where the camera could be.
-    sighted = sum(kind != "camera" or s in sources.cameras for s, kind in shown.kinds.items())
-    if len(usable) < min(2, sighted) or (unusable and not _is_worth_having(shown, usable, alone=alone)):
+    if len(usable) < 2 or (unusable and not _is_worth_having(shown, usable, alone=alone)):
         raise FrameRejectedError(next(iter(unusable.values()), FrameReason.NO_LABELS))
     # One generator per moment: the result does not depend on which came before.
     seed = [moment.stamp_ns & 0x7FFFFFFFFFFFFFFF, moment.moment]
@@ -272,9 +269,11 @@ def _deskewed(shown: Shown, lidar: str, sweep: Sweep, motions: Mapping[str, Rada
 def _sources(rig: Rig, fleet: FleetConfig) -> tuple[Sources, dict[str, Any]]:
     """Sources of each sensor, and their part of the work key."""
     keys: dict[str, Any] = {}
-    cameras = {}
+    cameras: dict[str, SemanticsSource | None] = {}
     for name, camera in rig.cameras.items():
-        if camera.semantics is not None:
+        if camera.semantics is None:
+            cameras[name], keys[name] = None, {"source": "brightness"}
+        else:
             cameras[name], keys[name] = _source(camera.semantics, fleet)
     lidars = {name: _points(lidar, fleet) for name, lidar in rig.lidars.items()}
     radars = {name: _drivable(radar, fleet) for name, radar in rig.radars.items()}

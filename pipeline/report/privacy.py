@@ -1,7 +1,8 @@
 """Pictures with people and number plates made unrecognisable: road users in mosaic.
 
-The mosaic covers pixels of road users' classes and detections, grown by a margin. A person found by neither
-segmenter nor detector stays visible; if that must not happen, draw pages without pictures.
+The mosaic covers pixels of road users' classes and detections, grown by a margin; all of a picture whose camera has
+no semantics. A person found by neither segmenter nor detector stays visible; if that must not happen, draw pages
+without pictures.
 """
 
 from __future__ import annotations
@@ -45,7 +46,12 @@ def without_road_users(frame: Frame, observation: Observation) -> Frame:
 
 
 def road_user_mask(observation: Observation, size_px: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
-    """Pixels of the full image (width, height) of road users by labels or detections, with a margin."""
+    """Pixels of the full image (width, height) of road users by labels or detections, with a margin.
+
+    All pixels, if nothing was looked for.
+    """
+    if observation.is_unlabelled:
+        return np.ones(size_px[::-1], bool)
     labels: UInt8[np.ndarray, "h w"] | None = cv2.imdecode(
         np.frombuffer(observation.labels_png, np.uint8), cv2.IMREAD_GRAYSCALE
     )

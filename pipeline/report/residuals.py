@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
 from pipeline.geometry.cameras import camera_of
@@ -19,7 +19,7 @@ from pipeline.geometry.se3 import transform_points
 from pipeline.report.overlays import Extrinsics
 from pipeline.report.time_offsets import TimeOffsets, as_stamped
 from schemas.calibrations import pairs_of
-from schemas.observations import EDGE_LEFT, EDGE_RIGHT, Observation
+from schemas.observations import EDGE_LEFT, EDGE_RIGHT, STEP_RIGHT, Observation
 
 __all__ = ["MEASURES", "at_pixels", "boundary_distance_px", "frame_residuals"]
 
@@ -62,16 +62,12 @@ def frame_residuals(
 def boundary_distance_px(observation: Observation, only: Sequence[int] = ()) -> Float[np.ndarray, "H W"]:
     """Distance of each label pixel to the nearest horizontal change of label [full-image px], or inf.
 
-    One of the labels `only` must be at the change; empty = any label.
+    One of the labels `only` must be at the change; empty = any label. Without labels: to the nearest step of
+    brightness.
     """
-    labels = _decode_labels(observation)
-    change = np.zeros(labels.shape, bool)
-    change[:, 1:] = labels[:, 1:] != labels[:, :-1]
-    if only:
-        chosen = np.isin(labels, only)
-        change[:, 1:] &= chosen[:, 1:] | chosen[:, :-1]
+    change = _steps(observation) if observation.is_unlabelled else _changes(observation, only)
     if not change.any():
-        return np.full(labels.shape, np.inf)
+        return np.full(change.shape, np.inf)
     return cv2.distanceTransform((~change).astype(np.uint8), cv2.DIST_L2, 3) / float(observation.label_scale)
 
 
@@ -84,10 +80,26 @@ def at_pixels(
     return label_map[row, column].astype(np.float64)
 
 
-def _decode_labels(observation: Observation) -> np.ndarray:
-    bytes_ = np.frombuffer(observation.labels_png, np.uint8)
-    labels = cv2.imdecode(bytes_, cv2.IMREAD_GRAYSCALE) if len(bytes_) else None
-    return np.zeros((1, 1), np.uint8) if labels is None else labels
+def _changes(observation: Observation, only: Sequence[int]) -> Bool[np.ndarray, "H W"]:
+    labels = _decoded(observation.labels_png)
+    change = np.zeros(labels.shape, bool)
+    change[:, 1:] = labels[:, 1:] != labels[:, :-1]
+    if only:
+        chosen = np.isin(labels, only)
+        change[:, 1:] &= chosen[:, 1:] | chosen[:, :-1]
+    return change
+
+
+def _steps(observation: Observation) -> Bool[np.ndarray, "H W"]:
+    steps = _decoded(observation.steps_png or b"")
+    change = np.zeros(steps.shape, bool)
+    change[:, 1:] = (steps[:, :-1] & STEP_RIGHT) > 0
+    return change
+
+
+def _decoded(png: bytes) -> np.ndarray:
+    image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE) if png else None
+    return np.zeros((1, 1), np.uint8) if image is None else image
 
 
 def _on_silhouette(observation: Observation, boundary: np.ndarray, T_camera_lidar: np.ndarray) -> float:

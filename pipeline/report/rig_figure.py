@@ -129,11 +129,11 @@ def _upright(kind: str) -> Float[np.ndarray, "4 4"]:
 
 
 def _known(pose: PoseRow) -> str:
-    """Text with the accuracy of directions in the sensor."""
+    """Text with the accuracy of directions in the sensor, and remarks on its pose."""
     if pose.azimuth_sigma_rad is None or pose.elevation_sigma_rad is None:
         return pose.reason
     azimuth_deg, elevation_deg = np.degrees([pose.azimuth_sigma_rad, pose.elevation_sigma_rad])
-    return f"azimuth ± {azimuth_deg:.2f}°, elevation ± {elevation_deg:.2f}°"
+    return "; ".join([f"azimuth ± {azimuth_deg:.2f}°, elevation ± {elevation_deg:.2f}°", *pose.notes])
 
 
 def _places(sensors: Sequence[DrawnSensor], height: float) -> dict[str, tuple[float, float]]:

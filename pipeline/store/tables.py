@@ -220,6 +220,7 @@ def _writer_options(schema: TableSchema) -> dict[str, Any]:
         "image",
         "labels_png",
         "road_contrast_png",
+        "steps_png",
         "lidar_x_m",
         "lidar_y_m",
         "lidar_z_m",

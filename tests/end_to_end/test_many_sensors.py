@@ -22,6 +22,7 @@ from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import frames_of, ingested, observations_of, perceived
 from schemas.calibrations import CalibrationRecord
 from schemas.moments import PRIOR, SENSORS_ABSENT
+from schemas.observations import WITHOUT_LABELS
 from schemas.poses import PoseRow
 from tests.makers.kept_days import kept_fleet
 from tests.makers.stages import ingest_day, perceive_day
@@ -84,21 +85,28 @@ def test_what_is_damaged_of_one_camera_costs_that_camera_alone(day, tmp_path, mo
 
 
 @pytest.mark.slow
-def test_a_camera_without_semantics_is_counted_and_told_what_to_set_and_the_others_go_on(day, tmp_path):
+def test_a_camera_without_semantics_is_aligned_by_brightness_and_records_poses_and_outcomes_say_so(
+    day, tmp_path
+):
     lake, fleet, _, (_, before) = day
     copy = Lake.at(tmp_path / "lake")
     shutil.copytree(lake.root, copy.root)
     name, rig = next(iter(fleet.rigs.items()))
-    blind = rig.cameras | {"left": rig.cameras["left"].model_copy(update={"semantics": None})}
-    fleet = fleet.model_copy(update={"rigs": {name: rig.model_copy(update={"cameras": blind})}})
+    bare = rig.cameras | {"left": rig.cameras["left"].model_copy(update={"semantics": None})}
+    fleet = fleet.model_copy(update={"rigs": {name: rig.model_copy(update={"cameras": bare})}})
     found = perceive_day(DAY, fleet, copy)
     assert (found.status, found.rows) == ("done", before.rows)
-    assert found.rejected["without_left_no_semantics"] == before.rows
-    assert "left: name its topics or models in [rigs.duo.cameras.left.semantics]" in found.reason
-    assert sensors_of(perceived(copy, DAY)).keys() == KINDS.keys() - {"left"}
-    poses = CALIBRATE.run(Task(fleet, copy, DAY)).records
-    (left,) = [r for r in poses if isinstance(r, PoseRow) and r.sensor == "left"]
-    assert (left.status, "[rigs.duo.cameras.left.semantics]" in left.reason) == ("refused", True)
+    assert f"left: {WITHOUT_LABELS}" in found.reason
+    assert "[rigs.duo.cameras.left.semantics]" in found.reason
+    outcome = CALIBRATE.run(Task(fleet, copy, DAY))
+    assert f"left: {WITHOUT_LABELS}" in outcome.reason
+    records = [r for r in outcome.records if isinstance(r, CalibrationRecord)]
+    noted = {(r.parent_frame, r.pair) for r in records if WITHOUT_LABELS in r.notes}
+    assert noted == {("left", "camera_lidar")}
+    with_radar = [r for r in records if r.parent_frame == "left" and r.pair == "camera_radar"]
+    assert all((r.status, r.faults) == ("refused", ["no_labels"]) for r in with_radar)
+    poses = {r.sensor: r.notes for r in outcome.records if isinstance(r, PoseRow)}
+    assert {sensor for sensor, notes in poses.items() if WITHOUT_LABELS in notes} == {"left"}
 
 
 @pytest.mark.parametrize("camera", ["front", "left"])

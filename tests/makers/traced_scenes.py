@@ -15,6 +15,7 @@ import numpy as np
 from pipeline.config import PerceiveConfig
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse
+from pipeline.perceive.brightness import brightness_steps
 from pipeline.perceive.depth_edges import lidar_edges
 from pipeline.perceive.road_markings import lidar_markings, road_contrast
 from schemas.observations import Observation
@@ -23,6 +24,10 @@ from tests.makers.solve_scenes import AXES, make_observation
 GROUND_M = -1.8
 ROAD_HALF_WIDTH_M = 6.0
 ROAD, TERRAIN, VEGETATION, POLE, SKY, CAR = 0, 9, 8, 5, 10, 13
+VOID = 255
+# Brightness of what a camera without semantics sees.
+GREY = np.full(256, 120, np.uint8)
+GREY[[ROAD, TERRAIN, VEGETATION, POLE, SKY, CAR]] = 80, 105, 50, 150, 230, 30
 
 
 @dataclass(frozen=True)
@@ -114,6 +119,44 @@ def traced_frame(
         lidar_edge_gap_rad=edges.gap_rad, lidar_edge_points=edges.points,
         marking_xyz_m=marks.xyz_m, marking_z=marks.z, ground_plane=np.array([0.0, 0, 1, -GROUND_M]),
     )  # fmt: skip
+
+
+def without_labels(day: Sequence[Observation]) -> list[Observation]:
+    """The same scenes as a camera without semantics shows them: steps of brightness, no labels, no road users."""
+    return [_without_labels(o) for o in day]
+
+
+def _without_labels(o: Observation) -> Observation:
+    labels, contrast = (
+        cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE)
+        for png in (o.labels_png, o.road_contrast_png)
+    )
+    grey = GREY[labels]
+    grey[contrast > 60] = 200  # paint
+    grey = cv2.GaussianBlur(grey, (3, 3), 0.7)
+    none = {"road_user_boxes_px": np.zeros((0, 4), np.float32), "road_user_classes": [],
+            "road_user_scores": np.zeros(0, np.float32), "sky_fraction": 0.0, "drivable_fraction": 0.0}  # fmt: skip
+    return replace(
+        o, **none,
+        labels_png=cv2.imencode(".png", np.full(labels.shape, VOID, np.uint8))[1].tobytes(),
+        steps_png=cv2.imencode(".png", brightness_steps(grey))[1].tobytes(),
+        road_contrast_png=cv2.imencode(".png", road_contrast(grey, np.ones(grey.shape, bool)))[1].tobytes(),
+        lidar_drivable_xyz_m=free_ground(o).astype(np.float32),
+    )  # fmt: skip
+
+
+def free_ground(o: Observation) -> np.ndarray:
+    """Road on a 1 m grid, as far as no object stands in the way, lidar frame."""
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(4.0, 60), np.arange(-5.0, 6)))
+    objects = o.lidar_map_xyz_m[o.lidar_map_is_ground == 0]
+    reach_m = np.full(181, np.inf)
+    np.minimum.at(reach_m, _degrees_of(objects[:, 0], objects[:, 1]), np.hypot(objects[:, 0], objects[:, 1]))
+    is_free = np.hypot(x, y) < reach_m[_degrees_of(x, y)]
+    return np.column_stack([x, y, np.full(len(x), GROUND_M)])[is_free]
+
+
+def _degrees_of(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return np.round(np.degrees(np.arctan2(y, x))).astype(int) + 90
 
 
 def scatter_boxes(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

@@ -2,16 +2,18 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
 from pipeline.config import FleetConfig
 from pipeline.errors import ConfigError, ContractError
+from pipeline.perceive.labels import VOID_ID
 from pipeline.perceive.stage import WITHOUT_ROWS
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import observations_of, perceived
 from schemas.calibrations import SENSORS
-from schemas.faults import FAULTS
+from schemas.observations import STEP_BELOW, STEP_RIGHT, WITHOUT_LABELS
 from tests.makers.lakes import write_frames
 from tests.makers.stages import perceive_day
 
@@ -207,19 +209,31 @@ def test_a_day_without_labels_keeps_lidar_and_radar(lake, made_frame):
         np.testing.assert_array_equal(a.radar_track_xyz_m, b.radar_track_xyz_m)
 
 
-def test_a_camera_without_semantics_leaves_a_lone_lidar_its_frames_and_says_what_to_do(lake, made_frame):
+def test_a_camera_without_semantics_shows_steps_of_brightness_and_is_told_how_to_have_labels(
+    lake, made_frame
+):
     perceive_day(DAY, fleet(), lake)
-    whole, blind = rows(lake), fleet()
-    rig = blind.rigs["default"]
+    whole, bare = rows(lake), fleet()
+    rig = bare.rigs["default"]
     cameras = {"camera": rig.cameras["camera"].model_copy(update={"semantics": None})}
-    rig = rig.model_copy(update={"cameras": cameras, "radars": {}})
-    write(lake, [replace(made_frame(i), sensors=["camera", "lidar"]) for i in range(5)], key="blind")
-    result = perceive_day(DAY, blind.model_copy(update={"rigs": {"default": rig}}), lake)
-    assert (result.status, result.rows) == ("done", 5)
-    assert result.reason.startswith(FAULTS["no_labels"])
+    bare = bare.model_copy(update={"rigs": {"default": rig.model_copy(update={"cameras": cameras})}})
+    write(
+        lake, [replace(made_frame(i), labels_png=None, detection_boxes_px=None) for i in range(5)], key="bare"
+    )
+    result = perceive_day(DAY, bare, lake)
+    assert (result.status, result.rows, result.rejected) == ("done", 5, {})
+    assert result.reason.startswith(f"camera: {WITHOUT_LABELS}")
+    assert "[rigs.default.cameras.camera.semantics]" in result.reason
     assert "boresight models fetch" in result.reason
     for a, b in zip(rows(lake), whole, strict=True):
-        assert a.sensors == ["lidar"]
+        assert (a.sensors, a.is_unlabelled, b.is_unlabelled) == (b.sensors, True, False)
+        labels, steps = (
+            cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE)
+            for png in (a.labels_png, a.steps_png)
+        )
+        assert (labels.min(), labels.shape) == (VOID_ID, steps.shape)
+        assert steps.max() <= STEP_RIGHT + STEP_BELOW
+        assert (a.label_gradients, len(a.road_user_boxes_px)) == (None, 0)
         np.testing.assert_array_equal(a.lidar_edge_xyz_m, b.lidar_edge_xyz_m)
 
 

@@ -25,7 +25,7 @@ from pipeline.report.scenes import choose_frames, choose_windows
 from pipeline.sections import ReportConfig
 from schemas.calibrations import SENSORS
 from schemas.frames import Frame
-from schemas.observations import EDGE_LEFT, EDGE_RIGHT, Observation
+from schemas.observations import EDGE_LEFT, EDGE_RIGHT, STEP_RIGHT, Observation
 
 WIDTH, HEIGHT, FOCAL = 700, 300, 600.0
 T_CL = from_rotation_translation(
@@ -208,3 +208,24 @@ def test_what_is_no_picture_is_not_shown_where_road_users_are_hidden():
     scene = _scene()
     broken = replace(scene.frame, image=b"no picture")
     assert scene_of(broken, scene.observation, ReportConfig(road_users="hidden")).frame.image == b""
+
+
+def test_a_picture_that_nobody_looked_for_road_users_in_is_hidden_whole():
+    scene, rng = _scene(), np.random.default_rng(6)
+    image = rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+    frame = replace(scene.frame, image=cv2.imencode(".png", image)[1].tobytes())
+    unlabelled = replace(scene.observation, steps_png=scene.observation.labels_png)
+    hidden = decode_image(scene_of(frame, unlabelled, ReportConfig(road_users="hidden")).frame)
+    assert len(np.unique(hidden.reshape(-1, 3), axis=0)) < 0.02 * image.size
+
+
+def test_without_labels_distances_are_to_steps_of_brightness():
+    scene = _scene()
+    steps = np.zeros((HEIGHT, WIDTH), np.uint8)
+    steps[:, 60] = STEP_RIGHT
+    unlabelled = replace(
+        scene.observation, steps_png=cv2.imencode(".png", steps)[1].tobytes(), label_scale=1.0
+    )
+    distance = boundary_distance_px(unlabelled, (5,))
+    assert (distance[:, 61] == 0).all()
+    assert distance[50, 91] == pytest.approx(30.0, abs=2.0)

@@ -49,6 +49,8 @@ def trigger_metrics(
     }
     for observation in observations:
         there = set(pairs_of(observation.sensors)) & transforms.keys()
+        if observation.is_unlabelled:
+            there -= {"camera_lidar", "camera_radar"}
         labels = labels_of(observation) if "camera" in observation.sensors else np.zeros((0, 0), np.uint8)
         if "camera_lidar" in there:
             outside = _lidar_outside(observation, labels, transforms["camera_lidar"])

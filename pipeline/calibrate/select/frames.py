@@ -184,6 +184,7 @@ def missing_content(observations: Sequence[Observation], pair: str) -> list[str]
             missing.append("the radar measures no elevation: its roll, pitch and height stay at the prior")
     if (
         "camera" in FRAMES_OF_PAIR[pair]
+        and not any(o.is_unlabelled for o in observations)
         and np.mean([len(o.road_user_boxes_px) > 0 for o in observations]) < _SCARCE
     ):
         missing.append("hardly any road users in the images")

@@ -33,6 +33,7 @@ from pipeline.objective.camera_lidar.label_width import widened
 from pipeline.objective.camera_lidar.score import (
     Alignments,
     KernelSettings,
+    Start,
     Terms,
     lidar_velocities,
     prepare_terms,
@@ -106,7 +107,11 @@ def _camera_lidar(
     velocity = lidar_velocities(observations, prior.T_lidar_radar, heading_rad)
     reach = float(apart) + _REACH_RAD
     readout_s = prior.camera.readout_s
-    terms = prepare_terms(observations, estimate.T, velocity, reach_rad=reach, readout_s=readout_s)
+    # As in the fit: paint is looked for where the prior puts free ground.
+    start = Start(prior.T_camera_lidar, prior.rotation_sigma_rad)
+    terms = prepare_terms(
+        observations, estimate.T, velocity, reach_rad=reach, readout_s=readout_s, start=start
+    )
     focal = estimate.diagnostics.get("focal_scale", 1.0)
     # Of methods that estimate none: as if sensors of constant gaps measured together.
     dt_s = (

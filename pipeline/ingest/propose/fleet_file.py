@@ -108,8 +108,9 @@ def _camera(camera: FoundCamera) -> Iterator[str]:
         what = (
             "label images or detections" if has == "no" else "label images" if camera.labels else "detections"
         )
-        yield f"# The logs have {has} {what} of this camera, and it needs both. Log them, or name two models, of yours"
-        yield "# or those that `boresight models fetch` downloads into models/ (mind their licences):"
+        yield f"# The logs have {has} {what} of this camera; semantics are both. Without them, its borders are steps"
+        yield "# of brightness, and it has no edge to a radar. Better: log both, or name two models, of yours or those"
+        yield "# that `boresight models fetch` downloads into models/ (mind their licences):"
         yield f"# {semantics_line('models')}"
         return
     known = "" if camera.label_set in ("cityscapes", "") else f', label_set = "{camera.label_set}"'

@@ -25,6 +25,7 @@ from pipeline.results import Progress, silent
 from pipeline.rig.rig import Rig
 from pipeline.store.views import logged_stars
 from schemas.frames import Frame
+from schemas.observations import WITHOUT_LABELS
 
 __all__ = ["Proposal", "propose_fleet"]
 
@@ -66,7 +67,8 @@ def propose_fleet(logs: Sequence[Path], fleet: str, progress: Progress = silent)
 
     meanings = _meanings(survey.logs, text({}), found, names, progress)
     cameras = {n: s for n, s in names.items() if isinstance(s, FoundCamera)}
-    missing = [f"{n}: semantics" for n, s in cameras.items() if not (s.labels and s.detections)]
+    unlabelled = [n for n, s in cameras.items() if not (s.labels and s.detections)]
+    missing = [f"{n}: semantics (recommended; {WITHOUT_LABELS})" for n in unlabelled]
     missing += ["prior: transforms between the sensors"] if untied or not static else []
     missing += [f"{n}: the Doppler's sign" for n, m in meanings.items() if not m.positive]
     return Proposal(text(meanings), tuple(names), tuple(missing), tuple(survey.logs), tuple(survey.problems))

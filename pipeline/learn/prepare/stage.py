@@ -80,7 +80,8 @@ def _samples(
         return
     lake, partition, fleet = task.lake, task.partition, task.fleet
     frames = frames_of(lake, partition, sorted(about), chosen)
-    whole = (o for o in observations_of(lake, partition, chosen=chosen) if len(o.sensors) == len(SENSORS))
+    rows = observations_of(lake, partition, chosen=chosen)
+    whole = (o for o in rows if len(o.sensors) == len(SENSORS) and not o.is_unlabelled)
     observation = next(whole, None)
     if observation is None:
         rejected[SampleReason.SENSOR_MISSING.value] += len(about)

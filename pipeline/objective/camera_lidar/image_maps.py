@@ -1,4 +1,4 @@
-"""Image maps of the camera-lidar terms: offsets to mask boundaries by direction, road contrast, labels.
+"""Image maps of the camera-lidar terms: offsets to boundaries by direction, road contrast, labels.
 
 All maps are at label size. Boundaries lie between pixels, so an offset is stored as the integer k of k + 1/2
 pixels from a pixel's centre along the boundary's axis: exact in one byte, for every kernel width.
@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Int8, UInt8
 
 from pipeline.geometry.cameras import Camera, camera_of
+from pipeline.objective.camera_lidar.brightness_maps import Start, free_ground, step_offsets
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -218,18 +219,28 @@ def _over_rows(x: np.ndarray) -> np.ndarray:
     return cv2.GaussianBlur(x, (1, 25), 0, sigmaY=4.0)
 
 
-def prepare_maps(observations: Sequence[Observation], blurs_px: tuple[float, ...]) -> CameraMaps:
-    """Decode and prepare the maps of frames that share one camera and one label size."""
-    first = observations[0]
+def prepare_maps(
+    observations: Sequence[Observation], blurs_px: tuple[float, ...], start: Start
+) -> CameraMaps:
+    """Decode and prepare the maps of frames that share one camera and one label size.
+
+    Without labels, borders are steps of brightness, and paint is looked for where `start` puts free ground.
+    """
+    camera = camera_of(observations[0]).scaled(observations[0].label_scale)
     labels = np.stack([_decoded(o.labels_png) for o in observations])
     count, size = len(observations), labels.shape[1:]
     offsets = np.empty((count, 4, *size), np.int8)
     contrast = np.zeros((len(blurs_px), count, *size), np.int8)
     for f, o in enumerate(observations):
-        _scan(_FOREGROUND, labels[f], offsets[f])
+        is_road = labels[f] == _ROAD
+        if o.steps_png is None:
+            _scan(_FOREGROUND, labels[f], offsets[f])
+        else:
+            offsets[f] = step_offsets(_decoded(o.steps_png), REACH_PX, NO_BOUNDARY)
+            is_road = free_ground(o.lidar_drivable_xyz_m.astype(np.float64), camera, start)
         if o.road_contrast_png is not None:
-            contrast[:, f] = contrast_levels(_decoded(o.road_contrast_png), labels[f] == _ROAD, blurs_px)
-    return CameraMaps(camera_of(first).scaled(first.label_scale), offsets, contrast, labels)
+            contrast[:, f] = contrast_levels(_decoded(o.road_contrast_png), is_road, blurs_px)
+    return CameraMaps(camera, offsets, contrast, labels)
 
 
 def _decoded(png: bytes) -> UInt8[np.ndarray, "H W"]:

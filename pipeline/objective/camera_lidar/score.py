@@ -15,6 +15,7 @@ import numba
 import numpy as np
 from jaxtyping import Float, Float32, Int64
 
+from pipeline.objective.camera_lidar.brightness_maps import Start
 from pipeline.objective.camera_lidar.edges import (
     chance_of,
     edge_gradients,
@@ -46,6 +47,7 @@ __all__ = [
     "CONTRAST_BLURS_PX",
     "Alignments",
     "KernelSettings",
+    "Start",
     "Terms",
     "lidar_velocities",
     "prepare_terms",
@@ -401,13 +403,15 @@ def prepare_terms(
     *,
     reach_rad: float,
     readout_s: float = 0.0,
+    start: Start | None = None,
 ) -> Terms:
     """Decode maps and gather the points that can come into view within `reach_rad` of a pose.
 
     `readout_s` is the rolling shutter's, from the first image row to the last; `Terms.exposed_at` brings it
-    to bear.
+    to bear. Without labels, `start` decides where paint is looked for; None = anywhere within reach of the pose.
     """
-    maps = prepare_maps(observations, CONTRAST_BLURS_PX)
+    start = Start(T_camera_lidar, reach_rad) if start is None else start
+    maps = prepare_maps(observations, CONTRAST_BLURS_PX, start)
     view = (observations, T_camera_lidar, maps.camera, reach_rad)
     edges, markings, classes = gather_edges(*view), gather_markings(*view), gather_classes(*view)
     yaw_rate = np.array([o.ego_yaw_rate_radps or 0.0 for o in observations])

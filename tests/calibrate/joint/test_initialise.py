@@ -167,6 +167,7 @@ def test_a_term_without_data_weighs_nothing(terms):
     assert evidence.weighted().marking_weight == 0.0
     assert evidence.weighted().edge_weight == 1.0
     assert evidence.of(wrong)[:, 1].tolist() == [0.0] * len(wrong)
+    assert evidence.terms_with_values == 2  # so chance has no third term either
 
 
 def test_the_best_of_many_chance_poses_shows_as_much_as_drawn_ones():

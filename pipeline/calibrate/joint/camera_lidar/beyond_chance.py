@@ -73,6 +73,11 @@ class Evidence:
         tail = beyond.sum(0) / np.maximum((beyond > 0).sum(0), 1)
         return replace(raw, middle=tuple(np.median(shown, axis=0)), tail=tuple(tail))
 
+    @property
+    def terms_with_values(self) -> int:
+        """Number of terms that the day shows: classes need labels, markings need reflectivity."""
+        return sum(tail > 0 for tail in self.tail)
+
     def weighted(self) -> KernelSettings:
         """The kernel with equal weights of edges and markings in units of chance; the larger weight is 1."""
         weight = np.array([1 / t if t > 0 else 0.0 for t in self.tail[:2]])

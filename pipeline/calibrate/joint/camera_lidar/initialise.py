@@ -207,7 +207,7 @@ class _Search:
             best.origin,
             self.candidates,
             tuple(float(x) for x in best.evidence),
-            by_chance(self.poses, len(TERMS)),
+            by_chance(self.poses, self.evidence.terms_with_values),
             np.pi if rival is None else self._apart(rival.state, best.state),
             np.inf if rival is None else _rejected(best, rival),
         )
