@@ -188,7 +188,7 @@ def test_the_law_holds_of_lidar_radar_on_a_street():
     rng = np.random.default_rng(5)
     T = perturb_exactly(T_LIDAR_RADAR, np.radians(2.0), 0.05, rng)
     prior = Prior(T_CAMERA_LIDAR, T, float(np.radians(2.0)), 0.05)
-    law_holds(estimate_lidar_radar(street_day(20), prior, None, SolveConfig(), rng), prior)
+    law_holds(estimate_lidar_radar(street_day(20), prior, SolveConfig(), rng), prior)
 
 
 @pytest.mark.slow

@@ -37,7 +37,7 @@ def estimates():
     seen = estimate_camera_lidar(traced_day(SPARSE, 6, seed=3), prior, config, np.random.default_rng(5))
     T = perturb_exactly(T_LIDAR_RADAR, np.radians(2.0), 0.1, np.random.default_rng(0))
     prior = Prior(T_CAMERA_LIDAR, T, float(np.radians(2.0)), 0.05)
-    ranged = estimate_lidar_radar(street_day(12), prior, T_CAMERA_LIDAR, config, np.random.default_rng(3))
+    ranged = estimate_lidar_radar(street_day(12), prior, config, np.random.default_rng(3))
     return [
         (
             e.T.tolist(),
