@@ -86,9 +86,7 @@ def test_roll_owes_nothing_to_the_constant_below_the_box_centre():
     radar = transform_points(np.linalg.inv(true_T), camera)
     rolls = []
     for bias in (0.0, np.radians(-1.0)):
-        pairs = BoxPairs(
-            radar, seen[:, 0], seen[:, 1] - bias, np.full(n, 3), np.zeros(n, np.int64), np.zeros(n, np.int64)
-        )
+        pairs = BoxPairs(radar, seen[:, 0], seen[:, 1] - bias, np.zeros(n, np.int64), np.zeros(n, np.int64))
         T, found = solve_roll_and_bias(pairs)
         rolls.append((T @ np.linalg.inv(T_CAMERA_RADAR))[1, 0])
         assert abs(found[0] - bias) < np.radians(0.03)

@@ -47,7 +47,6 @@ _PAIR = np.dtype(  # of BoxPairs
         ("point_radar_m", "f8", 3),
         ("azimuth_rad", "f8"),
         ("elevation_rad", "f8"),
-        ("detections", "i8"),
         ("kind", "i8"),
         ("frame", "i8"),
     ]
@@ -78,7 +77,6 @@ class BoxPairs:
     point_radar_m: Float[np.ndarray, "B 3"]  # median azimuth, elevation and range of the detections
     azimuth_rad: Float[np.ndarray, " B"]  # box centre as the camera sees it, left positive
     elevation_rad: Float[np.ndarray, " B"]  # up positive
-    detections: Int64[np.ndarray, " B"]
     kind: Int64[np.ndarray, " B"]  # index into BOX_CLASSES
     frame: Int64[np.ndarray, " B"]  # index into the observations given
 
@@ -126,7 +124,7 @@ def box_pairs(
             if len(chosen) >= _LEAST_DETECTIONS:
                 middle = from_spherical(median_of_rows(to_spherical(radar[chosen])))
                 centre = boxes.azimuth_rad[b], boxes.elevation_rad[b]
-                rows.append((middle, *centre, len(chosen), boxes.kind[b], index))
+                rows.append((middle, *centre, boxes.kind[b], index))
     return BoxPairs(**columns_of(rows, _PAIR))
 
 
