@@ -17,7 +17,21 @@ from typing import Any, Literal, TypeVar, dataclass_transform, get_args, get_typ
 import numpy as np
 import pyarrow as pa
 
-__all__ = ["Column", "Posed", "Recorded", "TableSchema", "array", "column", "per_point", "points", "row"]
+__all__ = [
+    "POSE_COLUMNS",
+    "Column",
+    "Posed",
+    "Recorded",
+    "TableSchema",
+    "array",
+    "column",
+    "per_point",
+    "points",
+    "row",
+]
+
+# Columns of a pose T_a_b; where a row has several, each has a prefix (prior_qw, ego_tx_m).
+POSE_COLUMNS = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 
 Row = TypeVar("Row")
 

@@ -56,6 +56,8 @@ def print_table(table: str, rows: list[dict[str, Any]]) -> None:
 def _calibration_cells(row: dict[str, Any]) -> dict[str, str]:
     import numpy as np
 
+    from pipeline.geometry.pose_columns import pose_of
+
     sigma = np.full(6, np.nan) if row["covariance"] is None else np.sqrt(np.diag(row["covariance"]))
     seen = row["observable"] or [False] * 6
     degrees = " ".join(_sigma(s, o, 3) for s, o in zip(np.degrees(sigma[:3]), seen[:3], strict=True))
@@ -64,7 +66,7 @@ def _calibration_cells(row: dict[str, Any]) -> dict[str, str]:
         **_named(row, "vehicle", "day", "method"),
         "pair": _edge(row),
         "status": row["status"],
-        **_pose_cells(row["T"], _prior_of(row)),
+        **_pose_cells(row["T"], pose_of(row.__getitem__, "prior_")),
         "sigma [deg, m]": f"{degrees} deg\n{metres} m",
         "frames": str(row["frames_used"]),
         "certified": ", ".join(row["determined"]),
@@ -128,15 +130,6 @@ def _sure_cells(row: dict[str, Any]) -> dict[str, str]:
         "elevation [deg]": elevation,
         "certified": ", ".join(row["determined"]),
     }
-
-
-def _prior_of(row: dict[str, Any]) -> Any:
-    import numpy as np
-
-    from pipeline.geometry.se3 import from_quaternion
-
-    values = [row[f"prior_{name}"] for name in ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")]
-    return None if None in values else from_quaternion(np.array(values[:4]), np.array(values[4:]))
 
 
 def _pose_cells(T: Any, T_prior: Any, *, with_change: bool = True) -> dict[str, str]:

@@ -10,6 +10,7 @@ from pipeline.store.current import current_records, transform_of
 from pipeline.store.partitions import Lake, Partition, days_after
 from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
+from schemas.columns import POSE_COLUMNS
 
 __all__ = ["accepted_before"]
 
@@ -17,7 +18,6 @@ __all__ = ["accepted_before"]
 _DAYS_BACK = 10
 # A vehicle that drives once a week has ten days in a quarter; older days are not read.
 _CALENDAR_DAYS_BACK = 92
-_TRANSFORM = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 
 
 def accepted_before(
@@ -35,7 +35,7 @@ def accepted_before(
         vehicle=partition.vehicle,
         first=days_after(partition.day, -_CALENDAR_DAYS_BACK),
         last=days_after(partition.day, -1),
-        columns=_TRANSFORM,
+        columns=POSE_COLUMNS,
     )
     wanted = (edge.parent.name, edge.child.name, method, "accepted")
     records = current_records(found)

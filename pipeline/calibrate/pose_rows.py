@@ -73,18 +73,7 @@ def _row(
     views: Mapping[str, View],
     verify: VerifyConfig,
 ) -> PoseRow:
-    told: dict[str, Any] = {
-        "vehicle": about.partition.vehicle,
-        "day": about.partition.day,
-        "method": about.method,
-        "sensor": sensor.name,
-        "kind": sensor.kind,
-        "reference": graph.reference.name,
-        "work_key": about.work_key,
-        "code_version": CODE_VERSION,
-        "inputs": list(about.inputs),
-        "view_azimuth_rad": None if sensor.name not in views else _azimuth_seen(views[sensor.name], sensor),
-    }
+    told = _identity(about, graph, sensor, views)
     if sensor == graph.reference:
         where = transform_fields("", np.eye(4)) | {
             "covariance": np.zeros((6, 6)),
@@ -126,6 +115,21 @@ def _row(
         dt_sigma_s=found.dt_sigma_s,
         edges=[edge.name for edge in found.rests_on],
     )
+
+
+def _identity(about: Inputs, graph: RigGraph, sensor: Sensor, views: Mapping[str, View]) -> dict[str, Any]:
+    return {
+        "vehicle": about.partition.vehicle,
+        "day": about.partition.day,
+        "method": about.method,
+        "sensor": sensor.name,
+        "kind": sensor.kind,
+        "reference": graph.reference.name,
+        "work_key": about.work_key,
+        "code_version": CODE_VERSION,
+        "inputs": list(about.inputs),
+        "view_azimuth_rad": None if sensor.name not in views else _azimuth_seen(views[sensor.name], sensor),
+    }
 
 
 def _targets(sensor: Sensor, poses: Extrinsics, views: Mapping[str, View]) -> Float[np.ndarray, "3 3"]:

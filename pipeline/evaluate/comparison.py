@@ -20,6 +20,7 @@ from pipeline.geometry.targets import (
 )
 from pipeline.store.current import targets_of
 from schemas.calibrations import PAIRS, CalibrationRecord
+from schemas.columns import POSE_COLUMNS
 
 __all__ = ["compare", "current_runs"]
 
@@ -99,8 +100,7 @@ def _independent_loop(run: Mapping[str, CalibrationRecord]) -> tuple[float, floa
 
 
 def _transform(record: CalibrationRecord, prefix: str) -> np.ndarray:
-    names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
-    values = np.array([getattr(record, prefix + name) for name in names], np.float64)
+    values = np.array([getattr(record, prefix + name) for name in POSE_COLUMNS], np.float64)
     return from_quaternion(values[:4], values[4:])
 
 

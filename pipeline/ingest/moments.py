@@ -11,11 +11,8 @@ from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
-import numpy as np
-from jaxtyping import Float
-
 from pipeline.config import IngestConfig
-from pipeline.geometry.se3 import to_quaternion
+from pipeline.geometry.pose_columns import pose_columns
 from pipeline.ingest.captures import Read, Rejected, readers_of
 from pipeline.ingest.index import DayIndex
 from pipeline.ingest.logged_prior import LoggedPrior
@@ -75,7 +72,7 @@ class MomentBuilder:
             gap_ns={sensor: capture.stamp_ns - stamp_ns for sensor, capture in captures.items()},
             ego_speed_mps=None if ego is None else ego.speed_mps,
             ego_yaw_rate_radps=None if ego is None else ego.yaw_rate_radps,
-            **_pose_columns(None if ego is None else ego.T_odom_vehicle),
+            **pose_columns(None if ego is None else ego.T_odom_vehicle, "ego_"),
         )  # fmt: skip
         return row, captures
 
@@ -110,9 +107,3 @@ class MomentBuilder:
             self.counts[name] += 1
             if self.counts[name] == 1 and why.detail:
                 self._index.complain(str(why))
-
-
-def _pose_columns(T: Float[np.ndarray, "4 4"] | None) -> dict[str, float | None]:
-    names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
-    values = [None] * 7 if T is None else [float(v) for v in (*to_quaternion(T), *T[:3, 3])]
-    return {f"ego_{n}": v for n, v in zip(names, values, strict=True)}

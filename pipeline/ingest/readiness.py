@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from schemas.observations import WITHOUT_LABELS
 
-__all__ = ["DofVerdict", "Evidence", "in_order", "judge", "judge_edge", "overall"]
+__all__ = ["DofVerdict", "Evidence", "in_order", "judge_edge", "overall"]
 
 # 30 frames give camera-lidar within 0.1 deg and lidar-radar yaw within 0.15 deg on real logs; 10 give twice
 # that.
@@ -51,16 +51,6 @@ class DofVerdict:
     dof: str
     verdict: str
     reasons: list[str] = field(default_factory=list)
-
-
-def judge(evidence: Evidence) -> list[DofVerdict]:
-    """One verdict per pair and class of DoF: the weakest of its requirements."""
-    of_pair = dict.fromkeys(_ORDER, evidence.frames) if evidence.frames_of is None else evidence.frames_of
-    return [
-        verdict
-        for pair in sorted(of_pair, key=_ORDER.index)
-        for verdict in judge_edge(pair, pair, replace(evidence, frames=of_pair[pair]))
-    ]
 
 
 def in_order(kind: str) -> int:

@@ -130,7 +130,6 @@ def ego_motion(
     odometry: Odometry,
     *,
     heading: tuple[float, float] | None = None,
-    axle_behind_m: float = 0.0,
 ) -> EgoMotion:
     """Fuse the motion by radars and odometry.
 
@@ -139,7 +138,6 @@ def ego_motion(
         odometry: motion by odometry; all NaN if none is logged.
         heading: azimuth in axes of the base in which the car drives straight on, and its sigma [rad]: (0, 0)
             for a vehicle frame; None = from the radars' mountings, for a base that is a sensor.
-        axle_behind_m: distance of the rear axle, which does not slip, behind the base's origin.
     """
     speeds = {r.name: r.level()[0][:, 0] for r in radars} | {"odometry": odometry.speed_mps}
     left_out = contradicting(speeds)
@@ -150,7 +148,7 @@ def ego_motion(
     for _ in range(_ROUNDS):  # how radars are mounted shows once turns are known, and the other way round
         mounted = [_direction(r, turn) for r in radars]
         way, way_sigma = _mean(mounted, [r.yaw_sigma_rad for r in radars]) if heading is None else heading
-        equations = _of_the_car(odometry, scatter, way, axle_behind_m)
+        equations = _of_the_car(odometry, scatter, way)
         u, H = _fused(equations, [_turned(r, way - m) for r, m in zip(radars, mounted, strict=True)])
         turn = np.where(np.isfinite(odometry.yaw_rate_radps), turn, u[:, 2])
     unknown = ~np.isfinite(np.stack(list(speeds.values()))).any(0)
@@ -265,12 +263,10 @@ def _scatter(radars: Sequence[DopplerMotion], odometry: Odometry) -> float:
     return max(1.4826 * float(np.median(np.abs(known))), _LEAST_SIGMA_MPS)
 
 
-def _of_the_car(
-    odometry: Odometry, speed_sigma_mps: float, way_rad: float, axle_behind_m: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Equations of each moment by odometry, and by a rear axle without side slip."""
+def _of_the_car(odometry: Odometry, speed_sigma_mps: float, way_rad: float) -> tuple[np.ndarray, np.ndarray]:
+    """Equations of each moment by odometry, and by a rear axle without side slip, at the base's origin."""
     F = len(odometry.speed_mps)
-    axle = np.array([-np.tan(way_rad), 1.0, -axle_behind_m])
+    axle = np.array([-np.tan(way_rad), 1.0, 0.0])
     H = np.tile(np.outer(axle, axle) / _ASIDE_SIGMA_MPS**2 + np.diag(_HARDLY), (F, 1, 1))
     g = np.zeros((F, 3))
     for k, values, sigma in ((0, odometry.speed_mps, speed_sigma_mps),

@@ -15,7 +15,7 @@ Source: Zhang, Singh 2014, "LOAM: Lidar Odometry and Mapping in Real-time" (poin
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -47,7 +47,6 @@ class BeamTimes:
     Args:
         sense: 1 to the left, in the direction of increasing azimuth; -1 to the right (seen from above).
         begin_rad: azimuth of the first beam of a turn.
-        period_s: duration of a turn.
         stamp_share: share of the turn that is complete at the stamp.
     """
 
@@ -90,7 +89,6 @@ def beam_times(
     surfaces: Mapping[int, Surfaces],
     pairs: Sequence[tuple[int, int, float]],
     told: Mapping[int, Arc],
-    period_s: float = PERIOD_S,
 ) -> Found:
     """Estimate a lidar's rotation from pairs of its sweeps as logged.
 
@@ -98,7 +96,6 @@ def beam_times(
         surfaces: surfaces of each sweep, by its number.
         pairs: earlier and later sweep, and the time between their stamps [s].
         told: motion per second at a sweep, if odometry has it.
-        period_s: duration of a turn.
     """
     arcs = registered(surfaces, pairs, told)
     motion = {**_motions(arcs, pairs), **told}
@@ -120,8 +117,8 @@ def beam_times(
         best = int(np.argmax(along**2 / curvature))
         lasts_s = PERIOD_S * along[best] / curvature[best]
         times = lasts_s / PERIOD_S * _TIMES[best]
-    is_one = _LASTS[0] * period_s < lasts_s < _LASTS[1] * period_s
-    turn = _decided(N, b, best, period_s) if is_one else None
+    is_one = _LASTS[0] * PERIOD_S < lasts_s < _LASTS[1] * PERIOD_S
+    turn = _decided(N, b, best) if is_one else None
     return Found(turn, motion if turn is not None else told)
 
 
@@ -131,19 +128,17 @@ def velocity_of(xyz_m: Float[np.ndarray, "N 3"], motion: Arc) -> Float[np.ndarra
     return np.stack([x, motion.yaw_rad * xyz_m[:, 0], np.zeros(len(xyz_m))], axis=1)
 
 
-def _decided(
-    N: Float[np.ndarray, "P S S"], b: Float[np.ndarray, "P S"], best: int, period_s: float
-) -> BeamTimes | None:
+def _decided(N: Float[np.ndarray, "P S S"], b: Float[np.ndarray, "P S"], best: int) -> BeamTimes | None:
     """The best hypothesis, if it is better than those of the other direction, of other starts, and of no rotation."""
-    found, scale = _HYPOTHESES[best], period_s / PERIOD_S
-    gain = _gain(N, b, scale * _TIMES[best])
+    found = _HYPOTHESES[best]
+    gain = _gain(N, b, _TIMES[best])
     others = [
-        _gain(N, b, scale * t)
+        _gain(N, b, t)
         for h, t in zip(_HYPOTHESES, _TIMES, strict=True)
         if h.sense != found.sense or abs(_wrapped(h.begin_rad - found.begin_rad)) >= _ANOTHER_RAD
     ]
     surely = all(_z(gain - other) >= _CLEARLY for other in [np.zeros(len(b)), *others])
-    return replace(found, period_s=period_s) if surely else None
+    return found if surely else None
 
 
 def _gain(

@@ -19,6 +19,7 @@ from pipeline.store.records import last_day, read_last, read_records
 from pipeline.store.tables import COLLECTED
 from pipeline.store.views import Chosen, frames_of, ingested, observations_of, perceived
 from schemas.calibrations import CALIBRATIONS, PAIRS, SENSORS, CalibrationRecord
+from schemas.columns import POSE_COLUMNS
 from schemas.drift import DRIFT, DriftFinding
 from schemas.frames import Frame
 from schemas.observations import Observation
@@ -42,8 +43,9 @@ __all__ = [
     "states_of",
 ]
 
-_POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
-_COMPARED = (*_POSE, *(f"prior_{name}" for name in _POSE), "covariance", "observable", "determined")
+_COMPARED = (
+    *POSE_COLUMNS, *(f"prior_{name}" for name in POSE_COLUMNS), "covariance", "observable", "determined",
+)  # fmt: skip
 _FRAMES_LOOKED_AT = 60  # evenly spread; more dots say nothing more
 
 

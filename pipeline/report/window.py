@@ -24,14 +24,14 @@ from pipeline.store.current import current_rows
 from pipeline.store.partitions import Lake, days_after, months_before
 from pipeline.store.records import first_day, last_day, read_columns
 from schemas.calibrations import CALIBRATIONS, STATUSES
+from schemas.columns import POSE_COLUMNS
 
 __all__ = ["FEWEST_DAYS", "FleetWindow", "read_window"]
 
 # Of a vehicle, however far back they lie: as many as its charts reach back to (audit/days.py).
 FEWEST_DAYS = 14
 _MONTHS_BACK = 4  # and no further, as charts do (audit/history.py)
-_POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
-_COLUMNS = ("status", *_POSE, "covariance", "observable", "code_version")
+_COLUMNS = ("status", *POSE_COLUMNS, "covariance", "observable", "code_version")
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +146,7 @@ def _window_of(table: pa.Table | None) -> FleetWindow:
 
 def _estimates(found: pa.Table) -> tuple[Float[np.ndarray, "N 4 4"], Float[np.ndarray, "N 6"]]:
     """Poses and the sigmas of quantities that a mechanic can measure; not finite for records without them."""
-    pose = np.stack([found[name].to_numpy() for name in _POSE], axis=1)
+    pose = np.stack([found[name].to_numpy() for name in POSE_COLUMNS], axis=1)
     covariance = matrices(found["covariance"])
     is_there = np.isfinite(pose).all(axis=1) & there(found["covariance"])
     T, sigma = np.full((len(pose), 4, 4), np.nan), np.full((len(pose), 6), np.nan)

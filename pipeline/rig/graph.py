@@ -204,10 +204,6 @@ class RigGraph:
                     queue.append(there)
         return seen.get(b)
 
-    def is_on_cycle(self, edge: Edge) -> bool:
-        """True if its sensors stay connected without it: only then can other edges check it."""
-        return self.without([edge]).path(*edge.sensors) is not None
-
     def cycles(self) -> tuple[tuple[Edge, ...], ...]:
         """A cycle basis: each edge outside a spanning tree, and the path between its ends in the tree."""
         tree, rest = self._spanning_tree()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -10,7 +11,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from jaxtyping import Float
 
-from pipeline.geometry.se3 import from_quaternion
+from pipeline.geometry.pose_columns import pose_of
 from pipeline.geometry.targets import DEFAULT_TARGETS
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.columns import TableSchema
@@ -117,24 +118,14 @@ def transform_of(
     record: CalibrationRecord | StateRow | PoseRow | LineAnswer,
 ) -> Float[np.ndarray, "4 4"] | None:
     """T_parent_child of a record or state, T_reference_sensor of a pose; None without an estimate."""
-    return _transform(record.qw, record.qx, record.qy, record.qz, record.tx_m, record.ty_m, record.tz_m)
+    return pose_of(partial(getattr, record))
 
 
 def prior_of(record: CalibrationRecord | PoseRow) -> Float[np.ndarray, "4 4"] | None:
     """Prior T_parent_child of a record, or of a pose; None if none was given."""
-    return _transform(
-        record.prior_qw, record.prior_qx, record.prior_qy, record.prior_qz,
-        record.prior_tx_m, record.prior_ty_m, record.prior_tz_m,
-    )  # fmt: skip
+    return pose_of(partial(getattr, record), "prior_")
 
 
 def targets_of(record: CalibrationRecord) -> Float[np.ndarray, "N 3"]:
     """Targets of a record's sigmas, in the child's frame [m]; those of older releases if it has none."""
     return DEFAULT_TARGETS if record.targets_m is None else np.asarray(record.targets_m)
-
-
-def _transform(*columns: float | None) -> np.ndarray | None:
-    values = [v for v in columns if v is not None]
-    if len(values) != len(columns):
-        return None
-    return from_quaternion(np.array(values[:4]), np.array(values[4:]))

@@ -12,6 +12,7 @@ import numpy as np
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.se3 import exp_se3
 from pipeline.objective.paper.cost_maps import fold_frames
+from tests.benchmarks.numpy_objectives import bilinear
 
 POSES, FRAMES, POINTS, WIDTH, HEIGHT, PENALTY = 90, 6, 10_000, 912, 470, 1.0
 ROBUST_PX, SKY = 20.0, 1.0
@@ -62,8 +63,8 @@ def naive(maps, points, T):
             v = FOCAL_PX * q[:, 1] / z + CENTRE_PX[1]
             seen = (q[:, 2] >= 0.5) & (u >= 0) & (v >= 0) & (u <= WIDTH - 1.001) & (v <= HEIGHT - 1.001)
             uc, vc = np.where(seen, u, 0.0), np.where(seen, v, 0.0)
-            d = _bilinear(distance, uc, vc)
-            cost = d * d / (d * d + ROBUST_PX**2) + SKY * _bilinear(sky, uc, vc)
+            d = bilinear(distance, uc, vc)
+            cost = d * d / (d * d + ROBUST_PX**2) + SKY * bilinear(sky, uc, vc)
             out[i, f] = np.where(seen, cost, PENALTY).sum()
     return out
 
@@ -105,10 +106,3 @@ def best_cpu_s(rounds, *functions):
             function()
             best[k] = min(best[k], time.process_time() - start)
     return best
-
-
-def _bilinear(image, u, v):
-    iu, iv = u.astype(np.int64), v.astype(np.int64)
-    a, b = u - iu, v - iv
-    top = image[iv, iu] * (1 - a) + image[iv, iu + 1] * a
-    return top * (1 - b) + (image[iv + 1, iu] * (1 - a) + image[iv + 1, iu + 1] * a) * b

@@ -53,7 +53,7 @@ def _markings(terms, markings, mine, f, u, v, valid, settings):
     contrast = terms.maps.contrast[settings.contrast_level, f]
     height, width = contrast.shape
     seen = valid & (u >= 0) & (v >= 0) & (u <= width - 1.01) & (v <= height - 1.01)
-    total = _bilinear(contrast.astype(np.float64), u[seen], v[seen]).sum()
+    total = bilinear(contrast.astype(np.float64), u[seen], v[seen]).sum()
     return total * settings.delta * CONTRAST_STEP * settings.marking_weight
 
 
@@ -177,7 +177,7 @@ def _map_means(points, maps, cameras, penalty, T):
             u, v = uv.T
             height, width = image.shape
             seen = valid & (u >= 0) & (v >= 0) & (u <= width - 1.001) & (v <= height - 1.001)
-            value = _bilinear(image, np.where(seen, u, 0), np.where(seen, v, 0))
+            value = bilinear(image, np.where(seen, u, 0), np.where(seen, v, 0))
             out[f] = np.where(seen, value, penalty).mean()
     return out
 
@@ -209,7 +209,7 @@ def _lidar_radar(loss, T):
             at = transform_points(inverse(T), cells.astype(np.float64)) / lidar_radar.CELL_M - 0.5
             v, u = at[:, 0], at[:, 1] + image.shape[1] // 2
             seen = (u >= 0) & (v >= 0) & (u < image.shape[1] - 1) & (v < image.shape[0] - 1)
-            inside = np.where(seen, _bilinear(image, np.where(seen, u, 0), np.where(seen, v, 0)), 0).mean()
+            inside = np.where(seen, bilinear(image, np.where(seen, u, 0), np.where(seen, v, 0)), 0).mean()
             overlap = inside * loss.lidar_area_m2[f]
             out[f] += 1 - overlap / (loss.lidar_area_m2[f] + loss.radar_area_m2[f] - overlap)
         if len(tracks) and len(centres):
@@ -219,7 +219,7 @@ def _lidar_radar(loss, T):
     return out
 
 
-def _bilinear(image, u, v):
+def bilinear(image, u, v):
     iu, iv = u.astype(np.int64), v.astype(np.int64)
     a, b = u - iu, v - iv
     top = image[iv, iu] * (1 - a) + image[iv, iu + 1] * a

@@ -12,25 +12,17 @@ from pipeline.geometry.se3 import from_quaternion, rotation_angle_rad
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
+from tests.makers.fleet_files import THREE_SENSORS
 from tests.makers.lakes import write_observations
 from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
 from tests.makers.stages import calibrate_day
 
 DAY = Partition("car 1", "2024-05-06")
-TOPICS = {
-    "camera": {
-        "image": "/i",
-        "info": "/c",
-        "semantics": {"source": "topics", "labels": "/l", "detections": "/d"},
-    },
-    "lidar": {"points": "/p"},
-    "radar": {"points": "/r"},
-}
 
 
 def fleet_of(prior=None, camera=None, **sections):
-    rig = TOPICS | ({"prior": prior} if prior else {})
-    rig = rig | {"camera": TOPICS["camera"] | (camera or {})}
+    rig = THREE_SENSORS | ({"prior": prior} if prior else {})
+    rig = rig | {"camera": THREE_SENSORS["camera"] | (camera or {})}
     small = {"paper_population": 20, "paper_generations": 10, "search_rotation_deg": 4.0}
     solve = small | sections.pop("solve", {})
     return FleetConfig.model_validate(

@@ -15,24 +15,16 @@ from pipeline.store.partitions import Partition
 from schemas.calibrations import PAIRS
 from schemas.observations import Observation
 from tests.benchmarks.studies.metrics import transform_of
+from tests.makers.fleet_files import THREE_SENSORS
 from tests.makers.radar_scenes import T_LIDAR_RADAR, street_day
 from tests.makers.solve_scenes import T_CAMERA_LIDAR, make_day
 
 PRIOR = Prior(T_CAMERA_LIDAR, T_LIDAR_RADAR, np.radians(2.0), 0.05)
-RIG = {
-    "camera": {
-        "image": "/i",
-        "info": "/c",
-        "semantics": {"source": "topics", "labels": "/l", "detections": "/d"},
-    },
-    "lidar": {"points": "/p"},
-    "radar": {"points": "/r"},
-}
 
 
 def records_of(day, prior=PRIOR, method="joint", solver=None, **sections):
     fleet = FleetConfig.model_validate(
-        {"fleet": {"name": "f"}, "rigs": {"default": RIG}, "vehicles": {"v": {}}} | sections
+        {"fleet": {"name": "f"}, "rigs": {"default": THREE_SENSORS}, "vehicles": {"v": {}}} | sections
     )
     about = Inputs(Partition("v", "2024-05-06"), method, "k", 1, ())
     return {r.pair: r for r in calibrate_observations(day, prior, fleet, about, solver=solver)}

@@ -24,6 +24,7 @@ from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.poses import POSES, PoseRow
 from tests.audit.fleet_records import T_LIDAR_RADAR, vehicle_records
 from tests.makers.calibrations import T_CAMERA_LIDAR
+from tests.makers.fleet_files import THREE_SENSORS
 from tests.makers.lakes import write_frames
 
 FRAME_IDS = {"camera": ["front_optical"], "lidar": ["/top"], "radar": ["radar_front"]}
@@ -31,10 +32,7 @@ ROLLED = {"radar": np.array([0.05, 0.0, 0.0, 0.0, 0.0, 0.0])}  # [rad]
 
 
 def _fleet() -> FleetConfig:
-    semantics = {"source": "topics", "labels": "/l", "detections": "/d"}
-    rig = {"camera": {"image": "/i", "info": "/c", "semantics": semantics}}
-    rig |= {"lidar": {"points": "/p"}, "radar": {"points": "/r"}}
-    fleet = {"fleet": {"name": "test"}, "rigs": {"default": rig}, "vehicles": {"v": {}}}
+    fleet = {"fleet": {"name": "test"}, "rigs": {"default": THREE_SENSORS}, "vehicles": {"v": {}}}
     return FleetConfig.model_validate(fleet)
 
 

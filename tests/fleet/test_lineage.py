@@ -16,6 +16,7 @@ from pipeline.fleet.nightly import Night
 from pipeline.fleet.pattern import VehicleDay
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.remote_logs import RemoteLog
+from tests.makers.fleet_files import THREE_SENSORS
 from tests.makers.night_outcomes import DAY, day_outcome, stage_outcome
 
 pytest.importorskip("openlineage.client", reason="pip install 'boresight[ops]'")
@@ -39,13 +40,7 @@ FACETS = {
 
 @pytest.fixture
 def lineage(tmp_path):
-    camera = {
-        "image": "/i",
-        "info": "/k",
-        "semantics": {"source": "topics", "labels": "/l", "detections": "/d"},
-    }
-    rig = {"camera": camera, "lidar": {"points": "/p"}, "radar": {"points": "/r"}}
-    fleet = FleetConfig.model_validate({"fleet": {"name": "test"}, "rigs": {"default": rig}})
+    fleet = FleetConfig.model_validate({"fleet": {"name": "test"}, "rigs": {"default": THREE_SENSORS}})
     days = [VehicleDay(Partition("car", DAY), (Path("/logs/a.mcap"),))]
     return NightLineage.of(Night(fleet, Lake.at(tmp_path / "lake")), days)
 

@@ -18,23 +18,14 @@ from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, PAIRS, CalibrationRecord
 from schemas.outcomes import OUTCOMES, OutcomeRow
+from tests.makers.fleet_files import THREE_SENSORS
 from tests.makers.lakes import write_records
 
 DAY = "2026-03-02"
 FLEET = FleetConfig.model_validate(
     {
         "fleet": {"name": "test"},
-        "rigs": {
-            "default": {
-                "camera": {
-                    "image": "/i",
-                    "info": "/k",
-                    "semantics": {"source": "topics", "labels": "/l", "detections": "/d"},
-                },
-                "lidar": {"points": "/p"},
-                "radar": {"points": "/r"},
-            }
-        },
+        "rigs": {"default": THREE_SENSORS},
         "vehicles": {"car": {}, "bus": {}},
     }
 )

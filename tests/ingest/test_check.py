@@ -12,7 +12,7 @@ from jobs.check import check
 from pipeline.errors import ConfigError, ModelError
 from pipeline.ingest.check import check_logs
 from pipeline.ingest.doppler_speed import doppler_speed
-from pipeline.ingest.readiness import Evidence, judge, overall
+from pipeline.ingest.readiness import Evidence, judge_edge, overall
 from pipeline.ingest.units import unit_that_fits
 from pipeline.rig.rig import Rig
 from pipeline.rigs import RadarTopics
@@ -29,6 +29,10 @@ GOOD = Evidence(
     elevation_share=1.0,
     moving_share=0.8,
 )
+
+
+def judge(evidence):
+    return [verdict for pair in PAIRS for verdict in judge_edge(pair, pair, evidence)]
 
 
 def verdict(evidence, pair, dof):

@@ -1,6 +1,6 @@
 """The smallest fleet.toml: one rig with the topics of the written logs, and what a test adds to it."""
 
-__all__ = ["fleet_toml"]
+__all__ = ["THREE_SENSORS", "fleet_toml"]
 
 _TOPICS = """
 [fleet]
@@ -29,3 +29,15 @@ def fleet_toml(*vehicles, sections="", lidar="", radar=""):
     """
     named = "".join(f'[vehicles."{vehicle}"]\nrig = "default"\n' for vehicle in vehicles)
     return f"{_TOPICS.format(lidar=lidar, radar=radar)}{sections}\n{named}"
+
+
+# A rig of one camera, one lidar and one radar, as FleetConfig takes it.
+THREE_SENSORS = {
+    "camera": {
+        "image": "/i",
+        "info": "/c",
+        "semantics": {"source": "topics", "labels": "/l", "detections": "/d"},
+    },
+    "lidar": {"points": "/p"},
+    "radar": {"points": "/r"},
+}

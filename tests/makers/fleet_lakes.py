@@ -28,6 +28,7 @@ from schemas.drift import DRIFT
 from schemas.outcomes import OUTCOMES
 from schemas.states import STATES
 from tests.audit.fleet_records import T_CAMERA_LIDAR, T_LIDAR_RADAR, covariance_of, vehicle_records
+from tests.makers.fleet_files import THREE_SENSORS
 
 __all__ = ["FleetHistory", "one_rig_fleet"]
 
@@ -41,10 +42,7 @@ KNOCKED_DAYS = 9  # before the end, from which one of a hundred has a radar that
 
 def one_rig_fleet():
     """A fleet.toml of one rig; its vehicles are those that have records."""
-    semantics = {"source": "topics", "labels": "/l", "detections": "/d"}
-    camera = {"image": "/i", "info": "/c", "semantics": semantics}
-    rig = {"camera": camera, "lidar": {"points": "/p"}, "radar": {"points": "/r"}}
-    return FleetConfig.model_validate({"fleet": {"name": "study"}, "rigs": {"default": rig}})
+    return FleetConfig.model_validate({"fleet": {"name": "study"}, "rigs": {"default": THREE_SENSORS}})
 
 
 @dataclass(frozen=True)

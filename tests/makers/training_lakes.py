@@ -92,17 +92,3 @@ def fleet_lake(folder: Path, vehicles=("a", "b", "c", "d"), days=("2026-01-01",)
         for day in days:
             fill(lake, vehicle, day, frames)
     return lake
-
-
-def linked_fleet(folder: Path, vehicles, days, frames: int, **changes) -> Lake:
-    """As `fleet_lake`, but every vehicle-day is a hard link to the first: thousands of frames in a second."""
-    first = Partition(vehicles[0], days[0])
-    fill(Lake.at(folder), first.vehicle, first.day, frames, **changes)
-    for path in list(folder.rglob("*.parquet")):
-        table = path.relative_to(folder).parts[0]
-        for other in (Partition(v, d) for v in vehicles for d in days):
-            if other != first:
-                to = folder / table / other.folder / path.name
-                to.parent.mkdir(parents=True, exist_ok=True)
-                to.hardlink_to(path)
-    return Lake.at(folder)

@@ -44,10 +44,9 @@ def test_box_jacobian_agrees_with_central_differences():
     bias = np.array([0.01, -0.01])
 
     def residual(step):
-        T = exp_se3(step[:6]) @ T_LIDAR_RADAR
-        return elevation_residuals(pairs, T_CAMERA_LIDAR, T, bias + step[6:])[0]
+        return elevation_residuals(pairs, exp_se3(step[:6]) @ T_CAMERA_RADAR, bias + step[6:])[0]
 
-    _, J = elevation_residuals(pairs, T_CAMERA_LIDAR, T_LIDAR_RADAR, bias)
+    _, J = elevation_residuals(pairs, T_CAMERA_RADAR, bias)
     assert np.allclose(J, central_differences(residual, 8), atol=1e-6)
 
 
@@ -57,16 +56,16 @@ def test_detections_in_boxes_are_those_of_the_car():
     camera = transform_points(T_CAMERA_RADAR, pairs.point_radar_m)
     azimuth = camera_direction_angles(camera)[:, 0]
     assert np.median(np.abs(azimuth - pairs.azimuth_rad)) < np.radians(1.0)
-    residual, _ = elevation_residuals(pairs, T_CAMERA_LIDAR, T_LIDAR_RADAR, np.zeros(2))
+    residual, _ = elevation_residuals(pairs, T_CAMERA_RADAR, np.zeros(2))
     assert np.median(np.abs(residual)) < np.radians(0.7)
 
 
 def solve_roll_and_bias(pairs):
     """Roll and bias with pitch and the rest held, as least squares from the term alone."""
-    T, bias = T_LIDAR_RADAR, np.zeros(2)
-    keep = [0, 6]
+    T, bias = T_CAMERA_RADAR, np.zeros(2)
+    keep = [2, 6]  # the camera's optical axis
     for _ in range(8):
-        H, g, _ = box_equations(pairs, T_CAMERA_LIDAR, T, bias, 1)
+        H, g, _ = box_equations(pairs, T, bias, 1)
         step = np.zeros(8)
         step[keep] = -np.linalg.solve(H[0][np.ix_(keep, keep)], g[0][keep])
         T, bias = exp_se3(step[:6]) @ T, bias + step[6:]
@@ -78,19 +77,18 @@ def test_roll_owes_nothing_to_the_constant_below_the_box_centre():
     n = 60
     azimuth, elevation = rng.uniform(-0.45, 0.45, n), rng.normal(0, 0.02, n)
     roll = np.radians(2.0)
-    true_T = exp_se3(np.array([roll, 0, 0, 0, 0, 0])) @ T_LIDAR_RADAR
+    true_T = exp_se3(np.array([0, 0, roll, 0, 0, 0])) @ T_CAMERA_RADAR
     lidar = 20 * np.stack(
         [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)], -1
     )
-    seen = camera_direction_angles(transform_points(T_CAMERA_LIDAR, lidar))
-    radar = transform_points(np.linalg.inv(true_T), lidar)
+    camera = transform_points(T_CAMERA_LIDAR, lidar)
+    seen = camera_direction_angles(camera)
+    radar = transform_points(np.linalg.inv(true_T), camera)
     rolls = []
     for bias in (0.0, np.radians(-1.0)):
-        pairs = BoxPairs(
-            radar, seen[:, 0], seen[:, 1] - bias, np.full(n, 3), np.zeros(n, np.int64), np.zeros(n, np.int64)
-        )
+        pairs = BoxPairs(radar, seen[:, 0], seen[:, 1] - bias, np.zeros(n, np.int64), np.zeros(n, np.int64))
         T, found = solve_roll_and_bias(pairs)
-        rolls.append((T @ np.linalg.inv(T_LIDAR_RADAR))[2, 1])
+        rolls.append((T @ np.linalg.inv(T_CAMERA_RADAR))[1, 0])
         assert abs(found[0] - bias) < np.radians(0.03)
     assert np.allclose(rolls, np.sin(roll), atol=np.radians(0.03))
 
@@ -99,7 +97,7 @@ def test_a_radar_without_elevation_gives_no_boxes():
     day = street_day(3, elevation=False)
     pairs = box_pairs(day, vehicle_boxes(day), T_CAMERA_RADAR, 0.2)
     assert pairs.count == 0
-    H, g, sigma = box_equations(pairs, T_CAMERA_LIDAR, T_LIDAR_RADAR, np.zeros(2), 3)
+    H, g, sigma = box_equations(pairs, T_CAMERA_RADAR, np.zeros(2), 3)
     assert not H.any()
     assert not g.any()
     assert np.isnan(sigma)

@@ -28,7 +28,7 @@ def one_pair(lidar_point):
     """A single detection and a single lidar point."""
     return RegistrationFrames(
         RADAR[None], np.array([0, 1]), lidar_point[None], np.array([0, 1]), np.zeros((1, 4)), np.array([False]),
-        np.array([True]), VELOCITY[None], np.array([YAW_RATE]), np.array([GAP_S]), np.array([0]), np.array([0]),
+        np.array([True]), VELOCITY[None], np.array([YAW_RATE]), np.array([GAP_S]), np.array([0]),
     )  # fmt: skip
 
 

@@ -14,6 +14,7 @@ from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import observations_of, perceived
 from schemas.calibrations import SENSORS
 from schemas.observations import STEP_BELOW, STEP_RIGHT, WITHOUT_LABELS
+from tests.makers.fleet_files import THREE_SENSORS
 from tests.makers.lakes import write_frames
 from tests.makers.stages import perceive_day
 
@@ -24,16 +25,7 @@ def fleet(**perceive):
     return FleetConfig.model_validate(
         {
             "fleet": {"name": "made"},
-            "rigs": {
-                "default": {
-                    "camera": {
-                        "image": "/i", "info": "/c",
-                        "semantics": {"source": "topics", "labels": "/l", "detections": "/d"},
-                    },
-                    "lidar": {"points": "/p"},
-                    "radar": {"points": "/r"},
-                }
-            },
+            "rigs": {"default": THREE_SENSORS},
             "vehicles": {"car-1": {}},
             "perceive": perceive,
         }

@@ -1,7 +1,6 @@
 """The maker of calibration records, a fleet of them in a lake, and a real browser driven through a pipe."""
 
 import base64
-import importlib.util
 import json
 import os
 import select
@@ -16,6 +15,8 @@ from typing import Any
 
 import pytest
 
+from tests.audit import fleet_records
+
 CHROMIUM = next((p for p in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if p), None)
 FLAGS = [
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--hide-scrollbars",
@@ -27,14 +28,7 @@ FLAGS = [
 @pytest.fixture(scope="session")
 def maker() -> ModuleType:
     """The module tests/audit/fleet_records.py."""
-    path = Path(__file__).parent.parent / "audit" / "fleet_records.py"
-    spec = importlib.util.spec_from_file_location("fleet_records", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["fleet_records"] = module
-    spec.loader.exec_module(module)
-    return module
+    return fleet_records
 
 
 class Browser:

@@ -21,6 +21,7 @@ from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
+from tests.makers.fleet_files import THREE_SENSORS
 from tests.makers.fleet_pages import write_fleet_page
 from tests.makers.lakes import write_records
 from tests.makers.stages import audit_fleet
@@ -29,13 +30,7 @@ KNOCK = np.array([0.0, 0.0, np.radians(1.0), 0.0, 0.03, 0.0])
 
 
 def _config() -> FleetConfig:
-    semantics = {"source": "topics", "labels": "/l", "detections": "/d"}
-    rig = {
-        "camera": {"image": "/i", "info": "/c", "semantics": semantics},
-        "lidar": {"points": "/p"},
-        "radar": {"points": "/r"},
-    }
-    return FleetConfig.model_validate({"fleet": {"name": "test"}, "rigs": {"default": rig}})
+    return FleetConfig.model_validate({"fleet": {"name": "test"}, "rigs": {"default": THREE_SENSORS}})
 
 
 def _store(lake: Lake, records: list[CalibrationRecord]) -> None:

@@ -21,7 +21,7 @@ from pipeline.store import delta
 from pipeline.store.commits import assert_records, commit_records
 from pipeline.store.current import current_records
 from pipeline.store.delta import Wanted, live_files, open_table, read_file, tidy_table
-from pipeline.store.partitions import Lake, Partition
+from pipeline.store.partitions import Lake
 from pipeline.store.records import RecordIndex, last_day, read_columns, read_latest, read_records
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from schemas.drift import DRIFT, DriftFinding
@@ -29,7 +29,6 @@ from tests.makers.lakes import write_records
 from tests.makers.table_rows import ROW_TYPES, make_row, same
 
 REPO = Path(__file__).resolve().parents[2]
-DAY = Partition("car", "2026-03-02")
 
 
 @pytest.fixture

@@ -208,8 +208,7 @@ def _equations(seen: _Seen, T: np.ndarray, bias: np.ndarray, step: int) -> _Equa
     F = len(seen.observations)
     gate = BOX_ELEVATION_GATES_RAD[min(step // _SCHEDULE.steps_at_first_box_gate, 1)]
     pairs = box_pairs(seen.observations, seen.boxes, T, float(gate))
-    # With the radar's own frame in the lidar's place, the left twist is that of T_camera_radar.
-    Hb, gb, box_sigma = box_equations(pairs, np.eye(4), T, bias, F)
+    Hb, gb, box_sigma = box_equations(pairs, T, bias, F)
     Ha, ga, azimuth_sigma = azimuth_equations_camera(seen.clusters, T, float(_AZIMUTH_GATES_RAD[step]))
     about_radar = np.eye(Hb.shape[1])
     about_radar[:6, :6] = np.linalg.inv(change_jacobian(T))

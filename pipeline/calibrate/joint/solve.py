@@ -78,7 +78,7 @@ def _solved(
 ) -> _Found:
     rng = np.random.default_rng([seed, ("camera_lidar", "lidar_radar", "camera_radar").index(pair)])
     if pair == "lidar_radar":
-        found = estimate_lidar_radar(observations, prior, None, config, rng)
+        found = estimate_lidar_radar(observations, prior, config, rng)
         return found, lidar_radar_failures(found)
     if pair == "camera_radar":
         return estimate_camera_radar(observations, prior, config, rng, boxes="boxes" in config.terms), []

@@ -16,7 +16,6 @@ from pipeline.rigs import CameraPrior
 __all__ = [
     "BOX_ELEVATION_GATES_RAD",
     "BOX_ROLL_FLOOR_CAMERA_RAD",
-    "BOX_ROLL_FLOOR_LIDAR_RAD",
     "CAMERA_LIDAR_BIAS",
     "CAMERA_LIDAR_DT_FLOOR_S",
     "CAMERA_RADAR_BIAS",
@@ -111,23 +110,22 @@ OUTLIER_DENSITY = 0.2
 # Sigmas of azimuth [rad], elevation [rad] and range [m] at which poses are compared: wide in elevation, which is not
 # what decides.
 REGISTRATION_COMPARISON_SIGMA = np.array([np.radians(0.5), np.radians(6.0), 0.2])
-# Roll by vehicle boxes: which detections of a box are taken moved it by 0.5 deg on real logs.
-BOX_ROLL_FLOOR_LIDAR_RAD = np.radians(1.0)
 
 # -- camera-radar without the lidar ----------------------------------------------------------------------------------
 
 # Boxes of cars seen from behind and from the side are not centred on where radars see them; constants of elevation.
 CAMERA_RADAR_BIAS = np.array([np.radians(0.3), np.radians(0.25), np.radians(0.1), 0.0, 0.0, 0.0])
-# Roll by vehicle boxes was 1.0 deg RMS off on nine simulated days whose boxes predicted 0.5. Differs from
-# BOX_ROLL_FLOOR_LIDAR_RAD, which was chosen on real logs; this one was measured later.
+# Roll by vehicle boxes was 1.0 deg RMS off on nine simulated days whose boxes predicted 0.5. Which detections of a box
+# are taken moved it by 0.5 deg on real logs.
 BOX_ROLL_FLOOR_CAMERA_RAD = np.radians(1.2)
+
+# How far a detection's elevation may lie from its box's: at the start, and once pitch and roll are about right.
+BOX_ELEVATION_GATES_RAD = (np.radians(12.0), np.radians(7.0))
 
 # -- both radar pairs ------------------------------------------------------------------------------------------------
 
 # A prior that the data contradict by more sigmas than this loses weight: the scale of its Cauchy weight.
 PRIOR_CONTRADICTION_SIGMAS = 2.5
-# How far a detection's elevation may lie from its box's: at the start, and once pitch and roll are about right.
-BOX_ELEVATION_GATES_RAD = (np.radians(12.0), np.radians(7.0))
 
 # -- held-out frames -------------------------------------------------------------------------------------------------
 

@@ -141,19 +141,16 @@ def bootstrap_blocks(
     return block_of[scene]
 
 
-def scene_blocks(
-    observations: Sequence[Observation], at_least: int = _FEWEST_BLOCKS
-) -> Int[np.ndarray, " F"]:
+def scene_blocks(observations: Sequence[Observation]) -> Int[np.ndarray, " F"]:
     """Block name of each frame, for scatter over scenes: its drive, of any length.
 
-    If the day has fewer drives than `at_least`, it is cut between scenes into that many stretches with equal
-    numbers of frames.
+    A day of few drives is cut between scenes into stretches with equal numbers of frames.
     """
     drives, scene = np.array([o.drive for o in observations]), scenes_of(observations)
     first = np.unique(scene, return_index=True)[1]  # frame that each scene begins with
-    if len(np.unique(drives)) >= at_least:
+    if len(np.unique(drives)) >= _FEWEST_BLOCKS:
         return drives[first][scene]
-    return first[scene] * at_least // max(len(observations), 1)
+    return first[scene] * _FEWEST_BLOCKS // max(len(observations), 1)
 
 
 def _apart(gradient: Float[np.ndarray, "F P"]) -> float:

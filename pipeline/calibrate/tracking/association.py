@@ -43,11 +43,6 @@ class Association:
     sightings: Int64[np.ndarray, " S"]  # rows of `Shared.of_reference`, pair by pair
     pair: Int64[np.ndarray, " S"]  # 0..K-1
 
-    @property
-    def count(self) -> int:
-        """Number of pairs."""
-        return len(self.reference)
-
 
 @dataclass(frozen=True, eq=False)
 class Shared:

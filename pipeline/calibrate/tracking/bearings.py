@@ -81,7 +81,6 @@ class AlignedBearings:
     T: Float[np.ndarray, "4 4"]
     covariance: Float[np.ndarray, "6 6"]  # without a bias floor; translation is the prior's
     spread: Float[np.ndarray, "3 3"]  # part of the rotation's covariance that comes from resampling tracks
-    weight: Float[np.ndarray, " N"]  # Geman-McClure, 0..1
     kept: Bool[np.ndarray, " K"]  # tracks that agree
     residual_rad: Float[np.ndarray, " A"]  # robust standard deviation of the kept sightings
 
@@ -133,7 +132,7 @@ def align_bearings(
     covariance, resampled = _covariance(bearings, z, J, share * weight, prior_covariance, rng)
     inliers = weight > _OUTLIER_WEIGHT
     spread = _spread(bearings.residuals(T)[0][inliers]) if inliers.any() else np.full(len(scale), np.nan)
-    return AlignedBearings(T, covariance, resampled, weight, kept, spread)
+    return AlignedBearings(T, covariance, resampled, kept, spread)
 
 
 def consistency(

@@ -22,6 +22,7 @@ from pipeline.calibrate.tracking.kalman import Motion, Scan, Track, follow
 from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.spherical import camera_direction_angles, from_spherical
+from pipeline.objective.radar.moving_clusters import ROAD_USER_HEIGHT_M
 from pipeline.rows import take_rows
 from schemas.observations import Observation
 
@@ -36,15 +37,6 @@ __all__ = [
     "turn_between",
 ]
 
-_HEIGHT_M = {
-    "person": 1.7,
-    "rider": 1.7,
-    "bicycle": 1.6,
-    "motorcycle": 1.6,
-    "truck": 2.9,
-    "bus": 3.0,
-    "train": 3.5,
-}
 _CAR_HEIGHT_M = 1.55
 _BOX_RANGE_FRACTION, _BOX_BEARING_SIGMA_RAD = 0.2, np.radians(0.5)
 _BORDER_PX = 6.0  # a box that ends at the image's border ends there by accident
@@ -236,7 +228,9 @@ def _boxes(o: Observation) -> tuple[np.ndarray, np.ndarray]:
     inside &= (x1 < o.image_width_px - _BORDER_PX) & (y1 < o.image_height_px - _BORDER_PX)
     xm, ym = 0.5 * (x0 + x1), 0.5 * (y0 + y1)
     angle = camera_direction_angles(camera.unproject(np.stack([np.stack([xm, y], -1) for y in (ym, y0, y1)])))
-    height = np.array([_HEIGHT_M.get(name, _CAR_HEIGHT_M) for name in o.road_user_classes], np.float64)
+    height = np.array(
+        [ROAD_USER_HEIGHT_M.get(name, _CAR_HEIGHT_M) for name in o.road_user_classes], np.float64
+    )
     distance = height / np.maximum(angle[1, :, 1] - angle[2, :, 1], 1e-3)
     ok = inside & np.isfinite(angle).all(axis=(0, 2)) & (distance < _FAR_M)
     return angle[0, ok], distance[ok]

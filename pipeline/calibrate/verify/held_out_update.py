@@ -48,8 +48,6 @@ class HeldOutUpdate:
     covariance: Float[np.ndarray, "6 6"]  # of the updated result
     shift_covariance: Float[np.ndarray, "6 6"]  # of the shift, if both covariances are right
     bias: Float[np.ndarray, "6 6"]  # covariance of what all held-out frames err by alike
-    inflation: float  # by which the frames' information was divided, at least 1
-    blocks: int
 
 
 def held_out_update(
@@ -72,12 +70,11 @@ def held_out_update(
     """
     limits = limits or ChecksConfig()
     prior = np.linalg.inv(covariance)
-    x, J, inflation, count = np.zeros(len(bias)), np.zeros_like(covariance), 1.0, 0
+    x, J = np.zeros(len(bias)), np.zeros_like(covariance)
     for width in _SCHEDULE.widths:
         g, H = derivatives(x, width)
         informative = np.abs(g).sum(axis=1) > 0
-        count = len(np.unique(blocks[informative]))
-        if count < limits.min_held_out_blocks:
+        if len(np.unique(blocks[informative])) < limits.min_held_out_blocks:
             return None
         information = _positive_part(H.sum(axis=0))
         sigmas = limits.held_out_contradiction_sigmas
@@ -97,8 +94,6 @@ def held_out_update(
         updated[pose],
         0.5 * (shift_covariance + shift_covariance.T)[pose],
         np.diag(bias[:6] ** 2),
-        inflation,
-        count,
     )
 
 

@@ -143,23 +143,24 @@ def judge(
         checks.append(_Check(_FAILED, "the day determines no degree of freedom"))
     score = min(1.0, *(c.margin for c in checks))
     failed = [c for c in checks if c.margin < 0]
-    if failed:
-        disproved = any(c.disproves for c in failed)
-        unsure_only, few_only = (
-            all(c.of_sigma for c in failed),
-            all(c.of_sigma or c.of_number for c in failed),
-        )
-        reasons = "; ".join(c.reason for c in failed)
-        named = tuple(faults | dict.fromkeys(c.fault for c in failed if c.fault))
-        return Verdict(
-            "held",
-            reasons,
-            score,
-            disproved=disproved,
-            unsure_only=unsure_only,
-            few_only=few_only,
-            faults=named,
-        )
+    return _held(failed, score, faults) if failed else _accepted(estimate, prior, evidence, score)
+
+
+def _held(failed: Sequence[_Check], score: float, faults: Mapping[str, None]) -> Verdict:
+    """The verdict with failed checks; `faults` are named besides theirs."""
+    return Verdict(
+        "held",
+        "; ".join(c.reason for c in failed),
+        score,
+        disproved=any(c.disproves for c in failed),
+        unsure_only=all(c.of_sigma for c in failed),
+        few_only=all(c.of_sigma or c.of_number for c in failed),
+        faults=tuple(dict.fromkeys([*faults, *(c.fault for c in failed if c.fault)])),
+    )
+
+
+def _accepted(estimate: PairEstimate, prior: Prior, evidence: Evidence, score: float) -> Verdict:
+    """The verdict without failed checks, with what it certifies and what nothing checks."""
     certified = tuple(name for name, claim in evidence.claims.items() if claim.margin >= 0)
     unchecked = _unchecked(estimate, prior, certified)
     reason = "; ".join([*_reservations(estimate, evidence.claims), *_differences(estimate.pair, unchecked)])

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from pipeline.errors import ContractError
 from pipeline.geometry.se3 import from_quaternion
 from pipeline.learn.batches.batch import TrainingBatch
+from schemas.columns import POSE_COLUMNS
 from schemas.training import TrainingRow
 
 __all__ = ["collate"]
@@ -77,6 +78,5 @@ def collate(rows: Sequence[TrainingRow]) -> TrainingBatch:
 
 
 def _transforms(rows: Sequence[TrainingRow], prefix: str) -> Float[torch.Tensor, "B 4 4"]:
-    names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
-    values = np.array([[getattr(r, prefix + name) for name in names] for r in rows])
+    values = np.array([[getattr(r, prefix + name) for name in POSE_COLUMNS] for r in rows])
     return torch.from_numpy(from_quaternion(values[:, :4], values[:, 4:]).astype(np.float32))

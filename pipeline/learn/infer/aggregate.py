@@ -122,11 +122,7 @@ def day_estimate(
         ignored |= unobservable
     spread = _spread(pair, answers, draws, ignored)
     gain_variance = draws[:, 1:].transpose(0, 2, 1).var(axis=0)
-    x, covariance, R = m0, P, spread
-    for _ in range(3):
-        # Errors of H count by how far the truth may lie from the centre.
-        R = spread + np.diag(gain_variance @ (np.diag(covariance) + x * x))
-        x, covariance = _update(m0, P, H, R, mean)
+    x, covariance, R = _updated_thrice(m0, P, H, spread, mean, gain_variance)
     stated = np.zeros((6, 6)) if answers.ends is None else np.diag(np.square(FRAME_SIGMA[pair]))
     weighed, observability = (
         1 - np.diag(twist_of_bearing @ C @ twist_of_bearing.T) / np.diag(prior_covariance)
@@ -157,8 +153,23 @@ def day_estimate(
     )
 
 
+def _updated_thrice(
+    m0: np.ndarray,
+    P: np.ndarray,
+    H: np.ndarray,
+    spread: np.ndarray,
+    mean: np.ndarray,
+    gain_variance: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Update, its covariance, and that of the answers: errors of H count by how far the truth may lie."""
+    x, covariance, R = m0, P, spread
+    for _ in range(3):
+        R = spread + np.diag(gain_variance @ (np.diag(covariance) + x * x))
+        x, covariance = _update(m0, P, H, R, mean)
+    return x, covariance, R
+
+
 def measured_estimate(
-    pair: str,
     T: Float[np.ndarray, "4 4"],
     information: Float[np.ndarray, "6 6"],
     bias_sigma: Float[np.ndarray, " 6"],
@@ -166,7 +177,7 @@ def measured_estimate(
     prior_covariance: Float[np.ndarray, "6 6"],
     frames: int,
 ) -> PairEstimate:
-    """Estimate of a pair from a fit of all frames under the prior, with an error common to all frames.
+    """Estimate of camera-lidar from a fit of all frames under the prior, with an error common to all frames.
 
     Args:
         T: the peak of frames and prior together.
@@ -191,7 +202,7 @@ def measured_estimate(
     covariance = back @ (keep @ P @ keep.T + gain @ told @ gain.T) @ back.T
     covariance = (covariance + covariance.T) / 2
     return PairEstimate(
-        pair,
+        "camera_lidar",
         exp_se3(x) @ T,
         covariance,
         observability,

@@ -41,15 +41,7 @@ class JointDay:
         if rows is not None:
             some = [frame for frame, kept in zip(self.frames, rows, strict=True) if kept]
             fit = fit_of(some, self.block[rows], fit.T, T_prior, covariance)
-        return measured_estimate(
-            "camera_lidar",
-            fit.T,
-            fit.information,
-            JOINT_BIAS_SIGMA,
-            T_prior,
-            covariance,
-            fit.frames,
-        )
+        return measured_estimate(fit.T, fit.information, JOINT_BIAS_SIGMA, T_prior, covariance, fit.frames)
 
 
 def fitted_day(

@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 from pipeline.config import PrepareConfig
 from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.cameras import Camera, camera_of
-from pipeline.geometry.se3 import to_quaternion
+from pipeline.geometry.pose_columns import pose_columns
 from pipeline.geometry.spherical import camera_direction_angles
 from pipeline.learn.sample.camera_maps import camera_features, stored_grid
 from pipeline.learn.sample.clouds import View, lidar_columns, padded_rows, radar_columns
@@ -205,7 +205,5 @@ def _reference_columns(observation: Observation, prior: Prior) -> dict[str, Any]
         "radar_lag_s": (observation.radar_stamp_ns - observation.stamp_ns) * 1e-9,
     }
     for pair in ("camera_lidar", "lidar_radar"):
-        values = (*to_quaternion(prior.of(pair)), *prior.of(pair)[:3, 3])
-        for part, value in zip(("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m"), values, strict=True):
-            columns[f"prior_{pair}_{part}"] = float(value)
+        columns |= pose_columns(prior.of(pair), f"prior_{pair}_")
     return columns

@@ -26,6 +26,7 @@ from schemas.observations import Observation
 
 __all__ = [
     "MATCH_RAD",
+    "ROAD_USER_HEIGHT_M",
     "MovingClusters",
     "azimuth_equations_camera",
     "azimuth_equations_lidar",
@@ -41,7 +42,8 @@ _APART_M = 1e3
 _LEAST_DETECTIONS = 2
 _LARGEST_M = 12.0  # lidar clusters longer than a lorry are walls
 _RANGE_FACTOR = 1.8
-_HEIGHT_M = {
+# Usual heights; what is not among them is as high as a car.
+ROAD_USER_HEIGHT_M = {
     "person": 1.7,
     "rider": 1.7,
     "bicycle": 1.6,
@@ -233,7 +235,7 @@ def _box_azimuths(o: Observation) -> tuple[np.ndarray, np.ndarray]:
     xm, ym = 0.5 * (x0 + x1), 0.5 * (y0 + y1)
     rays = camera.unproject(np.stack([np.stack([xm, y], -1) for y in (ym, y0, y1)]))
     angle = camera_direction_angles(rays)
-    height = np.array([_HEIGHT_M.get(name, 1.5) for name in o.road_user_classes])
+    height = np.array([ROAD_USER_HEIGHT_M.get(name, 1.5) for name in o.road_user_classes])
     ok = np.isfinite(angle).all(axis=(0, 2))
     extent = np.maximum(angle[1, :, 1] - angle[2, :, 1], 1e-3)
     return angle[0, ok, 0], (height / extent)[ok]

@@ -61,7 +61,6 @@ _FRAME = np.dtype(  # what RegistrationFrames holds of a frame beside its points
         ("velocity_mps", "f8", 3),
         ("yaw_rate_radps", "f8"),
         ("stamp_gap_s", "f8"),
-        ("block", "i8"),
         ("frame", "i8"),
     ]
 )
@@ -81,7 +80,6 @@ class RegistrationFrames:
     velocity_mps: Float[np.ndarray, "F 3"]  # of the radar, in radar axes
     yaw_rate_radps: Float[np.ndarray, " F"]
     stamp_gap_s: Float[np.ndarray, " F"]  # radar stamp minus lidar stamp
-    block: Int64[np.ndarray, " F"]  # drive, for resampling
     frame: Int64[np.ndarray, " F"]  # index into the observations given
     # Lowest and highest that the lidar ever showed, lidar axes.
     lidar_elevation_rad: Float[np.ndarray, " 2"] = field(default_factory=lambda: np.array([-1.5, 1.5]))
@@ -263,7 +261,6 @@ def _frame_columns(o: Observation, index: int) -> tuple[object, ...]:
         o.radar_velocity_mps,
         o.ego_yaw_rate_radps or 0.0,  # about the vertical, alike at every place of the car
         (o.radar_stamp_ns - o.stamp_ns) * 1e-9,
-        o.drive,
         index,
     )
 

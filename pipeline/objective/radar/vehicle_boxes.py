@@ -47,7 +47,6 @@ _PAIR = np.dtype(  # of BoxPairs
         ("point_radar_m", "f8", 3),
         ("azimuth_rad", "f8"),
         ("elevation_rad", "f8"),
-        ("detections", "i8"),
         ("kind", "i8"),
         ("frame", "i8"),
     ]
@@ -78,7 +77,6 @@ class BoxPairs:
     point_radar_m: Float[np.ndarray, "B 3"]  # median azimuth, elevation and range of the detections
     azimuth_rad: Float[np.ndarray, " B"]  # box centre as the camera sees it, left positive
     elevation_rad: Float[np.ndarray, " B"]  # up positive
-    detections: Int64[np.ndarray, " B"]
     kind: Int64[np.ndarray, " B"]  # index into BOX_CLASSES
     frame: Int64[np.ndarray, " B"]  # index into the observations given
 
@@ -126,47 +124,39 @@ def box_pairs(
             if len(chosen) >= _LEAST_DETECTIONS:
                 middle = from_spherical(median_of_rows(to_spherical(radar[chosen])))
                 centre = boxes.azimuth_rad[b], boxes.elevation_rad[b]
-                rows.append((middle, *centre, len(chosen), boxes.kind[b], index))
+                rows.append((middle, *centre, boxes.kind[b], index))
     return BoxPairs(**columns_of(rows, _PAIR))
 
 
 def elevation_residuals(
-    pairs: BoxPairs,
-    T_camera_lidar: Float[np.ndarray, "4 4"],
-    T_lidar_radar: Float[np.ndarray, "4 4"],
-    bias_rad: Float[np.ndarray, " C"],
+    pairs: BoxPairs, T_camera_radar: Float[np.ndarray, "4 4"], bias_rad: Float[np.ndarray, " C"]
 ) -> tuple[Float[np.ndarray, " B"], Float[np.ndarray, "B P"]]:
     """Radar elevation minus box elevation minus the class's bias, and its Jacobian.
 
-    Unknowns: left twist of T_lidar_radar (6), then the biases, one per entry of BOX_CLASSES.
+    Unknowns: left twist of T_camera_radar (6), then the biases, one per entry of BOX_CLASSES.
     """
-    lidar = transform_points(T_lidar_radar, pairs.point_radar_m)
-    camera = transform_points(T_camera_lidar, lidar)
+    camera = transform_points(T_camera_radar, pairs.point_radar_m)
     elevation = camera_direction_angles(camera)[:, 1]
     x, y, z = camera.T
     h = np.hypot(x, z)
     r2 = h * h + y * y
     # elevation = atan2(-y, hypot(x, z))
-    gradient = np.stack([x * y / (h * r2), -h / r2, z * y / (h * r2)], -1) @ T_camera_lidar[:3, :3]
+    gradient = np.stack([x * y / (h * r2), -h / r2, z * y / (h * r2)], -1)
     J = np.zeros((pairs.count, 6 + len(bias_rad)))
-    J[:, :3] = -(gradient[:, None, :] @ hat(lidar))[:, 0]
+    J[:, :3] = -(gradient[:, None, :] @ hat(camera))[:, 0]
     J[:, 3:6] = gradient
     J[np.arange(pairs.count), 6 + pairs.kind] = -1.0
     return elevation - pairs.elevation_rad - bias_rad[pairs.kind], J
 
 
 def box_equations(
-    pairs: BoxPairs,
-    T_camera_lidar: Float[np.ndarray, "4 4"],
-    T_lidar_radar: Float[np.ndarray, "4 4"],
-    bias_rad: Float[np.ndarray, " C"],
-    frames: int,
+    pairs: BoxPairs, T_camera_radar: Float[np.ndarray, "4 4"], bias_rad: Float[np.ndarray, " C"], frames: int
 ) -> tuple[Float[np.ndarray, "F P P"], Float[np.ndarray, "F P"], float]:
     """Per frame, information and gradient of the robust (Cauchy) elevation cost, and the residual's own sigma [rad].
 
     The spread of the residuals themselves is taken as the precision of this radar's elevations.
     """
-    found = elevation_residuals(pairs, T_camera_lidar, T_lidar_radar, bias_rad)
+    found = elevation_residuals(pairs, T_camera_radar, bias_rad)
     return robust_equations(*found, pairs.frame, frames)
 
 

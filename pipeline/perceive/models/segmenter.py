@@ -26,21 +26,15 @@ class Segmenter:
         self._table = to_cityscapes(manifest.output.label_set)
         self._check_alike = AlikeCheck(manifest.file)
 
-    def segment(
-        self, image_bgr: UInt8[np.ndarray, "H W 3"], size: tuple[int, int]
-    ) -> UInt8[np.ndarray, "h w"]:
-        """Cityscapes train ids at `size` (rows, columns).
+    def segment_each(
+        self, images_bgr: Sequence[UInt8[np.ndarray, "H W 3"]], sizes: Sequence[tuple[int, int]]
+    ) -> list[UInt8[np.ndarray, "h w"]]:
+        """Cityscapes train ids of images at `sizes` (rows, columns), in one run if the model takes batches.
 
         Raises:
             ModelOutputError: another shape or classes than the manifest's, not finite, or the same for
                 several images.
         """
-        return self.segment_each([image_bgr], [size])[0]
-
-    def segment_each(
-        self, images_bgr: Sequence[UInt8[np.ndarray, "H W 3"]], sizes: Sequence[tuple[int, int]]
-    ) -> list[UInt8[np.ndarray, "h w"]]:
-        """Train ids of several images, in one run if the model takes batches; errors as `segment`."""
         fitted = [fit_image(image, self._manifest.input) for image in images_bgr]
         outputs = self._session.run_each([tensor for tensor, _ in fitted])
         return [

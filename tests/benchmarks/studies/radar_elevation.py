@@ -188,7 +188,7 @@ def _part(name: str, frames: range, day: Day, terms: Sequence[str] = TERMS) -> _
         day.fleet.changed(solve={"terms": list(terms)}).solve,
     )
     rows = [day.rows[k] for k in frames]
-    found = estimate_lidar_radar(rows, prior, None, config, np.random.default_rng(0))
+    found = estimate_lidar_radar(rows, prior, config, np.random.default_rng(0))
     assert found.common_covariance is not None
     every, common = (
         change_covariance(found.T, C)[_PITCH, _PITCH] for C in (found.covariance, found.common_covariance)

@@ -83,15 +83,7 @@ def _print_errors(specs: Sequence[DaySpec], root: Path) -> None:
 def _tilt_deg(day: Day, rows: list[Observation]) -> tuple[Array, Array]:
     """Error of roll and pitch against where detections point, and sigma."""
     prior = prior_of(day, Run(day.spec).prior, day.spec.seed)
-    camera = np.diag([1e-7] * 3 + [1e-5] * 3)
-    found = estimate_lidar_radar(
-        rows,
-        prior,
-        day.true_of("camera_lidar"),
-        SolveConfig(),
-        np.random.default_rng(0),
-        covariance_camera_lidar=camera,
-    )
+    found = estimate_lidar_radar(rows, prior, SolveConfig(), np.random.default_rng(0))
     error = change_between(day.pointing_of("lidar_radar"), found.T)
     sigma = np.sqrt(np.diag(change_covariance(found.T, found.covariance)))
     return np.degrees(error[:2]).round(2), np.degrees(sigma[:2]).round(2)

@@ -9,7 +9,6 @@ from pipeline.calibrate.adjust.adjusted import AdjustmentLimits
 from pipeline.calibrate.adjust.evidence import evidence_of
 from pipeline.calibrate.adjust.rig import adjust
 from pipeline.calibrate.adjust.three import EDGES, poses_of, three_sensors
-from pipeline.calibrate.joint.camera_lidar.estimate import estimate_camera_lidar
 from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.checks import FailedCheck
@@ -17,6 +16,7 @@ from pipeline.extrinsics.estimates import PairEstimate, Prior
 from pipeline.geometry.changes import change_between, change_covariance, change_jacobian
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation, perturb_exactly
 from pipeline.rig.evidence import EDGE
+from tests.makers.camera_lidar import estimate_camera_lidar
 from tests.makers.radar_scenes import T_LIDAR_RADAR, street_day
 from tests.makers.solve_scenes import T_CAMERA_LIDAR
 from tests.makers.traced_scenes import DENSE, T_TRUE, traced_day
@@ -188,7 +188,7 @@ def test_the_law_holds_of_lidar_radar_on_a_street():
     rng = np.random.default_rng(5)
     T = perturb_exactly(T_LIDAR_RADAR, np.radians(2.0), 0.05, rng)
     prior = Prior(T_CAMERA_LIDAR, T, float(np.radians(2.0)), 0.05)
-    law_holds(estimate_lidar_radar(street_day(20), prior, None, SolveConfig(), rng), prior)
+    law_holds(estimate_lidar_radar(street_day(20), prior, SolveConfig(), rng), prior)
 
 
 @pytest.mark.slow

@@ -9,7 +9,6 @@ from pipeline.calibrate.joint.camera_lidar.estimate import (
     _usable,
     align_camera_lidar,
     analyse_camera_lidar,
-    estimate_camera_lidar,
 )
 from pipeline.calibrate.joint.camera_lidar.observability import time_offset_variance
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState
@@ -20,6 +19,7 @@ from pipeline.errors import SolveError
 from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.changes import change_between, change_covariance
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse, log_so3, perturb_exactly
+from tests.makers.camera_lidar import estimate_camera_lidar
 from tests.makers.solve_scenes import make_day
 from tests.makers.traced_scenes import DENSE, SPARSE, T_TRUE, traced_day
 

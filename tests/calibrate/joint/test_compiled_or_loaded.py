@@ -18,11 +18,11 @@ from numba.core.dispatcher import Dispatcher
 
 import pipeline.objective
 import pipeline.perceive
-from pipeline.calibrate.joint.camera_lidar.estimate import estimate_camera_lidar
 from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.se3 import perturb_exactly
+from tests.makers.camera_lidar import estimate_camera_lidar
 from tests.makers.radar_scenes import T_LIDAR_RADAR, street_day
 from tests.makers.solve_scenes import T_CAMERA_LIDAR
 from tests.makers.traced_scenes import SPARSE, T_TRUE, traced_day
@@ -37,7 +37,7 @@ def estimates():
     seen = estimate_camera_lidar(traced_day(SPARSE, 6, seed=3), prior, config, np.random.default_rng(5))
     T = perturb_exactly(T_LIDAR_RADAR, np.radians(2.0), 0.1, np.random.default_rng(0))
     prior = Prior(T_CAMERA_LIDAR, T, float(np.radians(2.0)), 0.05)
-    ranged = estimate_lidar_radar(street_day(12), prior, T_CAMERA_LIDAR, config, np.random.default_rng(3))
+    ranged = estimate_lidar_radar(street_day(12), prior, config, np.random.default_rng(3))
     return [
         (
             e.T.tolist(),

@@ -31,8 +31,8 @@ def prior_off_by(rotation_deg, shift_m, seed=0):
     return Prior(T_CAMERA_LIDAR, T, SIGMA_ROTATION, SIGMA_SHIFT)
 
 
-def solve(day, prior, camera=T_CAMERA_LIDAR, seed=0):
-    return estimate_lidar_radar(day, prior, camera, CONFIG, np.random.default_rng(seed))
+def solve(day, prior, seed=0):
+    return estimate_lidar_radar(day, prior, CONFIG, np.random.default_rng(seed))
 
 
 def error_of(estimate):
@@ -147,13 +147,6 @@ def test_frames_of_a_turn_that_no_odometry_measured_are_left_out(day):
     assert solve([*measured, *straight], prior_off_by(1, 0.02)).frames_used == 24
 
 
-def test_boxes_make_roll_surer(day):
-    with_camera, without = (solve(day, prior_off_by(1, 0.02), camera) for camera in (T_CAMERA_LIDAR, None))
-    assert with_camera.covariance[0, 0] < without.covariance[0, 0]
-    assert with_camera.diagnostics["boxes"] > 20
-    assert without.diagnostics["boxes"] == 0
-
-
 def test_a_radar_of_poor_elevation_is_not_trusted_with_roll(day):
     rng = np.random.default_rng(5)
 
@@ -162,8 +155,8 @@ def test_a_radar_of_poor_elevation_is_not_trusted_with_roll(day):
         aer[:, 1] += np.radians(4.0) * rng.standard_normal(len(aer))
         return replace(o, radar_xyz_m=from_spherical(aer).astype(np.float32))
 
-    sharp = solve(day[:20], prior_off_by(1, 0.02), None)
-    poor = solve([blurred(o) for o in day[:20]], prior_off_by(1, 0.02), None)
+    sharp = solve(day[:20], prior_off_by(1, 0.02))
+    poor = solve([blurred(o) for o in day[:20]], prior_off_by(1, 0.02))
     sigma = [np.sqrt(found.covariance[0, 0]) for found in (sharp, poor)]
     assert sigma[1] > 2 * sigma[0]
     for found, s in zip((sharp, poor), sigma, strict=True):
@@ -184,7 +177,7 @@ def with_road(day, pitched_deg=0.0):
 
 
 def test_the_way_along_the_road_makes_pitch_surer(day):
-    blind, seeing = (solve(rows, prior_off_by(1, 0.02), None) for rows in (day[:20], with_road(day[:20])))
+    blind, seeing = (solve(rows, prior_off_by(1, 0.02)) for rows in (day[:20], with_road(day[:20])))
     assert blind.diagnostics["doppler_frames"] == 0
     assert seeing.diagnostics["doppler_frames"] >= 10
     assert seeing.covariance[1, 1] < 0.8 * blind.covariance[1, 1]
@@ -194,15 +187,15 @@ def test_the_way_along_the_road_makes_pitch_surer(day):
 
 def test_a_way_that_contradicts_the_registration_makes_pitch_less_sure_and_says_so(day):
     agreeing, contradicting = (
-        solve(with_road(day[:20], pitched_deg), prior_off_by(1, 0.02), None) for pitched_deg in (0.0, 3.0)
+        solve(with_road(day[:20], pitched_deg), prior_off_by(1, 0.02)) for pitched_deg in (0.0, 3.0)
     )
     assert contradicting.covariance[1, 1] > 4 * agreeing.covariance[1, 1]
     assert any("witnesses of radar pitch contradict each other" in note for note in contradicting.notes)
 
 
 def test_a_constant_elevation_error_turns_pitch_and_leaves_roll(day):
-    right = solve(day[:20], prior_off_by(1, 0.02), None)
-    high = solve(elevated(day[:20], np.radians(1.0)), prior_off_by(1, 0.02), None)
+    right = solve(day[:20], prior_off_by(1, 0.02))
+    high = solve(elevated(day[:20], np.radians(1.0)), prior_off_by(1, 0.02))
     turned = change_between(right.T, high.T)
     assert 0.8 < np.degrees(turned[1]) < 1.1  # all but the prior's share
     assert abs(np.degrees(turned[0])) < 0.15
@@ -211,8 +204,8 @@ def test_a_constant_elevation_error_turns_pitch_and_leaves_roll(day):
 def test_detections_by_way_of_the_road_turn_the_radar_by_less_than_its_sigma(day):
     plane = np.array([0.0, 0.0, 1.0, -GROUND_M])
     rows = [replace(o, ground_plane=plane) for o in day[:20]]
-    right = solve(rows, prior_off_by(1, 0.02), None)
-    bent = solve(bounced(rows, T_LIDAR_RADAR, 1 / 6, np.random.default_rng(0)), prior_off_by(1, 0.02), None)
+    right = solve(rows, prior_off_by(1, 0.02))
+    bent = solve(bounced(rows, T_LIDAR_RADAR, 1 / 6, np.random.default_rng(0)), prior_off_by(1, 0.02))
     turned = change_between(right.T, bent.T)
     assert np.all(np.abs(turned[:2]) < np.sqrt(np.diag(bent.covariance)[:2]))
 

@@ -96,7 +96,7 @@ def test_a_third_of_a_day_in_a_convoy_moves_nothing_and_is_counted():
         measured = replace(o, ego_yaw_rate_radps=0.0)
         frames.append(replace(measured, **wrong) if k % 3 == 0 else measured)
     prior = Prior(T_CAMERA_LIDAR, T_LIDAR_RADAR, np.radians(2.0), 0.2)
-    found = estimate_lidar_radar(frames, prior, None, SolveConfig(), np.random.default_rng(0))
+    found = estimate_lidar_radar(frames, prior, SolveConfig(), np.random.default_rng(0))
     assert found.frames_rejected == {"radar velocity contradicts the odometry": 8}
     assert found.frames_used == 16
     error = change_between(T_LIDAR_RADAR, found.T)

@@ -3,18 +3,19 @@
 The statistic is the root mean square of error over sigma, over the degrees of freedom that a day determines (and the
 radar's time offset). It would be 1 where sigmas held noise only. Theirs also hold bias floors, for what real drives
 have and these scenes have not, so it is smaller here; the bounds are a third either way of what other seeds showed
-(100 to 107 for the radar; 100 to 109 for the camera, measured with 0.7.0: 0.23 and 0.33 by fives).
+(100 to 107 for the radar, without boxes: 0.37 and 0.35 by fives; 100 to 109 for the camera, measured with 0.7.0: 0.23
+and 0.33 by fives).
 """
 
 import numpy as np
 import pytest
 
-from pipeline.calibrate.joint.camera_lidar.estimate import estimate_camera_lidar
 from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.changes import change_between, change_covariance
 from pipeline.geometry.se3 import perturb_exactly
+from tests.makers.camera_lidar import estimate_camera_lidar
 from tests.makers.radar_scenes import DT_S, T_LIDAR_RADAR, street_day
 from tests.makers.solve_scenes import T_CAMERA_LIDAR
 from tests.makers.traced_scenes import SPARSE, T_TRUE, traced_day
@@ -29,7 +30,7 @@ def radar_normalised(seed):
     prior = Prior(
         T_CAMERA_LIDAR, perturb_exactly(T_LIDAR_RADAR, np.radians(1.5), 0.04, rng), SIGMA_RAD, SIGMA_M
     )
-    found = estimate_lidar_radar(street_day(20, seed=seed), prior, T_CAMERA_LIDAR, SolveConfig(), rng)
+    found = estimate_lidar_radar(street_day(20, seed=seed), prior, SolveConfig(), rng)
     offset = (found.time_offset_s - DT_S) / found.time_offset_sigma_s
     return [*normalised(found, T_LIDAR_RADAR), offset]
 
@@ -51,7 +52,7 @@ def normalised(estimate, T_true):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("of_day", "usual"),
-    [(radar_normalised, 0.47), (camera_normalised, 0.28)],
+    [(radar_normalised, 0.36), (camera_normalised, 0.28)],
     ids=["lidar-radar", "camera-lidar"],
 )
 def test_errors_are_as_large_as_their_sigmas_say_neither_larger_nor_smaller(of_day, usual):

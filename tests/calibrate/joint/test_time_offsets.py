@@ -11,7 +11,6 @@ from pipeline.calibrate.joint.lidar_radar.time_offset import dips
 from pipeline.extrinsics.estimates import Prior
 from pipeline.objective.radar.moving_clusters import moving_clusters
 from pipeline.objective.radar.registration import registration_frames
-from pipeline.objective.radar.vehicle_boxes import BOX_CLASSES, vehicle_boxes
 from tests.makers.radar_scenes import DT_S, SIGMA, T_LIDAR_RADAR, street_day
 from tests.makers.solve_scenes import T_CAMERA_LIDAR
 
@@ -41,8 +40,6 @@ def problem():
         rows,
         registration_frames(rows, T_LIDAR_RADAR, rng),
         moving_clusters(rows, with_boxes=False),
-        vehicle_boxes(rows),
-        None,
         Prior(T_CAMERA_LIDAR, T_LIDAR_RADAR, np.radians(2), 0.05),
         0.05,
         np.radians(0.4),
@@ -51,7 +48,7 @@ def problem():
 
 
 def state_at(dt_s):
-    return RadarState(T_LIDAR_RADAR, dt_s, 0.0, np.zeros(len(BOX_CLASSES)), SIGMA, 0.0)
+    return RadarState(T_LIDAR_RADAR, dt_s, 0.0, SIGMA, 0.0)
 
 
 @pytest.mark.parametrize("slid_s", [0.6, -0.6])

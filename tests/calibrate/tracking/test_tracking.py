@@ -177,7 +177,7 @@ def test_a_cluster_as_high_as_a_house_or_off_the_ground_is_no_road_user(day):
 def test_tracks_that_contradict_each_other_are_not_paired():
     path = np.array([30.0, 2, 0]) + np.array([5.0, 0, 0]) * STEP_S * np.arange(6)[:, None]
     lidar = [make_track(path, np.array([5.0, 0, 0]))]
-    assert associate(shared_sightings(lidar, lidar), np.eye(4), np.radians(1)).count == 1
+    assert len(associate(shared_sightings(lidar, lidar), np.eye(4), np.radians(1)).reference) == 1
     for other in (
         make_track(path + [15.0, 0, 0], np.array([5.0, 0, 0])),  # too far
         make_track(path, np.array([-8.0, 0, 0])),  # the wrong way
@@ -185,7 +185,7 @@ def test_tracks_that_contradict_each_other_are_not_paired():
         make_track(path, np.array([5.0, 0, 0]), first_frame=5),  # another time
         make_track(path, np.array([5.0, 0, 0]), drive=1),
     ):
-        assert associate(shared_sightings(lidar, [other]), np.eye(4), np.radians(1)).count == 0
+        assert not len(associate(shared_sightings(lidar, [other]), np.eye(4), np.radians(1)).reference)
 
 
 @pytest.mark.parametrize(("turn", "expected"), [(0.0, False), (1.0, True)])

@@ -112,9 +112,7 @@ def test_a_radar_mounted_further_ahead_than_its_prior_says_is_found_though_x_is_
     T = T_LIDAR_RADAR.copy()
     T[0, 3] += off_m
     prior = replace(PRIOR, T_lidar_radar=T, translation_sigma_m=0.01)
-    found = estimate_lidar_radar(
-        street_day(24, seed=5), prior, T_CAMERA_LIDAR, SolveConfig(), np.random.default_rng(0)
-    )
+    found = estimate_lidar_radar(street_day(24, seed=5), prior, SolveConfig(), np.random.default_rng(0))
     alarms = prior_alarms({"lidar_radar": found}, prior, LIMITS)["lidar_radar"]
     own = found.diagnostics
     assert not found.observable[3]

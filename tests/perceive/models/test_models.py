@@ -52,7 +52,7 @@ def test_boundaries_of_reduced_logits_lie_where_the_image_has_them(tmp_path, fit
     image = np.full((rows, columns, 3), 51, np.uint8)
     image[:, columns // 3 :] = (230, 26, 26)  # BGR: sky
     image[: rows // 4] = (26, 26, 230)  # building
-    labels = Segmenter(segmenter(tmp_path, fit)).segment(image, (rows // 2, columns // 2))
+    [labels] = Segmenter(segmenter(tmp_path, fit)).segment_each([image], [(rows // 2, columns // 2)])
     assert labels.shape == (rows // 2, columns // 2)
     assert set(np.unique(labels)) == {2, 3, 10}
     middle, right = labels[rows // 3], labels[:, -3]
@@ -68,7 +68,7 @@ def test_interpolated_logits_place_a_boundary_finer_than_their_stride(tmp_path):
     for edge in range(60, 100):
         image = np.full((96, 160, 3), 51, np.uint8)
         image[:, edge:] = (230, 26, 26)
-        labels = model.segment(image, (96, 160))
+        [labels] = model.segment_each([image], [(96, 160)])
         errors.append(np.sum(labels[40] == 3) - edge)
     assert abs(np.mean(errors)) < 0.6
     assert np.max(np.abs(errors)) <= 2  # nearest would err by up to 4
@@ -82,7 +82,7 @@ def test_plain_label_outputs_are_resampled_with_aligned_centres(tmp_path):
     manifest = load_manifest(
         write_manifest(tmp_path / "m.toml", tmp_path / "m.onnx", "segment", given, output), "segment"
     )
-    labels = Segmenter(manifest).segment(np.zeros((192, 320, 3), np.uint8), (96, 160))
+    [labels] = Segmenter(manifest).segment_each([np.zeros((192, 320, 3), np.uint8)], [(96, 160)])
     assert np.array_equal(np.unique(labels, return_counts=True)[1], [96 * 40, 96 * 120])
 
 
@@ -249,16 +249,16 @@ def answering(folder, answer, layout, label_set="cityscapes"):
 def test_answers_of_other_classes_or_of_no_numbers_are_refused(tmp_path, answer, layout, words):
     model = answering(tmp_path, answer, layout)
     with pytest.raises(ModelError, match=words):
-        model.segment(np.zeros((96, 160, 3), np.uint8), (48, 80))
+        model.segment_each([np.zeros((96, 160, 3), np.uint8)], [(48, 80)])
 
 
 def test_a_model_that_answers_every_picture_alike_is_refused_and_a_stuck_camera_is_not_its_fault(tmp_path):
     model = answering(tmp_path, np.zeros((1, 19, 24, 40)), "logits")
     pictures = [np.full((96, 160, 3), shade, np.uint8) for shade in range(4)]
     for picture in [pictures[0]] * 9 + pictures[:3]:
-        model.segment(picture, (48, 80))
+        model.segment_each([picture], [(48, 80)])
     with pytest.raises(ModelOutputError, match="same answer for 4 different inputs"):
-        model.segment(pictures[3], (48, 80))
+        model.segment_each([pictures[3]], [(48, 80)])
 
 
 def test_a_detector_of_other_classes_or_of_no_numbers_is_refused(tmp_path):

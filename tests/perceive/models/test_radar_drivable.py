@@ -21,6 +21,7 @@ from pipeline.perceive.models.radar_drivable import RadarDrivable
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import observations_of
 from schemas.observations import Observation
+from tests.makers.fleet_files import THREE_SENSORS
 from tests.makers.lakes import write_frames
 from tests.makers.stages import perceive_day
 
@@ -29,9 +30,7 @@ COLUMNS = {"radar_drivable_azimuth_rad", "radar_drivable_range_m"}
 
 
 def fleet(file="fleet.toml", **radar):
-    semantics = {"source": "topics", "labels": "/l", "detections": "/d"}
-    camera = {"image": "/i", "info": "/c", "semantics": semantics}
-    rig = {"camera": camera, "lidar": {"points": "/p"}, "radar": {"points": "/r"} | radar}
+    rig = THREE_SENSORS | {"radar": THREE_SENSORS["radar"] | radar}
     values = {"fleet": {"name": "made"}, "rigs": {"default": rig}, "vehicles": {"car-1": {}}}
     return FleetConfig.model_validate(values).read_from(Path(file))
 

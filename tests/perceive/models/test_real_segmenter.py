@@ -79,7 +79,7 @@ def test_several_images_in_one_run_get_the_labels_that_each_gets_alone(real_logs
     own, joint = (Session(m, (3, 512, 1024)).run_each(tensors) for m in both)
     for a, b in zip(own, joint, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
-    expected = [alone.segment(image, size) for image, size in zip(images, sizes, strict=True)]
+    expected = [alone.segment_each([image], [size])[0] for image, size in zip(images, sizes, strict=True)]
     found = together.segment_each(images, sizes)
     for a, b in zip(expected, found, strict=True):
         assert np.mean(a != b) < 1e-4  # pixels where two classes are alike to the last bits
@@ -89,7 +89,7 @@ def test_espnetv2_labels_pixels_as_the_log_does(real_logs, real_segmenter, tmp_p
     segmenter = Segmenter(manifest_of(real_segmenter, tmp_path))
     agreement, road = [], []
     for image, logged in images_and_labels(real_logs / "astyx-1_2019-01-14_00.mcap"):
-        labels = segmenter.segment(image, logged.shape)
+        [labels] = segmenter.segment_each([image], [logged.shape])
         known = logged != 255
         agreement.append(np.mean(labels[known] == logged[known]))
         road.append(np.sum((labels == ROAD) & (logged == ROAD)) / np.sum((labels == ROAD) | (logged == ROAD)))

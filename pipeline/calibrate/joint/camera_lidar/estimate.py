@@ -31,7 +31,6 @@ from pipeline.calibrate.joint.camera_lidar.observability import (
     CameraLidarProblem,
     ObservabilityAnalysis,
     analyse_observability,
-    day_covariance,
 )
 from pipeline.calibrate.joint.camera_lidar.optical_axis import TZ
 from pipeline.calibrate.joint.camera_lidar.other_solutions import parts_of_alignment, starts_apart
@@ -43,7 +42,6 @@ from pipeline.calibrate.joint.camera_lidar.refine import (
     weighted,
 )
 from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
-from pipeline.calibrate.joint.camera_lidar.side_bias import sides_apart
 from pipeline.calibrate.joint.camera_lidar.time_offset import FOCAL, far_time_offset, s_per_metre
 from pipeline.calibrate.joint.camera_lidar.witnesses import (
     Witness,
@@ -83,7 +81,6 @@ __all__ = [
     "AlignmentState",
     "align_camera_lidar",
     "analyse_camera_lidar",
-    "estimate_camera_lidar",
 ]
 
 _FEWEST_FRAMES = 5
@@ -109,30 +106,16 @@ class Aligned:
         float  # by which labels are wider than their objects, and the problem's edges moved outward
     )
 
-    @property
-    def T_camera_lidar(self) -> Float[np.ndarray, "4 4"]:
-        """The pose."""
-        return self.state.T_camera_lidar
 
-    @property
-    def covariance(self) -> Float[np.ndarray, "6 6"]:
-        """Covariance of the pose, by left perturbation."""
-        biases = sides_apart(self.problem.terms, self.state, self.kernel).biases(IS_TZ)
-        of_day = day_covariance(self.problem, self.state, self.kernel, IS_TZ)
-        of_changes = of_day.beside(biases).covariance[:6, :6]
-        to_left = np.linalg.inv(change_jacobian(self.state.T_camera_lidar))
-        return to_left @ of_changes @ to_left.T
-
-
-def estimate_camera_lidar(
+def align_camera_lidar(
     observations: Sequence[Observation],
     prior: Prior,
     config: SolveConfig,
     rng: np.random.Generator,
-    *,
-    velocity_lidar: Float[np.ndarray, "F 3"] | None = None,
-) -> PairEstimate:
-    """Estimate T_camera_lidar and the camera's time offset.
+) -> Aligned:
+    """Find the basin and refine in it, from wide to narrow kernels.
+
+    The car drives along the heading that the radar's Doppler and the prior T_lidar_radar show.
 
     Args:
         observations: the day's frames; those with another camera or label size than the first are left out.
@@ -140,31 +123,14 @@ def estimate_camera_lidar(
             gaps, with `time_offset_sigma_s`.
         config: search box and resampling.
         rng: source of all random numbers.
-        velocity_lidar: own velocity per observation in lidar axes [m/s]; by default the speed along the
-            heading that the radar's Doppler and the prior T_lidar_radar show.
 
     Raises:
         SolveError: too few frames, or nothing to align in them.
     """
-    aligned = align_camera_lidar(observations, prior, config, rng, velocity_lidar=velocity_lidar)
-    return analyse_camera_lidar(aligned, rng)
-
-
-def align_camera_lidar(
-    observations: Sequence[Observation],
-    prior: Prior,
-    config: SolveConfig,
-    rng: np.random.Generator,
-    *,
-    velocity_lidar: Float[np.ndarray, "F 3"] | None = None,
-) -> Aligned:
-    """Find the basin and refine in it, from wide to narrow kernels; arguments as of `estimate_camera_lidar`."""
     used, rejected = _usable(observations)
-    heading_sigma = HEADING_SIGMA_RAD
-    if velocity_lidar is None:
-        heading_rad, sigma_rad = prior.heading or (None, prior.rotation_sigma_rad)
-        velocity_lidar = lidar_velocities(observations, prior.T_lidar_radar, heading_rad)
-        heading_sigma = float(np.hypot(heading_sigma, sigma_rad))
+    heading_rad, sigma_rad = prior.heading or (None, prior.rotation_sigma_rad)
+    velocity_lidar = lidar_velocities(observations, prior.T_lidar_radar, heading_rad)
+    heading_sigma = float(np.hypot(HEADING_SIGMA_RAD, sigma_rad))
     if len(used) < _FEWEST_FRAMES:
         raise SolveError(f"camera-lidar needs {_FEWEST_FRAMES} frames of one camera, the day has {len(used)}")
     frames = [observations[i] for i in used]
@@ -179,24 +145,7 @@ def align_camera_lidar(
     basin = find_basin(terms, thin, rng, scenes.block)
     thin = replace(thin, terms=thin.terms.exposed_at(basin.state.alone), kernel=basin.kernel)
     sharp = sharp.in_view(basin.state.T_camera_lidar, MARGIN_RAD).at_most(SCHEDULE.sharp_points, rng)
-    # Wide kernels are biased along the optical axis: where the prior is better than that, start at its tz.
-    near = prior.translation_sigma_m <= _NEAR_PRIOR_M
-    fixed = IS_TZ if near else NONE_FIXED
-    starts = {"best": basin.state, "second": basin.second, "rival": basin.rival}
-    ends = {name: start for name, start in starts.items() if start is not None}
-    ends = {k: _at_prior_tz(end, prior, terms) if near else end for k, end in ends.items()}
-    ends = {k: refine(thin, end, steps=SCHEDULE.first_steps, fixed=fixed) for k, end in ends.items()}
-    kernel = basin.kernel
-    for sigma_px, contrast in SCHEDULE.kernels[1:]:
-        sharp = sharp.exposed_at(ends["best"].alone)
-        fitted = sharp.fitted(ends["best"].alone, KernelSettings.wide(sigma_px, contrast), rng)
-        kernel = weighted(sharp, ends["best"], fitted, scenes)
-        scored = Scored(sharp, kernel, prior, config, limits)
-        ends = {k: refine(scored, end, steps=SCHEDULE.sharper_steps, fixed=fixed) for k, end in ends.items()}
-    state, second = ends["best"], ends.get("second")
-    if (rival := ends.get("rival")) is not None:
-        basin = settled(basin, Scored(sharp, kernel, prior, config, limits), state, rival)
-        second = second or rival
+    sharp, kernel, basin, state, second = _refined(thin, sharp, terms, basin, scenes, rng)
     width_px = label_width_px(sharp, state.alone, kernel)
     problem = CameraLidarProblem(
         widened(sharp, state.T_camera_lidar, width_px),
@@ -212,6 +161,30 @@ def align_camera_lidar(
     return Aligned(
         problem, frames, rejected, basin, state, second, kernel, expected_dt_s, intrinsics, width_px
     )
+
+
+def _refined(
+    thin: Scored, sharp: Terms, terms: Terms, basin: Basin, scenes: Scenes, rng: np.random.Generator
+) -> tuple[Terms, KernelSettings, Basin, AlignmentState, AlignmentState | None]:
+    """Candidates of the basin from its wide kernel to the narrowest: where the best and the second best led."""
+    # Wide kernels are biased along the optical axis: where the prior is better than that, start at its tz.
+    near = thin.prior.translation_sigma_m <= _NEAR_PRIOR_M
+    fixed = IS_TZ if near else NONE_FIXED
+    starts = {"best": basin.state, "second": basin.second, "rival": basin.rival}
+    ends = {name: start for name, start in starts.items() if start is not None}
+    ends = {k: _at_prior_tz(end, thin.prior, terms) if near else end for k, end in ends.items()}
+    ends = {k: refine(thin, end, steps=SCHEDULE.first_steps, fixed=fixed) for k, end in ends.items()}
+    scored = replace(thin, terms=sharp)
+    for sigma_px, contrast in SCHEDULE.kernels[1:]:
+        sharp = sharp.exposed_at(ends["best"].alone)
+        fitted = sharp.fitted(ends["best"].alone, KernelSettings.wide(sigma_px, contrast), rng)
+        scored = replace(thin, terms=sharp, kernel=weighted(sharp, ends["best"], fitted, scenes))
+        ends = {k: refine(scored, end, steps=SCHEDULE.sharper_steps, fixed=fixed) for k, end in ends.items()}
+    state, second = ends["best"], ends.get("second")
+    if (rival := ends.get("rival")) is not None:
+        basin = settled(basin, scored, state, rival)
+        second = second or rival
+    return sharp, scored.kernel, basin, state, second
 
 
 def analyse_camera_lidar(

@@ -2,40 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from pipeline.calibrate.joint.lidar_radar.problem import DT, RANGE, Linear, RadarState
-from pipeline.calibrate.joint.lidar_radar.witnesses import Witness, contradiction, own_numbers
+from pipeline.calibrate.joint.lidar_radar.observability import ObservabilityAnalysis
+from pipeline.calibrate.joint.lidar_radar.problem import DT, RANGE, RadarState
+from pipeline.calibrate.joint.lidar_radar.witnesses import contradiction, own_numbers
 from pipeline.calibrate.numerics.bias_floors import RADAR_ELEVATION_BIAS_RAD, RANGE_BIAS_SIGMA_M
 from pipeline.geometry.changes import change_between
-from pipeline.objective.radar.heights import Heights
 
-__all__ = ["ObservabilityAnalysis", "diagnostics_of", "notes_of"]
+__all__ = ["diagnostics_of", "notes_of"]
 
-_FEWEST_BOXES = 5
 _DT_UNSURE_S = 0.005  # a time offset known no better than this gets a note
 _NAMES = np.array(["roll", "pitch", "yaw", "x", "y", "z"])
 _DOF_UNITS = ("rx_rad", "ry_rad", "rz_rad", "tx_m", "ty_m", "tz_m")
-
-
-@dataclass(frozen=True, eq=False)
-class ObservabilityAnalysis:
-    """The solution in which every unknown is either determined by the day or fixed at the prior."""
-
-    state: RadarState
-    linear: Linear
-    covariance: np.ndarray  # P P, of all unknowns, turns about the radar
-    common: np.ndarray  # P P, of the covariance what all days of a vehicle err by alike
-    bias: np.ndarray  # 7 7, of the common part what was added to all else
-    # P P: what all frames of the day err by alike, in the weights of elevation's sources; of that, what all days share.
-    floors: np.ndarray
-    floors_alike: np.ndarray
-    fixed: np.ndarray  # P, bool
-    observability: np.ndarray  # 7, of pose and dt
-    witnesses: tuple[Witness, ...]  # of pitch, asked where the car's way had no say yet
-    heights: Heights | None
 
 
 def notes_of(analysis: ObservabilityAnalysis, *, has_elevation: bool) -> list[str]:
@@ -51,12 +30,9 @@ def notes_of(analysis: ObservabilityAnalysis, *, has_elevation: bool) -> list[st
         notes.append(
             f"time offset known to {1e3 * dt_sigma_s:.0f} ms only: where the car keeps one speed, x looks the same"
         )
-    if linear.boxes < _FEWEST_BOXES:
-        notes.append(
-            "no vehicle boxes with radar elevations: roll and pitch depend on the registration and the prior"
-        )
-    else:
-        notes.append("radar pitch assumes that returns are at a constant angle (0 +- 1 deg) from box centres")
+    notes.append(
+        "no vehicle boxes with radar elevations: roll and pitch depend on the registration and the prior"
+    )
     if linear.travel_frames:
         notes.append(
             "radar pitch assumes that the car drives along its road, as the lidar sees it under the car"
@@ -103,9 +79,8 @@ def diagnostics_of(
         "bounce_share": state.bounce,
         **({} if analysis.heights is None else {"displaced_share": analysis.heights.displaced}),
         "assigned_share": float(linear.registration.assigned.mean()),
-        "boxes": float(linear.boxes),
-        "box_sigma_rad": linear.box_sigma_rad,
-        **{f"box_bias_{k}_rad": float(v) for k, v in zip(("car", "large"), state.bias_rad, strict=True)},
+        # Boxes are camera-radar's; the names stay for who reads records.
+        **dict.fromkeys(("boxes", "box_bias_car_rad", "box_bias_large_rad"), 0.0),
         "moving_azimuth_sigma_rad": linear.mover_sigma_rad,
         "registration_roll_offset_rad": float(linear.registration_step[0]),
         "registration_roll_sigma_rad": float(linear.floor[0]),

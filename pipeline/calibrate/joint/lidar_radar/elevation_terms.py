@@ -1,9 +1,9 @@
 """Terms for roll, pitch and z of lidar-radar from elevations and the direction of travel, with their errors.
 
 The registration's elevations contribute no more than the lidar's own beam spacing allows (points collapse
-onto the rings, repeatably and with the lowest residual); the camera's vehicle boxes determine roll, and pitch
-up to their constant. The direction of travel adds pitch: Doppler gives it in radar axes, the road in
-lidar axes. Displaced heights add pitch as a function of the radar's height.
+onto the rings, repeatably and with the lowest residual). The direction of travel adds pitch: Doppler gives it
+in radar axes, the road in lidar axes. Displaced heights add pitch as a function of the radar's height. The
+camera's vehicle boxes belong to camera-radar: the adjustment of all edges brings their roll and pitch here.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from pipeline.calibrate.joint.lidar_radar.problem import (
-    CLASSES,
     ELEVATION_DOF,
     SEEN_LOW,
     RadarProblem,
@@ -28,15 +27,12 @@ from pipeline.calibrate.joint.lidar_radar.tilt_floors import (
     tilt_of,
 )
 from pipeline.calibrate.joint.lidar_radar.witnesses import Witness, own_equations
-from pipeline.calibrate.numerics.bias_floors import BOX_ROLL_FLOOR_LIDAR_RAD
 from pipeline.geometry.changes import change_between
 from pipeline.objective.radar.heights import Heights
 from pipeline.objective.radar.registration import NormalEquations
 from pipeline.objective.radar.travel import DOPPLER_PITCH_FLOOR_RAD, pitch_equations
-from pipeline.objective.radar.vehicle_boxes import BIAS_SIGMA_RAD, BOX_CLASSES, BoxPairs, box_equations
 
 __all__ = [
-    "add_boxes",
     "add_elevations",
     "add_heights",
     "add_travel",
@@ -44,36 +40,6 @@ __all__ = [
     "travel_equations",
     "turned",
 ]
-
-# Roll and pitch of the boxes, and their constants: pitch has unknowns of its own.
-_BOX_FLOOR = np.array([BOX_ROLL_FLOOR_LIDAR_RAD, 0.0] + [0.0] * len(BOX_CLASSES))
-
-
-def add_boxes(
-    problem: RadarProblem,
-    state: RadarState,
-    pairs: BoxPairs | None,
-    about_radar: np.ndarray,
-    sums: Sums,
-) -> tuple[float, Witness | None]:
-    """Add the camera's vehicle boxes; returns an elevation's sigma in its box [rad], and their pitch."""
-    if pairs is None or problem.T_camera_lidar is None:
-        return float("nan"), None
-    F = len(sums.g)
-    Hb, gb, sigma = box_equations(pairs, problem.T_camera_lidar, state.T_lidar_radar, state.bias_rad, F)
-    Hb, gb = turned(about_radar, Hb, gb)
-    # Roll, pitch and the biases only: a constant offset below the centre in metres would look like z, and boxes were
-    # matched by azimuth at this pose.
-    own = np.array([0, 1, *range(6, 6 + len(BOX_CLASSES))])
-    Hb, gb = Hb[:, own[:, None], own], gb[:, own]
-    prior = np.diag([0.0, *[1 / BIAS_SIGMA_RAD**2] * len(BOX_CLASSES)])
-    H_own, g_own = tilt_of(state.T_lidar_radar, Hb.sum(0), gb.sum(0))
-    witness = own_equations("boxes", H_own[1:, 1:] + prior, g_own[1:] + prior @ [0.0, *state.bias_rad], 0.0)
-    doubt_rad = problem.doubt_rad.get("boxes", 0.0)
-    floor = along_radar(state.T_lidar_radar, _BOX_FLOOR + doubt_rad * (np.arange(len(_BOX_FLOOR)) == 1))
-    columns = np.array([0, 1, *range(CLASSES.start, CLASSES.stop)])
-    _add_tilts(problem, state, "boxes", columns, Hb, gb, floor, sums)
-    return sigma, witness
 
 
 def add_travel(problem: RadarProblem, state: RadarState, sums: Sums) -> tuple[float, Witness | None]:

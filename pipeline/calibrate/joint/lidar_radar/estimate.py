@@ -9,59 +9,47 @@ determined unknown would follow any weak structure of the scene, by many sigmas 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float
 
-from pipeline.calibrate.joint.lidar_radar.conclusions import ObservabilityAnalysis, diagnostics_of, notes_of
+from pipeline.calibrate.joint.lidar_radar.conclusions import diagnostics_of, notes_of
 from pipeline.calibrate.joint.lidar_radar.elevation_spread import beam_spacing, elevation_spread
 from pipeline.calibrate.joint.lidar_radar.elevation_terms import height_equations, travel_equations
-from pipeline.calibrate.joint.lidar_radar.measured_curvature import with_measured_curvature
+from pipeline.calibrate.joint.lidar_radar.observability import ObservabilityAnalysis, analyse_observability
 from pipeline.calibrate.joint.lidar_radar.own_position import own_position
 from pipeline.calibrate.joint.lidar_radar.problem import (
-    AZIMUTH_RANGE_DOF,
     DT,
-    ELEVATION_DOF,
-    SEEN_LOW,
-    Linear,
     RadarProblem,
     RadarState,
 )
 from pipeline.calibrate.joint.lidar_radar.radar_velocity import contradicts_odometry, turns_unmeasured
 from pipeline.calibrate.joint.lidar_radar.schedule import SCHEDULE
-from pipeline.calibrate.joint.lidar_radar.search import NONE_FIXED, anneal, finish, last_step, scan
+from pipeline.calibrate.joint.lidar_radar.search import anneal, finish, scan
 from pipeline.calibrate.joint.lidar_radar.seen_low import seen_low_of
-from pipeline.calibrate.joint.lidar_radar.tilt_floors import following_tilt, radar_tilt_axes
+from pipeline.calibrate.joint.lidar_radar.tilt_floors import radar_tilt_axes
 from pipeline.calibrate.joint.lidar_radar.time_offset import (
     better_time_offset,
     comparison_cost,
     far_time_offset,
 )
 from pipeline.calibrate.joint.lidar_radar.witnesses import Witness, contradiction, doubted
-from pipeline.calibrate.numerics.bias_floors import (
-    LIDAR_RADAR_BIAS,
-    LIDAR_RADAR_DT_FLOOR_S,
-)
 from pipeline.calibrate.numerics.change_point import parts_of_day, with_parts
 from pipeline.calibrate.numerics.covariance import (
     CLEARLY,
-    OBSERVABLE,
     bootstrap_covariance,
-    covariance_with_fixed,
     with_ends,
 )
 from pipeline.calibrate.numerics.frame_blocks import blocks_of, scenes_of
 from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
-from pipeline.extrinsics.common_share import common_part, prior_share
+from pipeline.extrinsics.common_share import common_part
 from pipeline.extrinsics.estimates import DayParts, PairEstimate, Prior
 from pipeline.geometry.changes import change_between, change_jacobian
 from pipeline.objective.radar.heights import displaced_heights
 from pipeline.objective.radar.moving_clusters import moving_clusters
 from pipeline.objective.radar.registration import registration_frames
 from pipeline.objective.radar.travel import travel_directions
-from pipeline.objective.radar.vehicle_boxes import vehicle_boxes
 from pipeline.objective.stamp_gaps import constant_gap_s, radar_gaps_s
 from pipeline.rig.evidence import EDGE
 from schemas.observations import Observation
@@ -71,27 +59,14 @@ __all__ = ["estimate_lidar_radar"]
 _FEWEST_FRAMES = 5
 # Of a part from the whole day: the registration reaches a degree and a half.
 _KNOCKS_RAD = tuple(np.radians([-5.0, -3.5, -2.0, 2.0, 3.5, 5.0]).tolist())
-_CAMERA_SIGMA_RAD = np.radians(0.5)  # a camera less sure than what its boxes show is left out
-_REMAINING_STEPS = 10.0  # of dt, that count as uncertainty: the valley is flat
 _YAW, _ANY_RAD = 2, np.radians(20.0)
-
-
-@dataclass(frozen=True, eq=False)
-class _Camera:
-    """Pose and covariance of camera-lidar, needed to use the camera's vehicle boxes."""
-
-    T_camera_lidar: np.ndarray | None
-    covariance: np.ndarray | None
 
 
 def estimate_lidar_radar(
     observations: Sequence[Observation],
     prior: Prior,
-    T_camera_lidar: Float[np.ndarray, "4 4"] | None,
     config: SolveConfig,
     rng: np.random.Generator,
-    *,
-    covariance_camera_lidar: Float[np.ndarray, "6 6"] | None = None,
 ) -> PairEstimate:
     """Estimate T_lidar_radar and the radar's time offset (stamp_lidar = stamp_radar + dt).
 
@@ -99,17 +74,13 @@ def estimate_lidar_radar(
         observations: the day's frames.
         prior: start, and weak information. It loses weight if the data contradict it by many sigmas, and
             dominates where the data have little information.
-        T_camera_lidar: needed to use the camera's boxes; without it, roll and pitch come from the
-            registration and the prior.
         config: search range, sigma of the time offset, resampling.
         rng: selects detections and resamples.
-        covariance_camera_lidar: covariance of T_camera_lidar; None = exact.
 
     Raises:
         SolveError: too few frames with static detections and a lidar map.
     """
-    camera = _usable_camera(T_camera_lidar, covariance_camera_lidar, config)
-    problem, rejected = _problem(observations, prior, camera.T_camera_lidar, config, rng)
+    problem, rejected = _problem(observations, prior, config, rng)
     count = problem.frames.count
     some = problem if count < SCHEDULE.many_frames else problem.of_frames(np.arange(0, count, 2))
     ends = [anneal(some, start) for start in scan(problem, config)]
@@ -119,10 +90,10 @@ def estimate_lidar_radar(
     without_way = best
     if {"doppler", "static"} & set(config.terms):
         problem, without_way, witnesses = _with_way(problem, best, rng)
-    analysis = _analyse_observability(problem, without_way, camera, config, rng)
+    analysis = analyse_observability(problem, without_way, config, rng)
     other = better_time_offset(problem, analysis.state)
     if other is not None:
-        analysis = _analyse_observability(problem, other, camera, config, rng)
+        analysis = analyse_observability(problem, other, config, rng)
     analysis = _with_witnesses(analysis, witnesses, without_way)
     parts = [problem.of_frames(np.arange(k, count, 2)) for k in (0, 1)]
     halves = [finish(part, analysis.state, analysis.fixed)[0] for part in parts]
@@ -142,7 +113,6 @@ def estimate_lidar_radar(
 def _problem(
     observations: Sequence[Observation],
     prior: Prior,
-    T_camera_lidar: np.ndarray | None,
     config: SolveConfig,
     rng: np.random.Generator,
 ) -> tuple[RadarProblem, dict[str, int]]:
@@ -167,8 +137,6 @@ def _problem(
         observations,
         replace(frames, stamp_gap_s=frames.stamp_gap_s - gap_s),
         replace(movers, stamp_gap_s=movers.stamp_gap_s - gap_s),
-        vehicle_boxes(observations),
-        T_camera_lidar,
         prior,
         config.time_offset_sigma_s,
         beam_spacing(observations),
@@ -261,16 +229,6 @@ def _with_witnesses(
     return replace(analysis, witnesses=witnesses, covariance=covariance, common=common)
 
 
-def _usable_camera(
-    T_camera_lidar: np.ndarray | None, covariance: np.ndarray | None, config: SolveConfig
-) -> _Camera:
-    """The camera; None if `terms` leaves its boxes out, or if its own error would affect roll and pitch."""
-    unsure = covariance is not None and np.diag(covariance)[:3].max() > _CAMERA_SIGMA_RAD**2
-    if unsure or "boxes" not in config.terms:
-        return _Camera(None, covariance)
-    return _Camera(T_camera_lidar, covariance)
-
-
 def _consistent_with_odometry(observations: Sequence[Observation]) -> list[Observation]:
     """Frames whose radar velocity the odometry does not contradict."""
     wrong = contradicts_odometry(observations)
@@ -285,101 +243,6 @@ def _second_best(ends: list[RadarState], costs: list[np.ndarray]) -> RadarState:
         if end is not ends[best] and worse.mean() < CLEARLY * worse.std() / np.sqrt(len(worse)):
             return end
     return ends[best]
-
-
-def _analyse_observability(
-    problem: RadarProblem,
-    state: RadarState,
-    camera: _Camera,
-    config: SolveConfig,
-    rng: np.random.Generator,
-) -> ObservabilityAnalysis:
-    """Solve, fix what the day did not determine, and solve again until nothing more has to be fixed."""
-    block = blocks_of(problem.observations, config.bootstrap_blocks)
-    before = np.append(np.diag(problem.prior.covariance("lidar_radar")), problem.dt_sigma_s**2)
-    fixed, observability = NONE_FIXED.copy(), np.ones(DT + 1)
-    while True:
-        if fixed.any() and not fixed[DT]:
-            # While free, x had followed dt through their valley; with x back at the prior, dt may be out of reach.
-            state = state.with_fixed(problem.prior, fixed)
-            state = better_time_offset(problem, state) or state
-        # Once the radar's sigmas are estimated they stay, so that solutions can be compared.
-        sharpen = problem.travel is None and problem.heights is None and not fixed.any()
-        state, linear = finish(problem, state, fixed, sharpen=sharpen)
-        information = with_measured_curvature(problem, state, linear.information)
-        curvature = information.sum(0) + linear.prior_information
-        variance = 1 / np.diag(linear.prior_information)
-        variance[: DT + 1] = np.where(fixed[: DT + 1], before, variance[: DT + 1])
-        full = covariance_with_fixed(information, linear.g, variance, curvature, fixed, block, rng)
-        full[:2, :2] += _camera_share(camera) * ~(fixed[:2, None] | fixed[:2])
-        follow = _following_tilt(linear, fixed)
-        full = follow @ full @ follow.T
-        free = ~fixed[: DT + 1]
-        dt_bias = LIDAR_RADAR_DT_FLOOR_S**2 + _remaining_dt(linear, state, fixed) ** 2
-        bias = np.where(free, [*LIDAR_RADAR_BIAS**2, dt_bias], 0.0)
-        removed = _observability(np.diag(full)[: DT + 1], bias, before)
-        observability[free] = removed[free]
-        if np.all(removed[free] >= OBSERVABLE):
-            break
-        unknown = removed < OBSERVABLE
-        # Where x and dt look alike, neither is determined while both are free, and one is once the other is fixed. Both
-        # fixed, they contradict the scene by metres, and yaw follows.
-        unknown[DT] &= not np.any(unknown[:DT] & ~fixed[:DT])
-        fixed[: DT + 1] |= unknown
-    floors, alike = (
-        follow @ _left_by(scatter, curvature, fixed) @ follow.T
-        for scatter in (linear.floors, linear.floors_alike)
-    )
-    # How low things are seen is the radar's and its roads': it is no less a bias for being estimated.
-    alike = alike + np.outer(full[SEEN_LOW], full[SEEN_LOW]) / variance[SEEN_LOW]
-    others = np.arange(len(variance)) != SEEN_LOW
-    common = alike + prior_share(full, np.diag(others / variance))
-    for covariance in (full, common):
-        covariance[np.arange(DT + 1), np.arange(DT + 1)] += bias
-    return ObservabilityAnalysis(
-        state,
-        linear,
-        full,
-        common,
-        np.diag(bias),
-        floors,
-        alike,
-        fixed,
-        observability,
-        linear.witnesses,
-        problem.heights,
-    )
-
-
-def _following_tilt(linear: Linear, fixed: Bool[np.ndarray, " P"]) -> Float[np.ndarray, "P P"]:
-    """Dependence of yaw, x, y, dt and range bias on errors of roll, pitch, z, which are fixed in their equations."""
-    H = np.zeros_like(linear.prior_information)
-    H[:8, :8] = linear.registration.H[0].sum(0)
-    follows = AZIMUTH_RANGE_DOF[~fixed[AZIMUTH_RANGE_DOF]]
-    return following_tilt(H, linear.prior_information, follows, ELEVATION_DOF)
-
-
-def _left_by(
-    scatter: Float[np.ndarray, "P P"], curvature: Float[np.ndarray, "P P"], fixed: Bool[np.ndarray, " P"]
-) -> Float[np.ndarray, "P P"]:
-    """Covariance of the free unknowns from the scatter of the total gradient."""
-    out, free = np.zeros_like(curvature), np.ix_(~fixed, ~fixed)
-    follow = np.linalg.inv(curvature[free])
-    out[free] = follow @ scatter[free] @ follow.T
-    return out
-
-
-def _observability(variance: np.ndarray, bias: np.ndarray, before: np.ndarray) -> np.ndarray:
-    """Fraction of prior variance removed, bias floor included.
-
-    Args:
-        variance: variance of the estimate, day and prior together, without bias.
-        bias: squared bias floor of the day's information.
-        before: variance of the prior.
-    """
-    # The floor is an error of the day's information alone: it does not widen the prior.
-    day = 1 / np.maximum(1 / variance - 1 / before, 1e-9 / before) + bias
-    return before / (before + day)
 
 
 def _conclude(
@@ -414,16 +277,3 @@ def _conclude(
         bias_in_weights=J @ analysis.floors_alike[:6, :6] @ J.T,
         time_offset_prior_s=-problem.constant_gap_s,
     )
-
-
-def _remaining_dt(linear: Linear, state: RadarState, fixed: np.ndarray) -> float:
-    """Ten times the next step of dt [s], because many small steps may follow in a flat valley."""
-    return float(_REMAINING_STEPS * last_step(linear, state, fixed)[DT])
-
-
-def _camera_share(camera: _Camera) -> np.ndarray:
-    """Covariance (2 2) of roll and pitch due to the camera-lidar rotation, through the boxes."""
-    if camera.covariance is None or camera.T_camera_lidar is None:
-        return np.zeros((2, 2))
-    R = camera.T_camera_lidar[:3, :3]
-    return (R.T @ camera.covariance[:3, :3] @ R)[:2, :2]

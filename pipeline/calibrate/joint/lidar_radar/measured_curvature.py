@@ -48,5 +48,5 @@ def with_measured_curvature(
 
 
 def _gradient(problem: RadarProblem, state: RadarState) -> np.ndarray:
-    g = linearise(problem, state, 1.0, None).g
+    g = linearise(problem, state, 1.0).g
     return g.sum(0)[AZIMUTH_RANGE_DOF]

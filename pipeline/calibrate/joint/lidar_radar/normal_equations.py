@@ -12,7 +12,6 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.calibrate.joint.lidar_radar.elevation_terms import (
-    add_boxes,
     add_elevations,
     add_heights,
     add_travel,
@@ -20,11 +19,11 @@ from pipeline.calibrate.joint.lidar_radar.elevation_terms import (
 )
 from pipeline.calibrate.joint.lidar_radar.problem import (
     AZIMUTH_RANGE_DOF,
-    CLASSES,
     DT,
     RANGE,
     SEEN_LOW,
     UNKNOWNS,
+    UNUSED,
     Linear,
     RadarProblem,
     RadarState,
@@ -39,21 +38,18 @@ from pipeline.calibrate.numerics.bias_floors import (
 from pipeline.geometry.changes import change_between, change_jacobian
 from pipeline.objective.radar.moving_clusters import azimuth_equations_lidar
 from pipeline.objective.radar.registration import NormalEquations, normal_equations
-from pipeline.objective.radar.vehicle_boxes import BIAS_SIGMA_RAD, BoxPairs
+from pipeline.objective.radar.vehicle_boxes import BIAS_SIGMA_RAD
 
 __all__ = ["linearise"]
 
 
-def linearise(
-    problem: RadarProblem, state: RadarState, widen: float, pairs: BoxPairs | None, stride: int = 1
-) -> Linear:
+def linearise(problem: RadarProblem, state: RadarState, widen: float, stride: int = 1) -> Linear:
     """Associate at a state and linearise all terms.
 
     Args:
         problem: the day.
         state: where.
         widen: of the registration's sigmas; only at 1 do moving clusters take part.
-        pairs: detections in vehicle boxes.
         stride: use every n-th static detection.
     """
     F = len(problem.observations)
@@ -70,7 +66,6 @@ def linearise(
     floor = problem.spread.floor(float(state.sigma[1]), problem.spacing_rad)
     floor[1] = np.hypot(floor[1], problem.doubt_rad.get("registration", 0.0))
     registration_step = add_elevations(problem, state, equations, stride, floor, sums)
-    box_sigma, box_witness = add_boxes(problem, state, pairs, about_radar, sums)
     travel_scatter, travel_witness = add_travel(problem, state, sums)
     height_witness = add_heights(problem, state, sums)
     own = Witness("registration", float(registration_step[1]), float(floor[1]))
@@ -86,12 +81,10 @@ def linearise(
         prior_information,
         prior_gradient,
         equations,
-        box_sigma,
-        0 if pairs is None else pairs.count,
         mover_sigma,
         registration_step,
         floor,
-        tuple(w for w in (seen, box_witness, travel_witness, height_witness) if w is not None),
+        tuple(w for w in (seen, travel_witness, height_witness) if w is not None),
         0 if travel_witness is None or problem.travel is None else problem.travel.count,
         travel_scatter,
         sums.floors,
@@ -163,7 +156,6 @@ def _prior_equations(problem: RadarProblem, state: RadarState) -> tuple[np.ndarr
     x[:6] = change_between(prior.T_lidar_radar, state.T_lidar_radar)
     x[DT] = state.dt_s
     x[RANGE] = state.range_bias_m
-    x[CLASSES] = state.bias_rad
     x[SEEN_LOW] = state.seen_low - problem.seen_low.mean
     weight = np.empty(UNKNOWNS)
     turned = float(x[:3] @ x[:3]) / prior.rotation_sigma_rad**2
@@ -172,6 +164,6 @@ def _prior_equations(problem: RadarProblem, state: RadarState) -> tuple[np.ndarr
     weight[3:6] = 1 / prior.translation_sigma_m**2 / (1 + shifted / PRIOR_CONTRADICTION_SIGMAS**2)
     weight[DT] = 1 / problem.dt_sigma_s**2
     weight[RANGE] = 1 / RANGE_BIAS_SIGMA_M**2
-    weight[CLASSES] = 1 / BIAS_SIGMA_RAD**2
+    weight[UNUSED] = 1 / BIAS_SIGMA_RAD**2
     weight[SEEN_LOW] = 1 / problem.seen_low.sigma**2
     return np.diag(weight), weight * x

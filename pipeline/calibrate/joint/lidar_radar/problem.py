@@ -23,18 +23,17 @@ from pipeline.objective.radar.heights import Heights
 from pipeline.objective.radar.moving_clusters import MovingClusters
 from pipeline.objective.radar.registration import NormalEquations, RegistrationFrames
 from pipeline.objective.radar.travel import TravelDirections
-from pipeline.objective.radar.vehicle_boxes import BOX_CLASSES, VehicleBoxes
 from schemas.observations import Observation
 
 __all__ = [
     "AZIMUTH_RANGE_DOF",
-    "CLASSES",
     "DT",
     "ELEVATION_DOF",
     "RANGE",
     "SEEN_LOW",
     "STEP_LIMIT",
     "UNKNOWNS",
+    "UNUSED",
     "Linear",
     "RadarProblem",
     "RadarState",
@@ -42,10 +41,12 @@ __all__ = [
 ]
 
 DT, RANGE = 6, 7
-CLASSES = slice(8, 8 + len(BOX_CLASSES))
-SEEN_LOW = CLASSES.stop
-UNKNOWNS = SEEN_LOW + 1
-STEP_LIMIT = np.array([0.05] * 3 + [0.15] * 3 + [0.03, 0.1] + [0.05] * len(BOX_CLASSES) + [0.5])
+# Two constants of vehicle boxes, which no term knows any more. Without them resampling would draw other numbers, and
+# sigmas of records would differ from those of earlier releases by a percent.
+UNUSED = slice(8, 10)
+SEEN_LOW = 10
+UNKNOWNS = 11
+STEP_LIMIT = np.array([0.05] * 3 + [0.15] * 3 + [0.03, 0.1] + [0.05] * 2 + [0.5])
 AZIMUTH_RANGE_DOF = np.array([2, 3, 4, 6, 7])
 ELEVATION_DOF = np.array([0, 1, 5])
 
@@ -57,7 +58,6 @@ class RadarState:
     T_lidar_radar: np.ndarray  # 4 4
     dt_s: float
     range_bias_m: float
-    bias_rad: np.ndarray  # elevation of returns from the box's centre, by class
     sigma: np.ndarray  # 3: azimuth [rad], elevation [rad], range [m]
     bounce: float  # share of detections that are mirrored in the road
     seen_low: float = 0.0  # share of their height by which detections are seen too low
@@ -70,7 +70,6 @@ class RadarState:
             T_lidar_radar=from_rotation_translation(exp_so3(step[:3]) @ T[:3, :3], T[:3, 3] + step[3:6]),
             dt_s=self.dt_s + float(step[DT]),
             range_bias_m=self.range_bias_m + float(step[RANGE]),
-            bias_rad=self.bias_rad + step[CLASSES],
             seen_low=self.seen_low + float(step[SEEN_LOW]),
         )
 
@@ -95,8 +94,6 @@ class RadarProblem:
     observations: Sequence[Observation]
     frames: RegistrationFrames
     movers: MovingClusters
-    boxes: VehicleBoxes
-    T_camera_lidar: np.ndarray | None
     prior: Prior
     dt_sigma_s: float
     spacing_rad: float  # of the lidar's beams, vertically
@@ -119,7 +116,6 @@ class RadarProblem:
             observations=part,
             frames=frames,
             movers=self.movers.of_frames(chosen),
-            boxes=self.boxes.of_frames(chosen),
             travel=None if self.travel is None else self.travel.of_frames(chosen),
             heights=None if self.heights is None else self.heights.of_frames(chosen),
         )
@@ -135,8 +131,6 @@ class Linear:
     prior_information: np.ndarray  # P P
     prior_gradient: np.ndarray  # P
     registration: NormalEquations
-    box_sigma_rad: float
-    boxes: int
     mover_sigma_rad: float
     # 3: where the registration's elevations alone would move roll, pitch (about the radar's own axes), z
     registration_step: np.ndarray

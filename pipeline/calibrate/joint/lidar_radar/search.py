@@ -18,11 +18,10 @@ from pipeline.calibrate.joint.lidar_radar.problem import (
 )
 from pipeline.calibrate.joint.lidar_radar.schedule import SCHEDULE
 from pipeline.calibrate.joint.lidar_radar.time_offset import scan_time_offset
-from pipeline.calibrate.numerics.bias_floors import BOX_ELEVATION_GATES_RAD, OUTLIER_DENSITY
+from pipeline.calibrate.numerics.bias_floors import OUTLIER_DENSITY
 from pipeline.config import SolveConfig
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation
 from pipeline.objective.radar.registration import BOUNCE_PRIOR, SIGMA_START, registration_cost, updated_sigma
-from pipeline.objective.radar.vehicle_boxes import BOX_CLASSES, BoxPairs, box_pairs
 
 __all__ = ["NONE_FIXED", "anneal", "finish", "last_step", "scan"]
 
@@ -47,10 +46,9 @@ def scan(problem: RadarProblem, config: SolveConfig) -> list[RadarState]:
     cost = [
         float(registration_cost(part, T, 0.0, sigma, OUTLIER_DENSITY, SCHEDULE.stride).mean()) for T in poses
     ]
-    bias = np.zeros(len(BOX_CLASSES))
     best = int(np.argmin(cost if "static" in problem.terms else np.abs(turns)))
     chosen = [best] if abs(turns[best]) < 0.5 * _SCAN_STEP_RAD else [best, int(np.argmin(np.abs(turns)))]
-    return [RadarState(poses[k], 0.0, 0.0, bias, SIGMA_START.copy(), BOUNCE_PRIOR) for k in chosen]
+    return [RadarState(poses[k], 0.0, 0.0, SIGMA_START.copy(), BOUNCE_PRIOR) for k in chosen]
 
 
 def anneal(problem: RadarProblem, state: RadarState) -> RadarState:
@@ -58,12 +56,10 @@ def anneal(problem: RadarProblem, state: RadarState) -> RadarState:
 
     `problem` may be a part of the day: this finds the basin, `finish` its minimum.
     """
-    pairs, valley = None, _Valley()
+    valley = _Valley()
     for k in range(SCHEDULE.anneal_steps):
         widen = max(1.0, SCHEDULE.widest * SCHEDULE.cooling**k)
-        if k in (0, SCHEDULE.anneal_steps // 2):
-            pairs = _boxes(problem, state, BOX_ELEVATION_GATES_RAD[min(k, 1)])
-        linear = linearise(problem, state, widen, pairs, stride=SCHEDULE.stride)
+        linear = linearise(problem, state, widen, stride=SCHEDULE.stride)
         if k in SCHEDULE.dt_scans:
             state, valley = scan_time_offset(problem, state, SCHEDULE.dt_scans[k]), _Valley()
         # Where sigmas are wide, dt would only wander: x shifts detections as it does.
@@ -87,10 +83,9 @@ def finish(
     Unknowns in `fixed` keep the prior's value; with `sharpen` the radar's sigmas follow the residuals.
     """
     state = state.with_fixed(problem.prior, fixed)
-    pairs = _boxes(problem, state, BOX_ELEVATION_GATES_RAD[1])
     valley = _Valley()
     for k in range(SCHEDULE.final_steps):
-        linear = linearise(problem, state, 1.0, pairs)
+        linear = linearise(problem, state, 1.0)
         step, valley = _next_step(linear, state, valley, SCHEDULE.final_em_share, fixed)
         state = state.moved(step).with_fixed(problem.prior, fixed)
         converged = np.max(np.abs(step) / STEP_LIMIT) < SCHEDULE.converged
@@ -102,7 +97,7 @@ def finish(
             converged = converged and change < SCHEDULE.sigmas_converged
         if converged:
             break
-    return state, linearise(problem, state, 1.0, pairs)
+    return state, linearise(problem, state, 1.0)
 
 
 def _sharpened(linear: Linear, state: RadarState) -> RadarState:
@@ -160,9 +155,3 @@ def _next_step(
 def last_step(linear: Linear, state: RadarState, fixed: Bool[np.ndarray, " P"]) -> Float[np.ndarray, " P"]:
     """The remaining step with soft assignment."""
     return _next_step(linear, state, _Valley(), SCHEDULE.final_em_share, fixed)[0]
-
-
-def _boxes(problem: RadarProblem, state: RadarState, gate: float) -> BoxPairs | None:
-    if problem.T_camera_lidar is None:
-        return None
-    return box_pairs(problem.observations, problem.boxes, problem.T_camera_lidar @ state.T_lidar_radar, gate)

@@ -1,9 +1,9 @@
 """A common error of all sources of pitch: detections measured too low, by an unknown share of their height.
 
 A radar measures an object between its true position and its mirror image in the road. If this is ignored, all
-sources rotate the estimated radar upwards at once. The registration and the vehicle boxes do so by the share
-times the mean ratio of height to range of the objects they use; the Doppler velocity does so by the share
-times its own sensitivity. Therefore the share is one unknown, common to all of them.
+sources rotate the estimated radar upwards at once. The registration does so by the share times the mean ratio
+of height to range of the objects it uses; the Doppler velocity does so by the share times its own sensitivity.
+Therefore the share is one unknown, common to both.
 
 Nothing is measured too high, so the prior of the share is a half-normal distribution. Its sigma is the
 fraction of detections below the road, without those that noise, full mirror images and strays explain
@@ -52,7 +52,7 @@ def seen_low_of(travel: TravelDirections | None, heights: Heights | None) -> See
     below = float(np.mean(travel.below)) if heights is None else heights.seen_low(travel.below)
     by_height = max(float(np.mean(travel.height_rad)), 0.0)
     by_velocity = max(-float(np.median(travel.per_displaced)), 0.0)
-    per_share = {"registration": by_height, "boxes": by_height, "doppler": by_velocity}
+    per_share = {"registration": by_height, "doppler": by_velocity}
     return SeenLow(float(_MEAN * below), max(float(_SIGMA * below), _LEAST_SHARE), per_share)
 
 
