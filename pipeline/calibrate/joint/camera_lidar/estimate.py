@@ -281,10 +281,8 @@ def _terms(
     """The terms selected in the config, with all points that can come into view within the search range."""
     reach = search_range(prior, config).rotation_rad + MARGIN_RAD
     readout_s = prior.camera.readout_s
-    start = Start(prior.T_camera_lidar, prior.rotation_sigma_rad)
-    terms = prepare_terms(
-        frames, start.T_camera_lidar, velocity_lidar, reach_rad=reach, readout_s=readout_s, start=start
-    )
+    T, start = prior.T_camera_lidar, Start(prior.T_camera_lidar, prior.rotation_sigma_rad)
+    terms = prepare_terms(frames, T, velocity_lidar, reach_rad=reach, readout_s=readout_s, start=start)
     terms = terms.gaps_beyond(constant_gap_s(terms.gap_s))
     terms = terms.of_kinds(edges="edges" in config.terms, markings="reflectivity" in config.terms)
     if "edges" in config.terms and len(terms.edges.xyz_m) < _FEWEST_EDGES * len(frames):
