@@ -64,14 +64,9 @@ from pipeline.errors import SolveError
 from pipeline.extrinsics.common_share import common_part
 from pipeline.extrinsics.estimates import PairEstimate, Prior
 from pipeline.geometry.changes import change_jacobian
+from pipeline.objective.camera_lidar.brightness_maps import Start
 from pipeline.objective.camera_lidar.label_width import label_width_px, widened
-from pipeline.objective.camera_lidar.score import (
-    KernelSettings,
-    Start,
-    Terms,
-    lidar_velocities,
-    prepare_terms,
-)
+from pipeline.objective.camera_lidar.score import KernelSettings, Terms, lidar_velocities, prepare_terms
 from pipeline.objective.stamp_gaps import camera_gaps_s, constant_gap_s
 from pipeline.rig.evidence import EDGE
 from schemas.observations import Observation
@@ -252,12 +247,9 @@ def _terms(
     frames: Sequence[Observation], velocity_lidar: np.ndarray, prior: Prior, config: SolveConfig
 ) -> Terms:
     """The terms selected in the config, with all points that can come into view within the search range."""
-    reach = search_range(prior, config).rotation_rad + MARGIN_RAD
-    readout_s = prior.camera.readout_s
-    start = Start(prior.T_camera_lidar, prior.rotation_sigma_rad)
-    terms = prepare_terms(
-        frames, start.T_camera_lidar, velocity_lidar, reach_rad=reach, readout_s=readout_s, start=start
-    )
+    reach, T = search_range(prior, config).rotation_rad + MARGIN_RAD, prior.T_camera_lidar
+    readout_s, start = prior.camera.readout_s, Start(T, prior.rotation_sigma_rad)
+    terms = prepare_terms(frames, T, velocity_lidar, reach_rad=reach, readout_s=readout_s, start=start)
     terms = terms.gaps_beyond(constant_gap_s(terms.gap_s))
     terms = terms.of_kinds(edges="edges" in config.terms, markings="reflectivity" in config.terms)
     if "edges" in config.terms and len(terms.edges.xyz_m) < _FEWEST_EDGES * len(frames):
