@@ -18,8 +18,7 @@ pytestmark = [
 # How far from the truth, beside the limit, a reference may be: the real car's is good to .2 deg.
 REFERENCE_DEG = {"real_car": 0.2, "other_world": 0.0, "kitti": 0.1}
 
-# A start from which the study found both accepted; from some others the real car is held, known to .09 deg.
-ACCEPTED_FROM = 202
+ACCEPTED = {"other_world"}  # from every start; the real car is held from some, whose azimuth is known to .08 deg
 
 
 @pytest.fixture(scope="module")
@@ -37,11 +36,12 @@ def off_deg(record, true):
 
 
 @pytest.mark.parametrize("day", ["real_car", "other_world"], indirect=True)
-def test_a_real_log_without_labels_is_accepted_and_right_from_two_degrees_and_says_how(day):
+def test_a_real_log_without_labels_is_right_from_two_degrees_and_says_how(day):
     name, rows, fleet, true = day
     assert all(o.is_unlabelled for o in rows if "camera" in o.sensors)
-    record, _ = found_from(rows, fleet, true, 2.0, ACCEPTED_FROM)
-    assert record.status == "accepted", record.reason
+    record, _ = found_from(rows, fleet, true, 2.0, 41)
+    unsure_only = record.diagnostics["unsure_only"] > 0
+    assert record.status == "accepted" or (unsure_only and name not in ACCEPTED), record.reason
     assert off_deg(record, true) < LIMITS_DEG["camera_lidar"] + REFERENCE_DEG[name]
     assert WITHOUT_LABELS in record.notes
 
