@@ -21,6 +21,7 @@ from pipeline.rig.graph import Edge
 from pipeline.store.columns import matrices, observable_dofs, ordinals, places, there
 from pipeline.store.current import current_rows
 from schemas.calibrations import CALIBRATIONS, DOF_NAMES, STATUSES
+from schemas.columns import POSE_COLUMNS
 
 __all__ = [
     "COLUMNS",
@@ -34,14 +35,13 @@ __all__ = [
 ]
 
 _ROUNDING = 1e-3  # of what should be 1
-_POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 _SHIFTS = tuple(f"diagnostics.holdout_{n}_shift_rad" for n in ("azimuth", "elevation"))
 _DISPROVED = "diagnostics.disproved"
 _UNCHECKED = tuple(f"diagnostics.unchecked_{dof}_sigmas" for dof in DOF_NAMES)
 # Columns of a record beside its identity.
 COLUMNS = (
     "status",
-    *_POSE,
+    *POSE_COLUMNS,
     "covariance",
     "common_covariance",
     "observable",
@@ -159,8 +159,8 @@ def estimates_at(found: pa.Table, edges: tuple[Edge, ...], edge: Int[np.ndarray,
     owner, day = np.asarray(names.indices).astype(np.int64), ordinals(found["day"])
     order = np.lexsort((edge, day, owner))  # edges of a day side by side
     found = found.take(pa.array(order))
-    pose = np.stack([found[name].to_numpy() for name in _POSE], axis=1)
-    is_there = np.all([there(found[name]) for name in (*_POSE, "covariance")], axis=0)
+    pose = np.stack([found[name].to_numpy() for name in POSE_COLUMNS], axis=1)
+    is_there = np.all([there(found[name]) for name in (*POSE_COLUMNS, "covariance")], axis=0)
     shifts = np.abs(np.stack([pc.fill_null(found[name], 0.0).to_numpy() for name in _SHIFTS], axis=1))
     worst = shifts.max(axis=1, initial=0.0)
     unchecked = np.stack([pc.fill_null(found[name], 0.0).to_numpy() for name in _UNCHECKED], axis=1)

@@ -19,13 +19,13 @@ from pipeline.store.current import current_rows
 from pipeline.store.partitions import Lake, days_after
 from pipeline.store.records import count_of_days, read_columns
 from schemas.calibrations import CALIBRATIONS
-from schemas.columns import TableSchema
+from schemas.columns import POSE_COLUMNS, TableSchema
 from schemas.poses import POSES
 from schemas.versions import CODE_VERSION
 
 __all__ = ["Asked", "LineRecords", "read_line_records", "release_of"]
 
-_PRIOR = tuple(f"prior_{n}" for n in ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m"))
+_PRIOR = tuple(f"prior_{n}" for n in POSE_COLUMNS)
 _UNSURE = ("diagnostics.unsure_only", "diagnostics.few_only")
 _ROUNDING = 1e-3  # of a quaternion's length
 _LEAST = 1e-9  # eigenvalue of a correlation matrix: with less a covariance knows a direction exactly

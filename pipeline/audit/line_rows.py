@@ -13,7 +13,7 @@ from scipy.special import ndtri
 
 from pipeline.audit.estimates import day_name
 from pipeline.audit.line_days import Drawing
-from pipeline.audit.state_rows import pose_columns
+from pipeline.audit.line_witnesses import Witnesses
 from pipeline.config import FleetModelConfig, VerifyConfig
 from pipeline.fleet_model.answers import DIFFERS_SIGMAS, Answers, largest_change_without_one, with_line
 from pipeline.fleet_model.apart import shared_axes, shared_errors
@@ -28,29 +28,22 @@ from pipeline.fleet_model.evidence import (
 from pipeline.fleet_model.line import FEWEST_VEHICLES, LineModel, learn_line
 from pipeline.fleet_model.sums import DaySums
 from pipeline.geometry.changes import change_jacobian, changed
+from pipeline.geometry.pose_columns import pose_columns
 from pipeline.geometry.se3 import to_quaternion
 from pipeline.rig.graph import Edge, RigPose
 from pipeline.rig.sigmas import direction_sigmas
 from schemas.calibrations import DOF_NAMES
+from schemas.columns import POSE_COLUMNS
 from schemas.fleet_model import OF_ALL, FleetModelRow, LineAnswer
 
-__all__ = ["LineOfEdge", "Witnesses", "as_answers", "line_rows"]
+__all__ = ["LineOfEdge", "as_answers", "line_rows"]
 
 # Vehicles of a line with a change that matters on one edge: more are no chance, and no majority says who is right.
 _ALARMS, _FEWEST_ALARMS = 0.1, 3
-_POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 _NO_SURER = 1.2  # times the sigma alone: an answer that is so much less sure with the line is of no use
 _OBSERVABLE = 0.5  # of the prior's variance: with less an axis counts as determined
 _PRIORS_APART = 3.0  # ratio of the largest sigma of a vehicle's prior to the smallest, which is said
 _WORDS = {"two groups": "form two groups", "many outside": "lie outside of the others"}
-
-
-@dataclass(frozen=True, eq=False)
-class Witnesses:
-    """Mounts that radars report themselves: by name of a shared axis, angle [rad] and inverse variance by vehicle."""
-
-    value: dict[str, Float[np.ndarray, " N"]]
-    information: dict[str, Float[np.ndarray, " N"]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +104,7 @@ def line_rows(
     row = FleetModelRow(
         vehicle=OF_ALL, **line.about, status=found.status, reason=reason, vehicles=len(names), outside=outside,
         since=day_name(int(first.min())) if len(first) else None, most_without_one=most,
-        **{f"drawing_{name}": value for name, value in pose_columns(line.drawing.T).items()},
+        **pose_columns(line.drawing.T, "drawing_"),
         **_model_columns(line, found), **_motion_columns(found.motion),
     )  # fmt: skip
     return row, _answer_columns(line, prior, evidence, found, verify)
@@ -311,8 +304,9 @@ def _answer_columns(
     moved_by, of_record = (change - alone).tolist(), (day_change - change).tolist()
     return [
         {
-            **dict(zip(_POSE, pose[k], strict=True)), "covariance": covariance[k], "common_covariance": common[k],
-            "observable": observable[k].tolist(), "alone_covariance": alone_covariance[k], "moved_by": moved_by[k],
+            **dict(zip(POSE_COLUMNS, pose[k], strict=True)), "covariance": covariance[k],
+            "common_covariance": common[k], "observable": observable[k].tolist(),
+            "alone_covariance": alone_covariance[k], "moved_by": moved_by[k],
             "record_day": day_name(int(sums.last[k])), "record_alone_covariance": day_alone_covariance[k],
             "record_change": of_record[k], "record_covariance": day_covariance[k],
             **_sure(line.edge, sigma[k], verify), **standing.of(k),

@@ -9,7 +9,7 @@ import datetime as dt
 from collections import Counter
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pyarrow as pa
@@ -21,21 +21,20 @@ from pipeline.audit.estimates import day_name
 from pipeline.audit.line_clocks import clocks_of_lines
 from pipeline.audit.line_days import Counted, DaysOfLines, Drawing, Key
 from pipeline.audit.line_records import release_of
-from pipeline.audit.line_rows import LineOfEdge, Witnesses, as_answers, line_rows
+from pipeline.audit.line_rows import LineOfEdge, as_answers, line_rows
+from pipeline.audit.line_witnesses import reports_of_radars, witnesses_of
 from pipeline.audit.pose_states import since_of_pose
 from pipeline.audit.service import events_until, since_of
 from pipeline.config import FleetConfig, config_hash
-from pipeline.geometry.se3 import from_quaternion
+from pipeline.geometry.pose_columns import pose_of
 from pipeline.rig.edges import edge_named, edge_order, line_edge, pair_of
 from pipeline.rig.graph import Edge, RigPose, tie
 from pipeline.stage_work import Records, Run, Task, Told, Window, Work
-from pipeline.store.current import current_rows
 from pipeline.store.partitions import Lake, content_hash, days_after, last_possible_day, work_key
-from pipeline.store.records import last_assertion, last_day, read_columns, read_last, read_last_columns
+from pipeline.store.records import last_assertion, last_day, read_last, read_last_columns
 from schemas.calibrations import CALIBRATIONS, DOF_NAMES
 from schemas.drift import DRIFT, DriftFinding
 from schemas.fleet_model import FLEET_MODEL, LINE_ANSWERS, FleetModelRow, LineAnswer
-from schemas.radar_alignments import RADAR_ALIGNMENTS
 from schemas.service_events import ServiceEvent
 from schemas.versions import CODE_VERSION
 
@@ -47,12 +46,6 @@ _GONE_DAYS = 60  # a vehicle that was not seen for so long is of no line, as it 
 _EDGE = ("pair", "parent_frame", "child_frame")
 _OF_DRIFT = ("vehicle", *_EDGE, "dof", "status", "start_day", "start_day_latest", "moved_sensor",
              "day_scale", "day_autocorrelation")  # fmt: skip
-_ANGLES = ("azimuth", "elevation")
-_OF_RADARS = (
-    "vehicle", "sensor", "day", "sign_is_published",
-    *(f"{name}_{what}" for name in _ANGLES for what in ("rad", "sigma_rad", "scatter_rad")),
-)  # fmt: skip
-_SUREST_RAD = float(np.radians(0.05))  # a radar's own alignment is not taken to be surer
 
 
 def work(task: Task) -> Work:
@@ -101,7 +94,7 @@ def _rows(
     counted = days.count(counted)
     told = _by_line(counted)
     config = config_hash(fleet.audit, fleet.verify, fleet.fleet_model, {"to": last, "method": method})
-    witnesses, clocks = _witnesses(lake, method, window), clocks_of_lines(lake, method, last, line_of)
+    witnesses, clocks = reports_of_radars(lake, method, window), clocks_of_lines(lake, method, last, line_of)
     for done, ((line, edge), keys) in enumerate(told.items()):
         run.progress(done, len(told), f"{line} {edge.name}")
         rows = np.array([counted.place[key] for key in keys], np.int64)
@@ -116,7 +109,7 @@ def _rows(
             np.array([noise.alike_of(key) for key in keys]).reshape(-1, DOFS),
             np.array([_is_remounted(edge, events.get(v, ())) for v in vehicles], bool),
             np.array([_has_changed(edge, changes.get(v, ())) for v in vehicles], bool),
-            _witnesses_of(witnesses, keys, since),
+            witnesses_of(witnesses, keys, since),
         )  # fmt: skip
         row, columns = line_rows(of_edge, fleet.fleet_model, fleet.verify)
         row = replace(row, **clocks.get((line, edge), {}))
@@ -208,9 +201,9 @@ def _of_last_night(
             for release, day in pairs
             if release != release_of(CODE_VERSION)
         }
-        if r.drawing_qw is not None:
-            pose = [getattr(r, f"drawing_{n}") for n in ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")]
-            drawings[of] = Drawing(from_quaternion(np.array(pose[:4]), np.array(pose[4:])))
+        drawing = pose_of(partial(getattr, r), "drawing_")
+        if drawing is not None:
+            drawings[of] = Drawing(drawing)
     return drawings, others
 
 
@@ -246,43 +239,6 @@ def _has_changed(edge: Edge, changes: Sequence[DriftFinding]) -> bool:
         return since_of_pose(edge.child, edge, (), red, "")[0] != ""
     of = (edge.kind, edge.parent.name, edge.child.name)
     return any((c.pair, c.parent_frame, c.child_frame) == of for c in red)
-
-
-_Reports = dict[tuple[str, str], dict[str, list[tuple[str, float, float]]]]  # of days
-
-
-def _witnesses(lake: Lake, method: str, window: tuple[str, str]) -> _Reports:
-    """Angles and sigmas that radars report of their own mounts, by vehicle and radar, where their signs are known."""
-    table = read_columns(lake, RADAR_ALIGNMENTS, _OF_RADARS, first=window[0], last=window[1])
-    found: _Reports = {}
-    if table is None:
-        return found
-    rows = current_rows(table.filter(pc.equal(table["method"], method)), RADAR_ALIGNMENTS)
-    for row in rows.select(list(_OF_RADARS)).to_pylist():
-        if not row["sign_is_published"]:
-            continue
-        for name in _ANGLES:
-            if row[f"{name}_rad"] is not None:
-                sizes = (row[f"{name}_sigma_rad"] or 0.0, row[f"{name}_scatter_rad"] or 0.0, _SUREST_RAD)
-                of = found.setdefault((row["vehicle"], row["sensor"]), {})
-                of.setdefault(f"radar {name}", []).append((row["day"], row[f"{name}_rad"], max(sizes)))
-    return found
-
-
-def _witnesses_of(reports: _Reports, keys: Sequence[Key], since: Callable[[Key], str]) -> Witnesses:
-    """Mean of each vehicle's reports since it changed; their errors are taken to be the same every day."""
-    value = {f"radar {name}": np.zeros(len(keys)) for name in _ANGLES}
-    information = {name: np.zeros(len(keys)) for name in value}
-    for k, (vehicle, edge) in enumerate(keys):
-        radars = [sensor.name for sensor in (edge.parent, edge.child) if sensor.kind == "radar"]
-        of_radar = reports.get((vehicle, radars[0]), {}) if len(radars) == 1 else {}
-        for name, days in of_radar.items():
-            own = [(angle, sigma) for day, angle, sigma in days if day >= since((vehicle, edge))]
-            if not own:
-                continue
-            angle, sigma = np.array(own).mean(axis=0)
-            value[name][k], information[name][k] = angle, 1 / sigma**2
-    return Witnesses(value, information)
 
 
 def _told(rows: Sequence[LineAnswer]) -> Told:

@@ -11,13 +11,12 @@ from pipeline.rig.edges import line_edge
 from pipeline.rig.graph import Edge
 from pipeline.store.partitions import Lake
 from pipeline.store.records import last_assertion, read_last
+from schemas.columns import POSE_COLUMNS
 from schemas.fleet_model import LINE_ANSWERS, LineAnswer
 from schemas.states import StateRow
 from schemas.versions import CODE_VERSION
 
 __all__ = ["LineAnswers", "answers_of", "with_its_line"]
-
-_POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +71,7 @@ def with_its_line(
         line_azimuth_sigma_rad=answer.azimuth_sigma_rad,
         line_elevation_sigma_rad=answer.elevation_sigma_rad,
         line_moved_by=answer.moved_by,
-        **{f"line_{name}": getattr(answer, name) for name in _POSE},
+        **{f"line_{name}": getattr(answer, name) for name in POSE_COLUMNS},
     )
     if use != "states" or answer.status != "shared":
         return beside
@@ -82,8 +81,8 @@ def with_its_line(
     none = "no day of the vehicle alone was accepted" if state.status == "none" else ""
     return replace(
         beside,
-        **{name: getattr(answer, name) for name in _POSE},
-        **{f"alone_{name}": getattr(state, name) for name in _POSE},
+        **{name: getattr(answer, name) for name in POSE_COLUMNS},
+        **{f"alone_{name}": getattr(state, name) for name in POSE_COLUMNS},
         alone_covariance=state.covariance,
         loads="line",
         status="current",

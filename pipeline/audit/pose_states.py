@@ -28,8 +28,9 @@ from pipeline.audit.estimates import (
     faults_of,
 )
 from pipeline.audit.service import restart_of, what_was_done
-from pipeline.audit.state_rows import fused_as_they_differ, pose_columns, with_state
+from pipeline.audit.state_rows import fused_as_they_differ, with_state
 from pipeline.config import VerifyConfig
+from pipeline.geometry.pose_columns import pose_columns
 from pipeline.geometry.se3 import adjoint, inverse
 from pipeline.rig.edges import edge_order
 from pipeline.rig.graph import Edge, Sensor, is_one_of_each, tie

@@ -22,12 +22,12 @@ from pipeline.rig.graph import Edge
 from pipeline.store.partitions import Lake, days_after
 from pipeline.store.records import read_columns, read_latest
 from schemas.calibrations import CALIBRATIONS
+from schemas.columns import POSE_COLUMNS
 from schemas.service_events import ServiceEvent
 from schemas.states import STATES, StateRow
 
 __all__ = ["Kept", "first_accepted", "kept_columns", "kept_of", "read_kept"]
 
-_POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 _COLUMNS = tuple(c.name for c in STATES.columns if c.name.startswith("reference_"))
 # Records that were committed while a night's audit ran may be younger than what it read, and older than its states.
 _MARGIN = dt.timedelta(days=1)
@@ -98,7 +98,7 @@ def kept_columns(kept: Kept, count: int) -> dict[str, Any]:
     pose = [*to_quaternion(made.T).tolist(), *made.T[:3, 3].tolist()]
     return columns | {
         "reference_used": len(made.days),
-        **{f"reference_{name}": float(value) for name, value in zip(_POSE, pose, strict=True)},
+        **{f"reference_{name}": float(value) for name, value in zip(POSE_COLUMNS, pose, strict=True)},
         "reference_covariance": made.spread,
         "reference_observable": [bool(v) for v in made.observable],
     }
@@ -106,7 +106,7 @@ def kept_columns(kept: Kept, count: int) -> dict[str, Any]:
 
 def _kept(state: StateRow) -> Kept:
     days = tuple(state.reference_days or ())
-    pose = [getattr(state, f"reference_{name}") for name in _POSE]
+    pose = [getattr(state, f"reference_{name}") for name in POSE_COLUMNS]
     if state.reference_covariance is None or None in pose:
         return Kept(state.reference_since or "", days)
     ordinals = tuple(dt.date.fromisoformat(day).toordinal() for day in days[: state.reference_used])

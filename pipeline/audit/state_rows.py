@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -14,13 +12,13 @@ from scipy.stats import chi2
 from pipeline.audit.estimates import Estimates, day_name, days_of
 from pipeline.audit.state import DayEstimate, State, fuse
 from pipeline.config import VerifyConfig
-from pipeline.geometry.se3 import to_quaternion
+from pipeline.geometry.pose_columns import pose_columns
 from pipeline.geometry.target_sigmas import target_sigmas
 from pipeline.geometry.targets import DEFAULT_TARGETS
 from schemas.calibrations import DOF_NAMES
 from schemas.states import StateRow
 
-__all__ = ["fused", "fused_as_they_differ", "pose_columns", "with_state"]
+__all__ = ["fused", "fused_as_they_differ", "with_state"]
 
 # Of successive accepted days: the most that the charts' budget is proved for. A state promises no more than such days
 # can give.
@@ -99,12 +97,6 @@ def with_state(
         unchecked=_unchecked(own),
         inputs=own.keys(),
     )
-
-
-def pose_columns(T: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
-    """A pose as columns of a row."""
-    names: Sequence[str] = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
-    return dict(zip(names, (*to_quaternion(T).tolist(), *T[:3, 3].tolist()), strict=True))
 
 
 def _targets(days: Estimates) -> Float[np.ndarray, "N 3"]:

@@ -10,11 +10,12 @@ import numpy as np
 
 from pipeline.calibrate.adjust.adjusted import AdjustedRig, AdjustmentLimits
 from pipeline.calibrate.adjust.rig import adjust
-from pipeline.calibrate.records import Inputs, transform_fields
+from pipeline.calibrate.records import Inputs
 from pipeline.calibrate.verify.seen_targets import targets_of
 from pipeline.calibrate.verify.target_accuracy import claims_of
 from pipeline.config import FleetConfig
 from pipeline.extrinsics.checks import faults_of
+from pipeline.geometry.pose_columns import pose_columns
 from pipeline.geometry.targets import DEFAULT_TARGETS
 from pipeline.rig.evidence import EdgeEvidence
 from pipeline.rig.extrinsics import Extrinsics
@@ -46,9 +47,9 @@ def record_of_evidence(
     status, reason, determined, sigmas = _judged(alone, evidence, views, fleet)
     return CalibrationRecord(
         **_identity(about, edge, frames_total),
-        **transform_fields("prior_", before.T[edge.child.name]),
+        **pose_columns(before.T[edge.child.name], "prior_"),
         prior_covariance=before.covariance,
-        **transform_fields("", T),
+        **pose_columns(T),
         covariance=covariance,
         common_covariance=alone.poses.common,
         observability=[float(v) for v in found.observability],

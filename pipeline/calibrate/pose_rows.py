@@ -10,11 +10,12 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.calibrate.adjust.adjusted import AdjustedRig, AdjustedSensor
-from pipeline.calibrate.records import Inputs, transform_fields
+from pipeline.calibrate.records import Inputs
 from pipeline.calibrate.verify.seen_targets import targets_of
 from pipeline.calibrate.verify.target_accuracy import Claim, claims_of
 from pipeline.config import VerifyConfig
 from pipeline.extrinsics.checks import faults_of
+from pipeline.geometry.pose_columns import pose_columns
 from pipeline.geometry.spherical import from_spherical
 from pipeline.geometry.targets import DEFAULT_TARGETS
 from pipeline.rig.extrinsics import Extrinsics
@@ -75,7 +76,7 @@ def _row(
 ) -> PoseRow:
     told = _identity(about, graph, sensor, views)
     if sensor == graph.reference:
-        where = transform_fields("", np.eye(4)) | {
+        where = pose_columns(np.eye(4)) | {
             "covariance": np.zeros((6, 6)),
             "common_covariance": np.zeros((6, 6)),
         }
@@ -96,8 +97,8 @@ def _row(
     status, reason = _verdict(sensor, found, claims, determined)
     return PoseRow(
         **told,
-        **transform_fields("", poses.T[sensor.name]),
-        **transform_fields("prior_", adjusted.before.T[sensor.name]),
+        **pose_columns(poses.T[sensor.name]),
+        **pose_columns(adjusted.before.T[sensor.name], "prior_"),
         prior_covariance=adjusted.before.covariance_between(reference, sensor.name),
         unsure_only=status == "held" and not found.doubts,
         covariance=poses.covariance_between(reference, sensor.name),

@@ -19,7 +19,7 @@ from pipeline.calibrate.verify.held_out_test import HeldOutTest
 from pipeline.errors import SolveError
 from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
 from pipeline.geometry.cameras import camera_of
-from pipeline.geometry.se3 import to_quaternion
+from pipeline.geometry.pose_columns import pose_columns
 from pipeline.geometry.spherical import camera_direction_angles
 from pipeline.stage_work import NO_PROBES, Probes
 from pipeline.store.partitions import Partition
@@ -33,7 +33,6 @@ __all__ = [
     "record_of",
     "refused_record",
     "refused_records",
-    "transform_fields",
 ]
 
 # Speeds that separate a highway from a town [m/s]: 20 m/s = 72 km/h is above town limits.
@@ -173,15 +172,8 @@ def _identity(about: Inputs, pair: str, frames: int, prior: Prior | None) -> dic
         "frames_total": frames,
     }
     if prior is not None and prior.knows(pair):
-        fields |= transform_fields("prior_", prior.of(pair)) | {"prior_covariance": prior.covariance(pair)}
+        fields |= pose_columns(prior.of(pair), "prior_") | {"prior_covariance": prior.covariance(pair)}
     return fields
-
-
-def transform_fields(prefix: str, T: np.ndarray) -> dict[str, Any]:
-    """Columns of a pose, their names with a prefix."""
-    names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
-    values = (*to_quaternion(T), *T[:3, 3])
-    return {f"{prefix}{name}": float(value) for name, value in zip(names, values, strict=True)}
 
 
 def _unobservable(observable: np.ndarray) -> list[str]:
@@ -269,7 +261,7 @@ def _estimate_fields(estimate: PairEstimate, judged: Judged) -> dict[str, Any]:
         "azimuth_sigma_rad": sigma["azimuth"],
         "elevation_sigma_rad": sigma["elevation"],
         "targets_m": judged.targets,
-        **transform_fields("", estimate.T),
+        **pose_columns(estimate.T),
     }
 
 

@@ -16,6 +16,7 @@ from pipeline.rig.sigmas import direction_sigmas
 from pipeline.store.current import transform_of
 from pipeline.store.partitions import Lake
 from pipeline.store.records import read_last
+from schemas.columns import POSE_COLUMNS
 from schemas.fleet_model import FLEET_MODEL, LINE_ANSWERS, LINE_STATUSES, FleetModelRow, LineAnswer
 
 __all__ = [
@@ -33,9 +34,8 @@ __all__ = [
 _DEG = 180 / math.pi
 _NAMED = 12  # vehicles that a page names; the others it counts
 _OF_ANSWERS = ("line", "kinds", "reason", "distance_sigmas", "differs")
-_POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 _BOTH = (
-    "line", "kinds", "status", "reason", *_POSE, "covariance", "alone_covariance", "moved_by", "record_day",
+    "line", "kinds", "status", "reason", *POSE_COLUMNS, "covariance", "alone_covariance", "moved_by", "record_day",
     "record_change", "record_covariance", "record_alone_covariance",
 )  # fmt: skip
 

@@ -11,7 +11,8 @@ from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, scales
 from pipeline.calibrate.numerics.bias_floors import OUTLIER_DENSITY
 from pipeline.calibrate.numerics.response_surface import DESIGN
 from pipeline.geometry.changes import changed
-from pipeline.objective.camera_lidar.score import KernelSettings, lidar_velocities, prepare_terms
+from pipeline.objective.camera_lidar.own_motion import lidar_velocities
+from pipeline.objective.camera_lidar.score import KernelSettings, prepare_terms
 from pipeline.objective.paper.camera_lidar import camera_lidar_loss
 from pipeline.objective.paper.camera_radar import camera_radar_loss
 from pipeline.objective.paper.lidar_radar import lidar_radar_loss

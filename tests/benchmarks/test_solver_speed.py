@@ -16,7 +16,8 @@ from pipeline.calibrate.paper.pairwise import solve_pairwise
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.estimates import Prior
 from pipeline.geometry.se3 import perturb_exactly
-from pipeline.objective.camera_lidar.score import KernelSettings, lidar_velocities, prepare_terms
+from pipeline.objective.camera_lidar.own_motion import lidar_velocities
+from pipeline.objective.camera_lidar.score import KernelSettings, prepare_terms
 from pipeline.objective.paper.camera_lidar import camera_lidar_loss
 from pipeline.objective.paper.camera_radar import camera_radar_loss
 from pipeline.objective.paper.lidar_radar import lidar_radar_loss

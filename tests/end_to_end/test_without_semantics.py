@@ -18,7 +18,9 @@ pytestmark = [
 # How far from the truth, beside the limit, a reference may be: the real car's is good to .2 deg.
 REFERENCE_DEG = {"real_car": 0.2, "other_world": 0.0, "kitti": 0.1}
 
-ACCEPTED = {"other_world"}  # from every start; the real car is held from some, whose azimuth is known to .08 deg
+ACCEPTED = {
+    "other_world"
+}  # from every start; the real car is held from some, whose azimuth is known to .08 deg
 
 
 @pytest.fixture(scope="module")

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from jobs.cli import main
-from pipeline.audit.state_rows import pose_columns
 from pipeline.config import FleetConfig
 from pipeline.export.calibration import ExportedPair
 from pipeline.geometry.changes import change_between, change_covariance
+from pipeline.geometry.pose_columns import pose_columns
 from pipeline.geometry.se3 import exp_se3, inverse
 from pipeline.stage_work import Task, Window
 from pipeline.stages import AUDIT, STATE

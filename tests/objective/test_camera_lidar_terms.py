@@ -15,15 +15,10 @@ from pipeline.objective.camera_lidar.image_maps import (
     boundary_offsets,
     contrast_levels,
 )
+from pipeline.objective.camera_lidar.own_motion import lidar_velocities
 from pipeline.objective.camera_lidar.points import Points
 from pipeline.objective.camera_lidar.projection_loops import camera_parameters, project_point, project_points
-from pipeline.objective.camera_lidar.score import (
-    Alignments,
-    KernelSettings,
-    Terms,
-    lidar_velocities,
-    prepare_terms,
-)
+from pipeline.objective.camera_lidar.score import Alignments, KernelSettings, Terms, prepare_terms
 from pipeline.simulate.sensors.rigs import rig_named
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
 from tests.makers.traced_scenes import DENSE, SPARSE, T_TRUE, traced_day

@@ -30,14 +30,8 @@ from pipeline.extrinsics.estimates import PairEstimate, Prior
 from pipeline.geometry.changes import change_jacobian
 from pipeline.geometry.se3 import exp_se3, exp_so3, from_rotation_translation, log_so3, rotation_angle_rad
 from pipeline.objective.camera_lidar.label_width import widened
-from pipeline.objective.camera_lidar.score import (
-    Alignments,
-    KernelSettings,
-    Start,
-    Terms,
-    lidar_velocities,
-    prepare_terms,
-)
+from pipeline.objective.camera_lidar.own_motion import lidar_velocities
+from pipeline.objective.camera_lidar.score import Alignments, KernelSettings, Start, Terms, prepare_terms
 from pipeline.objective.radar.moving_clusters import (
     azimuth_equations_camera,
     camera_radar_cost,

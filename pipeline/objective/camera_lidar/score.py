@@ -9,9 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import no_type_check
 
-import numba
 import numpy as np
 from jaxtyping import Float, Float32, Int64
 
@@ -26,6 +24,7 @@ from pipeline.objective.camera_lidar.edges import (
 from pipeline.objective.camera_lidar.image_maps import CONTRAST_STEP, CameraMaps, prepare_maps
 from pipeline.objective.camera_lidar.kernel_settings import MAX_GAP_PX, WIDEST_GAP_RAD, KernelSettings
 from pipeline.objective.camera_lidar.mutual_information import class_information
+from pipeline.objective.camera_lidar.own_motion import motion_in_camera, moving_poses
 from pipeline.objective.camera_lidar.points import (
     CLASSES,
     EDGE_KINDS,
@@ -39,7 +38,6 @@ from pipeline.objective.camera_lidar.points import (
 from pipeline.objective.camera_lidar.projection_loops import camera_parameters, count_in_view
 from pipeline.objective.camera_lidar.reflectivity import marking_gradients, marking_scores
 from pipeline.objective.camera_lidar.rolling_shutter import exposed
-from pipeline.objective.ego_motion import shown_heading
 from pipeline.objective.stamp_gaps import camera_gaps_s
 from schemas.observations import EDGE_ABOVE, Observation
 
@@ -49,7 +47,6 @@ __all__ = [
     "KernelSettings",
     "Start",
     "Terms",
-    "lidar_velocities",
     "prepare_terms",
 ]
 
@@ -197,7 +194,7 @@ class Terms:
         were farther ahead by tau times the own velocity: p' = Rz(yaw_rate tau) (p + v tau).
         """
         R, t = at.T_camera_lidar[:, :3, :3], at.T_camera_lidar[:, :3, 3]
-        return _moving_poses(R, t, at.dt_s, self.gap_s, self.velocity_lidar, self.yaw_rate)
+        return moving_poses(R, t, at.dt_s, self.gap_s, self.velocity_lidar, self.yaw_rate)
 
     def edge_score(self, at: Alignments, settings: KernelSettings) -> Float32[np.ndarray, "P F"]:
         """Log likelihood ratio of the edges, wide ones weighted by the settings."""
@@ -295,7 +292,7 @@ class Terms:
     ) -> tuple[Float[np.ndarray, "F 11"], Float[np.ndarray, "F 11 11"]]:
         """As `gradient`, and by principal point (right, down) [px of the label image] and readout time [s]."""
         poses = self.poses(at)[0].astype(np.float64)
-        motion = _motion_in_camera(poses, at.T_camera_lidar[0, :3, 3], self.velocity_lidar, self.yaw_rate)
+        motion = motion_in_camera(poses, at.T_camera_lidar[0, :3, 3], self.velocity_lidar, self.yaw_rate)
         focal, m = float(at.focal[0]), self.markings
         gradient, information = np.zeros((self.frames, 11)), np.zeros((self.frames, 11, 11))
         if settings.edge_weight > 0:
@@ -334,66 +331,8 @@ class Terms:
         return replace(settings, match=match, chance=chance, delta=delta)
 
 
-@no_type_check  # keeps the tests' shape checks out of compiled code
-@numba.njit(cache=True, nogil=True)
-def _moving_poses(
-    R: np.ndarray,
-    t: np.ndarray,
-    dt_s: np.ndarray,
-    gap_s: np.ndarray,
-    velocity: np.ndarray,
-    yaw_rate: np.ndarray,
-) -> np.ndarray:
-    """[R Rz(yaw_rate tau) | R Rz(yaw_rate tau) v tau + t] as rows, tau = dt - gap, for each pose and frame."""
-    count, frames = R.shape[0], velocity.shape[0]
-    out = np.empty((count, frames, 12), np.float32)
-    for p in range(count):
-        for f in range(frames):
-            tau = dt_s[p] - gap_s[f]
-            c, s = np.cos(yaw_rate[f] * tau), np.sin(yaw_rate[f] * tau)
-            for i in range(3):
-                a, b, d = c * R[p, i, 0] + s * R[p, i, 1], c * R[p, i, 1] - s * R[p, i, 0], R[p, i, 2]
-                ahead = a * velocity[f, 0] + b * velocity[f, 1] + d * velocity[f, 2]
-                row = 4 * i
-                out[p, f, row], out[p, f, row + 1], out[p, f, row + 2] = a, b, d
-                out[p, f, row + 3] = ahead * tau + t[p, i]
-    return out
-
-
-def _motion_in_camera(
-    poses: Float[np.ndarray, "F 12"],
-    t_camera_lidar: Float[np.ndarray, " 3"],
-    velocity_lidar: Float[np.ndarray, "F 3"],
-    yaw_rate: Float[np.ndarray, " F"],
-) -> Float[np.ndarray, "F 4"]:
-    """Velocity in camera axes and yaw rate: a point moves by velocity + yaw_rate up x (point - pose's translation)."""
-    rows = poses.reshape(-1, 3, 4)
-    # The turn is about the lidar, which is where the pose's translation was before the way driven.
-    turn = yaw_rate[:, None] * np.cross(rows[:, :, 2], rows[:, :, 3] - t_camera_lidar)
-    velocity = np.einsum("fij,fj->fi", rows[:, :, :3], velocity_lidar) + turn
-    return np.column_stack([velocity, yaw_rate])
-
-
 def _weights(markings: Points, settings: KernelSettings) -> np.ndarray:
     return np.full(len(markings.xyz_m), settings.delta * CONTRAST_STEP, np.float32)
-
-
-def lidar_velocities(
-    observations: Sequence[Observation],
-    T_lidar_radar: Float[np.ndarray, "4 4"],
-    heading_rad: float | None = None,
-) -> Float[np.ndarray, "F 3"]:
-    """Own velocity in lidar axes [m/s]: the speed along one heading of the day, in the horizontal plane.
-
-    Args:
-        observations: whose speeds are taken, 0 where unknown.
-        T_lidar_radar: turns the radar's Doppler into the heading; where no radar shows it, it is the lidar's
-            x axis.
-        heading_rad: azimuth of the heading where it is known otherwise.
-    """
-    speed = np.array([o.ego_speed_mps if o.ego_speed_mps is not None else 0.0 for o in observations])
-    heading = (shown_heading(observations, T_lidar_radar) or 0.0) if heading_rad is None else heading_rad
-    return speed[:, None] * np.array([np.cos(heading), np.sin(heading), 0.0])
 
 
 def prepare_terms(

@@ -26,13 +26,9 @@ from pipeline.geometry.se3 import (
     transform_points,
 )
 from pipeline.objective.camera_lidar.kernel_settings import MAX_GAP_PX
+from pipeline.objective.camera_lidar.own_motion import lidar_velocities
 from pipeline.objective.camera_lidar.points import Points
-from pipeline.objective.camera_lidar.score import (
-    Alignments,
-    KernelSettings,
-    lidar_velocities,
-    prepare_terms,
-)
+from pipeline.objective.camera_lidar.score import Alignments, KernelSettings, prepare_terms
 from tests.makers.traced_scenes import DENSE, T_TRUE, traced_day
 
 REACH_RAD = np.radians(8.0)

@@ -8,7 +8,8 @@ from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, Scored,
 from pipeline.calibrate.joint.camera_lidar.time_offset import far_time_offset
 from pipeline.config import SolveConfig
 from pipeline.extrinsics.estimates import Prior
-from pipeline.objective.camera_lidar.score import KernelSettings, lidar_velocities, prepare_terms
+from pipeline.objective.camera_lidar.own_motion import lidar_velocities
+from pipeline.objective.camera_lidar.score import KernelSettings, prepare_terms
 from tests.makers.traced_scenes import DENSE, T_TRUE, traced_day
 
 SHARP = KernelSettings.wide(1.5, 2)

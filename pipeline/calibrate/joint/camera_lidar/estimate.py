@@ -66,7 +66,8 @@ from pipeline.extrinsics.estimates import PairEstimate, Prior
 from pipeline.geometry.changes import change_jacobian
 from pipeline.objective.camera_lidar.brightness_maps import Start
 from pipeline.objective.camera_lidar.label_width import label_width_px, widened
-from pipeline.objective.camera_lidar.score import KernelSettings, Terms, lidar_velocities, prepare_terms
+from pipeline.objective.camera_lidar.own_motion import lidar_velocities
+from pipeline.objective.camera_lidar.score import KernelSettings, Terms, prepare_terms
 from pipeline.objective.stamp_gaps import camera_gaps_s, constant_gap_s
 from pipeline.rig.evidence import EDGE
 from schemas.observations import Observation
