@@ -85,9 +85,12 @@ def found(lines: Lines, row: Row) -> str:
     sizes: dict[float, list[bool]] = {}
     for r in lines:
         sizes.setdefault(r["prior"][1], []).append(_is_home(r["pairs"], row))
-    hits = [sum(home) for _, home in sorted(sizes.items())]
-    [trials] = {len(home) for home in sizes.values()}
-    return f"{', '.join(map(str, hits))} of {trials} (> {100 * interval(min(hits), trials)[0]:.0f} %)"
+    counts = [(sum(home), len(home)) for _, home in sorted(sizes.items())]
+    words, trials = [str(hits) for hits, _ in counts], {n for _, n in counts}
+    if len(trials) > 1:
+        words = [f"{hits} of {n}" for hits, n in counts]
+    of_all = f" of {counts[0][1]}" if len(trials) == 1 else ""
+    return f"{', '.join(words)}{of_all} (> {100 * min(interval(*c)[0] for c in counts):.0f} %)"
 
 
 def _is_home(pairs: Mapping[str, Any], row: Row) -> bool:

@@ -11,8 +11,9 @@ of camera-lidar, and azimuth of lidar-radar, within 0.5 deg of the truth, whatev
     python tests/benchmarks/studies/basin.py --root DAYS --starts 12 --lake world=FOLDER --out basin_starts.jsonl
 
 So many starts per day of exactly 2, 5, 10 and 15 deg (5, 10, 20, 30 cm) in random directions, as they are stated, with
-all frames of the day and with ten. `--lake NAME=FOLDER` adds a day of another origin: FOLDER has fleet.toml, a lake
-that was perceived, and maybe truth.json (else its logged calibration is the reference).
+all frames of the day and with ten; `--set basin-starts-2` has other days, `--sizes` and `--frames` choose a part.
+`--lake NAME=FOLDER` adds a day of another origin: FOLDER has fleet.toml, a lake that was perceived, and maybe
+truth.json (else its logged calibration is the reference).
 """
 
 from __future__ import annotations
@@ -40,18 +41,24 @@ def main() -> None:
     parser.add_argument("--starts", type=int, default=0, help="exact starts per day and size")
     parser.add_argument("--lake", nargs="*", default=[], help="NAME=FOLDER of days of other origin")
     parser.add_argument("--only-lakes", action="store_true", help="no simulated days")
+    parser.add_argument("--set", choices=["basin-starts", "basin-starts-2"], default="basin-starts")
+    parser.add_argument(
+        "--sizes", type=float, nargs="+", default=[s[1] for s in EXACT], help="of exact starts [deg]"
+    )
+    parser.add_argument("--frames", type=int, nargs="+", default=FRAMES, help="frames of exact starts")
     args = parser.parse_args()
     if not args.starts:
         days = SETS["dev-basin" if args.tuning else "basin"]
         run_study([Run(day, prior=start, seed=day.seed) for start in STARTS for day in days], args, summary)
         return
-    made = [] if args.only_lakes else SETS["dev-basin" if args.tuning else "basin-starts"]
+    made = [] if args.only_lakes else SETS["dev-basin" if args.tuning else args.set]
     days = [*made, *(_adopted(x, args.root) for x in args.lake)]
     runs = [
         Run(day, prior=start, seed=100 * day.seed + number, select={"frames": frames})
         for number in range(args.starts)
         for start in EXACT
-        for frames in FRAMES
+        if start[1] in args.sizes
+        for frames in args.frames
         for day in days
     ]
     run_study(runs, args, by_start)

@@ -328,6 +328,19 @@ SETS: dict[str, list[DaySpec]] = {
             ("paper", "ring16", "demo", "spin128", "pinhole", "rosette", "fisheye", "truck")
         )
     ],
+    # The same with other drives, worlds and dusk in another order, for a first look at 0.12.0.
+    "basin-starts-2": [
+        DaySpec(
+            4408 + i,
+            ("highway", "urban", "mixed")[i % 3],
+            rig=rig,
+            frames=100,
+            fault="camera:dusk:1" if i % 4 == 1 else "",
+        )
+        for i, rig in enumerate(
+            ("paper", "ring16", "demo", "spin128", "pinhole", "rosette", "fisheye", "truck")
+        )
+    ],
     "radar-elevation": [
         *_both(4000, 4),
         *_both(4006, 2),
