@@ -76,7 +76,7 @@ class Evidence:
     @property
     def terms_with_values(self) -> int:
         """Number of terms that the day shows: classes need labels, markings need reflectivity."""
-        return sum(tail > 0 for tail in self.tail)
+        return int(np.count_nonzero(np.asarray(self.tail) > 0))
 
     def weighted(self) -> KernelSettings:
         """The kernel with equal weights of edges and markings in units of chance; the larger weight is 1."""
