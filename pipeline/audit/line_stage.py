@@ -63,11 +63,12 @@ def work(task: Task) -> Work:
     settings = (fleet.audit, fleet.verify, fleet.fleet_model, {"to": last, "method": method})
     before = last_assertion(lake, LINE_ANSWERS, method)
     going_on = before is None or before.day <= last  # an earlier window is counted by itself
-    counted = Counted.read(lake, method) if last and going_on else Counted()
 
     def rows(run: Run) -> Generator[Records, None, None]:
         if not last:
             return
+        # Read here, so that it is gone before the rows are written, when memory is fullest.
+        counted = Counted.read(lake, method) if going_on else Counted()
         yield from _rows(task, method, window, counted, run)
 
     return Work(settings, rows, inputs=(), tell=_told, again=True)
