@@ -94,7 +94,7 @@ def test_the_readout_time_of_the_prior_reaches_every_step_of_camera_lidar():
     T = perturb_exactly(T_TRUE, np.radians(1.0), 0.03, np.random.default_rng(0))
     prior = Prior(T, np.eye(4), float(np.radians(2.0)), 0.05, camera=CameraPrior(READOUT_S))
     aligned = align_camera_lidar(day, prior, SolveConfig(), np.random.default_rng(0))
-    turn = log_so3((aligned.T_camera_lidar @ inverse(T_TRUE))[:3, :3])
+    turn = log_so3((aligned.state.T_camera_lidar @ inverse(T_TRUE))[:3, :3])
     assert np.degrees(np.abs(turn)).max() < 0.3
     terms = aligned.problem.terms
     there = terms.exposed_at(aligned.state.alone)
