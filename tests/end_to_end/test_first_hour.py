@@ -95,7 +95,8 @@ PAIRS = {
     "simulated": {"camera_lidar", "camera_radar", "lidar_radar"},
     "real_car": {"camera_lidar", "camera_radar", "lidar_radar"},
     "other_world": {"camera_lidar", "camera_radar", "lidar_radar"},
-    "nuscenes": {"lidar_base", "radar_base"},  # its cameras have no labels, and its radar sees no clusters
+    # Its cameras have no labels, so their borders are steps of brightness; its radar sees no clusters.
+    "nuscenes": {"camera_lidar", "lidar_base", "radar_base"},
     "kitti": {"camera_lidar"},  # it has no radar
 }
 
