@@ -72,7 +72,7 @@ def test_starts_that_end_apart_widen_sigma_unless_the_day_rejects_one():
 
     def found(day):
         aligned = align_camera_lidar(day, prior_off_by(0.2, 0.02, 0), SolveConfig(), np.random.default_rng(0))
-        apart = [np.linalg.norm(log_so3(aligned.T_camera_lidar[:3, :3] @ T[:3, :3].T)) for T in ends]
+        apart = [np.linalg.norm(log_so3(aligned.state.T_camera_lidar[:3, :3] @ T[:3, :3].T)) for T in ends]
         second = AlignmentState(ends[int(np.argmax(apart))], aligned.state.dt_s)
         return [
             analyse_camera_lidar(replace(aligned, second=s), np.random.default_rng(0)) for s in (None, second)
