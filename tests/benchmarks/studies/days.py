@@ -209,6 +209,15 @@ def _turned(first: int) -> list[DaySpec]:
     return [DaySpec(first + i, ("urban", "highway")[i % 2], fault=fault) for i, fault in enumerate(faults)]
 
 
+def _a_day_of_each_rig(first: int, environments: Sequence[str], *, dusk: int) -> list[DaySpec]:
+    """Eight rigs; every fourth day at dusk, from number `dusk` on."""
+    rigs = ("paper", "ring16", "demo", "spin128", "pinhole", "rosette", "fisheye", "truck")
+    return [
+        DaySpec(first + i, environments[i % 3], 100, rig, "camera:dusk:1" if i % 4 == dusk else "")
+        for i, rig in enumerate(rigs)
+    ]
+
+
 def _worlds(first: int, count: int) -> list[DaySpec]:
     """Another world with another rig for every seed."""
     return [DaySpec(seed, f"world-{seed}", 60, f"random-{seed}") for seed in range(first, first + count)]
@@ -316,31 +325,9 @@ SETS: dict[str, list[DaySpec]] = {
         if i >= 16
     ],
     # Eight rigs, a day each, by day and at dusk: exact starts of every size (`basin.py --starts`). Tuning: dev-basin.
-    "basin-starts": [
-        DaySpec(
-            4400 + i,
-            ("mixed", "highway", "urban")[i % 3],
-            rig=rig,
-            frames=100,
-            fault="camera:dusk:1" if i % 4 == 2 else "",
-        )
-        for i, rig in enumerate(
-            ("paper", "ring16", "demo", "spin128", "pinhole", "rosette", "fisheye", "truck")
-        )
-    ],
+    "basin-starts": _a_day_of_each_rig(4400, ("mixed", "highway", "urban"), dusk=2),
     # The same with other drives, worlds and dusk in another order, for a first look at 0.12.0.
-    "basin-starts-2": [
-        DaySpec(
-            4408 + i,
-            ("highway", "urban", "mixed")[i % 3],
-            rig=rig,
-            frames=100,
-            fault="camera:dusk:1" if i % 4 == 1 else "",
-        )
-        for i, rig in enumerate(
-            ("paper", "ring16", "demo", "spin128", "pinhole", "rosette", "fisheye", "truck")
-        )
-    ],
+    "basin-starts-2": _a_day_of_each_rig(4408, ("highway", "urban", "mixed"), dusk=1),
     "radar-elevation": [
         *_both(4000, 4),
         *_both(4006, 2),

@@ -3,8 +3,8 @@
 The statistic is the root mean square of error over sigma, over the degrees of freedom that a day determines (and the
 radar's time offset). It would be 1 where sigmas held noise only. Theirs also hold bias floors, for what real drives
 have and these scenes have not, so it is smaller here; the bounds are a third either way of what other seeds showed
-(100 to 107 for the radar, without boxes: 0.37 and 0.35 by fives; 100 to 109 for the camera, measured with 0.7.0: 0.23
-and 0.33 by fives).
+(100 to 119 for the radar: 0.37, 0.41, 0.31, 0.35 by fives; 100 to 109 for the camera, measured with 0.7.0: 0.23 and
+0.33 by fives).
 """
 
 import numpy as np

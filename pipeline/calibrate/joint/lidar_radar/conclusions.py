@@ -30,9 +30,7 @@ def notes_of(analysis: ObservabilityAnalysis, *, has_elevation: bool) -> list[st
         notes.append(
             f"time offset known to {1e3 * dt_sigma_s:.0f} ms only: where the car keeps one speed, x looks the same"
         )
-    notes.append(
-        "no vehicle boxes with radar elevations: roll and pitch depend on the registration and the prior"
-    )
+    notes.append("vehicle boxes are not used: roll and pitch depend on the registration and the prior")
     if linear.travel_frames:
         notes.append(
             "radar pitch assumes that the car drives along its road, as the lidar sees it under the car"
@@ -79,8 +77,6 @@ def diagnostics_of(
         "bounce_share": state.bounce,
         **({} if analysis.heights is None else {"displaced_share": analysis.heights.displaced}),
         "assigned_share": float(linear.registration.assigned.mean()),
-        # Boxes are camera-radar's; the names stay for who reads records.
-        **dict.fromkeys(("boxes", "box_bias_car_rad", "box_bias_large_rad"), 0.0),
         "moving_azimuth_sigma_rad": linear.mover_sigma_rad,
         "registration_roll_offset_rad": float(linear.registration_step[0]),
         "registration_roll_sigma_rad": float(linear.floor[0]),
