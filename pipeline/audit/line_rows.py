@@ -189,7 +189,7 @@ def _model(line: LineOfEdge, evidence: LineEvidence, prior: LinePrior) -> _Found
     motion = Motion("none", -1, 0.0, 0)
     count = len(line.vehicles)
     if count < FEWEST_VEHICLES:
-        reason = f"{count} vehicles with days, {FEWEST_VEHICLES} needed"
+        reason = f"{count} vehicle{'s' if count > 1 else ''} with days, {FEWEST_VEHICLES} needed"
         return _Found("UNKNOWN", reason, prior, None, motion, None)
     motion = _motion(line, prior)
     # How far days err alike is hardly known of few days. Where it is less than assumed, mounts scatter by more.
