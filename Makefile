@@ -52,12 +52,11 @@ demo: setup ## synthetic fleet to HTML report, in minutes
 # Files go to workers whole, for what their tests share; tests/conftest.py puts the heaviest first.
 PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder --durations 25 \
 	--ignore tests/benchmarks
-SHAPES := --jaxtyping-packages=schemas$(comma)pipeline$(comma)beartype.beartype
+# Each function's first calls, and one in many after them: every call would double what the tests cost.
+SHAPES := -p tests.shapes --jaxtyping-packages=schemas$(comma)pipeline$(comma)beartype.beartype
 
-# Checks of shapes double what heavy tests cost, so these run without them.
-test: setup browser ## tests of less than ten seconds; EVERYTHING=1 checks shapes and types in them, and runs the slow ones
-	$(if $(EVERYTHING),@code=0; $(PYTEST) -m "not slow" $(SHAPES) || code=$$?; \
-		$(PYTEST) -m slow || code=$$?; exit $$code,$(PYTEST) -m "not slow")
+test: setup browser ## tests of less than ten seconds; EVERYTHING=1 runs the slow ones too, and checks shapes and types
+	$(PYTEST) $(if $(EVERYTHING),$(SHAPES),-m "not slow")
 
 # Page tests want Chromium. It is installed where that is allowed without asking, and nowhere else; tests without it are
 # named in the last lines of `make test`.

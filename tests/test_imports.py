@@ -141,16 +141,25 @@ def test_every_command_leads_to_a_function_with_a_sentence_of_help(command):
     assert function.__annotations__["return"] in (int, "int")
 
 
-def test_help_comes_within_a_second_and_loads_nothing_heavy():
+def cpu_s_of(code):
+    """Processor time of the cheapest of three runs, of the last of which is what it printed."""
+    costs = []
+    for _ in range(3):
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        costs.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+    return min(costs), done.stdout
+
+
+def test_help_costs_a_few_starts_of_python_and_loads_nothing_heavy():
     code = (
         "import sys; from jobs.cli import main; main(['--help']);"
         "heavy = {'torch', 'embreex', 'numpy', 'pyarrow', 'scipy', 'numba', 'cv2', 'matplotlib', 'pydantic'};"
         "print('loaded:', sorted(heavy & set(sys.modules)))"
     )
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    assert done.stdout.splitlines()[-1] == "loaded: []"
-    # Of the processor, not of the clock: another process may be busy on this machine.
-    assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < 1.0
-    assert all(command in done.stdout for command in COMMANDS)
+    help_s, said = cpu_s_of(code)
+    bare_s, _ = cpu_s_of("import asyncio, json")
+    assert said.splitlines()[-1] == "loaded: []"
+    assert all(command in said for command in COMMANDS)
+    assert help_s < 6 * bare_s

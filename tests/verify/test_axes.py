@@ -209,19 +209,18 @@ def test_a_sensor_whose_edges_contradict_each_other_or_that_is_not_in_the_calibr
     assert {c.reason for c in checks} == {"the calibration in use has no pose of it"}
 
 
-@pytest.mark.slow
 def test_right_calibrations_of_a_large_rig_are_called_wrong_as_rarely_as_those_of_one_axis():
     """26 axes at three sigmas each were wrong on 4 % of right rigs; the limits of size play no part at this sigma."""
     rng = np.random.default_rng(11)
     sigma, limits = 1.0, {"azimuth": AxisLimits(1e-6, np.radians(9), 0.9)}
     wrong = {False: 0, True: 0}
     for _ in range(300):
-        rows = [
-            pose(f"s{k}", "lidar", off_deg=sigma * rng.normal(), sigma_deg=sigma, axis=2) for k in range(26)
-        ]
+        # A rig is called wrong if its axis that is furthest off is.
+        furthest = max(rng.normal(size=26), key=abs)
+        row = pose("lidar", "lidar", off_deg=sigma * furthest, sigma_deg=sigma, axis=2)
         for shared in wrong:
             beyond = shared_sigmas(26) if shared else 3.0
-            wrong[shared] += any(c.status == "fail" for row in rows for c in check_pose(*row, limits, beyond))
+            wrong[shared] += any(c.status == "fail" for c in check_pose(*row, limits, beyond))
     assert wrong[True] <= 4
     assert wrong[False] >= 8
 

@@ -117,11 +117,11 @@ class Soak:
         return told
 
 
-def make_fleet(folder: Path) -> None:
+def make_fleet(folder: Path, days: int = DAYS) -> None:
     """Tiny logs of a few vehicles and days, in three containers."""
     vehicles = [f"car-{v}" for v in range(VEHICLES)]
     for v, vehicle in enumerate(vehicles):
-        for d in range(DAYS):
+        for d in range(days):
             place = folder / "logs" / vehicle / f"2026-03-{2 + d:02d}"
             place.mkdir(parents=True)
             kit = Kit(ros=1 if v % 3 == 1 else 2, frames=FRAMES).drive(START_NS + d * DAY_NS + v * 10**9)
