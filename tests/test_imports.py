@@ -162,4 +162,4 @@ def test_help_costs_a_few_starts_of_python_and_loads_nothing_heavy():
     bare_s, _ = cpu_s_of("import asyncio, json")
     assert said.splitlines()[-1] == "loaded: []"
     assert all(command in said for command in COMMANDS)
-    assert help_s < 6 * bare_s
+    assert help_s < 8 * bare_s
