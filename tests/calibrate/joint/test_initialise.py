@@ -219,6 +219,26 @@ def test_edges_in_view_are_those_that_the_camera_model_projects_into_the_image(d
     assert 0 < inside.sum() < len(inside)
 
 
+def test_an_end_that_still_pays_a_prior_on_its_way_is_optimised_before_it_is_rejected(terms):
+    """From 15 deg away the right end was given up for a focal length that its climb had not yet brought back."""
+    prior, kernel = off_by(1.0, 0.02, 5), KernelSettings.wide(*SCHEDULE.kernels[0])
+    wrong = wrong_poses(prior, REACH_RAD, 0.05, np.random.default_rng(0))
+    evidence = Evidence(terms, kernel, ((40.0, 30.0), (-40.0, -30.0))).measured(wrong)
+    search = initialise._Search(
+        Scored(terms, kernel, prior, SolveConfig()), evidence, np.arange(terms.frames)
+    )
+    T_near = turned(T_TRUE, np.radians([0.0, 0.4, 0.0]))
+    on_its_way = search._end("edges", AlignmentState(T_near, focal=1.01))
+    elsewhere = turned(T_TRUE, np.radians([0.0, 0.0, 7.0]))
+    ahead = search._end("markings", AlignmentState(elsewhere))
+    ahead = replace(ahead, prior=on_its_way.total - ahead.evidence.sum() + 20.0)
+    arrived = search._arrived(on_its_way, ahead)
+    assert arrived.is_finished
+    assert arrived.total > on_its_way.total + 1.0
+    assert degrees_off(arrived.state.T_camera_lidar) < 0.2
+    assert search._finished(arrived) is arrived
+
+
 def test_a_rival_near_by_is_asked_again_by_a_sharper_kernel(terms):
     basin = replace(searched(terms, off_by(1.0, 0.02, 5)), rival_z=1.0, doubt="")
     scored = Scored(terms, KernelSettings.wide(*SCHEDULE.kernels[-1]), off_by(1.0, 0.02, 5), SolveConfig())

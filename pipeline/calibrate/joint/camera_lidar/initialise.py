@@ -39,6 +39,8 @@ __all__ = ["MARGIN_RAD", "Basin", "difference", "find_basin", "settled"]
 _SAME_OPTIMUM_RAD, _SAME_OPTIMUM_KERNELS = float(np.radians(0.5)), 0.75
 _ENDS_THAT_TELL = 2  # how far two starts of one optimum end apart
 _POINTS = 500  # that show how far two ends are apart
+# An end is optimised so many times more at most, until a time raises its evidence by less than this.
+_FINISHES, _HARDLY = 4, 0.5
 # A rival no further off is asked again by sharper kernels: they keep the points in view from the best end, and
 # this far about it (`estimate`). From further off other points are seen, and what is seen there cannot be compared.
 MARGIN_RAD = float(np.radians(2.0))
@@ -76,6 +78,7 @@ class _End:
     evidence: Float[np.ndarray, " 3"]
     by_frame: Float[np.ndarray, " F"]
     prior: float  # log density, up to a constant
+    is_finished: bool = False  # optimised until it hardly rises
 
     @property
     def total(self) -> float:
@@ -191,12 +194,12 @@ class _Search:
 
         As long as candidates are left, the sum of a term's data suffices as a reason.
         """
-        highest = max(self.ends, key=lambda e: e.total)
-        best = self._finished(highest)
+        self.ends.sort(key=lambda e: -e.total)
+        first = self._finished(self.ends[0])
         # Ends elsewhere that are near, or that the day does not reject, may not have arrived yet.
-        others = [self._arrived(e, best) for e in self.ends if e is not highest]
-        first, best = best, max([best, *others], key=lambda e: e.total)
-        apart = [(self._apart(e.state, best.state), e) for e in [first, *others] if e is not best]
+        self.ends = [first, *(self._arrived(e, first) for e in self.ends[1:])]
+        best = max(self.ends, key=lambda e: e.total)
+        apart = [(self._apart(e.state, best.state), e) for e in self.ends if e is not best]
         agreeing = [e for a, e in apart if a < self.same_rad]
         rivals = [e for a, e in apart if a >= self.same_rad]
         rival = min(rivals, key=lambda e: _rejected(best, e), default=None)
@@ -248,11 +251,20 @@ class _Search:
 
     def _arrived(self, end: _End, best: _End) -> _End:
         apart = self._apart(end.state, best.state)
-        is_rival = apart < self.leads_there_rad or _rejected(best, end) < CLEARLY
+        # By its frames alone: on its way an end may pay a prior of the focal length that it will not pay in the end.
+        is_rival = apart < self.leads_there_rad or _rejected_by_frames(best, end) < CLEARLY
         return self._finished(end) if is_rival and apart >= self.same_rad else end
 
     def _finished(self, end: _End) -> _End:
-        return self._end(end.origin, refine(self.scored, end.state, steps=SCHEDULE.finishing_steps))
+        """The end, optimised further for as long as it rises: a focal length's valley is long."""
+        if end.is_finished:
+            return end
+        for _ in range(_FINISHES):
+            before = end.total
+            end = self._end(end.origin, refine(self.scored, end.state, steps=SCHEDULE.finishing_steps))
+            if end.total - before < _HARDLY:
+                break
+        return replace(end, is_finished=True)
 
     def _end(self, origin: str, state: AlignmentState) -> _End:
         at = state.alone
@@ -265,11 +277,24 @@ class _Search:
 
 def _rejected(best: _End, other: _End) -> float:
     """Standard errors by which the day rejects an end, from its frames or equivalent to its evidence."""
+    return max(_by_scatter(best, other), _equivalent(best.total - other.total))
+
+
+def _rejected_by_frames(best: _End, other: _End) -> float:
+    """`_rejected`, without the priors of both."""
+    lead = best.total - best.prior - (other.total - other.prior)
+    return max(_by_scatter(best, other), _equivalent(lead))
+
+
+def _by_scatter(best: _End, other: _End) -> float:
     lower = best.by_frame - other.by_frame
     error = lower.std(ddof=1) / np.sqrt(len(lower)) if len(lower) > 1 else np.inf
-    by_frames = float(lower.mean() / error) if error > 0 else np.inf
-    lead = max(best.total - other.total, 0.0)
-    return max(by_frames, float(np.sqrt(2 * lead)))
+    return float(lower.mean() / error) if error > 0 else np.inf
+
+
+def _equivalent(lead: float) -> float:
+    """Standard errors of a normal variable with this difference of log likelihoods."""
+    return float(np.sqrt(2 * max(lead, 0.0)))
 
 
 def _apart_rad(terms: Terms, a: AlignmentState, b: AlignmentState) -> float:
