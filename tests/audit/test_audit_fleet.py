@@ -69,6 +69,7 @@ def test_a_knocked_radar_is_found_on_its_vehicle_sensor_and_day(tmp_path: Path, 
     assert all(f.status != "RED" for f in findings if f.pair == "camera_lidar")
 
 
+@pytest.mark.slow
 def test_a_vehicle_raises_no_more_false_alarms_than_its_budget(maker: ModuleType) -> None:
     rng = np.random.default_rng(2)
     config = AuditConfig(false_alarms_per_1000_vehicle_days=200.0)  # 0.2 per audit: 120 audits can tell

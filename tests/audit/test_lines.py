@@ -121,6 +121,7 @@ def largest_difference(some, others):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_stamped", [True, False])
 def test_a_night_that_adds_its_day_counts_what_all_days_at_once_do(tmp_path, is_stamped):
     line, fleet = MadeLine(12, 6, seed=2), fleet_of()
@@ -244,6 +245,7 @@ def test_a_record_that_cannot_be_counted_costs_the_others_nothing(tmp_path, dama
     assert len([a for a in answers.values() if a.days > 1.5]) == 15
 
 
+@pytest.mark.slow
 def test_nights_of_a_hundred_days_count_nearly_what_all_at_once_do(tmp_path):
     records = stamped(line_records(MadeLine(6, 100, seed=40, pairs=("camera_lidar",))))
     lake = Lake.at(tmp_path / "nights")
@@ -432,6 +434,7 @@ def pose_states_of(lake, **sections):
     return {(r.vehicle, r.sensor): r for r in read_last(lake, STATES, StateRow, "joint") if r.sensor}
 
 
+@pytest.mark.slow
 def test_poses_of_a_rig_are_surer_with_their_line_and_a_knocked_camera_keeps_its_own(tmp_path):
     lake = Lake.at(tmp_path)
     knock = {3: {"front": np.r_[0, np.radians(1.0), 0, 0, 0, 0]}}

@@ -58,6 +58,7 @@ def with_one_scan_repeated(day, k):
     return [replace(o, **stuck) for o in day]
 
 
+@pytest.mark.slow
 def test_a_radar_that_repeats_one_scan_certifies_nothing_however_sure_held_out_frames_are():
     turn = exp_so3(np.array([0, 0, np.radians(0.3)]))
     turned = from_rotation_translation(turn @ T_LIDAR_RADAR[:3, :3], T_LIDAR_RADAR[:3, 3])
@@ -70,6 +71,7 @@ def test_a_radar_that_repeats_one_scan_certifies_nothing_however_sure_held_out_f
     assert (record.status, record.determined) == ("held", [])
 
 
+@pytest.mark.slow
 def test_a_registration_that_the_camera_contradicts_is_not_accepted(street):
     records = records_of(street)
     fine = records["lidar_radar"]

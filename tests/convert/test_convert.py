@@ -249,6 +249,7 @@ def found_by_devkits(tmp_path_factory):
     return json.loads(done.stdout.splitlines()[-1])
 
 
+@pytest.mark.slow
 def test_the_data_sets_own_devkits_find_the_same_in_these_folders(converted, found_by_devkits):
     name, _, _, frames = converted
     if name == "kitti":

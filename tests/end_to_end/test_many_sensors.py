@@ -27,6 +27,7 @@ from schemas.poses import PoseRow
 from tests.makers.kept_days import kept_fleet
 from tests.makers.stages import ingest_day, perceive_day
 
+pytestmark = pytest.mark.slow
 DAY, MOMENTS = Partition("vehicle-1", "2026-03-02"), 8
 DUO = rig_named("duo")
 KINDS = {"front": "camera", "left": "camera", "top": "lidar", "nose": "radar", "corner_fl": "radar"}

@@ -121,6 +121,7 @@ def read_by_others(tmp_path_factory):
     return sent, json.loads(done.stdout.splitlines()[-1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", READERS)
 def test_the_program_that_a_format_is_for_finds_the_same_transforms(name, read_by_others):
     sent, found = read_by_others

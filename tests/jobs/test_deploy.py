@@ -301,6 +301,7 @@ except Exception as err:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("code", RETRIED)
 def test_airflow_takes_the_dag_and_tries_again_what_may_help(code, airflow, fake_night):
     python, environment = airflow
@@ -338,6 +339,7 @@ else:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("code", RETRIED)
 def test_dagster_makes_the_asset_of_a_day_and_tries_again_what_may_help(code, fake_night):
     assert run_asset(code) == {0: "success", 3: "success", 1: "again 2", 2: "never again"}[code]

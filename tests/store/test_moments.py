@@ -177,6 +177,7 @@ while True:
 """
 
 
+@pytest.mark.slow
 def test_a_writer_killed_at_any_moment_leaves_a_day_of_one_work_or_none(lake):
     kept = set()
     for turn in range(6):

@@ -351,6 +351,7 @@ def write_many(root, name, times):
         commit_records(lake, CALIBRATIONS, [record(rng, f"{name}{i}"), record(rng, "shared", vehicle="bus")])
 
 
+@pytest.mark.slow
 def test_two_writers_at_once_both_get_their_records_in(lake):
     context = multiprocessing.get_context("spawn")
     writers = [context.Process(target=write_many, args=(lake.root, name, 8)) for name in "ab"]
@@ -378,6 +379,7 @@ for i in range(10_000):
 """
 
 
+@pytest.mark.slow
 def test_a_killed_writer_loses_nothing_that_it_committed_and_leaves_no_half(lake, rng):
     told, env = [], os.environ | {"PYTHONPATH": str(REPO)}
     for turn in range(4):

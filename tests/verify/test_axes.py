@@ -140,6 +140,7 @@ def test_the_answer_needs_every_axis_that_a_pair_is_good_for():
     assert answer_of([]) == "inconclusive"
 
 
+@pytest.mark.slow
 def test_right_calibrations_fail_and_wrong_ones_pass_as_rarely_as_promised():
     rng = np.random.default_rng(3)
     answers = {0.0: [], 0.5: []}

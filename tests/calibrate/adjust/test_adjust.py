@@ -186,6 +186,7 @@ def test_nothing_is_claimed_of_an_edge_that_only_the_prior_checks():
     assert all(e.innovation_sigmas is None for e in found.edges.values())
 
 
+@pytest.mark.slow
 def test_good_rigs_lose_no_edge_more_often_than_the_limit_says():
     rng, lost = np.random.default_rng(7), 0
     pairs = [("cam0", "top"), ("top", "rad0"), ("cam0", "lid0"), ("lid0", "rad0"), ("cam0", "rad0")]

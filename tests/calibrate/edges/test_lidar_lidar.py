@@ -79,6 +79,7 @@ def test_lidars_without_overlap_have_no_edge(street):
         estimate_lidar_lidar(EDGE, replace(given(street), child=back), street.ego, true_pose(), street.scenes)
 
 
+@pytest.mark.slow
 def test_an_empty_square_shows_height_and_tilt_alone(street):
     def flat(sweeps):
         kept = [(s, np.abs(s.xyz_m[:, 1]) < 30) for s in sweeps]

@@ -74,6 +74,7 @@ def test_cars_with_windows_are_held_and_pitch_is_as_unsure_as_the_evidence_is_ap
     assert np.degrees(sigma) > 0.4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("within_m", "faults"), [(0.0, []), (18.0, ["witnesses_disagree"])])
 def test_windows_in_cars_of_one_kind_only_are_seen_where_no_paint_tells(within_m, faults):
     day = traced_day(DENSE, 12, seed=1, reflective=False)

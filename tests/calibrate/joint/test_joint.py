@@ -83,6 +83,7 @@ def solved_with_camera(monkeypatch, day, doubt, prior=PRIOR):
     return solve_joint(dict.fromkeys(PAIRS, day), prior, SolveConfig(), seed=0), headings
 
 
+@pytest.mark.slow
 def test_a_basin_in_doubt_disproves_its_own_pair_alone(monkeypatch):
     day = street_day(12)
     found, _ = solved_with_camera(monkeypatch, day, "")

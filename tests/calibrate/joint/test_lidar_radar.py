@@ -67,6 +67,7 @@ def test_wrong_priors_lead_to_the_truth(day, rotation_deg, shift_m):
         assert abs(found.time_offset_s - DT_S) < 3 * found.time_offset_sigma_s
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_numbers(day):
     a, b = (solve(day[:12], prior_off_by(2, 0.1), seed=3) for _ in range(2))
     assert np.array_equal(a.T, b.T)

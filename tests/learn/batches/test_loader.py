@@ -36,6 +36,7 @@ def taken(loader, batches):
     return [names(next(loader)) for _ in range(batches)]
 
 
+@pytest.mark.slow
 def test_an_epoch_shows_every_frame_once_in_another_order_each_time(lake):
     loader = TrainingLoader(lake, 4, window_groups=3)
     assert loader.frames == 40

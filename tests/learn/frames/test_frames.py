@@ -241,6 +241,7 @@ def killed_export(lake, out, form, at, function="os.fsync", of=None):
     assert done.returncode == -9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", ["webdataset", "kitti", "nuscenes"])
 def test_an_export_killed_in_the_middle_of_a_file_goes_on_to_the_same_bytes(
     lake, tmp_path, monkeypatch, form
@@ -454,6 +455,7 @@ def test_from_a_bucket_to_a_bucket_the_same_bytes_as_between_folders(lake, tmp_p
     assert found == contents(tmp_path / "out")
 
 
+@pytest.mark.slow
 def test_nuscenes_devkit_webdataset_and_pykitti_open_what_is_written(lake, tmp_path):
     python = os.environ.get("BORESIGHT_READERS")
     if not python:

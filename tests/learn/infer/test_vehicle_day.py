@@ -244,6 +244,7 @@ def test_untrained_networks_make_records_that_nobody_would_drive_by(lake, capsys
     assert told["work_key"] == records[0].work_key
 
 
+@pytest.mark.slow
 def test_one_frame_on_the_command_line_prints_transforms_and_records_nothing(lake, capsys):
     before = len(read_records(Lake.at(lake / "lake"), CALIBRATIONS, CalibrationRecord))
     code, told = run(lake, capsys, "--frame", "7", "--perturb", "2,0.05")

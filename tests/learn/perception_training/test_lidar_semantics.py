@@ -152,6 +152,7 @@ def test_layout_holds_the_sweeps_and_images_are_cut_to_where_labels_are(samples)
     assert set(np.unique(train.label)) == {UNLABELLED, ROAD, CAR}
 
 
+@pytest.mark.slow
 def test_the_network_learns_and_perception_gets_its_answers_from_the_exported_model(samples, tmp_path):
     train, held_out = samples
     config = SweepTraining(steps=120, batch_size=4, width=8)
@@ -214,6 +215,7 @@ def test_scores_are_those_of_the_definition():
     assert sum(p.numel() for p in build_sweep_network(16, 0).parameters()) < 100_000
 
 
+@pytest.mark.slow
 def test_the_job_trains_on_a_lake_holds_days_out_and_leaves_model_manifest_and_card(tmp_path):
     fleet = tmp_path / "fleet.toml"
     fleet.write_text(

@@ -129,6 +129,7 @@ def test_a_budget_of_time_brings_the_rate_down_whatever_the_speed(data, tmp_path
     assert rates[-1] < 0.6 * rates[0]
 
 
+@pytest.mark.slow
 def test_sigterm_ends_the_command_with_143_and_a_whole_checkpoint(data, tmp_path):
     (tmp_path / "train.toml").write_text(
         "\n".join(f"{k} = {v}" for k, v in (SMALL | {"log_every": 1}).items())
