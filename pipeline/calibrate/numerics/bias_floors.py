@@ -41,7 +41,6 @@ __all__ = [
     "REGISTRATION_COMPARISON_SIGMA",
     "SIDES_APART_RANGE_M",
     "SIDES_APART_SHARE",
-    "SIDES_UNASKED_PX",
     "SWEEP_S",
     "TRACKING_BIAS_RAD",
     "TYPICAL_RANGE_M",
@@ -67,9 +66,6 @@ SIDES_APART_SHARE, SIDES_APART_RANGE_M = 0.7, 10.0
 # One side alone is as far apart at least as this share of a label pixel and of the angle between beams, in quadrature:
 # no other side takes back what its labels or the beams' gaps move it by (tops of one height, rows 1 deg apart: .5 deg).
 EDGE_SIDE_ALONE = 0.3
-# Where no side of an axis has edges enough to be asked, near and far are as far apart as on those worlds: .75 px in the
-# median are 1.1 px RMS. Paint alone errs too: along a line ahead its pitch was .4 deg off, at a sigma of .07.
-SIDES_UNASKED_PX = 1.1
 # Relative sigma of the logged focal length. The solver leaves the focal length free within it, so that the position
 # along the optical axis is no surer than the intrinsics.
 FOCAL_SIGMA = CameraPrior.focal_sigma

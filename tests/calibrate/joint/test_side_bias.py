@@ -8,7 +8,7 @@ import pytest
 from pipeline.calibrate.joint.camera_lidar.observability import along_the_way
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState
 from pipeline.calibrate.joint.camera_lidar.side_bias import SidesApart, sides_apart
-from pipeline.calibrate.numerics.bias_floors import EDGE_SIDE_ALONE, SIDES_APART_RANGE_M, SIDES_UNASKED_PX
+from pipeline.calibrate.numerics.bias_floors import EDGE_SIDE_ALONE, SIDES_APART_RANGE_M
 from pipeline.objective.camera_lidar.label_width import OUTWARD, label_width_px, widened
 from pipeline.objective.camera_lidar.score import KernelSettings, prepare_terms
 from schemas.observations import EDGE_BELOW, EDGE_LEFT
@@ -64,7 +64,7 @@ def test_far_edges_that_lie_beside_their_borders_leave_the_yaw_open(terms, kerne
     assert good.pitch_px >= EDGE_SIDE_ALONE  # tops alone: nothing floats over the ground
     assert good.yaw_px < 0.5
     without = chosen(terms, edges.side != EDGE_BELOW)
-    assert sides_apart(without, STATE, kernel).pitch_px == SIDES_UNASKED_PX
+    assert sides_apart(without, STATE, kernel).pitch_px == 0  # edges tell nothing of it
     is_left = edges.side == EDGE_LEFT
     range_m = np.linalg.norm(edges.xyz_m, axis=1)
     is_far_left = is_left & (range_m > np.median(range_m[is_left]))

@@ -21,7 +21,6 @@ from pipeline.calibrate.numerics.bias_floors import (
     EDGE_SIDE_MOST_PX,
     SIDES_APART_RANGE_M,
     SIDES_APART_SHARE,
-    SIDES_UNASKED_PX,
 )
 from pipeline.objective.camera_lidar.label_width import SHIFTS_PX, shift_score
 from pipeline.objective.camera_lidar.points import Points
@@ -59,7 +58,7 @@ class SidesApart:
 
 
 def sides_apart(terms: Terms, state: AlignmentState, kernel: KernelSettings) -> SidesApart:
-    """Offsets of far edges minus near edges at a solution; the usual ones where edges are too few."""
+    """Offsets of far edges minus near edges at a solution, in pitch and yaw; 0 where there are too few edges."""
     pitch_px, yaw_px = (_apart_px(terms, state, kernel, sides) for sides in _SIDES.values())
     return SidesApart(pitch_px, yaw_px, 1 / float(terms.camera[1]))
 
@@ -70,7 +69,7 @@ def most_offset_rad(edges: Points, px_rad: float) -> float:
 
 
 def _apart_px(terms: Terms, state: AlignmentState, kernel: KernelSettings, sides: tuple[int, int]) -> float:
-    """Offset of far edges minus offset of near edges, RMS over the sides; the usual one if all have too few."""
+    """Offset of far edges minus offset of near edges, RMS over the sides; 0 where every side has too few edges."""
     range_m, focal_px = np.linalg.norm(terms.edges.xyz_m, axis=1), float(terms.camera[1])
     far_less_near, gap_px = [], 0.0
     for side in sides:
@@ -85,7 +84,7 @@ def _apart_px(terms: Terms, state: AlignmentState, kernel: KernelSettings, sides
         far_less_near.append(far_px - near_px)
         gap_px = float(np.median(terms.edges.gap_rad[mine])) * focal_px
     if not far_less_near:
-        return SIDES_UNASKED_PX
+        return 0.0
     one_sided_px = EDGE_SIDE_ALONE * float(np.hypot(1.0, gap_px)) if len(far_less_near) == 1 else 0.0
     return float(np.hypot(np.sqrt(np.mean(np.square(far_less_near))), one_sided_px))
 
