@@ -221,6 +221,7 @@ def analyse_camera_lidar(
         "label_width_px": aligned.label_width_px,
         "sides_apart_pitch_px": analysis.apart.pitch_px,
         "sides_apart_yaw_px": analysis.apart.yaw_px,
+        "along_paint_deg": float(np.degrees(np.linalg.norm(analysis.along_paint[:3]))),
     }
     diagnostics |= {"own_dt_s": aligned.expected_dt_s + own_dt_s, "own_dt_z": z}
     if analysis.observability[5] < OBSERVABLE and own_tz is not None:

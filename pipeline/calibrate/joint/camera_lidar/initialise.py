@@ -39,7 +39,7 @@ __all__ = ["MARGIN_RAD", "Basin", "difference", "find_basin", "settled"]
 _SAME_OPTIMUM_RAD, _SAME_OPTIMUM_KERNELS = float(np.radians(0.5)), 0.75
 _ENDS_THAT_TELL = 2  # how far two starts of one optimum end apart
 _POINTS = 500  # that show how far two ends are apart
-# An end is optimised so many times more at most, until a time raises its evidence by less than this.
+# A rival that may not have arrived is optimised so many times more at most, until a time raises it by less than this.
 _FINISHES, _HARDLY = 4, 0.5
 # A rival no further off is asked again by sharper kernels: they keep the points in view from the best end, and
 # this far about it (`estimate`). From further off other points are seen, and what is seen there cannot be compared.
@@ -78,7 +78,7 @@ class _End:
     evidence: Float[np.ndarray, " 3"]
     by_frame: Float[np.ndarray, " F"]
     prior: float  # log density, up to a constant
-    is_finished: bool = False  # optimised until it hardly rises
+    is_finished: bool = False  # optimised further than to compare candidates
 
     @property
     def total(self) -> float:
@@ -253,13 +253,13 @@ class _Search:
         apart = self._apart(end.state, best.state)
         # By its frames alone: on its way an end may pay a prior of the focal length that it will not pay in the end.
         is_rival = apart < self.leads_there_rad or _rejected_by_frames(best, end) < CLEARLY
-        return self._finished(end) if is_rival and apart >= self.same_rad else end
+        return self._finished(end, _FINISHES) if is_rival and apart >= self.same_rad else end
 
-    def _finished(self, end: _End) -> _End:
-        """The end, optimised further for as long as it rises: a focal length's valley is long."""
+    def _finished(self, end: _End, times: int = 1) -> _End:
+        """The end, optimised further, several times for as long as it rises: a focal length's valley is long."""
         if end.is_finished:
             return end
-        for _ in range(_FINISHES):
+        for _ in range(times):
             before = end.total
             end = self._end(end.origin, refine(self.scored, end.state, steps=SCHEDULE.finishing_steps))
             if end.total - before < _HARDLY:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
+from pipeline.calibrate.joint.camera_lidar.along_paint import along_paint
 from pipeline.calibrate.joint.camera_lidar.heading_bias import MotionSigmas, motion_biases
 from pipeline.calibrate.joint.camera_lidar.optical_axis import TZ, TzProfile, profile_tz, with_tz
 from pipeline.calibrate.joint.camera_lidar.refine import (
@@ -93,6 +94,7 @@ class ObservabilityAnalysis:
     observability: np.ndarray  # 6
     profile: TzProfile
     apart: SidesApart  # how far near and far edges lie apart there
+    along_paint: np.ndarray  # 8, how far gradients along lines draw it
 
 
 def analyse_observability(
@@ -182,6 +184,8 @@ def _fix_unobservable(
     apart = sides_apart(problem.terms, state, kernel)
     # Labels that are off make an answer unsure. They do not make the prior the better answer: after what is fixed.
     day = day.beside(apart.biases(fixed))
+    drawn = along_paint(problem.terms, state, kernel, _curvature(problem, state, kernel), fixed)
+    day = day.beside(drawn)
     return ObservabilityAnalysis(
         problem.prior,
         state,
@@ -193,6 +197,7 @@ def _fix_unobservable(
         observability,
         profile,
         apart,
+        drawn[0],
     )
 
 
