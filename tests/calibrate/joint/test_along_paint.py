@@ -82,8 +82,8 @@ def line_ahead(terms, growth):
 
 def drawn(terms, fixed=NONE):
     kernel = replace(KernelSettings.wide(1.5, 2), marking_weight=1.0, delta=1.0)
-    information = terms.gradient(STATE.alone, kernel)[1].sum(0)
-    return along_paint(terms, STATE, kernel, information + PRIOR, fixed)[0]
+    edges = terms.of_kinds(edges=True, markings=False).gradient(STATE.alone, kernel)[1].sum(0)
+    return along_paint(terms, STATE, kernel, edges + PRIOR, fixed)[0]
 
 
 def test_a_line_ahead_that_grows_brighter_draws_pitch_and_an_even_one_does_not(terms):

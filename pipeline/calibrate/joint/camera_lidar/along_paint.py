@@ -28,13 +28,13 @@ def along_paint(
     terms: Terms,
     state: AlignmentState,
     kernel: KernelSettings,
-    curvature: Float[np.ndarray, "8 8"],
+    without_paint: Float[np.ndarray, "8 8"],
     fixed: Bool[np.ndarray, " 8"],
 ) -> Float[np.ndarray, "1 8"]:
     """How far a solution is drawn by gradients along lines: one sigma of its bias, as `AlignmentState.changed`.
 
     Args:
-        curvature: of the cost at the solution, prior included.
+        without_paint: curvature of the cost at the solution by its other terms and its prior.
         fixed: unknowns that are not solved for.
     """
     out = np.zeros((1, 8))
@@ -47,8 +47,8 @@ def along_paint(
     )
     across = whole - along
     weight, free = kernel.marking_weight, np.flatnonzero(~fixed)
-    without = curvature - weight * (whole.T @ whole - across.T @ across)
-    out[0, free] = np.linalg.solve(without[np.ix_(free, free)], weight * along.sum(0)[free])
+    curvature = without_paint + weight * across.T @ across
+    out[0, free] = np.linalg.solve(curvature[np.ix_(free, free)], weight * along.sum(0)[free])
     return out
 
 

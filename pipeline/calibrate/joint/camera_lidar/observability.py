@@ -184,7 +184,8 @@ def _fix_unobservable(
     apart = sides_apart(problem.terms, state, kernel)
     # Labels that are off make an answer unsure. They do not make the prior the better answer: after what is fixed.
     day = day.beside(apart.biases(fixed))
-    drawn = along_paint(problem.terms, state, kernel, _curvature(problem, state, kernel), fixed)
+    unpainted = replace(problem, terms=problem.terms.of_kinds(edges=True, markings=False))
+    drawn = along_paint(problem.terms, state, kernel, _curvature(unpainted, state, kernel), fixed)
     day = day.beside(drawn)
     return ObservabilityAnalysis(
         problem.prior,
