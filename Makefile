@@ -56,7 +56,9 @@ PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-re
 SHAPES := -p tests.shapes --jaxtyping-packages=schemas$(comma)pipeline$(comma)beartype.beartype
 
 test: setup browser ## tests of less than ten seconds; EVERYTHING=1 runs the slow ones too, and checks shapes and types
-	$(PYTEST) $(if $(EVERYTHING),$(SHAPES),-m "not slow")
+	@# Two runs: Ray's trainer leaves the processes of its run in a state in which no other cluster comes up.
+	$(if $(EVERYTHING),@code=0; $(PYTEST) -m "not slow" $(SHAPES) || code=$$?; \
+		$(PYTEST) -m slow $(SHAPES) || code=$$?; exit $$code,$(PYTEST) -m "not slow")
 
 # Page tests want Chromium. It is installed where that is allowed without asking, and nowhere else; tests without it are
 # named in the last lines of `make test`.

@@ -18,10 +18,6 @@ from tests.makers.ray_clusters import ray_or_skip
 HERE = Path(__file__).resolve().parent
 
 
-SLOW_RAY = pytest.param("ray", marks=pytest.mark.slow)  # a cluster needs seconds to come up
-EACH_EXECUTOR = [SLOW_RAY if name == "ray" else name for name in EXECUTORS]
-
-
 def run(name, function, kinds, folder, workers=2, watch=lambda *_: None):
     items = [(kind, str(folder)) for kind in kinds]
     return {f.item[0]: f for f in EXECUTORS[name](function, items, workers, watch)}
@@ -51,7 +47,7 @@ def installed(request, monkeypatch):
         ray_or_skip().shutdown()
 
 
-@pytest.mark.parametrize("installed", EACH_EXECUTOR, indirect=True)
+@pytest.mark.parametrize("installed", EXECUTORS, indirect=True)
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
 def test_every_item_ends_once_and_an_error_stays_with_its_own_item(installed, behave, tmp_path):
     seen = []
@@ -68,7 +64,7 @@ def test_every_item_ends_once_and_an_error_stays_with_its_own_item(installed, be
         assert (0, 1, 2, "a at work") in seen
 
 
-@pytest.mark.parametrize("installed", EACH_EXECUTOR, indirect=True)
+@pytest.mark.parametrize("installed", EXECUTORS, indirect=True)
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_worker_that_asks_for_too_much_memory_is_refused_it_by_name_and_works_on(
     installed, behave, tmp_path
@@ -138,7 +134,7 @@ def gone(processes, seconds):
     return not alive
 
 
-@pytest.mark.parametrize("name", ["process", SLOW_RAY])
+@pytest.mark.parametrize("name", ["process", "ray"])
 def test_sigterm_lets_workers_put_their_things_away_and_leaves_none_behind(name, tmp_path):
     process, workers = started(name, tmp_path)
     process.send_signal(signal.SIGTERM)

@@ -13,7 +13,7 @@ from pipeline.fleet.executor import EXECUTORS
 from pipeline.fleet.ray_tasks import _work
 from tests.makers.ray_clusters import lasting, two_nodes
 
-pytestmark = [*lasting, pytest.mark.slow]
+pytestmark = lasting
 HERE = Path(__file__).resolve().parent
 ray_tasks = EXECUTORS["ray"]
 
