@@ -39,6 +39,7 @@ def test_a_night_on_a_bucket_records_what_a_night_on_a_folder_does(tmp_path):
             assert summary["damaged"] == []
             assert summary["report"].startswith(lake)
             records[lake] = json.loads(run(environment, "show", "calibrations", "--lake", lake, "--json")[1])
+        # Of the bucket alone: `test_nightly` asks the same of a folder.
         again = json.loads(run(environment, "nightly", "--lake", lake, *common)[1].splitlines()[-1])
         assert again["done"] == 0
         status = json.loads(run(environment, "status", "--lake", lake)[1].splitlines()[-1])

@@ -19,7 +19,8 @@ from pipeline.objective.camera_lidar.score import Alignments, KernelSettings, Te
 
 __all__ = ["along_paint"]
 
-_AROUND_PX = 3.0  # standard deviation of the window in which paint has one direction or several
+# Standard deviation of the window in which paint has one direction or several: half of the widest blur. Not tuned.
+_AROUND_PX = 3.0
 # Of finite differences: turns [rad], shifts [m], time [s], focal length; far below a pixel, far above rounding.
 _STEPS: Final = np.array([1e-4] * 3 + [1e-3] * 4 + [1e-4])
 
