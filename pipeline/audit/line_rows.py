@@ -16,7 +16,7 @@ from pipeline.audit.line_days import Drawing
 from pipeline.audit.line_witnesses import Witnesses
 from pipeline.config import FleetModelConfig, VerifyConfig
 from pipeline.fleet_model.answers import DIFFERS_SIGMAS, Answers, largest_change_without_one, with_line
-from pipeline.fleet_model.apart import shared_axes, shared_errors
+from pipeline.fleet_model.apart import shared_axes, shared_errors, widened
 from pipeline.fleet_model.contradictions import Motion, contradiction_of, motion_of
 from pipeline.fleet_model.evidence import (
     LineEvidence,
@@ -195,6 +195,9 @@ def _model(line: LineOfEdge, evidence: LineEvidence, prior: LinePrior) -> _Found
     # How far days err alike is hardly known of few days. Where it is less than assumed, mounts scatter by more.
     apart = _evidence(line, prior, days="all", alike=False)
     model = learn_line(evidence, prior, learn_line(apart, prior).variance)
+    wide = widened(model, shared_axes(line.edge.kind, line.drawing.T[:3, :3]))
+    if wide is not prior:
+        model = learn_line(evidence, wide, learn_line(apart, wide).variance)
     answers = with_line(model, evidence, line.sums.common, _own_priors(line))
     contradiction = contradiction_of(evidence, model)
     alarms = int(line.changed.sum())

@@ -76,7 +76,8 @@ def with_line(
     allowed = _limited(change - alone, own_spread + common, model.prior)
     kept = change - alone - allowed
     doubt = np.clip(distance - _DOUBTED, 0.0, 1.0)[:, None] * allowed
-    spread = spread + _square(kept) + _square(doubt) + _beyond(common, model.prior.bias[:M, :M])
+    stated = model.prior.bias if model.prior.stated is None else model.prior.stated
+    spread = spread + _square(kept) + _square(doubt) + _beyond(common, stated[:M, :M])
     shared = distance < OUTSIDE
     change = np.where(shared[:, None], alone + allowed, evidence.alone(model.prior, own)[0])
     spread = np.where(shared[:, None, None], spread, own_spread + common)

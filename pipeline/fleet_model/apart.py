@@ -3,20 +3,27 @@
 Records of one kind determine only the sum of both: every camera of a line mounted 0.2 deg too low looks like a
 segmenter whose labels lie 0.2 deg too high. A direction of the shared error is told apart where its sigma is less than
 half of what was known before; in the others its prior is kept, and nobody's answer gets surer there.
+
+The prior of a shared error is what records state of it. If data tell it apart, or contradict the statement, and it is
+larger than stated, the statement is too small: the line's prior becomes as wide as data show. Otherwise the error would
+be estimated too small, and the rest of it would move the mounts.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.fleet_model.evidence import LinePrior
 from pipeline.fleet_model.line import LineModel
 
-__all__ = ["SharedError", "shared_axes", "shared_errors", "told_apart"]
+__all__ = ["SharedError", "shared_axes", "shared_errors", "told_apart", "widened"]
 
 _TOLD = 0.5  # of the prior's sigma
+_SHOWN = 0.98  # of the prior's sigma: with more data show nothing of an error
+_CONTRADICTED = 3.0  # sigmas of data and statement together
 
 
 @dataclass(frozen=True)
@@ -85,6 +92,27 @@ def shared_errors(model: LineModel, axes: dict[str, Float[np.ndarray, " 6"]]) ->
             )
         )  # fmt: skip
     return found
+
+
+def widened(model: LineModel, axes: dict[str, Float[np.ndarray, " 6"]]) -> LinePrior:
+    """The line's prior, as wide along shared errors that exceed what records state as the data alone show them to be.
+
+    The same prior if none is. The variance is the likeliest one of the error's only draw (type II maximum likelihood).
+    """
+    prior, M = model.prior, len(model.prior.mount)
+    bias = prior.bias.copy()
+    for error in shared_errors(model, axes):
+        if error.sigma > _SHOWN * error.prior_sigma:
+            continue
+        u = np.r_[axes[error.name], np.zeros(len(bias) - M)]
+        variance = 1 / (1 / error.sigma**2 - 1 / error.prior_sigma**2)  # of the data alone, and their value
+        value = error.value * variance / error.sigma**2
+        before = float(u @ bias @ u)
+        if not error.told and abs(value) < _CONTRADICTED * np.sqrt(variance + before):
+            continue
+        if (larger := value**2 - variance) > before:
+            bias += (larger - before) * np.outer(bias @ u, bias @ u) / before**2
+    return prior if (bias == prior.bias).all() else replace(prior, bias=bias, stated=prior.bias)
 
 
 def told_apart(model: LineModel) -> tuple[Float[np.ndarray, " G"], Float[np.ndarray, "G G"]]:

@@ -72,10 +72,14 @@ class LineEvidence:
 
 @dataclass(frozen=True, eq=False)
 class LinePrior:
-    """Covariance of the common error of all mounts (about the drawing) and of the shared errors of sensors."""
+    """Covariance of the common error of all mounts (about the drawing) and of the shared errors of sensors.
+
+    `stated`: of the shared errors by the records, if data show them to be larger; None = `bias`.
+    """
 
     mount: Float[np.ndarray, "M M"]
     bias: Float[np.ndarray, "P P"]
+    stated: Float[np.ndarray, "P P"] | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.fleet_model.answers import DIFFERS_SIGMAS, largest_change_without_one, with_line
-from pipeline.fleet_model.apart import shared_axes, shared_errors, told_apart
+from pipeline.fleet_model.apart import shared_axes, shared_errors, told_apart, widened
 from pipeline.fleet_model.contradictions import contradiction_of, motion_of
 from pipeline.fleet_model.evidence import shifts_in_sigmas
 from pipeline.fleet_model.line import LinePrior, learn_line
@@ -136,6 +136,41 @@ def test_remounted_vehicles_tell_a_shared_error_from_a_common_mount_error():
     assert sigma < 0.08 * DEG
     assert model.mean[7] == pytest.approx(0.8 * DEG, abs=3 * sigma)
     assert model.mean[1] == pytest.approx(-0.4 * DEG, abs=3 * sigma)
+
+
+@pytest.mark.parametrize("stated_deg", [0.05, 0.2])
+def test_a_shared_error_beyond_what_records_state_is_neither_shrunk_nor_moved_into_mounts(stated_deg):
+    axes = {"radar elevation": shared_axes("lidar_radar", np.eye(3))["radar elevation"]}
+    drawing, bias = np.array([0.3 * DEG] * 3 + [0.02] * 3), np.array([0, 0.8 * DEG, 0, 0, 0, 0])
+    stated, z, moved = np.diag([(stated_deg * DEG) ** 2] * 3 + [0.01**2] * 3), [], []
+    for seed in range(8):
+        line = make_line(120, 0.5, seed, bias=bias, remounted=30, drawing=drawing)
+        prior = LinePrior(np.diag(drawing**2), stated)
+        shrunk = learn_line(line.evidence, prior)
+        model = learn_line(line.evidence, widened(shrunk, axes))
+        [before], [error] = (shared_errors(m, axes) for m in (shrunk, model))
+        assert abs(before.value) < 0.95 * abs(error.value)
+        assert error.told
+        z.append((abs(error.value) - 0.8 * DEG) / error.sigma)
+        moved.append(np.mean(with_line(model, line.evidence, line.common).change[30:, 1]) / DEG)
+    assert np.abs(np.mean(z)) < 1.0
+    assert np.sqrt(np.mean(np.square(z))) < 1.5
+    assert np.abs(np.mean(moved)) < 0.08
+
+
+def test_a_prior_is_not_widened_by_errors_as_large_as_stated_nor_by_what_no_data_tell_apart():
+    axes = shared_axes("lidar_radar", np.eye(3))
+    turns = {
+        name: axes[name] for name in ("radar elevation", "radar azimuth")
+    }  # not told apart by 30 vehicles
+    for seed in range(12):
+        rng = np.random.default_rng([seed, 9])
+        drawing = np.array([0.3 * DEG] * 3 + [0.02] * 3)
+        prior = LinePrior(np.diag(drawing**2), np.diag(COMMON**2))
+        line = make_line(120, 0.5, seed, bias=COMMON * rng.normal(size=6), remounted=30, drawing=drawing)
+        assert widened(model := learn_line(line.evidence, prior), turns) is model.prior
+        far = make_line(120, 0.5, seed, bias=np.array([0, 0.8 * DEG, 0, 0, 0, 0]))
+        assert widened(model := learn_line(far.evidence, PRIOR), axes) is model.prior
 
 
 def test_drives_in_both_directions_tell_an_error_that_turns_with_the_vehicle():
