@@ -122,8 +122,11 @@ def test_time_limit_leaves_a_checkpoint_to_go_on_from(data, tmp_path):
 
 
 def test_a_budget_of_time_brings_the_rate_down_whatever_the_speed(data, tmp_path):
-    result = train(TrainRequest(data, tmp_path, "cpu"), config(steps=None, budget_minutes=0.05, log_every=1))
+    told = []
+    settings = config(steps=None, budget_minutes=0.05, log_every=1)
+    result = train(TrainRequest(data, tmp_path, "cpu"), settings, lambda *done: told.append(done))
     assert result.status == "done"
+    assert told[-1][1] <= 2 * result.step  # what is told as the whole run is what fits into the budget
     rates = [r["learning_rate"] for r in reports(tmp_path) if "loss" in r]
     assert rates == sorted(rates, reverse=True)
     assert rates[-1] < 0.6 * rates[0]
