@@ -111,6 +111,14 @@ def test_between_two_and_three_sigmas_they_widen_without_a_failed_check():
     assert widening(asked)[0] == pytest.approx(np.radians(0.55))
 
 
+def test_boxes_that_differ_from_the_fit_by_more_than_two_sigmas_widen_it_as_any_part_does():
+    fit = witness("the fit", 0.0, 0.11, 0.03)
+    for boxes_deg, wider_deg in ((0.42, 0.21), (0.30, 0.0)):  # .32 deg are three of their floors
+        asked = [fit, witness("boxes", boxes_deg, 0.04, 0.1)]
+        assert disagreement(asked) == []
+        assert widening(asked)[0] == pytest.approx(np.radians(wider_deg))
+
+
 def test_what_labels_too_wide_explain_contradicts_nothing():
     asked = [witness("a", 0.2), witness("b", -0.2)]
     assert disagreement(asked) == []

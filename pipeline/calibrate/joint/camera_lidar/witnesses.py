@@ -38,7 +38,10 @@ _WIDENING_SIGMAS, _SIGMAS = 2.0, 3.0
 _PAINT_FLOOR_PX = 0.5  # on 34 good days of thirteen rigs paint is off by up to 0.4
 # Medians over the boxes of eight good days of five rigs, at the true pose: pitch -.12 to -.30 deg, as the ground takes
 # the objects' feet, yaw -.25 to +.02; the real car -.10 and .00, KITTI -.17 and .02.
-_BOX_PITCH_RAD, _BOX_FLOOR_RAD, _FEWEST_BOXES = float(np.radians(-0.18)), float(np.radians(0.15)), 20
+_BOX_PITCH_RAD, _FEWEST_BOXES = float(np.radians(-0.18)), 20
+# Beside its scatter, pitch by boxes errs by .05 deg on 51 days of eight rigs and by .10 on 34 of drawn worlds and rigs
+# (`boxes_pitch_*` and errors of the lines in tests/benchmarks/results).
+_BOX_FLOOR_RAD: Final = tuple(np.radians((0.10, 0.15)).tolist())
 # Those that see a turn about an axis (0 pitch, 1 yaw); a turn along an edge moves it within its border.
 _SIDES: Final = {
     0: (("edges below a foreground", EDGE_ABOVE), ("edges above a foreground", EDGE_BELOW)),
@@ -139,7 +142,7 @@ def _boxes(
     drawn = rng.integers(len(known), size=(_RESAMPLES, len(known)))
     scatter = np.std([np.median(offset[np.concatenate([rows[b] for b in d])], axis=0) for d in drawn], axis=0)
     return [
-        Witness(_BOXES, axis, float(np.median(offset[:, axis])), float(scatter[axis]), _BOX_FLOOR_RAD)
+        Witness(_BOXES, axis, float(np.median(offset[:, axis])), float(scatter[axis]), _BOX_FLOOR_RAD[axis])
         for axis in (0, 1)
     ]
 
@@ -155,14 +158,10 @@ def disagreement(witnesses: Sequence[Witness]) -> list[FailedCheck]:
 
 
 def widening(witnesses: Sequence[Witness]) -> Float[np.ndarray, " 2"]:
-    """Sigma of pitch and of yaw [rad] to add: half of a difference of more than two sigmas, else 0.
-
-    Boxes are coarse, so their difference must exceed three sigmas.
-    """
+    """Sigma of pitch and of yaw [rad] to add: half of the largest difference of more than two sigmas, else 0."""
     sigma = np.zeros(2)
-    fine = [w for w in witnesses if w.name != _BOXES]
-    for a, b in [*_contradictions(fine, _WIDENING_SIGMAS), *_contradictions(witnesses, _SIGMAS)]:
-        sigma[a.axis] = max(sigma[a.axis], abs(a.offset_rad - b.offset_rad) / 2)
+    for a, b in _contradictions(witnesses, _WIDENING_SIGMAS):
+        sigma[a.axis] = abs(a.offset_rad - b.offset_rad) / 2
     return sigma
 
 
