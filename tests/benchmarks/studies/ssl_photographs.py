@@ -4,7 +4,8 @@
 
 FOLDER has fleet.toml and a lake with one real vehicle-day, ingested and perceived. Whole days as the product records
 them, started 2 deg / 0.2 m off by several draws, and single frames of each log, knocked by 5 deg / 5 cm: with
-the logged classes and the image, with either alone. Distances are to the logs' own calibration, itself good to about
+the logged classes and the image, with either alone; `--polish`: days whose answers are optimised directly from there,
+as `[solve] polish` does. Distances are to the logs' own calibration, itself good to about
 0.2 deg: nothing finer is a claim about the car. What was measured already is kept.
 """
 
@@ -51,9 +52,10 @@ def by_log(day: SslDay) -> dict[str, SslDay]:
     return {name: replace(day, rows=[o for o in day.rows if o.log == name]) for name in names}
 
 
-def days_told(models: ModelSet, day: SslDay, draws: int) -> list[dict[str, Any]]:
+def days_told(models: ModelSet, day: SslDay, draws: int, *, polish: bool = False) -> list[dict[str, Any]]:
     """The product's records of the day, a draw of the start each."""
-    found = [measure_day(models, replace(day, where=replace(day.where, seed=k))) for k in range(draws)]
+    drawn = [replace(day, where=replace(day.where, seed=k)) for k in range(draws)]
+    found = [measure_day(models, one, polish=polish) for one in drawn]
     keep = ("az_deg", "el_deg", "range_m", "prior_az_deg", "prior_el_deg", "status", "reason")
     return [{p: {k: told.get(k) for k in keep} for p, told in one["pairs"].items()} for one in found]
 
@@ -108,6 +110,7 @@ def main() -> None:
     parser.add_argument("--parts", nargs="+", choices=["days", "frames"], default=["days", "frames"])
     parser.add_argument("--logs", nargs="+", help="only these; for networks that the others taught")
     parser.add_argument("--draws", type=int, default=4)
+    parser.add_argument("--polish", action="store_true", help="days alone")
     parser.add_argument("--frames", type=int, default=24, help="single frames of each log")
     parser.add_argument("--out", type=Path, default=Path("tests/benchmarks/results/ssl_photographs.json"))
     args = parser.parse_args()
@@ -119,11 +122,12 @@ def main() -> None:
             logs = {log: part for log, part in by_log(day).items() if not args.logs or log in args.logs}
             seen = {o.frame_index for part in logs.values() for o in part.rows}
             day = replace(day, rows=[o for o in day.rows if o.frame_index in seen])
-            told = results.setdefault(f"{models.name}, {mode}", {"network": models.key})
+            name = f"{models.name}, {mode}" + (", polished" if args.polish else "")
+            told = results.setdefault(name, {"network": models.key})
             told |= {"commit": commit_now(), "date": time.strftime("%Y-%m-%d")}
             if "days" in args.parts and not told.get("days"):
-                told["days"] = days_told(models, day, args.draws)
-            if "frames" in args.parts and not told.get("frames"):
+                told["days"] = days_told(models, day, args.draws, polish=args.polish)
+            if "frames" in args.parts and not args.polish and not told.get("frames"):
                 told["frames"] = {log: frames_told(models, part, args.frames) for log, part in logs.items()}
             args.out.write_text(json.dumps(results, indent=1) + "\n")
             print(summary(results), flush=True)
