@@ -31,7 +31,9 @@ def main() -> None:
     """Run what is missing, then print the table."""
     parser = study_arguments(__doc__ or "", "rigs")
     parser.add_argument(
-        "--set", choices=["dev-rigs", "dev-views", "dev-worlds", "worlds", "rows"], default="dev-rigs"
+        "--set",
+        choices=["dev-rigs", "dev-views", "dev-worlds", "worlds", "worlds-full", "rows", "rows-full"],
+        default="dev-rigs",
     )
     args = parser.parse_args()
     run_study([Run(day, seed=day.seed) for day in SETS[args.set]], args, summary)
