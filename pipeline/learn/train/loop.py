@@ -157,10 +157,8 @@ def run_loop(
             reported, reported_step = now, run.step
             if log is not None:
                 log.report(run.step, report)
-            expected = max(
-                run.step, round(run.step / max(run.progress, 1e-9))
-            )  # of a budget of time, at today's pace
-            progress(run.step, expected, f"loss {report['loss']:.3f}")
+            steps = round(run.step / max(run.progress, 1e-9))  # of a budget of time: at the pace so far
+            progress(run.step, max(run.step, steps), f"loss {report['loss']:.3f}")
         run.validate(folder, log)
     run.save(folder)
     status = "done" if run.finished else ("stopped" if stops else "time_limit")
