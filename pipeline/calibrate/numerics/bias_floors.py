@@ -39,8 +39,6 @@ __all__ = [
     "RADAR_ELEVATION_BIAS_RAD",
     "RANGE_BIAS_SIGMA_M",
     "REGISTRATION_COMPARISON_SIGMA",
-    "SIDES_APART_RANGE_M",
-    "SIDES_APART_SHARE",
     "SWEEP_S",
     "TRACKING_BIAS_RAD",
     "TYPICAL_RANGE_M",
@@ -59,12 +57,8 @@ CAMERA_LIDAR_DT_FLOOR_S = 0.004
 # between two beams. At most, on 34 good days of thirteen rigs: one label pixel and .4 of the angle between beams; what
 # the sources of one day are compared with.
 EDGE_SIDE_MOST_PX, EDGE_SIDE_MOST_OF_GAP = 1.0, 0.4
-# Of how far near and far edges of both sides lie apart at the solution, the share that one sigma of each angle is, of
-# pitch and yaw about a point so far ahead. On 52 drawn worlds (seeds 60 to 75, 6400 to 6435), where they are .4 px
-# (yaw) and .75 px (pitch) apart in the median, errors are then 1.0 to 1.2 sigma RMS.
-SIDES_APART_SHARE, SIDES_APART_RANGE_M = 0.7, 10.0
-# One side alone is as far apart at least as this share of a label pixel and of the angle between beams, in quadrature:
-# no other side takes back what its labels or the beams' gaps move it by (tops of one height, rows 1 deg apart: .5 deg).
+# One side alone is off by at least this share of a label pixel and of the angle between beams, in quadrature: no other
+# side takes back what its labels or the beams' gaps move it by (tops of one height, rows 1 deg apart: .5 deg).
 EDGE_SIDE_ALONE = 0.3
 # Relative sigma of the logged focal length. The solver leaves the focal length free within it, so that the position
 # along the optical axis is no surer than the intrinsics.

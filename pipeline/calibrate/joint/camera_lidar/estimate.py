@@ -219,8 +219,10 @@ def analyse_camera_lidar(
     own_dt_s, z = far_time_offset(problem.terms, analysis.state, analysis.kernel, rng)
     diagnostics |= {
         "label_width_px": aligned.label_width_px,
-        "sides_apart_pitch_px": analysis.apart.pitch_px,
-        "sides_apart_yaw_px": analysis.apart.yaw_px,
+        **{
+            f"left_out_{name}_deg": float(np.degrees(np.linalg.norm(analysis.left_out[:, axis])))
+            for axis, name in enumerate(("pitch", "yaw"))
+        },
         "along_paint_deg": float(np.degrees(np.linalg.norm(analysis.along_paint[:3]))),
     }
     diagnostics |= {"own_dt_s": aligned.expected_dt_s + own_dt_s, "own_dt_z": z}

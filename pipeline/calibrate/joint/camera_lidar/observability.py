@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 
 from pipeline.calibrate.joint.camera_lidar.along_paint import along_paint
 from pipeline.calibrate.joint.camera_lidar.heading_bias import MotionSigmas, motion_biases
+from pipeline.calibrate.joint.camera_lidar.left_out import left_out
 from pipeline.calibrate.joint.camera_lidar.optical_axis import TZ, TzProfile, profile_tz, with_tz
 from pipeline.calibrate.joint.camera_lidar.refine import (
     AlignmentState,
@@ -24,7 +25,6 @@ from pipeline.calibrate.joint.camera_lidar.refine import (
     weighted,
 )
 from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
-from pipeline.calibrate.joint.camera_lidar.side_bias import SidesApart, sides_apart
 from pipeline.calibrate.joint.camera_lidar.time_offset import (
     DT,
     FOCAL,
@@ -93,7 +93,7 @@ class ObservabilityAnalysis:
     floors: np.ndarray  # 8 8, of the common part what is no prior's
     observability: np.ndarray  # 6
     profile: TzProfile
-    apart: SidesApart  # how far near and far edges lie apart there
+    left_out: np.ndarray  # K 8, how far the solution moves without a side of edges or a part of one
     along_paint: np.ndarray  # 8, how far gradients along lines draw it
 
 
@@ -181,9 +181,10 @@ def _fix_unobservable(
         if more_fixed.sum() == fixed.sum():
             break
         fixed = more_fixed
-    apart = sides_apart(problem.terms, state, kernel)
     # Labels that are off make an answer unsure. They do not make the prior the better answer: after what is fixed.
-    day = day.beside(apart.biases(fixed))
+    curvature, variance = _curvature(problem, state, kernel), _prior_variance(problem)
+    moved = left_out(problem.terms, state, kernel, curvature, variance, fixed)
+    day = day.beside(moved)
     unpainted = replace(problem, terms=problem.terms.of_kinds(edges=True, markings=False))
     drawn = along_paint(problem.terms, state, kernel, _curvature(unpainted, state, kernel), fixed)
     day = day.beside(drawn)
@@ -197,7 +198,7 @@ def _fix_unobservable(
         day.floors,
         observability,
         profile,
-        apart,
+        moved,
         drawn[0],
     )
 

@@ -19,8 +19,11 @@ from jaxtyping import Float, Int
 
 from pipeline.calibrate.joint.camera_lidar.boxes import box_offsets
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState
-from pipeline.calibrate.joint.camera_lidar.side_bias import most_offset_rad
-from pipeline.calibrate.numerics.bias_floors import CAMERA_LIDAR_BIAS
+from pipeline.calibrate.numerics.bias_floors import (
+    CAMERA_LIDAR_BIAS,
+    EDGE_SIDE_MOST_OF_GAP,
+    EDGE_SIDE_MOST_PX,
+)
 from pipeline.calibrate.numerics.covariance import CLEARLY
 from pipeline.extrinsics.checks import FailedCheck
 from pipeline.objective.camera_lidar.points import Points
@@ -107,14 +110,19 @@ def ask_witnesses(
                 continue
             halves = {k: replace(terms, edges=half) for k, half in _by_height(edges).items()}
             scores = {k: half.edge_score(at, kernel) for k, half in halves.items()}
-            ask(name, axis, sum(scores.values(), np.zeros(1)), most_offset_rad(edges, px_rad))
+            ask(name, axis, sum(scores.values(), np.zeros(1)), _most_offset_rad(edges, px_rad))
             for k, half in halves.items():
                 if len(half.edges.xyz_m) >= _FEWEST:
-                    ask(f"{k} {name}", axis, scores[k], most_offset_rad(half.edges, px_rad), name)
+                    ask(f"{k} {name}", axis, scores[k], _most_offset_rad(half.edges, px_rad), name)
         if kernel.marking_weight > 0 and len(terms.markings.xyz_m) >= _FEWEST:
             ask("paint", axis, terms.marking_score(at, kernel), _PAINT_FLOOR_PX * px_rad)
     fit = [Witness(_FIT, axis, 0.0, fit_sigma_rad[axis], float(CAMERA_LIDAR_BIAS[axis])) for axis in _SIDES]
     return fit + found + _boxes(observations, terms.poses(state.alone)[0], blocks, seed)
+
+
+def _most_offset_rad(edges: Points, px_rad: float) -> float:
+    """Largest plausible angle between jumps in range and boundaries of one side; `px_rad`: angle of a label pixel."""
+    return float(np.hypot(EDGE_SIDE_MOST_PX * px_rad, EDGE_SIDE_MOST_OF_GAP * np.median(edges.gap_rad)))
 
 
 def _by_height(edges: Points) -> dict[str, Points]:
