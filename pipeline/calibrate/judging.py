@@ -12,6 +12,7 @@ from pipeline.calibrate.numerics.frame_blocks import scene_blocks
 from pipeline.calibrate.numerics.search_range import search_range
 from pipeline.calibrate.select.frames import Selection
 from pipeline.calibrate.verify.held_out_score import held_out_score
+from pipeline.calibrate.verify.held_out_search import found_elsewhere, held_out_place
 from pipeline.calibrate.verify.held_out_test import HeldOutTest, paired_test
 from pipeline.calibrate.verify.held_out_update import held_out_update
 from pipeline.calibrate.verify.mounting import mounting_covariance
@@ -66,6 +67,15 @@ class Judging:
     def _views(self) -> dict[str, View]:
         return views_of(self.observations)
 
+    @cached_property
+    def _place_by_held_out(self) -> np.ndarray | None:
+        """T_camera_lidar by a search on held-out frames, if these are more than those of the fit."""
+        held_out = self.selection.holdout["camera_lidar"]
+        if len(held_out) <= len(self.selection.fit["camera_lidar"]):
+            return None
+        frames = [self.observations[i] for i in held_out]
+        return held_out_place(frames, self.prior, self.fleet.solve)
+
     def pair(self, estimate: PairEstimate, failed: Sequence[FailedCheck], *, together: bool) -> Judged:
         """Judge one pair; `together` is true if other pairs take part in its pose (see `judge`)."""
         pair, limits = estimate.pair, self.fleet.verify.checks
@@ -79,11 +89,11 @@ class Judging:
                 FailedCheck("the day has too few frames to hold any out, so the result is not checked")
             )
         targets = DEFAULT_TARGETS if targets is None else targets
-        test, claims, probes = self._held_out(estimate, held_out, limits, mounting, targets)
+        test, claims, probes, elsewhere = self._held_out(estimate, held_out, limits, mounting, targets)
         verdict = judge(
             estimate,
             self.prior,
-            Evidence(test, claims, [*failed, *unseen]),
+            Evidence(test, claims, [*failed, *unseen, *elsewhere]),
             search_range(self.prior, self.fleet.solve),
             limits,
             triggered=active,
@@ -98,15 +108,15 @@ class Judging:
         limits: ChecksConfig,
         mounting: np.ndarray | None,
         targets: np.ndarray,
-    ) -> tuple[HeldOutTest | None, Mapping[str, Claim], dict[str, float]]:
-        """Held-out frames at the prior and at the result, the remaining claim, and known turns of the result."""
+    ) -> tuple[HeldOutTest | None, Mapping[str, Claim], dict[str, float], list[FailedCheck]]:
+        """Held-out frames at the prior and at the result, the remaining claim, known turns, and a better place."""
         pair, verify, prior = estimate.pair, self.fleet.verify, self.prior
         azimuth_deg, elevation_deg = (
             (verify.camera_lidar_limit_deg, verify.camera_lidar_limit_deg)
             if pair == "camera_lidar"
             else (verify.radar_limit_deg, verify.radar_elevation_limit_deg)
         )
-        test, update, probes = None, None, dict[str, float]()
+        test, update, probes, score = None, None, dict[str, float](), None
         if held_out:
             score = held_out_score(estimate, held_out, prior, self.fleet.solve)
             blocks = scene_blocks(held_out)
@@ -127,4 +137,10 @@ class Judging:
             mounting,
             targets,
         )
-        return test, claims, probes
+        place = self._place_by_held_out if pair == "camera_lidar" and score is not None else None
+        if score is None or place is None:
+            return test, claims, probes, []
+        elsewhere = found_elsewhere(
+            estimate, place, score.cost, claims, scene_blocks(held_out), targets, limits.worse_alignment_z
+        )
+        return test, claims, probes, elsewhere

@@ -13,6 +13,7 @@ from pipeline.extrinsics.prior import perturbed, read_prior
 from pipeline.geometry.targets import errors_at_targets
 from pipeline.store.partitions import Lake, Partition
 from schemas.calibrations import CalibrationRecord
+from schemas.observations import Observation
 from tests.benchmarks.studies.metrics import transform_of
 from tests.makers.simulated_days import perceived
 
@@ -24,15 +25,21 @@ SEED = 0
 
 
 @pytest.fixture(scope="module")
-def solved(real_logs, tmp_path_factory) -> tuple[Prior, dict[str, CalibrationRecord]]:
-    """The given calibration, and what `joint` made of the day, pair by pair.
-
-    Everything is ingested and perceived; every second frame is calibrated, which is half of the time.
-    """
+def rows(real_logs, tmp_path_factory) -> list[Observation]:
+    """All frames of the day, ingested and perceived."""
     folder = tmp_path_factory.mktemp("real")
     logs = sorted(real_logs.glob("astyx-1_*"))
-    rows = perceived(FLEET, Lake.at(folder / "lake"), DAY, logs, folder).observations
-    assert len(rows) == 187
+    found = perceived(FLEET, Lake.at(folder / "lake"), DAY, logs, folder).observations
+    assert len(found) == 187
+    return found
+
+
+@pytest.fixture(scope="module")
+def solved(rows) -> tuple[Prior, dict[str, CalibrationRecord]]:
+    """The given calibration, and what `joint` made of the day, pair by pair.
+
+    Every second frame is calibrated, which is half of the time.
+    """
     fleet = load_fleet(FLEET)
     given = read_prior(rows, fleet, DAY.vehicle)
     records = calibrate_observations(
@@ -78,3 +85,18 @@ def test_the_radars_elevation_has_witnesses_that_agree_and_a_sigma_of_half_a_deg
     assert record.loop_rotation_rad <= 3 * record.loop_rotation_sigma_rad
     assert errors["lidar_radar"][1] <= 0.6
     assert record.elevation_sigma_rad <= np.radians(0.5)
+
+
+def test_ten_frames_that_lead_to_a_wrong_place_are_contradicted_by_those_held_out(rows):
+    """From this start 5 deg off ten frames match best 1.4 deg beside the right place, and the radar rested on it."""
+    fleet = load_fleet(FLEET).changed(select={"frames": 10})
+    given = read_prior(rows, fleet, DAY.vehicle)
+    prior = perturbed(given, (5.0, 0.1), 22)
+    records = calibrate_observations(rows, prior, fleet, Inputs(DAY, "joint", "test", 22, ()))
+    for record in records:
+        T = transform_of(record)
+        if record.status == "accepted" and T is not None:
+            azimuth = errors_at_targets(record.pair, T, given.of(record.pair))[0]
+            assert np.degrees(azimuth) < (0.2 if record.pair == "camera_lidar" else 0.4), record.pair
+    reasons = {record.pair: record.reason for record in records}
+    assert "the held-out frames, which are more than those of the fit" in reasons["camera_lidar"]
