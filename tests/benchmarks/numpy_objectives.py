@@ -166,7 +166,7 @@ def paper_losses(rows, losses):
 
 
 def _points_of(folded):
-    return np.split(np.stack([folded.x_m, folded.y_m, folded.z_m], -1).astype(np.float64), folded.first[1:-1])
+    return np.split(folded.xyz_m.T.astype(np.float64), folded.first[1:-1])
 
 
 def _map_means(points, maps, cameras, penalty, T):

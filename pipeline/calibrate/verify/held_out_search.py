@@ -2,7 +2,8 @@
 
 Ten frames can match best in a wrong place, a degree or more from the right one. The other checks by held-out
 frames look near the result, and there they find a place as well. Where held-out frames are more than those of
-the fit, a search on them is more reliable than the result that they judge.
+the fit, a search on them is more reliable than the result that they judge. It shares labels, CameraInfo and
+prior with the fit: it shows a wrong place, and nothing of errors that all frames have.
 """
 
 from __future__ import annotations

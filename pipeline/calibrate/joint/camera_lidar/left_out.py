@@ -5,9 +5,10 @@ behind a hedge, the wheels below a sill. They are the same in all scenes, so nei
 halves of the day show them. They differ between sides of objects, near and far, and left and right in the
 image. If such a part is wrong, the solution without it is another one. A part that pulls nothing changes
 nothing, however far its edges are from their borders. A side without an opposite one has nobody to
-contradict it: a usual shift of its borders is added.
+contradict it: a usual shift of its borders is added. What moves all parts alike, such as a principal point,
+moves the solution with them and is not seen here.
 
-Source: jackknife over few clusters: MacKinnon, Nielsen, Webb 2023, https://doi.org/10.1002/jae.2931.
+Source: jackknife over few clusters: MacKinnon, Nielsen, Webb 2023, https://doi.org/10.1002/jae.2969.
 """
 
 from __future__ import annotations
@@ -36,8 +37,9 @@ _OPPOSITE: Final = {
 }
 _RANGES: Final = (1 / 3, 2 / 3)  # quantiles of range that divide a side into near, middle and far
 _FEWEST = 10  # edges of a part, and three times as many of a side: fewer pull nothing
-_OF_PREDICTED = 0.5  # of the Gauss-Newton curvature, the share that the score's own curvature has at least
-_REMAINS = 0.1  # of the data's curvature, the share that remains at least without a part
+# Shares that keep curvatures positive, assumed: of the Gauss-Newton curvature that the score's own has at least (as in
+# `refine`), and of the data's that remains at least without a part.
+_OF_PREDICTED, _REMAINS = 0.5, 0.1
 _DEFINITE = 1e-3  # of the prior, added where the data say nothing
 _SMALL_PX = 0.5  # shift for finite differences, within the kernel
 
