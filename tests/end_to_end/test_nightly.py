@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from contextlib import contextmanager
 from pathlib import Path
 
 import psutil
@@ -20,6 +21,7 @@ from pipeline.store.views import ingested, observations_of, perceived
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from tests.makers.fleet_files import fleet_toml
 from tests.makers.kept_days import kept_fleet
+from tests.makers.processes import descendants, started, works
 from tests.makers.ray_clusters import two_nodes
 
 BORESIGHT = f"{sys.prefix}/bin/boresight"
@@ -178,27 +180,27 @@ def test_damaged_tables_cost_the_fleet_nothing_and_the_next_night_heals_them(fle
     assert (summary["damaged"], summary["done"]) == ([], 0)
 
 
+@contextmanager
 def nightly_with_workers(fleet, lake):
     """A night in the background, and its workers once they are at work."""
     arguments = command(fleet, lake, "--workers", "2", "--to", DAYS[0])
-    process = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 60
-    while time.monotonic() < deadline:
-        children = psutil.Process(process.pid).children(recursive=True)
-        workers = [c for c in children if "spawn_main" in " ".join(c.cmdline())]
-        if len(workers) == 2 and any(Path(lake).rglob("*.parquet")):
-            return process, workers
-        time.sleep(0.02)
-    process.kill()
-    raise AssertionError("no workers came to work")
+    with started(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        deadline = time.monotonic() + 60
+        workers = []
+        while len(workers) != 2 or not any(Path(lake).rglob("*.parquet")):
+            assert time.monotonic() < deadline, "no workers came to work"
+            assert process.poll() is None, process.communicate()
+            time.sleep(0.02)
+            workers = [c for c in descendants(process) if works(c, "spawn_main")]
+        yield process, workers
 
 
 @pytest.mark.slow
 def test_a_killed_worker_costs_time_and_no_vehicle_day(fleet, tmp_path):
     lake = tmp_path / "lake"
-    process, workers = nightly_with_workers(fleet, lake)
-    workers[0].kill()
-    out, _ = process.communicate(timeout=300)
+    with nightly_with_workers(fleet, lake) as (process, workers):
+        workers[0].kill()
+        out, _ = process.communicate(timeout=300)
     summary = json.loads(out.splitlines()[-1])
     assert process.returncode == 3
     assert summary["failed"] == 0
@@ -218,16 +220,14 @@ def test_all_executors_record_the_same_though_a_worker_and_a_node_of_a_cluster_d
     fleet, first_night, tmp_path
 ):
     told = ("--metrics", f"{tmp_path}/night.prom", "--lineage", f"{tmp_path}/events.json")
-    with two_nodes() as (cluster, (node, _)):
-        process = subprocess.Popen(
-            command(fleet, tmp_path / "ray", "--executor", "ray", "--to", DAYS[0], *told),
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
+    night = command(fleet, tmp_path / "ray", "--executor", "ray", "--to", DAYS[0], *told)
+    with (
+        two_nodes() as (cluster, (node, _)),
+        started(night, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process,
+    ):
         on_node = psutil.Process(node.all_processes["raylet"][0].process.pid)
         deadline = time.monotonic() + 120
-        while not (tasks := [c for c in on_node.children() if "ray::_work" in " ".join(c.cmdline())]):
+        while not (tasks := [c for c in on_node.children() if works(c, "ray::_work")]):
             assert time.monotonic() < deadline
             assert process.poll() is None, process.communicate()
             time.sleep(0.02)
@@ -257,12 +257,12 @@ def test_all_executors_record_the_same_though_a_worker_and_a_node_of_a_cluster_d
 @pytest.mark.slow
 def test_sigterm_stops_the_night_cleanly_and_the_next_one_goes_on(fleet, tmp_path):
     lake = tmp_path / "lake"
-    process, workers = nightly_with_workers(fleet, lake)
-    process.send_signal(signal.SIGTERM)
-    out, _ = process.communicate(timeout=30)
-    assert process.returncode == 143
-    assert json.loads(out.splitlines()[-1])["status"] == "stopped"
-    assert psutil.wait_procs(workers, timeout=5)[1] == []
+    with nightly_with_workers(fleet, lake) as (process, workers):
+        process.send_signal(signal.SIGTERM)
+        out, _ = process.communicate(timeout=30)
+        assert process.returncode == 143
+        assert json.loads(out.splitlines()[-1])["status"] == "stopped"
+        assert psutil.wait_procs(workers, timeout=5)[1] == []
     assert not list(lake.rglob("*.tmp"))
     code, summary, _ = run(*command(fleet, lake, "--workers", "2", "--to", DAYS[0]))
     assert (code, summary["failed"]) == (3, 0)

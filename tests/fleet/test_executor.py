@@ -1,9 +1,9 @@
 import os
 import resource
 import signal
-import subprocess
 import sys
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
 import psutil
@@ -13,6 +13,7 @@ from pipeline.fleet import processes
 from pipeline.fleet.board import Board
 from pipeline.fleet.executor import EXECUTORS
 from pipeline.memory import MODEL_THREADS
+from tests.makers.processes import descendants, started, works
 from tests.makers.ray_clusters import ray_or_skip
 
 HERE = Path(__file__).resolve().parent
@@ -91,8 +92,7 @@ def test_a_killed_worker_costs_its_own_item_only_and_is_retried_within_bounds(be
     # Twice alone; before that once in company, unless a neighbour's death came before it had begun.
     assert 2 <= tries(tmp_path, "die-always") <= 3
     assert tries(tmp_path, "die-once") <= 3
-    children = psutil.Process().children(recursive=True)
-    assert not [c for c in children if "spawn_main" in " ".join(c.cmdline())]
+    assert not [c for c in psutil.Process().children(recursive=True) if works(c, "spawn_main")]
 
 
 SCRIPT = """
@@ -113,20 +113,22 @@ if __name__ == "__main__":
 """
 
 
-def started(name, tmp_path):
+@contextmanager
+def at_work(name, tmp_path):
+    """A program with two workers that sleep, and the processes below it."""
     if name == "ray":
         ray_or_skip()
     script = tmp_path / "main.py"
     script.write_text(SCRIPT.format(here=str(HERE), log=str(tmp_path), name=name))
     environment = {k: v for k, v in os.environ.items() if k != "RAY_ADDRESS"}
-    process = subprocess.Popen([sys.executable, str(script)], env=environment)
-    deadline = time.monotonic() + 120
-    while not all((tmp_path / f"sleep-{i}.tmp").exists() for i in (1, 2)):
-        assert time.monotonic() < deadline, "workers never began"
-        time.sleep(0.05)
-    children = psutil.Process(process.pid).children(recursive=True)
-    # Ray's agents take up to a minute to see that they are alone.
-    return process, [c for c in children if "Agent" not in c.name() + " ".join(c.cmdline())]
+    with started([sys.executable, str(script)], env=environment) as process:
+        deadline = time.monotonic() + 120
+        while not all((tmp_path / f"sleep-{i}.tmp").exists() for i in (1, 2)):
+            assert time.monotonic() < deadline, "workers never began"
+            assert process.poll() is None, "the program ended before its workers began"
+            time.sleep(0.05)
+        # Ray's agents take up to a minute to see that they are alone.
+        yield process, [c for c in descendants(process) if not works(c, "Agent")]
 
 
 def gone(processes, seconds):
@@ -136,16 +138,18 @@ def gone(processes, seconds):
 
 @pytest.mark.parametrize("name", ["process", "ray"])
 def test_sigterm_lets_workers_put_their_things_away_and_leaves_none_behind(name, tmp_path):
-    process, workers = started(name, tmp_path)
-    process.send_signal(signal.SIGTERM)
-    assert process.wait(30) == 143
-    assert gone(workers, 5)
+    with at_work(name, tmp_path) as (process, workers):
+        assert len(workers) >= 2
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(30) == 143
+        assert gone(workers, 5)
     assert not list(tmp_path.glob("*.tmp"))
 
 
 def test_workers_do_not_outlive_a_killed_parent(tmp_path):
-    process, workers = started("process", tmp_path)
-    process.kill()
-    process.wait()
-    assert gone(workers, 10)
+    with at_work("process", tmp_path) as (process, workers):
+        assert len(workers) >= 2
+        process.kill()
+        process.wait()
+        assert gone(workers, 10)
     assert not list(tmp_path.glob("*.tmp"))

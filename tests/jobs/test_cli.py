@@ -9,6 +9,7 @@ import pytest
 from jobs import cli
 from pipeline.errors import ConfigError, LogError, SolveError
 from tests.makers.fleet_files import fleet_toml
+from tests.makers.processes import started
 
 
 @pytest.fixture
@@ -165,15 +166,14 @@ sys.exit(cli.main(["export", "schemas", "--out", sys.argv[1]]))
 
 
 def test_sigterm_ends_a_command_with_143_and_nothing_half_written(tmp_path):
-    process = subprocess.Popen(
-        [sys.executable, "-c", SLEEPER, str(tmp_path)], stdout=subprocess.PIPE, text=True
-    )
-    deadline = time.monotonic() + 30
-    while not (tmp_path / "begun").exists():
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-    process.send_signal(signal.SIGTERM)
-    out, _ = process.communicate(timeout=20)
+    command = [sys.executable, "-c", SLEEPER, str(tmp_path)]
+    with started(command, stdout=subprocess.PIPE, text=True) as process:
+        deadline = time.monotonic() + 30
+        while not (tmp_path / "begun").exists():
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        process.send_signal(signal.SIGTERM)
+        out, _ = process.communicate(timeout=20)
     assert process.returncode == 143
     assert json.loads(out.splitlines()[-1])["status"] == "stopped"
     assert [p.name for p in tmp_path.iterdir()] == ["begun"]

@@ -12,6 +12,7 @@ import pytest
 
 from jobs.cli import main
 from tests.makers.fleet_files import fleet_toml
+from tests.makers.processes import started
 from tests.makers.written_logs import Kit
 
 DAY = "2023-11-14"  # of the written logs
@@ -92,14 +93,13 @@ def test_each_code_of_the_table_is_what_a_command_returns_with_the_status_it_lis
 @pytest.mark.parametrize("code", [130, 143])
 def test_a_stopped_command_ends_with_the_code_of_its_signal(code, tmp_path):
     options = ["--out", str(tmp_path / "fleet"), "--vehicles", "1", "--days", "9", "--frames", "300"]
-    process = subprocess.Popen(
-        [sys.executable, "-c", LISTENING, "simulate", *options], stdout=subprocess.PIPE, text=True
-    )
-    while not list(tmp_path.rglob("logs/*/*")):
-        assert process.poll() is None
-        time.sleep(0.1)
-    process.send_signal(signal.Signals(code - 128))
-    out, _ = process.communicate(timeout=60)
+    command = [sys.executable, "-c", LISTENING, "simulate", *options]
+    with started(command, stdout=subprocess.PIPE, text=True) as process:
+        while not list(tmp_path.rglob("logs/*/*")):
+            assert process.poll() is None
+            time.sleep(0.1)
+        process.send_signal(signal.Signals(code - 128))
+        out, _ = process.communicate(timeout=60)
     assert process.returncode == code
     assert json.loads(out.splitlines()[-1])["status"] in table()[code].split(", ")
 

@@ -8,6 +8,7 @@ import pytest
 
 from jobs.simulate import simulate
 from pipeline.errors import ConfigError
+from tests.makers.processes import started
 
 
 def test_the_job_ends_with_one_line_of_json_that_says_where_things_are(tmp_path, capsys):
@@ -54,16 +55,12 @@ def test_the_job_refuses_what_cannot_be_before_it_writes_anything(wrong, tmp_pat
 def test_a_simulation_in_several_processes_stops_at_once_and_leaves_no_half_log(tmp_path):
     command = [f"{sys.prefix}/bin/boresight", "simulate", "--out", tmp_path, "--vehicles", "2", "--days", "2"]
     command += ["--frames", "90", "--workers", "2"]
-    running = subprocess.Popen(list(map(str, command)), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
-    try:
+    quiet = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+    with started(list(map(str, command)), **quiet) as running:
         _wait_until(lambda: len(list(tmp_path.glob("logs/*/*/.partial-*"))) == 2, 120)
         began = time.monotonic()
         running.send_signal(signal.SIGTERM)
         stdout, _ = running.communicate(timeout=60)
-    except BaseException:
-        running.terminate()
-        running.communicate()
-        raise
     assert running.returncode == 128 + signal.SIGTERM
     assert json.loads(stdout.splitlines()[-1])["status"] == "stopped"
     assert time.monotonic() - began < 30  # two days take minutes

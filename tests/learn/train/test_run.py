@@ -29,6 +29,7 @@ from pipeline.store.partitions import Partition
 from pipeline.store.tables import write_partition
 from pipeline.store.views import frames_of
 from schemas.training import TRAINING
+from tests.makers.processes import started
 from tests.makers.simulated_days import simulated_day
 
 SMALL = {"width": 4, "hidden": 16, "batch_size": 2, "validate_every": 10, "validation_frames": 4}
@@ -139,12 +140,12 @@ def test_sigterm_ends_the_command_with_143_and_a_whole_checkpoint(data, tmp_path
     )
     command = [sys.executable, "-m", "jobs.cli", "train", "--data", data, "--out", str(tmp_path / "run")]
     command += ["--config", str(tmp_path / "train.toml"), "--device", "cpu", "--steps", "100000"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 120
-    while not read_metrics(tmp_path / "run") and time.monotonic() < deadline and process.poll() is None:
-        time.sleep(0.2)
-    process.terminate()
-    out, err = process.communicate(timeout=60)
+    with started(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        deadline = time.monotonic() + 120
+        while not read_metrics(tmp_path / "run") and time.monotonic() < deadline and process.poll() is None:
+            time.sleep(0.2)
+        process.terminate()
+        out, err = process.communicate(timeout=60)
     assert process.returncode == 143, err
     summary = json.loads(out.splitlines()[-1])
     assert summary["status"] == "stopped"
