@@ -3,7 +3,7 @@
 Paths are strings here for speed: a fleet's night checks a hundred thousand of them.
 """
 
-# ruff: noqa: PTH116, PTH118, PTH120, PTH207
+# ruff: noqa: PTH110, PTH116, PTH118, PTH120, PTH207
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def _owned(pattern: str) -> dict[str, _Owner]:
         if not match or not is_day(_day(match)):
             continue
         for log in listings.logs_at(path):
-            about, own = os.stat(log), (_day(match), match["vehicle"])
+            about, own = _about(log), (_day(match), match["vehicle"])
             if seen.setdefault((own, about.st_dev, about.st_ino), log) == log:
                 owner[log] = own
     return owner
@@ -176,7 +176,7 @@ class _Listings:
         return recorded if is_recording else set()
 
     def _listed(self, folder: str) -> tuple[dict[str, None], list[str]]:
-        """Regular files and folders, by name; both empty if it is not a readable folder."""
+        """Regular files, links to lost logs, and folders, by name; both empty if it is not a readable folder."""
         if folder not in self._of:
             try:
                 with os.scandir(folder or ".") as entries:
@@ -184,7 +184,7 @@ class _Listings:
             except OSError:
                 inside = []
             start = os.path.join(folder, "")
-            files = dict.fromkeys(start + e.name for e in inside if _is(e.is_file))
+            files = dict.fromkeys(start + e.name for e in inside if _is(e.is_file) or _is_lost_log(e))
             self._of[folder] = (files, [start + e.name for e in inside if _is(e.is_dir)])
         return self._of[folder]
 
@@ -195,3 +195,16 @@ def _is(kind: Callable[[], bool]) -> bool:
         return kind()
     except OSError:
         return False
+
+
+def _is_lost_log(entry: os.DirEntry[str]) -> bool:
+    """Whether it is a link named like a log whose target is not there: a log that `ingest` reports as unreadable."""
+    return entry.name.endswith(_SUFFIXES) and entry.is_symlink() and not os.path.exists(entry.path)
+
+
+def _about(log: str) -> os.stat_result:
+    """What a log is on the disk, or what its link is where that leads nowhere."""
+    try:
+        return os.stat(log)
+    except OSError:
+        return os.lstat(log)

@@ -15,7 +15,7 @@ from pipeline.errors import ConfigError
 from pipeline.extrinsics.prior_file import read_star
 from pipeline.ingest.alignment import day_alignments
 from pipeline.ingest.captures import Rejected
-from pipeline.ingest.containers.reader import content_identity
+from pipeline.ingest.containers.reader import content_identity, leads_nowhere
 from pipeline.ingest.index import DayIndex, index_logs
 from pipeline.ingest.moments import Anchored, MomentBuilder
 from pipeline.ingest.repetition import REPEATED
@@ -75,9 +75,10 @@ def work(task: Task) -> Work:
 
     Raises:
         ConfigError: unknown vehicle, a log that does not exist, an unusable prior file.
+        LogError: a log that cannot be read, or a link whose target is not there.
     """
     rig = task.fleet.rig_of(task.partition.vehicle)
-    missing = [str(p) for p in task.logs if not p.exists()]
+    missing = [str(p) for p in task.logs if not p.exists() and not leads_nowhere(p)]
     if missing:
         raise ConfigError("command line", "LOG", f"no such file: {', '.join(missing)}")
     file_prior = read_file_prior(rig, task.fleet)

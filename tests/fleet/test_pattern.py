@@ -136,6 +136,19 @@ def test_links_that_lead_round_in_a_circle_show_a_log_once_and_pipes_are_no_logs
     assert found("{vehicle}/{day}/**/*.mcap", tmp_path) == {("car", "2026-03-02"): ["car/2026-03-02/a.mcap"]}
 
 
+@pytest.mark.parametrize("pattern", ["{vehicle}/{day}/*.mcap", "{vehicle}/{day}", "{vehicle}/{day}/**"])
+def test_a_link_to_a_lost_log_is_a_log_that_its_day_has_to_answer_for(pattern, tmp_path):
+    touch(tmp_path / "car/2026-03-02/a.mcap")
+    (tmp_path / "bus/2026-03-02").mkdir(parents=True)
+    (tmp_path / "car/2026-03-02/b.mcap").symlink_to(tmp_path / "unmounted/b.mcap")
+    (tmp_path / "bus/2026-03-02/a.mcap").symlink_to("a.mcap")  # to itself
+    (tmp_path / "bus/2026-03-02/notes").symlink_to(tmp_path / "unmounted/notes")
+    assert found(pattern, tmp_path) == {
+        ("bus", "2026-03-02"): ["bus/2026-03-02/a.mcap"],
+        ("car", "2026-03-02"): ["car/2026-03-02/a.mcap", "car/2026-03-02/b.mcap"],
+    }
+
+
 def test_a_log_that_is_linked_into_two_places_is_a_log_of_both(tmp_path):
     touch(tmp_path / "car/2026-03-02/a.mcap")
     for place in ("bus/2026-03-02", "car/2026-03-03"):

@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from pipeline.errors import ConfigError
+from pipeline.errors import ConfigError, LogError
 from pipeline.ingest.containers.mcap import McapLog
 from pipeline.ingest.sync import Rejection, none_near
 from pipeline.store.partitions import Lake, Partition
@@ -21,6 +21,12 @@ def test_a_missing_file_or_unknown_vehicle_is_a_mistake_of_the_caller(kit, tmp_p
         run_ingest(tmp_path / "none.mcap")
     with pytest.raises(ConfigError, match="unknown vehicle"):
         run_ingest(tmp_path, fleet=kit.fleet(vehicles={"other": {}}))
+
+
+def test_a_link_to_a_lost_log_is_named_with_where_it_leads(tmp_path, run_ingest):
+    (tmp_path / "a.mcap").symlink_to("/unmounted/a.mcap")
+    with pytest.raises(LogError, match=r"a\.mcap.* is a link to /unmounted/a\.mcap, which is not there"):
+        run_ingest(tmp_path / "a.mcap")
 
 
 @pytest.mark.parametrize("name", ["a.mcap", "a.bag", "a.db3", "a.txt", "folder"])

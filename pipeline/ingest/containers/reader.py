@@ -29,6 +29,7 @@ __all__ = [
     "Position",
     "RawMessage",
     "content_identity",
+    "leads_nowhere",
     "open_log",
 ]
 
@@ -143,6 +144,8 @@ def content_identity(path: LogPath) -> str:
     """
     if isinstance(path, RemoteLog):
         return path.identity
+    if leads_nowhere(path):
+        raise LogError(str(path), f"is a link to {path.readlink()}, which is not there")
     if path.exists() and not (path.is_dir() or path.is_file()):
         raise LogError(str(path), "is neither a file nor a folder")
     digest = hashlib.sha256(path.name.encode())
@@ -158,6 +161,11 @@ def content_identity(path: LogPath) -> str:
     except OSError as err:
         raise LogError(str(path), f"cannot be read: {err}") from err
     return f"{path.name}:{digest.hexdigest()[:24]}"
+
+
+def leads_nowhere(path: LogPath) -> bool:
+    """Whether a log is a link whose target is not there, as when a disk is not mounted."""
+    return isinstance(path, Path) and path.is_symlink() and not path.exists()
 
 
 class ChunkCache:
