@@ -91,18 +91,32 @@ def test_far_edges_beside_their_borders_make_yaw_unsure_if_they_pull(terms, kern
     assert yaw_deg(moved_without_parts(far_left_aside(terms, 30.0), kernel)) < 1.5 * good
 
 
-def test_a_solution_without_a_side_is_where_it_was_said_to_be(terms, kernel):
-    terms = far_left_aside(terms, 0.5)
-    without = chosen(terms, terms.edges.side != EDGE_LEFT)
+def said_and_moved_rad(seed):
+    """Changes of yaw or pitch without each side, as said and as solved again, of a day with borders aside."""
+    day = traced_day(DENSE, 16, seed=seed)
+    terms = prepare_terms(day, T_TRUE, np.zeros((len(day), 3)), reach_rad=0.03)
+    kernel = terms.fitted(STATE.alone, KernelSettings.wide(1.5, 2), np.random.default_rng(0))
+    terms = far_left_aside(terms, 1.0)
     prior = Prior(T_TRUE, T_TRUE, float(np.sqrt(VARIANCE[0])), float(np.sqrt(VARIANCE[3])))
-    solved = refine(Scored(terms, kernel, prior, SolveConfig()), STATE, steps=20, fixed=NOT_SOLVED)
-    again = refine(Scored(without, kernel, prior, SolveConfig()), solved, steps=20, fixed=NOT_SOLVED)
-    seen = left_out(terms, solved, kernel, curvature_of(terms, kernel), VARIANCE, NOT_SOLVED)
-    sides = np.unique(terms.edges.side)
-    said_rad = seen[list(sides).index(EDGE_LEFT), 1] / np.sqrt(1 - 1 / len(sides))
-    moved_rad = change_between(solved.T_camera_lidar, again.T_camera_lidar)[1]
-    assert np.degrees(moved_rad) > 0.02  # of .17 deg that half a pixel is
-    assert said_rad == pytest.approx(moved_rad, rel=0.33)
+
+    def solved(terms, start):
+        return refine(Scored(terms, kernel, prior, SolveConfig()), start, steps=20, fixed=NOT_SOLVED)
+
+    whole, sides = solved(terms, STATE), np.unique(terms.edges.side)
+    seen = left_out(terms, whole, kernel, curvature_of(terms, kernel), VARIANCE, NOT_SOLVED)
+    for k, side in enumerate(sides):
+        axis = 1 if side in (EDGE_LEFT, EDGE_RIGHT) else 0
+        without = solved(chosen(terms, terms.edges.side != side), whole)
+        moved = change_between(whole.T_camera_lidar, without.T_camera_lidar)[axis]
+        yield seen[k, axis] / np.sqrt(1 - 1 / len(sides)), moved
+
+
+def test_solutions_without_a_side_are_where_they_were_said_to_be():
+    # Each by itself is rough by half: the score is. Over three days they agree.
+    said, moved = np.array([pair for seed in (1, 2, 3) for pair in said_and_moved_rad(seed)]).T
+    assert np.degrees(np.linalg.norm(moved)) > 0.05
+    assert said @ moved > 0.5 * np.linalg.norm(said) * np.linalg.norm(moved)
+    assert 0.5 < np.linalg.norm(said) / np.linalg.norm(moved) < 1.5
 
 
 def test_a_side_without_an_opposite_one_is_unsure_by_a_usual_shift_of_its_borders(terms, kernel):
