@@ -12,7 +12,7 @@ from pipeline.calibrate.joint.camera_lidar.estimate import (
 )
 from pipeline.calibrate.joint.camera_lidar.observability import time_offset_variance
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState
-from pipeline.calibrate.joint.camera_lidar.time_offset import TimeOffsetProfile, s_per_metre
+from pipeline.calibrate.joint.camera_lidar.time_offset import TimeOffsetProfile
 from pipeline.calibrate.numerics.search_range import search_range
 from pipeline.config import SolveConfig
 from pipeline.errors import SolveError
@@ -172,17 +172,23 @@ def test_what_the_day_cannot_determine_stays_at_the_prior_with_its_sigma_and_the
         assert abs(e.time_offset_s - 0.03) < 3 * e.time_offset_sigma_s
 
 
-def test_the_less_is_known_along_the_axis_the_less_is_known_of_the_time_offset():
-    # A car that stands dt later looks as if it stood further on.
+@pytest.mark.parametrize("walking_mps", [None, 1.0])
+def test_the_less_is_known_along_the_axis_the_less_is_known_of_the_time_offset(walking_mps):
+    # A car that stands dt later looks as if it stood further on: in a jam by a second per metre.
     day = traced_day(SPARSE, 6, seed=3)
+    if walking_mps is not None:
+        day = [replace(o, ego_speed_mps=walking_mps) for o in day]  # images are taken with their sweeps
     begun = align_camera_lidar(day, prior_off_by(1.0, 0.03, 2), SolveConfig(), np.random.default_rng(5))
     timed = TimeOffsetProfile(begun.state, 1e-6, 0.0)
-    little, much = (
-        time_offset_variance(replace(begun.problem, tz_variance=m**2), begun.state, begun.kernel, timed)
-        for m in (0.02, 0.1)
-    )
-    share = s_per_metre(begun.problem.terms, begun.state) * 0.1
-    assert 0.5 * share**2 < much - little < share**2
+    expected_s = begun.problem.config.time_offset_sigma_s
+
+    def day_variance(tz_sigma_m):
+        problem = replace(begun.problem, tz_variance=tz_sigma_m**2)
+        return 1 / (1 / time_offset_variance(problem, begun.state, begun.kernel, timed) - 1 / expected_s**2)
+
+    forward_mps = begun.problem.terms.velocity_lidar @ begun.state.T_camera_lidar[2, :3]
+    share_s = float(forward_mps.sum() / np.sum(forward_mps**2)) * 0.1
+    assert 0.5 * share_s**2 < day_variance(0.1) - day_variance(0.02) < 1.5 * share_s**2
 
 
 def test_what_the_day_knows_better_than_the_prior_is_left_to_the_day():

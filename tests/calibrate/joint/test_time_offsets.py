@@ -1,14 +1,20 @@
 """The radar's time offset: dips of the registration's cost beside slopes that have nothing to do with time."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from pipeline.calibrate.joint.lidar_radar import time_offset
 from pipeline.calibrate.joint.lidar_radar.elevation_spread import ElevationSpread
+from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
 from pipeline.calibrate.joint.lidar_radar.problem import RadarProblem, RadarState
 from pipeline.calibrate.joint.lidar_radar.schedule import SCHEDULE
 from pipeline.calibrate.joint.lidar_radar.time_offset import dips
+from pipeline.config import SolveConfig
 from pipeline.extrinsics.estimates import Prior
+from pipeline.geometry.se3 import inverse, transform_points
+from pipeline.geometry.spherical import from_spherical, to_spherical
 from pipeline.objective.radar.moving_clusters import moving_clusters
 from pipeline.objective.radar.registration import registration_frames
 from tests.makers.radar_scenes import DT_S, SIGMA, T_LIDAR_RADAR, street_day
@@ -35,7 +41,11 @@ def test_a_dip_is_deepest_where_it_is_however_steep_the_slope(slope):
 @pytest.fixture(scope="module")
 def problem():
     """Sixteen frames of streets, at the true pose."""
-    rows, rng = street_day(16, seed=5), np.random.default_rng(0)
+    return problem_of(street_day(16, seed=5))
+
+
+def problem_of(rows):
+    rng = np.random.default_rng(0)
     return RadarProblem(
         rows,
         registration_frames(rows, T_LIDAR_RADAR, rng),
@@ -67,3 +77,41 @@ def test_the_radars_own_sigmas_bring_back_an_offset_that_wider_ones_do_not_see(p
     assert found is not None
     assert abs(found.dt_s - DT_S) < 0.012  # half a step of 0.2 m
     assert time_offset.better_time_offset(problem, right) is None
+
+
+def tunnel_day(frames, seed=3):
+    """Frames of two plain walls, of which lidar and radar see other places every time."""
+    rng = np.random.default_rng(seed)
+
+    def walls(count, *ends):
+        x, y = rng.uniform(*ends, count), rng.choice([-5.0, 5.0], count)
+        return np.stack([x, y, rng.uniform(-1.7, 2.3, count)], -1)
+
+    nothing = np.full(220, -1, np.int32), np.zeros(220, np.uint8), np.zeros(220, np.float32)
+    radar = dict(zip(("radar_cluster", "radar_motion", "radar_residual_mps"), nothing, strict=True))
+    for o in street_day(frames, seed=5):
+        cloud, seen = walls(9000, -10, 80), transform_points(inverse(T_LIDAR_RADAR), walls(220, 3, 60))
+        noisy = from_spherical(to_spherical(seen) + rng.normal(size=seen.shape) * SIGMA)
+        yield replace(
+            o,
+            **radar,
+            lidar_map_xyz_m=cloud.astype(np.float32),
+            lidar_map_is_ground=np.zeros(len(cloud), np.uint8),
+            lidar_map_cluster=np.full(len(cloud), -1, np.int32),
+            radar_xyz_m=noisy.astype(np.float32),
+        )
+
+
+def test_a_time_offset_that_blocks_of_frames_find_anywhere_is_unsure_and_one_they_agree_on_is_not(problem):
+    def scatter_s(problem):
+        block = np.arange(problem.frames.count) // 2
+        return time_offset.time_offset_scatter_s(problem, state_at(DT_S), block, np.random.default_rng(0))
+
+    assert scatter_s(problem) < 0.012  # half a step of 0.2 m
+    assert scatter_s(problem_of(list(tunnel_day(16)))) > 0.03
+
+
+def test_in_a_tunnel_the_time_offset_is_wrong_within_its_sigma():
+    prior = Prior(T_CAMERA_LIDAR, T_LIDAR_RADAR, np.radians(2), 0.05)
+    e = estimate_lidar_radar(list(tunnel_day(24, seed=5)), prior, SolveConfig(), np.random.default_rng(0))
+    assert 0.02 < abs(e.time_offset_s) < 3 * e.time_offset_sigma_s  # it had been 46 ms at a sigma of 6

@@ -42,7 +42,7 @@ from pipeline.calibrate.joint.camera_lidar.refine import (
     weighted,
 )
 from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
-from pipeline.calibrate.joint.camera_lidar.time_offset import FOCAL, far_time_offset, s_per_metre
+from pipeline.calibrate.joint.camera_lidar.time_offset import DT, FOCAL, far_time_offset, s_per_metre
 from pipeline.calibrate.joint.camera_lidar.witnesses import (
     Witness,
     ask_witnesses,
@@ -223,6 +223,7 @@ def analyse_camera_lidar(
             f"left_out_{name}_deg": float(np.degrees(np.linalg.norm(analysis.left_out[:, axis])))
             for axis, name in enumerate(("pitch", "yaw"))
         },
+        "left_out_dt_s": float(np.linalg.norm(analysis.left_out_in_time[:, DT])),
         "along_paint_deg": float(np.degrees(np.linalg.norm(analysis.along_paint[:3]))),
     }
     diagnostics |= {"own_dt_s": aligned.expected_dt_s + own_dt_s, "own_dt_z": z}

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 from pipeline.calibrate.joint.camera_lidar.along_paint import along_paint
 from pipeline.calibrate.joint.camera_lidar.heading_bias import MotionSigmas, motion_biases
 from pipeline.calibrate.joint.camera_lidar.left_out import left_out
+from pipeline.calibrate.joint.camera_lidar.left_out_in_time import left_out_in_time
 from pipeline.calibrate.joint.camera_lidar.optical_axis import TZ, TzProfile, profile_tz, with_tz
 from pipeline.calibrate.joint.camera_lidar.refine import (
     AlignmentState,
@@ -30,7 +31,6 @@ from pipeline.calibrate.joint.camera_lidar.time_offset import (
     FOCAL,
     TimeOffsetProfile,
     profile_time_offset,
-    s_per_metre,
 )
 from pipeline.calibrate.numerics.bias_floors import CAMERA_LIDAR_BIAS, CAMERA_LIDAR_DT_FLOOR_S, FOCAL_SIGMA
 from pipeline.calibrate.numerics.covariance import OBSERVABLE, covariance_with_fixed, response
@@ -95,6 +95,7 @@ class ObservabilityAnalysis:
     profile: TzProfile
     left_out: np.ndarray  # K 8, how far the solution moves without a side of edges or a part of one
     along_paint: np.ndarray  # 8, how far gradients along lines draw it
+    left_out_in_time: np.ndarray  # K 8, how far it moves with the time offset of either half of the image
 
 
 def analyse_observability(
@@ -130,11 +131,14 @@ def analyse_observability(
     along = CAMERA_LIDAR_DT_FLOOR_S * along_the_way(
         analysis.state.T_camera_lidar, problem.terms.velocity_lidar, analysis.fixed
     )
+    in_time = left_out_in_time(timed, analysis.fixed)
+    biases = np.vstack([along, np.where(_IS_DT, 0.0, in_time)])
     for covariance in (analysis.covariance, analysis.common, analysis.floors):
-        covariance[:] += np.outer(along, along)
+        covariance[:] += biases.T @ biases
+    timed = replace(timed, variance_s2=timed.variance_s2 + float(np.sum(in_time[:, DT] ** 2)))
     analysis.covariance[DT, DT] = time_offset_variance(problem, analysis.state, analysis.kernel, timed)
     analysis.observability[TZ] = max(tz_observability, 0.0)
-    return analysis
+    return replace(analysis, left_out_in_time=in_time)
 
 
 def along_the_way(
@@ -200,6 +204,7 @@ def _fix_unobservable(
         profile,
         moved,
         drawn[0],
+        np.zeros((0, 8)),
     )
 
 
@@ -211,11 +216,11 @@ def _timed(
     ends = replace(state, dt_s=0.0, focal=1.0).changed(np.outer([-reach_s, reach_s], _IS_DT))
     terms = problem.terms.seen_throughout(ends).at_most(SCHEDULE.time_offset_points, rng)
     some = replace(problem.scored(kernel), terms=terms)
-    found = profile_time_offset(some, state, IS_TZ)
+    found = profile_time_offset(some, state, IS_TZ, problem.scenes.block)
     # The alignment saw all edges: where they drew it further than a profile reaches back, it begins anew.
     if max(abs(state.dt_s), abs(found.state.dt_s)) <= SCHEDULE.time_offset_reach_s:
         return found
-    anew = profile_time_offset(some, replace(state, dt_s=0.0), IS_TZ)
+    anew = profile_time_offset(some, replace(state, dt_s=0.0), IS_TZ, problem.scenes.block)
     return anew if anew.score > found.score else found
 
 
@@ -223,8 +228,9 @@ def time_offset_variance(
     problem: CameraLidarProblem, state: AlignmentState, kernel: KernelSettings, timed: TimeOffsetProfile
 ) -> float:
     """Variance of the profile, its floor, and the uncertainty due to tz and focal length [s2]; at most the prior's."""
-    of_tz = s_per_metre(problem.terms, state) ** 2 * problem.tz_variance
-    of_focal = response(_curvature(problem, state, kernel), _IS_FOCAL, IS_TZ)[DT, 0] * FOCAL_SIGMA
+    curvature = _curvature(problem, state, kernel)
+    of_tz = response(curvature, IS_TZ, _IS_FOCAL)[DT, 0] ** 2 * problem.tz_variance
+    of_focal = response(curvature, _IS_FOCAL, IS_TZ)[DT, 0] * FOCAL_SIGMA
     day_variance = timed.variance_s2 + CAMERA_LIDAR_DT_FLOOR_S**2 + of_tz + of_focal**2
     return 1 / (1 / day_variance + 1 / problem.config.time_offset_sigma_s**2)
 

@@ -15,10 +15,10 @@ Sources: profile likelihood: Murphy & van der Vaart 2000; parameters considered,
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import median_filter
 
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, Scored, prior_value, refine, scales
@@ -26,7 +26,17 @@ from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
 from pipeline.calibrate.numerics.response_surface import DESIGN
 from pipeline.objective.camera_lidar.score import Alignments, KernelSettings, Terms
 
-__all__ = ["DT", "FOCAL", "TimeOffsetProfile", "far_time_offset", "profile_time_offset", "s_per_metre"]
+__all__ = [
+    "DT",
+    "FOCAL",
+    "TimeOffsetProfile",
+    "compared_terms",
+    "far_time_offset",
+    "frame_scores",
+    "maximum",
+    "profile_time_offset",
+    "s_per_metre",
+]
 
 DT, FOCAL = 6, 7  # of the eight unknowns
 _SLOW_MPS = 2.0  # below such speeds a shift along the axis is not made up for by the time offset
@@ -37,11 +47,14 @@ _DT_AND_FOCAL = np.isin(np.arange(8), (DT, FOCAL))
 
 @dataclass(frozen=True, eq=False)
 class TimeOffsetProfile:
-    """The best state of the profile, the variance of its time offset over resampled frames, and its score."""
+    """The best state of the profile, the variance of its time offset over resampled blocks, and its score."""
 
     state: AlignmentState
     variance_s2: float
     score: float
+    ends: tuple[AlignmentState, ...] = ()  # the solved states, in order of their time offsets
+    values: np.ndarray = field(default_factory=lambda: np.zeros(0))  # score of each of them
+    scored: Scored | None = None  # by what they were solved
 
 
 def s_per_metre(terms: Terms, state: AlignmentState) -> float:
@@ -51,11 +64,12 @@ def s_per_metre(terms: Terms, state: AlignmentState) -> float:
 
 
 def profile_time_offset(
-    scored: Scored, state: AlignmentState, fixed: Bool[np.ndarray, " 8"]
+    scored: Scored, state: AlignmentState, fixed: Bool[np.ndarray, " 8"], block: Int[np.ndarray, " F"]
 ) -> TimeOffsetProfile:
     """Step the time offset to both sides of a solution while the score rises; solve the pose at each step.
 
     `fixed` are unknowns of the pose besides time offset and focal length; the focal length is the log's.
+    `block` tells which frames have common errors.
     """
     speed_mps = float(np.sqrt(np.mean(np.sum(scored.terms.velocity_lidar**2, axis=1))))
     step_s = min(SCHEDULE.time_offset_step_m / max(speed_mps, 1.0), SCHEDULE.time_offset_max_step_s)
@@ -63,14 +77,19 @@ def profile_time_offset(
     steps = np.array(sorted(ends))
     score = np.column_stack([ends[k][1] for k in steps])
     k = int(np.argmax(score.sum(0)))
-    top = _maximum(score.sum(0)[None])[0]
+    values = score.sum(0)
+    top = maximum(values[None])[0]
     # Another sample of streets might have another of the valley's maxima.
+    blocks = int(block.max()) + 1
+    by_block = np.zeros((blocks, len(values)))
+    np.add.at(by_block, block, score)
     drawn = np.random.default_rng(0).multinomial(
-        len(score), np.full(len(score), 1 / len(score)), size=SCHEDULE.time_offset_resamples
+        blocks, np.full(blocks, 1 / blocks), size=SCHEDULE.time_offset_resamples
     )
-    spread = float(np.mean((_maximum(drawn @ score) - top) ** 2))
+    spread = float(np.mean((maximum(drawn @ by_block) - top) ** 2)) * blocks / max(blocks - 1, 1)
     best = replace(ends[int(steps[k])][0], dt_s=ends[0][0].dt_s + (top + steps[0]) * step_s)
-    return TimeOffsetProfile(best, spread * step_s**2, float(score[:, k].sum()))
+    states = tuple(ends[k][0] for k in steps.tolist())
+    return TimeOffsetProfile(best, spread * step_s**2, float(values[k]), states, values, scored)
 
 
 def _ends(
@@ -78,7 +97,7 @@ def _ends(
 ) -> dict[int, tuple[AlignmentState, np.ndarray]]:
     """The solved state and each frame's score at time offsets on a grid, by number of steps from the start."""
     start = refine(scored, replace(state, focal=1.0), steps=SCHEDULE.profile_start_steps, fixed=fixed)
-    ends = {0: (start, _frame_scores(scored, start))}
+    ends = {0: (start, frame_scores(scored, start))}
     reach_s = SCHEDULE.time_offset_reach_s
     for sign in (1, -1):
         here = start
@@ -89,7 +108,7 @@ def _ends(
                 break
             moved = replace(here, dt_s=start.dt_s + sign * k * step_s)
             here = refine(scored, moved, steps=SCHEDULE.profile_steps, fixed=fixed)
-            ends[sign * k] = here, _frame_scores(scored, here)
+            ends[sign * k] = here, frame_scores(scored, here)
     return ends
 
 
@@ -116,7 +135,7 @@ def far_time_offset(
     return float(offsets[best]), float(more.mean() / (max(float(more.std()), 1e-12) / np.sqrt(len(more))))
 
 
-def _maximum(value: Float[np.ndarray, "S N"]) -> Float[np.ndarray, " S"]:
+def maximum(value: Float[np.ndarray, "S N"]) -> Float[np.ndarray, " S"]:
     """Maximum of each row, in steps: the top of the parabola through the highest value and its neighbours."""
     k = np.argmax(value, axis=1)
     inner = np.clip(k, 1, value.shape[1] - 2)
@@ -125,17 +144,25 @@ def _maximum(value: Float[np.ndarray, "S N"]) -> Float[np.ndarray, " S"]:
     return np.where(inner == k, k + 0.5 * (after - before) / curvature, k)
 
 
-def _frame_scores(scored: Scored, state: AlignmentState) -> Float[np.ndarray, " F"]:
-    """Score of each frame, averaged over a ball because it is rough, and its share of the prior.
+def compared_terms(scored: Scored) -> Terms:
+    """What the time offset is told by: narrow edges; where there are none, wide ones; else markings.
 
-    Only edges are used, if there are any. Markings run along the direction of travel and hardly determine the
-    time: only their number in view depends on it. This slope moved three days of 16 rings 30 to 60 ms off,
-    while edges were 1 to 12 ms off (tuning days 110 to 121: RMS 23 ms by both, 4.3 by edges). Wide edges are
-    left out too, if there are others.
+    Markings run along the direction of travel and hardly determine the time: only their number in view
+    depends on it. This slope moved three days of 16 rings 30 to 60 ms off, while edges were 1 to 12 ms off
+    (tuning days 110 to 121: RMS 23 ms by both, 4.3 by edges).
     """
     terms = scored.terms
-    if len(terms.edges.xyz_m) and scored.kernel.edge_weight > 0:
-        scored = replace(scored, terms=terms.narrow if len(terms.narrow.edges.xyz_m) else terms.wide)
-    ball = DESIGN * np.where(_DT_AND_FOCAL, 0.0, scales(scored.terms, scored.kernel))
-    score = scored.terms.score(state.changed(ball), scored.kernel).mean(0)
-    return score + float(prior_value(state.alone, scored.prior, scored.config)[0]) / len(score)
+    if not len(terms.edges.xyz_m) or scored.kernel.edge_weight <= 0:
+        return terms
+    return terms.narrow if len(terms.narrow.edges.xyz_m) else terms.wide
+
+
+def frame_scores(
+    scored: Scored, state: AlignmentState, *, with_prior: bool = True
+) -> Float[np.ndarray, " F"]:
+    """Score of each frame, averaged over a ball because it is rough, and its share of the prior."""
+    terms = compared_terms(scored)
+    ball = DESIGN * np.where(_DT_AND_FOCAL, 0.0, scales(terms, scored.kernel))
+    score = terms.score(state.changed(ball), scored.kernel).mean(0)
+    prior = float(prior_value(state.alone, scored.prior, scored.config)[0]) if with_prior else 0.0
+    return score + prior / len(score)

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Int
 
 from pipeline.calibrate.joint.lidar_radar.conclusions import diagnostics_of, notes_of
 from pipeline.calibrate.joint.lidar_radar.elevation_spread import beam_spacing, elevation_spread
@@ -32,6 +33,7 @@ from pipeline.calibrate.joint.lidar_radar.time_offset import (
     better_time_offset,
     comparison_cost,
     far_time_offset,
+    time_offset_scatter_s,
 )
 from pipeline.calibrate.joint.lidar_radar.witnesses import Witness, contradiction, doubted
 from pipeline.calibrate.numerics.change_point import parts_of_day, with_parts
@@ -95,6 +97,8 @@ def estimate_lidar_radar(
     if other is not None:
         analysis = analyse_observability(problem, other, config, rng)
     analysis = _with_witnesses(analysis, witnesses, without_way)
+    block = blocks_of(problem.observations, config.bootstrap_blocks)
+    analysis = _with_other_dips(problem, analysis, block[problem.frames.frame])
     parts = [problem.of_frames(np.arange(k, count, 2)) for k in (0, 1)]
     halves = [finish(part, analysis.state, analysis.fixed)[0] for part in parts]
     rival = _second_best(ends, costs)
@@ -103,7 +107,6 @@ def estimate_lidar_radar(
         rival = finish(problem, rival.with_fixed(problem.prior, analysis.fixed), analysis.fixed)[0]
     compared = [analysis.state, analysis.state if rival is best else rival]
     found = _conclude(problem, analysis, compared, halves, rejected)
-    block = blocks_of(problem.observations, config.bootstrap_blocks)
     own = own_position(problem, analysis.state, analysis.fixed, block)
     own |= far_time_offset(problem, analysis.state)
     found = with_parts(found, _parts(problem, analysis, config, rng))
@@ -227,6 +230,18 @@ def _with_witnesses(
         wider[:2, :2] += (disagreement.factor - 1) * np.outer(axes[:, 1], axes[:, 1])
         covariance, common = (wider @ part @ wider for part in (covariance, common))
     return replace(analysis, witnesses=witnesses, covariance=covariance, common=common)
+
+
+def _with_other_dips(
+    problem: RadarProblem, analysis: ObservabilityAnalysis, block: Int[np.ndarray, " F"]
+) -> ObservabilityAnalysis:
+    """The analysis with the time offset as unsure as blocks of frames are about its dip."""
+    if analysis.fixed[DT]:
+        return analysis
+    scatter_s = time_offset_scatter_s(problem, analysis.state, block, np.random.default_rng(0))
+    covariance = analysis.covariance.copy()
+    covariance[DT, DT] += scatter_s**2
+    return replace(analysis, covariance=covariance)
 
 
 def _consistent_with_odometry(observations: Sequence[Observation]) -> list[Observation]:
