@@ -109,6 +109,14 @@ def clocks(lines: Lines, row: Row) -> str:
     return f"{rate(hits, len(off))}, RMS {1e3 * np.sqrt(np.mean(off**2)):.1f} ms"
 
 
+def clock_sigmas(lines: Lines, row: Row) -> str:
+    """Time offsets of `pairs` within three of their sigmas, and their RMS error in sigmas."""
+    records = [r["pairs"].get(pair, {}) for r in lines for pair in row["pairs"]]
+    known = [p for p in records if p.get("dt_s") is not None]
+    z = np.array([(p["dt_s"] - p["dt_true_s"]) / p["dt_sigma_s"] for p in known])
+    return f"{rate(int(np.sum(np.abs(z) <= 3)), len(z))}, RMS {np.sqrt(np.mean(z**2)):.2f} sigma"
+
+
 def verified(lines: Lines, row: Row) -> str:
     """Answers of `boresight verify` that are `answer`."""
     hits = [answer_of_log(dict(r)) == row["answer"] for r in lines]
@@ -240,8 +248,8 @@ def last(lines: Lines, row: Row) -> str:
 MEASURES: dict[str, Callable[[Lines, Row], str]] = {
     f.__name__: f
     for f in (
-        accepted_days, by_noise, clocks, efficiency, errors, faulty, found, given_inside, inside, knocked, last,
-        mounting, named, power, rig_base, rig_knocks, rig_wrong, shown, starts, stopped_good, total,
+        accepted_days, by_noise, clock_sigmas, clocks, efficiency, errors, faulty, found, given_inside, inside,
+        knocked, last, mounting, named, power, rig_base, rig_knocks, rig_wrong, shown, starts, stopped_good, total,
         value, verified, wrong_days,
     )
 }  # fmt: skip
