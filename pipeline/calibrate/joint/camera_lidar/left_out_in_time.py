@@ -5,7 +5,7 @@ Oncoming cars draw the time offset one way, cars ahead the other, by up to the t
 a tunnel most edges lie on them: the time offset was 100 ms off at a sigma of 9, azimuth .2 deg. Rails and walls
 match anywhere along them and draw it too. All frames share this, so resampled frames do not show it. But
 oncoming traffic is on one half of the image, so the halves contradict each other. Leaving out sides of objects
-or ranges besides said no more on 110 known days. What draws both halves alike, such as cars ahead in all
+or ranges besides said no more on 140 known days. What draws both halves alike, such as cars ahead in all
 lanes, is not seen here.
 
 The changes are read off the profile, for the score is far from quadratic over decimetres of way.
