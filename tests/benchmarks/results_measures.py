@@ -110,11 +110,11 @@ def clocks(lines: Lines, row: Row) -> str:
 
 
 def clock_sigmas(lines: Lines, row: Row) -> str:
-    """Time offsets of `pairs` within three of their sigmas, and their RMS error in sigmas."""
+    """Time offsets of `pairs` within three of their sigmas, and their error in sigmas (RMS)."""
     records = [r["pairs"].get(pair, {}) for r in lines for pair in row["pairs"]]
     known = [p for p in records if p.get("dt_s") is not None]
     z = np.array([(p["dt_s"] - p["dt_true_s"]) / p["dt_sigma_s"] for p in known])
-    return f"{rate(int(np.sum(np.abs(z) <= 3)), len(z))}, RMS {np.sqrt(np.mean(z**2)):.2f} sigma"
+    return f"{rate(int(np.sum(np.abs(z) <= 3)), len(z))}, {np.sqrt(np.mean(z**2)):.2f} sigma"
 
 
 def verified(lines: Lines, row: Row) -> str:
