@@ -35,8 +35,10 @@ def main() -> None:
         choices=["dev-rigs", "dev-views", "dev-worlds", "worlds", "worlds-full", "rows", "rows-full"],
         default="dev-rigs",
     )
+    parser.add_argument("--seeds", nargs="+", type=int, help="of the set, only these days")
     args = parser.parse_args()
-    run_study([Run(day, seed=day.seed) for day in SETS[args.set]], args, summary)
+    days = [day for day in SETS[args.set] if args.seeds is None or day.seed in args.seeds]
+    run_study([Run(day, seed=day.seed) for day in days], args, summary)
 
 
 def summary(results: list[dict[str, Any]]) -> str:

@@ -337,10 +337,14 @@ def _conclude(
     witnesses: Sequence[Witness],
 ) -> PairEstimate:
     """The estimate, its covariance by left perturbation, notes."""
-    dt_sigma = float(np.sqrt(analysis.covariance[6, 6]))
+    dt_sigma = float(np.sqrt(analysis.covariance[DT, DT]))
+    expected_sigma = aligned.problem.config.time_offset_sigma_s
+    # The score took its errors for independent: where they are not, what is expected has more weight. The pose stays at
+    # its own time offset, where its errors were computed.
+    told = 1 - (dt_sigma / expected_sigma) ** 2
     known = analysis.prior.camera
     notes = aligned.intrinsics.notes(known)
-    if dt_sigma > _UNKNOWN_SHARE * aligned.problem.config.time_offset_sigma_s:
+    if dt_sigma > _UNKNOWN_SHARE * expected_sigma:
         notes.append("camera time offset: the day's speeds do not determine it")
     to_left = np.linalg.inv(change_jacobian(analysis.state.T_camera_lidar))
     return PairEstimate(
@@ -351,7 +355,7 @@ def _conclude(
         analysis.observability >= OBSERVABLE,
         frames_used=len(aligned.frames),
         frames_rejected=aligned.rejected,
-        time_offset_s=aligned.expected_dt_s + analysis.state.dt_s,
+        time_offset_s=aligned.expected_dt_s + told * analysis.state.dt_s,
         time_offset_sigma_s=dt_sigma,
         diagnostics=diagnostics | aligned.intrinsics.diagnostics(known) | witness_numbers(witnesses),
         notes=notes,
