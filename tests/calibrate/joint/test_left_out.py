@@ -111,6 +111,7 @@ def said_and_moved_rad(seed):
         yield seen[k, axis] / np.sqrt(1 - 1 / len(sides)), moved
 
 
+@pytest.mark.slow
 def test_solutions_without_a_side_are_where_they_were_said_to_be():
     # Each by itself is rough by half: the score is. Over three days they agree.
     said, moved = np.array([pair for seed in (1, 2, 3) for pair in said_and_moved_rad(seed)]).T
