@@ -339,9 +339,9 @@ def _conclude(
     """The estimate, its covariance by left perturbation, notes."""
     dt_sigma = float(np.sqrt(analysis.covariance[DT, DT]))
     expected_sigma = aligned.problem.config.time_offset_sigma_s
-    # The score took its errors for independent: where they are not, what is expected has more weight. The pose stays at
-    # its own time offset, where its errors were computed.
-    told = 1 - (dt_sigma / expected_sigma) ** 2
+    # The profile took all errors for independent, and gave the expected time offset too little weight. The pose stays:
+    # solved at the weighted time offset, it was worse on known days.
+    dt_weight = 1 - (dt_sigma / expected_sigma) ** 2
     known = analysis.prior.camera
     notes = aligned.intrinsics.notes(known)
     if dt_sigma > _UNKNOWN_SHARE * expected_sigma:
@@ -355,7 +355,7 @@ def _conclude(
         analysis.observability >= OBSERVABLE,
         frames_used=len(aligned.frames),
         frames_rejected=aligned.rejected,
-        time_offset_s=aligned.expected_dt_s + told * analysis.state.dt_s,
+        time_offset_s=aligned.expected_dt_s + dt_weight * analysis.state.dt_s,
         time_offset_sigma_s=dt_sigma,
         diagnostics=diagnostics | aligned.intrinsics.diagnostics(known) | witness_numbers(witnesses),
         notes=notes,

@@ -1,12 +1,12 @@
 """Bias of the camera's time offset: how far it moves, and the pose with it, without either half of the image.
 
 Other road users move between a lidar's point and the image, and edges on them are taken for static ones.
-Oncoming cars draw the time offset one way, cars ahead the other, by up to the time between point and image. In
-a tunnel most edges lie on them: the time offset was 100 ms off at a sigma of 9, azimuth .2 deg. Rails and walls
-match anywhere along them and draw it too. All frames share this, so resampled frames do not show it. But
-oncoming traffic is on one half of the image, so the halves contradict each other. Leaving out sides of objects
-or ranges besides said no more on 140 known days. What draws both halves alike, such as cars ahead in all
-lanes, is not seen here.
+Oncoming cars move the time offset one way, cars ahead the other, by up to the time between point and image. In
+a tunnel most edges lie on them: one time offset was 99 ms off at a sigma of 9. Rails and walls match anywhere
+along them and move it too. All frames share this error, so resampled frames do not show it. But oncoming traffic
+is on one half of the image, so the two halves disagree. Leaving out sides of objects or ranges as well did not
+fit the errors of 140 known days better. What moves both halves alike, such as cars ahead in all lanes, is not
+seen here.
 
 The changes are read off the profile, for the score is far from quadratic over decimetres of way.
 

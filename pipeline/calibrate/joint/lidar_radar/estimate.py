@@ -235,17 +235,17 @@ def _with_witnesses(
 def _with_other_dips(
     problem: RadarProblem, analysis: ObservabilityAnalysis, block: Int[np.ndarray, " F"]
 ) -> ObservabilityAnalysis:
-    """The analysis with the time offset as unsure as blocks of frames are about its dip, and as near what is expected.
+    """The analysis with the variance over blocks of frames, and the weight of the time offset against the expected one.
 
     The pose stays: where dips are everywhere, it does not depend on them.
     """
     if analysis.fixed[DT]:
         return analysis
     scatter_s = time_offset_scatter_s(problem, analysis.state, block, np.random.default_rng(0))
-    told = 1 / (1 + (scatter_s / problem.dt_sigma_s) ** 2)
+    weight = 1 / (1 + (scatter_s / problem.dt_sigma_s) ** 2)
     covariance = analysis.covariance.copy()
-    covariance[DT, DT] += told * scatter_s**2
-    return replace(analysis, covariance=covariance, dt_told=told)
+    covariance[DT, DT] += weight * scatter_s**2
+    return replace(analysis, covariance=covariance, dt_weight=weight)
 
 
 def _consistent_with_odometry(observations: Sequence[Observation]) -> list[Observation]:
@@ -287,7 +287,7 @@ def _conclude(
         ~fixed[:6],
         problem.frames.count,
         {reason: count for reason, count in rejected.items() if count},
-        analysis.dt_told * state.dt_s - problem.constant_gap_s,
+        analysis.dt_weight * state.dt_s - problem.constant_gap_s,
         float(np.sqrt(analysis.covariance[DT, DT])),
         diagnostics_of(analysis, ends, halves),
         notes,

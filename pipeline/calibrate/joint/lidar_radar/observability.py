@@ -49,7 +49,7 @@ class ObservabilityAnalysis:
     observability: np.ndarray  # 7, of pose and dt
     witnesses: tuple[Witness, ...]  # of pitch, asked where the car's way had no say yet
     heights: Heights | None
-    dt_told: float = 1.0  # by the day, of what is known of the time offset; the rest is expected
+    dt_weight: float = 1.0  # of the day's time offset against the expected one
 
 
 def analyse_observability(
