@@ -32,11 +32,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "check": ("jobs.check:check", "Check whether logs can be calibrated, and in which degrees of freedom."),
     "verify": (
         "jobs.verify:verify",
-        "Check the calibration that a car uses now against one log.",
-    ),
-    "verify-set": (
-        "jobs.verify_set:verify_set",
-        "Judge the calibrations that a data set ships, over all of its logs.",
+        "Check the calibration that a car uses now against one or more logs.",
     ),
     "nightly": (
         "jobs.nightly:nightly",

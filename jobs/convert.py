@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from pipeline.convert.recording import Recording
     from pipeline.rig.graph import Kind
 
-__all__ = ["DataSet", "convert", "models_of", "recordings_of", "write_fleet"]
+__all__ = ["convert"]
 
 DataSet = Literal["nuscenes", "vod", "kitti"]
 RADAR_COLUMNS = "x,y,z,power,doppler"
@@ -55,24 +55,24 @@ def convert(
     from pipeline.convert.log_file import write_log
     from pipeline.store.partitions import Partition
 
-    models = models_of(segmenter, detector)
+    models = _models_of(segmenter, detector)
     owner = vehicle or str(data_set)
     Partition(owner, day)  # raises for invalid names
     messages = 0
     with progress_reporter("convert") as progress:
         progress(0, 0, f"tables of {folder}")
         named: dict[Kind, str | None] = {"camera": camera, "lidar": lidar, "radar": radar}
-        recordings = recordings_of(data_set, folder, owner, day, named, radar_columns)
+        recordings = _recordings_of(data_set, folder, owner, day, named, radar_columns)
         paths = [_path_of(out, r) for r in recordings]
         for done, (path, recording) in enumerate(zip(paths, recordings, strict=True)):
             progress(done, len(paths), recording.name)
             messages += write_log(path, recording)
-    fleet = write_fleet(out, data_set, recordings, models)
+    fleet = _write_fleet(out, data_set, recordings, models)
     print_summary("convert", "done", fleet=fleet, logs=paths, messages=messages)
     return 0
 
 
-def models_of(segmenter: str | None, detector: str | None) -> tuple[str, str] | None:
+def _models_of(segmenter: str | None, detector: str | None) -> tuple[str, str] | None:
     """Manifests of both models, or None; ConfigError for one of them."""
     from pipeline.errors import ConfigError
 
@@ -83,13 +83,13 @@ def models_of(segmenter: str | None, detector: str | None) -> tuple[str, str] | 
     return segmenter, detector
 
 
-def recordings_of(
+def _recordings_of(
     data_set: DataSet,
     folder: Path,
     owner: str,
     day: str,
     named: Mapping[Kind, str | None],
-    radar_columns: str = RADAR_COLUMNS,
+    radar_columns: str,
 ) -> list[Recording]:
     """Recordings of a data set's folder; `named` has channels of nuScenes, separated by commas."""
     from pipeline.convert.kitti_shaped import read_kitti, read_view_of_delft
@@ -102,7 +102,7 @@ def recordings_of(
     return read_kitti(folder, owner, day, radar_columns.split(","))
 
 
-def write_fleet(
+def _write_fleet(
     out: Path, data_set: DataSet, recordings: Sequence[Recording], models: tuple[str, str] | None
 ) -> Path:
     """Write fleet.toml for recordings."""

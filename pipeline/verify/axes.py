@@ -92,20 +92,18 @@ def check_axes(
         pair = _pair(record), record.pair
         return [silent(pair, axis, of, blocked or record.reason) for axis, of in limits.items()]
     off = _off(record.pair, in_use, found, np.asarray(record.covariance), targets_of(record))
-    common = _off(record.pair, in_use, found, _common(record), targets_of(record))
     of = _pair(record), record.pair
     return [
-        checked(of, axis, limits[axis], (*off[axis], common[axis][1]), blocked, CONTRADICTION_SIGMAS, said)
+        checked(of, axis, limits[axis], off[axis], blocked, CONTRADICTION_SIGMAS, said)
         for axis in limits
         if axis in off
         for said in [held_out_of([record], verify or VerifyConfig(), axis)]
     ]
 
 
-def probes(asked_deg: tuple[float, float], sizes: Sequence[float] = (0.5, 1.0, 2.0)) -> Probes:
-    """Turns for `Task.probe_deg`: the errors asked for, and multiples of them."""
-    wanted = sorted({1.0, *sizes})
-    of_camera, of_radar = (tuple(deg * size for size in wanted) for deg in asked_deg)
+def probes(asked_deg: tuple[float, float]) -> Probes:
+    """Turns for `Task.probe_deg`: the errors asked for, half and twice as large."""
+    of_camera, of_radar = (tuple(deg * size for size in (0.5, 1.0, 2.0)) for deg in asked_deg)
     return of_camera, of_radar
 
 
@@ -156,11 +154,8 @@ def check_pose(
     A = adjoint(T)
     targets = DEFAULT_TARGETS if row.targets_m is None else np.asarray(row.targets_m)
     off = _off(f"{row.kind}_of", inverse(in_use), T, A @ np.asarray(row.covariance) @ A.T, targets)
-    common = _off(f"{row.kind}_of", inverse(in_use), T, A @ _common(row) @ A.T, targets)
     return [
-        checked(
-            of, axis, limits[axis], (*off[axis], common[axis][1]), why, beyond, (held_out or {}).get(axis)
-        )
+        checked(of, axis, limits[axis], off[axis], why, beyond, (held_out or {}).get(axis))
         for axis in limits
         if axis in off
     ]
@@ -220,11 +215,6 @@ def _off(
         roll_sigma = np.sqrt(change_covariance(found, covariance)[_ROLL, _ROLL])
         off["roll"] = float(change_between(found, in_use)[_ROLL]), float(roll_sigma)
     return off
-
-
-def _common(row: CalibrationRecord | PoseRow) -> Float[np.ndarray, "6 6"]:
-    """The part of a covariance that all logs of a vehicle share."""
-    return np.zeros((6, 6)) if row.common_covariance is None else np.asarray(row.common_covariance)
 
 
 def _pair(record: CalibrationRecord) -> str:

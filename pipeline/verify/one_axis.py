@@ -85,10 +85,6 @@ class AxisCheck:
     shown_rad: (
         float  # from here on errors would have failed with probability SHOWN_POWER; nan = none of those tried
     )
-    signed_rad: float = float("nan")  # off_rad with its sign
-    common_rad: float = 0.0  # of sigma_rad, the part that all logs of a vehicle share
-    held_out_z: Mapping[float, float] = field(default_factory=dict)  # by turn [deg]
-    beyond: float = 3.0  # threshold in sigmas
 
 
 def power_of(
@@ -119,7 +115,7 @@ def checked(
     of: tuple[str, str],
     axis: str,
     limits: AxisLimits,
-    off: tuple[float, float, float],
+    off: tuple[float, float],
     blocked: str,
     beyond: float,
     held_out: HeldOut | None = None,
@@ -130,13 +126,12 @@ def checked(
         of: the pair or sensor in words, and its kind.
         axis: azimuth, elevation or roll.
         limits: of the axis.
-        off: signed distance, its sigma, and the part of that which all logs share.
+        off: signed distance and its sigma.
         blocked: why the log's answer cannot be compared; empty if it can.
         beyond: threshold in sigmas.
         held_out: the held-out test of turns.
     """
-    signed_rad, sigma_rad, common_rad = off
-    off_rad = abs(signed_rad)
+    off_rad, sigma_rad = abs(off[0]), off[1]
     held_out = held_out or HeldOut()
     power = power_of(limits.asked_rad, limits.limit_rad, sigma_rad, beyond, held_out)
     shown = shown_from(limits.limit_rad, sigma_rad, beyond, held_out)
@@ -147,10 +142,7 @@ def checked(
         else _status(off_rad, sigma_rad, limits, power, held_out, measured=measured)
     )
     numbers = (off_rad, sigma_rad, limits.limit_rad, limits.asked_rad)
-    return AxisCheck(
-        *of, axis, status, reason, *numbers, 0.0 if blocked else power, shown,
-        signed_rad, common_rad, held_out.z, beyond,
-    )  # fmt: skip
+    return AxisCheck(*of, axis, status, reason, *numbers, 0.0 if blocked else power, shown)
 
 
 def silent(of: tuple[str, str], axis: str, limits: AxisLimits, reason: str) -> AxisCheck:

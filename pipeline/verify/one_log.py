@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
-
-import numpy as np
+from collections.abc import Iterable, Sequence
 
 from pipeline.config import FleetConfig, VerifyConfig
 from pipeline.errors import SolveError
 from pipeline.extrinsics.prior import rig_prior
 from pipeline.geometry.sensor_turns import TURN_AXES
-from pipeline.rig.edges import edge_of
 from pipeline.rig.graph import Sensor
 from pipeline.rig.prior import RigPrior
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import perceived
 from pipeline.verify.axes import (
-    check_axes,
     check_pose,
     held_out_of,
     kind_of_pose,
@@ -31,7 +26,7 @@ from schemas.calibrations import FRAMES_OF_PAIR, CalibrationRecord
 from schemas.moments import PRIOR
 from schemas.poses import PoseRow
 
-__all__ = ["check_poses", "check_sensors", "for_one_look", "prior_in_use", "with_prior"]
+__all__ = ["check_poses", "for_one_look", "prior_in_use", "with_prior"]
 
 
 def for_one_look(config: FleetConfig, frames: int) -> FleetConfig:
@@ -52,13 +47,7 @@ def prior_in_use(config: FleetConfig, lake: Lake, partition: Partition) -> RigPr
         return None
 
 
-def with_prior(
-    config: FleetConfig,
-    lake: Lake,
-    vehicle: str,
-    prior: RigPrior,
-    turned: Mapping[str, np.ndarray] | None = None,
-) -> FleetConfig:
+def with_prior(config: FleetConfig, lake: Lake, vehicle: str, prior: RigPrior) -> FleetConfig:
     """The configuration with the calibration in use rounded to a grid, so that its last digits do not change a result.
 
     A search can have different results for starts that differ by less than any measurement error: for two
@@ -69,10 +58,9 @@ def with_prior(
         lake: a local folder, for the file of the prior.
         vehicle: its name.
         prior: the calibration in use.
-        turned: known turns (4x4, T_sensor_turned) to apply to the calibration, by sensor.
     """
     rig = config.rig_of(vehicle)
-    if rig.is_one_of_each and not turned:
+    if rig.is_one_of_each:
         kinds = {node.name: node.kind for node in rig.nodes}
         ends = {(kinds[a], kinds[b]): T for (a, b), T in prior.T.items()}
         said: dict[str, object] = {
@@ -80,25 +68,11 @@ def with_prior(
         }
     else:
         poses = prior.extrinsics()
-        own = {name: poses.T[name] @ (turned or {}).get(name, np.eye(4)) for name in poses.order}
-        said = {"reference": prior.reference.name, "T": {n: on_grid(T).tolist() for n, T in own.items()}}
+        own = {name: on_grid(poses.T[name]).tolist() for name in poses.order}
+        said = {"reference": prior.reference.name, "T": own}
     file = lake.local_root / "on_grid.json"
     file.write_text(json.dumps(said))
     return config.with_prior_file(vehicle, file)
-
-
-def check_sensors(
-    records: Sequence[CalibrationRecord], verify: VerifyConfig, asked_deg: tuple[float, float]
-) -> list[AxisCheck]:
-    """Check one camera, one lidar and one radar as sensors: each by its pair with the lidar, if there is a lidar."""
-    direct = [r for r in records if "lidar" in r.pair] or records
-    checks = []
-    for record in direct:
-        kind = "camera" if record.pair == "camera_lidar" else "radar"
-        sensor = next((s.name for s in edge_of(record).sensors if s.kind == kind), kind)
-        limits = limits_of(record.pair, verify, asked_deg)
-        checks += [replace(c, pair=sensor) for c in check_axes(record, limits, verify)]
-    return checks
 
 
 def check_poses(

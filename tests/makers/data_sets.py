@@ -181,27 +181,6 @@ def nuscenes(folder, frames=12):
     return folder
 
 
-def more_scenes(folder, scenes):
-    """Repeat the scene of `nuscenes` a minute later each time, with the same files."""
-    tables = folder / "v1.0-mini"
-    held = {
-        name: json.loads((tables / f"{name}.json").read_text()) for name in ("scene", "sample", "sample_data")
-    }
-    first = {name: list(rows) for name, rows in held.items()}
-    for k in range(1, scenes):
-        for name, rows in first.items():
-            for row in rows:
-                new = row | {"token": f"{row['token']}-{k}"}
-                new |= {"name": f"scene-{k + 1:04d}"} if name == "scene" else {
-                    "timestamp": row["timestamp"] + 60_000_000 * k
-                }  # fmt: skip
-                new |= {of: f"{row[of]}-{k}" for of in ("scene_token", "sample_token") if of in row}
-                held[name].append(new)
-    for name, rows in held.items():
-        (tables / f"{name}.json").write_text(json.dumps(rows))
-    return folder
-
-
 def pcd(points):
     """A radar scan of nuScenes: eighteen fields, velocity as a vector along the ray, one ambiguous point at the end."""
     fields = (
