@@ -11,6 +11,7 @@ import numpy as np
 from pipeline.calibrate.numerics.frame_blocks import scene_blocks
 from pipeline.calibrate.numerics.search_range import search_range
 from pipeline.calibrate.select.frames import Selection
+from pipeline.calibrate.verify.edge_result import EdgeResult
 from pipeline.calibrate.verify.held_out_score import held_out_score
 from pipeline.calibrate.verify.held_out_search import found_elsewhere, held_out_place
 from pipeline.calibrate.verify.held_out_test import HeldOutTest, paired_test
@@ -90,16 +91,28 @@ class Judging:
             )
         targets = DEFAULT_TARGETS if targets is None else targets
         test, claims, probes, elsewhere = self._held_out(estimate, held_out, limits, mounting, targets)
+        disproved = [FailedCheck(estimate.disproved, disproves=True)] if estimate.disproved else []
         verdict = judge(
-            estimate,
-            self.prior,
-            Evidence(test, claims, [*failed, *unseen, *elsewhere]),
-            search_range(self.prior, self.fleet.solve),
+            self._result(estimate),
+            Evidence(test, claims, [*failed, *unseen, *elsewhere, *disproved]),
             limits,
             triggered=active,
             together=together,
         )
         return Judged(verdict, test, claims, mounting, targets, probes)
+
+    def _result(self, estimate: PairEstimate) -> EdgeResult:
+        pair, prior = estimate.pair, self.prior
+        return EdgeResult(
+            pair,
+            estimate.T,
+            estimate.covariance,
+            estimate.observable,
+            prior.of(pair),
+            prior.covariance(pair),
+            estimate.frames_used,
+            search_range(prior.sigmas, self.fleet.solve),
+        )
 
     def _held_out(
         self,

@@ -41,6 +41,11 @@ class Prior:
         alone = self.T_camera_radar_alone
         return composed if alone is None or np.isfinite(composed).all() else alone
 
+    @property
+    def sigmas(self) -> tuple[float, float]:
+        """Of rotation [rad] and translation [m], each axis."""
+        return self.rotation_sigma_rad, self.translation_sigma_m
+
     def knows(self, pair: str) -> bool:
         """True if this pair has a prior."""
         return bool(np.isfinite(self.of(pair)).all())

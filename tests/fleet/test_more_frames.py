@@ -8,11 +8,11 @@ import pytest
 
 from pipeline.calibrate.numerics.search_range import SearchRange
 from pipeline.calibrate.select.frames import _too_few
+from pipeline.calibrate.verify.edge_result import EdgeResult
 from pipeline.calibrate.verify.held_out_test import HeldOutTest
 from pipeline.calibrate.verify.target_accuracy import Claim
 from pipeline.calibrate.verify.verdict import Evidence, judge
 from pipeline.config import ChecksConfig
-from pipeline.extrinsics.estimates import PairEstimate, Prior
 from pipeline.fleet.more_frames import MOST_TIMES_MORE, _lacks_frames, asks_for_more, spent_before
 from pipeline.fleet.nightly import Night, run_night
 from pipeline.fleet.pattern import VehicleDay
@@ -26,8 +26,10 @@ from schemas.moments import SWEEPS_LOGGED, SWEEPS_PLANNED
 from tests.fleet.test_nightly import DAY, FLEET
 from tests.makers.written_logs import Kit, fleet_config
 
-PRIOR = Prior(np.eye(4), np.eye(4), 0.035, 0.05)
-ESTIMATE = PairEstimate("lidar_radar", np.eye(4), np.eye(6) * 1e-6, np.full(6, 0.9), np.ones(6, bool), 50)
+RESULT = EdgeResult(
+    "lidar_radar", np.eye(4), np.eye(6) * 1e-6, np.ones(6, bool), np.eye(4), np.eye(6) * 1e-3, 50,
+    SearchRange(0.1, 0.3),
+)  # fmt: skip
 VAGUE, SURE = (Claim(sigma, 0.0, 0.0, sigma, 0.003, 0.995) for sigma in (0.01, 1e-4))
 FEW = _too_few("camera_lidar", [1, 2], [["sky"]] * 9, 5)
 
@@ -35,7 +37,7 @@ FEW = _too_few("camera_lidar", [1, 2], [["sky"]] * 9, 5)
 def held_for(claim, frames):
     """The reason of a verdict on a result that is right but for what is given."""
     evidence = Evidence(HeldOutTest(1.0, 0.8, 0.02, frames, 10), {"azimuth": claim})
-    found = judge(ESTIMATE, PRIOR, evidence, SearchRange(0.1, 0.3), ChecksConfig())
+    found = judge(RESULT, evidence, ChecksConfig())
     assert found.status == "held"
     return found.reason
 

@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.config import SolveConfig
-from pipeline.extrinsics.estimates import Prior
 
 __all__ = ["SearchRange", "search_range"]
 
@@ -23,8 +22,13 @@ class SearchRange(NamedTuple):
     translation_m: float
 
 
-def search_range(prior: Prior, config: SolveConfig) -> SearchRange:
-    """The box to search, by the prior and at least `search_rotation_deg` and `search_translation_m`."""
-    rotation = max(float(np.radians(config.search_rotation_deg)), _SIGMAS_ROTATION * prior.rotation_sigma_rad)
-    translation = max(config.search_translation_m, _SIGMAS_TRANSLATION * prior.translation_sigma_m)
+def search_range(prior_sigmas: tuple[float, float], config: SolveConfig) -> SearchRange:
+    """The box to search, by the prior and at least `search_rotation_deg` and `search_translation_m`.
+
+    Args:
+        prior_sigmas: of rotation [rad] and translation [m], each axis.
+    """
+    rotation_rad, translation_m = prior_sigmas
+    rotation = max(float(np.radians(config.search_rotation_deg)), _SIGMAS_ROTATION * rotation_rad)
+    translation = max(config.search_translation_m, _SIGMAS_TRANSLATION * translation_m)
     return SearchRange(min(rotation, np.pi), translation)

@@ -13,14 +13,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pipeline.calibrate.numerics.search_range import SearchRange
 from pipeline.calibrate.select.frames import SHORTEST
+from pipeline.calibrate.verify.edge_result import EdgeResult
 from pipeline.calibrate.verify.held_out_test import HeldOutTest
 from pipeline.calibrate.verify.target_accuracy import Claim
 from pipeline.config import ChecksConfig
 from pipeline.extrinsics.checks import FailedCheck, faults_of
-from pipeline.extrinsics.estimates import PairEstimate, Prior
-from pipeline.geometry.changes import change_between, change_covariance
 from schemas.calibrations import DOF_NAMES
 
 __all__ = ["Evidence", "Verdict", "judge"]
@@ -51,7 +49,7 @@ _FAILED = -1.0  # margin of a check that yields no number
 
 @dataclass(frozen=True)
 class Evidence:
-    """Evidence for and against one pair's estimate."""
+    """Evidence for and against the result of one edge."""
 
     held_out: HeldOutTest | None  # held-out frames at prior and result; None where none has both costs
     claims: Mapping[str, Claim]  # of azimuth and elevation at the targets
@@ -95,25 +93,21 @@ class _Check:
 
 
 def judge(
-    estimate: PairEstimate,
-    prior: Prior,
+    result: EdgeResult,
     evidence: Evidence,
-    search: SearchRange,
     limits: ChecksConfig,
     *,
     triggered: bool = True,
     together: bool = False,
 ) -> Verdict:
-    """Decide on one pair.
+    """Decide on one edge, of any kind.
 
     Args:
-        estimate: the result.
-        prior: the pose that stays current without it.
+        result: the pose, its prior, and what was determined.
         evidence: held-out frames, claims and failed checks.
-        search: search range of the solver about the prior.
         limits: thresholds.
-        triggered: False if no trigger is active for this pair, so that it was not estimated.
-        together: whether other pairs contribute to the pose. The move of the pair is then checked in its
+        triggered: False if no trigger is active for this edge, so that it was not estimated.
+        together: whether other edges contribute to the pose. The move of the edge is then checked in its
             separate verdict, and it need not align better on its own held-out frames. But it must not align
             worse, and they must not contradict it.
     """
@@ -121,29 +115,27 @@ def judge(
         return Verdict("held", "not triggered: the prior stays", _FAILED)
     faults = dict.fromkeys(faults_of(evidence.failed_checks))
     checks: list[_Check] = []
-    if estimate.frames_used < limits.min_fit_frames:
-        few = f"too few frames: {estimate.frames_used}, needs {limits.min_fit_frames}"
+    if result.frames_used < limits.min_fit_frames:
+        few = f"too few frames: {result.frames_used}, needs {limits.min_fit_frames}"
         sentences = [check.sentence for check in evidence.failed_checks]
-        if estimate.pair != "camera_lidar" or estimate.frames_used < SHORTEST:
+        if result.kind != "camera_lidar" or result.frames_used < SHORTEST:
             return Verdict("refused", "; ".join([*sentences, few]), _FAILED, faults=tuple(faults))
         checks.append(_Check(_FAILED, few, of_number=True))
     checks += [
         _Check(_FAILED, check.sentence, check.disproves, of_number=check.fault == "few_scenes")
         for check in evidence.failed_checks
     ]
-    if estimate.disproved:
-        checks.append(_Check(_FAILED, estimate.disproved, disproves=True))
     if together:
-        checks += _aligns_no_worse(estimate, prior, evidence.held_out, limits)
+        checks += _aligns_no_worse(result, evidence.held_out, limits)
     else:
-        checks += _moves_little(estimate, prior, search, limits)
-        checks.append(_aligns_better(estimate, prior, evidence.held_out, limits))
-    checks += _claims_hold(estimate, evidence.claims)
-    if not estimate.observable.any():
+        checks += _moves_little(result, limits)
+        checks.append(_aligns_better(result, evidence.held_out, limits))
+    checks += _claims_hold(result, evidence.claims)
+    if not result.observable.any():
         checks.append(_Check(_FAILED, "the day determines no degree of freedom"))
     score = min(1.0, *(c.margin for c in checks))
     failed = [c for c in checks if c.margin < 0]
-    return _held(failed, score, faults) if failed else _accepted(estimate, prior, evidence, score)
+    return _held(failed, score, faults) if failed else _accepted(result, evidence, score)
 
 
 def _held(failed: Sequence[_Check], score: float, faults: Mapping[str, None]) -> Verdict:
@@ -159,25 +151,23 @@ def _held(failed: Sequence[_Check], score: float, faults: Mapping[str, None]) ->
     )
 
 
-def _accepted(estimate: PairEstimate, prior: Prior, evidence: Evidence, score: float) -> Verdict:
+def _accepted(result: EdgeResult, evidence: Evidence, score: float) -> Verdict:
     """The verdict without failed checks, with what it certifies and what nothing checks."""
     certified = tuple(name for name, claim in evidence.claims.items() if claim.margin >= 0)
-    unchecked = _unchecked(estimate, prior, certified)
-    reason = "; ".join([*_reservations(estimate, evidence.claims), *_differences(estimate.pair, unchecked)])
+    unchecked = _unchecked(result, certified)
+    reason = "; ".join([*_reservations(result, evidence.claims), *_differences(result.kind, unchecked)])
     far = {DOF_NAMES[k]: sigmas for k, sigmas in unchecked.items()}
     mounting = tuple(name for name in certified if evidence.claims[name].certifies_mounting)
     return Verdict("accepted", reason, score, certified, unchecked=far, mounting=mounting)
 
 
-def _moves_little(
-    estimate: PairEstimate, prior: Prior, search: SearchRange, limits: ChecksConfig
-) -> list[_Check]:
+def _moves_little(result: EdgeResult, limits: ChecksConfig) -> list[_Check]:
     """Within the search range, and within the prior's sigmas."""
-    step = change_between(prior.of(estimate.pair), estimate.T)
+    step, search = result.move, result.search
     rotation, translation = float(np.linalg.norm(step[:3])), float(np.abs(step[3:]).max())
     # The searched box has half-widths per axis: its corners lie sqrt(3) further out.
     reach = np.sqrt(3) * search.rotation_rad
-    ratio = np.abs(step) / np.sqrt(np.diag(prior.covariance(estimate.pair)))
+    ratio = result.move_prior_sigmas
     worst = int(np.argmax(ratio))
     return [
         _Check(
@@ -200,9 +190,7 @@ def _moves_little(
     ]
 
 
-def _aligns_better(
-    estimate: PairEstimate, prior: Prior, test: HeldOutTest | None, limits: ChecksConfig
-) -> _Check:
+def _aligns_better(result: EdgeResult, test: HeldOutTest | None, limits: ChecksConfig) -> _Check:
     """Held-out frames align better than at the prior, or equally well if the result agrees with the prior."""
     if test is None or test.frames < limits.min_held_out_frames:
         found = 0 if test is None else test.frames
@@ -211,9 +199,9 @@ def _aligns_better(
     if test.z > limits.worse_alignment_z:
         # The radar's registration cost has slopes of its own (`lidar_radar/time_offset`): a right result near a prior
         # may score worse. That leaves it unproved, no more.
-        is_proof = estimate.pair == "camera_lidar"
+        is_proof = result.kind == "camera_lidar"
         return _Check(1 - test.z / limits.worse_alignment_z, _worse(test), disproves=is_proof)
-    name, ratio = _largest_move(estimate, prior)
+    name, ratio = _largest_move(result)
     same = 1 - ratio / limits.prior_agreement_sigmas
     better = (-test.z - limits.better_alignment_z) / limits.better_alignment_z
     moved = f"{name} moved {ratio:.1f} of its sigmas"
@@ -222,32 +210,23 @@ def _aligns_better(
     )
 
 
-def _aligns_no_worse(
-    estimate: PairEstimate, prior: Prior, test: HeldOutTest | None, limits: ChecksConfig
-) -> list[_Check]:
+def _aligns_no_worse(result: EdgeResult, test: HeldOutTest | None, limits: ChecksConfig) -> list[_Check]:
     """If other pairs contribute to the pose: alignment no worse than at a prior that the result contradicts."""
     if test is None:
         return []
-    _, ratio = _largest_move(estimate, prior)
+    _, ratio = _largest_move(result)
     same, not_worse = 1 - ratio / limits.prior_agreement_sigmas, 1 - test.z / limits.worse_alignment_z
     return [_Check(min(1.0, max(same, not_worse)), _worse(test))]
 
 
-def _largest_move(estimate: PairEstimate, prior: Prior) -> tuple[str, float]:
+def _largest_move(result: EdgeResult) -> tuple[str, float]:
     """Largest move of a degree of freedom that held-out frames score, in sigmas of the result."""
-    ratio = np.where(_SCORED[estimate.pair], _moves(estimate, prior), 0.0)
+    ratio = np.where(_SCORED[result.kind], result.move_sigmas, 0.0)
     worst = int(np.argmax(ratio))
     return DOF_NAMES[worst], float(ratio[worst])
 
 
-def _moves(estimate: PairEstimate, prior: Prior) -> np.ndarray:
-    """Distance of each degree of freedom from the prior, in sigmas of the result; 0 if not determined."""
-    sigma = np.sqrt(np.diag(change_covariance(estimate.T, estimate.covariance)))
-    step = change_between(prior.of(estimate.pair), estimate.T)
-    return np.asarray(np.where(estimate.observable, np.abs(step) / sigma, 0.0))
-
-
-def _unchecked(estimate: PairEstimate, prior: Prior, certified: Sequence[str]) -> dict[int, float]:
+def _unchecked(result: EdgeResult, certified: Sequence[str]) -> dict[int, float]:
     """DoF of a record certified for its azimuth alone that moved far from the prior: sigmas of the move by index.
 
     Records with a certified elevation are left out: their sources of elevation are precise, and right rolls
@@ -255,8 +234,8 @@ def _unchecked(estimate: PairEstimate, prior: Prior, certified: Sequence[str]) -
     """
     if "elevation" in certified:
         return {}
-    moves = _moves(estimate, prior)
-    return {k: float(moves[k]) for k in _UNCHECKED[estimate.pair] if moves[k] > _UNCHECKED_MOVE_SIGMAS}
+    moves = result.move_sigmas
+    return {k: float(moves[k]) for k in _UNCHECKED[result.kind] if moves[k] > _UNCHECKED_MOVE_SIGMAS}
 
 
 def _worse(test: HeldOutTest) -> str:
@@ -264,7 +243,7 @@ def _worse(test: HeldOutTest) -> str:
     return f"held-out frames align worse than at the prior ({change})"
 
 
-def _claims_hold(estimate: PairEstimate, claims: Mapping[str, Claim]) -> list[_Check]:
+def _claims_hold(result: EdgeResult, claims: Mapping[str, Claim]) -> list[_Check]:
     """Held-out frames must not contradict the result, and its claim must be certain enough."""
     checks = []
     for name, claim in claims.items():
@@ -275,7 +254,7 @@ def _claims_hold(estimate: PairEstimate, claims: Mapping[str, Claim]) -> list[_C
                 f" sigma of that {_deg(claim.shift_sigma_rad)}",
             )
         )
-        if name in _NEEDED[estimate.pair]:
+        if name in _NEEDED[result.kind]:
             checks.append(_Check(claim.margin, f"{name} is {_known(claim)}", of_sigma=True))
     return checks
 
@@ -292,12 +271,12 @@ def _differences(pair: str, unchecked: Mapping[int, float]) -> list[str]:
     return [f"{_UNCHECKED[pair][k]} is {sigmas:.1f} {far}" for k, sigmas in unchecked.items()]
 
 
-def _reservations(estimate: PairEstimate, claims: Mapping[str, Claim]) -> list[str]:
+def _reservations(result: EdgeResult, claims: Mapping[str, Claim]) -> list[str]:
     """Axes that an accepted record does not certify."""
     open_claims = [
         f"{name} not certified: {_known(claim)}" for name, claim in claims.items() if claim.margin < 0
     ]
-    kept = [name for name, seen in zip(DOF_NAMES, estimate.observable, strict=True) if not seen]
+    kept = [name for name, seen in zip(DOF_NAMES, result.observable, strict=True) if not seen]
     return [*open_claims, *([f"not determined by the day: {', '.join(kept)}"] if kept else [])]
 
 

@@ -214,13 +214,13 @@ def test_the_search_follows_a_prior_that_says_it_may_be_far_off():
     day = traced_day(DENSE, 10, seed=1, dt_s=0.03)
     T = perturb_exactly(T_TRUE, np.radians(14.0), 0.5, np.random.default_rng(3))
     prior = Prior(T, np.eye(4), float(np.radians(14.0)), 0.5)
-    rotation, shift = search_range(prior, SolveConfig())
+    rotation, shift = search_range(prior.sigmas, SolveConfig())
     assert np.degrees(rotation) > 14
     assert shift > 0.5
     e = estimate_camera_lidar(day, prior, SolveConfig(), np.random.default_rng(0))
     assert np.abs(np.degrees(log_so3((e.T @ inverse(T_TRUE))[:3, :3]))).max() < 0.4
     near = Prior(T, np.eye(4), 0.01, 0.01)
-    assert search_range(near, SolveConfig()) == (np.radians(6.0), 0.3)
+    assert search_range(near.sigmas, SolveConfig()) == (np.radians(6.0), 0.3)
 
 
 def test_same_seed_gives_the_same_estimate():

@@ -50,7 +50,7 @@ def terms(day):
 def searched(terms, prior, limits=None):
     kernel = KernelSettings.wide(*SCHEDULE.kernels[0])
     config = SolveConfig()
-    limits = limits or search_range(prior, config)
+    limits = limits or search_range(prior.sigmas, config)
     thin = Scored(terms.sharp(MAX_GAP_PX), kernel, prior, config, limits)
     return find_basin(terms, thin, np.random.default_rng(0), np.arange(terms.frames))
 

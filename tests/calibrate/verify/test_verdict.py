@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.numerics.search_range import SearchRange
+from pipeline.calibrate.verify.edge_result import EdgeResult
 from pipeline.calibrate.verify.failed_checks import heading_failures, loop_failures
 from pipeline.calibrate.verify.held_out_test import HeldOutTest, paired_test
 from pipeline.calibrate.verify.target_accuracy import DIRECTIONS, Claim
@@ -37,8 +38,12 @@ SURE = {name: Claim(0.001, 0.0, 0.001, 0.001, np.radians(0.2), 0.995) for name i
 
 def verdict(result, test, failed=(), claims=SURE, limits=None, **changes):
     checks = [f if isinstance(f, FailedCheck) else FailedCheck(f) for f in failed]
-    evidence = Evidence(test, claims, checks)
-    return judge(result, PRIOR, evidence, SEARCH, limits or ChecksConfig(), **changes)
+    pair = result.pair
+    of_edge = EdgeResult(
+        pair, result.T, result.covariance, result.observable, PRIOR.of(pair), PRIOR.covariance(pair),
+        result.frames_used, SEARCH,
+    )  # fmt: skip
+    return judge(of_edge, Evidence(test, claims, checks), limits or ChecksConfig(), **changes)
 
 
 def test_a_better_alignment_is_accepted_without_remark():
@@ -55,7 +60,8 @@ def test_a_worse_alignment_is_held_whatever_else_looks_fine():
 def test_what_a_check_shows_to_be_wrong_is_told_from_what_is_only_unproved():
     assert verdict(estimate(0.01), WORSE).disproved
     assert verdict(estimate(shift_m=0.5), BETTER).disproved  # beyond the search range
-    assert verdict(replace(estimate(1.5), disproved="nobody vouches for it"), BETTER).disproved
+    shown = FailedCheck("another basin is better", disproves=True)
+    assert verdict(estimate(1.5), BETTER, failed=[shown]).disproved
     unproved = [
         verdict(estimate(1.0), SAME),
         verdict(estimate(1.5), BETTER, failed=["disjoint halves disagree"]),
@@ -223,7 +229,7 @@ def test_a_day_that_is_held_for_too_few_frames_or_scenes_alone_is_told_from_one_
     assert verdict(estimate(0.2), SAME, (), unsure).few_only
     for result, test, failed in (
         (few, WORSE, ()),
-        (replace(few, disproved="nobody vouches for it"), SAME, ()),
+        (few, SAME, (FailedCheck("another basin is better", disproves=True),)),
         (few, SAME, ("disjoint halves disagree",)),
         (replace(estimate(1.0), frames_used=7), SAME, ()),  # moved, and nothing confirms it
     ):

@@ -135,7 +135,7 @@ def align_camera_lidar(
 
     first = KernelSettings.wide(*SCHEDULE.kernels[0])
     sharp = terms.telling()
-    limits = search_range(prior, config)
+    limits = search_range(prior.sigmas, config)
     thin = Scored(sharp.at_most(SCHEDULE.wide_points, rng), first, prior, config, limits)
     scenes = Scenes.of(frames, config.bootstrap_blocks)
     basin = find_basin(terms, thin, rng, scenes.block)
@@ -252,7 +252,7 @@ def _terms(
     frames: Sequence[Observation], velocity_lidar: np.ndarray, prior: Prior, config: SolveConfig
 ) -> Terms:
     """The terms selected in the config, with all points that can come into view within the search range."""
-    reach, T = search_range(prior, config).rotation_rad + MARGIN_RAD, prior.T_camera_lidar
+    reach, T = search_range(prior.sigmas, config).rotation_rad + MARGIN_RAD, prior.T_camera_lidar
     readout_s, start = prior.camera.readout_s, Start(T, prior.rotation_sigma_rad)
     terms = prepare_terms(frames, T, velocity_lidar, reach_rad=reach, readout_s=readout_s, start=start)
     terms = terms.gaps_beyond(constant_gap_s(terms.gap_s))

@@ -95,7 +95,7 @@ def find_basin(terms: Terms, scored: Scored, rng: np.random.Generator, block: In
         rng: decides everything random.
         block: block of each frame; errors of different blocks are independent.
     """
-    prior, (reach, shift) = scored.prior, search_range(scored.prior, scored.config)
+    prior, (reach, shift) = scored.prior, search_range(scored.prior.sigmas, scored.config)
     wrong = wrong_poses(prior, reach, min(shift, _SHIFT_SIGMAS * prior.translation_sigma_m), rng)
     match = np.full_like(scored.kernel.match, SCHEDULE.coarse_match)
     kernel = replace(scored.kernel, match=match)
@@ -155,7 +155,7 @@ def _candidates(
     if prior.T_camera_lidar_before is not None:
         # Last: whether an earlier day was calibrated already must not change a day whose own data decide.
         state = AlignmentState(prior.T_camera_lidar_before)
-        yield "state", state.within(prior, search_range(prior, scored.config)), True
+        yield "state", state.within(prior, search_range(prior.sigmas, scored.config)), True
 
 
 def _climbed(scored: Scored, start: AlignmentState) -> AlignmentState:
@@ -178,7 +178,7 @@ class _Search:
         self.ends: list[_End] = []
         kernel_rad = scored.kernel.sigma_px / float(scored.terms.camera[1])
         self.same_rad = max(_SAME_OPTIMUM_RAD, _SAME_OPTIMUM_KERNELS * kernel_rad)
-        reach = search_range(scored.prior, scored.config).rotation_rad
+        reach = search_range(scored.prior.sigmas, scored.config).rotation_rad
         self.leads_there_rad = SCHEDULE.grid_step_kernels * grid_kernel_rad(reach)
         self.poses, self.candidates = len(grid_turns(reach)), 0
 
