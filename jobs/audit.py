@@ -32,7 +32,6 @@ def audit(
     from jobs.terminal.summary import exit_code, left_out, print_summary, progress_reporter
     from jobs.terminal.vehicle_status import (
         count_statuses,
-        model_lines,
         moved_sensors,
         next_steps,
         realigned_radars,
@@ -40,7 +39,7 @@ def audit(
     from pipeline.calibrate.methods import method_named
     from pipeline.config import load_fleet
     from pipeline.stage_work import Task, Window
-    from pipeline.stages import AUDIT, LINES, REPORT, STATE
+    from pipeline.stages import AUDIT, REPORT, STATE
     from pipeline.store.partitions import Lake
     from schemas.drift import DRIFT, DRIFT_STATUSES
 
@@ -51,7 +50,6 @@ def audit(
     with progress_reporter("audit") as progress:
         task = Task(config, tables, Window(from_day, to_day), method, progress=progress)
         outcome = AUDIT.run(task)
-        lines = LINES.run(task)
         STATE.run(task)
     findings = DRIFT.rows_among(outcome.records)
     charts = [f.status for f in findings]
@@ -73,7 +71,6 @@ def audit(
         charts={s: charts.count(s) for s in DRIFT_STATUSES},
         moved=moved_sensors(findings),
         **realigned_radars([outcome]),
-        **model_lines([lines]),
         next_steps=next_steps(findings, lake),
         damaged=damaged,
         report=report,

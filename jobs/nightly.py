@@ -64,7 +64,7 @@ def nightly(
     from jobs.extras import require
     from jobs.night_sinks import night_sinks
     from jobs.terminal.summary import exit_code
-    from jobs.terminal.vehicle_status import model_lines, realigned_radars
+    from jobs.terminal.vehicle_status import realigned_radars
     from pipeline.calibrate.methods import method_named
     from pipeline.config import load_fleet
     from pipeline.extrinsics.prior import require_named_files
@@ -96,7 +96,7 @@ def nightly(
         tidy(tables)
         code = exit_code([*night_statuses(outcomes, config), *(["incomplete"] if tables.damage else [])])
         sinks.ended(code, findings)
-    realigned = realigned_radars(closed) | model_lines(closed)
+    realigned = realigned_radars(closed)
     _print_end(tables, code, outcomes, findings, pages, rigs_to_mend(outcomes, config), realigned)
     return held_exit_code if code == 3 else code
 
@@ -227,7 +227,7 @@ def close_night(
     from pipeline.fleet.pages import OnWorkers
     from pipeline.report.stage import Pages
     from pipeline.stage_work import Task, Window
-    from pipeline.stages import AUDIT, LINES, REPORT, STATE
+    from pipeline.stages import AUDIT, REPORT, STATE
     from pipeline.store.files import LocalFiles
     from pipeline.store.partitions import Partition
     from schemas.drift import DRIFT
@@ -236,7 +236,6 @@ def close_night(
         task = Task(night.fleet, night.lake, Window(None, to_day), night.method, progress=progress)
         audit = AUDIT.run(task)
         told(audit)
-        told(LINES.run(task))
         told(STATE.run(task))
     findings = DRIFT.rows_among(audit.records)
     if not findings:

@@ -17,8 +17,6 @@ Table = Literal[
     "radar_alignments",
     "drift",
     "states",
-    "fleet_model",
-    "line_answers",
     "outcomes",
     "service_events",
     "moments",
@@ -45,8 +43,7 @@ def show(
         day: only this day, YYYY-MM-DD.
         method: only records of this method.
         current: only the current record of each vehicle, day, method and edge or sensor; for drift, findings
-            of the last audit; for fleet_model and line_answers, rows of the last night; for service_events,
-            events that were not withdrawn; for outcomes, all rows.
+            of the last audit; for service_events, events that were not withdrawn; for outcomes, all rows.
         json: print only a JSON list: oldest record first, keys as the columns. Calibrations have "T" too, the
             4x4 row-major T_parent_child; poses have T_reference_sensor (null if refused).
     """
@@ -93,8 +90,6 @@ def _records(
         "radar_alignments": current_alignments,
         "drift": current_drift,
         "states": current_states,
-        "fleet_model": list,
-        "line_answers": list,
         "outcomes": list,
         "service_events": current_events,
     }
@@ -102,27 +97,13 @@ def _records(
     rows = [r for r in rows if method in (None, getattr(r, "method", None))]
     names = [c.name for c in TABLES[table].columns]
     chosen = kinds[table](rows) if current else rows
-    if current and table in (
-        "drift",
-        "fleet_model",
-        "line_answers",
-    ):  # what the last night left out is not current
+    if current and table == "drift":  # what the last audit left out is not current
         last = {last_assertion(lake, TABLES[table], m) for m in {r.method for r in chosen}}
-        days = {(a.day, a.method) for a in last if a is not None}
-        # Rows of a model line are asserted one by one; of another day's none is current.
-        chosen = [
-            r
-            for r in chosen
-            if (
-                Assertion(r.asserted_at, r.day, r.method) in last
-                if table == "drift"
-                else (r.day, r.method) in days
-            )
-        ]
+        chosen = [r for r in chosen if Assertion(r.asserted_at, r.day, r.method) in last]
     if table == "states":
         return state_rows(lake, chosen)
     shown = [{n: getattr(r, n) for n in names} for r in chosen]
-    if table in ("calibrations", "poses", "line_answers"):
+    if table in ("calibrations", "poses"):
         return [row | {"T": transform_of(r)} for row, r in zip(shown, chosen, strict=True)]
     return shown
 

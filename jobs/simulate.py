@@ -27,7 +27,6 @@ def simulate(
     container: Literal["mcap", "ros1", "db3", "mixed"] = "mcap",
     faults: str = "",
     remount_deg: float | None = None,
-    alike_deg: float | None = None,
     reflectors: bool = False,
     seed: int = 1,
     workers: int = 1,
@@ -55,8 +54,6 @@ def simulate(
             intrinsics, centre, centre-v [px], labels, night, dusk, few.
         remount_deg: standard deviation per axis of the mounting's change from day to day, for a rig that is
             taken off every evening; default: the change of a fixed sensor, some hundredths of a degree.
-        alike_deg: standard deviation per axis between the vehicles' mounts, about a deviation from the
-            drawing common to all; default: independent deviations with the sigmas of the prior.
         reflectors: record three corner reflectors on every vehicle's last day too, under OUT/reflectors.
         seed: random seed; the same seed gives the same logs.
         workers: number of processes.
@@ -84,7 +81,6 @@ def simulate(
         faults=named,
         seed=seed,
         remount_deg=remount_deg,
-        alike_deg=alike_deg,
     )
     return _write(spec, out, reflectors, workers)
 

@@ -27,7 +27,6 @@ from pipeline.sections import (
     TERMS,
     AuditConfig,
     ChecksConfig,
-    FleetModelConfig,
     IngestConfig,
     LearnConfig,
     PerceiveConfig,
@@ -45,7 +44,6 @@ __all__ = [
     "AuditConfig",
     "ChecksConfig",
     "FleetConfig",
-    "FleetModelConfig",
     "IngestConfig",
     "LearnConfig",
     "PerceiveConfig",
@@ -67,14 +65,14 @@ _SHORT = {(section, kind) for kind, section in SECTIONS.items()}
 
 
 class Vehicle(Section):
-    """One vehicle: the name of its rig, and of its model line if it is not the rig's."""
+    """One vehicle: the name of its rig, and of its model if it is not the rig's."""
 
     rig: str = "default"
     model: str | None = None
 
     @property
-    def line(self) -> str:
-        """Name of the model line, whose vehicles are taken to be built alike."""
+    def model_or_rig(self) -> str:
+        """Name of the model, whose vehicles are taken to be built alike."""
         return self.model or self.rig
 
 
@@ -103,7 +101,6 @@ class FleetConfig(Section):
     prepare: PrepareConfig = PrepareConfig()
     learn: LearnConfig = LearnConfig()
     audit: AuditConfig = AuditConfig()
-    fleet_model: FleetModelConfig = FleetModelConfig()
     report: ReportConfig = ReportConfig()
     _file: Path = PrivateAttr(default=Path("fleet.toml"))  # not a key of the file: neither dumped nor hashed
 
@@ -120,10 +117,10 @@ class FleetConfig(Section):
                 )
         rig_of: dict[str, str] = {}
         for name, vehicle in self.vehicles.items():
-            if rig_of.setdefault(vehicle.line, vehicle.rig) != vehicle.rig:
+            if rig_of.setdefault(vehicle.model_or_rig, vehicle.rig) != vehicle.rig:
                 raise ValueError(
-                    f"vehicles.{name}: model {vehicle.line!r} has the rig {vehicle.rig!r} here and "
-                    f"{rig_of[vehicle.line]!r} elsewhere; vehicles of one model have one rig"
+                    f"vehicles.{name}: model {vehicle.model_or_rig!r} has the rig {vehicle.rig!r} here and "
+                    f"{rig_of[vehicle.model_or_rig]!r} elsewhere; vehicles of one model have one rig"
                 )
         return self
 

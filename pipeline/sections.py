@@ -332,18 +332,6 @@ class ReportConfig(Section):
     road_users: Literal["shown", "hidden"] = "shown"
 
 
-class FleetModelConfig(Section):
-    """What the vehicles of a model line share, and what of it is loaded."""
-
-    # "report": states are those of each vehicle alone, and the answer with the line stands beside them; "states": the
-    # answer with the line is what `boresight state` and `export` give.
-    use: Literal["report", "states"] = "report"
-    # Sigma of the common error of all mounts of a line about their drawing; left out: that of the prior. A small one
-    # lets data tell an error that all sensors share from one of all mounts.
-    common_mount_sigma_deg: Positive | None = None
-    common_mount_sigma_m: Positive | None = None
-
-
 class AuditConfig(Section):
     """Control charts and drift audit."""
 

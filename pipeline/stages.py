@@ -11,7 +11,6 @@ from schemas.calibrations import CALIBRATIONS
 from schemas.captures import CAPTURES
 from schemas.drift import DRIFT
 from schemas.features import FEATURES
-from schemas.fleet_model import FLEET_MODEL, LINE_ANSWERS
 from schemas.moments import MOMENTS, PERCEIVED
 from schemas.poses import POSES
 from schemas.radar_alignments import RADAR_ALIGNMENTS
@@ -19,7 +18,7 @@ from schemas.service_events import SERVICE_EVENTS
 from schemas.states import STATES
 from schemas.training import TRAINING
 
-__all__ = ["AUDIT", "CALIBRATE", "INGEST", "LINES", "PERCEIVE", "PREPARE", "REPORT", "STAGES", "STATE"]
+__all__ = ["AUDIT", "CALIBRATE", "INGEST", "PERCEIVE", "PREPARE", "REPORT", "STAGES", "STATE"]
 
 _INGESTED, _PERCEIVED = (MOMENTS, *CAPTURES.values()), (PERCEIVED, *FEATURES.values())
 
@@ -40,16 +39,9 @@ AUDIT = Stage(
     "pipeline.audit.stage:work",
     per_vehicle_day=False,
 )
-LINES = Stage(
-    "lines",
-    (CALIBRATIONS, RADAR_ALIGNMENTS, DRIFT),
-    (LINE_ANSWERS, FLEET_MODEL),
-    "pipeline.audit.line_stage:work",
-    per_vehicle_day=False,
-)
 STATE = Stage(
     "state",
-    (CALIBRATIONS, POSES, DRIFT, LINE_ANSWERS),
+    (CALIBRATIONS, POSES, DRIFT),
     (STATES,),
     "pipeline.audit.state_stage:work",
     per_vehicle_day=False,
@@ -62,4 +54,4 @@ REPORT = Stage(
     per_vehicle_day=False,
 )
 
-STAGES = (INGEST, PERCEIVE, PREPARE, CALIBRATE, AUDIT, LINES, STATE, REPORT)
+STAGES = (INGEST, PERCEIVE, PREPARE, CALIBRATE, AUDIT, STATE, REPORT)

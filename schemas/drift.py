@@ -67,7 +67,7 @@ class DriftFinding(Recorded):
     moved_motion_sigma: list[float] | None = column("sigmas of moved_motion", default=None)
     inputs: list[str] = column("work keys of the records on the chart", default_factory=list)
     day_scale: float | None = column(
-        "ratio of the days' scatter to their sigmas on this chart, learnt from the model line and the vehicle; null "
+        "ratio of the days' scatter to their sigmas on this chart, learnt from the model's vehicles and its own; null "
         "before version 4",
         default=None,
     )

@@ -58,8 +58,7 @@ class PoseRow(Posed):
     prior_tz_m: float | None = column(_PRIOR, default=None)
     prior_covariance: np.ndarray | None = array("<f8", (6, 6), "prior covariance, same order", default=None)
     unsure_only: bool = column(
-        "held for nothing but too few frames or scenes, or a sigma that is too large for the limits: model lines count "
-        "such days",
+        "held for nothing but too few frames or scenes, or a sigma that is too large for the limits",
         default=False,
     )
     notes: list[str] = column("remarks", default_factory=list)

@@ -12,8 +12,6 @@ from schemas.columns import Posed, TableSchema, array, column, row
 
 __all__ = ["STATES", "StateRow"]
 
-_WITH_LINE = "pose T_parent_child with the vehicle's model line (table line_answers); null without one"
-_ALONE = "pose T_parent_child of the vehicle alone, where the one with its line is loaded; null elsewhere"
 _REFERENCE = "mean pose T_parent_child of the reference days; null until there are enough of them"
 
 
@@ -70,54 +68,14 @@ class StateRow(Posed):
     reference_observable: list[bool] | None = column(
         "per DoF: determined by at least one reference day", default=None
     )
-    loads: str = column(
-        "alone (the pose is that of the vehicle alone) or line (the one with its model line: [fleet_model] use = "
-        "'states')",
-        default="alone",
-    )
-    line_status: str | None = column(
-        "shared (the model line has a part in the line_ pose), outside (the vehicle differs from its line) or alone "
-        "(the line is not GREEN, or was not learnt tonight); null before version 6",
-        default=None,
-    )
-    line_reason: str | None = column("reason for line_status", default=None)
-    line_qw: float | None = column(_WITH_LINE, default=None)
-    line_qx: float | None = column(_WITH_LINE, default=None)
-    line_qy: float | None = column(_WITH_LINE, default=None)
-    line_qz: float | None = column(_WITH_LINE, default=None)
-    line_tx_m: float | None = column(_WITH_LINE, default=None)
-    line_ty_m: float | None = column(_WITH_LINE, default=None)
-    line_tz_m: float | None = column(_WITH_LINE, default=None)
-    line_covariance: np.ndarray | None = array(
-        "<f8", (6, 6), "covariance of the pose with the line, left perturbation [rad, m]", default=None
-    )
-    line_azimuth_sigma_rad: float | None = column("sigma of a target's azimuth with the line", default=None)
-    line_elevation_sigma_rad: float | None = column(
-        "sigma of a target's elevation with the line", default=None
-    )
-    line_moved_by: list[float] | None = column(
-        "from the vehicle's answer alone to the one with the line: rotation vector [rad], shift of the child's origin "
-        "[m], in the parent's axes",
-        default=None,
-    )
-    alone_qw: float | None = column(_ALONE, default=None)
-    alone_qx: float | None = column(_ALONE, default=None)
-    alone_qy: float | None = column(_ALONE, default=None)
-    alone_qz: float | None = column(_ALONE, default=None)
-    alone_tx_m: float | None = column(_ALONE, default=None)
-    alone_ty_m: float | None = column(_ALONE, default=None)
-    alone_tz_m: float | None = column(_ALONE, default=None)
-    alone_covariance: np.ndarray | None = array(
-        "<f8", (6, 6), "covariance of the pose of the vehicle alone", default=None
-    )
 
 
 STATES = TableSchema(
     StateRow,
     "states",
-    6,
+    7,
     "boresight state prints the latest rows.",
     made_by="state",
-    reads_versions=(1, 2, 3, 4, 5),
+    reads_versions=(1, 2, 3, 4, 5, 6),
     about=("vehicle", "day", "method", "pair", "parent_frame", "child_frame"),
 )

@@ -10,7 +10,6 @@ from schemas.captures import CAPTURES
 from schemas.columns import TableSchema
 from schemas.drift import DRIFT
 from schemas.features import FEATURES
-from schemas.fleet_model import FLEET_MODEL, LINE_ANSWERS
 from schemas.moments import MOMENTS, PERCEIVED
 from schemas.outcomes import OUTCOMES
 from schemas.poses import POSES
@@ -28,8 +27,8 @@ CODE_VERSION = "0.12.0"
 TABLES: dict[str, TableSchema] = {
     t.name: t
     for t in (
-        MOMENTS, *CAPTURES.values(), PERCEIVED, *FEATURES.values(), TRAINING, CALIBRATIONS, POSES, DRIFT, LINE_ANSWERS,
-        FLEET_MODEL, STATES, OUTCOMES, SERVICE_EVENTS, RADAR_ALIGNMENTS,
+        MOMENTS, *CAPTURES.values(), PERCEIVED, *FEATURES.values(), TRAINING, CALIBRATIONS, POSES, DRIFT,
+        STATES, OUTCOMES, SERVICE_EVENTS, RADAR_ALIGNMENTS,
     )
 }  # fmt: skip
 

@@ -21,7 +21,6 @@ FOUNDATIONS = {
     "names",
     "sections",
     "results",
-    "fleet_model",
     "geometry",
     "store",
     "objective",

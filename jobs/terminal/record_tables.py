@@ -33,8 +33,6 @@ def print_table(table: str, rows: list[dict[str, Any]]) -> None:
         "poses": _pose_row_cells,
         "drift": _drift_cells,
         "states": _state_cells,
-        "fleet_model": _line_cells,
-        "line_answers": _answer_cells,
         "outcomes": _outcome_cells,
         "service_events": _event_cells,
     }.get(table, _partition_cells)
@@ -90,35 +88,6 @@ def _alignment_cells(row: dict[str, Any]) -> list[dict[str, str]]:
     from pipeline.report.radar_alignments import alignment_lines
 
     return [_named(row, "vehicle", "day", "method") | line for line in alignment_lines(row)]
-
-
-def _line_cells(row: dict[str, Any]) -> dict[str, str]:
-    from pipeline.report.lines import scatter_words, shared_words
-
-    return {
-        **_named(row, "day", "method", "line"),
-        "edge": _edge(row),
-        **_named(row, "status"),
-        "vehicles": str(row["vehicles"]),
-        "outside": ", ".join(row["outside"]),
-        "since": row["since"] or "",
-        "mounts scatter by": scatter_words(row["scatter"]),
-        "shared (1 sigma)": "\n".join(shared_words(row)),
-        "reason": row["reason"],
-    }
-
-
-def _answer_cells(row: dict[str, Any]) -> dict[str, str]:
-    far = row["distance_sigmas"]
-    return {
-        **_named(row, "vehicle", "day", "method", "line"),
-        "edge": _edge(row),
-        **_named(row, "status"),
-        **_pose_cells(row["T"], None, with_change=False),
-        **_sure_cells(row),
-        "from its line": "" if far is None else f"{far:.1f} sigmas ({row['distance_axis']})",
-        "reason": row["reason"],
-    }
 
 
 def _sure_cells(row: dict[str, Any]) -> dict[str, str]:
@@ -184,22 +153,9 @@ def _state_cells(row: dict[str, Any]) -> dict[str, str]:
         "state": row["status"],
         **_pose_cells(row["T"], row["T_prior"]),
         **_sure_cells(row),
-        "with its line": _line_words(row),
         "days": f"{len(days)}: {days[0]} to {days[-1]}" if days else "0",
         "reason": "; ".join(text for text in (row["reason"], _unchecked(row["unchecked"] or {})) if text),
     }
-
-
-def _line_words(row: dict[str, Any]) -> str:
-    """Answer with the model line: its sigmas, and the turn from the vehicle's answer alone to it."""
-    if row["line_status"] in (None, "alone"):
-        return ""
-    if row["line_status"] == "outside":
-        return f"outside: {row['line_reason']}"
-    sigmas = (row["line_azimuth_sigma_rad"], row["line_elevation_sigma_rad"])
-    sure = "/".join(f"{s * 180 / math.pi:.3f}" for s in sigmas)
-    turn = " ".join(f"{v * 180 / math.pi:+.3f}" for v in row["line_moved_by"][:3])
-    return f"sigma {sure} deg, turned by {turn} deg{' (loaded)' if row['loads'] == 'line' else ''}"
 
 
 def _unchecked(sigmas: dict[str, float]) -> str:

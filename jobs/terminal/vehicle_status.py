@@ -9,10 +9,9 @@ from typing import Any
 from jobs.terminal.record_tables import STATUS_STYLES
 from pipeline.results import Outcome
 from schemas.drift import DRIFT_STATUSES, DriftFinding, VehicleStatus, next_step, status_of
-from schemas.fleet_model import FLEET_MODEL, LINE_ANSWERS
 from schemas.service_events import SERVICE_EVENTS
 
-__all__ = ["count_statuses", "model_lines", "moved_sensors", "next_steps", "realigned_radars", "status_lines"]
+__all__ = ["count_statuses", "moved_sensors", "next_steps", "realigned_radars", "status_lines"]
 
 _STEPS = 40  # vehicles whose next steps are printed; the others are counted
 
@@ -47,24 +46,6 @@ def realigned_radars(outcomes: Sequence[Outcome]) -> dict[str, list[dict[str, st
     events = SERVICE_EVENTS.rows_among(row for outcome in outcomes for row in outcome.records)
     found = [{"vehicle": e.vehicle, "sensor": e.sensor, "what": e.note} for e in events]
     return {"realigned": found} if found else {}
-
-
-def model_lines(outcomes: Sequence[Outcome]) -> dict[str, dict[str, Any]]:
-    """Under key `lines`: status of each line and edge, and vehicles that differ; or why no line was learnt."""
-    from pipeline.report.lines import too_few
-    from pipeline.rig.edges import line_edge, words_of
-
-    rows = [row for outcome in outcomes for row in outcome.records]
-    found = FLEET_MODEL.rows_among(rows)
-    few = too_few(found)
-    status = {f"{r.line} {words_of(line_edge(r))}": r.status for r in found if r.line not in few}
-    differ = sorted({a.vehicle for a in LINE_ANSWERS.rows_among(rows) if a.differs})
-    left = [f"and {len(differ) - _STEPS} more"] if len(differ) > _STEPS else []
-    told = {"status": status, "vehicles_that_differ": differ[:_STEPS] + left, "too_few_vehicles": few}
-    if found:
-        return {"lines": told}
-    why = [outcome.reason for outcome in outcomes if outcome.stage == "lines" and outcome.reason]
-    return {"lines": {"not_learnt": why[0]}} if why else {}
 
 
 def next_steps(findings: Sequence[DriftFinding], lake: str) -> list[str]:

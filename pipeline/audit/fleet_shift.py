@@ -1,7 +1,7 @@
-"""Changes that nearly all vehicles of a model line show on the same day: a release, or another common cause.
+"""Changes that nearly all vehicles of a model show on the same day: a release, or another common cause.
 
-They are removed from the days of the line's vehicles, which are judged again, so a vehicle that was also
-knocked on that day still shows a change. A change of half of a line is not removed, because no majority
+They are removed from the days of the model's vehicles, which are judged again, so a vehicle that was also
+knocked on that day still shows a change. A change of half of a model's vehicles is not removed, because no majority
 determines which half is right.
 """
 
@@ -41,9 +41,9 @@ class FleetShift:
 def judge_without_fleet_shifts(
     fleet: Sequence[Mapping[Edge, PairDays]], config: AuditConfig, models: Sequence[str] = ()
 ) -> tuple[list[VehicleVerdict], dict[tuple[str, Edge, str], FleetShift]]:
-    """Verdicts on all vehicles, and the removed changes by (model line, edge, dof).
+    """Verdicts on all vehicles, and the removed changes by (model, edge, dof).
 
-    `models` has the model line of each vehicle; empty = all vehicles have the same one.
+    `models` has the model of each vehicle; empty = all vehicles have the same one.
     """
     verdicts = judge_fleet(fleet, config, models)
     names = list(models) or [""] * len(fleet)
@@ -61,7 +61,7 @@ def judge_without_fleet_shifts(
 def shifts_of(
     model: str, shifts: Mapping[tuple[str, Edge, str], FleetShift]
 ) -> dict[tuple[Edge, str], FleetShift]:
-    """Changes of one model line."""
+    """Changes of one model."""
     return {(edge, dof): shift for (of, edge, dof), shift in shifts.items() if of == model}
 
 

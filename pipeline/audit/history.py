@@ -43,8 +43,8 @@ def last_audited_day(lake: Lake, tomorrow: str) -> str | None:
 
 
 def models_of(fleet: FleetConfig, vehicles: Iterable[str]) -> list[str]:
-    """Model line of each vehicle, if fleet.toml has the vehicle."""
-    return [fleet.vehicle(vehicle).line if fleet.knows(vehicle) else "" for vehicle in vehicles]
+    """Model of each vehicle, if fleet.toml has the vehicle."""
+    return [fleet.vehicle(vehicle).model_or_rig if fleet.knows(vehicle) else "" for vehicle in vehicles]
 
 
 @dataclass

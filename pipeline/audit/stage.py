@@ -125,11 +125,11 @@ def _judged(
     days = [_charted(vehicle, window, fleet.audit) for vehicle in vehicles.values()]
     models = models_of(fleet, vehicles)
     verdicts, shifts = judge_without_fleet_shifts(days, fleet.audit, models)
-    of_line = {model: shifts_of(model, shifts) for model in set(models)}
+    of_model = {model: shifts_of(model, shifts) for model in set(models)}
     before = _found_before(task.lake, method, dict(zip(vehicles, verdicts, strict=True)), first)
     for done, ((name, vehicle), verdict) in enumerate(zip(vehicles.items(), verdicts, strict=True)):
         progress(done, len(vehicles), name)
-        yield _findings(fleet, name, vehicle, verdict, window, (of_line[models[done]], before.get(name, {})))
+        yield _findings(fleet, name, vehicle, verdict, window, (of_model[models[done]], before.get(name, {})))
     progress(len(vehicles), len(vehicles), "")
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import datetime as dt
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import replace
-from typing import cast
 
 import numpy as np
 from jaxtyping import Float
@@ -13,14 +12,13 @@ from jaxtyping import Float
 from pipeline.audit.days import DOFS, charts_of_fleet, edges_of_fleet
 from pipeline.audit.estimates import Estimates, days_of, estimates_of, joined
 from pipeline.audit.history import History, models_of
-from pipeline.audit.line_states import answers_of, with_its_line
 from pipeline.audit.noise import estimate_noise
 from pipeline.audit.pose_states import pose_states, read_poses
 from pipeline.audit.references import Kept, first_accepted, kept_columns, kept_of, read_kept
 from pipeline.audit.service import events_until, restart_of, since_of
 from pipeline.audit.state_rows import fused, with_state
 from pipeline.config import AuditConfig, FleetConfig, config_hash
-from pipeline.rig.graph import Edge, Kind, RigPose, Sensor
+from pipeline.rig.graph import Edge
 from pipeline.stage_work import Records, Run, Task, Told, Window, Work
 from pipeline.store.partitions import Partition, content_hash, days_after, last_possible_day, work_key
 from pipeline.store.records import last_day, read_last
@@ -58,7 +56,6 @@ def work(task: Task) -> Work:
     changes: dict[str, list[DriftFinding]] = {}
     for finding in read_last(task.lake, DRIFT, DriftFinding, method, columns=_CHANGE):
         changes.setdefault(finding.vehicle, []).append(finding)
-    answers = answers_of(task.lake, method, last)
     references = _references(history, records, (first, last), events, fleet.audit) if last else {}
 
     def rows(run: Run) -> Generator[Records, None, None]:
@@ -75,31 +72,16 @@ def work(task: Task) -> Work:
             whole = [replace(r, **kept_columns(k, count)) for r, k in zip(own.rows, kept, strict=True)]
             known = events.get(vehicle, ()), changes.get(vehicle, ())
             about = vehicle, last, method
-            use = fleet.fleet_model.use
-            whole = [with_its_line(r, edge, answers, use) for r, edge in zip(whole, edges, strict=True)]
-            whole += [
-                r if edge is None else with_its_line(r, edge, answers, use)
-                for r in pose_states(about, poses, known, own_scales.get(vehicle, {}), fleet.verify)
-                for edge in [_pose_of(r, poses.references[vehicle])]
-            ]
+            whole += pose_states(about, poses, known, own_scales.get(vehicle, {}), fleet.verify)
             begun = {edge.name: first for edge, first in since.items()}
-            config = config_hash(
-                fleet.audit, fleet.verify, fleet.fleet_model, {"to": last, "method": method, "since": begun}
-            )
+            config = config_hash(fleet.audit, fleet.verify, {"to": last, "method": method, "since": begun})
             inputs = sorted({*(own.inputs or ()), *(key for row in whole for key in row.inputs)})
             key = work_key("state", CODE_VERSION, config, [*inputs, content_hash(whole)])
             yield replace(own, rows=[replace(r, work_key=key) for r in whole], work_key=key, inputs=inputs)
 
-    settings = (fleet.audit, fleet.verify, fleet.fleet_model, {"to": last, "method": method})
+    settings = (fleet.audit, fleet.verify, {"to": last, "method": method})
     read = tuple(sorted({*records.keys(), *poses.estimates.keys()}))
     return Work(settings, rows, inputs=read, tell=_told, again=True)
-
-
-def _pose_of(row: StateRow, reference: Sensor) -> RigPose | None:
-    """The edge or pose that a row of a sensor describes; None for the reference itself."""
-    if row.kind is None or row.child_frame == reference.name:
-        return None
-    return RigPose(reference, Sensor(row.child_frame, cast("Kind", row.kind)))
 
 
 def _references(

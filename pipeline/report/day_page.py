@@ -11,7 +11,6 @@ from pipeline.config import FleetConfig
 from pipeline.errors import ConfigError, DamagedError
 from pipeline.report.day import PairView, answer_for, answered, pair_view, sigmas_of, status_sentence
 from pipeline.report.figures import SigmaPanel, residual_figure, sigma_figure
-from pipeline.report.lines import answer_cells, last_answers
 from pipeline.report.page import render, write_page
 from pipeline.report.picture_file import write_picture
 from pipeline.report.pictures import ScenePictures, scene_pictures
@@ -37,7 +36,6 @@ from pipeline.store.files import Files, LocalFiles
 from pipeline.store.partitions import Lake, Partition
 from schemas.calibrations import PAIRS, CalibrationRecord, pairs_of
 from schemas.drift import DriftFinding
-from schemas.fleet_model import LineAnswer
 from schemas.words import day_word
 
 __all__ = ["DayRead", "write_day_page", "write_day_picture"]
@@ -48,11 +46,10 @@ P = TypeVar("P", bound=PurePath)
 
 @dataclass(frozen=True)
 class DayRead:
-    """Input of the page of a vehicle-day: its current records by edge, the vehicle's current findings and answers."""
+    """Input of the page of a vehicle-day: its current records by edge, the vehicle's current findings."""
 
     records: Mapping[str, CalibrationRecord]
     findings: Sequence[DriftFinding]
-    answers: Sequence[LineAnswer] = ()
 
 
 def write_day_page(
@@ -86,7 +83,6 @@ def write_day_page(
         read = DayRead(
             day_records(lake, partition, method),
             drift_of(lake, method, partition.vehicle),
-            last_answers(lake, method, [partition.vehicle]),
         )
     shown = _content(lake, partition, read, fleet.report if pictures else None)
     html = render(
@@ -159,13 +155,6 @@ def _content(
         "residual_svg": residual_svg,
         "alignments": [
             line for row in day_alignments(lake, partition, records) for line in alignment_lines(asdict(row))
-        ],
-        "lines": [
-            cells
-            for answer in read.answers
-            if answer.record_day == partition.day
-            for cells in [answer_cells(answer, of_day=True)]
-            if cells is not None
         ],
         "provenance": _provenance(list(records.values())),
     }

@@ -15,7 +15,6 @@ import numpy as np
 from pipeline.config import FleetConfig
 from pipeline.report.charts import charted_edges, fleet_charts
 from pipeline.report.fleet import DAY_LETTERS, VehicleRow, finding_views, fleet_rows, headline_for, index_row
-from pipeline.report.lines import fleet_lines
 from pipeline.report.names import page_stem
 from pipeline.report.page import render, write_page
 from pipeline.report.reading import fleet_records
@@ -78,8 +77,6 @@ def render_fleet_page(
         shown=rows[:_CHARTS],
         index=json.dumps(_index(album, days, rows, {v.vehicle: v for v in views}, (edges, charts))),
         dofs=[f"{d} [{'deg' if d.startswith('r') else 'm'}]" for d in DOF_NAMES],
-        models=fleet_lines(album.lake, album.method, [row.vehicle for row in rows[:_CHARTS]]),
-        loads_lines=album.fleet.fleet_model.use == "states",
         truth=known,
         truth_summary=truth_summary(known),
         provenance=_provenance(window, verdicts),

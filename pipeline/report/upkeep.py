@@ -7,14 +7,13 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cache, lru_cache
+from functools import lru_cache
 from pathlib import Path, PurePath
 from typing import Any, Protocol, runtime_checkable
 from urllib.parse import quote
 
 from pipeline.config import FleetConfig, config_hash
 from pipeline.report.day_page import DayRead, write_day_page
-from pipeline.report.lines import last_answers
 from pipeline.report.names import page_name
 from pipeline.report.reading import records_of_day
 from pipeline.results import MadeWhenAsked, Progress, silent
@@ -22,7 +21,6 @@ from pipeline.store.files import Files
 from pipeline.store.partitions import Lake, Partition
 from schemas.calibrations import CalibrationRecord
 from schemas.drift import DriftFinding, status_of
-from schemas.fleet_model import LineAnswer
 from schemas.versions import CODE_VERSION
 
 __all__ = ["Album", "DayJob", "FanOut", "draw_days", "one_by_one", "stamp_of"]
@@ -184,17 +182,9 @@ def _jobs(
         among = {vehicle for vehicle, of in vehicle_days if of == day}
         return records_of_day(sent.lake, sent.method, day, among)
 
-    @cache
-    def answers() -> dict[str, list[LineAnswer]]:
-        found: dict[str, list[LineAnswer]] = {}
-        for answer in last_answers(sent.lake, sent.method, {vehicle for vehicle, _ in vehicle_days}):
-            found.setdefault(answer.vehicle, []).append(answer)
-        return found
-
     def job(index: int) -> DayJob:
         vehicle, day = vehicle_days[index]
-        of_line = [answer for answer in answers().get(vehicle, ()) if answer.record_day == day]
-        read = DayRead(records(day).get(vehicle, {}), findings.get(vehicle, ()), of_line)
+        read = DayRead(records(day).get(vehicle, {}), findings.get(vehicle, ()))
         return DayJob(sent, Partition(vehicle, day), read)
 
     return MadeWhenAsked(len(vehicle_days), job)

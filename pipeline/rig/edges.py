@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cache
 from typing import Final, cast
 
 import numpy as np
@@ -11,10 +10,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from jaxtyping import Int
 
-from pipeline.rig.graph import EDGE_KINDS, TIE_KINDS, Edge, Kind, RigPose, Sensor
+from pipeline.rig.graph import EDGE_KINDS, TIE_KINDS, Edge, Kind, Sensor
 from schemas.calibrations import FRAMES_OF_PAIR, CalibrationRecord
 from schemas.drift import DriftFinding
-from schemas.fleet_model import FleetModelRow, LineAnswer
 from schemas.states import StateRow
 
 __all__ = [
@@ -24,9 +22,6 @@ __all__ = [
     "edge_of",
     "edge_order",
     "edges_of_rows",
-    "line_edge",
-    "line_edges",
-    "pair_of",
     "words_of",
 ]
 
@@ -47,30 +42,6 @@ def edge_of(row: CalibrationRecord | StateRow | DriftFinding) -> Edge:
     return edge_named(row.pair, row.parent_frame, row.child_frame)
 
 
-def line_edge(row: FleetModelRow | LineAnswer) -> Edge:
-    """The edge, or the sensor's pose, that a row of a model line describes."""
-    return _line_edge(row.pair, row.kinds, row.parent_frame, row.child_frame)
-
-
-def line_edges(rows: pa.Table) -> list[Edge]:
-    """`line_edge` of each row of a table."""
-    known = cache(_line_edge)
-    names = (rows[name].to_pylist() for name in ("pair", "kinds", "parent_frame", "child_frame"))
-    return [known(*of) for of in zip(*names, strict=True)]
-
-
-def _line_edge(pair: str, kinds: str, parent: str, child: str) -> Edge:
-    if pair != POSE:
-        return edge_named(pair, parent, child)
-    of_parent, of_child = (cast("Kind", kind) for kind in kinds.split("_"))
-    return RigPose(Sensor(parent, of_parent), Sensor(child, of_child))
-
-
-def pair_of(edge: Edge) -> str:
-    """Column `pair` of rows about an edge or a sensor's pose."""
-    return POSE if isinstance(edge, RigPose) else edge.kind
-
-
 # Edges of a rig whose sensors are named after their kinds, as in a short fleet.toml and in all records until
 # 0.10.
 EDGE_OF_PAIR: Final[Mapping[str, Edge]] = {
@@ -79,15 +50,12 @@ EDGE_OF_PAIR: Final[Mapping[str, Edge]] = {
 
 
 def edge_order(edge: Edge) -> tuple[int, str, str]:
-    """Sort key of an edge: kinds in the order of TIE_KINDS, then names; poses are last."""
-    kind = len(TIE_KINDS) if isinstance(edge, RigPose) else TIE_KINDS.index(edge.kind)
-    return kind, edge.parent.name, edge.child.name
+    """Sort key of an edge: kinds in the order of TIE_KINDS, then names."""
+    return TIE_KINDS.index(edge.kind), edge.parent.name, edge.child.name
 
 
 def words_of(edge: Edge) -> str:
-    """Text for an edge or a pose: an edge's kind if its sensors are named after their kinds, else their names."""
-    if isinstance(edge, RigPose):
-        return f"{edge.child.name} in {edge.parent.name}"
+    """Text for an edge: its kind if its sensors are named after their kinds, else their names."""
     return edge.kind if edge == EDGE_OF_PAIR.get(edge.kind) else edge.name
 
 

@@ -20,7 +20,6 @@ __all__ = [
     "Edge",
     "Kind",
     "RigGraph",
-    "RigPose",
     "Sensor",
     "edge_between",
     "is_one_of_each",
@@ -85,14 +84,6 @@ class Edge:
     def other(self, name: str) -> Sensor:
         """The sensor at the other end of the named one."""
         return self.child if name == self.parent.name else self.parent
-
-
-@dataclass(frozen=True, order=True)
-class RigPose(Edge):
-    """T_reference_sensor of an adjusted rig; not equal to the edge of the same two sensors, if there is one."""
-
-    def __post_init__(self) -> None:
-        assert self.parent.name != self.child.name
 
 
 def possible_edges(nodes: Sequence[Sensor]) -> tuple[Edge, ...]:

@@ -64,7 +64,6 @@ class FleetSpec:
     faults: tuple[Fault, ...] = ()
     seed: int = 1
     remount_deg: float | None = None  # sd per axis and day; None = the rig's (fixed sensors: hundredths)
-    alike_deg: float | None = None  # sd of the vehicles' mounts about a common one; None = each by itself
     semantics: SemanticsSpec = field(default_factory=SemanticsSpec)
 
     def __post_init__(self) -> None:
@@ -214,7 +213,7 @@ def mounting_on(spec: FleetSpec, vehicle: int, day: int, share: float = 0.0) -> 
     if spec.remount_deg is not None:  # the paper's rig is taken off every evening: lever arms change too
         shift_m = rig.remount_translation_m * max(spec.remount_deg / rig.remount_rotation_deg, 1.0) / 4
         rig = replace(rig, remount_rotation_deg=spec.remount_deg, remount_translation_m=shift_m)
-    mounting = mounting_of(rig, spec.seed, vehicle, day, spec.alike_deg)
+    mounting = mounting_of(rig, spec.seed, vehicle, day)
     return shaken(mounting, spec.faults, vehicle_names(spec)[vehicle], day, share)
 
 

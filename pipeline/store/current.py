@@ -16,7 +16,6 @@ from pipeline.geometry.targets import DEFAULT_TARGETS
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.columns import TableSchema
 from schemas.drift import DriftFinding
-from schemas.fleet_model import LineAnswer
 from schemas.poses import POSES, PoseRow
 from schemas.radar_alignments import RADAR_ALIGNMENTS, RadarAlignment
 from schemas.service_events import ServiceEvent
@@ -115,7 +114,7 @@ def current_events(events: Sequence[ServiceEvent]) -> list[ServiceEvent]:
 
 
 def transform_of(
-    record: CalibrationRecord | StateRow | PoseRow | LineAnswer,
+    record: CalibrationRecord | StateRow | PoseRow,
 ) -> Float[np.ndarray, "4 4"] | None:
     """T_parent_child of a record or state, T_reference_sensor of a pose; None without an estimate."""
     return pose_of(partial(getattr, record))

@@ -25,7 +25,6 @@ from schemas.columns import TableSchema
 __all__ = [
     "Assertion",
     "RecordIndex",
-    "count_of_days",
     "first_day",
     "last_assertion",
     "last_day",
@@ -103,28 +102,6 @@ def read_columns(
     for name in (n for n in asked if n not in found.column_names):
         field = schema.arrow_schema().field(name).with_nullable(True)
         found = found.append_column(field, pa.nulls(found.num_rows, field.type))
-    return found
-
-
-def count_of_days(
-    lake: Lake,
-    schema: TableSchema,
-    *,
-    first: str,
-    last: str,
-    vehicle: AbstractSet[str] | None = None,
-    asserted_after: str | None = None,
-) -> dict[str, int]:
-    """Number of rows that `read_columns` reads of each day, from few columns; days without rows are left out."""
-    wanted = replace(_wanted(vehicle, first, last), asserted_after=asserted_after)
-    names = ["day"] + ["vehicle"] * (vehicle is not None) + ["asserted_at"] * (asserted_after is not None)
-    found: dict[str, int] = {}
-    for file in data_files(lake, schema):
-        if not wanted.may_be_within(file.days, file.vehicles):
-            continue
-        part = read_file(lake, schema, file.name, names, wanted)
-        for value in pc.value_counts(_chosen(part, wanted)["day"]).to_pylist() if part is not None else ():
-            found[value["values"]] = found.get(value["values"], 0) + value["counts"]
     return found
 
 

@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 from scipy.linalg import eigh
 
-from pipeline.audit.line_records import Asked, read_line_records
 from pipeline.config import load_fleet
 from pipeline.geometry.se3 import inverse, log_se3
-from pipeline.rig.graph import RigPose
 from pipeline.simulate.fleet import FleetSpec
 from pipeline.stage_work import Task
 from pipeline.stages import CALIBRATE
@@ -80,17 +78,6 @@ def test_a_pose_has_the_prior_that_is_in_it_and_is_surer_along_every_direction(d
         assert shares.min() < 0.1, name
         checked += 1
     assert checked >= 3
-    counted = {
-        edge.child.name
-        for read in read_line_records(task.lake, DAY.day, DAY.day, Asked("joint", DAY.day))
-        for (_, edge), is_usable in zip(read.keys(), read.usable, strict=True)
-        if is_usable and isinstance(edge, RigPose)
-    }
-    assert counted == {
-        name
-        for name, pose in poses_of(task).items()
-        if name != "top" and (pose.status == "accepted" or pose.unsure_only)
-    }
 
 
 def test_a_front_camera_is_known_to_a_tenth_of_a_degree(day):

@@ -8,7 +8,6 @@ from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, SENSORS, Calibrat
 from schemas.captures import CAPTURES
 from schemas.drift import DRIFT, DriftFinding
 from schemas.features import FEATURES
-from schemas.fleet_model import FLEET_MODEL, LINE_ANSWERS, FleetModelRow, LineAnswer
 from schemas.frames import Frame
 from schemas.moments import MOMENTS, PERCEIVED
 from schemas.observations import Observation
@@ -32,8 +31,6 @@ ROW_TYPES = {
     RADAR_ALIGNMENTS.name: (RADAR_ALIGNMENTS, RadarAlignment),
     STATES.name: (STATES, StateRow),
     SERVICE_EVENTS.name: (SERVICE_EVENTS, ServiceEvent),
-    LINE_ANSWERS.name: (LINE_ANSWERS, LineAnswer),
-    FLEET_MODEL.name: (FLEET_MODEL, FleetModelRow),
 }
 
 

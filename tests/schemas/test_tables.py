@@ -11,7 +11,6 @@ from schemas.captures import CAPTURES
 from schemas.columns import TableSchema
 from schemas.drift import DRIFT, DriftFinding
 from schemas.features import FEATURES
-from schemas.fleet_model import FLEET_MODEL, LINE_ANSWERS, FleetModelRow, LineAnswer
 from schemas.moments import MOMENTS, PERCEIVED
 from schemas.outcomes import OUTCOMES, OutcomeRow
 from schemas.poses import POSES, PoseRow
@@ -26,8 +25,6 @@ ROW_TYPES = {
     TRAINING.name: TrainingRow,
     CALIBRATIONS.name: CalibrationRecord,
     DRIFT.name: DriftFinding,
-    FLEET_MODEL.name: FleetModelRow,
-    LINE_ANSWERS.name: LineAnswer,
     OUTCOMES.name: OutcomeRow,
     POSES.name: PoseRow,
     RADAR_ALIGNMENTS.name: RadarAlignment,

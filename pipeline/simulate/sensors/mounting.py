@@ -80,27 +80,11 @@ class Mounting:
         return mounted.camera, mounted.nominal_camera
 
 
-def mounting_of(rig: RigSpec, seed: int, vehicle: int, day: int, alike_deg: float | None = None) -> Mounting:
-    """Mounting of a vehicle on a day: CAD plus deviations of this vehicle and of the day's remount.
-
-    `alike_deg`: standard deviation per axis between vehicles (and a centimetre per degree), about a deviation
-        from CAD that all share; None = independent deviations.
-    """
+def mounting_of(rig: RigSpec, seed: int, vehicle: int, day: int) -> Mounting:
+    """Mounting of a vehicle on a day: CAD plus deviations of this vehicle and of the day's remount."""
     built = np.random.default_rng([seed, vehicle, 41])
     remount = np.random.default_rng([seed, vehicle, day, 42])
-    common = built if alike_deg is None else np.random.default_rng([seed, 43])
-    poses = {s.name: _poses(rig, s, common, remount) for s in rig.sensors}
-    if alike_deg is not None:
-        own = np.random.default_rng([seed, vehicle, 44])
-        poses = {
-            name: (
-                _disturbed(
-                    T, np.radians(alike_deg) * own.normal(size=3), 0.01 * alike_deg * own.normal(size=3)
-                ),
-                nominal,
-            )
-            for name, (T, nominal) in poses.items()
-        }
+    poses = {s.name: _poses(rig, s, built, remount) for s in rig.sensors}
     lenses = {s.name: _lens(s.sheet, built) for s in rig.sensors if isinstance(s.sheet, CameraSpec)}
     delays = {s.name: s.delay_s + built.normal(0, rig.delay_sd_s) for s in rig.sensors if s != rig.reference}
     # Range bias [m], elevation bias [deg].
