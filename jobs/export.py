@@ -17,7 +17,7 @@ __all__ = ["export"]
 
 What = Literal[
     "schemas", "onnx", "ros2", "tf-static", "urdf", "xacro", "autoware", "kitti", "nuscenes", "t4", "kalibr", "opencv",
-    "apollo", "openlabel", "matlab", "foxglove",
+    "foxglove",
 ]  # fmt: skip
 
 

@@ -80,9 +80,6 @@ FORMATS = {
     "t4": "pipeline.export.nuscenes:T4",
     "kalibr": "pipeline.export.kalibr:KALIBR",
     "opencv": "pipeline.export.opencv:OPENCV",
-    "apollo": "pipeline.export.apollo:APOLLO",
-    "openlabel": "pipeline.export.openlabel:OPENLABEL",
-    "matlab": "pipeline.export.matlab:MATLAB",
 }
 
 

@@ -97,18 +97,6 @@ def _of_ego(T_ego):
     }
 
 
-def openlabel(folder):
-    from vcd import core, scl
-
-    content = core.OpenLABEL()
-    content.load_from_file(str(folder / "openlabel.json"), validation=True)
-    scene = scl.Scene(content)
-    return "vcd", {
-        "camera_lidar": scene.get_transform("lidar", "camera")[0],
-        "lidar_radar": scene.get_transform("radar", "lidar")[0],
-    }
-
-
 def kitti(folder):
     from pykitti.utils import read_calib_file
 
@@ -129,7 +117,7 @@ def opencv(folder):
     }
 
 
-READERS = {f.__name__: f for f in (urdf, xacro, autoware, nuscenes, t4, openlabel, kitti, opencv)}
+READERS = {f.__name__: f for f in (urdf, xacro, autoware, nuscenes, t4, kitti, opencv)}
 
 
 def main():

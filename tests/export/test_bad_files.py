@@ -7,9 +7,6 @@ from pipeline.export.calibration import FrameNames
 from pipeline.export.formats import FORMATS, format_named
 
 LAUNCH = "launch:\n- node: {exec: static_transform_publisher, args: "
-APOLLO = "header: {frame_id: lidar}\nchild_frame_id: camera\ntransform: "
-QUATERNION = "{translation: {x: 1, y: 0, z: 0}, rotation: {w: 0.5, x: 0, y: 0, z: 0}}"
-LABEL = '{"openlabel": {"coordinate_systems": {"lidar": {"parent": ""}, "camera": {"parent": "lidar", '
 BAD = [
     ("ros2", {"a.launch.py": "Node(executable='static_transform_publisher', arguments=['--x', '1'])"},
      r"a\.launch\.py: --y"),
@@ -43,15 +40,9 @@ BAD = [
     ("kalibr", {"k.yaml": "cam0: ["}, r"k\.yaml: not readable YAML"),
     ("opencv", {"o.yaml": "%YAML:1.0\n---\nx: 1\n"}, r"o\.yaml: T_camera_lidar: missing"),
     ("opencv", {"o.yaml": "not a storage"}, r"o\.yaml"),
-    ("apollo", {"a.yaml": APOLLO + QUATERNION}, r"transform\.rotation: its quaternion has length 0\.5"),
-    ("apollo", {"a.yaml": "child_frame_id: camera"}, r"a\.yaml: header: missing"),
-    ("openlabel", {"o.json": LABEL + '"pose_wrt_parent": {"euler_angles": [0, 0, 0]}}}}}'},
-     "euler_angles: is not read"),
-    ("openlabel", {"o.json": LABEL + '"pose_wrt_parent": {"matrix4x4": [1]}}}}}'},
-     r"camera\.pose_wrt_parent: needs 12 or 16"),
-    ("openlabel", {"o.json": '{"vcd": {}}'}, "drafts before OpenLABEL"),
-    ("matlab", {"m.json": "{"}, r"m\.json: not readable JSON"),
-    ("matlab", {"m.json": '{"T_camera_lidar": [[1, 0], [0]]}'}, r"m\.json: T_camera_lidar: is not a matrix"),
+    ("t4", {"sensor.json": '[{"token": "a", "channel": "camera"}]', "calibrated_sensor.json":
+            '[{"sensor_token": "a", "rotation": [0.5, 0, 0, 0], "translation": [0, 0, 0]}]'}, "has length 0.5"),
+    ("t4", {"sensor.json": "{"}, r"sensor\.json: not readable JSON"),
 ]  # fmt: skip
 
 

@@ -144,7 +144,7 @@ def test_a_refused_day_writes_nothing_even_when_forced(lake, tmp_path, capsys):
     folder, days = lake
     call = [
         "export",
-        "matlab",
+        "opencv",
         "--lake",
         folder,
         "--vehicle",
@@ -152,7 +152,7 @@ def test_a_refused_day_writes_nothing_even_when_forced(lake, tmp_path, capsys):
         "--day",
         days[3],
         "--out",
-        tmp_path / "x.json",
+        tmp_path / "x.yaml",
     ]
     code, summary, _ = run(capsys, *call, "--force")
     assert (code, summary["status"], summary["outputs"]) == (3, "refused", [])
@@ -168,23 +168,19 @@ def test_the_car_hangs_on_its_own_base_where_a_file_says_where_the_lidar_sits(la
         '<origin xyz="0.9 0 2" rpy="0 0 0"/><parent link="base_link"/><child link="top"/></joint></robot>'
     )
     named = ["--lidar-frame", "top", "--camera-frame", "front_optical", "--mount", f"urdf:{mount}"]
-    call = ["export", "apollo", "--lake", folder, "--vehicle", "v", "--day", days[0], "--out", tmp_path / "o"]
+    file = tmp_path / "o.urdf"
+    call = ["export", "urdf", "--lake", folder, "--vehicle", "v", "--day", days[0], "--out", file]
     assert run(capsys, *call, *named)[0] == 0
-    assert {p.name for p in (tmp_path / "o").iterdir()} == {
-        *("top_extrinsics.yaml", "front_optical_extrinsics.yaml", "radar_extrinsics.yaml"),
-        *("front_optical_intrinsics.yaml", "top_extrinsics.provenance.json"),
-    }
-    text = (tmp_path / "o" / "top_extrinsics.yaml").read_text()
-    assert "frame_id: base_link" in text
-    assert "x: 0.9" in text
-    files = sorted((tmp_path / "o").iterdir())
-    assert run(capsys, "import", "apollo", *files, *named[:4], "--out", tmp_path / "p.json")[0] == 0
+    tree = format_named("urdf").tree({"o.urdf": file.read_bytes()})
+    assert set(tree.edges) == {"top", "front_optical", "radar"}
+    np.testing.assert_allclose(tree.lookup("base_link", "top")[:3, 3], [0.9, 0, 2])
+    assert run(capsys, "import", "urdf", file, *named[:4], "--out", tmp_path / "p.json")[0] == 0
     assert run(capsys, *call, "--lidar-frame", "side", "--mount", f"urdf:{mount}")[0] == 2
     log = tmp_path / "drive.mcap"
     log.write_bytes(format_named("tf-static").write(calibration(T_base_lidar=T_BASE_LIDAR))["tf_static.mcap"])
-    call[-1] = tmp_path / "l"
     assert run(capsys, *call, "--mount", f"log:{log}")[0] == 0
-    assert "z: 2.0" in (tmp_path / "l" / "lidar_extrinsics.yaml").read_text()
+    tree = format_named("urdf").tree({"o.urdf": file.read_bytes()})
+    np.testing.assert_allclose(tree.lookup("base_link", "lidar"), T_BASE_LIDAR)
     assert run(capsys, *call, "--base-frame", "map", "--mount", f"log:{log}")[0] == 2
 
 

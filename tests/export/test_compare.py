@@ -120,10 +120,10 @@ def test_a_knock_between_two_days_stands_out_in_json_table_and_page(lake, tmp_pa
 def test_an_export_is_its_record_and_every_kind_of_source_can_be_named(lake, tmp_path, capsys):
     of_v = ["--lake", lake, "--vehicle", "v"]
     day = ["--lake", str(lake), "--vehicle", "v", "--day", "2026-03-01"]
-    main(["export", "openlabel", *day, "--out", str(tmp_path / "o.json")])
-    main(["import", "openlabel", str(tmp_path / "o.json"), "--out", str(tmp_path / "prior.json")])
+    main(["export", "urdf", *day, "--out", str(tmp_path / "o.urdf")])
+    main(["import", "urdf", str(tmp_path / "o.urdf"), "--out", str(tmp_path / "prior.json")])
     capsys.readouterr()
-    for other in (f"openlabel:{tmp_path / 'o.json'}", tmp_path / "prior.json"):
+    for other in (f"urdf:{tmp_path / 'o.urdf'}", tmp_path / "prior.json"):
         code, out = said(capsys, "compare", "2026-03-01", other, *of_v, "--json")
         changes = [row["change"] for p in json.loads(out)["pairs"] for row in p["axes"]]
         assert code == 0

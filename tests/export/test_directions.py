@@ -91,30 +91,6 @@ EXPECTED = {
             "data: [ 0, -1, 0, 2, 1, 0, 0, 0.25, 0, 0, 1, -1, 0, 0, 0, 1 ]",
         ]
     },
-    "apollo": {
-        "camera_extrinsics.yaml": [
-            ("frame_id: lidar child_frame_id: camera transform: translation: x: 1 y: 0 z: 0.5 "
-            "rotation: w: 0.5 x: -0.5 y: 0.5 z: -0.5")
-        ],
-        "radar_extrinsics.yaml": [
-            ("frame_id: lidar child_frame_id: radar transform: translation: x: 2 y: 0.25 z: -1 "
-            "rotation: w: 0.7071067812 x: 0 y: 0 z: 0.7071067812")
-        ],
-        "lidar_extrinsics.yaml": ["frame_id: base_link child_frame_id: lidar transform: translation: x: 0 y: 0 z: 2"],
-    },
-    "openlabel": {
-        "openlabel.json": [
-            ('"camera": { "type": "sensor_cs", "parent": "lidar", "children": [], "pose_wrt_parent": { '
-            '"matrix4x4": [ 0, 0, 1, 1, -1, 0, 0, 0, 0, -1, 0, 0.5, 0, 0, 0, 1 ] }'),
-            '"matrix4x4": [ 0, -1, 0, 2, 1, 0, 0, 0.25, 0, 0, 1, -1, 0, 0, 0, 1 ]',
-        ]
-    },
-    "matlab": {
-        "calibration.json": [
-            '"T_camera_lidar": [ [ 0, -1, 0, 0 ], [ 0, 0, -1, 0.5 ], [ 1, 0, 0, -1 ], [ 0, 0, 0, 1 ] ]',
-            '"T_camera_radar": [ [ -1, 0, 0, -0.25 ], [ 0, 0, -1, 1.5 ], [ 0, -1, 0, 1 ], [ 0, 0, 0, 1 ] ]',
-        ]
-    },
 }  # fmt: skip
 _NUMBER = re.compile(r"-?\d+\.\d*(?:e[+-]?\d+)?|-?\b\d+(?=[,.\s])")
 
@@ -214,34 +190,6 @@ sensor_kit_base_link:
         "a.yaml": "%YAML:1.0\n---\nT_camera_lidar: !!opencv-matrix\n   rows: 3\n   cols: 4\n   dt: d\n"
         "   data: [ 0., -1., 0., 0., 0., 0., -1., .5, 1., 0., 0., -1. ]\nT_lidar_radar: !!opencv-matrix\n   rows: 4\n"
         "   cols: 4\n   dt: f\n   data: [ 0., -1., 0., 2., 1., 0., 0., .25, 0., 0., 1., -1., 0., 0., 0., 1. ]\n"
-    },
-    "apollo": {
-        "camera_extrinsics.yaml": """
-header: {seq: 0, stamp: {secs: 0, nsecs: 0}, frame_id: lidar}
-child_frame_id: camera
-transform: {translation: {x: 1, y: 0, z: 0.5}, rotation: {x: -0.5, y: 0.5, z: -0.5, w: 0.5}}
-""",
-        "radar_extrinsics.yaml": """
-header: {frame_id: lidar}
-transform:
-  rotation: {x: 0, y: 0, z: 0.7071067811865476, w: 0.7071067811865476}
-  translation: {x: 2, y: 0.25, z: -1}
-child_frame_id: radar
-""",
-    },
-    "openlabel": {
-        "a.json": """{"openlabel": {"metadata": {"schema_version": "1.0.0"}, "coordinate_systems": {
-"vehicle-iso8855": {"type": "local_cs", "parent": "", "children": ["lidar"]},
-"lidar": {"type": "sensor_cs", "parent": "vehicle-iso8855", "children": ["camera", "radar"],
-  "pose_wrt_parent": {"quaternion": [0, 0, 0, 1], "translation": [0, 0, 2]}},
-"camera": {"type": "sensor_cs", "parent": "lidar", "children": [],
-  "pose_wrt_parent": {"matrix4x4": [0, 0, 1, 1, -1, 0, 0, 0, 0, -1, 0, 0.5, 0, 0, 0, 1]}},
-"radar": {"type": "sensor_cs", "parent": "lidar", "children": [],
-  "pose_wrt_parent": {"quaternion": [0, 0, 0.7071067811865476, 0.7071067811865476], "translation": [2, 0.25, -1]}}}}}"""
-    },
-    "matlab": {
-        "a.json": '{"T_camera_lidar": [[0,-1,0,0],[0,0,-1,0.5],[1,0,0,-1],[0,0,0,1]], '
-        '"T_lidar_radar": [[0,-1,0,2],[1,0,0,0.25],[0,0,1,-1],[0,0,0,1]]}'
     },
 }
 

@@ -141,8 +141,8 @@ def test_a_rig_is_named_where_the_fleet_has_several(fleet, tmp_path, capsys):
     fleet.write_text(
         FLEET + FLEET[FLEET.index("[rigs.van]") : FLEET.index("[vehicles")].replace("van", "bus")
     )
-    files = exported(tmp_path, "matlab")
-    code, summary = imported(capsys, "matlab", files, fleet, tmp_path / "prior.json")
+    files = exported(tmp_path, "opencv")
+    code, summary = imported(capsys, "opencv", files, fleet, tmp_path / "prior.json")
     assert code == 2
     assert "name one of van, bus with --rig" in summary["reason"]
-    assert imported(capsys, "matlab", files, fleet, tmp_path / "prior.json", "--rig", "bus")[0] == 0
+    assert imported(capsys, "opencv", files, fleet, tmp_path / "prior.json", "--rig", "bus")[0] == 0

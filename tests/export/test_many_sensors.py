@@ -179,27 +179,15 @@ def test_kitti_has_a_file_per_camera_with_a_line_per_radar():
             )
 
 
-def test_opencv_and_matlab_have_every_edge_under_a_name_that_they_can_read():
+def test_opencv_has_every_edge_under_a_name_that_it_can_read():
     text = format_named("opencv").write(five())["calibration.yaml"].decode()
     storage = cv2.FileStorage(text, cv2.FileStorage_READ | cv2.FileStorage_MEMORY)
-    held = json.loads(format_named("matlab").write(five())["calibration.json"])
     for edge in EDGES:
         name = f"T_{edge.parent.name}_{edge.child.name}"
         assert name.isidentifier()
         np.testing.assert_array_equal(storage.getNode(name).mat(), T_of(edge))
-        np.testing.assert_array_equal(held[name], T_of(edge))
     for camera in ("front", "left"):
         np.testing.assert_array_equal(storage.getNode(f"camera_matrix_{camera}").mat(), CAMERA.K)
-        assert held[f"camera_{camera}"]["K"] == CAMERA.K.tolist()
-
-
-def test_openlabel_has_a_stream_per_sensor_by_its_kind():
-    held = json.loads(format_named("openlabel").write(five())["openlabel.json"])["openlabel"]
-    kinds = {name: stream["type"] for name, stream in held["streams"].items()}
-    assert kinds == {
-        "cam_front_optical": "camera", "left": "camera", "top": "lidar", "ars548_fl": "radar", "bumper": "radar",
-    }  # fmt: skip
-    assert "intrinsics_pinhole" in held["streams"]["left"]["stream_properties"]
 
 
 @pytest.fixture

@@ -30,7 +30,7 @@ def in_use(fleet, folder, text, lake=None):
     return _of_poses(folder, fleet, "van-1", text, lake, FrameOptions())
 
 
-@pytest.mark.parametrize("form", ["urdf", "autoware", "kalibr", "openlabel"])
+@pytest.mark.parametrize("form", ["urdf", "autoware", "kalibr"])
 def test_it_takes_what_export_writes_and_goes_on_without_sensors_that_the_files_lack(form, fleet, tmp_path):
     files = [
         f for f in exported(tmp_path, form, [s for s in OTHERS if s.name != "left"]) if "provenance" not in f

@@ -41,8 +41,7 @@ EXPECTED = HERE / "expected"
 TABLES = ("calibrations", "drift", "outcomes", "service_events", "states")
 # All but Foxglove's, which shows images. The side file with the provenance is the same of all: one of them is kept.
 FORMATS = (
-    "ros2", "tf-static", "urdf", "xacro", "autoware", "nuscenes", "t4", "apollo", "openlabel", "kalibr", "kitti",
-    "opencv", "matlab",
+    "ros2", "tf-static", "urdf", "xacro", "autoware", "nuscenes", "t4", "kalibr", "kitti", "opencv",
 )  # fmt: skip
 # Formats, vehicle and options: a state of which a pair has no day, a day after a knock, a held day.
 EXPORTED = {
