@@ -26,7 +26,7 @@ view: setup ## open3d beside it (a gigabyte): the 3D view of a vehicle-day, and 
 # Other programs that open what is written, in environments of their own: their pins agree neither with ours nor with
 # each other. `make test` runs what needs them once they are there.
 READERS := .venv-readers
-DATA_READERS := nuscenes-devkit==1.2.0 t4-devkit==0.1.0 yourdfpy==0.0.60 xacro==2.1.1 webdataset==1.0.2 "pyarrow<20" "pandas<3"
+DATA_READERS := nuscenes-devkit==1.2.0 t4-devkit==0.1.0 yourdfpy==0.0.60 xacro==2.1.1 "pyarrow<20" "pandas<3"
 BARE_READERS := pykitti==0.3.1 vod-tudelft==1.0.3# without their requirements, of which reading needs none
 SCHEDULERS := apache-airflow==3.3.2 dagster==1.13.29 kubernetes-validate==1.37.0
 # --no-compile: most of it is never imported.

@@ -74,7 +74,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     ),
     "export frames": (
         "jobs.export_frames:export_frames",
-        "Write frames of many days with calibration: WebDataset, Parquet, KITTI, nuScenes.",
+        "Write frames of many days with calibration: Parquet, nuScenes.",
     ),
     "import": (
         "jobs.import_prior:import_prior",

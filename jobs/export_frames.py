@@ -23,7 +23,7 @@ def export_frames(
     fleet: Path,
     lake: str,
     out: str,
-    format: Literal["webdataset", "parquet", "kitti", "nuscenes"],  # noqa: A002 - as it is typed
+    format: Literal["parquet", "nuscenes"],  # noqa: A002 - as it is typed
     calibration: Literal["state", "day", "prior"] = "state",
     perturb: tuple[float, float] | None = None,
     perturb_per: Literal["frame", "day"] = "frame",
@@ -47,8 +47,7 @@ def export_frames(
         fleet: fleet.toml; section [prepare] sets the spacing of frames and the split.
         lake: folder of the tables, or s3://BUCKET/PREFIX.
         out: folder of the export, or s3://BUCKET/PREFIX.
-        format: webdataset (tar shards), parquet (with a torch Dataset), kitti or nuscenes (images
-            undistorted).
+        format: parquet (with a torch Dataset) or nuscenes (images undistorted).
         calibration: state (the one that each vehicle loads tonight; days before a sensor moved are left out),
             day (the records of each day), or prior (the prior of each day).
         perturb: DEG M: move the pose of each sensor by exactly this much; the unperturbed pose is written

@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.learn.frames.kitti import finish_kitti
 from pipeline.learn.frames.nuscenes_tables import finish_nuscenes
 from pipeline.learn.frames.output import Output
 from pipeline.store.partitions import Partition
@@ -27,22 +26,10 @@ _SYNCHRONISED = (
     "is de-skewed to it."
 )
 _OPEN = {
-    "webdataset": (
-        'webdataset.WebDataset("train/VEHICLE_DAY-000000.tar"). Files of one KEY are a sample: KEY.SENSOR.jpg or .png '
-        "as logged (not undistorted), KEY.SENSOR.labels.png, KEY.SENSOR.npy (float32, columns `fields`; NaN where the "
-        "log has no value), KEY.json."
-    ),
     "parquet": (
         '`from dataset import Frames; DataLoader(Frames(".", "train"), num_workers=2, collate_fn=list)`: dataset.py '
         "lies here and needs torch and pyarrow. A row is a frame. Images are as logged, not undistorted; points are "
         "NaN where the log has no value."
-    ),
-    "kitti": (
-        "KITTI object folders in training/, splits in ImageSets/*.txt; frames.jsonl has the facts of each frame. "
-        "Images are undistorted with the logged K. label_2 has boxes in the image and none in space (KITTI's -1, -10, "
-        "-1000); radar/*.bin are View-of-Delft's rows (x y z RCS v_r v_r_compensated time), NaN where the car's speed "
-        "is not known. Tr_imu_to_velo is the identity if the lidar's pose on the car is unknown. semantic/*.png are "
-        "labels. Intensity is NaN where the log has none."
     ),
     "nuscenes": (
         'NuScenes("v1.0-boresight", "."); splits by scene are in v1.0-boresight/splits.json. Images are undistorted '
@@ -51,7 +38,6 @@ _OPEN = {
         "unknown, the ego frame is the reference. Rings and intensities that are not logged are 0."
     ),
 }
-_FINISH = {"kitti": finish_kitti, "nuscenes": finish_nuscenes}
 
 
 def write_card(
@@ -85,8 +71,8 @@ def write_card(
         "labels": "Cityscapes train ids (0 road .. 18 bicycle, 255 void), as perceive read or made them",
         "files": files,
     }
-    if finish := _FINISH.get(settings["format"]):
-        finish(output, days)
+    if settings["format"] == "nuscenes":
+        finish_nuscenes(output, days)
     if settings["format"] == "parquet":
         output.write("dataset.py", Path(__file__).with_name("torch_dataset.py").read_bytes())
     output.write("README.md", _page(card, settings).encode())
@@ -112,7 +98,7 @@ def _page(card: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
     if moved is not None:
         lines.append(
             f"\nPoses are moved on purpose by exactly {moved[0]:g} deg and {moved[1]:g} m, one draw per "
-            f"{settings['perturb_per']} from seed {settings['seed']}; `answer_T_reference_sensor` (calib_answer/, "
+            f"{settings['perturb_per']} from seed {settings['seed']}; `answer_T_reference_sensor` ("
             "calibrated_sensor_answer.json) is where each sensor was."
         )
     lines += [f"\n## Open it\n{_OPEN[settings['format']]}", f"\nLabels: {card['labels']}.\n"]

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from pipeline.learn.frames.frame import Frame, Mounting, Perturbation, Place, read_frames
-from pipeline.learn.frames.kitti import KittiWriter
 from pipeline.learn.frames.nuscenes import NuScenesWriter
 from pipeline.learn.frames.output import DayOutput, Output
 from pipeline.learn.frames.shards import ShardWriter
@@ -37,13 +36,9 @@ class FrameWriter(Protocol):
 
 
 FORMATS: dict[str, Callable[[DayOutput, ExitStack], FrameWriter]] = {
-    "webdataset": lambda output, stack: ShardWriter(output, stack, "tar"),
-    "parquet": lambda output, stack: ShardWriter(output, stack, "parquet"),
-    "kitti": KittiWriter,
+    "parquet": ShardWriter,
     "nuscenes": NuScenesWriter,
 }
-
-NEEDED = {"kitti": frozenset({"camera", "lidar"})}  # kinds without which a format has no frame
 
 
 @dataclass(frozen=True)
@@ -66,7 +61,7 @@ def export_day(task: DayTask, progress: Progress) -> str:
     before = output.done(task.partition)
     if before is not None and before["work_key"] == key:
         return "cached"
-    with output.writing(task.partition, task.places) as own:
+    with output.writing(task.partition) as own:
         told = _write(task, own, progress)
     mounting = task.mounting
     poses = {
@@ -93,9 +88,6 @@ def _write(task: DayTask, output: DayOutput, progress: Progress) -> dict[str, di
             progress(done, len(task.places), "frames")
             if frame is None:
                 lost[_TOO_FEW] += 1
-                continue
-            if missing := NEEDED.get(task.format, frozenset()) - frame.kinds:
-                lost[f"without_{'_'.join(sorted(missing))}"] += 1
                 continue
             writer.add(frame)
             kept[frame.at.split] += 1

@@ -32,7 +32,6 @@ __all__ = [
 
 LIDAR_FIELDS = ("x", "y", "z", "intensity")
 RADAR_FIELDS = ("x", "y", "z", "range_rate", "power")
-_KIND: dict[type, str] = {Image: "camera", Sweep: "lidar", Scan: "radar"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,10 +83,9 @@ class Perturbation:
 
 @dataclass(frozen=True)
 class Place:
-    """A moment that is wanted: its row, its number in the export, and the keys that it was split by."""
+    """A moment that is wanted: its row, and the keys that it was split by."""
 
     moment: int
-    number: int
     split: str
     place: str
     environment: str
@@ -98,7 +96,7 @@ class Frame:
     """One moment of a vehicle-day.
 
     Args:
-        at: number, split and place.
+        at: split and place.
         seen: labels and boxes of cameras, by name.
         T: T_reference_sensor as it is given out, of these sensors.
         answer: the unperturbed poses of the calibration; None if `T` has them.
@@ -119,11 +117,6 @@ class Frame:
         return f"{day_key(self.partition)}_{self.moment.moment:06d}"
 
     @property
-    def kinds(self) -> frozenset[str]:
-        """Kinds of the sensors that the frame shows."""
-        return frozenset(_KIND[type(capture)] for capture in self.captures.values())
-
-    @property
     def T_odom_vehicle(self) -> Float[np.ndarray, "4 4"] | None:
         """The car's pose at the moment by odometry, or None."""
         m = self.moment
@@ -134,7 +127,7 @@ class Frame:
 
 
 def day_key(partition: Partition) -> str:
-    """A name that no other vehicle-day has, without a dot: WebDataset ends a key at the first one."""
+    """A name that no other vehicle-day has, without a dot: file names end a key at the first one."""
     return f"{quote(partition.vehicle, safe=' ').replace('.', '%2E')}_{partition.day}"
 
 

@@ -89,8 +89,8 @@ def _made(sensor: str, model: str, K: bytes, D: bytes, width_px: int, height_px:
     seen = _field_deg(camera)
     if seen > _WIDEST_DEG:
         problem = (
-            f"sees {seen:.0f} deg, and an undistorted image can show {_WIDEST_DEG:.0f} at most: take webdataset or "
-            "parquet, whose images are as logged, or leave the camera out with --sensor"
+            f"sees {seen:.0f} deg, and an undistorted image can show {_WIDEST_DEG:.0f} at most: take parquet, "
+            "whose images are as logged, or leave the camera out with --sensor"
         )
         raise ConfigError("command line", sensor, problem)
     if model != "equidistant" and not np.any(camera.D):

@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import PurePath
 from typing import Any, BinaryIO
 
 from pipeline.learn.frames.facts import to_json
-from pipeline.learn.frames.frame import Place, day_key
+from pipeline.learn.frames.frame import day_key
 from pipeline.store.files import Files
 from pipeline.store.partitions import Lake, Partition
 from schemas.training import SPLITS
 
-__all__ = ["FRAMES_PER_SHARD", "DayOutput", "Output"]
+__all__ = ["DayOutput", "Output"]
 
-FRAMES_PER_SHARD = 128  # of a real car 100 to 250 MB: what loaders of shards advise
-_FOLDERS = ("training", "samples", "labels", *SPLITS)  # where formats put the files of frames
+_FOLDERS = ("samples", "labels", *SPLITS)  # where formats put the files of frames
 
 
 @dataclass(frozen=True)
@@ -77,11 +76,10 @@ class Output:
             return
 
     @contextmanager
-    def writing(self, partition: Partition, places: Sequence[Place]) -> Iterator[DayOutput]:
+    def writing(self, partition: Partition) -> Iterator[DayOutput]:
         """Output of a vehicle-day in place of its earlier files; an error leaves none of the new ones."""
         self._forget(partition)
-        numbers = [places[0].number, places[-1].number] if places else []
-        self.write(_of(partition, "begun.json"), to_json({"numbers": numbers}))
+        self.write(_of(partition, "begun.json"), b"{}")
         try:
             with self.replacing(_of(partition, "rows.jsonl")) as stream:
                 yield DayOutput(self, stream)
@@ -97,18 +95,15 @@ class Output:
             if part == "files":
                 self.delete(name)
         self.delete(_of(partition, "rows.jsonl"))
-        begun = self.read(_of(partition, "begun.json"))
-        if begun is not None:
-            self._sweep(partition, begun["numbers"])
+        if self.read(_of(partition, "begun.json")) is not None:
+            self._sweep(partition)
             self.delete(_of(partition, "begun.json"))
 
-    def _sweep(self, partition: Partition, numbers: Sequence[int]) -> None:
-        """Remove files of a killed writer, which are named by the day's key or its numbers."""
+    def _sweep(self, partition: Partition) -> None:
+        """Remove files of a killed writer, which are named by the day's key."""
         own = re.compile(re.escape(day_key(partition)) + r"[_-]\d{6,}")
         for path in [p for folder in _FOLDERS for p in self.files.find(self.root / folder, "**/*")]:
-            stem = path.name.partition(".")[0]
-            of_number = stem.isdecimal() and numbers and numbers[0] <= int(stem) <= numbers[-1]
-            if of_number or own.fullmatch(stem):
+            if own.fullmatch(path.name.partition(".")[0]):
                 self.files.delete(path)
 
 

@@ -48,35 +48,23 @@ def plan_frames(
     for done, day in enumerate(days):
         progress(done, len(days), f"{day.vehicle} {day.day}")
         surveys.append(survey_day(day, lake, config))
-    decided, first = {}, {}
+    decided = {}
     if before is not None:
         decided = {(kind, value): side for kind, value, side in before["sides"]}
-        first = before["first"]
     else:
         config = config.split_with(by=settled_keys(surveys, config, lake))
         decided = decided_sides(lake, config)
     plan = plan_days(surveys, config, decided)
-    following = max((number + count for number, count in first.values()), default=0)
     planned: Planned = {}
     for survey in surveys:
         sides, lost = frame_sides(survey, plan, config)
         wanted = [k for k, side in enumerate(sides) if side is not None]
-        name = survey.partition.folder
-        number, count = first.get(name, (following, 0))
-        if count < len(wanted):
-            number, first[name] = following, [following, len(wanted)]
-            following += len(wanted)
-        planned[survey.partition] = (
-            [
-                Place(k, number + n, sides[k] or "", survey.place[k], survey.environment[k])
-                for n, k in enumerate(wanted)
-            ],
-            lost,
-        )
+        places = [Place(k, sides[k] or "", survey.place[k], survey.environment[k]) for k in wanted]
+        planned[survey.partition] = places, lost
     _require_splits(config, planned)
     all_sides = sorted([kind, value, side] for (kind, value), side in (decided | dict(plan.sides)).items())
     whole = _with_split(settings, config)
-    output.write(_FILE, to_json({"settings": whole, "sides": all_sides, "first": first}))
+    output.write(_FILE, to_json({"settings": whole, "sides": all_sides}))
     return planned, whole
 
 
