@@ -65,15 +65,18 @@ class Claim:
         return bool(np.isfinite(sigma) and self._bound_rad(sigma) <= self.limit_rad)
 
     def _bound_rad(self, sigma_rad: float) -> float:
-        shift = self.shift_rad if self.agreement < 0 else 0.0
+        shift = self.shift_rad if self.is_contradicted else 0.0
         return _quantile(shift, sigma_rad, self.confidence)
 
     @property
-    def agreement(self) -> float:
-        """1 = held-out frames agree, 0 = they would move the estimate by as many sigmas as contradict it."""
-        if self.shift_sigma_rad <= 0:
-            return 1.0
-        return 1 - self.shift_rad / (self.contradiction_sigmas * self.shift_sigma_rad)
+    def is_contradicted(self) -> bool:
+        """Held-out frames would move the estimate by more sigmas of that move than chance does."""
+        return 0 < self.contradiction_sigmas * self.shift_sigma_rad < self.shift_rad
+
+    @property
+    def is_exceeded(self) -> bool:
+        """They contradict it, and would move it by more than its sigma."""
+        return self.is_contradicted and self.shift_rad > self.sigma_rad
 
 
 def _quantile(shift: float, sigma: float, probability: float) -> float:

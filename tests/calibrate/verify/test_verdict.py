@@ -190,13 +190,28 @@ def test_where_elevation_is_certified_a_move_of_roll_or_pitch_needs_no_warning()
     assert verdict(estimate(1.0, pair="lidar_radar"), BETTER).unchecked == {}
 
 
-def test_held_out_frames_that_lie_elsewhere_by_more_than_their_sigma_hold():
-    off = SURE | {"elevation": claim(0.01, shift_deg=0.15, shift_sigma_deg=0.04)}
+@pytest.mark.parametrize(("shift_deg", "status"), [(0.02, "accepted"), (0.15, "held")])
+def test_a_shift_that_contradicts_by_its_sigmas_holds_where_it_matters_against_the_limit(shift_deg, status):
+    """A day of other roads was held for 0.02 deg at a sigma of 0.01, and was right."""
+    off = SURE | {"elevation": claim(0.05, shift_deg, shift_sigma_deg=shift_deg / 3.5)}
+    found = verdict(estimate(1.5), BETTER, claims=off)
+    assert found.status == status
+    assert not found.unsure_only
+    assert ("elevation is 0.15 deg off by held-out frames" in found.reason) == (status == "held")
+
+
+def test_a_shift_beyond_the_sigma_leaves_a_radars_elevation_uncertified():
+    off = SURE | {"elevation": claim(0.05, 0.15, 0.04)}
     found = verdict(estimate(1.5, pair="lidar_radar"), BETTER, claims=off)
-    assert found.status == "held"
-    assert "would move the elevation by 0.15 deg, sigma of that 0.04 deg" in found.reason
-    near = SURE | {"elevation": claim(0.01, shift_deg=0.05, shift_sigma_deg=0.04)}
-    assert verdict(estimate(1.5), BETTER, claims=near).status == "accepted"
+    assert (found.status, found.determined) == ("accepted", ("azimuth",))
+    assert "elevation not certified: 0.15 deg off by held-out frames" in found.reason
+
+
+def test_a_sigma_that_held_out_frames_exceed_is_not_only_too_large():
+    wide = claim(0.1, 0.02, 0.005)  # by a tenth of its sigma
+    assert verdict(estimate(1.5), BETTER, claims=SURE | {"elevation": wide}).unsure_only
+    beyond = claim(0.1, 0.15, 0.04)
+    assert not verdict(estimate(1.5), BETTER, claims=SURE | {"elevation": beyond}).unsure_only
 
 
 def test_the_score_is_the_smallest_margin_and_ranks():
