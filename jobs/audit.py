@@ -34,7 +34,6 @@ def audit(
         count_statuses,
         moved_sensors,
         next_steps,
-        realigned_radars,
     )
     from pipeline.calibrate.methods import method_named
     from pipeline.config import load_fleet
@@ -70,7 +69,6 @@ def audit(
         statuses=count_statuses(findings),
         charts={s: charts.count(s) for s in DRIFT_STATUSES},
         moved=moved_sensors(findings),
-        **realigned_radars([outcome]),
         next_steps=next_steps(findings, lake),
         damaged=damaged,
         report=report,

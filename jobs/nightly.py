@@ -64,7 +64,6 @@ def nightly(
     from jobs.extras import require
     from jobs.night_sinks import night_sinks
     from jobs.terminal.summary import exit_code
-    from jobs.terminal.vehicle_status import realigned_radars
     from pipeline.calibrate.methods import method_named
     from pipeline.config import load_fleet
     from pipeline.extrinsics.prior import require_named_files
@@ -86,18 +85,13 @@ def nightly(
     with night_sinks(night, days, metrics, lineage) as sinks:
         outcomes = watch_night(night, days, executor, workers, sinks.take)
         drawing = Drawing(report, pictures, executor, workers)
-        closed: list[Outcome] = []
-
-        def take(outcome: Outcome) -> None:
-            closed.append(outcome)
-            sinks.take_stage(outcome)
-
-        findings, pages = close_night(night, to_day, drawing, outcomes, take) if outcomes else ([], [])
+        findings, pages = (
+            close_night(night, to_day, drawing, outcomes, sinks.take_stage) if outcomes else ([], [])
+        )
         tidy(tables)
         code = exit_code([*night_statuses(outcomes, config), *(["incomplete"] if tables.damage else [])])
         sinks.ended(code, findings)
-    realigned = realigned_radars(closed)
-    _print_end(tables, code, outcomes, findings, pages, rigs_to_mend(outcomes, config), realigned)
+    _print_end(tables, code, outcomes, findings, pages, rigs_to_mend(outcomes, config))
     return held_exit_code if code == 3 else code
 
 
@@ -108,7 +102,6 @@ def _print_end(
     findings: Sequence[DriftFinding],
     pages: Sequence[str],
     mend: Mapping[str, str],
-    realigned: Mapping[str, Any],
 ) -> None:
     """Print the summary of the night: statuses of vehicle-days and vehicles, and paths of the pages."""
     from jobs.terminal.summary import left_out, print_summary
@@ -124,7 +117,6 @@ def _print_end(
         problems=[_problem(o) for o in outcomes if o.status not in ("done", "cached")],
         statuses=count_statuses(findings),
         moved=moved_sensors(findings),
-        **realigned,
         next_steps=next_steps(findings, str(tables)),
         misconfigured=mend,
         damaged=left_out(tables),

@@ -30,7 +30,7 @@ def service(
         lake: folder of the tables.
         vehicle: vehicle id; run the command once per vehicle.
         day: day of the work, YYYY-MM-DD.
-        kind: kind of work; re-alignment is written by the audit for a radar that its own software turned.
+        kind: kind of work; re-alignment: a radar's own software turned its points.
         sensor: name of the sensor, or base; all = the whole vehicle.
         note: free text.
         withdraw: withdraw an event recorded by mistake; it has no effect from the next audit on.

@@ -14,7 +14,6 @@ __all__ = ["show"]
 Table = Literal[
     "calibrations",
     "poses",
-    "radar_alignments",
     "drift",
     "states",
     "outcomes",
@@ -73,7 +72,6 @@ def _records(
 ) -> list[dict[str, Any]]:
     from jobs.terminal.state_rows import state_rows
     from pipeline.store.current import (
-        current_alignments,
         current_drift,
         current_events,
         current_poses,
@@ -87,7 +85,6 @@ def _records(
     kinds: dict[str, Callable[[list[Any]], list[Any]]] = {
         "calibrations": current_records,
         "poses": current_poses,
-        "radar_alignments": current_alignments,
         "drift": current_drift,
         "states": current_states,
         "outcomes": list,

@@ -49,9 +49,8 @@ def simulate(
             alley, country, deck, tunnel, or world-SEED, drawn from SEED.
         container: ROS 2 MCAP, ROS 1 bag, ROS 2 bag folder, or each in turn.
         faults: vehicle:day:sensor:kind:amount, separated by commas; kinds: yaw pitch roll [deg], x y z [m],
-            drift-... per day, warm-... over the day, realign and realign-untold (by a radar's software)
-            [deg], time and stamp [s] (0.5@0.6: after .6 of the day's frames), missing, stuck, swap,
-            intrinsics, centre, centre-v [px], labels, night, dusk, few.
+            drift-... per day, warm-... over the day, time and stamp [s] (0.5@0.6: after .6 of the day's
+            frames), missing, stuck, swap, intrinsics, centre, centre-v [px], labels, night, dusk, few.
         remount_deg: standard deviation per axis of the mounting's change from day to day, for a rig that is
             taken off every evening; default: the change of a fixed sensor, some hundredths of a degree.
         reflectors: record three corner reflectors on every vehicle's last day too, under OUT/reflectors.

@@ -10,7 +10,6 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 __all__ = [
-    "AlignmentFields",
     "CameraPrior",
     "CameraTopics",
     "EgoTopics",
@@ -201,26 +200,6 @@ class OnnxDrivable(Section):
     model: str
 
 
-class AlignmentFields(Section):
-    """Message fields with the radar's misalignment: `packet.theta`, or `-packet.theta` for the opposite sign.
-
-    Azimuth is positive to the left, elevation is positive upwards. A message may hold one of the two.
-    """
-
-    azimuth: str | None = None
-    elevation: str | None = None
-    azimuth_variance: str | None = None
-    elevation_variance: str | None = None
-    status: str | None = None
-    unit: Literal["rad", "deg"] = "rad"  # of the angles; variances are in its square
-
-    @model_validator(mode="after")
-    def _states_an_angle(self) -> AlignmentFields:
-        if self.azimuth is None and self.elevation is None:
-            raise ValueError("name the field of the azimuth, of the elevation, or both")
-        return self
-
-
 class RadarTopics(_Sensor):
     """Topic of a radar, and the meaning of its Doppler field."""
 
@@ -236,10 +215,6 @@ class RadarTopics(_Sensor):
     )
     # drivers that log RadarScan differ; PointCloud2 has x y z
     azimuth_positive: Literal["left", "right"] = "left"
-    # Topics with the radar's estimate of its misalignment; a single topic needs no brackets. Left out of
-    # dumps if empty.
-    alignment: tuple[Topic, ...] = Field(default=(), exclude_if=lambda topics: not topics)
-    alignment_fields: AlignmentFields | None = Field(default=None, exclude_if=lambda fields: fields is None)
     # None = from geometry. Left out of dumps: only perception uses it, so a change must not ingest a rig's
     # logs again.
     drivable: OnnxDrivable | None = Field(default=None, exclude=True)
@@ -248,17 +223,6 @@ class RadarTopics(_Sensor):
         """Model files of this sensor as (key, path)."""
         if self.drivable is not None:
             yield "drivable.model", self.drivable.model
-
-    @field_validator("alignment", mode="before")
-    @classmethod
-    def _one_topic_is_a_list(cls, value: Any) -> Any:
-        return (value,) if isinstance(value, str) else value
-
-    @model_validator(mode="after")
-    def _fields_are_of_a_topic(self) -> RadarTopics:
-        if self.alignment_fields is not None and not self.alignment:
-            raise ValueError("alignment_fields needs the topic of the message: alignment = ...")
-        return self
 
     @model_validator(mode="after")
     def _one_way_to_say_velocity(self) -> RadarTopics:

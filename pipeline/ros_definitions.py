@@ -2,7 +2,7 @@
 
 When reading a log, they are used only if the log itself has no definition; a message that does not fit byte
 for byte is refused. Logs that are written here use the same definitions. Source: vision_msgs 4.1 (Humble);
-radar_msgs 0.2 (Humble); off_highway_premium_radar_msgs 0.9.
+radar_msgs 0.2 (Humble).
 """
 
 from __future__ import annotations
@@ -12,11 +12,6 @@ from rosbags.typesys.store import Typestore
 
 __all__ = ["DEFINITIONS", "register"]
 
-_BOSCH = "off_highway_premium_radar_msgs"
-_PARTS = (
-    "Time", "OperationMode", "LocationAttributesHeader", "SensorModulationPerformance", "MisalignmentPacket",
-    "InterferenceIndicator", "SensorFieldOfView", "LocationAttributesPacket",
-)  # fmt: skip
 # type -> (types that it needs, text)
 DEFINITIONS: dict[str, tuple[tuple[str, ...], str]] = {
     "vision_msgs/msg/Point2D": ((), "float64 x\nfloat64 y\n"),
@@ -67,58 +62,6 @@ DEFINITIONS: dict[str, tuple[tuple[str, ...], str]] = {
     "radar_msgs/msg/RadarTracks": (
         ("radar_msgs/msg/RadarTrack",),
         "std_msgs/Header header\nradar_msgs/RadarTrack[] tracks\n",
-    ),
-    f"{_BOSCH}/msg/Time": ((), "uint32 sec\nuint32 nanosec\n"),
-    f"{_BOSCH}/msg/OperationMode": ((), "uint8 operation_mode\n"),
-    f"{_BOSCH}/msg/LocationAttributesHeader": (
-        (),
-        (
-            f"uint32 lgp_version\nuint8 block_counter\n{_BOSCH}/Time start_measurement\n"
-            f"{_BOSCH}/OperationMode operation_mode\nbool data_measured\n"
-        ),
-    ),
-    f"{_BOSCH}/msg/SensorModulationPerformance": (
-        (),
-        (
-            "uint8 detection_of_measurement_program\nuint8 modulation_id\nfloat32 distance_range_scaling\n"
-            "float32 separability_distance\nfloat32 separability_relative_velocity\nfloat32 precision_distance\n"
-            "float32 precision_relative_velocity\nfloat32 covariance_of_distance_and_relative_velocity\n"
-            "float32 minimum_measurable_distance\nfloat32 maximum_measurable_distance\n"
-            "float32 minimum_measurable_relative_velocity\nfloat32 maximum_measurable_relative_velocity\n"
-        ),
-    ),
-    f"{_BOSCH}/msg/MisalignmentPacket": (
-        (),
-        (
-            "float32 theta\nfloat32 theta_variance\nfloat32 phi\nfloat32 phi_variance\nfloat32 phi_eme\n"
-            "float32 phi_eme_variance\nuint16 status\nuint16 status_eme\nfloat32 percent_negative_theta\n"
-            "float32 min_theta_sos\nfloat32 max_theta_sos\nfloat32 theta_sos_variance\nfloat32 theta_sos_mean\n"
-            "float32 min_phi_sos\nfloat32 max_phi_sos\nfloat32 phi_sos_variance\nfloat32 phi_sos_mean\n"
-            "float32 phi_sos_spread\nuint16 num_sos\nuint16 num_eme\n"
-        ),
-    ),
-    f"{_BOSCH}/msg/InterferenceIndicator": (
-        (),
-        "float32 fov_reduction_due_to_interfence\nuint8 interference_indicator\n",
-    ),
-    f"{_BOSCH}/msg/SensorFieldOfView": (
-        (),
-        "float32[25] fov\nfloat32[25] azimuth\nfloat32[11] elevation_range_scaling\nfloat32[11] elevation\n",
-    ),
-    f"{_BOSCH}/msg/LocationAttributesPacket": (
-        (),
-        (
-            f"{_BOSCH}/SensorModulationPerformance sensor_modulation_performance\n"
-            f"{_BOSCH}/MisalignmentPacket misalignment\n{_BOSCH}/InterferenceIndicator interference_indicator\n"
-            f"{_BOSCH}/SensorFieldOfView sensor_field_of_view\n"
-        ),
-    ),
-    f"{_BOSCH}/msg/LocationAttributes": (
-        tuple(f"{_BOSCH}/msg/{name}" for name in _PARTS),
-        (
-            f"std_msgs/Header header\n{_BOSCH}/LocationAttributesHeader location_attributes_header\n"
-            f"{_BOSCH}/LocationAttributesPacket location_attributes_packet\ngeometry_msgs/Pose mounting_pose\n"
-        ),
     ),
 }
 

@@ -27,8 +27,7 @@ _DATATYPES: Final = {"f4": 7, "u2": 4, "u1": 2}  # sensor_msgs/PointField
 def _typestore(ros_version: int) -> Typestore:
     """Type store with all types that are written; built once per process."""
     store = get_typestore(Stores.ROS1_NOETIC if ros_version == 1 else Stores.ROS2_HUMBLE)
-    for kind in ("vision_msgs/msg/Detection2DArray", "off_highway_premium_radar_msgs/msg/LocationAttributes"):
-        register(store, kind)
+    register(store, "vision_msgs/msg/Detection2DArray")
     if ros_version == 1:
         text = "geometry_msgs/TransformStamped[] transforms"
         store.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
@@ -114,34 +113,6 @@ class RosMessages:
             data=np.frombuffer(rows.tobytes(), np.uint8),
             is_dense=True,
         )
-
-    def location_attributes(
-        self, header: Any, azimuth_rad: float, elevation_rad: float, sigma_rad: float
-    ) -> Any:
-        """LocationAttributes of a Bosch radar with its misalignment; all other fields are zero."""
-        stated = {
-            "theta": azimuth_rad,
-            "phi": elevation_rad,
-            "theta_variance": sigma_rad**2,
-            "phi_variance": sigma_rad**2,
-        }
-        return self._filled("off_highway_premium_radar_msgs/msg/LocationAttributes", header, stated)
-
-    def _filled(self, kind: str, header: Any, values: Mapping[str, float]) -> Any:
-        """A message of a type, nested types included, with zeros in all fields but the named ones."""
-        fields: dict[str, Any] = {}
-        for name, (_, detail) in self.typestore.fielddefs[kind][1]:
-            if detail == "std_msgs/msg/Header":
-                fields[name] = header
-            elif isinstance(detail, str):
-                fields[name] = self._filled(detail, header, values)
-            elif isinstance(detail[0], tuple):
-                fields[name] = np.zeros(detail[1], np.dtype(detail[0][1][0]))
-            else:
-                fields[name] = values.get(
-                    name, {"float32": 0.0, "float64": 0.0, "bool": False}.get(detail[0], 0)
-                )
-        return self.typestore.types[kind](**fields)
 
     def transforms(self, of_child: Iterable[tuple[Any, str, Float[np.ndarray, "4 4"]]]) -> Any:
         """TFMessage from (header with the parent's frame, child frame, T_parent_child)."""

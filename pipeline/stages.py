@@ -13,8 +13,6 @@ from schemas.drift import DRIFT
 from schemas.features import FEATURES
 from schemas.moments import MOMENTS, PERCEIVED
 from schemas.poses import POSES
-from schemas.radar_alignments import RADAR_ALIGNMENTS
-from schemas.service_events import SERVICE_EVENTS
 from schemas.states import STATES
 from schemas.training import TRAINING
 
@@ -28,14 +26,14 @@ PREPARE = Stage("prepare", (*_INGESTED, *_PERCEIVED), (TRAINING,), "pipeline.lea
 CALIBRATE = Stage(
     "calibrate",
     (*_INGESTED, *_PERCEIVED),
-    (CALIBRATIONS, POSES, RADAR_ALIGNMENTS),
+    (CALIBRATIONS, POSES),
     "pipeline.calibrate.stage:work",
     needs_inputs=False,
 )
 AUDIT = Stage(
     "audit",
-    (CALIBRATIONS, RADAR_ALIGNMENTS),
-    (DRIFT, SERVICE_EVENTS),
+    (CALIBRATIONS,),
+    (DRIFT,),
     "pipeline.audit.stage:work",
     per_vehicle_day=False,
 )

@@ -11,7 +11,6 @@ __all__ = [
     "MOMENTS",
     "PERCEIVED",
     "PRIOR",
-    "RADAR_ALIGNMENT",
     "SAME_SCENE_NS",
     "SENSORS_ABSENT",
     "SWEEPS_LOGGED",
@@ -27,8 +26,6 @@ __all__ = [
 SWEEPS_LOGGED, SWEEPS_PLANNED, SWEEPS_READ = "sweeps_in_logs", "sweeps_planned", "sweeps_read"
 # Key in the manifest's `extra`: reasons for missing sensors of moments, by sensor.
 SENSORS_ABSENT = "sensors_absent"
-# Key in the manifest's `extra`: alignment reported by radars: columns of table `radar_alignments`, by radar.
-RADAR_ALIGNMENT = "radar_alignment"
 # Keys in the manifest's `extra`: table of each sensor's file; logged transforms, each with log, parent,
 # child, q (w x y z) and t_m of T_parent_child.
 FILES: Final = "files"

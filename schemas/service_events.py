@@ -6,7 +6,7 @@ from schemas.columns import Recorded, TableSchema, column, row
 
 __all__ = ["REALIGNED", "SERVICE_EVENTS", "ServiceEvent"]
 
-REALIGNED = "re-alignment"  # of a radar by its own software, as its messages report; recorded by the audit
+REALIGNED = "re-alignment"  # of a radar by its own software
 
 
 @row(eq=True)

@@ -13,7 +13,6 @@ from schemas.features import FEATURES
 from schemas.moments import MOMENTS, PERCEIVED
 from schemas.outcomes import OUTCOMES
 from schemas.poses import POSES
-from schemas.radar_alignments import RADAR_ALIGNMENTS
 from schemas.service_events import SERVICE_EVENTS
 from schemas.states import STATES
 from schemas.training import TRAINING
@@ -28,7 +27,7 @@ TABLES: dict[str, TableSchema] = {
     t.name: t
     for t in (
         MOMENTS, *CAPTURES.values(), PERCEIVED, *FEATURES.values(), TRAINING, CALIBRATIONS, POSES, DRIFT,
-        STATES, OUTCOMES, SERVICE_EVENTS, RADAR_ALIGNMENTS,
+        STATES, OUTCOMES, SERVICE_EVENTS,
     )
 }  # fmt: skip
 

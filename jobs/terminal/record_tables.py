@@ -36,11 +36,7 @@ def print_table(table: str, rows: list[dict[str, Any]]) -> None:
         "outcomes": _outcome_cells,
         "service_events": _event_cells,
     }.get(table, _partition_cells)
-    lines = (
-        [line for row in rows for line in _alignment_cells(row)]
-        if table == "radar_alignments"
-        else [cells(row) for row in rows]
-    )
+    lines = [cells(row) for row in rows]
     view = Table(title=f"{table}: {len(rows)} row{'' if len(rows) == 1 else 's'}", title_justify="left")
     for name in lines[0]:
         # Only the text at the end of a line may wrap, never numbers and names.
@@ -81,13 +77,6 @@ def _pose_row_cells(row: dict[str, Any]) -> dict[str, str]:
         "edges": ", ".join(row["edges"]),
         "reason": "; ".join(text for text in (in_words(row["faults"] or ()), row["reason"]) if text),
     }
-
-
-def _alignment_cells(row: dict[str, Any]) -> list[dict[str, str]]:
-    """A line for each axis in the radar's alignment messages."""
-    from pipeline.report.radar_alignments import alignment_lines
-
-    return [_named(row, "vehicle", "day", "method") | line for line in alignment_lines(row)]
 
 
 def _sure_cells(row: dict[str, Any]) -> dict[str, str]:

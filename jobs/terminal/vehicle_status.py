@@ -7,11 +7,9 @@ from shlex import quote
 from typing import Any
 
 from jobs.terminal.record_tables import STATUS_STYLES
-from pipeline.results import Outcome
 from schemas.drift import DRIFT_STATUSES, DriftFinding, VehicleStatus, next_step, status_of
-from schemas.service_events import SERVICE_EVENTS
 
-__all__ = ["count_statuses", "moved_sensors", "next_steps", "realigned_radars", "status_lines"]
+__all__ = ["count_statuses", "moved_sensors", "next_steps", "status_lines"]
 
 _STEPS = 40  # vehicles whose next steps are printed; the others are counted
 
@@ -39,13 +37,6 @@ def moved_sensors(findings: Sequence[DriftFinding]) -> list[dict[str, Any]]:
         for vehicle, stored in _statuses(findings).items()
         if stored.sensor
     ]
-
-
-def realigned_radars(outcomes: Sequence[Outcome]) -> dict[str, list[dict[str, str]]]:
-    """Radars whose points were turned by software, with amounts, under key `realigned`; empty if none."""
-    events = SERVICE_EVENTS.rows_among(row for outcome in outcomes for row in outcome.records)
-    found = [{"vehicle": e.vehicle, "sensor": e.sensor, "what": e.note} for e in events]
-    return {"realigned": found} if found else {}
 
 
 def next_steps(findings: Sequence[DriftFinding], lake: str) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 from pipeline.rig.graph import Edge
 from pipeline.store.current import current_events
@@ -11,7 +11,7 @@ from pipeline.store.records import read_records
 from schemas.drift import DriftFinding
 from schemas.service_events import REALIGNED, SERVICE_EVENTS, ServiceEvent
 
-__all__ = ["events_until", "restart_of", "since_of", "what_was_done", "with_events"]
+__all__ = ["events_until", "restart_of", "since_of", "what_was_done"]
 
 
 def events_until(lake: Lake, last: str | None) -> dict[str, list[ServiceEvent]]:
@@ -20,16 +20,6 @@ def events_until(lake: Lake, last: str | None) -> dict[str, list[ServiceEvent]]:
     for event in current_events(read_records(lake, SERVICE_EVENTS, ServiceEvent, last=last)):
         events.setdefault(event.vehicle, []).append(event)
     return events
-
-
-def with_events(
-    events: Mapping[str, Sequence[ServiceEvent]], more: Sequence[ServiceEvent]
-) -> dict[str, list[ServiceEvent]]:
-    """Events by vehicle, with new ones added."""
-    found = {vehicle: list(own) for vehicle, own in events.items()}
-    for event in more:
-        found.setdefault(event.vehicle, []).append(event)
-    return found
 
 
 def restart_of(events: Sequence[ServiceEvent], edge: Edge, last_day: str) -> ServiceEvent | None:
@@ -44,10 +34,9 @@ def restart_of(events: Sequence[ServiceEvent], edge: Edge, last_day: str) -> Ser
 
 def what_was_done(event: ServiceEvent) -> str:
     """The event in words."""
-    if event.kind == REALIGNED:
-        return f"re-alignment of the {event.sensor} by its own software ({event.note})"
     of = "all sensors" if event.sensor == "all" else f"the {event.sensor}"
-    return f"{event.kind} of {of} on {event.day}"
+    by = " by its own software" if event.kind == REALIGNED else ""
+    return f"{event.kind} of {of}{by} on {event.day}"
 
 
 def since_of(

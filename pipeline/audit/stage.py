@@ -15,8 +15,7 @@ from pipeline.audit.estimates import Estimates, days_of
 from pipeline.audit.findings import VehicleAudit, vehicle_findings
 from pipeline.audit.fleet_shift import FleetShift, judge_without_fleet_shifts, shifts_of
 from pipeline.audit.history import History, last_audited_day, models_of
-from pipeline.audit.realignments import Realignments, find_realignments
-from pipeline.audit.service import events_until, restart_of, what_was_done, with_events
+from pipeline.audit.service import events_until, restart_of, what_was_done
 from pipeline.audit.standing import said_before, standing
 from pipeline.audit.vehicle import VehicleVerdict
 from pipeline.config import AuditConfig, FleetConfig, config_hash
@@ -55,7 +54,6 @@ class _Vehicle:
     events: Sequence[ServiceEvent]
     references: Mapping[Edge, Reference]  # that an earlier night made of records that are not among these
     said: Sequence[DriftFinding]  # by the last audit, where some of the vehicle's records cannot be read
-    by_radar: Mapping[str, str]  # what a reader should know of a radar's own estimate
 
 
 def work(task: Task) -> Work:
@@ -79,32 +77,21 @@ def work(task: Task) -> Work:
     events = events_until(task.lake, last)
     enough = (FEWEST_DAYS, fleet.audit.reference_days)
     records, references = history.window((first, last), events, enough, fleet.named_vehicles)
-    realigned = find_realignments(task.lake, method, (first, last), events, records, fleet.audit)
-    if realigned.events:
-        events = with_events(events, realigned.events)
-        records, references = history.window((first, last), events, enough, fleet.named_vehicles)
     said = said_before(task.lake, method)
     names = sorted({*records.vehicles, *fleet.named_vehicles, *said})
     made: dict[str, dict[Edge, Reference]] = {}
     for (name, edge), reference in references.items():
         made.setdefault(name, {})[edge] = reference
     vehicles = {
-        v: _Vehicle(
-            records.of(v),
-            events.get(v, ()),
-            made.get(v, {}),
-            said.get(v, ()),
-            {sensor: text for (name, sensor), text in realigned.remarks.items() if name == v},
-        )
-        for v in names
+        v: _Vehicle(records.of(v), events.get(v, ()), made.get(v, {}), said.get(v, ())) for v in names
     }
     done = sorted([e.vehicle, e.day, e.sensor, e.kind] for v in vehicles.values() for e in v.events)
     settings = (fleet.audit, {"from": first, "to": last, "method": method, "events": done})
     return Work(
         settings,
-        lambda run: _judged(task, vehicles, (first, last, method), realigned, run.progress),
+        lambda run: _judged(task, vehicles, (first, last, method), run.progress),
         inputs=tuple(records.keys()),
-        tell=lambda rows: _told(rows, list(history.left_out), realigned.events),
+        tell=lambda rows: _told(rows, list(history.left_out)),
         again=True,
     )
 
@@ -113,11 +100,9 @@ def _judged(
     task: Task,
     vehicles: Mapping[str, _Vehicle],
     window: tuple[str, str, str],
-    realigned: Realignments,
     progress: Progress,
 ) -> Generator[Records, None, None]:
-    """Newly found re-alignments, then the findings of each vehicle, judged together."""
-    yield Records(realigned.events)
+    """Findings of each vehicle, judged together."""
     fleet, (first, _, method) = task.fleet, window
     begin = dt.date.fromisoformat(first).toordinal()
     if not any(v.said or (v.records.day >= begin).any() for v in vehicles.values()):
@@ -146,12 +131,9 @@ def _charted(vehicle: _Vehicle, window: tuple[str, str, str], config: AuditConfi
     return charts
 
 
-def _told(
-    findings: Sequence[DriftFinding], left_out: Sequence[str], realigned: Sequence[ServiceEvent]
-) -> Told:
+def _told(findings: Sequence[DriftFinding], left_out: Sequence[str]) -> Told:
     counts = Counter(f.status for f in findings)
     reasons = [] if findings else ["no calibration record in the window"]
-    reasons += [f"{event.vehicle}: {what_was_done(event)}" for event in realigned[:_NAMED]]
     if left_out:
         more = f" and {len(left_out) - _NAMED} more" if len(left_out) > _NAMED else ""
         reasons.append(f"left out: {'; '.join(left_out[:_NAMED])}{more}")
@@ -236,9 +218,6 @@ def _remarks(
         restart = restart_of(vehicle.events, edge, last)
         if restart is not None:
             remarks |= {(edge, dof): f"since the {what_was_done(restart)}" for dof in DOF_NAMES}
-        for text in (text for s in edge.sensors if (text := vehicle.by_radar.get(s.name))):
-            own = {(edge, dof): remarks.get((edge, dof)) for dof in DOF_NAMES}
-            remarks |= {key: f"{said}; {text}" if said else text for key, said in own.items()}
     for key, shift in shifts.items():
         day = dt.date.fromordinal(shift.day).isoformat()
         text = f"without what {shift.vehicles} of {shift.of} vehicles show since {day}"

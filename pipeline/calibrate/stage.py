@@ -7,7 +7,6 @@ from dataclasses import asdict
 from typing import Any
 
 from pipeline.calibrate.methods import Method, method_named
-from pipeline.calibrate.radar_alignment import with_alignments
 from pipeline.calibrate.records import (
     Inputs,
 )
@@ -76,7 +75,7 @@ def work(task: Task) -> Work:
             found = calibrated(task, about, run.progress)
         except SolveError as err:
             found = refused_edges(about, rig, err.reason, err.fault)
-        yield Records(with_alignments(found, ingested(task.lake, task.partition), about))
+        yield Records(found)
 
     return Work(
         (fleet.select, fleet.trigger, fleet.solve, fleet.verify, prior, settings),

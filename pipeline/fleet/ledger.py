@@ -16,7 +16,6 @@ from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.columns import TableSchema
 from schemas.outcomes import OUTCOMES, OutcomeRow
 from schemas.poses import POSES, PoseRow
-from schemas.radar_alignments import RADAR_ALIGNMENTS, RadarAlignment
 from schemas.versions import CODE_VERSION, TABLES
 
 __all__ = ["Known", "Ledger", "outcome_row", "record_outcome"]
@@ -31,7 +30,7 @@ _ROWS = 3000
 class Known:
     """One vehicle-day in the lake: records (without columns that outcomes lack) and outcomes."""
 
-    records: tuple[CalibrationRecord | PoseRow | RadarAlignment, ...] = ()
+    records: tuple[CalibrationRecord | PoseRow, ...] = ()
     outcomes: tuple[OutcomeRow, ...] = ()
 
 
@@ -57,7 +56,7 @@ class Ledger:
                 open_table(lake, schema)  # reports an unwritable table before the night's work
         self._lake = lake
         # Commit order: a calibration's poses are committed before it, and outcomes come last.
-        self._waiting = [_Waiting(t) for t in (RADAR_ALIGNMENTS, POSES, CALIBRATIONS, OUTCOMES)]
+        self._waiting = [_Waiting(t) for t in (POSES, CALIBRATIONS, OUTCOMES)]
         self._committed_at = time.monotonic()
         days = sorted({p.day for p in partitions})
         # a night without vehicle-days needs no tables
@@ -66,7 +65,6 @@ class Ledger:
             lake, CALIBRATIONS, CalibrationRecord, *span, ("frames_rejected", "inputs")
         )
         self._poses = RecordIndex(lake, POSES, PoseRow, *span, ("inputs",))
-        self._alignments = RecordIndex(lake, RADAR_ALIGNMENTS, RadarAlignment, *span, ("inputs",))
         self._outcomes = RecordIndex(
             lake, OUTCOMES, OutcomeRow, *span, ("rows", "kept", "rejected", "faults")
         )
@@ -74,16 +72,14 @@ class Ledger:
     def known(self, partition: Partition) -> Known:
         """Rows of a vehicle-day at the beginning of the night; the current one of a key comes last."""
         of = (partition.vehicle, partition.day)
-        found = self._records.of(*of), self._poses.of(*of), self._alignments.of(*of)
-        return Known((*found[0], *found[1], *found[2]), tuple(self._outcomes.of(*of)))
+        found = self._records.of(*of), self._poses.of(*of)
+        return Known((*found[0], *found[1]), tuple(self._outcomes.of(*of)))
 
     def add(self, outcome: Outcome, method: str) -> None:
         """Add an outcome and its records, and commit if it is time; on an OSError the rows are kept."""
-        alignments, poses, records, outcomes = self._waiting
+        poses, records, outcomes = self._waiting
         of = (outcome.vehicle, outcome.day)
         if outcome.records:
-            own = RADAR_ALIGNMENTS.rows_among(outcome.records)
-            _sort(alignments, own, self._alignments.of(*of))
             _sort(poses, POSES.rows_among(outcome.records), self._poses.of(*of))
             _sort(records, CALIBRATIONS.rows_among(outcome.records), self._records.of(*of))
         _sort(outcomes, [outcome_row(outcome, method)], self._outcomes.of(*of))

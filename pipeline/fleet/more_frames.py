@@ -10,7 +10,6 @@ from pipeline.stage_work import Task
 from pipeline.stages import CALIBRATE, INGEST
 from schemas.calibrations import ASKS_FOR_FRAMES
 from schemas.moments import SWEEPS_LOGGED, SWEEPS_PLANNED
-from schemas.radar_alignments import RadarAlignment
 
 __all__ = ["MOST_TIMES_MORE", "asks_for_more", "spent_before", "with_more_sweeps"]
 
@@ -29,8 +28,7 @@ def asks_for_more(results: Sequence[Outcome]) -> bool:
         return False
     if any(r.status == "refused" for r in results if r.stage != CALIBRATE.name):
         return True
-    judged = [r for r in results[-1].records if not isinstance(r, RadarAlignment)]
-    return any(_lacks_frames(r.reason) for r in judged if r.status != "accepted")
+    return any(_lacks_frames(r.reason) for r in results[-1].records if r.status != "accepted")
 
 
 def with_more_sweeps(task: Task) -> Task:

@@ -14,7 +14,6 @@ from jaxtyping import Int64
 from pipeline.config import FleetConfig, IngestConfig
 from pipeline.errors import ConfigError, SolveError
 from pipeline.extrinsics.prior import rig_prior
-from pipeline.ingest.alignment import day_alignments
 from pipeline.ingest.captures import Rejected
 from pipeline.ingest.directions_and_units import prior_transform
 from pipeline.ingest.index import ACCEPTED_TYPES, DayIndex, index_logs
@@ -22,7 +21,7 @@ from pipeline.ingest.moments import MomentBuilder
 from pipeline.ingest.readiness import DofVerdict, Evidence, overall
 from pipeline.ingest.rig_matrix import RigFinding
 from pipeline.ingest.rig_sample import RigSample
-from pipeline.ingest.roles import ALIGNMENT, NEEDED, Role, topics_of
+from pipeline.ingest.roles import NEEDED, topics_of
 from pipeline.ingest.stage import pick_moments, read_file_prior
 from pipeline.ingest.sync import WRONG_UNIT, constant_gap_ns
 from pipeline.results import Progress, silent
@@ -83,7 +82,6 @@ class CheckReport:
     rejected: dict[str, int]
     problems: list[str]
     advice: list[str]
-    radar_alignments: dict[str, dict[str, Any]]  # by radar, the alignment that it logs
 
 
 def check_logs(
@@ -110,7 +108,6 @@ def check_logs(
                 rejected[outcome.reason] += 1
                 index.complain(str(outcome))
             progress(done, len(picked), "frames looked at")
-        alignments = day_alignments(index, rig)
         without = Counter({k: n for k, n in builder.counts.items() if k.startswith("without_")})
     finally:
         index.close()
@@ -140,8 +137,7 @@ def check_logs(
         has_odometry=any(f.ego_speed_mps is not None for f in first),
         rejected={str(k): int(v) for k, v in (rejected + index.damage + without).items() if v},
         problems=index.problems,
-        advice=[*sample.advice, *_advice(first, rig, topics, sample.whole.frames), *_unnamed(index, rig)],
-        radar_alignments=alignments,
+        advice=[*sample.advice, *_advice(first, rig, topics, sample.whole.frames)],
     )
 
 
@@ -182,27 +178,12 @@ def _topics(index: DayIndex, rig: Rig) -> list[TopicFinding]:
                 {name for (name, kind) in index.surveyed if kind in wanted and name not in topics_of(rig)}
             )
             problem = "no message" + (f"; the same type comes on {', '.join(others[:4])}" if others else "")
-        elif not set(types) & set(wanted) and not _has_fields(rig, role):
+        elif not set(types) & set(wanted):
             problem = f"type {', '.join(types)}, not {' or '.join(wanted)}"
         stamps = np.unique(index.stream(role).stamps_ns)
         rate = float(1e9 / np.median(np.diff(stamps))) if len(stamps) > 2 else None
         findings.append(TopicFinding(str(role), topic, sorted(types), sum(types.values()), rate, problem))
     return findings
-
-
-def _has_fields(rig: Rig, role: Role) -> bool:
-    """Whether fleet.toml names the fields of this message, so that any type is accepted."""
-    return role.what == ALIGNMENT and rig.radars[role.sensor].alignment_fields is not None
-
-
-def _unnamed(index: DayIndex, rig: Rig) -> list[str]:
-    """Topics on which radars log their alignment, but that fleet.toml does not name."""
-    found = sorted({(t, kind) for t, kind in index.surveyed if kind in ACCEPTED_TYPES[ALIGNMENT]})
-    return [
-        f'{topic} ({kind}) states the alignment of a radar: alignment = "{topic}" in its section reads it'
-        for topic, kind in found
-        if topic not in topics_of(rig)
-    ]
 
 
 def _sync(index: DayIndex, moments: int, config: IngestConfig) -> SyncQuality:

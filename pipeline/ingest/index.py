@@ -19,7 +19,6 @@ from pipeline.geometry.cameras import Camera
 from pipeline.geometry.transform_tree import TransformTree
 from pipeline.ingest.containers.reader import Channel, ChunkCache, LogReader, Position, RawMessage, open_log
 from pipeline.ingest.containers.timeline import Stretches, Timeline
-from pipeline.ingest.messages.alignment import ALIGNMENT_MESSAGES
 from pipeline.ingest.messages.decoding import DECODE_ERRORS, content_without_stamp, decode, header_stamp_ns
 from pipeline.ingest.messages.detections_3d import DETECTIONS_3D
 from pipeline.ingest.messages.foxglove import REFUSED, foxglove_types
@@ -27,7 +26,7 @@ from pipeline.ingest.messages.generation import encoding_fault
 from pipeline.ingest.messages.image import read_camera_info
 from pipeline.ingest.messages.odometry import EgoTrack
 from pipeline.ingest.reading_plan import Reading, plan_reading, plan_sweeps, rare_topics
-from pipeline.ingest.roles import ALIGNMENT, CAPTURED, INFO, NEEDED, ODOMETRY, TF_STATIC, Role, topics_of
+from pipeline.ingest.roles import CAPTURED, INFO, NEEDED, ODOMETRY, TF_STATIC, Role, topics_of
 from pipeline.rig.rig import Rig
 from pipeline.store.remote_logs import LogPath
 
@@ -47,7 +46,6 @@ ACCEPTED_TYPES: dict[str, tuple[str, ...]] = {
     "detections": ("vision_msgs/msg/Detection2DArray", *DETECTIONS_3D),
     "lidar": _CLOUD_TYPES,
     "radar": (*_CLOUD_TYPES, "radar_msgs/msg/RadarScan", "radar_msgs/msg/RadarTracks"),
-    ALIGNMENT: tuple(ALIGNMENT_MESSAGES),
     "odometry": ("nav_msgs/msg/Odometry", *foxglove_types("Odometry")),
     "tf_static": (
         "tf2_msgs/msg/TFMessage",
@@ -268,8 +266,7 @@ def _index_log(
         if role is None:
             continue
         index.topics_seen.add(message.channel.topic)
-        # For an unknown type of alignment message, fleet.toml may name the fields.
-        if role.what != ALIGNMENT and message.channel.msgtype not in ACCEPTED_TYPES[role.what]:
+        if message.channel.msgtype not in ACCEPTED_TYPES[role.what]:
             index.damage["wrong_type"] += 1
             index.complain(
                 f"{index.log_names[number]}, topic {message.channel.topic}: {_refusal(message, role)}"

@@ -8,12 +8,11 @@ from pipeline.rig.rig import Rig
 from pipeline.rigs import TopicSemantics
 
 __all__ = [
-    "ALIGNMENT", "CAPTURED", "DETECTIONS", "INFO", "LABELS", "LIDAR", "NEEDED", "ODOMETRY", "RADAR", "TF_STATIC",
+    "CAPTURED", "DETECTIONS", "INFO", "LABELS", "LIDAR", "NEEDED", "ODOMETRY", "RADAR", "TF_STATIC",
     "Role", "topics_of",
 ]  # fmt: skip
 
 IMAGE, INFO, LABELS, DETECTIONS, LIDAR, RADAR = "image", "info", "labels", "detections", "lidar", "radar"
-ALIGNMENT = "alignment"
 CAPTURED: Final = {"camera": IMAGE, "lidar": LIDAR, "radar": RADAR}  # by kind of sensor
 NEEDED: Final = (IMAGE, INFO, LIDAR, RADAR)  # a sensor without one of these is missing
 
@@ -27,7 +26,7 @@ class Role(NamedTuple):
     @property
     def kind(self) -> str:
         """Kind of the sensor."""
-        if self.what in (LIDAR, RADAR, ALIGNMENT):
+        if self.what in (LIDAR, RADAR):
             return LIDAR if self.what == LIDAR else RADAR
         return "camera" if self.sensor else ""
 
@@ -53,7 +52,6 @@ def topics_of(rig: Rig) -> dict[str, Role]:
     for name in sorted(rig.radars, key=lambda radar: radar != rig.reference):
         topics[rig.radars[name].points] = Role(RADAR, name)
     topics[rig.prior.topic] = TF_STATIC
-    topics |= {topic: Role(ALIGNMENT, n) for n, radar in rig.radars.items() for topic in radar.alignment}
     for name, camera in rig.cameras.items():
         if isinstance(camera.semantics, TopicSemantics):
             topics[camera.semantics.labels] = Role(LABELS, name)

@@ -13,7 +13,6 @@ from jaxtyping import Int64
 from pipeline.config import FleetConfig, IngestConfig
 from pipeline.errors import ConfigError
 from pipeline.extrinsics.prior_file import read_star
-from pipeline.ingest.alignment import day_alignments
 from pipeline.ingest.captures import Rejected
 from pipeline.ingest.containers.reader import content_identity, leads_nowhere
 from pipeline.ingest.index import DayIndex, index_logs
@@ -39,7 +38,6 @@ from schemas.captures import Capture
 from schemas.faults import FAULTS
 from schemas.moments import (
     PRIOR,
-    RADAR_ALIGNMENT,
     SENSORS_ABSENT,
     SWEEPS_LOGGED,
     SWEEPS_PLANNED,
@@ -109,7 +107,6 @@ def _rows(
         for row in _built(anchored, builder, index, rejected, run.progress):
             made += 1
             yield row
-        alignments = day_alignments(index, rig)
         run.rejected.update(_all_counts(rejected, index, builder))
         run.kept.update(_reading_counts(index))
         if not made:
@@ -121,7 +118,6 @@ def _rows(
             "frame_ids": builder.prior.frame_ids,
         }
         run.extra[PRIOR] = builder.prior.rows()
-        run.extra |= {RADAR_ALIGNMENT: alignments} if alignments else {}
         run.extra[SENSORS_ABSENT] = absences(index, rig, builder.counts, config)
         run.remarks = _shorten(index.problems)
     finally:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Any, TypeVar
 
@@ -14,9 +14,7 @@ from pipeline.report.figures import SigmaPanel, residual_figure, sigma_figure
 from pipeline.report.page import render, write_page
 from pipeline.report.picture_file import write_picture
 from pipeline.report.pictures import ScenePictures, scene_pictures
-from pipeline.report.radar_alignments import alignment_lines
 from pipeline.report.reading import (
-    day_alignments,
     day_poses,
     day_records,
     drawn_records,
@@ -153,9 +151,6 @@ def _content(
         "rig_svg": rig_of_day(poses, records.values()),
         "sigma_svg": _sigma_svg(records),
         "residual_svg": residual_svg,
-        "alignments": [
-            line for row in day_alignments(lake, partition, records) for line in alignment_lines(asdict(row))
-        ],
         "provenance": _provenance(list(records.values())),
     }
 

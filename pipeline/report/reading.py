@@ -13,7 +13,7 @@ from pipeline.report.privacy import without_road_users
 from pipeline.report.scenes import choose_frames
 from pipeline.rig.edges import edge_of, edge_order, words_of
 from pipeline.sections import ReportConfig
-from pipeline.store.current import current_alignments, current_poses, current_records, prior_of, transform_of
+from pipeline.store.current import current_poses, current_records, prior_of, transform_of
 from pipeline.store.partitions import Lake, Partition, days_after
 from pipeline.store.records import last_day, read_last, read_records
 from pipeline.store.tables import COLLECTED
@@ -24,10 +24,8 @@ from schemas.drift import DRIFT, DriftFinding
 from schemas.frames import Frame
 from schemas.observations import Observation
 from schemas.poses import POSES, PoseRow
-from schemas.radar_alignments import RADAR_ALIGNMENTS, RadarAlignment
 
 __all__ = [
-    "day_alignments",
     "day_poses",
     "day_records",
     "drawn_records",
@@ -69,15 +67,6 @@ def day_poses(lake: Lake, partition: Partition, records: Mapping[str, Calibratio
         return []
     found = read_records(lake, POSES, PoseRow, vehicle=partition.vehicle, day=partition.day)
     return [p for p in current_poses(found) if p.method in methods]
-
-
-def day_alignments(
-    lake: Lake, partition: Partition, records: Mapping[str, CalibrationRecord]
-) -> list[RadarAlignment]:
-    """Alignment stated by radars on a vehicle-day, stored with records of the same method."""
-    methods = {r.method for r in records.values()}
-    found = read_records(lake, RADAR_ALIGNMENTS, RadarAlignment, vehicle=partition.vehicle, day=partition.day)
-    return [a for a in current_alignments(found) if a.method in methods]
 
 
 def fleet_records(lake: Lake, method: str, window_days: int) -> list[CalibrationRecord]:

@@ -314,7 +314,6 @@ class Rig(Section):
         yield from ((f"points of {name}", lidar.points) for name, lidar in self.lidars.items())
         for name, radar in self.radars.items():
             yield f"points of {name}", radar.points
-            yield from ((f"alignment of {name}", topic) for topic in radar.alignment)
         yield "prior", self.prior.topic
         if self.ego is not None:
             yield "odometry", self.ego.odometry

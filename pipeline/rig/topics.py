@@ -28,11 +28,10 @@ _FRAMES: Final = {
 
 
 def topics_of(name: str, kind: Kind) -> dict[str, str]:
-    """Topics of a sensor: image, info, labels, detections of a camera; points; alignment of a radar."""
+    """Topics of a sensor: image, info, labels, detections of a camera; else points."""
     if kind != "camera":
         points = TOPICS[kind] if name == kind else f"/{kind}/{name}/points"
-        alignment = points.replace("points", "location_attributes")
-        return {"points": points} | ({"alignment": alignment} if kind == "radar" else {})
+        return {"points": points}
     if name == kind:
         return {n: TOPICS[n] for n in ("info", "image", "labels", "detections")}
     return {

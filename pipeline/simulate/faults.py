@@ -5,11 +5,9 @@ Sensors are named as in the rig.
 Kinds: yaw, pitch, roll [deg] and x, y, z [m] move a sensor from that day on, about the vehicle's axes at the
 sensor; with the prefix `drift-` they grow by the amount per day, starting that day. From that day on, `time`
 [s] lets a sensor measure earlier than its stamps, which stay aligned with the others; `stamp` [s] shifts only
-its stamps. `realign` [deg]: the radar's software rotates its points to the left by this angle, and reports
-it; `realign-untold` does not report it.
-All of these may start within their day: amount `0.5@0.6` starts after six tenths of its frames. With the
-prefix `warm-` a rotation or shift grows from zero at the first frame of that day to the amount at its last,
-and is gone the next day. Only on that day, also starting within it: `missing` (no data), `stuck` (the first
+its stamps. All of these may start within their day: amount `0.5@0.6` starts after six tenths of its frames.
+With the prefix `warm-` a rotation or shift grows from zero at the first frame of that day to the amount at
+its last, and is gone the next day. Only on that day, also starting within it: `missing` (no data), `stuck` (the first
 data of each drive are repeated with new stamps). Only on that day: `swap` (the sensor's topic has the other
 point cloud; in a rig of many sensors, that of the next sensor of its kind, and vice versa), `intrinsics`
 (logged focal length wrong by the fraction), `centre` and `centre-v` (logged principal point too far to the
@@ -42,7 +40,6 @@ __all__ = [
     "misread",
     "parse_faults",
     "shaken",
-    "states_alignment",
     "swapped_with",
 ]
 
@@ -51,13 +48,11 @@ _CAMERA_ONLY: Final = ("intrinsics", "centre", "centre-v", "labels", "night", "d
 _SENT: Final = ("missing", "stuck")
 _DAY_ONLY: Final = (*_SENT, "swap", *_CAMERA_ONLY)
 _CLOCKS: Final = ("time", "stamp")
-_REALIGNED: Final = ("realign", "realign-untold")
 _WARM: Final = "warm-"
 KINDS: Final = (
     *_AXES,
     *(f"{how}-{a}" for how in ("drift", "warm") for a in _AXES),
     *_CLOCKS,
-    *_REALIGNED,
     *_DAY_ONLY,
 )
 
@@ -126,16 +121,9 @@ def _sensors(kind: str, rig: RigSpec) -> list[str]:
     """Sensors of a rig that a kind of fault applies to."""
     if kind in _CLOCKS:  # other clocks are compared with the reference lidar's
         return [s.name for s in rig.sensors if s != rig.reference]
-    if kind in _REALIGNED:
-        return [s.name for s in rig.of_kind("radar")]
     if kind == "swap":
         return [s.name for s in rig.sensors if s.kind != "camera" and swapped_with(s, rig) is not None]
     return [s.name for s in rig.sensors if kind not in _CAMERA_ONLY or s.kind == "camera"]
-
-
-def states_alignment(faults: tuple[Fault, ...]) -> bool:
-    """True if radars of the fleet report their alignment: if a fault realigns one of them."""
-    return any(fault.kind in _REALIGNED for fault in faults)
 
 
 def swapped_with(sensor: SensorSpec, rig: RigSpec) -> SensorSpec | None:
@@ -165,10 +153,6 @@ def _moved(mounted: Mounted, fault: Fault, day: int, share: float) -> Mounted:
         # A late stamp belongs to an earlier event: shifting both keeps the time of the event.
         phase_s = mounted.phase_s + (fault.amount if fault.kind == "stamp" else 0.0)
         return replace(mounted, delay_s=mounted.delay_s + fault.amount, phase_s=phase_s)
-    if fault.kind in _REALIGNED:
-        angle = float(np.radians(fault.amount))
-        stated = angle if fault.kind == "realign" else 0.0
-        return replace(mounted, turned_rad=mounted.turned_rad + angle, stated_rad=mounted.stated_rad + stated)
     how, _, kind = fault.kind.rpartition("-")
     amount = fault.amount * {"drift": day - fault.day + 1, "warm": share, "": 1}[how]
     T = mounted.T_vehicle.copy()

@@ -17,7 +17,7 @@ import numpy as np
 
 from pipeline.errors import ConfigError
 from pipeline.results import Progress, silent
-from pipeline.simulate.faults import Fault, faults_on, shaken, states_alignment
+from pipeline.simulate.faults import Fault, faults_on, shaken
 from pipeline.simulate.logs.fleet_toml import mixed_fleet_toml
 from pipeline.simulate.logs.frame_messages import Setup
 from pipeline.simulate.logs.recording import FIRST_FRAME_S, record_drive
@@ -119,9 +119,7 @@ def simulate_fleet(
     """Write `logs/VEHICLE/DAY/`, `truth/VEHICLE/DAY.json` and `fleet.toml` to `out`; returns a summary."""
     vehicles, days = vehicle_names(spec), day_names(spec.first_day, spec.days)
     out.mkdir(parents=True, exist_ok=True)
-    (out / "fleet.toml").write_text(
-        mixed_fleet_toml("synthetic", rigs_of(spec), states_alignment(spec.faults))
-    )
+    (out / "fleet.toml").write_text(mixed_fleet_toml("synthetic", rigs_of(spec)))
     work = [(v, d) for d in range(len(days)) for v in range(len(vehicles))]
     total, done, logs = len(work) * spec.frames, 0, 0
     if workers <= 1:
@@ -225,7 +223,6 @@ def _setup(spec: FleetSpec, vehicle: int, day: int, share: float) -> Setup:
         mounting_on(spec, vehicle, day, share),
         spec.semantics,
         today,
-        states_alignment(spec.faults),
     )
 
 

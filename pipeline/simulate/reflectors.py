@@ -122,7 +122,7 @@ def _picks(
 ) -> dict[str, Any]:
     """Careful manual picks in each sensor's data, and the truth."""
     seen, lidar, radar = (
-        transform_points(inverse(m[n].T_points), REFLECTORS_VEHICLE) for n in ("camera", "lidar", "radar")
+        transform_points(inverse(m[n].T_vehicle), REFLECTORS_VEHICLE) for n in ("camera", "lidar", "radar")
     )
     camera, logged = m.camera("camera")
     pixels, _ = camera.project(seen)

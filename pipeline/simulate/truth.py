@@ -31,7 +31,7 @@ def _poses(mounting: Mounting) -> dict[str, Any]:
     """Poses of all sensors, and delays of their stamps relative to the reference's."""
     sensors = mounting.sensors.items()
     return {
-        "T_base_sensor": {n: m.T_points.tolist() for n, m in sensors},
+        "T_base_sensor": {n: m.T_vehicle.tolist() for n, m in sensors},
         "dt_s": {n: m.delay_s for n, m in sensors},
     }
 
@@ -56,7 +56,7 @@ def _of_three(m: Mounting, rig: RigSpec, today: DayFaults) -> dict[str, Any]:
     about = _camera(rig["camera"], m, today)
     return {
         **_pairs(m),
-        **{f"T_vehicle_{n}": mounted.T_points.tolist() for n, mounted in m.sensors.items()},
+        **{f"T_vehicle_{n}": mounted.T_vehicle.tolist() for n, mounted in m.sensors.items()},
         "dt_camera_lidar_s": camera.delay_s,
         "dt_lidar_radar_s": -radar.delay_s,
         "dt_camera_radar_s": camera.delay_s - radar.delay_s,

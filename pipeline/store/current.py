@@ -17,12 +17,10 @@ from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.columns import TableSchema
 from schemas.drift import DriftFinding
 from schemas.poses import POSES, PoseRow
-from schemas.radar_alignments import RADAR_ALIGNMENTS, RadarAlignment
 from schemas.service_events import ServiceEvent
 from schemas.states import StateRow
 
 __all__ = [
-    "current_alignments",
     "current_drift",
     "current_events",
     "current_poses",
@@ -47,11 +45,6 @@ def current_records(records: Sequence[CalibrationRecord]) -> list[CalibrationRec
 def current_poses(poses: Sequence[PoseRow]) -> list[PoseRow]:
     """The current pose of each (vehicle, day, method, sensor), in this order; `poses` by assertion."""
     return _last_of_each(poses, POSES)
-
-
-def current_alignments(rows: Sequence[RadarAlignment]) -> list[RadarAlignment]:
-    """The current row of each (vehicle, day, method, radar), in this order; `rows` by assertion."""
-    return _last_of_each(rows, RADAR_ALIGNMENTS)
 
 
 def _last_of_each(rows: Sequence[_Row], schema: TableSchema) -> list[_Row]:

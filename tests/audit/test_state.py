@@ -134,19 +134,20 @@ def test_a_state_rests_on_the_accepted_days_since_the_last_change(tmp_path: Path
     assert "no accepted day after the repair of all sensors on 2026-03-22" in states["lidar_radar"].reason
 
 
+@pytest.mark.parametrize(("kind", "by"), [("repair", ""), ("re-alignment", " by its own software")])
 def test_a_service_event_and_the_state_after_it_are_commands(
-    tmp_path: Path, maker: ModuleType, capsys: pytest.CaptureFixture[str]
+    kind: str, by: str, tmp_path: Path, maker: ModuleType, capsys: pytest.CaptureFixture[str]
 ) -> None:
     lake = Lake.at(tmp_path)
     _write(lake, maker.vehicle_records("v", 6, np.random.default_rng(6)))
     for day in (_day(2), _day(3)):
-        assert service(lake=str(tmp_path), vehicle="v", day=day, kind="repair", sensor="radar") == 0
+        assert service(lake=str(tmp_path), vehicle="v", day=day, kind=kind, sensor="radar") == 0
     _states(lake)
     capsys.readouterr()
     assert state(lake=str(tmp_path), vehicle="v", json=True) == 0
     found = {row["pair"]: row for row in json.loads(capsys.readouterr().out)}
     assert found["lidar_radar"]["days"] == [_day(4), _day(5)]
-    assert "repair of the radar on 2026-03-04" in found["lidar_radar"]["reason"]
+    assert f"{kind} of the radar{by} on 2026-03-04" in found["lidar_radar"]["reason"]
     assert len(found["camera_lidar"]["days"]) == 6
     assert np.shape(found["camera_lidar"]["T"]) == (4, 4)
     assert state(lake=str(tmp_path)) == 0

@@ -139,7 +139,7 @@ def test_a_server_gets_a_run_per_stage_below_the_nights(lineage, tmp_path, monke
     assert made["outputFacets"]["outputStatistics"]["rowCount"] == 7
     assert made["facets"]["version"]["datasetVersion"] == "key of ingest"
     assert [d["name"] for d in perceive["inputs"]] == tables
-    records = [f"{tmp_path}/lake/{t}" for t in ("calibrations", "poses", "radar_alignments")]
+    records = [f"{tmp_path}/lake/{t}" for t in ("calibrations", "poses")]
     assert [d["name"] for d in calibrate["outputs"]] == records
     assert ingest["eventTime"] == "2026-03-03T01:00:02+00:00"
 

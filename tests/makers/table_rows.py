@@ -13,7 +13,6 @@ from schemas.moments import MOMENTS, PERCEIVED
 from schemas.observations import Observation
 from schemas.outcomes import OUTCOMES, OutcomeRow
 from schemas.poses import POSES, PoseRow
-from schemas.radar_alignments import RADAR_ALIGNMENTS, RadarAlignment
 from schemas.service_events import SERVICE_EVENTS, ServiceEvent
 from schemas.states import STATES, StateRow
 from schemas.training import TRAINING, TrainingRow
@@ -28,7 +27,6 @@ ROW_TYPES = {
     DRIFT.name: (DRIFT, DriftFinding),
     OUTCOMES.name: (OUTCOMES, OutcomeRow),
     POSES.name: (POSES, PoseRow),
-    RADAR_ALIGNMENTS.name: (RADAR_ALIGNMENTS, RadarAlignment),
     STATES.name: (STATES, StateRow),
     SERVICE_EVENTS.name: (SERVICE_EVENTS, ServiceEvent),
 }

@@ -14,7 +14,6 @@ from schemas.features import FEATURES
 from schemas.moments import MOMENTS, PERCEIVED
 from schemas.outcomes import OUTCOMES, OutcomeRow
 from schemas.poses import POSES, PoseRow
-from schemas.radar_alignments import RADAR_ALIGNMENTS, RadarAlignment
 from schemas.service_events import SERVICE_EVENTS, ServiceEvent
 from schemas.states import STATES, StateRow
 from schemas.training import TRAINING, TrainingRow
@@ -27,7 +26,6 @@ ROW_TYPES = {
     DRIFT.name: DriftFinding,
     OUTCOMES.name: OutcomeRow,
     POSES.name: PoseRow,
-    RADAR_ALIGNMENTS.name: RadarAlignment,
     STATES.name: StateRow,
     SERVICE_EVENTS.name: ServiceEvent,
 }

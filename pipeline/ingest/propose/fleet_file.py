@@ -124,8 +124,6 @@ def _camera(camera: FoundCamera) -> Iterator[str]:
 
 
 def _radar(radar: FoundCloud, meaning: RadarMeaning) -> Iterator[str]:
-    if radar.alignment:
-        yield f"alignment = {json.dumps(list(radar.alignment))}"
     if len(radar.doppler) > 1:
         yield _with(
             f"velocity_fields = {json.dumps(list(radar.doppler))}", "relative to the radar, not over ground"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
@@ -56,7 +56,6 @@ class FoundCloud:
     msgtype: str
     fields: tuple[str, ...] = ()
     doppler: tuple[str, ...] = ()
-    alignment: tuple[str, ...] = ()  # topics with the radar's own alignment
 
 
 @dataclass(eq=False)
@@ -74,7 +73,6 @@ def find_sensors(survey: Survey) -> FoundSensors:
     """Cameras, lidars and radars in the logs, one for each frame id and kind."""
     found = FoundSensors()
     _find_clouds(survey, found)
-    _find_alignments(survey, found)
     _find_cameras(survey, found)
     odometry = sorted(survey.of("odometry"), key=lambda t: (not _moves(t), -t.messages))
     if odometry:
@@ -108,16 +106,6 @@ def _find_clouds(survey: Survey, found: FoundSensors) -> None:
         clouds.sort(key=lambda c: -c[1])
         (found.radars if kind == "radar" else found.lidars).append(clouds[0][0])
         found.passed_over += [f"{c.topic} ({kind} {c.frame_id} too)" for c, _ in clouds[1:]]
-
-
-def _find_alignments(survey: Survey, found: FoundSensors) -> None:
-    """Alignment messages: of the only radar, or in the frame of a radar's points."""
-    topics, radars = survey.of("alignment"), found.radars
-    for k, radar in enumerate(radars):
-        own = [t.name for t in topics if len(radars) == 1 or t.frame_id == radar.frame_id]
-        radars[k] = replace(radar, alignment=tuple(own))
-    named = {name for radar in radars for name in radar.alignment}
-    found.passed_over += [f"{t.name} (which radar?)" for t in topics if t.name not in named]
 
 
 def _columns(message: Any) -> np.ndarray:

@@ -16,25 +16,21 @@ def fleet_toml(fleet: str, rig_name: str, rig: RigSpec, vehicles: list[str]) -> 
     return _text(fleet, {rig_name: rig}, dict.fromkeys(vehicles, rig_name))
 
 
-def mixed_fleet_toml(fleet: str, rigs: Mapping[str, RigSpec], states_alignment: bool = False) -> str:
+def mixed_fleet_toml(fleet: str, rigs: Mapping[str, RigSpec]) -> str:
     """Text of fleet.toml for vehicles with a rig each."""
-    return _text(
-        fleet, {r.name: r for r in rigs.values()}, {v: r.name for v, r in rigs.items()}, states_alignment
-    )
+    return _text(fleet, {r.name: r for r in rigs.values()}, {v: r.name for v, r in rigs.items()})
 
 
-def _text(
-    fleet: str, rigs: Mapping[str, RigSpec], vehicles: Mapping[str, str], states_alignment: bool = False
-) -> str:
+def _text(fleet: str, rigs: Mapping[str, RigSpec], vehicles: Mapping[str, str]) -> str:
     lines = ["[fleet]", f'name = "{fleet}"', ""]
     for name, rig in rigs.items():
-        lines += [*_sections(name, rig, states_alignment), ""]
+        lines += [*_sections(name, rig), ""]
     for vehicle, rig_name in vehicles.items():
         lines += [f'[vehicles."{vehicle}"]', f'rig = "{rig_name}"', ""]
     return "\n".join(lines[:-1]) + "\n"
 
 
-def _sections(rig_name: str, rig: RigSpec, states_alignment: bool) -> list[str]:
+def _sections(rig_name: str, rig: RigSpec) -> list[str]:
     lines = (
         []
         if rig.is_short
@@ -43,8 +39,6 @@ def _sections(rig_name: str, rig: RigSpec, states_alignment: bool) -> list[str]:
     for sensor in rig.sensors:
         lines += [f"[rigs.{rig_name}.{sensor.kind}{'' if rig.is_short else f's.{sensor.name}'}]"]
         lines += _sensor(sensor)
-        if states_alignment and sensor.kind == "radar":
-            lines.append(f'alignment = "{topics_of(sensor.name, "radar")["alignment"]}"')
         lines.append("")
     return [
         *lines,

@@ -22,21 +22,18 @@ from pipeline.simulate.sensors.simulated_frame import Image, SimulatedFrame
 
 __all__ = ["At", "Sent", "Setup", "messages_of"]
 
-# The radar filters its estimate over minutes: messages scatter far less than their error.
-_STATED_SCATTER_RAD, _STATED_SIGMA_RAD = np.radians(0.01), np.radians(0.05)
 At = Callable[[float], int]  # stamp [ns] of a time of the drive [s]
 Sent = tuple[int, str, Any]  # log time [ns], topic, message
 
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """A vehicle at one moment: rig, mounting, label networks, faults, and whether radars state alignment."""
+    """A vehicle at one moment: rig, mounting, label networks, faults."""
 
     rig: RigSpec
     mounting: Mounting
     semantics: SemanticsSpec
     faults: DayFaults = field(default_factory=DayFaults)
-    states_alignment: bool = False
 
 
 def messages_of(
@@ -62,18 +59,7 @@ def messages_of(
             owner = plug if plug.kind == sensor.kind else sensor
             topic = topics_of(plug.name, plug.kind)["points"]
             sent.append((stamp, topic, messages.cloud(messages.at(stamp, owner.name), columns)))
-            if setup.states_alignment and sensor.kind == "radar":
-                stated = messages.location_attributes(
-                    messages.at(stamp, name), *_alignment(setup.mounting[name].stated_rad, stamp)
-                )
-                sent.append((stamp, topics_of(name, "radar")["alignment"], stated))
     return sent
-
-
-def _alignment(stated_rad: float, stamp_ns: int) -> tuple[float, float, float]:
-    """Azimuth, elevation and sigma as reported by a radar, from a separate random generator."""
-    azimuth, elevation = np.random.default_rng(stamp_ns).normal(0, _STATED_SCATTER_RAD, 2)
-    return stated_rad + azimuth, elevation, _STATED_SIGMA_RAD
 
 
 def _plugged(sensor: SensorSpec, setup: Setup) -> SensorSpec:

@@ -31,8 +31,6 @@ class Mounted:
         delay_s: its stamp of an event minus the reference lidar's.
         phase_s: constant offset of its stamps after the moment, without jitter.
         nominal_camera: logged intrinsics.
-        turned_rad: rotation of points by a radar's software, positive to the left.
-        stated_rad: misalignment in azimuth that a radar reports.
     """
 
     T_vehicle: np.ndarray
@@ -42,20 +40,6 @@ class Mounted:
     camera: Camera | None = None
     nominal_camera: Camera | None = None
     errors: RadarErrors | None = None
-    turned_rad: float = 0.0
-    stated_rad: float = 0.0
-
-    @property
-    def R_turned(self) -> Float[np.ndarray, "3 3"]:
-        """Rotation of points by a radar's software."""
-        return exp_so3(np.array([0.0, 0.0, self.turned_rad]))
-
-    @property
-    def T_points(self) -> Float[np.ndarray, "4 4"]:
-        """T_vehicle_points: pose of the axes of the points, which a radar's software may have rotated."""
-        if not self.turned_rad:
-            return self.T_vehicle
-        return self.T_vehicle @ from_rotation_translation(self.R_turned.T, np.zeros(3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +53,8 @@ class Mounting:
         return self.sensors[name]
 
     def between(self, parent: str, child: str) -> Float[np.ndarray, "4 4"]:
-        """True T_parent_child of two sensors, between the axes of their points."""
-        return inverse(self[parent].T_points) @ self[child].T_points
+        """True T_parent_child of two sensors."""
+        return inverse(self[parent].T_vehicle) @ self[child].T_vehicle
 
     def camera(self, name: str) -> tuple[Camera, Camera]:
         """Intrinsics of a camera: true, and as logged."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -124,12 +124,9 @@ def _scan(seat: Seat, name: str, stamp_s: float, rng: np.random.Generator) -> Sc
     assert isinstance(sheet, RadarSpec)
     assert mounted.errors is not None
     moment = seat.moment.advanced(stamp_s - mounted.delay_s)
-    scan = scan_radar(
+    return scan_radar(
         moment, scene.ego, mounted.T_vehicle, sheet, mounted.errors, rng, scene.mirrors_m, scene.beacons_map
     )
-    if not mounted.turned_rad:
-        return scan
-    return replace(scan, xyz_m=(scan.xyz_m @ mounted.R_turned.T).astype(scan.xyz_m.dtype))
 
 
 def _exposed(

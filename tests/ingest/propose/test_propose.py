@@ -16,7 +16,6 @@ from pipeline.ingest.propose.doppler import doppler_period
 from pipeline.ingest.propose.logs_pattern import logs_pattern, nightly_command
 from pipeline.ingest.propose.propose import propose_fleet
 from pipeline.store.partitions import Partition
-from tests.makers import alignment_messages
 from tests.makers.written_logs import (
     DETECTIONS,
     HEIGHT,
@@ -223,16 +222,3 @@ def test_kitti_lacks_its_semantics_alone(kitti_logs):
     values, found = proposed(*kitti_logs.glob("*.mcap"))
     assert set(values["rigs"]["default"]) == {"camera", "lidar", "prior"}
     assert found.missing == ("camera: semantics (recommended; no labels: borders are steps of brightness)",)
-
-
-def test_messages_of_the_radar_about_its_own_alignment_are_found(tmp_path):
-    made = drive()
-    kit = alignment_messages.kit_of()
-    made.store = kit.store
-    for topic, kind in (
-        ("/radar/status4", alignment_messages.ESR4),
-        ("/radar/status6", alignment_messages.ESR6),
-    ):
-        made.add(topic, kind, START_NS, alignment_messages.message(kit, kind, START_NS))
-    values, _ = proposed(made.mcap(tmp_path / "a.mcap"))
-    assert values["rigs"]["default"]["radar"]["alignment"] == ["/radar/status4", "/radar/status6"]
