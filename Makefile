@@ -23,27 +23,21 @@ $(STAMP): pyproject.toml constraints.txt
 view: setup ## open3d beside it (a gigabyte): the 3D view of a vehicle-day, and the tests of it
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[view]'
 
-# Other programs that open what is written, in environments of their own: their pins agree neither with ours nor with
-# each other. `make test` runs what needs them once they are there.
+# Other programs that open what is written, in one environment of their own: their pins do not agree with ours. `make
+# test` runs what needs them once it is there.
 READERS := .venv-readers
-DATA_READERS := nuscenes-devkit==1.2.0 t4-devkit==0.1.0 yourdfpy==0.0.60 xacro==2.1.1 "pyarrow<20" "pandas<3"
+READERS_OF := nuscenes-devkit==1.2.0 t4-devkit==0.1.0 yourdfpy==0.0.60 xacro==2.1.1 kubernetes-validate==1.37.0 "pyarrow<20" "pandas<3"
 BARE_READERS := pykitti==0.3.1 vod-tudelft==1.0.3# without their requirements, of which reading needs none
-SCHEDULERS := apache-airflow==3.3.2 dagster==1.13.29 kubernetes-validate==1.37.0
-# --no-compile: most of it is never imported.
-install_data = $(1) $(DATA_READERS) && $(1) --no-deps $(BARE_READERS)
-install_schedulers = $(1) $(SCHEDULERS)
-export BORESIGHT_READERS ?= $(wildcard $(CURDIR)/$(READERS)/data/bin/python)
-export BORESIGHT_SCHEDULERS ?= $(wildcard $(CURDIR)/$(READERS)/schedulers/bin/python)
+export BORESIGHT_READERS ?= $(wildcard $(CURDIR)/$(READERS)/bin/python)
 
-readers: setup $(READERS)/data $(READERS)/schedulers ## data sets' devkits, Airflow, Dagster, Ray's trainer (1.5 GB), and the tests of them
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[train-ray]'
-
-# An environment appears whole or not at all; pip names what it did not find, and `make test` what it leaves out for that.
-# Under CI nothing may be left out.
-$(READERS)/%: Makefile
+# The environment appears whole or not at all; pip names what it did not find, and `make test` what it leaves out for
+# that. Under CI nothing may be left out. --no-compile: most of it is never imported.
+readers: $(READERS) ## devkits of data sets, a URDF reader, Kubernetes' schema (1 GB), and the tests of them
+$(READERS): Makefile
 	rm -rf $@ $@.new
 	$(PYTHON) -m venv $@.new
-	$(call install_$*,$@.new/bin/python -m pip install --quiet --no-compile) && mv $@.new $@ \
+	pip="$@.new/bin/python -m pip install --quiet --no-compile"; \
+	$$pip $(READERS_OF) && $$pip --no-deps $(BARE_READERS) && mv $@.new $@ \
 		|| { echo "$@ is not there: tests that need it are left out"; test -z "$$CI"; }
 
 demo: setup ## synthetic fleet to HTML report, in minutes
@@ -56,9 +50,7 @@ PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-re
 SHAPES := -p tests.shapes --jaxtyping-packages=schemas$(comma)pipeline$(comma)beartype.beartype
 
 test: setup browser ## tests of less than ten seconds; EVERYTHING=1 runs the slow ones too, and checks shapes and types
-	@# Two runs: Ray's trainer leaves the processes of its run in a state in which no other cluster comes up.
-	$(if $(EVERYTHING),@code=0; $(PYTEST) -m "not slow" $(SHAPES) || code=$$?; \
-		$(PYTEST) -m slow $(SHAPES) || code=$$?; exit $$code,$(PYTEST) -m "not slow")
+	$(PYTEST) $(if $(EVERYTHING),$(SHAPES),-m "not slow")
 
 # Page tests want Chromium. It is installed where that is allowed without asking, and nowhere else; tests without it are
 # named in the last lines of `make test`.

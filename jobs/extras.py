@@ -17,7 +17,7 @@ EXTRAS = {
     "simulate": "embreex",
     "train": "torch",
     "ray": "ray",
-    "ops": "openlineage",
+    "ops": "prometheus_client",
     "viz": "foxglove",
     "view": "open3d",
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
@@ -12,6 +13,7 @@ from cyclopts import Parameter
 if TYPE_CHECKING:
     from pipeline.fleet.nightly import DayOutcome, Night
     from pipeline.fleet.pattern import VehicleDay
+    from pipeline.fleet.tally import Tally
     from pipeline.results import Outcome
     from pipeline.store.partitions import Lake
     from schemas.drift import DriftFinding
@@ -34,7 +36,6 @@ def nightly(
     report: Path | None = None,
     pictures: bool = True,
     metrics: Path | None = None,
-    lineage: str | None = None,
     held_exit_code: Literal[0, 3] = 3,
     dry_run: bool = False,
 ) -> int:
@@ -56,13 +57,11 @@ def nightly(
         report: HTML page of the fleet; default: report/fleet.html in the lake.
         pictures: --no-pictures draws pages without images of public roads.
         metrics: Prometheus text file to replace at the end of the night; needs the extra [ops].
-        lineage: file or URL for OpenLineage events; needs the extra [ops].
         held_exit_code: exit code if something was held or refused; 0 for schedulers that treat any other code
             as failure.
         dry_run: only list what would run, and why.
     """
     from jobs.extras import require
-    from jobs.night_sinks import night_sinks
     from jobs.terminal.summary import exit_code
     from pipeline.calibrate.methods import method_named
     from pipeline.config import load_fleet
@@ -70,9 +69,10 @@ def nightly(
     from pipeline.fleet.misconfigured import night_statuses, rigs_to_mend
     from pipeline.fleet.nightly import Night
     from pipeline.fleet.pattern import find_vehicle_days
+    from pipeline.fleet.tally import Tally
     from pipeline.store.partitions import Lake
 
-    for extra, is_asked in (("ray", executor == "ray"), ("ops", metrics or lineage)):
+    for extra, is_asked in (("ray", executor == "ray"), ("ops", metrics)):
         if is_asked:
             require(extra)
     config = load_fleet(fleet)
@@ -82,17 +82,31 @@ def nightly(
     days = find_vehicle_days(logs, from_day, to_day)
     if dry_run:
         return _print_plan(night, days)
-    with night_sinks(night, days, metrics, lineage) as sinks:
-        outcomes = watch_night(night, days, executor, workers, sinks.take)
-        drawing = Drawing(report, pictures, executor, workers)
-        findings, pages = (
-            close_night(night, to_day, drawing, outcomes, sinks.take_stage) if outcomes else ([], [])
-        )
-        tidy(tables)
-        code = exit_code([*night_statuses(outcomes, config), *(["incomplete"] if tables.damage else [])])
-        sinks.ended(code, findings)
+    tally, began_s = Tally(), time.time()
+    outcomes = watch_night(night, days, executor, workers, tally.add)
+    drawing = Drawing(report, pictures, executor, workers)
+    findings, pages = close_night(night, to_day, drawing, outcomes, tally.add_stage) if outcomes else ([], [])
+    tidy(tables)
+    code = exit_code([*night_statuses(outcomes, config), *(["incomplete"] if tables.damage else [])])
+    if metrics is not None:
+        _write_metrics(metrics, config.fleet.name, tally, code, began_s, findings)
     _print_end(tables, code, outcomes, findings, pages, rigs_to_mend(outcomes, config))
     return held_exit_code if code == 3 else code
+
+
+def _write_metrics(
+    file: Path, fleet: str, tally: Tally, code: int, began_s: float, findings: Sequence[DriftFinding]
+) -> None:
+    """Write the metrics; the log names a file that cannot be written, and the night goes on."""
+    from jobs.terminal.logging import logger
+    from jobs.terminal.vehicle_status import count_statuses, moved_sensors
+    from pipeline.fleet.metrics import NightEnd, write_metrics
+
+    end = NightEnd(code, began_s, time.time(), count_statuses(findings), moved_sensors(findings))
+    try:
+        write_metrics(file, fleet, tally, end)
+    except OSError as err:
+        logger().warning("no metrics", file=str(file), reason=str(err))
 
 
 def _print_end(

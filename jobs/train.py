@@ -33,11 +33,10 @@ def train(  # options of the command
     time_limit: str | None = None,
     device: Literal["auto", "cpu", "cuda"] = "auto",
     compiled: bool = False,
-    ray_workers: int | None = None,
 ) -> int:
     """Train on the table training (from `boresight prepare`), or continue the run in OUT.
 
-    Several processes: `torchrun --nproc-per-node N $(which boresight) train ...`, or --ray-workers N.
+    Several processes: `torchrun --nproc-per-node N $(which boresight) train ...`.
 
     Args:
         data: folder of the tables, with table training.
@@ -54,7 +53,6 @@ def train(  # options of the command
         time_limit: stop after this duration, as in 9m, with a checkpoint to continue from.
         device: cpu, cuda, or the best one available.
         compiled: compile the encoders (takes minutes at the start, faster afterwards).
-        ray_workers: train on a Ray cluster with this many workers; needs the extra [train-ray].
     """
     from pipeline.learn.train.run import TrainRequest
     from pipeline.learn.train.settings import load_train_config
@@ -71,26 +69,21 @@ def train(  # options of the command
     settings = load_train_config(config, options)
     limit = None if time_limit is None else parse_duration(time_limit, "time-limit")
     request = TrainRequest(data, out, device, limit, compiled, start_from)
-    return _run(request, settings, ray_workers)
+    return _run(request, settings)
 
 
-def _run(request: TrainRequest, settings: TrainConfig, ray_workers: int | None) -> int:
-    """Train in this process, as one process of torchrun, or on Ray; prints the summary once."""
+def _run(request: TrainRequest, settings: TrainConfig) -> int:
+    """Train in this process, or as one process of torchrun; prints the summary once."""
     import os
 
     from jobs.terminal.summary import progress_reporter
     from pipeline.learn.train.run import train as run
 
-    if ray_workers is not None:
-        from pipeline.learn.train.ray import train_on_ray
-
-        result = train_on_ray(request, settings, ray_workers)
-    elif os.environ.get("RANK", "0") != "0":  # a process of torchrun: only the first one prints
+    if os.environ.get("RANK", "0") != "0":  # a process of torchrun: only the first one prints
         result = run(request, settings)
         return 128 + result.signal if result.signal else 0
-    else:
-        with progress_reporter(f"train {request.out.name}") as progress:
-            result = run(request, settings, progress)
+    with progress_reporter(f"train {request.out.name}") as progress:
+        result = run(request, settings, progress)
     return report_training("train", result, request.out)
 
 

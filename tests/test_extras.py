@@ -22,7 +22,6 @@ DISTRIBUTION_OF = {
     "foxglove": "foxglove-sdk",
     "google": "protobuf",
     "mcap_protobuf": "mcap-protobuf-support",
-    "openlineage": "openlineage-python",
     "ruamel": "ruamel.yaml",
 }
 # Commands beyond the night, and the extra that each needs.
@@ -36,7 +35,7 @@ NEEDS = {
     "view": "view",
 }
 # What only an option of a command imports, and asks for before anything is read: `--executor ray`, `--metrics` ...
-OPTIONAL = {"av", "foxglove", "ray", "openlineage", "prometheus_client"}
+OPTIONAL = {"av", "foxglove", "ray", "prometheus_client"}
 # Each as a person would call it; the folders need not exist, since the extra is asked for first.
 CALLS = {
     "demo": ["demo"],
@@ -120,15 +119,13 @@ def test_an_extra_holds_all_else_that_its_commands_may_import(command):
 
 def test_nothing_is_declared_that_nothing_imports():
     imported = set().union(*(reached(command)[1] for command in COMMANDS))
-    declared_for_users = declared("simulate", "train", "ray", "train-ray", "ops", "video", "viz", "view") - {
-        "boresight"
-    }
+    declared_for_users = declared("simulate", "train", "ray", "ops", "video", "viz", "view")
     assert declared_for_users - imported == {"tensorboard"}  # imported by torch.utils.tensorboard
 
 
 @pytest.mark.parametrize(
     ("option", "value", "extra"),
-    [("--executor", "ray", "ray"), ("--metrics", "a.prom", "ops"), ("--lineage", "a.json", "ops")],
+    [("--executor", "ray", "ray"), ("--metrics", "a.prom", "ops")],
 )
 def test_an_option_without_its_extra_says_so_before_anything_is_read(option, value, extra):
     code = (

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections import Counter
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -219,7 +218,7 @@ def answers(lake, **of):
 def test_all_executors_record_the_same_though_a_worker_and_a_node_of_a_cluster_die(
     fleet, first_night, tmp_path
 ):
-    told = ("--metrics", f"{tmp_path}/night.prom", "--lineage", f"{tmp_path}/events.json")
+    told = ("--metrics", f"{tmp_path}/night.prom")
     night = command(fleet, tmp_path / "ray", "--executor", "ray", "--to", DAYS[0], *told)
     with (
         two_nodes() as (cluster, (node, _)),
@@ -248,10 +247,6 @@ def test_all_executors_record_the_same_though_a_worker_and_a_node_of_a_cluster_d
     metrics = (tmp_path / "night.prom").read_text()
     for stage in ("ingest", "perceive", "calibrate", "audit", "state", "report"):
         assert f'boresight_stage_seconds{{fleet="synthetic",stage="{stage}"}}' in metrics
-    events = [json.loads(line) for line in (tmp_path / "events.json").read_text().splitlines()]
-    runs = Counter(e["run"]["runId"] for e in events)
-    assert set(runs.values()) == {2}  # each begun and ended once, what was tried twice too
-    assert {e["job"]["name"] for e in events} == {"nightly", "ingest", "perceive", "calibrate"}
 
 
 @pytest.mark.slow

@@ -1,7 +1,6 @@
 """What `jobs/deploy` offers to schedulers: looked at by what they themselves bring, where that is here.
 
-Airflow, Dagster and kubernetes-validate have pins of their own: $BORESIGHT_SCHEDULERS names a Python that has them
-(`make readers`).
+kubernetes-validate is among the programs of others: $BORESIGHT_READERS names a Python that has it (`make readers`).
 """
 
 import json
@@ -10,9 +9,7 @@ import re
 import shutil
 import stat
 import subprocess
-import sys
 import tomllib
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -146,7 +143,9 @@ def manifest(path):
 @pytest.fixture(scope="module")
 def kubernetes():
     """Kubernetes' own schema, as a function that takes manifests or raises."""
-    python = python_with("kubernetes_validate")
+    python = os.environ.get("BORESIGHT_READERS")
+    if not python:
+        pytest.skip("BORESIGHT_READERS names no Python with kubernetes-validate: make readers")
 
     def takes(*told):
         code = "import json, sys, kubernetes_validate as k\nfor one in json.load(sys.stdin):"
@@ -254,106 +253,6 @@ def test_a_rayjob_runs_the_night_with_the_ray_that_was_tested():
     # Where logs, lake and configuration are must be the same for the driver and the workers.
     mounts = [c["volumeMounts"] for pod in pods()[1:] for c in pod["containers"]]
     assert all(m == mounts[0] for m in mounts)
-
-
-# Airflow and Dagster
-
-
-def python_with(module):
-    """A Python that has the module; the test is left out where none is known."""
-    named = os.environ.get("BORESIGHT_SCHEDULERS")
-    if not named and find_spec(module) is None:
-        pytest.skip(f"no {module} here, and $BORESIGHT_SCHEDULERS names no Python that has it: make readers")
-    return named or sys.executable
-
-
-@pytest.fixture(scope="module")
-def airflow(tmp_path_factory):
-    """Interpreter and environment of an Airflow with an empty database."""
-    python, home = python_with("airflow"), tmp_path_factory.mktemp("airflow")
-    environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "AIRFLOW_HOME")}
-    environment |= {
-        "AIRFLOW_HOME": str(home),
-        "AIRFLOW__CORE__LOAD_EXAMPLES": "False",
-        "AIRFLOW__CORE__DAGS_FOLDER": str(DEPLOY / "airflow"),
-    }
-    subprocess.run(
-        [python, "-m", "airflow", "db", "migrate"], env=environment, capture_output=True, check=True
-    )
-    return python, environment
-
-
-RUN_TASK = """
-import sys
-from airflow.dag_processing.dagbag import DagBag
-bag = DagBag(sys.argv[1])
-assert not bag.import_errors, bag.import_errors
-dag = bag.dags["boresight_night"]
-[task] = dag.tasks
-assert (task.retries, dag.catchup, dag.max_active_runs) == (2, False, 1)
-from airflow.sdk.exceptions import AirflowFailException
-try:
-    print("said", task.python_callable())
-except AirflowFailException as err:
-    print("never again", err)
-except Exception as err:
-    print("again", err)
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("code", RETRIED)
-def test_airflow_takes_the_dag_and_tries_again_what_may_help(code, airflow, fake_night):
-    python, environment = airflow
-    ours = {k: v for k, v in os.environ.items() if k.startswith(("BORESIGHT", "NOTED"))}
-    done = subprocess.run(
-        [python, "-c", RUN_TASK, str(DEPLOY / "airflow")],
-        env=environment | ours | {"CODE": str(code)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
-    last = done.stdout.splitlines()[-1]
-    assert last.split()[0] == {0: "said", 3: "said", 1: "again", 2: "never"}[code]
-    assert '"held": 4' in last
-    assert known(options_of(fake_night))
-
-
-RUN_ASSET = """
-import sys, importlib.util, dagster as dg
-spec = importlib.util.spec_from_file_location("definitions", sys.argv[1])
-module = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(module)
-dg.Definitions.validate_loadable(module.definitions)
-if sys.argv[2] == "1":  # a run would wait for the next try
-    try:
-        module.calibrations(dg.build_asset_context(partition_key="2026-03-02"))
-    except dg.RetryRequested as err:
-        print("again", err.max_retries)
-else:
-    result = dg.materialize([module.calibrations], partition_key="2026-03-02", raise_on_error=False)
-    events = {e.event_type_value for e in result.all_events}
-    assert "STEP_UP_FOR_RETRY" not in events
-    print("success" if result.success else "never again")
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("code", RETRIED)
-def test_dagster_makes_the_asset_of_a_day_and_tries_again_what_may_help(code, fake_night):
-    assert run_asset(code) == {0: "success", 3: "success", 1: "again 2", 2: "never again"}[code]
-    options = options_of(fake_night)
-    assert (options["--from"], options["--to"]) == ("2026-03-02", "2026-03-02")
-    assert known(options)
-
-
-def run_asset(code):
-    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"} | {"CODE": str(code)}
-    command = [python_with("dagster"), "-c", RUN_ASSET, str(DEPLOY / "dagster" / "definitions.py"), str(code)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr[-3000:]
-    return done.stdout.splitlines()[-1]
 
 
 def test_the_readme_names_every_file():

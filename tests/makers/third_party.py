@@ -22,8 +22,8 @@ licence that each distribution states. Nothing of it is shipped with Boresight. 
 bring NVIDIA's own libraries as well, under NVIDIA's licence; a CPU build of torch does not. opencv's wheel holds
 FFmpeg's libraries (LGPL-2.1), unchanged and loaded at run time. PyAV (`[video]`) states its own licence; its wheel
 holds FFmpeg with x264 and x265, which are under the GPL: who passes that wheel on owes what the GPL asks. Written in
-the environment of `make view`, which leaves out `[train-ray]`: `ray[train]` brings pandas and tensorboardX besides;
-and `[gpu]`: onnxruntime-gpu (MIT) takes the place of onnxruntime, and asks for NVIDIA's libraries.
+the environment of `make view`, which leaves out `[gpu]`: onnxruntime-gpu (MIT) takes the place of onnxruntime, and
+asks for NVIDIA's libraries.
 
 """
 # Who states the whole text in place of a name: words of it, and the name.
@@ -60,7 +60,7 @@ def installed(extras=None):
         if (name, frozenset(need.extras)) not in found:
             found.add((name, frozenset(need.extras)))
             waiting += [(n, e) for n in needed for e in ("", *need.extras)]
-    return {name for name, _ in found} - {"boresight"}  # which [train-ray] names
+    return {name for name, _ in found}
 
 
 def licences():

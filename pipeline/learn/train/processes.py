@@ -58,19 +58,18 @@ ALONE = Processes(0, 1, torch.device("cpu"))
 
 @contextmanager
 def joined(device: str) -> Iterator[Processes]:
-    """Join the process group that torchrun or Ray described in the environment, or train alone.
+    """Join the process group that torchrun described in the environment, or train alone.
 
     `device` is cpu, cuda (the GPU of this process) or auto; ConfigError if there is none.
     """
     rank, count = int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
     chosen = _device(device, int(os.environ.get("LOCAL_RANK", "0")))
-    already = distributed.is_available() and distributed.is_initialized()
-    if count > 1 and not already:
+    if count > 1:
         distributed.init_process_group("nccl" if chosen.type == "cuda" else "gloo")
     try:
         yield Processes(rank, count, chosen)
     finally:
-        if count > 1 and not already:
+        if count > 1:
             distributed.destroy_process_group()
 
 

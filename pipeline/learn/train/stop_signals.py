@@ -15,8 +15,7 @@ __all__ = ["stop_signals"]
 def stop_signals() -> Iterator[list[int]]:
     """Collect SIGTERM and SIGINT instead of ending the process in the middle of a step.
 
-    Yields a list of the signals so far. It stays empty outside the main thread: Ray's workers receive no
-    signals.
+    Yields a list of the signals so far. It stays empty outside the main thread, which alone receives signals.
     """
     received: list[int] = []
     if threading.current_thread() is not threading.main_thread():

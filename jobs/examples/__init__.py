@@ -1,1 +1,0 @@
-"""Examples to read and to change: notebook cells that also run as scripts."""
