@@ -21,7 +21,8 @@ __all__ = ["RECORD", "Look", "freshness", "heading", "look", "read_looks"]
 RECORD = Path(__file__).parents[1] / "results" / "seeds.toml"
 _REAL = 0
 # Below 200: the days of days.py for tuning. From 1000: the fleet that networks learn from (ssl_fleet.py).
-_TUNING = frozenset([*range(1, 200), *range(1000, 1100)])
+# From 71001: study `states`.
+_TUNING = frozenset([*range(1, 200), *range(1000, 1100), *range(71001, 71100)])
 
 
 @dataclass(frozen=True)
