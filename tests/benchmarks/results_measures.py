@@ -18,6 +18,7 @@ from tests.benchmarks.studies.in_use import answer_of_log
 from tests.benchmarks.studies.metrics import within
 from tests.benchmarks.studies.rates import interval, rate
 from tests.benchmarks.studies.rig_faults import is_on_base
+from tests.benchmarks.studies.states_measures import counts
 
 __all__ = ["MEASURES", "interval", "rate"]
 
@@ -240,6 +241,11 @@ def power(lines: Lines, row: Row) -> str:
     return f"{shares} ({100 * low:.0f} to {100 * high:.0f})"
 
 
+def states(lines: Lines, row: Row) -> str:
+    """What study `states` counts under the words of `count`."""
+    return counts(lines)[row["count"]]
+
+
 def last(lines: Lines, row: Row) -> str:
     """As `value`, of the last line that was chosen."""
     return value(lines[-1:], row)
@@ -249,7 +255,7 @@ MEASURES: dict[str, Callable[[Lines, Row], str]] = {
     f.__name__: f
     for f in (
         accepted_days, by_noise, clock_sigmas, clocks, efficiency, errors, faulty, found, given_inside, inside,
-        knocked, last, mounting, named, power, rig_base, rig_knocks, rig_wrong, shown, starts, stopped_good, total,
-        value, verified, wrong_days,
+        knocked, last, mounting, named, power, rig_base, rig_knocks, rig_wrong, shown, starts, states, stopped_good,
+        total, value, verified, wrong_days,
     )
 }  # fmt: skip

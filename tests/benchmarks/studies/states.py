@@ -58,14 +58,21 @@ from tests.benchmarks.studies.states_fleet import (
     FIRST_DAY,
     STORIES,
     Story,
-    between,
     fleet_text,
     logged_poses,
     spec_of_day,
     stories_of,
     tomorrows_poses,
 )
-from tests.benchmarks.studies.states_measures import Entry, apart, measure, read_file, summary
+from tests.benchmarks.studies.states_measures import (
+    Entry,
+    apart,
+    between,
+    measure,
+    read_file,
+    readme_text,
+    summary,
+)
 
 _OBSERVATIONS = {t.name for t in (MOMENTS, PERCEIVED, *FEATURES.values())}
 _RECORDS = ((CALIBRATIONS, CalibrationRecord), (POSES, PoseRow))
@@ -335,6 +342,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=40, help="a vehicle-day, over two drives")
     parser.add_argument("--only-observe", action="store_true")
     parser.add_argument("--again", choices=["perceive", "calibrate", "audit"])
+    parser.add_argument("--readme", action="store_true", help="print the rows for the results' tables too")
     parser.add_argument("--out", type=Path, default=RESULTS / "states.jsonl")
     args = parser.parse_args()
     os.nice(5)
@@ -348,6 +356,9 @@ def main() -> None:
     if rows:
         print(look("states", [{"commit": r["commit"], "day": {"seed": r["seed"]}} for r in rows]))
         print(summary(rows))
+        print(
+            f"\nFor results/rows.toml and results/README.md:\n\n{readme_text(rows)}\n" if args.readme else ""
+        )
     print(costs(fleets))
 
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse
+from pipeline.geometry.se3 import exp_so3, from_rotation_translation
 from pipeline.simulate.faults import Fault
 from pipeline.simulate.fleet import FleetSpec, mounting_on
 from pipeline.simulate.logs.fleet_toml import mixed_fleet_toml
@@ -20,7 +19,6 @@ __all__ = [
     "FIRST_DAY",
     "STORIES",
     "Story",
-    "between",
     "fleet_text",
     "logged_poses",
     "spec_of_day",
@@ -168,8 +166,3 @@ def _pointing(mounting: Mounting) -> dict[str, np.ndarray]:
         down = from_rotation_translation(exp_so3(np.array([0.0, bias_rad, 0.0])), np.zeros(3))
         found[name] = mounted.T_points @ down
     return found
-
-
-def between(poses: Mapping[str, np.ndarray], parent: str, child: str) -> np.ndarray:
-    """T_parent_child of two sensors, or of base and one."""
-    return inverse(poses[parent]) @ poses[child]

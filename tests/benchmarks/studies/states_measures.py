@@ -19,14 +19,15 @@ from pipeline.geometry.spherical import camera_direction_angles, to_spherical, w
 from pipeline.geometry.targets import DEFAULT_TARGETS
 from schemas.calibrations import DOF_NAMES
 from tests.benchmarks.studies.rates import rate
-from tests.benchmarks.studies.states_fleet import between
 
-__all__ = ["Entry", "apart", "measure", "read_file", "summary", "target_errors_deg"]
+__all__ = ["Entry", "apart", "between", "counts", "measure", "read_file", "readme_text", "summary"]
 
 _OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 _AHEAD_OF = ("camera", "radar", "lidar", "base")  # of an edge's ends, the one before which its targets lie
 # A file is farther off than prior and record if by more than this: less is the mounts' scatter of one day.
 _FARTHER_DEG, _FARTHER_M = 0.1, 0.02
+_FARTHER = f"farther than prior and record (by {_FARTHER_DEG} deg or {_FARTHER_M} m)"
+_COARSE = "coarse labels: first night with camera-lidar certified"
 _LIMITS = VerifyConfig()
 _UNITS = np.r_[np.full(3, 180 / np.pi), np.ones(3)]  # rows hold degrees and metres
 
@@ -55,6 +56,11 @@ class Entry:
     status: str = ""
     reason: str = ""
     frames: tuple[str, str] = ("", "")
+
+
+def between(poses: Mapping[str, np.ndarray], parent: str, child: str) -> np.ndarray:
+    """T_parent_child from the poses of both in one frame, by name."""
+    return inverse(poses[parent]) @ poses[child]
 
 
 def read_file(folder: Path) -> list[Entry]:
@@ -235,7 +241,7 @@ def summary(rows: Sequence[Row]) -> str:
     columns = {rig: [r for r in rows if r["rig"] == rig] for rig in rigs} | {"all": list(rows)}
     if len(rigs) == 1:
         del columns["all"]
-    cells = {name: _measures(own) for name, own in columns.items()}
+    cells = {name: counts(own) for name, own in columns.items()}
     heads = ["of the exported file, against tomorrow's truth", *cells]
     lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
     questions = next(iter(cells.values()))
@@ -243,7 +249,8 @@ def summary(rows: Sequence[Row]) -> str:
     return "\n".join([*lines, "", *_by_edge(rows), "", *_faults(rows)])
 
 
-def _measures(rows: Sequence[Row]) -> dict[str, str]:
+def counts(rows: Sequence[Row]) -> dict[str, str]:
+    """What the study asks, in words, and its answer from these lines."""
     written = [r for r in rows if r["file"] is not None]
     edges = [r for r in written if r["what"] == "edge"]
     z = [sigmas_off(r) for r in written]
@@ -260,18 +267,38 @@ def _measures(rows: Sequence[Row]) -> dict[str, str]:
         "edges with a certified direction": rate(sum(bool(r["certified"]) for r in edges), len(edges)),
         "within 3 sigmas, of all axes used": rate(int(inside.sum()), len(inside)),
         "edges and poses with all axes used within 3": rate(sum(bool((v <= 3).all()) for v in z), len(z)),
-        f"farther than prior and record (by {_FARTHER_DEG} deg or {_FARTHER_M} m)": rate(
-            sum(map(is_farther, written)), len(written)
-        ),
+        _FARTHER: rate(sum(map(is_farther, written)), len(written)),
         "farther by anything": rate(sum(is_farther(r, 0, 0) for r in written), len(written)),
         "nights from a knock until right": ", ".join(
             f"{rows_of['vehicle'].removeprefix('vehicle-')} ({rows_of['story']}): {'never' if n is None else n}"
             for (rows_of, n) in zip(moved.values(), waits.values(), strict=True)
         ),
-        "coarse labels: first night with camera-lidar certified": _coarse(rows),
+        _COARSE: _coarse(rows),
         "ROS 2 file apart from the other [deg, m]": f"{max((a[0] for a in apart_deg), default=0):.2g}, "
         f"{max((a[1] for a in apart_deg), default=0):.2g}",
     }
+
+
+# Of `counts`, those with a goal: what the table of all results asks, the goal, the key.
+_GOALS = (
+    ("files of states, against the next drive: certified and wrong", "0 of 600", "wrong and certified"),
+    ("the same: axes that are used within 3 sigmas", "99 %", "within 3 sigmas, of all axes used"),
+    ("the same: farther from the truth than prior and record", "0", _FARTHER),
+    ("coarse labels: night of the first state that certifies camera-lidar", "4", _COARSE),
+)
+
+
+def readme_text(rows: Sequence[Row]) -> str:
+    """Rows for results/rows.toml, and the paragraph of results/README.md, of these lines."""
+    same = 'file = "states.jsonl"\nmeasure = "states"'
+    made = [
+        f'[[row]]\nquestion = "{q}"\ngoal = "{goal}"\n{same}\ncount = "{key}"\n' for q, goal, key in _GOALS
+    ]
+    seeds = ", ".join(sorted({f"{r['rig']} {r['seed']}" for r in rows}))
+    told = "; ".join(f"{name}: {text}" for name, text in counts(rows).items())
+    commits = ", ".join(sorted({r["commit"] for r in rows}))
+    command = "`python -m tests.benchmarks.studies.states --keep DIR` -> [states.jsonl](states.jsonl)"
+    return "\n".join([*made, f"{command}. Seeds {seeds}, code of {commits}. {told}."])
 
 
 def _coarse(rows: Sequence[Row]) -> str:
