@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, get_args
 
@@ -303,6 +304,13 @@ class VerifyConfig(Section):
     # Smallest probability that an error is within its limit, for a direction to be certified.
     confidence: Annotated[float, Field(gt=0.5, lt=1)] = 0.995
     checks: ChecksConfig = ChecksConfig()
+
+    def limits_rad(self, kind: str) -> tuple[float, float]:
+        """Largest errors of azimuth and elevation that an edge of this kind may have."""
+        camera_deg = self.camera_lidar_limit_deg
+        radar_deg = self.radar_limit_deg, self.radar_elevation_limit_deg
+        azimuth_deg, elevation_deg = radar_deg if "radar" in kind else (camera_deg, camera_deg)
+        return math.radians(azimuth_deg), math.radians(elevation_deg)
 
     @model_validator(mode="before")
     @classmethod

@@ -33,18 +33,14 @@ def evidence_of_day(day: SolvedDay, edges: Mapping[str, Edge], fleet: FleetConfi
     """Evidence of the pairs, and the reason for leaving out pairs held for more than a wide sigma."""
     return [
         evidence_of(
-            estimate, edges[pair], day.prior, fleet.solve.time_offset_sigma_s, _checks(day.judged[pair])
+            estimate,
+            edges[pair],
+            day.prior,
+            fleet.solve.time_offset_sigma_s,
+            day.judged[pair].verdict.against,
         )
         for pair, estimate in day.solution.pairs.items()
     ]
-
-
-def _checks(judged: Judged) -> list[FailedCheck]:
-    verdict = judged.verdict
-    if verdict.status == "accepted" or (verdict.status == "held" and verdict.unsure_only):
-        return []
-    fault = verdict.faults[0] if verdict.faults else ""
-    return [FailedCheck(verdict.reason, fault, disproves=verdict.disproved)]
 
 
 def clocks_of(day: SolvedDay, edges: Mapping[str, Edge]) -> dict[Edge, float]:

@@ -1,70 +1,102 @@
-"""Record of an edge with evidence but without a pair's estimate: the evidence with its prior."""
+"""Record of an edge with evidence but without a pair's estimate: the evidence with its prior, judged."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from pipeline.calibrate.adjust.adjusted import AdjustedRig, AdjustmentLimits
 from pipeline.calibrate.adjust.rig import adjust
-from pipeline.calibrate.records import Inputs
+from pipeline.calibrate.judging import Judged
+from pipeline.calibrate.numerics.search_range import search_range
+from pipeline.calibrate.records import Inputs, unobservable, verdict_fields, verdict_numbers
+from pipeline.calibrate.verify.edge_result import EdgeResult
+from pipeline.calibrate.verify.mounting import mounting_covariance
 from pipeline.calibrate.verify.seen_targets import targets_of
 from pipeline.calibrate.verify.target_accuracy import claims_of
+from pipeline.calibrate.verify.verdict import Evidence, judge
 from pipeline.config import FleetConfig
-from pipeline.extrinsics.checks import faults_of
+from pipeline.geometry.changes import change_covariance
 from pipeline.geometry.pose_columns import pose_columns
+from pipeline.geometry.se3 import adjoint, inverse
 from pipeline.geometry.targets import DEFAULT_TARGETS
 from pipeline.rig.evidence import EdgeEvidence
 from pipeline.rig.extrinsics import Extrinsics
-from pipeline.rig.graph import Edge, RigGraph
+from pipeline.rig.graph import BASE, Edge, RigGraph
 from pipeline.rig.prior import RigPrior
 from pipeline.rig.views import View
-from schemas.calibrations import DOF_NAMES, CalibrationRecord
+from schemas.calibrations import CalibrationRecord
 from schemas.versions import CODE_VERSION
 
-__all__ = ["record_of_evidence", "refused_edge"]
+__all__ = ["JudgedEdge", "judged_edge", "record_of_edge", "refused_edge"]
+
+_ON_BASE = ("roll", "pitch", "yaw", "x", "y", "z")
 
 
-def record_of_evidence(
-    about: Inputs,
-    evidence: EdgeEvidence,
-    prior: RigPrior,
-    views: Mapping[str, View],
-    fleet: FleetConfig,
-    frames_total: int,
-) -> CalibrationRecord:
-    """Record of an edge from its own data and its prior alone."""
-    edge, limits = evidence.edge, AdjustmentLimits(fleet.solve.time_offset_sigma_s)
-    before = _prior_of(edge, prior)
-    alone = adjust(
-        RigGraph(edge.sensors, (edge,), edge.parent), before, [replace(evidence, checks=())], limits
-    )
-    found = alone.sensors[edge.child.name]
+@dataclass(frozen=True, eq=False)
+class JudgedEdge:
+    """An edge's evidence, with its prior alone, and the verdict on it.
+
+    `evidence` has the reason why the rig must not use it, if there is one.
+    """
+
+    evidence: EdgeEvidence
+    alone: AdjustedRig
+    judged: Judged
+
+
+def judged_edge(
+    evidence: EdgeEvidence, prior: RigPrior, views: Mapping[str, View], fleet: FleetConfig
+) -> JudgedEdge:
+    """Combine an edge's own data with its prior alone, and judge the result."""
+    edge = evidence.edge
+    free, limits = replace(evidence, checks=()), AdjustmentLimits(fleet.solve.time_offset_sigma_s)
+    alone = adjust(RigGraph(edge.sensors, (edge,), edge.parent), _prior_of(edge, prior), [free], limits)
     T, covariance = alone.poses.T[edge.child.name], alone.poses.covariance
-    status, reason, determined, sigmas = _judged(alone, evidence, views, fleet)
+    targets = targets_of(T, views.get(edge.parent.name), views.get(edge.child.name))
+    targets = DEFAULT_TARGETS if targets is None else targets
+    azimuth_rad, elevation_rad = fleet.verify.limits_rad(edge.kind)
+    mounting = mounting_covariance(edge.kind, T, covariance, None)
+    claims = claims_of(
+        edge.kind,
+        T,
+        covariance,
+        None,
+        azimuth_rad,
+        fleet.verify.confidence,
+        elevation_limit_rad=elevation_rad,
+        mounting=mounting,
+        targets=targets,
+    )
+    result = _result(evidence, alone, prior, fleet)
+    verdict = judge(result, Evidence(None, claims, evidence.checks), fleet.verify.checks)
+    judged = Judged(verdict, None, claims, mounting, targets)
+    return JudgedEdge(replace(evidence, checks=verdict.against), alone, judged)
+
+
+def record_of_edge(about: Inputs, found: JudgedEdge, frames_total: int) -> CalibrationRecord:
+    """Record of an edge from its own data and its prior alone."""
+    evidence, alone, child = found.evidence, found.alone, found.evidence.edge.child.name
+    of_child = alone.sensors[child]
+    pose = {} if found.judged.verdict.status == "refused" else pose_columns(alone.poses.T[child]) | {
+        "covariance": alone.poses.covariance,
+        "common_covariance": alone.poses.common,
+        "observability": [float(v) for v in of_child.observability],
+        "observable": [bool(v) for v in of_child.determined],
+    }  # fmt: skip
     return CalibrationRecord(
-        **_identity(about, edge, frames_total),
-        **pose_columns(before.T[edge.child.name], "prior_"),
-        prior_covariance=before.covariance,
-        **pose_columns(T),
-        covariance=covariance,
-        common_covariance=alone.poses.common,
-        observability=[float(v) for v in found.observability],
-        observable=[bool(v) for v in found.determined],
-        status=status,
-        reason=reason,
-        faults=faults_of(evidence.checks),
-        determined=determined,
-        limit_rad=float(np.radians(fleet.verify.camera_lidar_limit_deg)),
-        azimuth_sigma_rad=sigmas[0],
-        elevation_sigma_rad=sigmas[1],
+        **_identity(about, evidence.edge, frames_total),
+        **pose_columns(alone.before.T[child], "prior_"),
+        prior_covariance=alone.before.covariance,
+        **pose,
+        **verdict_fields(found.judged),
         frames_used=evidence.frames_used,
         frames_rejected=dict(evidence.frames_rejected),
-        notes=[*evidence.notes, *_unobservable(found.determined)],
-        diagnostics=dict(evidence.diagnostics),
+        notes=[*evidence.notes, *unobservable(of_child.determined)],
+        diagnostics=dict(evidence.diagnostics) | verdict_numbers(found.judged),
     )
 
 
@@ -83,35 +115,35 @@ def _prior_of(edge: Edge, prior: RigPrior) -> Extrinsics:
     return Extrinsics(edge.parent, {parent: np.eye(4), child: T}, (child,), covariance, covariance)
 
 
-def _judged(
-    alone: AdjustedRig, evidence: EdgeEvidence, views: Mapping[str, View], fleet: FleetConfig
-) -> tuple[str, str, list[str], tuple[float, float]]:
-    """Status, reason, certified directions and sigmas of azimuth and elevation."""
-    edge, verify = evidence.edge, fleet.verify
-    parent, child = edge.sensors
-    T = alone.poses.T[child.name]
-    targets = targets_of(T, views.get(parent.name), views.get(child.name))
-    is_radar = "radar" in edge.kind
-    azimuth_deg = verify.radar_limit_deg if is_radar else verify.camera_lidar_limit_deg
-    elevation_deg = verify.radar_elevation_limit_deg if is_radar else verify.camera_lidar_limit_deg
-    claims = claims_of(
+def _result(evidence: EdgeEvidence, alone: AdjustedRig, prior: RigPrior, fleet: FleetConfig) -> EdgeResult:
+    edge, child, names = evidence.edge, evidence.edge.child.name, EdgeResult.names
+    (T, covariance), (before, before_covariance) = (
+        (at.T[child], at.covariance) for at in (alone.poses, alone.before)
+    )
+    if edge.child == BASE:
+        (T, covariance), (before, before_covariance) = (
+            _inverse(T, covariance),
+            _inverse(before, before_covariance),
+        )
+        names = _ON_BASE
+    sigmas = prior.sigmas_between(*(s.name for s in edge.sensors))
+    return EdgeResult(
         edge.kind,
         T,
-        alone.poses.covariance,
-        None,
-        float(np.radians(azimuth_deg)),
-        verify.confidence,
-        elevation_limit_rad=float(np.radians(elevation_deg)),
-        targets=DEFAULT_TARGETS if targets is None else targets,
+        covariance,
+        alone.sensors[child].determined,
+        before,
+        change_covariance(before, before_covariance),
+        evidence.frames_used,
+        search_range(sigmas, fleet.solve),
+        names,
     )
-    sigmas = claims["azimuth"].sigma_rad, claims["elevation"].sigma_rad
-    determined = [name for name, claim in claims.items() if claim.margin >= 0]
-    if evidence.checks:
-        return "held", "; ".join(c.sentence for c in evidence.checks), [], sigmas
-    if not determined:
-        words = ", ".join(f"{n} known to {np.degrees(c.sigma_rad):.2f} deg" for n, c in claims.items())
-        return "held", f"{words} (1 sigma), not within its limit", [], sigmas
-    return "accepted", "", determined, sigmas
+
+
+def _inverse(T: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The inverse pose, and the covariance of its left perturbation."""
+    A = adjoint(inverse(T))
+    return inverse(T), A @ covariance @ A.T
 
 
 def _identity(about: Inputs, edge: Edge, frames_total: int) -> dict[str, Any]:
@@ -128,8 +160,3 @@ def _identity(about: Inputs, edge: Edge, frames_total: int) -> dict[str, Any]:
         "inputs": list(about.inputs),
         "frames_total": frames_total,
     }
-
-
-def _unobservable(determined: np.ndarray) -> list[str]:
-    names = [name for name, seen in zip(DOF_NAMES, determined, strict=True) if not seen]
-    return [f"not determined by the day: {', '.join(names)}"] if names else []

@@ -124,11 +124,7 @@ class Judging:
     ) -> tuple[HeldOutTest | None, Mapping[str, Claim], dict[str, float], list[FailedCheck]]:
         """Held-out frames at the prior and at the result, the remaining claim, known turns, and a better place."""
         pair, verify, prior = estimate.pair, self.fleet.verify, self.prior
-        azimuth_deg, elevation_deg = (
-            (verify.camera_lidar_limit_deg, verify.camera_lidar_limit_deg)
-            if pair == "camera_lidar"
-            else (verify.radar_limit_deg, verify.radar_elevation_limit_deg)
-        )
+        azimuth_rad, elevation_rad = verify.limits_rad(pair)
         test, update, probes, score = None, None, dict[str, float](), None
         if held_out:
             score = held_out_score(estimate, held_out, prior, self.fleet.solve)
@@ -143,10 +139,10 @@ class Judging:
             estimate.T,
             estimate.covariance,
             update,
-            float(np.radians(azimuth_deg)),
+            azimuth_rad,
             verify.confidence,
             limits.held_out_contradiction_sigmas,
-            float(np.radians(elevation_deg)),
+            elevation_rad,
             mounting,
             targets,
         )

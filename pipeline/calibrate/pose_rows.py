@@ -145,20 +145,15 @@ def _claims(
     """Claims for directions of the reference's points in the sensor, at these targets."""
     reference = poses.reference.name
     T = poses.between(sensor.name, reference)
-    camera_deg = verify.camera_lidar_limit_deg
-    azimuth_deg, elevation_deg = (
-        (verify.radar_limit_deg, verify.radar_elevation_limit_deg)
-        if sensor.kind == "radar"
-        else (camera_deg, camera_deg)
-    )
+    azimuth_rad, elevation_rad = verify.limits_rad(sensor.kind)
     return claims_of(
         f"{sensor.kind}_{poses.reference.kind}",
         T,
         poses.covariance_between(sensor.name, reference),
         None,
-        float(np.radians(azimuth_deg)),
+        azimuth_rad,
         verify.confidence,
-        elevation_limit_rad=float(np.radians(elevation_deg)),
+        elevation_limit_rad=elevation_rad,
         targets=targets,
     )
 

@@ -33,6 +33,9 @@ __all__ = [
     "record_of",
     "refused_record",
     "refused_records",
+    "unobservable",
+    "verdict_fields",
+    "verdict_numbers",
 ]
 
 # Speeds that separate a highway from a town [m/s]: 20 m/s = 72 km/h is above town limits.
@@ -60,44 +63,30 @@ class Inputs:
 def record_of(about: Inputs, pair: str, day: SolvedDay) -> CalibrationRecord:
     """The record of one pair that was computed."""
     estimate, judged, selection = day.solution.pairs[pair], day.judged[pair], day.selection
-    verdict, test = judged.verdict, judged.test
+    verdict = judged.verdict
     trigger_after = trigger_metrics(day.trigger_sample, {pair: estimate.T})[pair]
     return CalibrationRecord(
         **_identity(about, pair, len(day.observations), day.prior),
-        **(
-            {}
-            if verdict.status == "refused"
-            else _estimate_fields(estimate, judged) | _mounting_fields(judged)
-        ),
+        **({} if verdict.status == "refused" else _estimate_fields(estimate)),
+        **verdict_fields(judged),
         **_loop_fields(day.solution),
-        status=verdict.status,
-        reason=verdict.reason,
-        faults=list(verdict.faults),
-        score=verdict.score,
-        determined=list(verdict.determined),
-        mounting_determined=list(verdict.mounting),
-        limit_rad=judged.claims["azimuth"].limit_rad,
         frames_used=estimate.frames_used,
         frames_rejected=_add(selection.rejected[pair], estimate.frames_rejected),
         environment=environment_of(day.observations),
         triggered=day.triggered[pair],
         trigger_before=dict(day.trigger_before[pair]),
         trigger_after=dict(trigger_after),
-        alignment_before=test.before if test else None,
-        alignment_after=test.after if test else None,
         time_offset_s=estimate.time_offset_s,
         time_offset_sigma_s=estimate.time_offset_sigma_s,
         notes=[
             *notes_of_pair(pair, day.observations),
             *selection.notes.get(pair, []),
-            *_unobservable(estimate.observable),
+            *unobservable(estimate.observable),
         ],
         assumptions=[*_assumed(estimate, day.observations), *estimate.notes],
         drive_missing=selection.missing.get(pair, []),
         diagnostics=dict(estimate.diagnostics)
-        | _test_numbers(test)
-        | dict(judged.probes)
-        | _claim_numbers(judged)
+        | verdict_numbers(judged)
         | _camera_numbers(pair, day.observations)
         | dict(day.numbers)
         | _parts_numbers(estimate)
@@ -176,7 +165,8 @@ def _identity(about: Inputs, pair: str, frames: int, prior: Prior | None) -> dic
     return fields
 
 
-def _unobservable(observable: np.ndarray) -> list[str]:
+def unobservable(observable: np.ndarray) -> list[str]:
+    """A note of the degrees of freedom that the day did not determine; none if there are none."""
     names = [name for name, seen in zip(DOF_NAMES, observable, strict=True) if not seen]
     return [f"not determined by the day: {', '.join(names)}"] if names else []
 
@@ -226,6 +216,31 @@ def _test_numbers(test: HeldOutTest | None) -> dict[str, float]:
     return {f"holdout_{name}": value for name, value in frames.items()}
 
 
+def verdict_fields(judged: Judged) -> dict[str, Any]:
+    """Fields of the verdict; sigmas and targets are missing in a refused record."""
+    verdict, test = judged.verdict, judged.test
+    fields = {
+        "status": verdict.status,
+        "reason": verdict.reason,
+        "faults": list(verdict.faults),
+        "score": verdict.score,
+        "determined": list(verdict.determined),
+        "mounting_determined": list(verdict.mounting),
+        "limit_rad": judged.claims["azimuth"].limit_rad,
+        "alignment_before": test.before if test else None,
+        "alignment_after": test.after if test else None,
+    }
+    if verdict.status == "refused":
+        return fields
+    sigmas = {f"{name}_sigma_rad": claim.sigma_rad for name, claim in judged.claims.items()}
+    return fields | sigmas | {"targets_m": judged.targets} | _mounting_fields(judged)
+
+
+def verdict_numbers(judged: Judged) -> dict[str, float]:
+    """Numbers behind the verdict: held-out frames, known turns of the result, score, certified axes."""
+    return _test_numbers(judged.test) | dict(judged.probes) | _claim_numbers(judged)
+
+
 def _claim_numbers(judged: Judged) -> dict[str, float]:
     """Score, certified and unchecked axes, innovation of held-out frames, resulting sigma."""
     certified = judged.verdict.determined
@@ -250,17 +265,13 @@ def _claim_numbers(judged: Judged) -> dict[str, float]:
     }
 
 
-def _estimate_fields(estimate: PairEstimate, judged: Judged) -> dict[str, Any]:
+def _estimate_fields(estimate: PairEstimate) -> dict[str, Any]:
     """Fields that a refused record lacks: the transform and its covariance."""
-    sigma = {name: claim.sigma_rad for name, claim in judged.claims.items()}
     return {
         "covariance": estimate.covariance,
         "common_covariance": estimate.common_covariance,
         "observability": [float(v) for v in estimate.observability],
         "observable": [bool(v) for v in estimate.observable],
-        "azimuth_sigma_rad": sigma["azimuth"],
-        "elevation_sigma_rad": sigma["elevation"],
-        "targets_m": judged.targets,
         **pose_columns(estimate.T),
     }
 

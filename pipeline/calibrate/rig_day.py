@@ -18,7 +18,7 @@ from pipeline.calibrate.adjust.adjusted import AdjustedRig
 from pipeline.calibrate.adjusted_day import adjusted_rig, clocks_of, evidence_of_day, judged_together
 from pipeline.calibrate.base_edges import BaseEdges
 from pipeline.calibrate.day import DayOfPairs, records_of, solve_day
-from pipeline.calibrate.edge_records import record_of_evidence, refused_edge
+from pipeline.calibrate.edge_records import judged_edge, record_of_edge, refused_edge
 from pipeline.calibrate.records import Inputs, refused_record
 from pipeline.calibrate.verify.constancy import moved_failures
 from pipeline.config import FleetConfig
@@ -33,7 +33,6 @@ from pipeline.rig.graph import BASE, Edge, RigGraph
 from pipeline.rig.prior import RigPrior
 from pipeline.rig.rig import Rig
 from pipeline.rig.views import View
-from pipeline.store.current import transform_of
 from pipeline.store.views import Chosen
 from schemas.calibrations import SENSORS, CalibrationRecord
 from schemas.observations import Observation
@@ -199,13 +198,15 @@ def _solve_other(
     except SolveError as err:
         found.records.append(refused_edge(about, edge, err.reason, 0, err.fault))
         return
-    record = record_of_evidence(about, shown, day.prior, day.views, fleet, frames)
-    found.records.append(record)
-    found.evidence.append(shown)
-    if edge.kind == "lidar_base" and not shown.checks and record.covariance is not None:
-        T, sigma_rad = transform_of(record), float(np.sqrt(record.covariance[2, 2]))
-        assert T is not None
-        found.headings.setdefault(edge.parent.name, []).append((_azimuth(T), sigma_rad))
+    judged = judged_edge(shown, day.prior, day.views, fleet)
+    found.records.append(record_of_edge(about, judged, frames))
+    found.evidence.append(judged.evidence)
+    if edge.kind == "lidar_base" and not judged.evidence.checks:
+        poses = judged.alone.poses
+        sigma_rad = float(np.sqrt(poses.covariance[2, 2]))
+        found.headings.setdefault(edge.parent.name, []).append(
+            (_azimuth(poses.T[edge.child.name]), sigma_rad)
+        )
 
 
 def _azimuth(T_lidar_base: Float[np.ndarray, "4 4"]) -> float:

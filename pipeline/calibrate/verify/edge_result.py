@@ -1,4 +1,9 @@
-"""Result of one edge of any kind beside its prior: input of the verdict."""
+"""Result of one edge of any kind beside its prior: input of the verdict.
+
+The move from the prior is the sensor's turn and the shift of its origin in axes of what it is mounted on. So a
+sensor on the vehicle frame is given as T_base_sensor: as T_sensor_base, a turn in its bracket would be a
+shift by its lever arm.
+"""
 
 from __future__ import annotations
 
@@ -9,21 +14,24 @@ from jaxtyping import Bool, Float
 
 from pipeline.calibrate.numerics.search_range import SearchRange
 from pipeline.geometry.changes import change_between, change_covariance
+from schemas.calibrations import DOF_NAMES
 
 __all__ = ["EdgeResult"]
 
 
 @dataclass(frozen=True, eq=False)
 class EdgeResult:
-    """T_parent_child of an edge, the prior that stays current without it, and what the day determined.
+    """Pose of an edge, the prior that stays current without it, and what the day determined.
 
     Args:
         kind: kind of the edge, e.g. camera_lidar.
+        T: T_parent_child, or its inverse for an edge to the vehicle frame.
         covariance: of the left perturbation exp(xi) T [rad, m].
-        observable: degrees of freedom that the day determined.
-        prior: T_parent_child before the day.
-        prior_covariance: of a change (rotation vector, child's origin) of the prior [rad, m].
+        observable: degrees of freedom of T_parent_child that the day determined.
+        prior: T before the day.
+        prior_covariance: of a change (rotation vector, origin) of the prior [rad, m].
         search: what was searched about the prior.
+        names: of the six numbers of a change.
     """
 
     kind: str
@@ -34,6 +42,7 @@ class EdgeResult:
     prior_covariance: Float[np.ndarray, "6 6"]
     frames_used: int
     search: SearchRange
+    names: tuple[str, ...] = DOF_NAMES
 
     @property
     def move(self) -> Float[np.ndarray, " 6"]:

@@ -23,13 +23,15 @@ from schemas.calibrations import DOF_NAMES
 
 __all__ = ["Evidence", "Verdict", "judge"]
 
-# What a pair is good for: without it there is nothing to accept. A radar without elevation is still worth its azimuth.
+# What an edge is good for: without it there is nothing to accept. A radar without elevation is still worth its
+# azimuth. Of other kinds either direction is.
 _NEEDED = {
     "camera_lidar": ("azimuth", "elevation"),
     "camera_radar": ("azimuth",),
     "lidar_radar": ("azimuth",),
 }
-# Degrees of freedom that the held-out score depends on: registration and boxes do not see the radar's elevation.
+# Degrees of freedom that the held-out score depends on, of the kinds of edges that have one: registration and boxes do
+# not see the radar's elevation.
 _SCORED = {
     "camera_lidar": np.ones(6, bool),
     "camera_radar": np.array([False, True, False, False, False, False]),
@@ -75,6 +77,14 @@ class Verdict:
         str, ...
     ] = ()  # of the certified directions, those in which the mounting is within the limit too
     faults: tuple[str, ...] = ()  # keys of schemas.faults.FAULTS that the failed checks name
+
+    @property
+    def against(self) -> tuple[FailedCheck, ...]:
+        """Why the adjustment of the rig must not use the edge; empty if it may, as with a sigma that is too large."""
+        if self.status == "accepted" or (self.status == "held" and self.unsure_only):
+            return ()
+        fault = self.faults[0] if self.faults else ""
+        return (FailedCheck(self.reason, fault, disproves=self.disproved),)
 
 
 @dataclass(frozen=True)
@@ -129,7 +139,8 @@ def judge(
         checks += _aligns_no_worse(result, evidence.held_out, limits)
     else:
         checks += _moves_little(result, limits)
-        checks.append(_aligns_better(result, evidence.held_out, limits))
+        if result.kind in _SCORED:
+            checks.append(_aligns_better(result, evidence.held_out, limits))
     checks += _claims_hold(result, evidence.claims)
     if not result.observable.any():
         checks.append(_Check(_FAILED, "the day determines no degree of freedom"))
@@ -184,7 +195,7 @@ def _moves_little(result: EdgeResult, limits: ChecksConfig) -> list[_Check]:
         ),
         _Check(
             1 - ratio[worst] / limits.max_move_prior_sigmas,
-            f"{DOF_NAMES[worst]} moved {ratio[worst]:.1f} prior sigmas",
+            f"{result.names[worst]} moved {ratio[worst]:.1f} prior sigmas",
             fault="prior",
         ),
     ]
@@ -223,7 +234,7 @@ def _largest_move(result: EdgeResult) -> tuple[str, float]:
     """Largest move of a degree of freedom that held-out frames score, in sigmas of the result."""
     ratio = np.where(_SCORED[result.kind], result.move_sigmas, 0.0)
     worst = int(np.argmax(ratio))
-    return DOF_NAMES[worst], float(ratio[worst])
+    return result.names[worst], float(ratio[worst])
 
 
 def _unchecked(result: EdgeResult, certified: Sequence[str]) -> dict[int, float]:
@@ -235,7 +246,7 @@ def _unchecked(result: EdgeResult, certified: Sequence[str]) -> dict[int, float]
     if "elevation" in certified:
         return {}
     moves = result.move_sigmas
-    return {k: float(moves[k]) for k in _UNCHECKED[result.kind] if moves[k] > _UNCHECKED_MOVE_SIGMAS}
+    return {k: float(moves[k]) for k in _UNCHECKED.get(result.kind, {}) if moves[k] > _UNCHECKED_MOVE_SIGMAS}
 
 
 def _worse(test: HeldOutTest) -> str:
@@ -248,11 +259,16 @@ def _claims_hold(result: EdgeResult, claims: Mapping[str, Claim]) -> list[_Check
 
     A sigma that held-out frames exceed is not only too large: the pose may lie outside of it.
     """
-    return [
-        _Check(claim.margin, f"{name} is {_known(claim)}", of_sigma=not claim.is_exceeded)
+    needed = _NEEDED.get(result.kind)
+    checks = {
+        name: _Check(claim.margin, f"{name} is {_known(claim)}", of_sigma=not claim.is_exceeded)
         for name, claim in claims.items()
-        if name in _NEEDED[result.kind]
-    ]
+    }
+    if needed is not None:
+        return [checks[name] for name in needed if name in checks]
+    best = max(check.margin for check in checks.values())
+    words = "; ".join(check.reason for check in checks.values())
+    return [_Check(best, words, of_sigma=all(check.of_sigma for check in checks.values()))]
 
 
 def _known(claim: Claim) -> str:
