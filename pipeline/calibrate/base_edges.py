@@ -18,9 +18,17 @@ from pipeline.calibrate.edges.radar_base import Stamps, estimate_radar_base
 from pipeline.calibrate.edges.sweeps import sweeps_of
 from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.errors import SolveError
+from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.prior import no_prior
 from pipeline.geometry.se3 import inverse
-from pipeline.objective.ego_motion import DopplerMotion, EgoMotion, Odometry, ego_motion, motion_of
+from pipeline.objective.ego_motion import (
+    DopplerMotion,
+    EgoMotion,
+    Odometry,
+    backwards,
+    ego_motion,
+    motion_of,
+)
 from pipeline.objective.radar.travel import TravelDirections, travel_directions
 from pipeline.rig.evidence import EdgeEvidence
 from pipeline.rig.graph import BASE, Edge
@@ -30,6 +38,7 @@ from schemas.observations import Observation
 
 __all__ = ["BaseEdges"]
 
+_ODOMETRY = "odometry"
 _FEWEST_DIRECTIONS = 8  # scans whose elevations a lidar mends: fewer show no pitch
 
 
@@ -96,9 +105,14 @@ class BaseEdges:
         radar = self._doppler(name, rows) if rows else None
         if radar is None:
             raise SolveError(f"{name} is silent: the day has no scan of it", "silent_sensor")
+        if name in self._backwards:
+            return _turned_round(edge, radar), len(rows)
         scenes = Scenes.of(rows)
         stamps = Stamps(*(np.array(column) for column in zip(*_stamps(rows), strict=True)))
         ego = self._ego_at(rows, without=name)
+        if not np.isfinite(ego.velocity_mps).any():
+            wrong = f": the car drives backwards by {', '.join(self._backwards)}" if self._backwards else ""
+            raise SolveError(f"nothing but {name} itself shows how the car moves{wrong}")
         found = estimate_radar_base(edge, radar, ego, stamps, scenes, self._directions(name, rows))
         return found, len(rows)
 
@@ -136,8 +150,21 @@ class BaseEdges:
 
     def _ego_at(self, rows: Sequence[Observation], without: str = "") -> EgoMotion:
         """Motion of the base at the rows' moments, by odometry and all radars but one."""
-        measured = [self._doppler(name, rows) for name in self.radars if name != without]
-        return ego_motion([m for m in measured if m is not None], _odometry(rows), heading=(0.0, 0.0))
+        radars = [name for name in self.radars if name not in (without, *self._backwards)]
+        measured = [m for name in radars if (m := self._doppler(name, rows)) is not None]
+        odometry = _odometry(rows)
+        if _ODOMETRY in self._backwards:
+            odometry = Odometry(odometry.speed_mps * np.nan, odometry.yaw_rate_radps * np.nan)
+        return ego_motion(measured, odometry, heading=(0.0, 0.0))
+
+    @cached_property
+    def _backwards(self) -> list[str]:
+        """Sources of motion by which the car drives backwards, where others show that it does not."""
+        rows = {name: list(self._dopplers[name].values()) for name in self.radars}
+        measured = [m for name in self.radars if (m := self._doppler(name, rows[name])) is not None]
+        odometry = [_odometry(of_radar).speed_mps for of_radar in rows.values() if of_radar]
+        speeds = {m.name: m.level()[0][:, 0] for m in measured}
+        return backwards(speeds | {_ODOMETRY: np.concatenate(odometry)} if odometry else speeds)
 
     def _doppler(self, name: str, rows: Sequence[Observation]) -> DopplerMotion | None:
         T_base_radar = self.prior.between(BASE.name, name)
@@ -159,6 +186,17 @@ class BaseEdges:
             T_base_radar,
             sigma_rad,
         )
+
+
+def _turned_round(edge: Edge, radar: DopplerMotion) -> EdgeEvidence:
+    """A radar by whose Doppler the car drives backwards, at its prior."""
+    shown = f"by the Doppler of {radar.name} the car drives backwards, by other sources it does not"
+    fits = "the other sign fits (doppler_positive in fleet.toml), or its transform is turned round"
+    nothing, moments = np.zeros((7, 7)), int(np.isfinite(radar.velocity_mps).all(1).sum())
+    return EdgeEvidence(
+        edge, inverse(radar.T_base_radar), 0.0, nothing, nothing[0], frames_used=moments,
+        checks=(FailedCheck(f"{shown}: {fits}", "doppler"),),
+    )  # fmt: skip
 
 
 def _stamps(rows: Sequence[Observation]) -> list[tuple[int, int, int]]:

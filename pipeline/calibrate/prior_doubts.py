@@ -42,16 +42,23 @@ def hold_doubted(
 
 
 def _held(row: PoseRow, said: str) -> PoseRow:
-    if row.status != "accepted" or row.sensor == row.reference:
+    if row.status == "refused" or row.sensor == row.reference:
         return row
     reason = f"{said}; {row.reason}" if row.reason else said
-    return replace(row, status="held", reason=reason, faults=[*row.faults, _FAULT], determined=[])
+    faults = list(dict.fromkeys([*row.faults, _FAULT]))
+    return replace(row, status="held", reason=reason, faults=faults, determined=[], unsure_only=False)
 
 
 def _held_record(record: CalibrationRecord, said: str) -> CalibrationRecord:
     """Record of an edge, held unless its own data determine x and y."""
-    if record.status != "accepted" or all((record.observable or [False] * 6)[3:5]):
+    if record.status == "refused" or _FAULT in record.faults or all((record.observable or [False] * 6)[3:5]):
         return record
-    reason = f"{said}; {record.reason}" if record.reason else said
-    faults = [*record.faults, _FAULT]
-    return replace(record, status="held", reason=reason, faults=faults, determined=[], mounting_determined=[])
+    return replace(
+        record,
+        status="held",
+        reason=f"{said}; {record.reason}" if record.reason else said,
+        faults=[*record.faults, _FAULT],
+        determined=[],
+        mounting_determined=[],
+        diagnostics=record.diagnostics | {"unsure_only": 0.0, "few_only": 0.0},
+    )

@@ -28,6 +28,7 @@ __all__ = [
     "EgoMotion",
     "Odometry",
     "agreed_share",
+    "backwards",
     "contradicting",
     "ego_motion",
     "is_same",
@@ -41,6 +42,7 @@ __all__ = [
 # ambiguous), odometry and Doppler in 97 %; where one was wrong, in 17, 17 and 40 % at most.
 _SAME_MPS, _SAME_SHARE = 0.5, 0.2
 _MET, _AGREED = 0.4, 0.5
+_MOSTLY = 2 / 3  # of the moments with motion: no car drives backwards for so much of a day
 _MOVING_MPS, _FEWEST, _FEWEST_FRAMES = 3.0, 6, 5
 _LEAST_SIGMA_MPS = 0.03  # Doppler's steps, a wheel's ticks
 _ODOMETRY_SIGMAS = (0.1, 0.003)  # of speed [m/s] and yaw rate [rad/s] where nothing else shows their scatter
@@ -215,6 +217,17 @@ def contradicting(speeds_mps: Mapping[str, Float[np.ndarray, " F"]]) -> dict[str
         if met < _MET and together >= _AGREED:
             found[name] = f"{name} has the speed of the other sources in {met:.0%} of the moments"
     return found
+
+
+def backwards(speeds_mps: Mapping[str, Float[np.ndarray, " F"]]) -> list[str]:
+    """Sources by which the car drives backwards for most of the day, where it drives forwards by another.
+
+    Moments may differ from source to source.
+    """
+    moving = {n: v[np.abs(np.nan_to_num(v)) > _MOVING_MPS] for n, v in speeds_mps.items()}
+    share = {n: float(np.mean(v < 0)) for n, v in moving.items() if len(v) >= _FEWEST}
+    is_driven = any(value < 1 - _MOSTLY for value in share.values())
+    return [n for n, value in share.items() if value > _MOSTLY] if is_driven else []
 
 
 def agreed_share(speed_mps: Float[np.ndarray, " F"], other_mps: Float[np.ndarray, " F"]) -> float:

@@ -88,3 +88,20 @@ def test_edges_of_a_sensor_with_a_wrong_prior_are_held_unless_they_know_its_plac
         "grille-nose": ("accepted", ["azimuth"]),
         "left-rear": ("accepted", ["azimuth"]),
     }
+
+
+def test_what_was_only_unsure_does_not_count_where_its_prior_is_contradicted():
+    unsure = replace(
+        pose("left"), status="held", reason="azimuth known to .2 deg", unsure_only=True, determined=[]
+    )
+    record = replace(
+        against("left-nose")[0],
+        pair="camera_radar",
+        faults=[],
+        reason="azimuth",
+        diagnostics={"unsure_only": 1.0},
+    )
+    rows, records = hold_doubted([pose("top"), unsure], [*against("left-top"), record])
+    assert (rows[1].status, rows[1].faults, rows[1].unsure_only) == ("held", ["prior"], False)
+    assert rows[1].reason.endswith("; azimuth known to .2 deg")
+    assert (records[1].faults, records[1].diagnostics["unsure_only"]) == (["prior"], 0.0)

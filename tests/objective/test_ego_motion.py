@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation
-from pipeline.objective.ego_motion import DopplerMotion, Odometry, ego_motion
+from pipeline.objective.ego_motion import DopplerMotion, Odometry, backwards, ego_motion
 
 MOMENTS = 120
 NOISE_MPS = 0.05
@@ -113,3 +113,14 @@ def test_a_sensor_moves_with_its_lever_arm():
     found = ego_motion([], Odometry(np.array([10.0, 0.0]), np.array([0.5, 0.5])), heading=(0.0, 0.0))
     T = from_rotation_translation(exp_so3(np.radians([0.0, 0.0, 90.0])), np.array([2.0, 1.0, 0.5]))
     assert found.at_sensor(T) == pytest.approx(np.array([[1.0, -9.5, 0.0], [1.0, 0.5, 0.0]]), abs=2e-3)
+
+
+def test_who_drives_backwards_is_named_where_somebody_drives_ahead():
+    ahead = np.full(20, 9.0)
+    reverse = np.where(np.arange(20) < 4, -2.0, 9.0)  # out of a parking space
+    assert backwards({"front": -ahead, "odometry": reverse}) == ["front"]
+    assert backwards({"front": -ahead, "rear": -ahead, "odometry": ahead}) == ["front", "rear"]
+    assert backwards({"front": ahead, "odometry": -ahead}) == ["odometry"]
+    assert backwards({"front": -ahead, "odometry": -ahead}) == []  # the base's axes, or a car that does
+    assert backwards({"front": -ahead, "odometry": np.full(20, np.nan)}) == []
+    assert backwards({"front": -ahead[:5], "odometry": ahead}) == []  # too few moments

@@ -1,0 +1,147 @@
+"""Edges to the vehicle frame and between lidars are judged as pairs are: range, prior, number, claims."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.calibrate.edge_records import judged_edge, record_of_edge
+from pipeline.calibrate.edges.radar_base import estimate_radar_base
+from pipeline.calibrate.records import Inputs
+from pipeline.extrinsics.checks import FailedCheck
+from pipeline.geometry.changes import change_between
+from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse
+from pipeline.rig.evidence import EdgeEvidence
+from pipeline.rig.graph import BASE, Edge, Sensor
+from pipeline.rig.prior import RigPrior
+from pipeline.store.partitions import Partition
+from tests.calibrate.edges.test_radar_base import ALL, EDGE, STAMPS, day, mounted
+from tests.makers.written_logs import fleet_config
+
+FLEET = fleet_config()
+ABOUT = Inputs(Partition("car", "2026-03-02"), "joint", "w", 0, ())
+TOP = Sensor("top", "lidar")
+SIGMAS = (float(np.radians(2.0)), 0.03)
+
+
+def turned(T, rpy_deg=(0.0, 0.0, 0.0), xyz_m=(0.0, 0.0, 0.0)):
+    """A sensor turned about its own origin and shifted, in axes of the base."""
+    return from_rotation_translation(exp_so3(np.radians(rpy_deg)) @ T[:3, :3], T[:3, 3] + xyz_m)
+
+
+def prior_of(edge, T_base_sensor, sigmas=SIGMAS):
+    name = edge.parent.name
+    return RigPrior(
+        edge.sensors, edge.parent, {(name, "base"): inverse(T_base_sensor)}, {name: sigmas, "base": sigmas}
+    )
+
+
+def judged(evidence, T_base_sensor, sigmas=SIGMAS):
+    found = judged_edge(evidence, prior_of(evidence.edge, T_base_sensor, sigmas), {}, FLEET)
+    return found, record_of_edge(ABOUT, found, 200)
+
+
+def radar_day(prior_off_deg):
+    """A radar of known place, and its evidence from a prior that is turned in its bracket."""
+    T = mounted(50.0)
+    radar, ego = day(T, off_deg=prior_off_deg)
+    return T, radar.T_base_radar, estimate_radar_base(EDGE, radar, ego, STAMPS, ALL)
+
+
+def sure(edge, T_base_sensor, frames=40):
+    """Evidence that knows every axis well."""
+    return EdgeEvidence(edge, inverse(T_base_sensor), 0.0, np.eye(7) * 1e6, np.zeros(7), frames_used=frames)
+
+
+def test_a_radar_within_its_prior_is_accepted_for_its_azimuth_and_used():
+    T, prior, evidence = radar_day(2.0)
+    found, record = judged(evidence, prior)
+    assert (record.status, record.determined, record.faults) == ("accepted", ["azimuth"], [])
+    assert found.evidence.checks == ()
+    assert abs(change_between(T, inverse(found.alone.poses.T["base"]))[2]) < np.radians(0.1)
+    assert record.limit_rad == pytest.approx(np.radians(0.4))
+    assert record.score > 0
+
+
+@pytest.mark.parametrize(
+    ("off_deg", "words"), [(9.0, "yaw moved 4."), (25.0, "beyond the search range"), (179.0, "")]
+)
+def test_a_radar_far_from_its_prior_is_held_names_the_prior_and_is_not_used(off_deg, words):
+    _, prior, evidence = radar_day(off_deg)
+    found, record = judged(evidence, prior)
+    assert (record.status, record.determined, record.faults) == ("held", [], ["prior"])
+    assert words in record.reason
+    assert [check.fault for check in found.evidence.checks] == ["prior"]
+    assert record.diagnostics["disproved"] == float(off_deg > 20)
+
+
+@pytest.mark.parametrize(("sigma_deg", "faults"), [(3.2, ["prior"]), (6.0, [])])
+def test_the_range_grows_with_the_sigma_of_the_prior(sigma_deg, faults):
+    T = mounted(0.0)
+    prior = turned(T, (0.0, 0.0, 12.0))
+    _, record = judged(sure(EDGE, T), prior, (np.radians(sigma_deg), 0.03))
+    assert record.faults == faults
+    assert (record.reason == "moved 12.0 deg, beyond the search range") == bool(
+        faults
+    )  # 3.8 sigmas are no reason
+
+
+def test_a_sensor_that_turned_in_its_bracket_is_not_shifted_by_its_lever_arm():
+    T = mounted(0.0)  # 3.6 m before the base: six degrees are .38 m there
+    prior = turned(T, (0.0, 0.0, 6.0))
+    assert np.abs(inverse(prior)[:3, 3] - inverse(T)[:3, 3]).max() > 0.3
+    assert judged(sure(EDGE, T), prior)[1].status == "accepted"
+
+
+@pytest.mark.parametrize(
+    ("rpy_deg", "z_m", "words"), [((0, 0, 0), 0.5, "moved 0.50 m, beyond"), ((0, 9, 0), 0, "pitch moved 4.5")]
+)
+def test_a_lidar_far_from_its_prior_is_held(rpy_deg, z_m, words):
+    T, edge = turned(np.eye(4), xyz_m=(1.2, 0.0, 1.8)), Edge(TOP, BASE)
+    assert judged(sure(edge, T), T)[1].status == "accepted"
+    found, record = judged(sure(edge, T), turned(T, rpy_deg, (0.0, 0.0, z_m)))
+    assert (record.status, record.faults) == ("held", ["prior"])
+    assert words in record.reason
+    assert found.evidence.checks
+
+
+def test_two_lidars_are_held_to_their_prior_with_its_lever_arm():
+    edge = Edge(TOP, Sensor("grille", "lidar"))
+    T = turned(np.eye(4), xyz_m=(2.0, 0.0, -1.4))
+    prior = RigPrior(
+        edge.sensors, TOP, {("top", "grille"): T}, {n: (np.radians(1.0), 0.03) for n in ("top", "grille")}
+    )
+
+    def verdict(T_found):
+        evidence = EdgeEvidence(edge, T_found, 0.0, np.eye(7) * 1e6, np.zeros(7), frames_used=30)
+        return judged_edge(evidence, prior, {}, FLEET).judged.verdict
+
+    assert verdict(T).status == "accepted"
+    swung = from_rotation_translation(exp_so3(np.radians([0.0, 0.0, 3.0])), np.zeros(3)) @ T
+    assert verdict(swung).status == "accepted"  # the roof's lidar turned: the grille's is seen elsewhere
+    assert verdict(turned(T, xyz_m=(0.0, 0.0, 0.4))).faults == ("prior",)
+
+
+def test_what_an_estimator_names_is_held_and_left_out():
+    T = mounted(0.0)
+    failed = replace(sure(EDGE, T), checks=(FailedCheck("halves differ", "witnesses_disagree"),))
+    found, record = judged(failed, T)
+    assert (record.status, record.faults) == ("held", ["witnesses_disagree"])
+    assert found.evidence.checks[0].fault == "witnesses_disagree"
+
+
+def test_an_edge_that_is_only_unsure_is_held_and_used():
+    T = mounted(0.0)
+    unsure = replace(sure(EDGE, T), information=np.eye(7) * np.radians(0.4) ** -2)
+    found, record = judged(unsure, T)
+    assert record.status == "held"
+    assert record.diagnostics["unsure_only"] == 1.0
+    assert found.evidence.checks == ()
+
+
+def test_too_few_frames_are_refused_and_have_no_pose():
+    T = mounted(0.0)
+    found, record = judged(sure(EDGE, T, frames=7), T)
+    assert (record.status, record.reason) == ("refused", "too few frames: 7, needs 8")
+    assert record.covariance is None
+    assert found.evidence.checks
