@@ -21,7 +21,6 @@ from pipeline.calibrate.verify.verdict import Evidence, judge
 from pipeline.config import FleetConfig
 from pipeline.geometry.changes import change_covariance
 from pipeline.geometry.pose_columns import pose_columns
-from pipeline.geometry.se3 import adjoint, inverse
 from pipeline.geometry.targets import DEFAULT_TARGETS
 from pipeline.rig.evidence import EdgeEvidence
 from pipeline.rig.extrinsics import Extrinsics
@@ -32,8 +31,6 @@ from schemas.calibrations import CalibrationRecord
 from schemas.versions import CODE_VERSION
 
 __all__ = ["JudgedEdge", "judged_edge", "record_of_edge", "refused_edge"]
-
-_ON_BASE = ("roll", "pitch", "yaw", "x", "y", "z")
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,34 +113,22 @@ def _prior_of(edge: Edge, prior: RigPrior) -> Extrinsics:
 
 
 def _result(evidence: EdgeEvidence, alone: AdjustedRig, prior: RigPrior, fleet: FleetConfig) -> EdgeResult:
-    edge, child, names = evidence.edge, evidence.edge.child.name, EdgeResult.names
-    (T, covariance), (before, before_covariance) = (
-        (at.T[child], at.covariance) for at in (alone.poses, alone.before)
-    )
-    if edge.child == BASE:
-        (T, covariance), (before, before_covariance) = (
-            _inverse(T, covariance),
-            _inverse(before, before_covariance),
-        )
-        names = _ON_BASE
+    """The edge's pose beside its prior."""
+    edge, child = evidence.edge, evidence.edge.child.name
     sigmas = prior.sigmas_between(*(s.name for s in edge.sensors))
+    before, before_sigma = alone.before.T[child], np.repeat(sigmas, 3)
+    if edge.child != BASE:  # a parent that turns swings the child
+        before_sigma = np.sqrt(np.diag(change_covariance(before, alone.before.covariance)))
     return EdgeResult(
         edge.kind,
-        T,
-        covariance,
+        alone.poses.T[child],
+        alone.poses.covariance,
         alone.sensors[child].determined,
         before,
-        change_covariance(before, before_covariance),
+        before_sigma,
         evidence.frames_used,
         search_range(sigmas, fleet.solve),
-        names,
     )
-
-
-def _inverse(T: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The inverse pose, and the covariance of its left perturbation."""
-    A = adjoint(inverse(T))
-    return inverse(T), A @ covariance @ A.T
 
 
 def _identity(about: Inputs, edge: Edge, frames_total: int) -> dict[str, Any]:

@@ -109,7 +109,7 @@ class Judging:
             estimate.covariance,
             estimate.observable,
             prior.of(pair),
-            prior.covariance(pair),
+            np.sqrt(np.diag(prior.covariance(pair))),
             estimate.frames_used,
             search_range(prior.sigmas, self.fleet.solve),
         )

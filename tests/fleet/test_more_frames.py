@@ -27,7 +27,7 @@ from tests.fleet.test_nightly import DAY, FLEET
 from tests.makers.written_logs import Kit, fleet_config
 
 RESULT = EdgeResult(
-    "lidar_radar", np.eye(4), np.eye(6) * 1e-6, np.ones(6, bool), np.eye(4), np.eye(6) * 1e-3, 50,
+    "lidar_radar", np.eye(4), np.eye(6) * 1e-6, np.ones(6, bool), np.eye(4), np.full(6, 0.03), 50,
     SearchRange(0.1, 0.3),
 )  # fmt: skip
 VAGUE, SURE = (Claim(sigma, 0.0, 0.0, sigma, 0.003, 0.995) for sigma in (0.01, 1e-4))

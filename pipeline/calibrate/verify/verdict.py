@@ -178,7 +178,7 @@ def _moves_little(result: EdgeResult, limits: ChecksConfig) -> list[_Check]:
     rotation, translation = float(np.linalg.norm(step[:3])), float(np.abs(step[3:]).max())
     # The searched box has half-widths per axis: its corners lie sqrt(3) further out.
     reach = np.sqrt(3) * search.rotation_rad
-    ratio = result.move_prior_sigmas
+    ratio = np.abs(step) / result.prior_sigma
     worst = int(np.argmax(ratio))
     return [
         _Check(

@@ -40,7 +40,7 @@ def verdict(result, test, failed=(), claims=SURE, limits=None, **changes):
     checks = [f if isinstance(f, FailedCheck) else FailedCheck(f) for f in failed]
     pair = result.pair
     of_edge = EdgeResult(
-        pair, result.T, result.covariance, result.observable, PRIOR.of(pair), PRIOR.covariance(pair),
+        pair, result.T, result.covariance, result.observable, PRIOR.of(pair), np.sqrt(np.diag(PRIOR.covariance(pair))),
         result.frames_used, SEARCH,
     )  # fmt: skip
     return judge(of_edge, Evidence(test, claims, checks), limits or ChecksConfig(), **changes)
