@@ -39,6 +39,15 @@ def kitti_logs() -> Path:
 
 
 @pytest.fixture(scope="session")
+def van_logs() -> Path:
+    """Folder with a day of another simulator's van: two radars, two cameras, a lidar, odometry."""
+    folder = SHARED / "data" / "other_van"
+    if not folder.is_dir():
+        pytest.skip("the van's logs are not on this machine")
+    return folder
+
+
+@pytest.fixture(scope="session")
 def real_detector() -> Path:
     """A real third-party ONNX detector."""
     path = SHARED / "models" / "yolox_nano.onnx"

@@ -17,6 +17,7 @@ from pipeline.calibrate.edges.lidar_lidar import LidarPair, estimate_lidar_lidar
 from pipeline.calibrate.edges.radar_base import Stamps, estimate_radar_base
 from pipeline.calibrate.edges.sweeps import sweeps_of
 from pipeline.calibrate.numerics.frame_blocks import Scenes
+from pipeline.calibrate.verify.motion_sources import compared_sources
 from pipeline.errors import SolveError
 from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.prior import no_prior
@@ -114,7 +115,8 @@ class BaseEdges:
             wrong = f": the car drives backwards by {', '.join(self._backwards)}" if self._backwards else ""
             raise SolveError(f"nothing but {name} itself shows how the car moves{wrong}")
         found = estimate_radar_base(edge, radar, ego, stamps, scenes, self._directions(name, rows))
-        return found, len(rows)
+        sources = compared_sources(rows, radar.T_base_radar)
+        return replace(found, checks=(*found.checks, *sources.wrong)), len(rows)
 
     def _directions(self, radar: str, rows: Sequence[Observation]) -> TravelDirections | None:
         """Velocities that a lidar's elevations mend, of the lidar that most scans share their view with."""

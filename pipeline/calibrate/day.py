@@ -90,7 +90,7 @@ def solve_day(
     solver: Solver | None = None,
 ) -> DayOfPairs:
     """Select, trigger, solve, judge, each pair by its own frames; as `calibrate_observations`."""
-    motion = compared_sources(observations, prior.T_lidar_radar)
+    motion = compared_sources(observations, prior.T_ahead_radar)
     try:
         return _solved(observations, prior, fleet, about, motion, progress, solver)
     except SolveError as err:

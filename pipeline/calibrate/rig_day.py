@@ -68,6 +68,7 @@ class RigDay:
     def prior_of(self, chosen: Chosen, edges: Sequence[Edge], headings: Headings) -> Prior:
         """Prior of up to one camera, one lidar and one radar, with the direction of travel in the lidar's axes."""
         prior = prior_of_three(self.prior, self.rig, *(chosen.get(kind) for kind in SENSORS))
+        prior = replace(prior, T_base_radar=self.prior.between(BASE.name, chosen.get("radar", "")))
         at = next((e for e in edges if e.kind == "camera_lidar"), None)
         if at is None:
             return prior

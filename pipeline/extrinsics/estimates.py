@@ -33,6 +33,13 @@ class Prior:
     # day's radar.
     heading: tuple[float, float] | None = None
     T_camera_radar_alone: np.ndarray | None = None  # for a rig or a day without a lidar
+    T_base_radar: np.ndarray | None = None  # pose on the vehicle, whose x points ahead; None if unknown
+
+    @property
+    def T_ahead_radar(self) -> Float[np.ndarray, "4 4"]:
+        """The radar's pose in axes whose x points ahead: a lidar's, else the vehicle's; NaN if both are unknown."""
+        base = self.T_base_radar
+        return self.T_lidar_radar if base is None or np.isfinite(self.T_lidar_radar).all() else base
 
     @property
     def T_camera_radar(self) -> Float[np.ndarray, "4 4"]:

@@ -122,7 +122,9 @@ def check_logs(
     rows = builder.prior.rows()
     present = [frozenset(a.places) for a in anchored]
     prior = _prior(rows, fleet, rig, index.problems)
-    sample = RigSample(rig, built, len(picked) if anchored else 0, present, logged_stars(rows), prior, silent)
+    tracked = [n for t in topics for n in rig.radars if t.topic == rig.radars[n].points and _is_of_tracks(t)]
+    looked = len(picked) if anchored else 0
+    sample = RigSample(rig, built, looked, present, logged_stars(rows), prior, silent, tracked)
     verdicts = [v for own in sample.verdicts.values() for v in own]
     first = sample.frames({str(kind): sensor for sensor, kind in reversed(index.kinds.items())})
     return CheckReport(
@@ -184,6 +186,10 @@ def _topics(index: DayIndex, rig: Rig) -> list[TopicFinding]:
         rate = float(1e9 / np.median(np.diff(stamps))) if len(stamps) > 2 else None
         findings.append(TopicFinding(str(role), topic, sorted(types), sum(types.values()), rate, problem))
     return findings
+
+
+def _is_of_tracks(found: TopicFinding) -> bool:
+    return any(kind.endswith("RadarTracks") for kind in found.types)
 
 
 def _sync(index: DayIndex, moments: int, config: IngestConfig) -> SyncQuality:

@@ -6,18 +6,17 @@ fit are reported. The checks are coarse: the faults that they detect change thes
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
 
 from pipeline.ingest.doppler_speed import doppler_speed
-from pipeline.rig.rig import Rig
 from pipeline.rigs import RadarTopics
 from schemas.frames import Frame
 
-__all__ = ["MOVING_MPS", "Motion", "drives_ahead", "motion_of", "prior_transform"]
+__all__ = ["MOVING_MPS", "AskedRadar", "Motion", "motion_of", "opposed_signs", "prior_transform"]
 
 MOVING_MPS = 1.0
 _BACKWARDS = "the car would drive backwards"
@@ -32,35 +31,69 @@ _OFF = 0.25  # larger relative differences of odometry and Doppler are an error
 _CELL_M, _TALL_M, _LEAST_MET, _TURNED_MORE = 1.0, 0.5, 0.3, 1.5
 
 
+@dataclass(frozen=True, eq=False)
+class AskedRadar:
+    """A radar whose Doppler is tested.
+
+    Args:
+        R_ahead_radar: by log, rotation 3 3 from radar axes to axes whose x points ahead, by the transforms of
+            the log; a radar without one is taken to look ahead.
+        has_sign: False for messages whose velocities are vectors: no setting turns their sign.
+    """
+
+    name: str
+    topics: RadarTopics
+    R_ahead_radar: Mapping[str, np.ndarray] = field(default_factory=dict)
+    has_sign: bool = True
+
+    @property
+    def has_setting(self) -> bool:
+        """Whether doppler_positive has an effect."""
+        return self.has_sign and self.topics.velocity_fields is None
+
+    def directions(self, frame: Frame) -> Float[np.ndarray, "N 3"]:
+        """Unit vectors to the detections of a scan, in axes whose x points ahead."""
+        R = self.R_ahead_radar.get(frame.log, np.eye(3))
+        xyz = frame.radar_xyz_m.astype(np.float64) @ R.T
+        return np.asarray(xyz / np.linalg.norm(xyz, axis=1, keepdims=True))
+
+
 @dataclass(frozen=True)
 class Motion:
-    """Motion of the car in the frames, and the problems found by source."""
+    """Motion of the car in the frames, and the problems found by source.
+
+    `doppler_positive` is the sign that fits: "" if the frames do not show one, or if a sensor that is turned
+    round explains them instead.
+    """
 
     moving_share: float | None  # by odometry or else Doppler; None = unknown
     doppler_problem: str = ""
     doppler_is_wrong: bool = False  # its sign or unit is certainly wrong, and must be corrected first
     wrong: tuple[str, ...] = ()  # other sources that are certainly wrong
     advice: tuple[str, ...] = ()
+    doppler_positive: str = ""
 
 
-def motion_of(frames: Sequence[Frame], rig: Rig) -> Motion:
-    """Compare odometry, Doppler and clouds of some frames."""
+def motion_of(frames: Sequence[Frame], radar: AskedRadar | None) -> Motion:
+    """Compare odometry, Doppler and clouds of some frames; without a radar, odometry is all there is."""
     scanned = [f for f in frames if "radar" in f.sensors]
-    fits = [_fit(f, rig.radar) for f in scanned]
+    fits = [_fit(f, radar) for f in scanned] if radar is not None else []
     speeds = np.array([s for s, share in fits if share > _EXPLAINED])
     odometry = np.array([f.ego_speed_mps for f in frames if f.ego_speed_mps is not None])
     fitted = speeds if len(speeds) >= len(scanned) / 2 else np.zeros(0)
     known = odometry if len(odometry) else fitted
     moving = float(np.mean(np.abs(known) > MOVING_MPS)) if len(known) else None
-    if rig.radar is None:
+    if radar is None:
         return Motion(moving)
-    problem = _unfit(scanned, fits, rig.radar)
+    problem = _unfit(scanned, fits, radar)
     moved = speeds[np.abs(speeds) > MOVING_MPS]
     sign = _sign(moved) if not problem else 0
+    if sign < 0 and _sign(odometry[np.abs(odometry) > MOVING_MPS]) < 0:
+        sign = 1  # odometry too: the car reverses
     turned = _turned_round(scanned, sign)
     wrong: list[str] = []
     if sign < 0:
-        problem = turned or _other_sign(rig.radar)
+        problem = turned or _other_sign(radar)
     elif turned:
         wrong.append(turned)
     is_wrong = sign < 0
@@ -73,19 +106,28 @@ def motion_of(frames: Sequence[Frame], rig: Rig) -> Motion:
     if by_doppler:
         problem, is_wrong = by_doppler, True
     wrong += [by_odometry] if by_odometry else []
-    return Motion(moving, problem, is_wrong, tuple(wrong), _assumed_sign(rig.radar, sign))
+    positive = (
+        ""
+        if turned or not radar.has_setting
+        else {1: radar.topics.doppler_positive, -1: _other(radar.topics), 0: ""}[sign]
+    )
+    return Motion(moving, problem, is_wrong, tuple(wrong), _assumed_sign(radar, sign), positive)
 
 
-def drives_ahead(frames: Sequence[Frame], rig: Rig) -> int:
-    """Direction of travel by Doppler: 1 = forward, -1 = backward, 0 = cannot be determined.
-
-    With odometry the two are compared; without it, the car is assumed to drive forward most of the time.
-    """
-    scanned = [f for f in frames if "radar" in f.sensors]
-    fits = [(f, *_fit(f, rig.radar)) for f in scanned]
-    moved = [(f, s) for f, s, share in fits if share > _EXPLAINED and abs(s) > MOVING_MPS]
-    both = [s * np.sign(f.ego_speed_mps) for f, s in moved if f.ego_speed_mps]
-    return _sign(np.array(both if len(both) >= _FEWEST else [s for _, s in moved]))
+def opposed_signs(positive: Mapping[str, str]) -> list[str]:
+    """A sentence if the signs that fit the radars of one car differ; `positive` has "" for an unknown sign."""
+    of: dict[str, list[str]] = {
+        sign: [n for n, p in positive.items() if p == sign] for sign in ("receding", "approaching")
+    }
+    if not all(of.values()):
+        return []
+    named = " and ".join(f'{", ".join(names)} "{sign}"' for sign, names in of.items())
+    few = ", ".join(min((len(names), names) for names in of.values())[1])
+    needed = f"by tf the radars need different signs: doppler_positive of {named}"
+    correction = (
+        f"correct the transform of {few} if it is turned round, else keep both if the data sheets differ"
+    )
+    return [f"{needed}; {correction}"]
 
 
 def prior_transform(frame: Frame, pair: str) -> Float[np.ndarray, "4 4"]:
@@ -93,18 +135,15 @@ def prior_transform(frame: Frame, pair: str) -> Float[np.ndarray, "4 4"]:
     return frame.priors.get(pair, np.eye(4))
 
 
-def _fit(frame: Frame, radar: RadarTopics | None, factor: float = 1.0) -> tuple[float, float]:
+def _fit(frame: Frame, radar: AskedRadar, factor: float = 1.0) -> tuple[float, float]:
     """Speed from the Doppler times a factor, and the share of detections that it explains."""
-    # A radar may point in any direction; a lidar's x axis is assumed to point forward.
-    xyz = frame.radar_xyz_m.astype(np.float64) @ prior_transform(frame, "lidar_radar")[:3, :3].T
-    directions = xyz / np.linalg.norm(xyz, axis=1, keepdims=True)
-    period = None if radar is None else radar.doppler_period_mps
-    return doppler_speed(directions, factor * frame.radar_range_rate_mps.astype(np.float64), period)
+    rates = factor * frame.radar_range_rate_mps.astype(np.float64)
+    return doppler_speed(radar.directions(frame), rates, radar.topics.doppler_period_mps)
 
 
-def _unfit(frames: Sequence[Frame], fits: Sequence[tuple[float, float]], radar: RadarTopics) -> str:
+def _unfit(frames: Sequence[Frame], fits: Sequence[tuple[float, float]], radar: AskedRadar) -> str:
     """Reason why the Doppler gives no speed: its period, its unit, or unknown."""
-    period = radar.doppler_period_mps
+    period = radar.topics.doppler_period_mps
     spans = [float(np.ptp(f.radar_range_rate_mps)) for f in frames]
     if period is not None and spans and max(spans) > 1.05 * period:
         return f"Doppler spans {max(spans):.1f} m/s, more than doppler_period_mps = {period:g} allows"
@@ -124,18 +163,26 @@ def _sign(moved_mps: Float[np.ndarray, " N"]) -> int:
     return -1 if backwards > _MOST else 1 if backwards < 1 - _MOST else 0
 
 
-def _other_sign(radar: RadarTopics) -> str:
-    if radar.velocity_fields is not None:
-        return f"{_BACKWARDS}: velocity_fields must be relative to the radar, x ahead"
-    other = "receding" if radar.doppler_positive == "approaching" else "approaching"
-    return f'{_BACKWARDS}: doppler_positive is probably "{other}"'
+def _other(topics: RadarTopics) -> str:
+    return "receding" if topics.doppler_positive == "approaching" else "approaching"
 
 
-def _assumed_sign(radar: RadarTopics, sign: int) -> tuple[str, ...]:
+def _other_sign(radar: AskedRadar) -> str:
+    if radar.topics.velocity_fields is not None:
+        return f"{_BACKWARDS}: velocity_fields must be relative to the radar, x ahead of it"
+    if not radar.has_sign:
+        return f"{_BACKWARDS}: velocities of tracks must be relative to the radar, x ahead of it"
+    whose = "" if radar.name == "radar" else f" of {radar.name}"
+    return f'{_BACKWARDS}: doppler_positive{whose} is probably "{_other(radar.topics)}"'
+
+
+def _assumed_sign(radar: AskedRadar, sign: int) -> tuple[str, ...]:
     """Advice on a sign that fleet.toml leaves out, with the result of the log."""
-    if radar.velocity_fields is not None or "doppler_positive" in radar.model_fields_set:
+    topics = radar.topics
+    if not radar.has_setting or "doppler_positive" in topics.model_fields_set:
         return ()
-    absent = f'fleet.toml does not set doppler_positive, so "{radar.doppler_positive}" is assumed'
+    whose = "" if radar.name == "radar" else f" of {radar.name}"
+    absent = f'fleet.toml does not set doppler_positive{whose}, so "{topics.doppler_positive}" is assumed'
     shown = {1: "the log shows that it is", -1: "the log shows the opposite", 0: "this log does not show it"}[
         sign
     ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from schemas.observations import WITHOUT_LABELS
 
@@ -41,6 +41,7 @@ class Evidence:
     missing: tuple[str, ...] = ()
     frames_of: Mapping[str, int] | None = None
     names_semantics: bool = True
+    has_odometry: bool = False
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,8 @@ def in_order(kind: str) -> int:
 
 def judge_edge(name: str, kind: str, evidence: Evidence) -> list[DofVerdict]:
     """One verdict per class of DoF of an edge, from facts on its two sensors."""
+    if "radar" not in kind and evidence.has_odometry:  # which moves these sensors, whatever a Doppler shows
+        evidence = replace(evidence, doppler_problem="", doppler_is_wrong=False)
     needs = [(dof, needs) for of, dof, needs in _needs(evidence) if of == kind]
     return [
         _verdict(name, dof, needs if evidence.frames else _without_frames(evidence)) for dof, needs in needs

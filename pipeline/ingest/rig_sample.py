@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TypeVar
@@ -13,10 +13,10 @@ from jaxtyping import Float
 from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.scan_rows import rows_of
 from pipeline.geometry.spherical import to_spherical
-from pipeline.ingest.directions_and_units import Motion, motion_of
+from pipeline.ingest.directions_and_units import AskedRadar, Motion, motion_of, opposed_signs
 from pipeline.ingest.readiness import DofVerdict, Evidence, in_order, judge_edge
 from pipeline.ingest.rig_matrix import RigFinding, rig_finding
-from pipeline.rig.graph import Edge, RigGraph, Sensor
+from pipeline.rig.graph import BASE, Edge, RigGraph, Sensor
 from pipeline.rig.overlap import Overlap, find_edges, overlaps_of
 from pipeline.rig.prior import RigPrior, Star, between, middle_of
 from pipeline.rig.rig import Rig
@@ -43,6 +43,7 @@ class RigSample:
         present: for each moment of the day, the sensors that have a stamp.
         prior: of all sensors; None if there is none.
         missing: by sensor, the topics without usable messages and the reason.
+        tracked: radars whose messages are tracks.
     """
 
     rig: Rig
@@ -52,6 +53,7 @@ class RigSample:
     stars: Mapping[str, Star]
     prior: RigPrior | None
     missing: Mapping[str, tuple[str, ...]]
+    tracked: Collection[str] = ()
     _motions: dict[tuple[str, str], Motion] = field(default_factory=dict)
     _ring_counts: dict[str, int] = field(default_factory=dict)
 
@@ -129,8 +131,19 @@ class RigSample:
         """Motion of the car from the chosen lidar and radar, computed once."""
         shown = (chosen.get("lidar", ""), chosen.get("radar", ""))
         if shown not in self._motions:
-            self._motions[shown] = motion_of(self.frames(chosen), _only(self.rig, chosen))
+            radar = self.asked(shown[1]) if shown[1] else None
+            self._motions[shown] = motion_of(self.frames(chosen), radar)
         return self._motions[shown]
+
+    def asked(self, radar: str) -> AskedRadar:
+        """A radar with the direction in which it looks: by the vehicle frame, else by a lidar, whose x points ahead."""
+        ahead = {}
+        for log, star in self.stars.items():
+            known = (between(star, frame, radar) for frame in (BASE.name, *self.rig.lidars))
+            T = next((T for T in known if T is not None), None)
+            if T is not None:
+                ahead[log] = T[:3, :3]
+        return AskedRadar(radar, self.rig.radars[radar], ahead, radar not in self.tracked)
 
     def _rings(self, chosen: Mapping[str, str]) -> int:
         """Number of rings of the chosen lidar, computed once."""
@@ -143,7 +156,9 @@ class RigSample:
     def advice(self) -> list[str]:
         """Advice from each radar's Doppler, computed once."""
         edges = [edge for edge in self.graph.edges if "radar" in edge.kind]
-        return list(dict.fromkeys(a for edge in edges for a in self.motion(self._beside(edge)).advice))
+        motions = {c["radar"]: self.motion(c) for c in map(self._beside, edges)}
+        found = [a for motion in motions.values() for a in motion.advice]
+        return [*found, *opposed_signs({name: m.doppler_positive for name, m in motions.items()})]
 
     def _usable(self, looked_into: int) -> int:
         """Number of usable moments of the day, extrapolated from the sample."""
@@ -216,6 +231,7 @@ def _evidence(frames: list[Frame], rig: Rig, motion: Motion) -> Evidence:
         doppler_problem=motion.doppler_problem,
         doppler_is_wrong=motion.doppler_is_wrong,
         wrong=motion.wrong,
+        has_odometry=any(f.ego_speed_mps is not None for f in frames),
         names_semantics=rig.camera is None or rig.semantics is not None,
     )
 

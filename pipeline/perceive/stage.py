@@ -167,9 +167,13 @@ class Shown:
         return {s: c for s, c in usable.items() if self.kinds[s] == kind}
 
     def heading(self, radar: str, lidar: str | None = None) -> float | None:
-        """Azimuth in a radar's axes of the forward axis of a lidar: the given one, else the first with a known pose."""
-        lidars = [s for s, kind in self.kinds.items() if kind == "lidar"] if lidar is None else [lidar]
-        known = (between(self.star, name, radar) for name in lidars)
+        """Azimuth in a radar's axes of the way ahead: the x axis of a lidar, else of the vehicle frame.
+
+        The lidar is the given one, or the first with a known pose.
+        """
+        lidars = [s for s, kind in self.kinds.items() if kind == "lidar"]
+        ahead = [*lidars, BASE.name] if lidar is None else [lidar]
+        known = (between(self.star, name, radar) for name in ahead)
         return heading_of(next((T for T in known if T is not None), None))
 
 

@@ -41,7 +41,7 @@ _FACTORS = ((3.6, "km/h for m/s"), (1 / 3.6, "m/s for km/h"), (180 / np.pi, "deg
 _NEAR = 0.1
 _SPEEDS = ("odometry_by_lidar", "doppler_by_lidar", "odometry_by_doppler")
 _NAMED_FACTORS = tuple(sign * f for f in (1.0, 3.6, 1 / 3.6, 2.0, 0.5) for sign in (-1, 1) if sign * f != 1)
-_KEY = " (doppler_positive in fleet.toml)"
+_KEY = " (doppler_positive in fleet.toml; or its transform is turned round)"
 _NAMES = {"odometry": "odometry", "doppler": "the radar's Doppler", "lidar": "the lidar's sweeps"}
 
 
@@ -89,7 +89,8 @@ def compared_sources(
 ) -> MotionFindings:
     """Compare speeds and yaw rates of the day's observations, in order of time.
 
-    `T_lidar_radar` is the prior; it rotates Doppler velocities into lidar axes, whose x points ahead.
+    `T_lidar_radar` is the prior; it rotates Doppler velocities into lidar axes, whose x points ahead. Of
+    observations without a lidar it is T_base_radar.
     """
     if not observations:
         return MotionFindings()

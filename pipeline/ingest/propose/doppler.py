@@ -1,18 +1,16 @@
-"""Meaning of a radar's Doppler, tested on the log: its aliasing period and its sign."""
+"""Aliasing period of a radar's Doppler, tested on the log."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
 
-from pipeline.ingest.directions_and_units import drives_ahead
+from pipeline.ingest.directions_and_units import AskedRadar
 from pipeline.ingest.doppler_speed import doppler_speed
-from pipeline.rig.rig import Rig
 from schemas.frames import Frame
 
-__all__ = ["doppler_period", "doppler_sign"]
+__all__ = ["doppler_period"]
 
 _FEWEST_SCANS = 3  # scans that no speed explains without a period
 _HALF = 0.5  # share of a scan's detections explained by one speed: then no period is needed
@@ -21,14 +19,14 @@ _MORE, _MOST = 0.1, 2 / 3
 _MOST_STEPS = 4096  # most distinct values of a quantised Doppler; with more it is not quantised
 
 
-def doppler_period(frames: Sequence[Frame]) -> float | None:
+def doppler_period(frames: Sequence[Frame], radar: AskedRadar) -> float | None:
     """Aliasing period of the Doppler [m/s]; None if it is not aliased or the log does not show it.
 
     An aliased Doppler fills the range of one period for any speed of the car, so the observed range is tried.
     It is accepted if, in most scans that no speed explains without it, a static world explains more
     detections with it.
     """
-    scans = [(_directions(f), f.radar_range_rate_mps.astype(np.float64)) for f in frames if _has_scan(f)]
+    scans = [(radar.directions(f), f.radar_range_rate_mps.astype(np.float64)) for f in frames if _has_scan(f)]
     if len(scans) < _FEWEST_SCANS:
         return None
     values = np.unique(np.round(np.concatenate([rates for _, rates in scans]), 4))
@@ -44,20 +42,5 @@ def doppler_period(frames: Sequence[Frame]) -> float | None:
     return period if len(gained) >= _FEWEST_SCANS and gained.mean() >= _MOST else None
 
 
-def doppler_sign(frames: Sequence[Frame], rig: Rig) -> str:
-    """The `doppler_positive` that fits frames read with that of `rig`; "" if undetermined."""
-    if rig.radar is None:
-        return ""
-    tried = rig.radar.doppler_positive
-    other = "approaching" if tried == "receding" else "receding"
-    return {1: tried, -1: other, 0: ""}[drives_ahead(frames, rig)]
-
-
 def _has_scan(frame: Frame) -> bool:
     return "radar" in frame.sensors and len(frame.radar_xyz_m) > 0
-
-
-def _directions(frame: Frame) -> Float[np.ndarray, "N 3"]:
-    prior = frame.priors.get("lidar_radar", np.eye(4))[:3, :3]
-    xyz = frame.radar_xyz_m.astype(np.float64) @ prior.T
-    return np.asarray(xyz / np.linalg.norm(xyz, axis=1, keepdims=True))

@@ -19,11 +19,16 @@ _COLUMN = 60  # column of comments behind a line
 
 @dataclass(frozen=True)
 class RadarMeaning:
-    """Doppler of a radar in the log: sign ("" = undetermined), period if aliased [m/s]."""
+    """Doppler of a radar in the log: sign ("" = undetermined), period if aliased [m/s], and problems.
+
+    `has_sign` is False for messages whose velocities are vectors.
+    """
 
     positive: str = ""
     period_mps: float | None = None
     scans: int = 0
+    problems: tuple[str, ...] = ()
+    has_sign: bool = True
 
 
 @dataclass(frozen=True)
@@ -67,7 +72,11 @@ def fleet_text(
 ) -> str:
     """Text of the file for a fleet of that name."""
     is_short = all(name in ("camera", "lidar", "radar") for name in names)
-    lines = ["[fleet]", f"name = {json.dumps(fleet)}", *_of_rig(facts, is_short=is_short)]
+    lines = [
+        "[fleet]",
+        f"name = {json.dumps(fleet)}",
+        *_of_rig(facts, is_comment=is_short and bool(found.lidars)),
+    ]
     for name, sensor in names.items():
         kind = "camera" if isinstance(sensor, FoundCamera) else "lidar" if sensor in found.lidars else "radar"
         lines += ["", f"[rigs.default.{kind if is_short else f'{kind}s.{name}'}]"]
@@ -90,12 +99,12 @@ def fleet_text(
     return "\n".join(lines) + "\n"
 
 
-def _of_rig(facts: Facts, *, is_short: bool) -> list[str]:
-    """Lines on the vehicle frame: active for a rig of many sensors if it is logged, else a comment."""
+def _of_rig(facts: Facts, *, is_comment: bool) -> list[str]:
+    """Lines on the vehicle frame, if it is logged: a comment where a lidar's x axis shows the way ahead."""
     if not facts.vehicle_frames:
         return []
     line = f"base = {json.dumps(facts.vehicle_frames[0])}"
-    if is_short:
+    if is_comment:
         return ["", "# [rigs.default]", _with(f"# {line}", "for poses on the vehicle, too")]
     return ["", "[rigs.default]", _with(line, "the vehicle's frame")]
 
@@ -133,7 +142,7 @@ def _radar(radar: FoundCloud, meaning: RadarMeaning) -> Iterator[str]:
         yield f'# doppler_field = "..."     # which of {", ".join(radar.fields)} is the speed along the line of sight?'
     elif radar.doppler:
         yield f"doppler_field = {json.dumps(radar.doppler[0])}"
-    if meaning.positive:
+    if meaning.positive and meaning.has_sign:
         shown = f"by {meaning.scans} scans: else the car drives backwards"
         yield _with(f'doppler_positive = "{meaning.positive}"', shown)
     elif not radar.msgtype.endswith("RadarTracks"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +13,10 @@ from pipeline.config import FleetConfig, validated
 from pipeline.errors import ConfigError
 from pipeline.geometry.transform_tree import TransformTree
 from pipeline.ingest.captures import Rejected
+from pipeline.ingest.directions_and_units import motion_of, opposed_signs
 from pipeline.ingest.index import index_logs
 from pipeline.ingest.moments import MomentBuilder
-from pipeline.ingest.propose.doppler import doppler_period, doppler_sign
+from pipeline.ingest.propose.doppler import doppler_period
 from pipeline.ingest.propose.fleet_file import Facts, RadarMeaning, fleet_text, names_of
 from pipeline.ingest.propose.sensors import FoundCamera, FoundCloud, FoundSensors, find_sensors
 from pipeline.ingest.propose.survey import Survey, survey_logs
@@ -24,7 +25,6 @@ from pipeline.ingest.stage import pick_moments
 from pipeline.results import Progress, silent
 from pipeline.rig.rig import Rig
 from pipeline.store.views import logged_stars
-from schemas.frames import Frame
 from schemas.observations import WITHOUT_LABELS
 
 __all__ = ["Proposal", "propose_fleet"]
@@ -65,13 +65,15 @@ def propose_fleet(logs: Sequence[Path], fleet: str, progress: Progress = silent)
     def text(meanings: Mapping[str, RadarMeaning]) -> str:
         return fleet_text(fleet, found, names, Facts(static, untied, frames, meanings))
 
-    meanings = _meanings(survey.logs, text({}), found, names, progress)
+    meanings = _meanings(survey, text({}), found, names, frames, progress)
+    signs = opposed_signs({name: m.positive for name, m in meanings.items()})
+    problems = [*survey.problems, *(f"{n}: {p}" for n, m in meanings.items() for p in m.problems), *signs]
     cameras = {n: s for n, s in names.items() if isinstance(s, FoundCamera)}
     unlabelled = [n for n, s in cameras.items() if not (s.labels and s.detections)]
     missing = [f"{n}: semantics (recommended; {WITHOUT_LABELS})" for n in unlabelled]
     missing += ["prior: transforms between the sensors"] if untied or not static else []
-    missing += [f"{n}: the Doppler's sign" for n, m in meanings.items() if not m.positive]
-    return Proposal(text(meanings), tuple(names), tuple(missing), tuple(survey.logs), tuple(survey.problems))
+    missing += [f"{n}: the Doppler's sign" for n, m in meanings.items() if m.has_sign and not m.positive]
+    return Proposal(text(meanings), tuple(names), tuple(missing), tuple(survey.logs), tuple(problems))
 
 
 def _static(survey: Survey) -> tuple[str, TransformTree]:
@@ -82,35 +84,39 @@ def _static(survey: Survey) -> tuple[str, TransformTree]:
 
 
 def _meanings(
-    logs: Sequence[Path],
+    survey: Survey,
     text: str,
     found: FoundSensors,
     names: Mapping[str, FoundCamera | FoundCloud],
+    vehicle_frames: Sequence[str],
     progress: Progress,
 ) -> dict[str, RadarMeaning]:
-    """Doppler of each radar, tested on moments of the logs."""
+    """Doppler of each radar, tested on moments of the logs, in the direction in which it looks by tf."""
     radars = {n: s for n, s in names.items() if isinstance(s, FoundCloud) and s in found.radars}
-    can_be_tried = {n for n, s in radars.items() if len(s.doppler) == 1 or not s.fields}
-    fleet = validated(FleetConfig, tomllib.loads(text), "fleet.toml")
-    rig = fleet.rigs["default"]
+    can_be_tried = [n for n, s in sorted(radars.items()) if len(s.doppler) == 1 or not s.fields]
     if not can_be_tried:
         return {}
-    sample = _sample(logs, rig, fleet, progress)
-    lidar = next(iter(rig.lidars), "")
-    meanings = {}
-    for name in sorted(can_be_tried):
-        chosen = {"radar": name} | ({"lidar": lidar} if lidar else {})
-        frames = [f for f in sample.frames(chosen) if "radar" in f.sensors]
-        meanings[name] = _meaning(frames, rig.of_sensors([name]))
-    return meanings
+    fleet = validated(FleetConfig, tomllib.loads(text), "fleet.toml")
+    base = next(iter(vehicle_frames), None)
+    sample = _sample(survey.logs, fleet.rigs["default"].model_copy(update={"base": base}), fleet, progress)
+    tracked = [n for n in can_be_tried if radars[n].msgtype.endswith("RadarTracks")]
+    return {n: _meaning(replace(sample, tracked=tracked), n) for n in can_be_tried}
 
 
-def _meaning(frames: Sequence[Frame], rig: Rig) -> RadarMeaning:
-    period = doppler_period(frames)
-    ((name, radar),) = rig.radars.items()
-    wrapped = radar.model_copy(update={"doppler_period_mps": period})
-    rig = rig.model_copy(update={"radars": {name: wrapped}})
-    return RadarMeaning(doppler_sign(frames, rig), period, len(frames))
+def _meaning(sample: RigSample, radar: str) -> RadarMeaning:
+    lidar = next(iter(sample.rig.lidars), "")
+    frames = [f for f in sample.frames({"radar": radar, "lidar": lidar}) if "radar" in f.sensors]
+    asked = sample.asked(radar)
+    period = doppler_period(frames, asked)
+    asked = replace(asked, topics=asked.topics.model_copy(update={"doppler_period_mps": period}))
+    if not asked.R_ahead_radar and len(sample.rig.radars) > 1:
+        return RadarMeaning("", period, len(frames), has_sign=asked.has_sign)
+    motion = motion_of(frames, asked)
+    # A Doppler that another sign mends is no problem: this file is written with that sign.
+    of_doppler = [motion.doppler_problem] if motion.doppler_problem and not motion.doppler_positive else []
+    return RadarMeaning(
+        motion.doppler_positive, period, len(frames), (*of_doppler, *motion.wrong), asked.has_sign
+    )
 
 
 def _sample(logs: Sequence[Path], rig: Rig, fleet: FleetConfig, progress: Progress) -> RigSample:

@@ -12,9 +12,11 @@ from jobs.cli import main
 from pipeline.config import load_fleet
 from pipeline.errors import ConfigError
 from pipeline.fleet.pattern import find_vehicle_days
+from pipeline.ingest.directions_and_units import AskedRadar
 from pipeline.ingest.propose.doppler import doppler_period
 from pipeline.ingest.propose.logs_pattern import logs_pattern, nightly_command
 from pipeline.ingest.propose.propose import propose_fleet
+from pipeline.rigs import RadarTopics
 from pipeline.store.partitions import Partition
 from tests.makers.written_logs import (
     DETECTIONS,
@@ -100,7 +102,7 @@ def test_a_doppler_that_wraps_is_told_from_one_that_does_not(tmp_path):
     assert values["rigs"]["default"]["radar"]["doppler_period_mps"] == pytest.approx(period, abs=2 * step)
     values, _ = proposed(drive(24).mcap(tmp_path / "b.mcap"))
     assert "doppler_period_mps" not in values["rigs"]["default"]["radar"]
-    assert doppler_period([]) is None
+    assert doppler_period([], AskedRadar("radar", RadarTopics(points=RADAR))) is None
 
 
 def test_components_of_a_velocity_are_named_and_those_over_ground_are_not(tmp_path):
@@ -144,8 +146,10 @@ def test_several_sensors_of_a_kind_are_called_by_their_frames_and_get_the_vehicl
     rig = values["rigs"]["default"]
     assert set(rig["radars"]) == {"radar", "radar_left"}
     assert rig["base"] == "base_link"
-    assert found.missing == ("prior: transforms between the sensors",)
-    assert "radar_left (radar_left_link)" in found.text  # no chain of transforms to it
+    # no chain of transforms to it, so nothing shows where it looks
+    unknown = ("prior: transforms between the sensors", "radar_left: the Doppler's sign")
+    assert found.missing == unknown
+    assert "radar_left (radar_left_link)" in found.text
 
 
 def test_of_two_clouds_of_one_lidar_the_raw_one_is_taken_and_the_other_is_named(tmp_path):
