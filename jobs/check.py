@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,7 +26,7 @@ def check(fleet: Path, /, *logs: Path, rig: str | None = None, json: bool = Fals
     from dataclasses import asdict
 
     from jobs.terminal.summary import print_json, print_summary, progress_reporter
-    from pipeline.config import load_fleet, moved_keys
+    from pipeline.config import load_fleet
     from pipeline.errors import ConfigError
     from pipeline.extrinsics.prior import require_named_files
     from pipeline.ingest.check import check_logs
@@ -49,8 +48,6 @@ def check(fleet: Path, /, *logs: Path, rig: str | None = None, json: bool = Fals
         print_json(asdict(report))
     else:
         _print_report(report, name)
-        for old, new in moved_keys(fleet).items():
-            sys.stderr.write(f"{fleet}: {old} is {new} now; both names are read\n")
         following = _following(report, fleet, logs)
         verdicts = {p: _worst(report, p) for p in dict.fromkeys(v.pair for v in report.verdicts)}
         print_summary(

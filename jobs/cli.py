@@ -84,7 +84,6 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "jobs.compare:compare",
         "Compare two calibrations axis by axis: records, days, methods, files.",
     ),
-    "migrate": ("jobs.migrate:migrate", "Convert a lake of an older release to the tables of this one."),
     "repair": ("jobs.repair:repair", "Repair a lake with a damaged log or lost files."),
     "convert": (
         "jobs.convert:convert",

@@ -41,17 +41,14 @@ def status(
     from jobs.terminal.summary import exit_code, left_out, print_summary
     from jobs.terminal.vehicle_status import count_statuses, moved_sensors, next_steps, status_lines
     from pipeline.fleet.status import day_statuses
-    from pipeline.store.data_files import data_files
     from pipeline.store.partitions import Lake, check_day, days_after
     from pipeline.store.records import last_day, read_last, read_records
-    from schemas.calibrations import CALIBRATIONS
     from schemas.drift import DRIFT, DriftFinding
     from schemas.outcomes import OUTCOMES, OutcomeRow
     from schemas.words import DAY_WORDS
 
     check_day("to", to_day)
     tables = Lake.existing(lake)
-    data_files(tables, CALIBRATIONS)  # names records of a release before 0.6, and the command that moves them
     last = to_day or last_day(tables, OUTCOMES)
     first = from_day or (None if last is None else days_after(last, -30))
     rows = read_records(tables, OUTCOMES, OutcomeRow, first=first, last=last)

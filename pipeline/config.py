@@ -23,7 +23,6 @@ from pipeline.names import is_pattern, is_vehicle, matches
 from pipeline.rig.rig import SECTIONS, Rig
 from pipeline.rigs import Positive, Section
 from pipeline.sections import (
-    MOVED,
     TERMS,
     AuditConfig,
     ChecksConfig,
@@ -55,7 +54,6 @@ __all__ = [
     "VerifyConfig",
     "config_hash",
     "load_fleet",
-    "moved_keys",
     "read_toml",
     "validated",
 ]
@@ -209,17 +207,6 @@ def load_fleet(path: Path) -> FleetConfig:
     return validated(FleetConfig, read_toml(path), str(path)).read_from(path)
 
 
-def moved_keys(path: Path) -> dict[str, str]:
-    """Keys of a fleet.toml that a newer section holds, and their names there; both are read."""
-    file = read_toml(path)
-    return {
-        f"{outer}.{old}": f"{outer}.{section}.{name}"
-        for outer in ("prepare", "verify")
-        for (section, name), old in MOVED.items()
-        if old in file.get(outer, {})
-    }
-
-
 def read_toml(path: Path) -> dict[str, Any]:
     """Content of a TOML file; raises ConfigError if it is missing, or not TOML."""
     try:
@@ -256,8 +243,6 @@ def _written(loc: Sequence[str | int], values: Any) -> Sequence[str | int]:
         if not isinstance(values, dict):
             break
         two: Any = tuple(loc[i : i + 2])
-        if MOVED.get(two) in values:
-            return (*loc[:i], MOVED[two], *loc[i + 2 :])
         if key not in values and two in _SHORT:
             return (*loc[:i], *loc[i + 1 :])
         values = values.get(key)

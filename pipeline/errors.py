@@ -66,6 +66,14 @@ class ContractError(BoresightError):
         super().__init__(f"{path}: {problem}")
 
 
+class OtherVersionError(ContractError):
+    """A table whose schema is of another version than this release reads, and the release that wrote it."""
+
+    def __init__(self, path: str, found: str, release: str, reads: str, remedy: str) -> None:
+        told = f"holds {found}, written by boresight {release}; this version reads {reads}"
+        super().__init__(path, f"{told}: {remedy}")
+
+
 class DamagedError(ContractError):
     """A file of a table that cannot be read; with the file moved away, its stage makes it again."""
 

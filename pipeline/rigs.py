@@ -66,7 +66,7 @@ class TopicSemantics(Section):
     # ignored.
     label_set: Literal["cityscapes", "ade20k", "coco"] | dict[StreetClass, tuple[LabelId, ...]] = "cityscapes"
     # For a detector that logs other names or numbers: { "2" = "car", ... }, with the names as logged.
-    classes: dict[str, RoadUser] = Field(default_factory=dict, exclude_if=lambda classes: not classes)
+    classes: dict[str, RoadUser] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _a_label_means_one_thing(self) -> TopicSemantics:
@@ -210,9 +210,7 @@ class RadarTopics(_Sensor):
     # ["vx", "vy"] or three names: components of the velocity relative to the radar, in radar axes, for a
     # cloud without a Doppler field. Ego-compensated velocities (over ground) contain no information on the
     # radar's pose and must not be named here.
-    velocity_fields: tuple[str, str] | tuple[str, str, str] | None = Field(
-        default=None, exclude_if=lambda fields: fields is None
-    )
+    velocity_fields: tuple[str, str] | tuple[str, str, str] | None = None
     # drivers that log RadarScan differ; PointCloud2 has x y z
     azimuth_positive: Literal["left", "right"] = "left"
     # None = from geometry. Left out of dumps: only perception uses it, so a change must not ingest a rig's
@@ -244,9 +242,8 @@ class PriorConfig(Section):
     """Source of the prior and its sigmas."""
 
     source: Literal["tf_static", "file"] = "tf_static"
-    # Topic of static transforms; Foxglove's loggers have no fixed name. Left out of dumps if it is ROS's
-    # name, so that older rigs are not ingested again.
-    topic: Topic = Field(default=TF_STATIC, exclude_if=lambda topic: topic == TF_STATIC)
+    # Topic of static transforms; Foxglove's loggers have no fixed name.
+    topic: Topic = TF_STATIC
     # JSON, relative to fleet.toml: {"reference": "top", "T": {"front": 4x4, ...}} with T_reference_sensor of
     # each sensor; for a rig in the short form also {"T_camera_lidar": 4x4, "T_lidar_radar": 4x4}.
     file: str | None = None

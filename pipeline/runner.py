@@ -147,7 +147,7 @@ def _inputs(stage: Stage, task: Task) -> dict[str, Manifest]:
     for schema in (s for s in stage.reads if not s.of_sensor):
         manifest = read_manifest(task.lake, schema, task.partition)
         if manifest is None:
-            problem = absence(task.lake, schema, task.partition)
+            problem = absence(schema, task.partition)
             raise ContractError(str(task.lake.folder(schema.name, task.partition)), problem)
         found[schema.name] = manifest
     return found

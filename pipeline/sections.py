@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Annotated, Any, Literal, get_args
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
@@ -12,7 +11,6 @@ from pipeline.rigs import Positive, Section
 from schemas.calibrations import METHODS
 
 __all__ = [
-    "MOVED",
     "TERMS",
     "AuditConfig",
     "ChecksConfig",
@@ -247,30 +245,6 @@ class ChecksConfig(Section):
     max_heading_error_share: Fraction = 0.25
 
 
-# (section, key): name of the key in files up to 0.11, which had it in the section around it. Both are read.
-MOVED = (
-    {("split", name): name for name in SplitConfig.model_fields}
-    | {("split", "by"): "split_by"}
-    | {("grid", name): f"grid_{name}" for name in GridConfig.model_fields}
-    | {("checks", name): name for name in ChecksConfig.model_fields}
-)
-
-
-def _moved(values: object, *sections: str) -> object:
-    """Values with keys of 0.11 in the sections where they are now; ValueError for a key that is set twice."""
-    if not isinstance(values, Mapping):
-        return values
-    new = dict(values)
-    for (section, name), old in MOVED.items():
-        within = new.get(section, {})
-        if section not in sections or old not in new or not isinstance(within, Mapping):
-            continue
-        if name in within:
-            raise ValueError(f"{old} is the old name of {section}.{name}, which is set too")
-        new[section] = {**within, name: new.pop(old)}
-    return new
-
-
 class PrepareConfig(Section):
     """Training data: points per cloud, frames per vehicle-day, the split, and the camera's grid."""
 
@@ -283,11 +257,6 @@ class PrepareConfig(Section):
     seed: Annotated[int, Field(ge=0)] = 0
     split: SplitConfig = SplitConfig()
     grid: GridConfig = GridConfig()
-
-    @model_validator(mode="before")
-    @classmethod
-    def _keys_of_0_11(cls, values: object) -> object:
-        return _moved(values, "split", "grid")
 
     def split_with(self, **values: Any) -> PrepareConfig:
         """Copy with other values in [prepare.split]; they are not validated."""
@@ -311,11 +280,6 @@ class VerifyConfig(Section):
         radar_deg = self.radar_limit_deg, self.radar_elevation_limit_deg
         azimuth_deg, elevation_deg = radar_deg if "radar" in kind else (camera_deg, camera_deg)
         return math.radians(azimuth_deg), math.radians(elevation_deg)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _keys_of_0_11(cls, values: object) -> object:
-        return _moved(values, "checks")
 
 
 class LearnConfig(Section):

@@ -86,8 +86,7 @@ class CalibrationRecord(Posed):
     targets_m: np.ndarray | None = array(
         "<f8",
         (3, 3),
-        "targets in child_frame, 15, 25 and 40 m away, visible to both sensors; null if refused and in rows of"
-        " version 3, whose targets lie ahead of the child at -10, 8 and 0 deg",
+        "targets in child_frame, 15, 25 and 40 m away, visible to both sensors; null if refused",
         default=None,
     )
     mounting_determined: list[str] = column(
@@ -145,11 +144,11 @@ class CalibrationRecord(Posed):
     )
     innovation_sigmas: float | None = column(
         "difference between this edge's estimate and the one from the rig's other edges, in sigmas; null if no "
-        "other edges join its sensors, and in rows before version 5",
+        "other edges join its sensors",
         default=None,
     )
     used: bool | None = column(
-        "whether the adjustment of the whole rig uses this edge; null in rows before version 5",
+        "whether the adjustment of the whole rig uses this edge; null without an adjustment",
         default=None,
     )
     environment: str = column("highway, urban, mixed or unknown", default="unknown")
@@ -175,9 +174,8 @@ class CalibrationRecord(Posed):
 CALIBRATIONS = TableSchema(
     CalibrationRecord,
     "calibrations",
-    5,
+    6,
     "One row per edge and method. boresight show calibrations --json prints these names plus T, 4x4 row-major.",
     made_by="calibrate",
-    reads_versions=(1, 2, 3, 4),
     about=("vehicle", "day", "method", "pair", "parent_frame", "child_frame"),
 )

@@ -9,7 +9,7 @@ list columns. The metadata of the column's Arrow field has dtype and shape, so a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import Field, dataclass, field, fields
 from types import UnionType
 from typing import Any, Literal, TypeVar, dataclass_transform, get_args, get_type_hints
@@ -112,17 +112,11 @@ class TableSchema:
     version: int
     doc: str = ""
     made_by: str = ""  # stage and command that write it
-    # Older versions whose rows are read too; their missing columns have defaults in the row's dataclass.
-    reads_versions: tuple[int, ...] = ()
     # For record tables: columns that identify the subject of a row. Among rows with the same subject, the one
     # asserted last is current; work_key distinguishes them. Empty for tables of partitions that are replaced
     # as a whole.
     about: tuple[str, ...] = ()
-    # Column that older releases did not write -> the column it is derived from, and its value per value of
-    # that column.
-    follows: Mapping[str, tuple[str, Mapping[str, str]]] = field(default_factory=dict, hash=False)
     of_sensor: bool = False  # a partition has a file per sensor, joined by another table
-    before: str = ""  # the table with this role before 0.11
     columns: tuple[
         Column, ...
     ] = ()  # default: the fields of the row type in their order, inherited ones last

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from shlex import quote
 
-from schemas.calibrations import FRAMES_OF_PAIR
 from schemas.columns import Recorded, TableSchema, column, row
 
 __all__ = [
@@ -68,16 +67,16 @@ class DriftFinding(Recorded):
     inputs: list[str] = column("work keys of the records on the chart", default_factory=list)
     day_scale: float | None = column(
         "ratio of the days' scatter to their sigmas on this chart, learnt from the model's vehicles and its own; null "
-        "before version 4",
+        "without a chart",
         default=None,
     )
     day_autocorrelation: float | None = column(
         "autocorrelation of the errors of neighbouring days, learnt likewise", default=None
     )
-    vehicle_status: str | None = column(
+    vehicle_status: str = column(
         "status of the whole vehicle, equal in all its rows of one audit: RED or YELLOW if a chart is, "
-        "GREEN if a rotation of any sensor would have been detected, else UNKNOWN; null in rows of releases before 0.4",
-        default=None,
+        "GREEN if a rotation of any sensor would have been detected, else UNKNOWN",
+        default="UNKNOWN",
     )
     vehicle_sensor: str | None = column(
         "name of the sensor that moved; null if none moved or the data do not identify it",
@@ -90,14 +89,9 @@ class DriftFinding(Recorded):
 DRIFT = TableSchema(
     DriftFinding,
     "drift",
-    4,
+    5,
     made_by="audit",
-    reads_versions=(1, 2, 3),
     about=("vehicle", "day", "method", "pair", "parent_frame", "child_frame", "dof"),
-    follows={
-        name: ("pair", {pair: frames[k] for pair, frames in FRAMES_OF_PAIR.items()})
-        for k, name in enumerate(("parent_frame", "child_frame"))
-    },
 )
 
 
@@ -112,7 +106,7 @@ class VehicleStatus:
 
 
 def status_of(findings: Sequence[DriftFinding]) -> VehicleStatus:
-    """The stored verdict on a vehicle; UNKNOWN, with a reason, if no audit has stored one.
+    """The stored verdict on a vehicle; UNKNOWN, with a reason, without an audit.
 
     Args:
         findings: current rows of one vehicle and method.
@@ -120,8 +114,6 @@ def status_of(findings: Sequence[DriftFinding]) -> VehicleStatus:
     if not findings:
         return VehicleStatus("UNKNOWN", "no audit yet")
     first = findings[0]
-    if first.vehicle_status is None:
-        return VehicleStatus("UNKNOWN", "audited by an older release, which stored no status: audit again")
     return VehicleStatus(
         first.vehicle_status, first.vehicle_reason or "", first.vehicle_sensor, first.vehicle_since
     )
@@ -148,7 +140,6 @@ DAYS_WILL_TELL = "will tell"
 _DAYS_NEEDED = (
     re.compile(r"(?P<has>\d+) days? of data, (?P<needs>\d+) needed"),
     re.compile(r"that size itself with about (?P<needs>\d+) days?"),
-    re.compile(r"that size after about (?P<needs>\d+) days?"),  # as 0.12 and older releases put it
 )
 
 
@@ -189,9 +180,7 @@ def next_step(findings: Sequence[DriftFinding], lake: str) -> str:
 def _until_it_is_known(
     findings: Sequence[DriftFinding], reason: str, of: str, lake: str, look_again: str
 ) -> str:
-    """What a vehicle that is UNKNOWN needs: another audit, a repair of tables, more days, or a look at its days."""
-    if findings[0].vehicle_status is None:
-        return f"audit again: `boresight audit --fleet FLEET --lake {lake}`, with your fleet.toml for FLEET."
+    """What a vehicle that is UNKNOWN needs: a repair of tables, more days, or a look at its days."""
     if "cannot be read" in reason:
         return f"restore what can be restored of the tables: `boresight repair --lake {lake}`."
     asked = next((found for pattern in _DAYS_NEEDED if (found := pattern.search(reason))), None)

@@ -144,7 +144,7 @@ class ScanFeatures(ScanFeatureColumns, Capture):
 _ONE = "; a file per {}, joined by the table perceived."
 IMAGE_FEATURES = TableSchema(
     ImageFeatures, "image_features", 2, "Features of a camera's images" + _ONE.format("camera"),
-    made_by="perceive", of_sensor=True, reads_versions=(1,),
+    made_by="perceive", of_sensor=True,
 )  # fmt: skip
 SWEEP_FEATURES = TableSchema(
     SweepFeatures, "sweep_features", 1, "Features of a lidar's sweeps" + _ONE.format("lidar"),

@@ -87,9 +87,9 @@ class Perceived(Joined):
 
 MOMENTS = TableSchema(
     Moment, "moments", 1, "Stamps of the rig's moments, and the rows of images, sweeps and scans for each.",
-    made_by="ingest", before="frames",
+    made_by="ingest",
 )  # fmt: skip
 PERCEIVED = TableSchema(
     Perceived, "perceived", 1, "Moments with features, and the rows of the sensors' features for each.",
-    made_by="perceive", before="observations",
+    made_by="perceive",
 )  # fmt: skip

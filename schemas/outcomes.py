@@ -40,9 +40,8 @@ class OutcomeRow(Recorded):
 OUTCOMES = TableSchema(
     OutcomeRow,
     "outcomes",
-    3,
+    4,
     "Stages that were up to date add no row.",
     made_by="nightly",
-    reads_versions=(1, 2),
     about=("vehicle", "day", "stage", "method"),
 )

@@ -11,7 +11,7 @@ from schemas.columns import Posed, TableSchema, array, column, row
 
 __all__ = ["POSES", "PoseRow"]
 
-_PRIOR = "prior transform T_reference_sensor; null without a pose and before version 3"
+_PRIOR = "prior transform T_reference_sensor; null without a pose"
 
 
 @row(eq=False)
@@ -37,8 +37,7 @@ class PoseRow(Posed):
     targets_m: np.ndarray | None = array(
         "<f8",
         (3, 3),
-        "targets in the reference's frame, 15, 25 and 40 m away, visible to the sensor; null if refused and "
-        "in rows of version 1",
+        "targets in the reference's frame, 15, 25 and 40 m away, visible to the sensor; null if refused",
         default=None,
     )
     dt_s: float | None = column(
@@ -69,9 +68,8 @@ class PoseRow(Posed):
 POSES = TableSchema(
     PoseRow,
     "poses",
-    3,
+    4,
     "One row per sensor and method, the reference too. boresight show poses --json prints these names plus T, 4x4.",
     made_by="calibrate",
-    reads_versions=(1, 2),
     about=("vehicle", "day", "method", "sensor"),
 )

@@ -24,9 +24,8 @@ class ServiceEvent(Recorded):
 SERVICE_EVENTS = TableSchema(
     ServiceEvent,
     "service_events",
-    3,
+    4,
     "Among events of one vehicle, day, sensor and kind, the last one recorded is valid.",
     made_by="service",
-    reads_versions=(1, 2),
     about=("vehicle", "day", "sensor", "kind"),
 )

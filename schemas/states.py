@@ -42,7 +42,7 @@ class StateRow(Posed):
     inputs: list[str] = column("work keys of the records of these days", default_factory=list)
     reference_days: list[str] | None = column(
         "first accepted days since reference_since, at most audit.reference_days: the charts' fixed "
-        "reference is their mean; null in rows of version 1",
+        "reference is their mean; null in rows of sensors",
         default=None,
     )
     reference_since: str | None = column(
@@ -76,6 +76,5 @@ STATES = TableSchema(
     7,
     "boresight state prints the latest rows.",
     made_by="state",
-    reads_versions=(1, 2, 3, 4, 5, 6),
     about=("vehicle", "day", "method", "pair", "parent_frame", "child_frame"),
 )

@@ -191,5 +191,4 @@ TRAINING = TableSchema(
     4,
     "One frame per row. Padded rows of arrays are 0.",
     made_by="prepare",
-    reads_versions=(1, 2, 3),  # these have additional columns, which are not read
 )

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.config import FleetConfig, config_hash, load_fleet, moved_keys
+from pipeline.config import FleetConfig, config_hash, load_fleet
 from pipeline.errors import ConfigError
 from pipeline.extrinsics.prior import require_named_files
 from pipeline.rigs import PriorConfig, Section
@@ -77,56 +77,6 @@ def test_what_cannot_be_right_is_refused_by_the_name_of_its_key(change, key, tmp
     assert key in str(caught.value)
     assert "fleet.toml" in str(caught.value)
     assert caught.value.exit_code == 2
-
-
-OLD = """
-[prepare]
-grid_step_deg = 0.2
-split_by = "day"
-guard_s = 1
-seed = 4
-[prepare.split]
-val_fraction = 0.2
-[verify]
-radar_limit_deg = 0.5
-max_move_prior_sigmas = 6
-"""
-
-
-def test_keys_of_0_11_mean_what_they_meant_and_check_names_their_new_places(tmp_path):
-    old = load(tmp_path, GOOD + OLD)
-    new = load(
-        tmp_path,
-        GOOD
-        + """
-[prepare]
-seed = 4
-split = { by = "day", guard_s = 1, val_fraction = 0.2 }
-grid = { step_deg = 0.2 }
-[verify]
-radar_limit_deg = 0.5
-checks = { max_move_prior_sigmas = 6 }
-""",
-    )
-    assert config_hash(old.prepare, old.verify) == config_hash(new.prepare, new.verify)
-    assert "by" in old.prepare.split.model_fields_set
-    assert moved_keys(tmp_path / "fleet.toml") == {}
-    (tmp_path / "fleet.toml").write_text(GOOD + OLD)
-    assert moved_keys(tmp_path / "fleet.toml") == {
-        "prepare.guard_s": "prepare.split.guard_s",
-        "prepare.split_by": "prepare.split.by",
-        "prepare.grid_step_deg": "prepare.grid.step_deg",
-        "verify.max_move_prior_sigmas": "verify.checks.max_move_prior_sigmas",
-    }
-
-
-def test_an_old_key_is_refused_by_the_name_it_was_written_with_and_beside_its_new_one(tmp_path):
-    with pytest.raises(ConfigError, match=r"prepare\.grid_step_deg: must be a multiple of 0\.1"):
-        load(tmp_path, GOOD + "[prepare]\ngrid_step_deg = 0.25")
-    with pytest.raises(
-        ConfigError, match=r"prepare: split_by is the old name of split\.by, which is set too"
-    ):
-        load(tmp_path, GOOD + '[prepare]\nsplit_by = "day"\nsplit = { by = "day" }')
 
 
 def test_every_section_has_at_most_twelve_keys():

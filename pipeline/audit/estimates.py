@@ -68,13 +68,13 @@ class Estimates:
         pose: T_parent_child as quaternion (scalar first) and translation [m].
         has_estimate: neither pose nor covariance is null.
         common: part of the covariance from errors common to all days.
-        has_common: records of older releases do not have it.
+        has_common: False if the method does not tell it apart.
         disproved: a check shows that the pose is wrong.
         shown_wrong_rad: angular error that the checks of a held record found.
         unchecked_sigmas: distance of each DoF from the prior if it is large and unchecked, else 0.
         half_days: for a day within which a sensor moved, changes from the pose and their sigmas, by part of
             the day.
-        targets: targets of its sigmas, in the child's frame; not finite in rows of older releases.
+        targets: targets of its sigmas, in the child's frame; not finite if it has none.
     """
 
     vehicles: list[str]
@@ -204,7 +204,7 @@ def days_of(records: Estimates, held_sigma_factor: float) -> dict[Edge, PairDays
         if not len(rows):
             continue
         own = records.at(rows)
-        # Without a common part (older releases), all of the covariance counts as varying.
+        # Without a common part, all of the covariance counts as varying.
         common = np.where(own.has_common[:, None, None], own.common, 0.0)
         covariance, held = own.covariance.copy(), ~own.accepted
         covariance[held] = common[held] + (covariance - common)[held] * held_sigma_factor**2

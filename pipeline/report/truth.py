@@ -41,8 +41,6 @@ class TruthRow:
 def read_truth(folder: Path) -> Truth:
     """Read `<folder>/<vehicle>/<day>.json`: T_base_sensor, by sensor, as 4x4 lists.
 
-    Files of releases before 0.11.0 have T_camera_lidar and T_camera_radar.
-
     Raises:
         ConfigError: the folder holds no such file, or one lacks a transform.
     """
@@ -58,12 +56,8 @@ def read_truth(folder: Path) -> Truth:
 
 
 def _poses(content: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    if "T_base_sensor" in content:
-        of = content["T_base_sensor"]
-        return {name: np.array(T, dtype=float) for name, T in of.items()} | {"base": np.eye(4)}
-    # Only relative poses are used, so the camera can replace the base.
-    seen = {n: np.array(content[f"T_camera_{n}"], dtype=float) for n in ("lidar", "radar")}
-    return {"camera": np.eye(4)} | seen
+    of = content["T_base_sensor"]
+    return {name: np.array(T, dtype=float) for name, T in of.items()} | {"base": np.eye(4)}
 
 
 def true_transform(truth: Truth, record: CalibrationRecord) -> Float[np.ndarray, "4 4"] | None:

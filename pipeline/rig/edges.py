@@ -42,8 +42,7 @@ def edge_of(row: CalibrationRecord | StateRow | DriftFinding) -> Edge:
     return edge_named(row.pair, row.parent_frame, row.child_frame)
 
 
-# Edges of a rig whose sensors are named after their kinds, as in a short fleet.toml and in all records until
-# 0.10.
+# Edges of a rig whose sensors are named after their kinds, as in a short fleet.toml.
 EDGE_OF_PAIR: Final[Mapping[str, Edge]] = {
     pair: edge_named(pair, *frames) for pair, frames in FRAMES_OF_PAIR.items()
 }

@@ -9,7 +9,6 @@ from typing import Any, Final, TypeVar
 from pydantic import (
     Field,
     field_validator,
-    model_serializer,
     model_validator,
 )
 
@@ -198,15 +197,6 @@ class Rig(Section):
                 )
             values |= {} if one is None else {section: {kind: one}}
         return values
-
-    @model_serializer(mode="wrap")
-    def _short_form(self, dump: Any, info: Any) -> dict[str, Any]:
-        """The dump of releases before 0.11 for rigs of three sensors, so that work keys do not change."""
-        whole = dump(self)
-        if all(set(of) <= {kind} for kind, of in self._of_kind.items()):
-            short = {kind: whole.pop(section).get(kind) for kind, section in SECTIONS.items()}
-            whole = {k: v for k, v in short.items() if v is not None or not info.exclude_none} | whole
-        return {k: v for k, v in whole.items() if v is not None or k not in ("reference", "base")}
 
     @field_validator("reference", mode="before")
     @classmethod

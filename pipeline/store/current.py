@@ -119,5 +119,5 @@ def prior_of(record: CalibrationRecord | PoseRow) -> Float[np.ndarray, "4 4"] | 
 
 
 def targets_of(record: CalibrationRecord) -> Float[np.ndarray, "N 3"]:
-    """Targets of a record's sigmas, in the child's frame [m]; those of older releases if it has none."""
+    """Targets of a record's sigmas, in the child's frame [m]; the default ones if it has none."""
     return DEFAULT_TARGETS if record.targets_m is None else np.asarray(record.targets_m)

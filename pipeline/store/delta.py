@@ -16,15 +16,16 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from deltalake import DeltaTable, Schema, WriterProperties
 from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundError
 
-from pipeline.errors import ContractError, DamagedLogError
+from pipeline.errors import DamagedLogError, OtherVersionError
 from pipeline.store.parquet_file import opened_parquet
 from pipeline.store.partitions import Lake
-from pipeline.store.rows import with_what_follows
 from schemas.columns import TableSchema
+from schemas.versions import CODE_VERSION
 
 __all__ = [
     "DAMAGED",
@@ -43,7 +44,7 @@ __all__ = [
 ]
 
 _MONTH = "month"
-_VERSION = "boresight.version"
+_VERSION, _RELEASE = "boresight.version", "boresight.release"
 # A reader of one vehicle's day reads whole files: 32 MB hold some thousand vehicle-days, read in a tenth of a
 # second.
 _FILE_BYTES = 32 << 20
@@ -58,9 +59,6 @@ _KEEP_HOURS = 7 * 24
 # seconds.
 _TRIES = 40
 _PAUSE_S = 0.05
-# Removed columns: a table of an older release requires them in every row, and gets the values of that
-# release.
-_RETIRED = {"trio": "default"}
 DAMAGED = "_damaged"  # the underscore makes Delta's own tools ignore it
 LOG = "_delta_log"
 
@@ -102,13 +100,8 @@ class LiveFile:
 
 
 def stored_schema(schema: TableSchema) -> pa.Schema:
-    """Arrow schema of a record table's files: its columns, and the month.
-
-    All columns but the key may be null: rows of older releases lack the columns that were added later.
-    """
-    known = {*schema.about, "work_key", "asserted_at"}
-    stored = [f.with_nullable(f.name not in known) for f in schema.arrow_schema()]
-    return pa.schema([*stored, pa.field(_MONTH, pa.string(), nullable=False)])
+    """Arrow schema of a record table's files: its columns, and the month."""
+    return pa.schema([*schema.arrow_schema(), pa.field(_MONTH, pa.string(), nullable=False)])
 
 
 def open_table(lake: Lake, schema: TableSchema) -> DeltaTable | None:
@@ -116,14 +109,9 @@ def open_table(lake: Lake, schema: TableSchema) -> DeltaTable | None:
 
     Raises:
         DamagedLogError: the table's log cannot be read, or lacks an entry.
-        ContractError: records of a release that stored them as Parquet files, or of a newer release.
+        ContractError: the table is of another schema version.
     """
     where = lake.table(schema.name)
-    if lake.has_record_files(schema.name):
-        problem = (
-            f"holds records as files, as releases before 0.6 kept them: run `boresight migrate --lake {lake}`"
-        )
-        raise ContractError(where, problem)
     try:
         table = DeltaTable(where, storage_options=lake.files.delta_options())
     except TableNotFoundError as err:
@@ -141,11 +129,21 @@ def open_table(lake: Lake, schema: TableSchema) -> DeltaTable | None:
     if empty:
         raise DamagedLogError(where, f"{', '.join(sorted(empty))} of no bytes", str(lake))
     found = table.metadata().configuration.get(_VERSION, "")
-    readable = {str(v) for v in (schema.version, *schema.reads_versions)}
-    if table.protocol().min_reader_version > 1 or found not in readable:
-        problem = f"holds {schema.name}/{found or '?'}, this version reads {schema.name}/{schema.version}"
-        raise ContractError(where, problem)
+    if table.protocol().min_reader_version > 1 or found != str(schema.version):
+        of, reads = (f"{schema.name}/{version}" for version in (found or "?", schema.version))
+        remedy = "use that release, or a new lake"
+        raise OtherVersionError(where, of, _release_of(lake, schema, table), reads, remedy)
     return table
+
+
+def _release_of(lake: Lake, schema: TableSchema, table: DeltaTable) -> str:
+    """Release that made a table; of one without this property, the release of its last rows, if they have it."""
+    told = table.metadata().configuration.get(_RELEASE)
+    if told is None and "code_version" in {f.name for f in table.schema().fields}:
+        for file in sorted(live_files(table), key=lambda f: -f.written_s)[:1]:
+            rows = read_file(lake, schema, file.name, ["code_version"])
+            told = None if rows is None else pc.max(rows["code_version"]).as_py()
+    return told or "(release unknown)"
 
 
 def live_files(table: DeltaTable) -> list[LiveFile]:
@@ -175,12 +173,11 @@ def read_file(
     """
     path, mapped = lake.record_file(schema.name, name), _mapped(columns)
     asked = [c for c in columns if "." not in c]
-    whole = [*asked, *(schema.follows[c][0] for c in asked if c in schema.follows)]
     # Keys of maps repeat in every row: dictionary encoding takes a fifth of the memory and time.
-    coded = [f"{c}.key_value.key" for c in mapped if c not in whole]
+    coded = [f"{c}.key_value.key" for c in mapped if c not in asked]
     try:
         with opened_parquet(lake.files, path, coded) as file:
-            there = [c for c in dict.fromkeys([*whole, *mapped]) if c in file.names]
+            there = [c for c in dict.fromkeys([*asked, *mapped]) if c in file.names]
             # One by one: pyarrow 26 cannot read dictionary-encoded map keys of several row groups at once.
             groups = _groups(file.metadata, wanted or Wanted())
             parts = [file.groups([g], there) for g in groups]
@@ -193,14 +190,14 @@ def read_file(
         lake.damage.append(f"{path}: {str(err).splitlines()[0]}")
         return None
     # the writer may have chosen string views for strings
-    there = [c for c in there if c in whole]
+    there = [c for c in there if c in asked]
     arrow = schema.arrow_schema()
-    found = table.select(there).cast(pa.schema([arrow.field(c).with_nullable(True) for c in there]))
+    found = table.select(there).cast(pa.schema([arrow.field(c) for c in there]))
     for column, keys in mapped.items():
         for key in keys:
             maps = table[column] if column in table.column_names else None
             found = found.append_column(f"{column}.{key}", _values_of(maps, key, table.num_rows))
-    return with_what_follows(found, schema, asked)
+    return found
 
 
 def _mapped(columns: Sequence[str]) -> dict[str, list[str]]:
@@ -292,32 +289,17 @@ def _merge(table: DeltaTable, schema: TableSchema, rows: pa.Table, *, insert: bo
     days, months = (sorted(set(rows.column(n).to_pylist())) for n in ("day", _MONTH))
     # Literals, so that only files of these days are read; days and months are digits and hyphens.
     window = f"t.day >= '{days[0]}' and t.day <= '{days[-1]}' and t.{_MONTH} in ({_quoted(months)})"
-    same = " and ".join(_same(c, schema) for c in (*schema.about, "work_key"))
-    known = {f.name for f in table.schema().fields}
-    later = [f.with_nullable(True) for f in stored_schema(schema) if f.name in set(schema.about) - known]
-    if later:  # else the merge would read them before adding rows
-        table.alter.add_columns(Schema.from_arrow(pa.schema(later)).fields)
-    for name in _RETIRED.keys() & known - set(rows.column_names):
-        rows = rows.append_column(name, pa.array([_RETIRED[name]] * rows.num_rows, pa.string()))
-    # Keep an older release's column descriptions: differing ones cannot be merged.
-    rows = rows.cast(pa.schema([f.remove_metadata() if f.name in known else f for f in rows.schema]))
-    if table.metadata().configuration.get(_VERSION) != str(schema.version):
-        table.alter.set_table_properties({_VERSION: str(schema.version)}, raise_if_not_exists=False)
+    same = " and ".join(f"t.{c} = s.{c}" for c in (*schema.about, "work_key"))
+    # Without descriptions: those of another release may be worded otherwise, and could not be merged.
+    rows = rows.cast(pa.schema([f.remove_metadata() for f in rows.schema]))
     merging = table.merge(
         rows,
         f"{window} and {same}",
         source_alias="s",
         target_alias="t",
-        merge_schema=not known >= set(rows.column_names),
         writer_properties=_WRITER,
     ).when_matched_update({"asserted_at": "s.asserted_at"}, predicate="s.asserted_at > t.asserted_at")
     (merging.when_not_matched_insert_all() if insert else merging).execute()
-
-
-def _same(column: str, schema: TableSchema) -> str:
-    """Condition for an equal key column; null in a row of an older release is derived from another column."""
-    same = f"t.{column} = s.{column}"
-    return f"({same} or t.{column} is null)" if column in schema.follows else same
 
 
 def _quoted(values: Sequence[str]) -> str:
@@ -337,6 +319,7 @@ def create_table(lake: Lake, schema: TableSchema) -> DeltaTable:
         description=schema.doc or None,
         configuration={
             _VERSION: str(schema.version),
+            _RELEASE: CODE_VERSION,
             # Keeps the log small: no query filters files by the other columns.
             "delta.dataSkippingStatsColumns": "vehicle,day",
             "delta.targetFileSize": str(_FILE_BYTES),

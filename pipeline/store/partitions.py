@@ -93,14 +93,12 @@ class Lake:
     """Root of the tables: a folder, or a prefix of a bucket.
 
     Args:
-        migrating: True during migration, when records of an older release exist in addition to the new ones.
         damage: filled while reading: file and reason of everything left out because it is unreadable.
         lost: days and vehicles of the records left out.
     """
 
     root: PurePath
     files: Files = field(default_factory=LocalFiles)
-    migrating: bool = False
     damage: list[str] = field(default_factory=list, compare=False, repr=False)
     lost: list[LostRows] = field(default_factory=list, compare=False, repr=False)
 
@@ -164,11 +162,6 @@ class Lake:
     def exists(self) -> bool:
         """Whether the folder exists."""
         return self.files.exists(self.root)
-
-    def has_record_files(self, table: str) -> bool:
-        """Whether a release before 0.6 left records as files in folders of vehicles."""
-        found = self.files.find(self.root / table, "vehicle=*/day=*/*.parquet")
-        return not self.migrating and isinstance(self.root, Path) and any(True for _ in found)
 
     def record_file(self, table: str, name: str) -> PurePath:
         """Data file of a record table, by its name in the table's log."""

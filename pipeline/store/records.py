@@ -91,18 +91,12 @@ def read_columns(
 
     Args:
         columns: names; "diagnostics.disproved" is one value of a column of maps, null where a record has
-            none. A column unknown to all releases that wrote to the lake is null in every row.
+            none.
         asserted_after: only records that became current after this moment.
     """
-    asked = dict.fromkeys([*schema.about, "asserted_at", "work_key", *columns])
+    asked = list(dict.fromkeys([*schema.about, "asserted_at", "work_key", *columns]))
     wanted = replace(_wanted(vehicle, first, last), asserted_after=asserted_after)
-    found = _rows_of(lake, schema, list(asked), wanted)
-    if found is None:
-        return None
-    for name in (n for n in asked if n not in found.column_names):
-        field = schema.arrow_schema().field(name).with_nullable(True)
-        found = found.append_column(field, pa.nulls(found.num_rows, field.type))
-    return found
+    return _rows_of(lake, schema, asked, wanted)
 
 
 class RecordIndex(Generic[Row]):

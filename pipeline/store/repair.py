@@ -130,17 +130,10 @@ def _set_log_aside(lake: Lake, schema: TableSchema) -> None:
 
 
 def _whole_rows(lake: Lake, schema: TableSchema, name: str) -> pa.Table | None:
-    """All rows of a file with all columns of the table, null for columns that its release did not have."""
+    """All rows of a file; None if it cannot be read, or is of another schema version."""
     rows = read_file(lake, schema, name, [c.name for c in schema.columns])
-    if rows is None:
+    if rows is None or rows.num_columns < len(schema.columns):
         return None
     rows = once(rows, schema)
-    stored = stored_schema(schema)
     months = pa.array([day[:7] for day in rows["day"].to_pylist()], pa.string())
-    columns = [
-        months if f.name not in rows.column_names and f.name == "month"
-        else rows[f.name] if f.name in rows.column_names
-        else pa.nulls(rows.num_rows, f.type)
-        for f in stored
-    ]  # fmt: skip
-    return pa.table(columns, schema=stored)
+    return rows.append_column("month", months).select(stored_schema(schema).names).cast(stored_schema(schema))

@@ -33,7 +33,6 @@ def collect(
     """
     days = [p for p in lake.partitions(schema.name) if p.day < before]
     yield from (c for p in days if (c := _collect_day(lake, schema, p, today, dry_run=dry_run)) is not None)
-    yield from _collect_older(lake, schema, before, dry_run=dry_run)
     for table in (schema, *sensor_tables(schema)):
         for aside in lake.files.find(lake.root / table.name, "vehicle=*/day=*/*.damaged"):
             if aside.parent.name.removeprefix("day=") < before and not dry_run:
@@ -63,25 +62,12 @@ def _collect_day(
     return Collected(partition, size)
 
 
-def _collect_older(lake: Lake, schema: TableSchema, before: str, *, dry_run: bool) -> Iterator[Collected]:
-    """Tables of releases before 0.11 in the table's place, which no command reads."""
-    for partition in lake.partitions(schema.before) if schema.before else ():
-        path = lake.file(schema.before, partition)
-        if partition.day < before:
-            size = lake.files.size(path)
-            if not dry_run:
-                lake.files.delete(path)
-            yield Collected(partition, size)
-
-
 def collect_pages(lake: Lake, before: str, *, dry_run: bool = False) -> list[str]:
     """Remove pages of vehicle-days before `before` from the lake's reports; returns their names."""
     gone = []
-    report, wide = lake.root / "report", len("YYYY-MM-DD")
-    pages = [(page.parent.name, page) for page in lake.files.find(report, "*_days/*/*.html")]
-    pages += [(page.stem[-wide:], page) for page in lake.files.find(report, "*_days/*.html")]  # before 0.7
-    for day, page in pages:
-        if is_day(day) and day < before:
+    report = lake.root / "report"
+    for page in list(lake.files.find(report, "*_days/*/*.html")):
+        if is_day(page.parent.name) and page.parent.name < before:
             gone.append(str(page.relative_to(report)))
             if not dry_run:
                 lake.files.delete(page)

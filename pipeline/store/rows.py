@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import MISSING, Field, fields
+from dataclasses import MISSING, fields
 from typing import Any, TypeVar
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from pipeline.errors import ContractError
 from schemas.columns import Column, TableSchema
 
-__all__ = ["from_table", "to_table", "with_what_follows"]
+__all__ = ["from_table", "to_table"]
 
 Row = TypeVar("Row")
 
@@ -30,10 +29,10 @@ def to_table(rows: Sequence[Any], schema: TableSchema) -> pa.Table:
 def from_table(table: pa.Table, schema: TableSchema, row_type: type[Row]) -> list[Row]:
     """Row dataclasses of a table; array fields are decoded without a copy.
 
-    Records are kept for ever: a column that an older release did not have takes the field's default.
+    A column that was not read takes the field's default.
 
     Raises:
-        ContractError: the table lacks a column of the schema that has no default.
+        ContractError: a column that was not read has no default.
     """
     known = {f.name: f for f in fields(row_type)}  # type: ignore[arg-type]
     absent = [c.name for c in schema.columns if c.name not in table.column_names]
@@ -42,33 +41,11 @@ def from_table(table: pa.Table, schema: TableSchema, row_type: type[Row]) -> lis
     if missing:
         raise ContractError(schema.name, f"columns missing: {', '.join(missing)}")
     values = {
-        c.name: _filled(_decode_column(table.column(c.name), c), c, known[c.name])
+        c.name: _decode_column(table.column(c.name), c)
         for c in schema.columns
         if c.name in known and c.name not in absent
     }
     return [row_type(**{name: values[name][i] for name in values}) for i in range(table.num_rows)]
-
-
-def with_what_follows(found: pa.Table, schema: TableSchema, asked: Sequence[str]) -> pa.Table:
-    """The table with requested columns derived for rows of releases that did not have them."""
-    for column, (source, values) in schema.follows.items():
-        if column in asked and source in found.column_names:
-            place = pc.index_in(found[source], pa.array(values.keys(), pa.string()))
-            made = pa.array(values.values(), pa.string()).take(place.combine_chunks())
-            if column in found.column_names:
-                made = pc.coalesce(found[column], made)
-                found = found.drop_columns(column)
-            found = found.append_column(column, made)
-    return found
-
-
-def _filled(values: list[Any], column: Column, field: Field[Any]) -> list[Any]:
-    """Values of a column; null becomes the default if the column was added later and is not nullable."""
-    if column.nullable or column.is_array or None not in values:
-        return values
-    if field.default_factory is MISSING:
-        return [field.default if v is None else v for v in values]
-    return [field.default_factory() if v is None else v for v in values]
 
 
 def _encode(value: Any, column: Column, table: str) -> Any:

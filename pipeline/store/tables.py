@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipeline.errors import CollectedError, ContractError, DamagedError
+from pipeline.errors import CollectedError, ContractError, DamagedError, OtherVersionError
 from pipeline.store.parquet_file import opened_parquet
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.rows import from_table, to_table
@@ -150,12 +150,10 @@ def read_manifest(
         return None
 
 
-def absence(lake: Lake, schema: TableSchema, partition: Partition) -> str:
+def absence(schema: TableSchema, partition: Partition) -> str:
     """Error text for a missing partition, with the remedy."""
     problem = f"table {schema.name} has no partition for {partition.vehicle} on {partition.day}"
     problem += f": run `boresight {schema.made_by}` first" if schema.made_by else ""
-    if schema.before and lake.partitions(schema.before, partition.vehicle, partition.day):
-        problem += f" (its {schema.before} are of a release before 0.11; ingest makes them again)"
     return problem
 
 
@@ -182,7 +180,7 @@ def iterate_rows(
     path = lake.file(schema.name, partition, sensor)
     manifest = read_manifest(lake, schema, partition, sensor)
     if manifest is None:
-        raise ContractError(str(path), absence(lake, schema, partition))
+        raise ContractError(str(path), absence(schema, partition))
     if COLLECTED in manifest.extra:
         raise CollectedError(str(path), manifest.extra[COLLECTED])
     wanted = None if rows is None else set(rows)
@@ -263,8 +261,9 @@ def _manifest(lake: Lake, path: PurePath, schema: TableSchema) -> Manifest:
         raise ContractError(str(path), "was not written by Boresight (no manifest in the footer)")
     values = json.loads(raw)
     found, version = values.get("table"), values.get("version")
-    if found != schema.name or version not in (schema.version, *schema.reads_versions):
-        problem = f"holds {found}/{version}, this version reads {schema.name}/{schema.version}"
+    if (found, version) != (schema.name, schema.version):
+        release, reads = values.get("code_version", "?"), f"{schema.name}/{schema.version}"
         is_newer = found == schema.name and version > schema.version
-        raise ContractError(str(path), problem + ("" if is_newer else ": make it anew"))
+        remedy = "use that release" if is_newer else "make it anew"
+        raise OtherVersionError(str(path), f"{found}/{version}", release, reads, remedy)
     return Manifest(**{f.name: values[f.name] for f in fields(Manifest) if f.name in values})

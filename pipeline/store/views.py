@@ -9,7 +9,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from pipeline.errors import ContractError
 from pipeline.rig.prior import Star, between, transform_of_row
 from pipeline.store.moments import joined, sensors_of
 from pipeline.store.partitions import Lake, Partition
@@ -56,12 +55,8 @@ def perceived(lake: Lake, partition: Partition) -> Manifest | None:
 
 
 def perceived_days(lake: Lake) -> list[Partition]:
-    """Vehicle-days that were perceived, in order; ContractError if all are of an older release."""
-    days = lake.partitions(PERCEIVED.name)
-    if not days and lake.partitions(PERCEIVED.before):
-        problem = f"table {PERCEIVED.before} was made by a release before 0.11: run `boresight ingest` and `perceive`"
-        raise ContractError(str(lake.root), problem)
-    return days
+    """Vehicle-days that were perceived, in order."""
+    return lake.partitions(PERCEIVED.name)
 
 
 def frames_of(

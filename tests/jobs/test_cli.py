@@ -104,7 +104,6 @@ READERS = {
     "state": [],
     "status": [],
     "gc": ["--images-days", "30"],
-    "migrate": [],
 }
 
 

@@ -4,11 +4,9 @@ import json
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from jobs.show import show
 from jobs.status import status
-from pipeline.errors import ContractError
 from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake
 from schemas.calibrations import CALIBRATIONS
@@ -69,14 +67,6 @@ def test_poses_are_shown_with_their_transform_and_the_current_one_alone_where_as
     assert asked | {"azimuth_sigma_rad", "elevation_sigma_rad"} <= rows[0].keys()
     assert show("poses", lake=str(tmp_path)) == 0
     assert "front" in capsys.readouterr().out
-
-
-def test_status_names_the_command_that_moves_records_of_older_releases(tmp_path):
-    old = tmp_path / "calibrations/vehicle=car/day=2026-03-02"
-    old.mkdir(parents=True)
-    (old / "joint-abc.parquet").touch()
-    with pytest.raises(ContractError, match="boresight migrate"):
-        status(lake=str(tmp_path))
 
 
 def test_faults_of_records_are_said_in_plain_words_by_show_and_status(tmp_path, capsys):

@@ -57,12 +57,8 @@ def fleet(tmp_path_factory: pytest.TempPathFactory, maker: ModuleType) -> tuple[
         path = truth / "b" / f"2026-03-0{day + 1}.json"
         path.parent.mkdir(parents=True, exist_ok=True)
         lr = maker.T_LIDAR_RADAR @ (maker.exp_se3(KNOCK) if day > 1 else np.eye(4))
-        T = {
-            "camera_lidar": maker.T_CAMERA_LIDAR,
-            "lidar_radar": lr,
-            "camera_radar": maker.T_CAMERA_LIDAR @ lr,
-        }
-        path.write_text(json.dumps({f"T_{pair}": value.tolist() for pair, value in T.items()}))
+        T = {"camera": np.eye(4), "lidar": maker.T_CAMERA_LIDAR, "radar": maker.T_CAMERA_LIDAR @ lr}
+        path.write_text(json.dumps({"T_base_sensor": {name: value.tolist() for name, value in T.items()}}))
     page = root / "fleet page.html"
     write_fleet_report(lake, _config(), Pages(page, read_truth(truth)))
     return lake, page, truth

@@ -74,13 +74,6 @@ def test_the_short_form_is_a_rig_whose_sensors_are_called_by_their_kinds(tmp_pat
     assert short.rigs["default"].camera == short.rigs["default"].cameras["camera"]
 
 
-def test_dumps_of_three_sensor_rigs_stay_so_that_no_log_is_ingested_again(tmp_path):
-    rig = load(tmp_path, fleet_toml("car-1")).rigs["default"]
-    assert config_hash(rig) == "6252c4c2fb4a00bc"  # of release 0.10.0
-    assert list(rig.model_dump()) == ["camera", "lidar", "radar", "ego", "prior"]
-    assert "radar" not in rig.model_copy(update={"radars": {}}).model_dump(exclude_none=True)
-
-
 def test_what_only_calibration_asks_for_is_no_reason_to_ingest_again(tmp_path):
     plain = load(tmp_path, VAN)
     other = VAN.replace("4.0", "3.0").replace(

@@ -14,12 +14,10 @@ import pytest
 from pipeline.errors import ContractError, DamagedError
 from pipeline.store.moments import is_whole, joined, sensor_files, write_moments
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.tables import write_partition
 from pipeline.store.views import frames_of, ingested, observations_of
 from schemas.moments import FILES, MOMENTS, PRIOR
 from tests.makers.lakes import joined_of, write_frames, write_observations
-from tests.makers.table_rows import make_frame, make_observation, make_row, same
-from tests.makers.whole_tables import FRAMES
+from tests.makers.table_rows import make_frame, make_observation, same
 
 REPO = Path(__file__).resolve().parents[2]
 DAY = Partition("car", "2026-03-02")
@@ -150,17 +148,6 @@ def test_an_error_while_writing_leaves_the_old_day_and_nothing_else(lake):
         raise RuntimeError("sensor")
     assert sorted(p for p in lake.root.rglob("*") if p.is_file()) == before
     assert len(list(frames_of(lake, DAY))) == 5
-
-
-def test_a_lake_of_an_older_release_says_what_to_do_and_is_not_read_as_something_else(lake):
-    with write_partition(lake, FRAMES, DAY, "key", "0.9.0") as writer:
-        writer.append([make_row("frames", np.random.default_rng(0))])
-        writer.describe(kept={}, rejected={})
-    assert ingested(lake, DAY) is None
-    with pytest.raises(
-        ContractError, match=r"run `boresight ingest` first \(its frames are of a release before 0\.11"
-    ):
-        list(frames_of(lake, DAY))
 
 
 _WRITER = """

@@ -226,34 +226,6 @@ def test_a_lake_without_records_reads_as_empty_and_is_not_made_by_reading(lake):
     assert not lake.root.exists()
 
 
-def test_a_table_of_another_version_is_named(lake, rng):
-    commit_records(lake, CALIBRATIONS, [record(rng, "A")])
-    newer = replace(CALIBRATIONS, version=CALIBRATIONS.version + 1)
-    with pytest.raises(
-        ContractError, match=rf"holds calibrations/{CALIBRATIONS.version}, this version reads"
-    ):
-        read_records(lake, newer, CalibrationRecord)
-
-
-def test_records_of_a_release_that_knew_fewer_columns_stay_readable_and_more_can_come(lake, rng):
-    later = {"score", "drive_missing", "common_covariance"}
-    columns = tuple(c for c in CALIBRATIONS.columns if c.name not in later)
-    fewer = replace(CALIBRATIONS, version=2, columns=columns)
-    commit_records(lake, fewer, [record(rng, "old", score=0.5, drive_missing=["a"])])
-    [found] = read(lake)
-    assert (found.score, found.drive_missing, found.common_covariance) == (None, [], None)
-    commit_records(lake, CALIBRATIONS, [record(rng, "new", score=0.5, drive_missing=["a"])])
-    old, new = read(lake)
-    assert (old.score, old.drive_missing) == (None, [])
-    assert (new.score, new.drive_missing) == (0.5, ["a"])
-    np.testing.assert_array_equal(old.covariance, found.covariance)
-    assert new.common_covariance.shape == (6, 6)
-    with pytest.raises(
-        ContractError, match=rf"holds calibrations/{CALIBRATIONS.version}, this version reads calibrations/2"
-    ):
-        read_records(lake, replace(fewer, reads_versions=()), CalibrationRecord)
-
-
 def test_a_row_without_what_its_table_promises_is_not_committed(lake, rng):
     with pytest.raises(ContractError, match="covariance has shape"):
         commit_records(lake, CALIBRATIONS, [record(rng, "A"), record(rng, "B", covariance=np.eye(4))])

@@ -17,14 +17,12 @@ from pipeline.store.moments import sensor_files
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.retention import collect, first_day_kept
 from pipeline.store.row_groups import read_columns
-from pipeline.store.tables import write_partition
 from pipeline.store.views import frames_of, ingested, observations_of
 from schemas.captures import CAPTURES
 from schemas.moments import MOMENTS
 from tests.makers.fleet_files import fleet_toml
 from tests.makers.lakes import joined_of, write_frames, write_observations
-from tests.makers.table_rows import make_frame, make_observation, make_row
-from tests.makers.whole_tables import FRAMES, OBSERVATIONS
+from tests.makers.table_rows import make_frame, make_observation
 
 OLD, NEW = Partition("car", "2026-03-02"), Partition("car", "2026-03-20")
 
@@ -98,7 +96,7 @@ def test_the_command_takes_images_and_pages_and_says_how_much(lake, capsys):
     today = dt.datetime.now(dt.UTC).date()
     recent = first_day_kept(today, 30)
     pages = lake.root / "report" / "fleet_days"
-    for name in ("2026-03-02/car.html", f"{recent}/car.html", "index.html", "car_2026-03-02.html"):
+    for name in ("2026-03-02/car.html", f"{recent}/car.html", "index.html"):
         (pages / name).parent.mkdir(parents=True, exist_ok=True)
         (pages / name).touch()
     assert gc(lake=str(lake.root), dry_run=True) == 0
@@ -109,7 +107,7 @@ def test_the_command_takes_images_and_pages_and_says_how_much(lake, capsys):
     assert {k: planned[k] for k in ("partitions", "freed_bytes", "pages")} == {
         k: done[k] for k in ("partitions", "freed_bytes", "pages")
     }
-    assert (done["partitions"], done["pages"]) == ({"moments": 2}, 2)
+    assert (done["partitions"], done["pages"]) == ({"moments": 2}, 1)
     assert done["freed_bytes"] > 0
     assert sorted(p for p in pages.rglob("*.html")) == [pages / recent / "car.html", pages / "index.html"]
     assert gc(lake=str(lake.root), observations_days=1) == 0
@@ -118,21 +116,6 @@ def test_the_command_takes_images_and_pages_and_says_how_much(lake, capsys):
         gc(lake=str(lake.root), images_days=0)
     with pytest.raises(ConfigError, match="no such folder"):
         gc(lake=str(lake.root / "x"))
-
-
-def test_frames_and_observations_of_an_older_release_go_with_the_moments_that_took_their_place(lake, capsys):
-    rng = np.random.default_rng(0)
-    for schema in (FRAMES, OBSERVATIONS):
-        for partition in (OLD, Partition("car", "2999-01-01")):
-            with write_partition(lake, schema, partition, "key", "0.9.0") as writer:
-                writer.append([make_row(schema.name, rng)])
-                writer.describe(kept={}, rejected={})
-    assert gc(lake=str(lake.root)) == 0
-    assert json.loads(capsys.readouterr().out)["partitions"] == {"moments": 3}
-    assert [p.day for p in lake.partitions("frames")] == [
-        "2999-01-01"
-    ]  # its images may stay as long as others
-    assert len(lake.partitions("observations")) == 2
 
 
 def test_a_month_kept_is_thirty_days_with_today():

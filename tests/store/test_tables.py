@@ -17,7 +17,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from pipeline.errors import ContractError, DamagedError
+import pipeline.store.delta
+from pipeline.errors import ContractError, DamagedError, OtherVersionError
 from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
@@ -27,11 +28,10 @@ from pipeline.store.tables import (
     read_rows,
     write_partition,
 )
-from pipeline.store.views import perceived_days
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
-from schemas.versions import TABLES
+from schemas.versions import CODE_VERSION, TABLES
 from tests.makers.table_rows import ROW_TYPES, make_row, same
-from tests.makers.whole_tables import FRAMES, OBSERVATIONS, WholeFrame
+from tests.makers.whole_tables import FRAMES, WholeFrame
 
 REPO = Path(__file__).resolve().parents[2]
 DAY = Partition("car", "2026-03-02")
@@ -111,26 +111,45 @@ def test_a_row_that_breaks_its_contract_is_not_written(field, value, match, lake
 
 
 @pytest.mark.parametrize("table", TABLES)
-def test_what_a_newer_release_wrote_is_refused_with_its_version_whatever_table(table, lake, rng):
+@pytest.mark.parametrize("step", [1, -1])
+def test_what_another_release_wrote_is_refused_with_file_version_and_release(table, step, lake, rng):
     schema, row_type = ROW_TYPES[table]
-    newer = dataclasses.replace(schema, version=schema.version + 1)
-    words = f"{table}/{newer.version}, this version reads {table}/{schema.version}$"
+    other = dataclasses.replace(schema, version=schema.version + step)
+    holds, reads = f"{table}.* holds {table}/{other.version}", f"this version reads {table}/{schema.version}"
     if schema.is_record_table:
         times = {"recorded_at": "", "asserted_at": ""}
-        commit_records(lake, newer, [make_row(table, rng, vehicle="v", day="2026-03-02", **times)])
-        with pytest.raises(ContractError, match=words):
-            read_records(lake, schema, row_type)
+        commit_records(lake, other, [make_row(table, rng, vehicle="v", day="2026-03-02", **times)])
+        words = f"{holds}, written by boresight {CODE_VERSION}; {reads}: use that release, or a new lake$"
+        for refused in (
+            lambda: read_records(lake, schema, row_type),
+            lambda: commit_records(lake, schema, [make_row(table, rng, **times)]),
+        ):
+            with pytest.raises(OtherVersionError, match=words):
+                refused()
     else:
-        write(lake, [make_row(table, rng)], schema=newer)
-        with pytest.raises(ContractError, match=words):
+        write(lake, [make_row(table, rng)], schema=other)
+        remedy = "use that release" if step > 0 else "make it anew"
+        with pytest.raises(
+            OtherVersionError, match=rf"{holds}, written by boresight 0\.1; {reads}: {remedy}$"
+        ):
             read_rows(lake, schema, DAY, row_type)
 
 
-def test_days_that_an_older_release_perceived_are_said_to_be_its_and_none(lake, rng):
-    assert perceived_days(lake) == []
-    write(lake, [make_row("observations", rng)], schema=OBSERVATIONS)
-    with pytest.raises(ContractError, match=r"release before 0\.11: run `boresight ingest` and `perceive`"):
-        perceived_days(lake)
+@pytest.mark.parametrize(
+    ("table", "release"), [("calibrations", "0.11.0"), ("drift", r"\(release unknown\)")]
+)
+def test_a_record_table_that_does_not_name_its_release_has_it_in_its_rows_or_nowhere(
+    table, release, lake, rng, monkeypatch
+):
+    schema, row_type = ROW_TYPES[table]
+    of = {"vehicle": "v", "day": "2026-03-02", "recorded_at": "", "asserted_at": ""}
+    told = {"code_version": "0.11.0"} if table == "calibrations" else {}
+    with monkeypatch.context() as patch:  # as releases until 0.12 made tables
+        patch.setattr(pipeline.store.delta, "_RELEASE", "unread")
+        other = dataclasses.replace(schema, version=schema.version - 1)
+        commit_records(lake, other, [make_row(table, rng, **of, **told)])
+    with pytest.raises(OtherVersionError, match=f"written by boresight {release}; this version"):
+        read_records(lake, schema, row_type)
 
 
 def test_another_version_a_foreign_file_and_a_damaged_one_are_named(lake, rng):

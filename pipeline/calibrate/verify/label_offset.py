@@ -76,7 +76,7 @@ class LabelOffset:
 def with_label_offset(solution: Solution, observations: Sequence[Observation]) -> Solution:
     """The solution with the labels' offset in camera-lidar: its numbers, a failed check, or a wider covariance.
 
-    Unchanged where no frame has gradients (written by an earlier release).
+    Unchanged where no frame has gradients.
     """
     frames = [o for o in observations if o.label_gradients is not None]
     if not frames:

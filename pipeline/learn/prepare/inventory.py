@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -111,18 +110,13 @@ def require_sides(lake: Lake) -> None:
     if not path.exists():
         return
     told = json.loads(path.read_text())
-    wanted = ["train", *(["val"] if _val_fraction(told["settings"]) > 0 else [])]
+    wanted = ["train", *(["val"] if told["settings"]["split"]["val_fraction"] > 0 else [])]
     if empty := [side for side in wanted if not told["frames"][side]]:
         problem = (
             f"no frames on side {', '.join(empty)}: prepare again with more vehicle-days or another "
             "[prepare.split] by (`boresight prepare` names one); val_fraction = 0 trains without validation"
         )
         raise ContractError(str(path), problem)
-
-
-def _val_fraction(settings: Mapping[str, Any]) -> float:
-    """`val_fraction` in the settings of an inventory, which have no sections up to 0.11."""
-    return float(settings.get("split", settings)["val_fraction"])
 
 
 def _leaks(

@@ -227,7 +227,6 @@ def _generator(seed: int, step: int, rank: int) -> torch.Generator:
 
 def _same_config(folder: Path, begun: dict[str, Any], config: TrainConfig) -> None:
     now = config.model_dump(mode="json")
-    begun = TrainConfig.model_validate(begun).model_dump(mode="json")  # as this release names it
     other = sorted(k for k in begun.keys() | now.keys() if begun.get(k) != now.get(k))
     if other:
         problem = (

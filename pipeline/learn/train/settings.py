@@ -35,9 +35,6 @@ PAIRS_OF: dict[str, tuple[str, ...]] = {
     "lidar_radar": ("lidar_radar",),
 }
 
-# Keys of train.toml and of runs of 0.3.0 that have another name now; both are understood.
-_RENAMED = {"doubt_weight": "uncertainty_weight"}
-
 
 class _Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -60,14 +57,6 @@ class LossConfig(_Section):
     loop: NotNegative = 1.0
     prior: NotNegative = 0.1  # holds what frames do not determine, and is weaker than what they determine
     semantics: NotNegative = 1.0  # the encoders' cross-entropy to the precomputed classes
-
-    @model_validator(mode="before")
-    @classmethod
-    def _without_way(cls, values: object) -> object:
-        """Runs before 0.10 name a term `way`, which was off."""
-        if not isinstance(values, Mapping) or values.get("way"):
-            return values
-        return {key: value for key, value in values.items() if key != "way"}
 
 
 class AugmentConfig(_Section):
@@ -154,13 +143,6 @@ class TrainConfig(DescentConfig):
     loss: LossConfig = LossConfig()
     augment: AugmentConfig = AugmentConfig()
     strange: StrangeConfig = StrangeConfig()
-
-    @model_validator(mode="before")
-    @classmethod
-    def _renamed(cls, values: object) -> object:
-        if not isinstance(values, Mapping):
-            return values
-        return {_RENAMED.get(key, key): value for key, value in values.items()}
 
     @model_validator(mode="after")
     def _cells_fit(self) -> TrainConfig:

@@ -221,22 +221,6 @@ def test_what_cannot_be_right_is_named(tmp_path):
     assert parse_duration("1.5h", "budget") == 5400
 
 
-def test_a_key_of_an_earlier_release_keeps_its_meaning(data, tmp_path):
-    path = tmp_path / "train.toml"
-    path.write_text("doubt_weight = 0.5")
-    assert load_train_config(path, {}).uncertainty_weight == 0.5
-    path.write_text("[loss]\nway = 1.0")
-    with pytest.raises(ConfigError, match=r"loss\.way"):
-        load_train_config(path, {})
-    train(TrainRequest(data, tmp_path, "cpu"), config(steps=1))
-    state = load_checkpoint(tmp_path / "last.pt")
-    state["config"]["doubt_weight"] = state["config"].pop("uncertainty_weight")
-    state["config"]["loss"]["way"] = 0.0  # a term that 0.9 had, and left out
-    state.pop("format")
-    save_checkpoint(tmp_path / "last.pt", state)
-    assert train(TrainRequest(data, tmp_path, "cpu"), config(steps=1)).status == "done"
-
-
 def test_defaults_are_the_papers_recipe():
     c = TrainConfig()
     assert (c.batch_size, c.adam_betas, c.learning_rate, c.final_learning_rate) == (

@@ -220,7 +220,7 @@ def test_a_day_without_a_model_is_what_it_was_and_models_need_no_new_ingest(tmp_
     assert told.rigs["default"].lidar.semantics.segmenter == "seg.toml"
     assert config_hash(plain.rigs["default"]) == config_hash(told.rigs["default"])
     assert FleetConfig.model_validate(plain.model_dump(mode="json")).read_from(plain.file) == plain
-    assert plain.model_dump(mode="json")["rigs"]["default"]["lidar"] == {"points": "/lidar/points"}
+    assert plain.model_dump(mode="json")["rigs"]["default"]["lidars"]["lidar"] == {"points": "/lidar/points"}
 
 
 def test_a_sweep_without_intensity_and_with_bad_points_is_perceived_too(tmp_path, made_frame):
