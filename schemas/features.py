@@ -48,9 +48,9 @@ class ImageFeatureColumns(CameraColumns):
     )
     label_gradients: np.ndarray | None = array(
         "<f4",
-        (4, 6, 33),
-        "image gradients across the labels' borders: by EDGE_* side, sixth of the image and distance from -16"
-        " to 16 label pixels; null without an image or semantics",
+        (8, 6, 33),
+        "image gradients across the labels' borders: by EDGE_* side of objects, then of what stands before the sky; "
+        "by sixth of the image and distance from -16 to 16 label pixels; null without an image or semantics",
         default=None,
     )
     steps_png: bytes | None = column(
@@ -143,7 +143,7 @@ class ScanFeatures(ScanFeatureColumns, Capture):
 
 _ONE = "; a file per {}, joined by the table perceived."
 IMAGE_FEATURES = TableSchema(
-    ImageFeatures, "image_features", 2, "Features of a camera's images" + _ONE.format("camera"),
+    ImageFeatures, "image_features", 3, "Features of a camera's images" + _ONE.format("camera"),
     made_by="perceive", of_sensor=True,
 )  # fmt: skip
 SWEEP_FEATURES = TableSchema(

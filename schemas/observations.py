@@ -34,10 +34,12 @@ class Observation(ImageFeatureColumns, SweepFeatureColumns, ScanFeatureColumns, 
     Args:
         ego_speed_mps: from odometry if logged, else from the Doppler fit of static detections.
         ego_yaw_rate_radps: from odometry, else None.
+        label_offset_px: from the labels to the picture, right and down [label px], where calibrate measured one.
     """
 
     ego_speed_mps: float | None
     ego_yaw_rate_radps: float | None
+    label_offset_px: tuple[float, float] = (0.0, 0.0)
 
     @property
     def is_unlabelled(self) -> bool:

@@ -78,20 +78,16 @@ def judged_together(day: SolvedDay, rig: AdjustedRig | None, edges: Mapping[str,
         return day
     pairs, verdicts = dict(day.solution.pairs), dict(day.judged)
     for pair, own in day.solution.pairs.items():
-        if (
-            day.failed[pair]
-            or own.disproved
-            or pair not in day.judging.active
-            or edges[pair] not in rig.edges
-        ):
+        if day.judged[pair].held_by or pair not in day.judging.active or edges[pair] not in rig.edges:
             continue
         against = _contradictions(edges[pair], rig, day.judged[pair])
+        failed = [*day.failed[pair], *against]
         estimate = _of_rig(own, edges[pair], rig, day.solution)
-        again = day.judging.pair(estimate, against, together=True)
+        again = day.judging.pair(estimate, failed, together=True)
         if edges[pair] not in rig.left_out or again.verdict.status == "accepted":
             pairs[pair], verdicts[pair] = estimate, again
         elif against:
-            verdicts[pair] = day.judging.pair(own, against, together=False)
+            verdicts[pair] = day.judging.pair(own, failed, together=False)
     return replace(day, solution=replace(day.solution, pairs=pairs), judged=verdicts)
 
 

@@ -17,7 +17,7 @@ from pipeline.calibrate.select.frames import PAPER_SYNC_GATE_S, Selection, selec
 from pipeline.calibrate.solved import SolvedDay
 from pipeline.calibrate.unlabelled import unlabelled_pairs
 from pipeline.calibrate.verify.day_checks import FoundDay, checks_of_day
-from pipeline.calibrate.verify.label_offset import with_label_offset
+from pipeline.calibrate.verify.day_labels import day_labels
 from pipeline.calibrate.verify.motion_sources import MotionFindings, compared_sources
 from pipeline.calibrate.verify.mounting import camera_turn_sigma_rad
 from pipeline.config import FleetConfig
@@ -115,6 +115,8 @@ def _solved(
 ) -> DayOfPairs:
     """A day whose sources of motion were compared."""
     progress(0, 4, "select frames")
+    labels = day_labels(observations, float(np.radians(fleet.verify.camera_lidar_limit_deg)))
+    observations = observations if labels is None else labels.in_place(observations)
     method = method_named(about.method)
     selection = _selection(observations, method, fleet, about)
     unlabelled = unlabelled_pairs(observations, about.chosen, needs_labels=method.needs_labels)
@@ -144,8 +146,8 @@ def _solved(
         triggered=active,
         progress=lambda done, total, what: progress(1, 4, f"{what} ({done}/{total})"),
     )
-    if "camera_lidar" in active:
-        solution = with_label_offset(solution, observations)
+    if labels is not None and "camera_lidar" in active:
+        solution = labels.judged(solution)
     progress(2, 4, "judge on held-out frames")
     failed, judging = _judging(
         observations, selection, prior, solution, fleet, active, motion, about.probe_deg

@@ -68,7 +68,7 @@ def judged_edge(
         mounting=mounting,
         targets=targets,
     )
-    result = _result(evidence, alone, prior, fleet)
+    result = _result(evidence, alone, prior, fleet, targets)
     verdict = judge(result, Evidence(None, claims, evidence.checks), fleet.verify.checks)
     judged = Judged(verdict, None, claims, mounting, targets)
     return JudgedEdge(replace(evidence, checks=verdict.against), alone, judged)
@@ -112,7 +112,9 @@ def _prior_of(edge: Edge, prior: RigPrior) -> Extrinsics:
     return Extrinsics(edge.parent, {parent: np.eye(4), child: T}, (child,), covariance, covariance)
 
 
-def _result(evidence: EdgeEvidence, alone: AdjustedRig, prior: RigPrior, fleet: FleetConfig) -> EdgeResult:
+def _result(
+    evidence: EdgeEvidence, alone: AdjustedRig, prior: RigPrior, fleet: FleetConfig, targets: np.ndarray
+) -> EdgeResult:
     """The edge's pose beside its prior."""
     edge, child = evidence.edge, evidence.edge.child.name
     sigmas = prior.sigmas_between(*(s.name for s in edge.sensors))
@@ -128,6 +130,7 @@ def _result(evidence: EdgeEvidence, alone: AdjustedRig, prior: RigPrior, fleet: 
         before_sigma,
         evidence.frames_used,
         search_range(sigmas, fleet.solve),
+        targets,
     )
 
 

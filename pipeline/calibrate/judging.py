@@ -20,7 +20,7 @@ from pipeline.calibrate.verify.mounting import mounting_covariance
 from pipeline.calibrate.verify.probes import probe_numbers
 from pipeline.calibrate.verify.seen_targets import seen_targets, unseen_failure, views_of
 from pipeline.calibrate.verify.target_accuracy import Claim, claims_of
-from pipeline.calibrate.verify.verdict import Evidence, Verdict, judge
+from pipeline.calibrate.verify.verdict import Evidence, Verdict, judge, matters
 from pipeline.config import ChecksConfig, FleetConfig
 from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.estimates import PairEstimate, Prior
@@ -42,6 +42,7 @@ class Judged:
     mounting_covariance: np.ndarray | None = None  # 6 6; None if the camera's mounting is unknown
     targets: np.ndarray = field(default_factory=lambda: DEFAULT_TARGETS)  # 3 3, in the child's frame
     probes: Mapping[str, float] = field(default_factory=dict)  # of `probe_numbers`
+    held_by: tuple[FailedCheck, ...] = ()  # of the checks of solver and day, those that matter
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,16 +93,18 @@ class Judging:
         targets = DEFAULT_TARGETS if targets is None else targets
         test, claims, probes, elsewhere = self._held_out(estimate, held_out, limits, mounting, targets)
         disproved = [FailedCheck(estimate.disproved, disproves=True)] if estimate.disproved else []
+        result = self._result(estimate, targets)
         verdict = judge(
-            self._result(estimate),
+            result,
             Evidence(test, claims, [*failed, *unseen, *elsewhere, *disproved]),
             limits,
             triggered=active,
             together=together,
         )
-        return Judged(verdict, test, claims, mounting, targets, probes)
+        held_by = tuple(check for check in (*failed, *disproved) if matters(check, result, claims))
+        return Judged(verdict, test, claims, mounting, targets, probes, held_by)
 
-    def _result(self, estimate: PairEstimate) -> EdgeResult:
+    def _result(self, estimate: PairEstimate, targets: np.ndarray) -> EdgeResult:
         pair, prior = estimate.pair, self.prior
         return EdgeResult(
             pair,
@@ -112,6 +115,7 @@ class Judging:
             np.sqrt(np.diag(prior.covariance(pair))),
             estimate.frames_used,
             search_range(prior.sigmas, self.fleet.solve),
+            targets,
         )
 
     def _held_out(

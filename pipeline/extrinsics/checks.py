@@ -7,16 +7,28 @@ from dataclasses import dataclass
 
 from schemas.faults import FAULTS
 
-__all__ = ["FailedCheck", "faults_of"]
+__all__ = ["HARMLESS", "Change", "FailedCheck", "faults_of"]
+
+# Rotation vector and shift of the child's origin, both along the parent's axes [rad, m], as `geometry.changes`.
+Change = tuple[float, float, float, float, float, float]
+HARMLESS: Change = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class FailedCheck:
-    """Sentence about a failed check, and its fault in `schemas.faults` if it has one."""
+    """Sentence about a failed check, its fault in `schemas.faults` if it has one, and what it is worth.
+
+    Args:
+        fault: key of FAULTS; empty if the check cannot name the cause.
+        disproves: the pose is certainly wrong and must not be used, not only unproved.
+        error: by how much the pose would be wrong if the check is right: it holds a record only where that
+            matters against its limits. None = nobody knows, so that it always holds.
+    """
 
     sentence: str
-    fault: str = ""  # key of FAULTS; empty if the check cannot name the cause
-    disproves: bool = False  # the pose is certainly wrong and must not be used, not only unproved
+    fault: str = ""
+    disproves: bool = False
+    error: Change | None = None
 
     def __post_init__(self) -> None:
         assert not self.fault or self.fault in FAULTS, self.fault

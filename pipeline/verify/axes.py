@@ -146,7 +146,8 @@ def check_pose(
         held_out: by axis, the held-out test of turns; None = there is none.
     """
     of, found = (row.sensor, kind_of_pose(row.kind)), transform_of(row)
-    why = f"the log gives no estimate: {row.reason}" if row.faults or found is None else ""
+    is_wrong = row.faults and row.status != "accepted" and not row.unsure_only
+    why = f"the log gives no estimate: {row.reason}" if is_wrong or found is None else ""
     why = why if in_use is not None else "the calibration in use has no pose of it"
     if in_use is None or found is None or row.covariance is None:
         return [silent(of, axis, limit, why) for axis, limit in limits.items()]

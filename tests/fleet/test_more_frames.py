@@ -16,6 +16,7 @@ from pipeline.config import ChecksConfig
 from pipeline.fleet.more_frames import MOST_TIMES_MORE, _lacks_frames, asks_for_more, spent_before
 from pipeline.fleet.nightly import Night, run_night
 from pipeline.fleet.pattern import VehicleDay
+from pipeline.geometry.targets import DEFAULT_TARGETS
 from pipeline.results import Effort, Outcome
 from pipeline.runner import Stage, why_to_run
 from pipeline.stage_work import Task
@@ -28,7 +29,7 @@ from tests.makers.written_logs import Kit, fleet_config
 
 RESULT = EdgeResult(
     "lidar_radar", np.eye(4), np.eye(6) * 1e-6, np.ones(6, bool), np.eye(4), np.full(6, 0.03), 50,
-    SearchRange(0.1, 0.3),
+    SearchRange(0.1, 0.3), DEFAULT_TARGETS,
 )  # fmt: skip
 VAGUE, SURE = (Claim(sigma, 0.0, 0.0, sigma, 0.003, 0.995) for sigma in (0.01, 1e-4))
 FEW = _too_few("camera_lidar", [1, 2], [["sky"]] * 9, 5)

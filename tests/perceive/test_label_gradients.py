@@ -6,7 +6,7 @@ import pytest
 from pipeline.perceive.label_gradients import BINS, REACH_PX, label_gradients
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
 
-CAR, BUILDING, ROAD = 13, 2, 0
+CAR, BUILDING, ROAD, SKY = 13, 2, 0, 10
 
 
 def a_car(width=120, height=90, noise=0.0):
@@ -29,7 +29,7 @@ def test_each_sides_maximum_lies_where_the_picture_s_border_does(right, down):
 def test_labels_too_wide_move_opposite_sides_apart():
     grey, labels = a_car()
     labels[28:62, 38:82] = CAR
-    peaks = label_gradients(grey, labels).sum(1).argmax(1) - REACH_PX
+    peaks = label_gradients(grey, labels).sum(1).argmax(1) - REACH_PX  # no sky: the last two are empty
     assert peaks[EDGE_LEFT] == peaks[EDGE_ABOVE] == -2  # the foreground lies before the border
     assert peaks[EDGE_RIGHT] == peaks[EDGE_BELOW] == 2
 
@@ -54,3 +54,13 @@ def test_noise_cancels_along_a_border():
     grey = np.random.default_rng(1).integers(90, 110, labels.shape, dtype=np.uint8)
     noisy, _ = a_car(noise=12.0)
     assert label_gradients(noisy, labels).max() > 2.5 * label_gradients(grey, labels).max()
+
+
+def test_what_stands_before_the_sky_is_kept_apart():
+    grey, labels = a_car()
+    labels[labels == CAR] = SKY  # a hole in a building
+    found = label_gradients(grey, labels)
+    assert not found[:4].any()
+    assert (found[4:].sum((1, 2)) > 0).all()
+    # The building lies on the left of the hole's left border.
+    assert found[4 + EDGE_LEFT].sum(1).argmax() < found[4 + EDGE_RIGHT].sum(1).argmax()

@@ -41,14 +41,14 @@ def evidence_of(
     Args:
         prior: that the estimate has in it.
         clock_sigma_s: of the time offset before the day.
-        checks: that the estimate failed in addition to its own.
+        checks: that the estimate failed, and that matter.
     """
     information, gradient = np.zeros((7, 7)), np.zeros(7)
     information[:6, :6], gradient[:6], in_weights = _of_pose(estimate, prior)
     bias = dict(estimate.bias)
     bias[EDGE] = bias.get(EDGE, np.zeros((6, 6))) + in_weights
     information[6, 6], gradient[6] = _clock(estimate, clock_sigma_s)
-    failed = [*checks, *estimate.failed_checks]
+    failed = list(checks)
     if estimate.disproved:
         failed.append(FailedCheck(estimate.disproved, disproves=True))
     return EdgeEvidence(

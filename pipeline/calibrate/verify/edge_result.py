@@ -31,6 +31,7 @@ class EdgeResult:
         prior: T_parent_child before the day.
         prior_sigma: of each number of a move, before the day [rad, m].
         search: what was searched about the prior.
+        targets: in view of both sensors, in the child's frame [m].
     """
 
     kind: str
@@ -41,6 +42,7 @@ class EdgeResult:
     prior_sigma: Float[np.ndarray, " 6"]
     frames_used: int
     search: SearchRange
+    targets: Float[np.ndarray, "N 3"]
 
     @property
     def move(self) -> Float[np.ndarray, " 6"]:

@@ -1,23 +1,21 @@
-"""Offset of a day's labels to its images, and its effect on camera-lidar, without extrinsics.
+"""Offset of a day's labels to its images, without extrinsics.
 
 Fit, halves and held-out frames all match depth edges to the same label borders, so a shift of all labels
 (padding, a resize) rotates the camera unseen. The image gradients (`perceive.label_gradients`) show it.
+Labels that are too wide are not displaced: what moves the left and the right borders of objects apart, or
+their tops and feet, is their width, and that of what stands before the sky is another one. With one width for
+all, labels of a coarse network, objects a pixel too wide, were .5 to 1.5 px down in seven of eight worlds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy.special import ndtr, stdtrit
 
-from pipeline.calibrate.numerics.frame_blocks import scene_blocks
-from pipeline.extrinsics.checks import FailedCheck
-from pipeline.extrinsics.estimates import PairEstimate, Solution
-from schemas.observations import Observation
-
-__all__ = ["LabelOffset", "measure_label_offset", "with_label_offset"]
+__all__ = ["LabelOffset", "measure_label_offset"]
 
 _SMOOTH_PX = 1.5  # borders of sharp labels are two to four pixels wide in the picture
 _FINE = 8  # steps per pixel of the smoothed gradients
@@ -29,15 +27,21 @@ _FLOOR_OF_WIDTH = np.array([[0.04, 0.08], [0.07, 0.22]])
 _FLOOR_PX = np.array([[0.03, 0.05], [0.1, 0.1]])
 _SEEN_PX = 1.0  # slips are whole label pixels: where the day would show one, nothing is left open
 _NOWHERE_PX = 10.0  # maxima further out are of other structures
-_LARGEST_PX = np.array([13.0, 10.0, 3.0])  # shift, shift of the image's ends, width that labels have too much
+_WELL_PX = 0.4  # an offset with a larger sigma is not known well enough to be taken back
+# Shift, shift of the image's ends, width that labels of objects and of what stands before the sky have too much.
+_LARGEST_PX = (13.0, 10.0, 6.0, 3.0)
 _START_STEP_PX, _STEPS = 0.5, 12
 _STEP_PX = 0.5  # size of the quadratic surface, and longest step
+_LEAST_FREEDOM = 5
 _LEAST_CURVATURE = 1e-3  # of the largest: directions that nothing determines
-_DESIGN = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3, indexing="ij"), -1).reshape(-1, 3)
-_UPPER = np.triu_indices(3)
+_DESIGN = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 4, indexing="ij"), -1).reshape(-1, 4)
+_UPPER = np.triu_indices(4)
 _FIT = np.linalg.pinv(
     np.column_stack([np.ones(len(_DESIGN)), _DESIGN, _DESIGN[:, _UPPER[0]] * _DESIGN[:, _UPPER[1]]])
 )
+# Places in the column `label_gradients`, of each axis: sides of objects, and of what stands before the sky. The latter
+# hardly has lower ones: along the skyline a shift looks like width, and only the picture's scale shows.
+_SIDES = (([0, 1], [4, 5]), ([2, 3], [6, 7]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,10 +54,27 @@ class LabelOffset:
     ends_sigma_px: np.ndarray  # 2
 
     @property
+    def is_shifted(self) -> Bool[np.ndarray, " 2"]:
+        """Whether the shift is beyond three sigmas, to the right and down."""
+        return np.asarray(np.abs(self.shift_px) > _SIGMAS * self.shift_sigma_px)
+
+    @property
     def is_beside(self) -> bool:
         """Whether a shift or a slip of scale is beyond three sigmas, or too far for the picture's own borders."""
-        off = np.abs([self.shift_px, self.ends_px]) / [self.shift_sigma_px, self.ends_sigma_px]
-        return bool((off > _SIGMAS).any() or (np.abs(self.shift_px) > _NOWHERE_PX).any())
+        is_scaled = np.abs(self.ends_px) > _SIGMAS * self.ends_sigma_px
+        return bool((self.is_shifted | is_scaled | (np.abs(self.shift_px) > _NOWHERE_PX)).any())
+
+    def correction_px(self, most_px: Float[np.ndarray, " 2"]) -> Float[np.ndarray, " 2"] | None:
+        """What moves the labels under the picture; None where they are beside it and cannot be moved back.
+
+        A slip of scale cannot, nor a shift that is large or badly known.
+        """
+        is_small = np.abs(self.shift_px) <= most_px
+        is_known = self.shift_sigma_px <= _WELL_PX
+        is_scaled = np.abs(self.ends_px) > _SIGMAS * self.ends_sigma_px
+        if is_scaled.any() or (self.is_shifted & ~(is_small & is_known)).any():
+            return None
+        return np.where(self.is_shifted, self.shift_px, 0.0)
 
     @property
     def open_px(self) -> Float[np.ndarray, " 2"]:
@@ -61,89 +82,62 @@ class LabelOffset:
         return np.sqrt(np.maximum(self.shift_sigma_px**2 - (_SEEN_PX / _SIGMAS) ** 2, 0.0))
 
     @property
-    def sentence(self) -> str:
+    def in_words(self) -> str:
         """The offset in words."""
         (u, v), (su, sv), (a, b), (sa, sb) = (
             self.shift_px, self.shift_sigma_px, self.ends_px, self.ends_sigma_px
         )  # fmt: skip
         return (
-            f"labels are offset from their image: it is {u:+.1f} +- {su:.1f} label px right and {v:+.1f} +- {sv:.1f} "
-            f"down of them in the middle, {a:+.1f} +- {sa:.1f} and {b:+.1f} +- {sb:.1f} more at the right and lower "
-            "end (padding, resize or another image in the segmenter?)"
+            f"it is {u:+.1f} +- {su:.1f} label px right and {v:+.1f} +- {sv:.1f} down of them in the middle, "
+            f"{a:+.1f} +- {sa:.1f} and {b:+.1f} +- {sb:.1f} more at the right and lower end"
         )
 
 
-def with_label_offset(solution: Solution, observations: Sequence[Observation]) -> Solution:
-    """The solution with the labels' offset in camera-lidar: its numbers, a failed check, or a wider covariance.
-
-    Unchanged where no frame has gradients.
-    """
-    frames = [o for o in observations if o.label_gradients is not None]
-    if not frames:
-        return solution
-    gradients = np.stack([o.label_gradients for o in frames if o.label_gradients is not None])
-    offset = measure_label_offset(gradients, scene_blocks(frames))
-    focal_px = np.array([frames[0].camera_K[0, 0], frames[0].camera_K[1, 1]]) * frames[0].label_scale
-    return _applied(solution, offset, focal_px)
-
-
-def _applied(solution: Solution, offset: LabelOffset, focal_px: Float[np.ndarray, " 2"]) -> Solution:
-    failed = dict(solution.failed_checks)
-    if offset.is_beside:
-        found = FailedCheck(offset.sentence, "labels_offset")
-        failed["camera_lidar"] = [*failed.get("camera_lidar", []), found]
-    pairs = solution.pairs | {"camera_lidar": _widened(solution.pairs["camera_lidar"], offset, focal_px)}
-    return replace(solution, pairs=pairs, failed_checks=failed)
-
-
-def _widened(estimate: PairEstimate, offset: LabelOffset, focal_px: Float[np.ndarray, " 2"]) -> PairEstimate:
-    """Labels that are too far right rotate the camera about its y axis, labels too far down about its x axis."""
-    yaw, pitch = offset.open_px / focal_px
-    numbers = {
-        f"label_{name}_{axis}{sigma}_px": float(value)
-        for name, sigma, values in (
-            ("shift", "", offset.shift_px),
-            ("shift", "_sigma", offset.shift_sigma_px),
-            ("ends", "", offset.ends_px),
-            ("ends", "_sigma", offset.ends_sigma_px),
-        )
-        for axis, value in zip("uv", values, strict=True)
-    }
-    more = np.diag([pitch**2, yaw**2, 0, 0, 0, 0])
-    return replace(
-        estimate, covariance=estimate.covariance + more, diagnostics=estimate.diagnostics | numbers
-    )
-
-
-def measure_label_offset(gradients: Float[np.ndarray, "F 4 B D"], block: np.ndarray) -> LabelOffset:
+def measure_label_offset(gradients: Float[np.ndarray, "F 8 B D"], block: np.ndarray) -> LabelOffset:
     """The offset, from column `label_gradients` of frames and the blocks of frames that share scenes."""
     names = np.unique(block)
     of_block = np.stack([gradients[block == name].sum(0, dtype=np.float64) for name in names])
     (u, u_sigma), (v, v_sigma) = (
-        _measure_axis(of_block[:, s], a) for a, s in enumerate((slice(0, 2), slice(2, 4)))
+        _measure_axis([of_block[:, sides] for sides in kinds], axis) for axis, kinds in enumerate(_SIDES)
     )
     both, sigmas = np.stack([u, v], 1), np.stack([u_sigma, v_sigma], 1)
     return LabelOffset(both[0], sigmas[0], both[1], sigmas[1])
 
 
 def _measure_axis(
-    gradients: Float[np.ndarray, "N 2 B D"], axis: int
+    gradients: list[np.ndarray], axis: int
 ) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]]:
     """Shift and shift of the ends along one axis, with sigmas: scatter over blocks, and the floor of structure."""
-    smooth = gradients @ _smoothing(gradients.shape[-1])
-    day = smooth.sum(0, keepdims=True)
-    grids = [np.arange(-reach, reach + 0.1, _START_STEP_PX) for reach in _LARGEST_PX]
-    starts = np.stack(np.meshgrid(*grids, indexing="ij"), -1).reshape(-1, 3)
-    at = starts[np.argmax(_heights(day, starts)[0])]
+    smooth = [of_kind @ _smoothing(of_kind.shape[-1]) for of_kind in gradients]
+    day = [of_kind.sum(0, keepdims=True) for of_kind in smooth]
+    at = _highest(day)
     for _ in range(_STEPS):
         gradient, curvature = _quadratics(_heights(day, at + _STEP_PX * _DESIGN))
         step = np.clip(np.linalg.solve(_bounded(curvature[0]), gradient[0]), -1, 1)
         at = at + _STEP_PX * step
     slopes, curvature = _quadratics(_heights(smooth, at + _STEP_PX * _DESIGN))
     moves = _STEP_PX * np.linalg.solve(_bounded(curvature.sum(0)), slopes.T)
-    scatter = np.sqrt((moves**2).sum(1) * len(moves.T) / max(len(moves.T) - 1, 1))
+    scatter = np.sqrt((moves**2).sum(1)) * _of_few(len(moves.T))
     floor = np.hypot(_FLOOR_PX[axis], _FLOOR_OF_WIDTH[axis] * _half_width_px(day, at))
     return at[:2], np.hypot(scatter[:2], floor)
+
+
+def _highest(day: list[np.ndarray]) -> Float[np.ndarray, " 4"]:
+    """The best shifts on a grid, each kind of border at its own best width."""
+    shift, ends, *widths = (np.arange(-most, most + 0.1, _START_STEP_PX) for most in _LARGEST_PX)
+    best = []
+    for of_kind, width in zip(day, widths, strict=True):
+        grid = np.stack(np.meshgrid(shift, ends, width, indexing="ij"), -1)
+        best.append(_heights_of(of_kind, grid.reshape(-1, 3))[0].reshape(grid.shape[:3]))
+    i, j = np.unravel_index(np.argmax(best[0].max(2) + best[1].max(2)), (len(shift), len(ends)))
+    return np.array([shift[i], ends[j], *(w[np.argmax(b[i, j])] for w, b in zip(widths, best, strict=True))])
+
+
+def _of_few(blocks: int) -> float:
+    """Factor of a scatter over so few blocks with which three sigmas are as rare as of many."""
+    # Fewer than six leave a shift open that the floor of structure bounds as well.
+    chance = stdtrit(max(blocks - 1, _LEAST_FREEDOM), ndtr(_SIGMAS)) / _SIGMAS
+    return float(np.sqrt(blocks / max(blocks - 1, 1)) * chance)
 
 
 def _smoothing(size: int) -> Float[np.ndarray, "D E"]:
@@ -153,8 +147,15 @@ def _smoothing(size: int) -> Float[np.ndarray, "D E"]:
     return weight / weight.sum(0)
 
 
-def _heights(smooth: Float[np.ndarray, "N 2 B E"], at: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "N P"]:
-    """Gradients at the picture's borders for shifts, shifts of the ends and widths that labels have too much."""
+def _heights(smooth: list[np.ndarray], at: Float[np.ndarray, "P 4"]) -> Float[np.ndarray, "N P"]:
+    """Gradients at the picture's borders for shifts, shifts of the ends, and widths of both kinds of border."""
+    return _heights_of(smooth[0], at[:, [0, 1, 2]]) + _heights_of(smooth[1], at[:, [0, 1, 3]])
+
+
+def _heights_of(
+    smooth: Float[np.ndarray, "N 2 B E"], at: Float[np.ndarray, "P 3"]
+) -> Float[np.ndarray, "N P"]:
+    """`_heights` of one kind of border."""
     _, _, bins, fine = smooth.shape
     place = (np.arange(bins) + 0.5) * 2 / bins - 1
     middle = at[:, :1] + at[:, 1:2] * place
@@ -170,25 +171,25 @@ def _heights(smooth: Float[np.ndarray, "N 2 B E"], at: Float[np.ndarray, "P 3"])
 
 
 def _quadratics(
-    heights: Float[np.ndarray, "N 27"],
-) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3 3"]]:
+    heights: Float[np.ndarray, "N 81"],
+) -> tuple[Float[np.ndarray, "N 4"], Float[np.ndarray, "N 4 4"]]:
     """Gradient and negative curvature of the quadratics through heights on the design."""
     c = heights @ _FIT.T
-    upper = np.zeros((len(c), 3, 3))
-    upper[:, _UPPER[0], _UPPER[1]] = -c[:, 4:]
-    return c[:, 1:4], upper + upper.transpose(0, 2, 1)
+    upper = np.zeros((len(c), 4, 4))
+    upper[:, _UPPER[0], _UPPER[1]] = -c[:, 5:]
+    return c[:, 1:5], upper + upper.transpose(0, 2, 1)
 
 
-def _bounded(curvature: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+def _bounded(curvature: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     """The curvature with each eigenvalue at least a small share of the largest."""
     value, vector = np.linalg.eigh(curvature)
     least = _LEAST_CURVATURE * np.abs(value).max() + np.finfo(np.float64).tiny
     return (vector * np.maximum(value, least)) @ vector.T
 
 
-def _half_width_px(day: Float[np.ndarray, "1 2 B E"], at: Float[np.ndarray, " 3"]) -> float:
+def _half_width_px(day: list[np.ndarray], at: Float[np.ndarray, " 4"]) -> float:
     """Width of the maximum at half its height over the surroundings; the whole range if there is none."""
     along = np.arange(-8, 8.01, 1 / _FINE)
-    height = _heights(day, at + np.outer(along, [1, 0, 0]))[0]
+    height = _heights(day, at + np.outer(along, [1, 0, 0, 0]))[0]
     half = (height.max() + np.quantile(height, 0.15)) / 2
     return float(np.mean(height > half) * (along[-1] - along[0]) / 2)

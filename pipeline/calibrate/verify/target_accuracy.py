@@ -15,7 +15,7 @@ their bound certified exceeded it, at 99.5 %.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -30,6 +30,7 @@ from pipeline.geometry.targets import DEFAULT_TARGETS
 __all__ = ["DIRECTIONS", "Claim", "claims_of", "target_jacobian", "target_sigmas"]
 
 DIRECTIONS = ("azimuth", "elevation")
+_CHECK_SIGMAS = 3.0
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,20 @@ class Claim:
     def is_exceeded(self) -> bool:
         """They contradict it, and would move it by more than its sigma."""
         return self.is_contradicted and self.shift_rad > self.sigma_rad
+
+    def is_exceeded_by(self, error_rad: float) -> bool:
+        """Whether an error that a check shows is more than the sigma, and not within the limit with it.
+
+        Checks fail from three sigmas on: so well, at least, the error is known.
+        """
+        sigma_rad = float(np.hypot(self.sigma_rad, error_rad / _CHECK_SIGMAS))
+        beyond = _quantile(error_rad, sigma_rad, self.confidence) > self.limit_rad
+        return error_rad > self.sigma_rad and beyond
+
+    @property
+    def without_sigma(self) -> Claim:
+        """The limit alone."""
+        return replace(self, sigma_rad=0.0)
 
 
 def _quantile(shift: float, sigma: float, probability: float) -> float:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pipeline.calibrate.select.frames import SHORTEST
+from pipeline.calibrate.verify.consequence import RANGE, exceeded_by, largest_rad
 from pipeline.calibrate.verify.edge_result import EdgeResult
 from pipeline.calibrate.verify.held_out_test import HeldOutTest
 from pipeline.calibrate.verify.target_accuracy import Claim
@@ -21,7 +22,7 @@ from pipeline.config import ChecksConfig
 from pipeline.extrinsics.checks import FailedCheck, faults_of
 from schemas.calibrations import DOF_NAMES
 
-__all__ = ["Evidence", "Verdict", "judge"]
+__all__ = ["Evidence", "Verdict", "judge", "matters"]
 
 # What an edge is good for: without it there is nothing to accept. A radar without elevation is still worth its
 # azimuth. Of other kinds either direction is.
@@ -76,7 +77,8 @@ class Verdict:
     mounting: tuple[
         str, ...
     ] = ()  # of the certified directions, those in which the mounting is within the limit too
-    faults: tuple[str, ...] = ()  # keys of schemas.faults.FAULTS that the failed checks name
+    # Keys of schemas.faults.FAULTS that failed checks name; of an accepted record those that do not matter.
+    faults: tuple[str, ...] = ()
 
     @property
     def against(self) -> tuple[FailedCheck, ...]:
@@ -134,6 +136,7 @@ def judge(
     checks += [
         _Check(_FAILED, check.sentence, check.disproves, of_number=check.fault == "few_scenes")
         for check in evidence.failed_checks
+        if matters(check, result, evidence.claims)
     ]
     if together:
         checks += _aligns_no_worse(result, evidence.held_out, limits)
@@ -162,14 +165,40 @@ def _held(failed: Sequence[_Check], score: float, faults: Mapping[str, None]) ->
     )
 
 
+def matters(check: FailedCheck, result: EdgeResult, claims: Mapping[str, Claim]) -> bool:
+    """Whether the pose would be no good for what the edge is needed for if the check is right."""
+    exceeded, needed = set(_exceeded(check, result, claims)), _NEEDED.get(result.kind)
+    if needed is None:
+        return RANGE in exceeded or exceeded >= claims.keys()
+    return not exceeded.isdisjoint({*needed, RANGE})
+
+
 def _accepted(result: EdgeResult, evidence: Evidence, score: float) -> Verdict:
-    """The verdict without failed checks, with what it certifies and what nothing checks."""
-    certified = tuple(name for name, claim in evidence.claims.items() if claim.margin >= 0)
+    """The verdict without a failed check that matters, with what it certifies and what nothing checks."""
+    claims, checks = evidence.claims, evidence.failed_checks
+    doubted = {name for check in checks for name in _exceeded(check, result, claims)}
+    certified = tuple(name for name, claim in claims.items() if claim.margin >= 0 and name not in doubted)
     unchecked = _unchecked(result, certified)
-    reason = "; ".join([*_reservations(result, evidence.claims), *_differences(result.kind, unchecked)])
+    said = [_harmless(check, result, claims) for check in checks]
+    reason = "; ".join([*said, *_reservations(result, claims), *_differences(result.kind, unchecked)])
     far = {DOF_NAMES[k]: sigmas for k, sigmas in unchecked.items()}
-    mounting = tuple(name for name in certified if evidence.claims[name].certifies_mounting)
-    return Verdict("accepted", reason, score, certified, unchecked=far, mounting=mounting)
+    mounting = tuple(name for name in certified if claims[name].certifies_mounting)
+    faults = tuple(faults_of(checks))
+    return Verdict("accepted", reason, score, certified, unchecked=far, mounting=mounting, faults=faults)
+
+
+def _exceeded(check: FailedCheck, result: EdgeResult, claims: Mapping[str, Claim]) -> list[str]:
+    """Directions whose limit the pose exceeds if the check is right."""
+    return [*claims, RANGE] if check.error is None else exceeded_by(result, claims, check.error)
+
+
+def _harmless(check: FailedCheck, result: EdgeResult, claims: Mapping[str, Claim]) -> str:
+    """Sentence about a check that does not hold the record."""
+    if exceeded := _exceeded(check, result, claims):
+        return f"{check.sentence}: {' and '.join(exceeded)} not certified"
+    if check.error is None or not any(check.error):
+        return check.sentence
+    return f"{check.sentence}: {_deg(largest_rad(result, check.error))} at the targets, within the limit"
 
 
 def _moves_little(result: EdgeResult, limits: ChecksConfig) -> list[_Check]:

@@ -78,11 +78,19 @@ class Terms:
     yaw_rate: np.ndarray  # F [rad/s]
     gap_s: np.ndarray  # F, image stamp minus lidar stamp
     readout_s: float = 0.0  # of a rolling shutter, from the first row to the last
+    label_offset_px: tuple[float, float] = (0.0, 0.0)  # from the labels to the picture, which has the paint
 
     @property
     def frames(self) -> int:
         """Number of frames."""
         return len(self.velocity_lidar)
+
+    @cached_property
+    def _label_camera(self) -> np.ndarray:
+        """The camera that projects into the labels."""
+        camera = self.camera.copy()
+        camera[3:5] -= np.array(self.label_offset_px, np.float32)
+        return camera
 
     @cached_property
     def _is_wide(self) -> np.ndarray:
@@ -141,7 +149,7 @@ class Terms:
         still = np.zeros((len(self.edges.xyz_m), 2), np.float32)
         is_seen = np.ones(len(still), bool)
         for poses, focal in zip(self.poses(at), at.focal.astype(np.float32), strict=True):
-            residual = edge_residuals(self.camera, self.maps.offsets, self.edges, poses, focal, still)
+            residual = edge_residuals(self._label_camera, self.maps.offsets, self.edges, poses, focal, still)
             is_seen &= ~np.isnan(residual)
         return replace(self, edges=self.edges.chosen(is_seen))
 
@@ -201,7 +209,7 @@ class Terms:
         focal, poses = at.focal.astype(np.float32), self.poses(at)
         score = np.zeros((len(at.dt_s), self.frames), np.float32)
         for edges, weight in self._weighted_edges(settings):
-            found = edge_scores(self.camera, self.maps.offsets, edges, poses, focal, settings)
+            found = edge_scores(self._label_camera, self.maps.offsets, edges, poses, focal, settings)
             score += np.float32(weight) * found
         return score
 
@@ -265,7 +273,7 @@ class Terms:
         """Mutual information of lidar class and label, nats per point; for the basin only."""
         c = self.classes
         return class_information(
-            self.camera, self.maps.labels, c.xyz_m, c.kind, c.start, c.image, self.poses(at), CLASSES
+            self._label_camera, self.maps.labels, c.xyz_m, c.kind, c.start, c.image, self.poses(at), CLASSES
         )
 
     def score(self, at: Alignments, settings: KernelSettings) -> Float[np.ndarray, "P F"]:
@@ -297,7 +305,9 @@ class Terms:
         gradient, information = np.zeros((self.frames, 11)), np.zeros((self.frames, 11, 11))
         if settings.edge_weight > 0:
             for edges, weight in self._weighted_edges(settings):
-                g, H = edge_gradients(self.camera, self.maps.offsets, edges, poses, focal, motion, settings)
+                g, H = edge_gradients(
+                    self._label_camera, self.maps.offsets, edges, poses, focal, motion, settings
+                )
                 gradient += settings.edge_weight * weight * g
                 information += settings.edge_weight * weight * H
         if settings.marking_weight > 0:
@@ -321,8 +331,8 @@ class Terms:
         e, m, offsets = self.edges, self.markings, self.maps.offsets
         still = np.zeros((len(e.xyz_m), 2), np.float32)
         elsewhere = rng.uniform(-_CHANCE_SHIFT_PX, _CHANCE_SHIFT_PX, still.shape).astype(np.float32)
-        at_chance = edge_residuals(self.camera, offsets, e, poses, focal, elsewhere)
-        here = edge_residuals(self.camera, offsets, e, poses, focal, still)
+        at_chance = edge_residuals(self._label_camera, offsets, e, poses, focal, elsewhere)
+        here = edge_residuals(self._label_camera, offsets, e, poses, focal, still)
         chance = chance_of(at_chance, e.kind, EDGE_KINDS)
         sigma = np.hypot(settings.sigma_px, e.gap_rad * self.camera[1] / np.sqrt(12))
         match = fit_match_share(here, e.kind, sigma, chance)
@@ -356,4 +366,5 @@ def prepare_terms(
     yaw_rate = np.array([o.ego_yaw_rate_radps or 0.0 for o in observations])
     gap_s = camera_gaps_s(observations)
     camera = camera_parameters(maps.camera)
-    return Terms(maps, camera, edges, markings, classes, velocity_lidar, yaw_rate, gap_s, readout_s)
+    at_px = observations[0].label_offset_px
+    return Terms(maps, camera, edges, markings, classes, velocity_lidar, yaw_rate, gap_s, readout_s, at_px)

@@ -88,7 +88,8 @@ def camera_radar_loss(
         frame_of.append(np.full(len(near), index))
         boxes = observation.road_user_boxes_px.astype(np.float64).reshape(-1, 4)
         # Pixel centres are integers: a full-image pixel u lies at (u + 1/2) s - 1/2 in the label image.
-        centres.append(((boxes[:, :2] + boxes[:, 2:]) / 2 + 0.5) * observation.label_scale - 0.5)
+        middle = ((boxes[:, :2] + boxes[:, 2:]) / 2 + 0.5) * observation.label_scale - 0.5
+        centres.append(middle - observation.label_offset_px)
         cloud = in_range(observation.radar_xyz_m)
         clouds.append(thin(cloud[safely_in_view(camera, in_camera(T_prior, cloud), margin_rad)], _DETECTIONS))
         costs.append(np.where(labels == SKY, PENALTY, 0.0))

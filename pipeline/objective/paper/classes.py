@@ -40,9 +40,11 @@ def labels_of(observation: Observation) -> UInt8[np.ndarray, "H W"]:
 
 
 def camera_at_label_size(observation: Observation, labels: UInt8[np.ndarray, "H W"]) -> Camera:
-    """The frame's camera scaled to its label image, whose size wins over rounding."""
+    """The camera that projects into the frame's label image, whose size wins over rounding."""
     scaled = camera_of(observation).scaled(observation.label_scale)
-    return Camera(scaled.model, scaled.K, scaled.D, labels.shape[1], labels.shape[0])
+    K = scaled.K.copy()
+    K[:2, 2] -= observation.label_offset_px
+    return Camera(scaled.model, K, scaled.D, labels.shape[1], labels.shape[0])
 
 
 def distance_cost(distance: Float[np.ndarray, "*shape"], scale: float) -> Float[np.ndarray, "*shape"]:

@@ -15,6 +15,7 @@ from pipeline.config import ChecksConfig
 from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
 from pipeline.geometry.se3 import exp_se3, exp_so3, from_rotation_translation
+from pipeline.geometry.targets import DEFAULT_TARGETS
 from tests.makers.solve_scenes import make_day
 
 PRIOR = Prior(np.eye(4), np.eye(4), np.radians(2), 0.05)
@@ -41,9 +42,67 @@ def verdict(result, test, failed=(), claims=SURE, limits=None, **changes):
     pair = result.pair
     of_edge = EdgeResult(
         pair, result.T, result.covariance, result.observable, PRIOR.of(pair), np.sqrt(np.diag(PRIOR.covariance(pair))),
-        result.frames_used, SEARCH,
+        result.frames_used, SEARCH, DEFAULT_TARGETS,
     )  # fmt: skip
     return judge(of_edge, Evidence(test, claims, checks), limits or ChecksConfig(), **changes)
+
+
+def checked(error, fault="witnesses_disagree"):
+    return FailedCheck("two halves disagree", fault, error=error)
+
+
+DEG = np.radians(1.0)
+
+
+@pytest.mark.parametrize(
+    ("pair", "error", "status", "determined"),
+    [
+        ("camera_lidar", (0, 0.05 * DEG, 0, 0, 0, 0), "accepted", ("azimuth", "elevation")),
+        ("camera_lidar", (0, 0.15 * DEG, 0, 0, 0, 0), "held", ()),
+        ("camera_lidar", (0, 0, 0, 0, 0.1, 0), "held", ()),  # up to .4 deg of near targets
+        ("lidar_radar", (0, 0, 0.15 * DEG, 0, 0, 0), "accepted", ("azimuth", "elevation")),
+        ("lidar_radar", (0, 0, 0.5 * DEG, 0, 0, 0), "held", ()),
+        ("lidar_radar", (0, 3 * DEG, 0, 0, 0, 0), "accepted", ("azimuth",)),  # pitch: no matter for its azimuth
+        ("lidar_radar", (0, 0, 0, 0.4, 0, 0), "held", ()),  # along the line of sight
+        ("lidar_lidar", (0, 3 * DEG, 0, 0, 0, 0), "accepted", ("azimuth",)),
+        ("lidar_lidar", (0, 3 * DEG, 3 * DEG, 0, 0, 0), "held", ()),
+    ],
+)  # fmt: skip
+def test_a_check_holds_where_the_pose_would_be_beyond_its_limits_if_it_is_right(
+    pair, error, status, determined
+):
+    limits = {"camera_lidar": 0.2}.get(pair, 0.4)
+    sure = {name: Claim(1e-4, 0.0, 1e-4, 1e-4, np.radians(limits), 0.995) for name in DIRECTIONS}
+    prior = PairEstimate(pair, np.eye(4), np.diag(SIGMA**2), np.ones(6), np.ones(6, bool), 50)
+    of_edge = EdgeResult(
+        pair,
+        prior.T,
+        prior.covariance,
+        prior.observable,
+        np.eye(4),
+        np.full(6, 0.1),
+        50,
+        SEARCH,
+        DEFAULT_TARGETS,
+    )
+    found = judge(of_edge, Evidence(BETTER, sure, [checked(error)]), ChecksConfig())
+    assert (found.status, found.determined) == (status, determined)
+    assert found.faults == ("witnesses_disagree",)
+    assert "two halves disagree" in found.reason
+    assert not found.unsure_only
+
+
+def test_a_check_whose_consequence_nobody_knows_always_holds():
+    assert verdict(estimate(0.2), SAME, [checked(None)]).status == "held"
+    assert verdict(estimate(0.2), SAME, [checked((0, 1e-5, 0, 0, 0, 0))]).status == "accepted"
+
+
+def test_a_record_held_for_its_sigma_is_held_for_nothing_more_by_a_check_within_that_sigma():
+    unsure = {name: claim(0.15) for name in DIRECTIONS}
+    within = verdict(estimate(0.2), SAME, [checked((0, 0.1 * DEG, 0, 0, 0, 0))], unsure)
+    assert (within.status, within.unsure_only) == ("held", True)
+    beyond = verdict(estimate(0.2), SAME, [checked((0, 0.2 * DEG, 0, 0, 0, 0))], unsure)
+    assert (beyond.status, beyond.unsure_only) == ("held", False)
 
 
 def test_a_better_alignment_is_accepted_without_remark():

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from pipeline.calibrate.joint.camera_lidar.beyond_chance import TERMS as BASIN_TERMS
 from pipeline.calibrate.joint.camera_lidar.heading_bias import MotionSigmas, sweep_s_per_rad
@@ -227,6 +227,7 @@ def analyse_camera_lidar(
         "along_paint_deg": float(np.degrees(np.linalg.norm(analysis.along_paint[:3]))),
     }
     diagnostics |= {"own_dt_s": aligned.expected_dt_s + own_dt_s, "own_dt_z": z}
+    diagnostics |= _moved_by_labels(scored, analysis.state, fixed)
     if analysis.observability[5] < OBSERVABLE and own_tz is not None:
         diagnostics |= {"own_tz_m": own_tz[0], "own_tz_sigma_m": own_tz[1]}
     own = np.sqrt(np.diag(analysis.covariance)[:2]).tolist()
@@ -288,6 +289,18 @@ def _at_prior_tz(state: AlignmentState, prior: Prior, terms: Terms) -> Alignment
     """Reset tz to the prior; adjust dt so that static points keep their pixels."""
     shift_m = float(state.T_camera_lidar[2, 3] - prior.T_camera_lidar[2, 3])
     return replace(state, dt_s=state.dt_s + s_per_metre(terms, state) * shift_m).with_fixed(prior, IS_TZ)
+
+
+def _moved_by_labels(
+    scored: Scored, state: AlignmentState, fixed: Bool[np.ndarray, " 8"]
+) -> dict[str, float]:
+    """Rotation from the solution with labels beside their picture to that with labels moved back [deg]."""
+    if not any(scored.terms.label_offset_px):
+        return {}
+    beside = replace(scored, terms=replace(scored.terms, label_offset_px=(0.0, 0.0)))
+    turned = difference(state, refine(beside, state, steps=SCHEDULE.half_steps, fixed=fixed))[:3]
+    names = ("pitch", "yaw", "roll")
+    return {f"labels_moved_{n}_deg": float(np.degrees(v)) for n, v in zip(names, turned, strict=True)}
 
 
 def _diagnostics(

@@ -1,0 +1,41 @@
+"""Consequence of a failed check: what it would mean at the targets, against the limits, if it is right."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from pipeline.calibrate.verify.edge_result import EdgeResult
+from pipeline.calibrate.verify.target_accuracy import DIRECTIONS, Claim
+from pipeline.extrinsics.checks import Change
+from pipeline.geometry.se3 import exp_so3, from_rotation_translation
+from pipeline.geometry.targets import errors_at_targets
+
+__all__ = ["RANGE", "exceeded_by", "largest_rad"]
+
+RANGE = "range"
+
+
+def exceeded_by(result: EdgeResult, claims: Mapping[str, Claim], error: Change) -> list[str]:
+    """Directions whose limit the pose would exceed with such an error: azimuth, elevation, range.
+
+    A shift along the line of sight moves no direction; it counts as if it were across it, against the limit
+    of azimuth.
+    """
+    found = dict(zip((*DIRECTIONS, RANGE), _at_targets(result, error), strict=True))
+    limits = {**claims, RANGE: claims[DIRECTIONS[0]].without_sigma}
+    return [name for name, off_rad in found.items() if limits[name].is_exceeded_by(off_rad)]
+
+
+def largest_rad(result: EdgeResult, error: Change) -> float:
+    """Largest of the three."""
+    return float(max(_at_targets(result, error)))
+
+
+def _at_targets(result: EdgeResult, error: Change) -> tuple[float, float, float]:
+    turned = exp_so3(np.array(error[:3])) @ result.T[:3, :3]
+    wrong = from_rotation_translation(turned, result.T[:3, 3] + np.array(error[3:]))
+    azimuth, elevation, range_m = errors_at_targets(result.kind, wrong, result.T, result.targets)
+    per_metre = float(np.mean(1 / np.linalg.norm(result.targets, axis=1)))
+    return float(azimuth), float(elevation), float(range_m) * per_metre
