@@ -1,9 +1,9 @@
-"""The result tables of both READMEs, made of results/rows.toml and of the files that it names.
+"""The result table of the README, made of results/rows.toml and of the files that it names.
 
-    python -m tests.benchmarks.results_table          writes them (make results)
-    python -m tests.benchmarks.results_table --check  says whether they are what the results give
+    python -m tests.benchmarks.results_table          writes it (make results)
+    python -m tests.benchmarks.results_table --check  exit code 1 where it is not what the results give
 
-A row names a question, its goal, its files and how the number is computed (`results_measures.py`). What else a reader
+A row names a question, its goal, its file and how the number is computed (`results_measures.py`). What else a reader
 must know to believe the number is computed: the release of the code (results/releases.toml, kept because commits are
 rebased), whether its seeds were looked at before (results/seeds.toml), on how many distinct days it rests, and for a
 rate its 95 % interval.
@@ -25,7 +25,7 @@ from tests.benchmarks.results_measures import MEASURES
 from tests.benchmarks.studies.looks import freshness, read_looks
 
 __all__ = [
-    "TARGETS",
+    "README",
     "WIDEST",
     "learn_releases",
     "lines_of",
@@ -41,8 +41,8 @@ REPO = Path(__file__).resolve().parents[2]
 ROWS = RESULTS / "rows.toml"
 RELEASES = RESULTS / "releases.toml"
 BEGIN, END = "<!-- results: written by make results -->", "<!-- end of results -->"
-TARGETS = {REPO / "README.md": True, RESULTS / "README.md": False}  # the first has rows of `top` alone
-WIDEST = 110  # characters of a line of the first
+README = REPO / "README.md"
+WIDEST = 110  # characters of a line
 
 
 def rows(path: Path = ROWS) -> list[dict[str, Any]]:
@@ -51,37 +51,28 @@ def rows(path: Path = ROWS) -> list[dict[str, Any]]:
 
 
 def lines_of(row: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Lines of the row's files that its `where` chooses; a JSON file is one line."""
-    found: list[dict[str, Any]] = []
-    for name in _files(row):
-        path = RESULTS / name
-        text = path.read_text()
-        found += [json.loads(text)] if path.suffix == ".json" else [json.loads(x) for x in text.splitlines()]
+    """Lines of the row's file that its `where` chooses."""
+    if "file" not in row:
+        return []
+    found = [json.loads(line) for line in (RESULTS / row["file"]).read_text().splitlines()]
     chosen = [r for r in found if all(_at(r, key) in _listed(v) for key, v in row.get("where", {}).items())]
     if not chosen:
         raise SystemExit(f"rows.toml: no line of {row['file']} is chosen for {row['question']!r}")
     return chosen
 
 
-def render(top_only: bool) -> str:
+def render() -> str:
     """The table as Markdown."""
     heads = ["question", "goal", "measured (95 % interval)", "days, look", "release"]
-    heads += [] if top_only else ["file"]
-    chosen = [row for row in rows() if row.get("top") or not top_only]
-    body = [_cells(row, top_only) for row in chosen]
+    body = [_cells(row) for row in rows()]
     return "\n".join("| " + " | ".join(cells) + " |" for cells in [heads, ["---"] * len(heads), *body])
 
 
-def _cells(row: Mapping[str, Any], top_only: bool) -> list[str]:
+def _cells(row: Mapping[str, Any]) -> list[str]:
     lines = lines_of(row)
-    text = MEASURES[row["measure"]](lines, row)
-    cells = [row["question"], row.get("goal", ""), text, f"{_days(lines, row)}, {_look(lines, row)}"]
-    cells.append(_release(lines, row))
-    return cells if top_only else [*cells, ", ".join(f"[{name}]({name})" for name in _files(row))]
-
-
-def _files(row: Mapping[str, Any]) -> list[str]:
-    return list(_listed(row["file"]))
+    text = row["measured"] if "measured" in row else MEASURES[row["measure"]](lines, row)
+    days = f"{_days(lines, row)}, {_look(lines, row)}"
+    return [row["question"], row.get("goal", ""), text, days, _release(lines, row)]
 
 
 def _listed(value: Any) -> list[Any]:
@@ -167,18 +158,17 @@ def _order(release: str) -> tuple[int, ...]:
     return tuple(int(part) for part in release.split("."))
 
 
-def written(path: Path, top_only: bool) -> str:
-    """The file with its table made anew."""
-    text = path.read_text()
-    before, found, rest = text.partition(BEGIN)
+def written() -> str:
+    """The README with its table made anew."""
+    before, found, rest = README.read_text().partition(BEGIN)
     after = rest.partition(END)[2]
     if not found:
-        raise SystemExit(f"{path} has no line {BEGIN}")
-    return f"{before}{BEGIN}\n{render(top_only)}\n{END}{after}"
+        raise SystemExit(f"{README} has no line {BEGIN}")
+    return f"{before}{BEGIN}\n{render()}\n{END}{after}"
 
 
 def main() -> None:
-    """Write both tables, or say which is not what the results give."""
+    """Write the table, or compare it."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -186,12 +176,12 @@ def main() -> None:
     args = parser.parse_args()
     if not args.check:
         learn_releases()
-    stale = [path for path, top_only in TARGETS.items() if written(path, top_only) != path.read_text()]
+    is_stale = written() != README.read_text()
     if args.check:
-        sys.exit(f"not what the results give: {', '.join(map(str, stale))}; make results" if stale else 0)
-    for path in stale:
-        path.write_text(written(path, TARGETS[path]))
-        print(f"wrote {path}")
+        sys.exit(f"{README} is not what the results give: make results" if is_stale else 0)
+    if is_stale:
+        README.write_text(written())
+        print(f"wrote {README}")
 
 
 if __name__ == "__main__":

@@ -13,7 +13,16 @@ from pipeline.ingest.containers.reader import open_log
 
 _STORE = get_typestore(Stores.ROS2_HUMBLE)
 _STORE.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
-_CODES = {1: "i1", 2: "u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 8: "<f8"}  # sensor_msgs/PointField
+_CODES = {
+    1: "i1",
+    2: "u1",
+    3: "<i2",
+    4: "<u2",
+    5: "<i4",
+    6: "<u4",
+    7: "<f4",
+    8: "<f8",
+}  # sensor_msgs/PointField
 
 
 def rewrite_logs(logs, out, topics, edit):
@@ -57,7 +66,7 @@ def _copy(log, path, edit, count, number):
     reader.close()
 
 
-def silent(message, share):
+def silent(_message, _share):
     return None
 
 
@@ -65,7 +74,7 @@ def stuck():
     """The first payload under each message's own stamp."""
     held = []
 
-    def edit(message, share):
+    def edit(message, _share):
         held.append(message.data)
         message.data = held[0]
         return message
@@ -108,13 +117,13 @@ def turned(deg, axis=2):
     return exp_so3(np.radians(deg) * np.eye(3)[axis])
 
 
-empty = cloud(lambda rows, share: rows[:0])
+empty = cloud(lambda rows, _share: rows[:0])
 
 
 def labels_right(px):
     """Label images moved; what comes in from outside is the border repeated."""
 
-    def edit(message, share):
+    def edit(message, _share):
         pixels = cv2.imdecode(message.data, cv2.IMREAD_UNCHANGED)
         move, size = np.array([[1.0, 0, px], [0, 1, 0]]), pixels.shape[1::-1]
         moved = cv2.warpAffine(pixels, move, size, flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
@@ -125,7 +134,7 @@ def labels_right(px):
 
 
 def focal(share_of_it):
-    def edit(message, share):
+    def edit(message, _share):
         message.k, message.p = message.k.copy(), message.p.copy()
         message.k[[0, 4]] *= 1 + share_of_it
         message.p[[0, 5]] *= 1 + share_of_it
@@ -137,7 +146,7 @@ def focal(share_of_it):
 def odometry(factor):
     """Speeds and turn rates, multiplied."""
 
-    def edit(message, share):
+    def edit(message, _share):
         for vector in (message.twist.twist.linear, message.twist.twist.angular):
             vector.x, vector.y, vector.z = factor * vector.x, factor * vector.y, factor * vector.z
         return message
@@ -148,7 +157,7 @@ def odometry(factor):
 def mounted(frame, step):
     """The sensor's edge of tf_static, composed with a step (4 4) in the sensor's own axes."""
 
-    def edit(message, share):
+    def edit(message, _share):
         for edge in message.transforms:
             # Where the sensor is the parent, the step is undone on the other side.
             child, parent = edge.child_frame_id == frame, edge.header.frame_id == frame
