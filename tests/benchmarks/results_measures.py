@@ -14,6 +14,7 @@ import numpy as np
 from schemas.calibrations import PAIRS
 from tests.benchmarks.studies.metrics import within
 from tests.benchmarks.studies.rates import interval, rate
+from tests.benchmarks.studies.states_measures import counts
 
 __all__ = ["MEASURES", "interval", "rate"]
 
@@ -71,6 +72,11 @@ def clock_sigmas(lines: Lines, row: Row) -> str:
     return f"{rate(int(np.sum(np.abs(z) <= 3)), len(z))}, {np.sqrt(np.mean(z**2)):.2f} sigma"
 
 
+def states(lines: Lines, row: Row) -> str:
+    """What study `states` counts under the words of `count`."""
+    return counts(lines)[row["count"]]
+
+
 MEASURES: dict[str, Callable[[Lines, Row], str]] = {
-    f.__name__: f for f in (accepted_days, clock_sigmas, errors, inside, wrong_days)
+    f.__name__: f for f in (accepted_days, clock_sigmas, errors, inside, states, wrong_days)
 }
