@@ -70,7 +70,7 @@ bench: setup ## speed and memory, measured as ratios against the committed basel
 bench-accept: setup ## the same, and writes what it measures into the baseline
 	$(ONE_THREAD) $(BIN)/python -m pytest tests/benchmarks -p no:xdist -s --accept-baseline
 
-results: setup ## write the result table of the README from what was measured
+results: setup ## write the result tables of both READMEs from what was measured
 	$(BIN)/python -m tests.benchmarks.results_table
 
 accuracy-accept: setup ## measure the fixed days of tests/accuracy and write their baseline

@@ -1,7 +1,7 @@
-"""The result table of the README, made of results/rows.toml and of the files that it names.
+"""The result tables of both READMEs, made of results/rows.toml and of the files that it names.
 
-    python -m tests.benchmarks.results_table          writes it (make results)
-    python -m tests.benchmarks.results_table --check  exit code 1 where it is not what the results give
+    python -m tests.benchmarks.results_table          writes them (make results)
+    python -m tests.benchmarks.results_table --check  exit code 1 where they are not what the results give
 
 A row names a question, its goal, its file and how the number is computed (`results_measures.py`). What else a reader
 must know to believe the number is computed: the release of the code (results/releases.toml, kept because commits are
@@ -25,7 +25,7 @@ from tests.benchmarks.results_measures import MEASURES
 from tests.benchmarks.studies.looks import freshness, read_looks
 
 __all__ = [
-    "README",
+    "TARGETS",
     "WIDEST",
     "learn_releases",
     "lines_of",
@@ -41,8 +41,8 @@ REPO = Path(__file__).resolve().parents[2]
 ROWS = RESULTS / "rows.toml"
 RELEASES = RESULTS / "releases.toml"
 BEGIN, END = "<!-- results: written by make results -->", "<!-- end of results -->"
-README = REPO / "README.md"
-WIDEST = 110  # characters of a line
+TARGETS = {REPO / "README.md": True, RESULTS / "README.md": False}  # the first has rows of `top` alone
+WIDEST = 110  # characters of a line of the first
 
 
 def rows(path: Path = ROWS) -> list[dict[str, Any]]:
@@ -61,10 +61,10 @@ def lines_of(row: Mapping[str, Any]) -> list[dict[str, Any]]:
     return chosen
 
 
-def render() -> str:
+def render(top_only: bool) -> str:
     """The table as Markdown."""
     heads = ["question", "goal", "measured (95 % interval)", "days, look", "release"]
-    body = [_cells(row) for row in rows()]
+    body = [_cells(row) for row in rows() if row.get("top") or not top_only]
     return "\n".join("| " + " | ".join(cells) + " |" for cells in [heads, ["---"] * len(heads), *body])
 
 
@@ -158,17 +158,17 @@ def _order(release: str) -> tuple[int, ...]:
     return tuple(int(part) for part in release.split("."))
 
 
-def written() -> str:
-    """The README with its table made anew."""
-    before, found, rest = README.read_text().partition(BEGIN)
+def written(path: Path, top_only: bool) -> str:
+    """The file with its table made anew."""
+    before, found, rest = path.read_text().partition(BEGIN)
     after = rest.partition(END)[2]
     if not found:
-        raise SystemExit(f"{README} has no line {BEGIN}")
-    return f"{before}{BEGIN}\n{render()}\n{END}{after}"
+        raise SystemExit(f"{path} has no line {BEGIN}")
+    return f"{before}{BEGIN}\n{render(top_only)}\n{END}{after}"
 
 
 def main() -> None:
-    """Write the table, or compare it."""
+    """Write both tables, or compare them."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -176,12 +176,12 @@ def main() -> None:
     args = parser.parse_args()
     if not args.check:
         learn_releases()
-    is_stale = written() != README.read_text()
+    stale = [path for path, top_only in TARGETS.items() if written(path, top_only) != path.read_text()]
     if args.check:
-        sys.exit(f"{README} is not what the results give: make results" if is_stale else 0)
-    if is_stale:
-        README.write_text(written())
-        print(f"wrote {README}")
+        sys.exit(f"not what the results give: {', '.join(map(str, stale))}; make results" if stale else 0)
+    for path in stale:
+        path.write_text(written(path, TARGETS[path]))
+        print(f"wrote {path}")
 
 
 if __name__ == "__main__":
