@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,7 +29,6 @@ def read_calibration(
     method: str,
     *,
     force: bool,
-    unchecked: bool,
     frames: FrameOptions,
     own_frames: bool,
     mount: str | None,
@@ -40,63 +38,38 @@ def read_calibration(
     With `own_frames`, frames that no option names get their names from the logs.
     """
     from jobs.terminal.summary import left_out as tell_damage
-    from pipeline.export.calibration import ExportedCalibration
-    from pipeline.export.lake import (
-        choose_pairs,
-        edges_of_vehicle,
-        pairs_of_day,
-        pairs_of_poses,
-        pairs_of_state,
-        read_cameras,
-        read_frame_ids,
-        rest_at_prior,
-    )
+    from pipeline.export.calibration import ExportedCalibration, reference_of
+    from pipeline.export.lake import choose_pairs, pairs_of, read_cameras, read_frame_ids, read_tf
     from pipeline.rig.edges import words_of
+    from pipeline.rig.graph import BASE
     from pipeline.store.partitions import Lake
-    from schemas.calibrations import PAIRS
     from schemas.versions import CODE_VERSION
     from schemas.words import day_word
 
     lake = Lake.existing(location)
-    # A rig that was adjusted as a whole has a pose per sensor, other rigs have one per edge.
-    by_edge = (
-        pairs_of_state(lake, vehicle, method) if day is None else pairs_of_day(lake, vehicle, day, method)
-    )
-    poses = pairs_of_poses(lake, vehicle, day, method)
-    found = {words_of(edge): pair for edge, pair in poses.items()} or by_edge
-    if by_edge.keys() <= set(
-        PAIRS
-    ):  # one camera, one lidar, one radar: only pairs have unchecked axes, and camera-radar
-        found, poses = (
-            by_edge | {words: _unchecked_as(pair, by_edge.get(words)) for words, pair in found.items()},
-            {},
-        )
-    source = f"record of {day}"
-    # Without a transform, a record was refused, and a state does not exist.
+    found = pairs_of(lake, vehicle, day, method)
+    # Without a transform, a record was refused, or no prior is known.
     word = day_word("refused" if isinstance(p, str) else p.status for p in found.values())
-    pairs, without = choose_pairs(found, force=force)
-    pairs = pairs if unchecked else rest_at_prior(lake, vehicle, method, pairs)
+    pairs, without = choose_pairs({words_of(edge): pair for edge, pair in found.items()}, force=force)
     details = [p.details for p in pairs.values()]
-    days = {str(d) for detail in details for d in _listed(detail.get("days"))} | ({day} if day else set())
+    days = {str(d) for detail in details for d in (*_listed(detail.get("days")), detail["day"])}
     names = frames.names(read_frame_ids(lake, vehicle, days) if own_frames else None)
-    edges = tuple(poses) or edges_of_vehicle(lake, vehicle, day, method)
+    edges = tuple(found)
     seen = sorted({sensor.name for edge in edges for sensor in edge.sensors if sensor.kind == "camera"})
     cameras = read_cameras(lake, vehicle, days, seen)
-    T_base_lidar = None if mount is None else mounting(mount, names, edges)
+    tree = read_tf(lake, vehicle, days)
+    T_base = None if mount is None else mounting(mount, names, edges)
+    on_base = {e for e in edges if BASE in e.sensors and words_of(e) in pairs}
+    if T_base is None and not on_base:  # the car's own root, where its tf has one
+        T_base = tree.lookup(names.base, names.of(reference_of(edges).name))
+    source = f"record of {day}"
     if day is None:
         source = f"state of {max((str(d['day']) for d in details), default='no day')}"
     tell_damage(lake)
     return ExportedCalibration(
-        vehicle, source, method, CODE_VERSION, pairs, None, names, T_base_lidar, without, word,
-        known=edges, cameras=cameras,
+        vehicle, source, method, CODE_VERSION, pairs, None, names, T_base, without, word,
+        known=edges, cameras=cameras, own_tree=tree.edges,
     )  # fmt: skip
-
-
-def _unchecked_as(pose: ExportedPair | str, pair: ExportedPair | str | None) -> ExportedPair | str:
-    """The pose with the unchecked axes of its pair's record or state."""
-    if isinstance(pose, str) or pair is None or isinstance(pair, str):
-        return pose
-    return replace(pose, unchecked=pair.unchecked)
 
 
 def _listed(value: object) -> list[object]:
@@ -188,7 +161,7 @@ def poses_in_use(
     """
     from pipeline.export.files import noted_frames, read_files
     from pipeline.export.formats import FORMATS, format_named
-    from pipeline.export.lake import pairs_of_poses
+    from pipeline.export.lake import pairs_of
     from pipeline.export.rig_poses import from_ties, reference_of_rig, rig_poses
     from pipeline.rig.graph import tie
     from pipeline.store.partitions import Lake
@@ -203,9 +176,7 @@ def poses_in_use(
     if location is None:
         problem = f'{text!r} is neither FORMAT:FILE nor .json; a day of a lake, or "state", needs --lake'
         raise ConfigError("command line", "--calibration", problem)
-    found = pairs_of_poses(
-        Lake.existing(location), owner or vehicle, None if day == "state" else day, "joint"
-    )
+    found = pairs_of(Lake.existing(location), owner or vehicle, None if day == "state" else day, "joint")
     reference = reference_of_rig(rig)
     wanted = {tie(n, reference) for n in rig.nodes if n != reference}
     if not found.keys() & wanted:
@@ -233,10 +204,9 @@ def _side_of_files(text: str, form: str, files: str, names: FrameNames, edges: t
 
 def _side_of_lake(text: str, location: str | None, vehicle: str | None, method: str) -> Side:
     from pipeline.export.compare import Side
-    from pipeline.export.lake import choose_pairs, pairs_of_day, pairs_of_poses, pairs_of_state, priors_of_day
+    from pipeline.export.lake import choose_pairs, pairs_of, priors_of_day
     from pipeline.rig.edges import words_of
     from pipeline.store.partitions import Lake
-    from schemas.calibrations import PAIRS
 
     owner, at, rest = text.rpartition("@")
     owner = owner if at else (vehicle or "")
@@ -249,9 +219,7 @@ def _side_of_lake(text: str, location: str | None, vehicle: str | None, method: 
     if named == "prior":
         found = priors_of_day(lake, owner, day, method)
     else:
-        found = pairs_of_state(lake, owner, by) if of_day is None else pairs_of_day(lake, owner, of_day, by)
-        if not found.keys() <= set(PAIRS):  # as `export` does
-            found = {words_of(e): p for e, p in pairs_of_poses(lake, owner, of_day, by).items()} or found
+        found = {words_of(edge): pair for edge, pair in pairs_of(lake, owner, of_day, by).items()}
     pairs, missing = choose_pairs(found, force=True)
     days = frozenset[str]() if named == "prior" else _days(pairs, day)
     return Side(f"{owner} {rest}", pairs, owner, days, missing)

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 __all__ = ["export"]
 
+NOTHING_CERTIFIED = 4  # exit code: a file was written, or nothing could be, and nothing in it is certified
+
 What = Literal[
     "schemas", "onnx", "ros2", "tf-static", "urdf", "xacro", "autoware", "kitti", "nuscenes", "t4", "kalibr", "opencv",
     "foxglove",
@@ -30,7 +32,6 @@ def export(
     day: str | None = None,
     method: str = "joint",
     force: bool = False,
-    unchecked: bool = False,
     mount: str | None = None,
     update: Path | None = None,
     frames: FrameOptions | None = None,
@@ -42,8 +43,11 @@ def export(
 ) -> int:
     """Write a file for other programs: a calibration in one of many formats, JSON Schemas, or a network.
 
-    A calibration is a vehicle's state, or with --day the records of that day. Held and refused pairs are left
-    out. Exit code 3 if a pair is not accepted or not certified; the file and the summary list those pairs.
+    A calibration is a vehicle's state, or with --day the records of that day. In a state, a sensor without usable
+    days is at its prior; of a day, held and refused pairs are left out. The file and the summary have the reasons.
+
+    Exit codes: 0 all that the vehicle has is current (of a day: accepted); 3 something is at the prior, held or left
+    out; 4 nothing is certified.
 
     Args:
         what: format of a calibration; or "foxglove", an MCAP file of a day's drive with its calibration, for
@@ -54,11 +58,10 @@ def export(
         vehicle: vehicle id.
         day: YYYY-MM-DD: export the records of this day; default: the vehicle's state.
         method: calibration method.
-        force: write held pairs too, marked as held; the exit code stays 3.
-        unchecked: write axes that are far from the prior and not covered by a check; default: write the prior
-        for them.
+        force: with --day, write held pairs too, marked as held; the exit code is that without --force.
         mount: pose of the reference lidar on the car (from --base-frame to the lidar's frame): log:FILE (its
-            /tf_static) or FORMAT:FILE, as in urdf:car.urdf; default: the lidar is the root of the tree.
+            /tf_static) or FORMAT:FILE, as in urdf:car.urdf; default: from the car's logs, where their /tf_static
+            has the base frame; else the lidar is the root of the tree.
         update: for "autoware": your sensor_kit_calibration.yaml; --out is a copy of it with new numbers for
             the calibrated sensors.
         frames: frame names.
@@ -84,10 +87,13 @@ def export(
         return 0
     if lake is None or vehicle is None:
         raise ConfigError("command line", "lake, vehicle", "a calibration needs --lake and --vehicle")
+    if force and day is None:
+        problem = "a state has no held pairs: what no day determines is at its prior; --force goes with --day"
+        raise ConfigError("command line", "force", problem)
     # Autoware's sensor kit has the camera's link, while logs name its optical frame.
     own_frames = not (generic_frames or what == "autoware")
     calibration = read_calibration(
-        lake, vehicle, day, method, force=force, unchecked=unchecked, frames=frames or FrameOptions(),
+        lake, vehicle, day, method, force=force, frames=frames or FrameOptions(),
         own_frames=own_frames, mount=mount,
     )  # fmt: skip
     if what == "foxglove":
@@ -134,19 +140,24 @@ def _written(calibration: ExportedCalibration) -> list[str]:
 
 
 def _tell(what: str, calibration: ExportedCalibration, outputs: list[Path]) -> int:
-    """Log a warning for each pair that is not accepted, print the summary and return the exit code."""
+    """Log what of each pair is used and each warning, print the summary and return the exit code."""
     from jobs.terminal.logging import logger
     from jobs.terminal.summary import print_summary
-    from pipeline.export.provenance import not_certified, warnings_of
+    from pipeline.export.calibration import USABLE
+    from pipeline.export.provenance import not_certified, used_lines, warnings_of
 
     doubts, written = not_certified(calibration), _written(calibration)
+    for words in used_lines(calibration):
+        logger().info(words, vehicle=calibration.vehicle, source=calibration.source)
     for words in warnings_of(calibration):
         logger().warning(words, vehicle=calibration.vehicle, source=calibration.source)
-    status = calibration.word if written or calibration.word != "done" else "refused"
-    status = "uncertified" if status == "done" and doubts else status
+    usable = (pair for name in written if (pair := calibration.pairs[name]).status in USABLE)
+    certified = any(pair.certified for pair in usable)
+    word = calibration.word
+    status = "uncertified" if not certified and word in ("done", "partly") else word
     told = {"vehicle": calibration.vehicle, "source": calibration.source, "pairs": written}
     print_summary("export", status, what=what, **told, not_certified=doubts, outputs=outputs)
-    return 0 if status == "done" else 3
+    return NOTHING_CERTIFIED if not certified else 0 if word == "done" else 3
 
 
 def _export_onnx(out: Path, run: Path | None, notes: Path | None) -> list[Path]:

@@ -84,7 +84,7 @@ def _of_calibration(lake: Lake, day: Partition, kind: str, method: str, *, force
 
     of_day = day.day if kind == "day" else None
     found = read_calibration(
-        str(lake), day.vehicle, of_day, method, force=force, unchecked=False, frames=FrameOptions(), own_frames=False,
+        str(lake), day.vehicle, of_day, method, force=force, frames=FrameOptions(), own_frames=False,
         mount=None,
     )  # fmt: skip
     reference = found.reference.name

@@ -70,7 +70,6 @@ def show(
 def _records(
     lake: Lake, table: Table, vehicle: str | None, day: str | None, method: str | None, *, current: bool
 ) -> list[dict[str, Any]]:
-    from jobs.terminal.state_rows import state_rows
     from pipeline.store.current import (
         current_drift,
         current_events,
@@ -80,6 +79,7 @@ def _records(
         transform_of,
     )
     from pipeline.store.records import Assertion, last_assertion, read_records
+    from pipeline.store.state_values import state_values
     from schemas.versions import TABLES
 
     kinds: dict[str, Callable[[list[Any]], list[Any]]] = {
@@ -98,7 +98,7 @@ def _records(
         last = {last_assertion(lake, TABLES[table], m) for m in {r.method for r in chosen}}
         chosen = [r for r in chosen if Assertion(r.asserted_at, r.day, r.method) in last]
     if table == "states":
-        return state_rows(lake, chosen)
+        return state_values(chosen)
     shown = [{n: getattr(r, n) for n in names} for r in chosen]
     if table in ("calibrations", "poses"):
         return [row | {"T": transform_of(r)} for row, r in zip(shown, chosen, strict=True)]

@@ -109,7 +109,7 @@ def _rig(lake: Lake, vehicle: str, day: str, method: str) -> Rig:
     from pipeline.view.moment import Rig
 
     after = read_calibration(
-        str(lake.root), vehicle, day, method, force=True, unchecked=True, frames=FrameOptions(), own_frames=False,
+        str(lake.root), vehicle, day, method, force=True, frames=FrameOptions(), own_frames=False,
         mount=None,
     )  # fmt: skip
     found = priors_of_day(lake, vehicle, day, method)

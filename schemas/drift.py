@@ -159,7 +159,7 @@ def next_step(findings: Sequence[DriftFinding], lake: str) -> str:
     if stored.status == "UNKNOWN":
         return f"{vehicle}: {_until_it_is_known(findings, stored.reason, of, quote(lake), look_again)}"
     if stored.status == "YELLOW" and DAYS_WILL_TELL in stored.reason:
-        return f"{vehicle}: nothing yet but to drive on; {look_again}."
+        return f"{vehicle}: drive on; {look_again}."
     load = (
         f"load the state of tonight, which rests on the days since: `boresight export ros2 {of} "
         f"--out {quote(f'tonight/{vehicle}')}` (`boresight export --help` lists other formats)"
@@ -188,4 +188,5 @@ def _until_it_is_known(
         return f"see which days gave no estimate, and which check failed: `boresight status {of}`."
     has = int(asked.groupdict().get("has") or max(f.days_used for f in findings))
     more = max(int(asked["needs"]) - has, 1)
-    return f"nothing but to drive on: it needs {more} more accepted {'day' if more == 1 else 'days'}; {look_again}."
+    needed = "1 more accepted day is needed" if more == 1 else f"{more} more accepted days are needed"
+    return f"drive: {needed}; {look_again}."

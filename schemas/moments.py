@@ -16,6 +16,7 @@ __all__ = [
     "SWEEPS_LOGGED",
     "SWEEPS_PLANNED",
     "SWEEPS_READ",
+    "TF",
     "EgoColumns",
     "Moment",
     "Perceived",
@@ -30,6 +31,8 @@ SENSORS_ABSENT = "sensors_absent"
 # child, q (w x y z) and t_m of T_parent_child.
 FILES: Final = "files"
 PRIOR: Final = "prior"
+# Key in the manifest's `extra`: the car's own frames above its sensors, as logged on /tf_static, in the same layout.
+TF: Final = "tf_static"
 # Moments closer in time than this show the same scene: an incomplete one adds nothing to a complete one
 # beside it.
 SAME_SCENE_NS = 10**9

@@ -1,7 +1,6 @@
-"""Table `states`: calibration to load tonight: mean of a vehicle's accepted days since the last change.
+"""Table `states`: calibration to load tonight, from a vehicle's days since each sensor last moved.
 
-One row per edge. A vehicle whose rig is adjusted as a whole (table `poses`) also has one row per sensor; load
-those, because all edges agree in them.
+One row per sensor, the reference included, and one per edge, composed of its sensors' poses.
 """
 
 from __future__ import annotations
@@ -12,6 +11,7 @@ from schemas.columns import Posed, TableSchema, array, column, row
 
 __all__ = ["STATES", "StateRow"]
 
+_PRIOR = "prior T_parent_child of the last day; null if unknown"
 _REFERENCE = "mean pose T_parent_child of the reference days; null until there are enough of them"
 
 
@@ -27,19 +27,28 @@ class StateRow(Posed):
     )
     parent_frame: str = column("frame a of T_a_b: name of a sensor, or base; for poses the reference")
     child_frame: str = column("frame b of T_a_b: name of a sensor, or base")
-    status: str = column("current (load it) or none (no accepted day since the last change)")
-    reason: str = column("first day of the mean, and days left out of it")
-    unchecked: dict[str, float] = column(
-        "unchecked DoF that at least half of its days found far from the prior: largest distance in sigmas",
-        default_factory=dict,
+    status: str = column(
+        "current (days since the last change determine it), prior (no such day: the pose is the prior) or none (not "
+        "even a prior is known)"
     )
+    reason: str = column("why days before `since` do not count, days left out, and what is not certified")
     sensor: str | None = column(
         "sensor of a pose row, same as child_frame; null in rows of edges", default=None
     )
     kind: str | None = column("kind of that sensor: camera, lidar, radar or base", default=None)
-    since: str | None = column("first day that may be in the mean; null = no limit", default=None)
-    days: list[str] = column("days in the mean", default_factory=list)
+    since: str | None = column("first day that may count; null = no limit", default=None)
+    days: list[str] = column("days that it rests on", default_factory=list)
     inputs: list[str] = column("work keys of the records of these days", default_factory=list)
+    prior_qw: float | None = column(_PRIOR, default=None)
+    prior_qx: float | None = column(_PRIOR, default=None)
+    prior_qy: float | None = column(_PRIOR, default=None)
+    prior_qz: float | None = column(_PRIOR, default=None)
+    prior_tx_m: float | None = column(_PRIOR, default=None)
+    prior_ty_m: float | None = column(_PRIOR, default=None)
+    prior_tz_m: float | None = column(_PRIOR, default=None)
+    prior_covariance: np.ndarray | None = array(
+        "<f8", (6, 6), "covariance of the prior, left perturbation [rad, m]", default=None
+    )
     reference_days: list[str] | None = column(
         "first accepted days since reference_since, at most audit.reference_days: the charts' fixed "
         "reference is their mean; null in rows of sensors",

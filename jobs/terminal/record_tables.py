@@ -143,13 +143,8 @@ def _state_cells(row: dict[str, Any]) -> dict[str, str]:
         **_pose_cells(row["T"], row["T_prior"]),
         **_sure_cells(row),
         "days": f"{len(days)}: {days[0]} to {days[-1]}" if days else "0",
-        "reason": "; ".join(text for text in (row["reason"], _unchecked(row["unchecked"] or {})) if text),
+        "reason": "; ".join(text for text in (row["in_words"], row["reason"]) if text),
     }
-
-
-def _unchecked(sigmas: dict[str, float]) -> str:
-    """Unchecked axes, as `rx is 3.3 sigma from the prior and not checked`."""
-    return "; ".join(f"{d} is {s:.1f} sigma from the prior and not checked" for d, s in sigmas.items())
 
 
 def _outcome_cells(row: dict[str, Any]) -> dict[str, str]:

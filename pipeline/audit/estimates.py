@@ -20,7 +20,7 @@ from pipeline.rig.edges import edge_order, edges_of_rows
 from pipeline.rig.graph import Edge
 from pipeline.store.columns import matrices, observable_dofs, ordinals, places, there
 from pipeline.store.current import current_rows
-from schemas.calibrations import CALIBRATIONS, DOF_NAMES, STATUSES
+from schemas.calibrations import CALIBRATIONS, STATUSES
 from schemas.columns import POSE_COLUMNS
 
 __all__ = [
@@ -37,7 +37,6 @@ __all__ = [
 _ROUNDING = 1e-3  # of what should be 1
 _SHIFTS = tuple(f"diagnostics.holdout_{n}_shift_rad" for n in ("azimuth", "elevation"))
 _DISPROVED = "diagnostics.disproved"
-_UNCHECKED = tuple(f"diagnostics.unchecked_{dof}_sigmas" for dof in DOF_NAMES)
 # Columns of a record beside its identity.
 COLUMNS = (
     "status",
@@ -49,7 +48,6 @@ COLUMNS = (
     "targets_m",
     _DISPROVED,
     *_SHIFTS,
-    *_UNCHECKED,
 )
 _ACCEPTED, _HELD, _REFUSED = (STATUSES.index(name) for name in ("accepted", "held", "refused"))
 
@@ -71,7 +69,6 @@ class Estimates:
         has_common: False if the method does not tell it apart.
         disproved: a check shows that the pose is wrong.
         shown_wrong_rad: angular error that the checks of a held record found.
-        unchecked_sigmas: distance of each DoF from the prior if it is large and unchecked, else 0.
         half_days: for a day within which a sensor moved, changes from the pose and their sigmas, by part of
             the day.
         targets: targets of its sigmas, in the child's frame; not finite if it has none.
@@ -91,7 +88,6 @@ class Estimates:
     observable: Bool[np.ndarray, "N 6"]
     disproved: Bool[np.ndarray, " N"]
     shown_wrong_rad: Float[np.ndarray, " N"]
-    unchecked_sigmas: Float[np.ndarray, "N 6"]
     half_days: Float[np.ndarray, "N 2 2 6"]
     targets: Float[np.ndarray, "N 3 3"]
     work_key: pa.Array
@@ -147,7 +143,7 @@ def estimates_of(table: pa.Table | None) -> Estimates:
     """Current records of a table that has COLUMNS and the key columns; None = no records."""
     if table is None:
         table = CALIBRATIONS.arrow_schema().empty_table()
-        for name in (_DISPROVED, *_SHIFTS, *_UNCHECKED):
+        for name in (_DISPROVED, *_SHIFTS):
             table = table.append_column(name, pa.array([], pa.float64()))
     found = current_rows(table, CALIBRATIONS)
     return estimates_at(found, *edges_of_rows(found))
@@ -163,14 +159,13 @@ def estimates_at(found: pa.Table, edges: tuple[Edge, ...], edge: Int[np.ndarray,
     is_there = np.all([there(found[name]) for name in (*POSE_COLUMNS, "covariance")], axis=0)
     shifts = np.abs(np.stack([pc.fill_null(found[name], 0.0).to_numpy() for name in _SHIFTS], axis=1))
     worst = shifts.max(axis=1, initial=0.0)
-    unchecked = np.stack([pc.fill_null(found[name], 0.0).to_numpy() for name in _UNCHECKED], axis=1)
     return Estimates(
         names.dictionary.to_pylist(),  # rows are in order of vehicle, and so is what they are first met in
         edges, owner[order], day[order], edge[order], places(found["status"], STATUSES), pose,
         is_there, matrices(found["covariance"]), matrices(found["common_covariance"]),
         there(found["common_covariance"]), observable_dofs(found["observable"]),
         pc.fill_null(found[_DISPROVED], 0.0).to_numpy() != 0.0, np.where(np.isfinite(worst), worst, 0.0),
-        unchecked, matrices(found["half_days"], (2, 2, 6)), matrices(found["targets_m"], (3, 3)),
+        matrices(found["half_days"], (2, 2, 6)), matrices(found["targets_m"], (3, 3)),
         found["work_key"].combine_chunks(),
     )  # fmt: skip
 

@@ -57,7 +57,10 @@ def vehicle_findings(
             if last_estimate:
                 chart = replace(chart, reason=f"{chart.reason}; no estimate after {last_estimate}")
             if (edge, dof) in remarks:
-                chart = replace(chart, reason=f"{chart.reason}; {remarks[edge, dof]}")
+                # After a service event the days begin again: how many a chart needs is known.
+                none_yet = f"0 days of data, {max(config.baseline_days + 1, 2)} needed"
+                reason = chart.reason if chart.days_used else none_yet
+                chart = replace(chart, reason=f"{reason}; {remarks[edge, dof]}")
             if before is not None:
                 chart = _begun_before(chart, before.get((edge, dof)))
             base = DriftFinding(

@@ -6,12 +6,11 @@ from collections.abc import Sequence
 
 from pipeline.rig.graph import Edge
 from pipeline.store.current import current_events
-from pipeline.store.partitions import Lake, days_after
+from pipeline.store.partitions import Lake
 from pipeline.store.records import read_records
-from schemas.drift import DriftFinding
 from schemas.service_events import REALIGNED, SERVICE_EVENTS, ServiceEvent
 
-__all__ = ["events_until", "restart_of", "since_of", "what_was_done"]
+__all__ = ["events_until", "restart_of", "what_was_done"]
 
 
 def events_until(lake: Lake, last: str | None) -> dict[str, list[ServiceEvent]]:
@@ -37,21 +36,3 @@ def what_was_done(event: ServiceEvent) -> str:
     of = "all sensors" if event.sensor == "all" else f"the {event.sensor}"
     by = " by its own software" if event.kind == REALIGNED else ""
     return f"{event.kind} of {of}{by} on {event.day}"
-
-
-def since_of(
-    edge: Edge, events: Sequence[ServiceEvent], findings: Sequence[DriftFinding], last: str
-) -> tuple[str, str]:
-    """First day that may count for an edge, and why; empty if all days may."""
-    first, why = "", ""
-    event = restart_of(events, edge, last)
-    if event is not None:
-        first = days_after(event.day, 1)
-        why = f"after the {what_was_done(event)}"
-    for finding in findings:
-        is_own = (finding.parent_frame, finding.child_frame) == (edge.parent.name, edge.child.name)
-        changed = is_own and finding.status in ("RED", "YELLOW") and finding.start_day
-        if changed and (finding.start_day_latest or "") > first:
-            first = finding.start_day_latest or ""
-            why = f"after a change that the audit found since {finding.start_day}"
-    return first, why

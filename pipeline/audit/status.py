@@ -85,7 +85,8 @@ def decide_status(findings: Sequence[DriftFinding]) -> VehicleStatus:
         blind = [f for f in own if f.status != "GREEN"]
         why = "".join(f"; {words_of(first)} {f.dof}: {f.reason}" for f in blind[:1])
         return VehicleStatus("UNKNOWN", f"a turn of the {hidden} could hide ({count}){why}")
-    why = next((f": {f.reason}" for f in findings if most and f.days_used == most), "")
+    own = [f for f in findings if f.days_used == most and (most or "needed" in f.reason)]
+    why = "".join(f": {f.reason}" for f in own[:1])
     return VehicleStatus("UNKNOWN", f"too little data to say whether a sensor moved{why}")
 
 

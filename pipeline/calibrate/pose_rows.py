@@ -15,26 +15,35 @@ from pipeline.calibrate.verify.seen_targets import targets_of
 from pipeline.calibrate.verify.target_accuracy import Claim, claims_of
 from pipeline.config import VerifyConfig
 from pipeline.extrinsics.checks import faults_of
+from pipeline.geometry.changes import change_jacobian
 from pipeline.geometry.pose_columns import pose_columns
+from pipeline.geometry.se3 import adjoint, inverse, transform_points
 from pipeline.geometry.spherical import from_spherical
 from pipeline.geometry.targets import DEFAULT_TARGETS
 from pipeline.rig.extrinsics import Extrinsics
 from pipeline.rig.graph import RigGraph, Sensor
 from pipeline.rig.views import View
-from schemas.calibrations import CalibrationRecord
+from pipeline.store.current import prior_of, transform_of
+from schemas.calibrations import FRAMES_OF_PAIR, CalibrationRecord
 from schemas.poses import PoseRow
 from schemas.versions import CODE_VERSION
 
-__all__ = ["pose_rows"]
+__all__ = ["pose_rows", "poses_of_records"]
 
 # Ahead, left, up of a body as right, down, ahead of a camera.
 _OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+_AT_REFERENCE: dict[str, Any] = pose_columns(np.eye(4)) | {
+    "covariance": np.zeros((6, 6)), "common_covariance": np.zeros((6, 6)),
+    "status": "accepted", "reason": "poses refer to it", "dt_s": 0.0,
+}  # fmt: skip
 
 
 def pose_rows(
     about: Inputs,
     graph: RigGraph,
     adjusted: AdjustedRig | None,
+    before: Extrinsics,
     views: Mapping[str, View],
     verify: VerifyConfig,
     judged: Mapping[str, CalibrationRecord] | None = None,
@@ -43,12 +52,83 @@ def pose_rows(
 
     Args:
         adjusted: the adjusted rig; None if no edge had evidence.
+        before: the prior of the sensors that have one.
         views: view of each sensor, by name; a pose is certified for directions in this view.
         judged: by sensor, the record of its edge to the reference if that was judged at the adjusted pose,
             with held-out frames; its verdict is used for the pose.
     """
-    rows = [_row(about, graph, sensor, adjusted, views, verify) for sensor in graph.sensors]
+    rows = [_row(about, graph, sensor, adjusted, before, views, verify) for sensor in graph.sensors]
     return [_as_judged(row, (judged or {}).get(row.sensor)) for row in rows]
+
+
+def poses_of_records(about: Inputs, records: Sequence[CalibrationRecord]) -> list[PoseRow]:
+    """A row for each sensor of a method whose records are the answer: of edges to the lidar, else to the radar."""
+    kinds = {about.chosen.get(kind, kind): kind for pair in about.pairs for kind in FRAMES_OF_PAIR[pair]}
+    reference = next(name for kind in ("lidar", "radar") for name in kinds if kinds[name] == kind)
+    to_reference = {
+        r.parent_frame if r.child_frame == reference else r.child_frame: r
+        for r in records
+        if reference in (r.parent_frame, r.child_frame)
+    }
+    told: dict[str, Any] = {
+        "vehicle": about.partition.vehicle, "day": about.partition.day, "method": about.method, "reference": reference,
+        "work_key": about.work_key, "code_version": CODE_VERSION, "inputs": list(about.inputs),
+    }  # fmt: skip
+    own: dict[str, Any] = {
+        "kind": kinds[reference],
+        "sensor": reference,
+        "status": "accepted",
+        "reason": "poses refer to it",
+    }
+    exact: dict[str, Any] = {"covariance": np.zeros((6, 6)), "common_covariance": np.zeros((6, 6))}
+    first = PoseRow(**told, **own, **exact, **pose_columns(np.eye(4)), dt_s=0.0)
+    return [
+        first,
+        *(
+            PoseRow(**told, sensor=name, kind=kinds[name], **_of_record(record, reference))
+            for name, record in to_reference.items()
+        ),
+    ]
+
+
+def _of_record(record: CalibrationRecord, reference: str) -> dict[str, Any]:
+    """Columns of the pose of the sensor that an edge joins to the reference."""
+    T, T_prior = transform_of(record), prior_of(record)
+    C, B, P, targets = record.covariance, record.common_covariance, record.prior_covariance, record.targets_m
+    if T_prior is not None and P is not None:  # a record's prior is of changes
+        to_left = np.linalg.inv(change_jacobian(T_prior))
+        P = to_left @ P @ to_left.T
+    if record.child_frame == reference:
+        (T, C, B), (T_prior, P, _) = _reversed(T, C, B), _reversed(T_prior, P, None)
+    elif targets is not None and T is not None:
+        targets = transform_points(T, targets)
+    judged = (
+        "status",
+        "reason",
+        "faults",
+        "determined",
+        "azimuth_sigma_rad",
+        "elevation_sigma_rad",
+        "observable",
+    )
+    return {
+        **{name: getattr(record, name) for name in judged},
+        **pose_columns(T),
+        **pose_columns(T_prior, "prior_"),
+        "covariance": C,
+        "common_covariance": B,
+        "prior_covariance": P,
+        "targets_m": targets,
+        "unsure_only": bool(record.diagnostics.get("unsure_only")),
+    }
+
+
+def _reversed(T: np.ndarray | None, *covariances: np.ndarray | None) -> tuple[np.ndarray | None, ...]:
+    """The inverse of a transform, and covariances of its left perturbation as of the inverse's."""
+    if T is None:
+        return (None, *(None for _ in covariances))
+    A = adjoint(inverse(T))
+    return inverse(T), *(None if C is None else A @ C @ A.T for C in covariances)
 
 
 def _as_judged(row: PoseRow, record: CalibrationRecord | None) -> PoseRow:
@@ -62,7 +142,7 @@ def _as_judged(row: PoseRow, record: CalibrationRecord | None) -> PoseRow:
         determined=record.determined or [],
         azimuth_sigma_rad=record.azimuth_sigma_rad,
         elevation_sigma_rad=record.elevation_sigma_rad,
-        unsure_only=any(record.diagnostics.get(name) for name in ("unsure_only", "few_only")),
+        unsure_only=bool(record.diagnostics.get("unsure_only")),
     )
 
 
@@ -71,16 +151,13 @@ def _row(
     graph: RigGraph,
     sensor: Sensor,
     adjusted: AdjustedRig | None,
+    before: Extrinsics,
     views: Mapping[str, View],
     verify: VerifyConfig,
 ) -> PoseRow:
-    told = _identity(about, graph, sensor, views)
+    told = _identity(about, graph, sensor, views) | _prior(graph.reference.name, sensor.name, before)
     if sensor == graph.reference:
-        where = pose_columns(np.eye(4)) | {
-            "covariance": np.zeros((6, 6)),
-            "common_covariance": np.zeros((6, 6)),
-        }
-        return PoseRow(**told, **where, status="accepted", reason="poses refer to it", dt_s=0.0)
+        return PoseRow(**told, **_AT_REFERENCE)
     found = None if adjusted is None else adjusted.sensors.get(sensor.name)
     if adjusted is None or found is None:
         why = "no edge of the rig has evidence" if adjusted is None else "its prior pose is unknown"
@@ -98,8 +175,6 @@ def _row(
     return PoseRow(
         **told,
         **pose_columns(poses.T[sensor.name]),
-        **pose_columns(adjusted.before.T[sensor.name], "prior_"),
-        prior_covariance=adjusted.before.covariance_between(reference, sensor.name),
         unsure_only=status == "held" and not found.doubts,
         covariance=poses.covariance_between(reference, sensor.name),
         common_covariance=poses.covariance_between(reference, sensor.name, common=True),
@@ -116,6 +191,14 @@ def _row(
         dt_sigma_s=found.dt_sigma_s,
         edges=[edge.name for edge in found.rests_on],
     )
+
+
+def _prior(reference: str, sensor: str, before: Extrinsics) -> dict[str, Any]:
+    """Columns of the prior; empty if it is unknown."""
+    if sensor not in before.T or sensor == reference:
+        return {}
+    of_sensor = before.covariance_between(reference, sensor)
+    return {**pose_columns(before.T[sensor], "prior_"), "prior_covariance": of_sensor}
 
 
 def _identity(about: Inputs, graph: RigGraph, sensor: Sensor, views: Mapping[str, View]) -> dict[str, Any]:

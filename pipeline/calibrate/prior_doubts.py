@@ -60,5 +60,5 @@ def _held_record(record: CalibrationRecord, said: str) -> CalibrationRecord:
         faults=[*record.faults, _FAULT],
         determined=[],
         mounting_determined=[],
-        diagnostics=record.diagnostics | {"unsure_only": 0.0, "few_only": 0.0},
+        diagnostics=record.diagnostics | {"unsure_only": 0.0},
     )

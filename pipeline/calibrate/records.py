@@ -242,18 +242,16 @@ def verdict_numbers(judged: Judged) -> dict[str, float]:
 
 
 def _claim_numbers(judged: Judged) -> dict[str, float]:
-    """Score, certified and unchecked axes, innovation of held-out frames, resulting sigma."""
+    """Score, certified axes, innovation of held-out frames, resulting sigma."""
     certified = judged.verdict.determined
     numbers = {
         "confidence": judged.verdict.score,
         "disproved": float(judged.verdict.disproved),
         "unsure_only": float(judged.verdict.unsure_only),
-        "few_only": float(judged.verdict.few_only),
         "vouched_az": float("azimuth" in certified),
         "vouched_el": float("elevation" in certified),
         "elevation_limit_rad": judged.claims["elevation"].limit_rad,
     }
-    numbers |= {f"unchecked_{dof}_sigmas": sigmas for dof, sigmas in judged.verdict.unchecked.items()}
     return numbers | {
         f"holdout_{name}_{what}_rad": value
         for name, claim in judged.claims.items()

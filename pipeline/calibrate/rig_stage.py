@@ -12,7 +12,7 @@ from pipeline.calibrate.day import calibrate_observations
 from pipeline.calibrate.earlier import accepted_before
 from pipeline.calibrate.edge_records import refused_edge
 from pipeline.calibrate.methods import method_named
-from pipeline.calibrate.pose_rows import pose_rows
+from pipeline.calibrate.pose_rows import pose_rows, poses_of_records
 from pipeline.calibrate.prior_doubts import hold_doubted
 from pipeline.calibrate.records import Inputs, refused_records
 from pipeline.calibrate.rig_day import RigDay, calibrate_rig
@@ -44,20 +44,22 @@ def rig_rows(task: Task, about: Inputs, progress: Progress) -> list[CalibrationR
     fleet, rig = task.fleet, task.fleet.rig_of(task.partition.vehicle)
     day = _read(task, rig, about.seed)
     found = calibrate_rig(day, fleet, about, progress)
-    poses = pose_rows(about, day.graph, found.adjusted, day.views, fleet.verify, found.judged)
+    before = replace(day.prior, reference=day.graph.reference).extrinsics()
+    poses = pose_rows(about, day.graph, found.adjusted, before, day.views, fleet.verify, found.judged)
     poses, records = hold_doubted(poses, found.records)
     return [*records, *noted(poses, records)]
 
 
-def three_rows(task: Task, about: Inputs, progress: Progress) -> list[CalibrationRecord]:
-    """Records of three sensors of the rig, by a method for one of each kind; errors as `three_of_day`."""
+def three_rows(task: Task, about: Inputs, progress: Progress) -> list[CalibrationRecord | PoseRow]:
+    """Records and poses of three sensors of the rig, by a method for one of each kind; errors as `three_of_day`."""
     chosen, prior = three_of_day(task, about.seed)
     rows, of_three = _rows(task, chosen), replace(about, chosen=chosen, pairs=pairs_of(chosen))
     try:
         solver = method_named(about.method).solver_of(task, chosen)
-        return calibrate_observations(rows, prior, task.fleet, of_three, progress, solver)
+        records = calibrate_observations(rows, prior, task.fleet, of_three, progress, solver)
     except SolveError as err:
-        return refused_records(of_three, err.reason, len(rows), prior, err.fault)
+        records = refused_records(of_three, err.reason, len(rows), prior, err.fault)
+    return [*records, *poses_of_records(of_three, records)]
 
 
 def three_of_day(task: Task, seed: int) -> tuple[Chosen, Prior]:

@@ -29,6 +29,7 @@ from schemas.calibrations import (
 from schemas.faults import FAULTS
 from schemas.moments import SENSORS_ABSENT
 from schemas.observations import WITHOUT_LABELS
+from schemas.poses import PoseRow
 
 __all__ = ["work"]
 
@@ -71,6 +72,7 @@ def work(task: Task) -> Work:
             probe_deg=task.probe_deg,
         )  # fmt: skip
         calibrated = rig_rows if method.name == "joint" else three_rows
+        found: Sequence[CalibrationRecord | PoseRow]
         try:
             found = calibrated(task, about, run.progress)
         except SolveError as err:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
 
 from pipeline.errors import ConfigError
 from pipeline.geometry.cameras import Camera
-from pipeline.geometry.changes import change_between, change_covariance, change_jacobian, changed
+from pipeline.geometry.changes import change_covariance
 from pipeline.geometry.se3 import adjoint, inverse
 from pipeline.rig.edges import EDGE_OF_PAIR, edge_order, words_of
 from pipeline.rig.graph import BASE, KINDS, Edge, RigGraph, Sensor
@@ -29,12 +29,13 @@ __all__ = [
     "needed_camera",
     "poses_of",
     "reference_of",
+    "replaced_transforms",
     "sigmas_of",
     "written_pairs",
 ]
 
 # Statuses of a pair that may be loaded, of records and of states.
-USABLE = ("accepted", "current")
+USABLE = ("accepted", "current", "prior")
 _KINDS = ("camera", "lidar", "radar", "base")
 _REFERENCES = ("lidar", "radar", "camera")  # sensor kinds in order of preference as reference of the poses
 # Valid as a ROS frame, and without quotes in XML, YAML, a shell and a xacro expression.
@@ -99,8 +100,6 @@ class ExportedPair:
         certified: whether azimuth and elevation are within their limits.
         common: part of the covariance that is common to all days of a vehicle; None if unknown.
         details: more about its origin, in plain values (work key, days, time offset, notes).
-        unchecked: distance from the prior in sigmas, of DoF that are far from it and that no check covers.
-        resting: DoF of `unchecked` that were reset to the prior.
     """
 
     pair: str
@@ -112,8 +111,6 @@ class ExportedPair:
     certified: tuple[str, ...] = ("azimuth", "elevation")
     common: Float[np.ndarray, "6 6"] | None = None
     details: Mapping[str, object] = field(default_factory=dict)
-    unchecked: Mapping[str, float] = field(default_factory=dict)
-    resting: tuple[str, ...] = ()
     of: Edge | None = None
 
     @property
@@ -130,23 +127,6 @@ class ExportedPair:
     def at_prior(self) -> list[str]:
         """Degrees of freedom that the data did not determine."""
         return [name for name, seen in zip(DOF_NAMES, self.observable, strict=True) if not seen]
-
-    def resting_at(
-        self, T_prior: Float[np.ndarray, "4 4"], prior_covariance: Float[np.ndarray, "6 6"]
-    ) -> ExportedPair:
-        """Copy with the unchecked DoF reset to the prior and its covariance; others follow by correlation."""
-        rows = [DOF_NAMES.index(dof) for dof in self.unchecked]
-        if not rows or self.covariance is None:
-            return self
-        J = change_jacobian(self.T)
-        C, P = J @ self.covariance @ J.T, change_covariance(T_prior, prior_covariance)
-        gain = C[:, rows] @ np.linalg.inv(C[np.ix_(rows, rows)])
-        change = change_between(T_prior, self.T)
-        change = change - gain @ change[rows]
-        C = C + gain @ (P - C)[np.ix_(rows, rows)] @ gain.T
-        T = changed(T_prior, change)
-        K = np.linalg.inv(change_jacobian(T))
-        return replace(self, T=T, covariance=K @ C @ K.T, resting=tuple(self.unchecked))
 
 
 def reference_of(edges: Collection[Edge]) -> Sensor:
@@ -168,6 +148,7 @@ class ExportedCalibration:
         left_out: reason by name, for edges that are not in `pairs`.
         word: status of the record or state as a whole, one of DAY_WORDS.
         known: all edges of the vehicle, those left out included; empty = those of camera, lidar and radar.
+        own_tree: parent of each frame above the sensors in the car's own /tf_static.
     """
 
     vehicle: str
@@ -182,6 +163,7 @@ class ExportedCalibration:
     word: str = "done"
     cameras: Mapping[str, Camera] = field(default_factory=dict)
     known: tuple[Edge, ...] = ()
+    own_tree: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         require_different([self.names.of(sensor.name) for sensor in (*self.sensors, BASE)])
@@ -279,6 +261,22 @@ def poses_of(calibration: ExportedCalibration) -> list[Pose]:
         if found is not None:
             poses.append(Pose(sensor.name, names.of(reference), names.of(sensor.name), *found))
     return poses
+
+
+def replaced_transforms(calibration: ExportedCalibration) -> list[str]:
+    """Transforms of the car's own /tf_static that the poses replace, as `parent -> child`.
+
+    A frame has one parent, and no chain of frames returns to itself: with both sources on, one of them is ignored.
+    """
+    children = {pose.child for pose in poses_of(calibration)}
+    own, above = calibration.own_tree, calibration.root
+    passed = {above}
+    while own.get(above, above) not in passed:
+        above = own[above]
+        passed.add(above)
+    # Where the root has one of these children above it, the chain is cut at the root.
+    replaced = {f for f in own if f in children} | ({calibration.root} if passed & children else set())
+    return [f"{own[child]} -> {child}" for child in sorted(replaced)]
 
 
 def written_pairs(calibration: ExportedCalibration) -> list[str]:

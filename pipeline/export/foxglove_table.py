@@ -10,7 +10,7 @@ from foxglove import layouts
 from jaxtyping import Float
 
 from pipeline.export.calibration import ExportedCalibration, ExportedPair, FrameNames, sigmas_of
-from pipeline.export.provenance import warnings_of
+from pipeline.export.provenance import used_lines, warnings_of
 from pipeline.geometry.changes import change_between
 from schemas.calibrations import DOF_NAMES
 
@@ -34,6 +34,7 @@ TABLE_SCHEMA: dict[str, Any] = {
         "source": {"type": "string"},
         "method": {"type": "string"},
         "warnings": {"type": "array", "items": {"type": "string"}},
+        "in_words": {"type": "array", "items": {"type": "string"}},
         "rows": {"type": "array", "items": {"type": "object", "properties": _ROW}},
     },
 }
@@ -45,7 +46,8 @@ def table_of(
     """A row per pair and axis: change from the prior along the parent's axes, with sigma [deg, cm]."""
     rows = [row for pair in calibration.pairs.values() for row in _rows(pair, priors.get(pair.pair))]
     told = {"vehicle": calibration.vehicle, "source": calibration.source, "method": calibration.method}
-    return told | {"warnings": warnings_of(calibration), "rows": rows}
+    words = {"warnings": warnings_of(calibration), "in_words": used_lines(calibration)}
+    return told | words | {"rows": rows}
 
 
 def _rows(pair: ExportedPair, prior: Float[np.ndarray, "4 4"] | None) -> list[dict[str, Any]]:

@@ -11,26 +11,26 @@ from pipeline.errors import ConfigError, ContractError
 from pipeline.export.calibration import USABLE, ExportedPair, is_frame
 from pipeline.geometry.cameras import Camera, camera_of
 from pipeline.geometry.se3 import adjoint, inverse
+from pipeline.geometry.transform_tree import TransformTree
 from pipeline.rig.edges import edge_of, edge_order, words_of
 from pipeline.rig.graph import Edge, Kind, Sensor, is_one_of_each, tie
+from pipeline.rig.prior import transform_of_row
 from pipeline.store.current import current_poses, current_records, current_states, prior_of, transform_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
 from pipeline.store.views import ingested, observations_of, perceived
 from schemas.calibrations import CALIBRATIONS, DOF_NAMES, CalibrationRecord
+from schemas.moments import TF
 from schemas.poses import POSES, PoseRow
 from schemas.states import STATES, StateRow
 
 __all__ = [
     "choose_pairs",
-    "edges_of_vehicle",
-    "pairs_of_day",
-    "pairs_of_poses",
-    "pairs_of_state",
+    "pairs_of",
     "priors_of_day",
     "read_cameras",
     "read_frame_ids",
-    "rest_at_prior",
+    "read_tf",
 ]
 
 # Fields of a record or state for the provenance, if present.
@@ -41,37 +41,38 @@ _DETAILS = (
 )
 
 
-def pairs_of_day(lake: Lake, vehicle: str, day: str, method: str) -> dict[str, ExportedPair | str]:
-    """Estimates of the day's current records by edge name, or the reason why there is none.
+def pairs_of(lake: Lake, vehicle: str, day: str | None, method: str) -> dict[Edge, ExportedPair | str]:
+    """Edges of every sensor to the reference, of a day or (no day) of the vehicle's state; else the reason for none.
+
+    With camera-radar of a rig of three, beside the edges to the lidar. Numbers are those of the stored rows, to the
+    last digit: rows of edges where they hold the sensors' poses, else rows of the sensors.
 
     Raises:
-        ConfigError: no record of that vehicle, day and method; the message lists the existing ones.
+        ConfigError: no state of that vehicle and method, or no record of that day; the message lists those there are.
     """
-    return _pairs(_records(lake, vehicle, day, method))
-
-
-def pairs_of_poses(lake: Lake, vehicle: str, day: str | None, method: str) -> dict[Edge, ExportedPair | str]:
-    """Poses relative to the reference, from the day's adjusted rig or (no day) the vehicle's state.
-
-    Keys are edges to the reference. Empty for a vehicle whose rig is not adjusted as a whole, and for a
-    vehicle with one sensor of each kind, whose records hold the adjusted poses already.
-
-    Raises:
-        ConfigError: as `pairs_of_day`, or no state of that vehicle and method is stored.
-    """
-    own: list[tuple[str, str, str, PoseRow | StateRow]]
+    rows: Sequence[CalibrationRecord | StateRow]
+    poses: list[tuple[str, str, str, PoseRow | StateRow]]
     if day is None:
-        states = current_states(read_records(lake, STATES, StateRow, vehicle=vehicle))
-        own = [(s.sensor, s.kind or "", s.parent_frame, s) for s in states if s.sensor and s.method == method]
+        states = _states(lake, vehicle, method)
+        rows = [r for r in states if r.sensor is None]
+        poses = [(r.sensor, r.kind or "", r.parent_frame, r) for r in states if r.sensor is not None]
     else:
-        poses = current_poses(read_records(lake, POSES, PoseRow, vehicle=vehicle, day=day))
-        own = [(p.sensor, p.kind, p.reference, p) for p in poses if p.method == method]
-    nodes = {s.name: s for edge in edges_of_vehicle(lake, vehicle, day, method) for s in edge.sensors}
-    if is_one_of_each(nodes.values()):
-        return {}
-    nodes |= {name: Sensor(name, cast("Kind", kind)) for name, kind, *_ in own}
-    ties = {tie(nodes[n], nodes[r]): (n, row) for n, _, r, row in own if n != r and r in nodes}
-    return {edge: _pair_of_pose(ties[edge][1], ties[edge][0], edge) for edge in sorted(ties, key=edge_order)}
+        rows = _records(lake, vehicle, day, method)
+        found = current_poses(read_records(lake, POSES, PoseRow, vehicle=vehicle, day=day))
+        poses = [(p.sensor, p.kind, p.reference, p) for p in found if p.method == method]
+    of_edge = {edge_of(row): row for row in rows}
+    nodes = {s.name: s for edge in of_edge for s in edge.sensors}
+    nodes |= {name: Sensor(name, cast("Kind", kind)) for name, kind, *_ in poses}
+    ties = {tie(nodes[n], nodes[r]): (n, row) for n, _, r, row in poses if n != r and r in nodes}
+    of_three = is_one_of_each(nodes.values())
+    adjusted = {edge: row for edge, row in of_edge.items() if day is None or of_three}
+    chosen: dict[Edge, ExportedPair | str] = {
+        edge: _pair(adjusted[edge]) if edge in adjusted else _pair_of_pose(row, name, edge)
+        for edge, (name, row) in ties.items()
+    }
+    if of_three or not ties:
+        chosen |= {edge: _pair(row) for edge, row in of_edge.items() if edge not in chosen}
+    return {edge: chosen[edge] for edge in sorted(chosen, key=edge_order)}
 
 
 def _pair_of_pose(row: PoseRow | StateRow, sensor: str, edge: Edge) -> ExportedPair | str:
@@ -85,9 +86,10 @@ def _pair_of_pose(row: PoseRow | StateRow, sensor: str, edge: Edge) -> ExportedP
         A = adjoint(T)
         covariance, common = A @ covariance @ A.T, None if common is None else A @ common @ A.T
         unseen = ", ".join(dof for dof, is_seen in zip(DOF_NAMES, seen, strict=True) if not is_seen)
-        # The degrees of freedom refer to axes of the reference; in axes of the sensor they are mixed.
-        own = f"{unseen} along the axes of {edge.child.name} kept at the prior" if unseen else ""
-        seen, reason = (True,) * 6, "; ".join(words for words in (reason, own) if words)
+        if row.status != "prior":
+            # The degrees of freedom refer to axes of the reference; in axes of the sensor they are mixed.
+            own = f"{unseen} along the axes of {edge.child.name} kept at the prior" if unseen else ""
+            seen, reason = (True,) * 6, "; ".join(words for words in (reason, own) if words)
     return ExportedPair(
         words_of(edge),
         T,
@@ -116,15 +118,6 @@ def priors_of_day(lake: Lake, vehicle: str, day: str, method: str) -> dict[str, 
     return found
 
 
-def edges_of_vehicle(lake: Lake, vehicle: str, day: str | None, method: str) -> tuple[Edge, ...]:
-    """All edges in the day's records or (no day) in the states."""
-    if day is None:
-        rows: Sequence[CalibrationRecord | StateRow] = _states(lake, vehicle, method)
-    else:
-        rows = _records(lake, vehicle, day, method)
-    return tuple(edge_of(row) for row in rows)
-
-
 def _records(lake: Lake, vehicle: str, day: str, method: str) -> list[CalibrationRecord]:
     Partition(vehicle, day)  # raises for an invalid vehicle or day
     records = current_records(read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle=vehicle, day=day))
@@ -138,23 +131,13 @@ def _records(lake: Lake, vehicle: str, day: str, method: str) -> list[Calibratio
     return found
 
 
-def pairs_of_state(lake: Lake, vehicle: str, method: str) -> dict[str, ExportedPair | str]:
-    """Edges that a vehicle should load tonight, by name, or the reason for none; else ConfigError."""
-    return _pairs(_states(lake, vehicle, method))
-
-
 def _states(lake: Lake, vehicle: str, method: str) -> list[StateRow]:
     rows = current_states(read_records(lake, STATES, StateRow, vehicle=vehicle))
-    found = [r for r in rows if r.method == method and r.sensor is None]
+    found = [r for r in rows if r.method == method]
     if not found:
         problem = f"the lake has no state of {vehicle} by {method}: run `boresight audit`, or give --day"
         raise ConfigError("command line", "vehicle", problem)
     return found
-
-
-def _pairs(rows: Sequence[CalibrationRecord] | Sequence[StateRow]) -> dict[str, ExportedPair | str]:
-    by_edge = {edge_of(row): _pair(row) for row in rows}
-    return {words_of(edge): by_edge[edge] for edge in sorted(by_edge, key=edge_order)}
 
 
 def _pair(row: CalibrationRecord | StateRow) -> ExportedPair | str:
@@ -172,38 +155,12 @@ def _pair(row: CalibrationRecord | StateRow) -> ExportedPair | str:
         tuple(row.determined),
         row.common_covariance,
         _details(row),
-        _unchecked(row),
         of=edge,
     )
 
 
 def _details(row: CalibrationRecord | StateRow | PoseRow) -> dict[str, object]:
     return {name: value for name in _DETAILS if (value := getattr(row, name, None)) not in (None, "", [])}
-
-
-def _unchecked(row: CalibrationRecord | StateRow) -> dict[str, float]:
-    if isinstance(row, StateRow):
-        return row.unchecked
-    found = {dof: row.diagnostics.get(f"unchecked_{dof}_sigmas") for dof in DOF_NAMES}
-    return {dof: sigmas for dof, sigmas in found.items() if sigmas is not None}
-
-
-def rest_at_prior(
-    lake: Lake, vehicle: str, method: str, pairs: Mapping[str, ExportedPair]
-) -> dict[str, ExportedPair]:
-    """Pairs with unchecked DoF that are far from the prior reset to the prior of their last day's record."""
-    return {name: _rested(lake, vehicle, method, pair) for name, pair in pairs.items()}
-
-
-def _rested(lake: Lake, vehicle: str, method: str, pair: ExportedPair) -> ExportedPair:
-    days = pair.details.get("days") or [pair.details.get("day")]
-    if not pair.unchecked or not isinstance(days, list):
-        return pair
-    for record in _records(lake, vehicle, str(days[-1]), method):
-        T = prior_of(record)
-        if edge_of(record) == pair.edge and T is not None and record.prior_covariance is not None:
-            return pair.resting_at(T, record.prior_covariance)
-    return pair
 
 
 def choose_pairs(
@@ -240,6 +197,22 @@ def read_cameras(lake: Lake, vehicle: str, days: Iterable[str], cameras: Sequenc
         except ContractError as err:  # damaged, or deleted at the end of its retention
             lake.damage.append(str(err))
     return found
+
+
+def read_tf(lake: Lake, vehicle: str, days: Iterable[str]) -> TransformTree:
+    """The car's own tree above its sensors, from /tf_static of the latest of these days that has one."""
+    tree = TransformTree()
+    for day in sorted(days, reverse=True):
+        try:
+            manifest = ingested(lake, Partition(vehicle, day))
+        except ContractError as err:  # damaged
+            lake.damage.append(str(err))
+            continue
+        for row in () if manifest is None else manifest.extra.get(TF, ()):
+            tree.add_transform(row["parent"], row["child"], transform_of_row(row))
+        if tree.edges:
+            break
+    return tree
 
 
 def read_frame_ids(lake: Lake, vehicle: str, days: Iterable[str]) -> dict[str, str]:

@@ -7,9 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.export.calibration import USABLE, ExportedCalibration, ExportedPair, Pose, poses_of, sigmas_of
+from pipeline.export.calibration import (
+    USABLE,
+    ExportedCalibration,
+    ExportedPair,
+    Pose,
+    poses_of,
+    replaced_transforms,
+    sigmas_of,
+)
+from schemas.words import axes_in_words
 
-__all__ = ["comment_lines", "not_certified", "provenance_of", "warnings_of"]
+__all__ = ["comment_lines", "not_certified", "provenance_of", "used_lines", "warnings_of"]
 
 _AXES = {
     "camera": "optical: x right, y down, z forward",
@@ -38,40 +47,41 @@ def provenance_of(calibration: ExportedCalibration) -> dict[str, Any]:
         "poses": [_pose(edge) for edge in poses_of(calibration)],
         "pairs": {name: _pair(pair) for name, pair in calibration.pairs.items()},
         "left_out": dict(calibration.left_out),
+        "replaces_in_tf_static": replaced_transforms(calibration),
     }
 
 
 def warnings_of(calibration: ExportedCalibration) -> list[str]:
-    """Warnings, a sentence each: pairs left out or not accepted, and directions that are not certified."""
+    """Warnings, a sentence each: what is left out, at the prior or not certified, and the car's own transforms."""
     found = [f"{pair} is left out: {reason}" for pair, reason in calibration.left_out.items()]
     for pair in calibration.pairs.values():
         if pair.status not in USABLE:
             found.append(f"{pair.pair} is {pair.status.upper()}, check it before loading: {pair.reason}")
-        elif missing := [d for d in _DIRECTIONS if d not in pair.certified]:
-            found.append(f"{pair.pair}: {' and '.join(missing)} not certified; {pair.reason}".rstrip("; "))
-        if pair.at_prior:
-            found.append(
-                f"{pair.pair}: {', '.join(pair.at_prior)} not determined by the data, kept at the prior"
-            )
-        found += [f"{pair.pair}: {_far(pair, dof, sigmas)}" for dof, sigmas in pair.unchecked.items()]
+        elif pair.reason and (pair.status == "prior" or len(pair.certified) < len(_DIRECTIONS)):
+            found.append(f"{pair.pair}: {pair.reason}")
+    replaced = replaced_transforms(calibration)
+    if replaced:
+        found.append(
+            f"switch these off in the car's own /tf_static, a frame has one parent: {', '.join(replaced)}"
+        )
     return [" ".join(words.split()) for words in found]
 
 
-def _far(pair: ExportedPair, dof: str, sigmas: float) -> str:
-    """Warning for an axis that no check covers, with its treatment."""
-    became = (
-        "reset to the prior (--unchecked writes the estimate)"
-        if dof in pair.resting
-        else "written as estimated (--unchecked)"
-    )
-    return f"{dof} is {sigmas:.1f} sigma from the prior and no check covers it: {became}"
+def used_lines(calibration: ExportedCalibration) -> list[str]:
+    """For each pair one line: axes that are used, certified directions, axes at the prior."""
+    return [
+        f"{pair.pair}: {axes_in_words(pair.edge.parent.kind, pair.observable, pair.certified)}"
+        for pair in calibration.pairs.values()
+    ]
 
 
 def not_certified(calibration: ExportedCalibration) -> dict[str, str]:
     """Reason by pair why not all of it is reliable; empty if all pairs are accepted and certified."""
     found = dict(calibration.left_out)
     for name, pair in calibration.pairs.items():
-        if pair.status not in USABLE:
+        if pair.status == "prior":
+            found[name] = pair.reason
+        elif pair.status not in USABLE:
             found[name] = f"{pair.status}: {pair.reason}"
         elif missing := [d for d in _DIRECTIONS if d not in pair.certified]:
             found[name] = f"{' and '.join(missing)} not certified"
@@ -89,6 +99,7 @@ def comment_lines(calibration: ExportedCalibration, camera_axes: str | None = No
         frames |= {calibration.names.of(name): camera_axes for name in cameras}
     lines = [
         f"Boresight {calibration.code_version}: {calibration.vehicle}, {calibration.source}, {calibration.method}",
+        *used_lines(calibration),
         *(f"WARNING: {words}" for words in warnings_of(calibration)),
         *(f"frame {name}: {axes}" for name, axes in frames.items()),
     ]
@@ -130,8 +141,8 @@ def _pair(pair: ExportedPair) -> dict[str, Any]:
         "status": pair.status,
         "reason": pair.reason,
         "certified": list(pair.certified),
-        "kept_at_prior": [*pair.at_prior, *pair.resting],
-        "unchecked_sigmas": dict(pair.unchecked),
+        "kept_at_prior": pair.at_prior,
+        "in_words": axes_in_words(pair.edge.parent.kind, pair.observable, pair.certified),
         f"T_{pair.identifier}": pair.T.tolist(),
         "sigma": sigmas_of(pair.T, pair.covariance),
         "covariance": None if pair.covariance is None else pair.covariance.tolist(),

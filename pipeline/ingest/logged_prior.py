@@ -49,6 +49,21 @@ class LoggedPrior:
                 rows[name, row["parent"], row["child"], *row["q"], *row["t_m"]] = {"log": name, **row}
         return list(rows.values())
 
+    def frames_above(self) -> list[dict[str, Any]]:
+        """The frames between each sensor's frame and the root of the car's tree, as rows of T_parent_child."""
+        chains: dict[tuple[str, str], np.ndarray] = {}
+        for log in {key[0] for key in self._stars}:
+            tree = self._index.trees[log]
+            parent_of = tree.edges
+            for frame in {name.lstrip("/") for ids in self.frame_ids.values() for name in ids}:
+                child = frame
+                while (parent := parent_of.get(child)) is not None and (parent, child) not in chains:
+                    T = tree.lookup(parent, child)
+                    assert T is not None, "an edge of the tree"
+                    chains[parent, child] = T
+                    child = parent
+        return to_rows([chains])
+
     def _lookup(self, log: int, a: tuple[str, str], b: tuple[str, str]) -> np.ndarray | None:
         """T_a_b of two sensors with their frames."""
         if (log, a, b) not in self._found:

@@ -42,6 +42,7 @@ from schemas.moments import (
     SWEEPS_LOGGED,
     SWEEPS_PLANNED,
     SWEEPS_READ,
+    TF,
     Moment,
 )
 
@@ -118,6 +119,7 @@ def _rows(
             "frame_ids": builder.prior.frame_ids,
         }
         run.extra[PRIOR] = builder.prior.rows()
+        run.extra[TF] = builder.prior.frames_above()
         run.extra[SENSORS_ABSENT] = absences(index, rig, builder.counts, config)
         run.remarks = _shorten(index.problems)
     finally:

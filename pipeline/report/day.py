@@ -5,13 +5,11 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 
 from pipeline.geometry.changes import change_between, change_covariance
-from pipeline.report.words import AXIS_NAMES, dof_title, motion_in_words, scaled, unit_of
-from pipeline.rig.graph import Kind, Sensor, is_one_of_each
+from pipeline.report.words import dof_title, motion_in_words, scaled, unit_of
 from pipeline.store.current import prior_of, transform_of
 from pipeline.store.partitions import Lake
 from schemas.calibrations import DOF_NAMES, CalibrationRecord
@@ -80,7 +78,6 @@ class PairView:
     loop: str
     certified: str
     mounting: str  # what of it holds for the mounting, beside the direction in the image
-    unchecked: str  # of an accepted record, what contradicts the prior and nothing checks
     notes: list[str]
     assumptions: list[str]
     missing: list[str]
@@ -134,7 +131,6 @@ def pair_view(record: CalibrationRecord) -> PairView:
         loop=_loop(record),
         certified=_certified(record),
         mounting=_mounting(record),
-        unchecked=_unchecked(record),
         notes=[note for note in record.notes if not note.startswith(_SAID_BY_THE_AXES)],
         assumptions=list(record.assumptions),
         missing=list(record.drive_missing),
@@ -170,13 +166,6 @@ def _mounting(record: CalibrationRecord) -> str:
     return f"{certified} certified; known to {known} (1 sigma)"
 
 
-def _unchecked(record: CalibrationRecord) -> str:
-    """As `roll (3.1 sigma)`: axes of an accepted record that left the prior clearly and that nothing checks."""
-    names = AXIS_NAMES[record.pair.split("_")[0]]
-    moves = {k: record.diagnostics.get(f"unchecked_{dof}_sigmas") for k, dof in enumerate(DOF_NAMES)}
-    return ", ".join(f"{names[k]} ({sigmas:.1f} sigma)" for k, sigmas in moves.items() if sigmas is not None)
-
-
 @dataclass(frozen=True)
 class Answered:
     """Content of the first sentence about a sensor; attributes as those of `PairView`."""
@@ -185,25 +174,12 @@ class Answered:
     status: str
     sensors: tuple[str, ...]
     certified: str
-    unchecked: str = ""
 
 
 def answered(views: Sequence[PairView | Answered], poses: Sequence[PoseRow]) -> Sequence[PairView | Answered]:
-    """Sensors if the day has poses of them, without the reference; else edges.
-
-    Records of a rig with one sensor of each kind hold the same poses, so unchecked axes there are unchecked
-    here.
-    """
-    one_of_each = is_one_of_each([Sensor(p.sensor, cast("Kind", p.kind)) for p in poses])
-    unchecked = {frozenset(v.sensors): v.unchecked for v in views if one_of_each}
+    """Sensors if the day has poses of them, without the reference; else edges."""
     return [
-        Answered(
-            p.sensor,
-            p.status,
-            (p.sensor,),
-            ", ".join(p.determined),
-            unchecked.get(frozenset((p.sensor, p.reference)), ""),
-        )
+        Answered(p.sensor, p.status, (p.sensor,), ", ".join(p.determined))
         for p in poses
         if p.sensor != p.reference
     ] or views
@@ -235,20 +211,11 @@ def answer_for(
     if not accepted:
         return "bad", "No. Nothing was accepted: keep the transforms that the car has."
     if not other:
-        unchecked = _not_in(views)
         what = "pairs" if any(len(v.sensors) > 1 for v in views) else "sensors"
-        sentence = f"Yes{unchecked}. All {what} are accepted: they may go on the car, with the sigmas below."
-        return "partly" if unchecked else "good", sentence + _azimuth_only(views)
-    sentence = f"Partly. Accepted: {', '.join(accepted)}{_not_in(views)}. Keep what the car has for {', '.join(other)}."
+        sentence = f"Yes. All {what} are accepted: they may go on the car, with the sigmas below."
+        return "good", sentence + _azimuth_only(views)
+    sentence = f"Partly. Accepted: {', '.join(accepted)}. Keep what the car has for {', '.join(other)}."
     return "partly", sentence + _azimuth_only(views)
-
-
-def _not_in(views: Sequence[PairView | Answered]) -> str:
-    """As `, but not in lidar-radar's roll (...)`: what accepted pairs say without anything to check it."""
-    parts = [f"{v.title}'s {v.unchecked}" for v in views if v.status == "accepted" and v.unchecked]
-    if not parts:
-        return ""
-    return f", but not in {' and '.join(parts)}: far from the prior, checked by nothing, not certified"
 
 
 def _azimuth_only(views: Sequence[PairView | Answered]) -> str:

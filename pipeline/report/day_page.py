@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath
@@ -25,15 +26,20 @@ from pipeline.report.reading import (
     scenes_among,
     spread_observations,
     states_of,
+    vehicle_states,
 )
 from pipeline.report.residuals import frame_residuals
 from pipeline.report.rig_figure import rig_of_day
 from pipeline.report.time_offsets import TimeOffsets, as_stamped, time_offsets_of
+from pipeline.report.words import pose_text, sigma_text
+from pipeline.results import plain
 from pipeline.sections import ReportConfig
 from pipeline.store.files import Files, LocalFiles
 from pipeline.store.partitions import Lake, Partition
+from pipeline.store.state_values import state_values
 from schemas.calibrations import PAIRS, CalibrationRecord, pairs_of
 from schemas.drift import DriftFinding
+from schemas.states import StateRow
 from schemas.words import day_word
 
 __all__ = ["DayRead", "write_day_page", "write_day_picture"]
@@ -44,10 +50,11 @@ P = TypeVar("P", bound=PurePath)
 
 @dataclass(frozen=True)
 class DayRead:
-    """Input of the page of a vehicle-day: its current records by edge, the vehicle's current findings."""
+    """Input of the page of a vehicle-day: its current records by edge, the vehicle's current findings and states."""
 
     records: Mapping[str, CalibrationRecord]
     findings: Sequence[DriftFinding]
+    states: Sequence[StateRow] = ()
 
 
 def write_day_page(
@@ -81,6 +88,7 @@ def write_day_page(
         read = DayRead(
             day_records(lake, partition, method),
             drift_of(lake, method, partition.vehicle),
+            vehicle_states(lake, partition.vehicle, method),
         )
     shown = _content(lake, partition, read, fleet.report if pictures else None)
     html = render(
@@ -143,6 +151,7 @@ def _content(
         "environment": next(iter(records.values())).environment,
         "answer": answer_for(answered(views, poses), partition.day, findings),
         "drift": _as_of(findings, lake),
+        "load": _to_load(read.states, partition.day),
         "pairs": views,
         "labels": labels,
         "scenes": drawn,
@@ -152,6 +161,21 @@ def _content(
         "sigma_svg": _sigma_svg(records),
         "residual_svg": residual_svg,
         "provenance": _provenance(list(records.values())),
+    }
+
+
+def _to_load(states: Sequence[StateRow], day: str) -> dict[str, Any] | None:
+    """What the vehicle should load, as `boresight state --json` has it; None on pages of earlier days."""
+    values = state_values(states)
+    last = max((d for row in values for d in (*row["days"], "")), default="")
+    if not values or day not in (last, values[0]["day"]):
+        return None
+    shown = [row for row in values if row["sensor"] is not None and row["sensor"] != row["parent_frame"]]
+    return {
+        "day": values[0]["day"],
+        "reference": next((row["parent_frame"] for row in shown), ""),
+        "sensors": [row | {"pose": pose_text(row["T"]), "sigma": sigma_text(row)} for row in shown],
+        "json": json.dumps(plain(values)),
     }
 
 

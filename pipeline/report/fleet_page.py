@@ -24,8 +24,12 @@ from pipeline.report.verdicts import FleetVerdicts
 from pipeline.report.window import FleetWindow
 from pipeline.report.words import dof_title
 from pipeline.rig.graph import Edge
+from pipeline.store.current import current_events
+from pipeline.store.partitions import Lake
+from pipeline.store.records import read_records
 from schemas.calibrations import DOF_NAMES
 from schemas.drift import DRIFT_STATUSES
+from schemas.service_events import SERVICE_EVENTS, ServiceEvent
 
 __all__ = ["render_fleet_page"]
 
@@ -33,6 +37,7 @@ _FINDINGS = 12  # named first; the table has them all
 _ROWS = 50  # that are on the page without a script; the script shows all of them
 _CHARTS = 24  # vehicles that the page shows charts of unasked; so many have their numbers in the page itself
 _VEHICLES_A_FILE = 40  # whose charts a file beside the page holds: some 250 kB
+_EVENTS = 20  # latest ones
 _WORK_KEYS = 8  # that the page names; the others it counts
 
 Truth = Mapping[tuple[str, str], Mapping[str, np.ndarray]]
@@ -72,6 +77,7 @@ def render_fleet_page(
         rows=rows[:_ROWS],
         total=len(rows),
         days=days,
+        events=_latest_events(album.lake, dates),
         words=DAY_LETTERS,
         link=lambda vehicle, day: f"{quote(album.folder.name)}/{day}/{quote(page_stem(vehicle))}.html",
         shown=rows[:_CHARTS],
@@ -132,6 +138,12 @@ def _write_charts(
         if path.name not in parts:  # of when the fleet had another size
             album.files.delete(path)
     return [file_of[row.vehicle] for row in rows]
+
+
+def _latest_events(lake: Lake, window: Sequence[str]) -> list[ServiceEvent]:
+    """Service events since the window's first day, the latest first."""
+    found = current_events(read_records(lake, SERVICE_EVENTS, ServiceEvent, first=min(window, default=None)))
+    return sorted(found, key=lambda e: (e.day, e.vehicle), reverse=True)[:_EVENTS]
 
 
 def _budget(fleet: FleetConfig) -> str:

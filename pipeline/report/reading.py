@@ -13,7 +13,13 @@ from pipeline.report.privacy import without_road_users
 from pipeline.report.scenes import choose_frames
 from pipeline.rig.edges import edge_of, edge_order, words_of
 from pipeline.sections import ReportConfig
-from pipeline.store.current import current_poses, current_records, prior_of, transform_of
+from pipeline.store.current import (
+    current_poses,
+    current_records,
+    current_states,
+    prior_of,
+    transform_of,
+)
 from pipeline.store.partitions import Lake, Partition, days_after
 from pipeline.store.records import last_day, read_last, read_records
 from pipeline.store.tables import COLLECTED
@@ -24,6 +30,7 @@ from schemas.drift import DRIFT, DriftFinding
 from schemas.frames import Frame
 from schemas.observations import Observation
 from schemas.poses import POSES, PoseRow
+from schemas.states import STATES, StateRow
 
 __all__ = [
     "day_poses",
@@ -39,6 +46,7 @@ __all__ = [
     "scenes_among",
     "spread_observations",
     "states_of",
+    "vehicle_states",
 ]
 
 _COMPARED = (
@@ -67,6 +75,12 @@ def day_poses(lake: Lake, partition: Partition, records: Mapping[str, Calibratio
         return []
     found = read_records(lake, POSES, PoseRow, vehicle=partition.vehicle, day=partition.day)
     return [p for p in current_poses(found) if p.method in methods]
+
+
+def vehicle_states(lake: Lake, vehicle: str, method: str) -> list[StateRow]:
+    """What a vehicle should load, by the last audit."""
+    found = [s for s in read_records(lake, STATES, StateRow, vehicle=vehicle) if s.method == method]
+    return current_states(found)
 
 
 def fleet_records(lake: Lake, method: str, window_days: int) -> list[CalibrationRecord]:

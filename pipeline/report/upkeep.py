@@ -17,10 +17,13 @@ from pipeline.report.day_page import DayRead, write_day_page
 from pipeline.report.names import page_name
 from pipeline.report.reading import records_of_day
 from pipeline.results import MadeWhenAsked, Progress, silent
+from pipeline.store.current import current_states
 from pipeline.store.files import Files
 from pipeline.store.partitions import Lake, Partition
+from pipeline.store.records import read_last
 from schemas.calibrations import CalibrationRecord
 from schemas.drift import DriftFinding, status_of
+from schemas.states import STATES, StateRow
 from schemas.versions import CODE_VERSION
 
 __all__ = ["Album", "DayJob", "FanOut", "draw_days", "one_by_one", "stamp_of"]
@@ -177,6 +180,10 @@ def _jobs(
     page = album.page.absolute() if isinstance(album.page, Path) else album.page
     sent = replace(album, lake=album.lake.absolute(), fleet=fleet, page=page)
 
+    states: dict[str, list[StateRow]] = {}
+    for row in current_states(read_last(sent.lake, STATES, StateRow, sent.method)):
+        states.setdefault(row.vehicle, []).append(row)
+
     @lru_cache(maxsize=2)  # workers end a day while others begin the next
     def records(day: str) -> dict[str, dict[str, CalibrationRecord]]:
         among = {vehicle for vehicle, of in vehicle_days if of == day}
@@ -184,7 +191,7 @@ def _jobs(
 
     def job(index: int) -> DayJob:
         vehicle, day = vehicle_days[index]
-        read = DayRead(records(day).get(vehicle, {}), findings.get(vehicle, ()))
+        read = DayRead(records(day).get(vehicle, {}), findings.get(vehicle, ()), states.get(vehicle, ()))
         return DayJob(sent, Partition(vehicle, day), read)
 
     return MadeWhenAsked(len(vehicle_days), job)

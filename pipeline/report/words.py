@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
+from pipeline.geometry.se3 import to_quaternion
 from schemas.calibrations import DOF_NAMES, FRAMES_OF_PAIR
+from schemas.words import AXIS_NAMES
 
 __all__ = [
-    "AXIS_NAMES",
     "PAIR_TITLES",
     "dof_title",
     "motion_in_words",
+    "pose_text",
     "scaled",
+    "sigma_text",
     "significant_motion",
     "unit_of",
     "with_sigma",
 ]
 
-_BODY = ("roll", "pitch", "yaw", "forward", "left", "up")
-_OPTICAL = ("pitch", "yaw", "roll", "right", "down", "forward")
-# What the DoFs of a twist mean along the axes of a kind of sensor.
-AXIS_NAMES = {"camera": _OPTICAL, "lidar": _BODY, "radar": _BODY, "base": _BODY}
 PAIR_TITLES = {pair: "-".join(frames) for pair, frames in FRAMES_OF_PAIR.items()}
 _CLEAR_SIGMAS = 3.0
 
@@ -60,3 +62,19 @@ def motion_in_words(kind: str, motion: list[float], sigma: list[float]) -> str:
     shown = significant_motion(motion, sigma)
     parts = [f"{names[k]} {with_sigma(motion[k], sigma[k], DOF_NAMES[k])}" for k in shown]
     return ", ".join(parts) or "no single axis is significant"
+
+
+def pose_text(T: np.ndarray | None) -> str:
+    """Quaternion (w, x, y, z) and translation of a pose, with all digits that matter to a car."""
+    if T is None:
+        return ""
+    numbers = [f"{v:.6f}" for v in to_quaternion(T)], [f"{v:.4f}" for v in T[:3, 3]]
+    return f"{' '.join(numbers[0])}; {' '.join(numbers[1])} m"
+
+
+def sigma_text(row: Mapping[str, Any]) -> str:
+    """Sigmas of azimuth and elevation of a state."""
+    if row["azimuth_sigma_rad"] is None:
+        return ""
+    azimuth, elevation = np.degrees([row["azimuth_sigma_rad"], row["elevation_sigma_rad"]])
+    return f"{azimuth:.3f} / {elevation:.3f}"

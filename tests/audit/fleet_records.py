@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import datetime as dt
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from itertools import groupby
 
 import numpy as np
 import pyarrow as pa
@@ -11,10 +13,14 @@ import pyarrow as pa
 from pipeline.audit import estimates
 from pipeline.audit.days import PairDays
 from pipeline.audit.estimates import COLUMNS, estimates_of
+from pipeline.calibrate.pose_rows import poses_of_records
+from pipeline.calibrate.records import Inputs
 from pipeline.geometry.se3 import adjoint, exp_se3, from_rotation_translation, inverse, to_quaternion
 from pipeline.rig.graph import Edge
+from pipeline.store.partitions import Partition
 from pipeline.store.rows import to_table
 from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, PAIRS, CalibrationRecord
+from schemas.poses import PoseRow
 
 FIRST_DAY = dt.date(2026, 3, 1)
 # Lidar axes (x forward, y left, z up) seen in the optical frame, sensors where a car has them.
@@ -68,6 +74,24 @@ def vehicle_records(
             _record(vehicle, day, pair, T[pair], cov[pair], status(day), unobservable) for pair in PAIRS
         ]
     return records
+
+
+def poses_of(records: Iterable[CalibrationRecord]) -> list[PoseRow]:
+    """Poses of the sensors, as the calibrate stage writes them with the records; no error is common to all days."""
+    rows = []
+    of_day = groupby(
+        sorted(records, key=lambda r: (r.vehicle, r.day, r.method)), lambda r: (r.vehicle, r.day, r.method)
+    )
+    for (vehicle, day, method), own in of_day:
+        whole = [
+            r if r.covariance is None or r.common_covariance is not None
+            else replace(r, common_covariance=np.zeros((6, 6)))
+            for r in own
+        ]  # fmt: skip
+        pairs = tuple(r.pair for r in whole)
+        about = Inputs(Partition(vehicle, day), method, whole[0].work_key, 0, (), pairs)
+        rows += poses_of_records(about, whole)
+    return rows
 
 
 def days_of(records: list[CalibrationRecord], held_sigma_factor: float) -> dict[Edge, PairDays]:

@@ -15,10 +15,11 @@ from pipeline.store.partitions import Lake
 from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS
 from schemas.drift import DriftFinding
+from schemas.poses import POSES
 from schemas.service_events import SERVICE_EVENTS, ServiceEvent
 from schemas.states import STATES, StateRow
 from tests.audit.fleet_records import vehicle_records
-from tests.makers.rig_records import EDGES, T_of, rig_records
+from tests.makers.rig_records import EDGES, POSE_SIGMA, T_of, pose_rows, rig_records
 
 RIGS = """
 [fleet]
@@ -129,19 +130,34 @@ def test_a_state_s_sigmas_are_of_targets_where_the_sensors_look(fleet, lake):
         ("b", ahead),
         ("c", None),
     ):  # of the radar, which looks to the left
-        rows = rig_records(vehicle, 3, np.random.default_rng(9), edges=[edge])
+        rng = np.random.default_rng(9)
+        rows = rig_records(vehicle, 3, rng, edges=[edge])
         commit_records(lake, CALIBRATIONS, [replace(r, targets_m=targets) for r in rows])
+        unsure = np.diag([np.radians(0.5) ** 2, *(POSE_SIGMA**2)[1:]])
+        columns = {"covariance": unsure, "common_covariance": 0.1 * unsure}
+        poses = [r for r in pose_rows(vehicle, 3, rng) if r.sensor in ("top", "corner")]
+        commit_records(lake, POSES, [r if r.sensor == "top" else replace(r, **columns) for r in poses])
     STATE.run(Task(fleet, lake, Window()))
-    found = {s.vehicle: np.degrees(s.elevation_sigma_rad) for s in read_records(lake, STATES, StateRow)}
-    assert found["b"] > 1.5 * found["a"]
-    assert found["c"] == pytest.approx(found["b"], rel=0.1)
+    states = [s for s in read_records(lake, STATES, StateRow) if s.azimuth_sigma_rad is not None]
+    for of_sensor in (True, False):  # a sensor and its edge to the reference have one accuracy
+        found = {
+            s.vehicle: np.degrees(s.elevation_sigma_rad)
+            for s in states
+            if (s.sensor is not None) == of_sensor and s.child_frame == "corner"
+        }
+        assert found["b"] > 1.5 * found["a"]
+        assert found["c"] == pytest.approx(found["b"], rel=0.1)
 
 
-def test_a_state_is_written_for_every_edge(fleet, lake):
-    commit_records(lake, CALIBRATIONS, rig_records("a", 6, np.random.default_rng(8)))
+def test_a_state_is_written_for_every_edge_and_sensor(fleet, lake):
+    rng = np.random.default_rng(8)
+    commit_records(lake, CALIBRATIONS, rig_records("a", 6, rng))
+    commit_records(lake, POSES, pose_rows("a", 6, rng))
     STATE.run(Task(fleet, lake, Window()))
-    states = {(s.parent_frame, s.child_frame): s for s in read_records(lake, STATES, StateRow)}
+    rows = read_records(lake, STATES, StateRow)
+    states = {(s.parent_frame, s.child_frame): s for s in rows if s.sensor is None}
     assert states.keys() == EDGE_NAMES
+    assert {s.sensor for s in rows} == {None, "top", "front", "left", "bumper", "corner"}
     for own in EDGES:
         state = states[own.parent.name, own.child.name]
         sigma = np.sqrt(np.diag(state.covariance)[3:])

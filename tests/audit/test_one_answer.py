@@ -20,6 +20,7 @@ from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake
 from schemas.calibrations import CALIBRATIONS
 from schemas.drift import DriftFinding
+from schemas.poses import POSES
 from tests.makers.fleet_pages import write_fleet_page
 
 KNOCK = {"radar": np.array([0.0, 0.0, np.radians(1.0), 0.0, 0.03, 0.0])}
@@ -108,12 +109,15 @@ def test_a_vehicle_whose_days_scatter_more_than_they_say_has_a_state_as_unsure_a
     for noise in (1.0, 3.0):
         lake = Lake.at(tmp_path / str(noise))
         records = maker.vehicle_records("v", 40, np.random.default_rng(8), noise=noise)
-        commit_records(lake, CALIBRATIONS, [replace(r, common_covariance=common) for r in records])
+        records = [replace(r, common_covariance=common) for r in records]
+        commit_records(lake, CALIBRATIONS, records)
+        commit_records(lake, POSES, maker.poses_of(records))
         AUDIT.run(Task(fleet("v"), lake, Window()))
         rows = STATE.run(Task(fleet("v"), lake, Window())).records
-        sigma[noise] = {row.pair: row.azimuth_sigma_rad for row in rows}
+        sigma[noise] = {row.pair: np.degrees(row.azimuth_sigma_rad) for row in rows if row.sensor is None}
+    # Tomorrow lies as far off as the days scatter: by three times what they state, of which the mean of 40 is free.
     for pair, stated in sigma[1.0].items():
-        assert 1.8 < sigma[3.0][pair] / stated < 3.3, pair
+        assert 1.8 < sigma[3.0][pair] / stated < 4.0, pair
 
 
 def test_a_service_event_is_withdrawn_and_an_impossible_one_is_refused(

@@ -25,7 +25,7 @@ def test_a_sure_prior_alone_certifies_nothing(seen, status):
     found = AdjustedSensor(np.full(6, float(seen)), np.full(6, seen), (EDGE,), "", (), 0.01)
     graph = RigGraph((TOP, NOSE), (EDGE,), TOP)
     top, nose = pose_rows(
-        ABOUT, graph, AdjustedRig(poses, tight, poses, {"nose": found}, {}), {}, VerifyConfig()
+        ABOUT, graph, AdjustedRig(poses, tight, poses, {"nose": found}, {}), poses, {}, VerifyConfig()
     )
     assert (top.status, nose.status) == ("accepted", status)
     assert seen or "no degree of freedom" in nose.reason
@@ -40,6 +40,6 @@ def test_a_sensor_whose_edges_are_all_left_out_says_what_fault_they_name():
     )
     edges = {EDGE: AdjustedEdge(evidence, None, checks)}
     found = AdjustedRig(poses, np.eye(6), poses, {"nose": untied}, edges)
-    _, nose = pose_rows(ABOUT, RigGraph((TOP, NOSE), (EDGE,), TOP), found, {}, VerifyConfig())
+    _, nose = pose_rows(ABOUT, RigGraph((TOP, NOSE), (EDGE,), TOP), found, poses, {}, VerifyConfig())
     assert (nose.status, nose.faults) == ("refused", ["moved_in_day"])
     assert nose.reason.endswith("top-nose; the nose moved")

@@ -1,4 +1,4 @@
-"""`boresight export` and `import` on a lake: what is not accepted never goes out unsaid, and exit codes say it."""
+"""`boresight export` and `import` on a lake: what is not accepted is named, and exit codes tell it apart."""
 
 import json
 from dataclasses import replace
@@ -34,7 +34,7 @@ def lake(tmp_path_factory):
     ]
     days = sorted({r.day for r in records})
     changed = {
-        (days[1], "lidar_radar"): {"determined": ["azimuth"]},
+        (days[1], "lidar_radar"): {"determined": ["azimuth"], "reason": "elevation known to 0.4 deg"},
         (days[2], "lidar_radar"): {"status": "held", "reason": "halves disagree", "determined": []},
         (days[2], "camera_radar"): {
             "status": "held",
@@ -112,17 +112,20 @@ def test_an_accepted_day_and_a_state_go_out_and_come_back_as_a_prior(lake, tmp_p
     assert (tmp_path / "ros" / "static_transforms.launch.py").is_file()
 
 
-def test_a_direction_that_is_not_certified_is_said_in_the_file_on_stderr_and_by_exit_code_3(
+def test_a_direction_that_is_not_certified_is_named_in_the_file_on_stderr_and_in_the_summary(
     lake, tmp_path, capsys
 ):
     folder, days = lake
     code, summary, said = run(
         capsys, "export", "urdf", "--lake", folder, "--vehicle", "v", "--day", days[1], "--out", tmp_path
     )
-    assert (code, summary["status"]) == (3, "uncertified")
+    assert (code, summary["status"]) == (0, "done")
     assert summary["not_certified"] == {"lidar_radar": "elevation not certified"}
-    assert "elevation not certified" in said
-    assert "WARNING: lidar_radar: elevation not certified" in (tmp_path / "sensors.urdf").read_text()
+    for text in (said, (tmp_path / "sensors.urdf").read_text()):
+        assert (
+            "lidar_radar: used: roll, pitch, yaw, left, up; certified: azimuth; at the prior: forward" in text
+        )
+        assert "lidar_radar: elevation known to 0.4 deg" in text
 
 
 def test_a_held_pair_is_left_out_unless_forced_and_then_marked(lake, tmp_path, capsys):
@@ -155,9 +158,23 @@ def test_a_refused_day_writes_nothing_even_when_forced(lake, tmp_path, capsys):
         tmp_path / "x.yaml",
     ]
     code, summary, _ = run(capsys, *call, "--force")
-    assert (code, summary["status"], summary["outputs"]) == (3, "refused", [])
+    assert (code, summary["status"], summary["outputs"]) == (4, "refused", [])
     assert "12 frames" in summary["not_certified"]["camera_lidar"]
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("force", [[], ["--force"]])
+def test_a_day_that_certifies_only_what_no_file_is_made_of_has_exit_code_4(tmp_path, capsys, force):
+    held = {"status": "held", "reason": "halves disagree"}
+    records = [
+        replace(r, determined=BOTH, **({} if r.pair == "camera_radar" else held))
+        for r in vehicle_records("v", 1, np.random.default_rng(1))
+    ]
+    commit_records(Lake.at(tmp_path / "lake"), CALIBRATIONS, records)
+    call = ["export", "urdf", "--lake", tmp_path / "lake", "--vehicle", "v", "--day", records[0].day, *force]
+    code, summary, _ = run(capsys, *call, "--out", tmp_path / "out")
+    assert (code, summary["status"]) == (4, "uncertified")
+    assert summary["pairs"] == (["camera_lidar", "lidar_radar"] if force else [])
 
 
 def test_the_car_hangs_on_its_own_base_where_a_file_says_where_the_lidar_sits(lake, tmp_path, capsys):

@@ -1,7 +1,6 @@
 """Calibrations of rigs of many sensors, in every format: as many poses as sensors, the same numbers when read."""
 
 import json
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -16,21 +15,16 @@ from pipeline.export.files import write_files, written_files
 from pipeline.export.formats import FORMATS, format_named
 from pipeline.geometry.se3 import adjoint, exp_se3, inverse, to_quaternion
 from pipeline.rig.edges import edge_named, words_of
-from pipeline.rig.graph import Sensor, tie
 from pipeline.store.commits import commit_records
-from pipeline.store.current import transform_of
 from pipeline.store.partitions import Lake
-from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS
 from schemas.poses import POSES
-from schemas.states import STATES, StateRow
 from tests.makers.calibrations import CAMERA, T_BASE_LIDAR, random_transform
 from tests.makers.rig_records import EDGES, T_TOP, T_of, covariance_of, pose_rows, rig_records
 from tests.makers.table_rows import make_row
 
 T_LINK_OPTICAL = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
 NAMES = {"front": "cam_front_optical", "corner": "ars548_fl"}
-REST = (("front", "camera"), ("bumper", "radar"), ("corner", "radar"))
 RIG = """
 [fleet]
 name = "vans"
@@ -283,7 +277,7 @@ def test_a_file_of_five_sensors_is_held_against_the_day_that_it_was_written_from
 
 @pytest.fixture
 def with_state(tmp_path):
-    """A lake with the state of five sensors, of which the left camera has no accepted day."""
+    """A lake with the state of five sensors, of which the left camera has no usable day."""
     lake, refused = Lake.at(tmp_path / "lake"), {"status": "refused", "reason": "nothing to see", "qw": None}
     rows = pose_rows("van", 3, np.random.default_rng(5), of={(k, "left"): refused for k in range(3)})
     commit_records(lake, CALIBRATIONS, rig_records("van", 3, np.random.default_rng(2)))
@@ -294,31 +288,12 @@ def with_state(tmp_path):
     return lake.root
 
 
-@pytest.mark.parametrize("form", [f for f in FORMATS if format_named(f).write is not None])
-def test_a_state_is_exported_as_one_rig_in_every_format_and_what_it_lacks_is_named(
-    with_state, tmp_path, capsys, form
-):
-    of_van = ("--lake", with_state, "--vehicle", "van")
-    capsys.readouterr()
-    code, summary = said(capsys, "export", form, "--out", tmp_path / "out", *of_van)
-    if code == 2:  # of days whose observations are gone
-        assert "front: the format needs intrinsics" in summary["reason"]
-        return
-    assert (code, summary["pairs"]) == (3, ["front-top", "top-bumper", "top-corner"])
-    assert summary["not_certified"]["left-top"].startswith(
-        "none: no accepted day; 2026-03-03 refused: nothing"
-    )
-    states = {s.sensor: s for s in read_records(Lake.at(with_state), STATES, StateRow) if s.sensor}
-    files = {p.name: p.read_bytes() for p in map(Path, summary["outputs"]) if "provenance" not in p.name}
-    names = FrameNames()
-    found = format_named(form).pairs(
-        files, names, [tie(Sensor("top", "lidar"), Sensor(n, k)) for n, k in REST]
-    )
-    for sensor, kind in REST:
-        T = inverse(transform_of(states[sensor])) if kind == "camera" else transform_of(states[sensor])
-        words = f"{sensor}-top" if kind == "camera" else f"top-{sensor}"
-        np.testing.assert_allclose(found[words], T, atol=1e-9)
-    assert not any("left" in p for p in found)
+@pytest.mark.parametrize("form", ["kitti", "nuscenes", "t4", "kalibr"])
+def test_a_state_of_days_whose_observations_are_gone_has_no_intrinsics(with_state, tmp_path, capsys, form):
+    call = ("export", form, "--out", tmp_path / "out", "--lake", with_state, "--vehicle", "van")
+    code, summary = said(capsys, *call)
+    assert code == 2
+    assert "front: the format needs intrinsics" in summary["reason"]
 
 
 def test_a_state_is_compared_with_the_file_that_was_written_of_it(with_state, tmp_path, capsys):
@@ -326,7 +301,7 @@ def test_a_state_is_compared_with_the_file_that_was_written_of_it(with_state, tm
     said(capsys, "export", "urdf", "--out", tmp_path / "car.urdf", *of_van)
     assert main([str(a) for a in ("compare", f"urdf:{tmp_path}/car.urdf", "state", *of_van, "--json")]) == 0
     found = json.loads(capsys.readouterr().out)["pairs"]
-    assert {p["pair"] for p in found} == {"front-top", "top-bumper", "top-corner"}
+    assert {p["pair"] for p in found} == {"front-top", "left-top", "top-bumper", "top-corner"}
     assert max(abs(axis["change"]) for p in found for axis in p["axes"]) < 1e-9
 
 
@@ -334,10 +309,12 @@ def test_the_state_of_a_rig_is_a_line_per_sensor(with_state, capsys):
     capsys.readouterr()
     assert main(["state", "--lake", str(with_state)]) == 0
     out = capsys.readouterr().out
-    assert "front in top" in out
-    assert "no accepted day; 2026-03-03 refused: nothing to see" in out
+    assert out.startswith("van, 2026-03-03, joint: load bumper, corner, front; keep left at the prior\n")
+    assert "top -> front: current, 3 days from 2026-03-01 to 2026-03-03" in out
+    assert "no usable day; 2026-03-03 refused: nothing to see" in out
     assert "front-top" not in out
+    assert max(map(len, out.splitlines())) <= 80
     assert main(["state", "--lake", str(with_state), "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)
     assert {r["sensor"] for r in rows} == {None, "top", "front", "left", "bumper", "corner"}
-    assert {r["sensor"]: r["T"] for r in rows}["left"] is None
+    np.testing.assert_allclose({r["sensor"]: r["T"] for r in rows}["left"], T_TOP["left"], atol=1e-12)

@@ -85,7 +85,8 @@ def test_warnings_frames_and_sigma_are_in_the_file_or_beside_it(name, tmp_path):
         format_named(name), calibration(pairs=sent.pairs | {"lidar_radar": held}), tmp_path / "o"
     )
     text = b"".join(files.values()).decode(errors="replace")
-    for words in ("lidar_radar is HELD", "not determined by the data", "optical: x right, y down, z forward"):
+    at_prior = "certified: nothing; at the prior: up"
+    for words in ("lidar_radar is HELD", at_prior, "optical: x right, y down, z forward"):
         assert words in text
     side = [path for path in files if path.name.endswith(".provenance.json")]
     assert bool(side) != format_named(name).holds_provenance

@@ -8,9 +8,14 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from jobs.cli import main
+from pipeline.store.commits import commit_records
+from pipeline.store.partitions import Lake
+from schemas.calibrations import CALIBRATIONS
+from tests.audit.fleet_records import vehicle_records
 from tests.makers.fleet_files import fleet_toml
 from tests.makers.processes import started
 from tests.makers.written_logs import Kit
@@ -71,6 +76,13 @@ def full_disk(folder: Path) -> list[str]:
     return command
 
 
+def nothing_certified(folder: Path) -> list[str]:
+    lake, rng = Lake.at(folder / "lake"), np.random.default_rng(1)
+    commit_records(lake, CALIBRATIONS, vehicle_records("car", 1, rng, status=lambda _day: "refused"))
+    day = ["--vehicle", "car", "--day", "2026-03-01"]
+    return ["export", "ros2", "--lake", f"{folder}/lake", *day, "--out", f"{folder}/out"]
+
+
 def mistyped_rig(folder: Path) -> list[str]:
     return night(rig_of(folder, car="default", van="mistyped"))
 
@@ -80,7 +92,8 @@ def short_drive(folder: Path) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("code", "command"), [(0, nothing_new), (1, full_disk), (2, mistyped_rig), (3, short_drive)]
+    ("code", "command"),
+    [(0, nothing_new), (1, full_disk), (2, mistyped_rig), (3, short_drive), (4, nothing_certified)],
 )
 def test_each_code_of_the_table_is_what_a_command_returns_with_the_status_it_lists(
     code, command, tmp_path, capsys
@@ -105,7 +118,7 @@ def test_a_stopped_command_ends_with_the_code_of_its_signal(code, tmp_path):
 
 
 def test_the_table_lists_no_code_that_is_not_tried_here():
-    assert set(table()) == {0, 1, 2, 3, 130, 143}
+    assert set(table()) == {0, 1, 2, 3, 4, 130, 143}
 
 
 def test_a_rig_whose_days_are_all_misconfigured_is_named_and_the_others_go_on(tmp_path, capsys):

@@ -1,6 +1,6 @@
 """Rows of any table, filled by what its schema promises."""
 
-from dataclasses import fields
+from dataclasses import MISSING, fields
 
 import numpy as np
 
@@ -58,7 +58,8 @@ def _view(view, schema, rng, nulls, free, values):
     stamps = {f"{kind}_stamp_ns": columns["stamp_ns"] for kind in SENSORS}
     own = {"log": "a.mcap", "drive": 0, "sensors": list(SENSORS), "priors": {}, **stamps}
     own |= {} if "ego_speed_mps" in columns else {"ego_speed_mps": None, "ego_yaw_rate_radps": None}
-    return view(**{f.name: (columns | own | values)[f.name] for f in fields(view)})
+    known = columns | own | values
+    return view(**{f.name: known[f.name] for f in fields(view) if f.name in known or f.default is MISSING})
 
 
 def make_value(column, rng, free):

@@ -5,9 +5,9 @@ import pytest
 from pipeline.report.day import PairView, answer_for
 
 
-def view(title, certified, status="accepted", unchecked=""):
-    made = object.__new__(PairView)  # of all that a page shows of a pair, the answer looks at these five
-    fields = {"title": title, "certified": certified, "status": status, "unchecked": unchecked}
+def view(title, certified, status="accepted"):
+    made = object.__new__(PairView)  # of all that a page shows of a pair, the answer looks at these four
+    fields = {"title": title, "certified": certified, "status": status}
     fields["sensors"] = tuple(title.split("-"))
     for name, value in fields.items():
         object.__setattr__(made, name, value)
@@ -33,17 +33,3 @@ def test_a_pair_that_was_not_accepted_is_not_said_to_be_certified(status):
     sentence = answer_for([CAMERA_LIDAR, view("lidar-radar", RADAR.certified, status)], "2026-03-02", [])[1]
     assert "azimuth only" not in sentence
     assert "Keep what the car has for lidar-radar" in sentence
-
-
-def test_what_left_the_prior_and_nothing_checks_stands_in_the_first_sentence():
-    rolled = view("lidar-radar", RADAR.certified, unchecked="roll (3.3 sigma)")
-    sort, sentence = answer_for([CAMERA_LIDAR, rolled], "2026-03-02", [])
-    assert sort == "partly"
-    assert sentence.startswith("Yes, but not in lidar-radar's roll (3.3 sigma): far from the prior")
-    held = view("camera-radar", RADAR.certified, "held")
-    assert "not in lidar-radar's roll" in answer_for([CAMERA_LIDAR, rolled, held], "2026-03-02", [])[1]
-
-
-def test_what_a_held_pair_says_needs_no_warning():
-    rolled = view("lidar-radar", RADAR.certified, "held", unchecked="roll (3.3 sigma)")
-    assert "roll" not in answer_for([CAMERA_LIDAR, rolled], "2026-03-02", [])[1]

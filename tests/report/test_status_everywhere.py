@@ -19,10 +19,13 @@ from jobs.terminal.vehicle_status import count_statuses, moved_sensors, next_ste
 from pipeline.report.stage import write_day_page
 from pipeline.stage_work import Task, Window
 from pipeline.stages import STATE
+from pipeline.store.commits import commit_records
 from pipeline.store.current import current_drift
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
+from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.drift import DRIFT, DRIFT_STATUSES, DriftFinding, next_step, status_of
+from schemas.poses import POSES
 from tests.makers.fleet_pages import write_fleet_page
 from tests.makers.stages import audit_fleet
 from tests.report.test_pages import KNOCK, _config, _store
@@ -154,12 +157,12 @@ def test_of_yellow_what_the_next_days_decide_is_told_from_what_is_sure() -> None
         (
             "UNKNOWN",
             "camera-lidar rx: 3 days of data, 5 needed",
-            "2 more accepted days; look again tomorrow: `",
+            "2 more accepted days are needed; look again tomorrow: `",
         ),
         (
             "UNKNOWN",
             "that size itself with about 5 days like these",
-            "1 more accepted day; look again tomorrow: `",
+            "1 more accepted day is needed; look again tomorrow: `",
         ),
         (
             "UNKNOWN",
@@ -169,7 +172,7 @@ def test_of_yellow_what_the_next_days_decide_is_told_from_what_is_sure() -> None
         (
             "UNKNOWN",
             "too little data to say whether a sensor moved: 1 day of data, 5 needed",
-            "4 more accepted days; look again tomorrow: `",
+            "4 more accepted days are needed; look again tomorrow: `",
         ),
         ("UNKNOWN", "no change; some of its records cannot be read", "`boresight repair --lake L`"),
     ],
@@ -179,9 +182,15 @@ def test_a_vehicle_that_is_unknown_has_a_next_step_too(status: str, reason: str,
 
 
 def test_each_command_of_the_next_steps_runs_as_it_is_printed(
-    lake: Lake, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    lake: Lake,
+    maker: ModuleType,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     own = Lake.at(shutil.copytree(lake.root, tmp_path / "a lake"))
+    records = read_records(own, CALIBRATIONS, CalibrationRecord)
+    commit_records(own, POSES, maker.poses_of(records))
     STATE.run(Task(_config(), own, Window()))
     monkeypatch.chdir(tmp_path)
     page = html.unescape(write_fleet_page(own, _config(), tmp_path / "fleet.html"))

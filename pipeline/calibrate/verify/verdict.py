@@ -38,15 +38,6 @@ _SCORED = {
     "camera_radar": np.array([False, True, False, False, False, False]),
     "lidar_radar": np.array([False, False, True, True, True, False]),
 }
-# Degrees of freedom that are unchecked where elevation is not certified, by index.
-_UNCHECKED = {
-    "camera_lidar": {},
-    "camera_radar": {0: "pitch", 2: "roll"},
-    "lidar_radar": {0: "roll", 1: "pitch", 5: "height"},
-}
-# Own sigmas from which a move that is unchecked is named: chance causes it once in 370 records. The prior's sigma is no
-# excuse: whoever loads the result replaces the prior by it.
-_UNCHECKED_MOVE_SIGMAS = 3.0
 _FAILED = -1.0  # margin of a check that yields no number
 
 
@@ -68,12 +59,7 @@ class Verdict:
     score: float = 0.0
     determined: tuple[str, ...] = field(default=())
     disproved: bool = False  # a check shows that the pose is wrong, not only unproved: nobody should use it
-    # Of an accepted record: degrees of freedom that contradict the prior and that nothing checks, how far in sigmas.
-    unchecked: Mapping[str, float] = field(default_factory=dict)
     unsure_only: bool = False  # held, but for nothing more than a sigma that is too large for the limits
-    few_only: bool = (
-        False  # held for nothing more than that, or too few frames or scenes to judge the day by itself
-    )
     mounting: tuple[
         str, ...
     ] = ()  # of the certified directions, those in which the mounting is within the limit too
@@ -98,9 +84,6 @@ class _Check:
     disproves: bool = False  # where it fails, the pose is wrong, not only unproved
     # If it fails, the pose may still be within its sigma, but the sigma is too large.
     of_sigma: bool = False
-    of_number: bool = (
-        False  # If it fails, too little was seen for a verdict; nothing speaks against the pose.
-    )
     fault: str = ""  # key of schemas.faults.FAULTS that it names
 
 
@@ -132,9 +115,9 @@ def judge(
         sentences = [check.sentence for check in evidence.failed_checks]
         if result.kind != "camera_lidar" or result.frames_used < SHORTEST:
             return Verdict("refused", "; ".join([*sentences, few]), _FAILED, faults=tuple(faults))
-        checks.append(_Check(_FAILED, few, of_number=True))
+        checks.append(_Check(_FAILED, few))
     checks += [
-        _Check(_FAILED, check.sentence, check.disproves, of_number=check.fault == "few_scenes")
+        _Check(_FAILED, check.sentence, check.disproves)
         for check in evidence.failed_checks
         if matters(check, result, evidence.claims)
     ]
@@ -160,7 +143,6 @@ def _held(failed: Sequence[_Check], score: float, faults: Mapping[str, None]) ->
         score,
         disproved=any(c.disproves for c in failed),
         unsure_only=all(c.of_sigma for c in failed),
-        few_only=all(c.of_sigma or c.of_number for c in failed),
         faults=tuple(dict.fromkeys([*faults, *(c.fault for c in failed if c.fault)])),
     )
 
@@ -174,17 +156,15 @@ def matters(check: FailedCheck, result: EdgeResult, claims: Mapping[str, Claim])
 
 
 def _accepted(result: EdgeResult, evidence: Evidence, score: float) -> Verdict:
-    """The verdict without a failed check that matters, with what it certifies and what nothing checks."""
+    """The verdict without a failed check that matters, with what it certifies."""
     claims, checks = evidence.claims, evidence.failed_checks
     doubted = {name for check in checks for name in _exceeded(check, result, claims)}
     certified = tuple(name for name, claim in claims.items() if claim.margin >= 0 and name not in doubted)
-    unchecked = _unchecked(result, certified)
     said = [_harmless(check, result, claims) for check in checks]
-    reason = "; ".join([*said, *_reservations(result, claims), *_differences(result.kind, unchecked)])
-    far = {DOF_NAMES[k]: sigmas for k, sigmas in unchecked.items()}
+    reason = "; ".join([*said, *_reservations(result, claims)])
     mounting = tuple(name for name in certified if claims[name].certifies_mounting)
     faults = tuple(faults_of(checks))
-    return Verdict("accepted", reason, score, certified, unchecked=far, mounting=mounting, faults=faults)
+    return Verdict("accepted", reason, score, certified, mounting=mounting, faults=faults)
 
 
 def _exceeded(check: FailedCheck, result: EdgeResult, claims: Mapping[str, Claim]) -> list[str]:
@@ -235,7 +215,7 @@ def _aligns_better(result: EdgeResult, test: HeldOutTest | None, limits: ChecksC
     if test is None or test.frames < limits.min_held_out_frames:
         found = 0 if test is None else test.frames
         few = f"too few held-out frames to judge: {found}, needs {limits.min_held_out_frames}"
-        return _Check(_FAILED, few, of_number=True)
+        return _Check(_FAILED, few)
     if test.z > limits.worse_alignment_z:
         # The radar's registration cost has slopes of its own (`lidar_radar/time_offset`): a right result near a prior
         # may score worse. That leaves it unproved, no more.
@@ -266,18 +246,6 @@ def _largest_move(result: EdgeResult) -> tuple[str, float]:
     return result.names[worst], float(ratio[worst])
 
 
-def _unchecked(result: EdgeResult, certified: Sequence[str]) -> dict[int, float]:
-    """DoF of a record certified for its azimuth alone that moved far from the prior: sigmas of the move by index.
-
-    Records with a certified elevation are left out: their sources of elevation are precise, and right rolls
-    move by many of their sigmas.
-    """
-    if "elevation" in certified:
-        return {}
-    moves = result.move_sigmas
-    return {k: float(moves[k]) for k in _UNCHECKED.get(result.kind, {}) if moves[k] > _UNCHECKED_MOVE_SIGMAS}
-
-
 def _worse(test: HeldOutTest) -> str:
     change = f"{test.after:.4g} after {test.before:.4g}, z = {test.z:.1f}"
     return f"held-out frames align worse than at the prior ({change})"
@@ -304,11 +272,6 @@ def _known(claim: Claim) -> str:
     off = f"{_deg(claim.shift_rad)} off by held-out frames and " if claim.is_exceeded else ""
     within = f"not within {_deg(claim.limit_rad)} at {100 * claim.confidence:.3g} %"
     return f"{off}known to {_deg(claim.sigma_rad)} (1 sigma), {within}"
-
-
-def _differences(pair: str, unchecked: Mapping[int, float]) -> list[str]:
-    far = "sigma from the prior, and no held-out frame checks it: not certified"
-    return [f"{_UNCHECKED[pair][k]} is {sigmas:.1f} {far}" for k, sigmas in unchecked.items()]
 
 
 def _reservations(result: EdgeResult, claims: Mapping[str, Claim]) -> list[str]:

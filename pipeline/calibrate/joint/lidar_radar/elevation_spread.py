@@ -20,7 +20,9 @@ __all__ = ["ElevationSpread", "beam_spacing", "elevation_spread"]
 # adds a share of its beam spacing, for points collapse onto the rings. z is wrong by the same angle at 15 m.
 # Pitch alone errs by a fifth of the noise more: on 28 days of drawn worlds and rigs (seeds 6400 to 6435) .30 deg RMS,
 # 1.7 of these floors without it (ceilings, crowns and what noise takes from one surface to the next), 1.1 with it.
-_RING_SHARE, _NOISE_SHARE = 0.05, 0.2
+# Roll errs by as much as the beams are apart. On the real car (beams 2 deg apart) the registration's roll repeats to .2
+# deg over halves of the day and is -4.0 deg; boxes have -1.0 +- 1.1, the network +.2. Without it the floor is .8.
+_RING_SHARE, _ROLL_RING_SHARE, _NOISE_SHARE = 0.05, 1.0, 0.2
 _Z_DISTANCE_M, _Z_FLOOR_M = 15.0, 0.03
 _ROLL_FACTOR = 0.7  # of pitch's at an azimuth of one radian: both sides seldom err in opposite directions
 _DEFAULT_SPACING_RAD = np.radians(1.0)
@@ -36,8 +38,16 @@ class ElevationSpread:
     def floor(self, noise_rad: float, spacing_rad: float) -> np.ndarray:
         """Sigma of roll, pitch [rad] and z [m] of the registration due to this elevation noise."""
         angle = np.hypot(noise_rad**2 / self.elevation_rad, _RING_SHARE * spacing_rad)
-        roll, z_m = _ROLL_FACTOR * angle / self.azimuth_rad, np.hypot(_Z_DISTANCE_M * angle, _Z_FLOOR_M)
+        roll = np.hypot(self.roll_of_day(noise_rad), self._roll(_ROLL_RING_SHARE * spacing_rad))
+        z_m = np.hypot(_Z_DISTANCE_M * angle, _Z_FLOOR_M)
         return np.array([roll, np.hypot(angle, _NOISE_SHARE * noise_rad), z_m])
+
+    def roll_of_day(self, noise_rad: float) -> float:
+        """Part of the roll's sigma that differs from day to day; points collapse onto the rings every day alike."""
+        return self._roll(noise_rad**2 / self.elevation_rad)
+
+    def _roll(self, angle_rad: float) -> float:
+        return float(_ROLL_FACTOR * angle_rad / self.azimuth_rad)
 
 
 def beam_spacing(observations: Sequence[Observation]) -> float:

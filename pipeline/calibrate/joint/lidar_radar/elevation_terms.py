@@ -123,7 +123,8 @@ def add_elevations(
     ge[at] = stride * equations.g[1][:, ELEVATION_DOF]
     # Roll follows from what stands left and right of the road: four edges of three vehicles scattered by .15 deg over
     # their 15 days, about a mean of .02, where the floor is .2. Pitch erred by .11 about -.13.
-    floors, roll = (along_radar(state.T_lidar_radar, floor * part) for part in (np.ones(3), np.eye(3)[0]))
+    of_day = problem.spread.roll_of_day(float(state.sigma[1])) * np.eye(3)[0]
+    floors, roll = (along_radar(state.T_lidar_radar, part) for part in (floor, of_day))
     _add_tilts(problem, state, "registration", ELEVATION_DOF, He, ge, floors, sums, Ie, roll)
     H_own, g_own = tilt_of(state.T_lidar_radar, He.sum(0), ge.sum(0))
     return np.asarray(-np.linalg.pinv(H_own, rcond=1e-6) @ g_own)

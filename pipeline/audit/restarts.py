@@ -1,0 +1,69 @@
+"""From which day on a sensor's days count: since the sensor, or the reference that its pose refers to, last moved."""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.audit.service import what_was_done
+from pipeline.rig.graph import Sensor
+from pipeline.store.partitions import days_after
+from schemas.drift import DriftFinding
+from schemas.service_events import ServiceEvent
+
+__all__ = ["drift_per_day", "last_restart"]
+
+_ALARMS = ("RED", "YELLOW")
+
+
+def last_restart(
+    sensor: Sensor,
+    reference: Sensor,
+    events: Sequence[ServiceEvent],
+    findings: Sequence[DriftFinding],
+    last_day: str,
+) -> tuple[str, str]:
+    """First day that counts for a sensor's pose, and why; empty if all days do.
+
+    The day of a service event belongs to neither side, because the drive may be before or after it. Where the audit
+    cannot tell which end of an edge moved, either may have.
+    """
+    ends = {sensor.name, reference.name}
+    first, why = "", ""
+    for event in events:
+        begin = days_after(event.day, 1)
+        if event.day <= last_day and event.sensor in {"all", *ends} and begin > first:
+            first, why = begin, f"after the {what_was_done(event)}"
+    for finding in findings:
+        begin = finding.start_day_latest or ""
+        if finding.status not in _ALARMS or begin <= first or not ends & _moved_by(finding):
+            continue
+        named = finding.moved_sensor
+        edge = f"{finding.parent_frame} or {finding.child_frame}"
+        who = f"{named} moved" if named else f"{edge} moved, and the days do not show which"
+        first, why = begin, f"since {begin}: {who}"
+    return first, why
+
+
+def drift_per_day(
+    sensor: Sensor, reference: Sensor, findings: Sequence[DriftFinding]
+) -> Float[np.ndarray, " 6"] | None:
+    """Rotation [rad] and shift [m] per day, each three times, of a slow drift found by the audit; else None."""
+    rate = np.zeros(6)
+    for finding in findings:
+        drifts = finding.status in _ALARMS and finding.kind == "slow drift"
+        if not drifts or not finding.start_day or not {sensor.name, reference.name} & _moved_by(finding):
+            continue
+        since = dt.date.fromisoformat(finding.start_day)
+        days = max((dt.date.fromisoformat(finding.day) - since).days, 1)
+        at = slice(0, 3) if finding.dof.startswith("r") else slice(3, 6)
+        rate[at] = np.maximum(rate[at], abs(finding.magnitude or 0.0) / days)
+    return rate if rate.any() else None
+
+
+def _moved_by(finding: DriftFinding) -> set[str]:
+    named = finding.moved_sensor
+    return {finding.parent_frame, finding.child_frame} if named is None else {named}

@@ -1,0 +1,180 @@
+"""Where the terms of self-supervision have their minimum over a day's frames, relative to the true extrinsics.
+
+    python tests/benchmarks/ssl_landscape.py --lake DIR/lake --fleet DIR/fleet.toml --truth DIR/truth [--frames 60]
+
+One degree of freedom at a time, the others at the truth. Axes are those of the vehicle in all pairs: x forward, y left,
+z up; for camera pairs they turn about the camera. A degree of freedom counts as determined where the standard error of
+the minimum, by the frames' own scatter, is below a third of what is asked of it (0.15 deg, 5 cm).
+
+The simulator's clocks differ by a constant that no term knows; it would show as a shift along the way driven, so it is
+taken out of the lags here (`--clocks` leaves it in).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.interpolate import CubicSpline
+
+from pipeline.config import load_fleet
+from pipeline.extrinsics.prior import read_prior
+from pipeline.geometry.se3 import exp_so3
+from pipeline.learn.batches.batch import TrainingBatch
+from pipeline.learn.batches.collate import collate
+from pipeline.learn.sample.frame_sample import About, make_row
+from pipeline.learn.train.frame_objective import PAIR_OF_TERM, FrameObjective, frame_objective, weighted
+from pipeline.learn.train.settings import LossConfig
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.views import frames_of, observations_of, perceived_days
+
+PAIRS = ("camera_lidar", "camera_radar", "lidar_radar")
+DOFS = ("roll", "pitch", "yaw", "tx", "ty", "tz")
+TOLERANCE = np.array([0.15] * 3 + [0.05] * 3)  # deg, m
+# Offsets of one degree of freedom, in tolerances.
+STEPS = np.array([-8.0, -4, -2, -1, 0, 1, 2, 4, 8])
+_CAMERA_AXES = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # of vehicle axes
+
+
+@dataclass(frozen=True)
+class Minimum:
+    """Minimum of a mean over frames along one degree of freedom [deg or m], and its standard error (inf = none)."""
+
+    offset: float
+    error: float
+
+    def determined(self, tolerance: float) -> bool:
+        """Whether the frames say where the minimum is."""
+        return self.error < tolerance / 3
+
+
+def day_batch(
+    lake: Lake, partition: Partition, fleet: Path, frames: int | None = None, prior: object = None
+) -> TrainingBatch:
+    """Rows of a perceived day as one batch, evenly spread over the day."""
+    config = load_fleet(fleet)
+    observations = list(observations_of(lake, partition))
+    logged = {f.frame_index: f for f in list(frames_of(lake, partition))}
+    reference = prior or read_prior(observations, config, partition.vehicle)
+    if frames is not None and frames < len(observations):
+        observations = [observations[i] for i in np.linspace(0, len(observations) - 1, frames).astype(int)]
+    about = About(partition.vehicle, partition.day, "rig", "train", "place", "unknown")
+    return collate(
+        [make_row(logged[o.frame_index], o, reference, about, config.prepare) for o in observations]
+    )
+
+
+def with_true_clocks(batch: TrainingBatch, truth: dict[str, float]) -> TrainingBatch:
+    """Lags by true time: stamp_camera = stamp_lidar + dt_camera_lidar, stamp_lidar = stamp_radar + dt_lidar_radar."""
+    return replace(
+        batch,
+        camera_lag_s=batch.camera_lag_s - truth["dt_camera_lidar_s"],
+        radar_lag_s=batch.radar_lag_s + truth["dt_lidar_radar_s"],
+    )
+
+
+def moved(T: np.ndarray, pair: str, dof: int, offset: float) -> np.ndarray:
+    """The pose turned [deg] or shifted [m] along an axis of the vehicle."""
+    axis = np.eye(3)[dof % 3]
+    if pair != "lidar_radar":
+        axis = _CAMERA_AXES @ axis
+    T = T.copy()
+    if dof < 3:
+        T[:3, :3] = exp_so3(np.radians(offset) * axis) @ T[:3, :3]
+    else:
+        T[:3, 3] += offset * axis
+    return T
+
+
+def minima(
+    batch: TrainingBatch, truth: dict[str, np.ndarray], weights: LossConfig
+) -> dict[str, list[Minimum]]:
+    """By term, and by pair for the weighted sum of its terms: the minimum along each degree of freedom."""
+    objective = [frame_objective(batch[slice(i, i + 8)]) for i in range(0, len(batch), 8)]
+    found: dict[str, list[Minimum]] = {}
+    for dof in range(6):
+        offsets = STEPS * TOLERANCE[dof]
+        curves = _curves(objective, truth, dof, offsets)
+        for pair in PAIRS:
+            curves[pair] = weighted({k: v for k, v in curves.items() if k in PAIR_OF_TERM}, weights, (pair,))
+        for name, curve in curves.items():
+            found.setdefault(name, []).append(minimum(offsets, curve.numpy()))
+    return found
+
+
+def minimum(offsets: np.ndarray, curve: np.ndarray) -> Minimum:
+    """Minimum of the mean of curves (offsets x frames); at the border it is none."""
+    fine = np.linspace(offsets[0], offsets[-1], 1601)
+    lowest = fine[np.argmin(CubicSpline(offsets, curve.mean(1))(fine))]
+    if lowest in (fine[0], fine[-1]) or np.ptp(curve.mean(1)) < 1e-9:
+        return Minimum(float("nan"), float("inf"))
+    # Slope of each frame's own curve about the minimum, over +- two tolerances, and the mean's second difference.
+    reach = 2 * (offsets[-1] / STEPS[-1])
+    low, middle, high = (CubicSpline(offsets, curve)(lowest + s * reach) for s in (-1, 0, 1))
+    slopes, bend = (high - low) / (2 * reach), float((high - 2 * middle + low).mean()) / reach**2
+    if bend <= 0:
+        return Minimum(float(lowest), float("inf"))
+    return Minimum(float(lowest), float(slopes.std() / np.sqrt(curve.shape[1]) / bend))
+
+
+def _curves(
+    objective: Sequence[FrameObjective], truth: dict[str, np.ndarray], dof: int, offsets: np.ndarray
+) -> dict[str, torch.Tensor]:
+    poses = {
+        pair: torch.tensor(np.stack([moved(truth[pair], pair, dof, o) for o in offsets]), dtype=torch.float32)
+        for pair in PAIRS
+    }
+    parts: dict[str, list[torch.Tensor]] = {}
+    with torch.no_grad():
+        for part in objective:
+            count = len(part.centres_rad)
+            by_pose = [
+                part.terms(*(poses[pair][i].expand(count, 4, 4) for pair in PAIRS))
+                for i in range(len(offsets))
+            ]
+            for name in by_pose[0]:
+                if name != "loop":
+                    parts.setdefault(name, []).append(torch.stack([t[name] for t in by_pose]))
+    return {name: torch.cat(values, 1) for name, values in parts.items()}
+
+
+def table(found: dict[str, list[Minimum]]) -> str:
+    """Markdown: offsets of the minima; in brackets where the frames do not determine them, - where there is none."""
+    lines = ["| term | " + " | ".join(DOFS) + " |", "|---" * 7 + "|"]
+    for name, row in found.items():
+        cells = []
+        for dof, m in enumerate(row):
+            text = "-" if np.isnan(m.offset) else f"{m.offset:+.3f}"
+            cells.append(text if text == "-" or m.determined(TOLERANCE[dof]) else f"({text})")
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Print the table of one day."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("--lake", type=Path, required=True)
+    parser.add_argument("--fleet", type=Path, required=True)
+    parser.add_argument("--truth", type=Path, required=True)
+    parser.add_argument("--frames", type=int, default=60)
+    parser.add_argument("--clocks", action="store_true")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    lake = Lake.at(args.lake)
+    for partition in perceived_days(lake):
+        told = json.loads((args.truth / partition.vehicle / f"{partition.day}.json").read_text())
+        truth = {pair: np.array(told[f"T_{pair}"]) for pair in PAIRS}
+        batch = day_batch(lake, partition, args.fleet, args.frames)
+        if not args.clocks:
+            batch = with_true_clocks(batch, told)
+        print(f"\n{partition.vehicle} {partition.day}, {len(batch)} frames\n")
+        print(table(minima(batch, truth, LossConfig())), flush=True)
+
+
+if __name__ == "__main__":
+    main()
