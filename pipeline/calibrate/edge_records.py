@@ -12,8 +12,10 @@ from pipeline.calibrate.adjust.adjusted import AdjustedRig, AdjustmentLimits
 from pipeline.calibrate.adjust.rig import adjust
 from pipeline.calibrate.judging import Judged
 from pipeline.calibrate.numerics.search_range import search_range
-from pipeline.calibrate.records import Inputs, unobservable, verdict_fields, verdict_numbers
+from pipeline.calibrate.records import Inputs, parts_numbers, unobservable, verdict_fields, verdict_numbers
 from pipeline.calibrate.verify.edge_result import EdgeResult
+from pipeline.calibrate.verify.held_out_test import HeldOutTest, paired_test
+from pipeline.calibrate.verify.held_out_update import HeldOutUpdate
 from pipeline.calibrate.verify.mounting import mounting_covariance
 from pipeline.calibrate.verify.seen_targets import targets_of
 from pipeline.calibrate.verify.target_accuracy import claims_of
@@ -22,7 +24,7 @@ from pipeline.config import FleetConfig
 from pipeline.geometry.changes import change_covariance
 from pipeline.geometry.pose_columns import pose_columns
 from pipeline.geometry.targets import DEFAULT_TARGETS
-from pipeline.rig.evidence import EdgeEvidence
+from pipeline.rig.evidence import EdgeEvidence, OtherScenes
 from pipeline.rig.extrinsics import Extrinsics
 from pipeline.rig.graph import BASE, Edge, RigGraph
 from pipeline.rig.prior import RigPrior
@@ -57,20 +59,22 @@ def judged_edge(
     targets = DEFAULT_TARGETS if targets is None else targets
     azimuth_rad, elevation_rad = fleet.verify.limits_rad(edge.kind)
     mounting = mounting_covariance(edge.kind, T, covariance, None)
+    test, update = _other_scenes(evidence.others, covariance)
     claims = claims_of(
         edge.kind,
         T,
         covariance,
-        None,
+        update,
         azimuth_rad,
         fleet.verify.confidence,
+        fleet.verify.checks.held_out_contradiction_sigmas,
         elevation_limit_rad=elevation_rad,
         mounting=mounting,
         targets=targets,
     )
     result = _result(evidence, alone, prior, fleet, targets)
-    verdict = judge(result, Evidence(None, claims, evidence.checks), fleet.verify.checks)
-    judged = Judged(verdict, None, claims, mounting, targets)
+    verdict = judge(result, Evidence(test, claims, evidence.checks), fleet.verify.checks)
+    judged = Judged(verdict, test, claims, mounting, targets)
     return JudgedEdge(replace(evidence, checks=verdict.against), alone, judged)
 
 
@@ -93,7 +97,9 @@ def record_of_edge(about: Inputs, found: JudgedEdge, frames_total: int) -> Calib
         frames_used=evidence.frames_used,
         frames_rejected=dict(evidence.frames_rejected),
         notes=[*evidence.notes, *unobservable(of_child.determined)],
-        diagnostics=dict(evidence.diagnostics) | verdict_numbers(found.judged),
+        diagnostics=dict(evidence.diagnostics)
+        | verdict_numbers(found.judged)
+        | parts_numbers(evidence.parts),
     )
 
 
@@ -110,6 +116,16 @@ def _prior_of(edge: Edge, prior: RigPrior) -> Extrinsics:
     rotation, translation = prior.sigmas_between(parent, child)
     covariance = np.diag([rotation**2] * 3 + [translation**2] * 3)
     return Extrinsics(edge.parent, {parent: np.eye(4), child: T}, (child,), covariance, covariance)
+
+
+def _other_scenes(
+    others: OtherScenes | None, covariance: np.ndarray
+) -> tuple[HeldOutTest | None, HeldOutUpdate | None]:
+    """What scenes that took no part in a fit show of the result."""
+    if others is None:
+        return None, None
+    test = None if others.cost is None else paired_test(*others.cost)
+    return test, HeldOutUpdate(others.shift, covariance, others.covariance, np.zeros((6, 6)))
 
 
 def _result(

@@ -17,7 +17,7 @@ from pipeline.calibrate.verify.constancy import PART_FLOOR_RAD
 from pipeline.calibrate.verify.failed_checks import loop_sigmas
 from pipeline.calibrate.verify.held_out_test import HeldOutTest
 from pipeline.errors import SolveError
-from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
+from pipeline.extrinsics.estimates import DayParts, PairEstimate, Prior, Solution
 from pipeline.geometry.cameras import camera_of
 from pipeline.geometry.pose_columns import pose_columns
 from pipeline.geometry.spherical import camera_direction_angles
@@ -30,6 +30,7 @@ from schemas.versions import CODE_VERSION
 __all__ = [
     "Inputs",
     "environment_of",
+    "parts_numbers",
     "record_of",
     "refused_record",
     "refused_records",
@@ -89,7 +90,7 @@ def record_of(about: Inputs, pair: str, day: SolvedDay) -> CalibrationRecord:
         | verdict_numbers(judged)
         | _camera_numbers(pair, day.observations)
         | dict(day.numbers)
-        | _parts_numbers(estimate)
+        | parts_numbers(estimate.parts)
         | {"paper_frames": float(selection.passed[pair])},
         half_days=half_days_of(
             pair, day.solution.pairs, {p: judged.verdict.faults for p, judged in day.judged.items()}
@@ -202,9 +203,8 @@ def _scaled(K: np.ndarray, factor: float) -> np.ndarray:
     return out
 
 
-def _parts_numbers(estimate: PairEstimate) -> dict[str, float]:
+def parts_numbers(parts: DayParts | None) -> dict[str, float]:
     """How far the last part of the day turns from its first, and in how many sigmas."""
-    parts = estimate.parts
     if parts is None:
         return {}
     numbers = {f"parts_{DOF_NAMES[k]}_rad": float(parts.step[k]) for k in parts.tested}

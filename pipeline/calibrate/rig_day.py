@@ -113,7 +113,7 @@ def calibrate_rig(day: RigDay, fleet: FleetConfig, about: Inputs, progress: Prog
     progress(done, done + 1, "adjust the rig")
     prior = replace(day.prior, reference=day.graph.reference).extrinsics()
     sigma_s = fleet.solve.time_offset_sigma_s
-    moved = moved_failures(found.estimates, day.graph.edges)
+    moved = moved_failures({e.edge: e.parts for e in found.evidence if e.parts}, day.graph.edges)
     records = [_without_moved(r, moved.get(_edge_of(r, day.graph), ())) for r in found.records]
     evidence = [replace(e, checks=e.checks or tuple(moved.get(e.edge, ()))) for e in found.evidence]
     rig = adjusted_rig(day.graph, prior, evidence, found.clocks, sigma_s)

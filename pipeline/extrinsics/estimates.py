@@ -97,7 +97,9 @@ class DayParts:
             floor_rad: difference between parts of one day without motion, due to different scenes (1 sigma).
         """
         sigma = np.sqrt(np.diag(self.spread[0] + self.spread[1]) + floor_rad**2)
-        return np.where(np.isin(np.arange(3), self.tested), self.step / sigma, 0.0)
+        of, found = list(self.tested), np.zeros(3)
+        found[of] = self.step[of] / sigma[of]
+        return found
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,11 +8,28 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pipeline.extrinsics.checks import FailedCheck
+from pipeline.extrinsics.estimates import DayParts
 from pipeline.rig.graph import Edge
 
-__all__ = ["EDGE", "EdgeEvidence"]
+__all__ = ["EDGE", "EdgeEvidence", "OtherScenes"]
 
 EDGE = "edge"  # owner of a bias from the matching of the two sensors
+
+
+@dataclass(frozen=True, eq=False)
+class OtherScenes:
+    """What scenes show of a fit in which they took no part: the day in two halves, each beside the other's fit.
+
+    Args:
+        shift: 6, left perturbation by which they would move T [rad, m].
+        covariance: 6 6, of that shift if both halves are right.
+        cost: before, after, block (F each): mismatch of a moment at the prior and at the other half's fit, lower is
+            better, and the block of its scene; None for an edge whose fit cannot end in another place.
+    """
+
+    shift: np.ndarray
+    covariance: np.ndarray
+    cost: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,8 +47,9 @@ class EdgeEvidence:
         bias: covariances 6 6 of errors common to all frames, by owner: a sensor's name (error of its
             intrinsics or elevation, as an apparent rotation in the sensor's axes), or EDGE (in the parent's
             axes).
-        checks: failed checks of this edge: basin, halves, held-out frames. Such an edge is left out of the
-            adjustment.
+        checks: failed checks of this edge. Such an edge is left out of the adjustment.
+        others: scenes that took no part in a fit; None for pairs, whose held-out frames are judged apart.
+        parts: first and last part of the day; None if it is too short.
         diagnostics: numbers for the record, names with units.
     """
 
@@ -46,6 +64,8 @@ class EdgeEvidence:
     checks: tuple[FailedCheck, ...] = ()
     diagnostics: Mapping[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    others: OtherScenes | None = None
+    parts: DayParts | None = None
 
     def __post_init__(self) -> None:
         assert self.T.shape == (4, 4)

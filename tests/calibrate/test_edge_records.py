@@ -11,7 +11,7 @@ from pipeline.calibrate.records import Inputs
 from pipeline.extrinsics.checks import FailedCheck
 from pipeline.geometry.changes import change_between
 from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse
-from pipeline.rig.evidence import EdgeEvidence
+from pipeline.rig.evidence import EdgeEvidence, OtherScenes
 from pipeline.rig.graph import BASE, Edge, Sensor
 from pipeline.rig.prior import RigPrior
 from pipeline.store.partitions import Partition
@@ -113,13 +113,47 @@ def test_two_lidars_are_held_to_their_prior_with_its_lever_arm():
     )
 
     def verdict(T_found):
-        evidence = EdgeEvidence(edge, T_found, 0.0, np.eye(7) * 1e6, np.zeros(7), frames_used=30)
+        better = OtherScenes(
+            np.zeros(6), np.zeros((6, 6)), (np.full(30, 0.5), np.linspace(0.1, 0.2, 30), np.arange(30))
+        )
+        evidence = EdgeEvidence(
+            edge, T_found, 0.0, np.eye(7) * 1e6, np.zeros(7), frames_used=30, others=better
+        )
         return judged_edge(evidence, prior, {}, FLEET).judged.verdict
 
     assert verdict(T).status == "accepted"
     swung = from_rotation_translation(exp_so3(np.radians([0.0, 0.0, 3.0])), np.zeros(3)) @ T
     assert verdict(swung).status == "accepted"  # the roof's lidar turned: the grille's is seen elsewhere
     assert verdict(turned(T, xyz_m=(0.0, 0.0, 0.4))).faults == ("prior",)
+
+
+def test_scenes_that_contradict_a_fit_hold_it_by_what_they_would_move_and_name_it():
+    T = mounted(0.0)
+
+    def beside(shift_deg):
+        shift, covariance = np.zeros(6), np.diag([0.0, 0.0, np.radians(0.05) ** 2, 0.0, 0.0, 0.0])
+        shift[2] = np.radians(shift_deg)
+        return judged(replace(sure(EDGE, T), others=OtherScenes(shift, covariance)), T)
+
+    found, record = beside(0.5)
+    assert (record.status, record.faults, record.determined) == ("held", ["witnesses_disagree"], [])
+    assert "azimuth is 0.50 deg off by held-out frames" in record.reason
+    assert found.evidence.checks
+    assert beside(0.1)[1].status == "accepted"  # two sigmas
+    assert beside(0.2)[1].status == "accepted"  # four, and within the limit
+    assert record.diagnostics["holdout_azimuth_shift_rad"] == pytest.approx(np.radians(0.5), rel=0.05)
+
+
+@pytest.mark.parametrize(("after", "status"), [(0.3, "accepted"), (0.5, "held"), (0.7, "held")])
+def test_two_lidars_need_a_better_alignment_of_scenes_that_took_no_part(after, status):
+    edge, T = Edge(TOP, Sensor("grille", "lidar")), turned(np.eye(4), xyz_m=(2.0, 0.0, -1.4))
+    prior = RigPrior(edge.sensors, TOP, {("top", "grille"): T}, dict.fromkeys(("top", "grille"), SIGMAS))
+    noise = np.random.default_rng(3).normal(0, 0.01, (2, 30))
+    cost = (0.5 + noise[0], after + noise[1], np.arange(30))
+    others = OtherScenes(np.zeros(6), np.zeros((6, 6)), cost)
+    moved = turned(T, (0.0, 0.0, 1.0))
+    evidence = EdgeEvidence(edge, moved, 0.0, np.eye(7) * 1e6, np.zeros(7), frames_used=30, others=others)
+    assert judged_edge(evidence, prior, {}, FLEET).judged.verdict.status == status
 
 
 def test_what_an_estimator_names_is_held_and_left_out():

@@ -63,6 +63,7 @@ def evidence_of(
         tuple(dict.fromkeys(failed)),
         estimate.diagnostics,
         tuple(estimate.notes),
+        parts=estimate.parts if estimate.observable.any() else None,
     )
 
 

@@ -16,16 +16,16 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.calibrate.edges.on_base import Series, changes_by_left, first_and_last, other_scenes
 from pipeline.calibrate.edges.road import RoadUnder, road_under
-from pipeline.calibrate.edges.robust_regression import Regression, regress
+from pipeline.calibrate.edges.robust_regression import Regression, Rows, regress
 from pipeline.calibrate.edges.sweep_travel import SweepTravel, sweep_travel
 from pipeline.calibrate.edges.sweeps import Sweep, deskewed_again
 from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.extrinsics.checks import FailedCheck
-from pipeline.geometry.changes import change_jacobian
-from pipeline.geometry.se3 import adjoint, exp_so3, from_rotation_translation, inverse
+from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse
 from pipeline.objective.ego_motion import EgoMotion
-from pipeline.rig.evidence import EDGE, EdgeEvidence
+from pipeline.rig.evidence import EDGE, EdgeEvidence, OtherScenes
 from pipeline.rig.graph import BASE, Edge
 
 __all__ = ["estimate_lidar_base"]
@@ -42,8 +42,9 @@ _AXLE_SIGMA_M = 1.5  # how far from the base the point may lie that follows the 
 _NODS_SIGMA = np.radians(0.3)  # per m/s2, along and across: 3 deg/g
 _LONGEST_WAY_M = 20.0  # beyond, scatter is the road's and no longer the registration's
 _AGAIN_RAD = np.radians(2.0)  # so far from the start the sweeps are looked at again
-_HALVES_SIGMAS = 4.0
+_MEASURED_SIGMAS = 4.0
 _AXES = ("roll", "pitch", "yaw", "height")
+_CHANGES = (0, 1, 2, 5)  # these of a change of T_base_lidar
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,13 +95,14 @@ def estimate_lidar_base(
         height_m: the lidar's measured height over the road, and its sigma.
     """
     assumed = T_base_lidar if T_base_lidar_deskewed is None else T_base_lidar_deskewed
-    T, travel, roads, shown = _solved(sweeps, ego, T_base_lidar, assumed, scenes, road_z_m)
+    T, travel, roads, rows = _solved(sweeps, ego, T_base_lidar, assumed, scenes, road_z_m)
+    shown = _Shown(**{name: regress(of) for name, of in rows.items()})
     change, variance = np.zeros(4), np.full(4, np.inf)
     for k, name in enumerate(_AXES):
         found = shown.axis(name)
         if found is not None:
             change[k], variance[k] = found
-    checks = _halves(shown)
+    checks = list[FailedCheck]()
     if height_m is not None:
         off_m = height_m[0] + road_z_m - T[2, 3]
         change[3], variance[3], contradicts = _with_measured(change[3], variance[3], off_m, height_m[1])
@@ -110,6 +112,7 @@ def estimate_lidar_base(
         edge, inverse(T), 0.0, information, gradient, _biases(edge, T),
         frames_used=len(set(roads.moment) | set(travel.moment)),
         checks=tuple(checks), diagnostics=_numbers(travel, roads, shown), notes=_notes(variance),
+        others=_others(T, shown), parts=first_and_last(T, _series(travel, roads, rows, sweeps, scenes)),
     )  # fmt: skip
 
 
@@ -120,8 +123,8 @@ def _solved(
     assumed: np.ndarray,
     scenes: Scenes,
     road_z_m: float,
-) -> tuple[np.ndarray, SweepTravel, RoadUnder, _Shown]:
-    """Pose from road and direction of travel, and their evidence there."""
+) -> tuple[np.ndarray, SweepTravel, RoadUnder, dict[str, Rows]]:
+    """Pose from road and direction of travel, and their evidence there: rows by the names of `_Shown`."""
     start = T
     skewed = ego.at_sensor(assumed)
     travel = sweep_travel(deskewed_again(sweeps, skewed, ego.at_sensor(T)), ego, T)
@@ -131,30 +134,33 @@ def _solved(
         if again and _angle(start, T) > _AGAIN_RAD:
             start, travel = T, sweep_travel(now, ego, T)
         roads = road_under(now, T, road_z_m)
-        shown = _shown(travel.seen_from(T @ inverse(start)), roads, ego, scenes, road_z_m)
+        rows = _rows(travel.seen_from(T @ inverse(start)), roads, ego, scenes, road_z_m)
         if again < 2:
+            shown = _Shown(**{name: regress(of) for name, of in rows.items()})
             T = _moved(T, [0.0 if (found := shown.axis(name)) is None else found[0] for name in _AXES])
-    return T, travel, roads, shown
+    return T, travel, roads, rows
 
 
-def _shown(travel: SweepTravel, roads: RoadUnder, ego: EgoMotion, scenes: Scenes, road_z_m: float) -> _Shown:
+def _rows(
+    travel: SweepTravel, roads: RoadUnder, ego: EgoMotion, scenes: Scenes, road_z_m: float
+) -> dict[str, Rows]:
     """Regressions on longitudinal and lateral acceleration and curvature; signs are those of the pose's change."""
     azimuth, elevation = travel.angles_rad.T
     one, free = np.ones(len(azimuth)), np.inf
     block, sigma = travel.bend, 1 / np.minimum(travel.way_m, _LONGEST_WAY_M)
     turning = np.stack([one, travel.curvature_radpm], 1)
     nodding = np.stack([one, travel.acceleration_mps2], 1)
-    yaw = regress(turning, -azimuth, sigma, block, np.array([free, _AXLE_SIGMA_M]))
-    by_way = regress(nodding, elevation, sigma, block, np.array([free, _NODS_SIGMA]))
+    yaw = Rows(turning, -azimuth, sigma, block, np.array([free, _AXLE_SIGMA_M]), one)
+    by_way = Rows(nodding, elevation, sigma, block, np.array([free, _NODS_SIGMA]), one)
     block, share = scenes.block[roads.moment], scenes.weight[roads.moment]
     one, sigma = np.ones((len(block), 1)), np.ones(len(block))
     across = (ego.velocity_mps[:, 0] * ego.yaw_rate_radps)[roads.moment]
     known = np.isfinite(across)
     leaning = np.stack([one[:, 0], np.where(known, across, 0.0)], 1)
-    roll = regress(leaning, -roads.cross_slope, sigma, block, np.array([free, _NODS_SIGMA]), share)
-    by_road = regress(one, roads.slope, sigma, block, np.array([free]), share)
-    height = regress(one, road_z_m - roads.height_m, sigma, block, np.array([free]), share)
-    return _Shown(roll, by_road, by_way, yaw, height)
+    roll = Rows(leaning, -roads.cross_slope, sigma, block, np.array([free, _NODS_SIGMA]), share)
+    by_road = Rows(one, roads.slope, sigma, block, np.array([free]), share)
+    height = Rows(one, road_z_m - roads.height_m, sigma, block, np.array([free]), share)
+    return {"roll": roll, "pitch_by_road": by_road, "pitch_by_way": by_way, "yaw": yaw, "height": height}
 
 
 def _moved(T: np.ndarray, change: Sequence[float]) -> np.ndarray:
@@ -176,21 +182,33 @@ def _with_measured(
         return off_m, sigma_m**2, []
     apart = abs(off_m - change) / np.sqrt(variance + sigma_m**2 + STANCE[3] ** 2 + _RANGES_M**2)
     told = f"the road shows a height {100 * (change - off_m):+.0f} cm beside the measured one"
-    checks = [FailedCheck(told, "witnesses_disagree")] if apart > _HALVES_SIGMAS else []
+    checks = [FailedCheck(told, "witnesses_disagree")] if apart > _MEASURED_SIGMAS else []
     total = 1 / (1 / variance + 1 / sigma_m**2)
     return total * (change / variance + off_m / sigma_m**2), total, checks
 
 
-def _halves(shown: _Shown) -> list[FailedCheck]:
-    """Axes in which the two halves of the scenes contradict each other, beyond the car's stance."""
-    of = {"roll": shown.roll, "pitch": shown.pitch_by_way, "yaw": shown.yaw, "height": shown.height}
-    checks = []
-    for (name, fit), stance in zip(of.items(), STANCE, strict=True):
-        sigmas = 0.0 if fit is None else fit.halves / float(np.hypot(np.sqrt(fit.covariance[0, 0]), stance))
-        if sigmas > _HALVES_SIGMAS:
-            told = f"{name} to the base differs by {sigmas:.0f} sigmas between halves of the scenes"
-            checks.append(FailedCheck(told, "witnesses_disagree"))
-    return checks
+def _others(T: np.ndarray, shown: _Shown) -> OtherScenes:
+    """Halves of the scenes, beyond the car's stance; pitch by the way, which is sharper than that by the road."""
+    fits = (shown.roll, shown.pitch_by_way, shown.yaw, shown.height)
+    return other_scenes(T, list(zip(_CHANGES, fits, STANCE.tolist(), strict=True)))
+
+
+def _series(
+    travel: SweepTravel,
+    roads: RoadUnder,
+    rows: dict[str, Rows],
+    sweeps: Sequence[Sweep],
+    scenes: Scenes,
+) -> list[Series]:
+    """Turns of the lidar over the day, by road and way."""
+    stamp_ns = np.array([s.stamp_ns for s in sweeps], np.int64)
+    road, way = roads.moment, travel.moment
+    return [
+        Series(axis, rows[name], scenes.scene[moment], stamp_ns[moment], float(STANCE[axis]))
+        for name, axis, moment in (
+            ("roll", 0, road), ("pitch_by_road", 1, road), ("pitch_by_way", 1, way), ("yaw", 2, way)
+        )
+    ]  # fmt: skip
 
 
 def _by_left_perturbation(
@@ -198,8 +216,7 @@ def _by_left_perturbation(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Information and gradient of T_lidar_base, from changes of T_base_lidar: roll, pitch, yaw, height."""
     J = np.zeros((4, 7))
-    # exp(xi) T_lidar_base is the inverse of exp(-Ad(T_base_lidar) xi) T_base_lidar.
-    J[:, :6] = -(change_jacobian(T) @ adjoint(T))[[0, 1, 2, 5]]
+    J[:, :6] = changes_by_left(T)[list(_CHANGES)]
     weight = 1 / variance
     return (J.T * weight) @ J, J.T @ (weight * change)
 
@@ -210,8 +227,8 @@ def _biases(edge: Edge, T: np.ndarray) -> dict[str, np.ndarray]:
     of_lidar = np.zeros((6, 6))
     of_lidar[3:, 3:] = _RANGES_M**2 * np.outer(up, up)
     axes = np.zeros((4, 6))
-    axes[[0, 1, 2, 3], [0, 1, 2, 5]] = 1.0
-    to_lidar = adjoint(inverse(T)) @ np.linalg.inv(change_jacobian(T)) @ axes.T
+    axes[range(4), _CHANGES] = 1.0
+    to_lidar = np.linalg.inv(changes_by_left(T)) @ axes.T
     return {
         BASE.name: axes.T @ np.diag(STANCE**2) @ axes,
         edge.parent.name: of_lidar,

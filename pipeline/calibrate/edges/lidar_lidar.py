@@ -9,7 +9,7 @@ the base, or a camera.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -17,20 +17,23 @@ from jaxtyping import Float
 from pipeline.calibrate.edges.point_to_plane import Surfaces, plane_equations
 from pipeline.calibrate.edges.sweeps import Sweep, deskewed_again
 from pipeline.calibrate.numerics.bias_floors import SWEEP_S, TYPICAL_RANGE_M
+from pipeline.calibrate.numerics.change_point import parts_of_day
 from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.errors import SolveError
 from pipeline.extrinsics.checks import FailedCheck
+from pipeline.extrinsics.estimates import DayParts
 from pipeline.geometry.se3 import (
     adjoint,
     exp_se3,
     exp_so3,
     from_rotation_translation,
     inverse,
+    log_se3,
     rotation_angle_rad,
     transform_points,
 )
 from pipeline.objective.ego_motion import EgoMotion
-from pipeline.rig.evidence import EDGE, EdgeEvidence
+from pipeline.rig.evidence import EDGE, EdgeEvidence, OtherScenes
 from pipeline.rig.graph import Edge
 
 __all__ = ["LidarPair", "estimate_lidar_lidar"]
@@ -52,6 +55,7 @@ _LEAST_CURVATURE = 7e-4
 # Beyond what scenes scatter by, errors of 8 simulated pairs (seeds 41 to 48): 0.01 deg RMS, 1.4 cm along x, where the
 # clock trades with it, 1 mm elsewhere; real ranges are good to 3 cm, on surfaces on all sides.
 _MATCHING = np.array([*np.radians([0.02, 0.02, 0.02]), 0.014, 0.01, 0.01])
+_WHOLLY = 0.99  # of a unit turn within the directions that the scenes determine
 _CLOCK_S = 0.002  # likewise, beyond what scenes scatter by: 1 ms RMS on those pairs
 _SWEEP_S_PER_RAD = 0.07  # of a lidar that looks ahead; one that looks around takes 0.016
 
@@ -93,8 +97,56 @@ class _End:
     dt_s: float
     H: np.ndarray  # M 7 7
     g: np.ndarray  # M 7
-    share: float
+    shares: np.ndarray  # M, of the points that meet a surface
     scatter_m: float
+
+    @property
+    def share(self) -> float:
+        """Mean over the moments."""
+        return float(self.shares.mean())
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """An end, with the directions in which the scenes determine it, in units of _UNITS.
+
+    Args:
+        V: 7 K, these directions.
+        block: of each moment.
+    """
+
+    end: _End
+    V: np.ndarray
+    block: np.ndarray
+
+    @classmethod
+    def of(cls, end: _End, block: np.ndarray) -> _Seen:
+        """The directions in which the scenes curve enough."""
+        curvature, axes = np.linalg.eigh(end.H.sum(0) / np.outer(_UNITS, _UNITS))
+        keep = curvature > max(_SHOWN_M**-2, _LEAST_CURVATURE * curvature[-1])
+        return cls(end, axes[:, keep], block)
+
+    def step(self, some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Newton step of some moments (7), and its covariance (7 7) by the scatter of their blocks."""
+        V, unit = self.V, _UNITS
+        H, g, block = self.end.H[some].sum(0), self.end.g[some], self.block[some]
+        names = np.unique(block)
+        scores = np.stack([g[block == b].sum(0) for b in names]) / unit @ V
+        spread = scores.T @ scores * len(names) / max(len(names) - 1, 1)
+        inverse_curvature = np.linalg.inv(V.T @ (H / np.outer(unit, unit)) @ V)
+        C = inverse_curvature @ spread @ inverse_curvature + inverse_curvature
+        C += np.outer(V[6], V[6]) * (_CLOCK_S * unit[6]) ** 2
+        B = V / unit[:, None]
+        return B @ (inverse_curvature @ scores.sum(0)), B @ C @ B.T
+
+    def evidence(self, A: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Information and gradient for T_parent_child."""
+        step, C = self.step(np.arange(len(self.block)))
+        B = self.V * _UNITS[:, None]
+        information = B @ np.linalg.inv(B.T @ C @ B) @ B.T
+        J = np.eye(7)  # exp(xi_base) A T = A exp(Ad(A)^-1 xi_base) T
+        J[:6, :6] = adjoint(A)
+        return J.T @ information @ J, J.T @ information @ step
 
 
 def estimate_lidar_lidar(
@@ -107,7 +159,8 @@ def estimate_lidar_lidar(
     """
     block_of, A = scenes.block, pair.T_base_parent
     moments = _moments(pair, ego, T_parent_child, scenes)
-    ends = sorted((_climbed(moments, turn) for turn in (0.0, _TURN_RAD, -_TURN_RAD)), key=lambda e: -e.share)
+    starts = [_turned(turn) for turn in (0.0, _TURN_RAD, -_TURN_RAD)]
+    ends = sorted((_climbed(moments, X) for X in starts), key=lambda e: -e.share)
     if ends[0].share < _LEAST_SHARE:
         raise SolveError(
             f"{edge.name}: {ends[0].share:.0%} of what one lidar shows lies on what the other one sees"
@@ -115,13 +168,18 @@ def estimate_lidar_lidar(
     # De-skewed along the pose that was found, the child is laid on once more.
     T = inverse(A) @ ends[0].X @ A @ T_parent_child
     moments = _moments(pair, ego, T, scenes)
-    end = _climbed(moments, 0.0)
+    end = _climbed(moments, np.eye(4))
+    frames = [m.frame for m in moments]
+    at_prior = _equations(moments, A @ T_parent_child @ inverse(A @ T), 0.0, _GATES_M[-1])
     T = inverse(A) @ end.X @ A @ T
-    information, gradient = _evidence(end, block_of[[m.frame for m in moments]], A)
+    seen = _Seen.of(end, block_of[frames])
+    information, gradient = seen.evidence(A)
     numbers = {"share": end.share, "scatter_m": end.scatter_m, "moments": float(len(moments))}
     return EdgeEvidence(
         edge, T, end.dt_s, information, gradient, {EDGE: _floor(pair, moments)},
         frames_used=len(moments), checks=_other_ends(ends), diagnostics=numbers, notes=_notes(information),
+        others=_others(seen, moments, at_prior, A, _floor(pair, moments)),
+        parts=_parts(seen, moments, T, A, [pair.parent[k].stamp_ns for k in frames], scenes.scene[frames]),
     )  # fmt: skip
 
 
@@ -165,12 +223,17 @@ def _standing(sweep: Sweep, T_base_lidar: np.ndarray, most: int, speed_mps: floa
     return transform_points(T_base_lidar, xyz_m[:: max(1, -(-len(xyz_m) // most))])
 
 
-def _climbed(moments: Sequence[_Moment], turn_rad: float) -> _End:
-    """Registration from the start, rotated about the vertical, with decreasing gates."""
-    X, dt = from_rotation_translation(exp_so3(np.array([0.0, 0.0, turn_rad])), np.zeros(3)), 0.0
+def _turned(turn_rad: float) -> np.ndarray:
+    return from_rotation_translation(exp_so3(np.array([0.0, 0.0, turn_rad])), np.zeros(3))
+
+
+def _climbed(
+    moments: Sequence[_Moment], X: np.ndarray, dt: float = 0.0, gates_m: Sequence[float] = _GATES_M
+) -> _End:
+    """Registration from a start, with decreasing gates."""
     # Nothing holds a direction that the scenes do not show but a damping that never decides between ends.
     damped = np.diag(_UNITS**2) * 1e-3
-    for gate in _GATES_M:
+    for gate in gates_m:
         for _ in range(_STEPS):
             end = _equations(moments, X, dt, gate)
             step = np.linalg.solve(end.H.sum(0) + damped, end.g.sum(0))
@@ -182,22 +245,22 @@ def _climbed(moments: Sequence[_Moment], turn_rad: float) -> _End:
 
 def _equations(moments: Sequence[_Moment], X: np.ndarray, dt_s: float, gate_m: float) -> _End:
     """Information and gradient of each moment for (xi, dt), left perturbation of X in axes of the base."""
-    H, g, share, scatter = np.zeros((len(moments), 7, 7)), np.zeros((len(moments), 7)), [], []
+    H, g, scatter = np.zeros((len(moments), 7, 7)), np.zeros((len(moments), 7)), list[float]()
+    shares = np.zeros(len(moments))
     for k, m in enumerate(moments):
         # The child measured when the car was further on: its points lie where the base then was.
         M = exp_se3(m.motion * (m.gap_s + dt_s))
         moved = transform_points(M @ X, m.points_m)
         found = plane_equations(moved, m.surfaces, gate_m)
         if found is None:
-            share.append(0.0)
             continue
         J = np.eye(6, 7)
         J[:, :6] = adjoint(M)
         J[:, 6] = m.motion
         H[k], g[k] = J.T @ found.information @ J, J.T @ found.gradient
-        share.append(found.share)
+        shares[k] = found.share
         scatter.append(found.scatter_m)
-    return _End(X, dt_s, H, g, float(np.mean(share)), float(np.median(scatter)) if scatter else float("nan"))
+    return _End(X, dt_s, H, g, shares, float(np.median(scatter)) if scatter else float("nan"))
 
 
 def _other_ends(ends: Sequence[_End]) -> tuple[FailedCheck, ...]:
@@ -223,23 +286,50 @@ def _floor(pair: LidarPair, moments: Sequence[_Moment]) -> np.ndarray:
     return np.asarray(np.diag(_MATCHING**2 + lifted**2))
 
 
-def _evidence(end: _End, blocks: np.ndarray, A: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Information and gradient for T_parent_child, from the scatter of blocks, in observed directions."""
-    H, unit = end.H.sum(0), _UNITS
-    curvature, axes = np.linalg.eigh(H / np.outer(unit, unit))
-    names = np.unique(blocks)
-    scores = np.stack([end.g[blocks == b].sum(0) for b in names]) / unit
-    spread = scores.T @ scores * len(names) / max(len(names) - 1, 1)
-    keep = curvature > max(_SHOWN_M**-2, _LEAST_CURVATURE * curvature[-1])
-    V = axes[:, keep]
-    inverse_curvature = np.diag(1 / curvature[keep])
-    clock = np.outer(V[6], V[6]) * (_CLOCK_S * unit[6]) ** 2
-    C = inverse_curvature @ (V.T @ spread @ V) @ inverse_curvature + inverse_curvature + clock
-    information = V @ np.linalg.inv(C) @ V.T * np.outer(unit, unit)
-    step = V @ inverse_curvature @ V.T @ (end.g.sum(0) / unit) / unit
-    J = np.eye(7)  # exp(xi_base) A T = A exp(Ad(A)^-1 xi_base) T
-    J[:6, :6] = adjoint(A)
-    return J.T @ information @ J, J.T @ information @ step
+def _refitted(end: _End, moments: Sequence[_Moment], some: np.ndarray) -> _End:
+    """The end of some moments, from that of all of them."""
+    return _climbed([moments[k] for k in some], end.X, end.dt_s, _GATES_M[2:])
+
+
+def _others(
+    seen: _Seen, moments: Sequence[_Moment], at_prior: _End, A: np.ndarray, floor: np.ndarray
+) -> OtherScenes:
+    """Moments of even blocks at the fit of the odd ones, and the other way round; `floor` of either, 6 6."""
+    is_even = np.unique(seen.block, return_inverse=True)[1] % 2 == 0
+    halves = [np.flatnonzero(is_even), np.flatnonzero(~is_even)]
+    if min(len(half) for half in halves) < _FEWEST_MOMENTS // 2:
+        return OtherScenes(np.zeros(6), np.zeros((6, 6)))
+    one, other = (_refitted(seen.end, moments, half) for half in halves)
+    after = np.where(is_even, *(_equations(moments, e.X, e.dt_s, _GATES_M[-1]).shares for e in (other, one)))
+    to_parent, covariance = adjoint(inverse(A)), seen.step(np.arange(len(moments)))[1][:6, :6]
+    apart = np.append(log_se3(one.X @ inverse(other.X)), one.dt_s - other.dt_s) / 2
+    shift = to_parent @ (seen.V @ (seen.V.T @ (apart * _UNITS)) / _UNITS)[:6]
+    spread = to_parent @ covariance @ to_parent.T + floor
+    return OtherScenes(shift, spread, (1 - at_prior.shares, 1 - after, seen.block))
+
+
+def _parts(
+    seen: _Seen,
+    moments: Sequence[_Moment],
+    T: np.ndarray,
+    A: np.ndarray,
+    stamp_ns: Sequence[int],
+    scene: np.ndarray,
+) -> DayParts | None:
+    """First and last part of the day."""
+    end, to_parent = seen.end, adjoint(inverse(A))
+
+    def solve(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        own = _refitted(end, moments, rows)
+        _, C = replace(seen, end=own, block=seen.block[rows]).step(np.arange(len(rows)))
+        turn = inverse(A) @ own.X @ inverse(end.X) @ A
+        return own.X, turn @ T, (to_parent @ C[:6, :6] @ to_parent.T)[:3, :3]
+
+    def score(X: np.ndarray) -> np.ndarray:
+        return _equations(moments, X, end.dt_s, _GATES_M[-1]).shares
+
+    turns = tuple(k for k in range(3) if np.linalg.norm(A[:3, k] @ seen.V[:3]) > _WHOLLY)
+    return parts_of_day(end.g, stamp_ns, solve, score, turns, scene) if turns else None
 
 
 def _notes(information: np.ndarray) -> tuple[str, ...]:

@@ -17,10 +17,10 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from pipeline.calibrate.edges.lidar_base import STANCE
-from pipeline.calibrate.edges.robust_regression import Regression, regress
+from pipeline.calibrate.edges.on_base import Series, changes_by_left, first_and_last, other_scenes
+from pipeline.calibrate.edges.robust_regression import Regression, Rows, regress
 from pipeline.calibrate.numerics.frame_blocks import Scenes
-from pipeline.geometry.changes import change_jacobian
-from pipeline.geometry.se3 import adjoint, exp_so3, from_rotation_translation, inverse
+from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse
 from pipeline.objective.ego_motion import DopplerMotion, EgoMotion
 from pipeline.objective.radar.travel import TravelDirections
 from pipeline.rig.evidence import EDGE, EdgeEvidence
@@ -70,21 +70,23 @@ def estimate_radar_base(
     """
     T = radar.T_base_radar
     for _ in range(_PASSES):
-        yaw, clock = _by_doppler(radar, T, ego, stamps)
-        pitch = None if directions is None else _pitch(directions, T, scenes)
+        turns, clock = _by_doppler(radar, T, ego, stamps)
+        yaw, pitch = regress(turns), None if directions is None else _pitch(directions, T, scenes)
         turn = np.array([0.0, 0.0 if pitch is None else pitch.value[0], 0.0 if yaw is None else yaw.value[0]])
         T = from_rotation_translation(exp_so3(turn) @ T[:3, :3], T[:3, 3])
     variance = np.array([np.inf if fit is None else fit.covariance[0, 0] for fit in (pitch, yaw, clock)])
     variance += np.array([0.0, 0.0, _CLOCK_FLOOR_S]) ** 2
     J = np.zeros((3, 7))
-    # exp(xi) T_radar_base is the inverse of exp(-Ad(T_base_radar) xi) T_base_radar.
-    J[:2, :6] = -(change_jacobian(T) @ adjoint(T))[[1, 2]]
+    J[:2, :6] = changes_by_left(T)[[1, 2]]
     J[2, 6] = 1.0
-    moments = int(np.sum(_moving(radar, ego)))
+    moving = np.flatnonzero(_moving(radar, ego))
+    day = Series(2, turns, scenes.scene[moving], stamps.moment_ns[moving], float(STANCE[2]))
+    halves = [(1, pitch, float(STANCE[1])), (2, yaw, float(STANCE[2]))]
     return EdgeEvidence(
         edge, inverse(T), 0.0 if clock is None else float(clock.value[0]), (J.T / variance) @ J, np.zeros(7),
         _biases(T, 0.0 if directions is None else directions.bias_rad()),
-        frames_used=moments, diagnostics=_numbers(yaw, moments), notes=_notes(yaw, pitch, clock),
+        frames_used=len(moving), diagnostics=_numbers(yaw, len(moving)), notes=_notes(yaw, pitch, clock),
+        others=other_scenes(T, halves), parts=first_and_last(T, [day]),
     )  # fmt: skip
 
 
@@ -95,8 +97,8 @@ def _moving(radar: DopplerMotion, ego: EgoMotion) -> np.ndarray:
 
 def _by_doppler(
     radar: DopplerMotion, T: np.ndarray, ego: EgoMotion, stamps: Stamps
-) -> tuple[Regression | None, Regression | None]:
-    """Change of yaw, and the clock: stamp of the radar minus that of the base."""
+) -> tuple[Rows, Regression | None]:
+    """Rows of the change of yaw, and the clock: stamp of the radar minus that of the base."""
     use = _moving(radar, ego)
     R, ways = T[:2, :3], np.copysign(1.0, ego.velocity_mps[use, :1])
     seen = radar.velocity_mps[use] @ R.T
@@ -109,15 +111,15 @@ def _by_doppler(
     sigma = np.hypot(aside, _LEAST_AZIMUTH_RAD)
     bend = _bends(ego, stamps)[use]
     turning = np.stack([np.ones(len(off)), turn / vx], 1)
-    yaw = regress(
-        turning, -np.arctan2(np.sin(off), np.cos(off)), sigma, bend, np.array([np.inf, _LEVER_SIGMA_M])
-    )
+    lever = np.array([np.inf, _LEVER_SIGMA_M])
+    yaw = Rows(turning, -np.arctan2(np.sin(off), np.cos(off)), sigma, bend, lever, turning[:, 0])
     faster, late_s = _accelerations(ego, stamps)[use], (stamps.scan_ns - stamps.moment_ns)[use] * 1e-9
     apart = np.hypot(*seen.T) - speed - faster * ways[:, 0] * late_s
     sigma = np.sqrt(covariance[:, 0, 0] + _LEAST_SPEED_SIGMA_MPS**2)
     design = np.stack([-faster * ways[:, 0], speed], 1)
     told = np.isfinite(faster)
-    clock = regress(design[told], apart[told], sigma[told], bend[told], np.array([_NO_CLOCK_S, _SCALE_SIGMA]))
+    prior = np.array([_NO_CLOCK_S, _SCALE_SIGMA])
+    clock = regress(Rows(design, apart, sigma, bend, prior, turning[:, 0]).some(told))
     return yaw, None if clock is None or clock.covariance[0, 0] > (_NO_CLOCK_S / 2) ** 2 else clock
 
 
@@ -125,10 +127,9 @@ def _pitch(directions: TravelDirections, T: np.ndarray, scenes: Scenes) -> Regre
     """Change of pitch that makes the velocities level in the base."""
     v = directions.velocity_mps @ T[:3, :3].T
     elevation = np.arctan2(v[:, 2], np.hypot(v[:, 0], v[:, 1])) * np.copysign(1.0, v[:, 0])
-    return regress(
-        np.ones((len(v), 1)), elevation, np.hypot(directions.sigma_rad, _LEAST_AZIMUTH_RAD),
-        scenes.block[directions.frame], np.array([np.inf]),
-    )  # fmt: skip
+    sigma, block = np.hypot(directions.sigma_rad, _LEAST_AZIMUTH_RAD), scenes.block[directions.frame]
+    one = np.ones(len(v))
+    return regress(Rows(one[:, None], elevation, sigma, block, np.array([np.inf]), one))
 
 
 def _bends(ego: EgoMotion, stamps: Stamps) -> Int64[np.ndarray, " F"]:
@@ -153,7 +154,7 @@ def _biases(T: np.ndarray, pitch_rad: float) -> dict[str, np.ndarray]:
     axes = np.zeros((4, 6))
     axes[[0, 1, 2, 3], [0, 1, 2, 5]] = 1.0
     floor = np.diag([0.0, pitch_rad, _YAW_FLOOR_RAD, 0.0, 0.0, 0.0]) ** 2
-    to_radar = adjoint(inverse(T)) @ np.linalg.inv(change_jacobian(T))
+    to_radar = np.linalg.inv(changes_by_left(T))
     return {BASE.name: axes.T @ np.diag(STANCE**2) @ axes, EDGE: to_radar @ floor @ to_radar.T}
 
 

@@ -5,14 +5,42 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
-__all__ = ["Regression", "regress"]
+__all__ = ["Regression", "Rows", "regress"]
 
 _PASSES = 20
 _SCALES = 2.0  # of the Cauchy weight, in robust standard deviations
 _LEAST = 1e-6
 _FEW = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Rows of y = A x.
+
+    Args:
+        sigma: relative sigmas of the rows; their common scale is estimated.
+        block: block of each row; errors within a block may be correlated.
+        prior_sigmas: sigmas of coefficients about 0; infinite ones are free.
+        share: weight of each row; the rows of one scene add up to one.
+    """
+
+    A: Float[np.ndarray, "N P"]
+    y: Float[np.ndarray, " N"]
+    sigma: Float[np.ndarray, " N"]
+    block: Int[np.ndarray, " N"]
+    prior_sigmas: Float[np.ndarray, " P"]
+    share: Float[np.ndarray, " N"]
+
+    def some(self, of: Bool[np.ndarray, " N"] | Int[np.ndarray, " M"]) -> Rows:
+        """Some of the rows."""
+        A, y, sigma, block, share = (a[of] for a in (self.A, self.y, self.sigma, self.block, self.share))
+        return Rows(A, y, sigma, block, self.prior_sigmas, share)
+
+    def residuals(self, x: Float[np.ndarray, " P"]) -> Float[np.ndarray, " N"]:
+        """Of all rows, in sigmas of theirs."""
+        return (self.y - self.A @ x) / self.sigma
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,34 +53,17 @@ class Regression:
     halves: float  # half of what the first coefficient differs by between even and odd blocks; NaN of too few
 
 
-def regress(
-    A: Float[np.ndarray, "N P"],
-    y: Float[np.ndarray, " N"],
-    sigma: Float[np.ndarray, " N"],
-    blocks: Int[np.ndarray, " N"],
-    prior_sigmas: Float[np.ndarray, " P"],
-    share: Float[np.ndarray, " N"] | None = None,
-) -> Regression | None:
-    """Fit y = A x.
+def regress(rows: Rows) -> Regression | None:
+    """Fit the rows.
 
     The covariance is, for each coefficient, the larger one of the sandwich estimate over blocks and that of
-    independent rows.
-
-    Args:
-        sigma: relative sigmas of the rows; their common scale is estimated.
-        blocks: block of each row; errors within a block may be correlated.
-        prior_sigmas: sigmas of coefficients about 0; infinite ones are free.
-        share: weight of each row; the rows of one scene add up to one.
-
-    Returns:
-        None for fewer than three blocks, or if there are no more rows than free coefficients.
+    independent rows. None for fewer than three blocks, or if there are no more rows than coefficients.
     """
-    names = np.unique(blocks)
-    if len(names) < 3 or len(y) <= A.shape[1]:
+    names = np.unique(rows.block)
+    if len(names) < 3 or len(rows.y) <= rows.A.shape[1]:
         return None
-    held = np.diag(1 / prior_sigmas**2)
-    share = np.ones(len(y)) if share is None else share
-    A_, y_ = A / sigma[:, None], y / sigma
+    held, blocks, share = np.diag(1 / rows.prior_sigmas**2), rows.block, rows.share
+    A_, y_ = rows.A / rows.sigma[:, None], rows.y / rows.sigma
     x, scale, weight = _fitted(A_, y_, held, share)
     H = (A_.T * weight) @ A_ / scale**2 + held
     scores = (A_ * (weight * (y_ - A_ @ x) / scale**2)[:, None]).astype(np.float64)

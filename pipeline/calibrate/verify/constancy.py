@@ -15,9 +15,10 @@ import numpy as np
 from pipeline.extrinsics.attribution import PairShift, attribute
 from pipeline.extrinsics.checks import FailedCheck
 from pipeline.extrinsics.estimates import DayParts, PairEstimate
-from pipeline.geometry.changes import change_jacobian
+from pipeline.geometry.changes import change_between, change_jacobian
+from pipeline.geometry.se3 import adjoint, inverse
 from pipeline.rig.edges import EDGE_OF_PAIR
-from pipeline.rig.graph import Edge
+from pipeline.rig.graph import BASE, Edge
 
 __all__ = ["MOVED_SIGMAS", "PART_FLOOR_RAD", "constancy_failures", "moved_failures"]
 
@@ -27,31 +28,30 @@ MOVED_SIGMAS = 4.0
 PART_FLOOR_RAD = float(np.radians(0.03) * np.sqrt(2))
 # Of what the parts are not compared in, or do not know, when the sensor is looked for.
 _ANY_RAD, _ANY_M = np.radians(20.0), 0.05
-_AXES = {
-    "camera_lidar": ("pitch", "yaw", "roll"),
-    "camera_radar": ("pitch", "yaw", "roll"),
-    "lidar_radar": ("roll", "pitch", "yaw"),
-}
+_OF_CAMERA, _OF_OTHERS = ("pitch", "yaw", "roll"), ("roll", "pitch", "yaw")  # turns about the parent's axes
 
 
 def constancy_failures(estimates: Mapping[str, PairEstimate]) -> dict[str, list[FailedCheck]]:
     """`moved_failures` of the pairs of three sensors, by pair."""
     of_edge = {EDGE_OF_PAIR[pair]: estimate for pair, estimate in estimates.items()}
-    return {edge.kind: checks for edge, checks in moved_failures(of_edge, of_edge).items()}
+    parts = {edge: e.parts for edge, e in of_edge.items() if e.parts is not None and e.observable.any()}
+    return {edge.kind: checks for edge, checks in moved_failures(parts, of_edge).items()}
 
 
-def moved_failures(
-    estimates: Mapping[Edge, PairEstimate], edges: Collection[Edge]
-) -> dict[Edge, list[FailedCheck]]:
+def moved_failures(parts: Mapping[Edge, DayParts], edges: Collection[Edge]) -> dict[Edge, list[FailedCheck]]:
     """Edges whose parts contradict each other, and the other edges of the sensors that may have moved."""
-    parts = {edge: e.parts for edge, e in estimates.items() if e.parts is not None and e.observable.any()}
     size = {edge: float(np.abs(p.sigmas(PART_FLOOR_RAD)).max()) for edge, p in parts.items()}
     moved = [edge for edge in parts if size[edge] > MOVED_SIGMAS]
     if not moved:
         return {}
     surest = max(moved, key=size.__getitem__)
     found = attribute(
-        {edge: _shift(p, edge in moved or edge.kind == "camera_lidar") for edge, p in parts.items()}
+        {
+            edge: _shift_on_base(p)
+            if edge.child == BASE
+            else _shift(p, edge in moved or edge.kind in ("camera_lidar", "lidar_lidar"))
+            for edge, p in parts.items()
+        }
     )
     ends = [s.name for s in surest.sensors]
     rivals = [s for s, share in found.probability.items() if share > 0.05] or ends
@@ -68,7 +68,8 @@ def moved_failures(
 def _failure(edge: Edge, parts: DayParts, sigmas: float, sensors: list[str]) -> FailedCheck:
     axis = int(np.argmax(np.abs(parts.sigmas(PART_FLOOR_RAD))))
     first, last = (datetime.fromtimestamp(ns / 1e9, UTC).strftime("%H:%M:%S") for ns in parts.cut_ns)
-    size = f"{_AXES[edge.kind][axis]} turned by about {np.degrees(parts.step[axis]):+.2f} deg ({sigmas:.1f} sigma)"
+    names = _OF_CAMERA if edge.parent.kind == "camera" else _OF_OTHERS
+    size = f"{names[axis]} turned by about {np.degrees(parts.step[axis]):+.2f} deg ({sigmas:.1f} sigma)"
     ends = [s.name for s in edge.sensors]
     who = " or ".join([s for s in ends if s in sensors] or ends)
     return FailedCheck(
@@ -90,3 +91,14 @@ def _shift(parts: DayParts, is_tilt_known: bool) -> PairShift:
         covariance[:2, :2] += np.eye(2) * _ANY_RAD**2
     to_twist = np.linalg.inv(change_jacobian(parts.T[0]))
     return PairShift(parts.T[0], to_twist @ change, to_twist @ covariance @ to_twist.T)
+
+
+def _shift_on_base(parts: DayParts) -> PairShift:
+    """The step of a sensor that turned in its bracket on the car, as a twist of T_sensor_base."""
+    T, covariance = parts.T[0], np.eye(6) * _ANY_M**2
+    R = T[:3, :3].T
+    untested = np.diag(~np.isin(range(3), parts.tested) * _ANY_RAD**2)
+    covariance[:3, :3] = R @ (sum(parts.spread) + untested) @ R.T + np.eye(3) * PART_FLOOR_RAD**2
+    change = change_between(inverse(T), inverse(parts.T[1]))
+    to_twist = -adjoint(T) @ np.linalg.inv(change_jacobian(inverse(T)))
+    return PairShift(T, to_twist @ change, to_twist @ covariance @ to_twist.T)

@@ -9,7 +9,7 @@ recorded, but a check failed and the prior stays current. Refused: not enough da
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -37,6 +37,7 @@ _SCORED = {
     "camera_lidar": np.ones(6, bool),
     "camera_radar": np.array([False, True, False, False, False, False]),
     "lidar_radar": np.array([False, False, True, True, True, False]),
+    "lidar_lidar": np.ones(6, bool),
 }
 _FAILED = -1.0  # margin of a check that yields no number
 
@@ -263,9 +264,12 @@ def _claims_hold(result: EdgeResult, claims: Mapping[str, Claim]) -> list[_Check
     }
     if needed is not None:
         return [checks[name] for name in needed if name in checks]
+    # Either direction will do, but none that the rest of the day contradicts.
+    wrong = [
+        replace(c, fault="witnesses_disagree") for c in checks.values() if c.margin < 0 and not c.of_sigma
+    ]
     best = max(check.margin for check in checks.values())
-    words = "; ".join(check.reason for check in checks.values())
-    return [_Check(best, words, of_sigma=all(check.of_sigma for check in checks.values()))]
+    return [*wrong, *(c for c in checks.values() if c.of_sigma and (best < 0 or c.margin == best))]
 
 
 def _known(claim: Claim) -> str:

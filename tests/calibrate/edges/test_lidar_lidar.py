@@ -7,9 +7,11 @@ import pytest
 
 from pipeline.calibrate.edges.lidar_lidar import LidarPair, _equations, _Moment, estimate_lidar_lidar
 from pipeline.calibrate.edges.point_to_plane import Surfaces
+from pipeline.calibrate.verify.constancy import MOVED_SIGMAS, PART_FLOOR_RAD
+from pipeline.calibrate.verify.held_out_test import paired_test
 from pipeline.errors import SolveError
 from pipeline.geometry.changes import change_between, change_jacobian
-from pipeline.geometry.se3 import exp_se3, inverse, perturb_exactly, transform_points
+from pipeline.geometry.se3 import exp_se3, exp_so3, inverse, perturb_exactly, transform_points
 from pipeline.rig.graph import Edge, Sensor
 from pipeline.simulate.sensors.data_sheets import LidarSpec
 from tests.makers.swept_streets import AROUND, FORWARD, Mounted, chosen, pose, swept_streets
@@ -70,6 +72,19 @@ def test_pose_and_clock_of_known_truth_come_out_within_sigma(seed, spec, T_base_
         sigma[[3, 6]] < [0.05, 0.01]
     ).all() or kind == "highway"  # whose rails do not show the way along them
     assert not evidence.checks
+    before, after, block = evidence.others.cost
+    assert paired_test(before, after, block).z < -4.0  # of moments that took no part in the fit
+    assert (np.abs(evidence.others.shift) < 4 * np.sqrt(np.diag(evidence.others.covariance))).all()
+    assert np.abs(evidence.parts.sigmas(PART_FLOOR_RAD)).max() < 3.0
+
+
+def test_a_lidar_that_turned_at_noon_shows_it(street):
+    R = exp_so3(np.radians([0.0, 0.0, 1.0]))
+    later = [replace(s, xyz_m=s.xyz_m @ R) for s in street.sweeps["side"][MOMENTS // 2 :]]
+    pair = replace(given(street), child=[*street.sweeps["side"][: MOMENTS // 2], *later])
+    found = estimate_lidar_lidar(EDGE, pair, street.ego, true_pose(), street.scenes).parts
+    assert abs(found.sigmas(PART_FLOOR_RAD)[2]) > MOVED_SIGMAS
+    assert 0.5 < np.degrees(abs(found.step[2])) < 1.3
 
 
 @pytest.mark.slow

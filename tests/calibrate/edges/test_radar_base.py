@@ -5,8 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.calibrate.edges.lidar_base import STANCE
 from pipeline.calibrate.edges.radar_base import Stamps, estimate_radar_base
 from pipeline.calibrate.numerics.frame_blocks import Scenes
+from pipeline.calibrate.verify.constancy import MOVED_SIGMAS, PART_FLOOR_RAD
 from pipeline.geometry.changes import change_between, change_jacobian
 from pipeline.geometry.se3 import adjoint, exp_so3, from_rotation_translation, inverse
 from pipeline.objective.ego_motion import DopplerMotion, EgoMotion
@@ -106,6 +108,32 @@ def test_convoys_in_some_scans_do_not_turn_the_radar():
     radar.velocity_mps[::9] += [9.0, 2.0, 0.0]
     evidence = estimate_radar_base(EDGE, radar, ego, STAMPS, ALL)
     assert abs(change_between(inverse(evidence.T), mounted(0.0))[2]) < np.radians(0.1)
+
+
+def test_a_radar_that_turned_at_noon_shows_it_with_time_and_size():
+    radar, ego = day(mounted(60.0))
+    steady = estimate_radar_base(EDGE, radar, ego, STAMPS, ALL)
+    assert np.abs(steady.parts.sigmas(PART_FLOOR_RAD)).max() < 3.0
+    later = np.arange(F) >= 100
+    radar.velocity_mps[later] @= exp_so3(np.radians([0.0, 0.0, 1.0]))
+    found = estimate_radar_base(EDGE, radar, ego, STAMPS, ALL).parts
+    assert found.tested == (2,)
+    assert abs(found.sigmas(PART_FLOOR_RAD)[2]) > 2 * MOVED_SIGMAS
+    assert np.degrees(abs(found.step[2])) == pytest.approx(1.0, abs=0.15)
+    assert abs(found.cut_ns[1] - STAMPS.moment_ns[100]) <= 10 * STEP_S * 1e9
+
+
+def test_halves_of_the_scenes_that_differ_show_by_how_much():
+    radar, ego = day(mounted(0.0))
+    agreed = estimate_radar_base(EDGE, radar, ego, STAMPS, ALL).others
+    assert abs(agreed.shift[2]) < 3 * np.sqrt(agreed.covariance[2, 2])
+    way_m = np.cumsum(np.r_[0.0, ego.velocity_mps[1:, 0] * STEP_S])
+    odd = (way_m // 50.0) % 2 == 1
+    radar.velocity_mps[odd] @= exp_so3(np.radians([0.0, 0.0, 2.0]))
+    found = estimate_radar_base(EDGE, radar, ego, STAMPS, ALL).others
+    assert np.degrees(abs(found.shift[2])) == pytest.approx(1.0, abs=0.2)
+    assert not np.any(found.shift[[0, 1]])
+    assert found.covariance[2, 2] >= STANCE[2] ** 2
 
 
 def test_velocities_with_a_lidars_elevations_show_pitch():

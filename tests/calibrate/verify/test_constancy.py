@@ -104,8 +104,7 @@ def test_the_one_sensor_of_a_rig_that_moved_loses_edges_that_do_not_show_it():
         # The grille is the parent of its pairs with radars: what it sees turns the other way.
         last = inverse(M) @ T if edge.parent.name == "grille" else T
         spread = np.diag(np.radians([20.0, 20.0, 0.06]) ** 2)
-        own = PairEstimate("lidar_radar", T, np.eye(6) * 1e-6, np.ones(6), np.ones(6, bool), 40)
-        return replace(own, parts=DayParts((T, last), (spread, spread), CUT_NS, (2,)))
+        return DayParts((T, last), (spread, spread), CUT_NS, (2,))
 
     pairs = [edge_named("lidar_radar", a, b) for a in ("grille", "top") for b in ("nose", "corner")]
     others = [edge_named("lidar_lidar", "grille", "top"), edge_named("lidar_base", "grille", "base"),
@@ -145,3 +144,29 @@ def test_a_step_that_few_scenes_cannot_prove_widens_the_sigma_by_half_of_it():
     assert sigma.max() > np.radians(0.2)
     sure = replace(found, covariance=np.eye(6))
     np.testing.assert_array_equal(with_parts(sure, few_scenes).covariance, sure.covariance)
+
+
+def test_a_radar_that_turned_on_the_car_is_told_from_the_car():
+    """Edges to the vehicle frame alone: with a second radar that stays, it is not the base."""
+
+    def on_base(name, x_m, turn_deg):
+        def at(turned_deg):
+            R = exp_so3(np.radians([0.0, 0.0, turned_deg]))
+            return inverse(from_rotation_translation(R, np.array([x_m, 0.0, 0.6])))
+
+        sure = np.diag([0.0, 0.0, np.radians(0.06) ** 2])
+        return edge_named("radar_base", name, "base"), DayParts(
+            (at(0), at(turn_deg)), (sure, sure), CUT_NS, (2,)
+        )
+
+    def failed(**turns):
+        parts = dict(on_base(name, x, turns.get(name, 0.0)) for name, x in (("nose", 3.6), ("tail", -1.0)))
+        return {edge.parent.name: checks[0].sentence for edge, checks in moved_failures(parts, parts).items()}
+
+    assert failed() == {}
+    assert failed(nose=0.1) == {}
+    assert list(failed(nose=1.0)) == ["nose"]
+    # Of T_radar_base: where the radar turns to the left, the car turns to the right.
+    assert failed(nose=1.0)["nose"].startswith("yaw turned by about -1.00 deg")
+    assert failed(nose=1.0)["nose"].endswith("the nose moved")
+    assert failed(nose=1.0, tail=1.0)["tail"].endswith("the base moved")
