@@ -25,7 +25,7 @@ __all__ = ["run_on_ray"]
 Item = TypeVar("Item")
 Outcome = TypeVar("Outcome")
 
-# Memory limit of a worker in DESIGN, for logs of any length (tests/benchmarks/results/long_log.json: 455 MB).
+# Memory limit of a worker in DESIGN, for logs of any length (long_log.json of 62eb5928: 455 MB).
 _MEMORY_BYTES = 2 << 30
 # Two tasks per CPU: the second waits for the first, and shows an autoscaler that more nodes have work.
 _TASKS_PER_CPU = 2

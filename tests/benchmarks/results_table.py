@@ -1,9 +1,9 @@
 """The result tables of both READMEs, made of results/rows.toml and of the files that it names.
 
     python -m tests.benchmarks.results_table          writes them (make results)
-    python -m tests.benchmarks.results_table --check  says whether they are what the results give
+    python -m tests.benchmarks.results_table --check  exit code 1 where they are not what the results give
 
-A row names a question, its goal, its files and how the number is computed (`results_measures.py`). What else a reader
+A row names a question, its goal, its file and how the number is computed (`results_measures.py`). What else a reader
 must know to believe the number is computed: the release of the code (results/releases.toml, kept because commits are
 rebased), whether its seeds were looked at before (results/seeds.toml), on how many distinct days it rests, and for a
 rate its 95 % interval.
@@ -51,12 +51,10 @@ def rows(path: Path = ROWS) -> list[dict[str, Any]]:
 
 
 def lines_of(row: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Lines of the row's files that its `where` chooses; a JSON file is one line."""
-    found: list[dict[str, Any]] = []
-    for name in _files(row):
-        path = RESULTS / name
-        text = path.read_text()
-        found += [json.loads(text)] if path.suffix == ".json" else [json.loads(x) for x in text.splitlines()]
+    """Lines of the row's file that its `where` chooses."""
+    if "file" not in row:
+        return []
+    found = [json.loads(line) for line in (RESULTS / row["file"]).read_text().splitlines()]
     chosen = [r for r in found if all(_at(r, key) in _listed(v) for key, v in row.get("where", {}).items())]
     if not chosen:
         raise SystemExit(f"rows.toml: no line of {row['file']} is chosen for {row['question']!r}")
@@ -66,22 +64,15 @@ def lines_of(row: Mapping[str, Any]) -> list[dict[str, Any]]:
 def render(top_only: bool) -> str:
     """The table as Markdown."""
     heads = ["question", "goal", "measured (95 % interval)", "days, look", "release"]
-    heads += [] if top_only else ["file"]
-    chosen = [row for row in rows() if row.get("top") or not top_only]
-    body = [_cells(row, top_only) for row in chosen]
+    body = [_cells(row) for row in rows() if row.get("top") or not top_only]
     return "\n".join("| " + " | ".join(cells) + " |" for cells in [heads, ["---"] * len(heads), *body])
 
 
-def _cells(row: Mapping[str, Any], top_only: bool) -> list[str]:
+def _cells(row: Mapping[str, Any]) -> list[str]:
     lines = lines_of(row)
-    text = MEASURES[row["measure"]](lines, row)
-    cells = [row["question"], row.get("goal", ""), text, f"{_days(lines, row)}, {_look(lines, row)}"]
-    cells.append(_release(lines, row))
-    return cells if top_only else [*cells, ", ".join(f"[{name}]({name})" for name in _files(row))]
-
-
-def _files(row: Mapping[str, Any]) -> list[str]:
-    return list(_listed(row["file"]))
+    text = row["measured"] if "measured" in row else MEASURES[row["measure"]](lines, row)
+    days = f"{_days(lines, row)}, {_look(lines, row)}"
+    return [row["question"], row.get("goal", ""), text, days, _release(lines, row)]
 
 
 def _listed(value: Any) -> list[Any]:
@@ -169,8 +160,7 @@ def _order(release: str) -> tuple[int, ...]:
 
 def written(path: Path, top_only: bool) -> str:
     """The file with its table made anew."""
-    text = path.read_text()
-    before, found, rest = text.partition(BEGIN)
+    before, found, rest = path.read_text().partition(BEGIN)
     after = rest.partition(END)[2]
     if not found:
         raise SystemExit(f"{path} has no line {BEGIN}")
@@ -178,7 +168,7 @@ def written(path: Path, top_only: bool) -> str:
 
 
 def main() -> None:
-    """Write both tables, or say which is not what the results give."""
+    """Write both tables, or compare them."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -264,6 +264,19 @@ def test_sigterm_stops_the_night_cleanly_and_the_next_one_goes_on(fleet, tmp_pat
     assert good_days(lake) >= WANTED_FIRST
 
 
+@pytest.mark.slow
+def test_a_night_killed_with_its_workers_is_completed_by_the_next_one(fleet, first_night, tmp_path):
+    lake = tmp_path / "lake"
+    with nightly_with_workers(fleet, lake) as (process, workers):
+        for victim in (process, *workers):
+            victim.kill()
+        process.communicate()
+        assert psutil.wait_procs(workers, timeout=5)[1] == []
+    code, summary, _ = run(*command(fleet, lake, "--workers", "2", "--to", DAYS[0]))
+    assert (code, summary["failed"]) == (3, 0)
+    assert answers(lake) == answers(first_night[0], day=DAYS[0])
+
+
 def test_days_outside_the_window_are_not_touched(tmp_path):
     (tmp_path / "fleet.toml").write_text(fleet_toml("vehicle-1"))
     log = tmp_path / "logs" / "vehicle-1" / DAYS[0] / "a.mcap"

@@ -1,13 +1,22 @@
 """Real logs whose fleet.toml names no semantics, from logs to the record of camera-lidar."""
 
+import json
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from pipeline.calibrate.day import calibrate_observations
+from pipeline.calibrate.records import Inputs
+from pipeline.config import load_fleet
+from pipeline.extrinsics.prior import perturbed, read_prior
 from pipeline.geometry.targets import errors_at_targets
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.views import observations_of
 from schemas.observations import WITHOUT_LABELS
 from tests.accuracy.days import SHARED
 from tests.benchmarks.studies.metrics import LIMITS_DEG, transform_of
-from tests.benchmarks.studies.without_semantics import LOGS, day_of, found_from
+from tests.makers.stages import ingest_day, perceive_day
 
 pytestmark = [
     pytest.mark.slow,
@@ -15,9 +24,32 @@ pytestmark = [
         not (SHARED / "astyx").is_dir(), reason="the recordings are not beside this repository"
     ),
 ]
-# How far from the truth, beside the limit, a reference may be: the real car's is good to .2 deg.
-REFERENCE_DEG = {"real_car": 0.2, "other_world": 0.0, "kitti": 0.1}
-
+RIG = """
+[fleet]
+name = "without-semantics"
+[vehicles."{vehicle}"]
+rig = "default"
+[rigs.default.camera]
+image = "/camera/front/image/compressed"
+info = "/camera/front/camera_info"
+[rigs.default.lidar]
+points = "/lidar/top/points"
+[rigs.default.prior]
+source = "tf_static"
+"""
+RADAR = """
+[rigs.default.radar]
+points = "/radar/front/points"
+doppler_field = "doppler"
+"""
+ASTYX = 'doppler_positive = "approaching"\ndoppler_period_mps = 10.394\n'
+OTHER = 'doppler_positive = "receding"\n[rigs.default.ego]\nodometry = "/vehicle/odometry"\n'
+# By log: files, vehicle-day, fleet.toml beyond camera and lidar, and how far from the truth its reference may be [deg].
+LOGS = {
+    "other_world": ("other_world/*.mcap", Partition("veh00", "2026-03-02"), RADAR + OTHER, 0.0),
+    "real_car": ("astyx/astyx-1_*", Partition("astyx-1", "2019-01-14"), RADAR + ASTYX, 0.2),
+    "kitti": ("kitti/*.mcap", Partition("kitti-1", "2011-09-26"), "", 0.1),
+}
 ACCEPTED = {
     "other_world"
 }  # from every start; the real car is held from some, whose azimuth is known to .08 deg
@@ -25,10 +57,31 @@ ACCEPTED = {
 
 @pytest.fixture(scope="module")
 def day(request, tmp_path_factory):
-    name = request.param
-    if not sorted(SHARED.glob(LOGS[name][0])):
+    """Observations without labels, and the truth; of real cars the logged calibration."""
+    name, folder = request.param, tmp_path_factory.mktemp(request.param)
+    files, partition, extra, _ = LOGS[name]
+    if not (logs := sorted(SHARED.glob(files))):
         pytest.skip(f"no recordings of {name} beside this repository")
-    return name, *day_of(name, tmp_path_factory.mktemp(name))
+    (folder / "fleet.toml").write_text(RIG.format(vehicle=partition.vehicle) + extra)
+    fleet, lake = load_fleet(folder / "fleet.toml"), Lake.at(folder / "lake")
+    ingest_day(logs, partition, fleet, lake)
+    perceive_day(partition, fleet, lake)
+    rows = list(observations_of(lake, partition))
+    given, truth = read_prior(rows, fleet, partition.vehicle), (SHARED / files).parent / "truth.json"
+    if truth.exists():
+        known = {k: np.array(T) for k, T in json.loads(truth.read_text()).items() if k.startswith("T_")}
+        given = replace(given, T_camera_lidar=known["T_camera_lidar"], T_lidar_radar=known["T_lidar_radar"])
+    return name, rows, fleet, given
+
+
+def found_from(rows, fleet, true, deg, seed, *, is_hidden=False):
+    """The record of camera-lidar from a start that is turned by `deg`; a hidden one states the sigmas of the truth."""
+    start = perturbed(true, (deg, 0.025 * deg), seed)
+    if is_hidden:
+        start = replace(start, **{k: getattr(true, k) for k in ("rotation_sigma_rad", "translation_sigma_m")})
+    inputs = Inputs(Partition("any", "2026-03-02"), "joint", "test", seed, (), pairs=("camera_lidar",))
+    [record] = calibrate_observations(rows, start, fleet, inputs)
+    return record
 
 
 def off_deg(record, true):
@@ -41,10 +94,10 @@ def off_deg(record, true):
 def test_a_real_log_without_labels_is_right_from_two_degrees_and_says_how(day):
     name, rows, fleet, true = day
     assert all(o.is_unlabelled for o in rows if "camera" in o.sensors)
-    record, _ = found_from(rows, fleet, true, 2.0, 41)
+    record = found_from(rows, fleet, true, 2.0, 41)
     unsure_only = record.diagnostics["unsure_only"] > 0
     assert record.status == "accepted" or (unsure_only and name not in ACCEPTED), record.reason
-    assert off_deg(record, true) < LIMITS_DEG["camera_lidar"] + REFERENCE_DEG[name]
+    assert off_deg(record, true) < LIMITS_DEG["camera_lidar"] + LOGS[name][3]
     assert WITHOUT_LABELS in record.notes
 
 
@@ -52,6 +105,6 @@ def test_a_real_log_without_labels_is_right_from_two_degrees_and_says_how(day):
 @pytest.mark.parametrize(("deg", "is_hidden"), [(5.0, False), (5.0, True)])
 def test_a_start_far_off_is_not_accepted_wrong(day, deg, is_hidden):
     name, rows, fleet, true = day
-    record, _ = found_from(rows, fleet, true, deg, 42, is_hidden=is_hidden)
-    is_right = off_deg(record, true) < LIMITS_DEG["camera_lidar"] + REFERENCE_DEG[name]
+    record = found_from(rows, fleet, true, deg, 42, is_hidden=is_hidden)
+    is_right = off_deg(record, true) < LIMITS_DEG["camera_lidar"] + LOGS[name][3]
     assert record.status != "accepted" or is_right, record.reason

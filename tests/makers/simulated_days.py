@@ -11,6 +11,7 @@ from pipeline.simulate.faults import parse_faults
 from pipeline.simulate.fleet import FleetSpec
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import observations_of
+from schemas.calibrations import PAIRS
 from schemas.observations import Observation
 from tests.makers.kept_days import kept_fleet
 from tests.makers.stages import ingest_day, perceive_day
@@ -67,10 +68,10 @@ def perceived(
     perceive_day(partition, config, lake)
     path = folder / "truth" / partition.vehicle / f"{partition.day}.json"
     told = json.loads(path.read_text()) if path.exists() else {}
-    truth = {
-        p: np.array(told[f"T_{p}"])
-        for p in ("camera_lidar", "camera_radar", "lidar_radar")
-        if f"T_{p}" in told
-    }
     rows = list(observations_of(lake, partition))
-    return SimulatedDay(lake, partition, config, fleet_file, rows, truth, told)
+    return SimulatedDay(lake, partition, config, fleet_file, rows, transforms_of(told), told)
+
+
+def transforms_of(told: dict[str, float]) -> dict[str, np.ndarray]:
+    """Transforms by pair of a truth file's content."""
+    return {p: np.array(told[f"T_{p}"]) for p in PAIRS if f"T_{p}" in told}

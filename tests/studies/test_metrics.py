@@ -10,9 +10,7 @@ from pipeline.geometry.changes import change_covariance
 from pipeline.geometry.se3 import exp_se3, exp_so3, from_rotation_translation, to_quaternion
 from schemas.calibrations import CalibrationRecord
 from tests.benchmarks.studies.metrics import claimed_error_deg, inside_share, measure, rms, within
-from tests.benchmarks.studies.radar_elevation import summary as elevation_summary
 from tests.benchmarks.studies.sigma_coverage import summary as coverage_summary
-from tests.benchmarks.studies.verdict import is_right, precision_recall, worse_than_prior
 from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR
 
 PRIOR = Prior(T_CAMERA_LIDAR, T_LIDAR_RADAR, np.radians(2.0), 0.05)
@@ -63,24 +61,11 @@ def test_limits_ask_of_all_angles_or_only_of_those_that_are_claimed():
     assert claimed_error_deg("camera_lidar", measured | {"observable": [0] * 6}, claimed=True) == 0.0
 
 
-def test_worse_than_the_prior_means_by_more_than_the_own_sigma():
-    sigma = [np.radians(0.1)] * 6
-    measured = {"az_deg": 0.25, "el_deg": 0.0, "prior_az_deg": 0.2, "prior_el_deg": 0.0, "sigma": sigma}
-    assert not worse_than_prior("camera_lidar", measured)
-    assert worse_than_prior("camera_lidar", measured | {"az_deg": 0.35})
-
-
 def test_shares_and_root_mean_squares():
     errors = np.array([0.5, -1.5, 2.5, -3.5])
     assert inside_share(errors, np.ones(4), 1) == 0.25
     assert inside_share(errors, np.ones(4), 3) == 0.75
     assert rms([3.0, 4.0]) == pytest.approx(np.sqrt(12.5))
-
-
-def test_precision_falls_and_recall_rises_where_the_surest_are_right():
-    curve = precision_recall([(0.1, False), (0.9, True), (0.5, True), (0.3, False)])
-    assert [c[1] for c in curve] == pytest.approx([1, 1, 2 / 3, 0.5])
-    assert [c[2] for c in curve] == pytest.approx([0.5, 1, 1, 1])
 
 
 def test_the_coverage_table_names_what_lies_beyond_three_sigma():
@@ -93,23 +78,6 @@ def test_the_coverage_table_names_what_lies_beyond_three_sigma():
     assert "camera_lidar ty" not in text
 
 
-def test_a_held_record_that_vouches_for_nothing_is_not_right_by_that():
-    """Right is what the pair is good for; a radar's elevation counts only where a record vouches for it."""
-    silent = {
-        "az_deg": 12.0,
-        "el_deg": 0.1,
-        "observable": [0] * 6,
-        "diagnostics": {"vouched_az": 0, "vouched_el": 0},
-    }
-    assert within("lidar_radar", silent, claimed=True)
-    assert not is_right("lidar_radar", silent)
-    assert not is_right("camera_lidar", silent)
-    coarse = silent | {"az_deg": 0.1, "el_deg": 2.0}
-    assert is_right("lidar_radar", coarse)
-    assert not is_right("camera_lidar", coarse)
-    assert not is_right("lidar_radar", coarse | {"diagnostics": {"vouched_az": 1, "vouched_el": 1}})
-
-
 def elevation_result(error_deg, seed=1, status="accepted", offset_rad=0.0):
     said = {"registration_pitch_offset_rad": 0.0, "registration_pitch_sigma_rad": 0.002}
     said |= {"doppler_pitch_offset_rad": offset_rad, "doppler_pitch_sigma_rad": 0.003, "doppler_frames": 38.0}
@@ -118,16 +86,3 @@ def elevation_result(error_deg, seed=1, status="accepted", offset_rad=0.0):
         "sigma": [0.004, 0.001, 0.004, 1, 1, 1], "diagnostics": said | {"vouched_el": 1.0},
     }  # fmt: skip
     return {"day": {"rig": "paper", "environment": "urban", "seed": seed}, "pairs": {"lidar_radar": pair}}
-
-
-def test_certified_elevations_beyond_their_limit_and_witnesses_apart_are_counted():
-    far = elevation_result(0.7, seed=2, offset_rad=0.02)
-    held = elevation_result(0.1, seed=3, status="held")
-    text = elevation_summary([elevation_result(0.2), far, held])
-    assert "certified within 0.6 deg 2/3 (66.7 %), right 1/2 (50.0 %)" in text
-    assert "witnesses agree within two sigmas 2/3 (66.7 %)" in text
-    assert "RMS pitch error/sigma 2.00" in text
-    assert (
-        "| paper urban 2 | 38 | accepted | 0.700 | 0.800 | +2.0 | +0.00 +- 0.11 | - | +1.15 +- 0.17 | - | yes |"
-        in text
-    )

@@ -126,7 +126,7 @@ _ALL: Final = (
 )  # fmt: skip
 RIGS: Final = {rig.name: rig for rig in _ALL}
 # Suffixes of rig names, and their changes of the radars. `-dirty` matches two real-like days by statistics
-# that need no truth (tests/benchmarks/studies/radar_dirt.py).
+# that need no truth (study radar_dirt of 62eb5928).
 _RADARS: Final[dict[str, dict[str, Any]]] = {
     "-flat": {"has_elevation": False},
     "-dirty": {"road_mirror": 0.3, "elevation_noise": 2.0},

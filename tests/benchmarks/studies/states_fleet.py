@@ -164,5 +164,5 @@ def _pointing(mounting: Mounting) -> dict[str, np.ndarray]:
     for name, mounted in mounting.sensors.items():
         bias_rad = 0.0 if mounted.errors is None else mounted.errors.elevation_bias_rad
         down = from_rotation_translation(exp_so3(np.array([0.0, bias_rad, 0.0])), np.zeros(3))
-        found[name] = mounted.T_points @ down
+        found[name] = mounted.T_vehicle @ down
     return found

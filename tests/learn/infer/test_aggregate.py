@@ -11,7 +11,6 @@ from pipeline.geometry.se3 import exp_se3, inverse, log_se3
 from pipeline.geometry.targets import errors_at_targets
 from pipeline.learn.infer import aggregate
 from pipeline.learn.infer.aggregate import Answers, day_estimate, twists_about
-from tests.benchmarks.studies.ssl_bias import shared_bias
 from tests.makers.solve_scenes import T_CAMERA_LIDAR
 
 PRIOR_SD = np.array([*np.radians([1.2] * 3), *[0.05] * 3])
@@ -52,20 +51,6 @@ def test_a_network_that_knows_is_followed_whatever_the_prior_says(monkeypatch):
     assert np.abs(off(found, x)[:3]).max() < np.radians(0.12)
     assert np.abs(off(found, x)[3:]).max() < 0.03
     assert found.frames_used == 96
-
-
-def test_what_all_answers_are_off_by_alike_is_found_where_the_truth_is_known():
-    rng = np.random.default_rng(4)
-    x, bias = (
-        PRIOR_SD * [0.3, -0.4, 0.2, 0.3, -0.2, 0.4],
-        np.array([*np.radians([0.1, -0.2, 0.3]), 0.05, -0.02, 0.03]),
-    )
-    answers = day(rng, np.zeros((6, 6)), x, noise=NOISE / 5)
-    S = aggregate._bearing_of_twist(answers.T_centre)
-    biased = replace(answers, answer=answers.answer + np.linalg.solve(S, bias))
-    found = shared_bias(biased, exp_se3(x) @ answers.T_centre)
-    assert np.degrees(found[:3]) == pytest.approx(np.degrees(bias[:3]), abs=0.05)
-    assert found[3:] == pytest.approx(bias[3:], abs=0.012)
 
 
 def test_shifts_are_believed_of_a_network_that_was_measured_and_of_no_other():

@@ -12,7 +12,7 @@ from pipeline.learn.train.settings import PAIRS_OF, AugmentConfig, LossConfig
 from pipeline.objective.differentiable.poses import exp_so3, pose, transform_points
 from pipeline.objective.differentiable.terms import soft_clamp, soft_minimum
 from schemas.training import UNKNOWN_CLASS
-from tests.benchmarks.ssl_landscape import PAIRS, TOLERANCE, day_batch, minima, with_true_clocks
+from tests.makers.loss_landscapes import PAIRS, TOLERANCE, day_batch, minima, with_true_clocks
 from tests.makers.simulated_days import simulated_day
 from tests.makers.torch_poses import exp_se3
 

@@ -1,19 +1,15 @@
 """Where the terms of self-supervision have their minimum over a day's frames, relative to the true extrinsics.
 
-    python tests/benchmarks/ssl_landscape.py --lake DIR/lake --fleet DIR/fleet.toml --truth DIR/truth [--frames 60]
-
 One degree of freedom at a time, the others at the truth. Axes are those of the vehicle in all pairs: x forward, y left,
 z up; for camera pairs they turn about the camera. A degree of freedom counts as determined where the standard error of
 the minimum, by the frames' own scatter, is below a third of what is asked of it (0.15 deg, 5 cm).
 
-The simulator's clocks differ by a constant that no term knows; it would show as a shift along the way driven, so it is
-taken out of the lags here (`--clocks` leaves it in).
+The simulator's clocks differ by a constant that no term knows; it would show as a shift along the way driven, so
+`with_true_clocks` takes it out of the lags.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,10 +27,9 @@ from pipeline.learn.sample.frame_sample import About, make_row
 from pipeline.learn.train.frame_objective import PAIR_OF_TERM, FrameObjective, frame_objective, weighted
 from pipeline.learn.train.settings import LossConfig
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.views import frames_of, observations_of, perceived_days
+from pipeline.store.views import frames_of, observations_of
 
 PAIRS = ("camera_lidar", "camera_radar", "lidar_radar")
-DOFS = ("roll", "pitch", "yaw", "tx", "ty", "tz")
 TOLERANCE = np.array([0.15] * 3 + [0.05] * 3)  # deg, m
 # Offsets of one degree of freedom, in tolerances.
 STEPS = np.array([-8.0, -4, -2, -1, 0, 1, 2, 4, 8])
@@ -53,16 +48,12 @@ class Minimum:
         return self.error < tolerance / 3
 
 
-def day_batch(
-    lake: Lake, partition: Partition, fleet: Path, frames: int | None = None, prior: object = None
-) -> TrainingBatch:
-    """Rows of a perceived day as one batch, evenly spread over the day."""
+def day_batch(lake: Lake, partition: Partition, fleet: Path) -> TrainingBatch:
+    """Rows of a perceived day as one batch."""
     config = load_fleet(fleet)
     observations = list(observations_of(lake, partition))
     logged = {f.frame_index: f for f in list(frames_of(lake, partition))}
-    reference = prior or read_prior(observations, config, partition.vehicle)
-    if frames is not None and frames < len(observations):
-        observations = [observations[i] for i in np.linspace(0, len(observations) - 1, frames).astype(int)]
+    reference = read_prior(observations, config, partition.vehicle)
     about = About(partition.vehicle, partition.day, "rig", "train", "place", "unknown")
     return collate(
         [make_row(logged[o.frame_index], o, reference, about, config.prepare) for o in observations]
@@ -141,40 +132,3 @@ def _curves(
                 if name != "loop":
                     parts.setdefault(name, []).append(torch.stack([t[name] for t in by_pose]))
     return {name: torch.cat(values, 1) for name, values in parts.items()}
-
-
-def table(found: dict[str, list[Minimum]]) -> str:
-    """Markdown: offsets of the minima; in brackets where the frames do not determine them, - where there is none."""
-    lines = ["| term | " + " | ".join(DOFS) + " |", "|---" * 7 + "|"]
-    for name, row in found.items():
-        cells = []
-        for dof, m in enumerate(row):
-            text = "-" if np.isnan(m.offset) else f"{m.offset:+.3f}"
-            cells.append(text if text == "-" or m.determined(TOLERANCE[dof]) else f"({text})")
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
-
-
-def main() -> None:
-    """Print the table of one day."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
-    parser.add_argument("--lake", type=Path, required=True)
-    parser.add_argument("--fleet", type=Path, required=True)
-    parser.add_argument("--truth", type=Path, required=True)
-    parser.add_argument("--frames", type=int, default=60)
-    parser.add_argument("--clocks", action="store_true")
-    args = parser.parse_args()
-    torch.set_num_threads(1)
-    lake = Lake.at(args.lake)
-    for partition in perceived_days(lake):
-        told = json.loads((args.truth / partition.vehicle / f"{partition.day}.json").read_text())
-        truth = {pair: np.array(told[f"T_{pair}"]) for pair in PAIRS}
-        batch = day_batch(lake, partition, args.fleet, args.frames)
-        if not args.clocks:
-            batch = with_true_clocks(batch, told)
-        print(f"\n{partition.vehicle} {partition.day}, {len(batch)} frames\n")
-        print(table(minima(batch, truth, LossConfig())), flush=True)
-
-
-if __name__ == "__main__":
-    main()
