@@ -63,9 +63,12 @@ def check(fleet: Path, /, *logs: Path, rig: str | None = None, json: bool = Fals
 
 
 def _following(report: CheckReport, fleet: Path, logs: tuple[Path, ...]) -> list[str]:
-    """Commands to type next: `models fetch` if cameras lack labels, `nightly` if logs can be calibrated."""
+    """Next steps: what to correct, and then this check again; else labels for cameras, and the night."""
     from pipeline.ingest.propose.logs_pattern import nightly_command
 
+    if report.corrections:
+        again = f"boresight check {fleet} {' '.join(map(str, logs[:2]))}{' ...' if len(logs) > 2 else ''}"
+        return [*report.corrections, again]
     unlabelled = any("boresight models fetch" in why for v in report.verdicts for why in v.reasons)
     fetch = ["boresight models fetch"] if unlabelled else []
     return fetch if report.answer == "no" else [*fetch, *nightly_command(fleet, logs)]

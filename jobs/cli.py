@@ -7,16 +7,17 @@ was held or refused; 130 and 143 after SIGINT and SIGTERM.
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any
+from typing import Any, TextIO
 
 from cyclopts import App, CycloptsError
 
 from jobs.terminal.logging import configure, logger
-from jobs.terminal.summary import print_summary
+from jobs.terminal.summary import is_terminal, print_summary
 from pipeline.errors import BoresightError
 from pipeline.store.atomic_write import NO_SPACE
 
@@ -155,11 +156,24 @@ def _stop(signum: int, _frame: Any) -> None:
 
 
 def _end(command: str, reason: str, code: int) -> int:
-    logger().error(reason, command=command, exit_code=code)
-    if command != "show":  # stdout of `show` contains only records
+    """Print the error: a line on stderr, the summary on stdout, and one of the two where both go to one place."""
+    is_shown_once = _is_one_place(sys.stdout, sys.stderr)
+    has_summary = command != "show"  # stdout of `show` contains only records
+    if not (is_shown_once and has_summary) or is_terminal():
+        logger().error(reason, command=command, exit_code=code)
+    if has_summary and not (is_shown_once and is_terminal()):
         status = {3: "refused", INTERRUPTED: "stopped", TERMINATED: "stopped"}.get(code, "failed")
         print_summary(command, status, reason=reason, exit_code=code)
     return code
+
+
+def _is_one_place(*streams: TextIO) -> bool:
+    """Whether streams are the same terminal, file or pipe."""
+    try:
+        places = [os.fstat(stream.fileno()) for stream in streams]
+    except (OSError, ValueError):  # not a file, as in tests
+        return False
+    return len({(place.st_dev, place.st_ino) for place in places}) == 1
 
 
 if __name__ == "__main__":

@@ -44,7 +44,7 @@ def nightly(
     Args:
         fleet: fleet.toml.
         lake: folder of the tables, created if missing.
-        logs: pattern such as "logs/{vehicle}/{day}/*.mcap" or "data/{vehicle}_{day}_*"; quoted.
+        logs: pattern such as "logs/{vehicle}/{day}/*" or "data/{vehicle}_{day}_*"; quoted.
             In a bucket: "s3://BUCKET/{vehicle}/{day}/*.mcap".
         from_day: first day, YYYY-MM-DD.
         to_day: last day.
@@ -62,13 +62,15 @@ def nightly(
         dry_run: only list what would run, and why.
     """
     from jobs.extras import require
+    from jobs.terminal.logging import logger
     from jobs.terminal.summary import exit_code
+    from jobs.terminal.vehicle_status import next_steps
     from pipeline.calibrate.methods import method_named
     from pipeline.config import load_fleet
     from pipeline.extrinsics.prior import require_named_files
-    from pipeline.fleet.misconfigured import night_statuses, rigs_to_mend
+    from pipeline.fleet.misconfigured import night_statuses, to_mend, vehicles_to_mend
     from pipeline.fleet.nightly import Night
-    from pipeline.fleet.pattern import find_vehicle_days
+    from pipeline.fleet.pattern import find_logs
     from pipeline.fleet.tally import Tally
     from pipeline.store.partitions import Lake
 
@@ -79,9 +81,12 @@ def nightly(
     require_named_files(config)
     tables = Lake.at(lake)
     night = Night(config, tables, method_named(method or config.audit.method).name, seed)
-    days = find_vehicle_days(logs, from_day, to_day)
+    found = find_logs(logs, from_day, to_day)
+    days, beside = found.days, found.problem
+    if beside:
+        logger().warning(beside)
     if dry_run:
-        return _print_plan(night, days)
+        return _print_plan(night, days, beside)
     tally, began_s = Tally(), time.time()
     outcomes = watch_night(night, days, executor, workers, tally.add)
     drawing = Drawing(report, pictures, executor, workers)
@@ -90,7 +95,16 @@ def nightly(
     code = exit_code([*night_statuses(outcomes, config), *(["incomplete"] if tables.damage else [])])
     if metrics is not None:
         _write_metrics(metrics, config.fleet.name, tally, code, began_s, findings)
-    _print_end(tables, code, outcomes, findings, pages, rigs_to_mend(outcomes, config))
+    steps = next_steps(findings, str(tables), vehicles_to_mend(outcomes, config))
+    told = {"misconfigured": to_mend(outcomes, config), "logs_left_out": beside}
+    _print_end(
+        tables,
+        code,
+        outcomes,
+        findings,
+        pages,
+        told | {"next_steps": [*([beside] if beside else []), *steps]},
+    )
     return held_exit_code if code == 3 else code
 
 
@@ -115,11 +129,11 @@ def _print_end(
     outcomes: Sequence[DayOutcome],
     findings: Sequence[DriftFinding],
     pages: Sequence[str],
-    mend: Mapping[str, str],
+    told: Mapping[str, Any],
 ) -> None:
     """Print the summary of the night: statuses of vehicle-days and vehicles, and paths of the pages."""
     from jobs.terminal.summary import left_out, print_summary
-    from jobs.terminal.vehicle_status import count_statuses, moved_sensors, next_steps
+    from jobs.terminal.vehicle_status import count_statuses, moved_sensors
     from schemas.words import DAY_WORDS
 
     held = any(o.status in ("partly", "held", "refused") for o in outcomes)
@@ -131,14 +145,13 @@ def _print_end(
         problems=[_problem(o) for o in outcomes if o.status not in ("done", "cached")],
         statuses=count_statuses(findings),
         moved=moved_sensors(findings),
-        next_steps=next_steps(findings, str(tables)),
-        misconfigured=mend,
+        **told,
         damaged=left_out(tables),
         report=pages[0] if pages else None,
     )
 
 
-def _print_plan(night: Night, days: Sequence[VehicleDay]) -> int:
+def _print_plan(night: Night, days: Sequence[VehicleDay], beside: str) -> int:
     """Print what the night would do with each vehicle-day, as a table and as the summary."""
     import sys
     from dataclasses import asdict
@@ -154,6 +167,7 @@ def _print_plan(night: Night, days: Sequence[VehicleDay]) -> int:
         "planned",
         vehicle_days=len(plans),
         would_run=sum(bool(p.stages) for p in plans),
+        logs_left_out=beside,
         damaged=left_out(night.lake),
         plan=[asdict(p) for p in plans],
     )

@@ -63,24 +63,13 @@ def service(
 
 def _require_known(lake: Lake, of: Partition) -> None:
     """Raise ConfigError for a day in the future or a vehicle without a day in the lake."""
-    from difflib import get_close_matches
-
+    from jobs.terminal.known_vehicles import require_vehicle
     from pipeline.errors import ConfigError
     from pipeline.store.partitions import last_possible_day
-    from pipeline.store.records import read_columns
-    from schemas.calibrations import CALIBRATIONS
-    from schemas.outcomes import OUTCOMES
 
     if of.day > last_possible_day():
         raise ConfigError("command line", "day", f"{of.day} has not come yet")
-    known: set[str] = set()
-    for table in (CALIBRATIONS, OUTCOMES):
-        rows = read_columns(lake, table, (), first=None, last=None)
-        known |= set() if rows is None else set(rows["vehicle"].unique().to_pylist())
-    if of.vehicle not in known and not any(rows.may_be_of(of.vehicle) for rows in lake.lost):
-        like = get_close_matches(of.vehicle, sorted(known)) or sorted(known)[:5]
-        problem = f"the lake has no day of {of.vehicle!r}; it has {', '.join(like) or 'no vehicle'}"
-        raise ConfigError("command line", "vehicle", problem)
+    require_vehicle(lake, of.vehicle)
 
 
 def _require_sensor(lake: Lake, vehicle: str, sensor: str) -> None:

@@ -23,6 +23,7 @@ def state(*, lake: str, vehicle: str | None = None, method: str = "joint", json:
             T_parent_child, null if unknown), and "in_words". Rows of sensors (`sensor` is not null) and rows of the
             edges, composed of the sensors' poses.
     """
+    from jobs.terminal.known_vehicles import require_vehicle
     from jobs.terminal.state_text import state_text
     from jobs.terminal.summary import left_out, print_json
     from pipeline.store.current import current_states
@@ -33,6 +34,8 @@ def state(*, lake: str, vehicle: str | None = None, method: str = "joint", json:
 
     tables = Lake.existing(lake)
     found = [r for r in read_records(tables, STATES, StateRow, vehicle=vehicle) if r.method == method]
+    if vehicle is not None and not found:
+        require_vehicle(tables, vehicle)
     rows = state_values(current_states(found))
     if json:
         print_json(rows, indent=2)

@@ -38,6 +38,9 @@ def status(
     """
     from dataclasses import asdict
 
+    from rich.markup import escape
+
+    from jobs.terminal.known_vehicles import require_vehicle
     from jobs.terminal.summary import exit_code, left_out, print_summary
     from jobs.terminal.vehicle_status import count_statuses, moved_sensors, next_steps, status_lines
     from pipeline.fleet.status import day_statuses
@@ -54,9 +57,14 @@ def status(
     rows = read_records(tables, OUTCOMES, OutcomeRow, first=first, last=last)
     method = method or _audited_method(tables, {r.method for r in rows if r.method})
     found = [s for s in day_statuses(rows, method) if vehicle in (None, s.vehicle)]
+    last_of = {s.vehicle: s.day for s in found if s.stage}  # in order of day
     findings = read_last(tables, DRIFT, DriftFinding, method, vehicle=vehicle)
+    if vehicle is not None and not (found or findings):
+        require_vehicle(tables, vehicle)
+    mend = {s.vehicle: s.mend for s in found if s.mend and s.day == last_of.get(s.vehicle)}
+    steps = next_steps(findings, lake, mend)
     if not json:
-        _print_table(found, [*status_lines(findings), *next_steps(findings, lake)])
+        _print_table(found, [*status_lines(findings), *map(escape, steps)])
     damaged = left_out(tables)
     ended = "incomplete" if damaged else "done"
     print_summary(
@@ -70,7 +78,8 @@ def status(
         **{name: sum(s.status == name for s in found) for name in DAY_WORDS},
         statuses=count_statuses(findings),
         moved=moved_sensors(findings),
-        next_steps=next_steps(findings, lake),
+        next_steps=steps,
+        misconfigured=mend,
         damaged=damaged,
         **({"days": [asdict(s) for s in found]} if json else {}),
     )

@@ -23,6 +23,7 @@ from pipeline.store.partitions import Partition, work_key
 from pipeline.store.records import read_records
 from pipeline.store.tables import Manifest, PartitionWriter, absence, read_manifest, write_partition
 from schemas.columns import TableSchema
+from schemas.moments import STATED_FAULTS
 from schemas.versions import CODE_VERSION
 
 __all__ = ["Stage", "run_stage", "try_stage", "why_to_run"]
@@ -228,6 +229,7 @@ def _partition_outcome(stage: Stage, task: Task, work: Work, status: str, manife
         kept=dict(manifest.kept),
         rejected=dict(manifest.rejected),
         reason=reason,
+        faults=tuple(manifest.extra.get(STATED_FAULTS, ())),
         outputs=[str(task.lake.folder(manifest.table, task.partition))],
     )
 

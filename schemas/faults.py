@@ -9,7 +9,7 @@ __all__ = ["FAULTS", "in_words"]
 
 FAULTS: Final = {
     "camera_info": "the camera's intrinsics differ from its CameraInfo",
-    "configuration": "fleet.toml, or a file that it names, must be mended: no other log helps",
+    "configuration": "fleet.toml, a file that it names, or the recording must be corrected: no other log helps",
     "doppler": "the sign, unit or period of the radar's Doppler differs from the configuration",
     "few_scenes": "the day has too few different scenes",
     "labels_offset": "semantic labels are shifted against their image",

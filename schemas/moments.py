@@ -13,6 +13,7 @@ __all__ = [
     "PRIOR",
     "SAME_SCENE_NS",
     "SENSORS_ABSENT",
+    "STATED_FAULTS",
     "SWEEPS_LOGGED",
     "SWEEPS_PLANNED",
     "SWEEPS_READ",
@@ -27,6 +28,8 @@ __all__ = [
 SWEEPS_LOGGED, SWEEPS_PLANNED, SWEEPS_READ = "sweeps_in_logs", "sweeps_planned", "sweeps_read"
 # Key in the manifest's `extra`: reasons for missing sensors of moments, by sensor.
 SENSORS_ABSENT = "sensors_absent"
+# Likewise: faults that the remarks state, keys of `schemas.faults.FAULTS`.
+STATED_FAULTS = "faults"
 # Keys in the manifest's `extra`: table of each sensor's file; logged transforms, each with log, parent,
 # child, q (w x y z) and t_m of T_parent_child.
 FILES: Final = "files"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from shlex import quote
 from typing import Any
 
@@ -11,6 +11,7 @@ from schemas.drift import DRIFT_STATUSES, DriftFinding, VehicleStatus, next_step
 
 __all__ = ["count_statuses", "moved_sensors", "next_steps", "status_lines"]
 
+_NAMED = 3  # vehicles named before one correction
 _STEPS = 40  # vehicles whose next steps are printed; the others are counted
 
 
@@ -39,14 +40,31 @@ def moved_sensors(findings: Sequence[DriftFinding]) -> list[dict[str, Any]]:
     ]
 
 
-def next_steps(findings: Sequence[DriftFinding], lake: str) -> list[str]:
-    """A sentence with the next command for each vehicle that is not GREEN, the most urgent first."""
+def next_steps(
+    findings: Sequence[DriftFinding], lake: str, mend: Mapping[str, str] | None = None
+) -> list[str]:
+    """A sentence with the next command for each vehicle that is not GREEN, the most urgent first.
+
+    Before them what `mend` has: corrections by vehicle, which no further day of an UNKNOWN one replaces.
+    """
+    mend = mend or {}
+    first = [_correction(what, mend) for what in dict.fromkeys(mend.values())]
     rows = _by_vehicle(findings)
-    urgent = sorted(rows, key=lambda v: (DRIFT_STATUSES.index(status_of(rows[v]).status), v))
+    status = {vehicle: status_of(own).status for vehicle, own in rows.items()}
+    waiting = {vehicle for vehicle in mend if status.get(vehicle) == "UNKNOWN"}
+    urgent = sorted(rows.keys() - waiting, key=lambda v: (DRIFT_STATUSES.index(status[v]), v))
     steps = [step for vehicle in urgent if (step := next_step(rows[vehicle], lake))]
     left = len(steps) - _STEPS
     more = [f"and {left} other vehicles: `boresight status --lake {quote(lake)} --vehicle VEHICLE`"]
-    return steps[:_STEPS] + more * (left > 0)
+    return first[:_STEPS] + steps[:_STEPS] + more * (left > 0)
+
+
+def _correction(what: str, mend: Mapping[str, str]) -> str:
+    """What must be corrected, after the vehicles that wait for it."""
+    vehicles = [vehicle for vehicle, own in mend.items() if own == what]
+    named = ", ".join(vehicles[:_NAMED])
+    more = f" and {len(vehicles) - _NAMED} more" if len(vehicles) > _NAMED else ""
+    return f"{named}{more}: {what}; then run the night again."
 
 
 def _statuses(findings: Sequence[DriftFinding]) -> dict[str, VehicleStatus]:

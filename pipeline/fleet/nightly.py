@@ -13,6 +13,7 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -48,8 +49,8 @@ class Night:
 class DayOutcome:
     """Result of a vehicle-day.
 
-    `status`: a word of DAY_WORDS, or "cached" if all was done already. `misconfigured`: the cause is
-    fleet.toml, or a file that it names, and must be corrected there.
+    `status`: a word of DAY_WORDS, or "cached" if all was done already. `mend`: what must be corrected in
+    fleet.toml, in a file that it names, or in the recording; empty if nothing.
     """
 
     vehicle: str
@@ -60,9 +61,11 @@ class DayOutcome:
     pairs: dict[str, str] = field(default_factory=dict)
     frames: int = 0
     trace: str = ""
-    misconfigured: bool = False
+    mend: str = ""
     results: tuple[Outcome, ...] = field(default=(), repr=False)  # of the stages, with the records to commit
 
+
+_NAMED = 5  # vehicles of fleet.toml named beside an unknown one
 
 # Configuration of the vehicle, the day with its logs, and its rows in the lake.
 _Job = tuple[dict[str, Any], VehicleDay, Known]
@@ -77,32 +80,49 @@ def run_night(
         workers: processes or tasks at a time; None = as many as the executor finds CPUs for.
         watch: called with the progress of the i-th of the days known to fleet.toml.
     """
-    known = []
-    for day in days:
-        reason = refused_at_once(night, day.partition)
-        if reason:
-            yield DayOutcome(day.partition.vehicle, day.partition.day, "refused", reason)
-        else:
-            known.append(day)
-    ledger = Ledger(night.lake, [d.partition for d in known])
+    why = [refused_at_once(night, day.partition) for day in days]
+    known = [day for day, reason in zip(days, why, strict=True) if not reason]
+    ledger = Ledger(night.lake, [day.partition for day in days])
     jobs, run = _jobs(night, known, ledger), partial(_run_job, _shared(night))
     try:
+        for day, reason in zip(days, why, strict=True):
+            if reason:
+                yield _told(ledger, night, _refused(night, day.partition, reason))
         with closing(EXECUTORS[executor](run, jobs, workers, watch)) as results:
             for finished in results:
-                outcome = _outcome(finished)
-                for result in outcome.results:
-                    with suppress(OSError):  # the storage may answer again before the night ends
-                        ledger.add(result, night.method)
-                yield outcome
+                yield _told(ledger, night, _outcome(finished))
     finally:
         ledger.commit()
 
 
+def _told(ledger: Ledger, night: Night, outcome: DayOutcome) -> DayOutcome:
+    """The outcome, whose results are in the ledger."""
+    for result in outcome.results:
+        with suppress(OSError):  # the storage may answer again before the night ends
+            ledger.add(result, night.method)
+    return outcome
+
+
 def refused_at_once(night: Night, of: Partition) -> str:
     """Reason why logs cannot be of the vehicle and day in their path; empty if they can."""
-    if not night.fleet.knows(of.vehicle):
-        return f"{night.fleet.file} has no vehicle {of.vehicle!r}"
-    return f"{of.day} is in the future: correct the logs' path" if of.day > last_possible_day() else ""
+    if of.day > last_possible_day():
+        return f"{of.day} is in the future: correct the logs' path"
+    if night.fleet.knows(of.vehicle):
+        return ""
+    has = ", ".join(
+        get_close_matches(of.vehicle, night.fleet.vehicles) or list(night.fleet.vehicles)[:_NAMED]
+    )
+    add = f'add [vehicles."{of.vehicle}"] with its rig, or correct the logs\' path'
+    return f"{night.fleet.file} has no vehicle {of.vehicle!r}; it has {has or 'none'}: {add}"
+
+
+def _refused(night: Night, of: Partition, reason: str) -> DayOutcome:
+    """Outcome of a vehicle-day that no stage is run on; an unknown vehicle is recorded, a wrong day is not."""
+    refused = DayOutcome(of.vehicle, of.day, "refused", reason)
+    if night.fleet.knows(of.vehicle) or of.day > last_possible_day():
+        return refused
+    result = Outcome(INGEST.name, of.vehicle, of.day, "refused", "", reason=reason, faults=("configuration",))
+    return replace(refused, mend=reason, results=(result,))
 
 
 def run_vehicle_day(night: Night, work: VehicleDay, known: Known, progress: Progress) -> DayOutcome:
@@ -205,5 +225,5 @@ def _summarise(partition: Partition, results: Sequence[Outcome]) -> DayOutcome:
         {r.stage: r.status for r in results},
         pairs,
         next((r.rows for r in results if r.stage == INGEST.name), 0),
-        misconfigured=worst is not None and "configuration" in worst.faults,
+        mend=next((r.reason for r in results if "configuration" in r.faults), ""),
     )

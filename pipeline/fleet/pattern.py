@@ -1,4 +1,4 @@
-"""Assignment of logs to vehicle-days by a pattern such as "logs/{vehicle}/{day}/*.mcap".
+"""Assignment of logs to vehicle-days by a pattern such as "logs/{vehicle}/{day}/*".
 
 Paths are strings here for speed: a fleet's night checks a hundred thousand of them.
 """
@@ -11,7 +11,7 @@ import glob
 import os
 import re
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from pipeline.errors import ConfigError
 from pipeline.store.partitions import Partition, check_day, is_day
 from pipeline.store.remote_logs import LogPath, find_remote_logs
 
-__all__ = ["VehicleDay", "find_vehicle_days"]
+__all__ = ["FoundLogs", "VehicleDay", "find_logs", "find_vehicle_days"]
 
 _SUFFIXES = (".mcap", ".bag", ".db3", ".zstd")
 _ROS2_FILES = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")  # as `ingest` reads them from a folder
@@ -40,6 +40,33 @@ class VehicleDay:
 def find_vehicle_days(
     pattern: str, from_day: str | None = None, to_day: str | None = None
 ) -> list[VehicleDay]:
+    """Vehicle-days of all logs that match, as `find_logs`."""
+    return find_logs(pattern, from_day, to_day).days
+
+
+@dataclass(frozen=True)
+class FoundLogs:
+    """Vehicle-days of the logs that match a pattern, and logs of another format that it leaves out.
+
+    `wider` is a pattern that matches them too; empty if nothing is left out.
+    """
+
+    days: list[VehicleDay]
+    left_out: list[VehicleDay]
+    wider: str = ""
+
+    @property
+    def problem(self) -> str:
+        """What is left out, and the pattern to use; empty if nothing is."""
+        if not self.left_out:
+            return ""
+        count = sum(len(day.logs) for day in self.left_out)
+        few = f"{count} log{'s' * (count != 1)} of {len(self.left_out)} vehicle-day{'s' * (len(self.left_out) != 1)}"
+        beside = f"in another format, as {self.left_out[0].logs[0]}"
+        return f'--logs leaves out {few} {beside}: use --logs "{self.wider}"'
+
+
+def find_logs(pattern: str, from_day: str | None = None, to_day: str | None = None) -> FoundLogs:
     """Vehicle-days of all logs that match, in order of day and vehicle, so that a night finishes day by day.
 
     Args:
@@ -57,25 +84,60 @@ def find_vehicle_days(
         check_day(name, day)
     if from_day and to_day and from_day > to_day:
         raise ConfigError("command line", "--from", f"{from_day} is after --to {to_day}")
-    days = [
-        VehicleDay(Partition(vehicle, day), tuple(sorted(logs)))
-        for (day, vehicle), logs in sorted(_found(pattern).items())
+    wanted, others = (_vehicle_days(logs) for logs in _found(pattern))
+    if not wanted:
+        beside = FoundLogs([], others, _wider(pattern)).problem
+        raise ConfigError("command line", "--logs", beside or f"no log matches {pattern!r}")
+    within = [
+        [d for d in days if (from_day or "") <= d.partition.day <= (to_day or "9999")]
+        for days in (wanted, others)
     ]
-    if not days:
-        raise ConfigError("command line", "--logs", f"no log matches {pattern!r}")
-    return [d for d in days if (from_day or "") <= d.partition.day <= (to_day or "9999")]
+    return FoundLogs(within[0], within[1], _wider(pattern) if within[1] else "")
 
 
-def _found(pattern: str) -> Mapping[_Owner, Iterable[LogPath]]:
-    """Logs of each matching vehicle-day, in a folder or in a bucket."""
+def _vehicle_days(logs: Mapping[_Owner, Iterable[LogPath]]) -> list[VehicleDay]:
+    return [
+        VehicleDay(Partition(vehicle, day), tuple(sorted(own)))
+        for (day, vehicle), own in sorted(logs.items())
+    ]
+
+
+def _suffix(pattern: str) -> str:
+    """Format that the pattern demands of logs; empty if it takes any."""
+    return next((suffix for suffix in _SUFFIXES if pattern.endswith(suffix)), "")
+
+
+def _wider(pattern: str) -> str:
+    """The pattern for logs of any format."""
+    stem = pattern.removesuffix(_suffix(pattern))
+    # after {vehicle} a star would take all but the first letter of the name
+    return stem if stem.endswith("*") else f"{stem}.*" if stem.endswith("{vehicle}") else f"{stem}*"
+
+
+def _in_other_formats(pattern: str) -> list[re.Pattern[str]]:
+    """Matchers of logs that differ from the pattern by their format; bag folders have no suffix."""
+    own = _suffix(pattern)
+    stem = pattern.removesuffix(own)
+    return [_matcher(stem + other) for other in (*_SUFFIXES, "") if own and other != own]
+
+
+_Found = tuple[Mapping[_Owner, Iterable[LogPath]], Mapping[_Owner, Iterable[LogPath]]]
+
+
+def _found(pattern: str) -> _Found:
+    """Logs of each matching vehicle-day, in a folder or in a bucket; and those in other formats."""
     if not pattern.startswith("s3://"):
-        return _logs_by_owner(_owned(pattern))
-    matcher, found = _matcher(pattern), defaultdict[_Owner, list[LogPath]](list)
+        wanted, others = _owned(pattern)
+        return _logs_by_owner(wanted), _logs_by_owner(others)
+    matchers = [_matcher(pattern), *_in_other_formats(pattern)]
+    found = defaultdict[_Owner, list[LogPath]](list), defaultdict[_Owner, list[LogPath]](list)
     # List everything below the last folder that the pattern names without wildcards.
     for log in find_remote_logs(re.split(r"[{*?\[]", pattern)[0].rpartition("/")[0]):
-        match = matcher.fullmatch(str(log))
-        if match and is_day(_day(match)) and log.name.endswith(_SUFFIXES):
-            found[_day(match), match["vehicle"]].append(log)
+        for k, matcher in enumerate(matchers if log.name.endswith(_SUFFIXES) else ()):
+            match = matcher.fullmatch(str(log))
+            if match and is_day(_day(match)):
+                found[min(k, 1)][_day(match), match["vehicle"]].append(log)
+                break
     return found
 
 
@@ -112,27 +174,41 @@ def _shell_token(token: str) -> str:
     return f"[{negation}{re.escape(token[1 + len(negation) : -1]).replace(chr(92) + '-', '-')}]"
 
 
-def _owned(pattern: str) -> dict[str, _Owner]:
+def _owned(pattern: str) -> tuple[dict[str, _Owner], dict[str, _Owner]]:
     """Vehicle-day of each log file and bag folder that matches, or that is in a matching folder.
+
+    Then the vehicle-days of logs that differ from the pattern by their format alone.
 
     Folders are listed once each, so the work grows with the number of files. A symbolic link to a log that
     was already found in the same vehicle-day is ignored: a link to its own parent would repeat every log
     forty times. A log linked into two vehicle-days belongs to both, as a copy would.
     """
-    matcher, listings = _matcher(pattern), _Listings()
-    shell = re.sub(r"\{(vehicle|day)\}", "*", pattern)
-    owner: dict[str, _Owner] = {}
+    matchers, listings = [_matcher(pattern), *_in_other_formats(pattern)], _Listings()
+    shell = re.sub(r"\{(vehicle|day)\}", "*", _any_format(pattern))
+    owner: tuple[dict[str, _Owner], dict[str, _Owner]] = ({}, {})
     seen: dict[tuple[_Owner, int, int], str] = {}
-    for name in sorted(glob.iglob(shell, recursive=True, include_hidden=False)):
-        path = name.rstrip("/")
-        match = matcher.fullmatch(path)
-        if not match or not is_day(_day(match)):
+    found = [(name.rstrip("/"), _first(matchers, name.rstrip("/"))) for name in sorted(
+        glob.iglob(shell, recursive=True, include_hidden=False))]  # fmt: skip
+    for path, (k, match) in sorted(found, key=lambda f: min(f[1][0], 1)):  # those that match come first
+        if match is None or not is_day(_day(match)):
             continue
-        for log in listings.logs_at(path):
+        for log in listings.logs_at(path) if k == 0 else listings.log_at(path):
             about, own = _about(log), (_day(match), match["vehicle"])
             if seen.setdefault((own, about.st_dev, about.st_ino), log) == log:
-                owner[log] = own
-    return owner
+                owner[min(k, 1)][log] = own
+    return owner[0], {log: own for log, own in owner[1].items() if log not in owner[0]}
+
+
+def _any_format(pattern: str) -> str:
+    """The pattern with any ending in place of that of a format."""
+    own = _suffix(pattern)
+    return f"{pattern.removesuffix(own).rstrip('*')}*" if own else pattern
+
+
+def _first(matchers: Sequence[re.Pattern[str]], path: str) -> tuple[int, re.Match[str] | None]:
+    """The first match, and the number of its matcher."""
+    found = ((k, match) for k, matcher in enumerate(matchers) if (match := matcher.fullmatch(path)))
+    return next(found, (0, None))
 
 
 def _logs_by_owner(owner: dict[str, _Owner]) -> dict[_Owner, set[Path]]:
@@ -165,6 +241,10 @@ class _Listings:
             return [path]  # a recording that lost its files, which `ingest` reports
         logs = [f for f in files if f.endswith(_SUFFIXES)]
         return logs + [f for inner in folders for f in sorted(self.bag_files(inner))]
+
+    def log_at(self, path: str) -> list[str]:
+        """A log file, or the files of a recording; of another folder none."""
+        return self.logs_at(path) if path.endswith(_SUFFIXES) else sorted(self.bag_files(path))
 
     def bag_files(self, folder: str) -> set[str]:
         """Files of a ROS 2 recording in a folder: with its metadata, or databases without metadata."""

@@ -26,6 +26,7 @@ class DayStatus:
         bytes_read: by these runs; None if unknown.
         bytes_written: likewise.
         faults: faults named in the reason, keys of `schemas.faults.FAULTS`.
+        mend: what must be corrected in fleet.toml or in the recording; empty if nothing.
     """
 
     vehicle: str
@@ -40,6 +41,7 @@ class DayStatus:
     bytes_read: int | None = None
     bytes_written: int | None = None
     faults: list[str] = field(default_factory=list)
+    mend: str = ""
 
 
 def day_statuses(rows: Sequence[OutcomeRow], method: str | None = None) -> list[DayStatus]:
@@ -72,7 +74,7 @@ def _of_method(vehicle: str, day: str, method: str, rows: Sequence[OutcomeRow]) 
     last = next((r for r in own if r.stage == _LAST_STAGE), None)
     # Use the reason of the stage that refused, not its copy in calibrate's records of every pair.
     refused = next((r for r in own if r.status == "refused" and r.stage != _LAST_STAGE), None)
-    said = failed or (refused if last is not None and last.status == "refused" else None) or last
+    said = failed or (refused if last is None or last.status == "refused" else None) or last
     if said is None:
         latest = max(own, key=lambda r: r.asserted_at)
         status, reason, stage = "missing", f"no {_LAST_STAGE} after {latest.stage} yet", latest.stage
@@ -91,6 +93,7 @@ def _of_method(vehicle: str, day: str, method: str, rows: Sequence[OutcomeRow]) 
         _total([r.bytes_read for r in own]),
         _total([r.bytes_written for r in own]),
         [] if said is None else list(said.faults),
+        next((r.reason for r in own if "configuration" in r.faults), ""),
     )
 
 

@@ -13,10 +13,10 @@ from jaxtyping import Int64
 
 from pipeline.config import FleetConfig, IngestConfig
 from pipeline.errors import ConfigError, SolveError
-from pipeline.extrinsics.prior import rig_prior
+from pipeline.extrinsics.prior import no_prior, rig_prior
 from pipeline.ingest.captures import Rejected
 from pipeline.ingest.directions_and_units import prior_transform
-from pipeline.ingest.index import ACCEPTED_TYPES, DayIndex, index_logs
+from pipeline.ingest.index import DayIndex, index_logs
 from pipeline.ingest.moments import MomentBuilder
 from pipeline.ingest.readiness import DofVerdict, Evidence, overall
 from pipeline.ingest.rig_matrix import RigFinding
@@ -24,6 +24,7 @@ from pipeline.ingest.rig_sample import RigSample
 from pipeline.ingest.roles import NEEDED, topics_of
 from pipeline.ingest.stage import pick_moments, read_file_prior
 from pipeline.ingest.sync import WRONG_UNIT, constant_gap_ns
+from pipeline.ingest.unheard import Unheard, unheard_topics
 from pipeline.results import Progress, silent
 from pipeline.rig.prior import RigPrior
 from pipeline.rig.rig import Rig
@@ -68,7 +69,10 @@ class SyncQuality:
 
 @dataclass(frozen=True)
 class CheckReport:
-    """Result of `boresight check`; `answer` is "yes", "partly" or "no"."""
+    """Result of `boresight check`; `answer` is "yes", "partly" or "no".
+
+    `corrections` has what is wrong in fleet.toml or in the recording, and how to correct it: before a night.
+    """
 
     answer: str
     verdicts: list[DofVerdict]
@@ -82,6 +86,7 @@ class CheckReport:
     rejected: dict[str, int]
     problems: list[str]
     advice: list[str]
+    corrections: list[str]
 
 
 def check_logs(
@@ -109,14 +114,13 @@ def check_logs(
                 index.complain(str(outcome))
             progress(done, len(picked), "frames looked at")
         without = Counter({k: n for k, n in builder.counts.items() if k.startswith("without_")})
+        unheard = unheard_topics(index, rig)
     finally:
         index.close()
-    topics = _topics(index, rig)
+    topics = _topics(index, rig, unheard)
     silent = dict[str, tuple[str, ...]]()
-    for found, role in zip(topics, topics_of(rig).values(), strict=True):
-        if role.what in NEEDED and found.problem:
-            said = f"{found.topic} ({found.role}): {found.problem}"
-            silent[role.sensor] = (*silent.get(role.sensor, ()), said)
+    for found in (u for u in unheard if u.role.what in NEEDED):
+        silent[found.role.sensor] = (*silent.get(found.role.sensor, ()), str(found))
     shown = {sensor for _, captures in built for sensor in captures}
     silent |= _of_another_unit(rejected + builder.counts, rig, index.problems, shown)
     rows = builder.prior.rows()
@@ -140,7 +144,20 @@ def check_logs(
         rejected={str(k): int(v) for k, v in (rejected + index.damage + without).items() if v},
         problems=index.problems,
         advice=[*sample.advice, *_advice(first, rig, topics, sample.whole.frames)],
+        corrections=_corrections(unheard, sample),
     )
+
+
+def _corrections(unheard: Sequence[Unheard], sample: RigSample) -> list[str]:
+    """Mistakes that no further drive mends: topics, signs and units, a missing prior."""
+    found = [str(u) for u in unheard if u.is_misconfigured]
+    for of in sample.evidence.values():
+        found += [of.doppler_problem] if of.doppler_is_wrong else []
+        found += of.wrong
+    untied = [sample.name(edge) for edge, of in sample.evidence.items() if of.frames and not of.has_prior]
+    if untied or (sample.prior is None and sample.built):
+        found.append(f"{no_prior(', '.join(untied) or 'any pair')} (`boresight import` writes such a file)")
+    return list(dict.fromkeys(found))
 
 
 def _prior(
@@ -169,21 +186,14 @@ def _of_another_unit(
     return found
 
 
-def _topics(index: DayIndex, rig: Rig) -> list[TopicFinding]:
+def _topics(index: DayIndex, rig: Rig, unheard: Sequence[Unheard]) -> list[TopicFinding]:
+    problems = {found.topic: found.problem for found in unheard}
     findings = []
     for topic, role in topics_of(rig).items():
         types = Counter({kind: n for (name, kind), n in index.surveyed.items() if name == topic})
-        wanted = ACCEPTED_TYPES[role.what]
-        problem = ""
-        if not types:
-            others = sorted(
-                {name for (name, kind) in index.surveyed if kind in wanted and name not in topics_of(rig)}
-            )
-            problem = "no message" + (f"; the same type comes on {', '.join(others[:4])}" if others else "")
-        elif not set(types) & set(wanted):
-            problem = f"type {', '.join(types)}, not {' or '.join(wanted)}"
         stamps = np.unique(index.stream(role).stamps_ns)
         rate = float(1e9 / np.median(np.diff(stamps))) if len(stamps) > 2 else None
+        problem = problems.get(topic, "" if types else "no message")
         findings.append(TopicFinding(str(role), topic, sorted(types), sum(types.values()), rate, problem))
     return findings
 

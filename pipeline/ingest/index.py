@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import resource
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 
@@ -26,7 +26,7 @@ from pipeline.ingest.messages.generation import encoding_fault
 from pipeline.ingest.messages.image import read_camera_info
 from pipeline.ingest.messages.odometry import EgoTrack
 from pipeline.ingest.reading_plan import Reading, plan_reading, plan_sweeps, rare_topics
-from pipeline.ingest.roles import CAPTURED, INFO, NEEDED, ODOMETRY, TF_STATIC, Role, topics_of
+from pipeline.ingest.roles import CAPTURED, INFO, ODOMETRY, TF_STATIC, Role, topics_of
 from pipeline.rig.rig import Rig
 from pipeline.store.remote_logs import LogPath
 
@@ -53,6 +53,8 @@ ACCEPTED_TYPES: dict[str, tuple[str, ...]] = {
         *foxglove_types("FrameTransforms", "FrameTransform"),
     ),
 }
+# A glance at logs for topics that the rig does not name: all sensors of a car log within a second.
+_GLANCES, _GLANCE_NS = 3, 10**9
 _MOST_OPEN_FILES = 65536  # one per minute of 45 days, more than a vehicle-day has
 _MOST_CAMERAS = 1000  # distinct camera_info contents kept: a limit for drivers that write noise into them
 
@@ -95,7 +97,7 @@ class DayIndex:
     cameras: dict[str, list[tuple[int, int, Camera]]] = field(default_factory=dict)
     trees: list[TransformTree] = field(default_factory=list)
     ego: EgoTrack = field(default_factory=EgoTrack)
-    topics_seen: set[str] = field(default_factory=set)
+    types_seen: set[tuple[str, str]] = field(default_factory=set)  # topics of the rig, with types
     surveyed: Counter[tuple[str, str]] = field(default_factory=Counter)  # (topic, type) -> messages
     problems: list[str] = field(default_factory=list)
     encodings_right: set[tuple[int, str]] = field(default_factory=set)  # log and topic
@@ -123,6 +125,22 @@ class DayIndex:
     def stream(self, role: Role) -> Stream:
         """Messages of a role; empty if there are none."""
         return self.streams.setdefault(role, Stream())
+
+    def types_of(self, topic: str) -> set[str]:
+        """Types of the messages on a topic of the rig."""
+        return {kind for name, kind in self.types_seen if name == topic}
+
+    def types_beside(self) -> Collection[tuple[str, str]]:
+        """Topics and types in the logs, without a survey those at the beginning of some of them."""
+        if not self.surveyed:
+            for log in self.logs[:_GLANCES]:
+                first_ns = None
+                for message in log.scan():
+                    first_ns = message.log_time_ns if first_ns is None else first_ns
+                    if message.log_time_ns > first_ns + _GLANCE_NS:
+                        break
+                    self.surveyed[message.channel.topic, message.channel.msgtype] += 1
+        return self.surveyed
 
     def read(self, located: Located) -> memoryview:
         """Payload of a message."""
@@ -152,7 +170,7 @@ def index_logs(
     """Scan the logs once; of images and clouds only the stamp is read. Unreadable logs become problems.
 
     Args:
-        survey: count the messages of every topic in `surveyed`.
+        survey: count the messages of every topic in `surveyed`; else those of a glance, when asked for.
         budget: largest number of sweeps; a longer day is read in bursts. None = read the whole day.
     """
     index = DayIndex({role.sensor: role.kind for role in topics_of(rig).values() if role.is_capture})
@@ -179,9 +197,6 @@ def _read_day(index: DayIndex, rig: Rig, budget: int | None, *, survey: bool) ->
             _read_bursts(index, number, topics, timeline, index.reading.around)
     if budget is not None and index.reading is None and len(index.captures(index.anchor).stamps) > budget:
         _take_bursts(index, timelines, budget)
-    for topic, role in topics.items():
-        if role.what in NEEDED and topic not in index.topics_seen:
-            index.complain(f"topic {topic} ({role}) has no message in any log")
     for tree in index.trees:
         for other in index.trees:
             tree.fill_from(other)
@@ -265,7 +280,7 @@ def _index_log(
         role = topics.get(message.channel.topic)
         if role is None:
             continue
-        index.topics_seen.add(message.channel.topic)
+        index.types_seen.add((message.channel.topic, message.channel.msgtype))
         if message.channel.msgtype not in ACCEPTED_TYPES[role.what]:
             index.damage["wrong_type"] += 1
             index.complain(

@@ -110,10 +110,8 @@ _Needs = list[tuple[str, str]]
 
 def _without_frames(e: Evidence) -> _Needs:
     """Without frames only the reason: prior, labels and motion are unknown."""
-    why = [("no", topic) for topic in e.missing] or [
-        ("no", f"0 usable synchronised frames; at least {_FEW_FRAMES} are needed")
-    ]
-    return [*why, ("no", "so prior, labels and motion could not be judged")]
+    why = e.missing or (f"0 usable synchronised frames; at least {_FEW_FRAMES} are needed",)
+    return [("no", f"{'; '.join(why)} (prior, labels and motion were therefore not checked)")]
 
 
 def _common_needs(e: Evidence) -> _Needs:
@@ -132,7 +130,8 @@ def _camera_needs(e: Evidence) -> _Needs:
     if not e.names_semantics:
         return [("weak", f"{WITHOUT_LABELS}; better {_GET_LABELS}")]
     if e.labels_share == 0:
-        return [("no", f"no semantic labels: {_GET_LABELS}")]
+        without = "remove `semantics` from fleet.toml, for borders by brightness"
+        return [("no", f"no semantic labels on the topics of `semantics`: {_GET_LABELS}, or {without}")]
     return [("weak", f"labels on {e.labels_share:.0%} of the frames only")] if e.labels_share < 0.5 else []
 
 

@@ -215,14 +215,14 @@ def _evidence(frames: list[Frame], rig: Rig, motion: Motion) -> Evidence:
     def share(flags: list[bool]) -> float:
         return float(np.mean(flags)) if flags else 0.0
 
-    # A rig without a camera lacks no labels, but has no boxes either.
+    # Without a camera, or one that is silent, no labels are lacking, but there are no boxes either.
     computed = isinstance(rig.semantics, OnnxSemantics)
     seen, swept, scanned = ([f for f in frames if kind in f.sensors] for kind in SENSORS)
     labelled = share([f.labels_png is not None for f in seen])
     return Evidence(
         frames=len(frames),
         has_prior=True,
-        labels_share=1.0 if rig.camera is None or computed else labelled,
+        labels_share=1.0 if not seen or computed else labelled,
         detections_share=1.0 if computed else share([f.detection_boxes_px is not None for f in seen]),
         has_intensity=share([f.lidar_intensity is not None for f in swept]) > 0.5,
         rings=0,
@@ -232,7 +232,7 @@ def _evidence(frames: list[Frame], rig: Rig, motion: Motion) -> Evidence:
         doppler_is_wrong=motion.doppler_is_wrong,
         wrong=motion.wrong,
         has_odometry=any(f.ego_speed_mps is not None for f in frames),
-        names_semantics=rig.camera is None or rig.semantics is not None,
+        names_semantics=not seen or rig.semantics is not None,
     )
 
 

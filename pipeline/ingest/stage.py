@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 from collections import Counter
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +18,7 @@ from pipeline.ingest.containers.reader import content_identity, leads_nowhere
 from pipeline.ingest.index import DayIndex, index_logs
 from pipeline.ingest.moments import Anchored, MomentBuilder
 from pipeline.ingest.repetition import REPEATED
-from pipeline.ingest.roles import topics_of
+from pipeline.ingest.roles import NEEDED, topics_of
 from pipeline.ingest.sync import (
     WRONG_UNIT,
     Matched,
@@ -28,6 +28,7 @@ from pipeline.ingest.sync import (
     none_near,
     number_drives,
 )
+from pipeline.ingest.unheard import Unheard, unheard_topics
 from pipeline.objective.stamp_gaps import motion_gates_ns
 from pipeline.results import Progress
 from pipeline.rig.graph import possible_edges
@@ -39,6 +40,7 @@ from schemas.faults import FAULTS
 from schemas.moments import (
     PRIOR,
     SENSORS_ABSENT,
+    STATED_FAULTS,
     SWEEPS_LOGGED,
     SWEEPS_PLANNED,
     SWEEPS_READ,
@@ -102,6 +104,10 @@ def _rows(
     run.progress(0, 0, "reading the index")
     index = index_logs(task.logs, rig, budget=config.read_budget)
     try:
+        unheard = unheard_topics(index, rig)
+        # first, because of many problems only some are shown
+        index.problems[:0] = [str(u) for u in unheard if u.is_misconfigured]
+        index.problems += [str(u) for u in unheard if not u.is_misconfigured]
         builder = MomentBuilder(index, rig, config, file_prior)
         anchored, rejected = pick_moments(index, rig, config)
         made = 0
@@ -111,7 +117,7 @@ def _rows(
         run.rejected.update(_all_counts(rejected, index, builder))
         run.kept.update(_reading_counts(index))
         if not made:
-            raise NothingUsable(*refusal(index, rig, rejected, config))
+            raise NothingUsable(*refusal(index, rig, rejected, config, unheard))
         _complain_of_date(index, task.partition.day)
         run.extra |= {
             "problems": index.problems,
@@ -120,7 +126,8 @@ def _rows(
         }
         run.extra[PRIOR] = builder.prior.rows()
         run.extra[TF] = builder.prior.frames_above()
-        run.extra[SENSORS_ABSENT] = absences(index, rig, builder.counts, config)
+        run.extra[SENSORS_ABSENT] = absences(index, rig, builder.counts, config, unheard)
+        run.extra[STATED_FAULTS] = ["configuration"] if any(u.is_misconfigured for u in unheard) else []
         run.remarks = _shorten(index.problems)
     finally:
         index.close()
@@ -179,16 +186,18 @@ def _tied(rig: Rig, anchor: str) -> set[str] | None:
     return {s.name for s in sensors if rig.base is not None or {s.name, anchor} in ends}
 
 
-def refusal(index: DayIndex, rig: Rig, rejected: Counter[str], config: IngestConfig) -> tuple[str, ...]:
+def refusal(
+    index: DayIndex, rig: Rig, rejected: Counter[str], config: IngestConfig, unheard: Sequence[Unheard]
+) -> tuple[str, ...]:
     """Reason why a day gives no frame, with topic and remedy; then the faults that it states."""
     topics = {role.sensor: f"{topic} ({role})" for topic, role in topics_of(rig).items() if role.is_capture}
     absent = [name for sensor, name in topics.items() if not index.captures(sensor).stamps]
     faults: tuple[str, ...] = ()
+    if any(u.is_misconfigured and u.role.what in NEEDED for u in unheard):
+        return _shorten(index.problems), "configuration"
     if len(topics) - len(absent) < 2:
-        what, faults = _nothing_on(", ".join(absent)), ("configuration",)
-    elif rejected.get(Rejection.CAMERA_INFO):
-        cameras = [c for c in rig.cameras if not index.cameras.get(c)] or list(rig.cameras)
-        what = _no_intrinsics(rig.cameras[cameras[0]].info)
+        what = _nothing_on(", ".join(absent))
+        faults = ("configuration",) if index.types_beside() else ()  # no message at all is no fault of topics
     elif not set(rejected) & set(_UNUSABLE):
         of = {"camera": "an image", "lidar": "a sweep", "radar": "a scan"}
         heard = {s: _topic_of(rig, s) for s, name in topics.items() if name not in absent}
@@ -202,9 +211,12 @@ def refusal(index: DayIndex, rig: Rig, rejected: Counter[str], config: IngestCon
     return _shorten([what, *index.problems]), *faults
 
 
-def absences(index: DayIndex, rig: Rig, counts: Counter[str], config: IngestConfig) -> dict[str, str]:
+def absences(
+    index: DayIndex, rig: Rig, counts: Counter[str], config: IngestConfig, unheard: Sequence[Unheard]
+) -> dict[str, str]:
     """By missing sensor, the reason, with topic and remedy."""
     found = {}
+    of_sensor = {u.role.sensor: str(u) for u in unheard if u.role.what in NEEDED and u.is_misconfigured}
     for topic, role in topics_of(rig).items():
         if not role.is_capture:
             continue
@@ -214,10 +226,10 @@ def absences(index: DayIndex, rig: Rig, counts: Counter[str], config: IngestConf
         reason, count = own.most_common(1)[0]
         if not count:
             continue
-        if not index.captures(sensor).stamps:
+        if sensor in of_sensor:
+            found[sensor] = of_sensor[sensor]
+        elif not index.captures(sensor).stamps:
             found[sensor] = _nothing_on(f"{topic} ({role})")
-        elif reason == Rejection.CAMERA_INFO:
-            found[sensor] = _no_intrinsics(rig.cameras[sensor].info)
         elif reason == near:
             found[sensor] = f"nothing of {topic} is near enough: not {_near_enough(config)}"
         else:
@@ -233,10 +245,6 @@ def _topic_of(rig: Rig, sensor: str) -> str:
 
 def _nothing_on(topics: str) -> str:
     return f"no usable message on {topics}: correct the topics in fleet.toml (see `boresight check`)"
-
-
-def _no_intrinsics(topic: str) -> str:
-    return f"no usable intrinsics on {topic}: log a sensor_msgs/CameraInfo with a calibrated K"
 
 
 def _near_enough(config: IngestConfig) -> str:
@@ -303,5 +311,6 @@ def _reading_counts(index: DayIndex) -> dict[str, int]:
 
 
 def _shorten(problems: list[str]) -> str:
+    problems = list(dict.fromkeys(problems))
     more = len(problems) - _PROBLEMS_SHOWN
     return "; ".join(problems[:_PROBLEMS_SHOWN]) + (f"; and {more} more" if more > 0 else "")

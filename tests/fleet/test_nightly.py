@@ -234,13 +234,13 @@ def test_a_wrong_configuration_fails_the_day_that_shows_it(night, monkeypatch):
         monkeypatch, night.lake, ingest=ConfigError("prior.json", "T_camera_lidar", "is no transform")
     )
     car = outcomes(replace(night, seed=3))["car"]
-    assert (car.reason, car.misconfigured) == ("prior.json: T_camera_lidar: is no transform", True)
+    assert car.reason == car.mend == "prior.json: T_camera_lidar: is no transform"
     assert night_statuses([car], night.fleet) == ["misconfigured"]
 
 
-@pytest.mark.parametrize(("faults", "misconfigured"), [(("configuration",), True), ((), False)])
+@pytest.mark.parametrize(("faults", "is_one"), [(("configuration",), True), ((), False)])
 def test_a_refusal_is_one_of_the_configuration_by_its_fault_and_not_by_its_words(
-    faults, misconfigured, night, monkeypatch
+    faults, is_one, night, monkeypatch
 ):
     def say(stage, task):
         of = (stage.name, task.partition.vehicle, task.partition.day)
@@ -249,7 +249,7 @@ def test_a_refusal_is_one_of_the_configuration_by_its_fault_and_not_by_its_words
     real = Stage.run
     monkeypatch.setattr(Stage, "run", lambda s, task: real(s, task) if task.given else say(s, task))
     car = outcomes(night)["car"]
-    assert (car.status, car.misconfigured) == ("refused", misconfigured)
+    assert (car.status, car.mend) == ("refused", car.reason if is_one else "")
     assert [r.faults for r in records(night)] == [list(faults)] * 3
     [row] = [r for r in read_records(night.lake, OUTCOMES, OutcomeRow) if r.stage == "ingest"]
     assert row.faults == list(faults)

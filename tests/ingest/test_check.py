@@ -140,7 +140,8 @@ def test_without_a_sensors_topic_its_pairs_alone_fail_and_nothing_else_is_said_t
         assert found.verdict == "no"
         assert topic in found.reasons[0]
         assert "/mistyped" in found.reasons[0]
-        assert found.reasons[1:] == ["so prior, labels and motion could not be judged"]
+        assert found.reasons[0].endswith("(prior, labels and motion were therefore not checked)")
+        assert found.reasons[1:] == []
 
 
 @pytest.mark.parametrize("sensor", SENSORS)
@@ -156,7 +157,7 @@ def test_a_rig_of_two_sensors_is_judged_by_its_one_pair(kit, tmp_path, sensor):
 
 def test_sensors_that_never_meet_are_told_from_absent_ones():
     (first, *_), *_ = [v.reasons for v in judge(changed(frames=0, has_prior=False, labels_share=0.0))]
-    assert first == "0 usable synchronised frames; at least 10 are needed"
+    assert first.startswith("0 usable synchronised frames; at least 10 are needed (")
 
 
 def test_a_planar_radar_a_missing_field_and_a_wrong_sign_are_noticed(kit, tmp_path):

@@ -1,4 +1,4 @@
-"""`boresight nightly`: metrics and exit codes of a night without work: one vehicle that nobody knows."""
+"""`boresight nightly`: metrics and exit codes of a night without work: one day that has not come yet."""
 
 import json
 
@@ -10,7 +10,7 @@ from tests.makers.fleet_files import fleet_toml
 
 @pytest.fixture
 def night(tmp_path, capfd):
-    log = tmp_path / "logs" / "stranger" / "2026-03-02" / "a.mcap"
+    log = tmp_path / "logs" / "car" / "2999-03-02" / "a.mcap"
     log.parent.mkdir(parents=True)
     log.touch()
     (tmp_path / "fleet.toml").write_text(fleet_toml("car"))

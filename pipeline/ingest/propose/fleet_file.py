@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pipeline.ingest.propose.sensors import FoundCamera, FoundCloud, FoundSensors
 from pipeline.third_party_models import semantics_line
 
-__all__ = ["Facts", "RadarMeaning", "fleet_text", "names_of"]
+__all__ = ["Facts", "RadarMeaning", "fleet_text", "left_out", "names_of"]
 
 _NO_NAME = re.compile(r"[^A-Za-z0-9_]+")
 _ENDINGS = ("_optical_frame", "_optical", "_frame", "_link")
@@ -94,9 +94,18 @@ def fleet_text(
             '# odometry = "/..."     # none in these logs: speed comes from Doppler',
         ]
     lines += ["", *_prior(facts), "", '[vehicles."*"]', 'rig = "default"']
+    lines += ["", *(f"# {what}" for what in left_out(found))] if found.left_out else []
     if found.passed_over:
         lines += ["", "# Not used:", *(f"#   {what}" for what in sorted(found.passed_over))]
     return "\n".join(lines) + "\n"
+
+
+def left_out(found: FoundSensors) -> list[str]:
+    """Why cameras of the logs are not in the file, a sentence per camera."""
+    return [
+        f"Camera left out: no usable CameraInfo of {', '.join(images)} in these logs. Record it, with a calibrated K."
+        for images in found.left_out.values()
+    ]
 
 
 def _of_rig(facts: Facts, *, is_comment: bool) -> list[str]:

@@ -19,8 +19,6 @@ def logs_pattern(logs: Sequence[Path]) -> str:
     """
     paths = [path for path in logs if path.is_dir() or path.suffix in _SUFFIXES]
     patterns = {_pattern(path) for path in paths}
-    if len(patterns) > 1:  # recorded in several formats
-        patterns = {_pattern(path.with_suffix("")) for path in paths}
     return patterns.pop() if len(patterns) == 1 else ""
 
 
@@ -35,11 +33,11 @@ def nightly_command(fleet: Path, logs: Sequence[Path]) -> list[str]:
 
 
 def _pattern(path: Path) -> str:
-    """From folders VEHICLE/DAY, else from a file name VEHICLE_DAY..."""
+    """From folders VEHICLE/DAY, else from a file name VEHICLE_DAY...; it matches logs of every format."""
     parts = path.parts
     day = next((i for i, part in enumerate(parts[:-1]) if _DAY.fullmatch(part)), 0)
     if day:
-        return str(Path(*parts[: day - 1], "{vehicle}", "{day}", *parts[day + 1 : -1], f"*{path.suffix}"))
+        return str(Path(*parts[: day - 1], "{vehicle}", "{day}", *parts[day + 1 : -1], "*"))
     in_name = _DAY.search(path.name)
     vehicle = "" if in_name is None else path.name[: in_name.start()].rstrip("_-.")
     if in_name is None or not vehicle:

@@ -17,7 +17,7 @@ from pipeline.ingest.directions_and_units import motion_of, opposed_signs
 from pipeline.ingest.index import index_logs
 from pipeline.ingest.moments import MomentBuilder
 from pipeline.ingest.propose.doppler import doppler_period
-from pipeline.ingest.propose.fleet_file import Facts, RadarMeaning, fleet_text, names_of
+from pipeline.ingest.propose.fleet_file import Facts, RadarMeaning, fleet_text, left_out, names_of
 from pipeline.ingest.propose.sensors import FoundCamera, FoundCloud, FoundSensors, find_sensors
 from pipeline.ingest.propose.survey import Survey, survey_logs
 from pipeline.ingest.rig_sample import RigSample
@@ -55,7 +55,9 @@ def propose_fleet(logs: Sequence[Path], fleet: str, progress: Progress = silent)
     names = names_of(found)
     if len(names) < 2:
         seen = ", ".join(f"{t.name} ({t.msgtype})" for t in survey.topics.values()) or "no topic that is read"
-        said = "; ".join([f"there are {seen}", *survey.problems[:3], *found.passed_over[:5]])
+        said = "; ".join(
+            [f"there are {seen}", *survey.problems[:3], *left_out(found)[:3], *found.passed_over[:5]]
+        )
         raise ConfigError(str(logs[0]), "LOG", f"fewer than two of camera, lidar and radar; {said}")
     static, tree = _static(survey)
     tied_to = next((s.frame_id for s in [*found.lidars, *found.radars] if s.frame_id), "")
@@ -67,7 +69,8 @@ def propose_fleet(logs: Sequence[Path], fleet: str, progress: Progress = silent)
 
     meanings = _meanings(survey, text({}), found, names, frames, progress)
     signs = opposed_signs({name: m.positive for name, m in meanings.items()})
-    problems = [*survey.problems, *(f"{n}: {p}" for n, m in meanings.items() for p in m.problems), *signs]
+    problems = [*survey.problems, *left_out(found), *signs]
+    problems += [f"{n}: {p}" for n, m in meanings.items() for p in m.problems]
     cameras = {n: s for n, s in names.items() if isinstance(s, FoundCamera)}
     unlabelled = [n for n, s in cameras.items() if not (s.labels and s.detections)]
     missing = [f"{n}: semantics (recommended; {WITHOUT_LABELS})" for n in unlabelled]

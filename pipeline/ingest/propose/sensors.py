@@ -60,13 +60,14 @@ class FoundCloud:
 
 @dataclass(eq=False)
 class FoundSensors:
-    """All sensors found, and descriptions of the topics not used."""
+    """All sensors found, descriptions of the topics not used, and images of cameras left out, by frame id."""
 
     cameras: list[FoundCamera] = field(default_factory=list)
     lidars: list[FoundCloud] = field(default_factory=list)
     radars: list[FoundCloud] = field(default_factory=list)
     odometry: str = ""
     passed_over: list[str] = field(default_factory=list)
+    left_out: dict[str, list[str]] = field(default_factory=dict)
 
 
 def find_sensors(survey: Survey) -> FoundSensors:
@@ -146,9 +147,13 @@ def _find_cameras(survey: Survey, found: FoundSensors) -> None:
             found.passed_over.append(f"{info.name} (no image of its size)")
         elif all(camera.frame_id != other.frame_id for other in found.cameras):
             found.cameras.append(camera)
-    used = {c.image for c in found.cameras}
-    why = "no CameraInfo, or of a camera that has an image"
-    found.passed_over += [f"{name} ({why})" for name in pictures if name not in used]
+    of_frame = {c.frame_id: c.image for c in found.cameras}
+    for name, (topic, _) in pictures.items():
+        image = of_frame.get(topic.frame_id)
+        if image is None:
+            found.left_out.setdefault(topic.frame_id, []).append(name)
+        elif image != name:
+            found.passed_over.append(f"{name} (the camera of {image} too)")
     found.cameras = [
         _with_semantics(c, found.cameras, labels, survey.of("detections")) for c in found.cameras
     ]
