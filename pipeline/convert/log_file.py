@@ -51,6 +51,9 @@ def _messages(ros: RosMessages, recording: Recording, event: Event) -> list[tupl
     ]
 
 
+_TURN = '\nturn = { sense = "right", begins_deg = 180.0 }'
+
+
 def fleet_text(
     name: str,
     vehicles: Sequence[str],
@@ -68,10 +71,12 @@ def fleet_text(
         base: whether the frame of the poses is the vehicle's.
     """
     is_short = all(sensor == kind for sensor, kind in kinds.items())
+    # KITTI's own lidar, whose clouds have no time per point; data sets of its shape with a radar have others.
+    turn = _TURN if name == "kitti" and "radar" not in kinds.values() else ""
     lines = [
         f"[fleet]\nname = {json.dumps(name)}",
         *([f"[rigs.default]\nbase = {json.dumps(frame_of('base'))}"] if base and not is_short else []),
-        *(_section(sensor, kind, models) for sensor, kind in kinds.items()),
+        *(_section(sensor, kind, models) + turn * (kind == "lidar") for sensor, kind in kinds.items()),
         *([f'[rigs.default.ego]\nodometry = "{TOPICS["odometry"]}"'] if ego else []),
         '[rigs.default.prior]\nsource = "tf_static"',
         *(f'[vehicles.{json.dumps(vehicle)}]\nrig = "default"' for vehicle in vehicles),

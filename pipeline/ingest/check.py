@@ -35,6 +35,10 @@ from schemas.frames import Frame
 
 __all__ = ["CheckReport", "SyncQuality", "TopicFinding", "check_logs"]
 
+_NO_TIMES = (
+    "the lidar logs no time per point: its sweeps stay as logged. If it turns, and its driver does not de-skew, "
+    'say how in fleet.toml, below points: turn = { sense = "right", begins_deg = 180.0 }'
+)
 _SAMPLE = 40  # frames that are decoded; of the others only the stamps are read
 
 
@@ -254,8 +258,9 @@ def _advice(frames: list[Frame], rig: Rig, topics: list[TopicFinding], usable: i
         advice.append(
             f"{rig.ego.odometry} has no messages around any sweep: the lidar is de-skewed by Doppler, without turns"
         )
-    if any("lidar" in f.sensors for f in frames) and all(f.lidar_time_s is None for f in frames):
-        advice.append("the lidar logs no time per point: sweeps cannot be de-skewed")
+    untimed = any("lidar" in f.sensors for f in frames) and all(f.lidar_time_s is None for f in frames)
+    if untimed and all(lidar.turn is None for lidar in rig.lidars.values()):
+        advice.append(_NO_TIMES)
     if 0 < usable < 100:
         advice.append(f"{usable} frames: a calibration uses up to 100, so log a longer drive")
     return advice

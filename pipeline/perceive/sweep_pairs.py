@@ -6,14 +6,14 @@ Source: Chen, Medioni 1992 (point to plane); the start comes from a grid of dist
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int64
+from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-__all__ = ["Arc", "Matched", "Surfaces", "matched", "registered", "surfaces_of"]
+__all__ = ["Arc", "Surfaces", "motions", "surfaces_of"]
 
 _VOXEL_M, _NEAREST_M, _REACH_M = 0.25, 3.0, 50.0
 _NEIGHBOURS, _NEIGHBOURS_M = 8, 1.2  # of a point, to find its surface
@@ -24,7 +24,7 @@ _FLAT, _UPRIGHT, _ROAD = (
 )  # least over middle variance; vertical part of a normal: surface, no road
 _MOST_POINTS, _COARSE_POINTS, _COARSE_OTHERS = 4000, 500, 20_000
 _FASTEST_MPS, _BACKWARDS_M, _STEP_M, _TURNS_RAD = 45.0, 2.0, 0.5, (-0.06, -0.02, 0.02, 0.06)
-_COARSE_M, _WIDE_M, _CLOSE_M = 0.7, (2.0, 1.0, 0.5, 0.5, 0.5), (0.5, 0.5, 0.5)
+_COARSE_M, _MATCHED_M = 0.7, (2.0, 1.0, 0.5, 0.5, 0.5)
 _APART_M, _DISTINCT = 1.5, 1.1  # as in calibrate's sweep_motion: so much better than ways so far away
 _SIGMA_M: Final = 0.05  # of a rest while registering; beyond it weighs less (Cauchy)
 _FEWEST: Final = 200
@@ -62,23 +62,6 @@ class Surfaces:
     others: Float[np.ndarray, "M 3"]
     tree: cKDTree
 
-    def moved(self, by_m: Float[np.ndarray, "N 3"]) -> Surfaces:
-        """The surfaces with moved points."""
-        xyz_m = self.xyz_m + by_m
-        return replace(self, xyz_m=xyz_m, tree=cKDTree(xyz_m))
-
-
-class Matched(NamedTuple):
-    """Points of the later sweep on surfaces of the earlier, after the best arc; rest = normal . (moved - surface)."""
-
-    arc: Arc
-    first: Int64[np.ndarray, " M"]
-    last: Int64[np.ndarray, " M"]
-    normal: Float[np.ndarray, "M 3"]
-    rest_m: Float[np.ndarray, " M"]
-    jacobian: Float[np.ndarray, "M 3"]  # of the rest by x, y and yaw
-    cost: float
-
 
 def surfaces_of(xyz_m: np.ndarray) -> Surfaces:
     """Upright surfaces of a sweep."""
@@ -97,35 +80,35 @@ def surfaces_of(xyz_m: np.ndarray) -> Surfaces:
     return Surfaces(xyz[flat], normal[flat], xyz[up < _ROAD], cKDTree(xyz[flat]))
 
 
-def registered(
-    surfaces: Mapping[int, Surfaces], pairs: Sequence[tuple[int, int, float]], told: Mapping[int, Arc]
-) -> list[Arc | None]:
-    """Arc of each pair (earlier, later, seconds between); None if the sweeps do not determine it.
+def motions(surfaces: Mapping[int, Surfaces], pairs: Sequence[tuple[int, int, float]]) -> dict[int, Arc]:
+    """Motion per second at each sweep of a pair (earlier, later, seconds between): the mean of its pairs.
 
-    `told` is the motion per second at a sweep, if odometry has it. Without it, the best arc of a grid must be
-    clearly better than others, because along the rails of a motorway all distances fit equally well.
+    The best arc of a grid must be clearly better than others, because along the rails of a motorway all distances
+    fit equally well; sweeps that do not determine it have no motion.
     """
-    arcs: list[Arc | None] = []
+    held: dict[int, list[Arc]] = {}
     before: tuple[int, Arc, float] | None = None
     for i, j, gap_s in pairs:
         first, last = surfaces[i], surfaces[j]
-        start = None
+        start = arc = None
         if min(len(first.xyz_m), len(last.xyz_m)) >= _FEWEST:
-            if i in told and j in told:
-                start = Arc(*(np.mean([told[i], told[j]], axis=0) * gap_s))
-            elif (start := _coarse(first, last, gap_s)) is None and before is not None and before[0] == i:
+            start = _coarse(first, last, gap_s)
+            if start is None and before is not None and before[0] == i:
                 start = Arc(*(v * gap_s / before[2] for v in before[1]))
-        found = None if start is None else matched(first, last, start, _WIDE_M)
-        arcs.append(found.arc if found is not None and len(found.rest_m) >= _FEWEST else None)
-        before = None if arcs[-1] is None else (j, arcs[-1], gap_s)
-    return arcs
+        if start is not None:
+            arc = _matched(first, last, start)
+        before = None if arc is None else (j, arc, gap_s)
+        if arc is not None:
+            for k in (i, j):
+                held.setdefault(k, []).append(Arc(*(v / gap_s for v in arc)))
+    return {k: Arc(*np.mean(of, axis=0)) for k, of in held.items()}
 
 
-def matched(first: Surfaces, last: Surfaces, start: Arc, reach_m: Sequence[float] = _CLOSE_M) -> Matched:
+def _matched(first: Surfaces, last: Surfaces, start: Arc) -> Arc | None:
     """The best arc near a start, by robust least squares, with one step for each matching distance."""
     some = _thinned(np.arange(len(last.xyz_m)), _MOST_POINTS)
     arc = start
-    for reach in reach_m:
+    for reach in _MATCHED_M:
         moved = arc.moved(last.xyz_m[some])
         distance, near = first.tree.query(moved, distance_upper_bound=reach)
         at = np.flatnonzero(np.isfinite(distance))
@@ -138,9 +121,7 @@ def matched(first: Surfaces, last: Surfaces, start: Arc, reach_m: Sequence[float
         after = Arc(*step)
         x, y, _ = after.moved(np.array([[arc.x, arc.y, 0.0]]))[0]
         before, arc = arc, Arc(float(x), float(y), arc.yaw_rad + after.yaw_rad)
-    outside = np.log1p((reach_m[-1] / _SIGMA_M) ** 2) * (len(some) - len(at))
-    cost = float((np.log1p((rest / _SIGMA_M) ** 2).sum() + outside) / max(len(some), 1))
-    return Matched(before, near, some[at], n, rest, J, cost)
+    return before if len(rest) >= _FEWEST else None
 
 
 def _coarse(first: Surfaces, last: Surfaces, gap_s: float) -> Arc | None:

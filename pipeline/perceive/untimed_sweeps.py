@@ -1,4 +1,7 @@
-"""Sweeps of spinning lidars without a time per point: times from azimuths, and points moved to the stamp."""
+"""Sweeps of spinning lidars without a time per point: times from azimuths, and points moved to the stamp.
+
+A turn takes a tenth of a second, in which a car drives one to three metres. fleet.toml says how the lidar turns.
+"""
 
 from __future__ import annotations
 
@@ -7,23 +10,23 @@ from dataclasses import dataclass, replace
 from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import UInt16
+from jaxtyping import Float, Float32, UInt16
 
 from pipeline.geometry.scan_rows import rows_of
 from pipeline.geometry.spherical import to_spherical
-from pipeline.perceive.beam_times import MOVES_MPS, BeamTimes, beam_times, velocity_of
-from pipeline.perceive.sweep_pairs import Arc, surfaces_of
+from pipeline.perceive.sweep_pairs import Arc, motions, surfaces_of
 from pipeline.rigs import LidarTurn
 from schemas.captures import Sweep
 
 __all__ = ["BY_AZIMUTH", "WITHOUT_TIMES", "Turning", "turning_of"]
 
 # Among the manifest's kept: sweeps that have their times from the azimuth; and those of a spinning lidar that drives,
-# for which nothing tells how it turns. They are left as they were logged.
+# for which fleet.toml has no `turn`. They are left as they were logged.
 BY_AZIMUTH: Final = "frames_timed_by_azimuth"
 WITHOUT_TIMES: Final = "frames_without_point_times"
 _NEIGHBOUR_S = 0.9  # sweeps further apart share too little
 _FULL_TURN: Final = 330 / 360  # of its degrees with points, for a lidar that spins
+_MOVES_MPS: Final = 0.3
 _STANDS_RADPS: Final = 0.01
 _OF_STAMP: Final = {"begin": 0.0, "middle": 0.5, "end": 1.0}
 
@@ -48,7 +51,7 @@ class Seen(Protocol):
 class Turning:
     """A lidar's rotation, None if unknown; and its motion per second in its own axes, by moment."""
 
-    turn: BeamTimes | None
+    turn: LidarTurn | None
     motion: Mapping[int, Arc]
 
     def timed(self, seen: Seen, sweep: Sweep) -> tuple[Sweep, str]:
@@ -57,42 +60,58 @@ class Turning:
         The motion is the odometry's, or else that between sweeps. Without both, a radar's Doppler may move it later.
         """
         motion = _told(seen) or self.motion.get(seen.moment)
-        stands = motion is not None and motion.way < MOVES_MPS and abs(motion.yaw_rad) < _STANDS_RADPS
+        stands = motion is not None and motion.way < _MOVES_MPS and abs(motion.yaw_rad) < _STANDS_RADPS
         if self.turn is None:
             return sweep, "" if stands else WITHOUT_TIMES
-        time_s = self.turn.of(sweep.lidar_xyz_m)
+        time_s = _times_of(self.turn, sweep.lidar_xyz_m)
         if motion is None:
             return replace(sweep, lidar_time_s=time_s), BY_AZIMUTH
         timed = replace(sweep, lidar_time_s=time_s, lidar_deskewed=True)
         if stands:
             return timed, BY_AZIMUTH
         xyz = sweep.lidar_xyz_m.astype(np.float64)
-        x, y, z = (xyz + time_s[:, None] * velocity_of(xyz, motion)).astype(np.float32).T
+        x, y, z = (xyz + time_s[:, None] * _velocity_of(xyz, motion)).astype(np.float32).T
         # Moved points lie in no order and at no common elevation: rows are those that were measured.
         moved = replace(timed, lidar_x_m=x, lidar_y_m=y, lidar_z_m=z, lidar_ring=_rows_of(sweep))
         return moved, BY_AZIMUTH
 
 
-def turning_of(sweeps: Iterable[tuple[Seen, Sweep]], told: LidarTurn | None) -> Turning | None:
-    """A lidar's rotation, from fleet.toml or from its sweeps; None if they have times, or it does not spin."""
-    surfaces, pairs, moves = {}, [], {}
+def turning_of(sweeps: Iterable[tuple[Seen, Sweep]], turn: LidarTurn | None) -> Turning | None:
+    """A lidar's rotation as in fleet.toml; None if the sweeps have times, or it does not spin.
+
+    Where odometry has no motion, pairs of sweeps give it.
+    """
+    surfaces, pairs = {}, []
     before: Seen | None = None
     for seen, sweep in sweeps:
         if before is None and (sweep.lidar_deskewed or sweep.lidar_time_s is not None or not _spins(sweep)):
             return None
-        if (motion := _told(seen)) is not None:
-            moves[seen.moment] = motion
-        surfaces[seen.moment] = surfaces_of(sweep.lidar_xyz_m)
-        if before is not None and before.drive == seen.drive:
+        if turn is None:
+            return Turning(None, {})
+        if _told(seen) is None:
+            surfaces[seen.moment] = surfaces_of(sweep.lidar_xyz_m)
+        if (
+            before is not None
+            and before.drive == seen.drive
+            and surfaces.keys() >= {before.moment, seen.moment}
+        ):
             gap_s = (seen.stamp_ns - before.stamp_ns) * 1e-9
             pairs += [(before.moment, seen.moment, gap_s)] if 0 < gap_s < _NEIGHBOUR_S else []
         before = seen
-    found = beam_times(surfaces, pairs, moves)
-    if told is None:
-        return Turning(found.turn, found.motion)
-    sense = 1.0 if told.sense == "left" else -1.0
-    turn = BeamTimes(sense, float(np.radians(told.begins_deg)), told.period_s, _OF_STAMP[told.stamp])
-    return Turning(turn, found.motion)
+    return Turning(turn, motions(surfaces, pairs))
+
+
+def _times_of(turn: LidarTurn, xyz_m: Float32[np.ndarray, "N 3"]) -> Float32[np.ndarray, " N"]:
+    """Times of points relative to the stamp [s]. The azimuth grows to the left, seen from above."""
+    azimuth = np.arctan2(xyz_m[:, 1], xyz_m[:, 0]).astype(np.float64) - np.radians(turn.begins_deg)
+    share = (azimuth if turn.sense == "left" else -azimuth) % (2 * np.pi) / (2 * np.pi)
+    return ((share - _OF_STAMP[turn.stamp]) * turn.period_s).astype(np.float32)
+
+
+def _velocity_of(xyz_m: Float[np.ndarray, "N 3"], motion: Arc) -> Float[np.ndarray, "N 3"]:
+    """Velocity of standing points relative to the lidar; with it, points are moved by their time to the stamp."""
+    x = motion.x - motion.yaw_rad * xyz_m[:, 1]
+    return np.stack([x, motion.yaw_rad * xyz_m[:, 0], np.zeros(len(xyz_m))], axis=1)
 
 
 def _told(seen: Seen) -> Arc | None:

@@ -11,12 +11,12 @@ from jaxtyping import Bool, Float32, UInt16
 
 from pipeline.ingest.units import unit_that_fits
 
-__all__ = ["LidarCloud", "cloud_columns", "first_field", "read_lidar"]
+__all__ = ["TIME_FIELDS", "LidarCloud", "cloud_columns", "first_field", "read_lidar"]
 
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _INTENSITY = ("intensity", "reflectivity", "intensities", "i", "remission", "signal")
 _RING = ("ring", "channel", "line", "laser_id", "beam", "row")
-_TIME = (
+TIME_FIELDS = (
     "time",
     "t",
     "timestamp",
@@ -117,7 +117,7 @@ def read_lidar(message: Any, stamp_ns: int, max_range_m: float) -> LidarCloud:
         z[keep],
         None if intensity is None else intensity[keep].astype(np.float32),
         _ring(ring, keep),
-        _relative_time_s(first_field(points, _TIME), keep, stamp_ns),
+        _relative_time_s(first_field(points, TIME_FIELDS), keep, stamp_ns),
         dropped,
         unit_that_fits(np.sqrt(range2), max_range_m) if 2 * dropped.total() > len(x) else "",
     )

@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
+from pipeline.ingest.messages.point_cloud import TIME_FIELDS
 from pipeline.ingest.propose.sensors import FoundCamera, FoundCloud, FoundSensors
 from pipeline.third_party_models import semantics_line
 
@@ -84,7 +85,13 @@ def fleet_text(
             lines += _camera(sensor)
         else:
             lines += [f"points = {json.dumps(sensor.topic)}"]
-            lines += _radar(sensor, facts.meanings.get(name, RadarMeaning())) if kind == "radar" else []
+            if kind == "radar":
+                lines += _radar(sensor, facts.meanings.get(name, RadarMeaning()))
+            elif sensor.fields and not set(sensor.fields) & set(TIME_FIELDS):
+                lines += [
+                    "# These clouds have no time per point. If the lidar turns, and its driver does not de-skew:"
+                ]
+                lines += ['# turn = { sense = "right", begins_deg = 180.0 }']
     if found.odometry:
         lines += ["", "[rigs.default.ego]", f"odometry = {json.dumps(found.odometry)}"]
     else:

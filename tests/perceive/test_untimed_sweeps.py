@@ -1,4 +1,4 @@
-"""Times of a spinning lidar's points from their azimuth: its sense, where a turn begins, and when to be silent."""
+"""Times of a spinning lidar's points from their azimuth, as fleet.toml says that it turns."""
 
 from dataclasses import dataclass, replace
 from functools import cache
@@ -8,8 +8,7 @@ import pytest
 from mcap.reader import make_reader
 
 from pipeline.ingest.deskew import deskew
-from pipeline.perceive.beam_times import BeamTimes, beam_times
-from pipeline.perceive.sweep_pairs import surfaces_of
+from pipeline.perceive.sweep_pairs import motions, surfaces_of
 from pipeline.perceive.untimed_sweeps import BY_AZIMUTH, WITHOUT_TIMES, Turning, turning_of
 from pipeline.rig.topics import TOPICS
 from pipeline.rigs import LidarTurn
@@ -20,7 +19,8 @@ from pipeline.simulate.world.drives import Drive
 from schemas.captures import Sweep
 from tests.makers.swept_streets import AROUND, pose
 
-GAP_S, SWEEPS, LEFT, RIGHT = 0.5, 14, 1.0, -1.0
+GAP_S, SWEEPS = 0.5, 14
+RIGHT = LidarTurn(sense="right", begins_deg=180.0)
 MOUNTED = pose(1.2, 0.0, 1.9)
 
 
@@ -54,11 +54,6 @@ def drive():
     return out
 
 
-def found_of(clouds, gap_s=GAP_S):
-    surfaces = {k: surfaces_of(xyz) for k, xyz in enumerate(clouds)}
-    return beam_times(surfaces, [(k, k + 1, gap_s) for k in range(len(clouds) - 1)], {})
-
-
 def mirrored(xyz):
     return (xyz * [1, -1, 1]).astype(np.float32)
 
@@ -76,40 +71,34 @@ def off_m(cloud, still):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("change", "sense"), [(np.asarray, RIGHT), (mirrored, LEFT)])
-def test_a_moving_car_shows_which_way_its_lidar_turns_and_where_a_turn_begins(change, sense):
+@pytest.mark.parametrize(("change", "sense"), [(np.asarray, "right"), (mirrored, "left")])
+def test_points_are_moved_to_the_stamp_by_the_motion_between_sweeps(change, sense):
     raw, still, since_s = zip(*drive(), strict=True)
-    found = found_of([change(xyz) for xyz in raw])
-    assert found.turn is not None
-    assert found.turn.sense == sense
-    assert abs(np.cos(found.turn.begin_rad) + 1) < 0.07  # behind the car, within 20 deg
-    turning = Turning(found.turn, found.motion)
-    wrong = Turning(replace(found.turn, sense=-sense), found.motion)
+    seen = [(Seen(k, round(1e9 * k * GAP_S)), sweep(change(xyz))) for k, xyz in enumerate(raw)]
+    turning = turning_of(seen, LidarTurn(sense=sense, begins_deg=180.0))
+    wrong = replace(
+        turning, turn=LidarTurn(sense={"left": "right", "right": "left"}[sense], begins_deg=180.0)
+    )
     for k in range(0, SWEEPS, 6):
         as_logged, right = change(raw[k]), change(still[k])
-        by_azimuth, note = turning.timed(Seen(k, 0), sweep(as_logged))
+        by_azimuth, note = turning.timed(*seen[k])
         assert (note, by_azimuth.lidar_deskewed) == (BY_AZIMUTH, True)
-        ahead = np.abs(np.arctan2(as_logged[:, 1], as_logged[:, 0])) < 2.5  # the begin is known to a sector
+        ahead = np.abs(np.arctan2(as_logged[:, 1], as_logged[:, 0])) < 2.5
         assert np.abs(by_azimuth.lidar_time_s - since_s[k])[ahead].max() < 0.008
         as_far = off_m(as_logged, right)
         assert off_m(by_azimuth.lidar_xyz_m, right) < 0.3 * as_far
-        assert off_m(wrong.timed(Seen(k, 0), sweep(as_logged))[0].lidar_xyz_m, right) > 1.5 * as_far
+        assert off_m(wrong.timed(*seen[k])[0].lidar_xyz_m, right) > 1.5 * as_far
 
 
-@pytest.mark.slow
-def test_sweeps_that_their_driver_has_put_right_are_left_as_they_are():
-    assert found_of([still for _, still, _ in drive()]).turn is None
-
-
-def test_a_car_that_stands_tells_nothing_and_its_points_stay():
-    rng, (_, still, _) = np.random.default_rng(0), drive()[0]
-    clouds = [(still + rng.normal(0, 0.01, still.shape)).astype(np.float32) for _ in range(10)]
-    found = found_of(clouds)
-    assert found.turn is None
-    stands = Seen(0, 0, ego_speed_mps=0.0)
-    assert Turning(None, found.motion).timed(stands, sweep(clouds[0]))[1] == ""
-    timed, _ = Turning(BeamTimes(LEFT, 0.0), found.motion).timed(stands, sweep(clouds[0]))
-    np.testing.assert_array_equal(timed.lidar_xyz_m, clouds[0])
+def test_odometry_goes_before_the_motion_between_sweeps_and_a_car_that_stands_keeps_its_points():
+    cloud = sweep(drive()[0][0])
+    moments = [(Seen(k, k * 10**8, ego_speed_mps=0.0), cloud) for k in range(2)]
+    turning = turning_of(moments, RIGHT)
+    assert turning.motion == {}
+    timed, note = turning.timed(*moments[0])
+    assert (note, timed.lidar_deskewed) == (BY_AZIMUTH, True)
+    np.testing.assert_array_equal(timed.lidar_xyz_m, cloud.lidar_xyz_m)
+    assert Turning(None, {}).timed(*moments[0])[1] == ""
 
 
 def test_a_car_that_drives_and_a_lidar_of_which_nobody_knows_is_counted():
@@ -124,10 +113,12 @@ def test_a_car_that_drives_and_a_lidar_of_which_nobody_knows_is_counted():
 )
 def test_what_fleet_toml_says_needs_no_car_that_moves(sense, stamp, times):
     told = LidarTurn(sense=sense, begins_deg=-90.0, stamp=stamp)
-    moments = [(Seen(0, 0), sweep(drive()[0][0]))]
-    turn = turning_of(moments, told).turn
-    at = turn.at(np.radians([-89.9999, 0.0]) if sense == "left" else np.radians([-90.0001, 0.0]))
-    np.testing.assert_allclose(at, times, atol=1e-4)
+    azimuth = np.radians([-89.9999, 0.0] if sense == "left" else [-90.0001, 0.0])
+    ahead = np.stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth], 1)
+    cloud = sweep(np.vstack([10 * ahead, drive()[0][0]]))
+    timed, note = turning_of([(Seen(0, 0), cloud)], told).timed(Seen(0, 0), cloud)
+    np.testing.assert_allclose(timed.lidar_time_s[:2], times, atol=1e-4)
+    assert (note, timed.lidar_deskewed) == (BY_AZIMUTH, False)
 
 
 @pytest.mark.parametrize("change", [{"lidar_time_s": "some"}, {"lidar_deskewed": True}, {"only": "ahead"}])
@@ -137,22 +128,19 @@ def test_sweeps_with_times_and_lidars_that_do_not_spin_are_not_looked_at(change)
         xyz, change = xyz[xyz[:, 0] > 0], {}
     if "lidar_time_s" in change:
         change = {"lidar_time_s": np.zeros(len(xyz), np.float32)}
-    assert turning_of([(Seen(0, 0), replace(sweep(xyz), **change))], None) is None
+    assert turning_of([(Seen(0, 0), replace(sweep(xyz), **change))], RIGHT) is None
 
 
 @pytest.mark.slow
 @pytest.mark.real_logs
-def test_kitti_s_lidar_turns_to_the_right_and_begins_behind(kitti_logs):
-    """As the odometry programs that are measured on it assume, whose authors know the sensor."""
+def test_the_motion_of_kitti_s_car_is_found_until_it_stands(kitti_logs):
     store, clouds = RosMessages(2).typestore, []
     (log,) = kitti_logs.glob("*.mcap")
     with log.open("rb") as stream:
         for schema, _, message in make_reader(stream).iter_messages(topics=[TOPICS["lidar"]]):
             held = store.deserialize_cdr(message.data, schema.name)
             clouds.append(np.frombuffer(held.data.tobytes(), "<f4").reshape(-1, held.point_step // 4)[:, :3])
-    found = found_of(clouds, 0.3)
-    assert found.turn is not None
-    assert found.turn.sense == RIGHT
-    assert abs(np.cos(found.turn.begin_rad) + 1) < 0.07
-    assert found.motion[0].x == pytest.approx(2.4, abs=0.2)
-    assert found.motion[len(clouds) - 1].way < 0.1
+    surfaces = {k: surfaces_of(xyz) for k, xyz in enumerate(clouds)}
+    found = motions(surfaces, [(k, k + 1, 0.3) for k in range(len(clouds) - 1)])
+    assert found[0].x == pytest.approx(2.4, abs=0.2)
+    assert found[len(clouds) - 1].way < 0.1
