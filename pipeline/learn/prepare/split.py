@@ -1,10 +1,11 @@
 """Split of frames for training, validation and test of a network: no vehicle, day or place is on two sides.
 
-Frames with a common key are linked. If the links form separate groups, whole groups are assigned and no frame
-is lost. If all frames are linked (every vehicle drives every day), vehicles, days and places are divided so
-that the sides have the largest worth (`search`), and a frame is used only if all of its keys agree.
+Frames with a common key are linked, directly or through others. Whole groups of linked frames are assigned, the largest
+first, equal ones in the order of a hash, to the side that lacks most. Where all frames are linked (every vehicle drives
+every day, and days are among the keys), only one side has frames: split by fewer keys (`sides.settled_keys`).
 
-Decisions of earlier runs are kept: a lake grows, and a frame that tested one network must not train the next.
+Decisions of earlier runs are kept: a lake grows, and a frame that tested one network must not train the next. A frame
+whose keys were decided differently is left out.
 """
 
 from __future__ import annotations
@@ -14,10 +15,6 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
-from jaxtyping import Bool, Int
-
-from pipeline.learn.prepare.search import Cut, search_sides
 from schemas.training import SPLITS
 
 __all__ = ["SplitPlan", "Unit", "environment_of_speeds", "plan_split"]
@@ -74,8 +71,7 @@ def plan_split(
     shares = {side: share for side, share in shares.items() if share > 0}
     units = sorted(units, key=lambda u: (u.vehicle, u.day, u.place))
     known = {key: side for key, side in (decided or {}).items() if key[0] in by and side in shares}
-    dealt = _deal_groups(_linked(units, by), by, shares, seed, known)
-    return SplitPlan(tuple(by), known | _searched(units, by, shares, seed, known, dealt))
+    return SplitPlan(tuple(by), _deal_groups(_linked(units, by), by, shares, seed, known) | known)
 
 
 def environment_of_speeds(speeds_mps: Sequence[float | None]) -> str:
@@ -147,41 +143,6 @@ def _assign(
         have[side] += unit.frames
         for key in unit.keys(by):
             sides[key] = side
-
-
-def _searched(
-    units: Sequence[Unit],
-    by: Sequence[str],
-    shares: Mapping[str, float],
-    seed: int,
-    known: Mapping[tuple[str, str], str],
-    dealt: Mapping[tuple[str, str], str],
-) -> dict[tuple[str, str], str]:
-    """Sides of all keys by a search from two starts: whole groups assigned, and all keys on the first side."""
-    if not units:
-        return {}
-    names = list(shares)
-    number = {key: i for i, key in enumerate(dealt)}
-    keys = np.array([[number[key] for key in unit.keys(by)] for unit in units])
-    fixed = np.array([key in known for key in number])
-    own = _without_riders(keys, fixed)
-    merged, of_unit = np.unique(own, axis=0, return_inverse=True)
-    frames = np.bincount(of_unit.reshape(-1), [u.frames for u in units]).astype(np.int64)
-    groups = np.array([names.index(known.get(key, side)) for key, side in dealt.items()])
-    cut = Cut(merged, frames, np.array([shares[name] for name in names]), fixed)
-    sides = search_sides(cut, [groups, np.where(fixed, groups, 0)], seed)
-    for unit, kept in zip(keys, own, strict=True):  # riders go where the rest of their unit goes
-        sides[unit[kept < 0]] = sides[unit[kept >= 0][0]]
-    return {key: names[sides[i]] for key, i in number.items()}
-
-
-def _without_riders(keys: Int[np.ndarray, "N K"], known: Bool[np.ndarray, " M"]) -> Int[np.ndarray, "N K"]:
-    """Keys of each unit; -1 for undecided keys of one unit only, which follow its other keys."""
-    alone = (np.bincount(keys.ravel(), minlength=len(known)) == 1) & ~known
-    out = np.where(alone[keys], -1, keys)
-    nothing = (out < 0).all(axis=1)
-    out[nothing, 0] = keys[nothing, 0]
-    return out
 
 
 def _rank(key: tuple[str, str], seed: int) -> str:
