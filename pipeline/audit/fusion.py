@@ -24,8 +24,8 @@ from pipeline.geometry.changes import change_between, change_jacobian, changed
 __all__ = ["Fused", "Mount", "PoseDays", "current_level", "fuse"]
 
 _DOFS = 6
-# Share of the prior's variance from which a direction counts as left at the prior.
-_NOTHING, _LEAST_SHARE = 0.99, 1e-9
+# Share of the prior's variance from which a direction counts as left at the prior: as an axis of a day's record.
+_NOTHING, _LEAST_SHARE = 0.5, 1e-9
 # Of a day's variance, what varies from day to day at least: sigmas are estimates themselves.
 _LEAST_VARYING = 0.01
 # Sigmas by which one axis of a day may lie from the later days: by chance once in a hundred days of six axes.
@@ -60,6 +60,12 @@ class PoseDays:
     def at(self, rows: np.ndarray | slice) -> PoseDays:
         """Some of the days."""
         return PoseDays(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
+
+    def change_per_day(self) -> Float[np.ndarray, " 6"]:
+        """Size of the change from the first day to the last, by DoF [rad or m a day]; infinite for a single day."""
+        if len(self.day) == 1:
+            return np.full(_DOFS, np.inf)
+        return np.asarray(np.abs(change_between(self.T[0], self.T[-1])) / (self.day[-1] - self.day[0]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -138,6 +138,8 @@ def _sensor_row(
         pose = _Pose(T, covariance, covariance, covariance, T, covariance)
         return replace(row, **_columns(pose), status="prior"), pose
     drift = drift_per_day(sensor, reference, known[1])
+    if drift is not None:  # a step may pass for a drift while it has few days: its days then lie level
+        drift = np.minimum(drift, counted.poses.change_per_day())
     moving = mount if drift is None else replace(mount, wander=mount.wander + drift**2)
     found = fuse(counted.poses, moving, dt.date.fromisoformat(empty.day).toordinal() + 1)
     names = [day_name(int(day)) for day in counted.poses.day]

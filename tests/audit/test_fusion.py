@@ -74,7 +74,7 @@ def test_what_varies_averages_down_and_what_is_common_does_not():
 
 def test_the_prior_counts_once_however_many_days_lean_on_it():
     rng = np.random.default_rng(4)
-    days, truth = days_of(30, rng, noise=2 * np.sqrt(np.diag(PRIOR)), bias=np.zeros(6), scatter=np.zeros(6))
+    days, truth = days_of(30, rng, noise=0.8 * np.sqrt(np.diag(PRIOR)), bias=np.zeros(6), scatter=np.zeros(6))
     found = fuse(days, STILL, 31)
     each = np.linalg.norm(change_between(truth, days.T)[:, :3], axis=1)
     assert np.linalg.norm(change_between(truth, found.T)[:3]) < 0.7 * np.median(each)
