@@ -129,5 +129,5 @@ def _status(found: ExportedCalibration, a: str, b: str) -> str:
 
 def _doubts(found: ExportedCalibration, a: str, b: str) -> dict[str, Any]:
     """Axes of a pose that kept the prior or that no check covers; empty if there are none."""
-    axes = sorted({dof for pair in _pairs(found, a, b) for dof in (*pair.at_prior, *pair.resting)})
+    axes = sorted({dof for pair in _pairs(found, a, b) for dof in pair.at_prior})
     return {"kept_at_prior": axes} if axes else {}

@@ -1,7 +1,5 @@
 """The loader's order is the seed's, resumes to the frame, and gives every rank its own."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -10,7 +8,7 @@ from pipeline.errors import ContractError
 from pipeline.learn.batches.loader import TrainingLoader, load_split
 from pipeline.learn.prepare.survey import plan_days, survey_day
 from pipeline.store.partitions import Partition
-from pipeline.store.tables import read_rows, write_partition
+from pipeline.store.tables import read_rows
 from schemas.training import TRAINING, TrainingRow
 from tests.makers import training_lakes
 from tests.makers.stages import prepare_day
@@ -106,22 +104,6 @@ def test_a_batch_holds_what_the_rows_hold(lake):
     assert torch.equal(some.image[1], batch.image[3])
     assert names(batch[2:4]) == names(batch)[2:4]
     assert batch.to("cpu").lidar_flags.dtype == torch.uint8
-
-
-def test_a_table_of_an_older_version_is_read_without_its_columns_that_are_gone(lake, tmp_path):
-    partition = lake.partitions(TRAINING.name)[0]
-    rows = read_rows(lake, TRAINING, partition, TrainingRow)
-    older = replace(
-        TRAINING, version=2, columns=(*TRAINING.columns, replace(TRAINING.columns[-1], name="road_slope"))
-    )
-    other = training_lakes.Lake.at(tmp_path)
-    with write_partition(other, older, partition, "old", "0.9.0") as writer:
-        for row in rows:
-            object.__setattr__(row, "road_slope", 0.5)
-        writer.append(rows)
-        writer.describe(kept={}, rejected={})
-    batch = load_split(other, rows[0].split)
-    assert np.array_equal(batch.radar_xyz_m, np.stack([row.radar_xyz_m for row in rows]))
 
 
 def test_a_changed_table_or_another_order_refuses_to_resume(lake, tmp_path):
