@@ -14,14 +14,14 @@ and S once more.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from pipeline.geometry.changes import change_between, change_jacobian, changed
 
-__all__ = ["Fused", "Mount", "PoseDays", "current_level", "fuse"]
+__all__ = ["Fused", "Mount", "PoseDays", "current_level", "fuse", "with_held_day"]
 
 _DOFS = 6
 # Share of the prior's variance from which a direction counts as left at the prior: as an axis of a day's record.
@@ -132,6 +132,23 @@ def fuse(days: PoseDays, mount: Mount, tomorrow: int) -> Fused:
     covariance, common, of_prior = (_symmetric(K @ part @ K.T) for part in parts)
     moved_on = int(days.day[kept[0]]) if earlier else None
     return Fused(T, covariance, common, of_prior, tuple(kept), tuple(left_out), moved_on)
+
+
+def with_held_day(found: Fused, day: PoseDays, mount: Mount) -> Fused | None:
+    """The pose with the step to a held day as a part of its sigma, if the day lies apart; None if it does not.
+
+    A knock may make the verdict hold the day that first shows it: until a day counts, both poses are possible.
+    """
+    step = change_between(found.T, day.T[0])
+    _, weight, variance = _compared(day, mount)
+    [covariance] = _in_changes(found.T[None], found.covariance[None])
+    z = np.abs(step) / np.sqrt(variance[0] + np.diag(covariance))
+    apart = (weight[0] > 0) & (z > _APART_SIGMAS)
+    if not apart.any():
+        return None
+    K = np.linalg.inv(change_jacobian(found.T))
+    wider = _symmetric(K @ (covariance + np.diag(np.where(apart, step**2, 0.0))) @ K.T)
+    return replace(found, covariance=wider)
 
 
 def current_level(days: PoseDays, mount: Mount) -> tuple[list[int], list[int]]:

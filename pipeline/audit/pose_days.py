@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -38,6 +38,7 @@ class SensorDays:
         targets: of the last of these days, in the reference's frame; None if it has none.
         prior: T_reference_sensor and covariance (left perturbation) before the last day; None if unknown.
         last: day, status and reason of the last row.
+        held: days with a pose that do not count, in order of day.
     """
 
     poses: PoseDays
@@ -47,14 +48,19 @@ class SensorDays:
     targets: Float[np.ndarray, "3 3"] | None
     prior: tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "6 6"]] | None
     last: tuple[str, str, str]
+    held: PoseDays
 
     def since(self, first: int) -> SensorDays:
         """The days from an ordinal on."""
         rows = np.flatnonzero(self.poses.day >= first)
         keys = tuple(self.work_keys[k] for k in rows.tolist())
-        return SensorDays(
-            self.poses.at(rows), self.accepted[rows], self.observable[rows], keys, self.targets, self.prior, self.last
-        )  # fmt: skip
+        return replace(
+            self,
+            poses=self.poses.at(rows),
+            accepted=self.accepted[rows],
+            observable=self.observable[rows],
+            work_keys=keys,
+        )
 
     def charted(self) -> PairDays:
         """The days as the charts have them."""
@@ -118,7 +124,7 @@ def _sensor(rows: pa.Table, at: Sequence[int]) -> SensorDays:
     C, B, P = (matrices(rows[name]) for name in ("covariance", "common_covariance", "prior_covariance"))
     knows_prior = np.isfinite(prior).all(axis=(1, 2)) & _is_covariance(P)
     sound = np.isfinite(pose).all(axis=(1, 2)) & _is_covariance(C) & np.isfinite(B).all(axis=(1, 2))
-    kept = np.flatnonzero(counts & sound & knows_prior)
+    kept, left = (np.flatnonzero(of & sound & knows_prior) for of in (counts, ~counts))
     days: Int[np.ndarray, " N"] = ordinals(rows["day"])
     targets, keys = matrices(rows["targets_m"], (3, 3)), rows["work_key"].to_pylist()
     seen = kept[np.isfinite(targets[kept]).all(axis=(1, 2))]
@@ -132,6 +138,7 @@ def _sensor(rows: pa.Table, at: Sequence[int]) -> SensorDays:
         targets[seen[-1]] if len(seen) else None,
         (prior[known[-1]], P[known[-1]]) if len(known) else None,
         (last[0], last[1], last[2]),
+        PoseDays(days[left], pose[left], C[left], B[left], prior[left], P[left]),
     )
 
 

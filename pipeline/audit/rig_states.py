@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from scipy.special import ndtri
 
 from pipeline.audit.estimates import day_name
-from pipeline.audit.fusion import Mount, fuse
+from pipeline.audit.fusion import Mount, fuse, with_held_day
 from pipeline.audit.pose_days import SensorDays, VehiclePoses
 from pipeline.audit.restarts import drift_per_day, last_restart
 from pipeline.config import VerifyConfig
@@ -146,6 +146,14 @@ def _sensor_row(
     if found.moved_on is not None:
         base = replace(base, since=day_name(found.moved_on))
         why = f"its days show another pose since {base.since}"
+    later = np.flatnonzero(days.held.day > counted.poses.day[-1])[-1:]
+    doubted = with_held_day(found, days.held.at(later), mount) if len(later) else None
+    if doubted is not None:
+        found = doubted
+        held = day_name(int(days.held.day[later[0]]))
+        remarks.append(
+            f"{held} was held and lies apart: the sensor may have moved, so both poses are possible"
+        )
     before = counted.poses.T_prior[-1], counted.poses.prior_covariance[-1]
     pose = _Pose(found.T, found.covariance, found.common, found.of_prior, *before)
     left_out = ", ".join(names[k] for k in found.left_out)

@@ -212,3 +212,18 @@ def test_a_damaged_pose_is_not_fused(lake):
     rows = states(lake, pose_rows("a", 4, np.random.default_rng(10), of=of))
     assert rows["left"].days == days(1, 3, 4)
     assert rows["front"].days == days(1, 2, 4)
+
+
+def test_a_held_day_that_lies_apart_leaves_both_poses_possible(lake):
+    """The day of a knock was held: the file of that night was 1 deg off, and certified."""
+    of = {(4, "front"): {"status": "held", "reason": "halves of the day disagree"}}
+    turned = pose_rows(
+        "a", 5, np.random.default_rng(13), motion=lambda d: {"front": 2 * TURN * (d >= 4)}, of=of
+    )
+    front = states(lake, turned)["front"]
+    assert front.days[-1] == "2026-03-04"
+    assert "azimuth" not in front.determined
+    assert "2026-03-05 was held and lies apart" in front.reason
+    truth = T_TOP["front"] @ exp_se3(2 * TURN)
+    sigma = np.sqrt(np.diag(front.covariance)[:3])
+    assert np.all(np.abs(log_se3(transform_of(front) @ inverse(truth))[:3]) < 3 * sigma)
