@@ -61,13 +61,8 @@ def other_scenes(
     return OtherScenes(to_left @ shift, to_left @ np.diag(variance) @ to_left.T)
 
 
-def first_and_last(T_base_sensor: Float[np.ndarray, "4 4"], series: Sequence[Series]) -> DayParts | None:
-    """First and last part of the day, of the axis that differs most between them."""
-    parts = [p for s in series if (p := _parts(T_base_sensor, s)) is not None]
-    return max(parts, key=lambda p: float(np.abs(p.sigmas(0.0)).max()), default=None)
-
-
-def _parts(T: np.ndarray, series: Series) -> DayParts | None:
+def first_and_last(T: Float[np.ndarray, "4 4"], series: Series) -> DayParts | None:
+    """First and last part of the day of a sensor at T = T_base_sensor; None if it is too short."""
     whole = regress(series.rows)
     if whole is None:
         return None

@@ -86,7 +86,7 @@ def estimate_radar_base(
         edge, inverse(T), 0.0 if clock is None else float(clock.value[0]), (J.T / variance) @ J, np.zeros(7),
         _biases(T, 0.0 if directions is None else directions.bias_rad()),
         frames_used=len(moving), diagnostics=_numbers(yaw, len(moving)), notes=_notes(yaw, pitch, clock),
-        others=other_scenes(T, halves), parts=first_and_last(T, [day]),
+        others=other_scenes(T, halves), parts=first_and_last(T, day),
     )  # fmt: skip
 
 

@@ -147,11 +147,18 @@ def test_a_car_that_parks_on_a_kerb_for_half_of_the_day_is_one_scene(street):
 def test_a_lidar_that_turned_at_noon_shows_it(street, evidence):
     assert np.abs(evidence.parts.sigmas(PART_FLOOR_RAD)).max() < 3.0
     sweeps, noon = street.sweeps["top"], len(street.sweeps["top"]) // 2
-    later = [turned(s, [np.radians(1.0), 0.0, 0.0]) for s in sweeps[noon:]]
+    later = [turned(s, [0.0, 0.0, np.radians(1.0)]) for s in sweeps[noon:]]
     found = estimated(replace(street, sweeps={"top": [*sweeps[:noon], *later]})).parts
     assert np.abs(found.sigmas(PART_FLOOR_RAD)).max() > MOVED_SIGMAS
-    assert np.degrees(abs(found.step[0])) == pytest.approx(1.0, abs=0.2)
+    assert np.degrees(abs(found.step[2])) == pytest.approx(1.0, abs=0.2)
     assert abs(found.cut_ns[1] - sweeps[noon].stamp_ns) < 4e9
+
+
+def test_a_car_that_stands_otherwise_in_the_afternoon_is_no_lidar_that_moved(street):
+    sweeps, noon = street.sweeps["top"], len(street.sweeps["top"]) // 2
+    later = [turned(s, np.radians([0.3, 0.7, 0.0])) for s in sweeps[noon:]]
+    found = estimated(replace(street, sweeps={"top": [*sweeps[:noon], *later]})).parts
+    assert np.abs(found.sigmas(PART_FLOOR_RAD)).max() < 3.0
 
 
 def test_cars_that_keep_their_distance_do_not_slow_the_way(street):
