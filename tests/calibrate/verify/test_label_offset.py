@@ -69,7 +69,7 @@ def test_labels_of_another_picture_are_flagged_or_leave_the_shift_open():
 
 @pytest.mark.parametrize("wide_px", [1, 2, 4])
 def test_labels_too_wide_are_not_displaced_ones_where_the_skyline_is_in_place(wide_px):
-    """Seven of eight worlds were held for this with labels of a coarse network."""
+    """Labels of a coarse network seemed beside their picture on seven of eight days."""
     gradients = gradients_of(FRAMES, wide_px=wide_px)
     offset = measure_label_offset(gradients, BLOCKS)
     assert not offset.is_beside
