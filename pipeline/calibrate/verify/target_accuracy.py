@@ -72,12 +72,12 @@ class Claim:
     @property
     def is_contradicted(self) -> bool:
         """Held-out frames would move the estimate by more sigmas of that move than chance does."""
-        return 0 < self.contradiction_sigmas * self.shift_sigma_rad < self.shift_rad
+        return bool(0 < self.contradiction_sigmas * self.shift_sigma_rad < self.shift_rad)
 
     @property
     def is_exceeded(self) -> bool:
         """They contradict it, and would move it by more than its sigma."""
-        return self.is_contradicted and self.shift_rad > self.sigma_rad
+        return bool(self.is_contradicted and self.shift_rad > self.sigma_rad)
 
     def is_exceeded_by(self, error_rad: float) -> bool:
         """Whether an error that a check shows is more than the sigma, and not within the limit with it.
@@ -86,7 +86,7 @@ class Claim:
         """
         sigma_rad = float(np.hypot(self.sigma_rad, error_rad / _CHECK_SIGMAS))
         beyond = _quantile(error_rad, sigma_rad, self.confidence) > self.limit_rad
-        return error_rad > self.sigma_rad and beyond
+        return bool(error_rad > self.sigma_rad and beyond)
 
     @property
     def without_sigma(self) -> Claim:

@@ -57,15 +57,15 @@ DEG = np.radians(1.0)
 @pytest.mark.parametrize(
     ("pair", "error", "status", "determined"),
     [
-        ("camera_lidar", (0, 0.05 * DEG, 0, 0, 0, 0), "accepted", ("azimuth", "elevation")),
-        ("camera_lidar", (0, 0.15 * DEG, 0, 0, 0, 0), "held", ()),
-        ("camera_lidar", (0, 0, 0, 0, 0.1, 0), "held", ()),  # up to .4 deg of near targets
-        ("lidar_radar", (0, 0, 0.15 * DEG, 0, 0, 0), "accepted", ("azimuth", "elevation")),
-        ("lidar_radar", (0, 0, 0.5 * DEG, 0, 0, 0), "held", ()),
-        ("lidar_radar", (0, 3 * DEG, 0, 0, 0, 0), "accepted", ("azimuth",)),  # pitch: no matter for its azimuth
-        ("lidar_radar", (0, 0, 0, 0.4, 0, 0), "held", ()),  # along the line of sight
-        ("lidar_lidar", (0, 3 * DEG, 0, 0, 0, 0), "accepted", ("azimuth",)),
-        ("lidar_lidar", (0, 3 * DEG, 3 * DEG, 0, 0, 0), "held", ()),
+        ("camera_lidar", (0.0, 0.05 * DEG, 0.0, 0.0, 0.0, 0.0), "accepted", ("azimuth", "elevation")),
+        ("camera_lidar", (0.0, 0.15 * DEG, 0.0, 0.0, 0.0, 0.0), "held", ()),
+        ("camera_lidar", (0.0, 0.0, 0.0, 0.0, 0.1, 0.0), "held", ()),  # up to .4 deg of near targets
+        ("lidar_radar", (0.0, 0.0, 0.15 * DEG, 0.0, 0.0, 0.0), "accepted", ("azimuth", "elevation")),
+        ("lidar_radar", (0.0, 0.0, 0.5 * DEG, 0.0, 0.0, 0.0), "held", ()),
+        ("lidar_radar", (0.0, 3 * DEG, 0.0, 0.0, 0.0, 0.0), "accepted", ("azimuth",)),  # pitch: no matter for its azimuth
+        ("lidar_radar", (0.0, 0.0, 0.0, 0.4, 0.0, 0.0), "held", ()),  # along the line of sight
+        ("lidar_lidar", (0.0, 3 * DEG, 0.0, 0.0, 0.0, 0.0), "accepted", ("azimuth",)),
+        ("lidar_lidar", (0.0, 3 * DEG, 3 * DEG, 0.0, 0.0, 0.0), "held", ()),
     ],
 )  # fmt: skip
 def test_a_check_holds_where_the_pose_would_be_beyond_its_limits_if_it_is_right(
@@ -94,14 +94,14 @@ def test_a_check_holds_where_the_pose_would_be_beyond_its_limits_if_it_is_right(
 
 def test_a_check_whose_consequence_nobody_knows_always_holds():
     assert verdict(estimate(0.2), SAME, [checked(None)]).status == "held"
-    assert verdict(estimate(0.2), SAME, [checked((0, 1e-5, 0, 0, 0, 0))]).status == "accepted"
+    assert verdict(estimate(0.2), SAME, [checked((0.0, 1e-5, 0.0, 0.0, 0.0, 0.0))]).status == "accepted"
 
 
 def test_a_record_held_for_its_sigma_is_held_for_nothing_more_by_a_check_within_that_sigma():
     unsure = {name: claim(0.15) for name in DIRECTIONS}
-    within = verdict(estimate(0.2), SAME, [checked((0, 0.1 * DEG, 0, 0, 0, 0))], unsure)
+    within = verdict(estimate(0.2), SAME, [checked((0.0, 0.1 * DEG, 0.0, 0.0, 0.0, 0.0))], unsure)
     assert (within.status, within.unsure_only) == ("held", True)
-    beyond = verdict(estimate(0.2), SAME, [checked((0, 0.2 * DEG, 0, 0, 0, 0))], unsure)
+    beyond = verdict(estimate(0.2), SAME, [checked((0.0, 0.2 * DEG, 0.0, 0.0, 0.0, 0.0))], unsure)
     assert (beyond.status, beyond.unsure_only) == ("held", False)
 
 
