@@ -36,9 +36,9 @@ def audit(
         next_steps,
     )
     from pipeline.calibrate.methods import method_named
-    from pipeline.config import load_fleet
-    from pipeline.stage_work import Task, Window
-    from pipeline.stages import AUDIT, REPORT, STATE
+    from pipeline.core.config import load_fleet
+    from pipeline.core.stage_work import Task, Window
+    from pipeline.core.stages import AUDIT, REPORT, STATE
     from pipeline.store.partitions import Lake
     from schemas.drift import DRIFT, DRIFT_STATUSES
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from pipeline.stage_work import Task
+    from pipeline.core.stage_work import Task
 
 __all__ = ["calibrate", "parse_pair", "parse_perturb"]
 
@@ -43,10 +43,10 @@ def calibrate(
     from dataclasses import replace
 
     from pipeline.calibrate.methods import method_named
-    from pipeline.config import load_fleet
-    from pipeline.errors import ConfigError
-    from pipeline.extrinsics.prior import require_named_files
-    from pipeline.stage_work import Task
+    from pipeline.core.config import load_fleet
+    from pipeline.core.errors import ConfigError
+    from pipeline.core.stage_work import Task
+    from pipeline.rig.day_prior import require_named_files
     from pipeline.store.partitions import Lake, Partition
 
     if page is not None and frame is None:
@@ -69,9 +69,9 @@ def _calibrate_day(task: Task) -> int:
     from dataclasses import replace
 
     from jobs.terminal.summary import exit_code, print_summary, progress_reporter
-    from pipeline.errors import ConfigError
+    from pipeline.core.errors import ConfigError
+    from pipeline.core.stages import CALIBRATE
     from pipeline.fleet.ledger import record_outcome
-    from pipeline.stages import CALIBRATE
     from pipeline.store.views import perceived
     from schemas.words import day_word
 
@@ -150,7 +150,7 @@ def parse_perturb(text: str | None) -> tuple[float, float] | None:
 
 def parse_pair(text: str, option: str) -> tuple[float, float]:
     """Parse "ROT_DEG,TRANS_M" to (degrees, metres); a ConfigError names `option`."""
-    from pipeline.errors import ConfigError
+    from pipeline.core.errors import ConfigError
 
     try:
         rotation_deg, translation_m = (float(part) for part in text.split(","))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.errors import ConfigError
+from pipeline.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from jobs.frame_options import FrameOptions
     from pipeline.export.calibration import ExportedCalibration, ExportedPair, FrameNames
     from pipeline.export.compare import Side
-    from pipeline.geometry.transform_tree import TransformTree
     from pipeline.rig.graph import Edge
     from pipeline.rig.rig import Rig
+    from pipeline.rig.transform_tree import TransformTree
 
 __all__ = ["mounting", "poses_in_use", "read_calibration", "read_sides"]
 
@@ -107,9 +107,9 @@ def _logged(path: Path) -> TransformTree:
     """Read the transforms on /tf_static of a log in any container."""
     from contextlib import closing
 
-    from pipeline.geometry.transform_tree import TransformTree
     from pipeline.ingest.containers.reader import open_log
     from pipeline.ingest.messages.decoding import decode
+    from pipeline.rig.transform_tree import TransformTree
 
     tree = TransformTree()
     with closing(open_log(path)) as log:
@@ -190,8 +190,8 @@ def _side_of_files(text: str, form: str, files: str, names: FrameNames, edges: t
     from pipeline.export.compare import Side, composed
     from pipeline.export.files import read_files
     from pipeline.export.formats import format_named
-    from pipeline.extrinsics.prior_file import read_transforms
     from pipeline.rig.edges import words_of
+    from pipeline.rig.prior_file import read_transforms
 
     if form:
         found = format_named(form).pairs(read_files([Path(f) for f in files.split(",")]), names, edges)

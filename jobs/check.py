@@ -26,11 +26,11 @@ def check(fleet: Path, /, *logs: Path, rig: str | None = None, json: bool = Fals
     from dataclasses import asdict
 
     from jobs.terminal.summary import print_json, print_summary, progress_reporter
-    from pipeline.config import load_fleet
-    from pipeline.errors import ConfigError
-    from pipeline.extrinsics.prior import require_named_files
+    from pipeline.core.config import load_fleet
+    from pipeline.core.errors import ConfigError
     from pipeline.ingest.check import check_logs
     from pipeline.perceive.models.source import check_models
+    from pipeline.rig.day_prior import require_named_files
 
     config = load_fleet(fleet)
     require_named_files(config)

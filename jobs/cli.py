@@ -18,7 +18,7 @@ from cyclopts import App, CycloptsError
 
 from jobs.terminal.logging import configure, logger
 from jobs.terminal.summary import is_terminal, print_summary
-from pipeline.errors import BoresightError
+from pipeline.core.errors import BoresightError
 from pipeline.store.atomic_write import NO_SPACE
 
 __all__ = ["COMMANDS", "app", "main"]

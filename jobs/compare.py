@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from jobs.frame_options import FrameOptions
 
 if TYPE_CHECKING:
-    from pipeline.extrinsics.differences import PairDifference
+    from pipeline.rig.differences import PairDifference
 
 __all__ = ["compare"]
 
@@ -43,7 +43,7 @@ def compare(
     """
     from jobs.calibration_sources import read_sides
     from jobs.terminal.summary import print_json, print_summary
-    from pipeline.errors import ConfigError
+    from pipeline.core.errors import ConfigError
     from pipeline.export.compare import compare as compare_sides
 
     names = frames or FrameOptions()

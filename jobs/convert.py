@@ -74,7 +74,7 @@ def convert(
 
 def _models_of(segmenter: str | None, detector: str | None) -> tuple[str, str] | None:
     """Manifests of both models, or None; ConfigError for one of them."""
-    from pipeline.errors import ConfigError
+    from pipeline.core.errors import ConfigError
 
     if segmenter is None and detector is None:
         return None

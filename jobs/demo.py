@@ -13,8 +13,8 @@ from jobs.extras import needs
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from pipeline.core.results import Progress
     from pipeline.fleet.nightly import DayOutcome, Night
-    from pipeline.results import Progress
     from pipeline.simulate.fleet import FleetSpec
     from schemas.drift import DriftFinding
 
@@ -53,7 +53,7 @@ def demo(
     """
     from jobs.nightly import Drawing, close_night
     from jobs.terminal.demo_table import print_comparison, print_methods
-    from pipeline.config import load_fleet
+    from pipeline.core.config import load_fleet
     from pipeline.fleet.nightly import Night
     from pipeline.report.truth import read_truth
     from pipeline.store.partitions import Lake
@@ -139,8 +139,8 @@ def _simulate(spec: FleetSpec, out: Path, workers: int | None) -> None:
     from contextlib import closing
 
     from jobs.terminal.night_view import night_view
-    from pipeline.config import config_hash
-    from pipeline.errors import LogError
+    from pipeline.core.config import config_hash
+    from pipeline.core.errors import LogError
     from pipeline.fleet.executor import EXECUTORS
     from pipeline.simulate.fleet import day_names, rigs_of, vehicle_names
     from pipeline.simulate.logs.fleet_toml import mixed_fleet_toml

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.extrinsics.differences import ComparedRun
+    from pipeline.rig.differences import ComparedRun
     from pipeline.store.partitions import Lake
 
 __all__ = ["evaluate"]
@@ -85,7 +85,7 @@ def evaluate(
 
 def _check(truth: Path | None, reflectors: Path | None, recording: str | None, out: Path | None) -> None:
     """Raise ConfigError for options that contradict each other, before any work."""
-    from pipeline.errors import ConfigError
+    from pipeline.core.errors import ConfigError
 
     if (truth is None) == (reflectors is None):
         raise ConfigError("command line", "truth", "give either --truth or --reflectors")

@@ -74,7 +74,7 @@ def export(
     """
     from jobs.calibration_sources import read_calibration
     from jobs.terminal.summary import print_summary
-    from pipeline.errors import ConfigError
+    from pipeline.core.errors import ConfigError
 
     if what == "schemas":
         from schemas.versions import write_json_schemas
@@ -124,7 +124,7 @@ def _export_drive(
     sensors: tuple[str, ...],
 ) -> int:
     from jobs.export_drive import export_foxglove
-    from pipeline.errors import ConfigError
+    from pipeline.core.errors import ConfigError
 
     if lake is None or day is None:
         raise ConfigError("command line", "day", "foxglove shows a day's drive: give --day")
@@ -161,7 +161,7 @@ def _tell(what: str, calibration: ExportedCalibration, outputs: list[Path]) -> i
 
 
 def _export_onnx(out: Path, run: Path | None, notes: Path | None) -> list[Path]:
-    from pipeline.errors import ConfigError
+    from pipeline.core.errors import ConfigError
 
     if run is None or not run.is_dir():
         raise ConfigError("command line", "run", "onnx needs --run FOLDER, written by `boresight train`")

@@ -10,7 +10,7 @@ from cyclopts import Parameter
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.config import FleetConfig
+    from pipeline.core.config import FleetConfig
     from pipeline.learn.frames.day import DayTask
     from pipeline.learn.frames.frame import Mounting
     from pipeline.store.partitions import Lake, Partition
@@ -66,8 +66,8 @@ def export_frames(
     """
     from jobs.prepare import days_with_observations
     from jobs.terminal.summary import print_summary, progress_reporter
-    from pipeline.config import load_fleet
-    from pipeline.errors import ConfigError
+    from pipeline.core.config import load_fleet
+    from pipeline.core.errors import ConfigError
     from pipeline.learn.frames.card import write_card
     from pipeline.learn.frames.day import DayTask
     from pipeline.learn.frames.frame import Perturbation
@@ -127,7 +127,7 @@ def _mountings(
 ) -> tuple[dict[Partition, Mounting], list[dict[str, str]]]:
     """The calibration of each vehicle-day, and the vehicle-days without one, with the reason."""
     from jobs.frame_calibrations import mounting_of
-    from pipeline.errors import ConfigError, SolveError
+    from pipeline.core.errors import ConfigError, SolveError
 
     known, without = {}, []
     for day in days:

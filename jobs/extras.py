@@ -39,7 +39,7 @@ def needs(extra: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
 
 def require(extra: str) -> None:
     """Raise MissingExtraError before any work, so that no file is half-written."""
-    from pipeline.errors import MissingExtraError
+    from pipeline.core.errors import MissingExtraError
 
     if find_spec(EXTRAS[extra]) is None:
         raise MissingExtraError(extra, EXTRAS[extra])

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from pipeline.errors import ConfigError, SolveError
+from pipeline.core.errors import ConfigError, SolveError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.config import FleetConfig
+    from pipeline.core.config import FleetConfig
     from pipeline.export.calibration import ExportedCalibration
     from pipeline.learn.frames.frame import Mounting
     from pipeline.store.partitions import Lake, Partition
@@ -56,8 +56,8 @@ def _of_sensors(found: Mounting, sensors: Sequence[str]) -> Mounting:
 def _of_prior(lake: Lake, fleet: FleetConfig, day: Partition) -> Mounting:
     import numpy as np
 
-    from pipeline.extrinsics.prior import rig_prior
     from pipeline.learn.frames.frame import Mounting
+    from pipeline.rig.day_prior import rig_prior
     from pipeline.rig.graph import BASE
     from pipeline.store.views import ingested
     from schemas.moments import PRIOR

@@ -35,7 +35,7 @@ class FrameOptions:
 
     def names(self, known: Mapping[str, str] | None = None) -> FrameNames:
         """Frame names for the pipeline; `known` has names for frames without an option; else ConfigError."""
-        from pipeline.errors import ConfigError
+        from pipeline.core.errors import ConfigError
         from pipeline.export.calibration import FrameNames
 
         asked = {s: n for s in _KINDS if (n := getattr(self, s)) is not None}

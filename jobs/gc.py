@@ -24,7 +24,7 @@ def gc(
     import datetime as dt
 
     from jobs.terminal.summary import print_summary, progress_reporter
-    from pipeline.errors import ConfigError
+    from pipeline.core.errors import ConfigError
     from pipeline.store.partitions import Lake
     from pipeline.store.retention import collect, collect_pages, first_day_kept
     from schemas.moments import MOMENTS, PERCEIVED

@@ -39,7 +39,7 @@ def import_prior(
     from pipeline.export.files import prior_text, read_files, write_files
     from pipeline.export.formats import format_named
     from pipeline.export.tree import ESTIMATED_PAIRS
-    from pipeline.extrinsics.prior_file import read_transforms
+    from pipeline.rig.prior_file import read_transforms
 
     read = read_files(files)
     if fleet is not None:
@@ -65,13 +65,13 @@ def _of_rig(
     frames: FrameOptions,
 ) -> list[str]:
     """Write the prior file of all sensors of a rig; returns them; ConfigError if one is missing or twice."""
-    from pipeline.config import load_fleet
-    from pipeline.errors import ConfigError
+    from pipeline.core.config import load_fleet
+    from pipeline.core.errors import ConfigError
     from pipeline.export.files import noted_frames, write_files
     from pipeline.export.formats import format_named
     from pipeline.export.rig_poses import reference_of_rig, require_all, rig_poses, star_text
-    from pipeline.extrinsics.prior_file import read_star
     from pipeline.rig.prior import between
+    from pipeline.rig.prior_file import read_star
 
     rigs, name = load_fleet(of[0]).rigs, of[1]
     name = next(iter(rigs)) if name is None and len(rigs) == 1 else name

@@ -17,7 +17,7 @@ def init(*logs: Path, out: Path = Path("fleet.toml"), name: str = "fleet", force
         force: replace the file if it exists.
     """
     from jobs.terminal.summary import print_summary, progress_reporter
-    from pipeline.errors import ConfigError
+    from pipeline.core.errors import ConfigError
     from pipeline.ingest.propose.logs_pattern import nightly_command
     from pipeline.ingest.propose.propose import propose_fleet
     from pipeline.store.atomic_write import atomic_write

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from pipeline.third_party_models import ThirdPartyModel
+    from pipeline.core.third_party_models import ThirdPartyModel
 
 __all__ = ["fetch", "models"]
 
@@ -26,8 +26,8 @@ def models(*, json: bool = False) -> int:
     from dataclasses import asdict
 
     from jobs.terminal.summary import print_summary
-    from pipeline.shipped_models import shipped_models
-    from pipeline.third_party_models import CATALOGUE
+    from pipeline.core.shipped_models import shipped_models
+    from pipeline.core.third_party_models import CATALOGUE
 
     found = shipped_models()
     for model in () if json else found:
@@ -67,9 +67,9 @@ def fetch(*names: str, into: Path = Path("models"), mirror: str | None = None) -
         mirror: address of a folder with the files NAME.onnx, in place of the pinned addresses.
     """
     from jobs.terminal.summary import print_summary, progress_reporter
+    from pipeline.core.third_party_models import manifest_text, named, semantics_line
     from pipeline.perceive.models.download import download
     from pipeline.store.atomic_write import atomic_write
-    from pipeline.third_party_models import manifest_text, named, semantics_line
 
     chosen = named(names)
     fetched, there = list[str](), list[str]()

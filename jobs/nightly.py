@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 if TYPE_CHECKING:
+    from pipeline.core.results import Outcome
     from pipeline.fleet.nightly import DayOutcome, Night
     from pipeline.fleet.pattern import VehicleDay
     from pipeline.fleet.tally import Tally
-    from pipeline.results import Outcome
     from pipeline.store.partitions import Lake
     from schemas.drift import DriftFinding
 
@@ -66,12 +66,12 @@ def nightly(
     from jobs.terminal.summary import exit_code
     from jobs.terminal.vehicle_status import next_steps
     from pipeline.calibrate.methods import method_named
-    from pipeline.config import load_fleet
-    from pipeline.extrinsics.prior import require_named_files
+    from pipeline.core.config import load_fleet
     from pipeline.fleet.misconfigured import night_statuses, to_mend, vehicles_to_mend
     from pipeline.fleet.nightly import Night
     from pipeline.fleet.pattern import find_logs
     from pipeline.fleet.tally import Tally
+    from pipeline.rig.day_prior import require_named_files
     from pipeline.store.partitions import Lake
 
     for extra, is_asked in (("ray", executor == "ray"), ("ops", metrics)):
@@ -198,7 +198,7 @@ def watch_night(
     `take` receives each complete outcome.
     """
     from jobs.terminal.night_view import night_view
-    from pipeline.errors import ConfigError
+    from pipeline.core.errors import ConfigError
     from pipeline.fleet.nightly import refused_at_once, run_night
 
     if workers is not None and workers < 1:
@@ -244,10 +244,10 @@ def close_night(
     night get a page however old they are. `told` receives the outcome of each of these stages.
     """
     from jobs.terminal.summary import progress_reporter
+    from pipeline.core.stage_work import Task, Window
+    from pipeline.core.stages import AUDIT, REPORT, STATE
     from pipeline.fleet.pages import OnWorkers
     from pipeline.report.stage import Pages
-    from pipeline.stage_work import Task, Window
-    from pipeline.stages import AUDIT, REPORT, STATE
     from pipeline.store.files import LocalFiles
     from pipeline.store.partitions import Partition
     from schemas.drift import DRIFT

@@ -17,11 +17,11 @@ def perceive(*, fleet: Path, lake: str, vehicle: str, day: str) -> int:
         day: YYYY-MM-DD.
     """
     from jobs.terminal.summary import exit_code, print_summary, progress_reporter
-    from pipeline.config import load_fleet
-    from pipeline.extrinsics.prior import require_named_files
+    from pipeline.core.config import load_fleet
+    from pipeline.core.stage_work import Task
+    from pipeline.core.stages import PERCEIVE
     from pipeline.fleet.ledger import record_outcome
-    from pipeline.stage_work import Task
-    from pipeline.stages import PERCEIVE
+    from pipeline.rig.day_prior import require_named_files
     from pipeline.store.partitions import Lake, Partition
 
     config = load_fleet(fleet)

@@ -10,11 +10,11 @@ from cyclopts import Parameter
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.config import FleetConfig
+    from pipeline.core.config import FleetConfig
+    from pipeline.core.results import Outcome
+    from pipeline.core.stage_work import Task
     from pipeline.learn.prepare.inventory import Inventory
     from pipeline.learn.prepare.sides import Choice
-    from pipeline.results import Outcome
-    from pipeline.stage_work import Task
     from pipeline.store.partitions import Lake, Partition
 
 __all__ = ["days_with_observations", "prepare"]
@@ -49,7 +49,7 @@ def prepare(
 
     from jobs.terminal.split_table import print_choices
     from jobs.terminal.summary import exit_code, print_summary, progress_reporter
-    from pipeline.config import load_fleet
+    from pipeline.core.config import load_fleet
     from pipeline.learn.prepare.inventory import take_inventory, write_inventory
     from pipeline.store.partitions import Lake
 
@@ -91,7 +91,7 @@ def days_with_observations(
     vehicles: Sequence[str] | None,
 ) -> list[Partition]:
     """Vehicle-days with observations, for the given days and vehicles; ConfigError if there are none."""
-    from pipeline.errors import ConfigError
+    from pipeline.core.errors import ConfigError
     from pipeline.store.partitions import check_day
     from pipeline.store.views import perceived_days
 
@@ -117,11 +117,11 @@ def _plan(
 ) -> tuple[FleetConfig, list[Task], list[Choice]]:
     """Survey all days and assign sides: configuration with the keys, a task per day, and other splits."""
     from jobs.terminal.summary import progress_reporter
+    from pipeline.core.stage_work import Task
     from pipeline.learn.prepare.decided import decided_sides
     from pipeline.learn.prepare.sides import price_choices, settled_keys
     from pipeline.learn.prepare.split import SplitPlan, Unit
     from pipeline.learn.prepare.survey import plan_days, survey_day
-    from pipeline.stage_work import Task
 
     surveys = []
     with progress_reporter("survey") as progress:
@@ -151,11 +151,11 @@ def _run(work: Sequence[Task], executor: str, workers: int | None) -> list[Outco
     from functools import partial
 
     from jobs.terminal.summary import progress_reporter
-    from pipeline.errors import ConfigError
+    from pipeline.core.errors import ConfigError
+    from pipeline.core.results import Outcome
+    from pipeline.core.runner import try_stage
+    from pipeline.core.stages import PREPARE
     from pipeline.fleet.executor import EXECUTORS
-    from pipeline.results import Outcome
-    from pipeline.runner import try_stage
-    from pipeline.stages import PREPARE
 
     if workers is not None and workers < 1:
         raise ConfigError("command line", "--workers", f"{workers} is less than one")

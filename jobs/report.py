@@ -35,12 +35,12 @@ def report(
         pictures: --no-pictures draws pages without images of public roads.
     """
     from jobs.terminal.summary import print_summary, progress_reporter
-    from pipeline.config import load_fleet
-    from pipeline.errors import ConfigError
+    from pipeline.core.config import load_fleet
+    from pipeline.core.errors import ConfigError
+    from pipeline.core.stage_work import Task, Window
+    from pipeline.core.stages import REPORT
     from pipeline.report.stage import Pages, write_day_picture
     from pipeline.report.truth import read_truth
-    from pipeline.stage_work import Task, Window
-    from pipeline.stages import REPORT
     from pipeline.store.partitions import Lake, Partition
 
     if (vehicle is None) != (day is None):

@@ -37,7 +37,7 @@ def service(
     """
     from jobs.terminal.summary import exit_code, print_summary
     from pipeline.audit.service import events_until
-    from pipeline.errors import ConfigError
+    from pipeline.core.errors import ConfigError
     from pipeline.store.commits import commit_records
     from pipeline.store.partitions import Lake, Partition, work_key
     from schemas.service_events import SERVICE_EVENTS, ServiceEvent
@@ -64,7 +64,7 @@ def service(
 def _require_known(lake: Lake, of: Partition) -> None:
     """Raise ConfigError for a day in the future or a vehicle without a day in the lake."""
     from jobs.terminal.known_vehicles import require_vehicle
-    from pipeline.errors import ConfigError
+    from pipeline.core.errors import ConfigError
     from pipeline.store.partitions import last_possible_day
 
     if of.day > last_possible_day():
@@ -74,7 +74,7 @@ def _require_known(lake: Lake, of: Partition) -> None:
 
 def _require_sensor(lake: Lake, vehicle: str, sensor: str) -> None:
     """Raise ConfigError for a sensor without a record of this vehicle."""
-    from pipeline.errors import ConfigError
+    from pipeline.core.errors import ConfigError
     from pipeline.store.records import read_columns
     from schemas.calibrations import CALIBRATIONS
 

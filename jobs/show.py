@@ -108,7 +108,7 @@ def _records(
 def _partitions(lake: Lake, table: Table, vehicle: str | None, day: str | None) -> list[dict[str, Any]]:
     from dataclasses import asdict
 
-    from pipeline.errors import ContractError
+    from pipeline.core.errors import ContractError
     from pipeline.store.tables import read_manifest
     from schemas.versions import TABLES
 

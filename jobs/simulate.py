@@ -57,7 +57,7 @@ def simulate(
         seed: random seed; the same seed gives the same logs.
         workers: number of processes.
     """
-    from pipeline.errors import ConfigError
+    from pipeline.core.errors import ConfigError
     from pipeline.simulate.faults import parse_faults
     from pipeline.simulate.fleet import FleetSpec, day_names
     from pipeline.simulate.sensors.rigs import rig_named

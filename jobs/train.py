@@ -103,7 +103,7 @@ def report_training(
 
 def parse_duration(text: str, option: str) -> float:
     """Parse "90s", "25m", "1.5h" or a number to seconds; ConfigError if not above 0."""
-    from pipeline.errors import ConfigError
+    from pipeline.core.errors import ConfigError
 
     number, unit = (text[:-1], text[-1]) if text and text[-1] in _UNIT_S else (text, "s")
     try:

@@ -49,7 +49,7 @@ def train_lidar_semantics(  # options of the command
 
     from jobs.terminal.summary import progress_reporter
     from jobs.train import parse_duration, report_training
-    from pipeline.config import load_fleet
+    from pipeline.core.config import load_fleet
     from pipeline.learn.perception_training.lidar_semantics.network import export_sweeps
     from pipeline.learn.perception_training.lidar_semantics.samples import labelled_sweeps, normal_of
     from pipeline.learn.perception_training.lidar_semantics.training import SweepTraining, train_sweeps

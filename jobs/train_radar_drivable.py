@@ -44,7 +44,7 @@ def train_radar_drivable(  # options of the command
 
     from jobs.terminal.summary import progress_reporter
     from jobs.train import parse_duration, report_training
-    from pipeline.config import load_fleet
+    from pipeline.core.config import load_fleet
     from pipeline.learn.perception_training.radar_drivable.network import export_drivable
     from pipeline.learn.perception_training.radar_drivable.samples import drivable_samples
     from pipeline.learn.perception_training.radar_drivable.training import DrivableTraining, train_drivable

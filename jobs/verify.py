@@ -10,10 +10,10 @@ from jobs.frame_options import FrameOptions
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from pipeline.config import FleetConfig
-    from pipeline.results import Progress
+    from pipeline.core.config import FleetConfig
+    from pipeline.core.results import Progress
+    from pipeline.core.stage_work import Probes
     from pipeline.rig.graph import Sensor
-    from pipeline.stage_work import Probes
     from pipeline.store.partitions import Lake, Partition
     from pipeline.verify.one_axis import AxisCheck
 
@@ -64,9 +64,9 @@ def verify(
     from tempfile import TemporaryDirectory
 
     from jobs.terminal.summary import print_json, print_summary, progress_reporter
-    from pipeline.config import load_fleet
-    from pipeline.errors import ConfigError
-    from pipeline.extrinsics.prior import require_named_files
+    from pipeline.core.config import load_fleet
+    from pipeline.core.errors import ConfigError
+    from pipeline.rig.day_prior import require_named_files
     from pipeline.store.partitions import Lake
     from pipeline.verify.axes import answer_of, answer_of_sensors, answers_by_sensor
     from pipeline.verify.one_log import for_one_look
@@ -107,7 +107,7 @@ def verify(
 
 
 def _vehicle(config: FleetConfig, vehicle: str | None) -> str:
-    from pipeline.errors import ConfigError
+    from pipeline.core.errors import ConfigError
 
     if vehicle is not None:
         config.rig_of(vehicle)  # raises for an unknown vehicle
@@ -120,7 +120,7 @@ def _vehicle(config: FleetConfig, vehicle: str | None) -> str:
 def _as_prior(folder: Path, calibration: str, lake: str | None, vehicle: str, named: FrameOptions) -> Path:
     """Write the calibration of `--calibration` as a prior file; raises before the first log is opened."""
     from jobs.calibration_sources import read_sides
-    from pipeline.errors import ConfigError
+    from pipeline.core.errors import ConfigError
     from pipeline.export.files import prior_text
 
     [side] = read_sides([calibration], lake, vehicle, "joint", named)
@@ -140,7 +140,7 @@ def _of_poses(
         ConfigError: neither a file nor a lake, or fewer than two sensors; raised before a log is opened.
     """
     from jobs.calibration_sources import poses_in_use
-    from pipeline.errors import ConfigError
+    from pipeline.core.errors import ConfigError
     from pipeline.export.rig_poses import reference_of_rig, require_all, star_text
 
     if calibration.endswith(".json") and ":" not in calibration:
@@ -210,8 +210,8 @@ def _calibrate(
     """Calibrate from the log, with the calibration in use as prior."""
     from dataclasses import replace
 
-    from pipeline.stage_work import Task
-    from pipeline.stages import CALIBRATE, INGEST, PERCEIVE
+    from pipeline.core.stage_work import Task
+    from pipeline.core.stages import CALIBRATE, INGEST, PERCEIVE
     from pipeline.verify.one_log import prior_in_use, with_prior
 
     task = Task(config, lake, partition, "joint", probe_deg=probe_deg, logs=logs, progress=progress)

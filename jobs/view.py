@@ -43,7 +43,7 @@ def view(
         out: draw into this PNG, without a window.
     """
     from jobs.terminal.summary import print_summary
-    from pipeline.errors import ConfigError
+    from pipeline.core.errors import ConfigError
     from pipeline.store.partitions import Lake, Partition
     from pipeline.view.moment import count_moments, read_moment
     from pipeline.view.system import import_open3d, require_display, require_renderer

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.config import FleetConfig, config_hash, load_fleet
-from pipeline.errors import ConfigError
-from pipeline.extrinsics.prior import require_named_files
-from pipeline.rigs import PriorConfig, Section
+from pipeline.core.config import FleetConfig, config_hash, load_fleet
+from pipeline.core.errors import ConfigError
+from pipeline.core.rigs import PriorConfig, Section
+from pipeline.rig.day_prior import require_named_files
 from tests.makers.fleet_files import fleet_toml
 
 GOOD = fleet_toml("car-1")

@@ -11,17 +11,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import pipeline.runner
+import pipeline.core.runner
 import pipeline.store.tables
-from pipeline.config import load_fleet
-from pipeline.errors import ConfigError, ContractError, LogError
+from pipeline.core.config import load_fleet
+from pipeline.core.errors import ConfigError, ContractError, LogError
+from pipeline.core.results import Outcome
+from pipeline.core.runner import Stage, try_stage, why_to_run
+from pipeline.core.stage_work import NothingUsable, Records, Run, Task, Told, Window, Work
+from pipeline.core.stages import CALIBRATE, PERCEIVE, PREPARE, REPORT, STAGES
 from pipeline.fleet.ledger import outcome_row
 from pipeline.learn.prepare.split import SplitPlan
 from pipeline.report.stage import Pages
-from pipeline.results import Outcome
-from pipeline.runner import Stage, try_stage, why_to_run
-from pipeline.stage_work import NothingUsable, Records, Run, Task, Told, Window, Work
-from pipeline.stages import CALIBRATE, PERCEIVE, PREPARE, REPORT, STAGES
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
 from pipeline.store.tables import read_manifest
@@ -108,7 +108,7 @@ def test_the_same_key_is_done_once_and_other_settings_are_other_work(task, stage
 def test_another_code_version_is_other_work(task, stage, monkeypatch):
     made_up, made = stage(some(1))
     key = made_up.run(task).work_key
-    monkeypatch.setattr(pipeline.runner, "CODE_VERSION", "another")
+    monkeypatch.setattr(pipeline.core.runner, "CODE_VERSION", "another")
     assert made_up.run(task).work_key != key
     assert made.asked == 2
 
@@ -144,10 +144,10 @@ def test_a_first_run_that_raises_leaves_no_partition(task, stage):
 _KILLED = """
 import os, signal, sys
 from pathlib import Path
-from pipeline.config import load_fleet
-from pipeline.runner import Stage
+from pipeline.core.config import load_fleet
+from pipeline.core.runner import Stage
 from pipeline.store.partitions import Lake, Partition
-from pipeline.stage_work import Task, Work
+from pipeline.core.stage_work import Task, Work
 from schemas.features import FEATURES
 from schemas.moments import PERCEIVED
 from tests.makers.lakes import joined_of
@@ -271,7 +271,7 @@ def test_why_a_stage_would_run_names_what_changed(task, stage, monkeypatch):
     assert why() == ""
     assert why({"voxel_m": 0.5}) == "other configuration"
     assert why(inputs=("b",)) == "other inputs"
-    monkeypatch.setattr(pipeline.runner, "CODE_VERSION", "another")
+    monkeypatch.setattr(pipeline.core.runner, "CODE_VERSION", "another")
     assert "this is another" in why()
 
 
@@ -397,7 +397,7 @@ def test_every_stage_names_settings_that_can_be_hashed_and_rows_that_wait_to_be_
         task = replace(task, inputs=found)
     files = sorted(lake.root.rglob("*"))
     works = [stage.load()(task) for _ in range(2)]
-    keys = [pipeline.runner.config_hash(*w.settings) for w in works]
+    keys = [pipeline.core.runner.config_hash(*w.settings) for w in works]
     assert keys[0] == keys[1]
     assert isinstance(works[0], Work)
     works[0].rows(Run("key", (), task.progress))  # not asked for a row, it does nothing

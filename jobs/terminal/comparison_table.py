@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from pipeline.extrinsics.differences import PairDifference
+    from pipeline.rig.differences import PairDifference
 
 __all__ = ["print_comparison"]
 

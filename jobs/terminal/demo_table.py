@@ -101,7 +101,7 @@ def _mean_error(
     before: bool,
 ) -> str:
     """Mean error over the records of a pair that have a transform."""
-    from pipeline.geometry.targets import errors_at_targets
+    from pipeline.rig.targets import errors_at_targets
     from pipeline.store.current import prior_of, transform_of
 
     found = []
@@ -161,7 +161,7 @@ def _table(day: str) -> Table:
 
 
 def _rows(record: CalibrationRecord, T_true: np.ndarray) -> list[list[str]]:
-    from pipeline.geometry.changes import change_between, change_covariance
+    from pipeline.rig.changes import change_between, change_covariance
     from pipeline.store.current import prior_of, transform_of
 
     T, T_prior = transform_of(record), prior_of(record)
@@ -188,7 +188,7 @@ def _name(record: CalibrationRecord) -> str:
 
 
 def _errors(record: CalibrationRecord, T_true: np.ndarray) -> dict[str, Any]:
-    from pipeline.geometry.se3 import inverse, rotation_angle_rad
+    from pipeline.rig.se3 import inverse, rotation_angle_rad
     from pipeline.store.current import prior_of, transform_of
 
     def error(T: np.ndarray | None) -> tuple[float | None, float | None]:

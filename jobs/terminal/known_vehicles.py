@@ -16,7 +16,7 @@ def require_vehicle(lake: Lake, vehicle: str) -> None:
     """Raise ConfigError for a vehicle without a day in the lake, unless rows that cannot be read may have one."""
     from difflib import get_close_matches
 
-    from pipeline.errors import ConfigError
+    from pipeline.core.errors import ConfigError
     from pipeline.store.records import read_columns
     from schemas.calibrations import CALIBRATIONS
     from schemas.outcomes import OUTCOMES

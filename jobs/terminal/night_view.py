@@ -70,7 +70,7 @@ class _Lines:
     """Lines for a log file, updated five times a second: a shorter stage may get no line, a long one gets several."""
 
     def __init__(self, names: list[str], total: int, title: str) -> None:
-        from pipeline.stages import STAGES
+        from pipeline.core.stages import STAGES
 
         self._names, self._total, self._title, self._ended = names, total, title, 0
         self._stages = {stage.name for stage in STAGES}

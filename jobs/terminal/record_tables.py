@@ -50,7 +50,7 @@ def print_table(table: str, rows: list[dict[str, Any]]) -> None:
 def _calibration_cells(row: dict[str, Any]) -> dict[str, str]:
     import numpy as np
 
-    from pipeline.geometry.pose_columns import pose_of
+    from pipeline.rig.pose_columns import pose_of
 
     sigma = np.full(6, np.nan) if row["covariance"] is None else np.sqrt(np.diag(row["covariance"]))
     seen = row["observable"] or [False] * 6
@@ -94,8 +94,8 @@ def _pose_cells(T: Any, T_prior: Any, *, with_change: bool = True) -> dict[str, 
     """Pose of the child in the parent, and its change from the prior, along the parent's axes."""
     import numpy as np
 
-    from pipeline.geometry.changes import change_between
-    from pipeline.geometry.se3 import to_quaternion
+    from pipeline.rig.changes import change_between
+    from pipeline.rig.se3 import to_quaternion
 
     def words(numbers: Any, form: str) -> str:
         return " ".join(f"{number:{form}}" for number in numbers)

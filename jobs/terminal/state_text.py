@@ -41,8 +41,8 @@ def _name(row: dict[str, Any]) -> str:
 def _sensor(row: dict[str, Any]) -> Iterator[str]:
     import numpy as np
 
-    from pipeline.geometry.changes import change_between
-    from pipeline.geometry.se3 import to_quaternion
+    from pipeline.rig.changes import change_between
+    from pipeline.rig.se3 import to_quaternion
 
     days = row["days"]
     of_days = (

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from pipeline.results import Progress, plain
+from pipeline.core.results import Progress, plain
 
 if TYPE_CHECKING:
     from pipeline.store.partitions import Lake

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from pipeline.audit.charts import Charts, clipped
 from pipeline.audit.scan import scan
-from pipeline.geometry.changes import change_between, change_jacobian, changed
+from pipeline.rig.changes import change_between, change_jacobian, changed
 from pipeline.rig.edges import edge_order
 from pipeline.rig.graph import Edge
 from schemas.calibrations import DOF_NAMES

@@ -13,8 +13,8 @@ from pipeline.audit.estimates import Estimates, day_name
 from pipeline.audit.status import decide_status
 from pipeline.audit.vehicle import VehicleVerdict, limit_of
 from pipeline.audit.verdicts import ChartVerdict
-from pipeline.config import AuditConfig
-from pipeline.extrinsics.attribution import Attribution
+from pipeline.core.config import AuditConfig
+from pipeline.rig.attribution import Attribution
 from pipeline.rig.edges import edge_order
 from pipeline.rig.graph import Edge
 from schemas.calibrations import DOF_NAMES, STATUSES

@@ -15,7 +15,7 @@ import numpy as np
 
 from pipeline.audit.days import PairDays
 from pipeline.audit.vehicle import VehicleVerdict, judge_fleet
-from pipeline.config import AuditConfig
+from pipeline.core.config import AuditConfig
 from pipeline.rig.graph import Edge
 from schemas.calibrations import DOF_NAMES
 

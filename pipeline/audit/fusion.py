@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.geometry.changes import change_between, change_jacobian, changed
+from pipeline.rig.changes import change_between, change_jacobian, changed
 
 __all__ = ["Fused", "Mount", "PoseDays", "current_level", "fuse", "with_held_day"]
 

@@ -11,7 +11,7 @@ from pipeline.audit.fusion import Mount
 from pipeline.audit.noise import estimate_noise
 from pipeline.audit.vehicle import limit_of
 from pipeline.audit.wander import with_wander
-from pipeline.config import AuditConfig
+from pipeline.core.config import AuditConfig
 from pipeline.rig.graph import Edge
 from schemas.calibrations import DOF_NAMES
 

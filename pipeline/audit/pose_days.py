@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float, Int
 
 from pipeline.audit.days import PairDays, pair_days
 from pipeline.audit.fusion import PoseDays
-from pipeline.geometry.se3 import from_quaternion
 from pipeline.rig.graph import KINDS, Sensor
+from pipeline.rig.se3 import from_quaternion
 from pipeline.store.columns import matrices, observable_dofs, ordinals, there
 from pipeline.store.current import current_rows
 from pipeline.store.partitions import Lake

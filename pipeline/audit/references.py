@@ -16,9 +16,9 @@ import numpy as np
 from pipeline.audit.days import PairDays, Reference, reference_of
 from pipeline.audit.estimates import day_name
 from pipeline.audit.service import restart_of
-from pipeline.geometry.se3 import from_quaternion, to_quaternion
 from pipeline.rig.edges import edge_of
 from pipeline.rig.graph import Edge
+from pipeline.rig.se3 import from_quaternion, to_quaternion
 from pipeline.store.partitions import Lake, days_after
 from pipeline.store.records import read_columns, read_latest
 from schemas.calibrations import CALIBRATIONS

@@ -19,13 +19,13 @@ from pipeline.audit.estimates import day_name
 from pipeline.audit.fusion import Mount, fuse, with_held_day
 from pipeline.audit.pose_days import SensorDays, VehiclePoses
 from pipeline.audit.restarts import drift_per_day, last_restart
-from pipeline.config import VerifyConfig
-from pipeline.geometry.changes import change_covariance
-from pipeline.geometry.pose_columns import pose_columns
-from pipeline.geometry.se3 import adjoint, inverse, transform_points
-from pipeline.geometry.target_sigmas import target_sigmas
-from pipeline.geometry.targets import DEFAULT_TARGETS
+from pipeline.core.config import VerifyConfig
+from pipeline.rig.changes import change_covariance
 from pipeline.rig.graph import Edge, Sensor, tie
+from pipeline.rig.pose_columns import pose_columns
+from pipeline.rig.se3 import adjoint, inverse, transform_points
+from pipeline.rig.target_sigmas import target_sigmas
+from pipeline.rig.targets import DEFAULT_TARGETS
 from schemas.drift import DriftFinding
 from schemas.service_events import ServiceEvent
 from schemas.states import StateRow

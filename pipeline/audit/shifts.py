@@ -16,8 +16,8 @@ from scipy.linalg import solve_triangular
 
 from pipeline.audit.days import DOFS, PairDays
 from pipeline.audit.scan import alike
-from pipeline.extrinsics.attribution import PairShift
-from pipeline.geometry.changes import change_jacobian
+from pipeline.rig.attribution import PairShift
+from pipeline.rig.changes import change_jacobian
 
 __all__ = ["Whitened"]
 

@@ -18,12 +18,12 @@ from pipeline.audit.history import History, last_audited_day, models_of
 from pipeline.audit.service import events_until, restart_of, what_was_done
 from pipeline.audit.standing import said_before, standing
 from pipeline.audit.vehicle import VehicleVerdict
-from pipeline.config import AuditConfig, FleetConfig, config_hash
-from pipeline.errors import ConfigError
-from pipeline.results import Progress
+from pipeline.core.config import AuditConfig, FleetConfig, config_hash
+from pipeline.core.errors import ConfigError
+from pipeline.core.results import Progress
+from pipeline.core.stage_work import Records, Task, Told, Window, Work
 from pipeline.rig.edges import edge_of
 from pipeline.rig.graph import EDGE_KINDS, KINDS, Edge, edge_between
-from pipeline.stage_work import Records, Task, Told, Window, Work
 from pipeline.store.partitions import (
     Lake,
     Partition,

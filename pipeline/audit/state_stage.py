@@ -17,10 +17,10 @@ from pipeline.audit.pose_days import VehiclePoses, read_poses
 from pipeline.audit.references import Kept, first_accepted, kept_columns, kept_of, read_kept
 from pipeline.audit.rig_states import rig_states
 from pipeline.audit.service import events_until, restart_of
-from pipeline.config import AuditConfig, FleetConfig, config_hash
+from pipeline.core.config import AuditConfig, FleetConfig, config_hash
+from pipeline.core.stage_work import Records, Run, Task, Told, Window, Work
 from pipeline.rig.edges import edge_of
 from pipeline.rig.graph import Edge, tie
-from pipeline.stage_work import Records, Run, Task, Told, Window, Work
 from pipeline.store.partitions import Partition, content_hash, days_after, last_possible_day, work_key
 from pipeline.store.records import last_day, read_last
 from schemas.calibrations import CALIBRATIONS

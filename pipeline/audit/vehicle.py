@@ -14,8 +14,8 @@ from pipeline.audit.noise import Noise, estimate_noise
 from pipeline.audit.shifts import Whitened
 from pipeline.audit.verdicts import ChartVerdict, judge_charts
 from pipeline.audit.wander import with_wander
-from pipeline.config import AuditConfig
-from pipeline.extrinsics.attribution import Attribution, attribute
+from pipeline.core.config import AuditConfig
+from pipeline.rig.attribution import Attribution, attribute
 from pipeline.rig.graph import Edge
 from schemas.calibrations import DOF_NAMES
 

@@ -17,9 +17,9 @@ from pipeline.calibrate.adjust.rig import adjust
 from pipeline.calibrate.judging import Judged
 from pipeline.calibrate.numerics.covariance import OBSERVABLE
 from pipeline.calibrate.solved import SolvedDay
-from pipeline.config import FleetConfig
-from pipeline.extrinsics.checks import FailedCheck
-from pipeline.extrinsics.estimates import PairEstimate, Solution
+from pipeline.core.config import FleetConfig
+from pipeline.rig.checks import FailedCheck
+from pipeline.rig.estimates import PairEstimate, Solution
 from pipeline.rig.evidence import EdgeEvidence
 from pipeline.rig.extrinsics import Extrinsics
 from pipeline.rig.graph import Edge, RigGraph

@@ -18,10 +18,7 @@ from pipeline.calibrate.edges.radar_base import Stamps, estimate_radar_base
 from pipeline.calibrate.edges.sweeps import sweeps_of
 from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.calibrate.verify.motion_sources import compared_sources
-from pipeline.errors import SolveError
-from pipeline.extrinsics.checks import FailedCheck
-from pipeline.extrinsics.prior import no_prior
-from pipeline.geometry.se3 import inverse
+from pipeline.core.errors import SolveError
 from pipeline.objective.ego_motion import (
     DopplerMotion,
     EgoMotion,
@@ -31,9 +28,12 @@ from pipeline.objective.ego_motion import (
     motion_of,
 )
 from pipeline.objective.radar.travel import TravelDirections, travel_directions
+from pipeline.rig.checks import FailedCheck
+from pipeline.rig.day_prior import no_prior
 from pipeline.rig.evidence import EdgeEvidence
 from pipeline.rig.graph import BASE, Edge
 from pipeline.rig.prior import RigPrior
+from pipeline.rig.se3 import inverse
 from pipeline.store.views import Chosen
 from schemas.observations import Observation
 

@@ -20,13 +20,13 @@ from pipeline.calibrate.verify.day_checks import FoundDay, checks_of_day
 from pipeline.calibrate.verify.day_labels import day_labels
 from pipeline.calibrate.verify.motion_sources import MotionFindings, compared_sources
 from pipeline.calibrate.verify.mounting import camera_turn_sigma_rad
-from pipeline.config import FleetConfig
-from pipeline.errors import SolveError
-from pipeline.extrinsics.checks import FailedCheck
-from pipeline.extrinsics.estimates import Prior, Solution
-from pipeline.extrinsics.prior import no_prior
-from pipeline.results import Progress, silent
-from pipeline.stage_work import Probes
+from pipeline.core.config import FleetConfig
+from pipeline.core.errors import SolveError
+from pipeline.core.results import Progress, silent
+from pipeline.core.stage_work import Probes
+from pipeline.rig.checks import FailedCheck
+from pipeline.rig.day_prior import no_prior
+from pipeline.rig.estimates import Prior, Solution
 from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, SENSORS, CalibrationRecord
 from schemas.observations import WITHOUT_LABELS, Observation
 

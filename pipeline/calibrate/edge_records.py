@@ -20,14 +20,14 @@ from pipeline.calibrate.verify.mounting import mounting_covariance
 from pipeline.calibrate.verify.seen_targets import targets_of
 from pipeline.calibrate.verify.target_accuracy import claims_of
 from pipeline.calibrate.verify.verdict import Evidence, judge
-from pipeline.config import FleetConfig
-from pipeline.geometry.changes import change_covariance
-from pipeline.geometry.pose_columns import pose_columns
-from pipeline.geometry.targets import DEFAULT_TARGETS
+from pipeline.core.config import FleetConfig
+from pipeline.rig.changes import change_covariance
 from pipeline.rig.evidence import EdgeEvidence, OtherScenes
 from pipeline.rig.extrinsics import Extrinsics
 from pipeline.rig.graph import BASE, Edge, RigGraph
+from pipeline.rig.pose_columns import pose_columns
 from pipeline.rig.prior import RigPrior
+from pipeline.rig.targets import DEFAULT_TARGETS
 from pipeline.rig.views import View
 from schemas.calibrations import CalibrationRecord
 from schemas.versions import CODE_VERSION

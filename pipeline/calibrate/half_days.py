@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.extrinsics.estimates import PairEstimate
-from pipeline.geometry.changes import change_between
-from pipeline.geometry.se3 import inverse
+from pipeline.rig.changes import change_between
+from pipeline.rig.estimates import PairEstimate
+from pipeline.rig.se3 import inverse
 from schemas.calibrations import PAIRS
 
 __all__ = ["half_days_of"]

@@ -21,12 +21,12 @@ from pipeline.calibrate.verify.probes import probe_numbers
 from pipeline.calibrate.verify.seen_targets import seen_targets, unseen_failure, views_of
 from pipeline.calibrate.verify.target_accuracy import Claim, claims_of
 from pipeline.calibrate.verify.verdict import Evidence, Verdict, judge, matters
-from pipeline.config import ChecksConfig, FleetConfig
-from pipeline.extrinsics.checks import FailedCheck
-from pipeline.extrinsics.estimates import PairEstimate, Prior
-from pipeline.geometry.targets import DEFAULT_TARGETS
+from pipeline.core.config import ChecksConfig, FleetConfig
+from pipeline.core.stage_work import NO_PROBES, Probes
+from pipeline.rig.checks import FailedCheck
+from pipeline.rig.estimates import PairEstimate, Prior
+from pipeline.rig.targets import DEFAULT_TARGETS
 from pipeline.rig.views import View
-from pipeline.stage_work import NO_PROBES, Probes
 from schemas.observations import Observation
 
 __all__ = ["Judged", "Judging"]

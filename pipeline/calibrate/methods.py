@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, runtime_checkable
 
-from pipeline.config import SolveConfig
-from pipeline.errors import ConfigError
-from pipeline.extrinsics.estimates import Prior, Solution
-from pipeline.results import Progress
-from pipeline.stage_work import Task
+from pipeline.core.config import SolveConfig
+from pipeline.core.errors import ConfigError
+from pipeline.core.results import Progress
+from pipeline.core.stage_work import Task
+from pipeline.rig.estimates import Prior, Solution
 from schemas.observations import Observation
 
 __all__ = ["METHODS", "Method", "Solver", "method_named"]

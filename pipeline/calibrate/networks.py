@@ -10,15 +10,15 @@ import numpy as np
 from pipeline.calibrate.joint.solve import solve_joint
 from pipeline.calibrate.methods import METHODS, Solver, method_named
 from pipeline.calibrate.rig_stage import three_of_day
-from pipeline.config import SolveConfig, config_hash
-from pipeline.errors import ConfigError, SolveError
-from pipeline.extrinsics.estimates import Prior, Solution
-from pipeline.extrinsics.prior import perturbed, read_prior
+from pipeline.core.config import SolveConfig, config_hash
+from pipeline.core.errors import ConfigError, SolveError
+from pipeline.core.results import Progress
+from pipeline.core.stage_work import Task
 from pipeline.learn.infer.onnx_networks import model_files, models_key, open_networks
 from pipeline.learn.infer.pitch_by_travel import informed_by_way
 from pipeline.learn.infer.vehicle_day import single_frame_solution, solve_by_networks
-from pipeline.results import Progress
-from pipeline.stage_work import Task
+from pipeline.rig.day_prior import perturbed, read_prior
+from pipeline.rig.estimates import Prior, Solution
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.row_groups import read_columns
 from pipeline.store.views import Chosen, frames_of, ingested, observations_of, perceived

@@ -13,15 +13,15 @@ from pipeline.calibrate.adjust.adjusted import AdjustedRig, AdjustedSensor
 from pipeline.calibrate.records import Inputs
 from pipeline.calibrate.verify.seen_targets import targets_of
 from pipeline.calibrate.verify.target_accuracy import Claim, claims_of
-from pipeline.config import VerifyConfig
-from pipeline.extrinsics.checks import faults_of
-from pipeline.geometry.changes import change_jacobian
-from pipeline.geometry.pose_columns import pose_columns
-from pipeline.geometry.se3 import adjoint, inverse, transform_points
-from pipeline.geometry.spherical import from_spherical
-from pipeline.geometry.targets import DEFAULT_TARGETS
+from pipeline.core.config import VerifyConfig
+from pipeline.rig.changes import change_jacobian
+from pipeline.rig.checks import faults_of
 from pipeline.rig.extrinsics import Extrinsics
 from pipeline.rig.graph import RigGraph, Sensor
+from pipeline.rig.pose_columns import pose_columns
+from pipeline.rig.se3 import adjoint, inverse, transform_points
+from pipeline.rig.spherical import from_spherical
+from pipeline.rig.targets import DEFAULT_TARGETS
 from pipeline.rig.views import View
 from pipeline.store.current import prior_of, transform_of
 from schemas.calibrations import FRAMES_OF_PAIR, CalibrationRecord

@@ -16,12 +16,12 @@ from pipeline.calibrate.unlabelled import notes_of_pair
 from pipeline.calibrate.verify.constancy import PART_FLOOR_RAD
 from pipeline.calibrate.verify.failed_checks import loop_sigmas
 from pipeline.calibrate.verify.held_out_test import HeldOutTest
-from pipeline.errors import SolveError
-from pipeline.extrinsics.estimates import DayParts, PairEstimate, Prior, Solution
-from pipeline.geometry.cameras import camera_of
-from pipeline.geometry.pose_columns import pose_columns
-from pipeline.geometry.spherical import camera_direction_angles
-from pipeline.stage_work import NO_PROBES, Probes
+from pipeline.core.errors import SolveError
+from pipeline.core.stage_work import NO_PROBES, Probes
+from pipeline.rig.cameras import camera_of
+from pipeline.rig.estimates import DayParts, PairEstimate, Prior, Solution
+from pipeline.rig.pose_columns import pose_columns
+from pipeline.rig.spherical import camera_direction_angles
 from pipeline.store.partitions import Partition
 from schemas.calibrations import DOF_NAMES, FRAMES_OF_PAIR, PAIRS, CalibrationRecord
 from schemas.observations import Observation

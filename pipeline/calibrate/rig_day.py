@@ -21,13 +21,13 @@ from pipeline.calibrate.day import DayOfPairs, records_of, solve_day
 from pipeline.calibrate.edge_records import judged_edge, record_of_edge, refused_edge
 from pipeline.calibrate.records import Inputs, refused_record
 from pipeline.calibrate.verify.constancy import moved_failures
-from pipeline.config import FleetConfig
-from pipeline.errors import SolveError
-from pipeline.extrinsics.checks import FailedCheck, faults_of
-from pipeline.extrinsics.estimates import PairEstimate, Prior
-from pipeline.extrinsics.prior import no_prior, prior_of_three
+from pipeline.core.config import FleetConfig
+from pipeline.core.errors import SolveError
+from pipeline.core.results import Progress
 from pipeline.objective.ego_motion import mean_heading, shown_heading
-from pipeline.results import Progress
+from pipeline.rig.checks import FailedCheck, faults_of
+from pipeline.rig.day_prior import no_prior, prior_of_three
+from pipeline.rig.estimates import PairEstimate, Prior
 from pipeline.rig.evidence import EdgeEvidence
 from pipeline.rig.graph import BASE, Edge, RigGraph
 from pipeline.rig.prior import RigPrior

@@ -19,16 +19,16 @@ from pipeline.calibrate.rig_day import RigDay, calibrate_rig
 from pipeline.calibrate.three_sensors import three_sensors
 from pipeline.calibrate.unlabelled import noted
 from pipeline.calibrate.verify.seen_targets import views_of
-from pipeline.errors import SolveError
-from pipeline.extrinsics.estimates import Prior
-from pipeline.extrinsics.prior import prior_of_three, rig_prior
-from pipeline.results import Progress
+from pipeline.core.errors import SolveError
+from pipeline.core.results import Progress
+from pipeline.core.stage_work import Task
+from pipeline.rig.day_prior import prior_of_three, rig_prior
+from pipeline.rig.estimates import Prior
 from pipeline.rig.graph import Edge, edge_between
 from pipeline.rig.overlap import find_edges, overlaps_of
 from pipeline.rig.prior import RigPrior, middle_of, moved
 from pipeline.rig.rig import Rig
 from pipeline.rig.views import FRAMES, View
-from pipeline.stage_work import Task
 from pipeline.store.moments import sensors_of
 from pipeline.store.views import Chosen, observations_of, perceived
 from schemas.calibrations import SENSORS, CalibrationRecord, pairs_of

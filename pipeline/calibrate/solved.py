@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 from pipeline.calibrate.judging import Judged, Judging
 from pipeline.calibrate.select.frames import Selection
-from pipeline.extrinsics.checks import FailedCheck
-from pipeline.extrinsics.estimates import Prior, Solution
+from pipeline.rig.checks import FailedCheck
+from pipeline.rig.estimates import Prior, Solution
 from schemas.observations import Observation
 
 __all__ = ["SolvedDay"]

@@ -11,12 +11,12 @@ from pipeline.calibrate.records import (
     Inputs,
 )
 from pipeline.calibrate.rig_stage import refused_edges, rig_rows, three_rows
-from pipeline.errors import ConfigError, SolveError
-from pipeline.extrinsics.prior import prior_key
-from pipeline.results import Outcome
+from pipeline.core.errors import ConfigError, SolveError
+from pipeline.core.results import Outcome
+from pipeline.core.stage_work import Records, Run, Task, Told, Work
+from pipeline.rig.day_prior import prior_key
 from pipeline.rig.edges import edge_of, words_of
 from pipeline.rig.rig import Rig
-from pipeline.stage_work import Records, Run, Task, Told, Work
 from pipeline.store.moments import sensors_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import ingested, perceived

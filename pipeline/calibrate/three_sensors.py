@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from pipeline.errors import SolveError
+from pipeline.core.errors import SolveError
 from pipeline.rig.overlap import Overlap, best_three
 from pipeline.rig.rig import Rig
 

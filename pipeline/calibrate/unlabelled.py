@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Final
 
-from pipeline.errors import SolveError
+from pipeline.core.errors import SolveError
 from schemas.calibrations import FRAMES_OF_PAIR, CalibrationRecord
 from schemas.faults import FAULTS
 from schemas.observations import WITHOUT_LABELS, Observation

@@ -23,10 +23,10 @@ from jaxtyping import Float
 
 from pipeline.convert.files import read_bytes, read_float_rows
 from pipeline.convert.recording import Event, Recording, ego_events
-from pipeline.errors import ConfigError
-from pipeline.geometry.cameras import Camera
-from pipeline.geometry.se3 import inverse
+from pipeline.core.errors import ConfigError
+from pipeline.rig.cameras import Camera
 from pipeline.rig.graph import Kind
+from pipeline.rig.se3 import inverse
 
 __all__ = ["Layout", "read_kitti", "read_view_of_delft"]
 

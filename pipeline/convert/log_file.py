@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.convert.recording import Event, Recording, image_format
+from pipeline.core.ros_messages import McapLog, RosMessages
 from pipeline.rig.graph import Kind
 from pipeline.rig.topics import TOPICS, frame_of, topics_of
-from pipeline.ros_messages import McapLog, RosMessages
 from pipeline.store.atomic_write import atomic_write
 
 __all__ = ["fleet_text", "write_log"]

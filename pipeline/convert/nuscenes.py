@@ -20,10 +20,10 @@ from jaxtyping import Float
 
 from pipeline.convert.files import read_bytes, read_float_rows, read_json, read_pcd
 from pipeline.convert.recording import Event, Recording, ego_events
-from pipeline.errors import ConfigError
-from pipeline.geometry.cameras import Camera
-from pipeline.geometry.se3 import from_quaternion, from_rotation_translation
+from pipeline.core.errors import ConfigError
+from pipeline.rig.cameras import Camera
 from pipeline.rig.graph import Kind
+from pipeline.rig.se3 import from_quaternion, from_rotation_translation
 
 __all__ = ["read_nuscenes"]
 

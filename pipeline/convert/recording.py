@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.geometry.cameras import Camera
-from pipeline.geometry.se3 import inverse, log_so3
+from pipeline.rig.cameras import Camera
 from pipeline.rig.graph import Kind
+from pipeline.rig.se3 import inverse, log_so3
 
 __all__ = ["EgoMotion", "Event", "Recording", "ego_events", "image_format"]
 

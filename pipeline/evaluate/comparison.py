@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.extrinsics.differences import Comparison
-from pipeline.geometry.se3 import from_quaternion, inverse, log_se3
-from pipeline.geometry.targets import (
+from pipeline.rig.differences import Comparison
+from pipeline.rig.se3 import from_quaternion, inverse, log_se3
+from pipeline.rig.targets import (
     Picks,
     PickUncertainty,
     error_sigma_at_picks,

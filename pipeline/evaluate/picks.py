@@ -24,10 +24,10 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import ConfigError
+from pipeline.core.errors import ConfigError
 from pipeline.evaluate.reflectors import Echoes, Found, find_in_lidar, find_in_radar
-from pipeline.geometry.cameras import Camera
-from pipeline.geometry.targets import Picks, PickUncertainty
+from pipeline.rig.cameras import Camera
+from pipeline.rig.targets import Picks, PickUncertainty
 
 __all__ = ["ReflectorFile", "find_again", "read_reflectors"]
 

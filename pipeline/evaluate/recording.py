@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pipeline.errors import ConfigError, ContractError
+from pipeline.core.errors import ConfigError, ContractError
 from pipeline.evaluate.picks import ReflectorFile, find_again, read_reflectors
 from pipeline.evaluate.reflectors import Echoes
 from pipeline.store.partitions import Lake, Partition

@@ -9,8 +9,8 @@ import numpy as np
 
 from pipeline.evaluate.comparison import compare, current_runs
 from pipeline.evaluate.recording import ReflectorFiles
-from pipeline.extrinsics.differences import ComparedRun
-from pipeline.extrinsics.prior_file import read_transforms
+from pipeline.rig.differences import ComparedRun
+from pipeline.rig.prior_file import read_transforms
 from schemas.calibrations import CalibrationRecord
 
 __all__ = ["compare_runs"]

@@ -10,12 +10,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.errors import ConfigError
-from pipeline.geometry.cameras import Camera
-from pipeline.geometry.changes import change_covariance
-from pipeline.geometry.se3 import adjoint, inverse
+from pipeline.core.errors import ConfigError
+from pipeline.rig.cameras import Camera
+from pipeline.rig.changes import change_covariance
 from pipeline.rig.edges import EDGE_OF_PAIR, edge_order, words_of
 from pipeline.rig.graph import BASE, KINDS, Edge, RigGraph, Sensor
+from pipeline.rig.se3 import adjoint, inverse
 from schemas.calibrations import DOF_NAMES
 
 __all__ = [

@@ -10,11 +10,11 @@ from jaxtyping import Float
 
 from pipeline.export.calibration import ExportedPair
 from pipeline.export.tree import ESTIMATED_PAIRS
-from pipeline.extrinsics.differences import PairDifference
-from pipeline.geometry.changes import change_between, change_covariance
-from pipeline.geometry.se3 import inverse, log_se3
-from pipeline.geometry.target_sigmas import target_sigmas
+from pipeline.rig.changes import change_between, change_covariance
+from pipeline.rig.differences import PairDifference
 from pipeline.rig.edges import edge_order
+from pipeline.rig.se3 import inverse, log_se3
+from pipeline.rig.target_sigmas import target_sigmas
 
 __all__ = ["Side", "compare", "composed"]
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.errors import ConfigError
+from pipeline.core.errors import ConfigError
 from pipeline.export.calibration import ExportedCalibration
 from pipeline.export.formats import Format
 from pipeline.export.provenance import provenance_of

@@ -8,13 +8,13 @@ from importlib import import_module
 
 import numpy as np
 
-from pipeline.errors import ConfigError
+from pipeline.core.errors import ConfigError
 from pipeline.export.calibration import ExportedCalibration, FrameNames
 from pipeline.export.tree import ESTIMATED_EDGES, pairs_of_tree
-from pipeline.geometry.se3 import inverse
-from pipeline.geometry.transform_tree import TransformTree
 from pipeline.rig.edges import words_of
 from pipeline.rig.graph import Edge
+from pipeline.rig.se3 import inverse
+from pipeline.rig.transform_tree import TransformTree
 
 __all__ = ["FORMATS", "Files", "Format", "format_named"]
 

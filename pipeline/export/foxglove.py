@@ -21,8 +21,8 @@ from pipeline.export.calibration import ExportedCalibration, poses_of
 from pipeline.export.foxglove_table import TABLE_SCHEMA, table_of
 from pipeline.export.provenance import provenance_of
 from pipeline.export.texts import to_json
-from pipeline.geometry.cameras import Camera, camera_of
-from pipeline.geometry.se3 import to_quaternion, transform_points
+from pipeline.rig.cameras import Camera, camera_of
+from pipeline.rig.se3 import to_quaternion, transform_points
 from schemas.frames import Frame
 from schemas.observations import Observation
 

@@ -24,7 +24,7 @@ from pipeline.export.foxglove import TOPICS, Scene
 from pipeline.export.foxglove_table import TABLE_SCHEMA, table_of
 from pipeline.export.provenance import provenance_of
 from pipeline.export.texts import to_json
-from pipeline.geometry.cameras import camera_of
+from pipeline.rig.cameras import camera_of
 from pipeline.rig.graph import Sensor
 from schemas.frames import Frame
 from schemas.observations import Observation

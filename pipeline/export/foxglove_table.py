@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from pipeline.export.calibration import ExportedCalibration, ExportedPair, FrameNames, sigmas_of
 from pipeline.export.provenance import used_lines, warnings_of
-from pipeline.geometry.changes import change_between
+from pipeline.rig.changes import change_between
 from schemas.calibrations import DOF_NAMES
 
 __all__ = ["TABLE_SCHEMA", "layout_of", "table_of"]

@@ -11,15 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import ConfigError
+from pipeline.core.errors import ConfigError
 from pipeline.export.calibration import ExportedCalibration, FrameNames, cameras_of, needed_camera
 from pipeline.export.formats import Files, Format
 from pipeline.export.provenance import comment_lines
 from pipeline.export.texts import field_of, load_yaml, matrix_of, to_yaml
-from pipeline.geometry.cameras import Camera
-from pipeline.geometry.se3 import inverse
+from pipeline.rig.cameras import Camera
 from pipeline.rig.edges import words_of
 from pipeline.rig.graph import Edge
+from pipeline.rig.se3 import inverse
 
 __all__ = ["KALIBR"]
 

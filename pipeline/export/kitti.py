@@ -13,13 +13,13 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from pipeline.errors import ConfigError
+from pipeline.core.errors import ConfigError
 from pipeline.export.calibration import ExportedCalibration, FrameNames, cameras_of, needed_camera
 from pipeline.export.formats import Files, Format
 from pipeline.export.texts import matrix_of, text_of
-from pipeline.geometry.se3 import inverse
 from pipeline.rig.edges import words_of
 from pipeline.rig.graph import Edge
+from pipeline.rig.se3 import inverse
 
 __all__ = ["KITTI", "VOD"]
 

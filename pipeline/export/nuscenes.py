@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import ConfigError
+from pipeline.core.errors import ConfigError
 from pipeline.export.calibration import ExportedCalibration, needed_camera
 from pipeline.export.formats import Files, Format
 from pipeline.export.texts import field_of, load_json, number_of, pose_of_quaternion, to_json
-from pipeline.geometry.se3 import to_quaternion
-from pipeline.geometry.transform_tree import TransformTree
+from pipeline.rig.se3 import to_quaternion
+from pipeline.rig.transform_tree import TransformTree
 
 __all__ = ["NUSCENES", "T4"]
 

@@ -7,15 +7,15 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.errors import ConfigError
+from pipeline.core.errors import ConfigError
 from pipeline.export.calibration import FrameNames
 from pipeline.export.formats import Files, Format
 from pipeline.export.texts import to_json
-from pipeline.geometry.se3 import inverse
 from pipeline.rig.edges import words_of
 from pipeline.rig.graph import Edge, Sensor, tie
 from pipeline.rig.prior import middle_of
 from pipeline.rig.rig import Rig
+from pipeline.rig.se3 import inverse
 
 __all__ = ["from_ties", "reference_of_rig", "require_all", "rig_poses", "star_text"]
 

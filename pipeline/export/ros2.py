@@ -10,14 +10,14 @@ import shlex
 from collections.abc import Sequence
 from typing import Any
 
-from pipeline.errors import ConfigError
+from pipeline.core.errors import ConfigError
 from pipeline.export.calibration import ExportedCalibration, Pose, poses_of
 from pipeline.export.formats import Files, Format
 from pipeline.export.provenance import comment_lines
 from pipeline.export.texts import field_of, load_yaml, pose_of_quaternion, text_of, to_yaml
 from pipeline.export.tree import require_frames
-from pipeline.geometry.se3 import to_quaternion
-from pipeline.geometry.transform_tree import TransformTree
+from pipeline.rig.se3 import to_quaternion
+from pipeline.rig.transform_tree import TransformTree
 
 __all__ = ["ROS2"]
 

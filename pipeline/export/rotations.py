@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.geometry.se3 import from_rotation_translation
+from pipeline.rig.se3 import from_rotation_translation
 
 __all__ = ["T_LINK_OPTICAL", "pose_of_rpy", "rpy_of"]
 

@@ -15,9 +15,9 @@ from ruamel.yaml.error import YAMLError
 from ruamel.yaml.nodes import ScalarNode
 from ruamel.yaml.representer import RoundTripRepresenter
 
-from pipeline.errors import ConfigError
-from pipeline.geometry.se3 import from_quaternion
-from pipeline.results import plain
+from pipeline.core.errors import ConfigError
+from pipeline.core.results import plain
+from pipeline.rig.se3 import from_quaternion
 
 __all__ = [
     "edit_yaml",

@@ -15,12 +15,12 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType
 from rosbags.typesys import Stores, get_typestore
 
-from pipeline.errors import ConfigError
+from pipeline.core.errors import ConfigError
+from pipeline.core.ros_messages import McapLog
 from pipeline.export.calibration import ExportedCalibration, poses_of
 from pipeline.export.formats import Files, Format
 from pipeline.export.provenance import provenance_of
-from pipeline.geometry.transform_tree import TransformTree
-from pipeline.ros_messages import McapLog
+from pipeline.rig.transform_tree import TransformTree
 
 __all__ = ["TF_STATIC"]
 

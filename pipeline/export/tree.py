@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.errors import ConfigError
+from pipeline.core.errors import ConfigError
 from pipeline.export.calibration import FrameNames
-from pipeline.geometry.transform_tree import TransformTree
 from pipeline.rig.edges import EDGE_OF_PAIR, words_of
 from pipeline.rig.graph import Edge
+from pipeline.rig.transform_tree import TransformTree
 
 __all__ = ["ESTIMATED_EDGES", "ESTIMATED_PAIRS", "pairs_of_tree", "require_frames"]
 

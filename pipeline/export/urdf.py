@@ -11,13 +11,13 @@ from xml.etree import ElementTree as ET
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.errors import ConfigError
+from pipeline.core.errors import ConfigError
 from pipeline.export.calibration import ExportedCalibration, Pose, poses_of
 from pipeline.export.formats import Files, Format
 from pipeline.export.provenance import comment_lines
 from pipeline.export.rotations import pose_of_rpy, rpy_of
 from pipeline.export.tree import require_frames
-from pipeline.geometry.transform_tree import TransformTree
+from pipeline.rig.transform_tree import TransformTree
 
 __all__ = ["URDF", "XACRO", "joint_of", "xml_of"]
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from pipeline.errors import ConfigError
+from pipeline.core.errors import ConfigError
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import Chosen, frames_of, ingested, observations_of, perceived
 from schemas.frames import Frame

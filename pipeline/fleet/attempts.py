@@ -8,8 +8,8 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
-from pipeline.memory import usable_cpus
-from pipeline.results import Progress
+from pipeline.core.memory import usable_cpus
+from pipeline.core.results import Progress
 
 __all__ = ["ONE_THREAD", "Executor", "Finished", "Turns", "Watch", "attempt", "usable_cpus"]
 

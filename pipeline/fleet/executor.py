@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Sequence
 from typing import TypeVar
 
+from pipeline.core.results import Progress
 from pipeline.fleet.attempts import Executor, Finished, Watch, attempt, usable_cpus
 from pipeline.fleet.processes import run_processes
 from pipeline.fleet.ray_tasks import run_on_ray
-from pipeline.results import Progress
 
 __all__ = ["EXECUTORS", "Executor", "Finished", "Watch", "run_inline", "usable_cpus"]
 

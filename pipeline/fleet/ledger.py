@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from pipeline.results import Outcome
+from pipeline.core.results import Outcome
 from pipeline.store.commits import assert_records, commit_records
 from pipeline.store.delta import open_table
 from pipeline.store.partitions import Lake, Partition, work_key

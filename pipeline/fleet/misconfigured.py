@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from pipeline.config import FleetConfig
+from pipeline.core.config import FleetConfig
 from pipeline.fleet.nightly import DayOutcome
 
 __all__ = ["night_statuses", "to_mend", "vehicles_to_mend"]

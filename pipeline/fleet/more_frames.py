@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from pipeline.results import Effort, Outcome
-from pipeline.stage_work import Task
-from pipeline.stages import CALIBRATE, INGEST
+from pipeline.core.results import Effort, Outcome
+from pipeline.core.stage_work import Task
+from pipeline.core.stages import CALIBRATE, INGEST
 from schemas.calibrations import ASKS_FOR_FRAMES
 from schemas.moments import SWEEPS_LOGGED, SWEEPS_PLANNED
 

@@ -18,16 +18,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from pipeline.config import FleetConfig
+from pipeline.core.config import FleetConfig
+from pipeline.core.results import MadeWhenAsked, Outcome, Progress, silent
+from pipeline.core.runner import Stage, try_stage
+from pipeline.core.stage_work import Task
+from pipeline.core.stages import CALIBRATE, INGEST, PERCEIVE
 from pipeline.fleet.executor import EXECUTORS, Finished, Watch
 from pipeline.fleet.ledger import Known, Ledger
 from pipeline.fleet.more_frames import MOST_TIMES_MORE, asks_for_more, spent_before, with_more_sweeps
 from pipeline.fleet.pattern import VehicleDay
-from pipeline.results import MadeWhenAsked, Outcome, Progress, silent
 from pipeline.rig.edges import edge_of, words_of
-from pipeline.runner import Stage, try_stage
-from pipeline.stage_work import Task
-from pipeline.stages import CALIBRATE, INGEST, PERCEIVE
 from pipeline.store.partitions import Lake, Partition, last_possible_day
 from schemas.calibrations import CalibrationRecord
 from schemas.words import day_word

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from pipeline.core.results import Progress
 from pipeline.fleet.executor import EXECUTORS
-from pipeline.results import Progress
 
 __all__ = ["OnWorkers"]
 

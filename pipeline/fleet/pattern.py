@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.errors import ConfigError
+from pipeline.core.errors import ConfigError
 from pipeline.store.partitions import Partition, check_day, is_day
 from pipeline.store.remote_logs import LogPath, find_remote_logs
 

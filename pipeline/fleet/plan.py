@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from pipeline.errors import BoresightError
+from pipeline.core.errors import BoresightError
+from pipeline.core.runner import why_to_run
+from pipeline.core.stage_work import Task
+from pipeline.core.stages import CALIBRATE, INGEST, PERCEIVE
 from pipeline.fleet.ledger import Ledger
 from pipeline.fleet.nightly import Night, refused_at_once, task_of
 from pipeline.fleet.pattern import VehicleDay
-from pipeline.runner import why_to_run
-from pipeline.stage_work import Task
-from pipeline.stages import CALIBRATE, INGEST, PERCEIVE
 
 __all__ = ["DayPlan", "plan_night"]
 

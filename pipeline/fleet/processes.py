@@ -16,10 +16,10 @@ from dataclasses import replace
 from multiprocessing import connection, get_context, parent_process
 from typing import Any, TypeVar
 
+from pipeline.core.memory import MODEL_THREADS
+from pipeline.core.results import Progress
 from pipeline.fleet.attempts import ONE_THREAD, Finished, Turns, Watch, attempt, usable_cpus
 from pipeline.fleet.board import Board
-from pipeline.memory import MODEL_THREADS
-from pipeline.results import Progress
 
 __all__ = ["run_processes"]
 

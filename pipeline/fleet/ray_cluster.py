@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
-from pipeline.errors import ConfigError, MissingExtraError
+from pipeline.core.errors import ConfigError, MissingExtraError
 
 __all__ = ["Cluster", "connected", "sigterm_between_calls"]
 

@@ -14,10 +14,10 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import Any, TypeVar
 
-from pipeline.errors import ConfigError, ContractError
+from pipeline.core.errors import ConfigError, ContractError
+from pipeline.core.results import Progress
 from pipeline.fleet.attempts import ONE_THREAD, Finished, Turns, Watch, attempt, usable_cpus
 from pipeline.fleet.ray_cluster import Cluster, connected, sigterm_between_calls
-from pipeline.results import Progress
 from schemas.versions import CODE_VERSION
 
 __all__ = ["run_on_ray"]

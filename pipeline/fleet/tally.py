@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass, field
 
+from pipeline.core.results import Outcome
 from pipeline.fleet.nightly import DayOutcome
-from pipeline.results import Outcome
 
 __all__ = ["Tally"]
 

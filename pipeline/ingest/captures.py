@@ -8,9 +8,9 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from pipeline.config import IngestConfig
-from pipeline.errors import LogError
-from pipeline.geometry.cameras import Camera
+from pipeline.core.config import IngestConfig
+from pipeline.core.errors import LogError
+from pipeline.core.rigs import CameraTopics, RadarTopics, TopicSemantics
 from pipeline.ingest.deskew import deskew
 from pipeline.ingest.index import DayIndex, Located
 from pipeline.ingest.messages.decoding import DECODE_ERRORS, decode, header_frame_id
@@ -29,8 +29,8 @@ from pipeline.ingest.messages.radar import RadarCloud, read_radar
 from pipeline.ingest.messages.video import VideoPictures, video_codec
 from pipeline.ingest.roles import DETECTIONS, LABELS, Role
 from pipeline.ingest.sync import Rejection, match_nearest
+from pipeline.rig.cameras import Camera
 from pipeline.rig.rig import Rig
-from pipeline.rigs import CameraTopics, RadarTopics, TopicSemantics
 from schemas.captures import Capture, Image, Scan, Sweep
 
 __all__ = ["CaptureReader", "Read", "Rejected", "readers_of"]

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int64
 
-from pipeline.config import FleetConfig, IngestConfig
-from pipeline.errors import ConfigError, SolveError
-from pipeline.extrinsics.prior import no_prior, rig_prior
+from pipeline.core.config import FleetConfig, IngestConfig
+from pipeline.core.errors import ConfigError, SolveError
+from pipeline.core.results import Progress, silent
 from pipeline.ingest.captures import Rejected
 from pipeline.ingest.directions_and_units import prior_transform
 from pipeline.ingest.index import DayIndex, index_logs
@@ -25,7 +25,7 @@ from pipeline.ingest.roles import NEEDED, topics_of
 from pipeline.ingest.stage import pick_moments, read_file_prior
 from pipeline.ingest.sync import WRONG_UNIT, constant_gap_ns
 from pipeline.ingest.unheard import Unheard, unheard_topics
-from pipeline.results import Progress, silent
+from pipeline.rig.day_prior import no_prior, rig_prior
 from pipeline.rig.prior import RigPrior
 from pipeline.rig.rig import Rig
 from pipeline.store.views import logged_stars

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Float32
 
-from pipeline.geometry.se3 import inverse, transform_points
+from pipeline.rig.se3 import inverse, transform_points
 
 __all__ = ["deskew", "planar_motion"]
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.core.rigs import RadarTopics
 from pipeline.ingest.doppler_speed import doppler_speed
-from pipeline.rigs import RadarTopics
 from schemas.frames import Frame
 
 __all__ = ["MOVING_MPS", "AskedRadar", "Motion", "motion_of", "opposed_signs", "prior_transform"]

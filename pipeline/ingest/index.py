@@ -14,9 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Int64
 
-from pipeline.errors import LogError
-from pipeline.geometry.cameras import Camera
-from pipeline.geometry.transform_tree import TransformTree
+from pipeline.core.errors import LogError
 from pipeline.ingest.containers.reader import Channel, ChunkCache, LogReader, Position, RawMessage, open_log
 from pipeline.ingest.containers.timeline import Stretches, Timeline
 from pipeline.ingest.messages.decoding import DECODE_ERRORS, content_without_stamp, decode, header_stamp_ns
@@ -27,7 +25,9 @@ from pipeline.ingest.messages.image import read_camera_info
 from pipeline.ingest.messages.odometry import EgoTrack
 from pipeline.ingest.reading_plan import Reading, plan_reading, plan_sweeps, rare_topics
 from pipeline.ingest.roles import CAPTURED, INFO, ODOMETRY, TF_STATIC, Role, topics_of
+from pipeline.rig.cameras import Camera
 from pipeline.rig.rig import Rig
+from pipeline.rig.transform_tree import TransformTree
 from pipeline.store.remote_logs import LogPath
 
 __all__ = ["ACCEPTED_TYPES", "DayIndex", "Located", "Stream", "index_logs"]

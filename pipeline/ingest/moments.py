@@ -11,14 +11,14 @@ from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
-from pipeline.config import IngestConfig
-from pipeline.geometry.pose_columns import pose_columns
+from pipeline.core.config import IngestConfig
 from pipeline.ingest.captures import Read, Rejected, readers_of
 from pipeline.ingest.index import DayIndex
 from pipeline.ingest.logged_prior import LoggedPrior
 from pipeline.ingest.repetition import REPEATED, Repetitions
 from pipeline.ingest.sync import Rejection, none_near
 from pipeline.rig.graph import possible_edges
+from pipeline.rig.pose_columns import pose_columns
 from pipeline.rig.prior import Star
 from pipeline.rig.rig import Rig
 from schemas.captures import Capture

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int64
 
-from pipeline.errors import LogError
+from pipeline.core.errors import LogError
+from pipeline.core.rigs import RadarTopics
 from pipeline.ingest.bursts import BurstMotion, PossibleBursts, choose_bursts, possible_bursts
 from pipeline.ingest.containers.reader import LogReader, RawMessage
 from pipeline.ingest.containers.timeline import Stretches, Timeline
@@ -19,7 +20,6 @@ from pipeline.ingest.messages.odometry import EgoTrack
 from pipeline.ingest.messages.radar import read_radar
 from pipeline.ingest.roles import INFO, LIDAR, ODOMETRY, RADAR, TF_STATIC, Role
 from pipeline.rig.rig import Rig
-from pipeline.rigs import RadarTopics
 
 __all__ = ["Reading", "plan_reading", "plan_sweeps", "rare_topics"]
 

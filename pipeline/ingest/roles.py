@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
+from pipeline.core.rigs import TopicSemantics
 from pipeline.rig.rig import Rig
-from pipeline.rigs import TopicSemantics
 
 __all__ = [
     "CAPTURED", "DETECTIONS", "INFO", "LABELS", "LIDAR", "NEEDED", "ODOMETRY", "RADAR", "TF_STATIC",

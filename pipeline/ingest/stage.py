@@ -10,9 +10,10 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Int64
 
-from pipeline.config import FleetConfig, IngestConfig
-from pipeline.errors import ConfigError
-from pipeline.extrinsics.prior_file import read_star
+from pipeline.core.config import FleetConfig, IngestConfig
+from pipeline.core.errors import ConfigError
+from pipeline.core.results import Progress
+from pipeline.core.stage_work import NothingUsable, Run, Task, Work
 from pipeline.ingest.captures import Rejected
 from pipeline.ingest.containers.reader import content_identity, leads_nowhere
 from pipeline.ingest.index import DayIndex, index_logs
@@ -30,11 +31,10 @@ from pipeline.ingest.sync import (
 )
 from pipeline.ingest.unheard import Unheard, unheard_topics
 from pipeline.objective.stamp_gaps import motion_gates_ns
-from pipeline.results import Progress
 from pipeline.rig.graph import possible_edges
 from pipeline.rig.prior import Star
+from pipeline.rig.prior_file import read_star
 from pipeline.rig.rig import Rig
-from pipeline.stage_work import NothingUsable, Run, Task, Work
 from schemas.captures import Capture
 from schemas.faults import FAULTS
 from schemas.moments import (

@@ -11,10 +11,10 @@ import numba
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from pipeline.config import PerceiveConfig
+from pipeline.core.config import PerceiveConfig
+from pipeline.core.rigs import RoadUser, TopicSemantics
 from pipeline.perceive.labels import ROAD_ID, SKY_ID, road_user_name, to_cityscapes
 from pipeline.perceive.rejections import FrameReason, FrameRejectedError
-from pipeline.rigs import RoadUser, TopicSemantics
 from schemas.captures import ImageColumns
 
 __all__ = [

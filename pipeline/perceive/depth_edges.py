@@ -19,10 +19,10 @@ import numpy as np
 from jaxtyping import Float32, Int32, UInt8, UInt16
 from numba import njit
 
-from pipeline.config import PerceiveConfig
-from pipeline.geometry.scan_rows import rows_of
-from pipeline.geometry.spherical import from_spherical, to_spherical
+from pipeline.core.config import PerceiveConfig
 from pipeline.perceive.scattered_edges import Jumps, jumps_between_neighbours
+from pipeline.rig.scan_rows import rows_of
+from pipeline.rig.spherical import from_spherical, to_spherical
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
 
 __all__ = ["LidarEdges", "lidar_edges"]

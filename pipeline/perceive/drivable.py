@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from numba import njit
 
-from pipeline.geometry.radar_grid import Scan
+from pipeline.rig.radar_grid import Scan
 
 __all__ = ["DrivableSource", "FreeSector", "free_sector"]
 

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int32, UInt8
 from numba import njit
 
-from pipeline.config import PerceiveConfig
+from pipeline.core.config import PerceiveConfig
 from pipeline.perceive.moving import cluster_moving, wrapped
 from pipeline.perceive.selection import median_of
 

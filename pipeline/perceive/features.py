@@ -9,9 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from pipeline.config import PerceiveConfig
-from pipeline.geometry.cameras import camera_of
-from pipeline.geometry.radar_grid import Scan as RadarScan
+from pipeline.core.config import PerceiveConfig
 from pipeline.perceive.brightness import brightness_steps
 from pipeline.perceive.camera import CameraSemantics, SemanticsSource, decode_grey, encode_png
 from pipeline.perceive.depth_edges import lidar_edges
@@ -25,6 +23,8 @@ from pipeline.perceive.lidar import cluster_boxes, cluster_objects, sample_unifo
 from pipeline.perceive.rejections import FrameReason
 from pipeline.perceive.road_markings import lidar_markings, road_contrast
 from pipeline.perceive.tracks import EgoMotion, TrackState, advance_tracks, measure_clusters
+from pipeline.rig.cameras import camera_of
+from pipeline.rig.radar_grid import Scan as RadarScan
 from schemas.captures import CameraColumns, Capture, Image, Scan, Sweep, SweepColumns
 from schemas.features import ImageFeatures, ScanFeatures, SweepFeatures
 from schemas.moments import Moment

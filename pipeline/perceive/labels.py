@@ -12,7 +12,7 @@ from typing import get_args
 import numpy as np
 from jaxtyping import UInt8
 
-from pipeline.rigs import RoadUser, StreetClass
+from pipeline.core.rigs import RoadUser, StreetClass
 
 __all__ = [
     "CITYSCAPES",

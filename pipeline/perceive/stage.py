@@ -9,8 +9,10 @@ from typing import Any, Final, NamedTuple, cast
 
 import numpy as np
 
-from pipeline.config import FleetConfig, PerceiveConfig
-from pipeline.errors import ModelOutputError
+from pipeline.core.config import FleetConfig, PerceiveConfig
+from pipeline.core.errors import ModelOutputError
+from pipeline.core.rigs import LidarTopics, OnnxSemantics, RadarTopics, TopicSemantics
+from pipeline.core.stage_work import NothingUsable, Run, Task, Work
 from pipeline.perceive.camera import BatchedSource, SemanticsSource, TopicSource
 from pipeline.perceive.drivable import DrivableSource
 from pipeline.perceive.ego_velocity import RadarMotion
@@ -31,8 +33,6 @@ from pipeline.perceive.untimed_sweeps import Turning, turning_of
 from pipeline.rig.graph import BASE, Kind, Sensor, possible_edges
 from pipeline.rig.prior import Star, between
 from pipeline.rig.rig import Rig
-from pipeline.rigs import LidarTopics, OnnxSemantics, RadarTopics, TopicSemantics
-from pipeline.stage_work import NothingUsable, Run, Task, Work
 from pipeline.store.moments import joined, sensors_of
 from pipeline.store.views import logged_stars
 from schemas.captures import Capture, Sweep

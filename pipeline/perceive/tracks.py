@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float32, Int32
 
-from pipeline.geometry.ground_tracks import (
+from pipeline.rig.ground_tracks import (
     Filters,
     Measurements,
     advance,

@@ -12,10 +12,10 @@ from typing import Final, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float, Float32, UInt16
 
-from pipeline.geometry.scan_rows import rows_of
-from pipeline.geometry.spherical import to_spherical
+from pipeline.core.rigs import LidarTurn
 from pipeline.perceive.sweep_pairs import Arc, motions, surfaces_of
-from pipeline.rigs import LidarTurn
+from pipeline.rig.scan_rows import rows_of
+from pipeline.rig.spherical import to_spherical
 from schemas.captures import Sweep
 
 __all__ = ["BY_AZIMUTH", "WITHOUT_TIMES", "Turning", "turning_of"]

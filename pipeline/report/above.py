@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import UInt8
 from markupsafe import Markup
 
-from pipeline.geometry.se3 import transform_points
 from pipeline.report.encode import png_uri
 from pipeline.report.overlays import Extrinsics, Scene
 from pipeline.report.svg import Plot, document
+from pipeline.rig.se3 import transform_points
 
 __all__ = ["top_bitmap", "top_view"]
 

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipeline.geometry.changes import change_between
 from pipeline.report.verdicts import ChartVerdicts, FleetVerdicts
 from pipeline.report.window import FleetWindow
+from pipeline.rig.changes import change_between
 from pipeline.rig.edges import edge_order
 from pipeline.rig.graph import Edge
 from schemas.calibrations import DOF_NAMES

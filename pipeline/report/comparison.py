@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.extrinsics.differences import PairDifference
 from pipeline.report.page import render
 from pipeline.report.words import dof_title, scaled, unit_of
+from pipeline.rig.differences import PairDifference
 from schemas.calibrations import DOF_NAMES
 
 __all__ = ["comparison_page"]

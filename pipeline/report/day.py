@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.geometry.changes import change_between, change_covariance
 from pipeline.report.words import dof_title, motion_in_words, scaled, unit_of
+from pipeline.rig.changes import change_between, change_covariance
 from pipeline.store.current import prior_of, transform_of
 from pipeline.store.partitions import Lake
 from schemas.calibrations import DOF_NAMES, CalibrationRecord

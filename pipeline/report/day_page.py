@@ -8,8 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Any, TypeVar
 
-from pipeline.config import FleetConfig
-from pipeline.errors import ConfigError, DamagedError
+from pipeline.core.config import FleetConfig
+from pipeline.core.errors import ConfigError, DamagedError
+from pipeline.core.results import plain
+from pipeline.core.sections import ReportConfig
 from pipeline.report.day import PairView, answer_for, answered, pair_view, sigmas_of, status_sentence
 from pipeline.report.figures import SigmaPanel, residual_figure, sigma_figure
 from pipeline.report.page import render, write_page
@@ -32,8 +34,6 @@ from pipeline.report.residuals import frame_residuals
 from pipeline.report.rig_figure import rig_of_day
 from pipeline.report.time_offsets import TimeOffsets, as_stamped, time_offsets_of
 from pipeline.report.words import pose_text, sigma_text
-from pipeline.results import plain
-from pipeline.sections import ReportConfig
 from pipeline.store.files import Files, LocalFiles
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.state_values import state_values

@@ -6,12 +6,12 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from pipeline.extrinsics.differences import ComparedRun
-from pipeline.geometry.se3 import transform_points
 from pipeline.report.evaluation import EvaluatedRun, TableView, View, evaluation_page
 from pipeline.report.overlays import Extrinsics, Scene
 from pipeline.report.scenes import choose_frames
 from pipeline.report.time_offsets import as_stamped, time_offsets_of
+from pipeline.rig.differences import ComparedRun
+from pipeline.rig.se3 import transform_points
 from pipeline.store.current import prior_of, targets_of, transform_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import frames_of, ingested, observations_of, perceived

@@ -12,7 +12,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from pipeline.config import FleetConfig
+from pipeline.core.config import FleetConfig
 from pipeline.report.charts import charted_edges, fleet_charts
 from pipeline.report.fleet import DAY_LETTERS, VehicleRow, finding_views, fleet_rows, headline_for, index_row
 from pipeline.report.names import page_stem

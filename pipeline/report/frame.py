@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.extrinsics.estimates import Prior, Solution
 from pipeline.report.above import top_view
 from pipeline.report.encode import jpeg_uri
 from pipeline.report.overlays import Extrinsics, Scene, whole_view
 from pipeline.report.page import render, write_page
 from pipeline.report.pictures import close_ups_of
+from pipeline.rig.estimates import Prior, Solution
 from schemas.calibrations import DOF_NAMES, PAIRS
 
 __all__ = ["write_frame_page"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from pipeline.config import config_hash
+from pipeline.core.config import config_hash
 
 __all__ = ["page_name", "page_stem"]
 

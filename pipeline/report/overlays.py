@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipeline.geometry.cameras import Camera, camera_of
-from pipeline.geometry.se3 import transform_points
+from pipeline.rig.cameras import Camera, camera_of
+from pipeline.rig.se3 import transform_points
 from schemas.frames import Frame
 from schemas.observations import Observation
 

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipeline.errors import ConfigError
-from pipeline.geometry.se3 import exp_se3, inverse, log_se3, rotation_angle_rad
+from pipeline.core.errors import ConfigError
 from pipeline.report.overlays import Extrinsics, Scene, Window, front_view, lidar_view, lidar_window
+from pipeline.rig.se3 import exp_se3, inverse, log_se3, rotation_angle_rad
 
 __all__ = ["between", "write_picture"]
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.geometry.cameras import camera_of
 from pipeline.report.above import top_view
 from pipeline.report.encode import jpeg_uri
 from pipeline.report.overlays import Extrinsics, Scene, close_up, front_view
 from pipeline.report.scenes import choose_windows
+from pipeline.rig.cameras import camera_of
 from schemas.calibrations import SENSORS
 
 __all__ = ["CloseUps", "ScenePictures", "close_ups_of", "scene_pictures"]

@@ -7,12 +7,12 @@ from typing import cast
 
 import numpy as np
 
-from pipeline.errors import ConfigError
+from pipeline.core.errors import ConfigError
+from pipeline.core.sections import ReportConfig
 from pipeline.report.overlays import Extrinsics, Scene
 from pipeline.report.privacy import without_road_users
 from pipeline.report.scenes import choose_frames
 from pipeline.rig.edges import edge_of, edge_order, words_of
-from pipeline.sections import ReportConfig
 from pipeline.store.current import (
     current_poses,
     current_records,

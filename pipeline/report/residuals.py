@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
-from pipeline.geometry.cameras import camera_of
-from pipeline.geometry.se3 import transform_points
 from pipeline.report.overlays import Extrinsics
 from pipeline.report.time_offsets import TimeOffsets, as_stamped
+from pipeline.rig.cameras import camera_of
+from pipeline.rig.se3 import transform_points
 from schemas.calibrations import pairs_of
 from schemas.observations import EDGE_LEFT, EDGE_RIGHT, STEP_RIGHT, Observation
 

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float
 from markupsafe import Markup, escape
 
-from pipeline.geometry.se3 import inverse
 from pipeline.report.svg import MUTED, document
 from pipeline.rig.graph import BASE, Kind
+from pipeline.rig.se3 import inverse
 from pipeline.store.current import transform_of
 from schemas.calibrations import CalibrationRecord
 from schemas.poses import PoseRow

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.geometry.cameras import camera_of
-from pipeline.geometry.se3 import transform_points
 from pipeline.report.overlays import Window
 from pipeline.report.residuals import at_pixels, boundary_distance_px
+from pipeline.rig.cameras import camera_of
+from pipeline.rig.se3 import transform_points
 from schemas.observations import EDGE_LEFT, EDGE_RIGHT, Observation
 
 __all__ = ["choose_frames", "choose_windows"]

@@ -8,15 +8,15 @@ from pathlib import PurePath
 
 import numpy as np
 
-from pipeline.config import FleetConfig
+from pipeline.core.config import FleetConfig
+from pipeline.core.results import Progress, silent
+from pipeline.core.stage_work import Run, Task, Work
 from pipeline.report.day_page import write_day_page, write_day_picture
 from pipeline.report.fleet_page import render_fleet_page
 from pipeline.report.reading import records_of_day
 from pipeline.report.upkeep import Album, FanOut, draw_days, one_by_one, stamp_of
 from pipeline.report.verdicts import read_verdicts
 from pipeline.report.window import read_window
-from pipeline.results import Progress, silent
-from pipeline.stage_work import Run, Task, Work
 from pipeline.store.files import Files, LocalFiles
 from pipeline.store.partitions import Lake, Partition, last_possible_day
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation
 from pipeline.report.overlays import Extrinsics
+from pipeline.rig.se3 import exp_so3, from_rotation_translation
 from schemas.calibrations import CalibrationRecord
 from schemas.observations import Observation
 

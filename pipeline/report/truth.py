@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.errors import ConfigError
-from pipeline.geometry.changes import change_between, change_covariance
-from pipeline.geometry.se3 import inverse
+from pipeline.core.errors import ConfigError
 from pipeline.report.words import scaled
+from pipeline.rig.changes import change_between, change_covariance
+from pipeline.rig.se3 import inverse
 from pipeline.store.current import prior_of, transform_of
 from schemas.calibrations import DOF_NAMES, CalibrationRecord
 

@@ -12,11 +12,11 @@ from pathlib import Path, PurePath
 from typing import Any, Protocol, runtime_checkable
 from urllib.parse import quote
 
-from pipeline.config import FleetConfig, config_hash
+from pipeline.core.config import FleetConfig, config_hash
+from pipeline.core.results import MadeWhenAsked, Progress, silent
 from pipeline.report.day_page import DayRead, write_day_page
 from pipeline.report.names import page_name
 from pipeline.report.reading import records_of_day
-from pipeline.results import MadeWhenAsked, Progress, silent
 from pipeline.store.current import current_states
 from pipeline.store.files import Files
 from pipeline.store.partitions import Lake, Partition

@@ -15,10 +15,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from jaxtyping import Bool, Float, Int
 
-from pipeline.geometry.changes import change_covariance
-from pipeline.geometry.se3 import from_quaternion
+from pipeline.rig.changes import change_covariance
 from pipeline.rig.edges import edges_of_rows
 from pipeline.rig.graph import EDGE_KINDS, Edge
+from pipeline.rig.se3 import from_quaternion
 from pipeline.store.columns import known_rows, matrices, observable_dofs, ordinals, places, there
 from pipeline.store.current import current_rows
 from pipeline.store.partitions import Lake, days_after, months_before

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.geometry.se3 import to_quaternion
+from pipeline.rig.se3 import to_quaternion
 from schemas.calibrations import DOF_NAMES, FRAMES_OF_PAIR
 from schemas.words import AXIS_NAMES
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pipeline.extrinsics.checks import FailedCheck
-from pipeline.extrinsics.estimates import DayParts
+from pipeline.rig.checks import FailedCheck
+from pipeline.rig.estimates import DayParts
 from pipeline.rig.graph import Edge
 
 __all__ = ["EDGE", "EdgeEvidence", "OtherScenes"]

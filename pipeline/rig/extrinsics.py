@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.geometry.se3 import adjoint, inverse
 from pipeline.rig.graph import Sensor
+from pipeline.rig.se3 import adjoint, inverse
 
 __all__ = ["Extrinsics"]
 

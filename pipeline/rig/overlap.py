@@ -9,9 +9,9 @@ from itertools import combinations, product
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipeline.geometry.se3 import exp_so3, inverse, transform_points
 from pipeline.rig.graph import Edge, RigGraph, Sensor, edge_between, possible_edges
 from pipeline.rig.prior import RigPrior
+from pipeline.rig.se3 import exp_so3, inverse, transform_points
 from pipeline.rig.views import View
 
 __all__ = ["Overlap", "best_three", "find_edges", "overlaps_of"]

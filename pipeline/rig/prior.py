@@ -13,8 +13,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.errors import SolveError
-from pipeline.geometry.se3 import (
+from pipeline.core.errors import SolveError
+from pipeline.rig.extrinsics import Extrinsics
+from pipeline.rig.graph import BASE, KINDS, Kind, Sensor
+from pipeline.rig.se3 import (
     adjoint,
     from_quaternion,
     from_rotation_translation,
@@ -23,8 +25,6 @@ from pipeline.geometry.se3 import (
     perturb_exactly,
     to_quaternion,
 )
-from pipeline.rig.extrinsics import Extrinsics
-from pipeline.rig.graph import BASE, KINDS, Kind, Sensor
 
 __all__ = [
     "RigPrior",

@@ -12,9 +12,8 @@ from pydantic import (
     model_validator,
 )
 
-from pipeline.errors import ConfigError
-from pipeline.rig.graph import BASE, KINDS, Edge, Sensor, edge_between, possible_edges
-from pipeline.rigs import (
+from pipeline.core.errors import ConfigError
+from pipeline.core.rigs import (
     CameraTopics,
     EgoTopics,
     LidarTopics,
@@ -25,6 +24,7 @@ from pipeline.rigs import (
     SensorPrior,
     TopicSemantics,
 )
+from pipeline.rig.graph import BASE, KINDS, Edge, Sensor, edge_between, possible_edges
 
 __all__ = ["SECTIONS", "Rig"]
 

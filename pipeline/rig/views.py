@@ -10,8 +10,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipeline.geometry.cameras import Camera
-from pipeline.geometry.spherical import to_spherical
+from pipeline.rig.cameras import Camera
+from pipeline.rig.spherical import to_spherical
 
 __all__ = ["FRAMES", "View", "view_of_camera", "view_of_clouds"]
 

@@ -25,9 +25,9 @@ from typing import Final
 
 import numpy as np
 
-from pipeline.errors import ConfigError
-from pipeline.geometry.cameras import Camera
-from pipeline.geometry.se3 import exp_so3
+from pipeline.core.errors import ConfigError
+from pipeline.rig.cameras import Camera
+from pipeline.rig.se3 import exp_so3
 from pipeline.simulate.sensors.mounting import Mounted, Mounting
 from pipeline.simulate.sensors.rig_spec import RigSpec, SensorSpec
 from pipeline.simulate.sensors.rigs import RIGS

@@ -15,8 +15,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from pipeline.errors import ConfigError
-from pipeline.results import Progress, silent
+from pipeline.core.errors import ConfigError
+from pipeline.core.results import Progress, silent
 from pipeline.simulate.faults import Fault, faults_on, shaken
 from pipeline.simulate.logs.fleet_toml import mixed_fleet_toml
 from pipeline.simulate.logs.frame_messages import Setup

@@ -16,8 +16,8 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.geometry.se3 import inverse, transform_points
-from pipeline.results import Progress, silent
+from pipeline.core.results import Progress, silent
+from pipeline.rig.se3 import inverse, transform_points
 from pipeline.rig.topics import TOPICS
 from pipeline.simulate.fleet import FleetSpec, day_names, mounting_on, rig_of, vehicle_names
 from pipeline.simulate.logs.frame_messages import Setup, messages_of

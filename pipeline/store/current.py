@@ -11,8 +11,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from jaxtyping import Float
 
-from pipeline.geometry.pose_columns import pose_of
-from pipeline.geometry.targets import DEFAULT_TARGETS
+from pipeline.rig.pose_columns import pose_of
+from pipeline.rig.targets import DEFAULT_TARGETS
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.columns import TableSchema
 from schemas.drift import DriftFinding

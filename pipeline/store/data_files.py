@@ -7,7 +7,7 @@ from pathlib import PurePosixPath
 
 import pyarrow as pa
 
-from pipeline.errors import DamagedLogError
+from pipeline.core.errors import DamagedLogError
 from pipeline.store.delta import LiveFile, live_files, open_table, spans_of_file
 from pipeline.store.partitions import Lake
 from schemas.columns import TableSchema

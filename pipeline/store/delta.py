@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 from deltalake import DeltaTable, Schema, WriterProperties
 from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundError
 
-from pipeline.errors import DamagedLogError, OtherVersionError
+from pipeline.core.errors import DamagedLogError, OtherVersionError
 from pipeline.store.parquet_file import opened_parquet
 from pipeline.store.partitions import Lake
 from schemas.columns import TableSchema

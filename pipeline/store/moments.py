@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import PurePath
 from typing import Any
 
-from pipeline.errors import ContractError
+from pipeline.core.errors import ContractError
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import (
     COLLECTED,

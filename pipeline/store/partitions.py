@@ -13,8 +13,8 @@ from urllib.parse import quote, unquote
 
 import numpy as np
 
-from pipeline.errors import ConfigError
-from pipeline.names import is_vehicle
+from pipeline.core.errors import ConfigError
+from pipeline.core.names import is_vehicle
 from pipeline.store.files import Files, LocalFiles
 from pipeline.store.object_store import Bucket
 

@@ -10,7 +10,7 @@ from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
-from pipeline.errors import ConfigError, StorageError
+from pipeline.core.errors import ConfigError, StorageError
 from pipeline.store.object_store import Bucket
 
 __all__ = ["LogPath", "RangeReader", "RemoteLog", "find_remote_logs", "log_at"]

@@ -8,7 +8,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from pipeline.errors import DamagedLogError
+from pipeline.core.errors import DamagedLogError
 from pipeline.store.data_files import files_there, once
 from pipeline.store.delta import (
     DAMAGED,

@@ -6,7 +6,7 @@ import datetime as dt
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from pipeline.errors import ContractError
+from pipeline.core.errors import ContractError
 from pipeline.store.moments import sensor_files, sensor_tables
 from pipeline.store.partitions import Lake, Partition, is_day
 from pipeline.store.tables import COLLECTED, read_manifest, write_manifest

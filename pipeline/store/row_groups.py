@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import PurePath
 from typing import Any, TypeVar
 
-from pipeline.errors import CollectedError, ContractError
+from pipeline.core.errors import CollectedError, ContractError
 from pipeline.store.parquet_file import opened_parquet
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.rows import from_table

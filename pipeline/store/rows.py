@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 import pyarrow as pa
 
-from pipeline.errors import ContractError
+from pipeline.core.errors import ContractError
 from schemas.columns import Column, TableSchema
 
 __all__ = ["from_table", "to_table"]

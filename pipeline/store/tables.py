@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipeline.errors import CollectedError, ContractError, DamagedError, OtherVersionError
+from pipeline.core.errors import CollectedError, ContractError, DamagedError, OtherVersionError
 from pipeline.store.parquet_file import opened_parquet
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.rows import from_table, to_table

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from pipeline.config import ChecksConfig
+from pipeline.core.config import ChecksConfig
 
 __all__ = ["AxisCheck", "AxisLimits", "HeldOut", "checked", "power_of", "shown_from", "silent"]
 

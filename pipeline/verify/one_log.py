@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Sequence
 
-from pipeline.config import FleetConfig, VerifyConfig
-from pipeline.errors import SolveError
-from pipeline.extrinsics.prior import rig_prior
-from pipeline.geometry.sensor_turns import TURN_AXES
+from pipeline.core.config import FleetConfig, VerifyConfig
+from pipeline.core.errors import SolveError
+from pipeline.rig.day_prior import rig_prior
 from pipeline.rig.graph import Sensor
 from pipeline.rig.prior import RigPrior
+from pipeline.rig.sensor_turns import TURN_AXES
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import perceived
 from pipeline.verify.axes import (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation, log_so3
+from pipeline.rig.se3 import exp_so3, from_rotation_translation, log_so3
 
 __all__ = ["on_grid"]
 

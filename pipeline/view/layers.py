@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
-from pipeline.geometry.cameras import Camera, camera_of
-from pipeline.geometry.se3 import inverse, transform_points
+from pipeline.rig.cameras import Camera, camera_of
+from pipeline.rig.se3 import inverse, transform_points
 from pipeline.view.moment import Rig, Shown
 from schemas.captures import Image, Scan, Sweep
 from schemas.features import ImageFeatures, ScanFeatures, SweepFeatures

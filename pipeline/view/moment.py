@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.errors import ConfigError
-from pipeline.geometry.se3 import exp_so3
+from pipeline.core.errors import ConfigError
+from pipeline.rig.se3 import exp_so3
 from pipeline.store.moments import joined, sensors_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_rows

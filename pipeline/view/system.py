@@ -10,7 +10,7 @@ import os
 import re
 from typing import Any
 
-from pipeline.errors import MissingLibraryError
+from pipeline.core.errors import MissingLibraryError
 
 __all__ = ["import_open3d", "require_display", "require_renderer"]
 

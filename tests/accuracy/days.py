@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.extrinsics.prior import read_prior
+from pipeline.rig.day_prior import read_prior
 from pipeline.store.partitions import Lake, Partition
 from schemas.calibrations import PAIRS
 from tests.benchmarks.studies.days import Day, DaySpec

@@ -15,8 +15,8 @@ from pipeline.audit.days import PairDays
 from pipeline.audit.estimates import COLUMNS, estimates_of
 from pipeline.calibrate.pose_rows import poses_of_records
 from pipeline.calibrate.records import Inputs
-from pipeline.geometry.se3 import adjoint, exp_se3, from_rotation_translation, inverse, to_quaternion
 from pipeline.rig.graph import Edge
+from pipeline.rig.se3 import adjoint, exp_se3, from_rotation_translation, inverse, to_quaternion
 from pipeline.store.partitions import Partition
 from pipeline.store.rows import to_table
 from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, PAIRS, CalibrationRecord

@@ -10,10 +10,10 @@ from pipeline.audit.days import PairDays
 from pipeline.audit.scan import alike
 from pipeline.audit.shifts import Whitened
 from pipeline.audit.vehicle import independent_edges
-from pipeline.extrinsics.attribution import PairShift, attribute
-from pipeline.geometry.se3 import adjoint, exp_se3, inverse, log_se3
+from pipeline.rig.attribution import PairShift, attribute
 from pipeline.rig.edges import EDGE_OF_PAIR
 from pipeline.rig.graph import Edge, Sensor
+from pipeline.rig.se3 import adjoint, exp_se3, inverse, log_se3
 from tests.makers.random_rigs import Rig, knock
 
 CAMERA_LIDAR, CAMERA_RADAR, LIDAR_RADAR = (

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from pipeline.audit.vehicle import judge_fleet
-from pipeline.config import AuditConfig, FleetConfig
-from pipeline.errors import ConfigError
-from pipeline.geometry.changes import change_between
-from pipeline.geometry.se3 import exp_so3, from_quaternion, from_rotation_translation, to_quaternion
-from pipeline.stage_work import Task, Window
-from pipeline.stages import AUDIT
+from pipeline.core.config import AuditConfig, FleetConfig
+from pipeline.core.errors import ConfigError
+from pipeline.core.stage_work import Task, Window
+from pipeline.core.stages import AUDIT
+from pipeline.rig.changes import change_between
+from pipeline.rig.se3 import exp_so3, from_quaternion, from_rotation_translation, to_quaternion
 from pipeline.store.commits import commit_records
 from pipeline.store.current import current_drift
 from pipeline.store.partitions import Lake

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from jobs.service import service
-from pipeline.config import load_fleet
-from pipeline.errors import ConfigError
-from pipeline.stage_work import Task, Window
-from pipeline.stages import AUDIT, STATE
+from pipeline.core.config import load_fleet
+from pipeline.core.errors import ConfigError
+from pipeline.core.stage_work import Task, Window
+from pipeline.core.stages import AUDIT, STATE
 from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake
 from pipeline.store.records import read_records

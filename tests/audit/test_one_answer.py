@@ -12,10 +12,10 @@ import pytest
 from jobs.service import service
 from jobs.show import show
 from jobs.terminal.vehicle_status import count_statuses
-from pipeline.config import FleetConfig
-from pipeline.errors import ConfigError
-from pipeline.stage_work import Task, Window
-from pipeline.stages import AUDIT, STATE
+from pipeline.core.config import FleetConfig
+from pipeline.core.errors import ConfigError
+from pipeline.core.stage_work import Task, Window
+from pipeline.core.stages import AUDIT, STATE
 from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake
 from schemas.calibrations import CALIBRATIONS

@@ -8,9 +8,9 @@ import pytest
 from pipeline.audit import history
 from pipeline.audit.estimates import day_name
 from pipeline.audit.references import read_kept
+from pipeline.core.stage_work import Task, Window
+from pipeline.core.stages import AUDIT, STATE
 from pipeline.rig.edges import EDGE_OF_PAIR
-from pipeline.stage_work import Task, Window
-from pipeline.stages import AUDIT, STATE
 from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake
 from pipeline.store.records import read_records

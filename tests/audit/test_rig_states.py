@@ -8,9 +8,9 @@ import pytest
 from pipeline.audit.fusion import Mount
 from pipeline.audit.pose_days import read_poses
 from pipeline.audit.rig_states import rig_states
-from pipeline.config import VerifyConfig
-from pipeline.geometry.se3 import exp_se3, inverse, log_se3
+from pipeline.core.config import VerifyConfig
 from pipeline.rig.graph import tie
+from pipeline.rig.se3 import exp_se3, inverse, log_se3
 from pipeline.store.commits import commit_records
 from pipeline.store.current import transform_of
 from pipeline.store.partitions import Lake

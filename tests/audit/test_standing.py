@@ -11,7 +11,7 @@ from jobs.audit import audit
 from jobs.service import service
 from jobs.state import state
 from jobs.status import status
-from pipeline.errors import DamagedLogError
+from pipeline.core.errors import DamagedLogError
 from pipeline.fleet.ledger import Ledger
 from pipeline.store.commits import commit_records
 from pipeline.store.delta import live_files, open_table

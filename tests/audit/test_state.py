@@ -11,9 +11,9 @@ import pytest
 
 from jobs.service import service
 from jobs.state import state
-from pipeline.config import FleetConfig
-from pipeline.stage_work import Task, Window
-from pipeline.stages import AUDIT, STATE
+from pipeline.core.config import FleetConfig
+from pipeline.core.stage_work import Task, Window
+from pipeline.core.stages import AUDIT, STATE
 from pipeline.store.commits import commit_records
 from pipeline.store.current import transform_of
 from pipeline.store.partitions import Lake

@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 
-from pipeline.geometry.se3 import exp_se3
+from pipeline.rig.se3 import exp_se3
 
 POSES, FRAMES, POINTS, WIDTH, HEIGHT, PENALTY = 90, 6, 10_000, 912, 470, 1.0
 ROBUST_PX, SKY = 20.0, 1.0

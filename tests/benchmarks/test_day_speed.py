@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from pipeline.config import load_fleet
+from pipeline.core.config import load_fleet
 from pipeline.simulate.fleet import FleetSpec, simulate_fleet
 from pipeline.store.partitions import Lake, Partition
 from tests.benchmarks.kernel_workload import FRAMES, POINTS, naive_cpu_s

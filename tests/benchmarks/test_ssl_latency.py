@@ -5,7 +5,6 @@ import time
 import numpy as np
 import pytest
 
-from pipeline.geometry.cameras import Camera
 from pipeline.learn.export.onnx_file import export_onnx
 from pipeline.learn.infer.compiled_rendering import FrameSensors
 from pipeline.learn.infer.single_frame import SingleFrameCalibrator
@@ -13,6 +12,7 @@ from pipeline.learn.network.calibration_network import build_network
 from pipeline.learn.sample.camera_maps import class_likelihood
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import NetworkConfig
+from pipeline.rig.cameras import Camera
 
 GOAL_MS = 40.0
 BUSY = 6.0  # a shared machine: the goal is for idle cores; three processes on two were seen to take three times as long

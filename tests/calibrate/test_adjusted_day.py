@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.extrinsics.checks import FailedCheck
-from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
-from pipeline.geometry.se3 import exp_se3, log_se3
+from pipeline.rig.checks import FailedCheck
+from pipeline.rig.estimates import PairEstimate, Prior, Solution
+from pipeline.rig.se3 import exp_se3, log_se3
 from schemas.calibrations import PAIRS
 from tests.benchmarks.studies.metrics import transform_of
 from tests.calibrate.test_contradictions import records_of

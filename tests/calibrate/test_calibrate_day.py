@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.records import environment_of
-from pipeline.config import FleetConfig
-from pipeline.errors import ConfigError
-from pipeline.geometry.se3 import from_quaternion, rotation_angle_rad
+from pipeline.core.config import FleetConfig
+from pipeline.core.errors import ConfigError
+from pipeline.rig.se3 import from_quaternion, rotation_angle_rad
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord

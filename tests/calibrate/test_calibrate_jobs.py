@@ -8,9 +8,9 @@ import pytest
 from jobs.calibrate import calibrate, parse_perturb
 from jobs.evaluate import evaluate
 from jobs.status import status
-from pipeline.errors import ConfigError
-from pipeline.geometry.se3 import inverse, transform_points
-from pipeline.geometry.targets import DEFAULT_TARGETS
+from pipeline.core.errors import ConfigError
+from pipeline.rig.se3 import inverse, transform_points
+from pipeline.rig.targets import DEFAULT_TARGETS
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
 from schemas.outcomes import OUTCOMES, OutcomeRow

@@ -7,10 +7,10 @@ import pytest
 
 from pipeline.calibrate.day import calibrate_observations
 from pipeline.calibrate.records import Inputs
-from pipeline.config import FleetConfig
-from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation, perturb_exactly
-from pipeline.geometry.targets import errors_at_targets
+from pipeline.core.config import FleetConfig
+from pipeline.rig.estimates import PairEstimate, Prior, Solution
+from pipeline.rig.se3 import exp_so3, from_rotation_translation, perturb_exactly
+from pipeline.rig.targets import errors_at_targets
 from pipeline.store.partitions import Partition
 from schemas.calibrations import PAIRS
 from schemas.observations import Observation

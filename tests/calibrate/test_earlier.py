@@ -4,8 +4,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from pipeline.calibrate.earlier import accepted_before
-from pipeline.geometry.se3 import to_quaternion
 from pipeline.rig.edges import EDGE_OF_PAIR
+from pipeline.rig.se3 import to_quaternion
 from pipeline.store.partitions import Lake, Partition
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from tests.makers.lakes import write_records

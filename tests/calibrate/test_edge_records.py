@@ -8,12 +8,12 @@ import pytest
 from pipeline.calibrate.edge_records import judged_edge, record_of_edge
 from pipeline.calibrate.edges.radar_base import estimate_radar_base
 from pipeline.calibrate.records import Inputs
-from pipeline.extrinsics.checks import FailedCheck
-from pipeline.geometry.changes import change_between
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse
+from pipeline.rig.changes import change_between
+from pipeline.rig.checks import FailedCheck
 from pipeline.rig.evidence import EdgeEvidence, OtherScenes
 from pipeline.rig.graph import BASE, Edge, Sensor
 from pipeline.rig.prior import RigPrior
+from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
 from pipeline.store.partitions import Partition
 from tests.calibrate.edges.test_radar_base import ALL, EDGE, STAMPS, day, mounted
 from tests.makers.written_logs import fleet_config

@@ -8,8 +8,8 @@ import pytest
 
 from pipeline.calibrate.day import calibrate_observations
 from pipeline.calibrate.records import Inputs
-from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.targets import errors_at_targets
+from pipeline.rig.estimates import Prior
+from pipeline.rig.targets import errors_at_targets
 from pipeline.store.current import targets_of, transform_of
 from pipeline.store.partitions import Partition
 from tests.makers.simulated_days import simulated_day

@@ -6,8 +6,8 @@ import pytest
 from pipeline.calibrate.adjust.adjusted import AdjustedEdge, AdjustedRig, AdjustedSensor
 from pipeline.calibrate.pose_rows import pose_rows
 from pipeline.calibrate.records import Inputs
-from pipeline.config import VerifyConfig
-from pipeline.extrinsics.checks import FailedCheck
+from pipeline.core.config import VerifyConfig
+from pipeline.rig.checks import FailedCheck
 from pipeline.rig.evidence import EdgeEvidence
 from pipeline.rig.extrinsics import Extrinsics
 from pipeline.rig.graph import RigGraph, Sensor, edge_between

@@ -1,8 +1,8 @@
 import pytest
 
 from pipeline.calibrate.three_sensors import three_sensors
-from pipeline.config import FleetConfig
-from pipeline.errors import SolveError
+from pipeline.core.config import FleetConfig
+from pipeline.core.errors import SolveError
 from pipeline.rig.overlap import overlaps_of
 from tests.rig.test_overlap import VAN, rig
 

@@ -11,9 +11,9 @@ import pytest
 from mcap.reader import make_reader
 
 from jobs.cli import main
-from pipeline.config import load_fleet
-from pipeline.geometry.se3 import from_quaternion
-from pipeline.ros_messages import RosMessages
+from pipeline.core.config import load_fleet
+from pipeline.core.ros_messages import RosMessages
+from pipeline.rig.se3 import from_quaternion
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import frames_of
 from tests.makers import data_sets
@@ -224,7 +224,7 @@ def test_models_are_named_in_fleet_toml_and_a_radar_without_doppler_is_refused(t
     assert "lacks doppler" in capsys.readouterr().out
     assert main([*call, "--segmenter", "s.toml"]) == 2
     assert main([*call, "--segmenter", "s.toml", "--detector", "d.toml", "--vehicle", 'the "red" one']) == 0
-    from pipeline.config import load_fleet
+    from pipeline.core.config import load_fleet
 
     fleet = load_fleet(tmp_path / "fleet.toml")
     assert fleet.rigs["default"].camera.semantics.segmenter == "s.toml"

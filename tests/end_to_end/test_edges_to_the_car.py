@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from pipeline.config import load_fleet
-from pipeline.geometry.changes import change_between
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse
+from pipeline.core.config import load_fleet
+from pipeline.rig.changes import change_between
+from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
 from pipeline.simulate.fleet import FleetSpec
 from pipeline.store.current import transform_of
 from pipeline.store.partitions import Lake

@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from pipeline.geometry.se3 import exp_so3, to_quaternion
+from pipeline.rig.se3 import exp_so3, to_quaternion
 from pipeline.simulate.fleet import FleetSpec
 from pipeline.simulate.reflectors import simulate_reflectors
 from pipeline.store.partitions import Lake

@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from pipeline.config import load_fleet
-from pipeline.geometry.se3 import from_rotation_translation
-from pipeline.geometry.targets import errors_at_targets
+from pipeline.core.config import load_fleet
+from pipeline.rig.se3 import from_rotation_translation
+from pipeline.rig.targets import errors_at_targets
 from pipeline.simulate.fleet import FleetSpec
 from pipeline.store.current import transform_of
 from pipeline.store.partitions import Lake, Partition

@@ -9,11 +9,11 @@ from mcap.reader import make_reader
 from jobs.cli import main
 from pipeline.calibrate.day import calibrate_observations
 from pipeline.calibrate.records import Inputs
-from pipeline.config import load_fleet
-from pipeline.extrinsics.prior import perturbed, read_prior
-from pipeline.geometry.targets import errors_at_targets
+from pipeline.core.config import load_fleet
+from pipeline.core.ros_messages import RosMessages
+from pipeline.rig.day_prior import perturbed, read_prior
+from pipeline.rig.targets import errors_at_targets
 from pipeline.rig.topics import TOPICS
-from pipeline.ros_messages import RosMessages
 from pipeline.store.current import targets_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records

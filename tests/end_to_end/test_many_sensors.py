@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from jobs.cli import main
-from pipeline.config import load_fleet
-from pipeline.extrinsics.prior import prior_of_three, rig_prior
-from pipeline.geometry.se3 import inverse, log_se3
+from pipeline.core.config import load_fleet
+from pipeline.core.stage_work import Task
+from pipeline.core.stages import CALIBRATE
 from pipeline.ingest.index import DayIndex
+from pipeline.rig.day_prior import prior_of_three, rig_prior
+from pipeline.rig.se3 import inverse, log_se3
 from pipeline.simulate.faults import parse_faults
 from pipeline.simulate.fleet import FleetSpec
 from pipeline.simulate.sensors.rigs import rig_named
-from pipeline.stage_work import Task
-from pipeline.stages import CALIBRATE
 from pipeline.store.moments import sensors_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import frames_of, ingested, observations_of, perceived

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jobs.cli import main
-from pipeline.geometry.se3 import from_quaternion, log_so3
+from pipeline.rig.se3 import from_quaternion, log_so3
 from pipeline.simulate.fleet import FleetSpec
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records

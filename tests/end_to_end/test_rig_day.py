@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.linalg import eigh
 
-from pipeline.config import load_fleet
-from pipeline.geometry.se3 import inverse, log_se3
+from pipeline.core.config import load_fleet
+from pipeline.core.stage_work import Task
+from pipeline.core.stages import CALIBRATE
+from pipeline.rig.se3 import inverse, log_se3
 from pipeline.simulate.fleet import FleetSpec
-from pipeline.stage_work import Task
-from pipeline.stages import CALIBRATE
 from pipeline.store.current import current_poses, prior_of, transform_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records

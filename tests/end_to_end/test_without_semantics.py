@@ -8,9 +8,9 @@ import pytest
 
 from pipeline.calibrate.day import calibrate_observations
 from pipeline.calibrate.records import Inputs
-from pipeline.config import load_fleet
-from pipeline.extrinsics.prior import perturbed, read_prior
-from pipeline.geometry.targets import errors_at_targets
+from pipeline.core.config import load_fleet
+from pipeline.rig.day_prior import perturbed, read_prior
+from pipeline.rig.targets import errors_at_targets
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import observations_of
 from schemas.observations import WITHOUT_LABELS

@@ -2,7 +2,7 @@
 
 import pytest
 
-from pipeline.errors import ConfigError
+from pipeline.core.errors import ConfigError
 from pipeline.export.calibration import FrameNames
 from pipeline.export.formats import FORMATS, format_named
 

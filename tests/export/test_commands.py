@@ -9,7 +9,7 @@ import pytest
 from jobs.cli import main
 from pipeline.export.calibration import FrameNames
 from pipeline.export.formats import format_named
-from pipeline.extrinsics.prior_file import read_transforms
+from pipeline.rig.prior_file import read_transforms
 from pipeline.store.commits import commit_records
 from pipeline.store.current import transform_of
 from pipeline.store.partitions import Lake, Partition

@@ -10,8 +10,8 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from jobs.cli import main
 from pipeline.export.foxglove import TOPICS
-from pipeline.geometry.cameras import Camera
-from pipeline.geometry.se3 import exp_se3, from_quaternion, inverse, to_quaternion, transform_points
+from pipeline.rig.cameras import Camera
+from pipeline.rig.se3 import exp_se3, from_quaternion, inverse, to_quaternion, transform_points
 from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import frames_of

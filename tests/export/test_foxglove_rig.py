@@ -8,7 +8,7 @@ import pytest
 from mcap.reader import make_reader
 
 from jobs.cli import main
-from pipeline.geometry.se3 import from_quaternion, inverse, transform_points
+from pipeline.rig.se3 import from_quaternion, inverse, transform_points
 from pipeline.store.commits import commit_records
 from pipeline.store.moments import write_moments
 from pipeline.store.partitions import Lake, Partition

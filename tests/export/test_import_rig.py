@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from jobs.cli import main
-from pipeline.config import load_fleet
+from pipeline.core.config import load_fleet
 from pipeline.export.calibration import ExportedCalibration, ExportedPair, FrameNames
 from pipeline.export.files import write_files, written_files
 from pipeline.export.formats import FORMATS, format_named
-from pipeline.extrinsics.prior_file import read_star
-from pipeline.geometry.se3 import inverse
 from pipeline.rig.edges import words_of
 from pipeline.rig.graph import Sensor, tie
+from pipeline.rig.prior_file import read_star
+from pipeline.rig.se3 import inverse
 from tests.makers.calibrations import CAMERA, random_transform
 
 TOP = Sensor("top", "lidar")

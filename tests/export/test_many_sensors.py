@@ -9,12 +9,12 @@ import xacro
 import yaml
 
 from jobs.cli import main
-from pipeline.errors import ConfigError
+from pipeline.core.errors import ConfigError
 from pipeline.export.calibration import ExportedCalibration, ExportedPair, FrameNames, poses_of
 from pipeline.export.files import write_files, written_files
 from pipeline.export.formats import FORMATS, format_named
-from pipeline.geometry.se3 import adjoint, exp_se3, inverse, to_quaternion
 from pipeline.rig.edges import edge_named, words_of
+from pipeline.rig.se3 import adjoint, exp_se3, inverse, to_quaternion
 from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake
 from schemas.calibrations import CALIBRATIONS

@@ -10,17 +10,17 @@ import pytest
 from mcap.reader import make_reader
 
 from jobs.cli import main
-from pipeline.config import FleetConfig
+from pipeline.core.config import FleetConfig
+from pipeline.core.stage_work import Task, Window
+from pipeline.core.stages import AUDIT, STATE
 from pipeline.export.calibration import ExportedCalibration, ExportedPair, FrameNames, replaced_transforms
 from pipeline.export.formats import FORMATS, format_named
-from pipeline.geometry.changes import change_covariance
-from pipeline.geometry.se3 import exp_se3, inverse
 from pipeline.report.stage import write_day_page
 from pipeline.report.words import pose_text
+from pipeline.rig.changes import change_covariance
 from pipeline.rig.edges import edge_named, words_of
 from pipeline.rig.prior import to_rows
-from pipeline.stage_work import Task, Window
-from pipeline.stages import AUDIT, STATE
+from pipeline.rig.se3 import exp_se3, inverse
 from pipeline.store.commits import commit_records
 from pipeline.store.moments import write_moments
 from pipeline.store.partitions import Lake, Partition

@@ -15,9 +15,9 @@ import yaml
 from pipeline.export.calibration import FrameNames
 from pipeline.export.files import write_files, written_files
 from pipeline.export.formats import format_named
-from pipeline.geometry.transform_tree import TransformTree
 from pipeline.ingest.containers.reader import open_log
 from pipeline.ingest.messages.decoding import decode
+from pipeline.rig.transform_tree import TransformTree
 from tests.export.real_readers import READERS
 from tests.makers.calibrations import calibration, random_transform
 

@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import ConfigError
+from pipeline.core.errors import ConfigError
 from pipeline.export.calibration import FrameNames
 from pipeline.export.files import prior_text
 from pipeline.export.formats import FORMATS, format_named
 from pipeline.export.rotations import pose_of_rpy, rpy_of
-from pipeline.geometry.cameras import Camera
-from pipeline.geometry.se3 import exp_so3
+from pipeline.rig.cameras import Camera
+from pipeline.rig.se3 import exp_so3
 from tests.makers.calibrations import CAMERA, calibration, random_transform
 
 WRITTEN = [name for name in FORMATS if format_named(name).write is not None]

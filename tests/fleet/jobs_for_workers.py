@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.memory import at_most
+from pipeline.core.memory import at_most
 
 
 def behave(item, progress):

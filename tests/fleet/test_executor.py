@@ -9,10 +9,10 @@ from pathlib import Path
 import psutil
 import pytest
 
+from pipeline.core.memory import MODEL_THREADS
 from pipeline.fleet import processes
 from pipeline.fleet.board import Board
 from pipeline.fleet.executor import EXECUTORS
-from pipeline.memory import MODEL_THREADS
 from tests.makers.processes import descendants, started, works
 from tests.makers.ray_clusters import ray_or_skip
 

@@ -12,15 +12,15 @@ from pipeline.calibrate.verify.edge_result import EdgeResult
 from pipeline.calibrate.verify.held_out_test import HeldOutTest
 from pipeline.calibrate.verify.target_accuracy import Claim
 from pipeline.calibrate.verify.verdict import Evidence, judge
-from pipeline.config import ChecksConfig
+from pipeline.core.config import ChecksConfig
+from pipeline.core.results import Effort, Outcome
+from pipeline.core.runner import Stage, why_to_run
+from pipeline.core.stage_work import Task
+from pipeline.core.stages import INGEST
 from pipeline.fleet.more_frames import MOST_TIMES_MORE, _lacks_frames, asks_for_more, spent_before
 from pipeline.fleet.nightly import Night, run_night
 from pipeline.fleet.pattern import VehicleDay
-from pipeline.geometry.targets import DEFAULT_TARGETS
-from pipeline.results import Effort, Outcome
-from pipeline.runner import Stage, why_to_run
-from pipeline.stage_work import Task
-from pipeline.stages import INGEST
+from pipeline.rig.targets import DEFAULT_TARGETS
 from pipeline.store.partitions import Lake, Partition
 from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, CalibrationRecord
 from schemas.moments import SWEEPS_LOGGED, SWEEPS_PLANNED

@@ -6,14 +6,14 @@ from pathlib import Path
 import pytest
 
 import pipeline.fleet.ledger
-from pipeline.config import FleetConfig
-from pipeline.errors import CollectedError, ConfigError, DamagedError, LogError
+from pipeline.core.config import FleetConfig
+from pipeline.core.errors import CollectedError, ConfigError, DamagedError, LogError
+from pipeline.core.results import Outcome
+from pipeline.core.runner import Stage
 from pipeline.fleet.misconfigured import night_statuses
 from pipeline.fleet.nightly import Night, run_night
 from pipeline.fleet.pattern import VehicleDay
 from pipeline.fleet.status import day_statuses
-from pipeline.results import Outcome
-from pipeline.runner import Stage
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, PAIRS, CalibrationRecord

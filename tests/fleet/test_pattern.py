@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.errors import ConfigError
+from pipeline.core.errors import ConfigError
 from pipeline.fleet import pattern as pattern_module
 from pipeline.fleet.pattern import find_vehicle_days
 

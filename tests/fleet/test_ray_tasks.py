@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import pipeline.fleet.ray_tasks
-from pipeline.errors import ConfigError, ContractError, MissingExtraError
+from pipeline.core.errors import ConfigError, ContractError, MissingExtraError
 from pipeline.fleet.executor import EXECUTORS
 from pipeline.fleet.ray_tasks import _work
 from tests.makers.ray_clusters import lasting, two_nodes

@@ -12,8 +12,8 @@ import pytest
 from jobs.cli import main
 from jobs.terminal.night_view import _MARKS
 from jobs.terminal.record_tables import STATUS_STYLES
+from pipeline.core.results import Outcome
 from pipeline.fleet.ledger import Ledger
-from pipeline.results import Outcome
 from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake, Partition
 from schemas.calibrations import CALIBRATIONS, PAIRS

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from pipeline.config import FleetConfig
+from pipeline.core.config import FleetConfig
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import frames_of
 from tests.makers import written_logs

@@ -21,7 +21,7 @@ _OPEN = """
 import json, sys, time
 from pathlib import Path
 import zstandard
-from pipeline.errors import LogError
+from pipeline.core.errors import LogError
 from pipeline.ingest.containers.reader import open_log
 from pipeline.ingest.messages.image import inspect_image
 

@@ -9,13 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jobs.check import check
-from pipeline.errors import ConfigError, ModelError
+from pipeline.core.errors import ConfigError, ModelError
+from pipeline.core.rigs import RadarTopics
 from pipeline.ingest.check import check_logs
 from pipeline.ingest.doppler_speed import doppler_speed
 from pipeline.ingest.readiness import Evidence, judge_edge, overall
 from pipeline.ingest.units import unit_that_fits
 from pipeline.rig.rig import Rig
-from pipeline.rigs import RadarTopics
 from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, SENSORS
 from tests.makers.fleet_files import fleet_toml
 

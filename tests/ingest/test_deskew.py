@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.geometry.se3 import exp_se3, inverse, transform_points
 from pipeline.ingest.deskew import deskew, planar_motion
+from pipeline.rig.se3 import exp_se3, inverse, transform_points
 
 
 @settings(max_examples=25, deadline=None)

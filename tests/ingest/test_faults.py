@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from pipeline.errors import ConfigError, LogError
+from pipeline.core.errors import ConfigError, LogError
 from pipeline.ingest.containers.mcap import McapLog
 from pipeline.ingest.sync import Rejection, none_near
 from pipeline.store.partitions import Lake, Partition

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rosbags.typesys import get_types_from_msg
 
-from pipeline.errors import LogError
+from pipeline.core.errors import LogError
 from pipeline.ingest.check import check_logs
 from pipeline.ingest.containers.reader import BYTES_AS_TEXT, PROTOBUF, Channel
 from pipeline.ingest.messages.decoding import decode, header_stamp_ns

@@ -5,7 +5,7 @@ import resource
 
 import pytest
 
-from pipeline.config import load_fleet
+from pipeline.core.config import load_fleet
 from pipeline.ingest.index import index_logs
 from tests.makers.fleet_files import fleet_toml
 

@@ -6,7 +6,7 @@ import pytest
 
 from jobs.check import check
 from jobs.ingest import ingest
-from pipeline.errors import ConfigError
+from pipeline.core.errors import ConfigError
 from tests.makers.fleet_files import fleet_toml
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
-from pipeline.config import load_fleet
+from pipeline.core.config import load_fleet
 from pipeline.ingest.check import check_logs
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import frames_of

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import pipeline.store.object_store
-from pipeline.errors import ConfigError, LogError, StorageError
+from pipeline.core.errors import ConfigError, LogError, StorageError
 from pipeline.fleet.pattern import find_vehicle_days
 from pipeline.ingest.containers import rosbag2_folder
 from pipeline.ingest.containers.reader import content_identity, open_log

@@ -7,7 +7,7 @@ import time
 import pytest
 
 from jobs import cli
-from pipeline.errors import ConfigError, LogError, SolveError
+from pipeline.core.errors import ConfigError, LogError, SolveError
 from tests.makers.fleet_files import fleet_toml
 from tests.makers.processes import started
 

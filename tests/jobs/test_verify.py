@@ -9,8 +9,8 @@ import pytest
 from jobs.cli import main
 from jobs.frame_options import FrameOptions
 from jobs.verify import _as_prior
-from pipeline.extrinsics.prior_file import read_transforms
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation
+from pipeline.rig.prior_file import read_transforms
+from pipeline.rig.se3 import exp_so3, from_rotation_translation
 from tests.makers.simulated_days import simulated_day
 
 FRAMES = 30

@@ -9,9 +9,9 @@ import pytest
 from jobs.calibration_sources import poses_in_use
 from jobs.frame_options import FrameOptions
 from jobs.verify import _of_poses
-from pipeline.config import load_fleet
-from pipeline.errors import ConfigError
-from pipeline.extrinsics.prior_file import read_star
+from pipeline.core.config import load_fleet
+from pipeline.core.errors import ConfigError
+from pipeline.rig.prior_file import read_star
 from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake
 from schemas.calibrations import CALIBRATIONS

@@ -3,8 +3,8 @@
 import numpy as np
 
 from pipeline.export.calibration import ExportedCalibration, ExportedPair, FrameNames
-from pipeline.geometry.cameras import Camera
-from pipeline.geometry.se3 import exp_se3
+from pipeline.rig.cameras import Camera
+from pipeline.rig.se3 import exp_se3
 
 SIGMA = np.array([1e-3, 2e-3, 3e-3, 0.01, 0.02, 0.03])
 CAMERA = Camera(

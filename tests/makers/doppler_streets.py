@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse, transform_points
-from pipeline.geometry.spherical import from_spherical, to_spherical
+from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse, transform_points
+from pipeline.rig.spherical import from_spherical, to_spherical
 from tests.makers.solve_scenes import make_day
 
 GROUND_M, SPEED_MPS = -1.7, 14.0

@@ -8,8 +8,8 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from pipeline.geometry.se3 import exp_so3, from_quaternion, to_quaternion
 from pipeline.ingest.containers.reader import open_log
+from pipeline.rig.se3 import exp_so3, from_quaternion, to_quaternion
 
 _STORE = get_typestore(Stores.ROS2_HUMBLE)
 _STORE.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))

@@ -13,12 +13,12 @@ import numpy as np
 import pyarrow as pa
 from deltalake import WriterProperties, write_deltalake
 
-from pipeline.config import FleetConfig
+from pipeline.core.config import FleetConfig
+from pipeline.core.results import Outcome
+from pipeline.core.stage_work import Task, Window
+from pipeline.core.stages import AUDIT, STATE
 from pipeline.fleet.ledger import outcome_row
-from pipeline.geometry.se3 import adjoint, exp_se3, to_quaternion
-from pipeline.results import Outcome
-from pipeline.stage_work import Task, Window
-from pipeline.stages import AUDIT, STATE
+from pipeline.rig.se3 import adjoint, exp_se3, to_quaternion
 from pipeline.store.commits import commit_records
 from pipeline.store.delta import merge_rows, open_table, stored_schema, tidy_table
 from pipeline.store.partitions import Lake

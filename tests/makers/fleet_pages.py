@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from pipeline.config import FleetConfig
+from pipeline.core.config import FleetConfig
 from pipeline.report.fleet_page import render_fleet_page
 from pipeline.report.upkeep import Album
 from pipeline.report.verdicts import read_verdicts

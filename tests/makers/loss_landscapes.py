@@ -18,14 +18,14 @@ import numpy as np
 import torch
 from scipy.interpolate import CubicSpline
 
-from pipeline.config import load_fleet
-from pipeline.extrinsics.prior import read_prior
-from pipeline.geometry.se3 import exp_so3
+from pipeline.core.config import load_fleet
 from pipeline.learn.batches.batch import TrainingBatch
 from pipeline.learn.batches.collate import collate
 from pipeline.learn.sample.frame_sample import About, make_row
 from pipeline.learn.train.frame_objective import PAIR_OF_TERM, FrameObjective, frame_objective, weighted
 from pipeline.learn.train.settings import LossConfig
+from pipeline.rig.day_prior import read_prior
+from pipeline.rig.se3 import exp_so3
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import frames_of, observations_of
 

@@ -1,7 +1,7 @@
 """Outcomes of vehicle-days as a night's stages would give them, for who is told of them."""
 
+from pipeline.core.results import Effort, Outcome
 from pipeline.fleet.nightly import DayOutcome
-from pipeline.results import Effort, Outcome
 
 __all__ = ["DAY", "day_outcome", "stage_outcome"]
 

@@ -4,9 +4,9 @@ import contextlib
 
 import numpy as np
 
-from pipeline.extrinsics.attribution import PairShift
-from pipeline.geometry.se3 import adjoint, exp_se3, from_rotation_translation, inverse
+from pipeline.rig.attribution import PairShift
 from pipeline.rig.graph import BASE, Sensor, edge_between
+from pipeline.rig.se3 import adjoint, exp_se3, from_rotation_translation, inverse
 
 __all__ = ["SHIFT_SIGMAS", "UNSURE_DEG", "UNSURE_M", "Rig", "knock"]
 

@@ -4,8 +4,8 @@ import datetime as dt
 
 import numpy as np
 
-from pipeline.geometry.se3 import exp_se3, from_rotation_translation, inverse, to_quaternion
 from pipeline.rig.edges import edge_named
+from pipeline.rig.se3 import exp_se3, from_rotation_translation, inverse, to_quaternion
 from schemas.calibrations import CalibrationRecord
 from schemas.poses import PoseRow
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.config import FleetConfig, load_fleet
+from pipeline.core.config import FleetConfig, load_fleet
 from pipeline.simulate.faults import parse_faults
 from pipeline.simulate.fleet import FleetSpec
 from pipeline.store.partitions import Lake, Partition

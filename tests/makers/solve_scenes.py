@@ -7,8 +7,8 @@ optimiser do what they should, not how well they do on the road.
 import cv2
 import numpy as np
 
-from pipeline.geometry.cameras import Camera
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse, transform_points
+from pipeline.rig.cameras import Camera
+from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse, transform_points
 from schemas.calibrations import SENSORS
 from schemas.observations import EDGE_LEFT, EDGE_RIGHT, Observation
 

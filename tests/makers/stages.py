@@ -1,8 +1,8 @@
 """Stages in one line, as tests call them."""
 
-from pipeline.results import silent
-from pipeline.stage_work import Task, Window
-from pipeline.stages import AUDIT, CALIBRATE, INGEST, PERCEIVE, PREPARE
+from pipeline.core.results import silent
+from pipeline.core.stage_work import Task, Window
+from pipeline.core.stages import AUDIT, CALIBRATE, INGEST, PERCEIVE, PREPARE
 
 __all__ = ["audit_fleet", "calibrate_day", "ingest_day", "perceive_day", "prepare_day"]
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pipeline.config import FleetConfig
+from pipeline.core.config import FleetConfig
 from pipeline.learn.prepare.decided import decided_sides
 from pipeline.learn.prepare.survey import plan_days, survey_day
 from pipeline.store.partitions import Lake, Partition

@@ -14,7 +14,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as FolderWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from pipeline.config import FleetConfig
+from pipeline.core.config import FleetConfig
 
 START_NS = 1_700_000_000 * 10**9
 PERIOD_NS = 100_000_000

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from pipeline.geometry.se3 import inverse, transform_points
-from pipeline.geometry.spherical import to_spherical
 from pipeline.objective.radar.registration import RANGE_M, VIEW_MARGIN_RAD
 from pipeline.objective.radar.registration_neighbours import CUT
+from pipeline.rig.se3 import inverse, transform_points
+from pipeline.rig.spherical import to_spherical
 
 
 def registration(frames, T_lidar_radar, dt_s, sigma, bounce_prior, outlier):

@@ -5,8 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.geometry.se3 import exp_se3, transform_points
-from pipeline.geometry.spherical import camera_direction_angles
 from pipeline.objective.radar.medians import median_of_rows
 from pipeline.objective.radar.moving_clusters import (
     azimuth_equations_camera,
@@ -22,6 +20,8 @@ from pipeline.objective.radar.vehicle_boxes import (
     elevation_residuals,
     vehicle_boxes,
 )
+from pipeline.rig.se3 import exp_se3, transform_points
+from pipeline.rig.spherical import camera_direction_angles
 from tests.makers.radar_scenes import DT_S, T_LIDAR_RADAR, street_day
 from tests.makers.solve_scenes import T_CAMERA_LIDAR
 

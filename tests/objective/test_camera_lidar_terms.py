@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.joint.camera_lidar.estimate import AlignmentState
-from pipeline.geometry.cameras import Camera
-from pipeline.geometry.se3 import perturb_exactly
 from pipeline.objective.camera_lidar.edges import chance_of, fit_match_share
 from pipeline.objective.camera_lidar.image_maps import (
     NO_BOUNDARY,
@@ -19,6 +17,8 @@ from pipeline.objective.camera_lidar.own_motion import lidar_velocities
 from pipeline.objective.camera_lidar.points import Points
 from pipeline.objective.camera_lidar.projection_loops import camera_parameters, project_point, project_points
 from pipeline.objective.camera_lidar.score import Alignments, KernelSettings, Terms, prepare_terms
+from pipeline.rig.cameras import Camera
+from pipeline.rig.se3 import perturb_exactly
 from pipeline.simulate.sensors.rigs import rig_named
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
 from tests.makers.traced_scenes import DENSE, SPARSE, T_TRUE, traced_day

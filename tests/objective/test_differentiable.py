@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.extrinsics.prior import read_prior
-from pipeline.geometry import se3
 from pipeline.objective.camera_lidar.edges import edge_residuals
 from pipeline.objective.camera_lidar.score import Alignments, prepare_terms
 from pipeline.objective.differentiable.lookup import bilinear
@@ -31,6 +29,8 @@ from pipeline.objective.paper.camera_lidar import camera_lidar_loss
 from pipeline.objective.paper.camera_radar import camera_radar_loss
 from pipeline.objective.paper.cost_maps import fold_frames, frame_costs
 from pipeline.objective.paper.lidar_radar import lidar_radar_loss
+from pipeline.rig import se3
+from pipeline.rig.day_prior import read_prior
 from pipeline.store.partitions import Lake, Partition
 from tests.makers.simulated_days import perceived, simulated_day
 from tests.makers.torch_poses import exp_se3

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation
 from pipeline.objective.ego_motion import DopplerMotion, Odometry, backwards, ego_motion
+from pipeline.rig.se3 import exp_so3, from_rotation_translation
 
 MOMENTS = 120
 NOISE_MPS = 0.05

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.geometry.se3 import inverse, transform_points
-from pipeline.geometry.spherical import from_spherical, to_spherical
 from pipeline.objective.radar.heights import displaced_heights
+from pipeline.rig.se3 import inverse, transform_points
+from pipeline.rig.spherical import from_spherical, to_spherical
 from tests.makers.doppler_streets import GROUND_M, T_LIDAR_RADAR, turned
 from tests.makers.radar_scenes import DT_S, street_day
 from tests.makers.radar_scenes import T_LIDAR_RADAR as T_STREET

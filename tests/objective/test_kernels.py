@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from pipeline.geometry.cameras import Camera
-from pipeline.geometry.se3 import exp_se3
 from pipeline.objective.paper.cost_maps import fold_frames, frame_costs, pack_quads
+from pipeline.rig.cameras import Camera
+from pipeline.rig.se3 import exp_se3
 
 WIDTH, HEIGHT, PENALTY = 320, 200, 1.5
 K = np.array([[180.0, 0, 158.3], [0, 182.0, 99.1], [0, 0, 1]])

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.geometry.se3 import exp_so3, inverse
 from pipeline.objective.paper.camera_lidar import camera_lidar_loss, object_cost_map
 from pipeline.objective.paper.camera_radar import camera_radar_loss
 from pipeline.objective.paper.lidar_radar import CELL_M, drivable_map, lidar_radar_loss
 from pipeline.objective.paper.loop import euler_angles, joint_objective, loop_loss, loop_transform
+from pipeline.rig.se3 import exp_so3, inverse
 from tests.makers.solve_scenes import CAMERA, CAR, SKY, T_CAMERA_LIDAR, T_LIDAR_RADAR, VEGETATION, make_day
 
 TRUTH = {

@@ -5,8 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.geometry.se3 import exp_se3, exp_so3, from_rotation_translation, inverse, transform_points
-from pipeline.geometry.spherical import to_spherical
 from pipeline.objective.radar.registration import (
     SIGMA_START,
     RegistrationFrames,
@@ -15,6 +13,8 @@ from pipeline.objective.radar.registration import (
     registration_frames,
     updated_sigma,
 )
+from pipeline.rig.se3 import exp_se3, exp_so3, from_rotation_translation, inverse, transform_points
+from pipeline.rig.spherical import to_spherical
 from tests.makers.radar_scenes import DT_S, SIGMA, T_LIDAR_RADAR, street_day
 from tests.objective import plain_numpy
 

@@ -11,12 +11,12 @@ from pipeline.calibrate.joint.camera_lidar.estimate import (
     analyse_camera_lidar,
 )
 from pipeline.calibrate.verify.held_out_score import held_out_score
-from pipeline.config import SolveConfig
-from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.se3 import exp_so3, inverse, log_so3, perturb_exactly, transform_points
+from pipeline.core.config import SolveConfig
+from pipeline.core.rigs import CameraPrior
 from pipeline.objective.camera_lidar.rolling_shutter import row_delays_s
 from pipeline.objective.camera_lidar.score import KernelSettings, prepare_terms
-from pipeline.rigs import CameraPrior
+from pipeline.rig.estimates import Prior
+from pipeline.rig.se3 import exp_so3, inverse, log_so3, perturb_exactly, transform_points
 from tests.makers.traced_scenes import DENSE, SPARSE, T_TRUE, traced_day
 
 READOUT_S = 0.05

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.geometry import se3
 from pipeline.objective.differentiable.paper import padded
 from pipeline.objective.differentiable.poses import inverse, transform_points
 from pipeline.objective.differentiable.static import (
@@ -29,6 +28,7 @@ from pipeline.objective.radar.registration import (
     normal_equations,
     registration_frames,
 )
+from pipeline.rig import se3
 from tests.makers.radar_scenes import GROUND_M, T_LIDAR_RADAR, street_day
 from tests.makers.torch_poses import exp_se3
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation
 from pipeline.objective.radar.travel import pitch_equations, pitch_residuals, travel_directions
+from pipeline.rig.se3 import exp_so3, from_rotation_translation
 from tests.makers.doppler_streets import T_LIDAR_RADAR, day_of, turned
 
 

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.config import PerceiveConfig
+from pipeline.core.config import PerceiveConfig
+from pipeline.core.rigs import TopicSemantics
 from pipeline.perceive.camera import TopicSource, decode_grey, encode_png, label_size, resize_labels
 from pipeline.perceive.rejections import FrameReason, FrameRejectedError
-from pipeline.rigs import TopicSemantics
 
 TOPICS = TopicSemantics(source="topics", labels="/l", detections="/d")
 

@@ -8,12 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from pipeline.config import PerceiveConfig
-from pipeline.geometry.se3 import exp_so3
+from pipeline.core.config import PerceiveConfig
+from pipeline.core.rigs import TopicSemantics
 from pipeline.perceive.camera import TopicSource
 from pipeline.perceive.deskew import deskew_straight, velocity_ahead
 from pipeline.perceive.stage import AS_LOGGED, BY_DOPPLER, Shown, Sources, perceive_moment
-from pipeline.rigs import TopicSemantics
+from pipeline.rig.se3 import exp_so3
 from tests.makers.lakes import joined_of
 
 SPEED_MPS = 8.0  # of the made frames

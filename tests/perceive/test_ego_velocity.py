@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.config import PerceiveConfig
+from pipeline.core.config import PerceiveConfig
 from pipeline.perceive.ego_velocity import MOVING, STATIC, UNDECIDED, Travel, radar_motion
 from pipeline.perceive.moving import cluster_moving
 

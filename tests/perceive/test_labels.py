@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from pipeline.core.rigs import TopicSemantics
 from pipeline.perceive.labels import (
     CITYSCAPES,
     DETECTOR_SETS,
@@ -14,7 +15,6 @@ from pipeline.perceive.labels import (
     road_user_name,
     to_cityscapes,
 )
-from pipeline.rigs import TopicSemantics
 
 
 def test_cityscapes_labels_stay_as_they_are():

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.config import FleetConfig
-from pipeline.errors import ConfigError, ContractError
+from pipeline.core.config import FleetConfig
+from pipeline.core.errors import ConfigError, ContractError
 from pipeline.perceive.labels import VOID_ID
 from pipeline.perceive.stage import WITHOUT_ROWS
 from pipeline.store.partitions import Lake, Partition

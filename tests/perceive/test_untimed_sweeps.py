@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from pipeline.core.rigs import LidarTurn
+from pipeline.core.ros_messages import RosMessages
 from pipeline.ingest.deskew import deskew
 from pipeline.perceive.sweep_pairs import motions, surfaces_of
 from pipeline.perceive.untimed_sweeps import BY_AZIMUTH, WITHOUT_TIMES, Turning, turning_of
 from pipeline.rig.topics import TOPICS
-from pipeline.rigs import LidarTurn
-from pipeline.ros_messages import RosMessages
 from pipeline.simulate.sensors.lidar import sweep_lidar
 from pipeline.simulate.world.casting import World
 from pipeline.simulate.world.drives import Drive

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.audit.days import FEWEST_DAYS as OF_CHARTS
-from pipeline.names import is_vehicle
+from pipeline.core.names import is_vehicle
 from pipeline.report.charts import fleet_charts
 from pipeline.report.fleet_page import render_fleet_page
 from pipeline.report.names import page_name, page_stem

@@ -6,7 +6,7 @@ import re
 import cv2
 import numpy as np
 
-from pipeline.config import load_fleet
+from pipeline.core.config import load_fleet
 from pipeline.report.reading import drawn_records, names_drawn, other_cameras
 from pipeline.report.stage import write_day_page
 from pipeline.rig.edges import words_of

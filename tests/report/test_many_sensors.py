@@ -6,10 +6,10 @@ import re
 import numpy as np
 import pytest
 
-from pipeline.config import load_fleet
+from pipeline.core.config import load_fleet
+from pipeline.core.stage_work import Task, Window
+from pipeline.core.stages import AUDIT
 from pipeline.report.stage import write_day_page
-from pipeline.stage_work import Task, Window
-from pipeline.stages import AUDIT
 from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake, Partition
 from schemas.calibrations import CALIBRATIONS

@@ -12,8 +12,8 @@ from urllib.parse import quote
 import numpy as np
 import pytest
 
-from pipeline.config import FleetConfig
-from pipeline.errors import ConfigError
+from pipeline.core.config import FleetConfig
+from pipeline.core.errors import ConfigError
 from pipeline.report.page import commands
 from pipeline.report.stage import Pages, write_day_page, write_fleet_report
 from pipeline.report.truth import read_truth

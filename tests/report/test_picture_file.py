@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.errors import ConfigError
-from pipeline.geometry.se3 import inverse, rotation_angle_rad
+from pipeline.core.errors import ConfigError
 from pipeline.report.overlays import front_view, lidar_window
 from pipeline.report.picture_file import between, write_picture
+from pipeline.rig.se3 import inverse, rotation_angle_rad
 from tests.report.test_pictures import GOOD, WIDTH, _scene, _turned
 
 LABELS = ("prior", "calibrated")

@@ -7,8 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.geometry.cameras import camera_of
-from pipeline.geometry.se3 import exp_se3, from_rotation_translation, inverse, transform_points
+from pipeline.core.sections import ReportConfig
 from pipeline.report.above import top_bitmap, top_view
 from pipeline.report.overlays import (
     Extrinsics,
@@ -22,7 +21,8 @@ from pipeline.report.overlays import (
 from pipeline.report.reading import scene_of
 from pipeline.report.residuals import MEASURES, boundary_distance_px, frame_residuals
 from pipeline.report.scenes import choose_frames, choose_windows
-from pipeline.sections import ReportConfig
+from pipeline.rig.cameras import camera_of
+from pipeline.rig.se3 import exp_se3, from_rotation_translation, inverse, transform_points
 from schemas.calibrations import SENSORS
 from schemas.frames import Frame
 from schemas.observations import EDGE_LEFT, EDGE_RIGHT, STEP_RIGHT, Observation

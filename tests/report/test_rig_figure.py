@@ -5,8 +5,8 @@ import re
 import numpy as np
 import pytest
 
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation
 from pipeline.report.rig_figure import DrawnEdge, DrawnSensor, rig_figure
+from pipeline.rig.se3 import exp_so3, from_rotation_translation
 
 OPTICAL = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # axes of a camera that looks forward
 

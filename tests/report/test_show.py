@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from jobs.show import show
-from pipeline.errors import ConfigError
-from pipeline.geometry.se3 import from_quaternion
+from pipeline.core.errors import ConfigError
+from pipeline.rig.se3 import from_quaternion
 from pipeline.store.partitions import Lake
 from schemas.calibrations import CALIBRATIONS
 from tests.makers.lakes import write_records

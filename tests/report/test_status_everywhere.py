@@ -16,9 +16,9 @@ from rich.text import Text
 from jobs.cli import main
 from jobs.show import show
 from jobs.terminal.vehicle_status import count_statuses, moved_sensors, next_steps, status_lines
+from pipeline.core.stage_work import Task, Window
+from pipeline.core.stages import STATE
 from pipeline.report.stage import write_day_page
-from pipeline.stage_work import Task, Window
-from pipeline.stages import STATE
 from pipeline.store.commits import commit_records
 from pipeline.store.current import current_drift
 from pipeline.store.partitions import Lake, Partition

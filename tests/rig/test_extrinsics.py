@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from pipeline.geometry.se3 import exp_se3, inverse, log_se3
 from pipeline.rig.extrinsics import Extrinsics
 from pipeline.rig.graph import Sensor
+from pipeline.rig.se3 import exp_se3, inverse, log_se3
 
 NAMES = ("front", "corner")
 

@@ -6,11 +6,11 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse
-from pipeline.geometry.spherical import to_spherical
 from pipeline.rig.graph import BASE, RigGraph, Sensor, edge_between
 from pipeline.rig.overlap import Overlap, best_three, find_edges, overlaps_of
 from pipeline.rig.prior import RigPrior, star_of
+from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
+from pipeline.rig.spherical import to_spherical
 
 # Name, kind, azimuth that it looks to, half-width and half-height of its view [deg].
 VAN = [

@@ -3,11 +3,11 @@ import json
 import numpy as np
 import pytest
 
-from pipeline.config import load_fleet
-from pipeline.errors import ConfigError, SolveError
-from pipeline.extrinsics.prior import perturbed, prior_of_three, rig_prior
-from pipeline.geometry.se3 import adjoint, exp_se3, inverse, log_so3
+from pipeline.core.config import load_fleet
+from pipeline.core.errors import ConfigError, SolveError
+from pipeline.rig.day_prior import perturbed, prior_of_three, rig_prior
 from pipeline.rig.prior import RigPrior, from_rows, moved, star_of, to_rows
+from pipeline.rig.se3 import adjoint, exp_se3, inverse, log_so3
 from schemas.calibrations import pairs_of
 from tests.makers.fleet_files import fleet_toml
 from tests.rig.test_rig import VAN

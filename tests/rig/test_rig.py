@@ -2,8 +2,8 @@ import json
 
 import pytest
 
-from pipeline.config import FleetConfig, config_hash, load_fleet
-from pipeline.errors import ConfigError
+from pipeline.core.config import FleetConfig, config_hash, load_fleet
+from pipeline.core.errors import ConfigError
 from tests.makers.fleet_files import fleet_toml
 
 VAN = """

@@ -9,7 +9,7 @@ from mcap.reader import make_reader
 from rosbags.rosbag1 import Reader as Bag1
 from rosbags.rosbag2 import Reader as Bag2
 
-from pipeline.ros_messages import RosMessages
+from pipeline.core.ros_messages import RosMessages
 from pipeline.simulate.sensors.lidar import Sweep
 from pipeline.simulate.sensors.mounting import Mounting, mounting_of
 from pipeline.simulate.sensors.radar import Scan

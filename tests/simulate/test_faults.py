@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.errors import ConfigError
-from pipeline.geometry.se3 import inverse, log_so3
+from pipeline.core.errors import ConfigError
+from pipeline.rig.se3 import inverse, log_so3
 from pipeline.rig.topics import TOPICS
 from pipeline.simulate.faults import Fault, faults_on, parse_faults
 from pipeline.simulate.fleet import FleetSpec, mounting_on, simulate_vehicle_day

@@ -7,7 +7,7 @@ import time
 import pytest
 
 from jobs.simulate import simulate
-from pipeline.errors import ConfigError
+from pipeline.core.errors import ConfigError
 from tests.makers.processes import started
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.errors import ConfigError
+from pipeline.core.errors import ConfigError
 from pipeline.simulate.fleet import FleetSpec
 from pipeline.simulate.sensors.data_sheets import LidarSpec
 from pipeline.simulate.sensors.lidar import sweep_lidar

@@ -3,8 +3,8 @@ import json
 import numpy as np
 import pytest
 
-from pipeline.config import load_fleet
-from pipeline.errors import ConfigError
+from pipeline.core.config import load_fleet
+from pipeline.core.errors import ConfigError
 from pipeline.rig.topics import TOPICS
 from pipeline.simulate.fleet import FleetSpec, simulate_fleet, simulate_vehicle_day
 from pipeline.simulate.logs.writers import CONTAINERS, log_name, open_log

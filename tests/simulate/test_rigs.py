@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from pipeline.config import load_fleet
-from pipeline.errors import ConfigError
+from pipeline.core.config import load_fleet
+from pipeline.core.errors import ConfigError
 from pipeline.rig.topics import TOPICS
 from pipeline.simulate.fleet import FleetSpec, drive_of, simulate_vehicle_day
 from pipeline.simulate.logs.fleet_toml import fleet_toml, mixed_fleet_toml

@@ -2,8 +2,8 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.geometry.se3 import exp_so3, inverse, transform_points
-from pipeline.geometry.spherical import from_spherical, to_spherical
+from pipeline.rig.se3 import exp_so3, inverse, transform_points
+from pipeline.rig.spherical import from_spherical, to_spherical
 from pipeline.simulate.sensors.radar import RadarErrors, scan_radar
 from pipeline.simulate.world.casting import _cast
 from pipeline.simulate.world.materials import LABELS
@@ -160,7 +160,7 @@ def test_standing_radar_detections_lie_on_what_the_lidar_sees(shots):
 
 
 def test_the_nominal_mounting_is_off_by_a_degree_or_so_but_not_more():
-    from pipeline.geometry.se3 import rotation_angle_rad
+    from pipeline.rig.se3 import rotation_angle_rad
     from pipeline.simulate.sensors.mounting import mounting_of
     from pipeline.simulate.sensors.rigs import rig_named
 

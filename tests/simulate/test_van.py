@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.config import load_fleet
-from pipeline.errors import ConfigError
-from pipeline.geometry.se3 import inverse, log_so3
+from pipeline.core.config import load_fleet
+from pipeline.core.errors import ConfigError
 from pipeline.report.truth import read_truth
+from pipeline.rig.se3 import inverse, log_so3
 from pipeline.simulate.faults import parse_faults
 from pipeline.simulate.fleet import FleetSpec, simulate_fleet
 from pipeline.simulate.sensors.data_sheets import CameraSpec, LidarSpec

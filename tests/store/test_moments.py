@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.errors import ContractError, DamagedError
+from pipeline.core.errors import ContractError, DamagedError
 from pipeline.store.moments import is_whole, joined, sensor_files, write_moments
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import frames_of, ingested, observations_of

@@ -12,7 +12,7 @@ import pytest
 from deltalake import DeltaTable
 
 import pipeline.store.object_store
-from pipeline.errors import ConfigError, DamagedError
+from pipeline.core.errors import ConfigError, DamagedError
 from pipeline.store.commits import assert_records, commit_records
 from pipeline.store.current import current_records
 from pipeline.store.delta import tidy_table

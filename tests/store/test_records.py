@@ -16,7 +16,7 @@ import pytest
 from deltalake import DeltaTable, WriterProperties
 
 import pipeline.store.delta
-from pipeline.errors import ContractError
+from pipeline.core.errors import ContractError
 from pipeline.store import delta
 from pipeline.store.commits import assert_records, commit_records
 from pipeline.store.current import current_records

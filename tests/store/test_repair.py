@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import pipeline.store.object_store
-from pipeline.errors import DamagedLogError
+from pipeline.core.errors import DamagedLogError
 from pipeline.store.commits import assert_records, commit_records
 from pipeline.store.delta import live_files, open_table, tidy_table
 from pipeline.store.partitions import Lake

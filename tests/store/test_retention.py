@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from jobs.gc import gc
-from pipeline.config import load_fleet
-from pipeline.errors import CollectedError, ConfigError
+from pipeline.core.config import load_fleet
+from pipeline.core.errors import CollectedError, ConfigError
+from pipeline.core.runner import Stage
+from pipeline.core.stage_work import Task, Work
 from pipeline.report.reading import has_frames
-from pipeline.runner import Stage
-from pipeline.stage_work import Task, Work
 from pipeline.store.moments import sensor_files
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.retention import collect, first_day_kept

@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import pipeline.store.delta
-from pipeline.errors import ContractError, DamagedError, OtherVersionError
+from pipeline.core.errors import ContractError, DamagedError, OtherVersionError
 from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records

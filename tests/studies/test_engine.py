@@ -1,6 +1,6 @@
 """Studies go on where they stopped, from the priors that they promise, on days spoiled as they say."""
 
-from pipeline.config import load_fleet
+from pipeline.core.config import load_fleet
 from tests.benchmarks.studies.days import DaySpec, label_by_network
 from tests.makers.fleet_files import fleet_toml
 from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR

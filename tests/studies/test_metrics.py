@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.changes import change_covariance
-from pipeline.geometry.se3 import exp_se3, exp_so3, from_rotation_translation, to_quaternion
+from pipeline.rig.changes import change_covariance
+from pipeline.rig.estimates import Prior
+from pipeline.rig.se3 import exp_se3, exp_so3, from_rotation_translation, to_quaternion
 from schemas.calibrations import CalibrationRecord
 from tests.benchmarks.studies.metrics import claimed_error_deg, inside_share, measure, rms, within
 from tests.benchmarks.studies.sigma_coverage import summary as coverage_summary

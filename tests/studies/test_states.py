@@ -5,10 +5,10 @@ import tomllib
 import numpy as np
 import pytest
 
-from pipeline.config import load_fleet
+from pipeline.core.config import load_fleet
 from pipeline.export.files import write_files, written_files
 from pipeline.export.formats import format_named
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse
+from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
 from tests.benchmarks.results_measures import MEASURES
 from tests.benchmarks.studies.states_fleet import (
     fleet_text,

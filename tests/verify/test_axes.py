@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.config import VerifyConfig
-from pipeline.geometry.se3 import exp_se3, inverse, to_quaternion
+from pipeline.core.config import VerifyConfig
+from pipeline.rig.se3 import exp_se3, inverse, to_quaternion
 from pipeline.verify.axes import (
     answer_of,
     answer_of_sensors,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.geometry.se3 import exp_se3, exp_so3, from_rotation_translation, inverse, log_se3
+from pipeline.rig.se3 import exp_se3, exp_so3, from_rotation_translation, inverse, log_se3
 from pipeline.verify.spelling import on_grid
 
 

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from jobs.cli import main
-from pipeline.errors import MissingLibraryError
-from pipeline.geometry.se3 import inverse, transform_points
+from pipeline.core.errors import MissingLibraryError
+from pipeline.rig.se3 import inverse, transform_points
 from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake
 from pipeline.view.layers import Dots, Name, Picture, Strokes, layers_of
@@ -127,7 +127,7 @@ def test_the_picture_lies_on_the_rays_of_the_camera_three_metres_away():
 
 
 def read_camera():
-    from pipeline.geometry.cameras import camera_of
+    from pipeline.rig.cameras import camera_of
 
     return camera_of(image())
 

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.calibrate.adjust.equations import inverse_of_information
-from pipeline.extrinsics.checks import FailedCheck
-from pipeline.geometry.changes import change_jacobian
+from pipeline.rig.changes import change_jacobian
+from pipeline.rig.checks import FailedCheck
 from pipeline.rig.evidence import EdgeEvidence
 from pipeline.rig.extrinsics import Extrinsics
 from pipeline.rig.graph import Edge

@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.geometry.se3 import adjoint, exp_se3, hat, inverse, log_se3
 from pipeline.rig.evidence import EDGE, EdgeEvidence
 from pipeline.rig.extrinsics import Extrinsics
+from pipeline.rig.se3 import adjoint, exp_se3, hat, inverse, log_se3
 
 __all__ = [
     "Equations",

@@ -14,12 +14,12 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import eigh
 
-from pipeline.extrinsics.checks import FailedCheck
-from pipeline.extrinsics.estimates import PairEstimate, Prior
-from pipeline.geometry.changes import change_between, change_covariance, change_jacobian
-from pipeline.geometry.se3 import adjoint, inverse
+from pipeline.rig.changes import change_between, change_covariance, change_jacobian
+from pipeline.rig.checks import FailedCheck
+from pipeline.rig.estimates import PairEstimate, Prior
 from pipeline.rig.evidence import EDGE, EdgeEvidence
 from pipeline.rig.graph import Edge
+from pipeline.rig.se3 import adjoint, inverse
 
 __all__ = ["evidence_of"]
 

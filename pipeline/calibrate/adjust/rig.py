@@ -25,8 +25,8 @@ from pipeline.calibrate.adjust.equations import (
 )
 from pipeline.calibrate.adjust.innovations import innovation
 from pipeline.calibrate.numerics.covariance import OBSERVABLE
-from pipeline.extrinsics.checks import FailedCheck
-from pipeline.extrinsics.common_share import common_part
+from pipeline.rig.checks import FailedCheck
+from pipeline.rig.common_share import common_part
 from pipeline.rig.evidence import EdgeEvidence
 from pipeline.rig.extrinsics import Extrinsics
 from pipeline.rig.graph import Edge, RigGraph, Sensor

@@ -6,11 +6,11 @@ from collections.abc import Collection
 
 import numpy as np
 
-from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.changes import change_jacobian
-from pipeline.geometry.se3 import adjoint, inverse
+from pipeline.rig.changes import change_jacobian
+from pipeline.rig.estimates import Prior
 from pipeline.rig.extrinsics import Extrinsics
 from pipeline.rig.graph import Edge, RigGraph, Sensor
+from pipeline.rig.se3 import adjoint, inverse
 
 __all__ = ["CAMERA", "EDGES", "LIDAR", "RADAR", "poses_of", "three_sensors"]
 

@@ -22,11 +22,11 @@ from pipeline.calibrate.edges.robust_regression import Regression, Rows, regress
 from pipeline.calibrate.edges.sweep_travel import SweepTravel, sweep_travel
 from pipeline.calibrate.edges.sweeps import Sweep, deskewed_again
 from pipeline.calibrate.numerics.frame_blocks import Scenes
-from pipeline.extrinsics.checks import FailedCheck
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse
 from pipeline.objective.ego_motion import EgoMotion
+from pipeline.rig.checks import FailedCheck
 from pipeline.rig.evidence import EDGE, EdgeEvidence, OtherScenes
 from pipeline.rig.graph import BASE, Edge
+from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
 
 __all__ = ["estimate_lidar_base"]
 

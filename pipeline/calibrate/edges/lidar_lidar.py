@@ -19,10 +19,13 @@ from pipeline.calibrate.edges.sweeps import Sweep, deskewed_again
 from pipeline.calibrate.numerics.bias_floors import SWEEP_S, TYPICAL_RANGE_M
 from pipeline.calibrate.numerics.change_point import parts_of_day
 from pipeline.calibrate.numerics.frame_blocks import Scenes
-from pipeline.errors import SolveError
-from pipeline.extrinsics.checks import FailedCheck
-from pipeline.extrinsics.estimates import DayParts
-from pipeline.geometry.se3 import (
+from pipeline.core.errors import SolveError
+from pipeline.objective.ego_motion import EgoMotion
+from pipeline.rig.checks import FailedCheck
+from pipeline.rig.estimates import DayParts
+from pipeline.rig.evidence import EDGE, EdgeEvidence, OtherScenes
+from pipeline.rig.graph import Edge
+from pipeline.rig.se3 import (
     adjoint,
     exp_se3,
     exp_so3,
@@ -32,9 +35,6 @@ from pipeline.geometry.se3 import (
     rotation_angle_rad,
     transform_points,
 )
-from pipeline.objective.ego_motion import EgoMotion
-from pipeline.rig.evidence import EDGE, EdgeEvidence, OtherScenes
-from pipeline.rig.graph import Edge
 
 __all__ = ["LidarPair", "estimate_lidar_lidar"]
 

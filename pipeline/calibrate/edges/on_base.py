@@ -10,10 +10,10 @@ from jaxtyping import Float, Int
 
 from pipeline.calibrate.edges.robust_regression import Regression, Rows, regress
 from pipeline.calibrate.numerics.change_point import parts_of_day
-from pipeline.extrinsics.estimates import DayParts
-from pipeline.geometry.changes import change_jacobian, changed
-from pipeline.geometry.se3 import adjoint, inverse
+from pipeline.rig.changes import change_jacobian, changed
+from pipeline.rig.estimates import DayParts
 from pipeline.rig.evidence import OtherScenes
+from pipeline.rig.se3 import adjoint, inverse
 
 __all__ = ["Series", "changes_by_left", "first_and_last", "other_scenes"]
 

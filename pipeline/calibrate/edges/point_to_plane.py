@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import cKDTree
 
-from pipeline.geometry.se3 import exp_se3, inverse, log_se3, transform_points
+from pipeline.rig.se3 import exp_se3, inverse, log_se3, transform_points
 
 __all__ = ["PlaneEquations", "Registration", "Surfaces", "plane_equations", "register"]
 

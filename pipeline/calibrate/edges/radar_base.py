@@ -20,11 +20,11 @@ from pipeline.calibrate.edges.lidar_base import STANCE
 from pipeline.calibrate.edges.on_base import Series, changes_by_left, first_and_last, other_scenes
 from pipeline.calibrate.edges.robust_regression import Regression, Rows, regress
 from pipeline.calibrate.numerics.frame_blocks import Scenes
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse
 from pipeline.objective.ego_motion import DopplerMotion, EgoMotion
 from pipeline.objective.radar.travel import TravelDirections
 from pipeline.rig.evidence import EDGE, EdgeEvidence
 from pipeline.rig.graph import BASE, Edge
+from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
 
 __all__ = ["Stamps", "estimate_radar_base"]
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.calibrate.edges.sweeps import Sweep
-from pipeline.geometry.se3 import transform_points
+from pipeline.rig.se3 import transform_points
 
 __all__ = ["RoadUnder", "road_under"]
 

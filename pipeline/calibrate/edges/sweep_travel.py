@@ -16,8 +16,8 @@ from jaxtyping import Float, Int64
 
 from pipeline.calibrate.edges.point_to_plane import Surfaces, register
 from pipeline.calibrate.edges.sweeps import Sweep
-from pipeline.geometry.se3 import exp_se3, log_se3, transform_points
 from pipeline.objective.ego_motion import EgoMotion
+from pipeline.rig.se3 import exp_se3, log_se3, transform_points
 
 __all__ = ["SweepTravel", "sweep_travel"]
 

@@ -21,11 +21,7 @@ from pipeline.calibrate.numerics.bias_floors import (
 )
 from pipeline.calibrate.numerics.covariance import Posterior, covariance_with_fixed, posterior
 from pipeline.calibrate.numerics.frame_blocks import blocks_of
-from pipeline.config import SolveConfig
-from pipeline.extrinsics.common_share import common_of
-from pipeline.extrinsics.estimates import PairEstimate, Prior
-from pipeline.geometry.changes import change_jacobian
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation, log_so3
+from pipeline.core.config import SolveConfig
 from pipeline.objective.radar.moving_clusters import (
     MATCH_RAD,
     MovingClusters,
@@ -41,6 +37,10 @@ from pipeline.objective.radar.vehicle_boxes import (
     box_pairs,
     vehicle_boxes,
 )
+from pipeline.rig.changes import change_jacobian
+from pipeline.rig.common_share import common_of
+from pipeline.rig.estimates import PairEstimate, Prior
+from pipeline.rig.se3 import exp_so3, from_rotation_translation, log_so3
 from schemas.observations import Observation
 
 __all__ = ["estimate_camera_radar"]

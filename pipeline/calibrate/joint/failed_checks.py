@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.calibrate.joint.lidar_radar.tilt_floors import radar_tilt_axes
-from pipeline.extrinsics.checks import FailedCheck
-from pipeline.extrinsics.estimates import PairEstimate
+from pipeline.rig.checks import FailedCheck
+from pipeline.rig.estimates import PairEstimate
 
 __all__ = ["lidar_radar_failures"]
 

@@ -19,13 +19,13 @@ from pipeline.calibrate.joint.camera_lidar.intrinsics import contradictions
 from pipeline.calibrate.joint.camera_radar import estimate_camera_radar
 from pipeline.calibrate.joint.failed_checks import lidar_radar_failures
 from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
-from pipeline.config import SolveConfig
-from pipeline.errors import SolveError
-from pipeline.extrinsics.checks import FailedCheck
-from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
-from pipeline.geometry.se3 import compose_covariance, inverse, log_so3
+from pipeline.core.config import SolveConfig
+from pipeline.core.errors import SolveError
+from pipeline.core.results import Progress, silent
 from pipeline.objective.ego_motion import mean_heading, shown_heading
-from pipeline.results import Progress, silent
+from pipeline.rig.checks import FailedCheck
+from pipeline.rig.estimates import PairEstimate, Prior, Solution
+from pipeline.rig.se3 import compose_covariance, inverse, log_so3
 from schemas.calibrations import PAIRS
 from schemas.observations import Observation
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.rigs import CameraPrior
+from pipeline.core.rigs import CameraPrior
 
 __all__ = [
     "BOX_ELEVATION_GATES_RAD",

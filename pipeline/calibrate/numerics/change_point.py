@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipeline.calibrate.numerics.frame_blocks import FEWEST_SCENES
-from pipeline.extrinsics.estimates import DayParts, PairEstimate
+from pipeline.rig.estimates import DayParts, PairEstimate
 
 __all__ = ["likeliest_cut", "parts_of_day", "with_parts"]
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.config import SolveConfig
+from pipeline.core.config import SolveConfig
 
 __all__ = ["SearchRange", "search_range"]
 

@@ -24,11 +24,11 @@ from pipeline.calibrate.paper.pairwise import (
     pair_problem,
     solve_pair,
 )
-from pipeline.config import SolveConfig
-from pipeline.extrinsics.estimates import Prior, Solution
-from pipeline.geometry.changes import changed
+from pipeline.core.config import SolveConfig
+from pipeline.core.results import Progress, silent
 from pipeline.objective.paper.loop import joint_objective, loop_loss, loop_transform
-from pipeline.results import Progress, silent
+from pipeline.rig.changes import changed
+from pipeline.rig.estimates import Prior, Solution
 from schemas.calibrations import PAIRS
 from schemas.observations import Observation
 

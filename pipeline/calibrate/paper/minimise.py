@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import differential_evolution, minimize
 
-from pipeline.config import SolveConfig
+from pipeline.core.config import SolveConfig
 
 __all__ = ["Minimum", "at_border", "half_widths", "minimise"]
 

@@ -28,17 +28,17 @@ from pipeline.calibrate.numerics.covariance import OBSERVABLE
 from pipeline.calibrate.numerics.frame_blocks import scene_blocks
 from pipeline.calibrate.paper.minimise import Minimum, minimise
 from pipeline.calibrate.paper.sandwich import sandwich_covariance
-from pipeline.config import SolveConfig
-from pipeline.extrinsics.checks import FailedCheck
-from pipeline.extrinsics.common_share import common_of
-from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
-from pipeline.geometry.changes import changed
-from pipeline.geometry.se3 import rotation_angle_rad
+from pipeline.core.config import SolveConfig
+from pipeline.core.results import Progress, silent
 from pipeline.objective.paper.camera_lidar import CameraLidarLoss, camera_lidar_loss
 from pipeline.objective.paper.camera_radar import CameraRadarLoss, camera_radar_loss
 from pipeline.objective.paper.lidar_radar import LidarRadarLoss, lidar_radar_loss
 from pipeline.objective.paper.loop import loop_transform
-from pipeline.results import Progress, silent
+from pipeline.rig.changes import changed
+from pipeline.rig.checks import FailedCheck
+from pipeline.rig.common_share import common_of
+from pipeline.rig.estimates import PairEstimate, Prior, Solution
+from pipeline.rig.se3 import rotation_angle_rad
 from schemas.calibrations import PAIRS
 from schemas.observations import Observation
 

@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.geometry.se3 import exp_se3
+from pipeline.rig.se3 import exp_se3
 
 __all__ = ["sandwich_covariance"]
 

@@ -18,12 +18,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.config import TriggerConfig
-from pipeline.geometry.cameras import Camera
-from pipeline.geometry.se3 import inverse, transform_points
+from pipeline.core.config import TriggerConfig
 from pipeline.objective.paper.camera_lidar import cluster_points
 from pipeline.objective.paper.classes import REFLECTING, camera_at_label_size, in_camera, labels_of
 from pipeline.objective.paper.lidar_radar import CELL_M, FAR_M, drivable_map
+from pipeline.rig.cameras import Camera
+from pipeline.rig.se3 import inverse, transform_points
 from schemas.calibrations import pairs_of
 from schemas.observations import Observation
 

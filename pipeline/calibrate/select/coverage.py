@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.geometry.se3 import transform_points
-from pipeline.geometry.spherical import camera_direction_angles, to_spherical
+from pipeline.rig.se3 import transform_points
+from pipeline.rig.spherical import camera_direction_angles, to_spherical
 from schemas.observations import Observation
 
 __all__ = ["choose_for_information", "contents_of", "missing_in_view"]

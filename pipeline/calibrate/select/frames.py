@@ -19,8 +19,8 @@ from jaxtyping import Bool, Int
 
 from pipeline.calibrate.numerics.frame_blocks import FEWEST_SCENES, scenes_of
 from pipeline.calibrate.select.coverage import choose_for_information, contents_of, missing_in_view
-from pipeline.config import SelectConfig
-from pipeline.errors import SolveError
+from pipeline.core.config import SelectConfig
+from pipeline.core.errors import SolveError
 from pipeline.objective.stamp_gaps import motion_gates_ns
 from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, SENSORS
 from schemas.faults import FAULTS

@@ -19,9 +19,9 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from pipeline.calibrate.tracking.kalman import Track
-from pipeline.geometry.se3 import inverse, transform_points
-from pipeline.geometry.spherical import to_spherical, wrap_angle
-from pipeline.rows import join_rows, take_rows
+from pipeline.core.rows import join_rows, take_rows
+from pipeline.rig.se3 import inverse, transform_points
+from pipeline.rig.spherical import to_spherical, wrap_angle
 
 __all__ = ["Association", "Shared", "associate", "bearing_sigma_rad", "shared_sightings"]
 

@@ -17,8 +17,8 @@ from jaxtyping import Bool, Float, Int64
 from scipy.stats import f as f_distribution
 
 from pipeline.calibrate.numerics.covariance import bootstrap_covariance
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation, hat, log_so3
-from pipeline.geometry.spherical import spherical_jacobian, to_spherical, wrap_angle
+from pipeline.rig.se3 import exp_so3, from_rotation_translation, hat, log_so3
+from pipeline.rig.spherical import spherical_jacobian, to_spherical, wrap_angle
 
 __all__ = ["AlignedBearings", "Bearings", "Consistency", "align_bearings", "consistency"]
 

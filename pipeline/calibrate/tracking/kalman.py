@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int64
 
-from pipeline.geometry.ground_tracks import (
+from pipeline.rig.ground_tracks import (
     Filters,
     Measurements,
     advance,

@@ -19,11 +19,11 @@ from jaxtyping import Bool, Float, Int64
 from scipy.spatial import cKDTree
 
 from pipeline.calibrate.tracking.kalman import Motion, Scan, Track, follow
-from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.cameras import camera_of
-from pipeline.geometry.spherical import camera_direction_angles, from_spherical
+from pipeline.core.rows import take_rows
 from pipeline.objective.radar.moving_clusters import ROAD_USER_HEIGHT_M
-from pipeline.rows import take_rows
+from pipeline.rig.cameras import camera_of
+from pipeline.rig.estimates import Prior
+from pipeline.rig.spherical import camera_direction_angles, from_spherical
 from schemas.observations import Observation
 
 __all__ = [

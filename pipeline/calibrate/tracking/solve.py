@@ -39,14 +39,14 @@ from pipeline.calibrate.tracking.object_tracks import (
     passes_by,
     radar_tracks,
 )
-from pipeline.config import SolveConfig
-from pipeline.errors import SolveError
-from pipeline.extrinsics.checks import FailedCheck
-from pipeline.extrinsics.common_share import common_of
-from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
-from pipeline.geometry.se3 import compose_covariance, inverse, log_so3
-from pipeline.geometry.spherical import to_spherical
-from pipeline.results import Progress, silent
+from pipeline.core.config import SolveConfig
+from pipeline.core.errors import SolveError
+from pipeline.core.results import Progress, silent
+from pipeline.rig.checks import FailedCheck
+from pipeline.rig.common_share import common_of
+from pipeline.rig.estimates import PairEstimate, Prior, Solution
+from pipeline.rig.se3 import compose_covariance, inverse, log_so3
+from pipeline.rig.spherical import to_spherical
 from schemas.calibrations import PAIRS
 from schemas.observations import Observation
 

@@ -8,9 +8,9 @@ import numpy as np
 
 from pipeline.calibrate.verify.edge_result import EdgeResult
 from pipeline.calibrate.verify.target_accuracy import DIRECTIONS, Claim
-from pipeline.extrinsics.checks import Change
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation
-from pipeline.geometry.targets import errors_at_targets
+from pipeline.rig.checks import Change
+from pipeline.rig.se3 import exp_so3, from_rotation_translation
+from pipeline.rig.targets import errors_at_targets
 
 __all__ = ["RANGE", "exceeded_by", "largest_rad"]
 

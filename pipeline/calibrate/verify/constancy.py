@@ -12,13 +12,13 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from pipeline.extrinsics.attribution import PairShift, attribute
-from pipeline.extrinsics.checks import FailedCheck
-from pipeline.extrinsics.estimates import DayParts, PairEstimate
-from pipeline.geometry.changes import change_between, change_jacobian
-from pipeline.geometry.se3 import adjoint, inverse
+from pipeline.rig.attribution import PairShift, attribute
+from pipeline.rig.changes import change_between, change_jacobian
+from pipeline.rig.checks import FailedCheck
 from pipeline.rig.edges import EDGE_OF_PAIR
+from pipeline.rig.estimates import DayParts, PairEstimate
 from pipeline.rig.graph import BASE, Edge
+from pipeline.rig.se3 import adjoint, inverse
 
 __all__ = ["MOVED_SIGMAS", "PART_FLOOR_RAD", "constancy_failures", "moved_failures"]
 

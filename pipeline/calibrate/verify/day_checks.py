@@ -16,9 +16,9 @@ from pipeline.calibrate.verify.failed_checks import heading_failures, loop_failu
 from pipeline.calibrate.verify.motion_sources import MotionFindings
 from pipeline.calibrate.verify.prior_alarms import clock_alarms, edge_alarms, prior_alarms
 from pipeline.calibrate.verify.scene_count import scene_failures
-from pipeline.config import ChecksConfig, FleetConfig
-from pipeline.extrinsics.checks import FailedCheck
-from pipeline.extrinsics.estimates import Prior, Solution
+from pipeline.core.config import ChecksConfig, FleetConfig
+from pipeline.rig.checks import FailedCheck
+from pipeline.rig.estimates import Prior, Solution
 from schemas.calibrations import PAIRS
 from schemas.observations import Observation
 

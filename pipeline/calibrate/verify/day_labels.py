@@ -15,8 +15,8 @@ from jaxtyping import Float
 
 from pipeline.calibrate.numerics.frame_blocks import scene_blocks
 from pipeline.calibrate.verify.label_offset import LabelOffset, measure_label_offset
-from pipeline.extrinsics.checks import HARMLESS, FailedCheck
-from pipeline.extrinsics.estimates import PairEstimate, Solution
+from pipeline.rig.checks import HARMLESS, FailedCheck
+from pipeline.rig.estimates import PairEstimate, Solution
 from schemas.observations import Observation
 
 __all__ = ["DayLabels", "day_labels"]

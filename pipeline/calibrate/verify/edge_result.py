@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.calibrate.numerics.search_range import SearchRange
-from pipeline.geometry.changes import change_between, change_covariance
-from pipeline.geometry.se3 import adjoint, inverse
+from pipeline.rig.changes import change_between, change_covariance
+from pipeline.rig.se3 import adjoint, inverse
 from schemas.calibrations import DOF_NAMES
 
 __all__ = ["EdgeResult"]

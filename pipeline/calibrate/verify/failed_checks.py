@@ -9,13 +9,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.config import ChecksConfig
-from pipeline.extrinsics.checks import FailedCheck
-from pipeline.extrinsics.estimates import Prior, Solution
-from pipeline.geometry.changes import change_between
-from pipeline.geometry.se3 import adjoint, inverse
-from pipeline.geometry.targets import DEFAULT_TARGETS
+from pipeline.core.config import ChecksConfig
 from pipeline.objective.stamp_gaps import camera_gaps_s, constant_gap_s
+from pipeline.rig.changes import change_between
+from pipeline.rig.checks import FailedCheck
+from pipeline.rig.estimates import Prior, Solution
+from pipeline.rig.se3 import adjoint, inverse
+from pipeline.rig.targets import DEFAULT_TARGETS
 from schemas.observations import Observation
 
 __all__ = ["heading_failures", "loop_failures", "loop_sigmas"]

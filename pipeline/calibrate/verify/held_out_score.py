@@ -25,10 +25,7 @@ from pipeline.calibrate.numerics.bias_floors import (
 )
 from pipeline.calibrate.numerics.response_surface import DESIGN, fit_quadratics
 from pipeline.calibrate.verify.held_out_update import FrameDerivatives
-from pipeline.config import SolveConfig
-from pipeline.extrinsics.estimates import PairEstimate, Prior
-from pipeline.geometry.changes import change_jacobian
-from pipeline.geometry.se3 import exp_se3, exp_so3, from_rotation_translation, log_so3, rotation_angle_rad
+from pipeline.core.config import SolveConfig
 from pipeline.objective.camera_lidar.label_width import widened
 from pipeline.objective.camera_lidar.own_motion import lidar_velocities
 from pipeline.objective.camera_lidar.score import Alignments, KernelSettings, Start, Terms, prepare_terms
@@ -44,6 +41,9 @@ from pipeline.objective.radar.registration import (
     registration_frames,
 )
 from pipeline.objective.stamp_gaps import camera_gaps_s, constant_gap_s, radar_gaps_s
+from pipeline.rig.changes import change_jacobian
+from pipeline.rig.estimates import PairEstimate, Prior
+from pipeline.rig.se3 import exp_se3, exp_so3, from_rotation_translation, log_so3, rotation_angle_rad
 from schemas.observations import Observation
 
 __all__ = ["HeldOutScore", "held_out_score"]

@@ -16,11 +16,11 @@ from jaxtyping import Float, Int
 from pipeline.calibrate.joint.camera_lidar.estimate import align_camera_lidar
 from pipeline.calibrate.verify.held_out_test import paired_test
 from pipeline.calibrate.verify.target_accuracy import Claim
-from pipeline.config import SolveConfig
-from pipeline.errors import SolveError
-from pipeline.extrinsics.checks import FailedCheck
-from pipeline.extrinsics.estimates import PairEstimate, Prior
-from pipeline.geometry.targets import errors_at_targets
+from pipeline.core.config import SolveConfig
+from pipeline.core.errors import SolveError
+from pipeline.rig.checks import FailedCheck
+from pipeline.rig.estimates import PairEstimate, Prior
+from pipeline.rig.targets import errors_at_targets
 from schemas.observations import Observation
 
 __all__ = ["found_elsewhere", "held_out_place"]

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import ndtr, stdtrit
 
-from pipeline.config import ChecksConfig
+from pipeline.core.config import ChecksConfig
 
 __all__ = ["FrameDerivatives", "HeldOutUpdate", "held_out_update"]
 

@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.calibrate.verify.sweep_motion import occupied_share, sweep_motion
-from pipeline.extrinsics.checks import FailedCheck
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation
 from pipeline.objective.ego_motion import is_same, motion_of
+from pipeline.rig.checks import FailedCheck
+from pipeline.rig.se3 import exp_so3, from_rotation_translation
 from schemas.observations import Observation
 
 __all__ = ["MotionFindings", "compared_sources"]

@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.calibrate.numerics.bias_floors import RADAR_ELEVATION_BIAS_RAD
-from pipeline.extrinsics.estimates import Solution
-from pipeline.geometry.se3 import hat
-from pipeline.rigs import CameraPrior
+from pipeline.core.rigs import CameraPrior
+from pipeline.rig.estimates import Solution
+from pipeline.rig.se3 import hat
 
 __all__ = ["camera_turn_sigma_rad", "mounting_covariance"]
 

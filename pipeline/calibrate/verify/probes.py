@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipeline.calibrate.verify.held_out_test import paired_test
-from pipeline.geometry.sensor_turns import sensor_turn
+from pipeline.rig.sensor_turns import sensor_turn
 from schemas.calibrations import PROBE_Z
 
 __all__ = ["probe_numbers"]

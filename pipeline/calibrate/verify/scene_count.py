@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.calibrate.numerics.frame_blocks import FEWEST_SCENES, scenes_of
-from pipeline.extrinsics.checks import FailedCheck
+from pipeline.rig.checks import FailedCheck
 from schemas.observations import Observation
 
 __all__ = ["scene_failures"]

@@ -14,12 +14,12 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.extrinsics.checks import FailedCheck
-from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.cameras import camera_of
-from pipeline.geometry.se3 import transform_points
-from pipeline.geometry.spherical import from_spherical, to_spherical, wrap_angle
-from pipeline.geometry.targets import DEFAULT_TARGETS
+from pipeline.rig.cameras import camera_of
+from pipeline.rig.checks import FailedCheck
+from pipeline.rig.estimates import Prior
+from pipeline.rig.se3 import transform_points
+from pipeline.rig.spherical import from_spherical, to_spherical, wrap_angle
+from pipeline.rig.targets import DEFAULT_TARGETS
 from pipeline.rig.views import FRAMES, View, view_of_camera, view_of_clouds
 from schemas.calibrations import FRAMES_OF_PAIR
 from schemas.observations import Observation

@@ -23,9 +23,9 @@ from scipy.optimize import brentq
 from scipy.special import ndtr, ndtri
 
 from pipeline.calibrate.verify.held_out_update import HeldOutUpdate
-from pipeline.config import ChecksConfig
-from pipeline.geometry.target_sigmas import target_jacobian, target_sigmas
-from pipeline.geometry.targets import DEFAULT_TARGETS
+from pipeline.core.config import ChecksConfig
+from pipeline.rig.target_sigmas import target_jacobian, target_sigmas
+from pipeline.rig.targets import DEFAULT_TARGETS
 
 __all__ = ["DIRECTIONS", "Claim", "claims_of", "target_jacobian", "target_sigmas"]
 

@@ -18,8 +18,8 @@ from pipeline.calibrate.verify.consequence import RANGE, exceeded_by, largest_ra
 from pipeline.calibrate.verify.edge_result import EdgeResult
 from pipeline.calibrate.verify.held_out_test import HeldOutTest
 from pipeline.calibrate.verify.target_accuracy import Claim
-from pipeline.config import ChecksConfig
-from pipeline.extrinsics.checks import FailedCheck, faults_of
+from pipeline.core.config import ChecksConfig
+from pipeline.rig.checks import FailedCheck, faults_of
 from schemas.calibrations import DOF_NAMES
 
 __all__ = ["Evidence", "Verdict", "judge", "matters"]

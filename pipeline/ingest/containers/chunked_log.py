@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
-from pipeline.errors import LogError
+from pipeline.core.errors import LogError
 from pipeline.ingest.containers.reader import ChunkCache, Position, RawMessage
 from pipeline.ingest.containers.timeline import Chunk, Stretches, Timeline, timeline_of_chunks
 from pipeline.store.remote_logs import LogPath

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from pipeline.errors import LogError
+from pipeline.core.errors import LogError
 from pipeline.ingest.containers.timeline import Stretches, Timeline
 from pipeline.store.remote_logs import LogPath, RemoteLog
 

@@ -15,7 +15,7 @@ from typing import BinaryIO, cast
 
 import zstandard
 
-from pipeline.errors import LogError, StorageError
+from pipeline.core.errors import LogError, StorageError
 from pipeline.ingest.containers.bounded import most_bytes
 from pipeline.ingest.containers.reader import ChunkCache, LogReader, Position, RawMessage, open_log
 from pipeline.ingest.containers.timeline import Stretches, Timeline

@@ -16,7 +16,7 @@ import apsw
 import numpy as np
 import zstandard
 
-from pipeline.errors import LogError
+from pipeline.core.errors import LogError
 from pipeline.ingest.containers.bounded import OversizedError, most_bytes, unpack_zstd
 from pipeline.ingest.containers.reader import Channel, ChunkCache, Position, RawMessage
 from pipeline.ingest.containers.timeline import Counted, Stretches, Timeline

@@ -10,11 +10,11 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from pipeline.errors import LogError
+from pipeline.core.errors import LogError
+from pipeline.core.ros_definitions import DEFINITIONS, register
 from pipeline.ingest.containers.reader import PROTOBUF, READ_ERRORS, Channel
 from pipeline.ingest.messages import protobuf
 from pipeline.ingest.messages.foxglove import as_ros
-from pipeline.ros_definitions import DEFINITIONS, register
 
 __all__ = ["DECODE_ERRORS", "content_without_stamp", "decode", "header_frame_id", "header_stamp_ns"]
 

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32
 
-from pipeline.geometry.cameras import Camera
-from pipeline.geometry.se3 import from_quaternion, transform_points
+from pipeline.rig.cameras import Camera
+from pipeline.rig.se3 import from_quaternion, transform_points
 
 __all__ = ["DETECTIONS_3D", "read_detections_3d"]
 

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipeline.geometry.cameras import Camera
 from pipeline.ingest.messages.other_codecs import decode_other
+from pipeline.rig.cameras import Camera
 
 __all__ = [
     "MOST_PIXELS",

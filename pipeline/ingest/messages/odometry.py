@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.geometry.se3 import exp_so3, from_quaternion, from_rotation_translation, log_so3
+from pipeline.rig.se3 import exp_so3, from_quaternion, from_rotation_translation, log_so3
 
 __all__ = ["EgoState", "EgoTrack"]
 

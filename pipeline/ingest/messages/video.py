@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int64, UInt8
 
-from pipeline.errors import MissingExtraError
+from pipeline.core.errors import MissingExtraError
 from pipeline.ingest.messages.image import MOST_PIXELS
 
 __all__ = ["VideoPictures", "video_codec"]

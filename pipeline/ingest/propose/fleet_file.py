@@ -7,9 +7,9 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
+from pipeline.core.third_party_models import semantics_line
 from pipeline.ingest.messages.point_cloud import TIME_FIELDS
 from pipeline.ingest.propose.sensors import FoundCamera, FoundCloud, FoundSensors
-from pipeline.third_party_models import semantics_line
 
 __all__ = ["Facts", "RadarMeaning", "fleet_text", "left_out", "names_of"]
 

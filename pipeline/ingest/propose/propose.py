@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.config import FleetConfig, validated
-from pipeline.errors import ConfigError
-from pipeline.geometry.transform_tree import TransformTree
+from pipeline.core.config import FleetConfig, validated
+from pipeline.core.errors import ConfigError
+from pipeline.core.results import Progress, silent
 from pipeline.ingest.captures import Rejected
 from pipeline.ingest.directions_and_units import motion_of, opposed_signs
 from pipeline.ingest.index import index_logs
@@ -22,8 +22,8 @@ from pipeline.ingest.propose.sensors import FoundCamera, FoundCloud, FoundSensor
 from pipeline.ingest.propose.survey import Survey, survey_logs
 from pipeline.ingest.rig_sample import RigSample
 from pipeline.ingest.stage import pick_moments
-from pipeline.results import Progress, silent
 from pipeline.rig.rig import Rig
+from pipeline.rig.transform_tree import TransformTree
 from pipeline.store.views import logged_stars
 from schemas.observations import WITHOUT_LABELS
 

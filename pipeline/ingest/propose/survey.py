@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import LogError
-from pipeline.geometry.transform_tree import TransformTree
+from pipeline.core.errors import LogError
+from pipeline.core.results import Progress, silent
 from pipeline.ingest.containers.reader import LogReader, RawMessage, open_log
 from pipeline.ingest.index import ACCEPTED_TYPES
 from pipeline.ingest.messages.decoding import DECODE_ERRORS, decode, header_frame_id
-from pipeline.results import Progress, silent
+from pipeline.rig.transform_tree import TransformTree
 
 __all__ = ["Survey", "Topic", "survey_logs"]
 

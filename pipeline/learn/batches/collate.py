@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from pipeline.errors import ContractError
-from pipeline.geometry.se3 import from_quaternion
+from pipeline.core.errors import ContractError
 from pipeline.learn.batches.batch import TrainingBatch
+from pipeline.rig.se3 import from_quaternion
 from schemas.columns import POSE_COLUMNS
 from schemas.training import TrainingRow
 

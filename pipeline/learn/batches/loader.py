@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import ContractError
+from pipeline.core.errors import ContractError
 from pipeline.learn.batches.batch import TrainingBatch
 from pipeline.learn.batches.collate import collate
 from pipeline.learn.prepare.inventory import read_leaks

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import ConfigError
+from pipeline.core.errors import ConfigError
 from pipeline.learn.train.checkpoints import BEST, LAST, load_checkpoint
 from pipeline.learn.train.metrics import read_metrics
 

@@ -8,11 +8,11 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from pipeline.core.results import Progress
 from pipeline.learn.frames.frame import Frame, Mounting, Perturbation, Place, read_frames
 from pipeline.learn.frames.nuscenes import NuScenesWriter
 from pipeline.learn.frames.output import DayOutput, Output
 from pipeline.learn.frames.shards import ShardWriter
-from pipeline.results import Progress
 from pipeline.store.partitions import Lake, Partition, work_key
 from pipeline.store.tables import read_manifest
 from schemas.moments import MOMENTS, PERCEIVED

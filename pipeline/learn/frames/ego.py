@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.geometry.se3 import exp_se3
 from pipeline.learn.frames.frame import Frame
+from pipeline.rig.se3 import exp_se3
 from schemas.captures import Scan
 
 __all__ = ["T_root_sensor", "compensated_range_rate", "pose_at"]

@@ -11,7 +11,7 @@ from urllib.parse import quote
 import numpy as np
 from jaxtyping import Float, Float32
 
-from pipeline.geometry.se3 import from_quaternion, perturb_exactly
+from pipeline.rig.se3 import from_quaternion, perturb_exactly
 from pipeline.store.moments import joined
 from pipeline.store.partitions import Lake, Partition
 from schemas.captures import Image, Scan, Sweep

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipeline.errors import ConfigError
-from pipeline.geometry.cameras import Camera, camera_of
+from pipeline.core.errors import ConfigError
+from pipeline.rig.cameras import Camera, camera_of
 from schemas.captures import CameraColumns, Image
 from schemas.features import ImageFeatureColumns
 

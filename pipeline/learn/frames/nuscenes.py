@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import SolveError
-from pipeline.geometry.se3 import from_rotation_translation, inverse, to_quaternion
+from pipeline.core.errors import SolveError
 from pipeline.learn.frames.ego import T_root_sensor, compensated_range_rate, pose_at
 from pipeline.learn.frames.frame import Frame
 from pipeline.learn.frames.images import undistortion_of
 from pipeline.learn.frames.nuscenes_tables import token_of
 from pipeline.learn.frames.output import DayOutput
+from pipeline.rig.se3 import from_rotation_translation, inverse, to_quaternion
 from schemas.captures import Image, Scan, Sweep
 
 __all__ = ["NuScenesWriter"]

@@ -7,15 +7,15 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from pipeline.config import PrepareConfig
-from pipeline.errors import ConfigError
+from pipeline.core.config import PrepareConfig
+from pipeline.core.errors import ConfigError
+from pipeline.core.results import Progress
 from pipeline.learn.frames.facts import to_json
 from pipeline.learn.frames.frame import Place
 from pipeline.learn.frames.output import Output
 from pipeline.learn.prepare.decided import decided_sides, split_settings
 from pipeline.learn.prepare.sides import frame_sides, settled_keys
 from pipeline.learn.prepare.survey import plan_days, survey_day
-from pipeline.results import Progress
 from pipeline.store.partitions import Lake, Partition
 from schemas.training import SPLITS
 

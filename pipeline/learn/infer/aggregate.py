@@ -24,10 +24,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipeline.extrinsics.common_share import common_of
-from pipeline.extrinsics.estimates import PairEstimate
-from pipeline.geometry.se3 import exp_se3, hat, inverse, log_se3, transform_points
-from pipeline.geometry.spherical import from_spherical
+from pipeline.rig.common_share import common_of
+from pipeline.rig.estimates import PairEstimate
+from pipeline.rig.se3 import exp_se3, hat, inverse, log_se3, transform_points
+from pipeline.rig.spherical import from_spherical
 
 __all__ = ["BIAS_SIGMA", "Answers", "day_estimate", "mean_answer", "measured_estimate", "twists_about"]
 

@@ -10,7 +10,6 @@ import numba
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32
 
-from pipeline.geometry.se3 import transform_points
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import (
     CAMERA_CHANNELS,
@@ -34,6 +33,7 @@ from pipeline.learn.sample.layout import (
     OBJECT_POINTS,
     RADAR_POINTS,
 )  # fmt: skip
+from pipeline.rig.se3 import transform_points
 from schemas.training import POINT_IS_EDGE, POINT_IS_GROUND, TrainingRow
 
 __all__ = ["FrameSensors", "compiled_nearest_points", "frame_sensors", "render_frame"]

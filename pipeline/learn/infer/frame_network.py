@@ -8,8 +8,8 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from pipeline.extrinsics.estimates import Prior
 from pipeline.learn.infer.class_evidence import FrameEvidence
+from pipeline.rig.estimates import Prior
 from schemas.frames import Frame
 from schemas.observations import Observation
 

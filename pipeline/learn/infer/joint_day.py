@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipeline.extrinsics.checks import FailedCheck
-from pipeline.extrinsics.estimates import PairEstimate, Prior
-from pipeline.geometry.se3 import inverse, rotation_angle_rad
 from pipeline.learn.infer.aggregate import measured_estimate
 from pipeline.learn.infer.class_evidence import FrameEvidence
 from pipeline.learn.infer.joint_fit import APART_RAD, JointFit, climbed, fit_of, rival_score, voted
+from pipeline.rig.checks import FailedCheck
+from pipeline.rig.estimates import PairEstimate, Prior
+from pipeline.rig.se3 import inverse, rotation_angle_rad
 
 __all__ = ["JOINT_BIAS_SIGMA", "JointDay", "fitted_day"]
 

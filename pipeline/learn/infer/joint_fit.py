@@ -19,8 +19,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.optimize import minimize
 
-from pipeline.geometry.se3 import exp_se3, inverse, log_se3, rotation_angle_rad
 from pipeline.learn.infer.class_evidence import FrameEvidence, scores
+from pipeline.rig.se3 import exp_se3, inverse, log_se3, rotation_angle_rad
 
 __all__ = ["APART_RAD", "JointFit", "climbed", "fit_of", "rival_score", "voted"]
 

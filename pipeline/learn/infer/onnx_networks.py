@@ -12,10 +12,8 @@ from pathlib import Path
 import numpy as np
 from onnxruntime.capi.onnxruntime_pybind11_state import InvalidArgument
 
-from pipeline.config import FleetConfig, LearnConfig, PrepareConfig
-from pipeline.errors import ConfigError, ModelError
-from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.cameras import camera_of
+from pipeline.core.config import FleetConfig, LearnConfig, PrepareConfig
+from pipeline.core.errors import ConfigError, ModelError
 from pipeline.learn.infer.class_evidence import FrameEvidence
 from pipeline.learn.infer.compiled_rendering import FrameSensors, frame_sensors
 from pipeline.learn.infer.frame_network import FrameAnswer
@@ -25,6 +23,8 @@ from pipeline.learn.sample.frame_sample import About, sensor_row
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import PAIRS as ROWS
 from pipeline.objective.paper.classes import labels_of
+from pipeline.rig.cameras import camera_of
+from pipeline.rig.estimates import Prior
 from schemas.calibrations import PAIRS
 from schemas.frames import Frame
 from schemas.observations import Observation

@@ -20,9 +20,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.extrinsics.common_share import common_part
-from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
-from pipeline.geometry.se3 import exp_so3, inverse, log_se3
 from pipeline.learn.infer.aggregate import OBSERVABLE
 from pipeline.objective.radar.heights import displaced_heights
 from pipeline.objective.radar.travel import (
@@ -31,6 +28,9 @@ from pipeline.objective.radar.travel import (
     pitch_residuals,
     travel_directions,
 )
+from pipeline.rig.common_share import common_part
+from pipeline.rig.estimates import PairEstimate, Prior, Solution
+from pipeline.rig.se3 import exp_so3, inverse, log_se3
 from schemas.observations import Observation
 
 __all__ = ["WayTurn", "informed_by_way", "updated_by_way", "way_turn"]

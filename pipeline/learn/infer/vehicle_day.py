@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipeline.errors import SolveError
-from pipeline.extrinsics.checks import FailedCheck
-from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
-from pipeline.geometry.se3 import exp_se3, inverse, log_se3, rotation_angle_rad
+from pipeline.core.errors import SolveError
+from pipeline.core.results import Progress, silent
 from pipeline.learn.infer.aggregate import Answers, day_estimate, mean_answer, twists_about
 from pipeline.learn.infer.class_evidence import FrameEvidence
 from pipeline.learn.infer.frame_network import FrameNetwork, FrameSource
 from pipeline.learn.infer.joint_day import JointDay, fitted_day
 from pipeline.learn.sample.frame_sample import SampleRejectedError
-from pipeline.results import Progress, silent
+from pipeline.rig.checks import FailedCheck
+from pipeline.rig.estimates import PairEstimate, Prior, Solution
+from pipeline.rig.se3 import exp_se3, inverse, log_se3, rotation_angle_rad
 from schemas.calibrations import PAIRS
 from schemas.frames import Frame
 from schemas.observations import Observation

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from pipeline.config import FleetConfig
-from pipeline.errors import ContractError
+from pipeline.core.config import FleetConfig
+from pipeline.core.errors import ContractError
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import perceived_days
 

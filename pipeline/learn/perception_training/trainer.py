@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from torch import Tensor, nn
 
-from pipeline.errors import ConfigError, ContractError
+from pipeline.core.errors import ConfigError, ContractError
+from pipeline.core.results import Progress, silent
 from pipeline.learn.train.checkpoints import LAST, load_checkpoint
 from pipeline.learn.train.loop import Run, TrainResult, run_loop
 from pipeline.learn.train.metrics import MetricsLog
 from pipeline.learn.train.settings import Count, DescentConfig
 from pipeline.learn.train.stop_signals import stop_signals
-from pipeline.results import Progress, silent
 
 __all__ = ["Task", "TrainingConfig", "hash_of_arrays", "run_training"]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from pipeline.config import PrepareConfig, config_hash
+from pipeline.core.config import PrepareConfig, config_hash
 from pipeline.store.partitions import Lake
 from pipeline.store.tables import read_manifest
 from schemas.training import TRAINING

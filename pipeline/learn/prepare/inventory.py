@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from pipeline.errors import ContractError
+from pipeline.core.errors import ContractError
 from pipeline.store.atomic_write import atomic_write
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.row_groups import read_columns

@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.config import PrepareConfig
+from pipeline.core.config import PrepareConfig
 from pipeline.learn.prepare.decided import decided_sides
 from pipeline.learn.prepare.split import SplitPlan
 from pipeline.learn.prepare.survey import Survey, plan_days

@@ -11,16 +11,16 @@ from collections.abc import Generator, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from pipeline.config import PrepareConfig
-from pipeline.errors import SolveError
-from pipeline.extrinsics.estimates import Prior
-from pipeline.extrinsics.prior import prior_key, read_prior
+from pipeline.core.config import PrepareConfig
+from pipeline.core.errors import SolveError
+from pipeline.core.stage_work import Run, Task, Work
 from pipeline.learn.prepare.decided import split_rule
 from pipeline.learn.prepare.sides import frame_sides
 from pipeline.learn.prepare.split import SplitPlan, Unit
 from pipeline.learn.prepare.survey import Survey, survey_day
 from pipeline.learn.sample.frame_sample import About, SampleReason, SampleRejectedError, make_row
-from pipeline.stage_work import Run, Task, Work
+from pipeline.rig.day_prior import prior_key, read_prior
+from pipeline.rig.estimates import Prior
 from pipeline.store.views import Chosen, frames_of, observations_of
 from schemas.calibrations import PAIRS, SENSORS
 from schemas.frames import Frame

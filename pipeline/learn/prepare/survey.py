@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.config import PrepareConfig
+from pipeline.core.config import PrepareConfig
 from pipeline.learn.prepare.split import SplitPlan, Unit, environment_of_speeds, plan_split
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.row_groups import read_columns

@@ -16,10 +16,10 @@ import numba
 import numpy as np
 from jaxtyping import Bool, Float32, Int8, Int32, UInt8
 
-from pipeline.geometry.cameras import Camera
 from pipeline.learn.sample.grid import Grid, grid_rays
 from pipeline.learn.sample.layout import CLASS_CONFIDENCE
 from pipeline.objective.camera_lidar.image_maps import NO_BOUNDARY, boundary_offsets
+from pipeline.rig.cameras import Camera
 from schemas.training import CLASS_OF_LABEL, DISTANCE_GROUPS, GRID_CLASSES, NO_EDGE, UNKNOWN_CLASS
 
 __all__ = ["FINE_DEG", "CameraFeatures", "camera_features", "class_likelihood", "stored_grid"]

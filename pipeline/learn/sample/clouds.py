@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Integer, UInt8
 from scipy.spatial import cKDTree
 
-from pipeline.config import PrepareConfig
-from pipeline.geometry.scan_rows import rows_of
-from pipeline.geometry.se3 import transform_points
-from pipeline.geometry.spherical import camera_direction_angles, to_spherical
+from pipeline.core.config import PrepareConfig
 from pipeline.objective.paper.lidar_radar import drivable_map
+from pipeline.rig.scan_rows import rows_of
+from pipeline.rig.se3 import transform_points
+from pipeline.rig.spherical import camera_direction_angles, to_spherical
 from schemas.frames import Frame
 from schemas.observations import Observation
 from schemas.training import POINT_IS_EDGE, POINT_IS_GROUND

@@ -10,15 +10,15 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipeline.config import PrepareConfig
-from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.cameras import Camera, camera_of
-from pipeline.geometry.pose_columns import pose_columns
-from pipeline.geometry.spherical import camera_direction_angles
+from pipeline.core.config import PrepareConfig
 from pipeline.learn.sample.camera_maps import camera_features, stored_grid
 from pipeline.learn.sample.clouds import View, lidar_columns, padded_rows, radar_columns
 from pipeline.learn.sample.grid import Grid, resample_camera
 from pipeline.objective.paper.classes import labels_of
+from pipeline.rig.cameras import Camera, camera_of
+from pipeline.rig.estimates import Prior
+from pipeline.rig.pose_columns import pose_columns
+from pipeline.rig.spherical import camera_direction_angles
 from schemas.frames import Frame
 from schemas.observations import Observation
 from schemas.training import DISTANCE_GROUPS, TrainingRow

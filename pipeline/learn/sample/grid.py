@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipeline.geometry.cameras import Camera
+from pipeline.rig.cameras import Camera
 
 __all__ = ["Grid", "grid_rays", "resample_camera"]
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from pipeline.errors import ContractError
+from pipeline.core.errors import ContractError
 
 __all__ = ["BEST", "LAST", "load_checkpoint", "save_checkpoint"]
 

@@ -15,12 +15,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from pipeline.core.results import Progress
 from pipeline.learn.train.checkpoints import LAST, save_checkpoint
 from pipeline.learn.train.metrics import MetricsLog
 from pipeline.learn.train.processes import ALONE, Processes
 from pipeline.learn.train.schedule import DivergenceGuard, cosine_rate
 from pipeline.learn.train.settings import DescentConfig
-from pipeline.results import Progress
 
 __all__ = ["Run", "TrainResult", "run_loop"]
 

@@ -17,8 +17,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pipeline.config import SolveConfig
-from pipeline.errors import ContractError
+from pipeline.core.config import SolveConfig
+from pipeline.core.errors import ContractError
 from pipeline.learn.batches.batch import TrainingBatch
 from pipeline.learn.network.calibration_network import CalibrationNetwork
 from pipeline.learn.network.concat_network import ConcatCore

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import distributed
 
-from pipeline.errors import ConfigError
+from pipeline.core.errors import ConfigError
 
 __all__ = ["ALONE", "Processes", "joined"]
 

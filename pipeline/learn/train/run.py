@@ -10,6 +10,7 @@ from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipeline.core.results import Progress, silent
 from pipeline.learn.prepare.inventory import require_sides
 from pipeline.learn.train.loop import TrainResult, run_loop
 from pipeline.learn.train.metrics import MetricsLog
@@ -17,7 +18,6 @@ from pipeline.learn.train.processes import joined
 from pipeline.learn.train.run_state import begin_run
 from pipeline.learn.train.settings import TrainConfig
 from pipeline.learn.train.stop_signals import stop_signals
-from pipeline.results import Progress, silent
 from pipeline.store.partitions import Lake
 
 __all__ = ["TrainRequest", "train"]

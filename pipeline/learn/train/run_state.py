@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
-from pipeline.errors import ConfigError, ContractError
+from pipeline.core.errors import ConfigError, ContractError
 from pipeline.learn.batches.batch import TrainingBatch
 from pipeline.learn.batches.loader import load_split
 from pipeline.learn.network.calibration_network import CalibrationNetwork, build_network

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from pipeline.errors import BoresightError
+from pipeline.core.errors import BoresightError
 
 __all__ = ["DivergedError", "DivergenceGuard", "cosine_rate"]
 

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from pipeline.config import read_toml, validated
+from pipeline.core.config import read_toml, validated
 from pipeline.learn.sample.grid import Grid
 
 __all__ = [

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int8, UInt8
 
-from pipeline.geometry.cameras import Camera
+from pipeline.rig.cameras import Camera
 from schemas.observations import STEP_BELOW, STEP_RIGHT
 
 __all__ = ["Start", "free_ground", "step_offsets"]

@@ -14,8 +14,8 @@ import numba
 import numpy as np
 from jaxtyping import Bool, Int8, UInt8
 
-from pipeline.geometry.cameras import Camera, camera_of
 from pipeline.objective.camera_lidar.brightness_maps import Start, free_ground, step_offsets
+from pipeline.rig.cameras import Camera, camera_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

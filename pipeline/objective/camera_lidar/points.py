@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipeline.geometry.cameras import Camera
+from pipeline.rig.cameras import Camera
 from schemas.observations import Observation
 
 __all__ = [

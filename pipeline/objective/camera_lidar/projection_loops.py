@@ -12,7 +12,7 @@ import numba
 import numpy as np
 
 if TYPE_CHECKING:
-    from pipeline.geometry.cameras import Camera
+    from pipeline.rig.cameras import Camera
 
 __all__ = [
     "along_motion",

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.geometry.cameras import Camera
+from pipeline.rig.cameras import Camera
 
 if TYPE_CHECKING:
     from pipeline.objective.camera_lidar.points import Points

@@ -1,6 +1,6 @@
 """Rigid transforms as torch tensors, differentiable everywhere: twists, Euler angles, the loop of the three pairs.
 
-The same conventions as `pipeline.geometry.se3`: twist = (rotation vector [rad], translation [m]),
+The same conventions as `pipeline.rig.se3`: twist = (rotation vector [rad], translation [m]),
 perturbations on the left. Shapes are `*batch`, for any batch of the caller.
 
 Source: paper section 4.4, equation 1, for the loop loss; Sola et al. 2018 for the exponential maps.

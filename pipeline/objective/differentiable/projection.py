@@ -1,7 +1,7 @@
 """Projection of points into images of several frames, differentiable: camera models and the equirectangular grid.
 
 Both take a frame's points to map pixels (u right, v down, (0, 0) = centre of the first pixel), for any kind
-of map. Models are exact, as in `pipeline.geometry.cameras`; the compiled kernels fit polynomials to them.
+of map. Models are exact, as in `pipeline.rig.cameras`; the compiled kernels fit polynomials to them.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pipeline.geometry.cameras import Camera
+from pipeline.rig.cameras import Camera
 
 __all__ = ["CameraProjection", "GridProjection", "camera_projection"]
 

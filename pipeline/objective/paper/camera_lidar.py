@@ -16,7 +16,6 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from pipeline.geometry.cameras import Camera
 from pipeline.objective.paper.classes import (
     REFLECTING,
     SKY,
@@ -29,6 +28,7 @@ from pipeline.objective.paper.classes import (
     thin,
 )
 from pipeline.objective.paper.cost_maps import FoldedFrames, fold_frames, frame_costs
+from pipeline.rig.cameras import Camera
 from schemas.observations import Observation
 
 __all__ = ["CameraLidarLoss", "camera_lidar_loss", "cluster_points", "object_cost_map"]

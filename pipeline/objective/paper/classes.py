@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from pipeline.errors import ContractError
-from pipeline.geometry.cameras import Camera, camera_of
-from pipeline.geometry.se3 import transform_points
+from pipeline.core.errors import ContractError
+from pipeline.rig.cameras import Camera, camera_of
+from pipeline.rig.se3 import transform_points
 from schemas.observations import Observation
 
 __all__ = [

@@ -21,8 +21,8 @@ import numba
 import numpy as np
 from jaxtyping import Float, Float32, Int32, Int64, UInt8, UInt32
 
-from pipeline.geometry.cameras import Camera
 from pipeline.objective.camera_lidar.projection_loops import camera_parameters, project_points
+from pipeline.rig.cameras import Camera
 
 __all__ = ["FoldedFrames", "fold_frames", "frame_costs", "pack_quads"]
 

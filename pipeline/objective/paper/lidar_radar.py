@@ -18,7 +18,7 @@ import numba
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipeline.geometry.se3 import inverse
+from pipeline.rig.se3 import inverse
 from schemas.observations import Observation
 
 __all__ = ["LidarRadarLoss", "drivable_map", "lidar_radar_loss"]

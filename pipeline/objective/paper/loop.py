@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.geometry.se3 import inverse
+from pipeline.rig.se3 import inverse
 
 __all__ = ["euler_angles", "joint_objective", "loop_loss", "loop_transform"]
 

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 from jaxtyping import Float, Int64
 
-from pipeline.rows import take_rows
+from pipeline.core.rows import take_rows
 
 __all__ = ["equations_by_frame", "robust_equations", "rows_of_frames", "spread_of"]
 

@@ -24,9 +24,9 @@ from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 from scipy.special import ndtr
 
-from pipeline.geometry.se3 import inverse, transform_points
-from pipeline.geometry.spherical import to_spherical
 from pipeline.objective.radar.frame_equations import rows_of_frames
+from pipeline.rig.se3 import inverse, transform_points
+from pipeline.rig.spherical import to_spherical
 from schemas.observations import Observation
 
 __all__ = ["Heights", "displaced_heights"]

@@ -15,13 +15,13 @@ import numpy as np
 from jaxtyping import Float, Int64
 from scipy.spatial import cKDTree
 
-from pipeline.geometry.cameras import camera_of
-from pipeline.geometry.se3 import inverse, transform_points
-from pipeline.geometry.spherical import camera_direction_angles, wrap_angle
+from pipeline.core.rows import columns_of
 from pipeline.objective.radar.frame_equations import robust_equations, rows_of_frames
 from pipeline.objective.radar.medians import median_of_rows
 from pipeline.objective.stamp_gaps import radar_gaps_s, scan_to_image_s
-from pipeline.rows import columns_of
+from pipeline.rig.cameras import camera_of
+from pipeline.rig.se3 import inverse, transform_points
+from pipeline.rig.spherical import camera_direction_angles, wrap_angle
 from schemas.observations import Observation
 
 __all__ = [

@@ -22,9 +22,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from pipeline.geometry.se3 import inverse, transform_points
+from pipeline.core.rows import columns_of
 from pipeline.objective.radar.registration_loops import STATS, accumulate_frames
-from pipeline.rows import columns_of
+from pipeline.rig.se3 import inverse, transform_points
 from schemas.observations import Observation
 
 __all__ = [

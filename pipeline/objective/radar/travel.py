@@ -31,10 +31,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int64
 
-from pipeline.geometry.se3 import hat, inverse, transform_points
+from pipeline.core.rows import columns_of
 from pipeline.objective.radar.frame_equations import equations_by_frame, rows_of_frames, spread_of
 from pipeline.objective.radar.registration import RANGE_M, SIDE_RAD
-from pipeline.rows import columns_of
+from pipeline.rig.se3 import hat, inverse, transform_points
 from schemas.observations import Observation
 
 __all__ = [

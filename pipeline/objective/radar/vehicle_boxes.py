@@ -14,13 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int64
 
-from pipeline.geometry.cameras import camera_of
-from pipeline.geometry.se3 import hat, transform_points
-from pipeline.geometry.spherical import camera_direction_angles, from_spherical, to_spherical
+from pipeline.core.rows import columns_of
 from pipeline.objective.radar.frame_equations import robust_equations, rows_of_frames
 from pipeline.objective.radar.medians import median_of_rows
 from pipeline.objective.stamp_gaps import scan_to_image_s
-from pipeline.rows import columns_of
+from pipeline.rig.cameras import camera_of
+from pipeline.rig.se3 import hat, transform_points
+from pipeline.rig.spherical import camera_direction_angles, from_spherical, to_spherical
 from schemas.observations import Observation
 
 __all__ = [

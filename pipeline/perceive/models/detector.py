@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Int, UInt8
 
-from pipeline.errors import ModelError, ModelOutputError
+from pipeline.core.errors import ModelError, ModelOutputError
+from pipeline.core.rows import join_rows, take_rows
 from pipeline.perceive.camera import Detections
 from pipeline.perceive.labels import DETECTOR_COUNTS, detector_names
 from pipeline.perceive.models.manifest import Manifest
 from pipeline.perceive.models.session import Session, fit_image
-from pipeline.rows import join_rows, take_rows
 
 __all__ = ["Candidates", "Detector", "decode_head", "suppress"]
 

@@ -11,8 +11,8 @@ import urllib.request
 from pathlib import Path
 from typing import IO, Final
 
-from pipeline.errors import DownloadError
-from pipeline.results import Progress, silent
+from pipeline.core.errors import DownloadError
+from pipeline.core.results import Progress, silent
 
 __all__ = ["download"]
 

@@ -12,7 +12,7 @@ from typing import Annotated, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from pipeline.errors import ModelError
+from pipeline.core.errors import ModelError
 from pipeline.perceive.labels import DETECTOR_SETS, LABEL_SETS
 
 __all__ = ["InputSpec", "Manifest", "ModelFile", "OutputSpec", "Section", "load_manifest", "read_manifest"]

@@ -13,13 +13,13 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.config import FleetConfig
-from pipeline.errors import ModelError, ModelOutputError
-from pipeline.geometry.radar_grid import CHANNELS, SHAPE, Scan, ScanMemory, grid_layout, sector_of
+from pipeline.core.config import FleetConfig
+from pipeline.core.errors import ModelError, ModelOutputError
+from pipeline.core.rigs import OnnxDrivable
 from pipeline.perceive.drivable import FreeSector
 from pipeline.perceive.models.manifest import ModelFile, read_manifest
 from pipeline.perceive.models.session import Session
-from pipeline.rigs import OnnxDrivable
+from pipeline.rig.radar_grid import CHANNELS, SHAPE, Scan, ScanMemory, grid_layout, sector_of
 
 __all__ = ["RadarDrivable"]
 

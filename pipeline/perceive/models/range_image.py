@@ -22,13 +22,13 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from pydantic import Field, model_validator
 
-from pipeline.config import FleetConfig
-from pipeline.errors import ModelOutputError
-from pipeline.geometry.range_image import EMPTY, channels_of, project, vote_of_neighbours
+from pipeline.core.config import FleetConfig
+from pipeline.core.errors import ModelOutputError
+from pipeline.core.rigs import OnnxPointSemantics
 from pipeline.perceive.ground import PointKind
 from pipeline.perceive.models.manifest import ModelFile, Section, read_manifest
 from pipeline.perceive.models.session import Session
-from pipeline.rigs import OnnxPointSemantics
+from pipeline.rig.range_image import EMPTY, channels_of, project, vote_of_neighbours
 
 __all__ = ["POINT_LABEL_SETS", "RangeImageManifest", "RangeImageSegmenter"]
 

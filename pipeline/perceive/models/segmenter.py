@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from pipeline.errors import ModelOutputError
+from pipeline.core.errors import ModelOutputError
 from pipeline.perceive.labels import LABEL_COUNTS, VOID_ID, to_cityscapes
 from pipeline.perceive.models.manifest import Manifest
 from pipeline.perceive.models.session import AlikeCheck, Fit, Session, fit_image

@@ -13,8 +13,8 @@ import numpy as np
 import onnxruntime as ort
 from jaxtyping import Float32, UInt8
 
-from pipeline.errors import ModelError, ModelOutputError
-from pipeline.memory import MODEL_THREADS, usable_cpus
+from pipeline.core.errors import ModelError, ModelOutputError
+from pipeline.core.memory import MODEL_THREADS, usable_cpus
 from pipeline.perceive.models.manifest import InputSpec, ModelFile
 
 __all__ = ["AlikeCheck", "Fit", "Session", "fit_image", "model_threads", "open_session"]

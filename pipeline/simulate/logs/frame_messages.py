@@ -9,8 +9,8 @@ from typing import Any
 import cv2
 import numpy as np
 
+from pipeline.core.ros_messages import RosMessages
 from pipeline.rig.topics import topics_of
-from pipeline.ros_messages import RosMessages
 from pipeline.simulate.faults import DayFaults, misread, swapped_with
 from pipeline.simulate.sensors.data_sheets import LidarSpec, RadarSpec
 from pipeline.simulate.sensors.lidar import Sweep

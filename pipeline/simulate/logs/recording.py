@@ -8,7 +8,7 @@ from typing import Final, TypeVar
 
 import numpy as np
 
-from pipeline.geometry.se3 import from_rotation_translation
+from pipeline.rig.se3 import from_rotation_translation
 from pipeline.rig.topics import TOPICS
 from pipeline.simulate.faults import DayFaults
 from pipeline.simulate.logs.frame_messages import Sent, Setup, messages_of

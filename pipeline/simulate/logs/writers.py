@@ -11,8 +11,8 @@ from typing import Any, Final, NamedTuple
 from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import Writer as Bag2Writer
 
+from pipeline.core.ros_messages import McapLog, RosMessages
 from pipeline.rig.topics import TOPICS
-from pipeline.ros_messages import McapLog, RosMessages
 
 __all__ = ["CONTAINERS", "OpenLog", "log_name", "open_log"]
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int32
 
-from pipeline.geometry.cameras import Camera
+from pipeline.rig.cameras import Camera
 from pipeline.simulate.sensors.pixels import upsampled
 from pipeline.simulate.sensors.rolling_shutter import RollingShutter
 from pipeline.simulate.sensors.shading import Light, Sight, Surfaces, developed, shade

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.geometry.cameras import Camera
+from pipeline.rig.cameras import Camera
 
 __all__ = ["CameraSpec", "LidarSpec", "RadarSpec"]
 

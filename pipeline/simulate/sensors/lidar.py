@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.geometry.spherical import from_spherical
+from pipeline.rig.spherical import from_spherical
 from pipeline.simulate.sensors.beams import beams_of
 from pipeline.simulate.sensors.data_sheets import LidarSpec
 from pipeline.simulate.world.casting import Hits, Moment

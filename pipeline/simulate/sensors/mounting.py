@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.geometry.cameras import Camera
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse
+from pipeline.rig.cameras import Camera
+from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
 from pipeline.simulate.sensors.data_sheets import CameraSpec
 from pipeline.simulate.sensors.radar import RadarErrors
 from pipeline.simulate.sensors.rig_spec import RigSpec, SensorSpec, Triple

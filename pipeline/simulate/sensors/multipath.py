@@ -13,8 +13,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.geometry.se3 import inverse, transform_points
-from pipeline.geometry.spherical import from_spherical, to_spherical
+from pipeline.rig.se3 import inverse, transform_points
+from pipeline.rig.spherical import from_spherical, to_spherical
 
 __all__ = ["faded_by_road", "image_in_road"]
 

@@ -13,9 +13,9 @@ import numba
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.geometry.se3 import inverse, transform_points
-from pipeline.geometry.spherical import from_spherical, to_spherical
-from pipeline.rows import join_rows, take_rows
+from pipeline.core.rows import join_rows, take_rows
+from pipeline.rig.se3 import inverse, transform_points
+from pipeline.rig.spherical import from_spherical, to_spherical
 from pipeline.simulate.sensors.data_sheets import RadarSpec
 from pipeline.simulate.sensors.multipath import faded_by_road, image_in_road
 from pipeline.simulate.world.casting import Moment

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from pipeline.errors import ConfigError
+from pipeline.core.errors import ConfigError
 from pipeline.simulate.sensors.data_sheets import CameraSpec, LidarSpec, RadarSpec
 from pipeline.simulate.sensors.random_rigs import random_rig
 from pipeline.simulate.sensors.rig_spec import RigSpec, SensorSpec, short_rig

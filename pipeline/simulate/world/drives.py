@@ -13,7 +13,7 @@ from typing import Final, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.geometry.se3 import from_rotation_translation
+from pipeline.rig.se3 import from_rotation_translation
 from pipeline.simulate.world.landscapes import Landscape, landscape_named
 
 __all__ = ["Drive", "EgoMotion", "Motion", "Parked", "Road", "RoadLayout", "layout_of"]

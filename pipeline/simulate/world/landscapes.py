@@ -7,7 +7,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from pipeline.errors import ConfigError
+from pipeline.core.errors import ConfigError
 
 __all__ = ["LANDSCAPES", "WORLD", "Landscape", "landscape_named"]
 

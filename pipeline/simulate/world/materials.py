@@ -11,7 +11,7 @@ from typing import Final, NamedTuple, get_args
 
 import numpy as np
 
-from pipeline.rigs import StreetClass
+from pipeline.core.rigs import StreetClass
 
 __all__ = [
     "LABELS",

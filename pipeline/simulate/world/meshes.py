@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.rows import columns_of, join_rows, take_rows
+from pipeline.core.rows import columns_of, join_rows, take_rows
 from pipeline.simulate.world.materials import material
 
 __all__ = ["Colour", "Mesh", "MeshBuilder", "Number", "join", "placed"]

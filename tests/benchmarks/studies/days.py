@@ -23,9 +23,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.config import FleetConfig, load_fleet
-from pipeline.extrinsics.prior import read_prior
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation
+from pipeline.core.config import FleetConfig, load_fleet
+from pipeline.rig.day_prior import read_prior
+from pipeline.rig.se3 import exp_so3, from_rotation_translation
 from pipeline.simulate.faults import parse_faults
 from pipeline.simulate.fleet import FleetSpec, day_names, simulate_fleet
 from pipeline.simulate.logs.fleet_toml import fleet_toml

@@ -23,14 +23,14 @@ import numpy as np
 
 from pipeline.calibrate.day import calibrate_observations
 from pipeline.calibrate.records import Inputs
-from pipeline.config import FleetConfig, SolveConfig
-from pipeline.errors import SolveError
-from pipeline.extrinsics.estimates import Prior
-from pipeline.extrinsics.prior import perturbed, read_prior
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation
-from pipeline.geometry.targets import loop_errors
+from pipeline.core.config import FleetConfig, SolveConfig
+from pipeline.core.errors import SolveError
 from pipeline.learn.perception_training.radar_drivable.samples import scan_of
 from pipeline.perceive.models.radar_drivable import RadarDrivable
+from pipeline.rig.day_prior import perturbed, read_prior
+from pipeline.rig.estimates import Prior
+from pipeline.rig.se3 import exp_so3, from_rotation_translation
+from pipeline.rig.targets import loop_errors
 from pipeline.store.partitions import Partition
 from pipeline.verify.axes import check_axes, limits_of
 from schemas.calibrations import PAIRS, CalibrationRecord

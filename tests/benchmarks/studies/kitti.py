@@ -19,10 +19,10 @@ import numpy as np
 
 from pipeline.calibrate.day import calibrate_observations
 from pipeline.calibrate.records import Inputs
-from pipeline.config import FleetConfig, load_fleet
-from pipeline.extrinsics.estimates import Prior
-from pipeline.extrinsics.prior import perturbed, read_prior
-from pipeline.geometry.targets import errors_at_targets
+from pipeline.core.config import FleetConfig, load_fleet
+from pipeline.rig.day_prior import perturbed, read_prior
+from pipeline.rig.estimates import Prior
+from pipeline.rig.targets import errors_at_targets
 from pipeline.store.current import targets_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import observations_of

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.changes import change_between, change_covariance
-from pipeline.geometry.se3 import from_quaternion
-from pipeline.geometry.targets import errors_at_targets
+from pipeline.rig.changes import change_between, change_covariance
+from pipeline.rig.estimates import Prior
+from pipeline.rig.se3 import from_quaternion
+from pipeline.rig.targets import errors_at_targets
 from pipeline.store.current import targets_of
 from schemas.calibrations import CalibrationRecord
 

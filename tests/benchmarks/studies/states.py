@@ -38,7 +38,7 @@ from jobs.calibrate import calibrate
 from jobs.export import export
 from jobs.ingest import ingest
 from jobs.perceive import perceive
-from pipeline.errors import ConfigError
+from pipeline.core.errors import ConfigError
 from pipeline.export.formats import FORMATS
 from pipeline.simulate.fleet import day_names, simulate_vehicle_day
 from pipeline.simulate.sensors.rigs import rig_named

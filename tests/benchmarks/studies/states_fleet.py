@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation
+from pipeline.rig.se3 import exp_so3, from_rotation_translation
 from pipeline.simulate.faults import Fault
 from pipeline.simulate.fleet import FleetSpec, mounting_on
 from pipeline.simulate.logs.fleet_toml import mixed_fleet_toml

@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.config import VerifyConfig
-from pipeline.geometry.changes import change_between
-from pipeline.geometry.se3 import from_quaternion, inverse, transform_points
-from pipeline.geometry.spherical import camera_direction_angles, to_spherical, wrap_angle
-from pipeline.geometry.targets import DEFAULT_TARGETS
+from pipeline.core.config import VerifyConfig
+from pipeline.rig.changes import change_between
+from pipeline.rig.se3 import from_quaternion, inverse, transform_points
+from pipeline.rig.spherical import camera_direction_angles, to_spherical, wrap_angle
+from pipeline.rig.targets import DEFAULT_TARGETS
 from schemas.calibrations import DOF_NAMES
 from tests.benchmarks.studies.rates import rate
 

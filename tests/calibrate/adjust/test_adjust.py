@@ -8,11 +8,11 @@ import pytest
 from pipeline.calibrate.adjust.adjusted import AdjustmentLimits
 from pipeline.calibrate.adjust.equations import Rig, equations_at, left_jacobian_inverse
 from pipeline.calibrate.adjust.rig import adjust
-from pipeline.extrinsics.checks import FailedCheck
-from pipeline.geometry.se3 import compose_covariance, exp_se3, inverse, log_se3
+from pipeline.rig.checks import FailedCheck
 from pipeline.rig.evidence import EDGE, EdgeEvidence
 from pipeline.rig.extrinsics import Extrinsics
 from pipeline.rig.graph import RigGraph, Sensor, edge_between
+from pipeline.rig.se3 import compose_covariance, exp_se3, inverse, log_se3
 
 LIMITS = AdjustmentLimits(clock_sigma_s=0.02)
 PRIOR_SIGMA = np.array([np.radians(2.0)] * 3 + [0.05] * 3)

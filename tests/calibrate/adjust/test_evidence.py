@@ -10,12 +10,12 @@ from pipeline.calibrate.adjust.evidence import evidence_of
 from pipeline.calibrate.adjust.rig import adjust
 from pipeline.calibrate.adjust.three import EDGES, poses_of, three_sensors
 from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
-from pipeline.config import SolveConfig
-from pipeline.extrinsics.checks import FailedCheck
-from pipeline.extrinsics.estimates import PairEstimate, Prior
-from pipeline.geometry.changes import change_between, change_covariance, change_jacobian
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation, perturb_exactly
+from pipeline.core.config import SolveConfig
+from pipeline.rig.changes import change_between, change_covariance, change_jacobian
+from pipeline.rig.checks import FailedCheck
+from pipeline.rig.estimates import PairEstimate, Prior
 from pipeline.rig.evidence import EDGE
+from pipeline.rig.se3 import exp_so3, from_rotation_translation, perturb_exactly
 from tests.makers.camera_lidar import estimate_camera_lidar
 from tests.makers.radar_scenes import T_LIDAR_RADAR, street_day
 from tests.makers.solve_scenes import T_CAMERA_LIDAR

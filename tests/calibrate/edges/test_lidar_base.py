@@ -8,10 +8,10 @@ import pytest
 from pipeline.calibrate.edges.lidar_base import estimate_lidar_base
 from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.calibrate.verify.constancy import MOVED_SIGMAS, PART_FLOOR_RAD
-from pipeline.geometry.changes import change_between, change_jacobian
-from pipeline.geometry.se3 import adjoint, exp_se3, exp_so3, inverse, perturb_exactly
 from pipeline.objective.ego_motion import EgoMotion
+from pipeline.rig.changes import change_between, change_jacobian
 from pipeline.rig.graph import BASE, Edge, Sensor
+from pipeline.rig.se3 import adjoint, exp_se3, exp_so3, inverse, perturb_exactly
 from tests.makers.swept_streets import AROUND, Mounted, chosen, pose, swept_streets
 
 EDGE = Edge(Sensor("top", "lidar"), BASE)

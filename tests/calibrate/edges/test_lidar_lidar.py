@@ -9,10 +9,10 @@ from pipeline.calibrate.edges.lidar_lidar import LidarPair, _equations, _Moment,
 from pipeline.calibrate.edges.point_to_plane import Surfaces
 from pipeline.calibrate.verify.constancy import MOVED_SIGMAS, PART_FLOOR_RAD
 from pipeline.calibrate.verify.held_out_test import paired_test
-from pipeline.errors import SolveError
-from pipeline.geometry.changes import change_between, change_jacobian
-from pipeline.geometry.se3 import exp_se3, exp_so3, inverse, perturb_exactly, transform_points
+from pipeline.core.errors import SolveError
+from pipeline.rig.changes import change_between, change_jacobian
 from pipeline.rig.graph import Edge, Sensor
+from pipeline.rig.se3 import exp_se3, exp_so3, inverse, perturb_exactly, transform_points
 from pipeline.simulate.sensors.data_sheets import LidarSpec
 from tests.makers.swept_streets import AROUND, FORWARD, Mounted, chosen, pose, swept_streets
 

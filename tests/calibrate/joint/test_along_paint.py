@@ -7,9 +7,9 @@ import pytest
 
 from pipeline.calibrate.joint.camera_lidar.along_paint import _of_image, along_paint
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState
-from pipeline.geometry.se3 import inverse, transform_points
 from pipeline.objective.camera_lidar.points import Points
 from pipeline.objective.camera_lidar.score import KernelSettings, prepare_terms
+from pipeline.rig.se3 import inverse, transform_points
 from tests.makers.traced_scenes import DENSE, T_TRUE, traced_day
 
 STATE = AlignmentState(T_TRUE)

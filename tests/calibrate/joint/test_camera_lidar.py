@@ -14,11 +14,11 @@ from pipeline.calibrate.joint.camera_lidar.observability import time_offset_vari
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState
 from pipeline.calibrate.joint.camera_lidar.time_offset import TimeOffsetProfile
 from pipeline.calibrate.numerics.search_range import search_range
-from pipeline.config import SolveConfig
-from pipeline.errors import SolveError
-from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.changes import change_between, change_covariance
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse, log_so3, perturb_exactly
+from pipeline.core.config import SolveConfig
+from pipeline.core.errors import SolveError
+from pipeline.rig.changes import change_between, change_covariance
+from pipeline.rig.estimates import Prior
+from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse, log_so3, perturb_exactly
 from tests.makers.camera_lidar import estimate_camera_lidar
 from tests.makers.solve_scenes import make_day
 from tests.makers.traced_scenes import DENSE, SPARSE, T_TRUE, traced_day

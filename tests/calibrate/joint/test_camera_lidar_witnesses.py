@@ -8,9 +8,9 @@ import pytest
 from pipeline.calibrate.joint.camera_lidar import witnesses as parts
 from pipeline.calibrate.joint.camera_lidar.boxes import box_offsets
 from pipeline.calibrate.joint.camera_lidar.witnesses import Witness, disagreement, widening
-from pipeline.config import SolveConfig
-from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse, log_so3, perturb_exactly
+from pipeline.core.config import SolveConfig
+from pipeline.rig.estimates import Prior
+from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse, log_so3, perturb_exactly
 from schemas.observations import EDGE_BELOW
 from tests.makers.camera_lidar import estimate_camera_lidar
 from tests.makers.solve_scenes import T_CAMERA_LIDAR, make_day

@@ -13,11 +13,15 @@ from pipeline.calibrate.joint.camera_lidar.rotation_grid import grid_maxima
 from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
 from pipeline.calibrate.numerics.covariance import CLEARLY
 from pipeline.calibrate.numerics.search_range import SearchRange, search_range
-from pipeline.config import SolveConfig
-from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.cameras import camera_of
-from pipeline.geometry.changes import change_between
-from pipeline.geometry.se3 import (
+from pipeline.core.config import SolveConfig
+from pipeline.objective.camera_lidar.kernel_settings import MAX_GAP_PX
+from pipeline.objective.camera_lidar.own_motion import lidar_velocities
+from pipeline.objective.camera_lidar.points import Points
+from pipeline.objective.camera_lidar.score import Alignments, KernelSettings, prepare_terms
+from pipeline.rig.cameras import camera_of
+from pipeline.rig.changes import change_between
+from pipeline.rig.estimates import Prior
+from pipeline.rig.se3 import (
     exp_so3,
     from_rotation_translation,
     inverse,
@@ -25,10 +29,6 @@ from pipeline.geometry.se3 import (
     perturb_exactly,
     transform_points,
 )
-from pipeline.objective.camera_lidar.kernel_settings import MAX_GAP_PX
-from pipeline.objective.camera_lidar.own_motion import lidar_velocities
-from pipeline.objective.camera_lidar.points import Points
-from pipeline.objective.camera_lidar.score import Alignments, KernelSettings, prepare_terms
 from tests.makers.traced_scenes import DENSE, T_TRUE, traced_day
 
 REACH_RAD = np.radians(8.0)

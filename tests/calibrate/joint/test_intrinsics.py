@@ -8,10 +8,10 @@ import pytest
 from pipeline.calibrate.joint.camera_lidar.estimate import align_camera_lidar
 from pipeline.calibrate.joint.camera_lidar.intrinsics import DayIntrinsics, contradictions
 from pipeline.calibrate.joint.solve import solve_joint
-from pipeline.config import SolveConfig
-from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.se3 import perturb_exactly
-from pipeline.rigs import CameraPrior
+from pipeline.core.config import SolveConfig
+from pipeline.core.rigs import CameraPrior
+from pipeline.rig.estimates import Prior
+from pipeline.rig.se3 import perturb_exactly
 from schemas.calibrations import PAIRS
 from tests.makers.traced_scenes import DENSE, T_TRUE, traced_day
 

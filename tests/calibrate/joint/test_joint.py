@@ -9,11 +9,11 @@ from pipeline.calibrate.joint.camera_lidar.estimate import Aligned, AlignmentSta
 from pipeline.calibrate.joint.camera_lidar.initialise import Basin
 from pipeline.calibrate.joint.camera_lidar.intrinsics import DayIntrinsics
 from pipeline.calibrate.joint.solve import solve_joint
-from pipeline.config import SolveConfig
-from pipeline.extrinsics.estimates import PairEstimate, Prior
-from pipeline.geometry.se3 import exp_se3, log_se3, perturb_exactly
+from pipeline.core.config import SolveConfig
 from pipeline.objective.camera_lidar.kernel_settings import KernelSettings
 from pipeline.objective.ego_motion import mean_heading, shown_heading
+from pipeline.rig.estimates import PairEstimate, Prior
+from pipeline.rig.se3 import exp_se3, log_se3, perturb_exactly
 from schemas.calibrations import PAIRS
 from tests.makers.radar_scenes import T_LIDAR_RADAR, street_day
 from tests.makers.solve_scenes import T_CAMERA_LIDAR

@@ -9,11 +9,11 @@ from pipeline.calibrate.joint.camera_lidar.left_out import left_out
 from pipeline.calibrate.joint.camera_lidar.observability import along_the_way
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, Scored, refine
 from pipeline.calibrate.numerics.bias_floors import EDGE_SIDE_ALONE
-from pipeline.config import SolveConfig
-from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.changes import change_between, change_jacobian
+from pipeline.core.config import SolveConfig
 from pipeline.objective.camera_lidar.label_width import OUTWARD, label_width_px, widened
 from pipeline.objective.camera_lidar.score import KernelSettings, prepare_terms
+from pipeline.rig.changes import change_between, change_jacobian
+from pipeline.rig.estimates import Prior
 from schemas.observations import EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
 from tests.makers.traced_scenes import DENSE, T_TRUE, traced_day
 

@@ -9,9 +9,9 @@ from pipeline.calibrate.joint.camera_lidar.left_out_in_time import left_out_in_t
 from pipeline.calibrate.joint.camera_lidar.observability import IS_TZ
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, Scored
 from pipeline.calibrate.joint.camera_lidar.time_offset import DT, TimeOffsetProfile, profile_time_offset
-from pipeline.config import SolveConfig
-from pipeline.extrinsics.estimates import Prior
+from pipeline.core.config import SolveConfig
 from pipeline.objective.camera_lidar.score import KernelSettings, prepare_terms
+from pipeline.rig.estimates import Prior
 from tests.makers.camera_lidar import estimate_camera_lidar
 from tests.makers.traced_scenes import DENSE, T_TRUE, traced_day
 

@@ -9,13 +9,13 @@ from pipeline.calibrate.joint import camera_radar
 from pipeline.calibrate.joint.camera_radar import estimate_camera_radar
 from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
 from pipeline.calibrate.verify.constancy import MOVED_SIGMAS, PART_FLOOR_RAD
-from pipeline.config import SolveConfig
-from pipeline.errors import SolveError
-from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.changes import change_between, change_covariance
-from pipeline.geometry.se3 import exp_se3, exp_so3, log_se3, perturb_exactly
-from pipeline.geometry.spherical import from_spherical, to_spherical
+from pipeline.core.config import SolveConfig
+from pipeline.core.errors import SolveError
 from pipeline.objective.radar.moving_clusters import camera_radar_cost
+from pipeline.rig.changes import change_between, change_covariance
+from pipeline.rig.estimates import Prior
+from pipeline.rig.se3 import exp_se3, exp_so3, log_se3, perturb_exactly
+from pipeline.rig.spherical import from_spherical, to_spherical
 from tests.makers.radar_errors import bounced, elevated
 from tests.makers.radar_scenes import DT_S, GROUND_M, T_LIDAR_RADAR, street_day
 from tests.makers.solve_scenes import T_CAMERA_LIDAR

@@ -7,10 +7,10 @@ import pytest
 
 from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
 from pipeline.calibrate.joint.lidar_radar.radar_velocity import contradicts_odometry, turns_unmeasured
-from pipeline.config import SolveConfig
-from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.changes import change_between, change_covariance
-from pipeline.geometry.se3 import exp_so3
+from pipeline.core.config import SolveConfig
+from pipeline.rig.changes import change_between, change_covariance
+from pipeline.rig.estimates import Prior
+from pipeline.rig.se3 import exp_so3
 from tests.makers.radar_scenes import T_LIDAR_RADAR, street_day
 from tests.makers.solve_scenes import T_CAMERA_LIDAR
 

@@ -6,10 +6,10 @@ import pytest
 from pipeline.calibrate.joint.camera_lidar import refine as module
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, Scored, prior_value, refine, scales
 from pipeline.calibrate.joint.camera_lidar.time_offset import far_time_offset
-from pipeline.config import SolveConfig
-from pipeline.extrinsics.estimates import Prior
+from pipeline.core.config import SolveConfig
 from pipeline.objective.camera_lidar.own_motion import lidar_velocities
 from pipeline.objective.camera_lidar.score import KernelSettings, prepare_terms
+from pipeline.rig.estimates import Prior
 from tests.makers.traced_scenes import DENSE, T_TRUE, traced_day
 
 SHARP = KernelSettings.wide(1.5, 2)

@@ -5,8 +5,8 @@ import pytest
 from pydantic import ValidationError
 
 from pipeline.calibrate.joint.solve import solve_joint
-from pipeline.config import TERMS, SolveConfig
-from pipeline.extrinsics.estimates import Prior
+from pipeline.core.config import TERMS, SolveConfig
+from pipeline.rig.estimates import Prior
 from schemas.calibrations import PAIRS
 from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
 

@@ -10,7 +10,7 @@ from pipeline.calibrate.joint.lidar_radar.tilt_floors import (
     tempered,
     tilt_of,
 )
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation
+from pipeline.rig.se3 import exp_so3, from_rotation_translation
 
 FLOOR = np.array([0.02, 0.004, 0.1])  # of the radar's own roll, pitch [rad] and z [m]
 

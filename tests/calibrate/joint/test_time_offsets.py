@@ -11,12 +11,12 @@ from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
 from pipeline.calibrate.joint.lidar_radar.problem import RadarProblem, RadarState
 from pipeline.calibrate.joint.lidar_radar.schedule import SCHEDULE
 from pipeline.calibrate.joint.lidar_radar.time_offset import dips
-from pipeline.config import SolveConfig
-from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.se3 import inverse, transform_points
-from pipeline.geometry.spherical import from_spherical, to_spherical
+from pipeline.core.config import SolveConfig
 from pipeline.objective.radar.moving_clusters import moving_clusters
 from pipeline.objective.radar.registration import registration_frames
+from pipeline.rig.estimates import Prior
+from pipeline.rig.se3 import inverse, transform_points
+from pipeline.rig.spherical import from_spherical, to_spherical
 from tests.makers.radar_scenes import DT_S, SIGMA, T_LIDAR_RADAR, street_day
 from tests.makers.solve_scenes import T_CAMERA_LIDAR
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.verify.constancy import MOVED_SIGMAS, PART_FLOOR_RAD
-from pipeline.config import SolveConfig
-from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse, log_so3, perturb_exactly
+from pipeline.core.config import SolveConfig
+from pipeline.rig.estimates import Prior
+from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse, log_so3, perturb_exactly
 from tests.makers.camera_lidar import estimate_camera_lidar
 from tests.makers.traced_scenes import DENSE, SPARSE, T_TRUE, traced_day, without_labels
 

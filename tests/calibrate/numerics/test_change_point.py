@@ -5,7 +5,7 @@ import pytest
 
 from pipeline.calibrate.numerics.change_point import likeliest_cut, parts_of_day
 from pipeline.calibrate.verify.constancy import MOVED_SIGMAS, PART_FLOOR_RAD
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation
+from pipeline.rig.se3 import exp_so3, from_rotation_translation
 
 NOISE_RAD = np.radians(0.3)  # of a frame
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.extrinsics.common_share import common_of, common_part, prior_share
+from pipeline.rig.common_share import common_of, common_part, prior_share
 
 
 def _covariance(rng: np.random.Generator, scale: float = 1.0) -> np.ndarray:

@@ -8,12 +8,12 @@ from pipeline.calibrate.paper.joint_optimisation import joint_costs, solve_joint
 from pipeline.calibrate.paper.minimise import minimise
 from pipeline.calibrate.paper.pairwise import pair_problem, solve_pairwise
 from pipeline.calibrate.paper.sandwich import sandwich_covariance
-from pipeline.config import SolveConfig
-from pipeline.errors import ConfigError
-from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.changes import changed
-from pipeline.geometry.se3 import exp_so3, perturb_exactly, rotation_angle_rad
-from pipeline.geometry.targets import errors_at_targets
+from pipeline.core.config import SolveConfig
+from pipeline.core.errors import ConfigError
+from pipeline.rig.changes import changed
+from pipeline.rig.estimates import Prior
+from pipeline.rig.se3 import exp_so3, perturb_exactly, rotation_angle_rad
+from pipeline.rig.targets import errors_at_targets
 from schemas.calibrations import METHODS as METHOD_NAMES
 from schemas.calibrations import PAIRS
 from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
@@ -157,7 +157,7 @@ def test_sandwich_covariance_is_that_of_the_mean_for_independent_quadratic_losse
     centres = rng.normal(size=(4000, 6)) * sigma
 
     def frame_losses(T):
-        from pipeline.geometry.se3 import log_se3
+        from pipeline.rig.se3 import log_se3
 
         return (((log_se3(T)[:, None] - centres[None]) / sigma) ** 2).sum(axis=2)
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.paper.triggers import exceeded, trigger_metrics
-from pipeline.config import TriggerConfig
-from pipeline.geometry.se3 import exp_so3
+from pipeline.core.config import TriggerConfig
+from pipeline.rig.se3 import exp_so3
 from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
 
 

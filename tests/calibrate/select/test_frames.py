@@ -13,7 +13,7 @@ from pipeline.calibrate.select.frames import (
     select_frames,
     unmet_conditions,
 )
-from pipeline.config import SelectConfig
+from pipeline.core.config import SelectConfig
 from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, SENSORS
 from schemas.faults import FAULTS
 from tests.makers.solve_scenes import make_day

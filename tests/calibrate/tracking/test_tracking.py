@@ -19,10 +19,10 @@ from pipeline.calibrate.tracking.object_tracks import (
     turn_between,
 )
 from pipeline.calibrate.tracking.solve import PairTracks, calibrate_pair, solve_tracking
-from pipeline.config import SolveConfig
-from pipeline.errors import SolveError
-from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse, log_so3, transform_points
+from pipeline.core.config import SolveConfig
+from pipeline.core.errors import SolveError
+from pipeline.rig.estimates import Prior
+from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse, log_so3, transform_points
 from schemas.calibrations import PAIRS
 from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
 

@@ -8,9 +8,9 @@ import pytest
 from pipeline.calibrate.half_days import half_days_of
 from pipeline.calibrate.numerics.change_point import with_parts
 from pipeline.calibrate.verify.constancy import constancy_failures, moved_failures
-from pipeline.extrinsics.estimates import DayParts, PairEstimate
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse
 from pipeline.rig.edges import edge_named
+from pipeline.rig.estimates import DayParts, PairEstimate
+from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
 from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR
 
 CUT_NS = (1772447400 * 10**9, 1772447700 * 10**9)  # 10:30:00 and 10:35:00 UTC

@@ -10,10 +10,10 @@ from pipeline.calibrate.verify import held_out_score as held_out_score_module
 from pipeline.calibrate.verify.held_out_score import held_out_score
 from pipeline.calibrate.verify.held_out_update import held_out_update
 from pipeline.calibrate.verify.target_accuracy import claims_of
-from pipeline.config import SolveConfig
-from pipeline.extrinsics.estimates import PairEstimate, Prior
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation, log_so3
-from pipeline.geometry.spherical import from_spherical
+from pipeline.core.config import SolveConfig
+from pipeline.rig.estimates import PairEstimate, Prior
+from pipeline.rig.se3 import exp_so3, from_rotation_translation, log_so3
+from pipeline.rig.spherical import from_spherical
 from tests.makers.radar_scenes import DT_S, GROUND_M, T_LIDAR_RADAR, street_day
 from tests.makers.traced_scenes import DENSE, ROAD, SPARSE, T_TRUE, TERRAIN, traced_day
 

@@ -6,10 +6,10 @@ import pytest
 from pipeline.calibrate.verify.held_out_score import held_out_score
 from pipeline.calibrate.verify.held_out_search import found_elsewhere, held_out_place
 from pipeline.calibrate.verify.target_accuracy import claims_of
-from pipeline.config import SolveConfig
-from pipeline.extrinsics.estimates import PairEstimate, Prior
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation, log_so3
-from pipeline.geometry.targets import DEFAULT_TARGETS
+from pipeline.core.config import SolveConfig
+from pipeline.rig.estimates import PairEstimate, Prior
+from pipeline.rig.se3 import exp_so3, from_rotation_translation, log_so3
+from pipeline.rig.targets import DEFAULT_TARGETS
 from tests.makers.solve_scenes import T_LIDAR_RADAR
 from tests.makers.traced_scenes import DENSE, T_TRUE, traced_day
 

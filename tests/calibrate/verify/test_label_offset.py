@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.calibrate.verify.day_labels import day_labels
 from pipeline.calibrate.verify.label_offset import measure_label_offset
-from pipeline.extrinsics.estimates import PairEstimate, Solution
+from pipeline.rig.estimates import PairEstimate, Solution
 from schemas.calibrations import PAIRS
 from tests.makers.label_pictures import HEIGHT, WIDTH, gradients_of
 from tests.makers.solve_scenes import make_day

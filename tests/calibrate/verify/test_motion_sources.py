@@ -7,8 +7,8 @@ import pytest
 
 from pipeline.calibrate.verify.motion_sources import compared_sources
 from pipeline.calibrate.verify.sweep_motion import sweep_motion
-from pipeline.geometry.se3 import exp_so3
 from pipeline.objective.camera_lidar.own_motion import lidar_velocities
+from pipeline.rig.se3 import exp_so3
 from schemas.calibrations import PAIRS
 from tests.makers.solve_scenes import T_LIDAR_RADAR, make_day
 

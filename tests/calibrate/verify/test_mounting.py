@@ -8,12 +8,12 @@ import pytest
 from pipeline.calibrate.numerics.bias_floors import RADAR_ELEVATION_BIAS_RAD
 from pipeline.calibrate.verify.mounting import camera_turn_sigma_rad, mounting_covariance
 from pipeline.calibrate.verify.target_accuracy import DIRECTIONS, claims_of
-from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation
-from pipeline.geometry.target_sigmas import target_sigmas
-from pipeline.geometry.targets import errors_at_targets
+from pipeline.core.rigs import CameraPrior, CameraTopics
 from pipeline.report.day import pair_view
-from pipeline.rigs import CameraPrior, CameraTopics
+from pipeline.rig.estimates import PairEstimate, Prior, Solution
+from pipeline.rig.se3 import exp_so3, from_rotation_translation
+from pipeline.rig.target_sigmas import target_sigmas
+from pipeline.rig.targets import errors_at_targets
 from tests.benchmarks.studies.metrics import transform_of
 from tests.calibrate.test_contradictions import records_of
 from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR

@@ -7,9 +7,9 @@ import pytest
 
 from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
 from pipeline.calibrate.verify.prior_alarms import clock_alarms, edge_alarms, prior_alarms
-from pipeline.config import ChecksConfig, SolveConfig
-from pipeline.extrinsics.estimates import PairEstimate, Prior
-from pipeline.geometry.changes import change_jacobian
+from pipeline.core.config import ChecksConfig, SolveConfig
+from pipeline.rig.changes import change_jacobian
+from pipeline.rig.estimates import PairEstimate, Prior
 from tests.makers.radar_scenes import T_LIDAR_RADAR, street_day
 from tests.makers.solve_scenes import T_CAMERA_LIDAR
 

@@ -12,8 +12,8 @@ from pipeline.calibrate.verify.target_accuracy import (
     target_jacobian,
     target_sigmas,
 )
-from pipeline.geometry.se3 import exp_se3, exp_so3, from_rotation_translation
-from pipeline.geometry.targets import errors_at_targets
+from pipeline.rig.se3 import exp_se3, exp_so3, from_rotation_translation
+from pipeline.rig.targets import errors_at_targets
 
 AXES = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # camera from lidar
 T_CAMERA = from_rotation_translation(AXES, np.array([0.1, -0.3, -0.5]))

@@ -11,11 +11,11 @@ from pipeline.calibrate.verify.failed_checks import heading_failures, loop_failu
 from pipeline.calibrate.verify.held_out_test import HeldOutTest, paired_test
 from pipeline.calibrate.verify.target_accuracy import DIRECTIONS, Claim
 from pipeline.calibrate.verify.verdict import Evidence, judge
-from pipeline.config import ChecksConfig
-from pipeline.extrinsics.checks import FailedCheck
-from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
-from pipeline.geometry.se3 import exp_se3, exp_so3, from_rotation_translation
-from pipeline.geometry.targets import DEFAULT_TARGETS
+from pipeline.core.config import ChecksConfig
+from pipeline.rig.checks import FailedCheck
+from pipeline.rig.estimates import PairEstimate, Prior, Solution
+from pipeline.rig.se3 import exp_se3, exp_so3, from_rotation_translation
+from pipeline.rig.targets import DEFAULT_TARGETS
 from tests.makers.solve_scenes import make_day
 
 PRIOR = Prior(np.eye(4), np.eye(4), np.radians(2), 0.05)
@@ -62,7 +62,7 @@ DEG = np.radians(1.0)
         ("camera_lidar", (0.0, 0.0, 0.0, 0.0, 0.1, 0.0), "held", ()),  # up to .4 deg of near targets
         ("lidar_radar", (0.0, 0.0, 0.15 * DEG, 0.0, 0.0, 0.0), "accepted", ("azimuth", "elevation")),
         ("lidar_radar", (0.0, 0.0, 0.5 * DEG, 0.0, 0.0, 0.0), "held", ()),
-        ("lidar_radar", (0.0, 3 * DEG, 0.0, 0.0, 0.0, 0.0), "accepted", ("azimuth",)),  # pitch: no matter for its azimuth
+        ("lidar_radar", (0.0, 3 * DEG, 0.0, 0.0, 0.0, 0.0), "accepted", ("azimuth",)),  # its azimuth stands
         ("lidar_radar", (0.0, 0.0, 0.0, 0.4, 0.0, 0.0), "held", ()),  # along the line of sight
         ("lidar_lidar", (0.0, 3 * DEG, 0.0, 0.0, 0.0, 0.0), "accepted", ("azimuth",)),
         ("lidar_lidar", (0.0, 3 * DEG, 3 * DEG, 0.0, 0.0, 0.0), "held", ()),

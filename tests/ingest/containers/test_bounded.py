@@ -12,7 +12,7 @@ import lz4.frame
 import pytest
 import zstandard
 
-from pipeline.errors import LogError
+from pipeline.core.errors import LogError
 from pipeline.ingest.containers import rosbag2_folder
 from pipeline.ingest.containers.bounded import unpack_bz2, unpack_lz4, unpack_zstd
 from pipeline.ingest.containers.reader import content_identity, open_log

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import zstandard
 
-from pipeline.geometry.se3 import to_quaternion
+from pipeline.rig.se3 import to_quaternion
 
 CONTAINERS = (
     "mcap",

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.errors import BoresightError
+from pipeline.core.errors import BoresightError
 from schemas.calibrations import SENSORS
 
 TRIALS = 20  # per container and kind of damage: 20 x 3 x 3 logs

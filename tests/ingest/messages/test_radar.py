@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from pipeline.core.rigs import RadarTopics
 from pipeline.ingest.messages.radar import read_radar
-from pipeline.rigs import RadarTopics
 
 
 def config(**fields):

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.errors import MissingExtraError
+from pipeline.core.errors import MissingExtraError
 from pipeline.ingest.messages.video import VideoPictures
 from tests.makers import foxglove_logs
 

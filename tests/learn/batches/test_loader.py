@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.errors import ContractError
+from pipeline.core.errors import ContractError
 from pipeline.learn.batches.loader import TrainingLoader, load_split
 from pipeline.learn.prepare.survey import plan_days, survey_day
 from pipeline.store.partitions import Partition

@@ -11,9 +11,7 @@ import pytest
 import torch
 from onnxruntime import InferenceSession
 
-from pipeline.errors import ModelError
-from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.se3 import exp_so3, transform_points
+from pipeline.core.errors import ModelError
 from pipeline.learn.batches.collate import collate
 from pipeline.learn.export.onnx_file import export_onnx
 from pipeline.learn.infer.compiled_rendering import frame_sensors, render_frame
@@ -26,6 +24,8 @@ from pipeline.learn.network.views import render
 from pipeline.learn.sample.frame_sample import About, make_row
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import NetworkConfig
+from pipeline.rig.estimates import Prior
+from pipeline.rig.se3 import exp_so3, transform_points
 from schemas.training import GRID_CLASSES
 from schemas.versions import CODE_VERSION
 from tests.makers import solve_scenes, training_lakes

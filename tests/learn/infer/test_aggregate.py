@@ -7,10 +7,10 @@ import pytest
 from scipy.stats import chi2
 
 from pipeline.calibrate.verify.target_accuracy import target_sigmas
-from pipeline.geometry.se3 import exp_se3, inverse, log_se3
-from pipeline.geometry.targets import errors_at_targets
 from pipeline.learn.infer import aggregate
 from pipeline.learn.infer.aggregate import Answers, day_estimate, twists_about
+from pipeline.rig.se3 import exp_se3, inverse, log_se3
+from pipeline.rig.targets import errors_at_targets
 from tests.makers.solve_scenes import T_CAMERA_LIDAR
 
 PRIOR_SD = np.array([*np.radians([1.2] * 3), *[0.05] * 3])

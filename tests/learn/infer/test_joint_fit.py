@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.se3 import exp_se3, inverse, log_se3, transform_points
 from pipeline.learn.infer.class_evidence import FrameEvidence, scores
 from pipeline.learn.infer.joint_day import fitted_day
 from pipeline.learn.infer.joint_fit import climbed, fit_of, rival_score, voted
 from pipeline.learn.sample.grid import Grid
+from pipeline.rig.estimates import Prior
+from pipeline.rig.se3 import exp_se3, inverse, log_se3, transform_points
 from schemas.training import GRID_CLASSES
 from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR
 

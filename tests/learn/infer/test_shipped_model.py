@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.networks import calibrate_frame
-from pipeline.config import LearnConfig, PrepareConfig
-from pipeline.geometry.targets import errors_at_targets
+from pipeline.core.config import LearnConfig, PrepareConfig
+from pipeline.core.stage_work import Task
 from pipeline.learn.infer.onnx_networks import SHIPPED, model_files, open_networks
-from pipeline.stage_work import Task
+from pipeline.rig.targets import errors_at_targets
 from schemas.calibrations import PAIRS
 from tests.makers.simulated_days import simulated_day
 

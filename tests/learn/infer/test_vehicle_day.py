@@ -9,9 +9,7 @@ import pytest
 import torch
 
 from jobs.cli import main
-from pipeline.errors import ConfigError, ModelError, SolveError
-from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.se3 import exp_se3, inverse, log_se3
+from pipeline.core.errors import ConfigError, ModelError, SolveError
 from pipeline.learn.export.onnx_file import export_onnx
 from pipeline.learn.infer.frame_network import FrameAnswer
 from pipeline.learn.infer.onnx_networks import model_files, models_key, open_networks
@@ -19,6 +17,8 @@ from pipeline.learn.infer.vehicle_day import single_frame_solution, solve_by_net
 from pipeline.learn.network.calibration_network import build_network
 from pipeline.learn.sample.frame_sample import SampleReason, SampleRejectedError
 from pipeline.learn.sample.layout import NetworkConfig
+from pipeline.rig.estimates import Prior
+from pipeline.rig.se3 import exp_se3, inverse, log_se3
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
@@ -266,7 +266,7 @@ def test_one_frame_on_the_command_line_prints_transforms_and_records_nothing(lak
 
 
 def test_another_model_is_other_work(lake, tmp_path):
-    from pipeline.config import load_fleet
+    from pipeline.core.config import load_fleet
 
     fleet = load_fleet(lake / "fleet.toml")
     files = model_files("joint-ssl", fleet)
@@ -287,7 +287,7 @@ def with_bias(path, out, bias):
 
 
 def test_a_card_may_say_by_what_all_answers_are_off_alike(lake, tmp_path):
-    from pipeline.config import load_fleet
+    from pipeline.core.config import load_fleet
 
     fleet = load_fleet(lake / "fleet.toml")
     files = model_files("joint-ssl", fleet)
@@ -320,7 +320,7 @@ def test_a_missing_model_names_its_key(lake, tmp_path):
 
 
 def test_a_day_without_frames_is_refused_not_crashed(lake, tmp_path):
-    from pipeline.config import load_fleet
+    from pipeline.core.config import load_fleet
 
     training_lakes.fill(Lake.at(tmp_path), "a", "2026-01-01", 24)
     Lake.at(tmp_path).file("moments", DAY).unlink()

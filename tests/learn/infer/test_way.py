@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.extrinsics.estimates import PairEstimate, Prior, Solution
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation, inverse, log_se3
 from pipeline.learn.infer.pitch_by_travel import WayTurn, informed_by_way, updated_by_way, way_turn
+from pipeline.rig.estimates import PairEstimate, Prior, Solution
+from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse, log_se3
 from schemas.calibrations import PAIRS
 from tests.makers.doppler_streets import GROUND_M, T_LIDAR_RADAR, day_of, scene, turned
 from tests.makers.solve_scenes import T_CAMERA_LIDAR

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.extrinsics.estimates import Prior
 from pipeline.learn.batches.batch import TrainingBatch
 from pipeline.learn.batches.collate import collate
 from pipeline.learn.network.calibration_network import build_network
@@ -18,6 +17,7 @@ from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import GRAPH_INPUTS, PAIRS, NetworkConfig
 from pipeline.learn.train.semantics_loss import class_of_points, semantics_loss
 from pipeline.objective.differentiable.poses import transform_points
+from pipeline.rig.estimates import Prior
 from schemas.training import UNKNOWN_CLASS
 from tests.makers import solve_scenes, training_lakes
 

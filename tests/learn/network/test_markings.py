@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.geometry.se3 import exp_so3
 from pipeline.learn.infer.compiled_rendering import _marks
 from pipeline.learn.network.markings import log_markings, mark_strength
 from pipeline.learn.network.matching_network import MatchingCore
 from pipeline.learn.network.outputs import pose_of_twist
 from pipeline.learn.sample.grid import Grid, grid_rays
 from pipeline.learn.sample.layout import LIDAR_CHANNELS, LIDAR_FEATURES, MARKED_POINTS
+from pipeline.rig.se3 import exp_so3
 
 GRID = Grid()
 INTENSITY, GROUND = (2 + LIDAR_FEATURES.index(name) for name in ("intensity", "ground"))

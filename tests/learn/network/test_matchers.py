@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.geometry.se3 import exp_se3, exp_so3
-from pipeline.geometry.spherical import camera_direction_angles, to_spherical
 from pipeline.learn.network.class_matcher import NEUTRAL, ClassMatcher
 from pipeline.learn.network.encoders import LidarEncoder
 from pipeline.learn.network.least_squares import (
@@ -21,6 +19,8 @@ from pipeline.learn.network.occupancy_matcher import OccupancyMatcher, _away, _k
 from pipeline.learn.network.outputs import pose_of_twist
 from pipeline.learn.sample.grid import Grid, grid_rays
 from pipeline.learn.sample.layout import CAMERA_CHANNELS, CLASS_CHANNELS
+from pipeline.rig.se3 import exp_se3, exp_so3
+from pipeline.rig.spherical import camera_direction_angles, to_spherical
 from schemas.training import GRID_CLASSES
 
 GRID = Grid()

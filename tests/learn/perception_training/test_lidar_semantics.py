@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.errors import ConfigError, ContractError
-from pipeline.geometry.range_image import EMPTY
-from pipeline.geometry.se3 import transform_points
+from pipeline.core.errors import ConfigError, ContractError
+from pipeline.core.rows import take_rows
 from pipeline.learn.perception_training.lidar_semantics.labels import (
     KIND_OF_LABEL,
     KINDS,
@@ -37,7 +36,8 @@ from pipeline.learn.perception_training.lidar_semantics.training import (
 from pipeline.learn.train.checkpoints import load_checkpoint
 from pipeline.perceive.ground import PointKind
 from pipeline.perceive.models.range_image import POINT_LABEL_SETS, RangeImageSegmenter
-from pipeline.rows import take_rows
+from pipeline.rig.range_image import EMPTY
+from pipeline.rig.se3 import transform_points
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import observations_of
 from tests.makers.lakes import write_observations

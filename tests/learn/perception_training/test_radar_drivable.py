@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.config import load_fleet
-from pipeline.errors import ConfigError, ContractError
-from pipeline.geometry.radar_grid import cell_centres, sector_mask, sector_of
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation
+from pipeline.core.config import load_fleet
+from pipeline.core.errors import ConfigError, ContractError
+from pipeline.core.rows import take_rows
 from pipeline.learn.perception_training.radar_drivable.network import build_drivable_network
 from pipeline.learn.perception_training.radar_drivable.samples import (
     BLOCKED,
@@ -30,7 +29,8 @@ from pipeline.learn.perception_training.radar_drivable.training import (
 )
 from pipeline.learn.train.checkpoints import load_checkpoint
 from pipeline.perceive.drivable import free_sector
-from pipeline.rows import take_rows
+from pipeline.rig.radar_grid import cell_centres, sector_mask, sector_of
+from pipeline.rig.se3 import exp_so3, from_rotation_translation
 from pipeline.store.partitions import Lake, Partition
 from tests.makers.fleet_files import fleet_toml
 from tests.makers.lakes import write_observations

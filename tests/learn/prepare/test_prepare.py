@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from jobs.cli import main
-from pipeline.config import load_fleet
-from pipeline.errors import ContractError
-from pipeline.geometry.se3 import exp_se3
+from pipeline.core.config import load_fleet
+from pipeline.core.errors import ContractError
 from pipeline.learn.prepare.inventory import alike, read_leaks, take_inventory, write_inventory
 from pipeline.learn.prepare.sides import frame_sides
 from pipeline.learn.prepare.survey import plan_days, survey_day
+from pipeline.rig.se3 import exp_se3
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_manifest, read_rows
 from pipeline.store.views import frames_of, observations_of, perceived_days

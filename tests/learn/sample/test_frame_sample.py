@@ -7,10 +7,6 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.cameras import Camera
-from pipeline.geometry.se3 import transform_points
-from pipeline.geometry.spherical import camera_direction_angles
 from pipeline.learn.sample.camera_maps import camera_features, class_likelihood, stored_grid
 from pipeline.learn.sample.clouds import range_edges
 from pipeline.learn.sample.frame_sample import (
@@ -22,6 +18,10 @@ from pipeline.learn.sample.frame_sample import (
     sensor_row,
 )
 from pipeline.learn.sample.grid import grid_rays, resample_camera
+from pipeline.rig.cameras import Camera
+from pipeline.rig.estimates import Prior
+from pipeline.rig.se3 import transform_points
+from pipeline.rig.spherical import camera_direction_angles
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
 from schemas.training import DISTANCE_GROUPS, GRID_CLASSES, NO_EDGE, POINT_IS_EDGE, POINT_IS_GROUND
 from tests.makers import solve_scenes, training_lakes

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.geometry.cameras import Camera
-from pipeline.geometry.se3 import exp_so3
-from pipeline.geometry.spherical import camera_direction_angles
 from pipeline.learn.infer.compiled_rendering import compiled_nearest_points
 from pipeline.learn.network.rendering import nearest_points, paint
 from pipeline.learn.sample.grid import Grid, grid_rays, resample_camera
+from pipeline.rig.cameras import Camera
+from pipeline.rig.se3 import exp_so3
+from pipeline.rig.spherical import camera_direction_angles
 
 GRID = Grid()
 WIDE = np.array([[900.0, 0, 911.5], [0, 920, 469.5], [0, 0, 1]])

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.geometry import se3
 from pipeline.learn.train.augment import random_guess, turned_view
 from pipeline.learn.train.frame_objective import PAIR_OF_TERM, frame_objective, weighted
 from pipeline.learn.train.running_mean import DayMeans, twist_between, uncertainty_loss
 from pipeline.learn.train.settings import PAIRS_OF, AugmentConfig, LossConfig
 from pipeline.objective.differentiable.poses import exp_so3, pose, transform_points
 from pipeline.objective.differentiable.terms import soft_clamp, soft_minimum
+from pipeline.rig import se3
 from schemas.training import UNKNOWN_CLASS
 from tests.makers.loss_landscapes import PAIRS, TOLERANCE, day_batch, minima, with_true_clocks
 from tests.makers.simulated_days import simulated_day

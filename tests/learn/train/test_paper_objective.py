@@ -6,9 +6,7 @@ import torch
 
 from pipeline.calibrate.paper.joint_optimisation import joint_costs
 from pipeline.calibrate.paper.pairwise import pair_problem
-from pipeline.errors import ConfigError
-from pipeline.extrinsics.prior import read_prior
-from pipeline.geometry.changes import changed
+from pipeline.core.errors import ConfigError
 from pipeline.learn.batches.collate import collate
 from pipeline.learn.sample.frame_sample import About, make_row
 from pipeline.learn.train.metrics import read_metrics
@@ -17,6 +15,8 @@ from pipeline.learn.train.run import TrainRequest, train
 from pipeline.learn.train.run_state import network_of_run
 from pipeline.learn.train.settings import PAIRS_OF, load_train_config
 from pipeline.objective.paper.loop import loop_loss, loop_transform
+from pipeline.rig.changes import changed
+from pipeline.rig.day_prior import read_prior
 from pipeline.store.partitions import Partition
 from pipeline.store.tables import write_partition
 from pipeline.store.views import frames_of

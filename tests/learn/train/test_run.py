@@ -14,8 +14,7 @@ import pytest
 import torch
 
 from jobs.train import parse_duration
-from pipeline.errors import ConfigError, ContractError
-from pipeline.extrinsics.prior import read_prior
+from pipeline.core.errors import ConfigError, ContractError
 from pipeline.learn.network.calibration_network import build_network
 from pipeline.learn.sample.frame_sample import About, make_row
 from pipeline.learn.sample.layout import NetworkConfig
@@ -25,6 +24,7 @@ from pipeline.learn.train.run import TrainRequest, train
 from pipeline.learn.train.run_state import network_of_run
 from pipeline.learn.train.schedule import DivergedError, DivergenceGuard, cosine_rate
 from pipeline.learn.train.settings import TrainConfig, load_train_config
+from pipeline.rig.day_prior import read_prior
 from pipeline.store.partitions import Partition
 from pipeline.store.tables import write_partition
 from pipeline.store.views import frames_of

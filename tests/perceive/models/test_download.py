@@ -14,11 +14,11 @@ from pathlib import Path
 import pytest
 
 from jobs.cli import main
-from pipeline import third_party_models
-from pipeline.errors import DownloadError
+from pipeline.core import third_party_models
+from pipeline.core.errors import DownloadError
+from pipeline.core.third_party_models import CATALOGUE, manifest_text
 from pipeline.perceive.models.download import download
 from pipeline.perceive.models.manifest import Manifest, read_manifest
-from pipeline.third_party_models import CATALOGUE, manifest_text
 
 CONTENT = bytes(range(256)) * 4000  # about a megabyte: several blocks
 SHA256 = hashlib.sha256(CONTENT).hexdigest()

@@ -6,15 +6,15 @@ import numpy as np
 import onnxruntime
 import pytest
 
-from pipeline.config import load_fleet
-from pipeline.errors import ModelError, ModelOutputError
-from pipeline.memory import MODEL_THREADS, usable_cpus
+from pipeline.core.config import load_fleet
+from pipeline.core.errors import ModelError, ModelOutputError
+from pipeline.core.memory import MODEL_THREADS, usable_cpus
+from pipeline.core.rigs import OnnxSemantics
 from pipeline.perceive.models.detector import Candidates, Detector, decode_head, suppress
 from pipeline.perceive.models.manifest import InputSpec, load_manifest
 from pipeline.perceive.models.segmenter import Segmenter
 from pipeline.perceive.models.session import Fit, fit_image, model_threads
 from pipeline.perceive.models.source import ModelSource
-from pipeline.rigs import OnnxSemantics
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import observations_of
 from tests.makers.fleet_files import fleet_toml

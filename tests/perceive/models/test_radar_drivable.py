@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.config import FleetConfig, config_hash
-from pipeline.errors import ModelError
-from pipeline.geometry.radar_grid import SHAPE, sector_of
+from pipeline.core.config import FleetConfig, config_hash
+from pipeline.core.errors import ModelError
 from pipeline.learn.perception_training.radar_drivable.network import build_drivable_network, export_drivable
 from pipeline.learn.perception_training.radar_drivable.samples import day_samples, scan_of
 from pipeline.learn.perception_training.radar_drivable.training import (
@@ -18,6 +17,7 @@ from pipeline.learn.perception_training.radar_drivable.training import (
     train_drivable,
 )
 from pipeline.perceive.models.radar_drivable import RadarDrivable
+from pipeline.rig.radar_grid import SHAPE, sector_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import observations_of
 from schemas.observations import Observation
@@ -84,7 +84,7 @@ def test_the_model_answers_as_the_network_does(lake, tmp_path):
     perceive_day(DAY, fleet(), lake)
     network = build_drivable_network(24, 3).eval()
     model = RadarDrivable(export_drivable(network, tmp_path, {}))
-    from pipeline.geometry.radar_grid import ScanMemory
+    from pipeline.rig.radar_grid import ScanMemory
 
     memory = ScanMemory()
     for row in rows(lake):

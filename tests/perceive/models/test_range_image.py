@@ -8,11 +8,11 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from pipeline.config import FleetConfig, config_hash, load_fleet
-from pipeline.errors import ConfigError, ModelError
+from pipeline.core.config import FleetConfig, config_hash, load_fleet
+from pipeline.core.errors import ConfigError, ModelError
+from pipeline.core.shipped_models import shipped_manifest
 from pipeline.perceive.ground import PointKind
 from pipeline.perceive.models.range_image import POINT_LABEL_SETS, RangeImageSegmenter
-from pipeline.shipped_models import shipped_manifest
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import observations_of
 from tests.makers.fleet_files import fleet_toml

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
+from pipeline.core.third_party_models import manifest_text, named
 from pipeline.perceive.labels import road_user_name
 from pipeline.perceive.models.detector import Detector
 from pipeline.perceive.models.manifest import load_manifest
-from pipeline.third_party_models import manifest_text, named
 
 pytestmark = [pytest.mark.real_logs]
 

@@ -16,9 +16,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation
 from pipeline.objective.camera_lidar.score import Alignments, KernelSettings, Terms
+from pipeline.rig.estimates import Prior
+from pipeline.rig.se3 import exp_so3, from_rotation_translation
 
 __all__ = ["TERMS", "Evidence", "by_chance", "wrong_poses"]
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from jaxtyping import Float, Int64
 
-from pipeline.geometry.cameras import camera_of
+from pipeline.rig.cameras import camera_of
 from schemas.observations import Observation
 
 __all__ = ["box_offsets"]

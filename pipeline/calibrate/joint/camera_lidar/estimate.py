@@ -59,16 +59,16 @@ from pipeline.calibrate.numerics.change_point import with_parts
 from pipeline.calibrate.numerics.covariance import OBSERVABLE, with_ends
 from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.calibrate.numerics.search_range import search_range
-from pipeline.config import SolveConfig
-from pipeline.errors import SolveError
-from pipeline.extrinsics.common_share import common_part
-from pipeline.extrinsics.estimates import PairEstimate, Prior
-from pipeline.geometry.changes import change_jacobian
+from pipeline.core.config import SolveConfig
+from pipeline.core.errors import SolveError
 from pipeline.objective.camera_lidar.brightness_maps import Start
 from pipeline.objective.camera_lidar.label_width import label_width_px, widened
 from pipeline.objective.camera_lidar.own_motion import lidar_velocities
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms, prepare_terms
 from pipeline.objective.stamp_gaps import camera_gaps_s, constant_gap_s
+from pipeline.rig.changes import change_jacobian
+from pipeline.rig.common_share import common_part
+from pipeline.rig.estimates import PairEstimate, Prior
 from pipeline.rig.evidence import EDGE
 from schemas.observations import Observation
 

@@ -19,9 +19,9 @@ from jaxtyping import Bool, Float
 
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState
 from pipeline.calibrate.numerics.bias_floors import MOUNTING_SIGMA_RAD, SWEEP_S
-from pipeline.geometry.changes import change_jacobian
 from pipeline.objective.camera_lidar.points import Points
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms
+from pipeline.rig.changes import change_jacobian
 from schemas.observations import Observation
 
 __all__ = ["MotionSigmas", "motion_biases", "sweep_s_per_rad"]

@@ -28,9 +28,9 @@ from pipeline.calibrate.joint.camera_lidar.rotation_grid import (
 from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
 from pipeline.calibrate.numerics.covariance import CLEARLY, widening
 from pipeline.calibrate.numerics.search_range import search_range
-from pipeline.geometry.se3 import inverse, log_so3, transform_points
 from pipeline.objective.camera_lidar.kernel_settings import MAX_GAP_PX
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms
+from pipeline.rig.se3 import inverse, log_so3, transform_points
 
 __all__ = ["MARGIN_RAD", "Basin", "difference", "find_basin", "settled"]
 

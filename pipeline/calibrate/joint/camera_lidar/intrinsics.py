@@ -40,11 +40,11 @@ from pipeline.calibrate.numerics.bias_floors import (
     INTRINSICS_CONTRADICTION_SIGMAS,
     INTRINSICS_HALF_SIGMAS,
 )
-from pipeline.extrinsics.checks import FailedCheck
-from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.changes import change_between, change_jacobian
+from pipeline.core.rigs import CameraPrior
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms
-from pipeline.rigs import CameraPrior
+from pipeline.rig.changes import change_between, change_jacobian
+from pipeline.rig.checks import FailedCheck
+from pipeline.rig.estimates import Prior
 
 __all__ = ["DayIntrinsics", "contradictions", "measure_intrinsics"]
 

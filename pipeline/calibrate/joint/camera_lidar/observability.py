@@ -35,11 +35,11 @@ from pipeline.calibrate.joint.camera_lidar.time_offset import (
 from pipeline.calibrate.numerics.bias_floors import CAMERA_LIDAR_BIAS, CAMERA_LIDAR_DT_FLOOR_S, FOCAL_SIGMA
 from pipeline.calibrate.numerics.covariance import OBSERVABLE, covariance_with_fixed, response
 from pipeline.calibrate.numerics.frame_blocks import SCENE_DEGREES, Scenes
-from pipeline.config import SolveConfig
-from pipeline.extrinsics.common_share import prior_share
-from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.changes import change_jacobian
+from pipeline.core.config import SolveConfig
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms
+from pipeline.rig.changes import change_jacobian
+from pipeline.rig.common_share import prior_share
+from pipeline.rig.estimates import Prior
 
 __all__ = [
     "IS_TZ",

@@ -23,7 +23,7 @@ from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, Scored,
 from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
 from pipeline.calibrate.numerics.bias_floors import TZ_COMMON_BIAS_M, TZ_UNCHECKED_BIAS_M
 from pipeline.calibrate.numerics.response_surface import DESIGN
-from pipeline.extrinsics.estimates import Prior
+from pipeline.rig.estimates import Prior
 
 __all__ = ["TZ", "TzProfile", "profile_tz", "with_tz"]
 

@@ -21,7 +21,7 @@ from pipeline.calibrate.joint.camera_lidar.refine import (
 from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
 from pipeline.calibrate.numerics.change_point import parts_of_day
 from pipeline.calibrate.numerics.covariance import CLEARLY, bootstrap_covariance
-from pipeline.extrinsics.estimates import DayParts
+from pipeline.rig.estimates import DayParts
 from schemas.observations import Observation
 
 __all__ = ["parts_of_alignment", "starts_apart"]

@@ -11,10 +11,10 @@ from pipeline.calibrate.numerics.bias_floors import FOCAL_SIGMA, TYPICAL_RANGE_M
 from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.calibrate.numerics.response_surface import DESIGN, at_least, fit_quadratics
 from pipeline.calibrate.numerics.search_range import SearchRange
-from pipeline.config import SolveConfig
-from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.se3 import exp_se3, exp_so3, from_rotation_translation, log_so3
+from pipeline.core.config import SolveConfig
 from pipeline.objective.camera_lidar.score import Alignments, KernelSettings, Terms
+from pipeline.rig.estimates import Prior
+from pipeline.rig.se3 import exp_se3, exp_so3, from_rotation_translation, log_so3
 
 __all__ = [
     "NONE_FIXED",

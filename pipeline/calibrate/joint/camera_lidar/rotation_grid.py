@@ -15,9 +15,9 @@ from jaxtyping import Float
 
 from pipeline.calibrate.joint.camera_lidar.beyond_chance import TERMS, Evidence
 from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
-from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms
+from pipeline.rig.estimates import Prior
+from pipeline.rig.se3 import exp_so3, from_rotation_translation
 
 __all__ = ["GRID_SHIFTS_PX", "grid_kernel_rad", "grid_maxima", "grid_turns"]
 

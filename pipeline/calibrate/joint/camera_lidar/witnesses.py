@@ -25,9 +25,9 @@ from pipeline.calibrate.numerics.bias_floors import (
     EDGE_SIDE_MOST_PX,
 )
 from pipeline.calibrate.numerics.covariance import CLEARLY
-from pipeline.extrinsics.checks import FailedCheck
 from pipeline.objective.camera_lidar.points import Points
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms
+from pipeline.rig.checks import FailedCheck
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT, Observation
 
 __all__ = ["Witness", "ask_witnesses", "disagreement", "widening", "witness_numbers"]

@@ -8,7 +8,7 @@ from pipeline.calibrate.joint.lidar_radar.observability import ObservabilityAnal
 from pipeline.calibrate.joint.lidar_radar.problem import DT, RANGE, RadarState
 from pipeline.calibrate.joint.lidar_radar.witnesses import contradiction, own_numbers
 from pipeline.calibrate.numerics.bias_floors import RADAR_ELEVATION_BIAS_RAD, RANGE_BIAS_SIGMA_M
-from pipeline.geometry.changes import change_between
+from pipeline.rig.changes import change_between
 
 __all__ = ["diagnostics_of", "notes_of"]
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.geometry.spherical import to_spherical
 from pipeline.objective.radar.registration import RegistrationFrames
+from pipeline.rig.spherical import to_spherical
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, Observation
 
 __all__ = ["ElevationSpread", "beam_spacing", "elevation_spread"]

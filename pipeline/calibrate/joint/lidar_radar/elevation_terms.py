@@ -27,10 +27,10 @@ from pipeline.calibrate.joint.lidar_radar.tilt_floors import (
     tilt_of,
 )
 from pipeline.calibrate.joint.lidar_radar.witnesses import Witness, own_equations
-from pipeline.geometry.changes import change_between
 from pipeline.objective.radar.heights import Heights
 from pipeline.objective.radar.registration import NormalEquations
 from pipeline.objective.radar.travel import DOPPLER_PITCH_FLOOR_RAD, pitch_equations
+from pipeline.rig.changes import change_between
 
 __all__ = [
     "add_elevations",

@@ -43,16 +43,16 @@ from pipeline.calibrate.numerics.covariance import (
     with_ends,
 )
 from pipeline.calibrate.numerics.frame_blocks import blocks_of, scenes_of
-from pipeline.config import SolveConfig
-from pipeline.errors import SolveError
-from pipeline.extrinsics.common_share import common_part
-from pipeline.extrinsics.estimates import DayParts, PairEstimate, Prior
-from pipeline.geometry.changes import change_between, change_jacobian
+from pipeline.core.config import SolveConfig
+from pipeline.core.errors import SolveError
 from pipeline.objective.radar.heights import displaced_heights
 from pipeline.objective.radar.moving_clusters import moving_clusters
 from pipeline.objective.radar.registration import registration_frames
 from pipeline.objective.radar.travel import travel_directions
 from pipeline.objective.stamp_gaps import constant_gap_s, radar_gaps_s
+from pipeline.rig.changes import change_between, change_jacobian
+from pipeline.rig.common_share import common_part
+from pipeline.rig.estimates import DayParts, PairEstimate, Prior
 from pipeline.rig.evidence import EDGE
 from schemas.observations import Observation
 

@@ -35,10 +35,10 @@ from pipeline.calibrate.numerics.bias_floors import (
     PRIOR_CONTRADICTION_SIGMAS,
     RANGE_BIAS_SIGMA_M,
 )
-from pipeline.geometry.changes import change_between, change_jacobian
 from pipeline.objective.radar.moving_clusters import azimuth_equations_lidar
 from pipeline.objective.radar.registration import NormalEquations, normal_equations
 from pipeline.objective.radar.vehicle_boxes import BIAS_SIGMA_RAD
+from pipeline.rig.changes import change_between, change_jacobian
 
 __all__ = ["linearise"]
 

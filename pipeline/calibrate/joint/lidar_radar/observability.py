@@ -24,9 +24,9 @@ from pipeline.calibrate.joint.lidar_radar.witnesses import Witness
 from pipeline.calibrate.numerics.bias_floors import LIDAR_RADAR_BIAS, LIDAR_RADAR_DT_FLOOR_S
 from pipeline.calibrate.numerics.covariance import OBSERVABLE, covariance_with_fixed
 from pipeline.calibrate.numerics.frame_blocks import blocks_of
-from pipeline.config import SolveConfig
-from pipeline.extrinsics.common_share import prior_share
+from pipeline.core.config import SolveConfig
 from pipeline.objective.radar.heights import Heights
+from pipeline.rig.common_share import prior_share
 
 __all__ = ["ObservabilityAnalysis", "analyse_observability"]
 

@@ -23,7 +23,7 @@ from pipeline.calibrate.joint.lidar_radar.problem import DT, RadarProblem, Radar
 from pipeline.calibrate.joint.lidar_radar.search import finish
 from pipeline.calibrate.joint.lidar_radar.time_offset import comparison_cost
 from pipeline.calibrate.numerics.covariance import bootstrap_covariance
-from pipeline.geometry.changes import change_between
+from pipeline.rig.changes import change_between
 
 __all__ = ["own_position"]
 

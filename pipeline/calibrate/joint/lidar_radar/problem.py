@@ -16,13 +16,13 @@ from jaxtyping import Bool, Float
 from pipeline.calibrate.joint.lidar_radar.elevation_spread import ElevationSpread
 from pipeline.calibrate.joint.lidar_radar.seen_low import SeenLow
 from pipeline.calibrate.joint.lidar_radar.witnesses import Witness
-from pipeline.config import TERMS
-from pipeline.extrinsics.estimates import Prior
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation, log_so3
+from pipeline.core.config import TERMS
 from pipeline.objective.radar.heights import Heights
 from pipeline.objective.radar.moving_clusters import MovingClusters
 from pipeline.objective.radar.registration import NormalEquations, RegistrationFrames
 from pipeline.objective.radar.travel import TravelDirections
+from pipeline.rig.estimates import Prior
+from pipeline.rig.se3 import exp_so3, from_rotation_translation, log_so3
 from schemas.observations import Observation
 
 __all__ = [

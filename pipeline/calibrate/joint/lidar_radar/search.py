@@ -19,9 +19,9 @@ from pipeline.calibrate.joint.lidar_radar.problem import (
 from pipeline.calibrate.joint.lidar_radar.schedule import SCHEDULE
 from pipeline.calibrate.joint.lidar_radar.time_offset import scan_time_offset
 from pipeline.calibrate.numerics.bias_floors import OUTLIER_DENSITY
-from pipeline.config import SolveConfig
-from pipeline.geometry.se3 import exp_so3, from_rotation_translation
+from pipeline.core.config import SolveConfig
 from pipeline.objective.radar.registration import BOUNCE_PRIOR, SIGMA_START, registration_cost, updated_sigma
+from pipeline.rig.se3 import exp_so3, from_rotation_translation
 
 __all__ = ["NONE_FIXED", "anneal", "finish", "last_step", "scan"]
 

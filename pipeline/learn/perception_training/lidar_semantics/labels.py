@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from pipeline.geometry.cameras import camera_of
-from pipeline.geometry.se3 import transform_points
 from pipeline.objective.paper.classes import labels_of
+from pipeline.rig.cameras import camera_of
+from pipeline.rig.se3 import transform_points
 from schemas.observations import Observation
 
 __all__ = [

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float16, Float32, UInt8
 
-from pipeline.config import FleetConfig
-from pipeline.extrinsics.prior import read_prior
-from pipeline.geometry.range_image import EMPTY, channels_of, project
+from pipeline.core.config import FleetConfig
 from pipeline.learn.perception_training.days import is_held_out, vehicle_days
 from pipeline.learn.perception_training.lidar_semantics.labels import UNLABELLED, project_labels
+from pipeline.rig.day_prior import read_prior
+from pipeline.rig.range_image import EMPTY, channels_of, project
 from pipeline.store.current import current_records, transform_of
 from pipeline.store.partitions import Lake
 from pipeline.store.records import read_records

@@ -10,8 +10,9 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from pipeline.errors import ContractError
-from pipeline.geometry.range_image import EMPTY
+from pipeline.core.errors import ContractError
+from pipeline.core.results import Progress, silent
+from pipeline.core.rows import take_rows
 from pipeline.learn.perception_training.lidar_semantics.labels import (
     GROUND,
     KIND_OF_LABEL,
@@ -28,8 +29,7 @@ from pipeline.learn.perception_training.trainer import (
     run_training,
 )
 from pipeline.learn.train.loop import TrainResult
-from pipeline.results import Progress, silent
-from pipeline.rows import take_rows
+from pipeline.rig.range_image import EMPTY
 
 __all__ = ["SweepTraining", "held_out_scores", "kind_scores", "train_sweeps"]
 

@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from pipeline.geometry.radar_grid import CHANNELS, SHAPE, grid_layout
 from pipeline.learn.perception_training.exporter import export_model
+from pipeline.rig.radar_grid import CHANNELS, SHAPE, grid_layout
 
 __all__ = ["LIMITS", "NAME", "DrivableNetwork", "build_drivable_network", "export_drivable"]
 

@@ -15,12 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float16, UInt8
 
-from pipeline.config import FleetConfig
-from pipeline.extrinsics.prior import read_prior
-from pipeline.geometry.radar_grid import CHANNELS, SHAPE, Scan, ScanMemory, cell_centres, sector_mask
-from pipeline.geometry.se3 import transform_points
+from pipeline.core.config import FleetConfig
+from pipeline.core.rows import columns_of, join_rows, take_rows
 from pipeline.learn.perception_training.days import is_held_out, vehicle_days
-from pipeline.rows import columns_of, join_rows, take_rows
+from pipeline.rig.day_prior import read_prior
+from pipeline.rig.radar_grid import CHANNELS, SHAPE, Scan, ScanMemory, cell_centres, sector_mask
+from pipeline.rig.se3 import transform_points
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import observations_of
 from schemas.observations import Observation

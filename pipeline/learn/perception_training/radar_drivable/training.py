@@ -10,8 +10,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from pipeline.errors import ContractError
-from pipeline.geometry.radar_grid import cell_centres, sector_mask, sector_of
+from pipeline.core.errors import ContractError
+from pipeline.core.results import Progress, silent
+from pipeline.core.rows import take_rows
 from pipeline.learn.perception_training.radar_drivable.network import DrivableNetwork, build_drivable_network
 from pipeline.learn.perception_training.radar_drivable.samples import FREE, UNKNOWN, DrivableSamples
 from pipeline.learn.perception_training.trainer import (
@@ -21,8 +22,7 @@ from pipeline.learn.perception_training.trainer import (
     run_training,
 )
 from pipeline.learn.train.loop import TrainResult
-from pipeline.results import Progress, silent
-from pipeline.rows import take_rows
+from pipeline.rig.radar_grid import cell_centres, sector_mask, sector_of
 
 __all__ = ["DrivableTraining", "area_iou", "held_out_iou", "probabilities", "train_drivable"]
 

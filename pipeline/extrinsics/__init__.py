@@ -1,1 +1,0 @@
-"""Extrinsics as values: priors, estimates of pairs, solutions."""

@@ -1,1 +1,0 @@
-"""Mathematics of frames, cameras and angles; conventions in CONVENTIONS.md."""

@@ -1,0 +1,160 @@
+"""Inputs and outputs of a calibration method; shared by `calibrate` and `learn`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from pipeline.core.rigs import CameraPrior
+from pipeline.rig.changes import change_between
+from pipeline.rig.checks import FailedCheck
+from pipeline.rig.se3 import adjoint
+
+__all__ = ["DayParts", "PairEstimate", "Prior", "Solution"]
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """Prior of the day: two transforms, the third composed of them, each with isotropic sigmas.
+
+    A transform that the rig or the day lacks is NaN; a rig without a lidar has only the third one.
+    """
+
+    T_camera_lidar: np.ndarray
+    T_lidar_radar: np.ndarray
+    rotation_sigma_rad: float
+    translation_sigma_m: float
+    # Estimate of an earlier accepted day: a start for the search, without weight.
+    T_camera_lidar_before: np.ndarray | None = None
+    camera: CameraPrior = field(default_factory=CameraPrior)
+    # Azimuth of the direction of travel in lidar axes and its sigma [rad], if known better than from the
+    # day's radar.
+    heading: tuple[float, float] | None = None
+    T_camera_radar_alone: np.ndarray | None = None  # for a rig or a day without a lidar
+    T_base_radar: np.ndarray | None = None  # pose on the vehicle, whose x points ahead; None if unknown
+
+    @property
+    def T_ahead_radar(self) -> Float[np.ndarray, "4 4"]:
+        """The radar's pose in axes whose x points ahead: a lidar's, else the vehicle's; NaN if both are unknown."""
+        base = self.T_base_radar
+        return self.T_lidar_radar if base is None or np.isfinite(self.T_lidar_radar).all() else base
+
+    @property
+    def T_camera_radar(self) -> Float[np.ndarray, "4 4"]:
+        """T_camera_lidar @ T_lidar_radar; if these are unknown, the transform given directly."""
+        composed = self.T_camera_lidar @ self.T_lidar_radar
+        alone = self.T_camera_radar_alone
+        return composed if alone is None or np.isfinite(composed).all() else alone
+
+    @property
+    def sigmas(self) -> tuple[float, float]:
+        """Of rotation [rad] and translation [m], each axis."""
+        return self.rotation_sigma_rad, self.translation_sigma_m
+
+    def knows(self, pair: str) -> bool:
+        """True if this pair has a prior."""
+        return bool(np.isfinite(self.of(pair)).all())
+
+    def of(self, pair: str) -> Float[np.ndarray, "4 4"]:
+        """Prior transform of camera_lidar, camera_radar or lidar_radar; NaN if unknown."""
+        return {
+            "camera_lidar": self.T_camera_lidar,
+            "camera_radar": self.T_camera_radar,
+            "lidar_radar": self.T_lidar_radar,
+        }[pair]
+
+    def covariance(self, pair: str) -> Float[np.ndarray, "6 6"]:
+        """Prior covariance (rotation vector, translation; left perturbation); composed for camera_radar."""
+        base = np.diag([self.rotation_sigma_rad**2] * 3 + [self.translation_sigma_m**2] * 3)
+        if pair != "camera_radar" or not (self.knows("camera_lidar") and self.knows("lidar_radar")):
+            return base
+        # Each prior is isotropic about its own sensor: rotate the second into camera axes, without lever arm.
+        A = adjoint(self.T_camera_lidar).copy()
+        A[3:, :3] = 0
+        return base + A @ base @ A.T
+
+
+@dataclass(frozen=True, eq=False)
+class DayParts:
+    """A pair's rotation fitted to the first and the last part of a day, cut at the largest difference."""
+
+    T: tuple[np.ndarray, np.ndarray]  # 4 4 of each part
+    spread: tuple[np.ndarray, np.ndarray]  # 3 3 of each part's rotation vector, without common errors
+    cut_ns: tuple[int, int]  # stamps of the last frame before the cut and of the first one after it
+    tested: tuple[int, ...]  # rotations (0, 1, 2) that both parts determine without the prior
+
+    @property
+    def step(self) -> Float[np.ndarray, " 3"]:
+        """Rotation from the first part to the last, in the parent's axes [rad]."""
+        return change_between(*self.T)[:3]
+
+    def sigmas(self, floor_rad: float) -> Float[np.ndarray, " 3"]:
+        """Rotations of the step in units of their sigmas; 0 for rotations that are not compared.
+
+        Args:
+            floor_rad: difference between parts of one day without motion, due to different scenes (1 sigma).
+        """
+        sigma = np.sqrt(np.diag(self.spread[0] + self.spread[1]) + floor_rad**2)
+        of, found = list(self.tested), np.zeros(3)
+        found[of] = self.step[of] / sigma[of]
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class PairEstimate:
+    """Result for one pair: T, covariance, and the degrees of freedom that the day determined.
+
+    Degrees of freedom: rotation vector about the parent's axes [rad], then position of the child's origin
+    [m].
+    """
+
+    pair: str
+    T: np.ndarray  # 4 4
+    covariance: np.ndarray  # 6 6, of the left perturbation exp(xi) T [rad, m]
+    observability: np.ndarray  # 6, share 0..1 of the prior's variance that the day removed
+    observable: np.ndarray  # 6, bool; the others keep the prior
+    frames_used: int
+    frames_rejected: dict[str, int] = field(default_factory=dict)
+    time_offset_s: float | None = None  # stamp_parent = stamp_child + dt
+    time_offset_sigma_s: float | None = None
+    diagnostics: dict[str, float] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    # 6 6, from errors common to all days of a vehicle; part of covariance.
+    common_covariance: np.ndarray | None = None
+    failed_checks: list[FailedCheck] = field(default_factory=list)  # checks of the solver, on this pair alone
+    parts: DayParts | None = None  # None if the day is too short, or if the method does not cut it
+    disproved: str = ""  # why the estimate is certainly wrong, if a check of the solver shows that
+    # Covariances 6 6 (left perturbation) of errors common to all frames, parts of `covariance`: by "camera",
+    # "lidar" or "radar" for errors common to all pairs of that sensor, by "edge" for errors of this pair
+    # alone ...
+    bias: dict[str, np.ndarray] = field(default_factory=dict)
+    bias_in_weights: np.ndarray | None = (
+        None  # ... and of errors of this pair that are already included in the weights of its data
+    )
+    time_offset_prior_s: float | None = None  # expected time offset before the day
+
+    @classmethod
+    def at_prior(cls, pair: str, prior: Prior) -> PairEstimate:
+        """The prior, for a pair without an estimate."""
+        covariance, none = prior.covariance(pair), np.zeros(6)
+        return cls(pair, prior.of(pair), covariance, none, none > 0, 0, common_covariance=covariance)
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Estimates of the day's pairs, and the loop of three independent estimates, if the method made them.
+
+    The loop's angle covers the independently estimated rotations. Its translation is None if none was
+    estimated independently, as in `joint`, where camera-radar without the lidar takes its position from the
+    prior.
+    """
+
+    method: str
+    pairs: dict[str, PairEstimate]
+    loop_rotation_rad: float | None = None
+    loop_translation_m: float | None = None
+    # Failed checks while solving, by pair: starts or halves disagree, camera contradicts radar.
+    failed_checks: dict[str, list[FailedCheck]] = field(default_factory=dict)
+    apart: bool = False  # True if no pair uses another's data: the adjustment of the rig combines them

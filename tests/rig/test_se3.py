@@ -1,0 +1,193 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+from pipeline.rig import se3
+
+finite = st.floats(-3.0, 3.0)
+batches = st.sampled_from([(), (1,), (4,), (2, 3), (0,)])
+# Angles where series, quaternion branches and the wrap at pi can go wrong.
+angles = st.one_of(
+    st.floats(0.0, np.pi - 1e-3),
+    st.sampled_from(
+        [0.0, 1e-12, 1e-9, 1e-6, 0.999e-3, 1e-3, 1.001e-3, 0.1, np.pi / 2, np.pi - 1e-4, np.pi - 1e-7]
+    ),
+)
+
+
+@st.composite
+def rotation_vectors(draw, shape=None):
+    shape = draw(batches) if shape is None else shape
+    axis = draw(hnp.arrays(np.float64, (*shape, 3), elements=finite))
+    norm = np.linalg.norm(axis, axis=-1, keepdims=True)
+    axis = np.where(norm > 1e-3, axis / np.where(norm > 1e-3, norm, 1), [1.0, 0, 0])
+    return axis * draw(hnp.arrays(np.float64, (*shape, 1), elements=angles))
+
+
+@st.composite
+def twists(draw, shape=None):
+    phi = draw(rotation_vectors(shape))
+    return np.concatenate([phi, draw(hnp.arrays(np.float64, phi.shape, elements=st.floats(-50, 50)))], -1)
+
+
+def close(a, b, atol=1e-10):
+    np.testing.assert_allclose(a, b, atol=atol, rtol=1e-9)
+
+
+@given(twists(shape=()), twists(shape=()), twists(shape=()))
+def test_transforms_form_a_group(a, b, c):
+    A, B, C = se3.exp_se3(a), se3.exp_se3(b), se3.exp_se3(c)
+    close((A @ B) @ C, A @ (B @ C), 1e-9)
+    close(A @ se3.inverse(A), np.eye(4))
+    close(se3.inverse(A @ B), se3.inverse(B) @ se3.inverse(A), 1e-9)
+    close(A @ np.eye(4), A)
+
+
+@given(rotation_vectors())
+def test_exp_so3_is_a_rotation_and_agrees_with_scipy(phi):
+    R = se3.exp_so3(phi)
+    close(R @ np.swapaxes(R, -1, -2), np.broadcast_to(np.eye(3), R.shape), 1e-12)
+    close(np.linalg.det(R), np.ones(R.shape[:-2]), 1e-12)
+    close(R.reshape(-1, 3, 3), Rotation.from_rotvec(phi.reshape(-1, 3)).as_matrix().reshape(-1, 3, 3), 1e-12)
+
+
+@given(rotation_vectors())
+def test_log_so3_inverts_exp_from_zero_to_nearly_pi(phi):
+    close(se3.log_so3(se3.exp_so3(phi)), phi, 1e-8)
+
+
+@given(rotation_vectors(shape=()))
+def test_log_so3_of_half_a_turn_is_one_of_the_two_answers(phi):
+    norm = np.linalg.norm(phi)
+    axis = phi / norm if norm > 0 else np.array([0, 0, 1.0])
+    found = se3.log_so3(se3.exp_so3(np.pi * axis))
+    assert abs(np.linalg.norm(found) - np.pi) < 1e-7
+    assert abs(abs(found @ axis) - np.pi) < 1e-7
+
+
+@given(twists())
+def test_log_se3_inverts_exp(xi):
+    np.testing.assert_allclose(se3.log_se3(se3.exp_se3(xi)), xi, atol=2e-6, rtol=1e-7)
+
+
+@given(twists(shape=()))
+def test_exp_se3_is_the_matrix_exponential(xi):
+    generator = np.zeros((4, 4))
+    generator[:3, :3], generator[:3, 3] = se3.hat(xi[:3]), xi[3:]
+    close(se3.exp_se3(xi), expm(generator), 1e-9)
+
+
+@given(twists(shape=()), twists(shape=()))
+def test_adjoint_moves_a_perturbation_to_the_other_side(a, xi):
+    T, small = se3.exp_se3(a), 0.01 * xi
+    close(T @ se3.exp_se3(small), se3.exp_se3(se3.adjoint(T) @ small) @ T, 1e-8)
+    close(se3.adjoint(se3.inverse(T)), np.linalg.inv(se3.adjoint(T)), 1e-8)
+
+
+@given(rotation_vectors(), st.floats(-10, 10))
+def test_quaternions_round_trip_with_w_first_and_not_negative(phi, x):
+    T = se3.from_rotation_translation(se3.exp_so3(phi), np.full(phi.shape, x))
+    q = se3.to_quaternion(T)
+    assert np.all(q[..., 0] >= 0)
+    close(np.linalg.norm(q, axis=-1), np.ones(phi.shape[:-1]), 1e-12)
+    close(se3.from_quaternion(3.0 * q, T[..., :3, 3]), T, 1e-12)
+    scipy_xyzw = Rotation.from_matrix(T[..., :3, :3].reshape(-1, 3, 3)).as_quat().reshape(*phi.shape[:-1], 4)
+    same = np.abs(np.sum(q * scipy_xyzw[..., [3, 0, 1, 2]], -1))
+    close(same, np.ones(phi.shape[:-1]), 1e-12)
+
+
+@pytest.mark.parametrize("q", [[0.0, 0, 0, 0], [np.nan, 0, 0, 1]])
+def test_a_quaternion_without_a_rotation_is_an_error(q):
+    with pytest.raises(ValueError, match="no rotation"):
+        se3.from_quaternion(np.array(q), np.zeros(3))
+
+
+@given(twists(shape=()), hnp.arrays(np.float64, (5, 3), elements=st.floats(-100, 100)))
+def test_transform_points_equals_homogeneous_multiplication(xi, points):
+    T = se3.exp_se3(xi)
+    homogeneous = np.concatenate([points, np.ones((5, 1))], 1) @ T.T
+    close(se3.transform_points(T, points), homogeneous[:, :3], 1e-9)
+
+
+def test_transform_points_keeps_single_precision():
+    points = np.array([[10.0, 1.0, -2.0]], np.float32)
+    found = se3.transform_points(se3.exp_se3(np.array([0.1, 0.2, 0.3, 1, 2, 3])), points)
+    assert found.dtype == np.float32
+
+
+@given(twists(shape=()), st.floats(0, 3.0), st.floats(0, 1), st.integers(0, 2**31))
+def test_perturb_exactly_moves_by_exactly_what_it_says(xi, angle, shift, seed):
+    T = se3.exp_se3(xi)
+    moved = se3.perturb_exactly(T, angle, shift, np.random.default_rng(seed))
+    assert abs(se3.rotation_angle_rad(moved @ se3.inverse(T)) - angle) < 1e-7
+    assert abs(np.linalg.norm(moved[:3, 3] - T[:3, 3]) - shift) < 1e-9
+
+
+def covariance(rng, rotation_rad, translation_m):
+    A = rng.normal(size=(6, 6)) @ np.diag(rng.uniform(0.3, 1, 6))
+    scale = np.array([rotation_rad] * 3 + [translation_m] * 3)
+    C = A @ A.T
+    C /= np.sqrt(np.outer(np.diag(C), np.diag(C)))
+    return C * np.outer(scale, scale)
+
+
+def sample_covariance(T_mean, T_samples):
+    return np.cov(se3.log_se3(T_samples @ se3.inverse(T_mean)).T)
+
+
+def whitened(C, C_expected):
+    """C in the units of what was expected: the identity where they agree."""
+    L = np.linalg.inv(np.linalg.cholesky(C_expected))
+    return L @ C @ L.T
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_composed_covariances_agree_with_monte_carlo(seed):
+    rng = np.random.default_rng(seed)
+    T_a_b, T_b_c = se3.exp_se3(rng.normal(size=6) * [1, 1, 1, 2, 2, 2]), se3.exp_se3(rng.normal(size=6))
+    cov_a_b, cov_b_c = covariance(rng, 0.01, 0.02), covariance(rng, 0.02, 0.01)
+    n = 40_000  # spread of an estimated variance: sqrt(2/n) = 0.7 %
+    A = se3.exp_se3(rng.multivariate_normal(np.zeros(6), cov_a_b, n)) @ T_a_b
+    B = se3.exp_se3(rng.multivariate_normal(np.zeros(6), cov_b_c, n)) @ T_b_c
+    composed = se3.compose_covariance(T_a_b, cov_a_b, cov_b_c)
+    np.testing.assert_allclose(
+        whitened(sample_covariance(T_a_b @ T_b_c, A @ B), composed), np.eye(6), atol=0.05
+    )
+
+
+@settings(max_examples=30)
+@given(twists(shape=()), hnp.arrays(np.float64, 3, elements=st.floats(-30, 30)))
+def test_left_perturbation_of_a_point_has_the_derivative_that_conventions_state(xi, point):
+    T = se3.exp_se3(xi)
+    moved = se3.transform_points(T, point)
+    J = np.concatenate([-se3.hat(moved), np.eye(3)], 1)
+    step = 1e-6
+    for i in range(6):
+        delta = np.eye(6)[i] * step
+        ahead = se3.transform_points(se3.exp_se3(delta) @ T, point)
+        back = se3.transform_points(se3.exp_se3(-delta) @ T, point)
+        np.testing.assert_allclose((ahead - back) / (2 * step), J[:, i], atol=1e-5)
+
+
+@given(twists(shape=()), twists(shape=()))
+def test_a_change_is_what_a_mechanic_would_measure(a, b):
+    from pipeline.rig.changes import change_between
+
+    before, after = se3.exp_se3(a), se3.exp_se3(b)
+    change = change_between(before, after)
+    close(se3.exp_so3(change[:3]) @ before[:3, :3], after[:3, :3], 1e-7)
+    close(before[:3, 3] + change[3:], after[:3, 3], 1e-9)
+
+
+def test_covariance_of_a_change_agrees_with_monte_carlo():
+    from pipeline.rig.changes import change_between, change_covariance
+
+    rng = np.random.default_rng(4)
+    T, C = se3.exp_se3(rng.normal(size=6)), covariance(rng, 0.01, 0.01)
+    samples = se3.exp_se3(rng.multivariate_normal(np.zeros(6), C, 20_000)) @ T
+    found = np.cov(np.array([change_between(T, S) for S in samples]).T)
+    np.testing.assert_allclose(whitened(found, change_covariance(T, C)), np.eye(6), atol=0.06)
