@@ -58,8 +58,7 @@ def models(*, json: bool = False) -> int:
 def fetch(*names: str, into: Path = Path("models"), mirror: str | None = None) -> int:
     """Download models of other people, with manifests, for cameras whose labels nobody logs.
 
-    Address, size and licence are shown first. The sha256 is checked before a file appears. An interrupted
-    download continues.
+    Address, size and licence are shown first. The sha256 is checked before a file appears.
 
     Args:
         names: of `boresight models list`; default: a segmenter and a detector, which a camera needs both.
