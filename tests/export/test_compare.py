@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jobs.cli import main
 from pipeline.export.calibration import ExportedPair
 from pipeline.export.compare import Side, compare, composed
 from pipeline.report.comparison import comparison_page
@@ -18,6 +17,7 @@ from pipeline.store.partitions import Lake
 from schemas.calibrations import CALIBRATIONS
 from tests.audit.fleet_records import vehicle_records
 from tests.makers.calibrations import T_CAMERA_LIDAR, T_LIDAR_RADAR
+from tests.makers.commands import command
 
 VARYING = np.diag([1e-3, 2e-3, 5e-4, 0.01, 0.02, 0.03]) ** 2
 COMMON = np.diag([5e-4, 4e-3, 1e-4, 0.02, 0.01, 0.05]) ** 2
@@ -93,46 +93,39 @@ def lake(tmp_path_factory):
     return folder
 
 
-def said(capsys, *arguments):
-    code = main([str(a) for a in arguments])
-    return code, capsys.readouterr().out
-
-
 def test_a_knock_between_two_days_stands_out_in_json_table_and_page(lake, tmp_path, capsys):
     call = ["compare", "2026-03-01", "2026-03-03", "--lake", lake, "--vehicle", "v"]
-    code, out = said(capsys, *call, "--json")
-    found = json.loads(out)
-    by_pair = {p["pair"]: {row["dof"]: row for row in p["axes"]} for p in found["pairs"]}
-    assert code == 0
+    told = command(capsys, *call, "--json")
+    assert told.code == 0
+    found = json.loads(told.out)["pairs"]
+    by_pair = {p["pair"]: {row["dof"]: row for row in p["axes"]} for p in found}
     yaw = by_pair["lidar_radar"]["rz"]
     assert yaw["change"] == pytest.approx(np.radians(1.5), abs=4 * yaw["sigma"])
     assert yaw["z"] > 10
     assert max(abs(row["z"]) for row in by_pair["camera_lidar"].values()) < 4
-    code, out = said(capsys, *call, "--page", tmp_path / "page.html")
-    assert "rz (yaw)" in out
-    assert json.loads(out.splitlines()[-1])["largest_z"] > 10
+    told = command(capsys, *call, "--page", tmp_path / "page.html")
+    assert "rz (yaw)" in told.out
+    assert told.summary["largest_z"] > 10
     page = (tmp_path / "page.html").read_text()
-    assert "Further apart than the sigmas explain" in page
-    assert "lidar-radar rz (yaw)" in page
+    for words in ("Further apart than the sigmas explain", "lidar-radar rz (yaw)"):
+        assert words in page
     assert 0 < page.count('class="n off"') < 6  # what stands out is marked, and nothing else
 
 
 def test_an_export_is_its_record_and_every_kind_of_source_can_be_named(lake, tmp_path, capsys):
-    of_v = ["--lake", lake, "--vehicle", "v"]
-    day = ["--lake", str(lake), "--vehicle", "v", "--day", "2026-03-01"]
-    main(["export", "urdf", *day, "--out", str(tmp_path / "o.urdf")])
-    main(["import", "urdf", str(tmp_path / "o.urdf"), "--out", str(tmp_path / "prior.json")])
-    capsys.readouterr()
-    for other in (f"urdf:{tmp_path / 'o.urdf'}", tmp_path / "prior.json"):
-        code, out = said(capsys, "compare", "2026-03-01", other, *of_v, "--json")
-        changes = [row["change"] for p in json.loads(out)["pairs"] for row in p["axes"]]
-        assert code == 0
-        assert len(changes) == 18
+    of_v, urdf = ["--lake", lake, "--vehicle", "v"], tmp_path / "o.urdf"
+    command(capsys, "export", "urdf", *of_v, "--day", "2026-03-01", "--out", urdf)
+    command(capsys, "import", "urdf", urdf, "--out", tmp_path / "prior.json")
+    for other in (f"urdf:{urdf}", tmp_path / "prior.json"):
+        told = command(capsys, "compare", "2026-03-01", other, *of_v, "--json")
+        changes = [row["change"] for p in json.loads(told.out)["pairs"] for row in p["axes"]]
+        assert (told.code, len(changes)) == (0, 18)
         assert np.abs(changes).max() < 1e-12
     for other in ("2026-03-01/prior", "2026-03-01/tracking", "w@2026-03-01"):
-        code, out = said(capsys, "compare", "v@2026-03-01", other, *of_v, "--json")
-        assert (code, len(json.loads(out)["pairs"])) == (0, 3)
-    assert {p["status_b"] for p in json.loads(out)["pairs"]} == {"held"}
+        told = command(capsys, "compare", "v@2026-03-01", other, *of_v, "--json")
+        found = json.loads(told.out)["pairs"]
+        assert (told.code, len(found)) == (0, 3)
+    assert {p["status_b"] for p in found} == {"held"}
 
 
 @pytest.mark.parametrize(
@@ -146,9 +139,9 @@ def test_an_export_is_its_record_and_every_kind_of_source_can_be_named(lake, tmp
     ],
 )
 def test_what_cannot_be_compared_is_a_usage_error(lake, capsys, arguments, words):
-    code, out = said(capsys, "compare", *(a.replace("{lake}", str(lake)) for a in arguments))
-    assert code == 2
-    assert words in json.loads(out.splitlines()[-1])["reason"]
+    told = command(capsys, "compare", *(a.replace("{lake}", str(lake)) for a in arguments))
+    assert told.code == 2
+    assert words in told.summary["reason"]
 
 
 def test_the_page_escapes_names_and_says_when_nobody_states_a_sigma():

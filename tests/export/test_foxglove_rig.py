@@ -5,9 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
 
-from jobs.cli import main
 from pipeline.rig.se3 import from_quaternion, inverse, transform_points
 from pipeline.store.commits import commit_records
 from pipeline.store.moments import write_moments
@@ -15,7 +13,8 @@ from pipeline.store.partitions import Lake, Partition
 from schemas.calibrations import CALIBRATIONS
 from schemas.moments import MOMENTS, PERCEIVED
 from tests.export.test_foxglove import CAMERA, frame, observation
-from tests.makers.foxglove_logs import schema
+from tests.makers.commands import command
+from tests.makers.foxglove_logs import messages_of
 from tests.makers.lakes import joined_of
 from tests.makers.rig_records import T_TOP, rig_records
 
@@ -60,19 +59,10 @@ def lake(tmp_path_factory):
     return lake.root
 
 
-def exported(lake, out, *more):
+def exported(capsys, lake, out, *more):
     call = ["export", "foxglove", "--lake", lake, "--vehicle", "van", "--day", DAY.day, "--out", out, *more]
-    code, found = main([str(a) for a in call]), {}
-    if not out.exists():
-        return code, found
-    with out.open("rb") as stream:
-        for its, channel, message in make_reader(stream, validate_crcs=True).iter_messages():
-            if its.encoding == "protobuf":  # by the official class, not the file's own schema
-                told = schema(its.name.removeprefix("foxglove.")).FromString(message.data)
-            else:
-                told = json.loads(message.data)
-            found.setdefault(channel.topic, []).append(told)
-    return code, found
+    told = command(capsys, *call)
+    return told, messages_of(out) if out.exists() else {}
 
 
 def poses(message):
@@ -84,9 +74,9 @@ def poses(message):
     return by_child
 
 
-def test_every_sensor_has_channels_of_its_own(lake, tmp_path):
-    code, found = exported(lake, tmp_path / "drive.mcap")
-    assert code == 3  # the corner's edge is held
+def test_every_sensor_has_channels_of_its_own(lake, tmp_path, capsys):
+    told, found = exported(capsys, lake, tmp_path / "drive.mcap")
+    assert told.code == 3  # the corner's edge is held
     of_camera = ("image", "calibration", "boxes", "overlay", "overlay_prior")
     wanted = {f"/{c}/{topic}" for c in ("front", "left") for topic in of_camera}
     wanted |= {"/top/points", "/top/boxes", "/tf", "/boresight/calibration"}
@@ -96,17 +86,16 @@ def test_every_sensor_has_channels_of_its_own(lake, tmp_path):
     for k in range(COUNT):
         assert found["/front/image"][k].data == frame(k).image
         assert found["/left/image"][k].data == frame(k + 10).image
-        points = np.frombuffer(found["/corner/points"][k].data, "<f4").reshape(
-            len(frame(k + 10).radar_x_m), -1
-        )
-        np.testing.assert_array_equal(points[:, 0], frame(k + 10).radar_x_m)
+        x = frame(k + 10).radar_x_m
+        points = np.frombuffer(found["/corner/points"][k].data, "<f4").reshape(len(x), -1)
+        np.testing.assert_array_equal(points[:, 0], x)
         assert found["/corner/points"][k].frame_id == "corner"
     layout = json.loads((tmp_path / "drive.layout.json").read_text())
     assert "/left/overlay" in json.dumps(layout)
 
 
-def test_frames_hang_where_the_day_and_the_prior_have_them(lake, tmp_path):
-    _, found = exported(lake, tmp_path / "drive.mcap")
+def test_frames_hang_where_the_day_and_the_prior_have_them(lake, tmp_path, capsys):
+    _, found = exported(capsys, lake, tmp_path / "drive.mcap")
     tree = poses(found["/tf"][0])
     assert tree.keys() == {"front", "left", "bumper", "bumper_prior", "corner_prior"}  # the corner is held
     assert {parent for parent, _ in tree.values()} == {"top"}
@@ -115,8 +104,8 @@ def test_frames_hang_where_the_day_and_the_prior_have_them(lake, tmp_path):
     assert 1e-6 < np.abs(tree["bumper"][1] - T_TOP["bumper"]).max() < 0.3
 
 
-def test_the_reference_lidar_s_edges_lie_in_every_camera_s_image(lake, tmp_path):
-    _, found = exported(lake, tmp_path / "drive.mcap")
+def test_the_reference_lidar_s_edges_lie_in_every_camera_s_image(lake, tmp_path, capsys):
+    _, found = exported(capsys, lake, tmp_path / "drive.mcap")
     for name in ("front", "left"):
         drawn = found[f"/{name}/overlay_prior"][1]
         points = transform_points(inverse(T_TOP[name]), AROUND.astype(float))
@@ -127,9 +116,9 @@ def test_the_reference_lidar_s_edges_lie_in_every_camera_s_image(lake, tmp_path)
 
 
 def test_only_the_sensors_that_are_named_are_shown_and_an_unknown_one_is_refused(lake, tmp_path, capsys):
-    _, found = exported(lake, tmp_path / "drive.mcap", "--sensor", "left", "--sensor", "corner")
+    _, found = exported(capsys, lake, tmp_path / "drive.mcap", "--sensor", "left", "--sensor", "corner")
     topics = {topic.split("/")[1] for topic in found}
     assert topics == {"left", "corner", "tf", "boresight"}
-    code, found = exported(lake, tmp_path / "other.mcap", "--sensor", "rear")
-    assert (code, found) == (2, {})
-    assert "no rear: the rig has front, left, top, bumper, corner" in capsys.readouterr().out
+    told, found = exported(capsys, lake, tmp_path / "other.mcap", "--sensor", "rear")
+    assert (told.code, found) == (2, {})
+    assert "no rear: the rig has front, left, top, bumper, corner" in told.out

@@ -6,7 +6,6 @@ import re
 import numpy as np
 import pytest
 
-from jobs.cli import main
 from pipeline.core.config import load_fleet
 from pipeline.export.calibration import ExportedCalibration, ExportedPair, FrameNames
 from pipeline.export.files import write_files, written_files
@@ -16,6 +15,7 @@ from pipeline.rig.graph import Sensor, tie
 from pipeline.rig.prior_file import read_star
 from pipeline.rig.se3 import inverse
 from tests.makers.calibrations import CAMERA, random_transform
+from tests.makers.commands import command
 
 TOP = Sensor("top", "lidar")
 OTHERS = (
@@ -67,18 +67,14 @@ def fleet(tmp_path):
 
 
 def imported(capsys, form, files, fleet, out, *more):
-    code = main(["import", form, *files, "--fleet", str(fleet), "--out", str(out), *map(str, more)])
-    return code, json.loads(capsys.readouterr().out.splitlines()[-1])
+    told = command(capsys, "import", form, *files, "--fleet", fleet, "--out", out, *more)
+    return told.code, told.summary
 
 
 @pytest.mark.parametrize("form", [f for f in FORMATS if format_named(f).write is not None])
 def test_every_format_comes_back_as_the_prior_of_all_sensors(form, fleet, tmp_path, capsys):
-    files = [
-        f
-        for f in exported(tmp_path, form)
-        if not f.endswith((".xacro", "_intrinsics.yaml")) or form == "xacro"
-    ]
-    files = [f for f in files if not f.endswith("launch.py")]
+    aside = (".xacro", "_intrinsics.yaml") if form != "xacro" else ("launch.py",)
+    files = [f for f in exported(tmp_path, form) if not f.endswith((*aside, "launch.py"))]
     # A log has no side file that says what its frames are called.
     names = (
         [word for n, f in NAMES.items() for word in ("--frame", f"{n}={f}")] if form == "tf-static" else []

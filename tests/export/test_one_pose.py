@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from jobs.cli import main
 from pipeline.core.config import FleetConfig
 from pipeline.core.stage_work import Task, Window
 from pipeline.core.stages import AUDIT, STATE
@@ -31,6 +30,7 @@ from schemas.poses import POSES
 from schemas.states import STATES, StateRow
 from tests.audit.fleet_records import T_LIDAR_RADAR, poses_of, vehicle_records
 from tests.makers.calibrations import CAMERA, T_BASE_LIDAR
+from tests.makers.commands import command
 from tests.makers.fleet_files import THREE_SENSORS
 from tests.makers.lakes import joined_of, write_frames, write_observations
 from tests.makers.rig_records import T_TOP, pose_rows, rig_records
@@ -89,27 +89,15 @@ def lake(tmp_path_factory, fleet):
     return tables.root
 
 
-def run(capsys, *arguments):
-    """Exit code, the last line of stdout, and stderr."""
-    capsys.readouterr()
-    code = main([str(a) for a in arguments])
-    told = capsys.readouterr()
-    return code, json.loads(told.out.splitlines()[-1]), told.err
-
-
 def export(capsys, lake, vehicle, form, out, *options):
-    code, summary, err = run(
-        capsys, "export", form, "--lake", lake, "--vehicle", vehicle, "--out", out, *options
-    )
-    files = {p.name: p.read_bytes() for p in out.rglob("*") if p.is_file()} if out.exists() else {}
-    return code, summary, err, files
+    """What the command returns and prints, and the content of its files by name."""
+    told = command(capsys, "export", form, "--lake", lake, "--vehicle", vehicle, "--out", out, *options)
+    return told, {p.name: p.read_bytes() for p in out.rglob("*") if p.is_file()} if out.exists() else {}
 
 
 def states_of(capsys, lake, vehicle):
     """Rows of `boresight state --json`: by sensor, by name of the edge, and all of them."""
-    capsys.readouterr()
-    assert main(["state", "--lake", str(lake), "--vehicle", vehicle, "--json"]) == 0
-    rows = json.loads(capsys.readouterr().out)
+    rows = json.loads(command(capsys, "state", "--lake", lake, "--vehicle", vehicle, "--json").out)
     edges = [r for r in rows if r["sensor"] is None]
     named = {words_of(edge_named(r["pair"], r["parent_frame"], r["child_frame"])): r for r in edges}
     return {r["sensor"]: r for r in rows if r["sensor"] is not None}, named, rows
@@ -138,8 +126,8 @@ def test_every_format_of_a_state_reads_back_as_the_one_pose_of_each_sensor(
 ):
     sensors, edges, _ = states_of(capsys, lake, vehicle)
     reference, *others = SENSORS[vehicle]
-    code, _, err, files = export(capsys, lake, vehicle, form, tmp_path / "out")
-    assert code == (3 if vehicle == "van" else 0)
+    said, files = export(capsys, lake, vehicle, form, tmp_path / "out")
+    assert said.code == (3 if vehicle == "van" else 0)
     frames = {} if form == "autoware" else FRAMES[vehicle]
     tied = {
         name: (other, row)
@@ -167,7 +155,7 @@ def test_every_format_of_a_state_reads_back_as_the_one_pose_of_each_sensor(
         for column in ("azimuth_sigma_rad", "elevation_sigma_rad", "status", "determined"):
             assert row[column] == sensors[other][column], column
         assert row["reason"].endswith(sensors[other]["reason"])
-        assert f"{name}: {row['in_words']}" in err
+        assert f"{name}: {row['in_words']}" in said.err
         pose = next(p for p in side["poses"] if p["child"] == FrameNames.named(frames).of(other))
         np.testing.assert_allclose(pose["T_parent_child"], sensors[other]["T"], atol=1e-12)
         np.testing.assert_allclose(list(pose["sigma"].values()), sigmas(sensors[other]), rtol=1e-9)
@@ -210,18 +198,6 @@ def test_the_page_has_the_rows_of_the_state_and_copies_them_as_json(lake, fleet,
             assert words in shown
 
 
-def test_what_left_the_prior_far_behind_is_in_the_file_as_the_state_has_it(lake, tmp_path, capsys):
-    """No axis is reset on the way to the file: the radar's roll of .05 rad is known to .5 deg."""
-    sensors, edges, _ = states_of(capsys, lake, "car")
-    *_, files = export(capsys, lake, "car", "opencv", tmp_path / "out")
-    told = side_of(files)["pairs"]["lidar_radar"]
-    assert told["T_lidar_radar"] == sensors["radar"]["T"] == edges["lidar_radar"]["T"]
-    roll = np.arctan2(told["T_lidar_radar"][2][1], told["T_lidar_radar"][2][2])
-    assert abs(roll - ROLLED[0]) < 3 * told["sigma"]["rx_rad"]
-    assert told["in_words"].startswith("used: roll, ")
-    assert told["in_words"].endswith("; at the prior: up")
-
-
 def test_frames_are_named_as_in_the_logs_and_come_back_without_being_named(lake, tmp_path, capsys):
     for options, names in (
         ([], ("front_optical", "roof", "radar_front")),
@@ -229,16 +205,16 @@ def test_frames_are_named_as_in_the_logs_and_come_back_without_being_named(lake,
         (["--radar-frame", "bumper"], ("front_optical", "roof", "bumper")),
     ):
         out = tmp_path / f"{names[2]}.urdf"
-        run(capsys, "export", "urdf", "--lake", lake, "--vehicle", "car", *options, "--out", out)
+        command(capsys, "export", "urdf", "--lake", lake, "--vehicle", "car", *options, "--out", out)
         assert all(f'link name="{name}"' in out.read_text() for name in names)
-        assert run(capsys, "import", "urdf", out, "--out", tmp_path / "prior.json")[0] == 0
-    *_, files = export(capsys, lake, "car", "autoware", tmp_path / "kit")
+        assert command(capsys, "import", "urdf", out, "--out", tmp_path / "prior.json").code == 0
+    _, files = export(capsys, lake, "car", "autoware", tmp_path / "kit")
     assert b"front_optical" not in files["sensor_kit_calibration.yaml"]
 
 
 def test_a_sensor_without_usable_days_is_in_the_launch_file_at_its_prior_and_named(lake, tmp_path, capsys):
-    code, summary, err, files = export(capsys, lake, "van", "ros2", tmp_path / "out")
-    assert (code, summary["status"]) == (3, "partly")
+    said, files = export(capsys, lake, "van", "ros2", tmp_path / "out")
+    assert (said.code, said.summary["status"]) == (3, "partly")
     for name in ("static_transforms.launch.py", "static_transforms.launch.yaml"):
         tree = format_named("ros2").tree({name: files[name]})
         np.testing.assert_allclose(tree.lookup("top", "left"), T_TOP["left"], atol=1e-12)
@@ -246,13 +222,13 @@ def test_a_sensor_without_usable_days_is_in_the_launch_file_at_its_prior_and_nam
         why = "left-top: left is at its prior: no usable day; 2026-03-04 refused: nothing to see"
         assert f"# WARNING: {why}" in text
         assert "# left-top: used: nothing; certified: nothing; at the prior: pitch, yaw, roll" in text
-    assert why in err
-    assert summary["not_certified"]["left-top"].startswith("left is at its prior: no usable day")
+    assert why in said.err
+    assert said.summary["not_certified"]["left-top"].startswith("left is at its prior: no usable day")
 
 
 def test_the_tree_has_the_root_of_the_car_s_own_tf_and_names_what_it_replaces(lake, tmp_path, capsys):
     sensors, *_ = states_of(capsys, lake, "car")
-    _, _, err, files = export(capsys, lake, "car", "ros2", tmp_path / "out")
+    said, files = export(capsys, lake, "car", "ros2", tmp_path / "out")
     tree = format_named("ros2").tree({n: files[n] for n in files if "launch" in n})
     assert tree.edges == {"roof": "base_link", "front_optical": "roof", "radar_front": "roof"}
     np.testing.assert_allclose(tree.lookup("base_link", "roof"), T_BASE_LIDAR, atol=1e-12)
@@ -261,7 +237,7 @@ def test_the_tree_has_the_root_of_the_car_s_own_tf_and_names_what_it_replaces(la
     replaced = ["camera_link -> front_optical", "base_link -> radar_front", "base_link -> roof"]
     assert side_of(files)["replaces_in_tf_static"] == replaced
     words = f"switch these off in the car's own /tf_static, a frame has one parent: {', '.join(replaced)}"
-    assert words in err
+    assert words in said.err
     assert words in files["static_transforms.launch.yaml"].decode()
 
 
@@ -285,21 +261,15 @@ def test_a_camera_at_its_prior_without_an_edge_of_its_own_uses_nothing(lake, tmp
     states = read_records(Lake.existing(lake), STATES, StateRow, vehicle="van")
     other = Lake.at(tmp_path / "lake")
     commit_records(other, STATES, [r for r in states if (r.parent_frame, r.child_frame) != ("left", "top")])
-    *_, files = export(capsys, other.root, "van", "urdf", tmp_path / "out")
+    _, files = export(capsys, other.root, "van", "urdf", tmp_path / "out")
     left = side_of(files)["pairs"]["left-top"]
     assert left["in_words"].startswith("used: nothing; certified: nothing; at the prior: pitch, yaw, roll, ")
     assert left["reason"] == "no usable day; 2026-03-04 refused: nothing to see"
 
 
-def test_a_car_whose_logs_have_no_base_frame_has_the_lidar_as_root(lake, tmp_path, capsys):
-    *_, files = export(capsys, lake, "van", "urdf", tmp_path / "out")
-    assert set(format_named("urdf").tree({"f": files["sensors.urdf"]}).edges.values()) == {"top"}
-    assert side_of(files)["replaces_in_tf_static"] == []
-
-
 def test_a_vehicle_without_any_usable_day_gets_its_priors_and_exit_code_4(lake, tmp_path, capsys):
-    code, summary, _, files = export(capsys, lake, "new", "urdf", tmp_path / "out")
-    assert (code, summary["status"]) == (4, "held")
+    said, files = export(capsys, lake, "new", "urdf", tmp_path / "out")
+    assert (said.code, said.summary["status"]) == (4, "held")
     found = format_named("urdf").pairs({"f": files["sensors.urdf"]}, FrameNames())
     np.testing.assert_allclose(found["lidar_radar"], T_LIDAR_RADAR, atol=1e-12)
     for pair in side_of(files)["pairs"].values():
@@ -307,6 +277,6 @@ def test_a_vehicle_without_any_usable_day_gets_its_priors_and_exit_code_4(lake, 
 
 
 def test_force_has_nothing_to_force_in_a_state(lake, tmp_path, capsys):
-    code, summary, _, files = export(capsys, lake, "van", "ros2", tmp_path / "out", "--force")
-    assert (code, files) == (2, {})
-    assert "--force goes with --day" in summary["reason"]
+    said, files = export(capsys, lake, "van", "ros2", tmp_path / "out", "--force")
+    assert (said.code, files) == (2, {})
+    assert "--force goes with --day" in said.summary["reason"]

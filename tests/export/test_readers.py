@@ -12,14 +12,12 @@ import pytest
 import xacro
 import yaml
 
-from pipeline.export.calibration import FrameNames
 from pipeline.export.files import write_files, written_files
 from pipeline.export.formats import format_named
-from pipeline.ingest.containers.reader import open_log
-from pipeline.ingest.messages.decoding import decode
-from pipeline.rig.transform_tree import TransformTree
 from tests.export.real_readers import READERS
+from tests.export.test_many_sensors import five
 from tests.makers.calibrations import calibration, random_transform
+from tests.makers.rig_records import T_TOP
 
 
 @pytest.fixture
@@ -33,31 +31,21 @@ def exported(name, sent, folder):
     return folder / name
 
 
-def test_autoware_s_kit_expands_with_xacro_to_the_poses_of_its_yaml(sent, tmp_path):
-    folder = exported("autoware", sent, tmp_path)
-    car = tmp_path / "car.xacro"
+def test_autoware_s_kit_expands_with_xacro_to_the_poses_of_its_yaml(tmp_path):
+    sent = five()
+    folder, car = exported("autoware", sent, tmp_path), tmp_path / "car.xacro"
     car.write_text(f"""<robot name="car" xmlns:xacro="http://ros.org/wiki/xacro">
 <xacro:include filename="{folder}/sensor_kit.xacro"/><link name="base_link"/>
 <xacro:sensor_kit_macro parent="base_link" x="0.9" y="0" z="2" roll="0" pitch="0" yaw="0" config_dir="{folder}"/>
 </robot>""")
-    expanded = xacro.process_file(str(car)).toxml()
-    found = format_named("urdf").pairs({"car.urdf": expanded.encode()}, sent.names)
-    own = format_named("autoware").pairs(
-        {"k.yaml": (folder / "sensor_kit_calibration.yaml").read_bytes()}, sent.names
-    )
-    np.testing.assert_allclose(found["lidar_radar"], sent.pairs["lidar_radar"].T, atol=1e-12)
-    np.testing.assert_allclose(own["camera_lidar"], sent.pairs["camera_lidar"].T, atol=1e-12)
+    expanded = format_named("urdf").tree({"car": xacro.process_file(str(car)).toxml().encode()})
+    own = format_named("autoware").tree({"k.yaml": (folder / "sensor_kit_calibration.yaml").read_bytes()})
     T_link_optical = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
-    np.testing.assert_allclose(T_link_optical @ own["camera_lidar"], found["camera_lidar"], atol=1e-12)
-
-
-def test_the_xacro_expands_to_what_the_urdf_says(sent, tmp_path):
-    path = exported("xacro", sent, tmp_path) / "sensors.urdf.xacro"
-    expanded = xacro.process_file(str(path)).toxml().encode()
-    urdf = format_named("urdf").write(sent)["sensors.urdf"]
-    found = [format_named("urdf").pairs({"f": text}, sent.names) for text in (expanded, urdf)]
-    for pair in ("camera_lidar", "lidar_radar"):
-        np.testing.assert_array_equal(found[0][pair], found[1][pair])
+    for sensor, T in T_TOP.items():
+        optical = T_link_optical if sensor in ("front", "left") else np.eye(4)
+        for tree in (expanded, own):
+            found = tree.lookup("top", sent.names.of(sensor))
+            np.testing.assert_allclose(found @ optical, T, atol=1e-12)
 
 
 def test_ros_2_launch_files_start_a_publisher_per_pose(sent, monkeypatch):
@@ -81,15 +69,6 @@ def test_ros_2_launch_files_start_a_publisher_per_pose(sent, monkeypatch):
         assert (node["package"], node["executable"]) == (other["pkg"], other["exec"])
         assert node["arguments"] == other["args"].split()
         assert all(isinstance(a, str) for a in node["arguments"])
-
-
-def test_the_static_transforms_are_a_log_that_ingest_reads(sent, tmp_path):
-    path = exported("tf-static", sent, tmp_path) / "tf_static.mcap"
-    log, tree = open_log(path), TransformTree()
-    for message in log.scan(["/tf_static"]):
-        assert tree.add_message(decode(message.channel, message.data)) == 0
-    log.close()
-    np.testing.assert_allclose(tree.lookup("camera", "lidar"), sent.pairs["camera_lidar"].T, atol=1e-12)
 
 
 def test_the_camera_chain_passes_kalibr_s_own_checks(sent):
@@ -129,7 +108,3 @@ def test_the_program_that_a_format_is_for_finds_the_same_transforms(name, read_b
         np.testing.assert_allclose(
             found[name][pair], sent.pairs[pair].T, atol=1e-12, err_msg=found[name]["reader"]
         )
-
-
-def test_names_of_frames_are_the_defaults_that_the_readers_look_for():
-    assert FrameNames() == FrameNames("camera", "lidar", "radar", "base_link")

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import mcap.writer
+from mcap.reader import make_reader
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from tests.makers.written_logs import Kit
@@ -27,6 +29,21 @@ _NUMBERS = {
 def schema(name: str) -> Any:
     """The official class of a message."""
     return getattr(import_module(f"foxglove_schemas_protobuf.{name}_pb2"), name)
+
+
+def messages_of(path: Path) -> dict[str, list[Any]]:
+    """By topic, the messages of an MCAP: by the official classes, not by the schemas in the file."""
+    found: dict[str, list[Any]] = {}
+    with path.open("rb") as stream:
+        for its, channel, message in make_reader(stream, validate_crcs=True).iter_messages():
+            if its is not None and its.encoding == "protobuf":
+                whole = schema(its.name.removeprefix("foxglove."))
+                assert its.name == whole.DESCRIPTOR.full_name
+                told = whole.FromString(message.data)
+            else:
+                told = json.loads(message.data)
+            found.setdefault(channel.topic, []).append(told)
+    return found
 
 
 def foxglove(message: Any) -> Any:
