@@ -9,21 +9,24 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.audit.days import DOFS, PairDays, charts_of_fleet, edges_of_fleet
 from pipeline.audit.estimates import Estimates, days_of, estimates_of, joined
 from pipeline.audit.fusion import Mount
 from pipeline.audit.history import History, models_of
-from pipeline.audit.mounts import mounts_of
+from pipeline.audit.noise import estimate_noise
 from pipeline.audit.pose_days import VehiclePoses, read_poses
 from pipeline.audit.references import Kept, first_accepted, kept_columns, kept_of, read_kept
 from pipeline.audit.rig_states import rig_states
 from pipeline.audit.service import events_until, restart_of
+from pipeline.audit.vehicle import limit_of
+from pipeline.audit.wander import with_wander
 from pipeline.core.config import AuditConfig, FleetConfig, config_hash
 from pipeline.core.stage_work import Records, Run, Task, Told, Window, Work
 from pipeline.rig.edges import edge_of
 from pipeline.rig.graph import Edge, tie
 from pipeline.store.partitions import Partition, content_hash, days_after, last_possible_day, work_key
 from pipeline.store.records import last_day, read_last
-from schemas.calibrations import CALIBRATIONS
+from schemas.calibrations import CALIBRATIONS, DOF_NAMES
 from schemas.drift import DRIFT, DriftFinding
 from schemas.service_events import ServiceEvent
 from schemas.states import StateRow
@@ -36,6 +39,9 @@ _DAYS_BACK = 60
 _END = dt.date.max.toordinal()
 # What is asked of the audit's rows.
 _CHANGE = ("start_day", "start_day_latest", "moved_sensor", "kind", "magnitude")
+# A mount's scatter from day to day before any day shows more: another simulator's mounts have .03 to .05 deg; load,
+# temperature and tyres move a car's sensors to its road by as much.
+_SCATTER = np.array([*np.radians([0.03] * 3), 0.003, 0.003, 0.003])
 
 
 def work(task: Task) -> Work:
@@ -135,3 +141,33 @@ def _edges_of(records: Estimates) -> dict[Edge, Float[np.ndarray, "3 3"] | None]
 def _told(rows: Sequence[StateRow]) -> Told:
     counts = {s: sum(r.status == s for r in rows) for s in ("current", "prior", "none")}
     return Told(counts, reason="" if rows else "no calibration record", refused=not rows)
+
+
+def mounts_of(
+    fleet: Sequence[Mapping[Edge, PairDays]], config: AuditConfig, models: Sequence[str]
+) -> list[dict[Edge, Mount]]:
+    """The mount of each sensor of each vehicle, by tie of sensor and reference."""
+    edges = edges_of_fleet(fleet)
+    if not edges:
+        return [{} for _ in fleet]
+    charts, shape = charts_of_fleet(fleet, edges), (len(fleet), len(edges), DOFS)
+    limit = np.tile([limit_of(edge, dof, config) for edge in edges for dof in DOF_NAMES], len(fleet))
+    noise = with_wander(charts, estimate_noise(charts, DOFS, len(edges), models), limit, shape, models)
+    least = noise if noise.less_alike is None else noise.less_alike
+    # Days that scatter by more than their sigmas do so because the mount does, or because the sigmas are too small:
+    # either way tomorrow lies that far off.
+    sigma = np.where(np.isfinite(charts.sigma), charts.sigma, np.nan)
+    known = charts.count > 0
+    typical = np.zeros(len(known))
+    typical[known] = np.nanmedian(sigma[known], axis=1)
+    beyond = ((noise.scale**2 - 1) * typical**2).reshape(shape)
+    alike = (0.5 * (noise.autocorrelation + least.autocorrelation)).reshape(shape).mean(axis=-1)
+    wander = np.zeros(shape) if noise.wander is None else noise.wander.reshape(shape)
+    return [
+        {
+            edge: Mount(np.sqrt(_SCATTER**2 + beyond[v, p]), wander[v, p], float(alike[v, p]))
+            for p, edge in enumerate(edges)
+            if edge in own
+        }
+        for v, own in enumerate(fleet)
+    ]

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.calibrate.adjust.three import EDGES, poses_of, three_sensors
 from pipeline.calibrate.adjusted_day import adjusted_rig, clocks_of, evidence_of_day, judged_together
 from pipeline.calibrate.judging import Judged, Judging
 from pipeline.calibrate.methods import Method, Solver, method_named
@@ -24,15 +23,29 @@ from pipeline.core.config import FleetConfig
 from pipeline.core.errors import SolveError
 from pipeline.core.results import Progress, silent
 from pipeline.core.stage_work import Probes
+from pipeline.rig.changes import change_jacobian
 from pipeline.rig.checks import FailedCheck
 from pipeline.rig.day_prior import no_prior
 from pipeline.rig.estimates import Prior, Solution
+from pipeline.rig.extrinsics import Extrinsics
+from pipeline.rig.graph import Edge, RigGraph, Sensor
+from pipeline.rig.se3 import adjoint, inverse
 from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, SENSORS, CalibrationRecord
 from schemas.observations import WITHOUT_LABELS, Observation
 
-__all__ = ["DayOfPairs", "calibrate_observations", "records_of", "solve_day"]
+__all__ = [
+    "EDGES",
+    "DayOfPairs",
+    "calibrate_observations",
+    "poses_of",
+    "records_of",
+    "solve_day",
+    "three_sensors",
+]
 
 _TRIGGER_FRAMES = 40  # metrics are means over frames: more of them only cost time
+CAMERA, LIDAR, RADAR = Sensor("camera", "camera"), Sensor("lidar", "lidar"), Sensor("radar", "radar")
+EDGES = {e.kind: e for e in (Edge(CAMERA, LIDAR), Edge(CAMERA, RADAR), Edge(LIDAR, RADAR))}
 
 
 def calibrate_observations(
@@ -263,3 +276,25 @@ def _spread(
     rows = [o for o in observations if id(o) in used]
     picked = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), _TRIGGER_FRAMES)).astype(int))
     return [rows[i] for i in picked]
+
+
+def three_sensors(pairs: Collection[str]) -> RigGraph:
+    """The graph of these pairs, referred to the lidar."""
+    return RigGraph((CAMERA, LIDAR, RADAR), tuple(e for p, e in EDGES.items() if p in pairs), LIDAR)
+
+
+def poses_of(prior: Prior, dt_s: dict[str, float]) -> Extrinsics:
+    """Poses relative to the lidar; rotation and position of each transform are independent, in parent axes.
+
+    `dt_s` are the expected clock offsets of camera and radar to the lidar.
+    """
+    T_lidar_camera = inverse(prior.T_camera_lidar)
+    covariance = np.zeros((12, 12))
+    for k, (pair, turned) in enumerate(
+        (("camera_lidar", adjoint(T_lidar_camera)), ("lidar_radar", np.eye(6)))
+    ):
+        to_left = turned @ np.linalg.inv(change_jacobian(prior.of(pair)))
+        at = slice(6 * k, 6 * k + 6)
+        covariance[at, at] = to_left @ prior.covariance(pair) @ to_left.T
+    T = {"lidar": np.eye(4), "camera": T_lidar_camera, "radar": prior.T_lidar_radar}
+    return Extrinsics(LIDAR, T, ("camera", "radar"), covariance, covariance, dt_s)

@@ -1,12 +1,20 @@
-"""Verdict and evidence of each pair of a solved day: held-out frames, claim, failed checks."""
+"""Verdict and evidence of each pair of a solved day: held-out frames, claim, failed checks.
+
+Held-out frames at known rotations of the result: a test whether they would reject a prior rotated like this.
+
+A record that lies many sigmas from its prior is held unless held-out frames align better at the result than at
+the prior. To find the smallest error of the prior that would be detected, this test is made for errors that
+the prior does not have.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from pipeline.calibrate.numerics.frame_blocks import scene_blocks
 from pipeline.calibrate.numerics.search_range import search_range
@@ -17,7 +25,6 @@ from pipeline.calibrate.verify.held_out_search import found_elsewhere, held_out_
 from pipeline.calibrate.verify.held_out_test import HeldOutTest, paired_test
 from pipeline.calibrate.verify.held_out_update import held_out_update
 from pipeline.calibrate.verify.mounting import mounting_covariance
-from pipeline.calibrate.verify.probes import probe_numbers
 from pipeline.calibrate.verify.seen_targets import seen_targets, unseen_failure, views_of
 from pipeline.calibrate.verify.target_accuracy import Claim, claims_of
 from pipeline.calibrate.verify.verdict import Evidence, Verdict, judge, matters
@@ -25,11 +32,16 @@ from pipeline.core.config import ChecksConfig, FleetConfig
 from pipeline.core.stage_work import NO_PROBES, Probes
 from pipeline.rig.checks import FailedCheck
 from pipeline.rig.estimates import PairEstimate, Prior
+from pipeline.rig.sensor_turns import sensor_turn
 from pipeline.rig.targets import DEFAULT_TARGETS
 from pipeline.rig.views import View
+from schemas.calibrations import PROBE_Z
 from schemas.observations import Observation
 
 __all__ = ["Judged", "Judging"]
+
+# Axes that the comparison of held-out frames depends on.
+_PROBED = {"camera_lidar": ("azimuth", "elevation", "roll"), "lidar_radar": ("azimuth",)}
 
 
 @dataclass(frozen=True)
@@ -157,3 +169,30 @@ class Judging:
             estimate, place, score.cost, claims, scene_blocks(held_out), targets, limits.worse_alignment_z
         )
         return test, claims, probes, elsewhere
+
+
+def probe_numbers(
+    pair: str,
+    T: Float[np.ndarray, "4 4"],
+    cost: Callable[[np.ndarray], np.ndarray],
+    blocks: Int[np.ndarray, " F"],
+    sizes_deg: Sequence[float],
+) -> dict[str, float]:
+    """Deviate z of the paired test by turn, negative = held-out frames prefer the result; for diagnostics.
+
+    Args:
+        pair: pair whose camera or radar is rotated.
+        T: the result.
+        cost: cost of each held-out frame at a pose of the pair.
+        blocks: scene of each held-out frame.
+        sizes_deg: sizes of the rotations; both signs are tested.
+    """
+    found, after = dict[str, float](), cost(T) if sizes_deg else np.zeros(0)
+    for axis in _PROBED.get(pair, ()):
+        for deg in (sign * size for size in sizes_deg for sign in (1.0, -1.0)):
+            of_camera = pair == "camera_lidar"
+            R = sensor_turn(axis, float(np.radians(deg)), of_camera=of_camera)
+            test = paired_test(cost(np.linalg.inv(R) @ T if of_camera else T @ R), after, blocks)
+            if test is not None:
+                found[f"{PROBE_Z}{axis}_{deg:+g}"] = test.z
+    return found

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
-from pipeline.calibrate.half_days import half_days_of
 from pipeline.calibrate.judging import Judged
 from pipeline.calibrate.paper.triggers import trigger_metrics
 from pipeline.calibrate.solved import SolvedDay
@@ -19,8 +19,10 @@ from pipeline.calibrate.verify.held_out_test import HeldOutTest
 from pipeline.core.errors import SolveError
 from pipeline.core.stage_work import NO_PROBES, Probes
 from pipeline.rig.cameras import camera_of
+from pipeline.rig.changes import change_between
 from pipeline.rig.estimates import DayParts, PairEstimate, Prior, Solution
 from pipeline.rig.pose_columns import pose_columns
+from pipeline.rig.se3 import inverse
 from pipeline.rig.spherical import camera_direction_angles
 from pipeline.store.partitions import Partition
 from schemas.calibrations import DOF_NAMES, FRAMES_OF_PAIR, PAIRS, CalibrationRecord
@@ -30,6 +32,7 @@ from schemas.versions import CODE_VERSION
 __all__ = [
     "Inputs",
     "environment_of",
+    "half_days_of",
     "parts_numbers",
     "record_of",
     "refused_record",
@@ -306,3 +309,37 @@ def _loop_fields(solution: Solution) -> dict[str, Any]:
 
 def _add(a: Mapping[str, int], b: Mapping[str, int]) -> dict[str, int]:
     return {name: a.get(name, 0) + b.get(name, 0) for name in {*a, *b}}
+
+
+def half_days_of(
+    pair: str, estimates: Mapping[str, PairEstimate], faults: Mapping[str, Sequence[str]]
+) -> Float[np.ndarray, "2 2 6"] | None:
+    """Changes of a pair from its estimate to its first and last part, with sigmas; None if it did not move.
+
+    Camera_radar changes as the other two do. `faults` are those of each pair's verdict.
+    """
+    parts, own = (
+        {p: _parts(e, "moved_in_day" in faults.get(p, ())) for p, e in estimates.items()},
+        estimates[pair],
+    )
+    poses, sigmas = parts[pair]
+    if pair == "camera_radar" and own.parts is None and len(parts) == len(PAIRS):
+        (T_cl, s_cl), (T_lr, s_lr) = parts["camera_lidar"], parts["lidar_radar"]
+        # From where the other two have it, for its own pose is of all three.
+        back = inverse(estimates["camera_lidar"].T @ estimates["lidar_radar"].T) @ own.T
+        poses, sigmas = [a @ b @ back for a, b in zip(T_cl, T_lr, strict=True)], np.hypot(s_cl, s_lr)
+    change = np.array([change_between(own.T, T) for T in poses])
+    if not sigmas.any():
+        return None
+    # A turn of the parent carries the child's origin along.
+    shift = np.where(np.abs(change[:, 3:]).max() > 0, sigmas.max(axis=1) * np.linalg.norm(own.T[:3, 3]), 0.0)
+    return np.stack([change, np.column_stack([sigmas, *[shift] * 3])], axis=1)
+
+
+def _parts(estimate: PairEstimate, has_moved: bool) -> tuple[list[np.ndarray], Float[np.ndarray, "2 3"]]:
+    """Poses of the two parts and sigmas of their rotations; the estimate itself if it did not move."""
+    if estimate.parts is None or not has_moved:
+        return [estimate.T, estimate.T], np.zeros((2, 3))
+    compared = np.isin(np.arange(3), estimate.parts.tested)
+    sigma = [np.where(compared, np.sqrt(np.diag(s)), 0.0) for s in estimate.parts.spread]
+    return list(estimate.parts.T), np.array(sigma)

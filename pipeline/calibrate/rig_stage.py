@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
+from jaxtyping import Float
 
 from pipeline.calibrate.day import calibrate_observations
-from pipeline.calibrate.earlier import accepted_before
 from pipeline.calibrate.edge_records import refused_edge
 from pipeline.calibrate.methods import method_named
 from pipeline.calibrate.pose_rows import pose_rows, poses_of_records
 from pipeline.calibrate.prior_doubts import hold_doubted
 from pipeline.calibrate.records import Inputs, refused_records
 from pipeline.calibrate.rig_day import RigDay, calibrate_rig
-from pipeline.calibrate.three_sensors import three_sensors
 from pipeline.calibrate.unlabelled import noted
 from pipeline.calibrate.verify.seen_targets import views_of
 from pipeline.core.errors import SolveError
@@ -25,18 +24,27 @@ from pipeline.core.stage_work import Task
 from pipeline.rig.day_prior import prior_of_three, rig_prior
 from pipeline.rig.estimates import Prior
 from pipeline.rig.graph import Edge, edge_between
-from pipeline.rig.overlap import find_edges, overlaps_of
+from pipeline.rig.overlap import Overlap, best_three, find_edges, overlaps_of
 from pipeline.rig.prior import RigPrior, middle_of, moved
 from pipeline.rig.rig import Rig
 from pipeline.rig.views import FRAMES, View
+from pipeline.store.current import current_records, transform_of
 from pipeline.store.moments import sensors_of
+from pipeline.store.partitions import Lake, Partition, days_after
+from pipeline.store.records import read_records
 from pipeline.store.views import Chosen, observations_of, perceived
-from schemas.calibrations import SENSORS, CalibrationRecord, pairs_of
+from schemas.calibrations import CALIBRATIONS, SENSORS, CalibrationRecord, pairs_of
+from schemas.columns import POSE_COLUMNS
 from schemas.moments import PRIOR
 from schemas.observations import Observation
 from schemas.poses import PoseRow
 
-__all__ = ["refused_edges", "rig_rows", "three_of_day", "three_rows"]
+__all__ = ["accepted_before", "refused_edges", "rig_rows", "three_of_day", "three_rows", "three_sensors"]
+
+# Days with records that are looked at: a vehicle that was held for longer has no state worth a look.
+_DAYS_BACK = 10
+# A vehicle that drives once a week has ten days in a quarter; older days are not read.
+_CALENDAR_DAYS_BACK = 92
 
 
 def rig_rows(task: Task, about: Inputs, progress: Progress) -> list[CalibrationRecord | PoseRow]:
@@ -136,3 +144,49 @@ def _view(task: Task, chosen: Chosen, moments: Sequence[int]) -> View | None:
 
 def _rows(task: Task, chosen: Chosen) -> list[Observation]:
     return list(observations_of(task.lake, task.partition, chosen=chosen))
+
+
+def accepted_before(
+    lake: Lake, partition: Partition, method: str, edge: Edge
+) -> Float[np.ndarray, "4 4"] | None:
+    """T_parent_child of an edge on its latest earlier accepted day; None if there is none.
+
+    It carries no information about today's pose and is no part of the work key: the search starts there only
+    if the day alone does not decide, and the result is judged like any other.
+    """
+    found = read_records(
+        lake,
+        CALIBRATIONS,
+        CalibrationRecord,
+        vehicle=partition.vehicle,
+        first=days_after(partition.day, -_CALENDAR_DAYS_BACK),
+        last=days_after(partition.day, -1),
+        columns=POSE_COLUMNS,
+    )
+    wanted = (edge.parent.name, edge.child.name, method, "accepted")
+    records = current_records(found)
+    days = sorted({r.day for r in records}, reverse=True)[:_DAYS_BACK]
+    for record in reversed(records):
+        if (
+            record.day in days
+            and (record.parent_frame, record.child_frame, record.method, record.status) == wanted
+        ):
+            return transform_of(record)
+    return None
+
+
+def three_sensors(method: str, rig: Rig, overlaps: Sequence[Overlap]) -> Mapping[str, str]:
+    """Names by kind: those that the rig names, else the three with the largest overlap; else SolveError."""
+    sensors = [node for node in rig.nodes if node.kind != "base"]
+    only: Mapping[str, str] = {sensor.kind: sensor.name for sensor in sensors}
+    if len(only) == len(sensors):
+        return only
+    named = rig.three or ()
+    among = [o for o in overlaps if not named or {s.name for s in o.edge.sensors} <= set(named)]
+    best = best_three(among)
+    if best is None:
+        which = "no three of the rig do"
+        if named:
+            which = f"{', '.join(named[:2])} and {named[2]} share none, name others as three of the rig"
+        raise SolveError(f"method {method} works on a camera, a lidar and a radar that share a view: {which}")
+    return {sensor.kind: sensor.name for sensor in best}

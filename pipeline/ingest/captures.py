@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Float, Float32
 
 from pipeline.core.config import IngestConfig
 from pipeline.core.errors import LogError
 from pipeline.core.rigs import CameraTopics, RadarTopics, TopicSemantics
-from pipeline.ingest.deskew import deskew
 from pipeline.ingest.index import DayIndex, Located
 from pipeline.ingest.messages.decoding import DECODE_ERRORS, decode, header_frame_id
 from pipeline.ingest.messages.detections import read_detections
@@ -31,9 +31,10 @@ from pipeline.ingest.roles import DETECTIONS, LABELS, Role
 from pipeline.ingest.sync import Rejection, match_nearest
 from pipeline.rig.cameras import Camera
 from pipeline.rig.rig import Rig
+from pipeline.rig.se3 import inverse, transform_points
 from schemas.captures import Capture, Image, Scan, Sweep
 
-__all__ = ["CaptureReader", "Read", "Rejected", "readers_of"]
+__all__ = ["CaptureReader", "Read", "Rejected", "deskew", "planar_motion", "readers_of"]
 
 _SAME_IMAGE_NS = 5_000_000  # labels and detections have the stamp of the image they were computed from
 
@@ -252,3 +253,42 @@ class _Scans:
             radar_has_elevation=cloud.has_elevation, doppler_period_mps=self._radar.doppler_period_mps,
         )  # fmt: skip
         return Read(row, frame_id, cloud, cloud.dropped)
+
+
+def deskew(
+    points_lidar: Float32[np.ndarray, "N 3"],
+    time_s: Float32[np.ndarray, " N"],
+    speed_mps: float,
+    yaw_rate_radps: float,
+    T_vehicle_lidar: Float[np.ndarray, "4 4"],
+) -> Float32[np.ndarray, "N 3"]:
+    """Points in the lidar frame at the stamp, for a vehicle of constant speed and yaw rate during the sweep.
+
+    Args:
+        time_s: of each point, relative to the stamp.
+        speed_mps: forward speed of the vehicle frame's origin.
+        yaw_rate_radps: positive to the left.
+        T_vehicle_lidar: maps lidar coordinates to the vehicle frame (x forward, y left, z up).
+    """
+    points = transform_points(T_vehicle_lidar, points_lidar.astype(np.float64))
+    yaw, shift_x, shift_y = planar_motion(time_s.astype(np.float64), speed_mps, yaw_rate_radps)
+    c, s = np.cos(yaw), np.sin(yaw)
+    moved = np.stack(
+        [
+            c * points[:, 0] - s * points[:, 1] + shift_x,
+            s * points[:, 0] + c * points[:, 1] + shift_y,
+            points[:, 2],
+        ],
+        -1,
+    )
+    return transform_points(inverse(T_vehicle_lidar), moved).astype(np.float32)
+
+
+def planar_motion(
+    time_s: Float[np.ndarray, " N"], speed_mps: float, yaw_rate_radps: float
+) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, " N"], Float[np.ndarray, " N"]]:
+    """Yaw [rad] and position [m] of the vehicle on a circular arc, relative to its pose at time 0."""
+    yaw = yaw_rate_radps * time_s
+    # sin(a)/a and (1-cos(a))/a through sinc: exact on a straight line too
+    half = np.sinc(yaw / (2 * np.pi))
+    return yaw, speed_mps * time_s * half * np.cos(yaw / 2), speed_mps * time_s * half * np.sin(yaw / 2)

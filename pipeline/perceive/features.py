@@ -1,4 +1,16 @@
-"""Features of one image, sweep or scan: a function per kind of sensor, from captures to features."""
+"""Features of one image, sweep or scan: a function per kind of sensor, from captures to features.
+
+Steps of brightness in an image, in the place of label borders, for a camera without semantics.
+
+No step shows which side is nearer, so each is a border of both. Strong, long steps are taken: outlines of
+poles, cars and houses, kerbs and paint, not the grain of leaves and asphalt.
+
+Move a sweep's points to its stamp by the radar's velocity, for logs without odometry.
+
+One scan gives the radar's velocity but not the car's yaw rate, because the lever arm is not logged. Points
+are therefore moved as if the car drove straight. In a turn the rotation between a point and the stamp
+remains: half a degree at 10 deg/s and half a sweep. Lidar-radar leaves such frames out.
+"""
 
 from __future__ import annotations
 
@@ -6,14 +18,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
 
 from pipeline.core.config import PerceiveConfig
-from pipeline.perceive.brightness import brightness_steps
 from pipeline.perceive.camera import CameraSemantics, SemanticsSource, decode_grey, encode_png
 from pipeline.perceive.depth_edges import lidar_edges
-from pipeline.perceive.deskew import deskew_straight, velocity_ahead
 from pipeline.perceive.drivable import DrivableSource, free_sector
 from pipeline.perceive.ego_velocity import RadarMotion, Travel, radar_motion
 from pipeline.perceive.ground import PointSource, find_ground
@@ -28,8 +39,11 @@ from pipeline.rig.radar_grid import Scan as RadarScan
 from schemas.captures import CameraColumns, Capture, Image, Scan, Sweep, SweepColumns
 from schemas.features import ImageFeatures, ScanFeatures, SweepFeatures
 from schemas.moments import Moment
+from schemas.observations import STEP_BELOW, STEP_RIGHT
 
 __all__ = [
+    "brightness_steps",
+    "deskew_straight",
     "deskewed",
     "heading_of",
     "motion_of",
@@ -37,11 +51,20 @@ __all__ = [
     "perceive_scan",
     "perceive_sweep",
     "speed_of",
+    "velocity_ahead",
     "why_unusable",
 ]
 
 _MIN_LIDAR_POINTS = 100  # less shows neither ground nor objects
 _CAMERA = ("image_width_px", "image_height_px", "camera_model", "camera_K", "camera_D")
+# Tried on the real car and on another simulator's day; a blur of 2 px, the strongest 3 % and runs of any length find
+# the same pose to .05 deg.
+_BLUR_PX = 1.0
+_STRONGEST = 0.07  # share of the pixels
+_SHORTEST_RUN_PX = 8
+_GAP_PX = 4  # in a run, where another border crosses it
+_LEAST_STEP = 0.5  # grey levels: in a plain image the strongest steps are rounding
+_LEAST_ACROSS = 0.7  # of the step along the other axis: a step belongs to the axis that it crosses
 
 
 def why_unusable(capture: Capture) -> FrameReason | None:
@@ -271,3 +294,48 @@ def _as_scan(scan: Scan, moment: Moment, motion: RadarMotion, ego: EgoMotion) ->
         ego.velocity_mps,
         ego.yaw_rate_radps,
     )
+
+
+def brightness_steps(grey: UInt8[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W"]:
+    """Bits of each pixel: STEP_RIGHT if brightness steps between it and the next one of its row; STEP_BELOW."""
+    right, below = _steps_along_rows(grey), _steps_along_rows(grey.T).T
+    return np.asarray(STEP_RIGHT * right + STEP_BELOW * below, np.uint8)
+
+
+def _steps_along_rows(grey: UInt8[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    """Where the step to the next pixel of the row is a maximum of the row, among the strongest, and in a long run."""
+    blurred = cv2.GaussianBlur(np.ascontiguousarray(grey, np.float32), (0, 0), _BLUR_PX)
+    along, across = np.zeros_like(blurred), np.zeros_like(blurred)
+    along[:, :-1] = np.abs(np.diff(blurred, axis=1))
+    across[:-1] = np.abs(np.diff(blurred, axis=0))
+    is_step = along > max(float(np.quantile(along, 1 - _STRONGEST)), _LEAST_STEP)
+    is_step[:, 1:-1] &= (along[:, 1:-1] >= along[:, :-2]) & (along[:, 1:-1] > along[:, 2:])
+    is_step[:, [0, -1]] = False
+    is_step &= along > _LEAST_ACROSS * across
+    closed = cv2.morphologyEx(is_step.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((_GAP_PX + 1, 1), np.uint8))
+    _, run, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
+    is_long = stats[:, cv2.CC_STAT_HEIGHT] >= _SHORTEST_RUN_PX
+    is_long[0] = False  # the background
+    return np.asarray(is_long[run])
+
+
+def deskew_straight(
+    points_lidar: Float32[np.ndarray, "N 3"],
+    time_s: Float32[np.ndarray, " N"],
+    velocity_lidar_mps: Float[np.ndarray, " 3"],
+) -> Float32[np.ndarray, "N 3"]:
+    """Points in the lidar frame at the stamp [m]; velocity in lidar axes, times relative to the stamp."""
+    moved = points_lidar + time_s.astype(np.float64)[:, None] * velocity_lidar_mps
+    return moved.astype(np.float32)
+
+
+def velocity_ahead(
+    velocity_radar_mps: Float[np.ndarray, " 3"], heading_rad: float
+) -> Float[np.ndarray, " 3"]:
+    """Level velocity of the car in lidar axes, from that in radar axes without its vertical part.
+
+    `heading_rad` is the azimuth of the lidar's x axis in radar axes.
+    """
+    c, s = np.cos(heading_rad), np.sin(heading_rad)
+    vx, vy = float(velocity_radar_mps[0]), float(velocity_radar_mps[1])
+    return np.array([c * vx + s * vy, c * vy - s * vx, 0.0])

@@ -2,7 +2,7 @@
 
 An error fails if it is measured (beyond so many sigmas, and beyond its limit) and if held-out frames confirm
 the log's answer: a record many sigmas from its prior is held where they align no better than at the prior.
-Turns of the answer show whether they would (`calibrate/verify/probes.py`).
+Turns of the answer show whether they would (`calibrate/judging.py`).
 """
 
 from __future__ import annotations

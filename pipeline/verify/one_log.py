@@ -5,11 +5,15 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Sequence
 
+import numpy as np
+from jaxtyping import Float
+
 from pipeline.core.config import FleetConfig, VerifyConfig
 from pipeline.core.errors import SolveError
 from pipeline.rig.day_prior import rig_prior
 from pipeline.rig.graph import Sensor
 from pipeline.rig.prior import RigPrior
+from pipeline.rig.se3 import exp_so3, from_rotation_translation, log_so3
 from pipeline.rig.sensor_turns import TURN_AXES
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import perceived
@@ -21,12 +25,15 @@ from pipeline.verify.axes import (
     shared_sigmas,
 )
 from pipeline.verify.one_axis import AxisCheck, HeldOut
-from pipeline.verify.spelling import on_grid
 from schemas.calibrations import FRAMES_OF_PAIR, CalibrationRecord
 from schemas.moments import PRIOR
 from schemas.poses import PoseRow
 
-__all__ = ["check_poses", "for_one_look", "prior_in_use", "with_prior"]
+__all__ = ["check_poses", "for_one_look", "on_grid", "prior_in_use", "with_prior"]
+
+_CELL = 1e-4  # rad and m: .006 deg, a tenth of the sigma on the best day
+# As fraction of a cell: keeps borders of cells away from numbers with up to five digits, as in files.
+_OFFSET = 0.137
 
 
 def for_one_look(config: FleetConfig, frames: int) -> FleetConfig:
@@ -117,3 +124,10 @@ def _held_out(row: PoseRow, records: Sequence[CalibrationRecord], verify: Verify
     pair = {"camera": "camera_lidar", "radar": "lidar_radar"}.get(row.kind)
     own = [r for r in records if r.pair == pair and row.sensor in {r.parent_frame, r.child_frame}]
     return {axis: held_out_of(own, verify, axis) for axis in TURN_AXES}
+
+
+def on_grid(T: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """The transform at the middle of its cell: at most half a cell away in each component."""
+    numbers = np.concatenate([log_so3(T[:3, :3]), T[:3, 3]])
+    middle = (np.floor(numbers / _CELL + _OFFSET) + 0.5 - _OFFSET) * _CELL
+    return from_rotation_translation(exp_so3(middle[:3]), middle[3:])

@@ -1,6 +1,6 @@
 import pytest
 
-from pipeline.calibrate.three_sensors import three_sensors
+from pipeline.calibrate.rig_stage import three_sensors
 from pipeline.core.config import FleetConfig
 from pipeline.core.errors import SolveError
 from pipeline.rig.overlap import overlaps_of

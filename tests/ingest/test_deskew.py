@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.ingest.deskew import deskew, planar_motion
+from pipeline.ingest.captures import deskew, planar_motion
 from pipeline.rig.se3 import exp_se3, inverse, transform_points
 
 

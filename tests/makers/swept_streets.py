@@ -6,7 +6,7 @@ import numpy as np
 
 from pipeline.calibrate.edges.sweeps import Sweep, vehicle_sized
 from pipeline.calibrate.numerics.frame_blocks import Scenes
-from pipeline.ingest.deskew import deskew
+from pipeline.ingest.captures import deskew
 from pipeline.objective.ego_motion import EgoMotion
 from pipeline.perceive.ground import find_ground
 from pipeline.perceive.lidar import cluster_boxes, cluster_objects, sample_uniformly

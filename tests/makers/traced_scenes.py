@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 
 from pipeline.core.config import PerceiveConfig
-from pipeline.perceive.brightness import brightness_steps
 from pipeline.perceive.depth_edges import lidar_edges
+from pipeline.perceive.features import brightness_steps
 from pipeline.perceive.road_markings import lidar_markings, road_contrast
 from pipeline.rig.cameras import Camera
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse

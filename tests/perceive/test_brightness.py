@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.perceive.brightness import brightness_steps
+from pipeline.perceive.features import brightness_steps
 from schemas.observations import STEP_BELOW, STEP_RIGHT
 
 HEIGHT, WIDTH = 60, 90

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from pipeline.core.config import PerceiveConfig
 from pipeline.core.rigs import TopicSemantics
 from pipeline.perceive.camera import TopicSource
-from pipeline.perceive.deskew import deskew_straight, velocity_ahead
+from pipeline.perceive.features import deskew_straight, velocity_ahead
 from pipeline.perceive.stage import AS_LOGGED, BY_DOPPLER, Shown, Sources, perceive_moment
 from pipeline.rig.se3 import exp_so3
 from tests.makers.lakes import joined_of

@@ -9,7 +9,7 @@ from mcap.reader import make_reader
 
 from pipeline.core.rigs import LidarTurn
 from pipeline.core.ros_messages import RosMessages
-from pipeline.ingest.deskew import deskew
+from pipeline.ingest.captures import deskew
 from pipeline.perceive.sweep_pairs import motions, surfaces_of
 from pipeline.perceive.untimed_sweeps import BY_AZIMUTH, WITHOUT_TIMES, Turning, turning_of
 from pipeline.rig.topics import TOPICS

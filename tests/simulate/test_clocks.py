@@ -9,7 +9,7 @@ import pytest
 from pipeline.rig.topics import TOPICS
 from pipeline.simulate.faults import Fault
 from pipeline.simulate.fleet import FleetSpec, mounting_on, simulate_vehicle_day
-from pipeline.simulate.sensors.clocks import Ticks, free_clocks
+from pipeline.simulate.logs.recording import Ticks, free_clocks
 from pipeline.simulate.sensors.rigs import rig_named
 
 SHORT = {"vehicles": 1, "days": 1, "drives": 1, "environments": "urban"}

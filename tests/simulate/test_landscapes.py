@@ -10,12 +10,11 @@ from pipeline.simulate.fleet import FleetSpec
 from pipeline.simulate.sensors.data_sheets import LidarSpec
 from pipeline.simulate.sensors.lidar import sweep_lidar
 from pipeline.simulate.world.actors import HOLLOW, actor_mesh
-from pipeline.simulate.world.casting import Moment, standing_of
+from pipeline.simulate.world.casting import Moment, chunk_mesh, standing_of
 from pipeline.simulate.world.drives import Drive, Parked
 from pipeline.simulate.world.landscapes import LANDSCAPES, landscape_named
 from pipeline.simulate.world.materials import LABELS, MATERIALS
 from pipeline.simulate.world.meshes import MeshBuilder, join, placed
-from pipeline.simulate.world.scenery import chunk_mesh
 
 CAR_M = 9.0
 HIGH = np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1.73], [0, 0, 0, 1]])

@@ -3,8 +3,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from pipeline.simulate.sensors.multipath import faded_by_road
-from pipeline.simulate.sensors.radar import RadarErrors, scan_radar
+from pipeline.simulate.sensors.radar import RadarErrors, faded_by_road, scan_radar
 from pipeline.simulate.sensors.rigs import rig_named
 from pipeline.simulate.sensors.semantics import Box, SemanticsSpec, noisy_boxes, noisy_labels
 from pipeline.simulate.world.materials import LABELS

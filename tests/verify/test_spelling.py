@@ -3,7 +3,7 @@
 import numpy as np
 
 from pipeline.rig.se3 import exp_se3, exp_so3, from_rotation_translation, inverse, log_se3
-from pipeline.verify.spelling import on_grid
+from pipeline.verify.one_log import on_grid
 
 
 def test_digits_beyond_any_measurement_do_not_matter_and_the_pose_stays_where_it_is():

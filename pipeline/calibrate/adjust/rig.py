@@ -4,6 +4,11 @@ Edges that failed a check are left out first: within a cycle, an innovation show
 rarely which one. Then the edge with the largest innovation beyond the limit is removed, and the rest is
 solved again. If several edges explain a contradiction about equally well, the one whose removal loses least
 information is removed, and all are listed.
+
+Innovation of each edge: its distance to all others, in sigmas.
+
+An edge without a second path between its sensors is compared with the prior. Directions that neither the edge
+nor the others know better than the prior are left out.
 """
 
 from __future__ import annotations
@@ -13,7 +18,9 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import norm
+from scipy.linalg import eigh
+from scipy.special import ndtri_exp
+from scipy.stats import chi2, norm
 
 from pipeline.calibrate.adjust.adjusted import AdjustedEdge, AdjustedRig, AdjustedSensor, AdjustmentLimits
 from pipeline.calibrate.adjust.equations import (
@@ -23,7 +30,6 @@ from pipeline.calibrate.adjust.equations import (
     equations_at,
     inverse_of_information,
 )
-from pipeline.calibrate.adjust.innovations import innovation
 from pipeline.calibrate.numerics.covariance import OBSERVABLE
 from pipeline.rig.checks import FailedCheck
 from pipeline.rig.common_share import common_part
@@ -40,6 +46,8 @@ _CLEAR = 2 * np.log(20.0)
 _MATTERS = 1.01  # a variance that grows by more than this share rests on the edge that was left out
 # An edge five sigmas wrong draws a pose by one sigma that rests on it by a fifth, whose variance grows by a quarter.
 _DRAWS = 1.25
+# Information that stands in for none, as a share of the prior's: an edge is then so much less sure than the prior.
+_NONE = 1e-6
 
 
 def adjust(
@@ -205,3 +213,29 @@ def _untied(graph: RigGraph, sensor: Sensor, used: Sequence[Edge]) -> str:
         f"nothing ties it, {', '.join(with_it)} to the reference {graph.reference.name}: "
         "what joins them is the prior"
     )
+
+
+def innovation(
+    edge: LinearEdge, others: Equations, prior_covariance: Float[np.ndarray, "N N"]
+) -> tuple[float, float] | None:
+    """Chi-squared of the edge against others and prior, and the equivalent normal sigmas.
+
+    None if edge and others together know no direction better than the prior.
+    """
+    C = inverse_of_information(others.H)
+    before = edge.J @ prior_covariance @ edge.J.T
+    of_edge = inverse_of_information(edge.W + _NONE * inverse_of_information(before))
+    residual = of_edge @ edge.g - edge.x - edge.J @ (C @ others.g)
+    covariance = of_edge + edge.J @ C @ edge.J.T
+    values, vectors = eigh(covariance, before)
+    known = values < 1.0
+    if not known.any():
+        return None
+    square = float(np.sum((vectors[:, known].T @ residual) ** 2 / values[known]))
+    return square, _sigmas(square, int(known.sum()))
+
+
+def _sigmas(square: float, freedom: int) -> float:
+    """Normal deviate of equal probability; the root of chi-squared if that is below the number range."""
+    log_probability = float(chi2.logsf(square, freedom))
+    return float(-ndtri_exp(log_probability - np.log(2))) if np.isfinite(log_probability) else square**0.5

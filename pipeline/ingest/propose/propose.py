@@ -13,10 +13,10 @@ from pipeline.core.config import FleetConfig, validated
 from pipeline.core.errors import ConfigError
 from pipeline.core.results import Progress, silent
 from pipeline.ingest.captures import Rejected
-from pipeline.ingest.directions_and_units import motion_of, opposed_signs
+from pipeline.ingest.directions_and_units import AskedRadar, motion_of, opposed_signs
+from pipeline.ingest.doppler_speed import doppler_speed
 from pipeline.ingest.index import index_logs
 from pipeline.ingest.moments import MomentBuilder
-from pipeline.ingest.propose.doppler import doppler_period
 from pipeline.ingest.propose.fleet_file import Facts, RadarMeaning, fleet_text, left_out, names_of
 from pipeline.ingest.propose.sensors import FoundCamera, FoundCloud, FoundSensors, find_sensors
 from pipeline.ingest.propose.survey import Survey, survey_logs
@@ -25,12 +25,18 @@ from pipeline.ingest.stage import pick_moments
 from pipeline.rig.rig import Rig
 from pipeline.rig.transform_tree import TransformTree
 from pipeline.store.views import logged_stars
+from schemas.frames import Frame
 from schemas.observations import WITHOUT_LABELS
 
-__all__ = ["Proposal", "propose_fleet"]
+__all__ = ["Proposal", "doppler_period", "propose_fleet"]
 
 _SAMPLE = 30  # moments on which the Doppler is tested
 _VEHICLE_FRAMES = ("base_link", "base_footprint", "vehicle", "ego_vehicle", "rear_axle", "imu_link")
+_FEWEST_SCANS = 3  # scans that no speed explains without a period
+_HALF = 0.5  # share of a scan's detections explained by one speed: then no period is needed
+# increase of the explained share by a period, and share of scans with that increase
+_MORE, _MOST = 0.1, 2 / 3
+_MOST_STEPS = 4096  # most distinct values of a quantised Doppler; with more it is not quantised
 
 
 @dataclass(frozen=True)
@@ -139,3 +145,30 @@ def _sample(logs: Sequence[Path], rig: Rig, fleet: FleetConfig, progress: Progre
         index.close()
     present = [frozenset(a.places) for a in anchored]
     return RigSample(rig, built, len(picked), present, logged_stars(builder.prior.rows()), None, {})
+
+
+def doppler_period(frames: Sequence[Frame], radar: AskedRadar) -> float | None:
+    """Aliasing period of the Doppler [m/s]; None if it is not aliased or the log does not show it.
+
+    An aliased Doppler fills the range of one period for any speed of the car, so the observed range is tried.
+    It is accepted if, in most scans that no speed explains without it, a static world explains more
+    detections with it.
+    """
+    scans = [(radar.directions(f), f.radar_range_rate_mps.astype(np.float64)) for f in frames if _has_scan(f)]
+    if len(scans) < _FEWEST_SCANS:
+        return None
+    values = np.unique(np.round(np.concatenate([rates for _, rates in scans]), 4))
+    steps = np.diff(values)
+    span = float(values[-1] - values[0])
+    step = float(np.median(steps)) if len(steps) else 0.0
+    if step <= 0:
+        return None
+    period = span + (step if span / step < _MOST_STEPS else 0.0)
+    plain = np.array([doppler_speed(d, r, None)[1] for d, r in scans])
+    wrapped = np.array([doppler_speed(d, r, period)[1] for d, r in scans])
+    gained = (wrapped > plain + _MORE)[plain < _HALF]
+    return period if len(gained) >= _FEWEST_SCANS and gained.mean() >= _MOST else None
+
+
+def _has_scan(frame: Frame) -> bool:
+    return "radar" in frame.sensors and len(frame.radar_xyz_m) > 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final, TypeVar
 
 import numpy as np
@@ -13,7 +13,6 @@ from pipeline.rig.topics import TOPICS
 from pipeline.simulate.faults import DayFaults
 from pipeline.simulate.logs.frame_messages import Sent, Setup, messages_of
 from pipeline.simulate.logs.writers import OpenLog
-from pipeline.simulate.sensors.clocks import Ticks, free_clocks
 from pipeline.simulate.sensors.data_sheets import LidarSpec
 from pipeline.simulate.sensors.mounting import Mounting
 from pipeline.simulate.sensors.rig_spec import RigSpec
@@ -28,7 +27,7 @@ from pipeline.simulate.sensors.simulated_frame import (
 from pipeline.simulate.world.casting import World
 from pipeline.simulate.world.drives import Drive
 
-__all__ = ["FIRST_FRAME_S", "nominal_poses", "record_drive"]
+__all__ = ["FIRST_FRAME_S", "Ticks", "free_clocks", "nominal_poses", "record_drive"]
 
 T = TypeVar("T")
 _ODOMETRY_HZ: Final = 20.0
@@ -36,6 +35,23 @@ FIRST_FRAME_S: Final = 1.0  # the log of a drive starts this long before its fir
 # For free-running sensors the log has the measurement nearest to the reference's sweep, because rendering
 # dominates the cost; every few sweeps also the second nearest, so that pairing must choose.
 _NEIGHBOURS_EVERY: Final = 4
+# Relative rate errors: mechanical lidars keep theirs to some parts in a thousand, quartzes to a hundred in a
+# million. Without them, 30 and 10 Hz would keep a constant gap for a whole drive, as if triggered.
+_RATE_SD: Final = {"camera": 1e-4, "lidar": 3e-3, "radar": 1e-4}
+
+
+@dataclass(frozen=True)
+class Ticks:
+    """The stamps of one sensor: phase + k period [s]."""
+
+    period_s: float
+    phase_s: float
+
+    def nearest(self, t_s: float) -> tuple[float, float]:
+        """The stamp nearest to a time, and the next nearest."""
+        k = round((t_s - self.phase_s) / self.period_s)
+        first = self.phase_s + k * self.period_s
+        return first, first + float(np.copysign(self.period_s, t_s - first))
 
 
 def record_drive(
@@ -152,3 +168,12 @@ def _odometry(drive: Drive, rng: np.random.Generator) -> list[tuple[float, np.nd
     R[:, 1, 0], R[:, 1, 1], R[:, 2, 2] = np.sin(yaw), np.cos(yaw), 1.0
     poses = from_rotation_translation(R, np.stack([x, y, np.zeros_like(x)], 1))
     return [(float(a), b, float(c), float(d)) for a, b, c, d in zip(t, poses, speed, yaw_rate, strict=True)]
+
+
+def free_clocks(rig: RigSpec, rng: np.random.Generator) -> dict[str, Ticks]:
+    """Independent clocks of the free-running sensors for one drive: random phases and rate errors."""
+    free = {s.name: (s.rate_hz, _RATE_SD[s.kind]) for s in rig.sensors if s.rate_hz is not None}
+    rates, sd = np.array([*free.values()]).reshape(-1, 2).T
+    periods = 1 / (rates * (1 + rng.normal(0, sd)))
+    phases = rng.uniform(0, periods)
+    return {n: Ticks(float(p), float(a)) for n, p, a in zip(free, periods, phases, strict=True)}

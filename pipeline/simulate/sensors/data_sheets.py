@@ -73,7 +73,7 @@ class RadarSpec:
     """An FMCW MIMO radar: resolution cells and accuracy of its estimator.
 
     `road_mirror` is the share of echoes that also reach the radar by reflection on the road, with an
-    elevation between the object and its mirror image (`multipath.py`); with 0, the road changes elevations up
+    elevation between the object and its mirror image (`radar.py`); with 0, the road changes elevations up
     as often as down.
     """
 

@@ -17,15 +17,18 @@ from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Float
 
 from pipeline.simulate.world.actors import actor_mesh
-from pipeline.simulate.world.chunk import CHUNK_M
+from pipeline.simulate.world.chunk import CHUNK_M, Chunk
 from pipeline.simulate.world.drives import Drive
 from pipeline.simulate.world.landscapes import LANDSCAPES, Landscape
 from pipeline.simulate.world.meshes import Mesh, join, placed
+from pipeline.simulate.world.motorway import add_motorway
+from pipeline.simulate.world.plots import add_halls, add_plots, add_rows
 from pipeline.simulate.world.ray_selection import rays_near
-from pipeline.simulate.world.scenery import chunk_mesh
+from pipeline.simulate.world.road_surface import add_asphalt
+from pipeline.simulate.world.street import add_street
 from pipeline.simulate.world.traffic import Actor, actors_at
 
-__all__ = ["Hits", "Moment", "ShadowMap", "Standing", "World", "shadow_map", "standing_of"]
+__all__ = ["Hits", "Moment", "ShadowMap", "Standing", "World", "chunk_mesh", "shadow_map", "standing_of"]
 
 _AHEAD_M: Final = 170.0
 _BEHIND_M: Final = 60.0
@@ -267,3 +270,22 @@ def standing_of(
     return Standing(
         origin, local, scene, shadow_map(scene, origin, sun, to_map, s_m, shadows_behind_m), _normals(corners)
     )
+
+
+def chunk_mesh(drive: Drive, index: int) -> Mesh:
+    """The static world between arc lengths `index * CHUNK_M` and `(index + 1) * CHUNK_M`, in the map."""
+    chunk = Chunk(drive, index, np.random.default_rng([drive.seed, 31, index + 1000]))
+    add_asphalt(chunk)
+    if drive.landscape.ceiling_m:
+        add_halls(chunk)
+    elif drive.landscape.fast:
+        add_motorway(chunk)
+    elif drive.landscape.plain:
+        add_street(chunk)
+    else:
+        add_plots(chunk)
+    if not drive.landscape.plain:
+        add_rows(chunk)
+    flat = chunk.along.mesh()
+    bent = drive.road.to_map(flat.corners.astype(np.float64)).astype(np.float32)
+    return join([replace(flat, corners=bent), *chunk.rigid])

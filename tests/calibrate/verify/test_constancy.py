@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.calibrate.half_days import half_days_of
 from pipeline.calibrate.numerics.change_point import with_parts
+from pipeline.calibrate.records import half_days_of
 from pipeline.calibrate.verify.constancy import constancy_failures, moved_failures
 from pipeline.rig.edges import edge_named
 from pipeline.rig.estimates import DayParts, PairEstimate
