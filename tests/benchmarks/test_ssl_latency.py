@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from pipeline.learn.export.onnx_file import export_onnx
-from pipeline.learn.infer.compiled_rendering import FrameSensors
 from pipeline.learn.infer.single_frame import SingleFrameCalibrator
 from pipeline.learn.network.calibration_network import build_network
 from pipeline.learn.sample.camera_maps import class_likelihood
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import NetworkConfig
+from pipeline.learn.sample.rendering import FrameSensors
 from pipeline.rig.cameras import Camera
 
 GOAL_MS = 40.0

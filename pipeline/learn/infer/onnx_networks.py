@@ -15,13 +15,13 @@ from onnxruntime.capi.onnxruntime_pybind11_state import InvalidArgument
 from pipeline.core.config import FleetConfig, LearnConfig, PrepareConfig
 from pipeline.core.errors import ConfigError, ModelError
 from pipeline.learn.infer.class_evidence import FrameEvidence
-from pipeline.learn.infer.compiled_rendering import FrameSensors, frame_sensors
 from pipeline.learn.infer.frame_network import FrameAnswer
 from pipeline.learn.infer.single_frame import SingleFrameCalibrator
 from pipeline.learn.sample.camera_maps import class_likelihood
 from pipeline.learn.sample.frame_sample import About, sensor_row
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import PAIRS as ROWS
+from pipeline.learn.sample.rendering import FrameSensors, frame_sensors
 from pipeline.objective.paper.classes import labels_of
 from pipeline.rig.cameras import camera_of
 from pipeline.rig.estimates import Prior

@@ -20,10 +20,10 @@ from jaxtyping import Float
 
 from pipeline.core.errors import ModelError
 from pipeline.learn.infer.class_evidence import FrameEvidence
-from pipeline.learn.infer.compiled_rendering import FrameSensors, render_frame
 from pipeline.learn.infer.split_graph import split_graph
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import EVIDENCE, PAIRS, NetworkConfig
+from pipeline.learn.sample.rendering import FrameSensors, render_frame
 from pipeline.rig.se3 import inverse, transform_points
 
 __all__ = ["FrameEstimate", "SingleFrameCalibrator", "config_from_metadata"]

@@ -15,27 +15,16 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812 - the name that everybody uses
 
-from pipeline.learn.sample.layout import LIDAR_FEATURES, MARK_FLAT, MARK_LEAST_SHARE, MARK_SIGMAS, MARK_WINDOW
+from pipeline.learn.sample.layout import MARK_FLAT, MARK_LEAST_SHARE
 
-__all__ = ["log_markings", "mark_strength"]
+__all__ = ["log_markings"]
 
-_OCCUPIED, _INTENSITY, _GROUND = 0, 2 + LIDAR_FEATURES.index("intensity"), 2 + LIDAR_FEATURES.index("ground")
 # Of the image: narrower than the sweep's, for it is dense, and three rows high.
 _WIDE, _HIGH = 25, 3
 _FULL_SIGMAS = 2.0  # contrast that counts as paint for certain
 _NO_MARKING = 0.1  # likelihood of bright ground where the image has no paint: wet patches, kerbs, snow
 _LEAST_ROAD = 50.0  # cells; fewer show no line
 _ROAD, _VERGE = 0, 1  # of GRID_CLASSES
-
-
-def mark_strength(lidar_grid: Float[Tensor, "B C H W"]) -> Float[Tensor, "B H W"]:
-    """Contrast of each cell's ground with its neighbours in the row: 0 up to one sigma, 1 from MARK_SIGMAS on.
-
-    Zero everywhere if no reflectivity is logged.
-    """
-    ground = lidar_grid[:, _OCCUPIED : _OCCUPIED + 1] * lidar_grid[:, _GROUND : _GROUND + 1]
-    above = _above_beside(lidar_grid[:, _INTENSITY : _INTENSITY + 1], ground, (1, MARK_WINDOW))
-    return ((above - 1.0) / (MARK_SIGMAS - 1.0)).clamp(0.0, 1.0)[:, 0]
 
 
 def log_markings(

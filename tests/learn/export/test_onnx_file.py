@@ -14,7 +14,6 @@ from onnxruntime import InferenceSession
 from pipeline.core.errors import ModelError
 from pipeline.learn.batches.collate import collate
 from pipeline.learn.export.onnx_file import export_onnx
-from pipeline.learn.infer.compiled_rendering import frame_sensors, render_frame
 from pipeline.learn.infer.single_frame import SingleFrameCalibrator
 from pipeline.learn.infer.split_graph import split_graph
 from pipeline.learn.network.calibration_network import build_network
@@ -24,6 +23,7 @@ from pipeline.learn.network.views import render
 from pipeline.learn.sample.frame_sample import About, make_row
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import NetworkConfig
+from pipeline.learn.sample.rendering import frame_sensors, render_frame
 from pipeline.rig.estimates import Prior
 from pipeline.rig.se3 import exp_so3, transform_points
 from schemas.training import GRID_CLASSES

@@ -1,13 +1,12 @@
-"""The grid's angles, what is rendered onto it through a guess, and that inference renders what training rendered."""
+"""The grid's angles, and what is rendered onto it through a guess."""
 
 import cv2
 import numpy as np
 import pytest
-import torch
 
-from pipeline.learn.infer.compiled_rendering import compiled_nearest_points
-from pipeline.learn.network.rendering import nearest_points, paint
 from pipeline.learn.sample.grid import Grid, grid_rays, resample_camera
+from pipeline.learn.sample.layout import NEARNESS_M
+from pipeline.learn.sample.rendering import nearest_points, render_radar
 from pipeline.rig.cameras import Camera
 from pipeline.rig.se3 import exp_so3
 from pipeline.rig.spherical import camera_direction_angles
@@ -21,12 +20,9 @@ CAMERAS = {
 }
 
 
-def torch_points(points):
-    return torch.tensor(np.asarray(points), dtype=torch.float32)[None]
-
-
-def everywhere(points):
-    return torch.ones((1, points.shape[1]), dtype=torch.bool)
+def cells(points, valid=None):
+    points = np.asarray(points, np.float32)
+    return nearest_points(points, np.ones(len(points), bool) if valid is None else np.array(valid), GRID)
 
 
 def test_cells_look_where_their_row_and_column_say():
@@ -38,47 +34,30 @@ def test_cells_look_where_their_row_and_column_say():
 
 def test_a_point_on_the_ray_of_each_cell_is_rendered_into_that_cell():
     rays = grid_rays(GRID).reshape(-1, 3)
-    points = torch_points(rays * np.linspace(3, 90, len(rays))[:, None])
-    index = nearest_points(points, everywhere(points), GRID)
-    assert torch.equal(index[0], torch.arange(len(rays)))
-    ranges = paint(index, points.norm(dim=-1, keepdim=True), GRID)
-    assert ranges.flatten().numpy() == pytest.approx(np.linspace(3, 90, len(rays)), rel=1e-5)
+    points = (rays * np.linspace(6, 90, len(rays))[:, None]).astype(np.float32)
+    np.testing.assert_array_equal(cells(points), np.arange(len(rays)))
+    painted = render_radar(points, np.tile(np.arange(3, dtype=np.float32), (len(points), 1)), GRID)
+    near = np.minimum(NEARNESS_M / np.linalg.norm(points, axis=1), 2)
+    assert painted[1].ravel() == pytest.approx(near, rel=1e-5)
+    np.testing.assert_array_equal(painted[[0, 2, 3, 4]].mean(axis=(1, 2)), [1, 0, 1, 2])
 
 
 def test_of_several_points_in_a_cell_the_nearest_wins_and_absent_ones_never():
     ray = grid_rays(GRID)[40, 100]
-    points = torch_points([ray * 30, ray * 12, ray * 5, ray * 20])
-    valid = torch.tensor([[True, True, False, True]])
-    index = nearest_points(points, valid, GRID)[0]
+    index = cells([ray * 30, ray * 12, ray * 5, ray * 20], [True, True, False, True])
     assert index[40 * GRID.width + 100] == 1
     assert (index >= 0).sum() == 1
 
 
 def test_what_is_behind_or_outside_is_not_rendered():
-    points = torch_points([[0, 0, -10], [30, 0, 10], [0, -10, 10], [0, 10, 10], [0, 0, 0.2]])
-    assert (nearest_points(points, everywhere(points), GRID) == -1).all()
+    assert (cells([[0, 0, -10], [30, 0, 10], [0, -10, 10], [0, 10, 10], [0, 0, 0.2]]) == -1).all()
 
 
 def test_a_turn_about_the_upright_axis_is_a_shift_of_columns():
     rays = grid_rays(GRID)[:, 60:120].reshape(-1, 3) * 20
     turned = rays @ exp_so3(np.radians([0, 5 * GRID.cell_deg, 0])).T  # y points down: to the right
-    first, second = (
-        nearest_points(torch_points(p), everywhere(torch_points(p)), GRID).reshape(GRID.height, GRID.width)
-        for p in (rays, turned)
-    )
-    assert torch.equal(second[:, 65:125], first[:, 60:120])
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_inference_renders_what_training_rendered(seed):
-    rng = np.random.default_rng(seed)
-    points = (rng.normal(0, [12, 3, 12], (6000, 3)) + [0, 0, 15]).astype(np.float32)
-    valid = rng.random(6000) < 0.9
-    ours = compiled_nearest_points(points, valid, GRID)
-    theirs = nearest_points(torch_points(points), torch.tensor(valid)[None], GRID)[0].numpy()
-    assert (ours >= 0).sum() > 1000
-    # A point within rounding of a border may fall into the neighbour: its own cell and the other's differ.
-    assert (ours != theirs).sum() <= 4
+    first, second = (cells(p).reshape(GRID.height, GRID.width) for p in (rays, turned))
+    np.testing.assert_array_equal(second[:, 65:125], first[:, 60:120])
 
 
 @pytest.mark.parametrize("model", CAMERAS)

@@ -1,4 +1,7 @@
-"""One frame's sensors at a guess without torch: compiled version of `network.views.render`, for inference."""
+"""One frame's sensors rendered at a guess, for training and inference; without torch, compiled.
+
+Per cell of the camera's grid the nearest point wins.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +39,15 @@ from pipeline.learn.sample.layout import (
 from pipeline.rig.se3 import transform_points
 from schemas.training import POINT_IS_EDGE, POINT_IS_GROUND, TrainingRow
 
-__all__ = ["FrameSensors", "compiled_nearest_points", "frame_sensors", "render_frame"]
+__all__ = [
+    "FrameSensors",
+    "frame_sensors",
+    "mark_strength",
+    "nearest_points",
+    "render_frame",
+    "render_lidar",
+    "render_radar",
+]
 
 _INTENSITY = LIDAR_FEATURES.index("intensity")
 _EDGE, _GROUND = LIDAR_FEATURES.index("edge"), LIDAR_FEATURES.index("ground")
@@ -118,40 +129,66 @@ def render_frame(
     marks: bool = True,
 ) -> dict[str, np.ndarray]:
     """Inputs of the exported graph by name, batch 1; without `marks` those of bright ground are empty."""
-    lidar_camera = transform_points(T_camera_lidar, sensors.lidar_xyz_m).astype(np.float32)
     radar_camera = transform_points(T_camera_radar, sensors.radar_xyz_m).astype(np.float32)
     radar_lidar = transform_points(T_lidar_radar, sensors.radar_xyz_m).astype(np.float32)
-    edge, ground = sensors.lidar_features[:, _EDGE], sensors.lidar_features[:, _GROUND]
+    count = min(len(radar_camera), RADAR_POINTS)
+    lidar, _ = render_lidar(sensors.lidar_xyz_m, sensors.lidar_features, T_camera_lidar, grid, marks=marks)
+    return {
+        "camera": sensors.camera_channels(camera_channels),
+        **{name: values[None] for name, values in lidar.items()},
+        "radar_grid": render_radar(radar_camera, sensors.radar_features, grid)[None],
+        "radar_lidar": _padded(radar_lidar[:count], RADAR_POINTS)[None],
+        "radar_camera": _padded(radar_camera[:count], RADAR_POINTS)[None],
+        "radar_features": _padded(sensors.radar_features[:count], RADAR_POINTS)[None],
+        "radar_valid": _padded(np.ones(count, bool), RADAR_POINTS)[None],
+        "radar_has_elevation": np.array([sensors.radar_has_elevation]),
+    }
+
+
+def render_lidar(
+    xyz_m: Float32[np.ndarray, "N 3"],
+    features: Float32[np.ndarray, "N 4"],
+    T_camera_lidar: Float[np.ndarray, "4 4"],
+    grid: Grid,
+    *,
+    marks: bool = True,
+    nearness: float = 1.0,
+) -> tuple[dict[str, np.ndarray], Int32[np.ndarray, " HW"]]:
+    """A sweep's inputs of the graph by name, and the point of each cell, -1 in empty ones.
+
+    `nearness` multiplies the rendered nearness (training looks at frames as if they were farther or nearer).
+    """
+    lidar_camera = transform_points(T_camera_lidar, xyz_m).astype(np.float32)
+    edge, ground = features[:, _EDGE], features[:, _GROUND]
     in_view = _in_view(lidar_camera, grid)
     rank = _importance(len(lidar_camera))
     matched = _best(rank + EDGE_BONUS * edge + OBJECT_BONUS * (1 - ground), in_view, MATCHED_POINTS)
     solid = _best(rank, in_view & (ground < 0.5), OBJECT_POINTS)
     weight = np.where(ground > 0.5, np.float32(GROUND_WEIGHT), np.float32(1))
-    count = min(len(radar_camera), RADAR_POINTS)
-    painted, index = _painted(lidar_camera, sensors.lidar_features, grid)
+    painted, index = _painted(lidar_camera, features, grid, nearness)
     strength, marked = _marks(painted, index) if marks else (np.zeros(0, np.float32), index[:0])
     return {
-        "camera": sensors.camera_channels(camera_channels),
-        "lidar_grid": painted[None],
-        "radar_grid": _painted(radar_camera, sensors.radar_features, grid)[0][None],
+        "lidar_grid": painted,
         "points_camera": _padded(lidar_camera[matched], MATCHED_POINTS),
         "point_weight": _padded(weight[matched], MATCHED_POINTS),
-        "objects": _padded(sensors.lidar_xyz_m[solid], OBJECT_POINTS),
+        "objects": _padded(xyz_m[solid], OBJECT_POINTS),
         "object_weight": _padded(np.ones(len(solid), np.float32), OBJECT_POINTS),
-        "radar_lidar": _padded(radar_lidar[:count], RADAR_POINTS),
-        "radar_camera": _padded(radar_camera[:count], RADAR_POINTS),
-        "radar_features": _padded(sensors.radar_features[:count], RADAR_POINTS),
-        "radar_valid": _padded(np.ones(count, bool), RADAR_POINTS),
-        "radar_has_elevation": np.array([sensors.radar_has_elevation]),
         "marks_camera": _padded(lidar_camera[marked], MARKED_POINTS),
         "mark_weight": _padded(strength, MARKED_POINTS),
-    }
+    }, index
 
 
-def compiled_nearest_points(
+def render_radar(
+    points_camera: Float32[np.ndarray, "M 3"], features: Float32[np.ndarray, "M 3"], grid: Grid
+) -> Float32[np.ndarray, "5 H W"]:
+    """A scan's cells; points in the optical frame."""
+    return _painted(points_camera, features, grid)[0]
+
+
+def nearest_points(
     points_camera: Float[np.ndarray, "N 3"], valid: Bool[np.ndarray, " N"], grid: Grid
 ) -> Int32[np.ndarray, " HW"]:
-    """Index of the nearest point in each cell (row by row), -1 in empty cells (`network.rendering.nearest_points`)."""
+    """Index of the nearest point in each cell (row by row), -1 in empty cells."""
     out = np.full(grid.height * grid.width, -1, np.int32)
     limits = np.radians([grid.top_deg, grid.left_deg, grid.cell_deg]).astype(np.float32)
     points = np.ascontiguousarray(points_camera, dtype=np.float32)
@@ -180,21 +217,26 @@ def _nearest(points, valid, limits, height, width, out):  # noqa: ANN001, ANN202
             out[cell] = n
 
 
-def _painted(points_camera: np.ndarray, features: np.ndarray, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+def _painted(
+    points_camera: np.ndarray, features: np.ndarray, grid: Grid, nearness: float = 1.0
+) -> tuple[np.ndarray, np.ndarray]:
     """C H W: occupied, nearness and features of the points that won their cells; and which points these are."""
-    index = compiled_nearest_points(points_camera, np.ones(len(points_camera), bool), grid)
+    index = nearest_points(points_camera, np.ones(len(points_camera), bool), grid)
     out = np.zeros((2 + features.shape[1], len(index)), np.float32)
     full = np.flatnonzero(index >= 0)
     winners = index[full]
     distance = np.maximum(np.linalg.norm(points_camera[winners], axis=1), np.float32(NEAR_M))
     out[0, full] = 1
-    out[1, full] = np.minimum(np.float32(NEARNESS_M) / distance, 2)
+    out[1, full] = np.minimum(np.float32(nearness * NEARNESS_M) / distance, 2)
     out[2:, full] = features[winners].T
     return out.reshape(-1, grid.height, grid.width), index
 
 
-def _marks(painted: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Strength and points of the brightest ground, brightest first (`network.markings.mark_strength`)."""
+def mark_strength(painted: Float32[np.ndarray, "6 H W"]) -> Float32[np.ndarray, "H W"]:
+    """Contrast of each cell's ground with its neighbours in the row: 0 up to one sigma, 1 from MARK_SIGMAS on.
+
+    Zero everywhere if no reflectivity is logged.
+    """
     ground = painted[0] * painted[2 + _GROUND]
     values = painted[2 + _INTENSITY] * ground
     share = _row_sums(ground)
@@ -202,7 +244,12 @@ def _marks(painted: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarr
         painted[2 + _INTENSITY] - _row_sums(values) / np.maximum(share, MARK_LEAST_SHARE * MARK_WINDOW)
     ) * ground
     spread = np.sqrt((above * above).sum() / max(ground.sum(), 1.0)) + MARK_FLAT
-    strength = np.clip((above / spread - 1) / (MARK_SIGMAS - 1), 0, 1).astype(np.float32).ravel()
+    return np.clip((above / spread - 1) / (MARK_SIGMAS - 1), 0, 1).astype(np.float32)
+
+
+def _marks(painted: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Strength and points of the brightest ground, brightest first."""
+    strength = mark_strength(painted).ravel()
     cells = np.flatnonzero(strength)
     cells = cells[np.argsort(-strength[cells], kind="stable")][:MARKED_POINTS]
     return strength[cells], index[cells]
@@ -237,8 +284,10 @@ def _in_view(points_camera: np.ndarray, grid: Grid) -> Bool[np.ndarray, " N"]:
 
 @lru_cache(maxsize=4)
 def _importance(count: int) -> Float32[np.ndarray, " N"]:
-    """As in `network.views`: a fixed irregular number in 0..1 per row."""
-    return ((np.arange(count, dtype=np.int64) * 2654435761) % 65536).astype(np.float32) / np.float32(65536)
+    """A fixed irregular number in 0..1 per row: picks points evenly, and the same ones on every machine."""
+    return ((np.arange(count, dtype=np.int64) * 2654435761) % 65536).astype(np.float32) / np.float32(
+        65536
+    )  # Knuth's multiplicative hash
 
 
 def _best(score: np.ndarray, allowed: np.ndarray, count: int) -> np.ndarray:
@@ -252,7 +301,7 @@ def _best(score: np.ndarray, allowed: np.ndarray, count: int) -> np.ndarray:
 
 
 def _padded(values: np.ndarray, count: int) -> np.ndarray:
-    """1 `count` ...: the values, and zeros behind them."""
-    out = np.zeros((1, count, *values.shape[1:]), values.dtype)
-    out[0, : len(values)] = values
+    """`count` rows: the values, and zeros behind them."""
+    out = np.zeros((count, *values.shape[1:]), values.dtype)
+    out[: len(values)] = values
     return out
