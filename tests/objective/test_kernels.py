@@ -1,9 +1,9 @@
-"""The kernel of folded cost maps against a plain NumPy reference."""
+"""Costs of folded maps against a plain NumPy reference."""
 
 import numpy as np
 import pytest
 
-from pipeline.objective.paper.cost_maps import fold_frames, frame_costs, pack_quads
+from pipeline.objective.paper.cost_maps import fold_frames, frame_costs
 from pipeline.rig.cameras import Camera
 from pipeline.rig.se3 import exp_se3
 
@@ -92,13 +92,6 @@ def test_points_out_of_view_and_behind_the_camera_cost_the_penalty():
         2.5,
     )
     assert frame_costs(frames, np.eye(4)[None])[0, 0] == pytest.approx(7.5)
-
-
-def test_quads_hold_a_pixel_and_its_three_neighbours():
-    bytes_map = np.arange(12, dtype=np.uint8).reshape(3, 4)
-    q = pack_quads(bytes_map)
-    assert [(int(q[1, 2]) >> s) & 255 for s in (0, 8, 16, 24)] == [6, 7, 10, 11]
-    assert q[2, 3] == 11
 
 
 def test_a_frame_without_points_costs_nothing():

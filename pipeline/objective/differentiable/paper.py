@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pipeline.objective.differentiable.lookup import bilinear, masked_mean
@@ -49,8 +49,7 @@ class FoldedTensors:
 
     points: Float[Tensor, "F N 3"]
     present: Bool[Tensor, "F N"]
-    maps: UInt8[Tensor, "F H W"]
-    step: Float[Tensor, " F"]  # cost of one step of a byte
+    maps: Float[Tensor, "F H W"]
     projection: CameraProjection
     penalty: float
 
@@ -58,8 +57,7 @@ class FoldedTensors:
         """Mean cost of each frame's points."""
         uv, valid = self.projection.project(transform_points(T_camera_points, self.points))
         value = bilinear(self.maps, uv, valid, -1.0)
-        cost = torch.where(value < 0, self.penalty, value * self.step[:, None])
-        return masked_mean(cost, self.present)
+        return masked_mean(torch.where(value < 0, self.penalty, value), self.present)
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,16 +170,13 @@ def padded(arrays: Sequence[np.ndarray], dtype: torch.dtype) -> tuple[Tensor, Te
 
 
 def folded_tensors(frames: FoldedFrames, dtype: torch.dtype = torch.float32) -> FoldedTensors:
-    """Points and byte maps as tensors; ValueError if the cameras differ in size or kind of model."""
-    sizes = {(c.height_px, c.width_px) for c in frames.cameras}
+    """Points and maps as tensors; ValueError if the cameras differ in size or kind of model."""
+    sizes = {costs.shape for costs in frames.maps}
     if len(sizes) != 1:
         raise ValueError(f"the maps of a batch must have one size, not {sorted(sizes)}")
-    # The lowest byte of a quad is the pixel's own cost.
-    bytes_ = (frames.quads & np.uint32(255)).astype(np.uint8).reshape(frames.frames, *sizes.pop())
     return FoldedTensors(
-        *padded(np.split(frames.xyz_m.T, frames.first[1:-1]), dtype),
-        torch.from_numpy(bytes_),
-        torch.tensor(frames.step, dtype=dtype),
+        *padded([xyz.T for xyz in frames.xyz_m], dtype),
+        torch.from_numpy(np.stack(frames.maps)),
         camera_projection(frames.cameras, dtype),
         frames.penalty,
     )
