@@ -1,7 +1,6 @@
 """Which sensor moved: motions of one sensor, built by SE(3) algebra, with noise."""
 
 from dataclasses import replace
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -13,7 +12,8 @@ from pipeline.audit.vehicle import independent_edges
 from pipeline.rig.attribution import PairShift, attribute
 from pipeline.rig.edges import EDGE_OF_PAIR
 from pipeline.rig.graph import Edge, Sensor
-from pipeline.rig.se3 import adjoint, exp_se3, inverse, log_se3
+from pipeline.rig.se3 import exp_se3
+from tests.audit.fleet_records import days_of, vehicle_records
 from tests.makers.random_rigs import Rig, knock
 
 CAMERA_LIDAR, CAMERA_RADAR, LIDAR_RADAR = (
@@ -22,55 +22,27 @@ CAMERA_LIDAR, CAMERA_RADAR, LIDAR_RADAR = (
 KNOCK = np.array([0.0, 0.0, np.radians(1.0), 0.0, 0.03, 0.0])  # a turned bracket: yaw and a little sideways
 
 
-def _days(maker: ModuleType, moved: dict[str, np.ndarray], seed: int) -> dict[Edge, PairDays]:
+def _days(moved, seed):
     rng = np.random.default_rng(seed)
-    return maker.days_of(maker.vehicle_records("v", 4, rng, motion=lambda day: moved if day > 1 else {}), 2.0)
+    return days_of(vehicle_records("v", 4, rng, motion=lambda day: moved if day > 1 else {}), 2.0)
 
 
-def _shifts(maker: ModuleType, moved: dict[str, np.ndarray], seed: int) -> dict[Edge, PairShift]:
-    days, is_after = _days(maker, moved, seed), np.array([0.0, 0, 1, 1])
+def _shifts(moved, seed):
+    days, is_after = _days(moved, seed), np.array([0.0, 0, 1, 1])
     own = independent_edges(days, days[CAMERA_LIDAR].day)
     return {pair: Whitened.of(d, np.zeros(6)).shift(is_after) for pair, d in own.items()}
 
 
-@pytest.mark.parametrize(("sensor", "twist"), [
-    ("radar", KNOCK),
-    ("camera", np.array([0, np.radians(0.4), 0, 0, 0, 0])),
-    ("lidar", np.array([0, np.radians(0.5), np.radians(0.3), 0, 0, 0])),
-])  # fmt: skip
-def test_the_moved_sensor_is_named_with_its_motion_in_its_own_axes(
-    maker: ModuleType, sensor: str, twist: np.ndarray
-) -> None:
-    named, normalised = 0, []
-    for seed in range(60):
-        found = attribute(_shifts(maker, {sensor: twist}, seed))
-        assert found.sensor in (sensor, None)
-        if found.sensor == sensor:
-            named += 1
-            moved = found.moved[sensor]
-            error = moved.motion - twist
-            normalised.append(error @ np.linalg.solve(moved.covariance, error))
-    assert named >= 57
-    assert 4.5 < np.mean(normalised) < 7.5  # chi-squared with 6 degrees of freedom
-
-
-def test_a_motion_lost_in_the_noise_is_not_pinned_on_a_sensor(maker: ModuleType) -> None:
-    answers = [attribute(_shifts(maker, {}, seed)).sensor for seed in range(40)]
+def test_a_motion_lost_in_the_noise_is_not_pinned_on_a_sensor():
+    answers = [attribute(_shifts({}, seed)).sensor for seed in range(40)]
     assert answers.count(None) >= 30
 
 
-def test_two_sensors_that_moved_apart_are_not_blamed_on_one(maker: ModuleType) -> None:
-    both = {"camera": np.array([0, 0.02, 0, 0, 0, 0]), "radar": np.array([0, 0, -0.03, 0, 0.1, 0])}
-    found = attribute(_shifts(maker, both, 0))
-    assert found.sensor is None
-    assert "no single sensor" in found.explanation
-
-
-def test_a_scale_that_few_days_told_does_not_hide_who_moved(maker: ModuleType) -> None:
+def test_a_scale_that_few_days_told_does_not_hide_who_moved():
     """Scales drawn as sure as ten degrees of freedom tell them: the misfit's own level holds, two movers still show."""
     rng, named, by_known_scale = np.random.default_rng(7), 0, 0
     for seed in range(200):
-        shifts = _shifts(maker, {"radar": KNOCK}, seed)
+        shifts = _shifts({"radar": KNOCK}, seed)
         told = rng.chisquare(10) / 10
         shifts = {p: replace(s, covariance=s.covariance * told) for p, s in shifts.items()}
         named += attribute(shifts, 10.0).sensor == "radar"
@@ -78,16 +50,11 @@ def test_a_scale_that_few_days_told_does_not_hide_who_moved(maker: ModuleType) -
     assert by_known_scale < named
     assert named >= 197
     both = {"camera": np.array([0, 0.02, 0, 0, 0, 0]), "radar": np.array([0, 0, -0.03, 0, 0.1, 0])}
-    assert attribute(_shifts(maker, both, 0), 10.0).sensor is None
+    assert attribute(_shifts(both, 0), 10.0).sensor is None
 
 
-def test_one_pair_alone_cannot_tell(maker: ModuleType) -> None:
-    shifts = _shifts(maker, {"radar": KNOCK}, 0)
-    assert attribute({LIDAR_RADAR: shifts[LIDAR_RADAR]}).sensor is None
-
-
-def test_a_composed_pair_is_not_counted_as_a_third_witness(maker: ModuleType) -> None:
-    days = _days(maker, {"radar": KNOCK}, 0)
+def test_a_composed_pair_is_not_counted_as_a_third_witness():
+    days = _days({"radar": KNOCK}, 0)
     last = days[CAMERA_LIDAR].day
     assert set(independent_edges(days, last)) == {CAMERA_LIDAR, LIDAR_RADAR}
     own = replace(days[CAMERA_RADAR], T=exp_se3(np.full(6, 1e-3)) @ days[CAMERA_RADAR].T)
@@ -95,7 +62,7 @@ def test_a_composed_pair_is_not_counted_as_a_third_witness(maker: ModuleType) ->
 
 
 @pytest.mark.parametrize("reference_days", [0, 10])
-def test_a_shift_through_days_that_err_alike_is_as_unsure_as_it_says(reference_days: int) -> None:
+def test_a_shift_through_days_that_err_alike_is_as_unsure_as_it_says(reference_days: int):
     rng = np.random.default_rng(3)
     # The fourth day was held: three times as unsure, for reasons of its own.
     spread = np.repeat(np.eye(6)[None], 8, axis=0) * 1e-6
@@ -119,7 +86,7 @@ def test_a_shift_through_days_that_err_alike_is_as_unsure_as_it_says(reference_d
     assert scatter == pytest.approx(np.sqrt(found[0].covariance[0, 0]), rel=0.04)
 
 
-def test_the_day_of_a_step_is_the_split_that_gains_most() -> None:
+def test_the_day_of_a_step_is_the_split_that_gains_most():
     rng = np.random.default_rng(4)
     spread = np.repeat(np.eye(6)[None], 12, axis=0) * 1e-6
     change = 1e-3 * rng.normal(size=(12, 6))
@@ -134,20 +101,6 @@ def test_the_day_of_a_step_is_the_split_that_gains_most() -> None:
         size = change[s + 1 :].mean(axis=0) - change[: s + 1].mean(axis=0)
         expected = size @ size / (1e-6 * (1 / (s + 1) + 1 / (11 - s)))
         assert whitened.step_gains()[s] == pytest.approx(expected)
-
-
-def test_three_independent_edges_agree_on_the_sensor() -> None:
-    rng = np.random.default_rng(1)
-    T_cl, T_lr = exp_se3(rng.normal(size=6)), exp_se3(rng.normal(size=6))
-    T = {"camera_lidar": T_cl, "lidar_radar": T_lr, "camera_radar": exp_se3(np.full(6, 1e-3)) @ T_cl @ T_lr}
-    cov = np.diag([1e-7] * 3 + [1e-4] * 3)
-    xi = {p: np.zeros(6) for p in T}
-    for pair in ("lidar_radar", "camera_radar"):
-        xi[pair] = log_se3(T[pair] @ exp_se3(KNOCK) @ inverse(T[pair]))
-        np.testing.assert_allclose(xi[pair], adjoint(T[pair]) @ KNOCK, atol=1e-9)
-    found = attribute({EDGE_OF_PAIR[p]: PairShift(T[p], xi[p], cov) for p in T})
-    assert found.sensor == "radar"
-    np.testing.assert_allclose(found.moved["radar"].motion, KNOCK, atol=1e-9)
 
 
 # -- rigs of many sensors ----------------------------------------------------------------------------
@@ -212,14 +165,3 @@ def test_two_sensors_that_moved_at_once_are_both_named_with_their_motions():
             normalised.append(error @ np.linalg.solve(found.moved[name].covariance, error))
     assert right >= 95
     assert 4.5 < np.mean(normalised) < 7.5
-
-
-def test_an_edge_shows_the_one_of_two_moved_sensors_that_is_its_end():
-    rng = np.random.default_rng(36)
-    rig = Rig(rng)
-    names = {"s0", "s1"}
-    found = attribute(rig.shifts({name: knock(rng, rig.sensors[0]) for name in names}, rng))
-    assert set(found.moved) == names
-    for edge in rig.edges:
-        ends = {edge.parent.name, edge.child.name}
-        assert found.on(edge) in (names & ends or names)

@@ -12,19 +12,13 @@ from pipeline.audit.changes import start_interval
 from pipeline.audit.charts import Charts, alarm_threshold, clipped, thresholds
 from pipeline.audit.noise import Noise, Prior, estimate_noise
 from pipeline.audit.scan import scan, scan_by
-from pipeline.audit.verdicts import ChartVerdict, judge_charts
+from pipeline.audit.verdicts import judge_charts
 from pipeline.audit.wander import with_wander
 
 PROBABILITY = 1e-3 / 18  # one chart's share of one false alarm in 1000 vehicle-days over 18 charts
 
 
-def _charts(
-    values: list[np.ndarray] | np.ndarray,
-    sigma: np.ndarray | float = 1.0,
-    day: np.ndarray | None = None,
-    accepted: np.ndarray | None = None,
-    reference_days: int = 0,
-) -> Charts:
+def _charts(values, sigma=1.0, day=None, accepted=None, reference_days=0):
     rows = [np.asarray(v, float) for v in values]
     N = max(1, *(len(v) for v in rows))
     out = Charts(
@@ -47,10 +41,8 @@ def _known(charts: Charts, autocorrelation: float = 0.0) -> Noise:
     return Noise(np.ones(M), np.full(M, 1e6), np.full(M, autocorrelation), np.zeros(M))
 
 
-def _judge(
-    value: np.ndarray | list[float], limit: float, sigma: np.ndarray | float = 1.0, **chart: object
-) -> ChartVerdict:
-    charts = _charts([np.asarray(value)], sigma, **chart)  # type: ignore[arg-type]
+def _judge(value, limit, sigma=1.0, **chart):
+    charts = _charts([np.asarray(value)], sigma, **chart)
     return judge_charts(
         charts, _known(charts), np.array([limit]), np.array([[PROBABILITY], [20 * PROBABILITY]]), 2
     )[0]
@@ -62,7 +54,7 @@ def _z(charts: Charts, autocorrelation: float = 0.0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("days", [2, 4, 28])
-def test_false_alarms_stay_within_the_budget_and_do_not_waste_it(days: int) -> None:
+def test_false_alarms_stay_within_the_budget_and_do_not_waste_it(days: int):
     rng = np.random.default_rng(days)
     sigma = rng.uniform(0.5, 2.0, days)
     probability, trials = 0.02, 6000
@@ -74,15 +66,7 @@ def test_false_alarms_stay_within_the_budget_and_do_not_waste_it(days: int) -> N
     assert alarms >= 0.75 * probability - 3 * spread  # a bound that wastes the budget costs power
 
 
-def test_the_threshold_lies_between_one_test_and_bonferroni() -> None:
-    from scipy.stats import norm
-
-    for days in (3, 10, 200):
-        threshold = alarm_threshold(np.ones(days), PROBABILITY)
-        assert norm.isf(PROBABILITY / 2) < threshold < norm.isf(PROBABILITY / 2 / (days - 1))
-
-
-def test_a_scale_that_is_hardly_known_needs_more_sigmas() -> None:
+def test_a_scale_that_is_hardly_known_needs_more_sigmas():
     found = thresholds(np.array([10, 10, 1]), np.array([8.0, 1e9, 8.0]), np.full(3, PROBABILITY))
     assert found[0] > found[1] + 1
     assert found[1] == pytest.approx(
@@ -91,44 +75,12 @@ def test_a_scale_that_is_hardly_known_needs_more_sigmas() -> None:
     assert np.isinf(found[2])
 
 
-@given(st.integers(2, 12), st.floats(-1e3, 1e3), st.integers(0, 2**32 - 1))
-@settings(max_examples=40, deadline=None)
-def test_the_scan_does_not_care_where_zero_lies(days: int, offset: float, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    value, sigma = rng.normal(size=days), rng.uniform(0.5, 2, days)
-    np.testing.assert_allclose(_z(_charts([value + offset], sigma)), _z(_charts([value], sigma)), atol=1e-8)
-
-
-@given(st.integers(3, 10), st.integers(0, 2**32 - 1))
-@settings(max_examples=30, deadline=None)
-def test_the_squared_scan_is_the_likelihood_gain_of_a_step(days: int, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    value, sigma = rng.normal(size=days), rng.uniform(0.5, 2, days)
-    w = sigma**-2
-
-    def chi2(v: np.ndarray, w: np.ndarray) -> float:
-        return float(w @ (v - (w @ v) / w.sum()) ** 2)
-
-    gains = [chi2(value, w) - chi2(value[:k], w[:k]) - chi2(value[k:], w[k:]) for k in range(1, days)]
-    np.testing.assert_allclose(_z(_charts([value], sigma))[0] ** 2, gains, atol=1e-9)
-
-
-def test_the_scan_of_a_chart_does_not_depend_on_the_others_beside_it() -> None:
-    rng = np.random.default_rng(4)
-    rows = [rng.normal(size=n) for n in (3, 12, 0, 1, 7)]
-    together = _z(_charts(rows), 0.4)
-    for m, row in enumerate(rows):
-        if len(row) > 1:
-            np.testing.assert_allclose(together[m, : len(row) - 1], _z(_charts([row]), 0.4)[0], atol=1e-12)
-        np.testing.assert_array_equal(together[m, max(len(row) - 1, 0) :], 0)
-
-
 @pytest.mark.parametrize("phi", [0.0, 0.6, 0.9])
 @pytest.mark.parametrize("reference_days", [0, 10])
 @pytest.mark.parametrize("wander", [0.0, 0.09])
 def test_steps_and_drifts_are_least_squares_through_ar1_days_with_gaps_about_a_level_that_wanders(
     phi: float, reference_days: int, wander: float
-) -> None:
+):
     rng = np.random.default_rng(5)
     day, sigma, value = np.array([0, 1, 2, 5, 6, 9, 10]), rng.uniform(0.5, 2, 7), rng.normal(size=7) + 100
     charts = _charts([value, value[:3]], 1.0, None, None, reference_days)
@@ -157,7 +109,7 @@ def test_steps_and_drifts_are_least_squares_through_ar1_days_with_gaps_about_a_l
 
 
 @pytest.mark.parametrize("of", ["step", "drift"])
-def test_false_alarms_of_days_that_err_alike_stay_within_the_budget(of: str) -> None:
+def test_false_alarms_of_days_that_err_alike_stay_within_the_budget(of: str):
     rng, trials, probability = np.random.default_rng(6), 4000, 0.02
     e = rng.normal(size=(trials, 20))
     for k in range(1, 20):
@@ -170,7 +122,7 @@ def test_false_alarms_of_days_that_err_alike_stay_within_the_budget(of: str) -> 
     assert 0.6 * probability - 3 * spread <= alarms <= probability + 3 * spread
 
 
-def test_where_the_autocorrelation_is_not_known_each_split_is_as_sure_as_by_the_worse_of_both() -> None:
+def test_where_the_autocorrelation_is_not_known_each_split_is_as_sure_as_by_the_worse_of_both():
     rng = np.random.default_rng(7)
     charts = _charts(rng.normal(size=(3, 9)))
     low, high = _known(charts, 0.0), _known(charts, 0.6)
@@ -188,7 +140,7 @@ def test_where_the_autocorrelation_is_not_known_each_split_is_as_sure_as_by_the_
 
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=30, deadline=None)
-def test_one_day_alone_is_clipped_and_two_in_a_row_are_believed(seed: int) -> None:
+def test_one_day_alone_is_clipped_and_two_in_a_row_are_believed(seed: int):
     rng = np.random.default_rng(seed)
     at = int(rng.integers(0, 12))
     alone, lasting = rng.normal(size=12) * 0.3, rng.normal(size=12) * 0.3
@@ -199,12 +151,7 @@ def test_one_day_alone_is_clipped_and_two_in_a_row_are_believed(seed: int) -> No
     np.testing.assert_allclose(found, lasting, atol=2.0)
 
 
-def test_a_reference_is_never_clipped_nor_is_the_day_after_it() -> None:
-    value = np.array([0.0, 9, 9, 9, 9, 9])
-    np.testing.assert_array_equal(clipped(_charts([value], reference_days=10), np.ones(1))[0], value)
-
-
-def test_a_knock_on_the_third_of_four_days_is_found_with_its_day_and_size() -> None:
+def test_a_knock_on_the_third_of_four_days_is_found_with_its_day_and_size():
     rng = np.random.default_rng(3)
     found, right_day, sizes = 0, 0, []
     for _ in range(400):
@@ -222,7 +169,7 @@ def test_a_knock_on_the_third_of_four_days_is_found_with_its_day_and_size() -> N
 
 
 @pytest.mark.parametrize(("days", "first", "size"), [(4, 2, 6.0), (10, 5, 4.0), (28, 20, 3.0)])
-def test_the_start_interval_holds_the_true_day(days: int, first: int, size: float) -> None:
+def test_the_start_interval_holds_the_true_day(days: int, first: int, size: float):
     rng = np.random.default_rng(days)
     trials, held = 1500, 0
     for _ in range(trials):
@@ -233,12 +180,12 @@ def test_the_start_interval_holds_the_true_day(days: int, first: int, size: floa
     assert held / trials >= 0.95
 
 
-def test_missing_days_widen_the_start_interval() -> None:
+def test_missing_days_widen_the_start_interval():
     charts = _charts([np.array([0, 0, 0, 9.0, 9, 9])], 1.0, np.array([1, 2, 3, 8, 9, 10]))
     assert start_interval(_z(charts)[0] ** 2, charts.day[0]) == (8, 4, 8)
 
 
-def test_slow_drift_and_step_are_told_apart() -> None:
+def test_slow_drift_and_step_are_told_apart():
     rng = np.random.default_rng(5)
     kinds = {"step": [], "slow drift": []}
     for _ in range(200):
@@ -252,63 +199,48 @@ def test_slow_drift_and_step_are_told_apart() -> None:
     assert kinds["slow drift"].count("slow drift") >= 190
 
 
-def test_a_drift_fit_recovers_its_size() -> None:
-    day = np.array([0, 1, 2, 3, 5, 8, 9])
-    value = np.maximum(day - 2, 0) * 0.1 + 4.0
-    charts = _charts([value], 0.01, day)
-    found = scan(charts, charts.value, np.ones(1), np.zeros(1))
-    best = int(np.argmax(found.drift_z[0]))
-    assert best == 2
-    assert found.drift[0, best] == pytest.approx(0.7, abs=1e-9)
-    assert found.drift_sigma[0, best] < 0.02
+@pytest.mark.parametrize(
+    ("values", "limit", "sigma", "status", "words"),
+    [
+        ([0, 0, 0, 0, 0, 9], 1.0, 0.5, "YELLOW", "one day stands out"),
+        ([0, 0, 0, 0, 0, 9, 9], 1.0, 0.5, "RED", ""),
+        ([0, 0, 14, 0, 0, 0], 2.0, 0.5, "GREEN", ""),  # it did not last
+        ([0] * 8 + [9] * 6 + [0] * 3, 1.0, 0.3, "GREEN", "back where the reference is"),
+        ([0] * 8 + [9] * 6 + [0], 1.0, 0.3, "RED", ""),  # one day is no repair yet
+        ([0] * 8 + [9] * 14 + [15] * 3, 1.0, 0.3, "RED", ""),
+        ([0, 0, 0, 0.2, 0.2, 0.2], 0.25, 0.01, "YELLOW", "below"),
+        ([0, 0, 0.38, 0.38], 0.25, 0.1, "YELLOW", "may have begun"),
+        ([0] * 10 + [0.3] * 4, 0.25, 0.08, "YELLOW", "may be of a size that matters"),
+        ([0] * 10 + [0.3] * 4, 0.2, 0.08, "RED", ""),
+        ([0] * 4, 0.25, 0.1, "GREEN", ""),
+        ([0] * 4, 0.25, 0.3, "UNKNOWN", "too inaccurate to exclude"),
+        ([], 1.0, 0.01, "UNKNOWN", ""),
+        ([0, 0], 1.0, 0.01, "UNKNOWN", ""),
+    ],
+)
+def test_a_chart_s_status_is_that_of_its_days(values, limit, sigma, status, words):
+    verdict = _judge(np.array(values, float), limit, sigma)
+    assert verdict.status == status
+    assert words in verdict.reason
+    assert (verdict.change is not None) == (status in ("RED", "YELLOW"))
 
 
-def test_a_last_day_that_stands_out_is_yellow_until_the_next_one_tells() -> None:
-    verdict = _judge([0, 0, 0, 0, 0, 9], 1.0, 0.5)
-    assert verdict.status == "YELLOW"
-    assert "one day stands out" in verdict.reason
-    assert verdict.change is not None
-    assert (verdict.change.day, verdict.change.size) == (5, 9.0)
-    assert _judge([0, 0, 0, 0, 0, 9, 9], 1.0, 0.5).status == "RED"
+def test_a_change_has_the_day_and_size_of_the_first_and_the_last_of_several():
+    last = _judge([0, 0, 0, 0, 0, 9], 1.0, 0.5).change
+    assert (last.day, last.size) == (5, 9.0)
+    second = _judge([0.0] * 8 + [9.0] * 14 + [15.0] * 3, 1.0, 0.3).change
+    assert (second.day, second.settled) == (8, 22)
+    assert second.size == pytest.approx(15.0)
 
 
-def test_a_day_that_stood_out_and_did_not_last_is_no_change() -> None:
-    verdict = _judge([0, 0, 14, 0, 0, 0], 2.0, 0.5)
-    assert (verdict.status, verdict.change) == ("GREEN", None)
-
-
-def test_a_value_that_came_back_is_green_and_one_that_did_not_stays_red() -> None:
-    off = [0.0] * 8 + [9.0] * 6
-    back = _judge([*off, 0.0, 0.0, 0.0], 1.0, 0.3)
-    assert (back.status, back.reason, back.change) == ("GREEN", "back where the reference is", None)
-    assert _judge([*off, 0.0], 1.0, 0.3).status == "RED"  # one day is no repair yet
-    for days in (1, 30, 300):
-        stays = _judge([0.0] + [9.0] * (days + 2), 1.0, 0.3, reference_days=8)
-        assert stays.status == "RED"
-
-
-def test_a_second_change_does_not_move_the_start_of_the_first() -> None:
-    verdict = _judge([0.0] * 8 + [9.0] * 14 + [15.0] * 3, 1.0, 0.3)
-    assert verdict.change is not None
-    assert (verdict.status, verdict.change.day, verdict.change.settled) == ("RED", 8, 22)
-    assert verdict.change.size == pytest.approx(15.0)
-
-
-def test_a_sure_change_below_the_limit_is_yellow() -> None:
-    verdict = _judge([0, 0, 0, 0.2, 0.2, 0.2], 0.25, 0.01)
-    assert verdict.status == "YELLOW"
-    assert "below" in verdict.reason
-
-
-def test_green_is_only_said_where_a_change_of_the_limit_would_be_seen() -> None:
-    seeing, blind = _judge(np.zeros(4), 0.25, 0.1), _judge(np.zeros(4), 0.25, 0.3)
-    assert (seeing.status, blind.status) == ("GREEN", "UNKNOWN")
-    assert "too inaccurate to exclude" in blind.reason
+@pytest.mark.parametrize("days", [1, 30, 300])
+def test_a_chart_off_its_reference_stays_red(days):
+    assert _judge([0.0] + [9.0] * (days + 2), 1.0, 0.3, reference_days=8).status == "RED"
 
 
 @pytest.mark.parametrize("sigma", [0.13, 0.2, 0.31])
 @pytest.mark.parametrize("days", [3, 4, 9])
-def test_a_chart_that_cannot_tell_yet_says_after_how_many_days_it_can(sigma: float, days: int) -> None:
+def test_a_chart_that_cannot_tell_yet_says_after_how_many_days_it_can(sigma: float, days: int):
     blind = _judge(np.zeros(days), 0.25, sigma)
     if blind.status == "GREEN":
         assert days >= 9  # only then is the sigma small enough
@@ -321,23 +253,7 @@ def test_a_chart_that_cannot_tell_yet_says_after_how_many_days_it_can(sigma: flo
     assert _judge(np.zeros(int(0.8 * needed)), 0.25, sigma).status == "UNKNOWN"
 
 
-def test_what_looks_like_a_change_but_is_not_sure_is_yellow() -> None:
-    verdict = _judge([0.0, 0.0, 0.38, 0.38], 0.25, 0.1)
-    assert verdict.status == "YELLOW"
-    assert verdict.change is not None
-    assert verdict.change.day == 2
-    assert "may have begun" in verdict.reason
-
-
-def test_a_sure_change_whose_size_may_be_below_what_matters_is_yellow() -> None:
-    value = [0.0] * 10 + [0.3] * 4
-    verdict = _judge(value, 0.25, 0.08)
-    assert verdict.status == "YELLOW"
-    assert "may be of a size that matters" in verdict.reason
-    assert _judge(value, 0.2, 0.08).status == "RED"
-
-
-def test_two_days_are_not_enough_where_single_days_are_often_far_off() -> None:
+def test_two_days_are_not_enough_where_single_days_are_often_far_off():
     charts = _charts([np.array([0.0] * 8 + [9.0] * after) for after in (2, 3)])
     known = _known(charts)
     for far, expected in ((0.003, ["RED", "RED"]), (0.02, ["YELLOW", "RED"])):
@@ -346,12 +262,7 @@ def test_two_days_are_not_enough_where_single_days_are_often_far_off() -> None:
         assert [v.status for v in verdicts] == expected
 
 
-@pytest.mark.parametrize("days", [0, 1, 2])
-def test_too_few_days_are_unknown(days: int) -> None:
-    assert _judge(np.zeros(days), 1.0, 0.01).status == "UNKNOWN"
-
-
-def test_a_threshold_needs_two_days_and_a_probability() -> None:
+def test_a_threshold_needs_two_days_and_a_probability():
     for sigma, probability in ((np.ones(1), 0.1), (np.ones(3), 0.0), (np.ones(3), 1.0)):
         with pytest.raises(ValueError, match="no threshold"):
             alarm_threshold(sigma, probability)
@@ -362,14 +273,14 @@ def _fleet_noise(values: np.ndarray) -> Noise:
     return estimate_noise(_charts(values.reshape(-1, values.shape[-1])), 2, 1)
 
 
-def test_scatter_is_the_fleets_and_never_shrinks_sigmas() -> None:
+def test_scatter_is_the_fleets_and_never_shrinks_sigmas():
     rng = np.random.default_rng(7)
     wide, tight = (_fleet_noise(rng.normal(size=(30, 2, 28)) * factor).scale for factor in (2.0, 0.2))
     assert np.median(wide) == pytest.approx(2.0, rel=0.1)
     np.testing.assert_array_equal(tight, 1.0)
 
 
-def test_a_vehicle_whose_sigmas_are_too_small_is_told_from_its_fleet() -> None:
+def test_a_vehicle_whose_sigmas_are_too_small_is_told_from_its_fleet():
     rng = np.random.default_rng(8)
     values = rng.normal(size=(30, 2, 28))
     values[3] *= 1.8
@@ -378,7 +289,7 @@ def test_a_vehicle_whose_sigmas_are_too_small_is_told_from_its_fleet() -> None:
     assert np.median(scale) < 1.2
 
 
-def test_real_steps_are_no_scatter() -> None:
+def test_real_steps_are_no_scatter():
     rng = np.random.default_rng(9)
     values = rng.normal(size=(10, 2, 30))
     values[..., 15:] += 50
@@ -390,7 +301,7 @@ def test_real_steps_are_no_scatter() -> None:
 
 
 @pytest.mark.parametrize("phi", [0.0, 0.3, 0.6])
-def test_autocorrelation_is_found_and_is_not_taken_for_small_scatter(phi: float) -> None:
+def test_autocorrelation_is_found_and_is_not_taken_for_small_scatter(phi: float):
     rng = np.random.default_rng(10)
     e = rng.normal(size=(150, 2, 40))
     for k in range(1, 40):
@@ -400,13 +311,7 @@ def test_autocorrelation_is_found_and_is_not_taken_for_small_scatter(phi: float)
     assert np.median(found.scale) < 1.15
 
 
-def test_a_fleet_that_nobody_has_seen_is_taken_to_err_alike_from_day_to_day() -> None:
-    found = _fleet_noise(np.random.default_rng(11).normal(size=(1, 2, 4)))
-    assert found.autocorrelation.min() > 0.5
-    assert estimate_noise(_charts([np.zeros(0)] * 2), 2, 1).scale.tolist() == [1.0, 1.0]
-
-
-def test_scatter_is_learnt_by_model() -> None:
+def test_scatter_is_learnt_by_model():
     rng = np.random.default_rng(12)
     values = rng.normal(size=(200, 2, 8)) * np.where(np.arange(200) < 100, 1.0, 2.0)[:, None, None]
     charts = _charts(values.reshape(-1, 8))
@@ -416,7 +321,7 @@ def test_scatter_is_learnt_by_model() -> None:
     assert np.median(apart[100:]) > 1.05 * np.median(together[100:])
 
 
-def test_what_is_known_before_gives_way_to_a_fleet_s_days_as_they_come() -> None:
+def test_what_is_known_before_gives_way_to_a_fleet_s_days_as_they_come():
     rng = np.random.default_rng(13)
     for vehicles, low, high in ((1, 1.5, 2.7), (60, 1.0, 1.15)):
         charts = _charts(rng.normal(size=(vehicles, 2, 12)).reshape(-1, 12))
@@ -424,7 +329,7 @@ def test_what_is_known_before_gives_way_to_a_fleet_s_days_as_they_come() -> None
         assert low < np.median(learnt) < high
 
 
-def test_vehicles_that_are_alike_are_known_to_more_degrees_of_freedom_than_such_that_differ() -> None:
+def test_vehicles_that_are_alike_are_known_to_more_degrees_of_freedom_than_such_that_differ():
     rng = np.random.default_rng(14)
     values = rng.normal(size=(60, 2, 28))
     alike, differ = (
@@ -433,7 +338,7 @@ def test_vehicles_that_are_alike_are_known_to_more_degrees_of_freedom_than_such_
     assert np.median(alike.freedom) > 2 * np.median(differ.freedom)
 
 
-def test_what_begins_on_all_vehicles_at_once_is_no_scatter() -> None:
+def test_what_begins_on_all_vehicles_at_once_is_no_scatter():
     rng = np.random.default_rng(15)
     values = rng.normal(size=(30, 2, 28))
     drifting = values + np.maximum(np.arange(28) - 21, 0) * 0.8
@@ -442,7 +347,7 @@ def test_what_begins_on_all_vehicles_at_once_is_no_scatter() -> None:
     assert np.median(moving.autocorrelation) < np.median(still.autocorrelation) + 0.05
 
 
-def test_a_change_that_stays_is_no_day_far_off() -> None:
+def test_a_change_that_stays_is_no_day_far_off():
     values = np.random.default_rng(10).normal(size=(1, 2, 8))
     quiet = _fleet_noise(values).far[0]
     stays, single = values.copy(), values.copy()
@@ -452,7 +357,7 @@ def test_a_change_that_stays_is_no_day_far_off() -> None:
     assert _fleet_noise(single).far[0] > 2 * quiet
 
 
-def test_edges_of_a_fleet_are_as_often_far_off_as_the_one_that_is_most() -> None:
+def test_edges_of_a_fleet_are_as_often_far_off_as_the_one_that_is_most():
     values = np.random.default_rng(11).normal(size=(4, 6, 20))
     values[:, 0, 2:-2:5] += 30
     charts = _charts(values.reshape(24, 20))
@@ -461,7 +366,7 @@ def test_edges_of_a_fleet_are_as_often_far_off_as_the_one_that_is_most() -> None
     assert len(np.unique(noise.far)) == 1
 
 
-def test_a_change_that_may_have_begun_takes_more_where_few_days_say_how_they_scatter() -> None:
+def test_a_change_that_may_have_begun_takes_more_where_few_days_say_how_they_scatter():
     verdicts = []
     for before in (2, 14):
         charts = _charts([np.array([0.0] * before + [0.4, 0.4])], 0.1)
@@ -484,7 +389,7 @@ def _swinging(vehicles: int, swing: float, moved: float = 0.0) -> tuple[Charts, 
     return charts, with_wander(charts, noise, np.full(2 * vehicles, 0.1), (vehicles, 1, 2))
 
 
-def test_what_all_vehicles_wander_by_over_weeks_is_learnt_by_axis() -> None:
+def test_what_all_vehicles_wander_by_over_weeks_is_learnt_by_axis():
     _, noise = _swinging(60, 0.03)
     assert noise.wander is not None
     turning, still = noise.wander.reshape(60, 2)[0]
@@ -493,13 +398,13 @@ def test_what_all_vehicles_wander_by_over_weeks_is_learnt_by_axis() -> None:
 
 
 @pytest.mark.parametrize("moved", [0.15, 0.3])
-def test_a_fleet_that_moved_as_one_is_not_taken_to_wander(moved: float) -> None:
+def test_a_fleet_that_moved_as_one_is_not_taken_to_wander(moved: float):
     _, noise = _swinging(60, 0.0, moved)
     assert noise.wander is not None
     assert noise.wander.max() == 0
 
 
-def test_a_swing_that_all_vehicles_show_is_no_change_and_a_larger_change_is() -> None:
+def test_a_swing_that_all_vehicles_show_is_no_change_and_a_larger_change_is():
     charts, noise = _swinging(60, 0.03)
     still = replace(noise, wander=None, less_alike=None)
     charts.value[0, 1:] = 0.1 + 0.02 * np.random.default_rng(1).normal(size=28)
@@ -510,26 +415,8 @@ def test_a_swing_that_all_vehicles_show_is_no_change_and_a_larger_change_is() ->
     assert [found[m].status for m in (0, 2)] == ["GREEN", "RED"]
 
 
-def test_an_error_that_dies_away_is_no_change_where_days_are_often_far_off_and_one_that_stays_is() -> None:
-    rng = np.random.default_rng(3)
-    dying, lasting = (0.1 * rng.normal(size=28) for _ in range(2))
-    dying[24:] += 6 * 0.6 ** np.arange(4)
-    lasting[24:] += 6
-    charts = _charts([dying, lasting])
-    known = _known(charts, 0.6)
-    often = replace(known, far=np.full(2, 0.02))
-    probability = np.full((2, 2), PROBABILITY)
-    z = [np.abs(scan_by(charts, charts.value, n, n.reach).z).max(axis=1) for n in (known, often)]
-    assert z[0][0] > 5
-    assert z[1][0] < 4.5
-    verdicts = judge_charts(charts, often, np.full(2, 2.0), probability, 2)
-    assert [v.status for v in verdicts] == ["GREEN", "RED"]
-    assert verdicts[1].change is not None
-    assert verdicts[1].change.size == pytest.approx(6, abs=0.6)
-
-
 @pytest.mark.parametrize("size", [10.0, 40.0])
-def test_a_day_far_off_explains_the_days_that_come_back_from_it_however_far_it_is(size: float) -> None:
+def test_a_day_far_off_explains_the_days_that_come_back_from_it_however_far_it_is(size: float):
     rng = np.random.default_rng(5)
     error = np.zeros((200, 11))
     for k in range(1, 11):
@@ -546,7 +433,7 @@ def test_a_day_far_off_explains_the_days_that_come_back_from_it_however_far_it_i
 
 
 @pytest.mark.parametrize(("far", "status"), [(0.0027, "YELLOW"), (0.02, "GREEN")])
-def test_a_last_day_alone_stands_out_only_beyond_what_single_days_do(far: float, status: str) -> None:
+def test_a_last_day_alone_stands_out_only_beyond_what_single_days_do(far: float, status: str):
     charts = _charts([np.array([0.0] * 14 + [8.0])])  # 5.7 sigmas of a difference of two days
     noise = replace(_known(charts), far=np.full(1, far))
     (verdict,) = judge_charts(charts, noise, np.full(1, 2.0), np.full((2, 1), 1e-3), 2)

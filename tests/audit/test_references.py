@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.audit import history
-from pipeline.audit.estimates import day_name
+from pipeline.audit.estimates import day_name as name_of
 from pipeline.audit.references import read_kept
 from pipeline.core.stage_work import Task, Window
 from pipeline.core.stages import AUDIT, STATE
@@ -17,7 +17,8 @@ from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.service_events import ServiceEvent
 from schemas.states import STATES, StateRow
-from tests.audit.test_audit_fleet import KNOCK, _day, _fleet
+from tests.audit.fleet_records import vehicle_records
+from tests.audit.test_audit_fleet import KNOCK, day_name, fleet_config
 
 CAMERA_LIDAR = EDGE_OF_PAIR["camera_lidar"]
 DAYS = 60
@@ -29,12 +30,12 @@ def night_of(day):
 
 
 @pytest.fixture
-def bare(tmp_path, maker):
+def bare(tmp_path):
     """A knocked vehicle, a good one that was held at times, and one that joined a week ago; two months."""
     rng = np.random.default_rng(41)
-    rows = maker.vehicle_records("a", DAYS, rng, status=lambda d: "held" if d % 7 == 3 else "accepted")
-    rows += maker.vehicle_records("b", DAYS, rng, motion=lambda d: {"radar": KNOCK} if d > 50 else {})
-    rows += [r for r in maker.vehicle_records("c", DAYS, rng) if r.day >= _day(54)]
+    rows = vehicle_records("a", DAYS, rng, status=lambda d: "held" if d % 7 == 3 else "accepted")
+    rows += vehicle_records("b", DAYS, rng, motion=lambda d: {"radar": KNOCK} if d > 50 else {})
+    rows += [r for r in vehicle_records("c", DAYS, rng) if r.day >= day_name(54)]
     lake = Lake.at(tmp_path / "bare")
     commit_records(lake, CALIBRATIONS, [replace(r, recorded_at=night_of(r.day)) for r in rows])
     return lake
@@ -43,8 +44,8 @@ def bare(tmp_path, maker):
 @pytest.fixture
 def lake(tmp_path, bare):
     """The same, with the states of the night before."""
-    STATE.run(Task(_fleet(), bare, Window(None, _day(LAST - 1))))
-    lake, stamp = Lake.at(tmp_path / "kept"), night_of(_day(LAST - 1))
+    STATE.run(Task(fleet_config(), bare, Window(None, day_name(LAST - 1))))
+    lake, stamp = Lake.at(tmp_path / "kept"), night_of(day_name(LAST - 1))
     rows = read_records(bare, CALIBRATIONS, CalibrationRecord)
     commit_records(lake, CALIBRATIONS, [replace(r, asserted_at="") for r in rows])
     states = read_records(bare, STATES, StateRow)
@@ -53,11 +54,11 @@ def lake(tmp_path, bare):
 
 
 def audited(lake):
-    return AUDIT.run(Task(_fleet(), lake, Window())).records
+    return AUDIT.run(Task(fleet_config(), lake, Window())).records
 
 
 def kept(lake, events=(), count=10):
-    return read_kept(lake, "joint", (_day(LAST - 27), _day(LAST)), {"a": events}, count)
+    return read_kept(lake, "joint", (day_name(LAST - 27), day_name(LAST)), {"a": events}, count)
 
 
 def test_a_night_reads_its_window_alone_and_finds_what_it_would_find_from_the_first_days(
@@ -72,18 +73,12 @@ def test_a_night_reads_its_window_alone_and_finds_what_it_would_find_from_the_fi
     monkeypatch.setattr(history, "read_columns", spy)
     told = audited(lake)
     whole = {(first, last) for first, last, vehicle in spans if vehicle is None and last is not None}
-    assert whole == {(_day(LAST - 27), _day(LAST))}
+    assert whole == {(day_name(LAST - 27), day_name(LAST))}
     assert {v for _, _, vehicle in spans for v in vehicle or ()} <= {"c"}  # which drove on few days
     assert {f.vehicle for f in told if f.status == "RED"} == {"b"}
     for a, b in zip(expected, told, strict=True):
-        assert (a.vehicle, a.pair, a.dof, a.status, a.reason) == (
-            b.vehicle,
-            b.pair,
-            b.dof,
-            b.status,
-            b.reason,
-        )
-        assert (a.start_day, a.days_used) == (b.start_day, b.days_used)
+        for name in ("vehicle", "pair", "dof", "status", "reason", "start_day", "days_used"):
+            assert getattr(a, name) == getattr(b, name)
         assert b.statistic == (None if a.statistic is None else pytest.approx(a.statistic, rel=1e-6))
 
 
@@ -97,26 +92,26 @@ def test_states_keep_the_first_accepted_days_and_from_the_tenth_on_what_they_mak
     found = kept(lake)
     assert set(found) == {(v, edge) for v in "abc" for edge in EDGE_OF_PAIR.values()}
     a, c = (found[v, CAMERA_LIDAR] for v in "ac")
-    assert a.days == tuple(_day(d) for d in range(12) if d % 7 != 3)
-    assert [day_name(d) for d in a.reference.days] == list(a.days)
-    assert (c.days, c.reference) == (tuple(_day(d) for d in range(54, LAST)), None)
+    assert a.days == tuple(day_name(d) for d in range(12) if d % 7 != 3)
+    assert [name_of(d) for d in a.reference.days] == list(a.days)
+    assert (c.days, c.reference) == (tuple(day_name(d) for d in range(54, LAST)), None)
 
 
 def test_what_is_kept_no_longer_counts_after_a_service_event_another_setting_or_another_record(lake):
     assert kept(lake, count=9) == {}
-    event = ServiceEvent(vehicle="a", day=_day(20), sensor="radar", kind="re-mount")
+    event = ServiceEvent(vehicle="a", day=day_name(20), sensor="radar", kind="re-mount")
     assert {p for v, p in kept(lake, [event]) if v == "a"} == {
         CAMERA_LIDAR
     }  # which has nothing to do with it
-    old = next(r for r in read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle="a", day=_day(2)))
+    old = next(r for r in read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle="a", day=day_name(2)))
     commit_records(lake, CALIBRATIONS, [replace(old, work_key="again", recorded_at="", asserted_at="")])
     assert {v for v, _ in kept(lake)} == {"b", "c"}
 
 
 def test_the_states_of_every_night_keep_the_same_reference(lake):
     before = kept(lake)
-    STATE.run(Task(_fleet(), lake, Window()))
-    after = read_kept(lake, "joint", (_day(LAST - 27), _day(LAST)), {}, 10)
+    STATE.run(Task(fleet_config(), lake, Window()))
+    after = read_kept(lake, "joint", (day_name(LAST - 27), day_name(LAST)), {}, 10)
     for key, own in before.items():
         assert after[key].days[: len(own.days)] == own.days
         if own.reference is not None:

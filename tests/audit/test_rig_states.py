@@ -167,18 +167,6 @@ def test_too_few_days_for_a_chart_still_show_a_knock_and_the_state_is_that_of_af
     assert rows["left"].days == days(1, 2, 3, 4, 5)
 
 
-def test_an_edge_without_a_change_of_its_own_starts_again_with_its_sensor(lake):
-    """A camera turned on day 3 of 5 and named: camera-radar went on with the two days before, .46 deg off."""
-    turned = pose_rows("a", 5, np.random.default_rng(6), motion=lambda d: {"front": TURN} if d >= 2 else {})
-    found = found_change("front", ("front", "top"), "2026-03-03")
-    rows = states(lake, turned, (), [found], edges=EDGES)
-    assert rows["front", "bumper"].days == days(1, 2, 3, 4, 5)  # the radar's, which did not move
-    assert rows["front"].days == days(3, 4, 5)
-    truth = inverse(T_TOP["front"] @ exp_se3(TURN)) @ T_TOP["bumper"]
-    off = np.degrees(log_se3(transform_of(rows["front", "bumper"]) @ inverse(truth))[:3])
-    assert np.abs(off).max() < 0.15
-
-
 def test_a_slow_drift_makes_recent_days_weigh_more_and_tomorrow_less_sure(lake):
     drifting = pose_rows("a", 12, np.random.default_rng(12), motion=lambda d: {"front": d * TURN / 10})
     still = states(lake, drifting)["front"]

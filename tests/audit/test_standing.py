@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -18,19 +17,17 @@ from pipeline.store.delta import live_files, open_table
 from pipeline.store.partitions import Lake
 from pipeline.store.repair import repair_table
 from schemas.calibrations import CALIBRATIONS
+from tests.audit.fleet_records import vehicle_records
+from tests.audit.test_audit_fleet import knocked
 from tests.makers.fleet_files import fleet_toml
-
-KNOCK = {"radar": np.array([0.0, 0.0, np.radians(1.0), 0.0, 0.03, 0.0])}
 
 
 @pytest.fixture
-def files(tmp_path: Path, maker: ModuleType) -> tuple[Path, Path]:
+def files(tmp_path):
     """fleet.toml and a lake of two vehicles, a commit each; the radar of "v" is knocked on the eleventh day."""
     lake, rng = Lake.at(tmp_path / "lake"), np.random.default_rng(22)
-    commit_records(
-        lake, CALIBRATIONS, maker.vehicle_records("v", 20, rng, motion=lambda d: KNOCK if d > 9 else {})
-    )
-    commit_records(lake, CALIBRATIONS, maker.vehicle_records("w", 20, rng))
+    commit_records(lake, CALIBRATIONS, vehicle_records("v", 20, rng, motion=knocked(10)))
+    commit_records(lake, CALIBRATIONS, vehicle_records("w", 20, rng))
     (tmp_path / "fleet.toml").write_text(fleet_toml("v", "w"))
     return tmp_path / "fleet.toml", tmp_path / "lake"
 
