@@ -1,4 +1,4 @@
-"""The maker of calibration records, a fleet of them in a lake, and a real browser driven through a pipe."""
+"""A real browser driven through a pipe."""
 
 import base64
 import json
@@ -10,12 +10,9 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
-
-from tests.audit import fleet_records
 
 CHROMIUM = next((p for p in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if p), None)
 FLAGS = [
@@ -25,16 +22,10 @@ FLAGS = [
 ]  # fmt: skip
 
 
-@pytest.fixture(scope="session")
-def maker() -> ModuleType:
-    """The module tests/audit/fleet_records.py."""
-    return fleet_records
-
-
 class Browser:
     """Chromium behind the DevTools protocol; every console error, exception and failed load is a problem."""
 
-    def __init__(self, profile: Path) -> None:
+    def __init__(self, profile: Path):
         assert CHROMIUM is not None
         their_read, self._write = os.pipe()
         self._read, their_write = os.pipe()
@@ -72,7 +63,7 @@ class Browser:
         result = self.call("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)
         return result["result"].get("value")
 
-    def press(self, key: str) -> None:
+    def press(self, key: str):
         """Press and release a key."""
         code = {"Tab": 9, "Enter": 13}[key]
         text = {"text": "\r"} if key == "Enter" else {}
@@ -81,7 +72,7 @@ class Browser:
                 "Input.dispatchKeyEvent", type=kind, key=key, code=key, windowsVirtualKeyCode=code, **text
             )
 
-    def screenshot(self, path: Path) -> None:
+    def screenshot(self, path: Path):
         """PNG of the window."""
         path.write_bytes(base64.b64decode(self.call("Page.captureScreenshot")["data"]))
 
@@ -89,7 +80,7 @@ class Browser:
         """One command to the page."""
         return self._call(method, self._session, **params)
 
-    def close(self) -> None:
+    def close(self):
         """End the browser."""
         self._process.terminate()
         self._process.wait(10)

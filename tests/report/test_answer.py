@@ -1,35 +1,55 @@
-"""The day page's first sentence claims no more than the records certify."""
+"""The day page's first sentence: which sensors to trust, and no more than the records certify."""
 
 import pytest
 
-from pipeline.report.day import PairView, answer_for
+from pipeline.report.day import Answered, answer_for, answered
+from schemas.poses import PoseRow
+
+BOTH = "azimuth and elevation within 0.2 deg at 15 to 40 m; score 0.30"
+AZIMUTH = "azimuth within 0.4 deg at 15 to 40 m; score 0.20"
+NAMED = "Certified in azimuth only: lidar-radar."
 
 
-def view(title, certified, status="accepted"):
-    made = object.__new__(PairView)  # of all that a page shows of a pair, the answer looks at these four
-    fields = {"title": title, "certified": certified, "status": status}
-    fields["sensors"] = tuple(title.split("-"))
-    for name, value in fields.items():
-        object.__setattr__(made, name, value)
-    return made
+@pytest.mark.parametrize(
+    ("certified", "status", "verdict", "words", "never"),
+    [
+        (AZIMUTH, "accepted", "good", NAMED, "Keep"),
+        (BOTH, "accepted", "good", "All pairs are accepted", "azimuth only"),
+        (AZIMUTH, "held", "partly", "Keep what the car has for lidar-radar", "azimuth only"),
+        (AZIMUTH, "refused", "partly", "Keep what the car has for lidar-radar", "azimuth only"),
+    ],
+)
+def test_what_is_certified_in_one_direction_is_named_and_what_is_not_accepted_never_is(
+    certified, status, verdict, words, never
+):
+    pairs = [Answered("camera-lidar", "accepted", ("camera", "lidar"), BOTH),
+             Answered("lidar-radar", status, ("lidar", "radar"), certified)]  # fmt: skip
+    found, sentence = answer_for(pairs, "2026-03-02", [])
+    assert found == verdict
+    assert words in sentence
+    assert never not in sentence
 
 
-CAMERA_LIDAR = view("camera-lidar", "azimuth and elevation within 0.2 deg at 15 to 40 m; score 0.30")
-RADAR = view("lidar-radar", "azimuth within 0.4 deg at 15 to 40 m; score 0.20")
+def pose(sensor, kind, status="accepted"):
+    told = {"vehicle": "v", "day": "2026-03-02", "method": "joint", "work_key": "w", "code_version": "t"}
+    told |= {"reference": "top", "reason": "", "determined": ["azimuth", "elevation"]}
+    return PoseRow(**told, sensor=sensor, kind=kind, status=status)
 
 
-def test_an_accepted_radar_whose_elevation_nobody_certifies_is_named():
-    sort, sentence = answer_for([CAMERA_LIDAR, RADAR], "2026-03-02", [])
-    assert sort == "good"
-    assert sentence.endswith("Certified in azimuth only: lidar-radar.")
+TWO = (("top", "lidar"), ("nose", "radar"))
 
 
-def test_where_both_directions_are_certified_nothing_is_added():
-    assert "azimuth only" not in answer_for([CAMERA_LIDAR], "2026-03-02", [])[1]
-
-
-@pytest.mark.parametrize("status", ["held", "refused"])
-def test_a_pair_that_was_not_accepted_is_not_said_to_be_certified(status):
-    sentence = answer_for([CAMERA_LIDAR, view("lidar-radar", RADAR.certified, status)], "2026-03-02", [])[1]
-    assert "azimuth only" not in sentence
-    assert "Keep what the car has for lidar-radar" in sentence
+@pytest.mark.parametrize(
+    ("poses", "verdict", "words"),
+    [
+        ((), "good", "All pairs are accepted"),
+        (TWO, "good", "All sensors are accepted"),
+        ((*TWO, ("front", "camera", "held")), "partly", "Accepted: nose. Keep what the car has for front."),
+    ],
+)
+def test_sensors_are_named_without_the_reference_and_pairs_only_without_poses(poses, verdict, words):
+    pair = Answered("top-nose", "accepted", ("top", "nose"), "azimuth")
+    found, sentence = answer_for(answered([pair], [pose(*p) for p in poses]), "2026-03-02", [])
+    assert found == verdict
+    assert words in sentence
+    assert ("Certified in azimuth only: top-nose." in sentence) == (not poses)  # of poses, both are

@@ -1,7 +1,5 @@
 """The page of evaluate: tables as given, a dot per run, pictures at both states, and a browser without complaints."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -58,7 +56,7 @@ def test_honest_sigmas_follow_the_grey_curve_and_small_ones_lie_below():
 
 
 @pytest.mark.browser
-def test_a_browser_shows_the_page_without_a_complaint_and_not_wider_than_a_laptop(browser: Any, tmp_path):
+def test_a_browser_shows_the_page_without_a_complaint_and_not_wider_than_a_laptop(browser, tmp_path):
     views = [
         View("urban: alignment", _scene(), _turned(3.0), GOOD, True, "car 2026-01-01, joint."),
         View("Abrupt change", _scene(), _turned(3.0), GOOD, False, "car 2026-01-01, joint."),

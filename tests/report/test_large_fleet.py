@@ -3,22 +3,20 @@
 import json
 import re
 import shutil
-from urllib.parse import unquote
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.audit.days import FEWEST_DAYS as OF_CHARTS
 from pipeline.core.names import is_vehicle
 from pipeline.report.charts import fleet_charts
 from pipeline.report.fleet_page import render_fleet_page
-from pipeline.report.names import page_name, page_stem
+from pipeline.report.names import page_stem
 from pipeline.report.upkeep import Album
-from pipeline.report.window import FEWEST_DAYS
 from pipeline.store.files import LocalFiles
 from pipeline.store.partitions import Lake
+from tests.audit.fleet_records import covariance_of
 from tests.makers.large_fleets import KINDS, repeated, some_of_each_kind
 from tests.report.test_pages import _config
 
@@ -80,7 +78,7 @@ def test_the_table_begins_with_what_needs_attention_and_has_every_vehicle_once(l
         assert f'"{row[0]}":' in text
 
 
-def test_a_chart_s_numbers_are_the_records(kinds, maker):
+def test_a_chart_s_numbers_are_the_records(kinds):
     _, window, verdicts = kinds
     charts = dict(fleet_charts(window, verdicts))
     assert set(charts) == set(KINDS)
@@ -90,7 +88,7 @@ def test_a_chart_s_numbers_are_the_records(kinds, maker):
     days = charts["radar-knocked"]["days"]
     assert start[0] == days[5]
     before, after = np.array(values[:5]) / 1e4, np.array(values[5:]) / 1e4
-    sigma = np.degrees(np.sqrt(maker.covariance_of("lidar_radar")[2, 2]))
+    sigma = np.degrees(np.sqrt(covariance_of("lidar_radar")[2, 2]))
     np.testing.assert_allclose(np.array(sigmas) / 1e4, sigma, atol=2e-3)
     assert abs(before.mean()) < 2e-4  # relative to the level before the change
     assert abs(after.mean() - 1.0) < 4 * sigma / np.sqrt(5)
@@ -184,22 +182,3 @@ def test_no_two_vehicles_pages_have_one_name_on_any_file_system(names):
     for stem in stems:
         assert re.fullmatch(r"[a-z0-9._~-]+", stem)
         assert not stem.startswith(".")
-
-
-@pytest.mark.parametrize(
-    "names", [("Car", "car", "CAR"), ("a b", "a_b"), ("con", "con."), ("ä", "ae", "a\u0308")]
-)
-def test_names_that_file_systems_take_for_one_have_pages_of_their_own(names):
-    stems = {page_stem(name).casefold() for name in names}
-    assert len(stems) == len(names)
-    assert stems.isdisjoint({"con", "nul", "aux"})
-
-
-def test_plain_names_stay_readable_and_long_ones_fit():
-    assert page_name("car-1", "2026-03-01") == "2026-03-01/car-1.html"
-    assert len(page_stem("Ü" * 33)) < 80
-    assert unquote(page_stem("a~b")) != page_stem("a_b")
-
-
-def test_pages_reach_back_as_far_as_charts_do():
-    assert FEWEST_DAYS == OF_CHARTS

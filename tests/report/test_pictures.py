@@ -9,19 +9,10 @@ import pytest
 
 from pipeline.core.sections import ReportConfig
 from pipeline.report.above import top_bitmap, top_view
-from pipeline.report.overlays import (
-    Extrinsics,
-    Scene,
-    Window,
-    close_up,
-    decode_image,
-    front_view,
-    whole_view,
-)
+from pipeline.report.overlays import Extrinsics, Scene, Window, close_up, decode_image, front_view, whole_view
 from pipeline.report.reading import scene_of
 from pipeline.report.residuals import MEASURES, boundary_distance_px, frame_residuals
 from pipeline.report.scenes import choose_frames, choose_windows
-from pipeline.rig.cameras import camera_of
 from pipeline.rig.se3 import exp_se3, from_rotation_translation, inverse, transform_points
 from schemas.calibrations import SENSORS
 from schemas.frames import Frame
@@ -36,13 +27,13 @@ GOOD = Extrinsics(T_CL, T_CL @ T_LR, T_LR)
 POLE_Y_M, POLE_X_M = 1.5, 12.0
 
 
-def _turned(yaw_deg: float) -> Extrinsics:
+def _turned(yaw_deg):
     turn = exp_se3(np.array([0.0, np.radians(yaw_deg), 0.0, 0.0, 0.0, 0.0]))
     turn_radar = exp_se3(np.array([0.0, 0.0, np.radians(yaw_deg), 0.0, 0.0, 0.0]))
     return Extrinsics(turn @ T_CL, turn @ T_CL @ T_LR, turn_radar @ T_LR)
 
 
-def _blank(row_type: Any, **known: Any) -> Any:
+def _blank(row_type, **known):
     """A row with empty arrays wherever the scene says nothing."""
     values: dict[str, Any] = {}
     for f in fields(row_type):
@@ -57,7 +48,7 @@ def _blank(row_type: Any, **known: Any) -> Any:
     return row_type(**(values | {"priors": {}} | known))
 
 
-def _scene() -> Scene:
+def _scene():
     z = np.linspace(-1.5, 1.5, 25)
     half = 0.15
     sides = [np.stack([np.full(25, POLE_X_M), np.full(25, POLE_Y_M + s * half), z], 1) for s in (1, -1)]
@@ -88,18 +79,18 @@ def _scene() -> Scene:
     return Scene(frame, observation)
 
 
-def camera_u(points: np.ndarray) -> np.ndarray:
+def camera_u(points):
     seen = transform_points(T_CL, points)
     return FOCAL * seen[:, 0] / seen[:, 2] + WIDTH / 2
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
+def scene():
     """A grey image, a pole, a wall and one moving radar track on the right."""
     return _scene()
 
 
-def test_each_half_of_the_front_view_shows_its_own_state(scene: Scene) -> None:
+def test_each_half_of_the_front_view_shows_its_own_state(scene):
     both = front_view(scene, _turned(2.0), GOOD, ("prior", "calibrated"))
     good = front_view(scene, GOOD, GOOD, ("prior", "calibrated"))
     bad = front_view(scene, _turned(2.0), _turned(2.0), ("prior", "calibrated"))
@@ -109,7 +100,7 @@ def test_each_half_of_the_front_view_shows_its_own_state(scene: Scene) -> None:
     assert (good[:, : middle - 3] != bad[:, : middle - 3]).any()
 
 
-def test_a_whole_view_shows_one_state_left_and_right(scene: Scene) -> None:
+def test_a_whole_view_shows_one_state_left_and_right(scene):
     whole, both = whole_view(scene, GOOD, "x"), front_view(scene, GOOD, _turned(2.0), ("x", ""))
     middle = whole.shape[1] // 2
     np.testing.assert_array_equal(whole[:, : middle - 3], both[:, : middle - 3])
@@ -117,7 +108,7 @@ def test_a_whole_view_shows_one_state_left_and_right(scene: Scene) -> None:
     assert top_view(scene, GOOD, GOOD, ("before", "before")).count(">before<") == 1
 
 
-def test_a_moving_track_is_a_white_cross_where_it_projects(scene: Scene) -> None:
+def test_a_moving_track_is_a_white_cross_where_it_projects(scene):
     image = front_view(scene, GOOD, GOOD, ("", ""))
     scale = image.shape[1] / WIDTH
     seen = transform_points(T_CL, np.array([[15.0, -2.0, -0.5]]))[0]
@@ -125,7 +116,7 @@ def test_a_moving_track_is_a_white_cross_where_it_projects(scene: Scene) -> None
     assert (image[round(v * scale), round(u * scale)] == 255).all()
 
 
-def test_a_close_up_shows_a_fifth_of_a_degree(scene: Scene) -> None:
+def test_a_close_up_shows_a_fifth_of_a_degree(scene):
     window = Window((float(camera_u(np.array([[POLE_X_M, POLE_Y_M, 0.0]]))[0]), 150.0), (84, 60))
     pictures = [close_up(scene, state, window, 5).astype(int) for state in (GOOD, _turned(0.2))]
     assert pictures[0].shape == (300, 420, 3)
@@ -133,14 +124,14 @@ def test_a_close_up_shows_a_fifth_of_a_degree(scene: Scene) -> None:
     assert abs(columns[1] - columns[0]) > 5  # 0.2 deg are 2 px of the image and 10 px here
 
 
-def test_a_broken_image_is_grey_and_not_a_crash(scene: Scene) -> None:
+def test_a_broken_image_is_grey_and_not_a_crash(scene):
     for content in (b"", b"no picture"):
         broken = Frame(**(vars(scene.frame) | {"image": content}))
         assert decode_image(broken).shape == (HEIGHT, WIDTH, 3)
 
 
-def test_radar_from_above_lies_on_the_pole_only_when_calibrated(scene: Scene) -> None:
-    def black_at_pole(state: Extrinsics) -> bool:
+def test_radar_from_above_lies_on_the_pole_only_when_calibrated(scene):
+    def black_at_pole(state):
         bitmap = top_bitmap(scene, state, state)
         row, column = round((60 - POLE_X_M) * 16), round((30 - POLE_Y_M) * 16)
         return bool((bitmap[row - 4 : row + 5, column - 4 : column + 5].sum(axis=-1) < 60).any())
@@ -151,7 +142,7 @@ def test_radar_from_above_lies_on_the_pole_only_when_calibrated(scene: Scene) ->
     assert "b<c" not in top_view(scene, GOOD, GOOD, ("a", "b<c"))
 
 
-def test_residuals_get_worse_when_a_sensor_is_turned(scene: Scene) -> None:
+def test_residuals_get_worse_when_a_sensor_is_turned(scene):
     good, bad = frame_residuals([scene.observation], (GOOD, _turned(3.0)))
     assert set(good) == set(MEASURES)
     assert good["camera_lidar"][0] > 90
@@ -160,12 +151,7 @@ def test_residuals_get_worse_when_a_sensor_is_turned(scene: Scene) -> None:
     assert np.isnan(good["camera_radar"][0])  # no moving detections in a box: nothing to tell
 
 
-def test_boundaries_can_be_limited_to_clear_outlines(scene: Scene) -> None:
-    assert np.isfinite(boundary_distance_px(scene.observation, (5,))).all()
-    assert np.isinf(boundary_distance_px(scene.observation, (11,))).all()
-
-
-def test_the_pole_is_chosen_as_a_window_and_empty_frames_as_none(scene: Scene) -> None:
+def test_the_pole_is_chosen_as_a_window_and_empty_frames_as_none(scene):
     windows = choose_windows(scene.observation, T_CL, 3)
     assert len(windows) >= 1
     u = float(camera_u(np.array([[POLE_X_M, POLE_Y_M, 0.0]]))[0])
@@ -178,10 +164,6 @@ def test_the_pole_is_chosen_as_a_window_and_empty_frames_as_none(scene: Scene) -
     assert choose_windows(empty, T_CL, 3) == []
     assert choose_frames([empty, scene.observation, empty], T_CL, 1) == [1]
     assert choose_frames([], T_CL, 3) == []
-
-
-def test_the_camera_of_a_row_is_the_rows(scene: Scene) -> None:
-    assert camera_of(scene.frame).focal_px == (FOCAL, FOCAL)
 
 
 def test_road_users_are_hidden_and_nothing_else():

@@ -60,14 +60,6 @@ def test_gaps_of_the_frame_s_own_stamps_are_bridged_as_offsets_are():
     np.testing.assert_allclose(right.T_lidar_radar, same.T_lidar_radar, atol=1e-9)
 
 
-def test_the_way_follows_the_heading_that_the_radar_shows():
-    sideways = as_stamped(
-        GOOD, _driving(10.0, 0.0, radar_velocity_mps=np.array([0.0, 9.0, 0.4])), TimeOffsets(0.1)
-    )
-    moved = inverse(T_CL) @ sideways.T_camera_lidar
-    np.testing.assert_allclose(moved[:3, 3], [0.0, 1.0, 0.0], atol=1e-9)
-
-
 def test_without_offsets_or_speed_nothing_moves():
     for observation, offsets in (
         (_driving(20.0, 0.2), TimeOffsets()),
