@@ -44,16 +44,11 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "calibrate": ("jobs.calibrate:calibrate", "Estimate extrinsics of one vehicle-day and record them."),
     "prepare": ("jobs.prepare:prepare", "Make training data from many vehicle-days."),
     "train": ("jobs.train:train", "Train a calibration network without ground truth."),
-    "train-radar-drivable": (
-        "jobs.train_radar_drivable:train_radar_drivable",
-        "Train a small network for the radar's drivable area; the lidar is the teacher.",
-    ),
-    "train-lidar-semantics": (
-        "jobs.train_lidar_semantics:train_lidar_semantics",
-        "Train a small network for lidar semantics; the camera is the teacher.",
+    "train-perception": (
+        "jobs.train_perception:train_perception",
+        "Train lidar semantics or the radar's drivable area from another sensor.",
     ),
     "models": ("jobs.models:models", "List the networks included and those that `models fetch` downloads."),
-    "models list": ("jobs.models:models", "The same as `models`."),
     "models fetch": (
         "jobs.models:fetch",
         "Download a segmenter and a detector for cameras without labels; shows licence and sha256.",

@@ -61,7 +61,7 @@ def fetch(*names: str, into: Path = Path("models"), mirror: str | None = None) -
     Address, size and licence are shown first. The sha256 is checked before a file appears.
 
     Args:
-        names: of `boresight models list`; default: a segmenter and a detector, which a camera needs both.
+        names: of `boresight models`; default: a segmenter and a detector, which a camera needs both.
         into: folder for the files; fleet.toml names it relative to itself.
         mirror: address of a folder with the files NAME.onnx, in place of the pinned addresses.
     """

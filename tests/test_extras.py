@@ -29,8 +29,7 @@ NEEDS = {
     "demo": "simulate",
     "simulate": "simulate",
     "train": "train",
-    "train-radar-drivable": "train",
-    "train-lidar-semantics": "train",
+    "train-perception": "train",
     "export": "train",
     "view": "view",
 }
@@ -41,8 +40,9 @@ CALLS = {
     "demo": ["demo"],
     "simulate": ["simulate", "--out", "logs"],
     "train": ["train", "--data", "lake", "--out", "run"],
-    "train-radar-drivable": ["train-radar-drivable", "--fleet", "f.toml", "--lake", "lake", "--out", "run"],
-    "train-lidar-semantics": ["train-lidar-semantics", "--fleet", "f.toml", "--lake", "lake", "--out", "run"],
+    "train-perception": [
+        *("train-perception", "lidar_semantics", "--fleet", "f.toml", "--lake", "lake", "--out", "run")
+    ],
     "export": ["export", "onnx", "--out", "a.onnx", "--run", "."],
     "view": ["view", "--lake", "lake", "--vehicle", "v", "--day", "2026-03-02"],
 }

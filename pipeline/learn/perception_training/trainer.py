@@ -1,26 +1,51 @@
-"""Training of perception's networks, by the loop of all networks, with scores on held-out samples."""
+"""Train a network of perception from another sensor, score it on held-out days, and export it."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
+import onnx
+import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
+from pipeline.core.config import FleetConfig
 from pipeline.core.errors import ConfigError, ContractError
 from pipeline.core.results import Progress, silent
+from pipeline.core.rows import join_rows, take_rows
+from pipeline.learn.export.model_card import write_card
+from pipeline.learn.export.tracing import trace_to_onnx
 from pipeline.learn.train.checkpoints import LAST, load_checkpoint
 from pipeline.learn.train.loop import Run, TrainResult, run_loop
 from pipeline.learn.train.metrics import MetricsLog
 from pipeline.learn.train.settings import Count, DescentConfig
 from pipeline.learn.train.stop_signals import stop_signals
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.views import perceived_days
+from schemas.versions import CODE_VERSION
 
-__all__ = ["Task", "TrainingConfig", "hash_of_arrays", "run_training"]
+__all__ = [
+    "Graph",
+    "Labelled",
+    "Learner",
+    "Samples",
+    "Task",
+    "TrainingConfig",
+    "build_network",
+    "export_model",
+    "split_days",
+    "train_network",
+    "vehicle_days",
+]
+
+_HELD_OUT_EVERY = 5  # vehicle-days; the second one already, so that two are enough
 
 
 class TrainingConfig(DescentConfig):
@@ -28,6 +53,7 @@ class TrainingConfig(DescentConfig):
 
     steps: Count
     width: Count  # channels of the network's first layer
+    frames_per_day: Count  # at most, evenly spaced
     final_learning_rate: float = 1e-5  # small enough to stand still, large enough for float32
     gradient_norm: float = 1.0
     log_every: int = 25
@@ -36,62 +62,180 @@ class TrainingConfig(DescentConfig):
 
 
 @dataclass(frozen=True, eq=False)
-class Task:
-    """Training task of one network.
+class Labelled:
+    """A table of samples: arrays with one entry per sample, labels among them."""
+
+    label: np.ndarray  # first axis: samples
+
+    def __len__(self) -> int:
+        return len(self.label)
+
+
+R = TypeVar("R", bound=Labelled)
+
+
+@dataclass(frozen=True, eq=False)
+class Samples(Generic[R]):
+    """Samples to learn from and held-out ones, and their numbers for the card."""
+
+    train: R
+    held_out: R
+    numbers: dict[str, int]
+
+
+class Learner(ABC, Generic[R]):
+    """What a task makes of the samples to learn from: a loss, and scores."""
+
+    @abstractmethod
+    def loss(self, network: nn.Module, batch: R, rng: np.random.Generator) -> Float[Tensor, ""]:
+        """Loss of a batch, differentiable."""
+
+    @abstractmethod
+    def scores(self, network: nn.Module, held_out: R) -> dict[str, float]:
+        """Scores of the network in evaluation mode, by name."""
+
+
+@dataclass(frozen=True, eq=False)
+class Graph:
+    """What is exported: `manifest` is the model's .toml after path and sha256: task, layout of input and output."""
+
+    module: nn.Module
+    example: Tensor
+    names: tuple[str, str]  # of input and output
+    manifest: str
+
+
+@dataclass(frozen=True, eq=False)
+class Task(Generic[R]):
+    """A network that perception uses.
 
     Args:
-        data_key: hash of the samples; a run continues only with the same ones.
-        scores: scores of the network in evaluation mode on held-out samples, by name.
-        metric: name of a score in metrics.jsonl, with {} for the score's own name.
+        name: of the task in the command, and of the model's files.
+        samples: of all days of a lake; ContractError if there are too few days.
+        network: fresh weights at a width.
+        learner: from the samples to learn from.
+        graph: network and samples to what is exported.
     """
 
-    network: nn.Module
-    data_key: str
-    loss: Callable[[np.random.Generator], Tensor]
-    scores: Callable[[], dict[str, float]]
-    metric: str = "held_out/{}"
+    name: str
+    purpose: str
+    limits: tuple[str, ...]
+    config: type[TrainingConfig]
+    unlabelled: int
+    samples: Callable[[FleetConfig, Lake, Any], Samples[R]]
+    network: Callable[[int], nn.Module]
+    learner: Callable[[R], Learner[R]]
+    graph: Callable[[nn.Module, R], Graph]
 
 
-def run_training(
-    task: Task, out: Path, config: TrainingConfig, time_limit_s: float | None, progress: Progress = silent
-) -> TrainResult:
-    """Train the task's network, or continue the run in `out`; leaves last.pt and metrics.jsonl there.
+def vehicle_days(fleet: FleetConfig, lake: Lake) -> list[Partition]:
+    """Perceived vehicle-days of the fleet; raises ContractError if there are none."""
+    days = [p for p in perceived_days(lake) if fleet.knows(p.vehicle)]
+    if not days:
+        problem = "no vehicle-days with observations of vehicles in fleet.toml: run `boresight perceive`"
+        raise ContractError(str(lake.root), problem)
+    return days
+
+
+def split_days(days: Sequence[Partition], samples_of: Callable[[Partition], R]) -> Samples[R]:
+    """Samples of all days, every fifth day held out; of a single day, the first 0.7 against the last 0.2."""
+    parts = [samples_of(day) for day in days]
+    if len(parts) == 1:
+        # Neighbouring scans are alike: a tenth between the two sides belongs to neither.
+        rows, total = np.arange(len(parts[0])), len(parts[0])
+        train, held_out = (
+            take_rows(parts[0], r) for r in (rows[: int(0.7 * total)], rows[int(0.8 * total) :])
+        )
+    else:
+        train, held_out = (
+            join_rows([p for i, p in enumerate(parts) if (i % _HELD_OUT_EVERY == 1) == side])
+            for side in (False, True)
+        )
+    numbers = {"vehicle_days": len(days), "samples": len(train), "held_out_samples": len(held_out)}
+    return Samples(train, held_out, numbers)
+
+
+def train_network(
+    task: Task[R],
+    samples: Samples[R],
+    out: Path,
+    config: TrainingConfig,
+    time_limit_s: float | None = None,
+    progress: Progress = silent,
+) -> tuple[nn.Module, TrainResult]:
+    """Train, or continue the run in `out`, until it is finished, the time is up or a signal stops it.
+
+    Leaves last.pt and metrics.jsonl there; the result reports the scores on held-out samples.
 
     Raises:
-        ContractError: the run was begun on other samples.
+        ContractError: no labels on one side, or other samples than the run began with.
         ConfigError: the run was begun with another configuration.
         DivergedError: the loss is not finite or has grown too much.
     """
+    for side, name in ((samples.train, "to learn from"), (samples.held_out, "held out")):
+        if not np.any(side.label != task.unlabelled):
+            problem = f"no labels in the {len(side)} samples {name}: both are needed"
+            raise ContractError(str(out), problem)
+    network, learner = build_network(task, config.width, config.seed), task.learner(samples.train)
     out.mkdir(parents=True, exist_ok=True)
-    run = _TaskRun(task, config)
+    run = _TaskRun(network, learner, samples.train, config)
     if (out / LAST).exists():
         run.resume(out / LAST)
     with stop_signals() as stops, closing(MetricsLog(out, run.step, events=False)) as log:
         result = run_loop(run, out, log, stops, time_limit_s, progress)
-        task.network.eval()
-        scores = task.scores()
-        log.report(run.step, {task.metric.format(name): value for name, value in scores.items()})
-    return replace(result, report=scores)
+        scores = learner.scores(network.eval(), samples.held_out)
+        log.report(run.step, {f"held_out/{name}": value for name, value in scores.items()})
+    return network, replace(result, report=scores)
 
 
-def hash_of_arrays(*arrays: np.ndarray) -> str:
-    """Sixteen hexadecimal digits that are equal if the arrays are, bit for bit."""
-    digest = hashlib.sha256()
-    for array in arrays:
-        digest.update(np.ascontiguousarray(array).data)
-    return digest.hexdigest()[:16]
+def build_network(task: Task[R], width: int, seed: int) -> nn.Module:
+    """New weights; the caller's random state is not changed."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return task.network(width)
+
+
+def export_model(task: Task[R], network: nn.Module, train: R, folder: Path, card: dict[str, Any]) -> Path:
+    """Write NAME.onnx, NAME.toml (the manifest), NAME.json and NAME.md (the card); returns the manifest."""
+    graph = task.graph(network.eval(), train)
+    folder.mkdir(parents=True, exist_ok=True)
+    model, unfinished = folder / f"{task.name}.onnx", folder / f"{task.name}.part"
+    onnx.checker.check_model(
+        trace_to_onnx(graph.module, (graph.example,), unfinished, graph.names[:1], graph.names[1:])
+    )
+    unfinished.replace(model)
+    about = {
+        "code_version": CODE_VERSION,
+        "parameters": sum(p.numel() for p in network.parameters()),
+        "purpose": task.purpose,
+        "command": f"boresight train-perception {task.name}",
+        **card,
+        "limits": task.limits,
+    }
+    write_card(model, about)
+    digest = hashlib.sha256(model.read_bytes()).hexdigest()
+    path = folder / f"{task.name}.toml"
+    path.write_text(f'path = "{model.name}"\nsha256 = "{digest}"\n{graph.manifest}')
+    return path
 
 
 class _TaskRun(Run):
-    def __init__(self, task: Task, config: TrainingConfig) -> None:
-        super().__init__(task.network, config, config.steps)
-        self.task, self.config = task, config
+    def __init__(self, network: nn.Module, learner: Learner[R], train: R, config: TrainingConfig) -> None:
+        super().__init__(network, config, config.steps)
+        self.learner, self.train, self.config = learner, train, config
+        digest = hashlib.sha256()
+        for array in vars(train).values():
+            if isinstance(array, np.ndarray):
+                digest.update(np.ascontiguousarray(array).data)
+        self.data_key = digest.hexdigest()[:16]
 
     def losses(self) -> dict[str, Tensor]:
-        return {"loss": self.task.loss(np.random.default_rng([self.config.seed, self.step]))}
+        rng = np.random.default_rng([self.config.seed, self.step])
+        batch = take_rows(self.train, rng.integers(0, len(self.train), self.config.batch_size))
+        return {"loss": self.learner.loss(self.network, batch, rng)}
 
     def state(self) -> dict[str, Any]:
-        return super().state() | {"config": self.config.model_dump(), "data_key": self.task.data_key}
+        return super().state() | {"config": self.config.model_dump(), "data_key": self.data_key}
 
     def resume(self, path: Path) -> None:
         """Continue from a checkpoint."""
@@ -99,6 +243,6 @@ class _TaskRun(Run):
         if state["config"] != self.config.model_dump():
             problem = f"this run was begun with {state['config']}: take another folder"
             raise ConfigError(str(path), "", problem)
-        if state["data_key"] != self.task.data_key:
+        if state["data_key"] != self.data_key:
             raise ContractError(str(path), "this run was begun on other samples: take another folder")
         self.load(state)

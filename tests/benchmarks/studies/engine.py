@@ -25,7 +25,7 @@ from pipeline.calibrate.day import calibrate_observations
 from pipeline.calibrate.records import Inputs
 from pipeline.core.config import FleetConfig, SolveConfig
 from pipeline.core.errors import SolveError
-from pipeline.learn.perception_training.radar_drivable.samples import scan_of
+from pipeline.learn.perception_training.radar_drivable import scan_of
 from pipeline.perceive.models.radar_drivable import RadarDrivable
 from pipeline.rig.day_prior import perturbed, read_prior
 from pipeline.rig.estimates import Prior

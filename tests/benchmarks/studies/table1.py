@@ -2,7 +2,7 @@
 
     python tests/benchmarks/studies/days.py generate --root DAYS --sets table1 one-clock
     python tests/benchmarks/studies/days.py gather --root DAYS --sets dev --out FLEET
-    boresight train-radar-drivable --fleet FLEET/fleet.toml --lake FLEET/lake --out DAYS/radar_drivable
+    boresight train-perception radar_drivable --fleet FLEET/fleet.toml --lake FLEET/lake --out DAYS/radar_drivable
     python tests/benchmarks/studies/table1.py --root DAYS --workers 2
     python tests/benchmarks/studies/table1.py --root DAYS --workers 2 --days one-clock
 
@@ -89,7 +89,9 @@ def rows_for(root: Path) -> list[Row]:
     """Rows that can be had: without a learned model, those without it, and a line says why."""
     if (root / DRIVABLE_MODEL).exists():
         return list(ROWS)
-    print(f"No rows with {_LEARNED}: {root / DRIVABLE_MODEL} is not there (boresight train-radar-drivable)")
+    print(
+        f"No rows with {_LEARNED}: {root / DRIVABLE_MODEL} is not there (boresight train-perception radar_drivable)"
+    )
     return [row for row in ROWS if not row.spoil]
 
 

@@ -9,13 +9,14 @@ import torch
 
 from pipeline.core.config import FleetConfig, config_hash
 from pipeline.core.errors import ModelError
-from pipeline.learn.perception_training.radar_drivable.network import build_drivable_network, export_drivable
-from pipeline.learn.perception_training.radar_drivable.samples import day_samples, scan_of
-from pipeline.learn.perception_training.radar_drivable.training import (
+from pipeline.learn.perception_training.radar_drivable import (
+    TASK,
     DrivableTraining,
+    day_samples,
     probabilities,
-    train_drivable,
+    scan_of,
 )
+from pipeline.learn.perception_training.trainer import Samples, build_network, export_model, train_network
 from pipeline.perceive.models.radar_drivable import RadarDrivable
 from pipeline.rig.radar_grid import SHAPE, sector_of
 from pipeline.store.partitions import Lake, Partition
@@ -27,6 +28,7 @@ from tests.makers.stages import perceive_day
 
 DAY = Partition("car-1", "2026-03-02")
 COLUMNS = {"radar_drivable_azimuth_rad", "radar_drivable_range_m"}
+NOTHING = day_samples([], np.eye(4), 0)
 
 
 def fleet(file="fleet.toml", **radar):
@@ -57,8 +59,8 @@ def test_a_network_taught_by_a_days_lidar_tells_the_days_radar_where_the_road_is
     before = rows(lake)
     samples = day_samples(before, np.eye(4), 8)
     training = DrivableTraining(steps=30, batch_size=4, width=8)
-    network, _ = train_drivable(samples, samples, tmp_path / "run", training)
-    export_drivable(network, tmp_path, {})
+    network, _ = train_network(TASK, Samples(samples, samples, {}), tmp_path / "run", training)
+    export_model(TASK, network, samples, tmp_path, {})
     result = perceive_day(DAY, fleet(file, **MODEL), lake)
     assert result.status == "done"  # not taken from the cache of the geometric one
     assert result.work_key != geometric_key
@@ -82,8 +84,8 @@ def test_a_network_taught_by_a_days_lidar_tells_the_days_radar_where_the_road_is
 
 def test_the_model_answers_as_the_network_does(lake, tmp_path):
     perceive_day(DAY, fleet(), lake)
-    network = build_drivable_network(24, 3).eval()
-    model = RadarDrivable(export_drivable(network, tmp_path, {}))
+    network = build_network(TASK, 24, 3).eval()
+    model = RadarDrivable(export_model(TASK, network, NOTHING, tmp_path, {}))
     from pipeline.rig.radar_grid import ScanMemory
 
     memory = ScanMemory()
@@ -110,7 +112,7 @@ def test_a_model_is_no_reason_to_ingest_again():
     ],
 )
 def test_a_manifest_that_does_not_fit_is_told_by_its_key(before, after, told, tmp_path):
-    manifest = export_drivable(build_drivable_network(4, 0), tmp_path, {})
+    manifest = export_model(TASK, build_network(TASK, 4, 0), NOTHING, tmp_path, {})
     assert before in manifest.read_text()
     manifest.write_text(manifest.read_text().replace(before, after))
     with pytest.raises(ModelError, match=told):

@@ -1,0 +1,351 @@
+"""Classes of lidar points by a range-image network that learns from the camera.
+
+Samples are sweeps as images, labelled where the camera sees them; scores compare with labels of held-out days.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float16, Float32, Int, UInt8
+from torch import Tensor, nn
+from torch.nn import functional
+
+from pipeline.core.config import FleetConfig
+from pipeline.core.rows import columns_of
+from pipeline.learn.perception_training.lidar_labels import (
+    GROUND,
+    KIND_OF_LABEL,
+    KINDS,
+    LABELS,
+    UNLABELLED,
+    project_labels,
+)
+from pipeline.learn.perception_training.trainer import (
+    Graph,
+    Labelled,
+    Learner,
+    Samples,
+    Task,
+    TrainingConfig,
+    split_days,
+    vehicle_days,
+)
+from pipeline.learn.train.settings import Count
+from pipeline.rig.day_prior import read_prior
+from pipeline.rig.range_image import EMPTY, channels_of, project
+from pipeline.store.current import current_records, transform_of
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.records import read_records
+from pipeline.store.views import frames_of, observations_of
+from schemas.calibrations import CALIBRATIONS, CalibrationRecord
+from schemas.frames import Frame
+from schemas.observations import Observation
+
+__all__ = [
+    "TASK",
+    "SweepImages",
+    "SweepLayout",
+    "SweepTraining",
+    "cut",
+    "day_images",
+    "kind_scores",
+    "layout_of",
+]
+
+LIMITS = (
+    "Learned from the camera's classes through a calibration, with the errors of both.",
+    "Thin objects were learned from their middles only; objects outside the camera's view were not learned.",
+    "Valid for the lidars, roads and weather of its samples only; remission must be logged as by these lidars.",
+)
+_CHANNELS = 5
+_DILATIONS = ((1, 1), (1, 2), (2, 4), (1, 1))  # rows, columns
+_BRIGHTEST = 60_000.0  # in sixteen bits
+_BRIGHTNESS = 0.2  # remission of lidars of one make differs by as much
+_EDGE_PX = 8  # beyond the labels: what their pixels' neighbourhoods show
+
+
+class SweepTraining(TrainingConfig):
+    """Defaults that suit some hundred sweeps."""
+
+    steps: int = 400
+    batch_size: int = 4
+    learning_rate: float = 4e-3
+    width: int = 16
+    frames_per_day: int = 30
+    rows: Count = 48  # of the range image, over the lidar's field of view
+    columns: Count = 1024  # over 360 deg
+
+
+@dataclass(frozen=True)
+class SweepLayout:
+    """Geometry of the images, as in the model's manifest; the columns cover 360 deg."""
+
+    rows: int
+    columns: int
+    fov_up_deg: float
+    fov_down_deg: float
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Rows, columns."""
+        return self.rows, self.columns
+
+
+@dataclass(frozen=True, eq=False)
+class SweepImages(Labelled):
+    """Range, x, y, z [m], remission of the pixels around the labels; EMPTY in all five without a point."""
+
+    channels: Float16[np.ndarray, "N 5 H W"]
+    label: UInt8[np.ndarray, "N H W"]
+    layout: SweepLayout  # of the whole images
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Mean and deviation of the five channels where points are, as in the manifest."""
+
+    mean: tuple[float, ...]
+    std: tuple[float, ...]
+
+    def apply(self, channels: np.ndarray) -> Float32[np.ndarray, "N 5 H W"]:
+        """Normalised channels, 0 in empty pixels."""
+        mean, std = (np.array(v, np.float32)[:, None, None] for v in (self.mean, self.std))
+        filled = channels[:, :1] != EMPTY
+        return np.where(filled, (channels.astype(np.float32) - mean) / std, 0).astype(np.float32)
+
+
+class SweepNetwork(nn.Module):
+    """Normalised range image to logits of the 20 labels: 60 k parameters at width 16. Even numbers of columns."""
+
+    def __init__(self, width: int = 16) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(_CHANNELS, width, 3, padding=1)
+        self.down = nn.Conv2d(width, 2 * width, 3, stride=(1, 2), padding=1)
+        self.blocks = nn.ModuleList(
+            nn.Conv2d(2 * width, 2 * width, 3, padding=d, dilation=d) for d in _DILATIONS
+        )
+        self.up = nn.Conv2d(3 * width, width, 3, padding=1)
+        self.last = nn.Conv2d(width, len(LABELS), 1)
+
+    def forward(self, image: Float[Tensor, "B 5 H W"]) -> Float[Tensor, "B L H W"]:
+        """Logits."""
+        fine = torch.relu(self.first(image))
+        x = torch.relu(self.down(fine))
+        for block in self.blocks:
+            x = x + torch.relu(block(x))
+        x = functional.interpolate(x, scale_factor=(1.0, 2.0), mode="nearest")
+        logits: Tensor = self.last(torch.relu(self.up(torch.cat([fine, x], dim=1))))
+        return logits
+
+
+def labelled_sweeps(fleet: FleetConfig, lake: Lake, config: SweepTraining) -> Samples[SweepImages]:
+    """Sweeps of all vehicle-days with observations.
+
+    Each day by its accepted camera-lidar calibration where the lake has one, else by its prior.
+    """
+    days = vehicle_days(fleet, lake)
+    chosen = {day.vehicle: fleet.rig_of(day.vehicle).one_of_each("training") for day in days}
+    accepted = {
+        (r.vehicle, r.day): transform_of(r)
+        for r in current_records(read_records(lake, CALIBRATIONS, CalibrationRecord))
+        if r.status == "accepted" and _is_of(r, chosen)
+    }
+    first = (next(frames_of(lake, day, chosen=chosen[day.vehicle])) for day in days)
+    layout = layout_of(first, config.rows, config.columns)
+
+    def of_day(day: Partition) -> SweepImages:
+        names = chosen[day.vehicle]
+        rows = list(observations_of(lake, day, chosen=names))
+        known = accepted.get((day.vehicle, day.day))
+        T = read_prior(rows, fleet, day.vehicle).T_camera_lidar if known is None else known
+        return day_images(frames_of(lake, day, chosen=names), rows, T, layout, config.frames_per_day)
+
+    found = cut(split_days(days, of_day))
+    calibrated = sum((day.vehicle, day.day) in accepted for day in days)
+    return replace(found, numbers=found.numbers | {"calibrated_days": calibrated})
+
+
+def _is_of(record: CalibrationRecord, chosen: Mapping[str, Mapping[str, str]]) -> bool:
+    """Whether a record is of its vehicle's chosen camera and lidar."""
+    names = chosen.get(record.vehicle, {})
+    return (record.parent_frame, record.child_frame) == (names.get("camera"), names.get("lidar"))
+
+
+def normal_of(images: SweepImages) -> Normal:
+    """Statistics of the channels where points are; a channel that never changes is left as it is."""
+    values = images.channels.transpose(1, 0, 2, 3)[:, images.channels[:, 0] != EMPTY].astype(np.float64)
+    std = values.std(axis=1)
+    return Normal(
+        tuple(float(v) for v in values.mean(axis=1)), tuple(float(s) if s > 0 else 1.0 for s in std)
+    )
+
+
+def sweep_of(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+    """Finite points and their remission as logged; a log without intensity has none, 0 everywhere."""
+    xyz = np.stack([frame.lidar_x_m, frame.lidar_y_m, frame.lidar_z_m], axis=1)
+    intensity = np.zeros(len(xyz), np.float32) if frame.lidar_intensity is None else frame.lidar_intensity
+    kept = np.isfinite(xyz).all(axis=1)
+    return xyz[kept], np.clip(np.nan_to_num(intensity[kept].astype(np.float32)), 0, _BRIGHTEST)
+
+
+def layout_of(frames: Iterable[Frame], rows: int, columns: int) -> SweepLayout:
+    """A layout that holds nearly all points of these sweeps."""
+    elevations = []
+    for frame in frames:
+        xyz, _ = sweep_of(frame)
+        range_m = np.linalg.norm(xyz, axis=1)
+        elevations.append(np.degrees(np.arcsin(xyz[range_m > 0, 2] / range_m[range_m > 0])))
+    low, high = np.percentile(np.concatenate(elevations), [0.1, 99.9])
+    return SweepLayout(rows, columns, float(np.ceil(high)), float(np.floor(low)))
+
+
+def day_images(
+    frames: Iterable[Frame],
+    observations: Sequence[Observation],
+    T_camera_lidar: Float[np.ndarray, "4 4"],
+    layout: SweepLayout,
+    limit: int,
+) -> SweepImages:
+    """Whole images of at most `limit` frames of a vehicle-day, evenly spread.
+
+    Frames that perception rejected are left out. `T_camera_lidar` is the current calibration, never a truth.
+    """
+    chosen = np.linspace(0, len(observations) - 1, min(limit, len(observations))).astype(int)
+    wanted = {observations[i].frame_index: observations[i] for i in chosen}
+    made = [
+        _image(frame, wanted[frame.frame_index], T_camera_lidar, layout)
+        for frame in frames
+        if frame.frame_index in wanted
+    ]
+    kinds = np.dtype([("channels", "f2", (_CHANNELS, *layout.size)), ("label", "u1", layout.size)])
+    return SweepImages(**columns_of(made, kinds), layout=layout)
+
+
+def cut(samples: Samples[SweepImages]) -> Samples[SweepImages]:
+    """Both sides cut to the columns where either has labels."""
+    sides = (samples.train, samples.held_out)
+    shown = np.any([(side.label != UNLABELLED).any(axis=(0, 1)) for side in sides], axis=0)
+    columns = np.flatnonzero(shown) if shown.any() else np.arange(len(shown))
+    first, last = max(0, int(columns[0]) - _EDGE_PX), min(len(shown), int(columns[-1]) + 1 + _EDGE_PX)
+    last -= (last - first) % 2  # the network halves the columns
+    train, held_out = (
+        replace(
+            side, channels=side.channels[..., first:last].copy(), label=side.label[..., first:last].copy()
+        )
+        for side in sides
+    )
+    return replace(samples, train=train, held_out=held_out)
+
+
+def _image(
+    frame: Frame, observation: Observation, T_camera_lidar: np.ndarray, layout: SweepLayout
+) -> tuple[np.ndarray, np.ndarray]:
+    xyz, remission = sweep_of(frame)
+    image = project(xyz, layout.size, layout.fov_up_deg, layout.fov_down_deg)
+    labels = project_labels(observation, T_camera_lidar, xyz)
+    filled = image.point != EMPTY
+    drawn = np.full(layout.size, UNLABELLED, np.uint8)
+    drawn[filled] = labels[image.point[filled]]
+    return channels_of(image, xyz, remission), drawn
+
+
+class SweepLearner(Learner[SweepImages]):
+    """Loss and scores, by channels normalised and labels weighted as in the samples to learn from."""
+
+    def __init__(self, train: SweepImages) -> None:
+        self.normal, self.weight = normal_of(train), _weights(train.label)
+
+    def loss(self, network: nn.Module, batch: SweepImages, rng: np.random.Generator) -> Float[Tensor, ""]:
+        """Weighted cross-entropy of the varied batch over its labelled pixels."""
+        channels, label = _varied(batch, rng)
+        target = torch.from_numpy(label.astype(np.int64))
+        logits = network(torch.from_numpy(self.normal.apply(channels)))
+        total = functional.cross_entropy(
+            logits, target, self.weight, ignore_index=UNLABELLED, reduction="sum"
+        )
+        return total / self.weight[target].sum().clamp(min=1e-6)
+
+    def scores(self, network: nn.Module, held_out: SweepImages) -> dict[str, float]:
+        """Share of labelled pixels with the right kind, and IoU of ground and of each labelled kind."""
+        with torch.no_grad():
+            found = np.concatenate(
+                [
+                    network(torch.from_numpy(self.normal.apply(held_out.channels[i : i + 8])))
+                    .argmax(1)
+                    .numpy()
+                    for i in range(0, len(held_out), 8)
+                ]
+            )
+        known = held_out.label != UNLABELLED
+        return kind_scores(KIND_OF_LABEL[found[known]], KIND_OF_LABEL[held_out.label[known]])
+
+
+def kind_scores(found: UInt8[np.ndarray, " N"], wanted: UInt8[np.ndarray, " N"]) -> dict[str, float]:
+    """Accuracy of kinds, IoU of ground and of each kind that occurs in the labels."""
+    scores = {"accuracy": float(np.mean(found == wanted))}
+    sets = {"ground": GROUND} | {KINDS[k]: (k,) for k in range(1, len(KINDS))}
+    for name, kinds in sets.items():
+        a, b = np.isin(found, kinds), np.isin(wanted, kinds)
+        if b.any():
+            scores[f"iou_{name}"] = float(np.sum(a & b) / np.sum(a | b))
+    return scores
+
+
+def _varied(batch: SweepImages, rng: np.random.Generator) -> tuple[np.ndarray, Int[np.ndarray, "N H W"]]:
+    """Each sweep rotated about the vertical, possibly mirrored, brighter or darker.
+
+    Labels exist only in the camera's view; with rotated sweeps, objects on all sides are learned.
+    """
+    channels, label = batch.channels.astype(np.float32), batch.label.astype(np.int64)
+    for i in range(len(batch)):
+        filled = channels[i, 0] != EMPTY
+        if rng.random() < 0.5:
+            channels[i], label[i] = channels[i, :, :, ::-1].copy(), label[i, :, ::-1].copy()
+            filled = filled[:, ::-1]
+            channels[i, 2][filled] *= -1
+        angle = rng.uniform(-np.pi, np.pi)
+        x, y = channels[i, 1][filled], channels[i, 2][filled]
+        channels[i, 1][filled] = np.cos(angle) * x - np.sin(angle) * y
+        channels[i, 2][filled] = np.sin(angle) * x + np.cos(angle) * y
+        channels[i, 4][filled] *= rng.uniform(1 - _BRIGHTNESS, 1 + _BRIGHTNESS)
+    return channels, label
+
+
+def _weights(label: np.ndarray) -> torch.Tensor:
+    """Weight of each label in the loss: one over the root of its share, so that rare labels count."""
+    share = np.bincount(label.ravel(), minlength=len(LABELS)).astype(float)
+    share[UNLABELLED] = 0
+    share /= share.sum()
+    weight = np.where(share > 0, 1 / np.sqrt(np.maximum(share, 1e-4)), 0)
+    return torch.from_numpy((weight / (weight * share).sum()).astype(np.float32))
+
+
+def sweep_graph(network: nn.Module, train: SweepImages) -> Graph:
+    """Range image to logits, in RangeNet++'s convention."""
+    layout, normal = train.layout, normal_of(train)
+    image = {
+        "size": list(layout.size), "fov_up_deg": layout.fov_up_deg, "fov_down_deg": layout.fov_down_deg,
+        "mean": list(normal.mean), "std": list(normal.std), "empty": "zero",
+    }  # fmt: skip
+    lines = "".join(f"{key} = {json.dumps(value)}\n" for key, value in image.items())
+    output = '[output]\nlayout = "logits"\nlabel_set = "semantickitti"\n'
+    manifest = f'task = "segment_points"\n\n[input]\n{lines}\n{output}'
+    return Graph(network, torch.zeros(1, _CHANNELS, *layout.size), ("points", "logits"), manifest)
+
+
+TASK = Task(
+    "lidar_semantics",
+    "classes of lidar points (paper, section 4.2): lidar.semantics of a rig",
+    LIMITS,
+    SweepTraining,
+    UNLABELLED,
+    labelled_sweeps,
+    SweepNetwork,
+    SweepLearner,
+    sweep_graph,
+)

@@ -1,1 +1,0 @@
-"""Classes of lidar points by a range-image network, trained from the camera: samples, training, export."""

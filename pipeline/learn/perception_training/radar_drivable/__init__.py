@@ -1,1 +1,0 @@
-"""The radar's drivable area by a small network that learns from the lidar: samples, training, export."""
