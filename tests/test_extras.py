@@ -95,7 +95,7 @@ def test_the_walk_reaches_every_stage_and_method():
     ours, others = reached("nightly")
     calibrate = {"joint.solve", "tracking.solve", "paper.joint_optimisation"}
     rooms = {
-        "ingest.deskew",
+        "ingest.captures",
         "perceive.models.session",
         "learn.infer.single_frame",
         "audit.charts",
