@@ -65,14 +65,6 @@ class DriftFinding(Recorded):
     )
     moved_motion_sigma: list[float] | None = column("sigmas of moved_motion", default=None)
     inputs: list[str] = column("work keys of the records on the chart", default_factory=list)
-    day_scale: float | None = column(
-        "ratio of the days' scatter to their sigmas on this chart, learnt from the model's vehicles and its own; null "
-        "without a chart",
-        default=None,
-    )
-    day_autocorrelation: float | None = column(
-        "autocorrelation of the errors of neighbouring days, learnt likewise", default=None
-    )
     vehicle_status: str = column(
         "status of the whole vehicle, equal in all its rows of one audit: RED or YELLOW if a chart is, "
         "GREEN if a rotation of any sensor would have been detected, else UNKNOWN",
@@ -89,7 +81,7 @@ class DriftFinding(Recorded):
 DRIFT = TableSchema(
     DriftFinding,
     "drift",
-    5,
+    6,
     made_by="audit",
     about=("vehicle", "day", "method", "pair", "parent_frame", "child_frame", "dof"),
 )

@@ -70,7 +70,7 @@ def vehicle_findings(
                 limit=limit_of(edge, dof, config), work_key=audit.work_key, statistic=chart.statistic,
                 threshold=chart.threshold, inputs=audit.inputs,
             )  # fmt: skip
-            columns = _change_columns(chart, edge, verdict.attribution) | _noise_columns(verdict, edge, dof)
+            columns = _change_columns(chart, edge, verdict.attribution)
             findings.append(replace(base, **columns))
     status = decide_status(findings)
     return [
@@ -109,16 +109,6 @@ def _change_columns(chart: ChartVerdict, edge: Edge, found: Attribution | None) 
         "moved_probability": moved.probability,
         "moved_motion": moved.motion.tolist(),
         "moved_motion_sigma": np.sqrt(np.diag(moved.covariance)).tolist(),
-    }
-
-
-def _noise_columns(verdict: VehicleVerdict, edge: Edge, dof: str) -> dict[str, float]:
-    noise, k = verdict.noise.get(edge), DOF_NAMES.index(dof)
-    if noise is None:
-        return {}
-    return {
-        "day_scale": float(noise.scale[k]),
-        "day_autocorrelation": float(noise.autocorrelation[k]),
     }
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Int
@@ -31,14 +31,10 @@ _COMPOSED_WITHIN = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class VehicleVerdict:
-    """Verdicts by (edge, dof), and the sensor that moved; `attribution` is None without an alarm.
-
-    `noise` has the noise of days by edge.
-    """
+    """Verdicts by (edge, dof), and the sensor that moved; `attribution` is None without an alarm."""
 
     charts: dict[tuple[Edge, str], ChartVerdict]
     attribution: Attribution | None
-    noise: Mapping[Edge, Noise] = field(default_factory=dict)
 
 
 def limit_of(edge: Edge, dof: str, config: AuditConfig) -> float:
@@ -99,7 +95,7 @@ def _judged(
         if key[0] in own
     }
     if not any(v.change for v in charts.values()):
-        return VehicleVerdict(charts, None, noise)
+        return VehicleVerdict(charts, None)
     strongest = _strongest(list(charts.values()))
     seen = {edge: found for edge, found in own.items() if len(found.day)}
     seen, days = _with_common_days(seen, strongest.day)
@@ -108,7 +104,7 @@ def _judged(
     alone = len(days) > 0 and strongest.day == int(days[-1])  # a last day that stands alone is what it is
     whitened = [_whitened(seen, some, days, alone=alone) for some in _as_alike_as_may_be(noise)]
     charts = _share_start(charts, _joint_start(whitened[0], days))
-    return VehicleVerdict(charts, _attribute(_strongest(list(charts.values())), whitened, noise, days), noise)
+    return VehicleVerdict(charts, _attribute(_strongest(list(charts.values())), whitened, noise, days))
 
 
 def _as_alike_as_may_be(noise: Mapping[Edge, Noise]) -> list[Mapping[Edge, Noise]]:
