@@ -33,7 +33,9 @@ from pathlib import Path
 from tests.makers.stages import ingest_day
 from pipeline.store.partitions import Lake, Partition
 from tests.makers.written_logs import fleet_config
-result = ingest_day([Path(sys.argv[1])], Partition("car", "2023-11-14"), fleet_config(), Lake.at(sys.argv[2]))
+# All sweeps: of a long day, ingest reads bursts of 400 sweeps by default.
+fleet = fleet_config(ingest={"read_sweeps": "all"})
+result = ingest_day([Path(sys.argv[1])], Partition("car", "2023-11-14"), fleet, Lake.at(sys.argv[2]))
 # Not ru_maxrss: a child inherits its parent's.
 peak = next(line for line in open("/proc/self/status") if line.startswith("VmHWM"))
 print(result.rows, int(peak.split()[1]) // 1024)
