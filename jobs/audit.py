@@ -39,6 +39,7 @@ def audit(
     from pipeline.core.config import load_fleet
     from pipeline.core.stage_work import Task, Window
     from pipeline.core.stages import AUDIT, REPORT, STATE
+    from pipeline.store.corrections import read_corrections
     from pipeline.store.partitions import Lake
     from schemas.drift import DRIFT, DRIFT_STATUSES
 
@@ -52,6 +53,7 @@ def audit(
         STATE.run(task)
     findings = DRIFT.rows_among(outcome.records)
     charts = [f.status for f in findings]
+    mend = read_corrections(tables, to_day)
     outputs = []
     if report is not None:
         from pipeline.report.stage import Pages
@@ -69,7 +71,8 @@ def audit(
         statuses=count_statuses(findings),
         charts={s: charts.count(s) for s in DRIFT_STATUSES},
         moved=moved_sensors(findings),
-        next_steps=next_steps(findings, lake),
+        next_steps=next_steps(findings, lake, mend),
+        misconfigured=mend,
         damaged=damaged,
         report=report,
         outputs=outputs,

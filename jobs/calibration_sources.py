@@ -37,6 +37,7 @@ def read_calibration(
 
     With `own_frames`, frames that no option names get their names from the logs.
     """
+    from jobs.terminal.known_vehicles import require_vehicle
     from jobs.terminal.summary import left_out as tell_damage
     from pipeline.export.calibration import ExportedCalibration, reference_of
     from pipeline.export.lake import choose_pairs, pairs_of, read_cameras, read_frame_ids, read_tf
@@ -47,7 +48,11 @@ def read_calibration(
     from schemas.words import day_word
 
     lake = Lake.existing(location)
-    found = pairs_of(lake, vehicle, day, method)
+    try:
+        found = pairs_of(lake, vehicle, day, method)
+    except ConfigError:
+        require_vehicle(lake, vehicle)  # names the vehicles of the lake, if this is none of them
+        raise
     # Without a transform, a record was refused, or no prior is known.
     word = day_word("refused" if isinstance(p, str) else p.status for p in found.values())
     pairs, without = choose_pairs({words_of(edge): pair for edge, pair in found.items()}, force=force)

@@ -134,12 +134,12 @@ def _print_end(
     """Print the summary of the night: statuses of vehicle-days and vehicles, and paths of the pages."""
     from jobs.terminal.summary import left_out, print_summary
     from jobs.terminal.vehicle_status import count_statuses, moved_sensors
+    from pipeline.fleet.status import night_word
     from schemas.words import DAY_WORDS
 
-    held = any(o.status in ("partly", "held", "refused") for o in outcomes)
     print_summary(
         "nightly",
-        {0: "done", 1: "failed", 2: "failed", 3: "held" if held else "incomplete"}[code],
+        {0: "done", 1: "failed", 2: "failed", 3: night_word(o.status for o in outcomes)}[code],
         vehicle_days=len(outcomes),
         **{s: sum(o.status == s for o in outcomes) for s in ("cached", *DAY_WORDS) if s != "missing"},
         problems=[_problem(o) for o in outcomes if o.status not in ("done", "cached")],

@@ -44,6 +44,7 @@ def status(
     from jobs.terminal.summary import exit_code, left_out, print_summary
     from jobs.terminal.vehicle_status import count_statuses, moved_sensors, next_steps, status_lines
     from pipeline.fleet.status import day_statuses
+    from pipeline.store.corrections import read_corrections
     from pipeline.store.partitions import Lake, check_day, days_after
     from pipeline.store.records import last_day, read_last, read_records
     from schemas.drift import DRIFT, DriftFinding
@@ -57,11 +58,10 @@ def status(
     rows = read_records(tables, OUTCOMES, OutcomeRow, first=first, last=last)
     method = method or _audited_method(tables, {r.method for r in rows if r.method})
     found = [s for s in day_statuses(rows, method) if vehicle in (None, s.vehicle)]
-    last_of = {s.vehicle: s.day for s in found if s.stage}  # in order of day
     findings = read_last(tables, DRIFT, DriftFinding, method, vehicle=vehicle)
     if vehicle is not None and not (found or findings):
         require_vehicle(tables, vehicle)
-    mend = {s.vehicle: s.mend for s in found if s.mend and s.day == last_of.get(s.vehicle)}
+    mend = {v: what for v, what in read_corrections(tables, to_day).items() if vehicle in (None, v)}
     steps = next_steps(findings, lake, mend)
     if not json:
         _print_table(found, [*status_lines(findings), *map(escape, steps)])

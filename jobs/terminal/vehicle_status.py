@@ -7,11 +7,11 @@ from shlex import quote
 from typing import Any
 
 from jobs.terminal.record_tables import STATUS_STYLES
+from pipeline.store.corrections import correction_steps
 from schemas.drift import DRIFT_STATUSES, DriftFinding, VehicleStatus, next_step, status_of
 
 __all__ = ["count_statuses", "moved_sensors", "next_steps", "status_lines"]
 
-_NAMED = 3  # vehicles named before one correction
 _STEPS = 40  # vehicles whose next steps are printed; the others are counted
 
 
@@ -48,7 +48,7 @@ def next_steps(
     Before them what `mend` has: corrections by vehicle, which no further day of an UNKNOWN one replaces.
     """
     mend = mend or {}
-    first = [_correction(what, mend) for what in dict.fromkeys(mend.values())]
+    first = correction_steps(mend)
     rows = _by_vehicle(findings)
     status = {vehicle: status_of(own).status for vehicle, own in rows.items()}
     waiting = {vehicle for vehicle in mend if status.get(vehicle) == "UNKNOWN"}
@@ -57,14 +57,6 @@ def next_steps(
     left = len(steps) - _STEPS
     more = [f"and {left} other vehicles: `boresight status --lake {quote(lake)} --vehicle VEHICLE`"]
     return first[:_STEPS] + steps[:_STEPS] + more * (left > 0)
-
-
-def _correction(what: str, mend: Mapping[str, str]) -> str:
-    """What must be corrected, after the vehicles that wait for it."""
-    vehicles = [vehicle for vehicle, own in mend.items() if own == what]
-    named = ", ".join(vehicles[:_NAMED])
-    more = f" and {len(vehicles) - _NAMED} more" if len(vehicles) > _NAMED else ""
-    return f"{named}{more}: {what}; then run the night again."
 
 
 def _statuses(findings: Sequence[DriftFinding]) -> dict[str, VehicleStatus]:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from schemas.outcomes import OutcomeRow
 from schemas.words import day_word
 
-__all__ = ["DayStatus", "day_statuses"]
+__all__ = ["DayStatus", "day_statuses", "night_word"]
 
 _LAST_STAGE = "calibrate"
 
@@ -26,7 +26,6 @@ class DayStatus:
         bytes_read: by these runs; None if unknown.
         bytes_written: likewise.
         faults: faults named in the reason, keys of `schemas.faults.FAULTS`.
-        mend: what must be corrected in fleet.toml or in the recording; empty if nothing.
     """
 
     vehicle: str
@@ -41,7 +40,6 @@ class DayStatus:
     bytes_read: int | None = None
     bytes_written: int | None = None
     faults: list[str] = field(default_factory=list)
-    mend: str = ""
 
 
 def day_statuses(rows: Sequence[OutcomeRow], method: str | None = None) -> list[DayStatus]:
@@ -66,6 +64,17 @@ def day_statuses(rows: Sequence[OutcomeRow], method: str | None = None) -> list[
             methods = known if method is None else [method]
             found += [_of_method(vehicle, day, of, list(current.values())) for of in methods]
     return found
+
+
+def night_word(statuses: Iterable[str]) -> str:
+    """Word for a night that is done but for what was held or refused, from the words of its vehicle-days.
+
+    "incomplete" if nothing was: then rows of the lake are unreadable.
+    """
+    words = set(statuses)
+    if not words & {"partly", "held", "refused"}:
+        return "incomplete"
+    return words.pop() if len(words) == 1 else "partly"
 
 
 def _of_method(vehicle: str, day: str, method: str, rows: Sequence[OutcomeRow]) -> DayStatus:
@@ -93,7 +102,6 @@ def _of_method(vehicle: str, day: str, method: str, rows: Sequence[OutcomeRow]) 
         _total([r.bytes_read for r in own]),
         _total([r.bytes_written for r in own]),
         [] if said is None else list(said.faults),
-        next((r.reason for r in own if "configuration" in r.faults), ""),
     )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from pipeline.report.words import dof_title, motion_in_words, scaled, unit_of
 from pipeline.rig.changes import change_between, change_covariance
+from pipeline.store.corrections import correction_steps
 from pipeline.store.current import prior_of, transform_of
 from pipeline.store.partitions import Lake
 from schemas.calibrations import DOF_NAMES, CalibrationRecord
@@ -31,9 +32,9 @@ __all__ = [
 
 _SAID_BY_THE_AXES = "not determined by the day"  # the page lists those axes by name
 _ADVICE = {
-    "accepted": "use it",
-    "held": "do not use it",
-    "refused": "nothing to use",
+    "accepted": "shown to be better than the prior",
+    "held": "not shown to be better than the prior",
+    "refused": "nothing computed",
 }
 
 
@@ -186,13 +187,17 @@ def answered(views: Sequence[PairView | Answered], poses: Sequence[PoseRow]) -> 
 
 
 def answer_for(
-    views: Sequence[PairView | Answered], day: str, findings: Sequence[DriftFinding]
+    views: Sequence[PairView | Answered],
+    day: str,
+    findings: Sequence[DriftFinding],
+    loaded: Sequence[Answered] = (),
 ) -> tuple[str, str]:
     """The headline of the page: (good, partly or bad; a sentence) on whether these numbers may be used on the car.
 
     Args:
         views: the day's edges, or its sensors.
         findings: the vehicle's current findings.
+        loaded: sensors of tonight's state, if the page shows it: the answer is then on the state.
     """
     accepted = [v.title for v in views if v.status == "accepted"]
     other = [v.title for v in views if v.status != "accepted"]
@@ -203,6 +208,8 @@ def answer_for(
         left = [t for t in accepted if t not in touched]
         still = f" Only {', '.join(left)} still holds." if left else ""
         return "bad", f"Not any more. The {sensor} moved on {stored.since}, after this day.{still}"
+    if loaded:
+        return _of_state(loaded)
     unsafe = [t for t in other if t in touched]
     if unsafe:
         first = f"Only {', '.join(accepted)} may be used." if accepted else "No."
@@ -213,23 +220,43 @@ def answer_for(
     if not other:
         what = "pairs" if any(len(v.sensors) > 1 for v in views) else "sensors"
         sentence = f"Yes. All {what} are accepted: they may go on the car, with the sigmas below."
-        return "good", sentence + _azimuth_only(views)
+        return "good", sentence + _one_direction(views)
     sentence = f"Partly. Accepted: {', '.join(accepted)}. Keep what the car has for {', '.join(other)}."
-    return "partly", sentence + _azimuth_only(views)
+    return "partly", sentence + _one_direction(views)
 
 
-def _azimuth_only(views: Sequence[PairView | Answered]) -> str:
-    """A sentence on accepted pairs without a certified elevation; empty if there are none."""
-    limited = [
-        v.title for v in views if v.status == "accepted" and v.certified and "elevation" not in v.certified
-    ]
-    return f" Certified in azimuth only: {', '.join(limited)}." if limited else ""
+def _of_state(loaded: Sequence[Answered]) -> tuple[str, str]:
+    """The headline of a page that shows tonight's state: what of it is certified, used, and at the prior."""
+    certified = [s for s in loaded if s.status == "current" and s.certified]
+    used = [s.title for s in loaded if s.status == "current" and not s.certified]
+    at_prior = [s.title for s in loaded if s.status != "current"]
+    if not certified:
+        return "bad", "No. Nothing in tonight's state is certified: keep what the car has."
+    of = ", ".join(s.title for s in certified)
+    sentence = f"Partly. Load tonight's state. Certified: {of}." if used or at_prior else (
+        "Yes. Load tonight's state: all sensors are certified."
+    )  # fmt: skip
+    sentence += f" Used, but not certified: {', '.join(used)}." if used else ""
+    sentence += f" At the prior: {', '.join(at_prior)}." if at_prior else ""
+    return "partly" if used or at_prior else "good", sentence + _one_direction(certified)
 
 
-def status_sentence(findings: Sequence[DriftFinding], lake: Lake) -> tuple[str, str]:
-    """The vehicle's stored status, its reason as a sentence, and the motion of a sensor that moved.
+def _one_direction(views: Sequence[PairView | Answered]) -> str:
+    """Sentences on what is used and certified in one direction only; empty if there is nothing."""
+    used = [v for v in views if v.status in ("accepted", "current")]
+    words = ""
+    for one, other in (("azimuth", "elevation"), ("elevation", "azimuth")):
+        of = ", ".join(v.title for v in used if one in v.certified and other not in v.certified)
+        words += f" Certified in {one} only: {of}." if of else ""
+    return words
 
-    `lake` is named in the commands of the next step.
+
+def status_sentence(findings: Sequence[DriftFinding], lake: Lake, mend: str = "") -> tuple[str, str]:
+    """The vehicle's stored status, its reason as a sentence, the motion of a sensor that moved, and what to do.
+
+    Args:
+        lake: named in the commands of the next step.
+        mend: what must be corrected first, if anything.
     """
     stored = status_of(findings)
     sentence = f"{stored.reason[:1].upper()}{stored.reason[1:]}."
@@ -238,8 +265,10 @@ def status_sentence(findings: Sequence[DriftFinding], lake: Lake) -> tuple[str, 
         kind = kind_of_sensor(moved.moved_sensor, findings)
         motion = motion_in_words(kind, moved.moved_motion or [], moved.moved_motion_sigma or [])
         sentence = f"{sentence} Its motion: {motion}."
-    step = next_step(findings, str(lake.absolute()))
-    return stored.status, f"{sentence} To do for {step}" if step else sentence
+    steps = correction_steps({findings[0].vehicle: mend}) if findings and mend else []
+    if not (steps and stored.status == "UNKNOWN"):
+        steps += [step] if (step := next_step(findings, str(lake.absolute()))) else []
+    return stored.status, " ".join([sentence, *(f"To do for {step}" for step in steps)])
 
 
 def clearest_alarm(findings: Sequence[DriftFinding]) -> DriftFinding | None:

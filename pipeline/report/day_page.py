@@ -12,7 +12,15 @@ from pipeline.core.config import FleetConfig
 from pipeline.core.errors import ConfigError, DamagedError
 from pipeline.core.results import plain
 from pipeline.core.sections import ReportConfig
-from pipeline.report.day import PairView, answer_for, answered, pair_view, sigmas_of, status_sentence
+from pipeline.report.day import (
+    Answered,
+    PairView,
+    answer_for,
+    answered,
+    pair_view,
+    sigmas_of,
+    status_sentence,
+)
 from pipeline.report.figures import SigmaPanel, residual_figure, sigma_figure
 from pipeline.report.page import render, write_page
 from pipeline.report.picture_file import write_picture
@@ -34,6 +42,7 @@ from pipeline.report.residuals import frame_residuals
 from pipeline.report.rig_figure import rig_of_day
 from pipeline.report.time_offsets import TimeOffsets, as_stamped, time_offsets_of
 from pipeline.report.words import pose_text, sigma_text
+from pipeline.store.corrections import read_corrections
 from pipeline.store.files import Files, LocalFiles
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.state_values import state_values
@@ -50,11 +59,15 @@ P = TypeVar("P", bound=PurePath)
 
 @dataclass(frozen=True)
 class DayRead:
-    """Input of the page of a vehicle-day: its current records by edge, the vehicle's current findings and states."""
+    """Input of the page of a vehicle-day: its current records by edge, the vehicle's current findings and states.
+
+    `mend`: what must be corrected first, if anything.
+    """
 
     records: Mapping[str, CalibrationRecord]
     findings: Sequence[DriftFinding]
     states: Sequence[StateRow] = ()
+    mend: str = ""
 
 
 def write_day_page(
@@ -89,6 +102,7 @@ def write_day_page(
             day_records(lake, partition, method),
             drift_of(lake, method, partition.vehicle),
             vehicle_states(lake, partition.vehicle, method),
+            read_corrections(lake).get(partition.vehicle, ""),
         )
     shown = _content(lake, partition, read, fleet.report if pictures else None)
     html = render(
@@ -147,11 +161,16 @@ def _content(
     if pictures is not None:
         for camera in other_cameras(records, of_three):
             drawn += _pictures(lake, partition, drawn_records(records, camera), labels, pictures, 1)[0]
+    load = _to_load(read.states, partition.day)
+    loaded = [
+        Answered(row["sensor"], row["status"], (row["sensor"],), ", ".join(row["determined"]))
+        for row in (load["sensors"] if load else ())
+    ]
     return {
         "environment": next(iter(records.values())).environment,
-        "answer": answer_for(answered(views, poses), partition.day, findings),
-        "drift": _as_of(findings, lake),
-        "load": _to_load(read.states, partition.day),
+        "answer": answer_for(answered(views, poses), partition.day, findings, loaded),
+        "drift": _as_of(read, lake),
+        "load": load,
         "pairs": views,
         "labels": labels,
         "scenes": drawn,
@@ -179,10 +198,10 @@ def _to_load(states: Sequence[StateRow], day: str) -> dict[str, Any] | None:
     }
 
 
-def _as_of(findings: Sequence[DriftFinding], lake: Lake) -> tuple[str, str]:
+def _as_of(read: DayRead, lake: Lake) -> tuple[str, str]:
     """The vehicle's status and the day of its audit: pages of days are not redrawn for every audit."""
-    status, sentence = status_sentence(findings, lake)
-    return status, f"{sentence} (Audit until {findings[0].day}.)" if findings else sentence
+    status, sentence = status_sentence(read.findings, lake, read.mend)
+    return status, f"{sentence} (Audit until {read.findings[0].day}.)" if read.findings else sentence
 
 
 def _after_label(views: Sequence[PairView]) -> str:

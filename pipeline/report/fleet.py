@@ -89,7 +89,9 @@ def fleet_rows(
     first = max(0, len(names) - _COLUMNS)
     rows = []
     for vehicle in sorted({*window.vehicles, *verdicts.vehicles}):
-        status, sentence = status_sentence(verdicts.findings.get(vehicle, []), lake)
+        status, sentence = status_sentence(
+            verdicts.findings.get(vehicle, []), lake, verdicts.corrections.get(vehicle, "")
+        )
         stored = status_of(verdicts.findings.get(vehicle, []))
         shown = letters[place[vehicle]] if vehicle in place else "." * len(names)
         marked = [

@@ -24,6 +24,7 @@ from pipeline.report.verdicts import FleetVerdicts
 from pipeline.report.window import FleetWindow
 from pipeline.report.words import dof_title
 from pipeline.rig.graph import Edge
+from pipeline.store.corrections import correction_steps
 from pipeline.store.current import current_events
 from pipeline.store.partitions import Lake
 from pipeline.store.records import read_records
@@ -71,6 +72,7 @@ def render_fleet_page(
         span=" to ".join(dates) or "no calibration record yet",
         headline=headline_for(verdicts, views),
         budget=_budget(album.fleet),
+        corrections=correction_steps(verdicts.corrections),
         findings=views[:_FINDINGS],
         findings_left=max(0, len(views) - _FINDINGS),
         counts=counts,

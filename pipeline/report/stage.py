@@ -71,8 +71,8 @@ def write_fleet_report(
     verdicts = read_verdicts(lake, album.method)
     keys = window.vehicle_days()
     keys |= _keys_of(album, [p for p in pages.also if (p.vehicle, p.day) not in keys])
-    stamps = {of: stamp_of(album, own, verdicts.findings.get(of[0], ())) for of, own in keys.items()}
-    there = draw_days(album, stamps, verdicts.findings, pages.fan_out, progress)
+    stamps = {of: stamp_of(album, own, of[0], verdicts) for of, own in keys.items()}
+    there = draw_days(album, stamps, verdicts, pages.fan_out, progress)
     return [render_fleet_page(album, window, verdicts, there, pages.truth), *there.values()]
 
 

@@ -17,12 +17,13 @@ from pipeline.core.results import MadeWhenAsked, Progress, silent
 from pipeline.report.day_page import DayRead, write_day_page
 from pipeline.report.names import page_name
 from pipeline.report.reading import records_of_day
+from pipeline.report.verdicts import FleetVerdicts
 from pipeline.store.current import current_states
 from pipeline.store.files import Files
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_last
 from schemas.calibrations import CalibrationRecord
-from schemas.drift import DriftFinding, status_of
+from schemas.drift import status_of
 from schemas.states import STATES, StateRow
 from schemas.versions import CODE_VERSION
 
@@ -93,7 +94,7 @@ class DayJob:
 def draw_days(
     album: Album,
     stamps: Mapping[tuple[str, str], str],
-    findings: Mapping[str, Sequence[DriftFinding]],
+    verdicts: FleetVerdicts,
     fan_out: FanOut,
     progress: Progress,
 ) -> dict[tuple[str, str], PurePath]:
@@ -103,7 +104,7 @@ def draw_days(
 
     Args:
         stamps: inputs of each vehicle-day's page (`stamp_of`).
-        findings: findings of the last audit, by vehicle.
+        verdicts: of the last audit.
         fan_out: executor that draws the pages.
     """
     by_day: dict[str, dict[str, str]] = {}
@@ -117,7 +118,7 @@ def draw_days(
         if drawn[day].get(album.path(vehicle, day).name) != stamp
     ]
     open_pages = Counter(day for _, day in stale)
-    jobs = _jobs(album, stale, findings)
+    jobs = _jobs(album, stale, verdicts)
     for job, found, error in fan_out(_draw, jobs, progress):
         vehicle, day = job.partition.vehicle, job.partition.day
         album.lake.damage.extend([f"page of {job}: {error}"] if error else found)
@@ -131,16 +132,17 @@ def draw_days(
     return {of: path for of, path in there.items() if path.name in drawn[of[1]]}
 
 
-def stamp_of(album: Album, work_keys: Iterable[str], findings: Sequence[DriftFinding]) -> str:
+def stamp_of(album: Album, work_keys: Iterable[str], vehicle: str, verdicts: FleetVerdicts) -> str:
     """Inputs of a day's page; it is drawn again if they changed.
 
     A sensor that moved is included, because it invalidates the numbers of days before.
     """
-    stored = status_of(findings)
+    stored = status_of(verdicts.findings.get(vehicle, ()))
     moved = [stored.sensor, stored.since] if stored.status == "RED" else None
     shown = album.fleet.report.model_dump() if album.pictures else None
+    mend = verdicts.corrections.get(vehicle, "")
     settings = {"pictures": shown, "link": album.page.name, "code": CODE_VERSION}
-    return config_hash({"keys": sorted(work_keys), "moved": moved, **settings})
+    return config_hash({"keys": sorted(work_keys), "moved": moved, "mend": mend, **settings})
 
 
 def _drawn(album: Album, day: str) -> dict[str, str]:
@@ -171,9 +173,7 @@ def _draw(job: DayJob, progress: Progress) -> list[str]:
     return found
 
 
-def _jobs(
-    album: Album, vehicle_days: Sequence[tuple[str, str]], findings: Mapping[str, Sequence[DriftFinding]]
-) -> Sequence[DayJob]:
+def _jobs(album: Album, vehicle_days: Sequence[tuple[str, str]], verdicts: FleetVerdicts) -> Sequence[DayJob]:
     """Pages to draw; records are read a day at a time."""
     # A worker is sent no vehicle's configuration: a page needs the fleet's name. It may be elsewhere, too.
     fleet = album.fleet.model_copy(update={"vehicles": {}, "rigs": {}})
@@ -191,7 +191,8 @@ def _jobs(
 
     def job(index: int) -> DayJob:
         vehicle, day = vehicle_days[index]
-        read = DayRead(records(day).get(vehicle, {}), findings.get(vehicle, ()), states.get(vehicle, ()))
+        found, mend = verdicts.findings.get(vehicle, ()), verdicts.corrections.get(vehicle, "")
+        read = DayRead(records(day).get(vehicle, {}), found, states.get(vehicle, ()), mend)
         return DayJob(sent, Partition(vehicle, day), read)
 
     return MadeWhenAsked(len(vehicle_days), job)

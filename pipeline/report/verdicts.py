@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from pipeline.rig.edges import edges_of_rows
 from pipeline.rig.graph import EDGE_KINDS, Edge
 from pipeline.store.columns import known_rows, ordinals, places
+from pipeline.store.corrections import read_corrections
 from pipeline.store.current import current_rows
 from pipeline.store.partitions import Lake
 from pipeline.store.records import read_last_columns
@@ -58,6 +59,7 @@ class FleetVerdicts:
         findings: by vehicle: all of its findings where something changed, else one, which has the vehicle's
             status.
         audited: days that the audits ended with.
+        corrections: by vehicle, what its configuration or recording needs before more days help.
     """
 
     vehicles: list[str]
@@ -65,6 +67,7 @@ class FleetVerdicts:
     charts: ChartVerdicts
     audited: list[str] = field(default_factory=list)
     work_keys: list[str] = field(default_factory=list)
+    corrections: Mapping[str, str] = field(default_factory=dict)
 
 
 def read_verdicts(lake: Lake, method: str) -> FleetVerdicts:
@@ -73,7 +76,7 @@ def read_verdicts(lake: Lake, method: str) -> FleetVerdicts:
     if found is None:
         none = np.zeros(0, np.int64)
         empty = ChartVerdicts((), none, none, none, none, np.zeros(0), np.zeros((0, 3), np.int64))
-        return FleetVerdicts([], {}, empty)
+        return FleetVerdicts([], {}, empty, corrections=read_corrections(lake))
     found = known_rows(
         current_rows(found, DRIFT), {"pair": EDGE_KINDS, "dof": DOF_NAMES, "status": DRIFT_STATUSES}
     )
@@ -85,6 +88,7 @@ def read_verdicts(lake: Lake, method: str) -> FleetVerdicts:
         _charts(found, owner),
         sorted(found["day"].unique().to_pylist()),
         sorted(found["work_key"].unique().to_pylist()),
+        read_corrections(lake),
     )
 
 

@@ -2,7 +2,9 @@
 
 import itertools
 
-from pipeline.fleet.status import day_statuses
+import pytest
+
+from pipeline.fleet.status import day_statuses, night_word
 from schemas.outcomes import OutcomeRow
 
 CLOCK = itertools.count()
@@ -86,3 +88,18 @@ def test_a_vehicle_day_counts_once_by_the_method_that_is_asked_for():
 
 def test_nothing_was_run_nothing_is_said():
     assert day_statuses([]) == []
+
+
+@pytest.mark.parametrize(
+    ("days", "word"),
+    [
+        (["done", "partly"], "partly"),
+        (["partly"], "partly"),
+        (["cached", "held"], "partly"),
+        (["held", "held"], "held"),
+        (["refused"], "refused"),
+        (["done", "cached"], "incomplete"),
+    ],
+)
+def test_the_word_of_a_night_is_that_of_its_days_if_they_agree(days, word):
+    assert night_word(days) == word

@@ -135,7 +135,10 @@ def test_a_rig_whose_days_are_all_misconfigured_is_named_and_the_others_go_on(tm
         (tmp_path / "fleet.toml").read_text().replace('rig = "mistyped"', 'rig = "default"')
     )
     Kit(frames=4).drive().without("/lidar/points").mcap(tmp_path / "logs" / "van" / DAY / "a.mcap")
+    capsys.readouterr()
     assert main(night(tmp_path)) == 3
+    summary = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert (summary["status"], summary["refused"]) == ("refused", 2)
 
 
 def mistyped_rig_again(folder: Path) -> list[str]:

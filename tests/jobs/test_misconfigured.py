@@ -1,5 +1,6 @@
 """Mistakes of fleet.toml, of --logs and of the recording are named with their correction, by every command."""
 
+import html
 import json
 import subprocess
 import sys
@@ -54,6 +55,22 @@ def check(folder, log, capsys):
     return report, last_line(capsys)["next_steps"]
 
 
+def on_pages(folder):
+    """Text of the fleet page, and of each page of a day."""
+    report = folder / "lake/report"
+    pages = [report / "fleet.html", *sorted(report.glob("fleet_days/*/*.html"))]
+    assert len(pages) == 2
+    return [html.unescape(page.read_text()) for page in pages]
+
+
+def assert_on_pages(folder, step):
+    fleet, day = on_pages(folder)
+    assert f"<li>{step}</li>" in fleet
+    for page in (fleet, day):
+        assert f"To do for {step}" in page
+        assert "accepted days are needed" not in page
+
+
 MISTYPED = (
     "/lidar/point (lidar): no message; the same type comes on /lidar/points: correct the topic in fleet.toml"
 )
@@ -72,12 +89,18 @@ def test_a_mistyped_topic_is_misconfigured_though_the_night_goes_on_with_the_oth
     code, summary = status(tmp_path, capsys)
     assert summary["misconfigured"] == {"car": MISTYPED}
     assert summary["next_steps"] == [f"car: {MISTYPED}; then run the night again."]
+    assert main(["audit", "--fleet", f"{tmp_path}/fleet.toml", "--lake", f"{tmp_path}/lake"]) == 0
+    summary = last_line(capsys)
+    assert summary["misconfigured"] == {"car": MISTYPED}
+    assert summary["next_steps"] == [f"car: {MISTYPED}; then run the night again."]
+    assert_on_pages(tmp_path, f"car: {MISTYPED}; then run the night again.")
     _, steps = check(tmp_path, log, capsys)
     assert steps == [MISTYPED, f"boresight check {tmp_path}/fleet.toml {log}"]
     configured(tmp_path)
     code, summary = night(tmp_path, capsys)
     assert (code, summary["misconfigured"]) == (3, {})
     assert status(tmp_path, capsys)[1]["misconfigured"] == {}
+    assert not any(MISTYPED in to_do for to_do in on_pages(tmp_path))
 
 
 def test_a_silent_sensor_of_a_rig_that_is_right_is_no_mistake_of_fleet_toml(tmp_path, capsys):
@@ -206,6 +229,19 @@ def test_an_unknown_vehicle_of_a_lake_is_an_error_that_names_those_it_has(tmp_pa
         assert last_line(capsys)["reason"].endswith("the lake has no day of 'kar'; it has car")
         assert main([command, "--lake", f"{tmp_path}/lake", "--vehicle", "car"]) == 0
         capsys.readouterr()
+    for day in ([], ["--day", DAY]):
+        asked = [
+            "export",
+            "ros2",
+            "--lake",
+            f"{tmp_path}/lake",
+            "--vehicle",
+            "kar",
+            "--out",
+            f"{tmp_path}/out",
+        ]
+        assert main([*asked, *day]) == 2
+        assert last_line(capsys)["reason"].endswith("the lake has no day of 'kar'; it has car")
 
 
 def test_without_transforms_the_next_step_is_a_prior(tmp_path, capsys):

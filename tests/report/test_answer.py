@@ -53,3 +53,40 @@ def test_sensors_are_named_without_the_reference_and_pairs_only_without_poses(po
     assert found == verdict
     assert words in sentence
     assert ("Certified in azimuth only: top-nose." in sentence) == (not poses)  # of poses, both are
+
+
+def sensor(name, status="current", certified="azimuth, elevation"):
+    return Answered(name, status, (name,), certified)
+
+
+@pytest.mark.parametrize(
+    ("loaded", "verdict", "words"),
+    [
+        (
+            [sensor("nose", certified="azimuth"), sensor("front")],
+            "good",
+            "Yes. Load tonight's state: all sensors are certified. Certified in azimuth only: nose.",
+        ),
+        (
+            [
+                sensor("front", certified="elevation"),
+                sensor("left", certified=""),
+                sensor("nose", "prior", ""),
+            ],
+            "partly",
+            (
+                "Partly. Load tonight's state. Certified: front. Used, but not certified: left. At the prior: nose. "
+                "Certified in elevation only: front."
+            ),
+        ),
+        (
+            [sensor("left", certified=""), sensor("nose", "prior", "")],
+            "bad",
+            "No. Nothing in tonight's state is certified: keep what the car has.",
+        ),
+    ],
+)
+def test_a_page_that_shows_the_state_of_tonight_answers_for_it_and_not_for_the_day(loaded, verdict, words):
+    pair = Answered("top-nose", "accepted", ("top", "nose"), "azimuth")
+    held = answered([pair], [pose("left", "camera", "held"), pose("front", "camera")])
+    assert answer_for(held, "2026-03-02", [], loaded) == (verdict, words)
