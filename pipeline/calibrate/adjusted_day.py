@@ -10,23 +10,26 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Float
 
 from pipeline.calibrate.adjust.adjusted import AdjustedRig, AdjustmentLimits
 from pipeline.calibrate.adjust.evidence import evidence_of
 from pipeline.calibrate.adjust.rig import adjust
-from pipeline.calibrate.judging import Judged
 from pipeline.calibrate.numerics.covariance import OBSERVABLE
 from pipeline.calibrate.solved import SolvedDay
 from pipeline.core.config import FleetConfig
-from pipeline.rig.checks import FailedCheck
+from pipeline.rig.changes import change_between, change_covariance
+from pipeline.rig.checks import Change, FailedCheck, change_of
 from pipeline.rig.estimates import PairEstimate, Solution
 from pipeline.rig.evidence import EdgeEvidence
 from pipeline.rig.extrinsics import Extrinsics
 from pipeline.rig.graph import Edge, RigGraph
+from pipeline.rig.se3 import adjoint, inverse
 
 __all__ = ["adjusted_rig", "clocks_of", "evidence_of_day", "judged_together"]
 
 _SIGMAS = 3.0  # by which an edge that is left out contradicts the rest
+_SCATTER = 1.5  # sigmas of a difference that is no contradiction
 
 
 def evidence_of_day(day: SolvedDay, edges: Mapping[str, Edge], fleet: FleetConfig) -> list[EdgeEvidence]:
@@ -80,9 +83,9 @@ def judged_together(day: SolvedDay, rig: AdjustedRig | None, edges: Mapping[str,
     for pair, own in day.solution.pairs.items():
         if day.judged[pair].held_by or pair not in day.judging.active or edges[pair] not in rig.edges:
             continue
-        against = _contradictions(edges[pair], rig, day.judged[pair])
-        failed = [*day.failed[pair], *against]
         estimate = _of_rig(own, edges[pair], rig, day.solution)
+        against = _contradictions(edges[pair], rig, day, estimate, edges)
+        failed = [*day.failed[pair], *against]
         again = day.judging.pair(estimate, failed, together=True)
         if edges[pair] not in rig.left_out or again.verdict.status == "accepted":
             pairs[pair], verdicts[pair] = estimate, again
@@ -91,24 +94,81 @@ def judged_together(day: SolvedDay, rig: AdjustedRig | None, edges: Mapping[str,
     return replace(day, solution=replace(day.solution, pairs=pairs), judged=verdicts)
 
 
-def _contradictions(edge: Edge, rig: AdjustedRig, own: Judged) -> list[FailedCheck]:
+def _contradictions(
+    edge: Edge, rig: AdjustedRig, day: SolvedDay, adjusted: PairEstimate, edges: Mapping[str, Edge]
+) -> list[FailedCheck]:
     """Contradictions of other edges to this one, of edges left out too unless they are known to be wrong.
 
     Camera-lidar is not checked: its held-out frames would show any error that a radar's edges can show.
     """
-    if edge.kind == "camera_lidar" and own.verdict.status == "accepted":
+    if edge.kind == "camera_lidar" and day.judged[edge.kind].verdict.status == "accepted":
         return []
     doubts = rig.edges[edge].doubts
-    names = [", ".join(e.name for e in doubts)] if doubts else []
+    found = (
+        {", ".join(e.name for e in doubts): [e for e in doubts if not rig.edges[e].used]} if doubts else {}
+    )
     for other, at in rig.edges.items():
         if other == edge or at.used or other in doubts or any(c.disproves for c in at.evidence.checks):
             continue
         if (at.innovation_sigmas or 0.0) > _SIGMAS:
-            names.append(f"{other.name} and the other edges")
+            found[f"{other.name} and the other edges"] = [other]
+    estimates = {edges[pair]: estimate for pair, estimate in day.solution.pairs.items()}
     return [
-        FailedCheck(f"{who} contradict each other and nothing tells which is wrong", "witnesses_disagree")
-        for who in names
+        FailedCheck(
+            f"{who} contradict each other and nothing tells which is wrong",
+            "witnesses_disagree",
+            error=_error(edge, out, rig, estimates, adjusted),
+        )
+        for who, out in found.items()
     ]
+
+
+def _error(
+    edge: Edge,
+    out: Sequence[Edge],
+    rig: AdjustedRig,
+    estimates: Mapping[Edge, PairEstimate],
+    adjusted: PairEstimate,
+) -> Change | None:
+    """Change of the edge's pose if the one edge that the rig does without is right; None if nobody knows.
+
+    Only in what the two poses differ by more than the scatter of both: a radar's edge to the camera may
+    contradict its roll and know little of its azimuth.
+    """
+    found = estimates.get(out[0]) if len(out) == 1 else None
+    around = None if found is None else _around(edge, out[0], rig)
+    if found is None or around is None:
+        return None
+    before, after, is_turned = around
+    T, covariance = (inverse(found.T), _of_inverse(found)) if is_turned else (found.T, found.covariance)
+    A = adjoint(before)
+    if_right, of_right = before @ T @ after, A @ covariance @ A.T
+    change = change_between(adjusted.T, if_right)
+    both = change_covariance(if_right, of_right) + change_covariance(adjusted.T, adjusted.covariance)
+    return change_of(np.where(np.abs(change) > _SCATTER * np.sqrt(np.diag(both)), change, 0.0))
+
+
+def _of_inverse(estimate: PairEstimate) -> Float[np.ndarray, "6 6"]:
+    A = adjoint(inverse(estimate.T))
+    return A @ estimate.covariance @ A.T
+
+
+def _around(
+    edge: Edge, out: Edge, rig: AdjustedRig
+) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "4 4"], bool] | None:
+    """Poses before and after an edge that is left out, on the way along it from the parent to the child of another.
+
+    The last is true where it is passed from its child to its parent. None if no edges in use lead there.
+    """
+    used = tuple(e for e, at in rig.edges.items() if at.used and e not in (edge, out))
+    sensors = {s for e in rig.edges for s in e.sensors}
+    graph = RigGraph(tuple(sensors), used, edge.parent)
+    for is_turned in (False, True):
+        first, last = out.sensors[::-1] if is_turned else out.sensors
+        if graph.path(edge.parent, first) is not None and graph.path(last, edge.child) is not None:
+            between = rig.poses.between
+            return between(edge.parent.name, first.name), between(last.name, edge.child.name), is_turned
+    return None
 
 
 def _of_rig(own: PairEstimate, edge: Edge, rig: AdjustedRig, solution: Solution) -> PairEstimate:

@@ -238,11 +238,9 @@ class ChecksConfig(Section):
     # If three independent estimates form a loop that stays open by more than this many of its sigmas, one is
     # wrong.
     max_loop_sigmas: Positive = 3.0
-    # Camera-lidar is solved with the heading of the prior. That heading was wrong if it changed by more than
-    # this many of its sigmas ...
+    # Lidar-radar and the prior contradict each other about the car's heading, which moves camera-lidar's cloud,
+    # if they differ by more than this many of the prior's sigmas.
     heading_change_prior_sigmas: Positive = 3.0
-    # ... and the record is held if the effect exceeds this share of `verify.camera_lidar_limit_deg`.
-    max_heading_error_share: Fraction = 0.25
 
 
 class PrepareConfig(Section):

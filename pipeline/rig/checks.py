@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from schemas.faults import FAULTS
 
-__all__ = ["HARMLESS", "Change", "FailedCheck", "faults_of"]
+__all__ = ["HARMLESS", "Change", "FailedCheck", "change_of", "faults_of"]
 
 # Rotation vector and shift of the child's origin, both along the parent's axes [rad, m], as `geometry.changes`.
 Change = tuple[float, float, float, float, float, float]
@@ -32,6 +32,12 @@ class FailedCheck:
 
     def __post_init__(self) -> None:
         assert not self.fault or self.fault in FAULTS, self.fault
+
+
+def change_of(change: Iterable[float]) -> Change:
+    """Six numbers as a change."""
+    rx, ry, rz, x, y, z = (float(v) for v in change)
+    return rx, ry, rz, x, y, z
 
 
 def faults_of(checks: Iterable[FailedCheck]) -> list[str]:

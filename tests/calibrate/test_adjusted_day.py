@@ -73,7 +73,7 @@ def test_an_edge_that_failed_a_check_keeps_its_pose_and_turns_no_other(day):
 
 
 def test_what_the_rest_contradicts_is_held_and_a_camera_that_its_own_frames_confirm_is_not(day):
-    found = records(day, roll_deg={"camera_radar": 1.5})
+    found = records(day, yaw_deg={"camera_radar": 2.5})
     for pair in ("lidar_radar", "camera_radar"):
         assert found[pair].status == "held"
         assert "contradict each other" in found[pair].reason
@@ -81,12 +81,23 @@ def test_what_the_rest_contradicts_is_held_and_a_camera_that_its_own_frames_conf
     assert found["camera_lidar"].status == "accepted"
 
 
+def test_a_contradiction_in_roll_costs_the_elevation_and_not_the_azimuth_and_is_named(day):
+    """Three of 32 drawn worlds lost a right lidar-radar to a camera-radar whose boxes disagreed in tilt."""
+    found = records(day, roll_deg={"camera_radar": 1.5})
+    for pair in ("lidar_radar", "camera_radar"):
+        assert (found[pair].status, found[pair].determined) == ("accepted", ["azimuth"])
+        assert "contradict each other" in found[pair].reason
+        assert "elevation not certified" in found[pair].reason
+        assert found[pair].faults == ["witnesses_disagree"]
+
+
 def test_a_held_edge_that_is_not_known_to_be_wrong_still_contradicts(day):
     held = {"camera_lidar": [FailedCheck("another CameraInfo")]}
-    found = records(day, held, roll_deg={"camera_radar": 1.5})
-    assert "camera-lidar and the other edges contradict" in found["lidar_radar"].reason
-    agreeing = records(day, held)
-    assert agreeing["lidar_radar"].status == "accepted"
+    found = records(day, held, roll_deg={"camera_radar": 1.5})["lidar_radar"]
+    assert "camera-lidar and the other edges contradict" in found.reason
+    assert found.determined == ["azimuth"]
+    agreeing = records(day, held)["lidar_radar"]
+    assert (agreeing.status, agreeing.determined) == ("accepted", ["azimuth", "elevation"])
 
 
 def test_pairs_that_were_not_estimated_apart_stay_as_their_method_has_them(day):

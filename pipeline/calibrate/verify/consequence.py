@@ -8,8 +8,8 @@ import numpy as np
 
 from pipeline.calibrate.verify.edge_result import EdgeResult
 from pipeline.calibrate.verify.target_accuracy import DIRECTIONS, Claim
+from pipeline.rig.changes import changed
 from pipeline.rig.checks import Change
-from pipeline.rig.se3 import exp_so3, from_rotation_translation
 from pipeline.rig.targets import errors_at_targets
 
 __all__ = ["RANGE", "exceeded_by", "largest_rad"]
@@ -34,8 +34,13 @@ def largest_rad(result: EdgeResult, error: Change) -> float:
 
 
 def _at_targets(result: EdgeResult, error: Change) -> tuple[float, float, float]:
-    turned = exp_so3(np.array(error[:3])) @ result.T[:3, :3]
-    wrong = from_rotation_translation(turned, result.T[:3, 3] + np.array(error[3:]))
-    azimuth, elevation, range_m = errors_at_targets(result.kind, wrong, result.T, result.targets)
+    change = np.array(error)
+    shift = np.where(
+        np.arange(6) < 3, 0.0, change
+    )  # a turn moves ranges by its lever arm: no more than directions
+    azimuth, elevation, _ = errors_at_targets(
+        result.kind, changed(result.T, change), result.T, result.targets
+    )
+    range_m = errors_at_targets(result.kind, changed(result.T, shift), result.T, result.targets)[2]
     per_metre = float(np.mean(1 / np.linalg.norm(result.targets, axis=1)))
     return float(azimuth), float(elevation), float(range_m) * per_metre

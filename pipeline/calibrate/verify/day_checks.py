@@ -8,8 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from pipeline.calibrate.select.frames import Selection
 from pipeline.calibrate.verify.constancy import constancy_failures
 from pipeline.calibrate.verify.failed_checks import heading_failures, loop_failures
@@ -52,13 +50,11 @@ def _solver(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:
 
 
 def _heading(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:
-    limit_rad = float(np.radians(day.fleet.verify.camera_lidar_limit_deg))
-    found = heading_failures(day.solution, day.prior, day.observations, limit_rad, day.limits)
-    return {"camera_lidar": found}
+    return {"camera_lidar": heading_failures(day.solution, day.prior, day.observations, day.limits)}
 
 
 def _loop(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:
-    return dict.fromkeys(PAIRS, loop_failures(day.solution, day.limits))
+    return loop_failures(day.solution, day.limits)
 
 
 def _scenes(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:

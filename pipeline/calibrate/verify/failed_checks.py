@@ -1,6 +1,6 @@
 """Checks of a solution as a whole: closure of the loop, and the heading.
 
-Each returns one value per failed check for `judge`; none if all pass.
+Each states by how much a pose would be wrong if it is right.
 """
 
 from __future__ import annotations
@@ -12,70 +12,80 @@ import numpy as np
 from pipeline.core.config import ChecksConfig
 from pipeline.objective.stamp_gaps import camera_gaps_s, constant_gap_s
 from pipeline.rig.changes import change_between
-from pipeline.rig.checks import FailedCheck
+from pipeline.rig.checks import Change, FailedCheck, change_of
 from pipeline.rig.estimates import Prior, Solution
 from pipeline.rig.se3 import adjoint, inverse
-from pipeline.rig.targets import DEFAULT_TARGETS
 from schemas.observations import Observation
 
 __all__ = ["heading_failures", "loop_failures", "loop_sigmas"]
 
 
-def loop_failures(solution: Solution, limits: ChecksConfig | None = None) -> list[FailedCheck]:
-    """A loop of independent estimates that does not close within its sigma: an error of any pair, so all fail."""
+def loop_failures(solution: Solution, limits: ChecksConfig | None = None) -> dict[str, list[FailedCheck]]:
+    """A loop of independent estimates that does not close within its sigma, by pair: any of them may be wrong.
+
+    Each would have to move by what closes the loop.
+    """
     limits = limits or ChecksConfig()
     found = loop_sigmas(solution)
     if found is None or solution.loop_rotation_rad is None or solution.loop_translation_m is None:
-        return []
+        return {}
     rotation, translation = found
-    failed = []
+    sentences = []
     if solution.loop_rotation_rad > limits.max_loop_sigmas * rotation:
         open_deg, sigma_deg = np.degrees(solution.loop_rotation_rad), np.degrees(rotation)
-        failed.append(f"the loop is open by {open_deg:.2f} deg, its sigma is {sigma_deg:.2f} deg")
+        sentences.append(f"the loop is open by {open_deg:.2f} deg, its sigma is {sigma_deg:.2f} deg")
     if solution.loop_translation_m > limits.max_loop_sigmas * translation:
-        failed.append(
-            f"the loop is open by {solution.loop_translation_m:.3f} m, its sigma is {translation:.3f} m"
-        )
-    return [FailedCheck(sentence, "witnesses_disagree") for sentence in failed]
+        open_m = solution.loop_translation_m
+        sentences.append(f"the loop is open by {open_m:.3f} m, its sigma is {translation:.3f} m")
+    return {
+        pair: [FailedCheck(s, "witnesses_disagree", error=error) for s in sentences]
+        for pair, error in (_closing(solution) if sentences else {}).items()
+    }
+
+
+def _closing(solution: Solution) -> dict[str, Change]:
+    """What each pair would have to change by to close the loop."""
+    cl, lr, cr = (solution.pairs[p].T for p in ("camera_lidar", "lidar_radar", "camera_radar"))
+    by_others = {
+        "camera_lidar": (cl, cr @ inverse(lr)),
+        "camera_radar": (cr, cl @ lr),
+        "lidar_radar": (lr, inverse(cl) @ cr),
+    }
+    return {pair: change_of(change_between(T, other)) for pair, (T, other) in by_others.items()}
 
 
 def heading_failures(
     solution: Solution,
     prior: Prior,
     observations: Sequence[Observation],
-    limit_rad: float,
     limits: ChecksConfig | None = None,
 ) -> list[FailedCheck]:
-    """Failed check of camera-lidar if it was solved with a heading that lidar-radar contradicts.
+    """Failed check of camera-lidar if the heading that it was solved with contradicts the prior.
 
-    A camera's time offset moves the cloud along the car's heading, which the radar's prior mounting gives.
-    If lidar-radar rotates the radar by many of the prior's sigmas, that heading was wrong. Camera-lidar then
-    has a lateral error of time offset times speed times this rotation.
+    A camera's time offset moves the cloud along the car's heading, which the radar's mounting gives. If
+    lidar-radar rotates the radar by many of the prior's sigmas, one of the two is wrong. Camera-lidar may then
+    have a lateral error of time offset times speed times this rotation.
 
     Args:
-        prior: prior whose T_lidar_radar gave the heading.
-        limit_rad: largest error that camera-lidar may have at the targets.
-        limits: threshold for a wrong heading, and its allowed share of `limit_rad`; None = the defaults.
+        prior: prior whose T_lidar_radar lidar-radar moved.
+        limits: threshold for a wrong heading; None = the default.
     """
     limits = limits or ChecksConfig()
     if not {"camera_lidar", "lidar_radar"} <= solution.pairs.keys():
         return []
-    dt_s, expected_s = (
-        solution.pairs["camera_lidar"].time_offset_s,
-        constant_gap_s(camera_gaps_s(observations)),
-    )
+    found = solution.pairs["camera_lidar"]
     turn = abs(float(change_between(prior.T_lidar_radar, solution.pairs["lidar_radar"].T)[2]))
     speeds = [abs(o.ego_speed_mps) for o in observations if o.ego_speed_mps is not None]
     if not speeds or turn < limits.heading_change_prior_sigmas * prior.rotation_sigma_rad:
         return []
     # What lies between sweep and image on the way, where the stamps' constant gap is the clock's.
-    way_s = 0.0 if dt_s is None else abs(dt_s - expected_s)
-    lateral_m = turn * way_s * float(np.mean(speeds))
-    rad_per_metre = float(np.sqrt(np.mean(1 / np.sum(DEFAULT_TARGETS**2, axis=1))))
-    if lateral_m * rad_per_metre < limits.max_heading_error_share * limit_rad:
-        return []
-    off = f"assumed heading off by {np.degrees(turn):.1f} deg by lidar-radar"
-    return [FailedCheck(f"{off}: up to {lateral_m:.2f} m lateral error through the camera's time offset")]
+    expected_s = constant_gap_s(camera_gaps_s(observations))
+    way_s = 0.0 if found.time_offset_s is None else abs(found.time_offset_s - expected_s)
+    lateral_m = round(turn * way_s * float(np.mean(speeds)), 2)  # less than a centimetre is nothing
+    off = f"heading off by {np.degrees(turn):.1f} deg between prior and lidar-radar"
+    sentence = f"{off}: up to {lateral_m:.2f} m lateral error through the camera's time offset"
+    error = change_of([0.0, 0.0, 0.0, *(lateral_m * found.T[:3, 1])])  # along the lidar's y
+    return [FailedCheck(sentence, error=error)] if lateral_m else []
 
 
 def loop_sigmas(solution: Solution) -> tuple[float, float] | None:

@@ -18,7 +18,8 @@ from pipeline.calibrate.verify.held_out_test import paired_test
 from pipeline.calibrate.verify.target_accuracy import Claim
 from pipeline.core.config import SolveConfig
 from pipeline.core.errors import SolveError
-from pipeline.rig.checks import FailedCheck
+from pipeline.rig.changes import change_between
+from pipeline.rig.checks import FailedCheck, change_of
 from pipeline.rig.estimates import PairEstimate, Prior
 from pipeline.rig.targets import errors_at_targets
 from schemas.observations import Observation
@@ -68,4 +69,5 @@ def found_elsewhere(
         f"the held-out frames, which are more than those of the fit, align better {azimuth:.2f} deg in azimuth "
         f"and {elevation:.2f} deg in elevation from it (z = {test.z:.1f})"
     )
-    return [FailedCheck(sentence, disproves=True)]
+    error = change_of(change_between(estimate.T, place))
+    return [FailedCheck(sentence, disproves=True, error=error)]

@@ -4,7 +4,7 @@ Fit, halves and held-out frames all match depth edges to the same label borders,
 (padding, a resize) rotates the camera unseen. The image gradients (`perceive.label_gradients`) show it.
 Labels that are too wide are not displaced: what moves the left and the right borders of objects apart, or
 their tops and feet, is their width, and that of what stands before the sky is another one. With one width for
-all, labels of a coarse network, objects a pixel too wide, were .5 to 1.5 px down in seven of eight worlds.
+all, labels of a coarse network, objects a pixel too wide, seemed .4 to 1.5 px beside on seven of eight days.
 """
 
 from __future__ import annotations

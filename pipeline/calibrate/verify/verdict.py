@@ -19,7 +19,8 @@ from pipeline.calibrate.verify.edge_result import EdgeResult
 from pipeline.calibrate.verify.held_out_test import HeldOutTest
 from pipeline.calibrate.verify.target_accuracy import Claim
 from pipeline.core.config import ChecksConfig
-from pipeline.rig.checks import FailedCheck, faults_of
+from pipeline.rig.changes import change_covariance
+from pipeline.rig.checks import FailedCheck, change_of, faults_of
 from schemas.calibrations import DOF_NAMES
 
 __all__ = ["Evidence", "Verdict", "judge", "matters"]
@@ -39,6 +40,9 @@ _SCORED = {
     "lidar_radar": np.array([False, False, True, True, True, False]),
     "lidar_lidar": np.ones(6, bool),
 }
+# Of a radar: what its elevation is made of, by index.
+_TILTS = {"camera_radar": (0, 2), "lidar_radar": (0, 1, 5)}
+_SIGMAS = 3.0
 _FAILED = -1.0  # margin of a check that yields no number
 
 
@@ -123,11 +127,11 @@ def judge(
         if matters(check, result, evidence.claims)
     ]
     if together:
-        checks += _aligns_no_worse(result, evidence.held_out, limits)
+        checks += _aligns_no_worse(result, evidence.claims, evidence.held_out, limits)
     else:
         checks += _moves_little(result, limits)
         if result.kind in _SCORED:
-            checks.append(_aligns_better(result, evidence.held_out, limits))
+            checks.append(_aligns_better(result, evidence.claims, evidence.held_out, limits))
     checks += _claims_hold(result, evidence.claims)
     if not result.observable.any():
         checks.append(_Check(_FAILED, "the day determines no degree of freedom"))
@@ -163,14 +167,26 @@ def _accepted(result: EdgeResult, evidence: Evidence, score: float) -> Verdict:
     certified = tuple(name for name, claim in claims.items() if claim.margin >= 0 and name not in doubted)
     said = [_harmless(check, result, claims) for check in checks]
     reason = "; ".join([*said, *_reservations(result, claims)])
-    mounting = tuple(name for name in certified if claims[name].certifies_mounting)
     faults = tuple(faults_of(checks))
+    # A wrong principal point is right in the image: what nobody knows then is where the camera is mounted.
+    is_mounted = "camera_info" not in faults
+    mounting = tuple(name for name in certified if is_mounted and claims[name].certifies_mounting)
     return Verdict("accepted", reason, score, certified, mounting=mounting, faults=faults)
 
 
 def _exceeded(check: FailedCheck, result: EdgeResult, claims: Mapping[str, Claim]) -> list[str]:
-    """Directions whose limit the pose exceeds if the check is right."""
-    return [*claims, RANGE] if check.error is None else exceeded_by(result, claims, check.error)
+    """Directions whose limit the pose exceeds if the check is right; no radar's elevation with a tilt in doubt."""
+    if check.error is None:
+        return [*claims, RANGE]
+    tilted = ["elevation"] if _tilts_in_doubt(check, result) else []
+    return list(dict.fromkeys([*exceeded_by(result, claims, check.error), *tilted]))
+
+
+def _tilts_in_doubt(check: FailedCheck, result: EdgeResult) -> list[int]:
+    """A radar's roll, pitch and height that are off by more than their sigmas allow if the check is right."""
+    sigma = np.sqrt(np.diag(change_covariance(result.T, result.covariance)))
+    off = np.zeros(6) if check.error is None else np.abs(check.error) / sigma
+    return [k for k in _TILTS.get(result.kind, ()) if off[k] > _SIGMAS]
 
 
 def _harmless(check: FailedCheck, result: EdgeResult, claims: Mapping[str, Claim]) -> str:
@@ -211,33 +227,45 @@ def _moves_little(result: EdgeResult, limits: ChecksConfig) -> list[_Check]:
     ]
 
 
-def _aligns_better(result: EdgeResult, test: HeldOutTest | None, limits: ChecksConfig) -> _Check:
-    """Held-out frames align better than at the prior, or equally well if the result agrees with the prior."""
+def _aligns_better(
+    result: EdgeResult, claims: Mapping[str, Claim], test: HeldOutTest | None, limits: ChecksConfig
+) -> _Check:
+    """Held-out frames align better than at the prior, or as well if the result hardly differs from the prior."""
     if test is None or test.frames < limits.min_held_out_frames:
         found = 0 if test is None else test.frames
         few = f"too few held-out frames to judge: {found}, needs {limits.min_held_out_frames}"
         return _Check(_FAILED, few)
+    near = _near_prior(result, claims)
     if test.z > limits.worse_alignment_z:
         # The radar's registration cost has slopes of its own (`lidar_radar/time_offset`): a right result near a prior
         # may score worse. That leaves it unproved, no more.
         is_proof = result.kind == "camera_lidar"
-        return _Check(1 - test.z / limits.worse_alignment_z, _worse(test), disproves=is_proof)
+        return _Check(max(near, 1 - test.z / limits.worse_alignment_z), _worse(test), disproves=is_proof)
     name, ratio = _largest_move(result)
     same = 1 - ratio / limits.prior_agreement_sigmas
     better = (-test.z - limits.better_alignment_z) / limits.better_alignment_z
     moved = f"{name} moved {ratio:.1f} of its sigmas"
     return _Check(
-        min(1.0, max(same, better)), f"{moved}, and held-out frames align no better (z = {test.z:.1f})"
+        min(1.0, max(same, better, near)),
+        f"{moved}, and held-out frames align no better (z = {test.z:.1f})",
     )
 
 
-def _aligns_no_worse(result: EdgeResult, test: HeldOutTest | None, limits: ChecksConfig) -> list[_Check]:
+def _aligns_no_worse(
+    result: EdgeResult, claims: Mapping[str, Claim], test: HeldOutTest | None, limits: ChecksConfig
+) -> list[_Check]:
     """If other pairs contribute to the pose: alignment no worse than at a prior that the result contradicts."""
     if test is None:
         return []
     _, ratio = _largest_move(result)
     same, not_worse = 1 - ratio / limits.prior_agreement_sigmas, 1 - test.z / limits.worse_alignment_z
-    return [_Check(min(1.0, max(same, not_worse)), _worse(test))]
+    return [_Check(min(1.0, max(same, not_worse, _near_prior(result, claims))), _worse(test))]
+
+
+def _near_prior(result: EdgeResult, claims: Mapping[str, Claim]) -> float:
+    """0 where the result is good for its purpose even if the prior is right in what held-out frames score, else -1."""
+    back = change_of(np.where(_SCORED[result.kind], -result.move, 0.0))
+    return _FAILED if exceeded_by(result, claims, back) else 0.0
 
 
 def _largest_move(result: EdgeResult) -> tuple[str, float]:

@@ -12,7 +12,7 @@ from pipeline.calibrate.verify.held_out_test import HeldOutTest, paired_test
 from pipeline.calibrate.verify.target_accuracy import DIRECTIONS, Claim
 from pipeline.calibrate.verify.verdict import Evidence, judge
 from pipeline.core.config import ChecksConfig
-from pipeline.rig.checks import FailedCheck
+from pipeline.rig.checks import HARMLESS, FailedCheck
 from pipeline.rig.estimates import PairEstimate, Prior, Solution
 from pipeline.rig.se3 import exp_se3, exp_so3, from_rotation_translation
 from pipeline.rig.targets import DEFAULT_TARGETS
@@ -92,6 +92,14 @@ def test_a_check_holds_where_the_pose_would_be_beyond_its_limits_if_it_is_right(
     assert not found.unsure_only
 
 
+def test_a_radars_tilt_in_doubt_certifies_no_elevation_however_little_targets_see_of_it():
+    rolled = verdict(estimate(0.2, pair="lidar_radar"), BETTER, [checked((0.5 * DEG, 0, 0, 0, 0, 0))])
+    assert (rolled.status, rolled.determined) == ("accepted", ("azimuth",))
+    assert "two halves disagree: elevation not certified" in rolled.reason
+    within = verdict(estimate(0.2, pair="lidar_radar"), BETTER, [checked((0.2 * DEG, 0, 0, 0, 0, 0))])
+    assert within.determined == DIRECTIONS
+
+
 def test_a_check_whose_consequence_nobody_knows_always_holds():
     assert verdict(estimate(0.2), SAME, [checked(None)]).status == "held"
     assert verdict(estimate(0.2), SAME, [checked((0.0, 1e-5, 0.0, 0.0, 0.0, 0.0))]).status == "accepted"
@@ -110,21 +118,32 @@ def test_a_better_alignment_is_accepted_without_remark():
     assert (verdict(estimate(1.5), BETTER).status, verdict(estimate(1.5), BETTER).reason) == ("accepted", "")
 
 
-def test_a_worse_alignment_is_held_whatever_else_looks_fine():
-    found = verdict(estimate(0.01), WORSE)
+def test_a_worse_alignment_is_held_where_it_matters_which_of_the_two_is_right():
+    found = verdict(estimate(0.3), WORSE)
     assert found.status == "held"
     assert "align worse than at the prior" in found.reason
+    # Both are good for the purpose, whichever is right.
+    assert verdict(estimate(0.02), WORSE).status == "accepted"
+    assert verdict(estimate(shift_m=0.1), WORSE).status == "held"  # .25 deg of targets 25 m away
+    assert verdict(estimate(shift_m=0.005), WORSE).status == "accepted"
+
+
+def test_no_better_alignment_is_accepted_where_a_move_of_many_sigmas_does_not_matter():
+    sure = replace(estimate(0.03), covariance=np.diag((SIGMA / 20) ** 2))  # six of its sigmas
+    assert verdict(sure, SAME).status == "accepted"
+    far = replace(estimate(0.3), covariance=np.diag((SIGMA / 20) ** 2))
+    assert "align no better" in verdict(far, SAME).reason
 
 
 def test_what_a_check_shows_to_be_wrong_is_told_from_what_is_only_unproved():
-    assert verdict(estimate(0.01), WORSE).disproved
+    assert verdict(estimate(0.3), WORSE).disproved
     assert verdict(estimate(shift_m=0.5), BETTER).disproved  # beyond the search range
     shown = FailedCheck("another basin is better", disproves=True)
     assert verdict(estimate(1.5), BETTER, failed=[shown]).disproved
     unproved = [
         verdict(estimate(1.0), SAME),
         verdict(estimate(1.5), BETTER, failed=["disjoint halves disagree"]),
-        verdict(estimate(0.01, pair="lidar_radar"), WORSE),  # its cost has slopes of its own
+        verdict(estimate(shift_m=0.15, pair="lidar_radar"), WORSE),  # its cost has slopes of its own
     ]
     assert [found.status for found in unproved] == ["held"] * 3
     assert not any(found.disproved for found in unproved)
@@ -231,7 +250,7 @@ def test_a_radar_is_accepted_for_its_azimuth_and_says_that_elevation_is_not_cert
 
 @pytest.mark.parametrize(("shift_deg", "status"), [(0.02, "accepted"), (0.15, "held")])
 def test_a_shift_that_contradicts_by_its_sigmas_holds_where_it_matters_against_the_limit(shift_deg, status):
-    """A day of other roads was held for 0.02 deg at a sigma of 0.01, and was right."""
+    """A real day was held for 0.02 deg at a sigma of 0.01, and was right."""
     off = SURE | {"elevation": claim(0.05, shift_deg, shift_sigma_deg=shift_deg / 3.5)}
     found = verdict(estimate(1.5), BETTER, claims=off)
     assert found.status == status
@@ -308,23 +327,30 @@ def test_each_limit_of_the_verdict_decides(change, turn_deg, after, words):
     assert words in strict.reason
 
 
-def solution(open_by):
+def solution(turn_deg=0.0, shift_m=0.0, loop=True):
+    """A loop that camera-radar leaves open about the vertical, and along z."""
     pairs = {p: estimate(pair=p) for p in ("camera_lidar", "camera_radar", "lidar_radar")}
-    angle, shift = open_by
-    return Solution("joint", pairs, angle, shift)
+    T = from_rotation_translation(exp_so3(np.array([0, 0, np.radians(turn_deg)])), np.array([0, 0, shift_m]))
+    pairs["camera_radar"] = replace(pairs["camera_radar"], T=T)
+    return Solution("joint", pairs, *((np.radians(turn_deg), shift_m) if loop else (None, None)))
 
 
 def test_a_loop_within_its_sigma_fails_no_check():
-    assert loop_failures(solution((np.radians(0.3), 0.05))) == []
+    assert loop_failures(solution(0.3, 0.05)) == {}
 
 
-def test_a_loop_beyond_three_sigma_fails_the_check():
-    assert "open by 2.00 deg" in loop_failures(solution((np.radians(2), 0.05)))[0].sentence
-    assert "open by 0.500 m" in loop_failures(solution((0.0, 0.5)))[0].sentence
+def test_a_loop_beyond_three_sigma_fails_every_pair_by_what_would_close_it():
+    turned = loop_failures(solution(2.0))
+    assert turned.keys() == {"camera_lidar", "camera_radar", "lidar_radar"}
+    assert all("open by 2.00 deg" in checks[0].sentence for checks in turned.values())
+    assert {p: round(np.degrees(checks[0].error[2])) for p, checks in turned.items()} == {
+        "camera_lidar": 2, "camera_radar": -2, "lidar_radar": 2,
+    }  # fmt: skip
+    assert "open by 0.500 m" in loop_failures(solution(0.0, 0.5))["lidar_radar"][0].sentence
 
 
 def test_a_method_without_independent_pairs_has_no_loop_to_check():
-    assert loop_failures(solution((None, None))) == []
+    assert loop_failures(solution(2.0, loop=False)) == {}
 
 
 def test_loop_failures_come_at_their_rate_when_the_sigmas_are_right():
@@ -334,7 +360,8 @@ def test_loop_failures_come_at_their_rate_when_the_sigmas_are_right():
         cl, lr, cr = (exp_se3(rng.normal(size=6) * SIGMA) for _ in range(3))
         loop = cl @ lr @ np.linalg.inv(cr)
         angle = float(np.arccos(np.clip((np.trace(loop[:3, :3]) - 1) / 2, -1, 1)))
-        hits += bool(loop_failures(solution((angle, float(np.linalg.norm(loop[:3, 3]))))))
+        size = angle, float(np.linalg.norm(loop[:3, 3]))
+        hits += bool(loop_failures(Solution("joint", solution().pairs, *size)))
     assert hits <= 4
 
 
@@ -393,7 +420,6 @@ def test_nothing_changed_is_neither_better_nor_worse():
 
 def test_a_radar_that_turned_beyond_its_prior_holds_what_was_solved_along_its_heading():
     day = make_day(5, ego_speed_mps=30.0)
-    limit = np.radians(0.2)
 
     def failures(turn_deg, dt_s):
         T = from_rotation_translation(exp_so3(np.array([0, 0, np.radians(turn_deg)])), np.zeros(3))
@@ -401,11 +427,24 @@ def test_a_radar_that_turned_beyond_its_prior_holds_what_was_solved_along_its_he
             "camera_lidar": replace(estimate(), time_offset_s=dt_s),
             "lidar_radar": replace(estimate(pair="lidar_radar"), T=T),
         }
-        return heading_failures(Solution("joint", pairs), PRIOR, day, limit)
+        return heading_failures(Solution("joint", pairs), PRIOR, day)
 
-    sentence = failures(9.0, 0.02)[0].sentence
-    assert "heading off by 9.0 deg" in sentence
-    assert "up to 0.09 m lateral error" in sentence
+    (check,) = failures(9.0, 0.02)
+    assert "heading off by 9.0 deg" in check.sentence
+    assert "up to 0.09 m lateral error" in check.sentence
+    assert check.error[3:] == pytest.approx((0, 0.09, 0))
+    assert verdict(estimate(1.5), BETTER, [check]).status == "held"
+    (little,) = failures(9.0, 0.005)
+    assert verdict(estimate(1.5), BETTER, [little]).status == "accepted"
     assert failures(9.0, 0.0) == []  # nothing was moved
     assert failures(9.0, None) == []
     assert failures(2.0, 0.02) == []  # within the prior's sigma: the covariance's business
+
+
+def test_a_wrong_principal_point_is_right_in_the_image_and_certifies_no_mounting():
+    mounted = {name: replace(claim, mounting_sigma_rad=0.001) for name, claim in SURE.items()}
+    assert verdict(estimate(1.5), BETTER, claims=mounted).mounting == DIRECTIONS
+    centre = FailedCheck("CameraInfo's principal point", "camera_info", error=HARMLESS)
+    found = verdict(estimate(1.5), BETTER, [centre], mounted)
+    assert (found.status, found.determined, found.mounting) == ("accepted", DIRECTIONS, ())
+    assert found.faults == ("camera_info",)

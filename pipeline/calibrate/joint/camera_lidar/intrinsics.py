@@ -43,7 +43,7 @@ from pipeline.calibrate.numerics.bias_floors import (
 from pipeline.core.rigs import CameraPrior
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms
 from pipeline.rig.changes import change_between, change_jacobian
-from pipeline.rig.checks import FailedCheck
+from pipeline.rig.checks import HARMLESS, FailedCheck
 from pipeline.rig.estimates import Prior
 
 __all__ = ["DayIntrinsics", "contradictions", "measure_intrinsics"]
@@ -144,8 +144,9 @@ def contradictions(day: DayIntrinsics, known: CameraPrior) -> list[FailedCheck]:
         found.append(
             FailedCheck(
                 f"CameraInfo's principal point is contradicted by the day: measured {right:+.1f} +- {u:.1f} px "
-                f"right, {down:+.1f} +- {v:.1f} px down",
+                f"right, {down:+.1f} +- {v:.1f} px down: right in the image, not in the mounting",
                 "camera_info",
+                error=HARMLESS,
             )
         )
     return found
