@@ -18,18 +18,17 @@ from pipeline.calibrate.adjust.rig import adjust
 from pipeline.calibrate.numerics.covariance import OBSERVABLE
 from pipeline.calibrate.solved import SolvedDay
 from pipeline.core.config import FleetConfig
-from pipeline.rig.changes import change_between, change_covariance
-from pipeline.rig.checks import Change, FailedCheck, change_of
+from pipeline.rig.changes import change_between
+from pipeline.rig.checks import FailedCheck, change_of
 from pipeline.rig.estimates import PairEstimate, Solution
 from pipeline.rig.evidence import EdgeEvidence
 from pipeline.rig.extrinsics import Extrinsics
 from pipeline.rig.graph import Edge, RigGraph
-from pipeline.rig.se3 import adjoint, inverse
+from pipeline.rig.se3 import adjoint, compose_covariance, inverse
 
 __all__ = ["adjusted_rig", "clocks_of", "evidence_of_day", "judged_together"]
 
 _SIGMAS = 3.0  # by which an edge that is left out contradicts the rest
-_SCATTER = 1.5  # sigmas of a difference that is no contradiction
 
 
 def evidence_of_day(day: SolvedDay, edges: Mapping[str, Edge], fleet: FleetConfig) -> list[EdgeEvidence]:
@@ -88,7 +87,7 @@ def judged_together(day: SolvedDay, rig: AdjustedRig | None, edges: Mapping[str,
         failed = [*day.failed[pair], *against]
         again = day.judging.pair(estimate, failed, together=True)
         if edges[pair] not in rig.left_out or again.verdict.status == "accepted":
-            pairs[pair], verdicts[pair] = estimate, again
+            pairs[pair], verdicts[pair] = estimate.doubted(again.doubt), again
         elif against:
             verdicts[pair] = day.judging.pair(own, failed, together=False)
     return replace(day, solution=replace(day.solution, pairs=pairs), judged=verdicts)
@@ -103,71 +102,48 @@ def _contradictions(
     """
     if edge.kind == "camera_lidar" and day.judged[edge.kind].verdict.status == "accepted":
         return []
-    doubts = rig.edges[edge].doubts
-    found = (
-        {", ".join(e.name for e in doubts): [e for e in doubts if not rig.edges[e].used]} if doubts else {}
-    )
+    found: dict[str, list[Edge]] = {}
+    if doubts := rig.edges[edge].doubts:
+        found[", ".join(e.name for e in doubts)] = [e for e in doubts if not rig.edges[e].used]
     for other, at in rig.edges.items():
         if other == edge or at.used or other in doubts or any(c.disproves for c in at.evidence.checks):
             continue
         if (at.innovation_sigmas or 0.0) > _SIGMAS:
             found[f"{other.name} and the other edges"] = [other]
     estimates = {edges[pair]: estimate for pair, estimate in day.solution.pairs.items()}
-    return [
-        FailedCheck(
-            f"{who} contradict each other and nothing tells which is wrong",
-            "witnesses_disagree",
-            error=_error(edge, out, rig, estimates, adjusted),
-        )
-        for who, out in found.items()
-    ]
-
-
-def _error(
-    edge: Edge,
-    out: Sequence[Edge],
-    rig: AdjustedRig,
-    estimates: Mapping[Edge, PairEstimate],
-    adjusted: PairEstimate,
-) -> Change | None:
-    """Change of the edge's pose if the one edge that the rig does without is right; None if nobody knows.
-
-    Only in what the two poses differ by more than the scatter of both: a radar's edge to the camera may
-    contradict its roll and know little of its azimuth.
-    """
-    found = estimates.get(out[0]) if len(out) == 1 else None
-    around = None if found is None else _around(edge, out[0], rig)
-    if found is None or around is None:
-        return None
-    before, after, is_turned = around
-    T, covariance = (inverse(found.T), _of_inverse(found)) if is_turned else (found.T, found.covariance)
-    A = adjoint(before)
-    if_right, of_right = before @ T @ after, A @ covariance @ A.T
-    change = change_between(adjusted.T, if_right)
-    both = change_covariance(if_right, of_right) + change_covariance(adjusted.T, adjusted.covariance)
-    return change_of(np.where(np.abs(change) > _SCATTER * np.sqrt(np.diag(both)), change, 0.0))
-
-
-def _of_inverse(estimate: PairEstimate) -> Float[np.ndarray, "6 6"]:
-    A = adjoint(inverse(estimate.T))
-    return A @ estimate.covariance @ A.T
+    checks = []
+    for who, out in found.items():
+        sentence = f"{who} contradict each other and nothing tells which is wrong"
+        around = _around(edge, out[0], rig, estimates) if len(out) == 1 else None
+        if around is None:  # nobody knows by how much
+            checks.append(FailedCheck(sentence, "witnesses_disagree"))
+            continue
+        error = change_of(change_between(adjusted.T, around[0]))
+        checks.append(FailedCheck(sentence, "witnesses_disagree", error=error, covariance=around[1]))
+    return checks
 
 
 def _around(
-    edge: Edge, out: Edge, rig: AdjustedRig
-) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "4 4"], bool] | None:
-    """Poses before and after an edge that is left out, on the way along it from the parent to the child of another.
+    edge: Edge, out: Edge, rig: AdjustedRig, estimates: Mapping[Edge, PairEstimate]
+) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "6 6"]] | None:
+    """Pose of an edge by the way over one that the rig does without, and its covariance (left perturbation).
 
-    The last is true where it is passed from its child to its parent. None if no edges in use lead there.
+    So it is if the edge that is left out is right. None if it has no estimate, or no edges in use lead there.
     """
+    if out not in estimates:
+        return None
     used = tuple(e for e, at in rig.edges.items() if at.used and e not in (edge, out))
-    sensors = {s for e in rig.edges for s in e.sensors}
-    graph = RigGraph(tuple(sensors), used, edge.parent)
-    for is_turned in (False, True):
-        first, last = out.sensors[::-1] if is_turned else out.sensors
+    graph = RigGraph(tuple({s for e in rig.edges for s in e.sensors}), used, edge.parent)
+    poses, found = rig.poses, estimates[out]
+    T, covariance = found.T, found.covariance
+    for first, last in (out.sensors, out.sensors[::-1]):
         if graph.path(edge.parent, first) is not None and graph.path(last, edge.child) is not None:
-            between = rig.poses.between
-            return between(edge.parent.name, first.name), between(last.name, edge.child.name), is_turned
+            before, after = (edge.parent.name, first.name), (last.name, edge.child.name)
+            T_before, of_before = poses.between(*before), poses.covariance_between(*before)
+            covariance = compose_covariance(T, covariance, poses.covariance_between(*after))
+            return T_before @ T @ poses.between(*after), compose_covariance(T_before, of_before, covariance)
+        A = adjoint(inverse(T))
+        T, covariance = inverse(T), A @ covariance @ A.T
     return None
 
 

@@ -165,12 +165,14 @@ def _solved(
     failed, judging = _judging(
         observations, selection, prior, solution, fleet, active, motion, about.probe_deg
     )
+    judged = _judged(solution, failed, judging, _composed_of(method, pairs))
+    doubted = {pair: estimate.doubted(judged[pair].doubt) for pair, estimate in solution.pairs.items()}
     day = SolvedDay(
         observations,
         selection,
         prior,
-        solution,
-        _judged(solution, failed, judging, _composed_of(method, pairs)),
+        replace(solution, pairs=doubted),
+        judged,
         failed,
         judging,
         sample,

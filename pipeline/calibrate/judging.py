@@ -19,6 +19,7 @@ from jaxtyping import Float, Int
 from pipeline.calibrate.numerics.frame_blocks import scene_blocks
 from pipeline.calibrate.numerics.search_range import search_range
 from pipeline.calibrate.select.frames import Selection
+from pipeline.calibrate.verify.consequence import tilt_in_doubt
 from pipeline.calibrate.verify.edge_result import EdgeResult
 from pipeline.calibrate.verify.held_out_score import held_out_score
 from pipeline.calibrate.verify.held_out_search import found_elsewhere, held_out_place
@@ -55,6 +56,8 @@ class Judged:
     targets: np.ndarray = field(default_factory=lambda: DEFAULT_TARGETS)  # 3 3, in the child's frame
     probes: Mapping[str, float] = field(default_factory=dict)  # of `probe_numbers`
     held_by: tuple[FailedCheck, ...] = ()  # of the checks of solver and day, those that matter
+    # 6 6, left perturbation: what failed checks of an accepted pose leave open in a tilt that it does not certify.
+    doubt: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +117,9 @@ class Judging:
             together=together,
         )
         held_by = tuple(check for check in (*failed, *disproved) if matters(check, result, claims))
-        return Judged(verdict, test, claims, mounting, targets, probes, held_by)
+        doubts = [tilt_in_doubt(result, check) for check in failed] if verdict.status == "accepted" else []
+        doubt = sum((d for d in doubts if d is not None), np.zeros((6, 6)))
+        return Judged(verdict, test, claims, mounting, targets, probes, held_by, doubt)
 
     def _result(self, estimate: PairEstimate, targets: np.ndarray) -> EdgeResult:
         pair, prior = estimate.pair, self.prior

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
 
 from schemas.faults import FAULTS
 
@@ -23,12 +26,15 @@ class FailedCheck:
         disproves: the pose is certainly wrong and must not be used, not only unproved.
         error: by how much the pose would be wrong if the check is right: it holds a record only where that
             matters against its limits. None = nobody knows, so that it always holds.
+        covariance: of the pose that would be right then, as left perturbation [rad, m]; None where the check
+            fails from three sigmas on in all that it can show, so that it knows the error to a third.
     """
 
     sentence: str
     fault: str = ""
     disproves: bool = False
     error: Change | None = None
+    covariance: Float[np.ndarray, "6 6"] | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
         assert not self.fault or self.fault in FAULTS, self.fault

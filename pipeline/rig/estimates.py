@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -140,6 +140,14 @@ class PairEstimate:
         """The prior, for a pair without an estimate."""
         covariance, none = prior.covariance(pair), np.zeros(6)
         return cls(pair, prior.of(pair), covariance, none, none > 0, 0, common_covariance=covariance)
+
+    def doubted(self, doubt: Float[np.ndarray, "6 6"]) -> PairEstimate:
+        """The estimate with an error besides that all its frames, and all its days, may have."""
+        if not doubt.any():
+            return self
+        common = None if self.common_covariance is None else self.common_covariance + doubt
+        bias = self.bias | {"edge": self.bias.get("edge", np.zeros((6, 6))) + doubt}
+        return replace(self, covariance=self.covariance + doubt, common_covariance=common, bias=bias)
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,13 +8,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
 
 from pipeline.core.config import ChecksConfig
 from pipeline.objective.stamp_gaps import camera_gaps_s, constant_gap_s
 from pipeline.rig.changes import change_between
 from pipeline.rig.checks import Change, FailedCheck, change_of
 from pipeline.rig.estimates import Prior, Solution
-from pipeline.rig.se3 import adjoint, inverse
+from pipeline.rig.se3 import adjoint, compose_covariance, inverse
 from schemas.observations import Observation
 
 __all__ = ["heading_failures", "loop_failures", "loop_sigmas"]
@@ -38,20 +39,29 @@ def loop_failures(solution: Solution, limits: ChecksConfig | None = None) -> dic
         open_m = solution.loop_translation_m
         sentences.append(f"the loop is open by {open_m:.3f} m, its sigma is {translation:.3f} m")
     return {
-        pair: [FailedCheck(s, "witnesses_disagree", error=error) for s in sentences]
-        for pair, error in (_closing(solution) if sentences else {}).items()
+        pair: [
+            FailedCheck(s, "witnesses_disagree", error=_change(solution, pair, T), covariance=covariance)
+            for s in sentences
+        ]
+        for pair, (T, covariance) in (_by_others(solution) if sentences else {}).items()
     }
 
 
-def _closing(solution: Solution) -> dict[str, Change]:
-    """What each pair would have to change by to close the loop."""
-    cl, lr, cr = (solution.pairs[p].T for p in ("camera_lidar", "lidar_radar", "camera_radar"))
-    by_others = {
-        "camera_lidar": (cl, cr @ inverse(lr)),
-        "camera_radar": (cr, cl @ lr),
-        "lidar_radar": (lr, inverse(cl) @ cr),
+def _change(solution: Solution, pair: str, T: Float[np.ndarray, "4 4"]) -> Change:
+    return change_of(change_between(solution.pairs[pair].T, T))
+
+
+def _by_others(
+    solution: Solution,
+) -> dict[str, tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "6 6"]]]:
+    """Pose of each pair that the other two give, which would close the loop, and its covariance."""
+    cl, lr, cr = (solution.pairs[p] for p in ("camera_lidar", "lidar_radar", "camera_radar"))
+    of_camera, back = cr.T @ inverse(lr.T), adjoint(inverse(cl.T))
+    return {
+        "camera_lidar": (of_camera, compose_covariance(of_camera, cr.covariance, lr.covariance)),
+        "camera_radar": (cl.T @ lr.T, compose_covariance(cl.T, cl.covariance, lr.covariance)),
+        "lidar_radar": (inverse(cl.T) @ cr.T, back @ (cl.covariance + cr.covariance) @ back.T),
     }
-    return {pair: change_of(change_between(T, other)) for pair, (T, other) in by_others.items()}
 
 
 def heading_failures(

@@ -79,14 +79,32 @@ class Claim:
         """They contradict it, and would move it by more than its sigma."""
         return bool(self.is_contradicted and self.shift_rad > self.sigma_rad)
 
-    def is_exceeded_by(self, error_rad: float) -> bool:
-        """Whether an error that a check shows is more than the sigma, and not within the limit with it.
+    def is_exceeded_by(self, error_rad: float, known_to_rad: float | None = None) -> bool:
+        """Whether an error that a check shows is not within the limit with the required probability.
 
-        Checks fail from three sigmas on: so well, at least, the error is known.
+        Args:
+            error_rad: the error if the check is right.
+            known_to_rad: its sigma. None where the check fails from three sigmas on: it is a third, at most, and
+                an error below the claim's own sigma is in the claim already.
         """
-        sigma_rad = float(np.hypot(self.sigma_rad, error_rad / _CHECK_SIGMAS))
-        beyond = _quantile(error_rad, sigma_rad, self.confidence) > self.limit_rad
-        return bool(error_rad > self.sigma_rad and beyond)
+        if known_to_rad is None:
+            if error_rad <= self.sigma_rad:
+                return False
+            known_to_rad = error_rad / _CHECK_SIGMAS
+        sigma_rad = float(np.hypot(self.sigma_rad, known_to_rad))
+        return bool(_quantile(error_rad, sigma_rad, self.confidence) > self.limit_rad)
+
+    @property
+    def agrees_with_held_out(self) -> bool:
+        """By held-out frames alone the error is within the limit with the required probability.
+
+        Their share of an update is that of its variance; what they find alone is the shift without the rest.
+        """
+        share = min(self.shift_sigma_rad / self.sigma_rad, 1.0) ** 2 if self.sigma_rad > 0 else 0.0
+        if share == 0:
+            return False
+        own_rad = self.sigma_rad * float(np.sqrt((1 - share) / share))
+        return bool(_quantile(self.shift_rad / share, own_rad, self.confidence) <= self.limit_rad)
 
     @property
     def without_sigma(self) -> Claim:

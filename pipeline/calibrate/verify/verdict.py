@@ -14,12 +14,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pipeline.calibrate.select.frames import SHORTEST
-from pipeline.calibrate.verify.consequence import RANGE, exceeded_by, largest_rad
+from pipeline.calibrate.verify.consequence import RANGE, at_targets, exceeded_by, tilt_in_doubt
 from pipeline.calibrate.verify.edge_result import EdgeResult
 from pipeline.calibrate.verify.held_out_test import HeldOutTest
 from pipeline.calibrate.verify.target_accuracy import Claim
 from pipeline.core.config import ChecksConfig
-from pipeline.rig.changes import change_covariance
 from pipeline.rig.checks import FailedCheck, change_of, faults_of
 from schemas.calibrations import DOF_NAMES
 
@@ -40,9 +39,6 @@ _SCORED = {
     "lidar_radar": np.array([False, False, True, True, True, False]),
     "lidar_lidar": np.ones(6, bool),
 }
-# Of a radar: what its elevation is made of, by index.
-_TILTS = {"camera_radar": (0, 2), "lidar_radar": (0, 1, 5)}
-_SIGMAS = 3.0
 _FAILED = -1.0  # margin of a check that yields no number
 
 
@@ -122,7 +118,7 @@ def judge(
             return Verdict("refused", "; ".join([*sentences, few]), _FAILED, faults=tuple(faults))
         checks.append(_Check(_FAILED, few))
     checks += [
-        _Check(_FAILED, check.sentence, check.disproves)
+        _Check(_FAILED, _with_size(check, result, "not within the limit"), check.disproves)
         for check in evidence.failed_checks
         if matters(check, result, evidence.claims)
     ]
@@ -176,26 +172,24 @@ def _accepted(result: EdgeResult, evidence: Evidence, score: float) -> Verdict:
 
 def _exceeded(check: FailedCheck, result: EdgeResult, claims: Mapping[str, Claim]) -> list[str]:
     """Directions whose limit the pose exceeds if the check is right; no radar's elevation with a tilt in doubt."""
-    if check.error is None:
-        return [*claims, RANGE]
-    tilted = ["elevation"] if _tilts_in_doubt(check, result) else []
-    return list(dict.fromkeys([*exceeded_by(result, claims, check.error), *tilted]))
-
-
-def _tilts_in_doubt(check: FailedCheck, result: EdgeResult) -> list[int]:
-    """A radar's roll, pitch and height that are off by more than their sigmas allow if the check is right."""
-    sigma = np.sqrt(np.diag(change_covariance(result.T, result.covariance)))
-    off = np.zeros(6) if check.error is None else np.abs(check.error) / sigma
-    return [k for k in _TILTS.get(result.kind, ()) if off[k] > _SIGMAS]
+    tilted = ["elevation"] if tilt_in_doubt(result, check) is not None else []
+    return list(dict.fromkeys([*exceeded_by(result, claims, check), *tilted]))
 
 
 def _harmless(check: FailedCheck, result: EdgeResult, claims: Mapping[str, Claim]) -> str:
     """Sentence about a check that does not hold the record."""
     if exceeded := _exceeded(check, result, claims):
         return f"{check.sentence}: {' and '.join(exceeded)} not certified"
+    return _with_size(check, result, "within the limit")
+
+
+def _with_size(check: FailedCheck, result: EdgeResult, words: str) -> str:
+    """The check's sentence with the largest error that it shows at the targets, if it knows one."""
     if check.error is None or not any(check.error):
         return check.sentence
-    return f"{check.sentence}: {_deg(largest_rad(result, check.error))} at the targets, within the limit"
+    off_rad, known_to_rad = max(at_targets(result, check).values(), key=lambda found: found[0])
+    sigma = "" if known_to_rad is None else f" +- {np.degrees(known_to_rad):.2f}"
+    return f"{check.sentence}: {np.degrees(off_rad):.2f}{sigma} deg at the targets, {words}"
 
 
 def _moves_little(result: EdgeResult, limits: ChecksConfig) -> list[_Check]:
@@ -263,9 +257,16 @@ def _aligns_no_worse(
 
 
 def _near_prior(result: EdgeResult, claims: Mapping[str, Claim]) -> float:
-    """0 where the result is good for its purpose even if the prior is right in what held-out frames score, else -1."""
+    """0 where the result is good for its purpose whatever its alignment says of it, else -1.
+
+    It is good if the prior is right in what held-out frames score, and held-out frames, which may lead beyond the
+    prior, would move it by no more either.
+    """
     back = change_of(np.where(_SCORED[result.kind], -result.move, 0.0))
-    return _FAILED if exceeded_by(result, claims, back) else 0.0
+    if exceeded_by(result, claims, FailedCheck("the prior is right", error=back)):
+        return _FAILED
+    needed = _NEEDED.get(result.kind, tuple(claims))
+    return 0.0 if all(claims[name].agrees_with_held_out for name in needed) else _FAILED
 
 
 def _largest_move(result: EdgeResult) -> tuple[str, float]:

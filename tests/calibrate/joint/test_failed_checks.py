@@ -98,3 +98,4 @@ def test_through_the_stage_a_pitch_in_doubt_certifies_no_elevation_and_costs_no_
     doubted = record_with(street, registration_pitch_offset_rad=np.radians(9.0))
     assert (doubted.status, doubted.determined) == ("accepted", ["azimuth"])
     assert "elevation not certified" in doubted.reason
+    assert np.sqrt(np.diag(np.reshape(doubted.covariance, (6, 6)))[1]) > np.radians(1.0)

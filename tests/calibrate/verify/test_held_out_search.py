@@ -56,6 +56,7 @@ def test_a_result_in_another_place_is_disproved_with_how_far_it_is_off(axis, dir
     assert check.disproves
     off_deg = float(check.sentence.split(f" deg in {direction}")[0].split()[-1])
     assert off_deg == pytest.approx(1.5, abs=0.2)
+    assert np.degrees(np.linalg.norm(check.error[:3])) == pytest.approx(1.5, abs=0.3)
 
 
 def test_a_search_that_went_astray_says_nothing_of_the_result(held_out):

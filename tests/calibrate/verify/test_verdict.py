@@ -12,7 +12,7 @@ from pipeline.calibrate.verify.held_out_test import HeldOutTest, paired_test
 from pipeline.calibrate.verify.target_accuracy import DIRECTIONS, Claim
 from pipeline.calibrate.verify.verdict import Evidence, judge
 from pipeline.core.config import ChecksConfig
-from pipeline.rig.checks import HARMLESS, FailedCheck
+from pipeline.rig.checks import HARMLESS, FailedCheck, change_of
 from pipeline.rig.estimates import PairEstimate, Prior, Solution
 from pipeline.rig.se3 import exp_se3, exp_so3, from_rotation_translation
 from pipeline.rig.targets import DEFAULT_TARGETS
@@ -48,7 +48,9 @@ def verdict(result, test, failed=(), claims=SURE, limits=None, **changes):
 
 
 def checked(error, fault="witnesses_disagree"):
-    return FailedCheck("two halves disagree", fault, error=error)
+    return FailedCheck(
+        "two halves disagree", fault, error=None if error is None else change_of(map(float, error))
+    )
 
 
 DEG = np.radians(1.0)
@@ -92,6 +94,47 @@ def test_a_check_holds_where_the_pose_would_be_beyond_its_limits_if_it_is_right(
     assert not found.unsure_only
 
 
+@pytest.mark.parametrize(
+    ("off_deg", "sigma_deg", "status"),
+    [(0.0, 0.12, "accepted"), (0.0, 0.16, "held"), (0.3, 0.01, "accepted"), (0.3, 0.05, "held"), (0.5, 0.01, "held")],
+)  # fmt: skip
+def test_what_a_check_leaves_possible_counts_its_size_and_its_own_sigma_against_the_limit(
+    off_deg, sigma_deg, status
+):
+    """A radar's azimuth is wanted within .4 deg at 99.5 %: 2.8 sigmas of the check, 2.6 beside an offset."""
+    claims = {name: Claim(1e-4, 0.0, 1e-4, 1e-4, 0.4 * DEG, 0.995) for name in DIRECTIONS}
+    known_to = np.diag([*[(sigma_deg * DEG) ** 2] * 3, *[1e-6] * 3])
+    check = FailedCheck(
+        "another edge contradicts",
+        error=change_of((0.0, 0.0, off_deg * DEG, 0.0, 0.0, 0.0)),
+        covariance=known_to,
+    )
+    found = verdict(estimate(pair="lidar_radar"), BETTER, [check], claims)
+    assert found.status == status
+    assert f"{off_deg:.2f} +- {sigma_deg:.2f} deg at the targets" in found.reason or off_deg == 0
+
+
+def test_a_check_that_knows_nothing_of_the_range_frees_no_range():
+    check = FailedCheck(
+        "another edge contradicts",
+        error=change_of((0.0, 0.0, 1e-4, 0.0, 0.0, 0.0)),
+        covariance=np.diag([1e-8] * 6),
+    )
+    of_radar = estimate(pair="lidar_radar")
+    assert verdict(of_radar, BETTER, [check]).status == "accepted"
+    far = replace(check, covariance=np.diag([1e-8, 1e-8, 1e-8, 0.1**2, 1e-8, 1e-8]))
+    assert verdict(of_radar, BETTER, [far]).status == "held"
+
+
+def test_a_check_that_may_hide_a_tilt_certifies_no_elevation():
+    known_to = np.diag([(0.5 * DEG) ** 2, *[1e-8] * 5])
+    check = FailedCheck(
+        "another edge contradicts", error=change_of((0.0, 0.0, 1e-4, 0.0, 0.0, 0.0)), covariance=known_to
+    )
+    found = verdict(estimate(pair="lidar_radar"), BETTER, [check])
+    assert (found.status, found.determined) == ("accepted", ("azimuth",))
+
+
 def test_a_radars_tilt_in_doubt_certifies_no_elevation_however_little_targets_see_of_it():
     rolled = verdict(estimate(0.2, pair="lidar_radar"), BETTER, [checked((0.5 * DEG, 0, 0, 0, 0, 0))])
     assert (rolled.status, rolled.determined) == ("accepted", ("azimuth",))
@@ -126,6 +169,15 @@ def test_a_worse_alignment_is_held_where_it_matters_which_of_the_two_is_right():
     assert verdict(estimate(0.02), WORSE).status == "accepted"
     assert verdict(estimate(shift_m=0.1), WORSE).status == "held"  # .25 deg of targets 25 m away
     assert verdict(estimate(shift_m=0.005), WORSE).status == "accepted"
+
+
+@pytest.mark.parametrize("test", [SAME, WORSE])
+def test_a_result_near_its_prior_is_held_where_held_out_frames_may_lead_beyond_the_prior(test):
+    near = replace(estimate(0.03), covariance=np.diag((SIGMA / 20) ** 2))
+    assert verdict(near, test).status == "accepted"
+    for lead in (claim(0.05, 0.08, 0.03), claim(0.06, 0.0, 0.02), claim(0.06, 0.0, 0.0)):
+        assert verdict(near, test, claims=SURE | {"azimuth": lead}).status == "held"
+    assert verdict(near, test, claims=SURE | {"azimuth": claim(0.05, 0.02, 0.04)}).status == "accepted"
 
 
 def test_no_better_alignment_is_accepted_where_a_move_of_many_sigmas_does_not_matter():
@@ -347,6 +399,9 @@ def test_a_loop_beyond_three_sigma_fails_every_pair_by_what_would_close_it():
         "camera_lidar": 2, "camera_radar": -2, "lidar_radar": 2,
     }  # fmt: skip
     assert "open by 0.500 m" in loop_failures(solution(0.0, 0.5))["lidar_radar"][0].sentence
+    # The other two know it to a tenth of a degree each.
+    covariance = turned["lidar_radar"][0].covariance
+    assert np.degrees(np.sqrt(np.diag(covariance)[:3])) == pytest.approx(0.1 * np.sqrt(2))
 
 
 def test_a_method_without_independent_pairs_has_no_loop_to_check():
