@@ -101,7 +101,7 @@ def test_the_readout_time_of_the_prior_reaches_every_step_of_camera_lidar():
     # Exposed at the last state before this one: they know their rows to a hundredth of the readout.
     for a, b in ((terms.edges, there.edges), (terms.markings, there.markings)):
         np.testing.assert_allclose(a.exposure_s, b.exposure_s, atol=0.01 * READOUT_S)
-    e = analyse_camera_lidar(aligned, np.random.default_rng(0), heading=(0.0, 0.01))
+    e = analyse_camera_lidar(aligned, np.random.default_rng(0), heading_rad=0.0)
     score = held_out_score(e, day, prior, SolveConfig())
     without = held_out_score(e, day, replace(prior, camera=CameraPrior()), SolveConfig())
     assert np.nansum(score.cost(e.T)) < np.nansum(without.cost(e.T))

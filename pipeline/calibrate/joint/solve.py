@@ -84,7 +84,8 @@ def _solved(
         return estimate_camera_radar(observations, prior, config, rng, boxes="boxes" in config.terms), []
     aligned = align_camera_lidar(observations, prior, config, rng)
     heading = _heading(observations, before.get("lidar_radar"), prior)
-    found = analyse_camera_lidar(aligned, np.random.default_rng([seed, 3]), heading=heading)
+    heading_rad = None if heading is None else heading[0]
+    found = analyse_camera_lidar(aligned, np.random.default_rng([seed, 3]), heading_rad=heading_rad)
     found = replace(found, disproved=aligned.basin.doubt)
     # Intrinsics of a lost basin have no known accuracy.
     told = [] if found.disproved else contradictions(aligned.intrinsics, prior.camera)

@@ -14,6 +14,7 @@ import numpy as np
 from pipeline.core.rigs import CameraPrior
 
 __all__ = [
+    "BORDER_SHARE",
     "BOX_ELEVATION_GATES_RAD",
     "BOX_ROLL_FLOOR_CAMERA_RAD",
     "CAMERA_LIDAR_BIAS",
@@ -26,13 +27,11 @@ __all__ = [
     "EDGE_SIDE_MOST_OF_GAP",
     "EDGE_SIDE_MOST_PX",
     "FOCAL_SIGMA",
-    "HEADING_SIGMA_RAD",
     "HELD_OUT_BIAS",
     "INTRINSICS_CONTRADICTION_SIGMAS",
     "INTRINSICS_HALF_SIGMAS",
     "LIDAR_RADAR_BIAS",
     "LIDAR_RADAR_DT_FLOOR_S",
-    "MOUNTING_SIGMA_RAD",
     "OUTLIER_DENSITY",
     "PAPER_BIAS",
     "PRIOR_CONTRADICTION_SIGMAS",
@@ -57,6 +56,9 @@ CAMERA_LIDAR_DT_FLOOR_S = 0.004
 # between two beams. At most, on 34 good days of thirteen rigs: one label pixel and .4 of the angle between beams; what
 # the sources of one day are compared with.
 EDGE_SIDE_MOST_PX, EDGE_SIDE_MOST_OF_GAP = 1.0, 0.4
+# Variance of the bias by borders, in units of the scatter of their pulls over sides, thirds of range and halves of the
+# image: 66 days of drawn worlds, rows and rigs allow 3 to 6; days of clean labels alone would ask for none.
+BORDER_SHARE = 3.0
 # One side alone is off by at least this share of a label pixel and of the angle between beams, in quadrature: no other
 # side takes back what its labels or the beams' gaps move it by (tops of one height, rows 1 deg apart: .5 deg).
 EDGE_SIDE_ALONE = 0.3
@@ -76,11 +78,6 @@ INTRINSICS_HALF_SIGMAS = 2.0
 TZ_UNCHECKED_BIAS_M = 0.18
 # ... and what both err by alike: RMS error where they agreed, simulated days of seeds 110 to 125.
 TZ_COMMON_BIAS_M = 0.05
-# Heading of the car in lidar axes where a caller states it; beyond it comes the sigma of the radar's yaw.
-HEADING_SIGMA_RAD = np.radians(0.3)
-# Yaw and pitch of the lidar's mounting as de-skewing assumed them: roll's errors on simulated days of seeds 110 to 145,
-# most of them of this kind, were two thirds of what 1 deg predicts.
-MOUNTING_SIGMA_RAD = np.radians(0.6)
 SWEEP_S = 0.1  # rotating and scanning lidars alike run at 10 Hz
 # Typical distance of what edges and markings lie on, and typical speed: steps in metres and seconds per step in pixels.
 TYPICAL_RANGE_M, TYPICAL_SPEED_MPS = 12.0, 8.0

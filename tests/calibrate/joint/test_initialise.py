@@ -93,16 +93,12 @@ def test_a_grid_of_rotations_has_the_truth_among_its_maxima(terms):
 
 
 def test_the_basin_is_found_from_five_degrees_and_leads_over_all_other_ends(terms):
-    seconds = []
     for seed in (1, 2):
         basin = searched(terms, off_by(5.0, 0.05, seed))
         assert degrees_off(basin.state.T_camera_lidar) < KERNEL_DEG
         assert not basin.doubt
         assert sum(basin.evidence) > basin.needed
         assert basin.rival_z > CLEARLY
-        seconds.append(basin.second)
-    # Where another candidate ends beside it, how far the two are apart is known; no verdict needs one.
-    assert any(second is not None for second in seconds)
 
 
 def test_bright_stretches_of_road_at_a_wrong_roll_do_not_outvote_the_edges(terms):

@@ -17,7 +17,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.calibrate.joint.camera_lidar.beyond_chance import TERMS as BASIN_TERMS
-from pipeline.calibrate.joint.camera_lidar.heading_bias import MotionSigmas, sweep_s_per_rad
 from pipeline.calibrate.joint.camera_lidar.initialise import (
     MARGIN_RAD,
     Basin,
@@ -33,7 +32,7 @@ from pipeline.calibrate.joint.camera_lidar.observability import (
     analyse_observability,
 )
 from pipeline.calibrate.joint.camera_lidar.optical_axis import TZ
-from pipeline.calibrate.joint.camera_lidar.other_solutions import parts_of_alignment, starts_apart
+from pipeline.calibrate.joint.camera_lidar.parts import parts_of_alignment
 from pipeline.calibrate.joint.camera_lidar.refine import (
     NONE_FIXED,
     AlignmentState,
@@ -47,16 +46,10 @@ from pipeline.calibrate.joint.camera_lidar.witnesses import (
     Witness,
     ask_witnesses,
     disagreement,
-    widening,
     witness_numbers,
 )
-from pipeline.calibrate.numerics.bias_floors import (
-    CAMERA_LIDAR_BIAS,
-    HEADING_SIGMA_RAD,
-    TZ_COMMON_BIAS_M,
-)
-from pipeline.calibrate.numerics.change_point import with_parts
-from pipeline.calibrate.numerics.covariance import OBSERVABLE, with_ends
+from pipeline.calibrate.numerics.bias_floors import CAMERA_LIDAR_BIAS, TZ_COMMON_BIAS_M
+from pipeline.calibrate.numerics.covariance import OBSERVABLE
 from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.calibrate.numerics.search_range import search_range
 from pipeline.core.config import SolveConfig
@@ -94,7 +87,6 @@ class Aligned:
     rejected: dict[str, int]
     basin: Basin
     state: AlignmentState
-    second: AlignmentState | None  # where the best other candidate of its optimum led
     kernel: KernelSettings
     expected_dt_s: float  # the state's time offset counts from it: the constant part of the stamps' gaps
     intrinsics: DayIntrinsics
@@ -124,9 +116,8 @@ def align_camera_lidar(
         SolveError: too few frames, or nothing to align in them.
     """
     used, rejected = _usable(observations)
-    heading_rad, sigma_rad = prior.heading or (None, prior.rotation_sigma_rad)
+    heading_rad = None if prior.heading is None else prior.heading[0]
     velocity_lidar = lidar_velocities(observations, prior.T_lidar_radar, heading_rad)
-    heading_sigma = float(np.hypot(HEADING_SIGMA_RAD, sigma_rad))
     if len(used) < _FEWEST_FRAMES:
         raise SolveError(f"camera-lidar needs {_FEWEST_FRAMES} frames of one camera, the day has {len(used)}")
     frames = [observations[i] for i in used]
@@ -141,7 +132,7 @@ def align_camera_lidar(
     basin = find_basin(terms, thin, rng, scenes.block)
     thin = replace(thin, terms=thin.terms.exposed_at(basin.state.alone), kernel=basin.kernel)
     sharp = sharp.in_view(basin.state.T_camera_lidar, MARGIN_RAD).at_most(SCHEDULE.sharp_points, rng)
-    sharp, kernel, basin, state, second = _refined(thin, sharp, terms, basin, scenes, rng)
+    sharp, kernel, basin, state = _refined(thin, sharp, terms, basin, scenes, rng)
     width_px = label_width_px(sharp, state.alone, kernel)
     problem = CameraLidarProblem(
         widened(sharp, state.T_camera_lidar, width_px),
@@ -150,23 +141,20 @@ def align_camera_lidar(
         scenes,
         int(rng.integers(2**32)),
         prior.translation_sigma_m**2,
-        MotionSigmas(heading_sigma, sweep_s_per_rad(frames)),
     )
     intrinsics = measure_intrinsics(problem, state, kernel, frames[0].label_scale, rng)
     expected_dt_s = constant_gap_s(camera_gaps_s(frames))
-    return Aligned(
-        problem, frames, rejected, basin, state, second, kernel, expected_dt_s, intrinsics, width_px
-    )
+    return Aligned(problem, frames, rejected, basin, state, kernel, expected_dt_s, intrinsics, width_px)
 
 
 def _refined(
     thin: Scored, sharp: Terms, terms: Terms, basin: Basin, scenes: Scenes, rng: np.random.Generator
-) -> tuple[Terms, KernelSettings, Basin, AlignmentState, AlignmentState | None]:
-    """Candidates of the basin from its wide kernel to the narrowest: where the best and the second best led."""
+) -> tuple[Terms, KernelSettings, Basin, AlignmentState]:
+    """The basin's best end, and its rival, from the wide kernel to the narrowest: where the best one led."""
     # Wide kernels are biased along the optical axis: where the prior is better than that, start at its tz.
     near = thin.prior.translation_sigma_m <= _NEAR_PRIOR_M
     fixed = IS_TZ if near else NONE_FIXED
-    starts = {"best": basin.state, "second": basin.second, "rival": basin.rival}
+    starts = {"best": basin.state, "rival": basin.rival}
     ends = {name: start for name, start in starts.items() if start is not None}
     ends = {k: _at_prior_tz(end, thin.prior, terms) if near else end for k, end in ends.items()}
     ends = {k: refine(thin, end, steps=SCHEDULE.first_steps, fixed=fixed) for k, end in ends.items()}
@@ -176,36 +164,30 @@ def _refined(
         fitted = sharp.fitted(ends["best"].alone, KernelSettings.wide(sigma_px, contrast), rng)
         scored = replace(thin, terms=sharp, kernel=weighted(sharp, ends["best"], fitted, scenes))
         ends = {k: refine(scored, end, steps=SCHEDULE.sharper_steps, fixed=fixed) for k, end in ends.items()}
-    state, second = ends["best"], ends.get("second")
+    state = ends["best"]
     if (rival := ends.get("rival")) is not None:
         basin = settled(basin, scored, state, rival)
-        second = second or rival
-    return sharp, scored.kernel, basin, state, second
+    return sharp, scored.kernel, basin, state
 
 
 def analyse_camera_lidar(
     aligned: Aligned,
     rng: np.random.Generator,
     *,
-    heading: tuple[float, float] | None = None,
+    heading_rad: float | None = None,
 ) -> PairEstimate:
     """The estimate with tz, time offset, observability and covariance.
 
     Args:
         aligned: the start.
         rng: for the chance densities and the points of the time offset's profile.
-        heading: azimuth of the direction of travel in lidar axes, and its sigma [rad]; by default the
-        velocities are those of `aligned`.
+        heading_rad: azimuth of the direction of travel in lidar axes; by default the velocities are those of
+            `aligned`.
     """
     problem = aligned.problem
-    if heading is not None:
-        velocity = lidar_velocities(aligned.frames, problem.prior.T_lidar_radar, heading[0])
-        sigma = float(np.hypot(HEADING_SIGMA_RAD, heading[1]))
-        problem = replace(
-            problem,
-            terms=problem.terms.exposed_at(aligned.state.alone, velocity),
-            motion=replace(problem.motion, heading_rad=sigma),
-        )
+    if heading_rad is not None:
+        velocity = lidar_velocities(aligned.frames, problem.prior.T_lidar_radar, heading_rad)
+        problem = replace(problem, terms=problem.terms.exposed_at(aligned.state.alone, velocity))
     analysis = analyse_observability(problem, aligned.state, aligned.kernel, rng)
     fixed = analysis.fixed | (np.arange(8) == FOCAL)
     scored = Scored(problem.terms, analysis.kernel, analysis.prior, problem.config)
@@ -213,14 +195,13 @@ def analyse_camera_lidar(
     for k in (0, 1):
         half = replace(scored, terms=problem.terms.of_frames(np.arange(k, problem.terms.frames, 2)))
         halves.append(refine(half, analysis.state, steps=SCHEDULE.half_steps, fixed=fixed))
-    starts = starts_apart(scored, analysis, aligned.second)
-    diagnostics = _diagnostics(problem.terms, analysis, aligned.basin, halves, starts)
+    diagnostics = _diagnostics(problem.terms, analysis, aligned.basin, halves)
     own_tz = analysis.profile.shift_from(float(problem.prior.T_camera_lidar[2, 3]))
     own_dt_s, z = far_time_offset(problem.terms, analysis.state, analysis.kernel, rng)
     diagnostics |= {
         "label_width_px": aligned.label_width_px,
         **{
-            f"left_out_{name}_deg": float(np.degrees(np.linalg.norm(analysis.left_out[:, axis])))
+            f"borders_{name}_deg": float(np.degrees(np.linalg.norm(analysis.borders[:, axis])))
             for axis, name in enumerate(("pitch", "yaw"))
         },
         "left_out_dt_s": float(np.linalg.norm(analysis.left_out_in_time[:, DT])),
@@ -240,10 +221,8 @@ def analyse_camera_lidar(
         problem.seed,
         own,
     )
-    covariance = analysis.covariance[:6, :6] + np.diag([*widening(witnesses) ** 2, 0, 0, 0, 0])
-    covariance = with_ends(covariance, starts[:6])
-    found = _conclude(analysis, covariance, aligned, diagnostics, witnesses)
-    return with_parts(found, parts_of_alignment(problem, analysis, aligned.frames))
+    parts = parts_of_alignment(problem, analysis, aligned.frames)
+    return replace(_conclude(analysis, aligned, diagnostics, witnesses), parts=parts)
 
 
 # -- steps -----------------------------------------------------------------------------------------------------------
@@ -308,7 +287,6 @@ def _diagnostics(
     analysis: ObservabilityAnalysis,
     basin: Basin,
     halves: list[AlignmentState],
-    starts: Float[np.ndarray, " 8"],
 ) -> dict[str, float]:
     """Numbers behind the verdict."""
     apart = difference(halves[0], halves[1])
@@ -322,10 +300,6 @@ def _diagnostics(
         **{f"halves_{n}_deg": float(np.degrees(abs(apart[i]))) for i, n in enumerate(("rx", "ry", "rz"))},
         **{f"halves_{n}_m": float(abs(apart[3 + i])) for i, n in enumerate(("tx", "ty", "tz"))},
         "halves_dt_s": float(abs(apart[6])),
-        **{
-            f"starts_{n}": float(starts[i])
-            for i, n in enumerate(("rx_rad", "ry_rad", "rz_rad", "tx_m", "ty_m"))
-        },
         **{
             f"edge_match_share_{n}": float(terms.mean_match(kernel)[i])
             for i, n in enumerate(("left", "right", "above", "below"))
@@ -344,7 +318,6 @@ def _diagnostics(
 
 def _conclude(
     analysis: ObservabilityAnalysis,
-    covariance: Float[np.ndarray, "6 6"],
     aligned: Aligned,
     diagnostics: dict[str, float],
     witnesses: Sequence[Witness],
@@ -360,10 +333,11 @@ def _conclude(
     if dt_sigma > _UNKNOWN_SHARE * expected_sigma:
         notes.append("camera time offset: the day's speeds do not determine it")
     to_left = np.linalg.inv(change_jacobian(analysis.state.T_camera_lidar))
+    covariance = to_left @ analysis.covariance[:6, :6] @ to_left.T
     return PairEstimate(
         "camera_lidar",
         analysis.state.T_camera_lidar,
-        to_left @ covariance @ to_left.T,
+        covariance,
         analysis.observability,
         analysis.observability >= OBSERVABLE,
         frames_used=len(aligned.frames),
@@ -372,9 +346,7 @@ def _conclude(
         time_offset_sigma_s=dt_sigma,
         diagnostics=diagnostics | aligned.intrinsics.diagnostics(known) | witness_numbers(witnesses),
         notes=notes,
-        common_covariance=common_part(
-            to_left @ analysis.common[:6, :6] @ to_left.T, to_left @ covariance @ to_left.T
-        ),
+        common_covariance=common_part(to_left @ analysis.common[:6, :6] @ to_left.T, covariance),
         failed_checks=disagreement(witnesses),
         bias={owner: to_left @ B @ to_left.T for owner, B in _biases(analysis).items()},
         bias_in_weights=to_left @ np.diag(_tz_bias(analysis)) @ to_left.T,

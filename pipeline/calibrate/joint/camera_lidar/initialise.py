@@ -37,7 +37,7 @@ __all__ = ["MARGIN_RAD", "Basin", "difference", "find_basin", "settled"]
 # Ends that move the day's points by less than this (median angle), or by less than three quarters of the kernel at
 # which they are compared, are one optimum: sharper kernels pull in as much.
 _SAME_OPTIMUM_RAD, _SAME_OPTIMUM_KERNELS = float(np.radians(0.5)), 0.75
-_ENDS_THAT_TELL = 2  # how far two starts of one optimum end apart
+_ENDS_THAT_TELL = 2  # of one optimum; the better one counts
 _POINTS = 500  # that show how far two ends are apart
 # A rival that may not have arrived is optimised so many times more at most, until a time raises it by less than this.
 _FINISHES, _HARDLY = 4, 0.5
@@ -55,7 +55,6 @@ class Basin:
     """The best end of all candidates, its evidence, and in `doubt` the reason against it (or empty)."""
 
     state: AlignmentState
-    second: AlignmentState | None  # the best one of another candidate that agrees with it
     kernel: KernelSettings  # at which ends were compared: the terms weighted alike in units of chance
     origin: str
     candidates: int
@@ -200,12 +199,10 @@ class _Search:
         self.ends = [first, *(self._arrived(e, first) for e in self.ends[1:])]
         best = max(self.ends, key=lambda e: e.total)
         apart = [(self._apart(e.state, best.state), e) for e in self.ends if e is not best]
-        agreeing = [e for a, e in apart if a < self.same_rad]
         rivals = [e for a, e in apart if a >= self.same_rad]
         rival = min(rivals, key=lambda e: _rejected(best, e), default=None)
         basin = Basin(
             best.state,
-            max(agreeing, key=lambda e: e.total).state if agreeing else None,
             self.scored.kernel,
             best.origin,
             self.candidates,

@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.calibrate.joint.camera_lidar.along_paint import along_paint
-from pipeline.calibrate.joint.camera_lidar.heading_bias import MotionSigmas, motion_biases
-from pipeline.calibrate.joint.camera_lidar.left_out import left_out
+from pipeline.calibrate.joint.camera_lidar.borders import border_errors
 from pipeline.calibrate.joint.camera_lidar.left_out_in_time import left_out_in_time
 from pipeline.calibrate.joint.camera_lidar.optical_axis import TZ, TzProfile, profile_tz, with_tz
 from pipeline.calibrate.joint.camera_lidar.refine import (
@@ -67,7 +66,6 @@ class CameraLidarProblem:
     scenes: Scenes  # of its frames: what they show, weights and covariance count by them
     seed: int  # of the bootstrap: solutions compare on the same resampled days
     tz_variance: float  # [m2]
-    motion: MotionSigmas
     tz_common_share: float = 1.0  # of its variance, the same every day
 
     @property
@@ -93,7 +91,7 @@ class ObservabilityAnalysis:
     floors: np.ndarray  # 8 8, of the common part what is no prior's
     observability: np.ndarray  # 6
     profile: TzProfile
-    left_out: np.ndarray  # K 8, how far the solution moves without a side of edges or a part of one
+    borders: np.ndarray  # K 8, how far borders of each part of a side may have moved it
     along_paint: np.ndarray  # 8, how far gradients along lines draw it
     left_out_in_time: np.ndarray  # K 8, how far it moves with the time offset of either half of the image
 
@@ -187,8 +185,8 @@ def _fix_unobservable(
         fixed = more_fixed
     # Labels that are off make an answer unsure. They do not make the prior the better answer: after what is fixed.
     curvature, variance = _curvature(problem, state, kernel), _prior_variance(problem)
-    moved = left_out(problem.terms, state, kernel, curvature, variance, fixed)
-    day = day.beside(moved)
+    borders = border_errors(problem.terms, state, kernel, curvature, variance, fixed)
+    day = day.beside(borders)
     unpainted = replace(problem, terms=problem.terms.of_kinds(edges=True, markings=False))
     drawn = along_paint(problem.terms, state, kernel, _curvature(unpainted, state, kernel), fixed)
     day = day.beside(drawn)
@@ -202,7 +200,7 @@ def _fix_unobservable(
         day.floors,
         observability,
         profile,
-        moved,
+        borders,
         drawn[0],
         np.zeros((0, 8)),
     )
@@ -276,9 +274,7 @@ def day_covariance(
         SCENE_DEGREES,
     )
     floor = np.where(fixed, 0.0, np.append(CAMERA_LIDAR_BIAS, [CAMERA_LIDAR_DT_FLOOR_S, 0.0]))
-    motion = motion_biases(terms, state, kernel, curvature, fixed, problem.motion)
-    # Masks, intrinsics and the lidar's mounting are the same every day.
-    floors = np.diag(floor**2) + motion.T @ motion
+    floors = np.diag(floor**2)  # masks and intrinsics are the same every day
     observability = np.clip(1 - np.diag(covariance + floors) / prior_variance, 0.0, 1.0)[:6]
     common = floors + prior_share(covariance, np.diag(problem.common_share / prior_variance))
     covariance = covariance + floors

@@ -58,8 +58,6 @@ class Schedule:
     time_offset_reach_s: float = 0.05
     time_offset_resamples: int = 200
 
-    # End of another start, with the same unknowns fixed.
-    start_steps: int = 3
     # Disjoint halves, from the solution of the whole.
     half_steps: int = 3
     # First and last part of the day, at each of two kernels.

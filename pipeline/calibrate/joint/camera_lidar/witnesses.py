@@ -27,17 +27,17 @@ from pipeline.calibrate.numerics.bias_floors import (
 from pipeline.calibrate.numerics.covariance import CLEARLY
 from pipeline.objective.camera_lidar.points import Points
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms
-from pipeline.rig.checks import FailedCheck
+from pipeline.rig.checks import FailedCheck, change_of
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT, Observation
 
-__all__ = ["Witness", "ask_witnesses", "disagreement", "widening", "witness_numbers"]
+__all__ = ["Witness", "ask_witnesses", "disagreement", "witness_numbers"]
 
 _REACH_RAD = np.radians(2.0)
 _STEP_PX = 0.5  # of the label image
 _RESAMPLES = 64
 _FEWEST_BLOCKS = 8  # with fewer, frames are resampled: two blocks know no scatter
 _FEWEST = 100  # edges, or markings, of a kind
-_WIDENING_SIGMAS, _SIGMAS = 2.0, 3.0
+_SIGMAS, _FLOORS = 2.0, 3.0  # by which two of them contradict: of both together
 _PAINT_FLOOR_PX = 0.5  # on 34 good days of thirteen rigs paint is off by up to 0.4
 # Medians over the boxes of eight good days of five rigs, at the true pose: pitch -.12 to -.30 deg, as the ground takes
 # the objects' feet, yaw -.25 to +.02; the real car -.10 and .00, KITTI -.17 and .02.
@@ -156,21 +156,22 @@ def _boxes(
 
 
 def disagreement(witnesses: Sequence[Witness]) -> list[FailedCheck]:
-    """A failed check for each axis about which two of them differ by more than three sigmas."""
-    return [
-        FailedCheck(
-            f"the evidence disagrees on {_AXES[a.axis]}: {a.sentence}, {b.sentence}", "witnesses_disagree"
-        )
-        for a, b in _contradictions(witnesses, _SIGMAS)
-    ]
+    """A failed check for each axis about which two contradict each other; its error is the larger of their offsets.
+
+    Sigma stays as it is: on known days half of the difference had nothing to do with the error, and a wider
+    sigma let radars move poses that were right.
+    """
+    return [_failed(a, b) for a, b in _contradictions(witnesses)]
 
 
-def widening(witnesses: Sequence[Witness]) -> Float[np.ndarray, " 2"]:
-    """Sigma of pitch and of yaw [rad] to add: half of the largest difference of more than two sigmas, else 0."""
-    sigma = np.zeros(2)
-    for a, b in _contradictions(witnesses, _WIDENING_SIGMAS):
-        sigma[a.axis] = abs(a.offset_rad - b.offset_rad) / 2
-    return sigma
+def _failed(a: Witness, b: Witness) -> FailedCheck:
+    right, about = max(a, b, key=lambda w: abs(w.offset_rad)), np.arange(6) == a.axis
+    return FailedCheck(
+        f"the evidence disagrees on {_AXES[a.axis]}: {a.sentence}, {b.sentence}",
+        "witnesses_disagree",
+        error=change_of(about * right.offset_rad),
+        covariance=np.diag(about * right.sigma_rad**2),
+    )
 
 
 def witness_numbers(witnesses: Sequence[Witness]) -> dict[str, float]:
@@ -183,8 +184,8 @@ def witness_numbers(witnesses: Sequence[Witness]) -> dict[str, float]:
     }
 
 
-def _contradictions(witnesses: Sequence[Witness], sigmas: float) -> list[tuple[Witness, Witness]]:
-    """The two parts that differ most in each axis, if by more than so many sigmas and three of their floors."""
+def _contradictions(witnesses: Sequence[Witness]) -> list[tuple[Witness, Witness]]:
+    """The two parts that differ most in each axis, if by more than two sigmas and three of their floors."""
     worst: dict[int, tuple[float, tuple[Witness, Witness]]] = {}
     for a, b in combinations(witnesses, 2):
         if _FIT in (a.name, b.name) and _BOXES not in (a.name, b.name):
@@ -193,8 +194,8 @@ def _contradictions(witnesses: Sequence[Witness], sigmas: float) -> list[tuple[W
             continue
         apart = abs(a.offset_rad - b.offset_rad)
         least = max(
-            sigmas * float(np.hypot(a.sigma_rad, b.sigma_rad)),
-            _SIGMAS * float(np.hypot(a.floor_rad, b.floor_rad)),
+            _SIGMAS * float(np.hypot(a.sigma_rad, b.sigma_rad)),
+            _FLOORS * float(np.hypot(a.floor_rad, b.floor_rad)),
         )
         if a.axis == b.axis and apart > max(least, worst.get(a.axis, (0.0,))[0]):
             worst[a.axis] = (apart, (a, b))

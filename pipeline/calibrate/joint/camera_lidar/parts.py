@@ -1,4 +1,4 @@
-"""The day's solution against others of the same day: where another start led, and those of its first and last part."""
+"""First and last part of a day, each with a camera-lidar rotation of its own, to see whether a sensor moved."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.calibrate.joint.camera_lidar.initialise import difference
 from pipeline.calibrate.joint.camera_lidar.observability import CameraLidarProblem, ObservabilityAnalysis
 from pipeline.calibrate.joint.camera_lidar.refine import (
     AlignmentState,
@@ -20,32 +19,13 @@ from pipeline.calibrate.joint.camera_lidar.refine import (
 )
 from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
 from pipeline.calibrate.numerics.change_point import parts_of_day
-from pipeline.calibrate.numerics.covariance import CLEARLY, bootstrap_covariance
+from pipeline.calibrate.numerics.covariance import bootstrap_covariance
 from pipeline.rig.estimates import DayParts
 from schemas.observations import Observation
 
-__all__ = ["parts_of_alignment", "starts_apart"]
+__all__ = ["parts_of_alignment"]
 
-_IS_TURN, _COMPARED = np.arange(8) < 3, np.arange(8) < 5
-
-
-def starts_apart(
-    scored: Scored, analysis: ObservabilityAnalysis, second: AlignmentState | None
-) -> Float[np.ndarray, " 8"]:
-    """How far from the solution a start of another origin ends; 0 where it ends in a clearly lower place."""
-    if second is None:
-        return np.zeros(8)
-    state = analysis.state
-    fixed = analysis.fixed | ~_COMPARED  # their profiles, not their starts, decide tz and the time offset
-    end = refine(
-        scored, replace(second, dt_s=state.dt_s, focal=state.focal), steps=SCHEDULE.start_steps, fixed=fixed
-    )
-    here, there = (scored.terms.score(s.alone, scored.kernel)[0] for s in (state, end))
-    lower = here - there
-    is_rival = lower.mean() < CLEARLY * lower.std() / np.sqrt(len(lower))
-    return difference(end, state) * ~fixed if is_rival else np.zeros(8)
-
-
+_IS_TURN = np.arange(8) < 3
 # Of each part's rotation without labels: a step of brightness shows no side, so parts of other scenes match other
 # borders. On a real and on a simulated day on which nothing moved, parts were .30 and .25 deg apart at a sigma of .06.
 _UNLABELLED_PART_RAD = float(np.radians(0.07))

@@ -1,14 +1,15 @@
-"""Bias of T_camera_lidar due to borders of other objects: how far it moves without one side, or one part of a side.
+"""Bias of T_camera_lidar due to borders of other objects: how far those of each part of a side pull the solution.
 
 Some borders in labels belong to another object than the lidar's edge: the roof above a car's window, the tree
 behind a hedge, the wheels below a sill. They are the same in all scenes, so neither scatter over scenes nor
 halves of the day show them. They differ between sides of objects, near and far, and left and right in the
-image. If such a part is wrong, the solution without it is another one. A part that pulls nothing changes
-nothing, however far its edges are from their borders. A side without an opposite one has nobody to
-contradict it: a usual shift of its borders is added. What moves all parts alike, such as a principal point,
-moves the solution with them and is not seen here.
+image: each such part pulls the solution by itself, and together they leave it where it is. The scatter of
+these pulls is the bias's variance (a sandwich whose clusters are the parts), times `BORDER_SHARE`. A part that
+pulls nothing changes nothing, however far its edges are from their borders. A side without an opposite one has
+nobody to contradict it: a usual shift of its borders is added. What moves all parts alike, such as a principal
+point, moves the solution with them and is not seen here.
 
-Source: jackknife over few clusters: MacKinnon, Nielsen, Webb 2023, https://doi.org/10.1002/jae.2969.
+Source: White 1982 (the sandwich); MacKinnon, Nielsen, Webb 2023, https://doi.org/10.1002/jae.2969 (few clusters).
 """
 
 from __future__ import annotations
@@ -21,13 +22,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, derivatives, scales
-from pipeline.calibrate.numerics.bias_floors import EDGE_SIDE_ALONE
+from pipeline.calibrate.numerics.bias_floors import BORDER_SHARE, EDGE_SIDE_ALONE
 from pipeline.calibrate.numerics.response_surface import at_least
 from pipeline.objective.camera_lidar.label_width import OUTWARD
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
 
-__all__ = ["left_out"]
+__all__ = ["border_errors"]
 
 _OPPOSITE: Final = {
     EDGE_LEFT: EDGE_RIGHT,
@@ -37,14 +38,13 @@ _OPPOSITE: Final = {
 }
 _RANGES: Final = (1 / 3, 2 / 3)  # quantiles of range that divide a side into near, middle and far
 _FEWEST = 10  # edges of a part, and three times as many of a side: fewer pull nothing
-# Shares that keep curvatures positive, assumed: of the Gauss-Newton curvature that the score's own has at least (as in
-# `refine`), and of the data's that remains at least without a part.
-_OF_PREDICTED, _REMAINS = 0.5, 0.1
+# Share of the Gauss-Newton curvature that the score's own has at least (as in `refine`): it keeps it positive.
+_OF_PREDICTED = 0.5
 _DEFINITE = 1e-3  # of the prior, added where the data say nothing
 _SMALL_PX = 0.5  # shift for finite differences, within the kernel
 
 
-def left_out(
+def border_errors(
     terms: Terms,
     state: AlignmentState,
     kernel: KernelSettings,
@@ -52,7 +52,7 @@ def left_out(
     prior_variance: Float[np.ndarray, " 8"],
     fixed: Bool[np.ndarray, " 8"],
 ) -> Float[np.ndarray, "K 8"]:
-    """Changes of a solution without each side of edges, and without each part of one: sigmas of its bias.
+    """Sigmas of a solution's bias: by how much borders of each part of a side may have moved it.
 
     Args:
         terms: points of the solution.
@@ -63,34 +63,29 @@ def left_out(
         fixed: unknowns that are not solved for.
 
     Returns:
-        One row per side and per part, in coordinates of `AlignmentState.changed` [rad, m, s]; their sum of
-        squares is the covariance.
+        One row per part, and per side without an opposite one, in coordinates of `AlignmentState.changed` [rad,
+        m, s]; their sum of squares is the covariance.
     """
     free, scale = np.flatnonzero(~fixed), scales(terms, kernel)
     parts = [(side, *_pull(part, state, kernel, scale)) for side, part in _parts(terms, state.T_camera_lidar)]
     if not parts:
         return np.zeros((0, 8))
-    sides = np.array([side for side, *_ in parts])
+    sides = {side for side, *_ in parts}
     gradient, own = (np.array(values) for values in list(zip(*parts, strict=True))[1:])
     _, of_paint = _pull(terms.of_kinds(edges=False, markings=True), state, kernel, scale)
     prior = np.diag(scale**2 / prior_variance)
     predicted = curvature * scale * scale[:, None] - (1 - _DEFINITE) * prior
-    data = at_least(own.sum(0) + of_paint, _OF_PREDICTED * predicted)
-    of_sides = [sides == side for side in np.unique(sides)]
-    rows = []
-    for groups in (of_sides, list(np.eye(len(parts), dtype=bool))):
-        share = np.sqrt(1 - 1 / len(groups))
-        for group in groups:
-            remains = at_least(data - own[group].sum(0), _REMAINS * data) + prior
-            step = np.zeros(8)
-            step[free] = np.linalg.solve(remains[np.ix_(free, free)], gradient[group].sum(0)[free])
-            rows.append(-share * step * scale)
-    for side in sorted(set(sides.tolist()) - {_OPPOSITE[side] for side in sides.tolist()}):
-        shifted = _shift_gradient(terms, state, kernel, scale, side)
-        step = np.zeros(8)
-        step[free] = np.linalg.solve((data + prior)[np.ix_(free, free)], shifted[free])
-        rows.append(step * scale)
-    return np.array(rows)
+    H = at_least(own.sum(0) + of_paint, _OF_PREDICTED * predicted) + prior
+    alone = [side for side in sorted(sides) if _OPPOSITE[side] not in sides]
+    pulls = np.vstack(
+        [
+            np.sqrt(BORDER_SHARE) * gradient,
+            *(_shift_gradient(terms, state, kernel, scale, side) for side in alone),
+        ]
+    )
+    rows = np.zeros_like(pulls)
+    rows[:, free] = np.linalg.solve(H[np.ix_(free, free)], pulls[:, free].T).T
+    return rows * scale
 
 
 def _parts(terms: Terms, T_camera_lidar: Float[np.ndarray, "4 4"]) -> Iterator[tuple[int, Terms]]:
