@@ -83,8 +83,7 @@ def _solved(
     if pair == "camera_radar":
         return estimate_camera_radar(observations, prior, config, rng, boxes="boxes" in config.terms), []
     aligned = align_camera_lidar(observations, prior, config, rng)
-    heading = _heading(observations, before.get("lidar_radar"), prior)
-    heading_rad = None if heading is None else heading[0]
+    heading_rad = _heading_rad(observations, before.get("lidar_radar"), prior)
     found = analyse_camera_lidar(aligned, np.random.default_rng([seed, 3]), heading_rad=heading_rad)
     found = replace(found, disproved=aligned.basin.doubt)
     # Intrinsics of a lost basin have no known accuracy.
@@ -117,12 +116,14 @@ def _without_terms(prior: Prior, config: SolveConfig) -> tuple[Prior, SolveConfi
     return prior, config
 
 
-def _heading(
+def _heading_rad(
     observations: Sequence[Observation], lidar_radar: _Found | None, prior: Prior
-) -> tuple[float, float] | None:
-    """Driving direction in lidar axes [rad] and its sigma, from the radar's Doppler and the prior; None if unknown."""
-    if lidar_radar is None or lidar_radar[1] or not lidar_radar[0].observable[2]:
-        return prior.heading
-    shown = shown_heading(observations, lidar_radar[0].T)
-    own = [] if shown is None else [(shown, float(np.sqrt(lidar_radar[0].covariance[2, 2])))]
-    return mean_heading([*own, *([] if prior.heading is None else [prior.heading])])
+) -> float | None:
+    """Driving direction in lidar axes, from the radar's Doppler and the prior; None if unknown."""
+    found = [] if prior.heading is None else [prior.heading]
+    if lidar_radar is not None and not lidar_radar[1] and lidar_radar[0].observable[2]:
+        shown = shown_heading(observations, lidar_radar[0].T)
+        own = [] if shown is None else [(shown, float(np.sqrt(lidar_radar[0].covariance[2, 2])))]
+        found = [*own, *found]
+    mean = mean_heading(found)
+    return None if mean is None else mean[0]

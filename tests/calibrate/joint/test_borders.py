@@ -7,11 +7,13 @@ import pytest
 
 from pipeline.calibrate.joint.camera_lidar.borders import border_errors
 from pipeline.calibrate.joint.camera_lidar.observability import along_the_way
-from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState
-from pipeline.calibrate.numerics.bias_floors import EDGE_SIDE_ALONE
+from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, Scored, refine
+from pipeline.calibrate.numerics.bias_floors import BORDER_SHARE, EDGE_SIDE_ALONE
+from pipeline.core.config import SolveConfig
 from pipeline.objective.camera_lidar.label_width import OUTWARD, label_width_px, widened
 from pipeline.objective.camera_lidar.score import KernelSettings, prepare_terms
-from pipeline.rig.changes import change_jacobian
+from pipeline.rig.changes import change_between, change_jacobian
+from pipeline.rig.estimates import Prior
 from schemas.observations import EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
 from tests.makers.traced_scenes import DENSE, T_TRUE, traced_day
 
@@ -87,6 +89,19 @@ def test_far_edges_beside_their_borders_make_yaw_unsure_if_they_pull(terms, kern
     assert yaw_deg(moved_by_borders(far_left_aside(terms, 2.0), kernel)) > 2 * good
     # Thirty pixels aside there is no border of theirs: they say nothing of the yaw, right or wrong.
     assert yaw_deg(moved_by_borders(far_left_aside(terms, 30.0), kernel)) < 1.5 * good
+
+
+def test_rows_are_by_how_much_the_parts_pull_the_solution(terms, kernel):
+    prior = Prior(T_TRUE, T_TRUE, float(np.sqrt(VARIANCE[0])), float(np.sqrt(VARIANCE[3])))
+
+    def found(some):
+        solved = refine(Scored(some, kernel, prior, SolveConfig()), STATE, steps=20, fixed=NOT_SOLVED)
+        return solved.T_camera_lidar, moved_by_borders(some, kernel)[:-1, 1].sum() / np.sqrt(BORDER_SHARE)
+
+    (T, before), (aside, after) = (found(some) for some in (terms, far_left_aside(terms, 1.0)))
+    moved = change_between(T, aside)[1]
+    assert abs(np.degrees(moved)) > 0.02
+    assert after - before == pytest.approx(moved, rel=0.4)
 
 
 def test_a_side_without_an_opposite_one_is_unsure_by_a_usual_shift_of_its_borders(terms, kernel):

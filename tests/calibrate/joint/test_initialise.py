@@ -141,7 +141,7 @@ def test_a_term_contradicts_an_end_only_where_its_own_lead_holds_over_the_frames
     scored = Scored(misled, kernel, prior, SolveConfig())
     search = initialise._Search(scored, evidence, np.arange(terms.frames))
     best, rival = (search._end("edges", AlignmentState(T)) for T in (T_TRUE, elsewhere))
-    basin = Basin(best.state, None, kernel, "edges", 2, (40.0, 0.0, 0.0), 13.0, 0.1, np.inf)
+    basin = Basin(best.state, kernel, "edges", 2, (40.0, 0.0, 0.0), 13.0, 0.1, np.inf)
     ahead = replace(rival, evidence=np.array([0.0, 30.0, 0.0]))
     doubt = search._doubt(basin, [ahead], is_last=True)
     assert doubt.startswith(said)
