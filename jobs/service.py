@@ -57,7 +57,8 @@ def service(
     )
     commit_records(tables, SERVICE_EVENTS, [event])
     about = {"vehicle": vehicle, "day": day, "sensor": sensor, "kind": kind, "withdrawn": withdraw}
-    print_summary("service", "done", **about, outputs=[tables.table(SERVICE_EVENTS.name)])
+    step = "status and states change with the next night, or with `boresight audit`"
+    print_summary("service", "done", **about, outputs=[tables.table(SERVICE_EVENTS.name)], next_steps=[step])
     return exit_code(["done"])
 
 

@@ -82,7 +82,7 @@ def test_the_summary_counts_vehicles_and_names_each_moved_sensor_once(lake):
     assert len({m["vehicle"] for m in moved_sensors(rows)}) == len(moved_sensors(rows))
 
 
-def test_a_red_vehicle_says_what_to_do_with_the_commands(lake, tmp_path):
+def test_a_red_vehicle_says_what_to_do_with_the_commands(lake, tmp_path, capsys):
     rows = [f for own in stored(lake).values() for f in own]
     steps = next_steps(rows, "my lake")
     assert [step.split(":")[0] for step in steps] == ["red", "yellow", "blind", "unknown"]
@@ -95,6 +95,8 @@ def test_a_red_vehicle_says_what_to_do_with_the_commands(lake, tmp_path):
     own = Lake.at(shutil.copytree(lake.root, tmp_path / "lake"))
     command = next_steps(rows, str(own.root))[0].split("`")[1]
     assert main(shlex.split(command)[1:]) == 0
+    assert "with the next night, or with `boresight audit`" in capsys.readouterr().out
+    assert status_of(stored(own)["red"]).status == "RED"
     audit_fleet(own, _config())
     assert status_of(stored(own)["red"]).status == "UNKNOWN"  # its charts begin anew
 
