@@ -85,9 +85,9 @@ def test_what_the_rest_contradicts_is_held_and_a_camera_that_its_own_frames_conf
     assert found["camera_lidar"].status == "accepted"
 
 
-@pytest.mark.parametrize("yaw_deg", [0.0, 0.3])
+@pytest.mark.parametrize("yaw_deg", [0.0, 0.1])
 def test_a_contradiction_frees_no_azimuth_that_it_does_not_know_itself(day, yaw_deg):
-    """Camera-radar shows a roll. Of azimuth it shows .3 deg at a sigma of .3: the record may be off by more."""
+    """Camera-radar shows a roll. Of azimuth it shows .1 deg at a sigma of .3: the record may be off by more."""
     found = records(day, roll_deg={"camera_radar": 1.5}, yaw_deg={"camera_radar": yaw_deg})["lidar_radar"]
     assert (found.status, found.faults) == ("held", ["witnesses_disagree"])
     assert "contradict each other" in found.reason

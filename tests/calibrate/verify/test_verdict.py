@@ -122,7 +122,7 @@ def test_a_check_that_knows_nothing_of_the_range_frees_no_range():
     )
     of_radar = estimate(pair="lidar_radar")
     assert verdict(of_radar, BETTER, [check]).status == "accepted"
-    far = replace(check, covariance=np.diag([1e-8, 1e-8, 1e-8, 0.1**2, 1e-8, 1e-8]))
+    far = replace(check, covariance=np.diag([1e-8, 1e-8, 1e-8, 0.04**2, 1e-8, 1e-8]))
     assert verdict(of_radar, BETTER, [far]).status == "held"
 
 
@@ -131,7 +131,8 @@ def test_a_check_that_may_hide_a_tilt_certifies_no_elevation():
     check = FailedCheck(
         "another edge contradicts", error=change_of((0.0, 0.0, 1e-4, 0.0, 0.0, 0.0)), covariance=known_to
     )
-    found = verdict(estimate(pair="lidar_radar"), BETTER, [check])
+    claims = {name: Claim(1e-4, 0.0, 1e-4, 1e-4, 0.6 * DEG, 0.995) for name in DIRECTIONS}
+    found = verdict(estimate(pair="lidar_radar"), BETTER, [check], claims)
     assert (found.status, found.determined) == ("accepted", ("azimuth",))
 
 
