@@ -9,16 +9,15 @@ from schemas.observations import STEP_BELOW, STEP_RIGHT
 HEIGHT, WIDTH = 60, 90
 
 
-def edge_at(place_px, dark=60.0, bright=150.0):
-    """Image that is bright to the right of a place; pixel centres are at whole numbers."""
-    share = np.clip(np.arange(WIDTH) + 0.5 - place_px, 0.0, 1.0)
-    return np.tile(np.round(dark + (bright - dark) * share), (HEIGHT, 1)).astype(np.uint8)
+def uniform(shade=120):
+    return np.full((HEIGHT, WIDTH), shade, np.uint8)
 
 
 @pytest.mark.parametrize("place_px", [30.0, 30.3, 30.7, 61.0])
 @pytest.mark.parametrize("is_upright", [True, False])
 def test_a_step_is_found_to_half_a_pixel_where_it_is_and_nowhere_else(place_px, is_upright):
-    grey = edge_at(place_px)
+    share = np.clip(np.arange(WIDTH) + 0.5 - place_px, 0.0, 1.0)  # pixel centres are at whole numbers
+    grey = np.tile(np.round(60 + 90 * share), (HEIGHT, 1)).astype(np.uint8)
     bit, other = (STEP_RIGHT, STEP_BELOW) if is_upright else (STEP_BELOW, STEP_RIGHT)
     found = brightness_steps(grey if is_upright else np.ascontiguousarray(grey.T))
     along = found if is_upright else found.T
@@ -28,12 +27,9 @@ def test_a_step_is_found_to_half_a_pixel_where_it_is_and_nowhere_else(place_px, 
     assert np.abs(columns + 0.5 - place_px).max() <= 0.5
 
 
-def test_a_uniform_picture_has_no_steps():
-    assert not brightness_steps(np.full((HEIGHT, WIDTH), 120, np.uint8)).any()
-
-
 def test_short_runs_are_grain_and_no_borders():
-    grey = np.full((HEIGHT, WIDTH), 120, np.uint8)
+    grey = uniform()
+    assert not brightness_steps(grey).any()
     grey[20:24, 40:44] = 200
     grey[30:50, 60:80] = 200
     rows, _ = np.nonzero(brightness_steps(grey) & STEP_RIGHT)
@@ -43,7 +39,7 @@ def test_short_runs_are_grain_and_no_borders():
 
 def test_a_pole_keeps_its_steps_where_another_border_crosses_it():
     # A gap there, at one height in all frames of a street, turned the camera by .2 deg at a sigma of .05.
-    grey = np.full((HEIGHT, WIDTH), 50, np.uint8)
+    grey = uniform(50)
     grey[:30] = 230
     grey[:, 40:46] = 150
     steps = brightness_steps(grey)

@@ -1,4 +1,4 @@
-"""DBSCAN against its definition and against scikit-learn."""
+"""DBSCAN against its definition."""
 
 import numpy as np
 import pytest
@@ -22,10 +22,6 @@ def textbook(points, eps, min_points):
     return near, core, component
 
 
-def same_partition(a, b):
-    return len(set(zip(a.tolist(), b.tolist(), strict=True))) == len(set(a.tolist())) == len(set(b.tolist()))
-
-
 @pytest.mark.parametrize("dimensions", [2, 3])
 @pytest.mark.parametrize("seed", range(6))
 def test_clusters_are_those_of_the_definition(dimensions, seed):
@@ -36,7 +32,8 @@ def test_clusters_are_those_of_the_definition(dimensions, seed):
     points = np.concatenate([*blobs, rng.uniform(-10, 10, (60, dimensions))])
     label = dbscan(points, 0.6, 5)
     near, core, component = textbook(points, 0.6, 5)
-    assert same_partition(label[core], component[core])
+    pairs = set(zip(label[core].tolist(), component[core].tolist(), strict=True))
+    assert len(pairs) == len(set(label[core])) == len(set(component[core]))
     reachable = (near & core).any(axis=1)
     assert np.array_equal(label >= 0, reachable)
     for border in np.flatnonzero(reachable & ~core):
@@ -44,30 +41,11 @@ def test_clusters_are_those_of_the_definition(dimensions, seed):
         assert label[border] == label[np.argmin(distance)]
 
 
-def test_the_order_of_points_does_not_matter():
-    rng = np.random.default_rng(1)
-    points = rng.normal(0, 2, (500, 3))
-    shuffle = rng.permutation(len(points))
-    assert same_partition(dbscan(points, 0.5, 4)[shuffle], dbscan(points[shuffle], 0.5, 4))
-
-
-def test_core_points_agree_with_scikit_learn_at_the_size_of_a_sweep():
-    from sklearn.cluster import DBSCAN
-
-    rng = np.random.default_rng(2)
-    points = np.concatenate(
-        [rng.normal(rng.uniform(-50, 50, 3) * [1, 1, 0.05], 0.5, (100, 3)) for _ in range(60)]
-    )
-    theirs = DBSCAN(eps=0.7, min_samples=8).fit_predict(points)
-    ours = dbscan(points, 0.7, 8)
-    assert np.array_equal(ours < 0, theirs < 0)
-    assert np.mean(ours[ours >= 0] != theirs[ours >= 0]) < 0.02 or same_partition(ours, theirs)
-
-
-def test_no_points_and_lone_points_make_no_cluster():
-    assert dbscan(np.zeros((0, 3)), 1.0, 2).shape == (0,)
-    assert dbscan(np.array([[0.0, 0, 0], [5, 0, 0]]), 1.0, 2).tolist() == [-1, -1]
-    assert dbscan(np.array([[0.0, 0, 0], [1, 0, 0]]), 1.0, 2).tolist() == [0, 0]  # eps itself is near
+@pytest.mark.parametrize(
+    ("x", "labels"), [([], []), ([0.0, 5.0], [-1, -1]), ([0.0, 1.0], [0, 0])]
+)  # eps itself is near
+def test_no_points_and_lone_points_make_no_cluster(x, labels):
+    assert dbscan(np.outer(x, [1.0, 0, 0]), 1.0, 2).tolist() == labels
 
 
 def test_points_kilometres_astray_change_no_cluster():

@@ -21,10 +21,15 @@ def post_before_wall(step_deg=0.2, elevations_deg=(-3.0, -1.0, 1.0, 3.0), post_t
     return xyz, ring, np.where(post, 0, -1).ravel().astype(np.int32)
 
 
-@pytest.mark.parametrize("with_ring", [True, False])
-def test_sides_ranges_and_directions_of_a_post(with_ring):
+@pytest.mark.parametrize("logged", ["rings", "no rings", "shuffled and renumbered"])
+def test_sides_ranges_and_directions_of_a_post(logged):
     xyz, ring, cluster = post_before_wall()
-    edges = lidar_edges(xyz, ring if with_ring else None, cluster, CONFIG)
+    if logged == "no rings":
+        ring = None
+    elif logged != "rings":
+        order = np.random.default_rng(0).permutation(len(xyz))
+        xyz, ring, cluster = xyz[order], np.array([2, 0, 3, 1], np.uint16)[ring[order]], cluster[order]
+    edges = lidar_edges(xyz, ring, cluster, CONFIG)
     aer = to_spherical(edges.xyz_m.astype(float))
     assert np.bincount(edges.side, minlength=4)[[EDGE_LEFT, EDGE_RIGHT, EDGE_ABOVE]].tolist() == [2, 2, 0]
     # Left in the image is a larger azimuth; the post ends between the beams at 2.0 and 2.2 deg.
@@ -37,37 +42,21 @@ def test_sides_ranges_and_directions_of_a_post(with_ring):
     assert (edges.points == np.count_nonzero(cluster == 0)).all()
 
 
-def test_edges_do_not_depend_on_the_order_of_points_or_the_numbering_of_rings():
-    xyz, ring, cluster = post_before_wall()
-    shuffled = np.random.default_rng(0).permutation(len(xyz))
-    renumbered = np.array([2, 0, 3, 1], np.uint16)[ring]
-    a, b = (
-        lidar_edges(xyz, ring, cluster, CONFIG),
-        lidar_edges(xyz[shuffled], renumbered[shuffled], cluster[shuffled], CONFIG),
-    )
-    assert sorted(map(tuple, a.xyz_m.round(3))) == sorted(map(tuple, b.xyz_m.round(3)))
-
-
-def test_many_missing_returns_make_no_edge_and_one_makes_a_wider_gap():
+@pytest.mark.parametrize(
+    ("gone_deg", "between_deg", "gaps_deg"),
+    [((2.1, 2.3), None, [0.4]), ((2.1, 3.1), None, []), (None, 2.2, [0.2])],
+    ids=["one return missing", "many returns missing", "a point between two surfaces"],
+)
+def test_missing_and_mixed_returns_at_a_border(gone_deg, between_deg, gaps_deg):
     xyz, ring, cluster = post_before_wall(elevations_deg=(-1.0,))
     azimuth = np.degrees(to_spherical(xyz.astype(float))[:, 0])
-    one = ~np.isclose(azimuth, 2.2, atol=0.01)
-    edges = lidar_edges(xyz[one], ring[one], cluster[one], CONFIG)
-    assert np.degrees(edges.gap_rad[edges.side == EDGE_RIGHT]) == pytest.approx([0.4], abs=0.01)
-    many = ~((azimuth > 2.1) & (azimuth < 3.1))
-    assert not (lidar_edges(xyz[many], ring[many], cluster[many], CONFIG).side == EDGE_RIGHT).any()
-
-
-def test_a_point_between_two_surfaces_adds_no_second_edge():
-    xyz, ring, cluster = post_before_wall(elevations_deg=(-1.0,))
-    azimuth = np.degrees(to_spherical(xyz.astype(float))[:, 0])
-    mixed = np.isclose(azimuth, 2.2, atol=0.01)
-    xyz[mixed] *= 20.0 / 30.0
-    edges = lidar_edges(xyz, ring, cluster, CONFIG)
-    assert np.count_nonzero(edges.side == EDGE_RIGHT) == 1
-    assert to_spherical(edges.xyz_m[edges.side == EDGE_RIGHT].astype(float))[0, 2] == pytest.approx(
-        10.0, abs=1e-3
-    )
+    if between_deg:
+        xyz[np.isclose(azimuth, between_deg, atol=0.01)] *= 20.0 / 30.0
+    kept = ~((azimuth > gone_deg[0]) & (azimuth < gone_deg[1])) if gone_deg else np.full(len(xyz), True)
+    edges = lidar_edges(xyz[kept], ring[kept], cluster[kept], CONFIG)
+    right = edges.side == EDGE_RIGHT
+    assert np.degrees(edges.gap_rad[right]) == pytest.approx(gaps_deg, abs=0.01)
+    np.testing.assert_allclose(to_spherical(edges.xyz_m[right].astype(float))[:, 2], 10.0, atol=1e-3)
 
 
 def scattered(range_of, seed=0, points=24000):
@@ -118,8 +107,7 @@ def test_the_road_under_a_sweep_without_rows_has_no_edges(logged):
     assert len(edges.side) == 0
 
 
-def test_empty_and_tiny_clouds_have_no_edges():
-    for n in (0, 1, 5):
-        edges = lidar_edges(np.full((n, 3), 5, np.float32), None, np.full(n, -1, np.int32), CONFIG)
-        assert len(edges.side) == 0
-        assert edges.xyz_m.shape == (0, 3)
+@pytest.mark.parametrize("count", [0, 1, 5])
+def test_empty_and_tiny_clouds_have_no_edges(count):
+    edges = lidar_edges(np.full((count, 3), 5, np.float32), None, np.full(count, -1, np.int32), CONFIG)
+    assert (len(edges.side), edges.xyz_m.shape) == (0, (0, 3))

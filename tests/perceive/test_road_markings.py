@@ -10,13 +10,10 @@ def test_paint_stands_out_of_rings_of_different_brightness():
     azimuth = np.tile(np.linspace(-0.5, 0.5, 400), 3)
     ring = np.repeat(np.arange(3, dtype=np.uint16), 400)
     radius = np.array([7.0, 10.0, 15.0])[ring]
-    xyz = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), np.full(1200, -1.8)], -1).astype(
-        np.float32
-    )
+    xyz = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), np.full(1200, -1.8)], -1)
     paint = np.abs(xyz[:, 1] - 1.0) < 0.1
-    intensity = (np.array([10.0, 30.0, 60.0])[ring] + 25 * paint + rng.normal(0, 1.5, 1200)).astype(
-        np.float32
-    )
+    intensity = np.array([10.0, 30.0, 60.0])[ring] + 25 * paint + rng.normal(0, 1.5, 1200)
+    xyz, intensity = xyz.astype(np.float32), intensity.astype(np.float32)
     for rings in (ring, None):
         marks = lidar_markings(xyz, intensity, rings, np.ones(1200, bool))
         bright = marks.xyz_m[marks.z > 6.0]

@@ -1,6 +1,7 @@
 """The stage: frames in, observations out; faults are counted, and the same work is not done twice."""
 
 from dataclasses import replace
+from itertools import count
 
 import cv2
 import numpy as np
@@ -19,41 +20,43 @@ from tests.makers.lakes import write_frames
 from tests.makers.stages import perceive_day
 
 DAY = Partition("car-1", "2026-03-02")
+COUNT = count()
+NONE = np.zeros(0, np.float32)
 
 
-def fleet(**perceive):
-    return FleetConfig.model_validate(
-        {
-            "fleet": {"name": "made"},
-            "rigs": {"default": THREE_SENSORS},
-            "vehicles": {"car-1": {}},
-            "perceive": perceive,
-        }
-    )  # fmt: skip
+def fleet(rig=THREE_SENSORS, **perceive):
+    values = {"rigs": {"default": rig}, "vehicles": {"car-1": {}}, "perceive": perceive}
+    return FleetConfig.model_validate({"fleet": {"name": "made"}} | values)
 
 
-def write(lake, frames, key="frames-key"):
-    write_frames(lake, DAY, frames, key)
+def stage(lake, frames=None, config=None):
+    """What the stage makes of frames, or of those of before: its result and its rows."""
+    if frames is not None:
+        write_frames(lake, DAY, frames, key=f"frames {next(COUNT)}")
+    result = perceive_day(DAY, config or fleet(), lake)
+    return result, list(observations_of(lake, DAY))
 
 
 @pytest.fixture
-def lake(tmp_path, made_frame):
-    """A lake with one drive of five frames."""
-    lake = Lake.at(tmp_path / "lake")
-    write(lake, [made_frame(i) for i in range(5)])
-    return lake
+def lake(tmp_path):
+    return Lake.at(tmp_path / "lake")
 
 
-def rows(lake):
-    return list(observations_of(lake, DAY))
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, made_frame):
+    """Result and rows of a drive of five frames."""
+    return stage(Lake.at(tmp_path_factory.mktemp("whole")), [made_frame(i) for i in range(5)])
 
 
-def test_a_days_frames_become_observations(lake):
-    result = perceive_day(DAY, fleet(), lake)
+def changed(made_frame, count=5, **fields):
+    return [replace(made_frame(i), **fields) for i in range(count)]
+
+
+def test_a_days_frames_become_observations(whole):
+    result, rows = whole
     assert (result.stage, result.status, result.rows, result.rejected) == ("perceive", "done", 5, {})
-    observations = rows(lake)
-    assert [o.frame_index for o in observations] == [0, 1, 2, 3, 4]
-    for o in observations:
+    assert [o.frame_index for o in rows] == [0, 1, 2, 3, 4]
+    for k, o in enumerate(rows, start=1):
         assert o.ground_plane[3] == pytest.approx(1.7, abs=0.05)
         assert o.ego_speed_mps == pytest.approx(8.0, abs=0.1)
         assert o.road_user_classes == ["car", "person"]
@@ -64,137 +67,103 @@ def test_a_days_frames_become_observations(lake):
         car = np.array([14.1, 0.0, -0.8])
         assert np.min(np.linalg.norm(o.lidar_cluster_centre_m - car, axis=1)) < 0.3
         assert np.all(o.radar_drivable_range_m > 3)
-
-
-def test_the_car_ahead_is_one_track_through_the_drive(lake):
-    perceive_day(DAY, fleet(), lake)
-    tracked = [(o.radar_track_id.tolist(), o.radar_track_age.tolist()) for o in rows(lake)]
-    assert tracked == [([0], [k]) for k in range(1, 6)]
-    last = rows(lake)[-1]
-    assert last.radar_track_velocity_mps[0] == pytest.approx([5.0, 0.0, 0.0], abs=0.5)
+        assert (o.radar_track_id.tolist(), o.radar_track_age.tolist()) == ([0], [k])
+    assert rows[-1].radar_track_velocity_mps[0] == pytest.approx([5.0, 0.0, 0.0], abs=0.5)
 
 
 def test_a_radar_that_looks_back_still_drives_forwards(lake, made_frame):
     frame = made_frame(0)
-    turned = replace(
-        frame, radar_x_m=-frame.radar_x_m, radar_y_m=-frame.radar_y_m,
-        priors={"lidar_radar": np.diag([-1.0, -1.0, 1.0, 1.0])},
-    )  # fmt: skip
-    write(lake, [turned], key="turned")
-    perceive_day(DAY, fleet(), lake)
-    [row] = rows(lake)
+    turned = {"radar_x_m": -frame.radar_x_m, "radar_y_m": -frame.radar_y_m}
+    priors = {"lidar_radar": np.diag([-1.0, -1.0, 1.0, 1.0])}
+    _, [row] = stage(lake, [replace(frame, **turned, priors=priors)])
     assert row.radar_velocity_mps[0] == pytest.approx(-8.0, abs=0.1)
     assert row.ego_speed_mps == pytest.approx(8.0, abs=0.1)
 
 
-def test_the_same_work_is_cached_and_other_work_is_not(lake, made_frame):
-    first = perceive_day(DAY, fleet(), lake)
-    again = perceive_day(DAY, fleet(), lake)
-    assert (again.status, again.work_key, again.rows) == ("cached", first.work_key, 5)
-    other = perceive_day(DAY, fleet(voxel_m=0.5), lake)
-    assert other.status == "done"
-    assert other.work_key != first.work_key
-    write(lake, [made_frame(0)], key="other-key")
-    assert perceive_day(DAY, fleet(voxel_m=0.5), lake).rows == 1
-
-
-def test_the_same_frames_give_the_same_bytes(lake, tmp_path, made_frame):
-    perceive_day(DAY, fleet(), lake)
-    twin = Lake.at(tmp_path / "twin")
-    write(twin, [made_frame(i) for i in range(5)])
-    perceive_day(DAY, fleet(), twin)
-    for a, b in zip(rows(lake), rows(twin), strict=True):
+def test_the_same_work_is_cached_other_work_is_not_and_the_same_frames_give_the_same_bytes(
+    lake, made_frame, whole
+):
+    seen = []
+    write_frames(lake, DAY, changed(made_frame), "frames-key")
+    first = perceive_day(DAY, fleet(), lake, progress=lambda *told: seen.append(told))
+    assert seen == [(k, 5, "perceive") for k in range(1, 6)]
+    for a, b in zip(observations_of(lake, DAY), whole[1], strict=True):
         assert a.labels_png == b.labels_png
         for name in ("lidar_map_xyz_m", "lidar_edge_xyz_m", "marking_z", "ground_plane", "radar_track_xyz_m"):
             assert np.array_equal(getattr(a, name), getattr(b, name)), name
+    again, _ = stage(lake)
+    assert (again.status, again.work_key, again.rows) == ("cached", first.work_key, 5)
+    other, _ = stage(lake, config=fleet(voxel_m=0.5))
+    assert other.status == "done"
+    assert other.work_key != first.work_key
+    assert stage(lake, [made_frame(0)], fleet(voxel_m=0.5))[0].rows == 1
 
 
 def test_bad_frames_are_counted_by_reason_and_do_not_stop_the_day(lake, made_frame):
-    frames = [made_frame(i) for i in range(8)]
-    frames[1] = replace(frames[1], image=b"broken")
-    frames[2] = replace(frames[2], labels_png=None)
-    frames[3] = replace(frames[3], detection_boxes_px=None, detection_classes=None, detection_scores=None)
-    frames[4] = replace(frames[4], **{f"lidar_{a}_m": np.full(6000, np.nan, np.float32) for a in "xyz"})
-    frames[5] = replace(frames[5], camera_D=np.zeros(3))
-    none = np.zeros(0, np.float32)
-    frames[6] = replace(frames[6], radar_x_m=none, radar_y_m=none, radar_z_m=none, radar_range_rate_mps=none)
-    write(lake, frames, key="faulty")
-    result = perceive_day(DAY, fleet(), lake)
+    faults = {
+        "image_undecodable": {"image": b"broken"},
+        "labels_missing": {"labels_png": None},
+        "detections_missing": dict.fromkeys(f"detection_{k}" for k in ("boxes_px", "classes", "scores")),
+        "lidar_points_too_few": {f"lidar_{a}_m": np.full(6000, np.nan, np.float32) for a in "xyz"},
+        "camera_model_invalid": {"camera_D": np.zeros(3)},
+        "radar_points_too_few": dict.fromkeys(
+            [*(f"radar_{a}_m" for a in "xyz"), "radar_range_rate_mps"], NONE
+        ),
+    }
+    frames = [replace(made_frame(i), **fault) for i, fault in enumerate([{}, *faults.values(), {}])]
+    result, rows = stage(lake, frames)
     assert result.status == "done"
-    assert [o.frame_index for o in rows(lake)] == [0, 7]
-    assert result.rejected == {
-        "image_undecodable": 1, "labels_missing": 1, "detections_missing": 1, "lidar_points_too_few": 1,
-        "camera_model_invalid": 1, "radar_points_too_few": 1,
-    }  # fmt: skip
+    assert [o.frame_index for o in rows] == [0, 7]
+    assert result.rejected == dict.fromkeys(faults, 1)
     assert perceived(lake, DAY).rejected == result.rejected
 
 
 def test_points_that_are_not_numbers_are_left_out(lake, made_frame):
-    frame = made_frame(0)
-    x = frame.lidar_x_m.copy()
+    x = made_frame(0).lidar_x_m.copy()
     x[::7] = np.nan
-    write(lake, [replace(frame, lidar_x_m=x)], key="nan")
-    perceive_day(DAY, fleet(), lake)
-    assert np.isfinite(rows(lake)[0].lidar_map_xyz_m).all()
+    _, [row] = stage(lake, changed(made_frame, 1, lidar_x_m=x))
+    assert np.isfinite(row.lidar_map_xyz_m).all()
 
 
 def test_points_of_a_deskewed_sweep_keep_their_times_and_those_as_logged_do_not(lake, made_frame):
     frame = made_frame(0)
     times = (frame.lidar_x_m * 1e-3).astype(np.float32)  # so that a point tells its own
-    frames = [replace(made_frame(i), lidar_time_s=times, lidar_deskewed=i == 0) for i in range(2)]
-    write(
-        lake, [replace(f, radar_range_rate_mps=f.radar_range_rate_mps * np.nan) for f in frames], key="timed"
+    still = {"lidar_time_s": times, "radar_range_rate_mps": frame.radar_range_rate_mps * np.nan}
+    _, [kept, as_logged] = stage(
+        lake, [replace(made_frame(i), lidar_deskewed=i == 0, **still) for i in range(2)]
     )
-    perceive_day(DAY, fleet(), lake)
-    kept, as_logged = rows(lake)
     assert np.array_equal(kept.lidar_map_time_s, (kept.lidar_map_xyz_m[:, 0] * 1e-3).astype(np.float32))
     assert as_logged.lidar_map_time_s is None
 
 
 def test_sweeps_without_rows_are_counted_and_still_show_edges(lake, made_frame):
     lasers = np.random.default_rng(0).integers(0, 6, len(made_frame(0).lidar_x_m)).astype(np.uint16)
-    frames = [
-        made_frame(0),
-        replace(made_frame(1), lidar_ring=lasers),
-        replace(made_frame(2), lidar_ring=lasers),
-    ]
-    write(lake, frames, key="rosette")
-    result = perceive_day(DAY, fleet(), lake)
+    result, rows = stage(lake, [made_frame(0), *changed(made_frame, 3, lidar_ring=lasers)[1:]])
     assert (result.kept, result.rejected) == ({"frames": 3, WITHOUT_ROWS: 2}, {})
-    assert all(len(o.lidar_edge_xyz_m) > 0 for o in rows(lake))
+    assert all(len(o.lidar_edge_xyz_m) > 0 for o in rows)
 
 
 def test_sensors_that_say_little_are_enough(lake, made_frame):
     # No rings, no reflectivity, no power, no elevation: what many sensors log.
-    frame = made_frame(0)
-    bare = replace(
-        frame, lidar_ring=None, lidar_intensity=None, radar_power_db=None,
-        radar_z_m=np.zeros_like(frame.radar_z_m), radar_has_elevation=False,
-    )  # fmt: skip
-    write(lake, [bare], key="bare")
-    assert perceive_day(DAY, fleet(), lake).rows == 1
-    assert rows(lake)[0].marking_xyz_m.shape == (0, 3)
-    assert len(rows(lake)[0].lidar_edge_xyz_m) > 0
+    bare = dict.fromkeys(("lidar_ring", "lidar_intensity", "radar_power_db"))
+    flat = {"radar_z_m": np.zeros_like(made_frame(0).radar_z_m), "radar_has_elevation": False}
+    _, [row] = stage(lake, changed(made_frame, 1, **bare, **flat))
+    assert row.marking_xyz_m.shape == (0, 3)
+    assert len(row.lidar_edge_xyz_m) > 0
 
 
 def test_a_day_without_a_usable_frame_is_refused_and_leaves_no_stale_observations(lake, made_frame):
-    perceive_day(DAY, fleet(), lake)
-    unlabelled = [replace(made_frame(i), labels_png=None, sensors=["camera", "lidar"]) for i in range(3)]
-    write(lake, unlabelled, key="unlabelled")
-    for _ in range(2):
-        result = perceive_day(DAY, fleet(), lake)
-        assert result.status == "refused"
+    stage(lake, [made_frame(0)])
+    for frames in (changed(made_frame, 3, labels_png=None, sensors=["camera", "lidar"]), None):
+        result, rows = stage(lake, frames)
+        assert (result.status, rows) == ("refused", [])
         assert "3 labels_missing" in result.reason
-        assert rows(lake) == []
 
 
-def test_a_day_without_labels_keeps_lidar_and_radar(lake, made_frame):
-    perceive_day(DAY, fleet(), lake)
-    whole = rows(lake)
-    write(lake, [replace(made_frame(i), labels_png=None) for i in range(5)], key="unlabelled")
-    result = perceive_day(DAY, fleet(), lake)
+def test_a_day_without_labels_keeps_lidar_and_radar(lake, made_frame, whole):
+    result, rows = stage(lake, changed(made_frame, labels_png=None))
     assert (result.status, result.rejected) == ("done", {"without_camera_labels_missing": 5})
-    for a, b in zip(rows(lake), whole, strict=True):
+    for a, b in zip(rows, whole[1], strict=True):
         assert a.sensors == ["lidar", "radar"]
         assert (a.labels_png, len(a.road_user_boxes_px), a.road_contrast_png) == (b"", 0, None)
         np.testing.assert_array_equal(a.lidar_edge_xyz_m, b.lidar_edge_xyz_m)
@@ -202,22 +171,16 @@ def test_a_day_without_labels_keeps_lidar_and_radar(lake, made_frame):
 
 
 def test_a_camera_without_semantics_shows_steps_of_brightness_and_is_told_how_to_have_labels(
-    lake, made_frame
+    lake, made_frame, whole
 ):
-    perceive_day(DAY, fleet(), lake)
-    whole, bare = rows(lake), fleet()
-    rig = bare.rigs["default"]
-    cameras = {"camera": rig.cameras["camera"].model_copy(update={"semantics": None})}
-    bare = bare.model_copy(update={"rigs": {"default": rig.model_copy(update={"cameras": cameras})}})
-    write(
-        lake, [replace(made_frame(i), labels_png=None, detection_boxes_px=None) for i in range(5)], key="bare"
-    )
-    result = perceive_day(DAY, bare, lake)
+    bare = {"camera": {k: v for k, v in THREE_SENSORS["camera"].items() if k != "semantics"}}
+    frames = changed(made_frame, labels_png=None, detection_boxes_px=None)
+    result, rows = stage(lake, frames, fleet(THREE_SENSORS | bare))
     assert (result.status, result.rows, result.rejected) == ("done", 5, {})
     assert result.reason.startswith(f"camera: {WITHOUT_LABELS}")
     assert "[rigs.default.cameras.camera.semantics]" in result.reason
     assert "boresight models fetch" in result.reason
-    for a, b in zip(rows(lake), whole, strict=True):
+    for a, b in zip(rows, whole[1], strict=True):
         assert (a.sensors, a.is_unlabelled, b.is_unlabelled) == (b.sensors, True, False)
         labels, steps = (
             cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE)
@@ -229,36 +192,29 @@ def test_a_camera_without_semantics_shows_steps_of_brightness_and_is_told_how_to
         np.testing.assert_array_equal(a.lidar_edge_xyz_m, b.lidar_edge_xyz_m)
 
 
+SHOWN_BY = {"camera": "labels_png", "lidar": "lidar_map_xyz_m", "radar": "radar_xyz_m"}
+
+
 @pytest.mark.parametrize("sensor", SENSORS)
-def test_what_a_missing_sensor_would_show_is_empty_and_the_others_are_perceived(lake, made_frame, sensor):
-    perceive_day(DAY, fleet(), lake)
-    whole, others = rows(lake), [s for s in SENSORS if s != sensor]
-    none = np.zeros(0, np.float32)
+def test_what_a_missing_sensor_would_show_is_empty_and_the_others_are_perceived(
+    lake, made_frame, whole, sensor
+):
+    others = [s for s in SENSORS if s != sensor]
     gone = {
         "camera": {"image": b"", "camera_model": "", "camera_K": np.full((3, 3), np.nan), "labels_png": None},
-        "lidar": {f"lidar_{axis}_m": none for axis in "xyz"} | {"lidar_ring": None, "lidar_intensity": None},
-        "radar": {f"radar_{axis}_m": none for axis in "xyz"} | {"radar_range_rate_mps": none},
+        "lidar": {f"lidar_{axis}_m": NONE for axis in "xyz"} | {"lidar_ring": None, "lidar_intensity": None},
+        "radar": {f"radar_{axis}_m": NONE for axis in "xyz"} | {"radar_range_rate_mps": NONE},
     }[sensor]
-    frames = [replace(made_frame(i), sensors=others, **gone) for i in range(5)]
-    write(lake, frames, key=f"no {sensor}")
-    result = perceive_day(DAY, fleet(), lake)
-    assert (result.status, result.rows, result.rejected) == ("done", 5, {})
-    for a, b in zip(rows(lake), whole, strict=True):
+    result, rows = stage(lake, changed(made_frame, 2, sensors=others, **gone))
+    assert (result.status, result.rows, result.rejected) == ("done", 2, {})
+    for a, b in zip(rows, whole[1][:2], strict=True):
         assert a.sensors == others
-        shown = {"camera": a.labels_png, "lidar": a.lidar_map_xyz_m, "radar": a.radar_xyz_m}
-        was = {"camera": b.labels_png, "lidar": b.lidar_map_xyz_m, "radar": b.radar_xyz_m}
-        assert len(shown.pop(sensor)) == 0
-        assert all(np.array_equal(shown[s], was[s]) for s in shown)
+        assert len(getattr(a, SHOWN_BY[sensor])) == 0
+        assert all(np.array_equal(getattr(a, SHOWN_BY[s]), getattr(b, SHOWN_BY[s])) for s in others)
 
 
 def test_a_day_without_frames_and_an_unknown_vehicle_are_named(lake):
     with pytest.raises(ContractError, match="ingest"):
-        perceive_day(Partition("car-1", "2026-03-03"), fleet(), lake)
+        perceive_day(DAY, fleet(), lake)
     with pytest.raises(ConfigError, match="car-2"):
         perceive_day(Partition("car-2", DAY.day), fleet(), lake)
-
-
-def test_progress_counts_every_frame(lake):
-    seen = []
-    perceive_day(DAY, fleet(), lake, progress=lambda done, total, what: seen.append((done, total, what)))
-    assert seen == [(k, 5, "perceive") for k in range(1, 6)]

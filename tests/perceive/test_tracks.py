@@ -55,11 +55,10 @@ class World:
 
 
 USERS = [
-    ([40.0, 3.0], [-13.0, 0.2]),
-    ([18.0, -0.5], [11.0, 0.0]),
-    ([30.0, -8.0], [-0.5, 1.6]),
+    ([40.0, 3.0], [-13.0, 0.2]), ([18.0, -0.5], [11.0, 0.0]), ([30.0, -8.0], [-0.5, 1.6]),
     ([25.0, 12.0], [4.0, -6.0]),
-]
+]  # fmt: skip
+NOTHING = ClusterReturns(np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros(0, np.int32))
 
 
 @pytest.mark.parametrize("period", [PERIOD_MPS, None])
@@ -81,74 +80,62 @@ def test_each_road_user_keeps_one_identity(step_s):
 
 
 def test_measured_centres_are_reported_without_filter_lag():
-    world = World(USERS)
-    returns = world.returns(0.0)
+    returns = World(USERS).returns(0.0)
     _, tracks = advance_tracks(TrackState.empty(), 0, 0, EgoMotion((12.0, 0.0), 0.0), returns, PERIOD_MPS)
     assert np.array_equal(tracks.xyz_m, returns.centre_m)
-    assert tracks.age.tolist() == [1, 1, 1, 1]
-    assert len(set(tracks.identity.tolist())) == 4
 
 
 @pytest.mark.parametrize(
-    ("times", "drives"),
-    [([0.0, 0.2, 3.0], [0, 0, 0]), ([0.0, 0.2, 0.4], [0, 0, 1]), ([0.0, 0.2, 0.1], [0, 0, 0])],
-)
-def test_a_gap_a_new_drive_and_a_clock_that_jumps_back_start_new_identities(times, drives):
-    found = World(USERS).follow(times, drives)
-    assert found[1].identity.tolist() == found[0].identity.tolist()
-    assert not set(found[2].identity.tolist()) & set(found[1].identity.tolist())
+    ("times", "drives", "ego_known"),
+    [
+        ([0.0, 0.2, 3.0], [0, 0, 0], True), ([0.0, 0.2, 0.4], [0, 0, 1], True),
+        ([0.0, 0.2, 0.1], [0, 0, 0], True), ([0.0, 0.1, 0.2], [0, 0, 0], False),
+    ],
+    ids=["gap", "new drive", "clock jumps back", "no ego velocity"],
+)  # fmt: skip
+def test_what_cannot_be_linked_starts_new_identities(times, drives, ego_known):
+    found = World(USERS).follow(times, drives, ego_known)
+    first, second, third = (t.identity.tolist() for t in found)
+    assert (first == second) is ego_known
+    assert len({*second, *third}) == 8
     assert found[2].age.tolist() == [1, 1, 1, 1]
-
-
-def test_scans_without_ego_velocity_are_not_linked():
-    found = World(USERS).follow([0.0, 0.1, 0.2], ego_known=False)
-    assert len({i for t in found for i in t.identity.tolist()}) == 12
 
 
 def test_a_track_survives_one_missed_scan():
     world = World([([20.0, 0.0], [11.0, 0.0])])
-    state, ego = TrackState.empty(), EgoMotion((12.0, 0.0), 0.0)
-    nothing = ClusterReturns(np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros(0, np.int32))
-    for t in (0.0, 0.2, 0.4):
-        state, before = advance_tracks(state, int(t * 1e9), 0, ego, world.returns(t), PERIOD_MPS)
-    state, none = advance_tracks(state, int(0.6e9), 0, ego, nothing, PERIOD_MPS)
-    _, after = advance_tracks(state, int(0.8e9), 0, ego, world.returns(0.8), PERIOD_MPS)
-    assert none.identity.shape == (0,)
-    assert after.identity.tolist() == before.identity.tolist()
-    assert after.age.tolist() == [4]
+    state, found = TrackState.empty(), []
+    for k in range(5):
+        seen = NOTHING if k == 3 else world.returns(0.2 * k)
+        state, tracks = advance_tracks(
+            state, k * 200_000_000, 0, EgoMotion((12.0, 0.0), 0.0), seen, PERIOD_MPS
+        )
+        found.append(tracks)
+    assert found[3].identity.shape == (0,)
+    assert found[4].identity.tolist() == found[2].identity.tolist()
+    assert found[4].age.tolist() == [4]
 
 
 def test_a_car_of_the_wrong_speed_is_not_taken_for_the_track():
     # Where the old car should be now stands another one that drives the other way.
-    state, ego = TrackState.empty(), EgoMotion((0.0, 0.0), 0.0)
-    for t in (0.0, 0.1, 0.2, 0.3):
+    state, identities = TrackState.empty(), []
+    for k, (x, rate) in enumerate([(20, 5), (20.5, 5), (21, 5), (21.5, 5), (22, -6)]):
         seen = ClusterReturns(
-            np.array([[20 + 5 * t, 0, 0]], np.float32), np.array([5.0], np.float32), np.array([4], np.int32)
+            np.array([[x, 0, 0]], np.float32), np.array([rate], np.float32), np.array([4], np.int32)
         )
-        state, tracks = advance_tracks(state, int(t * 1e9), 0, ego, seen, None)
-    other = ClusterReturns(
-        np.array([[22.0, 0, 0]], np.float32), np.array([-6.0], np.float32), np.array([4], np.int32)
-    )
-    _, after = advance_tracks(state, int(0.4e9), 0, ego, other, None)
-    assert after.identity[0] != tracks.identity[0]
+        state, tracks = advance_tracks(state, k * 100_000_000, 0, EgoMotion((0.0, 0.0), 0.0), seen, None)
+        identities.append(tracks.identity[0])
+    assert len(set(identities[:4])) == 1
+    assert identities[4] != identities[3]
 
 
-def test_cluster_rates_are_averaged_on_the_circle_of_the_period():
+@pytest.mark.parametrize(("period", "rate"), [(PERIOD_MPS, PERIOD_MPS / 2), (None, 0.0)])
+def test_cluster_rates_are_averaged_on_the_circle_of_the_period(period, rate):
     xyz = np.array([[10, 0, 0], [10, 1, 0], [30, 0, 0]], np.float32)
     residual = np.array([5.1, -5.1, 2.0], np.float32)  # 5.1 and -5.1 are 0.194 apart modulo 10.394
-    returns = measure_clusters(xyz, residual, np.array([0, 0, 1], np.int32), PERIOD_MPS)
-    assert abs(returns.rate_mps[0]) == pytest.approx(PERIOD_MPS / 2, abs=0.01)
+    returns = measure_clusters(xyz, residual, np.array([0, 0, 1], np.int32), period)
+    assert abs(returns.rate_mps[0]) == pytest.approx(rate, abs=1e-5)
     assert returns.rate_mps[1] == pytest.approx(2.0, abs=1e-5)
     assert returns.points.tolist() == [2, 1]
-    assert measure_clusters(xyz, residual, np.array([0, 0, 1], np.int32), None).rate_mps[0] == pytest.approx(
-        0, abs=1e-6
-    )
-
-
-def test_no_cluster_gives_no_track():
-    none = measure_clusters(
-        np.zeros((3, 3), np.float32), np.zeros(3, np.float32), np.full(3, -1, np.int32), PERIOD_MPS
-    )
-    state, tracks = advance_tracks(TrackState.empty(), 0, 0, EgoMotion((0.0, 0.0), None), none, PERIOD_MPS)
-    assert tracks.xyz_m.shape == (0, 3)
-    assert state.filters.state.shape == (0, 4)
+    none = measure_clusters(xyz, residual, np.full(3, -1, np.int32), period)
+    state, tracks = advance_tracks(TrackState.empty(), 0, 0, EgoMotion((0.0, 0.0), None), none, period)
+    assert (tracks.xyz_m.shape, state.filters.state.shape) == ((0, 3), (0, 4))

@@ -22,6 +22,8 @@ from tests.makers.swept_streets import AROUND, pose
 GAP_S, SWEEPS = 0.5, 14
 RIGHT = LidarTurn(sense="right", begins_deg=180.0)
 MOUNTED = pose(1.2, 0.0, 1.9)
+_AZIMUTH = np.linspace(-np.pi, np.pi, 20_000)
+ANY = np.stack([9 * np.cos(_AZIMUTH), 9 * np.sin(_AZIMUTH), np.tile([-1.0, 0.0, 1.0, 2.0], 5_000)], 1)
 
 
 @dataclass
@@ -91,21 +93,18 @@ def test_points_are_moved_to_the_stamp_by_the_motion_between_sweeps(change, sens
 
 
 def test_odometry_goes_before_the_motion_between_sweeps_and_a_car_that_stands_keeps_its_points():
-    cloud = sweep(drive()[0][0])
-    moments = [(Seen(k, k * 10**8, ego_speed_mps=0.0), cloud) for k in range(2)]
+    moments = [(Seen(k, k * 10**8, ego_speed_mps=0.0), sweep(ANY)) for k in range(2)]
     turning = turning_of(moments, RIGHT)
     assert turning.motion == {}
     timed, note = turning.timed(*moments[0])
     assert (note, timed.lidar_deskewed) == (BY_AZIMUTH, True)
-    np.testing.assert_array_equal(timed.lidar_xyz_m, cloud.lidar_xyz_m)
-    assert Turning(None, {}).timed(*moments[0])[1] == ""
+    np.testing.assert_array_equal(timed.lidar_xyz_m, sweep(ANY).lidar_xyz_m)
 
 
-def test_a_car_that_drives_and_a_lidar_of_which_nobody_knows_is_counted():
-    as_logged = sweep(drive()[0][0])
-    after, note = Turning(None, {}).timed(Seen(0, 0, ego_speed_mps=8.0), as_logged)
-    assert after is as_logged
-    assert note == WITHOUT_TIMES
+@pytest.mark.parametrize(("speed_mps", "note"), [(0.0, ""), (8.0, WITHOUT_TIMES)])
+def test_a_lidar_of_which_nobody_knows_is_counted_where_the_car_drives(speed_mps, note):
+    as_logged = sweep(ANY)
+    assert Turning(None, {}).timed(Seen(0, 0, ego_speed_mps=speed_mps), as_logged) == (as_logged, note)
 
 
 @pytest.mark.parametrize(
@@ -115,19 +114,22 @@ def test_what_fleet_toml_says_needs_no_car_that_moves(sense, stamp, times):
     told = LidarTurn(sense=sense, begins_deg=-90.0, stamp=stamp)
     azimuth = np.radians([-89.9999, 0.0] if sense == "left" else [-90.0001, 0.0])
     ahead = np.stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth], 1)
-    cloud = sweep(np.vstack([10 * ahead, drive()[0][0]]))
+    cloud = sweep(np.vstack([10 * ahead, ANY]))
     timed, note = turning_of([(Seen(0, 0), cloud)], told).timed(Seen(0, 0), cloud)
     np.testing.assert_allclose(timed.lidar_time_s[:2], times, atol=1e-4)
     assert (note, timed.lidar_deskewed) == (BY_AZIMUTH, False)
 
 
-@pytest.mark.parametrize("change", [{"lidar_time_s": "some"}, {"lidar_deskewed": True}, {"only": "ahead"}])
-def test_sweeps_with_times_and_lidars_that_do_not_spin_are_not_looked_at(change):
-    xyz = drive()[0][0]
-    if "only" in change:
-        xyz, change = xyz[xyz[:, 0] > 0], {}
-    if "lidar_time_s" in change:
-        change = {"lidar_time_s": np.zeros(len(xyz), np.float32)}
+@pytest.mark.parametrize(
+    ("xyz", "change"),
+    [
+        (ANY, {"lidar_time_s": np.zeros(len(ANY), np.float32)}),
+        (ANY, {"lidar_deskewed": True}),
+        (ANY[ANY[:, 0] > 0], {}),
+    ],
+    ids=["times", "deskewed", "only ahead"],
+)
+def test_sweeps_with_times_and_lidars_that_do_not_spin_are_not_looked_at(xyz, change):
     assert turning_of([(Seen(0, 0), replace(sweep(xyz), **change))], RIGHT) is None
 
 

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import onnxruntime
 import pytest
@@ -9,40 +10,46 @@ import pytest
 from pipeline.core.config import load_fleet
 from pipeline.core.errors import ModelError, ModelOutputError
 from pipeline.core.memory import MODEL_THREADS, usable_cpus
-from pipeline.core.rigs import OnnxSemantics
 from pipeline.perceive.models.detector import Candidates, Detector, decode_head, suppress
 from pipeline.perceive.models.manifest import InputSpec, load_manifest
 from pipeline.perceive.models.segmenter import Segmenter
 from pipeline.perceive.models.session import Fit, fit_image, model_threads
-from pipeline.perceive.models.source import ModelSource
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import observations_of
-from tests.makers.fleet_files import fleet_toml
 from tests.makers.lakes import write_frames
 from tests.makers.onnx_models import save_constant, save_segmenter, write_manifest
 from tests.makers.stages import perceive_day
 
 COLOURS = [[0.2, 0.2, 0.2], [0.9, 0.1, 0.1], [0.1, 0.1, 0.9]]  # RGB of ADE20K wall, building, sky
+DAY = Partition("car-1", "2026-03-02")
 FITS = ("letterbox_top_left", "letterbox_centre", "stretch")
 
 
-def segmenter(folder, fit="stretch", size=(96, 160), stride=4):
-    save_segmenter(folder / "seg.onnx", size, stride, COLOURS)
-    given = {"size": list(size), "scale": 1 / 255, "fit": fit, "pad": 128.0}
-    output = {"layout": "logits", "label_set": "ade20k"}
-    return load_manifest(
-        write_manifest(folder / "seg.toml", folder / "seg.onnx", "segment", given, output), "segment"
-    )
+PICTURE = np.zeros((96, 160, 3), np.uint8)
 
 
-def detector(folder, answer, layout, *, size=(96, 160), given=None, label_set="road_users", **output):
-    save_constant(folder / "det.onnx", answer, size)
-    text = write_manifest(
-        folder / "det.toml", folder / "det.onnx", "detect",
-        {"size": list(size), "fit": "letterbox_top_left"} | (given or {}),
-        {"layout": layout, "label_set": label_set} | output,
-    )  # fmt: skip
-    return Detector(load_manifest(text, "detect"))
+def manifest_of(folder, task, given, output, name="m"):
+    file = write_manifest(folder / f"{name}.toml", folder / f"{name}.onnx", task, given, output)
+    return load_manifest(file, task)
+
+
+def segmenter(folder, fit="stretch", stride=4):
+    save_segmenter(folder / "seg.onnx", (96, 160), stride, COLOURS)
+    given = {"size": [96, 160], "scale": 1 / 255, "fit": fit, "pad": 128.0}
+    return manifest_of(folder, "segment", given, {"layout": "logits", "label_set": "ade20k"}, "seg")
+
+
+def answering(folder, answer, layout, label_set="cityscapes"):
+    """A segmenter that gives this answer to every picture."""
+    save_constant(folder / "m.onnx", answer)
+    given = {"size": [96, 160], "fit": "stretch"}
+    return Segmenter(manifest_of(folder, "segment", given, {"layout": layout, "label_set": label_set}))
+
+
+def detector(folder, answer, layout, label_set="road_users", **given):
+    save_constant(folder / "det.onnx", answer)
+    given = {"size": [96, 160], "fit": "letterbox_top_left"} | given
+    return Detector(manifest_of(folder, "detect", given, {"layout": layout, "label_set": label_set}, "det"))
 
 
 @pytest.mark.parametrize("fit", FITS)
@@ -63,7 +70,7 @@ def test_boundaries_of_reduced_logits_lie_where_the_image_has_them(tmp_path, fit
 
 
 def test_interpolated_logits_place_a_boundary_finer_than_their_stride(tmp_path):
-    model = Segmenter(segmenter(tmp_path, size=(96, 160), stride=8))
+    model = Segmenter(segmenter(tmp_path, stride=8))
     errors = []
     for edge in range(60, 100):
         image = np.full((96, 160, 3), 51, np.uint8)
@@ -77,12 +84,8 @@ def test_interpolated_logits_place_a_boundary_finer_than_their_stride(tmp_path):
 def test_plain_label_outputs_are_resampled_with_aligned_centres(tmp_path):
     answer = np.zeros((1, 24, 40), np.float32)
     answer[:, :, 10:] = 10
-    save_constant(tmp_path / "m.onnx", answer)
-    given, output = {"size": [96, 160], "fit": "stretch"}, {"layout": "labels", "label_set": "cityscapes"}
-    manifest = load_manifest(
-        write_manifest(tmp_path / "m.toml", tmp_path / "m.onnx", "segment", given, output), "segment"
-    )
-    [labels] = Segmenter(manifest).segment_each([np.zeros((192, 320, 3), np.uint8)], [(96, 160)])
+    model = answering(tmp_path, answer, "labels")
+    [labels] = model.segment_each([np.zeros((192, 320, 3), np.uint8)], [(96, 160)])
     assert np.array_equal(np.unique(labels, return_counts=True)[1], [96 * 40, 96 * 120])
 
 
@@ -128,7 +131,7 @@ BOXES = [[10, 20, 50, 60], [100, 30, 140, 80], [101, 31, 141, 81]]
 def test_yolo_heads_give_boxes_in_full_image_pixels(tmp_path, layout, fit):
     answer = rows_of(BOXES, [2, 0, 0], [0.9, 0.8, 0.7], [1.0, 0.5, 0.5] if layout == "yolov5" else None)
     answer = answer if layout == "yolov5" else answer.transpose(0, 2, 1)
-    model = detector(tmp_path, answer, layout, given={"fit": fit})
+    model = detector(tmp_path, answer, layout, fit=fit)
     found = model.detect(np.zeros((192, 400, 3), np.uint8))  # scale 0.4: 76.8 of 96 rows are image
     offset = 0 if fit == "letterbox_top_left" else (96 - 77) // 2
     assert found.classes == ["car", "person"]  # the third box is the second one again
@@ -159,186 +162,155 @@ def test_suppression_works_within_a_class_only():
 
 def test_classes_that_are_no_road_users_are_left_out(tmp_path):
     answer = rows_of(BOXES[:2], [4, 2], [0.9, 0.8], [1.0, 1.0], count=80)  # COCO 4 is an airplane
-    assert detector(tmp_path, answer, "yolov5", label_set="coco").detect(
-        np.zeros((96, 160, 3), np.uint8)
-    ).classes == ["car"]
+    assert detector(tmp_path, answer, "yolov5", label_set="coco").detect(PICTURE).classes == ["car"]
 
 
 def test_tiles_report_each_object_once_and_none_that_a_tile_cuts(tmp_path):
     # Every tile answers the same two boxes: one inside, one at the right edge, cut by all tiles but the last.
     answer = rows_of([[60, 30, 90, 60], [140, 30, 160, 60]], [2, 2], [0.9, 0.8], [1.0, 1.0])
-    model = detector(tmp_path, answer, "yolov5", given={"tile_scales": [0.5], "tile_overlap": 0.25})
+    model = detector(tmp_path, answer, "yolov5", tile_scales=[0.5], tile_overlap=0.25)
     found = model.detect(np.zeros((192, 800, 3), np.uint8))  # 400 x 96 at half size: tiles at 0, 120, 240
     assert found.boxes_px[found.scores > 0.85][:, 0].tolist() == [120, 360, 600]
     assert found.boxes_px[found.scores < 0.85].tolist() == [[760, 60, 800, 120]]
 
 
-def good_manifest(folder):
-    segmenter(folder)
-    return folder / "seg.toml"
-
-
 @pytest.mark.parametrize(
-    ("old", "new", "words"),
+    ("old", "new", "key"),
     [
         ('path = "seg.onnx"', 'path = "none.onnx"', "path"),
         ('sha256 = "', 'sha256 = "00', "sha256"),
         ("[input]", 'colour = "rgb"\n[input]', "colour"),
         ('task = "segment"', 'task = "detect"', "layout"),
         ("size = [96, 160]", "size = [96]", "input.size"),
+        ("size = [96, 160]", "size = [64, 64]", r"input\.size"),
         ("size = [96, 160]", "size = [96, 160]\nstd = [0, 1, 1]", "std"),
         ('label_set = "ade20k"', 'label_set = "kitti"', "label_set"),
         ("[output]", "[output", "TOML"),
     ],
 )
-def test_a_wrong_manifest_is_refused_by_key(tmp_path, old, new, words):
-    path = good_manifest(tmp_path)
-    text = path.read_text()
+def test_a_wrong_manifest_is_refused_by_key(tmp_path, old, new, key):
+    file = segmenter(tmp_path).file
+    text = file.read_text()
     assert old in text
-    path.write_text(text.replace(old, new, 1))
-    with pytest.raises(ModelError, match=words) as error:
-        load_manifest(path, "segment")
-    assert str(path) in str(error.value)
+    file.write_text(text.replace(old, new, 1))
+    with pytest.raises(ModelError, match=key) as error:
+        Segmenter(load_manifest(file, "segment"))
+    assert str(file) in str(error.value)
 
 
-def test_another_model_file_than_the_manifest_means_is_refused(tmp_path):
-    path = good_manifest(tmp_path)
-    with (tmp_path / "seg.onnx").open("ab") as stream:
-        stream.write(b"x")
-    with pytest.raises(ModelError, match="sha256"):
-        load_manifest(path, "segment")
-
-
-def test_a_manifest_of_the_other_task_and_a_missing_one_are_refused(tmp_path):
+def test_another_file_another_task_no_model_and_no_manifest_are_refused(tmp_path):
+    file = segmenter(tmp_path).file
     with pytest.raises(ModelError, match="task"):
-        load_manifest(good_manifest(tmp_path), "detect")
+        load_manifest(file, "detect")
     with pytest.raises(ModelError, match="no such manifest"):
         load_manifest(tmp_path / "none.toml", "detect")
-
-
-@pytest.mark.parametrize(
-    ("shape", "layout", "words"),
-    [((1, 10, 13), "yolox", "strides"), ((10, 13), "yolov5", "layout"), ((1, 3, 9), "yolov8", "layout")],
-)
-def test_a_head_of_another_shape_than_its_layout_is_refused(tmp_path, shape, layout, words):
-    model = detector(tmp_path, np.zeros(shape, np.float32), layout)
-    with pytest.raises(ModelError, match=words):
-        model.detect(np.zeros((96, 160, 3), np.uint8))
-
-
-def answering(folder, answer, layout, label_set="cityscapes"):
-    """A segmenter that gives this answer to every picture."""
-    save_constant(folder / "m.onnx", answer)
-    given, output = {"size": [96, 160], "fit": "stretch"}, {"layout": layout, "label_set": label_set}
-    return Segmenter(
-        load_manifest(
-            write_manifest(folder / "m.toml", folder / "m.onnx", "segment", given, output), "segment"
+    (tmp_path / "seg.onnx").write_bytes(b"no model")
+    with pytest.raises(ModelError, match="sha256"):
+        load_manifest(file, "segment")
+    (tmp_path / "m.onnx").write_bytes(b"no model")
+    with pytest.raises(ModelError, match="onnxruntime"):
+        Detector(
+            manifest_of(tmp_path, "detect", {"size": [96, 160]}, {"layout": "yolov5", "label_set": "coco"})
         )
-    )
+
+
+ROWS = rows_of(BOXES, [2, 0, 0], [0.9, 0.8, 0.7], [1.0] * 3)
 
 
 @pytest.mark.parametrize(
-    ("answer", "layout", "words"),
+    ("answer", "layout", "label_set", "error", "words"),
     [
-        (np.zeros((1, 150, 24, 40)), "logits", "must be 1 x 19 or 20 x h x w"),
-        (np.full((1, 24, 40), 42.0), "labels", r"must be one image of 0\.\.19 or 255.* 42 to 42"),
-        (np.full((1, 19, 24, 40), np.nan), "logits", "NaN"),
-        (np.full((1, 24, 40), np.nan), "labels", "NaN"),
+        (np.zeros((1, 10, 13)), "yolox", "road_users", ModelError, "strides"),
+        (np.zeros((10, 13)), "yolov5", "road_users", ModelError, "layout"),
+        (np.zeros((1, 3, 9)), "yolov8", "road_users", ModelOutputError, "layout"),
+        (ROWS, "yolov5", "coco", ModelOutputError, "8 classes in .* its label set has 80"),
+        (
+            np.zeros((1, 84, 9)),
+            "yolov8",
+            "road_users",
+            ModelOutputError,
+            "80 classes in .* its label set has 8",
+        ),
+        (ROWS * np.nan, "yolov5", "road_users", ModelOutputError, "NaN"),
+        (
+            np.zeros((1, 150, 24, 40)),
+            "logits",
+            "cityscapes",
+            ModelOutputError,
+            "must be 1 x 19 or 20 x h x w",
+        ),
+        (
+            np.full((1, 24, 40), 42.0),
+            "labels",
+            "cityscapes",
+            ModelOutputError,
+            r"one image of 0\.\.19 or 255.* 42 to 42",
+        ),
+        (np.full((1, 19, 24, 40), np.nan), "logits", "cityscapes", ModelOutputError, "NaN"),
+        (np.full((1, 24, 40), np.nan), "labels", "cityscapes", ModelOutputError, "NaN"),
     ],
 )
-def test_answers_of_other_classes_or_of_no_numbers_are_refused(tmp_path, answer, layout, words):
-    model = answering(tmp_path, answer, layout)
-    with pytest.raises(ModelError, match=words):
-        model.segment_each([np.zeros((96, 160, 3), np.uint8)], [(48, 80)])
+def test_answers_of_another_shape_of_other_classes_or_of_no_numbers_are_refused(
+    tmp_path, answer, layout, label_set, error, words
+):
+    with pytest.raises(error, match=words):
+        runner(tmp_path, answer, layout, label_set)(PICTURE)
 
 
-def test_a_model_that_answers_every_picture_alike_is_refused_and_a_stuck_camera_is_not_its_fault(tmp_path):
-    model = answering(tmp_path, np.zeros((1, 19, 24, 40)), "logits")
-    pictures = [np.full((96, 160, 3), shade, np.uint8) for shade in range(4)]
+def runner(folder, answer, layout, label_set):
+    """Runs a constant model on a picture."""
+    if layout.startswith("yolo"):
+        return detector(folder, answer, layout, label_set).detect
+    model = answering(folder, answer, layout, label_set)
+    return lambda picture: model.segment_each([picture], [(48, 80)])
+
+
+@pytest.mark.parametrize(
+    "model",
+    [(ROWS, "yolov5", "road_users"), (np.zeros((1, 19, 24, 40)), "logits", "cityscapes")],
+    ids=["detector", "segmenter"],
+)
+def test_a_model_that_answers_every_picture_alike_is_refused_and_a_stuck_camera_is_not_its_fault(
+    tmp_path, model
+):
+    run = runner(tmp_path, *model)
+    pictures = [np.full_like(PICTURE, shade) for shade in range(4)]
     for picture in [pictures[0]] * 9 + pictures[:3]:
-        model.segment_each([picture], [(48, 80)])
+        run(picture)
     with pytest.raises(ModelOutputError, match="same answer for 4 different inputs"):
-        model.segment_each([pictures[3]], [(48, 80)])
+        run(pictures[3])
 
 
-def test_a_detector_of_other_classes_or_of_no_numbers_is_refused(tmp_path):
-    picture, rows = np.zeros((96, 160, 3), np.uint8), rows_of(BOXES, [2, 0, 0], [0.9, 0.8, 0.7], [1.0] * 3)
-    with pytest.raises(ModelOutputError, match=r"8 classes in .* its label set has 80"):
-        detector(tmp_path, rows, "yolov5", label_set="coco").detect(picture)
-    with pytest.raises(ModelOutputError, match=r"80 classes in .* its label set has 8"):
-        detector(tmp_path, np.zeros((1, 84, 9)), "yolov8").detect(picture)
-    rows[0, 0, 0] = np.nan
-    with pytest.raises(ModelOutputError, match="NaN"):
-        detector(tmp_path, rows, "yolov5").detect(picture)
-
-
-def test_a_detector_that_answers_every_picture_alike_is_refused_and_a_stuck_camera_is_not_its_fault(tmp_path):
-    model = detector(tmp_path, rows_of(BOXES, [2, 0, 0], [0.9, 0.8, 0.7], [1.0] * 3), "yolov5")
-    pictures = [np.full((96, 160, 3), shade, np.uint8) for shade in range(4)]
-    for picture in [pictures[0]] * 9 + pictures[:3]:
-        model.detect(picture)
-    with pytest.raises(ModelOutputError, match="same answer for 4 different inputs"):
-        model.detect(pictures[3])
-
-
-def test_a_size_that_the_model_does_not_take_is_refused_on_loading(tmp_path):
-    save_constant(tmp_path / "m.onnx", np.zeros((1, 3, 13), np.float32))
-    given, output = {"size": [64, 64]}, {"layout": "yolov5", "label_set": "coco"}
-    path = write_manifest(tmp_path / "m.toml", tmp_path / "m.onnx", "detect", given, output)
-    with pytest.raises(ModelError, match=r"input\.size"):
-        Detector(load_manifest(path, "detect"))
-
-
-def test_a_file_that_is_no_model_is_refused(tmp_path):
-    (tmp_path / "m.onnx").write_bytes(b"no model")
-    given, output = {"size": [96, 160]}, {"layout": "yolov5", "label_set": "coco"}
-    path = write_manifest(tmp_path / "m.toml", tmp_path / "m.onnx", "detect", given, output)
-    with pytest.raises(ModelError, match="onnxruntime"):
-        Detector(load_manifest(path, "detect"))
-
-
-def test_both_models_together_give_a_frames_semantics(tmp_path, made_frame):
-    segmenter(tmp_path)
-    detector(tmp_path, rows_of(BOXES, [2, 0, 0], [0.9, 0.8, 0.2], [1.0, 1.0, 1.0]), "yolov5")
-    wanted = OnnxSemantics(source="onnx", segmenter="seg.toml", detector="det.toml")
-    (tmp_path / "fleet.toml").write_text(
-        fleet_toml("car-1", sections="[perceive]\ndetection_min_score = 0.5")
+def days(folder, made_frame, section=""):
+    """Fleet and lake of three frames without logged semantics, the second one broken."""
+    (folder / "fleet.toml").write_text(
+        '[fleet]\nname = "made"\n[rigs.default.camera]\nimage = "/i"\ninfo = "/c"\n'
+        'semantics = { source = "onnx", segmenter = "seg.toml", detector = "det.toml" }\n'
+        f'[rigs.default.lidar]\npoints = "/p"\n[vehicles.car-1]\n[perceive]\n{section}\n'
     )
-    source = ModelSource.load(wanted, load_fleet(tmp_path / "fleet.toml"))
-    frame = made_frame()
-    found = source.read(frame)
-    assert found.labels.shape == (frame.image_height_px // 2, frame.image_width_px // 2)
-    assert found.detections.classes == ["car", "person"]
-    assert 0 < np.mean(found.labels == 3) < 1
+    lake = Lake.at(folder / f"lake-{section[:5]}")
+    bare = dict.fromkeys(("labels_png", "detection_boxes_px", "detection_classes", "detection_scores"))
+    frames = [replace(made_frame(i), sensors=["camera", "lidar"], **bare) for i in range(3)]
+    write_frames(lake, DAY, [frames[0], replace(frames[1], image=b"broken"), frames[2]])
+    return load_fleet(folder / "fleet.toml"), lake
 
 
 def test_a_day_is_perceived_with_models_and_anew_with_another_model(tmp_path, made_frame):
     segmenter(tmp_path)
-    detector(tmp_path, rows_of(BOXES[:1], [2], [0.9], [1.0]), "yolov5")
-    toml = tmp_path / "fleet.toml"
-    toml.write_text(
-        '[fleet]\nname = "made"\n[rigs.default.camera]\nimage = "/i"\ninfo = "/c"\n'
-        'semantics = { source = "onnx", segmenter = "seg.toml", detector = "det.toml" }\n'
-        '[rigs.default.lidar]\npoints = "/p"\n[rigs.default.radar]\npoints = "/r"\n[vehicles.car-1]\n'
-    )
-    lake, day = Lake.at(tmp_path / "lake"), Partition("car-1", "2026-03-02")
-    # The car logged no semantics: the models give them.
-    bare = dict.fromkeys(("labels_png", "detection_boxes_px", "detection_classes", "detection_scores"))
-    write_frames(lake, day, [replace(made_frame(i), **bare) for i in range(2)])
-    first = perceive_day(day, load_fleet(toml), lake)
-    assert (first.status, first.rows) == ("done", 2)
-    assert [o.road_user_classes for o in list(observations_of(lake, day))] == [
-        ["car"],
-        ["car"],
-    ]
-    assert perceive_day(day, load_fleet(toml), lake).status == "cached"
-    detector(tmp_path, rows_of(BOXES[:1], [0], [0.9], [1.0]), "yolov5")
-    again = perceive_day(day, load_fleet(toml), lake)
-    assert again.status == "done"
-    assert [o.road_user_classes for o in list(observations_of(lake, day))] == [
-        ["person"],
-        ["person"],
-    ]
+    keys = []
+    for category, name in ((2, "car"), (0, "person")):
+        detector(tmp_path, rows_of(BOXES, [category, 0, 0], [0.9, 0.4, 0.2], [1.0] * 3), "yolov5")
+        fleet, lake = days(tmp_path, made_frame, "detection_min_score = 0.5")
+        result = perceive_day(DAY, fleet, lake)
+        assert (result.status, result.rows, result.rejected) == ("done", 2, {"image_undecodable": 1})
+        found = list(observations_of(lake, DAY))
+        assert [o.road_user_classes for o in found] == [[name]] * 2
+        labels = cv2.imdecode(np.frombuffer(found[0].labels_png, np.uint8), cv2.IMREAD_UNCHANGED)
+        assert labels.shape == (made_frame().image_height_px // 2, made_frame().image_width_px // 2)
+        assert 0 < np.mean(labels == 3) < 1
+        assert perceive_day(DAY, fleet, lake).status == "cached"
+        keys.append(result.work_key)
+    assert len(set(keys)) == 2
 
 
 def test_frames_in_batches_and_another_provider_give_the_same_day_under_the_same_work_key(
@@ -346,27 +318,14 @@ def test_frames_in_batches_and_another_provider_give_the_same_day_under_the_same
 ):
     segmenter(tmp_path)
     detector(tmp_path, rows_of(BOXES[:1], [2], [0.9], [1.0]), "yolov5")
-    frames = [made_frame(i) for i in range(5)]
-    frames[1] = replace(frames[1], image=b"broken")
-    found, keys, reasons = [], [], []
-    for number, section in enumerate(
-        ("", "batch = 3", 'providers = ["CUDAExecutionProvider", "CPUExecutionProvider"]')
-    ):
-        toml = tmp_path / "fleet.toml"
-        toml.write_text(
-            '[fleet]\nname = "made"\n[rigs.default.camera]\nimage = "/i"\ninfo = "/c"\n'
-            'semantics = { source = "onnx", segmenter = "seg.toml", detector = "det.toml" }\n'
-            f'[rigs.default.lidar]\npoints = "/p"\n[vehicles.car-1]\n[perceive]\n{section}\n'
-        )
-        lake, day = Lake.at(tmp_path / f"lake-{number}"), Partition("car-1", "2026-03-02")
-        write_frames(lake, day, [replace(f, sensors=["camera", "lidar"]) for f in frames])
-        outcome = perceive_day(day, load_fleet(toml), lake)
-        assert (outcome.rows, outcome.rejected) == (4, {"image_undecodable": 1})
-        found.append([(o.labels_png, o.road_user_classes) for o in observations_of(lake, day)])
-        keys.append(outcome.work_key)
-        reasons.append(outcome.reason)
+    found, reasons = [], []
+    for section in ("", "batch = 2", 'providers = ["CUDAExecutionProvider", "CPUExecutionProvider"]'):
+        fleet, lake = days(tmp_path, made_frame, section)
+        result = perceive_day(DAY, fleet, lake)
+        rows = [(o.labels_png, o.road_user_classes) for o in observations_of(lake, DAY)]
+        found.append((result.work_key, result.rejected, rows))
+        reasons.append(result.reason)
     assert found[0] == found[1] == found[2]
-    assert len(set(keys)) == 1
     has_cuda = "CUDAExecutionProvider" in onnxruntime.get_available_providers()
     told = "models ran on CPUExecutionProvider: CUDAExecutionProvider could not be had"
     assert reasons == ["", "", "" if has_cuda else told]

@@ -18,7 +18,7 @@ from pipeline.learn.perception_training.radar_drivable import (
 )
 from pipeline.learn.perception_training.trainer import Samples, build_network, export_model, train_network
 from pipeline.perceive.models.radar_drivable import RadarDrivable
-from pipeline.rig.radar_grid import SHAPE, sector_of
+from pipeline.rig.radar_grid import SHAPE, ScanMemory, sector_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import observations_of
 from schemas.observations import Observation
@@ -86,8 +86,6 @@ def test_the_model_answers_as_the_network_does(lake, tmp_path):
     perceive_day(DAY, fleet(), lake)
     network = build_network(TASK, 24, 3).eval()
     model = RadarDrivable(export_model(TASK, network, NOTHING, tmp_path, {}))
-    from pipeline.rig.radar_grid import ScanMemory
-
     memory = ScanMemory()
     for row in rows(lake):
         features = torch.from_numpy(memory.features(scan_of(row)))[None]
@@ -106,9 +104,7 @@ def test_a_model_is_no_reason_to_ingest_again():
     [
         ("range_step_m = 1.0", "range_step_m = 0.5", "grid.range_step_m"),
         ('"moving", ', "", "grid.channels"),
-        ('sha256 = "', 'sha256 = "0', "sha256"),
         ('task = "radar_drivable"', 'task = "segment"', "task"),
-        ('path = "radar', 'path = "other', "path"),
     ],
 )
 def test_a_manifest_that_does_not_fit_is_told_by_its_key(before, after, told, tmp_path):
@@ -117,11 +113,6 @@ def test_a_manifest_that_does_not_fit_is_told_by_its_key(before, after, told, tm
     manifest.write_text(manifest.read_text().replace(before, after))
     with pytest.raises(ModelError, match=told):
         RadarDrivable(manifest)
-
-
-def test_no_manifest_is_a_plain_error(tmp_path, lake):
-    with pytest.raises(ModelError, match="no such manifest"):
-        perceive_day(DAY, fleet(tmp_path / "fleet.toml", **MODEL), lake)
 
 
 def test_the_network_that_ships_is_named_by_a_word_and_tells_free_ranges(lake):
