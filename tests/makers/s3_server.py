@@ -15,7 +15,6 @@ them wait; `{"mix": [FAULT, ...], "every": N}` gives every N-th request the next
 
 import json
 import os
-import re
 import socket
 import subprocess
 import sys
@@ -24,7 +23,6 @@ import time
 import urllib.request
 from contextlib import contextmanager
 from pathlib import Path
-from urllib.parse import urlencode
 
 REPO = Path(__file__).resolve().parents[2]
 BUCKET = "fleet"
@@ -126,18 +124,6 @@ class S3:
         body = json.dumps(plan).encode() if plan else None
         with urllib.request.urlopen(urllib.request.Request(f"{self.url}/faults", body)) as answer:
             return json.load(answer)
-
-    def stored(self, prefix=""):
-        """Bytes of the bucket's objects, or of those whose names begin so."""
-        sizes, token = [], ""
-        while token is not None:
-            asked = {"list-type": 2, "prefix": prefix} | ({"continuation-token": token} if token else {})
-            with urllib.request.urlopen(f"{self.url}/{BUCKET}?{urlencode(asked)}") as answer:
-                listing = answer.read().decode()
-            sizes += map(int, re.findall(r"<Size>(\d+)</Size>", listing))
-            more = re.search(r"<NextContinuationToken>(.*?)</NextContinuationToken>", listing)
-            token = more[1] if more else None
-        return sum(sizes)
 
 
 @contextmanager

@@ -4,7 +4,8 @@ from dataclasses import MISSING, fields
 
 import numpy as np
 
-from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, SENSORS, CalibrationRecord
+from pipeline.store.records import read_records
+from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, PAIRS, SENSORS, CalibrationRecord
 from schemas.captures import CAPTURES
 from schemas.drift import DRIFT, DriftFinding
 from schemas.features import FEATURES
@@ -41,6 +42,17 @@ def make_row(table, rng, *, nulls=False, free=5, **values):
         )
     filled = {c.name: None if nulls and c.nullable else make_value(c, rng, free) for c in schema.columns}
     return row_type(**filled | values)
+
+
+def make_record(rng, key, vehicle="car", day="2026-03-02", pair=PAIRS[0], **values):
+    """A calibration that is not written yet."""
+    values = {"recorded_at": "", "asserted_at": "", "method": "joint"} | values
+    return make_row("calibrations", rng, vehicle=vehicle, day=day, pair=pair, work_key=key, **values)
+
+
+def read_calibrations(lake, **choice):
+    """The calibrations of a lake."""
+    return read_records(lake, CALIBRATIONS, CalibrationRecord, **choice)
 
 
 def make_frame(rng, *, nulls=False, free=5, **values):

@@ -23,11 +23,6 @@ REPO = Path(__file__).resolve().parents[2]
 DAY = Partition("car", "2026-03-02")
 
 
-@pytest.fixture
-def lake(tmp_path):
-    return Lake.at(tmp_path / "lake")
-
-
 def frames(count, **values):
     rng = np.random.default_rng(3)
     return [
@@ -82,9 +77,7 @@ def test_frames_and_observations_come_back_as_they_were(sensors, lake):
 def test_a_view_is_of_the_sensors_that_are_chosen(lake):
     rows = write_two_cameras(lake)
     left = list(frames_of(lake, DAY, chosen={"camera": "left", "lidar": "top", "radar": "nose"}))
-    assert [f.sensors for f in left] == [["camera", "lidar", "radar"], ["lidar", "radar"]] * 2 + [
-        left[0].sensors
-    ]
+    assert [len(f.sensors) for f in left] == [3, 2, 3, 2, 3]
     assert (left[0].image, left[1].image) == (b"left", b"")
     assert left[2].camera_stamp_ns == left[2].stamp_ns + 5
     assert left[0].priors["camera_lidar"][0, 3] == 2.0
@@ -105,18 +98,10 @@ def test_files_lie_by_table_day_and_sensor_and_those_of_gone_sensors_go(lake):
         f"images/{of_day}/front.parquet", f"images/{of_day}/left.parquet", f"moments/{of_day}/part-0.parquet",
         f"scans/{of_day}/nose.parquet", f"sweeps/{of_day}/top.parquet",
     ]  # fmt: skip
-    assert ingested(lake, DAY).extra[FILES] == {
-        "front": "images",
-        "top": "sweeps",
-        "nose": "scans",
-        "left": "images",
-    }
+    tables = {"front": "images", "top": "sweeps", "nose": "scans", "left": "images"}
+    assert ingested(lake, DAY).extra[FILES] == tables
     write_frames(lake, DAY, frames(2))
-    assert sorted(p.name for p in sensor_files(lake, MOMENTS, DAY)) == [
-        "camera.parquet",
-        "lidar.parquet",
-        "radar.parquet",
-    ]
+    assert sorted(p.stem for p in sensor_files(lake, MOMENTS, DAY)) == ["camera", "lidar", "radar"]
 
 
 def test_a_file_of_other_work_is_not_read_with_these_moments(lake, tmp_path):

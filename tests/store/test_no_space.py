@@ -96,7 +96,9 @@ def test_a_temporary_folder_without_space_is_named_and_the_log_not_called_damage
     assert "no space left" in problem["reason"]
 
 
-@pytest.mark.parametrize("command", [["simulate", "--frames", 6], ["export", "schemas"]])
+@pytest.mark.parametrize(
+    "command", [["simulate", "--vehicles", 1, "--days", 1, "--frames", 3], ["export", "schemas"]]
+)
 def test_an_output_without_space_is_named(command, on_full_disk):
     out = on_full_disk.disk / "out"
     for option in (["--out", out], [f"--out={out}"]):

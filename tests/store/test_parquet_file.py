@@ -8,13 +8,11 @@ import pytest
 import pipeline.store.object_store
 from pipeline.store.commits import commit_records
 from pipeline.store.files import LocalFiles
-from pipeline.store.partitions import Lake, Partition
-from pipeline.store.records import read_records
+from pipeline.store.partitions import Partition
 from pipeline.store.row_groups import read_columns, read_group, row_groups
 from pipeline.store.tables import read_rows, write_partition
-from schemas.calibrations import CALIBRATIONS, CalibrationRecord
-from tests.makers.s3_server import BUCKET, running
-from tests.makers.table_rows import make_row
+from schemas.calibrations import CALIBRATIONS
+from tests.makers.table_rows import make_record, make_row, read_calibrations
 from tests.makers.whole_tables import FRAMES, WholeFrame
 
 DAY = Partition("car", "2026-03-02")
@@ -25,8 +23,7 @@ def fill_and_read(lake):
     rng = np.random.default_rng(0)
     with write_partition(lake, FRAMES, DAY, "key", "0.1") as writer:
         writer.append([make_row("frames", rng, frame_index=i) for i in range(3)])
-    values = {"recorded_at": "", "asserted_at": "", "vehicle": "car", "day": DAY.day, "work_key": "A"}
-    commit_records(lake, CALIBRATIONS, [make_row("calibrations", rng, **values)])
+    commit_records(lake, CALIBRATIONS, [make_record(rng, "A")])
 
     def read():
         groups = row_groups(lake, FRAMES, DAY)
@@ -34,19 +31,19 @@ def fill_and_read(lake):
             len(read_rows(lake, FRAMES, DAY, WholeFrame)),
             len(read_columns(lake, FRAMES, DAY, ["frame_index"])["frame_index"]),
             len(read_group(lake, FRAMES, groups[0], WholeFrame)),
-            len(read_records(lake, CALIBRATIONS, CalibrationRecord)),
+            len(read_calibrations(lake)),
         )
 
     return read
 
 
-def test_files_of_a_folder_are_read_without_any_object_of_python(tmp_path, monkeypatch):
-    read = fill_and_read(Lake.at(tmp_path))
+def test_files_of_a_folder_are_read_without_any_object_of_python(lake, monkeypatch):
+    read = fill_and_read(lake)
     monkeypatch.setattr(LocalFiles, "opened", lambda *_: pytest.fail("opened as a Python stream"))
     assert read() == (3, 3, 3, 1)
 
 
-def test_objects_of_a_bucket_are_read_in_the_callers_thread_alone(monkeypatch):
+def test_objects_of_a_bucket_are_read_in_the_callers_thread_alone(bucket_lake, monkeypatch):
     readers = set()
     real = pipeline.store.object_store._Reader.readinto
 
@@ -54,9 +51,6 @@ def test_objects_of_a_bucket_are_read_in_the_callers_thread_alone(monkeypatch):
         readers.add(threading.get_ident())
         return real(self, buffer)
 
-    with running() as s3:
-        for name, value in s3.environment.items():
-            monkeypatch.setenv(name, value)
-        monkeypatch.setattr(pipeline.store.object_store._Reader, "readinto", noted)
-        assert fill_and_read(Lake.at(f"s3://{BUCKET}/lakes/threads"))() == (3, 3, 3, 1)
+    monkeypatch.setattr(pipeline.store.object_store._Reader, "readinto", noted)
+    assert fill_and_read(bucket_lake)() == (3, 3, 3, 1)
     assert readers == {threading.get_ident()}

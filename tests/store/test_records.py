@@ -1,6 +1,5 @@
 """Record tables: nothing doubles, nothing is lost, what is current is written down, damage costs its own rows only."""
 
-import multiprocessing
 import os
 import signal
 import subprocess
@@ -24,30 +23,10 @@ from pipeline.store.delta import Wanted, live_files, open_table, read_file, tidy
 from pipeline.store.partitions import Lake
 from pipeline.store.records import RecordIndex, last_day, read_columns, read_latest, read_records
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
-from schemas.drift import DRIFT, DriftFinding
 from tests.makers.lakes import write_records
-from tests.makers.table_rows import ROW_TYPES, make_row, same
+from tests.makers.table_rows import ROW_TYPES, make_record, make_row, read_calibrations, same
 
 REPO = Path(__file__).resolve().parents[2]
-
-
-@pytest.fixture
-def lake(tmp_path):
-    return Lake.at(tmp_path / "lake")
-
-
-@pytest.fixture
-def rng():
-    return np.random.default_rng(0)
-
-
-def record(rng, key, vehicle="car", day="2026-03-02", pair=PAIRS[0], **values):
-    values = {"recorded_at": "", "asserted_at": "", "method": "joint"} | values
-    return make_row("calibrations", rng, vehicle=vehicle, day=day, pair=pair, work_key=key, **values)
-
-
-def read(lake, **choice):
-    return read_records(lake, CALIBRATIONS, CalibrationRecord, **choice)
 
 
 def version(lake, table="calibrations"):
@@ -58,37 +37,45 @@ def data_files(lake):
     return sorted(lake.root.glob("calibrations/month=*/*.parquet"))
 
 
-@pytest.mark.parametrize("nulls", [False, True])
-@pytest.mark.parametrize(
-    ("schema", "row_type"), [(CALIBRATIONS, CalibrationRecord), (DRIFT, DriftFinding)], ids=lambda s: s
-)
-def test_rows_of_every_record_table_come_back_as_they_were(nulls, schema, row_type, lake, rng):
-    rows = [
-        make_row(schema.name, rng, nulls=nulls, vehicle="car", day=f"2026-0{i}-02", work_key=str(i))
-        for i in (1, 2, 3)
-    ]
+@pytest.mark.parametrize("table", [n for n, (schema, _) in ROW_TYPES.items() if schema.is_record_table])
+def test_rows_of_every_record_table_come_back_as_they_were(table, lake, rng):
+    schema, row_type = ROW_TYPES[table]
+    of = [{"vehicle": "car", "day": f"2026-0{i}-02", "work_key": str(i)} for i in (1, 2, 3)]
+    rows = [make_row(table, rng, nulls=i == 1, **values) for i, values in enumerate(of)]
     commit_records(lake, schema, rows)
-    found = read_records(lake, schema, row_type)
-    assert [r.day for r in found] == [r.day for r in rows]
-    assert all(same(a, b) for a, b in zip(rows, found, strict=True))
+    assert all(same(a, b) for a, b in zip(rows, read_records(lake, schema, row_type), strict=True))
+
+
+def test_after_the_night_small_files_are_put_together_and_every_row_stays(any_lake, rng):
+    lake = any_lake
+    assert read_calibrations(lake) == []
+    days = [f"2026-03-{i:02d}" for i in range(1, 10)]
+    for day in days:
+        commit_records(lake, CALIBRATIONS, [make_record(rng, day, day=day)])
+    before = read_calibrations(lake)
+    assert commit_records(lake, CALIBRATIONS, before) == 0
+    assert last_day(lake, CALIBRATIONS) == days[-1]
+    assert any("9 files are 1 now" in what for what in tidy_table(lake, CALIBRATIONS))
+    assert all(same(a, b) for a, b in zip(before, read_calibrations(lake), strict=True))
+    assert list(tidy_table(lake, CALIBRATIONS)) == []
 
 
 def test_the_same_work_never_doubles_and_changes_no_byte(lake, rng):
-    rows = [record(rng, "k1", pair=pair) for pair in PAIRS]
+    rows = [make_record(rng, "k1", pair=pair) for pair in PAIRS]
     assert commit_records(lake, CALIBRATIONS, rows + rows) == 3
     before = version(lake)
     assert commit_records(lake, CALIBRATIONS, rows) == 0
     assert assert_records(lake, CALIBRATIONS, rows) == 0
     assert version(lake) == before
-    assert len(read(lake)) == 3
+    assert len(read_calibrations(lake)) == 3
 
 
 def test_records_say_when_they_were_written_and_file_times_say_nothing(lake, rng):
     for seed, key in ((3, "c"), (1, "a"), (2, "b")):
-        write_records(lake, CALIBRATIONS, [record(rng, "", seed=seed)], key)
+        write_records(lake, CALIBRATIONS, [make_record(rng, "", seed=seed)], key)
     for age, path in enumerate(data_files(lake)):
         os.utime(path, ns=(0, 10**18 + age * 10**9))
-    found = read(lake)
+    found = read_calibrations(lake)
     assert [r.seed for r in found] == [3, 1, 2]
     stamps = [r.recorded_at for r in found]
     assert stamps == sorted(set(stamps)) == [r.asserted_at for r in found]
@@ -96,56 +83,53 @@ def test_records_say_when_they_were_written_and_file_times_say_nothing(lake, rng
 
 
 def test_configuration_a_then_b_then_a_again_leaves_a_current(lake, rng):
-    a, b = record(rng, "A"), record(rng, "B")
+    a, b = make_record(rng, "A"), make_record(rng, "B")
     for row in (a, b):
         commit_records(lake, CALIBRATIONS, [row])
-    assert [r.work_key for r in current_records(read(lake))] == ["B"]
-    recorded = read(lake)[0]
-    assert assert_records(lake, CALIBRATIONS, [a]) == 1
-    assert [r.work_key for r in current_records(read(lake))] == ["A"]
-    again = read(lake)[-1]
-    assert len(read(lake)) == 2
+    assert [r.work_key for r in current_records(read_calibrations(lake))] == ["B"]
+    recorded = read_calibrations(lake)[0]
+    never = [make_record(rng, "C"), make_record(rng, "A", vehicle="bus")]  # nothing to assert
+    assert assert_records(lake, CALIBRATIONS, [a, *never]) == 1
+    assert [r.work_key for r in current_records(read_calibrations(lake))] == ["A"]
+    again = read_calibrations(lake)[-1]
+    assert len(read_calibrations(lake)) == 2
     assert (again.recorded_at, again.work_key) == (recorded.recorded_at, "A")
     assert again.asserted_at > recorded.asserted_at
     assert commit_records(lake, CALIBRATIONS, [b]) == 1  # to write it again is to assert it
-    assert [r.work_key for r in current_records(read(lake))] == ["B"]
-
-
-def test_nothing_is_added_by_an_assertion_of_what_was_never_recorded(lake, rng):
-    commit_records(lake, CALIBRATIONS, [record(rng, "A")])
-    assert assert_records(lake, CALIBRATIONS, [record(rng, "B"), record(rng, "C", vehicle="bus")]) == 0
-    assert [r.work_key for r in read(lake)] == ["A"]
+    assert [r.work_key for r in current_records(read_calibrations(lake))] == ["B"]
 
 
 def test_a_clock_that_was_in_the_future_does_not_keep_its_record_current(lake, rng):
     future = "2099-01-01T00:00:00.000000Z"
-    commit_records(lake, CALIBRATIONS, [record(rng, "A", recorded_at=future, asserted_at=future)])
-    commit_records(lake, CALIBRATIONS, [record(rng, "B")])
-    assert [r.work_key for r in current_records(read(lake))] == ["B"]
+    commit_records(lake, CALIBRATIONS, [make_record(rng, "A", recorded_at=future, asserted_at=future)])
+    commit_records(lake, CALIBRATIONS, [make_record(rng, "B")])
+    assert [r.work_key for r in current_records(read_calibrations(lake))] == ["B"]
 
 
 def test_an_edge_of_its_own_has_a_current_record_of_its_own(lake, rng):
-    rear = record(rng, "A", parent_frame="rear", child_frame="top")
-    commit_records(lake, CALIBRATIONS, [record(rng, "A"), rear])
-    assert [r.parent_frame for r in current_records(read(lake))] == ["camera", "rear"]
+    rear = make_record(rng, "A", parent_frame="rear", child_frame="top")
+    commit_records(lake, CALIBRATIONS, [make_record(rng, "A"), rear])
+    assert [r.parent_frame for r in current_records(read_calibrations(lake))] == ["camera", "rear"]
 
 
 def test_a_reader_gets_the_window_the_vehicle_and_the_columns_that_it_asks_for(lake, rng, monkeypatch):
-    rows = [record(rng, v + d, v, d) for v in ("a", "b") for d in ("2026-01-30", "2026-02-01", "2026-02-03")]
+    rows = [
+        make_record(rng, v + d, v, d) for v in ("a", "b") for d in ("2026-01-30", "2026-02-01", "2026-02-03")
+    ]
     for row in rows:
         commit_records(lake, CALIBRATIONS, [row])
     opened = []
     real = pipeline.store.delta.opened_parquet
     monkeypatch.setattr(pipeline.store.delta, "opened_parquet", lambda *a: (opened.append(a), real(*a))[1])
-    got = read(lake, vehicle="a", first="2026-02-01", columns=("qw",))
+    got = read_calibrations(lake, vehicle="a", first="2026-02-01", columns=("qw",))
     assert [(r.vehicle, r.day) for r in got] == [("a", "2026-02-01"), ("a", "2026-02-03")]
     assert len(opened) == 2  # files of other days and vehicles are not opened
     assert [r.qw for r in got] == [r.qw for r in rows[1:3]]
     assert got[0].covariance is None
     assert got[0].diagnostics == {}
-    assert [r.day for r in read(lake, day="2026-02-01")] == ["2026-02-01"] * 2
-    assert len(read(lake, last="2026-01-31")) == 2
-    assert read(lake, vehicle="c") == []
+    assert [r.day for r in read_calibrations(lake, day="2026-02-01")] == ["2026-02-01"] * 2
+    assert len(read_calibrations(lake, last="2026-01-31")) == 2
+    assert read_calibrations(lake, vehicle="c") == []
     assert last_day(lake, CALIBRATIONS) == "2026-02-03"
 
 
@@ -153,7 +137,7 @@ def test_of_a_month_in_one_file_only_the_row_groups_of_the_days_asked_for_are_re
     monkeypatch.setattr(delta, "_WRITER", WriterProperties(max_row_group_size=2))
     days = [f"2026-01-{d:02d}" for d in range(1, 11)]
     for day in days:
-        commit_records(lake, CALIBRATIONS, [record(rng, v + day, v, day) for v in ("a", "b")])
+        commit_records(lake, CALIBRATIONS, [make_record(rng, v + day, v, day) for v in ("a", "b")])
     assert any("are 1 now" in told for told in tidy_table(lake, CALIBRATIONS))
     [file] = live_files(open_table(lake, CALIBRATIONS))
     columns = ["vehicle", "day"]
@@ -164,13 +148,14 @@ def test_of_a_month_in_one_file_only_the_row_groups_of_the_days_asked_for_are_re
     mapped = read_file(lake, CALIBRATIONS, file.name, ["day", "diagnostics.x"])
     assert (mapped.num_rows, lake.damage) == (20, [])
     assert read_file(lake, CALIBRATIONS, file.name, columns, Wanted(frozenset({"c"}))).num_rows == 0
-    assert [r.day for r in read(lake, vehicle={"a", "c"}, last=days[1])] == days[:2]
+    assert [r.day for r in read_calibrations(lake, vehicle={"a", "c"}, last=days[1])] == days[:2]
 
 
 def test_one_value_of_a_column_of_maps_is_read_as_a_column(lake, rng):
     told = [{}, {"x": 1.5, "y": 2.0}, {"y": 3.0}, {}, {"x": 4.0}]
     rows = [
-        replace(record(rng, str(k), "a", f"2026-01-{k + 1:02d}"), diagnostics=d) for k, d in enumerate(told)
+        replace(make_record(rng, str(k), "a", f"2026-01-{k + 1:02d}"), diagnostics=d)
+        for k, d in enumerate(told)
     ]
     commit_records(lake, CALIBRATIONS, rows[:2])
     commit_records(lake, CALIBRATIONS, rows[2:])
@@ -189,10 +174,12 @@ def test_an_index_gives_each_vehicle_day_what_reading_it_gives(lake, rng):
     for key in ("A", "B"):
         for vehicle in ("a", "b"):
             days = ("2026-01-30", "2026-02-01", "2026-02-03")
-            commit_records(lake, CALIBRATIONS, [record(rng, key, vehicle, d, p) for d in days for p in PAIRS])
+            commit_records(
+                lake, CALIBRATIONS, [make_record(rng, key, vehicle, d, p) for d in days for p in PAIRS]
+            )
     index = RecordIndex(lake, CALIBRATIONS, CalibrationRecord, "2026-01-31", "2026-02-28")
     for vehicle, day in (("a", "2026-02-01"), ("b", "2026-02-03")):
-        expected = read(lake, vehicle=vehicle, day=day)
+        expected = read_calibrations(lake, vehicle=vehicle, day=day)
         assert len(expected) == 6
         assert all(same(x, y) for x, y in zip(index.of(vehicle, day), expected, strict=True))
     assert index.of("a", "2026-01-30") == []
@@ -207,7 +194,7 @@ def test_the_last_day_of_each_vehicle_and_method_is_read_and_no_other(lake, rng)
         ("a", "tracking"): ("2026-01-30",),
     }
     for (vehicle, method), of in days.items():
-        rows = [replace(record(rng, "k", vehicle, d, p), method=method) for d in of for p in PAIRS]
+        rows = [replace(make_record(rng, "k", vehicle, d, p), method=method) for d in of for p in PAIRS]
         commit_records(lake, CALIBRATIONS, rows)
     found = read_latest(lake, CALIBRATIONS, CalibrationRecord, first="2026-01-01")
     assert {(r.vehicle, r.method, r.day) for r in found} == {(*key, of[-1]) for key, of in days.items()}
@@ -219,7 +206,7 @@ def test_the_last_day_of_each_vehicle_and_method_is_read_and_no_other(lake, rng)
 
 
 def test_a_lake_without_records_reads_as_empty_and_is_not_made_by_reading(lake):
-    assert read(lake) == []
+    assert read_calibrations(lake) == []
     assert last_day(lake, CALIBRATIONS) is None
     assert commit_records(lake, CALIBRATIONS, []) == 0
     assert list(tidy_table(lake, CALIBRATIONS)) == []
@@ -228,8 +215,10 @@ def test_a_lake_without_records_reads_as_empty_and_is_not_made_by_reading(lake):
 
 def test_a_row_without_what_its_table_promises_is_not_committed(lake, rng):
     with pytest.raises(ContractError, match="covariance has shape"):
-        commit_records(lake, CALIBRATIONS, [record(rng, "A"), record(rng, "B", covariance=np.eye(4))])
-    assert read(lake) == []
+        commit_records(
+            lake, CALIBRATIONS, [make_record(rng, "A"), make_record(rng, "B", covariance=np.eye(4))]
+        )
+    assert read_calibrations(lake) == []
 
 
 # -- damage ------------------------------------------------------------------------------------------
@@ -247,19 +236,19 @@ def damage(path, how):
 
 @pytest.mark.parametrize("how", ["cut", "empty", "gone", "bits"])
 def test_a_damaged_file_is_named_and_left_out_and_healed_when_its_work_is_done_again(how, lake, rng):
-    bad, good = record(rng, "A"), record(rng, "B", vehicle="bus")
+    bad, good = make_record(rng, "A"), make_record(rng, "B", vehicle="bus")
     for row in (bad, good):
         commit_records(lake, CALIBRATIONS, [row])
     [path] = [p for p in data_files(lake) if "bus" not in read_vehicles(p)]
     damage(path, how)
-    assert [r.vehicle for r in read(lake)] == ["bus"]
+    assert [r.vehicle for r in read_calibrations(lake)] == ["bus"]
     assert path.name in lake.damage[0]
     commit_records(lake, CALIBRATIONS, [bad])
     whole = Lake.at(lake.root)
-    assert sorted(r.vehicle for r in read(whole)) == ["bus", "car"]
+    assert sorted(r.vehicle for r in read_calibrations(whole)) == ["bus", "car"]
     list(tidy_table(whole, CALIBRATIONS))
     fresh = Lake.at(lake.root)
-    assert sorted(r.vehicle for r in read(fresh)) == ["bus", "car"]
+    assert sorted(r.vehicle for r in read_calibrations(fresh)) == ["bus", "car"]
     assert fresh.damage == []
     assert how == "gone" or list(lake.root.glob("calibrations/_damaged/*"))
 
@@ -270,23 +259,11 @@ def read_vehicles(path):
     return pq.read_table(path, columns=["vehicle"], partitioning=None)["vehicle"].to_pylist()
 
 
-# -- upkeep ------------------------------------------------------------------------------------------
-
-
-def test_after_the_night_small_files_are_put_together_and_every_row_stays(lake, rng):
-    for i in range(12):
-        commit_records(lake, CALIBRATIONS, [record(rng, f"k{i}", day=f"2026-03-{i + 1:02d}")])
-    before = read(lake)
-    assert any("12 files are 1 now" in what for what in tidy_table(lake, CALIBRATIONS))
-    assert all(same(a, b) for a, b in zip(before, read(lake), strict=True))
-    assert list(tidy_table(lake, CALIBRATIONS)) == []
-
-
 # -- other engines -----------------------------------------------------------------------------------
 
 
 def test_duckdb_and_polars_read_records_by_the_documented_lines(lake, rng):
-    row = record(rng, "A", status="held")
+    row = make_record(rng, "A", status="held")
     commit_records(lake, CALIBRATIONS, [row])
     where = str(lake.root / "calibrations")
     records = DeltaTable(where).to_pyarrow_table()  # noqa: F841 - DuckDB finds it by its name
@@ -300,42 +277,7 @@ def test_duckdb_and_polars_read_records_by_the_documented_lines(lake, rng):
     np.testing.assert_array_equal(found, row.covariance)
 
 
-@pytest.mark.parametrize("name", [n for n, (schema, _) in ROW_TYPES.items() if schema.is_record_table])
-def test_duckdb_and_polars_read_every_record_table(name, lake, rng):
-    schema, _ = ROW_TYPES[name]
-    stamps = {"recorded_at": "", "asserted_at": ""}
-    rows = [make_row(name, rng, vehicle=v, day="2026-03-02", work_key="k", **stamps) for v in ("a", "b")]
-    commit_records(lake, schema, rows)
-    where = str(lake.root / name)
-    records = DeltaTable(where).to_pyarrow_table()  # noqa: F841 - DuckDB finds it by its name
-    assert duckdb.sql("select vehicle from records order by vehicle").fetchall() == [("a",), ("b",)]
-    frame = pl.scan_delta(where).filter(pl.col("day") == "2026-03-02").collect()
-    assert set(frame.columns) == {*(c.name for c in schema.columns), "month"}
-    assert frame.height == 2
-
-
-# -- many writers, and dead ones ---------------------------------------------------------------------
-
-
-def write_many(root, name, times):
-    lake, rng = Lake.at(root), np.random.default_rng(1)
-    for i in range(times):
-        commit_records(lake, CALIBRATIONS, [record(rng, f"{name}{i}"), record(rng, "shared", vehicle="bus")])
-
-
-@pytest.mark.slow
-def test_two_writers_at_once_both_get_their_records_in(lake):
-    context = multiprocessing.get_context("spawn")
-    writers = [context.Process(target=write_many, args=(lake.root, name, 8)) for name in "ab"]
-    for process in writers:
-        process.start()
-    for process in writers:
-        process.join(60)
-    assert [p.exitcode for p in writers] == [0, 0]
-    assert sorted(r.work_key for r in read(lake, vehicle="car")) == sorted(
-        f"{n}{i}" for n in "ab" for i in range(8)
-    )
-    assert [r.work_key for r in read(lake, vehicle="bus")] == ["shared"]
+# -- dead writers -----------------------------------------------------------------------------------
 
 
 _COMMITS = """
@@ -343,10 +285,10 @@ import sys, numpy as np
 from pipeline.store.partitions import Lake
 from pipeline.store.commits import commit_records
 from schemas.calibrations import CALIBRATIONS, PAIRS
-from tests.store.test_records import record
+from tests.makers.table_rows import ROW_TYPES, make_record, make_row, read_calibrations, same
 lake, rng, turn = Lake.at(sys.argv[1]), np.random.default_rng(0), int(sys.argv[2])
 for i in range(10_000):
-    commit_records(lake, CALIBRATIONS, [record(rng, f"{turn}-{i}", pair=pair) for pair in PAIRS])
+    commit_records(lake, CALIBRATIONS, [make_record(rng, f"{turn}-{i}", pair=pair) for pair in PAIRS])
     print(f"{turn}-{i}", flush=True)
 """
 
@@ -366,7 +308,7 @@ def test_a_killed_writer_loses_nothing_that_it_committed_and_leaves_no_half(lake
             time.sleep(rng.uniform(0, 0.3))
             writer.send_signal(signal.SIGKILL)
             told += writer.stdout.read().split()
-        found = read(lake)
+        found = read_calibrations(lake)
         pairs = {k: sorted(r.pair for r in found if r.work_key == k) for k in {r.work_key for r in found}}
         assert all(p == sorted(PAIRS) for p in pairs.values())
         assert set(told) <= set(pairs)
