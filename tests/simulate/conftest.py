@@ -57,15 +57,8 @@ def shots_of(environment, *, rig=None, times=(1.0, 4.0), seed=5, night=False):
         stamps = triggered_stamps(rig, mounting, t, rng)
         seen = frame_of(Seat(moment, scene, rig, mounting), stamps, rng, SemanticsSpec())
         image = seen.images["camera"]
-        frame = Trio(
-            t,
-            stamps["camera"],
-            image.jpeg,
-            image.boxes,
-            seen.sweeps["lidar"],
-            seen.scans["radar"],
-            image.true_labels,
-        )
+        clouds = seen.sweeps["lidar"], seen.scans["radar"]
+        frame = Trio(t, stamps["camera"], image.jpeg, image.boxes, *clouds, image.true_labels)
         shots.append(Shot(drive, scene, moment, rig, mounting, frame))
     return shots
 

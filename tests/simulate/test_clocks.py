@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.rig.topics import TOPICS
 from pipeline.simulate.faults import Fault
-from pipeline.simulate.fleet import FleetSpec, mounting_on, simulate_vehicle_day
+from pipeline.simulate.fleet import FleetSpec, simulate_vehicle_day
 from pipeline.simulate.logs.recording import Ticks, free_clocks
 from pipeline.simulate.sensors.rigs import rig_named
 
@@ -70,9 +70,3 @@ def test_a_stamp_fault_shifts_stamps_and_nothing_else(tmp_path, read, the_log):
         for n in ("good", "late")
     ]
     assert truth[1]["dt_camera_lidar_s"] - truth[0]["dt_camera_lidar_s"] == pytest.approx(0.06)
-
-
-def test_a_late_clock_shifts_what_a_sensor_sees_and_not_its_stamps():
-    fault = Fault("vehicle-1", 0, "radar", "time", 0.03)
-    mounting = mounting_on(FleetSpec(**SHORT, frames=1, faults=(fault,)), 0, 0)
-    assert mounting["radar"].phase_s == 0.0

@@ -1,3 +1,5 @@
+"""The command: its summary, what it refuses, and its end in the middle."""
+
 import json
 import signal
 import subprocess
@@ -6,40 +8,25 @@ import time
 
 import pytest
 
+import pipeline.simulate.reflectors
 from jobs.simulate import simulate
 from pipeline.core.errors import ConfigError
 from tests.makers.processes import started
 
 
-def test_the_job_ends_with_one_line_of_json_that_says_where_things_are(tmp_path, capsys):
-    code = simulate(
-        out=tmp_path, vehicles=1, days=2, frames=3, container="mixed", faults="vehicle-1:1:radar:yaw:1.2"
-    )
+def test_the_job_ends_with_one_line_of_json_that_says_where_things_are(tmp_path, capsys, monkeypatch):
+    full = pipeline.simulate.reflectors.simulate_reflectors
+    few = lambda *where, **how: full(*where, frames=2, **how)  # noqa: E731
+    monkeypatch.setattr(pipeline.simulate.reflectors, "simulate_reflectors", few)
+    knocked = {"faults": "vehicle-1:0:radar:yaw:1.2", "container": "mixed", "reflectors": True}
+    assert simulate(out=tmp_path, vehicles=1, days=1, frames=3, **knocked) == 0
     summary = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert code == 0
-    assert (summary["command"], summary["status"], summary["frames"], summary["logs"]) == (
-        "simulate",
-        "done",
-        6,
-        6,
-    )
-    assert sorted(p.name for p in (tmp_path / "truth" / "vehicle-1").iterdir()) == [
-        "2026-03-02.json",
-        "2026-03-03.json",
-    ]
+    assert (summary["command"], summary["status"]) == ("simulate", "done")
+    assert (summary["frames"], summary["logs"], len(summary["reflectors"])) == (3, 3, 1)
+    assert [p.name for p in (tmp_path / "truth" / "vehicle-1").iterdir()] == ["2026-03-02.json"]
     kinds = {p.suffix for p in (tmp_path / "logs" / "vehicle-1" / "2026-03-02").iterdir()}
     assert kinds == {".mcap", ".bag", ""}
-
-
-def test_the_job_records_reflectors_where_asked(tmp_path, capsys, monkeypatch):
-    import pipeline.simulate.reflectors as module
-
-    full = module.simulate_reflectors
-    monkeypatch.setattr(module, "simulate_reflectors", lambda *where, **how: full(*where, frames=2, **how))
-    simulate(out=tmp_path, vehicles=1, days=1, frames=1, reflectors=True)
-    summary = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert json.loads((tmp_path / "reflectors/vehicle-1/2026-03-02.json").read_text())["frames"] == 2
-    assert len(summary["reflectors"]) == 1
 
 
 @pytest.mark.parametrize(

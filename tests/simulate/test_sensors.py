@@ -1,8 +1,12 @@
+"""Sensors deliver what their data sheets say, with the errors that were asked for."""
+
 from dataclasses import replace
 
 import cv2
 import numpy as np
 
+from pipeline.simulate.sensors.camera import _exposed
+from pipeline.simulate.sensors.lidar import sweep_lidar
 from pipeline.simulate.sensors.radar import RadarErrors, faded_by_road, scan_radar
 from pipeline.simulate.sensors.rigs import rig_named
 from pipeline.simulate.sensors.semantics import Box, SemanticsSpec, noisy_boxes, noisy_labels
@@ -16,12 +20,9 @@ def test_the_paper_rig_has_the_data_sheet_of_the_paper():
     edges = camera.unproject(np.array([[-0.5, 469.5], [1823.5, 469.5], [911.5, -0.5], [911.5, 939.5]]))
     np.testing.assert_allclose(np.degrees(np.arccos(edges[0] @ edges[1])), 116.0, atol=0.1)
     np.testing.assert_allclose(np.degrees(np.arccos(edges[2] @ edges[3])), 58.5, atol=0.1)
-    assert rig["lidar"].sheet.columns == 240
-    assert rig["lidar"].sheet.rows == 96
-    assert (rig["radar"].sheet.azimuth_resolution_deg, rig["radar"].sheet.elevation_resolution_deg) == (
-        1.6,
-        6.0,
-    )
+    assert (rig["lidar"].sheet.columns, rig["lidar"].sheet.rows) == (240, 96)
+    radar = rig["radar"].sheet
+    assert (radar.azimuth_resolution_deg, radar.elevation_resolution_deg) == (1.6, 6.0)
 
 
 def test_doppler_is_quantised_and_folded_into_one_period(highway):
@@ -72,18 +73,14 @@ def test_only_what_stands_above_the_road_is_mirrored_in_it_and_strong_echoes_lie
     assert not none.any()
 
 
-def test_a_radar_without_elevation_reports_none(flat_shot):
-    assert np.all(flat_shot.frame.scan.xyz_m[:, 2] == 0)
-    assert len(flat_shot.frame.scan.xyz_m) > 30
-
-
-def test_sixteen_rings_look_all_around(flat_shot):
-    sweep = flat_shot.frame.sweep
-    azimuth = np.arctan2(sweep.xyz_m[:, 1], sweep.xyz_m[:, 0])
+def test_a_flat_radar_has_no_elevation_and_sixteen_rings_look_all_around(flat_shot):
+    sweep, scan = flat_shot.frame.sweep, flat_shot.frame.scan
+    assert len(scan.xyz_m) > 30
+    assert np.all(scan.xyz_m[:, 2] == 0)
     assert set(np.unique(sweep.ring)) <= set(range(16))
+    azimuth = np.arctan2(sweep.xyz_m[:, 1], sweep.xyz_m[:, 0])
     assert np.histogram(azimuth, 8, (-np.pi, np.pi))[0].min() > 50
-    assert sweep.time_s.min() >= -0.1
-    assert sweep.time_s.max() <= 0
+    assert -0.1 <= sweep.time_s.min() <= sweep.time_s.max() <= 0
 
 
 def test_paint_is_brighter_than_asphalt_to_camera_and_lidar(highway):
@@ -105,32 +102,18 @@ def test_paint_is_brighter_than_asphalt_to_camera_and_lidar(highway):
 
 def test_edges_of_objects_give_mixed_points(urban):
     """Some returns lie between two surfaces, so an estimator may not trust each depth jump."""
-    spec = urban[0].rig["lidar"].sheet
-    sharp = replace(spec, divergence_deg=1e-6)
-    from pipeline.simulate.sensors.lidar import sweep_lidar
-
-    args = (urban[0].moment, urban[0].scene.ego, urban[0].mounting["lidar"].T_vehicle)
-    end = urban[0].frame.lidar_stamp_s
-    wide = sweep_lidar(*args, spec, end, np.random.default_rng(0))
-    fine = sweep_lidar(*args, sharp, end, np.random.default_rng(0))
-    range_of = [
-        dict(
-            zip(
-                zip(s.ring.tolist(), s.time_s.tolist(), strict=True),
-                np.linalg.norm(s.xyz_m, axis=1),
-                strict=True,
-            )
-        )
-        for s in (wide, fine)
-    ]
+    shot = urban[0]
+    end, args = shot.frame.lidar_stamp_s, (shot.moment, shot.scene.ego, shot.mounting["lidar"].T_vehicle)
+    range_of = []
+    for spec in (shot.rig["lidar"].sheet, replace(shot.rig["lidar"].sheet, divergence_deg=1e-6)):
+        sweep = sweep_lidar(*args, spec, end, np.random.default_rng(0))
+        beams = zip(sweep.ring.tolist(), sweep.time_s.tolist(), strict=True)
+        range_of.append(dict(zip(beams, np.linalg.norm(sweep.xyz_m, axis=1), strict=True)))
     both = range_of[0].keys() & range_of[1].keys()
     moved = np.array([abs(range_of[0][k] - range_of[1][k]) for k in both])
     assert 0.002 < np.mean(moved > 0.25) < 0.2
-
-
-def test_some_beams_never_come_back(urban):
-    spec = urban[0].rig["lidar"].sheet
-    assert 0.3 < len(urban[0].frame.sweep.ring) / (spec.rows * spec.columns) < 0.99
+    sheet = shot.rig["lidar"].sheet
+    assert 0.3 < len(shot.frame.sweep.ring) / (sheet.rows * sheet.columns) < 0.99  # some never come back
 
 
 def test_labels_err_as_much_as_was_asked_for(shots):
@@ -164,3 +147,12 @@ def test_boxes_hold_the_road_users_of_the_label_image(urban):
         x0, x1, y0, y1 = (round(v / 2) for v in (box.x0, box.x1, box.y0, box.y1))
         covered[max(y0, 0) : y1 + 1, max(x0, 0) : x1 + 1] |= box.name in ("car", "truck")
     assert covered[cars].mean() > 0.7
+
+
+def test_pixels_beyond_black_and_white_are_black_and_white():
+    linear = np.full((60, 80, 3), 0.2, np.float32)
+    linear[:20], linear[40:] = -2.3e10, 2.3e10
+    image = _exposed(linear, 1.5, 0.0, np.random.default_rng(0))
+    assert (image[:18] == 0).all()
+    assert (image[42:] == 255).all()
+    assert ((image[25:35] > 60) & (image[25:35] < 220)).all()
