@@ -61,22 +61,11 @@ def test_a_moment_is_in_stretches_where_it_is_in_one_of_the_spans_they_were_merg
     assert all(b < c for (_, b), (c, _) in zip(merged.spans_ns, merged.spans_ns[1:], strict=False))
 
 
-def motion(speed, yaw_rate=None, position=None):
-    speed = np.asarray(speed, float)
-    unknown = BurstMotion.unknown(len(speed))
-    return BurstMotion(
-        speed,
-        unknown.yaw_rate_radps if yaw_rate is None else np.asarray(yaw_rate, float),
-        unknown.position_m if position is None else np.asarray(position, float),
-    )
-
-
 @given(st.integers(1, 60), st.integers(1, 30), st.integers(0, 2**32 - 1))
 def test_as_many_bursts_are_chosen_as_asked_for_each_once_and_in_order(possible, count, seed):
     rng = np.random.default_rng(seed)
-    drive = motion(
-        rng.uniform(0, 30, possible), rng.normal(0, 0.1, possible), rng.normal(0, 1e3, (possible, 2))
-    )
+    of_each = rng.uniform(0, 30, possible), rng.normal(0, 0.1, possible)
+    drive = BurstMotion(*of_each, rng.normal(0, 1e3, (possible, 2)))
     chosen = choose_bursts(drive, count)
     assert len(chosen) == min(possible, count)
     assert chosen == sorted(set(chosen))
@@ -96,21 +85,17 @@ def test_of_a_day_that_mostly_stood_the_driven_part_is_read():
     speed[driven] = np.linspace(2, 30, 15)
     yaw_rate[driven] = np.linspace(-0.3, 0.3, 15)
     position[driven, 0] = 250.0 * np.arange(15)
-    chosen = choose_bursts(motion(speed, yaw_rate, position), 20)
+    chosen = choose_bursts(BurstMotion(speed, yaw_rate, position), 20)
     assert np.isin(driven, chosen).sum() >= 13  # an even spread would have 5
     assert min(chosen) < 20  # and the rest of the day is not forgotten
     assert max(chosen) >= 35
 
 
-@pytest.mark.parametrize("kind", ["speed", "turn", "place"])
-def test_what_comes_once_a_day_is_read(kind):
+@pytest.mark.parametrize(("kind", "value"), [("speed", 28.0), ("turn", 0.2), ("place", 5e3)])
+def test_what_comes_once_a_day_is_read(kind, value):
     speed, yaw_rate, position = np.full(60, 12.0), np.zeros(60), np.zeros((60, 2))
-    {"speed": speed, "turn": yaw_rate, "place": position}[kind][47] = {
-        "speed": 28.0,
-        "turn": 0.2,
-        "place": 5e3,
-    }[kind]
-    assert 47 in choose_bursts(motion(speed, yaw_rate, position), 20)
+    {"speed": speed, "turn": yaw_rate, "place": position}[kind][47] = value
+    assert 47 in choose_bursts(BurstMotion(speed, yaw_rate, position), 20)
 
 
 def test_a_pause_within_a_chunk_is_no_recorded_time():

@@ -169,16 +169,6 @@ def test_a_protobuf_channel_without_a_schema_is_refused_in_words(kit):
         decode(Channel(kit.LIDAR, "foxglove.PointCloud", PROTOBUF, "", PROTOBUF), memoryview(b""))
 
 
-def test_a_long_foxglove_day_is_read_in_the_same_bursts(kit, tmp_path, run_ingest):
-    made = kit.Kit(frames=150).drive()
-    fleet = kit.fleet(ingest={"read_sweeps": 20})
-    result, ros = run_ingest(made.mcap(tmp_path / "ros.mcap"), fleet=fleet, name="a")
-    _, protobuf = run_ingest(foxglove_logs.write(made, tmp_path / "foxglove.mcap"), fleet=fleet, name="b")
-    assert result.kept["sweeps_in_logs"] == 150
-    assert len(ros) < 60
-    assert_same_rows(ros, protobuf)
-
-
 def test_check_says_of_a_foxglove_log_what_it_says_of_the_ros_log(kit, tmp_path):
     made, fleet = drive(kit), kit.fleet()
     logs = made.mcap(tmp_path / "ros.mcap"), foxglove_logs.write(made, tmp_path / "foxglove.mcap")

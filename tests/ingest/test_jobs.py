@@ -37,21 +37,16 @@ def test_ingest_exits_0_when_done_or_cached_and_3_when_refused(kit, tmp_path, fl
 
 def test_check_exits_0_1_2_for_yes_partly_no(kit, tmp_path, fleet, capsys):
     good = kit.Kit(frames=40).drive()
-    assert check(fleet, good.mcap(tmp_path / "good.mcap")) == 0
-    assert last_line(capsys)["status"] == "yes"
+    assert check(fleet, good.mcap(tmp_path / "good.mcap"), json=True) == 0
+    report = json.loads(capsys.readouterr().out)  # one object on stdout
+    assert report["answer"] == "yes"
+    assert {v["pair"] for v in report["verdicts"]} == {"camera_lidar", "lidar_radar", "camera_radar"}
+    assert report["sync"]["moments"] == 40
     assert check(fleet, good.without(kit.LABELS).mcap(tmp_path / "unlabelled.mcap")) == 1
     summary = last_line(capsys)
     assert summary["status"] == "partly"
     assert summary["pairs"] == {"camera_lidar": "no", "lidar_radar": "partly", "camera_radar": "no"}
     assert check(fleet, good.without(kit.RADAR).mcap(tmp_path / "blind.mcap")) == 2
     assert kit.RADAR in capsys.readouterr().err
-
-
-def test_check_as_json_is_one_object_on_stdout(kit, tmp_path, fleet, capsys):
-    assert check(fleet, kit.Kit(frames=40).drive().mcap(tmp_path / "a.mcap"), json=True) == 0
-    report = json.loads(capsys.readouterr().out)
-    assert report["answer"] == "yes"
-    assert {v["pair"] for v in report["verdicts"]} == {"camera_lidar", "lidar_radar", "camera_radar"}
-    assert report["sync"]["moments"] == 40
     with pytest.raises(ConfigError, match="no rig"):
-        check(fleet, tmp_path / "a.mcap", rig="truck")
+        check(fleet, tmp_path / "good.mcap", rig="truck")

@@ -1,3 +1,5 @@
+"""The matrix of a rig: what each two sensors share, which edges are judged, and why others are not."""
+
 from dataclasses import replace
 from io import StringIO
 
@@ -35,12 +37,9 @@ def test_every_two_sensors_that_could_be_calibrated_are_in_the_matrix_once():
     assert found.loose == []
 
 
-def test_two_sensors_of_which_others_share_more_say_so():
+def test_two_sensors_without_an_edge_say_why():
     pairs = {(p.parent, p.child): p for p in finding(cut=("front-fl",)).pairs}
     assert pairs["front", "fl"].why_not == "others share more"
-
-
-def test_a_silent_sensor_is_named_with_what_it_loses():
     found = finding(silent=("rr",))
     pairs = {(p.parent, p.child): p for p in found.pairs}
     assert (pairs["rear", "rr"].is_edge, pairs["rear", "rr"].why_not) == (False, "no data of rr")
@@ -64,6 +63,5 @@ def test_the_matrix_is_printed_within_a_terminals_width_with_each_reason_once():
     assert max(len(line) for line in lines) <= 100
     assert any(line.startswith("│front") and "76% 180" in line for line in lines)
     assert "poses refer to top" in text.getvalue()
-    assert (
-        " ".join(text.getvalue().split()).count("the radar measures no elevation") == 2
-    )  # two classes of DoF
+    plain = " ".join(text.getvalue().split())
+    assert plain.count("the radar measures no elevation") == 2  # two classes of DoF

@@ -30,18 +30,15 @@ def pose(x, y, z, q=(1.0, 0.0, 0.0, 0.0)):
 
 def autoware(*things, frame="camera_optical"):
     """Pose, size, label."""
+    of = SimpleNamespace
     objects = [
-        SimpleNamespace(
-            existence_probability=0.8,
-            classification=[
-                SimpleNamespace(label=0, probability=0.1),
-                SimpleNamespace(label=label, probability=0.9),
-            ],
-            kinematics=SimpleNamespace(pose_with_covariance=SimpleNamespace(pose=at)),
-            shape=SimpleNamespace(dimensions=size),
+        of(
+            existence_probability=0.8, shape=of(dimensions=size),
+            classification=[of(label=0, probability=0.1), of(label=label, probability=0.9)],
+            kinematics=of(pose_with_covariance=of(pose=at)),
         )
         for at, size, label in things
-    ]
+    ]  # fmt: skip
     return SimpleNamespace(header=SimpleNamespace(frame_id=frame), objects=objects)
 
 

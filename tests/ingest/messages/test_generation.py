@@ -39,12 +39,6 @@ def test_a_log_of_another_encoding_than_it_says_is_refused_in_words(
     assert result.rejected["wrong_encoding"] > 4
 
 
-@pytest.mark.parametrize(("ros", "said"), [(1, "ros1"), (2, "cdr")])
-def test_a_log_that_says_what_it_holds_is_read(kit, tmp_path, run_ingest, ros, said):
-    result, frames = run_ingest(mcap_that_says(kit.Kit(ros=ros).drive(), said, tmp_path / "car.mcap"))
-    assert (result.status, len(frames)) == ("done", 4)
-
-
 def test_a_ros_1_bag_with_type_names_of_ros_2_is_read(kit, tmp_path, run_ingest, monkeypatch):
     monkeypatch.setattr(rosbags.rosbag1.writer, "denormalize_msgtype", lambda name: name)
     log = kit.Kit(ros=1).drive().bag(tmp_path / "a.bag")

@@ -75,19 +75,15 @@ def test_a_trio_of_a_drive_is_found_with_all_its_topics_in_every_container(tmp_p
         assert found.missing == ()
 
 
-@pytest.mark.parametrize(("sign", "word"), [(1.0, "approaching"), (-1.0, "receding")])
-def test_the_doppler_s_sign_is_read_off_the_drive(tmp_path, sign, word):
+@pytest.mark.parametrize(("sign", "word"), [(1.0, "approaching"), (-1.0, "receding"), (0.0, None)])
+def test_the_doppler_s_sign_is_read_off_the_drive_and_a_standing_car_leaves_it_to_the_reader(
+    tmp_path, sign, word
+):
     log = with_doppler(drive(), lambda c: c | {"doppler": sign * c["doppler"]}).mcap(tmp_path / "a.mcap")
-    values, _ = proposed(log)
-    assert values["rigs"]["default"]["radar"]["doppler_positive"] == word
-
-
-def test_a_standing_car_leaves_the_sign_to_the_reader(tmp_path):
-    log = with_doppler(drive(), lambda c: c | {"doppler": 0 * c["doppler"]}).mcap(tmp_path / "a.mcap")
     values, found = proposed(log)
-    assert "doppler_positive" not in values["rigs"]["default"]["radar"]
-    assert '# doppler_positive = "receding"' in found.text
-    assert found.missing == ("radar: the Doppler's sign",)
+    assert values["rigs"]["default"]["radar"].get("doppler_positive") == word
+    assert ('# doppler_positive = "receding"' in found.text) == (word is None)
+    assert found.missing == (() if word else ("radar: the Doppler's sign",))
 
 
 def test_a_doppler_that_wraps_is_told_from_one_that_does_not(tmp_path):
@@ -187,22 +183,25 @@ def test_the_command_writes_once_and_says_what_to_type_next(tmp_path, capsys, mo
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["next_steps"] == [following]
 
 
-def test_the_pattern_finds_logs_by_folders_and_by_names(tmp_path):
-    for name in ("veh00_20260302_0800.mcap", "veh00_20260302_0900.mcap"):
-        (tmp_path / name).touch()
-    logs = sorted(tmp_path.glob("*.mcap"))
+@pytest.mark.parametrize(
+    ("names", "pattern"),
+    [
+        (["in/car/2026-03-02/raw/a.bag"], "in/{vehicle}/{day}/raw/*"),
+        (["in/a/2026-03-02/x.bag", "in/b/2026-03-02/y.mcap", "in/notes.txt"], "in/{vehicle}/{day}/*"),
+        (["logs/LICENSE.txt", "logs/a_2026-03-02_0.mcap", "logs/a_2026-03-02_1.bag"], "logs/{vehicle}_{day}*"),
+        (["drive.mcap"], ""),
+    ],
+)  # fmt: skip
+def test_the_pattern_is_that_of_folders_and_names_whatever_lies_beside(names, pattern):
+    assert logs_pattern([Path(name) for name in names]) == pattern
+
+
+def test_the_pattern_of_names_without_dashes_finds_the_day(tmp_path):
+    logs = [tmp_path / f"veh00_20260302_0{hour}00.mcap" for hour in (8, 9)]
+    for log in logs:
+        log.touch()
     (found,) = find_vehicle_days(logs_pattern(logs))
-    assert found.partition == Partition("veh00", "2026-03-02")
-    assert len(found.logs) == 2
-    assert logs_pattern([tmp_path / "drive.mcap"]) == ""
-    assert logs_pattern([Path("in/car/2026-03-02/raw/a.bag")]) == "in/{vehicle}/{day}/raw/*"
-
-
-def test_files_beside_the_logs_and_several_formats_do_not_hide_the_pattern():
-    named = [Path(f"logs/{name}") for name in ("LICENSE.txt", "a_2026-03-02_0.mcap", "a_2026-03-02_1.bag")]
-    assert logs_pattern(named) == "logs/{vehicle}_{day}*"
-    in_folders = [Path("in/a/2026-03-02/x.bag"), Path("in/b/2026-03-02/y.mcap"), Path("in/notes.txt")]
-    assert logs_pattern(in_folders) == "in/{vehicle}/{day}/*"
+    assert (found.partition, len(found.logs)) == (Partition("veh00", "2026-03-02"), 2)
 
 
 def test_logs_whose_names_tell_no_day_are_to_be_moved_before_the_night():
