@@ -45,7 +45,3 @@ def test_the_ground_is_inside_where_the_start_is_off_by_no_more_than_its_sigma(t
     )
     assert np.mean(widened[true]) > 0.98  # the picture's lower corners move by a little more than a turn
     assert widened.sum() > true.sum()
-
-
-def test_a_sweep_that_finds_no_ground_free_shows_no_place_for_paint():
-    assert not free_ground(np.zeros((0, 3)), CAMERA, Start(T, 0.1)).any()

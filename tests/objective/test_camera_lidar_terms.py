@@ -7,12 +7,7 @@ import pytest
 
 from pipeline.calibrate.joint.camera_lidar.estimate import AlignmentState
 from pipeline.objective.camera_lidar.edges import chance_of, fit_match_share
-from pipeline.objective.camera_lidar.image_maps import (
-    NO_BOUNDARY,
-    CameraMaps,
-    boundary_offsets,
-    contrast_levels,
-)
+from pipeline.objective.camera_lidar.image_maps import NO_BOUNDARY, CameraMaps, boundary_offsets
 from pipeline.objective.camera_lidar.own_motion import lidar_velocities
 from pipeline.objective.camera_lidar.points import Points
 from pipeline.objective.camera_lidar.projection_loops import camera_parameters, project_point, project_points
@@ -43,21 +38,6 @@ def test_each_boundary_is_found_from_both_sides_in_the_class_of_its_foreground()
     np.testing.assert_array_equal(column[EDGE_BELOW] + 0.5 + np.arange(40), 9.5)
     np.testing.assert_array_equal(column[EDGE_ABOVE] + 0.5 + np.arange(40), 29.5)
     assert (offsets[:, 5, 5] == NO_BOUNDARY).all()
-
-
-def test_two_backdrops_and_unknown_labels_make_no_boundary():
-    labels = np.full((10, 30), 2, np.uint8)
-    labels[:, 10:20], labels[:, 20:] = 8, 255
-    assert (boundary_offsets(labels) == NO_BOUNDARY).all()
-
-
-def test_contrast_is_zero_outside_the_road_and_has_no_mean_along_its_rows():
-    rng = np.random.default_rng(0)
-    road = np.zeros((80, 200), bool)
-    road[20:, 30:170] = True
-    level = contrast_levels(rng.integers(0, 60, road.shape).astype(np.uint8), road, (3.0,))[0].astype(float)
-    assert (level[~road] == 0).all()
-    assert abs(level[30:, 30:170].mean()) < 2.0
 
 
 CAMERAS = {
@@ -170,11 +150,6 @@ def test_some_frames_score_as_in_the_whole_without_copies_of_their_maps(terms):
     for whole, part in zip(terms.gradient(at, level), some.gradient(at, level), strict=True):
         np.testing.assert_array_equal(part, whole[[1, 3]])
     assert some.class_information(at) != terms.class_information(at)
-
-
-def test_information_is_positive_semidefinite(terms):
-    _, information = terms.gradient(AlignmentState(T_TRUE, 0.03).alone, KernelSettings.wide(3.0, 1))
-    assert np.linalg.eigvalsh(information.sum(0)).min() > -1e-6 * np.trace(information.sum(0))
 
 
 def test_score_is_best_at_the_true_pose_and_time_offset(terms):

@@ -8,7 +8,6 @@ import torch
 
 from pipeline.objective.camera_lidar.edges import edge_residuals
 from pipeline.objective.camera_lidar.score import Alignments, prepare_terms
-from pipeline.objective.differentiable.lookup import bilinear
 from pipeline.objective.differentiable.paper import (
     camera_radar_tensors,
     folded_tensors,
@@ -202,14 +201,6 @@ def test_on_the_grid_a_turn_of_the_camera_is_a_shift():
     np.testing.assert_allclose(shift[..., 1], 0, atol=1e-9)
 
 
-def test_bilinear_is_exact_on_a_plane_and_tells_what_is_outside():
-    v, u = np.mgrid[0:6, 0:9].astype(float)
-    plane = torch.tensor((2 * u - 3 * v)[None])
-    uv = torch.tensor([[[0.0, 0.0], [8.0, 5.0], [3.25, 1.5], [8.01, 2.0], [-0.01, 2.0]]], dtype=torch.float64)
-    got = bilinear(plane, uv, torch.ones(1, 5, dtype=torch.bool), 99.0)
-    np.testing.assert_allclose(got[0], [0, 1, 2, 99, 99])
-
-
 def test_poses_equal_their_numpy_versions():
     rng = np.random.default_rng(1)
     xi = rng.normal(size=(50, 6)) * np.array([[1.0], [1e-3], [1e-5], [0.0], [0.3]]).repeat(10, 0)
@@ -219,14 +210,6 @@ def test_poses_equal_their_numpy_versions():
     np.testing.assert_allclose(euler_angles(T), loop.euler_angles(se3.exp_se3(xi)), atol=1e-12)
     back = pose_of_euler_angles(euler_angles(T), T[:, :3, 3])
     np.testing.assert_allclose(back, T, atol=1e-12)
-
-
-def test_the_exponential_has_the_right_gradient_at_zero():
-    xi = torch.zeros(6, dtype=torch.float64, requires_grad=True)
-    point = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
-    T = exp_se3(xi)
-    (T[:3, :3] @ point + T[:3, 3]).sum().backward()
-    np.testing.assert_allclose(xi.grad, [2 - 3, 3 - 1, 1 - 2, 1, 1, 1])
 
 
 def test_the_loop_loss_is_the_numpy_one_and_zero_where_the_three_agree():

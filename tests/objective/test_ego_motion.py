@@ -55,16 +55,6 @@ def test_motion_is_right_within_its_sigma(names, logged):
     assert not found.left_out
 
 
-def test_more_radars_know_more():
-    rng = np.random.default_rng(2)
-    u = motion(rng)
-    radars = [radar(n, u, rng) for n in CORNERS]
-    one, all_three = (
-        ego_motion(r, SILENT, heading=(0.0, 0.0)).covariance[:, 0, 0].mean() for r in (radars[:1], radars)
-    )
-    assert all_three < 0.5 * one
-
-
 def test_a_convoy_in_some_scans_does_not_move_the_car():
     rng = np.random.default_rng(3)
     u = motion(rng)

@@ -92,15 +92,3 @@ def test_points_out_of_view_and_behind_the_camera_cost_the_penalty():
         2.5,
     )
     assert frame_costs(frames, np.eye(4)[None])[0, 0] == pytest.approx(7.5)
-
-
-def test_a_frame_without_points_costs_nothing():
-    frames = fold_frames(
-        [np.zeros((0, 3)), cloud(1)], [smooth_cost(1)] * 2, [CAMERAS["pinhole"]] * 2, PENALTY
-    )
-    assert frame_costs(frames, poses(3))[:, 0].tolist() == [0, 0, 0]
-
-
-def test_a_map_of_the_wrong_size_is_refused():
-    with pytest.raises(ValueError, match="does not fit camera"):
-        fold_frames([cloud(1)], [np.zeros((3, 3))], [CAMERAS["pinhole"]], PENALTY)

@@ -2,16 +2,15 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 
 from pipeline.objective.paper.camera_lidar import camera_lidar_loss, object_cost_map
 from pipeline.objective.paper.camera_radar import camera_radar_loss
-from pipeline.objective.paper.lidar_radar import CELL_M, drivable_map, lidar_radar_loss
-from pipeline.objective.paper.loop import euler_angles, joint_objective, loop_loss, loop_transform
+from pipeline.objective.paper.lidar_radar import lidar_radar_loss
+from pipeline.objective.paper.loop import euler_angles, loop_loss, loop_transform
 from pipeline.rig.se3 import exp_so3, inverse
-from tests.makers.solve_scenes import CAMERA, CAR, SKY, T_CAMERA_LIDAR, T_LIDAR_RADAR, VEGETATION, make_day
+from tests.makers.solve_scenes import CAMERA, SKY, T_CAMERA_LIDAR, T_LIDAR_RADAR, VEGETATION, make_day
 
 TRUTH = {
     "camera_lidar": T_CAMERA_LIDAR,
@@ -64,21 +63,6 @@ def test_camera_lidar_cost_is_nothing_on_objects_and_two_deep_in_the_sky():
     assert 1.9 < cost[0, 50] < 2.0
 
 
-def test_an_image_without_reflecting_objects_costs_the_same_everywhere_but_in_the_sky():
-    labels = np.zeros((160, 320), np.uint8)
-    labels[:50] = SKY
-    cost = object_cost_map(labels, CAMERA.scaled(0.5))
-    assert np.unique(cost[50:]) == [1.0]
-    assert np.unique(cost[:50]) == [2.0]
-
-
-def test_lidar_points_out_of_view_are_penalised():
-    day = make_day(2)
-    loss = loss_of("camera_lidar", day)
-    away = turned(T_CAMERA_LIDAR, 1, 90)
-    np.testing.assert_allclose(loss.frame_losses(away[None]), 1.0, rtol=1e-6)  # float32 sums
-
-
 def test_radar_detections_in_the_sky_are_penalised():
     day = make_day(2)
     loss = loss_of("camera_radar", day)
@@ -86,11 +70,6 @@ def test_radar_detections_in_the_sky_are_penalised():
     at_truth, raised = loss.frame_losses(np.stack([TRUTH["camera_radar"], up]))
     assert np.all(at_truth < 0.02)
     assert np.all(raised > at_truth + 1.0)  # both terms: sky, and far from every box centre
-
-
-def test_a_track_on_a_box_centre_costs_nothing():
-    loss = loss_of("camera_radar", make_day(1))
-    assert loss.frame_losses(TRUTH["camera_radar"][None])[0, 0] < 1e-3
 
 
 def test_a_radar_without_elevation_is_compared_in_the_plane_only():
@@ -110,13 +89,6 @@ def test_drivable_iou_lies_between_0_and_1_and_falls_with_yaw(day):
     assert np.all((iou > 0) & (iou < 1))
     assert iou[2] > 0.65  # the ragged rim of 1 m cells costs the rest
     assert iou[0] < iou[1] < iou[2] > iou[3] > iou[4]
-
-
-def test_drivable_map_holds_the_sector_area():
-    azimuth = np.linspace(-0.5, 0.5, 51)
-    area = drivable_map(azimuth, np.full(51, 30.0)).sum() * CELL_M**2
-    sector = 0.5 * 30**2 * (azimuth[-1] - azimuth[0] + azimuth[1] - azimuth[0])
-    assert area == pytest.approx(sector, rel=0.02)
 
 
 def test_frames_without_anything_to_compare_say_so():
@@ -156,12 +128,3 @@ def test_euler_angles_invert_the_matrix_of_roll_pitch_and_yaw():
         T = np.eye(4)
         T[:3, :3] = euler_matrix(angles)
         np.testing.assert_allclose(euler_angles(T), angles, atol=1e-12)
-
-
-def test_objective_is_equation_two():
-    np.testing.assert_allclose(joint_objective(np.array([0.0, 0.5]), np.array([0.2, 0.1])), [1.2, 1.65])
-
-
-def test_labels_survive_the_png(day):
-    labels = cv2.imdecode(np.frombuffer(day[0].labels_png, np.uint8), cv2.IMREAD_GRAYSCALE)
-    assert {SKY, CAR} <= set(np.unique(labels))

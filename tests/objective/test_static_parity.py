@@ -29,7 +29,7 @@ from pipeline.objective.radar.registration import (
     registration_frames,
 )
 from pipeline.rig import se3
-from tests.makers.radar_scenes import GROUND_M, T_LIDAR_RADAR, street_day
+from tests.makers.radar_scenes import T_LIDAR_RADAR, street_day
 from tests.makers.torch_poses import exp_se3
 
 PARITY = 1e-3
@@ -192,16 +192,3 @@ def test_limits_of_a_sweep_are_the_registrations_of_a_day_of_that_sweep(street):
         np.testing.assert_allclose(found, day, atol=1e-7)
     nothing = elevation_limits(points, torch.zeros_like(present))
     assert (nothing == torch.tensor([-1.5, 1.5])).all()
-
-
-def test_points_on_the_road_do_not_bounce(street):
-    """A mirror image is one only above the ground: without any height the prior of bounces costs its share alone."""
-    flat = [
-        replace(o, lidar_map_xyz_m=(o.lidar_map_xyz_m * [1, 1, 0] + [0, 0, GROUND_M]).astype(np.float32))
-        for o in street
-    ]
-    inputs = tensors(flat, [-1.5, 1.5])
-    T = torch.tensor(T_LIDAR_RADAR)[None]
-    with_share = cost_of(T, inputs, bounce_prior=0.2, outlier=0.8)
-    without = cost_of(T, inputs, bounce_prior=0.0, outlier=1.0)
-    torch.testing.assert_close(with_share, without - np.log(0.8))

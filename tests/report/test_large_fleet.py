@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,11 +15,71 @@ from pipeline.report.charts import fleet_charts
 from pipeline.report.fleet_page import render_fleet_page
 from pipeline.report.names import page_stem
 from pipeline.report.upkeep import Album
+from pipeline.report.verdicts import ChartVerdicts, FleetVerdicts, read_verdicts
+from pipeline.report.window import FleetWindow, read_window
+from pipeline.store.commits import commit_records
 from pipeline.store.files import LocalFiles
 from pipeline.store.partitions import Lake
-from tests.audit.fleet_records import covariance_of
-from tests.makers.large_fleets import KINDS, repeated, some_of_each_kind
+from schemas.calibrations import CALIBRATIONS
+from tests.audit.fleet_records import covariance_of, vehicle_records
+from tests.makers.stages import audit_fleet
 from tests.report.test_pages import _config
+
+KNOCK = np.array([0.0, 0.0, np.radians(1.0), 0.0, 0.03, 0.0])
+# Motion of a sensor from a day on, statuses of days, days that are driven; one of a dozen is knocked.
+KINDS = {
+    "radar-knocked": ({"radar": KNOCK}, {}, 1),
+    "camera-knocked": ({"camera": KNOCK[[1, 2, 0, 3, 4, 5]] / 3}, {}, 1),
+    "last-day-alone": ({"radar": KNOCK}, {}, 1),
+    "held": ({}, {2: "held", 5: "refused", 6: "held", 9: "held"}, 1),
+    "weekly": ({}, {}, 7),
+    **{f"good-{k}": ({}, {3: "held"} if k % 3 else {}, 1) for k in range(7)},
+}
+
+
+def some_of_each_kind(lake, fleet, days=28, seed=21):
+    """A lake with one vehicle of each kind, audited: (window, verdicts)."""
+    rng, rows = np.random.default_rng(seed), []
+    for kind, (motion, statuses, every) in KINDS.items():
+        begin = days - 1 if kind == "last-day-alone" else days // 2
+        rows += [
+            r
+            for r in vehicle_records(
+                kind, days, rng, motion=lambda d, m=motion, b=begin: m if d >= b else {},
+                status=lambda d, s=statuses: s.get(d, "accepted"),
+            )
+            if int(r.day[-2:]) % every == 0
+        ]  # fmt: skip
+    commit_records(lake, CALIBRATIONS, rows)
+    audit_fleet(lake, fleet)
+    return read_window(lake, "joint", days, "2100-01-01"), read_verdicts(lake, "joint")
+
+
+def repeated(window, verdicts, count, rare=25):
+    """The fleet as `count` vehicles, `rare` times as many of them good as of any other kind."""
+    kinds = [k for k in KINDS for _ in range(rare if k.startswith("good") else 1)]
+    names = [f"{kinds[i % len(kinds)].split('-')[0]}-{i:05d}" for i in range(count)]
+    names = sorted(zip(names, (kinds[i % len(kinds)] for i in range(count)), strict=True))
+    rows = [np.flatnonzero(window.owner == window.vehicles.index(kind)) for _, kind in names]
+    charts = [np.flatnonzero(verdicts.charts.owner == verdicts.vehicles.index(kind)) for _, kind in names]
+    at, on = np.concatenate(rows), np.concatenate(charts)
+    owner, chart_owner = (np.repeat(np.arange(count), [len(r) for r in of]) for of in (rows, charts))
+    c = verdicts.charts
+    return (
+        FleetWindow(
+            [name for name, _ in names], window.edges, owner, window.day[at], window.edge[at], window.status[at],
+            window.T[at], window.sigma[at], window.observable[at], [window.work_key[i] for i in at],
+            window.code_versions,
+        ),
+        FleetVerdicts(
+            [name for name, _ in names],
+            {name: [replace(f, vehicle=name) for f in verdicts.findings[kind]] for name, kind in names},
+            ChartVerdicts(c.edges, chart_owner, c.edge[on], c.dof[on], c.status[on], c.limit[on], c.start[on]),
+            verdicts.audited,
+            verdicts.work_keys,
+        ),
+    )  # fmt: skip
+
 
 VEHICLES = 10_000
 
@@ -182,3 +243,12 @@ def test_no_two_vehicles_pages_have_one_name_on_any_file_system(names):
     for stem in stems:
         assert re.fullmatch(r"[a-z0-9._~-]+", stem)
         assert not stem.startswith(".")
+
+
+@pytest.mark.parametrize(
+    "names", [("Car", "car", "CAR"), ("a b", "a_b"), ("con", "con."), ("ä", "ae", "a\u0308")]
+)
+def test_names_that_file_systems_take_for_one_have_pages_of_their_own(names):
+    stems = {page_stem(name).casefold() for name in names}
+    assert len(stems) == len(names)
+    assert stems.isdisjoint({"con", "nul", "aux"})

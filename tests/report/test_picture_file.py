@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from pipeline.core.errors import ConfigError
 from pipeline.report.overlays import front_view, lidar_window
 from pipeline.report.picture_file import between, write_picture
 from pipeline.rig.se3 import inverse, rotation_angle_rad
@@ -56,3 +57,8 @@ def test_the_window_holds_what_the_lidar_sees():
     for name in ("lidar_x_m", "lidar_y_m", "lidar_z_m"):
         object.__setattr__(narrow.frame, name, getattr(narrow.frame, name)[near])
     assert lidar_window(narrow, GOOD).size_px[0] < 0.5 * window.size_px[0]
+
+
+def test_another_format_is_refused_by_name(tmp_path):
+    with pytest.raises(ConfigError, match="sweep"):
+        write_picture(tmp_path / "sweep.mp4", _scene(), GOOD, GOOD, LABELS)

@@ -1,5 +1,6 @@
 """Pages of vehicle-days are kept up to date: each that is needed, none without need, wherever they are drawn."""
 
+from dataclasses import replace
 from pathlib import PurePosixPath
 
 import numpy as np
@@ -160,3 +161,14 @@ def test_pages_in_a_folder_leave_nothing_half_written(tmp_path):
     names = {p.relative_to(out.parent) for p in out.parent.rglob("*") if p.is_file()}
     assert {p.relative_to(out.parent) for p in pages} == {n for n in names if n.name != "drawn.json"}
     assert len(names) == 4 + 3
+
+
+def test_records_of_days_to_come_hide_nobody_s_days(tmp_path):
+    lake, out = Lake.at(tmp_path / "lake"), tmp_path / "fleet.html"
+    records = days_of("v", 3)
+    stray = [replace(r, vehicle="other", day="2099-01-01", work_key="stray") for r in records[:3]]
+    commit_records(lake, CALIBRATIONS, records + stray)
+    report(lake, out)
+    text = out.read_text()
+    assert "2026-03-03" in text
+    assert "2099" not in text
