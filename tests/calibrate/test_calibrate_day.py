@@ -24,17 +24,14 @@ def fleet_of(prior=None, camera=None, **sections):
     rig = THREE_SENSORS | ({"prior": prior} if prior else {})
     rig = rig | {"camera": THREE_SENSORS["camera"] | (camera or {})}
     small = {"paper_population": 20, "paper_generations": 10, "search_rotation_deg": 4.0}
-    solve = small | sections.pop("solve", {})
-    return FleetConfig.model_validate(
-        {
-            "fleet": {"name": "f"},
-            "rigs": {"default": rig},
-            "vehicles": {"car 1": {}},
-            "select": {"frames": 16},
-            "solve": solve,
-            **sections,
-        }
-    )
+    sections["solve"] = small | sections.get("solve", {})
+    known = {
+        "fleet": {"name": "f"},
+        "rigs": {"default": rig},
+        "vehicles": {"car 1": {}},
+        "select": {"frames": 16},
+    }
+    return FleetConfig.model_validate(known | sections)
 
 
 def lake_with(tmp_path, observations, key="k1"):
@@ -150,41 +147,37 @@ def test_a_day_without_observations_is_refused_with_the_reason(tmp_path):
         assert record.prior_qw is None
 
 
-def refusal(tmp_path, observations, **fleet):
-    lake = lake_with(tmp_path, observations)
-    result = calibrate_day(DAY, fleet_of(**fleet), lake, method="pairwise-optimisation")
-    assert result.status == "refused"
-    return records_of(lake)[0].reason
+def with_prior(day, prior, since=0):
+    return [replace(o, priors=prior) if i >= since else o for i, o in enumerate(day)]
 
 
-def test_too_few_frames_are_refused(tmp_path, day):
-    assert "too few frames" in refusal(tmp_path, day[:5])
+MOVED = T_CAMERA_LIDAR + np.array([[0, 0, 0, 0.01], *[[0] * 4] * 3])
+LIDAR_ALONE = {"camera_lidar": T_CAMERA_LIDAR}
 
 
-def test_no_frames_at_all_are_refused(tmp_path):
-    assert "no prior" in refusal(tmp_path, [])
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        (lambda day: day[:5], "too few frames"),
+        (lambda _: [], "no prior"),
+        (lambda day: with_prior(day, day[0].priors | {"camera_lidar": MOVED}, 21), "changes over the day"),
+        (lambda day: with_prior(day, {}), "no tf_static chain for any pair"),
+    ],
+)
+def test_a_day_without_enough_frames_or_one_prior_is_refused_with_the_reason(tmp_path, day, changed, words):
+    lake = lake_with(tmp_path, changed(day))
+    assert calibrate_day(DAY, fleet_of(), lake, method="pairwise-optimisation").status == "refused"
+    assert words in records_of(lake)[0].reason
 
 
-def test_a_prior_that_changes_over_the_day_is_refused(tmp_path, day):
-    other = T_CAMERA_LIDAR.copy()
-    other[0, 3] += 0.01
-    changed = [
-        replace(o, priors=o.priors | {"camera_lidar": other}) if i > 20 else o for i, o in enumerate(day)
-    ]
-    assert "changes over the day" in refusal(tmp_path, changed)
-
-
-def test_a_missing_prior_is_refused_and_some_frames_without_one_are_not(tmp_path, day):
-    none = [replace(o, priors={}) for o in day]
-    assert "no tf_static chain for any pair" in refusal(tmp_path / "none", none)
-    bare = [replace(o, priors={"camera_lidar": T_CAMERA_LIDAR}) for o in day]
-    lake = lake_with(tmp_path / "a", bare)
+def test_a_pair_without_a_prior_is_refused_alone_and_frames_without_one_are_not(tmp_path, day):
+    lake = lake_with(tmp_path / "a", with_prior(day, LIDAR_ALONE))
     calibrate_day(DAY, fleet_of(), lake, method="pairwise-optimisation")
     records = {r.pair: r for r in records_of(lake)}
     assert records["camera_lidar"].status in ("accepted", "held")
     for pair in ("camera_radar", "lidar_radar"):
         assert f"no tf_static chain for {pair}" in records[pair].reason
-    lake = lake_with(tmp_path / "b", [*bare[:3], *day[3:]])
+    lake = lake_with(tmp_path / "b", [*with_prior(day[:3], LIDAR_ALONE), *day[3:]])
     assert calibrate_day(DAY, fleet_of(), lake, method="pairwise-optimisation").status == "done"
 
 
@@ -206,13 +199,8 @@ def test_a_prior_file_is_read_beside_fleet_toml_and_its_content_is_part_of_the_w
 
 
 def test_without_a_trigger_the_prior_stays(tmp_path, day):
-    quiet = {
-        "when": "triggered",
-        "lidar_outside_fraction": 1.0,
-        "radar_outside_image": 99,
-        "radar_outside_lidar": 99,
-        "drivable_outside_fraction": 1.0,
-    }
+    quiet = {"when": "triggered", "lidar_outside_fraction": 1.0, "radar_outside_image": 99,
+             "radar_outside_lidar": 99, "drivable_outside_fraction": 1.0}  # fmt: skip
     lake = lake_with(tmp_path, day)
     result = calibrate_day(DAY, fleet_of(trigger=quiet), lake, method="joint-optimisation")
     assert result.kept == {"accepted": 0, "held": 3, "refused": 0}
@@ -222,15 +210,6 @@ def test_without_a_trigger_the_prior_stays(tmp_path, day):
         assert record.tx_m == record.prior_tx_m
 
 
-def test_unknown_vehicle_or_method_is_a_usage_error(tmp_path):
-    with pytest.raises(ConfigError, match="magic"):
-        calibrate_day(DAY, fleet_of(), Lake.at(tmp_path), method="magic")
-    with pytest.raises(ConfigError, match="unknown vehicle"):
-        calibrate_day(
-            Partition("other", "2024-05-06"), fleet_of(), Lake.at(tmp_path), method="joint-optimisation"
-        )
-
-
 def test_the_verdicts_thresholds_are_those_of_the_configuration(tmp_path, day):
     lake = lake_with(tmp_path, day)
     strict = fleet_of(verify={"checks": {"max_move_prior_sigmas": 1e-6}})
@@ -238,16 +217,6 @@ def test_the_verdicts_thresholds_are_those_of_the_configuration(tmp_path, day):
     assert result.kept["accepted"] == 0
     records = [r for r in result.records if isinstance(r, CalibrationRecord)]
     assert all("prior sigmas" in r.reason for r in records)
-
-
-def test_unknown_methods_are_a_usage_error_before_anything_is_read(tmp_path):
-    nothing = Lake.at(tmp_path / "nothing")
-    with pytest.raises(ConfigError, match="magic") as caught:
-        calibrate_day(DAY, fleet_of(), nothing, method="magic")
-    assert caught.value.exit_code == 2
-    assert not nothing.root.exists()
-    with pytest.raises(ConfigError, match="magic"):
-        fleet_of(audit={"method": "joint"}).changed(audit={"method": "magic"})
 
 
 @pytest.mark.parametrize(
@@ -262,3 +231,15 @@ def test_unknown_methods_are_a_usage_error_before_anything_is_read(tmp_path):
 )
 def test_environment_follows_from_speed(day, speeds, environment):
     assert environment_of([replace(day[0], ego_speed_mps=s) for s in speeds]) == environment
+
+
+def test_unknown_methods_are_a_usage_error_before_anything_is_read(tmp_path):
+    nothing = Lake.at(tmp_path / "nothing")
+    with pytest.raises(ConfigError, match="magic") as caught:
+        calibrate_day(DAY, fleet_of(), nothing, method="magic")
+    assert caught.value.exit_code == 2
+    assert not nothing.root.exists()
+    with pytest.raises(ConfigError, match="magic"):
+        fleet_of(audit={"method": "joint"}).changed(audit={"method": "magic"})
+    with pytest.raises(ConfigError, match="unknown vehicle"):
+        calibrate_day(Partition("other", DAY.day), fleet_of(), nothing, method="joint-optimisation")

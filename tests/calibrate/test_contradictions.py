@@ -90,27 +90,6 @@ def test_a_registration_that_the_camera_contradicts_is_not_accepted(street):
         assert turned[pair].determined == []
 
 
-def test_a_composed_pair_that_is_asked_for_brings_its_factors_with_it(street):
-    """The camera-radar trigger alone fires; held for want of factors, its record could never be accepted."""
-    found = records_of(
-        street,
-        trigger={
-            "when": "triggered",
-            "radar_outside_image": 0.0,
-            "lidar_outside_fraction": 1.0,
-            "radar_outside_lidar": 99,
-            "drivable_outside_fraction": 1.0,
-        },
-    )
-    assert [found[p].triggered for p in ("camera_lidar", "camera_radar", "lidar_radar")] == [
-        False,
-        True,
-        False,
-    ]
-    assert not any("not triggered" in r.reason for r in found.values())
-    assert found["lidar_radar"].status == "accepted"
-
-
 def test_pairs_that_no_trigger_asked_for_keep_the_prior_beside_one_that_is_calibrated():
     start = perturb_exactly(T_CAMERA_LIDAR, np.radians(1.0), 0.02, np.random.default_rng(0))
     found = records_of(
@@ -177,3 +156,24 @@ def test_a_pose_beyond_the_search_range_is_disproved_and_one_that_is_only_unsure
 
     assert solved(0.75)["lidar_radar"].diagnostics["disproved"] == 1.0
     assert solved(0.02)["lidar_radar"].diagnostics["disproved"] == 0.0
+
+
+def test_a_composed_pair_that_is_asked_for_brings_its_factors_with_it(street):
+    """The camera-radar trigger alone fires; held for want of factors, its record could never be accepted."""
+    found = records_of(
+        street,
+        trigger={
+            "when": "triggered",
+            "radar_outside_image": 0.0,
+            "lidar_outside_fraction": 1.0,
+            "radar_outside_lidar": 99,
+            "drivable_outside_fraction": 1.0,
+        },
+    )
+    assert [found[p].triggered for p in ("camera_lidar", "camera_radar", "lidar_radar")] == [
+        False,
+        True,
+        False,
+    ]
+    assert not any("not triggered" in r.reason for r in found.values())
+    assert found["lidar_radar"].status == "accepted"

@@ -12,33 +12,15 @@ TOLD = {"vehicle": "v", "day": "2026-03-02", "method": "joint", "work_key": "w",
 
 
 def pose(sensor):
-    return PoseRow(
-        **TOLD,
-        sensor=sensor,
-        kind="radar",
-        reference="top",
-        status="accepted",
-        reason="",
-        determined=["azimuth"],
-    )
+    about = {"sensor": sensor, "kind": "radar", "reference": "top", "status": "accepted", "reason": ""}
+    return PoseRow(**TOLD, **about, determined=["azimuth"])
 
 
 def against(*names):
     """Records of edges, each far from its prior."""
+    held = {"pair": "camera_lidar", "status": "held", "reason": "tx moved", "faults": ["prior"], "seed": 0}
     edges = (name.split("-") for name in names)
-    return [
-        CalibrationRecord(
-            **TOLD,
-            pair="camera_lidar",
-            parent_frame=a,
-            child_frame=b,
-            status="held",
-            reason="tx moved",
-            faults=["prior"],
-            seed=0,
-        )
-        for a, b in edges
-    ]
+    return [CalibrationRecord(**TOLD, **held, parent_frame=a, child_frame=b) for a, b in edges]
 
 
 @pytest.mark.parametrize(

@@ -105,3 +105,14 @@ def test_what_is_not_finite_is_null_in_json():
         "a": [1.5, None],
         "b": {"c": None},
     }
+
+
+def test_numbers_keep_their_digits_in_yaml_whatever_reader_meets_them():
+    import yaml
+
+    from pipeline.export.texts import load_yaml, to_yaml
+
+    values = [1e-17, 1e22, 0.1 + 0.2, -1.5e-300, 3.0]
+    text = to_yaml({"values": values}, ["a comment: with - signs"])
+    assert load_yaml("f", text)["values"] == values
+    assert yaml.safe_load(text)["values"] == values  # YAML 1.1 takes 1e-17 for a word

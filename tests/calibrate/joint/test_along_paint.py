@@ -34,21 +34,6 @@ def test_an_even_line_has_no_gradient_along_itself_in_whatever_direction_it_runs
     assert np.abs(along).max() < 0.3
 
 
-def test_a_trend_along_a_line_is_all_that_is_along_it():
-    whole, along = _of_image(stripe(0.0, 0.8), np.array([[60.0, 34.0], [60.0, 40.0], [60.0, 46.0]]))
-    assert along[:, 1] == pytest.approx(whole[:, 1], abs=0.15)
-    assert np.abs(along[:, 1]).min() > 0.5
-    assert np.abs(along[:, 0]).max() < 0.15
-
-
-def test_a_spot_is_no_line_and_a_point_outside_the_image_has_no_gradient():
-    v, u = np.mgrid[:80, :120].astype(float)
-    spot = np.round(60 * np.exp(-((u - 60) ** 2 + (v - 40) ** 2) / 18)).astype(np.int8)
-    whole, along = _of_image(spot, np.array([[60.0, 37.0], [np.nan, np.nan], [119.0, 40.0]]))
-    assert np.abs(along[0]).max() < 0.2 * np.abs(whole[0]).max()
-    assert (whole[1:] == 0).all()
-
-
 @pytest.fixture(scope="module")
 def terms():
     day = traced_day(DENSE, 6, seed=1)
@@ -97,8 +82,3 @@ def test_a_line_ahead_that_grows_brighter_draws_pitch_and_an_even_one_does_not(t
 
 def test_paint_of_a_road_with_arrows_and_lines_to_the_sides_draws_nothing(terms):
     assert np.abs(drawn(terms)[:3]).max() < np.radians(0.03)
-
-
-def test_a_day_without_paint_has_no_such_bias(terms):
-    none = terms.of_kinds(edges=True, markings=False)
-    assert (along_paint(none, STATE, KernelSettings.wide(1.5, 2), PRIOR, NONE) == 0).all()

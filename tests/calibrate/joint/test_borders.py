@@ -58,10 +58,6 @@ def test_the_width_is_what_all_objects_are_narrower_by_whatever_the_yaw(terms, k
     assert narrower - as_drawn == pytest.approx(1.5, abs=0.5)
 
 
-def test_a_day_without_left_or_right_edges_tells_no_width(terms, kernel):
-    assert label_width_px(chosen(terms, terms.edges.side != EDGE_LEFT), STATE.alone, kernel) == 0
-
-
 def curvature_of(terms, kernel):
     at_pose = np.eye(8)
     at_pose[:6, :6] = np.linalg.inv(change_jacobian(STATE.T_camera_lidar))
@@ -112,13 +108,6 @@ def test_a_side_without_an_opposite_one_is_unsure_by_a_usual_shift_of_its_border
     usual_deg = EDGE_SIDE_ALONE * np.hypot(1, gap_px) * px_deg
     # Beside markings, which know pitch as well.
     assert 0.3 * usual_deg < abs(np.degrees(rows[-1, 0])) < 1.1 * usual_deg
-
-
-def test_what_is_fixed_stays_and_a_day_without_edges_says_nothing(terms, kernel):
-    only_turns = np.arange(8) > 2
-    assert (moved_by_borders(terms, kernel, only_turns)[:, 3:] == 0).all()
-    bare = chosen(terms, np.zeros(len(terms.edges.side), bool))
-    assert len(moved_by_borders(bare, kernel)) == 0
 
 
 def test_a_camera_that_looks_aside_slides_along_its_own_x_with_the_clock():

@@ -52,15 +52,6 @@ def day():
     return traced_day(DENSE, 12, seed=1)
 
 
-@pytest.mark.slow
-def test_cars_without_windows_leave_edges_and_paint_in_agreement(day):
-    found = solved(day)
-    assert found.failed_checks == []
-    assert np.degrees(np.sqrt(found.covariance[0, 0])) < 0.1
-    for name in ("edges_above_a_foreground", "paint"):
-        assert abs(found.diagnostics[f"{name}_pitch_offset_rad"]) < np.radians(0.2)
-
-
 def test_cars_with_windows_are_held(day):
     found = solved(with_windows(day))
     (check,) = found.failed_checks
@@ -83,12 +74,6 @@ def test_windows_in_cars_of_one_kind_only_are_seen_where_no_paint_tells(within_m
         assert np.degrees(abs(check.error[0])) > 0.8 * turn_deg
         assert "low edges above a foreground" in check.sentence
         assert "high edges above a foreground" in check.sentence
-
-
-def test_a_half_of_a_side_testifies_against_the_other_half_alone():
-    halves = [replace(witness(name, deg), part_of="side") for name, deg in (("low", 0.0), ("high", 1.2))]
-    assert "low" in disagreement(halves)[0].sentence
-    assert disagreement([halves[1], witness("side", 0.0), replace(witness("c", 0.0), part_of="other")]) == []
 
 
 def witness(name, offset_deg, scatter_deg=0.02, floor_deg=0.1, axis=0):
@@ -122,21 +107,6 @@ def test_boxes_show_by_how_much_a_pose_is_turned(turn_deg):
     medians = [np.degrees(np.median(offset, axis=0)) for _, offset in (straight, turned)]
     assert np.abs(medians[0]).max() < 0.2  # faces that look away are in the box, not in the cloud
     np.testing.assert_allclose(medians[1] - medians[0], -np.array(turn_deg), atol=0.1)
-
-
-def test_boxes_that_pair_with_several_objects_or_none_show_nothing():
-    (o,) = make_day(1, seed=3)
-    twice = replace(o, road_user_boxes_px=np.repeat(o.road_user_boxes_px, 2, axis=0))
-    away = replace(o, road_user_boxes_px=o.road_user_boxes_px[:0])
-    assert len(box_offsets([twice, away], np.repeat(T_CAMERA_LIDAR[None], 2, axis=0))[0]) == 0
-
-
-def test_a_fit_that_all_boxes_contradict_is_held():
-    asked = [witness("the fit", 0.0, 0.04, 0.03), witness("boxes", -0.7, 0.05, 0.15)]
-    (check,) = disagreement(asked)
-    assert check.fault == "witnesses_disagree"
-    unsure = replace(asked[0], scatter_rad=np.radians(0.4))
-    assert disagreement([unsure, asked[1]]) == []
 
 
 @pytest.mark.parametrize(("nats", "is_sure"), [(3.0, False), (30.0, True)])

@@ -11,7 +11,7 @@ from pipeline.calibrate.joint.camera_lidar.intrinsics import DayIntrinsics
 from pipeline.calibrate.joint.solve import solve_joint
 from pipeline.core.config import SolveConfig
 from pipeline.objective.camera_lidar.kernel_settings import KernelSettings
-from pipeline.objective.ego_motion import mean_heading, shown_heading
+from pipeline.objective.ego_motion import shown_heading
 from pipeline.rig.estimates import PairEstimate, Prior
 from pipeline.rig.se3 import exp_se3, log_se3, perturb_exactly
 from schemas.calibrations import PAIRS
@@ -116,11 +116,3 @@ def test_an_untriggered_camera_lidar_stays_at_the_prior_and_the_radar_is_found_w
     error = log_se3(solution.pairs["lidar_radar"].T @ np.linalg.inv(T_LIDAR_RADAR))
     assert abs(error[2]) < np.radians(0.15)
     assert told[-1][0] == told[-1][1]
-
-
-def test_the_way_that_something_else_shows_counts_by_its_sigma(monkeypatch):
-    day = street_day(12)
-    known = replace(PRIOR, heading=(np.radians(1.0), 1e-6))
-    _, headings = solved_with_camera(monkeypatch, day, "", known)
-    assert headings[-1] == pytest.approx(known.heading[0], rel=1e-3)
-    assert mean_heading([(np.pi - 0.01, 0.1), (0.01 - np.pi, 0.1)])[0] == pytest.approx(np.pi)

@@ -39,24 +39,6 @@ def test_a_refinement_never_ends_lower_than_it_began_however_wide_its_surface(sc
             assert value(scored, end) >= value(scored, start)
 
 
-def test_a_surface_much_too_wide_is_narrowed_until_its_steps_climb(scored, monkeypatch):
-    rng = np.random.default_rng(2)
-    start = AlignmentState(T_TRUE).stepped(rng.normal(size=8) * 0.5 * scales(scored.terms, scored.kernel))
-    usual = value(scored, refine(scored, start, steps=8)) - value(scored, start)
-    monkeypatch.setattr(module, "_SURFACE_SIZE", 8.0)
-    found = value(scored, refine(scored, start, steps=8)) - value(scored, start)
-    assert usual > 0
-    assert found > 0.5 * usual
-
-
-def test_what_is_fixed_stays_at_the_prior(scored):
-    fixed = np.isin(np.arange(8), (5, 6, 7))
-    start = AlignmentState(T_TRUE).stepped(0.3 * scales(scored.terms, scored.kernel))
-    end = refine(scored, start, steps=3, fixed=fixed)
-    assert end.T_camera_lidar[2, 3] == scored.prior.T_camera_lidar[2, 3]
-    assert (end.dt_s, end.focal) == (start.dt_s, start.focal)
-
-
 @pytest.mark.parametrize("slid_s", [0.5, pytest.param(-0.5, marks=pytest.mark.slow)])
 def test_a_camera_whose_clock_is_half_a_second_off_is_seen_from_where_nothing_matches(slid_s):
     day = traced_day(DENSE, 12, seed=5, dt_s=0.02)

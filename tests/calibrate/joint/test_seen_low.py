@@ -48,8 +48,3 @@ def test_the_share_is_no_more_than_is_below_the_road_and_than_noise_images_and_s
     found = seen_low_of(ways(on_the_way), heights(displaced))
     assert np.hypot(found.mean, found.sigma) == pytest.approx(expected, rel=1e-6)
     assert found.per_share_rad == pytest.approx({"registration": 0.08, "doppler": 0.1})
-
-
-def test_without_moving_frames_nothing_is_expected():
-    assert seen_low_of(None, heights(0.1)).mean == 0.0
-    assert seen_low_of(ways(0.1), None).mean == pytest.approx(0.1 * np.sqrt(2 / np.pi))

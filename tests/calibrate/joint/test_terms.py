@@ -48,10 +48,3 @@ def test_without_static_detections_the_registration_says_nothing():
     both = solve_without()
     sigma = [np.sqrt(s.pairs["lidar_radar"].covariance[2, 2]) for s in (alone, both)]
     assert sigma[0] > sigma[1]
-
-
-def test_without_boxes_camera_radar_uses_none():
-    with_boxes, without = (
-        s.pairs["camera_radar"].diagnostics["boxes"] for s in (solve_without(), solve_without("boxes"))
-    )
-    assert without == 0 < with_boxes

@@ -12,12 +12,6 @@ from pipeline.calibrate.joint.lidar_radar.witnesses import (
 )
 
 
-def test_witnesses_that_agree_change_nothing():
-    assert contradiction([]) is None
-    assert contradiction([Witness("boxes", 0.3, 0.01)]) is None
-    assert contradiction([Witness("boxes", 0.01, 0.01), Witness("doppler", -0.01, 0.01)]) is None
-
-
 def test_witnesses_that_contradict_each_other_widen_the_sigma_and_are_named():
     found = contradiction([Witness("registration", 0.0, 0.002), Witness("doppler", 0.012, 0.002)])
     # Two values six sigmas apart: chi-squared is 18 for one degree of freedom.
@@ -55,12 +49,6 @@ def test_equations_give_the_step_with_nuisances_following():
         "boxes_pitch_offset_rad": equations.offset_rad,
         "boxes_pitch_sigma_rad": equations.sigma_rad,
     }
-
-
-def test_without_data_there_are_no_equations():
-    assert own_equations("doppler", np.zeros((1, 1)), np.zeros(1), 0.1) is None
-    # Pitch and its constant cannot be told apart without a prior on the constant.
-    assert own_equations("boxes", np.ones((2, 2)), np.ones(2), 0.1) is None
 
 
 def test_who_turns_the_radar_further_up_than_displaced_heights_errs_by_that_and_nobody_else():

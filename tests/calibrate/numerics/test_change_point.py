@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.calibrate.numerics.change_point import likeliest_cut, parts_of_day
+from pipeline.calibrate.numerics.change_point import parts_of_day
 from pipeline.calibrate.verify.constancy import MOVED_SIGMAS, PART_FLOOR_RAD
 from pipeline.rig.se3 import exp_so3, from_rotation_translation
 
@@ -45,11 +45,6 @@ def test_a_step_is_found_where_it_is_and_as_large(after):
         assert np.abs(parts.sigmas(PART_FLOOR_RAD)).max() > MOVED_SIGMAS
 
 
-def test_the_step_points_from_the_first_part_to_the_last():
-    parts = parts_of(measured(np.random.default_rng(0), 60, np.radians([2.0, 0, 0]), 30))
-    assert parts.step[0] == pytest.approx(np.radians(2.0), abs=np.radians(0.3))
-
-
 def test_quiet_days_are_never_called_moved():
     """Cut where they differ most, parts of quiet days differ by two or three sigmas; few by more."""
     found = [
@@ -58,22 +53,6 @@ def test_quiet_days_are_never_called_moved():
     ]
     assert np.mean(np.array(found) > MOVED_SIGMAS) < 0.005
     assert 1.5 < np.median(found) < 3.0
-
-
-def test_what_is_not_compared_says_nothing():
-    parts = parts_of(measured(np.random.default_rng(0), 60, np.radians([2.0, 0, 0]), 30))
-    only_yaw = type(parts)(parts.T, parts.spread, parts.cut_ns, (2,))
-    assert only_yaw.sigmas(0.0)[0] == 0.0
-
-
-def test_a_cut_leaves_frames_on_either_side():
-    rng = np.random.default_rng(1)
-    for frames in (6, 10, 40):
-        cut = likeliest_cut(rng.normal(size=(frames, 3)), np.arange(frames))
-        assert cut is not None
-        assert 3 <= cut <= frames - 3
-    assert likeliest_cut(np.zeros((5, 3)), np.arange(5)) is None
-    assert likeliest_cut(np.zeros((12, 3)), np.arange(12)) is not None  # nothing differs: any cut will do
 
 
 def test_a_cut_leaves_three_scenes_on_either_side():

@@ -24,12 +24,6 @@ def test_what_is_left_without_the_common_part_is_a_covariance(seed: int, scale: 
         assert np.linalg.eigvalsh(part * np.outer(unit, unit)).min() > -1e-9
 
 
-def test_a_common_part_that_fits_is_not_changed() -> None:
-    rng = np.random.default_rng(1)
-    common = _covariance(rng)
-    np.testing.assert_allclose(common_part(common, common + _covariance(rng)), common, rtol=1e-8, atol=1e-14)
-
-
 def test_what_stays_at_the_prior_is_the_same_every_day() -> None:
     prior = np.diag([1e-3] * 6)
     covariance = prior.copy()

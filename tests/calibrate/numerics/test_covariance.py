@@ -8,7 +8,6 @@ from pipeline.calibrate.numerics.covariance import (
     covariance_with_fixed,
     posterior,
     response,
-    spread_to_covariance,
     widening,
     with_ends,
 )
@@ -28,13 +27,6 @@ def linear_day(rng, frames=200, shared=0.0, sigma=1.0):
     return estimate, H, A * (A @ estimate - noise)[:, None], drive
 
 
-def test_independent_errors_give_the_textbook_covariance():
-    rng = np.random.default_rng(0)
-    _, H, g, _ = linear_day(rng)
-    found = bootstrap_covariance(H, g, np.zeros((2, 2)), np.arange(200), rng, resamples=2000)
-    assert np.allclose(np.diag(found), np.diag(np.linalg.inv(H.sum(0))), rtol=0.25)
-
-
 def test_errors_shared_by_a_drive_widen_the_covariance_and_cover_the_truth():
     z, naive = [], []
     for seed in range(120):
@@ -47,23 +39,6 @@ def test_errors_shared_by_a_drive_widen_the_covariance_and_cover_the_truth():
         naive.append(estimate[0] / np.sqrt(np.linalg.inv(H.sum(0))[0, 0]))
     assert np.std(naive) > 1.7
     assert 0.75 < np.std(z) < 1.4
-
-
-def test_where_the_frames_say_nothing_the_prior_remains():
-    rng = np.random.default_rng(0)
-    _, H, g, drive = linear_day(rng)
-    H[:, 1, :] = H[:, :, 1] = 0
-    g[:, 1] = 0
-    found = bootstrap_covariance(H, g, np.diag([1e-3, 4.0]), drive, rng)
-    assert found[1, 1] == pytest.approx(0.25, rel=1e-6)
-
-
-def test_no_direction_is_surer_than_the_information():
-    rng = np.random.default_rng(0)
-    _, H, g, drive = linear_day(rng)
-    found = bootstrap_covariance(H, 1e-6 * g, np.eye(2), drive, rng)
-    least = np.linalg.inv(H.sum(0) + np.eye(2))
-    assert np.linalg.eigvalsh(found - least).min() > -1e-12
 
 
 def test_a_single_block_has_no_spread_and_is_as_unsure_as_two():
@@ -101,14 +76,6 @@ def test_a_block_that_outweighs_the_day_is_not_taken_for_sure():
     assert np.mean(np.abs(z) < 1.96) > 0.93
 
 
-def test_the_larger_of_two_covariances_contains_both():
-    rng = np.random.default_rng(3)
-    A, B = (np.cov(rng.normal(size=(4, 30))) for _ in range(2))
-    larger = spread_to_covariance(A, B)
-    assert np.linalg.eigvalsh(larger - A).min() > -1e-10
-    assert np.linalg.eigvalsh(larger - B).min() > -1e-10
-
-
 @pytest.mark.parametrize(
     "drive", [np.zeros(100, int), np.arange(100), np.repeat(np.arange(5), [3, 50, 7, 20, 20])]
 )
@@ -118,10 +85,6 @@ def test_blocks_are_runs_of_frames_of_similar_size(drive):
     assert np.all(np.diff(block) <= 1)
     assert 8 <= block.max() + 1 <= 30
     assert np.bincount(block).max() <= 9
-
-
-def test_no_frames_have_no_blocks():
-    assert len(bootstrap_blocks(np.zeros(0, int), np.zeros(0, int))) == 0
 
 
 def test_an_unobservable_dof_keeps_the_prior_sigma_and_says_so():
@@ -135,12 +98,6 @@ def test_an_unobservable_dof_keeps_the_prior_sigma_and_says_so():
     assert after.covariance[2, 2] == pytest.approx(covariance[2, 2])
     assert np.linalg.eigvalsh(after.covariance).min() > 0
     assert after.observability[0] == pytest.approx(0.1)
-
-
-def test_the_bias_floor_is_never_undercut():
-    floor = np.array([1, 2, 3, 4, 5, 6]) * 1e-3
-    after = posterior(np.eye(6) * 1e-12, np.eye(6), floor)
-    assert np.all(np.sqrt(np.diag(after.covariance)) >= floor)
 
 
 def test_parameters_that_follow_a_held_one_inherit_its_uncertainty_and_cover_the_truth():
@@ -182,3 +139,17 @@ def test_two_ends_beyond_a_sigma_add_their_scatter_along_the_way_between_them_an
     rng = np.random.default_rng(0)
     truth = rng.integers(2, size=4000)[:, None] * apart + rng.multivariate_normal([0, 0], covariance, 4000)
     assert np.mean(truth**2, axis=0) == pytest.approx(np.diag(wider), rel=0.1)
+
+
+def test_no_direction_is_surer_than_the_information():
+    rng = np.random.default_rng(0)
+    _, H, g, drive = linear_day(rng)
+    found = bootstrap_covariance(H, 1e-6 * g, np.eye(2), drive, rng)
+    least = np.linalg.inv(H.sum(0) + np.eye(2))
+    assert np.linalg.eigvalsh(found - least).min() > -1e-12
+
+
+def test_the_bias_floor_is_never_undercut():
+    floor = np.array([1, 2, 3, 4, 5, 6]) * 1e-3
+    after = posterior(np.eye(6) * 1e-12, np.eye(6), floor)
+    assert np.all(np.sqrt(np.diag(after.covariance)) >= floor)

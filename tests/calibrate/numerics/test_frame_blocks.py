@@ -13,7 +13,6 @@ from pipeline.calibrate.numerics.frame_blocks import (
     Scenes,
     blocks_of,
     bootstrap_blocks,
-    scene_blocks,
     scenes_of,
 )
 from pipeline.calibrate.select.frames import MIN_FRAMES, hold_out, select_frames
@@ -81,20 +80,6 @@ def test_a_speed_that_says_zero_does_not_hide_a_drive(day):
     assert len(np.unique(scenes_of(waiting(day[0], 40)))) == 1
 
 
-def test_a_slow_car_needs_ten_metres_for_a_new_scene(day):
-    slow = [
-        replace(o, ego_speed_mps=3.5, drive=0, lidar_edge_xyz_m=np.zeros((0, 3), np.float32))
-        for o in day[:12]
-    ]
-    assert np.bincount(scenes_of(slow)).tolist() == [3, 3, 3, 3]
-
-
-def test_a_turn_on_the_spot_shows_something_else(day):
-    nothing = np.zeros((0, 3), np.float32)
-    turning = [replace(o, ego_yaw_rate_radps=0.1, lidar_edge_xyz_m=nothing) for o in waiting(day[0], 20)]
-    assert len(np.unique(scenes_of(turning))) == 3  # 54 deg at 20 deg a scene
-
-
 @given(seed=st.integers(0, 1000))
 @settings(max_examples=20, deadline=None)
 def test_blocks_hold_whole_scenes_and_do_not_ask_for_their_names(seed):
@@ -106,13 +91,6 @@ def test_blocks_hold_whole_scenes_and_do_not_ask_for_their_names(seed):
     names = rng.permutation(30)
     renamed = bootstrap_blocks(drive, names[scene])
     assert np.array_equal(np.equal.outer(block, block), np.equal.outer(renamed, renamed))
-
-
-def test_scatter_over_scenes_cuts_between_them(day):
-    frames = [*waiting(day[0], 30), *day[1:10]]
-    blocks, scene = scene_blocks(frames), scenes_of(frames)
-    assert all(len(np.unique(blocks[scene == s])) == 1 for s in np.unique(scene))
-    assert len(np.unique(scene_blocks(waiting(day[0], 30)))) == 1
 
 
 def test_a_view_judges_or_fits_as_a_whole(day):
@@ -156,11 +134,6 @@ def test_many_scenes_show_by_how_much_their_frames_err_together(correlation, exp
     common, own = rng.normal(size=(400, 1, 3)), rng.normal(size=(400, 4, 3))
     gradient = (np.sqrt(correlation) * common + np.sqrt(1 - correlation) * own).reshape(-1, 3)
     assert scenes_of_equal(400, 4).inflation(gradient) == pytest.approx(expected, rel=0.1)
-
-
-def test_one_scene_errs_as_scenes_are_wont_to():
-    gradient = np.random.default_rng(0).normal(size=(8, 3))
-    assert scenes_of_equal(1, 8).inflation(gradient) == pytest.approx((1 + 0.4 * 7) / (1 - (1 + 0.4 * 7) / 8))
 
 
 @pytest.mark.parametrize("count", [1, 2, 4, 20])

@@ -6,13 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.select.coverage import choose_for_information, contents_of
-from pipeline.calibrate.select.frames import (
-    MIN_FRAMES,
-    hold_out,
-    missing_content,
-    select_frames,
-    unmet_conditions,
-)
+from pipeline.calibrate.select.frames import MIN_FRAMES, missing_content, select_frames, unmet_conditions
 from pipeline.core.config import SelectConfig
 from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, SENSORS
 from schemas.faults import FAULTS
@@ -41,13 +35,6 @@ def test_every_condition_of_the_paper_is_named_when_it_is_missed(day):
     assert unmet_conditions(two, "lidar_radar", CONFIG) == ["radar_clusters"]
 
 
-def test_conditions_of_a_sensor_that_is_not_in_the_pair_do_not_count(day):
-    dark = make_changed(day[0], sky_fraction=0.0, road_user_boxes_px=np.zeros((0, 4), np.float32))
-    assert unmet_conditions(dark, "lidar_radar", CONFIG) == []
-    no_radar = make_changed(day[0], radar_track_xyz_m=np.zeros((0, 3), np.float32), radar_stamp_ns=0)
-    assert unmet_conditions(no_radar, "camera_lidar", CONFIG) == []
-
-
 def test_held_out_frames_are_no_neighbours_of_the_fit():
     day = make_day(160, step_s=0.2, per_drive=80)
     chosen = select_frames(day, CONFIG, paper=True)
@@ -56,17 +43,6 @@ def test_held_out_frames_are_no_neighbours_of_the_fit():
         assert len(chosen.holdout[pair]) >= 10
         gaps = np.abs(stamps[chosen.fit[pair]][:, None] - stamps[chosen.holdout[pair]][None])
         assert gaps.min() >= 1.0
-
-
-def test_both_parts_reach_over_the_whole_day(day):
-    held = np.array([h is True for h in hold_out(day, 0.2)])
-    assert 0.1 < held.mean() < 0.35
-    assert held[:30].any()
-    assert held[30:].any()
-
-
-def test_a_short_day_still_holds_a_block_out():
-    assert any(h is True for h in hold_out(make_day(12, per_drive=12), 0.2))
 
 
 def edges_at(azimuth_deg, range_m, count=30):
@@ -99,10 +75,6 @@ def test_chosen_frames_cover_more_of_the_view_than_evenly_spaced_ones():
     covered, even = (np.log1p(contents[list(rows)].sum(axis=0)).sum() for rows in (chosen, range(0, 200, 10)))
     assert covered > even
     assert len(set(chosen)) == 20
-
-
-def test_the_same_day_gives_the_same_frames(day):
-    assert select_frames(day, CONFIG, paper=True) == select_frames(day, CONFIG, paper=True)
 
 
 def test_every_frame_is_used_or_counted_with_a_reason(day):
@@ -216,6 +188,12 @@ def test_a_camera_that_nobody_labels_is_not_called_silent(frames):
         assert (chosen.refused[pair].reason, chosen.refused[pair].fault) == (why, "no_labels")
 
 
+def make_changed(observation, **changes):
+    from dataclasses import replace
+
+    return replace(observation, **changes)
+
+
 def test_a_radar_that_dies_at_noon_leaves_its_pairs_the_morning():
     day = make_day(60)
     half = [make_changed(o, sensors=["camera", "lidar"]) if i >= 30 else o for i, o in enumerate(day)]
@@ -223,9 +201,3 @@ def test_a_radar_that_dies_at_noon_leaves_its_pairs_the_morning():
     assert not chosen.refused
     assert max(chosen.fit["lidar_radar"]) < 30
     assert max(chosen.fit["camera_lidar"]) >= 30
-
-
-def make_changed(observation, **changes):
-    from dataclasses import replace
-
-    return replace(observation, **changes)

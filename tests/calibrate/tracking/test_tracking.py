@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.methods import method_named
-from pipeline.calibrate.numerics.bias_floors import TRACKING_BIAS_RAD
 from pipeline.calibrate.tracking.association import associate, shared_sightings
-from pipeline.calibrate.tracking.bearings import Bearings, align_bearings, consistency
+from pipeline.calibrate.tracking.bearings import Bearings
 from pipeline.calibrate.tracking.kalman import Motion, Scan, Track, follow
 from pipeline.calibrate.tracking.object_tracks import (
-    box_centres,
     lidar_tracks,
     motions,
     moves_over_ground,
@@ -91,19 +89,6 @@ def test_a_small_rotation_is_recovered_even_where_three_tracks_in_ten_are_wrong(
     assert rms[0] < 0.4  # roll: only what is beside the line of sight tells it
 
 
-def test_the_camera_is_turned_in_its_own_optical_axes():
-    level = np.eye(4)
-    level[:3, :3] = LEVEL
-    tracks = tracks_of_a_pair(np.random.default_rng(2), level @ T_CAMERA_LIDAR, inverted=False)
-    T = from_rotation_translation(exp_so3(TURN) @ T_CAMERA_LIDAR[:3, :3], T_CAMERA_LIDAR[:3, 3])
-    found = calibrate_pair(
-        "camera_lidar", tracks, Prior(T, T_LIDAR_RADAR, np.radians(2), 0.02), np.random.default_rng(0)
-    )
-    assert np.abs(error_deg(found.T, T_CAMERA_LIDAR)[:2]).max() < 0.12
-    assert np.array_equal(found.T[:3, 3], T[:3, 3])
-    assert not found.observable[3:].any()
-
-
 def test_a_radar_without_elevation_keeps_roll_and_pitch_at_the_prior():
     tracks = tracks_of_a_pair(np.random.default_rng(3), inverse(T_LIDAR_RADAR), elevation=False)
     prior = Prior(T_CAMERA_LIDAR, turned_prior(), np.radians(2), 0.02)
@@ -151,29 +136,6 @@ def test_association_follows_the_motion_not_the_nearest_position():
     assert associate(shared_sightings(alike, radar), np.eye(4), np.radians(4.0)).reference.tolist() == [1]
 
 
-def test_a_track_that_broke_off_and_began_again_keeps_both_parts_and_no_sighting_counts_twice():
-    velocity = np.array([5.0, 0, 0])
-    path = np.array([30.0, 2, 0]) + velocity * STEP_S * np.arange(8)[:, None]
-    whole = [make_track(path, velocity)]
-    parts = [make_track(path[:4], velocity), make_track(path[4:], velocity, first_frame=4)]
-    twice = make_track(path[2:6] + [0.4, 0, 0], velocity, first_frame=2)  # a ghost of the same car
-    found = associate(shared_sightings(whole, [*parts, twice]), np.eye(4), np.radians(1))
-    assert sorted(found.other.tolist()) == [0, 1]
-
-
-def test_a_cluster_as_high_as_a_house_or_off_the_ground_is_no_road_user(day):
-    low, high = day[0].lidar_cluster_min_m.copy(), day[0].lidar_cluster_max_m.copy()
-    assert len(low) >= 3
-    low[:, 2], high[:, 2] = -1.5, -0.1
-    high[0, 2] = 4.0
-    low[1, 2], high[1, 2] = 0.0, 0.5
-    plane = np.array([0.0, 0.0, 1.0, 1.7])
-    first = replace(day[0], lidar_cluster_min_m=low, lidar_cluster_max_m=high, ground_plane=plane)
-    second = replace(first, stamp_ns=first.stamp_ns + 10**8)
-    tracks = lidar_tracks([first, second], [Motion((0.0, 0.0))] * 2)
-    assert {int(k) for t in tracks for k in t.detection} == set(range(2, len(low)))
-
-
 def test_tracks_that_contradict_each_other_are_not_paired():
     path = np.array([30.0, 2, 0]) + np.array([5.0, 0, 0]) * STEP_S * np.arange(6)[:, None]
     lidar = [make_track(path, np.array([5.0, 0, 0]))]
@@ -197,22 +159,6 @@ def test_a_turned_sensor_is_called_miscalibrated_and_a_true_one_is_not(turn, exp
         d = calibrate_pair("lidar_radar", tracks, prior, np.random.default_rng(0)).diagnostics
         called.append(d["decalibration_statistic"] > d["decalibration_threshold"])
     assert called == [expected] * 10
-
-
-def test_few_tracks_raise_the_threshold_of_the_miscalibration_test():
-    thresholds = []
-    for count in (6, 40):
-        tracks = tracks_of_a_pair(np.random.default_rng(5), inverse(T_LIDAR_RADAR), count=count)
-        points = np.concatenate([t.target_m for t in tracks.lidar])
-        bearings = Bearings(
-            points, np.zeros((len(points), 2)), np.full(len(points), 0.01), np.repeat(np.arange(count), SIGHTINGS),
-            np.eye(3), True,
-        )  # fmt: skip
-        bearings = replace(bearings, bearing_rad=bearings.residuals(T_LIDAR_RADAR)[0])
-        aligned = align_bearings(bearings, T_LIDAR_RADAR, np.eye(6) * 1e-3, np.random.default_rng(0))
-        noisy = replace(aligned, covariance=np.eye(6) * 1e-4, spread=np.eye(3) * 1e-4)
-        thresholds.append(consistency(noisy, turned_prior(), TRACKING_BIAS_RAD).threshold)
-    assert thresholds[0] > 2 * thresholds[1] > 2 * 16.2  # chi^2 with 3 degrees of freedom, 99.9 %
 
 
 def test_the_filter_follows_an_object_past_a_moving_car_and_finds_its_velocity_over_ground():
@@ -244,14 +190,6 @@ def test_the_filter_follows_an_object_past_a_moving_car_and_finds_its_velocity_o
     speeds = sorted(float(np.linalg.norm(t.velocity_mps[-1])) for t in tracks)
     assert speeds[1] < 0.6
     assert speeds[2] == pytest.approx(np.hypot(4, 1), abs=0.6)
-
-
-def test_no_track_goes_from_one_drive_to_the_next():
-    one = np.array([[20.0, 0, 0]])
-    scans = [
-        Scan(i, i // 2, round(i * STEP_S * 1e9), Motion((0.0, 0.0)), one, np.eye(2)[None]) for i in range(4)
-    ]
-    assert [t.frame.tolist() for t in follow(scans)] == [[0, 1], [2, 3]]
 
 
 def test_the_turn_of_the_car_is_read_off_the_standing_clusters():
@@ -342,12 +280,6 @@ def test_tracking_is_the_same_to_the_last_bit_whenever_it_is_asked_by_name(day):
         assert np.array_equal(first.pairs[pair].covariance, again.pairs[pair].covariance)
 
 
-def test_pairs_that_did_not_trigger_keep_the_prior(day):
-    solution = solve(day, PRIOR, triggered=["lidar_radar"])
-    assert np.array_equal(solution.pairs["camera_lidar"].T, PRIOR.T_camera_lidar)
-    assert not np.array_equal(solution.pairs["lidar_radar"].T, PRIOR.T_lidar_radar)
-
-
 def test_a_day_on_which_nothing_moves_is_refused_and_says_so():
     day = make_day(8)
     still = [replace(o, lidar_cluster_centre_m=day[0].lidar_cluster_centre_m,
@@ -367,17 +299,3 @@ def test_a_camera_that_sees_nobody_leaves_the_radar_calibrated(day):
     assert solution.pairs["camera_lidar"].frames_used == 0
     assert np.array_equal(solution.pairs["camera_lidar"].T, PRIOR.T_camera_lidar)
     assert solution.pairs["lidar_radar"].frames_used == 16
-
-
-def test_a_box_stands_on_the_ground_and_is_no_lower_than_a_car(day):
-    track = make_track(day[0].lidar_cluster_centre_m[:1].astype(float), np.zeros(3))
-    low = day[0].lidar_cluster_min_m.copy()
-    high = day[0].lidar_cluster_max_m.copy()
-    low[0, 2], high[0, 2] = -1.4, -0.9  # what two rings leave of a car, 0.3 m above the ground at -1.7 m
-    plane = np.array([0.0, 0.0, 1.0, 1.7])
-    seen = replace(day[0], lidar_cluster_min_m=low, lidar_cluster_max_m=high, ground_plane=plane)
-    assert box_centres(track, [seen])[0, 2] == pytest.approx(-1.7 + 1.45 / 2, abs=1e-6)
-    tall = replace(seen, lidar_cluster_max_m=high + np.float32([0, 0, 2.2]))
-    assert box_centres(track, [tall])[0, 2] == pytest.approx((-1.7 + 1.3) / 2, abs=1e-6)
-    unknown = replace(seen, ground_plane=None)
-    assert box_centres(track, [unknown])[0, 2] == pytest.approx(-1.15, abs=1e-6)

@@ -59,9 +59,5 @@ def test_a_result_in_another_place_is_disproved_with_how_far_it_is_off(axis, dir
     assert np.degrees(np.linalg.norm(check.error[:3])) == pytest.approx(1.5, abs=0.3)
 
 
-def test_a_search_that_went_astray_says_nothing_of_the_result(held_out):
-    assert said_of(T_TRUE, held_out, turned(1, 1.5)) == []
-
-
 def test_frames_that_show_nothing_have_no_place(held_out):
     assert held_out_place(held_out[:2], PRIOR, SolveConfig()) is None

@@ -117,11 +117,3 @@ def test_four_pixels_are_right_in_the_image_and_certify_no_mounting(traced):
     page = pair_view(record)
     assert "in the image with this CameraInfo" in page.certified
     assert page.mounting.startswith("not certified; known to")
-
-
-def test_a_stated_principal_point_certifies_the_mounting(traced):
-    known = CameraPrior(centre_sigma_px=0.1, centre_is_stated=True)
-    prior = Prior(T_TRUE, np.eye(4), np.radians(2), 0.05, camera=known)
-    record = records_of(traced, prior)["camera_lidar"]
-    assert record.mounting_determined == record.determined == ["azimuth", "elevation"]
-    assert errors_at_targets("camera_lidar", transform_of(record), T_TRUE)[0] < record.limit_rad

@@ -157,11 +157,6 @@ def test_a_record_held_for_its_sigma_is_held_for_nothing_more_by_a_check_within_
     assert (beyond.status, beyond.unsure_only) == ("held", False)
 
 
-def test_a_better_alignment_is_accepted_without_remark():
-    assert verdict(estimate(1.5), BETTER) == verdict(estimate(1.5), BETTER)
-    assert (verdict(estimate(1.5), BETTER).status, verdict(estimate(1.5), BETTER).reason) == ("accepted", "")
-
-
 def test_a_worse_alignment_is_held_where_it_matters_which_of_the_two_is_right():
     found = verdict(estimate(0.3), WORSE)
     assert found.status == "held"
@@ -217,25 +212,12 @@ def test_a_dof_that_the_day_did_not_determine_may_not_hold_but_is_named():
     assert (found.status, found.reason) == ("accepted", "not determined by the day: ry")
 
 
-def test_failed_checks_hold_and_are_repeated():
-    found = verdict(
-        estimate(1.5), BETTER, failed=["restarts disagree by 0.8 deg", "the camera contradicts radar roll"]
-    )
-    assert found.status == "held"
-    assert found.reason == "restarts disagree by 0.8 deg; the camera contradicts radar roll"
-
-
 def test_the_faults_that_failed_checks_name_reach_the_verdict_each_once():
     moved = FailedCheck("turned at noon", "moved_in_day")
     again = FailedCheck("turned back at two", "moved_in_day")
     found = verdict(estimate(1.5), BETTER, failed=[moved, FailedCheck("no name"), again])
     assert found.faults == ("moved_in_day",)
     assert verdict(estimate(1.5), BETTER).faults == ()
-
-
-def test_a_pose_far_from_its_prior_names_the_prior():
-    assert verdict(estimate(8.5), BETTER).faults == ("prior",)
-    assert verdict(estimate(0.5, 0.31), BETTER).faults == ("prior",)
 
 
 @pytest.mark.parametrize(
@@ -248,7 +230,7 @@ def test_a_pose_far_from_its_prior_names_the_prior():
 )
 def test_moves_beyond_search_range_or_prior_are_held(rotation_deg, shift_m, words):
     found = verdict(estimate(rotation_deg, shift_m), BETTER)
-    assert found.status == "held"
+    assert (found.status, found.faults) == ("held", ("prior",))
     assert words in found.reason
 
 
@@ -357,10 +339,6 @@ def test_a_day_held_for_its_sigma_counts_in_the_state_and_one_that_is_too_short_
         assert (found.status, found.unsure_only) == ("held", False)
 
 
-def test_an_untriggered_pair_keeps_the_prior():
-    assert verdict(estimate(0.0), SAME, triggered=False).reason == "not triggered: the prior stays"
-
-
 @pytest.mark.parametrize(
     ("change", "turn_deg", "after", "words"),
     [
@@ -388,10 +366,6 @@ def solution(turn_deg=0.0, shift_m=0.0, loop=True):
     return Solution("joint", pairs, *((np.radians(turn_deg), shift_m) if loop else (None, None)))
 
 
-def test_a_loop_within_its_sigma_fails_no_check():
-    assert loop_failures(solution(0.3, 0.05)) == {}
-
-
 def test_a_loop_beyond_three_sigma_fails_every_pair_by_what_would_close_it():
     turned = loop_failures(solution(2.0))
     assert turned.keys() == {"camera_lidar", "camera_radar", "lidar_radar"}
@@ -405,10 +379,6 @@ def test_a_loop_beyond_three_sigma_fails_every_pair_by_what_would_close_it():
     assert np.degrees(np.sqrt(np.diag(covariance)[:3])) == pytest.approx(0.1 * np.sqrt(2))
 
 
-def test_a_method_without_independent_pairs_has_no_loop_to_check():
-    assert loop_failures(solution(2.0, loop=False)) == {}
-
-
 def test_loop_failures_come_at_their_rate_when_the_sigmas_are_right():
     rng = np.random.default_rng(0)
     hits = 0
@@ -419,15 +389,6 @@ def test_loop_failures_come_at_their_rate_when_the_sigmas_are_right():
         size = angle, float(np.linalg.norm(loop[:3, 3]))
         hits += bool(loop_failures(Solution("joint", solution().pairs, *size)))
     assert hits <= 4
-
-
-def test_paired_test_sees_a_small_change_in_large_scatter():
-    rng = np.random.default_rng(0)
-    level = rng.normal(size=200) * 5
-    blocks = np.arange(200) // 5
-    found = paired_test(level, level - 0.1 + rng.normal(size=200) * 0.2, blocks)
-    assert found.z < -4
-    assert (found.frames, found.blocks) == (200, 40)
 
 
 def test_paired_test_counts_blocks_not_frames():
@@ -468,10 +429,6 @@ def test_two_blocks_are_no_proof_however_well_they_agree():
     found = paired_test(before, after, blocks)
     assert (after.mean() - 0) / found.standard_error > 15
     assert 1 < found.z < 2.5
-
-
-def test_nothing_changed_is_neither_better_nor_worse():
-    assert paired_test(np.ones(5), np.ones(5), np.arange(5)).z == 0
 
 
 def test_a_radar_that_turned_beyond_its_prior_holds_what_was_solved_along_its_heading():
