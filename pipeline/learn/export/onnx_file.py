@@ -8,6 +8,8 @@ graph there and encode the camera once for several refinements (`infer/single_fr
 from __future__ import annotations
 
 import json
+import warnings
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -15,9 +17,9 @@ from typing import Any
 import onnx
 import torch
 from torch import Tensor, nn
+from torch.jit._trace import TracerWarning
 
 from pipeline.learn.export.model_card import write_card
-from pipeline.learn.export.tracing import trace_to_onnx
 from pipeline.learn.network.calibration_network import CalibrationNetwork
 from pipeline.learn.network.exported_weights import WEIGHTS, weight_places
 from pipeline.learn.network.views import RenderedView
@@ -37,7 +39,9 @@ from pipeline.learn.sample.layout import (
 from schemas.training import GRID_CLASSES
 from schemas.versions import CODE_VERSION
 
-__all__ = ["export_onnx"]
+__all__ = ["OPSET", "export_onnx", "trace_to_onnx"]
+
+OPSET = 18
 
 
 class _Graph(nn.Module):
@@ -137,3 +141,21 @@ def _card_of(network: CalibrationNetwork, metadata: dict[str, str], card: dict[s
         "code_version": CODE_VERSION,
         **card,
     }
+
+
+def trace_to_onnx(
+    graph: nn.Module, examples: tuple[Tensor, ...], path: Path, inputs: Sequence[str], outputs: Sequence[str]
+) -> onnx.ModelProto:
+    """Trace the graph on example inputs, write it to `path`, and read it back unchecked.
+
+    Uses the tracing exporter, because torch's newer one needs onnxscript.
+    """
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", category=DeprecationWarning)
+        warnings.filterwarnings("ignore", category=TracerWarning)
+        warnings.filterwarnings("ignore", message=".*Constant folding.*")
+        torch.onnx.export(
+            graph, examples, str(path), dynamo=False, opset_version=OPSET,
+            input_names=list(inputs), output_names=list(outputs),
+        )  # fmt: skip
+    return onnx.load(str(path))

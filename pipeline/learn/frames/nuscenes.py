@@ -14,14 +14,14 @@ from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from pipeline.core.errors import SolveError
-from pipeline.learn.frames.ego import T_root_sensor, compensated_range_rate, pose_at
 from pipeline.learn.frames.frame import Frame
 from pipeline.learn.frames.images import undistortion_of
 from pipeline.learn.frames.nuscenes_tables import token_of
 from pipeline.learn.frames.output import DayOutput
-from pipeline.rig.se3 import from_rotation_translation, inverse, to_quaternion
+from pipeline.rig.se3 import exp_se3, from_rotation_translation, inverse, to_quaternion
 from schemas.captures import Image, Scan, Sweep
 
 __all__ = ["NuScenesWriter"]
@@ -110,7 +110,7 @@ class NuScenesWriter:
 
     def _sample_data(self, frame: Frame, name: str, sample: str) -> None:
         capture, channel = frame.captures[name], _channel(frame, name)
-        T_odom_ego = pose_at(frame, capture.stamp_ns)
+        T_odom_ego = _pose_at(frame, capture.stamp_ns)
         if T_odom_ego is None:
             problem = "nuScenes needs the car's pose at each sample, and the logs have no odometry: take another format"
             raise SolveError(problem)
@@ -206,7 +206,7 @@ def _pcd(frame: Frame, name: str, scan: Scan) -> bytes:
     dtype = np.dtype([(n, f"<{t}") for n, t in (word.split(":") for word in _RADAR.split())])
     rows = np.zeros(len(scan.radar_x_m), dtype)
     flat = np.maximum(np.hypot(scan.radar_x_m, scan.radar_y_m), 1e-6)
-    own = compensated_range_rate(frame, name, scan)
+    own = _compensated_range_rate(frame, name, scan)
     for column, values in (("x", scan.radar_x_m), ("y", scan.radar_y_m), ("z", scan.radar_z_m)):
         rows[column] = values
     for axis, along in (("x", scan.radar_x_m / flat), ("y", scan.radar_y_m / flat)):
@@ -235,3 +235,30 @@ def _pose(T: np.ndarray) -> dict[str, list[float]]:
 
 def _us(stamp_ns: int) -> int:
     return round(stamp_ns / 1000)
+
+
+def T_root_sensor(frame: Frame, T_reference_sensor: np.ndarray) -> Float[np.ndarray, "4 4"]:
+    """A pose on the car, or on the reference if its pose on the car is unknown."""
+    T_base = frame.mounting.T_base_reference
+    return T_reference_sensor if T_base is None else T_base @ T_reference_sensor
+
+
+def _pose_at(frame: Frame, stamp_ns: int) -> Float[np.ndarray, "4 4"] | None:
+    """T_odom_vehicle at a stamp near the moment's, by speed and yaw rate; None without odometry."""
+    T, speed, turn = frame.T_odom_vehicle, frame.moment.ego_speed_mps, frame.moment.ego_yaw_rate_radps
+    if T is None or speed is None or turn is None:
+        return None
+    dt_s = (stamp_ns - frame.moment.stamp_ns) * 1e-9
+    return T @ exp_se3(np.array([0.0, 0, turn, speed, 0, 0]) * dt_s)
+
+
+def _compensated_range_rate(frame: Frame, sensor: str, scan: Scan) -> Float[np.ndarray, " M"]:
+    """Range rates without the car's own motion: 0 for static objects; NaN if it is unknown."""
+    speed, turn = frame.moment.ego_speed_mps, frame.moment.ego_yaw_rate_radps
+    if speed is None or turn is None:
+        return np.full(len(scan.radar_x_m), np.nan)
+    T = T_root_sensor(frame, frame.T[sensor])
+    velocity_radar = T[:3, :3].T @ (np.array([speed, 0, 0]) + np.cross([0, 0, turn], T[:3, 3]))
+    points = scan.radar_xyz_m.astype(np.float64)
+    rays = points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-6)
+    return scan.radar_range_rate_mps + rays @ velocity_radar

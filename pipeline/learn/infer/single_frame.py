@@ -7,7 +7,7 @@ that depends on the camera alone is computed once (`split_graph`).
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,13 +20,12 @@ from jaxtyping import Float
 
 from pipeline.core.errors import ModelError
 from pipeline.learn.infer.class_evidence import FrameEvidence
-from pipeline.learn.infer.split_graph import split_graph
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import EVIDENCE, PAIRS, NetworkConfig
 from pipeline.learn.sample.rendering import FrameSensors, render_frame
 from pipeline.rig.se3 import inverse, transform_points
 
-__all__ = ["FrameEstimate", "SingleFrameCalibrator", "config_from_metadata"]
+__all__ = ["FrameEstimate", "SingleFrameCalibrator", "config_from_metadata", "split_graph"]
 
 _ANSWERS = ["corrections", "log_variance"]
 
@@ -180,3 +179,33 @@ def _rigid(T: np.ndarray) -> np.ndarray:
     out = T.copy()
     out[:3, :3] = u @ vt
     return out
+
+
+def split_graph(
+    model: onnx.ModelProto, fixed: str, answers: Sequence[str]
+) -> tuple[onnx.ModelProto | None, onnx.ModelProto]:
+    """Two models that together compute `answers`: the part of input `fixed` alone (or None), the rest.
+
+    Input `fixed` does not depend on the guess, and is the same in all passes. The cut is found from the graph, so it
+    works on files of any version.
+    """
+    others = [i.name for i in model.graph.input if i.name != fixed]
+    first, passed_on = _crossing(model.graph, fixed, others)
+    cut = onnx.utils.Extractor(onnx.shape_inference.infer_shapes(model, data_prop=True))
+    if not first:
+        # A network of lidar and radar alone has no such input.
+        return None, cut.extract_model([i.name for i in model.graph.input], list(answers))
+    return cut.extract_model([fixed], passed_on), cut.extract_model([*passed_on, *others], list(answers))
+
+
+def _crossing(graph: onnx.GraphProto, fixed: str, others: Sequence[str]) -> tuple[bool, list[str]]:
+    """Whether anything can be computed beforehand, and which tensors pass from that part into the other."""
+    early, late = {fixed}, set(others)
+    crossing: dict[str, None] = {}
+    for node in graph.node:
+        if any(name in late for name in node.input):
+            late.update(node.output)
+            crossing.update(dict.fromkeys(name for name in node.input if name in early))
+        elif any(name in early for name in node.input):
+            early.update(node.output)
+    return len(crossing) > 0 and fixed not in crossing, list(crossing)

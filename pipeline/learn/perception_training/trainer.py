@@ -21,12 +21,11 @@ from pipeline.core.errors import ConfigError, ContractError
 from pipeline.core.results import Progress, silent
 from pipeline.core.rows import join_rows, take_rows
 from pipeline.learn.export.model_card import write_card
-from pipeline.learn.export.tracing import trace_to_onnx
+from pipeline.learn.export.onnx_file import trace_to_onnx
 from pipeline.learn.train.checkpoints import LAST, load_checkpoint
-from pipeline.learn.train.loop import Run, TrainResult, run_loop
+from pipeline.learn.train.loop import Run, TrainResult, run_loop, stop_signals
 from pipeline.learn.train.metrics import MetricsLog
 from pipeline.learn.train.settings import Count, DescentConfig
-from pipeline.learn.train.stop_signals import stop_signals
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import perceived_days
 from schemas.versions import CODE_VERSION

@@ -6,10 +6,15 @@ same weights, bit for bit, as a run without a stop: all randomness of a step com
 
 from __future__ import annotations
 
+import signal
+import threading
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import torch
@@ -22,7 +27,7 @@ from pipeline.learn.train.processes import ALONE, Processes
 from pipeline.learn.train.schedule import DivergenceGuard, cosine_rate
 from pipeline.learn.train.settings import DescentConfig
 
-__all__ = ["Run", "TrainResult", "run_loop"]
+__all__ = ["Run", "TrainResult", "run_loop", "stop_signals"]
 
 
 @dataclass(frozen=True)
@@ -162,5 +167,27 @@ def run_loop(
         run.validate(folder, log)
     run.save(folder)
     status = "done" if run.finished else ("stopped" if stops else "time_limit")
-    seconds, signal = time.monotonic() - began, stops[0] if stops else 0
-    return TrainResult(status, run.step, run.steps, samples_since(first_step), seconds, report, signal)
+    seconds, ended_by = time.monotonic() - began, stops[0] if stops else 0
+    return TrainResult(status, run.step, run.steps, samples_since(first_step), seconds, report, ended_by)
+
+
+@contextmanager
+def stop_signals() -> Iterator[list[int]]:
+    """Collect SIGTERM and SIGINT instead of ending the process in the middle of a step.
+
+    Yields a list of the signals so far. It stays empty outside the main thread, which alone receives signals.
+    """
+    received: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield received
+        return
+
+    def note(number: int, _frame: FrameType | None) -> None:
+        received.append(number)
+
+    before = {number: signal.signal(number, note) for number in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield received
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -12,12 +12,11 @@ from pathlib import Path
 
 from pipeline.core.results import Progress, silent
 from pipeline.learn.prepare.inventory import require_sides
-from pipeline.learn.train.loop import TrainResult, run_loop
+from pipeline.learn.train.loop import TrainResult, run_loop, stop_signals
 from pipeline.learn.train.metrics import MetricsLog
 from pipeline.learn.train.processes import joined
 from pipeline.learn.train.run_state import begin_run
 from pipeline.learn.train.settings import TrainConfig
-from pipeline.learn.train.stop_signals import stop_signals
 from pipeline.store.partitions import Lake
 
 __all__ = ["TrainRequest", "train"]

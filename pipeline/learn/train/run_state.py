@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -14,14 +15,13 @@ from torch.nn.parallel import DistributedDataParallel
 
 from pipeline.core.errors import ConfigError, ContractError
 from pipeline.learn.batches.batch import TrainingBatch
-from pipeline.learn.batches.loader import load_split
+from pipeline.learn.batches.loader import TrainingLoader, load_split
 from pipeline.learn.network.calibration_network import CalibrationNetwork, build_network
+from pipeline.learn.network.encoders import CameraEncoder, LidarEncoder
 from pipeline.learn.network.exported_weights import network_of_file
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import NetworkConfig
-from pipeline.learn.train.acceleration import accelerate
 from pipeline.learn.train.batch_loss import Passes, batch_loss
-from pipeline.learn.train.batch_stream import BatchStream
 from pipeline.learn.train.checkpoints import BEST, LAST, load_checkpoint, save_checkpoint
 from pipeline.learn.train.loop import Run
 from pipeline.learn.train.metrics import MetricsLog
@@ -31,10 +31,56 @@ from pipeline.learn.train.running_mean import DayMeans
 from pipeline.learn.train.settings import TrainConfig
 from pipeline.store.partitions import Lake
 
-__all__ = ["RunState", "begin_run", "network_of_run"]
+__all__ = ["BatchStream", "RunState", "accelerate", "begin_run", "network_of_run"]
 
 _ENDLESS = 10**9  # steps, where time is what ends a run
 _VALIDATION_SEED = 977  # the guesses of validation are the same every time
+
+
+class BatchStream:
+    """Endless batches of split `train` for this process, prefetched on a GPU; else ContractError."""
+
+    def __init__(self, data: str, config: TrainConfig, processes: Processes) -> None:
+        rank_of = (processes.rank, processes.count)
+        self._loader = TrainingLoader(Lake.at(data), config.batch_size, seed=config.seed, rank_of=rank_of)
+        self._device, self._place = processes.device, self._loader.state_dict()
+        self._ahead = ThreadPoolExecutor(1, "next-batch") if self._device.type == "cuda" else None
+        self._next: Future[tuple[TrainingBatch, dict[str, Any]]] | None = None
+
+    @property
+    def frames(self) -> int:
+        """Frames of the split."""
+        return self._loader.frames
+
+    def batch(self) -> TrainingBatch:
+        """The next step's batch, on the device."""
+        if self._ahead is None:
+            batch, self._place = self._fetch()
+            return batch
+        future = self._next or self._ahead.submit(self._fetch)
+        batch, self._place = future.result()
+        self._next = self._ahead.submit(self._fetch)
+        return batch.to(self._device, non_blocking=True)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The place after the last batch."""
+        return self._place
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on there."""
+        self._loader.load_state_dict(state)
+        self._place = state
+
+    def close(self) -> None:
+        """Release threads and memory."""
+        if self._ahead is not None:
+            self._ahead.shutdown(wait=True, cancel_futures=True)
+        self._loader.close()
+
+    def _fetch(self) -> tuple[TrainingBatch, dict[str, Any]]:
+        batch = next(self._loader)
+        place = self._loader.state_dict()
+        return (batch.pin_memory() if self._device.type == "cuda" else batch), place
 
 
 class RunState(Run):
@@ -233,3 +279,28 @@ def _same_config(folder: Path, begun: dict[str, Any], config: TrainConfig) -> No
             f"the run in this folder was begun with another {other[0]}: use a new folder, or the old value"
         )
         raise ConfigError(str(folder), other[0], problem)
+
+
+def accelerate(network: nn.Module, *, half: bool, compiled: bool) -> None:
+    """Set the image encoders to bfloat16, compile them, or both; parameters and outputs stay float32.
+
+    Of the encoders only: geometry in sixteen bits would be wrong by metres.
+    """
+    for module in network.modules():
+        if isinstance(module, CameraEncoder | LidarEncoder):
+            if half:
+                _in_bfloat16(module)
+            if compiled:
+                module.compile()
+
+
+def _in_bfloat16(module: nn.Module) -> None:
+    forward = module.forward
+
+    def in_bfloat16(inputs: Tensor) -> Tensor:
+        with torch.autocast(inputs.device.type, torch.bfloat16):
+            output: Tensor = forward(inputs)
+        return output.float()
+
+    # In place of hooks, which a compiler would have to stop at.
+    module.forward = in_bfloat16

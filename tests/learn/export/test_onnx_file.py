@@ -14,8 +14,7 @@ from onnxruntime import InferenceSession
 from pipeline.core.errors import ModelError
 from pipeline.learn.batches.collate import collate
 from pipeline.learn.export.onnx_file import export_onnx
-from pipeline.learn.infer.single_frame import SingleFrameCalibrator
-from pipeline.learn.infer.split_graph import split_graph
+from pipeline.learn.infer.single_frame import SingleFrameCalibrator, split_graph
 from pipeline.learn.network.calibration_network import build_network
 from pipeline.learn.network.exported_weights import network_of_file, weight_places
 from pipeline.learn.network.inputs import NetworkInputs, crop, given_classes, sensor_inputs
