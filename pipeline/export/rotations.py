@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from pipeline.rig.se3 import from_rotation_translation
 
@@ -31,12 +32,4 @@ def rpy_of(R: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 3"]:
 
 def pose_of_rpy(xyz_m: Float[np.ndarray, " 3"], rpy_rad: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "4 4"]:
     """T_parent_child from a position and from roll, pitch, yaw about fixed axes, as in URDF and Autoware."""
-    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy_rad), np.sin(rpy_rad)
-    R = np.array(
-        [
-            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-            [-sp, cp * sr, cp * cr],
-        ]
-    )
-    return from_rotation_translation(R, xyz_m)
+    return from_rotation_translation(Rotation.from_euler("xyz", rpy_rad).as_matrix(), xyz_m)

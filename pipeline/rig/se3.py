@@ -4,14 +4,15 @@
 `T' = exp(xi) T`, so xi is in the axes of the parent frame a.
 
 Source: Sola, Deray, Atchuthan 2018, "A micro Lie theory for state estimation in robotics", section IV and
-appendix D (their twist is translation first; here rotation comes first). By hand because SciPy's rotations have
-neither adjoints nor covariances of composed and inverted poses.
+appendix D (their twist is translation first; here rotation comes first). SciPy turns vectors, quaternions and twists
+into matrices and back; it has neither adjoints nor covariances of composed and inverted poses.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import RigidTransform, Rotation
 
 __all__ = [
     "adjoint",
@@ -30,9 +31,6 @@ __all__ = [
     "transform_points",
 ]
 
-# Below this angle the series of sin(x)/x etc. to fourth order are exact to 1e-16.
-_SMALL_RAD = 1e-3
-
 
 def hat(omega: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
     """Skew-symmetric matrix with `hat(a) @ b = a x b`."""
@@ -41,53 +39,29 @@ def hat(omega: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]
     return np.stack([np.stack([o, -z, y], -1), np.stack([z, o, -x], -1), np.stack([-y, x, o], -1)], -2)
 
 
-def _series(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """sin(t)/t, (1-cos t)/t^2, (t - sin t)/t^3, by Taylor series below _SMALL_RAD."""
-    small = theta < _SMALL_RAD
-    t = np.where(small, 1.0, theta)
-    t2 = theta * theta
-    a = np.where(small, 1 - t2 / 6 + t2 * t2 / 120, np.sin(t) / t)
-    b = np.where(small, 0.5 - t2 / 24 + t2 * t2 / 720, 2 * np.sin(t / 2) ** 2 / (t * t))
-    c = np.where(small, 1 / 6 - t2 / 120 + t2 * t2 / 5040, (t - np.sin(t)) / t**3)
-    return a, b, c
-
-
 def exp_so3(phi: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
     """Rotation matrix of a rotation vector [rad]."""
-    theta = np.asarray(np.linalg.norm(phi, axis=-1))
-    a, b, _ = _series(theta)
-    W = hat(phi)
-    return np.eye(3) + a[..., None, None] * W + b[..., None, None] * (W @ W)
+    return Rotation.from_rotvec(_rows(phi, 3)).as_matrix().reshape(*phi.shape, 3)
 
 
 def log_so3(R: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 3"]:
     """Rotation vector [rad] of a rotation matrix, angle in [0, pi]; well conditioned everywhere."""
-    q = _quaternion_of_rotation(R)
-    q = np.where(q[..., :1] < 0, -q, q)
-    v = q[..., 1:]
-    n = np.linalg.norm(v, axis=-1)
-    small = n < 1e-9  # here angle/sin(angle/2) = 2 to 1e-18
-    scale = np.where(small, 2.0, 2 * np.arctan2(n, q[..., 0]) / np.where(small, 1.0, n))
-    return scale[..., None] * v
+    return _rotations(R).as_rotvec().reshape(R.shape[:-1])
 
 
 def exp_se3(xi: Float[np.ndarray, "*batch 6"]) -> Float[np.ndarray, "*batch 4 4"]:
     """Transform of a twist (rotation vector [rad], translation [m])."""
-    phi, rho = xi[..., :3], xi[..., 3:]
-    _, b, c = _series(np.asarray(np.linalg.norm(phi, axis=-1)))
-    W = hat(phi)
-    V = np.eye(3) + b[..., None, None] * W + c[..., None, None] * (W @ W)
-    return from_rotation_translation(exp_so3(phi), (V @ rho[..., None])[..., 0])
+    return RigidTransform.from_exp_coords(_rows(xi, 6)).as_matrix().reshape(*xi.shape[:-1], 4, 4)
 
 
 def log_se3(T: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 6"]:
     """Twist of a transform, inverse of `exp_se3` for rotations below pi."""
+    # By hand: SciPy's takes four times as long for many, and an error for what is not finite.
     phi = log_so3(T[..., :3, :3])
-    theta = np.asarray(np.linalg.norm(phi, axis=-1))
-    a, b, _ = _series(theta)
-    small = theta < _SMALL_RAD
-    t2 = np.where(small, 1.0, theta * theta)
-    d = np.where(small, 1 / 12 + theta * theta / 720, (1 - a / (2 * b)) / t2)
+    half = np.linalg.norm(phi, axis=-1) / 2
+    small = half < 5e-4  # the series is then exact to 1e-16
+    h = np.where(small, 1.0, half)
+    d = np.where(small, 1 / 3 + half * half / 45, (1 - h / np.tan(h)) / (h * h)) / 4
     W = hat(phi)
     V_inv = np.eye(3) - 0.5 * W + d[..., None, None] * (W @ W)
     return np.concatenate([phi, (V_inv @ T[..., :3, 3:])[..., 0]], axis=-1)
@@ -142,8 +116,8 @@ def rotation_angle_rad(T: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, 
 
 def to_quaternion(T: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 4"]:
     """Unit quaternion (w, x, y, z) with w >= 0."""
-    q = _quaternion_of_rotation(T[..., :3, :3])
-    return np.where(q[..., :1] < 0, -q, q)
+    q = _rotations(T[..., :3, :3]).as_quat(canonical=True, scalar_first=True)
+    return q.reshape(*T.shape[:-2], 4)
 
 
 def from_quaternion(
@@ -153,16 +127,8 @@ def from_quaternion(
     norm = np.linalg.norm(q_wxyz, axis=-1, keepdims=True)
     if not np.all(np.isfinite(norm)) or np.any(norm < 1e-6):
         raise ValueError(f"no rotation: quaternion (w, x, y, z) = {q_wxyz}")
-    w, x, y, z = np.moveaxis(q_wxyz / norm, -1, 0)
-    R = np.stack(
-        [
-            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
-        ],
-        -2,
-    )
-    return from_rotation_translation(R, t)
+    R = Rotation.from_quat(_rows(q_wxyz, 4), scalar_first=True).as_matrix()
+    return from_rotation_translation(R.reshape(*q_wxyz.shape[:-1], 3, 3), t)
 
 
 def perturb_exactly(
@@ -177,21 +143,11 @@ def perturb_exactly(
     return from_rotation_translation(R, T[:3, 3] + translation_m * direction / np.linalg.norm(direction))
 
 
-def _quaternion_of_rotation(R: np.ndarray) -> np.ndarray:
-    """Quaternion (w, x, y, z) from the best-conditioned of the four branches (Shepperd 1978)."""
-    m00, m11, m22 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
-    # Row k of the 4x4 matrix 4 q q^T; the row with the largest diagonal is far from zero.
-    d01, d02, d12 = R[..., 1, 0] - R[..., 0, 1], R[..., 0, 2] - R[..., 2, 0], R[..., 2, 1] - R[..., 1, 2]
-    s01, s02, s12 = R[..., 1, 0] + R[..., 0, 1], R[..., 0, 2] + R[..., 2, 0], R[..., 2, 1] + R[..., 1, 2]
-    rows = np.stack(
-        [
-            np.stack([1 + m00 + m11 + m22, d12, d02, d01], -1),
-            np.stack([d12, 1 + m00 - m11 - m22, s01, s02], -1),
-            np.stack([d02, s01, 1 - m00 + m11 - m22, s12], -1),
-            np.stack([d01, s02, s12, 1 - m00 - m11 + m22], -1),
-        ],
-        -2,
-    )
-    best = np.argmax(np.diagonal(rows, axis1=-2, axis2=-1), axis=-1)
-    q = np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
-    return q / np.linalg.norm(q, axis=-1, keepdims=True)
+def _rotations(R: np.ndarray) -> Rotation:
+    """One axis of SciPy's rotations, taken as they are."""
+    return Rotation.from_matrix(_rows(R, 3, 3), assume_valid=True)
+
+
+def _rows(values: np.ndarray, *shape: int) -> np.ndarray:
+    """A copy with one axis of rows, which SciPy computes in C; it refuses arrays that are read-only."""
+    return np.array(values, np.float64).reshape(-1, *shape)

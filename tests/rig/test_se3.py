@@ -74,6 +74,17 @@ def test_log_se3_inverts_exp(xi):
     np.testing.assert_allclose(se3.log_se3(se3.exp_se3(xi)), xi, atol=2e-6, rtol=1e-7)
 
 
+def test_arrays_of_a_table_which_are_read_only_are_taken():
+    xi = np.broadcast_to(np.array([0.1, 0.2, 0.3, 1, 2, 3]), (2, 6))
+    T = np.broadcast_to(se3.exp_se3(xi)[0], (2, 4, 4))
+    close(se3.log_se3(T), xi)
+    close(se3.exp_so3(se3.log_so3(T[..., :3, :3])), T[..., :3, :3])
+    close(
+        se3.from_quaternion(np.broadcast_to(se3.to_quaternion(T)[0], (2, 4)), xi[:, 3:])[:, :3, :3],
+        T[:, :3, :3],
+    )
+
+
 @given(twists(shape=()))
 def test_exp_se3_is_the_matrix_exponential(xi):
     generator = np.zeros((4, 4))
