@@ -119,3 +119,10 @@ def test_a_camera_that_looks_aside_slides_along_its_own_x_with_the_clock():
     ahead = np.eye(4)
     ahead[:3, :3] = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
     assert np.allclose(along_the_way(ahead, velocity, tz_fixed), 0)
+
+
+def test_what_is_fixed_stays_and_a_day_without_edges_says_nothing(terms, kernel):
+    only_turns = np.arange(8) > 2
+    assert (moved_by_borders(terms, kernel, only_turns)[:, 3:] == 0).all()
+    bare = chosen(terms, np.zeros(len(terms.edges.side), bool))
+    assert len(moved_by_borders(bare, kernel)) == 0

@@ -8,7 +8,7 @@ import pytest
 from pipeline.calibrate.joint.camera_lidar.left_out_in_time import left_out_in_time
 from pipeline.calibrate.joint.camera_lidar.observability import IS_TZ
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, Scored
-from pipeline.calibrate.joint.camera_lidar.time_offset import DT, profile_time_offset
+from pipeline.calibrate.joint.camera_lidar.time_offset import DT, TimeOffsetProfile, profile_time_offset
 from pipeline.core.config import SolveConfig
 from pipeline.objective.camera_lidar.score import KernelSettings, prepare_terms
 from pipeline.rig.estimates import Prior
@@ -88,3 +88,12 @@ def test_a_day_of_oncoming_traffic_states_a_time_offset_near_what_is_expected_th
     assert expected.diagnostics["left_out_dt_s"] > 0.5 * abs(expected.time_offset_s)
     # The less is told by the day, the more counts what is expected: no offset.
     assert abs(expected.time_offset_s) < 0.95 * abs(vague.time_offset_s)
+
+
+def test_what_is_at_the_prior_stays_there_and_a_profile_without_ends_says_nothing(terms, kernel):
+    profile = profile_of(with_traffic(terms, 0.8, 0.0), kernel)
+    fixed = np.isin(np.arange(8), (1, 5))
+    rows = left_out_in_time(profile, fixed)
+    assert np.all(rows[:, fixed] == 0)
+    assert np.abs(rows[:, [0, DT]]).max(axis=0).min() > 0
+    assert left_out_in_time(TimeOffsetProfile(STATE, 1e-6, 0.0), IS_TZ).shape == (0, 8)

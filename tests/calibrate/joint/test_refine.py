@@ -47,3 +47,11 @@ def test_a_camera_whose_clock_is_half_a_second_off_is_seen_from_where_nothing_ma
     found_s, z = far_time_offset(terms, slid, SHARP, np.random.default_rng(0))
     assert abs(found_s - 0.02) < 0.04
     assert z > 2
+
+
+def test_what_is_fixed_stays_at_the_prior(scored):
+    fixed = np.isin(np.arange(8), (5, 6, 7))
+    start = AlignmentState(T_TRUE).stepped(0.3 * scales(scored.terms, scored.kernel))
+    end = refine(scored, start, steps=3, fixed=fixed)
+    assert end.T_camera_lidar[2, 3] == scored.prior.T_camera_lidar[2, 3]
+    assert (end.dt_s, end.focal) == (start.dt_s, start.focal)

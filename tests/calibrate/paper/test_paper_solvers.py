@@ -166,3 +166,9 @@ def test_every_method_of_the_table_resolves_and_others_are_a_usage_error():
     with pytest.raises(ConfigError, match="does not exist") as caught:
         method_named("magic")
     assert caught.value.exit_code == 2
+
+
+def test_uncertainty_is_said_to_be_ours_and_is_no_smaller_than_the_bias_floor(pairwise):
+    estimate = pairwise.pairs["camera_lidar"]
+    assert "the paper gives no uncertainty" in estimate.notes[0]
+    assert np.all(np.sqrt(np.diag(estimate.covariance)[:3]) >= np.radians(0.33))
