@@ -75,7 +75,7 @@ def clipped(charts: Charts, scale: Float[np.ndarray, " M"]) -> Float[np.ndarray,
     if N < 3:
         return out
     rows, last = np.arange(M), charts.count - 1
-    median = np.empty_like(out)
+    median = out.copy()  # beyond a chart's days too: what memory held there could be no number
     a, b, c = out[:, :-2], out[:, 1:-1], out[:, 2:]
     median[:, 1:-1] = np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c))
     median[:, 0] = median[:, 1]
