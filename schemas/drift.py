@@ -6,7 +6,6 @@ it there and do not compute another.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from shlex import quote
@@ -14,7 +13,6 @@ from shlex import quote
 from schemas.columns import Recorded, TableSchema, column, row
 
 __all__ = [
-    "DAYS_WILL_TELL",
     "DRIFT",
     "DRIFT_STATUSES",
     "DriftFinding",
@@ -45,6 +43,9 @@ class DriftFinding(Recorded):
     )
     reason: str = column("reason for the status")
     days_used: int = column("number of days on the chart")
+    days_needed: int | None = column(
+        "accepted days that this chart lacks for a verdict, at least; null if it has one", default=None
+    )
     statistic: float | None = column("maximum of the alarm statistic", default=None)
     threshold: float | None = column("alarm threshold for the false-alarm budget", default=None)
     start_day: str | None = column("first day after the change", default=None)
@@ -76,6 +77,11 @@ class DriftFinding(Recorded):
     )
     vehicle_since: str | None = column("first day after the vehicle's clearest change", default=None)
     vehicle_reason: str | None = column("reason for the vehicle's status", default=None)
+    vehicle_days_needed: int | None = column(
+        "accepted days that the vehicle's status lacks, at least; null if days do not change it: where it is UNKNOWN, "
+        "records cannot be read",
+        default=None,
+    )
 
 
 DRIFT = TableSchema(
@@ -95,6 +101,7 @@ class VehicleStatus:
     reason: str
     sensor: str | None = None
     since: str | None = None
+    days_needed: int | None = None
 
 
 def status_of(findings: Sequence[DriftFinding]) -> VehicleStatus:
@@ -107,7 +114,11 @@ def status_of(findings: Sequence[DriftFinding]) -> VehicleStatus:
         return VehicleStatus("UNKNOWN", "no audit yet")
     first = findings[0]
     return VehicleStatus(
-        first.vehicle_status, first.vehicle_reason or "", first.vehicle_sensor, first.vehicle_since
+        first.vehicle_status,
+        first.vehicle_reason or "",
+        first.vehicle_sensor,
+        first.vehicle_since,
+        first.vehicle_days_needed,
     )
 
 
@@ -126,15 +137,6 @@ def kind_of_sensor(name: str, findings: Sequence[DriftFinding]) -> str:
     return known.get(name, name)
 
 
-# Ends of reasons that resolve themselves with more days: no action is needed yet.
-DAYS_WILL_TELL = "will tell"
-# Of reasons of UNKNOWN, how many days a chart has to have, and the days it has where the reason says so.
-_DAYS_NEEDED = (
-    re.compile(r"(?P<has>\d+) days? of data, (?P<needs>\d+) needed"),
-    re.compile(r"that size itself with about (?P<needs>\d+) days?"),
-)
-
-
 def next_step(findings: Sequence[DriftFinding], lake: str) -> str:
     """Next action for a vehicle that is not GREEN, with commands that run as printed; empty if none is needed.
 
@@ -147,11 +149,10 @@ def next_step(findings: Sequence[DriftFinding], lake: str) -> str:
         return ""
     vehicle, day = findings[0].vehicle, findings[0].day
     of = f"--lake {quote(lake)} --vehicle {quote(vehicle)}"
-    look_again = f"look again tomorrow: `boresight status {of}`"
     if stored.status == "UNKNOWN":
-        return f"{vehicle}: {_until_it_is_known(findings, stored.reason, of, quote(lake), look_again)}"
-    if stored.status == "YELLOW" and DAYS_WILL_TELL in stored.reason:
-        return f"{vehicle}: drive on; {look_again}."
+        return f"{vehicle}: {_until_it_is_known(stored.days_needed, quote(lake))}"
+    if stored.status == "YELLOW" and stored.days_needed:
+        return f"{vehicle}: drive on; look again tomorrow: `boresight status {of}`."
     load = (
         f"load the state of tonight, which rests on the days since: `boresight export ros2 {of} "
         f"--out {quote(f'tonight/{vehicle}')}` (`boresight export --help` lists other formats)"
@@ -169,16 +170,8 @@ def next_step(findings: Sequence[DriftFinding], lake: str) -> str:
     return f"{vehicle}: {load}. {look}"
 
 
-def _until_it_is_known(
-    findings: Sequence[DriftFinding], reason: str, of: str, lake: str, look_again: str
-) -> str:
-    """What a vehicle that is UNKNOWN needs: a repair of tables, more days, or a look at its days."""
-    if "cannot be read" in reason:
+def _until_it_is_known(days: int | None, lake: str) -> str:
+    """What a vehicle that is UNKNOWN needs: a repair of tables, or more days."""
+    if days is None:
         return f"restore what can be restored of the tables: `boresight repair --lake {lake}`."
-    asked = next((found for pattern in _DAYS_NEEDED if (found := pattern.search(reason))), None)
-    if asked is None:
-        return f"see which days gave no estimate, and which check failed: `boresight status {of}`."
-    has = int(asked.groupdict().get("has") or max(f.days_used for f in findings))
-    more = max(int(asked["needs"]) - has, 1)
-    needed = "1 more accepted day is needed" if more == 1 else f"{more} more accepted days are needed"
-    return f"drive: {needed}; {look_again}."
+    return f"drive; {'1 more accepted day is' if days == 1 else f'{days} more accepted days are'} needed."

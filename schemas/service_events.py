@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 from schemas.columns import Recorded, TableSchema, column, row
 
-__all__ = ["REALIGNED", "SERVICE_EVENTS", "ServiceEvent"]
+__all__ = ["SERVICE_EVENTS", "ServiceEvent"]
 
-REALIGNED = "re-alignment"  # of a radar by its own software
+_REALIGNED = "re-alignment"  # of a radar by its own software
 
 
 @row(eq=True)
@@ -19,6 +21,17 @@ class ServiceEvent(Recorded):
     kind: str = column("re-mount, repair, software release, or re-alignment of a radar by its own software")
     note: str = column("for people", default="")
     withdrawn: bool = column("recorded by mistake, without effect", default=False)
+
+    def touches(self, sensors: Collection[str]) -> bool:
+        """True if the work may have moved one of the named sensors."""
+        return self.sensor == "all" or self.sensor in sensors
+
+    @property
+    def in_words(self) -> str:
+        """As `repair of the radar on 2026-03-07`."""
+        of = "all sensors" if self.sensor == "all" else f"the {self.sensor}"
+        by = " by its own software" if self.kind == _REALIGNED else ""
+        return f"{self.kind} of {of}{by} on {self.day}"
 
 
 SERVICE_EVENTS = TableSchema(

@@ -51,22 +51,20 @@ def vehicle_findings(
     findings = []
     known = {*records.own_edges(), *(edge for edge, _ in before or ())} or {*edges}
     for edge in sorted(known, key=edge_order):
-        without_data, last_estimate = _without_data(records, edge), _last_estimate(records, edge)
+        without_data = _without_data(records, edge, max(config.baseline_days + 1, 2))
+        last_estimate = _last_estimate(records, edge)
         for dof in DOF_NAMES:
             chart = verdict.charts.get((edge, dof)) or without_data
             if last_estimate:
                 chart = replace(chart, reason=f"{chart.reason}; no estimate after {last_estimate}")
             if (edge, dof) in remarks:
-                # After a service event the days begin again: how many a chart needs is known.
-                none_yet = f"0 days of data, {max(config.baseline_days + 1, 2)} needed"
-                reason = chart.reason if chart.days_used else none_yet
-                chart = replace(chart, reason=f"{reason}; {remarks[edge, dof]}")
+                chart = replace(chart, reason=f"{chart.reason}; {remarks[edge, dof]}")
             if before is not None:
                 chart = _begun_before(chart, before.get((edge, dof)))
             base = DriftFinding(
                 vehicle=audit.vehicle, day=audit.day, method=audit.method, pair=edge.kind,
                 parent_frame=edge.parent.name, child_frame=edge.child.name, dof=dof,
-                status=chart.status, reason=chart.reason, days_used=chart.days_used,
+                status=chart.status, reason=chart.reason, days_used=chart.days_used, days_needed=chart.days_needed,
                 limit=limit_of(edge, dof, config), work_key=audit.work_key, statistic=chart.statistic,
                 threshold=chart.threshold, inputs=audit.inputs,
             )  # fmt: skip
@@ -80,6 +78,7 @@ def vehicle_findings(
             vehicle_sensor=status.sensor,
             vehicle_since=status.since,
             vehicle_reason=status.reason,
+            vehicle_days_needed=status.days_needed,
         )
         for f in findings
     ]
@@ -132,9 +131,9 @@ def _last_estimate(records: Estimates, edge: Edge) -> str:
     return day_name(int(days.max())) if len(days) and days.max() < records.day.max() else ""
 
 
-def _without_data(records: Estimates, edge: Edge) -> ChartVerdict:
+def _without_data(records: Estimates, edge: Edge, needed: int) -> ChartVerdict:
     found = records.status[records.is_of(edge)].tolist()
     kinds = [(name, found.count(STATUSES.index(name))) for name in ("held", "refused")]
     counts = ", ".join(f"{count} {name}" for name, count in kinds if count)
     reason = f"no estimate in the window ({counts})" if counts else "no record in the window"
-    return ChartVerdict("UNKNOWN", reason, 0, None, None, None, None)
+    return ChartVerdict("UNKNOWN", f"{reason}, {needed} needed", 0, None, None, None, None, needed)

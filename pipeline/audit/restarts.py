@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.audit.service import what_was_done
 from pipeline.rig.graph import Sensor
 from pipeline.store.partitions import days_after
 from schemas.drift import DriftFinding
@@ -35,8 +34,8 @@ def last_restart(
     first, why = "", ""
     for event in events:
         begin = days_after(event.day, 1)
-        if event.day <= last_day and event.sensor in {"all", *ends} and begin > first:
-            first, why = begin, f"after the {what_was_done(event)}"
+        if event.day <= last_day and event.touches(ends) and begin > first:
+            first, why = begin, f"after the {event.in_words}"
     for finding in findings:
         begin = finding.start_day_latest or ""
         if finding.status not in _ALARMS or begin <= first or not ends & _moved_by(finding):

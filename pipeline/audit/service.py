@@ -8,9 +8,9 @@ from pipeline.rig.graph import Edge
 from pipeline.store.current import current_events
 from pipeline.store.partitions import Lake
 from pipeline.store.records import read_records
-from schemas.service_events import REALIGNED, SERVICE_EVENTS, ServiceEvent
+from schemas.service_events import SERVICE_EVENTS, ServiceEvent
 
-__all__ = ["events_until", "restart_of", "what_was_done"]
+__all__ = ["events_until", "restart_of"]
 
 
 def events_until(lake: Lake, last: str | None) -> dict[str, list[ServiceEvent]]:
@@ -26,13 +26,6 @@ def restart_of(events: Sequence[ServiceEvent], edge: Edge, last_day: str) -> Ser
 
     The day of the event belongs to neither side, because the drive may be before or after it.
     """
-    names = {"all", *(sensor.name for sensor in edge.sensors)}
-    touching = [e for e in events if e.day <= last_day and e.sensor in names]
+    names = [sensor.name for sensor in edge.sensors]
+    touching = [e for e in events if e.day <= last_day and e.touches(names)]
     return max(touching, key=lambda e: e.day, default=None)
-
-
-def what_was_done(event: ServiceEvent) -> str:
-    """The event in words."""
-    of = "all sensors" if event.sensor == "all" else f"the {event.sensor}"
-    by = " by its own software" if event.kind == REALIGNED else ""
-    return f"{event.kind} of {of}{by} on {event.day}"

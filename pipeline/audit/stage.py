@@ -15,7 +15,7 @@ from pipeline.audit.estimates import Estimates, days_of
 from pipeline.audit.findings import VehicleAudit, vehicle_findings
 from pipeline.audit.fleet_shift import FleetShift, judge_without_fleet_shifts, shifts_of
 from pipeline.audit.history import History, last_audited_day, models_of
-from pipeline.audit.service import events_until, restart_of, what_was_done
+from pipeline.audit.service import events_until, restart_of
 from pipeline.audit.standing import said_before, standing
 from pipeline.audit.vehicle import VehicleVerdict
 from pipeline.core.config import AuditConfig, FleetConfig, config_hash
@@ -217,7 +217,7 @@ def _remarks(
     for edge in vehicle.records.own_edges():
         restart = restart_of(vehicle.events, edge, last)
         if restart is not None:
-            remarks |= {(edge, dof): f"since the {what_was_done(restart)}" for dof in DOF_NAMES}
+            remarks |= {(edge, dof): f"since the {restart.in_words}" for dof in DOF_NAMES}
     for key, shift in shifts.items():
         day = dt.date.fromordinal(shift.day).isoformat()
         text = f"without what {shift.vehicles} of {shift.of} vehicles show since {day}"

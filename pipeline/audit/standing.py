@@ -49,11 +49,18 @@ def standing(
     before, now = (_CALMEST_FIRST.index(rows[0].vehicle_status or "UNKNOWN") for rows in (said, found))
     alarmed = before >= _CALMEST_FIRST.index("YELLOW")
     if before < now or (before == now and not alarmed):
-        return [replace(row, vehicle_reason=_with_less(row.vehicle_reason or "")) for row in found]
-    since = said[0].day
+        kept = [replace(row, vehicle_reason=_with_less(row.vehicle_reason or "")) for row in found]
+    else:
+        since = said[0].day
+        kept = [
+            replace(
+                row, reason=_kept(row.reason, since), vehicle_reason=_kept(row.vehicle_reason or "", since)
+            )
+            for row in again
+        ]
+    # More days do not replace the records of an UNKNOWN vehicle that cannot be read.
     return [
-        replace(row, reason=_kept(row.reason, since), vehicle_reason=_kept(row.vehicle_reason or "", since))
-        for row in again
+        replace(row, vehicle_days_needed=None) if row.vehicle_status == "UNKNOWN" else row for row in kept
     ]
 
 

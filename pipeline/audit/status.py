@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 
-from pipeline.rig.edges import EDGE_OF_PAIR, edge_of, edge_order, words_of
+from pipeline.rig.edges import edge_of, edge_order, words_of
 from pipeline.rig.graph import KINDS, Edge
 from schemas.drift import DriftFinding, VehicleStatus
 
@@ -50,8 +50,8 @@ def decide_status(findings: Sequence[DriftFinding]) -> VehicleStatus:
     GREEN: no chart alarms, and a rotation of any sensor by its limit would have been detected. For this, of
         the edges that the vehicle has, each camera's pitch and yaw against a lidar must be GREEN, and each
         radar's yaw against a lidar or a camera. Other charts may be UNKNOWN: the days cannot determine them
-        on most roads (radar roll, heights), so they would stay UNKNOWN. The reason gives the number of GREEN
-        charts.
+        on most roads (radar roll, heights), so they would stay UNKNOWN. The reason gives their
+        numbers.
     UNKNOWN: no chart alarms, but one of those charts could miss a change above the limit: it has too few
         days, its sigmas are too large, or a change may have begun.
 
@@ -65,29 +65,41 @@ def decide_status(findings: Sequence[DriftFinding]) -> VehicleStatus:
     if alarms:
         clearest = max(alarms, key=_clarity)
         reason = f"{_what_happened(clearest)}: {clearest.reason}"
-        return VehicleStatus(clearest.status, reason, clearest.moved_sensor, clearest.start_day)
-    status = {(edge_of(f), f.dof): f.status for f in findings}
-    watched = _watched({edge for edge, _ in status} or EDGE_OF_PAIR.values())
-    unwatched = [
-        sensors
-        for sensors, edges in watched.items()
-        if not any(all(status.get((e, dof)) == "GREEN" for dof in _WATCHED[e.kind]) for e in edges)
+        return VehicleStatus(
+            clearest.status, reason, clearest.moved_sensor, clearest.start_day, clearest.days_needed
+        )
+    if not findings:
+        return VehicleStatus("UNKNOWN", "too little data to say whether a sensor moved")
+    blind = {}  # of each group of sensors that may have turned unseen, charts of the edge that needs the fewest days
+    for sensors, edges in _watched({edge_of(f) for f in findings}).items():
+        if fewest := min((_blind(findings, edge) for edge in edges), key=_days_needed):
+            blind[sensors] = fewest
+    few = sum(f.status != "GREEN" for f in findings)
+    if not blind:
+        rest = f", enough to exclude a turn of any sensor; {few} have too little data" if few else ""
+        of = f"{len(findings) - few} of {len(findings)} charts exclude a change above the limit"
+        return VehicleStatus("GREEN", f"no sensor moved: {of}{rest}")
+    charts = max(blind.values(), key=_days_needed)
+    slowest = max(charts, key=lambda f: _days_needed([f]))
+    if max(f.days_used for f in findings) > 1:
+        turned = f"{' and '.join(f'the {of}' for of in blind)} may have turned unseen"
+        counts = f"{few} of {len(findings)} charts have too little data"
+        reason = f"{turned}: {counts}; {words_of(edge_of(slowest))} {slowest.dof}: {slowest.reason}"
+    else:
+        reason = f"too little data to say whether a sensor moved: {slowest.reason}"
+    return VehicleStatus("UNKNOWN", reason, days_needed=_days_needed(charts))
+
+
+def _blind(findings: Sequence[DriftFinding], edge: Edge) -> list[DriftFinding]:
+    """Charts of an edge that could miss a turn of its sensors."""
+    return [
+        f for f in findings if edge_of(f) == edge and f.dof in _WATCHED[edge.kind] and f.status != "GREEN"
     ]
-    green = sum(s == "GREEN" for s in status.values())
-    count = f"{green} of {len(findings)} charts would show a change that matters"
-    if not unwatched:
-        return VehicleStatus("GREEN", f"no sensor moved ({count})")
-    most = max((f.days_used for f in findings), default=0)
-    if most > 1:
-        hidden = " and of the ".join(unwatched)
-        first = watched[unwatched[0]][0]  # where there is a choice
-        own = [f for f in findings if edge_of(f) == first and f.dof in _WATCHED[first.kind]]
-        blind = [f for f in own if f.status != "GREEN"]
-        why = "".join(f"; {words_of(first)} {f.dof}: {f.reason}" for f in blind[:1])
-        return VehicleStatus("UNKNOWN", f"a turn of the {hidden} could hide ({count}){why}")
-    own = [f for f in findings if f.days_used == most and (most or "needed" in f.reason)]
-    why = "".join(f": {f.reason}" for f in own[:1])
-    return VehicleStatus("UNKNOWN", f"too little data to say whether a sensor moved{why}")
+
+
+def _days_needed(charts: Sequence[DriftFinding]) -> int:
+    """Accepted days until none of these charts is blind."""
+    return max((f.days_needed or 1 for f in charts), default=0)
 
 
 def _clarity(alarm: DriftFinding) -> tuple[bool, bool, float]:

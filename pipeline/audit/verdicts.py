@@ -18,7 +18,7 @@ from pipeline.audit.charts import Charts, clipped, thresholds
 from pipeline.audit.days import FEWEST_DAYS
 from pipeline.audit.noise import Noise
 from pipeline.audit.scan import Scan, scan_by
-from schemas.drift import DAYS_WILL_TELL
+from schemas.calibrations import DOF_NAMES
 
 __all__ = ["ChartVerdict", "judge_charts"]
 
@@ -31,13 +31,11 @@ _KNOWN = 240.0
 _HEAVY = 2 / 3  # of the sigmas that one day may lie off, where single days are often far off
 _TAIL = 4.0  # power by which days far off fall with the distance: Student's t with four degrees of freedom
 _TAME = 2  # days in a row that are no chance where single days are seldom far off
-_LASTING = "a lasting change of a size that matters"
-_ONE_DAY = f"one day stands out: the next day {DAYS_WILL_TELL} whether it lasts"
-_FEW_DAYS = (
-    f"two days stand out, and single days are often far off: the next day {DAYS_WILL_TELL} whether it lasts"
-)
-_MAYBE = f"a change that may be of a size that matters: the next days {DAYS_WILL_TELL}"
-_BEGUN = f"a change may have begun: the next days {DAYS_WILL_TELL}"
+_LASTING = "a lasting change above the limit"
+_ONE_DAY = "one day stands out: the next day will show whether it lasts"
+_FEW_DAYS = "two days stand out, and single days are often far off: the next day will show whether it lasts"
+_MAYBE = "a change that may be above the limit: the next days will show it"
+_BEGUN = "a change may have begun: the next days will show it"
 
 
 @dataclass(frozen=True)
@@ -51,6 +49,7 @@ class ChartVerdict:
     threshold: float | None
     visible_size: float | None  # smallest change of a well-placed step that the chart would show [rad or m]
     change: Change | None
+    days_needed: int | None = None  # accepted days that it lacks for a verdict, at least; None: it has one
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +82,7 @@ def judge_charts(
     """Judge every chart.
 
     Args:
-        charts: day estimates.
+        charts: day estimates, in order of edge and DoF.
         noise: their noise.
         limit: size of a change that matters [rad or m].
         probability: false-alarm probabilities of each chart: of an alarm tonight, and of a change that may
@@ -144,9 +143,9 @@ def _last_day(charts: Charts, noise: Noise) -> tuple[np.ndarray, np.ndarray]:
 def _verdict(seen: _Judged, m: int) -> ChartVerdict:
     days = int(seen.charts.count[m])
     if days < 2:
-        # A chart without any day may never have one, so no number of days is promised.
-        needed = f", {max(seen.baseline_days + 1, 2)} needed" if days else ""
-        return ChartVerdict("UNKNOWN", f"{_count(days)} of data{needed}", days, None, None, None, None)
+        needed = max(seen.baseline_days + 1, 2)
+        reason = f"{_count(days)} of data, {needed} needed"
+        return ChartVerdict("UNKNOWN", reason, days, None, None, None, None, needed - days)
     levels = None
     if seen.statistic[m] > seen.threshold[m]:
         levels = levels_of(
@@ -168,7 +167,7 @@ def _changed(seen: _Judged, m: int, levels: Levels) -> ChartVerdict | None:
     change, limit = describe(levels), float(seen.limit[m])
     status, reason = "RED", _LASTING
     if abs(change.size) < limit:
-        status, reason = "YELLOW", "a change below the size that matters"
+        status, reason = "YELLOW", "a change below the limit"
     elif (days := min(levels.days_before - _more(seen, m), levels.days_after)) < seen.believed[m]:
         status, reason = "YELLOW", _ONE_DAY if days < 2 else _FEW_DAYS
     elif abs(change.size) - _SURELY * change.size_sigma < limit:
@@ -184,6 +183,7 @@ def _changed(seen: _Judged, m: int, levels: Levels) -> ChartVerdict | None:
         levels.threshold,
         float(seen.visible[m]),
         change,
+        1 if reason in (_ONE_DAY, _FEW_DAYS, _MAYBE) else None,
     )
 
 
@@ -199,8 +199,12 @@ def _unchanged(seen: _Judged, m: int, levels: Levels | None) -> ChartVerdict:
     if levels is not None:
         statistic, visible = levels.statistic, _VISIBLE_SIGMAS * levels.sigma
 
-    def say(status: str, reason: str, change: Change | None = None) -> ChartVerdict:
-        return ChartVerdict(status, reason, days, statistic, float(seen.threshold[m]), visible, change)
+    def judged(
+        status: str, reason: str, needed: int | None = None, change: Change | None = None
+    ) -> ChartVerdict:
+        return ChartVerdict(
+            status, reason, days, statistic, float(seen.threshold[m]), visible, change, needed
+        )
 
     if days > 2 and seen.last_day[m] > seen.alone[m] and abs(seen.last_size[m]) > limit:
         return _one_day(seen, m)
@@ -208,12 +212,17 @@ def _unchanged(seen: _Judged, m: int, levels: Levels | None) -> ChartVerdict:
         after = 1 if seen.believed[m] == _TAME else int(seen.believed[m])
         begun = clearest(seen.scan.row(m, days), seen.charts.day[m, :days], limit, seen.watch[:, m], after)
         if begun is not None:
-            return say("YELLOW", _BEGUN, begun)
+            return judged("YELLOW", _BEGUN, 1, begun)
     if days <= seen.baseline_days:
-        return say("UNKNOWN", f"{_count(days)} of data, {seen.baseline_days + 1} needed")
+        needed = seen.baseline_days + 1
+        return judged("UNKNOWN", f"{_count(days)} of data, {needed} needed", needed - days)
     if visible > limit:
-        return say("UNKNOWN", _what_could_hide(days, visible / limit))
-    return say("GREEN", "no change" if levels is None else "back where the reference is")
+        # The smallest visible change decreases with the square root of the days.
+        needed = max(math.ceil(days * (visible / limit) ** 2) - days, 1)
+        return judged(
+            "UNKNOWN", _too_inaccurate(DOF_NAMES[m % len(DOF_NAMES)], visible, limit, needed), needed
+        )
+    return judged("GREEN", "no change" if levels is None else "back where the reference is")
 
 
 def _one_day(seen: _Judged, m: int) -> ChartVerdict:
@@ -224,15 +233,16 @@ def _one_day(seen: _Judged, m: int) -> ChartVerdict:
     before = int(charts.day[m, last - 1]) + 1
     change = Change(day, before, day, "step", float(seen.last_size[m]), sigma, day)
     threshold, visible = float(seen.threshold[m]), float(seen.visible[m])
-    return ChartVerdict("YELLOW", _ONE_DAY, last + 1, float(seen.last_day[m]), threshold, visible, change)
+    return ChartVerdict("YELLOW", _ONE_DAY, last + 1, float(seen.last_day[m]), threshold, visible, change, 1)
 
 
-def _what_could_hide(days: int, times: float) -> str:
-    """`times`: smallest visible change as a multiple of `limit`; it decreases with the square root of the days."""
-    needed = math.ceil(days * times**2)
+def _too_inaccurate(dof: str, visible: float, limit: float, needed: int) -> str:
+    """Reason of a chart that would miss a change above its limit [rad or m]."""
+    scale, unit = (180 / math.pi, "deg") if dof.startswith("r") else (1.0, "m")
+    such = "1 more such day is" if needed == 1 else f"{needed} more such days are"
     return (
-        f"no change seen, but these days are too inaccurate to exclude one of the size that matters: {times:.1f} times "
-        f"that size would be seen now, that size itself with about {_count(needed)} like these"
+        f"only a change above {visible * scale:.2g} {unit} would show (limit {limit * scale:.2g} {unit}); about {such} "
+        "needed"
     )
 
 

@@ -156,7 +156,10 @@ def headline_for(verdicts: FleetVerdicts, views: Sequence[FindingView]) -> tuple
         return worst, f"No sensor moved on {vehicles}."
     if worst == "UNKNOWN":
         where = f"on {statuses.count(worst)} of {vehicles}"
-        return worst, f"No change seen, but {where} the days so far could hide one that matters."
+        return (
+            worst,
+            f"No change seen, but {where} the days are too few or too inaccurate to exclude one above the limit.",
+        )
     of_these = [v for v in views if v.status == worst]
     named = [f"{v.vehicle}: {v.sensor} since {v.since}" for v in of_these[:3]]
     more = "" if len(of_these) <= 3 else f" and {len(of_these) - 3} more"

@@ -19,7 +19,8 @@ def charts(**changes):
     for pair, (parent, child) in FRAMES_OF_PAIR.items():
         for dof in DOF_NAMES:
             status = "GREEN" if (pair, dof) in WATCHED else "UNKNOWN"
-            about = {"pair": pair, "dof": dof, "parent_frame": parent, "child_frame": child, "status": status}
+            about = {"pair": pair, "dof": dof, "parent_frame": parent, "child_frame": child, "status": status,
+                     "days_needed": None if status == "GREEN" else 99}  # fmt: skip
             rows[f"{pair}_{dof}"] = DriftFinding(**same | about)
     assert len(rows) == 6 * len(PAIRS)
     return list((rows | {name: replace(rows[name], **fields) for name, fields in changes.items()}).values())
@@ -30,7 +31,7 @@ def alarm(status, **fields):
     return {"status": status, "reason": "why"} | change | fields
 
 
-UNSEEN = {"status": "UNKNOWN", "reason": "what could hide"}
+UNSEEN = {"status": "UNKNOWN", "reason": "why not", "days_needed": 4}
 CLEAREST = {
     "camera_lidar_rx": alarm("YELLOW", moved_sensor="camera", statistic=90.0),
     "lidar_radar_rz": alarm("RED", moved_sensor="radar", start_day="2026-03-06"),
@@ -42,9 +43,9 @@ CLEAREST = {
 @pytest.mark.parametrize(
     ("changes", "status", "sensor", "words"),
     [
-        ({}, "GREEN", None, "no sensor moved (3 of 18 charts would show a change that matters)"),
-        ({"camera_lidar_rx": UNSEEN}, "UNKNOWN", None, "camera_lidar rx: what could hide"),
-        ({"camera_lidar_ry": UNSEEN}, "UNKNOWN", None, "camera or lidar"),
+        ({}, "GREEN", None, "no sensor moved: 3 of 18 charts exclude a change above the limit, enough"),
+        ({"camera_lidar_rx": UNSEEN}, "UNKNOWN", None, "16 of 18 charts have too little data; camera_lidar rx: why"),
+        ({"camera_lidar_ry": UNSEEN}, "UNKNOWN", None, "the camera or lidar may have turned unseen"),
         ({"lidar_radar_rz": UNSEEN}, "UNKNOWN", None, "radar"),
         # Radar yaw may be watched from the camera instead.
         ({"lidar_radar_rz": UNSEEN, "camera_radar_ry": {"status": "GREEN"}}, "GREEN", None, ""),
@@ -60,6 +61,23 @@ def test_a_vehicle_is_as_its_clearest_alarm_and_green_where_every_turn_would_sho
     assert (found.status, found.sensor) == (status, sensor)
     assert words in found.reason
     assert (found.since is not None) == (status in ("RED", "YELLOW"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "days"),
+    [
+        ({}, None),
+        ({"camera_lidar_rx": UNSEEN}, 4),
+        ({"camera_lidar_rx": UNSEEN, "camera_lidar_ry": UNSEEN | {"days_needed": 6}}, 6),  # both are needed
+        ({"camera_lidar_rx": UNSEEN, "lidar_radar_rz": UNSEEN | {"days_needed": 7}}, 7),
+        # The camera shows the radar's yaw first.
+        ({"lidar_radar_rz": UNSEEN | {"days_needed": 7}, "camera_radar_ry": UNSEEN | {"days_needed": 2}}, 2),
+        ({"lidar_radar_tz": UNSEEN}, None),  # GREEN depends on no height
+        ({"camera_lidar_tz": alarm("YELLOW", days_needed=1)}, 1),
+    ],
+)
+def test_a_vehicle_lacks_the_days_of_the_charts_that_its_status_depends_on(changes, days):
+    assert decide_status(charts(**changes)).days_needed == days
 
 
 def test_one_day_is_too_little_data():
