@@ -6,7 +6,8 @@ as numbers, in files of a few dozen vehicles each.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import datetime as dt
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from pipeline.rig.changes import change_between
 from pipeline.rig.edges import edge_order
 from pipeline.rig.graph import Edge
 from schemas.calibrations import DOF_NAMES
+from schemas.service_events import ServiceEvent
 
 __all__ = ["charted_edges", "fleet_charts"]
 
@@ -32,19 +34,25 @@ def charted_edges(window: FleetWindow, verdicts: FleetVerdicts) -> tuple[Edge, .
     return tuple(sorted({*window.edges, *verdicts.charts.edges}, key=edge_order))
 
 
-def fleet_charts(window: FleetWindow, verdicts: FleetVerdicts) -> Iterator[tuple[str, dict[str, Any]]]:
+def fleet_charts(
+    window: FleetWindow, verdicts: FleetVerdicts, events: Sequence[ServiceEvent] = ()
+) -> Iterator[tuple[str, dict[str, Any]]]:
     """Every audited vehicle with its charts, for `templates/fleet.js`.
 
     A chart is [edge, dof, status, limit, start, values, sigmas]: places in `charted_edges`, DOF_NAMES and
     DRIFT_STATUSES; the limit, and per day value and sigma, in 1e-4 deg or 1e-4 m, null where the day does not
     say; the start as days of the calendar (first, earliest, latest), null where nothing changed. Values are
-    relative to the level before the change. `days` are ordinals of the calendar; `pairs` has a letter per
-    edge and day: accepted, held, refused, "." none.
+    relative to the level before the change, or since the last service event. `days` are ordinals of the
+    calendar; `pairs` has a letter per edge and day: accepted, held, refused, "." none; `events` are
+    [day, text, edges that it restarts].
     """
     first = _spans(window.owner, len(window.vehicles))
     of_chart = _spans(verdicts.charts.owner, len(verdicts.vehicles))
     place = {vehicle: v for v, vehicle in enumerate(window.vehicles)}
-    values = _values(window, verdicts)
+    by_vehicle: dict[str, list[ServiceEvent]] = {}
+    for event in events:
+        by_vehicle.setdefault(event.vehicle, []).append(event)
+    values = _values(window, verdicts, by_vehicle)
     edges = charted_edges(window, verdicts)
     place_of = [
         np.array([edges.index(e) for e in own], np.int64) for own in (window.edges, verdicts.charts.edges)
@@ -54,7 +62,17 @@ def fleet_charts(window: FleetWindow, verdicts: FleetVerdicts) -> Iterator[tuple
         if v is not None:
             rows, charts = slice(*first[v : v + 2]), slice(*of_chart[c : c + 2])
             shown = place_of[0][window.edge[rows]], place_of[1][verdicts.charts.edge[charts]]
-            yield vehicle, _vehicle(window, verdicts.charts, values, (rows, charts), shown, len(edges))
+            numbers = _vehicle(window, verdicts.charts, values, (rows, charts), shown, len(edges))
+            done = [
+                [dt.date.fromisoformat(e.day).toordinal(), e.in_words, _restarted(e, edges)]
+                for e in by_vehicle.get(vehicle, ())
+            ]
+            yield vehicle, numbers | {"events": done}
+
+
+def _restarted(event: ServiceEvent, edges: Sequence[Edge]) -> list[int]:
+    """Places of the edges that an event may have moved."""
+    return [k for k, edge in enumerate(edges) if event.touches([sensor.name for sensor in edge.sensors])]
 
 
 def _vehicle(
@@ -93,8 +111,13 @@ def _vehicle(
     return {"days": days.tolist(), "pairs": ["".join(row) for row in letters], "charts": listed}
 
 
-def _values(window: FleetWindow, verdicts: FleetVerdicts) -> Float[np.ndarray, "N 6"]:
-    """Changes [rad, m] of every record from its edge's level before the change; not finite where it has none."""
+def _values(
+    window: FleetWindow, verdicts: FleetVerdicts, events: Mapping[str, Sequence[ServiceEvent]]
+) -> Float[np.ndarray, "N 6"]:
+    """Changes [rad, m] of every record from its edge's level before the change; not finite where it has none.
+
+    The level is that since the last service event, if there are days since.
+    """
     seen = np.isfinite(window.sigma) & window.observable
     group = window.owner * len(window.edges) + window.edge
     origin = _first_of_each(group, seen.any(axis=1))[group]
@@ -106,11 +129,25 @@ def _values(window: FleetWindow, verdicts: FleetVerdicts) -> Float[np.ndarray, "
     weight = np.where(seen & (window.day[:, None] < start), window.sigma, np.inf) ** -2.0
     groups = int(group.max(initial=-1)) + 1
     level = np.zeros((groups, _DOFS))
+    since = np.where((window.day > _restarts(window, events)[group])[:, None], weight, 0.0)
     for k in range(_DOFS):
+        again = np.bincount(group, since[:, k], groups)[group] > 0
+        weight[again, k] = since[again, k]
         total = np.bincount(group, weight[:, k], groups)
         moment = np.bincount(group, weight[:, k] * np.where(seen[:, k], change[:, k], 0.0), groups)
         level[:, k] = np.divide(moment, total, out=np.zeros(groups), where=total > 0)
     return change - level[group]
+
+
+def _restarts(window: FleetWindow, events: Mapping[str, Sequence[ServiceEvent]]) -> Int[np.ndarray, " G"]:
+    """Day of the last service event per vehicle and edge; 0 if there was none."""
+    restarts = np.zeros((len(window.vehicles), len(window.edges)), np.int64)
+    for v, vehicle in enumerate(window.vehicles):
+        for event in events.get(vehicle, ()):
+            touched = _restarted(event, window.edges)
+            day = dt.date.fromisoformat(event.day).toordinal()
+            restarts[v, touched] = np.maximum(restarts[v, touched], day)
+    return restarts.ravel()
 
 
 def _starts(window: FleetWindow, verdicts: FleetVerdicts) -> Int[np.ndarray, "G 6"]:

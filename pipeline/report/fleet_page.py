@@ -38,7 +38,7 @@ _FINDINGS = 12  # named first; the table has them all
 _ROWS = 50  # that are on the page without a script; the script shows all of them
 _CHARTS = 24  # vehicles that the page shows charts of unasked; so many have their numbers in the page itself
 _VEHICLES_A_FILE = 40  # whose charts a file beside the page holds: some 250 kB
-_EVENTS = 20  # latest ones
+_EVENTS = 20  # latest ones in the list; charts have all of the window
 _WORK_KEYS = 8  # that the page names; the others it counts
 
 Truth = Mapping[tuple[str, str], Mapping[str, np.ndarray]]
@@ -59,11 +59,13 @@ def render_fleet_page(
     """
     days, rows = fleet_rows(window, verdicts, pages, album.lake)
     views = finding_views(verdicts.findings)
-    edges, charts = charted_edges(window, verdicts), fleet_charts(window, verdicts)
+    edges = charted_edges(window, verdicts)
     records = fleet_records(album.lake, album.method, album.fleet.audit.window_days) if truth else []
     known = truth_rows(records, truth or {})
     ends = [window.day.min(), window.day.max()] if len(window.day) else []
     dates = [dt.date.fromordinal(int(day)).isoformat() for day in ends]
+    events = _events_since(album.lake, min(dates, default=None))
+    charts = fleet_charts(window, verdicts, events)
     counts = {s: sum(r.status == s for r in rows) for s in DRIFT_STATUSES}
     html = render(
         "fleet.html",
@@ -79,7 +81,7 @@ def render_fleet_page(
         rows=rows[:_ROWS],
         total=len(rows),
         days=days,
-        events=_latest_events(album.lake, dates),
+        events=events[:_EVENTS],
         words=DAY_LETTERS,
         link=lambda vehicle, day: f"{quote(album.folder.name)}/{day}/{quote(page_stem(vehicle))}.html",
         shown=rows[:_CHARTS],
@@ -142,10 +144,10 @@ def _write_charts(
     return [file_of[row.vehicle] for row in rows]
 
 
-def _latest_events(lake: Lake, window: Sequence[str]) -> list[ServiceEvent]:
-    """Service events since the window's first day, the latest first."""
-    found = current_events(read_records(lake, SERVICE_EVENTS, ServiceEvent, first=min(window, default=None)))
-    return sorted(found, key=lambda e: (e.day, e.vehicle), reverse=True)[:_EVENTS]
+def _events_since(lake: Lake, first: str | None) -> list[ServiceEvent]:
+    """Service events, the latest first."""
+    found = current_events(read_records(lake, SERVICE_EVENTS, ServiceEvent, first=first))
+    return sorted(found, key=lambda e: (e.day, e.vehicle), reverse=True)
 
 
 def _budget(fleet: FleetConfig) -> str:

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 from dataclasses import replace
+from datetime import date
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from pipeline.store.commits import commit_records
 from pipeline.store.files import LocalFiles
 from pipeline.store.partitions import Lake
 from schemas.calibrations import CALIBRATIONS
+from schemas.service_events import ServiceEvent
 from tests.audit.fleet_records import covariance_of, vehicle_records
 from tests.makers.stages import audit_fleet
 from tests.report.test_pages import _config
@@ -156,6 +158,21 @@ def test_a_chart_s_numbers_are_the_records(kinds):
     held = charts["held"]
     refused = held["pairs"][0].index("r")
     assert all(chart[5][refused] is None for chart in held["charts"])
+
+
+def test_a_repair_is_drawn_on_the_charts_of_its_sensor_and_their_level_is_that_since(kinds):
+    _, window, verdicts = kinds
+    before = dict(fleet_charts(window, verdicts))["radar-knocked"]
+    day = before["days"][2]
+    event = ServiceEvent(
+        vehicle="radar-knocked", day=date.fromordinal(day).isoformat(), sensor="radar", kind="repair"
+    )
+    after = dict(fleet_charts(window, verdicts, [event]))["radar-knocked"]
+    assert after["events"] == [[day, f"repair of the radar on {event.day}", [1, 2]]]
+    yaw = next(c for c in after["charts"] if c[:2] == [2, 2])
+    assert abs(np.mean(yaw[5][3:5])) < 2  # of the two days between repair and knock, in 1e-4 deg
+    of_camera_lidar = [[c for c in own["charts"] if c[0] == 0] for own in (before, after)]
+    assert of_camera_lidar[0] == of_camera_lidar[1]
 
 
 @pytest.mark.browser

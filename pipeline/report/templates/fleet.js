@@ -135,7 +135,7 @@ function niceStep(span) {
   return power * [0.2, 0.5, 1, 2].find(m => span / (power * m) <= 5);
 }
 
-function panel(chart, days, letters, row) {
+function panel(chart, days, letters, row, events) {
   const [pair, dof, statusAt, limit, start, values, sigmas] = chart, status = fleet.statuses[statusAt];
   const colour = COLOURS[status], alarmed = status === "RED" || status === "YELLOW", unit = dof < 3 ? "deg" : "m";
   const left = dof * 206 + 40, top = row * 150 + 36, width = 158, height = 84;
@@ -170,6 +170,10 @@ function panel(chart, days, letters, row) {
     parts.push(box(x(earliest - 0.5), y(reach), x(Math.max(latest - 0.5, earliest - 0.45)), y(-reach), 0.22, colour));
     parts.push(line(x(begin - 0.5), y(-reach), x(begin - 0.5), y(reach), colour, 1.2, true));
   }
+  for (const [day, words] of events.filter(event => event[2].includes(pair) && event[0] >= first && event[0] <= last)) {
+    parts.push(`<g><title>${escape(words)}</title>${line(x(day), y(-reach), x(day), y(reach), "currentColor", 1.4)}` +
+      `<path d="M${x(day) - 4} ${top}h8l-4 6z"/></g>`);
+  }
   let seen = 0;
   days.forEach((day, i) => {
     if (letters[i] === ".") return;
@@ -191,7 +195,7 @@ function figure(name, found) {
   if (!found || !found.days.length) return `<p class="soft">No record in the window.</p>`;
   const own = [...new Set(found.charts.map(chart => chart[0]))];  // edges of this vehicle
   const pairs = own.map((p, row) => `<text x="0" y="${row * 150 + 12}" font-weight="600" font-size="12.5">${escape(fleet.pairs[p])}</text>`);
-  const panels = found.charts.map(chart => panel(chart, found.days, found.pairs[chart[0]], own.indexOf(chart[0])));
+  const panels = found.charts.map(chart => panel(chart, found.days, found.pairs[chart[0]], own.indexOf(chart[0]), found.events));
   return `<figure><svg viewBox="0 0 1246 ${own.length * 150 - 4}" font-size="11" fill="currentColor" role="img" aria-label="Control charts of ${escape(name)}">` +
     pairs.join("") + panels.join("") + "</svg></figure>";
 }
