@@ -11,7 +11,7 @@ from markupsafe import Markup
 
 from pipeline.report.above import top_view
 from pipeline.report.encode import jpeg_uri
-from pipeline.report.overlays import Extrinsics, Scene, front_view
+from pipeline.report.overlays import Extrinsics, Scene, front_view, whole_view
 from pipeline.report.page import render
 from pipeline.report.svg import MUTED, Plot, document
 from pipeline.report.words import PAIR_TITLES
@@ -110,12 +110,12 @@ def _draw(view: View) -> _Pictures:
     labels = ("uncalibrated", "calibrated")
     pictures = _Pictures(view.title, view.caption)
     if view.split:
-        words = f"left half {labels[0]}, right half {labels[1]}"
+        words = f"left {labels[0]}, right {labels[1]}"
         pictures.fronts.append((words, jpeg_uri(front_view(view.scene, view.before, view.after, labels))))
         pictures.tops.append((words, top_view(view.scene, view.before, view.after, labels)))
         return pictures
     for word, state in zip(labels, (view.before, view.after), strict=True):
-        pictures.fronts.append((word, jpeg_uri(front_view(view.scene, state, state, (word, word)), 900)))
+        pictures.fronts.append((word, jpeg_uri(whole_view(view.scene, state, word), 900)))
         pictures.tops.append((word, top_view(view.scene, state, state, (word, word))))
     return pictures
 

@@ -81,10 +81,11 @@ def decode_image(frame: Frame) -> Image:
 
 
 def front_view(scene: Scene, before: Extrinsics, after: Extrinsics, labels: tuple[str, str]) -> Image:
-    """Lidar and moving radar in the image: left half at `before`, right half at `after`; always `_CANVAS_PX` wide."""
+    """Lidar and moving radar in the middle half of the image, left at `before`, right at `after`; `_CANVAS_PX` wide."""
     halves = [_drawn(scene, state) for state in (before, after)]
     middle = halves[0].shape[1] // 2
-    image = np.concatenate([halves[0][:, :middle], halves[1][:, middle:]], axis=1)
+    seen = slice(middle // 2, middle // 2 + middle)
+    image = np.concatenate([half[:, seen] for half in halves], axis=1)
     cv2.line(image, (middle, 0), (middle, image.shape[0]), _WHITE, 3)
     _tag(image, labels[0], (14, 34))
     _tag(image, labels[1], (middle + 14, 34))
@@ -94,7 +95,7 @@ def front_view(scene: Scene, before: Extrinsics, after: Extrinsics, labels: tupl
 
 
 def whole_view(scene: Scene, state: Extrinsics, label: str) -> Image:
-    """The whole image at one state, for changes so large that the halves would show different objects."""
+    """The whole image at one state, as the front view draws its middle."""
     image = _drawn(scene, state)
     _tag(image, label, (14, 34))
     _colour_bar(image)

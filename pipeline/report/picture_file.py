@@ -1,4 +1,4 @@
-"""A picture of one frame as a file: a still with the prior in its left half, or one that moves from prior to result."""
+"""A picture of one frame as a file: a still of prior and result side by side, or one that moves between them."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def write_picture(
 ) -> Path:
     """Write the scene's camera image with lidar and moving radar at two states, with labels.
 
-    .jpg and .png are stills, left half `before`, right half `after`; .webp and .gif move between the two. The
+    .jpg and .png are stills, `before` left and `after` right; .webp and .gif move between the two. The
     folder is created.
 
     Raises:

@@ -66,7 +66,5 @@ def test_a_browser_shows_the_page_without_a_complaint_and_not_wider_than_a_lapto
     page.write_text(evaluation_page(tables(), [run("joint", 0.02)], views, z, []))
     assert browser.open(page) == []
     assert browser.evaluate("document.documentElement.scrollWidth") <= 1366
-    assert (
-        browser.evaluate("document.querySelectorAll('img').length") == 3
-    )  # one split in halves, two of one state
+    assert browser.evaluate("document.querySelectorAll('img').length") == 3  # one of two states, two of one
     assert browser.evaluate("[...document.images].every(i => i.naturalWidth > 0)")
