@@ -38,6 +38,16 @@ _ADVICE = {
 }
 
 
+# Reasons of pipeline/calibrate/select/frames.py that need more words than their names.
+_LEFT_OUT = {
+    "held_out": "held out to check the result",
+    "next_to_held_out": "too near in time to a held-out frame",
+    "not_needed": "show what the frames used show already",
+    "sync": "stamps too far apart",
+    "empty": "nothing to align",
+}
+
+
 @dataclass(frozen=True)
 class DofRow:
     """One line of a pair's table: numbers in words."""
@@ -127,7 +137,10 @@ def pair_view(record: CalibrationRecord) -> PairView:
         triggers=_triggers(record),
         alignment=_before_after(record.alignment_before, record.alignment_after),
         frames=f"{record.frames_used} of {record.frames_total}",
-        rejected=sorted(record.frames_rejected.items(), key=lambda kv: -kv[1]),
+        rejected=[
+            (_LEFT_OUT.get(why, why.replace("_", " ")), n)
+            for why, n in sorted(record.frames_rejected.items(), key=lambda kv: -kv[1])
+        ],
         time_offset=_time_offset(record),
         loop=_loop(record),
         certified=_certified(record),
@@ -140,7 +153,7 @@ def pair_view(record: CalibrationRecord) -> PairView:
 
 
 def _certified(record: CalibrationRecord) -> str:
-    """Directions that an accepted record certifies, and its score; empty if it was never judged."""
+    """Directions that an accepted record certifies, and the margin of its checks; empty if it was never judged."""
     if record.score is None or record.limit_rad is None:
         return ""
     limits = {
@@ -152,7 +165,8 @@ def _certified(record: CalibrationRecord) -> str:
     together = f"{' and '.join(record.determined)} within {np.degrees(record.limit_rad):.2g} deg"
     where = "at 15 to 40 m" + (", in the image with this CameraInfo" * record.pair.startswith("camera"))
     what = f"{together if same else ' and '.join(each)} {where}"
-    return f"{what if record.determined else 'nothing'}; score {record.score:.2f}"
+    margin = f"closest check: margin {record.score:.2f} (1 = far inside its limit, 0 = at it)"
+    return f"{what if record.determined else 'nothing'}; {margin}"
 
 
 def _mounting(record: CalibrationRecord) -> str:
@@ -164,7 +178,12 @@ def _mounting(record: CalibrationRecord) -> str:
         return "not certified: nothing says how well CameraInfo's principal point is known (centre_sigma_px)"
     certified = " and ".join(record.mounting_determined) or "not"
     known = f"{np.degrees(azimuth):.2f} deg of azimuth and {np.degrees(elevation):.2f} deg of elevation"
-    return f"{certified} certified; known to {known} (1 sigma)"
+    return (
+        f"{certified} certified; known to {known} (1 sigma), which includes how well CameraInfo's principal point is "
+        "known. Use it for geometry in the car's axes; to project into this camera's image, the sigma above"
+        if record.pair.startswith("camera")
+        else f"{certified} certified; known to {known} (1 sigma)"
+    )
 
 
 @dataclass(frozen=True)
@@ -333,7 +352,11 @@ def _triggers(record: CalibrationRecord) -> list[tuple[str, str, str]]:
 
 
 def _before_after(before: float | None, after: float | None) -> str:
-    return f"{_number(before)} → {_number(after)}" if before is not None or after is not None else ""
+    if before is None and after is None:
+        return ""
+    return (
+        f"{_number(before) or 'not computed'} at the prior, {_number(after) or 'not computed'} at the result"
+    )
 
 
 def _time_offset(record: CalibrationRecord) -> str:
@@ -350,7 +373,7 @@ def _loop(record: CalibrationRecord) -> str:
     degrees = float(np.degrees(1.0))
     angle = f"{_with_sigma(record.loop_rotation_rad, record.loop_rotation_sigma_rad, degrees, 2)} deg"
     if record.loop_translation_m is None:
-        return f"{angle}; rotations only"
+        return f"{angle} (rotations only)"
     return f"{angle}, {_with_sigma(record.loop_translation_m, record.loop_translation_sigma_m, 100.0, 1)} cm"
 
 

@@ -5,8 +5,8 @@ import pytest
 from pipeline.report.day import Answered, answer_for, answered
 from schemas.poses import PoseRow
 
-BOTH = "azimuth and elevation within 0.2 deg at 15 to 40 m; score 0.30"
-AZIMUTH = "azimuth within 0.4 deg at 15 to 40 m; score 0.20"
+BOTH = "azimuth and elevation within 0.2 deg at 15 to 40 m; closest check: margin 0.30"
+AZIMUTH = "azimuth within 0.4 deg at 15 to 40 m; closest check: margin 0.20"
 NAMED = "Certified in azimuth only: lidar-radar."
 
 

@@ -76,7 +76,7 @@ def missing_in_view(observations: Sequence[Observation], pair: str) -> list[str]
         views = [_seen(o, kind) for o in observations]
         azimuth, _, distance = np.concatenate(views).T if views else np.zeros((3, 0))
         if not len(azimuth):
-            missing.append(f"no {kind.words}")
+            missing.append(f"drive where there are {kind.words}: the frames show none")
             continue
         parts = {
             f"left of {_SIDE_DEG:.0f} deg": azimuth > np.radians(_SIDE_DEG),
@@ -86,7 +86,9 @@ def missing_in_view(observations: Sequence[Observation], pair: str) -> list[str]
         }
         empty = [where for where, there in parts.items() if there.mean() < _SCARCE]
         if empty:
-            missing.append(f"hardly any {kind.words} {' or '.join(empty)}")
+            missing.append(
+                f"drive where there are {kind.words} {' and '.join(empty)}: the frames hardly show any"
+            )
     return missing
 
 

@@ -176,22 +176,22 @@ def missing_content(observations: Sequence[Observation], pair: str) -> list[str]
     missing = []
     speeds = np.array([abs(o.ego_speed_mps) for o in observations if o.ego_speed_mps is not None])
     if len(speeds) and np.mean(speeds > _BRISK_MPS) < _SCARCE:
-        missing.append(f"hardly a frame faster than {_BRISK_MPS:.0f} m/s: time offsets stay unknown")
+        missing.append(f"drive faster than {_BRISK_MPS:.0f} m/s: time offsets stay unknown without")
     if "radar" in FRAMES_OF_PAIR[pair]:
         if np.mean([len(o.radar_track_xyz_m) > 0 for o in observations]) < _SCARCE:
-            missing.append("hardly any moving road users for the radar")
+            missing.append("drive where others drive: the radar hardly sees moving road users")
         if not any(o.radar_has_elevation for o in observations):
-            missing.append("the radar measures no elevation: its roll, pitch and height stay at the prior")
+            missing.append(
+                "no drive determines roll, pitch and height of this radar: it measures no elevation"
+            )
     if (
         "camera" in FRAMES_OF_PAIR[pair]
         and not any(o.is_unlabelled for o in observations)
         and np.mean([len(o.road_user_boxes_px) > 0 for o in observations]) < _SCARCE
     ):
-        missing.append("hardly any road users in the images")
+        missing.append("drive where others drive: the images hardly show road users")
     if len(np.unique(scenes_of(observations))) < FEWEST_SCENES:
-        missing.append(
-            "hardly any distance: the frames show the same street from the same place; drive some 100 m further"
-        )
+        missing.append("drive some 100 m further: the frames show the same street from the same place")
     return missing + missing_in_view(observations, pair)
 
 

@@ -120,15 +120,18 @@ def test_what_the_drive_lacks_is_said_per_pair(day):
     assert "time offsets" in missing_content(slow, "camera_lidar")[0]
     assert "no elevation" in missing_content(slow, "lidar_radar")[1]
     empty = [make_changed(o, radar_track_xyz_m=np.zeros((0, 3), np.float32)) for o in day]
-    assert "hardly any moving road users for the radar" in missing_content(empty, "lidar_radar")
+    assert "drive where others drive: the radar hardly sees moving road users" in missing_content(
+        empty, "lidar_radar"
+    )
 
 
 def test_parts_of_the_view_without_content_are_named(day):
     right_and_near = [
         make_changed(o, lidar_edge_xyz_m=np.concatenate([edges_at(-20, 15), edges_at(0, 8)])) for o in day
     ]
-    assert "hardly any depth edges left of 15 deg or beyond 40 m" in missing_content(
-        right_and_near, "camera_lidar"
+    assert (
+        "drive where there are depth edges left of 15 deg and beyond 40 m: the frames hardly show any"
+        in missing_content(right_and_near, "camera_lidar")
     )
     everywhere = [
         make_changed(o, lidar_edge_xyz_m=np.concatenate([edges_at(a, r) for a in (-25, 25) for r in (8, 50)]))
@@ -136,7 +139,9 @@ def test_parts_of_the_view_without_content_are_named(day):
     ]
     assert not any("depth edges" in m for m in missing_content(everywhere, "camera_lidar"))
     blank = [make_changed(o, marking_xyz_m=np.zeros((0, 3), np.float32)) for o in everywhere]
-    assert "no road markings" in missing_content(blank, "camera_lidar")
+    assert "drive where there are road markings: the frames show none" in missing_content(
+        blank, "camera_lidar"
+    )
     chosen = select_frames(right_and_near, CONFIG, paper=False)
     assert chosen.missing["camera_lidar"] == missing_content(
         [right_and_near[i] for i in chosen.fit["camera_lidar"]], "camera_lidar"
