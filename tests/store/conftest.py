@@ -22,7 +22,6 @@ def s3(server: object, monkeypatch: pytest.MonkeyPatch) -> Iterator[object]:
     """The server without faults, and this process set to use it."""
     for name, value in server.environment.items():
         monkeypatch.setenv(name, value)
-    monkeypatch.setattr(pipeline.store.object_store, "REQUEST_S", 2.0)
     pipeline.store.object_store._client.cache_clear()
     server.faults(fail=0, stall=0)
     yield server

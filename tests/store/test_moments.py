@@ -1,12 +1,6 @@
 """Moments and the files of their sensors: all of one work or none, any sensors of a rig joined."""
 
-import os
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +13,6 @@ from schemas.moments import FILES, MOMENTS, PRIOR
 from tests.makers.lakes import joined_of, write_frames, write_observations
 from tests.makers.table_rows import make_frame, make_observation, same
 
-REPO = Path(__file__).resolve().parents[2]
 DAY = Partition("car", "2026-03-02")
 
 
@@ -133,37 +126,3 @@ def test_an_error_while_writing_leaves_the_old_day_and_nothing_else(lake):
         raise RuntimeError("sensor")
     assert sorted(p for p in lake.root.rglob("*") if p.is_file()) == before
     assert len(list(frames_of(lake, DAY))) == 5
-
-
-_WRITER = """
-import sys
-from tests.store.test_moments import DAY, frames
-from tests.makers.lakes import write_frames
-from pipeline.store.partitions import Lake
-lake, generation = Lake.at(sys.argv[1]), 0
-while True:
-    generation += 1
-    write_frames(lake, DAY, frames(6, log=f"{generation}"), key=f"{generation}")
-    if generation == 1:  # on a busy machine the kill may come before a whole write
-        print("ready", flush=True)
-"""
-
-
-@pytest.mark.slow
-def test_a_writer_killed_at_any_moment_leaves_a_day_of_one_work_or_none(lake):
-    kept = set()
-    for turn in range(6):
-        process = subprocess.Popen(
-            [sys.executable, "-c", _WRITER, str(lake.root)], cwd=REPO, stdout=subprocess.PIPE
-        )
-        assert process.stdout.readline() == b"ready\n"
-        time.sleep(0.3 + 0.037 * turn)
-        os.kill(process.pid, signal.SIGKILL)
-        process.wait()
-        process.stdout.close()
-        manifest = ingested(lake, DAY)
-        if manifest is not None:
-            kept.add(manifest.work_key)
-            assert is_whole(lake, DAY, manifest)
-            assert {f.log for f in frames_of(lake, DAY)} == {manifest.work_key}
-    assert kept

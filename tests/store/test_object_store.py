@@ -5,10 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-import duckdb
-import polars as pl
 import pytest
-from deltalake import DeltaTable
 
 import pipeline.store.object_store
 from pipeline.store.commits import commit_records
@@ -42,14 +39,6 @@ def test_only_what_is_asked_for_is_fetched(lake, rng, s3):
     assert 0 < s3.faults(fail=0)["bytes_sent"] - before < 8 << 20  # of 24 MiB
 
 
-def test_other_engines_read_the_bucket_by_the_documented_lines(lake, rng):
-    commit_records(lake, CALIBRATIONS, [make_record(rng, "k")])
-    where = lake.table("calibrations")
-    records = DeltaTable(where).to_pyarrow_table()  # noqa: F841 - DuckDB finds it by its name
-    assert duckdb.sql("select vehicle, pair from records").fetchall() == [("car", PAIRS[0])]
-    assert pl.scan_delta(where).select("vehicle").collect()["vehicle"].to_list() == ["car"]
-
-
 @pytest.mark.parametrize(
     "fault",
     [
@@ -57,7 +46,9 @@ def test_other_engines_read_the_bucket_by_the_documented_lines(lake, rng):
         {"mix": ["500", "lost"], "every": 4},
     ],
 )  # fmt: skip
-def test_answers_of_5xx_late_ones_and_lost_ones_are_asked_for_again(fault, lake, rng, s3):
+def test_answers_of_5xx_late_ones_and_lost_ones_are_asked_for_again(fault, lake, rng, s3, monkeypatch):
+    monkeypatch.setattr(pipeline.store.object_store, "REQUEST_S", 2.0)
+    pipeline.store.object_store._client.cache_clear()
     rows = [make_row("frames", rng, frame_index=i) for i in range(3)]
     before = s3.faults(**fault)
     write(lake, rows)
@@ -113,7 +104,7 @@ def test_two_writers_at_once_both_get_their_records_in(any_lake):
     environment = os.environ | {"PYTHONPATH": str(REPO)}
     commands = [[sys.executable, "-c", _COMMITS, str(any_lake), name] for name in "ab"]
     writers = [subprocess.Popen(command, env=environment) for command in commands]
-    assert [w.wait(120) for w in writers] == [0, 0]
+    assert [w.wait(600) for w in writers] == [0, 0]
     of_both = sorted(f"{name}{i}" for name in "ab" for i in range(5))
     assert sorted(r.work_key for r in read_calibrations(any_lake, vehicle="car")) == of_both
     assert [r.work_key for r in read_calibrations(any_lake, vehicle="bus")] == ["shared"]

@@ -1,12 +1,7 @@
 """Record tables: nothing doubles, nothing is lost, what is current is written down, damage costs its own rows only."""
 
 import os
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
-from pathlib import Path
 
 import duckdb
 import numpy as np
@@ -25,8 +20,6 @@ from pipeline.store.records import RecordIndex, last_day, read_columns, read_lat
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from tests.makers.lakes import write_records
 from tests.makers.table_rows import ROW_TYPES, make_record, make_row, read_calibrations, same
-
-REPO = Path(__file__).resolve().parents[2]
 
 
 def version(lake, table="calibrations"):
@@ -48,7 +41,9 @@ def test_rows_of_every_record_table_come_back_as_they_were(table, lake, rng):
 
 def test_after_the_night_small_files_are_put_together_and_every_row_stays(any_lake, rng):
     lake = any_lake
-    assert read_calibrations(lake) == []
+    assert read_calibrations(lake) == list(tidy_table(lake, CALIBRATIONS)) == []
+    assert (last_day(lake, CALIBRATIONS), commit_records(lake, CALIBRATIONS, [])) == (None, 0)
+    assert not lake.exists()  # not made by reading
     days = [f"2026-03-{i:02d}" for i in range(1, 10)]
     for day in days:
         commit_records(lake, CALIBRATIONS, [make_record(rng, day, day=day)])
@@ -205,14 +200,6 @@ def test_the_last_day_of_each_vehicle_and_method_is_read_and_no_other(lake, rng)
     assert read_latest(lake, CALIBRATIONS, CalibrationRecord, first="2026-03-01") == []
 
 
-def test_a_lake_without_records_reads_as_empty_and_is_not_made_by_reading(lake):
-    assert read_calibrations(lake) == []
-    assert last_day(lake, CALIBRATIONS) is None
-    assert commit_records(lake, CALIBRATIONS, []) == 0
-    assert list(tidy_table(lake, CALIBRATIONS)) == []
-    assert not lake.root.exists()
-
-
 def test_a_row_without_what_its_table_promises_is_not_committed(lake, rng):
     with pytest.raises(ContractError, match="covariance has shape"):
         commit_records(
@@ -262,10 +249,10 @@ def read_vehicles(path):
 # -- other engines -----------------------------------------------------------------------------------
 
 
-def test_duckdb_and_polars_read_records_by_the_documented_lines(lake, rng):
+def test_duckdb_and_polars_read_records_by_the_documented_lines(any_lake, rng):
     row = make_record(rng, "A", status="held")
-    commit_records(lake, CALIBRATIONS, [row])
-    where = str(lake.root / "calibrations")
+    commit_records(any_lake, CALIBRATIONS, [row])
+    where = any_lake.table("calibrations")
     records = DeltaTable(where).to_pyarrow_table()  # noqa: F841 - DuckDB finds it by its name
     sql = "select vehicle, status, diagnostics['x'] from records where day >= '2026-03-01'"
     assert duckdb.sql(sql).fetchall() == [("car", "held", row.diagnostics["x"])]
@@ -275,41 +262,3 @@ def test_duckdb_and_polars_read_records_by_the_documented_lines(lake, rng):
     shape = [int(s) for s in about[b"shape"].split(b",")]
     found = np.frombuffer(frame["covariance"][0], about[b"dtype"].decode()).reshape(shape)
     np.testing.assert_array_equal(found, row.covariance)
-
-
-# -- dead writers -----------------------------------------------------------------------------------
-
-
-_COMMITS = """
-import sys, numpy as np
-from pipeline.store.partitions import Lake
-from pipeline.store.commits import commit_records
-from schemas.calibrations import CALIBRATIONS, PAIRS
-from tests.makers.table_rows import ROW_TYPES, make_record, make_row, read_calibrations, same
-lake, rng, turn = Lake.at(sys.argv[1]), np.random.default_rng(0), int(sys.argv[2])
-for i in range(10_000):
-    commit_records(lake, CALIBRATIONS, [make_record(rng, f"{turn}-{i}", pair=pair) for pair in PAIRS])
-    print(f"{turn}-{i}", flush=True)
-"""
-
-
-@pytest.mark.slow
-def test_a_killed_writer_loses_nothing_that_it_committed_and_leaves_no_half(lake, rng):
-    told, env = [], os.environ | {"PYTHONPATH": str(REPO)}
-    for turn in range(4):
-        writer = subprocess.Popen(
-            [sys.executable, "-c", _COMMITS, str(lake.root), str(turn)],
-            stdout=subprocess.PIPE,
-            text=True,
-            env=env,
-        )
-        with writer:
-            told.append(writer.stdout.readline().strip())
-            time.sleep(rng.uniform(0, 0.3))
-            writer.send_signal(signal.SIGKILL)
-            told += writer.stdout.read().split()
-        found = read_calibrations(lake)
-        pairs = {k: sorted(r.pair for r in found if r.work_key == k) for k in {r.work_key for r in found}}
-        assert all(p == sorted(PAIRS) for p in pairs.values())
-        assert set(told) <= set(pairs)
-    assert lake.damage == []

@@ -93,11 +93,11 @@ def test_times_in_every_convention_become_seconds_after_the_stamp_or_are_left_ou
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("width", 11), ("point_step", 0), ("point_step", 5), ("width", 2**31), ("data", np.zeros(9, np.uint8))],
+    [("width", 11), ("point_step", 0), ("point_step", 5), ("width", 2**31), ("data", slice(-1))],
 )
 def test_a_layout_that_contradicts_itself_is_refused(kit, name, value):
     broken = kit.Kit().cloud(0, kit.lidar(0, 10))
-    setattr(broken, name, value)
+    setattr(broken, name, broken.data[value] if name == "data" else value)
     with pytest.raises(ValueError, match=r"\w"):
         cloud_columns(broken)
     whole = kit.Kit().cloud(0, kit.lidar(0, 10))
