@@ -111,7 +111,7 @@ def _calibrate_frame(task: Task, frame: int, page: Path | None) -> int:
         progress(0, 0, f"frame {frame}")
         found = calibrate_frame(task, frame)
         if page is not None:
-            from pipeline.report.frame import write_frame_page
+            from pipeline.report.pictures import write_frame_page
             from pipeline.report.reading import scene_of
 
             progress(0, 0, "page")

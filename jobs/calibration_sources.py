@@ -164,10 +164,9 @@ def poses_in_use(
     Raises:
         ConfigError: the text has another form, or the source does not exist.
     """
-    from pipeline.export.files import noted_frames, read_files
+    from pipeline.export.files import from_ties, noted_frames, read_files, reference_of_rig, rig_poses
     from pipeline.export.formats import FORMATS, format_named
     from pipeline.export.lake import pairs_of
-    from pipeline.export.rig_poses import from_ties, reference_of_rig, rig_poses
     from pipeline.rig.graph import tie
     from pipeline.store.partitions import Lake
 

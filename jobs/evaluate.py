@@ -54,8 +54,8 @@ def evaluate(
 
     from jobs.calibrate import parse_pair
     from jobs.terminal.summary import print_summary, progress_reporter
+    from pipeline.evaluate.comparison import compare_runs
     from pipeline.evaluate.recording import ReflectorFiles
-    from pipeline.evaluate.runs import compare_runs
     from pipeline.evaluate.table import as_markdown, table_rows
     from pipeline.store.partitions import Lake
     from pipeline.store.records import read_records
@@ -98,7 +98,7 @@ def _check(truth: Path | None, reflectors: Path | None, recording: str | None, o
 
 def _write(out: Path, compared: Sequence[ComparedRun], notes: Sequence[str], lake: Lake) -> None:
     from pipeline.evaluate.table import as_markdown, as_parquet, table_rows
-    from pipeline.report.evaluated import page_of_runs
+    from pipeline.report.evaluation import page_of_runs
     from pipeline.report.page import write_page
 
     comparisons = [c.comparison for c in compared]

@@ -67,9 +67,15 @@ def _of_rig(
     """Write the prior file of all sensors of a rig; returns them; ConfigError if one is missing or twice."""
     from pipeline.core.config import load_fleet
     from pipeline.core.errors import ConfigError
-    from pipeline.export.files import noted_frames, write_files
+    from pipeline.export.files import (
+        noted_frames,
+        reference_of_rig,
+        require_all,
+        rig_poses,
+        star_text,
+        write_files,
+    )
     from pipeline.export.formats import format_named
-    from pipeline.export.rig_poses import reference_of_rig, require_all, rig_poses, star_text
     from pipeline.rig.prior import between
     from pipeline.rig.prior_file import read_star
 

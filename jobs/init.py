@@ -18,8 +18,8 @@ def init(*logs: Path, out: Path = Path("fleet.toml"), name: str = "fleet", force
     """
     from jobs.terminal.summary import print_summary, progress_reporter
     from pipeline.core.errors import ConfigError
-    from pipeline.ingest.propose.logs_pattern import nightly_command
     from pipeline.ingest.propose.propose import propose_fleet
+    from pipeline.ingest.propose.survey import nightly_command
     from pipeline.store.atomic_write import atomic_write
 
     if not logs:

@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator, Sequence
+from itertools import groupby
+from textwrap import wrap
+from typing import Any
 
 __all__ = ["state"]
+
+_WIDTH, _INDENT = 80, 4
 
 
 def state(*, lake: str, vehicle: str | None = None, method: str = "joint", json: bool = False) -> int:
@@ -24,7 +30,6 @@ def state(*, lake: str, vehicle: str | None = None, method: str = "joint", json:
             edges, composed of the sensors' poses.
     """
     from jobs.terminal.known_vehicles import require_vehicle
-    from jobs.terminal.state_text import state_text
     from jobs.terminal.summary import left_out, print_json
     from pipeline.store.current import current_states
     from pipeline.store.partitions import Lake
@@ -44,3 +49,62 @@ def state(*, lake: str, vehicle: str | None = None, method: str = "joint", json:
     else:
         sys.stdout.write(f"states: none in {lake}; boresight nightly and boresight audit write them\n")
     return 3 if left_out(tables) else 0
+
+
+def state_text(rows: Sequence[dict[str, Any]]) -> str:
+    """The states of vehicles, of `state_values`; edges of a vehicle with poses are left out."""
+    by_sensor = {(row["vehicle"], row["method"]) for row in rows if row["sensor"] is not None}
+    shown = [r for r in rows if r["sensor"] is not None or (r["vehicle"], r["method"]) not in by_sensor]
+    parts = []
+    for (vehicle, method, day), of in groupby(shown, key=lambda r: (r["vehicle"], r["method"], r["day"])):
+        parts.append("\n".join(_vehicle(f"{vehicle}, {day}, {method}", list(of))))
+    return "\n\n".join(parts) + "\n"
+
+
+def _vehicle(title: str, rows: Sequence[dict[str, Any]]) -> Iterator[str]:
+    own = [row for row in rows if row["child_frame"] != row["parent_frame"]]
+    load = [_name(row) for row in own if row["status"] == "current"]
+    keep = [_name(row) for row in own if row["status"] != "current"]
+    advice = [f"load {', '.join(load)}"] if load else []
+    advice += [f"keep {', '.join(keep)} at the prior"] if keep else []
+    yield from wrap(f"{title}: {'; '.join(advice) or 'nothing to load'}", _WIDTH)
+    for row in own:
+        yield from _sensor(row)
+
+
+def _name(row: dict[str, Any]) -> str:
+    """The sensor of a row, or both ends of an edge."""
+    return str(row["sensor"] or f"{row['parent_frame']}-{row['child_frame']}")
+
+
+def _sensor(row: dict[str, Any]) -> Iterator[str]:
+    import numpy as np
+
+    from pipeline.rig.changes import change_between
+    from pipeline.rig.se3 import to_quaternion
+
+    days = row["days"]
+    of_days = (
+        f", {len(days)} days from {days[0]} to {days[-1]}"
+        if days[1:]
+        else "".join(f", {day}" for day in days)
+    )
+    yield f"  {row['parent_frame']} -> {row['child_frame']}: {row['status']}{of_days}"
+    T, T_prior = row["T"], row["T_prior"]
+    lines = []
+    if T is not None:
+        lines.append(f"qw qx qy qz {_numbers(to_quaternion(T), '.6f')}")
+        lines.append(f"x y z {_numbers(T[:3, 3], '.4f')} m")
+    if T is not None and T_prior is not None and row["status"] == "current":
+        change = change_between(T_prior, T)
+        turn, shift = _numbers(np.degrees(change[:3]), "+.3f"), _numbers(change[3:], "+.3f")
+        lines.append(f"from the prior: {turn} deg, {shift} m")
+    if row["azimuth_sigma_rad"] is not None:
+        azimuth, elevation = np.degrees([row["azimuth_sigma_rad"], row["elevation_sigma_rad"]])
+        lines.append(f"sigma of azimuth {azimuth:.3f} deg, of elevation {elevation:.3f} deg")
+    for text in (*lines, row["in_words"], row["reason"]):
+        yield from wrap(text, _WIDTH, initial_indent=" " * _INDENT, subsequent_indent=" " * (_INDENT + 2))
+
+
+def _numbers(values: Any, form: str) -> str:
+    return " ".join(f"{value:{form}}" for value in values)

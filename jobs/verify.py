@@ -141,7 +141,7 @@ def _of_poses(
     """
     from jobs.calibration_sources import poses_in_use
     from pipeline.core.errors import ConfigError
-    from pipeline.export.rig_poses import reference_of_rig, require_all, star_text
+    from pipeline.export.files import reference_of_rig, require_all, star_text
 
     if calibration.endswith(".json") and ":" not in calibration:
         return config.with_prior_file(vehicle, Path(calibration)), ()
@@ -226,7 +226,7 @@ def _calibrate(
 def _write_page(
     config: FleetConfig, lake: Lake, partition: Partition, checks: list[AxisCheck], page: Path
 ) -> None:
-    from pipeline.report.in_use import in_use_view
+    from pipeline.report.comparison import in_use_view
     from pipeline.report.stage import write_day_page
     from pipeline.verify.axes import answer_of
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from pipeline.export.calibration import ExportedCalibration
     from pipeline.store.partitions import Lake
-    from pipeline.view.moment import Rig, Shown
+    from pipeline.view.layers import Rig, Shown
 
 __all__ = ["view"]
 
@@ -45,8 +45,8 @@ def view(
     from jobs.terminal.summary import print_summary
     from pipeline.core.errors import ConfigError
     from pipeline.store.partitions import Lake, Partition
-    from pipeline.view.moment import count_moments, read_moment
-    from pipeline.view.system import import_open3d, require_display, require_renderer
+    from pipeline.view.layers import count_moments, read_moment
+    from pipeline.view.window import import_open3d, require_display, require_renderer
 
     if out is not None and out.suffix != ".png":
         raise ConfigError("command line", "out", f"{out} must end in .png")
@@ -106,7 +106,7 @@ def _rig(lake: Lake, vehicle: str, day: str, method: str) -> Rig:
     from jobs.calibration_sources import read_calibration
     from jobs.frame_options import FrameOptions
     from pipeline.export.lake import priors_of_day
-    from pipeline.view.moment import Rig
+    from pipeline.view.layers import Rig
 
     after = read_calibration(
         str(lake.root), vehicle, day, method, force=True, frames=FrameOptions(), own_frames=False,

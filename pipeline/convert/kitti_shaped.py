@@ -21,8 +21,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.convert.files import read_bytes, read_float_rows
-from pipeline.convert.recording import Event, Recording, ego_events
+from pipeline.convert.recording import Event, Recording, ego_events, read_bytes, read_float_rows
 from pipeline.core.errors import ConfigError
 from pipeline.rig.cameras import Camera
 from pipeline.rig.graph import Kind

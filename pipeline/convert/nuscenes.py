@@ -18,8 +18,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.convert.files import read_bytes, read_float_rows, read_json, read_pcd
-from pipeline.convert.recording import Event, Recording, ego_events
+from pipeline.convert.recording import (
+    Event,
+    Recording,
+    ego_events,
+    read_bytes,
+    read_float_rows,
+    read_json,
+    read_pcd,
+)
 from pipeline.core.errors import ConfigError
 from pipeline.rig.cameras import Camera
 from pipeline.rig.graph import Kind

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.rig.differences import Comparison
+from pipeline.evaluate.recording import ReflectorFiles
+from pipeline.rig.differences import ComparedRun, Comparison
+from pipeline.rig.prior_file import read_transforms
 from pipeline.rig.se3 import from_quaternion, inverse, log_se3
 from pipeline.rig.targets import (
     Picks,
@@ -22,7 +25,7 @@ from pipeline.store.current import targets_of
 from schemas.calibrations import PAIRS, CalibrationRecord
 from schemas.columns import POSE_COLUMNS
 
-__all__ = ["compare", "current_runs"]
+__all__ = ["compare", "compare_runs", "current_runs"]
 
 
 def current_runs(records: Sequence[CalibrationRecord]) -> list[dict[str, CalibrationRecord]]:
@@ -112,3 +115,39 @@ def _normalised(
     of_truth = np.repeat(np.square(truth_sigma), 3)
     z = log_se3(T @ inverse(T_true)) / np.sqrt(np.diag(record.covariance) + of_truth)
     return z[np.array(record.observable, bool)]
+
+
+def compare_runs(
+    records: Sequence[CalibrationRecord],
+    truth: Path | None,
+    files: ReflectorFiles,
+    truth_sigma: tuple[float, float],
+) -> tuple[list[ComparedRun], dict[str, int]]:
+    """Compare every current run that has a truth; also returns the number of runs without a truth or result.
+
+    Args:
+        truth: JSON with transforms, or a folder with VEHICLE/DAY.json; None if `files` has reflectors.
+        truth_sigma: uncertainty of the truth, per axis: rotation [rad], translation [m].
+    """
+    compared, counts = [], {"refused_runs": 0, "runs_without_truth": 0}
+    for run in current_runs(records):
+        first = next(iter(run.values()))
+        known = None if truth is None else _truth_of(truth, first)
+        file = files.of(first.vehicle, first.day)
+        if known is None and file is None:
+            counts["runs_without_truth"] += 1
+            continue
+        picks = file.picks if file else None
+        comparison = compare(run, known, picks, truth_sigma)
+        if comparison is None:
+            counts["refused_runs"] += 1
+        else:
+            compared.append(ComparedRun(run, known, picks, comparison))
+    return compared, counts
+
+
+def _truth_of(truth: Path, record: CalibrationRecord) -> dict[str, np.ndarray] | None:
+    path = truth / record.vehicle / f"{record.day}.json" if truth.is_dir() else truth
+    if truth.is_dir() and not path.exists():
+        return None
+    return read_transforms(path)

@@ -19,9 +19,8 @@ from pipeline.core.errors import ConfigError
 from pipeline.export.calibration import ExportedCalibration
 from pipeline.export.formats import Files, Format
 from pipeline.export.provenance import comment_lines
-from pipeline.export.rotations import T_LINK_OPTICAL, pose_of_rpy, rpy_of
 from pipeline.export.texts import edit_yaml, field_of, load_yaml, number_of, to_yaml
-from pipeline.export.tree import require_frames
+from pipeline.export.tree import T_LINK_OPTICAL, pose_of_rpy, require_frames, rpy_of
 from pipeline.export.urdf import xml_of
 from pipeline.rig.se3 import inverse
 from pipeline.rig.transform_tree import TransformTree

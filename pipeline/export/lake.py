@@ -1,8 +1,8 @@
-"""Read a calibration from the lake: a day's records, or a vehicle's state."""
+"""Read a calibration from the lake: a day's records, or a vehicle's state; and frames of a day."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import cast
 
 import numpy as np
@@ -18,9 +18,11 @@ from pipeline.rig.transform_tree import TransformTree
 from pipeline.store.current import current_poses, current_records, current_states, prior_of, transform_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
-from pipeline.store.views import ingested, observations_of, perceived
+from pipeline.store.views import Chosen, frames_of, ingested, observations_of, perceived
 from schemas.calibrations import CALIBRATIONS, DOF_NAMES, CalibrationRecord
+from schemas.frames import Frame
 from schemas.moments import TF
+from schemas.observations import Observation
 from schemas.poses import POSES, PoseRow
 from schemas.states import STATES, StateRow
 
@@ -30,6 +32,7 @@ __all__ = [
     "priors_of_day",
     "read_cameras",
     "read_frame_ids",
+    "read_scenes",
     "read_tf",
 ]
 
@@ -230,3 +233,27 @@ def read_frame_ids(lake: Lake, vehicle: str, days: Iterable[str]) -> dict[str, s
                 names if len(set(names.values())) == len(names) and all(map(is_frame, names.values())) else {}
             )
     return {}
+
+
+def read_scenes(
+    lake: Lake, partition: Partition, most: int, chosen: Chosen | None = None
+) -> Iterator[tuple[Frame, Observation | None]]:
+    """At most `most` frames, evenly spread, in order of stamp; features are None if perception left it out.
+
+    Raises:
+        ConfigError: the lake has no frames of that day.
+        DamagedError, CollectedError: a file of the day is damaged or was deleted after its retention.
+    """
+    manifest = ingested(lake, partition)
+    if manifest is None:
+        problem = f"the lake has no frames of {partition.vehicle} {partition.day}: ingest the day's logs"
+        raise ConfigError("command line", "day", problem)
+    picked = np.unique(np.linspace(0, max(manifest.rows - 1, 0), most).round().astype(int)).tolist()
+    # Empty for a day that was not perceived.
+    seen = iter(()) if perceived(lake, partition) is None else observations_of(lake, partition, None, chosen)
+    observation = next(seen, None)
+    for frame in frames_of(lake, partition, picked, chosen):
+        while observation is not None and observation.frame_index < frame.frame_index:
+            observation = next(seen, None)
+        is_its = observation is not None and observation.frame_index == frame.frame_index
+        yield frame, observation if is_its else None

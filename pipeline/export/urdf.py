@@ -15,8 +15,7 @@ from pipeline.core.errors import ConfigError
 from pipeline.export.calibration import ExportedCalibration, Pose, poses_of
 from pipeline.export.formats import Files, Format
 from pipeline.export.provenance import comment_lines
-from pipeline.export.rotations import pose_of_rpy, rpy_of
-from pipeline.export.tree import require_frames
+from pipeline.export.tree import pose_of_rpy, require_frames, rpy_of
 from pipeline.rig.transform_tree import TransformTree
 
 __all__ = ["URDF", "XACRO", "joint_of", "xml_of"]

@@ -14,8 +14,7 @@ from pipeline.core.errors import LogError
 from pipeline.core.rigs import CameraTopics, RadarTopics, TopicSemantics
 from pipeline.ingest.index import DayIndex, Located
 from pipeline.ingest.messages.decoding import DECODE_ERRORS, decode, header_frame_id
-from pipeline.ingest.messages.detections import read_detections
-from pipeline.ingest.messages.detections_3d import DETECTIONS_3D, read_detections_3d
+from pipeline.ingest.messages.detections import DETECTIONS_3D, read_detections, read_detections_3d
 from pipeline.ingest.messages.image import (
     EncodedImage,
     encode_pixels,

@@ -18,13 +18,11 @@ from pipeline.ingest.captures import Rejected
 from pipeline.ingest.directions_and_units import prior_transform
 from pipeline.ingest.index import DayIndex, index_logs
 from pipeline.ingest.moments import MomentBuilder
-from pipeline.ingest.readiness import DofVerdict, Evidence, overall
-from pipeline.ingest.rig_matrix import RigFinding
-from pipeline.ingest.rig_sample import RigSample
+from pipeline.ingest.readiness import DofVerdict, Evidence, Unheard, overall, unheard_topics
+from pipeline.ingest.rig_sample import RigFinding, RigSample
 from pipeline.ingest.roles import NEEDED, topics_of
 from pipeline.ingest.stage import pick_moments, read_file_prior
 from pipeline.ingest.sync import WRONG_UNIT, constant_gap_ns
-from pipeline.ingest.unheard import Unheard, unheard_topics
 from pipeline.rig.day_prior import no_prior, rig_prior
 from pipeline.rig.prior import RigPrior
 from pipeline.rig.rig import Rig

@@ -13,10 +13,17 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.core.rigs import RadarTopics
-from pipeline.ingest.doppler_speed import doppler_speed
 from schemas.frames import Frame
 
-__all__ = ["MOVING_MPS", "AskedRadar", "Motion", "motion_of", "opposed_signs", "prior_transform"]
+__all__ = [
+    "MOVING_MPS",
+    "AskedRadar",
+    "Motion",
+    "doppler_speed",
+    "motion_of",
+    "opposed_signs",
+    "prior_transform",
+]
 
 MOVING_MPS = 1.0
 _BACKWARDS = "the car would drive backwards"
@@ -29,6 +36,7 @@ _OFF = 0.25  # larger relative differences of odometry and Doppler are an error
 # Number of occupied cells, and the factor by which more detections must meet them with the radar turned
 # round. On logs where cells came from the car's motion, 70 to 93 % met, and at most 29 % the other way round.
 _CELL_M, _TALL_M, _LEAST_MET, _TURNED_MORE = 1.0, 0.5, 0.3, 1.5
+_FIT_MPS = 0.35  # Doppler residual of static points at the right ego speed, quantisation included
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,3 +246,22 @@ def _met(frame: Frame) -> list[float]:
         np.floor(seen[:, :2] / _CELL_M).astype(np.int64).tolist() for seen in (given, radar, given * turn)
     ]
     return [float(np.mean([tuple(place) in standing for place in of])) for of in places]
+
+
+def doppler_speed(
+    directions: Float[np.ndarray, "N 3"], range_rate_mps: Float[np.ndarray, " N"], period_mps: float | None
+) -> tuple[float, float]:
+    """Forward speed [m/s] at which most detections of a scan fit a static world, and the share that fits.
+
+    The x axis of the directions is assumed to point along the driving direction. If the share is below a
+    third, this is not so, or the configuration of the Doppler is wrong. Negative speed = wrong sign, or the
+    car reverses.
+    """
+    speeds = np.arange(-45.0, 45.01, 0.15)
+    misfit = range_rate_mps + speeds[:, None] * directions[:, 0]
+    if period_mps is not None:
+        misfit = (misfit + period_mps / 2) % period_mps - period_mps / 2
+    share = np.mean(np.abs(misfit) < _FIT_MPS, axis=1)
+    # Among equal fits (aliases, or no detection off the axis) the slowest speed is chosen.
+    best = int(np.lexsort((np.abs(speeds), -np.round(share, 2)))[0])
+    return float(speeds[best]), float(share[best])

@@ -17,10 +17,15 @@ from jaxtyping import Int64
 from pipeline.core.errors import LogError
 from pipeline.ingest.containers.reader import Channel, ChunkCache, LogReader, Position, RawMessage, open_log
 from pipeline.ingest.containers.timeline import Stretches, Timeline
-from pipeline.ingest.messages.decoding import DECODE_ERRORS, content_without_stamp, decode, header_stamp_ns
-from pipeline.ingest.messages.detections_3d import DETECTIONS_3D
+from pipeline.ingest.messages.decoding import (
+    DECODE_ERRORS,
+    content_without_stamp,
+    decode,
+    encoding_fault,
+    header_stamp_ns,
+)
+from pipeline.ingest.messages.detections import DETECTIONS_3D
 from pipeline.ingest.messages.foxglove import REFUSED, foxglove_types
-from pipeline.ingest.messages.generation import encoding_fault
 from pipeline.ingest.messages.image import read_camera_info
 from pipeline.ingest.messages.odometry import EgoTrack
 from pipeline.ingest.reading_plan import Reading, plan_reading, plan_sweeps, rare_topics

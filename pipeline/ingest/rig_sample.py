@@ -1,11 +1,11 @@
-"""A sample of a day's moments for a rig: fields of view, edges, and facts for the verdict on each edge."""
+"""A sample of a day's moments for a rig: fields of view, edges, facts for the verdict on each edge, a matrix."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TypeVar
+from typing import Final, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -13,9 +13,8 @@ from jaxtyping import Float
 from pipeline.core.rigs import OnnxSemantics
 from pipeline.ingest.directions_and_units import AskedRadar, Motion, motion_of, opposed_signs
 from pipeline.ingest.readiness import DofVerdict, Evidence, in_order, judge_edge
-from pipeline.ingest.rig_matrix import RigFinding, rig_finding
 from pipeline.rig.cameras import camera_of
-from pipeline.rig.graph import BASE, Edge, RigGraph, Sensor
+from pipeline.rig.graph import BASE, Edge, RigGraph, Sensor, possible_edges
 from pipeline.rig.overlap import Overlap, find_edges, overlaps_of
 from pipeline.rig.prior import RigPrior, Star, between, middle_of
 from pipeline.rig.rig import Rig
@@ -28,9 +27,39 @@ from schemas.captures import Capture, Image, Scan, Sweep
 from schemas.frames import Frame
 from schemas.moments import Moment
 
-__all__ = ["RigSample"]
+__all__ = ["PairFinding", "RigFinding", "RigSample", "dof_counts", "rig_finding"]
 
 Topics = TypeVar("Topics")
+_COUNTED: Final = ("roll", "pitch", "yaw", "x", "y", "z")
+
+
+@dataclass(frozen=True)
+class PairFinding:
+    """One pair of sensors.
+
+    Args:
+        share: common share of the smaller field of view, at the prior; None if unknown, and for base.
+        moments: number with both sensors; for base, number with the sensor.
+    """
+
+    parent: str
+    child: str
+    kind: str
+    share: float | None
+    moments: int
+    is_edge: bool
+    why_not: str = ""
+    verdicts: list[DofVerdict] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class RigFinding:
+    """The rig: kinds by sensor, the reference of the poses, all possible edges, and unconnected sensors."""
+
+    sensors: dict[str, str]
+    reference: str
+    pairs: list[PairFinding]
+    loose: list[str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,3 +273,44 @@ def _rings(frame: Frame) -> int:
     finite = np.isfinite(xyz).all(axis=1)
     rows = rows_of(to_spherical(xyz[finite]), frame.lidar_ring[finite])
     return 0 if rows is None else int(rows.row.max()) + 1
+
+
+def rig_finding(
+    graph: RigGraph,
+    overlaps: Sequence[Overlap],
+    moments: Sequence[Collection[str]],
+    verdicts: Mapping[Edge, list[DofVerdict]],
+) -> RigFinding:
+    """Matrix of a rig: `moments` has the sensors with data of each moment."""
+    seen = {o.edge: o for o in overlaps}
+    pairs = []
+    for edge in possible_edges(graph.sensors):
+        is_edge, share = edge in graph.edges, seen[edge].share if edge in seen else None
+        ends = {s.name for s in edge.sensors if s.kind != "base"}
+        both = sum(ends <= set(moment) for moment in moments)
+        why_not = "" if is_edge else _why_not(edge, seen.get(edge), moments)
+        own = list(verdicts.get(edge, ()))
+        pairs.append(
+            PairFinding(edge.parent.name, edge.child.name, edge.kind, share, both, is_edge, why_not, own)
+        )
+    tied = graph.components()[0]
+    loose = [s.name for s in graph.sensors if s not in tied]
+    return RigFinding({s.name: s.kind for s in graph.sensors}, graph.reference.name, pairs, loose)
+
+
+def dof_counts(verdicts: Sequence[DofVerdict]) -> tuple[int, int]:
+    """Number of DoF of the six that an edge gives, and number that depend partly on the prior."""
+    counts = dict.fromkeys(("yes", "weak", "no"), 0)
+    for verdict in verdicts:
+        words = verdict.dof.replace("translation", "x y z").replace(",", " ").split()
+        counts[verdict.verdict] += sum(word in _COUNTED for word in words)
+    return counts["yes"], counts["weak"]
+
+
+def _why_not(edge: Edge, overlap: Overlap | None, moments: Sequence[Collection[str]]) -> str:
+    silent = [s.name for s in edge.sensors if s.kind != "base" and not any(s.name in m for m in moments)]
+    if silent:
+        return f"no data of {' and '.join(silent)}"
+    if overlap is None:
+        return "no prior" if edge.child.kind != "base" else "not named"
+    return "others share more" if overlap.is_enough else "their fields of view do not overlap"

@@ -17,8 +17,8 @@ from pipeline.core.stage_work import NothingUsable, Run, Task, Work
 from pipeline.ingest.captures import Rejected
 from pipeline.ingest.containers.reader import content_identity, leads_nowhere
 from pipeline.ingest.index import DayIndex, index_logs
-from pipeline.ingest.moments import Anchored, MomentBuilder
-from pipeline.ingest.repetition import REPEATED
+from pipeline.ingest.moments import REPEATED, Anchored, MomentBuilder
+from pipeline.ingest.readiness import Unheard, unheard_topics
 from pipeline.ingest.roles import NEEDED, topics_of
 from pipeline.ingest.sync import (
     WRONG_UNIT,
@@ -29,7 +29,6 @@ from pipeline.ingest.sync import (
     none_near,
     number_drives,
 )
-from pipeline.ingest.unheard import Unheard, unheard_topics
 from pipeline.objective.stamp_gaps import motion_gates_ns
 from pipeline.rig.graph import possible_edges
 from pipeline.rig.prior import Star

@@ -1,8 +1,10 @@
-"""The page of `boresight compare`: two calibrations, axis by axis."""
+"""The page of `boresight compare`: two calibrations, axis by axis; and the top of the page of `verify`."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
@@ -12,11 +14,17 @@ from pipeline.report.words import dof_title, scaled, unit_of
 from pipeline.rig.differences import PairDifference
 from schemas.calibrations import DOF_NAMES
 
-__all__ = ["comparison_page"]
+__all__ = ["comparison_page", "in_use_view"]
 
 _CLEAR_SIGMAS = 3.0
 _REACH = 6.0  # sigmas to either side that a bar has room for
 _WIDTH, _HEIGHT = 240, 18  # px of a bar
+_MOODS = {"pass": "good", "warn": "partly", "fail": "bad", "inconclusive": "none"}
+_ANSWERS = {
+    "right": ("good", "Yes, as far as it matters"),
+    "wrong": ("bad", "No"),
+    "inconclusive": ("partly", "This log does not decide"),
+}
 
 
 def comparison_page(first: str, second: str, pairs: Sequence[PairDifference], notes: Sequence[str]) -> str:
@@ -77,3 +85,32 @@ def _bar(z: float) -> Markup:
         f'<rect x="{left:.1f}" y="5" width="{width:.1f}" height="{_HEIGHT - 10}" fill="{colour}"/>'
         f'<line x1="{middle}" y1="1" x2="{middle}" y2="{_HEIGHT - 1}" stroke="var(--soft)"/></svg>'
     )
+
+
+def in_use_view(answer: str, checks: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The page's first screen, from the answer and the checks in the JSON of `boresight verify`."""
+    rows = [_row(check) for check in checks]
+    mood, headline = _ANSWERS[answer]
+    wrong, unsure = (
+        ", ".join(f"{r['pair']} {r['axis']}" for r in rows if r["status"] == status)
+        for status in ("fail", "inconclusive")
+    )
+    sentences = [f"Wrong: {wrong}."] * bool(wrong) + [f"This log does not determine: {unsure}."] * bool(
+        unsure
+    )
+    explained = " ".join(sentences) or "Every axis that is judged passes."
+    return {"mood": mood, "headline": headline, "explained": explained, "rows": rows}
+
+
+def _row(check: Mapping[str, Any]) -> dict[str, Any]:
+    """A check with its angles in words, and the class of the page's colours."""
+    # Kinds of sensors have a dash between them; names stay as they are.
+    pair = check["pair"].replace("_", "-") if check["pair"] == check["kind"] else check["pair"]
+    angles = {name: _deg(check[f"{name}_rad"]) for name in ("off", "sigma", "limit", "shown")}
+    return {**check, **angles, "pair": pair, "mood": _MOODS[check["status"]]}
+
+
+def _deg(angle_rad: object) -> str:
+    if not isinstance(angle_rad, float) or not math.isfinite(angle_rad):
+        return "unknown"
+    return f"{np.degrees(angle_rad):.2f} deg"

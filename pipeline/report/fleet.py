@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Int
 
 from pipeline.report.day import clearest_alarm, status_sentence
-from pipeline.report.names import page_stem
+from pipeline.report.page import page_stem
 from pipeline.report.verdicts import FleetVerdicts
 from pipeline.report.window import FleetWindow
 from pipeline.report.words import motion_in_words, with_sigma

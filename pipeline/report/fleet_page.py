@@ -15,8 +15,7 @@ import numpy as np
 from pipeline.core.config import FleetConfig
 from pipeline.report.charts import charted_edges, fleet_charts
 from pipeline.report.fleet import DAY_LETTERS, VehicleRow, finding_views, fleet_rows, headline_for, index_row
-from pipeline.report.names import page_stem
-from pipeline.report.page import render, write_page
+from pipeline.report.page import page_stem, render, write_page
 from pipeline.report.reading import fleet_records
 from pipeline.report.truth import truth_rows, truth_summary
 from pipeline.report.upkeep import Album

@@ -10,12 +10,17 @@ from typing import Any, TypeVar
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
+from pipeline.core.config import config_hash
 from pipeline.store.files import Files, LocalFiles
 
-__all__ = ["commands", "render", "write_page"]
+__all__ = ["commands", "page_name", "page_stem", "render", "write_page"]
 
 P = TypeVar("P", bound=PurePath)
 _COPY = '<button type="button" class="copy">Copy</button>'
+_PLAIN = re.compile(r"[a-z0-9_-][a-z0-9._-]*[a-z0-9_-]|[a-z0-9_-]")
+# Names that Windows keeps for devices, whatever follows the first dot.
+_DEVICES = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?")
+_READABLE = 60  # letters of an odd name that are kept; what a name differs in may come later
 
 
 def render(template: str, **values: Any) -> str:
@@ -56,3 +61,20 @@ def _is_ours(command: str) -> bool:
 def _safe_json(text: str) -> Markup:
     """JSON inside a script element: the only sequence that could end it is escaped."""
     return Markup(json.dumps(json.loads(text)).replace("<", "\\u003c"))  # noqa: S704 (escaped one call before)
+
+
+def page_stem(vehicle: str) -> str:
+    """File name of a vehicle's pages, without the ending: the vehicle's name if that is plain.
+
+    Some file systems do not distinguish case, accents and signs ("Car" and "car", "a b" and "a_b"). Such a
+    name gets "~" and a hash of the whole name; no plain name has a "~".
+    """
+    if _PLAIN.fullmatch(vehicle) and not _DEVICES.fullmatch(vehicle):
+        return vehicle
+    readable = re.sub(r"[^a-z0-9_-]", "_", vehicle.lower())[:_READABLE]
+    return f"{readable}~{config_hash({'vehicle': vehicle})[:12]}"
+
+
+def page_name(vehicle: str, day: str) -> str:
+    """A vehicle-day's page, relative to the folder of the days' pages."""
+    return f"{day}/{page_stem(vehicle)}.html"

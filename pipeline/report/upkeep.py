@@ -15,7 +15,7 @@ from urllib.parse import quote
 from pipeline.core.config import FleetConfig, config_hash
 from pipeline.core.results import MadeWhenAsked, Progress, silent
 from pipeline.report.day_page import DayRead, write_day_page
-from pipeline.report.names import page_name
+from pipeline.report.page import page_name
 from pipeline.report.reading import records_of_day
 from pipeline.report.verdicts import FleetVerdicts
 from pipeline.store.current import current_states

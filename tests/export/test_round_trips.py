@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from pipeline.core.errors import ConfigError
 from pipeline.export.files import prior_text
 from pipeline.export.formats import FORMATS, format_named
-from pipeline.export.rotations import pose_of_rpy, rpy_of
+from pipeline.export.tree import pose_of_rpy, rpy_of
 from pipeline.rig.cameras import Camera
 from pipeline.rig.se3 import exp_so3
 from tests.makers.calibrations import CAMERA, calibration

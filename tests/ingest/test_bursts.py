@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.ingest.bursts import BURST_TRIOS, BurstMotion, choose_bursts, possible_bursts
 from pipeline.ingest.containers.timeline import Chunk, Stretches, Timeline, timeline_of_chunks
+from pipeline.ingest.reading_plan import BURST_TRIOS, BurstMotion, choose_bursts, possible_bursts
 
 S = 10**9
 gaps = st.lists(st.tuples(st.integers(1, 4000), st.integers(3, 4000)), min_size=1, max_size=12)

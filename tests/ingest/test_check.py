@@ -12,7 +12,7 @@ from jobs.check import check
 from pipeline.core.errors import ConfigError, ModelError
 from pipeline.core.rigs import RadarTopics
 from pipeline.ingest.check import check_logs
-from pipeline.ingest.doppler_speed import doppler_speed
+from pipeline.ingest.directions_and_units import doppler_speed
 from pipeline.ingest.readiness import Evidence, judge_edge, overall
 from pipeline.rig.rig import Rig
 from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, SENSORS

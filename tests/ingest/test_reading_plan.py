@@ -5,9 +5,9 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from pipeline.ingest.bursts import BURST_TRIOS
 from pipeline.ingest.containers.mcap import McapLog
 from pipeline.ingest.containers.rosbag1 import BagLog
+from pipeline.ingest.reading_plan import BURST_TRIOS
 from tests.ingest.containers.test_containers import write
 from tests.makers.written_logs import Kit
 

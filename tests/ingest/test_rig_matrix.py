@@ -5,9 +5,9 @@ from io import StringIO
 
 from rich.console import Console
 
-from jobs.terminal.rig_table import print_rig
+from jobs.check import print_rig
 from pipeline.ingest.readiness import Evidence, judge_edge
-from pipeline.ingest.rig_matrix import dof_counts, rig_finding
+from pipeline.ingest.rig_sample import dof_counts, rig_finding
 from pipeline.rig.overlap import find_edges, overlaps_of
 from tests.rig.test_overlap import VAN, rig
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from pipeline.core.names import is_vehicle
 from pipeline.report.charts import fleet_charts
 from pipeline.report.fleet_page import render_fleet_page
-from pipeline.report.names import page_stem
+from pipeline.report.page import page_stem
 from pipeline.report.upkeep import Album
 from pipeline.report.verdicts import ChartVerdicts, FleetVerdicts, read_verdicts
 from pipeline.report.window import FleetWindow, read_window

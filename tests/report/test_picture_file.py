@@ -6,7 +6,7 @@ import pytest
 
 from pipeline.core.errors import ConfigError
 from pipeline.report.overlays import front_view, lidar_window
-from pipeline.report.picture_file import between, write_picture
+from pipeline.report.pictures import between, write_picture
 from pipeline.rig.se3 import inverse, rotation_angle_rad
 from tests.report.test_pictures import GOOD, WIDTH, _scene, _turned
 

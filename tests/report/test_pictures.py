@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from pipeline.core.sections import ReportConfig
-from pipeline.report.above import top_bitmap, top_view
 from pipeline.report.overlays import Extrinsics, Scene, Window, close_up, decode_image, front_view, whole_view
+from pipeline.report.pictures import top_bitmap, top_view
 from pipeline.report.reading import scene_of
 from pipeline.report.residuals import MEASURES, boundary_distance_px, frame_residuals
 from pipeline.report.scenes import choose_frames, choose_windows

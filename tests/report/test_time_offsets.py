@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.report.residuals import frame_residuals
-from pipeline.report.time_offsets import TimeOffsets, as_stamped, time_offsets_of
+from pipeline.report.residuals import TimeOffsets, as_stamped, frame_residuals, time_offsets_of
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse, transform_points
 from schemas.calibrations import FRAMES_OF_PAIR, CalibrationRecord
 from schemas.observations import Observation

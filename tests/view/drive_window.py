@@ -12,7 +12,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent.parent))
 
 from jobs.view import _rig
 from pipeline.store.partitions import Lake
-from pipeline.view.moment import read_moment
+from pipeline.view.layers import read_moment
 from pipeline.view.window import Viewer
 from tests.export.test_foxglove_rig import DAY
 

@@ -19,9 +19,8 @@ from pipeline.core.errors import MissingLibraryError
 from pipeline.rig.se3 import inverse, transform_points
 from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake
-from pipeline.view.layers import Dots, Name, Picture, Strokes, layers_of
-from pipeline.view.moment import Rig, Shown, read_moment
-from pipeline.view.system import require_renderer
+from pipeline.view.layers import Dots, Name, Picture, Rig, Shown, Strokes, layers_of, read_moment
+from pipeline.view.window import require_renderer
 from schemas.calibrations import CALIBRATIONS
 from schemas.captures import Image, Scan, Sweep
 from schemas.moments import MOMENTS, PERCEIVED

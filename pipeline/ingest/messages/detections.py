@@ -1,14 +1,96 @@
-"""Logged road users: vision_msgs/Detection2DArray of every version, read by attribute names."""
+"""Road users logged as 2D boxes, or as 3D boxes in the camera's own frame, projected to 2D boxes.
+
+3D boxes in any other frame are refused: their projection needs the calibration to be estimated, and they would
+confirm any prior that was used.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from itertools import product
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 
-__all__ = ["read_detections"]
+from pipeline.rig.cameras import Camera
+from pipeline.rig.se3 import from_quaternion, transform_points
+
+__all__ = ["DETECTIONS_3D", "read_detections", "read_detections_3d"]
+
+DETECTIONS_3D = (
+    "vision_msgs/msg/Detection3DArray",
+    "autoware_perception_msgs/msg/DetectedObjects",
+    "autoware_auto_perception_msgs/msg/DetectedObjects",
+)
+# autoware_perception_msgs/ObjectClassification; 0 is unknown.
+_AUTOWARE = {1: "car", 2: "truck", 3: "bus", 4: "trailer", 5: "motorcycle", 6: "bicycle", 7: "pedestrian"}
+# Points on a box of side 1: corners and midpoints of edges, because a lens bends edges outwards.
+_ON_A_BOX = np.array(list(product((-0.5, 0.0, 0.5), repeat=3)))
+_UNIT_TOLERANCE = 0.01  # largest deviation of a quaternion's length from 1; beyond it is damaged
+_Thing = tuple[Any, Any, str, float]  # pose, size, class, score
+
+
+def read_detections_3d(
+    message: Any, camera: Camera, camera_frame: str
+) -> tuple[Float32[np.ndarray, "N 4"], list[str], Float32[np.ndarray, " N"], int]:
+    """Boxes in the image, classes, scores, and the number of detections that give none.
+
+    `message` is a vision_msgs/Detection3DArray or Autoware's DetectedObjects.
+
+    Raises:
+        ValueError: the boxes are not in `camera_frame`, the image's optical frame.
+    """
+    frame = str(message.header.frame_id).lstrip("/")
+    if frame != camera_frame:
+        raise ValueError(
+            f"3D boxes in frame {frame!r} can be projected only with the calibration that is to be estimated: log them "
+            f"in the camera's frame {camera_frame!r}, or 2D detections of the image"
+        )
+    things = _autoware(message) if hasattr(message, "objects") else _vision(message)
+    boxes, classes, scores, dropped = [], [], [], 0
+    for pose, size, name, score in things:
+        box = _box(pose, size, camera)
+        if box is None or not name:
+            dropped += 1
+            continue
+        boxes.append(box)
+        classes.append(name)
+        scores.append(score if np.isfinite(score) else 0.0)
+    return np.array(boxes, np.float32).reshape(-1, 4), classes, np.array(scores, np.float32), dropped
+
+
+def _vision(message: Any) -> Iterator[_Thing]:
+    for detection in message.detections:
+        hypotheses = [getattr(r, "hypothesis", r) for r in detection.results]
+        named = [(str(h.class_id if hasattr(h, "class_id") else h.id), float(h.score)) for h in hypotheses]
+        name, score = max(named, key=lambda pair: pair[1], default=("", 0.0))
+        yield detection.bbox.center, detection.bbox.size, name, score
+
+
+def _autoware(message: Any) -> Iterator[_Thing]:
+    for thing in message.objects:
+        likely = max(thing.classification, key=lambda c: c.probability, default=None)
+        name = "" if likely is None else _AUTOWARE.get(int(likely.label), "")
+        pose = thing.kinematics.pose_with_covariance.pose
+        yield pose, thing.shape.dimensions, name, float(thing.existence_probability)
+
+
+def _box(pose: Any, size: Any, camera: Camera) -> Float[np.ndarray, " 4"] | None:
+    """Upright box of the visible part, in the image; None if the box is invalid or partly behind the camera."""
+    p, q = pose.position, pose.orientation
+    t, q_wxyz = np.array([p.x, p.y, p.z], np.float64), np.array([q.w, q.x, q.y, q.z], np.float64)
+    sides = np.array([size.x, size.y, size.z], np.float64)
+    is_box = bool(np.all(np.isfinite([*t, *q_wxyz, *sides])) and np.all(sides > 0))
+    if not is_box or abs(np.linalg.norm(q_wxyz) - 1) > _UNIT_TOLERANCE:
+        return None
+    uv, is_seen = camera.project(transform_points(from_quaternion(q_wxyz, t), _ON_A_BOX * sides))
+    if not is_seen.all():
+        return None
+    least, most = np.array([-0.5, -0.5]), np.array([camera.width_px, camera.height_px]) - 0.5
+    low, high = np.clip(uv.min(axis=0), least, most), np.clip(uv.max(axis=0), least, most)
+    return np.concatenate([low, high]) if np.all(high > low) else None
 
 
 def read_detections(
@@ -21,8 +103,8 @@ def read_detections(
     """
     boxes, classes, scores, dropped = [], [], [], 0
     for detection in message.detections:
-        box = _box(detection.bbox)
-        hypotheses = [_hypothesis(r) for r in detection.results]
+        box = _upright_box(detection.bbox)
+        hypotheses = [_hypothesis_2d(r) for r in detection.results]
         if box is None or not hypotheses:
             dropped += 1
             continue
@@ -33,7 +115,7 @@ def read_detections(
     return np.array(boxes, np.float32).reshape(-1, 4), classes, np.array(scores, np.float32), dropped
 
 
-def _box(bbox: Any) -> tuple[float, float, float, float] | None:
+def _upright_box(bbox: Any) -> tuple[float, float, float, float] | None:
     centre = getattr(bbox.center, "position", bbox.center)
     x, y, width, height, theta = (
         float(v) for v in (centre.x, centre.y, bbox.size_x, bbox.size_y, bbox.center.theta)
@@ -45,7 +127,7 @@ def _box(bbox: Any) -> tuple[float, float, float, float] | None:
     return x - half_x, y - half_y, x + half_x, y + half_y
 
 
-def _hypothesis(result: Any) -> tuple[str, float]:
+def _hypothesis_2d(result: Any) -> tuple[str, float]:
     inner = getattr(result, "hypothesis", result)
     name = str(inner.class_id if hasattr(inner, "class_id") else inner.id)
     score = float(inner.score)

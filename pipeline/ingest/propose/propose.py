@@ -13,8 +13,7 @@ from pipeline.core.config import FleetConfig, validated
 from pipeline.core.errors import ConfigError
 from pipeline.core.results import Progress, silent
 from pipeline.ingest.captures import Rejected
-from pipeline.ingest.directions_and_units import AskedRadar, motion_of, opposed_signs
-from pipeline.ingest.doppler_speed import doppler_speed
+from pipeline.ingest.directions_and_units import AskedRadar, doppler_speed, motion_of, opposed_signs
 from pipeline.ingest.index import index_logs
 from pipeline.ingest.moments import MomentBuilder
 from pipeline.ingest.propose.fleet_file import Facts, RadarMeaning, fleet_text, left_out, names_of

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rosbags.typesys import get_types_from_msg
 
-from pipeline.ingest.messages.detections_3d import read_detections_3d
+from pipeline.ingest.messages.detections import read_detections_3d
 from pipeline.rig.cameras import Camera
 
 CAMERA = Camera("plumb_bob", np.array([[80.0, 0, 48], [0, 80, 32], [0, 0, 1]]), np.zeros(5), 96, 64)

@@ -5,7 +5,7 @@ import pytest
 import rosbags.rosbag1.writer
 
 from pipeline.ingest.containers.reader import Channel
-from pipeline.ingest.messages.generation import encoding_fault
+from pipeline.ingest.messages.decoding import encoding_fault
 
 
 def mcap_that_says(kit, said, path):

@@ -14,8 +14,8 @@ from pipeline.core.errors import ConfigError
 from pipeline.core.rigs import RadarTopics
 from pipeline.fleet.pattern import find_vehicle_days
 from pipeline.ingest.directions_and_units import AskedRadar
-from pipeline.ingest.propose.logs_pattern import logs_pattern, nightly_command
 from pipeline.ingest.propose.propose import doppler_period, propose_fleet
+from pipeline.ingest.propose.survey import logs_pattern, nightly_command
 from pipeline.store.partitions import Partition
 from tests.makers.written_logs import (
     DETECTIONS,
