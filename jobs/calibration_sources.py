@@ -194,8 +194,8 @@ def _side_of_files(text: str, form: str, files: str, names: FrameNames, edges: t
     from pipeline.export.compare import Side, composed
     from pipeline.export.files import read_files
     from pipeline.export.formats import format_named
+    from pipeline.rig.day_prior import read_transforms
     from pipeline.rig.edges import words_of
-    from pipeline.rig.prior_file import read_transforms
 
     if form:
         found = format_named(form).pairs(read_files([Path(f) for f in files.split(",")]), names, edges)

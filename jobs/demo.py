@@ -142,8 +142,7 @@ def _simulate(spec: FleetSpec, out: Path, workers: int | None) -> None:
     from pipeline.core.config import config_hash
     from pipeline.core.errors import LogError
     from pipeline.fleet.executor import EXECUTORS
-    from pipeline.simulate.fleet import day_names, rigs_of, vehicle_names
-    from pipeline.simulate.logs.fleet_toml import mixed_fleet_toml
+    from pipeline.simulate.fleet import day_names, mixed_fleet_toml, rigs_of, vehicle_names
     from schemas.versions import CODE_VERSION
 
     stamp, key = out / ".simulated", config_hash({"spec": repr(spec), "code": CODE_VERSION})

@@ -39,7 +39,7 @@ def import_prior(
     from pipeline.export.files import prior_text, read_files, write_files
     from pipeline.export.formats import format_named
     from pipeline.export.tree import ESTIMATED_PAIRS
-    from pipeline.rig.prior_file import read_transforms
+    from pipeline.rig.day_prior import read_transforms
 
     read = read_files(files)
     if fleet is not None:
@@ -76,8 +76,8 @@ def _of_rig(
         write_files,
     )
     from pipeline.export.formats import format_named
+    from pipeline.rig.day_prior import read_star
     from pipeline.rig.prior import between
-    from pipeline.rig.prior_file import read_star
 
     rigs, name = load_fleet(of[0]).rigs, of[1]
     name = next(iter(rigs)) if name is None and len(rigs) == 1 else name

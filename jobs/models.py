@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from pipeline.core.third_party_models import ThirdPartyModel
+    from pipeline.core.models import ThirdPartyModel
 
 __all__ = ["fetch", "models"]
 
@@ -26,8 +26,7 @@ def models(*, json: bool = False) -> int:
     from dataclasses import asdict
 
     from jobs.terminal.summary import print_summary
-    from pipeline.core.shipped_models import shipped_models
-    from pipeline.core.third_party_models import CATALOGUE
+    from pipeline.core.models import CATALOGUE, shipped_models
 
     found = shipped_models()
     for model in () if json else found:
@@ -66,7 +65,7 @@ def fetch(*names: str, into: Path = Path("models"), mirror: str | None = None) -
         mirror: address of a folder with the files NAME.onnx, in place of the pinned addresses.
     """
     from jobs.terminal.summary import print_summary, progress_reporter
-    from pipeline.core.third_party_models import manifest_text, named, semantics_line
+    from pipeline.core.models import manifest_text, named, semantics_line
     from pipeline.perceive.models.download import download
     from pipeline.store.atomic_write import atomic_write
 

@@ -6,7 +6,7 @@ import shutil
 import pytest
 
 from jobs.cli import main
-from pipeline.core.shipped_models import REQUIRED, SHIPPED, shipped_models
+from pipeline.core.models import REQUIRED, SHIPPED, shipped_models
 from tests.makers.training_lakes import fleet_of
 
 
@@ -37,7 +37,7 @@ def test_another_file_or_a_card_that_lacks_something_is_told(spoil, tmp_path, ca
         card.unlink()
     (problem,) = shipped_models(tmp_path)[0].problems
     assert {"file": "another file", "card": "license", "missing": "no readable card"}[spoil] in problem
-    monkeypatch.setattr("pipeline.core.shipped_models.Path", lambda _: tmp_path / "models.py")
+    monkeypatch.setattr("pipeline.core.models.Path", lambda _: tmp_path / "models.py")
     assert main(["models"]) == 1
     assert "joint" in capsys.readouterr().err
 

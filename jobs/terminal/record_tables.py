@@ -50,7 +50,7 @@ def print_table(table: str, rows: list[dict[str, Any]]) -> None:
 def _calibration_cells(row: dict[str, Any]) -> dict[str, str]:
     import numpy as np
 
-    from pipeline.rig.pose_columns import pose_of
+    from pipeline.rig.edges import pose_of
 
     sigma = np.full(6, np.nan) if row["covariance"] is None else np.sqrt(np.diag(row["covariance"]))
     seen = row["observable"] or [False] * 6

@@ -21,11 +21,10 @@ from pipeline.audit.pose_days import SensorDays, VehiclePoses
 from pipeline.audit.restarts import drift_per_day, last_restart
 from pipeline.core.config import VerifyConfig
 from pipeline.rig.changes import change_covariance
+from pipeline.rig.edges import pose_columns
 from pipeline.rig.graph import Edge, Sensor, tie
-from pipeline.rig.pose_columns import pose_columns
 from pipeline.rig.se3 import adjoint, inverse, transform_points
-from pipeline.rig.target_sigmas import target_sigmas
-from pipeline.rig.targets import DEFAULT_TARGETS
+from pipeline.rig.targets import DEFAULT_TARGETS, target_sigmas
 from schemas.drift import DriftFinding
 from schemas.service_events import ServiceEvent
 from schemas.states import StateRow

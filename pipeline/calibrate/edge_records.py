@@ -22,13 +22,13 @@ from pipeline.calibrate.verify.target_accuracy import claims_of
 from pipeline.calibrate.verify.verdict import Evidence, judge
 from pipeline.core.config import FleetConfig
 from pipeline.rig.changes import change_covariance
+from pipeline.rig.edges import pose_columns
 from pipeline.rig.evidence import EdgeEvidence, OtherScenes
 from pipeline.rig.extrinsics import Extrinsics
 from pipeline.rig.graph import BASE, Edge, RigGraph
-from pipeline.rig.pose_columns import pose_columns
+from pipeline.rig.overlap import View
 from pipeline.rig.prior import RigPrior
 from pipeline.rig.targets import DEFAULT_TARGETS
-from pipeline.rig.views import View
 from schemas.calibrations import CalibrationRecord
 from schemas.versions import CODE_VERSION
 

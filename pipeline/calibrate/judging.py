@@ -33,9 +33,9 @@ from pipeline.core.config import ChecksConfig, FleetConfig
 from pipeline.core.stage_work import NO_PROBES, Probes
 from pipeline.rig.checks import FailedCheck
 from pipeline.rig.estimates import PairEstimate, Prior
-from pipeline.rig.sensor_turns import sensor_turn
+from pipeline.rig.overlap import View
+from pipeline.rig.rig import sensor_turn
 from pipeline.rig.targets import DEFAULT_TARGETS
-from pipeline.rig.views import View
 from schemas.calibrations import PROBE_Z
 from schemas.observations import Observation
 

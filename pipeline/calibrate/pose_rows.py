@@ -16,13 +16,13 @@ from pipeline.calibrate.verify.target_accuracy import Claim, claims_of
 from pipeline.core.config import VerifyConfig
 from pipeline.rig.changes import change_jacobian
 from pipeline.rig.checks import faults_of
+from pipeline.rig.edges import pose_columns
 from pipeline.rig.extrinsics import Extrinsics
 from pipeline.rig.graph import RigGraph, Sensor
-from pipeline.rig.pose_columns import pose_columns
+from pipeline.rig.overlap import View
 from pipeline.rig.se3 import adjoint, inverse, transform_points
 from pipeline.rig.spherical import from_spherical
 from pipeline.rig.targets import DEFAULT_TARGETS
-from pipeline.rig.views import View
 from pipeline.store.current import prior_of, transform_of
 from schemas.calibrations import FRAMES_OF_PAIR, CalibrationRecord
 from schemas.poses import PoseRow

@@ -20,8 +20,8 @@ from pipeline.core.errors import SolveError
 from pipeline.core.stage_work import NO_PROBES, Probes
 from pipeline.rig.cameras import camera_of
 from pipeline.rig.changes import change_between
+from pipeline.rig.edges import pose_columns
 from pipeline.rig.estimates import DayParts, PairEstimate, Prior, Solution
-from pipeline.rig.pose_columns import pose_columns
 from pipeline.rig.se3 import inverse
 from pipeline.rig.spherical import camera_direction_angles
 from pipeline.store.partitions import Partition

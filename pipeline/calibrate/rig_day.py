@@ -30,9 +30,9 @@ from pipeline.rig.day_prior import no_prior, prior_of_three
 from pipeline.rig.estimates import PairEstimate, Prior
 from pipeline.rig.evidence import EdgeEvidence
 from pipeline.rig.graph import BASE, Edge, RigGraph
+from pipeline.rig.overlap import View
 from pipeline.rig.prior import RigPrior
 from pipeline.rig.rig import Rig
-from pipeline.rig.views import View
 from pipeline.store.views import Chosen
 from schemas.calibrations import SENSORS, CalibrationRecord
 from schemas.observations import Observation

@@ -24,10 +24,9 @@ from pipeline.core.stage_work import Task
 from pipeline.rig.day_prior import prior_of_three, rig_prior
 from pipeline.rig.estimates import Prior
 from pipeline.rig.graph import Edge, edge_between
-from pipeline.rig.overlap import Overlap, best_three, find_edges, overlaps_of
+from pipeline.rig.overlap import FRAMES, Overlap, View, best_three, find_edges, overlaps_of
 from pipeline.rig.prior import RigPrior, middle_of, moved
 from pipeline.rig.rig import Rig
-from pipeline.rig.views import FRAMES, View
 from pipeline.store.current import current_records, transform_of
 from pipeline.store.moments import sensors_of
 from pipeline.store.partitions import Lake, Partition, days_after

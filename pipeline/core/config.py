@@ -19,6 +19,7 @@ from pydantic import (
 )
 
 from pipeline.core.errors import ConfigError
+from pipeline.core.models import PREFIX, shipped_manifest
 from pipeline.core.names import is_pattern, is_vehicle, matches
 from pipeline.core.rigs import Positive, Section
 from pipeline.core.sections import (
@@ -35,7 +36,6 @@ from pipeline.core.sections import (
     TriggerConfig,
     VerifyConfig,
 )
-from pipeline.core.shipped_models import PREFIX, shipped_manifest
 from pipeline.rig.rig import SECTIONS, Rig
 
 __all__ = [

@@ -1,4 +1,10 @@
-"""ROS messages and MCAP files from plain arrays: used by the simulator, `convert` and `export`."""
+"""ROS messages and MCAP files from plain arrays: used by the simulator, `convert` and `export`.
+
+Some bags contain no message definitions (ROS 2 Humble and older), and rosbags does not bundle all. When
+reading a log, those of this module are used only if the log itself has no definition; a message that does
+not fit byte for byte is refused. Logs that are written here use the same definitions. Source: vision_msgs
+4.1 (Humble); radar_msgs 0.2 (Humble).
+"""
 
 from __future__ import annotations
 
@@ -13,14 +19,65 @@ from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from pipeline.core.ros_definitions import register
 from pipeline.rig.cameras import Camera
 from pipeline.rig.se3 import to_quaternion
 from pipeline.rig.topics import frame_of
 
-__all__ = ["McapLog", "RosMessages"]
+__all__ = ["DEFINITIONS", "McapLog", "RosMessages", "register"]
 
 _DATATYPES: Final = {"f4": 7, "u2": 4, "u1": 2}  # sensor_msgs/PointField
+# type -> (types that it needs, text)
+DEFINITIONS: dict[str, tuple[tuple[str, ...], str]] = {
+    "vision_msgs/msg/Point2D": ((), "float64 x\nfloat64 y\n"),
+    "vision_msgs/msg/Pose2D": ((), "vision_msgs/Point2D position\nfloat64 theta\n"),
+    "vision_msgs/msg/BoundingBox2D": ((), "vision_msgs/Pose2D center\nfloat64 size_x\nfloat64 size_y\n"),
+    "vision_msgs/msg/ObjectHypothesis": ((), "string class_id\nfloat64 score\n"),
+    "vision_msgs/msg/ObjectHypothesisWithPose": (
+        (),
+        "vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n",
+    ),
+    "vision_msgs/msg/Detection2D": (
+        (),
+        (
+            "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
+            "vision_msgs/BoundingBox2D bbox\nstring id\n"
+        ),
+    ),
+    "vision_msgs/msg/Detection2DArray": (
+        (
+            "vision_msgs/msg/Point2D",
+            "vision_msgs/msg/Pose2D",
+            "vision_msgs/msg/BoundingBox2D",
+            "vision_msgs/msg/ObjectHypothesis",
+            "vision_msgs/msg/ObjectHypothesisWithPose",
+            "vision_msgs/msg/Detection2D",
+        ),
+        "std_msgs/Header header\nvision_msgs/Detection2D[] detections\n",
+    ),
+    "radar_msgs/msg/RadarReturn": (
+        (),
+        "float32 range\nfloat32 azimuth\nfloat32 elevation\nfloat32 doppler_velocity\nfloat32 amplitude\n",
+    ),
+    "radar_msgs/msg/RadarScan": (
+        ("radar_msgs/msg/RadarReturn",),
+        "std_msgs/Header header\nradar_msgs/RadarReturn[] returns\n",
+    ),
+    "radar_msgs/msg/RadarTrack": (
+        (),
+        (
+            "unique_identifier_msgs/UUID uuid\n"
+            "geometry_msgs/Point position\ngeometry_msgs/Vector3 velocity\n"
+            "geometry_msgs/Vector3 acceleration\ngeometry_msgs/Vector3 size\nuint16 classification\n"
+            "float32[6] position_covariance\nfloat32[6] velocity_covariance\n"
+            "float32[6] acceleration_covariance\n"
+            "float32[6] size_covariance\n"
+        ),
+    ),
+    "radar_msgs/msg/RadarTracks": (
+        ("radar_msgs/msg/RadarTrack",),
+        "std_msgs/Header header\nradar_msgs/RadarTrack[] tracks\n",
+    ),
+}
 
 
 @lru_cache(maxsize=2)
@@ -200,3 +257,9 @@ class McapLog:
             )
         data = self.messages.serialised(message)
         self.writer.add_message(self._channels[topic], log_time=stamp_ns, publish_time=stamp_ns, data=data)
+
+
+def register(store: Typestore, msgtype: str) -> None:
+    """Add one type of DEFINITIONS and the types it needs."""
+    for name in (*DEFINITIONS[msgtype][0], msgtype):
+        store.register(get_types_from_msg(DEFINITIONS[name][1], name))

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.evaluate.recording import ReflectorFiles
+from pipeline.rig.day_prior import read_transforms
 from pipeline.rig.differences import ComparedRun, Comparison
-from pipeline.rig.prior_file import read_transforms
 from pipeline.rig.se3 import from_quaternion, inverse, log_se3
 from pipeline.rig.targets import (
     Picks,

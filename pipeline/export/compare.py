@@ -14,7 +14,7 @@ from pipeline.rig.changes import change_between, change_covariance
 from pipeline.rig.differences import PairDifference
 from pipeline.rig.edges import edge_order
 from pipeline.rig.se3 import inverse, log_se3
-from pipeline.rig.target_sigmas import target_sigmas
+from pipeline.rig.targets import target_sigmas
 
 __all__ = ["Side", "compare", "composed"]
 

@@ -24,8 +24,8 @@ from pipeline.ingest.index import DayIndex
 from pipeline.ingest.messages.point_cloud import LidarCloud
 from pipeline.ingest.messages.radar import RadarCloud
 from pipeline.ingest.sync import Rejection, none_near
+from pipeline.rig.edges import pose_columns
 from pipeline.rig.graph import BASE, Sensor, possible_edges
-from pipeline.rig.pose_columns import pose_columns
 from pipeline.rig.prior import Star, between, middle_of, star_of, to_rows
 from pipeline.rig.rig import Rig
 from schemas.captures import Capture

@@ -15,12 +15,19 @@ from pipeline.ingest.directions_and_units import AskedRadar, Motion, motion_of, 
 from pipeline.ingest.readiness import DofVerdict, Evidence, in_order, judge_edge
 from pipeline.rig.cameras import camera_of
 from pipeline.rig.graph import BASE, Edge, RigGraph, Sensor, possible_edges
-from pipeline.rig.overlap import Overlap, find_edges, overlaps_of
+from pipeline.rig.overlap import (
+    FRAMES,
+    Overlap,
+    View,
+    find_edges,
+    overlaps_of,
+    view_of_camera,
+    view_of_clouds,
+)
 from pipeline.rig.prior import RigPrior, Star, between, middle_of
 from pipeline.rig.rig import Rig
 from pipeline.rig.scan_rows import rows_of
 from pipeline.rig.spherical import to_spherical
-from pipeline.rig.views import FRAMES, View, view_of_camera, view_of_clouds
 from pipeline.store.views import frame_of, priors_of
 from schemas.calibrations import SENSORS
 from schemas.captures import Capture, Image, Scan, Sweep

@@ -30,9 +30,9 @@ from pipeline.ingest.sync import (
     number_drives,
 )
 from pipeline.objective.stamp_gaps import motion_gates_ns
+from pipeline.rig.day_prior import read_star
 from pipeline.rig.graph import possible_edges
 from pipeline.rig.prior import Star
-from pipeline.rig.prior_file import read_star
 from pipeline.rig.rig import Rig
 from schemas.captures import Capture
 from schemas.faults import FAULTS

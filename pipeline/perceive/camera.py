@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Protocol, no_type_check, runtime_checkable
 
 import cv2
@@ -14,13 +15,14 @@ from jaxtyping import Float32, UInt8
 from pipeline.core.config import PerceiveConfig
 from pipeline.core.rigs import RoadUser, TopicSemantics
 from pipeline.perceive.labels import ROAD_ID, SKY_ID, road_user_name, to_cityscapes
-from pipeline.perceive.rejections import FrameReason, FrameRejectedError
 from schemas.captures import ImageColumns
 
 __all__ = [
     "BatchedSource",
     "CameraSemantics",
     "Detections",
+    "FrameReason",
+    "FrameRejectedError",
     "SemanticsSource",
     "TopicSource",
     "decode_colour",
@@ -35,6 +37,29 @@ _FLAT_PNG = (
     cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE,
     cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE,
 )  # fmt: skip
+
+
+class FrameReason(StrEnum):
+    """Reasons against a frame; the value is the key of the counts."""
+
+    UNDECODABLE_IMAGE = "image_undecodable"
+    IMAGE_SIZE = "image_size_differs_from_camera_info"
+    CAMERA_MODEL = "camera_model_invalid"
+    NO_LABELS = "labels_missing"
+    UNDECODABLE_LABELS = "labels_undecodable"
+    LABELS_SHAPE = "labels_aspect_differs_from_image"
+    NO_DETECTIONS = "detections_missing"
+    BAD_DETECTIONS = "detections_invalid"
+    FEW_LIDAR_POINTS = "lidar_points_too_few"
+    FEW_RADAR_POINTS = "radar_points_too_few"
+
+
+class FrameRejectedError(Exception):
+    """One frame cannot be used, for `reason`; handled within the stage."""
+
+    def __init__(self, reason: FrameReason) -> None:
+        self.reason = reason
+        super().__init__(reason.value)
 
 
 @dataclass(frozen=True, eq=False)

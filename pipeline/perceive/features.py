@@ -23,15 +23,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from pipeline.core.config import PerceiveConfig
-from pipeline.perceive.camera import CameraSemantics, SemanticsSource, decode_grey, encode_png
+from pipeline.perceive.camera import CameraSemantics, FrameReason, SemanticsSource, decode_grey, encode_png
 from pipeline.perceive.depth_edges import lidar_edges
 from pipeline.perceive.drivable import DrivableSource, free_sector
 from pipeline.perceive.ego_velocity import RadarMotion, Travel, radar_motion
 from pipeline.perceive.ground import PointSource, find_ground
-from pipeline.perceive.label_gradients import label_gradients
-from pipeline.perceive.labels import ROAD_ID, VOID_ID
+from pipeline.perceive.labels import ROAD_ID, VOID_ID, label_gradients
 from pipeline.perceive.lidar import cluster_boxes, cluster_objects, sample_uniformly
-from pipeline.perceive.rejections import FrameReason
 from pipeline.perceive.road_markings import lidar_markings, road_contrast
 from pipeline.perceive.tracks import EgoMotion, TrackState, advance_tracks, measure_clusters
 from pipeline.rig.cameras import camera_of

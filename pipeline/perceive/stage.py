@@ -13,7 +13,13 @@ from pipeline.core.config import FleetConfig, PerceiveConfig
 from pipeline.core.errors import ModelOutputError
 from pipeline.core.rigs import LidarTopics, OnnxSemantics, RadarTopics, TopicSemantics
 from pipeline.core.stage_work import NothingUsable, Run, Task, Work
-from pipeline.perceive.camera import BatchedSource, SemanticsSource, TopicSource
+from pipeline.perceive.camera import (
+    BatchedSource,
+    FrameReason,
+    FrameRejectedError,
+    SemanticsSource,
+    TopicSource,
+)
 from pipeline.perceive.drivable import DrivableSource
 from pipeline.perceive.ego_velocity import RadarMotion
 from pipeline.perceive.features import (
@@ -27,7 +33,6 @@ from pipeline.perceive.features import (
     why_unusable,
 )
 from pipeline.perceive.ground import PointSource
-from pipeline.perceive.rejections import FrameReason, FrameRejectedError
 from pipeline.perceive.tracks import TrackState
 from pipeline.perceive.untimed_sweeps import Turning, turning_of
 from pipeline.rig.graph import BASE, Kind, Sensor, possible_edges

@@ -1,17 +1,19 @@
-"""Edges in table columns: the pair (kind of the edge) and the names of its two sensors."""
+"""Edges and poses in table columns: the pair (kind of the edge) and the names of its two sensors."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Final, cast
+from collections.abc import Callable, Mapping
+from typing import Any, Final, cast
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from pipeline.rig.graph import EDGE_KINDS, TIE_KINDS, Edge, Kind, Sensor
+from pipeline.rig.se3 import from_quaternion, to_quaternion
 from schemas.calibrations import FRAMES_OF_PAIR, CalibrationRecord
+from schemas.columns import POSE_COLUMNS
 from schemas.drift import DriftFinding
 from schemas.states import StateRow
 
@@ -22,6 +24,8 @@ __all__ = [
     "edge_of",
     "edge_order",
     "edges_of_rows",
+    "pose_columns",
+    "pose_of",
     "words_of",
 ]
 
@@ -73,3 +77,15 @@ def _edge_or_none(pair: str, parent: str, child: str) -> Edge | None:
         return edge_named(pair, parent, child)
     except ValueError:
         return None
+
+
+def pose_columns(T: Float[np.ndarray, "4 4"] | None, prefix: str = "") -> dict[str, Any]:
+    """Columns of a pose, their names with a prefix; all null without a pose."""
+    values = [None] * 7 if T is None else [float(v) for v in (*to_quaternion(T), *T[:3, 3])]
+    return {f"{prefix}{name}": value for name, value in zip(POSE_COLUMNS, values, strict=True)}
+
+
+def pose_of(column: Callable[[str], Any], prefix: str = "") -> Float[np.ndarray, "4 4"] | None:
+    """The pose in the columns of a prefix, each given by its name; None if one is null."""
+    values = [column(prefix + name) for name in POSE_COLUMNS]
+    return None if None in values else from_quaternion(np.array(values[:4]), np.array(values[4:]))

@@ -6,6 +6,8 @@ import re
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any, Final, TypeVar
 
+import numpy as np
+from jaxtyping import Float
 from pydantic import (
     Field,
     field_validator,
@@ -25,8 +27,9 @@ from pipeline.core.rigs import (
     TopicSemantics,
 )
 from pipeline.rig.graph import BASE, KINDS, Edge, Sensor, edge_between, possible_edges
+from pipeline.rig.se3 import exp_so3, from_rotation_translation
 
-__all__ = ["SECTIONS", "Rig"]
+__all__ = ["SECTIONS", "TURN_AXES", "Rig", "sensor_turn"]
 
 SECTIONS: Final = {
     "camera": "cameras",
@@ -36,6 +39,10 @@ SECTIONS: Final = {
 # Names are file names in the lake, keys of maps and ends of edges.
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")
 _Topics = TypeVar("_Topics")
+TURN_AXES = ("azimuth", "elevation", "roll")
+# A camera looks along z of its frame, other sensors look along x.
+_OF_CAMERA = {"azimuth": 1, "elevation": 0, "roll": 2}
+_OF_OTHERS = {"azimuth": 2, "elevation": 1, "roll": 0}
 
 
 class Rig(Section):
@@ -318,3 +325,10 @@ def _only(section: str, of: Mapping[str, _Topics]) -> _Topics | None:
         problem = f"this works on one of {section} so far, and the rig has {_listed(of)}"
         raise ConfigError("fleet.toml", f"rigs.*.{section}", problem)
     return next(iter(of.values()), None)
+
+
+def sensor_turn(axis: str, angle_rad: float, *, of_camera: bool) -> Float[np.ndarray, "4 4"]:
+    """T_sensor_turned."""
+    omega = np.zeros(3)
+    omega[(_OF_CAMERA if of_camera else _OF_OTHERS)[axis]] = angle_rad
+    return from_rotation_translation(exp_so3(omega), np.zeros(3))

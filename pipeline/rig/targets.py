@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from jaxtyping import Float
 
 from pipeline.rig.cameras import Camera
-from pipeline.rig.se3 import inverse, transform_points
+from pipeline.rig.se3 import exp_se3, inverse, transform_points
 from pipeline.rig.spherical import camera_direction_angles, from_spherical, to_spherical, wrap_angle
 
 __all__ = [
@@ -26,6 +27,8 @@ __all__ = [
     "errors_of_picks",
     "loop_error_sigma",
     "loop_errors",
+    "target_jacobian",
+    "target_sigmas",
 ]
 
 # Three reflectors in the shared field of view of sensors that look ahead: azimuth, elevation [rad], range
@@ -33,6 +36,7 @@ __all__ = [
 DEFAULT_TARGETS = from_spherical(
     np.array([[np.radians(-10), 0, 15.0], [np.radians(8), 0, 25.0], [0.0, 0, 40.0]])
 )
+_STEP = 1e-5  # of central differences [rad and m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,3 +144,33 @@ def _mean_error(pair: str, points: np.ndarray, true: np.ndarray) -> np.ndarray:
         angles = camera_direction_angles(points) - camera_direction_angles(true)
         distance = np.linalg.norm(points, axis=1) - np.linalg.norm(true, axis=1)
     return np.array([*np.abs(wrap_angle(angles)).mean(axis=0), np.abs(distance).mean()])
+
+
+def target_jacobian(
+    pair: str, T: Float[np.ndarray, "4 4"], targets: Float[np.ndarray, "N 3"] = DEFAULT_TARGETS
+) -> Float[np.ndarray, "2 N 6"]:
+    """d(azimuth, elevation of each target) / d(left perturbation of T) [rad per rad and m]."""
+    angles = camera_direction_angles if pair.startswith("camera") else to_spherical
+    points = transform_points(T, targets)
+    columns = []
+    for steps in _nudges():
+        ahead, behind = (angles(transform_points(step, points)) for step in steps)
+        columns.append(wrap_angle(ahead[:, :2] - behind[:, :2]) / (2 * _STEP))
+    return np.stack(columns, -1).transpose(1, 0, 2)
+
+
+@cache
+def _nudges() -> tuple[tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "4 4"]], ...]:
+    """Small twists forward and back along each axis, cached: computing them dominated the Jacobian."""
+    return tuple((exp_se3(_STEP * axis), exp_se3(-_STEP * axis)) for axis in np.eye(6))
+
+
+def target_sigmas(
+    pair: str,
+    T: Float[np.ndarray, "4 4"],
+    covariance: Float[np.ndarray, "6 6"],
+    targets: Float[np.ndarray, "N 3"] = DEFAULT_TARGETS,
+) -> Float[np.ndarray, " 2"]:
+    """One sigma of azimuth and elevation [rad] at the targets, root mean square over them."""
+    J = target_jacobian(pair, T, targets)
+    return np.sqrt(np.einsum("dni,ij,dnj->dn", J, covariance, J).mean(axis=1))

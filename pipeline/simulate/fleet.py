@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import sys
+from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, date, datetime, timedelta
@@ -17,13 +18,13 @@ import numpy as np
 
 from pipeline.core.errors import ConfigError
 from pipeline.core.results import Progress, silent
+from pipeline.rig.topics import TOPICS, topics_of
 from pipeline.simulate.faults import Fault, faults_on, shaken
-from pipeline.simulate.logs.fleet_toml import mixed_fleet_toml
 from pipeline.simulate.logs.frame_messages import Setup
-from pipeline.simulate.logs.recording import FIRST_FRAME_S, record_drive
-from pipeline.simulate.logs.writers import CONTAINERS, log_name, open_log
+from pipeline.simulate.logs.recording import CONTAINERS, FIRST_FRAME_S, log_name, open_log, record_drive
+from pipeline.simulate.sensors.data_sheets import CameraSpec, RadarSpec
 from pipeline.simulate.sensors.mounting import Mounting, mounting_of
-from pipeline.simulate.sensors.rig_spec import RigSpec
+from pipeline.simulate.sensors.rig_spec import RigSpec, SensorSpec
 from pipeline.simulate.sensors.rigs import rig_named
 from pipeline.simulate.sensors.semantics import SemanticsSpec
 from pipeline.simulate.truth import truth_of
@@ -35,6 +36,8 @@ __all__ = [
     "FleetSpec",
     "day_names",
     "drive_of",
+    "fleet_toml",
+    "mixed_fleet_toml",
     "mounting_on",
     "rig_of",
     "rigs_of",
@@ -262,3 +265,68 @@ def _truth(spec: FleetSpec, vehicle: int, day: int) -> dict[str, Any]:
         **truth_of(rig_of(spec, vehicle), morning, evening, faults_on(spec.faults, name, day)),
         "faults": [asdict(f) | {"active": f.day <= day} for f in spec.faults if f.vehicle == name],
     }
+
+
+def fleet_toml(fleet: str, rig_name: str, rig: RigSpec, vehicles: list[str]) -> str:
+    """Text of fleet.toml; the prior's sigmas are deviations of a pair of sensors from CAD."""
+    return _text(fleet, {rig_name: rig}, dict.fromkeys(vehicles, rig_name))
+
+
+def mixed_fleet_toml(fleet: str, rigs: Mapping[str, RigSpec]) -> str:
+    """Text of fleet.toml for vehicles with a rig each."""
+    return _text(fleet, {r.name: r for r in rigs.values()}, {v: r.name for v, r in rigs.items()})
+
+
+def _text(fleet: str, rigs: Mapping[str, RigSpec], vehicles: Mapping[str, str]) -> str:
+    lines = ["[fleet]", f'name = "{fleet}"', ""]
+    for name, rig in rigs.items():
+        lines += [*_sections(name, rig), ""]
+    for vehicle, rig_name in vehicles.items():
+        lines += [f'[vehicles."{vehicle}"]', f'rig = "{rig_name}"', ""]
+    return "\n".join(lines[:-1]) + "\n"
+
+
+def _sections(rig_name: str, rig: RigSpec) -> list[str]:
+    lines = (
+        []
+        if rig.is_short
+        else [f"[rigs.{rig_name}]", f'reference = "{rig.reference.name}"', 'base = "base_link"', ""]
+    )
+    for sensor in rig.sensors:
+        lines += [f"[rigs.{rig_name}.{sensor.kind}{'' if rig.is_short else f's.{sensor.name}'}]"]
+        lines += _sensor(sensor)
+        lines.append("")
+    return [
+        *lines,
+        f"[rigs.{rig_name}.ego]",
+        f'odometry = "{TOPICS["odometry"]}"',
+        "",
+        f"[rigs.{rig_name}.prior]",
+        'source = "tf_static"',
+        "rotation_sigma_deg = 1.2",
+        "translation_sigma_m = 0.03",
+    ]
+
+
+def _sensor(sensor: SensorSpec) -> list[str]:
+    topics, sheet = topics_of(sensor.name, sensor.kind), sensor.sheet
+    if isinstance(sheet, CameraSpec):
+        return [
+            f'image = "{topics["image"]}"',
+            f'info = "{topics["info"]}"',
+            (
+                f'semantics = {{ source = "topics", labels = "{topics["labels"]}", '
+                f'detections = "{topics["detections"]}", label_set = "cityscapes" }}'
+            ),
+            *([f"readout_s = {sheet.readout_s}"] if sheet.readout_s else []),
+        ]
+    points = [f'points = "{topics["points"]}"']
+    if not isinstance(sheet, RadarSpec):
+        return points
+    period = sheet.doppler_period_mps
+    return [
+        *points,
+        'doppler_field = "doppler"',
+        f'doppler_positive = "{sheet.doppler_positive}"',
+        *([f"doppler_period_mps = {period}"] if period is not None else []),
+    ]

@@ -21,8 +21,7 @@ from pipeline.rig.se3 import inverse, transform_points
 from pipeline.rig.topics import TOPICS
 from pipeline.simulate.fleet import FleetSpec, day_names, mounting_on, rig_of, vehicle_names
 from pipeline.simulate.logs.frame_messages import Setup, messages_of
-from pipeline.simulate.logs.recording import nominal_poses
-from pipeline.simulate.logs.writers import open_log
+from pipeline.simulate.logs.recording import nominal_poses, open_log
 from pipeline.simulate.sensors.mounting import Mounting
 from pipeline.simulate.sensors.radar import Scan
 from pipeline.simulate.sensors.simulated_frame import Scene, Seat, frame_of, triggered_stamps

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
-from pipeline.rig.pose_columns import pose_of
+from pipeline.rig.edges import pose_of
 from schemas.states import STATES, StateRow
 from schemas.words import AXIS_NAMES, axes_in_words
 

@@ -28,8 +28,7 @@ from pipeline.core.stage_work import Probes
 from pipeline.rig.changes import change_between, change_covariance
 from pipeline.rig.edges import edge_of, words_of
 from pipeline.rig.se3 import adjoint, inverse, log_se3
-from pipeline.rig.target_sigmas import target_jacobian, target_sigmas
-from pipeline.rig.targets import DEFAULT_TARGETS
+from pipeline.rig.targets import DEFAULT_TARGETS, target_jacobian, target_sigmas
 from pipeline.store.current import prior_of, targets_of, transform_of
 from pipeline.verify.one_axis import AxisCheck, AxisLimits, HeldOut, checked, silent
 from schemas.calibrations import PROBE_Z, CalibrationRecord

@@ -13,8 +13,8 @@ from pipeline.core.errors import SolveError
 from pipeline.rig.day_prior import rig_prior
 from pipeline.rig.graph import Sensor
 from pipeline.rig.prior import RigPrior
+from pipeline.rig.rig import TURN_AXES
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, log_so3
-from pipeline.rig.sensor_turns import TURN_AXES
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import perceived
 from pipeline.verify.axes import (

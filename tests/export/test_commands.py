@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.export.calibration import FrameNames
 from pipeline.export.formats import format_named
-from pipeline.rig.prior_file import read_transforms
+from pipeline.rig.day_prior import read_transforms
 from pipeline.store.commits import commit_records
 from pipeline.store.current import transform_of
 from pipeline.store.partitions import Lake, Partition

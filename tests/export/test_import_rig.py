@@ -10,9 +10,9 @@ from pipeline.core.config import load_fleet
 from pipeline.export.calibration import ExportedCalibration, ExportedPair, FrameNames
 from pipeline.export.files import write_files, written_files
 from pipeline.export.formats import FORMATS, format_named
+from pipeline.rig.day_prior import read_star
 from pipeline.rig.edges import words_of
 from pipeline.rig.graph import Sensor, tie
-from pipeline.rig.prior_file import read_star
 from pipeline.rig.se3 import inverse
 from tests.makers.calibrations import CAMERA, random_transform
 from tests.makers.commands import command

@@ -9,7 +9,7 @@ import pytest
 from jobs.cli import main
 from jobs.frame_options import FrameOptions
 from jobs.verify import _as_prior
-from pipeline.rig.prior_file import read_transforms
+from pipeline.rig.day_prior import read_transforms
 from pipeline.rig.se3 import exp_so3, from_rotation_translation
 from tests.makers.simulated_days import simulated_day
 

@@ -11,7 +11,7 @@ from jobs.frame_options import FrameOptions
 from jobs.verify import _of_poses
 from pipeline.core.config import load_fleet
 from pipeline.core.errors import ConfigError
-from pipeline.rig.prior_file import read_star
+from pipeline.rig.day_prior import read_star
 from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake
 from schemas.calibrations import CALIBRATIONS

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.objective.radar.medians import median_of_rows
 from pipeline.objective.radar.moving_clusters import (
     camera_azimuth_residuals,
     lidar_azimuth_residuals,
@@ -16,6 +15,7 @@ from pipeline.objective.radar.vehicle_boxes import (
     box_equations,
     box_pairs,
     elevation_residuals,
+    median_of_rows,
     vehicle_boxes,
 )
 from pipeline.rig.se3 import exp_se3, transform_points

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.objective.camera_lidar.brightness_maps import Start, free_ground, step_offsets
+from pipeline.objective.camera_lidar.image_maps import Start, free_ground, step_offsets
 from pipeline.rig.cameras import Camera
 from pipeline.rig.se3 import exp_so3, from_rotation_translation
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT, STEP_BELOW, STEP_RIGHT

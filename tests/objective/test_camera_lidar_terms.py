@@ -8,8 +8,7 @@ import pytest
 from pipeline.calibrate.joint.camera_lidar.estimate import AlignmentState
 from pipeline.objective.camera_lidar.edges import chance_of, fit_match_share
 from pipeline.objective.camera_lidar.image_maps import NO_BOUNDARY, CameraMaps, boundary_offsets
-from pipeline.objective.camera_lidar.own_motion import lidar_velocities
-from pipeline.objective.camera_lidar.points import Points
+from pipeline.objective.camera_lidar.points import Points, lidar_velocities
 from pipeline.objective.camera_lidar.projection_loops import camera_parameters, project_point, project_points
 from pipeline.objective.camera_lidar.score import Alignments, KernelSettings, Terms, prepare_terms
 from pipeline.rig.cameras import Camera

@@ -13,7 +13,7 @@ from pipeline.calibrate.joint.camera_lidar.estimate import (
 from pipeline.calibrate.verify.held_out_score import held_out_score
 from pipeline.core.config import SolveConfig
 from pipeline.core.rigs import CameraPrior
-from pipeline.objective.camera_lidar.rolling_shutter import row_delays_s
+from pipeline.objective.camera_lidar.points import row_delays_s
 from pipeline.objective.camera_lidar.score import KernelSettings, prepare_terms
 from pipeline.rig.estimates import Prior
 from pipeline.rig.se3 import exp_so3, inverse, log_so3, perturb_exactly, transform_points

@@ -8,8 +8,14 @@ import pytest
 
 from pipeline.core.config import PerceiveConfig
 from pipeline.core.rigs import TopicSemantics
-from pipeline.perceive.camera import TopicSource, decode_grey, label_size, resize_labels
-from pipeline.perceive.rejections import FrameReason, FrameRejectedError
+from pipeline.perceive.camera import (
+    FrameReason,
+    FrameRejectedError,
+    TopicSource,
+    decode_grey,
+    label_size,
+    resize_labels,
+)
 
 TOPICS = TopicSemantics(source="topics", labels="/l", detections="/d")
 OWN_CLASSES = TOPICS.model_copy(update={"classes": {"2": "truck"}})

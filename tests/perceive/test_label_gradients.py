@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.perceive.label_gradients import BINS, REACH_PX, label_gradients
+from pipeline.perceive.labels import BINS, REACH_PX, label_gradients
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
 
 CAR, BUILDING, ROAD, SKY = 13, 2, 0, 10

@@ -9,7 +9,7 @@ from pipeline.core.config import load_fleet
 from pipeline.core.errors import ConfigError
 from pipeline.rig.topics import TOPICS
 from pipeline.simulate.fleet import FleetSpec, simulate_fleet, simulate_vehicle_day
-from pipeline.simulate.logs.writers import CONTAINERS, log_name, open_log
+from pipeline.simulate.logs.recording import CONTAINERS, log_name, open_log
 from pipeline.simulate.reflectors import simulate_reflectors
 
 SMALL = {"vehicles": 1, "days": 1, "frames": 2, "drives": 1, "environments": "urban"}

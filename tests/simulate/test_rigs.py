@@ -7,14 +7,12 @@ from scipy.spatial import cKDTree
 from pipeline.core.config import load_fleet
 from pipeline.core.errors import ConfigError
 from pipeline.rig.topics import TOPICS
-from pipeline.simulate.fleet import FleetSpec, drive_of, simulate_vehicle_day
-from pipeline.simulate.logs.fleet_toml import fleet_toml, mixed_fleet_toml
-from pipeline.simulate.sensors.camera import render, view_of
+from pipeline.simulate.fleet import FleetSpec, drive_of, fleet_toml, mixed_fleet_toml, simulate_vehicle_day
+from pipeline.simulate.sensors.camera import RollingShutter, render, view_of
 from pipeline.simulate.sensors.data_sheets import LidarSpec
 from pipeline.simulate.sensors.lidar import beams_of
 from pipeline.simulate.sensors.mounting import mounting_of
 from pipeline.simulate.sensors.rigs import RIGS, rig_named
-from pipeline.simulate.sensors.rolling_shutter import RollingShutter
 from pipeline.simulate.world.casting import World
 from pipeline.simulate.world.drives import Drive
 

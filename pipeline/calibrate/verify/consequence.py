@@ -11,8 +11,7 @@ from pipeline.calibrate.verify.edge_result import EdgeResult
 from pipeline.calibrate.verify.target_accuracy import DIRECTIONS, Claim
 from pipeline.rig.changes import change_covariance, change_jacobian, changed
 from pipeline.rig.checks import Change, FailedCheck
-from pipeline.rig.target_sigmas import target_sigmas
-from pipeline.rig.targets import errors_at_targets
+from pipeline.rig.targets import errors_at_targets, target_sigmas
 
 __all__ = ["RANGE", "at_targets", "exceeded_by", "tilt_in_doubt"]
 

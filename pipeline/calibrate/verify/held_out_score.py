@@ -27,7 +27,7 @@ from pipeline.calibrate.numerics.response_surface import DESIGN, fit_quadratics
 from pipeline.calibrate.verify.held_out_update import FrameDerivatives
 from pipeline.core.config import SolveConfig
 from pipeline.objective.camera_lidar.label_width import widened
-from pipeline.objective.camera_lidar.own_motion import lidar_velocities
+from pipeline.objective.camera_lidar.points import lidar_velocities
 from pipeline.objective.camera_lidar.score import Alignments, KernelSettings, Start, Terms, prepare_terms
 from pipeline.objective.radar.moving_clusters import (
     azimuth_equations_camera,

@@ -19,7 +19,7 @@ from pipeline.core.config import ChecksConfig
 from pipeline.rig.changes import change_between, change_covariance, change_jacobian
 from pipeline.rig.checks import FailedCheck
 from pipeline.rig.estimates import PairEstimate, Prior
-from pipeline.rig.target_sigmas import target_jacobian, target_sigmas
+from pipeline.rig.targets import target_jacobian, target_sigmas
 from schemas.calibrations import DOF_NAMES
 
 __all__ = ["clock_alarms", "edge_alarms", "prior_alarms"]

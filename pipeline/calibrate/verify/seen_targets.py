@@ -17,10 +17,10 @@ from jaxtyping import Float
 from pipeline.rig.cameras import camera_of
 from pipeline.rig.checks import FailedCheck
 from pipeline.rig.estimates import Prior
+from pipeline.rig.overlap import FRAMES, View, view_of_camera, view_of_clouds
 from pipeline.rig.se3 import transform_points
 from pipeline.rig.spherical import from_spherical, to_spherical, wrap_angle
 from pipeline.rig.targets import DEFAULT_TARGETS
-from pipeline.rig.views import FRAMES, View, view_of_camera, view_of_clouds
 from schemas.calibrations import FRAMES_OF_PAIR
 from schemas.observations import Observation
 

@@ -24,8 +24,7 @@ from scipy.special import ndtr, ndtri
 
 from pipeline.calibrate.verify.held_out_update import HeldOutUpdate
 from pipeline.core.config import ChecksConfig
-from pipeline.rig.target_sigmas import target_jacobian, target_sigmas
-from pipeline.rig.targets import DEFAULT_TARGETS
+from pipeline.rig.targets import DEFAULT_TARGETS, target_jacobian, target_sigmas
 
 __all__ = ["DIRECTIONS", "Claim", "claims_of", "target_jacobian", "target_sigmas"]
 

@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_
 from rosbags.typesys.store import Typestore
 
 from pipeline.core.errors import LogError
-from pipeline.core.ros_definitions import DEFINITIONS, register
+from pipeline.core.ros_messages import DEFINITIONS, register
 from pipeline.ingest.containers.reader import PROTOBUF, READ_ERRORS, Channel
 from pipeline.ingest.messages import protobuf
 from pipeline.ingest.messages.foxglove import as_ros

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from pipeline.core.third_party_models import semantics_line
+from pipeline.core.models import semantics_line
 from pipeline.ingest.messages.point_cloud import TIME_FIELDS
 from pipeline.ingest.propose.sensors import FoundCamera, FoundCloud, FoundSensors
 

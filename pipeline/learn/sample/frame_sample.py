@@ -16,8 +16,8 @@ from pipeline.learn.sample.clouds import View, lidar_columns, padded_rows, radar
 from pipeline.learn.sample.grid import Grid, resample_camera
 from pipeline.objective.paper.classes import labels_of
 from pipeline.rig.cameras import Camera, camera_of
+from pipeline.rig.edges import pose_columns
 from pipeline.rig.estimates import Prior
-from pipeline.rig.pose_columns import pose_columns
 from pipeline.rig.spherical import camera_direction_angles
 from schemas.frames import Frame
 from schemas.observations import Observation

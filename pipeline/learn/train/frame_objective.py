@@ -17,10 +17,9 @@ from torch import Tensor
 from pipeline.learn.batches.batch import TrainingBatch
 from pipeline.learn.train.running_mean import twist_between
 from pipeline.learn.train.settings import PAIRS_OF, LossConfig
-from pipeline.objective.differentiable.lookup import nearest_pixel
 from pipeline.objective.differentiable.paper import smooth_iou
 from pipeline.objective.differentiable.poses import inverse, loop_loss, transform_points
-from pipeline.objective.differentiable.projection import GridProjection
+from pipeline.objective.differentiable.projection import GridProjection, nearest_pixel
 from pipeline.objective.differentiable.static import (
     StaticFrames,
     elevation_limits,

@@ -1,13 +1,27 @@
-"""Points of the camera-lidar terms: gathered from observations, in or near the camera's view, sorted into kinds."""
+"""Points of the camera-lidar terms: gathered from observations, in or near the camera's view, sorted into kinds.
+
+Rolling shutter: the rows of an image are exposed from the top to the bottom during the readout time; the
+frame's time is that of the middle row. A point on row v of h was exposed ((v + 1/2)/h - 1/2) readouts later, after the car had moved on.
+Stamps that mean the first or the last row are half a readout off, which the time offset takes up like any
+other clock.
+
+Points are moved once for one pose, not in the loops over poses, because the change of a point's row between
+poses changes its delay by only a few hundredths.
+
+Source: Meingast, Geyer, Sastry 2005, section 3 (projection along a row's own pose).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import no_type_check
 
+import numba
 import numpy as np
 from jaxtyping import Bool, Float
 
+from pipeline.objective.ego_motion import shown_heading
 from pipeline.rig.cameras import Camera
 from schemas.observations import Observation
 
@@ -15,10 +29,15 @@ __all__ = [
     "CLASSES",
     "EDGE_KINDS",
     "Points",
+    "exposed",
     "gather_classes",
     "gather_edges",
     "gather_markings",
     "is_near_view",
+    "lidar_velocities",
+    "motion_in_camera",
+    "moving_poses",
+    "row_delays_s",
     "view_bounds",
 ]
 
@@ -35,6 +54,7 @@ _CLASS_HEIGHTS_M = (0.25, 1.0, 2.5, 5.0)
 _CLASS_RANGES_M = (12.0, 25.0)
 CLASSES = (len(_CLASS_HEIGHTS_M) + 1) * (len(_CLASS_RANGES_M) + 1)
 _CLASS_STRIDE = 8  # of the sampled cloud: neighbours are redundant
+_ROUNDS = 2  # the second moves rows by what the first left: a hundredth of the delay at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,3 +217,110 @@ def _gather(
         np.zeros(len(columns[0]), np.float32),
         np.arange(len(frames), dtype=np.int64),
     )
+
+
+@no_type_check  # keeps the tests' shape checks out of compiled code
+@numba.njit(cache=True, nogil=True)
+def moving_poses(
+    R: np.ndarray,
+    t: np.ndarray,
+    dt_s: np.ndarray,
+    gap_s: np.ndarray,
+    velocity: np.ndarray,
+    yaw_rate: np.ndarray,
+) -> np.ndarray:
+    """[R Rz(yaw_rate tau) | R Rz(yaw_rate tau) v tau + t] as rows, tau = dt - gap, for each pose and frame."""
+    count, frames = R.shape[0], velocity.shape[0]
+    out = np.empty((count, frames, 12), np.float32)
+    for p in range(count):
+        for f in range(frames):
+            tau = dt_s[p] - gap_s[f]
+            c, s = np.cos(yaw_rate[f] * tau), np.sin(yaw_rate[f] * tau)
+            for i in range(3):
+                a, b, d = c * R[p, i, 0] + s * R[p, i, 1], c * R[p, i, 1] - s * R[p, i, 0], R[p, i, 2]
+                ahead = a * velocity[f, 0] + b * velocity[f, 1] + d * velocity[f, 2]
+                row = 4 * i
+                out[p, f, row], out[p, f, row + 1], out[p, f, row + 2] = a, b, d
+                out[p, f, row + 3] = ahead * tau + t[p, i]
+    return out
+
+
+def motion_in_camera(
+    poses: Float[np.ndarray, "F 12"],
+    t_camera_lidar: Float[np.ndarray, " 3"],
+    velocity_lidar: Float[np.ndarray, "F 3"],
+    yaw_rate: Float[np.ndarray, " F"],
+) -> Float[np.ndarray, "F 4"]:
+    """Velocity in camera axes and yaw rate: a point moves by velocity + yaw_rate up x (point - pose's translation)."""
+    rows = poses.reshape(-1, 3, 4)
+    # The turn is about the lidar, which is where the pose's translation was before the way driven.
+    turn = yaw_rate[:, None] * np.cross(rows[:, :, 2], rows[:, :, 3] - t_camera_lidar)
+    velocity = np.einsum("fij,fj->fi", rows[:, :, :3], velocity_lidar) + turn
+    return np.column_stack([velocity, yaw_rate])
+
+
+def lidar_velocities(
+    observations: Sequence[Observation],
+    T_lidar_radar: Float[np.ndarray, "4 4"],
+    heading_rad: float | None = None,
+) -> Float[np.ndarray, "F 3"]:
+    """Own velocity in lidar axes [m/s]: the speed along one heading of the day, in the horizontal plane.
+
+    Args:
+        observations: whose speeds are taken, 0 where unknown.
+        T_lidar_radar: turns the radar's Doppler into the heading; where no radar shows it, it is the lidar's
+            x axis.
+        heading_rad: azimuth of the heading where it is known otherwise.
+    """
+    speed = np.array([o.ego_speed_mps if o.ego_speed_mps is not None else 0.0 for o in observations])
+    heading = (shown_heading(observations, T_lidar_radar) or 0.0) if heading_rad is None else heading_rad
+    return speed[:, None] * np.array([np.cos(heading), np.sin(heading), 0.0])
+
+
+def row_delays_s(v_px: Float[np.ndarray, " N"], height_px: int, readout_s: float) -> Float[np.ndarray, " N"]:
+    """Time of image rows after the middle one [s]; rows outside the image count as its border."""
+    return (np.clip((v_px + 0.5) / height_px, 0.0, 1.0) - 0.5) * readout_s
+
+
+def exposed(
+    points: Points,
+    poses: Float[np.ndarray, "F 12"],
+    camera: Camera,
+    velocity_lidar: Float[np.ndarray, "F 3"],
+    yaw_rate: Float[np.ndarray, " F"],
+    readout_s: float,
+) -> Points:
+    """Points where their image rows saw them.
+
+    Args:
+        points: of F frames, at the time of the middle row or as an earlier call left them.
+        poses: rows of the 3x4 transform into the camera at the time of the middle row, by frame.
+        camera: at the size of the label images.
+        velocity_lidar: own velocity in lidar axes [m/s]; the one that an earlier call had.
+        yaw_rate: own [rad/s].
+        readout_s: from the first row to the last (negative: from the last to the first); 0 puts the points
+            back to the time of the middle row.
+    """
+    frame = np.repeat(np.arange(len(poses)), np.diff(points.start))
+    velocity, turn = velocity_lidar[frame], yaw_rate[frame]
+    still = _turned(points.xyz_m.astype(np.float64), turn * points.exposure_s)
+    still += velocity * points.exposure_s[:, None]
+    exposure_s, moved = np.zeros(len(frame)), still
+    for _ in range(_ROUNDS if readout_s else 0):
+        rows = poses[frame].reshape(-1, 3, 4).astype(np.float64)
+        uv, valid = camera.project(np.einsum("nij,nj->ni", rows[:, :, :3], moved) + rows[:, :, 3])
+        exposure_s = np.where(valid, row_delays_s(uv[:, 1], camera.height_px, readout_s), 0.0)
+        # The car was there `exposure_s` later, so static objects were nearer by its motion.
+        moved = _turned(still - velocity * exposure_s[:, None], -turn * exposure_s)
+    return replace(
+        points,
+        xyz_m=np.ascontiguousarray(moved, np.float32),
+        exposure_s=exposure_s.astype(np.float32),
+    )
+
+
+def _turned(points: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
+    """Each point turned about the lidar's vertical by its own angle."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    x, y = points[:, 0], points[:, 1]
+    return np.stack([c * x - s * y, s * x + c * y, points[:, 2]], -1)

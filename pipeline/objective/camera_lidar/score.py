@@ -13,7 +13,6 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Float32, Int64
 
-from pipeline.objective.camera_lidar.brightness_maps import Start
 from pipeline.objective.camera_lidar.edges import (
     chance_of,
     edge_gradients,
@@ -21,23 +20,24 @@ from pipeline.objective.camera_lidar.edges import (
     edge_scores,
     fit_match_share,
 )
-from pipeline.objective.camera_lidar.image_maps import CONTRAST_STEP, CameraMaps, prepare_maps
+from pipeline.objective.camera_lidar.image_maps import CONTRAST_STEP, CameraMaps, Start, prepare_maps
 from pipeline.objective.camera_lidar.kernel_settings import MAX_GAP_PX, WIDEST_GAP_RAD, KernelSettings
 from pipeline.objective.camera_lidar.mutual_information import class_information
-from pipeline.objective.camera_lidar.own_motion import motion_in_camera, moving_poses
 from pipeline.objective.camera_lidar.points import (
     CLASSES,
     EDGE_KINDS,
     Points,
+    exposed,
     gather_classes,
     gather_edges,
     gather_markings,
     is_near_view,
+    motion_in_camera,
+    moving_poses,
     view_bounds,
 )
 from pipeline.objective.camera_lidar.projection_loops import camera_parameters, count_in_view
 from pipeline.objective.camera_lidar.reflectivity import marking_gradients, marking_scores
-from pipeline.objective.camera_lidar.rolling_shutter import exposed
 from pipeline.objective.stamp_gaps import camera_gaps_s
 from schemas.observations import EDGE_ABOVE, Observation
 

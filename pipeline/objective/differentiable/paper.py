@@ -17,9 +17,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pipeline.objective.differentiable.lookup import bilinear, masked_mean
 from pipeline.objective.differentiable.poses import inverse, transform_points
-from pipeline.objective.differentiable.projection import CameraProjection, camera_projection
+from pipeline.objective.differentiable.projection import (
+    CameraProjection,
+    bilinear,
+    camera_projection,
+    masked_mean,
+)
 from pipeline.objective.paper import camera_radar, lidar_radar
 from pipeline.objective.paper.camera_radar import CameraRadarLoss
 from pipeline.objective.paper.cost_maps import FoldedFrames

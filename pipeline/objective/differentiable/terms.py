@@ -16,9 +16,13 @@ from jaxtyping import Bool, Float, Int8, Int64, UInt8
 from torch import Tensor
 
 from pipeline.objective.camera_lidar.image_maps import NO_BOUNDARY
-from pipeline.objective.differentiable.lookup import bilinear_groups, masked_mean, nearest_pixel
 from pipeline.objective.differentiable.poses import transform_points
-from pipeline.objective.differentiable.projection import GridProjection
+from pipeline.objective.differentiable.projection import (
+    GridProjection,
+    bilinear_groups,
+    masked_mean,
+    nearest_pixel,
+)
 from pipeline.objective.paper.camera_lidar import SCALE_RAD as CLASS_SCALE_RAD
 from pipeline.objective.radar.registration import SIGMA_START
 

@@ -24,7 +24,7 @@ from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 from scipy.special import ndtr
 
-from pipeline.objective.radar.frame_equations import rows_of_frames
+from pipeline.objective.radar.registration import rows_of_frames
 from pipeline.rig.se3 import inverse, transform_points
 from pipeline.rig.spherical import to_spherical
 from schemas.observations import Observation

@@ -16,8 +16,8 @@ from jaxtyping import Float, Int64
 from scipy.spatial import cKDTree
 
 from pipeline.core.rows import columns_of
-from pipeline.objective.radar.frame_equations import robust_equations, rows_of_frames
-from pipeline.objective.radar.medians import median_of_rows
+from pipeline.objective.radar.registration import robust_equations, rows_of_frames
+from pipeline.objective.radar.vehicle_boxes import median_of_rows
 from pipeline.objective.stamp_gaps import radar_gaps_s, scan_to_image_s
 from pipeline.rig.cameras import camera_of
 from pipeline.rig.se3 import inverse, transform_points

@@ -18,11 +18,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from pipeline.core.rows import columns_of
+from pipeline.core.rows import columns_of, take_rows
 from pipeline.objective.radar.registration_loops import STATS, accumulate_frames
 from pipeline.rig.se3 import inverse, transform_points
 from schemas.observations import Observation
@@ -36,9 +37,13 @@ __all__ = [
     "VIEW_MARGIN_RAD",
     "NormalEquations",
     "RegistrationFrames",
+    "equations_by_frame",
     "normal_equations",
     "registration_cost",
     "registration_frames",
+    "robust_equations",
+    "rows_of_frames",
+    "spread_of",
     "updated_sigma",
 ]
 
@@ -64,6 +69,9 @@ _FRAME = np.dtype(  # what RegistrationFrames holds of a frame beside its points
         ("frame", "i8"),
     ]
 )
+_Rows = TypeVar("_Rows")
+_LEAST_ROWS = 5  # fewer have no spread to weigh them by
+_LEAST_SIGMA_RAD = np.radians(0.3)  # box edges are no better
 
 
 @dataclass(frozen=True, eq=False)
@@ -315,3 +323,50 @@ def _pack(pieces: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Points one after another, and where each frame begins."""
     first = np.concatenate([[0], np.cumsum([len(p) for p in pieces], dtype=np.int64)]).astype(np.int64)
     return (np.concatenate(pieces) if len(pieces) else np.zeros((0, 3))), first
+
+
+def rows_of_frames(rows: _Rows, frames: Int64[np.ndarray, " S"]) -> _Rows:
+    """The rows of these frames, which are renumbered in the given order."""
+    held: Any = rows
+    place = np.full(int(max(held.frame.max(initial=-1), frames.max(initial=-1))) + 1, -1, np.int64)
+    place[frames] = np.arange(len(frames))
+    index = np.flatnonzero(place[held.frame] >= 0)
+    return replace(take_rows(held, index), frame=place[held.frame[index]])
+
+
+def spread_of(residual: Float[np.ndarray, " B"]) -> float:
+    """Robust standard deviation."""
+    return float(1.4826 * np.median(np.abs(residual - np.median(residual))))
+
+
+def equations_by_frame(
+    weight: Float[np.ndarray, " B"],
+    residual: Float[np.ndarray, " B"],
+    J: Float[np.ndarray, "B P"],
+    frame: Int64[np.ndarray, " B"],
+    frames: int,
+) -> tuple[Float[np.ndarray, "F P P"], Float[np.ndarray, "F P"]]:
+    """Information and gradient of the weighted squares, per frame."""
+    P = J.shape[1]
+    H, g = np.zeros((frames, P, P)), np.zeros((frames, P))
+    np.add.at(H, frame, weight[:, None, None] * J[:, :, None] * J[:, None, :])
+    np.add.at(g, frame, (weight * residual)[:, None] * J)
+    return H, g
+
+
+def robust_equations(
+    residual: Float[np.ndarray, " B"],
+    J: Float[np.ndarray, "B P"],
+    frame: Int64[np.ndarray, " B"],
+    frames: int,
+) -> tuple[Float[np.ndarray, "F P P"], Float[np.ndarray, "F P"], float]:
+    """Per frame, information and gradient of the robust (Cauchy) cost of angles, and the residuals' own sigma [rad].
+
+    Equations are zero, and sigma is NaN, where residuals are too few to show their spread.
+    """
+    if len(residual) < _LEAST_ROWS:
+        none = np.zeros(0)
+        return *equations_by_frame(none, none, J[:0], frame[:0], frames), float("nan")
+    sigma = max(spread_of(residual), _LEAST_SIGMA_RAD)
+    weight = 1 / (1 + (residual / (2 * sigma)) ** 2) / sigma**2
+    return *equations_by_frame(weight, residual, J, frame, frames), sigma

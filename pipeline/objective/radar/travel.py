@@ -32,8 +32,13 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from pipeline.core.rows import columns_of
-from pipeline.objective.radar.frame_equations import equations_by_frame, rows_of_frames, spread_of
-from pipeline.objective.radar.registration import RANGE_M, SIDE_RAD
+from pipeline.objective.radar.registration import (
+    RANGE_M,
+    SIDE_RAD,
+    equations_by_frame,
+    rows_of_frames,
+    spread_of,
+)
 from pipeline.rig.se3 import hat, inverse, transform_points
 from schemas.observations import Observation
 

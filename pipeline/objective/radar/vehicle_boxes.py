@@ -15,8 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from pipeline.core.rows import columns_of
-from pipeline.objective.radar.frame_equations import robust_equations, rows_of_frames
-from pipeline.objective.radar.medians import median_of_rows
+from pipeline.objective.radar.registration import robust_equations, rows_of_frames
 from pipeline.objective.stamp_gaps import scan_to_image_s
 from pipeline.rig.cameras import camera_of
 from pipeline.rig.se3 import hat, transform_points
@@ -30,6 +29,7 @@ __all__ = [
     "box_equations",
     "box_pairs",
     "elevation_residuals",
+    "median_of_rows",
     "vehicle_boxes",
 ]
 
@@ -214,3 +214,9 @@ def _detections_of(
     count = np.searchsorted(r, r + _DEPTH_M, side="right") - np.arange(len(r))
     start = r[int(np.argmax(count))]
     return near[(distance[near] >= start) & (distance[near] <= start + _DEPTH_M)]
+
+
+def median_of_rows(x: Float[np.ndarray, "N ..."]) -> np.ndarray:
+    """Median over the first axis, as `np.median(x, axis=0)` has it; of one row or more, none with a NaN."""
+    ordered = np.sort(x, axis=0)
+    return np.asarray(0.5 * (ordered[(len(x) - 1) // 2] + ordered[len(x) // 2]))

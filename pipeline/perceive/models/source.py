@@ -8,11 +8,10 @@ from typing import Any
 from pipeline.core.config import FleetConfig, PerceiveConfig
 from pipeline.core.errors import ModelError
 from pipeline.core.rigs import OnnxSemantics
-from pipeline.perceive.camera import CameraSemantics, decode_colour, label_size
+from pipeline.perceive.camera import CameraSemantics, FrameRejectedError, decode_colour, label_size
 from pipeline.perceive.models.detector import Detector
 from pipeline.perceive.models.manifest import Manifest, load_manifest
 from pipeline.perceive.models.segmenter import Segmenter
-from pipeline.perceive.rejections import FrameRejectedError
 from pipeline.rig.rig import Rig
 from schemas.captures import ImageColumns
 

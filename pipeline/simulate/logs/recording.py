@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
-from typing import Final, TypeVar
+from pathlib import Path
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
+from rosbags.rosbag1 import Writer as Bag1Writer
+from rosbags.rosbag2 import Writer as Bag2Writer
 
+from pipeline.core.ros_messages import McapLog, RosMessages
 from pipeline.rig.se3 import from_rotation_translation
 from pipeline.rig.topics import TOPICS
 from pipeline.simulate.faults import DayFaults
 from pipeline.simulate.logs.frame_messages import Sent, Setup, messages_of
-from pipeline.simulate.logs.writers import OpenLog
 from pipeline.simulate.sensors.data_sheets import LidarSpec
 from pipeline.simulate.sensors.mounting import Mounting
 from pipeline.simulate.sensors.rig_spec import RigSpec
@@ -27,7 +32,16 @@ from pipeline.simulate.sensors.simulated_frame import (
 from pipeline.simulate.world.casting import World
 from pipeline.simulate.world.drives import Drive
 
-__all__ = ["FIRST_FRAME_S", "Ticks", "free_clocks", "nominal_poses", "record_drive"]
+__all__ = [
+    "CONTAINERS",
+    "FIRST_FRAME_S",
+    "Ticks",
+    "free_clocks",
+    "log_name",
+    "nominal_poses",
+    "open_log",
+    "record_drive",
+]
 
 T = TypeVar("T")
 _ODOMETRY_HZ: Final = 20.0
@@ -38,6 +52,14 @@ _NEIGHBOURS_EVERY: Final = 4
 # Relative rate errors: mechanical lidars keep theirs to some parts in a thousand, quartzes to a hundred in a
 # million. Without them, 30 and 10 Hz would keep a constant gap for a whole drive, as if triggered.
 _RATE_SD: Final = {"camera": 1e-4, "lidar": 3e-3, "radar": 1e-4}
+CONTAINERS: Final = ("mcap", "ros1", "db3")
+
+
+class OpenLog(NamedTuple):
+    """A log open for writing: creates messages, and writes them with put(topic, stamp_ns, message)."""
+
+    messages: RosMessages
+    put: Callable[[str, int, Any], None]
 
 
 @dataclass(frozen=True)
@@ -177,3 +199,58 @@ def free_clocks(rig: RigSpec, rng: np.random.Generator) -> dict[str, Ticks]:
     periods = 1 / (rates * (1 + rng.normal(0, sd)))
     phases = rng.uniform(0, periods)
     return {n: Ticks(float(p), float(a)) for n, p, a in zip(free, periods, phases, strict=True)}
+
+
+def log_name(stem: str, container: str) -> str:
+    """File (or folder) name of a log."""
+    return {"mcap": f"{stem}.mcap", "ros1": f"{stem}.bag", "db3": stem}[container]
+
+
+@contextmanager
+def open_log(path: Path, container: str) -> Iterator[OpenLog]:
+    """Open a log; it gets its final name, replacing an old one, when the block ends without an error."""
+    partial = path.parent / f".partial-{path.name}"
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    opener = {"mcap": _mcap, "ros1": _ros1, "db3": _db3}[container]
+    try:
+        with opener(partial / path.name) as log:
+            yield log
+        if path.is_dir():
+            shutil.rmtree(path)
+        (partial / path.name).replace(path)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+@contextmanager
+def _mcap(path: Path) -> Iterator[OpenLog]:
+    with path.open("wb") as file:
+        log = McapLog(file, "boresight-simulate")
+        yield OpenLog(log.messages, log.put)
+        log.writer.finish()
+
+
+def _ros1(path: Path) -> AbstractContextManager[OpenLog]:
+    writer = Bag1Writer(path)
+    writer.set_compression(Bag1Writer.CompressionFormat.LZ4)
+    return _bag(writer, RosMessages(1), latched={TOPICS["tf"]: {"latching": 1}})
+
+
+def _db3(path: Path) -> AbstractContextManager[OpenLog]:
+    return _bag(Bag2Writer(path, version=9), RosMessages(2), latched={})
+
+
+@contextmanager
+def _bag(writer: Any, messages: RosMessages, latched: dict[str, dict[str, int]]) -> Iterator[OpenLog]:
+    connections: dict[str, Any] = {}
+    with writer:
+
+        def put(topic: str, stamp_ns: int, message: Any) -> None:
+            if topic not in connections:
+                connections[topic] = writer.add_connection(
+                    topic, message.__msgtype__, typestore=messages.typestore, **latched.get(topic, {})
+                )
+            writer.write(connections[topic], stamp_ns, messages.serialised(message))
+
+        yield OpenLog(messages, put)

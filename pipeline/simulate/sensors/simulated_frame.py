@@ -8,13 +8,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pipeline.rig.graph import Kind
-from pipeline.simulate.sensors.camera import encode_jpeg, render, view_of
+from pipeline.simulate.sensors.camera import RollingShutter, encode_jpeg, render, view_of
 from pipeline.simulate.sensors.data_sheets import CameraSpec, LidarSpec, RadarSpec
 from pipeline.simulate.sensors.lidar import Sweep, sweep_lidar
 from pipeline.simulate.sensors.mounting import Mounting
 from pipeline.simulate.sensors.radar import Scan, scan_radar
 from pipeline.simulate.sensors.rig_spec import RigSpec
-from pipeline.simulate.sensors.rolling_shutter import RollingShutter
 from pipeline.simulate.sensors.semantics import (
     Box,
     SemanticsSpec,

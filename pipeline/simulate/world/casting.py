@@ -21,11 +21,9 @@ from pipeline.simulate.world.chunk import CHUNK_M, Chunk
 from pipeline.simulate.world.drives import Drive
 from pipeline.simulate.world.landscapes import LANDSCAPES, Landscape
 from pipeline.simulate.world.meshes import Mesh, join, placed
-from pipeline.simulate.world.motorway import add_motorway
 from pipeline.simulate.world.plots import add_halls, add_plots, add_rows
 from pipeline.simulate.world.ray_selection import rays_near
-from pipeline.simulate.world.road_surface import add_asphalt
-from pipeline.simulate.world.street import add_street
+from pipeline.simulate.world.street import add_asphalt, add_motorway, add_street
 from pipeline.simulate.world.traffic import Actor, actors_at
 
 __all__ = ["Hits", "Moment", "ShadowMap", "Standing", "World", "chunk_mesh", "shadow_map", "standing_of"]

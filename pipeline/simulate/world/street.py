@@ -1,4 +1,4 @@
-"""Roadsides of an urban road: kerbs, pavements, lamps, trees, house fronts, parked cars."""
+"""Surface of a road, and its sides: motorway; urban kerbs, pavements, lamps, trees, house fronts, parked cars."""
 
 from __future__ import annotations
 
@@ -6,9 +6,23 @@ import numpy as np
 
 from pipeline.simulate.world.actors import HOLLOW, VARIANTS, actor_mesh
 from pipeline.simulate.world.chunk import CHUNK_M, Chunk
-from pipeline.simulate.world.props import bollards, bush, lamp, litter_bin, sign, tree
+from pipeline.simulate.world.meshes import MeshBuilder
+from pipeline.simulate.world.props import (
+    PANEL,
+    SIGN_COLOURS,
+    bollards,
+    bush,
+    delineator,
+    farm,
+    lamp,
+    litter_bin,
+    rail_post,
+    sign,
+    signal,
+    tree,
+)
 
-__all__ = ["add_house", "add_parked", "add_pavement", "add_street"]
+__all__ = ["add_asphalt", "add_house", "add_motorway", "add_parked", "add_pavement", "add_street"]
 
 
 def add_street(c: Chunk) -> None:
@@ -139,3 +153,164 @@ def add_parked(c: Chunk, side: int, d: float) -> None:
         yaw = (0.0 if side < 0 else np.pi) + c.rng.normal(0, 0.02)
         mesh = actor_mesh(kind, int(c.rng.integers(VARIANTS[kind])) + HOLLOW * c.drive.landscape.glass)
         c.put(mesh, s + 3.25 + c.rng.uniform(-0.3, 0.3), side * d + c.rng.normal(0, 0.08), 0.0, yaw, instance)
+
+
+def add_motorway(c: Chunk) -> None:
+    """Both sides of a motorway, the rail between the carriageways, sometimes a gantry or a farm."""
+    rng = c.rng
+    style = np.random.default_rng([c.drive.seed, 34])
+    _guard_rail(c, 0.0, both=True)
+    for side in (-1, 1):
+        slope = _verge(c, side, style)
+        _plants(c, side, slope)
+        for s in c.every(55.0, 15.0, 0.7):
+            d = side * (c.drive.layout.left_edge + 1.7)
+            c.put(sign(int(rng.integers(24))), s, d, 0.0, 0.0 if side < 0 else np.pi)
+    if c.index % 7 == 3:
+        _gantry(c, c.s0 + 20.0)
+    if c.index % 5 == 2:
+        house, d = farm(rng), float(rng.choice([-1, 1])) * rng.uniform(45, 80)
+        c.put(house, c.s0 + 20.0, d, 1.0, rng.uniform(0, 6.28))
+
+
+def _verge(c: Chunk, side: int, style: np.random.Generator) -> float:
+    """Banks, rail and noise wall of one side; returns the height of the bank [m]."""
+    edge = side * c.drive.layout.left_edge
+    walled, railed = style.random() < 0.35, style.random() < 0.75
+    foot, slope = edge + side * 3.0, float(style.uniform(-1.0, 2.5))
+    _sloped(c, edge, foot, 0.0, -0.1, "grass")
+    _sloped(c, foot, edge + side * 14.0, -0.1, slope, "grass")
+    field = "soil" if style.random() < 0.3 else "grass"
+    _sloped(c, edge + side * 14.0, side * 150.0, slope, slope + 2.0, field)
+    if railed:
+        _guard_rail(c, edge + side * 0.8, both=False)
+    if walled and (c.index // 6) % 2 == 0:
+        top = float(3.5 + 0.5 * (c.index % 2))
+        c.wall((c.s0, c.s0 + CHUNK_M), edge + side * 4.5, (-0.2, top), "noise_wall")
+    return slope
+
+
+def _plants(c: Chunk, side: int, slope: float) -> None:
+    """Delineators, trees and bushes on the bank of one side."""
+    rng, edge = c.rng, side * c.drive.layout.left_edge
+    for s in c.every(25.0):
+        c.put(delineator(), s, edge + side * 1.4)
+    for s in c.every(6.0, 3.0, 0.55):
+        d = edge + side * rng.uniform(8, 26)
+        c.put(tree(int(rng.integers(40))), s, d, slope * 0.7 - 0.2, rng.uniform(0, 6.28))
+    for s in c.every(5.0, 2.0, 0.5):
+        plant = bush(int(rng.integers(20)))
+        c.put(plant, s, edge + side * rng.uniform(5, 10), 0.2 * slope, rng.uniform(0, 6.28))
+
+
+def _sloped(c: Chunk, d0: float, d1: float, h0: float, h1: float, name: str) -> None:
+    if d0 > d1:
+        d0, d1, h0, h1 = d1, d0, h1, h0
+    c.strip((d0, d1), (h0, h1), name, 10.0)
+
+
+def _guard_rail(c: Chunk, d: float, *, both: bool) -> None:
+    for offset in (-0.18, 0.18) if both else (0.0,):
+        for low, high, out in ((0.48, 0.58, 0.0), (0.58, 0.68, 0.05), (0.68, 0.78, 0.0)):
+            c.band(
+                (c.s0, c.s0 + CHUNK_M), (d + offset + out, d + offset + out + 1e-3), (low, high), "rail", 4.0
+            )
+    for s in c.every(4.0):
+        c.put(rail_post(), s, d)
+
+
+def _gantry(c: Chunk, s: float) -> None:
+    layout = c.drive.layout
+    left, right = 0.0, layout.right_edge - 1.6
+    b = MeshBuilder()
+    for d in (left, right):
+        b.tube(np.array([0, d, 0.0]), np.array([0, d, 7.6]), 0.16, "metal_pole", 8)
+    for z in (6.6, 7.5):
+        b.tube(np.array([0, left, z]), np.array([0, right, z]), 0.10, "metal_pole", 6)
+    for d in layout.lanes_own:
+        b.frustum(
+            (-0.25, -0.20, d - 1.6, d + 1.6, 5.6),
+            (-0.25, -0.20, d - 1.6, d + 1.6, 8.0),
+            PANEL,
+            SIGN_COLOURS[2],
+        )
+    c.put(b.mesh(), s, 0.0)
+
+
+def add_asphalt(c: Chunk) -> None:
+    """Asphalt with repairs and manholes, lane markings, crossings with their signals."""
+    layout, lift = c.drive.layout, 0.004
+    c.strip((layout.right_edge, layout.left_edge), (0.0, 0.0), c.drive.landscape.surface)
+    for _ in range(int(c.rng.integers(0, 4))):  # repairs: dark in the image, less so for the lidar
+        s, d = (
+            c.s0 + c.rng.uniform(2, 30),
+            c.rng.uniform(layout.right_edge + 1, max(layout.left_edge, 3.0) - 3),
+        )
+        c.band(
+            (s, s + c.rng.uniform(1.5, 9)),
+            (d, d + c.rng.uniform(0.6, 2.4)),
+            (lift / 2, lift / 2),
+            "asphalt_patch",
+        )
+    for _ in range(int(c.rng.integers(0, 3))):
+        s, d = c.s0 + c.rng.uniform(0, 39), c.rng.uniform(layout.right_edge + 1, layout.left_edge - 1)
+        c.band((s, s + 0.62), (d, d + 0.62), (lift, lift), "manhole")
+    if c.drive.landscape.markings:
+        _lanes(c)
+
+
+def _lanes(c: Chunk) -> None:
+    layout, lift = c.drive.layout, 0.004
+    own, other = sorted(layout.lanes_own), sorted(layout.lanes_oncoming)
+    half = layout.lane_m / 2
+    inner = [d + half for d in own[:-1]] + [d + half for d in other[:-1]]
+    for d in inner:
+        _dashes(c, d, 6.0, 12.0) if layout.landscape.fast else _dashes(c, d, 3.0, 9.0)
+    w = 0.10 if layout.landscape.fast else 0.075
+    if layout.landscape.fast:
+        for d in (own[-1] + half, own[0] - half, other[0] - half, other[-1] + half):
+            c.strip((d - 1.5 * w, d + 1.5 * w), (lift, lift), "paint")
+        return
+    if c.index % 5 in (1, 2):
+        c.strip((-w, w), (lift, lift), "paint")
+    else:
+        _dashes(c, 0.0, 3.0, 9.0)
+    for side in (-1, 1):
+        edge = side * (layout.left_edge - layout.parking_m)
+        if layout.parking_m:
+            c.strip((edge - w, edge + w), (lift, lift), "paint")
+            for s in c.every(6.5):
+                c.band(
+                    (s - w, s + w),
+                    (min(edge, side * layout.left_edge), max(edge, side * layout.left_edge)),
+                    (lift, lift),
+                    "paint",
+                )
+    if c.index % 4 == 1 and layout.lanes_oncoming and not c.drive.landscape.ceiling_m:
+        _crossing(c, c.s0 + 20.0)
+
+
+def _dashes(c: Chunk, d: float, dash_m: float, period_m: float) -> None:
+    for s in c.every(period_m):
+        c.band((s, s + dash_m), (d - 0.075, d + 0.075), (0.004, 0.004), "paint", step=3.0)
+
+
+def _crossing(c: Chunk, s: float) -> None:
+    layout = c.drive.layout
+    edge = layout.left_edge
+    for d in np.arange(-edge + 0.5, edge - 0.5, 1.0):
+        c.band((s, s + 3.5), (float(d), float(d) + 0.5), (0.005, 0.005), "paint")
+    c.band((s - 1.6, s - 1.2), (-edge + layout.parking_m, 0.0), (0.005, 0.005), "paint")
+    c.band((s + 4.8, s + 5.2), (0.0, edge - layout.parking_m), (0.005, 0.005), "paint")
+    for d in layout.lanes_own:
+        _arrow(c, s - 12.0, d)
+    for side, yaw in ((-1, np.pi), (1, 0.0)):
+        c.put(signal(), s - 1.0 if side < 0 else s + 4.5, side * (edge + 0.5), 0.12, yaw)
+
+
+def _arrow(c: Chunk, s: float, d: float) -> None:
+    c.band((s, s + 2.4), (d - 0.08, d + 0.08), (0.005, 0.005), "paint")
+    head = np.array(
+        [[[s + 2.4, d - 0.35, 0.005], [s + 4.0, d, 0.005], [s + 4.0, d, 0.005], [s + 2.4, d + 0.35, 0.005]]]
+    )
+    c.along.quads(head, "paint", uv=head[..., :2])

@@ -27,8 +27,7 @@ from pipeline.core.config import FleetConfig, load_fleet
 from pipeline.rig.day_prior import read_prior
 from pipeline.rig.se3 import exp_so3, from_rotation_translation
 from pipeline.simulate.faults import parse_faults
-from pipeline.simulate.fleet import FleetSpec, day_names, simulate_fleet
-from pipeline.simulate.logs.fleet_toml import fleet_toml
+from pipeline.simulate.fleet import FleetSpec, day_names, fleet_toml, simulate_fleet
 from pipeline.simulate.sensors.rigs import rig_named
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import observations_of

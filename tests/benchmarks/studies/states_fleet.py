@@ -9,8 +9,7 @@ import numpy as np
 
 from pipeline.rig.se3 import exp_so3, from_rotation_translation
 from pipeline.simulate.faults import Fault
-from pipeline.simulate.fleet import FleetSpec, mounting_on
-from pipeline.simulate.logs.fleet_toml import mixed_fleet_toml
+from pipeline.simulate.fleet import FleetSpec, mixed_fleet_toml, mounting_on
 from pipeline.simulate.sensors.mounting import Mounting
 from pipeline.simulate.sensors.rigs import rig_named
 from pipeline.simulate.sensors.semantics import SemanticsSpec

@@ -15,8 +15,7 @@ from pipeline.calibrate.numerics.covariance import CLEARLY
 from pipeline.calibrate.numerics.search_range import SearchRange, search_range
 from pipeline.core.config import SolveConfig
 from pipeline.objective.camera_lidar.kernel_settings import MAX_GAP_PX
-from pipeline.objective.camera_lidar.own_motion import lidar_velocities
-from pipeline.objective.camera_lidar.points import Points
+from pipeline.objective.camera_lidar.points import Points, lidar_velocities
 from pipeline.objective.camera_lidar.score import KernelSettings, prepare_terms
 from pipeline.rig.estimates import Prior
 from pipeline.rig.se3 import (

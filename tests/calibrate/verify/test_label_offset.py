@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.calibrate.verify.day_labels import day_labels
 from pipeline.calibrate.verify.label_offset import measure_label_offset
-from pipeline.perceive.label_gradients import label_gradients
+from pipeline.perceive.labels import label_gradients
 from pipeline.rig.estimates import PairEstimate, Solution
 from schemas.calibrations import PAIRS
 from tests.makers.solve_scenes import make_day

@@ -12,8 +12,7 @@ from pipeline.core.rigs import CameraPrior, CameraTopics
 from pipeline.report.day import pair_view
 from pipeline.rig.estimates import PairEstimate, Prior, Solution
 from pipeline.rig.se3 import exp_so3, from_rotation_translation
-from pipeline.rig.target_sigmas import target_sigmas
-from pipeline.rig.targets import errors_at_targets
+from pipeline.rig.targets import errors_at_targets, target_sigmas
 from tests.benchmarks.studies.metrics import transform_of
 from tests.calibrate.test_contradictions import records_of
 from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR

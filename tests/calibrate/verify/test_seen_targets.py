@@ -9,8 +9,7 @@ from pipeline.calibrate.verify.seen_targets import seen_targets, unseen_failure,
 from pipeline.rig.estimates import Prior
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse, transform_points
 from pipeline.rig.spherical import from_spherical, to_spherical
-from pipeline.rig.target_sigmas import target_sigmas
-from pipeline.rig.targets import DEFAULT_TARGETS
+from pipeline.rig.targets import DEFAULT_TARGETS, target_sigmas
 from schemas.calibrations import PAIRS
 from tests.makers.radar_scenes import street_day
 from tests.makers.solve_scenes import CAMERA, T_CAMERA_LIDAR, T_LIDAR_RADAR

@@ -15,9 +15,9 @@ from types import SimpleNamespace
 import pytest
 
 from jobs.cli import main
-from pipeline.core import third_party_models
+from pipeline.core import models
 from pipeline.core.errors import DownloadError
-from pipeline.core.third_party_models import CATALOGUE
+from pipeline.core.models import CATALOGUE
 from pipeline.perceive.models.download import download
 from pipeline.perceive.models.manifest import Manifest, read_manifest
 
@@ -139,7 +139,7 @@ def test_the_command_shows_the_licence_places_manifests_and_says_the_line(
     server, tmp_path, capsys, monkeypatch
 ):
     made = [dataclasses.replace(m, size_bytes=len(CONTENT), sha256=SHA256) for m in CATALOGUE]
-    monkeypatch.setattr(third_party_models, "CATALOGUE", tuple(made))
+    monkeypatch.setattr(models, "CATALOGUE", tuple(made))
     mirror = server.url.rsplit("/", 1)[0]
     assert main(["models", "fetch", "--into", str(tmp_path / "models"), "--mirror", mirror]) == 0
     shown = capsys.readouterr()

@@ -9,7 +9,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 from pipeline.core.config import FleetConfig, config_hash, load_fleet
 from pipeline.core.errors import ConfigError, ModelError
-from pipeline.core.shipped_models import shipped_manifest
+from pipeline.core.models import shipped_manifest
 from pipeline.perceive.ground import PointKind
 from pipeline.perceive.models.range_image import POINT_LABEL_SETS, RangeImageSegmenter
 from pipeline.store.partitions import Lake, Partition

@@ -9,7 +9,7 @@ import onnx
 import pytest
 from onnx import numpy_helper
 
-from pipeline.core.third_party_models import manifest_text, named
+from pipeline.core.models import manifest_text, named
 from pipeline.perceive.labels import road_user_name
 from pipeline.perceive.models.detector import Detector
 from pipeline.perceive.models.manifest import load_manifest

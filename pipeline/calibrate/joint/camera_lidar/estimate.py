@@ -54,9 +54,9 @@ from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.calibrate.numerics.search_range import search_range
 from pipeline.core.config import SolveConfig
 from pipeline.core.errors import SolveError
-from pipeline.objective.camera_lidar.brightness_maps import Start
+from pipeline.objective.camera_lidar.image_maps import Start
 from pipeline.objective.camera_lidar.label_width import label_width_px, widened
-from pipeline.objective.camera_lidar.own_motion import lidar_velocities
+from pipeline.objective.camera_lidar.points import lidar_velocities
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms, prepare_terms
 from pipeline.objective.stamp_gaps import camera_gaps_s, constant_gap_s
 from pipeline.rig.changes import change_jacobian
