@@ -1,9 +1,9 @@
 """Points of the camera-lidar terms: gathered from observations, in or near the camera's view, sorted into kinds.
 
 Rolling shutter: the rows of an image are exposed from the top to the bottom during the readout time; the
-frame's time is that of the middle row. A point on row v of h was exposed ((v + 1/2)/h - 1/2) readouts later, after the car had moved on.
-Stamps that mean the first or the last row are half a readout off, which the time offset takes up like any
-other clock.
+frame's time is that of the middle row. A point on row v of h was exposed ((v + 1/2)/h - 1/2) readouts later,
+after the car had moved on. Stamps that mean the first or the last row are half a readout off, which the time
+offset takes up like any other clock.
 
 Points are moved once for one pose, not in the loops over poses, because the change of a point's row between
 poses changes its delay by only a few hundredths.
