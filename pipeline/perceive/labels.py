@@ -88,6 +88,20 @@ _RUN_PX = (
 )
 _FLOOR_GREY = 5.0  # gradients of a border without contrast count less than those of one with this much
 _SKY, _BACKDROP, _OBJECT, _GROUND = (10,), (2, 3, 4, 8), (5, 6, 7, 11, 12, 13, 14, 15, 16, 17, 18), (0, 1, 9)
+
+
+def _foregrounds(*groups: tuple[tuple[int, ...], tuple[int, ...]]) -> UInt8[np.ndarray, "256 256"]:
+    """Nearer side of a border between labels a (left or above) and b: odd = a, even = b, 0 = not used.
+
+    Counted on by two from the first group of (far, near) labels to the next.
+    """
+    nearer = np.zeros((256, 256), np.uint8)
+    for number, (far, near) in enumerate(groups):
+        nearer[np.ix_(near, far)] = 2 * number + 1
+        nearer[np.ix_(far, near)] = 2 * number + 2
+    return nearer
+
+
 # Borders of two labels of a group, and of the ground before walls and plants, are not used. Kerbs and shadows are next
 # to the latter: on eight simulated days and the real car they moved the vertical offset by .1 to .6 px.
 _FOREGROUND = _foregrounds(((*_SKY, *_BACKDROP, *_GROUND), _OBJECT), (_SKY, _BACKDROP))
@@ -113,18 +127,6 @@ def road_user_name(logged: str) -> str | None:
     """Road user of a logged class name; None for other classes (traffic light, dog)."""
     name = logged.strip().lower().replace("_", " ")
     return name if name in ROAD_USERS else _ALIASES.get(name)
-
-
-def _foregrounds(*groups: tuple[tuple[int, ...], tuple[int, ...]]) -> UInt8[np.ndarray, "256 256"]:
-    """Nearer side of a border between labels a (left or above) and b: odd = a, even = b, 0 = not used.
-
-    Counted on by two from the first group of (far, near) labels to the next.
-    """
-    nearer = np.zeros((256, 256), np.uint8)
-    for number, (far, near) in enumerate(groups):
-        nearer[np.ix_(near, far)] = 2 * number + 1
-        nearer[np.ix_(far, near)] = 2 * number + 2
-    return nearer
 
 
 def label_gradients(
