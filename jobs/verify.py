@@ -112,7 +112,11 @@ def _vehicle(config: FleetConfig, vehicle: str | None) -> str:
     if vehicle is not None:
         config.rig_of(vehicle)  # raises for an unknown vehicle
         return vehicle
-    if len(config.vehicles) != 1 or not config.named_vehicles:
+    if not config.named_vehicles:
+        raise ConfigError(
+            "command line", "vehicle", "fleet.toml names none: add --vehicle NAME, the car of this log"
+        )
+    if len(config.vehicles) != 1:
         raise ConfigError("command line", "vehicle", f"name one of {sorted(config.vehicles)} with --vehicle")
     return config.named_vehicles[0]
 

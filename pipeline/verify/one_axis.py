@@ -161,14 +161,11 @@ def _status(
     if measured and off_rad > limits.limit_rad:
         return "fail", f"{distance}: beyond {_deg(limits.limit_rad)} and beyond chance"
     if power < limits.confidence:
-        seen = f"an error of {_deg(limits.asked_rad)} would have been detected with probability {power:.1%}"
-        confirmed = held_out.confirms(float(np.degrees(limits.asked_rad)))
-        why = (
-            ""
-            if confirmed >= limits.confidence
-            else ", because held-out frames hardly distinguish such a turn from none"
-        )
-        return "inconclusive", f"{distance}: {seen}{why}"
+        asked = _deg(limits.asked_rad)
+        why = f"an error of {asked} would show with a probability of only {power:.1%}"
+        if held_out.confirms(float(np.degrees(limits.asked_rad))) < limits.confidence:
+            why = f"held-out frames fit a turn of {asked} as well"
+        return "inconclusive", f"{distance}, but this log cannot prove it: {why}; use a longer log"
     if measured:
         return "warn", f"{distance}: beyond chance, within {_deg(limits.limit_rad)}"
     return "pass", distance
