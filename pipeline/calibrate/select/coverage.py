@@ -39,7 +39,7 @@ class _Kind:
 
 _KINDS = {
     "camera_lidar": (
-        _Kind("lidar_edge_xyz_m", "depth edges", camera_axes=True),
+        _Kind("lidar_edge_xyz_m", "poles, signs or cars (depth edges)", camera_axes=True),
         _Kind("marking_xyz_m", "road markings", camera_axes=True, far=False),
     ),
     "camera_radar": (_Kind("radar_track_xyz_m", "moving road users"),),

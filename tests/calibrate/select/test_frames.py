@@ -129,10 +129,8 @@ def test_parts_of_the_view_without_content_are_named(day):
     right_and_near = [
         make_changed(o, lidar_edge_xyz_m=np.concatenate([edges_at(-20, 15), edges_at(0, 8)])) for o in day
     ]
-    assert (
-        "drive where there are depth edges left of 15 deg and beyond 40 m: the frames hardly show any"
-        in missing_content(right_and_near, "camera_lidar")
-    )
+    lacks = "drive where there are poles, signs or cars (depth edges) left of 15 deg and beyond 40 m"
+    assert f"{lacks}: the frames hardly show any" in missing_content(right_and_near, "camera_lidar")
     everywhere = [
         make_changed(o, lidar_edge_xyz_m=np.concatenate([edges_at(a, r) for a in (-25, 25) for r in (8, 50)]))
         for o in day
