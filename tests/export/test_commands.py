@@ -163,7 +163,7 @@ OF_V = ["--lake", "{lake}", "--vehicle", "v"]
     ("arguments", "words"),
     [
         (["kitti"], "needs --lake and --vehicle"),
-        (["kitti", "--lake", "{lake}", "--vehicle", "w"], "no state of w by joint"),
+        (["kitti", "--lake", "{lake}", "--vehicle", "w"], "the lake has no day of 'w'"),
         (["kitti", *OF_V, "--day", "2020-01-01"], "no record of v 2020-01-01"),
         (["kitti", *OF_V, "--day", "yesterday"], "is not a day"),
         (["urdf", *OF_V, "--lidar-frame", "a b"], "is not a valid frame name"),

@@ -33,7 +33,7 @@ def exceeded_by(result: EdgeResult, claims: Mapping[str, Claim], check: FailedCh
     return [
         n
         for n, (off, known_to) in at_targets(result, check).items()
-        if limits[n].is_exceeded_by(off, known_to)
+        if n in limits and limits[n].is_exceeded_by(off, known_to)  # what is not claimed has no limit
     ]
 
 
