@@ -137,6 +137,9 @@ def kind_of_sensor(name: str, findings: Sequence[DriftFinding]) -> str:
     return known.get(name, name)
 
 
+_WITHIN_REACH = 28  # days: the audit's window, four weeks by default, never has more
+
+
 def next_step(findings: Sequence[DriftFinding], lake: str) -> str:
     """Next action for a vehicle that is not GREEN, with commands that run as printed; empty if none is needed.
 
@@ -174,4 +177,9 @@ def _until_it_is_known(days: int | None, lake: str) -> str:
     """What a vehicle that is UNKNOWN needs: a repair of tables, or more days."""
     if days is None:
         return f"restore what can be restored of the tables: `boresight repair --lake {lake}`."
+    if days > _WITHIN_REACH:
+        return (
+            f"drive other roads: of days like these, {days} more accepted ones would be needed; "
+            "the pages of its days name what to drive next time."
+        )
     return f"drive; {'1 more accepted day is' if days == 1 else f'{days} more accepted days are'} needed."

@@ -82,7 +82,8 @@ def decide_status(findings: Sequence[DriftFinding]) -> VehicleStatus:
     charts = max(blind.values(), key=_days_needed)
     slowest = max(charts, key=lambda f: _days_needed([f]))
     if max(f.days_used for f in findings) > 1:
-        turned = f"{' and '.join(f'the {of}' for of in blind)} may have turned unseen"
+        *some, last = blind
+        turned = f"the {', '.join(some)}{' and ' * bool(some)}{last} may have turned unseen"
         counts = f"{few} of {len(findings)} charts have too little data"
         reason = f"{turned}: {counts}; {words_of(edge_of(slowest))} {slowest.dof}: {slowest.reason}"
     else:

@@ -46,7 +46,13 @@ CLEAREST = {
         ({}, "GREEN", None, "no sensor moved: 3 of 18 charts exclude a change above the limit, enough"),
         ({"camera_lidar_rx": UNSEEN}, "UNKNOWN", None, "16 of 18 charts have too little data; camera_lidar rx: why"),
         ({"camera_lidar_ry": UNSEEN}, "UNKNOWN", None, "the camera or lidar may have turned unseen"),
-        ({"lidar_radar_rz": UNSEEN}, "UNKNOWN", None, "radar"),
+        ({"lidar_radar_rz": UNSEEN}, "UNKNOWN", None, "the radar may have turned unseen"),
+        (
+            {"camera_lidar_rx": UNSEEN, "lidar_radar_rz": UNSEEN},
+            "UNKNOWN",
+            None,
+            "the camera or lidar and radar may have turned unseen",
+        ),
         # Radar yaw may be watched from the camera instead.
         ({"lidar_radar_rz": UNSEEN, "camera_radar_ry": {"status": "GREEN"}}, "GREEN", None, ""),
         ({"camera_lidar_tz": alarm("YELLOW")}, "YELLOW", None, "something changed on 2026-03-05: why"),

@@ -126,6 +126,10 @@ def _row(status, reason, **rest):
             "`boresight service --lake L --vehicle v --day 2026-03-04 --kind re-mount --sensor camera`",
         ),
         (_row("UNKNOWN", "too few", vehicle_days_needed=2), "v: drive; 2 more accepted days are needed."),
+        (
+            _row("UNKNOWN", "too few", vehicle_days_needed=335),
+            "v: drive other roads: of days like these, 335 more",
+        ),
         (_row("UNKNOWN", "too few", vehicle_days_needed=1), "v: drive; 1 more accepted day is needed."),
         (_row("UNKNOWN", "no change; some of its records cannot be read"), "`boresight repair --lake L`"),
     ],
