@@ -79,7 +79,8 @@ def decide_status(findings: Sequence[DriftFinding]) -> VehicleStatus:
         rest = f", enough to exclude a turn of any sensor; {few} have too little data" if few else ""
         of = f"{len(findings) - few} of {len(findings)} charts exclude a change above the limit"
         return VehicleStatus("GREEN", f"no sensor moved: {of}{rest}")
-    charts = max(blind.values(), key=_days_needed)
+    # Of several, the one that has fewest days: those that begin again after a service event state it.
+    charts = max(blind.values(), key=lambda own: (_days_needed(own), -min(f.days_used for f in own)))
     slowest = max(charts, key=lambda f: _days_needed([f]))
     if max(f.days_used for f in findings) > 1:
         *some, last = blind

@@ -53,6 +53,12 @@ CLEAREST = {
             None,
             "the camera or lidar and radar may have turned unseen",
         ),
+        (  # since a repair of the radar
+            {"camera_lidar_rx": UNSEEN, "lidar_radar_rz": UNSEEN | {"days_used": 0}},
+            "UNKNOWN",
+            None,
+            "lidar_radar rz: why not",
+        ),
         # Radar yaw may be watched from the camera instead.
         ({"lidar_radar_rz": UNSEEN, "camera_radar_ry": {"status": "GREEN"}}, "GREEN", None, ""),
         ({"camera_lidar_tz": alarm("YELLOW")}, "YELLOW", None, "something changed on 2026-03-05: why"),
