@@ -21,7 +21,16 @@ from jaxtyping import Float, Int
 
 from pipeline.rig.changes import change_between, change_jacobian, changed
 
-__all__ = ["Fused", "Mount", "PoseDays", "current_level", "fuse", "with_held_day"]
+__all__ = [
+    "LEAST_SCATTER",
+    "Fused",
+    "Mount",
+    "PoseDays",
+    "after_a_move",
+    "current_level",
+    "fuse",
+    "with_held_day",
+]
 
 _DOFS = 6
 # Share of the prior's variance from which a direction counts as left at the prior: as an axis of a day's record.
@@ -34,6 +43,9 @@ _APART_SIGMAS = 3.14
 # not certified while its days are hard to believe as one level.
 _KNOCKS_A_DAY, _KNOCK = 0.01, np.array([*np.radians([0.5] * 3), 0.01, 0.01, 0.01])
 _NEW_DAYS = 3
+# A mount's scatter from day to day before any day shows more: another simulator's mounts have .03 to .05 deg; load,
+# temperature and tyres move a car's sensors to its road by as much.
+LEAST_SCATTER = np.array([*np.radians([0.03] * 3), 0.003, 0.003, 0.003])
 _DETERMINED = 0.5  # share of the prior's variance that an axis of a day lacks, to be compared between days
 
 
@@ -112,7 +124,7 @@ def fuse(days: PoseDays, mount: Mount, tomorrow: int) -> Fused:
     origin, last = own.T[-1], slice(-1, None)
     prior, moment = _of_prior(own.at(last), origin)
     information = prior
-    H, g = _of_days(own, origin, mount)
+    H, g, alike = _of_days(own, origin, mount)
     walk = np.diag(np.append(mount.wander, np.zeros(_DOFS)))
     for k, gap in enumerate(np.diff(own.day, append=tomorrow)):
         information, moment = information + H[k], moment + g[k]
@@ -127,7 +139,7 @@ def fuse(days: PoseDays, mount: Mount, tomorrow: int) -> Fused:
     T = changed(origin, x)
     K = np.linalg.inv(change_jacobian(T))
     earlier = [i for i in range(kept[0]) if i not in left_out]
-    covariance = level + np.diag(mount.scatter**2 + _unclear_step(own, mount))
+    covariance = level + np.diag(_of_tomorrow(mount, alike) + _unclear_step(own, mount))
     parts = (covariance, common, of_prior)
     covariance, common, of_prior = (_symmetric(K @ part @ K.T) for part in parts)
     moved_on = int(days.day[kept[0]]) if earlier else None
@@ -149,6 +161,12 @@ def with_held_day(found: Fused, day: PoseDays, mount: Mount) -> Fused | None:
     K = np.linalg.inv(change_jacobian(found.T))
     wider = _symmetric(K @ (covariance + np.diag(np.where(apart, step**2, 0.0))) @ K.T)
     return replace(found, covariance=wider)
+
+
+def after_a_move(found: Fused) -> Fused:
+    """The pose where the sensor moved since its last day, nobody knows how far: as far as knocks usually go."""
+    K = np.linalg.inv(change_jacobian(found.T))
+    return replace(found, covariance=_symmetric(found.covariance + K @ np.diag(_KNOCK**2) @ K.T))
 
 
 def current_level(days: PoseDays, mount: Mount) -> tuple[list[int], list[int]]:
@@ -221,8 +239,8 @@ def _of_prior(
 
 def _of_days(
     days: PoseDays, origin: Float[np.ndarray, "4 4"], mount: Mount
-) -> tuple[Float[np.ndarray, "N 12 12"], Float[np.ndarray, "N 12"]]:
-    """Information and moment of each day's data on (x, u).
+) -> tuple[Float[np.ndarray, "N 12 12"], Float[np.ndarray, "N 12"], Float[np.ndarray, " 6"]]:
+    """Information and moment of each day's data on (x, u), and the variance by DoF that days are said to err by alike.
 
     With columns V so that V' P V = 1 and V' C V = diag(c) for the day's prior P and its result C, the data alone know
     V'x with variance c / (1 - c), as far beyond the result as the prior pulled it back.
@@ -253,7 +271,18 @@ def _of_days(
     x, x0 = change_between(origin, days.T), change_between(origin, days.T_prior)
     v = np.einsum("nij,nj->ni", Vt, x) + ratio * np.einsum("nij,nj->ni", Vt, x - x0)
     AtW = A.swapaxes(1, 2) @ W
-    return AtW @ A, np.einsum("nij,nj->ni", AtW, v)
+    alike_by_dof = np.median(np.einsum("nii->ni", bias), axis=0)
+    return AtW @ A, np.einsum("nij,nj->ni", AtW, v), alike_by_dof
+
+
+def _of_tomorrow(mount: Mount, alike: Float[np.ndarray, " 6"]) -> Float[np.ndarray, " 6"]:
+    """Variance by DoF of tomorrow's mounting about its level.
+
+    Where days scatter more than by their varying part, the mount moves, or less of their error is alike than was said.
+    The sigma of the level counts all of that as alike; what scatters beyond it too is the mount's.
+    """
+    scatter = mount.scatter**2
+    return np.minimum(scatter, np.maximum(scatter - alike, LEAST_SCATTER**2))
 
 
 def _alike(count: int, autocorrelation: float) -> float:

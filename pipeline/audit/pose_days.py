@@ -26,6 +26,7 @@ __all__ = ["SensorDays", "VehiclePoses", "read_poses"]
 
 _PRIOR = tuple(f"prior_{name}" for name in POSE_COLUMNS)
 _WORDS = ("vehicle", "day", "sensor", "kind", "reference", "status", "reason", "unsure_only")
+_MOVED = "moved_in_day"
 _ROUNDING = 1e-3  # of what should be 1
 
 
@@ -39,6 +40,7 @@ class SensorDays:
         prior: T_reference_sensor and covariance (left perturbation) before the last day; None if unknown.
         last: day, status and reason of the last row.
         held: days with a pose that do not count, in order of day.
+        moved_within: days within which it or the reference moved, by the verdict, in order; they do not count either.
     """
 
     poses: PoseDays
@@ -49,6 +51,7 @@ class SensorDays:
     prior: tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "6 6"]] | None
     last: tuple[str, str, str]
     held: PoseDays
+    moved_within: Int[np.ndarray, " M"]
 
     def since(self, first: int) -> SensorDays:
         """The days from an ordinal on."""
@@ -80,7 +83,7 @@ class VehiclePoses:
 def read_poses(lake: Lake, method: str, first: str, last: str) -> dict[str, VehiclePoses]:
     """Current poses of every vehicle in a window of days."""
     asked = [*_WORDS, *POSE_COLUMNS, *_PRIOR]
-    asked += ["covariance", "common_covariance", "prior_covariance", "observable", "targets_m"]
+    asked += ["faults", "covariance", "common_covariance", "prior_covariance", "observable", "targets_m"]
     table = read_columns(lake, POSES, asked, first=first, last=last)
     if table is None:
         return {}
@@ -129,6 +132,7 @@ def _sensor(rows: pa.Table, at: Sequence[int]) -> SensorDays:
     targets, keys = matrices(rows["targets_m"], (3, 3)), rows["work_key"].to_pylist()
     seen = kept[np.isfinite(targets[kept]).all(axis=(1, 2))]
     known = np.flatnonzero(knows_prior)
+    moved = np.array([_MOVED in (faults or ()) for faults in rows["faults"].to_pylist()], bool)
     last = tuple(str(rows[name][-1].as_py()) for name in ("day", "status", "reason"))
     return SensorDays(
         PoseDays(days[kept], pose[kept], C[kept], B[kept], prior[kept], P[kept]),
@@ -139,6 +143,7 @@ def _sensor(rows: pa.Table, at: Sequence[int]) -> SensorDays:
         (prior[known[-1]], P[known[-1]]) if len(known) else None,
         (last[0], last[1], last[2]),
         PoseDays(days[left], pose[left], C[left], B[left], prior[left], P[left]),
+        days[moved & ~counts],
     )
 
 

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from scipy.special import ndtri
 
 from pipeline.audit.estimates import day_name
-from pipeline.audit.fusion import Mount, fuse, with_held_day
+from pipeline.audit.fusion import Mount, after_a_move, fuse, with_held_day
 from pipeline.audit.pose_days import SensorDays, VehiclePoses
 from pipeline.audit.restarts import drift_per_day, last_restart
 from pipeline.core.config import VerifyConfig
@@ -153,6 +153,11 @@ def _sensor_row(
         remarks.append(
             f"{held} was held and lies apart: the sensor may have moved, so both poses are possible"
         )
+    moved = days.moved_within[days.moved_within > counted.poses.day[-1]]
+    if len(moved):
+        found = after_a_move(found)
+        day = day_name(int(moved[-1]))
+        remarks.append(f"it or {reference.name} moved within {day}, and no later day counts yet: drive")
     before = counted.poses.T_prior[-1], counted.poses.prior_covariance[-1]
     pose = _Pose(found.T, found.covariance, found.common, found.of_prior, *before)
     left_out = ", ".join(names[k] for k in found.left_out)

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from pipeline.audit.days import DOFS, PairDays, charts_of_fleet, edges_of_fleet
 from pipeline.audit.estimates import Estimates, days_of, estimates_of, joined
-from pipeline.audit.fusion import Mount
+from pipeline.audit.fusion import LEAST_SCATTER, Mount
 from pipeline.audit.history import History, models_of
 from pipeline.audit.noise import estimate_noise
 from pipeline.audit.pose_days import VehiclePoses, read_poses
@@ -39,9 +39,6 @@ _DAYS_BACK = 60
 _END = dt.date.max.toordinal()
 # What is asked of the audit's rows.
 _CHANGE = ("start_day", "start_day_latest", "moved_sensor", "kind", "magnitude")
-# A mount's scatter from day to day before any day shows more: another simulator's mounts have .03 to .05 deg; load,
-# temperature and tyres move a car's sensors to its road by as much.
-_SCATTER = np.array([*np.radians([0.03] * 3), 0.003, 0.003, 0.003])
 
 
 def work(task: Task) -> Work:
@@ -165,7 +162,7 @@ def mounts_of(
     wander = np.zeros(shape) if noise.wander is None else noise.wander.reshape(shape)
     return [
         {
-            edge: Mount(np.sqrt(_SCATTER**2 + beyond[v, p]), wander[v, p], float(alike[v, p]))
+            edge: Mount(np.sqrt(LEAST_SCATTER**2 + beyond[v, p]), wander[v, p], float(alike[v, p]))
             for p, edge in enumerate(edges)
             if edge in own
         }

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.audit.fusion import Mount, PoseDays, fuse
+from pipeline.audit.fusion import LEAST_SCATTER, Mount, PoseDays, fuse
 from pipeline.rig.changes import change_between, change_covariance, change_jacobian, changed
 from pipeline.rig.se3 import exp_se3
 
@@ -70,6 +70,17 @@ def test_what_varies_averages_down_and_what_is_common_does_not():
     expected = 1 / np.sqrt(1 / before**2 + 1 / (NOISE**2 / 25 + BIAS**2))
     assert sigma[25] == pytest.approx(expected, rel=0.03)
     assert np.all(sigma[1][:3] > 1.5 * sigma[25][:3])
+
+
+@pytest.mark.parametrize(("scatter", "of_tomorrow"), [(0.0, 0.0), (0.9, 0.0), (3.0, np.sqrt(3.0**2 - 1))])
+def test_scatter_that_days_are_said_to_err_by_alike_is_not_the_mount_s(scatter, of_tomorrow):
+    """What is one thing counted twice left states of six nights unsure that days were sure of."""
+    rng = np.random.default_rng(4)
+    days, _ = days_of(25, rng, noise=0.1 * NOISE, scatter=np.zeros(6))
+    found = fuse(days, Mount(np.hypot(LEAST_SCATTER, scatter * BIAS), np.zeros(6), 0.0), 26)
+    variance = np.diag(change_covariance(found.T, found.covariance))
+    level = BIAS**2 + scatter**2 * BIAS**2 / 25
+    assert variance == pytest.approx(level + LEAST_SCATTER**2 + (of_tomorrow * BIAS) ** 2, rel=0.2)
 
 
 def test_the_prior_counts_once_however_many_days_lean_on_it():

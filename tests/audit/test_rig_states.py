@@ -215,3 +215,17 @@ def test_a_held_day_that_lies_apart_leaves_both_poses_possible(lake):
     truth = T_TOP["front"] @ exp_se3(2 * TURN)
     sigma = np.sqrt(np.diag(front.covariance)[:3])
     assert np.all(np.abs(log_se3(transform_of(front) @ inverse(truth))[:3]) < 3 * sigma)
+
+
+def test_a_day_within_which_the_sensor_moved_leaves_the_state_unsure_until_a_later_day_counts(lake):
+    """A camera turned by half a degree at noon: the day was refused, and the state of the days before it certified."""
+    moved = {(4, "front"): REFUSED | {"faults": ["moved_in_day"]}}
+    night = states(lake, pose_rows("a", 5, np.random.default_rng(14), of=moved))
+    assert night["front"].days[-1] == "2026-03-04"
+    assert night["front"].determined == []
+    assert "moved within 2026-03-05" in night["front"].reason
+    assert np.sqrt(np.diag(night["front"].covariance)[:3]).min() > np.radians(0.5)
+    assert night["left"].determined == ["azimuth", "elevation"]
+    after = states(lake, pose_rows("a", 6, np.random.default_rng(14), of=moved))["front"]
+    assert after.days[-1] == "2026-03-06"
+    assert after.determined == ["azimuth", "elevation"]
