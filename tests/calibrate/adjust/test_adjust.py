@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.adjust.adjusted import AdjustmentLimits
-from pipeline.calibrate.adjust.equations import Rig, equations_at
+from pipeline.calibrate.adjust.equations import Rig, equations_at, left_jacobian_inverse
 from pipeline.calibrate.adjust.rig import adjust
 from pipeline.rig.checks import FailedCheck
 from pipeline.rig.evidence import EDGE, EdgeEvidence
@@ -140,6 +140,23 @@ def test_a_tree_has_the_covariance_that_composition_has():
     )
 
 
+def test_five_lidars_do_not_average_down_the_bias_of_the_one_camera_that_they_share():
+    B = np.diag(np.array([*np.radians([0.05] * 3), 1e-4, 1e-4, 1e-4]) ** 2)
+    rng, sigma = np.random.default_rng(4), {}
+    for bias in ({"cam0": B}, {}):
+        for count in (1, 5):
+            scene = Scene(rng, "cam0", *(f"lid{k}" for k in range(4)))
+            lidars = ["top", *(f"lid{k}" for k in range(4))]
+            edges = [scene.edge("top", f"lid{k}") for k in range(4)]
+            edges += [scene.edge("cam0", lidars[k], bias=bias) for k in range(count)]
+            found = scene.adjusted(edges, innovation_sigmas=8.0).poses
+            sigma[bool(bias), count] = np.degrees(
+                np.sqrt(np.diag(found.covariance_between("cam0", "top"))[:3]).mean()
+            )
+    assert sigma[False, 5] < 0.6 * sigma[False, 1]
+    assert sigma[True, 5] > 0.05
+
+
 def test_an_edge_five_sigmas_off_is_named_where_several_cycles_check_it():
     rng, named, others = np.random.default_rng(5), 0, 0
     pairs = [
@@ -232,6 +249,21 @@ def test_what_nothing_ties_to_the_reference_keeps_the_prior_and_says_why():
     assert np.degrees(tied).max() < 0.1  # what they share they know of each other
 
 
+def test_an_edge_left_out_that_was_a_sensors_only_one_is_named_as_its_reason():
+    scene = Scene(np.random.default_rng(12), "cam0", "rad0")
+    edges = [scene.edge("cam0", "top", checks=(FailedCheck("lost"),)), scene.edge("top", "rad0")]
+    assert scene.adjusted(edges).sensors["cam0"].untied == "no edge of it can be used: cam0-top"
+
+
+def test_x_and_y_to_the_base_stay_at_the_prior_and_the_rest_is_determined():
+    scene = Scene(np.random.default_rng(13), "base", "rad0")
+    found = scene.adjusted([scene.edge("top", "base"), scene.edge("top", "rad0")]).sensors["base"]
+    R = scene.true["base"][:3, :3]
+    assert found.determined[:3].all()
+    assert found.determined[3:].sum() <= 1, R
+    assert {e.name for e in found.rests_on} == {"top-base"}
+
+
 def showing(scene, a, b, *directions):
     """Evidence of an edge that shows nothing but these directions, each a row of seven for one sigma."""
     rows = np.array(directions)
@@ -247,6 +279,19 @@ def test_a_turn_that_is_found_as_well_as_the_position_is_known_is_determined_and
     of_radar = found.sensors["rad0"]
     assert 0.1 < np.degrees(np.sqrt(found.poses.covariance_between("top", "rad0")[2, 2])) < 0.2
     assert of_radar.determined.tolist() == [False, False, True, False, False, False]
+
+
+def test_that_the_reference_was_found_to_be_turned_determines_no_other_sensors_turn():
+    scene = Scene(np.random.default_rng(16), "base", "cam0")
+    mounted = np.tile(np.diag(PRIOR_SIGMA**2), (2, 2))  # the reference's own, which all poses in it share
+    own = np.diag(np.concatenate([np.full(6, 1e-12), PRIOR_SIGMA**2]))
+    scene.prior = replace(
+        scene.prior, covariance=mounted + own, common=mounted + own, T=dict.fromkeys(scene.prior.T, np.eye(4))
+    )
+    edges = [scene.edge("top", "base"), showing(scene, "cam0", "top", np.eye(7)[1] * 1e4)]
+    found = scene.adjusted([replace(e, T=np.eye(4)) for e in edges], innovation_sigmas=1e6)
+    assert found.sensors["base"].determined[:3].all()
+    assert found.sensors["cam0"].determined[:3].tolist() == [False, True, False]
 
 
 def test_a_sensor_rests_on_the_edges_without_which_it_is_less_sure():
@@ -284,6 +329,57 @@ def test_the_equations_are_the_derivatives_of_the_cost():
             for x in step * np.eye(20)
         ]
         np.testing.assert_allclose(np.array(J).T, e.J, atol=1e-6)
+
+
+def test_the_left_jacobian_is_that_of_finite_differences():
+    rng = np.random.default_rng(16)
+    for size in (0.0, 0.01, 0.2):
+        xi, step = size * rng.normal(size=6), 1e-6
+        J = left_jacobian_inverse(xi)
+        for k, d in enumerate(step * np.eye(6)):
+            plus, minus = (log_se3(exp_se3(s) @ exp_se3(xi)) for s in (d, -d))
+            np.testing.assert_allclose((plus - minus) / (2 * step), J[:, k], atol=1e-6)
+
+
+def test_an_error_of_a_sensor_shows_in_its_edges_as_a_turn_of_that_sensor():
+    rng = np.random.default_rng(17)
+    scene = Scene(rng, "cam0", "rad0")
+    edges = [scene.edge("cam0", "top"), scene.edge("top", "rad0"), scene.edge("cam0", "rad0")]
+    edges = [replace(e, T=scene.between(*(s.name for s in e.edge.sensors))) for e in edges]
+    B = np.diag([np.radians(0.1) ** 2] * 3 + [1e-10] * 3)
+    stated = [replace(e, bias={"cam0": B} if e.edge.parent.name == "cam0" else {}) for e in edges]
+    found = scene.adjusted(stated)
+    # A turn of the camera by one sigma moves its pose by that and leaves the radar where it is.
+    extra = found.poses.covariance_between("cam0", "rad0") - scene.adjusted(edges).poses.covariance_between(
+        "cam0", "rad0"
+    )
+    assert np.degrees(np.sqrt(np.diag(extra)[0])) == pytest.approx(0.1, rel=0.05)
+    of_radar = np.diag(
+        found.poses.covariance_between("top", "rad0")
+        - scene.adjusted(edges).poses.covariance_between("top", "rad0")
+    )
+    assert np.degrees(np.sqrt(np.maximum(of_radar[:3], 0))).max() < 0.03
+
+
+def test_it_does_not_matter_where_an_edge_was_linearised():
+    scene = Scene(np.random.default_rng(19), "cam0", "rad0")
+    own = {EDGE: np.diag([np.radians(0.1) ** 2] * 3 + [4e-4] * 3), "cam0": np.eye(6) * 1e-6}
+    edges = [
+        scene.edge("cam0", "top", bias=own),
+        scene.edge("top", "rad0"),
+        scene.edge("cam0", "rad0", bias=own),
+    ]
+    d = np.array([1e-4, -2e-4, 1e-4, 1e-3, -1e-3, 2e-3, 0.002])
+    moved = [
+        replace(e, T=exp_se3(-d[:6]) @ e.T, dt_s=e.dt_s - d[6], gradient=e.information @ d) for e in edges
+    ]
+    a, b = scene.adjusted(edges, innovation_sigmas=9.0), scene.adjusted(moved, innovation_sigmas=9.0)
+    for name in ("cam0", "rad0"):
+        np.testing.assert_allclose(
+            log_se3(a.poses.T[name] @ inverse(b.poses.T[name])), np.zeros(6), atol=5e-5
+        )
+        assert a.poses.dt_s[name] == pytest.approx(b.poses.dt_s[name], abs=1e-6)
+    np.testing.assert_allclose(np.diag(a.poses.covariance), np.diag(b.poses.covariance), rtol=0.01)
 
 
 def test_evidence_of_an_edge_that_the_rig_lacks_is_an_error():

@@ -97,6 +97,19 @@ def test_evidence_and_prior_solved_alone_are_the_pairs_estimate(pair):
         )
 
 
+def test_data_alone_are_found_again_though_the_prior_had_most_of_the_say():
+    rng = np.random.default_rng(1)
+    noise, offset = noise_of(rng, 15.0), rng.normal(size=6) * 0.02
+    estimate = estimate_of("lidar_radar", noise, offset)
+    evidence = evidence_of(estimate, EDGES["lidar_radar"], PRIOR, CLOCK_S)
+    to_left = np.linalg.inv(change_jacobian(estimate.T))
+    data = np.linalg.inv(evidence.information[:6, :6])
+    np.testing.assert_allclose(data, to_left @ noise @ to_left.T, rtol=1e-6, atol=1e-9)
+    optimum = changed(PRIOR.T_lidar_radar, offset)
+    beyond = np.linalg.solve(to_left, data @ evidence.gradient[:6])
+    np.testing.assert_allclose(beyond, change_between(estimate.T, optimum), atol=2e-3)
+
+
 def test_what_the_day_did_not_move_has_no_information():
     estimate = estimate_of("camera_lidar", noise_of(np.random.default_rng(2)), np.zeros(6), fixed=(3, 5))
     evidence = evidence_of(estimate, EDGES["camera_lidar"], PRIOR, CLOCK_S)
@@ -125,12 +138,34 @@ def test_biases_are_handed_over_by_owner_and_are_not_in_the_information():
     np.testing.assert_allclose(sigma, today, rtol=0.05)
 
 
+def test_a_bias_that_the_weights_have_in_them_is_stated_in_full():
+    rng, sigma2 = np.random.default_rng(4), np.array([np.radians(0.3) ** 2, 0, 0, 0, 0, 0])
+    noise = noise_of(rng) + np.diag(sigma2)
+    estimate = estimate_of("lidar_radar", noise, np.zeros(6), in_weights=sigma2)
+    evidence = evidence_of(estimate, EDGES["lidar_radar"], PRIOR, CLOCK_S)
+    to_left = np.linalg.inv(change_jacobian(estimate.T))
+    np.testing.assert_allclose(
+        evidence.bias[EDGE], to_left @ np.diag(sigma2) @ to_left.T, rtol=1e-3, atol=1e-8
+    )
+    total = np.linalg.inv(evidence.information[:6, :6]) + evidence.bias[EDGE]
+    np.testing.assert_allclose(total, to_left @ noise @ to_left.T, rtol=1e-3, atol=1e-8)
+
+
 def test_failed_checks_travel_and_a_pair_that_shows_nothing_has_no_information():
     estimate = replace(PairEstimate.at_prior("camera_lidar", PRIOR), disproved="lost")
     evidence = evidence_of(estimate, EDGES["camera_lidar"], PRIOR, CLOCK_S, [FailedCheck("held out")])
     assert [c.sentence for c in evidence.checks] == ["held out", "lost"]
     assert not evidence.information.any()
     assert not evidence.gradient.any()
+
+
+def test_the_prior_of_two_transforms_says_the_same_of_them_as_poses():
+    poses = poses_of(PRIOR, {})
+    for pair in ("camera_lidar", "lidar_radar"):
+        parent, child = pair.split("_")
+        np.testing.assert_allclose(poses.between(parent, child), PRIOR.of(pair), atol=1e-12)
+        found = change_covariance(PRIOR.of(pair), poses.covariance_between(parent, child))
+        np.testing.assert_allclose(found, PRIOR.covariance(pair), atol=1e-12)
 
 
 def law_holds(estimate, prior):

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.edges.lidar_base import estimate_lidar_base
+from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.calibrate.verify.constancy import MOVED_SIGMAS, PART_FLOOR_RAD
+from pipeline.objective.ego_motion import EgoMotion
 from pipeline.rig.changes import change_between, change_jacobian
 from pipeline.rig.graph import BASE, Edge, Sensor
-from pipeline.rig.se3 import adjoint, exp_so3, inverse, perturb_exactly
+from pipeline.rig.se3 import adjoint, exp_se3, exp_so3, inverse, perturb_exactly
 from tests.makers.swept_streets import AROUND, Mounted, chosen, pose, swept_streets
 
 EDGE = Edge(Sensor("top", "lidar"), BASE)
@@ -88,6 +90,14 @@ def test_x_and_y_have_no_information_and_the_clock_none(evidence):
         assert along @ information @ along == pytest.approx(0.0, abs=1e-6 * information.max())
 
 
+def test_the_information_is_of_left_perturbations(evidence):
+    T, sigma = by_axis(evidence)
+    xi = np.array([2e-4, -3e-4, 1e-4, 2e-4, 1e-4, -3e-4])
+    change = change_between(T, inverse(exp_se3(xi) @ evidence.T))[AXES]
+    cost = np.sum((change / sigma) ** 2)
+    assert xi @ evidence.information[:6, :6] @ xi == pytest.approx(cost, rel=0.01)
+
+
 def test_an_empty_square_shows_no_yaw_and_still_the_road(street):
     flat = [chosen(s, s.is_ground) for s in street.sweeps["top"]]
     evidence = estimated(replace(street, sweeps={"top": flat}))
@@ -95,6 +105,15 @@ def test_an_empty_square_shows_no_yaw_and_still_the_road(street):
     assert not np.isfinite(sigma[2])
     assert any("yaw" in note for note in evidence.notes)
     assert (np.abs(error[[0, 1, 3]]) < LIMITS[[0, 1, 3]]).all()
+
+
+def test_without_motion_only_the_road_speaks(street):
+    unknown = EgoMotion(
+        street.ego.velocity_mps * np.nan, street.ego.yaw_rate_radps * np.nan, street.ego.covariance
+    )
+    _, sigma = errors(estimated(replace(street, ego=unknown)), T_BASE_TOP)
+    assert not np.isfinite(sigma[2])
+    assert np.isfinite(sigma[[0, 1, 3]]).all()
 
 
 def test_a_car_that_nods_when_it_brakes_keeps_its_pitch(street):
@@ -105,6 +124,24 @@ def test_a_car_that_nods_when_it_brakes_keeps_its_pitch(street):
     assert np.abs(faster).max() > 1.0
     error, _ = errors(estimated(replace(street, sweeps={"top": nodding})), T_BASE_TOP)
     assert abs(error[1]) < LIMITS[1]
+
+
+def test_a_car_that_parks_on_a_kerb_for_half_of_the_day_is_one_scene(street):
+    sweeps = street.sweeps["top"]
+    parked = [turned(sweeps[-1], [np.radians(4.0), 0.0, 0.0])] * len(sweeps)
+    ego = EgoMotion(
+        np.concatenate([street.ego.velocity_mps, 0 * street.ego.velocity_mps]),
+        np.concatenate([street.ego.yaw_rate_radps, 0 * street.ego.yaw_rate_radps]),
+        np.concatenate([street.ego.covariance] * 2),
+    )
+    scene, block = (
+        np.concatenate([a, np.full(len(a), a[-1] + 1)]) for a in (street.scenes.scene, street.scenes.block)
+    )
+    error, _ = errors(
+        estimated(replace(street, sweeps={"top": [*sweeps, *parked]}, ego=ego, scenes=Scenes(scene, block))),
+        T_BASE_TOP,
+    )
+    assert abs(error[0]) < LIMITS[0]
 
 
 def test_a_lidar_that_turned_at_noon_shows_it(street, evidence):
@@ -124,6 +161,14 @@ def test_a_car_that_stands_otherwise_in_the_afternoon_is_no_lidar_that_moved(str
     assert np.abs(found.sigmas(PART_FLOOR_RAD)).max() < 3.0
 
 
+def test_cars_that_keep_their_distance_do_not_slow_the_way(street):
+    box = np.random.default_rng(1).uniform([9.0, -1.0, -1.2], [9.3, 1.0, 0.2], (400, 3))
+    beside = box + [2.0, 4.0, 0.0]
+    convoy = [with_points(s, np.concatenate([box, beside])) for s in street.sweeps["top"]]
+    error, _ = errors(estimated(replace(street, sweeps={"top": convoy})), T_BASE_TOP)
+    assert (np.abs(error) < LIMITS).all()
+
+
 def test_a_measured_height_is_one_more_measurement_and_is_checked(street, evidence):
     alone, _ = by_axis(evidence)
     height_m = float(T_BASE_TOP[2, 3])
@@ -132,6 +177,15 @@ def test_a_measured_height_is_one_more_measurement_and_is_checked(street, eviden
     wrong = estimated(street, height_m=(height_m + 0.2, 0.01))
     assert any("height" in c.sentence for c in wrong.checks)
     assert by_axis(agreed)[0][2, 3] == pytest.approx(alone[2, 3], abs=0.01)
+
+
+def with_points(sweep, xyz_m):
+    """The sweep and points on something that stands on the ground, of a size that nobody knows."""
+    nothing = np.zeros(len(xyz_m), bool)
+    return replace(
+        sweep, xyz_m=np.concatenate([sweep.xyz_m, xyz_m]), is_ground=np.r_[sweep.is_ground, nothing],
+        may_move=np.r_[sweep.may_move, nothing], time_s=np.r_[sweep.time_s, 0.0 * nothing],
+    )  # fmt: skip
 
 
 def turned(sweep, rotation_base):

@@ -85,6 +85,12 @@ def test_a_wrong_lever_arm_is_no_yaw():
     assert evidence.diagnostics["lever_less_prior_m"] == pytest.approx(0.5, abs=0.15)
 
 
+def test_roll_and_position_have_no_information():
+    radar, ego = day(mounted(60.0))
+    evidence = estimate_radar_base(EDGE, radar, ego, STAMPS, ALL)
+    assert np.linalg.matrix_rank(evidence.information, tol=1e-9 * evidence.information.max()) == 2
+
+
 def test_an_even_speed_shows_no_clock_and_a_standing_car_nothing():
     radar, ego = day(mounted(0.0), changes=0.0)
     ego = EgoMotion(ego.velocity_mps * 0 + [14.0, 0.0], ego.yaw_rate_radps, ego.covariance)

@@ -7,7 +7,10 @@ import pytest
 
 from pipeline.calibrate.joint.camera_lidar.estimate import (
     _usable,
+    align_camera_lidar,
 )
+from pipeline.calibrate.joint.camera_lidar.observability import time_offset_variance
+from pipeline.calibrate.joint.camera_lidar.time_offset import TimeOffsetProfile
 from pipeline.calibrate.numerics.search_range import search_range
 from pipeline.core.config import SolveConfig
 from pipeline.core.errors import SolveError
@@ -85,6 +88,16 @@ def test_road_without_reflectivity_leaves_the_edges_to_do_it():
     assert e.diagnostics["marking_weight"] == 0.0
 
 
+def test_rows_a_degree_apart_tell_pitch_where_the_road_shows_nothing():
+    spinning = replace(SPARSE, elevations_deg=np.arange(-16.0, 16.0))
+    day = traced_day(spinning, 16, seed=1, reflective=False)
+    e = estimate_camera_lidar(day, prior_off_by(2.0, 0.05, 1), SolveConfig(), np.random.default_rng(0))
+    pitch_deg, sigma_deg = np.degrees([change_between(T_TRUE, e.T)[0], np.sqrt(e.covariance[0, 0])])
+    assert e.observable[0]
+    assert sigma_deg < 0.25
+    assert abs(pitch_deg) < 3 * sigma_deg
+
+
 def test_a_car_that_stands_says_what_it_sees_and_that_it_knows_it_less_well():
     """One scene does not know its own sigma; what it shows is better than a prior that it shows to be wrong."""
     (scene,) = traced_day(DENSE, 1, seed=1, reflective=False)
@@ -130,6 +143,25 @@ def test_what_the_day_cannot_determine_stays_at_the_prior_with_its_sigma_and_the
         assert abs(e.time_offset_s - 0.03) < 3 * e.time_offset_sigma_s
 
 
+@pytest.mark.parametrize("walking_mps", [None, 1.0])
+def test_the_less_is_known_along_the_axis_the_less_is_known_of_the_time_offset(walking_mps):
+    # A car that stands dt later looks as if it stood further on: in a jam by a second per metre.
+    day = traced_day(SPARSE, 6, seed=3)
+    if walking_mps is not None:
+        day = [replace(o, ego_speed_mps=walking_mps) for o in day]  # images are taken with their sweeps
+    begun = align_camera_lidar(day, prior_off_by(1.0, 0.03, 2), SolveConfig(), np.random.default_rng(5))
+    timed = TimeOffsetProfile(begun.state, 1e-6, 0.0)
+    expected_s = begun.problem.config.time_offset_sigma_s
+
+    def day_variance(tz_sigma_m):
+        problem = replace(begun.problem, tz_variance=tz_sigma_m**2)
+        return 1 / (1 / time_offset_variance(problem, begun.state, begun.kernel, timed) - 1 / expected_s**2)
+
+    forward_mps = begun.problem.terms.velocity_lidar @ begun.state.T_camera_lidar[2, :3]
+    share_s = float(forward_mps.sum() / np.sum(forward_mps**2)) * 0.1
+    assert 0.5 * share_s**2 < day_variance(0.1) - day_variance(0.02) < 1.5 * share_s**2
+
+
 def test_what_the_day_knows_better_than_the_prior_is_left_to_the_day():
     day = traced_day(DENSE, 10, seed=1, dt_s=0.03)
     prior = prior_along_the_axis(0.6)
@@ -139,6 +171,13 @@ def test_what_the_day_knows_better_than_the_prior_is_left_to_the_day():
     assert 0.03 < sigma[5] < 0.3
     assert abs(e.T[2, 3] - T_TRUE[2, 3]) < 3 * sigma[5]
     assert e.T[2, 3] != prior.T_camera_lidar[2, 3]
+
+
+def test_what_sparse_rings_leave_open_of_a_vague_prior_is_said_with_a_sigma_that_covers_it():
+    day = traced_day(SPARSE, 12, seed=1, dt_s=0.03)
+    e = estimate_camera_lidar(day, prior_along_the_axis(0.6), SolveConfig(), np.random.default_rng(0))
+    sigma = np.sqrt(np.diag(change_covariance(e.T, e.covariance)))
+    assert abs(e.T[2, 3] - T_TRUE[2, 3]) < 3 * sigma[5]
 
 
 @pytest.mark.slow

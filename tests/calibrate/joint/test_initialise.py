@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.joint.camera_lidar import initialise
-from pipeline.calibrate.joint.camera_lidar.beyond_chance import TERMS, Evidence, wrong_poses
-from pipeline.calibrate.joint.camera_lidar.initialise import find_basin
+from pipeline.calibrate.joint.camera_lidar.beyond_chance import TERMS, Evidence, by_chance, wrong_poses
+from pipeline.calibrate.joint.camera_lidar.initialise import Basin, difference, find_basin
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, Scored, refine
 from pipeline.calibrate.joint.camera_lidar.rotation_grid import grid_maxima
 from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
@@ -16,7 +16,9 @@ from pipeline.calibrate.numerics.search_range import SearchRange, search_range
 from pipeline.core.config import SolveConfig
 from pipeline.objective.camera_lidar.kernel_settings import MAX_GAP_PX
 from pipeline.objective.camera_lidar.points import Points, lidar_velocities
-from pipeline.objective.camera_lidar.score import KernelSettings, prepare_terms
+from pipeline.objective.camera_lidar.score import Alignments, KernelSettings, prepare_terms
+from pipeline.rig.cameras import camera_of
+from pipeline.rig.changes import change_between
 from pipeline.rig.estimates import Prior
 from pipeline.rig.se3 import (
     exp_so3,
@@ -119,6 +121,35 @@ def test_a_truth_out_of_reach_is_not_found(terms):
         assert basin.doubt
 
 
+def test_an_end_that_the_frames_do_not_tell_from_another_is_doubted(terms, monkeypatch):
+    monkeypatch.setattr(initialise, "CLEARLY", 1e6)
+    far = turned(T_TRUE, np.radians([4.0, -4.0, 0.0]))
+    monkeypatch.setattr(initialise, "grid_maxima", lambda *_: [("edges", far)])
+    assert "fits the frames as well" in searched(terms, off_by(1.0, 0.02, 5)).doubt
+
+
+@pytest.mark.parametrize(("frames", "said"), [(10, "markings contradict"), (1, "")])
+def test_a_term_contradicts_an_end_only_where_its_own_lead_holds_over_the_frames(terms, frames, said):
+    """A lidar that is blind to paint has its brightest places somewhere too: in one frame, and so in their sum."""
+    prior, kernel = off_by(1.0, 0.02, 5), KernelSettings.wide(*SCHEDULE.kernels[0])
+    wrong = wrong_poses(prior, REACH_RAD, 0.05, np.random.default_rng(0))
+    elsewhere = turned(T_TRUE, np.radians([0.0, 0.0, 7.0]))
+    bright = bright_on_bright(terms, elsewhere)
+    misled = replace(terms, markings=bright.chosen(np.arange(len(bright.xyz_m)) < frames * _BRIGHT))
+    evidence = Evidence(misled, kernel, ((40.0, 30.0), (-40.0, -30.0))).measured(wrong)
+    scored = Scored(misled, kernel, prior, SolveConfig())
+    search = initialise._Search(scored, evidence, np.arange(terms.frames))
+    best, rival = (search._end("edges", AlignmentState(T)) for T in (T_TRUE, elsewhere))
+    basin = Basin(best.state, kernel, "edges", 2, (40.0, 0.0, 0.0), 13.0, 0.1, np.inf)
+    ahead = replace(rival, evidence=np.array([0.0, 30.0, 0.0]))
+    doubt = search._doubt(basin, [ahead], is_last=True)
+    assert doubt.startswith(said)
+    assert bool(doubt) == bool(said)
+    assert search._doubt(basin, [ahead], is_last=False)  # candidates are left to ask
+    led = replace(basin, evidence=(70.0, 0.0, 0.0))
+    assert not search._doubt(led, [ahead], is_last=True)  # the others lead by far more
+
+
 def test_a_term_without_data_weighs_nothing(terms):
     prior, rng = off_by(1.0, 0.02, 5), np.random.default_rng(0)
     wrong = wrong_poses(prior, REACH_RAD, 0.05, rng)
@@ -128,6 +159,12 @@ def test_a_term_without_data_weighs_nothing(terms):
     assert evidence.weighted().edge_weight == 1.0
     assert evidence.of(wrong)[:, 1].tolist() == [0.0] * len(wrong)
     assert evidence.terms_with_values == 2  # so chance has no third term either
+
+
+def test_the_best_of_many_chance_poses_shows_as_much_as_drawn_ones():
+    rng = np.random.default_rng(0)
+    best = rng.exponential(size=(300, 2000, 3)).sum(2).max(1)
+    assert by_chance(2000, 3) == pytest.approx(np.median(best), abs=0.6)
 
 
 def test_the_state_of_an_earlier_day_is_looked_at_where_the_day_does_not_decide(terms, monkeypatch):
@@ -154,3 +191,56 @@ def test_no_climb_leaves_the_search_range(terms):
     assert (
         np.abs(state.T_camera_lidar[:3, 3] - prior.T_camera_lidar[:3, 3]).max() < limits.translation_m + 1e-9
     )
+
+
+def test_a_state_within_the_range_is_not_touched():
+    prior, limits = off_by(1.0, 0.02, 8), SearchRange(np.radians(6.0), 0.3)
+    state = AlignmentState(T_TRUE, 0.01)
+    assert state.within(prior, limits) is state
+    far = AlignmentState(turned(prior.T_camera_lidar, np.radians([10.0, 1.0, 0.0])), 0.01)
+    moved = change_between(prior.T_camera_lidar, far.within(prior, limits).T_camera_lidar)
+    assert np.allclose(moved[:3], [limits.rotation_rad, np.radians(1.0), 0.0], atol=1e-9)
+    assert difference(far, far) == pytest.approx(np.zeros(8))
+
+
+def test_edges_in_view_are_those_that_the_camera_model_projects_into_the_image(day, terms):
+    T = turned(T_TRUE, np.radians([0.0, 35.0, 4.0]))
+    at = Alignments(T[None], np.zeros(1), np.ones(1))
+    camera = terms.maps.camera
+    uv, valid = camera.project(transform_points(T, terms.edges.xyz_m.astype(np.float64)))
+    inside = valid & (uv >= 0).all(1) & (uv[:, 0] <= camera.width_px - 1) & (uv[:, 1] <= camera.height_px - 1)
+    assert camera.model == camera_of(day[0]).model
+    assert abs(int(terms.edges_in_view(at)[0]) - int(inside.sum())) <= 3  # single precision at the border
+    assert 0 < inside.sum() < len(inside)
+
+
+def test_an_end_that_still_pays_a_prior_on_its_way_is_optimised_before_it_is_rejected(terms):
+    """From 15 deg away the right end was given up for a focal length that its climb had not yet brought back."""
+    prior, kernel = off_by(1.0, 0.02, 5), KernelSettings.wide(*SCHEDULE.kernels[0])
+    wrong = wrong_poses(prior, REACH_RAD, 0.05, np.random.default_rng(0))
+    evidence = Evidence(terms, kernel, ((40.0, 30.0), (-40.0, -30.0))).measured(wrong)
+    search = initialise._Search(
+        Scored(terms, kernel, prior, SolveConfig()), evidence, np.arange(terms.frames)
+    )
+    T_near = turned(T_TRUE, np.radians([0.0, 0.4, 0.0]))
+    on_its_way = search._end("edges", AlignmentState(T_near, focal=1.01))
+    elsewhere = turned(T_TRUE, np.radians([0.0, 0.0, 7.0]))
+    ahead = search._end("markings", AlignmentState(elsewhere))
+    ahead = replace(ahead, prior=on_its_way.total - ahead.evidence.sum() + 20.0)
+    arrived = search._arrived(on_its_way, ahead)
+    assert arrived.is_finished
+    assert arrived.total > on_its_way.total + 1.0
+    assert degrees_off(arrived.state.T_camera_lidar) < 0.2
+    assert search._finished(arrived) is arrived
+
+
+def test_a_rival_near_by_is_asked_again_by_a_sharper_kernel(terms):
+    basin = replace(searched(terms, off_by(1.0, 0.02, 5)), rival_z=1.0, doubt="")
+    scored = Scored(terms, KernelSettings.wide(*SCHEDULE.kernels[-1]), off_by(1.0, 0.02, 5), SolveConfig())
+    best, same, other = (
+        AlignmentState(turned(T_TRUE, np.radians([angle, 0.0, 0.0]))) for angle in (0.0, 0.1, 1.0)
+    )
+    assert not initialise.settled(basin, scored, best, same).doubt  # both starts lead there
+    assert not initialise.settled(basin, scored, best, other).doubt  # the frames reject it
+    assert "fits the frames as well" in initialise.settled(basin, scored, other, best).doubt
+    assert initialise.settled(replace(basin, doubt="chance"), scored, best, same).doubt == "chance"

@@ -55,6 +55,14 @@ def test_a_focal_length_that_is_three_percent_off_is_measured_and_told(day, fact
     assert f"{found.focal - 1:+.1%}" in told
 
 
+def test_a_principal_point_that_is_wrong_downwards_is_measured_to_its_sigma(day):
+    right = measured(day)
+    found = measured(wrong(day, down_px=30.0))
+    moved = found.centre_px - right.centre_px
+    assert moved[1] == pytest.approx(-30.0, abs=2 * found.centre_sigma_px[1])
+    assert moved[1] < -10.0
+
+
 def test_a_contradicted_camera_info_holds_camera_lidar_with_the_measured_value(day):
     for rows, is_told in ((day, False), (wrong(day, 0.97), True)):
         observations = dict.fromkeys(PAIRS, rows)
@@ -89,8 +97,31 @@ def test_contradictions_need_three_sigmas_of_day_and_camera_info_together():
     assert len(contradictions(day_of(1.0149, centre_px=(0.0, 14.9)), CameraPrior(0.0, 0.0, 0.0))) == 2
 
 
+def test_what_one_half_of_the_frames_does_not_show_is_no_contradiction():
+    known, whole = CameraPrior(0.0, 0.0, 0.0), day_of(1.02, centre_px=(0.0, -12.0))
+    agree = (day_of(1.025, 0.006, (0.0, -14.0)), day_of(1.015, 0.006, (0.0, -10.0)))
+    assert len(contradictions(replace(whole, halves=agree), known)) == 2
+    for silent in (day_of(1.011, 0.006, (0.0, -5.0)), day_of(0.98, centre_px=(0.0, 12.0))):
+        assert contradictions(replace(whole, halves=(agree[0], silent)), known) == []
+
+
 def test_a_contradicted_camera_info_was_asked_of_both_halves(day):
     assert measured(day).halves == ()
     first, second = measured(wrong(day, 0.97)).halves
     assert first.focal > 1.015
     assert second.focal > 1.015
+
+
+def test_diagnostics_say_what_the_day_determined_and_what_stays_open_in_the_mounting():
+    known = CameraPrior(focal_sigma=0.003, centre_sigma_px=4.0, centre_is_stated=True)
+    d = day_of(1.01, 0.002, (5.0, -2.0)).diagnostics(known)
+    assert (d["day_focal_observable"], d["day_centre_u_observable"], d["day_centre_v_observable"]) == (
+        1,
+        0,
+        1,
+    )
+    assert (d["day_centre_u_px"], d["day_centre_v_px"]) == (5.0, -2.0)
+    assert d["mounting_pitch_sigma_rad"] == pytest.approx(2.4 / 900)  # 3 px and 4 px together
+    assert day_of().diagnostics(CameraPrior())["mounting_yaw_sigma_rad"] == pytest.approx(20 / 900)
+    sure = day_of().diagnostics(CameraPrior(centre_sigma_px=0.0, centre_is_stated=True))
+    assert sure["mounting_yaw_sigma_rad"] == 0.0

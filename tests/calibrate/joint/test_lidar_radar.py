@@ -5,14 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.calibrate.joint import camera_radar
 from pipeline.calibrate.joint.camera_radar import estimate_camera_radar
 from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
 from pipeline.calibrate.verify.constancy import MOVED_SIGMAS, PART_FLOOR_RAD
 from pipeline.core.config import SolveConfig
 from pipeline.core.errors import SolveError
+from pipeline.objective.radar.moving_clusters import camera_radar_cost
 from pipeline.rig.changes import change_between, change_covariance
 from pipeline.rig.estimates import Prior
-from pipeline.rig.se3 import exp_so3, log_se3, perturb_exactly
+from pipeline.rig.se3 import exp_se3, exp_so3, log_se3, perturb_exactly
 from pipeline.rig.spherical import from_spherical, to_spherical
 from tests.makers.radar_errors import bounced, elevated
 from tests.makers.radar_scenes import DT_S, GROUND_M, T_LIDAR_RADAR, street_day
@@ -65,6 +67,14 @@ def test_wrong_priors_lead_to_the_truth(day, rotation_deg, shift_m):
         assert abs(found.time_offset_s - DT_S) < 3 * found.time_offset_sigma_s
 
 
+@pytest.mark.slow
+def test_the_same_seed_gives_the_same_numbers(day):
+    a, b = (solve(day[:12], prior_off_by(2, 0.1), seed=3) for _ in range(2))
+    assert np.array_equal(a.T, b.T)
+    assert np.array_equal(a.covariance, b.covariance)
+    assert a.diagnostics == b.diagnostics
+
+
 def test_a_radar_without_elevation_leaves_roll_and_pitch_to_the_prior():
     prior = prior_off_by(2, 0.1, 1)
     found = solve(street_day(24, elevation=False), prior)
@@ -80,6 +90,29 @@ def test_a_radar_without_elevation_leaves_roll_and_pitch_to_the_prior():
     assert varying[2] > np.radians(0.01) ** 2
 
 
+@pytest.mark.parametrize("roll_deg", [-3.0, 3.0])
+def test_a_roll_that_nobody_measures_leaves_yaw_as_open_as_its_errors_show(roll_deg):
+    off = T_LIDAR_RADAR.copy()
+    off[:3, :3] = exp_so3(np.array([np.radians(roll_deg), 0.0, 0.0])) @ off[:3, :3]
+    found = solve(street_day(24, elevation=False), Prior(T_CAMERA_LIDAR, off, SIGMA_ROTATION, SIGMA_SHIFT))
+    error = change_between(T_LIDAR_RADAR, found.T)
+    assert abs(error[2]) > np.radians(0.06)  # a roll of 3 deg does that much
+    assert abs(error[2]) < 3 * np.sqrt(found.covariance[2, 2])
+    assert np.sqrt(found.covariance[2, 2]) < np.radians(0.2)
+
+
+def test_a_height_that_the_day_cannot_tell_stays_while_a_knock_aside_is_found(day):
+    knocked = T_LIDAR_RADAR.copy()
+    knocked[:3, 3] += [0.0, 0.12, 0.04]
+    prior = Prior(T_CAMERA_LIDAR, knocked, SIGMA_ROTATION, 0.03)
+    found = solve(day[:24], prior)
+    assert_kept(found, prior)
+    assert not found.observable[5]
+    assert found.observable[4]
+    assert abs(found.T[1, 3] - T_LIDAR_RADAR[1, 3]) < 0.04  # four prior sigmas away, all but a quarter found
+    assert any("z" in note and "kept at the prior" in note for note in found.notes)
+
+
 def test_others_are_less_sure_where_what_they_lean_on_rests_on_a_wider_prior(day):
     sure, vague = (
         solve(day[:24], Prior(T_CAMERA_LIDAR, T_LIDAR_RADAR, SIGMA_ROTATION, sigma))
@@ -91,6 +124,30 @@ def test_others_are_less_sure_where_what_they_lean_on_rests_on_a_wider_prior(day
         assert np.allclose(found.T[:3, 3], T_LIDAR_RADAR[:3, 3], atol=1e-9)
     # A radar that stands 1 cm aside sees the street turned: without knowing y, yaw is that much less sure.
     assert vague.covariance[2, 2] > sure.covariance[2, 2] + np.radians(0.01) ** 2
+
+
+def test_much_of_roll_is_drawn_anew_every_day_and_most_of_pitch_is_not(day):
+    """What noise makes of roll differs from day to day; what the beam spacing makes of it is the same every day."""
+    found = solve(day[:24], Prior(T_CAMERA_LIDAR, T_LIDAR_RADAR, SIGMA_ROTATION, SIGMA_SHIFT))
+    assert found.observable[:2].all()
+    alike = np.diag(found.common_covariance) / np.diag(found.covariance)
+    assert 0.3 < alike[0] < 0.7
+    assert alike[1] > 0.5
+
+
+def test_frames_of_a_turn_that_no_odometry_measured_are_left_out(day):
+    turning = {
+        "radar_velocity_mps": np.array([8.0, 1.0, 0.0]),
+        "ego_speed_mps": 8.0,
+        "ego_yaw_rate_radps": None,
+    }
+    turn = [replace(o, **turning) for o in day[:6]]
+    straight = [replace(o, ego_yaw_rate_radps=None) for o in day[6:24]]
+    found = solve([*turn, *straight], prior_off_by(1, 0.02))
+    assert found.frames_used == len(straight)
+    assert found.frames_rejected == {"turns at an unknown yaw rate": 6}
+    measured = [replace(o, ego_yaw_rate_radps=0.3) for o in turn]
+    assert solve([*measured, *straight], prior_off_by(1, 0.02)).frames_used == 24
 
 
 def test_a_radar_of_poor_elevation_is_not_trusted_with_roll(day):
@@ -156,6 +213,12 @@ def test_detections_by_way_of_the_road_turn_the_radar_by_less_than_its_sigma(day
     assert np.all(np.abs(turned[:2]) < np.sqrt(np.diag(bent.covariance)[:2]))
 
 
+def test_constant_elevation_and_range_errors_are_named_as_assumptions(day):
+    notes = "\n".join(solve(day[:20], prior_off_by(1, 0.02)).notes)
+    assert "own constant elevation error (0 +- 0.20 deg)" in notes
+    assert "range bias" in notes
+
+
 def test_stamps_that_are_all_late_by_as_much_change_the_time_offset_by_it_and_nothing_else(day):
     late = [replace(o, radar_stamp_ns=o.radar_stamp_ns + 60_000_000) for o in day]
     a, b = (solve(d, prior_off_by(1.0, 0.03)) for d in (day, late))
@@ -191,6 +254,15 @@ def test_too_few_frames_are_refused(day):
         solve(deaf, prior_off_by(1, 0.02))
 
 
+def test_half_of_a_day_that_was_turned_is_found(day):
+    yaw = np.radians(0.4)
+    turn = exp_se3(np.array([0, 0, -yaw, 0, 0, 0]))
+    turned = [replace(o, radar_xyz_m=(o.radar_xyz_m @ turn[:3, :3].T).astype(np.float32)) for o in day[20:]]
+    first, second = (solve(part, prior_off_by(1, 0.02)) for part in (day[:20], turned))
+    change = log_se3(second.T @ np.linalg.inv(first.T))
+    assert abs(change[2] - yaw) < np.radians(0.1)
+
+
 def turned_at_noon(day, axis, turn_deg):
     """First and last part of a day after whose half the radar is turned about one of its axes."""
     turn = exp_so3(np.radians(turn_deg) * np.eye(3)[axis])
@@ -208,6 +280,42 @@ def test_a_radar_that_turned_at_noon_shows_in_the_parts_of_the_day_with_time_and
     assert np.abs(quiet.sigmas(PART_FLOOR_RAD)).max() < MOVED_SIGMAS
 
 
+@pytest.mark.parametrize("turn_deg", [2.0, -2.0])
+def test_a_radar_that_tilted_at_noon_tilts_its_parts_and_leaves_yaw(day, turn_deg):
+    """Where nothing but boxes and the registration knows pitch, less than the turn, for sigmas of half a degree."""
+    parts = turned_at_noon(day, 1, turn_deg)
+    assert 0.4 < np.degrees(parts.step[1]) / turn_deg < 1.2
+    assert abs(parts.sigmas(PART_FLOOR_RAD)[2]) < MOVED_SIGMAS
+
+
+def test_the_held_out_cost_of_camera_radar_prefers_the_truth_and_names_frames_that_cannot_tell(day):
+    frames = [
+        *day[:8],
+        replace(day[8], radar_velocity_mps=None, radar_cluster=np.full_like(day[8].radar_cluster, -1)),
+    ]
+    wrong = exp_se3(np.array([0, 0, np.radians(1.0), 0, 0, 0])) @ T_LIDAR_RADAR
+    camera_right, camera_wrong = (
+        camera_radar_cost(frames, T_CAMERA_LIDAR @ T) for T in (T_LIDAR_RADAR, wrong)
+    )
+    assert np.nanmean(camera_right) < np.nanmean(camera_wrong)
+    assert np.isnan(camera_right[8])
+
+
+def test_an_azimuth_that_two_turns_explain_alike_is_left_open(day, monkeypatch):
+    """Cars in the next lane meet the boxes of this one: the loop is not to be judged by such an azimuth."""
+    prior, seen = prior_off_by(1, 0.02, 0), estimate_camera_radar
+    sure = seen(day, prior, CONFIG, np.random.default_rng(0))
+    assert sure.diagnostics["rival_share"] < 0.82
+    assert sure.observable[1]
+    scan = camera_radar._scan_azimuth
+    monkeypatch.setattr(camera_radar, "_scan_azimuth", lambda *a: (scan(*a)[0], 0.95))
+    unsure = seen(day, prior, CONFIG, np.random.default_rng(0))
+    assert not unsure.observable[1]
+    assert unsure.observability[1] == 0
+    assert any("azimuth is open" in note for note in unsure.notes)
+    assert unsure.observable[[0, 2]].tolist() == sure.observable[[0, 2]].tolist()
+
+
 def test_camera_and_radar_alone_find_their_azimuth(day):
     T_true = T_CAMERA_LIDAR @ T_LIDAR_RADAR
     for seed in range(3):
@@ -219,3 +327,9 @@ def test_camera_and_radar_alone_find_their_azimuth(day):
             < 3.5 * np.sqrt(np.diag(found.covariance))[:3][found.observable[:3]]
         )
         assert not found.observable[3:].all()
+
+
+def test_a_knock_wider_than_the_registration_reaches_shows_in_the_parts_too(day):
+    parts = turned_at_noon(day, 2, -5.0)
+    assert abs(parts.sigmas(PART_FLOOR_RAD)[2]) > 10 * MOVED_SIGMAS
+    assert np.degrees(parts.step[2]) == pytest.approx(-5.0, abs=0.2)

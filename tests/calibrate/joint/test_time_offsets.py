@@ -9,6 +9,7 @@ from pipeline.calibrate.joint.lidar_radar import time_offset
 from pipeline.calibrate.joint.lidar_radar.elevation_spread import ElevationSpread
 from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
 from pipeline.calibrate.joint.lidar_radar.problem import RadarProblem, RadarState
+from pipeline.calibrate.joint.lidar_radar.schedule import SCHEDULE
 from pipeline.calibrate.joint.lidar_radar.time_offset import dips
 from pipeline.core.config import SolveConfig
 from pipeline.objective.radar.moving_clusters import moving_clusters
@@ -18,6 +19,15 @@ from pipeline.rig.se3 import inverse, transform_points
 from pipeline.rig.spherical import from_spherical, to_spherical
 from tests.makers.radar_scenes import DT_S, SIGMA, T_LIDAR_RADAR, street_day
 from tests.makers.solve_scenes import T_CAMERA_LIDAR
+
+
+def test_a_slope_has_no_dip_wherever_it_leads():
+    steps = np.arange(41.0)[:, None]
+    slope = np.hstack([0.7 * steps, -2.0 * steps, 0 * steps])
+    inner = slice(
+        SCHEDULE.dt_dip_steps, -SCHEDULE.dt_dip_steps
+    )  # at the ends half of the surroundings are missing
+    assert np.allclose(dips(slope)[inner], 0.0)
 
 
 @pytest.mark.parametrize("slope", [-3.0, 0.0, 3.0])
@@ -58,6 +68,15 @@ def test_an_offset_far_beyond_what_is_searched_is_seen_from_anywhere(problem, sl
     assert far["own_dt_z"] < -2
     right = time_offset.far_time_offset(problem, state_at(DT_S))
     assert abs(right["own_dt_s"] - DT_S) < 0.02
+
+
+def test_the_radars_own_sigmas_bring_back_an_offset_that_wider_ones_do_not_see(problem, monkeypatch):
+    right, slid = state_at(DT_S), state_at(DT_S + 0.04)
+    monkeypatch.setattr(time_offset, "comparison_cost", lambda problem, _: np.zeros(problem.frames.count))
+    found = time_offset.better_time_offset(problem, slid)
+    assert found is not None
+    assert abs(found.dt_s - DT_S) < 0.012  # half a step of 0.2 m
+    assert time_offset.better_time_offset(problem, right) is None
 
 
 def tunnel_day(frames, seed=3):

@@ -69,6 +69,13 @@ def test_the_sensor_whose_two_pairs_shift_is_named_with_time_and_size(sensor, tu
     assert f"the {sensor} moved" in sentences
 
 
+def test_the_turn_has_the_sign_of_the_later_part():
+    (check,) = constancy_failures(estimates("radar", (0.0, 0.0, 1.0)))["lidar_radar"]
+    assert "+1.00 deg" in check.sentence
+    (check,) = constancy_failures(estimates("radar", (0.0, 0.0, -1.0)))["lidar_radar"]
+    assert "-1.00 deg" in check.sentence
+
+
 @pytest.mark.parametrize(("sensor", "with_radar"), [("lidar", True), ("camera", False)])
 def test_a_tilt_that_the_radar_does_not_see_leaves_two_sensors(sensor, with_radar):
     turn = (0.0, 1.0, 0.0) if sensor == "lidar" else (1.0, 0.0, 0.0)  # pitch of either
@@ -78,6 +85,17 @@ def test_a_tilt_that_the_radar_does_not_see_leaves_two_sensors(sensor, with_rada
     assert (
         failed["lidar_radar"][0].sentence == "the camera or lidar moved during the day, as camera-lidar shows"
     )
+
+
+def test_a_tilt_that_the_radar_shows_in_part_does_not_blame_the_camera():
+    """Elevation rests on witnesses with floors of their own, so that parts turn less than the lidar did."""
+    found = estimates("lidar", (0.0, 1.0, 0.0))
+    radar, sure = found["lidar_radar"], np.eye(3) * np.radians(0.2) ** 2
+    first, last = (turned("lidar", np.array((0.0, 1.0, 0.0)), share)["lidar_radar"] for share in (0.4, 0.6))
+    parts = DayParts((first, last), (sure, sure), CUT_NS, (0, 1, 2))
+    failed = constancy_failures(found | {"lidar_radar": replace(radar, parts=parts)})
+    assert "the camera or lidar moved" in failed["camera_lidar"][0].sentence
+    assert failed["lidar_radar"]
 
 
 def test_the_one_sensor_of_a_rig_that_moved_loses_edges_that_do_not_show_it():

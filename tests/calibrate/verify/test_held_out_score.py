@@ -79,6 +79,17 @@ def test_registration_contradicts_a_degree_of_yaw_and_leaves_elevation_alone(str
     assert tilted["elevation"].remaining_sigma_rad == pytest.approx(tilted["elevation"].sigma_rad, rel=0.02)
 
 
+def test_costs_compare_azimuth_and_range_of_the_radar_and_nothing_else(street):
+    prior = Prior(np.eye(4), T_LIDAR_RADAR, np.radians(2), 0.1)
+    score = held_out_score(result("lidar_radar", T_LIDAR_RADAR, DT_S), street, prior, SolveConfig())
+    best = np.nanmean(score.cost(T_LIDAR_RADAR))
+    np.testing.assert_allclose(
+        score.cost(turned(T_LIDAR_RADAR, 1, 3.0)), score.cost(T_LIDAR_RADAR), rtol=1e-3
+    )
+    for yaw in (-1.0, 1.0):
+        assert np.nanmean(score.cost(turned(T_LIDAR_RADAR, 2, yaw))) > best
+
+
 def test_a_street_that_is_dense_nearby_does_not_prefer_a_radar_that_is_farther_back(monkeypatch):
     # Ground in even steps of elevation, detections anywhere: nothing tells where along the way they are.
     rng, day = np.random.default_rng(3), street_day(12, seed=5)

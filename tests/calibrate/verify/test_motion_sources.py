@@ -7,6 +7,7 @@ import pytest
 
 from pipeline.calibrate.verify.motion_sources import compared_sources
 from pipeline.calibrate.verify.sweep_motion import sweep_motion
+from pipeline.objective.camera_lidar.points import lidar_velocities
 from pipeline.rig.se3 import exp_so3
 from schemas.calibrations import PAIRS
 from tests.makers.solve_scenes import T_LIDAR_RADAR, make_day
@@ -135,6 +136,13 @@ def test_a_doppler_of_the_wrong_sign_or_unit_is_named(day, factor, left):
     assert ("km/h for m/s" in sentence) == (abs(factor) > 2)
 
 
+def test_a_doppler_that_drives_backwards_all_day_is_named_where_nothing_else_tells(day):
+    alone = without_lidar(without_odometry(day))
+    assert told(alone) == []
+    assert [f for f, _ in told(with_doppler(alone, -1))] == ["doppler"]
+    assert told(without_lidar(without_odometry(with_doppler(day, 3.6)))) == []  # nobody can know
+
+
 def test_a_radar_that_looks_back_is_not_taken_for_a_wrong_sign(day):
     turned = T_LIDAR_RADAR.copy()
     turned[:3, :3] = turned[:3, :3] @ exp_so3(np.array([0.0, 0.0, np.pi]))
@@ -168,6 +176,11 @@ def test_a_convoy_that_fills_the_scans_is_no_wrong_doppler_and_a_fit_by_chance_i
     assert [f for f, _ in told(filled)] == ([] if fits == "what stands" else ["doppler"])
 
 
+def test_a_lidar_mounted_backwards_is_named(day):
+    back = [replace(o, lidar_map_xyz_m=o.lidar_map_xyz_m * np.float32([-1, -1, 1])) for o in day]
+    assert [f for f, _ in told(back)] == ["orientation"]
+
+
 @pytest.mark.parametrize("turned_by", [0.0, np.pi])
 def test_a_wrong_radar_costs_camera_and_lidar_their_day_only_where_their_motion_rests_on_it(day, turned_by):
     T = T_LIDAR_RADAR.copy()
@@ -177,6 +190,12 @@ def test_a_wrong_radar_costs_camera_and_lidar_their_day_only_where_their_motion_
         found = compared_sources(left, T)
         assert {pair for pair in PAIRS if found.of(pair)} == pairs
     assert all(compared_sources(with_odometry(day, 3.6), T_LIDAR_RADAR).of(pair) for pair in PAIRS)
+
+
+def test_the_car_drives_ahead_whatever_sign_its_doppler_has(day):
+    as_logged, turned = (lidar_velocities(rows, T_LIDAR_RADAR) for rows in (day, with_doppler(day, -1.0)))
+    np.testing.assert_allclose(as_logged, turned, atol=1e-9)
+    assert (as_logged[:, 0] > 0).all()
 
 
 def test_a_mirrored_sensor_is_named_and_a_radar_costs_only_its_own_pairs(day):

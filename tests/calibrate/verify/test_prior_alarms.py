@@ -58,12 +58,22 @@ def test_offsets_that_priors_have_raise_no_alarm(shift_m):
     assert alarms_of(shifted, estimate_of("lidar_radar", kept=[3, 5])) == {}
 
 
+def test_a_radar_that_knows_its_height_itself_is_not_held_for_the_lidars():
+    lower = estimate_of("camera_lidar", in_camera([0, 0, -0.3]), kept=[5])
+    assert alarms_of(lower, estimate_of("lidar_radar", kept=[3])) == {}
+
+
 def test_a_camera_that_moved_aside_as_well_is_at_fault_itself():
     """The radar sees where the lidar is along y: where it was. So it is the camera that hangs elsewhere."""
     aside = estimate_of("camera_lidar", in_camera([0, 0.3, -0.3]), kept=[5])
     assert alarms_of(aside, estimate_of("lidar_radar", kept=[3, 5])) == {}
     follows = estimate_of("lidar_radar", [0, -0.3, 0], kept=[3, 5])
     assert alarms_of(aside, follows) == {"lidar_radar": "prior"}
+
+
+def test_a_basin_that_is_lost_accuses_nobody():
+    lost = replace(estimate_of("camera_lidar", in_camera([0, 0, -0.3]), kept=[5]), disproved="lost")
+    assert alarms_of(lost, estimate_of("lidar_radar", kept=[3, 5])) == {}
 
 
 def test_a_position_left_to_the_prior_is_an_alarm_where_the_day_puts_it_elsewhere():
