@@ -12,6 +12,8 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
 import pytest  # noqa: E402 - numeric libraries read the environment while they are imported
 from hypothesis import settings  # noqa: E402
 
+from tests.budgets import BUDGETS, beyond, slowness  # noqa: E402
+
 # No deadline: the machine may be busy. The same examples each time: a red run must come again when it is looked at.
 settings.register_profile("house", deadline=None, derandomize=True)
 settings.load_profile("house")
@@ -91,6 +93,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 QUICK_CPU_S = 15.0
 COST = "cpu_s"
 BEGAN_CPU_S = pytest.StashKey[float]()
+BEYOND = pytest.StashKey[list[str]]()
 
 
 def cpu_s() -> float:
@@ -125,8 +128,42 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
         left_out[report.nodeid.partition("::")[0], reason.removeprefix("Skipped: ")] += 1
     for (file, reason), tests in sorted(left_out.items()):
         terminalreporter.write_line(f"left out of {file}: {tests} ({reason})")
-    reports = [*terminalreporter.stats.get("passed", []), *terminalreporter.stats.get("failed", [])]
-    costs = {r.nodeid: value for r in reports for name, value in r.user_properties if name == COST}
+    costs = cpu_s_of_tests(terminalreporter)
     for test, cost in sorted(costs.items(), key=lambda item: -item[1]):
         if cost > QUICK_CPU_S:
             terminalreporter.write_line(f"not quick, and not marked slow: {test} ({cost:.0f} s of CPU)")
+    for folder, cost in sorted(cpu_s_of_folders(costs).items(), key=lambda item: -item[1]):
+        terminalreporter.write_line(f"quick tests of {folder}: {cost:.0f} s of CPU")
+    for sentence in terminalreporter.config.stash.get(BEYOND, []):
+        terminalreporter.write_line(f"CPU seconds of the quick tests of {sentence}")
+
+
+def cpu_s_of_tests(reporter: pytest.TerminalReporter) -> dict[str, float]:
+    """What each test without the mark `slow` cost."""
+    reports = [*reporter.stats.get("passed", []), *reporter.stats.get("failed", [])]
+    return {r.nodeid: value for r in reports for name, value in r.user_properties if name == COST}
+
+
+def cpu_s_of_folders(costs: dict[str, float]) -> Counter[str]:
+    """Their sums by folder of tests/."""
+    sums: Counter[str] = Counter()
+    for test, cost in costs.items():
+        folder = Path(test.partition("::")[0]).parts[1]
+        sums["files beside the folders" if folder.endswith(".py") else folder] += cost
+    return sums
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Fail where the quick tests of a folder cost more than their budget, in CPU time of the machine of the budgets.
+
+    A part of the suite costs less than the whole, and the budgets are of a run with shape checks: every run is asked.
+    """
+    reporter = session.config.pluginmanager.getplugin("terminalreporter")
+    if hasattr(session.config, "workerinput") or reporter is None:
+        return
+    machine = slowness()
+    folders = {n: cost / machine for n, cost in cpu_s_of_folders(cpu_s_of_tests(reporter)).items()}
+    session.config.stash[BEYOND] = beyond(folders, BUDGETS["quick_cpu_s"])
+    if session.config.stash[BEYOND] and session.exitstatus == pytest.ExitCode.OK:
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
