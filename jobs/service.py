@@ -36,7 +36,7 @@ def service(
         withdraw: withdraw an event recorded by mistake; it has no effect from the next audit on.
     """
     from jobs.terminal.summary import exit_code, print_summary
-    from pipeline.audit.service import events_until
+    from pipeline.audit.restarts import events_until
     from pipeline.core.errors import ConfigError
     from pipeline.store.commits import commit_records
     from pipeline.store.partitions import Lake, Partition, work_key

@@ -17,7 +17,7 @@ import pyarrow.compute as pc
 from pipeline.audit.days import Reference
 from pipeline.audit.estimates import COLUMNS, Estimates, day_name, estimates_of, faults_of, joined
 from pipeline.audit.references import first_accepted, read_kept
-from pipeline.audit.service import restart_of
+from pipeline.audit.restarts import restart_of
 from pipeline.core.config import FleetConfig
 from pipeline.rig.edges import words_of
 from pipeline.rig.graph import Edge

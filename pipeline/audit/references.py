@@ -15,7 +15,7 @@ import numpy as np
 
 from pipeline.audit.days import PairDays, Reference, reference_of
 from pipeline.audit.estimates import day_name
-from pipeline.audit.service import restart_of
+from pipeline.audit.restarts import restart_of
 from pipeline.rig.edges import edge_of
 from pipeline.rig.graph import Edge
 from pipeline.rig.se3 import from_quaternion, to_quaternion

@@ -8,12 +8,14 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.rig.graph import Sensor
-from pipeline.store.partitions import days_after
+from pipeline.rig.graph import Edge, Sensor
+from pipeline.store.current import current_events
+from pipeline.store.partitions import Lake, days_after
+from pipeline.store.records import read_records
 from schemas.drift import DriftFinding
-from schemas.service_events import ServiceEvent
+from schemas.service_events import SERVICE_EVENTS, ServiceEvent
 
-__all__ = ["drift_per_day", "last_restart"]
+__all__ = ["drift_per_day", "events_until", "last_restart", "restart_of"]
 
 _ALARMS = ("RED", "YELLOW")
 
@@ -66,3 +68,21 @@ def drift_per_day(
 def _moved_by(finding: DriftFinding) -> set[str]:
     named = finding.moved_sensor
     return {finding.parent_frame, finding.child_frame} if named is None else {named}
+
+
+def events_until(lake: Lake, last: str | None) -> dict[str, list[ServiceEvent]]:
+    """Valid events by vehicle in order of day: the last version of each, without withdrawn or later ones."""
+    events: dict[str, list[ServiceEvent]] = {}
+    for event in current_events(read_records(lake, SERVICE_EVENTS, ServiceEvent, last=last)):
+        events.setdefault(event.vehicle, []).append(event)
+    return events
+
+
+def restart_of(events: Sequence[ServiceEvent], edge: Edge, last_day: str) -> ServiceEvent | None:
+    """The last event that moved an edge, or may have; None if there was none.
+
+    The day of the event belongs to neither side, because the drive may be before or after it.
+    """
+    names = [sensor.name for sensor in edge.sensors]
+    touching = [e for e in events if e.day <= last_day and e.touches(names)]
+    return max(touching, key=lambda e: e.day, default=None)

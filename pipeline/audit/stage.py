@@ -15,7 +15,7 @@ from pipeline.audit.estimates import Estimates, days_of
 from pipeline.audit.findings import VehicleAudit, vehicle_findings
 from pipeline.audit.fleet_shift import FleetShift, judge_without_fleet_shifts, shifts_of
 from pipeline.audit.history import History, last_audited_day, models_of
-from pipeline.audit.service import events_until, restart_of
+from pipeline.audit.restarts import events_until, restart_of
 from pipeline.audit.standing import said_before, standing
 from pipeline.audit.vehicle import VehicleVerdict
 from pipeline.core.config import AuditConfig, FleetConfig, config_hash

@@ -16,8 +16,8 @@ from pipeline.audit.history import History, models_of
 from pipeline.audit.noise import estimate_noise
 from pipeline.audit.pose_days import VehiclePoses, read_poses
 from pipeline.audit.references import Kept, first_accepted, kept_columns, kept_of, read_kept
+from pipeline.audit.restarts import events_until, restart_of
 from pipeline.audit.rig_states import rig_states
-from pipeline.audit.service import events_until, restart_of
 from pipeline.audit.vehicle import limit_of
 from pipeline.audit.wander import with_wander
 from pipeline.core.config import AuditConfig, FleetConfig, config_hash

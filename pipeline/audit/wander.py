@@ -14,8 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.audit.charts import Charts, clipped
-from pipeline.audit.differences import older_days, winsorised_variance
-from pipeline.audit.noise import Noise
+from pipeline.audit.noise import Noise, older_days, winsorised_variance
 from pipeline.audit.scan import errors_of, scan
 
 __all__ = ["with_wander"]

@@ -18,7 +18,7 @@ from pipeline.calibrate.unlabelled import unlabelled_pairs
 from pipeline.calibrate.verify.day_checks import FoundDay, checks_of_day
 from pipeline.calibrate.verify.day_labels import day_labels
 from pipeline.calibrate.verify.motion_sources import MotionFindings, compared_sources
-from pipeline.calibrate.verify.mounting import camera_turn_sigma_rad
+from pipeline.calibrate.verify.target_accuracy import camera_turn_sigma_rad
 from pipeline.core.config import FleetConfig
 from pipeline.core.errors import SolveError
 from pipeline.core.results import Progress, silent

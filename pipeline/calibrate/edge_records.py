@@ -16,9 +16,7 @@ from pipeline.calibrate.records import Inputs, parts_numbers, unobservable, verd
 from pipeline.calibrate.verify.edge_result import EdgeResult
 from pipeline.calibrate.verify.held_out_test import HeldOutTest, paired_test
 from pipeline.calibrate.verify.held_out_update import HeldOutUpdate
-from pipeline.calibrate.verify.mounting import mounting_covariance
-from pipeline.calibrate.verify.seen_targets import targets_of
-from pipeline.calibrate.verify.target_accuracy import claims_of
+from pipeline.calibrate.verify.target_accuracy import claims_of, mounting_covariance, targets_of
 from pipeline.calibrate.verify.verdict import Evidence, judge
 from pipeline.core.config import FleetConfig
 from pipeline.rig.changes import change_covariance

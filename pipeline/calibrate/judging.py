@@ -25,9 +25,14 @@ from pipeline.calibrate.verify.held_out_score import held_out_score
 from pipeline.calibrate.verify.held_out_search import found_elsewhere, held_out_place
 from pipeline.calibrate.verify.held_out_test import HeldOutTest, paired_test
 from pipeline.calibrate.verify.held_out_update import held_out_update
-from pipeline.calibrate.verify.mounting import mounting_covariance
-from pipeline.calibrate.verify.seen_targets import seen_targets, unseen_failure, views_of
-from pipeline.calibrate.verify.target_accuracy import Claim, claims_of
+from pipeline.calibrate.verify.target_accuracy import (
+    Claim,
+    claims_of,
+    mounting_covariance,
+    seen_targets,
+    unseen_failure,
+    views_of,
+)
 from pipeline.calibrate.verify.verdict import Evidence, Verdict, judge, matters
 from pipeline.core.config import ChecksConfig, FleetConfig
 from pipeline.core.stage_work import NO_PROBES, Probes

@@ -11,8 +11,7 @@ from jaxtyping import Float
 
 from pipeline.calibrate.adjust.adjusted import AdjustedRig, AdjustedSensor
 from pipeline.calibrate.records import Inputs
-from pipeline.calibrate.verify.seen_targets import targets_of
-from pipeline.calibrate.verify.target_accuracy import Claim, claims_of
+from pipeline.calibrate.verify.target_accuracy import Claim, claims_of, targets_of
 from pipeline.core.config import VerifyConfig
 from pipeline.rig.changes import change_jacobian
 from pipeline.rig.checks import faults_of

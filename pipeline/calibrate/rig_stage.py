@@ -17,7 +17,7 @@ from pipeline.calibrate.prior_doubts import hold_doubted
 from pipeline.calibrate.records import Inputs, refused_records
 from pipeline.calibrate.rig_day import RigDay, calibrate_rig
 from pipeline.calibrate.unlabelled import noted
-from pipeline.calibrate.verify.seen_targets import views_of
+from pipeline.calibrate.verify.target_accuracy import views_of
 from pipeline.core.errors import SolveError
 from pipeline.core.results import Progress
 from pipeline.core.stage_work import Task

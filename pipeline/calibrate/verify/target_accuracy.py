@@ -1,6 +1,6 @@
 """The claim of a record: the error at targets 15 to 40 m away, with a probability.
 
-Azimuth and elevation at the targets that both sensors see (`seen_targets.py`) are linear in the pose. So its
+Azimuth and elevation at the targets that both sensors see are linear in the pose. So its
 covariance gives their sigmas, with all correlations and all degrees of freedom that the day left to the
 prior. A direction is certified if its error, by that sigma, is within the limit of `[verify]` with the
 required probability.
@@ -11,10 +11,29 @@ off at a sigma of 1.19 deg, and accepted. They are not better on good days eithe
 shift stays at the prior, because it moves points as the clock does; held-out frames call it determined,
 because their update starts from independent errors of pose and clock. One of 27 azimuths of good days that
 their bound certified exceeded it, at 99.5 %.
+
+Covariance of the mounting pose, from that of the projection, and the reverse.
+
+To first order, a principal point wrong by d pixels has the effect of a camera rotated by d / f. No alignment
+separates the two, and users of the same CameraInfo still get the right pixel. This also holds through
+camera-radar, where both factors use the same camera, and in lidar-radar, whose boxes come from it. So a
+certified direction in the image does not certify the mounting of the camera. The mounting is known only as
+well as the principal point: as stated in fleet.toml (`centre_sigma_px`), else as measured by the day, else
+not at all. Likewise, a radar's own constant elevation error rotates its detections, which a record describes,
+but not its mounting.
+
+Targets in view of both sensors of a pair, at which a pair is certified.
+
+The effect of a pose error depends on the direction of a target. For a camera that looks to the left, a target
+ahead of the lidar would turn its pitch into a roll: it would be certified at a target that it never sees. So
+targets are placed where the views overlap at the prior. The view of a camera is its image by CameraInfo. The
+view of a lidar or radar is the set of directions in which it has points or detections on the day, with holes
+of the scene filled.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,14 +41,41 @@ from jaxtyping import Float
 from scipy.optimize import brentq
 from scipy.special import ndtr, ndtri
 
+from pipeline.calibrate.numerics.bias_floors import RADAR_ELEVATION_BIAS_RAD
 from pipeline.calibrate.verify.held_out_update import HeldOutUpdate
 from pipeline.core.config import ChecksConfig
+from pipeline.core.rigs import CameraPrior
+from pipeline.rig.cameras import camera_of
+from pipeline.rig.checks import FailedCheck
+from pipeline.rig.estimates import Prior, Solution
+from pipeline.rig.overlap import FRAMES, View, view_of_camera, view_of_clouds
+from pipeline.rig.se3 import hat, transform_points
+from pipeline.rig.spherical import from_spherical, to_spherical, wrap_angle
 from pipeline.rig.targets import DEFAULT_TARGETS, target_jacobian, target_sigmas
+from schemas.calibrations import FRAMES_OF_PAIR
+from schemas.observations import Observation
 
-__all__ = ["DIRECTIONS", "Claim", "claims_of", "target_jacobian", "target_sigmas"]
+__all__ = [
+    "DIRECTIONS",
+    "Claim",
+    "camera_turn_sigma_rad",
+    "claims_of",
+    "mounting_covariance",
+    "seen_targets",
+    "target_jacobian",
+    "target_sigmas",
+    "targets_of",
+    "unseen_failure",
+    "views_of",
+]
 
 DIRECTIONS = ("azimuth", "elevation")
 _CHECK_SIGMAS = 3.0
+_BIN_RAD = np.radians(2.0)
+_AZIMUTHS = np.radians(np.arange(-179.5, 180.0))
+_ELEVATIONS = np.radians(np.array(sorted(range(-40, 41), key=abs), np.float64))  # the flattest first
+_SPREAD, _, _RANGES_M = to_spherical(DEFAULT_TARGETS).T  # azimuths about the middle of what both see
+_WIDE_RAD = np.radians(12.5)  # half-width from which they lie as far apart as that
 
 
 @dataclass(frozen=True)
@@ -175,3 +221,101 @@ def claims_of(
             float(mounted[d]),
         )
     return claims
+
+
+def camera_turn_sigma_rad(
+    solution: Solution, known: CameraPrior, K: Float[np.ndarray, "3 3"]
+) -> Float[np.ndarray, " 2"] | None:
+    """Sigmas of the camera's pitch and yaw (about its x and y) due to the principal point.
+
+    As measured on the day, else as stated in fleet.toml, else None.
+    """
+    camera_lidar = solution.pairs.get("camera_lidar")
+    measured = {} if camera_lidar is None else camera_lidar.diagnostics
+    names = ("mounting_pitch_sigma_rad", "mounting_yaw_sigma_rad")
+    if all(name in measured for name in names):
+        return np.array([measured[name] for name in names])
+    return known.centre_sigma_px / np.diag(K)[[1, 0]] if known.centre_is_stated else None
+
+
+def mounting_covariance(
+    pair: str,
+    T: Float[np.ndarray, "4 4"],
+    covariance: Float[np.ndarray, "6 6"],
+    turn_sigma_rad: Float[np.ndarray, " 2"] | None,
+) -> Float[np.ndarray, "6 6"] | None:
+    """Covariance of an estimate as a mounting pose; None if the camera's principal point is unknown.
+
+    `covariance` is for users of the same CameraInfo and of the radar's detections; `turn_sigma_rad` is the
+    camera's.
+    """
+    wider = np.array(covariance, np.float64)
+    if pair.startswith("camera"):
+        if turn_sigma_rad is None:
+            return None
+        wider[[0, 1], [0, 1]] += turn_sigma_rad**2
+    if pair.endswith("radar"):
+        # A turn about the radar's own y, as a twist about the parent's origin.
+        axis = T[:3, 1]
+        twist = RADAR_ELEVATION_BIAS_RAD * np.concatenate([axis, hat(T[:3, 3]) @ axis])
+        wider += np.outer(twist, twist)
+    return wider
+
+
+def views_of(observations: Sequence[Observation]) -> dict[str, View]:
+    """View of each sensor, for points in its own frame; a sensor without data is left out."""
+    some = observations[:: max(len(observations) // FRAMES, 1)]
+    clouds = {
+        "lidar": [o.lidar_map_xyz_m for o in some if "lidar" in o.sensors],
+        "radar": [o.radar_xyz_m for o in some if "radar" in o.sensors],
+    }
+    views = {sensor: view_of_clouds(own) for sensor, own in clouds.items()}
+    camera = next((camera_of(o) for o in some if "camera" in o.sensors), None)
+    views["camera"] = None if camera is None else view_of_camera(camera)
+    return {sensor: view for sensor, view in views.items() if view is not None}
+
+
+def seen_targets(pair: str, prior: Prior, views: dict[str, View]) -> Float[np.ndarray, "3 3"] | None:
+    """Targets of a pair of camera, lidar and radar; a sensor without a view is taken to see everything."""
+    parent, child = FRAMES_OF_PAIR[pair]
+    return targets_of(prior.of(pair), views.get(parent), views.get(child))
+
+
+def targets_of(
+    T_parent_child: Float[np.ndarray, "4 4"], parent: View | None, child: View | None
+) -> Float[np.ndarray, "3 3"] | None:
+    """Three targets 15, 25 and 40 m away, in the child's frame; None if the views do not overlap.
+
+    They surround the middle of the common view, as level as the views allow. Their spacing is that of sensors
+    that look ahead, or less in narrow views. A view None sees everything.
+    """
+    # Near and far: a sensor a metre aside sees them two to four degrees apart.
+    ranges_m = [_RANGES_M.min(), _RANGES_M.max()]
+    points = from_spherical(np.stack(np.meshgrid(_AZIMUTHS, _ELEVATIONS, ranges_m, indexing="ij"), -1))
+    seen = np.ones(points.shape[:2], bool)
+    for view, T in ((child, np.eye(4)), (parent, T_parent_child)):
+        if view is not None:
+            seen &= view(transform_points(T, points)).all(axis=2)
+    columns = np.flatnonzero(seen.any(axis=1))
+    if not len(columns):
+        return None
+    azimuth = _AZIMUTHS[columns]
+    # Of a sensor that sees all around, ahead is as good as any.
+    around = len(columns) == len(_AZIMUTHS)
+    middle = 0.0 if around else float(np.angle(np.exp(1j * azimuth).mean()))
+    apart = np.abs(wrap_angle(azimuth - middle))
+    narrow = min(1.0, float(np.quantile(apart, 0.9)) / _WIDE_RAD)
+    targets = []
+    for offset, range_m in zip(_SPREAD * narrow, _RANGES_M, strict=True):
+        away = wrap_angle(azimuth - (middle + offset))
+        k = int(np.argmin(np.abs(away)))
+        # Where both see it, a target is where it should be and not on the grid.
+        target = middle + offset if abs(away[k]) <= _BIN_RAD else azimuth[k]
+        targets.append([target, _ELEVATIONS[int(np.argmax(seen[columns[k]]))], range_m])
+    return from_spherical(np.array(targets))
+
+
+def unseen_failure(pair: str) -> FailedCheck:
+    """Reason why a pair without overlapping views cannot be accepted."""
+    parent, child = FRAMES_OF_PAIR[pair]
+    return FailedCheck(f"{parent} and {child} see no direction in common at the prior: nothing to certify")

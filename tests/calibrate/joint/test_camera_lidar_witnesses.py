@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.joint.camera_lidar import witnesses as parts
-from pipeline.calibrate.joint.camera_lidar.boxes import box_offsets
-from pipeline.calibrate.joint.camera_lidar.witnesses import Witness, disagreement
+from pipeline.calibrate.joint.camera_lidar.witnesses import Witness, box_offsets, disagreement
 from pipeline.core.config import SolveConfig
 from pipeline.rig.estimates import Prior
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse, log_so3, perturb_exactly

@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.numerics.bias_floors import RADAR_ELEVATION_BIAS_RAD
-from pipeline.calibrate.verify.mounting import camera_turn_sigma_rad, mounting_covariance
-from pipeline.calibrate.verify.target_accuracy import DIRECTIONS, claims_of
+from pipeline.calibrate.verify.target_accuracy import (
+    DIRECTIONS,
+    camera_turn_sigma_rad,
+    claims_of,
+    mounting_covariance,
+)
 from pipeline.core.rigs import CameraPrior, CameraTopics
 from pipeline.report.day import pair_view
 from pipeline.rig.estimates import PairEstimate, Prior, Solution

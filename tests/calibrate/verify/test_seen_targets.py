@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.calibrate.verify.seen_targets import seen_targets, unseen_failure, views_of
+from pipeline.calibrate.verify.target_accuracy import seen_targets, unseen_failure, views_of
 from pipeline.rig.estimates import Prior
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse, transform_points
 from pipeline.rig.spherical import from_spherical, to_spherical
