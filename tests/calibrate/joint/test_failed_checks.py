@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.day import calibrate_observations
-from pipeline.calibrate.joint.failed_checks import lidar_radar_failures
 from pipeline.calibrate.joint.solve import solve_joint
 from pipeline.calibrate.records import Inputs
+from pipeline.calibrate.verify.failed_checks import lidar_radar_failures
 from pipeline.core.config import FleetConfig
 from pipeline.rig.estimates import PairEstimate, Prior
 from pipeline.store.partitions import Partition
