@@ -12,9 +12,9 @@ from cyclopts import Parameter
 
 if TYPE_CHECKING:
     from pipeline.core.results import Outcome
+    from pipeline.fleet.metrics import Tally
     from pipeline.fleet.nightly import DayOutcome, Night
     from pipeline.fleet.pattern import VehicleDay
-    from pipeline.fleet.tally import Tally
     from pipeline.store.partitions import Lake
     from schemas.drift import DriftFinding
 
@@ -67,10 +67,10 @@ def nightly(
     from jobs.terminal.vehicle_status import next_steps
     from pipeline.calibrate.methods import method_named
     from pipeline.core.config import load_fleet
+    from pipeline.fleet.metrics import Tally
     from pipeline.fleet.misconfigured import night_statuses, to_mend, vehicles_to_mend
     from pipeline.fleet.nightly import Night
     from pipeline.fleet.pattern import find_logs
-    from pipeline.fleet.tally import Tally
     from pipeline.rig.day_prior import require_named_files
     from pipeline.store.partitions import Lake
 

@@ -1,7 +1,8 @@
-"""A pool of spawned processes that survives killed workers."""
+"""A pool of spawned processes that survives killed workers; their progress in shared memory, without locks."""
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 import sys
@@ -19,15 +20,35 @@ from typing import Any, TypeVar
 from pipeline.core.memory import MODEL_THREADS
 from pipeline.core.results import Progress
 from pipeline.fleet.attempts import ONE_THREAD, Finished, Turns, Watch, attempt, usable_cpus
-from pipeline.fleet.board import Board
 
-__all__ = ["run_processes"]
+__all__ = ["Board", "run_processes"]
 
 Item = TypeVar("Item")
 Outcome = TypeVar("Outcome")
-
 _POLL_S = 0.2
 _GRACE_S = 10.0  # for a worker to leave its `with` blocks; Kubernetes gives the whole pod 30 s
+_TEXT_BYTES = 48
+
+
+class _Slot(ctypes.Structure):
+    _fields_ = (("done", ctypes.c_int64), ("total", ctypes.c_int64), ("what", ctypes.c_char * _TEXT_BYTES))
+
+
+class Board:
+    """One slot per item. A reader may see a half-written slot: use it for display only."""
+
+    def __init__(self, items: int) -> None:
+        self._slots = get_context("spawn").RawArray(_Slot, max(items, 1))
+
+    def write(self, index: int, done: int, total: int, what: str) -> None:
+        """Write the progress of an item."""
+        slot = self._slots[index]
+        slot.done, slot.total, slot.what = done, total, what.encode()[: _TEXT_BYTES - 1]
+
+    def read(self, index: int) -> tuple[int, int, str]:
+        """Last progress of an item: done, total, what."""
+        slot = self._slots[index]
+        return slot.done, slot.total, slot.what.decode(errors="replace")
 
 
 def run_processes(

@@ -11,8 +11,8 @@ import pytest
 
 from pipeline.core.memory import MODEL_THREADS
 from pipeline.fleet import processes
-from pipeline.fleet.board import Board
 from pipeline.fleet.executor import EXECUTORS
+from pipeline.fleet.processes import Board
 from tests.makers.processes import descendants, started, works
 from tests.makers.ray_clusters import ray_or_skip
 

@@ -2,8 +2,7 @@
 
 import pytest
 
-from pipeline.fleet.metrics import NightEnd, write_metrics
-from pipeline.fleet.tally import Tally
+from pipeline.fleet.metrics import NightEnd, Tally, write_metrics
 from schemas.versions import CODE_VERSION
 from tests.makers.night_outcomes import day_outcome, stage_outcome
 
