@@ -46,7 +46,7 @@ def view(
     from pipeline.core.errors import ConfigError
     from pipeline.store.partitions import Lake, Partition
     from pipeline.view.layers import count_moments, read_moment
-    from pipeline.view.window import import_open3d, require_display, require_renderer
+    from pipeline.view.system import import_open3d, require_display, require_renderer
 
     if out is not None and out.suffix != ".png":
         raise ConfigError("command line", "out", f"{out} must end in .png")

@@ -35,7 +35,7 @@ def night(tmp_path, capfd):
 def test_a_refused_day_is_a_success_where_the_scheduler_knows_no_other(night):
     assert night()[0] == 3
     code, summary, _ = night("--held-exit-code", "0")
-    assert (code, summary["status"], summary["refused"]) == (0, "held", 1)
+    assert (code, summary["status"], summary["refused"]) == (0, "refused", 1)
 
 
 def test_no_other_exit_code_can_be_asked_for(night):
@@ -53,5 +53,5 @@ def test_a_night_is_told_to_monitoring(night, tmp_path):
 def test_metrics_that_cannot_be_written_are_named_and_fail_nothing(night, tmp_path):
     pytest.importorskip("prometheus_client", reason="pip install 'boresight[ops]'")
     code, summary, err = night("--metrics", f"{tmp_path}/missing/night.prom")
-    assert (code, summary["status"]) == (3, "held")
+    assert (code, summary["status"]) == (3, "refused")
     assert f"{tmp_path}/missing/night.prom" in err

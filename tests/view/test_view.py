@@ -20,7 +20,7 @@ from pipeline.rig.se3 import inverse, transform_points
 from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake
 from pipeline.view.layers import Dots, Name, Picture, Rig, Shown, Strokes, layers_of, read_moment
-from pipeline.view.window import require_renderer
+from pipeline.view.system import require_renderer
 from schemas.calibrations import CALIBRATIONS
 from schemas.captures import Image, Scan, Sweep
 from schemas.moments import MOMENTS, PERCEIVED
