@@ -59,10 +59,11 @@ browser:
 	if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
 		apt-get update -qq && apt-get install -y -qq chromium fonts-dejavu-core; fi || true
 
-lint: setup ## style and types
+lint: setup ## style, types, and the lines of each room against tests/budgets.toml
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/python -m tests.budgets
 
 bench: setup ## speed and memory, measured as ratios against the committed baseline
 	$(ONE_THREAD) $(BIN)/python -m pytest tests/benchmarks -p no:xdist -s

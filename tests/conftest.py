@@ -162,7 +162,7 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
     reporter = session.config.pluginmanager.getplugin("terminalreporter")
     if hasattr(session.config, "workerinput") or reporter is None:
         return
-    machine = slowness()
+    machine = max(1.0, slowness())  # a fast moment proves nothing about the minutes before it
     folders = {n: cost / machine for n, cost in cpu_s_of_folders(cpu_s_of_tests(reporter)).items()}
     session.config.stash[BEYOND] = beyond(folders, BUDGETS["quick_cpu_s"])
     if session.config.stash[BEYOND] and session.exitstatus == pytest.ExitCode.OK:
