@@ -251,13 +251,13 @@ def _of_state(loaded: Sequence[Answered]) -> tuple[str, str]:
     at_prior = [s.title for s in loaded if s.status != "current"]
     if not certified:
         return "bad", "No. Nothing in tonight's state is certified: keep what the car has."
-    of = ", ".join(s.title for s in certified)
+    of, in_one = ", ".join(s.title for s in certified), _one_direction(certified)
     sentence = f"Partly. Load tonight's state. Certified: {of}." if used or at_prior else (
-        "Yes. Load tonight's state: all sensors are certified."
+        f"Yes. Load tonight's state: all sensors are certified{', in azimuth or elevation at least' if in_one else ''}."
     )  # fmt: skip
     sentence += f" Used, but not certified: {', '.join(used)}." if used else ""
     sentence += f" At the prior: {', '.join(at_prior)}." if at_prior else ""
-    return "partly" if used or at_prior else "good", sentence + _one_direction(certified)
+    return "partly" if used or at_prior else "good", sentence + in_one
 
 
 def _one_direction(views: Sequence[PairView | Answered]) -> str:

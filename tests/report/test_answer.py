@@ -65,7 +65,8 @@ def sensor(name, status="current", certified="azimuth, elevation"):
         (
             [sensor("nose", certified="azimuth"), sensor("front")],
             "good",
-            "Yes. Load tonight's state: all sensors are certified. Certified in azimuth only: nose.",
+            "Yes. Load tonight's state: all sensors are certified, in azimuth or elevation at least. "
+            + NAMED.replace("lidar-radar", "nose"),
         ),
         (
             [
