@@ -124,6 +124,11 @@ def _sensor_row(
     (sensor, days), reference = of, own.reference
     first, why = last_restart(sensor, reference, *known, empty.day)
     counted = days.since(dt.date.fromisoformat(first).toordinal() if first else 0)
+    moved = int(days.moved_within.max(initial=0))
+    anew = counted.since(moved + 1)
+    if 0 < len(anew.poses.day) < len(counted.poses.day):
+        counted, first = anew, day_name(moved + 1)
+        why = f"since it or {reference.name} moved within {day_name(moved)}"
     base = replace(empty, child_frame=sensor.name, sensor=sensor.name, kind=sensor.kind, since=first or None)
     apart = f"not counted, because their poses refer to another sensor: {', '.join(own.other_days)}"
     remarks = [apart] if own.other_days else []
@@ -153,11 +158,11 @@ def _sensor_row(
         remarks.append(
             f"{held} was held and lies apart: the sensor may have moved, so both poses are possible"
         )
-    moved = days.moved_within[days.moved_within > counted.poses.day[-1]]
-    if len(moved):
+    if moved > counted.poses.day[-1]:
         found = after_a_move(found)
-        day = day_name(int(moved[-1]))
-        remarks.append(f"it or {reference.name} moved within {day}, and no later day counts yet: drive")
+        remarks.append(
+            f"it or {reference.name} moved within {day_name(moved)}, and no later day counts yet: drive"
+        )
     before = counted.poses.T_prior[-1], counted.poses.prior_covariance[-1]
     pose = _Pose(found.T, found.covariance, found.common, found.of_prior, *before)
     left_out = ", ".join(names[k] for k in found.left_out)
