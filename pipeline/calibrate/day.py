@@ -146,9 +146,7 @@ def _solved(
     measured = method.paper_selection or fleet.trigger.when == "triggered"
     sample = _spread(observations, frames) if measured else []
     before = trigger_metrics(sample, {pair: prior.of(pair) for pair in pairs})
-    fired = {pair: exceeded(before[pair], fleet.trigger) for pair in pairs}
-    if measured and "camera_lidar" in pairs and any(o.is_unlabelled for o in sample):
-        fired["camera_lidar"] = [WITHOUT_LABELS]  # nothing shows that it need not be calibrated
+    fired = _fired(before, sample, fleet)
     active = _to_calibrate(method, fired, fleet.trigger.when)
     progress(1, 4, f"solve by {about.method}")
     solution = (solver or method.solver())(
@@ -182,6 +180,16 @@ def _solved(
     )
     progress(4, 4, "done")
     return DayOfPairs(refusals, day)
+
+
+def _fired(
+    before: Mapping[str, Mapping[str, float]], sample: Sequence[Observation], fleet: FleetConfig
+) -> dict[str, list[str]]:
+    """Triggers that the prior exceeds, by pair."""
+    fired = {pair: exceeded(metrics, fleet.trigger) for pair, metrics in before.items()}
+    if "camera_lidar" in fired and any(o.is_unlabelled for o in sample):
+        fired["camera_lidar"] = [WITHOUT_LABELS]  # nothing shows that it need not be calibrated
+    return fired
 
 
 def _selection(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.report.words import dof_title, motion_in_words, scaled, unit_of
+from pipeline.report.words import LEFT_OUT, dof_title, motion_in_words, scaled, unit_of
 from pipeline.rig.changes import change_between, change_covariance
 from pipeline.store.corrections import correction_steps
 from pipeline.store.current import prior_of, transform_of
@@ -35,16 +35,6 @@ _ADVICE = {
     "accepted": "shown to be better than the prior",
     "held": "not shown to be better than the prior",
     "refused": "nothing computed",
-}
-
-
-# Reasons of pipeline/calibrate/select/frames.py that need more words than their names.
-_LEFT_OUT = {
-    "held_out": "held out to check the result",
-    "next_to_held_out": "too near in time to a held-out frame",
-    "not_needed": "show what the frames used show already",
-    "sync": "stamps too far apart",
-    "empty": "nothing to align",
 }
 
 
@@ -138,7 +128,7 @@ def pair_view(record: CalibrationRecord) -> PairView:
         alignment=_before_after(record.alignment_before, record.alignment_after),
         frames=f"{record.frames_used} of {record.frames_total}",
         rejected=[
-            (_LEFT_OUT.get(why, why.replace("_", " ")), n)
+            (LEFT_OUT.get(why, why.replace("_", " ")), n)
             for why, n in sorted(record.frames_rejected.items(), key=lambda kv: -kv[1])
         ],
         time_offset=_time_offset(record),
@@ -252,9 +242,10 @@ def _of_state(loaded: Sequence[Answered]) -> tuple[str, str]:
     if not certified:
         return "bad", "No. Nothing in tonight's state is certified: keep what the car has."
     of, in_one = ", ".join(s.title for s in certified), _one_direction(certified)
-    sentence = f"Partly. Load tonight's state. Certified: {of}." if used or at_prior else (
-        f"Yes. Load tonight's state: all sensors are certified{', in azimuth or elevation at least' if in_one else ''}."
-    )  # fmt: skip
+    least = ", in azimuth or elevation at least" if in_one else ""
+    sentence = f"Yes. Load tonight's state: all sensors are certified{least}."
+    if used or at_prior:
+        sentence = f"Partly. Load tonight's state. Certified: {of}."
     sentence += f" Used, but not certified: {', '.join(used)}." if used else ""
     sentence += f" At the prior: {', '.join(at_prior)}." if at_prior else ""
     return "partly" if used or at_prior else "good", sentence + in_one

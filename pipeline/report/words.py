@@ -12,6 +12,7 @@ from schemas.calibrations import DOF_NAMES, FRAMES_OF_PAIR
 from schemas.words import AXIS_NAMES
 
 __all__ = [
+    "LEFT_OUT",
     "PAIR_TITLES",
     "dof_title",
     "motion_in_words",
@@ -22,6 +23,15 @@ __all__ = [
     "unit_of",
     "with_sigma",
 ]
+
+# Reasons of pipeline/calibrate/select/frames.py that need more words than their names.
+LEFT_OUT = {
+    "held_out": "held out to check the result",
+    "next_to_held_out": "too near in time to a held-out frame",
+    "not_needed": "show what the frames used show already",
+    "sync": "stamps too far apart",
+    "empty": "nothing to align",
+}
 
 PAIR_TITLES = {pair: "-".join(frames) for pair, frames in FRAMES_OF_PAIR.items()}
 _CLEAR_SIGMAS = 3.0
