@@ -23,7 +23,8 @@ from pipeline.core.errors import ConfigError
 from pipeline.core.results import Progress
 from pipeline.core.stage_work import Records, Task, Told, Window, Work
 from pipeline.rig.edges import edge_of
-from pipeline.rig.graph import EDGE_KINDS, KINDS, Edge, edge_between
+from pipeline.rig.graph import KINDS, Edge, edge_between
+from pipeline.rig.kinds import EDGE_KINDS
 from pipeline.store.partitions import (
     Lake,
     Partition,

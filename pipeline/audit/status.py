@@ -2,30 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 
 from pipeline.rig.edges import edge_of, edge_order, words_of
 from pipeline.rig.graph import KINDS, Edge
+from pipeline.rig.kinds import KIND_OF_EDGE
 from schemas.drift import DriftFinding, VehicleStatus
 
 __all__ = ["decide_status"]
-
-# Turns that every night determines, by kind of edge: what a GREEN chart of them excludes. Of cameras pitch and yaw, the
-# image's two axes; of radars yaw alone: they measure azimuth ten times better than elevation, and many measure none.
-_WATCHED: Mapping[str, tuple[str, ...]] = {
-    "camera_lidar": ("rx", "ry"),
-    "camera_radar": ("ry",),
-    "lidar_radar": ("rz",),
-    "lidar_lidar": ("rx", "ry", "rz"),
-    "lidar_base": ("rx", "ry"),
-    "radar_base": ("rz",),
-}
-# By kind of sensor, the edges whose charts watch it; the later ones only where it has none of the earlier.
-_WATCHING: Mapping[str, tuple[tuple[str, ...], ...]] = {
-    "camera": (("camera_lidar",), ("camera_radar",)),
-    "lidar": (("camera_lidar", "lidar_lidar"), ("lidar_radar",), ("lidar_base",)),
-    "radar": (("lidar_radar", "camera_radar"), ("radar_base",)),
-}
 
 
 def _watched(edges: Collection[Edge]) -> dict[str, tuple[Edge, ...]]:
@@ -35,9 +19,10 @@ def _watched(edges: Collection[Edge]) -> dict[str, tuple[Edge, ...]]:
     sensors = sorted({s for e in edges for s in e.sensors}, key=lambda s: (KINDS.index(s.kind), s.name))
     for sensor in sensors:
         own = [edge for edge in ordered if sensor in edge.sensors]
-        tiers = [tuple(e for e in own if e.kind in kinds) for kinds in _WATCHING.get(sensor.kind, ())]
-        watching = next((tier for tier in tiers if tier), None)
-        if watching is not None:
+        ranks = {e: KIND_OF_EDGE[e.kind].watches.get(sensor.kind) for e in own}
+        first = min((rank for rank in ranks.values() if rank is not None), default=None)
+        watching = tuple(e for e in own if ranks[e] == first)
+        if first is not None:
             by_edges.setdefault(watching, []).append(sensor.name)
     return {" or ".join(names): watching for watching, names in by_edges.items()}
 
@@ -95,7 +80,9 @@ def decide_status(findings: Sequence[DriftFinding]) -> VehicleStatus:
 def _blind(findings: Sequence[DriftFinding], edge: Edge) -> list[DriftFinding]:
     """Charts of an edge that could miss a turn of its sensors."""
     return [
-        f for f in findings if edge_of(f) == edge and f.dof in _WATCHED[edge.kind] and f.status != "GREEN"
+        f
+        for f in findings
+        if edge_of(f) == edge and f.dof in KIND_OF_EDGE[edge.kind].watched and f.status != "GREEN"
     ]
 
 

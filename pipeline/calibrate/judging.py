@@ -38,6 +38,7 @@ from pipeline.core.config import ChecksConfig, FleetConfig
 from pipeline.core.stage_work import NO_PROBES, Probes
 from pipeline.rig.checks import FailedCheck
 from pipeline.rig.estimates import PairEstimate, Prior
+from pipeline.rig.kinds import KIND_OF_EDGE
 from pipeline.rig.overlap import View
 from pipeline.rig.rig import sensor_turn
 from pipeline.rig.targets import DEFAULT_TARGETS
@@ -45,9 +46,6 @@ from schemas.calibrations import PROBE_Z
 from schemas.observations import Observation
 
 __all__ = ["Judged", "Judging"]
-
-# Axes that the comparison of held-out frames depends on.
-_PROBED = {"camera_lidar": ("azimuth", "elevation", "roll"), "lidar_radar": ("azimuth",)}
 
 
 @dataclass(frozen=True)
@@ -198,7 +196,7 @@ def probe_numbers(
         sizes_deg: sizes of the rotations; both signs are tested.
     """
     found, after = dict[str, float](), cost(T) if sizes_deg else np.zeros(0)
-    for axis in _PROBED.get(pair, ()):
+    for axis in KIND_OF_EDGE[pair].probed:
         for deg in (sign * size for size in sizes_deg for sign in (1.0, -1.0)):
             of_camera = pair == "camera_lidar"
             R = sensor_turn(axis, float(np.radians(deg)), of_camera=of_camera)

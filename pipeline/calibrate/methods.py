@@ -14,7 +14,7 @@ from pipeline.core.stage_work import Task
 from pipeline.rig.estimates import Prior, Solution
 from schemas.observations import Observation
 
-__all__ = ["METHODS", "Method", "Solver", "method_named"]
+__all__ = ["METHODS", "Method", "Solver", "method_named", "resolved"]
 
 
 @runtime_checkable
@@ -62,7 +62,7 @@ class Method:
     def solver(self) -> Solver:
         """The solver of a method that uses observations alone."""
         assert not self.needs_images, f"{self.name} needs frames: ask `solver_of` a task"
-        solver: Solver = _resolved(self.run)
+        solver: Solver = resolved(self.run)
         return solver
 
     def solver_of(self, task: Task, chosen: Mapping[str, str] | None = None) -> Solver:
@@ -73,12 +73,12 @@ class Method:
         """
         if not self.needs_images:
             return self.solver()
-        solver: Solver = _resolved(self.run)(self.name, task, chosen)
+        solver: Solver = resolved(self.run)(self.name, task, chosen)
         return solver
 
     def settings_of(self, task: Task) -> dict[str, Any]:
         """Inputs of the result other than observations and sections of fleet.toml, for the work key."""
-        return {} if self.settings is None else dict(_resolved(self.settings)(self.name, task))
+        return {} if self.settings is None else dict(resolved(self.settings)(self.name, task))
 
 
 _NETWORKS, _FILES = "pipeline.calibrate.networks:ssl_solver", "pipeline.calibrate.networks:ssl_settings"
@@ -112,6 +112,7 @@ def method_named(name: str) -> Method:
     raise ConfigError("command line", "method", f"{name!r} does not exist; choose from {known}")
 
 
-def _resolved(path: str) -> Any:
+def resolved(path: str) -> Any:
+    """What an import path `module:name` names."""
     module, _, name = path.partition(":")
     return getattr(importlib.import_module(module), name)

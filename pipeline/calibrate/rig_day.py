@@ -16,9 +16,10 @@ from jaxtyping import Float
 
 from pipeline.calibrate.adjust.adjusted import AdjustedRig
 from pipeline.calibrate.adjusted_day import adjusted_rig, clocks_of, evidence_of_day, judged_together
-from pipeline.calibrate.base_edges import BaseEdges
 from pipeline.calibrate.day import DayOfPairs, records_of, solve_day
 from pipeline.calibrate.edge_records import judged_edge, record_of_edge, refused_edge
+from pipeline.calibrate.edges.day_sources import DaySources
+from pipeline.calibrate.methods import resolved
 from pipeline.calibrate.records import Inputs, refused_record
 from pipeline.calibrate.verify.constancy import moved_failures
 from pipeline.core.config import FleetConfig
@@ -30,6 +31,7 @@ from pipeline.rig.day_prior import no_prior, prior_of_three
 from pipeline.rig.estimates import PairEstimate, Prior
 from pipeline.rig.evidence import EdgeEvidence
 from pipeline.rig.graph import BASE, Edge, RigGraph
+from pipeline.rig.kinds import KIND_OF_EDGE
 from pipeline.rig.overlap import View
 from pipeline.rig.prior import RigPrior
 from pipeline.rig.rig import Rig
@@ -38,10 +40,6 @@ from schemas.calibrations import SENSORS, CalibrationRecord
 from schemas.observations import Observation
 
 __all__ = ["CalibratedRig", "RigDay", "calibrate_rig"]
-
-# Camera-lidar needs the car's way in the lidar's axes, which the other edges of the lidar show.
-_ORDER = ("lidar_base", "radar_base", "lidar_lidar", "lidar_radar", "camera_lidar", "camera_radar")
-PAIR_KINDS = ("camera_lidar", "camera_radar", "lidar_radar")  # estimated as pairs of three kinds of sensors
 
 
 # By lidar, azimuths in its axes in which the car drives straight on, with sigmas [rad].
@@ -99,17 +97,17 @@ class CalibratedRig:
 def calibrate_rig(day: RigDay, fleet: FleetConfig, about: Inputs, progress: Progress) -> CalibratedRig:
     """Solve and judge each edge, then adjust poses and clocks of all sensors."""
     measured = day.rig.road_z_m, day.rig.measured_heights
-    others = BaseEdges(day.prior, tuple(day.rig.lidars), tuple(day.rig.radars), day.rows, *measured)
+    sources = DaySources(day.prior, tuple(day.rig.lidars), tuple(day.rig.radars), day.rows, *measured)
     found, done = _Found(), 0
-    for group in sorted(_groups(day.graph), key=lambda g: _ORDER.index(g[0].kind)):
+    for group in sorted(_groups(day.graph), key=lambda g: KIND_OF_EDGE[g[0].kind].order):
         progress(done, len(day.graph.edges) + 1, f"calibrate {', '.join(edge.name for edge in group)}")
         done += len(group)
         if len(group) == 1 and day.prior.between(*(s.name for s in group[0].sensors)) is None:
             found.records.append(refused_edge(about, group[0], no_prior(group[0].name), 0))
-        elif group[0].kind in PAIR_KINDS:
+        elif not KIND_OF_EDGE[group[0].kind].solver:
             _solve_pairs(day, fleet, about, group, found)
         else:
-            _solve_other(day, fleet, about, others, group[0], found)
+            _solve_other(day, fleet, about, sources, group[0], found)
     progress(done, done + 1, "adjust the rig")
     prior = replace(day.prior, reference=day.graph.reference).extrinsics()
     sigma_s = fleet.solve.time_offset_sigma_s
@@ -146,7 +144,7 @@ class _Found:
 
 def _groups(graph: RigGraph) -> list[tuple[Edge, ...]]:
     """Groups of edges solved from one reading: all pairs of a rig with one sensor of each kind, else single edges."""
-    pairs = [edge for edge in graph.edges if edge.kind in PAIR_KINDS]
+    pairs = [edge for edge in graph.edges if not KIND_OF_EDGE[edge.kind].solver]
     sensors = {sensor for edge in pairs for sensor in edge.sensors}
     if not pairs or len({sensor.kind for sensor in sensors}) < len(sensors):
         return [(edge,) for edge in graph.edges]
@@ -191,11 +189,11 @@ def _add_heading(edge: Edge, rows: Sequence[Observation], found: _Found) -> None
 
 
 def _solve_other(
-    day: RigDay, fleet: FleetConfig, about: Inputs, others: BaseEdges, edge: Edge, found: _Found
+    day: RigDay, fleet: FleetConfig, about: Inputs, sources: DaySources, edge: Edge, found: _Found
 ) -> None:
     """Solve an edge that is not a pair of camera, lidar and radar."""
     try:
-        shown, frames = others.solve(edge)
+        shown, frames = resolved(KIND_OF_EDGE[edge.kind].solver)(edge, sources)
     except SolveError as err:
         found.records.append(refused_edge(about, edge, err.reason, 0, err.fault))
         return

@@ -11,7 +11,8 @@ import pyarrow.compute as pc
 from jaxtyping import Float, Int
 
 from pipeline.rig.edges import edges_of_rows
-from pipeline.rig.graph import EDGE_KINDS, Edge
+from pipeline.rig.graph import Edge
+from pipeline.rig.kinds import EDGE_KINDS
 from pipeline.store.columns import known_rows, ordinals, places
 from pipeline.store.corrections import read_corrections
 from pipeline.store.current import current_rows

@@ -17,7 +17,8 @@ from jaxtyping import Bool, Float, Int
 
 from pipeline.rig.changes import change_covariance
 from pipeline.rig.edges import edges_of_rows
-from pipeline.rig.graph import EDGE_KINDS, Edge
+from pipeline.rig.graph import Edge
+from pipeline.rig.kinds import EDGE_KINDS
 from pipeline.rig.se3 import from_quaternion
 from pipeline.store.columns import known_rows, matrices, observable_dofs, ordinals, places, there
 from pipeline.store.current import current_rows

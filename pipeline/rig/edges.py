@@ -10,7 +10,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from jaxtyping import Float, Int
 
-from pipeline.rig.graph import EDGE_KINDS, TIE_KINDS, Edge, Kind, Sensor
+from pipeline.rig.graph import TIE_KINDS, Edge, Kind, Sensor
+from pipeline.rig.kinds import EDGE_KINDS
 from pipeline.rig.se3 import from_quaternion, to_quaternion
 from schemas.calibrations import FRAMES_OF_PAIR, CalibrationRecord
 from schemas.columns import POSE_COLUMNS

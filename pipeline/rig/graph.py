@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from itertools import combinations
 from typing import Final, Literal, get_args
 
+from pipeline.rig.kinds import EDGE_KINDS
+
 __all__ = [
     "BASE",
     "EDGE_KINDS",
@@ -29,10 +31,6 @@ __all__ = [
 
 Kind = Literal["camera", "lidar", "radar", "base"]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
-# Kinds of two nodes that can be calibrated against each other; two cameras are connected through a lidar.
-EDGE_KINDS: Final = (
-    "camera_lidar", "camera_radar", "lidar_radar", "lidar_lidar", "lidar_base", "radar_base",
-)  # fmt: skip
 # Kinds of two nodes connected through other nodes: their relative pose follows from the adjustment of the
 # rig.
 TIE_KINDS: Final = (*EDGE_KINDS, "camera_camera", "radar_radar", "camera_base")

@@ -27,6 +27,7 @@ from pipeline.core.config import VerifyConfig
 from pipeline.core.stage_work import Probes
 from pipeline.rig.changes import change_between, change_covariance
 from pipeline.rig.edges import edge_of, words_of
+from pipeline.rig.kinds import KIND_OF_EDGE
 from pipeline.rig.se3 import adjoint, inverse, log_se3
 from pipeline.rig.targets import DEFAULT_TARGETS, target_jacobian, target_sigmas
 from pipeline.store.current import prior_of, targets_of, transform_of
@@ -35,7 +36,6 @@ from schemas.calibrations import PROBE_Z, CalibrationRecord
 from schemas.poses import PoseRow
 
 __all__ = [
-    "NEEDED_AXES",
     "answer_of",
     "answer_of_sensors",
     "answers_by_sensor",
@@ -52,16 +52,6 @@ __all__ = [
 # that.
 CONTRADICTION_SIGMAS = 3.0
 _ROLL = 2  # component of a camera pose's change: about the optical axis
-
-# Axes that each kind of pair must determine; the elevation of a radar is optional.
-NEEDED_AXES: Mapping[str, tuple[str, ...]] = {
-    "camera_lidar": ("azimuth", "elevation"),
-    "camera_radar": ("azimuth",),
-    "lidar_radar": ("azimuth",),
-    "lidar_lidar": ("azimuth", "elevation"),
-    "lidar_base": ("azimuth", "elevation"),
-    "radar_base": ("azimuth",),
-}
 
 
 def limits_of(pair: str, verify: VerifyConfig, asked_deg: tuple[float, float]) -> dict[str, AxisLimits]:
@@ -166,7 +156,7 @@ def answers_by_sensor(checks: Sequence[AxisCheck]) -> dict[str, str]:
     answers: dict[str, str] = {}
     for sensor in dict.fromkeys(c.pair for c in checks):
         own = [c for c in checks if c.pair == sensor]
-        needed = [c.status in {"pass", "warn"} for c in own if c.axis in NEEDED_AXES[c.kind]]
+        needed = [c.status in {"pass", "warn"} for c in own if c.axis in KIND_OF_EDGE[c.kind].needed]
         is_wrong = any(c.status == "fail" for c in own)
         answers[sensor] = "wrong" if is_wrong else "right" if needed and all(needed) else "undecided"
     return answers
@@ -188,7 +178,7 @@ def answer_of(checks: Sequence[AxisCheck]) -> str:
         return "wrong"
     good: dict[str, bool] = {}
     for c in checks:
-        if c.axis in NEEDED_AXES[c.kind]:
+        if c.axis in KIND_OF_EDGE[c.kind].needed:
             good[c.pair] = good.get(c.pair, True) and c.status in {"pass", "warn"}
     edges = [set(pair.split("-")) for pair in good if "-" in pair]
     if len(edges) < len(good):  # sensors are named after their kinds

@@ -22,10 +22,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.calibrate.edges.day_sources import DaySources
 from pipeline.calibrate.edges.on_base import Series, changes_by_left, first_and_last, other_scenes
 from pipeline.calibrate.edges.robust_regression import Regression, Rows, regress
 from pipeline.calibrate.edges.sweep_travel import SweepTravel, sweep_travel
-from pipeline.calibrate.edges.sweeps import Sweep, deskewed_again
+from pipeline.calibrate.edges.sweeps import Sweep, deskewed_again, sweeps_of
 from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.objective.ego_motion import EgoMotion
 from pipeline.rig.checks import FailedCheck
@@ -33,7 +34,7 @@ from pipeline.rig.evidence import EDGE, EdgeEvidence, OtherScenes
 from pipeline.rig.graph import BASE, Edge
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse, transform_points
 
-__all__ = ["estimate_lidar_base"]
+__all__ = ["estimate_lidar_base", "solve"]
 
 # What all days of a car err by alike, as one sigma of roll, pitch, yaw and height of the base. Roads fall by about 2 %
 # to the side that is driven on, so bodies that lean by some 5 deg/g and rear axles that slip by some 3 deg/g (Gillespie
@@ -97,6 +98,17 @@ class _Shown:
         return mean, max(1.0, apart) / float(
             weight.sum()
         )  # two that differ by more than both sigmas widen it
+
+
+def solve(edge: Edge, sources: DaySources) -> tuple[EdgeEvidence, int]:
+    """Evidence of a day, and its number of moments; raises SolveError if there are too few."""
+    name = edge.parent.name
+    rows, T = sources.sweeps(name), sources.on_base(name)
+    ego, heights = sources.ego_at(rows), sources.heights.get(name)
+    found = estimate_lidar_base(
+        edge, sweeps_of(rows), ego, T, Scenes.of(rows), road_z_m=sources.road_z_m, height_m=heights
+    )
+    return found, len(rows)
 
 
 def estimate_lidar_base(

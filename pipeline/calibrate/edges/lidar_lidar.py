@@ -14,8 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.calibrate.edges.day_sources import DaySources
 from pipeline.calibrate.edges.point_to_plane import Surfaces, plane_equations
-from pipeline.calibrate.edges.sweeps import Sweep, deskewed_again
+from pipeline.calibrate.edges.sweeps import Sweep, deskewed_again, sweeps_of
 from pipeline.calibrate.numerics.bias_floors import SWEEP_S, TYPICAL_RANGE_M
 from pipeline.calibrate.numerics.change_point import parts_of_day
 from pipeline.calibrate.numerics.frame_blocks import Scenes
@@ -24,7 +25,7 @@ from pipeline.objective.ego_motion import EgoMotion
 from pipeline.rig.checks import FailedCheck
 from pipeline.rig.estimates import DayParts
 from pipeline.rig.evidence import EDGE, EdgeEvidence, OtherScenes
-from pipeline.rig.graph import Edge
+from pipeline.rig.graph import BASE, Edge
 from pipeline.rig.se3 import (
     adjoint,
     exp_se3,
@@ -36,7 +37,7 @@ from pipeline.rig.se3 import (
     transform_points,
 )
 
-__all__ = ["LidarPair", "estimate_lidar_lidar"]
+__all__ = ["LidarPair", "estimate_lidar_lidar", "solve"]
 
 _MOST_MOMENTS, _MOST_POINTS, _MOST_SURFACES = 30, 1500, 6000
 _MOTORWAY_MPS = 17.0  # faster, what has a vehicle's size drives
@@ -147,6 +148,19 @@ class _Seen:
         J = np.eye(7)  # exp(xi_base) A T = A exp(Ad(A)^-1 xi_base) T
         J[:6, :6] = adjoint(A)
         return J.T @ information @ J, J.T @ information @ step
+
+
+def solve(edge: Edge, sources: DaySources) -> tuple[EdgeEvidence, int]:
+    """Evidence of a day, and its number of common moments; raises SolveError if there are too few."""
+    parent, child = (s.name for s in edge.sensors)
+    of_child = {o.frame_index: o for o in sources.sweeps(child)}
+    rows = [o for o in sources.sweeps(parent) if o.frame_index in of_child]
+    T = sources.on_base(parent), sources.on_base(child)
+    sigma_rad = sources.prior.sigmas_between(parent, BASE.name)[0]
+    of_child_rows = [of_child[o.frame_index] for o in rows]
+    pair = LidarPair(sweeps_of(rows), sweeps_of(of_child_rows), T[0], T, sigma_rad)
+    found = estimate_lidar_lidar(edge, pair, sources.ego_at(rows), inverse(T[0]) @ T[1], Scenes.of(rows))
+    return found, len(rows)
 
 
 def estimate_lidar_lidar(

@@ -11,22 +11,28 @@ determine the clock. The motion must come from sources other than this radar.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int64
 
+from pipeline.calibrate.edges.day_sources import DaySources
 from pipeline.calibrate.edges.lidar_base import STANCE
 from pipeline.calibrate.edges.on_base import Series, changes_by_left, first_and_last, other_scenes
 from pipeline.calibrate.edges.robust_regression import Regression, Rows, regress
 from pipeline.calibrate.numerics.frame_blocks import Scenes
+from pipeline.calibrate.verify.motion_sources import compared_sources
+from pipeline.core.errors import SolveError
 from pipeline.objective.ego_motion import DopplerMotion, EgoMotion
-from pipeline.objective.radar.travel import TravelDirections
+from pipeline.objective.radar.travel import TravelDirections, travel_directions
+from pipeline.rig.checks import FailedCheck
 from pipeline.rig.evidence import EDGE, EdgeEvidence
 from pipeline.rig.graph import BASE, Edge
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
+from schemas.observations import Observation
 
-__all__ = ["Stamps", "estimate_radar_base"]
+__all__ = ["Stamps", "estimate_radar_base", "solve"]
 
 _LEAST_SPEED_MPS = 4.0  # slower, noise of 0.05 m/s is a degree
 _LEVER_SIGMA_M = (
@@ -41,6 +47,7 @@ _YAW_FLOOR_RAD = np.radians(0.02)  # errors of 8 tuning days were 0.018 deg RMS
 _CLOCK_FLOOR_S = 0.004  # 12 ms RMS, as scenes scatter; of no clock less is promised
 _NO_CLOCK_S = 1.0  # a clock that is not known to half of this is not known
 _PASSES = 3
+_FEWEST_DIRECTIONS = 8  # scans whose elevations a lidar mends: fewer show no pitch
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +57,29 @@ class Stamps:
     moment_ns: np.ndarray  # F
     scan_ns: np.ndarray  # F
     drive: np.ndarray  # F
+
+
+def solve(edge: Edge, sources: DaySources) -> tuple[EdgeEvidence, int]:
+    """Evidence of a day, and its number of moments; raises SolveError if there are too few."""
+    name = edge.parent.name
+    rows = sources.rows({"radar": name})
+    sources.on_base(name)
+    radar = sources.doppler(name, rows) if rows else None
+    if radar is None:
+        raise SolveError(f"{name} is silent: the day has no scan of it", "silent_sensor")
+    wrong = sources.backwards
+    if name in wrong:
+        return _turned_round(edge, radar), len(rows)
+    of_rows = ([o.stamp_ns for o in rows], [o.radar_stamp_ns for o in rows], [o.drive for o in rows])
+    stamps = Stamps(*(np.array(column) for column in of_rows))
+    ego = sources.ego_at(rows, without=name)
+    if not np.isfinite(ego.velocity_mps).any():
+        said = f": the car drives backwards by {', '.join(wrong)}" if wrong else ""
+        raise SolveError(f"nothing but {name} itself shows how the car moves{said}")
+    directions = _directions(name, rows, sources)
+    found = estimate_radar_base(edge, radar, ego, stamps, Scenes.of(rows), directions)
+    compared = compared_sources(rows, radar.T_base_radar)
+    return replace(found, checks=(*found.checks, *compared.wrong)), len(rows)
 
 
 def estimate_radar_base(
@@ -173,3 +203,30 @@ def _notes(yaw: Regression | None, pitch: Regression | None, clock: Regression |
         *(told for told, fit in shown.items() if fit is None),
         "roll, x, y, z to the base: the motion does not determine them",
     )
+
+
+def _directions(radar: str, rows: Sequence[Observation], sources: DaySources) -> TravelDirections | None:
+    """Velocities that a lidar's elevations mend, of the lidar that most scans share their view with."""
+    place = {o.frame_index: k for k, o in enumerate(rows)}
+    found: list[TravelDirections] = []
+    for lidar in sources.lidars:
+        T = sources.prior.between(lidar, radar)
+        both = [] if T is None else sources.rows({"lidar": lidar, "radar": radar})
+        both = [o for o in both if o.frame_index in place]
+        if T is not None and both:
+            seen = travel_directions(both, T, 0.0)
+            at = np.array([place[both[k].frame_index] for k in seen.frame], np.int64)
+            found.append(replace(seen, frame=at))
+    best = max(found, key=lambda seen: seen.count, default=None)
+    return None if best is None or best.count < _FEWEST_DIRECTIONS else best
+
+
+def _turned_round(edge: Edge, radar: DopplerMotion) -> EdgeEvidence:
+    """A radar by whose Doppler the car drives backwards, at its prior."""
+    shown = f"by the Doppler of {radar.name} the car drives backwards, by other sources it does not"
+    fits = "the other sign fits (doppler_positive in fleet.toml), or its transform is turned round"
+    nothing, moments = np.zeros((7, 7)), int(np.isfinite(radar.velocity_mps).all(1).sum())
+    return EdgeEvidence(
+        edge, inverse(radar.T_base_radar), 0.0, nothing, nothing[0], frames_used=moments,
+        checks=(FailedCheck(f"{shown}: {fits}", "doppler"),),
+    )  # fmt: skip

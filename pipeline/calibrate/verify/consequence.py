@@ -11,13 +11,13 @@ from pipeline.calibrate.verify.edge_result import EdgeResult
 from pipeline.calibrate.verify.target_accuracy import DIRECTIONS, Claim
 from pipeline.rig.changes import change_covariance, change_jacobian, changed
 from pipeline.rig.checks import Change, FailedCheck
+from pipeline.rig.kinds import KIND_OF_EDGE
 from pipeline.rig.targets import errors_at_targets, target_sigmas
+from schemas.calibrations import DOF_NAMES
 
 __all__ = ["RANGE", "at_targets", "exceeded_by", "tilt_in_doubt"]
 
 RANGE = "range"
-# Of a radar: what its elevation is made of, by index.
-_TILTS = {"camera_radar": (0, 2), "lidar_radar": (0, 1, 5)}
 _SIGMAS = 3.0
 
 
@@ -52,7 +52,7 @@ def tilt_in_doubt(result: EdgeResult, check: FailedCheck) -> Float[np.ndarray, "
     little targets see of it, but its pose has that tilt: whoever combines poses must not take it for sure.
     None where the check doubts none.
     """
-    tilts = list(_TILTS.get(result.kind, ()))
+    tilts = [DOF_NAMES.index(name) for name in KIND_OF_EDGE[result.kind].tilts]
     if check.error is None or not tilts:
         return None
     off, variance = np.zeros(6), np.zeros(6)

@@ -18,6 +18,7 @@ from pipeline.rig.checks import FailedCheck
 from pipeline.rig.edges import EDGE_OF_PAIR
 from pipeline.rig.estimates import DayParts, PairEstimate
 from pipeline.rig.graph import BASE, Edge
+from pipeline.rig.kinds import KIND_OF_EDGE
 from pipeline.rig.se3 import adjoint, inverse
 
 __all__ = ["MOVED_SIGMAS", "PART_FLOOR_RAD", "constancy_failures", "moved_failures"]
@@ -49,7 +50,7 @@ def moved_failures(parts: Mapping[Edge, DayParts], edges: Collection[Edge]) -> d
         {
             edge: _shift_on_base(p)
             if edge.child == BASE
-            else _shift(p, edge in moved or edge.kind in ("camera_lidar", "lidar_lidar"))
+            else _shift(p, edge in moved or KIND_OF_EDGE[edge.kind].has_tilt)
             for edge, p in parts.items()
         }
     )

@@ -20,25 +20,11 @@ from pipeline.calibrate.verify.held_out_test import HeldOutTest
 from pipeline.calibrate.verify.target_accuracy import Claim
 from pipeline.core.config import ChecksConfig
 from pipeline.rig.checks import FailedCheck, change_of, faults_of
+from pipeline.rig.kinds import KIND_OF_EDGE
 from schemas.calibrations import DOF_NAMES
 
 __all__ = ["Evidence", "Verdict", "judge", "matters"]
 
-# What an edge is good for: without it there is nothing to accept. A radar without elevation is still worth its
-# azimuth. Of other kinds either direction is.
-_NEEDED = {
-    "camera_lidar": ("azimuth", "elevation"),
-    "camera_radar": ("azimuth",),
-    "lidar_radar": ("azimuth",),
-}
-# Degrees of freedom that the held-out score depends on, of the kinds of edges that have one: registration and boxes do
-# not see the radar's elevation.
-_SCORED = {
-    "camera_lidar": np.ones(6, bool),
-    "camera_radar": np.array([False, True, False, False, False, False]),
-    "lidar_radar": np.array([False, False, True, True, True, False]),
-    "lidar_lidar": np.ones(6, bool),
-}
 _FAILED = -1.0  # margin of a check that yields no number
 
 
@@ -126,7 +112,7 @@ def judge(
         checks += _aligns_no_worse(result, evidence.claims, evidence.held_out, limits)
     else:
         checks += _moves_little(result, limits)
-        if result.kind in _SCORED:
+        if KIND_OF_EDGE[result.kind].scored:
             checks.append(_aligns_better(result, evidence.claims, evidence.held_out, limits))
     checks += _claims_hold(result, evidence.claims)
     if not result.observable.any():
@@ -150,7 +136,7 @@ def _held(failed: Sequence[_Check], score: float, faults: Mapping[str, None]) ->
 
 def matters(check: FailedCheck, result: EdgeResult, claims: Mapping[str, Claim]) -> bool:
     """Whether the pose would be no good for what the edge is needed for if the check is right."""
-    exceeded, needed = set(_exceeded(check, result, claims)), _NEEDED.get(result.kind)
+    exceeded, needed = set(_exceeded(check, result, claims)), KIND_OF_EDGE[result.kind].required
     if needed is None:
         return RANGE in exceeded or exceeded >= claims.keys()
     return not exceeded.isdisjoint({*needed, RANGE})
@@ -262,16 +248,16 @@ def _near_prior(result: EdgeResult, claims: Mapping[str, Claim]) -> float:
     It is good if the prior is right in what held-out frames score, and held-out frames, which may lead beyond the
     prior, would move it by no more either.
     """
-    back = change_of(np.where(_SCORED[result.kind], -result.move, 0.0))
+    back = change_of(np.where(KIND_OF_EDGE[result.kind].is_scored, -result.move, 0.0))
     if exceeded_by(result, claims, FailedCheck("the prior is right", error=back)):
         return _FAILED
-    needed = _NEEDED.get(result.kind, tuple(claims))
+    needed = KIND_OF_EDGE[result.kind].required or tuple(claims)
     return 0.0 if all(claims[name].agrees_with_held_out for name in needed) else _FAILED
 
 
 def _largest_move(result: EdgeResult) -> tuple[str, float]:
     """Largest move of a degree of freedom that held-out frames score, in sigmas of the result."""
-    ratio = np.where(_SCORED[result.kind], result.move_sigmas, 0.0)
+    ratio = np.where(KIND_OF_EDGE[result.kind].is_scored, result.move_sigmas, 0.0)
     worst = int(np.argmax(ratio))
     return result.names[worst], float(ratio[worst])
 
@@ -286,7 +272,7 @@ def _claims_hold(result: EdgeResult, claims: Mapping[str, Claim]) -> list[_Check
 
     A sigma that held-out frames exceed is not only too large: the pose may lie outside of it.
     """
-    needed = _NEEDED.get(result.kind)
+    needed = KIND_OF_EDGE[result.kind].required
     checks = {
         name: _Check(claim.margin, f"{name} is {_known(claim)}", of_sigma=not claim.is_exceeded)
         for name, claim in claims.items()
