@@ -44,8 +44,7 @@ demo: setup ## synthetic fleet to HTML report, in minutes
 	$(BIN)/boresight demo --out demo || [ $$? -eq 3 ] # 3: done, and something was held, as it should be
 
 # Files go to workers whole, for what their tests share; tests/conftest.py puts the heaviest first.
-PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder --durations 25 \
-	--ignore tests/benchmarks
+PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder --durations 25
 # Each function's first calls, and one in many after them: every call would double what the tests cost.
 SHAPES := -p tests.shapes --jaxtyping-packages=schemas$(comma)pipeline$(comma)beartype.beartype
 
@@ -64,12 +63,6 @@ lint: setup ## style, types, and the lines of each room against tests/budgets.to
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python -m tests.budgets
-
-bench: setup ## speed and memory, measured as ratios against the committed baseline
-	$(ONE_THREAD) $(BIN)/python -m pytest tests/benchmarks -p no:xdist -s
-
-bench-accept: setup ## the same, and writes what it measures into the baseline
-	$(ONE_THREAD) $(BIN)/python -m pytest tests/benchmarks -p no:xdist -s --accept-baseline
 
 results: setup ## write the result tables of both READMEs from what was measured
 	$(BIN)/python -m tests.benchmarks.results_table
@@ -97,4 +90,4 @@ audit-dependencies: $(LOOKERS)/.ready ## known vulnerabilities of what constrain
 clean: ## remove what the other targets made
 	rm -rf .venv $(LOOKERS) $(READERS) sbom.json demo .pytest_cache .mypy_cache .ruff_cache
 
-.PHONY: help setup view readers demo test browser lint bench bench-accept results accuracy-accept licenses sbom audit-dependencies clean
+.PHONY: help setup view readers demo test browser lint results accuracy-accept licenses sbom audit-dependencies clean

@@ -23,7 +23,7 @@ import numpy as np
 
 from schemas.calibrations import PAIRS
 from tests.accuracy.days import FIXED, WHOLE, FixedDay, make_day, measure_day
-from tests.benchmarks.kernel_workload import FRAMES, POINTS, naive_cpu_s
+from tests.accuracy.naive_cost import unit_s
 from tests.benchmarks.studies.commits import commit_now
 from tests.benchmarks.studies.metrics import within
 
@@ -33,7 +33,6 @@ __all__ = [
     "keep_noise",
     "main",
     "together",
-    "unit_s",
     "worse",
     "wrong_and_accepted",
     "z_scores",
@@ -80,11 +79,6 @@ def z_scores(result: Mapping[str, Any]) -> np.ndarray:
         if "error" in p
     ]
     return np.concatenate(found) if found else np.zeros(0)
-
-
-def unit_s() -> float:
-    """CPU seconds of naive NumPy over 100,000 points on this machine now."""
-    return naive_cpu_s() / (FRAMES * POINTS) * 1e5
 
 
 def baseline_of(draws: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Any]:

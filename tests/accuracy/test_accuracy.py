@@ -13,12 +13,12 @@ from tests.accuracy.baseline import (
     baseline_of,
     keep_noise,
     together,
-    unit_s,
     worse,
     wrong_and_accepted,
     z_scores,
 )
 from tests.accuracy.days import FIXED, WHOLE, make_day, measure_day
+from tests.accuracy.naive_cost import unit_s
 
 pytestmark = pytest.mark.slow
 _BASELINE = json.loads(BASELINE.read_text())

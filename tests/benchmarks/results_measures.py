@@ -10,11 +10,10 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from scipy.stats import beta
 
 from schemas.calibrations import PAIRS
 from tests.benchmarks.studies.metrics import within
-from tests.benchmarks.studies.rates import interval, rate
-from tests.benchmarks.studies.states_measures import counts
 
 __all__ = ["MEASURES", "interval", "rate"]
 
@@ -72,11 +71,26 @@ def clock_sigmas(lines: Lines, row: Row) -> str:
     return f"{rate(int(np.sum(np.abs(z) <= 3)), len(z))}, {np.sqrt(np.mean(z**2)):.2f} sigma"
 
 
-def states(lines: Lines, row: Row) -> str:
-    """What study `states` counts under the words of `count`."""
-    return counts(lines)[row["count"]]
+def interval(hits: int, trials: int) -> tuple[float, float]:
+    """Clopper and Pearson's 95 % interval of a rate; one-sided if none or all succeed (about 3 / trials wide)."""
+    if not 0 <= hits <= trials or trials < 1:
+        raise ValueError(f"{hits} of {trials} is no rate")
+    outside = 0.05 if hits in {0, trials} else 0.025
+    low = float(beta.ppf(outside, hits, trials - hits + 1)) if hits else 0.0
+    high = float(beta.ppf(1 - outside, hits + 1, trials - hits)) if hits < trials else 1.0
+    return low, high
+
+
+def rate(hits: int, trials: int) -> str:
+    """`k of n (low to high %)`."""
+    low, high = (100 * end for end in interval(hits, trials))
+    if hits == 0:
+        return f"{hits} of {trials} (< {high:.1f} %)"
+    if hits == trials:
+        return f"{hits} of {trials} (> {low:.1f} %)"
+    return f"{hits} of {trials} ({low:.0f} to {high:.0f} %)"
 
 
 MEASURES: dict[str, Callable[[Lines, Row], str]] = {
-    f.__name__: f for f in (accepted_days, clock_sigmas, errors, inside, states, wrong_days)
+    f.__name__: f for f in (accepted_days, clock_sigmas, errors, inside, wrong_days)
 }

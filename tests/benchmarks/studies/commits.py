@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import argparse
 import subprocess
 from collections.abc import Sequence
 from functools import lru_cache
 
-__all__ = ["accept_argument", "commit_now", "is_accepted", "is_same_code"]
+__all__ = ["EVERY", "commit_now", "is_accepted"]
 
 # What decides results: a commit that changes nothing here (a document, a study's table) makes the same numbers.
 _DECIDING = ("pipeline", "schemas")
-_EVERY = "all"
+EVERY = "all"
 
 
 def commit_now() -> str:
@@ -26,7 +25,7 @@ def commit_now() -> str:
 
 
 @lru_cache(maxsize=256)
-def is_same_code(first: str, second: str) -> bool:
+def _is_same_code(first: str, second: str) -> bool:
     """Both commits hold the same code, as far as it decides results.
 
     Nobody knows what a working tree with changes (a + at the end) held, or a commit that is not in this repository:
@@ -42,17 +41,6 @@ def is_same_code(first: str, second: str) -> bool:
     return done.returncode == 0
 
 
-def accept_argument(parser: argparse.ArgumentParser) -> None:
-    """Add `--accept-commits`: results of other code, which count as this code's only where a person says so."""
-    parser.add_argument(
-        "--accept-commits",
-        nargs="+",
-        default=[],
-        metavar="COMMIT",
-        help=f"lines by these commits count as done ('{_EVERY}': by any); otherwise only lines by the same code",
-    )
-
-
 def is_accepted(commit: str, now: str, accepted: Sequence[str]) -> bool:
     """A line by `commit` counts as done at commit `now`."""
-    return _EVERY in accepted or commit in accepted or is_same_code(commit, now)
+    return EVERY in accepted or commit in accepted or _is_same_code(commit, now)

@@ -14,15 +14,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tests.benchmarks.studies.commits import is_same_code
-
-__all__ = ["RECORD", "Look", "freshness", "heading", "look", "read_looks"]
+__all__ = ["freshness", "look", "read_looks"]
 
 RECORD = Path(__file__).parents[1] / "results" / "seeds.toml"
-_REAL = 0
-# Below 200: the days of days.py for tuning. From 1000: the fleet that networks learn from (ssl_fleet.py).
-# From 71001: study `states`.
-_TUNING = frozenset([*range(1, 200), *range(1000, 1100), *range(71001, 71100)])
+# 0: the real day. Below 200: the days of days.py for tuning. From 1000: the fleet that networks learnt from.
+_TUNING = frozenset([*range(200), *range(1000, 1100)])
 
 
 @dataclass(frozen=True)
@@ -43,58 +39,29 @@ def read_looks(record: Path = RECORD) -> list[Look]:
 
 
 def look(study: str, results: Sequence[dict[str, Any]], record: Path = RECORD) -> str:
-    """Note down that the test seeds of these result lines are seen now; returns the `heading` of their table."""
+    """Note down that the seeds of these result lines are seen now; returns whether this is a first look at them."""
     known = read_looks(record)
+    found: dict[str, set[int]] = {}
     for commit in dict.fromkeys(r["commit"] for r in results):
+        seeds = {r["day"]["seed"] for r in results if r["commit"] == commit}
+        for seed in seeds:
+            found.setdefault(freshness(seed, commit, known), set()).add(seed)
         seen = [e.seeds for e in known if e.commit == commit and e.study == study]
-        new = set(_seeds(results, commit)).difference(_TUNING, {_REAL}, *seen)
-        if new:
+        if new := seeds.difference(_TUNING, *seen):
             with record.open("a") as file:
                 file.write(
                     f'\n[[look]]\nstudy = "{study}"\nseeds = "{_ranges(new)}"\ncommit = "{commit}"\n'
                     f'date = "{time.strftime("%Y-%m-%d")}"\n'
                 )
-    return heading(results, record)
-
-
-def heading(results: Sequence[dict[str, Any]], record: Path = RECORD) -> str:
-    """Say of the seeds of result lines whether this is a first look at them.
-
-    Args:
-        results: lines with `commit` and `day.seed`.
-        record: looks so far, these lines' own among them.
-    """
-    known = read_looks(record)
-    said: dict[str, set[int]] = {}
-    for commit in dict.fromkeys(r["commit"] for r in results):
-        for seed in _seeds(results, commit):
-            said.setdefault(_freshness(seed, commit, known), set()).add(seed)
-    return "; ".join(f"{what}: days of seeds {_ranges(seeds)}" for what, seeds in said.items())
+    return "; ".join(f"{what}: days of seeds {_ranges(seeds)}" for what, seeds in found.items())
 
 
 def freshness(seed: int, commit: str, known: Sequence[Look]) -> str:
     """In a word, "tuned on", "first" or "second": the latter two by commits' names alone, whatever git has of them."""
-    if seed == _REAL or seed in _TUNING:
+    if seed in _TUNING:
         return "tuned on"
     first = next((e for e in known if seed in e.seeds), None)
     return "first" if first is None or first.commit == commit else "second"
-
-
-def _freshness(seed: int, commit: str, known: Sequence[Look]) -> str:
-    if seed == _REAL:
-        return "Seen throughout (the real day)"
-    if seed in _TUNING:
-        return "Tuning seeds"
-    if "+" in commit:
-        return "Made by uncommitted code (not to be stated)"
-    first = next((e for e in known if seed in e.seeds), None)
-    if first is None or is_same_code(first.commit, commit):
-        return "First look"
-    return f"Second look (first by commit {first.commit})"
-
-
-def _seeds(results: Iterable[dict[str, Any]], commit: str) -> list[int]:
-    return sorted({r["day"]["seed"] for r in results if r["commit"] == commit})
 
 
 def _seeds_of(text: str) -> frozenset[int]:

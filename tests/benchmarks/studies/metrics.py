@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,17 +15,7 @@ from pipeline.rig.targets import errors_at_targets
 from pipeline.store.current import targets_of
 from schemas.calibrations import CalibrationRecord
 
-__all__ = [
-    "LIMITS_DEG",
-    "claimed_error_deg",
-    "inside_share",
-    "measure",
-    "mounting_error",
-    "rms",
-    "share",
-    "transform_of",
-    "within",
-]
+__all__ = ["LIMITS_DEG", "inside_share", "measure", "mounting_error", "rms", "transform_of", "within"]
 
 # The issue's limits for an accepted result, and the axes of the parent frame that turn azimuth and elevation.
 LIMITS_DEG = {"camera_lidar": 0.2, "camera_radar": 0.4, "lidar_radar": 0.4}
@@ -108,11 +98,6 @@ def within(pair: str, measured: Mapping[str, Any], *, claimed: bool = False) -> 
     return azimuth <= LIMITS_DEG[pair] and elevation <= ELEVATION_LIMITS_DEG[pair]
 
 
-def claimed_error_deg(pair: str, measured: Mapping[str, Any], *, claimed: bool) -> float:
-    """The larger of azimuth and elevation error at the targets [deg]; 0 where nothing is claimed."""
-    return max(_claimed_angles(pair, measured, claimed=claimed))
-
-
 def _claimed_angles(pair: str, measured: Mapping[str, Any], *, claimed: bool) -> tuple[float, float]:
     """Azimuth and elevation error [deg]; 0 for what is not claimed."""
     angles = [float(measured["az_deg"]), float(measured["el_deg"])]
@@ -133,12 +118,6 @@ def inside_share(errors: Float[np.ndarray, " N"], sigmas: Float[np.ndarray, " N"
 def rms(values: Sequence[float] | Float[np.ndarray, " N"]) -> float:
     """Root mean square; NaN of none."""
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
-
-
-def share(hits: Iterable[bool]) -> str:
-    """`k/n (p %)`."""
-    found = list(hits)
-    return f"{sum(found)}/{len(found)} ({100 * np.mean(found):.1f} %)" if found else "none"
 
 
 def _rounded(values: np.ndarray) -> list[float]:

@@ -9,8 +9,8 @@ from pipeline.rig.changes import change_covariance
 from pipeline.rig.estimates import Prior
 from pipeline.rig.se3 import exp_se3, exp_so3, from_rotation_translation, to_quaternion
 from schemas.calibrations import CalibrationRecord
-from tests.benchmarks.studies.metrics import claimed_error_deg, inside_share, measure, rms, within
-from tests.benchmarks.studies.sigma_coverage import summary as coverage_summary
+from tests.benchmarks.studies.metrics import measure, within
+from tests.benchmarks.studies.run import coverage
 from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR
 
 PRIOR = Prior(T_CAMERA_LIDAR, T_LIDAR_RADAR, np.radians(2.0), 0.05)
@@ -58,31 +58,13 @@ def test_limits_ask_of_all_angles_or_only_of_those_that_are_claimed():
     measured = {"az_deg": 0.1, "el_deg": 0.5, "observable": [0, 1, 1, 1, 1, 1]}
     assert not within("camera_lidar", measured)
     assert within("camera_lidar", measured, claimed=True)
-    assert claimed_error_deg("camera_lidar", measured | {"observable": [0] * 6}, claimed=True) == 0.0
 
 
-def test_shares_and_root_mean_squares():
-    errors = np.array([0.5, -1.5, 2.5, -3.5])
-    assert inside_share(errors, np.ones(4), 1) == 0.25
-    assert inside_share(errors, np.ones(4), 3) == 0.75
-    assert rms([3.0, 4.0]) == pytest.approx(np.sqrt(12.5))
-
-
-def test_the_coverage_table_names_what_lies_beyond_three_sigma():
+def test_the_coverage_table_counts_what_lies_beyond_three_sigma():
     far = measure(
         record(exp_se3(np.array([0, 0, 0, 0.05, 0, 0])) @ T_CAMERA_LIDAR), T_CAMERA_LIDAR, PRIOR, 0.012
     )
     result = {"day": {"seed": 7, "environment": "urban"}, "pairs": {"camera_lidar": far}}
-    text = coverage_summary([result])
-    assert "seed 7 urban camera_lidar tx: error +0.050 m" in text
-    assert "camera_lidar ty" not in text
-
-
-def elevation_result(error_deg, seed=1, status="accepted", offset_rad=0.0):
-    said = {"registration_pitch_offset_rad": 0.0, "registration_pitch_sigma_rad": 0.002}
-    said |= {"doppler_pitch_offset_rad": offset_rad, "doppler_pitch_sigma_rad": 0.003, "doppler_frames": 38.0}
-    pair = {
-        "status": status, "el_deg": error_deg, "mounting_el_deg": error_deg + 0.1, "error": [0, 0.002, 0, 0, 0, 0],
-        "sigma": [0.004, 0.001, 0.004, 1, 1, 1], "diagnostics": said | {"vouched_el": 1.0},
-    }  # fmt: skip
-    return {"day": {"rig": "paper", "environment": "urban", "seed": seed}, "pairs": {"lidar_radar": pair}}
+    text = coverage([result])
+    assert "| day | camera_lidar | tx | 1 | 0.050 m | 0.010 m | 4" in text
+    assert "| prior | camera_lidar | tz | 1 | 0.000 m |" in text
