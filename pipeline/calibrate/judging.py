@@ -10,42 +10,50 @@ the prior does not have.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from pipeline.calibrate.adjust.adjusted import AdjustmentLimits
+from pipeline.calibrate.adjust.rig import adjust
 from pipeline.calibrate.numerics.frame_blocks import scene_blocks
-from pipeline.calibrate.numerics.search_range import search_range
+from pipeline.calibrate.numerics.search_range import SearchRange, search_range
 from pipeline.calibrate.select.frames import Selection
 from pipeline.calibrate.verify.consequence import tilt_in_doubt
 from pipeline.calibrate.verify.edge_result import EdgeResult
 from pipeline.calibrate.verify.held_out_score import held_out_score
 from pipeline.calibrate.verify.held_out_search import found_elsewhere, held_out_place
 from pipeline.calibrate.verify.held_out_test import HeldOutTest, paired_test
-from pipeline.calibrate.verify.held_out_update import held_out_update
+from pipeline.calibrate.verify.held_out_update import HeldOutUpdate, held_out_update
 from pipeline.calibrate.verify.target_accuracy import (
     Claim,
     claims_of,
     mounting_covariance,
     seen_targets,
+    targets_of,
     unseen_failure,
     views_of,
 )
 from pipeline.calibrate.verify.verdict import Evidence, Verdict, judge, matters
-from pipeline.core.config import ChecksConfig, FleetConfig
+from pipeline.core.config import FleetConfig, VerifyConfig
 from pipeline.core.stage_work import NO_PROBES, Probes
+from pipeline.rig.changes import change_covariance
 from pipeline.rig.checks import FailedCheck
 from pipeline.rig.estimates import PairEstimate, Prior
+from pipeline.rig.evidence import EdgeEvidence, OtherScenes
+from pipeline.rig.extrinsics import Extrinsics
+from pipeline.rig.graph import BASE, Edge, RigGraph
 from pipeline.rig.kinds import KIND_OF_EDGE
 from pipeline.rig.overlap import View
+from pipeline.rig.prior import RigPrior
 from pipeline.rig.rig import sensor_turn
 from pipeline.rig.targets import DEFAULT_TARGETS
 from schemas.calibrations import PROBE_Z
 from schemas.observations import Observation
 
-__all__ = ["Judged", "Judging"]
+__all__ = ["Judged", "JudgedEdge", "Judging", "judged_edge"]
 
 
 @dataclass(frozen=True)
@@ -109,9 +117,11 @@ class Judging:
                 FailedCheck("the day has too few frames to hold any out, so the result is not checked")
             )
         targets = DEFAULT_TARGETS if targets is None else targets
-        test, claims, probes, elsewhere = self._held_out(estimate, held_out, limits, mounting, targets)
+        test, claims, probes, elsewhere = self._held_out(estimate, held_out, mounting, targets)
         disproved = [FailedCheck(estimate.disproved, disproves=True)] if estimate.disproved else []
-        result = self._result(estimate, targets)
+        prior_sigma = np.sqrt(np.diag(self.prior.covariance(pair)))
+        search = search_range(self.prior.sigmas, self.fleet.solve)
+        result = _result(estimate, self.prior.of(pair), prior_sigma, search, targets)
         verdict = judge(
             result,
             Evidence(test, claims, [*failed, *unseen, *elsewhere, *disproved]),
@@ -124,31 +134,16 @@ class Judging:
         doubt = sum((d for d in doubts if d is not None), np.zeros((6, 6)))
         return Judged(verdict, test, claims, mounting, targets, probes, held_by, doubt)
 
-    def _result(self, estimate: PairEstimate, targets: np.ndarray) -> EdgeResult:
-        pair, prior = estimate.pair, self.prior
-        return EdgeResult(
-            pair,
-            estimate.T,
-            estimate.covariance,
-            estimate.observable,
-            prior.of(pair),
-            np.sqrt(np.diag(prior.covariance(pair))),
-            estimate.frames_used,
-            search_range(prior.sigmas, self.fleet.solve),
-            targets,
-        )
-
     def _held_out(
         self,
         estimate: PairEstimate,
         held_out: Sequence[Observation],
-        limits: ChecksConfig,
         mounting: np.ndarray | None,
         targets: np.ndarray,
     ) -> tuple[HeldOutTest | None, Mapping[str, Claim], dict[str, float], list[FailedCheck]]:
         """Held-out frames at the prior and at the result, the remaining claim, known turns, and a better place."""
         pair, verify, prior = estimate.pair, self.fleet.verify, self.prior
-        azimuth_rad, elevation_rad = verify.limits_rad(pair)
+        limits = verify.checks
         test, update, probes, score = None, None, dict[str, float](), None
         if held_out:
             score = held_out_score(estimate, held_out, prior, self.fleet.solve)
@@ -158,18 +153,7 @@ class Judging:
             covariance = np.diag([*np.zeros(6), *score.extra_variance])
             covariance[:6, :6] = estimate.covariance
             update = held_out_update(score.derivatives, covariance, score.bias, blocks, limits)
-        claims = claims_of(
-            pair,
-            estimate.T,
-            estimate.covariance,
-            update,
-            azimuth_rad,
-            verify.confidence,
-            limits.held_out_contradiction_sigmas,
-            elevation_rad,
-            mounting,
-            targets,
-        )
+        claims = _claims(estimate, update, verify, mounting, targets)
         place = self._place_by_held_out if pair == "camera_lidar" and score is not None else None
         if score is None or place is None:
             return test, claims, probes, []
@@ -177,6 +161,40 @@ class Judging:
             estimate, place, score.cost, claims, scene_blocks(held_out), targets, limits.worse_alignment_z
         )
         return test, claims, probes, elsewhere
+
+
+def _claims(
+    estimate: PairEstimate,
+    update: HeldOutUpdate | None,
+    verify: VerifyConfig,
+    mounting: np.ndarray | None,
+    targets: np.ndarray,
+) -> dict[str, Claim]:
+    azimuth_rad, elevation_rad = verify.limits_rad(estimate.pair)
+    return claims_of(
+        estimate.pair,
+        estimate.T,
+        estimate.covariance,
+        update,
+        azimuth_rad,
+        verify.confidence,
+        verify.checks.held_out_contradiction_sigmas,
+        elevation_rad,
+        mounting,
+        targets,
+    )
+
+
+def _result(
+    estimate: PairEstimate,
+    prior: np.ndarray,
+    prior_sigma: np.ndarray,
+    search: SearchRange,
+    targets: np.ndarray,
+) -> EdgeResult:
+    T, covariance, observable = estimate.T, estimate.covariance, estimate.observable
+    frames = estimate.frames_used
+    return EdgeResult(estimate.pair, T, covariance, observable, prior, prior_sigma, frames, search, targets)
 
 
 def probe_numbers(
@@ -204,3 +222,66 @@ def probe_numbers(
             if test is not None:
                 found[f"{PROBE_Z}{axis}_{deg:+g}"] = test.z
     return found
+
+
+# -- edges of other kinds than camera, lidar and radar: no frame is held out, halves of the day judge each other ----
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedEdge:
+    """An edge's evidence, its estimate with its prior alone, and the verdict on it.
+
+    `evidence` has the reason why the rig must not use it, if there is one.
+    """
+
+    evidence: EdgeEvidence
+    before: Extrinsics
+    estimate: PairEstimate
+    judged: Judged
+
+
+def judged_edge(
+    evidence: EdgeEvidence, prior: RigPrior, views: Mapping[str, View], fleet: FleetConfig
+) -> JudgedEdge:
+    """Combine an edge's own data with its prior alone, and judge the result."""
+    edge, child = evidence.edge, evidence.edge.child.name
+    free, limits = replace(evidence, checks=()), AdjustmentLimits(fleet.solve.time_offset_sigma_s)
+    alone = adjust(RigGraph(edge.sensors, (edge,), edge.parent), _prior_of(edge, prior), [free], limits)
+    of_child, poses = alone.sensors[child], alone.poses
+    estimate = PairEstimate(
+        edge.kind, poses.T[child], poses.covariance, of_child.observability, of_child.determined,
+        evidence.frames_used, dict(evidence.frames_rejected), diagnostics=dict(evidence.diagnostics),
+        common_covariance=poses.common, parts=evidence.parts,
+    )  # fmt: skip
+    targets = targets_of(estimate.T, views.get(edge.parent.name), views.get(child))
+    targets = DEFAULT_TARGETS if targets is None else targets
+    mounting = mounting_covariance(edge.kind, estimate.T, estimate.covariance, None)
+    test, update = _other_scenes(evidence.others, estimate.covariance)
+    claims = _claims(estimate, update, fleet.verify, mounting, targets)
+    sigmas = prior.sigmas_between(*(s.name for s in edge.sensors))
+    before, before_sigma = alone.before.T[child], np.repeat(sigmas, 3)
+    if edge.child != BASE:  # a parent that turns swings the child
+        before_sigma = np.sqrt(np.diag(change_covariance(before, alone.before.covariance)))
+    result = _result(estimate, before, before_sigma, search_range(sigmas, fleet.solve), targets)
+    verdict = judge(result, Evidence(test, claims, evidence.checks), fleet.verify.checks)
+    judged = Judged(verdict, test, claims, mounting, targets)
+    return JudgedEdge(replace(evidence, checks=verdict.against), alone.before, estimate, judged)
+
+
+def _prior_of(edge: Edge, prior: RigPrior) -> Extrinsics:
+    parent, child = (s.name for s in edge.sensors)
+    T = prior.between(parent, child)
+    assert T is not None, "an edge whose ends nothing ties is refused before"
+    rotation, translation = prior.sigmas_between(parent, child)
+    covariance = np.diag([rotation**2] * 3 + [translation**2] * 3)
+    return Extrinsics(edge.parent, {parent: np.eye(4), child: T}, (child,), covariance, covariance)
+
+
+def _other_scenes(
+    others: OtherScenes | None, covariance: np.ndarray
+) -> tuple[HeldOutTest | None, HeldOutUpdate | None]:
+    """What scenes that took no part in a fit show of the result."""
+    if others is None:
+        return None, None
+    test = None if others.cost is None else paired_test(*others.cost)
+    return test, HeldOutUpdate(others.shift, covariance, others.covariance, np.zeros((6, 6)))

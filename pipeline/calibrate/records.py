@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.calibrate.judging import Judged
+from pipeline.calibrate.judging import Judged, JudgedEdge
 from pipeline.calibrate.paper.triggers import trigger_metrics
 from pipeline.calibrate.solved import SolvedDay
 from pipeline.calibrate.unlabelled import notes_of_pair
@@ -20,8 +20,9 @@ from pipeline.core.errors import SolveError
 from pipeline.core.stage_work import NO_PROBES, Probes
 from pipeline.rig.cameras import camera_of
 from pipeline.rig.changes import change_between
-from pipeline.rig.edges import pose_columns
+from pipeline.rig.edges import edge_named, pose_columns
 from pipeline.rig.estimates import DayParts, PairEstimate, Prior, Solution
+from pipeline.rig.graph import Edge
 from pipeline.rig.se3 import inverse
 from pipeline.rig.spherical import camera_direction_angles
 from pipeline.store.partitions import Partition
@@ -31,15 +32,14 @@ from schemas.versions import CODE_VERSION
 
 __all__ = [
     "Inputs",
+    "computed_record",
+    "edge_of_pair",
     "environment_of",
     "half_days_of",
-    "parts_numbers",
     "record_of",
+    "record_of_edge",
+    "refused_edge",
     "refused_record",
-    "refused_records",
-    "unobservable",
-    "verdict_fields",
-    "verdict_numbers",
 ]
 
 # Speeds that separate a highway from a town [m/s]: 20 m/s = 72 km/h is above town limits.
@@ -65,16 +65,16 @@ class Inputs:
 
 
 def record_of(about: Inputs, pair: str, day: SolvedDay) -> CalibrationRecord:
-    """The record of one pair that was computed."""
+    """The record of one pair of camera, lidar and radar that was computed."""
     estimate, judged, selection = day.solution.pairs[pair], day.judged[pair], day.selection
-    verdict = judged.verdict
     trigger_after = trigger_metrics(day.trigger_sample, {pair: estimate.T})[pair]
-    return CalibrationRecord(
-        **_identity(about, pair, len(day.observations), day.prior),
-        **({} if verdict.status == "refused" else _estimate_fields(estimate)),
-        **verdict_fields(judged),
+    faults = {p: judged.verdict.faults for p, judged in day.judged.items()}
+    notes = [*notes_of_pair(pair, day.observations), *selection.notes.get(pair, [])]
+    record = computed_record(about, edge_of_pair(about, pair), len(day.observations), estimate, judged, notes)
+    return replace(
+        record,
+        **_prior_fields(pair, day.prior),
         **_loop_fields(day.solution),
-        frames_used=estimate.frames_used,
         frames_rejected=_add(selection.rejected[pair], estimate.frames_rejected),
         environment=environment_of(day.observations),
         triggered=day.triggered[pair],
@@ -82,23 +82,44 @@ def record_of(about: Inputs, pair: str, day: SolvedDay) -> CalibrationRecord:
         trigger_after=dict(trigger_after),
         time_offset_s=estimate.time_offset_s,
         time_offset_sigma_s=estimate.time_offset_sigma_s,
-        notes=[
-            *notes_of_pair(pair, day.observations),
-            *selection.notes.get(pair, []),
-            *unobservable(estimate.observable),
-        ],
         assumptions=[*_assumed(estimate, day.observations), *estimate.notes],
         drive_missing=selection.missing.get(pair, []),
-        diagnostics=dict(estimate.diagnostics)
-        | verdict_numbers(judged)
+        diagnostics=record.diagnostics
         | _camera_numbers(pair, day.observations)
         | dict(day.numbers)
-        | parts_numbers(estimate.parts)
         | {"paper_frames": float(selection.passed[pair])},
-        half_days=half_days_of(
-            pair, day.solution.pairs, {p: judged.verdict.faults for p, judged in day.judged.items()}
-        ),
+        half_days=half_days_of(pair, day.solution.pairs, faults),
     )
+
+
+def computed_record(
+    about: Inputs, edge: Edge, frames_total: int, found: PairEstimate, judged: Judged, notes: Sequence[str]
+) -> CalibrationRecord:
+    """The record of an edge of any kind; a refused one lacks the transform and its covariance."""
+    pose = {} if judged.verdict.status == "refused" else pose_columns(found.T) | {
+        "covariance": found.covariance,
+        "common_covariance": found.common_covariance,
+        "observability": [float(v) for v in found.observability],
+        "observable": [bool(v) for v in found.observable],
+    }  # fmt: skip
+    numbers = dict(found.diagnostics) | _verdict_numbers(judged) | _parts_numbers(found.parts)
+    return CalibrationRecord(
+        **_identity(about, edge, frames_total),
+        **pose,
+        **_verdict_fields(judged),
+        frames_used=found.frames_used,
+        frames_rejected=dict(found.frames_rejected),
+        notes=[*notes, *_unobservable(found.observable)],
+        diagnostics=numbers,
+    )
+
+
+def record_of_edge(about: Inputs, found: JudgedEdge, frames_total: int) -> CalibrationRecord:
+    """Record of an edge from its own data and its prior alone."""
+    edge, before = found.evidence.edge, found.before
+    record = computed_record(about, edge, frames_total, found.estimate, found.judged, found.evidence.notes)
+    prior = pose_columns(before.T[edge.child.name], "prior_")
+    return replace(record, **prior, prior_covariance=before.covariance)
 
 
 def refused_record(
@@ -110,29 +131,15 @@ def refused_record(
     counts: Mapping[str, int],
 ) -> CalibrationRecord:
     """The record of one pair that the day cannot calibrate; `counts` of frames not used, by reason."""
-    return CalibrationRecord(
-        **_identity(about, pair, len(observations), prior),
-        status="refused",
-        reason=why.reason,
-        environment=environment_of(observations),
-        frames_rejected=dict(counts),
-        faults=[why.fault] if why.fault else [],
-    )
+    refused = refused_edge(about, edge_of_pair(about, pair), why.reason, len(observations), why.fault)
+    environment, rejected = environment_of(observations), dict(counts)
+    return replace(refused, **_prior_fields(pair, prior), environment=environment, frames_rejected=rejected)
 
 
-def refused_records(
-    about: Inputs, reason: str, frames: int, prior: Prior | None, *faults: str
-) -> list[CalibrationRecord]:
-    """Records of a day that could not be calibrated at all."""
-    return [
-        CalibrationRecord(
-            **_identity(about, pair, frames, prior),
-            status="refused",
-            reason=reason,
-            faults=[fault for fault in faults if fault],
-        )
-        for pair in about.pairs
-    ]
+def refused_edge(about: Inputs, edge: Edge, why: str, frames_total: int, *faults: str) -> CalibrationRecord:
+    """The record of an edge that the day cannot calibrate."""
+    identity = _identity(about, edge, frames_total)
+    return CalibrationRecord(**identity, status="refused", reason=why, faults=[f for f in faults if f])
 
 
 def environment_of(observations: Sequence[Observation]) -> str:
@@ -149,27 +156,34 @@ def environment_of(observations: Sequence[Observation]) -> str:
     return "highway" if fast > 0.7 else "urban" if fast < 0.3 else "mixed"
 
 
-def _identity(about: Inputs, pair: str, frames: int, prior: Prior | None) -> dict[str, Any]:
-    parent, child = (about.chosen.get(kind, kind) for kind in FRAMES_OF_PAIR[pair])
-    fields: dict[str, Any] = {
+def edge_of_pair(about: Inputs, pair: str) -> Edge:
+    """The edge of a pair of camera, lidar and radar, by the names of the sensors that play them."""
+    return edge_named(pair, *(about.chosen.get(kind, kind) for kind in FRAMES_OF_PAIR[pair]))
+
+
+def _identity(about: Inputs, edge: Edge, frames_total: int) -> dict[str, Any]:
+    return {
         "vehicle": about.partition.vehicle,
         "day": about.partition.day,
         "method": about.method,
-        "pair": pair,
-        "parent_frame": parent,
-        "child_frame": child,
+        "pair": edge.kind,
+        "parent_frame": edge.parent.name,
+        "child_frame": edge.child.name,
         "work_key": about.work_key,
         "code_version": CODE_VERSION,
         "seed": about.seed,
         "inputs": list(about.inputs),
-        "frames_total": frames,
+        "frames_total": frames_total,
     }
-    if prior is not None and prior.knows(pair):
-        fields |= pose_columns(prior.of(pair), "prior_") | {"prior_covariance": prior.covariance(pair)}
-    return fields
 
 
-def unobservable(observable: np.ndarray) -> list[str]:
+def _prior_fields(pair: str, prior: Prior | None) -> dict[str, Any]:
+    if prior is None or not prior.knows(pair):
+        return {}
+    return pose_columns(prior.of(pair), "prior_") | {"prior_covariance": prior.covariance(pair)}
+
+
+def _unobservable(observable: np.ndarray) -> list[str]:
     """A note of the degrees of freedom that the day did not determine; none if there are none."""
     names = [name for name, seen in zip(DOF_NAMES, observable, strict=True) if not seen]
     return [f"not determined by the day: {', '.join(names)}"] if names else []
@@ -206,7 +220,7 @@ def _scaled(K: np.ndarray, factor: float) -> np.ndarray:
     return out
 
 
-def parts_numbers(parts: DayParts | None) -> dict[str, float]:
+def _parts_numbers(parts: DayParts | None) -> dict[str, float]:
     """How far the last part of the day turns from its first, and in how many sigmas."""
     if parts is None:
         return {}
@@ -219,7 +233,7 @@ def _test_numbers(test: HeldOutTest | None) -> dict[str, float]:
     return {f"holdout_{name}": value for name, value in frames.items()}
 
 
-def verdict_fields(judged: Judged) -> dict[str, Any]:
+def _verdict_fields(judged: Judged) -> dict[str, Any]:
     """Fields of the verdict; sigmas and targets are missing in a refused record."""
     verdict, test = judged.verdict, judged.test
     fields = {
@@ -239,7 +253,7 @@ def verdict_fields(judged: Judged) -> dict[str, Any]:
     return fields | sigmas | {"targets_m": judged.targets} | _mounting_fields(judged)
 
 
-def verdict_numbers(judged: Judged) -> dict[str, float]:
+def _verdict_numbers(judged: Judged) -> dict[str, float]:
     """Numbers behind the verdict: held-out frames, known turns of the result, score, certified axes."""
     return _test_numbers(judged.test) | dict(judged.probes) | _claim_numbers(judged)
 
@@ -263,17 +277,6 @@ def _claim_numbers(judged: Judged) -> dict[str, float]:
             ("shift_sigma", claim.shift_sigma_rad),
             ("remaining_sigma", claim.remaining_sigma_rad),
         )
-    }
-
-
-def _estimate_fields(estimate: PairEstimate) -> dict[str, Any]:
-    """Fields that a refused record lacks: the transform and its covariance."""
-    return {
-        "covariance": estimate.covariance,
-        "common_covariance": estimate.common_covariance,
-        "observability": [float(v) for v in estimate.observability],
-        "observable": [bool(v) for v in estimate.observable],
-        **pose_columns(estimate.T),
     }
 
 

@@ -17,10 +17,10 @@ from jaxtyping import Float
 from pipeline.calibrate.adjust.adjusted import AdjustedRig
 from pipeline.calibrate.adjusted_day import adjusted_rig, clocks_of, evidence_of_day, judged_together
 from pipeline.calibrate.day import DayOfPairs, records_of, solve_day
-from pipeline.calibrate.edge_records import judged_edge, record_of_edge, refused_edge
 from pipeline.calibrate.edges.day_sources import DaySources
+from pipeline.calibrate.judging import judged_edge
 from pipeline.calibrate.methods import resolved
-from pipeline.calibrate.records import Inputs, refused_record
+from pipeline.calibrate.records import Inputs, record_of_edge, refused_edge, refused_record
 from pipeline.calibrate.verify.constancy import moved_failures
 from pipeline.core.config import FleetConfig
 from pipeline.core.errors import SolveError
@@ -201,11 +201,9 @@ def _solve_other(
     found.records.append(record_of_edge(about, judged, frames))
     found.evidence.append(judged.evidence)
     if edge.kind == "lidar_base" and not judged.evidence.checks:
-        poses = judged.alone.poses
-        sigma_rad = float(np.sqrt(poses.covariance[2, 2]))
-        found.headings.setdefault(edge.parent.name, []).append(
-            (_azimuth(poses.T[edge.child.name]), sigma_rad)
-        )
+        estimate = judged.estimate
+        heading = _azimuth(estimate.T), float(np.sqrt(estimate.covariance[2, 2]))
+        found.headings.setdefault(edge.parent.name, []).append(heading)
 
 
 def _azimuth(T_lidar_base: Float[np.ndarray, "4 4"]) -> float:

@@ -10,11 +10,10 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.calibrate.day import calibrate_observations
-from pipeline.calibrate.edge_records import refused_edge
 from pipeline.calibrate.methods import method_named
 from pipeline.calibrate.pose_rows import pose_rows, poses_of_records
 from pipeline.calibrate.prior_doubts import hold_doubted
-from pipeline.calibrate.records import Inputs, refused_records
+from pipeline.calibrate.records import Inputs, refused_edge, refused_record
 from pipeline.calibrate.rig_day import RigDay, calibrate_rig
 from pipeline.calibrate.unlabelled import noted
 from pipeline.calibrate.verify.target_accuracy import views_of
@@ -65,7 +64,7 @@ def three_rows(task: Task, about: Inputs, progress: Progress) -> list[Calibratio
         solver = method_named(about.method).solver_of(task, chosen)
         records = calibrate_observations(rows, prior, task.fleet, of_three, progress, solver)
     except SolveError as err:
-        records = refused_records(of_three, err.reason, len(rows), prior, err.fault)
+        records = [refused_record(of_three, pair, err, rows, prior, {}) for pair in of_three.pairs]
     return [*records, *poses_of_records(of_three, records)]
 
 

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pipeline.calibrate.judging import judged_edge
 
-from pipeline.calibrate.edge_records import judged_edge, record_of_edge
 from pipeline.calibrate.edges.radar_base import estimate_radar_base
-from pipeline.calibrate.records import Inputs
+from pipeline.calibrate.records import Inputs, record_of_edge
 from pipeline.rig.changes import change_between
 from pipeline.rig.checks import FailedCheck
 from pipeline.rig.evidence import EdgeEvidence, OtherScenes
@@ -58,7 +58,7 @@ def test_a_radar_within_its_prior_is_accepted_for_its_azimuth_and_used():
     found, record = judged(evidence, prior)
     assert (record.status, record.determined, record.faults) == ("accepted", ["azimuth"], [])
     assert found.evidence.checks == ()
-    assert abs(change_between(T, inverse(found.alone.poses.T["base"]))[2]) < np.radians(0.1)
+    assert abs(change_between(T, inverse(found.estimate.T))[2]) < np.radians(0.1)
     assert record.limit_rad == pytest.approx(np.radians(0.4))
     assert record.score > 0
 
