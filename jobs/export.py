@@ -208,38 +208,28 @@ def export_foxglove(
     require("viz")
     if out.suffix != ".mcap":
         raise ConfigError("command line", "out", f"{out} must end in .mcap")
-    from pipeline.export.foxglove import TOPICS, write_foxglove
-    from pipeline.export.foxglove_table import layout_of
+    from pipeline.export.foxglove import layout_of, write_foxglove
     from pipeline.export.lake import priors_of_day, read_scenes
     from pipeline.store.atomic_write import atomic_write
     from pipeline.store.partitions import Lake, Partition
 
-    lake = Lake.existing(location)
+    lake, reference = Lake.existing(location), calibration.reference
     found = priors_of_day(lake, calibration.vehicle, day, calibration.method)
     known = {name: pair for name, pair in found.items() if not isinstance(pair, str)}
+    before = replace(calibration, pairs=known, known=tuple(pair.edge for pair in known.values()))
     partition, layout = Partition(calibration.vehicle, day), out.with_suffix(".layout.json")
     shown = _shown(calibration, sensors)
+    beside = {"lidar": reference.name} if reference.kind == "lidar" else {}
+    scenes = {
+        s: read_scenes(
+            lake, partition, most_frames, {s.kind: s.name} | (beside if s.kind == "camera" else {})
+        )
+        for s in shown
+    }
     out.parent.mkdir(parents=True, exist_ok=True)
-    if sensors or any(s.name != s.kind for s in shown):
-        from pipeline.export.foxglove_rig import layout_of_rig, write_foxglove_rig
-
-        reference = calibration.reference
-        before = replace(calibration, pairs=known, known=tuple(pair.edge for pair in known.values()))
-        beside = {"lidar": reference.name} if reference.kind == "lidar" else {}
-        of_rig = {
-            s: read_scenes(
-                lake, partition, most_frames, {s.kind: s.name} | (beside if s.kind == "camera" else {})
-            )
-            for s in shown
-        }
-        with progress_reporter("export foxglove"), atomic_write(out) as stream:
-            write_foxglove_rig(stream, calibration, before, of_rig)
-        text = layout_of_rig(shown, reference.name, calibration.names.of(reference.name))
-    else:
-        priors = {name: pair.T for name, pair in known.items()}
-        with progress_reporter("export foxglove"), atomic_write(out) as stream:
-            write_foxglove(stream, calibration, priors, read_scenes(lake, partition, most_frames))
-        text = layout_of(TOPICS, calibration.names)
+    with progress_reporter("export foxglove"), atomic_write(out) as stream:
+        write_foxglove(stream, calibration, before, scenes)
+    text = layout_of(shown, reference.name, calibration.names.of(reference.name))
     with atomic_write(layout) as stream:
         stream.write(text)
     return [out, layout]

@@ -1,4 +1,4 @@
-"""Changes and sigmas of a calibration as one JSON message for a table panel; and a layout of all topics."""
+"""Changes and sigmas of a calibration as one JSON message for a table panel."""
 
 from __future__ import annotations
 
@@ -6,15 +6,14 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from foxglove import layouts
 from jaxtyping import Float
 
-from pipeline.export.calibration import ExportedCalibration, ExportedPair, FrameNames, sigmas_of
+from pipeline.export.calibration import ExportedCalibration, ExportedPair, sigmas_of
 from pipeline.export.provenance import used_lines, warnings_of
 from pipeline.rig.changes import change_between
 from schemas.calibrations import DOF_NAMES
 
-__all__ = ["TABLE_SCHEMA", "layout_of", "table_of"]
+__all__ = ["TABLE_SCHEMA", "table_of"]
 
 _IN_UNITS = np.array([np.degrees(1.0)] * 3 + [100.0] * 3)  # rad to deg, m to cm
 _ROW = {
@@ -67,43 +66,3 @@ def _rows(pair: ExportedPair, prior: Float[np.ndarray, "4 4"] | None) -> list[di
         for axis, c, s, unit, seen in zip(DOF_NAMES, change, sigma, units, pair.observable, strict=True)
     ]  # fmt: skip
     return [{name: value for name, value in row.items() if value is not None} for row in rows]
-
-
-def layout_of(topics: Mapping[str, str], names: FrameNames) -> bytes:
-    """Foxglove layout: image with lidar and overlay, scene from the lidar, table of sigmas."""
-
-    def cloud(name: str, field: str, *, visible: bool) -> tuple[str, Any]:
-        settings = layouts.BaseRendererPointCloudTopicSettings(
-            visible=visible, color_mode="colormap", color_field=field, color_map="turbo", point_size=2.0
-        )
-        return topics[name], settings
-
-    shown = ("boxes", "overlay")
-    annotations = {
-        topics[name]: layouts.ImageAnnotationSettings(visible=name in shown)
-        for name in (*shown, "overlay_prior")
-    }
-    image = layouts.ImagePanel(
-        title="Camera: lidar as calibrated (switch topics to see the prior)",
-        config=layouts.ImageConfig(
-            image_mode=layouts.ImageModeConfig(
-                image_topic=topics["image"], calibration_topic=topics["camera"], annotations=annotations
-            ),
-            topics=dict([cloud("lidar", "x", visible=True), cloud("lidar_prior", "x", visible=False)]),
-        ),
-    )
-    clouds = [
-        cloud("lidar", "z", visible=True),
-        cloud("lidar_prior", "z", visible=False),
-        cloud("radar", "range_rate_mps", visible=True),
-        cloud("radar_prior", "range_rate_mps", visible=False),
-    ]
-    scene = layouts.ThreeDeePanel(
-        title="From above", config=layouts.ThreeDeeConfig(follow_tf=names.lidar, topics=dict(clouds))
-    )
-    table = layouts.TablePanel(config=layouts.TableConfig(topic_path=f"{topics['table']}.rows"))
-    right = layouts.SplitContainer(
-        direction="column", items=[layouts.SplitItem(content=scene), layouts.SplitItem(content=table)]
-    )
-    both = [layouts.SplitItem(proportion=3, content=image), layouts.SplitItem(proportion=2, content=right)]
-    return layouts.Layout(content=layouts.SplitContainer(direction="row", items=both)).to_json().encode()

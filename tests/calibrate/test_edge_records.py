@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pipeline.calibrate.judging import judged_edge
 
 from pipeline.calibrate.edges.radar_base import estimate_radar_base
+from pipeline.calibrate.judging import judged_edge
 from pipeline.calibrate.records import Inputs, record_of_edge
 from pipeline.rig.changes import change_between
 from pipeline.rig.checks import FailedCheck

@@ -5,7 +5,6 @@ import sys
 import numpy as np
 import pytest
 
-from pipeline.export.foxglove import TOPICS
 from pipeline.rig.cameras import Camera
 from pipeline.rig.se3 import exp_se3, from_quaternion, inverse, to_quaternion, transform_points
 from pipeline.store.commits import commit_records
@@ -22,6 +21,12 @@ from tests.makers.written_logs import fleet_config, jpeg
 
 pytest.importorskip("foxglove")
 DAY, COUNT = Partition("car", "2026-03-02"), 4
+TOPICS = {
+    "image": "/camera/image", "camera": "/camera/calibration", "boxes": "/camera/boxes",
+    "overlay": "/camera/overlay", "overlay_prior": "/camera/overlay_prior", "lidar": "/lidar/points",
+    "lidar_prior": "/lidar/points_prior", "clusters": "/lidar/boxes", "radar": "/radar/points",
+    "radar_prior": "/radar/points_prior", "tf": "/tf", "table": "/boresight/calibration",
+}  # fmt: skip
 START_NS = 1_772_400_000_000_000_000
 CAMERA = Camera("equidistant", np.array([[40.0, 0, 48], [0, 40, 32], [0, 0, 1]]), np.zeros(0), 96, 64)
 TURN = exp_se3(np.array([0.01, -0.02, 0.03, 0.04, 0.05, -0.06]))  # from the prior to the calibration

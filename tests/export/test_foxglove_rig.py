@@ -79,8 +79,8 @@ def test_every_sensor_has_channels_of_its_own(lake, tmp_path, capsys):
     assert told.code == 3  # the corner's edge is held
     of_camera = ("image", "calibration", "boxes", "overlay", "overlay_prior")
     wanted = {f"/{c}/{topic}" for c in ("front", "left") for topic in of_camera}
-    wanted |= {"/top/points", "/top/boxes", "/tf", "/boresight/calibration"}
-    wanted |= {f"/{r}/{topic}" for r in ("bumper", "corner") for topic in ("points", "points_prior")}
+    wanted |= {"/top/boxes", "/tf", "/boresight/calibration"}
+    wanted |= {f"/{r}/{topic}" for r in ("top", "bumper", "corner") for topic in ("points", "points_prior")}
     assert found.keys() == wanted
     assert {len(own) for topic, own in found.items() if topic != "/boresight/calibration"} == {COUNT}
     for k in range(COUNT):
@@ -97,8 +97,11 @@ def test_every_sensor_has_channels_of_its_own(lake, tmp_path, capsys):
 def test_frames_hang_where_the_day_and_the_prior_have_them(lake, tmp_path, capsys):
     _, found = exported(capsys, lake, tmp_path / "drive.mcap")
     tree = poses(found["/tf"][0])
-    assert tree.keys() == {"front", "left", "bumper", "bumper_prior", "corner_prior"}  # the corner is held
-    assert {parent for parent, _ in tree.values()} == {"top"}
+    # The corner is held.
+    assert tree.keys() == {"front", "left", "bumper", "top_prior", "bumper_prior", "corner_prior"}
+    assert {parent for child, (parent, _) in tree.items() if child != "top_prior"} == {"top"}
+    assert tree["top_prior"][0] == "front"
+    np.testing.assert_allclose(tree["top_prior"][1], inverse(T_TOP["front"]), atol=1e-9)
     for name in ("bumper", "corner"):
         np.testing.assert_allclose(tree[f"{name}_prior"][1], T_TOP[name], atol=1e-9)
     assert 1e-6 < np.abs(tree["bumper"][1] - T_TOP["bumper"]).max() < 0.3
