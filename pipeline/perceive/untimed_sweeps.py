@@ -5,20 +5,21 @@ A turn takes a tenth of a second, in which a car drives one to three metres. fle
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Protocol, runtime_checkable
+from typing import Final, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt16
+from jaxtyping import Bool, Float, Float32, UInt16
 
 from pipeline.core.rigs import LidarTurn
-from pipeline.perceive.sweep_pairs import Arc, motions, surfaces_of
+from pipeline.objective.sweep_registration import Surfaces, arc_between, one_per_cell, register
 from pipeline.rig.scan_rows import rows_of
+from pipeline.rig.se3 import exp_se3, log_se3
 from pipeline.rig.spherical import to_spherical
 from schemas.captures import Sweep
 
-__all__ = ["BY_AZIMUTH", "WITHOUT_TIMES", "Turning", "turning_of"]
+__all__ = ["BY_AZIMUTH", "WITHOUT_TIMES", "Arc", "Turning", "motions", "surfaces_of", "turning_of"]
 
 # Among the manifest's kept: sweeps that have their times from the azimuth; and those of a spinning lidar that drives,
 # for which fleet.toml has no `turn`. They are left as they were logged.
@@ -28,6 +29,11 @@ _NEIGHBOUR_S = 0.9  # sweeps further apart share too little
 _FULL_TURN: Final = 330 / 360  # of its degrees with points, for a lidar that spins
 _MOVES_MPS: Final = 0.3
 _STANDS_RADPS: Final = 0.01
+_VOXEL_M, _NEAREST_M, _REACH_M = 0.25, 3.0, 50.0
+_ROAD: Final = 0.8  # vertical part of a road's normal
+_MOST_POINTS, _MOST_SURFACES = 1800, 12_000
+# Of the start of a registration: a car neither rolls, nods nor climbs between two sweeps.
+_START_SIGMAS = np.array([1e-3, 1e-3, 0.1, 1.0, 1.0, 0.01])
 _OF_STAMP: Final = {"begin": 0.0, "middle": 0.5, "end": 1.0}
 
 
@@ -45,6 +51,19 @@ class Seen(Protocol):
     def ego_speed_mps(self) -> float | None: ...
     @property
     def ego_yaw_rate_radps(self) -> float | None: ...
+
+
+class Arc(NamedTuple):
+    """Motion of the lidar in its own axes, per second."""
+
+    x: float
+    y: float
+    yaw_rad: float
+
+    @property
+    def way(self) -> float:
+        """Speed [m/s]."""
+        return float(np.hypot(self.x, self.y))
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +118,62 @@ def turning_of(sweeps: Iterable[tuple[Seen, Sweep]], turn: LidarTurn | None) -> 
             pairs += [(before.moment, seen.moment, gap_s)] if 0 < gap_s < _NEIGHBOUR_S else []
         before = seen
     return Turning(turn, motions(surfaces, pairs))
+
+
+def surfaces_of(xyz_m: np.ndarray) -> Surfaces | None:
+    """Surfaces of a sweep, its points thinned; None if it has too few."""
+    far_m = np.hypot(xyz_m[:, 0], xyz_m[:, 1])
+    near = np.isfinite(xyz_m).all(1) & (far_m > _NEAREST_M) & (far_m < _REACH_M)
+    xyz = xyz_m[near].astype(np.float64)
+    cell = np.floor(xyz / _VOXEL_M).astype(np.int64) @ [1, 1 << 12, 1 << 24]
+    xyz = xyz[np.unique(cell, return_index=True)[1]]
+    return Surfaces.of(xyz[:: max(1, len(xyz) // _MOST_SURFACES)])
+
+
+def motions(
+    surfaces: Mapping[int, Surfaces | None], pairs: Sequence[tuple[int, int, float]]
+) -> dict[int, Arc]:
+    """Motion per second at each sweep of a pair (earlier, later, seconds between): the mean of its pairs.
+
+    Sweeps that do not determine it have no motion, unless the pair before them does: then they start there.
+    """
+    held: dict[int, list[Arc]] = {}
+    before: tuple[int, Arc] | None = None
+    for i, j, gap_s in pairs:
+        first, last = surfaces[i], surfaces[j]
+        arc = start = None
+        if first is not None and last is not None:
+            own = arc_between(_standing(first), _standing(last), gap_s)
+            start = Arc(own[0], 0.0, own[1]) if own is not None else None
+            if start is None and before is not None and before[0] == i:
+                start = before[1]
+        if first is not None and last is not None and start is not None:
+            arc = _matched(first, last, start, gap_s)
+        before = None if arc is None else (j, arc)
+        if arc is not None:
+            for k in (i, j):
+                held.setdefault(k, []).append(arc)
+    return {k: Arc(*np.mean(of, axis=0)) for k, of in held.items()}
+
+
+def _matched(first: Surfaces, last: Surfaces, start: Arc, gap_s: float) -> Arc | None:
+    """The best motion near a start; None if hardly any point of the later sweep meets the earlier one."""
+    points = last.xyz_m[_is_upright(last)]
+    twist = np.array([0.0, 0.0, start.yaw_rad, start.x, start.y, 0.0]) * gap_s
+    points = points[:: max(1, len(points) // _MOST_POINTS)]
+    found = register(points, first, exp_se3(twist), _START_SIGMAS)
+    if found is None:
+        return None
+    rate = log_se3(found.T) / gap_s
+    return Arc(float(rate[3]), float(rate[4]), float(rate[2]))
+
+
+def _standing(surfaces: Surfaces) -> Float[np.ndarray, "N 2"]:
+    return one_per_cell(surfaces.xyz_m[_is_upright(surfaces), :2])
+
+
+def _is_upright(surfaces: Surfaces) -> Bool[np.ndarray, " N"]:
+    return np.abs(surfaces.normal[:, 2]) < _ROAD
 
 
 def _times_of(turn: LidarTurn, xyz_m: Float32[np.ndarray, "N 3"]) -> Float32[np.ndarray, " N"]:

@@ -10,8 +10,14 @@ from mcap.reader import make_reader
 from pipeline.core.rigs import LidarTurn
 from pipeline.core.ros_messages import RosMessages
 from pipeline.ingest.captures import deskew
-from pipeline.perceive.sweep_pairs import motions, surfaces_of
-from pipeline.perceive.untimed_sweeps import BY_AZIMUTH, WITHOUT_TIMES, Turning, turning_of
+from pipeline.perceive.untimed_sweeps import (
+    BY_AZIMUTH,
+    WITHOUT_TIMES,
+    Turning,
+    motions,
+    surfaces_of,
+    turning_of,
+)
 from pipeline.rig.topics import TOPICS
 from pipeline.simulate.sensors.lidar import sweep_lidar
 from pipeline.simulate.world.casting import World

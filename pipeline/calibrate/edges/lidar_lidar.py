@@ -15,13 +15,13 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.calibrate.edges.day_sources import DaySources
-from pipeline.calibrate.edges.point_to_plane import Surfaces, plane_equations
 from pipeline.calibrate.edges.sweeps import Sweep, deskewed_again, sweeps_of
 from pipeline.calibrate.numerics.bias_floors import SWEEP_S, TYPICAL_RANGE_M
 from pipeline.calibrate.numerics.change_point import parts_of_day
 from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.core.errors import SolveError
 from pipeline.objective.ego_motion import EgoMotion
+from pipeline.objective.sweep_registration import Surfaces, plane_equations
 from pipeline.rig.checks import FailedCheck
 from pipeline.rig.estimates import DayParts
 from pipeline.rig.evidence import EDGE, EdgeEvidence, OtherScenes

@@ -14,9 +14,9 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, Int64
 
-from pipeline.calibrate.edges.point_to_plane import Surfaces, register
 from pipeline.calibrate.edges.sweeps import Sweep
 from pipeline.objective.ego_motion import EgoMotion
+from pipeline.objective.sweep_registration import Surfaces, register
 from pipeline.rig.se3 import exp_se3, log_se3, transform_points
 
 __all__ = ["SweepTravel", "sweep_travel"]

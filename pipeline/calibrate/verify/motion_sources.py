@@ -12,16 +12,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 
-from pipeline.calibrate.verify.sweep_motion import occupied_share, sweep_motion
 from pipeline.objective.ego_motion import is_same, motion_of
+from pipeline.objective.sweep_registration import arc_between, occupied_share, one_per_cell
 from pipeline.rig.checks import FailedCheck
-from pipeline.rig.se3 import exp_so3, from_rotation_translation
+from pipeline.rig.se3 import exp_so3, from_rotation_translation, transform_points
 from schemas.observations import Observation
 
-__all__ = ["MotionFindings", "compared_sources"]
+__all__ = ["MotionFindings", "SweepMotion", "compared_sources", "sweep_motion"]
 
+_GAP_S, _LONGEST_GAP_S = 0.5, 0.8  # as long as scenes still overlap: at 0.1 s half a cell is 2.5 m/s
+_MOST_PAIRS = 30
 _FEWEST = 6  # frames, or pairs of them
 _SIGMAS = 4.0
 _MOVING_MPS, _TURNING_RADPS, _ACCELERATING_MPS2 = 3.0, 0.03, 0.3
@@ -254,7 +256,7 @@ def _met(observations: Sequence[Observation], T_lidar_radar: np.ndarray) -> floa
     for o in (observations[i] for i in picked):
         xyz = o.radar_xyz_m[o.radar_motion == 0].astype(np.float64)
         if len(xyz):
-            shares.append(occupied_share(o, (xyz @ T_lidar_radar[:3, :3].T + T_lidar_radar[:3, 3])[:, :2]))
+            shares.append(occupied_share(_standing(o), transform_points(T_lidar_radar, xyz)[:, :2]))
     return float(np.mean(shares)) if shares else 0.0
 
 
@@ -295,3 +297,52 @@ def _slope(y: np.ndarray, x: np.ndarray, least: float) -> _Slope | None:
 
 def _share(y: np.ndarray, expected: np.ndarray) -> float:
     return float(np.mean(is_same(y, expected)))
+
+
+# -- the lidar's own sweeps, without odometry, Doppler or calibration --------------
+
+
+@dataclass(frozen=True, eq=False)
+class SweepMotion:
+    """Motion between pairs of sweeps that determine it. Lidar axes: x ahead, positive yaw to the left."""
+
+    first: Int64[np.ndarray, " P"]  # place of the earlier observation
+    last: Int64[np.ndarray, " P"]
+    speed_mps: Float[np.ndarray, " P"]
+    yaw_rate_radps: Float[np.ndarray, " P"]
+
+
+def sweep_motion(observations: Sequence[Observation]) -> SweepMotion:
+    """Motion between sweeps about half a second apart, of at most 30 pairs over the day."""
+    pairs = _pairs(observations)
+    pairs = pairs[np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), _MOST_PAIRS)).astype(int))]
+    found = [
+        (i, j, *motion)
+        for i, j in pairs
+        if (motion := _between(observations[i], observations[j])) is not None
+    ]
+    first, last, speed, turn = np.array(found, np.float64).reshape(-1, 4).T
+    return SweepMotion(first.astype(np.int64), last.astype(np.int64), speed, turn)
+
+
+def _pairs(observations: Sequence[Observation]) -> Int64[np.ndarray, "P 2"]:
+    """Indices of observations of one drive whose sweeps are nearest to half a second apart."""
+    stamps_s = np.array([o.stamp_ns for o in observations], np.int64) * 1e-9
+    drives = np.array([o.drive for o in observations], np.int64)
+    out = []
+    for i in range(len(observations) - 1):
+        gap = np.where(drives[i + 1 :] == drives[i], stamps_s[i + 1 :] - stamps_s[i], np.inf)
+        j = int(np.argmin(np.abs(gap - _GAP_S)))
+        if 0 < gap[j] <= _LONGEST_GAP_S:
+            out.append((i, i + 1 + j))
+    return np.array(out, np.int64).reshape(-1, 2)
+
+
+def _between(before: Observation, after: Observation) -> tuple[float, float] | None:
+    """Speed and yaw rate from one sweep to the other; None if undetermined."""
+    return arc_between(_standing(before), _standing(after), (after.stamp_ns - before.stamp_ns) * 1e-9)
+
+
+def _standing(o: Observation) -> Float[np.ndarray, "N 2"]:
+    """Standing objects around the lidar, one point per cell."""
+    return one_per_cell(o.lidar_map_xyz_m[o.lidar_map_is_ground == 0, :2].astype(np.float64))

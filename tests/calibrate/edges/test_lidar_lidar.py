@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.edges.lidar_lidar import LidarPair, _equations, _Moment, estimate_lidar_lidar
-from pipeline.calibrate.edges.point_to_plane import Surfaces
 from pipeline.calibrate.verify.constancy import MOVED_SIGMAS, PART_FLOOR_RAD
 from pipeline.calibrate.verify.held_out_test import paired_test
 from pipeline.core.errors import SolveError
+from pipeline.objective.sweep_registration import Surfaces
 from pipeline.rig.changes import change_between, change_jacobian
 from pipeline.rig.graph import Edge, Sensor
 from pipeline.rig.se3 import exp_se3, exp_so3, inverse, perturb_exactly, transform_points

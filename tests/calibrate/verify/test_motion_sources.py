@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.calibrate.verify.motion_sources import compared_sources
-from pipeline.calibrate.verify.sweep_motion import sweep_motion
+from pipeline.calibrate.verify.motion_sources import compared_sources, sweep_motion
 from pipeline.objective.camera_lidar.points import lidar_velocities
 from pipeline.rig.se3 import exp_so3
 from schemas.calibrations import PAIRS
