@@ -7,6 +7,17 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from jobs.terminal.summary import exit_code, left_out, print_summary, progress_reporter
+from jobs.terminal.vehicle_status import count_statuses, moved_sensors, next_steps
+from pipeline.calibrate.methods import method_named
+from pipeline.core.config import load_fleet
+from pipeline.core.stage_work import Task, Window
+from pipeline.core.stages import AUDIT, REPORT, STATE
+from pipeline.report.stage import Pages
+from pipeline.store.corrections import read_corrections
+from pipeline.store.partitions import Lake
+from schemas.drift import DRIFT, DRIFT_STATUSES
+
 __all__ = ["audit"]
 
 
@@ -29,20 +40,6 @@ def audit(
         method: calibration method of the audited records; default: audit.method.
         report: fleet page to write as well, with a page per vehicle-day in a folder next to it.
     """
-    from jobs.terminal.summary import exit_code, left_out, print_summary, progress_reporter
-    from jobs.terminal.vehicle_status import (
-        count_statuses,
-        moved_sensors,
-        next_steps,
-    )
-    from pipeline.calibrate.methods import method_named
-    from pipeline.core.config import load_fleet
-    from pipeline.core.stage_work import Task, Window
-    from pipeline.core.stages import AUDIT, REPORT, STATE
-    from pipeline.store.corrections import read_corrections
-    from pipeline.store.partitions import Lake
-    from schemas.drift import DRIFT, DRIFT_STATUSES
-
     if method is not None:
         method_named(method)
     config = load_fleet(fleet)
@@ -56,8 +53,6 @@ def audit(
     mend = read_corrections(tables, to_day)
     outputs = []
     if report is not None:
-        from pipeline.report.stage import Pages
-
         with progress_reporter("report") as progress:
             task = Task(config, tables, Window(), method, given=Pages(report), progress=progress)
             outputs = REPORT.run(task).outputs

@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from pipeline.core.stage_work import Task
+from jobs.terminal.summary import exit_code, print_summary, progress_reporter
+from pipeline.calibrate.methods import method_named
+from pipeline.core.config import load_fleet
+from pipeline.core.errors import ConfigError
+from pipeline.core.stage_work import Task
+from pipeline.core.stages import CALIBRATE
+from pipeline.fleet.ledger import record_outcome
+from pipeline.report.reading import scene_of
+from pipeline.rig.day_prior import require_named_files
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.views import perceived
+from schemas.words import day_word
 
 __all__ = ["calibrate", "parse_pair", "parse_perturb"]
 
@@ -40,15 +50,6 @@ def calibrate(
         page: HTML page to write for that frame, before and after.
         polish: refine the networks' result with the optimiser, as solve.polish in fleet.toml does.
     """
-    from dataclasses import replace
-
-    from pipeline.calibrate.methods import method_named
-    from pipeline.core.config import load_fleet
-    from pipeline.core.errors import ConfigError
-    from pipeline.core.stage_work import Task
-    from pipeline.rig.day_prior import require_named_files
-    from pipeline.store.partitions import Lake, Partition
-
     if page is not None and frame is None:
         raise ConfigError(
             "command line", "page", "shows one frame: name it by --frame (for a day: boresight report)"
@@ -66,15 +67,6 @@ def calibrate(
 
 def _calibrate_day(task: Task) -> int:
     """Calibrate the day, write its records to the lake and print their statuses."""
-    from dataclasses import replace
-
-    from jobs.terminal.summary import exit_code, print_summary, progress_reporter
-    from pipeline.core.errors import ConfigError
-    from pipeline.core.stages import CALIBRATE
-    from pipeline.fleet.ledger import record_outcome
-    from pipeline.store.views import perceived
-    from schemas.words import day_word
-
     vehicle, day = task.partition.vehicle, task.partition.day
     task.fleet.rig_of(vehicle)  # raises for an unknown vehicle
     if perceived(task.lake, task.partition) is None:
@@ -103,7 +95,6 @@ def _calibrate_day(task: Task) -> int:
 
 def _calibrate_frame(task: Task, frame: int, page: Path | None) -> int:
     """Calibrate one frame, print its transforms, and write its page if a path is given."""
-    from jobs.terminal.summary import print_summary, progress_reporter
     from pipeline.calibrate.networks import calibrate_frame
 
     partition = task.partition
@@ -112,7 +103,6 @@ def _calibrate_frame(task: Task, frame: int, page: Path | None) -> int:
         found = calibrate_frame(task, frame)
         if page is not None:
             from pipeline.report.pictures import write_frame_page
-            from pipeline.report.reading import scene_of
 
             progress(0, 0, "page")
             title = f"{partition.vehicle}, {partition.day}, frame {found.frame.frame_index}"
@@ -150,8 +140,6 @@ def parse_perturb(text: str | None) -> tuple[float, float] | None:
 
 def parse_pair(text: str, option: str) -> tuple[float, float]:
     """Parse "ROT_DEG,TRANS_M" to (degrees, metres); a ConfigError names `option`."""
-    from pipeline.core.errors import ConfigError
-
     try:
         rotation_deg, translation_m = (float(part) for part in text.split(","))
     except ValueError as err:

@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import numpy as np
+
+from jobs.frame_options import FrameOptions
+from jobs.terminal.known_vehicles import require_vehicle
+from jobs.terminal.summary import left_out as tell_damage
 from pipeline.core.errors import ConfigError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    import numpy as np
-
-    from jobs.frame_options import FrameOptions
-    from pipeline.export.calibration import ExportedCalibration, ExportedPair, FrameNames
-    from pipeline.export.compare import Side
-    from pipeline.rig.graph import Edge
-    from pipeline.rig.rig import Rig
-    from pipeline.rig.transform_tree import TransformTree
+from pipeline.export.calibration import ExportedCalibration, ExportedPair, FrameNames, reference_of
+from pipeline.export.compare import Side, composed
+from pipeline.export.files import from_ties, noted_frames, read_files, reference_of_rig, rig_poses
+from pipeline.export.formats import FORMATS, format_named
+from pipeline.export.lake import choose_pairs, pairs_of, priors_of_day, read_cameras, read_frame_ids, read_tf
+from pipeline.export.tree import ESTIMATED_EDGES
+from pipeline.ingest.containers.reader import open_log
+from pipeline.ingest.messages.decoding import decode
+from pipeline.rig.day_prior import read_transforms
+from pipeline.rig.edges import words_of
+from pipeline.rig.graph import BASE, Edge, tie
+from pipeline.rig.rig import Rig
+from pipeline.rig.transform_tree import TransformTree
+from pipeline.store.partitions import Lake
+from schemas.versions import CODE_VERSION
+from schemas.words import day_word
 
 __all__ = ["mounting", "poses_in_use", "read_calibration", "read_sides"]
 
@@ -37,16 +47,6 @@ def read_calibration(
 
     With `own_frames`, frames that no option names get their names from the logs.
     """
-    from jobs.terminal.known_vehicles import require_vehicle
-    from jobs.terminal.summary import left_out as tell_damage
-    from pipeline.export.calibration import ExportedCalibration, reference_of
-    from pipeline.export.lake import choose_pairs, pairs_of, read_cameras, read_frame_ids, read_tf
-    from pipeline.rig.edges import words_of
-    from pipeline.rig.graph import BASE
-    from pipeline.store.partitions import Lake
-    from schemas.versions import CODE_VERSION
-    from schemas.words import day_word
-
     lake = Lake.existing(location)
     try:
         found = pairs_of(lake, vehicle, day, method)
@@ -83,10 +83,6 @@ def _listed(value: object) -> list[object]:
 
 def mounting(text: str, names: FrameNames, edges: tuple[Edge, ...]) -> np.ndarray:
     """Read T_base_lidar of the reference sensor from log:FILE (/tf_static) or FORMAT:FILE."""
-    from pipeline.export.calibration import reference_of
-    from pipeline.export.files import read_files
-    from pipeline.export.formats import format_named
-
     name, colon, path = text.partition(":")
     if not colon:
         raise ConfigError(
@@ -110,12 +106,6 @@ def mounting(text: str, names: FrameNames, edges: tuple[Edge, ...]) -> np.ndarra
 
 def _logged(path: Path) -> TransformTree:
     """Read the transforms on /tf_static of a log in any container."""
-    from contextlib import closing
-
-    from pipeline.ingest.containers.reader import open_log
-    from pipeline.ingest.messages.decoding import decode
-    from pipeline.rig.transform_tree import TransformTree
-
     tree = TransformTree()
     with closing(open_log(path)) as log:
         for message in log.scan(["/tf_static"]):
@@ -135,9 +125,6 @@ def read_sides(
     Raises:
         ConfigError: a side has another form, or does not exist.
     """
-    from pipeline.export.formats import FORMATS
-    from pipeline.export.tree import ESTIMATED_EDGES
-
     forms = [text.partition(":")[0] if ":" in text else "" for text in texts]
     forms = [form if form in FORMATS else "" for form in forms]
     of_file = [bool(form) or text.endswith(".json") for form, text in zip(forms, texts, strict=True)]
@@ -164,12 +151,6 @@ def poses_in_use(
     Raises:
         ConfigError: the text has another form, or the source does not exist.
     """
-    from pipeline.export.files import from_ties, noted_frames, read_files, reference_of_rig, rig_poses
-    from pipeline.export.formats import FORMATS, format_named
-    from pipeline.export.lake import pairs_of
-    from pipeline.rig.graph import tie
-    from pipeline.store.partitions import Lake
-
     form, _, listed = text.partition(":")
     base = {} if rig.base is None else {"base": rig.base}
     if form in FORMATS:
@@ -190,12 +171,6 @@ def poses_in_use(
 
 
 def _side_of_files(text: str, form: str, files: str, names: FrameNames, edges: tuple[Edge, ...]) -> Side:
-    from pipeline.export.calibration import ExportedPair
-    from pipeline.export.compare import Side, composed
-    from pipeline.export.files import read_files
-    from pipeline.export.formats import format_named
-    from pipeline.rig.day_prior import read_transforms
-    from pipeline.rig.edges import words_of
 
     if form:
         found = format_named(form).pairs(read_files([Path(f) for f in files.split(",")]), names, edges)
@@ -207,10 +182,6 @@ def _side_of_files(text: str, form: str, files: str, names: FrameNames, edges: t
 
 
 def _side_of_lake(text: str, location: str | None, vehicle: str | None, method: str) -> Side:
-    from pipeline.export.compare import Side
-    from pipeline.export.lake import choose_pairs, pairs_of, priors_of_day
-    from pipeline.rig.edges import words_of
-    from pipeline.store.partitions import Lake
 
     owner, at, rest = text.rpartition("@")
     owner = owner if at else (vehicle or "")

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from rich.console import Console
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
 
-    from pipeline.ingest.check import CheckReport
-    from pipeline.ingest.rig_sample import PairFinding, RigFinding
+from jobs.terminal.summary import print_json, print_summary, progress_reporter
+from pipeline.core.config import load_fleet
+from pipeline.core.errors import ConfigError
+from pipeline.ingest.check import CheckReport, check_logs
+from pipeline.ingest.propose.survey import nightly_command
+from pipeline.ingest.rig_sample import PairFinding, RigFinding, dof_counts
+from pipeline.perceive.models.source import check_models
+from pipeline.rig.day_prior import require_named_files
 
 __all__ = ["check", "print_rig"]
 
@@ -26,15 +33,6 @@ def check(fleet: Path, /, *logs: Path, rig: str | None = None, json: bool = Fals
         rig: rig of fleet.toml; default: the only one, or "default".
         json: print the whole report as one JSON object on stdout.
     """
-    from dataclasses import asdict
-
-    from jobs.terminal.summary import print_json, print_summary, progress_reporter
-    from pipeline.core.config import load_fleet
-    from pipeline.core.errors import ConfigError
-    from pipeline.ingest.check import check_logs
-    from pipeline.perceive.models.source import check_models
-    from pipeline.rig.day_prior import require_named_files
-
     config = load_fleet(fleet)
     require_named_files(config)
     name = rig or (next(iter(config.rigs)) if len(config.rigs) == 1 else "default")
@@ -67,13 +65,11 @@ def check(fleet: Path, /, *logs: Path, rig: str | None = None, json: bool = Fals
 
 def _following(report: CheckReport, fleet: Path, logs: tuple[Path, ...]) -> list[str]:
     """Next steps: what to correct, and then this check again; else labels for cameras, and the night."""
-    from pipeline.ingest.propose.survey import nightly_command
-
     if report.corrections:
         again = f"boresight check {fleet} {' '.join(map(str, logs[:2]))}{' ...' if len(logs) > 2 else ''}"
         return [*report.corrections, again]
-    unlabelled = any("boresight models fetch" in why for v in report.verdicts for why in v.reasons)
-    fetch = ["boresight models fetch"] if unlabelled else []
+    unlabelled = any("boresight models --fetch" in why for v in report.verdicts for why in v.reasons)
+    fetch = ["boresight models --fetch"] if unlabelled else []
     return fetch if report.answer == "no" else [*fetch, *nightly_command(fleet, logs)]
 
 
@@ -83,8 +79,6 @@ def _worst(report: CheckReport, pair: str) -> str:
 
 
 def _print_report(report: CheckReport, rig: str) -> None:
-    from rich.console import Console
-    from rich.table import Table
 
     console = Console(stderr=True)
     topics = Table(title=f"Topics of rig {rig}", title_justify="left")
@@ -146,9 +140,6 @@ _COLOUR_OF_PAIR = {"yes": "green", "weak": "yellow", "no": "red"}
 
 def print_rig(console: Console, rig: RigFinding) -> None:
     """Print the matrix: a row for each sensor, a column for each sensor with which it could have an edge."""
-    from rich.markup import escape
-    from rich.table import Table
-
     pairs = {(p.parent, p.child): p for p in rig.pairs}
     columns = [s for s in rig.sensors if any(child == s for _, child in pairs)]
     rows = [s for s in rig.sensors if any(parent == s for parent, _ in pairs)]
@@ -177,7 +168,6 @@ def print_rig(console: Console, rig: RigFinding) -> None:
 
 
 def _cell(pair: PairFinding | None) -> str:
-    from pipeline.ingest.rig_sample import dof_counts
 
     if pair is None:
         return ""

@@ -5,12 +5,23 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from jobs.calibration_sources import read_sides
 from jobs.frame_options import FrameOptions
-
-if TYPE_CHECKING:
-    from pipeline.rig.differences import PairDifference
+from jobs.terminal.summary import print_json, print_summary
+from pipeline.core.errors import ConfigError
+from pipeline.export.compare import compare as compare_sides
+from pipeline.report.comparison import comparison_page
+from pipeline.report.page import write_page
+from pipeline.report.words import dof_title, scaled, unit_of
+from pipeline.rig.differences import PairDifference
+from schemas.calibrations import DOF_NAMES
 
 __all__ = ["compare"]
 
@@ -45,11 +56,6 @@ def compare(
         json: print only one JSON object: changes and sigmas in rad and m.
         frames: frame names in files.
     """
-    from jobs.calibration_sources import read_sides
-    from jobs.terminal.summary import print_json, print_summary
-    from pipeline.core.errors import ConfigError
-    from pipeline.export.compare import compare as compare_sides
-
     names = frames or FrameOptions()
     sides = read_sides([a, b], lake, vehicle, method, names)
     found, notes = compare_sides(*sides)
@@ -75,7 +81,6 @@ def compare(
 
 
 def _plain(difference: PairDifference) -> dict[str, Any]:
-    from schemas.calibrations import DOF_NAMES
 
     sigma, z = difference.sigma, difference.z
     axes = [
@@ -102,22 +107,12 @@ def _plain(difference: PairDifference) -> dict[str, Any]:
 
 
 def _write_page(page: Path, titles: list[str], found: list[PairDifference], notes: list[str]) -> None:
-    from pipeline.report.comparison import comparison_page
-    from pipeline.report.page import write_page
 
     write_page(page, comparison_page(titles[0], titles[1], found, notes))
 
 
 def print_comparison(titles: Sequence[str], found: Sequence[PairDifference], notes: Sequence[str]) -> None:
     """Print the change from the first to the second; changes that sigmas do not explain are bold."""
-    import numpy as np
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    from pipeline.report.words import dof_title, scaled, unit_of
-    from schemas.calibrations import DOF_NAMES
-
     view = Table(title=f"from {titles[0]} to {titles[1]}", title_justify="left")
     for name in ("pair", "axis", "change", "sigma", "z", ""):
         view.add_column(name, justify="right" if name in ("change", "sigma", "z") else "left", no_wrap=True)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.convert.recording import Recording
-    from pipeline.rig.graph import Kind
+from jobs.terminal.summary import print_summary, progress_reporter
+from pipeline.convert.kitti_shaped import read_kitti, read_view_of_delft
+from pipeline.convert.log_file import fleet_text, write_log
+from pipeline.convert.nuscenes import read_nuscenes
+from pipeline.convert.recording import Recording
+from pipeline.core.errors import ConfigError
+from pipeline.rig.graph import Kind
+from pipeline.store.partitions import Partition
 
 __all__ = ["convert"]
 
@@ -51,10 +55,6 @@ def convert(
             fleet.toml yourself.
         detector: model manifest for fleet.toml.
     """
-    from jobs.terminal.summary import print_summary, progress_reporter
-    from pipeline.convert.log_file import write_log
-    from pipeline.store.partitions import Partition
-
     models = _models_of(segmenter, detector)
     owner = vehicle or str(data_set)
     Partition(owner, day)  # raises for invalid names
@@ -74,8 +74,6 @@ def convert(
 
 def _models_of(segmenter: str | None, detector: str | None) -> tuple[str, str] | None:
     """Manifests of both models, or None; ConfigError for one of them."""
-    from pipeline.core.errors import ConfigError
-
     if segmenter is None and detector is None:
         return None
     if segmenter is None or detector is None:
@@ -92,9 +90,6 @@ def _recordings_of(
     radar_columns: str,
 ) -> list[Recording]:
     """Recordings of a data set's folder; `named` has channels of nuScenes, separated by commas."""
-    from pipeline.convert.kitti_shaped import read_kitti, read_view_of_delft
-    from pipeline.convert.nuscenes import read_nuscenes
-
     if data_set == "nuscenes":
         return read_nuscenes(folder, {k: c.split(",") for k, c in named.items() if c is not None})
     if data_set == "vod":
@@ -106,8 +101,6 @@ def _write_fleet(
     out: Path, data_set: DataSet, recordings: Sequence[Recording], models: tuple[str, str] | None
 ) -> Path:
     """Write fleet.toml for recordings."""
-    from pipeline.convert.log_file import fleet_text
-
     has_ego = all(any(e.sensor == "ego" for e in r.events) for r in recordings)
     vehicles = sorted({r.vehicle for r in recordings})
     kinds = {name: kind for r in recordings for name, kind in r.kinds.items()}
@@ -119,7 +112,6 @@ def _write_fleet(
 
 
 def _path_of(out: Path, recording: Recording) -> Path:
-    from pipeline.store.partitions import Partition
 
     Partition(recording.vehicle, recording.day)
     return out / "logs" / recording.vehicle / recording.day / f"{recording.name}.mcap"

@@ -3,20 +3,35 @@
 from __future__ import annotations
 
 import json
+import shutil
 import time
+from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rich.console import Console
+
 from jobs.extras import needs
+from jobs.nightly import Drawing, close_night, watch_night
+from jobs.terminal.demo_table import print_comparison, print_methods
+from jobs.terminal.night_view import night_view
+from jobs.terminal.summary import exit_code, is_terminal, print_summary
+from jobs.terminal.vehicle_status import count_statuses, moved_sensors
+from pipeline.core.config import config_hash, load_fleet
+from pipeline.core.errors import LogError
+from pipeline.core.results import Progress
+from pipeline.fleet.executor import EXECUTORS
+from pipeline.fleet.nightly import DayOutcome, Night
+from pipeline.fleet.pattern import find_vehicle_days
+from pipeline.report.truth import read_truth
+from pipeline.store.partitions import Lake
+from schemas.drift import DriftFinding
+from schemas.versions import CODE_VERSION
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.core.results import Progress
-    from pipeline.fleet.nightly import DayOutcome, Night
     from pipeline.simulate.fleet import FleetSpec
-    from schemas.drift import DriftFinding
 
 __all__ = ["demo"]
 
@@ -51,13 +66,6 @@ def demo(
         workers: processes at a time; default: one per CPU that this process may use.
         seed: random seed of the fleet.
     """
-    from jobs.nightly import Drawing, close_night
-    from jobs.terminal.demo_table import print_comparison, print_methods
-    from pipeline.core.config import load_fleet
-    from pipeline.fleet.nightly import Night
-    from pipeline.report.truth import read_truth
-    from pipeline.store.partitions import Lake
-
     began = time.monotonic()
     spec, dates = _plan(vehicles, days, frames, seed)
     bump = "; before day 3 someone bumps a radar" if spec.faults else ""
@@ -106,9 +114,6 @@ def _plan(vehicles: int, days: int, frames: int, seed: int) -> tuple[FleetSpec, 
 
 def _calibrate(night: Night, logs: Path, dates: Sequence[str], workers: int | None) -> list[DayOutcome]:
     """Calibrate every vehicle-day by the night's method, and the last day by the network too."""
-    from jobs.nightly import watch_night
-    from pipeline.fleet.pattern import find_vehicle_days
-
     work = find_vehicle_days(str(logs / "{vehicle}" / "{day}" / "*"), dates[0], dates[-1])
     # The network needs one camera, one lidar and one radar, and works on single frames without semantics.
     others = dict(_OWN_RIGS)
@@ -122,9 +127,6 @@ def _calibrate(night: Night, logs: Path, dates: Sequence[str], workers: int | No
 
 def _summarise(statuses: Sequence[str], findings: Sequence[DriftFinding], **told: Any) -> int:
     """Print the path of the report and the summary; returns the exit code."""
-    from jobs.terminal.summary import exit_code, print_summary
-    from jobs.terminal.vehicle_status import count_statuses, moved_sensors
-
     code = exit_code(statuses)
     page = told["report"] or "no report"
     _say(f"\n[bold]{page}[/]  open it in a browser ({told['seconds']:.0f} s in all)")
@@ -135,15 +137,7 @@ def _summarise(statuses: Sequence[str], findings: Sequence[DriftFinding], **told
 
 def _simulate(spec: FleetSpec, out: Path, workers: int | None) -> None:
     """Write the fleet's logs, unless the folder contains the same fleet already."""
-    import shutil
-    from contextlib import closing
-
-    from jobs.terminal.night_view import night_view
-    from pipeline.core.config import config_hash
-    from pipeline.core.errors import LogError
-    from pipeline.fleet.executor import EXECUTORS
     from pipeline.simulate.fleet import day_names, mixed_fleet_toml, rigs_of, vehicle_names
-    from schemas.versions import CODE_VERSION
 
     stamp, key = out / ".simulated", config_hash({"spec": repr(spec), "code": CODE_VERSION})
     if stamp.is_file() and stamp.read_text() == key:
@@ -175,9 +169,5 @@ def _simulate_one(work: tuple[FleetSpec, int, int, Path], progress: Progress) ->
 
 def _say(text: str) -> None:
     """Print a line on a terminal; without a terminal, the log has the same information."""
-    from jobs.terminal.summary import is_terminal
-
     if is_terminal():
-        from rich.console import Console
-
         Console(stderr=True, highlight=False).print(text)

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import math
+import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.rig.differences import ComparedRun
-    from pipeline.store.partitions import Lake
+from jobs.calibrate import parse_pair
+from jobs.terminal.summary import print_summary, progress_reporter
+from pipeline.core.errors import ConfigError
+from pipeline.evaluate.comparison import compare_runs
+from pipeline.evaluate.recording import ReflectorFiles
+from pipeline.evaluate.table import as_markdown, as_parquet, table_rows
+from pipeline.report.evaluation import page_of_runs
+from pipeline.report.page import write_page
+from pipeline.rig.differences import ComparedRun
+from pipeline.store.partitions import Lake
+from pipeline.store.records import read_records
+from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 
 __all__ = ["evaluate"]
 
@@ -49,18 +58,6 @@ def evaluate(
         out: FILE.md, FILE.parquet, FILE.html (a page with the paper's figures for these days), or a folder
             for all of them as table_1.*; the tables are printed on stderr in any case.
     """
-    import math
-    import sys
-
-    from jobs.calibrate import parse_pair
-    from jobs.terminal.summary import print_summary, progress_reporter
-    from pipeline.evaluate.comparison import compare_runs
-    from pipeline.evaluate.recording import ReflectorFiles
-    from pipeline.evaluate.table import as_markdown, table_rows
-    from pipeline.store.partitions import Lake
-    from pipeline.store.records import read_records
-    from schemas.calibrations import CALIBRATIONS, CalibrationRecord
-
     _check(truth, reflectors, recording_lake or recording_day, out)
     tables = Lake.existing(lake)
     records = [r for r in read_records(tables, CALIBRATIONS, CalibrationRecord) if method in (None, r.method)]
@@ -85,8 +82,6 @@ def evaluate(
 
 def _check(truth: Path | None, reflectors: Path | None, recording: str | None, out: Path | None) -> None:
     """Raise ConfigError for options that contradict each other, before any work."""
-    from pipeline.core.errors import ConfigError
-
     if (truth is None) == (reflectors is None):
         raise ConfigError("command line", "truth", "give either --truth or --reflectors")
     if truth is not None and recording:
@@ -97,9 +92,6 @@ def _check(truth: Path | None, reflectors: Path | None, recording: str | None, o
 
 
 def _write(out: Path, compared: Sequence[ComparedRun], notes: Sequence[str], lake: Lake) -> None:
-    from pipeline.evaluate.table import as_markdown, as_parquet, table_rows
-    from pipeline.report.evaluation import page_of_runs
-    from pipeline.report.page import write_page
 
     comparisons = [c.comparison for c in compared]
     rows = table_rows(comparisons)

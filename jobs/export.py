@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
+from jobs.calibration_sources import read_calibration
+from jobs.extras import require
 from jobs.frame_options import FrameOptions
+from jobs.terminal.logging import logger
+from jobs.terminal.summary import print_summary, progress_reporter
 from pipeline.core.errors import ConfigError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.export.calibration import ExportedCalibration
-    from pipeline.rig.graph import Sensor
+from pipeline.export.calibration import USABLE, ExportedCalibration, written_pairs
+from pipeline.export.files import updated_file, write_files, written_files
+from pipeline.export.formats import format_named
+from pipeline.export.lake import priors_of_day, read_scenes
+from pipeline.export.provenance import not_certified, used_lines, warnings_of
+from pipeline.rig.graph import Sensor
+from pipeline.store.atomic_write import atomic_write
+from pipeline.store.partitions import Lake, Partition
+from schemas.versions import write_json_schemas
 
 __all__ = ["export"]
 
@@ -76,13 +84,7 @@ def export(
         run: folder written by `boresight train`; required for "onnx".
         notes: JSON object for the card: measurements, description of the data.
     """
-    from jobs.calibration_sources import read_calibration
-    from jobs.terminal.summary import print_summary
-    from pipeline.core.errors import ConfigError
-
     if what == "schemas":
-        from schemas.versions import write_json_schemas
-
         print_summary("export", "done", what=what, outputs=write_json_schemas(out))
         return 0
     if what == "onnx":
@@ -106,8 +108,6 @@ def export(
 
 
 def _export_calibration(what: str, out: Path, calibration: ExportedCalibration, update: Path | None) -> int:
-    from pipeline.export.files import updated_file, write_files, written_files
-    from pipeline.export.formats import format_named
 
     files = {}
     if _written(calibration):
@@ -127,7 +127,6 @@ def _export_drive(
     most_frames: int,
     sensors: tuple[str, ...],
 ) -> int:
-    from pipeline.core.errors import ConfigError
 
     if lake is None or day is None:
         raise ConfigError("command line", "day", "foxglove shows a day's drive: give --day")
@@ -137,18 +136,12 @@ def _export_drive(
 
 
 def _written(calibration: ExportedCalibration) -> list[str]:
-    from pipeline.export.calibration import written_pairs
 
     return written_pairs(calibration)
 
 
 def _tell(what: str, calibration: ExportedCalibration, outputs: list[Path]) -> int:
     """Log what of each pair is used and each warning, print the summary and return the exit code."""
-    from jobs.terminal.logging import logger
-    from jobs.terminal.summary import print_summary
-    from pipeline.export.calibration import USABLE
-    from pipeline.export.provenance import not_certified, used_lines, warnings_of
-
     doubts, written = not_certified(calibration), _written(calibration)
     for words in used_lines(calibration):
         logger().info(words, vehicle=calibration.vehicle, source=calibration.source)
@@ -164,17 +157,13 @@ def _tell(what: str, calibration: ExportedCalibration, outputs: list[Path]) -> i
 
 
 def _export_onnx(out: Path, run: Path | None, notes: Path | None) -> list[Path]:
-    from pipeline.core.errors import ConfigError
 
     if run is None or not run.is_dir():
         raise ConfigError("command line", "run", "onnx needs --run FOLDER, written by `boresight train`")
     if out.suffix != ".onnx":
         raise ConfigError("command line", "out", f"{out} must end in .onnx")
-    from jobs.extras import require
 
     require("train")
-    from jobs.terminal.logging import logger
-    from jobs.terminal.summary import progress_reporter
     from pipeline.learn.export.model_card import UNFIT, card_of_run
     from pipeline.learn.export.onnx_file import export_onnx
     from pipeline.learn.train.run_state import network_of_run
@@ -202,16 +191,10 @@ def export_foxglove(
         MissingExtraError: foxglove-sdk is not installed.
         ConfigError: `out` does not end in .mcap, a sensor does not exist, or the day has no frames.
     """
-    from jobs.extras import require
-    from jobs.terminal.summary import progress_reporter
-
     require("viz")
     if out.suffix != ".mcap":
         raise ConfigError("command line", "out", f"{out} must end in .mcap")
     from pipeline.export.foxglove import layout_of, write_foxglove
-    from pipeline.export.lake import priors_of_day, read_scenes
-    from pipeline.store.atomic_write import atomic_write
-    from pipeline.store.partitions import Lake, Partition
 
     lake, reference = Lake.existing(location), calibration.reference
     found = priors_of_day(lake, calibration.vehicle, day, calibration.method)

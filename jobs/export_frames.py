@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.core.config import FleetConfig
-    from pipeline.learn.frames.day import DayTask
-    from pipeline.learn.frames.frame import Mounting
-    from pipeline.store.partitions import Lake, Partition
+from jobs.frame_calibrations import mounting_of
+from jobs.prepare import days_with_observations
+from jobs.terminal.summary import print_summary, progress_reporter
+from pipeline.core.config import FleetConfig, load_fleet
+from pipeline.core.errors import ConfigError, SolveError
+from pipeline.fleet.executor import EXECUTORS
+from pipeline.learn.frames.card import write_card
+from pipeline.learn.frames.day import DayTask, export_day
+from pipeline.learn.frames.frame import Mounting, Perturbation
+from pipeline.learn.frames.output import Output
+from pipeline.learn.frames.plan import plan_frames
+from pipeline.store.partitions import Lake, Partition
 
 __all__ = ["export_frames"]
 
@@ -64,17 +72,6 @@ def export_frames(
         executor: process (a pool) or inline (one after the other in this process).
         workers: processes at a time; default: one per CPU that this process may use.
     """
-    from jobs.prepare import days_with_observations
-    from jobs.terminal.summary import print_summary, progress_reporter
-    from pipeline.core.config import load_fleet
-    from pipeline.core.errors import ConfigError
-    from pipeline.learn.frames.card import write_card
-    from pipeline.learn.frames.day import DayTask
-    from pipeline.learn.frames.frame import Perturbation
-    from pipeline.learn.frames.output import Output
-    from pipeline.learn.frames.plan import plan_frames
-    from pipeline.store.partitions import Lake
-
     config, tables, output = load_fleet(fleet), Lake.existing(lake).absolute(), Output.at(out)
     days = days_with_observations(config, tables, from_day, to_day, vehicles)
     known, left_out = _mountings(tables, config, days, calibration, method, sensor, force=force)
@@ -126,9 +123,6 @@ def _mountings(
     force: bool,
 ) -> tuple[dict[Partition, Mounting], list[dict[str, str]]]:
     """The calibration of each vehicle-day, and the vehicle-days without one, with the reason."""
-    from jobs.frame_calibrations import mounting_of
-    from pipeline.core.errors import ConfigError, SolveError
-
     known, without = {}, []
     for day in days:
         try:
@@ -144,13 +138,6 @@ def _run(
     tasks: Sequence[DayTask], executor: str, workers: int | None
 ) -> tuple[dict[str, int], list[dict[str, str]]]:
     """Export all days and report progress: number of days done and cached, and the failed days."""
-    from collections import Counter
-    from contextlib import closing
-
-    from jobs.terminal.summary import progress_reporter
-    from pipeline.fleet.executor import EXECUTORS
-    from pipeline.learn.frames.day import export_day
-
     counts, failed = Counter[str](), list[dict[str, str]]()
     with progress_reporter("frames") as progress:
 

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
+import numpy as np
+
+from jobs.calibration_sources import read_calibration
+from jobs.frame_options import FrameOptions
+from pipeline.core.config import FleetConfig
 from pipeline.core.errors import ConfigError, SolveError
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.core.config import FleetConfig
-    from pipeline.export.calibration import ExportedCalibration
-    from pipeline.learn.frames.frame import Mounting
-    from pipeline.store.partitions import Lake, Partition
+from pipeline.export.calibration import ExportedCalibration, sigmas_of
+from pipeline.learn.frames.frame import Mounting
+from pipeline.rig.day_prior import rig_prior
+from pipeline.rig.graph import BASE
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.views import ingested
+from schemas.moments import PRIOR
 
 __all__ = ["mounting_of"]
 
@@ -44,7 +50,6 @@ def mounting_of(
 
 
 def _of_sensors(found: Mounting, sensors: Sequence[str]) -> Mounting:
-    from dataclasses import replace
 
     T = {n: T for n, T in found.T.items() if not sensors or n in sensors}
     if len(T) < 2:
@@ -54,13 +59,6 @@ def _of_sensors(found: Mounting, sensors: Sequence[str]) -> Mounting:
 
 
 def _of_prior(lake: Lake, fleet: FleetConfig, day: Partition) -> Mounting:
-    import numpy as np
-
-    from pipeline.learn.frames.frame import Mounting
-    from pipeline.rig.day_prior import rig_prior
-    from pipeline.rig.graph import BASE
-    from pipeline.store.views import ingested
-    from schemas.moments import PRIOR
 
     manifest, rig = ingested(lake, day), fleet.rig_of(day.vehicle)
     prior = rig_prior((manifest.extra if manifest else {}).get(PRIOR, ()), fleet, rig)
@@ -75,12 +73,6 @@ def _of_prior(lake: Lake, fleet: FleetConfig, day: Partition) -> Mounting:
 
 
 def _of_calibration(lake: Lake, day: Partition, kind: str, method: str, *, force: bool) -> Mounting:
-    import numpy as np
-
-    from jobs.calibration_sources import read_calibration
-    from jobs.frame_options import FrameOptions
-    from pipeline.export.calibration import sigmas_of
-    from pipeline.learn.frames.frame import Mounting
 
     of_day = day.day if kind == "day" else None
     found = read_calibration(

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from cyclopts import Parameter
 
-if TYPE_CHECKING:
-    from pipeline.export.calibration import FrameNames
+from pipeline.core.errors import ConfigError
+from pipeline.export.calibration import FrameNames
+from pipeline.export.files import noted_frames
 
 __all__ = ["FrameOptions"]
 
@@ -35,9 +36,6 @@ class FrameOptions:
 
     def names(self, known: Mapping[str, str] | None = None) -> FrameNames:
         """Frame names for the pipeline; `known` has names for frames without an option; else ConfigError."""
-        from pipeline.core.errors import ConfigError
-        from pipeline.export.calibration import FrameNames
-
         asked = {s: n for s in _KINDS if (n := getattr(self, s)) is not None}
         for text in self.frame:
             sensor, equals, name = text.partition("=")
@@ -48,6 +46,4 @@ class FrameOptions:
 
     def names_in(self, files: Iterable[str | Path]) -> FrameNames:
         """Frame names for reading files: from options, else from an export's notes in or beside them."""
-        from pipeline.export.files import noted_frames
-
         return self.names(noted_frames([Path(file) for file in files]))

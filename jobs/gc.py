@@ -2,6 +2,14 @@
 
 from __future__ import annotations
 
+import datetime as dt
+
+from jobs.terminal.summary import print_summary, progress_reporter
+from pipeline.core.errors import ConfigError
+from pipeline.store.partitions import Lake
+from pipeline.store.retention import collect, collect_pages, first_day_kept
+from schemas.moments import MOMENTS, PERCEIVED
+
 __all__ = ["gc"]
 
 
@@ -21,14 +29,6 @@ def gc(
             many days; default: all, so that a new release can calibrate them again.
         dry_run: only list what would be deleted.
     """
-    import datetime as dt
-
-    from jobs.terminal.summary import print_summary, progress_reporter
-    from pipeline.core.errors import ConfigError
-    from pipeline.store.partitions import Lake
-    from pipeline.store.retention import collect, collect_pages, first_day_kept
-    from schemas.moments import MOMENTS, PERCEIVED
-
     for name, days in (("images-days", images_days), ("observations-days", observations_days)):
         if days is not None and days < 1:
             raise ConfigError("command line", name, f"{days} is less than one")

@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from jobs.frame_options import FrameOptions
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
+from jobs.terminal.summary import print_summary
+from pipeline.core.config import load_fleet
+from pipeline.core.errors import ConfigError
+from pipeline.export.files import (
+    noted_frames,
+    prior_text,
+    read_files,
+    reference_of_rig,
+    require_all,
+    rig_poses,
+    star_text,
+    write_files,
+)
+from pipeline.export.formats import format_named
+from pipeline.export.tree import ESTIMATED_PAIRS
+from pipeline.rig.day_prior import read_star, read_transforms
+from pipeline.rig.prior import between
 
 __all__ = ["import_prior"]
 
@@ -35,12 +49,6 @@ def import_prior(
         rig: rig of fleet.toml; default: the only one.
         frames: frame names in the files.
     """
-    from jobs.terminal.summary import print_summary
-    from pipeline.export.files import prior_text, read_files, write_files
-    from pipeline.export.formats import format_named
-    from pipeline.export.tree import ESTIMATED_PAIRS
-    from pipeline.rig.day_prior import read_transforms
-
     read = read_files(files)
     if fleet is not None:
         taken = _of_rig(form, read, out, also, (fleet, rig), frames or FrameOptions())
@@ -65,20 +73,6 @@ def _of_rig(
     frames: FrameOptions,
 ) -> list[str]:
     """Write the prior file of all sensors of a rig; returns them; ConfigError if one is missing or twice."""
-    from pipeline.core.config import load_fleet
-    from pipeline.core.errors import ConfigError
-    from pipeline.export.files import (
-        noted_frames,
-        reference_of_rig,
-        require_all,
-        rig_poses,
-        star_text,
-        write_files,
-    )
-    from pipeline.export.formats import format_named
-    from pipeline.rig.day_prior import read_star
-    from pipeline.rig.prior import between
-
     rigs, name = load_fleet(of[0]).rigs, of[1]
     name = next(iter(rigs)) if name is None and len(rigs) == 1 else name
     if name not in rigs:

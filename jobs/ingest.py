@@ -4,6 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from jobs.terminal.summary import exit_code, print_summary, progress_reporter
+from pipeline.core.config import load_fleet
+from pipeline.core.errors import ConfigError
+from pipeline.core.stage_work import Task
+from pipeline.core.stages import INGEST
+from pipeline.fleet.ledger import record_outcome
+from pipeline.rig.day_prior import require_named_files
+from pipeline.store.partitions import Lake, Partition, last_possible_day
+from pipeline.store.remote_logs import log_at
+
 __all__ = ["ingest"]
 
 
@@ -18,16 +28,6 @@ def ingest(*logs: str, fleet: Path, lake: str, vehicle: str, day: str) -> int:
         vehicle: vehicle id, as in fleet.toml.
         day: YYYY-MM-DD.
     """
-    from jobs.terminal.summary import exit_code, print_summary, progress_reporter
-    from pipeline.core.config import load_fleet
-    from pipeline.core.errors import ConfigError
-    from pipeline.core.stage_work import Task
-    from pipeline.core.stages import INGEST
-    from pipeline.fleet.ledger import record_outcome
-    from pipeline.rig.day_prior import require_named_files
-    from pipeline.store.partitions import Lake, Partition, last_possible_day
-    from pipeline.store.remote_logs import log_at
-
     if not logs:
         raise ConfigError("command line", "LOG", "name at least one log of the day")
     if day > last_possible_day():

@@ -4,6 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from jobs.terminal.summary import print_summary, progress_reporter
+from pipeline.core.errors import ConfigError
+from pipeline.ingest.propose.propose import propose_fleet
+from pipeline.ingest.propose.survey import nightly_command
+from pipeline.store.atomic_write import atomic_write
+
 __all__ = ["init"]
 
 
@@ -16,12 +22,6 @@ def init(*logs: Path, out: Path = Path("fleet.toml"), name: str = "fleet", force
         name: name of the fleet.
         force: replace the file if it exists.
     """
-    from jobs.terminal.summary import print_summary, progress_reporter
-    from pipeline.core.errors import ConfigError
-    from pipeline.ingest.propose.propose import propose_fleet
-    from pipeline.ingest.propose.survey import nightly_command
-    from pipeline.store.atomic_write import atomic_write
-
     if not logs:
         raise ConfigError("command line", "LOG", "name at least one log")
     missing = [str(p) for p in logs if not p.exists()]
@@ -36,7 +36,7 @@ def init(*logs: Path, out: Path = Path("fleet.toml"), name: str = "fleet", force
     read = proposal.logs
     some = " ".join(str(p) for p in read[:2]) + (" ..." if len(read) > 2 else "")
     unlabelled = any(": semantics" in what for what in proposal.missing)
-    fetch = ["boresight models fetch"] if unlabelled else []
+    fetch = ["boresight models --fetch"] if unlabelled else []
     print_summary(
         "init",
         "done",

@@ -2,21 +2,41 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-if TYPE_CHECKING:
-    from pipeline.core.results import Outcome
-    from pipeline.fleet.metrics import Tally
-    from pipeline.fleet.nightly import DayOutcome, Night
-    from pipeline.fleet.pattern import VehicleDay
-    from pipeline.store.partitions import Lake
-    from schemas.drift import DriftFinding
+from jobs.extras import require
+from jobs.terminal.logging import logger
+from jobs.terminal.night_view import night_view
+from jobs.terminal.summary import exit_code, left_out, print_summary, progress_reporter
+from jobs.terminal.vehicle_status import count_statuses, moved_sensors, next_steps
+from pipeline.calibrate.methods import method_named
+from pipeline.core.config import load_fleet
+from pipeline.core.errors import ConfigError
+from pipeline.core.results import Outcome
+from pipeline.core.stage_work import Task, Window
+from pipeline.core.stages import AUDIT, REPORT, STATE
+from pipeline.fleet.metrics import NightEnd, Tally, write_metrics
+from pipeline.fleet.misconfigured import night_statuses, to_mend, vehicles_to_mend
+from pipeline.fleet.nightly import DayOutcome, Night, refused_at_once, run_night
+from pipeline.fleet.pages import OnWorkers
+from pipeline.fleet.pattern import VehicleDay, find_logs
+from pipeline.fleet.plan import plan_night
+from pipeline.fleet.status import night_word
+from pipeline.report.stage import Pages
+from pipeline.rig.day_prior import require_named_files
+from pipeline.store.delta import tidy_table
+from pipeline.store.files import LocalFiles
+from pipeline.store.partitions import Lake, Partition
+from schemas.drift import DRIFT, DriftFinding
+from schemas.versions import TABLES
+from schemas.words import DAY_WORDS
 
 __all__ = ["Drawing", "close_night", "nightly", "tidy", "watch_night"]
 
@@ -61,19 +81,6 @@ def nightly(
             as failure.
         dry_run: only list what would run, and why.
     """
-    from jobs.extras import require
-    from jobs.terminal.logging import logger
-    from jobs.terminal.summary import exit_code
-    from jobs.terminal.vehicle_status import next_steps
-    from pipeline.calibrate.methods import method_named
-    from pipeline.core.config import load_fleet
-    from pipeline.fleet.metrics import Tally
-    from pipeline.fleet.misconfigured import night_statuses, to_mend, vehicles_to_mend
-    from pipeline.fleet.nightly import Night
-    from pipeline.fleet.pattern import find_logs
-    from pipeline.rig.day_prior import require_named_files
-    from pipeline.store.partitions import Lake
-
     for extra, is_asked in (("ray", executor == "ray"), ("ops", metrics)):
         if is_asked:
             require(extra)
@@ -112,10 +119,6 @@ def _write_metrics(
     file: Path, fleet: str, tally: Tally, code: int, began_s: float, findings: Sequence[DriftFinding]
 ) -> None:
     """Write the metrics; the log names a file that cannot be written, and the night goes on."""
-    from jobs.terminal.logging import logger
-    from jobs.terminal.vehicle_status import count_statuses, moved_sensors
-    from pipeline.fleet.metrics import NightEnd, write_metrics
-
     end = NightEnd(code, began_s, time.time(), count_statuses(findings), moved_sensors(findings))
     try:
         write_metrics(file, fleet, tally, end)
@@ -132,11 +135,6 @@ def _print_end(
     told: Mapping[str, Any],
 ) -> None:
     """Print the summary of the night: statuses of vehicle-days and vehicles, and paths of the pages."""
-    from jobs.terminal.summary import left_out, print_summary
-    from jobs.terminal.vehicle_status import count_statuses, moved_sensors
-    from pipeline.fleet.status import night_word
-    from schemas.words import DAY_WORDS
-
     print_summary(
         "nightly",
         {0: "done", 1: "failed", 2: "failed", 3: night_word(o.status for o in outcomes)}[code],
@@ -153,12 +151,6 @@ def _print_end(
 
 def _print_plan(night: Night, days: Sequence[VehicleDay], beside: str) -> int:
     """Print what the night would do with each vehicle-day, as a table and as the summary."""
-    import sys
-    from dataclasses import asdict
-
-    from jobs.terminal.summary import left_out, print_summary
-    from pipeline.fleet.plan import plan_night
-
     plans = list(plan_night(night, days))
     for plan in plans:
         sys.stderr.write(f"{plan.vehicle} {plan.day}: {', '.join(plan.stages) or 'nothing'} ({plan.why})\n")
@@ -176,10 +168,6 @@ def _print_plan(night: Night, days: Sequence[VehicleDay], beside: str) -> int:
 
 def tidy(lake: Lake) -> None:
     """Compact the record tables after a night. The log lists what was done; failures are ignored."""
-    from jobs.terminal.logging import logger
-    from pipeline.store.delta import tidy_table
-    from schemas.versions import TABLES
-
     for schema in TABLES.values():
         if schema.is_record_table:
             for what in tidy_table(lake, schema):
@@ -197,10 +185,6 @@ def watch_night(
 
     `take` receives each complete outcome.
     """
-    from jobs.terminal.night_view import night_view
-    from pipeline.core.errors import ConfigError
-    from pipeline.fleet.nightly import refused_at_once, run_night
-
     if workers is not None and workers < 1:
         raise ConfigError("command line", "--workers", f"{workers} is less than one")
     known = [d.partition for d in days if not refused_at_once(night, d.partition)]
@@ -243,15 +227,6 @@ def close_night(
     The charts cover the last `audit.window_days` days, however few days this night processed. Days of this
     night get a page however old they are. `told` receives the outcome of each of these stages.
     """
-    from jobs.terminal.summary import progress_reporter
-    from pipeline.core.stage_work import Task, Window
-    from pipeline.core.stages import AUDIT, REPORT, STATE
-    from pipeline.fleet.pages import OnWorkers
-    from pipeline.report.stage import Pages
-    from pipeline.store.files import LocalFiles
-    from pipeline.store.partitions import Partition
-    from schemas.drift import DRIFT
-
     with progress_reporter("audit") as progress:
         task = Task(night.fleet, night.lake, Window(None, to_day), night.method, progress=progress)
         audit = AUDIT.run(task)

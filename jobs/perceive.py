@@ -4,6 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from jobs.terminal.summary import exit_code, print_summary, progress_reporter
+from pipeline.core.config import load_fleet
+from pipeline.core.stage_work import Task
+from pipeline.core.stages import PERCEIVE
+from pipeline.fleet.ledger import record_outcome
+from pipeline.rig.day_prior import require_named_files
+from pipeline.store.partitions import Lake, Partition
+
 __all__ = ["perceive"]
 
 
@@ -16,14 +24,6 @@ def perceive(*, fleet: Path, lake: str, vehicle: str, day: str) -> int:
         vehicle: vehicle id, as in fleet.toml.
         day: YYYY-MM-DD.
     """
-    from jobs.terminal.summary import exit_code, print_summary, progress_reporter
-    from pipeline.core.config import load_fleet
-    from pipeline.core.stage_work import Task
-    from pipeline.core.stages import PERCEIVE
-    from pipeline.fleet.ledger import record_outcome
-    from pipeline.rig.day_prior import require_named_files
-    from pipeline.store.partitions import Lake, Partition
-
     config = load_fleet(fleet)
     require_named_files(config)
     tables = Lake.existing(lake)

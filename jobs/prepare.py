@@ -3,20 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
+from rich.console import Console
+from rich.table import Table
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.core.config import FleetConfig
-    from pipeline.core.results import Outcome
-    from pipeline.core.stage_work import Task
-    from pipeline.learn.prepare.inventory import Inventory
-    from pipeline.learn.prepare.sides import Choice
-    from pipeline.store.partitions import Lake, Partition
+from jobs.terminal.summary import exit_code, print_summary, progress_reporter
+from pipeline.core.config import FleetConfig, load_fleet
+from pipeline.core.errors import ConfigError
+from pipeline.core.results import Outcome
+from pipeline.core.runner import try_stage
+from pipeline.core.stage_work import Task
+from pipeline.core.stages import PREPARE
+from pipeline.fleet.executor import EXECUTORS
+from pipeline.learn.prepare.decided import decided_sides
+from pipeline.learn.prepare.inventory import Inventory, take_inventory, write_inventory
+from pipeline.learn.prepare.sides import Choice, price_choices, settled_keys
+from pipeline.learn.prepare.split import SplitPlan, Unit
+from pipeline.learn.prepare.survey import plan_days, survey_day
+from pipeline.store.partitions import Lake, Partition, check_day
+from pipeline.store.views import perceived_days
+from schemas.training import TRAINING
+from schemas.versions import CODE_VERSION
 
 __all__ = ["days_with_observations", "prepare"]
 
@@ -55,13 +68,6 @@ def prepare(
         executor: process (a pool) or inline (one after the other in this process).
         workers: processes at a time; default: one per CPU that this process may use.
     """
-    from dataclasses import asdict
-
-    from jobs.terminal.summary import exit_code, print_summary, progress_reporter
-    from pipeline.core.config import load_fleet
-    from pipeline.learn.prepare.inventory import take_inventory, write_inventory
-    from pipeline.store.partitions import Lake
-
     config, tables = load_fleet(fleet), Lake.existing(lake)
     days = days_with_observations(config, tables, from_day, to_day, vehicles)
     for vehicle in {day.vehicle for day in days}:
@@ -100,10 +106,6 @@ def days_with_observations(
     vehicles: Sequence[str] | None,
 ) -> list[Partition]:
     """Vehicle-days with observations, for the given days and vehicles; ConfigError if there are none."""
-    from pipeline.core.errors import ConfigError
-    from pipeline.store.partitions import check_day
-    from pipeline.store.views import perceived_days
-
     for name, day in (("--from", from_day), ("--to", to_day)):
         check_day(name, day)
     for vehicle in vehicles or ():
@@ -125,13 +127,6 @@ def _plan(
     config: FleetConfig, lake: Lake, days: Sequence[Partition]
 ) -> tuple[FleetConfig, list[Task], list[Choice]]:
     """Survey all days and assign sides: configuration with the keys, a task per day, and other splits."""
-    from jobs.terminal.summary import progress_reporter
-    from pipeline.core.stage_work import Task
-    from pipeline.learn.prepare.decided import decided_sides
-    from pipeline.learn.prepare.sides import price_choices, settled_keys
-    from pipeline.learn.prepare.split import SplitPlan, Unit
-    from pipeline.learn.prepare.survey import plan_days, survey_day
-
     surveys = []
     with progress_reporter("survey") as progress:
         for done, day in enumerate(days):
@@ -156,16 +151,6 @@ def _plan(
 
 def _run(work: Sequence[Task], executor: str, workers: int | None) -> list[Outcome]:
     """Prepare all days, with progress; returns their outcomes."""
-    from contextlib import closing
-    from functools import partial
-
-    from jobs.terminal.summary import progress_reporter
-    from pipeline.core.errors import ConfigError
-    from pipeline.core.results import Outcome
-    from pipeline.core.runner import try_stage
-    from pipeline.core.stages import PREPARE
-    from pipeline.fleet.executor import EXECUTORS
-
     if workers is not None and workers < 1:
         raise ConfigError("command line", "--workers", f"{workers} is less than one")
     results: list[Outcome] = []
@@ -185,8 +170,6 @@ def _run(work: Sequence[Task], executor: str, workers: int | None) -> list[Outco
 
 
 def _about(config: FleetConfig) -> dict[str, Any]:
-    from schemas.training import TRAINING
-    from schemas.versions import CODE_VERSION
 
     return {
         "table": TRAINING.name,
@@ -241,9 +224,6 @@ def _problems(config: FleetConfig, results: Sequence[Outcome], inventory: Invent
 
 def print_choices(choices: Sequence[Choice]) -> None:
     """Print the splits as a table on stderr, the chosen split first."""
-    from rich.console import Console
-    from rich.table import Table
-
     table = Table(box=None, title="frames kept and lost by split", title_justify="left")
     for name in ("split_by", "train", "val", "test", "lost", "of them", "days without"):
         table.add_column(name, justify="left" if name in ("split_by", "of them") else "right")

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from jobs.terminal.summary import print_summary, progress_reporter
+from pipeline.store.partitions import Lake
+from pipeline.store.repair import repair_table
+from schemas.versions import TABLES
+
 __all__ = ["repair"]
 
 
@@ -15,11 +20,6 @@ def repair(*, lake: str) -> int:
     Args:
         lake: folder of the tables.
     """
-    from jobs.terminal.summary import print_summary, progress_reporter
-    from pipeline.store.partitions import Lake
-    from pipeline.store.repair import repair_table
-    from schemas.versions import TABLES
-
     tables, done = Lake.existing(lake), {}
     records = [s for s in TABLES.values() if s.is_record_table]
     with progress_reporter("repair") as progress:

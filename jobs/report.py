@@ -4,6 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from jobs.terminal.summary import print_summary, progress_reporter
+from pipeline.core.config import load_fleet
+from pipeline.core.errors import ConfigError
+from pipeline.core.stage_work import Task, Window
+from pipeline.core.stages import REPORT
+from pipeline.report.stage import Pages, write_day_picture
+from pipeline.report.truth import read_truth
+from pipeline.store.partitions import Lake, Partition
+
 __all__ = ["report"]
 
 
@@ -34,15 +43,6 @@ def report(
             --day.
         pictures: --no-pictures draws pages without images of public roads.
     """
-    from jobs.terminal.summary import print_summary, progress_reporter
-    from pipeline.core.config import load_fleet
-    from pipeline.core.errors import ConfigError
-    from pipeline.core.stage_work import Task, Window
-    from pipeline.core.stages import REPORT
-    from pipeline.report.stage import Pages, write_day_picture
-    from pipeline.report.truth import read_truth
-    from pipeline.store.partitions import Lake, Partition
-
     if (vehicle is None) != (day is None):
         raise ConfigError("command line", "vehicle, day", "a day's page needs both --vehicle and --day")
     if picture is not None and day is None:

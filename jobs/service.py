@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
-if TYPE_CHECKING:
-    from pipeline.store.partitions import Lake, Partition
+from jobs.terminal.known_vehicles import require_vehicle
+from jobs.terminal.summary import exit_code, print_summary
+from pipeline.audit.restarts import events_until
+from pipeline.core.errors import ConfigError
+from pipeline.store.commits import commit_records
+from pipeline.store.partitions import Lake, Partition, last_possible_day, work_key
+from pipeline.store.records import read_columns
+from schemas.calibrations import CALIBRATIONS
+from schemas.service_events import SERVICE_EVENTS, ServiceEvent
 
 __all__ = ["service"]
 
@@ -35,13 +42,6 @@ def service(
         note: free text.
         withdraw: withdraw an event recorded by mistake; it has no effect from the next audit on.
     """
-    from jobs.terminal.summary import exit_code, print_summary
-    from pipeline.audit.restarts import events_until
-    from pipeline.core.errors import ConfigError
-    from pipeline.store.commits import commit_records
-    from pipeline.store.partitions import Lake, Partition, work_key
-    from schemas.service_events import SERVICE_EVENTS, ServiceEvent
-
     tables, of = Lake.existing(lake), Partition(vehicle, day)
     _require_known(tables, of)
     _require_sensor(tables, vehicle, sensor)
@@ -64,10 +64,6 @@ def service(
 
 def _require_known(lake: Lake, of: Partition) -> None:
     """Raise ConfigError for a day in the future or a vehicle without a day in the lake."""
-    from jobs.terminal.known_vehicles import require_vehicle
-    from pipeline.core.errors import ConfigError
-    from pipeline.store.partitions import last_possible_day
-
     if of.day > last_possible_day():
         raise ConfigError("command line", "day", f"{of.day} has not come yet")
     require_vehicle(lake, of.vehicle)
@@ -75,10 +71,6 @@ def _require_known(lake: Lake, of: Partition) -> None:
 
 def _require_sensor(lake: Lake, vehicle: str, sensor: str) -> None:
     """Raise ConfigError for a sensor without a record of this vehicle."""
-    from pipeline.core.errors import ConfigError
-    from pipeline.store.records import read_columns
-    from schemas.calibrations import CALIBRATIONS
-
     rows = read_columns(lake, CALIBRATIONS, (), first=None, last=None, vehicle=vehicle)
     known = {n for c in ("parent_frame", "child_frame") for n in (rows[c].to_pylist() if rows else ())}
     if known and sensor not in {"all", *known}:

@@ -4,10 +4,25 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Literal
+from dataclasses import asdict
+from typing import Any, Literal
 
-if TYPE_CHECKING:
-    from pipeline.store.partitions import Lake
+from jobs.terminal.record_tables import print_table
+from jobs.terminal.summary import left_out, print_json
+from pipeline.core.errors import ContractError
+from pipeline.store.current import (
+    current_drift,
+    current_events,
+    current_poses,
+    current_records,
+    current_states,
+    transform_of,
+)
+from pipeline.store.partitions import Lake
+from pipeline.store.records import Assertion, last_assertion, read_records
+from pipeline.store.state_values import state_values
+from pipeline.store.tables import read_manifest
+from schemas.versions import TABLES
 
 __all__ = ["show"]
 
@@ -46,21 +61,14 @@ def show(
         json: print only a JSON list: oldest record first, keys as the columns. Calibrations have "T" too, the
             4x4 row-major T_parent_child; poses have T_reference_sensor (null if refused).
     """
-    from jobs.terminal.summary import left_out
-    from pipeline.store.partitions import Lake
-
     tables = Lake.existing(lake)
     if table in ("moments", "perceived"):
         rows = _partitions(tables, table, vehicle, day)
     else:
         rows = _records(tables, table, vehicle, day, method, current=current)
     if json:
-        from jobs.terminal.summary import print_json
-
         print_json(rows, indent=2)
     elif rows:
-        from jobs.terminal.record_tables import print_table
-
         print_table(table, rows)
     else:
         sys.stdout.write(f"{table}: no matching rows in {lake}\n")
@@ -70,17 +78,6 @@ def show(
 def _records(
     lake: Lake, table: Table, vehicle: str | None, day: str | None, method: str | None, *, current: bool
 ) -> list[dict[str, Any]]:
-    from pipeline.store.current import (
-        current_drift,
-        current_events,
-        current_poses,
-        current_records,
-        current_states,
-        transform_of,
-    )
-    from pipeline.store.records import Assertion, last_assertion, read_records
-    from pipeline.store.state_values import state_values
-    from schemas.versions import TABLES
 
     kinds: dict[str, Callable[[list[Any]], list[Any]]] = {
         "calibrations": current_records,
@@ -106,11 +103,6 @@ def _records(
 
 
 def _partitions(lake: Lake, table: Table, vehicle: str | None, day: str | None) -> list[dict[str, Any]]:
-    from dataclasses import asdict
-
-    from pipeline.core.errors import ContractError
-    from pipeline.store.tables import read_manifest
-    from schemas.versions import TABLES
 
     rows = []
     for partition in lake.partitions(table):

@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from jobs.extras import needs
+from jobs.terminal.summary import print_summary, progress_reporter
+from pipeline.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from pipeline.simulate.fleet import FleetSpec
@@ -57,7 +59,6 @@ def simulate(
         seed: random seed; the same seed gives the same logs.
         workers: number of processes.
     """
-    from pipeline.core.errors import ConfigError
     from pipeline.simulate.faults import parse_faults
     from pipeline.simulate.fleet import FleetSpec, day_names
     from pipeline.simulate.sensors.rigs import rig_named
@@ -86,7 +87,6 @@ def simulate(
 
 def _write(spec: FleetSpec, out: Path, reflectors: bool, workers: int) -> int:
     """Write logs and truth to `out`, and print the summary."""
-    from jobs.terminal.summary import print_summary, progress_reporter
     from pipeline.simulate.fleet import simulate_fleet
     from pipeline.simulate.reflectors import simulate_reflectors
 

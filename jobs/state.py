@@ -8,6 +8,18 @@ from itertools import groupby
 from textwrap import wrap
 from typing import Any
 
+import numpy as np
+
+from jobs.terminal.known_vehicles import require_vehicle
+from jobs.terminal.summary import left_out, print_json
+from pipeline.rig.changes import change_between
+from pipeline.rig.se3 import to_quaternion
+from pipeline.store.current import current_states
+from pipeline.store.partitions import Lake
+from pipeline.store.records import read_records
+from pipeline.store.state_values import state_values
+from schemas.states import STATES, StateRow
+
 __all__ = ["state"]
 
 _WIDTH, _INDENT = 80, 4
@@ -29,14 +41,6 @@ def state(*, lake: str, vehicle: str | None = None, method: str = "joint", json:
             T_parent_child, null if unknown), and "in_words". Rows of sensors (`sensor` is not null) and rows of the
             edges, composed of the sensors' poses.
     """
-    from jobs.terminal.known_vehicles import require_vehicle
-    from jobs.terminal.summary import left_out, print_json
-    from pipeline.store.current import current_states
-    from pipeline.store.partitions import Lake
-    from pipeline.store.records import read_records
-    from pipeline.store.state_values import state_values
-    from schemas.states import STATES, StateRow
-
     tables = Lake.existing(lake)
     found = [r for r in read_records(tables, STATES, StateRow, vehicle=vehicle) if r.method == method]
     if vehicle is not None and not found:
@@ -78,10 +82,6 @@ def _name(row: dict[str, Any]) -> str:
 
 
 def _sensor(row: dict[str, Any]) -> Iterator[str]:
-    import numpy as np
-
-    from pipeline.rig.changes import change_between
-    from pipeline.rig.se3 import to_quaternion
 
     days = row["days"]
     of_days = (

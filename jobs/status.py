@@ -3,13 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated
+from dataclasses import asdict
+from typing import Annotated
 
 from cyclopts import Parameter
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+from rich.text import Text
 
-if TYPE_CHECKING:
-    from pipeline.fleet.status import DayStatus
-    from pipeline.store.partitions import Lake
+from jobs.terminal.known_vehicles import require_vehicle
+from jobs.terminal.summary import exit_code, left_out, print_summary
+from jobs.terminal.vehicle_status import count_statuses, moved_sensors, next_steps, status_lines
+from pipeline.fleet.status import DayStatus, day_statuses
+from pipeline.store.corrections import read_corrections
+from pipeline.store.partitions import Lake, check_day, days_after
+from pipeline.store.records import last_assertion, last_day, read_last, read_records
+from schemas.drift import DRIFT, DriftFinding
+from schemas.faults import in_words
+from schemas.outcomes import OUTCOMES, OutcomeRow
+from schemas.words import DAY_WORDS
 
 __all__ = ["status"]
 
@@ -36,21 +49,6 @@ def status(
         to_day: last day; default: the last day in any night.
         json: list every vehicle-day in the summary's "days".
     """
-    from dataclasses import asdict
-
-    from rich.markup import escape
-
-    from jobs.terminal.known_vehicles import require_vehicle
-    from jobs.terminal.summary import exit_code, left_out, print_summary
-    from jobs.terminal.vehicle_status import count_statuses, moved_sensors, next_steps, status_lines
-    from pipeline.fleet.status import day_statuses
-    from pipeline.store.corrections import read_corrections
-    from pipeline.store.partitions import Lake, check_day, days_after
-    from pipeline.store.records import last_day, read_last, read_records
-    from schemas.drift import DRIFT, DriftFinding
-    from schemas.outcomes import OUTCOMES, OutcomeRow
-    from schemas.words import DAY_WORDS
-
     check_day("to", to_day)
     tables = Lake.existing(lake)
     last = to_day or last_day(tables, OUTCOMES)
@@ -88,9 +86,6 @@ def status(
 
 def _audited_method(lake: Lake, others: set[str]) -> str:
     """The method of the last audit; without an audit the default method, or a method that has records."""
-    from pipeline.store.records import last_assertion
-    from schemas.drift import DRIFT
-
     last = last_assertion(lake, DRIFT)
     if last is not None:
         return last.method
@@ -98,12 +93,6 @@ def _audited_method(lake: Lake, others: set[str]) -> str:
 
 
 def _print_table(days: Sequence[DayStatus], vehicles: Sequence[str]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    from schemas.faults import in_words
-    from schemas.words import DAY_WORDS
 
     wanting = sorted((d for d in days if d.status != "done"), key=lambda d: [*DAY_WORDS].index(d.status))
     table = Table("vehicle", "day", "status", "stage", "why")

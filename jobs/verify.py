@@ -2,20 +2,44 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from tempfile import TemporaryDirectory
+from typing import Any
 
+from numpy import degrees
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from jobs.calibration_sources import poses_in_use, read_sides
 from jobs.frame_options import FrameOptions
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.core.config import FleetConfig
-    from pipeline.core.results import Progress
-    from pipeline.core.stage_work import Probes
-    from pipeline.rig.graph import Sensor
-    from pipeline.store.partitions import Lake, Partition
-    from pipeline.verify.one_axis import AxisCheck
+from jobs.terminal.summary import print_json, print_summary, progress_reporter
+from pipeline.core.config import FleetConfig, load_fleet
+from pipeline.core.errors import ConfigError
+from pipeline.core.results import Progress
+from pipeline.core.stage_work import Probes, Task
+from pipeline.core.stages import CALIBRATE, INGEST, PERCEIVE
+from pipeline.export.files import prior_text, reference_of_rig, require_all, star_text
+from pipeline.report.comparison import in_use_view
+from pipeline.report.stage import write_day_page
+from pipeline.rig.day_prior import require_named_files
+from pipeline.rig.graph import Sensor
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.records import read_records
+from pipeline.verify.axes import (
+    answer_of,
+    answer_of_sensors,
+    answers_by_sensor,
+    check_axes,
+    limits_of,
+    probes,
+)
+from pipeline.verify.one_axis import AxisCheck
+from pipeline.verify.one_log import check_poses, for_one_look, prior_in_use, with_prior
+from schemas.calibrations import CALIBRATIONS, CalibrationRecord
+from schemas.poses import POSES, PoseRow
 
 __all__ = ["verify"]
 
@@ -61,16 +85,6 @@ def verify(
         json: print only one JSON object with every axis on stdout.
         named: frame names in the calibration's files.
     """
-    from tempfile import TemporaryDirectory
-
-    from jobs.terminal.summary import print_json, print_summary, progress_reporter
-    from pipeline.core.config import load_fleet
-    from pipeline.core.errors import ConfigError
-    from pipeline.rig.day_prior import require_named_files
-    from pipeline.store.partitions import Lake
-    from pipeline.verify.axes import answer_of, answer_of_sensors, answers_by_sensor
-    from pipeline.verify.one_log import for_one_look
-
     if not logs:
         raise ConfigError("command line", "LOG", "name at least one log of the car")
     config = load_fleet(fleet)
@@ -107,7 +121,6 @@ def verify(
 
 
 def _vehicle(config: FleetConfig, vehicle: str | None) -> str:
-    from pipeline.core.errors import ConfigError
 
     if vehicle is not None:
         config.rig_of(vehicle)  # raises for an unknown vehicle
@@ -123,10 +136,6 @@ def _vehicle(config: FleetConfig, vehicle: str | None) -> str:
 
 def _as_prior(folder: Path, calibration: str, lake: str | None, vehicle: str, named: FrameOptions) -> Path:
     """Write the calibration of `--calibration` as a prior file; raises before the first log is opened."""
-    from jobs.calibration_sources import read_sides
-    from pipeline.core.errors import ConfigError
-    from pipeline.export.files import prior_text
-
     [side] = read_sides([calibration], lake, vehicle, "joint", named)
     for pair, why in side.missing.items():
         raise ConfigError(side.title, pair, f"no transform to verify: {why}")
@@ -143,10 +152,6 @@ def _of_poses(
     Raises:
         ConfigError: neither a file nor a lake, or fewer than two sensors; raised before a log is opened.
     """
-    from jobs.calibration_sources import poses_in_use
-    from pipeline.core.errors import ConfigError
-    from pipeline.export.files import reference_of_rig, require_all, star_text
-
     if calibration.endswith(".json") and ":" not in calibration:
         return config.with_prior_file(vehicle, Path(calibration)), ()
     rig = config.rig_of(vehicle)
@@ -174,13 +179,6 @@ def _checked(
 
     `of`: the vehicle, and for a rig of many sensors those without a pose in the calibration in use.
     """
-    from pipeline.store.partitions import Partition
-    from pipeline.store.records import read_records
-    from pipeline.verify.axes import check_axes, limits_of, probes
-    from pipeline.verify.one_log import check_poses, prior_in_use
-    from schemas.calibrations import CALIBRATIONS, CalibrationRecord
-    from schemas.poses import POSES, PoseRow
-
     vehicle, lacking = of
     partition = Partition(vehicle, _DAY)
     _calibrate(config, lake, partition, logs, probes(asked_deg), progress)
@@ -212,12 +210,6 @@ def _calibrate(
     progress: Progress,
 ) -> None:
     """Calibrate from the log, with the calibration in use as prior."""
-    from dataclasses import replace
-
-    from pipeline.core.stage_work import Task
-    from pipeline.core.stages import CALIBRATE, INGEST, PERCEIVE
-    from pipeline.verify.one_log import prior_in_use, with_prior
-
     task = Task(config, lake, partition, "joint", probe_deg=probe_deg, logs=logs, progress=progress)
     for stage in (INGEST, PERCEIVE):
         stage.run(task)
@@ -230,25 +222,17 @@ def _calibrate(
 def _write_page(
     config: FleetConfig, lake: Lake, partition: Partition, checks: list[AxisCheck], page: Path
 ) -> None:
-    from pipeline.report.comparison import in_use_view
-    from pipeline.report.stage import write_day_page
-    from pipeline.verify.axes import answer_of
 
     view = in_use_view(answer_of(checks), [_told(c) for c in checks])
     write_day_page(lake, partition, config, page, "joint", in_use=view)
 
 
 def _told(check: AxisCheck) -> dict[str, Any]:
-    from dataclasses import asdict
 
     return asdict(check)
 
 
 def _print_table(checks: list[AxisCheck], answer: str, sensors: Mapping[str, str]) -> None:
-    from numpy import degrees
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
 
     table = Table(title="The calibration in use", title_justify="left")
     for heading in (

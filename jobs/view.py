@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
+import numpy as np
+
+from jobs.calibration_sources import read_calibration
 from jobs.extras import needs
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from pipeline.export.calibration import ExportedCalibration
-    from pipeline.store.partitions import Lake
-    from pipeline.view.layers import Rig, Shown
+from jobs.frame_options import FrameOptions
+from jobs.terminal.summary import print_summary
+from pipeline.core.errors import ConfigError
+from pipeline.export.calibration import ExportedCalibration
+from pipeline.export.lake import priors_of_day
+from pipeline.store.atomic_write import atomic_write
+from pipeline.store.partitions import Lake, Partition
+from pipeline.view.layers import Rig, Shown, count_moments, layers_of, read_moment
 
 __all__ = ["view"]
 
@@ -42,10 +47,6 @@ def view(
         method: of the records.
         out: draw into this PNG, without a window.
     """
-    from jobs.terminal.summary import print_summary
-    from pipeline.core.errors import ConfigError
-    from pipeline.store.partitions import Lake, Partition
-    from pipeline.view.layers import count_moments, read_moment
     from pipeline.view.system import import_open3d, require_display, require_renderer
 
     if out is not None and out.suffix != ".png":
@@ -76,11 +77,8 @@ def view(
 
 def _draw(rig: Rig, shown: Shown, title: str, state: str, out: Path) -> None:
     import cv2
-    import numpy as np
 
-    from pipeline.store.atomic_write import atomic_write
     from pipeline.view.draw import render, viewpoint
-    from pipeline.view.layers import layers_of
 
     cameras = [name for name, kind in rig.kinds.items() if kind == "camera"]
     place = viewpoint(rig.placed("calibrated"), cameras)
@@ -99,15 +97,6 @@ def _draw(rig: Rig, shown: Shown, title: str, state: str, out: Path) -> None:
 
 def _rig(lake: Lake, vehicle: str, day: str, method: str) -> Rig:
     """Poses before and after the day; a sensor without an estimate keeps its prior pose; else ConfigError."""
-    from dataclasses import replace
-
-    import numpy as np
-
-    from jobs.calibration_sources import read_calibration
-    from jobs.frame_options import FrameOptions
-    from pipeline.export.lake import priors_of_day
-    from pipeline.view.layers import Rig
-
     after = read_calibration(
         str(lake.root), vehicle, day, method, force=True, frames=FrameOptions(), own_frames=False,
         mount=None,
@@ -139,8 +128,6 @@ def _status(found: ExportedCalibration, sensor: str) -> str:
 
 def _upright(kind: str) -> np.ndarray:
     """T_car_reference of a sensor that looks ahead, if its pose on the car is unknown."""
-    import numpy as np
-
     T = np.eye(4)
     if kind == "camera":
         T[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from rich import box
+from rich.console import Console
+from rich.table import Table
 
 from jobs.terminal.record_tables import STATUS_STYLES
 from jobs.terminal.vehicle_status import status_lines
-
-if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.table import Table
-
-    from pipeline.report.truth import Truth
-    from pipeline.store.partitions import Lake
-    from schemas.calibrations import CalibrationRecord
-    from schemas.drift import DriftFinding
+from pipeline.report.truth import Truth, true_transform
+from pipeline.rig.changes import change_between, change_covariance
+from pipeline.rig.se3 import inverse, rotation_angle_rad
+from pipeline.rig.targets import errors_at_targets
+from pipeline.store.current import current_records, prior_of, transform_of
+from pipeline.store.partitions import Lake
+from pipeline.store.records import read_records
+from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
+from schemas.drift import DriftFinding
 
 __all__ = ["print_comparison", "print_methods"]
 
@@ -68,11 +71,6 @@ def print_methods(
     Returns:
         By method, for each record, what `print_comparison` returns.
     """
-    from rich import box
-    from rich.table import Table
-
-    from schemas.calibrations import PAIRS
-
     records = {method: _current(lake, method, day) for method in methods}
     shared = set.intersection(*({r.vehicle for r in own} for own in records.values()))
     records = {method: [r for r in own if r.vehicle in shared] for method, own in records.items()}
@@ -101,9 +99,6 @@ def _mean_error(
     before: bool,
 ) -> str:
     """Mean error over the records of a pair that have a transform."""
-    from pipeline.rig.targets import errors_at_targets
-    from pipeline.store.current import prior_of, transform_of
-
     found = []
     for record in (r for r in records if r.pair == pair):
         T = prior_of(record) if before else transform_of(record)
@@ -116,7 +111,6 @@ def _mean_error(
 
 
 def _true(truth: Truth, record: CalibrationRecord) -> np.ndarray:
-    from pipeline.report.truth import true_transform
 
     T = true_transform(truth, record)
     assert T is not None, "every sensor of the demo has a true pose"
@@ -124,16 +118,12 @@ def _true(truth: Truth, record: CalibrationRecord) -> np.ndarray:
 
 
 def _current(lake: Lake, method: str, day: str) -> list[CalibrationRecord]:
-    from pipeline.store.current import current_records
-    from pipeline.store.records import read_records
-    from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 
     found = read_records(lake, CALIBRATIONS, CalibrationRecord, day=day)
     return current_records([r for r in found if r.method == method])
 
 
 def _console() -> Console:
-    from rich.console import Console
 
     console = Console(highlight=False)
     console.width = max(console.width, _WIDTH)
@@ -141,8 +131,6 @@ def _console() -> Console:
 
 
 def _table(day: str) -> Table:
-    from rich import box
-    from rich.table import Table
 
     table = Table(
         title=f"Change from the nominal pose, {day}",
@@ -161,8 +149,6 @@ def _table(day: str) -> Table:
 
 
 def _rows(record: CalibrationRecord, T_true: np.ndarray) -> list[list[str]]:
-    from pipeline.rig.changes import change_between, change_covariance
-    from pipeline.store.current import prior_of, transform_of
 
     T, T_prior = transform_of(record), prior_of(record)
     if T is None or T_prior is None or record.covariance is None:
@@ -188,8 +174,6 @@ def _name(record: CalibrationRecord) -> str:
 
 
 def _errors(record: CalibrationRecord, T_true: np.ndarray) -> dict[str, Any]:
-    from pipeline.rig.se3 import inverse, rotation_angle_rad
-    from pipeline.store.current import prior_of, transform_of
 
     def error(T: np.ndarray | None) -> tuple[float | None, float | None]:
         if T is None:

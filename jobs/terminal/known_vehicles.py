@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from difflib import get_close_matches
 
-if TYPE_CHECKING:
-    from pipeline.store.partitions import Lake
+from pipeline.core.errors import ConfigError
+from pipeline.store.partitions import Lake
+from pipeline.store.records import read_columns
+from schemas.calibrations import CALIBRATIONS
+from schemas.outcomes import OUTCOMES
+from schemas.states import STATES
 
 __all__ = ["require_vehicle"]
 
@@ -14,14 +18,6 @@ _NAMED = 5  # vehicles of the lake named beside an unknown one
 
 def require_vehicle(lake: Lake, vehicle: str) -> None:
     """Raise ConfigError for a vehicle without a day in the lake, unless rows that cannot be read may have one."""
-    from difflib import get_close_matches
-
-    from pipeline.core.errors import ConfigError
-    from pipeline.store.records import read_columns
-    from schemas.calibrations import CALIBRATIONS
-    from schemas.outcomes import OUTCOMES
-    from schemas.states import STATES
-
     known: set[str] = set()
     for table in (CALIBRATIONS, OUTCOMES, STATES):
         rows = read_columns(lake, table, (), first=None, last=None)

@@ -5,13 +5,22 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    Progress,
+    SpinnerColumn,
+    TaskProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+)
 
 from jobs.terminal.logging import logger
 from jobs.terminal.summary import LOG_EVERY_S, is_terminal
-
-if TYPE_CHECKING:
-    from pipeline.fleet.nightly import DayOutcome
+from pipeline.core.stages import STAGES
+from pipeline.fleet.nightly import DayOutcome
 
 __all__ = ["NightView", "night_view"]
 
@@ -44,15 +53,6 @@ def night_view(names: list[str], total: int, title: str = "night") -> Iterator[N
     if not is_terminal():
         yield _Lines(names, total, title)
         return
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        Progress,
-        SpinnerColumn,
-        TaskProgressColumn,
-        TextColumn,
-        TimeElapsedColumn,
-    )
 
     columns = (
         SpinnerColumn(),
@@ -70,7 +70,6 @@ class _Lines:
     """Lines for a log file, updated five times a second: a shorter stage may get no line, a long one gets several."""
 
     def __init__(self, names: list[str], total: int, title: str) -> None:
-        from pipeline.core.stages import STAGES
 
         self._names, self._total, self._title, self._ended = names, total, title, 0
         self._stages = {stage.name for stage in STAGES}

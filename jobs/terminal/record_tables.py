@@ -6,6 +6,14 @@ import math
 import sys
 from typing import Any
 
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from pipeline.rig.changes import change_between
+from pipeline.rig.edges import POSE, edge_named, pose_of, words_of
+from pipeline.rig.se3 import to_quaternion
 from schemas.faults import in_words
 
 __all__ = ["STATUS_STYLES", "print_table"]
@@ -24,10 +32,6 @@ _PIPE_WIDTH = 280  # characters; output to a pipe or file need not fit a window
 
 def print_table(table: str, rows: list[dict[str, Any]]) -> None:
     """Print at least one row of a table, with its columns as headings."""
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
     cells = {
         "calibrations": _calibration_cells,
         "poses": _pose_row_cells,
@@ -48,9 +52,6 @@ def print_table(table: str, rows: list[dict[str, Any]]) -> None:
 
 
 def _calibration_cells(row: dict[str, Any]) -> dict[str, str]:
-    import numpy as np
-
-    from pipeline.rig.edges import pose_of
 
     sigma = np.full(6, np.nan) if row["covariance"] is None else np.sqrt(np.diag(row["covariance"]))
     seen = row["observable"] or [False] * 6
@@ -92,10 +93,6 @@ def _sure_cells(row: dict[str, Any]) -> dict[str, str]:
 
 def _pose_cells(T: Any, T_prior: Any, *, with_change: bool = True) -> dict[str, str]:
     """Pose of the child in the parent, and its change from the prior, along the parent's axes."""
-    import numpy as np
-
-    from pipeline.rig.changes import change_between
-    from pipeline.rig.se3 import to_quaternion
 
     def words(numbers: Any, form: str) -> str:
         return " ".join(f"{number:{form}}" for number in numbers)
@@ -179,8 +176,6 @@ def _named(row: dict[str, Any], *names: str) -> dict[str, str]:
 
 def _edge(row: dict[str, Any]) -> str:
     """Kinds of the two sensors, or their names if they differ from the kinds, as in `words_of`."""
-    from pipeline.rig.edges import POSE, edge_named, words_of
-
     if row["pair"] == POSE:
         return f"{row['child_frame']} in {row['parent_frame']}"
     return words_of(edge_named(row["pair"], row["parent_frame"], row["child_frame"]))

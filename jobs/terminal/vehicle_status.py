@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from shlex import quote
 from typing import Any
 
+from rich.markup import escape
+
 from jobs.terminal.record_tables import STATUS_STYLES
 from pipeline.store.corrections import correction_steps
 from schemas.drift import DRIFT_STATUSES, DriftFinding, VehicleStatus, next_step, status_of
@@ -17,8 +19,6 @@ _STEPS = 40  # vehicles whose next steps are printed; the others are counted
 
 def status_lines(findings: Sequence[DriftFinding]) -> list[str]:
     """A line per vehicle, sorted by name: its status and the reason, in rich's markup."""
-    from rich.markup import escape
-
     return [
         f"[{STATUS_STYLES[stored.status]}]{stored.status:8}[/] {escape(vehicle)}  {escape(stored.reason)}"
         for vehicle, stored in _statuses(findings).items()
