@@ -26,67 +26,41 @@ __all__ = ["COMMANDS", "app", "main"]
 FAILED, USAGE, INTERRUPTED, TERMINATED = 1, 2, 130, 143
 _OUTPUTS = ("--out", "--page", "--report")
 
-# Command -> its function and its line in `boresight --help`.
+# Command -> its line in `boresight --help`.
+_HELP = {
+    "demo": "Simulate a small fleet, calibrate it and write an HTML report, in minutes.",
+    "init": "Write a fleet.toml from logs, with comments for what is missing.",
+    "check": "Check whether logs can be calibrated, and in which degrees of freedom.",
+    "verify": "Check the calibration that a car uses now against one or more logs.",
+    "nightly": "Ingest, perceive, calibrate and audit all vehicle-days of a fleet.",
+    "ingest": "Read and synchronise the logs of one vehicle-day.",
+    "perceive": "Find semantics, objects, edges and motion in one vehicle-day.",
+    "calibrate": "Estimate extrinsics of one vehicle-day and record them.",
+    "prepare": "Make training data from many vehicle-days.",
+    "train": "Train a network without ground truth: calibration, lidar semantics, drivable area.",
+    "models": "List the networks included and those that --fetch downloads, for cameras without labels.",
+    "audit": "Find sensors that moved, by control charts over days.",
+    "service": "Record a repair, a re-mount or a software release: charts restart.",
+    "state": "Show the calibration that each vehicle should load tonight, with sigmas.",
+    "report": "Write HTML pages of vehicle-days and of the fleet.",
+    "show": "Show the rows of a lake's tables, as a table or as JSON.",
+    "view": "Show one vehicle-day in 3D, before and after its calibration.",
+    "status": "Show which vehicle-days are done, held, refused, failed or missing, and why.",
+    "gc": "Delete old images, and pages that show them, from a lake.",
+    "export": "Write a calibration for ROS 2, Autoware, KITTI, ...; JSON Schemas; a network as ONNX.",
+    "export frames": "Write frames of many days with calibration: Parquet, nuScenes.",
+    "import": "Convert calibration files of other programs to a prior file.",
+    "compare": "Compare two calibrations axis by axis: records, days, methods, files.",
+    "repair": "Repair a lake with a damaged log or lost files.",
+    "convert": "Convert public data sets (nuScenes, View-of-Delft, KITTI) to logs.",
+    "simulate": "Write logs of a simulated fleet, and its true extrinsics.",
+    "evaluate": "Compare records with true extrinsics or a reflector recording.",
+}
+_NAMED = {"import": "import_prior"}  # where a command has another name than its module and function
+# Command -> its function and its line of help.
 COMMANDS: dict[str, tuple[str, str]] = {
-    "demo": ("jobs.demo:demo", "Simulate a small fleet, calibrate it and write an HTML report, in minutes."),
-    "init": ("jobs.init:init", "Write a fleet.toml from logs, with comments for what is missing."),
-    "check": ("jobs.check:check", "Check whether logs can be calibrated, and in which degrees of freedom."),
-    "verify": (
-        "jobs.verify:verify",
-        "Check the calibration that a car uses now against one or more logs.",
-    ),
-    "nightly": (
-        "jobs.nightly:nightly",
-        "Ingest, perceive, calibrate and audit all vehicle-days of a fleet.",
-    ),
-    "ingest": ("jobs.ingest:ingest", "Read and synchronise the logs of one vehicle-day."),
-    "perceive": ("jobs.perceive:perceive", "Find semantics, objects, edges and motion in one vehicle-day."),
-    "calibrate": ("jobs.calibrate:calibrate", "Estimate extrinsics of one vehicle-day and record them."),
-    "prepare": ("jobs.prepare:prepare", "Make training data from many vehicle-days."),
-    "train": ("jobs.train:train", "Train a calibration network without ground truth."),
-    "train-perception": (
-        "jobs.train_perception:train_perception",
-        "Train lidar semantics or the radar's drivable area from another sensor.",
-    ),
-    "models": ("jobs.models:models", "List the networks included and those that `models fetch` downloads."),
-    "models fetch": (
-        "jobs.models:fetch",
-        "Download a segmenter and a detector for cameras without labels; shows licence and sha256.",
-    ),
-    "audit": ("jobs.audit:audit", "Find sensors that moved, by control charts over days."),
-    "service": ("jobs.service:service", "Record a repair, a re-mount or a software release: charts restart."),
-    "state": ("jobs.state:state", "Show the calibration that each vehicle should load tonight, with sigmas."),
-    "report": ("jobs.report:report", "Write HTML pages of vehicle-days and of the fleet."),
-    "show": ("jobs.show:show", "Show the rows of a lake's tables, as a table or as JSON."),
-    "view": ("jobs.view:view", "Show one vehicle-day in 3D, before and after its calibration."),
-    "status": (
-        "jobs.status:status",
-        "Show which vehicle-days are done, held, refused, failed or missing, and why.",
-    ),
-    "gc": ("jobs.gc:gc", "Delete old images, and pages that show them, from a lake."),
-    "export": (
-        "jobs.export:export",
-        "Write a calibration for ROS 2, Autoware, KITTI, ...; JSON Schemas; a network as ONNX.",
-    ),
-    "export frames": (
-        "jobs.export_frames:export_frames",
-        "Write frames of many days with calibration: Parquet, nuScenes.",
-    ),
-    "import": (
-        "jobs.import_prior:import_prior",
-        "Convert calibration files of other programs to a prior file.",
-    ),
-    "compare": (
-        "jobs.compare:compare",
-        "Compare two calibrations axis by axis: records, days, methods, files.",
-    ),
-    "repair": ("jobs.repair:repair", "Repair a lake with a damaged log or lost files."),
-    "convert": (
-        "jobs.convert:convert",
-        "Convert public data sets (nuScenes, View-of-Delft, KITTI) to logs.",
-    ),
-    "simulate": ("jobs.simulate:simulate", "Write logs of a simulated fleet, and its true extrinsics."),
-    "evaluate": ("jobs.evaluate:evaluate", "Compare records with true extrinsics or a reflector recording."),
+    name: ("jobs.{0}:{0}".format(_NAMED.get(name, name.replace(" ", "_"))), text)
+    for name, text in _HELP.items()
 }
 
 

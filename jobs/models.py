@@ -2,32 +2,57 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
 
-    from pipeline.core.models import ThirdPartyModel
+from jobs.terminal.summary import print_summary, progress_reporter
+from pipeline.core.errors import ConfigError
+from pipeline.core.models import (
+    CATALOGUE,
+    ThirdPartyModel,
+    manifest_text,
+    named,
+    semantics_line,
+    shipped_models,
+)
+from pipeline.perceive.models.download import download
+from pipeline.store.atomic_write import atomic_write
 
-__all__ = ["fetch", "models"]
+__all__ = ["models"]
 
 _WIDTH = 120  # columns, also where nobody watches: a sha256 and a path fit
 
 
-def models(*, json: bool = False) -> int:
-    """List the models that ship, compared with the sha256 of their cards, and those that `models fetch` downloads.
+def models(
+    *names: str,
+    fetch: bool = False,
+    into: Path = Path("models"),
+    mirror: str | None = None,
+    json: bool = False,
+) -> int:
+    """List the models that ship, compared with the sha256 of their cards, and those that --fetch downloads.
 
     Exit code 1 where a file is not the one that its card speaks of, or a card lacks something.
 
     Args:
+        names: models to fetch; default: a segmenter and a detector, which a camera without logged labels needs both.
+        fetch: download models of other people, with manifests. Address, size and licence are shown first; the sha256
+            is checked before a file appears.
+        into: folder for the files; fleet.toml names it relative to itself.
+        mirror: address of a folder with the files NAME.onnx, in place of the pinned addresses.
         json: the summary's "models" and "to_fetch" hold all that is known of them.
     """
-    from dataclasses import asdict
-
-    from jobs.terminal.summary import print_summary
-    from pipeline.core.models import CATALOGUE, shipped_models
-
+    if fetch:
+        return _fetch(named(names), into, mirror)
+    if names:
+        raise ConfigError(
+            "command line", "NAME", f"{' '.join(names)}: names go with --fetch, which downloads them"
+        )
     found = shipped_models()
     for model in () if json else found:
         card = model.card
@@ -39,37 +64,17 @@ def models(*, json: bool = False) -> int:
         }  # fmt: skip
         _print_block(model.name, rows)
     for other in () if json else CATALOGUE:
-        _print_block(f"{other.name} (to download: boresight models fetch {other.name})", _facts(other))
-    wrong = [model for model in found if model.problems]
-    print_summary(
-        "models",
-        "failed" if wrong else "done",
-        models=[
-            {"name": model.name, "path": model.file, "problems": model.problems}
-            | (model.card if json else {})
-            for model in found
-        ],
-        to_fetch=[asdict(other) if json else other.name for other in CATALOGUE],
-    )
+        _print_block(f"{other.name} (to download: boresight models --fetch {other.name})", _facts(other))
+    wrong = any(model.problems for model in found)
+    told = [
+        {"name": m.name, "path": m.file, "problems": m.problems} | (m.card if json else {}) for m in found
+    ]
+    others = [asdict(other) if json else other.name for other in CATALOGUE]
+    print_summary("models", "failed" if wrong else "done", models=told, to_fetch=others)
     return 1 if wrong else 0
 
 
-def fetch(*names: str, into: Path = Path("models"), mirror: str | None = None) -> int:
-    """Download models of other people, with manifests, for cameras whose labels nobody logs.
-
-    Address, size and licence are shown first. The sha256 is checked before a file appears.
-
-    Args:
-        names: of `boresight models`; default: a segmenter and a detector, which a camera needs both.
-        into: folder for the files; fleet.toml names it relative to itself.
-        mirror: address of a folder with the files NAME.onnx, in place of the pinned addresses.
-    """
-    from jobs.terminal.summary import print_summary, progress_reporter
-    from pipeline.core.models import manifest_text, named, semantics_line
-    from pipeline.perceive.models.download import download
-    from pipeline.store.atomic_write import atomic_write
-
-    chosen = named(names)
+def _fetch(chosen: Sequence[ThirdPartyModel], into: Path, mirror: str | None) -> int:
     fetched, there = list[str](), list[str]()
     for model in chosen:
         _print_block(model.name, _facts(model))
@@ -81,16 +86,15 @@ def fetch(*names: str, into: Path = Path("models"), mirror: str | None = None) -
         if came or not manifest.exists():  # what a user changed in it stays
             with atomic_write(manifest) as file:
                 file.write(manifest_text(model).encode())
+    line = semantics_line(str(into))
     print_summary(
-        "models fetch",
+        "models",
         "done",
         fetched=fetched,
         already_there=there,
         into=str(into),
-        enter_in_fleet_toml=f"[rigs.NAME.camera]\n{semantics_line(str(into))}",
-        next_steps=[
-            f"enter the `semantics` line under the camera in fleet.toml: {semantics_line(str(into))}"
-        ],
+        enter_in_fleet_toml=f"[rigs.NAME.camera]\n{line}",
+        next_steps=[f"enter the `semantics` line under the camera in fleet.toml: {line}"],
     )
     return 0
 
@@ -106,10 +110,6 @@ def _facts(model: ThirdPartyModel) -> dict[str, str]:
 
 def _print_block(title: str, rows: Mapping[str, object]) -> None:
     """One model, for people, on stderr."""
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
-
     table = Table(box=None, show_header=False, title=title, title_justify="left", title_style="bold")
     table.add_column()
     table.add_column(overflow="fold")

@@ -29,7 +29,6 @@ NEEDS = {
     "demo": "simulate",
     "simulate": "simulate",
     "train": "train",
-    "train-perception": "train",
     "export": "train",
     "view": "view",
 }
@@ -40,9 +39,6 @@ CALLS = {
     "demo": ["demo"],
     "simulate": ["simulate", "--out", "logs"],
     "train": ["train", "--data", "lake", "--out", "run"],
-    "train-perception": [
-        *("train-perception", "lidar_semantics", "--fleet", "f.toml", "--lake", "lake", "--out", "run")
-    ],
     "export": ["export", "onnx", "--out", "a.onnx", "--run", "."],
     "view": ["view", "--lake", "lake", "--vehicle", "v", "--day", "2026-03-02"],
 }

@@ -1,4 +1,4 @@
-"""Models that are shipped, with their cards, and third-party models that `boresight models fetch` downloads."""
+"""Models that are shipped, with their cards, and third-party models that `boresight models --fetch` downloads."""
 
 from __future__ import annotations
 

@@ -53,7 +53,9 @@ WITHOUT_ROWS: Final = "frames_without_lidar_rows"
 BY_DOPPLER: Final = "frames_deskewed_by_doppler"
 AS_LOGGED: Final = "frames_not_deskewed"
 # Remark on cameras without semantics, with the section of fleet.toml that would give them some.
-_REMEDY: Final = "to have labels, name topics or models in {} (`boresight models fetch` downloads two models)"
+_REMEDY: Final = (
+    "to have labels, name topics or models in {} (`boresight models --fetch` downloads two models)"
+)
 
 _Joined = tuple[Moment, dict[str, Any]]
 

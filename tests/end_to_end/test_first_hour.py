@@ -82,7 +82,7 @@ def nuscenes(folder):
 
 def kitti(folder):
     log = beginning(shared("kitti/kitti-1_2011-09-26_00.mcap"), folder, "kitti-1", "2011-09-26", 12)
-    models = folder / "models"  # where `boresight models fetch` puts its two, and what it calls them
+    models = folder / "models"  # where `boresight models --fetch` puts its two, and what it calls them
     models.mkdir()
     write_real_manifests(models, shared("../models/espnetv2_city.onnx"), shared("../models/yolox_nano.onnx"))
     (models / "segmenter.toml").rename(models / "segformer-b0-ade20k.toml")

@@ -44,7 +44,7 @@ def test_good_evidence_gives_a_yes_and_no_evidence_a_no(changes, answer):
         ({"elevation_share": 0.0}, "lidar_radar", "roll, pitch and z", "elevation"),
         ({"elevation_share": 0.0}, "camera_radar", "roll and pitch", "elevation"),
         ({"labels_share": 0.0}, "camera_lidar", "pitch", "semantic labels"),
-        ({"labels_share": 0.0, "names_semantics": False}, "camera_radar", "yaw", "models fetch"),
+        ({"labels_share": 0.0, "names_semantics": False}, "camera_radar", "yaw", "models --fetch"),
         ({"moving_share": 0.0}, "lidar_radar", "time offset", "moves in 0%"),
     ],
 )

@@ -131,7 +131,7 @@ def test_labels_that_are_not_logged_are_not_taken_for_another_image(tmp_path, ca
     report, steps = check(tmp_path, log, capsys)
     said = next(v["reasons"][0] for v in report["verdicts"] if v["pair"] == "camera_lidar")
     assert "remove `semantics` from fleet.toml" in said
-    assert steps[0] == "boresight models fetch"
+    assert steps[0] == "boresight models --fetch"
     assert report["corrections"] == []
 
 
@@ -160,7 +160,7 @@ def test_a_camera_without_intrinsics_is_named_by_every_command(tmp_path, capsys,
     assert INFO in summary["misconfigured"]["default"]
     report, steps = check(tmp_path, log, capsys)
     assert any(INFO in step and CALIBRATED in step for step in steps)
-    assert not any("models fetch" in step or "nightly" in step for step in steps)
+    assert not any("models --fetch" in step or "nightly" in step for step in steps)
     reasons = {v["pair"]: " ".join(v["reasons"]) for v in report["verdicts"]}
     assert "labels on the topics" not in " ".join(reasons.values())
     assert CALIBRATED in reasons["camera_lidar"]

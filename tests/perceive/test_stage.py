@@ -179,7 +179,7 @@ def test_a_camera_without_semantics_shows_steps_of_brightness_and_is_told_how_to
     assert (result.status, result.rows, result.rejected) == ("done", 5, {})
     assert result.reason.startswith(f"camera: {WITHOUT_LABELS}")
     assert "[rigs.default.cameras.camera.semantics]" in result.reason
-    assert "boresight models fetch" in result.reason
+    assert "boresight models --fetch" in result.reason
     for a, b in zip(rows, whole[1], strict=True):
         assert (a.sensors, a.is_unlabelled, b.is_unlabelled) == (b.sensors, True, False)
         labels, steps = (

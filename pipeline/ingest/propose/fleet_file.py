@@ -135,7 +135,7 @@ def _camera(camera: FoundCamera) -> Iterator[str]:
         )
         yield f"# The logs have {has} {what} of this camera; semantics are both. Without them, its borders are steps"
         yield "# of brightness, and it has no edge to a radar. Better: log both, or name two models, of yours or those"
-        yield "# that `boresight models fetch` downloads into models/ (mind their licences):"
+        yield "# that `boresight models --fetch` downloads into models/ (mind their licences):"
         yield f"# {semantics_line('models')}"
         return
     known = "" if camera.label_set in ("cityscapes", "") else f', label_set = "{camera.label_set}"'

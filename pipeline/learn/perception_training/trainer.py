@@ -207,7 +207,7 @@ def export_model(task: Task[R], network: nn.Module, train: R, folder: Path, card
         "code_version": CODE_VERSION,
         "parameters": sum(p.numel() for p in network.parameters()),
         "purpose": task.purpose,
-        "command": f"boresight train-perception {task.name}",
+        "command": f"boresight train --task {task.name}",
         **card,
         "limits": task.limits,
     }

@@ -1,6 +1,6 @@
 """The radar's drivable area by a small network, in place of the geometric one.
 
-`boresight train-perception radar_drivable` writes its manifest, which names the model and its grid.
+`boresight train --task radar_drivable` writes its manifest, which names the model and its grid.
 
 Source: paper, section 4.2 (a weakly supervised network segments the radar's drivable area).
 """

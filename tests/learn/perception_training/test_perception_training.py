@@ -404,8 +404,8 @@ def test_the_job_trains_on_a_lake_holds_days_out_and_leaves_model_manifest_and_c
     fill_lake, options, model, counts, scores = JOBS[task]
     (tmp_path / "fleet.toml").write_text(fleet_toml("a", "b"))
     fill_lake(Lake.at(tmp_path / "lake"))
-    places = ["--fleet", str(tmp_path / "fleet.toml"), "--lake", str(tmp_path / "lake")]
-    command = ["train-perception", task, *places, "--out", str(tmp_path / "run"), "--steps", "2", *options]
+    places = ["--fleet", str(tmp_path / "fleet.toml"), "--data", str(tmp_path / "lake")]
+    command = ["train", "--task", task, *places, "--out", str(tmp_path / "run"), "--steps", "2", *options]
     assert main([*command, "--batch-size", "2"]) == 0
     summary = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert (summary["status"], summary["samples"], summary["held_out_samples"]) == ("done", *counts)
@@ -421,6 +421,16 @@ def test_the_job_trains_on_a_lake_holds_days_out_and_leaves_model_manifest_and_c
 
 
 def test_an_option_of_the_other_task_is_refused_by_name(tmp_path, capsys):
-    places = ["--fleet", str(tmp_path), "--lake", str(tmp_path), "--out", str(tmp_path / "run")]
-    assert main(["train-perception", "radar_drivable", *places, "--rows", "24"]) == 2
-    assert "rows" in capsys.readouterr().out
+    fleet = tmp_path / "fleet.toml"
+    fleet.write_text(fleet_toml("a"))
+    command = ["train", "--data", str(tmp_path), "--out", str(tmp_path / "run")]
+    perception = ["--task", "radar_drivable", "--fleet", str(fleet)]
+    for options, named in (
+        ([*perception, "--rows", "24"], "rows"),
+        ([*perception, "--compiled"], "compiled"),
+        (perception[:2], "fleet"),
+        (perception[2:], "fleet"),
+        (["--columns", "24"], "columns"),
+    ):
+        assert main([*command, *options]) == 2
+        assert named in json.loads(capsys.readouterr().out.splitlines()[-1])["reason"]

@@ -141,7 +141,7 @@ def test_the_command_shows_the_licence_places_manifests_and_says_the_line(
     made = [dataclasses.replace(m, size_bytes=len(CONTENT), sha256=SHA256) for m in CATALOGUE]
     monkeypatch.setattr(models, "CATALOGUE", tuple(made))
     mirror = server.url.rsplit("/", 1)[0]
-    assert main(["models", "fetch", "--into", str(tmp_path / "models"), "--mirror", mirror]) == 0
+    assert main(["models", "--fetch", "--into", str(tmp_path / "models"), "--mirror", mirror]) == 0
     shown = capsys.readouterr()
     said = json.loads(shown.out.splitlines()[-1])
     assert said["fetched"] == [m.name for m in CATALOGUE]
@@ -151,8 +151,8 @@ def test_the_command_shows_the_licence_places_manifests_and_says_the_line(
         assert (manifest.sha256, manifest.task) == (SHA256, model.task)
     entered = tomllib.loads(said["enter_in_fleet_toml"])["rigs"]["NAME"]["camera"]["semantics"]
     assert all(Path(entered[key]).exists() for key in ("segmenter", "detector"))
-    assert main(["models", "fetch", "no-such"]) == 2
+    assert main(["models", "--fetch", "no-such"]) == 2
     changed = tmp_path / "models" / f"{CATALOGUE[0].name}.toml"
     changed.write_text(changed.read_text().replace("[512, 1024]", "[256, 512]"))
-    assert main(["models", "fetch", "--into", str(tmp_path / "models"), "--mirror", mirror]) == 0
+    assert main(["models", "--fetch", "--into", str(tmp_path / "models"), "--mirror", mirror]) == 0
     assert "[256, 512]" in changed.read_text()
