@@ -3,8 +3,7 @@
 A bias floor is the standard deviation of an error common to all frames of a day, which resampling frames does
 not show; it is added to an estimate's covariance in quadrature. Order of six: rotation vector, then shift of
 the child's origin, both in the parent's axes [rad, m]; of eight: then time offset [s] and the pair's nuisance
-(focal scale, range bias [m]). Solver and held-out update have separate floors for a pair: the solver's were
-measured again on later simulated days, the held-out update kept the earlier ones (`HELD_OUT_BIAS`).
+(focal scale, range bias [m]). Held-out frames err by the same as those of the fit (`HELD_OUT_BIAS`).
 """
 
 from __future__ import annotations
@@ -120,14 +119,11 @@ PRIOR_CONTRADICTION_SIGMAS = 2.5
 
 # -- held-out frames -------------------------------------------------------------------------------------------------
 
-# Differs from the solver's floors above: camera-lidar y 0.010 for 0.006 m; lidar-radar pitch 0.15 for 0.2 deg, yaw 0.05
-# for 0.01 deg, x 0.02 for 0.025 m, y 0.02 for 0.013 m; camera-radar yaw 0.1 for 0.25 deg, roll 0.3 for 0.1 deg,
-# position 0.1 m for none (the solver's stays at the prior). One set for both would change
-# what held-out frames certify.
+# With the time offset's floor and none for the pair's nuisance, whose sigma is stated with the frames' score.
 HELD_OUT_BIAS = {
-    "camera_lidar": np.array([*np.radians([0.03] * 3), 0.01, 0.01, 0.01, CAMERA_LIDAR_DT_FLOOR_S, 0.0]),
-    "lidar_radar": np.array([*np.radians([0.1, 0.15, 0.05]), 0.02, 0.02, 0.02, LIDAR_RADAR_DT_FLOOR_S, 0.0]),
-    "camera_radar": np.array([*np.radians([0.3, 0.1, 0.3]), 0.1, 0.1, 0.1, 0.0, 0.0]),
+    "camera_lidar": np.array([*CAMERA_LIDAR_BIAS, CAMERA_LIDAR_DT_FLOOR_S, 0.0]),
+    "lidar_radar": np.array([*LIDAR_RADAR_BIAS, LIDAR_RADAR_DT_FLOOR_S, 0.0]),
+    "camera_radar": np.array([*CAMERA_RADAR_BIAS, 0.0, 0.0]),
 }
 
 # -- baselines -------------------------------------------------------------------------------------------------------
