@@ -137,7 +137,7 @@ def _summarise(statuses: Sequence[str], findings: Sequence[DriftFinding], **told
 
 def _simulate(spec: FleetSpec, out: Path, workers: int | None) -> None:
     """Write the fleet's logs, unless the folder contains the same fleet already."""
-    from pipeline.simulate.fleet import day_names, mixed_fleet_toml, rigs_of, vehicle_names
+    from pipeline.simulate.fleet import day_names, fleet_toml, rigs_of, vehicle_names
 
     stamp, key = out / ".simulated", config_hash({"spec": repr(spec), "code": CODE_VERSION})
     if stamp.is_file() and stamp.read_text() == key:
@@ -147,7 +147,7 @@ def _simulate(spec: FleetSpec, out: Path, workers: int | None) -> None:
         shutil.rmtree(out / folder, ignore_errors=True)
     out.mkdir(parents=True, exist_ok=True)
     vehicles, days = vehicle_names(spec), day_names(spec.first_day, spec.days)
-    (out / "fleet.toml").write_text(mixed_fleet_toml("demo", rigs_of(spec)))
+    (out / "fleet.toml").write_text(fleet_toml("demo", rigs_of(spec)))
     work = [(spec, v, d, out) for d in range(len(days)) for v in range(len(vehicles))]
     names = [f"{vehicles[v]} {days[d]}" for _, v, d, _ in work]
     with (

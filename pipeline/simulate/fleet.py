@@ -37,7 +37,6 @@ __all__ = [
     "day_names",
     "drive_of",
     "fleet_toml",
-    "mixed_fleet_toml",
     "mounting_on",
     "rig_of",
     "rigs_of",
@@ -70,14 +69,8 @@ class FleetSpec:
     semantics: SemanticsSpec = field(default_factory=SemanticsSpec)
 
     def __post_init__(self) -> None:
-        counts = {
-            "vehicles": self.vehicles,
-            "days": self.days,
-            "frames": self.frames,
-            "drives": self.drives,
-            "rate_hz": self.rate_hz,
-        }
-        for name, value in counts.items():
+        for name in ("vehicles", "days", "frames", "drives", "rate_hz"):
+            value = getattr(self, name)
             if value <= 0:
                 raise ConfigError("simulate", name, f"{value} is not positive")
         if self.environments != _IN_TURN:
@@ -122,7 +115,7 @@ def simulate_fleet(
     """Write `logs/VEHICLE/DAY/`, `truth/VEHICLE/DAY.json` and `fleet.toml` to `out`; returns a summary."""
     vehicles, days = vehicle_names(spec), day_names(spec.first_day, spec.days)
     out.mkdir(parents=True, exist_ok=True)
-    (out / "fleet.toml").write_text(mixed_fleet_toml("synthetic", rigs_of(spec)))
+    (out / "fleet.toml").write_text(fleet_toml("synthetic", rigs_of(spec)))
     work = [(v, d) for d in range(len(days)) for v in range(len(vehicles))]
     total, done, logs = len(work) * spec.frames, 0, 0
     if workers <= 1:
@@ -267,22 +260,13 @@ def _truth(spec: FleetSpec, vehicle: int, day: int) -> dict[str, Any]:
     }
 
 
-def fleet_toml(fleet: str, rig_name: str, rig: RigSpec, vehicles: list[str]) -> str:
-    """Text of fleet.toml; the prior's sigmas are deviations of a pair of sensors from CAD."""
-    return _text(fleet, {rig_name: rig}, dict.fromkeys(vehicles, rig_name))
-
-
-def mixed_fleet_toml(fleet: str, rigs: Mapping[str, RigSpec]) -> str:
-    """Text of fleet.toml for vehicles with a rig each."""
-    return _text(fleet, {r.name: r for r in rigs.values()}, {v: r.name for v, r in rigs.items()})
-
-
-def _text(fleet: str, rigs: Mapping[str, RigSpec], vehicles: Mapping[str, str]) -> str:
+def fleet_toml(fleet: str, rigs: Mapping[str, RigSpec]) -> str:
+    """Text of fleet.toml for vehicles with a rig each; the prior's sigmas are deviations of a pair from CAD."""
     lines = ["[fleet]", f'name = "{fleet}"', ""]
-    for name, rig in rigs.items():
+    for name, rig in {r.name: r for r in rigs.values()}.items():
         lines += [*_sections(name, rig), ""]
-    for vehicle, rig_name in vehicles.items():
-        lines += [f'[vehicles."{vehicle}"]', f'rig = "{rig_name}"', ""]
+    for vehicle, rig in rigs.items():
+        lines += [f'[vehicles."{vehicle}"]', f'rig = "{rig.name}"', ""]
     return "\n".join(lines[:-1]) + "\n"
 
 

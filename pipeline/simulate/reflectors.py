@@ -127,7 +127,6 @@ def _picks(
     pixels, _ = camera.project(seen)
     positions = zip(pixels, lidar, radar, strict=True)
     targets = [_target(scans, *position, camera.width_px, rng) for position in positions]
-    pairs = (("camera", "lidar"), ("lidar", "radar"), ("camera", "radar"))
     return {
         "vehicle": vehicle,
         "day": day,
@@ -146,7 +145,7 @@ def _picks(
             "lidar_m": lidar.tolist(),
             "radar_m": radar.tolist(),
             "camera_K": camera.K.tolist(),
-            **{f"T_{a}_{b}": m.between(a, b).tolist() for a, b in pairs},
+            **m.pairs(),
         },
     }
 

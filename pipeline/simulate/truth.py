@@ -15,7 +15,7 @@ __all__ = ["truth_of"]
 
 def truth_of(rig: RigSpec, morning: Mounting, evening: Mounting, today: DayFaults) -> dict[str, Any]:
     """Poses, clocks and errors of a day's sensors; stamp_a = stamp_b + dt_a_b_s, as in records."""
-    ends = _poses(evening) | (_pairs(evening) if rig.is_short else {})
+    ends = _poses(evening) | (evening.pairs() if rig.is_short else {})
     return {
         "rig": rig.name,
         "reference": rig.reference.name,
@@ -43,19 +43,13 @@ def _camera(sensor: SensorSpec, mounting: Mounting, today: DayFaults) -> dict[st
     return {"K": true.K.tolist(), "K_logged": stated.K.tolist(), "readout_s": sensor.sheet.readout_s}
 
 
-def _pairs(m: Mounting) -> dict[str, Any]:
-    """T_parent_child of the pairs of a three-sensor rig."""
-    pairs = (("camera", "lidar"), ("lidar", "radar"), ("camera", "radar"))
-    return {f"T_{a}_{b}": m.between(a, b).tolist() for a, b in pairs}
-
-
 def _of_three(m: Mounting, rig: RigSpec, today: DayFaults) -> dict[str, Any]:
     """Truth of a three-sensor rig under the keys that its readers expect."""
     camera, radar, errors = m["camera"], m["radar"], m["radar"].errors
     assert errors is not None
     about = _camera(rig["camera"], m, today)
     return {
-        **_pairs(m),
+        **m.pairs(),
         **{f"T_vehicle_{n}": mounted.T_vehicle.tolist() for n, mounted in m.sensors.items()},
         "dt_camera_lidar_s": camera.delay_s,
         "dt_lidar_radar_s": -radar.delay_s,

@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 from pipeline.core.config import load_fleet
 from pipeline.core.errors import ConfigError
 from pipeline.rig.topics import TOPICS
-from pipeline.simulate.fleet import FleetSpec, drive_of, fleet_toml, mixed_fleet_toml, simulate_vehicle_day
+from pipeline.simulate.fleet import FleetSpec, drive_of, fleet_toml, simulate_vehicle_day
 from pipeline.simulate.sensors.camera import RollingShutter, render, view_of
 from pipeline.simulate.sensors.data_sheets import LidarSpec
 from pipeline.simulate.sensors.lidar import beams_of
@@ -23,7 +23,7 @@ every_rig = pytest.mark.parametrize("name", [*SHORT, "random-7003", "random-7004
 @every_rig
 def test_a_rig_has_a_fleet_file_and_true_poses_near_its_drawings(name, tmp_path):
     rig = rig_named(name)
-    (tmp_path / "fleet.toml").write_text(fleet_toml("f", name, rig, ["v"]))
+    (tmp_path / "fleet.toml").write_text(fleet_toml("f", {"v": rig}))
     radar = load_fleet(tmp_path / "fleet.toml").rig_of("v").radar
     assert radar.doppler_period_mps == rig["radar"].sheet.doppler_period_mps
     mounting = mounting_of(rig, 3, 0, 0)
@@ -77,7 +77,7 @@ def test_random_rigs_are_of_all_kinds_and_a_seed_s_own():
 
 def test_every_vehicle_of_a_mixed_fleet_has_its_own_rig(tmp_path):
     rigs = {f"v{seed}": rig_named(f"random-{seed}") for seed in range(3)}
-    (tmp_path / "fleet.toml").write_text(mixed_fleet_toml("f", rigs))
+    (tmp_path / "fleet.toml").write_text(fleet_toml("f", rigs))
     fleet = load_fleet(tmp_path / "fleet.toml")
     for vehicle, rig in rigs.items():
         assert fleet.rig_of(vehicle).radar.doppler_period_mps == rig["radar"].sheet.doppler_period_mps

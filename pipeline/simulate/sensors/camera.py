@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, no_type_check
 
 import cv2
+import numba
 import numpy as np
 from jaxtyping import Float, Float64, Int32
 
 from pipeline.rig.cameras import Camera
-from pipeline.simulate.sensors.pixels import upsampled
 from pipeline.simulate.sensors.shading import Light, Sight, Surfaces, developed, shade
 from pipeline.simulate.world.casting import Moment
 from pipeline.simulate.world.drives import Motion
@@ -85,11 +85,33 @@ def view_of(
     half, half_rows = _aimed(moment, camera.scaled(0.5), T_map_camera, shutter)
     full, full_rows = _aimed(moment, camera, T_map_camera, shutter)
     coarse = _seen(moment, half, half_rows, np.arange(half[..., 0].size)).reshape(half.shape[:2])
-    guess, unsure = upsampled(coarse, _surfaces(moment), camera.height_px, camera.width_px)
+    guess, unsure = _upsampled(coarse, _surfaces(moment), camera.height_px, camera.width_px)
     guess.reshape(-1)[unsure] = _seen(moment, full, full_rows, unsure)
     return View(
         coarse, guess, full, (T_map_camera[:3, 3] - moment.standing.origin).astype(np.float32), shutter
     )
+
+
+@no_type_check  # keeps the tests' shape checks out of compiled code
+@numba.njit(cache=True)
+def _upsampled(coarse, surface, height, width):  # noqa: ANN001, ANN202 - compiled
+    """Triangles at full size, and flat indices of pixels with several surfaces in their neighbourhood."""
+    h, w = coarse.shape
+    out = np.empty((height, width), np.int32)
+    unsure = np.empty(height * width, np.int64)
+    n = 0
+    for v in range(height):
+        i = min(v // 2, h - 1)
+        i2 = min(max(i + (1 if v % 2 else -1), 0), h - 1)
+        for u in range(width):
+            j = min(u // 2, w - 1)
+            j2 = min(max(j + (1 if u % 2 else -1), 0), w - 1)
+            out[v, u] = coarse[i, j]
+            a = surface[coarse[i, j]]
+            if a != surface[coarse[i2, j]] or a != surface[coarse[i, j2]] or a != surface[coarse[i2, j2]]:
+                unsure[n] = v * width + u
+                n += 1
+    return out, unsure[:n]
 
 
 class _Rows(NamedTuple):

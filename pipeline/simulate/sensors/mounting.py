@@ -56,6 +56,11 @@ class Mounting:
         """True T_parent_child of two sensors."""
         return inverse(self[parent].T_vehicle) @ self[child].T_vehicle
 
+    def pairs(self) -> dict[str, list[list[float]]]:
+        """True T_parent_child of the pairs of a three-sensor rig."""
+        pairs = (("camera", "lidar"), ("lidar", "radar"), ("camera", "radar"))
+        return {f"T_{a}_{b}": self.between(a, b).tolist() for a, b in pairs}
+
     def camera(self, name: str) -> tuple[Camera, Camera]:
         """Intrinsics of a camera: true, and as logged."""
         mounted = self[name]

@@ -87,12 +87,6 @@ def scan_radar(
     """One scan at the time of the moment.
 
     Args:
-        moment: the world.
-        ego: motion of the vehicle.
-        T_vehicle_radar: mounting.
-        spec: data sheet.
-        errors: constant errors.
-        rng: noise.
         mirrors_m: offsets to the left of the vehicle of long walls and rails that reflect targets.
         beacons_map: corner reflectors, strong enough to be detected in every scan.
     """

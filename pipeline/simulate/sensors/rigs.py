@@ -15,8 +15,7 @@ import numpy as np
 
 from pipeline.core.errors import ConfigError
 from pipeline.simulate.sensors.data_sheets import CameraSpec, LidarSpec, RadarSpec
-from pipeline.simulate.sensors.rig_spec import RigSpec, SensorSpec, short_rig
-from pipeline.simulate.sensors.van import DUO, VAN
+from pipeline.simulate.sensors.rig_spec import RigSpec, SensorSpec, Sheet, short_rig
 
 __all__ = ["RIGS", "rig_named"]
 
@@ -47,6 +46,59 @@ _ASPECT: Final = (1.3, 3.4)  # width over height: 4:3 to a strip cut from the im
 _SPARSE_ROWS: Final = (16, 16, 20, 24, 32, 32, 40)
 _DENSE_ROWS: Final = (48, 64, 64, 80, 96, 128)
 _SPARSE_SHARE: Final = 0.5  # networks trained on dense lidars fail on 16 rings
+
+
+# A delivery van with six cameras, two lidars and five radars, each with its own clock; and a subset, `duo`. The roof's
+# lidar overlaps with every camera, cameras with their neighbours, and the rear corner radars with the rear cameras.
+# Lens and pixels of surround cameras at about a third of their resolution; lens distortion is logged.
+_VAN_SIDE: Final = CameraSpec(
+    800, 500, 84.0, 58.7, model="plumb_bob", distortion=(-0.20, 0.05, 3e-4, -2e-4, -0.004)
+)
+_VAN_FRONT: Final = CameraSpec(912, 470)
+_VAN_REAR: Final = CameraSpec(720, 540, 186.0, 139.5)
+# 0.4 by 1.3 deg over 360 deg; a flash lidar in the grille that looks ahead, 120 by 25 deg.
+_VAN_ROOF: Final = LidarSpec((-180.0, 180.0), (-25.0, 15.0), 900, 32, 0.1, 1.2, 100.0)
+_VAN_GRILLE: Final = LidarSpec((-60.0, 60.0), (-12.5, 12.5), 300, 40, 0.05, 1.0, 90.0)
+_VAN_NOSE: Final = RadarSpec(azimuth_deg=45.0, max_range_m=100.0, rays=7000)
+_VAN_CORNER: Final = RadarSpec(
+    azimuth_deg=70.0, azimuth_resolution_deg=3.2, min_range_m=1.0, max_range_m=70.0, rays=7000
+)
+
+
+def _van_camera(name: str, sheet: CameraSpec, xyz_m: tuple[float, float, float], yaw_deg: float, pitch_deg: float,
+            delay_s: float) -> SensorSpec:  # fmt: skip
+    return SensorSpec(name, sheet, xyz_m, (0.0, pitch_deg, yaw_deg), delay_s, 30.0)
+
+
+_VAN: Final = RigSpec(
+    "van",
+    (
+        _van_camera("front", _VAN_FRONT, (2.05, 0.02, 1.95), 0.0, 2.0, 0.012),
+        _van_camera("left", _VAN_SIDE, (1.60, 0.98, 1.90), 70.0, 4.0, 0.009),
+        _van_camera("right", _VAN_SIDE, (1.60, -0.98, 1.90), -70.0, 4.0, 0.015),
+        _van_camera("rear_left", _VAN_SIDE, (1.40, 1.00, 1.90), 125.0, 4.0, 0.006),
+        _van_camera("rear_right", _VAN_SIDE, (1.40, -1.00, 1.90), -125.0, 4.0, 0.011),
+        _van_camera("rear", _VAN_REAR, (-0.95, 0.0, 1.75), 180.0, 10.0, 0.020),
+        SensorSpec("top", _VAN_ROOF, (1.20, 0.0, 2.35), rate_hz=10.0),
+        SensorSpec("grille", _VAN_GRILLE, (3.30, 0.05, 0.90), delay_s=-0.007, rate_hz=20.0),
+        SensorSpec("nose", _VAN_NOSE, (3.40, -0.20, 0.55), delay_s=-0.018, rate_hz=14.0),
+        SensorSpec("corner_fl", _VAN_CORNER, (3.15, 0.88, 0.60), (0.0, 0.0, 50.0), -0.025, 17.0),
+        SensorSpec("corner_fr", _VAN_CORNER, (3.15, -0.88, 0.60), (0.0, 0.0, -50.0), -0.021, 17.0),
+        SensorSpec("corner_rl", _VAN_CORNER, (-0.85, 0.90, 0.65), (0.0, 0.0, 135.0), -0.028, 17.0),
+        SensorSpec("corner_rr", _VAN_CORNER, (-0.85, -0.90, 0.65), (0.0, 0.0, -135.0), -0.023, 17.0),
+    ),
+    behind_m=150.0,
+)
+
+# For the demo: as fast as a three-sensor rig.
+_DUO_SHEETS: Final[dict[str, Sheet]] = {
+    "front": CameraSpec(608, 312),
+    "left": CameraSpec(480, 300, 84.0, 58.7, model="plumb_bob", distortion=_VAN_SIDE.distortion),
+    "top": replace(_VAN_ROOF, columns=450),
+    "nose": replace(_VAN_NOSE, rays=4000),
+    "corner_fl": replace(_VAN_CORNER, rays=4000),
+}
+_DUO: Final = RigSpec("duo", tuple(replace(_VAN[name], sheet=sheet) for name, sheet in _DUO_SHEETS.items()))
 
 
 def _demo(
@@ -131,8 +183,8 @@ _ALL: Final = (
     _demo("bumper", xyz_m=(_CAMERA_M, _LIDAR_M, (3.70, 0.05, 0.50))),
     # Nose down, and twice as fast.
     _demo("tilted", lidar=replace(_LIDAR, sweep_s=0.04), rpy_deg=(_LEVEL, (0.0, 5.0, 0.0), _LEVEL)),
-    VAN,
-    DUO,
+    _VAN,
+    _DUO,
 )  # fmt: skip
 RIGS: Final = {rig.name: rig for rig in _ALL}
 # Suffixes of rig names, and their changes of the radars. `-dirty` matches two real-like days by statistics

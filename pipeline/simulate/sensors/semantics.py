@@ -7,13 +7,13 @@ Boxes: small and hidden road users are missed, edges jitter with the size, some 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, no_type_check
 
 import cv2
+import numba
 import numpy as np
 from jaxtyping import Float, Int32, UInt8
 
-from pipeline.simulate.sensors.pixels import extents
 from pipeline.simulate.world.casting import Moment
 from pipeline.simulate.world.materials import LABELS, TABLE
 
@@ -167,7 +167,7 @@ def boxes_of(moment: Moment, coarse: Int32[np.ndarray, "h w"]) -> list[tuple[Box
     group = np.full(len(mesh), -1, np.int64)
     group[bodies] = number
     found = []
-    for key, (x0, y0, x1, y1, pixels) in zip(keys, extents(coarse, group, len(keys)), strict=True):
+    for key, (x0, y0, x1, y1, pixels) in zip(keys, _extents(coarse, group, len(keys)), strict=True):
         if pixels > 0 and LABELS[key % 32] in _COCO:
             # half-size pixel j covers full-size pixels 2j and 2j + 1
             found.append(
@@ -184,6 +184,24 @@ def boxes_of(moment: Moment, coarse: Int32[np.ndarray, "h w"]) -> list[tuple[Box
                 )
             )
     return found
+
+
+@no_type_check  # keeps the tests' shape checks out of compiled code
+@numba.njit(cache=True)
+def _extents(coarse, group, groups):  # noqa: ANN001, ANN202 - compiled
+    """(x0, y0, x1, y1, pixels) of each group of triangles."""
+    out = np.empty((groups, 5), np.int64)
+    out[:, :2], out[:, 2:] = 1 << 30, -1
+    out[:, 4] = 0
+    h, w = coarse.shape
+    for i in range(h):
+        for j in range(w):
+            k = coarse[i, j]
+            if k >= 0 and group[k] >= 0:
+                o = out[group[k]]
+                o[0], o[1], o[2], o[3] = min(o[0], j), min(o[1], i), max(o[2], j), max(o[3], i)
+                o[4] += 1
+    return out
 
 
 def noisy_boxes(

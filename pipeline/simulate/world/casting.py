@@ -9,8 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, no_type_check
 
+import numba
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
@@ -22,7 +23,6 @@ from pipeline.simulate.world.drives import Drive
 from pipeline.simulate.world.landscapes import LANDSCAPES, Landscape
 from pipeline.simulate.world.meshes import Mesh, join, placed
 from pipeline.simulate.world.plots import add_halls, add_plots, add_rows
-from pipeline.simulate.world.ray_selection import rays_near
 from pipeline.simulate.world.street import add_asphalt, add_motorway, add_street
 from pipeline.simulate.world.traffic import Actor, actors_at
 
@@ -163,7 +163,7 @@ class Moment:
             centre = p + R @ proto.centre
             if not _may_be_seen(centre - origins[0], proto.reach_m + 3.0, axis, cosine):
                 continue
-            near = rays_near(origins, directions, delay, centre, v, np.float32(proto.reach_m), range_m)
+            near = _rays_near(origins, directions, delay, centre, v, np.float32(proto.reach_m), range_m)
             if not near.size:
                 continue
             o = (origins[near] - p - v * delay[near, None]) @ R
@@ -203,6 +203,30 @@ def _cone(directions: np.ndarray) -> tuple[np.ndarray, float]:
     axis = directions[:: max(len(directions) // 512, 1)].mean(0)
     axis /= max(float(np.linalg.norm(axis)), 1e-6)
     return axis, float((directions @ axis).min())
+
+
+@no_type_check  # keeps the tests' shape checks out of compiled code
+@numba.njit(cache=True)
+def _rays_near(origins, directions, delay, centre, velocity, radius, limit):  # noqa: ANN001, ANN202 - compiled
+    """Indices of the rays (unit vectors) that pass within `radius` of a moving point, before their `limit`.
+
+    `delay` is the time of each ray after that of `centre` [s].
+    """
+    out = np.empty(len(directions), np.int64)
+    n = 0
+    for i in range(len(directions)):
+        x = centre[0] + velocity[0] * delay[i] - origins[i, 0]
+        y = centre[1] + velocity[1] * delay[i] - origins[i, 1]
+        z = centre[2] + velocity[2] * delay[i] - origins[i, 2]
+        along = x * directions[i, 0] + y * directions[i, 1] + z * directions[i, 2]
+        if (
+            along > -radius
+            and x * x + y * y + z * z - along * along < radius * radius
+            and along - radius < limit[i]
+        ):
+            out[n] = i
+            n += 1
+    return out[:n]
 
 
 def _may_be_seen(centre: np.ndarray, reach_m: float, axis: np.ndarray, cosine: float) -> bool:

@@ -232,16 +232,16 @@ class EgoMotion:
 
     def arc(self, t_s: float) -> float:
         """Arc length [m] at a time."""
-        return float(np.interp(t_s, self._profile.t_s, self._profile.s_m))
+        return float(self._arcs(np.array(t_s)))
 
     def _arcs(self, t_s: np.ndarray) -> np.ndarray:
         return np.interp(t_s, self._profile.t_s, self._profile.s_m)
 
     def poses(self, t_s: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N 4 4"]:
         """T_map_vehicle at times; the body pitches and rolls on its springs."""
-        here = self._ground(t_s)
-        slope = np.interp(t_s, self._profile.t_s, self._profile.slope)
-        s = self._arcs(t_s)
+        path, s = self._profile, self._arcs(t_s)
+        here = self.road.to_map(np.stack([s, np.interp(t_s, path.t_s, path.d_m), np.zeros_like(s)], -1))
+        slope = np.interp(t_s, path.t_s, path.slope)
         heading = self.road.centre(s)[3] + np.arctan(slope)
         z = self.road.centre(np.stack([s - 1.3, s + 1.3]))[2]
         grade = np.arctan2(z[1] - z[0], 2.6)
@@ -251,12 +251,6 @@ class EgoMotion:
         )
         roll = rough * (np.sin(0.7 * s / 2.3 + 2.0) * np.cos(0.07 * s))
         return from_rotation_translation(_rotation(heading, pitch, roll), here)
-
-    def _ground(self, t_s: np.ndarray) -> np.ndarray:
-        s = self._arcs(t_s)
-        return self.road.to_map(
-            np.stack([s, np.interp(t_s, self._profile.t_s, self._profile.d_m), np.zeros_like(s)], -1)
-        )
 
     def velocities(
         self, t_s: Float[np.ndarray, " N"]

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
 
 from pipeline.simulate.world.actors import HOLLOW, VARIANTS, actor_mesh
 from pipeline.simulate.world.chunk import CHUNK_M, Chunk, Span
 from pipeline.simulate.world.landscapes import Fence
-from pipeline.simulate.world.meshes import Mesh, MeshBuilder
-from pipeline.simulate.world.props import bush, tree
+from pipeline.simulate.world.meshes import MeshBuilder
+from pipeline.simulate.world.props import bush, made_once, tree
 from pipeline.simulate.world.street import add_house, add_parked, add_pavement
 
 __all__ = ["add_halls", "add_plots", "add_rows"]
@@ -77,11 +75,9 @@ def _fence(c: Chunk, s: Span, side: int, d: float, kind: Fence) -> None:
         c.band(s, (min(near, far), max(near, far)), (height, height), "hedge", 10.0, tint)
 
 
-@lru_cache(maxsize=64)
-def _post(height_m: float) -> Mesh:
-    b = MeshBuilder()
+@made_once
+def _post(b: MeshBuilder, height_m: float) -> None:
     b.tube(np.zeros(3), np.array([0, 0, height_m + 0.1]), 0.03, "metal_pole", 5)
-    return b.mesh()
 
 
 def add_rows(c: Chunk) -> None:
@@ -95,11 +91,9 @@ def add_rows(c: Chunk) -> None:
             c.put(_pole(), s, side * beside)
 
 
-@lru_cache(maxsize=1)
-def _pole() -> Mesh:
-    b = MeshBuilder()
+@made_once
+def _pole(b: MeshBuilder) -> None:
     b.tube(np.zeros(3), np.array([0, 0, 6.0]), 0.09, "metal_pole", 7)
-    return b.mesh()
 
 
 def add_halls(c: Chunk) -> None:
@@ -118,11 +112,9 @@ def add_halls(c: Chunk) -> None:
             _bays(c, side, beam + 0.5, edge + 3.2)
 
 
-@lru_cache(maxsize=8)
-def _column(top_m: float) -> Mesh:
-    b = MeshBuilder()
+@made_once
+def _column(b: MeshBuilder, top_m: float) -> None:
     b.box((0, 0, top_m / 2), (0.5, 0.5, top_m), "concrete")
-    return b.mesh()
 
 
 def _bays(c: Chunk, side: int, s: float, d: float) -> None:

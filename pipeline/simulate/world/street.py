@@ -89,20 +89,9 @@ def _frontage(c: Chunk, side: int, d: float) -> None:
             )
         if kind > 0.45:
             for _ in range(int(rng.integers(1, 4))):
-                c.put(
-                    tree(int(rng.integers(40))),
-                    s + rng.uniform(1, width),
-                    side * (d + rng.uniform(3, 14)),
-                    0.1,
-                    rng.uniform(0, 6),
-                )
-                c.put(
-                    bush(int(rng.integers(20))),
-                    s + rng.uniform(1, width),
-                    side * (d + rng.uniform(1.2, 3)),
-                    0.1,
-                    rng.uniform(0, 6),
-                )
+                for plant, kinds, near, far in ((tree, 40, 3, 14), (bush, 20, 1.2, 3)):
+                    mesh, at = plant(int(rng.integers(kinds))), s + rng.uniform(1, width)
+                    c.put(mesh, at, side * (d + rng.uniform(near, far)), 0.1, rng.uniform(0, 6))
         s += width
 
 
