@@ -6,7 +6,6 @@ import json
 import shutil
 import time
 from collections.abc import Sequence
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,14 +14,12 @@ from rich.console import Console
 
 from jobs.extras import needs
 from jobs.nightly import Drawing, close_night, watch_night
+from jobs.simulate import simulate_days
 from jobs.terminal.demo_table import print_comparison, print_methods
 from jobs.terminal.night_view import night_view
 from jobs.terminal.summary import exit_code, is_terminal, print_summary
 from jobs.terminal.vehicle_status import count_statuses, moved_sensors
 from pipeline.core.config import config_hash, load_fleet
-from pipeline.core.errors import LogError
-from pipeline.core.results import Progress
-from pipeline.fleet.executor import EXECUTORS
 from pipeline.fleet.nightly import DayOutcome, Night
 from pipeline.fleet.pattern import find_vehicle_days
 from pipeline.report.truth import read_truth
@@ -137,7 +134,6 @@ def _summarise(statuses: Sequence[str], findings: Sequence[DriftFinding], **told
 
 def _simulate(spec: FleetSpec, out: Path, workers: int | None) -> None:
     """Write the fleet's logs, unless the folder contains the same fleet already."""
-    from pipeline.simulate.fleet import day_names, fleet_toml, rigs_of, vehicle_names
 
     stamp, key = out / ".simulated", config_hash({"spec": repr(spec), "code": CODE_VERSION})
     if stamp.is_file() and stamp.read_text() == key:
@@ -145,26 +141,8 @@ def _simulate(spec: FleetSpec, out: Path, workers: int | None) -> None:
     stamp.unlink(missing_ok=True)
     for folder in ("logs", "truth"):
         shutil.rmtree(out / folder, ignore_errors=True)
-    out.mkdir(parents=True, exist_ok=True)
-    vehicles, days = vehicle_names(spec), day_names(spec.first_day, spec.days)
-    (out / "fleet.toml").write_text(fleet_toml("demo", rigs_of(spec)))
-    work = [(spec, v, d, out) for d in range(len(days)) for v in range(len(vehicles))]
-    names = [f"{vehicles[v]} {days[d]}" for _, v, d, _ in work]
-    with (
-        night_view(names, len(work), title="simulate") as view,
-        closing(EXECUTORS["process"](_simulate_one, work, workers, view.watch)) as results,
-    ):
-        for finished in results:
-            if finished.error:
-                raise LogError(str(out), f"simulating failed: {finished.error}\n{finished.trace}")
-            view.ended(names[work.index(finished.item)])
+    simulate_days(spec, out, "demo", workers)
     stamp.write_text(key)
-
-
-def _simulate_one(work: tuple[FleetSpec, int, int, Path], progress: Progress) -> int:
-    from pipeline.simulate.fleet import simulate_vehicle_day
-
-    return simulate_vehicle_day(*work, progress)
 
 
 def _say(text: str) -> None:

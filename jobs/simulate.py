@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from jobs.extras import needs
+from jobs.terminal.night_view import night_view
 from jobs.terminal.summary import print_summary, progress_reporter
-from pipeline.core.errors import ConfigError
+from pipeline.core.errors import ConfigError, LogError
+from pipeline.core.results import Progress
+from pipeline.fleet.executor import EXECUTORS
 
 if TYPE_CHECKING:
     from pipeline.simulate.fleet import FleetSpec
 
-__all__ = ["simulate"]
+__all__ = ["simulate", "simulate_days"]
 
 
 @needs("simulate")
@@ -65,37 +70,59 @@ def simulate(
 
     spec_of_rig = rig_named(rig)
     if reflectors and not spec_of_rig.is_short:
-        raise ConfigError(
-            "--reflectors", rig, "three reflectors are recorded by rigs of camera, lidar and radar"
-        )
+        problem = "three reflectors are recorded by rigs of camera, lidar and radar"
+        raise ConfigError("--reflectors", rig, problem)
     named = parse_faults(faults, day_names(first_day, days), spec_of_rig)
     spec = FleetSpec(
-        vehicles=vehicles,
-        days=days,
-        first_day=first_day,
-        frames=frames,
-        rate_hz=rate_hz,
-        rig=rig,
-        environments=environments,
-        container=container,
-        faults=named,
-        seed=seed,
-        remount_deg=remount_deg,
-    )
+        vehicles=vehicles, days=days, first_day=first_day, frames=frames, rate_hz=rate_hz, rig=rig, seed=seed,
+        environments=environments, container=container, faults=named, remount_deg=remount_deg,
+    )  # fmt: skip
     return _write(spec, out, reflectors, workers)
 
 
 def _write(spec: FleetSpec, out: Path, reflectors: bool, workers: int) -> int:
     """Write logs and truth to `out`, and print the summary."""
-    from pipeline.simulate.fleet import simulate_fleet
+    from pipeline.simulate.fleet import day_names, vehicle_names
     from pipeline.simulate.reflectors import simulate_reflectors
 
-    with progress_reporter(f"simulate {spec.vehicles} x {spec.days}") as progress:
-        result = simulate_fleet(spec, out, progress, workers)
-        if reflectors:
-            last = spec.days - 1
+    result = {
+        "vehicles": vehicle_names(spec),
+        "days": day_names(spec.first_day, spec.days),
+        "frames": spec.vehicles * spec.days * spec.frames,
+        "logs": simulate_days(spec, out, "synthetic", workers),
+        "fleet": str(out / "fleet.toml"),
+        "truth": str(out / "truth"),
+    }
+    if reflectors:
+        with progress_reporter("reflectors") as progress:
             result["reflectors"] = [
-                str(simulate_reflectors(spec, v, last, out, progress=progress)) for v in range(spec.vehicles)
+                str(simulate_reflectors(spec, v, spec.days - 1, out, progress=progress))
+                for v in range(spec.vehicles)
             ]
     print_summary("simulate", "done", **result)
     return 0
+
+
+def simulate_days(spec: FleetSpec, out: Path, fleet: str, workers: int | None) -> int:
+    """Write fleet.toml and all vehicle-days, in so many processes, with progress; returns the number of logs."""
+    from pipeline.simulate.fleet import begin_fleet, day_names, vehicle_names
+
+    work, logs = begin_fleet(spec, out, fleet), 0
+    names = [f"{vehicle_names(spec)[v]} {day_names(spec.first_day, spec.days)[d]}" for v, d in work]
+    run = EXECUTORS["process" if workers is None or workers > 1 else "inline"]
+    with (
+        night_view(names, len(work), title="simulate") as view,
+        closing(run(partial(_simulate_one, spec, out), work, workers, view.watch)) as results,
+    ):
+        for finished in results:
+            if finished.error:
+                raise LogError(str(out), f"simulating failed: {finished.error}\n{finished.trace}")
+            view.ended(names[work.index(finished.item)])
+            logs += finished.value or 0
+    return logs
+
+
+def _simulate_one(spec: FleetSpec, out: Path, at: tuple[int, int], progress: Progress) -> int:
+    from pipeline.simulate.fleet import simulate_vehicle_day
+
+    return simulate_vehicle_day(spec, *at, out, progress)

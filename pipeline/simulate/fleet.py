@@ -3,14 +3,9 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
-import sys
 from collections.abc import Mapping
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, date, datetime, timedelta
-from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Any, Final
 
@@ -34,6 +29,7 @@ from pipeline.simulate.world.landscapes import landscape_named
 
 __all__ = [
     "FleetSpec",
+    "begin_fleet",
     "day_names",
     "drive_of",
     "fleet_toml",
@@ -109,65 +105,17 @@ def day_names(first_day: str, days: int) -> list[str]:
     return [(first + timedelta(days=i)).isoformat() for i in range(days)]
 
 
-def simulate_fleet(
-    spec: FleetSpec, out: Path, progress: Progress = silent, workers: int = 1
-) -> dict[str, Any]:
-    """Write `logs/VEHICLE/DAY/`, `truth/VEHICLE/DAY.json` and `fleet.toml` to `out`; returns a summary."""
-    vehicles, days = vehicle_names(spec), day_names(spec.first_day, spec.days)
+def simulate_fleet(spec: FleetSpec, out: Path) -> None:
+    """Write `logs/VEHICLE/DAY/`, `truth/VEHICLE/DAY.json` and `fleet.toml` to `out`, day by day."""
+    for vehicle, day in begin_fleet(spec, out, "synthetic"):
+        simulate_vehicle_day(spec, vehicle, day, out)
+
+
+def begin_fleet(spec: FleetSpec, out: Path, name: str) -> list[tuple[int, int]]:
+    """Write fleet.toml; returns vehicle and day of all that is to be simulated."""
     out.mkdir(parents=True, exist_ok=True)
-    (out / "fleet.toml").write_text(fleet_toml("synthetic", rigs_of(spec)))
-    work = [(v, d) for d in range(len(days)) for v in range(len(vehicles))]
-    total, done, logs = len(work) * spec.frames, 0, 0
-    if workers <= 1:
-        for v, d in work:
-
-            def report(n: int, _total: int, what: str, base: int = done) -> None:
-                progress(base + n, total, what)
-
-            logs += simulate_vehicle_day(spec, v, d, out, report)
-            done += spec.frames
-    else:
-        others = set(active_children())
-        context = get_context("spawn")
-        with ProcessPoolExecutor(workers, mp_context=context, initializer=_stop_on_sigterm) as pool:
-            jobs = {pool.submit(_work, spec, v, d, out): (v, d) for v, d in work}
-            try:
-                for job in as_completed(jobs):
-                    v, d = jobs[job]
-                    logs, done = logs + job.result(), done + spec.frames
-                    progress(done, total, f"{vehicles[v]} {days[d]}")
-            except BaseException:
-                # After a stop or failure, remaining days are not needed, nor those in progress.
-                pool.shutdown(wait=False, cancel_futures=True)
-                for worker in set(active_children()) - others:
-                    worker.terminate()
-                raise
-    return {
-        "vehicles": vehicles,
-        "days": days,
-        "frames": total,
-        "logs": logs,
-        "fleet": str(out / "fleet.toml"),
-        "truth": str(out / "truth"),
-    }
-
-
-def _stop_on_sigterm() -> None:
-    """Make a worker unwind on SIGTERM, so that no log is half-written; ^C reaches it through its parent."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, _leave)
-
-
-def _work(spec: FleetSpec, vehicle: int, day: int, out: Path) -> int:
-    try:
-        return simulate_vehicle_day(spec, vehicle, day, out)
-    except SystemExit as err:  # after SIGTERM: without this the pool would give the worker the next day
-        os._exit(int(err.code or 0))
-
-
-def _leave(signum: int, _frame: Any) -> None:
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    sys.exit(128 + signum)
+    (out / "fleet.toml").write_text(fleet_toml(name, rigs_of(spec)))
+    return [(vehicle, day) for day in range(spec.days) for vehicle in range(spec.vehicles)]
 
 
 def simulate_vehicle_day(
