@@ -232,7 +232,7 @@ class EgoMotion:
 
     def arc(self, t_s: float) -> float:
         """Arc length [m] at a time."""
-        return float(self._arcs(np.array(t_s)))
+        return float(self._arcs(np.array([t_s]))[0])
 
     def _arcs(self, t_s: np.ndarray) -> np.ndarray:
         return np.interp(t_s, self._profile.t_s, self._profile.s_m)
