@@ -19,8 +19,7 @@ import torch
 from scipy.interpolate import CubicSpline
 
 from pipeline.core.config import load_fleet
-from pipeline.learn.batches.batch import TrainingBatch
-from pipeline.learn.batches.collate import collate
+from pipeline.learn.batches.batch import TrainingBatch, collate
 from pipeline.learn.sample.frame_sample import About, make_row
 from pipeline.learn.train.frame_objective import PAIR_OF_TERM, FrameObjective, frame_objective, weighted
 from pipeline.learn.train.settings import LossConfig

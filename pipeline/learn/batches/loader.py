@@ -17,8 +17,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.core.errors import ContractError
-from pipeline.learn.batches.batch import TrainingBatch
-from pipeline.learn.batches.collate import collate
+from pipeline.learn.batches.batch import TrainingBatch, collate
 from pipeline.learn.prepare.inventory import read_leaks
 from pipeline.store.partitions import Lake
 from pipeline.store.row_groups import RowGroup, read_columns, read_group, row_groups

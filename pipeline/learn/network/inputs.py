@@ -6,13 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
 import torch
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from pipeline.learn.batches.batch import TrainingBatch
 from pipeline.learn.sample.grid import Grid
-from pipeline.learn.sample.layout import CLASS_CONFIDENCE, FEATURE_UNITS
-from schemas.training import GRID_CLASSES, POINT_IS_EDGE, POINT_IS_GROUND, UNKNOWN_CLASS
+from pipeline.learn.sample.layout import CLASS_CONFIDENCE
+from schemas.training import GRID_CLASSES, UNKNOWN_CLASS
 
 __all__ = ["NetworkInputs", "SensorInputs", "crop", "given_classes", "sensor_inputs"]
 
@@ -57,24 +57,14 @@ class NetworkInputs:
 def sensor_inputs(batch: TrainingBatch, grid: Grid) -> SensorInputs:
     """Inputs from a batch of table `training`, whose grid has the same cells and contains the network's."""
     camera = torch.cat([batch.image, batch.grid_seen[:, None] * 255], 1)
-    flags = batch.lidar_flags
-    lidar_features = torch.stack(
-        [
-            batch.lidar_intensity / 255.0,
-            heights(batch.lidar_xyz_m, batch.lidar_valid, batch.ground_plane) / FEATURE_UNITS["height"],
-            ((flags & POINT_IS_EDGE) > 0).float(),
-            ((flags & POINT_IS_GROUND) > 0).float(),
-        ],
-        -1,
-    )
     return SensorInputs(
         crop(camera, batch.grid_step_deg, grid) / 255.0,
         given_classes(crop(batch.grid_class, batch.grid_step_deg, grid)),
         batch.lidar_xyz_m.float(),
-        lidar_features.float(),
+        batch.lidar_features,
         batch.lidar_valid,
         batch.radar_xyz_m.float(),
-        radar_features(batch.radar_residual_mps, batch.radar_power_db, batch.radar_motion == 1),
+        batch.radar_features,
         batch.radar_valid,
         batch.radar_has_elevation,
         torch.ones(len(batch), device=batch.image.device),
@@ -88,28 +78,6 @@ def given_classes(grid_class: UInt8[Tensor, "B H W"]) -> Float[Tensor, "B C H W"
     hot = torch.stack([(grid_class == k).float() for k in range(count)], 1)
     likelihood = CLASS_CONFIDENCE * hot + (1 - CLASS_CONFIDENCE) / count
     return torch.cat([likelihood * known, known], 1)
-
-
-def radar_features(
-    residual_mps: Float[Tensor, "B M"], power_db: Float[Tensor, "B M"], moving: Bool[Tensor, "B M"]
-) -> Float32[Tensor, "B M 3"]:
-    """RADAR_FEATURES from Doppler residuals, power over the scan's median, and perception's motion."""
-    speed = (residual_mps.abs() / FEATURE_UNITS["speed"]).clamp(max=2.0)
-    power = (power_db / FEATURE_UNITS["power"]).clamp(-2.0, 2.0)
-    return torch.stack([speed, power, moving.to(speed.dtype)], -1).float()
-
-
-def heights(
-    xyz_m: Float[Tensor, "B N 3"], valid: Bool[Tensor, "B N"], plane: Float[Tensor, "B 4"]
-) -> Float32[Tensor, "B N"]:
-    """Height over the ground plane [m], or over the frame's lowest points without a plane (zeros)."""
-    known = plane[:, :3].norm(dim=-1, keepdim=True) > 0.5
-    above_plane = (xyz_m * plane[:, None, :3].to(xyz_m.dtype)).sum(-1) + plane[:, 3:].to(xyz_m.dtype)
-    z = xyz_m[..., 2]
-    lowest = torch.where(valid, z, torch.full_like(z, 1e3)).sort(dim=1).values
-    # The 2 % quantile of the real points stands for the ground: reflections from below it are rare.
-    at = (valid.sum(1, keepdim=True).float() * 0.02).long()
-    return torch.where(known, above_plane, z - lowest.gather(1, at)).clamp(-5.0, 30.0).float()
 
 
 def crop(

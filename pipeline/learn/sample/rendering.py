@@ -13,6 +13,7 @@ import numba
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32
 
+from pipeline.learn.sample.clouds import padded_rows
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import (
     CAMERA_CHANNELS,
@@ -42,8 +43,10 @@ from schemas.training import POINT_IS_EDGE, POINT_IS_GROUND, TrainingRow
 __all__ = [
     "FrameSensors",
     "frame_sensors",
+    "lidar_features",
     "mark_strength",
     "nearest_points",
+    "radar_features",
     "render_frame",
     "render_lidar",
     "render_radar",
@@ -93,29 +96,40 @@ def frame_sensors(
     part = grid.window(shape, row.grid_step_deg)
     image = row.image.reshape(3, *shape)[:, *part] / np.float32(255)
     seen = row.grid_seen.reshape(shape)[part].astype(np.float32)
-    lidar = row.lidar_xyz_m[: row.lidar_count].astype(np.float32)
-    flags = row.lidar_flags[: row.lidar_count]
-    lidar_features = [
-        row.lidar_intensity[: row.lidar_count] / np.float32(255),
-        _heights(lidar, row.ground_plane) / np.float32(FEATURE_UNITS["height"]),
+    return FrameSensors(
+        np.concatenate([image, seen[None]]).astype(np.float32),
+        row.lidar_xyz_m[: row.lidar_count].astype(np.float32),
+        lidar_features(row),
+        row.radar_xyz_m[: row.radar_count].astype(np.float32),
+        radar_features(row),
+        bool(row.radar_has_elevation),
+        classes,
+    )
+
+
+def lidar_features(row: TrainingRow) -> Float32[np.ndarray, "N 4"]:
+    """LIDAR_FEATURES of a row's points, without the padding."""
+    count = row.lidar_count
+    flags = row.lidar_flags[:count]
+    height = _heights(row.lidar_xyz_m[:count].astype(np.float32), row.ground_plane)
+    features = [
+        row.lidar_intensity[:count] / np.float32(255),
+        height / np.float32(FEATURE_UNITS["height"]),
         (flags & POINT_IS_EDGE) > 0,
         (flags & POINT_IS_GROUND) > 0,
     ]
+    return np.stack(features, -1).astype(np.float32)
+
+
+def radar_features(row: TrainingRow) -> Float32[np.ndarray, "M 3"]:
+    """RADAR_FEATURES of a row's detections, without the padding."""
     count = row.radar_count
-    radar_features = [
+    features = [
         np.minimum(np.abs(row.radar_residual_mps[:count]) / FEATURE_UNITS["speed"], 2.0),
         np.clip(row.radar_power_db[:count] / FEATURE_UNITS["power"], -2.0, 2.0),
         row.radar_motion[:count] == 1,
     ]
-    return FrameSensors(
-        np.concatenate([image, seen[None]]).astype(np.float32),
-        lidar,
-        np.stack(lidar_features, -1).astype(np.float32),
-        row.radar_xyz_m[:count].astype(np.float32),
-        np.stack(radar_features, -1).astype(np.float32),
-        bool(row.radar_has_elevation),
-        classes,
-    )
+    return np.stack(features, -1).astype(np.float32)
 
 
 def render_frame(
@@ -137,10 +151,10 @@ def render_frame(
         "camera": sensors.camera_channels(camera_channels),
         **{name: values[None] for name, values in lidar.items()},
         "radar_grid": render_radar(radar_camera, sensors.radar_features, grid)[None],
-        "radar_lidar": _padded(radar_lidar[:count], RADAR_POINTS)[None],
-        "radar_camera": _padded(radar_camera[:count], RADAR_POINTS)[None],
-        "radar_features": _padded(sensors.radar_features[:count], RADAR_POINTS)[None],
-        "radar_valid": _padded(np.ones(count, bool), RADAR_POINTS)[None],
+        "radar_lidar": padded_rows(radar_lidar[:count], RADAR_POINTS)[None],
+        "radar_camera": padded_rows(radar_camera[:count], RADAR_POINTS)[None],
+        "radar_features": padded_rows(sensors.radar_features[:count], RADAR_POINTS)[None],
+        "radar_valid": padded_rows(np.ones(count, bool), RADAR_POINTS)[None],
         "radar_has_elevation": np.array([sensors.radar_has_elevation]),
     }
 
@@ -169,12 +183,12 @@ def render_lidar(
     strength, marked = _marks(painted, index) if marks else (np.zeros(0, np.float32), index[:0])
     return {
         "lidar_grid": painted,
-        "points_camera": _padded(lidar_camera[matched], MATCHED_POINTS),
-        "point_weight": _padded(weight[matched], MATCHED_POINTS),
-        "objects": _padded(xyz_m[solid], OBJECT_POINTS),
-        "object_weight": _padded(np.ones(len(solid), np.float32), OBJECT_POINTS),
-        "marks_camera": _padded(lidar_camera[marked], MARKED_POINTS),
-        "mark_weight": _padded(strength, MARKED_POINTS),
+        "points_camera": padded_rows(lidar_camera[matched], MATCHED_POINTS),
+        "point_weight": padded_rows(weight[matched], MATCHED_POINTS),
+        "objects": padded_rows(xyz_m[solid], OBJECT_POINTS),
+        "object_weight": padded_rows(np.ones(len(solid), np.float32), OBJECT_POINTS),
+        "marks_camera": padded_rows(lidar_camera[marked], MARKED_POINTS),
+        "mark_weight": padded_rows(strength, MARKED_POINTS),
     }, index
 
 
@@ -265,11 +279,12 @@ def _row_sums(values: np.ndarray) -> np.ndarray:
 
 
 def _heights(xyz: np.ndarray, plane: np.ndarray) -> np.ndarray:
-    """As `network.inputs.heights`."""
+    """Height over the ground plane [m], or over the frame's lowest points without a plane (zeros)."""
     if np.linalg.norm(plane[:3]) > 0.5:
         height = xyz @ plane[:3].astype(np.float32) + np.float32(plane[3])
     else:
         z = xyz[:, 2]
+        # The 2 % quantile stands for the ground: reflections from below it are rare.
         height = z - (np.sort(z)[int(np.float32(len(z)) * np.float32(0.02))] if len(z) else 0)
     return np.clip(height, -5, 30)
 
@@ -298,10 +313,3 @@ def _best(score: np.ndarray, allowed: np.ndarray, count: int) -> np.ndarray:
         keep = np.argpartition(score, count - 1)[:count]
         rows, score = rows[keep], score[keep]
     return rows[np.argsort(score, kind="stable")]
-
-
-def _padded(values: np.ndarray, count: int) -> np.ndarray:
-    """`count` rows: the values, and zeros behind them."""
-    out = np.zeros((count, *values.shape[1:]), values.dtype)
-    out[: len(values)] = values
-    return out

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from pipeline.simulate.world.meshes import Mesh, MeshBuilder
+from pipeline.simulate.world.meshes import Mesh, MeshBuilder, Number
 
 __all__ = [
     "PANEL",
@@ -41,7 +41,7 @@ def made_once(build: Callable[..., None]) -> Callable[..., Mesh]:
 
     @lru_cache(maxsize=64)
     @wraps(build)
-    def made(*arguments: float) -> Mesh:
+    def made(*arguments: Number) -> Mesh:
         b = MeshBuilder()
         build(b, *arguments)
         return b.mesh()
@@ -69,7 +69,7 @@ def sign(b: MeshBuilder, variant: int) -> None:
 
 
 @made_once
-def lamp(b: MeshBuilder, reach_m: float) -> None:
+def lamp(b: MeshBuilder, reach_m: Number) -> None:
     """Street lamp whose arm reaches `reach_m` to the left."""
     b.tube(np.zeros(3), np.array([0, 0, 7.0]), 0.08, "metal_pole", 7)
     b.tube(np.array([0, 0, 6.9]), np.array([0, reach_m, 7.3]), 0.045, "metal_pole", 5)

@@ -12,7 +12,7 @@ import torch
 from onnxruntime import InferenceSession
 
 from pipeline.core.errors import ModelError
-from pipeline.learn.batches.collate import collate
+from pipeline.learn.batches.batch import collate
 from pipeline.learn.export.onnx_file import export_onnx
 from pipeline.learn.infer.single_frame import SingleFrameCalibrator, split_graph
 from pipeline.learn.network.calibration_network import build_network

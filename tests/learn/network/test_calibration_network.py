@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.learn.batches.batch import TrainingBatch
-from pipeline.learn.batches.collate import collate
+from pipeline.learn.batches.batch import TrainingBatch, collate
 from pipeline.learn.network.calibration_network import build_network
 from pipeline.learn.network.inputs import NetworkInputs, crop, sensor_inputs
 from pipeline.learn.network.views import render

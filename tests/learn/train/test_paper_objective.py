@@ -7,7 +7,7 @@ import torch
 from pipeline.calibrate.paper.joint_optimisation import joint_costs
 from pipeline.calibrate.paper.pairwise import pair_problem
 from pipeline.core.errors import ConfigError
-from pipeline.learn.batches.collate import collate
+from pipeline.learn.batches.batch import collate
 from pipeline.learn.sample.frame_sample import About, make_row
 from pipeline.learn.train.metrics import read_metrics
 from pipeline.learn.train.paper_objective import PaperFrames
