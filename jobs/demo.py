@@ -16,7 +16,6 @@ from jobs.extras import needs
 from jobs.nightly import Drawing, close_night, watch_night
 from jobs.simulate import simulate_days
 from jobs.terminal.demo_table import print_comparison, print_methods
-from jobs.terminal.night_view import night_view
 from jobs.terminal.summary import exit_code, is_terminal, print_summary
 from jobs.terminal.vehicle_status import count_statuses, moved_sensors
 from pipeline.core.config import config_hash, load_fleet
@@ -134,7 +133,6 @@ def _summarise(statuses: Sequence[str], findings: Sequence[DriftFinding], **told
 
 def _simulate(spec: FleetSpec, out: Path, workers: int | None) -> None:
     """Write the fleet's logs, unless the folder contains the same fleet already."""
-
     stamp, key = out / ".simulated", config_hash({"spec": repr(spec), "code": CODE_VERSION})
     if stamp.is_file() and stamp.read_text() == key:
         return

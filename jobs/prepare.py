@@ -21,9 +21,8 @@ from pipeline.core.runner import try_stage
 from pipeline.core.stage_work import Task
 from pipeline.core.stages import PREPARE
 from pipeline.fleet.executor import EXECUTORS
-from pipeline.learn.prepare.decided import decided_sides
 from pipeline.learn.prepare.inventory import Inventory, take_inventory, write_inventory
-from pipeline.learn.prepare.sides import Choice, price_choices, settled_keys
+from pipeline.learn.prepare.sides import Choice, decided_sides, price_choices, settled_keys
 from pipeline.learn.prepare.split import SplitPlan, Unit
 from pipeline.learn.prepare.survey import plan_days, survey_day
 from pipeline.store.partitions import Lake, Partition, check_day

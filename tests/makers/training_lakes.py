@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from pipeline.core.config import FleetConfig
-from pipeline.learn.prepare.decided import decided_sides
+from pipeline.learn.prepare.sides import decided_sides
 from pipeline.learn.prepare.survey import plan_days, survey_day
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import perceived_days

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.core.errors import ConfigError
-from pipeline.learn.train.checkpoints import BEST, LAST, load_checkpoint
-from pipeline.learn.train.metrics import read_metrics
+from pipeline.learn.train.loop import BEST, LAST, load_checkpoint, read_metrics
 
 __all__ = ["LIMITS", "card_of_run", "write_card"]
 

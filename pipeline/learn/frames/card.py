@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.learn.frames.nuscenes_tables import finish_nuscenes
+from pipeline.learn.frames.nuscenes import finish_nuscenes
 from pipeline.learn.frames.output import Output
 from pipeline.store.partitions import Partition
 from schemas.training import SPLITS

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -19,16 +20,9 @@ from schemas.features import ImageFeatureColumns
 from schemas.moments import MOMENTS, PERCEIVED, Moment
 
 __all__ = [
-    "LIDAR_FIELDS",
-    "RADAR_FIELDS",
-    "Frame",
-    "Mounting",
-    "Perturbation",
-    "Place",
-    "day_key",
-    "points_of",
-    "read_frames",
-]
+    "LIDAR_FIELDS", "RADAR_FIELDS", "Frame", "Mounting", "Perturbation", "Place", "day_key", "facts_of",
+    "points_of", "read_frames", "to_json",
+]  # fmt: skip
 
 LIDAR_FIELDS = ("x", "y", "z", "intensity")
 RADAR_FIELDS = ("x", "y", "z", "range_rate", "power")
@@ -165,3 +159,73 @@ def read_frames(
         labels = {n: f for n, f in found.items() if isinstance(f, ImageFeatureColumns)}
         own = {n: T[n] for n in captures}
         yield Frame(partition, at, moment, captures, labels, mounting, own, answer)
+
+
+def facts_of(frame: Frame) -> dict[str, Any]:
+    """Plain values of a frame; 4x4 matrices are row-major, T_a_b takes coordinates in b to a."""
+    moment, T_odom = frame.moment, frame.T_odom_vehicle
+    T_base = frame.mounting.T_base_reference
+    return {
+        "key": frame.key,
+        "vehicle": frame.partition.vehicle,
+        "day": frame.partition.day,
+        "log": moment.log,
+        "drive": moment.drive,
+        "moment": moment.moment,
+        "stamp_ns": moment.stamp_ns,
+        "split": frame.at.split,
+        "place": frame.at.place,
+        "environment": frame.at.environment,
+        "calibration": frame.mounting.source,
+        "reference": frame.mounting.reference,
+        "T_base_reference": None if T_base is None else T_base.tolist(),
+        "T_odom_vehicle": None if T_odom is None else T_odom.tolist(),
+        "ego_speed_mps": moment.ego_speed_mps,
+        "ego_yaw_rate_radps": moment.ego_yaw_rate_radps,
+        "sensors": {name: _sensor(frame, name) for name in frame.captures},
+    }
+
+
+def to_json(value: Any) -> bytes:
+    """Strict JSON with sorted keys: the same bytes for the same value."""
+    return json.dumps(value, sort_keys=True, allow_nan=False).encode()
+
+
+def _sensor(frame: Frame, name: str) -> dict[str, Any]:
+    capture = frame.captures[name]
+    told: dict[str, Any] = {
+        "stamp_ns": capture.stamp_ns,
+        "T_reference_sensor": frame.T[name].tolist(),
+        **frame.mounting.about.get(name, {}),
+    }
+    if frame.answer is not None:
+        told["answer_T_reference_sensor"] = frame.answer[name].tolist()
+    if isinstance(capture, Sweep):
+        told |= {"kind": "lidar", "fields": LIDAR_FIELDS, "deskewed": capture.lidar_deskewed}
+    elif isinstance(capture, Scan):
+        told |= {"kind": "radar", "fields": RADAR_FIELDS, "has_elevation": capture.radar_has_elevation}
+        told["doppler_period_mps"] = capture.doppler_period_mps
+    else:
+        told |= {"kind": "camera"} | _camera(capture) | _seen(frame.seen.get(name))
+    return told
+
+
+def _camera(image: Image) -> dict[str, Any]:
+    return {
+        "camera_model": image.camera_model,
+        "camera_K": image.camera_K.tolist(),
+        "camera_D": image.camera_D.tolist(),
+        "width_px": image.image_width_px,
+        "height_px": image.image_height_px,
+    }
+
+
+def _seen(found: ImageFeatureColumns | None) -> dict[str, Any]:
+    if found is None:
+        return {}
+    return {
+        "label_scale": found.label_scale,
+        "boxes_px": found.road_user_boxes_px.tolist(),
+        "box_classes": found.road_user_classes,
+        "box_scores": found.road_user_scores.tolist(),
+    }

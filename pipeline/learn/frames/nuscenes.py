@@ -10,21 +10,25 @@ utils/splits.py.
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import Any
 
+import cv2
 import numpy as np
 from jaxtyping import Float
 
 from pipeline.core.errors import SolveError
-from pipeline.learn.frames.frame import Frame
+from pipeline.learn.frames.frame import Frame, to_json
 from pipeline.learn.frames.images import undistortion_of
-from pipeline.learn.frames.nuscenes_tables import token_of
-from pipeline.learn.frames.output import DayOutput
+from pipeline.learn.frames.output import DayOutput, Output
 from pipeline.rig.se3 import exp_se3, from_rotation_translation, inverse, to_quaternion
+from pipeline.store.partitions import Partition
 from schemas.captures import Image, Scan, Sweep
+from schemas.training import SPLITS
 
-__all__ = ["NuScenesWriter"]
+__all__ = ["VERSION", "NuScenesWriter", "finish_nuscenes", "token_of"]
 
 # Channels of sensors that are called by their kinds, as loaders expect them.
 _CHANNELS = {"camera": "CAM_FRONT", "lidar": "LIDAR_TOP", "radar": "RADAR_FRONT"}
@@ -262,3 +266,56 @@ def _compensated_range_rate(frame: Frame, sensor: str, scan: Scan) -> Float[np.n
     points = scan.radar_xyz_m.astype(np.float64)
     rays = points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-6)
     return scan.radar_range_rate_mps + rays @ velocity_radar
+
+
+VERSION = "v1.0-boresight"
+# Tables that the devkit opens; the last three are of others.
+_TABLES = (
+    *(
+        "category",
+        "attribute",
+        "visibility",
+        "instance",
+        "sensor",
+        "calibrated_sensor",
+        "ego_pose",
+        "log",
+        "scene",
+    ),
+    *("sample", "sample_data", "sample_annotation", "map", "object_ann", "calibrated_sensor_answer"),
+)
+_SHARED = {"sensor", "category"}
+
+
+def finish_nuscenes(output: Output, days: Sequence[Partition]) -> None:
+    """Write all tables, and the splits by scene; one row is in memory at a time."""
+    splits: dict[str, list[str]] = {split: [] for split in SPLITS}
+    logs: list[str] = []
+    known: set[str] = set()  # of tables whose rows several days share
+    with ExitStack() as stack:
+        streams = {
+            table: stack.enter_context(output.replacing(f"{VERSION}/{table}.json")) for table in _TABLES
+        }
+        began = set[str]()
+        for day in days:
+            for table, row in output.rows(day):
+                if table in splits:
+                    splits[table].append(row)
+                if table not in streams or row["token"] in known:
+                    continue
+                known |= {row["token"]} if table in _SHARED else set()
+                logs += [row["token"]] if table == "log" else []
+                streams[table].write((b",\n" if table in began else b"[\n") + to_json(row))
+                began.add(table)
+        streams["map"].write(b"[\n" + to_json({
+            "token": token_of("map"), "log_tokens": logs, "category": "none", "filename": "maps/none.png",
+        }))  # fmt: skip
+        for table, stream in streams.items():
+            stream.write(b"\n]\n" if table in began | {"map"} else b"[]\n")
+    output.write("maps/none.png", cv2.imencode(".png", np.full((1, 1), 128, np.uint8))[1].tobytes())
+    output.write(f"{VERSION}/splits.json", to_json(splits))
+
+
+def token_of(*words: str) -> str:
+    """32 hexadecimal digits that are the same for the same words."""
+    return hashlib.sha256("\0".join(words).encode()).hexdigest()[:32]

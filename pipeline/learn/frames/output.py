@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from pathlib import PurePath
 from typing import Any, BinaryIO
 
-from pipeline.learn.frames.facts import to_json
-from pipeline.learn.frames.frame import day_key
+from pipeline.learn.frames.frame import day_key, to_json
 from pipeline.store.files import Files
 from pipeline.store.partitions import Lake, Partition
 from schemas.training import SPLITS

@@ -10,11 +10,9 @@ from typing import Any
 from pipeline.core.config import PrepareConfig
 from pipeline.core.errors import ConfigError
 from pipeline.core.results import Progress
-from pipeline.learn.frames.facts import to_json
-from pipeline.learn.frames.frame import Place
+from pipeline.learn.frames.frame import Place, to_json
 from pipeline.learn.frames.output import Output
-from pipeline.learn.prepare.decided import decided_sides, split_settings
-from pipeline.learn.prepare.sides import frame_sides, settled_keys
+from pipeline.learn.prepare.sides import decided_sides, frame_sides, settled_keys, split_settings
 from pipeline.learn.prepare.survey import plan_days, survey_day
 from pipeline.store.partitions import Lake, Partition
 from schemas.training import SPLITS

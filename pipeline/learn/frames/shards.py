@@ -9,8 +9,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipeline.learn.frames.facts import facts_of
-from pipeline.learn.frames.frame import LIDAR_FIELDS, RADAR_FIELDS, Frame, points_of
+from pipeline.learn.frames.frame import LIDAR_FIELDS, RADAR_FIELDS, Frame, facts_of, points_of
 from pipeline.learn.frames.output import DayOutput
 from schemas.captures import Image, Sweep
 

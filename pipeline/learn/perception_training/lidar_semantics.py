@@ -47,15 +47,9 @@ from schemas.frames import Frame
 from schemas.observations import Observation
 
 __all__ = [
-    "TASK",
-    "SweepImages",
-    "SweepLayout",
-    "SweepTraining",
-    "cut",
-    "day_images",
-    "kind_scores",
+    "TASK", "SweepImages", "SweepLayout", "SweepTraining", "cut", "day_images", "kind_scores",
     "layout_of",
-]
+]  # fmt: skip
 
 LIMITS = (
     "Learned from the camera's classes through a calibration, with the errors of both.",

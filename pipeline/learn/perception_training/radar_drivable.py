@@ -48,19 +48,9 @@ from pipeline.store.views import observations_of
 from schemas.observations import Observation
 
 __all__ = [
-    "BLOCKED",
-    "FREE",
-    "TASK",
-    "UNKNOWN",
-    "DrivableSamples",
-    "DrivableTraining",
-    "area_iou",
-    "day_samples",
-    "label_grid",
-    "probabilities",
-    "samples_of_day",
-    "scan_of",
-]
+    "BLOCKED", "FREE", "TASK", "UNKNOWN", "DrivableSamples", "DrivableTraining", "area_iou",
+    "day_samples", "label_grid", "probabilities", "samples_of_day", "scan_of",
+]  # fmt: skip
 
 LIMITS = (
     "Learned from the lidar's drivable ground through each day's prior, with the errors of both.",

@@ -22,27 +22,24 @@ from pipeline.core.results import Progress, silent
 from pipeline.core.rows import join_rows, take_rows
 from pipeline.learn.export.model_card import write_card
 from pipeline.learn.export.onnx_file import trace_to_onnx
-from pipeline.learn.train.checkpoints import LAST, load_checkpoint
-from pipeline.learn.train.loop import Run, TrainResult, run_loop, stop_signals
-from pipeline.learn.train.metrics import MetricsLog
+from pipeline.learn.train.loop import (
+    LAST,
+    MetricsLog,
+    Run,
+    TrainResult,
+    load_checkpoint,
+    run_loop,
+    stop_signals,
+)
 from pipeline.learn.train.settings import Count, DescentConfig
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import perceived_days
 from schemas.versions import CODE_VERSION
 
 __all__ = [
-    "Graph",
-    "Labelled",
-    "Learner",
-    "Samples",
-    "Task",
-    "TrainingConfig",
-    "build_network",
-    "export_model",
-    "split_days",
-    "train_network",
-    "vehicle_days",
-]
+    "Graph", "Labelled", "Learner", "Samples", "Task", "TrainingConfig", "build_network",
+    "export_model", "split_days", "train_network", "vehicle_days",
+]  # fmt: skip
 
 _HELD_OUT_EVERY = 5  # vehicle-days; the second one already, so that two are enough
 

@@ -6,19 +6,27 @@ import itertools
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from pipeline.core.config import PrepareConfig
-from pipeline.learn.prepare.decided import decided_sides
+from pipeline.core.config import PrepareConfig, config_hash
 from pipeline.learn.prepare.split import SplitPlan
 from pipeline.learn.prepare.survey import Survey, plan_days
 from pipeline.learn.sample.frame_sample import SampleReason
 from pipeline.store.partitions import Lake
-from schemas.training import SPLITS
+from pipeline.store.tables import read_manifest
+from schemas.training import SPLITS, TRAINING
 
-__all__ = ["Choice", "frame_sides", "price_choices", "settled_keys"]
+__all__ = [
+    "Choice",
+    "decided_sides",
+    "frame_sides",
+    "price_choices",
+    "settled_keys",
+    "split_rule",
+    "split_settings",
+]
 
 Key = Literal["vehicle", "day", "place"]
 _FEW = 0.2  # of the frames
@@ -135,3 +143,31 @@ def _price(surveys: Sequence[Survey], plan: SplitPlan, config: PrepareConfig, ch
         lost.update(rejected)
         empty += not kept
     return Choice(plan.by, dict(frames), dict(lost), empty, chosen)
+
+
+_OF_SPLIT = ("val_fraction", "test_fraction", "positions", "place_m", "place_s")
+
+
+def decided_sides(lake: Lake, config: PrepareConfig) -> dict[tuple[str, str], str]:
+    """Sides of the vehicles, days and places in the lake's table `training`.
+
+    Empty for a table split by other keys, shares or seed, which is made again as a whole.
+    """
+    sides: dict[tuple[str, str], str] = {}
+    for partition in lake.partitions(TRAINING.name):
+        manifest = read_manifest(lake, TRAINING, partition)
+        if manifest is None or manifest.extra.get("split_rule") != split_rule(config):
+            continue
+        sides |= {(kind, value): side for kind, value, side in manifest.extra.get("sides", [])}
+    return sides
+
+
+def split_rule(config: PrepareConfig) -> str:
+    """Hash of `split_settings`."""
+    return config_hash(split_settings(config))
+
+
+def split_settings(config: PrepareConfig) -> dict[str, Any]:
+    """Settings that determine the names of places and the sides of keys, by the names that lakes store."""
+    split = {name: getattr(config.split, name) for name in _OF_SPLIT}
+    return {"split_by": config.split.by, **split, "seed": config.seed}

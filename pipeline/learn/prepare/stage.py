@@ -14,8 +14,7 @@ import numpy as np
 from pipeline.core.config import PrepareConfig
 from pipeline.core.errors import SolveError
 from pipeline.core.stage_work import Run, Task, Work
-from pipeline.learn.prepare.decided import split_rule
-from pipeline.learn.prepare.sides import frame_sides
+from pipeline.learn.prepare.sides import frame_sides, split_rule
 from pipeline.learn.prepare.split import SplitPlan, Unit
 from pipeline.learn.prepare.survey import Survey, survey_day
 from pipeline.learn.sample.frame_sample import About, SampleReason, SampleRejectedError, make_row

@@ -41,16 +41,9 @@ from pipeline.rig.se3 import transform_points
 from schemas.training import POINT_IS_EDGE, POINT_IS_GROUND, TrainingRow
 
 __all__ = [
-    "FrameSensors",
-    "frame_sensors",
-    "lidar_features",
-    "mark_strength",
-    "nearest_points",
-    "radar_features",
-    "render_frame",
-    "render_lidar",
-    "render_radar",
-]
+    "FrameSensors", "frame_sensors", "lidar_features", "mark_strength", "nearest_points",
+    "radar_features", "render_frame", "render_lidar", "render_radar",
+]  # fmt: skip
 
 _INTENSITY = LIDAR_FEATURES.index("intensity")
 _EDGE, _GROUND = LIDAR_FEATURES.index("edge"), LIDAR_FEATURES.index("ground")

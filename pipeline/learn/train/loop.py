@@ -6,6 +6,9 @@ same weights, bit for bit, as a run without a stop: all randomness of a step com
 
 from __future__ import annotations
 
+import json
+import math
+import os
 import signal
 import threading
 import time
@@ -15,19 +18,148 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, TextIO
 
 import torch
 from torch import Tensor, nn
 
+from pipeline.core.errors import BoresightError, ContractError
 from pipeline.core.results import Progress
-from pipeline.learn.train.checkpoints import LAST, save_checkpoint
-from pipeline.learn.train.metrics import MetricsLog
 from pipeline.learn.train.processes import ALONE, Processes
-from pipeline.learn.train.schedule import DivergenceGuard, cosine_rate
 from pipeline.learn.train.settings import DescentConfig
 
-__all__ = ["Run", "TrainResult", "run_loop", "stop_signals"]
+__all__ = [
+    "BEST", "LAST", "DivergedError", "DivergenceGuard", "MetricsLog", "Run", "TrainResult",
+    "cosine_rate", "load_checkpoint", "read_metrics", "run_loop", "save_checkpoint", "stop_signals",
+]  # fmt: skip
+
+LAST, BEST = "last.pt", "best.pt"
+_FORMAT = 1
+
+
+def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
+    """Write atomically; `state` holds tensors, numbers, strings, lists and dicts only."""
+    aside = path.with_suffix(".part")
+    with aside.open("wb") as stream:
+        torch.save({"format": _FORMAT} | state, stream)
+        stream.flush()
+        os.fsync(stream.fileno())
+    aside.replace(path)
+
+
+def load_checkpoint(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
+    """Read a checkpoint without running code in it; raises ContractError if it has another format."""
+    try:
+        state: dict[str, Any] = torch.load(path, map_location=device, weights_only=True)
+    except FileNotFoundError:
+        raise
+    except Exception as err:  # torch raises whatever its unpickler met
+        raise ContractError(str(path), f"no checkpoint that can be read: {err}") from err
+    if state.get("format") != _FORMAT:
+        raise ContractError(str(path), f"checkpoint of format {state.get('format')}, not {_FORMAT}")
+    return state
+
+
+class MetricsLog:
+    """Appends reports of a run; after a resume, lines beyond the checkpoint are dropped first, so none is doubled.
+
+    Args:
+        from_step: reports of later steps are dropped.
+        events: whether to write TensorBoard events as well, where TensorBoard is installed.
+    """
+
+    def __init__(self, folder: Path, from_step: int, *, events: bool = True) -> None:
+        self._path = folder / "metrics.jsonl"
+        kept = [r for r in read_metrics(folder) if r["step"] <= from_step]
+        self._path.write_text("".join(json.dumps(r) + "\n" for r in kept))
+        self._file: TextIO = self._path.open("a")
+        self._events = _writer(folder / "events", from_step) if events else None
+
+    def report(self, step: int, values: dict[str, float]) -> None:
+        """One report; values that are not finite become null."""
+        plain = {k: v if math.isfinite(v) else None for k, v in values.items()}
+        self._file.write(json.dumps({"step": step} | plain) + "\n")
+        self._file.flush()
+        if self._events is not None:
+            for name, value in values.items():
+                self._events.add_scalar(name, value, step)
+
+    def close(self) -> None:
+        """Finish both files; `contextlib.closing` calls it."""
+        self._file.close()
+        if self._events is not None:
+            self._events.close()
+
+
+def read_metrics(folder: Path) -> list[dict[str, Any]]:
+    """All complete lines of a run's reports, oldest first."""
+    path = folder / "metrics.jsonl"
+    if not path.exists():
+        return []
+    lines = path.read_text().split("\n")
+    return [json.loads(line) for line in lines[:-1]]  # a killed run may leave its last line unfinished
+
+
+def _writer(folder: Path, from_step: int) -> Any:
+    try:
+        from torch.utils.tensorboard import SummaryWriter  # noqa: PLC0415 - needs the extra [train]
+    except ImportError:
+        return None
+    return SummaryWriter(str(folder), purge_step=from_step + 1)
+
+
+_PATIENCE = 20  # reports before any is judged
+_SMOOTHING = 0.05  # of the loss: about the last twenty reports count
+
+
+class DivergedError(BoresightError):
+    """Training that diverges: `step` and the loss."""
+
+    def __init__(self, step: int, reason: str) -> None:
+        self.step, self.reason = step, reason
+        super().__init__(f"training diverged at step {step}: {reason}")
+
+
+def cosine_rate(progress: float, first: float, last: float) -> float:
+    """Learning rate at `progress` (0..1, held beyond)."""
+    share = min(max(progress, 0.0), 1.0)
+    return last + 0.5 * (first - last) * (1 + math.cos(math.pi * share))
+
+
+class DivergenceGuard:
+    """Raises if the loss is not finite, or a multiple of its smallest smoothed value."""
+
+    def __init__(self, factor: float) -> None:
+        self._factor = factor
+        self._smooth: float | None = None
+        self._least = math.inf
+        self._seen = 0
+
+    def check(self, step: int, loss: float, gradient_norm: float) -> None:
+        """Check the loss of one step."""
+        if not math.isfinite(loss):
+            raise DivergedError(step, f"the loss is {loss}")
+        if not math.isfinite(gradient_norm):
+            raise DivergedError(step, f"the gradient's norm is {gradient_norm}")
+        self._seen += 1
+        self._smooth = loss if self._smooth is None else self._smooth + _SMOOTHING * (loss - self._smooth)
+        self._least = min(self._least, self._smooth)
+        # Likelihood terms may take the sum below zero: a loss near zero has no useful multiple.
+        limit = self._factor * max(abs(self._least), 1.0)
+        if self._seen > _PATIENCE and self._smooth > limit:
+            told = f"is more than {self._factor:g} times its least, {self._least:.3g}"
+            raise DivergedError(step, f"the smoothed loss {self._smooth:.3g} {told}")
+
+    def state_dict(self) -> dict[str, float | int | None]:
+        """For checkpoints."""
+        return {"smooth": self._smooth, "least": self._least, "seen": self._seen}
+
+    def load_state_dict(self, state: dict[str, float | int | None]) -> None:
+        """From checkpoints."""
+        smooth, least, seen = state["smooth"], state["least"], state["seen"]
+        self._smooth = None if smooth is None else float(smooth)
+        self._least = math.inf if least is None else float(least)
+        self._seen = int(seen or 0)
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,7 @@ from pathlib import Path
 
 from pipeline.core.results import Progress, silent
 from pipeline.learn.prepare.inventory import require_sides
-from pipeline.learn.train.loop import TrainResult, run_loop, stop_signals
-from pipeline.learn.train.metrics import MetricsLog
+from pipeline.learn.train.loop import MetricsLog, TrainResult, run_loop, stop_signals
 from pipeline.learn.train.processes import joined
 from pipeline.learn.train.run_state import begin_run
 from pipeline.learn.train.settings import TrainConfig

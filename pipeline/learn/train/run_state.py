@@ -22,9 +22,7 @@ from pipeline.learn.network.exported_weights import network_of_file
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import NetworkConfig
 from pipeline.learn.train.batch_loss import Passes, batch_loss
-from pipeline.learn.train.checkpoints import BEST, LAST, load_checkpoint, save_checkpoint
-from pipeline.learn.train.loop import Run
-from pipeline.learn.train.metrics import MetricsLog
+from pipeline.learn.train.loop import BEST, LAST, MetricsLog, Run, load_checkpoint, save_checkpoint
 from pipeline.learn.train.paper_objective import PaperFrames, with_paper_inputs
 from pipeline.learn.train.processes import Processes
 from pipeline.learn.train.running_mean import DayMeans

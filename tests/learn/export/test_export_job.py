@@ -12,7 +12,7 @@ from pipeline.learn.infer.single_frame import SingleFrameCalibrator
 from pipeline.learn.network.calibration_network import build_network
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import NetworkConfig
-from pipeline.learn.train.checkpoints import BEST, LAST, load_checkpoint, save_checkpoint
+from pipeline.learn.train.loop import BEST, LAST, load_checkpoint, save_checkpoint
 from pipeline.learn.train.settings import TrainConfig
 
 

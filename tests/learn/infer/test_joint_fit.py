@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.learn.infer.class_evidence import FrameEvidence, scores
-from pipeline.learn.infer.joint_day import fitted_day
-from pipeline.learn.infer.joint_fit import climbed, fit_of, rival_score, voted
+from pipeline.learn.infer.joint_day import climbed, fit_of, fitted_day, rival_score, voted
 from pipeline.learn.sample.grid import Grid
 from pipeline.rig.estimates import Prior
 from pipeline.rig.se3 import exp_se3, inverse, log_se3, transform_points

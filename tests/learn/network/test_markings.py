@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.learn.network.markings import log_markings
-from pipeline.learn.network.matching_network import MatchingCore
+from pipeline.learn.network.matching_network import MatchingCore, log_markings
 from pipeline.learn.network.outputs import pose_of_twist
 from pipeline.learn.sample.grid import Grid, grid_rays
 from pipeline.learn.sample.layout import LIDAR_CHANNELS, LIDAR_FEATURES, MARKED_POINTS

@@ -51,7 +51,7 @@ from pipeline.learn.perception_training.trainer import (
     export_model,
     train_network,
 )
-from pipeline.learn.train.checkpoints import load_checkpoint
+from pipeline.learn.train.loop import load_checkpoint
 from pipeline.perceive.drivable import free_sector
 from pipeline.perceive.ground import PointKind
 from pipeline.perceive.models.radar_drivable import RadarDrivable

@@ -9,7 +9,7 @@ from pipeline.calibrate.paper.pairwise import pair_problem
 from pipeline.core.errors import ConfigError
 from pipeline.learn.batches.batch import collate
 from pipeline.learn.sample.frame_sample import About, make_row
-from pipeline.learn.train.metrics import read_metrics
+from pipeline.learn.train.loop import read_metrics
 from pipeline.learn.train.paper_objective import PaperFrames
 from pipeline.learn.train.run import TrainRequest, train
 from pipeline.learn.train.run_state import network_of_run

@@ -18,11 +18,17 @@ from pipeline.core.errors import ConfigError, ContractError
 from pipeline.learn.network.calibration_network import build_network
 from pipeline.learn.sample.frame_sample import About, make_row
 from pipeline.learn.sample.layout import NetworkConfig
-from pipeline.learn.train.checkpoints import load_checkpoint, save_checkpoint
-from pipeline.learn.train.metrics import MetricsLog, read_metrics
+from pipeline.learn.train.loop import (
+    DivergedError,
+    DivergenceGuard,
+    MetricsLog,
+    cosine_rate,
+    load_checkpoint,
+    read_metrics,
+    save_checkpoint,
+)
 from pipeline.learn.train.run import TrainRequest, train
 from pipeline.learn.train.run_state import network_of_run
-from pipeline.learn.train.schedule import DivergedError, DivergenceGuard, cosine_rate
 from pipeline.learn.train.settings import TrainConfig, load_train_config
 from pipeline.rig.day_prior import read_prior
 from pipeline.store.partitions import Partition
