@@ -103,7 +103,7 @@ def test_a_batch_holds_what_the_rows_hold(lake):
     assert names(some) == [names(batch)[7], names(batch)[3]]
     assert torch.equal(some.image[1], batch.image[3])
     assert names(batch[2:4]) == names(batch)[2:4]
-    assert batch.to("cpu").lidar_flags.dtype == torch.uint8
+    assert batch.to("cpu").grid_class.dtype == torch.uint8
 
 
 def test_a_changed_table_or_another_order_refuses_to_resume(lake, tmp_path):
