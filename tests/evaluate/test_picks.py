@@ -46,13 +46,6 @@ def test_the_sigma_of_a_position_is_its_spread_over_the_root_of_the_frames(tmp_p
     np.testing.assert_allclose(picks.spread.radar_m, [[0.1, 0.1, 0.6]] * 2)
 
 
-def test_a_file_without_spread_says_so_and_claims_no_sigma(tmp_path):
-    bare = [{k: t[k] for k in ("pixel", "lidar_m", "radar_m")} for t in content()["targets"]]
-    file = read(tmp_path, content(targets=bare))
-    assert file.picks.sigma is None
-    assert file.sources[1] == "lidar: picked, spread unknown"
-
-
 def test_a_file_judges_only_the_mounting_that_it_shows(tmp_path):
     named = read(tmp_path, content(vehicle="a", day="2026-03-02"))
     assert named.applies_to("a", "2026-03-02")

@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import cv2
 import numpy as np
 import pytest
@@ -7,8 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from pipeline.rig.cameras import CAMERA_MODELS, Camera, camera_of
-from tests.makers.solve_scenes import CAMERA, make_observation
+from pipeline.rig.cameras import Camera
 
 # Coefficients as calibrations of car cameras give them; a barrel that folds over far outside the image.
 DISTORTIONS = {
@@ -33,10 +30,6 @@ distorted = pytest.mark.parametrize("name", [n for n, (_, D) in DISTORTIONS.item
 pixels = hnp.arrays(np.float64, (7, 2), elements=st.floats(0, 1)).map(lambda u: u * [1823, 939])
 
 
-def test_every_model_is_tried_here():
-    assert {model for model, _ in DISTORTIONS.values()} == set(CAMERA_MODELS)
-
-
 @every_camera
 def test_rays_of_pixels_project_back_onto_them_at_any_depth(name):
     cam = camera(name)
@@ -52,17 +45,6 @@ def test_rays_of_pixels_project_back_onto_them_at_any_depth(name):
         np.testing.assert_allclose(back, uv[seen], atol=1e-6)
 
     law()
-
-
-@every_camera
-def test_batches_of_any_shape_project_alike(name):
-    cam = camera(name)
-    points = np.random.default_rng(0).normal(size=(2, 3, 3)) + [0, 0, 6]
-    uv, valid = cam.project(points)
-    assert uv.shape == (2, 3, 2)
-    assert valid.shape == (2, 3)
-    np.testing.assert_array_equal(cam.project(points[1, 2])[0], uv[1, 2])
-    assert cam.project(np.zeros((0, 3)))[0].shape == (0, 2)
 
 
 @every_camera
@@ -99,17 +81,6 @@ def test_no_point_beyond_the_fold_appears_inside_the_image(name):
     assert (np.diff(radius) > -1e-3 * np.abs(radius[1:])).all()
 
 
-def test_a_barrel_that_folds_says_where():
-    folding = Camera("plumb_bob", np.diag([800.0, 800, 1]), np.array([-0.4, 0, 0, 0]), 1600, 900)
-    # r (1 - 0.4 r^2) is largest at r = 1/sqrt(1.2)
-    assert abs(np.tan(folding.max_angle_rad) - 1 / np.sqrt(1.2)) < 0.01
-    inside, outside = folding.project(np.array([[0.5, 0, 1.0], [1.2, 0, 1.0]]))[1]
-    assert inside
-    assert not outside
-    # The widest radius that any ray reaches is 800 * 0.6086 px; beyond it there is none.
-    assert np.isnan(folding.unproject(np.array([600.0, 0.0]))).all()
-
-
 @pytest.mark.parametrize("name", ["f_theta", "fisheye"])
 def test_the_fast_polynomial_stays_within_a_thousandth_of_a_pixel(name):
     cam = camera(name)
@@ -121,11 +92,6 @@ def test_the_fast_polynomial_stays_within_a_thousandth_of_a_pixel(name):
     k = np.polynomial.polynomial.polyval(rays[..., 2], coefficients)
     fast = k[..., None] * rays[..., :2] * cam.focal_px + cam.centre_px
     assert np.abs(fast - uv).max() < 1e-3
-
-
-def test_the_polynomial_is_refused_for_a_pinhole():
-    with pytest.raises(ValueError, match="equidistant"):
-        camera("none").fast_polynomial()
 
 
 @every_camera
@@ -157,14 +123,3 @@ def test_contains_counts_the_outer_half_of_border_pixels_and_respects_a_margin()
 def test_impossible_intrinsics_are_refused(model, K, D, match):
     with pytest.raises(ValueError, match=match):
         Camera(model, K, np.array(D), 10, 10)
-
-
-def test_a_row_gives_the_camera_that_its_columns_describe():
-    rng = np.random.default_rng(0)
-    row = make_observation(rng, 0, 0, 0.0, camera_D=np.array([-0.1, 0.02, 0.0, 0.0]))
-    camera = camera_of(row)
-    assert (camera.model, camera.width_px, camera.height_px) == (CAMERA.model, 640, 320)
-    np.testing.assert_array_equal(camera.K, CAMERA.K)
-    np.testing.assert_array_equal(camera.D, row.camera_D)
-    with pytest.raises(ValueError, match="camera model"):
-        camera_of(replace(row, camera_model="thin_prism"))

@@ -14,16 +14,6 @@ def rig(*pairs):
     return RigGraph(sensors, tuple(edge_between(a, b) for a, b in pairs), TOP)
 
 
-def test_an_edge_is_named_for_its_sensors_and_kinds():
-    edge = edge_between(TOP, FRONT)
-    assert (edge.parent, edge.child) == (FRONT, TOP)
-    assert edge.kind == "camera_lidar"
-    assert edge.name == "front-top"
-    assert edge.other("front") == TOP
-    assert edge_between(BASE, CORNER).kind == "radar_base"
-    assert edge_between(TOP, SIDE) == edge_between(SIDE, TOP)
-
-
 @pytest.mark.parametrize(("a", "b"), [(FRONT, REAR), (FRONT, BASE), (TOP, TOP)])
 def test_what_shares_nothing_is_no_edge(a, b):
     with pytest.raises(ValueError, match=r"joins two sensors|cannot be calibrated"):
@@ -33,13 +23,6 @@ def test_what_shares_nothing_is_no_edge(a, b):
 def test_an_edge_in_the_wrong_order_is_refused():
     with pytest.raises(ValueError, match="cannot be calibrated"):
         Edge(TOP, FRONT)
-
-
-def test_a_way_leads_over_the_fewest_edges():
-    graph = rig((FRONT, TOP), (TOP, CORNER), (FRONT, CORNER), (REAR, TOP))
-    assert [e.name for e in graph.path(REAR, CORNER)] == ["rear-top", "top-corner"]
-    assert graph.path(TOP, TOP) == ()
-    assert graph.path(TOP, SIDE) is None
 
 
 def test_components_begin_with_the_references():

@@ -6,8 +6,8 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from pipeline.rig.graph import BASE, RigGraph, Sensor, edge_between
-from pipeline.rig.overlap import Overlap, best_three, find_edges, overlaps_of
+from pipeline.rig.graph import BASE, Sensor, edge_between
+from pipeline.rig.overlap import Overlap, find_edges, overlaps_of
 from pipeline.rig.prior import RigPrior, star_of
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
 from pipeline.rig.spherical import to_spherical
@@ -77,12 +77,6 @@ def test_directions_are_carried_from_the_one_that_sees_fewer_to_the_other(wider)
     assert found.share > 0.9
 
 
-def test_what_may_overlap_within_a_sigma_of_the_prior_is_an_edge():
-    aside = [("a", "camera", 41, 20, 10), ("b", "lidar", 0, 20, 10)]
-    (sure,), (unsure,) = overlaps_of(*rig(aside)), overlaps_of(*rig(aside, sigma_deg=4.0))
-    assert (sure.is_enough, unsure.is_enough) == (False, True)
-
-
 def test_each_camera_meets_the_lidar_all_around_and_only_the_radars_of_its_side():
     found = edges_of(*rig())
     assert {f"{camera}-top" for camera in ("front", "left", "right", "rear")} <= found
@@ -119,20 +113,6 @@ def test_the_same_edges_are_kept_on_days_that_share_some_percent_more_or_less(sh
     assert found == {frozenset(f"cam-l{i}" for i in range(kept))}
 
 
-def test_what_a_tree_needs_is_kept_beyond_the_three_best():
-    # Ahead and behind four lidars each; one camera behind sees a little of one lidar ahead, which has better partners.
-    sensors = [
-        *[(f"c{i}", "camera", 0, 40, 15) for i in range(3)], ("wide", "lidar", 0, 112, 15),
-        *[(f"l{i}", "lidar", 0, 60, 15) for i in range(2)],
-        *[(f"r{i}", "lidar", 180, 60, 15) for i in range(3)], ("back", "camera", 150, 45, 15),
-    ]  # fmt: skip
-    prior, views = rig(sensors)
-    graph = find_edges(prior, overlaps_of(prior, views))
-    assert len(graph.components()) == 1
-    (link,) = [e for e in graph.edges if not graph.without([e]).path(*e.sensors)]
-    assert link.name == "back-wide"
-
-
 def test_the_reference_is_the_lidar_with_most_edges_unless_named():
     prior, views = rig()
     overlaps = overlaps_of(prior, views)
@@ -158,27 +138,3 @@ def test_what_nothing_ties_to_the_reference_is_a_component_of_its_own():
     del views["under"]  # silent
     graph = find_edges(prior, overlaps_of(prior, views))
     assert [[s.name for s in c] for c in graph.components()[1:]] == [["under"]]
-
-
-def test_edges_that_the_file_names_are_all_that_there_are():
-    prior, views = rig()
-    named = [edge_between(Sensor("rear", "camera"), Sensor("nose", "lidar"))]
-    assert edges_of(prior, views, named=named) == {"rear-nose"}
-
-
-def test_a_rig_with_one_sensor_of_each_kind_has_all_its_pairs_as_before():
-    sensors = [
-        ("camera", "camera", 180, 20, 10),
-        ("lidar", "lidar", 0, 20, 10),
-        ("radar", "radar", 0, 20, 10),
-    ]
-    graph = find_edges(rig(sensors)[0], overlaps_of(*rig(sensors)))
-    assert isinstance(graph, RigGraph)
-    assert [e.kind for e in graph.edges] == ["camera_lidar", "camera_radar", "lidar_radar"]
-    assert graph.reference.name == "lidar"
-
-
-def test_the_best_three_sensors_all_share_a_view():
-    assert [s.name for s in best_three(overlaps_of(*rig()))] == ["front", "top", "ahead"]
-    apart = [("c", "camera", 0, 20, 10), ("l", "lidar", 0, 180, 15), ("r", "radar", 180, 50, 90)]
-    assert best_three(overlaps_of(*rig(apart))) is None

@@ -5,11 +5,9 @@ import pytest
 
 from pipeline.core.config import load_fleet
 from pipeline.core.errors import ConfigError, SolveError
-from pipeline.rig.day_prior import perturbed, prior_of_three, rig_prior
-from pipeline.rig.prior import RigPrior, from_rows, moved, star_of, to_rows
+from pipeline.rig.day_prior import rig_prior
+from pipeline.rig.prior import from_rows, moved, star_of, to_rows
 from pipeline.rig.se3 import adjoint, exp_se3, inverse, log_so3
-from schemas.calibrations import pairs_of
-from tests.makers.fleet_files import fleet_toml
 from tests.rig.test_rig import VAN
 
 NAMES = ("front", "left", "top", "nose", "corner_fl", "corner_rr", "base")
@@ -34,16 +32,6 @@ def prior_of(tmp_path, text=VAN, lost=()):
     return rig, rig_prior(rows, fleet, rig), T
 
 
-def three_sensors(tmp_path):
-    path = tmp_path / "fleet.toml"
-    path.write_text(fleet_toml("car"))
-    fleet = load_fleet(path)
-    rig, T = fleet.rigs["default"], poses()
-    as_sensor = dict(zip(("camera", "lidar", "radar"), ("front", "top", "corner_fl"), strict=True))
-    star = star_of(rig.nodes, lambda a, b: inverse(T[as_sensor[a]]) @ T[as_sensor[b]])
-    return rig, rig_prior(to_rows([star]), fleet, rig), star
-
-
 def test_poses_of_all_sensors_come_back_through_the_manifest(tmp_path):
     _, prior, T = prior_of(tmp_path)
     known = prior.extrinsics()
@@ -55,16 +43,6 @@ def test_poses_of_all_sensors_come_back_through_the_manifest(tmp_path):
         for b in NAMES:
             np.testing.assert_allclose(known.between(a, b), inverse(T[a]) @ T[b], atol=1e-9)
             np.testing.assert_allclose(prior.between(a, b), inverse(T[a]) @ T[b], atol=1e-9)
-
-
-def test_a_sensor_is_unsure_about_itself_by_its_own_sigmas(tmp_path):
-    _, prior, _ = prior_of(tmp_path)
-    known = prior.extrinsics()
-    for name, degrees in (("left", 2.0), ("corner_fl", 4.0)):
-        # In its own axes nothing of the lever arm is left.
-        expected = np.diag([np.radians(degrees) ** 2] * 3 + [0.05**2] * 3)
-        np.testing.assert_allclose(known.covariance_between(name, "base"), expected, atol=1e-12)
-    assert np.array_equal(known.covariance, known.common)
 
 
 def test_the_reference_is_mounted_with_a_tolerance_of_its_own_that_all_poses_in_it_share(tmp_path):
@@ -112,41 +90,6 @@ def test_no_sensor_but_the_reference_stays_where_it_was_and_all_move_by_as_much(
     assert after.sigmas["corner_fl"] == (np.radians(4), 0.1)
 
 
-@pytest.mark.parametrize("missing", [None, "camera", "lidar", "radar"])
-def test_a_three_sensor_rig_is_moved_by_the_draws_that_it_always_had(missing, tmp_path):
-    rig, prior, star = three_sensors(tmp_path)
-    if missing is not None:
-        rig = rig.model_copy(update={f"{missing}s": {}})
-        nodes = tuple(n for n in prior.nodes if n.name != missing)
-        star = {("camera", "radar"): prior.between("camera", "radar")} if missing == "lidar" else star
-        star = {ends: T for ends, T in star.items() if missing not in ends}
-        prior = RigPrior(nodes, nodes[-1] if missing == "lidar" else prior.reference, star, prior.sigmas)
-    names = [None if name == missing else name for name in ("camera", "lidar", "radar")]
-    then = perturbed(prior_of_three(prior, rig, *names), (2.0, 0.1), 7)
-    now = prior_of_three(moved(prior, np.radians(2.0), 0.1, 7), rig, *names)
-    for pair in pairs_of([name for name in names if name is not None]):
-        assert then.knows(pair)
-        np.testing.assert_array_equal(now.of(pair), then.of(pair))
-    assert (now.rotation_sigma_rad, now.translation_sigma_m) == (
-        then.rotation_sigma_rad,
-        then.translation_sigma_m,
-    )
-
-
-def test_any_three_sensors_have_the_prior_of_a_three_sensor_rig(tmp_path):
-    rig, prior, T = prior_of(tmp_path, VAN.replace('/left/info"', '/left/info"\nreadout_s = 0.02'))
-    found = prior_of_three(prior, rig, "left", "nose", "corner_rr")
-    np.testing.assert_allclose(found.T_camera_lidar, inverse(T["left"]) @ T["nose"], atol=1e-9)
-    np.testing.assert_allclose(found.T_lidar_radar, inverse(T["nose"]) @ T["corner_rr"], atol=1e-9)
-    assert found.camera.readout_s == 0.02
-    # Neither is the reference: both may be off.
-    assert found.rotation_sigma_rad == pytest.approx(np.radians(2) * np.sqrt(2))
-    pair = prior_of_three(prior, rig, None, "top", "corner_fl")
-    assert pair.knows("lidar_radar")
-    assert not pair.knows("camera_lidar")
-    assert pair.rotation_sigma_rad == pytest.approx(np.radians(np.hypot(2, 4)))  # both are mounted on the car
-
-
 def test_a_prior_file_says_where_every_sensor_is(tmp_path):
     path = tmp_path / "prior.json"
     text = VAN + '[rigs.van.prior]\nsource = "file"\nfile = "prior.json"\n'
@@ -170,15 +113,3 @@ def test_a_prior_file_says_where_every_sensor_is(tmp_path):
             prior_of(tmp_path, text)
         assert said in str(caught.value)
         assert "prior.json" in str(caught.value)
-
-
-def test_a_prior_file_of_poses_is_read_for_three_sensors_too(tmp_path):
-    rig, prior, star = three_sensors(tmp_path)
-    pose = {n: prior.between("lidar", n).tolist() for n in ("camera", "radar")}
-    (tmp_path / "prior.json").write_text(json.dumps({"reference": "lidar", "T": pose}))
-    rig = rig.model_copy(
-        update={"prior": rig.prior.model_copy(update={"source": "file", "file": "prior.json"})}
-    )
-    found = rig_prior([], load_fleet(tmp_path / "fleet.toml"), rig)
-    for ends, T in star.items():
-        np.testing.assert_allclose(found.between(*ends), T, atol=1e-9)

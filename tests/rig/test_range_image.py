@@ -21,15 +21,6 @@ def test_points_through_pixel_centres_fall_into_their_pixels():
     assert image.range_m == pytest.approx(10.0)
 
 
-def test_left_of_the_vehicle_is_left_in_the_image_and_above_is_above():
-    points = np.array([[9, 0.1, 0], [0.1, 9, 0], [0.1, -9, 0], [9, 0.1, 1]], np.float32)
-    image = project(points, SIZE, UP, DOWN)
-    ahead, left, right, high = zip(image.row, image.column, strict=True)
-    assert left[1] < ahead[1] < right[1]
-    assert ahead[1] == SIZE[1] // 2 - 1
-    assert high[0] < ahead[0]
-
-
 def test_of_points_in_one_pixel_the_nearest_is_drawn_whatever_their_order():
     ranges = np.array([30.0, 5.0, 12.0])
     for order in ([0, 1, 2], [2, 1, 0], [1, 0, 2]):
@@ -89,50 +80,3 @@ def test_votes_are_those_of_the_definition():
     found = vote_of_neighbours(image, labels, 20, **KNN)
     some = rng.choice(count, 800, replace=False)
     assert found[some].tolist() == [brute_vote(image, labels, n) for n in some]
-
-
-def test_an_image_of_one_label_gives_every_point_that_label():
-    rng = np.random.default_rng(4)
-    points = points_of(rng.uniform(0, 31, 3000), rng.uniform(0, 359, 3000), rng.uniform(3, 60, 3000))
-    found = vote_of_neighbours(project(points, SIZE, UP, DOWN), np.full(SIZE, 7), 20, **KNN)
-    assert set(found) == {7}
-
-
-def test_a_wall_behind_a_pole_does_not_take_the_poles_label():
-    wall = full_image(20.0)
-    pole = points_of(np.arange(32), np.full(32, 100), np.full(32, 8.0))
-    points = np.concatenate([wall, pole])
-    image = project(points, SIZE, UP, DOWN)
-    labels = np.where(image.range_m < 10, 18, BUILDING)
-    assert np.all(labels[:, 100] == 18)  # the pixels show nothing of the wall there
-    found = vote_of_neighbours(image, labels, 20, **KNN)
-    assert np.all(found[: len(wall)] == BUILDING)
-    assert np.all(found[len(wall) :][2:-2] == 18)
-
-
-def test_a_pixel_beyond_the_cutoff_has_no_vote():
-    alone = points_of([10], [50], [9.0])
-    crowd = points_of([9, 10, 10, 11], [50, 49, 51, 50], [10.5] * 4)
-    labels = np.full(SIZE, ROAD)
-    labels[10, 50] = CAR
-    image = project(np.concatenate([alone, crowd]), SIZE, UP, DOWN)
-    assert vote_of_neighbours(image, labels, 20, **KNN)[0] == CAR
-    assert vote_of_neighbours(image, labels, 20, **KNN | {"cutoff_m": 2.0})[0] == ROAD
-
-
-def test_unlabelled_wins_only_where_nothing_else_votes():
-    image = project(points_of([10, 10, 25], [50, 51, 50], [9.0, 9.1, 9.0]), SIZE, UP, DOWN)
-    labels = np.zeros(SIZE, np.int64)
-    labels[10, 51] = ROAD
-    assert vote_of_neighbours(image, labels, 20, **KNN).tolist() == [ROAD, ROAD, 0]
-
-
-def test_turning_the_lidar_by_whole_columns_changes_no_label():
-    rng = np.random.default_rng(5)
-    rows, columns = rng.integers(0, SIZE[0], 6000), rng.integers(0, SIZE[1], 6000)
-    range_m, labels = rng.uniform(4, 9, 6000), rng.integers(1, 6, SIZE)
-    found = vote_of_neighbours(project(points_of(rows, columns, range_m), SIZE, UP, DOWN), labels, 20, **KNN)
-    turned = project(points_of(rows, (columns + 77) % SIZE[1], range_m), SIZE, UP, DOWN)
-    again = vote_of_neighbours(turned, np.roll(labels, 77, axis=1), 20, **KNN)
-    # Votes tie in range to the last float32 bit now and then, nowhere else.
-    assert np.mean(found == again) > 0.999

@@ -18,8 +18,7 @@ def scanner(rows=16, columns=200, spacing_deg=2.0, droop_deg=0.0, jitter_deg=0.0
 
 
 @pytest.mark.parametrize(
-    "shape",
-    [{}, {"droop_deg": 5.0}, {"jitter_deg": 0.05}, {"rows": 128, "spacing_deg": 0.125}, {"rows": 1}],
+    "shape", [{}, {"droop_deg": 5.0}, {"jitter_deg": 0.05}, {"rows": 128, "spacing_deg": 0.125}, {"rows": 1}]
 )
 def test_rows_that_are_logged_are_rows_whatever_their_numbering(shape):
     aer, row = scanner(**shape)
@@ -27,16 +26,6 @@ def test_rows_that_are_logged_are_rows_whatever_their_numbering(shape):
     shuffled = np.random.default_rng(2).permutation(len(row))
     found = rows_of(aer[shuffled], numbering[row][shuffled]).row
     np.testing.assert_array_equal(found, row[shuffled])
-
-
-def test_rows_that_are_not_logged_are_crowds_of_elevations():
-    aer, row = scanner(rows=4, jitter_deg=0.002)
-    np.testing.assert_array_equal(rows_of(aer, None).row, row)
-
-
-def test_rows_that_run_into_each_other_and_are_not_logged_are_none():
-    aer, _ = scanner(rows=64, spacing_deg=0.2, jitter_deg=0.05)
-    assert rows_of(aer, None) is None
 
 
 def turns_stored_one_after_the_other(begin_deg, missing):
@@ -72,11 +61,6 @@ def test_lasers_of_a_rosette_are_no_rows():
     aer = np.stack([azimuth.ravel(), elevation.ravel(), np.full(azimuth.size, 20.0)], 1)
     for ring in (np.tile(np.arange(6), 4000).astype(np.uint16), np.zeros(24000, np.uint16), None):
         assert rows_of(aer, ring) is None
-
-
-def test_no_points_have_no_rows():
-    assert rows_of(np.zeros((0, 3)), None) is None
-    assert rows_of(np.zeros((0, 3)), np.zeros(0, np.uint16)) is None
 
 
 def test_the_order_is_by_row_then_by_azimuth_then_as_stored():

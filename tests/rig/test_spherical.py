@@ -44,17 +44,3 @@ def test_spherical_jacobian_agrees_with_central_differences():
         difference = to_spherical(xyz + d) - to_spherical(xyz - d)
         difference[:, 0] = wrap_angle(difference[:, 0])
         np.testing.assert_allclose(J[..., i], difference / (2 * step), atol=1e-6)
-
-
-@given(st.floats(-50, 50))
-def test_wrapped_angles_are_the_same_angle_in_one_turn(angle):
-    wrapped = float(wrap_angle(np.array(angle)))
-    assert -np.pi <= wrapped < np.pi
-    turns = (angle - wrapped) / (2 * np.pi)
-    assert abs(turns - round(turns)) < 1e-9
-
-
-def test_single_precision_stays_single():
-    xyz = np.ones((4, 3), np.float32)
-    assert to_spherical(xyz).dtype == np.float32
-    assert from_spherical(to_spherical(xyz)).dtype == np.float32
