@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from pipeline.objective.radar.moving_clusters import (
     camera_azimuth_residuals,
@@ -15,7 +14,6 @@ from pipeline.objective.radar.vehicle_boxes import (
     box_equations,
     box_pairs,
     elevation_residuals,
-    median_of_rows,
     vehicle_boxes,
 )
 from pipeline.rig.se3 import exp_se3, transform_points
@@ -120,19 +118,6 @@ def test_azimuth_jacobians_agree_with_central_differences():
     assert np.allclose(J, central_differences(against_camera, 6), atol=1e-6)
 
 
-def test_moving_clusters_are_brought_to_the_lidar_time():
-    late, prompt = street_day(30, dt_s=0.2), street_day(30, dt_s=0.0)
-    for day, dt in ((late, 0.2), (prompt, 0.0)):
-        clusters = moving_clusters(day)
-        centres = np.concatenate([o.lidar_cluster_centre_m[:3] for o in day])
-        found = transform_points(T_LIDAR_RADAR, clusters.at_lidar_time(dt))
-        along = np.abs(np.linalg.norm(found, axis=1) - np.linalg.norm(centres, axis=1))
-        assert np.median(along) < 0.25
-    off = transform_points(T_LIDAR_RADAR, moving_clusters(late).at_lidar_time(0.0))
-    centres = np.concatenate([o.lidar_cluster_centre_m[:3] for o in late])
-    assert np.median(np.abs(np.linalg.norm(off, axis=1) - np.linalg.norm(centres, axis=1))) > 0.4
-
-
 def test_in_a_turn_clusters_are_turned_back_to_when_sweep_and_image_were_taken():
     day = [
         replace(o, ego_yaw_rate_radps=0.5, radar_stamp_ns=o.stamp_ns + (k - 3) * 10_000_000)
@@ -149,11 +134,3 @@ def test_in_a_turn_clusters_are_turned_back_to_when_sweep_and_image_were_taken()
         np.testing.assert_allclose(
             np.linalg.norm(earlier, axis=1), np.linalg.norm(still.point_radar_m, axis=1)
         )
-
-
-@pytest.mark.parametrize("count", [1, 2, 5, 8])
-def test_medians_of_few_rows_are_those_of_numpy(count):
-    x = np.random.default_rng(count).normal(size=(count, 3)).astype(np.float32)
-    np.testing.assert_array_equal(median_of_rows(x), np.median(x, axis=0))
-    np.testing.assert_array_equal(median_of_rows(x[:, 0]), np.median(x[:, 0]))
-    assert median_of_rows(x).dtype == np.float32

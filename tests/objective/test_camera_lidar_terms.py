@@ -7,14 +7,12 @@ import pytest
 
 from pipeline.calibrate.joint.camera_lidar.estimate import AlignmentState
 from pipeline.objective.camera_lidar.edges import chance_of, fit_match_share
-from pipeline.objective.camera_lidar.image_maps import NO_BOUNDARY, CameraMaps, boundary_offsets
+from pipeline.objective.camera_lidar.image_maps import CameraMaps, boundary_offsets
 from pipeline.objective.camera_lidar.points import Points, lidar_velocities
 from pipeline.objective.camera_lidar.projection_loops import camera_parameters, project_point, project_points
 from pipeline.objective.camera_lidar.score import Alignments, KernelSettings, Terms, prepare_terms
 from pipeline.rig.cameras import Camera
 from pipeline.rig.se3 import perturb_exactly
-from pipeline.simulate.sensors.rigs import rig_named
-from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
 from tests.makers.traced_scenes import DENSE, SPARSE, T_TRUE, traced_day
 
 SKY, CAR = 10, 13
@@ -24,19 +22,6 @@ SKY, CAR = 10, 13
 def terms(request):
     day = traced_day(request.param, 6, seed=2, dt_s=0.03)
     return prepare_terms(day, T_TRUE, lidar_velocities(day, np.eye(4)), reach_rad=0.1).sharp(5.0)
-
-
-def test_each_boundary_is_found_from_both_sides_in_the_class_of_its_foreground():
-    labels = np.full((40, 60), SKY, np.uint8)
-    labels[10:30, 20:40] = CAR
-    offsets = boundary_offsets(labels)
-    row, column = offsets[:, 20, :], offsets[:, :, 30]
-    # The car's left border lies at u = 19.5, its foreground to the right of it.
-    np.testing.assert_array_equal(row[EDGE_RIGHT][:40] + 0.5 + np.arange(40), 19.5)
-    np.testing.assert_array_equal(row[EDGE_LEFT][20:] + 0.5 + np.arange(20, 60), 39.5)
-    np.testing.assert_array_equal(column[EDGE_BELOW] + 0.5 + np.arange(40), 9.5)
-    np.testing.assert_array_equal(column[EDGE_ABOVE] + 0.5 + np.arange(40), 29.5)
-    assert (offsets[:, 5, 5] == NO_BOUNDARY).all()
 
 
 CAMERAS = {
@@ -112,18 +97,6 @@ def test_vector_projection_agrees_with_the_point_by_point_one_and_marks_what_can
     np.testing.assert_allclose(np.stack([u, v], -1)[seen], [a[:2] for a in alone if a[2]], atol=0.02)
 
 
-def test_a_fisheye_is_projected_where_its_model_says_behind_the_camera_too():
-    camera = rig_named("fisheye")["camera"].sheet.nominal().scaled(0.5)
-    u, v = np.meshgrid(np.linspace(0, camera.width_px - 1, 33), np.linspace(0, camera.height_px - 1, 25))
-    pixels = np.stack([u.ravel(), v.ravel()], -1)
-    rays = camera.unproject(pixels)
-    assert (rays[:, 2] < -0.3).any()
-    c = camera_parameters(camera)
-    found = np.array([project_point(c, *p) for p in (12.0 * rays).astype(np.float32)])
-    assert found[:, 2].all()
-    np.testing.assert_allclose(found[:, :2], pixels, atol=0.1)
-
-
 def test_a_gap_between_the_stamps_is_a_time_offset_of_its_frame_the_other_way_round(terms):
     gaps = np.random.default_rng(0).uniform(-0.04, 0.04, terms.frames)
     moving = replace(terms, yaw_rate=np.full(terms.frames, 0.2))
@@ -137,20 +110,6 @@ def test_a_gap_between_the_stamps_is_a_time_offset_of_its_frame_the_other_way_ro
     np.testing.assert_array_equal(kept.gap_s, gaps[[1, 0]])
 
 
-def test_some_frames_score_as_in_the_whole_without_copies_of_their_maps(terms):
-    at, level = AlignmentState(T_TRUE, 0.03).alone, KernelSettings.wide(3.0, 1)
-    chosen = np.array([3, 1])
-    some = terms.of_frames(chosen).of_frames(np.array([1, 0]))
-    assert some.maps is terms.maps
-    for name in ("edge_score", "marking_score"):
-        whole, part = (getattr(t, name)(at, level) for t in (terms, some))
-        assert np.ptp(whole) > 0
-        np.testing.assert_array_equal(part, whole[:, [1, 3]])
-    for whole, part in zip(terms.gradient(at, level), some.gradient(at, level), strict=True):
-        np.testing.assert_array_equal(part, whole[[1, 3]])
-    assert some.class_information(at) != terms.class_information(at)
-
-
 def test_score_is_best_at_the_true_pose_and_time_offset(terms):
     level = KernelSettings.wide(3.0, 1)
     rng = np.random.default_rng(0)
@@ -161,13 +120,6 @@ def test_score_is_best_at_the_true_pose_and_time_offset(terms):
     offsets = np.array([-0.06, 0.0, 0.03, 0.09])
     at = Alignments(np.repeat(T_TRUE[None], 4, 0), offsets, np.ones(4))
     assert terms.score(at, level).sum(1).argmax() == 2
-
-
-def test_positive_time_offset_moves_static_points_along_the_ego_motion(terms):
-    still = terms.poses(AlignmentState(T_TRUE).alone)[0]
-    late = terms.poses(Alignments(T_TRUE[None], np.array([0.1]), np.ones(1)))[0]
-    ahead_lidar = (late - still).reshape(-1, 3, 4)[:, :, 3] @ T_TRUE[:3, :3]
-    np.testing.assert_allclose(ahead_lidar, 0.1 * terms.velocity_lidar, atol=1e-5)
 
 
 def test_score_above_chance_prefers_the_truth_to_poses_that_turn_everything_out_of_view():

@@ -14,14 +14,8 @@ from pipeline.objective.differentiable.paper import (
     lidar_radar_tensors,
     padded,
 )
-from pipeline.objective.differentiable.poses import (
-    euler_angles,
-    inverse,
-    loop_loss,
-    pose_of_euler_angles,
-    transform_points,
-)
-from pipeline.objective.differentiable.projection import GridProjection, camera_projection
+from pipeline.objective.differentiable.poses import loop_loss, transform_points
+from pipeline.objective.differentiable.projection import camera_projection
 from pipeline.objective.differentiable.terms import edge_residuals_px
 from pipeline.objective.paper import loop
 from pipeline.objective.paper.camera_lidar import camera_lidar_loss
@@ -188,28 +182,6 @@ def test_projection_equals_the_camera_and_its_jacobian(name):
         -1
     ) / 2e-5
     np.testing.assert_allclose(at.grad[0], slopes.T, atol=2e-4, rtol=1e-6)
-
-
-def test_on_the_grid_a_turn_of_the_camera_is_a_shift():
-    grid = GridProjection(-0.8, -0.4, np.radians(0.4))
-    points = torch.tensor(cloud(3)[:, [0, 1, 2]][None])
-    points = points[:, points[0, :, 2] > 0.5]
-    # About the downward axis: to the right.
-    turned = points @ torch.tensor(se3.exp_so3(np.array([0, 0.05, 0]))).T
-    shift = grid.project(turned)[0] - grid.project(points)[0]
-    np.testing.assert_allclose(shift[..., 0], 0.05 / np.radians(0.4), atol=1e-9)
-    np.testing.assert_allclose(shift[..., 1], 0, atol=1e-9)
-
-
-def test_poses_equal_their_numpy_versions():
-    rng = np.random.default_rng(1)
-    xi = rng.normal(size=(50, 6)) * np.array([[1.0], [1e-3], [1e-5], [0.0], [0.3]]).repeat(10, 0)
-    T = exp_se3(torch.tensor(xi))
-    np.testing.assert_allclose(T, se3.exp_se3(xi), atol=1e-12)
-    np.testing.assert_allclose(inverse(T), se3.inverse(se3.exp_se3(xi)), atol=1e-12)
-    np.testing.assert_allclose(euler_angles(T), loop.euler_angles(se3.exp_se3(xi)), atol=1e-12)
-    back = pose_of_euler_angles(euler_angles(T), T[:, :3, 3])
-    np.testing.assert_allclose(back, T, atol=1e-12)
 
 
 def test_the_loop_loss_is_the_numpy_one_and_zero_where_the_three_agree():

@@ -89,22 +89,6 @@ def test_the_direction_of_all_rests_on_the_mountings():
     )  # both priors' mean error, their own way
 
 
-def test_nothing_is_made_up_where_no_source_speaks():
-    rng = np.random.default_rng(6)
-    u = motion(rng)
-    front = radar("front", u, rng)
-    front.velocity_mps[:10] = np.nan
-    found = ego_motion([front], SILENT, heading=(0.0, 0.0))
-    assert np.isnan(found.velocity_mps[:10]).all()
-    assert np.isfinite(found.velocity_mps[10:]).all()
-
-
-def test_a_sensor_moves_with_its_lever_arm():
-    found = ego_motion([], Odometry(np.array([10.0, 0.0]), np.array([0.5, 0.5])), heading=(0.0, 0.0))
-    T = from_rotation_translation(exp_so3(np.radians([0.0, 0.0, 90.0])), np.array([2.0, 1.0, 0.5]))
-    assert found.at_sensor(T) == pytest.approx(np.array([[1.0, -9.5, 0.0], [1.0, 0.5, 0.0]]), abs=2e-3)
-
-
 def test_who_drives_backwards_is_named_where_somebody_drives_ahead():
     ahead = np.full(20, 9.0)
     reverse = np.where(np.arange(20) < 4, -2.0, 9.0)  # out of a parking space

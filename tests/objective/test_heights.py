@@ -68,19 +68,6 @@ def test_displaced_detections_turn_nothing_and_their_share_is_found(share):
     assert abs(np.degrees(found.turn_rad)) < 4 * np.degrees(found.frames.information.sum() ** -0.5)
 
 
-def test_images_that_a_radar_resolves_are_not_taken_for_displaced_things():
-    # As many are seen below the road on both days.
-    rng = np.random.default_rng(5)
-    images, between = (
-        displaced_heights(
-            [kerbs_and_cars(rng, q, image=p, noise_deg=0.5) for _ in range(15)], T_LIDAR_RADAR, 0.0, rng
-        )
-        for q, p in ((0.0, 0.3), (0.6, 0.0))
-    )
-    assert images.below < 0.5 * between.below
-    assert abs(np.degrees(images.turn_rad)) < 0.15
-
-
 def test_a_day_whose_detections_come_from_anywhere_tells_pitch_less_surely():
     rng = np.random.default_rng(7)
     right, strays = (
@@ -91,12 +78,6 @@ def test_a_day_whose_detections_come_from_anywhere_tells_pitch_less_surely():
     assert strays.floor_rad > 1.4 * right.floor_rad
 
 
-def test_a_pitch_at_the_end_of_the_search_is_not_taken_for_measured():
-    rng = np.random.default_rng(8)
-    rows = [kerbs_and_cars(rng, 0.0) for _ in range(8)]
-    assert displaced_heights(rows, turned(T_LIDAR_RADAR, np.radians(9.0)), 0.0, rng) is None
-
-
 def test_a_radar_that_points_down_is_turned_up_by_as_much():
     rng = np.random.default_rng(2)
     rows = [kerbs_and_cars(rng, 0.3) for _ in range(15)]
@@ -105,20 +86,3 @@ def test_a_radar_that_points_down_is_turned_up_by_as_much():
         for d in (0.0, 1.0)
     )
     assert np.degrees(down.turn_rad - right.turn_rad) == pytest.approx(-1.0, abs=0.15)
-
-
-def test_a_radar_that_is_taken_for_higher_is_turned_down_by_what_is_said_of_its_height():
-    rng = np.random.default_rng(2)
-    rows = [kerbs_and_cars(rng, 0.3) for _ in range(15)]
-    higher = T_LIDAR_RADAR.copy()
-    higher[2, 3] += 0.1
-    right, high = (displaced_heights(rows, T, 0.0, np.random.default_rng(0)) for T in (T_LIDAR_RADAR, higher))
-    assert right.per_height_radpm > 0.03
-    assert (high.turn_rad - right.turn_rad) / 0.1 == pytest.approx(right.per_height_radpm, rel=0.3)
-
-
-def test_without_a_road_nothing_is_said():
-    rng = np.random.default_rng(4)
-    rows = [replace(kerbs_and_cars(rng, 0.3), ground_plane=None) for _ in range(8)]
-    assert displaced_heights(rows, T_LIDAR_RADAR, 0.0, rng) is None
-    assert displaced_heights([], T_LIDAR_RADAR, 0.0, rng) is None

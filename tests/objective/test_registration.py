@@ -15,7 +15,6 @@ from pipeline.objective.radar.registration import (
 from pipeline.rig.se3 import exp_se3, inverse, transform_points
 from pipeline.rig.spherical import to_spherical
 from tests.makers.radar_scenes import DT_S, SIGMA, T_LIDAR_RADAR, street_day
-from tests.objective import plain_numpy
 
 RADAR = np.array([12.0, -4.0, 1.1])
 VELOCITY = np.array([9.0, -0.4, 0.2])
@@ -78,21 +77,6 @@ def test_gradient_agrees_with_differences_of_the_cost():
         )
 
 
-def test_an_uncertain_assignment_informs_less_than_a_certain_one():
-    point = matching_lidar_point(GAP_S)
-    frames = one_pair(point)
-    tangent = np.cross([0, 0, 1.0], RADAR / np.linalg.norm(RADAR))
-    wall = np.stack([point + s * T_LIDAR_RADAR[:3, :3] @ tangent for s in np.linspace(-0.3, 0.3, 21)])
-    along_wall = replace(frames, lidar_m=wall, lidar_first=np.array([0, 21]))
-    one, many = (
-        normal_equations(f, T_LIDAR_RADAR, 0.0, SIGMA_START, 0.0, outlier=1e-9) for f in (frames, along_wall)
-    )
-    assert many.information[0, 0, 2, 2] < 0.2 * one.information[0, 0, 2, 2]  # yaw slides along the wall
-    # Translation along the line of sight (range) stays as well known as before.
-    u = np.r_[T_LIDAR_RADAR[:3, :3] @ RADAR / np.linalg.norm(RADAR)]
-    assert u @ many.information[0, 0, 3:6, 3:6] @ u > 0.9 * u @ one.information[0, 0, 3:6, 3:6] @ u
-
-
 def test_the_cost_is_least_at_the_truth():
     frames = registration_frames(street_day(12), T_LIDAR_RADAR, np.random.default_rng(0))
 
@@ -138,34 +122,3 @@ def test_ground_bounces_are_recognised():
         frames = registration_frames(observations, T_LIDAR_RADAR, np.random.default_rng(0))
         shares.append(normal_equations(frames, T_LIDAR_RADAR, DT_S, SIGMA, 0.12, 0.2).bounced)
     assert shares[1] > 3 * shares[0] + 0.03
-
-
-def test_a_radar_without_elevation_gives_no_elevation_rows():
-    frames = registration_frames(street_day(4, elevation=False), T_LIDAR_RADAR, np.random.default_rng(0))
-    N = normal_equations(frames, T_LIDAR_RADAR, DT_S, SIGMA_START)
-    assert not N.H[1].any()
-    assert N.H[0].any()
-
-
-def test_frames_without_static_detections_are_left_out():
-    day = street_day(4)
-    empty = replace(day[1], radar_motion=np.ones_like(day[1].radar_motion))
-    lost = replace(day[2], radar_velocity_mps=None)
-    frames = registration_frames([day[0], empty, lost, day[3]], T_LIDAR_RADAR, np.random.default_rng(0))
-    assert frames.frame.tolist() == [0, 3]
-    none = registration_frames([empty], T_LIDAR_RADAR, np.random.default_rng(0))
-    assert none.count == 0
-
-
-@pytest.mark.parametrize("widen", [0.2, 1.0, 4.0])
-def test_every_lidar_point_in_reach_takes_part(widen):
-    """Against every pair of detection and point in plain NumPy, at sigmas sharper and wider than the cells."""
-    frames = registration_frames(street_day(3), T_LIDAR_RADAR, np.random.default_rng(0))
-    about = (T_LIDAR_RADAR, 0.04, widen * SIGMA_START, 0.12, 0.2)
-    ours, plain = normal_equations(frames, *about), plain_numpy.registration(frames, *about)
-    for a, b in zip((ours.H, ours.g, ours.information, ours.cost), plain, strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-6 * np.abs(b).max())
-    turning = replace(frames, yaw_rate_radps=np.full(frames.count, YAW_RATE))
-    cost = normal_equations(turning, *about).cost
-    assert np.abs(cost - ours.cost).max() > 1e-3
-    np.testing.assert_allclose(cost, plain_numpy.registration_cost(turning, *about), atol=1e-7)

@@ -56,29 +56,6 @@ def test_a_static_point_is_where_the_car_was_when_its_own_row_was_exposed(terms)
     assert np.abs(seen.edges.exposure_s).max() > 0.1 * READOUT_S
 
 
-def test_rows_from_first_to_last_are_half_a_readout_before_and_after_the_middle_one():
-    v = np.array([-50.0, 0.0, 99.5, 199.0, 300.0])
-    expected = READOUT_S * np.array([-0.5, -0.5 + 0.5 / 200, 0.0, 0.5 - 0.5 / 200, 0.5])
-    np.testing.assert_allclose(row_delays_s(v, 200, READOUT_S), expected, atol=1e-12)
-
-
-def test_exposing_again_elsewhere_or_at_another_speed_does_not_add_up(terms):
-    at = AlignmentState(T_TRUE, 0.02).alone
-    slower = 0.5 * terms.velocity_lidar
-    once = replace(terms, velocity_lidar=slower).exposed_at(at)
-    again = terms.exposed_at(AlignmentState(T_TRUE, -0.03).alone).exposed_at(at, slower)
-    np.testing.assert_array_equal(again.velocity_lidar, slower)
-    for a, b in ((once.edges, again.edges), (once.markings, again.markings), (once.classes, again.classes)):
-        np.testing.assert_allclose(a.xyz_m, b.xyz_m, atol=2e-4)
-    back = replace(again, readout_s=1e-12).exposed_at(at)
-    np.testing.assert_allclose(back.edges.xyz_m, terms.edges.xyz_m, atol=1e-4)
-
-
-def test_a_global_shutter_leaves_every_point_alone(terms):
-    still = replace(terms, readout_s=0.0)
-    assert still.exposed_at(AlignmentState(T_TRUE).alone).edges is still.edges
-
-
 def test_the_true_readout_scores_best_at_the_true_pose():
     day = traced_day(DENSE, 6, seed=3, dt_s=0.02, readout_s=READOUT_S)
     velocity = np.array([[o.ego_speed_mps, 0.0, 0.0] for o in day])

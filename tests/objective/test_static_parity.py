@@ -12,13 +12,8 @@ import pytest
 import torch
 
 from pipeline.objective.differentiable.paper import padded
-from pipeline.objective.differentiable.poses import inverse, transform_points
-from pipeline.objective.differentiable.static import (
-    StaticFrames,
-    elevation_limits,
-    static_cost,
-    tells_elevation,
-)
+from pipeline.objective.differentiable.poses import transform_points
+from pipeline.objective.differentiable.static import StaticFrames, static_cost, tells_elevation
 from pipeline.objective.radar.registration import (
     BOUNCE_PRIOR,
     RANGE_M,
@@ -149,25 +144,6 @@ def test_they_are_for_every_outlier_weight_with_and_without_bounce_and_elevation
     assert_close(gradient, kernel_slopes(frames, T, **how))
 
 
-def test_without_bounces_the_kernels_own_gradient_is_the_torch_one_with_jacobians_at_the_detection(street):
-    """What the kernel steps along: the same weights and residuals, each detection's points moved as it would itself."""
-    T = se3.exp_se3(np.array([0.004, 0.006, -0.003, 0.05, -0.04, 0.02])) @ T_LIDAR_RADAR
-    frames = kernels_frames(street, T_LIDAR_RADAR, TRUSTED_RAD)
-    equations = normal_equations(frames, T, 0.0, SIGMA_START, 0.0, outlier=1.0)
-    counts = np.diff(frames.radar_first)
-    wanted = equations.g.sum(0)[:, :6] / counts[:, None]
-
-    radar, *rest = tensors(street, TRUSTED_RAD)
-    radar = radar.requires_grad_()
-    cost_of(torch.tensor(T)[None], (radar, *rest), bounce_prior=0.0).sum().backward()
-    # Moving a detection is moving all of its partners the other way.
-    twist = torch.zeros(len(street), 6, dtype=torch.float64, requires_grad=True)
-    at = transform_points(torch.tensor(T), radar.detach())
-    moved = transform_points(inverse(exp_se3(twist) @ torch.tensor(T)), at)
-    (-radar.grad * moved).sum().backward()
-    assert_close(twist.grad.numpy(), wanted)
-
-
 def test_limits_take_elevation_from_detections_beyond_them_and_from_no_other(street):
     T = torch.tensor(T_LIDAR_RADAR)[None]
     inputs = tensors(street, TRUSTED_RAD)
@@ -182,13 +158,3 @@ def test_limits_take_elevation_from_detections_beyond_them_and_from_no_other(str
     torch.testing.assert_close(none, cost([-1.5, 1.5], elevation=False))
     assert (wide > some).all()
     assert (some > none).all()
-
-
-def test_limits_of_a_sweep_are_the_registrations_of_a_day_of_that_sweep(street):
-    points, present = padded([o.lidar_map_xyz_m for o in street], torch.float64)
-    ours = elevation_limits(points, present)
-    for o, found in zip(street, ours, strict=True):
-        day = registration_frames([o], T_LIDAR_RADAR, np.random.default_rng(0)).lidar_elevation_rad
-        np.testing.assert_allclose(found, day, atol=1e-7)
-    nothing = elevation_limits(points, torch.zeros_like(present))
-    assert (nothing == torch.tensor([-1.5, 1.5])).all()
