@@ -41,13 +41,6 @@ def test_clusters_are_those_of_the_definition(dimensions, seed):
         assert label[border] == label[np.argmin(distance)]
 
 
-@pytest.mark.parametrize(
-    ("x", "labels"), [([], []), ([0.0, 5.0], [-1, -1]), ([0.0, 1.0], [0, 0])]
-)  # eps itself is near
-def test_no_points_and_lone_points_make_no_cluster(x, labels):
-    assert dbscan(np.outer(x, [1.0, 0, 0]), 1.0, 2).tolist() == labels
-
-
 def test_points_kilometres_astray_change_no_cluster():
     points = np.random.default_rng(5).uniform(0, 20, (600, 3))
     astray = np.array([[1e9, 0, 0], [0, -1e9, 0], [0, 0, 1e9]])

@@ -71,11 +71,7 @@ def is_post(azimuth_deg, elevation_deg):
     return (np.abs(azimuth_deg) < 2.0) & (elevation_deg < 3.0)
 
 
-LOGGED = {
-    "no ring": lambda _: None,
-    "lasers as rings": lambda laser: laser,
-    "ring 0 for all": np.zeros_like,
-}
+LOGGED = {"no ring": lambda _: None, "lasers as rings": lambda laser: laser, "ring 0 for all": np.zeros_like}
 
 
 @pytest.mark.parametrize("logged", LOGGED)
@@ -105,9 +101,3 @@ def test_the_road_under_a_sweep_without_rows_has_no_edges(logged):
     xyz, a, _, laser = scattered(lambda _, e: np.where(e < -0.02, 1.8 / np.sin(np.maximum(-e, 0.02)), 90.0))
     edges = lidar_edges(xyz, LOGGED[logged](laser), np.full(len(a), -1, np.int32), CONFIG)
     assert len(edges.side) == 0
-
-
-@pytest.mark.parametrize("count", [0, 1, 5])
-def test_empty_and_tiny_clouds_have_no_edges(count):
-    edges = lidar_edges(np.full((count, 3), 5, np.float32), None, np.full(count, -1, np.int32), CONFIG)
-    assert (len(edges.side), edges.xyz_m.shape) == (0, (0, 3))

@@ -50,10 +50,3 @@ def test_a_sign_above_the_road_is_no_obstacle_where_elevation_is_measured():
     seen = np.concatenate([corridor(), blob([20, 0, 5])])
     assert np.all(ahead(sector(seen)) > 22)
     assert np.all(ahead(sector(seen * np.array([1, 1, 0], np.float32), has_elevation=False)) < 21)
-
-
-def test_directions_without_evidence_are_absent():
-    found = sector(blob([10, 6, 0], 50), blob([10, -6, 0], 50))
-    assert np.min(np.abs(found.azimuth_rad)) > np.radians(15)
-    nothing = sector(np.zeros((0, 3), np.float32), has_elevation=False)
-    assert nothing.azimuth_rad.shape == nothing.range_m.shape == (0,)

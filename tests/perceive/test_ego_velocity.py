@@ -5,7 +5,6 @@ import pytest
 
 from pipeline.core.config import PerceiveConfig
 from pipeline.perceive.ego_velocity import MOVING, STATIC, UNDECIDED, Travel, radar_motion
-from pipeline.perceive.moving import cluster_moving
 
 PERIOD_MPS = 10.394
 AHEAD = Travel(heading_rad=0.0)
@@ -74,25 +73,6 @@ def test_moving_cars_are_told_from_the_static_world_and_become_one_cluster_each_
     assert np.array_equal(found.cluster, again.cluster)
 
 
-def test_an_unambiguous_radar_without_elevation_gives_the_same_velocity():
-    rng = np.random.default_rng(4)
-    truth = np.array([22.0, 0.4, 0.0])
-    xyz, rate, _ = scan(rng, truth, movers=3)
-    xyz[:, 2] = 0
-    found = motion_of(xyz, rate, rng, period=None, has_elevation=False)
-    # Flattening directions leaves out the cosine of elevations (4 deg here): 0.25 %.
-    assert np.abs(found.velocity_mps[:2] - truth[:2]).max() < 0.12
-    assert found.velocity_cov[2, 2] > 0.5
-
-
-@pytest.mark.parametrize("hint_mps", [6.3, 16.0, 27.0])
-def test_odometry_limits_the_search(hint_mps):
-    rng = np.random.default_rng(5)
-    # Too narrow to lift the ambiguity.
-    xyz, rate, _ = scan(rng, np.array([6.0, 0.0, 0.0]), points=60, fov_deg=4.0)
-    assert abs(motion_of(xyz, rate, rng, Travel(hint_mps, 0.0)).velocity_mps[0] - hint_mps) < 2.5
-
-
 def test_odometry_finds_the_static_world_beside_a_bus_that_fills_the_scan():
     rng = np.random.default_rng(12)
     xyz, rate, _ = scan(rng, np.array([11.0, 0.0, 0.0]), points=80)
@@ -125,12 +105,6 @@ def test_detections_that_are_not_numbers_are_undecided_and_harm_nothing():
     assert abs(found.velocity_mps[0] - 5.0) < 0.05
     assert np.all(found.motion[::7] == UNDECIDED)
     assert np.isfinite(found.residual_mps).all()
-
-
-@pytest.mark.parametrize(("period", "count"), [(PERIOD_MPS, 1), (0.0, 2)])
-def test_clusters_join_across_the_wrap_of_the_doppler(period, count):
-    xyz = np.array([[20, 0, 0], [20.2, 0, 0], [20.4, 0, 0]], np.float32)
-    assert len(set(cluster_moving(xyz, np.array([5.1, -5.1, 5.0]), np.ones(3, bool), period, 1.8))) == count
 
 
 @pytest.mark.parametrize("period", [None, PERIOD_MPS])

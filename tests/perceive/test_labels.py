@@ -9,7 +9,6 @@ from pipeline.perceive.labels import (
     LABEL_SETS,
     ROAD_USERS,
     VOID_ID,
-    road_user_name,
     to_cityscapes,
 )  # fmt: skip
 
@@ -37,14 +36,6 @@ def test_foreign_labels_mean_what_their_sets_say(label_set, known):
     table = to_cityscapes(label_set)
     for foreign, name in known.items():
         assert table[foreign] == (VOID_ID if name is None else CITYSCAPES.index(name))
-
-
-@pytest.mark.parametrize(
-    ("logged", "name"),
-    [("car", "car"), ("Pedestrian", "person"), ("motor_bike", None), ("van", "car"), ("dog", None)],
-)
-def test_logged_class_names_become_road_users(logged, name):
-    assert road_user_name(logged) == name
 
 
 @pytest.mark.parametrize(

@@ -22,12 +22,6 @@ def test_paint_stands_out_of_rings_of_different_brightness():
         assert len(marks.z) < 800  # plain road is thinned
 
 
-def test_no_intensity_or_no_ground_gives_no_markings():
-    xyz = np.ones((50, 3), np.float32)
-    assert len(lidar_markings(xyz, None, None, np.ones(50, bool)).z) == 0
-    assert len(lidar_markings(xyz, np.ones(50, np.float32), None, np.zeros(50, bool)).z) == 0
-
-
 def test_contrast_shows_a_line_and_nothing_outside_the_mask():
     grey = np.full((60, 400), 70, np.uint8)
     grey[:, 200:204] = 180

@@ -79,12 +79,6 @@ def test_each_road_user_keeps_one_identity(step_s):
     assert found[-1].age.tolist() == [5, 5, 5]
 
 
-def test_measured_centres_are_reported_without_filter_lag():
-    returns = World(USERS).returns(0.0)
-    _, tracks = advance_tracks(TrackState.empty(), 0, 0, EgoMotion((12.0, 0.0), 0.0), returns, PERIOD_MPS)
-    assert np.array_equal(tracks.xyz_m, returns.centre_m)
-
-
 @pytest.mark.parametrize(
     ("times", "drives", "ego_known"),
     [
@@ -113,19 +107,6 @@ def test_a_track_survives_one_missed_scan():
     assert found[3].identity.shape == (0,)
     assert found[4].identity.tolist() == found[2].identity.tolist()
     assert found[4].age.tolist() == [4]
-
-
-def test_a_car_of_the_wrong_speed_is_not_taken_for_the_track():
-    # Where the old car should be now stands another one that drives the other way.
-    state, identities = TrackState.empty(), []
-    for k, (x, rate) in enumerate([(20, 5), (20.5, 5), (21, 5), (21.5, 5), (22, -6)]):
-        seen = ClusterReturns(
-            np.array([[x, 0, 0]], np.float32), np.array([rate], np.float32), np.array([4], np.int32)
-        )
-        state, tracks = advance_tracks(state, k * 100_000_000, 0, EgoMotion((0.0, 0.0), 0.0), seen, None)
-        identities.append(tracks.identity[0])
-    assert len(set(identities[:4])) == 1
-    assert identities[4] != identities[3]
 
 
 @pytest.mark.parametrize(("period", "rate"), [(PERIOD_MPS, PERIOD_MPS / 2), (None, 0.0)])

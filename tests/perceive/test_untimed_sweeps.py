@@ -5,20 +5,10 @@ from functools import cache
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
 
 from pipeline.core.rigs import LidarTurn
-from pipeline.core.ros_messages import RosMessages
 from pipeline.ingest.captures import deskew
-from pipeline.perceive.untimed_sweeps import (
-    BY_AZIMUTH,
-    WITHOUT_TIMES,
-    Turning,
-    motions,
-    surfaces_of,
-    turning_of,
-)
-from pipeline.rig.topics import TOPICS
+from pipeline.perceive.untimed_sweeps import BY_AZIMUTH, WITHOUT_TIMES, Turning, turning_of
 from pipeline.simulate.sensors.lidar import sweep_lidar
 from pipeline.simulate.world.casting import World
 from pipeline.simulate.world.drives import Drive
@@ -98,15 +88,6 @@ def test_points_are_moved_to_the_stamp_by_the_motion_between_sweeps(change, sens
         assert off_m(wrong.timed(*seen[k])[0].lidar_xyz_m, right) > 1.5 * as_far
 
 
-def test_odometry_goes_before_the_motion_between_sweeps_and_a_car_that_stands_keeps_its_points():
-    moments = [(Seen(k, k * 10**8, ego_speed_mps=0.0), sweep(ANY)) for k in range(2)]
-    turning = turning_of(moments, RIGHT)
-    assert turning.motion == {}
-    timed, note = turning.timed(*moments[0])
-    assert (note, timed.lidar_deskewed) == (BY_AZIMUTH, True)
-    np.testing.assert_array_equal(timed.lidar_xyz_m, sweep(ANY).lidar_xyz_m)
-
-
 @pytest.mark.parametrize(("speed_mps", "note"), [(0.0, ""), (8.0, WITHOUT_TIMES)])
 def test_a_lidar_of_which_nobody_knows_is_counted_where_the_car_drives(speed_mps, note):
     as_logged = sweep(ANY)
@@ -137,18 +118,3 @@ def test_what_fleet_toml_says_needs_no_car_that_moves(sense, stamp, times):
 )
 def test_sweeps_with_times_and_lidars_that_do_not_spin_are_not_looked_at(xyz, change):
     assert turning_of([(Seen(0, 0), replace(sweep(xyz), **change))], RIGHT) is None
-
-
-@pytest.mark.slow
-@pytest.mark.real_logs
-def test_the_motion_of_kitti_s_car_is_found_until_it_stands(kitti_logs):
-    store, clouds = RosMessages(2).typestore, []
-    (log,) = kitti_logs.glob("*.mcap")
-    with log.open("rb") as stream:
-        for schema, _, message in make_reader(stream).iter_messages(topics=[TOPICS["lidar"]]):
-            held = store.deserialize_cdr(message.data, schema.name)
-            clouds.append(np.frombuffer(held.data.tobytes(), "<f4").reshape(-1, held.point_step // 4)[:, :3])
-    surfaces = {k: surfaces_of(xyz) for k, xyz in enumerate(clouds)}
-    found = motions(surfaces, [(k, k + 1, 0.3) for k in range(len(clouds) - 1)])
-    assert found[0].x == pytest.approx(2.4, abs=0.2)
-    assert found[len(clouds) - 1].way < 0.1

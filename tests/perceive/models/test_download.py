@@ -113,15 +113,6 @@ def test_another_file_is_not_kept_and_leaves_the_one_before(how, server, tmp_pat
     assert (tmp_path / "model.onnx").read_bytes() == CONTENT
 
 
-@pytest.mark.parametrize("status", [404, 503])
-def test_a_server_without_the_file_is_named_with_its_answer(status, server, tmp_path):
-    server.status = status
-    with pytest.raises(DownloadError, match=f"{status} .* for url: {server.url}"):
-        fetched(server, tmp_path / "model.onnx")
-    assert server.asked == 3
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.usefixtures("server")
 def test_without_a_network_the_error_says_what_to_do(tmp_path):
     with socket.socket() as unused:

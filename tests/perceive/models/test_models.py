@@ -9,11 +9,10 @@ import pytest
 
 from pipeline.core.config import load_fleet
 from pipeline.core.errors import ModelError, ModelOutputError
-from pipeline.core.memory import MODEL_THREADS, usable_cpus
-from pipeline.perceive.models.detector import Candidates, Detector, decode_head, suppress
+from pipeline.perceive.models.detector import Detector, decode_head
 from pipeline.perceive.models.manifest import InputSpec, load_manifest
 from pipeline.perceive.models.segmenter import Segmenter
-from pipeline.perceive.models.session import Fit, fit_image, model_threads
+from pipeline.perceive.models.session import fit_image
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import observations_of
 from tests.makers.lakes import write_frames
@@ -69,26 +68,6 @@ def test_boundaries_of_reduced_logits_lie_where_the_image_has_them(tmp_path, fit
     assert np.sum(right == 2) == pytest.approx(rows / 8, abs=tolerance)
 
 
-def test_interpolated_logits_place_a_boundary_finer_than_their_stride(tmp_path):
-    model = Segmenter(segmenter(tmp_path, stride=8))
-    errors = []
-    for edge in range(60, 100):
-        image = np.full((96, 160, 3), 51, np.uint8)
-        image[:, edge:] = (230, 26, 26)
-        [labels] = model.segment_each([image], [(96, 160)])
-        errors.append(np.sum(labels[40] == 3) - edge)
-    assert abs(np.mean(errors)) < 0.6
-    assert np.max(np.abs(errors)) <= 2  # nearest would err by up to 4
-
-
-def test_plain_label_outputs_are_resampled_with_aligned_centres(tmp_path):
-    answer = np.zeros((1, 24, 40), np.float32)
-    answer[:, :, 10:] = 10
-    model = answering(tmp_path, answer, "labels")
-    [labels] = model.segment_each([np.zeros((192, 320, 3), np.uint8)], [(96, 160)])
-    assert np.array_equal(np.unique(labels, return_counts=True)[1], [96 * 40, 96 * 120])
-
-
 @pytest.mark.parametrize("fit", FITS)
 def test_a_box_in_the_models_input_comes_back_to_the_image(fit):
     image = np.zeros((300, 410, 3), np.uint8)
@@ -99,17 +78,6 @@ def test_a_box_in_the_models_input_comes_back_to_the_image(fit):
     y = (np.array([rows.min(), rows.max() + 1]) - where.offset_y) / where.scale_y
     assert x == pytest.approx([50, 120], abs=2.6)
     assert y == pytest.approx([100, 160], abs=2.6)
-
-
-def test_colours_and_normalisation_follow_the_manifest():
-    image = np.zeros((8, 8, 3), np.uint8)
-    image[:] = (10, 20, 30)  # BGR
-    spec = {"size": (8, 8), "mean": (1.0, 2.0, 3.0), "std": (2.0, 4.0, 8.0)}
-    rgb = fit_image(image, InputSpec(**spec, colour="rgb"))[0][0, :, 0, 0]
-    bgr = fit_image(image, InputSpec(**spec, colour="bgr"))[0][0, :, 0, 0]
-    assert rgb == pytest.approx([29 / 2, 18 / 4, 7 / 8])
-    assert bgr == pytest.approx([9 / 2, 18 / 4, 27 / 8])
-    assert fit_image(image, InputSpec(size=(8, 16)))[1] == Fit(1.0, 1.0, 4, 0, 8, 8)
 
 
 def rows_of(boxes, classes, scores, objectness=None, count=8):
@@ -151,18 +119,6 @@ def test_a_yolox_head_is_decoded_on_its_grid():
     assert found.classes[best] == 2
     x, y = (4 + 0.5) * 16, (3 + 0.25) * 16
     assert found.boxes[best] == pytest.approx([x - 16, y - 24, x + 16, y + 24])
-
-
-def test_suppression_works_within_a_class_only():
-    boxes = np.array([[0, 0, 10, 10], [1, 0, 11, 10], [0, 0, 10, 10], [50, 50, 60, 60]], np.float32)
-    found = Candidates(boxes, np.array([0.5, 0.9, 0.4, 0.1], np.float32), np.array([2, 2, 0, 2]))
-    assert suppress(found, 0.5).tolist() == [1, 2, 3]
-    assert suppress(found, 1.0).tolist() == [1, 0, 2, 3]
-
-
-def test_classes_that_are_no_road_users_are_left_out(tmp_path):
-    answer = rows_of(BOXES[:2], [4, 2], [0.9, 0.8], [1.0, 1.0], count=80)  # COCO 4 is an airplane
-    assert detector(tmp_path, answer, "yolov5", label_set="coco").detect(PICTURE).classes == ["car"]
 
 
 def test_tiles_report_each_object_once_and_none_that_a_tile_cuts(tmp_path):
@@ -221,33 +177,12 @@ ROWS = rows_of(BOXES, [2, 0, 0], [0.9, 0.8, 0.7], [1.0] * 3)
     ("answer", "layout", "label_set", "error", "words"),
     [
         (np.zeros((1, 10, 13)), "yolox", "road_users", ModelError, "strides"),
-        (np.zeros((10, 13)), "yolov5", "road_users", ModelError, "layout"),
         (np.zeros((1, 3, 9)), "yolov8", "road_users", ModelOutputError, "layout"),
         (ROWS, "yolov5", "coco", ModelOutputError, "8 classes in .* its label set has 80"),
-        (
-            np.zeros((1, 84, 9)),
-            "yolov8",
-            "road_users",
-            ModelOutputError,
-            "80 classes in .* its label set has 8",
-        ),
         (ROWS * np.nan, "yolov5", "road_users", ModelOutputError, "NaN"),
-        (
-            np.zeros((1, 150, 24, 40)),
-            "logits",
-            "cityscapes",
-            ModelOutputError,
-            "must be 1 x 19 or 20 x h x w",
-        ),
-        (
-            np.full((1, 24, 40), 42.0),
-            "labels",
-            "cityscapes",
-            ModelOutputError,
-            r"one image of 0\.\.19 or 255.* 42 to 42",
-        ),
+        (np.zeros((1, 150, 24, 40)), "logits", "cityscapes", ModelOutputError, "19 or 20 x h x w"),
+        (np.full((1, 24, 40), 42.0), "labels", "cityscapes", ModelOutputError, r"0\.\.19 or 255.* 42 to 42"),
         (np.full((1, 19, 24, 40), np.nan), "logits", "cityscapes", ModelOutputError, "NaN"),
-        (np.full((1, 24, 40), np.nan), "labels", "cityscapes", ModelOutputError, "NaN"),
     ],
 )
 def test_answers_of_another_shape_of_other_classes_or_of_no_numbers_are_refused(
@@ -329,23 +264,3 @@ def test_frames_in_batches_and_another_provider_give_the_same_day_under_the_same
     has_cuda = "CUDAExecutionProvider" in onnxruntime.get_available_providers()
     told = "models ran on CPUExecutionProvider: CUDAExecutionProvider could not be had"
     assert reasons == ["", "", "" if has_cuda else told]
-
-
-def test_a_provider_that_is_not_there_is_told_with_what_to_install(tmp_path):
-    manifest = segmenter(tmp_path)
-    if "CUDAExecutionProvider" not in onnxruntime.get_available_providers():
-        with pytest.raises(ModelError, match=r"perceive.providers: .* pip install 'boresight\[gpu\]'"):
-            Segmenter(manifest, ["CUDAExecutionProvider"])
-    with pytest.raises(ModelError, match=r"this onnxruntime has .* not NoExecutionProvider"):
-        Segmenter(manifest, ["NoExecutionProvider"])
-    assert Segmenter(manifest, ["CPUExecutionProvider"]).provider == "CPUExecutionProvider"
-
-
-def test_a_model_uses_the_share_of_its_worker_or_all_that_the_process_may(monkeypatch):
-    for name in (MODEL_THREADS, "OMP_NUM_THREADS"):
-        monkeypatch.delenv(name, raising=False)
-    assert model_threads() == usable_cpus()
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    assert model_threads() == 1
-    monkeypatch.setenv(MODEL_THREADS, "3")
-    assert model_threads() == 3

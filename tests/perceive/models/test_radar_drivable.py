@@ -7,18 +7,17 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.core.config import FleetConfig, config_hash
+from pipeline.core.config import FleetConfig
 from pipeline.core.errors import ModelError
 from pipeline.learn.perception_training.radar_drivable import (
     TASK,
     DrivableTraining,
     day_samples,
     probabilities,
-    scan_of,
 )
 from pipeline.learn.perception_training.trainer import Samples, build_network, export_model, train_network
 from pipeline.perceive.models.radar_drivable import RadarDrivable
-from pipeline.rig.radar_grid import SHAPE, ScanMemory, sector_of
+from pipeline.rig.radar_grid import sector_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import observations_of
 from schemas.observations import Observation
@@ -80,23 +79,6 @@ def test_a_network_taught_by_a_days_lidar_tells_the_days_radar_where_the_road_is
     assert perceive_day(DAY, fleet(file), lake).work_key == geometric_key
     for a, b in zip(before, rows(lake), strict=True):
         assert all(np.array_equal(getattr(a, name), getattr(b, name)) for name in COLUMNS)
-
-
-def test_the_model_answers_as_the_network_does(lake, tmp_path):
-    perceive_day(DAY, fleet(), lake)
-    network = build_network(TASK, 24, 3).eval()
-    model = RadarDrivable(export_model(TASK, network, NOTHING, tmp_path, {}))
-    memory = ScanMemory()
-    for row in rows(lake):
-        features = torch.from_numpy(memory.features(scan_of(row)))[None]
-        with torch.no_grad():
-            wanted = torch.sigmoid(network(features))[0].numpy()
-        assert wanted.shape == SHAPE
-        assert model.probability(scan_of(row)) == pytest.approx(wanted, abs=1e-5)
-
-
-def test_a_model_is_no_reason_to_ingest_again():
-    assert config_hash(fleet().rigs["default"]) == config_hash(fleet(**MODEL).rigs["default"])
 
 
 @pytest.mark.parametrize(

@@ -1,14 +1,12 @@
 """Lidar semantics by range-image models: their labels, their faults, and whole days."""
 
-from dataclasses import replace
-
 import numpy as np
 import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from pipeline.core.config import FleetConfig, config_hash, load_fleet
-from pipeline.core.errors import ConfigError, ModelError
+from pipeline.core.config import load_fleet
+from pipeline.core.errors import ModelError
 from pipeline.core.models import shipped_manifest
 from pipeline.perceive.ground import PointKind
 from pipeline.perceive.models.range_image import POINT_LABEL_SETS, RangeImageSegmenter
@@ -70,13 +68,6 @@ def manifest(folder, rules=STREET, *, given=None, name="seg", **graph):
 
 
 # models
-
-
-def test_every_label_of_the_set_has_its_kind(tmp_path):
-    for label, name in enumerate(LABELS):
-        segmenter = RangeImageSegmenter(manifest(tmp_path, {label: (NONE, NONE, 0.0)}))
-        found = segmenter.kinds(points_of([10], [50], [9.0]), None)
-        assert found.tolist() == [POINT_LABEL_SETS["semantickitti"][name]], name
 
 
 def test_remission_is_scaled_and_normalised_and_its_mean_where_the_log_has_none(tmp_path):
@@ -188,36 +179,6 @@ def test_a_day_is_perceived_with_a_model_and_anew_with_another(tmp_path, lake):
     assert np.abs(narrower[0].lidar_drivable_xyz_m[:, 1]).max() < 3.6
     scaled = MODEL.replace(" }", ", remission_scale = 0.5 }")
     assert perceived(fleet(tmp_path, scaled), lake)[0].status == "done"
-
-
-def test_a_day_without_a_model_is_what_it_was_and_models_need_no_new_ingest(tmp_path):
-    plain, told = load_fleet(fleet(tmp_path)), load_fleet(fleet(tmp_path, MODEL))
-    assert told.rigs["default"].lidar.semantics.segmenter == "seg.toml"
-    assert config_hash(plain.rigs["default"]) == config_hash(told.rigs["default"])
-    assert FleetConfig.model_validate(plain.model_dump(mode="json")).read_from(plain.file) == plain
-    assert plain.model_dump(mode="json")["rigs"]["default"]["lidars"]["lidar"] == {"points": "/lidar/points"}
-
-
-def test_a_sweep_without_intensity_and_with_bad_points_is_perceived_too(tmp_path, made_frame):
-    lake, frame = Lake.at(tmp_path / "lake"), made_frame()
-    x = frame.lidar_x_m.copy()
-    x[::50] = np.nan
-    write_frames(lake, DAY, [replace(frame, lidar_x_m=x, lidar_intensity=None)], "frames-key")
-    manifest(tmp_path)
-    result, rows = perceived(fleet(tmp_path, MODEL), lake)
-    assert result.status == "done"
-    assert np.abs(rows[0].lidar_drivable_xyz_m[:, 1]).max() < 4.5
-    assert len(rows[0].marking_z) == 0
-
-
-@pytest.mark.parametrize(
-    "semantics",
-    ['semantics = { source = "topics" }', MODEL.replace(" }", ", detector = 1 }"),
-     MODEL.replace(" }", ", remission_scale = 0.0 }")],
-)  # fmt: skip
-def test_impossible_settings_of_the_lidar_are_refused_by_key(tmp_path, semantics):
-    with pytest.raises(ConfigError, match=r"rigs\.default\.lidar\.semantics"):
-        load_fleet(fleet(tmp_path, semantics))
 
 
 def test_a_day_whose_model_is_missing_or_wrong_names_the_manifest(tmp_path, lake):

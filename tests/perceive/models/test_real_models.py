@@ -5,16 +5,13 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-import onnx
 import pytest
-from onnx import numpy_helper
 
 from pipeline.core.models import manifest_text, named
 from pipeline.perceive.labels import road_user_name
 from pipeline.perceive.models.detector import Detector
 from pipeline.perceive.models.manifest import load_manifest
 from pipeline.perceive.models.segmenter import Segmenter
-from pipeline.perceive.models.session import Session, fit_image
 from tests.makers.real_models import write_real_manifests
 
 pytestmark = [pytest.mark.real_logs]
@@ -98,38 +95,3 @@ def test_espnetv2_labels_pixels_as_the_log_does(real_logs, segmenter_manifest):
     # Measured 0.84 and 0.86: how the car prepared its images and dilated its labels is not known.
     assert np.mean(agreement) > 0.8
     assert np.mean(road) > 0.8
-
-
-def with_a_free_batch(model):
-    """The model for any number of images: its export wrote the 1 into its ends and into its reshapes."""
-    for value in (*model.graph.input, *model.graph.output):
-        value.type.tensor_type.shape.dim[0].dim_param = "batch"
-    shapes = {node.input[1] for node in model.graph.node if node.op_type == "Reshape"}
-    given = {node.output[0]: node.attribute[0].t for node in model.graph.node if node.op_type == "Constant"}
-    given |= {tensor.name: tensor for tensor in model.graph.initializer}
-    for tensor in (given[name] for name in shapes):
-        shape = numpy_helper.to_array(tensor).copy()
-        assert shape[0] == 1
-        shape[0] = 0  # as the input has it
-        tensor.CopyFrom(numpy_helper.from_array(shape, tensor.name))
-    return model
-
-
-@pytest.mark.slow
-def test_several_images_in_one_run_get_the_labels_that_each_gets_alone(
-    real_logs, real_segmenter, segmenter_manifest, tmp_path
-):
-    onnx.save(with_a_free_batch(onnx.load(real_segmenter)), tmp_path / "batches.onnx")
-    write_real_manifests(tmp_path, tmp_path / "batches.onnx", real_segmenter)
-    both = [segmenter_manifest, load_manifest(tmp_path / "segmenter.toml", "segment")]
-    alone, together = (Segmenter(manifest) for manifest in both)
-    seen = list(images_and_labels(real_logs))
-    images, sizes = [image for image, _ in seen], [labels.shape for _, labels in seen]
-    tensors = [fit_image(image, both[0].input)[0] for image in images]
-    own, joint = (Session(m, (3, 512, 1024)).run_each(tensors) for m in both)
-    for a, b in zip(own, joint, strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
-    expected = [alone.segment_each([image], [size])[0] for image, size in zip(images, sizes, strict=True)]
-    found = together.segment_each(images, sizes)
-    for a, b in zip(expected, found, strict=True):
-        assert np.mean(a != b) < 1e-4  # pixels where two classes are alike to the last bits
