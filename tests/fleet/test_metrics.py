@@ -2,11 +2,25 @@
 
 import pytest
 
+from pipeline.core.results import Effort, Outcome
 from pipeline.fleet.metrics import NightEnd, Tally, write_metrics
+from pipeline.fleet.nightly import DayOutcome
 from schemas.versions import CODE_VERSION
-from tests.makers.night_outcomes import day_outcome, stage_outcome
 
 parser = pytest.importorskip("prometheus_client.parser", reason="pip install 'boresight[ops]'")
+
+
+DAY = "2026-03-02"
+
+
+def stage_outcome(stage, vehicle, status="done", seconds=2.0, **values):
+    key = "" if status == "failed" else f"key of {stage}"
+    effort = Effort("2026-03-03T01:00:00.000000Z", seconds, 1000, 100)
+    return Outcome(stage, vehicle, DAY, status, key, effort=effort, **values)
+
+
+def day_outcome(vehicle, status="done", pairs=None, results=()):
+    return DayOutcome(vehicle, DAY, status, pairs=pairs or {}, results=tuple(results))
 
 
 def tally():
@@ -66,9 +80,3 @@ def test_a_first_failure_has_no_last_success(damage, tmp_path):
     file.write_bytes(damage)
     write_metrics(file, "test", tally(), end(1))
     assert ("boresight_last_success_timestamp_seconds",) not in samples(file)
-
-
-def test_another_fleets_success_is_not_this_ones(tmp_path):
-    write_metrics(tmp_path / "night.prom", "others", tally(), end(0))
-    write_metrics(tmp_path / "night.prom", "test", tally(), end(1))
-    assert ("boresight_last_success_timestamp_seconds",) not in samples(tmp_path / "night.prom")

@@ -13,18 +13,18 @@ from pipeline.calibrate.verify.held_out_test import HeldOutTest
 from pipeline.calibrate.verify.target_accuracy import Claim
 from pipeline.calibrate.verify.verdict import Evidence, judge
 from pipeline.core.config import ChecksConfig
-from pipeline.core.results import Effort, Outcome
+from pipeline.core.results import Outcome
 from pipeline.core.runner import Stage, why_to_run
 from pipeline.core.stage_work import Task
 from pipeline.core.stages import INGEST
-from pipeline.fleet.more_frames import MOST_TIMES_MORE, _lacks_frames, asks_for_more, spent_before
+from pipeline.fleet.more_frames import MOST_TIMES_MORE, _lacks_frames, asks_for_more
 from pipeline.fleet.nightly import Night, run_night
 from pipeline.fleet.pattern import VehicleDay
 from pipeline.rig.targets import DEFAULT_TARGETS
 from pipeline.store.partitions import Lake, Partition
-from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, CalibrationRecord
+from schemas.calibrations import PAIRS
 from schemas.moments import SWEEPS_LOGGED, SWEEPS_PLANNED
-from tests.fleet.test_nightly import DAY, FLEET
+from tests.fleet.test_nightly import DAY, FLEET, record_of
 from tests.makers.written_logs import Kit, fleet_config
 
 RESULT = EdgeResult(
@@ -57,29 +57,13 @@ def test_reasons_that_more_frames_cannot_clear_ask_for_none(reason):
     assert not _lacks_frames(reason)
 
 
-def record(pair, reason):
-    status = "held" if reason else "accepted"
-    return CalibrationRecord(
-        vehicle="car",
-        day=DAY,
-        method="joint",
-        pair=pair,
-        parent_frame=FRAMES_OF_PAIR[pair][0],
-        child_frame=FRAMES_OF_PAIR[pair][1],
-        status=status,
-        reason=reason,
-        work_key="key",
-        code_version="0",
-        seed=0,
-    )
-
-
 def results(reason, logged=36000, planned=400, ingest="done"):
     kept = {SWEEPS_LOGGED: logged, SWEEPS_PLANNED: planned} if logged else {}
-    records = tuple(record(pair, reason if pair == PAIRS[0] else "") for pair in PAIRS)
+    records = [record_of(pair, "accepted", "") for pair in PAIRS]
+    records[0] = record_of(PAIRS[0], "held" if reason else "accepted", reason)
     return [
         Outcome("ingest", "car", DAY, ingest, "i", rows=7, kept=kept),
-        Outcome("calibrate", "car", DAY, "done", "c", records=records),
+        Outcome("calibrate", "car", DAY, "done", "c", records=tuple(records)),
     ]
 
 
@@ -120,12 +104,6 @@ def test_a_night_doubles_what_is_read_until_it_is_enough_and_not_for_ever(
     assert len(asked) <= 1 + MOST_TIMES_MORE
     assert outcome.status == ("done" if enough <= 1600 else "partly")
     assert len(outcome.results) == 3  # of the last pass: one record per pair becomes current
-
-
-def test_what_passes_cost_is_counted_together():
-    a = [replace(r, effort=Effort("t0", 2.0, 5, None)) for r in results("")]
-    b = [replace(r, effort=Effort("t1", 3.0, 7, 1)) for r in results("")]
-    assert [r.effort for r in spent_before(a, b)] == [Effort("t0", 5.0, 12, None)] * 2
 
 
 def test_a_day_that_was_read_wider_is_up_to_date_and_one_that_was_read_less_is_not(tmp_path):
