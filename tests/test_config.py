@@ -1,8 +1,6 @@
-import json
 import pickle
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from pipeline.core.config import FleetConfig, config_hash, load_fleet
@@ -40,31 +38,21 @@ def test_a_small_file_is_enough_and_defaults_are_physical(tmp_path):
         (('source = "topics"', 'source = "magic"'), "semantics"),
         (('rig = "default"', 'rig = "other"'), "vehicles.car-1.rig"),
         (("[fleet]", "[ingest]\nsync_gate_s = 0\n[fleet]"), "ingest.sync_gate_s"),
-        (("[fleet]", "[ingest]\nsync_gate_s = nan\n[fleet]"), "ingest.sync_gate_s"),
         (("[fleet]", "[select]\nholdout_fraction = 1.0\n[fleet]"), "select.holdout_fraction"),
         (("[fleet]", "[rigs.default.prior]\nsource = 'file'\n[fleet]"), "prior"),
         (('name = "tests"', ""), "fleet.name"),
         (("[fleet]", "[audit]\nmethod = 'best'\n[fleet]"), "audit.method"),
         (("[fleet]", "[audit]\nwindow_days = 1_000_000_000\n[fleet]"), "audit.window_days"),
         (("[fleet]", "[perceive]\nlabel_scale = 1e-9\n[fleet]"), "perceive.label_scale"),
-        (
-            ("[fleet]", "[solve]\nsearch_rotation_deg = 1e9\n[fleet]"),
-            "solve.search_rotation_deg: 1e+09 deg",
-        ),
+        (("[fleet]", "[solve]\nsearch_rotation_deg = 1e9\n[fleet]"), "solve.search_rotation_deg: 1e+09 deg"),
         (("[fleet]", "[rigs.default.prior]\nrotation_sigma_deg = 181\n[fleet]"), "prior.rotation_sigma_deg"),
         (
             ("[fleet]", "[rigs.default.prior]\ntranslation_sigma_m = 1e9\n[fleet]"),
             "prior.translation_sigma_m",
         ),
-        (
-            ('points = "/radar/points"', 'points = "/radar/points"\ndoppler_period_mps = 1e-9'),
-            "radar.doppler_period_mps",
-        ),
         (("[fleet]", "[solve]\nseed = -1\n[fleet]"), "solve.seed"),
-        (("[fleet]", "[prepare]\nseed = -1\n[fleet]"), "prepare.seed"),
         (('points = "/radar/points"', 'points = "/lidar/points"'), "/lidar/points"),
         (('[vehicles."car-1"]', '[vehicles."a/b"]'), "a/b"),
-        (('[vehicles."car-1"]', '[vehicles."a=b"]'), "a=b"),
         (('[vehicles."car-1"]', '[vehicles.""]'), "vehicle's name"),
         (('[vehicles."car-1"]', '[vehicles."../../etc"]'), "../../etc"),
         (('[vehicles."car-1"]', f'[vehicles."{300 * "v"}"]'), "vehicle's name"),
@@ -90,19 +78,6 @@ def test_every_section_has_at_most_twelve_keys():
     assert {name: size for name, size in found.items() if size > 12} == {}
 
 
-def test_a_mistyped_key_is_named_once_and_with_the_key_that_was_meant(tmp_path):
-    text = GOOD.replace('points = "/radar/points"', 'points = "/radar/points"\ndoppler_period_mp = 10')
-    with pytest.raises(ConfigError, match="unknown key; did you mean 'doppler_period_mps'") as caught:
-        load(tmp_path, text)
-    assert str(caught.value).count("doppler_period_mp:") == 1
-
-
-@pytest.mark.parametrize("text", ["not toml [", "\x00"])
-def test_a_file_that_is_no_toml_is_named(text, tmp_path):
-    with pytest.raises(ConfigError, match="not a TOML file"):
-        load(tmp_path, text)
-
-
 def test_a_missing_file_and_an_unknown_vehicle_are_named(tmp_path):
     with pytest.raises(ConfigError, match="no such file"):
         load_fleet(tmp_path / "nowhere.toml")
@@ -126,12 +101,6 @@ def test_the_hash_changes_with_every_value_and_not_with_how_it_was_written(tmp_p
     assert config_hash(a.ingest, {"x": 1}) != config_hash(a.ingest, {"x": 2})
 
 
-def test_configuration_cannot_be_changed_after_loading(tmp_path):
-    fleet = load(tmp_path, GOOD)
-    with pytest.raises(ValueError, match="frozen"):
-        fleet.ingest.sync_gate_s = 1.0
-
-
 def test_a_configuration_knows_its_file_through_copies_changes_and_other_processes(tmp_path):
     fleet = load(tmp_path, GOOD)
     ways = [
@@ -147,11 +116,6 @@ def test_a_configuration_knows_its_file_through_copies_changes_and_other_process
         with pytest.raises(ConfigError) as caught:
             known.rig_of("tram")
         assert caught.value.file == str(tmp_path / "fleet.toml")
-
-
-def test_where_a_file_lies_is_no_part_of_any_hash(tmp_path):
-    fleet = load(tmp_path, GOOD)
-    assert config_hash(fleet) == config_hash(fleet.read_from(Path("/elsewhere/fleet.toml")))
 
 
 def test_changed_sections_are_validated_and_keep_what_dumps_leave_out(tmp_path):
@@ -197,14 +161,3 @@ def test_a_file_that_the_configuration_names_is_missed_before_any_log_is_opened(
         require_named_files(fleet)
     assert key in str(caught.value)
     assert caught.value.exit_code == 2
-
-
-def test_a_prior_that_is_not_finite_is_refused_before_any_log_is_opened(tmp_path):
-    fleet = load(tmp_path, f'{GOOD}\n[rigs.default.prior]\nsource = "file"\nfile = "prior.json"\n')
-    T = np.eye(4).tolist()
-    (tmp_path / "prior.json").write_text(json.dumps({"T_camera_lidar": T, "T_lidar_radar": T}))
-    require_named_files(fleet)
-    T[0][3] = float("nan")
-    (tmp_path / "prior.json").write_text(json.dumps({"T_camera_lidar": T, "T_lidar_radar": T}))
-    with pytest.raises(ConfigError, match="not finite"):
-        require_named_files(fleet)

@@ -87,22 +87,6 @@ def reached(command):
     return ours, others
 
 
-def test_the_walk_reaches_every_stage_and_method():
-    ours, others = reached("nightly")
-    calibrate = {"joint.solve", "tracking.solve", "paper.joint_optimisation"}
-    rooms = {
-        "ingest.captures",
-        "perceive.models.session",
-        "learn.infer.single_frame",
-        "audit.charts",
-        "report.day",
-    }
-    assert {f"pipeline.{m}" for m in rooms | {f"calibrate.{c}" for c in calibrate}} <= ours
-    assert {"numpy", "onnxruntime"} <= others
-    assert "torch" in reached("train")[1]
-    assert "embreex" in reached("demo")[1]
-
-
 @pytest.mark.parametrize("command", [c for c in COMMANDS if c not in NEEDS])
 def test_a_plain_install_holds_all_that_a_command_of_the_night_may_import(command):
     assert reached(command)[1] <= declared() | OPTIONAL
@@ -120,8 +104,7 @@ def test_nothing_is_declared_that_nothing_imports():
 
 
 @pytest.mark.parametrize(
-    ("option", "value", "extra"),
-    [("--executor", "ray", "ray"), ("--metrics", "a.prom", "ops")],
+    ("option", "value", "extra"), [("--executor", "ray", "ray"), ("--metrics", "a.prom", "ops")]
 )
 def test_an_option_without_its_extra_says_so_before_anything_is_read(option, value, extra):
     code = (

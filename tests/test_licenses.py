@@ -38,11 +38,6 @@ def test_every_licence_of_a_dependency_goes_together_with_ours(rows):
     assert {(name, part) for name, part in parts if not COMPATIBLE.fullmatch(part)} == set()
 
 
-@pytest.mark.parametrize("licence", ["GPL-3.0-only", "AGPL-3.0", "UNKNOWN", "Other/Proprietary License"])
-def test_the_list_of_licences_keeps_others_out(licence):
-    assert not COMPATIBLE.fullmatch(licence)
-
-
 def test_the_list_of_licences_is_that_of_this_environment(rows):
     listed = (REPO / "jobs" / "deploy" / "THIRD_PARTY_LICENSES.md").read_text()
     assert listed.startswith(heading())

@@ -31,12 +31,6 @@ def test_the_three_names_resolve_to_one_parent_folder():
     assert {Path(p.__file__).resolve().parent.parent for p in (jobs, pipeline, schemas)} == {REPO}
 
 
-@pytest.mark.parametrize("package", PACKAGES)
-def test_no_second_distribution_owns_a_name(package):
-    owners = {o.lower() for o in importlib.metadata.packages_distributions().get(package, [])}
-    assert owners <= {"boresight"}
-
-
 def test_the_command_is_installed():
     scripts = importlib.metadata.entry_points(group="console_scripts", name="boresight")
     assert [s.value for s in scripts] == ["jobs.cli:main"]
