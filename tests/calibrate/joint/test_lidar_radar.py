@@ -193,7 +193,7 @@ def test_a_way_that_contradicts_the_registration_makes_pitch_less_sure_and_says_
         solve(with_road(day[:20], pitched_deg), prior_off_by(1, 0.02)) for pitched_deg in (0.0, 3.0)
     )
     assert contradicting.covariance[1, 1] > 4 * agreeing.covariance[1, 1]
-    assert any("witnesses of radar pitch contradict each other" in note for note in contradicting.notes)
+    assert any("sources of radar pitch contradict each other" in note for note in contradicting.notes)
 
 
 def test_a_constant_elevation_error_turns_pitch_and_leaves_roll(day):

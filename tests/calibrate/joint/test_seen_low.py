@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.joint.lidar_radar.seen_low import SeenLow, added_share, seen_low_of
-from pipeline.calibrate.joint.lidar_radar.witnesses import Witness
+from pipeline.calibrate.joint.part_turn import PartTurn
 from pipeline.objective.radar.heights import Heights, HeightScores
 from pipeline.objective.radar.travel import TravelDirections
 
@@ -26,10 +26,10 @@ def heights(below):
 
 def test_who_takes_all_for_seen_where_it_is_reads_higher_by_the_share_and_is_as_unsure_as_it():
     share = SeenLow(0.1, 0.06, {"registration": PER_SHARE_RAD})
-    right = share.expected(Witness("registration", -0.1 * PER_SHARE_RAD, np.radians(0.4)))
+    right = share.expected(PartTurn("registration", -0.1 * PER_SHARE_RAD, np.radians(0.4)))
     assert right.offset_rad == pytest.approx(0.0, abs=1e-12)
     assert np.degrees(right.sigma_rad) == pytest.approx(0.5)
-    knows = Witness("heights", 0.01, 0.005)
+    knows = PartTurn("heights", 0.01, 0.005)
     assert share.expected(knows) == knows
 
 

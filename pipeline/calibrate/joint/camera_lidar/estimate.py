@@ -32,6 +32,11 @@ from pipeline.calibrate.joint.camera_lidar.observability import (
     analyse_observability,
 )
 from pipeline.calibrate.joint.camera_lidar.optical_axis import TZ
+from pipeline.calibrate.joint.camera_lidar.part_turns import (
+    disagreement,
+    turn_numbers,
+    turns_by_parts,
+)
 from pipeline.calibrate.joint.camera_lidar.parts import parts_of_alignment
 from pipeline.calibrate.joint.camera_lidar.refine import (
     NONE_FIXED,
@@ -42,12 +47,7 @@ from pipeline.calibrate.joint.camera_lidar.refine import (
 )
 from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
 from pipeline.calibrate.joint.camera_lidar.time_offset import DT, FOCAL, far_time_offset, s_per_metre
-from pipeline.calibrate.joint.camera_lidar.witnesses import (
-    Witness,
-    ask_witnesses,
-    disagreement,
-    witness_numbers,
-)
+from pipeline.calibrate.joint.part_turn import PartTurn
 from pipeline.calibrate.numerics.bias_floors import CAMERA_LIDAR_BIAS, TZ_COMMON_BIAS_M
 from pipeline.calibrate.numerics.covariance import OBSERVABLE
 from pipeline.calibrate.numerics.frame_blocks import Scenes
@@ -212,7 +212,7 @@ def analyse_camera_lidar(
     if analysis.observability[5] < OBSERVABLE and own_tz is not None:
         diagnostics |= {"own_tz_m": own_tz[0], "own_tz_sigma_m": own_tz[1]}
     own = np.sqrt(np.diag(analysis.covariance)[:2]).tolist()
-    witnesses = ask_witnesses(
+    turns = turns_by_parts(
         aligned.frames,
         problem.terms,
         analysis.state,
@@ -222,7 +222,7 @@ def analyse_camera_lidar(
         own,
     )
     parts = parts_of_alignment(problem, analysis, aligned.frames)
-    return replace(_conclude(analysis, aligned, diagnostics, witnesses), parts=parts)
+    return replace(_conclude(analysis, aligned, diagnostics, turns), parts=parts)
 
 
 # -- steps -----------------------------------------------------------------------------------------------------------
@@ -320,7 +320,7 @@ def _conclude(
     analysis: ObservabilityAnalysis,
     aligned: Aligned,
     diagnostics: dict[str, float],
-    witnesses: Sequence[Witness],
+    turns: Sequence[PartTurn],
 ) -> PairEstimate:
     """The estimate, its covariance by left perturbation, notes."""
     dt_sigma = float(np.sqrt(analysis.covariance[DT, DT]))
@@ -344,10 +344,10 @@ def _conclude(
         frames_rejected=aligned.rejected,
         time_offset_s=aligned.expected_dt_s + dt_weight * analysis.state.dt_s,
         time_offset_sigma_s=dt_sigma,
-        diagnostics=diagnostics | aligned.intrinsics.diagnostics(known) | witness_numbers(witnesses),
+        diagnostics=diagnostics | aligned.intrinsics.diagnostics(known) | turn_numbers(turns),
         notes=notes,
         common_covariance=common_part(to_left @ analysis.common[:6, :6] @ to_left.T, covariance),
-        failed_checks=disagreement(witnesses),
+        failed_checks=disagreement(turns),
         bias={owner: to_left @ B @ to_left.T for owner, B in _biases(analysis).items()},
         bias_in_weights=to_left @ np.diag(_tz_bias(analysis)) @ to_left.T,
         time_offset_prior_s=aligned.expected_dt_s,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.calibrate.joint.lidar_radar.observability import ObservabilityAnalysis
+from pipeline.calibrate.joint.lidar_radar.pitch_sources import contradiction, own_numbers
 from pipeline.calibrate.joint.lidar_radar.problem import DT, RANGE, RadarState
-from pipeline.calibrate.joint.lidar_radar.witnesses import contradiction, own_numbers
 from pipeline.calibrate.numerics.bias_floors import RADAR_ELEVATION_BIAS_RAD, RANGE_BIAS_SIGMA_M
 from pipeline.rig.changes import change_between
 
@@ -41,7 +41,7 @@ def notes_of(analysis: ObservabilityAnalysis, *, has_elevation: bool) -> list[st
             f"{analysis.heights.displaced:.2f} of those of low things, which this day tells no better than to "
             f"{np.degrees(analysis.heights.floor_rad):.2f} deg of pitch"
         )
-    disagreement = contradiction(analysis.witnesses)
+    disagreement = contradiction(analysis.sources)
     if disagreement is not None:
         notes.append(disagreement.sentence)
     bias_sigma_m = float(np.sqrt(analysis.covariance[RANGE, RANGE]))
@@ -82,7 +82,7 @@ def diagnostics_of(
         "registration_roll_sigma_rad": float(linear.floor[0]),
         "registration_pitch_offset_rad": float(linear.registration_step[1]),
         "registration_pitch_sigma_rad": float(linear.floor[1]),
-        **own_numbers(analysis.witnesses),
+        **own_numbers(analysis.sources),
         "doppler_frames": float(linear.travel_frames),
         "doppler_scatter_rad": linear.travel_scatter_rad,
         **{f"halves_{n}": float(v) for n, v in zip(_DOF_UNITS, half, strict=True)},

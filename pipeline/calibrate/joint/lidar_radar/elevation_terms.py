@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int64
 
+from pipeline.calibrate.joint.lidar_radar.pitch_sources import own_equations
 from pipeline.calibrate.joint.lidar_radar.problem import (
     ELEVATION_DOF,
     SEEN_LOW,
@@ -26,7 +27,7 @@ from pipeline.calibrate.joint.lidar_radar.tilt_floors import (
     tempered,
     tilt_of,
 )
-from pipeline.calibrate.joint.lidar_radar.witnesses import Witness, own_equations
+from pipeline.calibrate.joint.part_turn import PartTurn
 from pipeline.objective.radar.heights import Heights
 from pipeline.objective.radar.registration import NormalEquations
 from pipeline.objective.radar.travel import DOPPLER_PITCH_FLOOR_RAD, pitch_equations
@@ -42,18 +43,18 @@ __all__ = [
 ]
 
 
-def add_travel(problem: RadarProblem, state: RadarState, sums: Sums) -> tuple[float, Witness | None]:
+def add_travel(problem: RadarProblem, state: RadarState, sums: Sums) -> tuple[float, PartTurn | None]:
     """Add the direction of travel by Doppler and road; returns its scatter over frames [rad], and its pitch."""
     if problem.travel is None:
         return float("nan"), None
     H, g, scatter = pitch_equations(problem.travel, state.T_lidar_radar, len(sums.g))
-    witness = travel_equations(problem, state)
+    source = travel_equations(problem, state)
     floor = (DOPPLER_PITCH_FLOOR_RAD**2 + problem.doubt_rad.get("doppler", 0.0) ** 2) * np.eye(2)
     _add_tilts(problem, state, "doppler", np.arange(2), H, g, floor, sums)
-    return scatter, witness
+    return scatter, source
 
 
-def travel_equations(problem: RadarProblem, state: RadarState) -> Witness | None:
+def travel_equations(problem: RadarProblem, state: RadarState) -> PartTurn | None:
     """Pitch correction from the direction of travel alone, with sigma; None if it does not determine pitch."""
     if problem.travel is None:
         return None
@@ -62,18 +63,18 @@ def travel_equations(problem: RadarProblem, state: RadarState) -> Witness | None
     return own_equations("doppler", H_own[1:, 1:], g_own[1:], DOPPLER_PITCH_FLOOR_RAD)
 
 
-def add_heights(problem: RadarProblem, state: RadarState, sums: Sums) -> Witness | None:
+def add_heights(problem: RadarProblem, state: RadarState, sums: Sums) -> PartTurn | None:
     """Add static elevations, which may be displaced; returns their pitch correction at this state."""
     if problem.heights is None:
         return None
     H, g = _height_equations(problem.heights, state.T_lidar_radar, len(sums.g))
-    witness = height_equations(problem, state)
+    source = height_equations(problem, state)
     floor = problem.heights.floor_rad**2 * np.diag([1.0, 1.0, 0.0])
     _add_tilts(problem, state, "heights", ELEVATION_DOF, H, g, floor, sums)
-    return witness
+    return source
 
 
-def height_equations(problem: RadarProblem, state: RadarState) -> Witness | None:
+def height_equations(problem: RadarProblem, state: RadarState) -> PartTurn | None:
     """Pitch correction from displaced heights alone, with sigma; None if they do not determine pitch."""
     if problem.heights is None:
         return None

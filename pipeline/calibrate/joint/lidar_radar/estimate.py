@@ -19,6 +19,7 @@ from pipeline.calibrate.joint.lidar_radar.elevation_spread import beam_spacing, 
 from pipeline.calibrate.joint.lidar_radar.elevation_terms import height_equations, travel_equations
 from pipeline.calibrate.joint.lidar_radar.observability import ObservabilityAnalysis, analyse_observability
 from pipeline.calibrate.joint.lidar_radar.own_position import own_position
+from pipeline.calibrate.joint.lidar_radar.pitch_sources import contradiction, doubted
 from pipeline.calibrate.joint.lidar_radar.problem import (
     DT,
     RadarProblem,
@@ -35,7 +36,7 @@ from pipeline.calibrate.joint.lidar_radar.time_offset import (
     far_time_offset,
     time_offset_scatter_s,
 )
-from pipeline.calibrate.joint.lidar_radar.witnesses import Witness, contradiction, doubted
+from pipeline.calibrate.joint.part_turn import PartTurn
 from pipeline.calibrate.numerics.change_point import parts_of_day, with_parts
 from pipeline.calibrate.numerics.covariance import (
     CLEARLY,
@@ -88,15 +89,15 @@ def estimate_lidar_radar(
     ends = [anneal(some, start) for start in scan(problem, config)]
     costs = [comparison_cost(problem, end) for end in ends]
     best = ends[int(np.argmin([c.mean() for c in costs]))]
-    witnesses: tuple[Witness, ...] | None = None
+    sources: tuple[PartTurn, ...] | None = None
     without_way = best
     if {"doppler", "static"} & set(config.terms):
-        problem, without_way, witnesses = _with_way(problem, best, rng)
+        problem, without_way, sources = _with_way(problem, best, rng)
     analysis = analyse_observability(problem, without_way, config, rng)
     other = better_time_offset(problem, analysis.state)
     if other is not None:
         analysis = analyse_observability(problem, other, config, rng)
-    analysis = _with_witnesses(analysis, witnesses, without_way)
+    analysis = _with_sources(analysis, sources, without_way)
     block = blocks_of(problem.observations, config.bootstrap_blocks)
     analysis = _with_other_dips(problem, analysis, block[problem.frames.frame])
     parts = [problem.of_frames(np.arange(k, count, 2)) for k in (0, 1)]
@@ -189,7 +190,7 @@ def _start_of_part(part: RadarProblem, start: RadarState, unknowns: int) -> Rada
 
 def _with_way(
     problem: RadarProblem, state: RadarState, rng: np.random.Generator
-) -> tuple[RadarProblem, RadarState, tuple[Witness, ...]]:
+) -> tuple[RadarProblem, RadarState, tuple[PartTurn, ...]]:
     """The problem with direction of travel and displaced heights, the solution without them, and the pitch of each.
 
     Pitches and the radar's sigmas are computed at the solution without them. Otherwise, a wrong direction of
@@ -205,31 +206,29 @@ def _with_way(
     heights = displaced_heights(about[0], level, about[2], rng.spawn(1)[0]) if has_static else None
     seeing = replace(problem, travel=travel, heights=heights, seen_low=seen_low_of(travel, heights))
     added = travel_equations(seeing, state), height_equations(seeing, state)
-    witnesses = [seeing.seen_low.expected(w) for w in (*linear.witnesses, *added) if w is not None]
-    doubt_rad = doubted(witnesses)
-    wider = tuple(
-        replace(w, sigma_rad=float(np.hypot(w.sigma_rad, doubt_rad.get(w.name, 0.0)))) for w in witnesses
-    )
+    sources = [seeing.seen_low.expected(w) for w in (*linear.sources, *added) if w is not None]
+    doubt_rad = doubted(sources)
+    wider = tuple(w.wider(doubt_rad.get(w.name, 0.0)) for w in sources)
     return replace(seeing, doubt_rad=doubt_rad), replace(state, seen_low=seeing.seen_low.mean), wider
 
 
-def _with_witnesses(
-    analysis: ObservabilityAnalysis, witnesses: tuple[Witness, ...] | None, asked_at: RadarState
+def _with_sources(
+    analysis: ObservabilityAnalysis, sources: tuple[PartTurn, ...] | None, asked_at: RadarState
 ) -> ObservabilityAnalysis:
     """The analysis with an increased variance of pitch if its sources contradict each other."""
-    if witnesses is None:
+    if sources is None:
         return analysis
     axes = radar_tilt_axes(analysis.state.T_lidar_radar)
     turn = change_between(asked_at.T_lidar_radar, analysis.state.T_lidar_radar)[:2]
     moved = float(turn @ axes[:, 1])
-    witnesses = tuple(replace(w, offset_rad=w.offset_rad - moved) for w in witnesses)
-    covariance, common, disagreement = analysis.covariance, analysis.common, contradiction(witnesses)
+    sources = tuple(replace(w, offset_rad=w.offset_rad - moved) for w in sources)
+    covariance, common, disagreement = analysis.covariance, analysis.common, contradiction(sources)
     if disagreement is not None and not analysis.fixed[int(np.argmax(np.abs(axes[:, 1])))]:
         # The record's axes are the lidar's: only the radar's own pitch gets less sure.
         wider = np.eye(len(covariance))
         wider[:2, :2] += (disagreement.factor - 1) * np.outer(axes[:, 1], axes[:, 1])
         covariance, common = (wider @ part @ wider for part in (covariance, common))
-    return replace(analysis, witnesses=witnesses, covariance=covariance, common=common)
+    return replace(analysis, sources=sources, covariance=covariance, common=common)
 
 
 def _with_other_dips(

@@ -29,7 +29,7 @@ from pipeline.calibrate.joint.lidar_radar.problem import (
     RadarState,
     Sums,
 )
-from pipeline.calibrate.joint.lidar_radar.witnesses import Witness
+from pipeline.calibrate.joint.part_turn import PartTurn
 from pipeline.calibrate.numerics.bias_floors import (
     OUTLIER_DENSITY,
     PRIOR_CONTRADICTION_SIGMAS,
@@ -66,9 +66,9 @@ def linearise(problem: RadarProblem, state: RadarState, widen: float, stride: in
     floor = problem.spread.floor(float(state.sigma[1]), problem.spacing_rad)
     floor[1] = np.hypot(floor[1], problem.doubt_rad.get("registration", 0.0))
     registration_step = add_elevations(problem, state, equations, stride, floor, sums)
-    travel_scatter, travel_witness = add_travel(problem, state, sums)
-    height_witness = add_heights(problem, state, sums)
-    own = Witness("registration", float(registration_step[1]), float(floor[1]))
+    travel_scatter, by_travel = add_travel(problem, state, sums)
+    by_heights = add_heights(problem, state, sums)
+    own = PartTurn("registration", float(registration_step[1]), float(floor[1]))
     seen = own if problem.frames.has_elevation.any() and "static" in problem.terms else None
     mover_sigma = float("nan")
     if widen == 1.0 and "moving" in problem.terms:  # partners are found only once the clusters lie near them
@@ -84,8 +84,8 @@ def linearise(problem: RadarProblem, state: RadarState, widen: float, stride: in
         mover_sigma,
         registration_step,
         floor,
-        tuple(w for w in (seen, travel_witness, height_witness) if w is not None),
-        0 if travel_witness is None or problem.travel is None else problem.travel.count,
+        tuple(w for w in (seen, by_travel, by_heights) if w is not None),
+        0 if by_travel is None or problem.travel is None else problem.travel.count,
         travel_scatter,
         sums.floors,
         sums.floors - sums.of_day,

@@ -20,7 +20,7 @@ from pipeline.calibrate.joint.lidar_radar.problem import (
 from pipeline.calibrate.joint.lidar_radar.search import NONE_FIXED, finish, last_step
 from pipeline.calibrate.joint.lidar_radar.tilt_floors import following_tilt
 from pipeline.calibrate.joint.lidar_radar.time_offset import better_time_offset
-from pipeline.calibrate.joint.lidar_radar.witnesses import Witness
+from pipeline.calibrate.joint.part_turn import PartTurn
 from pipeline.calibrate.numerics.bias_floors import LIDAR_RADAR_BIAS, LIDAR_RADAR_DT_FLOOR_S
 from pipeline.calibrate.numerics.covariance import OBSERVABLE, covariance_with_fixed
 from pipeline.calibrate.numerics.frame_blocks import blocks_of
@@ -47,7 +47,7 @@ class ObservabilityAnalysis:
     floors_alike: np.ndarray
     fixed: np.ndarray  # P, bool
     observability: np.ndarray  # 7, of pose and dt
-    witnesses: tuple[Witness, ...]  # of pitch, asked where the car's way had no say yet
+    sources: tuple[PartTurn, ...]  # of pitch, asked where the car's way had no say yet
     heights: Heights | None
     dt_weight: float = 1.0  # of the day's time offset against the expected one
 
@@ -100,7 +100,7 @@ def analyse_observability(
         alike,
         fixed,
         observability,
-        linear.witnesses,
+        linear.sources,
         problem.heights,
     )
 

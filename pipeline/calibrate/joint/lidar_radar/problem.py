@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 
 from pipeline.calibrate.joint.lidar_radar.elevation_spread import ElevationSpread
 from pipeline.calibrate.joint.lidar_radar.seen_low import SeenLow
-from pipeline.calibrate.joint.lidar_radar.witnesses import Witness
+from pipeline.calibrate.joint.part_turn import PartTurn
 from pipeline.core.config import TERMS
 from pipeline.objective.radar.heights import Heights
 from pipeline.objective.radar.moving_clusters import MovingClusters
@@ -104,7 +104,7 @@ class RadarProblem:
     travel: TravelDirections | None = None  # None until the pose is near enough to measure them
     heights: Heights | None = None  # likewise
     seen_low: SeenLow = field(default_factory=SeenLow)
-    doubt_rad: Mapping[str, float] = field(default_factory=dict)  # of pitch, beyond a witness's own sigma
+    doubt_rad: Mapping[str, float] = field(default_factory=dict)  # of pitch, beyond a source's own sigma
 
     def of_frames(self, index: np.ndarray) -> RadarProblem:
         """The same with part of the registration's frames (and of the observations behind them)."""
@@ -135,7 +135,7 @@ class Linear:
     # 3: where the registration's elevations alone would move roll, pitch (about the radar's own axes), z
     registration_step: np.ndarray
     floor: np.ndarray  # 3: sigma that those elevations leave of roll, pitch [rad] and z [m]
-    witnesses: tuple[Witness, ...]  # of pitch
+    sources: tuple[PartTurn, ...]  # of pitch
     travel_frames: int
     travel_scatter_rad: float  # of the frames' ways beyond their own sigmas
     # P P: scatter of the total gradient by what all frames of elevation's sources err by; of that, what all days share.

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.calibrate.joint.lidar_radar.witnesses import Witness
+from pipeline.calibrate.joint.part_turn import PartTurn
 from pipeline.objective.radar.heights import Heights
 from pipeline.objective.radar.travel import TravelDirections
 
@@ -38,11 +38,11 @@ class SeenLow:
     # By how much the whole share would turn the radar up [rad].
     per_share_rad: Mapping[str, float] = field(default_factory=dict)
 
-    def expected(self, witness: Witness) -> Witness:
+    def expected(self, source: PartTurn) -> PartTurn:
         """The source's pitch, corrected for the prior mean of the share."""
-        per_rad = self.per_share_rad.get(witness.name, 0.0)
-        sigma_rad = float(np.hypot(witness.sigma_rad, per_rad * self.sigma))
-        return replace(witness, offset_rad=witness.offset_rad + per_rad * self.mean, sigma_rad=sigma_rad)
+        per_rad = self.per_share_rad.get(source.name, 0.0)
+        moved = replace(source, offset_rad=source.offset_rad + per_rad * self.mean)
+        return moved.wider(per_rad * self.sigma)
 
 
 def seen_low_of(travel: TravelDirections | None, heights: Heights | None) -> SeenLow:

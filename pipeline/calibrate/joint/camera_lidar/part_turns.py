@@ -15,7 +15,7 @@ show one road user. A detector trained apart from the segmenter has other errors
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 from typing import Final
 
@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Float, Int, Int64
 
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState
+from pipeline.calibrate.joint.part_turn import PartTurn
 from pipeline.calibrate.numerics.bias_floors import (
     CAMERA_LIDAR_BIAS,
     EDGE_SIDE_MOST_OF_GAP,
@@ -35,7 +36,7 @@ from pipeline.rig.cameras import camera_of
 from pipeline.rig.checks import FailedCheck, change_of
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT, Observation
 
-__all__ = ["Witness", "ask_witnesses", "box_offsets", "disagreement", "witness_numbers"]
+__all__ = ["box_offsets", "disagreement", "turn_numbers", "turns_by_parts"]
 
 _REACH_RAD = np.radians(2.0)
 _STEP_PX = 0.5  # of the label image
@@ -65,29 +66,7 @@ _LEAST_OVERLAP = 0.3  # intersection over union; of the second best pairing at m
 _Boxes = Float[np.ndarray, "_ 4"]  # u0 v0 u1 v1
 
 
-@dataclass(frozen=True)
-class Witness:
-    """Rotation of the solution by one part of the evidence alone."""
-
-    name: str
-    axis: int  # 0 pitch, 1 yaw: about the camera's x and y
-    offset_rad: float
-    scatter_rad: float  # over blocks of frames
-    floor_rad: float  # of what all scenes share: labels too wide, beams too far apart
-    part_of: str = ""  # the side of which this is a half: it testifies against the other half alone
-
-    @property
-    def sigma_rad(self) -> float:
-        """Sigma of the offset."""
-        return float(np.hypot(self.scatter_rad, self.floor_rad))
-
-    @property
-    def sentence(self) -> str:
-        """Sentence with the name of the part and its rotation."""
-        return f"{self.name} by {np.degrees(self.offset_rad):+.2f} +- {np.degrees(self.sigma_rad):.2f} deg"
-
-
-def ask_witnesses(
+def turns_by_parts(
     observations: Sequence[Observation],
     terms: Terms,
     state: AlignmentState,
@@ -95,7 +74,7 @@ def ask_witnesses(
     blocks: Int[np.ndarray, " F"],
     seed: int,
     fit_sigma_rad: Sequence[float],
-) -> list[Witness]:
+) -> list[PartTurn]:
     """Rotations about camera x and y by each side of the edges, its halves, the markings, and detected boxes alone.
 
     Each score's maximum within 2 deg, other unknowns unchanged, and the boxes' median; sigmas by resampling
@@ -110,7 +89,7 @@ def ask_witnesses(
     def ask(name: str, axis: int, score: np.ndarray, floor_rad: float, part_of: str = "") -> None:
         rng = np.random.default_rng(seed)
         offset, scatter = _maximum(turn_rad, score.astype(np.float64), blocks, rng)
-        found.append(Witness(name, axis, offset, scatter, floor_rad, part_of))
+        found.append(PartTurn(name, offset, scatter, floor_rad, axis, part_of))
 
     for axis, sides in _SIDES.items():
         at = state.changed(turn_rad[:, None] * (np.arange(8) == axis))
@@ -126,7 +105,7 @@ def ask_witnesses(
                     ask(f"{k} {name}", axis, scores[k], _most_offset_rad(half.edges, px_rad), name)
         if kernel.marking_weight > 0 and len(terms.markings.xyz_m) >= _FEWEST:
             ask("paint", axis, terms.marking_score(at, kernel), _PAINT_FLOOR_PX * px_rad)
-    fit = [Witness(_FIT, axis, 0.0, fit_sigma_rad[axis], float(CAMERA_LIDAR_BIAS[axis])) for axis in _SIDES]
+    fit = [PartTurn(_FIT, 0.0, fit_sigma_rad[axis], float(CAMERA_LIDAR_BIAS[axis]), axis) for axis in _SIDES]
     return fit + found + _boxes(observations, terms.poses(state.alone)[0], blocks, seed)
 
 
@@ -146,7 +125,7 @@ def _boxes(
     poses: Float[np.ndarray, "F 12"],
     blocks: Int[np.ndarray, " F"],
     seed: int,
-) -> list[Witness]:
+) -> list[PartTurn]:
     """Rotation of the solution by boxes of a detector, which are independent of the label maps."""
     T = np.tile(np.eye(4), (len(poses), 1, 1))
     T[:, :3] = poses.reshape(-1, 3, 4)
@@ -160,21 +139,21 @@ def _boxes(
     drawn = rng.integers(len(known), size=(_RESAMPLES, len(known)))
     scatter = np.std([np.median(offset[np.concatenate([rows[b] for b in d])], axis=0) for d in drawn], axis=0)
     return [
-        Witness(_BOXES, axis, float(np.median(offset[:, axis])), float(scatter[axis]), _BOX_FLOOR_RAD[axis])
+        PartTurn(_BOXES, float(np.median(offset[:, axis])), float(scatter[axis]), _BOX_FLOOR_RAD[axis], axis)
         for axis in (0, 1)
     ]
 
 
-def disagreement(witnesses: Sequence[Witness]) -> list[FailedCheck]:
+def disagreement(turns: Sequence[PartTurn]) -> list[FailedCheck]:
     """A failed check for each axis about which two contradict each other; its error is the larger of their offsets.
 
     Sigma stays as it is: on known days half of the difference had nothing to do with the error, and a wider
     sigma let radars move poses that were right.
     """
-    return [_failed(a, b) for a, b in _contradictions(witnesses)]
+    return [_failed(a, b) for a, b in _contradictions(turns)]
 
 
-def _failed(a: Witness, b: Witness) -> FailedCheck:
+def _failed(a: PartTurn, b: PartTurn) -> FailedCheck:
     right, about = max(a, b, key=lambda w: abs(w.offset_rad)), np.arange(6) == a.axis
     return FailedCheck(
         f"the evidence disagrees on {_AXES[a.axis]}: {a.sentence}, {b.sentence}",
@@ -184,20 +163,20 @@ def _failed(a: Witness, b: Witness) -> FailedCheck:
     )
 
 
-def witness_numbers(witnesses: Sequence[Witness]) -> dict[str, float]:
+def turn_numbers(turns: Sequence[PartTurn]) -> dict[str, float]:
     """Offsets and sigmas, for the record's diagnostics."""
     return {
         f"{w.name.replace(' ', '_')}_{_AXES[w.axis]}_{what}_rad": value
-        for w in witnesses
+        for w in turns
         if w.name != _FIT and not w.part_of
         for what, value in (("offset", w.offset_rad), ("sigma", w.sigma_rad))
     }
 
 
-def _contradictions(witnesses: Sequence[Witness]) -> list[tuple[Witness, Witness]]:
+def _contradictions(turns: Sequence[PartTurn]) -> list[tuple[PartTurn, PartTurn]]:
     """The two parts that differ most in each axis, if by more than two sigmas and three of their floors."""
-    worst: dict[int, tuple[float, tuple[Witness, Witness]]] = {}
-    for a, b in combinations(witnesses, 2):
+    worst: dict[int, tuple[float, tuple[PartTurn, PartTurn]]] = {}
+    for a, b in combinations(turns, 2):
         if _FIT in (a.name, b.name) and _BOXES not in (a.name, b.name):
             continue  # sides and paint are parts of the fit
         if a.part_of != b.part_of:

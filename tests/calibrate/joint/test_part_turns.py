@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.calibrate.joint.camera_lidar import witnesses as parts
-from pipeline.calibrate.joint.camera_lidar.witnesses import Witness, box_offsets, disagreement
+from pipeline.calibrate.joint.camera_lidar import part_turns as parts
+from pipeline.calibrate.joint.camera_lidar.part_turns import box_offsets, disagreement
+from pipeline.calibrate.joint.part_turn import PartTurn
 from pipeline.core.config import SolveConfig
 from pipeline.rig.estimates import Prior
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse, log_so3, perturb_exactly
@@ -76,7 +77,7 @@ def test_windows_in_cars_of_one_kind_only_are_seen_where_no_paint_tells(within_m
 
 
 def witness(name, offset_deg, scatter_deg=0.02, floor_deg=0.1, axis=0):
-    return Witness(name, axis, *np.radians([offset_deg, scatter_deg, floor_deg]))
+    return PartTurn(name, *np.radians([offset_deg, scatter_deg, floor_deg]), axis)
 
 
 def test_two_that_differ_beyond_two_sigmas_are_named_and_the_pose_may_be_off_by_the_larger():

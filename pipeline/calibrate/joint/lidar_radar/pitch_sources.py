@@ -8,19 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-__all__ = ["Contradiction", "Witness", "contradiction", "doubted", "own_equations", "own_numbers"]
+from pipeline.calibrate.joint.part_turn import PartTurn
+
+__all__ = ["Contradiction", "contradiction", "doubted", "own_equations", "own_numbers"]
 
 _SIGMAS = 2.0  # from which two sources contradict each other
 _SINGULAR = 1e-9
-
-
-@dataclass(frozen=True)
-class Witness:
-    """Pitch from one source alone, with all other unknowns at the solution."""
-
-    name: str
-    offset_rad: float  # from the solution to the pitch by this source alone
-    sigma_rad: float  # of this source, its own bias included
 
 
 @dataclass(frozen=True)
@@ -33,7 +26,7 @@ class Contradiction:
 
 def own_equations(
     name: str, H: Float[np.ndarray, "P P"], g: Float[np.ndarray, " P"], floor_rad: float
-) -> Witness | None:
+) -> PartTurn | None:
     """Pitch correction from these equations alone, with sigma; None if pitch is unconstrained.
 
     Pitch is the first unknown, the others are nuisances; `floor_rad` is the sigma of errors common to all
@@ -43,50 +36,49 @@ def own_equations(
     if H[0, 0] <= _SINGULAR or np.linalg.eigvalsh(H / np.outer(scale, scale))[0] < _SINGULAR:
         return None
     covariance = np.linalg.inv(H)
-    sigma = float(np.hypot(np.sqrt(covariance[0, 0]), floor_rad))
-    return Witness(name, float(-(covariance @ g)[0]), sigma)
+    return PartTurn(name, float(-(covariance @ g)[0]), float(np.sqrt(covariance[0, 0])), floor_rad)
 
 
-def doubted(witnesses: Sequence[Witness]) -> dict[str, float]:
+def doubted(sources: Sequence[PartTurn]) -> dict[str, float]:
     """Sigmas [rad] to add to sources of pitch that are biased by detections measured too low.
 
     Such detections rotate the estimated radar upwards. `heights` models them. If another source gives a
     higher pitch than both sigmas allow, its difference from `heights` is taken as its error.
     """
-    right = next((w for w in witnesses if w.name == "heights"), None)
+    right = next((w for w in sources if w.name == "heights"), None)
     if right is None:
         return {}
-    apart = {w: w.offset_rad - right.offset_rad for w in witnesses if w is not right}
+    apart = {w: w.offset_rad - right.offset_rad for w in sources if w is not right}
     beyond = {w.name: a**2 - w.sigma_rad**2 - right.sigma_rad**2 for w, a in apart.items() if a < 0}
     return {name: float(np.sqrt(variance)) for name, variance in beyond.items() if variance > 0}
 
 
-def contradiction(witnesses: Sequence[Witness]) -> Contradiction | None:
+def contradiction(sources: Sequence[PartTurn]) -> Contradiction | None:
     """Sources that are inconsistent with the mean of the others, and the factor on pitch's sigma; None if all agree.
 
     The factor is the square root of chi-squared per degree of freedom, at least one.
 
     Source: Birge 1932, "The calculation of errors by the method of least squares".
     """
-    apart = [w for w in witnesses if _is_contradicted(w, [o for o in witnesses if o is not w])]
+    apart = [w for w in sources if _is_contradicted(w, [o for o in sources if o is not w])]
     if not apart:
         return None
-    mean, _ = _mean(witnesses)
-    chi2 = sum(((w.offset_rad - mean) / w.sigma_rad) ** 2 for w in witnesses)
-    factor = max(1.0, float(np.sqrt(chi2 / (len(witnesses) - 1))))
+    mean, _ = _mean(sources)
+    chi2 = sum(((w.offset_rad - mean) / w.sigma_rad) ** 2 for w in sources)
+    factor = max(1.0, float(np.sqrt(chi2 / (len(sources) - 1))))
     said = ", ".join(
-        f"{w.name} {np.degrees(w.offset_rad):+.2f} +- {np.degrees(w.sigma_rad):.2f} deg" for w in witnesses
+        f"{w.name} {np.degrees(w.offset_rad):+.2f} +- {np.degrees(w.sigma_rad):.2f} deg" for w in sources
     )
     sentence = (
-        f"witnesses of radar pitch contradict each other ({said}): its sigma is {factor:.1f} times as wide"
+        f"sources of radar pitch contradict each other ({said}): its sigma is {factor:.1f} times as wide"
     )
     return Contradiction(factor, sentence)
 
 
-def own_numbers(witnesses: Sequence[Witness]) -> dict[str, float]:
+def own_numbers(sources: Sequence[PartTurn]) -> dict[str, float]:
     """Offset and sigma of each source, for the diagnostics of a record."""
     numbers: dict[str, float] = {}
-    for w in witnesses:
+    for w in sources:
         numbers |= {
             f"{w.name}_pitch_offset_rad": w.offset_rad,
             f"{w.name}_pitch_sigma_rad": w.sigma_rad,
@@ -94,15 +86,15 @@ def own_numbers(witnesses: Sequence[Witness]) -> dict[str, float]:
     return numbers
 
 
-def _is_contradicted(witness: Witness, others: Sequence[Witness]) -> bool:
+def _is_contradicted(source: PartTurn, others: Sequence[PartTurn]) -> bool:
     if not others:
         return False
     mean, sigma = _mean(others)
-    return bool(abs(witness.offset_rad - mean) > _SIGMAS * np.hypot(witness.sigma_rad, sigma))
+    return bool(abs(source.offset_rad - mean) > _SIGMAS * np.hypot(source.sigma_rad, sigma))
 
 
-def _mean(witnesses: Sequence[Witness]) -> tuple[float, float]:
+def _mean(sources: Sequence[PartTurn]) -> tuple[float, float]:
     """Weighted mean and its sigma."""
-    weight = np.array([w.sigma_rad**-2 for w in witnesses])
-    offset = np.array([w.offset_rad for w in witnesses])
+    weight = np.array([w.sigma_rad**-2 for w in sources])
+    offset = np.array([w.offset_rad for w in sources])
     return float(weight @ offset / weight.sum()), float(weight.sum() ** -0.5)

@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
-from pipeline.calibrate.joint.lidar_radar.witnesses import (
-    Witness,
+from pipeline.calibrate.joint.lidar_radar.pitch_sources import (
     contradiction,
     doubted,
     own_equations,
     own_numbers,
 )
+from pipeline.calibrate.joint.part_turn import PartTurn
 
 
 def test_witnesses_that_contradict_each_other_widen_the_sigma_and_are_named():
-    found = contradiction([Witness("registration", 0.0, 0.002), Witness("doppler", 0.012, 0.002)])
+    found = contradiction([PartTurn("registration", 0.0, 0.002), PartTurn("doppler", 0.012, 0.002)])
     # Two values six sigmas apart: chi-squared is 18 for one degree of freedom.
     assert found.factor == pytest.approx(np.sqrt(18))
     assert "registration +0.00 +- 0.11 deg" in found.sentence
@@ -21,7 +21,7 @@ def test_witnesses_that_contradict_each_other_widen_the_sigma_and_are_named():
 
 
 def test_the_widened_sigma_covers_both_sides():
-    a, b = Witness("registration", 0.0, 0.002), Witness("doppler", 0.012, 0.004)
+    a, b = PartTurn("registration", 0.0, 0.002), PartTurn("doppler", 0.012, 0.004)
     found = contradiction([a, b])
     weight = np.array([a.sigma_rad, b.sigma_rad]) ** -2.0
     mean, sigma = weight @ [a.offset_rad, b.offset_rad] / weight.sum(), weight.sum() ** -0.5
@@ -33,7 +33,7 @@ def test_errors_as_large_as_their_sigmas_seldom_contradict():
     sigma = np.array([0.002, 0.01, 0.003])
     found = [
         contradiction(
-            [Witness(str(k), e, s) for k, (e, s) in enumerate(zip(rng.normal(0, sigma), sigma, strict=True))]
+            [PartTurn(str(k), e, s) for k, (e, s) in enumerate(zip(rng.normal(0, sigma), sigma, strict=True))]
         )
         for _ in range(400)
     ]
@@ -52,9 +52,9 @@ def test_equations_give_the_step_with_nuisances_following():
 
 
 def test_who_turns_the_radar_further_up_than_displaced_heights_errs_by_that_and_nobody_else():
-    heights = Witness("heights", 0.01, 0.004)
+    heights = PartTurn("heights", 0.01, 0.004)
     up, down, near = (
-        Witness(n, o, 0.003) for n, o in (("boxes", -0.02), ("doppler", 0.04), ("registration", 0.008))
+        PartTurn(n, o, 0.003) for n, o in (("boxes", -0.02), ("doppler", 0.04), ("registration", 0.008))
     )
     found = doubted([up, down, near, heights])
     assert set(found) == {"boxes"}
