@@ -14,7 +14,6 @@ from jaxtyping import Int64
 from pipeline.core.config import FleetConfig, IngestConfig
 from pipeline.core.errors import ConfigError, SolveError
 from pipeline.core.results import Progress, silent
-from pipeline.ingest.captures import Rejected
 from pipeline.ingest.directions_and_units import prior_transform
 from pipeline.ingest.index import DayIndex, index_logs
 from pipeline.ingest.moments import MomentBuilder
@@ -106,15 +105,8 @@ def check_logs(
     try:
         anchored, rejected = pick_moments(index, rig, fleet.ingest)
         builder = MomentBuilder(index, rig, fleet.ingest, read_file_prior(rig, fleet))
-        built = []
-        picked = np.unique(np.linspace(0, max(len(anchored) - 1, 0), _SAMPLE).round().astype(int))
-        for done, i in enumerate(picked if anchored else [], 1):
-            try:
-                built.append(builder.build(anchored[i], int(i)))
-            except Rejected as outcome:
-                rejected[outcome.reason] += 1
-                index.complain(str(outcome))
-            progress(done, len(picked), "frames looked at")
+        built, looked, damaged = builder.sample(anchored, _SAMPLE, progress, "frames looked at")
+        rejected += damaged
         without = Counter({k: n for k, n in builder.counts.items() if k.startswith("without_")})
         unheard = unheard_topics(index, rig)
     finally:
@@ -129,7 +121,6 @@ def check_logs(
     present = [frozenset(a.places) for a in anchored]
     prior = _prior(rows, fleet, rig, index.problems)
     tracked = [n for t in topics for n in rig.radars if t.topic == rig.radars[n].points and _is_of_tracks(t)]
-    looked = len(picked) if anchored else 0
     sample = RigSample(rig, built, looked, present, logged_stars(rows), prior, silent, tracked)
     verdicts = [v for own in sample.verdicts.values() for v in own]
     first = sample.frames({str(kind): sensor for sensor, kind in reversed(index.kinds.items())})

@@ -12,13 +12,14 @@ of a few objects may be; it is not checked.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from pipeline.core.config import IngestConfig
+from pipeline.core.results import Progress
 from pipeline.ingest.captures import Read, Rejected, readers_of
 from pipeline.ingest.index import DayIndex
 from pipeline.ingest.messages.point_cloud import LidarCloud
@@ -103,24 +104,6 @@ class LoggedPrior:
         return self._found[log, a, b]
 
 
-class Repetitions:
-    """Hashes of the captures that a sensor delivered so far."""
-
-    def __init__(self) -> None:
-        self._seen: set[int] = set()
-
-    def is_new(self, measured: LidarCloud | RadarCloud | bytes) -> bool:
-        """Whether this image, sweep or scan is new, apart from its stamp."""
-        content = _content(measured)
-        if not content:
-            return True
-        # Random collisions among a day's thousands of captures are negligible with 2**64 values, at a third
-        # of a digest's time.
-        known = hash(content) in self._seen
-        self._seen.add(hash(content))
-        return not known
-
-
 @dataclass(frozen=True, slots=True)
 class Anchored:
     """Captures of one moment (indices by sensor), the sensor that stamps it, and its stretch of driving."""
@@ -141,7 +124,7 @@ class MomentBuilder:
         self.prior = LoggedPrior(index, rig, file_prior)
         self._readers = readers_of(index, rig, ingest, self.counts)
         self._kinds = {node.name: node.kind for node in rig.nodes if node.name in self._readers}
-        self._repetitions = {sensor: Repetitions() for sensor in self._readers}
+        self._contents: dict[str, set[int]] = {sensor: set() for sensor in self._readers}
         self._whole_ns = -SAME_SCENE_NS  # stamp of the last moment with all sensors
 
     def build(self, at: Anchored, moment: int) -> tuple[Moment, dict[str, Capture]]:
@@ -170,6 +153,22 @@ class MomentBuilder:
         )  # fmt: skip
         return row, captures
 
+    def sample(
+        self, anchored: Sequence[Anchored], count: int, progress: Progress, what: str
+    ) -> tuple[list[tuple[Moment, dict[str, Capture]]], int, Counter[str]]:
+        """Up to `count` moments spread over the day; how many were tried, and those not kept by reason."""
+        built, rejected = [], Counter[str]()
+        picked = np.unique(np.linspace(0, max(len(anchored) - 1, 0), count).round().astype(int))
+        picked = picked[: len(anchored)]
+        for done, i in enumerate(picked.tolist(), 1):
+            try:
+                built.append(self.build(anchored[i], i))
+            except Rejected as outcome:
+                rejected[outcome.reason] += 1
+                self._index.complain(str(outcome))
+            progress(done, len(picked), what)
+        return built, len(picked), rejected
+
     def _is_worth_having(self, parts: Collection[str], stamp_ns: int) -> bool:
         """Whether an incomplete moment shows a scene that no complete one shows."""
         if len(set(self._kinds.values())) == len(self._kinds):
@@ -184,7 +183,7 @@ class MomentBuilder:
         try:
             if sensor in at.places:
                 part = self._readers[sensor].read(at.places[sensor], moment)
-                if self._repetitions[sensor].is_new(part.measured):
+                if self._is_new(sensor, part.measured):
                     return part
                 missing[sensor] = Rejected(REPEATED[kind])
             else:
@@ -193,6 +192,15 @@ class MomentBuilder:
         except Rejected as why:
             missing[sensor] = why
         return None
+
+    def _is_new(self, sensor: str, measured: LidarCloud | RadarCloud | bytes) -> bool:
+        """Whether this image, sweep or scan is new, apart from its stamp."""
+        # Random collisions among a day's thousands of captures are negligible with 2**64 values, at a third
+        # of a digest's time.
+        content, seen = _content(measured), self._contents[sensor]
+        known = bool(content) and hash(content) in seen
+        seen.add(hash(content))
+        return not known
 
     def _count(self, missing: Mapping[str, Rejected]) -> None:
         """Count the missing sensors of the moment by reason; each payload problem is reported once."""

@@ -24,8 +24,7 @@ from pipeline.ingest.sync import (
     WRONG_UNIT,
     Matched,
     Rejection,
-    match_by_motion,
-    match_by_stamp,
+    match_moments,
     none_near,
     number_drives,
 )
@@ -168,11 +167,11 @@ def find_moments(index: DayIndex, rig: Rig, config: IngestConfig) -> Matched:
     others_ns = {s: index.captures(s).stamps_ns for s in index.kinds if s != index.anchor}
     tied = _tied(rig, index.anchor)
     if config.sync_gate_s is not None:
-        found = match_by_stamp(anchors_ns, others_ns, round(config.sync_gate_s * 1e9), tied)
+        found = match_moments(anchors_ns, others_ns, round(config.sync_gate_s * 1e9), tied)
     else:
         speed, yaw_rate = index.ego.motion_at(anchors_ns)
         gates = motion_gates_ns(speed, yaw_rate, config.sync_gate_m, float(np.radians(config.sync_gate_deg)))
-        found = match_by_motion(anchors_ns, others_ns, gates, tied)
+        found = match_moments(anchors_ns, others_ns, gates, tied)
     return replace(found, anchor=wanted[found.anchor])
 
 

@@ -19,8 +19,7 @@ __all__ = [
     "Rejection",
     "constant_gap_ns",
     "first_occurrences",
-    "match_by_motion",
-    "match_by_stamp",
+    "match_moments",
     "match_nearest",
     "none_near",
     "number_drives",
@@ -114,52 +113,56 @@ def match_nearest(
     return partner
 
 
-def match_by_stamp(
+def match_moments(
     anchor_ns: Int[np.ndarray, " L"],
     others_ns: Mapping[str, Int[np.ndarray, " M"]],
-    gate_ns: int,
+    gate_ns: int | Int[np.ndarray, " L"],
     tied: Collection[str] | None = None,
 ) -> Matched:
-    """Synchronised moments: any two stamps of one are within the gate (paper, section 4.5.1: under 5 ms).
+    """Synchronised moments: each anchor with the nearest capture of each sensor, any two of them within the gate.
 
-    An incomplete moment is kept if no complete one within a second shows the same scene. For rigs of many
-    sensors (`tied`) the gate applies between each stamp and the anchor's.
-
-    Stamps may have any order and repeat: of equal stamps the first one counts.
-    """
-    anchor = first_occurrences(anchor_ns)
-    once = {s: stamps[first_occurrences(stamps)] for s, stamps in others_ns.items()}
-    partners = {s: match_nearest(anchor_ns[anchor], stamps, gate_ns) for s, stamps in once.items()}
-    gates = np.full(len(anchor), gate_ns, np.int64)
-    return _gated(anchor_ns, others_ns, partners, dict.fromkeys(once, 0), gates, tied)
-
-
-def match_by_motion(
-    anchor_ns: Int[np.ndarray, " L"],
-    others_ns: Mapping[str, Int[np.ndarray, " M"]],
-    gates_ns: Int[np.ndarray, " L"],
-    tied: Collection[str] | None = None,
-) -> Matched:
-    """Each anchor with the nearest capture of each sensor, if the gap is within the anchor's own gate.
-
-    The constant part of a sensor's gaps is removed first: calibration estimates it. Nearest means within half
-    a period, so that an anchor without a partner does not take a neighbour's.
+    Stamps may have any order and repeat: of equal stamps the first one counts. An incomplete moment is kept if no
+    complete one within a second shows the same scene: there a sensor failed, or the rig lacks it.
 
     Args:
-        gates_ns: per anchor, the largest gap between two captures of its moment, constant gaps removed.
+        gate_ns: one gate for the stamps as they are (paper, section 4.5.1: under 5 ms); or per anchor, the largest
+            gap between two captures of its moment, constant gaps removed: calibration estimates them. Nearest then
+            means within half a period, so that an anchor without a partner does not take a neighbour's.
         tied: for a rig with several sensors of a kind, those that can be calibrated against the anchor. A
             moment then needs one of them, each within the gate of the anchor, and may lack others: every edge
             uses the moments that have its own two sensors.
     """
     anchor = first_occurrences(anchor_ns)
-    partners, constant = {}, {}
-    for sensor, stamps_ns in others_ns.items():
-        stamps = stamps_ns[first_occurrences(stamps_ns)]
-        constant[sensor] = constant_gap_ns(anchor_ns[anchor], stamps)
-        period = _period_ns(stamps)
-        half = int(gates_ns.max(initial=0)) if period is None else int(_HALF_A_PERIOD * period)
-        partners[sensor] = match_nearest(anchor_ns[anchor] + constant[sensor], stamps, half)
-    return _gated(anchor_ns, others_ns, partners, constant, gates_ns[anchor], tied)
+    own, names, is_fixed = anchor_ns[anchor], list(others_ns), isinstance(gate_ns, int)
+    gates = np.full(len(own), gate_ns, np.int64) if isinstance(gate_ns, int) else gate_ns[anchor]
+    constant_ns, places = dict.fromkeys(names, 0), {}
+    gap, has = np.zeros((len(names), len(own)), np.int64), np.zeros((len(names), len(own)), bool)
+    for k, s in enumerate(names):
+        once = first_occurrences(others_ns[s])
+        stamps, reach_ns = others_ns[s][once], int(np.max(gate_ns, initial=0))
+        if not is_fixed:
+            constant_ns[s] = constant_gap_ns(own, stamps)
+            period = _period_ns(stamps)
+            reach_ns = reach_ns if period is None else int(_HALF_A_PERIOD * period)
+        partner = match_nearest(own + constant_ns[s], stamps, reach_ns)
+        near = partner >= 0
+        gap[k, near] = stamps[partner[near]] - own[near] - constant_ns[s]
+        has[k] = near & (np.abs(gap[k]) <= gates)
+        places[s] = np.append(once, -1)[partner]
+    if tied is None:
+        together, apart = _together(gap, has, gates)
+        kept = _worth_having(own, 1 + together.sum(0), min(2, 1 + len(names)))
+    else:
+        together, apart = has, {}
+        kept = np.logical_or.reduce(has[[name in tied for name in names]], axis=0)
+    rejected = Counter[str]({Rejection.DUPLICATE_STAMP: len(anchor_ns) - len(anchor)})
+    heard = [k for k, s in enumerate(names) if len(others_ns[s])] or list(range(len(names)))
+    for i in np.flatnonzero(~kept):
+        lacking = next((names[k] for k in heard if not has[k, i]), "")
+        first, second = sorted(apart.get(int(i), (0, 0)))
+        rejected[none_near(lacking) if lacking else f"{names[first]}_{names[second]}_outside_gate"] += 1
+    others = {s: np.where(together[k, kept], places[s][kept], -1) for k, s in enumerate(names)}
+    return Matched(anchor[kept], others, +rejected, constant_ns)
 
 
 def constant_gap_ns(lidar_ns: Int[np.ndarray, " L"], stamps_ns: Int[np.ndarray, " M"]) -> int:
@@ -190,47 +193,6 @@ def _period_ns(stamps_ns: Int[np.ndarray, " M"]) -> float | None:
     return float(np.median(np.diff(np.sort(stamps_ns)))) if len(stamps_ns) > 1 else None
 
 
-def _gated(
-    anchor_ns: np.ndarray,
-    others_ns: Mapping[str, np.ndarray],
-    partners: Mapping[str, np.ndarray],
-    constant_ns: Mapping[str, int],
-    gates: np.ndarray,
-    tied: Collection[str] | None,
-) -> Matched:
-    """Moments with all stamps, constant gaps removed, within the anchor's gate; the others are counted.
-
-    Incomplete anchors are kept only far from complete moments: there a sensor failed or the rig lacks it. For
-    sensors `tied` to the anchor, gates and incomplete moments are as in `match_by_motion`.
-
-    `partners` are indices into the distinct stamps of each sensor, -1 = none.
-    """
-    anchor = first_occurrences(anchor_ns)
-    names, own = list(others_ns), anchor_ns[anchor]
-    once = {s: first_occurrences(others_ns[s]) for s in names}
-    gap, has = np.zeros((len(names), len(own)), np.int64), np.zeros((len(names), len(own)), bool)
-    for k, s in enumerate(names):
-        near, stamps = partners[s] >= 0, others_ns[s][once[s]]
-        gap[k, near] = stamps[partners[s][near]] - own[near] - constant_ns[s]
-        has[k] = near & (np.abs(gap[k]) <= gates)
-    if tied is None:
-        together, apart = _together(gap, has, gates)
-        kept = _worth_having(own, 1 + together.sum(0), min(2, 1 + len(names)))
-    else:
-        together, apart = has, {}
-        kept = np.logical_or.reduce(has[[name in tied for name in names]], axis=0)
-    rejected = Counter[str]({Rejection.DUPLICATE_STAMP: len(anchor_ns) - len(anchor)})
-    heard = [k for k, s in enumerate(names) if len(others_ns[s])] or list(range(len(names)))
-    for i in np.flatnonzero(~kept):
-        lacking = next((names[k] for k in heard if not has[k, i]), "")
-        a, b = sorted(apart.get(int(i), (0, 0)))
-        rejected[none_near(lacking) if lacking else f"{names[a]}_{names[b]}_outside_gate"] += 1
-    others = {
-        s: np.where(together[k, kept], _at(once[s], partners[s][kept]), -1) for k, s in enumerate(names)
-    }
-    return Matched(anchor[kept], others, +rejected, constant_ns)
-
-
 def _together(
     gap: Int64[np.ndarray, "S N"], has: Bool[np.ndarray, "S N"], gates: Int64[np.ndarray, " N"]
 ) -> tuple[Bool[np.ndarray, "S N"], dict[int, tuple[int, int]]]:
@@ -253,11 +215,6 @@ def _worth_having(
     end = np.searchsorted(stamps_ns, stamps_ns + SAME_SCENE_NS, "right")
     most = np.array([sensors[a:b].max() for a, b in zip(first, end, strict=True)], np.int64)
     return (sensors >= least) & (most == sensors)
-
-
-def _at(places: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """`places[index]`, -1 where the index is -1."""
-    return np.append(places, -1)[index]
 
 
 def number_drives(stamps_ns: Sequence[int], logs: Sequence[int]) -> Int64[np.ndarray, " N"]:

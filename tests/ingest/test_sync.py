@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from pipeline.ingest.sync import (
     constant_gap_ns,
     first_occurrences,
-    match_by_motion,
-    match_by_stamp,
+    match_moments,
     match_nearest,
     number_drives,
 )
@@ -33,10 +32,7 @@ captures = st.dictionaries(st.sampled_from("abcdefg"), stamps)
 def test_no_sweep_is_lost_captures_are_one_to_one_and_every_two_lie_within_the_gate(
     lidar, others, gate, by_motion
 ):
-    if by_motion:
-        found = match_by_motion(lidar, others, np.full(len(lidar), gate))
-    else:
-        found = match_by_stamp(lidar, others, gate)
+    found = match_moments(lidar, others, np.full(len(lidar), gate) if by_motion else gate)
     assert list(found.others) == list(others)
     together = [np.zeros(len(found.anchor))]
     for name, stamps_ns in others.items():
@@ -56,7 +52,7 @@ def test_the_order_of_logging_does_not_matter(lidar, camera, radar, seed):
     rng = np.random.default_rng(seed)
     mixed = [rng.permutation(s) for s in (lidar, camera, radar)]
     both = (lidar, camera, radar)
-    a, b = (match_by_stamp(s[0], {"camera": s[1], "radar": s[2]}, GATE) for s in (both, mixed))
+    a, b = (match_moments(s[0], {"camera": s[1], "radar": s[2]}, GATE) for s in (both, mixed))
     assert both[0][a.anchor].tolist() == mixed[0][b.anchor].tolist()
     for i, name in enumerate(("camera", "radar"), start=1):
         np.testing.assert_array_equal(seen(both[i], a.others[name]), seen(mixed[i], b.others[name]))
@@ -79,13 +75,13 @@ def test_no_pair_could_come_closer_than_the_partners_that_it_got(a, b):
 
 def test_a_gate_of_five_milliseconds_holds_between_every_two_sensors():
     lidar, camera = np.array([0]), np.array([3 * MS])
-    found = match_by_stamp(lidar, {"camera": camera, "radar": np.array([-2 * MS])}, 5 * MS)
+    found = match_moments(lidar, {"camera": camera, "radar": np.array([-2 * MS])}, 5 * MS)
     assert (found.others["camera"].tolist(), found.others["radar"].tolist()) == ([0], [0])
-    apart = match_by_stamp(lidar, {"camera": camera, "radar": np.array([-2 * MS - 1])}, 5 * MS)
+    apart = match_moments(lidar, {"camera": camera, "radar": np.array([-2 * MS - 1])}, 5 * MS)
     # The one farther from the sweep goes; the other's pair has what it needs.
     assert (apart.others["camera"].tolist(), apart.others["radar"].tolist()) == ([-1], [0])
     lidar, camera, radar = (np.array([0, 100 * MS]) + [0, late] for late in (0, 3 * MS, -2 * MS - 1))
-    beside = match_by_stamp(lidar, {"camera": camera, "radar": radar}, 5 * MS)
+    beside = match_moments(lidar, {"camera": camera, "radar": radar}, 5 * MS)
     assert beside.anchor.tolist() == [0]  # where a whole moment shows the same
     assert dict(beside.rejected) == {"camera_radar_outside_gate": 1}
 
@@ -94,16 +90,16 @@ def test_a_moment_of_many_sensors_lives_where_one_is_tied_to_the_anchor_whatever
     sweeps = ticks(10, 0)
     others = {name: sweeps.copy() for name in "abcde"}
     others["a"], others["b"] = others["a"][::2], others["b"][::3]
-    found = match_by_motion(sweeps, others, gates(sweeps, speed=0.0), tied={"a", "b", "c", "d", "e"})
+    found = match_moments(sweeps, others, gates(sweeps, speed=0.0), tied={"a", "b", "c", "d", "e"})
     assert len(found.anchor) == len(sweeps)
     assert {s: int(np.sum(at >= 0)) for s, at in found.others.items()} == {s: len(others[s]) for s in others}
-    found = match_by_motion(sweeps, others, gates(sweeps, speed=0.0), tied={"b"})
+    found = match_moments(sweeps, others, gates(sweeps, speed=0.0), tied={"b"})
     assert (len(found.anchor), dict(found.rejected)) == (200, {"no_a_in_gate": 200, "no_b_in_gate": 200})
 
 
 def test_of_many_sensors_each_is_gated_against_the_anchor_and_none_for_another():
     early_and_late = {"a": np.array([-4 * MS]), "b": np.array([4 * MS]), "c": np.array([6 * MS])}
-    found = match_by_stamp(np.array([0]), early_and_late, 5 * MS, tied={"a", "b", "c"})
+    found = match_moments(np.array([0]), early_and_late, 5 * MS, tied={"a", "b", "c"})
     assert {s: at.tolist() for s, at in found.others.items()} == {"a": [0], "b": [0], "c": [-1]}
 
 
@@ -119,14 +115,14 @@ def gates(sweeps, speed=20.0, yaw_rate=0.1):
 
 def test_every_sweep_of_free_running_sensors_gets_the_image_and_scan_nearest_to_it():
     sweeps, images, scans = ticks(10.03, 3, jitter_ms=0.1), ticks(30, 11), ticks(13, 40)
-    found = match_by_motion(sweeps, {"camera": images, "radar": scans}, gates(sweeps, speed=35.0))
+    found = match_moments(sweeps, {"camera": images, "radar": scans}, gates(sweeps, speed=35.0))
     assert (found.constant_ns["camera"], found.constant_ns["radar"]) == (0, 0)
     assert min(found.others["radar"]) >= 0
     assert len(found.anchor) >= len(sweeps) - 2  # the last ones outlive the radar
     for stamps_ns, own in ((images, found.others["camera"]), (scans, found.others["radar"])):
         distance = np.abs(stamps_ns[None] - sweeps[found.anchor][:, None])
         np.testing.assert_array_equal(distance.argmin(1), own)
-    strict = match_by_stamp(sweeps, {"camera": images, "radar": scans}, 5 * MS)
+    strict = match_moments(sweeps, {"camera": images, "radar": scans}, 5 * MS)
     assert np.sum((strict.others["camera"] >= 0) & (strict.others["radar"] >= 0)) < 0.1 * len(sweeps)
 
 
@@ -134,7 +130,7 @@ def test_every_sweep_of_free_running_sensors_gets_the_image_and_scan_nearest_to_
 def test_a_constant_offset_costs_no_sweep_and_is_found_up_to_whole_periods(offset_ms):
     sweeps = ticks(10, 0, jitter_ms=0.5)
     images, scans = sweeps + int(offset_ms * MS), sweeps + 2 * MS
-    found = match_by_motion(sweeps, {"camera": images, "radar": scans}, gates(sweeps, speed=40.0))
+    found = match_moments(sweeps, {"camera": images, "radar": scans}, gates(sweeps, speed=40.0))
     assert len(found.anchor) >= len(sweeps) - 1
     found_ms = found.constant_ns["camera"] / MS
     assert (found_ms - offset_ms + 50) % 100 - 50 == pytest.approx(0, abs=0.2)
@@ -145,7 +141,7 @@ def test_a_constant_offset_costs_no_sweep_and_is_found_up_to_whole_periods(offse
 def test_where_a_message_is_missing_the_sweep_goes_and_takes_no_neighbour_s():
     sweeps = ticks(10, 0)
     images = np.delete(sweeps + MS, [5, 6, 17])
-    found = match_by_motion(sweeps, {"camera": images, "radar": sweeps}, gates(sweeps, speed=0.0))
+    found = match_moments(sweeps, {"camera": images, "radar": sweeps}, gates(sweeps, speed=0.0))
     assert dict(found.rejected) == {"no_camera_in_gate": 3}
     np.testing.assert_array_equal(np.setdiff1d(np.arange(len(sweeps)), found.anchor), [5, 6, 17])
 
@@ -153,13 +149,13 @@ def test_where_a_message_is_missing_the_sweep_goes_and_takes_no_neighbour_s():
 def test_a_sensor_that_falls_silent_leaves_the_others_their_moments():
     sweeps = ticks(10, 0)
     scans = sweeps[:300] + MS
-    found = match_by_motion(sweeps, {"camera": sweeps + 2 * MS, "radar": scans}, gates(sweeps, speed=0.0))
+    found = match_moments(sweeps, {"camera": sweeps + 2 * MS, "radar": scans}, gates(sweeps, speed=0.0))
     without = np.flatnonzero(found.others["radar"] < 0)
     # Beside the last whole moment a second long nothing new is to be seen.
     np.testing.assert_array_equal(found.anchor[without], np.arange(310, len(sweeps)))
     assert dict(found.rejected) == {"no_radar_in_gate": 10}
     assert found.others["camera"].min() >= 0
-    silent = match_by_motion(sweeps, {"camera": sweeps[:0], "radar": scans}, gates(sweeps, speed=0.0))
+    silent = match_moments(sweeps, {"camera": sweeps[:0], "radar": scans}, gates(sweeps, speed=0.0))
     np.testing.assert_array_equal(silent.anchor, np.arange(300))
     assert set(silent.others["camera"]) == {-1}
     assert dict(silent.rejected) == {"no_radar_in_gate": 300}

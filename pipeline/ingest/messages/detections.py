@@ -7,7 +7,7 @@ confirm any prior that was used.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable
 from itertools import product
 from typing import Any
 
@@ -29,15 +29,22 @@ _AUTOWARE = {1: "car", 2: "truck", 3: "bus", 4: "trailer", 5: "motorcycle", 6: "
 # Points on a box of side 1: corners and midpoints of edges, because a lens bends edges outwards.
 _ON_A_BOX = np.array(list(product((-0.5, 0.0, 0.5), repeat=3)))
 _UNIT_TOLERANCE = 0.01  # largest deviation of a quaternion's length from 1; beyond it is damaged
-_Thing = tuple[Any, Any, str, float]  # pose, size, class, score
+_Box = Float[np.ndarray, " 4"] | None
+# Boxes, classes, scores, and the number of detections without a box or a class.
+_Read = tuple[Float32[np.ndarray, "N 4"], list[str], Float32[np.ndarray, " N"], int]
 
 
-def read_detections_3d(
-    message: Any, camera: Camera, camera_frame: str
-) -> tuple[Float32[np.ndarray, "N 4"], list[str], Float32[np.ndarray, " N"], int]:
-    """Boxes in the image, classes, scores, and the number of detections that give none.
+def read_detections(message: Any) -> _Read:
+    """Boxes (x0 y0 x1 y1 [px]), classes as logged, scores, and number of detections without box or class.
 
-    `message` is a vision_msgs/Detection3DArray or Autoware's DetectedObjects.
+    A rotated box becomes its upright bounding box. Version 3 and later of vision_msgs name a class
+    `hypothesis.class_id`, earlier ones `id`; version 4 has the centre in `center.position`.
+    """
+    return _columns((_upright_box(d.bbox), *_likeliest(d)) for d in message.detections)
+
+
+def read_detections_3d(message: Any, camera: Camera, camera_frame: str) -> _Read:
+    """The same of boxes in 3D, of a vision_msgs/Detection3DArray or Autoware's DetectedObjects.
 
     Raises:
         ValueError: the boxes are not in `camera_frame`, the image's optical frame.
@@ -48,36 +55,36 @@ def read_detections_3d(
             f"3D boxes in frame {frame!r} can be projected only with the calibration that is to be estimated: log them "
             f"in the camera's frame {camera_frame!r}, or 2D detections of the image"
         )
-    things = _autoware(message) if hasattr(message, "objects") else _vision(message)
-    boxes, classes, scores, dropped = [], [], [], 0
-    for pose, size, name, score in things:
-        box = _box(pose, size, camera)
-        if box is None or not name:
-            dropped += 1
-            continue
-        boxes.append(box)
-        classes.append(name)
-        scores.append(score if np.isfinite(score) else 0.0)
-    return np.array(boxes, np.float32).reshape(-1, 4), classes, np.array(scores, np.float32), dropped
+    if hasattr(message, "objects"):
+        return _columns(_autoware(thing, camera) for thing in message.objects)
+    found = ((_box(d.bbox.center, d.bbox.size, camera), *_likeliest(d)) for d in message.detections)
+    return _columns((box, name or None, score) for box, name, score in found)
 
 
-def _vision(message: Any) -> Iterator[_Thing]:
-    for detection in message.detections:
-        hypotheses = [getattr(r, "hypothesis", r) for r in detection.results]
-        named = [(str(h.class_id if hasattr(h, "class_id") else h.id), float(h.score)) for h in hypotheses]
-        name, score = max(named, key=lambda pair: pair[1], default=("", 0.0))
-        yield detection.bbox.center, detection.bbox.size, name, score
+def _columns(found: Iterable[tuple[_Box, str | None, float]]) -> _Read:
+    """Columns of the detections with a box and a class, and the number of the others."""
+    rows = list(found)
+    kept = [(box, name, score) for box, name, score in rows if box is not None and name is not None]
+    boxes = np.array([box for box, _, _ in kept], np.float32).reshape(-1, 4)
+    scores = [score if math.isfinite(score) else 0.0 for _, _, score in kept]
+    return boxes, [name for _, name, _ in kept], np.array(scores, np.float32), len(rows) - len(kept)
 
 
-def _autoware(message: Any) -> Iterator[_Thing]:
-    for thing in message.objects:
-        likely = max(thing.classification, key=lambda c: c.probability, default=None)
-        name = "" if likely is None else _AUTOWARE.get(int(likely.label), "")
-        pose = thing.kinematics.pose_with_covariance.pose
-        yield pose, thing.shape.dimensions, name, float(thing.existence_probability)
+def _likeliest(detection: Any) -> tuple[str | None, float]:
+    """Class with the highest score; None without a hypothesis."""
+    hypotheses = [getattr(r, "hypothesis", r) for r in detection.results]
+    named = [(str(h.class_id if hasattr(h, "class_id") else h.id), float(h.score)) for h in hypotheses]
+    return max(named, key=lambda pair: pair[1] if math.isfinite(pair[1]) else 0.0, default=(None, 0.0))
 
 
-def _box(pose: Any, size: Any, camera: Camera) -> Float[np.ndarray, " 4"] | None:
+def _autoware(thing: Any, camera: Camera) -> tuple[_Box, str | None, float]:
+    likely = max(thing.classification, key=lambda c: c.probability, default=None)
+    name = None if likely is None else _AUTOWARE.get(int(likely.label))
+    box = _box(thing.kinematics.pose_with_covariance.pose, thing.shape.dimensions, camera)
+    return box, name, float(thing.existence_probability)
+
+
+def _box(pose: Any, size: Any, camera: Camera) -> _Box:
     """Upright box of the visible part, in the image; None if the box is invalid or partly behind the camera."""
     p, q = pose.position, pose.orientation
     t, q_wxyz = np.array([p.x, p.y, p.z], np.float64), np.array([q.w, q.x, q.y, q.z], np.float64)
@@ -93,29 +100,7 @@ def _box(pose: Any, size: Any, camera: Camera) -> Float[np.ndarray, " 4"] | None
     return np.concatenate([low, high]) if np.all(high > low) else None
 
 
-def read_detections(
-    message: Any,
-) -> tuple[Float32[np.ndarray, "N 4"], list[str], Float32[np.ndarray, " N"], int]:
-    """Boxes (x0 y0 x1 y1 [px]), classes as logged, scores, and number of detections without box or class.
-
-    A rotated box becomes its upright bounding box. Version 3 and later of vision_msgs name a class
-    `hypothesis.class_id`, earlier ones `id`; version 4 has the centre in `center.position`.
-    """
-    boxes, classes, scores, dropped = [], [], [], 0
-    for detection in message.detections:
-        box = _upright_box(detection.bbox)
-        hypotheses = [_hypothesis_2d(r) for r in detection.results]
-        if box is None or not hypotheses:
-            dropped += 1
-            continue
-        name, score = max(hypotheses, key=lambda h: h[1])
-        boxes.append(box)
-        classes.append(name)
-        scores.append(score)
-    return np.array(boxes, np.float32).reshape(-1, 4), classes, np.array(scores, np.float32), dropped
-
-
-def _upright_box(bbox: Any) -> tuple[float, float, float, float] | None:
+def _upright_box(bbox: Any) -> _Box:
     centre = getattr(bbox.center, "position", bbox.center)
     x, y, width, height, theta = (
         float(v) for v in (centre.x, centre.y, bbox.size_x, bbox.size_y, bbox.center.theta)
@@ -124,11 +109,4 @@ def _upright_box(bbox: Any) -> tuple[float, float, float, float] | None:
         return None
     c, s = abs(math.cos(theta)), abs(math.sin(theta))
     half_x, half_y = (c * width + s * height) / 2, (s * width + c * height) / 2
-    return x - half_x, y - half_y, x + half_x, y + half_y
-
-
-def _hypothesis_2d(result: Any) -> tuple[str, float]:
-    inner = getattr(result, "hypothesis", result)
-    name = str(inner.class_id if hasattr(inner, "class_id") else inner.id)
-    score = float(inner.score)
-    return name, score if math.isfinite(score) else 0.0
+    return np.array([x - half_x, y - half_y, x + half_x, y + half_y])

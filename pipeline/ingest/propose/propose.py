@@ -12,7 +12,6 @@ import numpy as np
 from pipeline.core.config import FleetConfig, validated
 from pipeline.core.errors import ConfigError
 from pipeline.core.results import Progress, silent
-from pipeline.ingest.captures import Rejected
 from pipeline.ingest.directions_and_units import AskedRadar, doppler_speed, motion_of, opposed_signs
 from pipeline.ingest.index import index_logs
 from pipeline.ingest.moments import MomentBuilder
@@ -132,18 +131,11 @@ def _sample(logs: Sequence[Path], rig: Rig, fleet: FleetConfig, progress: Progre
     try:
         anchored, _ = pick_moments(index, rig, fleet.ingest)
         builder = MomentBuilder(index, rig, fleet.ingest)
-        built = []
-        picked = np.unique(np.linspace(0, max(len(anchored) - 1, 0), _SAMPLE).round().astype(int))
-        for done, i in enumerate(picked if anchored else [], 1):
-            try:
-                built.append(builder.build(anchored[i], int(i)))
-            except Rejected as outcome:
-                index.complain(str(outcome))
-            progress(done, len(picked), "moments tried")
+        built, tried, _ = builder.sample(anchored, _SAMPLE, progress, "moments tried")
     finally:
         index.close()
     present = [frozenset(a.places) for a in anchored]
-    return RigSample(rig, built, len(picked), present, logged_stars(builder.prior.rows()), None, {})
+    return RigSample(rig, built, tried, present, logged_stars(builder.prior.rows()), None, {})
 
 
 def doppler_period(frames: Sequence[Frame], radar: AskedRadar) -> float | None:
