@@ -20,7 +20,7 @@ from pipeline.learn.infer.vehicle_day import single_frame_solution, solve_by_net
 from pipeline.rig.day_prior import perturbed, read_prior
 from pipeline.rig.estimates import Prior, Solution
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.row_groups import read_columns
+from pipeline.store.tables import read_columns
 from pipeline.store.views import Chosen, frames_of, ingested, observations_of, perceived
 from schemas.calibrations import PAIRS
 from schemas.frames import Frame

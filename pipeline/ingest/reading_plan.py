@@ -21,7 +21,7 @@ from pipeline.ingest.containers.reader import LogReader, RawMessage
 from pipeline.ingest.containers.timeline import PAUSE_NS, Stretches, Timeline
 from pipeline.ingest.directions_and_units import doppler_speed
 from pipeline.ingest.messages.decoding import DECODE_ERRORS, decode, header_stamp_ns
-from pipeline.ingest.messages.odometry import EgoTrack
+from pipeline.ingest.messages.odometry import EgoState, EgoTrack
 from pipeline.ingest.messages.radar import read_radar
 from pipeline.ingest.roles import INFO, LIDAR, ODOMETRY, RADAR, TF_STATIC, Role
 from pipeline.rig.rig import Rig
@@ -82,6 +82,12 @@ class BurstMotion:
     def unknown(cls, count: int) -> BurstMotion:
         """Unknown motion for `count` bursts."""
         return cls(np.full(count, np.nan), np.full(count, np.nan), np.full((count, 2), np.nan))
+
+    def take(self, i: int, state: EgoState | None) -> None:
+        """Set the motion of a burst, if it was measured."""
+        if state is not None:
+            self.speed_mps[i], self.yaw_rate_radps[i] = state.speed_mps, state.yaw_rate_radps
+            self.position_m[i] = state.T_odom_vehicle[:2, 3]
 
 
 @dataclass(frozen=True)
@@ -154,7 +160,10 @@ def plan_sweeps(
     order = np.argsort(logged_ns, kind="stable")
     possible = possible_bursts(logged_ns[order], budget, is_motion_known=len(ego) > 0)
     stamps = stamps_ns[order][np.searchsorted(logged_ns[order], possible.middle_ns[:, 1])]
-    return _reading(possible, _ego_motion(ego, stamps), len(order), budget, 0)
+    motion = BurstMotion.unknown(len(stamps))
+    for i, stamp in enumerate(stamps.tolist()):
+        motion.take(i, ego.at(stamp))
+    return _reading(possible, motion, len(order), budget, 0)
 
 
 def rare_topics(timeline: Timeline, roles: Mapping[str, Role]) -> tuple[dict[str, Role], Stretches]:
@@ -189,19 +198,10 @@ def _motion_at(day: _Day, middle_ns: Int64[np.ndarray, "M 3"], by: Role | None) 
             if by.what == RADAR:
                 motion.speed_mps[i] = _speed_by_doppler(message, day.rig.radars[by.sensor])
             else:
-                numbers = _by_odometry(message)
-                motion.speed_mps[i], motion.yaw_rate_radps[i], *motion.position_m[i] = numbers
+                track = EgoTrack()
+                track.add(0, decode(message.channel, message.data))
+                motion.take(i, track.at(0))
     return motion
-
-
-def _by_odometry(message: RawMessage) -> Float[np.ndarray, " 4"]:
-    """Speed, yaw rate, x and y; NaN if the message is invalid."""
-    track = EgoTrack()
-    track.add(0, decode(message.channel, message.data))
-    state = track.at(0)
-    if state is None:
-        return np.full(4, np.nan)
-    return np.array([state.speed_mps, state.yaw_rate_radps, *state.T_odom_vehicle[:2, 3]])
 
 
 def _speed_by_doppler(message: RawMessage, radar: RadarTopics) -> float:
@@ -212,16 +212,6 @@ def _speed_by_doppler(message: RawMessage, radar: RadarTopics) -> float:
     rates = cloud.range_rate_mps.astype(np.float64)
     speed, share = doppler_speed(directions, rates, radar.doppler_period_mps)
     return speed if share >= _FIT_SHARE else np.nan
-
-
-def _ego_motion(ego: EgoTrack, stamps_ns: Int64[np.ndarray, " M"]) -> BurstMotion:
-    states = [ego.at(int(stamp)) for stamp in stamps_ns]
-    motion = BurstMotion.unknown(len(states))
-    for i, state in enumerate(states):
-        if state is not None:
-            motion.speed_mps[i], motion.yaw_rate_radps[i] = state.speed_mps, state.yaw_rate_radps
-            motion.position_m[i] = state.T_odom_vehicle[:2, 3]
-    return motion
 
 
 def _margin_ns(day: _Day, middle_ns: Int64[np.ndarray, "M 3"], needed: set[Role], anchor: Role) -> int | None:

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-__all__ = ["NO_SPACE", "atomic_write", "naming", "remove_abandoned"]
+__all__ = ["NO_SPACE", "atomic_write", "is_running", "naming", "remove_abandoned"]
 
 # No vehicle-day takes a day: an older temporary file was left by a killed writer on another machine.
 _ABANDONED_S = 24 * 3600.0
@@ -76,15 +76,16 @@ def _is_abandoned(temporary: Path) -> bool:
     if time.time() - temporary.stat().st_mtime > _ABANDONED_S:
         return True
     host, _, process = temporary.name.removeprefix(".writing-").rpartition("-")[0].rpartition("-")
-    if host != socket.gethostname() or not process.isdigit():
-        return False
+    return host == socket.gethostname() and process.isdigit() and not is_running(int(process))
+
+
+def is_running(process: int) -> bool:
+    """Whether there is a process with this id, of any user."""
     try:
-        os.kill(int(process), 0)
-    except ProcessLookupError:
-        return True
-    except PermissionError:
-        return False
-    return False
+        os.kill(process, 0)
+    except (ProcessLookupError, PermissionError) as err:
+        return isinstance(err, PermissionError)
+    return True
 
 
 def _flush_folder(folder: Path) -> None:

@@ -75,11 +75,9 @@ class LocalFiles:
         """Paths below a folder that match a pattern."""
         return iter(Path(folder).glob(pattern))
 
-    @contextmanager
-    def opened(self, path: PurePath) -> Iterator[BinaryIO]:
+    def opened(self, path: PurePath) -> BinaryIO:
         """A file opened for random access."""
-        with Path(path).open("rb") as stream:
-            yield stream
+        return Path(path).open("rb")
 
     @contextmanager
     def replacing(self, path: PurePath) -> Iterator[BinaryIO]:

@@ -145,10 +145,9 @@ class Lake:
         """File of a partition, or its file of a sensor (records have tables of their own)."""
         return self.folder(table, partition) / f"{sensor or 'part-0'}.parquet"
 
-    def partitions(self, table: str, vehicle: str | None = None, day: str | None = None) -> list[Partition]:
-        """Partitions of a table with at least one file, in order; with a vehicle or day, only those."""
-        vehicles = "*" if vehicle is None else quote(vehicle, safe="")
-        found = self.files.find(self.root / table, f"vehicle={vehicles}/day={day or '*'}/*.parquet")
+    def partitions(self, table: str) -> list[Partition]:
+        """Partitions of a table with at least one file, in order."""
+        found = self.files.find(self.root / table, "vehicle=*/day=*/*.parquet")
         return sorted({p for f in found if (p := _partition_of(f.parent)) is not None})
 
     def set_aside(self, path: str) -> None:

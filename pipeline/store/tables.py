@@ -22,12 +22,16 @@ __all__ = [
     "COLLECTED",
     "Manifest",
     "PartitionWriter",
+    "RowGroup",
     "absence",
     "iterate_rows",
     "naming_damage",
     "opened_for_writing",
+    "read_columns",
+    "read_group",
     "read_manifest",
     "read_rows",
+    "row_groups",
     "write_manifest",
     "write_partition",
 ]
@@ -177,12 +181,7 @@ def iterate_rows(
         DamagedError: its file cannot be read.
         CollectedError: its rows were deleted at the end of their retention.
     """
-    path = lake.file(schema.name, partition, sensor)
-    manifest = read_manifest(lake, schema, partition, sensor)
-    if manifest is None:
-        raise ContractError(str(path), absence(schema, partition))
-    if COLLECTED in manifest.extra:
-        raise CollectedError(str(path), manifest.extra[COLLECTED])
+    path = _with_rows(lake, schema, partition, sensor)
     wanted = None if rows is None else set(rows)
     with opened_parquet(lake.files, path) as file:
         first = 0
@@ -196,6 +195,58 @@ def iterate_rows(
                 with naming_damage(path):
                     table = file.groups([group])
                 yield from_table(table if len(picked) == count else table.take(picked), schema, row_type)
+
+
+@dataclass(frozen=True, order=True)
+class RowGroup:
+    """One row group of one partition."""
+
+    partition: Partition
+    index: int
+    rows: int
+
+
+def read_columns(
+    lake: Lake, schema: TableSchema, partition: Partition, names: Sequence[str]
+) -> dict[str, list[Any]]:
+    """Plain columns of a whole partition, without reading the others. Arrays are returned as bytes.
+
+    Raises:
+        ContractError: there is no such partition, or it was written with another schema version.
+        DamagedError: its file cannot be read.
+    """
+    path = _with_rows(lake, schema, partition)
+    with naming_damage(path), opened_parquet(lake.files, path) as file:
+        table = file.groups(list(range(file.metadata.num_row_groups)), list(names))
+    return {name: table.column(name).to_pylist() for name in names}
+
+
+def row_groups(lake: Lake, schema: TableSchema, partition: Partition) -> list[RowGroup]:
+    """The row groups of a partition, in order; raises ContractError if missing or of another version."""
+    with opened_parquet(lake.files, _with_rows(lake, schema, partition)) as file:
+        metadata = file.metadata
+    return [RowGroup(partition, i, metadata.row_group(i).num_rows) for i in range(metadata.num_row_groups)]
+
+
+def read_group(lake: Lake, schema: TableSchema, group: RowGroup, row_type: type[Row]) -> list[Row]:
+    """All rows of a group, arrays as views into one buffer; errors as `row_groups`."""
+    path = lake.file(schema.name, group.partition)
+    try:
+        with naming_damage(path), opened_parquet(lake.files, path) as file:
+            return from_table(file.groups([group.index]), schema, row_type)
+    except FileNotFoundError as err:
+        raise ContractError(str(path), "the partition disappeared while it was read") from err
+
+
+def _with_rows(lake: Lake, schema: TableSchema, partition: Partition, sensor: str | None = None) -> PurePath:
+    """File of a partition that has its rows; raises as `iterate_rows`."""
+    path = lake.file(schema.name, partition, sensor)
+    manifest = read_manifest(lake, schema, partition, sensor)
+    if manifest is None:
+        raise ContractError(str(path), absence(schema, partition))
+    if COLLECTED in manifest.extra:
+        raise CollectedError(str(path), manifest.extra[COLLECTED])
+    return path
 
 
 @contextmanager

@@ -159,11 +159,8 @@ def kubernetes():
     return takes
 
 
-def test_kubernetes_own_schema_takes_the_cronjob(kubernetes):
+def test_kubernetes_own_schema_takes_the_cronjob_and_the_pods_of_the_rayjob(kubernetes):
     kubernetes(manifest(CRONJOB))
-
-
-def test_kubernetes_own_schema_takes_the_pods_of_the_rayjob(kubernetes):
     kubernetes(*({"apiVersion": "v1", "kind": "Pod", "metadata": {"name": "a"}, "spec": p} for p in pods()))
 
 
@@ -173,11 +170,8 @@ def test_a_cronjob_tries_again_what_may_help_and_a_held_day_is_no_failed_pod():
     pod = job["template"]["spec"]
     [night] = pod["containers"]
     rules = {rule["action"]: rule for rule in job["podFailurePolicy"]["rules"]}
-    assert rules["FailJob"]["onExitCodes"] == {
-        "containerName": night["name"],
-        "operator": "In",
-        "values": [2],
-    }
+    codes = {"containerName": night["name"], "operator": "In", "values": [2]}
+    assert rules["FailJob"]["onExitCodes"] == codes
     assert "DisruptionTarget" in str(rules["Ignore"])
     assert "--held-exit-code=0" in night["args"]
     assert "command" not in night  # the image's own: no shell stands between SIGTERM and the night
@@ -213,13 +207,8 @@ CLUSTER_FIELDS = {
     "workerGroupSpecs": list,
 }  # fmt: skip
 GROUP_FIELDS = {
-    "groupName": str,
-    "replicas": int,
-    "minReplicas": int,
-    "maxReplicas": int,
-    "rayStartParams": dict,
-    "template": dict,
-}
+    "groupName": str, "replicas": int, "minReplicas": int, "maxReplicas": int, "rayStartParams": dict, "template": dict,
+}  # fmt: skip
 
 
 def assert_fields(found, fields):
@@ -255,13 +244,10 @@ def test_a_rayjob_runs_the_night_with_the_ray_that_was_tested():
     assert all(m == mounts[0] for m in mounts)
 
 
-def test_the_readme_names_every_file():
+def test_the_readme_names_every_file_and_images_install_what_this_release_is():
     readme = (DEPLOY / "README.md").read_text()
     files = [p.relative_to(DEPLOY) for p in DEPLOY.rglob("*") if p.is_file() and "__pycache__" not in p.parts]
     assert [str(f) for f in files if f.name not in readme and f.name != "README.md"] == []
-
-
-def test_images_install_what_this_release_is():
     version = tomllib.loads((REPO / "pyproject.toml").read_text())["project"]["requires-python"]
     assert version == ">=3.11"
     assert all("python:3.11-slim" in (DEPLOY / f).read_text() for f in ("Dockerfile", "Dockerfile.ray"))

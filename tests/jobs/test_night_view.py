@@ -44,6 +44,7 @@ def test_without_a_terminal_every_stage_that_begins_is_one_json_line(capsys):
             view.watch(0, done, 3, "ingest frames")
         view.watch(2, 0, 0, "ingest frames")
         view.watch(0, 1, 9, "perceive perceive")
+        view.watch(1, 1, 9, NAMES[1])  # what is simulated is no stage
     told = [(line["vehicle"], line["day"], line["stage"]) for line in lines_of(capsys)]
     car, bus = ("car", "2026-03-02"), ("bus", "2026-03-02")
     assert told == [(*car, "ingest"), (*bus, "ingest"), (*car, "perceive")]
@@ -60,12 +61,6 @@ def test_without_a_terminal_a_stage_that_takes_long_has_a_line_every_few_seconds
         (line["event"], line["vehicle"], line.get("done"), line.get("total")) for line in lines_of(capsys)
     ]
     assert told == [("stage", "car", None, None), ("progress", "car", 2, 9)]
-
-
-def test_what_is_simulated_is_no_stage(capsys):
-    with night_view(NAMES, 3, "simulate") as view:
-        view.watch(0, 1, 9, NAMES[0])
-    assert lines_of(capsys) == []
 
 
 def test_on_a_terminal_every_end_is_a_line_and_bars_do_not_stay(capsys, monkeypatch):

@@ -19,25 +19,11 @@ from tests.makers.table_rows import make_row
 
 def test_every_record_table_is_shown_for_people_and_for_machines(tmp_path, capsys):
     lake = Lake.at(tmp_path)
+    of = {"vehicle": "car", "day": "2026-03-02"}
+    refused = OutcomeRow(**of, stage="ingest", method="", status="refused", reason="no [radar]", work_key="k")
+    commit_records(lake, OUTCOMES, [refused])
     commit_records(
-        lake,
-        OUTCOMES,
-        [
-            OutcomeRow(
-                vehicle="car",
-                day="2026-03-02",
-                stage="ingest",
-                method="",
-                status="refused",
-                reason="no [radar]",
-                work_key="k",
-            )
-        ],
-    )
-    commit_records(
-        lake,
-        SERVICE_EVENTS,
-        [ServiceEvent(vehicle="car", day="2026-03-03", sensor="radar", kind="repair", note="new bracket")],
+        lake, SERVICE_EVENTS, [ServiceEvent(**of, sensor="radar", kind="repair", note="new bracket")]
     )
     for table, column, value in (
         ("outcomes", "reason", "no [radar]"),

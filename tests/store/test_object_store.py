@@ -10,8 +10,7 @@ import pytest
 import pipeline.store.object_store
 from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Partition
-from pipeline.store.row_groups import read_columns
-from pipeline.store.tables import read_manifest, read_rows, write_partition
+from pipeline.store.tables import read_columns, read_manifest, read_rows, write_partition
 from schemas.calibrations import CALIBRATIONS, PAIRS
 from tests.makers.s3_server import running
 from tests.makers.table_rows import make_record, make_row, read_calibrations

@@ -9,8 +9,7 @@ import pipeline.store.object_store
 from pipeline.store.commits import commit_records
 from pipeline.store.files import LocalFiles
 from pipeline.store.partitions import Partition
-from pipeline.store.row_groups import read_columns, read_group, row_groups
-from pipeline.store.tables import read_rows, write_partition
+from pipeline.store.tables import read_columns, read_group, read_rows, row_groups, write_partition
 from schemas.calibrations import CALIBRATIONS
 from tests.makers.table_rows import make_record, make_row, read_calibrations
 from tests.makers.whole_tables import FRAMES, WholeFrame

@@ -16,7 +16,7 @@ from pipeline.report.reading import has_frames
 from pipeline.store.moments import sensor_files
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.retention import collect, first_day_kept
-from pipeline.store.row_groups import read_columns
+from pipeline.store.tables import read_columns
 from pipeline.store.views import frames_of, ingested, observations_of
 from schemas.captures import CAPTURES
 from schemas.moments import MOMENTS

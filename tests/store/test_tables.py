@@ -19,8 +19,15 @@ from pipeline.core.errors import ContractError, DamagedError, OtherVersionError
 from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Partition
 from pipeline.store.records import read_records
-from pipeline.store.row_groups import read_columns, read_group, row_groups
-from pipeline.store.tables import iterate_rows, read_manifest, read_rows, write_partition
+from pipeline.store.tables import (
+    iterate_rows,
+    read_columns,
+    read_group,
+    read_manifest,
+    read_rows,
+    row_groups,
+    write_partition,
+)
 from schemas.versions import CODE_VERSION, TABLES
 from tests.makers.table_rows import ROW_TYPES, make_row, same
 from tests.makers.whole_tables import FRAMES, WholeFrame
@@ -73,8 +80,6 @@ def test_partitions_are_written_whole_found_and_read_by_row_and_column(any_lake,
     assert (manifest.rows, manifest.kept, manifest.rejected) == (5, {"frames": 5}, {"dark": 2})
     assert (manifest.inputs, manifest.extra) == (["in"], {"note": "x"})
     assert lake.partitions("frames") == [DAY, other]
-    assert lake.partitions("frames", vehicle="car") == [other]
-    assert lake.partitions("frames", day="2026-03-02") == [DAY]
     assert read_columns(lake, FRAMES, DAY, ["frame_index"]) == {"frame_index": [0, 1, 2, 3, 4]}
     groups = row_groups(lake, FRAMES, DAY)
     assert [g.rows for g in groups] == [2, 2, 1]

@@ -19,7 +19,7 @@ from pipeline.core.errors import LogError, StorageError
 from pipeline.ingest.containers.bounded import most_bytes
 from pipeline.ingest.containers.reader import ChunkCache, LogReader, Position, RawMessage, open_log
 from pipeline.ingest.containers.timeline import Stretches, Timeline
-from pipeline.store.atomic_write import NO_SPACE
+from pipeline.store.atomic_write import NO_SPACE, is_running
 from pipeline.store.remote_logs import LogPath
 
 __all__ = ["CompressedLog", "FetchedLog", "FolderLog"]
@@ -165,15 +165,5 @@ def _remove_left_behind() -> None:
         pid = folder.name.removeprefix(_UNPACKED).partition("-")[0]
         with suppress(FileNotFoundError):  # another process removed it first
             is_old = time.time() - folder.stat().st_mtime > _LEFT_BEHIND_S
-            if pid.isdigit() and is_old and not _is_running(int(pid)):
+            if pid.isdigit() and is_old and not is_running(int(pid)):
                 shutil.rmtree(folder, ignore_errors=True)
-
-
-def _is_running(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:  # a process of another user
-        return True
-    return True

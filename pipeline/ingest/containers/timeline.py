@@ -134,15 +134,14 @@ class Timeline:
     def joined(cls, parts: Iterable[Timeline]) -> Timeline:
         """Timeline of several logs as one."""
         spans: list[tuple[int, int]] = []
-        messages: dict[str, int] = {}
+        messages = Counter[str]()
         first: dict[str, tuple[int, int]] = {}
         counted: dict[str, list[Counted]] = {}
         for part in parts:
             spans += part.recorded.spans_ns
             for topic, its in part.counted.items():
                 counted.setdefault(topic, []).append(its)
-            for topic, count in part.messages.items():
-                messages[topic] = messages.get(topic, 0) + count
+            messages.update(part.messages)
             for topic, span in part.first.items():
                 first[topic] = min(span, first.get(topic, span))
         together = {topic: Counted.joined(of_topic) for topic, of_topic in counted.items()}
@@ -168,10 +167,9 @@ def timeline_of_chunks(
     chunks: Iterable[Chunk], topics: Mapping[int, str], messages: Mapping[int, int]
 ) -> Timeline:
     """Timeline of a log from the chunks of its index; `topics` and `messages` are by channel."""
-    counts: dict[str, int] = {}
-    for channel, count in messages.items():
-        if channel in topics:
-            counts[topics[channel]] = counts.get(topics[channel], 0) + count
+    counts = Counter[str]()
+    for channel in messages.keys() & topics.keys():
+        counts[topics[channel]] += messages[channel]
     first: dict[str, tuple[int, int]] = {}
     # Without chunks that have no message or a damaged index.
     filled = sorted((c for c in chunks if 0 < c.end_ns >= c.start_ns), key=lambda c: c.start_ns)

@@ -20,8 +20,7 @@ from pipeline.core.errors import ContractError
 from pipeline.learn.batches.batch import TrainingBatch, collate
 from pipeline.learn.prepare.inventory import read_leaks
 from pipeline.store.partitions import Lake
-from pipeline.store.row_groups import RowGroup, read_columns, read_group, row_groups
-from pipeline.store.tables import read_manifest
+from pipeline.store.tables import RowGroup, read_columns, read_group, read_manifest, row_groups
 from schemas.training import TRAINING, TrainingRow
 
 __all__ = ["TrainingLoader", "load_split"]

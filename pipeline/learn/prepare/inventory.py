@@ -17,8 +17,7 @@ from jaxtyping import Bool, Float32, UInt8
 from pipeline.core.errors import ContractError
 from pipeline.store.atomic_write import atomic_write
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.row_groups import read_columns
-from pipeline.store.tables import read_manifest
+from pipeline.store.tables import read_columns, read_manifest
 from schemas.training import SPLITS, TRAINING
 
 __all__ = [

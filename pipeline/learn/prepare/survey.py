@@ -12,7 +12,7 @@ import numpy as np
 from pipeline.core.config import PrepareConfig
 from pipeline.learn.prepare.split import SplitPlan, Unit, environment_of_speeds, plan_split
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.row_groups import read_columns
+from pipeline.store.tables import read_columns
 from schemas.moments import MOMENTS, PERCEIVED
 
 __all__ = ["Survey", "plan_days", "survey_day"]
