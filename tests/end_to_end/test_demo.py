@@ -50,10 +50,7 @@ def test_the_demo_ends_with_a_table_a_report_and_a_summary(demo):
     assert "azimuth, elevation [deg], range [m]" in table
     assert [
         line.split()[0] for line in table.splitlines() if line.split()[:1] in (["joint"], ["joint-ssl"])
-    ] == [
-        "joint",
-        "joint-ssl",
-    ]
+    ] == ["joint", "joint-ssl"]
 
 
 @pytest.mark.slow

@@ -7,7 +7,6 @@ from operator import attrgetter
 import numpy as np
 import pytest
 
-from jobs.cli import main
 from pipeline.core.config import load_fleet
 from pipeline.core.stage_work import Task
 from pipeline.core.stages import CALIBRATE
@@ -19,7 +18,7 @@ from pipeline.simulate.fleet import FleetSpec
 from pipeline.simulate.sensors.rigs import rig_named
 from pipeline.store.moments import sensors_of
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.views import frames_of, ingested, observations_of, perceived
+from pipeline.store.views import ingested, observations_of, perceived
 from schemas.calibrations import CalibrationRecord
 from schemas.moments import PRIOR, SENSORS_ABSENT
 from schemas.observations import WITHOUT_LABELS
@@ -110,28 +109,6 @@ def test_a_camera_without_semantics_is_aligned_by_brightness_and_records_poses_a
     assert {sensor for sensor, notes in poses.items() if WITHOUT_LABELS in notes} == {"left"}
 
 
-@pytest.mark.parametrize("camera", ["front", "left"])
-@pytest.mark.parametrize("radar", ["nose", "corner_fl"])
-def test_any_three_of_them_are_seen_as_a_rig_of_three(day, camera, radar):
-    lake, _, _, _ = day
-    chosen = {"camera": camera, "lidar": "top", "radar": radar}
-    frames = list(frames_of(lake, DAY, chosen=chosen))
-    observations = list(observations_of(lake, DAY, chosen=chosen))
-    assert [o.frame_index for o in observations] == [f.frame_index for f in frames]
-    assert len({(f.image_width_px, f.image_height_px) for f in frames if "camera" in f.sensors}) == 1
-    whole = [o for o in observations if len(o.sensors) == 3]
-    assert len(whole) >= MOMENTS // 2 - 1
-    for o in whole:
-        assert len(o.radar_xyz_m) > 10
-        assert len(o.lidar_map_xyz_m) > 100
-        assert o.labels_png
-        # The radar's own velocity is that of the car, wherever it looks, and the car's is the odometry's.
-        if o.radar_velocity_mps is not None:
-            ahead = o.priors["lidar_radar"][:3, :3] @ o.radar_velocity_mps
-            assert ahead[0] == pytest.approx(o.ego_speed_mps, abs=1.5)
-    assert {f.image for f in frames if f.image} != set()
-
-
 def test_the_prior_is_kept_once_and_ties_every_sensor_to_the_lidar(day):
     lake, fleet, truth, _ = day
     rows = ingested(lake, DAY).extra[PRIOR]
@@ -162,16 +139,3 @@ def test_methods_of_three_are_run_on_three_that_share_a_view(day, tmp_path, thre
     pairs = {("camera_lidar", camera, lidar), ("camera_radar", camera, radar), ("lidar_radar", lidar, radar)}
     assert ends == pairs
     assert not any("share a view" in r.reason for r in records)
-
-
-def test_a_night_of_many_sensors_ends_in_records_by_edge_and_in_pages(day, tmp_path, capsys):
-    lake, _, _, _ = day
-    out = lake.root.parent
-    logs = f"{out}/logs/{{vehicle}}/{{day}}/*"
-    call = ["nightly", "--fleet", str(out / "fleet.toml"), "--lake", str(tmp_path / "lake"), "--logs", logs]
-    assert main([*call, "--executor", "inline", "--report", str(tmp_path / "fleet.html")]) in (0, 3)
-    (problem,) = json.loads(capsys.readouterr().out.splitlines()[-1])[
-        "problems"
-    ]  # eight moments certify little
-    assert {"front-top", "left-top", "top-nose", "top-corner_fl", "top-base"} <= problem["pairs"].keys()
-    assert DAY.vehicle in (tmp_path / "fleet.html").read_text()

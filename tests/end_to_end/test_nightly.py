@@ -16,7 +16,7 @@ import pytest
 from pipeline.simulate.fleet import FleetSpec
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
-from pipeline.store.views import ingested, observations_of, perceived
+from pipeline.store.views import observations_of
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from tests.makers.fleet_files import fleet_toml
 from tests.makers.kept_days import kept_fleet
@@ -102,18 +102,6 @@ def test_the_night_calibrates_what_it_can_and_refuses_the_rest_with_reasons(firs
 
 
 @pytest.mark.slow
-def test_every_table_of_the_lake_says_what_it_was_made_from(first_night):
-    lake = Lake.at(first_night[0])
-    for vehicle, day in WANTED:
-        frames = ingested(lake, Partition(vehicle, day))
-        observations = perceived(lake, Partition(vehicle, day))
-        assert frames.rows == 12
-        assert observations.inputs == [frames.work_key]
-        records = read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle=vehicle, day=day)
-        assert {tuple(r.inputs) for r in records} == {(observations.work_key,)}
-
-
-@pytest.mark.slow
 def test_a_second_night_finds_nothing_to_do_and_changes_no_byte(fleet, first_night):
     lake, code, summary, _ = first_night
     tables = [p for p in lake.rglob("*.parquet") if "drift" not in p.parts]
@@ -192,19 +180,6 @@ def nightly_with_workers(fleet, lake):
             time.sleep(0.02)
             workers = [c for c in descendants(process) if works(c, "spawn_main")]
         yield process, workers
-
-
-@pytest.mark.slow
-def test_a_killed_worker_costs_time_and_no_vehicle_day(fleet, tmp_path):
-    lake = tmp_path / "lake"
-    with nightly_with_workers(fleet, lake) as (process, workers):
-        workers[0].kill()
-        out, _ = process.communicate(timeout=300)
-    summary = json.loads(out.splitlines()[-1])
-    assert process.returncode == 2
-    assert summary["failed"] == 0
-    assert summary["vehicle_days"] == 4
-    assert good_days(lake) >= WANTED_FIRST
 
 
 def answers(lake, **of):
