@@ -243,19 +243,6 @@ def test_a_day_that_asks_for_more_memory_than_a_worker_may_take_is_refused_until
     assert (greedy.run(with_bound(2.0)).status, made.asked) == ("done", 2)
 
 
-def test_why_a_stage_would_run_names_what_changed(task, stage, monkeypatch):
-    def why(settings=None, inputs=("a",)):
-        return why_to_run(stage(some(1), settings, inputs=inputs)[0], task)
-
-    assert why() == "no perceived yet"
-    stage(some(1), inputs=("a",))[0].run(task)
-    assert why() == ""
-    assert why({"voxel_m": 0.5}) == "other configuration"
-    assert why(inputs=("b",)) == "other inputs"
-    monkeypatch.setattr(pipeline.core.runner, "CODE_VERSION", "another")
-    assert "this is another" in why()
-
-
 @pytest.mark.parametrize(
     "damaged", [("perceived", DAY), ("scan_features", DAY, "radar")], ids=["moments", "a sensor's file"]
 )
@@ -266,21 +253,6 @@ def test_a_damaged_partition_is_made_anew(damaged, task, stage):
     file.write_bytes(file.read_bytes()[:-20])
     assert made_up.run(task).status == "done"
     assert made.asked == 2
-
-
-def test_row_groups_are_small_and_rows_are_asked_for_as_they_are_written(task, stage, monkeypatch):
-    import pyarrow.parquet as pq
-
-    monkeypatch.setattr(pipeline.store.tables, "_GROUP_ROWS", 4)
-    stage(some(10))[0].run(task)
-    file = task.lake.file("sweep_features", DAY, "lidar")
-    with pq.ParquetFile(file) as parquet:
-        sizes = [parquet.metadata.row_group(g).num_rows for g in range(parquet.num_row_groups)]
-    assert sizes == [4, 4, 2]
-    monkeypatch.setattr(pipeline.store.tables, "_GROUP_BYTES", 1)  # a row alone is more than that
-    stage(some(3), {"bytes": 1})[0].run(task)
-    with pq.ParquetFile(file) as parquet:
-        assert parquet.num_row_groups == 3
 
 
 def record(work_key):

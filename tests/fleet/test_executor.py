@@ -9,10 +9,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from pipeline.core.memory import MODEL_THREADS
-from pipeline.fleet import processes
 from pipeline.fleet.executor import EXECUTORS
-from pipeline.fleet.processes import Board
 from tests.makers.processes import descendants, started, works
 from tests.makers.ray_clusters import ray_or_skip
 
@@ -26,15 +23,6 @@ def run(name, function, kinds, folder, workers=2, watch=lambda *_: None):
 
 def tries(folder, kind):
     return len((folder / f"{kind}.tries").read_text().split())
-
-
-@pytest.mark.parametrize(("workers", "cpus", "share"), [(2, 9, "4"), (4, 2, "1")])
-def test_a_workers_models_may_use_its_share_of_the_cores(workers, cpus, share, monkeypatch):
-    monkeypatch.delenv(MODEL_THREADS, raising=False)
-    monkeypatch.setattr(processes, "usable_cpus", lambda: cpus)
-    with processes._pool(workers, print, Board(1)):
-        assert (os.environ[MODEL_THREADS], os.environ["OMP_NUM_THREADS"]) == (share, "1")
-    assert MODEL_THREADS not in os.environ
 
 
 @pytest.mark.parametrize("name", ["inline", "process"])  # of ray test_ray_tasks asks it on a cluster

@@ -219,14 +219,6 @@ def test_a_refusal_is_one_of_the_configuration_by_its_fault_and_not_by_its_words
     assert row.faults == list(faults)
 
 
-def test_a_pattern_takes_in_the_vehicles_that_the_logs_are_of_and_no_others(night, monkeypatch):
-    StagesThatSay(monkeypatch, night.lake)
-    taxis = night.fleet.model_copy(update={"vehicles": {"taxi-*": next(iter(night.fleet.vehicles.values()))}})
-    days = [VehicleDay(Partition(v, "2026-03-02"), (Path("a.mcap"),)) for v in ("taxi-7", "tram")]
-    found = run_night(replace(night, fleet=taxis), days, "inline", 1, lambda *_: None)
-    assert {o.vehicle: o.status == "refused" for o in found} == {"taxi-7": False, "tram": True}
-
-
 def test_a_day_that_has_not_come_yet_is_refused_at_once(night, monkeypatch):
     script = StagesThatSay(monkeypatch, night.lake)
     days = [VehicleDay(Partition("car", "2099-01-01"), (Path("a.mcap"),))]

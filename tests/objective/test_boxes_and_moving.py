@@ -10,14 +10,11 @@ from pipeline.objective.radar.moving_clusters import (
     moving_clusters,
 )
 from pipeline.objective.radar.vehicle_boxes import (
-    BoxPairs,
-    box_equations,
     box_pairs,
     elevation_residuals,
     vehicle_boxes,
 )
-from pipeline.rig.se3 import exp_se3, transform_points
-from pipeline.rig.spherical import camera_direction_angles
+from pipeline.rig.se3 import exp_se3
 from tests.makers.radar_scenes import DT_S, T_LIDAR_RADAR, street_day
 from tests.makers.solve_scenes import T_CAMERA_LIDAR
 
@@ -44,49 +41,6 @@ def test_box_jacobian_agrees_with_central_differences():
 
     _, J = elevation_residuals(pairs, T_CAMERA_RADAR, bias)
     assert np.allclose(J, central_differences(residual, 8), atol=1e-6)
-
-
-def solve_roll_and_bias(pairs):
-    """Roll and bias with pitch and the rest held, as least squares from the term alone."""
-    T, bias = T_CAMERA_RADAR, np.zeros(2)
-    keep = [2, 6]  # the camera's optical axis
-    for _ in range(8):
-        H, g, _ = box_equations(pairs, T, bias, 1)
-        step = np.zeros(8)
-        step[keep] = -np.linalg.solve(H[0][np.ix_(keep, keep)], g[0][keep])
-        T, bias = exp_se3(step[:6]) @ T, bias + step[6:]
-    return T, bias
-
-
-def test_roll_owes_nothing_to_the_constant_below_the_box_centre():
-    rng = np.random.default_rng(0)
-    n = 60
-    azimuth, elevation = rng.uniform(-0.45, 0.45, n), rng.normal(0, 0.02, n)
-    roll = np.radians(2.0)
-    true_T = exp_se3(np.array([0, 0, roll, 0, 0, 0])) @ T_CAMERA_RADAR
-    lidar = 20 * np.stack(
-        [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)], -1
-    )
-    camera = transform_points(T_CAMERA_LIDAR, lidar)
-    seen = camera_direction_angles(camera)
-    radar = transform_points(np.linalg.inv(true_T), camera)
-    rolls = []
-    for bias in (0.0, np.radians(-1.0)):
-        pairs = BoxPairs(radar, seen[:, 0], seen[:, 1] - bias, np.zeros(n, np.int64), np.zeros(n, np.int64))
-        T, found = solve_roll_and_bias(pairs)
-        rolls.append((T @ np.linalg.inv(T_CAMERA_RADAR))[1, 0])
-        assert abs(found[0] - bias) < np.radians(0.03)
-    assert np.allclose(rolls, np.sin(roll), atol=np.radians(0.03))
-
-
-def test_a_radar_without_elevation_gives_no_boxes():
-    day = street_day(3, elevation=False)
-    pairs = box_pairs(day, vehicle_boxes(day), T_CAMERA_RADAR, 0.2)
-    assert pairs.count == 0
-    H, g, sigma = box_equations(pairs, T_CAMERA_RADAR, np.zeros(2), 3)
-    assert not H.any()
-    assert not g.any()
-    assert np.isnan(sigma)
 
 
 def test_boxes_behind_a_nearer_one_are_left_out():

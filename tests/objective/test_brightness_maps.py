@@ -30,12 +30,6 @@ def test_offsets_point_to_the_nearest_step_and_no_further_than_they_reach():
         np.testing.assert_array_equal(offsets[side, :, 5], np.where(np.abs(10 - v) <= REACH_PX, 10 - v, NONE))
 
 
-def test_paint_is_looked_for_on_the_free_ground_and_not_in_the_sky():
-    found = free_ground(GROUND, CAMERA, Start(T, 0.0))
-    assert found[150, 160]
-    assert not found[:85].any()
-
-
 @pytest.mark.parametrize("turn_deg", [-1.9, 1.9])
 def test_the_ground_is_inside_where_the_start_is_off_by_no_more_than_its_sigma(turn_deg):
     off = from_rotation_translation(exp_so3(np.radians([turn_deg, 0, 0])) @ AXES, np.zeros(3))

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.joint.camera_lidar.estimate import AlignmentState
-from pipeline.objective.camera_lidar.edges import chance_of, fit_match_share
 from pipeline.objective.camera_lidar.image_maps import CameraMaps, boundary_offsets
 from pipeline.objective.camera_lidar.points import Points, lidar_velocities
 from pipeline.objective.camera_lidar.projection_loops import camera_parameters, project_point, project_points
@@ -122,21 +121,6 @@ def test_score_is_best_at_the_true_pose_and_time_offset(terms):
     assert terms.score(at, level).sum(1).argmax() == 2
 
 
-def test_score_above_chance_prefers_the_truth_to_poses_that_turn_everything_out_of_view():
-    day = traced_day(SPARSE, 6, seed=4)
-    velocity, settings = lidar_velocities(day, np.eye(4)), KernelSettings.wide(1.5, 2)
-
-    def score(T):
-        terms = prepare_terms(day, T, velocity, reach_rad=0.0).sharp(5.0)
-        at = AlignmentState(T).alone
-        return (terms.edge_excess(at, settings) + terms.marking_score(at, settings)).sum()
-
-    truth = score(T_TRUE)
-    rng = np.random.default_rng(1)
-    for degrees, metres in ((0.5, 0.03), (2.0, 0.1), (8.0, 0.2), (60.0, 0.5)):
-        assert score(perturb_exactly(T_TRUE, np.radians(degrees), metres, rng)) < truth
-
-
 def test_edges_seen_throughout_are_in_sight_at_every_alignment_and_no_others_are_left_out(terms):
     turned = AlignmentState(T_TRUE, 0.02).changed(
         np.outer([-0.4, 0.4], np.eye(8)[1])
@@ -152,15 +136,3 @@ def test_edges_seen_throughout_are_in_sight_at_every_alignment_and_no_others_are
     assert len(terms.seen_throughout(one).edges.xyz_m) == terms.edges_in_view(one)[0]
     in_turn = terms.seen_throughout(one).seen_throughout(other)
     np.testing.assert_array_equal(in_turn.edges.xyz_m, both.edges.xyz_m)
-
-
-def test_share_of_matches_is_recovered_and_vanishes_where_there_are_none():
-    rng = np.random.default_rng(0)
-    chance_px = rng.uniform(-90, 90, 4000)
-    matched = np.where(rng.random(4000) < 0.3, rng.normal(0, 0.8, 4000), rng.uniform(-90, 90, 4000))
-    kind = np.repeat(np.array([0, 1], np.uint8), 4000)
-    chance = chance_of(np.tile(chance_px, 2).astype(np.float32), kind, 2)
-    here = np.concatenate([matched, rng.uniform(-90, 90, 4000)]).astype(np.float32)
-    share = fit_match_share(here, kind, np.full(8000, 1.5), chance)
-    assert share[0] == pytest.approx(0.3, abs=0.05)
-    assert share[1] < 0.03

@@ -58,16 +58,6 @@ def kerbs_and_cars(rng, share, T=T_LIDAR_RADAR, noise_deg=1.0, image=0.0, stray=
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.6])
-def test_displaced_detections_turn_nothing_and_their_share_is_found(share):
-    rng = np.random.default_rng(1)
-    rows = [kerbs_and_cars(rng, share) for _ in range(15)]
-    found = displaced_heights(rows, T_LIDAR_RADAR, 0.0, rng)
-    assert abs(np.degrees(found.turn_rad)) < 0.15
-    assert abs(found.displaced - share) < 0.15
-    assert abs(np.degrees(found.turn_rad)) < 4 * np.degrees(found.frames.information.sum() ** -0.5)
-
-
 def test_a_day_whose_detections_come_from_anywhere_tells_pitch_less_surely():
     rng = np.random.default_rng(7)
     right, strays = (

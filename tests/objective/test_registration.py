@@ -10,7 +10,6 @@ from pipeline.objective.radar.registration import (
     RegistrationFrames,
     normal_equations,
     registration_frames,
-    updated_sigma,
 )
 from pipeline.rig.se3 import exp_se3, inverse, transform_points
 from pipeline.rig.spherical import to_spherical
@@ -94,18 +93,6 @@ def test_the_cost_is_least_at_the_truth():
         assert cost(moved(axis, -size)) > best
     assert cost(T_LIDAR_RADAR, DT_S + 0.03) > best
     assert cost(T_LIDAR_RADAR, DT_S - 0.03) > best
-
-
-def test_sigmas_are_found_from_the_data():
-    frames = registration_frames(street_day(20), T_LIDAR_RADAR, np.random.default_rng(0))
-    sigma, bounce = SIGMA_START.copy(), 0.12
-    for _ in range(15):
-        equations = normal_equations(frames, T_LIDAR_RADAR, DT_S, sigma, bounce, 0.2)
-        sigma, bounce = updated_sigma(equations, sigma, bounce)
-    # The nearest surfaces absorb some of the noise: never more than the truth, never half of it.
-    assert np.all(sigma < 1.25 * SIGMA)
-    assert np.all(sigma > 0.45 * SIGMA)
-    assert bounce < 0.05
 
 
 def test_ground_bounces_are_recognised():

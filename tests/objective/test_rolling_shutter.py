@@ -14,7 +14,7 @@ from pipeline.calibrate.verify.held_out_score import held_out_score
 from pipeline.core.config import SolveConfig
 from pipeline.core.rigs import CameraPrior
 from pipeline.objective.camera_lidar.points import row_delays_s
-from pipeline.objective.camera_lidar.score import KernelSettings, prepare_terms
+from pipeline.objective.camera_lidar.score import prepare_terms
 from pipeline.rig.estimates import Prior
 from pipeline.rig.se3 import exp_so3, inverse, log_so3, perturb_exactly, transform_points
 from tests.makers.traced_scenes import DENSE, SPARSE, T_TRUE, traced_day
@@ -54,16 +54,6 @@ def test_a_static_point_is_where_the_car_was_when_its_own_row_was_exposed(terms)
         expected_s = row_delays_s(uv[:, 1], camera.height_px, READOUT_S)
         np.testing.assert_allclose(after.exposure_s[inside], expected_s[inside], atol=2e-4)
     assert np.abs(seen.edges.exposure_s).max() > 0.1 * READOUT_S
-
-
-def test_the_true_readout_scores_best_at_the_true_pose():
-    day = traced_day(DENSE, 6, seed=3, dt_s=0.02, readout_s=READOUT_S)
-    velocity = np.array([[o.ego_speed_mps, 0.0, 0.0] for o in day])
-    at, kernel = AlignmentState(T_TRUE, 0.02).alone, KernelSettings.wide(2.0, 1)
-    made = prepare_terms(day, T_TRUE, velocity, reach_rad=0.1).sharp(5.0)
-    readouts = [0.0, 0.5 * READOUT_S, READOUT_S, 1.5 * READOUT_S]
-    scores = [replace(made, readout_s=r).exposed_at(at).score(at, kernel).sum() for r in readouts]
-    assert int(np.argmax(scores)) == 2
 
 
 def test_the_readout_time_of_the_prior_reaches_every_step_of_camera_lidar():

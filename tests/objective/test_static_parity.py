@@ -142,19 +142,3 @@ def test_they_are_for_every_outlier_weight_with_and_without_bounce_and_elevation
     value, gradient = torch_values(tensors(rows, TRUSTED_RAD), T, **how)
     np.testing.assert_allclose(value, kernel_costs(frames, T, **how), rtol=PARITY)
     assert_close(gradient, kernel_slopes(frames, T, **how))
-
-
-def test_limits_take_elevation_from_detections_beyond_them_and_from_no_other(street):
-    T = torch.tensor(T_LIDAR_RADAR)[None]
-    inputs = tensors(street, TRUSTED_RAD)
-    assert 0.05 < beyond(inputs, T_LIDAR_RADAR) < 0.6
-
-    def cost(limits_rad, elevation=True):
-        told = torch.full((len(street),), elevation)
-        limits = torch.tensor(limits_rad, dtype=torch.float64).expand(len(street), 2)
-        return cost_of(T, (*inputs[:5], told, limits))
-
-    wide, some, none = cost([-1.5, 1.5]), cost(TRUSTED_RAD), cost([0.3, 0.31])
-    torch.testing.assert_close(none, cost([-1.5, 1.5], elevation=False))
-    assert (wide > some).all()
-    assert (some > none).all()

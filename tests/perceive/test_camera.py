@@ -53,15 +53,6 @@ def test_halving_labels_takes_the_majority_and_invents_no_class():
     assert np.array_equal(held, most)
 
 
-def test_logged_semantics_are_read_with_fractions_of_sky_and_road(made_frame):
-    frame = made_frame()
-    found = read(frame)
-    assert found.labels.shape == label_size(frame.image_width_px, frame.image_height_px, 0.5)
-    logged = cv2.imdecode(np.frombuffer(frame.labels_png, np.uint8), cv2.IMREAD_UNCHANGED)
-    assert found.sky_fraction == pytest.approx(np.mean(logged == 10), abs=0.01)
-    assert found.drivable_fraction == pytest.approx(np.mean(logged == 0), abs=0.01)
-
-
 @pytest.mark.parametrize(
     ("topics", "change", "classes"),
     [

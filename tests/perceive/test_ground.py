@@ -93,16 +93,6 @@ def test_a_lane_between_parked_cars_is_the_ground_and_not_their_bonnets(seed):
     assert ground.is_ground[len(lane) :][: 60 * len(bonnets)].mean() < 0.05
 
 
-def test_what_lies_behind_an_obstacle_is_not_drivable():
-    points, _, _ = sweep(np.random.default_rng(4), walls=False)
-    a, z = np.meshgrid(np.radians(np.arange(20, 40, 0.2)), (-1.2, -0.8, -0.3))
-    fence = np.stack([10 * np.cos(a), 10 * np.sin(a), z], -1).reshape(-1, 3)
-    x, y, _ = ground_of(np.concatenate([points, fence])).drivable_xyz_m.T
-    far, azimuth_deg = np.hypot(x, y) > 11.5, np.degrees(np.arctan2(y, x))
-    assert not (far & (np.abs(azimuth_deg - 30) < 8)).any()
-    assert (far & (np.abs(azimuth_deg + 30) < 8)).any()
-
-
 @pytest.mark.parametrize(
     ("low", "high", "count"),
     [([3, -20, -1], [3.1, 20, 8], 20), ([3, -20, -1], [3.1, 20, 8], 4000), ([-20, -20, 2.5], [20, 20, 2.55], 4000)],
@@ -146,19 +136,6 @@ def test_the_drivable_area_ends_where_the_models_road_does_and_road_users_block_
     behind = lambda found: np.sum((found[:, 0] > 14) & (np.abs(found[:, 1]) < 1))  # noqa: E731
     assert behind(plain.drivable_xyz_m) > 20
     assert behind(told.drivable_xyz_m) == 0
-
-
-def test_the_surface_does_not_climb_what_the_model_knows_for_an_object(street):
-    points, kind = street
-    hedge = (points[:, 0] > 10) & (points[:, 0] < 20)  # rises like a hill, across the whole street
-    points[hedge, 2] += 0.05 * (points[hedge, 0] - 10)
-    kind[hedge] = PointKind.OTHER
-    beyond = (points[:, 0] > 20) & (points[:, 0] < 26) & (np.abs(points[:, 1]) < 4)
-    plain, told = ground_of(points), ground_of(points, kind)
-    assert np.mean(plain.is_ground[hedge]) > 0.5
-    assert not told.is_ground[hedge].any()
-    assert np.mean(plain.is_ground[beyond]) < 0.5
-    assert np.mean(told.is_ground[beyond]) > 0.99
 
 
 def real_sweeps(log):

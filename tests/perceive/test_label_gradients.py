@@ -34,13 +34,6 @@ def test_labels_too_wide_move_opposite_sides_apart():
     assert peaks[EDGE_RIGHT] == peaks[EDGE_BELOW] == 2
 
 
-@pytest.mark.parametrize("front", [ROAD, 3], ids=["kerb", "a wall before a building"])
-def test_kerbs_and_labels_of_one_group_are_left_out(front):
-    grey, labels = a_car()
-    labels[labels == CAR] = front
-    assert not label_gradients(grey, labels).any()
-
-
 def test_what_stands_before_the_sky_is_kept_apart():
     grey, labels = a_car()
     labels[labels == CAR] = SKY  # a hole in a building

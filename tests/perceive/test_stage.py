@@ -70,15 +70,6 @@ def test_a_days_frames_become_observations(whole):
     assert rows[-1].radar_track_velocity_mps[0] == pytest.approx([5.0, 0.0, 0.0], abs=0.5)
 
 
-def test_a_radar_that_looks_back_still_drives_forwards(lake, made_frame):
-    frame = made_frame(0)
-    turned = {"radar_x_m": -frame.radar_x_m, "radar_y_m": -frame.radar_y_m}
-    priors = {"lidar_radar": np.diag([-1.0, -1.0, 1.0, 1.0])}
-    _, [row] = stage(lake, [replace(frame, **turned, priors=priors)])
-    assert row.radar_velocity_mps[0] == pytest.approx(-8.0, abs=0.1)
-    assert row.ego_speed_mps == pytest.approx(8.0, abs=0.1)
-
-
 def test_the_same_work_is_cached_other_work_is_not_and_the_same_frames_give_the_same_bytes(
     lake, made_frame, whole
 ):
@@ -115,17 +106,6 @@ def test_bad_frames_are_counted_by_reason_and_do_not_stop_the_day(lake, made_fra
     assert [o.frame_index for o in rows] == [0, 7]
     assert result.rejected == dict.fromkeys(faults, 1)
     assert perceived(lake, DAY).rejected == result.rejected
-
-
-def test_points_of_a_deskewed_sweep_keep_their_times_and_those_as_logged_do_not(lake, made_frame):
-    frame = made_frame(0)
-    times = (frame.lidar_x_m * 1e-3).astype(np.float32)  # so that a point tells its own
-    still = {"lidar_time_s": times, "radar_range_rate_mps": frame.radar_range_rate_mps * np.nan}
-    _, [kept, as_logged] = stage(
-        lake, [replace(made_frame(i), lidar_deskewed=i == 0, **still) for i in range(2)]
-    )
-    assert np.array_equal(kept.lidar_map_time_s, (kept.lidar_map_xyz_m[:, 0] * 1e-3).astype(np.float32))
-    assert as_logged.lidar_map_time_s is None
 
 
 def test_sweeps_without_rows_are_counted_and_still_show_edges(lake, made_frame):

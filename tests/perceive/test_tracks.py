@@ -58,7 +58,6 @@ USERS = [
     ([40.0, 3.0], [-13.0, 0.2]), ([18.0, -0.5], [11.0, 0.0]), ([30.0, -8.0], [-0.5, 1.6]),
     ([25.0, 12.0], [4.0, -6.0]),
 ]  # fmt: skip
-NOTHING = ClusterReturns(np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros(0, np.int32))
 
 
 @pytest.mark.parametrize("period", [PERIOD_MPS, None])
@@ -93,20 +92,6 @@ def test_what_cannot_be_linked_starts_new_identities(times, drives, ego_known):
     assert (first == second) is ego_known
     assert len({*second, *third}) == 8
     assert found[2].age.tolist() == [1, 1, 1, 1]
-
-
-def test_a_track_survives_one_missed_scan():
-    world = World([([20.0, 0.0], [11.0, 0.0])])
-    state, found = TrackState.empty(), []
-    for k in range(5):
-        seen = NOTHING if k == 3 else world.returns(0.2 * k)
-        state, tracks = advance_tracks(
-            state, k * 200_000_000, 0, EgoMotion((12.0, 0.0), 0.0), seen, PERIOD_MPS
-        )
-        found.append(tracks)
-    assert found[3].identity.shape == (0,)
-    assert found[4].identity.tolist() == found[2].identity.tolist()
-    assert found[4].age.tolist() == [4]
 
 
 @pytest.mark.parametrize(("period", "rate"), [(PERIOD_MPS, PERIOD_MPS / 2), (None, 0.0)])

@@ -16,7 +16,8 @@ from schemas.captures import Sweep
 from tests.makers.swept_streets import AROUND, pose
 
 GAP_S, SWEEPS = 0.5, 14
-RIGHT = LidarTurn(sense="right", begins_deg=180.0)
+
+
 MOUNTED = pose(1.2, 0.0, 1.9)
 _AZIMUTH = np.linspace(-np.pi, np.pi, 20_000)
 ANY = np.stack([9 * np.cos(_AZIMUTH), 9 * np.sin(_AZIMUTH), np.tile([-1.0, 0.0, 1.0, 2.0], 5_000)], 1)
@@ -105,16 +106,3 @@ def test_what_fleet_toml_says_needs_no_car_that_moves(sense, stamp, times):
     timed, note = turning_of([(Seen(0, 0), cloud)], told).timed(Seen(0, 0), cloud)
     np.testing.assert_allclose(timed.lidar_time_s[:2], times, atol=1e-4)
     assert (note, timed.lidar_deskewed) == (BY_AZIMUTH, False)
-
-
-@pytest.mark.parametrize(
-    ("xyz", "change"),
-    [
-        (ANY, {"lidar_time_s": np.zeros(len(ANY), np.float32)}),
-        (ANY, {"lidar_deskewed": True}),
-        (ANY[ANY[:, 0] > 0], {}),
-    ],
-    ids=["times", "deskewed", "only ahead"],
-)
-def test_sweeps_with_times_and_lidars_that_do_not_spin_are_not_looked_at(xyz, change):
-    assert turning_of([(Seen(0, 0), replace(sweep(xyz), **change))], RIGHT) is None

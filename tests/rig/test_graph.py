@@ -25,12 +25,6 @@ def test_an_edge_in_the_wrong_order_is_refused():
         Edge(TOP, FRONT)
 
 
-def test_components_begin_with_the_references():
-    graph = rig((FRONT, TOP), (CORNER, BASE))
-    names = [[s.name for s in c] for c in graph.components()]
-    assert names == [["top", "front"], ["side"], ["rear"], ["corner", "base"]]
-
-
 def test_only_edges_on_a_cycle_are_checked_by_others():
     graph = rig((FRONT, TOP), (TOP, CORNER), (FRONT, CORNER), (REAR, TOP))
     assert [e.name for e in graph.edges if graph.without([e]).path(*e.sensors)] == [
@@ -52,3 +46,9 @@ def test_a_rig_that_contradicts_itself_is_refused():
         RigGraph((TOP,), (edge_between(TOP, FRONT),), TOP)
     with pytest.raises(ValueError, match="occurs twice"):
         RigGraph((TOP, FRONT), (edge_between(TOP, FRONT), edge_between(FRONT, TOP)), TOP)
+
+
+def test_components_begin_with_the_references():
+    graph = rig((FRONT, TOP), (CORNER, BASE))
+    names = [[s.name for s in c] for c in graph.components()]
+    assert names == [["top", "front"], ["side"], ["rear"], ["corner", "base"]]

@@ -90,16 +90,6 @@ def test_a_file_comes_whole_and_is_not_asked_for_twice(server, tmp_path, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_break_in_the_middle_is_tried_again_three_times_at_most(server, tmp_path):
-    server.breaks = 3
-    with pytest.raises(DownloadError, match="nothing was kept"):
-        fetched(server, tmp_path / "model.onnx")
-    assert not list(tmp_path.iterdir())
-    server.breaks = 2
-    assert fetched(server, tmp_path / "model.onnx")
-    assert (tmp_path / "model.onnx").read_bytes() == CONTENT
-
-
 @pytest.mark.parametrize("how", ["other", "longer"])
 def test_another_file_is_not_kept_and_leaves_the_one_before(how, server, tmp_path):
     (tmp_path / "model.onnx").write_bytes(b"of an earlier release")

@@ -4,15 +4,13 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-import onnxruntime
 import pytest
 
 from pipeline.core.config import load_fleet
 from pipeline.core.errors import ModelError, ModelOutputError
 from pipeline.perceive.models.detector import Detector, decode_head
-from pipeline.perceive.models.manifest import InputSpec, load_manifest
+from pipeline.perceive.models.manifest import load_manifest
 from pipeline.perceive.models.segmenter import Segmenter
-from pipeline.perceive.models.session import fit_image
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import observations_of
 from tests.makers.lakes import write_frames
@@ -66,18 +64,6 @@ def test_boundaries_of_reduced_logits_lie_where_the_image_has_them(tmp_path, fit
     tolerance = max(columns / 160, rows / 96)
     assert np.sum(middle == 3) == pytest.approx(columns / 6, abs=tolerance)
     assert np.sum(right == 2) == pytest.approx(rows / 8, abs=tolerance)
-
-
-@pytest.mark.parametrize("fit", FITS)
-def test_a_box_in_the_models_input_comes_back_to_the_image(fit):
-    image = np.zeros((300, 410, 3), np.uint8)
-    image[100:160, 50:120] = 255
-    tensor, where = fit_image(image, InputSpec(size=(96, 160), fit=fit, pad=0.0))
-    rows, columns = np.nonzero(tensor[0, 0] > 127)
-    x = (np.array([columns.min(), columns.max() + 1]) - where.offset_x) / where.scale_x
-    y = (np.array([rows.min(), rows.max() + 1]) - where.offset_y) / where.scale_y
-    assert x == pytest.approx([50, 120], abs=2.6)
-    assert y == pytest.approx([100, 160], abs=2.6)
 
 
 def rows_of(boxes, classes, scores, objectness=None, count=8):
@@ -246,21 +232,3 @@ def test_a_day_is_perceived_with_models_and_anew_with_another_model(tmp_path, ma
         assert perceive_day(DAY, fleet, lake).status == "cached"
         keys.append(result.work_key)
     assert len(set(keys)) == 2
-
-
-def test_frames_in_batches_and_another_provider_give_the_same_day_under_the_same_work_key(
-    tmp_path, made_frame
-):
-    segmenter(tmp_path)
-    detector(tmp_path, rows_of(BOXES[:1], [2], [0.9], [1.0]), "yolov5")
-    found, reasons = [], []
-    for section in ("", "batch = 2", 'providers = ["CUDAExecutionProvider", "CPUExecutionProvider"]'):
-        fleet, lake = days(tmp_path, made_frame, section)
-        result = perceive_day(DAY, fleet, lake)
-        rows = [(o.labels_png, o.road_user_classes) for o in observations_of(lake, DAY)]
-        found.append((result.work_key, result.rejected, rows))
-        reasons.append(result.reason)
-    assert found[0] == found[1] == found[2]
-    has_cuda = "CUDAExecutionProvider" in onnxruntime.get_available_providers()
-    told = "models ran on CPUExecutionProvider: CUDAExecutionProvider could not be had"
-    assert reasons == ["", "", "" if has_cuda else told]

@@ -83,15 +83,6 @@ def test_remission_is_scaled_and_normalised_and_its_mean_where_the_log_has_none(
     assert RangeImageSegmenter(file).kinds(points, None).tolist() == [other] * 3
 
 
-@pytest.mark.parametrize(("empty", "kind"), [("zero", PointKind.ROAD), ("minus_one", PointKind.OTHER)])
-def test_empty_pixels_are_what_the_manifest_says(tmp_path, empty, kind):
-    # Sum of normalised ranges over 3 x 3 pixels, a lone point at the mean: 0, or 8 x (-1 - 9)/5 = -16.
-    rules = {ROAD: ((1, 0, 0, 0, 0), NONE, 8.0), BUILDING: (NONE, NONE, 0.0)}
-    given = {"mean": [9.0, 0.0, 0.0, 0.0, 0.0], "std": [5.0, 1.0, 1.0, 1.0, 1.0], "empty": empty}
-    file = manifest(tmp_path, rules, given=given, window=3)
-    assert RangeImageSegmenter(file).kinds(points_of([10], [50], [9.0]), None).tolist() == [kind]
-
-
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
