@@ -1,4 +1,8 @@
-"""A stranger's machine: the wheel in an empty environment, in an empty folder, away from the checkout."""
+"""A stranger's machine: the wheel in an empty environment, in an empty folder, away from the checkout.
+
+Which shared libraries a command loads, with all processes that it starts, glibc's loader tells itself (LD_DEBUG, see
+ld.so(8)): one file per process, so no short-lived worker is missed.
+"""
 
 import json
 import os
@@ -10,11 +14,58 @@ from pathlib import Path
 import pytest
 from dockerfile_parse import DockerfileParser
 
-from tests.makers.loaded_libraries import foreign, loaded, tracing
-
 REPO = Path(__file__).resolve().parent.parent
 SMALL = ["--vehicles", "1", "--days", "1", "--frames", "12"]  # of 6 the network refuses to speak
 DOCKERFILE = REPO / "jobs" / "deploy" / "Dockerfile"
+
+
+# The C and C++ runtime on the list of PEP 600 (manylinux_2_17; so also of PEP 513, 571 and 599). What else is on that
+# list, libX11, libGL and libglib, belongs to a desktop: a bare Debian has none of it, so nothing may load it here.
+ALWAYS_THERE = re.compile(
+    r"ld-linux-(aarch64\.so\.1|x86-64\.so\.2)|lib(anl|c|dl|gcc_s|m|nsl|pthread|resolv|rt|stdc\+\+|util)\.so\.\d"
+)
+# Plugins of the resolver, which glibc loads as /etc/nsswitch.conf of that very machine tells it.
+_CHOSEN_BY_THE_SYSTEM = re.compile(r"libnss_\w+\.so\.2")
+_LOADED = re.compile(rb"calling init: (\S+)")
+# Modules of the standard library that stand on a library of the system: such a library is the interpreter's own.
+_OF_THE_INTERPRETER = "import bz2, ctypes, hashlib, lzma, pyexpat, sqlite3, ssl, uuid, zlib"
+
+
+def tracing(folder):
+    """Environment in which every process writes the libraries that it loads into a file of the folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    return os.environ | {"LD_DEBUG": "libs", "LD_DEBUG_OUTPUT": str(folder / "process")}
+
+
+def loaded(folder):
+    """Paths of all libraries that were loaded by processes run in `tracing(folder)`, and the number of these."""
+    files = list(folder.glob("process.*"))
+    return {m.decode() for f in files for m in _LOADED.findall(f.read_bytes())}, len(files)
+
+
+def foreign(paths, folder, python=sys.executable):
+    """Those of the paths that neither the environment of `python`, its interpreter nor a bare system brings.
+
+    Args:
+        paths: of shared libraries.
+        folder: to trace the interpreter in.
+        python: of the environment that loaded them.
+    """
+    subprocess.run([python, "-I", "-c", _OF_THE_INTERPRETER], env=tracing(folder), check=True)
+    own = {Path(p).resolve() for p in loaded(folder)[0]}
+    code = "import sys; print(sys.prefix, sys.base_prefix, sep='\\n')"
+    told = subprocess.run([python, "-I", "-c", code], capture_output=True, text=True, check=True).stdout
+    # An interpreter in /usr does not make all of /usr its own.
+    homes = [Path(h).resolve() for h in told.splitlines() if Path(h) not in (Path("/usr"), Path("/"))]
+    return {
+        p
+        for p in paths
+        if not ALWAYS_THERE.fullmatch(Path(p).name)
+        and not _CHOSEN_BY_THE_SYSTEM.fullmatch(Path(p).name)
+        and Path(p).resolve() not in own
+        and not any(Path(p).resolve().is_relative_to(h) for h in homes)
+        and not re.search(r"/python3\.\d+/lib-dynload/|/libpython3", p)
+    }
 
 
 def pip(*arguments):
