@@ -46,17 +46,8 @@ def converted(request, tmp_path_factory):
     vehicle, day, _ = WHAT[name]
     logs = sorted(map(str, (folder / "out" / "logs" / vehicle / day).iterdir()))
     lake = folder / "lake"
-    about = [
-        "--fleet",
-        str(folder / "out" / "fleet.toml"),
-        "--lake",
-        str(lake),
-        "--vehicle",
-        vehicle,
-        "--day",
-        day,
-    ]
-    assert main(["ingest", *logs, *about]) == 0
+    about = ["--fleet", str(folder / "out" / "fleet.toml"), "--lake", str(lake)]
+    assert main(["ingest", *logs, *about, "--vehicle", vehicle, "--day", day]) == 0
     return name, folder, logs, list(frames_of(Lake.at(lake), Partition(vehicle, day)))
 
 

@@ -58,17 +58,8 @@ def night(kitti_logs, real_segmenter, real_detector, tmp_path_factory):
     given = json.loads((kitti_logs / "given_calibration.json").read_text())[log.stem]
     kitti_folder(log, np.array(given["T_camera_lidar"]), out / "data")
     write_real_manifests(out, real_segmenter, real_detector)
-    call = [
-        "convert",
-        "kitti",
-        str(out / "data"),
-        "--out",
-        str(out),
-        "--vehicle",
-        DAY.vehicle,
-        "--day",
-        DAY.day,
-    ]
+    call = ["convert", "kitti", str(out / "data"), "--out", str(out)]
+    call += ["--vehicle", DAY.vehicle, "--day", DAY.day]
     assert main([*call, "--segmenter", "segmenter.toml", "--detector", "detector.toml"]) == 0
     logs = f"{out}/logs/{{vehicle}}/{{day}}/*.mcap"
     call = ["nightly", "--fleet", str(out / "fleet.toml"), "--lake", str(out / "lake"), "--logs", logs]

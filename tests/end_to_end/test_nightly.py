@@ -47,18 +47,8 @@ def fleet(tmp_path_factory):
 
 
 def command(fleet, lake, *options, vehicles="{vehicle}"):
-    logs = f"{fleet}/logs/{vehicles}/{{day}}/*"
-    return [
-        BORESIGHT,
-        "nightly",
-        "--fleet",
-        f"{fleet}/fleet.toml",
-        "--lake",
-        str(lake),
-        "--logs",
-        logs,
-        *options,
-    ]
+    about = ["--fleet", f"{fleet}/fleet.toml", "--lake", str(lake)]
+    return [BORESIGHT, "nightly", *about, "--logs", f"{fleet}/logs/{vehicles}/{{day}}/*", *options]
 
 
 def run(*arguments):

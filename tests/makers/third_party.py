@@ -65,15 +65,7 @@ def installed(extras=None):
 
 def licences():
     """Rows of pip-licenses: Name, Version, License (a short name), by name."""
-    command = [
-        sys.executable,
-        "-m",
-        "piplicenses",
-        "--from=mixed",
-        "--with-system",
-        "--format=json",
-        "--packages",
-    ]
+    command = f"{sys.executable} -m piplicenses --from=mixed --with-system --format=json --packages".split()
     done = subprocess.run([*command, *sorted(installed())], capture_output=True, text=True, check=True)
     rows = json.loads(done.stdout)
     for row in rows:
