@@ -1,7 +1,6 @@
 """The result tables of both READMEs, made of results/rows.toml and of the files that it names.
 
     python -m tests.benchmarks.results_table          writes them (make results)
-    python -m tests.benchmarks.results_table --check  exit code 1 where they are not what the results give
 
 A row names a question, its goal, its file and how the number is computed (`results_measures.py`). What else a reader
 must know to believe the number is computed: the release of the code (results/releases.toml, kept because commits are
@@ -11,11 +10,8 @@ rate its 95 % interval.
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
-import subprocess
-import sys
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -24,17 +20,7 @@ from typing import Any
 from tests.benchmarks.results_measures import MEASURES
 from tests.benchmarks.studies.looks import freshness, read_looks
 
-__all__ = [
-    "TARGETS",
-    "WIDEST",
-    "learn_releases",
-    "lines_of",
-    "release_now",
-    "release_of",
-    "render",
-    "rows",
-    "written",
-]
+__all__ = ["TARGETS", "WIDEST", "release_now", "release_of", "written"]
 
 RESULTS = Path(__file__).parent / "results"
 REPO = Path(__file__).resolve().parents[2]
@@ -114,11 +100,7 @@ def _release(lines: Sequence[Mapping[str, Any]], row: Mapping[str, Any]) -> str:
 
 def release_now() -> str:
     """The release that the code is on its way to: the topmost of the changelog."""
-    return _topmost((REPO / "CHANGELOG.md").read_text())
-
-
-def _topmost(changelog: str) -> str:
-    found = re.search(r"^## (\d+\.\d+\.\d+)", changelog, re.MULTILINE)
+    found = re.search(r"^## (\d+\.\d+\.\d+)", (REPO / "CHANGELOG.md").read_text(), re.MULTILINE)
     assert found is not None, "a changelog without a release"
     return found[1]
 
@@ -127,31 +109,13 @@ def release_of(commit: str) -> str:
     """The release that a commit was on its way to, as releases.toml has it."""
     known = tomllib.loads(RELEASES.read_text())["releases"]
     if commit not in known:
-        raise SystemExit(f"{RELEASES.name} has no release of commit {commit}: make results")
+        raise SystemExit(f"{RELEASES}: name the release that commit {commit} was on its way to")
     return str(known[commit])
-
-
-def learn_releases() -> None:
-    """Write down the releases of commits that releases.toml does not have: the topmost of the changelog there."""
-    known = tomllib.loads(RELEASES.read_text())["releases"]
-    for commit in dict.fromkeys(c for row in rows() for c in _commits(lines_of(row), row)):
-        if commit in known:
-            continue
-        changelog = _git("show", f"{commit}:CHANGELOG.md")
-        if changelog is None:
-            raise SystemExit(f"{RELEASES.name}: name the release of commit {commit}, which git does not know")
-        with RELEASES.open("a") as file:
-            file.write(f'"{commit}" = "{_topmost(changelog)}"\n')
 
 
 def _commits(lines: Sequence[Mapping[str, Any]], row: Mapping[str, Any]) -> set[str]:
     """Commits of lines, less the + of a working tree with changes; of a row whose lines have none, its own."""
     return {str(c).removesuffix("+") for r in lines if (c := r.get("commit"))} or {str(row["commit"])}
-
-
-def _git(*arguments: str) -> str | None:
-    done = subprocess.run(["git", *arguments], capture_output=True, text=True, check=False, cwd=REPO)
-    return None if done.returncode else done.stdout
 
 
 def _order(release: str) -> tuple[int, ...]:
@@ -168,20 +132,9 @@ def written(path: Path, top_only: bool) -> str:
 
 
 def main() -> None:
-    """Write both tables, or compare them."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--check", action="store_true")
-    args = parser.parse_args()
-    if not args.check:
-        learn_releases()
-    stale = [path for path, top_only in TARGETS.items() if written(path, top_only) != path.read_text()]
-    if args.check:
-        sys.exit(f"not what the results give: {', '.join(map(str, stale))}; make results" if stale else 0)
-    for path in stale:
-        path.write_text(written(path, TARGETS[path]))
-        print(f"wrote {path}")
+    """Write both tables."""
+    for path, top_only in TARGETS.items():
+        path.write_text(written(path, top_only))
 
 
 if __name__ == "__main__":
