@@ -1,6 +1,5 @@
 """A plain install holds what the night needs; other commands name the extra that they lack."""
 
-import ast
 import json
 import subprocess
 import sys
@@ -12,6 +11,7 @@ import pytest
 from packaging.requirements import Requirement
 
 from jobs.cli import COMMANDS
+from tests.test_imports import imports_of
 
 REPO = Path(__file__).resolve().parent.parent
 PACKAGES = ("jobs", "pipeline", "schemas")
@@ -53,22 +53,11 @@ def declared(*extras):
 
 
 @cache
-def imports_of(module):
-    """What a module of ours imports, at its top, inside functions, or by an import path in a string."""
+def imported_by(module):
+    """What a module of ours imports; nothing for a name inside a module."""
     path = REPO.joinpath(*module.split("."))
     path = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
-    if not path.is_file():
-        return frozenset()  # a name inside a module
-    found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.Import):
-            found |= {a.name for a in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            found |= {node.module, *(f"{node.module}.{a.name}" for a in node.names)}
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and ":" in node.value:
-            target = node.value.partition(":")[0]
-            found |= {target} if target.startswith("pipeline.") and " " not in target else set()
-    return frozenset(found)
+    return imports_of(path) if path.is_file() else set()
 
 
 @cache
@@ -83,7 +72,7 @@ def reached(command):
         elif name not in ours:
             ours.add(name)
             waiting += [name.rpartition(".")[0]] if "." in name else []
-            waiting += imports_of(name)
+            waiting += imported_by(name)
     return ours, others
 
 

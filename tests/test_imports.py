@@ -31,23 +31,26 @@ def modules():
 
 
 def imports_of(path):
-    """Full names of our own modules that a file imports, at its top or inside functions."""
+    """Full names of modules that a file imports, at its top or inside functions, or by an import path in a string."""
     found = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             found |= {a.name for a in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
-            found.add(node.module)
-            found |= {f"{node.module}.{a.name}" for a in node.names}
+            found |= {node.module, *(f"{node.module}.{a.name}" for a in node.names)}
         elif isinstance(node, ast.Constant) and isinstance(node.value, str) and ":" in node.value:
             target = node.value.partition(":")[0]  # import paths of backends, resolved on use
-            if target.startswith("pipeline.") and " " not in target:
-                found.add(target)
-    return {name for name in found if name.split(".")[0] in LAYERS}
+            found |= {target} if target.startswith("pipeline.") and " " not in target else set()
+    return found
 
 
-EDGES = [(name, imported) for name, path in modules() for imported in sorted(imports_of(path))]
+EDGES = [
+    (name, imported)
+    for name, path in modules()
+    for imported in sorted(imports_of(path))
+    if imported.split(".")[0] in LAYERS
+]
 
 
 def room(name):
