@@ -61,6 +61,7 @@ def test_parity_on_a_simulated_day(simulated):
     check_static(rows[:2], truth["lidar_radar"], thin=4)
 
 
+@pytest.mark.slow
 @pytest.mark.real_logs
 def test_parity_on_the_real_day(real):
     check_paper_losses(*real)

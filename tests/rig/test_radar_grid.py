@@ -48,7 +48,7 @@ def test_a_detection_lies_in_the_cell_around_it_and_in_the_channel_of_its_motion
     for m, name in enumerate(("static", "moving", "undecided")):
         expected = np.zeros(SHAPE)
         expected[a, r] = np.log(2) if m == motion else 0
-        assert channel(features, name) == pytest.approx(expected, abs=1e-6)
+        np.testing.assert_allclose(channel(features, name), expected, atol=1e-6)
     until = channel(features, "static_until")[a]
     assert np.array_equal(until > 0, (np.arange(SHAPE[1]) >= r) & (motion == 0))
 
