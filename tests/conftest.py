@@ -74,6 +74,7 @@ HEAVIEST_FIRST = (
     "test_wheel.py",
     "learn",
     "calibrate",
+    "fleet",
     "jobs",
     "simulate",
     "verify",
