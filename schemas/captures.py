@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from schemas.columns import TableSchema, array, column, per_point, row
+from schemas.image_motion import EarlierColumns
 
 __all__ = [
     "CAPTURES",
@@ -103,7 +104,7 @@ class ScanColumns:
 
 
 @row()
-class Image(ImageColumns, Capture):
+class Image(ImageColumns, EarlierColumns, Capture):
     """One row of `images`."""
 
 
@@ -119,7 +120,7 @@ class Scan(ScanColumns, Capture):
 
 _ONE = "of one {}, in order of stamp; a file per {}. Table moments joins the rows of a moment."
 IMAGES = TableSchema(
-    Image, "images", 1, "Images " + _ONE.format("camera", "camera"), made_by="ingest", of_sensor=True
+    Image, "images", 2, "Images " + _ONE.format("camera", "camera"), made_by="ingest", of_sensor=True
 )
 SWEEPS = TableSchema(
     Sweep, "sweeps", 1, "Sweeps " + _ONE.format("lidar", "lidar") + " x forward, y left, z up.",

@@ -11,6 +11,7 @@ import numpy as np
 
 from schemas.captures import CameraColumns, Capture
 from schemas.columns import TableSchema, array, column, per_point, points, row
+from schemas.image_motion import MotionColumns
 
 __all__ = [
     "FEATURES",
@@ -27,8 +28,8 @@ __all__ = [
 
 
 @row()
-class ImageFeatureColumns(CameraColumns):
-    """Features of an image, and the intrinsics of its camera."""
+class ImageFeatureColumns(MotionColumns, CameraColumns):
+    """Features of an image, the intrinsics of its camera, and the camera's motion."""
 
     labels_png: bytes = column(
         "PNG mono8 of Cityscapes train ids (0 road .. 18 bicycle, 255 void), usually at half size; all void without "
@@ -143,7 +144,7 @@ class ScanFeatures(ScanFeatureColumns, Capture):
 
 _ONE = "; a file per {}, joined by the table perceived."
 IMAGE_FEATURES = TableSchema(
-    ImageFeatures, "image_features", 3, "Features of a camera's images" + _ONE.format("camera"),
+    ImageFeatures, "image_features", 4, "Features of a camera's images" + _ONE.format("camera"),
     made_by="perceive", of_sensor=True,
 )  # fmt: skip
 SWEEP_FEATURES = TableSchema(

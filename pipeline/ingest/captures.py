@@ -12,6 +12,7 @@ from jaxtyping import Float, Float32
 from pipeline.core.config import IngestConfig
 from pipeline.core.errors import LogError
 from pipeline.core.rigs import CameraTopics, RadarTopics, TopicSemantics
+from pipeline.ingest.earlier_images import EarlierImages
 from pipeline.ingest.index import DayIndex, Located
 from pipeline.ingest.messages.decoding import DECODE_ERRORS, decode, header_frame_id
 from pipeline.ingest.messages.detections import DETECTIONS_3D, read_detections, read_detections_3d
@@ -107,6 +108,9 @@ class _Images:
         self._logged_semantics = int(isinstance(camera.semantics, TopicSemantics))
         stamps_ns = messages.captures.stamps_ns
         self._video = VideoPictures(self._packet, stamps_ns)
+        self._earlier = EarlierImages(
+            self._index, messages.sensor, lambda place: self._encoded(place)[0], (LogError, *DECODE_ERRORS)
+        )
         self._logged = {}
         for what in (LABELS, DETECTIONS):
             stream = self._index.stream(Role(what, messages.sensor))
@@ -125,24 +129,28 @@ class _Images:
             image_width_px=camera.width_px, image_height_px=camera.height_px,
             camera_model=camera.model, camera_K=camera.K, camera_D=camera.D, labels_png=self._labels(place),
             detection_boxes_px=boxes, detection_classes=classes, detection_scores=scores,
+            **self._earlier.columns(place, image.data),
         )  # fmt: skip
         return Read(row, frame_id, image.data)
 
     def _image(self, place: int, camera: Camera) -> tuple[EncodedImage, str]:
         try:
-            message, frame_id = self._messages.read(self._messages.captures.located[place])
-            if not hasattr(message, "format"):
-                image = encode_raw_image(message)
-            elif video_codec(message.format) is not None:
-                image = encode_pixels(self._video.picture(place))
-            else:
-                image = inspect_image(bytes(message.data))
+            image, frame_id = self._encoded(place)
         except (LogError, *DECODE_ERRORS) as err:
             raise Rejected(Rejection.IMAGE_DAMAGED, str(err)) from err
         if (image.width_px, image.height_px) != (camera.width_px, camera.height_px):
             sizes = f"{image.width_px}x{image.height_px}, camera_info {camera.width_px}x{camera.height_px}"
             raise Rejected(Rejection.IMAGE_SIZE, sizes)
         return image, frame_id
+
+    def _encoded(self, place: int) -> tuple[EncodedImage, str]:
+        """Image of a message, and its frame id."""
+        message, frame_id = self._messages.read(self._messages.captures.located[place])
+        if not hasattr(message, "format"):
+            return encode_raw_image(message), frame_id
+        if video_codec(message.format) is not None:
+            return encode_pixels(self._video.picture(place)), frame_id
+        return inspect_image(bytes(message.data)), frame_id
 
     def _packet(self, place: int) -> tuple[str, bytes]:
         message, _ = self._messages.read(self._messages.captures.located[place])

@@ -142,6 +142,12 @@ def _needs(evidence: Evidence) -> list[tuple[str, str, _Needs]]:
         ("lidar_base", "x and y", ground + [("weak", "x and y of the vehicle are observable only in turns")]),
         ("radar_base", "yaw", moving + radar),
         ("radar_base", "pitch", moving + radar + _elevation_needs(evidence)),
+        ("camera_base", "yaw and pitch", moving),
+        (
+            "camera_base",
+            "roll",
+            [*moving, ("weak", "roll of a camera on the vehicle is observable only in turns")],
+        ),
     ]
 
 

@@ -26,8 +26,10 @@ from pipeline.core.config import PerceiveConfig
 from pipeline.perceive.camera import CameraSemantics, FrameReason, SemanticsSource, decode_grey, encode_png
 from pipeline.perceive.depth_edges import lidar_edges
 from pipeline.perceive.drivable import DrivableSource, free_sector
+from pipeline.perceive.earlier_greys import EarlierGreys
 from pipeline.perceive.ego_velocity import RadarMotion, Travel, radar_motion
 from pipeline.perceive.ground import PointSource, find_ground
+from pipeline.perceive.image_motion import MotionReason
 from pipeline.perceive.labels import ROAD_ID, VOID_ID, label_gradients
 from pipeline.perceive.lidar import cluster_boxes, cluster_objects, sample_uniformly
 from pipeline.perceive.road_markings import lidar_markings, road_contrast
@@ -79,8 +81,12 @@ def why_unusable(capture: Capture) -> FrameReason | None:
     return None
 
 
-def perceive_image(image: Image, source: SemanticsSource | None, config: PerceiveConfig) -> ImageFeatures:
-    """Labels and road users of an image, or steps of its brightness without a source of semantics.
+def perceive_image(
+    image: Image, source: SemanticsSource | None, earlier: EarlierGreys, config: PerceiveConfig
+) -> tuple[ImageFeatures, MotionReason | None]:
+    """Labels and road users of an image, or steps of its brightness without a source of semantics; and its motion.
+
+    The reason is why the image shows no motion of the camera.
 
     Raises:
         FrameRejectedError: something cannot be read.
@@ -88,12 +94,16 @@ def perceive_image(image: Image, source: SemanticsSource | None, config: Perceiv
     semantics = None if source is None else source.read(image)
     grey = decode_grey(image, config.label_scale)
     shown = _without_semantics(grey) if semantics is None else _with_semantics(grey, semantics)
-    return ImageFeatures(
+    users = (None, None) if semantics is None else (semantics.labels, semantics.detections.boxes_px)
+    motion, reason = earlier.columns(image, grey, *users)
+    features = ImageFeatures(
         **_begin(image),
         **{name: getattr(image, name) for name in _CAMERA},
         label_scale=config.label_scale,
         **shown,
+        **motion,
     )
+    return features, reason
 
 
 def _with_semantics(grey: UInt8[np.ndarray, "H W"], semantics: CameraSemantics) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any, Final, NamedTuple, cast
 
@@ -21,6 +21,7 @@ from pipeline.perceive.camera import (
     TopicSource,
 )
 from pipeline.perceive.drivable import DrivableSource
+from pipeline.perceive.earlier_greys import EarlierGreys
 from pipeline.perceive.ego_velocity import RadarMotion
 from pipeline.perceive.features import (
     deskewed,
@@ -148,6 +149,7 @@ class Sources:
     radars: Mapping[str, DrivableSource | None]
     config: PerceiveConfig
     deskew: bool = True
+    earlier: dict[str, EarlierGreys] = field(default_factory=dict)  # of the day so far
 
     def remarks(self) -> list[str]:
         """Where models run on another provider than the first that fleet.toml names."""
@@ -190,7 +192,7 @@ class Found(NamedTuple):
     moment: Perceived
     features: dict[str, Any]
     tracks: dict[str, TrackState]
-    notes: list[str]  # WITHOUT_ROWS, BY_DOPPLER, AS_LOGGED, of each sweep that it is true of
+    notes: list[str]  # WITHOUT_ROWS, BY_DOPPLER, AS_LOGGED of a sweep; why an image shows no motion
     unusable: Mapping[str, FrameReason]  # sensors that the moment goes without
 
 
@@ -209,10 +211,12 @@ def perceive_moment(
     moment, config = shown.moment, sources.config
     asked = shown.captures
     unusable = {s: why for s, c in asked.items() if (why := why_unusable(c)) is not None}
-    features: dict[str, Any] = {}
+    features, notes = dict[str, Any](), list[str]()
     for camera, image in shown.of("camera", _less(asked, unusable)).items():
         try:
-            features[camera] = perceive_image(image, sources.cameras[camera], config)
+            earlier = sources.earlier.setdefault(camera, EarlierGreys())
+            features[camera], still = perceive_image(image, sources.cameras[camera], earlier, config)
+            notes += [] if still is None else [f"{camera}_without_motion_{still.value}"]
         except FrameRejectedError as why:
             unusable[camera] = why.reason
     usable = _less(asked, unusable)
@@ -220,7 +224,7 @@ def perceive_moment(
         raise FrameRejectedError(next(iter(unusable.values()), FrameReason.NO_LABELS))
     # One generator per moment: the result does not depend on which came before.
     seed = [moment.stamp_ns & 0x7FFFFFFFFFFFFFFF, moment.moment]
-    rng, notes = np.random.default_rng(seed), list[str]()
+    rng = np.random.default_rng(seed)
     scans, sweeps = shown.of("radar", usable), shown.of("lidar", usable)
     headings = {radar: shown.heading(radar) for radar in scans}
 

@@ -33,7 +33,7 @@ Kind = Literal["camera", "lidar", "radar", "base"]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 # Kinds of two nodes connected through other nodes: their relative pose follows from the adjustment of the
 # rig.
-TIE_KINDS: Final = (*EDGE_KINDS, "camera_camera", "radar_radar", "camera_base")
+TIE_KINDS: Final = (*EDGE_KINDS, "camera_camera", "radar_radar")
 
 
 @dataclass(frozen=True, order=True)

@@ -90,7 +90,8 @@ KIND_OF_EDGE: Final[Mapping[str, EdgeKind]] = {
         EdgeKind(
             "radar_base", 1, f"{_EDGES}.radar_base:solve", needed=("azimuth",), watched=("rz",), watches={"radar": 1}
         ),
+        EdgeKind("camera_base", 1, f"{_EDGES}.camera_base:solve", watched=("rx", "ry"), watches={"camera": 2}),
     )
 }  # fmt: skip
-# Two cameras are connected through a lidar.
+# Two cameras are connected through a lidar or the base.
 EDGE_KINDS: Final = tuple(KIND_OF_EDGE)

@@ -1,0 +1,226 @@
+"""Edge camera-base: mounting of a camera on the car, from how its images show the car's motion.
+
+In straight driving the camera's translation is the base's x axis: yaw and pitch. In turns the camera also moves by
+the turn times its lever arm, as a radar does (`radar_base`). The axis about which the camera turns is the base's z
+axis: roll and pitch, over turns. The body's own pitch and roll are means over scenes. The amount of turn is
+compared with the car's yaw rate: over changes of the yaw rate it determines the clock, over turns a scale, which
+is that of the focal length. Position has no information. Labels, depths and other sensors' poses take no part, so the
+errors are this edge's own; an error of the intrinsics turns what any edge of the camera shows.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float, Int64
+
+from pipeline.calibrate.edges.camera_travel import CameraTravel, camera_travel
+from pipeline.calibrate.edges.day_sources import DaySources
+from pipeline.calibrate.edges.lidar_base import STANCE
+from pipeline.calibrate.edges.on_base import Series, changes_by_left, first_and_last, other_scenes
+from pipeline.calibrate.edges.robust_regression import Regression, Rows, regress
+from pipeline.calibrate.numerics.frame_blocks import Scenes
+from pipeline.core.errors import SolveError
+from pipeline.rig.checks import FailedCheck
+from pipeline.rig.evidence import EDGE, EdgeEvidence
+from pipeline.rig.graph import BASE, Edge
+from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
+
+__all__ = ["estimate_camera_base", "solve"]
+
+_LEAST_RAD = np.radians(
+    0.1
+)  # a body pitches and yaws so much from image to image, however sharp the tracks are
+_LEVER_SIGMA_M = 1.5  # as of a radar: place of the rear axle, slip
+_NO_SCALE, _DRIFT_SIGMA_RADPS = 1.0, 0.003  # of a yaw rate beside the camera's
+_MOST_TURN_RAD = np.radians(0.6)  # a metre, of a car of which nothing shows the way: straight driving
+_TURNING_RAD = np.radians(0.4)
+_BEND_M = 50.0
+_FLOOR_RAD = np.radians(0.02)  # of yaw and pitch by matching, as of radars
+_ROLL_FLOOR_RAD = np.radians(0.05)  # roads that lean to one side in bends
+_CENTRE_RAD = np.radians(0.03)  # by principal point and focal length
+_CLOCK_FLOOR_S, _NO_CLOCK_S = 0.002, 1.0
+_FEWEST = 8
+_PASSES = 4
+
+
+def solve(edge: Edge, sources: DaySources) -> tuple[EdgeEvidence, int]:
+    """Evidence of a day, and its number of moments; raises SolveError if there are too few."""
+    name = edge.parent.name
+    T = sources.on_base(name)
+    rows = sources.rows({"camera": name})
+    if not rows:
+        raise SolveError(f"{name} is silent: the day has no image of it", "silent_sensor")
+    travel = camera_travel(rows, sources.ego_at(rows), Scenes.of(rows))
+    return estimate_camera_base(edge, travel, T), len(rows)
+
+
+def estimate_camera_base(
+    edge: Edge, travel: CameraTravel, T_base_camera: Float[np.ndarray, "4 4"]
+) -> EdgeEvidence:
+    """Evidence of a day on T_camera_base and on the base's clock.
+
+    Args:
+        T_base_camera: the start, whose rotation does not contribute to the information.
+
+    Raises:
+        SolveError: too few pairs of images show a motion.
+    """
+    if len(travel.span_s) < _FEWEST:
+        told = f"{len(travel.span_s)} of {_FEWEST} pairs of images that are needed show how {edge.parent.name} moves"
+        raise SolveError(told, "few_scenes")
+    T = T_base_camera
+    for _ in range(_PASSES):
+        rows = _rows(travel, T)
+        fits = {name: regress(of) for name, of in rows.items()}
+        change, variance = _combined(fits)
+        T = from_rotation_translation(exp_so3(change) @ T[:3, :3], T[:3, 3])
+    clock = _clock(travel, T)
+    timed = None if clock is None or clock.covariance[0, 0] > (_NO_CLOCK_S / 2) ** 2 else clock
+    J = np.zeros((4, 7))
+    J[:3, :6] = changes_by_left(T)[:3]
+    J[3, 6] = 1.0
+    of_clock = np.inf if timed is None else timed.covariance[0, 0] + _CLOCK_FLOOR_S**2
+    weight = 1 / np.append(variance, of_clock)
+    sources = [(0, fits["roll"]), (1, fits["pitch"]), (2, fits["yaw"])]
+    halves = [(axis, fit, float(STANCE[axis])) for axis, fit in sources]
+    straight = np.flatnonzero(_is_straight(travel, T))
+    series = Series(2, rows["yaw"], travel.scene[straight], travel.stamp_ns[straight], float(STANCE[2]))
+    return EdgeEvidence(
+        edge, inverse(T), 0.0 if timed is None else float(timed.value[0]), (J.T * weight) @ J,
+        np.zeros(7), _biases(edge, T), frames_used=len(travel.span_s), checks=_checks(edge, clock),
+        diagnostics=_numbers(travel, fits, clock), notes=_notes(fits, timed),
+        others=other_scenes(T, halves), parts=first_and_last(T, series),
+    )  # fmt: skip
+
+
+def _rows(travel: CameraTravel, T: np.ndarray) -> dict[str, Rows]:
+    """Regressions of the changes of T_base_camera: yaw and pitch by the way, roll and pitch by the axis of turns."""
+    R = T[:3, :3]
+    direction, turn = travel.direction @ R.T, travel.turn @ R.T
+    of_turn = R @ travel.covariance[:, :3, :3] @ R.T
+    of_direction = R @ travel.covariance[:, 3:, 3:] @ R.T
+    bend = _bends(travel)
+    straight = _is_straight(travel, T)
+    expected = _expected(travel, T, turn)
+    off = np.arctan2(direction[:, 1], direction[:, 0]) - np.arctan2(expected[:, 1], expected[:, 0])
+    off = np.arctan2(np.sin(off), np.cos(off))
+    # Of an azimuth, beside the direction of travel: other than directions these are nearly along x.
+    curvature = np.where(
+        np.isnan(travel.driven_m), turn[:, 2], turn[:, 2] / np.nan_to_num(travel.driven_m, nan=1.0)
+    )
+    one, free = np.ones(len(off)), np.inf
+    turning = np.stack([one, curvature], 1)
+    yaw = Rows(turning, -off, _sigma(of_direction, 1), bend, np.array([free, _LEVER_SIGMA_M]), one)
+    ahead = np.copysign(1.0, direction[:, 0])
+    elevation = np.arctan2(direction[:, 2], np.hypot(direction[:, 0], direction[:, 1])) * ahead
+    by_way = Rows(one[:, None], elevation, _sigma(of_direction, 2), bend, np.array([free]), one)
+    turned = np.abs(turn[:, 2]) > _TURNING_RAD
+    roll = Rows(turn[:, 2:], turn[:, 1], _sigma(of_turn, 1), bend, np.array([free]), one).some(turned)
+    by_axis = Rows(-turn[:, 2:], turn[:, 0], _sigma(of_turn, 0), bend, np.array([free]), one).some(turned)
+    return {"yaw": yaw.some(straight), "pitch": by_way.some(straight), "roll": roll, "pitch_by_axis": by_axis}
+
+
+def _sigma(covariance: np.ndarray, axis: int) -> np.ndarray:
+    return np.sqrt(covariance[:, axis, axis] + _LEAST_RAD**2)
+
+
+def _expected(travel: CameraTravel, T: np.ndarray, turn: np.ndarray) -> Float[np.ndarray, "N 2"]:
+    """Way of the camera in axes of the base midway: the base's own, and the turn times the lever arm."""
+    way = np.where(
+        np.isnan(travel.driven_m), np.copysign(1.0, (travel.direction @ T[:3, :3].T)[:, 0]), travel.driven_m
+    )
+    chord = way * np.sinc(turn[:, 2] / (2 * np.pi))
+    across = np.where(np.isnan(travel.driven_m), 0.0, 2 * np.sin(turn[:, 2] / 2))
+    return np.stack([chord - across * T[1, 3], across * T[0, 3]], 1)
+
+
+def _is_straight(travel: CameraTravel, T: np.ndarray) -> Bool[np.ndarray, " N"]:
+    """Pairs that show the direction of travel: where nothing shows the way, hardly turning ones."""
+    turned = (travel.turn @ T[:3, :3].T)[:, 2]
+    return np.asarray(np.isfinite(travel.driven_m) | (np.abs(turned) < _MOST_TURN_RAD))
+
+
+def _bends(travel: CameraTravel) -> Int64[np.ndarray, " N"]:
+    """Block of each pair: within one stretch of road the car leans and slips alike."""
+    rate = np.abs(np.nan_to_num(travel.driven_m, nan=3.0)) / travel.span_s
+    gap_s = np.diff(travel.stamp_ns, prepend=travel.stamp_ns[:1]) * 1e-9
+    new = np.diff(travel.drive, prepend=travel.drive[:1]) != 0
+    way_m = np.where(new, _BEND_M, rate * np.clip(gap_s, 0.0, 2.0 * _BEND_M))
+    return np.asarray(np.cumsum(way_m) // _BEND_M, np.int64)
+
+
+def _combined(fits: dict[str, Regression | None]) -> tuple[np.ndarray, np.ndarray]:
+    """Roll, pitch and yaw, and variances: pitch by both of its sources, wider if they differ."""
+    found = {
+        name: (0.0, np.inf) if f is None else (f.value[0], f.covariance[0, 0]) for name, f in fits.items()
+    }
+    both = np.array([found["pitch"], found["pitch_by_axis"]])
+    weight = 1 / both[:, 1]
+    pitch = (0.0, np.inf)
+    if weight.sum() > 0:
+        mean = weight @ both[:, 0] / weight.sum()
+        pitch = mean, max(1.0, weight @ (both[:, 0] - mean) ** 2) / weight.sum()
+    change = np.array([found["roll"], pitch, found["yaw"]])
+    return change[:, 0], change[:, 1]
+
+
+def _clock(travel: CameraTravel, T: np.ndarray) -> Regression | None:
+    """Stamp of the camera less that of the base, scale of its turns less 1, and drift of the yaw rate.
+
+    A camera that is late shows earlier turns: its turn less the base's is minus the delay times the yaw rate's change.
+    """
+    turned = (travel.turn @ T[:3, :3].T)[:, 2]
+    known = np.isfinite(travel.turned_rad) & np.isfinite(travel.turned_by_clock_radps)
+    base, by_clock = np.nan_to_num(travel.turned_rad), np.nan_to_num(travel.turned_by_clock_radps)
+    covariance = T[2, :3] @ travel.covariance[:, :3, :3] @ T[2, :3]
+    sigma, one = np.sqrt(covariance + (0.2 * _LEAST_RAD) ** 2), np.ones(len(turned))
+    design = np.stack([-by_clock, base, travel.span_s], 1)
+    priors = np.array([_NO_CLOCK_S, _NO_SCALE, _DRIFT_SIGMA_RADPS])
+    return regress(Rows(design, turned - base, sigma, _bends(travel), priors, one).some(known))
+
+
+def _checks(edge: Edge, clock: Regression | None) -> tuple[FailedCheck, ...]:
+    """An image that is mirrored turns the other way."""
+    if clock is None or 1 + clock.value[1] + 3 * np.sqrt(clock.covariance[1, 1]) > 0:
+        return ()
+    told = f"{edge.parent.name} turns right where the car turns left: a mirrored image, or a yaw rate of the wrong sign"
+    return (FailedCheck(told, "orientation", disproves=True),)
+
+
+def _biases(edge: Edge, T: np.ndarray) -> dict[str, np.ndarray]:
+    """Biases: the car's stance, the matching, the camera's intrinsics."""
+    axes = np.zeros((4, 6))
+    axes[[0, 1, 2, 3], [0, 1, 2, 5]] = 1.0
+    floor = np.diag([_ROLL_FLOOR_RAD, _FLOOR_RAD, _FLOOR_RAD, 0.0, 0.0, 0.0]) ** 2
+    to_camera = np.linalg.inv(changes_by_left(T))
+    intrinsics = np.diag([_CENTRE_RAD, _CENTRE_RAD, 0.0, 0.0, 0.0, 0.0]) ** 2
+    return {
+        BASE.name: axes.T @ np.diag(STANCE**2) @ axes,
+        EDGE: to_camera @ floor @ to_camera.T,
+        edge.parent.name: intrinsics,
+    }
+
+
+def _numbers(
+    travel: CameraTravel, fits: dict[str, Regression | None], clock: Regression | None
+) -> dict[str, float]:
+    numbers = {"image_pairs": float(len(travel.span_s))}
+    if clock is not None:
+        numbers |= {"focal_by_turns": float(clock.value[1])}
+        numbers |= {"focal_by_turns_sigma": float(np.sqrt(clock.covariance[1, 1]))}
+    by_way, by_axis = fits["pitch"], fits["pitch_by_axis"]
+    if by_way is not None and by_axis is not None:
+        numbers |= {"pitch_way_less_axis_deg": float(np.degrees(by_way.value[0] - by_axis.value[0]))}
+    return numbers
+
+
+def _notes(fits: dict[str, Regression | None], clock: Regression | None) -> tuple[str, ...]:
+    shown = {
+        "yaw and pitch to the base: too few images show the direction of travel": fits["yaw"] is not None,
+        "roll to the base: the car hardly turns": fits["roll"] is not None,
+        "clock against the base: the car hardly begins or ends a turn": clock is not None,
+    }
+    return (
+        *(told for told, is_shown in shown.items() if not is_shown),
+        "x, y, z to the base: motion has no scale",
+    )

@@ -1,0 +1,139 @@
+"""For each image of a moment, an earlier one of the same camera, some metres of driving before.
+
+From the two, perception finds how the camera moves. Most logs have more images than moments, so the earlier one is
+read from the log too, and kept at half size without colour; if it is the image of an earlier moment, its stamp
+suffices. Messages are looked at in the order in which they were logged.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from pipeline.ingest.index import DayIndex
+from pipeline.ingest.messages.image import EncodedImage
+
+__all__ = ["EarlierImages"]
+
+_WAY_M, _LEAST_M, _MOST_M = 3.0, 1.0, 6.0
+_SPAN_S, _LEAST_S, _MOST_S = 0.3, 0.04, 1.5  # without odometry: 1 to 6 m at 3.5 to 20 m/s
+_LATEST_S = 0.6  # likewise
+_STANDING_MPS = 0.3
+_STEPS = 12  # of the integral of odometry
+_QUALITY = 92
+# Why an image has no earlier one; perception adds its own reasons.
+NO_EARLIER, STAMPS_JUMP, STANDING, SAME_IMAGE = (
+    "no_earlier_image",
+    "stamps_jump",
+    "standing",
+    "same_image_again",
+)
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    place: int
+    span_s: float
+    driven_m: float  # NaN if unknown
+    is_kept: bool
+
+    @property
+    def off(self) -> float:
+        """How far it is from the best one; an image that is kept anyway comes first."""
+        by_way = abs(np.log(abs(self.driven_m) / _WAY_M)) if np.isfinite(self.driven_m) else np.nan
+        by_span = abs(np.log(self.span_s / _SPAN_S))
+        return float(by_span if np.isnan(by_way) else by_way) + (0.0 if self.is_kept else 0.7)
+
+
+class EarlierImages:
+    """Finds the earlier image of each image of one camera; asked in the order of moments.
+
+    Args:
+        picture: reads the image of a message; raises one of `errors` if it is damaged.
+    """
+
+    def __init__(
+        self,
+        index: DayIndex,
+        sensor: str,
+        picture: Callable[[int], EncodedImage],
+        errors: tuple[type[Exception], ...],
+    ) -> None:
+        self._index, self._captures, self._picture, self._errors = (
+            index,
+            index.captures(sensor),
+            picture,
+            errors,
+        )
+        self._kept: set[int] = set()  # images of moments
+
+    def columns(self, place: int, now: bytes) -> Mapping[str, Any]:
+        """Columns `EarlierColumns` of a message's image, which is then an earlier one of those that follow."""
+        found = self._nearest(place)
+        self._kept.add(place)
+        if isinstance(found, str):
+            return {"earlier_missing": found}
+        image = None
+        if not found.is_kept:
+            try:
+                earlier = self._picture(found.place)
+            except self._errors:
+                return {"earlier_missing": NO_EARLIER}
+            if earlier.data == now:
+                return {"earlier_missing": SAME_IMAGE}
+            image = _half_grey(earlier)
+        stamp_ns = self._captures.stamps[found.place]
+        return {"earlier_stamp_ns": stamp_ns, "earlier_image": image, **self._motion(stamp_ns, place)}
+
+    def _nearest(self, place: int) -> _Candidate | str:
+        """The best earlier image, or why there is none."""
+        stamps, located = self._captures.stamps, self._captures.located
+        now_ns, found, last_ns, driven_m = stamps[place], list[_Candidate](), stamps[place], 0.0
+        speed = self._index.ego.motion_at(np.array([now_ns], np.int64))[0][0]
+        for k in range(place - 1, -1, -1):
+            if located[k].log != located[place].log or now_ns - stamps[k] > _MOST_S * 1e9:
+                break
+            if stamps[k] >= last_ns:
+                return STAMPS_JUMP
+            ends = np.array([stamps[k], last_ns], np.int64)
+            driven_m += float(self._index.ego.motion_at(ends)[0].mean()) * (last_ns - stamps[k]) * 1e-9
+            last_ns = stamps[k]
+            span_s = (now_ns - stamps[k]) * 1e-9
+            is_near = span_s <= _LATEST_S if np.isnan(driven_m) else _LEAST_M <= abs(driven_m) <= _MOST_M
+            if is_near and span_s >= _LEAST_S:
+                found.append(_Candidate(k, span_s, driven_m, k in self._kept))
+        if not found:
+            return STANDING if abs(speed) < _STANDING_MPS else NO_EARLIER
+        return min(found, key=lambda c: c.off)
+
+    def _motion(self, earlier_ns: int, place: int) -> Mapping[str, float]:
+        """The car's motion by odometry, from the earlier image to this one; empty if it is not known throughout."""
+        stamps = np.linspace(earlier_ns, self._captures.stamps[place], _STEPS + 1).astype(np.int64)
+        speed, yaw_rate = self._index.ego.motion_at(stamps)
+        if not (np.isfinite(speed).all() and np.isfinite(yaw_rate).all()):
+            return {}
+        s = (stamps - earlier_ns) * 1e-9
+        return {
+            "ego_driven_m": float(np.trapezoid(speed, s)),
+            "ego_turned_rad": float(np.trapezoid(yaw_rate, s)),
+            "ego_turned_by_clock_radps": float(yaw_rate[-1] - yaw_rate[0]),
+        }
+
+
+def _half_grey(image: EncodedImage) -> bytes | None:
+    """The image at half size without colour, as JPEG; None if it cannot be decoded."""
+    data = np.frombuffer(image.data, np.uint8)
+    flag = cv2.IMREAD_REDUCED_GRAYSCALE_2 if image.format == "jpeg" else cv2.IMREAD_GRAYSCALE
+    grey = cv2.imdecode(data, flag | cv2.IMREAD_IGNORE_ORIENTATION)
+    if grey is None:
+        return None
+    half = -(-image.width_px // 2), -(-image.height_px // 2)
+    if grey.shape != half[::-1]:
+        grey = cv2.resize(grey, half, interpolation=cv2.INTER_AREA)
+    ok, blob = cv2.imencode(".jpg", grey, (cv2.IMWRITE_JPEG_QUALITY, _QUALITY))
+    assert ok, "OpenCV cannot encode a grey JPEG"
+    return bytes(blob)

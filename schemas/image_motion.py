@@ -1,0 +1,70 @@
+"""Columns of a camera's own motion: the earlier image that ingest keeps, and what perception finds from both."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from schemas.columns import array, column, row
+
+__all__ = ["EarlierColumns", "MotionColumns"]
+
+
+@row()
+class EarlierColumns:
+    """An earlier image of the same camera, 1 to 6 m of driving before, and the car's motion in between by odometry."""
+
+    earlier_stamp_ns: int | None = column("its stamp; null if the log has none", default=None)
+    earlier_image: bytes | None = column(
+        "JPEG mono8 at half size; null if it is the image of an earlier row", default=None
+    )
+    earlier_missing: str | None = column("why there is none", default=None)
+    ego_driven_m: float | None = column(
+        "way of the vehicle frame from the earlier image to this one, negative backwards; null without odometry",
+        default=None,
+    )
+    ego_turned_rad: float | None = column(
+        "yaw from the earlier image to this one, positive to the left; null without odometry", default=None
+    )
+    ego_turned_by_clock_radps: float | None = column(
+        "change of ego_turned_rad if both images were a second later; null without odometry", default=None
+    )
+
+
+@row()
+class MotionColumns:
+    """Motion of a camera from its earlier image to this one; null where the images show none.
+
+    Its axes lie midway between the camera's orientations at the two images. The rotation vector has the same
+    coordinates in all three: R_earlier_now = exp(motion_turn_rad).
+    """
+
+    motion_span_s: float | None = column("stamp of this image less that of the earlier one", default=None)
+    motion_turn_rad: np.ndarray | None = array(
+        "<f8", (3,), "rotation vector of R_earlier_now, camera axes", default=None
+    )
+    motion_direction: np.ndarray | None = array(
+        "<f8", (3,), "unit vector of the camera's translation, camera axes midway", default=None
+    )
+    motion_covariance: np.ndarray | None = array(
+        "<f8",
+        (6, 6),
+        "of motion_turn_rad and motion_direction from the scatter of the tracks; of rank 5, for the direction has no "
+        "length",
+        default=None,
+    )
+    motion_tracks: int | None = column("corners seen in both images", kind="int32", default=None)
+    motion_tracks_px: np.ndarray | None = array(
+        "<f4",
+        ("N", 4),
+        "tracks that follow the motion: u v in the earlier image, u v in this one, full-image pixels",
+        default=None,
+    )
+    motion_spread: float | None = column(
+        "share of 8 x 6 cells of the image that have such a track", default=None
+    )
+    motion_parallax_px: float | None = column(
+        "median shift of these tracks that rotation does not explain, at label size", default=None
+    )
+    ego_driven_m: float | None = column("as in images", default=None)
+    ego_turned_rad: float | None = column("as in images", default=None)
+    ego_turned_by_clock_radps: float | None = column("as in images", default=None)

@@ -1,0 +1,139 @@
+"""A camera's pose on the car and clock by its own motion: within sigma of the truth, or not at all."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.calibrate.edges.camera_base import estimate_camera_base
+from pipeline.calibrate.edges.camera_travel import CameraTravel
+from pipeline.calibrate.edges.on_base import changes_by_left
+from pipeline.core.errors import SolveError
+from pipeline.rig.changes import change_between
+from pipeline.rig.graph import BASE, Edge, Sensor
+from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
+
+EDGE = Edge(Sensor("front", "camera"), BASE)
+N, SPAN_S, STEP_S, LATE_S = 240, 0.3, 0.5, 0.012
+OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+NOISE = np.radians(0.08)  # of turn and direction, a pair
+
+
+def mounted(yaw_deg=0.0, pitch_deg=3.0, roll_deg=-1.0):
+    R = exp_so3(np.radians([0.0, 0.0, yaw_deg])) @ exp_so3(np.radians([0.0, pitch_deg, 0.0]))
+    return from_rotation_translation(
+        R @ OPTICAL @ exp_so3(np.radians([0.0, 0.0, roll_deg])), np.array([1.8, 0.6, 1.5])
+    )
+
+
+def day(T, seed=1, *, turning=0.25, late_s=LATE_S, body_deg=0.1, scale=1.0):
+    """A drive along bends of a camera at T = T_base_camera, whose base pitches and leans from pair to pair."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(N) * STEP_S
+    speed = 10 + 3 * np.sin(t / 7)
+
+    def rate(at):
+        return turning * np.sin(at / 3.0)
+
+    def turned(at):  # exactly, from `at` less the span
+        return -3.0 * turning * (np.cos(at / 3.0) - np.cos((at - SPAN_S) / 3.0))
+
+    a = turned(t - late_s)
+    body = rng.normal(0, np.radians(body_deg), (N, 2))
+    turn = np.stack([body[:, 0], body[:, 1], a], 1)
+    way = speed * SPAN_S
+    translation = np.stack([way, 0 * way, 0 * way], 1) + np.cross(turn, T[:3, 3]) * [1, 1, 0]
+    translation[:, 2] += rng.normal(0, np.radians(body_deg), N) * way
+    direction = translation / np.linalg.norm(translation, axis=1, keepdims=True)
+    noisy = direction @ T[:3, :3] + rng.normal(0, NOISE, (N, 3))
+    covariance = np.tile(np.eye(6) * NOISE**2, (N, 1, 1))
+    return CameraTravel(
+        (turn @ T[:3, :3] + rng.normal(0, NOISE, (N, 3))) * scale,
+        noisy / np.linalg.norm(noisy, axis=1, keepdims=True),
+        covariance, way, turned(t) + rng.normal(0, 1e-4, N), rate(t) - rate(t - SPAN_S), np.full(N, SPAN_S),
+        (t * 1e9).astype(np.int64), np.arange(N) // 120, np.arange(N) // 4,
+    )  # fmt: skip
+
+
+def start(T, off_deg=(1.5, -1.5, 2.0)):
+    return from_rotation_translation(exp_so3(np.radians(off_deg)) @ T[:3, :3], T[:3, 3])
+
+
+def error_and_sigma(evidence, T):
+    """Roll, pitch and yaw in axes of the base [rad]; infinite sigmas where nothing is known."""
+    found = inverse(evidence.T)
+    J = np.linalg.inv(changes_by_left(found))
+    information = np.diag(J.T @ evidence.information[:6, :6] @ J)[:3]
+    return change_between(found, T)[:3], np.where(information > 1e-3, information + 1e-12, 1e-12) ** -0.5
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 90.0, 180.0])
+def test_pose_and_clock_come_out_within_sigma_wherever_the_camera_looks(yaw_deg):
+    T = mounted(yaw_deg)
+    z, late = [], []
+    for seed in range(8):
+        evidence = estimate_camera_base(EDGE, day(T, seed), start(T))
+        error, sigma = error_and_sigma(evidence, T)
+        assert np.degrees(sigma).max() < 0.25
+        z.append(error / sigma)
+        late.append((evidence.dt_s - LATE_S) * evidence.information[6, 6] ** 0.5)
+        assert evidence.information[6, 6] ** -0.5 < 0.01
+    assert 0.3 < np.sqrt(np.mean(np.square(z))) < 1.6
+    assert np.sqrt(np.mean(np.square(late))) < 1.6
+
+
+def test_a_wrong_lever_arm_is_no_yaw():
+    T = mounted()
+    moved = T.copy()
+    moved[0, 3] += 1.0
+    error, sigma = error_and_sigma(estimate_camera_base(EDGE, day(T), start(moved)), T)
+    assert abs(error[2]) < 3 * sigma[2]
+
+
+def test_straight_driving_determines_neither_roll_nor_clock_and_says_so():
+    T = mounted()
+    evidence = estimate_camera_base(EDGE, day(T, turning=0.0), start(T))
+    _, sigma = error_and_sigma(evidence, T)
+    assert sigma[0] > 1e3
+    assert np.degrees(sigma[1:]).max() < 0.1
+    assert evidence.information[6, 6] == 0
+    assert {note.split(" to ")[0].split(" against ")[0] for note in evidence.notes} >= {"roll", "clock"}
+
+
+def test_without_odometry_and_doppler_the_straights_still_show_yaw_and_pitch():
+    T = mounted()
+    silent = np.full(N, np.nan)
+    travel = replace(day(T, turning=0.02), driven_m=silent, turned_rad=silent, turned_by_clock_radps=silent)
+    error, sigma = error_and_sigma(estimate_camera_base(EDGE, travel, start(T)), T)
+    assert (np.abs(error[1:]) < 4 * sigma[1:]).all()
+    assert np.degrees(sigma[1:]).max() < 0.2
+
+
+def test_focal_length_shows_in_turns_and_a_mirrored_image_is_named():
+    T = mounted()
+    numbers = estimate_camera_base(EDGE, day(T, scale=0.98), start(T)).diagnostics
+    assert abs(numbers["focal_by_turns"] + 0.02) < 3 * numbers["focal_by_turns_sigma"] < 0.02
+    travel = day(T)
+    mirror = np.diag([-1.0, 1.0, 1.0])  # left and right swapped in the picture: directions and axial turns
+    mirrored = replace(travel, turn=-travel.turn @ mirror, direction=travel.direction @ mirror)
+    [check] = estimate_camera_base(EDGE, mirrored, start(T)).checks
+    assert check.disproves
+    assert check.fault == "orientation"
+
+
+def test_traffic_that_pulls_single_pairs_away_moves_little():
+    T = mounted()
+    travel = day(T)
+    direction = travel.direction.copy()
+    direction[::7] += [0.2, 0.0, 0.0]
+    error, sigma = error_and_sigma(
+        estimate_camera_base(EDGE, replace(travel, direction=direction), start(T)), T
+    )
+    assert (np.abs(error) < 3 * sigma).all()
+
+
+def test_a_day_with_few_pairs_is_refused_with_the_number():
+    T = mounted()
+    few = CameraTravel(**{name: values[:5] for name, values in vars(day(T)).items()})
+    with pytest.raises(SolveError, match="5 of 8 pairs"):
+        estimate_camera_base(EDGE, few, start(T))

@@ -1,0 +1,212 @@
+"""Motion of a camera from its tracks and from two images: known truth, any camera model, and what must be named."""
+
+import cv2
+import numpy as np
+import pytest
+
+from pipeline.perceive.earlier_greys import EarlierGreys
+from pipeline.perceive.image_motion import (
+    MotionReason,
+    NoMotionError,
+    Tracks,
+    _moved,
+    _pixel_rad,
+    _residuals,
+    motion_of_tracks,
+)
+from pipeline.rig.cameras import Camera
+from pipeline.rig.se3 import exp_so3, log_so3
+from schemas.captures import Image
+
+SIZE = (900, 470)
+K = np.array([[420.0, 0, 449.5], [0, 420.0, 234.5], [0, 0, 1]])
+CAMERAS = {
+    "pinhole": Camera("plumb_bob", K, np.zeros(0), *SIZE),
+    "distorted": Camera("plumb_bob", K, np.array([-0.2, 0.05, 0.001, -0.001]), *SIZE),
+    "f-theta": Camera("equidistant", K, np.zeros(4), *SIZE),
+    "fisheye": Camera("equidistant", K * [[0.55], [0.55], [1]], np.array([-0.02, 0.002, 0, 0]), *SIZE),
+}
+STRAIGHT = np.radians([0.1, 0.3, -0.05])
+
+
+def tracks_of(
+    camera,
+    turn=STRAIGHT,
+    direction=(0.05, -0.02, 1.0),
+    way_m=3.0,
+    *,
+    seed=0,
+    noise_px=0.15,
+    traffic=0.0,
+    bonnet=0,
+):
+    """Tracks of a static world, of road users, and of the car's own bonnet; true turn and direction midway."""
+    rng = np.random.default_rng(seed)
+    u = np.array(direction) / np.linalg.norm(direction)
+    rays = camera.unproject(rng.uniform([0, 0], np.array(SIZE) - 1, (600, 2)))
+    now = rays[np.isfinite(rays).all(1)] * rng.uniform(4, 60, (np.isfinite(rays).all(1).sum(), 1))
+    R = exp_so3(np.array(turn))
+    t = exp_so3(np.array(turn) / 2) @ u * way_m  # in axes of the earlier camera
+    users = rng.random(len(now)) < traffic
+    before = now @ R.T + t + users[:, None] * np.array([0.8, 0.0, 2.5])
+    uv, uv_before = camera.project(now)[0], camera.project(before)[0]
+    seen = camera.contains(uv) & camera.contains(uv_before) & camera.project(before)[1]
+    uv, uv_before = uv[seen], uv_before[seen] + rng.normal(0, noise_px, (seen.sum(), 2))
+    own = rng.uniform([200, 420], [700, 469], (bonnet, 2))
+    uv, uv_before = (
+        np.concatenate([uv, own]),
+        np.concatenate([uv_before, own + rng.normal(0, 0.05, own.shape)]),
+    )
+    a, b = camera.unproject(uv_before), camera.unproject(uv)
+    known = np.isfinite(a).all(1) & np.isfinite(b).all(1)
+    return Tracks(uv_before, uv, a, b, _pixel_rad(b, camera)).some(known), np.array(turn), u
+
+
+def errors(found, turn, u):
+    """Errors of turn and direction [rad], in two axes across the direction."""
+    across = np.linalg.svd(u[None])[2][1:]
+    return np.concatenate([log_so3(exp_so3(-turn) @ exp_so3(found.turn)), across @ found.direction])
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+@pytest.mark.parametrize("direction", [(0.05, -0.02, 1.0), (0.95, 0.0, 0.3), (0.0, 0.1, -1.0)])
+def test_motion_comes_out_within_its_sigma_for_any_camera_and_way(name, direction):
+    z = []
+    for seed in range(12):
+        tracks, turn, u = tracks_of(CAMERAS[name], direction=direction, seed=seed)
+        found = motion_of_tracks(tracks, SIZE)
+        across = np.linalg.svd(u[None])[2][1:]
+        J = np.zeros((5, 6))
+        J[:3, :3], J[3:, 3:] = np.eye(3), across
+        e = errors(found, turn, u)
+        assert np.abs(e).max() < np.radians(0.25)
+        z.append(e @ np.linalg.inv(J @ found.covariance @ J.T) @ e / 5)
+    assert 0.3 < np.mean(z) < 3.0
+
+
+def test_the_jacobian_is_that_of_the_residuals():
+    tracks, turn, u = tracks_of(CAMERAS["f-theta"], turn=np.radians([1.0, 4.0, -2.0]), noise_px=0.0)
+    J = _residuals(tracks, turn, u)[1]
+    for k in range(5):
+        step = np.eye(5)[k] * 1e-6
+        ahead, behind = (_residuals(tracks, *_moved(turn, u, sign * step))[0] for sign in (1, -1))
+        assert (ahead - behind) / 2e-6 == pytest.approx(J[:, k], abs=1e-6)
+
+
+def test_a_third_of_traffic_and_the_bonnet_move_it_little():
+    for seed in range(5):
+        clean, turn, u = tracks_of(CAMERAS["pinhole"], seed=seed)
+        disturbed, *_ = tracks_of(CAMERAS["pinhole"], seed=seed, traffic=0.3, bonnet=150)
+        assert np.abs(errors(motion_of_tracks(clean, SIZE), turn, u)).max() < np.radians(0.15)
+        assert np.abs(errors(motion_of_tracks(disturbed, SIZE), turn, u)).max() < np.radians(0.25)
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"way_m": 1e-4, "turn": np.zeros(3), "noise_px": 0.02}, MotionReason.STANDING),
+        ({"way_m": 1e-3, "turn": np.radians([0.0, 4.0, 0.0])}, MotionReason.NO_PARALLAX),
+        ({"traffic": 1.0, "way_m": 0.0}, None),
+    ],
+)
+def test_what_shows_no_motion_is_named(changes, reason):
+    tracks, *_ = tracks_of(CAMERAS["pinhole"], **changes)
+    if reason is None:  # a world that moves as one is the world: nothing in the picture tells
+        assert motion_of_tracks(tracks, SIZE).parallax_px > 0
+        return
+    with pytest.raises(NoMotionError) as err:
+        motion_of_tracks(tracks, SIZE)
+    assert err.value.reason == reason
+
+
+def test_points_behind_the_camera_and_tracks_of_the_car_itself_are_named():
+    tracks, *_ = tracks_of(CAMERAS["pinhole"])
+    half = np.arange(len(tracks.now)) % 2 == 0  # as if half the world went backwards: no depth is in front
+    ends = [(tracks.before_px, tracks.now_px), (tracks.before, tracks.now)]
+    swapped = [np.where(half[:, None], *two) for pair in ends for two in (pair, pair[::-1])]
+    mixed = Tracks(*swapped, tracks.pixel_rad)
+    with pytest.raises(NoMotionError) as err:
+        motion_of_tracks(mixed, SIZE)
+    assert err.value.reason in (MotionReason.BEHIND, MotionReason.NO_COMMON_MOTION)
+    few = tracks.some(np.arange(len(tracks.now)) < 40)
+    own, *_ = tracks_of(CAMERAS["pinhole"], bonnet=200)
+    own = own.some(np.arange(len(own.now)) >= len(own.now) - 200)
+    both = Tracks(
+        *(np.concatenate([a, b]) for a, b in zip(vars(few).values(), vars(own).values(), strict=True))
+    )
+    with pytest.raises(NoMotionError) as err:
+        motion_of_tracks(both, SIZE)
+    assert err.value.reason == MotionReason.STATIC_TRACKS
+
+
+CAMERA = CAMERAS["pinhole"]
+
+
+def street(x_m, yaw_rad=0.0, brightness=1.0):
+    """Grey picture of a textured road between two textured walls, of a camera 1.5 m up that looks ahead."""
+    v, u = np.mgrid[0 : SIZE[1], 0 : SIZE[0]]
+    rays = CAMERA.unproject(np.stack([u, v], -1).astype(float))  # x right, y down, z ahead
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    ahead, left, up = c * rays[..., 2] + s * rays[..., 0], s * rays[..., 2] - c * rays[..., 0], -rays[..., 1]
+    with np.errstate(divide="ignore"):
+        to_road = np.where(up < 0, 1.5 / -up, np.inf)
+        to_wall = 6.0 / np.abs(left)
+    near = np.minimum(np.minimum(to_road, to_wall), 80.0)
+    at = np.stack([x_m + near * ahead, near * left, near * up], -1)
+    is_road = to_road < to_wall
+    cells = np.floor(np.stack([at[..., 0], np.where(is_road, at[..., 1], at[..., 2])], -1) / 0.6).astype(
+        np.int64
+    )
+    shade = ((cells[..., 0] * 7919 + cells[..., 1] * 104729 + is_road * 31) ** 2 // 7) % 200
+    grey = np.where(near >= 80.0, 220, shade + 20)
+    return cv2.GaussianBlur((grey * brightness).astype(np.uint8), (0, 0), 1.0)
+
+
+def image(stamp_s, earlier_s=None, *, kept=None, driven_m=None, missing=None):
+    return Image(
+        moment=0, stamp_ns=int(stamp_s * 1e9), image=b"", image_format="png", image_width_px=SIZE[0],
+        image_height_px=SIZE[1], camera_model=CAMERA.model, camera_K=CAMERA.K, camera_D=CAMERA.D, labels_png=None,
+        detection_boxes_px=None, detection_classes=None, detection_scores=None,
+        earlier_stamp_ns=None if earlier_s is None else int(earlier_s * 1e9), earlier_image=kept,
+        earlier_missing=missing, ego_driven_m=driven_m,
+    )  # fmt: skip
+
+
+def test_two_pictures_of_a_street_show_turn_and_direction():
+    greys = EarlierGreys()
+    first, reason = greys.columns(image(0.0, missing="no_earlier_image"), street(0.0), None, None)
+    assert (first, reason) == ({}, MotionReason.NO_EARLIER)
+    found, reason = greys.columns(image(0.3, 0.0), street(2.0, np.radians(1.0)), None, None)
+    assert reason is None
+    assert np.degrees(found["motion_turn_rad"]) == pytest.approx([0.0, -1.0, 0.0], abs=0.06)
+    assert np.degrees(found["motion_direction"][:2]) == pytest.approx([0.5, 0.0], abs=0.25)
+    assert found["motion_span_s"] == pytest.approx(0.3)
+    # The same from the picture that ingest kept.
+    kept = bytes(cv2.imencode(".jpg", street(0.0), (cv2.IMWRITE_JPEG_QUALITY, 92))[1])
+    again, _ = EarlierGreys().columns(image(0.3, 0.0, kept=kept), street(2.0, np.radians(1.0)), None, None)
+    assert again["motion_direction"] == pytest.approx(found["motion_direction"], abs=2e-3)
+
+
+def test_a_picture_again_under_a_new_stamp_the_night_and_a_standing_car_are_named():
+    greys = EarlierGreys()
+    greys.columns(image(0.0), street(0.0), None, None)
+    _, reason = greys.columns(image(0.3, 0.0, driven_m=3.0), street(0.0), None, None)
+    assert reason == MotionReason.SAME_IMAGE
+    _, reason = greys.columns(image(0.6, 0.3, driven_m=0.0), street(0.0), None, None)
+    assert reason == MotionReason.STANDING
+    _, reason = greys.columns(image(0.9, 0.6), street(2.0, brightness=0.0), None, None)
+    assert reason == MotionReason.FEW_TRACKS
+    _, reason = greys.columns(image(1.2, 0.95), street(2.0), None, None)  # its moment was not perceived
+    assert reason == MotionReason.NO_EARLIER
+
+
+def test_corners_of_road_users_are_left_out():
+    greys = EarlierGreys()
+    greys.columns(image(0.0), street(0.0), None, None)
+    labels = np.zeros(SIZE[::-1], np.uint8)
+    labels[300:, :] = 13
+    boxes = np.array([[0, 0, 300, 200]], np.float32)
+    found, _ = greys.columns(image(0.3, 0.0), street(2.0), labels, boxes)
+    u, v = found["motion_tracks_px"][:, 2:].T
+    assert v.max() < 300
+    assert not ((u < 295) & (v < 195)).any()
