@@ -94,7 +94,7 @@ def find_edges(
     """The graph of the rig: edges from fleet.toml, or edges between sensors with overlapping views.
 
     Each sensor keeps the three or four edges with the largest overlap, plus the edges of a spanning tree. If
-    the rig has `base`, every lidar and every radar has an edge to it. Sensors that no edge connects to the
+    the rig has `base`, every sensor has an edge to it. Sensors that no edge connects to the
     reference form other components of the graph. A rig with one sensor of each kind has all pairs as edges.
 
     Args:

@@ -73,4 +73,7 @@ def _part(one, kind, table):
     stamp_ns = one.stamp_ns if kind == "lidar" else getattr(one, f"{kind}_stamp_ns")
     own = {"moment": one.frame_index, "stamp_ns": stamp_ns}
     row = table.row_type
-    return row(**{f.name: own[f.name] if f.name in own else getattr(one, f.name) for f in fields(row)})
+    names = [
+        f.name for f in fields(row) if f.name in own or hasattr(one, f.name)
+    ]  # a frame has no earlier image
+    return row(**{name: own[name] if name in own else getattr(one, name) for name in names})

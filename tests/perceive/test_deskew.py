@@ -51,6 +51,11 @@ def perceived(frame, **options):
     return perceive_moment(shown, sources, {})
 
 
+def notes_of(found):
+    """What is noted of sweeps: one image alone shows no motion of its camera."""
+    return [note for note in found.notes if note != "camera_without_motion_no_earlier_image"]
+
+
 def farthest(found, frame):
     """How far the sampled cloud lies from the points of a frame, at most."""
     cloud = found.features["lidar"].lidar_map_xyz_m
@@ -60,7 +65,7 @@ def farthest(found, frame):
 def test_a_sweep_without_odometry_is_moved_by_the_radar_s_velocity(made_frame):
     right, frame = skewed(made_frame)
     found, left = perceived(frame), perceived(frame, deskew=False)
-    assert (found.notes, left.notes) == ([BY_DOPPLER], [])
+    assert (notes_of(found), notes_of(left)) == ([BY_DOPPLER], [])
     # 0.05 m/s of Doppler noise times a tenth of a second
     assert farthest(found, right) < 0.03
     assert farthest(left, frame) == 0.0
@@ -80,5 +85,5 @@ def test_a_sweep_without_odometry_is_moved_by_the_radar_s_velocity(made_frame):
 def test_a_sweep_that_cannot_be_moved_is_counted_and_one_that_need_not_is_not(made_frame, changes, notes):
     _, frame = skewed(made_frame)
     found = perceived(replace(frame, **changes))
-    assert found.notes == notes
+    assert notes_of(found) == notes
     assert farthest(found, frame) == 0.0

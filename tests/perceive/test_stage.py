@@ -111,7 +111,10 @@ def test_bad_frames_are_counted_by_reason_and_do_not_stop_the_day(lake, made_fra
 def test_sweeps_without_rows_are_counted_and_still_show_edges(lake, made_frame):
     lasers = np.random.default_rng(0).integers(0, 6, len(made_frame(0).lidar_x_m)).astype(np.uint16)
     result, rows = stage(lake, [made_frame(0), *changed(made_frame, 3, lidar_ring=lasers)[1:]])
-    assert (result.kept, result.rejected) == ({"frames": 3, WITHOUT_ROWS: 2}, {})
+    assert (result.kept, result.rejected) == (
+        {"frames": 3, WITHOUT_ROWS: 2, "camera_without_motion_no_earlier_image": 3},
+        {},
+    )
     assert all(len(o.lidar_edge_xyz_m) > 0 for o in rows)
 
 
