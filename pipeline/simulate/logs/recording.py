@@ -15,7 +15,7 @@ from rosbags.rosbag2 import Writer as Bag2Writer
 
 from pipeline.core.ros_messages import McapLog, RosMessages
 from pipeline.rig.se3 import from_rotation_translation
-from pipeline.rig.topics import TOPICS
+from pipeline.rig.topics import TOPICS, topics_of
 from pipeline.simulate.faults import DayFaults
 from pipeline.simulate.logs.frame_messages import Sent, Setup, messages_of
 from pipeline.simulate.sensors.data_sheets import LidarSpec
@@ -49,6 +49,7 @@ FIRST_FRAME_S: Final = 1.0  # the log of a drive starts this long before its fir
 # For free-running sensors the log has the measurement nearest to the reference's sweep, because rendering
 # dominates the cost; every few sweeps also the second nearest, so that pairing must choose.
 _NEIGHBOURS_EVERY: Final = 4
+_WAY_M, _TRIGGER_S = 3.0, 0.1  # between the two images of a pair; period of a camera that a lidar triggers
 # Relative rate errors: mechanical lidars keep theirs to some parts in a thousand, quartzes to a hundred in a
 # million. Without them, 30 and 10 Hz would keep a constant gap for a whole drive, as if triggered.
 _RATE_SD: Final = {"camera": 1e-4, "lidar": 3e-3, "radar": 1e-4}
@@ -110,6 +111,8 @@ def record_drive(
                 first |= {name: frame for name in frame.stamps_s if name not in first}
                 shown = _resent(frame, first, setup.faults)
                 pending += messages_of(messages, shown, setup, at, rng)
+        if rig.image_pairs:
+            pending += _images_before(messages, seat, setup, clocks, near, rate_hz, at)
         while odometry and odometry[0][0] <= stamp + 0.1:
             t, T, speed, yaw_rate = odometry.pop(0)
             pending.append((at(t), TOPICS["odometry"], messages.odometry(at(t), T, speed, yaw_rate)))
@@ -120,8 +123,39 @@ def record_drive(
 
 def _sweep_s(rig: RigSpec) -> float:
     sheet = rig.reference.sheet
-    assert isinstance(sheet, LidarSpec)
-    return sheet.sweep_s
+    return sheet.sweep_s if isinstance(sheet, LidarSpec) else 0.0
+
+
+def _images_before(
+    messages: RosMessages,
+    seat: Seat,
+    setup: Setup,
+    clocks: Mapping[str, Ticks],
+    stamps_s: Mapping[str, float],
+    rate_hz: float,
+    at: Callable[[float], int],
+) -> list[Sent]:
+    """Of each camera the image at its own rate some metres before, where the last moment lies farther back.
+
+    Its draws are its own: the moment's are those of a rig without such images.
+    """
+    sent, speed = (
+        list[Sent](),
+        float(np.linalg.norm(seat.scene.ego.velocities(np.array([seat.moment.t_s]))[0])),
+    )
+    if speed / rate_hz < _WAY_M * 2:
+        return sent
+    for sensor in seat.rig.of_kind("camera"):
+        name, stamp_s = sensor.name, stamps_s.get(sensor.name)
+        if stamp_s is None or setup.faults.has("missing", name) or setup.faults.has("stuck", name):
+            continue
+        period_s = clocks[name].period_s if name in clocks else _TRIGGER_S
+        stamp_s -= period_s * max(1, round(_WAY_M / speed / period_s))
+        rng = np.random.default_rng([round(stamp_s * 1e6), 67])
+        image = frame_of(seat, {name: stamp_s}, rng, setup.semantics).images[name]
+        jpeg = messages.image(messages.at(at(stamp_s), name), image.jpeg, "jpeg")
+        sent.append((at(stamp_s), topics_of(name, "camera")["image"], jpeg))
+    return sent
 
 
 def _stamps(

@@ -47,7 +47,8 @@ class RigSpec:
 
     Args:
         sensors: cameras, lidars and radars; the first lidar is the reference, whose sweeps define the
-            moments.
+            moments; without lidars the first radar.
+        image_pairs: cameras have another image some metres before each moment, at their own rate.
         delay_sd_s: standard deviation (sd) per vehicle of each delay.
         sync_jitter_s: sd of the stamps of triggered sensors.
         prior_rotation_deg: sd per vehicle and sensor of the mounting against CAD, angle.
@@ -66,6 +67,7 @@ class RigSpec:
     remount_rotation_deg: float = 0.02
     remount_translation_m: float = 0.002
     behind_m: float = 60.0
+    image_pairs: bool = False
 
     def __getitem__(self, name: str) -> SensorSpec:
         """The sensor with this name; raises KeyError if there is none."""
@@ -77,8 +79,8 @@ class RigSpec:
 
     @property
     def reference(self) -> SensorSpec:
-        """The first lidar."""
-        return self.of_kind("lidar")[0]
+        """The first lidar; without lidars the first radar."""
+        return (*self.of_kind("lidar"), *self.of_kind("radar"))[0]
 
     @property
     def is_short(self) -> bool:

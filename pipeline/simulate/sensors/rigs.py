@@ -20,6 +20,7 @@ from pipeline.simulate.sensors.rig_spec import RigSpec, SensorSpec, Sheet, short
 __all__ = ["RIGS", "rig_named"]
 
 RANDOM: Final = "random-"  # prefix of rigs drawn from a seed
+PAIRS: Final = "-pairs"  # suffix of rigs whose cameras have another image before each moment
 ROWS: Final = "rows-"  # `rows-32-60`: the rig demo with a lidar of 32 rows over 60 deg
 # Half the pixels of the paper's camera, with a matching lidar and radar: sufficient for most purposes, and
 # much faster.
@@ -99,6 +100,13 @@ _DUO_SHEETS: Final[dict[str, Sheet]] = {
     "corner_fl": replace(_VAN_CORNER, rays=4000),
 }
 _DUO: Final = RigSpec("duo", tuple(replace(_VAN[name], sheet=sheet) for name, sheet in _DUO_SHEETS.items()))
+# As most cars on the road have: cameras and radars alone.
+_NO_LIDAR: Final = RigSpec(
+    "no_lidar",
+    tuple(_VAN[name] for name in ("front", "left", "right", "nose", "corner_fl", "corner_fr")),
+    behind_m=150.0,
+    image_pairs=True,
+)
 
 
 def _demo(
@@ -185,6 +193,7 @@ _ALL: Final = (
     _demo("tilted", lidar=replace(_LIDAR, sweep_s=0.04), rpy_deg=(_LEVEL, (0.0, 5.0, 0.0), _LEVEL)),
     _VAN,
     _DUO,
+    _NO_LIDAR,
 )  # fmt: skip
 RIGS: Final = {rig.name: rig for rig in _ALL}
 # Suffixes of rig names, and their changes of the radars. `-dirty` matches two real-like days by statistics
@@ -198,8 +207,10 @@ _RADARS: Final[dict[str, dict[str, Any]]] = {
 def rig_named(name: str) -> RigSpec:
     """One of RIGS, `random-SEED` or `rows-ROWS-DEGREES`, perhaps with a suffix. ConfigError.
 
-    `-flat` removes radar elevation, `-dirty` degrades it.
+    `-flat` removes radar elevation, `-dirty` degrades it; `-pairs`, the last, gives cameras a second image.
     """
+    if name.endswith(PAIRS):
+        return replace(rig_named(name.removesuffix(PAIRS)), name=name, image_pairs=True)
     plain, change = name, None
     for ending, spoil in _RADARS.items():
         if name.endswith(ending):
