@@ -24,6 +24,7 @@ from pipeline.report.day import (
     sigmas_of,
     status_sentence,
 )
+from pipeline.report.motion_view import motion_pictures
 from pipeline.report.page import render, write_page
 from pipeline.report.pictures import ScenePictures, scene_pictures, write_picture
 from pipeline.report.reading import (
@@ -175,6 +176,7 @@ def _content(
     if pictures is not None:
         for camera in other_cameras(records, of_three):
             drawn += _pictures(lake, partition, drawn_records(records, camera), labels, pictures, 1)[0]
+    moving = [] if pictures is None else motion_pictures(lake, partition, records.values(), pictures)
     load = _to_load(read.states, partition.day)
     loaded = [
         Answered(row["sensor"], row["status"], (row["sensor"],), ", ".join(row["determined"]))
@@ -188,6 +190,7 @@ def _content(
         "pairs": views,
         "labels": labels,
         "scenes": drawn,
+        "motions": moving,
         "no_pictures": no_pictures,
         "offsets": time_offsets_of(of_three).in_words(),
         "rig_svg": rig_of_day(poses, records.values()),

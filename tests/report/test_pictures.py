@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 from pipeline.core.sections import ReportConfig
+from pipeline.report.motion_view import draw_motion
 from pipeline.report.overlays import Extrinsics, Scene, Window, close_up, decode_image, front_view, whole_view
 from pipeline.report.pictures import top_bitmap, top_view
 from pipeline.report.reading import scene_of
 from pipeline.report.residuals import MEASURES, boundary_distance_px, frame_residuals
 from pipeline.report.scenes import choose_frames, choose_windows
-from pipeline.rig.se3 import exp_se3, from_rotation_translation, inverse, transform_points
+from pipeline.rig.cameras import camera_of
+from pipeline.rig.se3 import exp_se3, exp_so3, from_rotation_translation, inverse, transform_points
 from schemas.calibrations import SENSORS
 from schemas.frames import Frame
 from schemas.observations import EDGE_LEFT, EDGE_RIGHT, STEP_RIGHT, Observation
@@ -216,3 +218,25 @@ def test_without_labels_distances_are_to_steps_of_brightness():
     distance = boundary_distance_px(unlabelled, (5,))
     assert (distance[:, 61] == 0).all()
     assert distance[50, 91] == pytest.approx(30.0, abs=2.0)
+
+
+def test_the_way_of_a_camera_and_straight_ahead_are_marked_where_they_project(scene):
+    turn, yaw = np.radians([0.0, 4.0, 0.0]), np.radians([0.0, 3.0, 0.0])
+    travel_now = np.array([0.1, 0.05, 1.0]) / np.linalg.norm([0.1, 0.05, 1.0])
+    seen = replace(
+        scene.observation,
+        motion_turn_rad=turn,
+        motion_direction=exp_so3(turn / 2) @ travel_now,
+        motion_tracks_px=np.array([[100, 200, 140, 220]], np.float32),
+    )
+    after = T_CL.copy()
+    after[:3, :3] = exp_so3(yaw) @ T_CL[:3, :3]
+    image = draw_motion(scene.frame, seen, T_CL, after)
+    scale = image.shape[1] / WIDTH
+    camera = camera_of(scene.frame).scaled(scale)
+    expected = camera.project(np.stack([travel_now, T_CL[:3, 0], after[:3, 0]]))[0]
+    for colour, at in zip([(60, 60, 255), (200, 200, 200), (255, 170, 60)], expected, strict=True):
+        v, u = np.nonzero((image == np.array(colour, np.uint8)).all(-1))
+        assert np.hypot((u.min() + u.max()) / 2 - at[0], (v.min() + v.max()) / 2 - at[1]) < 3
+    v, u = np.nonzero((image == np.array((90, 220, 90), np.uint8)).all(-1))
+    assert np.hypot(u.max() - 140 * scale, v.max() - 220 * scale) < 5
