@@ -201,3 +201,25 @@ def test_a_fault_of_a_vehicle_that_lacks_the_sensor_is_refused_before_anything_i
     faults = parse_faults("vehicle-1:0:corner_fl:yaw:1", [DAY], VAN)
     with pytest.raises(ConfigError, match="corner_fl"):
         FleetSpec(vehicles=2, days=1, rig="van", own_rigs=(("vehicle-1", "demo"),), faults=faults)
+
+
+def test_cameras_of_a_car_without_a_lidar_have_an_image_some_metres_before_each_moment(
+    tmp_path, read, the_log, monkeypatch
+):
+    rig = rig_named("no_lidar")
+    monkeypatch.setattr("pipeline.simulate.fleet.rig_named", lambda _: rig.changed(small))
+    simulate_fleet(
+        FleetSpec(vehicles=1, days=1, frames=2, drives=1, rig="no_lidar", environments="highway"), tmp_path
+    )
+    assert load_fleet(tmp_path / "fleet.toml").rigs["no_lidar"].reference == "nose"
+    messages = read(the_log(tmp_path))
+    speed = np.mean([m.twist.twist.linear.x for topic, _, m in messages if topic == "/vehicle/odometry"])
+    for name in ("front", "left", "right"):
+        stamps = sorted(stamp for topic, stamp, _ in messages if topic == f"/camera/{name}/image/compressed")
+        labels = sorted(stamp for topic, stamp, _ in messages if topic == f"/perception/{name}/labels")
+        assert len(labels) >= 2
+        for moment in labels[-1:]:
+            before = max(stamp for stamp in stamps if stamp < moment and stamp not in labels)
+            assert 1.5 < (moment - before) * 1e-9 * speed < 6.0
+    assert rig_named("demo-pairs").image_pairs
+    assert not rig_named("demo").image_pairs
