@@ -15,23 +15,10 @@ from pipeline.simulate.sensors.mounting import Mounting, mounting_of
 from pipeline.simulate.sensors.radar import Scan
 from pipeline.simulate.sensors.rig_spec import RigSpec
 from pipeline.simulate.sensors.rigs import rig_named
-from pipeline.simulate.sensors.semantics import Box, SemanticsSpec
-from pipeline.simulate.sensors.simulated_frame import Scene, Seat, frame_of, scene_of, triggered_stamps
+from pipeline.simulate.sensors.semantics import SemanticsSpec
+from pipeline.simulate.sensors.simulated_frame import Image, Scene, Seat, frame_of, scene_of, triggered_stamps
 from pipeline.simulate.world.casting import Moment, World
 from pipeline.simulate.world.drives import Drive
-
-
-@dataclass(frozen=True, eq=False)
-class Trio:
-    """What camera, lidar and radar of a rig of three deliver for one moment."""
-
-    lidar_stamp_s: float
-    camera_stamp_s: float
-    jpeg: bytes
-    boxes: list[Box]
-    sweep: Sweep
-    scan: Scan
-    true_labels: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +30,11 @@ class Shot:
     moment: Moment
     rig: RigSpec
     mounting: Mounting
-    frame: Trio
+    lidar_stamp_s: float
+    camera_stamp_s: float
+    image: Image
+    sweep: Sweep
+    scan: Scan
 
 
 def shots_of(environment, *, rig=None, times=(1.0, 4.0), seed=5, night=False):
@@ -56,10 +47,8 @@ def shots_of(environment, *, rig=None, times=(1.0, 4.0), seed=5, night=False):
         rng = np.random.default_rng([7, int(10 * t)])
         stamps = triggered_stamps(rig, mounting, t, rng)
         seen = frame_of(Seat(moment, scene, rig, mounting), stamps, rng, SemanticsSpec())
-        image = seen.images["camera"]
-        clouds = seen.sweeps["lidar"], seen.scans["radar"]
-        frame = Trio(t, stamps["camera"], image.jpeg, image.boxes, *clouds, image.true_labels)
-        shots.append(Shot(drive, scene, moment, rig, mounting, frame))
+        measured = seen.images["camera"], seen.sweeps["lidar"], seen.scans["radar"]
+        shots.append(Shot(drive, scene, moment, rig, mounting, t, stamps["camera"], *measured))
     return shots
 
 
@@ -76,13 +65,6 @@ def highway():
 @pytest.fixture(scope="session")
 def shots(urban, highway):
     return [*urban, *highway]
-
-
-@pytest.fixture(scope="session")
-def flat_shot():
-    rig = rig_named("ring16-flat")
-    small = rig.with_sheet("lidar", replace(rig["lidar"].sheet, columns=450))
-    return shots_of("urban", rig=small, times=(2.0,))[0]
 
 
 @pytest.fixture(scope="session")

@@ -10,7 +10,7 @@ import pytest
 from pipeline.core.errors import ConfigError
 from pipeline.rig.se3 import inverse, log_so3
 from pipeline.rig.topics import TOPICS
-from pipeline.simulate.faults import Fault, faults_on, parse_faults
+from pipeline.simulate.faults import Fault, parse_faults
 from pipeline.simulate.fleet import FleetSpec, mounting_on, simulate_vehicle_day
 
 DAYS = ["2026-03-02", "2026-03-03", "2026-03-04"]
@@ -49,18 +49,6 @@ def test_a_motion_over_time_is_as_far_as_the_day_has_come(fault, moments, expect
     spec = spec_with(*parse_faults(f"vehicle-1:{fault}", DAYS))
     turned = [turned_deg(spec, day, share=share) for day, share in moments]
     np.testing.assert_allclose(turned, expected, atol=1e-6)
-
-
-def test_a_knock_within_a_day_is_seen_by_its_later_frames_only(tmp_path, read, the_log):
-    quiet = {**QUIET, "vehicles": 1, "days": 1, "frames": 2}
-    clouds = {}
-    for name, faults in (("still", ""), ("knocked", "vehicle-1:0:lidar:yaw:5@0.5")):
-        spec = FleetSpec(**quiet, faults=parse_faults(faults, DAYS))
-        simulate_vehicle_day(spec, 0, 0, tmp_path / name)
-        messages = read(the_log(tmp_path / name))
-        clouds[name] = [bytes(m.data) for topic, _, m in messages if topic == TOPICS["lidar"]]
-    assert clouds["still"][0] == clouds["knocked"][0]
-    assert clouds["still"][1] != clouds["knocked"][1]
 
 
 def test_a_shift_moves_the_sensor_and_a_late_clock_the_stamps():
@@ -109,13 +97,6 @@ def wrong_labels(found, good):
     return np.mean(decoded(found[TOPICS["labels"]]) != decoded(good[TOPICS["labels"]]))
 
 
-def test_a_missing_sensor_is_missing_and_the_others_are_not(logged):
-    found, truth = logged("lidar:missing:1")
-    assert TOPICS["lidar"] not in found
-    assert {TOPICS["image"], TOPICS["radar"]} <= found.keys()
-    assert truth["faults"][0]["kind"] == "missing"
-
-
 def test_swapped_sensors_carry_one_another_s_points(logged):
     found, _ = logged("radar:swap:1")
     assert "doppler" in [f.name for f in found[TOPICS["lidar"]].fields]
@@ -146,14 +127,6 @@ def test_night_is_dark_and_confuses_the_networks_and_dusk_less(logged):
         assert truth["drives"][0]["night"]
     assert 0.02 < wrong["dusk"] < 0.6 * wrong["night"]
     assert wrong["night"] > 0.1
-
-
-def test_faults_on_another_day_leave_this_one_alone():
-    faults = (Fault("vehicle-1", 2, "lidar", "missing", 1.0), Fault("vehicle-1", 2, "camera", "few", 3.0))
-    assert not faults_on(faults, "vehicle-1", 1).faults
-    assert faults_on(faults, "vehicle-1", 2).has("missing", "lidar")
-    assert not faults_on(faults, "vehicle-1", 2).has("missing", "camera")
-    assert faults_on(faults, "vehicle-1", 2).amount("few") == 3
 
 
 def test_faults_are_read_from_text_by_day_or_number():

@@ -56,26 +56,6 @@ def test_beams_pass_the_windows_of_hollow_cars_to_the_seats_and_to_what_stands_b
     assert deep == through == 0
 
 
-@pytest.mark.parametrize(("name", "share"), [("mesh", 0.7), ("hedge", 0.35)])
-def test_a_share_of_the_beams_passes_wire_and_leaves(name, share):
-    b = MeshBuilder()
-    b.quads(np.array([[[8, -10, 0], [8, 10, 0], [8, 10, 8], [8, -10, 8]]]), name)
-    sweep = sweep_of(b.mesh())
-    ahead = sweep.xyz_m[:, 2] > np.tan(np.radians(-4.5)) * sweep.xyz_m[:, 0]  # not at the ground between
-    beyond = ahead & (sweep.xyz_m[:, 0] > 12)
-    assert abs(beyond.sum() / ahead.sum() - share) < 0.08
-
-
-def test_lacquer_seen_edge_on_gives_no_echo():
-    flat = {}
-    for name in ("car_paint", "car_lacquer"):
-        b = MeshBuilder()
-        b.quads(np.array([[[8, -2, 1.5], [11, -2, 1.5], [11, 2, 1.5], [8, 2, 1.5]]]), name)
-        flat[name] = int((sweep_of(b.mesh()).label == LABELS.index("car")).sum())
-    assert flat["car_paint"] > 50
-    assert flat["car_lacquer"] < 0.1 * flat["car_paint"]
-
-
 def test_where_the_infrared_is_blind_a_lidar_does_not_see_markings():
     told = {}
     for infrared in (True, False):
