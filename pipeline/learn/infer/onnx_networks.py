@@ -20,7 +20,6 @@ from pipeline.learn.infer.single_frame import SingleFrameCalibrator
 from pipeline.learn.sample.camera_maps import class_likelihood
 from pipeline.learn.sample.frame_sample import About, sensor_row
 from pipeline.learn.sample.grid import Grid
-from pipeline.learn.sample.layout import PAIRS as ROWS
 from pipeline.learn.sample.rendering import FrameSensors, frame_sensors
 from pipeline.objective.paper.classes import labels_of
 from pipeline.rig.cameras import camera_of
@@ -128,16 +127,10 @@ class OnnxNetwork:
 
     def answer(self, sensors: FrameSensors, guess: Mapping[str, np.ndarray]) -> FrameAnswer:
         """Transforms of the last pass; raises ModelError for inputs that this version does not render."""
-        three = (guess["camera_lidar"], guess["lidar_radar"], guess["camera_radar"])
         try:
-            last = self._calibrator.estimate(sensors, *three, self._iterations)[-1]
+            return self._calibrator.estimate(sensors, guess, self._iterations)[-1]
         except InvalidArgument as err:
             raise ModelError(str(self._path), f"was exported by another version: {err}") from err
-        variance = np.exp(np.clip(last.log_variance, -20.0, 5.0))
-        return FrameAnswer(
-            {pair: last.of(pair) for pair in self.pairs},
-            {pair: variance[ROWS.index(pair)] for pair in self.pairs},
-        )
 
 
 @dataclass(eq=False)

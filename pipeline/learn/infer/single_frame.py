@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,37 +19,15 @@ from jaxtyping import Float
 
 from pipeline.core.errors import ModelError
 from pipeline.learn.infer.class_evidence import FrameEvidence
+from pipeline.learn.infer.frame_network import FrameAnswer
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import EVIDENCE, PAIRS, NetworkConfig
 from pipeline.learn.sample.rendering import FrameSensors, render_frame
 from pipeline.rig.se3 import inverse, transform_points
 
-__all__ = ["FrameEstimate", "SingleFrameCalibrator", "config_from_metadata", "split_graph"]
+__all__ = ["SingleFrameCalibrator", "config_from_metadata", "split_graph"]
 
 _ANSWERS = ["corrections", "log_variance"]
-
-
-@dataclass(frozen=True, eq=False)
-class FrameEstimate:
-    """Extrinsics from one frame after one pass, with the network's variances.
-
-    `log_variance` has a row per pair of PAIRS and a column per component of a left twist (rotation vector
-    [rad], translation [m]). Pairs that are not in `estimated` keep their guess.
-    """
-
-    T_camera_lidar: Float[np.ndarray, "4 4"]
-    T_camera_radar: Float[np.ndarray, "4 4"]
-    T_lidar_radar: Float[np.ndarray, "4 4"]
-    log_variance: Float[np.ndarray, "3 6"]
-    estimated: tuple[str, ...]
-
-    def of(self, pair: str) -> Float[np.ndarray, "4 4"]:
-        """The transform of a pair."""
-        return {
-            "camera_lidar": self.T_camera_lidar,
-            "camera_radar": self.T_camera_radar,
-            "lidar_radar": self.T_lidar_radar,
-        }[pair]
 
 
 class SingleFrameCalibrator:
@@ -76,30 +53,29 @@ class SingleFrameCalibrator:
         return self.config.grid
 
     def estimate(
-        self,
-        sensors: FrameSensors,
-        T_camera_lidar: Float[np.ndarray, "4 4"],
-        T_lidar_radar: Float[np.ndarray, "4 4"],
-        T_camera_radar: Float[np.ndarray, "4 4"] | None = None,
-        iterations: int = 3,
-    ) -> list[FrameEstimate]:
-        """Estimates after each pass, rendered at the last rotation (`CalibrationNetwork.refine`).
+        self, sensors: FrameSensors, guess: Mapping[str, Float[np.ndarray, "4 4"]], iterations: int = 3
+    ) -> list[FrameAnswer]:
+        """Answers of each pass, rendered at the last rotation (`CalibrationNetwork.refine`).
 
         Args:
-            T_camera_radar: the guess; the product of the other two where left out.
+            guess: of every pair.
             iterations: passes; two for guesses within 3 deg, three beyond.
         """
-        camera_radar = T_camera_lidar @ T_lidar_radar if T_camera_radar is None else T_camera_radar
-        guess = (T_camera_lidar, camera_radar, T_lidar_radar)
         known = self._of_camera(sensors)
-        found: list[FrameEstimate] = []
+        found: list[FrameAnswer] = []
         for _ in range(iterations):
-            view = render_frame(sensors, *guess, self.grid, self._channels, marks=self.config.marks) | known
-            feed = {name: view[name] for name in self._inputs}
+            camera_lidar, camera_radar, lidar_radar = (guess[pair] for pair in PAIRS)
+            view = render_frame(
+                sensors, camera_lidar, camera_radar, lidar_radar, self.grid, self._channels,
+                marks=self.config.marks,
+            )  # fmt: skip
+            feed = {name: (view | known)[name] for name in self._inputs}
             corrections, log_variance = self._network.run(_ANSWERS, feed)
             step = corrections[0].astype(np.float64)
-            answer = self._corrected(step, guess)
-            found.append(FrameEstimate(*answer, log_variance[0].astype(np.float64), self.config.estimated))
+            variance = np.exp(np.clip(log_variance[0].astype(np.float64), -20.0, 5.0))
+            answer, own = self._corrected(step, guess), self.config.estimated
+            of_pair = dict(zip(PAIRS, variance, strict=True))
+            found.append(FrameAnswer({p: answer[p] for p in own}, {p: of_pair[p] for p in own}))
             step[:, :3, 3] = 0.0
             guess = self._corrected(step, guess)
         return found
@@ -133,13 +109,14 @@ class SingleFrameCalibrator:
         return dict(zip((o.name for o in self._once.get_outputs()), values, strict=True))
 
     def _corrected(
-        self, corrections: Float[np.ndarray, "3 4 4"], guess: tuple[np.ndarray, np.ndarray, np.ndarray]
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Corrected camera_lidar, camera_radar and lidar_radar (as `calibration_network.compose`)."""
-        camera_lidar = _rigid(corrections[0] @ guess[0])
-        lidar_radar = _rigid(corrections[2] @ guess[2])
-        base = camera_lidar @ lidar_radar if self.config.composed else guess[1]
-        return camera_lidar, _rigid(corrections[1] @ base), lidar_radar
+        self, corrections: Float[np.ndarray, "3 4 4"], guess: Mapping[str, np.ndarray]
+    ) -> dict[str, np.ndarray]:
+        """Corrected transforms by pair (as `calibration_network.compose`)."""
+        camera_lidar = _rigid(corrections[0] @ guess["camera_lidar"])
+        lidar_radar = _rigid(corrections[2] @ guess["lidar_radar"])
+        base = camera_lidar @ lidar_radar if self.config.composed else guess["camera_radar"]
+        found = (camera_lidar, _rigid(corrections[1] @ base), lidar_radar)
+        return dict(zip(PAIRS, found, strict=True))
 
 
 def config_from_metadata(path: Path, metadata: Mapping[str, str]) -> NetworkConfig:

@@ -45,13 +45,7 @@ def test_an_epoch_shows_every_frame_once_in_another_order_each_time(lake):
     assert neighbours < 0.75  # in order it would be 0.92
 
 
-def test_the_seed_decides_the_order(lake):
-    first, same, other = (taken(TrainingLoader(lake, 3, seed=s), 20) for s in (1, 1, 2))
-    assert first == same
-    assert first != other
-
-
-@pytest.mark.parametrize("after", [0, 1, 5, 13, 27])
+@pytest.mark.parametrize("after", [1, 13])
 def test_a_resumed_loader_continues_as_if_nothing_had_happened(lake, after):
     whole = TrainingLoader(lake, 3, seed=4, window_groups=2)
     begun = TrainingLoader(lake, 3, seed=4, window_groups=2)
@@ -114,13 +108,6 @@ def test_a_changed_table_or_another_order_refuses_to_resume(lake, tmp_path):
     training_lakes.prepare_all(other, training_lakes.fleet_of(VEHICLES, by=["vehicle"]))
     with pytest.raises(ContractError, match="changed"):
         TrainingLoader(other, 3, seed=1).load_state_dict(state)
-
-
-def test_too_little_data_is_said(lake, tmp_path):
-    with pytest.raises(ContractError, match="not enough for 99"):
-        TrainingLoader(lake, 3, rank_of=(0, 99))
-    with pytest.raises(ContractError, match="run `boresight prepare`"):
-        TrainingLoader(training_lakes.Lake.at(tmp_path), 3)
 
 
 def test_rows_of_two_grids_are_refused(tmp_path):

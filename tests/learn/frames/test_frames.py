@@ -33,6 +33,7 @@ EGO = {
 }  # fmt: skip
 NO_POSE = dict.fromkeys(("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m", "covariance"))
 SECTION = '[prepare.split]\nby = "vehicle"\nval_fraction = 0.2\ntest_fraction = 0.2'
+ONE_SPLIT = '[prepare.split]\nby = "day"\nval_fraction = 0\ntest_fraction = 0'
 
 
 @pytest.fixture(scope="module")
@@ -46,23 +47,16 @@ def lake(tmp_path_factory):
     return folder
 
 
-def command(lake, out, form, of=None):
-    call = [
-        "export",
-        "frames",
-        "--fleet",
-        str(lake / "fleet.toml"),
-        "--lake",
-        str(of or lake),
-        "--out",
-        str(out),
-    ]
-    return [*call, "--format", form, "--executor", "inline", "--calibration", "prior"]
+def command(lake, out, form, *more, of=None, fleet=None):
+    """The words of a command; calibrations are the priors unless asked for otherwise."""
+    places = {"--fleet": fleet or lake / "fleet.toml", "--lake": of or lake, "--out": out, "--format": form}
+    source = [] if "--calibration" in more else ["--calibration", "prior"]
+    words = [str(word) for place in places.items() for word in place]
+    return ["export", "frames", *words, "--executor", "inline", *source, *more]
 
 
-def export(lake, out, form, *more, code=0):
-    call = command(lake, out, form)
-    assert main([*(call[:-2] if "--calibration" in more else call), *more]) == code
+def export(lake, out, form, *more, code=0, fleet=None):
+    assert main(command(lake, out, form, *more, fleet=fleet)) == code
     return None if code else json.loads((Path(out) / "card.json").read_text())
 
 
@@ -91,7 +85,11 @@ def test_files_hold_every_frame_once(lake, tmp_path):
     assert sum(card["frames"].values()) == len(wanted) == 24
     assert all(card["frames"].values())
     assert all(name.startswith(f"{split}/") for split, names in card["files"].items() for name in names)
-    frames = [found for split in card["files"] for found in Frames(str(tmp_path), split)]
+    of = {split: list(Frames(str(tmp_path), split)) for split in card["files"]}
+    vehicles = [{found["vehicle"] for found in own} for own in of.values()]
+    assert set.union(*vehicles) == set(VEHICLES)
+    assert sum(map(len, vehicles)) == len(VEHICLES)  # no split shares one
+    frames = [found for own in of.values() for found in own]
     assert len({found["key"] for found in frames}) == 24
     for found in frames:
         frame, sensors = wanted[found["vehicle"], found["day"], found["moment"]], found["sensors"]
@@ -101,13 +99,6 @@ def test_files_hold_every_frame_once(lake, tmp_path):
         T = {n: np.array(sensors[n]["T_reference_sensor"]) for n in ("camera", "lidar", "radar")}
         np.testing.assert_allclose(inverse(T["camera"]) @ T["lidar"], frame.priors["camera_lidar"], atol=1e-9)
         np.testing.assert_allclose(inverse(T["lidar"]) @ T["radar"], frame.priors["lidar_radar"], atol=1e-9)
-
-
-def test_no_split_shares_a_vehicle_and_a_frame_says_which_it_is_of(lake, tmp_path):
-    export(lake, tmp_path, "parquet")
-    of = {s: {f["vehicle"] for f in Frames(str(tmp_path), s)} for s in ("train", "val", "test")}
-    assert set.union(*of.values()) == set(VEHICLES)
-    assert sum(map(len, of.values())) == len(VEHICLES)
 
 
 def test_two_workers_of_torch_read_parquet_by_the_copy_of_the_dataset_that_lies_beside_it(lake, tmp_path):
@@ -135,36 +126,15 @@ def test_two_workers_of_torch_read_parquet_by_the_copy_of_the_dataset_that_lies_
 
 
 def test_frames_come_back_through_convert_and_ingest(lake, tmp_path):
-    toml = tmp_path / "fleet.toml"
-    toml.write_text(
-        fleet_toml("a", sections='[prepare.split]\nby = "day"\nval_fraction = 0\ntest_fraction = 0')
-    )
-    call = [
-        "export",
-        "frames",
-        "--fleet",
-        str(toml),
-        "--lake",
-        str(lake),
-        "--out",
-        str(tmp_path / "out"),
-        "--to",
-        DAYS[0],
-    ]
-    assert main([*call, "--format", "nuscenes", "--calibration", "prior", "--executor", "inline"]) == 0
+    toml, again = tmp_path / "fleet.toml", Lake.at(tmp_path / "again")
+    toml.write_text(fleet_toml("a", sections=ONE_SPLIT))
+    export(lake, tmp_path / "out", "nuscenes", "--to", DAYS[0], fleet=toml)
     assert main(["convert", "nuscenes", str(tmp_path / "out"), "--out", str(tmp_path / "logs")]) == 0
     logs = [str(p) for p in (tmp_path / "logs" / "logs" / "a" / DAYS[0]).iterdir()]
-    call = [
-        "ingest",
-        *logs,
-        "--fleet",
-        str(tmp_path / "logs" / "fleet.toml"),
-        "--lake",
-        str(tmp_path / "again"),
-    ]
+    call = ["ingest", *logs, "--fleet", str(tmp_path / "logs" / "fleet.toml"), "--lake", str(again.root)]
     assert main([*call, "--vehicle", "a", "--day", DAYS[0]]) == 0
     before = list(frames_of(Lake.at(lake), Partition("a", DAYS[0])))
-    after = list(frames_of(Lake.at(tmp_path / "again"), Partition("a", DAYS[0])))
+    after = list(frames_of(again, Partition("a", DAYS[0])))
     assert len(after) == len(before) == 4
     for was, found in zip(before, after, strict=True):
         np.testing.assert_array_equal(found.lidar_xyz_m, was.lidar_xyz_m)
@@ -177,39 +147,6 @@ def test_frames_come_back_through_convert_and_ingest(lake, tmp_path):
         np.testing.assert_array_equal(*pictures)
 
 
-def test_a_stopped_export_counts_nothing_half_and_is_completed_to_the_same_bytes(lake, tmp_path):
-    export(lake, tmp_path / "whole", "parquet")
-    export(lake, tmp_path / "again", "parquet")
-    wanted = contents(tmp_path / "whole")
-    assert contents(tmp_path / "again") == wanted
-    killed = tmp_path / "killed"
-    code = (
-        "import os, sys\nimport pipeline.learn.frames.day as day\nwrite, days = day._write, []\n"
-        "def dies(*at):\n    days.append(1)\n    told = write(*at)\n"
-        "    os._exit(9) if len(days) == 3 else None\n    return told\n"
-        "day._write = dies\nfrom jobs.cli import main\nmain(sys.argv[1:])\n"
-    )
-    call = [
-        "export",
-        "frames",
-        "--fleet",
-        str(lake / "fleet.toml"),
-        "--lake",
-        str(lake),
-        "--out",
-        str(killed),
-    ]
-    call += ["--format", "parquet", "--calibration", "prior", "--executor", "inline"]
-    done = subprocess.run([sys.executable, "-c", code, *call], capture_output=True, check=False)
-    assert done.returncode == 9
-    assert not (killed / "card.json").exists()
-    assert len(list(killed.rglob("done.json"))) == 2
-    old = {p: p.stat().st_mtime_ns for p in killed.rglob("done.json")}
-    export(lake, killed, "parquet")
-    assert contents(killed) == wanted
-    assert {p: p.stat().st_mtime_ns for p in old} == old  # what was whole was not made again
-
-
 def killed_export(lake, out, form, at, function="os.fsync", of=None):
     """Begin an export in a process that is killed, as by `kill -9`, in its n-th call of what writes a file."""
     module, _, name = function.rpartition(".")
@@ -220,13 +157,12 @@ def killed_export(lake, out, form, at, function="os.fsync", of=None):
         f"{module}.{name} = dies\nfrom jobs.cli import main\nmain(sys.argv[1:])\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code, *command(lake, out, form, of)], capture_output=True, check=False
+        [sys.executable, "-c", code, *command(lake, out, form, of=of)], capture_output=True, check=False
     )
     assert done.returncode == -9
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("form", ["parquet", "nuscenes"])
+@pytest.mark.parametrize("form", ["parquet", pytest.param("nuscenes", marks=pytest.mark.slow)])
 def test_an_export_killed_in_the_middle_of_a_file_goes_on_to_the_same_bytes(
     lake, tmp_path, monkeypatch, form
 ):
@@ -239,17 +175,18 @@ def test_an_export_killed_in_the_middle_of_a_file_goes_on_to_the_same_bytes(
     # Odd calls flush a file, even ones its folder.
     killed_export(lake, tmp_path / "out", form, len(flushes) // 2 | 1)
     assert list((tmp_path / "out").rglob("*.tmp"))
-    assert 0 < len(list((tmp_path / "out").rglob("done.json"))) < 6
+    whole = {p: p.stat().st_mtime_ns for p in (tmp_path / "out").rglob("done.json")}
+    assert 0 < len(whole) < 6
     export(lake, tmp_path / "out", form)
     assert contents(tmp_path / "out") == wanted
+    assert {p: p.stat().st_mtime_ns for p in whole} == whole  # what was whole was not made again
 
 
 @pytest.mark.parametrize("later", [6, 3])
 def test_files_of_a_killed_export_do_not_stay_when_its_days_are_planned_anew(tmp_path, later):
     own = tmp_path / "lake"
     own.mkdir()
-    one = SECTION.replace("vehicle", "day").replace("0.2", "0")
-    (own / "fleet.toml").write_text(fleet_toml("a", sections=one))
+    (own / "fleet.toml").write_text(fleet_toml("a", sections=ONE_SPLIT))
     training_lakes.fill(Lake.at(own), "a", DAYS[0], frames=4, **EGO)
     killed_export(own, tmp_path / "out", "nuscenes", 34)
     before = {p for p in contents(tmp_path / "out") if p.startswith("samples")}
@@ -263,8 +200,7 @@ def test_files_of_a_killed_export_do_not_stay_when_its_days_are_planned_anew(tmp
 
 def test_vehicles_whose_names_differ_in_a_dot_do_not_share_a_file(tmp_path):
     names = ("a.b", "a-b", "a%2Eb")
-    one = SECTION.replace("vehicle", "day").replace("0.2", "0")
-    (tmp_path / "fleet.toml").write_text(fleet_toml(*names, sections=one))
+    (tmp_path / "fleet.toml").write_text(fleet_toml(*names, sections=ONE_SPLIT))
     for name in names:
         training_lakes.fill(Lake.at(tmp_path), name, DAYS[0], frames=3, **EGO)
     card = export(tmp_path, tmp_path / "out", "parquet")
@@ -277,18 +213,14 @@ def test_vehicles_whose_names_differ_in_a_dot_do_not_share_a_file(tmp_path):
 def test_a_later_vehicle_takes_no_frame_from_a_split_that_has_it(lake, tmp_path, capsys):
     few = tmp_path / "few.toml"
     few.write_text(fleet_toml(*VEHICLES, sections=SECTION))
-    call = ["export", "frames", "--fleet", str(few), "--lake", str(lake), "--out", str(tmp_path / "out")]
-    call += ["--format", "parquet", "--calibration", "prior", "--executor", "inline"]
-    assert main([*call, "--to", DAYS[0]]) == 0
-    first = json.loads((tmp_path / "out" / "plan.json").read_text())["sides"]
-    assert main(call) == 0
-    assert [side for side in first if side[0] == "vehicle"] == first
-    assert json.loads((tmp_path / "out" / "plan.json").read_text())["sides"] == first
-    assert main([*call, "--seed", "4"]) == 2  # another export has another place
-    few.write_text(
-        fleet_toml(*VEHICLES, sections=f"{SECTION}\nplace_m = 50")
-    )  # cells of the same names elsewhere
-    assert main(call) == 2
+    out = tmp_path / "out"
+    export(lake, out, "parquet", "--to", DAYS[0], fleet=few)
+    first = json.loads((out / "plan.json").read_text())["sides"]
+    export(lake, out, "parquet", fleet=few)
+    assert json.loads((out / "plan.json").read_text())["sides"] == first
+    export(lake, out, "parquet", "--seed", "4", fleet=few, code=2)  # another export has another place
+    few.write_text(fleet_toml(*VEHICLES, sections=f"{SECTION}\nplace_m = 50"))  # same names of other cells
+    export(lake, out, "parquet", fleet=few, code=2)
     assert "another [prepare.split] place_m" in capsys.readouterr().out
 
 
@@ -306,11 +238,6 @@ def test_moved_poses_are_exactly_as_far_off_as_is_said_and_the_answer_stands_bes
             np.testing.assert_allclose((turn, np.linalg.norm(T[:3, 3] - answer[:3, 3])), wanted, atol=1e-9)
         draws.append(frame["sensors"]["camera"]["T_reference_sensor"])
     assert len({str(draw) for draw in draws}) == len(draws)
-    export(lake, tmp_path / "day", "parquet", "--perturb", "3", "0.2", "--seed", "5", "--perturb-per", "day")
-    days = {}
-    for frame in Frames(str(tmp_path / "day"), "train"):
-        days.setdefault((frame["vehicle"], frame["day"]), set()).add(str(frame["sensors"]["camera"]))
-    assert len(days) >= 2
 
 
 def states(lake, moved_on=None):
@@ -335,8 +262,7 @@ def states(lake, moved_on=None):
 def test_tonight_s_state_goes_out_with_its_sigmas_and_not_with_days_before_a_sensor_moved(tmp_path):
     for day in DAYS:
         training_lakes.fill(Lake.at(tmp_path), "a", day, frames=4, **EGO)
-    one = '[prepare.split]\nby = "day"\nval_fraction = 0\ntest_fraction = 0'
-    (tmp_path / "fleet.toml").write_text(fleet_toml("a", sections=one))
+    (tmp_path / "fleet.toml").write_text(fleet_toml("a", sections=ONE_SPLIT))
     priors = states(tmp_path)
     card = export(tmp_path, tmp_path / "out", "parquet", "--calibration", "state")
     assert card["frames"]["train"] == 8
@@ -389,16 +315,13 @@ def test_an_undistorted_image_shows_a_ray_where_a_pinhole_does_and_boxes_and_lab
 
 def test_a_camera_that_a_plane_cannot_show_is_refused_in_a_sentence(lake, tmp_path, capsys):
     wide = Lake.at(tmp_path / "wide")
-    f = 640 / np.radians(95)
-    K = np.array([[f, 0, 639.5], [0, f, 359.5], [0, 0, 1]])
-    eye = {"camera_model": "equidistant", "camera_K": K, "camera_D": np.zeros(4)}
     frame = next(iter(lake_frames(lake).values()))
-    eye["camera_K"][0, 2], eye["camera_K"][1, 2] = frame.image_width_px / 2, frame.image_height_px / 2
-    eye["camera_K"][0, 0] = eye["camera_K"][1, 1] = frame.image_width_px / 2 / np.radians(95)
+    width, height = frame.image_width_px, frame.image_height_px
+    focal = width / 2 / np.radians(95)
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    eye = {"camera_model": "equidistant", "camera_K": K, "camera_D": np.zeros(4)}
     training_lakes.fill(wide, "a", DAYS[0], frames=3, **EGO, **eye)
-    (tmp_path / "wide" / "fleet.toml").write_text(
-        fleet_toml("a", sections='[prepare.split]\nby = "day"\nval_fraction = 0\ntest_fraction = 0')
-    )
+    (tmp_path / "wide" / "fleet.toml").write_text(fleet_toml("a", sections=ONE_SPLIT))
     export(tmp_path / "wide", tmp_path / "nuscenes", "nuscenes", code=1)
     assert "sees 190 deg, and an undistorted image can show 170 at most" in capsys.readouterr().out
     assert not list((tmp_path / "nuscenes" / "samples").rglob("*.jpg"))

@@ -47,28 +47,9 @@ def test_memory_does_not_grow_with_the_number_of_frames(lakes, form, tmp_path):
     peaks_mib = []
     for frames, lake in lakes:
         out = tmp_path / str(frames)
-        call = [
-            sys.executable,
-            "-c",
-            EXPORT,
-            "export",
-            "frames",
-            "--fleet",
-            lake / "fleet.toml",
-            "--lake",
-            lake,
-        ]
-        call += [
-            "--out",
-            out,
-            "--format",
-            form,
-            "--calibration",
-            "prior",
-            "--unsplit",
-            "--executor",
-            "inline",
-        ]
+        places = ["--fleet", lake / "fleet.toml", "--lake", lake, "--out", out, "--format", form]
+        more = ["--calibration", "prior", "--unsplit", "--executor", "inline"]
+        call = [sys.executable, "-c", EXPORT, "export", "frames", *places, *more]
         done = subprocess.run(call, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
         assert f'"train": {frames}' in (out / "card.json").read_text()

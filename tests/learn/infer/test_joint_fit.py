@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.learn.infer.class_evidence import FrameEvidence, scores
-from pipeline.learn.infer.joint_day import climbed, fit_of, fitted_day, rival_score, voted
+from pipeline.learn.infer.joint_day import climbed, fit_of, fitted_day
 from pipeline.learn.sample.grid import Grid
 from pipeline.rig.estimates import Prior
 from pipeline.rig.se3 import exp_se3, inverse, log_se3, transform_points
@@ -107,11 +107,6 @@ def test_frames_that_show_nothing_leave_the_prior_and_say_so(day):
     assert not found.information.any()
 
 
-def test_the_vote_puts_the_pose_first_that_most_frames_fit(day):
-    candidates = [off_by(0.05, 0, 0, 0, 0, 0), off_by(0.002, 0, 0, 0, 0, 0), off_by(0, 0.03, 0, 0, 0, 0)]
-    assert voted(day, candidates)[0] is candidates[1]
-
-
 def test_evidence_that_is_astray_by_scenes_weighs_little():
     """Paint of every scene is turned by another degree: the classes decide."""
     turn = np.radians(np.random.default_rng(3).normal(0, 1.0, (8, 3)))
@@ -144,8 +139,3 @@ def test_frames_that_fit_in_two_places_alike_fail_a_check():
     mixed = [frame(seed, turned if seed // 2 % 2 else T_CAMERA_LIDAR) for seed in range(16)]
     found, _ = fitted(mixed, [T_CAMERA_LIDAR, turned])
     assert any("frames do not agree" in check.sentence for check in found.failed)
-
-
-def test_poses_on_one_peak_are_no_rivals(day):
-    assert rival_score(day, BLOCK, T_CAMERA_LIDAR, off_by(0.001, 0, 0, 0, 0, 0)) == np.inf
-    assert rival_score(day, BLOCK, T_CAMERA_LIDAR, off_by(0.05, 0, 0, 0, 0, 0)) > 3

@@ -12,6 +12,7 @@ from pipeline.learn.infer.onnx_networks import SHIPPED, model_files, open_networ
 from pipeline.rig.targets import errors_at_targets
 from schemas.calibrations import PAIRS
 from tests.makers.simulated_days import simulated_day
+from tests.makers.training_lakes import fleet_of
 
 MODEL, WITH_CLASSES = SHIPPED / "joint.onnx", SHIPPED / "joint_classes.onnx"
 both = pytest.mark.parametrize("model", [MODEL, WITH_CLASSES], ids=lambda path: path.stem)
@@ -40,10 +41,11 @@ def test_its_card_says_what_it_comes_from_and_what_it_cannot_do(model):
     assert any("translations" in limit for limit in card["limits"])
 
 
-def test_a_fleet_that_names_no_network_gets_the_one_that_fits_what_it_is_shown(day):
-    assert model_files("joint-ssl", day.fleet) == {"joint": WITH_CLASSES}
-    assert model_files("joint-ssl", day.fleet.changed(learn={"camera": "classes"})) == {"joint": WITH_CLASSES}
-    assert model_files("joint-ssl", day.fleet.changed(learn={"camera": "image"})) == {"joint": MODEL}
+@pytest.mark.parametrize(
+    ("camera", "model"), [("both", WITH_CLASSES), ("classes", WITH_CLASSES), ("image", MODEL)]
+)
+def test_a_fleet_that_names_no_network_gets_the_one_that_fits_what_it_is_shown(camera, model):
+    assert model_files("joint-ssl", fleet_of("a").changed(learn={"camera": camera})) == {"joint": model}
 
 
 @pytest.mark.slow

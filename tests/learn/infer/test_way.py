@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.learn.infer.pitch_by_travel import WayTurn, informed_by_way, updated_by_way, way_turn
 from pipeline.rig.estimates import PairEstimate, Prior, Solution
-from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse, log_se3
+from pipeline.rig.se3 import inverse, log_se3
 from schemas.calibrations import PAIRS
 from tests.makers.doppler_streets import GROUND_M, T_LIDAR_RADAR, day_of, scene, turned
 from tests.makers.solve_scenes import T_CAMERA_LIDAR
@@ -104,16 +104,6 @@ def test_a_network_whose_detections_point_wrong_gives_way_in_both_radar_pairs(st
     assert told["camera_lidar"] is solution.pairs["camera_lidar"]
 
 
-def test_pairs_that_were_not_asked_for_keep_their_prior(street):
-    solution = solution_at(turned(T_LIDAR_RADAR, 0.03), T_CAMERA_LIDAR @ T_LIDAR_RADAR)
-    kept = replace(solution.pairs["lidar_radar"], frames_used=0)
-    told = informed_by_way(
-        replace(solution, pairs=solution.pairs | {"lidar_radar": kept}), street, prior()
-    ).pairs
-    assert told["lidar_radar"] is kept
-    assert told["camera_radar"] is not solution.pairs["camera_radar"]
-
-
 def test_what_agrees_is_averaged_by_information_and_gets_surer():
     before = estimate_of("lidar_radar", T_LIDAR_RADAR)
     after = updated_by_way(before, numbers(WAY, 0.1), PRIOR_COVARIANCE)
@@ -125,13 +115,6 @@ def test_what_agrees_is_averaged_by_information_and_gets_surer():
     assert np.array_equal(np.delete(np.diag(after.covariance)[:3], 1), np.delete(SIGMA[:3] ** 2, 1))
 
 
-def test_a_way_that_is_unsure_leaves_the_network_where_it_was():
-    before = estimate_of("lidar_radar", T_LIDAR_RADAR)
-    after = updated_by_way(before, numbers(WAY, 1.0, sigma_deg=60.0), PRIOR_COVARIANCE)
-    np.testing.assert_allclose(after.T, before.T, atol=1e-5)
-    np.testing.assert_allclose(after.covariance, before.covariance, atol=1e-5 * SIGMA.max())
-
-
 @pytest.mark.parametrize("turn_deg", [0.0, 0.5, 3.0])
 def test_covariances_stay_covariances_and_the_common_part_stays_inside(turn_deg):
     after = updated_by_way(
@@ -140,25 +123,3 @@ def test_covariances_stay_covariances_and_the_common_part_stays_inside(turn_deg)
     scale = 1 / np.sqrt(np.diag(after.covariance))
     for part in (after.covariance, after.common_covariance, after.covariance - after.common_covariance):
         assert np.linalg.eigvalsh(part * np.outer(scale, scale)).min() > -1e-9
-
-
-def test_pitch_that_the_network_did_not_know_is_determined_by_the_way_and_nothing_else_is():
-    blind = SIGMA.copy()
-    blind[1] = np.radians(2.0)
-    before = replace(
-        estimate_of("lidar_radar", T_LIDAR_RADAR, blind), observable=np.array([0, 0, 1, 1, 1, 0], bool)
-    )
-    after = updated_by_way(before, numbers(WAY, 1.5), PRIOR_COVARIANCE)
-    assert after.observable.tolist() == [False, True, True, True, True, False]
-    assert after.observability[1] > 0.9
-
-
-def test_the_turn_of_a_tilted_parent_is_about_the_same_line():
-    """Asked about camera_radar the way says the same as about lidar_radar where camera_lidar is exact."""
-    street = day_of(5, 12, noise_deg=0.5)
-    wrong = turned(T_LIDAR_RADAR, np.radians(1.0))
-    told = informed_by_way(solution_at(wrong, T_CAMERA_LIDAR @ wrong, 1e-6), street, prior()).pairs
-    offsets = [told[p].diagnostics["doppler_pitch_offset_rad"] for p in ("lidar_radar", "camera_radar")]
-    assert offsets[0] == pytest.approx(offsets[1], abs=1e-9)
-    rotated = from_rotation_translation(exp_so3(np.array([0.0, 0.0, 0.4])) @ wrong[:3, :3], wrong[:3, 3])
-    assert way_turn(street, rotated).axis @ [0, 1, 0] < 0.95

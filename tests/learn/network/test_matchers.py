@@ -7,21 +7,18 @@ import pytest
 import torch
 
 from pipeline.learn.network.class_matcher import NEUTRAL, ClassMatcher
-from pipeline.learn.network.encoders import LidarEncoder
 from pipeline.learn.network.least_squares import (
     angular_jacobian,
-    inverse_spd,
     small_rotation_vector,
     spherical_jacobian,
 )
-from pipeline.learn.network.matching_network import MatchingCore, confusions_of, continued_beyond
+from pipeline.learn.network.matching_network import MatchingCore
 from pipeline.learn.network.occupancy_matcher import OccupancyMatcher, _away, _kernel
 from pipeline.learn.network.outputs import pose_of_twist
 from pipeline.learn.sample.grid import Grid, grid_rays
 from pipeline.learn.sample.layout import CAMERA_CHANNELS, CLASS_CHANNELS
 from pipeline.rig.se3 import exp_se3, exp_so3
 from pipeline.rig.spherical import camera_direction_angles, to_spherical
-from schemas.training import GRID_CLASSES
 
 GRID = Grid()
 
@@ -90,18 +87,6 @@ def test_a_known_turn_about_each_axis_is_undone(axis, angle_deg):
     assert np.abs(turn).max() < 0.12
 
 
-def test_random_turns_of_three_degrees_and_shifts_are_undone_to_a_tenth():
-    rng = np.random.default_rng(3)
-    left = []
-    for _ in range(8):
-        T = np.eye(4)
-        T[:3, :3] = exp_so3(np.radians(rng.uniform(-3, 3, 3)))
-        T[:3, 3] = rng.uniform(-0.03, 0.03, 3)
-        turn, _, _ = matched(T)
-        left.append(np.abs(turn))
-    assert np.mean(left, axis=0).max() < 0.15  # a 3 cm shift alone looks like 0.1 deg at 17 m
-
-
 def test_parallax_tells_a_sideways_shift_from_a_turn():
     matcher = ClassMatcher(GRID)
     with torch.no_grad():
@@ -134,18 +119,6 @@ def test_a_narrow_image_does_not_push_points_out_of_itself():
     assert left < 0.5
 
 
-def test_single_cells_get_the_logits_that_the_whole_sweep_gives_them():
-    encoder = LidarEncoder(6, 10, 8)
-    generator = torch.Generator().manual_seed(3)
-    sweep = torch.rand(2, 6, 16, 32, generator=generator)
-    row, column = (torch.randint(side, (2, 50), generator=generator) for side in (16, 32))
-    with torch.no_grad():
-        whole = encoder(sweep)
-        single = encoder.logits_at(encoder.features(sweep), sweep, row, column)
-    wanted = whole[torch.arange(2)[:, None], :, row, column]
-    assert single.numpy() == pytest.approx(wanted.numpy(), abs=1e-5)
-
-
 @pytest.mark.parametrize("apart_m", [0.1, 60.0])
 def test_kernels_of_points_far_apart_are_no_subnormal_numbers(apart_m):
     """Ten times as long does a product of matrices take with them."""
@@ -176,28 +149,6 @@ def test_edges_find_the_boundaries_of_what_nobody_knows_the_class_of():
         left[edges] = 2.5 + np.degrees(float(found.twist[0, 1]))  # upright boundaries tell azimuth alone
     assert left[0.0] > 1.0
     assert abs(left[1.0]) < 0.2
-
-
-def test_classes_are_confused_with_their_like_and_never_with_the_sky():
-    found = confusions_of(0.6, 0.3)
-    assert torch.allclose(found.sum(1), torch.ones(10))
-    name = GRID_CLASSES.index
-    assert found[name("sky"), name("sky")] == 1
-    assert found[name("road"), name("verge")] == pytest.approx(0.3)
-    building = found[name("building")]
-    assert building[name("building")] > building[name("vegetation")] > building[name("vehicle")] > 0
-    assert building[name("road")] == 0
-    assert torch.equal(confusions_of(0.0, 0.0), torch.eye(10))
-
-
-def test_beyond_the_image_goes_on_what_is_seen_at_its_border():
-    seen = torch.zeros(1, 1, 16, 32)
-    seen[..., 4:10, 8:20] = 1
-    maps = torch.arange(16.0 * 32).reshape(1, 1, 16, 32)
-    filled = continued_beyond(maps, seen)[0, 0]
-    rows = torch.arange(16).clamp(4, 9)[:, None]
-    columns = torch.arange(32).clamp(8, 19)[None]
-    assert torch.equal(filled, (rows * 32 + columns).float())
 
 
 def test_blind_cameras_move_nothing_and_leave_the_prior_s_variance():
@@ -262,12 +213,6 @@ def test_a_radar_without_elevation_turns_about_the_upright_axis_alone():
     assert left[:2] == pytest.approx([1.0, 2.0], abs=0.2)
     # Nothing was learned of roll and pitch: their variance is the prior's.
     assert found.variance[0, :2].sqrt().numpy() == pytest.approx(0.02, rel=0.1)
-
-
-def test_elimination_inverts_what_numpy_inverts():
-    A = np.random.default_rng(0).normal(size=(5, 6, 6))
-    H = A @ A.transpose(0, 2, 1) + np.eye(6)
-    assert inverse_spd(torch.tensor(H)).numpy() == pytest.approx(np.linalg.inv(H), abs=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,7 @@ import pytest
 
 from jobs.cli import main
 from pipeline.core.config import load_fleet
-from pipeline.core.errors import ContractError
-from pipeline.learn.prepare.inventory import alike, read_leaks, take_inventory, write_inventory
+from pipeline.learn.prepare.inventory import read_leaks, take_inventory, write_inventory
 from pipeline.learn.prepare.sides import frame_sides
 from pipeline.learn.prepare.survey import plan_days, survey_day
 from pipeline.rig.se3 import exp_se3
@@ -47,15 +46,6 @@ def test_no_vehicle_day_or_place_is_on_two_sides(tmp_path):
     assert all(r.status == "done" for r in results.values())
 
 
-def test_a_fleet_that_shares_days_is_on_one_side_by_all_keys(tmp_path):
-    days = [f"2026-01-0{d}" for d in range(1, 4)]
-    lake = training_lakes.fleet_lake(tmp_path, ("a", "b", "c"), days, frames=2)
-    results = training_lakes.prepare_all(lake, training_lakes.fleet_of(("a", "b", "c")))
-    rows = rows_of(lake)
-    assert ({r.split for r in rows}, len(rows)) == ({"train"}, 18)
-    assert sum(r.rejected.get("split_conflict", 0) for r in results.values()) == 0
-
-
 def test_one_day_is_split_by_stretches_with_a_guard_between_them(tmp_path):
     lake = Lake.at(tmp_path)
     training_lakes.fill(lake, "a", "2026-01-01", frames=40)  # 1 s apart, drives of 8 frames 30 s apart
@@ -70,19 +60,6 @@ def test_one_day_is_split_by_stretches_with_a_guard_between_them(tmp_path):
     for row in rows:
         other = [abs(row.stamp_ns - r.stamp_ns) for r in rows if r.split != row.split]
         assert min(other) >= 2.5e9
-
-
-def test_cells_of_the_map_keep_vehicles_apart_that_drive_the_same_street(tmp_path):
-    lake = Lake.at(tmp_path)
-    for vehicle in VEHICLES:
-        for day in ("2026-01-01", "2026-01-02"):
-            east = 1000.0 * "aabbe".index(vehicle[0]) if vehicle in "abe" else 50.0
-            training_lakes.fill(lake, vehicle, day, 3, ego_tx_m=east, ego_ty_m=0.0)
-    fleet = training_lakes.fleet_of(VEHICLES, positions="map", by=["place"])
-    training_lakes.prepare_all(lake, fleet)
-    rows = rows_of(lake)
-    assert_sides_apart(rows, ("place",))
-    assert len({r.split for r in rows if r.vehicle in "acd"}) == 1  # a, c and d meet in one cell
 
 
 @pytest.mark.parametrize("positions", ["map", "local"])
@@ -112,15 +89,6 @@ def test_frames_of_two_sides_are_far_apart_also_over_the_border_of_a_cell_and_on
     apart = [np.hypot(a[2] - b[2], a[3] - b[3]) for a in at for b in at if a[0] == b[0] and a[1] != b[1]]
     assert min(apart) > fleet.prepare.split.guard_m / np.sqrt(2)
     assert len(at) > 120
-
-
-def test_a_position_of_minus_zero_is_in_the_cell_of_zero(tmp_path):
-    lake = Lake.at(tmp_path)
-    for vehicle, east in (("a", 0.0), ("b", -0.0)):
-        training_lakes.fill(lake, vehicle, "2026-01-01", 3, ego_tx_m=east, ego_ty_m=0.0)
-    fleet = training_lakes.fleet_of("ab", positions="map", by=["place"])
-    a, b = (survey_day(Partition(v, "2026-01-01"), lake, fleet.prepare).place for v in "ab")
-    assert a == b
 
 
 def test_three_vehicles_on_two_days_keep_four_fifths_of_their_frames_without_a_setting(tmp_path, capsys):
@@ -184,26 +152,6 @@ def test_the_same_work_is_done_once_and_what_is_lost_comes_back_the_same(tmp_pat
         assert all(np.array_equal(getattr(row, n), getattr(old, n)) for n in row.__dataclass_fields__)
 
 
-def test_a_growing_fleet_moves_no_frame_to_another_side(tmp_path):
-    lake = training_lakes.fleet_lake(tmp_path, VEHICLES[:3], frames=2)
-    fleet = training_lakes.fleet_of([*VEHICLES, "f", "g", "h"], by=["vehicle"])
-    training_lakes.prepare_all(lake, fleet)
-    before = {r.vehicle: r.split for r in rows_of(lake)}
-    training_lakes.fleet_lake(tmp_path, [*VEHICLES[3:], "f", "g", "h"], frames=4)
-    results = training_lakes.prepare_all(lake, fleet)
-    assert {p.vehicle for p, r in results.items() if r.status == "cached"} == set(before)
-    after = {r.vehicle: r.split for r in rows_of(lake)}
-    assert {v: after[v] for v in before} == before
-
-
-def test_frames_without_way_between_them_are_one_sample(tmp_path):
-    lake = Lake.at(tmp_path)
-    training_lakes.fill(lake, "a", "2026-01-01", 6, ego_speed_mps=0.3)  # 0.3 m between frames
-    fleet = training_lakes.fleet_of(["a"], by=["vehicle"], min_step_m=0.5)
-    result = training_lakes.prepare_all(lake, fleet)[Partition("a", "2026-01-01")]
-    assert (result.rows, result.rejected) == (3, {"hardly_moved": 3})
-
-
 def test_frames_that_perception_refused_or_that_changed_their_prior_are_counted(tmp_path):
     lake = Lake.at(tmp_path)
     training_lakes.fill(lake, "a", "2026-01-01", 6)
@@ -249,23 +197,6 @@ def test_views_that_come_back_on_another_side_are_found_and_barred(tmp_path):
     barred = read_leaks(lake)
     assert {p.vehicle for p in barred} < {"a", "b"}
     assert set.union(*barred.values()) == {0, 1, 2}
-
-
-def test_alike_is_the_number_of_differing_bits():
-    rng = np.random.default_rng(0)
-    views, others = rng.integers(0, 256, (2, 40, 32)).astype(np.uint8)
-    others[5] = views[7]
-    others[5, :2] ^= 0b10110001  # 8 bits
-    expected = (np.unpackbits(views[:, None] ^ others[None], axis=-1).sum(-1) < 9).any(1)
-    assert np.array_equal(alike(views, others, 9), expected)
-    assert expected.sum() == 1
-    assert not alike(views, others, 8).any()
-
-
-def test_prepare_without_perception_says_what_to_run(tmp_path):
-    lake = Lake.at(tmp_path)
-    with pytest.raises(ContractError, match="no such partition"):
-        survey_day(Partition("a", "2026-01-01"), lake, training_lakes.fleet_of(["a"]).prepare)
 
 
 @pytest.mark.slow

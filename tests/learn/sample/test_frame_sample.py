@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.learn.sample.camera_maps import camera_features, class_likelihood, stored_grid
+from pipeline.learn.sample.camera_maps import camera_features, stored_grid
 from pipeline.learn.sample.clouds import range_edges
 from pipeline.learn.sample.frame_sample import (
     About,
@@ -23,7 +23,7 @@ from pipeline.rig.estimates import Prior
 from pipeline.rig.se3 import transform_points
 from pipeline.rig.spherical import camera_direction_angles
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
-from schemas.training import DISTANCE_GROUPS, GRID_CLASSES, NO_EDGE, POINT_IS_EDGE, POINT_IS_GROUND
+from schemas.training import DISTANCE_GROUPS, GRID_CLASSES, NO_EDGE, POINT_IS_GROUND
 from tests.makers import solve_scenes, training_lakes
 
 ABOUT = About("v", "2026-01-01", "default", "train", "p", "urban")
@@ -43,22 +43,6 @@ def angles(grid):
 def pixel_angles():
     v, u = np.mgrid[0 : FTHETA.height_px, 0 : FTHETA.width_px].astype(float)
     return np.moveaxis(np.degrees(camera_direction_angles(FTHETA.unproject(np.stack([u, v], -1)))), -1, 0)
-
-
-def test_cells_that_a_boundary_crosses_have_shares_of_both_classes():
-    grid = stored_grid((64, 96), 0.4)
-    labels = labels_by_angle(lambda a, _: np.where(a > 0.3, CAR, ROAD))
-    labels[: labels.shape[0] // 3] = 255
-    found = class_likelihood(labels, FTHETA, grid)
-    likelihood, known = found[:-1], found[-1]
-    vehicle, road = (likelihood[GRID_CLASSES.index(name), 40] for name in ("vehicle", "road"))
-    assert vehicle[:47] == pytest.approx(0.91, abs=1e-5)
-    assert road[48:] == pytest.approx(0.91, abs=1e-5)
-    # The cell from 0.4 to 0 deg: a quarter of it lies to the left of 0.3 deg.
-    assert vehicle[47] == pytest.approx(0.9 * 0.25 + 0.01, abs=0.05)
-    assert likelihood.sum(axis=0)[known > 0] == pytest.approx(1.0, abs=1e-5)
-    assert known[0].max() == 0
-    assert likelihood[:, 0].max() == 0
 
 
 def labels_by_angle(paint):
@@ -212,25 +196,6 @@ def test_range_edges_are_the_near_ends_of_jumps():
     near = np.degrees(np.arctan2(xyz[edge, 1], xyz[edge, 0]))
     assert sorted(np.round(near, 1)) == pytest.approx([-2.9, -2.9, 6.9, 6.9], abs=0.21)
     assert not range_edges(np.full((5, 3), np.nan, np.float32), None).any()
-
-
-def test_range_edges_are_none_where_lasers_draw_no_rows():
-    rng = np.random.default_rng(0)
-    down, azimuth = np.radians(rng.uniform(3, 12, 6000)), np.radians(rng.uniform(-30, 30, 6000))
-    away = 1.8 / np.tan(down)
-    road = np.stack([away * np.cos(azimuth), away * np.sin(azimuth), np.full(6000, -1.8)], -1).astype(
-        np.float32
-    )
-    for ring in (rng.integers(0, 6, 6000), None):
-        assert not range_edges(road, ring).any()
-
-
-def test_the_reference_is_the_prior_and_the_row_repeats():
-    frame, observation = scene()
-    a, b = row_of(frame, observation), row_of(frame, observation)
-    assert all(np.array_equal(getattr(a, n), getattr(b, n)) for n in a.__dataclass_fields__)
-    assert a.prior_camera_lidar_tx_m == pytest.approx(PRIOR.T_camera_lidar[0, 3])
-    assert (a.lidar_flags & ~np.uint8(POINT_IS_EDGE | POINT_IS_GROUND)).max() == 0
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,5 @@
 """The grid's angles, and what is rendered onto it through a guess."""
 
-import cv2
 import numpy as np
 import pytest
 
@@ -8,7 +7,6 @@ from pipeline.learn.sample.grid import Grid, grid_rays, resample_camera
 from pipeline.learn.sample.layout import NEARNESS_M
 from pipeline.learn.sample.rendering import nearest_points, render_radar
 from pipeline.rig.cameras import Camera
-from pipeline.rig.se3 import exp_so3
 from pipeline.rig.spherical import camera_direction_angles
 
 GRID = Grid()
@@ -42,22 +40,8 @@ def test_a_point_on_the_ray_of_each_cell_is_rendered_into_that_cell():
     np.testing.assert_array_equal(painted[[0, 2, 3, 4]].mean(axis=(1, 2)), [1, 0, 1, 2])
 
 
-def test_of_several_points_in_a_cell_the_nearest_wins_and_absent_ones_never():
-    ray = grid_rays(GRID)[40, 100]
-    index = cells([ray * 30, ray * 12, ray * 5, ray * 20], [True, True, False, True])
-    assert index[40 * GRID.width + 100] == 1
-    assert (index >= 0).sum() == 1
-
-
 def test_what_is_behind_or_outside_is_not_rendered():
     assert (cells([[0, 0, -10], [30, 0, 10], [0, -10, 10], [0, 10, 10], [0, 0, 0.2]]) == -1).all()
-
-
-def test_a_turn_about_the_upright_axis_is_a_shift_of_columns():
-    rays = grid_rays(GRID)[:, 60:120].reshape(-1, 3) * 20
-    turned = rays @ exp_so3(np.radians([0, 5 * GRID.cell_deg, 0])).T  # y points down: to the right
-    first, second = (cells(p).reshape(GRID.height, GRID.width) for p in (rays, turned))
-    np.testing.assert_array_equal(second[:, 65:125], first[:, 60:120])
 
 
 @pytest.mark.parametrize("model", CAMERAS)
@@ -78,18 +62,6 @@ def test_cameras_of_any_lens_show_each_direction_in_its_cell(model):
         assert abs(((one - other) / 2 - cells[..., axis])[inside].mean()) < 0.01
 
 
-def test_a_smaller_copy_of_the_image_gives_the_same_grid():
-    camera = CAMERAS["f-theta"]
-    rng = np.random.default_rng(0)
-    image = cv2.resize(
-        rng.integers(0, 255, (24, 40, 3), np.uint8), (1824, 940), interpolation=cv2.INTER_CUBIC
-    )
-    small = cv2.resize(image, (912, 470), interpolation=cv2.INTER_AREA)
-    full, _ = resample_camera(image, camera, GRID)
-    half, _ = resample_camera(small, camera, GRID)
-    assert np.abs(full.astype(float) - half).mean() < 1.0
-
-
 def test_the_networks_view_is_cut_out_of_larger_maps_and_refused_from_others():
     rows, columns = GRID.window((128, 224), 0.4)
     assert (rows.start, rows.stop, columns.start, columns.stop) == (24, 120, 16, 208)
@@ -100,8 +72,3 @@ def test_the_networks_view_is_cut_out_of_larger_maps_and_refused_from_others():
     ):
         with pytest.raises(ValueError, match=words):
             GRID.window(shape, step)
-
-
-def test_a_grid_that_cannot_be_halved_is_refused():
-    with pytest.raises(ValueError, match="multiple of 16"):
-        Grid(cell_deg=0.4, left_deg=38.0)

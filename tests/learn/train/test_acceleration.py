@@ -30,10 +30,3 @@ def test_bfloat16_is_near_float32_but_not_it_and_goes_in_and_out_as_float32(enco
     one, two = (torch.cat([p.grad.ravel() for p in e.parameters()]) for e in (encoder, half))
     assert torch.nn.functional.cosine_similarity(one, two, 0) > 0.97
     assert half.state_dict().keys() == encoder.state_dict().keys()
-
-
-def test_without_either_nothing_changes(encoder):
-    image = torch.rand(1, 4, 32, 64)
-    before = encoder(image)
-    accelerate(encoder, half=False, compiled=False)
-    assert torch.equal(encoder(image), before)

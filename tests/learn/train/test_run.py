@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import closing
 from dataclasses import replace
 
 import pytest
@@ -21,8 +20,6 @@ from pipeline.learn.sample.layout import NetworkConfig
 from pipeline.learn.train.loop import (
     DivergedError,
     DivergenceGuard,
-    MetricsLog,
-    cosine_rate,
     load_checkpoint,
     read_metrics,
     save_checkpoint,
@@ -120,12 +117,6 @@ def test_a_finished_run_reports_falls_validates_and_gives_its_network(data, tmp_
     assert not network.training
     again = train(TrainRequest(data, out, "cpu"), config(steps=30, learning_rate=1e-2))
     assert (again.status, again.samples) == ("done", 0)
-
-
-def test_time_limit_leaves_a_checkpoint_to_go_on_from(data, tmp_path):
-    result = train(TrainRequest(data, tmp_path, "cpu", time_limit_s=0.5), config(steps=100_000))
-    assert result.status == "time_limit"
-    assert load_checkpoint(tmp_path / "last.pt")["step"] == result.step
 
 
 def test_a_budget_of_time_brings_the_rate_down_whatever_the_speed(data, tmp_path):
@@ -227,19 +218,6 @@ def test_what_cannot_be_right_is_named(tmp_path):
     assert parse_duration("1.5h", "budget") == 5400
 
 
-def test_defaults_are_the_papers_recipe():
-    c = TrainConfig()
-    assert (c.batch_size, c.adam_betas, c.learning_rate, c.final_learning_rate) == (
-        4,
-        (0.9, 0.999),
-        3e-4,
-        3e-7,
-    )
-    assert cosine_rate(0.0, 3e-4, 3e-7) == pytest.approx(3e-4)
-    assert cosine_rate(0.5, 3e-4, 3e-7) == pytest.approx(1.5015e-4)
-    assert cosine_rate(2.0, 3e-4, 3e-7) == pytest.approx(3e-7)
-
-
 def test_checkpoints_are_whole_or_not_there(tmp_path):
     path = tmp_path / "last.pt"
     save_checkpoint(path, {"step": 1, "weights": torch.ones(3)})
@@ -248,21 +226,6 @@ def test_checkpoints_are_whole_or_not_there(tmp_path):
     path.write_bytes(path.read_bytes()[:100])
     with pytest.raises(ContractError, match="no checkpoint"):
         load_checkpoint(path)
-
-
-def test_metrics_after_a_resume_hold_no_step_twice(tmp_path):
-    with closing(MetricsLog(tmp_path, 0, events=False)) as log:
-        for step in (1, 2, 3):
-            log.report(step, {"loss": float(step)})
-    with (tmp_path / "metrics.jsonl").open("a") as stream:
-        stream.write('{"step": 4, "lo')  # killed in the middle of a line
-    with closing(MetricsLog(tmp_path, 2, events=False)) as log:
-        log.report(3, {"loss": math.nan})
-    assert read_metrics(tmp_path) == [
-        {"step": 1, "loss": 1.0},
-        {"step": 2, "loss": 2.0},
-        {"step": 3, "loss": None},
-    ]
 
 
 def test_encoders_may_learn_at_every_step_and_matchers_at_every_third(data, tmp_path):
@@ -275,12 +238,6 @@ def test_encoders_may_learn_at_every_step_and_matchers_at_every_third(data, tmp_
     for part in ("camera_encoder", "lidar_encoder", "lidar_matcher", "radar_matcher", "heads"):
         ours, theirs = getattr(trained.core, part).state_dict(), getattr(start.core, part).state_dict()
         assert any(not torch.equal(ours[name], theirs[name]) for name in ours), part
-
-
-@pytest.mark.parametrize("without_classes", [{"architecture": "concat"}, {"pairs": "lidar_radar"}])
-def test_networks_without_classes_are_matched_at_every_step(without_classes):
-    with pytest.raises(ConfigError, match="matched_every must be 1"):
-        load_train_config(None, {"matched_every": 2, **without_classes})
 
 
 def test_a_run_may_start_from_anothers_weights_and_then_goes_on_with_its_own(data, tmp_path):
