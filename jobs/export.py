@@ -166,7 +166,7 @@ def _export_onnx(out: Path, run: Path | None, notes: Path | None) -> list[Path]:
     require("train")
     from pipeline.learn.export.model_card import UNFIT, card_of_run
     from pipeline.learn.export.onnx_file import export_onnx
-    from pipeline.learn.train.run_state import network_of_run
+    from pipeline.learn.train.run import network_of_run
 
     with progress_reporter("export onnx"):
         card = card_of_run(run, notes)

@@ -6,19 +6,319 @@ Source: paper section 4.5.4 for the recipe.
 from __future__ import annotations
 
 import json
+import math
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
+import torch
+from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
+
+from pipeline.core.errors import ConfigError, ContractError
 from pipeline.core.results import Progress, silent
+from pipeline.learn.batches.batch import TrainingBatch
+from pipeline.learn.batches.loader import TrainingLoader, load_split
+from pipeline.learn.network.calibration_network import CalibrationNetwork, build_network
+from pipeline.learn.network.encoders import CameraEncoder, LidarEncoder
+from pipeline.learn.network.exported_weights import network_of_file
 from pipeline.learn.prepare.inventory import require_sides
-from pipeline.learn.train.loop import MetricsLog, TrainResult, run_loop, stop_signals
-from pipeline.learn.train.processes import joined
-from pipeline.learn.train.run_state import begin_run
+from pipeline.learn.sample.grid import Grid
+from pipeline.learn.sample.layout import NetworkConfig
+from pipeline.learn.train.batch_loss import Passes, batch_loss
+from pipeline.learn.train.loop import (
+    BEST,
+    LAST,
+    MetricsLog,
+    Run,
+    TrainResult,
+    load_checkpoint,
+    run_loop,
+    save_checkpoint,
+    stop_signals,
+)
+from pipeline.learn.train.paper_objective import PaperFrames, with_paper_inputs
+from pipeline.learn.train.processes import Processes, joined
+from pipeline.learn.train.running_mean import DayMeans
 from pipeline.learn.train.settings import TrainConfig
 from pipeline.store.partitions import Lake
 
-__all__ = ["TrainRequest", "train"]
+__all__ = ["BatchStream", "RunState", "TrainRequest", "accelerate", "begin_run", "network_of_run", "train"]
+
+
+_ENDLESS = 10**9  # steps, where time is what ends a run
+_VALIDATION_SEED = 977  # the guesses of validation are the same every time
+
+
+class BatchStream:
+    """Endless batches of split `train` for this process, prefetched on a GPU; else ContractError."""
+
+    def __init__(self, data: str, config: TrainConfig, processes: Processes) -> None:
+        rank_of = (processes.rank, processes.count)
+        self._loader = TrainingLoader(Lake.at(data), config.batch_size, seed=config.seed, rank_of=rank_of)
+        self._device, self._place = processes.device, self._loader.state_dict()
+        self._ahead = ThreadPoolExecutor(1, "next-batch") if self._device.type == "cuda" else None
+        self._next: Future[tuple[TrainingBatch, dict[str, Any]]] | None = None
+
+    @property
+    def frames(self) -> int:
+        """Frames of the split."""
+        return self._loader.frames
+
+    def batch(self) -> TrainingBatch:
+        """The next step's batch, on the device."""
+        if self._ahead is None:
+            batch, self._place = self._fetch()
+            return batch
+        future = self._next or self._ahead.submit(self._fetch)
+        batch, self._place = future.result()
+        self._next = self._ahead.submit(self._fetch)
+        return batch.to(self._device, non_blocking=True)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The place after the last batch."""
+        return self._place
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on there."""
+        self._loader.load_state_dict(state)
+        self._place = state
+
+    def close(self) -> None:
+        """Release threads and memory."""
+        if self._ahead is not None:
+            self._ahead.shutdown(wait=True, cancel_futures=True)
+        self._loader.close()
+
+    def _fetch(self) -> tuple[TrainingBatch, dict[str, Any]]:
+        batch = next(self._loader)
+        place = self._loader.state_dict()
+        return (batch.pin_memory() if self._device.type == "cuda" else batch), place
+
+
+class RunState(Run):
+    """One process's part of a run."""
+
+    network: CalibrationNetwork
+
+    def __init__(
+        self, data: str, config: TrainConfig, processes: Processes, stream: BatchStream, *, compiled: bool
+    ) -> None:
+        self.config, self.grid, self.stream = config, Grid(config.cell_deg), stream
+        network = build_network(_network_config(config, self.grid), config.seed).to(processes.device)
+        self.paper: PaperFrames | None = None
+        if config.loss.definition == "paper":
+            with_paper_inputs(network)
+            self.paper = PaperFrames(Lake.at(data))
+        accelerate(network, half=processes.device.type == "cuda", compiled=compiled)
+        self.passes: nn.Module = Passes(network, config.iterations)
+        if processes.count > 1:
+            # A pair's network uses a part of the encoders only.
+            self.passes = DistributedDataParallel(self.passes, find_unused_parameters=True)
+        self.day_means, self.best = DayMeans(), math.inf
+        self.held_out = _held_out(data, config) if processes.leads else None
+        super().__init__(network, config, _steps(config, stream.frames, processes.count), processes)
+
+    @property
+    def progress(self) -> float:
+        """Share of the run that is done, by time if its end is set by time."""
+        if self.config.budget_minutes is not None:
+            return self.trained_s / (60 * self.config.budget_minutes)
+        return super().progress
+
+    def comparable(self) -> bool:
+        """Whether losses are comparable; those of the encoders alone have another size."""
+        return (self.step + 1) % self.config.matched_every == 0
+
+    def losses(self) -> dict[str, Tensor]:
+        """Losses of the step's batch, from random guesses."""
+        found = batch_loss(
+            self.passes, self.stream.batch(), self.config, self.day_means,
+            _generator(self.config.seed, self.step, self.processes.rank), self.network,
+            matched=self.comparable(), paper=self.paper,
+        )  # fmt: skip
+        return found.report | {"loss": found.loss}
+
+    def validate(self, folder: Path, log: MetricsLog | None) -> None:
+        """At intervals, report the losses of held-out frames from the same guesses; keep the best weights."""
+        frames, sums = self.held_out, dict[str, float]()
+        if frames is None or not (self.step % self.config.validate_every == 0 or self.finished):
+            return
+        passes, generator = Passes(self.network, self.config.iterations), torch.Generator()
+        generator.manual_seed(_VALIDATION_SEED)
+        day_means = DayMeans()
+        self.network.eval()
+        with torch.no_grad():
+            for first in range(0, len(frames), 16):
+                part = frames[first : first + 16].to(self.processes.device)
+                found = batch_loss(
+                    passes, part, self.config, day_means, generator, self.network, paper=self.paper
+                )
+                for name, value in found.report.items():
+                    sums[name] = sums.get(name, 0.0) + float(value) * len(part) / len(frames)
+        self.network.train()
+        if log is not None:
+            log.report(self.step, {f"validation/{name}": value for name, value in sums.items()})
+        if sums["alignment"] < self.best:
+            self.best = sums["alignment"]
+            content = {"network": self.network.state_dict(), "step": self.step, "alignment": self.best}
+            save_checkpoint(folder / BEST, self._about() | content)
+
+    def state(self) -> dict[str, Any]:
+        """Content of a checkpoint; every process must call this."""
+        # "consensus": name of the running day means in checkpoints of format 1.
+        own = {"stream": self.stream.state_dict(), "consensus": self.day_means.state_dict()}
+        everyone = {"processes": self.processes.gather(own), "best": self.best}
+        return super().state() | self._about() | everyone
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Continue from a checkpoint; raises ConfigError if another number of processes wrote it."""
+        if len(state["processes"]) != self.processes.count:
+            problem = f"begun by {len(state['processes'])}, now {self.processes.count}"
+            raise ConfigError("train", "processes", f"a run continues with as many as it was {problem}")
+        super().load(state)
+        own = state["processes"][self.processes.rank]
+        self.stream.load_state_dict(own["stream"])
+        self.day_means.load_state_dict(own["consensus"])
+        self.best = float(state["best"])
+
+    def _about(self) -> dict[str, Any]:
+        return {"config": self.config.model_dump(mode="json"), "grid": asdict(self.grid)}
+
+
+def begin_run(
+    data: str,
+    folder: Path,
+    config: TrainConfig,
+    processes: Processes,
+    *,
+    compiled: bool,
+    start: Path | None = None,
+) -> RunState:
+    """A new run, or the run in the folder at its last checkpoint; arguments and errors as of `train`."""
+    stream = BatchStream(data, config, processes)
+    try:
+        run = RunState(data, config, processes, stream, compiled=compiled)
+        if (folder / LAST).exists():
+            state = load_checkpoint(folder / LAST, processes.device)
+            _same_config(folder, state["config"], config)
+            run.load(state)
+        elif start is not None:
+            _take_weights(run.network, start)
+    except BaseException:
+        stream.close()
+        raise
+    return run
+
+
+def network_of_run(folder: Path, *, best: bool = True) -> CalibrationNetwork:
+    """Network of a run, on the CPU: the best on validation frames, else the last, else ContractError."""
+    path = folder / (BEST if best and (folder / BEST).exists() else LAST)
+    if not path.exists():
+        raise ContractError(str(folder), f"no run: there is neither {BEST} nor {LAST}")
+    state = load_checkpoint(path)
+    config = TrainConfig.model_validate(state["config"])
+    network = CalibrationNetwork(_network_config(config, Grid(**state["grid"])))
+    network.load_state_dict(state["network"])
+    return network.eval()
+
+
+def _take_weights(network: CalibrationNetwork, start: Path) -> None:
+    trained = network_of_file(start) if start.suffix == ".onnx" else network_of_run(start)
+    for name, theirs in asdict(trained.config).items():
+        ours = asdict(network.config)[name]
+        # Between stages a camera may be shown classes that it was not shown before, and paint be matched or not.
+        may_differ = name == "marks" or (name == "takes_classes" and ours)
+        if theirs != ours and not may_differ:
+            key, value = ("cell_deg", theirs["cell_deg"]) if name == "grid" else (name, theirs)
+            problem = (
+                f"{start} has a network of another kind: set {key} = {json.dumps(value)}, or start afresh"
+            )
+            raise ConfigError("train", key, problem)
+    network.load_state_dict(_widened(trained.state_dict(), network.state_dict()))
+
+
+def _widened(trained: dict[str, Tensor], fresh: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The weights, with zeros for channels that their source network lacks, so that its answers do not change."""
+    found = {}
+    for name, value in fresh.items():
+        weight = trained.get(name, value)
+        if weight.shape != value.shape:
+            weight = torch.zeros_like(value)
+            weight[:, : trained[name].shape[1]] = trained[name]
+        found[name] = weight
+    return found
+
+
+def _network_config(config: TrainConfig, grid: Grid) -> NetworkConfig:
+    return NetworkConfig(
+        config.architecture,
+        config.pairs,
+        grid,
+        config.width,
+        config.hidden,
+        config.takes_classes,
+        config.marks,
+    )
+
+
+def _steps(config: TrainConfig, frames: int, processes: int) -> int:
+    if config.steps is not None:
+        return config.steps
+    if config.budget_minutes is not None:
+        return _ENDLESS
+    return max(1, math.ceil(config.epochs * frames / (config.batch_size * processes)))
+
+
+def _held_out(data: str, config: TrainConfig) -> TrainingBatch | None:
+    """Frames to validate on; None if the data has none."""
+    try:
+        return load_split(Lake.at(data), "val", limit=config.validation_frames)
+    except ContractError:
+        return None
+
+
+def _generator(seed: int, step: int, rank: int) -> torch.Generator:
+    """Random numbers of one step: they depend on (seed, step, rank) only, so a checkpoint need not hold a state."""
+    # Odd multipliers keep neighbouring steps and ranks apart.
+    return torch.Generator().manual_seed((seed * 1_000_003 + step * 8_191 + rank * 131) % 2**63)
+
+
+def _same_config(folder: Path, begun: dict[str, Any], config: TrainConfig) -> None:
+    now = config.model_dump(mode="json")
+    other = sorted(k for k in begun.keys() | now.keys() if begun.get(k) != now.get(k))
+    if other:
+        problem = (
+            f"the run in this folder was begun with another {other[0]}: use a new folder, or the old value"
+        )
+        raise ConfigError(str(folder), other[0], problem)
+
+
+def accelerate(network: nn.Module, *, half: bool, compiled: bool) -> None:
+    """Set the image encoders to bfloat16, compile them, or both; parameters and outputs stay float32.
+
+    Of the encoders only: geometry in sixteen bits would be wrong by metres.
+    """
+    for module in network.modules():
+        if isinstance(module, CameraEncoder | LidarEncoder):
+            if half:
+                _in_bfloat16(module)
+            if compiled:
+                module.compile()
+
+
+def _in_bfloat16(module: nn.Module) -> None:
+    forward = module.forward
+
+    def in_bfloat16(inputs: Tensor) -> Tensor:
+        with torch.autocast(inputs.device.type, torch.bfloat16):
+            output: Tensor = forward(inputs)
+        return output.float()
+
+    # In place of hooks, which a compiler would have to stop at.
+    module.forward = in_bfloat16
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from pipeline.learn.network.encoders import CameraEncoder, LidarEncoder
-from pipeline.learn.train.run_state import accelerate
+from pipeline.learn.train.run import accelerate
 
 
 @pytest.fixture(params=["camera", "lidar"])

@@ -11,8 +11,7 @@ from pipeline.learn.batches.batch import collate
 from pipeline.learn.sample.frame_sample import About, make_row
 from pipeline.learn.train.loop import read_metrics
 from pipeline.learn.train.paper_objective import PaperFrames
-from pipeline.learn.train.run import TrainRequest, train
-from pipeline.learn.train.run_state import network_of_run
+from pipeline.learn.train.run import TrainRequest, network_of_run, train
 from pipeline.learn.train.settings import PAIRS_OF, load_train_config
 from pipeline.objective.paper.loop import loop_loss, loop_transform
 from pipeline.rig.changes import changed

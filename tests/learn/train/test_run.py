@@ -24,8 +24,7 @@ from pipeline.learn.train.loop import (
     read_metrics,
     save_checkpoint,
 )
-from pipeline.learn.train.run import TrainRequest, train
-from pipeline.learn.train.run_state import network_of_run
+from pipeline.learn.train.run import TrainRequest, network_of_run, train
 from pipeline.learn.train.settings import TrainConfig, load_train_config
 from pipeline.rig.day_prior import read_prior
 from pipeline.store.partitions import Partition
