@@ -75,7 +75,8 @@ def shots_of_rig():
         rig = rig_named(name)
         around = rig["lidar"].sheet.azimuth_deg[1] == 180
         lidar = replace(rig["lidar"].sheet, columns=450) if around else rig["lidar"].sheet
-        return shots_of(environment, rig=rig.with_sheet("lidar", lidar), times=(2.0,))[0]
+        small = rig.changed(lambda s: replace(s, sheet=lidar) if s.name == "lidar" else s)
+        return shots_of(environment, rig=small, times=(2.0,))[0]
 
     return make
 

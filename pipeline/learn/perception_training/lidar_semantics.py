@@ -6,7 +6,7 @@ Samples are sweeps as images, labelled where the camera sees them; scores compar
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -144,10 +144,11 @@ def labelled_sweeps(fleet: FleetConfig, lake: Lake, config: SweepTraining) -> Sa
     """
     days = vehicle_days(fleet, lake)
     chosen = {day.vehicle: fleet.rig_of(day.vehicle).one_of_each("training") for day in days}
+    sensors = {(vehicle, names.get("camera"), names.get("lidar")) for vehicle, names in chosen.items()}
     accepted = {
         (r.vehicle, r.day): transform_of(r)
         for r in current_records(read_records(lake, CALIBRATIONS, CalibrationRecord))
-        if r.status == "accepted" and _is_of(r, chosen)
+        if r.status == "accepted" and (r.vehicle, r.parent_frame, r.child_frame) in sensors
     }
     first = (next(frames_of(lake, day, chosen=chosen[day.vehicle])) for day in days)
     layout = layout_of(first, config.rows, config.columns)
@@ -162,12 +163,6 @@ def labelled_sweeps(fleet: FleetConfig, lake: Lake, config: SweepTraining) -> Sa
     found = cut(split_days(days, of_day))
     calibrated = sum((day.vehicle, day.day) in accepted for day in days)
     return replace(found, numbers=found.numbers | {"calibrated_days": calibrated})
-
-
-def _is_of(record: CalibrationRecord, chosen: Mapping[str, Mapping[str, str]]) -> bool:
-    """Whether a record is of its vehicle's chosen camera and lidar."""
-    names = chosen.get(record.vehicle, {})
-    return (record.parent_frame, record.child_frame) == (names.get("camera"), names.get("lidar"))
 
 
 def normal_of(images: SweepImages) -> Normal:

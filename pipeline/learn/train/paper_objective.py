@@ -34,7 +34,7 @@ from pipeline.objective.paper.camera_radar import camera_radar_loss
 from pipeline.objective.paper.lidar_radar import lidar_radar_loss
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_manifest
-from pipeline.store.views import Chosen, observations_of
+from pipeline.store.views import observations_of
 from schemas.observations import Observation
 from schemas.training import SAMPLED, TRAINING
 
@@ -87,19 +87,16 @@ class PaperFrames:
             found["loop"] = loop_loss(T_camera_lidar, T_lidar_radar, T_camera_radar)
         return found
 
-    def _chosen(self, partition: Partition) -> Chosen | None:
-        """Names of the sensors that the samples of a vehicle-day are of."""
-        manifest = read_manifest(self._lake, TRAINING, partition)
-        return None if manifest is None else manifest.extra.get(SAMPLED)
-
     def _frame(self, batch: TrainingBatch, row: int) -> dict[str, PairLoss]:
         partition = Partition(batch.vehicle[row], batch.day[row])
         if partition not in self._days:
             T_camera_lidar = batch.T_camera_lidar[row].double().cpu().numpy()
             T_camera_radar = batch.T_camera_radar[row].double().cpu().numpy()
+            manifest = read_manifest(self._lake, TRAINING, partition)
+            chosen = None if manifest is None else manifest.extra.get(SAMPLED)  # sensors of the samples
             self._days[partition] = {
                 o.frame_index: paper_frame(o, T_camera_lidar, T_camera_radar)
-                for o in observations_of(self._lake, partition, chosen=self._chosen(partition))
+                for o in observations_of(self._lake, partition, chosen=chosen)
             }
         self._days.move_to_end(partition)
         while len(self._days) > 1 and sum(map(len, self._days.values())) > _KEPT:

@@ -81,19 +81,13 @@ def mounting_of(rig: RigSpec, seed: int, vehicle: int, day: int) -> Mounting:
         s.name: RadarErrors(built.normal(0, 0.03), np.radians(built.normal(0, 0.15)))
         for s in rig.of_kind("radar")
     }
-    return Mounting(
-        {n: _mounted(pose, delays.get(n, 0.0), lenses.get(n), errors.get(n)) for n, pose in poses.items()}
-    )
-
-
-def _mounted(
-    pose: tuple[np.ndarray, np.ndarray],
-    delay_s: float,
-    lens: tuple[Camera, Camera] | None,
-    errors: RadarErrors | None,
-) -> Mounted:
-    true, nominal = lens or (None, None)
-    return Mounted(*pose, delay_s, camera=true, nominal_camera=nominal, errors=errors)
+    sensors = {}
+    for name, pose in poses.items():
+        true, nominal = lenses.get(name, (None, None))
+        sensors[name] = Mounted(
+            *pose, delays.get(name, 0.0), camera=true, nominal_camera=nominal, errors=errors.get(name)
+        )
+    return Mounting(sensors)
 
 
 def _poses(

@@ -96,7 +96,9 @@ def scan_radar(
     velocity_radar = velocity + np.cross(omega, T_map_radar[:3, 3] - T_map_vehicle[:3, 3])
     echoes = _scatterers(moment, T_map_radar, velocity_radar, spec, rng)
     if beacons_map is not None:
-        echoes = _with_beacons(echoes, transform_points(inverse(T_map_radar), beacons_map))
+        n, no = len(beacons_map), np.zeros(len(beacons_map), bool)
+        aer = to_spherical(transform_points(inverse(T_map_radar), beacons_map))
+        echoes = join_rows([echoes, _Cells(aer, np.zeros(n), np.full(n, 3e4), no, no)])
     cells = _merged(echoes, T_vehicle_radar, spec, rng)
     if not spec.road_mirror:
         cells = _bounced(cells, T_vehicle_radar, spec, rng)
@@ -241,11 +243,6 @@ def _bounced(cells: _Cells, T_vehicle_radar: np.ndarray, spec: RadarSpec, rng: n
     images = replace(cells, aer=aer_image, snr=np.abs(mirror) ** 4 * cells.snr)
     second = resolved & (images.snr > _THRESHOLD)
     return join_rows([replace(cells, aer=aer), take_rows(images, second)])
-
-
-def _with_beacons(echoes: _Cells, xyz_radar: np.ndarray) -> _Cells:
-    n, no = len(xyz_radar), np.zeros(len(xyz_radar), bool)
-    return join_rows([echoes, _Cells(to_spherical(xyz_radar), np.zeros(n), np.full(n, 3e4), no, no)])
 
 
 def _ghosts(

@@ -91,10 +91,6 @@ class RigSpec:
         """The rig with `change` applied to every sensor."""
         return replace(self, sensors=tuple(map(change, self.sensors)))
 
-    def with_sheet(self, name: str, sheet: Sheet) -> RigSpec:
-        """The rig with another data sheet for one sensor."""
-        return self.changed(lambda s: replace(s, sheet=sheet) if s.name == name else s)
-
 
 def short_rig(
     name: str,

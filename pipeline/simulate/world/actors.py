@@ -54,7 +54,7 @@ def actor_mesh(kind: str, variant: int) -> Mesh:
     elif kind == "cyclist":
         _cyclist(b, rng)
     else:
-        _pedestrian(b, rng, variant)
+        _person(b, rng, "cloth", (0.32, 0.12, -0.24, 0.0)[variant % 4], seated=False)
     return glazed(b.mesh(1), float(rng.uniform(0.5, 1.0))) if hollow else b.mesh(1)
 
 
@@ -168,10 +168,6 @@ def _person(b: MeshBuilder, rng: np.random.Generator, cloth: str, stride_m: floa
         rng,
         (1, 1, 1) if cloth == "cloth" else top,
     )
-
-
-def _pedestrian(b: MeshBuilder, rng: np.random.Generator, variant: int) -> None:
-    _person(b, rng, "cloth", (0.32, 0.12, -0.24, 0.0)[variant % 4], seated=False)
 
 
 def _cyclist(b: MeshBuilder, rng: np.random.Generator) -> None:

@@ -139,9 +139,6 @@ class Moment:
         sizes = [len(self.standing.mesh)] + [len(actor_mesh(a.kind, a.variant)) for a in self.actors]
         return [int(n) for n in np.cumsum(sizes)[:-1]]
 
-    def _place(self, actor: Actor) -> np.ndarray:
-        return (actor.T_map_actor[:3, 3] - self.standing.origin).astype(np.float32)
-
     def cast(
         self,
         origins: Float[np.ndarray, "N 3"],
@@ -159,7 +156,7 @@ class Moment:
         for actor, start in zip(self.actors, self._starts, strict=True):
             proto = _prototype(actor.kind, actor.variant)
             R, v = actor.T_map_actor[:3, :3].astype(np.float32), actor.velocity_map.astype(np.float32)
-            p = self._place(actor)
+            p = (actor.T_map_actor[:3, 3] - self.standing.origin).astype(np.float32)
             centre = p + R @ proto.centre
             if not _may_be_seen(centre - origins[0], proto.reach_m + 3.0, axis, cosine):
                 continue
