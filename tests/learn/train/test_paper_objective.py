@@ -1,5 +1,7 @@
 """Training on the paper's loss: the numbers of `joint-optimisation` on the same frames, and the paper's inputs."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -41,7 +43,8 @@ view_deg = 0.0
 @pytest.fixture(scope="module")
 def day(tmp_path_factory):
     """Three frames with their rows of table training, all of side train."""
-    day = simulated_day(tmp_path_factory.mktemp("day"), frames=3)
+    day = simulated_day(tmp_path_factory.mktemp("day"), frames=6, environment="mixed")
+    day = replace(day, observations=day.observations[:3])
     frames = {f.frame_index: f for f in list(frames_of(day.lake, day.partition))}
     prior = read_prior(day.observations, day.fleet, "vehicle-1")
     about = About("vehicle-1", day.partition.day, "demo", "train", "here", "urban")
