@@ -14,7 +14,13 @@ from pipeline.objective.differentiable.paper import (
     lidar_radar_tensors,
     padded,
 )
-from pipeline.objective.differentiable.poses import loop_loss, transform_points
+from pipeline.objective.differentiable.poses import (
+    euler_angles,
+    inverse,
+    loop_loss,
+    pose_of_euler_angles,
+    transform_points,
+)
 from pipeline.objective.differentiable.projection import camera_projection
 from pipeline.objective.differentiable.terms import edge_residuals_px
 from pipeline.objective.paper import loop
@@ -191,3 +197,14 @@ def test_the_loop_loss_is_the_numpy_one_and_zero_where_the_three_agree():
     np.testing.assert_allclose(ours, loop.loop_loss(loop.loop_transform(*T)), atol=1e-12)
     closed = loop_loss(torch.tensor(T[0]), torch.tensor(T[1]), torch.tensor(T[0] @ T[1]))
     np.testing.assert_allclose(closed, 0, atol=1e-12)
+
+
+def test_poses_equal_their_numpy_versions():
+    rng = np.random.default_rng(1)
+    xi = rng.normal(size=(50, 6)) * np.array([[1.0], [1e-3], [1e-5], [0.0], [0.3]]).repeat(10, 0)
+    T = exp_se3(torch.tensor(xi))
+    np.testing.assert_allclose(T, se3.exp_se3(xi), atol=1e-12)
+    np.testing.assert_allclose(inverse(T), se3.inverse(se3.exp_se3(xi)), atol=1e-12)
+    np.testing.assert_allclose(euler_angles(T), loop.euler_angles(se3.exp_se3(xi)), atol=1e-12)
+    back = pose_of_euler_angles(euler_angles(T), T[:, :3, 3])
+    np.testing.assert_allclose(back, T, atol=1e-12)
