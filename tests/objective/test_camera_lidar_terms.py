@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.joint.camera_lidar.estimate import AlignmentState
+from pipeline.objective.camera_lidar.edges import chance_of, fit_match_share
 from pipeline.objective.camera_lidar.image_maps import CameraMaps, boundary_offsets
 from pipeline.objective.camera_lidar.points import Points, lidar_velocities
 from pipeline.objective.camera_lidar.projection_loops import camera_parameters, project_point, project_points
@@ -136,3 +137,15 @@ def test_edges_seen_throughout_are_in_sight_at_every_alignment_and_no_others_are
     assert len(terms.seen_throughout(one).edges.xyz_m) == terms.edges_in_view(one)[0]
     in_turn = terms.seen_throughout(one).seen_throughout(other)
     np.testing.assert_array_equal(in_turn.edges.xyz_m, both.edges.xyz_m)
+
+
+def test_share_of_matches_is_recovered_and_vanishes_where_there_are_none():
+    rng = np.random.default_rng(0)
+    chance_px = rng.uniform(-90, 90, 4000)
+    matched = np.where(rng.random(4000) < 0.3, rng.normal(0, 0.8, 4000), rng.uniform(-90, 90, 4000))
+    kind = np.repeat(np.array([0, 1], np.uint8), 4000)
+    chance = chance_of(np.tile(chance_px, 2).astype(np.float32), kind, 2)
+    here = np.concatenate([matched, rng.uniform(-90, 90, 4000)]).astype(np.float32)
+    share = fit_match_share(here, kind, np.full(8000, 1.5), chance)
+    assert share[0] == pytest.approx(0.3, abs=0.05)
+    assert share[1] < 0.03
