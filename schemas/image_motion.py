@@ -6,7 +6,14 @@ import numpy as np
 
 from schemas.columns import array, column, row
 
-__all__ = ["EarlierColumns", "MotionColumns"]
+__all__ = ["EarlierColumns", "MotionColumns", "tracking_scale"]
+
+_SMALL_PX = 1000
+
+
+def tracking_scale(width_px: int) -> float:
+    """Size at which corners are tracked: half, of images up to 1000 px wide full size."""
+    return 1.0 if width_px <= _SMALL_PX else 0.5
 
 
 @row()
@@ -15,7 +22,8 @@ class EarlierColumns:
 
     earlier_stamp_ns: int | None = column("its stamp; null if the log has none", default=None)
     earlier_image: bytes | None = column(
-        "JPEG mono8 at half size; null if it is the image of an earlier row", default=None
+        "JPEG mono8 at half size, up to 1000 px wide at full size; null if it is the image of an earlier row",
+        default=None,
     )
     earlier_missing: str | None = column("why there is none", default=None)
     ego_driven_m: float | None = column(
@@ -63,7 +71,7 @@ class MotionColumns:
         "share of 8 x 6 cells of the image that have such a track", default=None
     )
     motion_parallax_px: float | None = column(
-        "median shift of these tracks that rotation does not explain, at label size", default=None
+        "median shift of these tracks that rotation does not explain, at the size of tracking", default=None
     )
     ego_driven_m: float | None = column("as in images", default=None)
     ego_turned_rad: float | None = column("as in images", default=None)

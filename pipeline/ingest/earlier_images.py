@@ -1,12 +1,13 @@
 """For each image of a moment, an earlier one of the same camera, some metres of driving before.
 
 From the two, perception finds how the camera moves. Most logs have more images than moments, so the earlier one is
-read from the log too, and kept at half size without colour; if it is the image of an earlier moment, its stamp
+read from the log too, and kept small without colour; if it is the image of an earlier moment, its stamp
 suffices. Messages are looked at in the order in which they were logged.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -16,12 +17,14 @@ import numpy as np
 
 from pipeline.ingest.index import DayIndex
 from pipeline.ingest.messages.image import EncodedImage
+from schemas.image_motion import tracking_scale
 
 __all__ = ["EarlierImages"]
 
 _WAY_M, _LEAST_M, _MOST_M = 3.0, 1.0, 6.0
 _SPAN_S, _LEAST_S, _MOST_S = 0.3, 0.04, 1.5  # without odometry: 1 to 6 m at 3.5 to 20 m/s
 _LATEST_S = 0.6  # likewise
+_ANOTHER = 0.3  # what another image costs, in logarithms of the way
 _STANDING_MPS = 0.3
 _STEPS = 12  # of the integral of odometry
 _QUALITY = 92
@@ -46,7 +49,7 @@ class _Candidate:
         """How far it is from the best one; an image that is kept anyway comes first."""
         by_way = abs(np.log(abs(self.driven_m) / _WAY_M)) if np.isfinite(self.driven_m) else np.nan
         by_span = abs(np.log(self.span_s / _SPAN_S))
-        return float(by_span if np.isnan(by_way) else by_way) + (0.0 if self.is_kept else 0.7)
+        return float(by_span if np.isnan(by_way) else by_way) + (0.0 if self.is_kept else _ANOTHER)
 
 
 class EarlierImages:
@@ -85,7 +88,7 @@ class EarlierImages:
                 return {"earlier_missing": NO_EARLIER}
             if earlier.data == now:
                 return {"earlier_missing": SAME_IMAGE}
-            image = _half_grey(earlier)
+            image = _small_grey(earlier)
         stamp_ns = self._captures.stamps[found.place]
         return {"earlier_stamp_ns": stamp_ns, "earlier_image": image, **self._motion(stamp_ns, place)}
 
@@ -124,16 +127,17 @@ class EarlierImages:
         }
 
 
-def _half_grey(image: EncodedImage) -> bytes | None:
-    """The image at half size without colour, as JPEG; None if it cannot be decoded."""
-    data = np.frombuffer(image.data, np.uint8)
-    flag = cv2.IMREAD_REDUCED_GRAYSCALE_2 if image.format == "jpeg" else cv2.IMREAD_GRAYSCALE
-    grey = cv2.imdecode(data, flag | cv2.IMREAD_IGNORE_ORIENTATION)
+def _small_grey(image: EncodedImage) -> bytes | None:
+    """The image at the size of tracking without colour, as JPEG; None if it cannot be decoded."""
+    scale = tracking_scale(image.width_px)
+    halved = image.format == "jpeg" and scale < 1
+    flag = cv2.IMREAD_REDUCED_GRAYSCALE_2 if halved else cv2.IMREAD_GRAYSCALE
+    grey = cv2.imdecode(np.frombuffer(image.data, np.uint8), flag | cv2.IMREAD_IGNORE_ORIENTATION)
     if grey is None:
         return None
-    half = -(-image.width_px // 2), -(-image.height_px // 2)
-    if grey.shape != half[::-1]:
-        grey = cv2.resize(grey, half, interpolation=cv2.INTER_AREA)
+    size = math.ceil(image.width_px * scale), math.ceil(image.height_px * scale)
+    if grey.shape != size[::-1]:
+        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     ok, blob = cv2.imencode(".jpg", grey, (cv2.IMWRITE_JPEG_QUALITY, _QUALITY))
     assert ok, "OpenCV cannot encode a grey JPEG"
     return bytes(blob)

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
+from pipeline.perceive.camera import decode_grey
 from pipeline.perceive.image_motion import (
     ImageMotion,
     MotionReason,
@@ -19,6 +20,7 @@ from pipeline.perceive.image_motion import (
 )
 from pipeline.rig.cameras import camera_of
 from schemas.captures import Image
+from schemas.image_motion import tracking_scale
 
 __all__ = ["EarlierGreys"]
 
@@ -29,7 +31,7 @@ _DRIVEN_M = 0.9
 
 
 class EarlierGreys:
-    """Grey images of one camera's last moments at label size; asked in order of time."""
+    """Grey images of one camera's last moments at the size of tracking; asked in order of time."""
 
     def __init__(self) -> None:
         self._greys: dict[int, np.ndarray] = {}
@@ -48,7 +50,10 @@ class EarlierGreys:
             boxes_px: road users in full-image pixels; None without semantics.
         """
         self._greys = {k: v for k, v in self._greys.items() if 0 <= image.stamp_ns - k < _KEPT_NS}
-        is_left_out = _users(image, grey.shape, labels, boxes_px)
+        scale = tracking_scale(image.image_width_px)
+        is_left_out = _users(image, labels, boxes_px)
+        if scale * image.image_width_px > grey.shape[1] + 1:
+            grey = decode_grey(image, scale)
         try:
             tracks, motion = self._motion(image, grey, is_left_out)
         except NoMotionError as err:
@@ -83,6 +88,9 @@ class EarlierGreys:
         if before is None:
             raise NoMotionError(MotionReason.NO_EARLIER)
         camera = camera_of(image).scaled(grey.shape[1] / image.image_width_px)
+        if is_left_out is not None and is_left_out.shape != grey.shape:
+            small = is_left_out.astype(np.uint8)
+            is_left_out = cv2.resize(small, grey.shape[::-1], interpolation=cv2.INTER_NEAREST).astype(bool)
         tracks = track(before, grey, camera, is_left_out)
         return tracks, motion_of_tracks(tracks, (grey.shape[1], grey.shape[0]))
 
@@ -97,13 +105,13 @@ class EarlierGreys:
 
 
 def _users(
-    image: Image, shape: tuple[int, ...], labels: np.ndarray | None, boxes_px: np.ndarray | None
+    image: Image, labels: np.ndarray | None, boxes_px: np.ndarray | None
 ) -> Bool[np.ndarray, "h w"] | None:
-    """Where road users are; None if nothing shows it."""
+    """Where road users are, at label size; None if nothing shows it."""
     if labels is None or boxes_px is None:
         return None
     users = np.isin(labels, _USER_IDS)
-    for x0, y0, x1, y1 in boxes_px * (shape[1] / image.image_width_px):
+    for x0, y0, x1, y1 in boxes_px * (labels.shape[1] / image.image_width_px):
         users[max(int(y0), 0) : max(int(np.ceil(y1)), 0), max(int(x0), 0) : max(int(np.ceil(x1)), 0)] = True
     kernel = np.ones((2 * _MARGIN_PX + 1,) * 2, np.uint8)
     return np.asarray(cv2.dilate(users.astype(np.uint8), kernel).astype(bool))

@@ -31,7 +31,7 @@ __all__ = [
 
 _CORNERS, _QUALITY, _APART_PX = 400, 0.004, 10
 _WINDOW_PX, _LEVELS, _BACK_PX = 15, 5, 0.5
-_FEWEST = 60
+_FEWEST = 35
 _STILL_PX = 0.3  # a track that moves less is far away, or on the car itself
 _NOISE_PX = 0.15  # of a track at the size of tracking: the threshold and the first scale of the loss
 _LEAST_NOISE_PX, _MOST_NOISE_PX = 0.05, 0.4

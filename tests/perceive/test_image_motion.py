@@ -128,7 +128,7 @@ def test_points_behind_the_camera_and_tracks_of_the_car_itself_are_named():
     with pytest.raises(NoMotionError) as err:
         motion_of_tracks(mixed, SIZE)
     assert err.value.reason in (MotionReason.BEHIND, MotionReason.NO_COMMON_MOTION)
-    few = tracks.some(np.arange(len(tracks.now)) < 40)
+    few = tracks.some(np.arange(len(tracks.now)) < 25)
     own, *_ = tracks_of(CAMERAS["pinhole"], bonnet=200)
     own = own.some(np.arange(len(own.now)) >= len(own.now) - 200)
     both = Tracks(

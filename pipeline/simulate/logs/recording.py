@@ -143,7 +143,7 @@ def _images_before(
         list[Sent](),
         float(np.linalg.norm(seat.scene.ego.velocities(np.array([seat.moment.t_s]))[0])),
     )
-    if speed / rate_hz < _WAY_M * 2:
+    if speed / rate_hz < _WAY_M * 1.3:
         return sent
     for sensor in seat.rig.of_kind("camera"):
         name, stamp_s = sensor.name, stamps_s.get(sensor.name)
