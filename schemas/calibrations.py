@@ -40,6 +40,7 @@ PROBE_Z = "probe_z_"
 DOF_NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
 
 _PRIOR = "prior transform T_parent_child; null if there is none"
+_OWN = "by the edge's own data and prior alone; null where T is that, as without an adjustment of the rig"
 
 
 def pairs_of(sensors: Collection[str]) -> tuple[str, ...]:
@@ -68,6 +69,18 @@ class CalibrationRecord(Posed):
     prior_ty_m: float | None = column(_PRIOR, default=None)
     prior_tz_m: float | None = column(_PRIOR, default=None)
     prior_covariance: np.ndarray | None = array("<f8", (6, 6), "prior covariance, same order", default=None)
+    own_qw: float | None = column(_OWN, default=None)
+    own_qx: float | None = column(_OWN, default=None)
+    own_qy: float | None = column(_OWN, default=None)
+    own_qz: float | None = column(_OWN, default=None)
+    own_tx_m: float | None = column(_OWN, default=None)
+    own_ty_m: float | None = column(_OWN, default=None)
+    own_tz_m: float | None = column(_OWN, default=None)
+    own_covariance: np.ndarray | None = array("<f8", (6, 6), f"covariance {_OWN}", default=None)
+    own_common_covariance: np.ndarray | None = array(
+        "<f8", (6, 6), "the part of it that is common to all days", default=None
+    )
+    own_observable: list[bool] | None = column(f"per DoF: determined {_OWN}", default=None)
     status: str = column(
         "accepted (use it), held (computed, the prior stays current), refused (nothing computed)"
     )
@@ -174,7 +187,7 @@ class CalibrationRecord(Posed):
 CALIBRATIONS = TableSchema(
     CalibrationRecord,
     "calibrations",
-    6,
+    7,
     "One row per edge and method. boresight show calibrations --json prints these names plus T, 4x4 row-major.",
     made_by="calibrate",
     about=("vehicle", "day", "method", "pair", "parent_frame", "child_frame"),

@@ -44,6 +44,7 @@ COLUMNS = (
     "covariance",
     "common_covariance",
     "observable",
+    *(f"own_{name}" for name in (*POSE_COLUMNS, "covariance", "common_covariance", "observable")),
     "half_days",
     "targets_m",
     _DISPROVED,
@@ -154,7 +155,7 @@ def estimates_at(found: pa.Table, edges: tuple[Edge, ...], edge: Int[np.ndarray,
     names = found["vehicle"].combine_chunks().dictionary_encode()
     owner, day = np.asarray(names.indices).astype(np.int64), ordinals(found["day"])
     order = np.lexsort((edge, day, owner))  # edges of a day side by side
-    found = found.take(pa.array(order))
+    found = _own(found.take(pa.array(order)))
     pose = np.stack([found[name].to_numpy() for name in POSE_COLUMNS], axis=1)
     is_there = np.all([there(found[name]) for name in (*POSE_COLUMNS, "covariance")], axis=0)
     shifts = np.abs(np.stack([pc.fill_null(found[name], 0.0).to_numpy() for name in _SHIFTS], axis=1))
@@ -168,6 +169,15 @@ def estimates_at(found: pa.Table, edges: tuple[Edge, ...], edge: Int[np.ndarray,
         matrices(found["half_days"], (2, 2, 6)), matrices(found["targets_m"], (3, 3)),
         found["work_key"].combine_chunks(),
     )  # fmt: skip
+
+
+def _own(found: pa.Table) -> pa.Table:
+    """What each edge found alone: charts of edges need independent values, and adjusted ones share their errors."""
+    is_there = pc.is_valid(found["own_covariance"])
+    for name in (*POSE_COLUMNS, "covariance", "common_covariance", "observable"):
+        k, own = found.column_names.index(name), found[f"own_{name}"]
+        found = found.set_column(k, name, pc.if_else(is_there, own, found[name]))
+    return found
 
 
 def joined(parts: Sequence[Estimates]) -> Estimates:

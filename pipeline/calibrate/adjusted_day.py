@@ -1,116 +1,128 @@
-"""Joint adjustment of a day's pairs over their evidence; each pair is judged again at the result.
+"""Adjustment of a rig over the evidence of its edges; each edge is judged again at the result.
 
 An edge that failed a check is left out and keeps its pose and verdict. An edge with too little data to be
-judged alone, as camera-radar mostly is, is certified at the adjusted pose.
+judged alone, as camera-radar mostly is, is certified at the adjusted pose. Its own evidence stands beside it in the
+record.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from pipeline.calibrate.adjust.adjusted import AdjustedRig, AdjustmentLimits
-from pipeline.calibrate.adjust.evidence import evidence_of
 from pipeline.calibrate.adjust.rig import adjust
 from pipeline.calibrate.numerics.covariance import OBSERVABLE
-from pipeline.calibrate.solved import SolvedDay
-from pipeline.core.config import FleetConfig
+from pipeline.calibrate.solved import SolvedEdge
 from pipeline.rig.changes import change_between
 from pipeline.rig.checks import FailedCheck, change_of
-from pipeline.rig.estimates import PairEstimate, Solution
-from pipeline.rig.evidence import EdgeEvidence
+from pipeline.rig.edges import pose_columns
+from pipeline.rig.estimates import PairEstimate
 from pipeline.rig.extrinsics import Extrinsics
 from pipeline.rig.graph import Edge, RigGraph
 from pipeline.rig.se3 import adjoint, compose_covariance, inverse
+from schemas.calibrations import CalibrationRecord
 
-__all__ = ["adjusted_rig", "clocks_of", "evidence_of_day", "judged_together"]
+__all__ = ["Concluded", "adjusted_rig", "conclude"]
 
 _SIGMAS = 3.0  # by which an edge that is left out contradicts the rest
 
 
-def evidence_of_day(day: SolvedDay, edges: Mapping[str, Edge], fleet: FleetConfig) -> list[EdgeEvidence]:
-    """Evidence of the pairs, and the reason for leaving out pairs held for more than a wide sigma."""
-    return [
-        evidence_of(
-            estimate,
-            edges[pair],
-            day.prior,
-            fleet.solve.time_offset_sigma_s,
-            day.judged[pair].verdict.against,
-        )
-        for pair, estimate in day.solution.pairs.items()
-    ]
-
-
-def clocks_of(day: SolvedDay, edges: Mapping[str, Edge]) -> dict[Edge, float]:
-    """Expected time offset of pairs that estimate one."""
-    expected = {edges[p]: e.time_offset_prior_s for p, e in day.solution.pairs.items()}
-    return {edge: dt_s for edge, dt_s in expected.items() if dt_s is not None}
-
-
 def adjusted_rig(
-    graph: RigGraph,
-    prior: Extrinsics,
-    evidence: Sequence[EdgeEvidence],
-    clocks: Mapping[Edge, float],
-    clock_sigma_s: float,
+    graph: RigGraph, prior: Extrinsics, edges: Sequence[SolvedEdge], clock_sigma_s: float
 ) -> AdjustedRig | None:
-    """The rig adjusted over evidence; None if there is none.
+    """The rig adjusted over the evidence of its edges; None if there is none.
 
-    Args:
-        prior: of all sensors that have one.
-        clocks: what is expected of the time offset of edges that time a sensor.
+    `prior` is of all sensors that have one.
     """
-    known = [e for e in evidence if {s.name for s in e.edge.sensors} <= set(prior.T)]
+    known = [e for e in edges if {s.name for s in e.edge.sensors} <= set(prior.T)]
     if not known:
         return None
     sensors = tuple(s for s in graph.sensors if s.name in prior.T)
-    edges = tuple(e for e in graph.edges if set(e.sensors) <= set(sensors))
-    graph = RigGraph(sensors, edges, graph.reference)
+    there = tuple(e for e in graph.edges if set(e.sensors) <= set(sensors))
+    graph = RigGraph(sensors, there, graph.reference)
+    expected = {e.edge: e.own.time_offset_prior_s for e in edges}
+    clocks = {edge: dt_s for edge, dt_s in expected.items() if dt_s is not None}
     prior = replace(prior, dt_s=_expected_clocks(graph, clocks))
-    return adjust(graph, prior, known, AdjustmentLimits(clock_sigma_s))
+    return adjust(graph, prior, [e.evidence for e in known], AdjustmentLimits(clock_sigma_s))
 
 
-def judged_together(day: SolvedDay, rig: AdjustedRig | None, edges: Mapping[str, Edge]) -> SolvedDay:
-    """The day at the adjusted poses."""
-    if rig is None:
-        return day
-    pairs, verdicts = dict(day.solution.pairs), dict(day.judged)
-    for pair, own in day.solution.pairs.items():
-        if day.judged[pair].held_by or pair not in day.judging.active or edges[pair] not in rig.edges:
-            continue
-        estimate = _of_rig(own, edges[pair], rig, day.solution)
-        against = _contradictions(edges[pair], rig, day, estimate, edges)
-        failed = [*day.failed[pair], *against]
-        again = day.judging.pair(estimate, failed, together=True)
-        if edges[pair] not in rig.left_out or again.verdict.status == "accepted":
-            pairs[pair], verdicts[pair] = estimate.doubted(again.doubt), again
-        elif against:
-            verdicts[pair] = day.judging.pair(own, failed, together=False)
-    return replace(day, solution=replace(day.solution, pairs=pairs), judged=verdicts)
+@dataclass(frozen=True, eq=False)
+class Concluded:
+    """An edge's record; `is_adjusted` if it states the adjusted pose, and not what the edge found alone."""
+
+    edge: Edge
+    record: CalibrationRecord
+    is_adjusted: bool
+
+
+def conclude(edges: Sequence[SolvedEdge], rig: AdjustedRig | None) -> list[Concluded]:
+    """The record of each edge: at the adjusted pose, unless it is held by checks of its own or left out.
+
+    A left-out edge whose pose the others certify states that pose.
+    """
+    estimates = {e.edge: e.own for e in edges}
+    return [_concluded(e, rig, estimates) for e in edges]
+
+
+def _concluded(
+    edge: SolvedEdge, rig: AdjustedRig | None, estimates: Mapping[Edge, PairEstimate]
+) -> Concluded:
+    at = None if rig is None else rig.edges.get(edge.edge)
+    if rig is None or at is None:
+        return Concluded(edge.edge, edge.record(edge.own, edge.judged), is_adjusted=False)
+    estimate, judged = edge.own, edge.judged
+    if edge.is_active and not edge.judged.held_by:
+        adjusted = _of_rig(edge, rig, estimates)
+        against = _contradictions(edge, rig, adjusted, estimates)
+        again = edge.judge(adjusted, [*edge.failed, *against], together=True)
+        if at.used or again.verdict.status == "accepted":
+            estimate, judged = adjusted.doubted(again.doubt), again
+        elif against and not edge.evidence.checks:  # else it is held by what it failed itself
+            judged = edge.judge(edge.own, [*edge.failed, *against], together=False)
+    record = edge.record(estimate, judged)
+    is_adjusted = estimate is not edge.own
+    if is_adjusted and record.status != "refused":
+        record = replace(record, **_own_columns(edge.own))
+    record = replace(record, innovation_sigmas=at.innovation_sigmas, used=at.used)
+    return Concluded(edge.edge, record, is_adjusted)
+
+
+def _own_columns(own: PairEstimate) -> dict[str, Any]:
+    """What an edge found alone, beside the adjusted pose of its record."""
+    return pose_columns(own.T, "own_") | {
+        "own_covariance": own.covariance,
+        "own_common_covariance": own.common_covariance,
+        "own_observable": [bool(v) for v in own.observable],
+    }
 
 
 def _contradictions(
-    edge: Edge, rig: AdjustedRig, day: SolvedDay, adjusted: PairEstimate, edges: Mapping[str, Edge]
+    solved: SolvedEdge, rig: AdjustedRig, adjusted: PairEstimate, estimates: Mapping[Edge, PairEstimate]
 ) -> list[FailedCheck]:
     """Contradictions of other edges to this one, of edges left out too unless they are known to be wrong.
 
-    Camera-lidar is not checked: its held-out frames would show any error that a radar's edges can show.
+    An edge that others in use confirm on another way is not contradicted by what is left out, and none is by an edge
+    that lies far from its prior, which holds what rests on that prior (`prior_doubts`). Camera-lidar is not checked:
+    its held-out frames would show any error that a radar's edges can show.
     """
-    if edge.kind == "camera_lidar" and day.judged[edge.kind].verdict.status == "accepted":
+    edge = solved.edge
+    if edge.kind == "camera_lidar" and solved.judged.verdict.status == "accepted":
         return []
-    found: dict[str, list[Edge]] = {}
-    if doubts := rig.edges[edge].doubts:
+    own, found = rig.edges[edge], dict[str, list[Edge]]()
+    if doubts := own.doubts:
         found[", ".join(e.name for e in doubts)] = [e for e in doubts if not rig.edges[e].used]
-    for other, at in rig.edges.items():
-        if other == edge or at.used or other in doubts or any(c.disproves for c in at.evidence.checks):
+    is_confirmed = own.used and own.innovation_sigmas is not None
+    for other, at in () if is_confirmed else rig.edges.items():
+        is_explained = any(c.disproves or c.fault == "prior" for c in at.evidence.checks)
+        if other == edge or at.used or other in doubts or is_explained:
             continue
         if (at.innovation_sigmas or 0.0) > _SIGMAS:
             found[f"{other.name} and the other edges"] = [other]
-    estimates = {edges[pair]: estimate for pair, estimate in day.solution.pairs.items()}
     checks = []
     for who, out in found.items():
         sentence = f"{who} contradict each other and nothing tells which is wrong"
@@ -147,11 +159,14 @@ def _around(
     return None
 
 
-def _of_rig(own: PairEstimate, edge: Edge, rig: AdjustedRig, solution: Solution) -> PairEstimate:
-    """A pair's estimate at the adjusted pose, with the other results of its own frames."""
+def _of_rig(solved: SolvedEdge, rig: AdjustedRig, estimates: Mapping[Edge, PairEstimate]) -> PairEstimate:
+    """An edge's estimate at the adjusted pose, with the other results of its own frames."""
+    own, edge = solved.own, solved.edge
     parent, child = (s.name for s in edge.sensors)
     observability = rig.observability(parent, child)
-    others = [e.frames_used for p, e in solution.pairs.items() if p != own.pair]
+    sensors = tuple({s for e in rig.edges for s in e.sensors})
+    way = RigGraph(sensors, tuple(rig.edges), edge.parent).without([edge]).path(*edge.sensors)
+    others = [estimates[e].frames_used for e in way or () if e in estimates]
     dt = {n: rig.poses.dt_s.get(n, 0.0) for n in (parent, child)}
     sigmas = [rig.sensors[n].dt_sigma_s for n in (parent, child) if n in rig.sensors]
     return replace(

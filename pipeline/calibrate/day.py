@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
-from pipeline.calibrate.adjusted_day import adjusted_rig, clocks_of, evidence_of_day, judged_together
+from pipeline.calibrate.adjust.evidence import evidence_of
+from pipeline.calibrate.adjusted_day import adjusted_rig, conclude
 from pipeline.calibrate.judging import Judged, Judging
 from pipeline.calibrate.methods import Method, Solver, method_named
 from pipeline.calibrate.paper.triggers import exceeded, trigger_metrics
 from pipeline.calibrate.records import Inputs, record_of, refused_record
 from pipeline.calibrate.select.frames import PAPER_SYNC_GATE_S, Selection, select_frames
-from pipeline.calibrate.solved import SolvedDay
+from pipeline.calibrate.solved import SolvedDay, SolvedEdge
 from pipeline.calibrate.unlabelled import unlabelled_pairs
 from pipeline.calibrate.verify.day_checks import FoundDay, checks_of_day
 from pipeline.calibrate.verify.day_labels import day_labels
@@ -38,7 +40,6 @@ __all__ = [
     "DayOfPairs",
     "calibrate_observations",
     "poses_of",
-    "records_of",
     "solve_day",
     "three_sensors",
 ]
@@ -64,23 +65,13 @@ def calibrate_observations(
         SolveError: the day cannot be calibrated.
     """
     day = solve_day(observations, prior, fleet, about, progress, solver)
-    if day.solved is None or not day.solved.solution.apart:
-        return records_of(about, day)
-    edges = {pair: EDGES[pair] for pair in day.solved.solution.pairs}
-    evidence = evidence_of_day(day.solved, edges, fleet)
-    graph, sigma_s = three_sensors(edges), fleet.solve.time_offset_sigma_s
-    if not all(prior.knows(pair) for pair in ("camera_lidar", "lidar_radar")):
-        return records_of(about, day)
-    rig = adjusted_rig(graph, poses_of(prior, {}), evidence, clocks_of(day.solved, edges), sigma_s)
-    return records_of(about, replace(day, solved=judged_together(day.solved, rig, edges)))
-
-
-def records_of(about: Inputs, day: DayOfPairs) -> list[CalibrationRecord]:
-    """One record per pair, for any verdict."""
-    return [
-        day.refused[pair] if day.solved is None or pair in day.refused else record_of(about, pair, day.solved)
-        for pair in about.pairs
-    ]
+    solved, rig, records = day.edges(about, fleet, EDGES), None, dict(day.refused)
+    knows_both = all(prior.knows(pair) for pair in ("camera_lidar", "lidar_radar"))
+    if day.solved is not None and day.solved.solution.apart and knows_both:
+        graph = three_sensors([e.edge.kind for e in solved])
+        rig = adjusted_rig(graph, poses_of(prior, {}), solved, fleet.solve.time_offset_sigma_s)
+    records |= {c.edge.kind: c.record for c in conclude(solved, rig)}
+    return [records[pair] for pair in about.pairs]
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +83,21 @@ class DayOfPairs:
 
     refused: Mapping[str, CalibrationRecord]
     solved: SolvedDay | None
+
+    def edges(self, about: Inputs, fleet: FleetConfig, edges: Mapping[str, Edge]) -> list[SolvedEdge]:
+        """The pairs that were solved, as edges of a rig; `edges` by pair."""
+        day = self.solved
+        return [] if day is None else [
+            SolvedEdge(
+                edges[pair], own, day.judged[pair],
+                evidence_of(
+                    own, edges[pair], day.prior, fleet.solve.time_offset_sigma_s, day.judged[pair].verdict.against
+                ),
+                tuple(day.failed[pair]), day.judging.pair, partial(record_of, about, pair, day),
+                is_active=pair in day.judging.active,
+            )
+            for pair, own in day.solution.pairs.items()
+        ]  # fmt: skip
 
 
 def solve_day(

@@ -42,7 +42,7 @@ from pipeline.core.stage_work import NO_PROBES, Probes
 from pipeline.rig.changes import change_covariance
 from pipeline.rig.checks import FailedCheck
 from pipeline.rig.estimates import PairEstimate, Prior
-from pipeline.rig.evidence import EdgeEvidence, OtherScenes
+from pipeline.rig.evidence import EdgeEvidence
 from pipeline.rig.extrinsics import Extrinsics
 from pipeline.rig.graph import BASE, Edge, RigGraph
 from pipeline.rig.kinds import KIND_OF_EDGE
@@ -53,7 +53,7 @@ from pipeline.rig.targets import DEFAULT_TARGETS
 from schemas.calibrations import PROBE_Z
 from schemas.observations import Observation
 
-__all__ = ["Judged", "JudgedEdge", "Judging", "judged_edge"]
+__all__ = ["EdgeJudging", "Judged", "Judging"]
 
 
 @dataclass(frozen=True)
@@ -228,44 +228,61 @@ def probe_numbers(
 
 
 @dataclass(frozen=True, eq=False)
-class JudgedEdge:
-    """An edge's evidence, its estimate with its prior alone, and the verdict on it.
+class EdgeJudging:
+    """Inputs of the verdicts on an edge, and its estimate by its own data and its prior.
 
-    `evidence` has the reason why the rig must not use it, if there is one.
+    Args:
+        before: the prior of its two sensors alone.
+        views: of each sensor, by name.
     """
 
     evidence: EdgeEvidence
     before: Extrinsics
     estimate: PairEstimate
-    judged: Judged
+    prior: RigPrior
+    views: Mapping[str, View]
+    fleet: FleetConfig
 
+    @classmethod
+    def of(
+        cls, evidence: EdgeEvidence, prior: RigPrior, views: Mapping[str, View], fleet: FleetConfig
+    ) -> EdgeJudging:
+        """Combine an edge's own data with its prior alone."""
+        edge, child = evidence.edge, evidence.edge.child.name
+        free, limits = replace(evidence, checks=()), AdjustmentLimits(fleet.solve.time_offset_sigma_s)
+        alone = adjust(RigGraph(edge.sensors, (edge,), edge.parent), _prior_of(edge, prior), [free], limits)
+        of_child, poses = alone.sensors[child], alone.poses
+        estimate = PairEstimate(
+            edge.kind, poses.T[child], poses.covariance, of_child.observability, of_child.determined,
+            evidence.frames_used, dict(evidence.frames_rejected), diagnostics=dict(evidence.diagnostics),
+            common_covariance=poses.common, parts=evidence.parts,
+        )  # fmt: skip
+        return cls(evidence, alone.before, estimate, prior, views, fleet)
 
-def judged_edge(
-    evidence: EdgeEvidence, prior: RigPrior, views: Mapping[str, View], fleet: FleetConfig
-) -> JudgedEdge:
-    """Combine an edge's own data with its prior alone, and judge the result."""
-    edge, child = evidence.edge, evidence.edge.child.name
-    free, limits = replace(evidence, checks=()), AdjustmentLimits(fleet.solve.time_offset_sigma_s)
-    alone = adjust(RigGraph(edge.sensors, (edge,), edge.parent), _prior_of(edge, prior), [free], limits)
-    of_child, poses = alone.sensors[child], alone.poses
-    estimate = PairEstimate(
-        edge.kind, poses.T[child], poses.covariance, of_child.observability, of_child.determined,
-        evidence.frames_used, dict(evidence.frames_rejected), diagnostics=dict(evidence.diagnostics),
-        common_covariance=poses.common, parts=evidence.parts,
-    )  # fmt: skip
-    targets = targets_of(estimate.T, views.get(edge.parent.name), views.get(child))
-    targets = DEFAULT_TARGETS if targets is None else targets
-    mounting = mounting_covariance(edge.kind, estimate.T, estimate.covariance, None)
-    test, update = _other_scenes(evidence.others, estimate.covariance)
-    claims = _claims(estimate, update, fleet.verify, mounting, targets)
-    sigmas = prior.sigmas_between(*(s.name for s in edge.sensors))
-    before, before_sigma = alone.before.T[child], np.repeat(sigmas, 3)
-    if edge.child != BASE:  # a parent that turns swings the child
-        before_sigma = np.sqrt(np.diag(change_covariance(before, alone.before.covariance)))
-    result = _result(estimate, before, before_sigma, search_range(sigmas, fleet.solve), targets)
-    verdict = judge(result, Evidence(test, claims, evidence.checks), fleet.verify.checks)
-    judged = Judged(verdict, test, claims, mounting, targets)
-    return JudgedEdge(replace(evidence, checks=verdict.against), alone.before, estimate, judged)
+    def edge(self, estimate: PairEstimate, failed: Sequence[FailedCheck], *, together: bool) -> Judged:
+        """Judge it at an estimate; `together` is true if other edges take part in its pose (see `judge`)."""
+        edge, checks = self.evidence.edge, self.fleet.verify.checks
+        targets = targets_of(estimate.T, self.views.get(edge.parent.name), self.views.get(edge.child.name))
+        targets = DEFAULT_TARGETS if targets is None else targets
+        mounting = mounting_covariance(edge.kind, estimate.T, estimate.covariance, None)
+        test, update = self._other_scenes(estimate)
+        claims = _claims(estimate, update, self.fleet.verify, mounting, targets)
+        sigmas = self.prior.sigmas_between(*(s.name for s in edge.sensors))
+        before, before_sigma = self.before.T[edge.child.name], np.repeat(sigmas, 3)
+        if edge.child != BASE:  # a parent that turns swings the child
+            before_sigma = np.sqrt(np.diag(change_covariance(before, self.before.covariance)))
+        result = _result(estimate, before, before_sigma, search_range(sigmas, self.fleet.solve), targets)
+        verdict = judge(result, Evidence(test, claims, failed), checks, together=together)
+        held_by = tuple(check for check in failed if matters(check, result, claims))
+        return Judged(verdict, test, claims, mounting, targets, held_by=held_by)
+
+    def _other_scenes(self, estimate: PairEstimate) -> tuple[HeldOutTest | None, HeldOutUpdate | None]:
+        """By how much scenes that took no part would move the edge's own fit; its way to the rig is its innovation."""
+        others = self.evidence.others
+        if others is None:
+            return None, None
+        test = None if others.cost is None else paired_test(*others.cost)
+        return test, HeldOutUpdate(others.shift, estimate.covariance, others.covariance, np.zeros((6, 6)))
 
 
 def _prior_of(edge: Edge, prior: RigPrior) -> Extrinsics:
@@ -275,13 +292,3 @@ def _prior_of(edge: Edge, prior: RigPrior) -> Extrinsics:
     rotation, translation = prior.sigmas_between(parent, child)
     covariance = np.diag([rotation**2] * 3 + [translation**2] * 3)
     return Extrinsics(edge.parent, {parent: np.eye(4), child: T}, (child,), covariance, covariance)
-
-
-def _other_scenes(
-    others: OtherScenes | None, covariance: np.ndarray
-) -> tuple[HeldOutTest | None, HeldOutUpdate | None]:
-    """What scenes that took no part in a fit show of the result."""
-    if others is None:
-        return None, None
-    test = None if others.cost is None else paired_test(*others.cost)
-    return test, HeldOutUpdate(others.shift, covariance, others.covariance, np.zeros((6, 6)))

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.calibrate.adjust.adjusted import AdjustedRig, AdjustedSensor
+from pipeline.calibrate.adjusted_day import Concluded
 from pipeline.calibrate.records import Inputs
 from pipeline.calibrate.verify.target_accuracy import Claim, claims_of, targets_of
 from pipeline.core.config import VerifyConfig
@@ -45,7 +46,7 @@ def pose_rows(
     before: Extrinsics,
     views: Mapping[str, View],
     verify: VerifyConfig,
-    judged: Mapping[str, CalibrationRecord] | None = None,
+    judged: Mapping[str, Concluded] | None = None,
 ) -> list[PoseRow]:
     """A row for each sensor, the reference included.
 
@@ -53,8 +54,8 @@ def pose_rows(
         adjusted: the adjusted rig; None if no edge had evidence.
         before: the prior of the sensors that have one.
         views: view of each sensor, by name; a pose is certified for directions in this view.
-        judged: by sensor, the record of its edge to the reference if that was judged at the adjusted pose,
-            with held-out frames; its verdict is used for the pose.
+        judged: by sensor, what was concluded of its edge to the reference; the verdict is the pose's where it is on the
+            adjusted pose, with held-out frames.
     """
     rows = [_row(about, graph, sensor, adjusted, before, views, verify) for sensor in graph.sensors]
     return [_as_judged(row, (judged or {}).get(row.sensor)) for row in rows]
@@ -130,9 +131,13 @@ def _reversed(T: np.ndarray | None, *covariances: np.ndarray | None) -> tuple[np
     return inverse(T), *(None if C is None else A @ C @ A.T for C in covariances)
 
 
-def _as_judged(row: PoseRow, record: CalibrationRecord | None) -> PoseRow:
-    if record is None or record.status == "refused" or row.status == "refused":
+def _as_judged(row: PoseRow, concluded: Concluded | None) -> PoseRow:
+    """The pose with the verdict on its edge to the reference, unless other edges certify it without that edge."""
+    if concluded is None or "refused" in (concluded.record.status, row.status):
         return row
+    if not concluded.is_adjusted and row.status == "accepted":
+        return row
+    record = concluded.record
     return replace(
         row,
         status=record.status,

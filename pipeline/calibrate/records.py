@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.calibrate.judging import Judged, JudgedEdge
+from pipeline.calibrate.judging import EdgeJudging, Judged
 from pipeline.calibrate.paper.triggers import trigger_metrics
 from pipeline.calibrate.solved import SolvedDay
 from pipeline.calibrate.unlabelled import notes_of_pair
@@ -64,9 +64,11 @@ class Inputs:
     probe_deg: Probes = NO_PROBES  # as `Task.probe_deg`
 
 
-def record_of(about: Inputs, pair: str, day: SolvedDay) -> CalibrationRecord:
-    """The record of one pair of camera, lidar and radar that was computed."""
-    estimate, judged, selection = day.solution.pairs[pair], day.judged[pair], day.selection
+def record_of(
+    about: Inputs, pair: str, day: SolvedDay, estimate: PairEstimate, judged: Judged
+) -> CalibrationRecord:
+    """The record of one pair of camera, lidar and radar that was computed, at its own or the adjusted pose."""
+    selection = day.selection
     trigger_after = trigger_metrics(day.trigger_sample, {pair: estimate.T})[pair]
     faults = {p: judged.verdict.faults for p, judged in day.judged.items()}
     notes = [*notes_of_pair(pair, day.observations), *selection.notes.get(pair, [])]
@@ -114,10 +116,12 @@ def computed_record(
     )
 
 
-def record_of_edge(about: Inputs, found: JudgedEdge, frames_total: int) -> CalibrationRecord:
-    """Record of an edge from its own data and its prior alone."""
+def record_of_edge(
+    about: Inputs, found: EdgeJudging, frames_total: int, estimate: PairEstimate, judged: Judged
+) -> CalibrationRecord:
+    """Record of an edge of another kind, at its own or the adjusted pose."""
     edge, before = found.evidence.edge, found.before
-    record = computed_record(about, edge, frames_total, found.estimate, found.judged, found.evidence.notes)
+    record = computed_record(about, edge, frames_total, estimate, judged, found.evidence.notes)
     prior = pose_columns(before.T[edge.child.name], "prior_")
     return replace(record, **prior, prior_covariance=before.covariance)
 

@@ -68,14 +68,20 @@ def pairs_of(lake: Lake, vehicle: str, day: str | None, method: str) -> dict[Edg
     nodes |= {name: Sensor(name, cast("Kind", kind)) for name, kind, *_ in poses}
     ties = {tie(nodes[n], nodes[r]): (n, row) for n, _, r, row in poses if n != r and r in nodes}
     of_three = is_one_of_each(nodes.values())
-    adjusted = {edge: row for edge, row in of_edge.items() if day is None or of_three}
     chosen: dict[Edge, ExportedPair | str] = {
-        edge: _pair(adjusted[edge]) if edge in adjusted else _pair_of_pose(row, name, edge)
+        edge: _pair_of_pose(row, name, edge)
+        if edge not in of_edge or _is_left_out(of_edge[edge])
+        else _pair(of_edge[edge])
         for edge, (name, row) in ties.items()
     }
     if of_three or not ties:
         chosen |= {edge: _pair(row) for edge, row in of_edge.items() if edge not in chosen}
     return {edge: chosen[edge] for edge in sorted(chosen, key=edge_order)}
+
+
+def _is_left_out(row: CalibrationRecord | StateRow) -> bool:
+    """Whether a record states what its edge found alone, and not the pose of the adjusted rig."""
+    return isinstance(row, CalibrationRecord) and row.used is False and row.own_covariance is None
 
 
 def _pair_of_pose(row: PoseRow | StateRow, sensor: str, edge: Edge) -> ExportedPair | str:

@@ -25,6 +25,7 @@ SHIFT_SIGMAS = {
     "lidar_radar": ([UNSURE_DEG, 0.4, 0.05], [UNSURE_M] * 3),
     "lidar_lidar": ([0.03, 0.03, 0.03], [0.02, 0.02, 0.02]),
     "lidar_base": ([0.05, 0.05, 0.1], [UNSURE_M, UNSURE_M, 0.02]),
+    "camera_base": ([0.05, 0.05, 0.1], [UNSURE_M, UNSURE_M, 0.02]),
     "radar_base": ([UNSURE_DEG, 0.4, 0.1], [UNSURE_M] * 3),
 }
 # Axes as cameras have them, seen from bodies' axes.
@@ -42,7 +43,7 @@ class Rig:
         possible = []
         for i, b in enumerate(self.sensors):
             for a in self.sensors[:i]:
-                with contextlib.suppress(ValueError):  # two cameras, two radars, a camera and base
+                with contextlib.suppress(ValueError):  # two cameras, two radars
                     possible.append(edge_between(a, b))
         # Each sensor on the first lidar, then others.
         tree = [e for e in possible if "s0" in (e.parent.name, e.child.name)]

@@ -1,12 +1,13 @@
 """Edges to the vehicle frame and between lidars are judged as pairs are: range, prior, number, claims."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from pipeline.calibrate.edges.radar_base import estimate_radar_base
-from pipeline.calibrate.judging import judged_edge
+from pipeline.calibrate.judging import EdgeJudging
 from pipeline.calibrate.records import Inputs, record_of_edge
 from pipeline.rig.changes import change_between
 from pipeline.rig.checks import FailedCheck
@@ -36,9 +37,15 @@ def prior_of(edge, T_base_sensor, sigmas=SIGMAS):
     )
 
 
+def judgement(evidence, prior):
+    judging = EdgeJudging.of(evidence, prior, {}, FLEET)
+    return judging, judging.edge(judging.estimate, evidence.checks, together=False)
+
+
 def judged(evidence, T_base_sensor, sigmas=SIGMAS):
-    found = judged_edge(evidence, prior_of(evidence.edge, T_base_sensor, sigmas), {}, FLEET)
-    return found, record_of_edge(ABOUT, found, 200)
+    judging, found = judgement(evidence, prior_of(evidence.edge, T_base_sensor, sigmas))
+    left = SimpleNamespace(estimate=judging.estimate, against=found.verdict.against)
+    return left, record_of_edge(ABOUT, judging, 200, judging.estimate, found)
 
 
 def radar_day(prior_off_deg):
@@ -57,7 +64,7 @@ def test_a_radar_within_its_prior_is_accepted_for_its_azimuth_and_used():
     T, prior, evidence = radar_day(2.0)
     found, record = judged(evidence, prior)
     assert (record.status, record.determined, record.faults) == ("accepted", ["azimuth"], [])
-    assert found.evidence.checks == ()
+    assert found.against == ()
     assert abs(change_between(T, inverse(found.estimate.T))[2]) < np.radians(0.1)
     assert record.limit_rad == pytest.approx(np.radians(0.4))
     assert record.score > 0
@@ -71,7 +78,7 @@ def test_a_radar_far_from_its_prior_is_held_names_the_prior_and_is_not_used(off_
     found, record = judged(evidence, prior)
     assert (record.status, record.determined, record.faults) == ("held", [], ["prior"])
     assert words in record.reason
-    assert [check.fault for check in found.evidence.checks] == ["prior"]
+    assert [check.fault for check in found.against] == ["prior"]
     assert record.diagnostics["disproved"] == float(off_deg > 20)
 
 
@@ -91,7 +98,7 @@ def test_a_lidar_far_from_its_prior_is_held(rpy_deg, z_m, words):
     found, record = judged(sure(edge, T), turned(T, rpy_deg, (0.0, 0.0, z_m)))
     assert (record.status, record.faults) == ("held", ["prior"])
     assert words in record.reason
-    assert found.evidence.checks
+    assert found.against
 
 
 def test_two_lidars_are_held_to_their_prior_with_its_lever_arm():
@@ -108,7 +115,7 @@ def test_two_lidars_are_held_to_their_prior_with_its_lever_arm():
         evidence = EdgeEvidence(
             edge, T_found, 0.0, np.eye(7) * 1e6, np.zeros(7), frames_used=30, others=better
         )
-        return judged_edge(evidence, prior, {}, FLEET).judged.verdict
+        return judgement(evidence, prior)[1].verdict
 
     assert verdict(T).status == "accepted"
     swung = from_rotation_translation(exp_so3(np.radians([0.0, 0.0, 3.0])), np.zeros(3)) @ T
@@ -127,7 +134,7 @@ def test_scenes_that_contradict_a_fit_hold_it_by_what_they_would_move_and_name_i
     found, record = beside(0.5)
     assert (record.status, record.faults, record.determined) == ("held", ["witnesses_disagree"], [])
     assert "azimuth is 0.50 deg off by held-out frames" in record.reason
-    assert found.evidence.checks
+    assert found.against
     assert beside(0.1)[1].status == "accepted"  # two sigmas
     assert beside(0.2)[1].status == "accepted"  # four, and within the limit
     assert record.diagnostics["holdout_azimuth_shift_rad"] == pytest.approx(np.radians(0.5), rel=0.05)
@@ -142,7 +149,7 @@ def test_two_lidars_need_a_better_alignment_of_scenes_that_took_no_part(after, s
     others = OtherScenes(np.zeros(6), np.zeros((6, 6)), cost)
     moved = turned(T, (0.0, 0.0, 1.0))
     evidence = EdgeEvidence(edge, moved, 0.0, np.eye(7) * 1e6, np.zeros(7), frames_used=30, others=others)
-    assert judged_edge(evidence, prior, {}, FLEET).judged.verdict.status == status
+    assert judgement(evidence, prior)[1].verdict.status == status
 
 
 def test_what_an_estimator_names_is_held_and_left_out():
@@ -150,7 +157,7 @@ def test_what_an_estimator_names_is_held_and_left_out():
     failed = replace(sure(EDGE, T), checks=(FailedCheck("halves differ", "witnesses_disagree"),))
     found, record = judged(failed, T)
     assert (record.status, record.faults) == ("held", ["witnesses_disagree"])
-    assert found.evidence.checks[0].fault == "witnesses_disagree"
+    assert found.against[0].fault == "witnesses_disagree"
 
 
 def test_an_edge_that_is_only_unsure_is_held_and_used():
@@ -159,7 +166,7 @@ def test_an_edge_that_is_only_unsure_is_held_and_used():
     found, record = judged(unsure, T)
     assert record.status == "held"
     assert record.diagnostics["unsure_only"] == 1.0
-    assert found.evidence.checks == ()
+    assert found.against == ()
 
 
 def test_too_few_frames_are_refused_and_have_no_pose():
@@ -167,4 +174,4 @@ def test_too_few_frames_are_refused_and_have_no_pose():
     found, record = judged(sure(EDGE, T, frames=7), T)
     assert (record.status, record.reason) == ("refused", "too few frames: 7, needs 8")
     assert record.covariance is None
-    assert found.evidence.checks
+    assert found.against

@@ -119,4 +119,4 @@ def test_a_base_whose_prior_is_half_a_metre_and_five_degrees_off_is_held(made, t
     assert (poses["base"].determined, poses["base"].status) == ([], "held")
     assert poses["base"].faults == ["prior"]
     assert not poses["base"].unsure_only
-    assert records["top", "nose"].status == "accepted"
+    assert records["top", "nose"].status == "accepted", records["top", "nose"].reason

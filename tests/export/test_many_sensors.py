@@ -2,6 +2,7 @@
 
 import json
 import tomllib
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -154,7 +155,9 @@ def test_commands_name_frames_of_any_sensor_and_the_file_is_as_the_day_it_was_wr
     assert "'front' is not SENSOR=NAME" in told.summary["reason"]
 
 
-def test_a_day_whose_rig_was_adjusted_is_exported_by_its_poses(lake, tmp_path, capsys):
+def test_what_the_rig_does_without_is_exported_by_its_poses_and_not_by_what_the_edge_found(tmp_path, capsys):
+    lake, left_out = str(tmp_path / "lake"), rig_records("van", 2, np.random.default_rng(2))
+    commit_records(Lake.at(lake), CALIBRATIONS, [replace(r, used=False) for r in left_out])
     rng, moved = np.random.default_rng(8), exp_se3(np.r_[0, 0, 0.004, 0.01, 0, 0])
     names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
     for sensor, kind, status in (
