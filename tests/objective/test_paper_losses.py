@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from pipeline.objective.paper.camera_lidar import camera_lidar_loss
+from pipeline.objective.paper.camera_lidar import camera_lidar_loss, object_cost_map
 from pipeline.objective.paper.camera_radar import camera_radar_loss
 from pipeline.objective.paper.lidar_radar import lidar_radar_loss
 from pipeline.objective.paper.loop import loop_loss, loop_transform
 from pipeline.rig.se3 import exp_so3, inverse
-from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
+from tests.makers.solve_scenes import CAMERA, SKY, T_CAMERA_LIDAR, T_LIDAR_RADAR, VEGETATION, make_day
 
 TRUTH = {
     "camera_lidar": T_CAMERA_LIDAR,
@@ -75,3 +75,12 @@ def test_loop_of_consistent_transforms_costs_nothing_and_grows_with_each_angle()
 def euler_matrix(angles):
     roll, pitch, yaw = (exp_so3(a * e) for a, e in zip(angles, np.eye(3), strict=True))
     return yaw @ pitch @ roll
+
+
+def test_camera_lidar_cost_is_nothing_on_objects_and_two_deep_in_the_sky():
+    labels = np.full((160, 320), VEGETATION, np.uint8)
+    labels[:100] = SKY
+    cost = object_cost_map(labels, CAMERA.scaled(0.5))
+    assert cost[120, 50] == 0
+    assert cost[99, 50] > 1.0  # the penalty, even at the edge
+    assert 1.9 < cost[0, 50] < 2.0

@@ -14,6 +14,7 @@ from pipeline.objective.radar.registration import (
 from pipeline.rig.se3 import exp_se3, inverse, transform_points
 from pipeline.rig.spherical import to_spherical
 from tests.makers.radar_scenes import DT_S, SIGMA, T_LIDAR_RADAR, street_day
+from tests.objective import plain_numpy
 
 RADAR = np.array([12.0, -4.0, 1.1])
 VELOCITY = np.array([9.0, -0.4, 0.2])
@@ -109,3 +110,17 @@ def test_ground_bounces_are_recognised():
         frames = registration_frames(observations, T_LIDAR_RADAR, np.random.default_rng(0))
         shares.append(normal_equations(frames, T_LIDAR_RADAR, DT_S, SIGMA, 0.12, 0.2).bounced)
     assert shares[1] > 3 * shares[0] + 0.03
+
+
+@pytest.mark.parametrize("widen", [0.2, 1.0, 4.0])
+def test_every_lidar_point_in_reach_takes_part(widen):
+    """Against every pair of detection and point in plain NumPy, at sigmas sharper and wider than the cells."""
+    frames = registration_frames(street_day(3), T_LIDAR_RADAR, np.random.default_rng(0))
+    about = (T_LIDAR_RADAR, 0.04, widen * SIGMA_START, 0.12, 0.2)
+    ours, plain = normal_equations(frames, *about), plain_numpy.registration(frames, *about)
+    for a, b in zip((ours.H, ours.g, ours.information, ours.cost), plain, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-6 * np.abs(b).max())
+    turning = replace(frames, yaw_rate_radps=np.full(frames.count, YAW_RATE))
+    cost = normal_equations(turning, *about).cost
+    assert np.abs(cost - ours.cost).max() > 1e-3
+    np.testing.assert_allclose(cost, plain_numpy.registration_cost(turning, *about), atol=1e-7)
