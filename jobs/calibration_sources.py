@@ -39,9 +39,9 @@ def read_calibration(
     method: str,
     *,
     force: bool,
-    frames: FrameOptions,
-    own_frames: bool,
-    mount: str | None,
+    frames: FrameOptions | None = None,
+    own_frames: bool = False,
+    mount: str | None = None,
 ) -> ExportedCalibration:
     """Read a day's records (without a day: the vehicle's state) for a file; ConfigError if there are none.
 
@@ -58,7 +58,7 @@ def read_calibration(
     pairs, without = choose_pairs({words_of(edge): pair for edge, pair in found.items()}, force=force)
     details = [p.details for p in pairs.values()]
     days = {str(d) for detail in details for d in (*_listed(detail.get("days")), detail["day"])}
-    names = frames.names(read_frame_ids(lake, vehicle, days) if own_frames else None)
+    names = (frames or FrameOptions()).names(read_frame_ids(lake, vehicle, days) if own_frames else None)
     edges = tuple(found)
     seen = sorted({sensor.name for edge in edges for sensor in edge.sensors if sensor.kind == "camera"})
     cameras = read_cameras(lake, vehicle, days, seen)

@@ -56,10 +56,11 @@ _HELP = {
     "simulate": "Write logs of a simulated fleet, and its true extrinsics.",
     "evaluate": "Compare records with true extrinsics or a reflector recording.",
 }
-_NAMED = {"import": "import_prior"}  # where a command has another name than its module and function
+# Where a command has another name than its module or its function.
+_ELSEWHERE = {"import": "jobs.import_prior:import_prior", "perceive": "jobs.ingest:perceive"}
 # Command -> its function and its line of help.
 COMMANDS: dict[str, tuple[str, str]] = {
-    name: ("jobs.{0}:{0}".format(_NAMED.get(name, name.replace(" ", "_"))), text)
+    name: (_ELSEWHERE.get(name, "jobs.{0}:{0}".format(name.replace(" ", "_"))), text)
     for name, text in _HELP.items()
 }
 

@@ -63,7 +63,9 @@ def convert(
         progress(0, 0, f"tables of {folder}")
         named: dict[Kind, str | None] = {"camera": camera, "lidar": lidar, "radar": radar}
         recordings = _recordings_of(data_set, folder, owner, day, named, radar_columns)
-        paths = [_path_of(out, r) for r in recordings]
+        folders = [Partition(r.vehicle, r.day) for r in recordings]  # raises for invalid names
+        named_logs = zip(folders, recordings, strict=True)
+        paths = [out / "logs" / p.vehicle / p.day / f"{r.name}.mcap" for p, r in named_logs]
         for done, (path, recording) in enumerate(zip(paths, recordings, strict=True)):
             progress(done, len(paths), recording.name)
             messages += write_log(path, recording)
@@ -109,9 +111,3 @@ def _write_fleet(
     fleet = out / "fleet.toml"
     fleet.write_text(fleet_text(data_set, vehicles, kinds, models, ego=has_ego, base=base))
     return fleet
-
-
-def _path_of(out: Path, recording: Recording) -> Path:
-
-    Partition(recording.vehicle, recording.day)
-    return out / "logs" / recording.vehicle / recording.day / f"{recording.name}.mcap"

@@ -99,7 +99,7 @@ def export(
     # Autoware's sensor kit has the camera's link, while logs name its optical frame.
     own_frames = not (generic_frames or what == "autoware")
     calibration = read_calibration(
-        lake, vehicle, day, method, force=force, frames=frames or FrameOptions(),
+        lake, vehicle, day, method, force=force, frames=frames,
         own_frames=own_frames, mount=mount,
     )  # fmt: skip
     if what == "foxglove":

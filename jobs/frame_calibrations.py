@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from jobs.calibration_sources import read_calibration
-from jobs.frame_options import FrameOptions
 from pipeline.core.config import FleetConfig
 from pipeline.core.errors import ConfigError, SolveError
 from pipeline.export.calibration import ExportedCalibration, sigmas_of
@@ -75,10 +74,7 @@ def _of_prior(lake: Lake, fleet: FleetConfig, day: Partition) -> Mounting:
 def _of_calibration(lake: Lake, day: Partition, kind: str, method: str, *, force: bool) -> Mounting:
 
     of_day = day.day if kind == "day" else None
-    found = read_calibration(
-        str(lake), day.vehicle, of_day, method, force=force, frames=FrameOptions(), own_frames=False,
-        mount=None,
-    )  # fmt: skip
+    found = read_calibration(str(lake), day.vehicle, of_day, method, force=force)
     reference = found.reference.name
     T, about = {reference: np.eye(4)}, {reference: _about("reference", [0.0] * 3, [0.0] * 3)}
     for sensor in found.sensors:

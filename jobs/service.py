@@ -42,8 +42,11 @@ def service(
         note: free text.
         withdraw: withdraw an event recorded by mistake; it has no effect from the next audit on.
     """
-    tables, of = Lake.existing(lake), Partition(vehicle, day)
-    _require_known(tables, of)
+    tables = Lake.existing(lake)
+    Partition(vehicle, day)  # raises for impossible names
+    if day > last_possible_day():
+        raise ConfigError("command line", "day", f"{day} has not come yet")
+    require_vehicle(tables, vehicle)
     _require_sensor(tables, vehicle, sensor)
     noted = events_until(tables, None).get(vehicle, [])
     if withdraw and (day, sensor, kind) not in [(e.day, e.sensor, e.kind) for e in noted]:
@@ -60,13 +63,6 @@ def service(
     step = "status and states change with the next night, or with `boresight audit`"
     print_summary("service", "done", **about, outputs=[tables.table(SERVICE_EVENTS.name)], next_steps=[step])
     return exit_code(["done"])
-
-
-def _require_known(lake: Lake, of: Partition) -> None:
-    """Raise ConfigError for a day in the future or a vehicle without a day in the lake."""
-    if of.day > last_possible_day():
-        raise ConfigError("command line", "day", f"{of.day} has not come yet")
-    require_vehicle(lake, of.vehicle)
 
 
 def _require_sensor(lake: Lake, vehicle: str, sensor: str) -> None:

@@ -10,7 +10,6 @@ import numpy as np
 
 from jobs.calibration_sources import read_calibration
 from jobs.extras import needs
-from jobs.frame_options import FrameOptions
 from jobs.terminal.summary import print_summary
 from pipeline.core.errors import ConfigError
 from pipeline.export.calibration import ExportedCalibration
@@ -97,10 +96,7 @@ def _draw(rig: Rig, shown: Shown, title: str, state: str, out: Path) -> None:
 
 def _rig(lake: Lake, vehicle: str, day: str, method: str) -> Rig:
     """Poses before and after the day; a sensor without an estimate keeps its prior pose; else ConfigError."""
-    after = read_calibration(
-        str(lake.root), vehicle, day, method, force=True, frames=FrameOptions(), own_frames=False,
-        mount=None,
-    )  # fmt: skip
+    after = read_calibration(str(lake.root), vehicle, day, method, force=True)
     found = priors_of_day(lake, vehicle, day, method)
     known = {name: pair for name, pair in found.items() if not isinstance(pair, str)}
     before = replace(after, pairs=known, known=tuple(pair.edge for pair in known.values()))

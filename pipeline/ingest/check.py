@@ -120,7 +120,8 @@ def check_logs(
     rows = builder.prior.rows()
     present = [frozenset(a.places) for a in anchored]
     prior = _prior(rows, fleet, rig, index.problems)
-    tracked = [n for t in topics for n in rig.radars if t.topic == rig.radars[n].points and _is_of_tracks(t)]
+    of_tracks = {t.topic for t in topics if any(kind.endswith("RadarTracks") for kind in t.types)}
+    tracked = [name for name, radar in rig.radars.items() if radar.points in of_tracks]
     sample = RigSample(rig, built, looked, present, logged_stars(rows), prior, silent, tracked)
     verdicts = [v for own in sample.verdicts.values() for v in own]
     first = sample.frames({str(kind): sensor for sensor, kind in reversed(index.kinds.items())})
@@ -189,10 +190,6 @@ def _topics(index: DayIndex, rig: Rig, unheard: Sequence[Unheard]) -> list[Topic
         problem = problems.get(topic, "" if types else "no message")
         findings.append(TopicFinding(str(role), topic, sorted(types), sum(types.values()), rate, problem))
     return findings
-
-
-def _is_of_tracks(found: TopicFinding) -> bool:
-    return any(kind.endswith("RadarTracks") for kind in found.types)
 
 
 def _sync(index: DayIndex, moments: int, config: IngestConfig) -> SyncQuality:

@@ -26,7 +26,7 @@ from pipeline.ingest.messages.point_cloud import LidarCloud
 from pipeline.ingest.messages.radar import RadarCloud
 from pipeline.ingest.sync import Rejection, none_near
 from pipeline.rig.edges import pose_columns
-from pipeline.rig.graph import BASE, Sensor, possible_edges
+from pipeline.rig.graph import BASE, possible_edges
 from pipeline.rig.prior import Star, between, middle_of, star_of, to_rows
 from pipeline.rig.rig import Rig
 from schemas.captures import Capture
@@ -64,7 +64,9 @@ class LoggedPrior:
             star = self._given
             if star is None:
                 star = star_of(nodes, lambda a, b: self._lookup(log, (a, frames[a]), (b, frames[b])))
-            self._stars[key] = star, _is_tied([node for node in nodes if node != BASE], star)
+            sensors = [node for node in nodes if node != BASE]
+            middle = middle_of(sensors)
+            self._stars[key] = star, all(between(star, middle.name, n.name) is not None for n in sensors)
         return self._stars[key][1]
 
     def rows(self) -> list[dict[str, Any]]:
@@ -219,8 +221,3 @@ def _content(part: LidarCloud | RadarCloud | bytes) -> tuple[bytes, ...]:
         few = len(part.xyz_m) < _FEWEST_POINTS
         return () if few else (part.xyz_m.tobytes(), part.range_rate_mps.tobytes())
     return (part,)
-
-
-def _is_tied(nodes: list[Sensor], star: Star) -> bool:
-    middle = middle_of(nodes)
-    return all(between(star, middle.name, node.name) is not None for node in nodes)

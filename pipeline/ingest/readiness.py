@@ -117,11 +117,18 @@ def judge_edge(name: str, kind: str, evidence: Evidence) -> list[DofVerdict]:
 
 def _needs(evidence: Evidence) -> list[tuple[str, str, _Needs]]:
     """Unmet requirements of each pair and class of DoF."""
-    camera, radar, ground = _camera_needs(evidence), _radar_needs(evidence), _common_needs(evidence)
-    pitch = ground + camera + _pitch_needs(evidence)
+    e, camera, ground = evidence, _camera_needs(evidence), _common_needs(evidence)
+    radar = [("weak", e.doppler_problem)] if e.doppler_problem and not e.doppler_is_wrong else []
+    pitch = ground + camera
+    if not (e.has_intensity or e.rings >= _DENSE_RINGS):
+        pitch += [
+            ("weak", "the lidar has few rings and logs no intensity: pitch depends on vertical edges only")
+        ]
     tilt = ground + radar + _elevation_needs(evidence)
     moving = ground + _moving_needs(evidence)
-    boxes = camera + _box_needs(evidence)
+    boxes = camera
+    if not e.names_semantics:
+        boxes = [*camera, ("no", f"no boxes of road users to compare with the radar: {_GET_LABELS}")]
     shift = [("weak", "far objects constrain shifts weakly: the prior provides part of it")]
     return [
         ("camera_lidar", "yaw and roll", ground + camera),
@@ -185,22 +192,6 @@ def _camera_needs(e: Evidence) -> _Needs:
         without = "remove `semantics` from fleet.toml, for borders by brightness"
         return [("no", f"no semantic labels on the topics of `semantics`: {_GET_LABELS}, or {without}")]
     return [("weak", f"labels on {e.labels_share:.0%} of the frames only")] if e.labels_share < 0.5 else []
-
-
-def _box_needs(e: Evidence) -> _Needs:
-    if e.names_semantics:
-        return []
-    return [("no", f"no boxes of road users to compare with the radar: {_GET_LABELS}")]
-
-
-def _pitch_needs(e: Evidence) -> _Needs:
-    if e.has_intensity or e.rings >= _DENSE_RINGS:
-        return []
-    return [("weak", "the lidar has few rings and logs no intensity: pitch depends on vertical edges only")]
-
-
-def _radar_needs(e: Evidence) -> _Needs:
-    return [("weak", e.doppler_problem)] if e.doppler_problem and not e.doppler_is_wrong else []
 
 
 def _elevation_needs(e: Evidence) -> _Needs:

@@ -26,9 +26,7 @@ class Role(NamedTuple):
     @property
     def kind(self) -> str:
         """Kind of the sensor."""
-        if self.what in (LIDAR, RADAR):
-            return LIDAR if self.what == LIDAR else RADAR
-        return "camera" if self.sensor else ""
+        return self.what if self.what in (LIDAR, RADAR) else "camera" if self.sensor else ""
 
     @property
     def is_capture(self) -> bool:

@@ -112,7 +112,8 @@ def _rows(
         for row in _built(anchored, builder, index, rejected, run.progress):
             made += 1
             yield row
-        run.rejected.update(_all_counts(rejected, index, builder))
+        counts = rejected + index.damage + builder.counts
+        run.rejected.update({str(k): int(v) for k, v in counts.items() if v})
         run.kept.update(_reading_counts(index))
         if not made:
             raise NothingUsable(*refusal(index, rig, rejected, config, unheard))
@@ -188,18 +189,17 @@ def refusal(
     index: DayIndex, rig: Rig, rejected: Counter[str], config: IngestConfig, unheard: Sequence[Unheard]
 ) -> tuple[str, ...]:
     """Reason why a day gives no frame, with topic and remedy; then the faults that it states."""
-    topics = {role.sensor: f"{topic} ({role})" for topic, role in topics_of(rig).items() if role.is_capture}
-    absent = [name for sensor, name in topics.items() if not index.captures(sensor).stamps]
+    topics = {role: topic for topic, role in topics_of(rig).items() if role.is_capture}
+    absent = [role for role in topics if not index.captures(role.sensor).stamps]
     faults: tuple[str, ...] = ()
     if any(u.is_misconfigured and u.role.what in NEEDED for u in unheard):
         return _shorten(index.problems), "configuration"
     if len(topics) - len(absent) < 2:
-        what = _nothing_on(", ".join(absent))
+        what = _nothing_on(", ".join(f"{topics[role]} ({role})" for role in absent))
         faults = ("configuration",) if index.types_beside() else ()  # no message at all is no fault of topics
     elif not set(rejected) & set(_UNUSABLE):
         of = {"camera": "an image", "lidar": "a sweep", "radar": "a scan"}
-        heard = {s: _topic_of(rig, s) for s, name in topics.items() if name not in absent}
-        met = " and ".join(f"{of[index.kinds[s]]} of {topic}" for s, topic in heard.items())
+        met = " and ".join(f"{of[r.kind]} of {topic}" for r, topic in topics.items() if r not in absent)
         what = f"{met} never come {_near_enough(config)}"
     else:
         reason = max(_UNUSABLE, key=lambda r: rejected[r])
@@ -235,10 +235,6 @@ def absences(
             why = next((p for p in index.problems if p.startswith(f"{reason}: ")), reason)
             found[sensor] = f"{stated}{topic} was unusable, most often {why} ({count})"
     return found
-
-
-def _topic_of(rig: Rig, sensor: str) -> str:
-    return next(topic for topic, role in topics_of(rig).items() if role.is_capture and role.sensor == sensor)
 
 
 def _nothing_on(topics: str) -> str:
@@ -294,10 +290,6 @@ def _built(
             if rejected[outcome.reason] == 1 and outcome.detail:
                 index.complain(f"{outcome.reason}: {outcome.detail}")
         progress(done, len(anchored), "frames")
-
-
-def _all_counts(rejected: Counter[str], index: DayIndex, builder: MomentBuilder) -> dict[str, int]:
-    return {str(k): int(v) for k, v in (rejected + index.damage + builder.counts).items() if v}
 
 
 def _reading_counts(index: DayIndex) -> dict[str, int]:

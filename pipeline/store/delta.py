@@ -288,7 +288,9 @@ def merge_rows(lake: Lake, schema: TableSchema, rows: pa.Table, *, insert: bool 
 def _merge(table: DeltaTable, schema: TableSchema, rows: pa.Table, *, insert: bool) -> None:
     days, months = (sorted(set(rows.column(n).to_pylist())) for n in ("day", _MONTH))
     # Literals, so that only files of these days are read; days and months are digits and hyphens.
-    window = f"t.day >= '{days[0]}' and t.day <= '{days[-1]}' and t.{_MONTH} in ({_quoted(months)})"
+    window = (
+        f"t.day >= '{days[0]}' and t.day <= '{days[-1]}' and t.{_MONTH} in ({', '.join(map(repr, months))})"
+    )
     same = " and ".join(f"t.{c} = s.{c}" for c in (*schema.about, "work_key"))
     # Without descriptions: those of another release may be worded otherwise, and could not be merged.
     rows = rows.cast(pa.schema([f.remove_metadata() for f in rows.schema]))
@@ -300,10 +302,6 @@ def _merge(table: DeltaTable, schema: TableSchema, rows: pa.Table, *, insert: bo
         writer_properties=_WRITER,
     ).when_matched_update({"asserted_at": "s.asserted_at"}, predicate="s.asserted_at > t.asserted_at")
     (merging.when_not_matched_insert_all() if insert else merging).execute()
-
-
-def _quoted(values: Sequence[str]) -> str:
-    return ", ".join(f"'{v}'" for v in values)
 
 
 def create_table(lake: Lake, schema: TableSchema) -> DeltaTable:

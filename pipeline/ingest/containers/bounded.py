@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import bz2
+from typing import Any
 
 import lz4.frame
 import zstandard
 
-__all__ = ["MOST_CHUNK_BYTES", "OversizedError", "most_bytes", "unpack_bz2", "unpack_lz4", "unpack_zstd"]
+__all__ = ["MOST_CHUNK_BYTES", "OversizedError", "most_bytes", "unpack", "unpack_zstd"]
 
 # Logs compress by 2 to 10, only label images by some hundred; data beyond that ratio and beyond a worker's
 # memory is a decompression bomb. A single chunk or message of up to 32 MiB (a raw picture of 8 Mpx has 24)
@@ -15,6 +16,7 @@ __all__ = ["MOST_CHUNK_BYTES", "OversizedError", "most_bytes", "unpack_bz2", "un
 _MOST_RATIO = 100
 _ANYWAY_BYTES = 32 << 20
 MOST_CHUNK_BYTES = 512 << 20
+_DECOMPRESSORS: dict[str, Any] = {"lz4": lz4.frame.LZ4FrameDecompressor, "bz2": bz2.BZ2Decompressor}
 
 
 class OversizedError(ValueError):
@@ -46,16 +48,25 @@ def unpack_zstd(data: bytes | memoryview, limit_bytes: int) -> bytes:
     return zstandard.ZstdDecompressor().decompress(data, max_output_size=limit_bytes)
 
 
-def unpack_lz4(data: bytes | memoryview, limit_bytes: int) -> bytes:
-    """Content of an lz4 frame of at most `limit_bytes`; errors as `unpack_zstd`, or RuntimeError."""
-    _check_ratio(data, limit_bytes)
-    return _at_most(limit_bytes, lz4.frame.LZ4FrameDecompressor().decompress(data, limit_bytes + 1))
+def unpack(compression: str, data: bytes | memoryview, size: int) -> bytes:
+    """Content of a chunk of this size; `compression` as MCAP and ROS 1 name it.
 
-
-def unpack_bz2(data: bytes | memoryview, limit_bytes: int) -> bytes:
-    """Content of bz2 data of at most `limit_bytes`; errors as `unpack_zstd`, or OSError."""
-    _check_ratio(data, limit_bytes)
-    return _at_most(limit_bytes, bz2.BZ2Decompressor().decompress(data, limit_bytes + 1))
+    Raises:
+        OversizedError: as `unpack_zstd`.
+        ValueError, OSError, RuntimeError, zstandard.ZstdError: damaged, of another size, or of another compression.
+    """
+    if compression in ("", "none"):
+        content = bytes(data)
+    elif compression == "zstd":
+        content = unpack_zstd(data, size)
+    elif compression in _DECOMPRESSORS:
+        _check_ratio(data, size)
+        content = _at_most(size, _DECOMPRESSORS[compression]().decompress(data, size + 1))
+    else:
+        raise ValueError(f"compression {compression!r}")
+    if len(content) != size:
+        raise ValueError("fewer bytes than were announced")
+    return content
 
 
 def _check_ratio(data: bytes | memoryview, announced_bytes: int) -> None:

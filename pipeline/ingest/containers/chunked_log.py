@@ -8,8 +8,11 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
+import zstandard
+
 from pipeline.core.errors import LogError
-from pipeline.ingest.containers.reader import ChunkCache, Position, RawMessage
+from pipeline.ingest.containers.bounded import OversizedError, unpack
+from pipeline.ingest.containers.reader import READ_ERRORS, ChunkCache, Position, RawMessage
 from pipeline.ingest.containers.timeline import Chunk, Stretches, Timeline, timeline_of_chunks
 from pipeline.store.remote_logs import LogPath
 
@@ -80,6 +83,16 @@ class ChunkedLog(ABC):
     def _content(self, start: int, length: int) -> bytes:
         self._file.seek(start)
         return self._file.read(length)
+
+    def _unpacked(self, compression: str, packed: bytes | memoryview, size: int) -> bytes | None:
+        """Content of a chunk; None (and counted) if it is damaged."""
+        try:
+            return unpack(compression, packed, size)
+        except OversizedError:
+            self.damage["oversized_chunks"] += 1
+        except (*READ_ERRORS, zstandard.ZstdError):
+            self.damage["damaged_chunks"] += 1
+        return None
 
     def _next_chunk(self, position: int) -> int | None:
         i = bisect_right(self._chunk_starts, position)

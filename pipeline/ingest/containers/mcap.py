@@ -10,13 +10,12 @@ import zlib
 from collections.abc import Collection, Iterator
 from io import BytesIO
 
-import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel as ChannelRecord
 from mcap.records import ChunkIndex, Footer, Schema, Statistics
 
-from pipeline.ingest.containers.bounded import MOST_CHUNK_BYTES, OversizedError, unpack_lz4, unpack_zstd
+from pipeline.ingest.containers.bounded import MOST_CHUNK_BYTES
 from pipeline.ingest.containers.chunked_log import ChunkedLog
 from pipeline.ingest.containers.reader import (
     BYTES_AS_TEXT,
@@ -38,7 +37,7 @@ _MESSAGE = struct.Struct("<HIQQ")  # channel id, sequence, log time, publish tim
 _CHUNK = struct.Struct("<QQQII")
 _FOOTER_SIZE = _RECORD.size + 20
 _LAST_OPCODE = max(Opcode)
-_DAMAGED = (*READ_ERRORS, struct.error, zstandard.ZstdError)
+_DAMAGED = (*READ_ERRORS, struct.error)
 
 
 class McapLog(ChunkedLog):
@@ -177,13 +176,11 @@ class McapLog(ChunkedLog):
             _, _, size, crc, name_length = _CHUNK.unpack_from(content)
             name_end = _CHUNK.size + name_length
             compression = content[_CHUNK.size : name_end].decode()
-            data = _decompress(compression, memoryview(content)[name_end + 8 :], size)
-            if len(data) != size or (check and crc and zlib.crc32(data) != crc):
-                raise ValueError("checksum")  # caught below like the errors of the codecs
-        except OversizedError:
-            self.damage["oversized_chunks"] += 1
-            return None
         except _DAMAGED:
+            self.damage["damaged_chunks"] += 1
+            return None
+        data = self._unpacked(compression, memoryview(content)[name_end + 8 :], size)
+        if data is not None and check and crc and zlib.crc32(data) != crc:
             self.damage["damaged_chunks"] += 1
             return None
         return data
@@ -241,16 +238,6 @@ def _inner_records(data: bytes) -> Iterator[tuple[int, int, int]]:
         if position > size:
             return
         yield opcode, start, position
-
-
-def _decompress(compression: str, data: memoryview, size: int) -> bytes:
-    if compression == "zstd":
-        return unpack_zstd(data, size)
-    if compression == "lz4":
-        return unpack_lz4(data, size)
-    if compression:
-        raise ValueError(f"compression {compression}")
-    return bytes(data)
 
 
 def _channel(record: ChannelRecord, schema: Schema | None) -> Channel:

@@ -9,7 +9,7 @@ import struct
 from collections import Counter
 from collections.abc import Collection, Iterator
 
-from pipeline.ingest.containers.bounded import MOST_CHUNK_BYTES, OversizedError, unpack_bz2, unpack_lz4
+from pipeline.ingest.containers.bounded import MOST_CHUNK_BYTES
 from pipeline.ingest.containers.chunked_log import ChunkedLog
 from pipeline.ingest.containers.reader import READ_ERRORS, Channel, ChunkCache, RawMessage
 from pipeline.ingest.containers.timeline import Chunk
@@ -148,18 +148,11 @@ class BagLog(ChunkedLog):
 
     def _open_chunk(self, header: dict[str, bytes], start: int, length: int) -> bytes | None:
         try:
-            size = _U32.unpack(header["size"])[0]
-            packed = self._content(start, min(length, MOST_CHUNK_BYTES))
-            data = _decompress(header["compression"], packed, size)
-            if len(data) != size:
-                raise ValueError("damaged chunk")
-        except OversizedError:
-            self.damage["oversized_chunks"] += 1
-            return None
+            size, compression = _U32.unpack(header["size"])[0], header["compression"].decode()
         except _DAMAGED:
             self.damage["damaged_chunks"] += 1
             return None
-        return data
+        return self._unpacked(compression, self._content(start, min(length, MOST_CHUNK_BYTES)), size)
 
     def _scan_chunk(
         self, chunk: bytes, chunk_start: int, topics: Collection[str] | None
@@ -219,13 +212,3 @@ def _fields(data: bytes) -> dict[str, bytes] | None:
     if position != len(data) or (is_record and fields.get("op", b"") not in [bytes([k]) for k in _KNOWN]):
         return None
     return fields
-
-
-def _decompress(compression: bytes, data: bytes, size: int) -> bytes:
-    if compression == b"lz4":
-        return unpack_lz4(data, size)
-    if compression == b"bz2":
-        return unpack_bz2(data, size)
-    if compression == b"none":
-        return data
-    raise ValueError(f"compression {compression!r}")

@@ -159,10 +159,7 @@ def _written_as(data: memoryview) -> str:
         if len(name) != length or not length:
             continue
         is_ended = name.endswith(b"\0")
-        if is_ended == (encoding == "cdr") and _is_text(name[: length - is_ended]):
+        text = name[: length - is_ended].decode("latin-1")
+        if is_ended == (encoding == "cdr") and text.isascii() and text.isprintable():
             return encoding
     return ""
-
-
-def _is_text(name: bytes) -> bool:
-    return name.isascii() and name.decode("ascii").isprintable()

@@ -79,11 +79,8 @@ def _upper(message: Any, name: str) -> Any:
 
 
 def _frame_transforms(message: Any) -> Any:
-    return SimpleNamespace(transforms=[_stamped(t) for t in message.transforms])
-
-
-def _frame_transform(message: Any) -> Any:
-    return SimpleNamespace(transforms=[_stamped(message)])
+    """Of several transforms, or of one."""
+    return SimpleNamespace(transforms=[_stamped(t) for t in getattr(message, "transforms", [message])])
 
 
 def _stamped(transform: Any) -> Any:
@@ -114,7 +111,7 @@ _TWINS: dict[str, Callable[[Any], Any]] = {
     "RawImage": _raw_image,
     "PointCloud": _point_cloud,
     "CameraCalibration": _camera_calibration,
-    "FrameTransform": _frame_transform,
+    "FrameTransform": _frame_transforms,
     "FrameTransforms": _frame_transforms,
     "Odometry": _odometry,
 }

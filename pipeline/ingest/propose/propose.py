@@ -145,7 +145,11 @@ def doppler_period(frames: Sequence[Frame], radar: AskedRadar) -> float | None:
     It is accepted if, in most scans that no speed explains without it, a static world explains more
     detections with it.
     """
-    scans = [(radar.directions(f), f.radar_range_rate_mps.astype(np.float64)) for f in frames if _has_scan(f)]
+    scans = [
+        (radar.directions(f), f.radar_range_rate_mps.astype(np.float64))
+        for f in frames
+        if "radar" in f.sensors and len(f.radar_xyz_m)
+    ]
     if len(scans) < _FEWEST_SCANS:
         return None
     values = np.unique(np.round(np.concatenate([rates for _, rates in scans]), 4))
@@ -159,7 +163,3 @@ def doppler_period(frames: Sequence[Frame], radar: AskedRadar) -> float | None:
     wrapped = np.array([doppler_speed(d, r, period)[1] for d, r in scans])
     gained = (wrapped > plain + _MORE)[plain < _HALF]
     return period if len(gained) >= _FEWEST_SCANS and gained.mean() >= _MOST else None
-
-
-def _has_scan(frame: Frame) -> bool:
-    return "radar" in frame.sensors and len(frame.radar_xyz_m) > 0

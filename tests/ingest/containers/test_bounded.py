@@ -14,22 +14,22 @@ import zstandard
 
 from pipeline.core.errors import LogError
 from pipeline.ingest.containers import rosbag2_folder
-from pipeline.ingest.containers.bounded import unpack_bz2, unpack_lz4, unpack_zstd
+from pipeline.ingest.containers.bounded import unpack, unpack_zstd
 from pipeline.ingest.containers.reader import content_identity, open_log
 
 CONTENT = bytes(range(256)) * 40
 PACKED = {
-    unpack_zstd: zstandard.ZstdCompressor().compress(CONTENT),
-    unpack_lz4: lz4.frame.compress(CONTENT),
-    unpack_bz2: bz2.compress(CONTENT),
-}
+    "zstd": zstandard.ZstdCompressor().compress(CONTENT), "lz4": lz4.frame.compress(CONTENT),
+    "bz2": bz2.compress(CONTENT), "none": CONTENT, "": CONTENT,
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("unpack", PACKED)
-def test_content_of_the_size_announced_comes_back_and_more_is_refused(unpack):
-    assert unpack(PACKED[unpack], len(CONTENT)) == CONTENT
-    with pytest.raises(ValueError, match="announced"):
-        unpack(PACKED[unpack], len(CONTENT) - 1)
+@pytest.mark.parametrize("compression", PACKED)
+def test_content_of_the_size_announced_comes_back_and_any_other_is_refused(compression):
+    assert unpack(compression, PACKED[compression], len(CONTENT)) == CONTENT
+    for size in (len(CONTENT) - 1, len(CONTENT) + 1):
+        with pytest.raises(ValueError, match="announced"):
+            unpack(compression, PACKED[compression], size)
 
 
 def test_a_zstd_frame_that_does_not_say_its_size_is_read_up_to_the_limit():
