@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from cyclopts import Parameter
 
-from jobs.frame_options import FrameOptions
-from jobs.terminal.known_vehicles import require_vehicle
 from jobs.terminal.summary import left_out as tell_damage
+from jobs.terminal.vehicle_status import require_vehicle
 from pipeline.core.errors import ConfigError
 from pipeline.export.calibration import ExportedCalibration, ExportedPair, FrameNames, reference_of
 from pipeline.export.compare import Side, composed
@@ -29,7 +31,7 @@ from pipeline.store.partitions import Lake
 from schemas.versions import CODE_VERSION
 from schemas.words import day_word
 
-__all__ = ["mounting", "poses_in_use", "read_calibration", "read_sides"]
+__all__ = ["FrameOptions", "mounting", "poses_in_use", "read_calibration", "read_sides"]
 
 
 def read_calibration(
@@ -204,3 +206,37 @@ def _days(pairs: dict[str, ExportedPair], day: str) -> frozenset[str]:
     """Days that the pairs were estimated from."""
     listed = {str(d) for pair in pairs.values() for d in _listed(pair.details.get("days"))}
     return frozenset(listed if day == "state" else {day})
+
+
+_KINDS = ("camera", "lidar", "radar", "base")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class FrameOptions:
+    """Frame names in the file; default: the names in the car's logs, otherwise the names of the sensors."""
+
+    camera: Annotated[
+        str | None, Parameter(name="--camera-frame", help="optical frame (Autoware: the link)")
+    ] = None
+    lidar: Annotated[str | None, Parameter(name="--lidar-frame", help="frame of the lidar")] = None
+    radar: Annotated[str | None, Parameter(name="--radar-frame", help="frame of the radar")] = None
+    base: Annotated[str | None, Parameter(name="--base-frame", help="frame of the car, of --mount")] = None
+    frame: Annotated[
+        tuple[str, ...],
+        Parameter(name="--frame", help="SENSOR=NAME, of any sensor; again for each", negative=()),
+    ] = ()
+
+    def names(self, known: Mapping[str, str] | None = None) -> FrameNames:
+        """Frame names for the pipeline; `known` has names for frames without an option; else ConfigError."""
+        asked = {s: n for s in _KINDS if (n := getattr(self, s)) is not None}
+        for text in self.frame:
+            sensor, equals, name = text.partition("=")
+            if not (sensor and equals and name):
+                raise ConfigError("command line", "frame", f"{text!r} is not SENSOR=NAME, as front=cam_front")
+            asked[sensor] = name
+        return FrameNames.named({**(known or {}), **asked})
+
+    def names_in(self, files: Iterable[str | Path]) -> FrameNames:
+        """Frame names for reading files: from options, else from an export's notes in or beside them."""
+        return self.names(noted_frames([Path(file) for file in files]))

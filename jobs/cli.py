@@ -57,7 +57,10 @@ _HELP = {
     "evaluate": "Compare records with true extrinsics or a reflector recording.",
 }
 # Where a command has another name than its module or its function.
-_ELSEWHERE = {"import": "jobs.import_prior:import_prior", "perceive": "jobs.ingest:perceive"}
+_ELSEWHERE = {
+    "import": "jobs.import_prior:import_prior", "perceive": "jobs.ingest:perceive", "gc": "jobs.upkeep:gc",
+    "repair": "jobs.upkeep:repair",
+}  # fmt: skip
 # Command -> its function and its line of help.
 COMMANDS: dict[str, tuple[str, str]] = {
     name: (_ELSEWHERE.get(name, "jobs.{0}:{0}".format(name.replace(" ", "_"))), text)

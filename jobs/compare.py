@@ -12,8 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from jobs.calibration_sources import read_sides
-from jobs.frame_options import FrameOptions
+from jobs.calibration_sources import FrameOptions, read_sides
 from jobs.terminal.summary import print_json, print_summary
 from pipeline.core.errors import ConfigError
 from pipeline.export.compare import compare as compare_sides

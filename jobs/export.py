@@ -10,9 +10,8 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from jobs.calibration_sources import read_calibration
+from jobs.calibration_sources import FrameOptions, read_calibration
 from jobs.extras import require
-from jobs.frame_options import FrameOptions
 from jobs.terminal.logging import logger
 from jobs.terminal.summary import print_summary, progress_reporter
 from pipeline.core.errors import ConfigError

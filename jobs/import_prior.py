@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from jobs.frame_options import FrameOptions
+from jobs.calibration_sources import FrameOptions
 from jobs.terminal.summary import print_summary
 from pipeline.core.config import load_fleet
 from pipeline.core.errors import ConfigError

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Literal
 
-from jobs.terminal.known_vehicles import require_vehicle
 from jobs.terminal.summary import exit_code, print_summary
+from jobs.terminal.vehicle_status import require_vehicle
 from pipeline.audit.restarts import events_until
 from pipeline.core.errors import ConfigError
 from pipeline.store.commits import commit_records

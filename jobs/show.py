@@ -16,11 +16,11 @@ from pipeline.store.current import (
     current_poses,
     current_records,
     current_states,
+    state_values,
     transform_of,
 )
 from pipeline.store.partitions import Lake
 from pipeline.store.records import Assertion, last_assertion, read_records
-from pipeline.store.state_values import state_values
 from pipeline.store.tables import read_manifest
 from schemas.versions import TABLES
 

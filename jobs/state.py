@@ -10,14 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from jobs.terminal.known_vehicles import require_vehicle
 from jobs.terminal.summary import left_out, print_json
+from jobs.terminal.vehicle_status import require_vehicle
 from pipeline.rig.changes import change_between
 from pipeline.rig.se3 import to_quaternion
-from pipeline.store.current import current_states
+from pipeline.store.current import current_states, state_values
 from pipeline.store.partitions import Lake
 from pipeline.store.records import read_records
-from pipeline.store.state_values import state_values
 from schemas.states import STATES, StateRow
 
 __all__ = ["state"]

@@ -12,9 +12,14 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from jobs.terminal.known_vehicles import require_vehicle
 from jobs.terminal.summary import exit_code, left_out, print_summary
-from jobs.terminal.vehicle_status import count_statuses, moved_sensors, next_steps, status_lines
+from jobs.terminal.vehicle_status import (
+    count_statuses,
+    moved_sensors,
+    next_steps,
+    require_vehicle,
+    status_lines,
+)
 from pipeline.fleet.status import DayStatus, day_statuses
 from pipeline.store.corrections import read_corrections
 from pipeline.store.partitions import Lake, check_day, days_after

@@ -13,8 +13,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from jobs.calibration_sources import poses_in_use, read_sides
-from jobs.frame_options import FrameOptions
+from jobs.calibration_sources import FrameOptions, poses_in_use, read_sides
 from jobs.terminal.summary import print_json, print_summary, progress_reporter
 from pipeline.core.config import FleetConfig, load_fleet
 from pipeline.core.errors import ConfigError

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 from shlex import quote
 from typing import Any
 
 from rich.markup import escape
 
 from jobs.terminal.record_tables import STATUS_STYLES
+from pipeline.core.errors import ConfigError
 from pipeline.store.corrections import correction_steps
+from pipeline.store.partitions import Lake
+from pipeline.store.records import read_columns
+from schemas.calibrations import CALIBRATIONS
 from schemas.drift import DRIFT_STATUSES, DriftFinding, VehicleStatus, next_step, status_of
+from schemas.outcomes import OUTCOMES
+from schemas.states import STATES
 
-__all__ = ["count_statuses", "moved_sensors", "next_steps", "status_lines"]
+__all__ = ["count_statuses", "moved_sensors", "next_steps", "require_vehicle", "status_lines"]
 
 _STEPS = 40  # vehicles whose next steps are printed; the others are counted
 
@@ -69,3 +76,18 @@ def _by_vehicle(findings: Sequence[DriftFinding]) -> dict[str, list[DriftFinding
     for finding in findings:
         rows.setdefault(finding.vehicle, []).append(finding)
     return rows
+
+
+_NAMED = 5  # vehicles of the lake named beside an unknown one
+
+
+def require_vehicle(lake: Lake, vehicle: str) -> None:
+    """Raise ConfigError for a vehicle without a day in the lake, unless rows that cannot be read may have one."""
+    known: set[str] = set()
+    for table in (CALIBRATIONS, OUTCOMES, STATES):
+        rows = read_columns(lake, table, (), first=None, last=None)
+        known |= set() if rows is None else set(rows["vehicle"].unique().to_pylist())
+    if vehicle not in known and not any(rows.may_be_of(vehicle) for rows in lake.lost):
+        like = get_close_matches(vehicle, sorted(known)) or sorted(known)[:_NAMED]
+        problem = f"the lake has no day of {vehicle!r}; it has {', '.join(like) or 'no vehicle'}"
+        raise ConfigError("command line", "vehicle", problem)

@@ -45,9 +45,9 @@ from pipeline.report.rig_figure import rig_of_day
 from pipeline.report.svg import MUTED, Plot, document, nice_step
 from pipeline.report.words import PAIR_TITLES, dof_title, pose_text, scaled, sigma_text, unit_of
 from pipeline.store.corrections import read_corrections
+from pipeline.store.current import state_values
 from pipeline.store.files import Files, LocalFiles
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.state_values import state_values
 from schemas.calibrations import DOF_NAMES, PAIRS, CalibrationRecord, pairs_of
 from schemas.drift import DriftFinding
 from schemas.states import StateRow

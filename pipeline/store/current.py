@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -18,7 +18,8 @@ from schemas.columns import TableSchema
 from schemas.drift import DriftFinding
 from schemas.poses import POSES, PoseRow
 from schemas.service_events import ServiceEvent
-from schemas.states import StateRow
+from schemas.states import STATES, StateRow
+from schemas.words import AXIS_NAMES, axes_in_words
 
 __all__ = [
     "current_drift",
@@ -28,6 +29,7 @@ __all__ = [
     "current_rows",
     "current_states",
     "prior_of",
+    "state_values",
     "targets_of",
     "transform_of",
 ]
@@ -121,3 +123,24 @@ def prior_of(record: CalibrationRecord | PoseRow) -> Float[np.ndarray, "4 4"] | 
 def targets_of(record: CalibrationRecord) -> Float[np.ndarray, "N 3"]:
     """Targets of a record's sigmas, in the child's frame [m]; the default ones if it has none."""
     return DEFAULT_TARGETS if record.targets_m is None else np.asarray(record.targets_m)
+
+
+def state_values(states: Sequence[StateRow]) -> list[dict[str, Any]]:
+    """Each state as a dict of its columns, with "T", "T_prior" (4x4 or None) and "in_words"."""
+    kinds = {(s.vehicle, s.method, s.sensor): s.kind for s in states if s.sensor is not None}
+    return [
+        {c.name: getattr(s, c.name) for c in STATES.columns}
+        | {
+            "T": pose_of(partial(getattr, s)),
+            "T_prior": pose_of(partial(getattr, s), "prior_"),
+            "in_words": _in_words(s, kinds.get((s.vehicle, s.method, s.parent_frame))),
+        }
+        for s in states
+    ]
+
+
+def _in_words(state: StateRow, parent_kind: str | None) -> str:
+    if state.observable is None or state.sensor == state.parent_frame:
+        return ""
+    kind = parent_kind if parent_kind in AXIS_NAMES else state.pair.partition("_")[0]
+    return axes_in_words(kind if kind in AXIS_NAMES else "lidar", state.observable, state.determined)

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
+from jobs.calibration_sources import FrameOptions
 from jobs.cli import main
-from jobs.frame_options import FrameOptions
 from jobs.verify import _as_prior
 from pipeline.rig.day_prior import read_transforms
 from pipeline.rig.se3 import exp_so3, from_rotation_translation

@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jobs.calibration_sources import poses_in_use
-from jobs.frame_options import FrameOptions
+from jobs.calibration_sources import FrameOptions, poses_in_use
 from jobs.verify import _of_poses
 from pipeline.core.config import load_fleet
 from pipeline.core.errors import ConfigError

@@ -7,7 +7,7 @@ import shutil
 import numpy as np
 import pytest
 
-from jobs.repair import repair
+from jobs.upkeep import repair
 from pipeline.core.errors import DamagedLogError
 from pipeline.store.commits import assert_records, commit_records
 from pipeline.store.delta import live_files, open_table, tidy_table

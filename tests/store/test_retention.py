@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jobs.gc import gc
+from jobs.upkeep import gc
 from pipeline.core.config import load_fleet
 from pipeline.core.errors import CollectedError, ConfigError
 from pipeline.core.runner import Stage

@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from pipeline.core.rigs import RadarTopics
-from pipeline.ingest.messages.point_cloud import cloud_columns, first_field
-from pipeline.ingest.units import unit_that_fits
+from pipeline.ingest.messages.point_cloud import cloud_columns, first_field, unit_that_fits
 
 __all__ = ["RadarCloud", "read_radar"]
 
