@@ -173,7 +173,6 @@ def poses_in_use(
 
 
 def _side_of_files(text: str, form: str, files: str, names: FrameNames, edges: tuple[Edge, ...]) -> Side:
-
     if form:
         found = format_named(form).pairs(read_files([Path(f) for f in files.split(",")]), names, edges)
     else:
@@ -184,7 +183,6 @@ def _side_of_files(text: str, form: str, files: str, names: FrameNames, edges: t
 
 
 def _side_of_lake(text: str, location: str | None, vehicle: str | None, method: str) -> Side:
-
     owner, at, rest = text.rpartition("@")
     owner = owner if at else (vehicle or "")
     day, _, named = rest.partition("/")

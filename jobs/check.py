@@ -79,7 +79,6 @@ def _worst(report: CheckReport, pair: str) -> str:
 
 
 def _print_report(report: CheckReport, rig: str) -> None:
-
     console = Console(stderr=True)
     topics = Table(title=f"Topics of rig {rig}", title_justify="left")
     for heading in ("role", "topic", "type", "messages", "rate", ""):
@@ -168,7 +167,6 @@ def print_rig(console: Console, rig: RigFinding) -> None:
 
 
 def _cell(pair: PairFinding | None) -> str:
-
     if pair is None:
         return ""
     share = "" if pair.share is None else f"{pair.share:.0%} "

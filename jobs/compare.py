@@ -62,7 +62,7 @@ def compare(
     if not found:
         raise ConfigError("command line", "A, B", f"no pair in common; {'; '.join(notes)}".rstrip("; "))
     if page is not None:
-        _write_page(page, titles, found, notes)
+        write_page(page, comparison_page(titles[0], titles[1], found, notes))
     plain: dict[str, Any] = {
         "a": titles[0],
         "b": titles[1],
@@ -80,7 +80,6 @@ def compare(
 
 
 def _plain(difference: PairDifference) -> dict[str, Any]:
-
     sigma, z = difference.sigma, difference.z
     axes = [
         {
@@ -103,11 +102,6 @@ def _plain(difference: PairDifference) -> dict[str, Any]:
         "target_elevation_rad": difference.targets_rad[1],
         "axes": axes,
     }
-
-
-def _write_page(page: Path, titles: list[str], found: list[PairDifference], notes: list[str]) -> None:
-
-    write_page(page, comparison_page(titles[0], titles[1], found, notes))
 
 
 def print_comparison(titles: Sequence[str], found: Sequence[PairDifference], notes: Sequence[str]) -> None:

@@ -92,7 +92,6 @@ def _check(truth: Path | None, reflectors: Path | None, recording: str | None, o
 
 
 def _write(out: Path, compared: Sequence[ComparedRun], notes: Sequence[str], lake: Lake) -> None:
-
     comparisons = [c.comparison for c in compared]
     rows = table_rows(comparisons)
     texts = as_markdown(rows, comparisons, notes)

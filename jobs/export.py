@@ -107,9 +107,8 @@ def export(
 
 
 def _export_calibration(what: str, out: Path, calibration: ExportedCalibration, update: Path | None) -> int:
-
     files = {}
-    if _written(calibration):
+    if written_pairs(calibration):
         form = format_named(what)
         files = (
             updated_file(form, calibration, update, out) if update else written_files(form, calibration, out)
@@ -126,22 +125,16 @@ def _export_drive(
     most_frames: int,
     sensors: tuple[str, ...],
 ) -> int:
-
     if lake is None or day is None:
         raise ConfigError("command line", "day", "foxglove shows a day's drive: give --day")
-    wanted = bool(_written(calibration))
+    wanted = bool(written_pairs(calibration))
     outputs = export_foxglove(calibration, lake, day, out, most_frames, sensors) if wanted else []
     return _tell("foxglove", calibration, outputs)
 
 
-def _written(calibration: ExportedCalibration) -> list[str]:
-
-    return written_pairs(calibration)
-
-
 def _tell(what: str, calibration: ExportedCalibration, outputs: list[Path]) -> int:
     """Log what of each pair is used and each warning, print the summary and return the exit code."""
-    doubts, written = not_certified(calibration), _written(calibration)
+    doubts, written = not_certified(calibration), written_pairs(calibration)
     for words in used_lines(calibration):
         logger().info(words, vehicle=calibration.vehicle, source=calibration.source)
     for words in warnings_of(calibration):
@@ -156,7 +149,6 @@ def _tell(what: str, calibration: ExportedCalibration, outputs: list[Path]) -> i
 
 
 def _export_onnx(out: Path, run: Path | None, notes: Path | None) -> list[Path]:
-
     if run is None or not run.is_dir():
         raise ConfigError("command line", "run", "onnx needs --run FOLDER, written by `boresight train`")
     if out.suffix != ".onnx":

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
 from jobs.frame_calibrations import mounting_of
-from jobs.prepare import days_with_observations
+from jobs.prepare import days_with_observations, over_days
 from jobs.terminal.summary import print_summary, progress_reporter
 from pipeline.core.config import FleetConfig, load_fleet
 from pipeline.core.errors import ConfigError, SolveError
-from pipeline.fleet.executor import EXECUTORS
 from pipeline.learn.frames.card import write_card
 from pipeline.learn.frames.day import DayTask, export_day
 from pipeline.learn.frames.frame import Mounting, Perturbation
@@ -139,16 +137,9 @@ def _run(
 ) -> tuple[dict[str, int], list[dict[str, str]]]:
     """Export all days and report progress: number of days done and cached, and the failed days."""
     counts, failed = Counter[str](), list[dict[str, str]]()
-    with progress_reporter("frames") as progress:
-
-        def watch(index: int, done: int, total: int, what: str) -> None:
-            day = tasks[index].partition
-            progress(sum(counts.values()), len(tasks), f"{day.vehicle} {day.day}: {what} {done}/{total}")
-
-        with closing(EXECUTORS[executor](export_day, tasks, workers, watch)) as finished:
-            for end in finished:
-                day = end.item.partition
-                counts[end.value or "failed"] += 1
-                if end.value is None:
-                    failed.append({"vehicle": day.vehicle, "day": day.day, "reason": end.error})
+    for end in over_days("frames", export_day, tasks, executor, workers):
+        day = end.item.partition
+        counts[end.value or "failed"] += 1
+        if end.value is None:
+            failed.append({"vehicle": day.vehicle, "day": day.day, "reason": end.error})
     return dict(counts), sorted(failed, key=lambda f: (f["vehicle"], f["day"]))

@@ -49,7 +49,6 @@ def mounting_of(
 
 
 def _of_sensors(found: Mounting, sensors: Sequence[str]) -> Mounting:
-
     T = {n: T for n, T in found.T.items() if not sensors or n in sensors}
     if len(T) < 2:
         problem = f"{found.source} has poses of {', '.join(T) or 'no sensor'}, and a frame needs two"
@@ -58,7 +57,6 @@ def _of_sensors(found: Mounting, sensors: Sequence[str]) -> Mounting:
 
 
 def _of_prior(lake: Lake, fleet: FleetConfig, day: Partition) -> Mounting:
-
     manifest, rig = ingested(lake, day), fleet.rig_of(day.vehicle)
     prior = rig_prior((manifest.extra if manifest else {}).get(PRIOR, ()), fleet, rig)
     reference = prior.reference.name
@@ -72,7 +70,6 @@ def _of_prior(lake: Lake, fleet: FleetConfig, day: Partition) -> Mounting:
 
 
 def _of_calibration(lake: Lake, day: Partition, kind: str, method: str, *, force: bool) -> Mounting:
-
     of_day = day.day if kind == "day" else None
     found = read_calibration(str(lake), day.vehicle, of_day, method, force=force)
     reference = found.reference.name

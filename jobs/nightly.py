@@ -140,7 +140,11 @@ def _print_end(
         {0: "done", 1: "failed", 2: "failed", 3: night_word(o.status for o in outcomes)}[code],
         vehicle_days=len(outcomes),
         **{s: sum(o.status == s for o in outcomes) for s in ("cached", *DAY_WORDS) if s != "missing"},
-        problems=[_problem(o) for o in outcomes if o.status not in ("done", "cached")],
+        problems=[
+            {name: getattr(o, name) for name in ("vehicle", "day", "status", "reason", "pairs")}
+            for o in outcomes
+            if o.status not in ("done", "cached")
+        ],
         statuses=count_statuses(findings),
         moved=moved_sensors(findings),
         **told,
@@ -250,13 +254,3 @@ def close_night(
         report = REPORT.run(task)
         told(report)
     return findings, [files.uri(PurePath(path)) for path in report.outputs]
-
-
-def _problem(outcome: DayOutcome) -> dict[str, Any]:
-    return {
-        "vehicle": outcome.vehicle,
-        "day": outcome.day,
-        "status": outcome.status,
-        "reason": outcome.reason,
-        "pairs": outcome.pairs,
-    }

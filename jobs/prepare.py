@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict
 from functools import partial
@@ -30,7 +30,7 @@ from pipeline.store.views import perceived_days
 from schemas.training import TRAINING
 from schemas.versions import CODE_VERSION
 
-__all__ = ["days_with_observations", "prepare"]
+__all__ = ["days_with_observations", "over_days", "prepare"]
 
 _WIDTH = 120  # columns, even without a terminal: one line per choice
 _WORDS = {
@@ -148,28 +148,35 @@ def _plan(
     return config, work, price_choices(surveys, plan, config.prepare)
 
 
-def _run(work: Sequence[Task], executor: str, workers: int | None) -> list[Outcome]:
-    """Prepare all days, with progress; returns their outcomes."""
+def over_days(
+    title: str, run: Callable[..., Any], tasks: Sequence[Any], executor: str, workers: int | None
+) -> Iterator[Any]:
+    """Ends of the work on vehicle-days, with progress; each task has a `partition`."""
     if workers is not None and workers < 1:
         raise ConfigError("command line", "--workers", f"{workers} is less than one")
-    results: list[Outcome] = []
-    with progress_reporter("prepare") as progress:
+    ended = 0
+    with progress_reporter(title) as progress:
 
         def watch(index: int, done: int, total: int, what: str) -> None:
-            day = work[index].partition
-            progress(len(results), len(work), f"{day.vehicle} {day.day}: {what} {done}/{total}")
+            day = tasks[index].partition
+            progress(ended, len(tasks), f"{day.vehicle} {day.day}: {what} {done}/{total}")
 
-        prepare_day = partial(try_stage, PREPARE)
-        with closing(EXECUTORS[executor](prepare_day, work, workers, watch)) as finished:
+        with closing(EXECUTORS[executor](run, tasks, workers, watch)) as finished:
             for end in finished:
-                day = end.item.partition
-                lost = Outcome("prepare", day.vehicle, day.day, "failed", "", reason=end.error)
-                results.append(end.value or lost)
+                ended += 1
+                yield end
+
+
+def _run(work: Sequence[Task], executor: str, workers: int | None) -> list[Outcome]:
+    """Prepare all days; returns their outcomes."""
+    results: list[Outcome] = []
+    for end in over_days("prepare", partial(try_stage, PREPARE), work, executor, workers):
+        day = end.item.partition
+        results.append(end.value or Outcome("prepare", day.vehicle, day.day, "failed", "", reason=end.error))
     return results
 
 
 def _about(config: FleetConfig) -> dict[str, Any]:
-
     return {
         "table": TRAINING.name,
         "version": TRAINING.version,
@@ -206,7 +213,7 @@ def _next_steps(
 
 def _problems(config: FleetConfig, results: Sequence[Outcome], inventory: Inventory) -> list[dict[str, str]]:
     found = [
-        {"vehicle": r.vehicle, "day": r.day, "status": r.status, "reason": r.reason}
+        {name: getattr(r, name) for name in ("vehicle", "day", "status", "reason")}
         for r in results
         if r.status not in ("done", "cached")
     ]

@@ -78,7 +78,6 @@ def show(
 def _records(
     lake: Lake, table: Table, vehicle: str | None, day: str | None, method: str | None, *, current: bool
 ) -> list[dict[str, Any]]:
-
     kinds: dict[str, Callable[[list[Any]], list[Any]]] = {
         "calibrations": current_records,
         "poses": current_poses,
@@ -103,7 +102,6 @@ def _records(
 
 
 def _partitions(lake: Lake, table: Table, vehicle: str | None, day: str | None) -> list[dict[str, Any]]:
-
     rows = []
     for partition in lake.partitions(table):
         if vehicle in (None, partition.vehicle) and day in (None, partition.day):

@@ -81,7 +81,6 @@ def _name(row: dict[str, Any]) -> str:
 
 
 def _sensor(row: dict[str, Any]) -> Iterator[str]:
-
     days = row["days"]
     of_days = (
         f", {len(days)} days from {days[0]} to {days[-1]}"

@@ -98,7 +98,6 @@ def _audited_method(lake: Lake, others: set[str]) -> str:
 
 
 def _print_table(days: Sequence[DayStatus], vehicles: Sequence[str]) -> None:
-
     wanting = sorted((d for d in days if d.status != "done"), key=lambda d: [*DAY_WORDS].index(d.status))
     table = Table("vehicle", "day", "status", "stage", "why")
     for day in wanting[:_ROWS]:

@@ -110,7 +110,7 @@ def verify(
     answer = answer_of_sensors(sensors) if of_sensors else answer_of(checks)
     told: dict[str, Any] = {"vehicle": name, "reason": reason, "page": page}
     told |= {"sensors": sensors} if of_sensors else {}
-    told |= {"axes": [_told(c) for c in checks]}
+    told |= {"axes": [asdict(c) for c in checks]}
     if json:
         print_json({"answer": answer, **told})
     else:
@@ -120,7 +120,6 @@ def verify(
 
 
 def _vehicle(config: FleetConfig, vehicle: str | None) -> str:
-
     if vehicle is not None:
         config.rig_of(vehicle)  # raises for an unknown vehicle
         return vehicle
@@ -195,7 +194,8 @@ def _checked(
         )
         checks = check_poses(poses, prior, lacking, config.verify, asked_deg, records)
     if page is not None:
-        _write_page(config, lake, partition, checks, page)
+        view = in_use_view(answer_of(checks), [asdict(c) for c in checks])
+        write_day_page(lake, partition, config, page, "joint", in_use=view)
     reasons = {r.reason for r in records if r.status == "refused"}
     return checks, "; ".join(sorted(reasons))
 
@@ -218,21 +218,7 @@ def _calibrate(
     CALIBRATE.run(replace(task, fleet=started))
 
 
-def _write_page(
-    config: FleetConfig, lake: Lake, partition: Partition, checks: list[AxisCheck], page: Path
-) -> None:
-
-    view = in_use_view(answer_of(checks), [_told(c) for c in checks])
-    write_day_page(lake, partition, config, page, "joint", in_use=view)
-
-
-def _told(check: AxisCheck) -> dict[str, Any]:
-
-    return asdict(check)
-
-
 def _print_table(checks: list[AxisCheck], answer: str, sensors: Mapping[str, str]) -> None:
-
     table = Table(title="The calibration in use", title_justify="left")
     for heading in (
         "sensor" if sensors else "pair",

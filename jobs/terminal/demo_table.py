@@ -111,27 +111,23 @@ def _mean_error(
 
 
 def _true(truth: Truth, record: CalibrationRecord) -> np.ndarray:
-
     T = true_transform(truth, record)
     assert T is not None, "every sensor of the demo has a true pose"
     return T
 
 
 def _current(lake: Lake, method: str, day: str) -> list[CalibrationRecord]:
-
     found = read_records(lake, CALIBRATIONS, CalibrationRecord, day=day)
     return current_records([r for r in found if r.method == method])
 
 
 def _console() -> Console:
-
     console = Console(highlight=False)
     console.width = max(console.width, _WIDTH)
     return console
 
 
 def _table(day: str) -> Table:
-
     table = Table(
         title=f"Change from the nominal pose, {day}",
         title_style="bold",
@@ -149,7 +145,6 @@ def _table(day: str) -> Table:
 
 
 def _rows(record: CalibrationRecord, T_true: np.ndarray) -> list[list[str]]:
-
     T, T_prior = transform_of(record), prior_of(record)
     if T is None or T_prior is None or record.covariance is None:
         return [[record.vehicle, _name(record), _styled(record.status)]]
@@ -174,7 +169,6 @@ def _name(record: CalibrationRecord) -> str:
 
 
 def _errors(record: CalibrationRecord, T_true: np.ndarray) -> dict[str, Any]:
-
     def error(T: np.ndarray | None) -> tuple[float | None, float | None]:
         if T is None:
             return None, None

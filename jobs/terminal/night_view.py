@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, Protocol
+from typing import Any
 
 from rich.console import Console
 from rich.progress import (
@@ -22,7 +22,7 @@ from jobs.terminal.summary import LOG_EVERY_S, is_terminal
 from pipeline.core.stages import STAGES
 from pipeline.fleet.nightly import DayOutcome
 
-__all__ = ["NightView", "night_view"]
+__all__ = ["night_view"]
 
 _MARKS = {
     "done": "[green]ok[/]",
@@ -34,22 +34,13 @@ _MARKS = {
 }
 
 
-class NightView(Protocol):
-    """Progress display: receives vehicle-days in work and finished vehicle-days."""
-
-    def watch(self, index: int, done: int, total: int, what: str) -> None:
-        """Update the progress of the vehicle-day with this index."""
-
-    def finished(self, outcome: DayOutcome) -> None:
-        """Show a finished vehicle-day."""
-
-    def ended(self, name: str) -> None:
-        """Show that the work with this name ended without errors or remarks."""
-
-
 @contextmanager
-def night_view(names: list[str], total: int, title: str = "night") -> Iterator[NightView]:
-    """A view of `total` vehicle-days; `names` are those in work, in order of index."""
+def night_view(names: list[str], total: int, title: str = "night") -> Iterator[_Lines | _Bars]:
+    """A view of `total` vehicle-days; `names` are those in work, in order of index.
+
+    It is told of progress (`watch`, by index), of finished vehicle-days (`finished`), and of other work that ended
+    without errors or remarks (`ended`, by name).
+    """
     if not is_terminal():
         yield _Lines(names, total, title)
         return

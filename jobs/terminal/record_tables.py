@@ -52,7 +52,6 @@ def print_table(table: str, rows: list[dict[str, Any]]) -> None:
 
 
 def _calibration_cells(row: dict[str, Any]) -> dict[str, str]:
-
     sigma = np.full(6, np.nan) if row["covariance"] is None else np.sqrt(np.diag(row["covariance"]))
     seen = row["observable"] or [False] * 6
     degrees = " ".join(_sigma(s, o, 3) for s, o in zip(np.degrees(sigma[:3]), seen[:3], strict=True))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -34,7 +34,7 @@ from pipeline.rig.rig import Rig
 from pipeline.rig.se3 import inverse, transform_points
 from schemas.captures import Capture, Image, Scan, Sweep
 
-__all__ = ["CaptureReader", "Read", "Rejected", "deskew", "planar_motion", "readers_of"]
+__all__ = ["Read", "Rejected", "deskew", "planar_motion", "readers_of"]
 
 _SAME_IMAGE_NS = 5_000_000  # labels and detections have the stamp of the image they were computed from
 
@@ -62,20 +62,14 @@ class Read:
     dropped: Counter[str] = field(default_factory=Counter)
 
 
-@runtime_checkable
-class CaptureReader(Protocol):
-    """Reads the messages of one sensor as rows."""
-
-    def read(self, place: int, moment: int) -> Read:
-        """Row of a message, by its index in the sensor's stream; raises Rejected if damaged or incomplete."""
-        ...
-
-
 def readers_of(
     index: DayIndex, rig: Rig, ingest: IngestConfig, counts: Counter[str]
-) -> dict[str, CaptureReader]:
-    """Reader of each sensor of a rig, by name; `counts` collects dropped points and missing parts."""
-    readers: dict[str, CaptureReader] = {}
+) -> dict[str, _Images | _Sweeps | _Scans]:
+    """Reader of each sensor of a rig, by name; `counts` collects dropped points and missing parts.
+
+    Its `read(place, moment)` gives the row of a message, by its index in the sensor's stream, or raises Rejected.
+    """
+    readers: dict[str, _Images | _Sweeps | _Scans] = {}
     for name, camera in rig.cameras.items():
         readers[name] = _Images(_Messages(index, name), camera, counts)
     readers |= {name: _Sweeps(_Messages(index, name), ingest, counts) for name in rig.lidars}

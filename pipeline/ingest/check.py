@@ -21,7 +21,7 @@ from pipeline.ingest.readiness import DofVerdict, Evidence, Unheard, overall, un
 from pipeline.ingest.rig_sample import RigFinding, RigSample
 from pipeline.ingest.roles import NEEDED, topics_of
 from pipeline.ingest.stage import pick_moments, read_file_prior
-from pipeline.ingest.sync import WRONG_UNIT, constant_gap_ns
+from pipeline.ingest.sync import WRONG_UNIT, constant_gap_ns, nearest_gaps_ns
 from pipeline.rig.day_prior import no_prior, rig_prior
 from pipeline.rig.prior import RigPrior
 from pipeline.rig.rig import Rig
@@ -213,11 +213,7 @@ def _sync(index: DayIndex, moments: int, config: IngestConfig) -> SyncQuality:
 def _median_distance_ms(a_ns: Int64[np.ndarray, " N"], b_ns: Int64[np.ndarray, " M"]) -> float | None:
     if not len(a_ns) or not len(b_ns):
         return None
-    right = np.clip(np.searchsorted(b_ns, a_ns), 1, max(len(b_ns) - 1, 1))
-    nearest = np.minimum(
-        np.abs(a_ns - b_ns[np.minimum(right, len(b_ns) - 1)]), np.abs(a_ns - b_ns[right - 1])
-    )
-    return float(np.median(nearest) * 1e-6)
+    return float(np.median(np.abs(nearest_gaps_ns(a_ns, b_ns))) * 1e-6)
 
 
 def _advice(frames: list[Frame], rig: Rig, topics: list[TopicFinding], usable: int) -> list[str]:

@@ -21,6 +21,7 @@ __all__ = [
     "first_occurrences",
     "match_moments",
     "match_nearest",
+    "nearest_gaps_ns",
     "none_near",
     "number_drives",
 ]
@@ -173,9 +174,7 @@ def constant_gap_ns(lidar_ns: Int[np.ndarray, " L"], stamps_ns: Int[np.ndarray, 
     period = _period_ns(stamps_ns)
     if period is None or not len(lidar_ns):
         return 0
-    right = np.clip(np.searchsorted(stamps_ns, lidar_ns), 1, len(stamps_ns) - 1)
-    before, after = stamps_ns[right - 1] - lidar_ns, stamps_ns[right] - lidar_ns
-    gap = np.where(np.abs(before) <= np.abs(after), before, after)
+    gap = nearest_gaps_ns(lidar_ns, stamps_ns)
     gap = gap[np.abs(gap) <= _HALF_A_PERIOD * period]
     if not len(gap):
         return 0
@@ -186,6 +185,13 @@ def constant_gap_ns(lidar_ns: Int[np.ndarray, " L"], stamps_ns: Int[np.ndarray, 
     # Gaps near half a period may have either sign: shift them to one side of the mean before taking the
     # median.
     return round(middle + float(np.median((gap - middle + period / 2) % period - period / 2)))
+
+
+def nearest_gaps_ns(a_ns: Int[np.ndarray, " N"], b_ns: Int[np.ndarray, " M"]) -> Int64[np.ndarray, " N"]:
+    """Time from each stamp of a to the nearest of b [ns]; b is sorted, and not empty."""
+    right = np.clip(np.searchsorted(b_ns, a_ns), 1, max(len(b_ns) - 1, 1))
+    before, after = b_ns[right - 1] - a_ns, b_ns[np.minimum(right, len(b_ns) - 1)] - a_ns
+    return np.where(np.abs(before) <= np.abs(after), before, after)
 
 
 def _period_ns(stamps_ns: Int[np.ndarray, " M"]) -> float | None:

@@ -1,62 +1,18 @@
-"""File operations of a lake, in a folder or in a bucket."""
+"""File operations of a lake: in a folder here, in a bucket with the same methods in `object_store.py`."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePath
-from typing import BinaryIO, Protocol, runtime_checkable
+from typing import BinaryIO
 
 from pipeline.store.atomic_write import atomic_write
+from pipeline.store.object_store import Bucket
 
 __all__ = ["Files", "LocalFiles"]
-
-
-@runtime_checkable
-class Files(Protocol):
-    """A location of whole files; `pipeline/store/object_store.py` has the other implementation."""
-
-    def uri(self, path: PurePath) -> str:
-        """Address of a file or folder for users and for `deltalake`."""
-        ...
-
-    def exists(self, path: PurePath) -> bool:
-        """Whether the file or folder exists."""
-        ...
-
-    def find(self, folder: PurePath, pattern: str) -> Iterator[PurePath]:
-        """Files below a folder whose path matches a pattern."""
-        ...
-
-    def opened(self, path: PurePath) -> AbstractContextManager[BinaryIO]:
-        """A file opened for random access."""
-        ...
-
-    def replacing(self, path: PurePath) -> AbstractContextManager[BinaryIO]:
-        """A stream whose content replaces the file when the block ends; on an error the file stays as it was."""
-        ...
-
-    def move(self, path: PurePath, to: PurePath) -> None:
-        """Rename a file, if it exists."""
-        ...
-
-    def delete(self, path: PurePath) -> None:
-        """Remove a file, if it exists."""
-        ...
-
-    def size(self, path: PurePath) -> int:
-        """Size of a file [bytes]; 0 if it does not exist."""
-        ...
-
-    def sizes(self, folder: PurePath) -> Iterator[tuple[str, int]]:
-        """Name and size [bytes] of each file in a folder; empty if the folder does not exist."""
-        ...
-
-    def delta_options(self) -> dict[str, str]:
-        """Storage options for `deltalake`."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -64,7 +20,7 @@ class LocalFiles:
     """Files of this machine, or of a mounted disk."""
 
     def uri(self, path: PurePath) -> str:
-        """The path."""
+        """Address of a file or folder for users and for `deltalake`: its path."""
         return str(path)
 
     def exists(self, path: PurePath) -> bool:
@@ -108,5 +64,8 @@ class LocalFiles:
                     yield entry.name, entry.stat().st_size
 
     def delta_options(self) -> dict[str, str]:
-        """No options."""
+        """Storage options for `deltalake`: none."""
         return {}
+
+
+Files = LocalFiles | Bucket

@@ -41,7 +41,7 @@ _ABSENT = (NotFoundError, FileNotFoundError)  # the client raises either
 
 @dataclass(frozen=True)
 class Bucket:
-    """A bucket whose objects are used as files; implements `Files`."""
+    """A bucket whose objects are used as files, with the methods of `LocalFiles`."""
 
     name: str
 
