@@ -230,11 +230,22 @@ def _read_log(
     *,
     survey: bool = False,
 ) -> None:
+    log = index.logs[number]
     try:
-        _index_log(index, number, topics, within, survey=survey)
+        for message in log.scan(None if survey else topics, within):
+            if survey:
+                index.surveyed[message.channel.topic, message.channel.msgtype] += 1
+            role = topics.get(message.channel.topic)
+            if role is not None:
+                _index_message(index, number, message, role)
     except OSError as err:  # a disk or share failed on the way: messages read so far are used
-        index.complain(f"{index.logs[number].path}: cannot be read further: {err}")
+        index.complain(f"{log.path}: cannot be read further: {err}")
         index.damage["logs_lost_while_reading"] += 1
+        return
+    for name, count in log.damage.items():
+        index.damage[name] += count
+        what = "is cut off" if name == "truncated" else f"{count} {name.replace('_', ' ')}"
+        index.complain(f"{log.path.name}: {what}")
 
 
 def _read_bursts(
@@ -275,33 +286,17 @@ def _allow_open_files() -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
 
 
-def _index_log(
-    index: DayIndex, number: int, topics: dict[str, Role], within: Stretches | None, *, survey: bool
-) -> None:
-    log = index.logs[number]
-    for message in log.scan(None if survey else topics, within):
-        if survey:
-            index.surveyed[message.channel.topic, message.channel.msgtype] += 1
-        role = topics.get(message.channel.topic)
-        if role is None:
-            continue
-        index.types_seen.add((message.channel.topic, message.channel.msgtype))
-        if message.channel.msgtype not in ACCEPTED_TYPES[role.what]:
-            index.damage["wrong_type"] += 1
-            index.complain(
-                f"{index.log_names[number]}, topic {message.channel.topic}: {_refusal(message, role)}"
-            )
-            continue
-        if role == TF_STATIC:
-            _take_transforms(index, number, message)
-        elif _is_of_another_encoding(index, number, message):
-            index.damage["wrong_encoding"] += 1
-        else:
-            _take(index, number, message, role)
-    for name, count in log.damage.items():
-        index.damage[name] += count
-        what = "is cut off" if name == "truncated" else f"{count} {name.replace('_', ' ')}"
-        index.complain(f"{log.path.name}: {what}")
+def _index_message(index: DayIndex, number: int, message: RawMessage, role: Role) -> None:
+    index.types_seen.add((message.channel.topic, message.channel.msgtype))
+    if message.channel.msgtype not in ACCEPTED_TYPES[role.what]:
+        index.damage["wrong_type"] += 1
+        index.complain(f"{index.log_names[number]}, topic {message.channel.topic}: {_refusal(message, role)}")
+    elif role == TF_STATIC:
+        _take_transforms(index, number, message)
+    elif _is_of_another_encoding(index, number, message):
+        index.damage["wrong_encoding"] += 1
+    else:
+        _take(index, number, message, role)
 
 
 def _take(index: DayIndex, number: int, message: RawMessage, role: Role) -> None:

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from jaxtyping import Int64
 
 from pipeline.core.config import IngestConfig
 from pipeline.core.results import Progress
@@ -32,7 +33,7 @@ from pipeline.rig.rig import Rig
 from schemas.captures import Capture
 from schemas.moments import SAME_SCENE_NS, Moment
 
-__all__ = ["REPEATED", "Anchored", "MomentBuilder"]
+__all__ = ["REPEATED", "Anchored", "MomentBuilder", "spread"]
 
 REPEATED = {
     "camera": Rejection.IMAGE_REPEATED,
@@ -160,8 +161,7 @@ class MomentBuilder:
     ) -> tuple[list[tuple[Moment, dict[str, Capture]]], int, Counter[str]]:
         """Up to `count` moments spread over the day; how many were tried, and those not kept by reason."""
         built, rejected = [], Counter[str]()
-        picked = np.unique(np.linspace(0, max(len(anchored) - 1, 0), count).round().astype(int))
-        picked = picked[: len(anchored)]
+        picked = spread(len(anchored), count)
         for done, i in enumerate(picked.tolist(), 1):
             try:
                 built.append(self.build(anchored[i], i))
@@ -221,3 +221,10 @@ def _content(part: LidarCloud | RadarCloud | bytes) -> tuple[bytes, ...]:
         few = len(part.xyz_m) < _FEWEST_POINTS
         return () if few else (part.xyz_m.tobytes(), part.range_rate_mps.tobytes())
     return (part,)
+
+
+def spread(count: int, limit: int | None) -> Int64[np.ndarray, " N"]:
+    """At most `limit` of so many places, evenly spread."""
+    if limit is None or count <= limit:
+        return np.arange(count, dtype=np.int64)
+    return np.unique(np.linspace(0, count - 1, limit).round().astype(np.int64))

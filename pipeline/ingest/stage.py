@@ -17,7 +17,7 @@ from pipeline.core.stage_work import NothingUsable, Run, Task, Work
 from pipeline.ingest.captures import Rejected
 from pipeline.ingest.containers.reader import content_identity, leads_nowhere
 from pipeline.ingest.index import DayIndex, index_logs
-from pipeline.ingest.moments import REPEATED, Anchored, MomentBuilder
+from pipeline.ingest.moments import REPEATED, Anchored, MomentBuilder, spread
 from pipeline.ingest.readiness import Unheard, unheard_topics
 from pipeline.ingest.roles import NEEDED, topics_of
 from pipeline.ingest.sync import (
@@ -145,7 +145,7 @@ def _complain_of_date(index: DayIndex, day: str) -> None:
 def pick_moments(index: DayIndex, rig: Rig, config: IngestConfig) -> tuple[list[Anchored], Counter[str]]:
     """Captures by moment, in order of time, at most `max_frames`; and unused sweeps by reason."""
     found, drives = find_moments(index, rig, config), _drives(index)
-    picked = _spread(len(found.anchor), config.max_frames)
+    picked = spread(len(found.anchor), config.max_frames)
     places = {index.anchor: found.anchor, **found.others}
     anchored = [
         Anchored(
@@ -265,12 +265,6 @@ def _drives(index: DayIndex) -> Int64[np.ndarray, " N"]:
     drives = np.zeros(len(order), np.int64)
     drives[order] = number_drives([sweeps.stamps[i] for i in order], [sweeps.located[i].log for i in order])
     return drives
-
-
-def _spread(count: int, limit: int | None) -> Int64[np.ndarray, " N"]:
-    if limit is None or count <= limit:
-        return np.arange(count, dtype=np.int64)
-    return np.unique(np.linspace(0, count - 1, limit).round().astype(np.int64))
 
 
 def _built(
