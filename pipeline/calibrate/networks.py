@@ -17,7 +17,6 @@ from pipeline.core.stage_work import Task
 from pipeline.learn.infer.onnx_networks import model_files, models_key, open_networks
 from pipeline.learn.infer.pitch_by_travel import informed_by_way
 from pipeline.learn.infer.vehicle_day import single_frame_solution, solve_by_networks
-from pipeline.rig.day_prior import perturbed, read_prior
 from pipeline.rig.estimates import Prior, Solution
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_columns
@@ -96,13 +95,8 @@ def calibrate_frame(task: Task, frame: int) -> FrameCalibration:
         known = " or ".join(m.name for m in METHODS if m.needs_images)
         raise ConfigError("command line", "--frame", f"{method.name} needs many frames; choose {known}")
     seed = fleet.solve.seed if task.seed is None else task.seed
-    if fleet.rig_of(partition.vehicle).is_one_of_each:
-        chosen = None
-        row, observation = _one_observation(task.lake, partition, frame, chosen)
-        prior = perturbed(read_prior([observation], fleet, partition.vehicle), task.perturb, seed)
-    else:
-        chosen, prior = three_of_day(replace(task, method=method.name), seed)
-        row, observation = _one_observation(task.lake, partition, frame, chosen)
+    chosen, prior = three_of_day(replace(task, method=method.name), seed)
+    row, observation = _one_observation(task.lake, partition, frame, chosen)
     networks = open_networks(model_files(method.name, fleet), fleet.learn, fleet.prepare)
     shown = next(_frames_of(task.lake, partition, chosen)([row]))
     solution = single_frame_solution(
