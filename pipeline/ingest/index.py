@@ -112,8 +112,8 @@ class DayIndex:
 
     @property
     def anchor(self) -> str:
-        """Sensor whose captures define the moments: the first lidar, or a radar if there is no sweep."""
-        able = sorted((s for s in self.kinds if self.kinds[s] != "camera"), key=lambda s: self.kinds[s])
+        """Sensor whose captures define the moments: the first lidar; without sweeps a radar, without scans a camera."""
+        able = sorted(self.kinds, key=lambda s: ("lidar", "radar", "camera").index(self.kinds[s]))
         return next((s for s in able if self.captures(s).stamps), able[0] if able else "")
 
     def captures(self, sensor: str) -> Stream:

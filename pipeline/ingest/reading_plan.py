@@ -23,7 +23,7 @@ from pipeline.ingest.directions_and_units import doppler_speed
 from pipeline.ingest.messages.decoding import DECODE_ERRORS, decode, header_stamp_ns
 from pipeline.ingest.messages.odometry import EgoState, EgoTrack
 from pipeline.ingest.messages.radar import read_radar
-from pipeline.ingest.roles import INFO, LIDAR, ODOMETRY, RADAR, TF_STATIC, Role
+from pipeline.ingest.roles import IMAGE, INFO, LIDAR, ODOMETRY, RADAR, TF_STATIC, Role
 from pipeline.rig.rig import Rig
 
 __all__ = [
@@ -38,6 +38,7 @@ __all__ = [
 ]
 
 _GLANCE_NS = 250_000_000  # on each side: odometry comes at 10 Hz or more, and a chunk often holds a second
+_ANCHORS = (LIDAR, RADAR, IMAGE)  # messages that define moments, the first that a rig has
 _LATENCY_GLANCES = 3  # at the day's begin, middle and end: clocks drift by some hundred ppm
 # Messages are logged after their stamps, with a latency by sensor: the stretch to read exceeds the burst by
 # the largest observed latency difference plus this margin, which also covers odometry of 2 Hz.
@@ -132,10 +133,10 @@ def plan_reading(
     held = {
         role: topic for topic, role in roles.items() if any(t.messages.get(topic) for t in indexed.values())
     }
-    anchors = [role for role in held if role.what in (LIDAR, RADAR)]
+    anchors = [role for role in held if role.what in _ANCHORS]
     if not anchors:
         return None
-    anchor = min(anchors, key=lambda role: role.what)
+    anchor = min(anchors, key=lambda role: _ANCHORS.index(role.what))
     about = held[anchor]
     timeline = Timeline.joined(t for t in indexed.values() if t.messages.get(about))
     sweeps = timeline.messages.get(about, 0)
@@ -143,7 +144,7 @@ def plan_reading(
     if counted is None or sweeps <= budget or 2 * len(indexed) < len(logs) or not timeline.recorded.length_ns:
         return None
     day = _Day(tuple(indexed), rig, roles)
-    by = next((r for r in (ODOMETRY, *anchors) if r in held and r.what != LIDAR), None)
+    by = next((r for r in (ODOMETRY, *anchors) if r in held and (r == ODOMETRY or r.what == RADAR)), None)
     possible = possible_bursts(counted.times_ns(), budget, is_motion_known=by is not None)
     motion = _motion_at(day, possible.middle_ns, by)
     needed = {role for role in held if role.is_capture}

@@ -4,13 +4,25 @@ import cv2
 import numpy as np
 import pytest
 
+from pipeline.core.config import FleetConfig
 from pipeline.store.moments import joined
 from pipeline.store.partitions import Lake, Partition
 from schemas.moments import MOMENTS
 from tests.makers import written_logs
 from tests.makers.stages import ingest_day
-from tests.makers.written_logs import IMAGE, ODOMETRY, PERIOD_NS, START_NS, Kit, jpeg
+from tests.makers.written_logs import IMAGE, INFO, ODOMETRY, PERIOD_NS, START_NS, Kit, jpeg
 
+TWO_CAMERAS = {
+    "fleet": {"name": "test"},
+    "rigs": {
+        "default": {
+            "base": "base_link",
+            "cameras": {"a": {"image": IMAGE, "info": INFO}, "b": {"image": "/b/image", "info": "/b/info"}},
+            "ego": {"odometry": ODOMETRY},
+        }
+    },
+    "vehicles": {"car": {}},
+}
 DAY = Partition("car", "2023-11-14")
 FRAMES = 12
 
@@ -93,3 +105,20 @@ def test_a_standing_car_stamps_that_jump_and_a_picture_again_are_named(images):
         if topic == IMAGE and logged == START_NS + 7 * PERIOD_NS:
             message.data = np.frombuffer(jpeg(10), np.uint8)
     assert images(kit)[1].earlier_missing == "same_image_again"
+
+
+def test_a_car_with_cameras_alone_has_moments_of_its_images(tmp_path):
+    kit = drive()
+    kit.messages = [m for m in kit.messages if m[0] not in ("/lidar/points", "/radar/points")]
+    of_a = list(enumerate(kit.messages))
+    for k, (topic, kind, logged, message) in of_a:
+        if topic == IMAGE:
+            kit.add("/b/image", kind, logged, kit.compressed(logged + 3_000_000, jpeg(50 + k)))
+        if topic == INFO:
+            kit.add("/b/info", kind, logged, message)
+    lake, log = Lake.at(tmp_path / "lake"), kit.mcap(tmp_path / "log.mcap")
+    ingest_day([log], DAY, FleetConfig.model_validate(TWO_CAMERAS), lake)
+    moments = list(joined(lake, MOMENTS, DAY))
+    assert len(moments) == FRAMES
+    assert all(set(captures) == {"a", "b"} for _, captures in moments)
+    assert moments[8][1]["b"].earlier_stamp_ns is not None
