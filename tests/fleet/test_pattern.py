@@ -123,3 +123,12 @@ def test_what_cannot_be_meant_is_refused(pattern, days, match, tmp_path):
     with pytest.raises(ConfigError, match=match) as caught:
         find_vehicle_days(str(tmp_path / pattern), *days)
     assert caught.value.exit_code == 2
+
+
+def test_shell_wildcards_choose_the_files(tmp_path):
+    touch(*(tmp_path / f"car/2026-03-02/{n}.mcap" for n in ("a0", "a1", "a2", "b0")))
+    assert found("{vehicle}/{day}/a[0-1].mcap", tmp_path)["car", "2026-03-02"] == [
+        "car/2026-03-02/a0.mcap",
+        "car/2026-03-02/a1.mcap",
+    ]
+    assert len(found("{vehicle}/{day}/?0.mcap", tmp_path)["car", "2026-03-02"]) == 2
