@@ -114,7 +114,10 @@ def _contradictions(
     if edge.kind == "camera_lidar" and solved.judged.verdict.status == "accepted":
         return []
     own, found = rig.edges[edge], dict[str, list[Edge]]()
-    if doubts := own.doubts:
+    of_ends = (d for s in edge.sensors if s.name in rig.sensors for d in rig.sensors[s.name].doubts)
+    if doubts := tuple(
+        dict.fromkeys([*own.doubts, *of_ends])
+    ):  # of its own, and of those that its pose rests on
         found[", ".join(e.name for e in doubts)] = [e for e in doubts if not rig.edges[e].used]
     is_confirmed = own.used and own.innovation_sigmas is not None
     for other, at in () if is_confirmed else rig.edges.items():
