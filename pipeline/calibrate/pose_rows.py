@@ -138,14 +138,16 @@ def _as_judged(row: PoseRow, concluded: Concluded | None) -> PoseRow:
     if not concluded.is_adjusted and row.status == "accepted":
         return row
     record = concluded.record
+    if concluded.is_adjusted:  # else the record's sigmas are of another pose
+        row = replace(
+            row, azimuth_sigma_rad=record.azimuth_sigma_rad, elevation_sigma_rad=record.elevation_sigma_rad
+        )
     return replace(
         row,
         status=record.status,
         reason=record.reason,
         faults=record.faults,
         determined=record.determined or [],
-        azimuth_sigma_rad=record.azimuth_sigma_rad,
-        elevation_sigma_rad=record.elevation_sigma_rad,
         unsure_only=bool(record.diagnostics.get("unsure_only")),
     )
 
