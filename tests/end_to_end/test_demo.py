@@ -69,7 +69,14 @@ def test_the_comparison_with_the_truth_is_kept(demo):
     pairs = ("camera_lidar", "camera_radar", "lidar_radar")
     # Two vehicles of three sensors, and one of two cameras and two radars, which the network is not run on.
     expected = {(method, pair): 2 for method in ("joint", "joint-ssl") for pair in pairs}
-    of_many = {"camera_lidar": 4, "camera_radar": 6, "lidar_radar": 4, "lidar_base": 1, "radar_base": 2}
+    of_many = {
+        "camera_lidar": 4,
+        "camera_radar": 6,
+        "lidar_radar": 4,
+        "lidar_base": 1,
+        "radar_base": 2,
+        "camera_base": 2,
+    }
     assert Counter((r["method"], r["pair"]) for r in rows) == expected | {
         ("joint", kind): count for kind, count in of_many.items()
     }

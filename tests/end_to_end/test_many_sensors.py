@@ -59,7 +59,8 @@ def test_every_sensor_has_a_file_and_what_it_lacks_is_counted_under_its_name(day
 
 @pytest.mark.parametrize(
     ("of_camera", "counts"),
-    [(attrgetter("image"), (4, 0)), (attrgetter("semantics.labels"), (0, 4))],
+    # Of every second image that is read some are earlier ones, which show a motion and cost no moment.
+    [(attrgetter("image"), (3, 0)), (attrgetter("semantics.labels"), (0, 4))],
     ids=["images", "labels"],
 )
 def test_what_is_damaged_of_one_camera_costs_that_camera_alone(day, tmp_path, monkeypatch, of_camera, counts):
