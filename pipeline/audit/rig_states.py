@@ -123,12 +123,8 @@ def _sensor_row(
     """The row of one sensor without its claims, and its pose; None if not even its prior is known."""
     (sensor, days), reference = of, own.reference
     first, why = last_restart(sensor, reference, *known, empty.day)
-    counted = days.since(dt.date.fromisoformat(first).toordinal() if first else 0)
     moved = int(days.moved_within.max(initial=0))
-    anew = counted.since(moved + 1)
-    if 0 < len(anew.poses.day) < len(counted.poses.day):
-        counted, first = anew, day_name(moved + 1)
-        why = f"since it or {reference.name} moved within {day_name(moved)}"
+    counted, first, why = _counted(days, first, why, moved, reference)
     base = replace(empty, child_frame=sensor.name, sensor=sensor.name, kind=sensor.kind, since=first or None)
     apart = f"not counted, because their poses refer to another sensor: {', '.join(own.other_days)}"
     remarks = [apart] if own.other_days else []
@@ -176,6 +172,17 @@ def _sensor_row(
         inputs=sorted({counted.work_keys[k] for k in found.rows}),
     )
     return row, pose
+
+
+def _counted(
+    days: SensorDays, first: str, why: str, moved: int, reference: Sensor
+) -> tuple[SensorDays, str, str]:
+    """Days that count, from which one on, and why: since the last restart, or since it moved within the day `moved`."""
+    counted = days.since(dt.date.fromisoformat(first).toordinal() if first else 0)
+    anew = counted.since(moved + 1)
+    if 0 < len(anew.poses.day) < len(counted.poses.day):
+        return anew, day_name(moved + 1), f"since it or {reference.name} moved within {day_name(moved)}"
+    return counted, first, why
 
 
 def _edge_row(

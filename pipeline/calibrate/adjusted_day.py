@@ -115,9 +115,8 @@ def _contradictions(
         return []
     own, found = rig.edges[edge], dict[str, list[Edge]]()
     of_ends = (d for s in edge.sensors if s.name in rig.sensors for d in rig.sensors[s.name].doubts)
-    if doubts := tuple(
-        dict.fromkeys([*own.doubts, *of_ends])
-    ):  # of its own, and of those that its pose rests on
+    doubts = tuple(dict.fromkeys([*own.doubts, *of_ends]))  # its own, and of edges that its pose rests on
+    if doubts:
         found[", ".join(e.name for e in doubts)] = [e for e in doubts if not rig.edges[e].used]
     is_confirmed = own.used and own.innovation_sigmas is not None
     for other, at in () if is_confirmed else rig.edges.items():

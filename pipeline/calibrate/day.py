@@ -149,10 +149,7 @@ def _solved(
     if not pairs:
         return DayOfPairs(refusals, None)
     frames = {pair: [observations[i] for i in selection.fit[pair]] for pair in pairs}
-    measured = method.paper_selection or fleet.trigger.when == "triggered"
-    sample = _spread(observations, frames) if measured else []
-    before = trigger_metrics(sample, {pair: prior.of(pair) for pair in pairs})
-    fired = _fired(before, sample, fleet)
+    sample, before, fired = _triggers(observations, frames, prior, method, fleet)
     active = _to_calibrate(method, fired, fleet.trigger.when)
     progress(1, 4, f"solve by {about.method}")
     solution = (solver or method.solver())(
@@ -186,6 +183,20 @@ def _solved(
     )
     progress(4, 4, "done")
     return DayOfPairs(refusals, day)
+
+
+def _triggers(
+    observations: Sequence[Observation],
+    frames: Mapping[str, Sequence[Observation]],
+    prior: Prior,
+    method: Method,
+    fleet: FleetConfig,
+) -> tuple[list[Observation], Mapping[str, Mapping[str, float]], dict[str, list[str]]]:
+    """Frames that trigger metrics are measured on, if they are; the metrics at the prior, and what they exceed."""
+    measured = method.paper_selection or fleet.trigger.when == "triggered"
+    sample = _spread(observations, frames) if measured else []
+    before = trigger_metrics(sample, {pair: prior.of(pair) for pair in frames})
+    return sample, before, _fired(before, sample, fleet)
 
 
 def _fired(

@@ -52,7 +52,8 @@ class RigDay:
 
     Args:
         views: view of each sensor, by name.
-        rows: observations of chosen sensors, in order of time; read for each edge, and then released.
+        rows: observations of chosen sensors, in order of time; read for each edge, and kept until it is judged at the
+            adjusted poses.
         before: T_parent_child of an edge from an earlier day; None if there is none.
     """
 

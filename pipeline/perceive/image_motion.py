@@ -35,9 +35,8 @@ _FEWEST = 35
 _STILL_PX = 0.3  # a track that moves less is far away, or on the car itself
 _NOISE_PX = 0.15  # of a track at the size of tracking: the threshold and the first scale of the loss
 _LEAST_NOISE_PX, _MOST_NOISE_PX = 0.05, 0.4
-_WIDER = (
-    1.3  # errors of simulated tracks over their sigma: directions are not linear in tracks of near points
-)
+# Errors of simulated tracks over their sigma: directions are not linear in tracks of near points.
+_WIDER = 1.3
 _RANSAC_PX = 0.7
 _WIDEST = np.cos(np.radians(75.0))  # bearings that RANSAC takes: it works on a plane
 _PASSES = 8

@@ -27,9 +27,8 @@ from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
 
 __all__ = ["estimate_camera_base", "solve"]
 
-_LEAST_RAD = np.radians(
-    0.1
-)  # a body pitches and yaws so much from image to image, however sharp the tracks are
+# A body pitches and yaws so much from image to image, however sharp the tracks are.
+_LEAST_RAD = np.radians(0.1)
 _LEVER_SIGMA_M = 1.5  # as of a radar: place of the rear axle, slip
 _NO_SCALE, _DRIFT_SIGMA_RADPS = 1.0, 0.003  # of a yaw rate beside the camera's
 _MOST_TURN_RAD = np.radians(0.6)  # a metre, of a car of which nothing shows the way: straight driving
