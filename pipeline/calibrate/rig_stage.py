@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, replace
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -112,7 +113,7 @@ def _read(task: Task, rig: Rig, seed: int) -> RigDay:
         graph,
         prior,
         views,
-        lambda chosen: _rows(task, chosen),
+        _shared_rows(task),
         lambda edge: accepted_before(task.lake, task.partition, method, edge),
     )
 
@@ -138,6 +139,24 @@ def _view(task: Task, chosen: Chosen, moments: Sequence[int]) -> View | None:
     [kind] = chosen
     rows = list(observations_of(task.lake, task.partition, moments, chosen))
     return views_of(rows).get(kind)
+
+
+def _shared_rows(task: Task) -> Callable[[Chosen], list[Observation]]:
+    """Reads rows of chosen sensors; what a sensor measured is held once, however many of its edges keep it."""
+    known: dict[tuple[str, str, int], np.ndarray] = {}
+
+    def shared(o: Observation, chosen: Chosen) -> Observation:
+        same: dict[str, Any] = {}
+        for one in fields(o):
+            value = getattr(o, one.name)
+            if isinstance(value, np.ndarray):
+                sensor = chosen.get(one.name.partition("_")[0], chosen.get("camera", ""))
+                first = known.setdefault((sensor, one.name, o.frame_index), value)
+                if first is not value and first.dtype == value.dtype and np.array_equal(first, value):
+                    same[one.name] = first
+        return replace(o, **same)
+
+    return lambda chosen: [shared(o, chosen) for o in _rows(task, chosen)]
 
 
 def _rows(task: Task, chosen: Chosen) -> list[Observation]:
