@@ -105,20 +105,23 @@ def _write(spec: FleetSpec, out: Path, reflectors: bool, workers: int) -> int:
 
 def simulate_days(spec: FleetSpec, out: Path, fleet: str, workers: int | None) -> int:
     """Write fleet.toml and all vehicle-days, in so many processes, with progress; returns the number of logs."""
-    from pipeline.simulate.fleet import begin_fleet, day_names, vehicle_names
+    from pipeline.simulate.fleet import begin_fleet, day_names, remove_half_logs, vehicle_names
 
     work, logs = begin_fleet(spec, out, fleet), 0
     names = [f"{vehicle_names(spec)[v]} {day_names(spec.first_day, spec.days)[d]}" for v, d in work]
     run = EXECUTORS["process" if workers is None or workers > 1 else "inline"]
-    with (
-        night_view(names, len(work), title="simulate") as view,
-        closing(run(partial(_simulate_one, spec, out), work, workers, view.watch)) as results,
-    ):
-        for finished in results:
-            if finished.error:
-                raise LogError(str(out), f"simulating failed: {finished.error}\n{finished.trace}")
-            view.ended(names[work.index(finished.item)])
-            logs += finished.value or 0
+    try:
+        with (
+            night_view(names, len(work), title="simulate") as view,
+            closing(run(partial(_simulate_one, spec, out), work, workers, view.watch)) as results,
+        ):
+            for finished in results:
+                if finished.error:
+                    raise LogError(str(out), f"simulating failed: {finished.error}\n{finished.trace}")
+                view.ended(names[work.index(finished.item)])
+                logs += finished.value or 0
+    finally:
+        remove_half_logs(out)
     return logs
 
 

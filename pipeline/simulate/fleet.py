@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, date, datetime, timedelta
@@ -16,7 +17,14 @@ from pipeline.core.results import Progress, silent
 from pipeline.rig.topics import TOPICS, topics_of
 from pipeline.simulate.faults import Fault, faults_on, shaken
 from pipeline.simulate.logs.frame_messages import Setup
-from pipeline.simulate.logs.recording import CONTAINERS, FIRST_FRAME_S, log_name, open_log, record_drive
+from pipeline.simulate.logs.recording import (
+    CONTAINERS,
+    FIRST_FRAME_S,
+    PARTIAL,
+    log_name,
+    open_log,
+    record_drive,
+)
 from pipeline.simulate.sensors.data_sheets import CameraSpec, RadarSpec
 from pipeline.simulate.sensors.mounting import Mounting, mounting_of
 from pipeline.simulate.sensors.rig_spec import RigSpec, SensorSpec
@@ -34,6 +42,7 @@ __all__ = [
     "drive_of",
     "fleet_toml",
     "mounting_on",
+    "remove_half_logs",
     "rig_of",
     "rigs_of",
     "simulate_fleet",
@@ -116,6 +125,12 @@ def begin_fleet(spec: FleetSpec, out: Path, name: str) -> list[tuple[int, int]]:
     out.mkdir(parents=True, exist_ok=True)
     (out / "fleet.toml").write_text(fleet_toml(name, rigs_of(spec)))
     return [(vehicle, day) for day in range(spec.days) for vehicle in range(spec.vehicles)]
+
+
+def remove_half_logs(out: Path) -> None:
+    """Remove what a process left that was killed while it wrote."""
+    for folder in out.glob(f"logs/*/*/{PARTIAL}*"):
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def simulate_vehicle_day(

@@ -35,6 +35,7 @@ from pipeline.simulate.world.drives import Drive
 __all__ = [
     "CONTAINERS",
     "FIRST_FRAME_S",
+    "PARTIAL",
     "Ticks",
     "free_clocks",
     "log_name",
@@ -54,6 +55,7 @@ _WAY_M, _TRIGGER_S = 3.0, 0.1  # between the two images of a pair; period of a c
 # million. Without them, 30 and 10 Hz would keep a constant gap for a whole drive, as if triggered.
 _RATE_SD: Final = {"camera": 1e-4, "lidar": 3e-3, "radar": 1e-4}
 CONTAINERS: Final = ("mcap", "ros1", "db3")
+PARTIAL: Final = ".partial-"  # a folder of this beginning holds a log that is being written
 
 
 class OpenLog(NamedTuple):
@@ -243,7 +245,7 @@ def log_name(stem: str, container: str) -> str:
 @contextmanager
 def open_log(path: Path, container: str) -> Iterator[OpenLog]:
     """Open a log; it gets its final name, replacing an old one, when the block ends without an error."""
-    partial = path.parent / f".partial-{path.name}"
+    partial = path.parent / f"{PARTIAL}{path.name}"
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     opener = {"mcap": _mcap, "ros1": _ros1, "db3": _db3}[container]
