@@ -107,8 +107,8 @@ def _contradictions(
     """Contradictions of other edges to this one, of edges left out too unless they are known to be wrong.
 
     An edge that others in use confirm on another way is not contradicted by what is left out, and none is by an edge
-    that lies far from its prior, which holds what rests on that prior (`prior_doubts`). Camera-lidar is not checked:
-    its held-out frames would show any error that a radar's edges can show.
+    that lies far from its prior, which holds what rests on that prior (`hold_doubted`). Camera-lidar is not
+    checked: its held-out frames would show any error that a radar's edges can show.
     """
     edge = solved.edge
     if edge.kind == "camera_lidar" and solved.judged.verdict.status == "accepted":

@@ -9,7 +9,6 @@ from functools import partial
 import numpy as np
 
 from pipeline.calibrate.adjust.evidence import evidence_of
-from pipeline.calibrate.adjusted_day import adjusted_rig, conclude
 from pipeline.calibrate.judging import Judged, Judging
 from pipeline.calibrate.methods import Method, Solver, method_named
 from pipeline.calibrate.paper.triggers import exceeded, trigger_metrics
@@ -25,53 +24,16 @@ from pipeline.core.config import FleetConfig
 from pipeline.core.errors import SolveError
 from pipeline.core.results import Progress, silent
 from pipeline.core.stage_work import Probes
-from pipeline.rig.changes import change_jacobian
 from pipeline.rig.checks import FailedCheck
 from pipeline.rig.day_prior import no_prior
 from pipeline.rig.estimates import Prior, Solution
-from pipeline.rig.extrinsics import Extrinsics
-from pipeline.rig.graph import Edge, RigGraph, Sensor
-from pipeline.rig.se3 import adjoint, inverse
+from pipeline.rig.graph import Edge
 from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, SENSORS, CalibrationRecord
 from schemas.observations import WITHOUT_LABELS, Observation
 
-__all__ = [
-    "EDGES",
-    "DayOfPairs",
-    "calibrate_observations",
-    "poses_of",
-    "solve_day",
-    "three_sensors",
-]
+__all__ = ["DayOfPairs", "solve_day"]
 
 _TRIGGER_FRAMES = 40  # metrics are means over frames: more of them only cost time
-CAMERA, LIDAR, RADAR = Sensor("camera", "camera"), Sensor("lidar", "lidar"), Sensor("radar", "radar")
-EDGES = {e.kind: e for e in (Edge(CAMERA, LIDAR), Edge(CAMERA, RADAR), Edge(LIDAR, RADAR))}
-
-
-def calibrate_observations(
-    observations: Sequence[Observation],
-    prior: Prior,
-    fleet: FleetConfig,
-    about: Inputs,
-    progress: Progress = silent,
-    solver: Solver | None = None,
-) -> list[CalibrationRecord]:
-    """The records of one day of one camera, one lidar and one radar, without writing anything.
-
-    `solver` is for methods that need more than observations (`Method.needs_images`); None = the method's own.
-
-    Raises:
-        SolveError: the day cannot be calibrated.
-    """
-    day = solve_day(observations, prior, fleet, about, progress, solver)
-    solved, rig, records = day.edges(about, fleet, EDGES), None, dict(day.refused)
-    knows_both = all(prior.knows(pair) for pair in ("camera_lidar", "lidar_radar"))
-    if day.solved is not None and day.solved.solution.apart and knows_both:
-        graph = three_sensors([e.edge.kind for e in solved])
-        rig = adjusted_rig(graph, poses_of(prior, {}), solved, fleet.solve.time_offset_sigma_s)
-    records |= {c.edge.kind: c.record for c in conclude(solved, rig)}
-    return [records[pair] for pair in about.pairs]
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +70,13 @@ def solve_day(
     progress: Progress = silent,
     solver: Solver | None = None,
 ) -> DayOfPairs:
-    """Select, trigger, solve, judge, each pair by its own frames; as `calibrate_observations`."""
+    """Select, trigger, solve, judge, each pair by its own frames.
+
+    `solver` is for methods that need more than observations (`Method.needs_images`); None = the method's own.
+
+    Raises:
+        SolveError: the day cannot be calibrated.
+    """
     motion = compared_sources(observations, prior.T_ahead_radar)
     try:
         return _solved(observations, prior, fleet, about, motion, progress, solver)
@@ -303,25 +271,3 @@ def _spread(
     rows = [o for o in observations if id(o) in used]
     picked = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), _TRIGGER_FRAMES)).astype(int))
     return [rows[i] for i in picked]
-
-
-def three_sensors(pairs: Collection[str]) -> RigGraph:
-    """The graph of these pairs, referred to the lidar."""
-    return RigGraph((CAMERA, LIDAR, RADAR), tuple(e for p, e in EDGES.items() if p in pairs), LIDAR)
-
-
-def poses_of(prior: Prior, dt_s: dict[str, float]) -> Extrinsics:
-    """Poses relative to the lidar; rotation and position of each transform are independent, in parent axes.
-
-    `dt_s` are the expected clock offsets of camera and radar to the lidar.
-    """
-    T_lidar_camera = inverse(prior.T_camera_lidar)
-    covariance = np.zeros((12, 12))
-    for k, (pair, turned) in enumerate(
-        (("camera_lidar", adjoint(T_lidar_camera)), ("lidar_radar", np.eye(6)))
-    ):
-        to_left = turned @ np.linalg.inv(change_jacobian(prior.of(pair)))
-        at = slice(6 * k, 6 * k + 6)
-        covariance[at, at] = to_left @ prior.covariance(pair) @ to_left.T
-    T = {"lidar": np.eye(4), "camera": T_lidar_camera, "radar": prior.T_lidar_radar}
-    return Extrinsics(LIDAR, T, ("camera", "radar"), covariance, covariance, dt_s)

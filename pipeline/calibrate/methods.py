@@ -46,6 +46,8 @@ class Method:
         needs_images: uses images and sweeps (table frames) in networks, not only observations.
         needs_all: estimates all three pairs or none; else a pair without frames costs the others nothing.
         needs_labels: of cameras in all their pairs; else camera-lidar can do with steps of brightness.
+        of_three: works on one camera, one lidar and one radar, and its records are the answer; else on all edges of a
+            rig, each from its own data, which the adjustment combines.
         settings: import path of `(method's name, task) -> dict`: further inputs of its result.
     """
 
@@ -57,6 +59,7 @@ class Method:
     needs_images: bool = False
     needs_all: bool = False
     needs_labels: bool = True
+    of_three: bool = True
     settings: str | None = None
 
     def solver(self) -> Solver:
@@ -83,7 +86,7 @@ class Method:
 
 _NETWORKS, _FILES = "pipeline.calibrate.networks:ssl_solver", "pipeline.calibrate.networks:ssl_settings"
 METHODS = (
-    Method("joint", "pipeline.calibrate.joint.solve:solve_joint", needs_labels=False),
+    Method("joint", "pipeline.calibrate.joint.solve:solve_joint", needs_labels=False, of_three=False),
     Method(
         "tracking",
         "pipeline.calibrate.tracking.solve:solve_tracking",

@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.calibrate.joint.solve import solve_joint
 from pipeline.calibrate.methods import METHODS, Solver, method_named
-from pipeline.calibrate.rig_stage import three_of_day
+from pipeline.calibrate.stage import three_of_day
 from pipeline.core.config import SolveConfig, config_hash
 from pipeline.core.errors import ConfigError, SolveError
 from pipeline.core.results import Progress

@@ -28,8 +28,9 @@ from schemas.calibrations import FRAMES_OF_PAIR, CalibrationRecord
 from schemas.poses import PoseRow
 from schemas.versions import CODE_VERSION
 
-__all__ = ["pose_rows", "poses_of_records"]
+__all__ = ["hold_doubted", "pose_rows", "poses_of_records"]
 
+_FAULT = "prior"  # that edges name which contradict their prior
 # Ahead, left, up of a body as right, down, ahead of a camera.
 _OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
@@ -277,3 +278,52 @@ def _azimuth_seen(view: View, sensor: Sensor) -> float:
     if sensor.kind == "camera":
         points = points @ _OPTICAL
     return float(2 * np.pi * view(points).any(axis=1).mean())
+
+
+def hold_doubted(
+    rows: Sequence[PoseRow], records: Sequence[CalibrationRecord]
+) -> tuple[list[PoseRow], list[CalibrationRecord]]:
+    """Poses, held if edges contradict the prior of their sensor or of the reference: the one common to all such edges.
+
+    An edge far from the prior is left out, because it may be in a wrong minimum. But if the prior is wrong, all poses
+    that depend on it have the same error, with the prior's small sigma: on a van whose reference lidar was logged .3 m
+    too far ahead, three edges showed it, and three radars without a measured position were accepted half a degree off.
+
+    Records of such a sensor's edges are held too, if their own data do not determine its position.
+    """
+    against = [r for r in records if _FAULT in r.faults]
+    ends = [{r.parent_frame, r.child_frame} for r in against]
+    if not ends:
+        return list(rows), list(records)
+    shared = set.intersection(*ends) if len(ends) > 1 else set[str]()
+    edges = ", ".join(f"{r.parent_frame}-{r.child_frame}" for r in against)
+    middle = {row.reference for row in rows}
+    doubted = shared or set.union(*ends) - middle
+    said = f"the prior pose of {' or '.join(sorted(doubted))}, on which it rests, is contradicted by {edges}"
+    return (
+        [_held(row, said) if {row.sensor, *middle} & doubted else row for row in rows],
+        [_held_record(r, said) if {r.parent_frame, r.child_frame} & doubted else r for r in records],
+    )
+
+
+def _held(row: PoseRow, said: str) -> PoseRow:
+    if row.status == "refused" or row.sensor == row.reference:
+        return row
+    reason = f"{said}; {row.reason}" if row.reason else said
+    faults = list(dict.fromkeys([*row.faults, _FAULT]))
+    return replace(row, status="held", reason=reason, faults=faults, determined=[], unsure_only=False)
+
+
+def _held_record(record: CalibrationRecord, said: str) -> CalibrationRecord:
+    """Record of an edge, held unless its own data determine x and y."""
+    if record.status == "refused" or _FAULT in record.faults or all((record.observable or [False] * 6)[3:5]):
+        return record
+    return replace(
+        record,
+        status="held",
+        reason=f"{said}; {record.reason}" if record.reason else said,
+        faults=[*record.faults, _FAULT],
+        determined=[],
+        mounting_determined=[],
+        diagnostics=record.diagnostics | {"unsure_only": 0.0},
+    )

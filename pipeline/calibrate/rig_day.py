@@ -19,13 +19,13 @@ from pipeline.calibrate.adjusted_day import Concluded, adjusted_rig, conclude
 from pipeline.calibrate.day import solve_day
 from pipeline.calibrate.edges.day_sources import DaySources
 from pipeline.calibrate.judging import EdgeJudging
-from pipeline.calibrate.methods import resolved
+from pipeline.calibrate.methods import Solver, method_named, resolved
 from pipeline.calibrate.records import Inputs, record_of_edge, refused_edge, refused_record
 from pipeline.calibrate.solved import SolvedEdge
 from pipeline.calibrate.verify.constancy import moved_failures
 from pipeline.core.config import FleetConfig
 from pipeline.core.errors import SolveError
-from pipeline.core.results import Progress
+from pipeline.core.results import Progress, silent
 from pipeline.objective.ego_motion import mean_heading, shown_heading
 from pipeline.rig.checks import FailedCheck
 from pipeline.rig.day_prior import no_prior, prior_of_three
@@ -95,26 +95,29 @@ class CalibratedRig:
     judged: Mapping[str, Concluded]
 
 
-def calibrate_rig(day: RigDay, fleet: FleetConfig, about: Inputs, progress: Progress) -> CalibratedRig:
-    """Solve and judge each edge, then adjust poses and clocks of all sensors."""
+def calibrate_rig(
+    day: RigDay, fleet: FleetConfig, about: Inputs, progress: Progress = silent, solver: Solver | None = None
+) -> CalibratedRig:
+    """Solve and judge each edge, then adjust poses and clocks of all sensors, unless the method is of three of them.
+
+    `solver` is for methods that need more than observations (`Method.needs_images`); None = the method's own.
+    """
     measured = day.rig.road_z_m, day.rig.measured_heights
     sources = DaySources(day.prior, tuple(day.rig.lidars), tuple(day.rig.radars), day.rows, *measured)
     found, done = _Found(), 0
-    for group in sorted(_groups(day.graph), key=lambda g: KIND_OF_EDGE[g[0].kind].order):
+    groups = sorted(_groups(day.graph), key=lambda g: KIND_OF_EDGE[g[0].kind].order)
+    inner = progress if len(groups) == 1 else silent
+    for group in groups:
         progress(done, len(day.graph.edges) + 1, f"calibrate {', '.join(edge.name for edge in group)}")
         done += len(group)
         if len(group) == 1 and day.prior.between(*(s.name for s in group[0].sensors)) is None:
             found.refused.append(refused_edge(about, group[0], no_prior(group[0].name), 0))
         elif not KIND_OF_EDGE[group[0].kind].solver:
-            _solve_pairs(day, fleet, about, group, found)
+            _solve_pairs(day, fleet, about, group, found, solver, inner)
         else:
             _solve_other(day, fleet, about, sources, group[0], found)
     progress(done, done + 1, "adjust the rig")
-    prior = replace(day.prior, reference=day.graph.reference).extrinsics()
-    parts = {e.edge: e.evidence.parts for e in found.edges if e.evidence.parts}
-    moved = moved_failures(parts, day.graph.edges)
-    edges = [_held_if_moved(e, moved.get(e.edge, ())) for e in found.edges]
-    rig = adjusted_rig(day.graph, prior, edges, fleet.solve.time_offset_sigma_s)
+    edges, rig = _adjusted(day, fleet, about, found.edges)
     concluded = conclude(edges, rig)
     order = {(e.parent.name, e.child.name): k for k, e in enumerate(day.graph.edges)}
     records = [*found.refused, *(c.record for c in concluded)]
@@ -122,6 +125,19 @@ def calibrate_rig(day: RigDay, fleet: FleetConfig, about: Inputs, progress: Prog
     middle = day.graph.reference
     to_middle = {c.edge.other(middle.name).name: c for c in concluded if middle in c.edge.sensors}
     return CalibratedRig(records, rig, to_middle)
+
+
+def _adjusted(
+    day: RigDay, fleet: FleetConfig, about: Inputs, edges: Sequence[SolvedEdge]
+) -> tuple[Sequence[SolvedEdge], AdjustedRig | None]:
+    """Edges with what the whole rig shows of them, and the rig; None where the method's records are the answer."""
+    if method_named(about.method).of_three:
+        return edges, None
+    prior = replace(day.prior, reference=day.graph.reference).extrinsics()
+    parts = {e.edge: e.evidence.parts for e in edges if e.evidence.parts}
+    moved = moved_failures(parts, day.graph.edges)
+    edges = [_held_if_moved(e, moved.get(e.edge, ())) for e in edges]
+    return edges, adjusted_rig(day.graph, prior, edges, fleet.solve.time_offset_sigma_s)
 
 
 def _held_if_moved(edge: SolvedEdge, moved: Sequence[FailedCheck]) -> SolvedEdge:
@@ -148,14 +164,20 @@ def _groups(graph: RigGraph) -> list[tuple[Edge, ...]]:
 
 
 def _solve_pairs(
-    day: RigDay, fleet: FleetConfig, about: Inputs, group: Sequence[Edge], found: _Found
+    day: RigDay,
+    fleet: FleetConfig,
+    about: Inputs,
+    group: Sequence[Edge],
+    found: _Found,
+    solver: Solver | None,
+    progress: Progress,
 ) -> None:
     chosen: Chosen = {sensor.kind: sensor.name for edge in group for sensor in edge.sensors}
     absent: dict[str, str] = {kind: about.absent[n] for kind, n in chosen.items() if n in about.absent}
     about = replace(about, pairs=tuple(edge.kind for edge in group), chosen=chosen, absent=absent)
     rows, prior = day.rows(chosen), day.prior_of(chosen, group, found.headings)
     try:
-        solved = solve_day(rows, prior, fleet, about)
+        solved = solve_day(rows, prior, fleet, about, progress, solver)
     except SolveError as err:
         found.refused.extend(refused_record(about, pair, err, rows, prior, {}) for pair in about.pairs)
         return

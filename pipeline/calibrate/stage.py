@@ -2,37 +2,49 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Generator, Iterable, Sequence
+from dataclasses import asdict, fields, replace
+from functools import partial
+from itertools import combinations
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
+
 from pipeline.calibrate.methods import Method, method_named
-from pipeline.calibrate.records import (
-    Inputs,
-)
-from pipeline.calibrate.rig_stage import refused_edges, rig_rows, three_rows
+from pipeline.calibrate.pose_rows import hold_doubted, pose_rows, poses_of_records
+from pipeline.calibrate.records import Inputs, refused_edge
+from pipeline.calibrate.rig_day import RigDay, calibrate_rig
+from pipeline.calibrate.unlabelled import noted
+from pipeline.calibrate.verify.target_accuracy import views_of
 from pipeline.core.errors import ConfigError, SolveError
-from pipeline.core.results import Outcome
+from pipeline.core.results import Outcome, Progress
 from pipeline.core.stage_work import Records, Run, Task, Told, Work
-from pipeline.rig.day_prior import prior_key
+from pipeline.rig.day_prior import prior_key, prior_of_three, rig_prior
 from pipeline.rig.edges import edge_of, words_of
+from pipeline.rig.estimates import Prior
+from pipeline.rig.graph import Edge, RigGraph, Sensor, edge_between
+from pipeline.rig.overlap import FRAMES, Overlap, View, best_three, find_edges, overlaps_of
+from pipeline.rig.prior import RigPrior, middle_of, moved
 from pipeline.rig.rig import Rig
+from pipeline.store.current import current_records, transform_of
 from pipeline.store.moments import sensors_of
-from pipeline.store.partitions import Lake, Partition
-from pipeline.store.views import ingested, perceived
-from schemas.calibrations import (
-    SENSORS,
-    STATUSES,
-    CalibrationRecord,
-    pairs_of,
-)
+from pipeline.store.partitions import Lake, Partition, days_after
+from pipeline.store.records import read_records
+from pipeline.store.views import Chosen, ingested, observations_of, perceived
+from schemas.calibrations import CALIBRATIONS, SENSORS, STATUSES, CalibrationRecord, pairs_of
+from schemas.columns import POSE_COLUMNS
 from schemas.faults import FAULTS
-from schemas.moments import SENSORS_ABSENT
-from schemas.observations import WITHOUT_LABELS
+from schemas.moments import PRIOR, SENSORS_ABSENT
+from schemas.observations import WITHOUT_LABELS, Observation
 from schemas.poses import PoseRow
 
-__all__ = ["work"]
+__all__ = ["accepted_before", "refused_edges", "three_of_day", "three_sensors", "work"]
 
+# Days with records that are looked at: a vehicle that was held for longer has no state worth a look.
+_DAYS_BACK = 10
+# A vehicle that drives once a week has ten days in a quarter; older days are not read.
+_CALENDAR_DAYS_BACK = 92
 _UNLABELLED = (
     "labels_missing",
     "detections_missing",
@@ -71,10 +83,9 @@ def work(task: Task) -> Work:
             task.partition, method.name, run.work_key, seed, run.inputs, pairs_of(rig.kinds), absent,
             probe_deg=task.probe_deg,
         )  # fmt: skip
-        calibrated = rig_rows if method.name == "joint" else three_rows
         found: Sequence[CalibrationRecord | PoseRow]
         try:
-            found = calibrated(task, about, run.progress)
+            found = _rows_of_day(task, about, run.progress)
         except SolveError as err:
             found = refused_edges(about, rig, err.reason, err.fault)
         yield Records(found)
@@ -132,3 +143,161 @@ def _told(records: Sequence[CalibrationRecord]) -> Told:
         refused=counts["refused"] == len(records),
         faults=tuple(dict.fromkeys(fault for r in records for fault in r.faults)),
     )
+
+
+def _rows_of_day(task: Task, about: Inputs, progress: Progress) -> list[CalibrationRecord | PoseRow]:
+    """Records of edges of a vehicle-day, and a pose of each sensor; SolveError if none can be made."""
+    fleet, method = task.fleet, method_named(about.method)
+    day = _read(task, about.seed, method)
+    if method.of_three:
+        chosen = _by_kind(day.graph.sensors)
+        about = replace(about, chosen=chosen, pairs=pairs_of(chosen))
+        solver = method.solver_of(task, chosen)
+        records = calibrate_rig(day, fleet, about, progress, solver).records
+        return [*records, *poses_of_records(about, records)]
+    found = calibrate_rig(day, fleet, about, progress)
+    before = replace(day.prior, reference=day.graph.reference).extrinsics()
+    poses = pose_rows(about, day.graph, found.adjusted, before, day.views, fleet.verify, found.judged)
+    poses, records = hold_doubted(poses, found.records)
+    return [*records, *noted(poses, records)]
+
+
+def three_of_day(task: Task, seed: int) -> tuple[Chosen, Prior]:
+    """The three sensors that the task's method is run on, and their prior.
+
+    Raises:
+        SolveError: no three share a view, or the day has no prior.
+    """
+    day = _read(task, seed, method_named(task.method or "joint-ssl"))
+    chosen = _by_kind(day.graph.sensors)
+    return chosen, prior_of_three(day.prior, day.rig, *(chosen.get(kind) for kind in SENSORS))
+
+
+def _by_kind(sensors: Iterable[Sensor]) -> Chosen:
+    return {sensor.kind: sensor.name for sensor in sensors}
+
+
+def refused_edges(about: Inputs, rig: Rig, why: str, *faults: str) -> list[CalibrationRecord]:
+    """Records of a day that could not be calibrated at all: of the edges that the rig names, else to the reference."""
+    return [refused_edge(about, edge, why, 0, *faults) for edge in _expected_edges(rig)]
+
+
+def _expected_edges(rig: Rig) -> tuple[Edge, ...]:
+    named = rig.named_edges
+    if named:
+        return named
+    nodes = [node for node in rig.nodes if node.kind != "base"]
+    if len({n.kind for n in nodes}) == len(nodes):
+        return tuple(edge_between(a, b) for a, b in combinations(nodes, 2))
+    middle = next((n for n in nodes if n.name == rig.reference), middle_of(nodes))
+    return tuple(edge_between(n, middle) for n in nodes if n.kind != middle.kind)
+
+
+def _read(task: Task, seed: int, method: Method) -> RigDay:
+    """Prior, views and edges of a vehicle-day; of a method of three sensors, their pairs."""
+    rig = task.fleet.rig_of(task.partition.vehicle)
+    prior, views = _known(task, rig, seed)
+    overlaps = overlaps_of(prior, views)
+    if method.of_three:
+        graph = _graph_of_three(three_sensors(method.name, rig, overlaps))
+        return RigDay(rig, graph, prior, views, lambda chosen: _rows(task, chosen))
+    nodes = {node.name: node for node in rig.nodes}
+    reference = None if rig.reference is None else nodes[rig.reference]
+    graph = find_edges(prior, overlaps, named=rig.named_edges, reference=reference)
+    before = partial(accepted_before, task.lake, task.partition, method.name)
+    return RigDay(rig, graph, prior, views, _shared_rows(task), before)
+
+
+def _graph_of_three(sensors: Sequence[Sensor]) -> RigGraph:
+    edges = tuple(edge_between(a, b) for a, b in combinations(sensors, 2))
+    return RigGraph(tuple(sensors), edges, middle_of(sensors))
+
+
+def _known(task: Task, rig: Rig, seed: int) -> tuple[RigPrior, dict[str, View]]:
+    """Prior and views of a vehicle-day."""
+    manifest = perceived(task.lake, task.partition)
+    if manifest is None:
+        raise SolveError("no observations of this day: ingest or perceive refused it, or did not run")
+    prior = rig_prior(manifest.extra.get(PRIOR, ()), task.fleet, rig)
+    if task.perturb is not None:
+        prior = moved(prior, float(np.radians(task.perturb[0])), task.perturb[1], seed)
+    moments = np.unique(np.linspace(0, manifest.rows - 1, min(FRAMES, manifest.rows)).astype(int)).tolist()
+    views = {
+        name: view
+        for name, kind in sensors_of(manifest).items()
+        if (view := _view(task, {kind: name}, moments)) is not None
+    }
+    return prior, views
+
+
+def _view(task: Task, chosen: Chosen, moments: Sequence[int]) -> View | None:
+    [kind] = chosen
+    rows = list(observations_of(task.lake, task.partition, moments, chosen))
+    return views_of(rows).get(kind)
+
+
+def _shared_rows(task: Task) -> Callable[[Chosen], list[Observation]]:
+    """Reads rows of chosen sensors; what a sensor measured is held once, however many of its edges keep it."""
+    known: dict[tuple[str, str, int], np.ndarray] = {}
+
+    def shared(o: Observation, chosen: Chosen) -> Observation:
+        same: dict[str, Any] = {}
+        for one in fields(o):
+            value = getattr(o, one.name)
+            if isinstance(value, np.ndarray):
+                sensor = chosen.get(one.name.partition("_")[0], chosen.get("camera", ""))
+                first = known.setdefault((sensor, one.name, o.frame_index), value)
+                if first is not value and first.dtype == value.dtype and np.array_equal(first, value):
+                    same[one.name] = first
+        return replace(o, **same)
+
+    return lambda chosen: [shared(o, chosen) for o in _rows(task, chosen)]
+
+
+def _rows(task: Task, chosen: Chosen) -> list[Observation]:
+    return list(observations_of(task.lake, task.partition, chosen=chosen))
+
+
+def accepted_before(
+    lake: Lake, partition: Partition, method: str, edge: Edge
+) -> Float[np.ndarray, "4 4"] | None:
+    """T_parent_child of an edge on its latest earlier accepted day; None if there is none.
+
+    It carries no information about today's pose and is no part of the work key: the search starts there only
+    if the day alone does not decide, and the result is judged like any other.
+    """
+    found = read_records(
+        lake,
+        CALIBRATIONS,
+        CalibrationRecord,
+        vehicle=partition.vehicle,
+        first=days_after(partition.day, -_CALENDAR_DAYS_BACK),
+        last=days_after(partition.day, -1),
+        columns=POSE_COLUMNS,
+    )
+    wanted = (edge.parent.name, edge.child.name, method, "accepted")
+    records = current_records(found)
+    days = sorted({r.day for r in records}, reverse=True)[:_DAYS_BACK]
+    for record in reversed(records):
+        if (
+            record.day in days
+            and (record.parent_frame, record.child_frame, record.method, record.status) == wanted
+        ):
+            return transform_of(record)
+    return None
+
+
+def three_sensors(method: str, rig: Rig, overlaps: Sequence[Overlap]) -> Sequence[Sensor]:
+    """One of each kind: those that the rig names, else the three with the largest overlap; else SolveError."""
+    sensors = [node for node in rig.nodes if node.kind != "base"]
+    if len({sensor.kind for sensor in sensors}) == len(sensors):
+        return sensors
+    named = rig.three or ()
+    among = [o for o in overlaps if not named or {s.name for s in o.edge.sensors} <= set(named)]
+    best = best_three(among)
+    if best is None:
+        which = "no three of the rig do"
+        if named:
+            which = f"{', '.join(named[:2])} and {named[2]} share none, name others as three of the rig"
+        raise SolveError(f"method {method} works on a camera, a lidar and a radar that share a view: {which}")
+    return best

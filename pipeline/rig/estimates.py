@@ -165,4 +165,3 @@ class Solution:
     loop_translation_m: float | None = None
     # Failed checks while solving, by pair: starts or halves disagree, camera contradicts radar.
     failed_checks: dict[str, list[FailedCheck]] = field(default_factory=dict)
-    apart: bool = False  # True if no pair uses another's data: the adjustment of the rig combines them

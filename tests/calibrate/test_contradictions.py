@@ -5,7 +5,6 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from pipeline.calibrate.day import calibrate_observations
 from pipeline.calibrate.records import Inputs
 from pipeline.core.config import FleetConfig
 from pipeline.rig.estimates import PairEstimate, Prior, Solution
@@ -15,6 +14,7 @@ from pipeline.store.partitions import Partition
 from schemas.calibrations import PAIRS
 from schemas.observations import Observation
 from tests.benchmarks.studies.metrics import transform_of
+from tests.makers.calibrated_days import records_of_rows
 from tests.makers.fleet_files import THREE_SENSORS
 from tests.makers.radar_scenes import T_LIDAR_RADAR, street_day
 from tests.makers.solve_scenes import T_CAMERA_LIDAR, make_day
@@ -27,7 +27,7 @@ def records_of(day, prior=PRIOR, method="joint", solver=None, **sections):
         {"fleet": {"name": "f"}, "rigs": {"default": THREE_SENSORS}, "vehicles": {"v": {}}} | sections
     )
     about = Inputs(Partition("v", "2024-05-06"), method, "k", 1, ())
-    return {r.pair: r for r in calibrate_observations(day, prior, fleet, about, solver=solver)}
+    return {r.pair: r for r in records_of_rows(day, prior, fleet, about, solver=solver)}
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,7 @@
 import pyarrow.parquet as pq
 import pytest
 
-from pipeline.calibrate.rig_stage import accepted_before
+from pipeline.calibrate.stage import accepted_before
 from pipeline.rig.edges import EDGE_OF_PAIR
 from pipeline.rig.se3 import to_quaternion
 from pipeline.store.partitions import Lake, Partition

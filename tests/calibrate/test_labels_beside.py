@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.calibrate.day import calibrate_observations
 from pipeline.calibrate.records import Inputs
 from pipeline.rig.estimates import Prior
 from pipeline.rig.targets import errors_at_targets
 from pipeline.store.current import targets_of, transform_of
 from pipeline.store.partitions import Partition
+from tests.makers.calibrated_days import records_of_rows
 from tests.makers.simulated_days import simulated_day
 
 pytestmark = pytest.mark.slow
@@ -43,7 +43,7 @@ def record_at(made):
             prior = Prior(made.truth["camera_lidar"], made.truth["lidar_radar"], np.radians(2.0), 0.05)
             about = Inputs(Partition("vehicle-1", "2026-03-02"), "joint", "k", 1, ("camera_lidar",))
             rows = [moved(o, right_px) for o in made.observations]
-            known[right_px] = {r.pair: r for r in calibrate_observations(rows, prior, made.fleet, about)}
+            known[right_px] = {r.pair: r for r in records_of_rows(rows, prior, made.fleet, about)}
         return known[right_px]["camera_lidar"]
 
     return get

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from pipeline.calibrate.prior_doubts import hold_doubted
+from pipeline.calibrate.pose_rows import hold_doubted
 from schemas.calibrations import CalibrationRecord
 from schemas.poses import PoseRow
 

@@ -1,6 +1,6 @@
 import pytest
 
-from pipeline.calibrate.rig_stage import three_sensors
+from pipeline.calibrate.stage import three_sensors
 from pipeline.core.config import FleetConfig
 from pipeline.core.errors import SolveError
 from pipeline.rig.overlap import overlaps_of
@@ -17,15 +17,19 @@ def config(sensors=VAN, **keys):
     return FleetConfig.model_validate({"fleet": {"name": "f"}, "rigs": {"van": values}}).rigs["van"]
 
 
+def names(method, rig, overlaps):
+    return {s.kind: s.name for s in three_sensors(method, rig, overlaps)}
+
+
 def test_the_three_that_share_most_are_taken_unless_the_rig_names_others():
     overlaps = overlaps_of(*rig())
-    assert three_sensors("tracking", config(), overlaps) == {
+    assert names("tracking", config(), overlaps) == {
         "camera": "front",
         "lidar": "top",
         "radar": "ahead",
     }
     named = config(three=["left", "top", "fl"])
-    assert three_sensors("tracking", named, overlaps) == {"camera": "left", "lidar": "top", "radar": "fl"}
+    assert names("tracking", named, overlaps) == {"camera": "left", "lidar": "top", "radar": "fl"}
 
 
 def test_three_that_share_nothing_are_refused_in_one_sentence():
@@ -41,4 +45,4 @@ def test_three_that_share_nothing_are_refused_in_one_sentence():
 
 def test_a_rig_with_one_of_each_is_asked_nothing():
     few = [s for s in VAN if s[0] in ("front", "top")]
-    assert three_sensors("tracking", config(few), []) == {"camera": "front", "lidar": "top"}
+    assert names("tracking", config(few), []) == {"camera": "front", "lidar": "top"}

@@ -7,7 +7,6 @@ import pytest
 from mcap.reader import make_reader
 
 from jobs.cli import main
-from pipeline.calibrate.day import calibrate_observations
 from pipeline.calibrate.records import Inputs
 from pipeline.core.config import load_fleet
 from pipeline.core.ros_messages import RosMessages
@@ -20,6 +19,7 @@ from pipeline.store.records import read_records
 from pipeline.store.views import observations_of
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from tests.benchmarks.studies.metrics import transform_of
+from tests.makers.calibrated_days import records_of_rows
 from tests.makers.real_models import write_real_manifests
 
 pytestmark = [pytest.mark.real_logs, pytest.mark.slow]
@@ -90,7 +90,7 @@ def test_no_start_is_certified_beyond_what_is_right(street, seed):
     fleet, rows = street
     given = read_prior(rows, fleet, DAY.vehicle)
     about = Inputs(DAY, "joint", "test", seed, (), pairs=("camera_lidar",))
-    (record,) = calibrate_observations(rows, perturbed(given, START, seed), fleet, about)
+    (record,) = records_of_rows(rows, perturbed(given, START, seed), fleet, about)
     T = transform_of(record)
     assert T is not None
     errors = np.degrees(errors_at_targets("camera_lidar", T, given.T_camera_lidar, targets_of(record))[:2])

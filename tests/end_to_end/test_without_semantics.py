@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.calibrate.day import calibrate_observations
 from pipeline.calibrate.records import Inputs
 from pipeline.core.config import load_fleet
 from pipeline.rig.day_prior import perturbed, read_prior
@@ -16,6 +15,7 @@ from pipeline.store.views import observations_of
 from schemas.observations import WITHOUT_LABELS
 from tests.accuracy.days import SHARED
 from tests.benchmarks.studies.metrics import LIMITS_DEG, transform_of
+from tests.makers.calibrated_days import records_of_rows
 from tests.makers.stages import ingest_day, perceive_day
 
 pytestmark = [
@@ -80,7 +80,7 @@ def found_from(rows, fleet, true, deg, seed, *, is_hidden=False):
     if is_hidden:
         start = replace(start, **{k: getattr(true, k) for k in ("rotation_sigma_rad", "translation_sigma_m")})
     inputs = Inputs(Partition("any", "2026-03-02"), "joint", "test", seed, (), pairs=("camera_lidar",))
-    [record] = calibrate_observations(rows, start, fleet, inputs)
+    [record] = records_of_rows(rows, start, fleet, inputs)
     return record
 
 

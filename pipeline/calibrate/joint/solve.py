@@ -65,7 +65,7 @@ def solve_joint(
     progress(len(observations), len(observations), "done")
     pairs = {pair: found[pair][0] for pair in PAIRS if pair in found}
     checks = {pair: found[pair][1] for pair in pairs if found[pair][1]}
-    return _with_loop(Solution("joint", pairs, failed_checks=checks, apart=True))
+    return _with_loop(Solution("joint", pairs, failed_checks=checks))
 
 
 def _solved(

@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.calibrate.day import calibrate_observations
 from pipeline.calibrate.records import Inputs
 from pipeline.core.config import SolveConfig
 from pipeline.core.errors import SolveError
@@ -34,6 +33,7 @@ from tests.benchmarks.studies.commits import commit_now, is_accepted
 from tests.benchmarks.studies.days import DATE, VEHICLE, Day, DaySpec, generated_day
 from tests.benchmarks.studies.looks import look
 from tests.benchmarks.studies.metrics import measure, mounting_error, transform_of
+from tests.makers.calibrated_days import records_of_rows
 
 __all__ = ["RESULTS", "Run", "calibrate_once", "run_study"]
 
@@ -111,7 +111,7 @@ def calibrate_once(run: Run, day: Day) -> dict[str, Any]:
     about = Inputs(Partition(VEHICLE, DATE), run.method, "study", run.seed, ())
     began = time.process_time()
     try:
-        records = calibrate_observations(day.rows, prior, fleet, about)
+        records = records_of_rows(day.rows, prior, fleet, about)
     except SolveError as err:
         return {"refused": err.reason, "pairs": {}}
     measured = {

@@ -8,13 +8,15 @@ import pytest
 from pipeline.calibrate.adjust.adjusted import AdjustmentLimits
 from pipeline.calibrate.adjust.evidence import evidence_of
 from pipeline.calibrate.adjust.rig import adjust
-from pipeline.calibrate.day import EDGES, poses_of, three_sensors
 from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
 from pipeline.core.config import SolveConfig
 from pipeline.rig.changes import change_between, change_covariance, change_jacobian
 from pipeline.rig.checks import FailedCheck
+from pipeline.rig.edges import EDGE_OF_PAIR
 from pipeline.rig.estimates import PairEstimate, Prior
 from pipeline.rig.evidence import EDGE
+from pipeline.rig.extrinsics import Extrinsics
+from pipeline.rig.graph import RigGraph
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, perturb_exactly
 from tests.makers.camera_lidar import estimate_camera_lidar
 from tests.makers.radar_scenes import T_LIDAR_RADAR, street_day
@@ -70,10 +72,14 @@ def noise_of(rng, scale=1.0):
 
 
 def alone(estimate, prior=PRIOR):
-    evidence = replace(evidence_of(estimate, EDGES[estimate.pair], prior, CLOCK_S), checks=())
-    dt_s = {"camera": -estimate.time_offset_prior_s, "radar": estimate.time_offset_prior_s}
-    graph, limits = three_sensors([estimate.pair]), AdjustmentLimits(CLOCK_S)
-    return adjust(graph, poses_of(prior, dt_s), [evidence], limits)
+    edge = EDGE_OF_PAIR[estimate.pair]
+    evidence = replace(evidence_of(estimate, edge, prior, CLOCK_S), checks=())
+    T, parent, child = prior.of(edge.kind), edge.parent.name, edge.child.name
+    to_left = np.linalg.inv(change_jacobian(T))
+    covariance = to_left @ prior.covariance(edge.kind) @ to_left.T
+    dt_s = {parent: 0.0, child: estimate.time_offset_prior_s}
+    poses = Extrinsics(edge.parent, {parent: np.eye(4), child: T}, (child,), covariance, covariance, dt_s)
+    return adjust(RigGraph(edge.sensors, (edge,), edge.parent), poses, [evidence], AdjustmentLimits(CLOCK_S))
 
 
 @pytest.mark.parametrize("pair", ["camera_lidar", "lidar_radar"])
@@ -90,18 +96,15 @@ def test_evidence_and_prior_solved_alone_are_the_pairs_estimate(pair):
             np.abs(apart) < 0.01 * np.sqrt(np.diag(change_covariance(estimate.T, estimate.covariance)))
         )
         np.testing.assert_allclose(C, estimate.covariance, rtol=0.01, atol=0.01 * np.abs(C).max())
-        clock = found.sensors["camera" if parent == "camera" else "radar"]
-        assert clock.dt_sigma_s == pytest.approx(0.004, rel=1e-6)
-        assert abs(found.poses.dt_s["camera" if parent == "camera" else "radar"]) == pytest.approx(
-            0.013, abs=1e-9
-        )
+        assert found.sensors[child].dt_sigma_s == pytest.approx(0.004, rel=1e-6)
+        assert found.poses.dt_s[child] == pytest.approx(0.013, abs=1e-9)
 
 
 def test_data_alone_are_found_again_though_the_prior_had_most_of_the_say():
     rng = np.random.default_rng(1)
     noise, offset = noise_of(rng, 15.0), rng.normal(size=6) * 0.02
     estimate = estimate_of("lidar_radar", noise, offset)
-    evidence = evidence_of(estimate, EDGES["lidar_radar"], PRIOR, CLOCK_S)
+    evidence = evidence_of(estimate, EDGE_OF_PAIR["lidar_radar"], PRIOR, CLOCK_S)
     to_left = np.linalg.inv(change_jacobian(estimate.T))
     data = np.linalg.inv(evidence.information[:6, :6])
     np.testing.assert_allclose(data, to_left @ noise @ to_left.T, rtol=1e-6, atol=1e-9)
@@ -112,7 +115,7 @@ def test_data_alone_are_found_again_though_the_prior_had_most_of_the_say():
 
 def test_what_the_day_did_not_move_has_no_information():
     estimate = estimate_of("camera_lidar", noise_of(np.random.default_rng(2)), np.zeros(6), fixed=(3, 5))
-    evidence = evidence_of(estimate, EDGES["camera_lidar"], PRIOR, CLOCK_S)
+    evidence = evidence_of(estimate, EDGE_OF_PAIR["camera_lidar"], PRIOR, CLOCK_S)
     assert np.linalg.matrix_rank(evidence.information[:6, :6], tol=1e-6) == 4
     covariance = alone(estimate).poses.covariance_between("camera", "lidar")
     sigma = np.sqrt(np.diag(estimate.covariance))
@@ -127,10 +130,10 @@ def test_biases_are_handed_over_by_owner_and_are_not_in_the_information():
     bias = {"radar": np.array([turn, turn, turn, 0, 0, 0]), EDGE: np.array([0, 0, 0, 1e-4, 1e-4, 1e-4])}
     plain = estimate_of("lidar_radar", noise, np.zeros(6))
     estimate = estimate_of("lidar_radar", noise, np.zeros(6), bias)
-    evidence = evidence_of(estimate, EDGES["lidar_radar"], PRIOR, CLOCK_S)
+    evidence = evidence_of(estimate, EDGE_OF_PAIR["lidar_radar"], PRIOR, CLOCK_S)
     assert set(evidence.bias) == {"radar", EDGE}
     np.testing.assert_allclose(evidence.bias["radar"][:3, :3], turn * np.eye(3), atol=1e-12)  # in any axes
-    data = evidence_of(plain, EDGES["lidar_radar"], PRIOR, CLOCK_S).information
+    data = evidence_of(plain, EDGE_OF_PAIR["lidar_radar"], PRIOR, CLOCK_S).information
     np.testing.assert_allclose(evidence.information, data, rtol=1e-6, atol=1e-3)
     found = alone(estimate).poses
     sigma = np.sqrt(np.diag(change_covariance(estimate.T, found.covariance_between("lidar", "radar"))))
@@ -142,7 +145,7 @@ def test_a_bias_that_the_weights_have_in_them_is_stated_in_full():
     rng, sigma2 = np.random.default_rng(4), np.array([np.radians(0.3) ** 2, 0, 0, 0, 0, 0])
     noise = noise_of(rng) + np.diag(sigma2)
     estimate = estimate_of("lidar_radar", noise, np.zeros(6), in_weights=sigma2)
-    evidence = evidence_of(estimate, EDGES["lidar_radar"], PRIOR, CLOCK_S)
+    evidence = evidence_of(estimate, EDGE_OF_PAIR["lidar_radar"], PRIOR, CLOCK_S)
     to_left = np.linalg.inv(change_jacobian(estimate.T))
     np.testing.assert_allclose(
         evidence.bias[EDGE], to_left @ np.diag(sigma2) @ to_left.T, rtol=1e-3, atol=1e-8
@@ -153,19 +156,10 @@ def test_a_bias_that_the_weights_have_in_them_is_stated_in_full():
 
 def test_failed_checks_travel_and_a_pair_that_shows_nothing_has_no_information():
     estimate = replace(PairEstimate.at_prior("camera_lidar", PRIOR), disproved="lost")
-    evidence = evidence_of(estimate, EDGES["camera_lidar"], PRIOR, CLOCK_S, [FailedCheck("held out")])
+    evidence = evidence_of(estimate, EDGE_OF_PAIR["camera_lidar"], PRIOR, CLOCK_S, [FailedCheck("held out")])
     assert [c.sentence for c in evidence.checks] == ["held out", "lost"]
     assert not evidence.information.any()
     assert not evidence.gradient.any()
-
-
-def test_the_prior_of_two_transforms_says_the_same_of_them_as_poses():
-    poses = poses_of(PRIOR, {})
-    for pair in ("camera_lidar", "lidar_radar"):
-        parent, child = pair.split("_")
-        np.testing.assert_allclose(poses.between(parent, child), PRIOR.of(pair), atol=1e-12)
-        found = change_covariance(PRIOR.of(pair), poses.covariance_between(parent, child))
-        np.testing.assert_allclose(found, PRIOR.covariance(pair), atol=1e-12)
 
 
 def law_holds(estimate, prior):

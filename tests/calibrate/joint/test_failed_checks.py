@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.calibrate.day import calibrate_observations
 from pipeline.calibrate.joint.solve import solve_joint
 from pipeline.calibrate.records import Inputs
 from pipeline.calibrate.verify.failed_checks import lidar_radar_failures
 from pipeline.core.config import FleetConfig
 from pipeline.rig.estimates import PairEstimate, Prior
 from pipeline.store.partitions import Partition
+from tests.makers.calibrated_days import records_of_rows
 from tests.makers.fleet_files import THREE_SENSORS
 from tests.makers.radar_scenes import T_LIDAR_RADAR, street_day
 from tests.makers.solve_scenes import T_CAMERA_LIDAR
@@ -78,7 +78,7 @@ def record_with(street, **numbers):
         return replace(solution, pairs=solution.pairs | {"lidar_radar": found}, failed_checks=failed)
 
     about = Inputs(Partition("v", "2024-05-06"), "joint", "k", 1, (), pairs=("lidar_radar",))
-    (record,) = calibrate_observations(street, PRIOR, fleet, about, solver=solver)
+    (record,) = records_of_rows(street, PRIOR, fleet, about, solver=solver)
     return record
 
 
