@@ -9,12 +9,12 @@ from functools import partial
 import numpy as np
 
 from pipeline.calibrate.adjust.evidence import evidence_of
+from pipeline.calibrate.adjusted_day import SolvedDay, SolvedEdge
 from pipeline.calibrate.judging import Judged, Judging
 from pipeline.calibrate.methods import Method, Solver, method_named
 from pipeline.calibrate.paper.triggers import exceeded, trigger_metrics
 from pipeline.calibrate.records import Inputs, record_of, refused_record
 from pipeline.calibrate.select.frames import PAPER_SYNC_GATE_S, Selection, select_frames
-from pipeline.calibrate.solved import SolvedDay, SolvedEdge
 from pipeline.calibrate.unlabelled import unlabelled_pairs
 from pipeline.calibrate.verify.day_checks import FoundDay, checks_of_day
 from pipeline.calibrate.verify.day_labels import day_labels

@@ -16,18 +16,22 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.calibrate.adjust.adjusted import AdjustmentLimits
-from pipeline.calibrate.adjust.rig import adjust
+from pipeline.calibrate.adjust.rig import AdjustmentLimits, adjust
 from pipeline.calibrate.numerics.frame_blocks import scene_blocks
 from pipeline.calibrate.numerics.search_range import SearchRange, search_range
 from pipeline.calibrate.select.frames import Selection
-from pipeline.calibrate.verify.consequence import tilt_in_doubt
-from pipeline.calibrate.verify.edge_result import EdgeResult
+from pipeline.calibrate.verify.edge_result import EdgeResult, tilt_in_doubt
+from pipeline.calibrate.verify.held_out import (
+    HeldOutTest,
+    HeldOutUpdate,
+    found_elsewhere,
+    held_out_place,
+    held_out_update,
+    paired_test,
+)
 from pipeline.calibrate.verify.held_out_score import held_out_score
-from pipeline.calibrate.verify.held_out_search import found_elsewhere, held_out_place
-from pipeline.calibrate.verify.held_out_test import HeldOutTest, paired_test
-from pipeline.calibrate.verify.held_out_update import HeldOutUpdate, held_out_update
 from pipeline.calibrate.verify.target_accuracy import (
+    DIRECTIONS,
     Claim,
     claims_of,
     mounting_covariance,
@@ -157,9 +161,9 @@ class Judging:
         place = self._place_by_held_out if pair == "camera_lidar" and score is not None else None
         if score is None or place is None:
             return test, claims, probes, []
-        elsewhere = found_elsewhere(
-            estimate, place, score.cost, claims, scene_blocks(held_out), targets, limits.worse_alignment_z
-        )
+        sigma_rad = np.array([claims[name].sigma_rad for name in DIRECTIONS])
+        blocks, z = scene_blocks(held_out), limits.worse_alignment_z
+        elsewhere = found_elsewhere(estimate, place, score.cost, sigma_rad, blocks, targets, z)
         return test, claims, probes, elsewhere
 
 

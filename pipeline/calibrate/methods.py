@@ -97,7 +97,7 @@ METHODS = (
     Method("pairwise-optimisation", "pipeline.calibrate.paper.pairwise:solve_pairwise", paper_selection=True),
     Method(
         "joint-optimisation",
-        "pipeline.calibrate.paper.joint_optimisation:solve_joint_optimisation",
+        "pipeline.calibrate.paper.pairwise:solve_joint_optimisation",
         paper_selection=True,
         needs_all=True,
     ),

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.calibrate.adjust.adjusted import AdjustedRig, AdjustedSensor
+from pipeline.calibrate.adjust.rig import AdjustedRig, AdjustedSensor
 from pipeline.calibrate.adjusted_day import Concluded
 from pipeline.calibrate.records import Inputs
 from pipeline.calibrate.verify.target_accuracy import Claim, claims_of, targets_of

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.calibrate.adjusted_day import SolvedDay
 from pipeline.calibrate.judging import EdgeJudging, Judged
 from pipeline.calibrate.paper.triggers import trigger_metrics
-from pipeline.calibrate.solved import SolvedDay
 from pipeline.calibrate.unlabelled import notes_of_pair
 from pipeline.calibrate.verify.constancy import PART_FLOOR_RAD
-from pipeline.calibrate.verify.failed_checks import loop_sigmas
-from pipeline.calibrate.verify.held_out_test import HeldOutTest
+from pipeline.calibrate.verify.day_checks import loop_sigmas
+from pipeline.calibrate.verify.held_out import HeldOutTest
 from pipeline.core.errors import SolveError
 from pipeline.core.stage_work import NO_PROBES, Probes
 from pipeline.rig.cameras import camera_of

@@ -14,14 +14,13 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.calibrate.adjust.adjusted import AdjustedRig
-from pipeline.calibrate.adjusted_day import Concluded, adjusted_rig, conclude
+from pipeline.calibrate.adjust.rig import AdjustedRig
+from pipeline.calibrate.adjusted_day import Concluded, SolvedEdge, adjusted_rig, conclude
 from pipeline.calibrate.day import solve_day
 from pipeline.calibrate.edges.day_sources import DaySources
 from pipeline.calibrate.judging import EdgeJudging
 from pipeline.calibrate.methods import Solver, method_named, resolved
 from pipeline.calibrate.records import Inputs, record_of_edge, refused_edge, refused_record
-from pipeline.calibrate.solved import SolvedEdge
 from pipeline.calibrate.verify.constancy import moved_failures
 from pipeline.core.config import FleetConfig
 from pipeline.core.errors import SolveError

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.calibrate.adjust.adjusted import AdjustedEdge, AdjustedRig, AdjustedSensor
+from pipeline.calibrate.adjust.rig import AdjustedEdge, AdjustedRig, AdjustedSensor
 from pipeline.calibrate.pose_rows import pose_rows
 from pipeline.calibrate.records import Inputs
 from pipeline.core.config import VerifyConfig

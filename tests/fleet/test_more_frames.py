@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.calibrate.numerics.search_range import SearchRange
 from pipeline.calibrate.verify.edge_result import EdgeResult
-from pipeline.calibrate.verify.held_out_test import HeldOutTest
+from pipeline.calibrate.verify.held_out import HeldOutTest
 from pipeline.calibrate.verify.target_accuracy import Claim
 from pipeline.calibrate.verify.verdict import Evidence, judge
 from pipeline.core.config import ChecksConfig

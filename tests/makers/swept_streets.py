@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pipeline.calibrate.edges.sweeps import Sweep, vehicle_sized
+from pipeline.calibrate.edges.sweep_travel import Sweep, vehicle_sized
 from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.ingest.captures import deskew
 from pipeline.objective.ego_motion import EgoMotion

@@ -16,8 +16,15 @@ from jaxtyping import Bool, Float, Int64
 from pipeline.calibrate.edges.camera_travel import CameraTravel, camera_travel
 from pipeline.calibrate.edges.day_sources import DaySources
 from pipeline.calibrate.edges.lidar_base import STANCE
-from pipeline.calibrate.edges.on_base import Series, changes_by_left, first_and_last, other_scenes
-from pipeline.calibrate.edges.robust_regression import Regression, Rows, regress
+from pipeline.calibrate.edges.on_base import (
+    Regression,
+    Rows,
+    Series,
+    changes_by_left,
+    first_and_last,
+    other_scenes,
+    regress,
+)
 from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.core.errors import SolveError
 from pipeline.rig.checks import FailedCheck

@@ -23,10 +23,16 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.calibrate.edges.day_sources import DaySources
-from pipeline.calibrate.edges.on_base import Series, changes_by_left, first_and_last, other_scenes
-from pipeline.calibrate.edges.robust_regression import Regression, Rows, regress
-from pipeline.calibrate.edges.sweep_travel import SweepTravel, sweep_travel
-from pipeline.calibrate.edges.sweeps import Sweep, deskewed_again, sweeps_of
+from pipeline.calibrate.edges.on_base import (
+    Regression,
+    Rows,
+    Series,
+    changes_by_left,
+    first_and_last,
+    other_scenes,
+    regress,
+)
+from pipeline.calibrate.edges.sweep_travel import Sweep, SweepTravel, deskewed_again, sweep_travel, sweeps_of
 from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.objective.ego_motion import EgoMotion
 from pipeline.rig.checks import FailedCheck

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.calibrate.edges.day_sources import DaySources
-from pipeline.calibrate.edges.sweeps import Sweep, deskewed_again, sweeps_of
+from pipeline.calibrate.edges.sweep_travel import Sweep, deskewed_again, sweeps_of
 from pipeline.calibrate.numerics.bias_floors import SWEEP_S, TYPICAL_RANGE_M
 from pipeline.calibrate.numerics.change_point import parts_of_day
 from pipeline.calibrate.numerics.frame_blocks import Scenes

@@ -1,4 +1,4 @@
-"""A sensor on the vehicle frame: from changes of T_base_sensor to T_sensor_base, over halves and parts of a day."""
+"""A sensor on the vehicle frame: robust regression of its turns, over halves and parts of a day."""
 
 from __future__ import annotations
 
@@ -6,16 +6,123 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
-from pipeline.calibrate.edges.robust_regression import Regression, Rows, regress
 from pipeline.calibrate.numerics.change_point import parts_of_day
 from pipeline.rig.changes import change_jacobian, changed
 from pipeline.rig.estimates import DayParts
 from pipeline.rig.evidence import OtherScenes
 from pipeline.rig.se3 import adjoint, inverse
 
-__all__ = ["Series", "changes_by_left", "first_and_last", "other_scenes"]
+__all__ = ["Regression", "Rows", "Series", "changes_by_left", "first_and_last", "other_scenes", "regress"]
+
+# --------------------------------------------------------------------------------------------------
+# Robust linear regression with a covariance from the scatter of blocks of frames.
+
+
+_PASSES = 20
+_SCALES = 2.0  # of the Cauchy weight, in robust standard deviations
+_LEAST = 1e-6
+_FEW = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Rows of y = A x.
+
+    Args:
+        sigma: relative sigmas of the rows; their common scale is estimated.
+        block: block of each row; errors within a block may be correlated.
+        prior_sigmas: sigmas of coefficients about 0; infinite ones are free.
+        share: weight of each row; the rows of one scene add up to one.
+    """
+
+    A: Float[np.ndarray, "N P"]
+    y: Float[np.ndarray, " N"]
+    sigma: Float[np.ndarray, " N"]
+    block: Int[np.ndarray, " N"]
+    prior_sigmas: Float[np.ndarray, " P"]
+    share: Float[np.ndarray, " N"]
+
+    def some(self, of: Bool[np.ndarray, " N"] | Int[np.ndarray, " M"]) -> Rows:
+        """Some of the rows."""
+        A, y, sigma, block, share = (a[of] for a in (self.A, self.y, self.sigma, self.block, self.share))
+        return Rows(A, y, sigma, block, self.prior_sigmas, share)
+
+    def residuals(self, x: Float[np.ndarray, " P"]) -> Float[np.ndarray, " N"]:
+        """Of all rows, in sigmas of theirs."""
+        return (self.y - self.A @ x) / self.sigma
+
+
+@dataclass(frozen=True, eq=False)
+class Regression:
+    """Coefficients, their covariance, and the scatter of single rows (in units of their sigmas)."""
+
+    value: np.ndarray  # P
+    covariance: np.ndarray  # P P
+    scatter: float
+    halves: float  # half of what the first coefficient differs by between even and odd blocks; NaN of too few
+
+
+def regress(rows: Rows) -> Regression | None:
+    """Fit the rows.
+
+    The covariance is, for each coefficient, the larger one of the sandwich estimate over blocks and that of
+    independent rows. None for fewer than three blocks, or if there are no more rows than coefficients.
+    """
+    names = np.unique(rows.block)
+    if len(names) < 3 or len(rows.y) <= rows.A.shape[1]:
+        return None
+    held, blocks, share = np.diag(1 / rows.prior_sigmas**2), rows.block, rows.share
+    A_, y_ = rows.A / rows.sigma[:, None], rows.y / rows.sigma
+    x, scale, weight = _fitted(A_, y_, held, share)
+    H = (A_.T * weight) @ A_ / scale**2 + held
+    scores = (A_ * (weight * (y_ - A_ @ x) / scale**2)[:, None]).astype(np.float64)
+    of_blocks = np.stack([scores[blocks == b].sum(0) for b in names])
+    spread = of_blocks.T @ of_blocks * _small_sample(len(names))
+    H_inverse = np.linalg.inv(H)
+    sandwich = H_inverse @ (spread + held) @ H_inverse
+    widen = np.sqrt(np.maximum(np.diag(H_inverse) / np.maximum(np.diag(sandwich), 1e-300), 1.0))
+    return Regression(x, sandwich * np.outer(widen, widen), scale, _halves(A_, y_, blocks, held, share))
+
+
+def _small_sample(blocks: int) -> float:
+    """Correction of a variance from few blocks: Student's t over the normal distribution, and the removed mean."""
+    return blocks / (blocks - 1) * ((blocks - 1) / (blocks - 3) if blocks > _FEW else _FEW)
+
+
+def _fitted(
+    A: np.ndarray, y: np.ndarray, held: np.ndarray, share: np.ndarray
+) -> tuple[np.ndarray, float, np.ndarray]:
+    """Coefficients, robust scale and Cauchy weights for rows of unit sigma, starting from least absolute deviations."""
+    weight, scale, x = share, 1.0, np.zeros(A.shape[1])
+    for k in range(_PASSES):
+        x = np.linalg.solve((A.T * weight) @ A / scale**2 + held, (A.T * weight) @ y / scale**2)
+        r = np.abs(y - A @ x)
+        scale = max(1.4826 * _median(r, share), _LEAST)
+        far = r / scale
+        weight = share / (1 + (far / _SCALES) ** 2) if k > _PASSES // 3 else share / np.maximum(far, 0.1)
+    return x, scale, weight
+
+
+def _median(values: np.ndarray, share: np.ndarray) -> float:
+    order = np.argsort(values)
+    below = np.cumsum(share[order])
+    return float(values[order][np.searchsorted(below, 0.5 * below[-1])])
+
+
+def _halves(A: np.ndarray, y: np.ndarray, blocks: np.ndarray, held: np.ndarray, share: np.ndarray) -> float:
+    """Difference between the first coefficient of even blocks and the mean of even and odd blocks; NaN for too few."""
+    even = np.unique(blocks, return_inverse=True)[1] % 2 == 0
+    if min(even.sum(), (~even).sum()) <= 2 * A.shape[1]:
+        return float("nan")
+    one, other = (_fitted(A[half], y[half], held, share[half])[0][0] for half in (even, ~even))
+    return float(abs(one - other) / 2)
+
+
+# --------------------------------------------------------------------------------------------------
+# A sensor on the vehicle frame: from changes of T_base_sensor to T_sensor_base, over halves and parts of a day.
+
 
 _UNKNOWN_RAD = np.pi  # sigma of a part of the day that determines nothing
 

@@ -19,8 +19,15 @@ from jaxtyping import Float, Int64
 
 from pipeline.calibrate.edges.day_sources import DaySources
 from pipeline.calibrate.edges.lidar_base import STANCE
-from pipeline.calibrate.edges.on_base import Series, changes_by_left, first_and_last, other_scenes
-from pipeline.calibrate.edges.robust_regression import Regression, Rows, regress
+from pipeline.calibrate.edges.on_base import (
+    Regression,
+    Rows,
+    Series,
+    changes_by_left,
+    first_and_last,
+    other_scenes,
+    regress,
+)
 from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.calibrate.verify.motion_sources import compared_sources
 from pipeline.core.errors import SolveError

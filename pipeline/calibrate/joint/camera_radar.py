@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.calibrate.joint.lidar_radar.tilt_floors import tempered
+from pipeline.calibrate.joint.lidar_radar.elevation_errors import tempered
 from pipeline.calibrate.numerics.bias_floors import (
     BOX_ELEVATION_GATES_RAD,
     BOX_ROLL_FLOOR_CAMERA_RAD,

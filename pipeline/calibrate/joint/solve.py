@@ -17,8 +17,8 @@ import numpy as np
 from pipeline.calibrate.joint.camera_lidar.estimate import align_camera_lidar, analyse_camera_lidar
 from pipeline.calibrate.joint.camera_lidar.intrinsics import contradictions
 from pipeline.calibrate.joint.camera_radar import estimate_camera_radar
+from pipeline.calibrate.joint.lidar_radar.conclusions import lidar_radar_failures
 from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
-from pipeline.calibrate.verify.failed_checks import lidar_radar_failures
 from pipeline.core.config import SolveConfig
 from pipeline.core.errors import SolveError
 from pipeline.core.results import Progress, silent

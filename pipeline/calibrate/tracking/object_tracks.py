@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int64
 from scipy.spatial import cKDTree
 
-from pipeline.calibrate.tracking.kalman import Motion, Scan, Track, follow
+from pipeline.calibrate.tracking.association import Motion, Scan, Track, follow
 from pipeline.core.rows import take_rows
 from pipeline.objective.radar.moving_clusters import ROAD_USER_HEIGHT_M
 from pipeline.rig.cameras import camera_of

@@ -24,12 +24,12 @@ from pipeline.calibrate.numerics.covariance import OBSERVABLE, posterior
 from pipeline.calibrate.tracking.association import (
     Association,
     Shared,
+    Track,
     associate,
     bearing_sigma_rad,
     shared_sightings,
 )
 from pipeline.calibrate.tracking.bearings import AlignedBearings, Bearings, align_bearings, consistency
-from pipeline.calibrate.tracking.kalman import Track
 from pipeline.calibrate.tracking.object_tracks import (
     box_centres,
     camera_tracks,

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.calibrate.numerics.search_range import SearchRange
-from pipeline.rig.changes import change_between, change_covariance
+from pipeline.calibrate.verify.target_accuracy import DIRECTIONS, Claim
+from pipeline.rig.changes import change_between, change_covariance, change_jacobian, changed
+from pipeline.rig.checks import Change, FailedCheck
+from pipeline.rig.kinds import KIND_OF_EDGE
 from pipeline.rig.se3 import adjoint, inverse
+from pipeline.rig.targets import errors_at_targets, target_sigmas
 from schemas.calibrations import DOF_NAMES
 
-__all__ = ["EdgeResult"]
+__all__ = ["RANGE", "EdgeResult", "at_targets", "exceeded_by", "tilt_in_doubt"]
 
 _ON_BASE = ("roll", "pitch", "yaw", "x", "y", "z")
 
@@ -69,3 +74,79 @@ class EdgeResult:
     @property
     def _is_on_base(self) -> bool:
         return self.kind.endswith("_base")
+
+
+# --------------------------------------------------------------------------------------------------
+# Consequence of a failed check: what it would mean at the targets, against the limits, if it is right.
+
+
+RANGE = "range"
+_SIGMAS = 3.0
+
+
+def exceeded_by(result: EdgeResult, claims: Mapping[str, Claim], check: FailedCheck) -> list[str]:
+    """Directions whose limit the pose would exceed if the check is right: azimuth, elevation, range.
+
+    A shift along the line of sight moves no direction; it counts as if it were across it, against the limit
+    of azimuth. All of them where nobody knows the check's error.
+    """
+    if check.error is None:
+        return [*claims, RANGE]
+    limits = {**claims, RANGE: claims[DIRECTIONS[0]].without_sigma}
+    return [
+        n
+        for n, (off, known_to) in at_targets(result, check).items()
+        if n in limits and limits[n].is_exceeded_by(off, known_to)  # what is not claimed has no limit
+    ]
+
+
+def at_targets(result: EdgeResult, check: FailedCheck) -> dict[str, tuple[float, float | None]]:
+    """Error of each direction if the check is right, and its sigma, None where the check states none [rad]."""
+    assert check.error is not None
+    off = _errors(result, check.error)
+    known_to = (None, None, None) if check.covariance is None else _sigmas(result, check.covariance)
+    return dict(zip((*DIRECTIONS, RANGE), zip(off, known_to, strict=True), strict=True))
+
+
+def tilt_in_doubt(result: EdgeResult, check: FailedCheck) -> Float[np.ndarray, "6 6"] | None:
+    """What is to be added to the covariance, as left perturbation, where a check doubts a radar's tilt.
+
+    Its roll, pitch or height may then be off by more than three sigmas. The record certifies no elevation, however
+    little targets see of it, but its pose has that tilt: whoever combines poses must not take it for sure.
+    None where the check doubts none.
+    """
+    tilts = [DOF_NAMES.index(name) for name in KIND_OF_EDGE[result.kind].tilts]
+    if check.error is None or not tilts:
+        return None
+    off, variance = np.zeros(6), np.zeros(6)
+    off[tilts] = np.array(check.error)[tilts]
+    if check.covariance is not None:
+        variance[tilts] = np.diag(change_covariance(result.T, check.covariance))[tilts]
+    own = np.sqrt(np.diag(change_covariance(result.T, result.covariance)))
+    if (np.abs(off) + np.sqrt(variance) <= _SIGMAS * own)[tilts].all():
+        return None
+    back = np.linalg.inv(change_jacobian(result.T))
+    return np.asarray(back @ (np.outer(off, off) + np.diag(variance)) @ back.T)
+
+
+def _errors(result: EdgeResult, error: Change) -> tuple[float, float, float]:
+    change = np.array(error)
+    # A turn moves ranges by its lever arm: no more than directions.
+    shift = np.where(np.arange(6) < 3, 0.0, change)
+    kind, T, targets = result.kind, result.T, result.targets
+    azimuth, elevation, _ = errors_at_targets(kind, changed(T, change), T, targets)
+    range_m = errors_at_targets(kind, changed(T, shift), T, targets)[2]
+    return float(azimuth), float(elevation), float(range_m) * _per_metre(targets)
+
+
+def _sigmas(result: EdgeResult, covariance: Float[np.ndarray, "6 6"]) -> tuple[float, float, float]:
+    azimuth, elevation = target_sigmas(result.kind, result.T, covariance, result.targets)
+    along = result.targets @ result.T[:3, :3].T
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    shift = change_covariance(result.T, covariance)[3:, 3:]
+    range_m = float(np.sqrt(np.einsum("ni,ij,nj->n", along, shift, along).mean()))
+    return float(azimuth), float(elevation), range_m * _per_metre(result.targets)
+
+
+def _per_metre(targets: Float[np.ndarray, "N 3"]) -> float:
+    return float(np.mean(1 / np.linalg.norm(targets, axis=1)))

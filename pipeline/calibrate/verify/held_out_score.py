@@ -24,7 +24,7 @@ from pipeline.calibrate.numerics.bias_floors import (
     TYPICAL_SPEED_MPS,
 )
 from pipeline.calibrate.numerics.response_surface import DESIGN, fit_quadratics
-from pipeline.calibrate.verify.held_out_update import FrameDerivatives
+from pipeline.calibrate.verify.held_out import FrameDerivatives
 from pipeline.core.config import SolveConfig
 from pipeline.objective.camera_lidar.label_width import widened
 from pipeline.objective.camera_lidar.points import lidar_velocities

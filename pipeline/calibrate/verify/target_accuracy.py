@@ -42,7 +42,7 @@ from scipy.optimize import brentq
 from scipy.special import ndtr, ndtri
 
 from pipeline.calibrate.numerics.bias_floors import RADAR_ELEVATION_BIAS_RAD
-from pipeline.calibrate.verify.held_out_update import HeldOutUpdate
+from pipeline.calibrate.verify.held_out import HeldOutUpdate
 from pipeline.core.config import ChecksConfig
 from pipeline.core.rigs import CameraPrior
 from pipeline.rig.cameras import camera_of

@@ -14,9 +14,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pipeline.calibrate.select.frames import SHORTEST
-from pipeline.calibrate.verify.consequence import RANGE, at_targets, exceeded_by, tilt_in_doubt
-from pipeline.calibrate.verify.edge_result import EdgeResult
-from pipeline.calibrate.verify.held_out_test import HeldOutTest
+from pipeline.calibrate.verify.edge_result import RANGE, EdgeResult, at_targets, exceeded_by, tilt_in_doubt
+from pipeline.calibrate.verify.held_out import HeldOutTest
 from pipeline.calibrate.verify.target_accuracy import Claim
 from pipeline.core.config import ChecksConfig
 from pipeline.rig.checks import FailedCheck, change_of, faults_of

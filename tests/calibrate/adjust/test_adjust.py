@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.calibrate.adjust.adjusted import AdjustmentLimits
 from pipeline.calibrate.adjust.equations import Rig, equations_at, left_jacobian_inverse
-from pipeline.calibrate.adjust.rig import adjust
+from pipeline.calibrate.adjust.rig import AdjustmentLimits, adjust
 from pipeline.rig.checks import FailedCheck
 from pipeline.rig.evidence import EDGE, EdgeEvidence
 from pipeline.rig.extrinsics import Extrinsics

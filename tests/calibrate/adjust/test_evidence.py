@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.calibrate.adjust.adjusted import AdjustmentLimits
 from pipeline.calibrate.adjust.evidence import evidence_of
-from pipeline.calibrate.adjust.rig import adjust
+from pipeline.calibrate.adjust.rig import AdjustmentLimits, adjust
 from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
 from pipeline.core.config import SolveConfig
 from pipeline.rig.changes import change_between, change_covariance, change_jacobian

@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.calibrate.edges.lidar_lidar import LidarPair, _equations, _Moment, estimate_lidar_lidar
 from pipeline.calibrate.verify.constancy import MOVED_SIGMAS, PART_FLOOR_RAD
-from pipeline.calibrate.verify.held_out_test import paired_test
+from pipeline.calibrate.verify.held_out import paired_test
 from pipeline.core.errors import SolveError
 from pipeline.objective.sweep_registration import Surfaces
 from pipeline.rig.changes import change_between, change_jacobian

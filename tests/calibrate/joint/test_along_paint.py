@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.calibrate.joint.camera_lidar.along_paint import _of_image, along_paint
+from pipeline.calibrate.joint.camera_lidar.borders import _of_image, along_paint
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState
 from pipeline.objective.camera_lidar.points import Points
 from pipeline.objective.camera_lidar.score import KernelSettings, prepare_terms

@@ -10,7 +10,7 @@ from pipeline.calibrate.joint.camera_lidar.estimate import (
     align_camera_lidar,
 )
 from pipeline.calibrate.joint.camera_lidar.observability import time_offset_variance
-from pipeline.calibrate.joint.camera_lidar.time_offset import TimeOffsetProfile
+from pipeline.calibrate.joint.camera_lidar.profiles import TimeOffsetProfile
 from pipeline.calibrate.numerics.search_range import search_range
 from pipeline.core.config import SolveConfig
 from pipeline.core.errors import SolveError

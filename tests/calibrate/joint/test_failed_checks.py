@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.calibrate.joint.lidar_radar.conclusions import lidar_radar_failures
 from pipeline.calibrate.joint.solve import solve_joint
 from pipeline.calibrate.records import Inputs
-from pipeline.calibrate.verify.failed_checks import lidar_radar_failures
 from pipeline.core.config import FleetConfig
 from pipeline.rig.estimates import PairEstimate, Prior
 from pipeline.store.partitions import Partition

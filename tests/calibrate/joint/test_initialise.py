@@ -6,10 +6,15 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.joint.camera_lidar import initialise
-from pipeline.calibrate.joint.camera_lidar.beyond_chance import TERMS, Evidence, by_chance, wrong_poses
 from pipeline.calibrate.joint.camera_lidar.initialise import Basin, difference, find_basin
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, Scored, refine
-from pipeline.calibrate.joint.camera_lidar.rotation_grid import grid_maxima
+from pipeline.calibrate.joint.camera_lidar.rotation_search import (
+    TERMS,
+    Evidence,
+    by_chance,
+    grid_maxima,
+    wrong_poses,
+)
 from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
 from pipeline.calibrate.numerics.covariance import CLEARLY
 from pipeline.calibrate.numerics.search_range import SearchRange, search_range

@@ -5,10 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.calibrate.joint.camera_lidar.left_out_in_time import left_out_in_time
 from pipeline.calibrate.joint.camera_lidar.observability import IS_TZ
+from pipeline.calibrate.joint.camera_lidar.profiles import (
+    DT,
+    TimeOffsetProfile,
+    left_out_in_time,
+    profile_time_offset,
+)
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, Scored
-from pipeline.calibrate.joint.camera_lidar.time_offset import DT, TimeOffsetProfile, profile_time_offset
 from pipeline.core.config import SolveConfig
 from pipeline.objective.camera_lidar.score import KernelSettings, prepare_terms
 from pipeline.rig.estimates import Prior

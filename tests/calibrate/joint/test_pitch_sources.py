@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.calibrate.joint.lidar_radar.pitch_sources import (
+from pipeline.calibrate.joint.lidar_radar.elevation_errors import (
     contradiction,
     doubted,
     own_equations,

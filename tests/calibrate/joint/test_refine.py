@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.joint.camera_lidar import refine as module
+from pipeline.calibrate.joint.camera_lidar.profiles import far_time_offset
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, Scored, prior_value, refine, scales
-from pipeline.calibrate.joint.camera_lidar.time_offset import far_time_offset
 from pipeline.core.config import SolveConfig
 from pipeline.objective.camera_lidar.points import lidar_velocities
 from pipeline.objective.camera_lidar.score import KernelSettings, prepare_terms

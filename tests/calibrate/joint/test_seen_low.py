@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.calibrate.joint.lidar_radar.seen_low import SeenLow, added_share, seen_low_of
+from pipeline.calibrate.joint.lidar_radar.elevation_errors import SeenLow, added_share, seen_low_of
 from pipeline.calibrate.joint.part_turn import PartTurn
 from pipeline.objective.radar.heights import Heights, HeightScores
 from pipeline.objective.radar.travel import TravelDirections

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.calibrate.joint.lidar_radar.tilt_floors import (
+from pipeline.calibrate.joint.lidar_radar.elevation_errors import (
     along_radar,
     following_tilt,
     radar_tilt_axes,

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.calibrate.joint.lidar_radar import time_offset
-from pipeline.calibrate.joint.lidar_radar.elevation_spread import ElevationSpread
+from pipeline.calibrate.joint.lidar_radar import search
+from pipeline.calibrate.joint.lidar_radar.elevation_errors import ElevationSpread
 from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
 from pipeline.calibrate.joint.lidar_radar.problem import RadarProblem, RadarState
 from pipeline.calibrate.joint.lidar_radar.schedule import SCHEDULE
-from pipeline.calibrate.joint.lidar_radar.time_offset import dips
+from pipeline.calibrate.joint.lidar_radar.search import dips
 from pipeline.core.config import SolveConfig
 from pipeline.objective.radar.moving_clusters import moving_clusters
 from pipeline.objective.radar.registration import registration_frames
@@ -63,20 +63,20 @@ def state_at(dt_s):
 
 @pytest.mark.parametrize("slid_s", [0.6, -0.6])
 def test_an_offset_far_beyond_what_is_searched_is_seen_from_anywhere(problem, slid_s):
-    far = time_offset.far_time_offset(problem, state_at(DT_S + slid_s))
+    far = search.far_time_offset(problem, state_at(DT_S + slid_s))
     assert abs(far["own_dt_s"] - DT_S) < 0.02
     assert far["own_dt_z"] < -2
-    right = time_offset.far_time_offset(problem, state_at(DT_S))
+    right = search.far_time_offset(problem, state_at(DT_S))
     assert abs(right["own_dt_s"] - DT_S) < 0.02
 
 
 def test_the_radars_own_sigmas_bring_back_an_offset_that_wider_ones_do_not_see(problem, monkeypatch):
     right, slid = state_at(DT_S), state_at(DT_S + 0.04)
-    monkeypatch.setattr(time_offset, "comparison_cost", lambda problem, _: np.zeros(problem.frames.count))
-    found = time_offset.better_time_offset(problem, slid)
+    monkeypatch.setattr(search, "comparison_cost", lambda problem, _: np.zeros(problem.frames.count))
+    found = search.better_time_offset(problem, slid)
     assert found is not None
     assert abs(found.dt_s - DT_S) < 0.012  # half a step of 0.2 m
-    assert time_offset.better_time_offset(problem, right) is None
+    assert search.better_time_offset(problem, right) is None
 
 
 def tunnel_day(frames, seed=3):
@@ -105,7 +105,7 @@ def tunnel_day(frames, seed=3):
 def test_a_time_offset_that_blocks_of_frames_find_anywhere_is_unsure_and_one_they_agree_on_is_not(problem):
     def scatter_s(problem):
         block = np.arange(problem.frames.count) // 2
-        return time_offset.time_offset_scatter_s(problem, state_at(DT_S), block, np.random.default_rng(0))
+        return search.time_offset_scatter_s(problem, state_at(DT_S), block, np.random.default_rng(0))
 
     assert scatter_s(problem) < 0.012  # half a step of 0.2 m
     assert scatter_s(problem_of(list(tunnel_day(16)))) > 0.03

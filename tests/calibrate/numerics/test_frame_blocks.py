@@ -16,7 +16,7 @@ from pipeline.calibrate.numerics.frame_blocks import (
     scenes_of,
 )
 from pipeline.calibrate.select.frames import MIN_FRAMES, hold_out, select_frames
-from pipeline.calibrate.verify.scene_count import scene_failures
+from pipeline.calibrate.verify.day_checks import scene_failures
 from pipeline.core.config import SelectConfig
 from tests.makers.solve_scenes import make_day
 

@@ -4,9 +4,14 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.methods import METHODS, method_named
-from pipeline.calibrate.paper.joint_optimisation import joint_costs, solve_joint_optimisation
 from pipeline.calibrate.paper.minimise import minimise
-from pipeline.calibrate.paper.pairwise import pair_problem, sandwich_covariance, solve_pairwise
+from pipeline.calibrate.paper.pairwise import (
+    joint_costs,
+    pair_problem,
+    sandwich_covariance,
+    solve_joint_optimisation,
+    solve_pairwise,
+)
 from pipeline.core.config import SolveConfig
 from pipeline.core.errors import ConfigError
 from pipeline.rig.changes import changed

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.methods import method_named
-from pipeline.calibrate.tracking.association import associate, shared_sightings
+from pipeline.calibrate.tracking.association import Motion, Scan, Track, associate, follow, shared_sightings
 from pipeline.calibrate.tracking.bearings import Bearings
-from pipeline.calibrate.tracking.kalman import Motion, Scan, Track, follow
 from pipeline.calibrate.tracking.object_tracks import (
     lidar_tracks,
     motions,

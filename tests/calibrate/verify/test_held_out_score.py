@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.verify import held_out_score as held_out_score_module
+from pipeline.calibrate.verify.held_out import held_out_update
 from pipeline.calibrate.verify.held_out_score import held_out_score
-from pipeline.calibrate.verify.held_out_update import held_out_update
 from pipeline.calibrate.verify.target_accuracy import claims_of
 from pipeline.core.config import SolveConfig
 from pipeline.rig.estimates import PairEstimate, Prior

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from pipeline.calibrate.verify.held_out import found_elsewhere, held_out_place
 from pipeline.calibrate.verify.held_out_score import held_out_score
-from pipeline.calibrate.verify.held_out_search import found_elsewhere, held_out_place
 from pipeline.calibrate.verify.target_accuracy import claims_of
 from pipeline.core.config import SolveConfig
 from pipeline.rig.estimates import PairEstimate, Prior
@@ -36,7 +36,8 @@ def said_of(T, held_out, place):
     score = held_out_score(result, held_out, PRIOR, SolveConfig())
     claims = claims_of("camera_lidar", T, result.covariance, None, float(np.radians(0.2)), 0.995)
     blocks = np.arange(len(held_out))
-    return found_elsewhere(result, place, score.cost, claims, blocks, DEFAULT_TARGETS, 2.33)
+    sigma_rad = np.array([claims[name].sigma_rad for name in ("azimuth", "elevation")])
+    return found_elsewhere(result, place, score.cost, sigma_rad, blocks, DEFAULT_TARGETS, 2.33)
 
 
 def turned(axis, degrees):

@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.calibrate.verify.day_labels import day_labels
-from pipeline.calibrate.verify.label_offset import measure_label_offset
+from pipeline.calibrate.verify.day_labels import day_labels, measure_label_offset
 from pipeline.perceive.labels import label_gradients
 from pipeline.rig.estimates import PairEstimate, Solution
 from schemas.calibrations import PAIRS

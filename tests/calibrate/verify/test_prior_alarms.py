@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
-from pipeline.calibrate.verify.prior_alarms import clock_alarms, edge_alarms, prior_alarms
+from pipeline.calibrate.verify.day_checks import clock_alarms, edge_alarms, prior_alarms
 from pipeline.core.config import ChecksConfig, SolveConfig
 from pipeline.rig.changes import change_jacobian
 from pipeline.rig.estimates import PairEstimate, Prior

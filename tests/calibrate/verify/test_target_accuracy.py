@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from pipeline.calibrate.verify.held_out_update import held_out_update
+from pipeline.calibrate.verify.held_out import held_out_update
 from pipeline.calibrate.verify.target_accuracy import Claim, claims_of, target_jacobian
 from pipeline.rig.se3 import exp_se3, exp_so3, from_rotation_translation
 from pipeline.rig.targets import errors_at_targets

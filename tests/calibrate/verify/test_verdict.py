@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.numerics.search_range import SearchRange
+from pipeline.calibrate.verify.day_checks import heading_failures, loop_failures
 from pipeline.calibrate.verify.edge_result import EdgeResult
-from pipeline.calibrate.verify.failed_checks import heading_failures, loop_failures
-from pipeline.calibrate.verify.held_out_test import HeldOutTest, paired_test
+from pipeline.calibrate.verify.held_out import HeldOutTest, paired_test
 from pipeline.calibrate.verify.target_accuracy import DIRECTIONS, Claim
 from pipeline.calibrate.verify.verdict import Evidence, judge
 from pipeline.core.config import ChecksConfig

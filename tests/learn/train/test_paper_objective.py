@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.calibrate.paper.joint_optimisation import joint_costs
-from pipeline.calibrate.paper.pairwise import pair_problem
+from pipeline.calibrate.paper.pairwise import joint_costs, pair_problem
 from pipeline.core.errors import ConfigError
 from pipeline.learn.batches.batch import collate
 from pipeline.learn.sample.frame_sample import About, make_row

@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipeline.calibrate.joint.camera_lidar.beyond_chance import TERMS as BASIN_TERMS
 from pipeline.calibrate.joint.camera_lidar.initialise import (
     MARGIN_RAD,
     Basin,
@@ -31,13 +30,13 @@ from pipeline.calibrate.joint.camera_lidar.observability import (
     ObservabilityAnalysis,
     analyse_observability,
 )
-from pipeline.calibrate.joint.camera_lidar.optical_axis import TZ
 from pipeline.calibrate.joint.camera_lidar.part_turns import (
     disagreement,
     turn_numbers,
     turns_by_parts,
 )
 from pipeline.calibrate.joint.camera_lidar.parts import parts_of_alignment
+from pipeline.calibrate.joint.camera_lidar.profiles import DT, FOCAL, TZ, far_time_offset, s_per_metre
 from pipeline.calibrate.joint.camera_lidar.refine import (
     NONE_FIXED,
     AlignmentState,
@@ -45,8 +44,8 @@ from pipeline.calibrate.joint.camera_lidar.refine import (
     refine,
     weighted,
 )
+from pipeline.calibrate.joint.camera_lidar.rotation_search import TERMS as BASIN_TERMS
 from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
-from pipeline.calibrate.joint.camera_lidar.time_offset import DT, FOCAL, far_time_offset, s_per_metre
 from pipeline.calibrate.joint.part_turn import PartTurn
 from pipeline.calibrate.numerics.bias_floors import CAMERA_LIDAR_BIAS, TZ_COMMON_BIAS_M
 from pipeline.calibrate.numerics.covariance import OBSERVABLE

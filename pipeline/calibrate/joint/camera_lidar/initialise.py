@@ -17,13 +17,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipeline.calibrate.joint.camera_lidar.beyond_chance import TERMS, Evidence, by_chance, wrong_poses
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, Scored, prior_value, refine
-from pipeline.calibrate.joint.camera_lidar.rotation_grid import (
+from pipeline.calibrate.joint.camera_lidar.rotation_search import (
     GRID_SHIFTS_PX,
+    TERMS,
+    Evidence,
+    by_chance,
     grid_kernel_rad,
     grid_maxima,
     grid_turns,
+    wrong_poses,
 )
 from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
 from pipeline.calibrate.numerics.covariance import CLEARLY, widening

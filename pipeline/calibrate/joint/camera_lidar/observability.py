@@ -12,10 +12,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipeline.calibrate.joint.camera_lidar.along_paint import along_paint
-from pipeline.calibrate.joint.camera_lidar.borders import border_errors
-from pipeline.calibrate.joint.camera_lidar.left_out_in_time import left_out_in_time
-from pipeline.calibrate.joint.camera_lidar.optical_axis import TZ, TzProfile, profile_tz, with_tz
+from pipeline.calibrate.joint.camera_lidar.borders import along_paint, border_errors
+from pipeline.calibrate.joint.camera_lidar.profiles import (
+    DT,
+    FOCAL,
+    TZ,
+    TimeOffsetProfile,
+    TzProfile,
+    left_out_in_time,
+    profile_time_offset,
+    profile_tz,
+    with_tz,
+)
 from pipeline.calibrate.joint.camera_lidar.refine import (
     AlignmentState,
     Scored,
@@ -25,12 +33,6 @@ from pipeline.calibrate.joint.camera_lidar.refine import (
     weighted,
 )
 from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
-from pipeline.calibrate.joint.camera_lidar.time_offset import (
-    DT,
-    FOCAL,
-    TimeOffsetProfile,
-    profile_time_offset,
-)
 from pipeline.calibrate.numerics.bias_floors import CAMERA_LIDAR_BIAS, CAMERA_LIDAR_DT_FLOOR_S, FOCAL_SIGMA
 from pipeline.calibrate.numerics.covariance import OBSERVABLE, covariance_with_fixed, response
 from pipeline.calibrate.numerics.frame_blocks import SCENE_DEGREES, Scenes

@@ -11,21 +11,21 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int64
 
-from pipeline.calibrate.joint.lidar_radar.pitch_sources import own_equations
+from pipeline.calibrate.joint.lidar_radar.elevation_errors import (
+    added_share,
+    along_radar,
+    floor_scatter,
+    own_equations,
+    radar_tilt_axes,
+    tempered,
+    tilt_of,
+)
 from pipeline.calibrate.joint.lidar_radar.problem import (
     ELEVATION_DOF,
     SEEN_LOW,
     RadarProblem,
     RadarState,
     Sums,
-)
-from pipeline.calibrate.joint.lidar_radar.seen_low import added_share
-from pipeline.calibrate.joint.lidar_radar.tilt_floors import (
-    along_radar,
-    floor_scatter,
-    radar_tilt_axes,
-    tempered,
-    tilt_of,
 )
 from pipeline.calibrate.joint.part_turn import PartTurn
 from pipeline.objective.radar.heights import Heights

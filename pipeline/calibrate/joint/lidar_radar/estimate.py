@@ -14,12 +14,17 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Int
 
-from pipeline.calibrate.joint.lidar_radar.conclusions import diagnostics_of, notes_of
-from pipeline.calibrate.joint.lidar_radar.elevation_spread import beam_spacing, elevation_spread
+from pipeline.calibrate.joint.lidar_radar.conclusions import diagnostics_of, notes_of, own_position
+from pipeline.calibrate.joint.lidar_radar.elevation_errors import (
+    beam_spacing,
+    contradiction,
+    doubted,
+    elevation_spread,
+    radar_tilt_axes,
+    seen_low_of,
+)
 from pipeline.calibrate.joint.lidar_radar.elevation_terms import height_equations, travel_equations
 from pipeline.calibrate.joint.lidar_radar.observability import ObservabilityAnalysis, analyse_observability
-from pipeline.calibrate.joint.lidar_radar.own_position import own_position
-from pipeline.calibrate.joint.lidar_radar.pitch_sources import contradiction, doubted
 from pipeline.calibrate.joint.lidar_radar.problem import (
     DT,
     RadarProblem,
@@ -27,13 +32,13 @@ from pipeline.calibrate.joint.lidar_radar.problem import (
 )
 from pipeline.calibrate.joint.lidar_radar.radar_velocity import contradicts_odometry, turns_unmeasured
 from pipeline.calibrate.joint.lidar_radar.schedule import SCHEDULE
-from pipeline.calibrate.joint.lidar_radar.search import anneal, finish, scan
-from pipeline.calibrate.joint.lidar_radar.seen_low import seen_low_of
-from pipeline.calibrate.joint.lidar_radar.tilt_floors import radar_tilt_axes
-from pipeline.calibrate.joint.lidar_radar.time_offset import (
+from pipeline.calibrate.joint.lidar_radar.search import (
+    anneal,
     better_time_offset,
     comparison_cost,
     far_time_offset,
+    finish,
+    scan,
     time_offset_scatter_s,
 )
 from pipeline.calibrate.joint.part_turn import PartTurn

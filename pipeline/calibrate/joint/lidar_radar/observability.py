@@ -1,4 +1,4 @@
-"""Observability analysis of lidar-radar: the degrees of freedom that the day determines, and their covariance."""
+"""Observability of lidar-radar: the degrees of freedom that the day determines, and their covariance."""
 
 from __future__ import annotations
 
@@ -7,19 +7,20 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipeline.calibrate.joint.lidar_radar.measured_curvature import with_measured_curvature
+from pipeline.calibrate.joint.lidar_radar.elevation_errors import following_tilt
+from pipeline.calibrate.joint.lidar_radar.normal_equations import linearise
 from pipeline.calibrate.joint.lidar_radar.problem import (
     AZIMUTH_RANGE_DOF,
     DT,
     ELEVATION_DOF,
     SEEN_LOW,
+    STEP_LIMIT,
+    UNKNOWNS,
     Linear,
     RadarProblem,
     RadarState,
 )
-from pipeline.calibrate.joint.lidar_radar.search import NONE_FIXED, finish, last_step
-from pipeline.calibrate.joint.lidar_radar.tilt_floors import following_tilt
-from pipeline.calibrate.joint.lidar_radar.time_offset import better_time_offset
+from pipeline.calibrate.joint.lidar_radar.search import NONE_FIXED, better_time_offset, finish, last_step
 from pipeline.calibrate.joint.part_turn import PartTurn
 from pipeline.calibrate.numerics.bias_floors import LIDAR_RADAR_BIAS, LIDAR_RADAR_DT_FLOOR_S
 from pipeline.calibrate.numerics.covariance import OBSERVABLE, covariance_with_fixed
@@ -28,7 +29,51 @@ from pipeline.core.config import SolveConfig
 from pipeline.objective.radar.heights import Heights
 from pipeline.rig.common_share import prior_share
 
-__all__ = ["ObservabilityAnalysis", "analyse_observability"]
+__all__ = ["ObservabilityAnalysis", "analyse_observability", "with_measured_curvature"]
+
+# --------------------------------------------------------------------------------------------------
+# The cost's own curvature over yaw, x, y, dt and range bias, where soft assignment predicts too much of it.
+
+
+_MEASURED_SHARE = (0.02, 1.0)  # range of the measured curvature, as a share of the predicted one
+
+
+def with_measured_curvature(
+    problem: RadarProblem, state: RadarState, information: Float[np.ndarray, "F P P"]
+) -> Float[np.ndarray, "F P P"]:
+    """Information with the cost's measured curvature over yaw, x, y, dt and range bias.
+
+    On days of one speed, x, dt and the range bias share a valley that is far flatter than soft assignment
+    predicts.
+    """
+    dof = AZIMUTH_RANGE_DOF
+    total = information.sum(0)[np.ix_(dof, dof)]
+    measured = np.zeros_like(total)
+    for column, k in enumerate(dof):
+        step = np.zeros(UNKNOWNS)
+        step[k] = 0.05 * STEP_LIMIT[k]
+        ahead, behind = (_gradient(problem, state.moved(s)) for s in (step, -step))
+        measured[:, column] = (ahead - behind) / (2 * step[k])
+    # A standing car has no information on dt: what is added is far below any prior.
+    L = np.linalg.cholesky(total + np.diag(1e-3 / STEP_LIMIT[dof] ** 2))
+    W = np.linalg.solve(L, np.linalg.solve(L, 0.5 * (measured + measured.T)).T)
+    values, vectors = np.linalg.eigh(0.5 * (W + W.T))
+    root = L @ vectors
+    out = information.copy()
+    out[np.ix_(np.arange(len(out)), dof, dof)] += (
+        (root * np.clip(values, *_MEASURED_SHARE)) @ root.T - total
+    ) / len(out)
+    return out
+
+
+def _gradient(problem: RadarProblem, state: RadarState) -> np.ndarray:
+    g = linearise(problem, state, 1.0).g
+    return g.sum(0)[AZIMUTH_RANGE_DOF]
+
+
+# --------------------------------------------------------------------------------------------------
+# Observability analysis of lidar-radar: the degrees of freedom that the day determines, and their covariance.
+
 
 _REMAINING_STEPS = 10.0  # of dt, that count as uncertainty: the valley is flat
 

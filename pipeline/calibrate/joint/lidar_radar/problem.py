@@ -13,8 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipeline.calibrate.joint.lidar_radar.elevation_spread import ElevationSpread
-from pipeline.calibrate.joint.lidar_radar.seen_low import SeenLow
+from pipeline.calibrate.joint.lidar_radar.elevation_errors import ElevationSpread, SeenLow
 from pipeline.calibrate.joint.part_turn import PartTurn
 from pipeline.core.config import TERMS
 from pipeline.objective.radar.heights import Heights
