@@ -14,7 +14,7 @@ from pipeline.calibrate.judging import Judged, Judging
 from pipeline.calibrate.numerics.covariance import OBSERVABLE
 from pipeline.calibrate.select.frames import Selection
 from pipeline.rig.changes import change_between
-from pipeline.rig.checks import FailedCheck, change_of
+from pipeline.rig.checks import Check, change_of
 from pipeline.rig.edges import pose_columns
 from pipeline.rig.estimates import PairEstimate, Prior, Solution
 from pipeline.rig.evidence import EdgeEvidence
@@ -49,7 +49,7 @@ class SolvedDay:
     prior: Prior
     solution: Solution
     judged: Mapping[str, Judged]
-    failed: Mapping[str, Sequence[FailedCheck]]
+    failed: Mapping[str, Sequence[Check]]
     judging: Judging
     trigger_sample: Sequence[Observation]
     trigger_before: Mapping[str, Mapping[str, float]]
@@ -61,9 +61,7 @@ class SolvedDay:
 class Judge(Protocol):
     """Verdict on an estimate of an edge; `together`: other edges take part in it."""
 
-    def __call__(
-        self, estimate: PairEstimate, failed: Sequence[FailedCheck], *, together: bool
-    ) -> Judged: ...
+    def __call__(self, estimate: PairEstimate, failed: Sequence[Check], *, together: bool) -> Judged: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,12 +82,12 @@ class SolvedEdge:
     own: PairEstimate
     judged: Judged
     evidence: EdgeEvidence
-    failed: Sequence[FailedCheck]
+    failed: Sequence[Check]
     judge: Judge
     record: Callable[[PairEstimate, Judged], CalibrationRecord]
     is_active: bool = True
 
-    def with_checks(self, checks: Sequence[FailedCheck]) -> SolvedEdge:
+    def with_checks(self, checks: Sequence[Check]) -> SolvedEdge:
         """The edge, judged with failed checks of the whole rig besides."""
         failed = (*self.failed, *checks)
         judged = self.judge(self.own, failed, together=False)
@@ -179,7 +177,7 @@ def _own_columns(own: PairEstimate) -> dict[str, Any]:
 
 def _contradictions(
     solved: SolvedEdge, rig: AdjustedRig, adjusted: PairEstimate, estimates: Mapping[Edge, PairEstimate]
-) -> list[FailedCheck]:
+) -> list[Check]:
     """Contradictions of other edges to this one, of edges left out too unless they are known to be wrong.
 
     An edge that others in use confirm on another way is not contradicted by what is left out, and none is by an edge
@@ -206,10 +204,10 @@ def _contradictions(
         sentence = f"{who} contradict each other and nothing tells which is wrong"
         around = _around(edge, out[0], rig, estimates) if len(out) == 1 else None
         if around is None:  # nobody knows by how much
-            checks.append(FailedCheck(sentence, "witnesses_disagree"))
+            checks.append(Check(sentence, "witnesses_disagree"))
             continue
         error = change_of(change_between(adjusted.T, around[0]))
-        checks.append(FailedCheck(sentence, "witnesses_disagree", error=error, covariance=around[1]))
+        checks.append(Check(sentence, "witnesses_disagree", error=error, covariance=around[1]))
     return checks
 
 

@@ -24,7 +24,7 @@ from pipeline.core.config import FleetConfig
 from pipeline.core.errors import SolveError
 from pipeline.core.results import Progress, silent
 from pipeline.core.stage_work import Probes
-from pipeline.rig.checks import FailedCheck
+from pipeline.rig.checks import Check
 from pipeline.rig.day_prior import no_prior
 from pipeline.rig.estimates import Prior, Solution
 from pipeline.rig.graph import Edge
@@ -84,7 +84,7 @@ def solve_day(
         raise _named(err, motion.wrong) from err
 
 
-def _named(refusal: SolveError, wrong: Sequence[FailedCheck]) -> SolveError:
+def _named(refusal: SolveError, wrong: Sequence[Check]) -> SolveError:
     """A refusal whose reason begins with a wrong source of motion, if there is one."""
     if not wrong:
         return refusal
@@ -206,7 +206,7 @@ def _judging(
     active: Sequence[str],
     motion: MotionFindings,
     probe_deg: Probes,
-) -> tuple[Mapping[str, Sequence[FailedCheck]], Judging]:
+) -> tuple[Mapping[str, Sequence[Check]], Judging]:
     """Failed checks of all pairs, and inputs of their verdicts."""
     seen_by = next((o for o in observations if "camera" in o.sensors), None)
     turn = None if seen_by is None else camera_turn_sigma_rad(solution, prior.camera, seen_by.camera_K)
@@ -217,7 +217,7 @@ def _judging(
 
 def _judged(
     solution: Solution,
-    failed: Mapping[str, Sequence[FailedCheck]],
+    failed: Mapping[str, Sequence[Check]],
     judging: Judging,
     composed: Collection[str],
 ) -> dict[str, Judged]:
@@ -228,7 +228,7 @@ def _judged(
         held = [j.verdict for j in judged.values() if j.verdict.status != "accepted"]
         if pair in composed and held:
             disproved = any(v.disproved for v in held)
-            checks.append(FailedCheck("composed of a pair that is not accepted", disproves=disproved))
+            checks.append(Check("composed of a pair that is not accepted", disproves=disproved))
         judged[pair] = judging.pair(solution.pairs[pair], checks, together=pair in composed)
     return judged
 

@@ -44,7 +44,7 @@ from pipeline.calibrate.verify.verdict import Evidence, Verdict, judge, matters
 from pipeline.core.config import FleetConfig, VerifyConfig
 from pipeline.core.stage_work import NO_PROBES, Probes
 from pipeline.rig.changes import change_covariance
-from pipeline.rig.checks import FailedCheck
+from pipeline.rig.checks import Check
 from pipeline.rig.estimates import PairEstimate, Prior
 from pipeline.rig.evidence import EdgeEvidence
 from pipeline.rig.extrinsics import Extrinsics
@@ -70,7 +70,7 @@ class Judged:
     mounting_covariance: np.ndarray | None = None  # 6 6; None if the camera's mounting is unknown
     targets: np.ndarray = field(default_factory=lambda: DEFAULT_TARGETS)  # 3 3, in the child's frame
     probes: Mapping[str, float] = field(default_factory=dict)  # of `probe_numbers`
-    held_by: tuple[FailedCheck, ...] = ()  # of the checks of solver and day, those that matter
+    held_by: tuple[Check, ...] = ()  # of the checks of solver and day, those that matter
     # 6 6, left perturbation: what failed checks of an accepted pose leave open in a tilt that it does not certify.
     doubt: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
 
@@ -108,7 +108,7 @@ class Judging:
         frames = [self.observations[i] for i in held_out]
         return held_out_place(frames, self.prior, self.fleet.solve)
 
-    def pair(self, estimate: PairEstimate, failed: Sequence[FailedCheck], *, together: bool) -> Judged:
+    def pair(self, estimate: PairEstimate, failed: Sequence[Check], *, together: bool) -> Judged:
         """Judge one pair; `together` is true if other pairs take part in its pose (see `judge`)."""
         pair, limits = estimate.pair, self.fleet.verify.checks
         active = pair in self.active
@@ -117,12 +117,10 @@ class Judging:
         targets = seen_targets(pair, self.prior, self._views)
         unseen = [] if targets is not None else [unseen_failure(pair)]
         if active and not held_out:
-            unseen.append(
-                FailedCheck("the day has too few frames to hold any out, so the result is not checked")
-            )
+            unseen.append(Check("the day has too few frames to hold any out, so the result is not checked"))
         targets = DEFAULT_TARGETS if targets is None else targets
         test, claims, probes, elsewhere = self._held_out(estimate, held_out, mounting, targets)
-        disproved = [FailedCheck(estimate.disproved, disproves=True)] if estimate.disproved else []
+        disproved = [Check(estimate.disproved, disproves=True)] if estimate.disproved else []
         prior_sigma = np.sqrt(np.diag(self.prior.covariance(pair)))
         search = search_range(self.prior.sigmas, self.fleet.solve)
         result = _result(estimate, self.prior.of(pair), prior_sigma, search, targets)
@@ -144,7 +142,7 @@ class Judging:
         held_out: Sequence[Observation],
         mounting: np.ndarray | None,
         targets: np.ndarray,
-    ) -> tuple[HeldOutTest | None, Mapping[str, Claim], dict[str, float], list[FailedCheck]]:
+    ) -> tuple[HeldOutTest | None, Mapping[str, Claim], dict[str, float], list[Check]]:
         """Held-out frames at the prior and at the result, the remaining claim, known turns, and a better place."""
         pair, verify, prior = estimate.pair, self.fleet.verify, self.prior
         limits = verify.checks
@@ -263,7 +261,7 @@ class EdgeJudging:
         )  # fmt: skip
         return cls(evidence, alone.before, estimate, prior, views, fleet)
 
-    def edge(self, estimate: PairEstimate, failed: Sequence[FailedCheck], *, together: bool) -> Judged:
+    def edge(self, estimate: PairEstimate, failed: Sequence[Check], *, together: bool) -> Judged:
         """Judge it at an estimate; `together` is true if other edges take part in its pose (see `judge`)."""
         edge, checks = self.evidence.edge, self.fleet.verify.checks
         targets = targets_of(estimate.T, self.views.get(edge.parent.name), self.views.get(edge.child.name))

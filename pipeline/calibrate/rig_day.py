@@ -26,7 +26,7 @@ from pipeline.core.config import FleetConfig
 from pipeline.core.errors import SolveError
 from pipeline.core.results import Progress, silent
 from pipeline.objective.ego_motion import mean_heading, shown_heading
-from pipeline.rig.checks import FailedCheck
+from pipeline.rig.checks import Check
 from pipeline.rig.day_prior import no_prior, prior_of_three
 from pipeline.rig.estimates import Prior
 from pipeline.rig.graph import BASE, Edge, RigGraph
@@ -139,7 +139,7 @@ def _adjusted(
     return edges, adjusted_rig(day.graph, prior, edges, fleet.solve.time_offset_sigma_s)
 
 
-def _held_if_moved(edge: SolvedEdge, moved: Sequence[FailedCheck]) -> SolvedEdge:
+def _held_if_moved(edge: SolvedEdge, moved: Sequence[Check]) -> SolvedEdge:
     """The edge, held if other edges show that a sensor of it moved during the day."""
     return edge if not moved or "moved_in_day" in edge.judged.verdict.faults else edge.with_checks(moved)
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from pipeline.core.rigs import CameraPrior
 from pipeline.rig.changes import change_between
-from pipeline.rig.checks import FailedCheck
+from pipeline.rig.checks import Check
 from pipeline.rig.se3 import adjoint
 
 __all__ = ["DayParts", "PairEstimate", "Prior", "Solution"]
@@ -123,7 +123,7 @@ class PairEstimate:
     notes: list[str] = field(default_factory=list)
     # 6 6, from errors common to all days of a vehicle; part of covariance.
     common_covariance: np.ndarray | None = None
-    failed_checks: list[FailedCheck] = field(default_factory=list)  # checks of the solver, on this pair alone
+    failed_checks: list[Check] = field(default_factory=list)  # checks of the solver, on this pair alone
     parts: DayParts | None = None  # None if the day is too short, or if the method does not cut it
     disproved: str = ""  # why the estimate is certainly wrong, if a check of the solver shows that
     # Covariances 6 6 (left perturbation) of errors common to all frames, parts of `covariance`: by "camera",
@@ -164,4 +164,4 @@ class Solution:
     loop_rotation_rad: float | None = None
     loop_translation_m: float | None = None
     # Failed checks while solving, by pair: starts or halves disagree, camera contradicts radar.
-    failed_checks: dict[str, list[FailedCheck]] = field(default_factory=dict)
+    failed_checks: dict[str, list[Check]] = field(default_factory=dict)

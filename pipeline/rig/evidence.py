@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pipeline.rig.checks import FailedCheck
+from pipeline.rig.checks import Check
 from pipeline.rig.estimates import DayParts
 from pipeline.rig.graph import Edge
 
@@ -61,7 +61,7 @@ class EdgeEvidence:
     bias: Mapping[str, np.ndarray] = field(default_factory=dict)
     frames_used: int = 0
     frames_rejected: Mapping[str, int] = field(default_factory=dict)
-    checks: tuple[FailedCheck, ...] = ()
+    checks: tuple[Check, ...] = ()
     diagnostics: Mapping[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     others: OtherScenes | None = None

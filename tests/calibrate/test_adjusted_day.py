@@ -1,11 +1,9 @@
 """Pairs estimated apart, adjusted together and judged again: what each record says then."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from pipeline.rig.checks import FailedCheck
+from pipeline.rig.checks import Check
 from pipeline.rig.estimates import PairEstimate, Prior, Solution
 from pipeline.rig.se3 import exp_se3, log_se3
 from schemas.calibrations import PAIRS
@@ -45,7 +43,7 @@ def day():
 
 
 def records(day, failed=None, **changes):
-    solution = Solution("joint", estimates(**changes), failed_checks=failed or {}, apart=True)
+    solution = Solution("joint", estimates(**changes), failed_checks=failed or {})
     return records_of(day, PRIOR, solver=lambda *_, **__: solution)
 
 
@@ -64,7 +62,7 @@ def test_camera_and_radar_that_hardly_know_their_pose_are_certified_by_the_other
 
 
 def test_an_edge_that_failed_a_check_keeps_its_pose_and_turns_no_other(day):
-    lost = {"camera_lidar": [FailedCheck("lost at sea", disproves=True)]}
+    lost = {"camera_lidar": [Check("lost at sea", disproves=True)]}
     found = records(day, lost, yaw_deg={"camera_lidar": 1.0})
     assert found["camera_lidar"].status == "held"
     assert found["camera_lidar"].reason.startswith("lost at sea")
@@ -116,7 +114,7 @@ def test_a_tilt_in_doubt_is_in_the_covariance_so_that_nobody_takes_it_for_sure(d
 
     determined, sure, _ = sigma_deg()
     assert determined == ["azimuth", "elevation"]
-    pitch = FailedCheck("the other half says", error=(0.0, np.radians(1.5), 0.0, 0.0, 0.0, 0.0))
+    pitch = Check("the other half says", error=(0.0, np.radians(1.5), 0.0, 0.0, 0.0, 0.0))
     determined, doubted, common = sigma_deg(lidar_radar=[pitch])
     assert determined == ["azimuth"]
     assert doubted[1] > 1.0 > 10 * sure[1]
@@ -125,14 +123,14 @@ def test_a_tilt_in_doubt_is_in_the_covariance_so_that_nobody_takes_it_for_sure(d
 
 
 def test_a_held_edge_that_is_not_known_to_be_wrong_still_contradicts(day):
-    held = {"camera_lidar": [FailedCheck("another CameraInfo")]}
+    held = {"camera_lidar": [Check("another CameraInfo")]}
     found = records(day, held, roll_deg={"camera_radar": 1.5})
     assert "camera-lidar and the other edges contradict" in found["lidar_radar"].reason
     agreeing = records(day, held)["lidar_radar"]
     assert (agreeing.status, agreeing.determined) == ("accepted", ["azimuth", "elevation"])
 
 
-def test_pairs_that_were_not_estimated_apart_stay_as_their_method_has_them(day):
-    solution = replace(Solution("joint", estimates(yaw_deg={"camera_radar": 0.3})), apart=False)
-    found = records_of(day, PRIOR, solver=lambda *_, **__: solution)
+def test_a_method_of_three_sensors_keeps_the_pairs_as_it_has_them(day):
+    solution = Solution("tracking", estimates(yaw_deg={"camera_radar": 0.3}))
+    found = records_of(day, PRIOR, "tracking", solver=lambda *_, **__: solution)
     assert error_deg(found["camera_radar"]) == pytest.approx(0.3)

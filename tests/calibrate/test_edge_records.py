@@ -10,7 +10,7 @@ from pipeline.calibrate.edges.radar_base import estimate_radar_base
 from pipeline.calibrate.judging import EdgeJudging
 from pipeline.calibrate.records import Inputs, record_of_edge
 from pipeline.rig.changes import change_between
-from pipeline.rig.checks import FailedCheck
+from pipeline.rig.checks import Check
 from pipeline.rig.evidence import EdgeEvidence, OtherScenes
 from pipeline.rig.graph import BASE, Edge, Sensor
 from pipeline.rig.prior import RigPrior
@@ -154,7 +154,7 @@ def test_two_lidars_need_a_better_alignment_of_scenes_that_took_no_part(after, s
 
 def test_what_an_estimator_names_is_held_and_left_out():
     T = mounted(0.0)
-    failed = replace(sure(EDGE, T), checks=(FailedCheck("halves differ", "witnesses_disagree"),))
+    failed = replace(sure(EDGE, T), checks=(Check("halves differ", "witnesses_disagree"),))
     found, record = judged(failed, T)
     assert (record.status, record.faults) == ("held", ["witnesses_disagree"])
     assert found.against[0].fault == "witnesses_disagree"

@@ -7,7 +7,7 @@ from pipeline.calibrate.adjust.rig import AdjustedEdge, AdjustedRig, AdjustedSen
 from pipeline.calibrate.pose_rows import pose_rows
 from pipeline.calibrate.records import Inputs
 from pipeline.core.config import VerifyConfig
-from pipeline.rig.checks import FailedCheck
+from pipeline.rig.checks import Check
 from pipeline.rig.evidence import EdgeEvidence
 from pipeline.rig.extrinsics import Extrinsics
 from pipeline.rig.graph import RigGraph, Sensor, edge_between
@@ -32,7 +32,7 @@ def test_a_sure_prior_alone_certifies_nothing(seen, status):
 
 
 def test_a_sensor_whose_edges_are_all_left_out_says_what_fault_they_name():
-    checks = (FailedCheck("too few held-out frames"), FailedCheck("the nose moved", "moved_in_day"))
+    checks = (Check("too few held-out frames"), Check("the nose moved", "moved_in_day"))
     evidence = EdgeEvidence(EDGE, np.eye(4), 0.0, np.eye(7), np.zeros(7), checks=checks)
     poses = Extrinsics(TOP, {"top": np.eye(4), "nose": np.eye(4)}, ("nose",), np.eye(6), np.eye(6))
     untied = AdjustedSensor(

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from scipy.linalg import eigh
 
 from pipeline.rig.changes import change_between, change_covariance, change_jacobian
-from pipeline.rig.checks import FailedCheck
+from pipeline.rig.checks import Check
 from pipeline.rig.estimates import PairEstimate, Prior
 from pipeline.rig.evidence import EDGE, EdgeEvidence
 from pipeline.rig.graph import Edge
@@ -34,7 +34,7 @@ def evidence_of(
     edge: Edge,
     prior: Prior,
     clock_sigma_s: float,
-    checks: Sequence[FailedCheck] = (),
+    checks: Sequence[Check] = (),
 ) -> EdgeEvidence:
     """The estimate without its prior.
 
@@ -50,7 +50,7 @@ def evidence_of(
     information[6, 6], gradient[6] = _clock(estimate, clock_sigma_s)
     failed = list(checks)
     if estimate.disproved:
-        failed.append(FailedCheck(estimate.disproved, disproves=True))
+        failed.append(Check(estimate.disproved, disproves=True))
     return EdgeEvidence(
         edge,
         estimate.T,

@@ -20,7 +20,7 @@ from pipeline.calibrate.adjust.equations import (
 )
 from pipeline.calibrate.numerics.covariance import OBSERVABLE
 from pipeline.rig.changes import change_jacobian
-from pipeline.rig.checks import FailedCheck
+from pipeline.rig.checks import Check
 from pipeline.rig.common_share import common_part
 from pipeline.rig.evidence import EdgeEvidence
 from pipeline.rig.extrinsics import Extrinsics
@@ -59,7 +59,7 @@ class AdjustedEdge:
 
     evidence: EdgeEvidence
     innovation_sigmas: float | None
-    failed: tuple[FailedCheck, ...] = ()
+    failed: tuple[Check, ...] = ()
     doubts: tuple[Edge, ...] = ()
 
     @property
@@ -260,9 +260,9 @@ def _left(equations: Equations, edge: LinearEdge) -> float:
     return float(np.linalg.slogdet(equations.without(edge).H)[1])
 
 
-def _contradiction(edge: Edge, rivals: Collection[Edge], sigmas: float) -> FailedCheck:
+def _contradiction(edge: Edge, rivals: Collection[Edge], sigmas: float) -> Check:
     others = "" if not rivals else f", or {', '.join(e.name for e in rivals)} is wrong"
-    return FailedCheck(
+    return Check(
         f"{edge.name} contradicts the other edges by {sigmas:.1f} sigmas{others}",
         "witnesses_disagree",
     )

@@ -27,7 +27,7 @@ from pipeline.calibrate.edges.on_base import (
 )
 from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.core.errors import SolveError
-from pipeline.rig.checks import FailedCheck
+from pipeline.rig.checks import Check
 from pipeline.rig.evidence import EDGE, EdgeEvidence
 from pipeline.rig.graph import BASE, Edge
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
@@ -188,12 +188,12 @@ def _clock(travel: CameraTravel, T: np.ndarray) -> Regression | None:
     return regress(Rows(design, turned - base, sigma, _bends(travel), priors, one).some(known))
 
 
-def _checks(edge: Edge, clock: Regression | None) -> tuple[FailedCheck, ...]:
+def _checks(edge: Edge, clock: Regression | None) -> tuple[Check, ...]:
     """An image that is mirrored turns the other way."""
     if clock is None or 1 + clock.value[1] + 3 * np.sqrt(clock.covariance[1, 1]) > 0:
         return ()
     told = f"{edge.parent.name} turns right where the car turns left: a mirrored image, or a yaw rate of the wrong sign"
-    return (FailedCheck(told, "orientation", disproves=True),)
+    return (Check(told, "orientation", disproves=True),)
 
 
 def _biases(edge: Edge, T: np.ndarray) -> dict[str, np.ndarray]:

@@ -35,7 +35,7 @@ from pipeline.calibrate.edges.on_base import (
 from pipeline.calibrate.edges.sweep_travel import Sweep, SweepTravel, deskewed_again, sweep_travel, sweeps_of
 from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.objective.ego_motion import EgoMotion
-from pipeline.rig.checks import FailedCheck
+from pipeline.rig.checks import Check
 from pipeline.rig.evidence import EDGE, EdgeEvidence, OtherScenes
 from pipeline.rig.graph import BASE, Edge
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse, transform_points
@@ -145,7 +145,7 @@ def estimate_lidar_base(
         found = shown.axis(name)
         if found is not None:
             change[k], variance[k] = found
-    checks = list[FailedCheck]()
+    checks = list[Check]()
     if height_m is not None:
         off_m = height_m[0] + road_z_m - T[2, 3]
         change[3], variance[3], contradicts = _with_measured(change[3], variance[3], off_m, height_m[1])
@@ -219,13 +219,13 @@ def _angle(a: np.ndarray, b: np.ndarray) -> float:
 
 def _with_measured(
     change: float, variance: float, off_m: float, sigma_m: float
-) -> tuple[float, float, list[FailedCheck]]:
+) -> tuple[float, float, list[Check]]:
     """The height from the road combined with a measured one."""
     if not np.isfinite(variance):
         return off_m, sigma_m**2, []
     apart = abs(off_m - change) / np.sqrt(variance + sigma_m**2 + STANCE[3] ** 2 + _RANGES_M**2)
     told = f"the road shows a height {100 * (change - off_m):+.0f} cm beside the measured one"
-    checks = [FailedCheck(told, "witnesses_disagree")] if apart > _MEASURED_SIGMAS else []
+    checks = [Check(told, "witnesses_disagree")] if apart > _MEASURED_SIGMAS else []
     total = 1 / (1 / variance + 1 / sigma_m**2)
     return total * (change / variance + off_m / sigma_m**2), total, checks
 

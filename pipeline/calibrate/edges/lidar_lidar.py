@@ -22,7 +22,7 @@ from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.core.errors import SolveError
 from pipeline.objective.ego_motion import EgoMotion
 from pipeline.objective.sweep_registration import Surfaces, plane_equations
-from pipeline.rig.checks import FailedCheck
+from pipeline.rig.checks import Check
 from pipeline.rig.estimates import DayParts
 from pipeline.rig.evidence import EDGE, EdgeEvidence, OtherScenes
 from pipeline.rig.graph import BASE, Edge
@@ -277,7 +277,7 @@ def _equations(moments: Sequence[_Moment], X: np.ndarray, dt_s: float, gate_m: f
     return _End(X, dt_s, H, g, shares, float(np.median(scatter)) if scatter else float("nan"))
 
 
-def _other_ends(ends: Sequence[_End]) -> tuple[FailedCheck, ...]:
+def _other_ends(ends: Sequence[_End]) -> tuple[Check, ...]:
     """Whether another start leads to a different pose with an equally good fit."""
     best = ends[0]
     apart = [
@@ -286,7 +286,7 @@ def _other_ends(ends: Sequence[_End]) -> tuple[FailedCheck, ...]:
         if rotation_angle_rad(inverse(best.X) @ other.X) > _APART_RAD and other.share > _NEARLY * best.share
     ]
     told = "another start leads to another pose with as many matching points"
-    return (FailedCheck(told, "witnesses_disagree"),) if apart else ()
+    return (Check(told, "witnesses_disagree"),) if apart else ()
 
 
 def _floor(pair: LidarPair, moments: Sequence[_Moment]) -> np.ndarray:

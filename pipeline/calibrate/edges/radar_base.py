@@ -33,7 +33,7 @@ from pipeline.calibrate.verify.motion_sources import compared_sources
 from pipeline.core.errors import SolveError
 from pipeline.objective.ego_motion import DopplerMotion, EgoMotion
 from pipeline.objective.radar.travel import TravelDirections, travel_directions
-from pipeline.rig.checks import FailedCheck
+from pipeline.rig.checks import Check
 from pipeline.rig.evidence import EDGE, EdgeEvidence
 from pipeline.rig.graph import BASE, Edge
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
@@ -235,5 +235,5 @@ def _turned_round(edge: Edge, radar: DopplerMotion) -> EdgeEvidence:
     nothing, moments = np.zeros((7, 7)), int(np.isfinite(radar.velocity_mps).all(1).sum())
     return EdgeEvidence(
         edge, inverse(radar.T_base_radar), 0.0, nothing, nothing[0], frames_used=moments,
-        checks=(FailedCheck(f"{shown}: {fits}", "doppler"),),
+        checks=(Check(f"{shown}: {fits}", "doppler"),),
     )  # fmt: skip

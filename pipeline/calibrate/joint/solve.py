@@ -23,7 +23,7 @@ from pipeline.core.config import SolveConfig
 from pipeline.core.errors import SolveError
 from pipeline.core.results import Progress, silent
 from pipeline.objective.ego_motion import mean_heading, shown_heading
-from pipeline.rig.checks import FailedCheck
+from pipeline.rig.checks import Check
 from pipeline.rig.estimates import PairEstimate, Prior, Solution
 from pipeline.rig.se3 import compose_covariance, inverse, log_so3
 from schemas.calibrations import PAIRS
@@ -36,7 +36,7 @@ _NO_OFFSET_S, _ANYWHERE_M = 1e-4, 10.0
 # The radar's turn gives the heading: lidar-radar comes first.
 _ORDER = ("lidar_radar", "camera_lidar", "camera_radar")
 
-_Found = tuple[PairEstimate, list[FailedCheck]]
+_Found = tuple[PairEstimate, list[Check]]
 
 
 def solve_joint(
@@ -61,7 +61,7 @@ def solve_joint(
             try:
                 found[pair] = _solved(pair, observations[pair], prior, config, seed, found)
             except SolveError as err:
-                found[pair] = found[pair][0], [FailedCheck(err.reason, err.fault)]
+                found[pair] = found[pair][0], [Check(err.reason, err.fault)]
     progress(len(observations), len(observations), "done")
     pairs = {pair: found[pair][0] for pair in PAIRS if pair in found}
     checks = {pair: found[pair][1] for pair in pairs if found[pair][1]}

@@ -19,7 +19,7 @@ from pipeline.objective.paper.camera_radar import CameraRadarLoss, camera_radar_
 from pipeline.objective.paper.lidar_radar import LidarRadarLoss, lidar_radar_loss
 from pipeline.objective.paper.loop import joint_objective, loop_loss, loop_transform
 from pipeline.rig.changes import changed
-from pipeline.rig.checks import FailedCheck
+from pipeline.rig.checks import Check
 from pipeline.rig.common_share import common_of
 from pipeline.rig.estimates import PairEstimate, Prior, Solution
 from pipeline.rig.se3 import exp_se3, rotation_angle_rad
@@ -175,10 +175,10 @@ def loop_size(pairs: Mapping[str, PairEstimate]) -> tuple[float | None, float | 
     return float(rotation_angle_rad(loop)), float(np.linalg.norm(loop[:3, 3]))
 
 
-def border_failures(pairs: Mapping[str, PairEstimate]) -> dict[str, list[FailedCheck]]:
+def border_failures(pairs: Mapping[str, PairEstimate]) -> dict[str, list[Check]]:
     """A minimum at the border of the search box is none: the loss may fall further outside."""
     return {
-        pair: [FailedCheck("the minimum lies at the border of the search range")]
+        pair: [Check("the minimum lies at the border of the search range")]
         for pair, estimate in pairs.items()
         if estimate.diagnostics.get("at_search_border")
     }

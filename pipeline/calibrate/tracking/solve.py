@@ -42,7 +42,7 @@ from pipeline.calibrate.tracking.object_tracks import (
 from pipeline.core.config import SolveConfig
 from pipeline.core.errors import SolveError
 from pipeline.core.results import Progress, silent
-from pipeline.rig.checks import FailedCheck
+from pipeline.rig.checks import Check
 from pipeline.rig.common_share import common_of
 from pipeline.rig.estimates import PairEstimate, Prior, Solution
 from pipeline.rig.se3 import compose_covariance, inverse, log_so3
@@ -99,7 +99,7 @@ def solve_tracking(
     sensors = _tracked(frames, prior)
     wanted = set(triggered) | ({"camera_lidar", "lidar_radar"} if "camera_radar" in triggered else set())
     pairs: dict[str, PairEstimate] = {}
-    failed_checks: dict[str, list[FailedCheck]] = {pair: [] for pair in PAIRS}
+    failed_checks: dict[str, list[Check]] = {pair: [] for pair in PAIRS}
     for k, pair in enumerate(("camera_lidar", "lidar_radar")):
         progress(1 + k, 3, pair)
         pairs[pair] = PairEstimate.at_prior(pair, prior)
@@ -113,7 +113,7 @@ def solve_tracking(
                 pair, sensors[pair], prior, np.random.default_rng([seed, k]), frames=rows
             )
         except SolveError as err:
-            failed_checks[pair].append(FailedCheck(err.reason, err.fault))
+            failed_checks[pair].append(Check(err.reason, err.fault))
     failed = [pair for pair in pairs if pair in wanted and failed_checks[pair]]
     if failed and len(failed) == len(wanted & set(pairs)):
         raise SolveError(

@@ -14,7 +14,7 @@ import numpy as np
 
 from pipeline.rig.attribution import PairShift, attribute
 from pipeline.rig.changes import change_between, change_jacobian
-from pipeline.rig.checks import FailedCheck
+from pipeline.rig.checks import Check
 from pipeline.rig.edges import EDGE_OF_PAIR
 from pipeline.rig.estimates import DayParts, PairEstimate
 from pipeline.rig.graph import BASE, Edge
@@ -32,14 +32,14 @@ _ANY_RAD, _ANY_M = np.radians(20.0), 0.05
 _OF_CAMERA, _OF_OTHERS = ("pitch", "yaw", "roll"), ("roll", "pitch", "yaw")  # turns about the parent's axes
 
 
-def constancy_failures(estimates: Mapping[str, PairEstimate]) -> dict[str, list[FailedCheck]]:
+def constancy_failures(estimates: Mapping[str, PairEstimate]) -> dict[str, list[Check]]:
     """`moved_failures` of the pairs of three sensors, by pair."""
     of_edge = {EDGE_OF_PAIR[pair]: estimate for pair, estimate in estimates.items()}
     parts = {edge: e.parts for edge, e in of_edge.items() if e.parts is not None and e.observable.any()}
     return {edge.kind: checks for edge, checks in moved_failures(parts, of_edge).items()}
 
 
-def moved_failures(parts: Mapping[Edge, DayParts], edges: Collection[Edge]) -> dict[Edge, list[FailedCheck]]:
+def moved_failures(parts: Mapping[Edge, DayParts], edges: Collection[Edge]) -> dict[Edge, list[Check]]:
     """Edges whose parts contradict each other, and the other edges of the sensors that may have moved."""
     size = {edge: float(np.abs(p.sigmas(PART_FLOOR_RAD)).max()) for edge, p in parts.items()}
     moved = [edge for edge in parts if size[edge] > MOVED_SIGMAS]
@@ -62,20 +62,18 @@ def moved_failures(parts: Mapping[Edge, DayParts], edges: Collection[Edge]) -> d
     for edge in edges:
         if edge not in failed and {s.name for s in edge.sensors} & set(sensors):
             sentence = f"the {' or '.join(sensors)} moved during the day, as {surest.name} shows"
-            failed[edge] = [FailedCheck(sentence, "moved_in_day")]
+            failed[edge] = [Check(sentence, "moved_in_day")]
     return failed
 
 
-def _failure(edge: Edge, parts: DayParts, sigmas: float, sensors: list[str]) -> FailedCheck:
+def _failure(edge: Edge, parts: DayParts, sigmas: float, sensors: list[str]) -> Check:
     axis = int(np.argmax(np.abs(parts.sigmas(PART_FLOOR_RAD))))
     first, last = (datetime.fromtimestamp(ns / 1e9, UTC).strftime("%H:%M:%S") for ns in parts.cut_ns)
     names = _OF_CAMERA if edge.parent.kind == "camera" else _OF_OTHERS
     size = f"{names[axis]} turned by about {np.degrees(parts.step[axis]):+.2f} deg ({sigmas:.1f} sigma)"
     ends = [s.name for s in edge.sensors]
     who = " or ".join([s for s in ends if s in sensors] or ends)
-    return FailedCheck(
-        f"{size} within the day, between {first} and {last} UTC: the {who} moved", "moved_in_day"
-    )
+    return Check(f"{size} within the day, between {first} and {last} UTC: the {who} moved", "moved_in_day")
 
 
 def _shift(parts: DayParts, is_tilt_known: bool) -> PairShift:

@@ -15,7 +15,7 @@ from pipeline.calibrate.verify.motion_sources import MotionFindings
 from pipeline.core.config import ChecksConfig, FleetConfig
 from pipeline.objective.stamp_gaps import camera_gaps_s, constant_gap_s
 from pipeline.rig.changes import change_between, change_covariance, change_jacobian
-from pipeline.rig.checks import Change, FailedCheck, change_of
+from pipeline.rig.checks import Change, Check, change_of
 from pipeline.rig.estimates import PairEstimate, Prior, Solution
 from pipeline.rig.se3 import adjoint, compose_covariance, inverse
 from pipeline.rig.targets import target_jacobian, target_sigmas
@@ -42,7 +42,7 @@ __all__ = [
 # Each states by how much a pose would be wrong if it is right, so that only what matters holds a record.
 
 
-def loop_failures(solution: Solution, limits: ChecksConfig | None = None) -> dict[str, list[FailedCheck]]:
+def loop_failures(solution: Solution, limits: ChecksConfig | None = None) -> dict[str, list[Check]]:
     """A loop of independent estimates that does not close within its sigma, by pair: any of them may be wrong.
 
     Each would have to move by what closes the loop.
@@ -61,7 +61,7 @@ def loop_failures(solution: Solution, limits: ChecksConfig | None = None) -> dic
         sentences.append(f"the loop is open by {open_m:.3f} m, its sigma is {translation:.3f} m")
     return {
         pair: [
-            FailedCheck(s, "witnesses_disagree", error=_change(solution, pair, T), covariance=covariance)
+            Check(s, "witnesses_disagree", error=_change(solution, pair, T), covariance=covariance)
             for s in sentences
         ]
         for pair, (T, covariance) in (_by_others(solution) if sentences else {}).items()
@@ -90,7 +90,7 @@ def heading_failures(
     prior: Prior,
     observations: Sequence[Observation],
     limits: ChecksConfig | None = None,
-) -> list[FailedCheck]:
+) -> list[Check]:
     """Failed check of camera-lidar if the heading that it was solved with contradicts the prior.
 
     A camera's time offset moves the cloud along the car's heading, which the radar's mounting gives. If
@@ -116,7 +116,7 @@ def heading_failures(
     off = f"heading off by {np.degrees(turn):.1f} deg between prior and lidar-radar"
     sentence = f"{off}: up to {lateral_m:.2f} m lateral error through the camera's time offset"
     error = change_of([0.0, 0.0, 0.0, *(lateral_m * found.T[:3, 1])])  # along the lidar's y
-    return [FailedCheck(sentence, error=error)] if lateral_m else []
+    return [Check(sentence, error=error)] if lateral_m else []
 
 
 def loop_sigmas(solution: Solution) -> tuple[float, float] | None:
@@ -139,13 +139,13 @@ def _loop_covariance(solution: Solution) -> np.ndarray:
 # Whether a day shows enough different scenes for anything to be certified: frames of a standing car are one.
 
 
-def scene_failures(fitted: Sequence[Observation]) -> list[FailedCheck]:
+def scene_failures(fitted: Sequence[Observation]) -> list[Check]:
     """A failed check for a fit to few scenes: errors common to them are in held-out frames too."""
     scenes = len(np.unique(scenes_of(fitted)))
     if scenes >= FEWEST_SCENES or not fitted:
         return []
     shown = f"its {len(fitted)} frames show {scenes} different scene{'s' * (scenes != 1)}"
-    return [FailedCheck(f"too few scenes: {shown}, needs {FEWEST_SCENES}", "few_scenes")]
+    return [Check(f"too few scenes: {shown}, needs {FEWEST_SCENES}", "few_scenes")]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -174,12 +174,12 @@ _LIDAR_PAIRS = ("camera_lidar", "lidar_radar")
 
 def prior_alarms(
     pairs: Mapping[str, PairEstimate], prior: Prior, limits: ChecksConfig
-) -> dict[str, list[FailedCheck]]:
+) -> dict[str, list[Check]]:
     """Positions left at the prior that the day's data contradict."""
     sigma_m = f"{prior.translation_sigma_m:g}"
     return {
         pair: [
-            FailedCheck(
+            Check(
                 f"the day itself puts {DOF_NAMES[k]} {shift:+.2f} +- {own:.2f} m from the prior, whose sigma is"
                 f" {sigma_m} m: measure the mounting",
                 "prior",
@@ -209,7 +209,7 @@ def _is_far(estimate: PairEstimate, k: int, prior: Prior, limits: ChecksConfig) 
 
 def clock_alarms(
     pairs: Mapping[str, PairEstimate], sigma_s: float, limits: ChecksConfig
-) -> dict[str, list[FailedCheck]]:
+) -> dict[str, list[Check]]:
     """Time offsets beyond `time_offset_sigma_s`, estimated or at the end of the search range."""
     out = {}
     for pair, estimate in pairs.items():
@@ -226,13 +226,13 @@ def clock_alarms(
             shown = f"the stamps are apart by {shown} ({1e3 * sigma_s:.0f} ms)"
         else:
             continue
-        out[pair] = [FailedCheck(f"{shown}: set the clocks, or state how far they may be off", "time_offset")]
+        out[pair] = [Check(f"{shown}: set the clocks, or state how far they may be off", "time_offset")]
     return out
 
 
 def edge_alarms(
     pairs: Mapping[str, PairEstimate], prior: Prior, limits: ChecksConfig
-) -> dict[str, list[FailedCheck]]:
+) -> dict[str, list[Check]]:
     """Alarms for camera-lidar or lidar-radar if the other one contradicts the lidar's mounting on which it depends."""
     out = {}
     for seen, resting in (_LIDAR_PAIRS, _LIDAR_PAIRS[::-1]):
@@ -247,7 +247,7 @@ def edge_alarms(
             continue
         axes = ", ".join(DOF_NAMES[k] for k in np.flatnonzero(_kept(pairs[resting], hidden)))
         why = f"{seen} contradicts the prior: if it is the lidar that is mounted elsewhere, then {axes} is wrong"
-        out[resting] = [FailedCheck(f"{why} here, where the day left it to the prior", "prior")]
+        out[resting] = [Check(f"{why} here, where the day left it to the prior", "prior")]
     return out
 
 
@@ -309,37 +309,37 @@ class FoundDay:
     motion: MotionFindings
 
 
-DayCheck = Callable[[FoundDay], Mapping[str, Sequence[FailedCheck]]]
+DayCheck = Callable[[FoundDay], Mapping[str, Sequence[Check]]]
 
 
-def _motion(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:
+def _motion(day: FoundDay) -> Mapping[str, Sequence[Check]]:
     """Sweeps are de-skewed, and stamps bridged, by the car's motion: a pair is right where its source of it is."""
     return {pair: day.motion.of(pair) for pair in PAIRS}
 
 
-def _solver(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:
+def _solver(day: FoundDay) -> Mapping[str, Sequence[Check]]:
     """Failed checks of the solver."""
     return day.solution.failed_checks
 
 
-def _heading(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:
+def _heading(day: FoundDay) -> Mapping[str, Sequence[Check]]:
     return {"camera_lidar": heading_failures(day.solution, day.prior, day.observations, day.limits)}
 
 
-def _loop(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:
+def _loop(day: FoundDay) -> Mapping[str, Sequence[Check]]:
     return loop_failures(day.solution, day.limits)
 
 
-def _scenes(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:
+def _scenes(day: FoundDay) -> Mapping[str, Sequence[Check]]:
     fitted = day.selection.fit.items()
     return {pair: scene_failures([day.observations[i] for i in frames]) for pair, frames in fitted}
 
 
-def _constancy(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:
+def _constancy(day: FoundDay) -> Mapping[str, Sequence[Check]]:
     return constancy_failures(day.solution.pairs)
 
 
-def _alarms(day: FoundDay) -> Mapping[str, Sequence[FailedCheck]]:
+def _alarms(day: FoundDay) -> Mapping[str, Sequence[Check]]:
     """Mountings and clocks many sigmas from their priors."""
     pairs = {p: e for p, e in day.solution.pairs.items() if e.frames_used}
     sigma_s = day.fleet.solve.time_offset_sigma_s
@@ -363,7 +363,7 @@ DAY_CHECKS: tuple[DayCheck, ...] = (
 )
 
 
-def checks_of_day(day: FoundDay) -> dict[str, list[FailedCheck]]:
+def checks_of_day(day: FoundDay) -> dict[str, list[Check]]:
     """Failed checks of every pair, each once."""
     found = [check(day) for check in DAY_CHECKS]
     return {

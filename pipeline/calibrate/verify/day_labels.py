@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from scipy.special import ndtr, stdtrit
 
 from pipeline.calibrate.numerics.frame_blocks import scene_blocks
-from pipeline.rig.checks import HARMLESS, FailedCheck
+from pipeline.rig.checks import HARMLESS, Check
 from pipeline.rig.estimates import PairEstimate, Solution
 from schemas.observations import Observation
 
@@ -244,15 +244,15 @@ class DayLabels:
         pairs = solution.pairs | {"camera_lidar": self._widened(solution.pairs["camera_lidar"])}
         return replace(solution, pairs=pairs, failed_checks=failed)
 
-    def _check(self, solution: Solution) -> FailedCheck:
+    def _check(self, solution: Solution) -> Check:
         said = f"labels are offset from their image: {self.offset.in_words} ({_CAUSES})"
         if self.moved_px is None:
-            return FailedCheck(said, "labels_offset")
+            return Check(said, "labels_offset")
         d = solution.pairs["camera_lidar"].diagnostics
         turned = [f"{name} by {d[f'labels_moved_{name}_deg']:+.2f} deg"
                   for name in ("pitch", "yaw") if f"labels_moved_{name}_deg" in d]  # fmt: skip
         effect = f", which turned {' and '.join(turned)}" if turned else ""
-        return FailedCheck(f"{said}; they are moved back{effect}", "labels_offset", error=HARMLESS)
+        return Check(f"{said}; they are moved back{effect}", "labels_offset", error=HARMLESS)
 
     def _widened(self, estimate: PairEstimate) -> PairEstimate:
         """Labels too far right rotate the camera about its y axis, labels too far down about its x axis."""

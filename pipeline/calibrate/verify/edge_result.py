@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from pipeline.calibrate.numerics.search_range import SearchRange
 from pipeline.calibrate.verify.target_accuracy import DIRECTIONS, Claim
 from pipeline.rig.changes import change_between, change_covariance, change_jacobian, changed
-from pipeline.rig.checks import Change, FailedCheck
+from pipeline.rig.checks import Change, Check
 from pipeline.rig.kinds import KIND_OF_EDGE
 from pipeline.rig.se3 import adjoint, inverse
 from pipeline.rig.targets import errors_at_targets, target_sigmas
@@ -84,7 +84,7 @@ RANGE = "range"
 _SIGMAS = 3.0
 
 
-def exceeded_by(result: EdgeResult, claims: Mapping[str, Claim], check: FailedCheck) -> list[str]:
+def exceeded_by(result: EdgeResult, claims: Mapping[str, Claim], check: Check) -> list[str]:
     """Directions whose limit the pose would exceed if the check is right: azimuth, elevation, range.
 
     A shift along the line of sight moves no direction; it counts as if it were across it, against the limit
@@ -100,7 +100,7 @@ def exceeded_by(result: EdgeResult, claims: Mapping[str, Claim], check: FailedCh
     ]
 
 
-def at_targets(result: EdgeResult, check: FailedCheck) -> dict[str, tuple[float, float | None]]:
+def at_targets(result: EdgeResult, check: Check) -> dict[str, tuple[float, float | None]]:
     """Error of each direction if the check is right, and its sigma, None where the check states none [rad]."""
     assert check.error is not None
     off = _errors(result, check.error)
@@ -108,7 +108,7 @@ def at_targets(result: EdgeResult, check: FailedCheck) -> dict[str, tuple[float,
     return dict(zip((*DIRECTIONS, RANGE), zip(off, known_to, strict=True), strict=True))
 
 
-def tilt_in_doubt(result: EdgeResult, check: FailedCheck) -> Float[np.ndarray, "6 6"] | None:
+def tilt_in_doubt(result: EdgeResult, check: Check) -> Float[np.ndarray, "6 6"] | None:
     """What is to be added to the covariance, as left perturbation, where a check doubts a radar's tilt.
 
     Its roll, pitch or height may then be off by more than three sigmas. The record certifies no elevation, however

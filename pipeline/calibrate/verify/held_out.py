@@ -13,7 +13,7 @@ from pipeline.calibrate.joint.camera_lidar.estimate import align_camera_lidar
 from pipeline.core.config import ChecksConfig, SolveConfig
 from pipeline.core.errors import SolveError
 from pipeline.rig.changes import change_between
-from pipeline.rig.checks import FailedCheck, change_of
+from pipeline.rig.checks import Check, change_of
 from pipeline.rig.estimates import PairEstimate, Prior
 from pipeline.rig.targets import errors_at_targets
 from schemas.observations import Observation
@@ -219,7 +219,7 @@ def found_elsewhere(
     blocks: Int[np.ndarray, " F"],
     targets: Float[np.ndarray, "N 3"],
     worse_z: float,
-) -> list[FailedCheck]:
+) -> list[Check]:
     """A failed check if held-out frames align better at a place that the result's sigma excludes.
 
     Args:
@@ -241,4 +241,4 @@ def found_elsewhere(
         f"and {elevation:.2f} deg in elevation from it (z = {test.z:.1f})"
     )
     error = change_of(change_between(estimate.T, place))
-    return [FailedCheck(sentence, disproves=True, error=error)]
+    return [Check(sentence, disproves=True, error=error)]

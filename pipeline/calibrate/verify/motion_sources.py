@@ -16,7 +16,7 @@ from jaxtyping import Float, Int64
 
 from pipeline.objective.ego_motion import is_same, motion_of
 from pipeline.objective.sweep_registration import arc_between, occupied_share, one_per_cell
-from pipeline.rig.checks import FailedCheck
+from pipeline.rig.checks import Check
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, transform_points
 from schemas.observations import Observation
 
@@ -51,12 +51,12 @@ _NAMES = {"odometry": "odometry", "doppler": "the radar's Doppler", "lidar": "th
 class MotionFindings:
     """Wrong sources of motion with reasons, and the numbers."""
 
-    wrong: list[FailedCheck] = field(default_factory=list)
+    wrong: list[Check] = field(default_factory=list)
     numbers: dict[str, float] = field(default_factory=dict)
     # Those of `wrong` that cost camera-lidar nothing: the radar's own, where odometry moves camera and lidar.
-    of_radar: list[FailedCheck] = field(default_factory=list)
+    of_radar: list[Check] = field(default_factory=list)
 
-    def of(self, pair: str) -> list[FailedCheck]:
+    def of(self, pair: str) -> list[Check]:
         """Reasons against a pair."""
         return [c for c in self.wrong if "radar" in pair or c not in self.of_radar]
 
@@ -105,11 +105,11 @@ def compared_sources(
     turning, lag = slopes.get("yaw_rate_by_lidar"), slopes.get("odometry_lag_s")
     if not wrong and turning is not None and turning.is_off(1.0, _TURN_SHARE):
         shown = f"odometry turns {turning.slope:+.2f} times as fast as the lidar's sweeps"
-        wrong.append(FailedCheck(f"{shown}: {_hint(turning.slope)}", "odometry"))
+        wrong.append(Check(f"{shown}: {_hint(turning.slope)}", "odometry"))
     if lag is not None and not wrong and lag.is_off(0.0, _LAG_S):
         way = "behind" if lag.slope > 0 else "ahead of"
         shown = f"odometry is {abs(1e3 * lag.slope):.0f} ms {way} the radar's Doppler"
-        wrong.append(FailedCheck(f"{shown}: check the stamps of both", "odometry"))
+        wrong.append(Check(f"{shown}: check the stamps of both", "odometry"))
     numbers = {f"motion_{name}": s.slope for name, s in slopes.items()}
     same = {f"motion_{n}_same": s.same for n, s in slopes.items() if n in _SPEEDS}
     return MotionFindings(wrong, numbers | same, of_radar)
@@ -137,7 +137,7 @@ def _slopes(observations: Sequence[Observation], sources: _Sources) -> dict[str,
     return {name: slope for name, slope in found.items() if slope is not None}
 
 
-def _wrong_speeds(slopes: dict[str, _Slope], doppler_mps: np.ndarray) -> list[FailedCheck]:
+def _wrong_speeds(slopes: dict[str, _Slope], doppler_mps: np.ndarray) -> list[Check]:
     """The source whose speed differs from the others."""
     by_lidar = {n: s for n in ("odometry", "doppler") if (s := slopes.get(f"{n}_by_lidar")) is not None}
     off = {name: s for name, s in by_lidar.items() if s.same < _MET and s.points >= _FEWEST_PAIRS}
@@ -150,9 +150,7 @@ def _wrong_speeds(slopes: dict[str, _Slope], doppler_mps: np.ndarray) -> list[Fa
     is_backwards = len(forward) >= _FEWEST and bool(np.mean(forward < 0) > 2 / 3)
     if between is None and is_backwards and "doppler" not in by_lidar:
         # Without other evidence: no car drives backwards for most of a day.
-        return [
-            FailedCheck(f"by the radar's Doppler the car drives backwards: {_hint(-1.0)}{_KEY}", "doppler")
-        ]
+        return [Check(f"by the radar's Doppler the car drives backwards: {_hint(-1.0)}{_KEY}", "doppler")]
     if between is None or between.same >= _AGREED:
         return []
     if (between.fits < 0 and is_backwards) or abs(abs(between.fits) * 3.6 - 1) < _NEAR:
@@ -160,26 +158,24 @@ def _wrong_speeds(slopes: dict[str, _Slope], doppler_mps: np.ndarray) -> list[Fa
     return [_wrong_speed("odometry", "doppler", between)]
 
 
-def _against_the_lidar(odometry: _Slope, *, agreed: bool) -> list[FailedCheck]:
+def _against_the_lidar(odometry: _Slope, *, agreed: bool) -> list[Check]:
     """Reasons if the lidar contradicts odometry and Doppler, which may agree with each other or not."""
     if agreed and odometry.fits == -1:
         return [
-            FailedCheck(
-                "by odometry and Doppler the lidar drives backwards: its x must point ahead", "orientation"
-            )
+            Check("by odometry and Doppler the lidar drives backwards: its x must point ahead", "orientation")
         ]
     # A Doppler is searched where odometry expects it, and may fit there. Sweeps that are mistaken (posts that meet the
     # next posts) show no constant factor.
     return [_wrong_speed("odometry", "lidar", odometry)] if odometry.agreed >= _AGREED else []
 
 
-def _wrong_speed(name: str, against: str, found: _Slope) -> FailedCheck:
+def _wrong_speed(name: str, against: str, found: _Slope) -> Check:
     key = _KEY if name == "doppler" and found.fits < 0 else ""
     where = f"in {found.same:.0%} of what moves" if found.same > 0.005 else "nowhere"
     shown = (
         f"{_NAMES[name]} agrees with {_NAMES[against]} {where}, and shows {found.fits:+.2f} times the speed"
     )
-    return FailedCheck(f"{shown}: {_hint(found.fits)}{key}", name)
+    return Check(f"{shown}: {_hint(found.fits)}{key}", name)
 
 
 def _hint(ratio: float) -> str:
@@ -189,14 +185,14 @@ def _hint(ratio: float) -> str:
     return f"{' and '.join(fits)} fits" if fits else "its scale is wrong"
 
 
-def _silent_doppler(observations: Sequence[Observation]) -> list[FailedCheck]:
+def _silent_doppler(observations: Sequence[Observation]) -> list[Check]:
     """Scans with many detections that no velocity explains."""
     explained = [_is_explained(o) for o in observations if len(o.radar_xyz_m) >= _DETECTIONS]
     silent = len(explained) - sum(explained)
     if len(explained) < _FEWEST or silent <= _MOST_SILENT * len(explained):
         return []
     shown = f"no velocity of the radar explains {silent} of {len(explained)} scans"
-    return [FailedCheck(f"{shown}: check doppler_field, its unit, and doppler_period_mps", "doppler")]
+    return [Check(f"{shown}: check doppler_field, its unit, and doppler_period_mps", "doppler")]
 
 
 def _is_explained(o: Observation) -> bool:
@@ -215,7 +211,7 @@ def _is_explained(o: Observation) -> bool:
     return bool(np.sum(stands) > _PEAKED * by_chance)
 
 
-def _wrong_axes(observations: Sequence[Observation], T_lidar_radar: np.ndarray) -> list[FailedCheck]:
+def _wrong_axes(observations: Sequence[Observation], T_lidar_radar: np.ndarray) -> list[Check]:
     """A sensor that is turned round or mirrored, if its detections match the lidar only then."""
     swap = np.diag([1.0, -1.0, 1.0, 1.0])
     turn = from_rotation_translation(exp_so3(np.array([0.0, 0.0, np.pi])), np.zeros(3))
@@ -230,7 +226,7 @@ def _wrong_axes(observations: Sequence[Observation], T_lidar_radar: np.ndarray) 
     if met < max(_LEAST_MET, _MORE * as_given):
         return []
     shown = f"{met:.0%} of the radar's detections meet the lidar where {how}, {as_given:.0%} as given"
-    return [FailedCheck(f"{shown}: mend its axes or its transform", "orientation")]
+    return [Check(f"{shown}: mend its axes or its transform", "orientation")]
 
 
 def _lidar_agrees(slopes: dict[str, _Slope]) -> bool:

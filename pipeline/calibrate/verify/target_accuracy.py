@@ -46,7 +46,7 @@ from pipeline.calibrate.verify.held_out import HeldOutUpdate
 from pipeline.core.config import ChecksConfig
 from pipeline.core.rigs import CameraPrior
 from pipeline.rig.cameras import camera_of
-from pipeline.rig.checks import FailedCheck
+from pipeline.rig.checks import Check
 from pipeline.rig.estimates import Prior, Solution
 from pipeline.rig.overlap import FRAMES, View, view_of_camera, view_of_clouds
 from pipeline.rig.se3 import hat, transform_points
@@ -315,7 +315,7 @@ def targets_of(
     return from_spherical(np.array(targets))
 
 
-def unseen_failure(pair: str) -> FailedCheck:
+def unseen_failure(pair: str) -> Check:
     """Reason why a pair without overlapping views cannot be accepted."""
     parent, child = FRAMES_OF_PAIR[pair]
-    return FailedCheck(f"{parent} and {child} see no direction in common at the prior: nothing to certify")
+    return Check(f"{parent} and {child} see no direction in common at the prior: nothing to certify")

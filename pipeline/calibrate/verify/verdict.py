@@ -18,13 +18,13 @@ from pipeline.calibrate.verify.edge_result import RANGE, EdgeResult, at_targets,
 from pipeline.calibrate.verify.held_out import HeldOutTest
 from pipeline.calibrate.verify.target_accuracy import Claim
 from pipeline.core.config import ChecksConfig
-from pipeline.rig.checks import FailedCheck, change_of, faults_of
+from pipeline.rig.checks import Check, change_of, faults_of
 from pipeline.rig.kinds import KIND_OF_EDGE
 from schemas.calibrations import DOF_NAMES
 
 __all__ = ["Evidence", "Verdict", "judge", "matters"]
 
-_FAILED = -1.0  # margin of a check that yields no number
+_FAILED = Check.margin  # of a check that yields no number
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Evidence:
 
     held_out: HeldOutTest | None  # held-out frames at prior and result; None where none has both costs
     claims: Mapping[str, Claim]  # of azimuth and elevation at the targets
-    failed_checks: Sequence[FailedCheck] = ()  # from the solver and from checks of the whole solution
+    failed_checks: Sequence[Check] = ()  # from the solver and from checks of the whole solution
 
 
 @dataclass(frozen=True)
@@ -53,24 +53,12 @@ class Verdict:
     faults: tuple[str, ...] = ()
 
     @property
-    def against(self) -> tuple[FailedCheck, ...]:
+    def against(self) -> tuple[Check, ...]:
         """Why the adjustment of the rig must not use the edge; empty if it may, as with a sigma that is too large."""
         if self.status == "accepted" or (self.status == "held" and self.unsure_only):
             return ()
         fault = self.faults[0] if self.faults else ""
-        return (FailedCheck(self.reason, fault, disproves=self.disproved),)
-
-
-@dataclass(frozen=True)
-class _Check:
-    """One condition: margin 1 = far inside, 0 = at the limit; the reason is given if the margin is negative."""
-
-    margin: float
-    reason: str
-    disproves: bool = False  # where it fails, the pose is wrong, not only unproved
-    # If it fails, the pose may still be within its sigma, but the sigma is too large.
-    of_sigma: bool = False
-    fault: str = ""  # key of schemas.faults.FAULTS that it names
+        return (Check(self.reason, fault, disproves=self.disproved),)
 
 
 def judge(
@@ -95,15 +83,15 @@ def judge(
     if not triggered:
         return Verdict("held", "not triggered: the prior stays", _FAILED)
     faults = dict.fromkeys(faults_of(evidence.failed_checks))
-    checks: list[_Check] = []
+    checks: list[Check] = []
     if result.frames_used < limits.min_fit_frames:
         few = f"too few frames: {result.frames_used}, needs {limits.min_fit_frames}"
         sentences = [check.sentence for check in evidence.failed_checks]
         if result.kind != "camera_lidar" or result.frames_used < SHORTEST:
             return Verdict("refused", "; ".join([*sentences, few]), _FAILED, faults=tuple(faults))
-        checks.append(_Check(_FAILED, few))
+        checks.append(Check(few))
     checks += [
-        _Check(_FAILED, _with_size(check, result, "not within the limit"), check.disproves)
+        replace(check, sentence=_with_size(check, result, "not within the limit"))
         for check in evidence.failed_checks
         if matters(check, result, evidence.claims)
     ]
@@ -115,17 +103,17 @@ def judge(
             checks.append(_aligns_better(result, evidence.claims, evidence.held_out, limits))
     checks += _claims_hold(result, evidence.claims)
     if not result.observable.any():
-        checks.append(_Check(_FAILED, "the day determines no degree of freedom"))
+        checks.append(Check("the day determines no degree of freedom"))
     score = min(1.0, *(c.margin for c in checks))
     failed = [c for c in checks if c.margin < 0]
     return _held(failed, score, faults) if failed else _accepted(result, evidence, score)
 
 
-def _held(failed: Sequence[_Check], score: float, faults: Mapping[str, None]) -> Verdict:
+def _held(failed: Sequence[Check], score: float, faults: Mapping[str, None]) -> Verdict:
     """The verdict with failed checks; `faults` are named besides theirs."""
     return Verdict(
         "held",
-        "; ".join(c.reason for c in failed),
+        "; ".join(c.sentence for c in failed),
         score,
         disproved=any(c.disproves for c in failed),
         unsure_only=all(c.of_sigma for c in failed),
@@ -133,7 +121,7 @@ def _held(failed: Sequence[_Check], score: float, faults: Mapping[str, None]) ->
     )
 
 
-def matters(check: FailedCheck, result: EdgeResult, claims: Mapping[str, Claim]) -> bool:
+def matters(check: Check, result: EdgeResult, claims: Mapping[str, Claim]) -> bool:
     """Whether the pose would be no good for what the edge is needed for if the check is right."""
     exceeded, needed = set(_exceeded(check, result, claims)), KIND_OF_EDGE[result.kind].required
     if needed is None:
@@ -155,20 +143,20 @@ def _accepted(result: EdgeResult, evidence: Evidence, score: float) -> Verdict:
     return Verdict("accepted", reason, score, certified, mounting=mounting, faults=faults)
 
 
-def _exceeded(check: FailedCheck, result: EdgeResult, claims: Mapping[str, Claim]) -> list[str]:
+def _exceeded(check: Check, result: EdgeResult, claims: Mapping[str, Claim]) -> list[str]:
     """Directions whose limit the pose exceeds if the check is right; no radar's elevation with a tilt in doubt."""
     tilted = ["elevation"] if tilt_in_doubt(result, check) is not None else []
     return list(dict.fromkeys([*exceeded_by(result, claims, check), *tilted]))
 
 
-def _harmless(check: FailedCheck, result: EdgeResult, claims: Mapping[str, Claim]) -> str:
+def _harmless(check: Check, result: EdgeResult, claims: Mapping[str, Claim]) -> str:
     """Sentence about a check that does not hold the record."""
     if exceeded := _exceeded(check, result, claims):
         return f"{check.sentence}: {' and '.join(exceeded)} not certified"
     return _with_size(check, result, "within the limit")
 
 
-def _with_size(check: FailedCheck, result: EdgeResult, words: str) -> str:
+def _with_size(check: Check, result: EdgeResult, words: str) -> str:
     """The check's sentence with the largest error that it shows at the targets, if it knows one."""
     if check.error is None or not any(check.error):
         return check.sentence
@@ -177,7 +165,7 @@ def _with_size(check: FailedCheck, result: EdgeResult, words: str) -> str:
     return f"{check.sentence}: {np.degrees(off_rad):.2f}{sigma} deg at the targets, {words}"
 
 
-def _moves_little(result: EdgeResult, limits: ChecksConfig) -> list[_Check]:
+def _moves_little(result: EdgeResult, limits: ChecksConfig) -> list[Check]:
     """Within the search range, and within the prior's sigmas."""
     step, search = result.move, result.search
     rotation, translation = float(np.linalg.norm(step[:3])), float(np.abs(step[3:]).max())
@@ -186,21 +174,21 @@ def _moves_little(result: EdgeResult, limits: ChecksConfig) -> list[_Check]:
     ratio = np.abs(step) / result.prior_sigma
     worst = int(np.argmax(ratio))
     return [
-        _Check(
-            1 - rotation / reach,
+        Check(
             f"moved {np.degrees(rotation):.1f} deg, beyond the search range",
+            margin=1 - rotation / reach,
             disproves=True,
             fault="prior",
         ),
-        _Check(
-            1 - translation / search.translation_m,
+        Check(
             f"moved {translation:.2f} m, beyond the search range",
+            margin=1 - translation / search.translation_m,
             disproves=True,
             fault="prior",
         ),
-        _Check(
-            1 - ratio[worst] / limits.max_move_prior_sigmas,
+        Check(
             f"{result.names[worst]} moved {ratio[worst]:.1f} prior sigmas",
+            margin=float(1 - ratio[worst] / limits.max_move_prior_sigmas),
             fault="prior",
         ),
     ]
@@ -208,37 +196,37 @@ def _moves_little(result: EdgeResult, limits: ChecksConfig) -> list[_Check]:
 
 def _aligns_better(
     result: EdgeResult, claims: Mapping[str, Claim], test: HeldOutTest | None, limits: ChecksConfig
-) -> _Check:
+) -> Check:
     """Held-out frames align better than at the prior, or as well if the result hardly differs from the prior."""
     if test is None or test.frames < limits.min_held_out_frames:
         found = 0 if test is None else test.frames
         few = f"too few held-out frames to judge: {found}, needs {limits.min_held_out_frames}"
-        return _Check(_FAILED, few)
+        return Check(few)
     near = _near_prior(result, claims)
     if test.z > limits.worse_alignment_z:
         # The radar's registration cost has slopes of its own (`lidar_radar/time_offset`): a right result near a prior
         # may score worse. That leaves it unproved, no more.
         is_proof = result.kind == "camera_lidar"
-        return _Check(max(near, 1 - test.z / limits.worse_alignment_z), _worse(test), disproves=is_proof)
+        margin = max(near, 1 - test.z / limits.worse_alignment_z)
+        return Check(_worse(test), margin=margin, disproves=is_proof)
     name, ratio = _largest_move(result)
     same = 1 - ratio / limits.prior_agreement_sigmas
     better = (-test.z - limits.better_alignment_z) / limits.better_alignment_z
     moved = f"{name} moved {ratio:.1f} of its sigmas"
-    return _Check(
-        min(1.0, max(same, better, near)),
-        f"{moved}, and held-out frames align no better (z = {test.z:.1f})",
-    )
+    sentence = f"{moved}, and held-out frames align no better (z = {test.z:.1f})"
+    return Check(sentence, margin=min(1.0, max(same, better, near)))
 
 
 def _aligns_no_worse(
     result: EdgeResult, claims: Mapping[str, Claim], test: HeldOutTest | None, limits: ChecksConfig
-) -> list[_Check]:
+) -> list[Check]:
     """If other pairs contribute to the pose: alignment no worse than at a prior that the result contradicts."""
     if test is None:
         return []
     _, ratio = _largest_move(result)
     same, not_worse = 1 - ratio / limits.prior_agreement_sigmas, 1 - test.z / limits.worse_alignment_z
-    return [_Check(min(1.0, max(same, not_worse, _near_prior(result, claims))), _worse(test))]
+    margin = min(1.0, max(same, not_worse, _near_prior(result, claims)))
+    return [Check(_worse(test), margin=margin)]
 
 
 def _near_prior(result: EdgeResult, claims: Mapping[str, Claim]) -> float:
@@ -248,7 +236,7 @@ def _near_prior(result: EdgeResult, claims: Mapping[str, Claim]) -> float:
     prior, would move it by no more either.
     """
     back = change_of(np.where(KIND_OF_EDGE[result.kind].is_scored, -result.move, 0.0))
-    if exceeded_by(result, claims, FailedCheck("the prior is right", error=back)):
+    if exceeded_by(result, claims, Check("the prior is right", error=back)):
         return _FAILED
     needed = KIND_OF_EDGE[result.kind].required or tuple(claims)
     return 0.0 if all(claims[name].agrees_with_held_out for name in needed) else _FAILED
@@ -266,14 +254,14 @@ def _worse(test: HeldOutTest) -> str:
     return f"held-out frames align worse than at the prior ({change})"
 
 
-def _claims_hold(result: EdgeResult, claims: Mapping[str, Claim]) -> list[_Check]:
+def _claims_hold(result: EdgeResult, claims: Mapping[str, Claim]) -> list[Check]:
     """What the purpose needs must be within its limit, by its sigma and by what held-out frames contradict.
 
     A sigma that held-out frames exceed is not only too large: the pose may lie outside of it.
     """
     needed = KIND_OF_EDGE[result.kind].required
     checks = {
-        name: _Check(claim.margin, f"{name} is {_known(claim)}", of_sigma=not claim.is_exceeded)
+        name: Check(f"{name} is {_known(claim)}", margin=claim.margin, of_sigma=not claim.is_exceeded)
         for name, claim in claims.items()
     }
     if needed is not None:

@@ -11,7 +11,7 @@ from scipy.optimize import minimize
 
 from pipeline.learn.infer.aggregate import measured_estimate
 from pipeline.learn.infer.class_evidence import FrameEvidence, scores
-from pipeline.rig.checks import FailedCheck
+from pipeline.rig.checks import Check
 from pipeline.rig.estimates import PairEstimate, Prior
 from pipeline.rig.se3 import exp_se3, inverse, log_se3, rotation_angle_rad
 
@@ -35,7 +35,7 @@ class JointDay:
     frames: Sequence[FrameEvidence]
     block: Int[np.ndarray, " F"]
     fit: JointFit
-    failed: list[FailedCheck]
+    failed: list[Check]
 
     def estimate(self, prior: Prior, rows: Bool[np.ndarray, " F"] | None = None) -> PairEstimate:
         """Of camera-lidar, by all frames or by some."""
@@ -82,12 +82,12 @@ def fitted_day(
     return JointDay(frames, block, fit, failed)
 
 
-def _not_clear(sigmas: float, T: np.ndarray, T_rival: np.ndarray) -> list[FailedCheck]:
+def _not_clear(sigmas: float, T: np.ndarray, T_rival: np.ndarray) -> list[Check]:
     if sigmas >= _CLEAR_SIGMAS:
         return []
     apart = np.degrees(float(rotation_angle_rad(T @ inverse(T_rival))))
     sentence = f"frames do not agree: they fit {apart:.1f} deg apart nearly as well ({sigmas:.1f} sigmas)"
-    return [FailedCheck(sentence, "witnesses_disagree")]
+    return [Check(sentence, "witnesses_disagree")]
 
 
 _UNIT = np.array([0.01] * 3 + [0.1] * 3)  # rad, m: steps of one are alike

@@ -17,7 +17,7 @@ from pipeline.learn.infer.class_evidence import FrameEvidence
 from pipeline.learn.infer.frame_network import FrameNetwork, FrameSource
 from pipeline.learn.infer.joint_day import JointDay, fitted_day
 from pipeline.learn.sample.frame_sample import SampleRejectedError
-from pipeline.rig.checks import FailedCheck
+from pipeline.rig.checks import Check
 from pipeline.rig.estimates import PairEstimate, Prior, Solution
 from pipeline.rig.se3 import exp_se3, inverse, log_se3, rotation_angle_rad
 from schemas.calibrations import PAIRS
@@ -312,7 +312,7 @@ def _estimate(pair: str, answers: Answers, asked: _Asked, rng: np.random.Generat
 
 def _halves_disagree(
     pair: str, block: np.ndarray, estimate: Callable[[str, np.ndarray], PairEstimate]
-) -> list[FailedCheck]:
+) -> list[Check]:
     """A failed check, if estimates from the odd and from the even blocks differ by more than their sigmas allow."""
     odd = np.unique(block, return_inverse=True)[1].ravel() % 2 == 1
     halves = [estimate(pair, rows) for rows in (odd, ~odd)]
@@ -323,7 +323,7 @@ def _halves_disagree(
     if ratio.max() <= _HALVES_SIGMAS:
         return []
     sentence = f"two halves of the day differ by {ratio.max():.1f} of their sigmas"
-    return [FailedCheck(sentence, "witnesses_disagree")]
+    return [Check(sentence, "witnesses_disagree")]
 
 
 def _part(answers: Answers, rows: np.ndarray) -> Answers:

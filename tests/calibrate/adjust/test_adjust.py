@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.calibrate.adjust.equations import Rig, equations_at, left_jacobian_inverse
 from pipeline.calibrate.adjust.rig import AdjustmentLimits, adjust
-from pipeline.rig.checks import FailedCheck
+from pipeline.rig.checks import Check
 from pipeline.rig.evidence import EDGE, EdgeEvidence
 from pipeline.rig.extrinsics import Extrinsics
 from pipeline.rig.graph import RigGraph, Sensor, edge_between
@@ -211,7 +211,7 @@ def test_an_edge_that_failed_its_own_check_goes_first_and_the_others_move_by_les
     rng = np.random.default_rng(9)
     scene = Scene(rng, *EIGHT)
     good = [scene.edge(*e) for e in CLOSED]
-    knocked = scene.edge("top", "rad0", off=np.full(7, 30.0), checks=(FailedCheck("halves disagree"),))
+    knocked = scene.edge("top", "rad0", off=np.full(7, 30.0), checks=(Check("halves disagree"),))
     with_it = scene.adjusted([knocked if e.edge == knocked.edge else e for e in good])
     clean = scene.adjusted(good)
     assert with_it.left_out == (knocked.edge,)
@@ -250,7 +250,7 @@ def test_what_nothing_ties_to_the_reference_keeps_the_prior_and_says_why():
 
 def test_an_edge_left_out_that_was_a_sensors_only_one_is_named_as_its_reason():
     scene = Scene(np.random.default_rng(12), "cam0", "rad0")
-    edges = [scene.edge("cam0", "top", checks=(FailedCheck("lost"),)), scene.edge("top", "rad0")]
+    edges = [scene.edge("cam0", "top", checks=(Check("lost"),)), scene.edge("top", "rad0")]
     assert scene.adjusted(edges).sensors["cam0"].untied == "no edge of it can be used: cam0-top"
 
 

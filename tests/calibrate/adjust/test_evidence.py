@@ -10,7 +10,7 @@ from pipeline.calibrate.adjust.rig import AdjustmentLimits, adjust
 from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
 from pipeline.core.config import SolveConfig
 from pipeline.rig.changes import change_between, change_covariance, change_jacobian
-from pipeline.rig.checks import FailedCheck
+from pipeline.rig.checks import Check
 from pipeline.rig.edges import EDGE_OF_PAIR
 from pipeline.rig.estimates import PairEstimate, Prior
 from pipeline.rig.evidence import EDGE
@@ -155,7 +155,7 @@ def test_a_bias_that_the_weights_have_in_them_is_stated_in_full():
 
 def test_failed_checks_travel_and_a_pair_that_shows_nothing_has_no_information():
     estimate = replace(PairEstimate.at_prior("camera_lidar", PRIOR), disproved="lost")
-    evidence = evidence_of(estimate, EDGE_OF_PAIR["camera_lidar"], PRIOR, CLOCK_S, [FailedCheck("held out")])
+    evidence = evidence_of(estimate, EDGE_OF_PAIR["camera_lidar"], PRIOR, CLOCK_S, [Check("held out")])
     assert [c.sentence for c in evidence.checks] == ["held out", "lost"]
     assert not evidence.information.any()
     assert not evidence.gradient.any()

@@ -12,7 +12,7 @@ from pipeline.calibrate.verify.held_out import HeldOutTest, paired_test
 from pipeline.calibrate.verify.target_accuracy import DIRECTIONS, Claim
 from pipeline.calibrate.verify.verdict import Evidence, judge
 from pipeline.core.config import ChecksConfig
-from pipeline.rig.checks import HARMLESS, FailedCheck, change_of
+from pipeline.rig.checks import HARMLESS, Check, change_of
 from pipeline.rig.estimates import PairEstimate, Prior, Solution
 from pipeline.rig.se3 import exp_se3, exp_so3, from_rotation_translation
 from pipeline.rig.targets import DEFAULT_TARGETS
@@ -38,7 +38,7 @@ SURE = {name: Claim(0.001, 0.0, 0.001, 0.001, np.radians(0.2), 0.995) for name i
 
 
 def verdict(result, test, failed=(), claims=SURE, limits=None, **changes):
-    checks = [f if isinstance(f, FailedCheck) else FailedCheck(f) for f in failed]
+    checks = [f if isinstance(f, Check) else Check(f) for f in failed]
     pair = result.pair
     of_edge = EdgeResult(
         pair, result.T, result.covariance, result.observable, PRIOR.of(pair), np.sqrt(np.diag(PRIOR.covariance(pair))),
@@ -48,9 +48,7 @@ def verdict(result, test, failed=(), claims=SURE, limits=None, **changes):
 
 
 def checked(error, fault="witnesses_disagree"):
-    return FailedCheck(
-        "two halves disagree", fault, error=None if error is None else change_of(map(float, error))
-    )
+    return Check("two halves disagree", fault, error=None if error is None else change_of(map(float, error)))
 
 
 DEG = np.radians(1.0)
@@ -104,7 +102,7 @@ def test_what_a_check_leaves_possible_counts_its_size_and_its_own_sigma_against_
     """A radar's azimuth is wanted within .4 deg at 99.5 %: 2.8 sigmas of the check, 2.6 beside an offset."""
     claims = {name: Claim(1e-4, 0.0, 1e-4, 1e-4, 0.4 * DEG, 0.995) for name in DIRECTIONS}
     known_to = np.diag([*[(sigma_deg * DEG) ** 2] * 3, *[1e-6] * 3])
-    check = FailedCheck(
+    check = Check(
         "another edge contradicts",
         error=change_of((0.0, 0.0, off_deg * DEG, 0.0, 0.0, 0.0)),
         covariance=known_to,
@@ -115,7 +113,7 @@ def test_what_a_check_leaves_possible_counts_its_size_and_its_own_sigma_against_
 
 
 def test_a_check_that_knows_nothing_of_the_range_frees_no_range():
-    check = FailedCheck(
+    check = Check(
         "another edge contradicts",
         error=change_of((0.0, 0.0, 1e-4, 0.0, 0.0, 0.0)),
         covariance=np.diag([1e-8] * 6),
@@ -128,7 +126,7 @@ def test_a_check_that_knows_nothing_of_the_range_frees_no_range():
 
 def test_a_check_that_may_hide_a_tilt_certifies_no_elevation():
     known_to = np.diag([(0.5 * DEG) ** 2, *[1e-8] * 5])
-    check = FailedCheck(
+    check = Check(
         "another edge contradicts", error=change_of((0.0, 0.0, 1e-4, 0.0, 0.0, 0.0)), covariance=known_to
     )
     claims = {name: Claim(1e-4, 0.0, 1e-4, 1e-4, 0.6 * DEG, 0.995) for name in DIRECTIONS}
@@ -186,7 +184,7 @@ def test_no_better_alignment_is_accepted_where_a_move_of_many_sigmas_does_not_ma
 def test_what_a_check_shows_to_be_wrong_is_told_from_what_is_only_unproved():
     assert verdict(estimate(0.3), WORSE).disproved
     assert verdict(estimate(shift_m=0.5), BETTER).disproved  # beyond the search range
-    shown = FailedCheck("another basin is better", disproves=True)
+    shown = Check("another basin is better", disproves=True)
     assert verdict(estimate(1.5), BETTER, failed=[shown]).disproved
     unproved = [
         verdict(estimate(1.0), SAME),
@@ -213,9 +211,9 @@ def test_a_dof_that_the_day_did_not_determine_may_not_hold_but_is_named():
 
 
 def test_the_faults_that_failed_checks_name_reach_the_verdict_each_once():
-    moved = FailedCheck("turned at noon", "moved_in_day")
-    again = FailedCheck("turned back at two", "moved_in_day")
-    found = verdict(estimate(1.5), BETTER, failed=[moved, FailedCheck("no name"), again])
+    moved = Check("turned at noon", "moved_in_day")
+    again = Check("turned back at two", "moved_in_day")
+    found = verdict(estimate(1.5), BETTER, failed=[moved, Check("no name"), again])
     assert found.faults == ("moved_in_day",)
     assert verdict(estimate(1.5), BETTER).faults == ()
 
@@ -326,14 +324,14 @@ def test_too_few_frames_are_refused():
 def test_a_day_held_for_its_sigma_counts_in_the_state_and_one_that_is_too_short_to_judge_does_not():
     unsure = {name: claim(0.15) for name in DIRECTIONS}
     few = replace(estimate(0.2), frames_used=7)
-    scenes = FailedCheck("too few scenes: its 7 frames show 2", "few_scenes")
+    scenes = Check("too few scenes: its 7 frames show 2", "few_scenes")
     assert verdict(estimate(0.2), SAME, (), unsure).unsure_only
     for result, test, failed in (
         (few, SAME, ()),
         (few, None, (scenes,)),
         (estimate(1.0), replace(BETTER, frames=2), (scenes,)),
         (few, WORSE, ()),
-        (few, SAME, (FailedCheck("another basin is better", disproves=True),)),
+        (few, SAME, (Check("another basin is better", disproves=True),)),
     ):
         found = verdict(result, test, failed, unsure)
         assert (found.status, found.unsure_only) == ("held", False)
@@ -457,7 +455,7 @@ def test_a_radar_that_turned_beyond_its_prior_holds_what_was_solved_along_its_he
 def test_a_wrong_principal_point_is_right_in_the_image_and_certifies_no_mounting():
     mounted = {name: replace(claim, mounting_sigma_rad=0.001) for name, claim in SURE.items()}
     assert verdict(estimate(1.5), BETTER, claims=mounted).mounting == DIRECTIONS
-    centre = FailedCheck("CameraInfo's principal point", "camera_info", error=HARMLESS)
+    centre = Check("CameraInfo's principal point", "camera_info", error=HARMLESS)
     found = verdict(estimate(1.5), BETTER, [centre], mounted)
     assert (found.status, found.determined, found.mounting) == ("accepted", DIRECTIONS, ())
     assert found.faults == ("camera_info",)

@@ -43,7 +43,7 @@ from pipeline.calibrate.numerics.bias_floors import (
 from pipeline.core.rigs import CameraPrior
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms
 from pipeline.rig.changes import change_between, change_jacobian
-from pipeline.rig.checks import FailedCheck
+from pipeline.rig.checks import Check
 from pipeline.rig.estimates import Prior
 
 __all__ = ["DayIntrinsics", "contradictions", "measure_intrinsics"]
@@ -127,7 +127,7 @@ class DayIntrinsics:
         return float(yaw), float(pitch)
 
 
-def contradictions(day: DayIntrinsics, known: CameraPrior) -> list[FailedCheck]:
+def contradictions(day: DayIntrinsics, known: CameraPrior) -> list[Check]:
     """One failed check for each intrinsic of CameraInfo that the day, and each half of it separately, contradicts."""
     off = _off_by_sigmas(day, known)
     is_wrong = np.abs(off) > INTRINSICS_CONTRADICTION_SIGMAS
@@ -136,7 +136,7 @@ def contradictions(day: DayIntrinsics, known: CameraPrior) -> list[FailedCheck]:
     found = []
     if is_wrong[0]:
         found.append(
-            FailedCheck(
+            Check(
                 f"CameraInfo's focal length is contradicted by the day: measured {day.focal - 1:+.1%} "
                 f"+- {day.focal_sigma:.1%}",
                 "camera_info",
@@ -148,7 +148,7 @@ def contradictions(day: DayIntrinsics, known: CameraPrior) -> list[FailedCheck]:
             float(abs(d) / f * _LEFT_OF_TURN) for d, f in zip(day.centre_px, day.focal_px, strict=True)
         ]
         found.append(
-            FailedCheck(
+            Check(
                 f"CameraInfo's principal point is contradicted by the day: measured {right:+.1f} +- {u:.1f} px "
                 f"right, {down:+.1f} +- {v:.1f} px down: right in the image, not in the mounting",
                 "camera_info",

@@ -33,7 +33,7 @@ from pipeline.calibrate.numerics.covariance import CLEARLY
 from pipeline.objective.camera_lidar.points import Points
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms
 from pipeline.rig.cameras import camera_of
-from pipeline.rig.checks import FailedCheck, change_of
+from pipeline.rig.checks import Check, change_of
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT, Observation
 
 __all__ = ["box_offsets", "disagreement", "turn_numbers", "turns_by_parts"]
@@ -144,7 +144,7 @@ def _boxes(
     ]
 
 
-def disagreement(turns: Sequence[PartTurn]) -> list[FailedCheck]:
+def disagreement(turns: Sequence[PartTurn]) -> list[Check]:
     """A failed check for each axis about which two contradict each other; its error is the larger of their offsets.
 
     Sigma stays as it is: on known days half of the difference had nothing to do with the error, and a wider
@@ -153,9 +153,9 @@ def disagreement(turns: Sequence[PartTurn]) -> list[FailedCheck]:
     return [_failed(a, b) for a, b in _contradictions(turns)]
 
 
-def _failed(a: PartTurn, b: PartTurn) -> FailedCheck:
+def _failed(a: PartTurn, b: PartTurn) -> Check:
     right, about = max(a, b, key=lambda w: abs(w.offset_rad)), np.arange(6) == a.axis
-    return FailedCheck(
+    return Check(
         f"the evidence disagrees on {_AXES[a.axis]}: {a.sentence}, {b.sentence}",
         "witnesses_disagree",
         error=change_of(about * right.offset_rad),

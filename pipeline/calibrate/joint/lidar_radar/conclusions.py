@@ -14,7 +14,7 @@ from pipeline.calibrate.joint.lidar_radar.search import comparison_cost, finish
 from pipeline.calibrate.numerics.bias_floors import RADAR_ELEVATION_BIAS_RAD, RANGE_BIAS_SIGMA_M
 from pipeline.calibrate.numerics.covariance import bootstrap_covariance
 from pipeline.rig.changes import change_between
-from pipeline.rig.checks import FailedCheck, change_of
+from pipeline.rig.checks import Check, change_of
 from pipeline.rig.estimates import PairEstimate
 
 __all__ = ["diagnostics_of", "lidar_radar_failures", "notes_of", "own_position"]
@@ -174,7 +174,7 @@ def diagnostics_of(
     return {k: v for k, v in diagnostics.items() if np.isfinite(v)}
 
 
-def lidar_radar_failures(estimate: PairEstimate) -> list[FailedCheck]:
+def lidar_radar_failures(estimate: PairEstimate) -> list[Check]:
     """Restarts, halves, and the registration against the camera's boxes."""
     if not estimate.diagnostics:
         return []
@@ -182,14 +182,14 @@ def lidar_radar_failures(estimate: PairEstimate) -> list[FailedCheck]:
     return [check for check in failed if check is not None]
 
 
-def _restarts(estimate: PairEstimate) -> FailedCheck | None:
+def _restarts(estimate: PairEstimate) -> Check | None:
     """Ends of the search in different basins: if another one is right, the pose is off by all of their distance."""
     least = np.array([np.inf, np.inf, _RESTART_ROTATION_RAD, _RESTART_SHIFT_M, _RESTART_SHIFT_M, np.inf])
     apart = _known(estimate, "restarts")
     return _difference("restarts", apart, np.maximum(least, _SIGMAS * _sigma(estimate)), apart)
 
 
-def _halves(estimate: PairEstimate) -> FailedCheck | None:
+def _halves(estimate: PairEstimate) -> Check | None:
     """The pose lies between those of the halves."""
     apart = _known(estimate, "halves")
     return _difference("disjoint halves", apart, _SIGMAS * _HALVES_FACTOR * _sigma(estimate), apart / 2)
@@ -197,15 +197,15 @@ def _halves(estimate: PairEstimate) -> FailedCheck | None:
 
 def _difference(
     who: str, apart: Float[np.ndarray, " 6"], allowed: Float[np.ndarray, " 6"], error: Float[np.ndarray, " 6"]
-) -> FailedCheck | None:
+) -> Check | None:
     beyond = np.flatnonzero(np.abs(apart) > allowed)
     if not len(beyond):
         return None
     sizes = " and ".join(f"{_NAMES[k]} by {_size(k, float(apart[k]))}" for k in beyond.tolist())
-    return FailedCheck(f"{who} disagree in {sizes}", "witnesses_disagree", error=change_of(error))
+    return Check(f"{who} disagree in {sizes}", "witnesses_disagree", error=change_of(error))
 
 
-def _registration(estimate: PairEstimate) -> list[FailedCheck]:
+def _registration(estimate: PairEstimate) -> list[Check]:
     """What turns the radar's roll or pitch if the registration alone is right."""
     d, failed = estimate.diagnostics, []
     for axis, name in zip(radar_tilt_axes(estimate.T).T, ("roll", "pitch"), strict=True):
@@ -215,7 +215,7 @@ def _registration(estimate: PairEstimate) -> list[FailedCheck]:
         if known and abs(offset) > _SIGMAS * np.hypot(floor, own):
             turned = f"would turn {name} by {np.degrees(offset):+.1f} deg, camera and prior would not"
             error = change_of([*(axis * offset), 0.0, 0.0, 0.0, 0.0])
-            failed.append(FailedCheck(f"the registration {turned}", "witnesses_disagree", error=error))
+            failed.append(Check(f"the registration {turned}", "witnesses_disagree", error=error))
     return failed
 
 
