@@ -47,9 +47,10 @@ from pipeline.calibrate.joint.camera_lidar.refine import (
 from pipeline.calibrate.joint.camera_lidar.rotation_search import TERMS as BASIN_TERMS
 from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
 from pipeline.calibrate.joint.part_turn import PartTurn
-from pipeline.calibrate.numerics.bias_floors import CAMERA_LIDAR_BIAS, TZ_COMMON_BIAS_M
+from pipeline.calibrate.numerics.bias_floors import TZ_COMMON_BIAS_M
 from pipeline.calibrate.numerics.covariance import OBSERVABLE
 from pipeline.calibrate.numerics.frame_blocks import Scenes
+from pipeline.calibrate.numerics.nuisances import by_owner, considered_numbers
 from pipeline.calibrate.numerics.search_range import search_range
 from pipeline.core.config import SolveConfig
 from pipeline.core.errors import SolveError
@@ -61,7 +62,6 @@ from pipeline.objective.stamp_gaps import camera_gaps_s, constant_gap_s
 from pipeline.rig.changes import change_jacobian
 from pipeline.rig.common_share import common_part
 from pipeline.rig.estimates import PairEstimate, Prior
-from pipeline.rig.evidence import EDGE
 from schemas.observations import Observation
 
 __all__ = [
@@ -199,12 +199,8 @@ def analyse_camera_lidar(
     own_dt_s, z = far_time_offset(problem.terms, analysis.state, analysis.kernel, rng)
     diagnostics |= {
         "label_width_px": aligned.label_width_px,
-        **{
-            f"borders_{name}_deg": float(np.degrees(np.linalg.norm(analysis.borders[:, axis])))
-            for axis, name in enumerate(("pitch", "yaw"))
-        },
-        "left_out_dt_s": float(np.linalg.norm(analysis.left_out_in_time[:, DT])),
-        "along_paint_deg": float(np.degrees(np.linalg.norm(analysis.along_paint[:3]))),
+        **considered_numbers(analysis.considered),
+        "left_out_dt_s": float(np.linalg.norm(analysis.considered[-1].rows[:, DT])),
     }
     diagnostics |= {"own_dt_s": aligned.expected_dt_s + own_dt_s, "own_dt_z": z}
     diagnostics |= _moved_by_labels(scored, analysis.state, fixed)
@@ -347,16 +343,10 @@ def _conclude(
         notes=notes,
         common_covariance=common_part(to_left @ analysis.common[:6, :6] @ to_left.T, covariance),
         failed_checks=disagreement(turns),
-        bias={owner: to_left @ B @ to_left.T for owner, B in _biases(analysis).items()},
+        bias={owner: to_left @ B @ to_left.T for owner, B in by_owner(analysis.considered).items()},
         bias_in_weights=to_left @ np.diag(_tz_bias(analysis)) @ to_left.T,
         time_offset_prior_s=aligned.expected_dt_s,
     )
-
-
-def _biases(analysis: ObservabilityAnalysis) -> dict[str, Float[np.ndarray, "6 6"]]:
-    """Errors common to all frames, by owner: masks and intrinsics rotate the camera in all of its pairs."""
-    turns = np.diag(np.where(analysis.fixed[:6] | (np.arange(6) > 2), 0.0, CAMERA_LIDAR_BIAS) ** 2)
-    return {"camera": turns, EDGE: analysis.floors[:6, :6] - turns}
 
 
 def _tz_bias(analysis: ObservabilityAnalysis) -> Float[np.ndarray, " 6"]:

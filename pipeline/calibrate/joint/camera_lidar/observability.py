@@ -36,6 +36,7 @@ from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
 from pipeline.calibrate.numerics.bias_floors import CAMERA_LIDAR_BIAS, CAMERA_LIDAR_DT_FLOOR_S, FOCAL_SIGMA
 from pipeline.calibrate.numerics.covariance import OBSERVABLE, covariance_with_fixed, response
 from pipeline.calibrate.numerics.frame_blocks import SCENE_DEGREES, Scenes
+from pipeline.calibrate.numerics.nuisances import Considered, considered_covariance
 from pipeline.core.config import SolveConfig
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms
 from pipeline.rig.changes import change_jacobian
@@ -90,12 +91,9 @@ class ObservabilityAnalysis:
     fixed: np.ndarray  # 8, bool: at the prior
     covariance: np.ndarray  # 8 8
     common: np.ndarray  # 8 8, of the covariance what all days of a vehicle err by alike
-    floors: np.ndarray  # 8 8, of the common part what is no prior's
+    considered: tuple[Considered, ...]  # of the common part what is no prior's
     observability: np.ndarray  # 6
     profile: TzProfile
-    borders: np.ndarray  # K 8, how far borders of each part of a side may have moved it
-    along_paint: np.ndarray  # 8, how far gradients along lines draw it
-    left_out_in_time: np.ndarray  # K 8, how far it moves with the time offset of either half of the image
 
 
 def analyse_observability(
@@ -127,18 +125,33 @@ def analyse_observability(
     if tz_m != state.T_camera_lidar[2, 3]:
         state = state.stepped(follow * (tz_m - state.T_camera_lidar[2, 3]))
         timed = _timed(problem, state, kernel, rng)
-    analysis = _fix_unobservable(problem, timed.state, kernel, profile, rng)
-    along = CAMERA_LIDAR_DT_FLOOR_S * along_the_way(
-        analysis.state.T_camera_lidar, problem.terms.velocity_lidar, analysis.fixed
+    found = _fix_unobservable(problem, timed.state, kernel, rng)
+    T, velocity = found.state.T_camera_lidar, problem.terms.velocity_lidar
+    along = CAMERA_LIDAR_DT_FLOOR_S * along_the_way(T, velocity, found.fixed)
+    in_time = left_out_in_time(timed, found.fixed)
+    considered = (
+        *found.day.floors,
+        Considered("borders", _borders(problem, found)),
+        Considered("along_paint", _along_paint(problem, found)),
+        Considered("travel", along[None]),
+        Considered("traffic", in_time),
     )
-    in_time = left_out_in_time(timed, analysis.fixed)
-    biases = np.vstack([along, np.where(_IS_DT, 0.0, in_time)])
-    for covariance in (analysis.covariance, analysis.common, analysis.floors):
-        covariance[:] += biases.T @ biases
+    shared = considered_covariance(considered)
+    covariance = found.day.scatter + shared
     timed = replace(timed, variance_s2=timed.variance_s2 + float(np.sum(in_time[:, DT] ** 2)))
-    analysis.covariance[DT, DT] = time_offset_variance(problem, analysis.state, analysis.kernel, timed)
-    analysis.observability[TZ] = max(tz_observability, 0.0)
-    return replace(analysis, left_out_in_time=in_time)
+    covariance[DT, DT] = time_offset_variance(problem, found.state, found.kernel, timed)
+    found.observability[TZ] = max(tz_observability, 0.0)
+    return ObservabilityAnalysis(
+        problem.prior,
+        found.state,
+        found.kernel,
+        found.fixed,
+        covariance,
+        found.day.of_prior + shared,
+        considered,
+        found.observability,
+        profile,
+    )
 
 
 def along_the_way(
@@ -156,13 +169,20 @@ def along_the_way(
     return np.where(fixed, 0.0, out)
 
 
+@dataclass(frozen=True, eq=False)
+class _Determined:
+    """A solution whose degrees of freedom are determined by the day or fixed at the prior."""
+
+    state: AlignmentState
+    kernel: KernelSettings
+    fixed: np.ndarray  # 8, bool
+    observability: np.ndarray  # 6
+    day: DayCovariance
+
+
 def _fix_unobservable(
-    problem: CameraLidarProblem,
-    state: AlignmentState,
-    kernel: KernelSettings,
-    profile: TzProfile,
-    rng: np.random.Generator,
-) -> ObservabilityAnalysis:
+    problem: CameraLidarProblem, state: AlignmentState, kernel: KernelSettings, rng: np.random.Generator
+) -> _Determined:
     """Solve again and again until all degrees of freedom are determined or fixed.
 
     Fixing one can make another undetermined if its optimum depends on the first, so one pass is not enough.
@@ -183,29 +203,22 @@ def _fix_unobservable(
         observability = np.where(fixed[:6], observability, day.observability)
         more_fixed = fixed | np.append(observability < OBSERVABLE, [False, False])
         if more_fixed.sum() == fixed.sum():
-            break
+            return _Determined(state, kernel, fixed, observability, day)
         fixed = more_fixed
-    # Labels that are off make an answer unsure. They do not make the prior the better answer: after what is fixed.
-    curvature, variance = _curvature(problem, state, kernel), _prior_variance(problem)
-    borders = border_errors(problem.terms, state, kernel, curvature, variance, fixed)
-    day = day.beside(borders)
+
+
+# Labels that are off make an answer unsure. They do not make the prior the better answer: after what is fixed.
+
+
+def _borders(problem: CameraLidarProblem, found: _Determined) -> Float[np.ndarray, "K 8"]:
+    curvature, variance = _curvature(problem, found.state, found.kernel), _prior_variance(problem)
+    return border_errors(problem.terms, found.state, found.kernel, curvature, variance, found.fixed)
+
+
+def _along_paint(problem: CameraLidarProblem, found: _Determined) -> Float[np.ndarray, "K 8"]:
     unpainted = replace(problem, terms=problem.terms.of_kinds(edges=True, markings=False))
-    drawn = along_paint(problem.terms, state, kernel, _curvature(unpainted, state, kernel), fixed)
-    day = day.beside(drawn)
-    return ObservabilityAnalysis(
-        problem.prior,
-        state,
-        kernel,
-        fixed,
-        day.covariance,
-        day.common,
-        day.floors,
-        observability,
-        profile,
-        borders,
-        drawn[0],
-        np.zeros((0, 8)),
-    )
+    curvature = _curvature(unpainted, found.state, found.kernel)
+    return along_paint(problem.terms, found.state, found.kernel, curvature, found.fixed)
 
 
 def _timed(
@@ -237,19 +250,17 @@ def time_offset_variance(
 
 @dataclass(frozen=True, eq=False)
 class DayCovariance:
-    """Covariance and observability of one day's solution."""
+    """Covariance and observability of one day's solution by its frames and its prior, without what is considered.
 
-    covariance: np.ndarray  # 8 8
-    common: np.ndarray  # 8 8, of the covariance what all days of a vehicle err by alike
-    floors: np.ndarray  # 8 8, of the common part what is no prior's
-    observability: np.ndarray  # 6
+    Args:
+        of_prior: of the scatter what all days of a vehicle err by alike.
+        floors: what masks and intrinsics move, which is part of the observability.
+    """
 
-    def beside(self, biases: Float[np.ndarray, "_ 8"]) -> DayCovariance:
-        """Covariance with further errors that all days share: one sigma each, rows as in `AlignmentState.changed`."""
-        more = biases.T @ biases
-        return DayCovariance(
-            self.covariance + more, self.common + more, self.floors + more, self.observability
-        )
+    scatter: Float[np.ndarray, "8 8"]
+    of_prior: Float[np.ndarray, "8 8"]
+    floors: tuple[Considered, ...]
+    observability: Float[np.ndarray, " 6"]
 
 
 def day_covariance(
@@ -276,11 +287,11 @@ def day_covariance(
         SCENE_DEGREES,
     )
     floor = np.where(fixed, 0.0, np.append(CAMERA_LIDAR_BIAS, [CAMERA_LIDAR_DT_FLOOR_S, 0.0]))
-    floors = np.diag(floor**2)  # masks and intrinsics are the same every day
-    observability = np.clip(1 - np.diag(covariance + floors) / prior_variance, 0.0, 1.0)[:6]
-    common = floors + prior_share(covariance, np.diag(problem.common_share / prior_variance))
-    covariance = covariance + floors
-    return DayCovariance(covariance, common, floors, observability)
+    turns = np.arange(8) < 3
+    floors = Considered("masks", np.diag(floor)[turns]), Considered("positions", np.diag(floor)[~turns])
+    observability = np.clip(1 - (np.diag(covariance) + floor**2) / prior_variance, 0.0, 1.0)[:6]
+    of_prior = prior_share(covariance, np.diag(problem.common_share / prior_variance))
+    return DayCovariance(covariance, of_prior, floors, observability)
 
 
 def _prior_variance(problem: CameraLidarProblem) -> Float[np.ndarray, " 8"]:
