@@ -29,11 +29,12 @@ from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
 from pipeline.verify.axes import (
     answer_of,
-    answer_of_sensors,
     answers_by_sensor,
     check_axes,
+    errors_in_words,
     limits_of,
     probes,
+    wrong_sensors,
 )
 from pipeline.verify.one_axis import AxisCheck
 from pipeline.verify.one_log import check_poses, for_one_look, prior_in_use, with_prior
@@ -42,6 +43,13 @@ from schemas.poses import POSES, PoseRow
 
 __all__ = ["verify"]
 
+# Exit codes of its own: schedulers take 3 for success.
+_EXIT_CODES = {"right": 0, "wrong": 4, "inconclusive": 5}
+_NEXT_STEPS = {
+    "wrong": "recalibrate with `boresight nightly`, then load what `boresight state` shows",
+    "inconclusive": "repeat with a longer log of varied driving; the reasons are with each axis",
+}
+_ANY_CAR = "car"  # name of the log's vehicle where fleet.toml has all vehicles in one entry
 _COLOUR = {"pass": "green", "warn": "yellow", "fail": "red", "inconclusive": "dim"}
 _DAY = "2000-01-01"  # of the single vehicle-day of a temporary lake
 # As many as `select.frames` selects for a calibration. On the one real drive tried, 60 left the radar
@@ -65,8 +73,8 @@ def verify(
 ) -> int:
     """Check the calibration in use against one log: pass, warn, fail or inconclusive per pair and axis.
 
-    For a rig of many sensors: per sensor and axis, and right, wrong or undecided per sensor. Exit code 0: all
-    axes that the pairs must determine pass or warn; 3: an axis fails, or the log cannot decide.
+    For a rig of many sensors: per sensor and axis, and right, wrong or undecided per sensor. Exit code 0: right, all
+    axes that the pairs must determine pass or warn; 4: wrong, an axis fails; 5: inconclusive, the log cannot decide.
 
     Args:
         logs: MCAP files, ROS 1 bags, ROS 2 bag folders or .db3 files of one drive.
@@ -76,7 +84,7 @@ def verify(
             sensors: JSON {"reference": "top", "T": {"front": 4x4, ...}}, or one of the others. Default: the
             prior of fleet.toml (tf_static of the log, or its file).
         lake: folder of the tables, if the calibration is a day or a state in a lake.
-        vehicle: vehicle of the log; default: the only one of fleet.toml.
+        vehicle: vehicle of the log; default: the only one of fleet.toml, or any, where it has one entry for all.
         camera_lidar_deg: an axis passes only if an error of this size would have made it fail.
         radar_deg: the same limit for pairs with the radar.
         frames: number of frames of the log to use.
@@ -106,9 +114,10 @@ def verify(
                 config, tables, (name, lacking if of_sensors else None), logs, (camera_lidar_deg, radar_deg), page,
                 progress,
             )  # fmt: skip
-    sensors = answers_by_sensor(checks) if of_sensors else {}
-    answer = answer_of_sensors(sensors) if of_sensors else answer_of(checks)
+    answer, sensors = answer_of(checks), answers_by_sensor(checks) if of_sensors else {}
     told: dict[str, Any] = {"vehicle": name, "reason": reason, "page": page}
+    told |= {"wrong_sensors": wrong_sensors(checks), "errors": errors_in_words(checks)}
+    told |= {"next_steps": [_NEXT_STEPS[answer]] if answer in _NEXT_STEPS else []}
     told |= {"sensors": sensors} if of_sensors else {}
     told |= {"axes": [asdict(c) for c in checks]}
     if json:
@@ -116,20 +125,16 @@ def verify(
     else:
         _print_table(checks, answer, sensors)
         print_summary("verify", answer, **told)
-    return 0 if answer == "right" else 3
+    return _EXIT_CODES[answer]
 
 
 def _vehicle(config: FleetConfig, vehicle: str | None) -> str:
     if vehicle is not None:
         config.rig_of(vehicle)  # raises for an unknown vehicle
         return vehicle
-    if not config.named_vehicles:
-        raise ConfigError(
-            "command line", "vehicle", "fleet.toml names none: add --vehicle NAME, the car of this log"
-        )
     if len(config.vehicles) != 1:
         raise ConfigError("command line", "vehicle", f"name one of {sorted(config.vehicles)} with --vehicle")
-    return config.named_vehicles[0]
+    return next(iter(config.named_vehicles), _ANY_CAR)
 
 
 def _as_prior(folder: Path, calibration: str, lake: str | None, vehicle: str, named: FrameOptions) -> Path:
@@ -194,7 +199,7 @@ def _checked(
         )
         checks = check_poses(poses, prior, lacking, config.verify, asked_deg, records)
     if page is not None:
-        view = in_use_view(answer_of(checks), [asdict(c) for c in checks])
+        view = in_use_view(answer_of(checks), [asdict(c) for c in checks], errors_in_words(checks))
         write_day_page(lake, partition, config, page, "joint", in_use=view)
     reasons = {r.reason for r in records if r.status == "refused"}
     return checks, "; ".join(sorted(reasons))
@@ -226,18 +231,20 @@ def _print_table(checks: list[AxisCheck], answer: str, sensors: Mapping[str, str
         "",
         "off [deg]",
         "sigma [deg]",
-        "shows from [deg]",
+        "detects [deg]",
     ):
         # Text: rich reads square brackets as styles.
         table.add_column(Text(heading), justify="right" if "deg" in heading else "left")
     for c in checks:
-        numbers = [f"{degrees(v):.2f}" for v in (c.off_rad, c.sigma_rad, c.shown_rad)]
+        numbers = [f"{degrees(v):.2f}" for v in (abs(c.off_rad), c.sigma_rad, c.shown_rad)]
         table.add_row(c.pair, c.axis, f"[{_COLOUR[c.status]}]{c.status}[/]", *numbers)
     console = Console(stderr=True)
     console.print(table)
     for c in checks:
         if c.status == "inconclusive":
-            console.print(f"  - {c.pair} {c.axis}: {c.reason}", markup=False, highlight=False)
+            console.print(f"{c.pair} {c.axis}: {c.reason}.", markup=False, highlight=False)
+    for sentence in errors_in_words(checks):
+        console.print(f"Wrong: {sentence}.", style="red", markup=False, highlight=False)
     for said in ("right", "wrong", "undecided"):
         if own := [sensor for sensor, is_said in sensors.items() if is_said == said]:
             console.print(f"{said}: {', '.join(own)}", markup=False, highlight=False)

@@ -87,17 +87,17 @@ def _bar(z: float) -> Markup:
     )
 
 
-def in_use_view(answer: str, checks: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The page's first screen, from the answer and the checks in the JSON of `boresight verify`."""
+def in_use_view(
+    answer: str, checks: Sequence[Mapping[str, Any]], errors: Sequence[str] = ()
+) -> dict[str, Any]:
+    """The page's first screen, from the answer, the checks and the errors in the JSON of `boresight verify`."""
     rows = [_row(check) for check in checks]
     mood, headline = _ANSWERS[answer]
-    wrong, unsure = (
-        ", ".join(f"{r['pair']} {r['axis']}" for r in rows if r["status"] == status)
-        for status in ("fail", "inconclusive")
-    )
-    sentences = [f"Wrong: {wrong}."] * bool(wrong) + [f"This log does not determine: {unsure}."] * bool(
-        unsure
-    )
+    unsure = ", ".join(f"{r['pair']} {r['axis']}" for r in rows if r["status"] == "inconclusive")
+    sentences = [
+        *(f"Wrong: {e}." for e in errors),
+        *[f"This log does not determine: {unsure}."] * bool(unsure),
+    ]
     explained = " ".join(sentences) or "Every axis that is judged passes."
     return {"mood": mood, "headline": headline, "explained": explained, "rows": rows}
 
@@ -106,7 +106,7 @@ def _row(check: Mapping[str, Any]) -> dict[str, Any]:
     """A check with its angles in words, and the class of the page's colours."""
     # Kinds of sensors have a dash between them; names stay as they are.
     pair = check["pair"].replace("_", "-") if check["pair"] == check["kind"] else check["pair"]
-    angles = {name: _deg(check[f"{name}_rad"]) for name in ("off", "sigma", "limit", "shown")}
+    angles = {name: _deg(abs(check[f"{name}_rad"])) for name in ("off", "sigma", "limit", "shown")}
     return {**check, **angles, "pair": pair, "mood": _MOODS[check["status"]]}
 
 

@@ -31,26 +31,37 @@ from pipeline.rig.kinds import KIND_OF_EDGE
 from pipeline.rig.se3 import adjoint, inverse, log_se3
 from pipeline.rig.targets import DEFAULT_TARGETS, target_jacobian, target_sigmas
 from pipeline.store.current import prior_of, targets_of, transform_of
-from pipeline.verify.one_axis import AxisCheck, AxisLimits, HeldOut, checked, silent
+from pipeline.verify.one_axis import AxisCheck, AxisLimits, HeldOut, checked
 from schemas.calibrations import PROBE_Z, CalibrationRecord
 from schemas.poses import PoseRow
 
 __all__ = [
+    "NOT_IN_USE",
     "answer_of",
-    "answer_of_sensors",
     "answers_by_sensor",
     "check_axes",
     "check_pose",
+    "errors_in_words",
     "held_out_of",
     "kind_of_pose",
     "limits_of",
     "probes",
     "shared_sigmas",
+    "wrong_sensors",
 ]
 
 # False alarm once in 370 correct calibrations; rarer if the limit, which must be exceeded too, is larger than
 # that.
 CONTRADICTION_SIGMAS = 3.0
+NOT_IN_USE = "the calibration in use has no pose of it"
+_NO_ESTIMATE = "this log gives no usable estimate"
+# By axis: in which direction the second sensor of an edge is set wrong where `off_rad` is positive, and where it is
+# negative; the first the other way round. Roll as seen from behind the camera.
+_TOWARD = {
+    "azimuth": ("left", "right"),
+    "elevation": ("up", "down"),
+    "roll": ("clockwise", "counterclockwise"),
+}
 _ROLL = 2  # component of a camera pose's change: about the optical axis
 
 
@@ -75,19 +86,10 @@ def check_axes(
     record: CalibrationRecord, limits: Mapping[str, AxisLimits], verify: VerifyConfig | None = None
 ) -> list[AxisCheck]:
     """Check every axis in `limits`, from the log's record, whose prior is the calibration in use."""
-    in_use, found = prior_of(record), transform_of(record)
-    blocked = _why_not(record)
-    if in_use is None or found is None or record.covariance is None:
-        pair = _pair(record), record.pair
-        return [silent(pair, axis, of, blocked or record.reason) for axis, of in limits.items()]
-    off = _off(record.pair, in_use, found, np.asarray(record.covariance), targets_of(record))
-    of = _pair(record), record.pair
-    return [
-        checked(of, axis, limits[axis], off[axis], blocked, CONTRADICTION_SIGMAS, said)
-        for axis in limits
-        if axis in off
-        for said in [held_out_of([record], verify or VerifyConfig(), axis)]
-    ]
+    of = words_of(edge_of(record)), record.pair, (record.parent_frame, record.child_frame)
+    held_out = {axis: held_out_of([record], verify or VerifyConfig(), axis) for axis in limits}
+    of_log = transform_of(record), record.covariance, targets_of(record), _why_not(record)
+    return _checks(of, record.pair, prior_of(record), of_log, limits, CONTRADICTION_SIGMAS, held_out)
 
 
 def probes(asked_deg: tuple[float, float]) -> Probes:
@@ -134,21 +136,35 @@ def check_pose(
         beyond: threshold in sigmas, from `shared_sigmas`.
         held_out: by axis, the held-out test of turns; None = there is none.
     """
-    of, found = (row.sensor, kind_of_pose(row.kind)), transform_of(row)
+    of, found = (row.sensor, kind_of_pose(row.kind), (row.sensor,)), transform_of(row)
     is_wrong = row.faults and row.status != "accepted" and not row.unsure_only
-    why = f"the log gives no estimate: {row.reason}" if is_wrong or found is None else ""
-    why = why if in_use is not None else "the calibration in use has no pose of it"
-    if in_use is None or found is None or row.covariance is None:
-        return [silent(of, axis, limit, why) for axis, limit in limits.items()]
-    T = inverse(found)  # the sensor's directions are in its own frame
-    A = adjoint(T)
+    why = f"{_NO_ESTIMATE}: {row.reason}" if is_wrong or found is None else ""
+    why = why if in_use is not None else NOT_IN_USE
+    # The sensor's directions are in its own frame.
+    T, A = (None, np.eye(6)) if found is None else (inverse(found), adjoint(inverse(found)))
+    covariance = None if row.covariance is None else A @ np.asarray(row.covariance) @ A.T
     targets = DEFAULT_TARGETS if row.targets_m is None else np.asarray(row.targets_m)
-    off = _off(f"{row.kind}_of", inverse(in_use), T, A @ np.asarray(row.covariance) @ A.T, targets)
-    return [
-        checked(of, axis, limits[axis], off[axis], why, beyond, (held_out or {}).get(axis))
-        for axis in limits
-        if axis in off
-    ]
+    before = None if in_use is None else inverse(in_use)
+    return _checks(
+        of, f"{row.kind}_of", before, (T, covariance, targets, why), limits, beyond, held_out or {}
+    )
+
+
+def _checks(
+    of: tuple[str, str, tuple[str, ...]],
+    pair: str,
+    in_use: Float[np.ndarray, "4 4"] | None,
+    of_log: tuple[np.ndarray | None, np.ndarray | None, np.ndarray, str],
+    limits: Mapping[str, AxisLimits],
+    beyond: float,
+    held_out: Mapping[str, HeldOut],
+) -> list[AxisCheck]:
+    """Checks by axis, from the log's estimate, its covariance and targets, and why it is not usable (or empty)."""
+    found, covariance, targets, why = of_log
+    off = dict.fromkeys(limits, (float("nan"), float("nan")))
+    if in_use is not None and found is not None and covariance is not None:
+        off = _off(pair, in_use, found, np.asarray(covariance), targets)
+    return [checked(of, a, limit, off[a], why, beyond, held_out.get(a)) for a, limit in limits.items()]
 
 
 def answers_by_sensor(checks: Sequence[AxisCheck]) -> dict[str, str]:
@@ -162,17 +178,10 @@ def answers_by_sensor(checks: Sequence[AxisCheck]) -> dict[str, str]:
     return answers
 
 
-def answer_of_sensors(answers: Mapping[str, str]) -> str:
-    """Answer for the rig: wrong if one sensor is wrong, right if all are right."""
-    said = set(answers.values())
-    return "wrong" if "wrong" in said else "right" if said == {"right"} else "inconclusive"
-
-
 def answer_of(checks: Sequence[AxisCheck]) -> str:
-    """Answer for all pairs: "wrong" if an axis fails, "right" if all required axes pass or warn.
+    """Answer for all sensors or pairs: "wrong" if an axis fails, "right" if all required axes pass or warn.
 
-    For sensors with names, several pairs share a sensor: the answer is right if the right pairs connect all
-    sensors.
+    For pairs whose sensors have names, several share a sensor: right if the right pairs connect all sensors.
     """
     if any(c.status == "fail" for c in checks):
         return "wrong"
@@ -180,13 +189,39 @@ def answer_of(checks: Sequence[AxisCheck]) -> str:
     for c in checks:
         if c.axis in KIND_OF_EDGE[c.kind].needed:
             good[c.pair] = good.get(c.pair, True) and c.status in {"pass", "warn"}
-    edges = [set(pair.split("-")) for pair in good if "-" in pair]
-    if len(edges) < len(good):  # sensors are named after their kinds
+    edges = {c.pair: set(c.sensors) for c in checks if c.pair != c.kind and len(c.sensors) > 1}
+    if len(edges) < len(good):  # sensors, or pairs whose sensors are named after their kinds
         return "right" if all(good.values()) else "inconclusive"
     tied: set[str] = set()
-    for ends in len(edges) * [set(pair.split("-")) for pair, is_good in good.items() if is_good]:
+    for ends in len(edges) * [edges[pair] for pair, is_good in good.items() if is_good]:
         tied |= ends if not tied or tied & ends else set()
-    return "right" if good and tied == set().union(*edges) else "inconclusive"
+    return "right" if good and tied == set().union(*edges.values()) else "inconclusive"
+
+
+def wrong_sensors(checks: Sequence[AxisCheck]) -> list[str]:
+    """Sensors that may be the wrong one: ends of all failing edges, without ends of edges that pass."""
+    failing = [c for c in checks if c.status == "fail"]
+    ends = [set(c.sensors) for c in failing]
+    among = set.intersection(*ends) or set.union(*ends) if ends else set()
+    failed, axes = {c.pair for c in failing}, {c.axis for c in failing}
+    good = [c for c in checks if c.status in {"pass", "warn"} and c.axis in axes and c.pair not in failed]
+    return sorted(among - {sensor for c in good for sensor in c.sensors} or among)
+
+
+def errors_in_words(checks: Sequence[AxisCheck]) -> list[str]:
+    """A sentence per wrong sensor and axis, by its failing edge of smallest sigma."""
+    wrong = wrong_sensors(checks)
+    failing = sorted((c for c in checks if c.status == "fail"), key=lambda c: -c.sigma_rad)
+    found = {(tuple(s for s in c.sensors if s in wrong), c.axis): c for c in failing}
+    return [_sentence(sensors, c) for (sensors, _), c in sorted(found.items()) if sensors]
+
+
+def _sentence(sensors: tuple[str, ...], check: AxisCheck) -> str:
+    size, limit = (f"{np.degrees(abs(rad)):.2f} deg" for rad in (check.off_rad, check.limit_rad))
+    if len(sensors) > 1:
+        return f"{' or '.join(sensors)}: {size} off in {check.axis} (limit {limit})"
+    is_left = (check.off_rad > 0) == (sensors[0] != check.sensors[0])
+    return f"{sensors[0]}: set {size} too far {_TOWARD[check.axis][not is_left]} (limit {limit})"
 
 
 def _off(
@@ -207,10 +242,6 @@ def _off(
     return off
 
 
-def _pair(record: CalibrationRecord) -> str:
-    return words_of(edge_of(record))
-
-
 def _why_not(record: CalibrationRecord) -> str:
     """Reason why the log's estimate cannot be compared; empty if it can.
 
@@ -218,4 +249,4 @@ def _why_not(record: CalibrationRecord) -> str:
     """
     if record.status == "accepted" or (record.status == "held" and record.diagnostics.get("unsure_only")):
         return ""
-    return f"the log gives no estimate: {record.reason}"
+    return f"{_NO_ESTIMATE}: {record.reason}"

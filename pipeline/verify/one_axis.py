@@ -15,7 +15,7 @@ from scipy.special import ndtr, ndtri
 
 from pipeline.core.config import ChecksConfig
 
-__all__ = ["AxisCheck", "AxisLimits", "HeldOut", "checked", "power_of", "shown_from", "silent"]
+__all__ = ["AxisCheck", "AxisLimits", "HeldOut", "checked", "power_of", "shown_from"]
 
 # The smallest detectable error of a log would have failed with this probability.
 SHOWN_POWER = 0.95
@@ -69,11 +69,13 @@ class AxisCheck:
     """Result of one axis of one pair; angles [rad] are nan if the log gives no estimate.
 
     `pair` is the kind of the pair, or the names of its sensors if they differ from their kinds; for a rig of
-    many sensors, the name of the sensor.
+    many sensors, the name of the sensor. `off_rad` is positive where targets lie too far left or up, or are
+    turned clockwise, in the axes of the first of `sensors`.
     """
 
     pair: str
     kind: str
+    sensors: tuple[str, ...]
     axis: str
     status: str  # pass, warn, fail or inconclusive
     reason: str
@@ -112,7 +114,7 @@ def shown_from(limit_rad: float, sigma_rad: float, beyond: float, held_out: Held
 
 
 def checked(
-    of: tuple[str, str],
+    of: tuple[str, str, tuple[str, ...]],
     axis: str,
     limits: AxisLimits,
     off: tuple[float, float],
@@ -123,53 +125,38 @@ def checked(
     """Check one axis.
 
     Args:
-        of: the pair or sensor in words, and its kind.
+        of: the pair or sensor in words, its kind, and the sensors.
         axis: azimuth, elevation or roll.
         limits: of the axis.
-        off: signed distance and its sigma.
+        off: signed distance and its sigma; nan if the log has no estimate.
         blocked: why the log's answer cannot be compared; empty if it can.
         beyond: threshold in sigmas.
         held_out: the held-out test of turns.
     """
-    off_rad, sigma_rad = abs(off[0]), off[1]
     held_out = held_out or HeldOut()
-    power = power_of(limits.asked_rad, limits.limit_rad, sigma_rad, beyond, held_out)
-    shown = shown_from(limits.limit_rad, sigma_rad, beyond, held_out)
-    measured = off_rad > beyond * sigma_rad
-    status, reason = (
-        ("inconclusive", blocked)
-        if blocked
-        else _status(off_rad, sigma_rad, limits, power, held_out, measured=measured)
-    )
-    numbers = (off_rad, sigma_rad, limits.limit_rad, limits.asked_rad)
-    return AxisCheck(*of, axis, status, reason, *numbers, 0.0 if blocked else power, shown)
-
-
-def silent(of: tuple[str, str], axis: str, limits: AxisLimits, reason: str) -> AxisCheck:
-    """A check of an axis without an estimate."""
-    nan = float("nan")
-    return AxisCheck(
-        *of, axis, "inconclusive", reason, nan, nan, limits.limit_rad, limits.asked_rad,
-        0.0, nan,
-    )  # fmt: skip
+    power = 0.0 if blocked else power_of(limits.asked_rad, limits.limit_rad, off[1], beyond, held_out)
+    shown = shown_from(limits.limit_rad, off[1], beyond, held_out)
+    status = ("inconclusive", blocked) if blocked else _status(off, limits, power, beyond, held_out)
+    return AxisCheck(*of, axis, *status, *off, limits.limit_rad, limits.asked_rad, power, shown)
 
 
 def _status(
-    off_rad: float, sigma_rad: float, limits: AxisLimits, power: float, held_out: HeldOut, *, measured: bool
+    off: tuple[float, float], limits: AxisLimits, power: float, beyond: float, held_out: HeldOut
 ) -> tuple[str, str]:
-    distance = f"{_deg(off_rad)} off, known to {_deg(sigma_rad)}"
-    if measured and off_rad > limits.limit_rad:
-        return "fail", f"{distance}: beyond {_deg(limits.limit_rad)} and beyond chance"
+    distance = f"{_deg(off[0])} off, sigma {_deg(off[1])}"
+    is_measured = abs(off[0]) > beyond * off[1]
+    if is_measured and abs(off[0]) > limits.limit_rad:
+        return "fail", f"{distance}, limit {_deg(limits.limit_rad)}"
     if power < limits.confidence:
         asked = _deg(limits.asked_rad)
-        why = f"an error of {asked} would show with a probability of only {power:.1%}"
+        why = f"it would detect an error of {asked} with a probability of only {power:.0%}"
         if held_out.confirms(float(np.degrees(limits.asked_rad))) < limits.confidence:
-            why = f"held-out frames fit a turn of {asked} as well"
-        return "inconclusive", f"{distance}, but this log cannot prove it: {why}; use a longer log"
-    if measured:
-        return "warn", f"{distance}: beyond chance, within {_deg(limits.limit_rad)}"
+            why = f"held-out frames align as well with an error of {asked}"
+        return "inconclusive", f"{distance}. This log cannot prove it: {why}"
+    if is_measured:
+        return "warn", f"{distance}: more than chance, within the limit of {_deg(limits.limit_rad)}"
     return "pass", distance
 
 
 def _deg(angle_rad: float) -> str:
-    return f"{np.degrees(angle_rad):.2f} deg"
+    return f"{np.degrees(abs(angle_rad)):.2f} deg"

@@ -18,13 +18,14 @@ from pipeline.rig.se3 import exp_so3, from_rotation_translation, log_so3
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import perceived
 from pipeline.verify.axes import (
+    NOT_IN_USE,
     check_pose,
     held_out_of,
     kind_of_pose,
     limits_of,
     shared_sigmas,
 )
-from pipeline.verify.one_axis import AxisCheck, HeldOut
+from pipeline.verify.one_axis import AxisCheck, HeldOut, checked
 from schemas.calibrations import FRAMES_OF_PAIR, CalibrationRecord
 from schemas.moments import PRIOR
 from schemas.poses import PoseRow
@@ -102,21 +103,18 @@ def check_poses(
     """
     own = [row for row in rows if row.sensor != row.reference]
     known = {row.sensor: None if prior is None else prior.between(row.reference, row.sensor) for row in own}
-    silent = [
-        PoseRow(
-            vehicle="", day="", method="joint", sensor=n.name, kind=n.kind, reference="",
-            status="refused", reason="", code_version="",
-        )
-        for n in lacking
-    ]  # fmt: skip
-    limits = {row.sensor: limits_of(kind_of_pose(row.kind), verify, asked_deg) for row in [*own, *silent]}
-    beyond = shared_sigmas(sum(len(limits[sensor]) for sensor in known))
-    return [
-        c
-        for row in [*own, *silent]
-        for said in [_held_out(row, records, verify)]
-        for c in check_pose(row, known.get(row.sensor), limits[row.sensor], beyond, said)
+    kinds = {row.sensor: row.kind for row in own} | {n.name: n.kind for n in lacking}
+    limits = {name: limits_of(kind_of_pose(kind), verify, asked_deg) for name, kind in kinds.items()}
+    beyond, nan = shared_sigmas(sum(len(limits[sensor]) for sensor in known)), (float("nan"),) * 2
+    checks = [
+        check_pose(r, known[r.sensor], limits[r.sensor], beyond, _held_out(r, records, verify)) for r in own
     ]
+    checks += [
+        [checked((n.name, kind_of_pose(n.kind), (n.name,)), axis, limit, nan, NOT_IN_USE, beyond)]
+        for n in lacking
+        for axis, limit in limits[n.name].items()
+    ]
+    return [c for of_sensor in checks for c in of_sensor]
 
 
 def _held_out(row: PoseRow, records: Sequence[CalibrationRecord], verify: VerifyConfig) -> dict[str, HeldOut]:

@@ -91,10 +91,22 @@ def short_drive(folder: Path) -> list[str]:
     return night(rig_of(folder, car="default"))
 
 
-@pytest.mark.parametrize(
-    ("code", "command"),
-    [(0, nothing_new), (1, full_disk), (2, mistyped_rig), (3, short_drive), (4, nothing_certified)],
-)
+def short_log(folder: Path) -> list[str]:
+    rig_of(folder, car="default")
+    return [
+        "verify",
+        f"{folder}/logs/car/{DAY}/a.mcap",
+        "--fleet",
+        f"{folder}/fleet.toml",
+        "--vehicle",
+        "car",
+    ]
+
+
+CODES = {0: nothing_new, 1: full_disk, 2: mistyped_rig, 3: short_drive, 4: nothing_certified, 5: short_log}
+
+
+@pytest.mark.parametrize(("code", "command"), CODES.items())
 def test_each_code_of_the_table_is_what_a_command_returns_with_the_status_it_lists(
     code, command, tmp_path, capsys
 ):
@@ -114,7 +126,7 @@ def test_a_stopped_command_ends_with_the_code_of_its_signal(code, tmp_path):
         process.send_signal(signal.Signals(code - 128))
         out, _ = process.communicate(timeout=60)
     assert process.returncode == code
-    assert set(table()) == {0, 1, 2, 3, 4, 130, 143}  # each is tried here
+    assert set(table()) == {*CODES, 130, 143}  # each is tried here
     assert json.loads(out.splitlines()[-1])["status"] in table()[code].split(", ")
 
 

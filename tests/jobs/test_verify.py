@@ -50,12 +50,11 @@ def test_a_right_calibration_passes_and_a_camera_turned_by_half_a_degree_fails(c
     code, answer = verify(car, calibration(tmp_path / "true.json", car[2]), capsys, "--page", str(page))
     assert (code, answer["answer"]) == (0, "right")
     assert status_of(answer, "camera_lidar", "azimuth") in {"pass", "warn"}
-    assert "is the calibration in use right?" in page.read_text()
-    assert "Yes, as far as it matters" in page.read_text()
+    assert 'class="answer good"' in page.read_text()
     assert page.read_text().count("data:image/jpeg") >= 3  # overlays of both calibrations
 
     code, answer = verify(car, calibration(tmp_path / "off.json", car[2], turned_deg=0.5), capsys)
-    assert (code, answer["answer"]) == (3, "wrong")
+    assert (code, answer["answer"], answer["wrong_sensors"]) == (4, "wrong", ["camera"])
     assert status_of(answer, "camera_lidar", "azimuth") == "fail"
     assert status_of(answer, "lidar_radar", "azimuth") in {"pass", "warn"}
 
@@ -64,7 +63,7 @@ def test_a_right_calibration_passes_and_a_camera_turned_by_half_a_degree_fails(c
 def test_a_log_with_a_few_frames_is_inconclusive_with_the_reason(car, tmp_path, capsys):
     file = calibration(tmp_path / "true.json", car[2])
     code, answer = verify(car, file, capsys, "--frames", "3")
-    assert (code, answer["answer"]) == (3, "inconclusive")
+    assert (code, answer["answer"]) == (5, "inconclusive")
     assert {a["status"] for a in answer["axes"]} == {"inconclusive"}
     assert "frames" in answer["reason"]
 
