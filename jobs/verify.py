@@ -225,14 +225,8 @@ def _calibrate(
 
 def _print_table(checks: list[AxisCheck], answer: str, sensors: Mapping[str, str]) -> None:
     table = Table(title="The calibration in use", title_justify="left")
-    for heading in (
-        "sensor" if sensors else "pair",
-        "axis",
-        "",
-        "off [deg]",
-        "sigma [deg]",
-        "detects [deg]",
-    ):
+    headings = ("sensor" if sensors else "pair", "axis", "", "off [deg]", "sigma [deg]", "detects [deg]")
+    for heading in headings:
         # Text: rich reads square brackets as styles.
         table.add_column(Text(heading), justify="right" if "deg" in heading else "left")
     for c in checks:
