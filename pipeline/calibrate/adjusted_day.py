@@ -134,17 +134,24 @@ class Concluded:
     is_adjusted: bool
 
 
-def conclude(edges: Sequence[SolvedEdge], rig: AdjustedRig | None) -> list[Concluded]:
+def conclude(
+    edges: Sequence[SolvedEdge],
+    rig: AdjustedRig | None,
+    against: Callable[[Edge], list[Check]] = lambda _: [],
+) -> list[Concluded]:
     """The record of each edge: at the adjusted pose, unless it is held by checks of its own or left out.
 
-    A left-out edge whose pose the others certify states that pose.
+    A left-out edge whose pose the others certify states that pose. `against` has checks of the whole rig besides.
     """
     estimates = {e.edge: e.own for e in edges}
-    return [_concluded(e, rig, estimates) for e in edges]
+    return [_concluded(e, rig, estimates, against(e.edge)) for e in edges]
 
 
 def _concluded(
-    edge: SolvedEdge, rig: AdjustedRig | None, estimates: Mapping[Edge, PairEstimate]
+    edge: SolvedEdge,
+    rig: AdjustedRig | None,
+    estimates: Mapping[Edge, PairEstimate],
+    more: Sequence[Check],
 ) -> Concluded:
     at = None if rig is None else rig.edges.get(edge.edge)
     if rig is None or at is None:
@@ -152,7 +159,7 @@ def _concluded(
     estimate, judged = edge.own, edge.judged
     if edge.is_active and not edge.judged.held_by:
         adjusted = _of_rig(edge, rig, estimates)
-        against = _contradictions(edge, rig, adjusted, estimates)
+        against = [*_contradictions(edge, rig, adjusted, estimates), *more]
         again = edge.judge(adjusted, [*edge.failed, *against], together=True)
         if at.used or again.verdict.status == "accepted":
             estimate, judged = adjusted.doubted(again.doubt), again
@@ -181,7 +188,7 @@ def _contradictions(
     """Contradictions of other edges to this one, of edges left out too unless they are known to be wrong.
 
     An edge that others in use confirm on another way is not contradicted by what is left out, and none is by an edge
-    that lies far from its prior, which holds what rests on that prior (`hold_doubted`). Camera-lidar is not
+    that lies far from its prior, which holds what rests on that prior (`wrong_priors`). Camera-lidar is not
     checked: its held-out frames would show any error that a radar's edges can show.
     """
     edge = solved.edge

@@ -12,7 +12,8 @@ from jaxtyping import Float
 from pipeline.calibrate.adjust.rig import AdjustedRig, AdjustedSensor
 from pipeline.calibrate.adjusted_day import Concluded
 from pipeline.calibrate.records import Inputs
-from pipeline.calibrate.verify.target_accuracy import Claim, claims_of, targets_of
+from pipeline.calibrate.verify.target_accuracy import DIRECTIONS, Claim, claims_of, targets_of
+from pipeline.calibrate.wrong_priors import WrongPrior
 from pipeline.core.config import VerifyConfig
 from pipeline.rig.changes import change_jacobian
 from pipeline.rig.checks import faults_of
@@ -20,17 +21,16 @@ from pipeline.rig.edges import pose_columns
 from pipeline.rig.extrinsics import Extrinsics
 from pipeline.rig.graph import RigGraph, Sensor
 from pipeline.rig.overlap import View
-from pipeline.rig.se3 import adjoint, inverse, transform_points
+from pipeline.rig.se3 import adjoint, exp_se3, inverse, transform_points
 from pipeline.rig.spherical import from_spherical
-from pipeline.rig.targets import DEFAULT_TARGETS
+from pipeline.rig.targets import DEFAULT_TARGETS, errors_at_targets
 from pipeline.store.current import prior_of, transform_of
 from schemas.calibrations import FRAMES_OF_PAIR, CalibrationRecord
 from schemas.poses import PoseRow
 from schemas.versions import CODE_VERSION
 
-__all__ = ["hold_doubted", "pose_rows", "poses_of_records"]
+__all__ = ["pose_rows", "poses_of_records"]
 
-_FAULT = "prior"  # that edges name which contradict their prior
 # Ahead, left, up of a body as right, down, ahead of a camera.
 _OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
@@ -48,6 +48,7 @@ def pose_rows(
     views: Mapping[str, View],
     verify: VerifyConfig,
     judged: Mapping[str, Concluded] | None = None,
+    wrong: Sequence[WrongPrior] = (),
 ) -> list[PoseRow]:
     """A row for each sensor, the reference included.
 
@@ -57,8 +58,9 @@ def pose_rows(
         views: view of each sensor, by name; a pose is certified for directions in this view.
         judged: by sensor, what was concluded of its edge to the reference; the verdict is the pose's where it is on the
             adjusted pose, with held-out frames.
+        wrong: priors that edges contradict: no direction is certified that such a prior would move beyond its limit.
     """
-    rows = [_row(about, graph, sensor, adjusted, before, views, verify) for sensor in graph.sensors]
+    rows = [_row(about, graph, sensor, adjusted, before, views, verify, wrong) for sensor in graph.sensors]
     return [_as_judged(row, (judged or {}).get(row.sensor)) for row in rows]
 
 
@@ -161,6 +163,7 @@ def _row(
     before: Extrinsics,
     views: Mapping[str, View],
     verify: VerifyConfig,
+    wrong: Sequence[WrongPrior],
 ) -> PoseRow:
     told = _identity(about, graph, sensor, views) | _prior(graph.reference.name, sensor.name, before)
     if sensor == graph.reference:
@@ -177,19 +180,24 @@ def _row(
     poses, reference = adjusted.poses, graph.reference.name
     targets = _targets(sensor, poses, views)
     claims = _claims(sensor, poses, targets, verify)
-    determined = [name for name, claim in claims.items() if claim.margin >= 0]
-    status, reason = _verdict(sensor, found, claims, determined)
+    doubted = _doubted(sensor, adjusted, claims, targets, wrong)
+    determined = [
+        n
+        for n, claim in claims.items()
+        if claim.margin >= 0 and not any(n in names for names in doubted.values())
+    ]
+    status, reason = _verdict(sensor, found, claims, determined, doubted)
     return PoseRow(
         **told,
         **pose_columns(poses.T[sensor.name]),
-        unsure_only=status == "held" and not found.doubts,
+        unsure_only=status == "held" and not found.doubts and not doubted,
         covariance=poses.covariance_between(reference, sensor.name),
         common_covariance=poses.covariance_between(reference, sensor.name, common=True),
         observability=[float(v) for v in found.observability],
         observable=[bool(v) for v in found.determined],
         status=status,
         reason=reason,
-        faults=["witnesses_disagree"] if found.doubts else [],
+        faults=["witnesses_disagree"] * bool(found.doubts) + ["prior"] * bool(doubted),
         determined=determined,
         targets_m=targets,
         azimuth_sigma_rad=claims["azimuth"].sigma_rad,
@@ -248,8 +256,33 @@ def _claims(
     )
 
 
+def _doubted(
+    sensor: Sensor,
+    rig: AdjustedRig,
+    claims: Mapping[str, Claim],
+    targets: Float[np.ndarray, "3 3"],
+    wrong: Sequence[WrongPrior],
+) -> dict[str, list[str]]:
+    """Directions that contradicted priors would move beyond their limits, by the sentence about the prior."""
+    reference = rig.poses.reference
+    T, found = rig.poses.between(sensor.name, reference.name), dict[str, list[str]]()
+    for prior in wrong:
+        T_wrong = exp_se3(prior.error(rig, sensor.name, reference.name)) @ T
+        off = errors_at_targets(f"{sensor.kind}_{reference.kind}", T_wrong, T, targets)[:2]
+        names = [
+            name for name, rad in zip(DIRECTIONS, off, strict=True) if claims[name].is_exceeded_by(float(rad))
+        ]
+        if names:
+            found[prior.sentence] = names
+    return found
+
+
 def _verdict(
-    sensor: Sensor, found: AdjustedSensor, claims: Mapping[str, Claim], determined: Sequence[str]
+    sensor: Sensor,
+    found: AdjustedSensor,
+    claims: Mapping[str, Claim],
+    determined: Sequence[str],
+    doubted: Mapping[str, Sequence[str]],
 ) -> tuple[str, str]:
     """Status and reason: a radar needs azimuth only, other sensors need both directions."""
     doubts = ", ".join(e.name for e in found.doubts)
@@ -258,15 +291,16 @@ def _verdict(
     if not found.determined.any():
         return "held", "the day determines no degree of freedom: the pose stays at the prior"
     needed = ("azimuth",) if sensor.kind == "radar" else tuple(claims)
-    unsure = {name: claim for name, claim in claims.items() if name not in determined}
-    words = "; ".join(
+    said = [f"{sentence}: {' and '.join(names)} not certified" for sentence, names in doubted.items()]
+    unsure = "; ".join(
         f"{name} known to {np.degrees(c.sigma_rad):.2f} deg (1 sigma), not within {np.degrees(c.limit_rad):.2f} deg "
         f"at {100 * c.confidence:g} %"
-        for name, c in unsure.items()
+        for name, c in claims.items()
+        if c.margin < 0
     )
-    if set(needed) & set(unsure):
-        return "held", words
-    return "accepted", f"not certified: {words}" if words else ""
+    if not set(needed) <= set(determined):
+        return "held", "; ".join([*said, *[unsure] * bool(unsure)])
+    return "accepted", "; ".join([*said, *[f"not certified: {unsure}"] * bool(unsure)])
 
 
 def _azimuth_seen(view: View, sensor: Sensor) -> float:
@@ -278,52 +312,3 @@ def _azimuth_seen(view: View, sensor: Sensor) -> float:
     if sensor.kind == "camera":
         points = points @ _OPTICAL
     return float(2 * np.pi * view(points).any(axis=1).mean())
-
-
-def hold_doubted(
-    rows: Sequence[PoseRow], records: Sequence[CalibrationRecord]
-) -> tuple[list[PoseRow], list[CalibrationRecord]]:
-    """Poses, held if edges contradict the prior of their sensor or of the reference: the one common to all such edges.
-
-    An edge far from the prior is left out, because it may be in a wrong minimum. But if the prior is wrong, all poses
-    that depend on it have the same error, with the prior's small sigma: on a van whose reference lidar was logged .3 m
-    too far ahead, three edges showed it, and three radars without a measured position were accepted half a degree off.
-
-    Records of such a sensor's edges are held too, if their own data do not determine its position.
-    """
-    against = [r for r in records if _FAULT in r.faults]
-    ends = [{r.parent_frame, r.child_frame} for r in against]
-    if not ends:
-        return list(rows), list(records)
-    shared = set.intersection(*ends) if len(ends) > 1 else set[str]()
-    edges = ", ".join(f"{r.parent_frame}-{r.child_frame}" for r in against)
-    middle = {row.reference for row in rows}
-    doubted = shared or set.union(*ends) - middle
-    said = f"the prior pose of {' or '.join(sorted(doubted))}, on which it rests, is contradicted by {edges}"
-    return (
-        [_held(row, said) if {row.sensor, *middle} & doubted else row for row in rows],
-        [_held_record(r, said) if {r.parent_frame, r.child_frame} & doubted else r for r in records],
-    )
-
-
-def _held(row: PoseRow, said: str) -> PoseRow:
-    if row.status == "refused" or row.sensor == row.reference:
-        return row
-    reason = f"{said}; {row.reason}" if row.reason else said
-    faults = list(dict.fromkeys([*row.faults, _FAULT]))
-    return replace(row, status="held", reason=reason, faults=faults, determined=[], unsure_only=False)
-
-
-def _held_record(record: CalibrationRecord, said: str) -> CalibrationRecord:
-    """Record of an edge, held unless its own data determine x and y."""
-    if record.status == "refused" or _FAULT in record.faults or all((record.observable or [False] * 6)[3:5]):
-        return record
-    return replace(
-        record,
-        status="held",
-        reason=f"{said}; {record.reason}" if record.reason else said,
-        faults=[*record.faults, _FAULT],
-        determined=[],
-        mounting_determined=[],
-        diagnostics=record.diagnostics | {"unsure_only": 0.0},
-    )

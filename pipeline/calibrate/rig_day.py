@@ -22,6 +22,7 @@ from pipeline.calibrate.judging import EdgeJudging
 from pipeline.calibrate.methods import Solver, method_named, resolved
 from pipeline.calibrate.records import Inputs, record_of_edge, refused_edge, refused_record
 from pipeline.calibrate.verify.constancy import moved_failures
+from pipeline.calibrate.wrong_priors import WrongPrior, wrong_priors
 from pipeline.core.config import FleetConfig
 from pipeline.core.errors import SolveError
 from pipeline.core.results import Progress, silent
@@ -86,12 +87,15 @@ class RigDay:
 class CalibratedRig:
     """Records of all edges, and the adjusted rig (None if no edge has evidence).
 
-    `judged` has what was concluded of the edges to the reference, by sensor.
+    Args:
+        judged: what was concluded of the edges to the reference, by sensor.
+        wrong: priors that edges contradict.
     """
 
     records: list[CalibrationRecord]
     adjusted: AdjustedRig | None
     judged: Mapping[str, Concluded]
+    wrong: Sequence[WrongPrior] = ()
 
 
 def calibrate_rig(
@@ -117,13 +121,19 @@ def calibrate_rig(
             _solve_other(day, fleet, about, sources, group[0], found)
     progress(done, done + 1, "adjust the rig")
     edges, rig = _adjusted(day, fleet, about, found.edges)
-    concluded = conclude(edges, rig)
+    wrong = [] if rig is None else wrong_priors(edges, rig, fleet.verify.checks)
+    concluded = conclude(edges, rig, lambda edge: _against(edge, rig, wrong))
     order = {(e.parent.name, e.child.name): k for k, e in enumerate(day.graph.edges)}
     records = [*found.refused, *(c.record for c in concluded)]
     records.sort(key=lambda r: order[r.parent_frame, r.child_frame])
     middle = day.graph.reference
     to_middle = {c.edge.other(middle.name).name: c for c in concluded if middle in c.edge.sensors}
-    return CalibratedRig(records, rig, to_middle)
+    return CalibratedRig(records, rig, to_middle, wrong)
+
+
+def _against(edge: Edge, rig: AdjustedRig | None, wrong: Sequence[WrongPrior]) -> list[Check]:
+    checks = [] if rig is None else [w.check(rig, edge) for w in wrong]
+    return [check for check in checks if check is not None]
 
 
 def _adjusted(

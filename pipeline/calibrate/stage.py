@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.calibrate.methods import Method, method_named
-from pipeline.calibrate.pose_rows import hold_doubted, pose_rows, poses_of_records
+from pipeline.calibrate.pose_rows import pose_rows, poses_of_records
 from pipeline.calibrate.records import Inputs, refused_edge
 from pipeline.calibrate.rig_day import RigDay, calibrate_rig
 from pipeline.calibrate.unlabelled import noted
@@ -157,9 +157,9 @@ def _rows_of_day(task: Task, about: Inputs, progress: Progress) -> list[Calibrat
         return [*records, *poses_of_records(about, records)]
     found = calibrate_rig(day, fleet, about, progress)
     before = replace(day.prior, reference=day.graph.reference).extrinsics()
-    poses = pose_rows(about, day.graph, found.adjusted, before, day.views, fleet.verify, found.judged)
-    poses, records = hold_doubted(poses, found.records)
-    return [*records, *noted(poses, records)]
+    rig, views = found.adjusted, day.views
+    poses = pose_rows(about, day.graph, rig, before, views, fleet.verify, found.judged, found.wrong)
+    return [*found.records, *noted(poses, found.records)]
 
 
 def three_of_day(task: Task, seed: int) -> tuple[Chosen, Prior]:

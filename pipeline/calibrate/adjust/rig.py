@@ -95,11 +95,11 @@ class AdjustedRig:
 
     Args:
         poses: all poses, with their joint covariance.
-        of_prior: part of that covariance that is the error of the prior.
+        by_prior: derivative of all poses by those of the prior.
     """
 
     poses: Extrinsics
-    of_prior: np.ndarray
+    by_prior: np.ndarray  # P P
     before: Extrinsics
     sensors: Mapping[str, AdjustedSensor]
     edges: Mapping[Edge, AdjustedEdge]
@@ -115,7 +115,8 @@ class AdjustedRig:
         """
         J = change_jacobian(self.poses.between(a, b)) @ self.poses.jacobian_between(a, b)
         variance = np.diag(J @ self.poses.covariance @ J.T)
-        share = 1 - np.diag(J @ self.of_prior @ J.T) / variance
+        of_prior = self.by_prior @ self.before.covariance @ self.by_prior.T
+        share = 1 - np.diag(J @ of_prior @ J.T) / variance
         share[:3] = 1 - variance[:3] / self._turns_before(a, b)
         return np.clip(share, 0.0, 1.0)
 
@@ -280,7 +281,7 @@ def _concluded(
         covariance=C[:n, :n],
         common=common_part(equations.common(C, rig)[:n, :n], C[:n, :n]),
     )
-    found = AdjustedRig(poses, follow @ rig.prior.covariance @ follow.T, rig.prior, {}, edges)
+    found = AdjustedRig(poses, follow, rig.prior, {}, edges)
     rests_on = _rests_on(equations, C, len(order))
     clock = np.sqrt(np.diag(C)[n : n + len(order)])
     used = [e.evidence.edge for e in equations.edges]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
-from pipeline.calibrate.verify.day_checks import clock_alarms, edge_alarms, prior_alarms
+from pipeline.calibrate.verify.day_checks import clock_alarms, prior_alarms
 from pipeline.core.config import ChecksConfig, SolveConfig
 from pipeline.rig.changes import change_jacobian
 from pipeline.rig.estimates import PairEstimate, Prior
@@ -36,44 +36,6 @@ def estimate_of(pair, shift_m=(0, 0, 0), kept=(), **found):
         time_offset_sigma_s=0.005,
         diagnostics=found,
     )
-
-
-def in_camera(shift_lidar):
-    return T_CAMERA_LIDAR[:3, :3] @ shift_lidar
-
-
-def alarms_of(camera_lidar, lidar_radar):
-    found = edge_alarms({"camera_lidar": camera_lidar, "lidar_radar": lidar_radar}, PRIOR, LIMITS)
-    return {pair: checks[0].fault for pair, checks in found.items()}
-
-
-def test_a_lidar_that_the_camera_finds_lower_holds_the_radar_whose_height_rests_on_it():
-    lower = estimate_of("camera_lidar", in_camera([0, 0, -0.3]), kept=[5])
-    assert alarms_of(lower, estimate_of("lidar_radar", kept=[3, 5])) == {"lidar_radar": "prior"}
-
-
-@pytest.mark.parametrize("shift_m", [0.0, 0.06, -0.11])
-def test_offsets_that_priors_have_raise_no_alarm(shift_m):
-    shifted = estimate_of("camera_lidar", in_camera([0, 0, shift_m]), kept=[5])
-    assert alarms_of(shifted, estimate_of("lidar_radar", kept=[3, 5])) == {}
-
-
-def test_a_radar_that_knows_its_height_itself_is_not_held_for_the_lidars():
-    lower = estimate_of("camera_lidar", in_camera([0, 0, -0.3]), kept=[5])
-    assert alarms_of(lower, estimate_of("lidar_radar", kept=[3])) == {}
-
-
-def test_a_camera_that_moved_aside_as_well_is_at_fault_itself():
-    """The radar sees where the lidar is along y: where it was. So it is the camera that hangs elsewhere."""
-    aside = estimate_of("camera_lidar", in_camera([0, 0.3, -0.3]), kept=[5])
-    assert alarms_of(aside, estimate_of("lidar_radar", kept=[3, 5])) == {}
-    follows = estimate_of("lidar_radar", [0, -0.3, 0], kept=[3, 5])
-    assert alarms_of(aside, follows) == {"lidar_radar": "prior"}
-
-
-def test_a_basin_that_is_lost_accuses_nobody():
-    lost = replace(estimate_of("camera_lidar", in_camera([0, 0, -0.3]), kept=[5]), disproved="lost")
-    assert alarms_of(lost, estimate_of("lidar_radar", kept=[3, 5])) == {}
 
 
 def test_a_position_left_to_the_prior_is_an_alarm_where_the_day_puts_it_elsewhere():
