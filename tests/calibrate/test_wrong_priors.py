@@ -84,6 +84,19 @@ def test_a_lidar_that_the_camera_finds_lower_is_suspected_and_radars_whose_heigh
     assert left.check(rig, nose.edge) is None
 
 
+def test_a_radar_that_sits_further_ahead_is_off_as_far_for_the_camera_that_takes_its_place_from_the_prior():
+    moved = np.array([0, 0, 0, 0.3, 0, 0])
+    edges = [
+        solved(TOP, NOSE, moved, accuses=True), solved(LEFT, TOP), solved(LEFT, NOSE, kept=[3, 4, 5])
+    ]  # fmt: skip
+    assert suspects(edges) == ["nose"]
+    rig = rig_of(edges)
+    (nose,) = wrong_priors(edges, rig, LIMITS)
+    assert nose.check(rig, edges[1].edge) is None
+    off = nose.check(rig, edges[2].edge).error
+    assert off[3:] == pytest.approx(T_CAMERA_LIDAR[:3, :3] @ moved[3:], abs=0.03)
+
+
 def test_a_pose_that_rests_on_it_certifies_no_direction_that_it_would_move_beyond_the_limit():
     edges = [lower(), solved(TOP, NOSE, kept=[X, Z]), solved(TOP, REAR, kept=[X])]
     rig, about = rig_of(edges), Inputs(Partition("car", "2026-03-02"), "joint", "key", 0, ())
