@@ -78,6 +78,7 @@ def test_pose_and_clock_of_known_truth_come_out_within_sigma(seed, spec, T_base_
     assert np.abs(evidence.parts.sigmas(PART_FLOOR_RAD)).max() < 3.0
 
 
+@pytest.mark.slow
 def test_a_lidar_that_turned_at_noon_shows_it(street):
     R = exp_so3(np.radians([0.0, 0.0, 1.0]))
     later = [replace(s, xyz_m=s.xyz_m @ R) for s in street.sweeps["side"][MOMENTS // 2 :]]

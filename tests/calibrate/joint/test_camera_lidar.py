@@ -88,6 +88,7 @@ def test_road_without_reflectivity_leaves_the_edges_to_do_it():
     assert e.diagnostics["marking_weight"] == 0.0
 
 
+@pytest.mark.slow
 def test_rows_a_degree_apart_tell_pitch_where_the_road_shows_nothing():
     spinning = replace(SPARSE, elevations_deg=np.arange(-16.0, 16.0))
     day = traced_day(spinning, 16, seed=1, reflective=False)

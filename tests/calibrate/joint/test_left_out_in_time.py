@@ -77,6 +77,7 @@ def test_a_time_offset_without_a_half_is_where_its_own_profile_has_it(terms, ker
         assert said == pytest.approx(profile_of(half, kernel).state.dt_s - whole, abs=0.012)  # a step
 
 
+@pytest.mark.slow
 def test_a_day_of_oncoming_traffic_states_a_time_offset_near_what_is_expected_that_its_sigma_covers():
     day = []
     for o in traced_day(DENSE, 12, seed=3):

@@ -111,6 +111,7 @@ def test_a_time_offset_that_blocks_of_frames_find_anywhere_is_unsure_and_one_the
     assert scatter_s(problem_of(list(tunnel_day(16)))) > 0.03
 
 
+@pytest.mark.slow
 def test_in_a_tunnel_the_time_offset_is_wrong_within_its_sigma_and_nearer_what_is_expected():
     prior = Prior(T_CAMERA_LIDAR, T_LIDAR_RADAR, np.radians(2), 0.05)
     e = estimate_lidar_radar(list(tunnel_day(24, seed=3)), prior, SolveConfig(), np.random.default_rng(0))

@@ -101,6 +101,7 @@ def traced():
     return traced_day(DENSE, 40, seed=7)
 
 
+@pytest.mark.slow
 def test_four_pixels_are_right_in_the_image_and_certify_no_mounting(traced):
     info = traced[0].camera_K.copy()
     info[0, 2] += 4.0
