@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +18,12 @@ from pipeline.rig.estimates import Prior
 from pipeline.rig.graph import Sensor
 from pipeline.rig.prior import RigPrior, Star, agreed, from_rows, middle_of
 from pipeline.rig.rig import Rig
-from pipeline.rig.se3 import inverse, perturb_exactly
+from pipeline.rig.se3 import inverse
 from schemas.calibrations import FRAMES_OF_PAIR, SENSORS, pairs_of
 from schemas.observations import Observation
 
 __all__ = [
     "no_prior",
-    "perturbed",
     "prior_key",
     "prior_of_three",
     "read_prior",
@@ -117,29 +115,6 @@ def _carried(observations: Sequence[Observation], names: Sequence[str]) -> list[
 def no_prior(pair: str) -> str:
     """Reason for refusing a day or a pair without a prior."""
     return f'no prior: the logs have no tf_static chain for {pair}; give prior.source = "file"'
-
-
-def perturbed(prior: Prior, perturb: tuple[float, float] | None, seed: int) -> Prior:
-    """The prior with all transforms moved by an exact angle [deg] and shift [m]; sigmas at least as large.
-
-    The sigmas become max(configured sigma, size of the perturbation): the size is known, like the tolerance
-    of a workshop, but the direction is not.
-    """
-    if perturb is None:
-        return prior
-    angle, shift = np.radians(perturb[0]), perturb[1]
-    rng = np.random.default_rng(seed)
-    T_camera_lidar = perturb_exactly(prior.T_camera_lidar, float(angle), shift, rng)
-    T_lidar_radar = perturb_exactly(prior.T_lidar_radar, float(angle), shift, rng)
-    alone = prior.T_camera_radar_alone
-    return replace(
-        prior,
-        T_camera_lidar=T_camera_lidar,
-        T_lidar_radar=T_lidar_radar,
-        T_camera_radar_alone=None if alone is None else perturb_exactly(alone, float(angle), shift, rng),
-        rotation_sigma_rad=max(prior.rotation_sigma_rad, float(angle)),
-        translation_sigma_m=max(prior.translation_sigma_m, shift),
-    )
 
 
 def prior_key(fleet: FleetConfig, vehicle: str) -> str:

@@ -10,7 +10,7 @@ from jobs.cli import main
 from pipeline.calibrate.records import Inputs
 from pipeline.core.config import load_fleet
 from pipeline.core.ros_messages import RosMessages
-from pipeline.rig.day_prior import perturbed, read_prior
+from pipeline.rig.day_prior import read_prior
 from pipeline.rig.targets import errors_at_targets
 from pipeline.rig.topics import TOPICS
 from pipeline.store.current import targets_of
@@ -19,7 +19,7 @@ from pipeline.store.records import read_records
 from pipeline.store.views import observations_of
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from tests.benchmarks.studies.metrics import transform_of
-from tests.makers.calibrated_days import records_of_rows
+from tests.makers.calibrated_days import perturbed, records_of_rows
 from tests.makers.real_models import write_real_manifests
 
 pytestmark = [pytest.mark.real_logs, pytest.mark.slow]

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
 
 from pipeline.calibrate.methods import Solver
 from pipeline.calibrate.records import Inputs
@@ -12,10 +15,11 @@ from pipeline.rig.edges import EDGE_OF_PAIR
 from pipeline.rig.estimates import Prior
 from pipeline.rig.graph import RigGraph, Sensor
 from pipeline.rig.prior import RigPrior, middle_of
+from pipeline.rig.se3 import perturb_exactly
 from schemas.calibrations import CalibrationRecord
 from schemas.observations import Observation
 
-__all__ = ["records_of_rows", "rig_prior_of"]
+__all__ = ["perturbed", "records_of_rows", "rig_prior_of"]
 
 
 def rig_prior_of(prior: Prior, sensors: Sequence[Sensor]) -> RigPrior:
@@ -46,3 +50,26 @@ def records_of_rows(
     return calibrate_rig(
         RigDay(rig, graph, known, {}, lambda _: list(rows)), fleet, about, solver=solver
     ).records
+
+
+def perturbed(prior: Prior, perturb: tuple[float, float] | None, seed: int) -> Prior:
+    """The prior with all transforms moved by an exact angle [deg] and shift [m]; sigmas at least as large.
+
+    The sigmas become max(configured sigma, size of the perturbation): the size is known, like the tolerance
+    of a workshop, but the direction is not.
+    """
+    if perturb is None:
+        return prior
+    angle, shift = np.radians(perturb[0]), perturb[1]
+    rng = np.random.default_rng(seed)
+    T_camera_lidar = perturb_exactly(prior.T_camera_lidar, float(angle), shift, rng)
+    T_lidar_radar = perturb_exactly(prior.T_lidar_radar, float(angle), shift, rng)
+    alone = prior.T_camera_radar_alone
+    return replace(
+        prior,
+        T_camera_lidar=T_camera_lidar,
+        T_lidar_radar=T_lidar_radar,
+        T_camera_radar_alone=None if alone is None else perturb_exactly(alone, float(angle), shift, rng),
+        rotation_sigma_rad=max(prior.rotation_sigma_rad, float(angle)),
+        translation_sigma_m=max(prior.translation_sigma_m, shift),
+    )

@@ -23,7 +23,7 @@ import numpy as np
 from pipeline.calibrate.records import Inputs
 from pipeline.core.config import SolveConfig
 from pipeline.core.errors import SolveError
-from pipeline.rig.day_prior import perturbed, read_prior
+from pipeline.rig.day_prior import read_prior
 from pipeline.rig.estimates import Prior
 from pipeline.rig.se3 import exp_so3, from_rotation_translation
 from pipeline.rig.targets import loop_errors
@@ -33,7 +33,7 @@ from tests.benchmarks.studies.commits import commit_now, is_accepted
 from tests.benchmarks.studies.days import DATE, VEHICLE, Day, DaySpec, generated_day
 from tests.benchmarks.studies.looks import look
 from tests.benchmarks.studies.metrics import measure, mounting_error, transform_of
-from tests.makers.calibrated_days import records_of_rows
+from tests.makers.calibrated_days import perturbed, records_of_rows
 
 __all__ = ["RESULTS", "Run", "calibrate_once", "run_study"]
 
