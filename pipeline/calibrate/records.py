@@ -14,7 +14,6 @@ from pipeline.calibrate.judging import EdgeJudging, Judged
 from pipeline.calibrate.paper.triggers import trigger_metrics
 from pipeline.calibrate.unlabelled import notes_of_pair
 from pipeline.calibrate.verify.constancy import PART_FLOOR_RAD
-from pipeline.calibrate.verify.day_checks import loop_sigmas
 from pipeline.calibrate.verify.held_out import HeldOutTest
 from pipeline.core.errors import SolveError
 from pipeline.core.stage_work import NO_PROBES, Probes
@@ -23,7 +22,7 @@ from pipeline.rig.changes import change_between
 from pipeline.rig.edges import edge_named, pose_columns
 from pipeline.rig.estimates import DayParts, PairEstimate, Prior, Solution
 from pipeline.rig.graph import Edge
-from pipeline.rig.se3 import inverse
+from pipeline.rig.se3 import adjoint, inverse
 from pipeline.rig.spherical import camera_direction_angles
 from pipeline.store.partitions import Partition
 from schemas.calibrations import DOF_NAMES, FRAMES_OF_PAIR, PAIRS, CalibrationRecord
@@ -305,13 +304,29 @@ def _loop_fields(solution: Solution) -> dict[str, Any]:
     """Residual of the loop, with sigmas from three pairs estimated apart or from the method's own check."""
     composed = solution.pairs.get("camera_radar")
     checked = None if composed is None else composed.diagnostics.get("loop_rotation_sigma_rad")
-    rotation, translation = loop_sigmas(solution) or (checked, None)
+    rotation, translation = _loop_sigmas(solution) or (checked, None)
     return {
         "loop_rotation_rad": solution.loop_rotation_rad,
         "loop_translation_m": solution.loop_translation_m,
         "loop_rotation_sigma_rad": rotation,
         "loop_translation_sigma_m": translation,
     }
+
+
+def _loop_sigmas(solution: Solution) -> tuple[float, float] | None:
+    """Sigma of the loop's angle [rad] and translation [m] if all three pairs were estimated independently."""
+    if solution.loop_rotation_rad is None or solution.loop_translation_m is None:
+        return None
+    covariance = _loop_covariance(solution)
+    return float(np.sqrt(np.trace(covariance[:3, :3]))), float(np.sqrt(np.trace(covariance[3:, 3:])))
+
+
+def _loop_covariance(solution: Solution) -> np.ndarray:
+    """Covariance (6 6) of T_camera_lidar T_lidar_radar T_radar_camera, with independent factors (first order)."""
+    cl, lr, cr = (solution.pairs[p] for p in ("camera_lidar", "lidar_radar", "camera_radar"))
+    A = adjoint(cl.T)
+    B = adjoint(cl.T @ lr.T @ inverse(cr.T))
+    return cl.covariance + A @ lr.covariance @ A.T + B @ cr.covariance @ B.T
 
 
 def _add(a: Mapping[str, int], b: Mapping[str, int]) -> dict[str, int]:

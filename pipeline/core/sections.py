@@ -235,12 +235,6 @@ class ChecksConfig(Section):
     min_held_out_blocks: Annotated[int, Field(ge=2)] = 3
     # Held-out frames contradict a result if they would move it by more than this many sigmas of that move.
     held_out_contradiction_sigmas: Positive = 3.0
-    # If three independent estimates form a loop that stays open by more than this many of its sigmas, one is
-    # wrong.
-    max_loop_sigmas: Positive = 3.0
-    # Lidar-radar and the prior contradict each other about the car's heading, which moves camera-lidar's cloud,
-    # if they differ by more than this many of the prior's sigmas.
-    heading_change_prior_sigmas: Positive = 3.0
 
 
 class PrepareConfig(Section):

@@ -17,7 +17,6 @@ import numpy as np
 from pipeline.calibrate.joint.camera_lidar.estimate import align_camera_lidar, analyse_camera_lidar
 from pipeline.calibrate.joint.camera_lidar.intrinsics import contradictions
 from pipeline.calibrate.joint.camera_radar import estimate_camera_radar
-from pipeline.calibrate.joint.lidar_radar.conclusions import lidar_radar_failures
 from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
 from pipeline.core.config import SolveConfig
 from pipeline.core.errors import SolveError
@@ -78,8 +77,7 @@ def _solved(
 ) -> _Found:
     rng = np.random.default_rng([seed, ("camera_lidar", "lidar_radar", "camera_radar").index(pair)])
     if pair == "lidar_radar":
-        found = estimate_lidar_radar(observations, prior, config, rng)
-        return found, lidar_radar_failures(found)
+        return estimate_lidar_radar(observations, prior, config, rng), []
     if pair == "camera_radar":
         return estimate_camera_radar(observations, prior, config, rng, boxes="boxes" in config.terms), []
     aligned = align_camera_lidar(observations, prior, config, rng)

@@ -30,7 +30,6 @@ __all__ = [
     "response",
     "spread_to_covariance",
     "widening",
-    "with_ends",
 ]
 
 CLEARLY = 4.0  # standard errors by which frames reject the end of another start
@@ -154,15 +153,6 @@ def spread_to_covariance(
     values, vectors = np.linalg.eigh(0.5 * (W + W.T))
     root = L @ vectors
     return (root * np.maximum(values, 1.0)) @ root.T
-
-
-def with_ends(
-    covariance: Float[np.ndarray, "P P"], apart: Float[np.ndarray, " P"]
-) -> Float[np.ndarray, "P P"]:
-    """Covariance of an estimate, plus the scatter of two starts' ends (`apart`) if it is beyond one sigma."""
-    if np.all(np.abs(apart) <= np.sqrt(np.diag(covariance))):
-        return covariance
-    return covariance + np.outer(apart, apart) / 2  # the variance of two values
 
 
 def posterior(

@@ -13,11 +13,8 @@ from pipeline.calibrate.select.frames import Selection
 from pipeline.calibrate.verify.constancy import constancy_failures
 from pipeline.calibrate.verify.motion_sources import MotionFindings
 from pipeline.core.config import ChecksConfig, FleetConfig
-from pipeline.objective.stamp_gaps import camera_gaps_s, constant_gap_s
-from pipeline.rig.changes import change_between
-from pipeline.rig.checks import Change, Check, change_of
+from pipeline.rig.checks import Check
 from pipeline.rig.estimates import PairEstimate, Prior, Solution
-from pipeline.rig.se3 import adjoint, compose_covariance, inverse
 from schemas.calibrations import DOF_NAMES, PAIRS
 from schemas.observations import Observation
 
@@ -28,9 +25,6 @@ __all__ = [
     "checks_of_day",
     "clock_alarms",
     "far_positions",
-    "heading_failures",
-    "loop_failures",
-    "loop_sigmas",
     "own_positions",
     "prior_alarms",
     "scene_failures",
@@ -40,99 +34,6 @@ __all__ = [
 # Checks of what a method solved: the loop of all pairs, and the heading.
 #
 # Each states by how much a pose would be wrong if it is right, so that only what matters holds a record.
-
-
-def loop_failures(solution: Solution, limits: ChecksConfig | None = None) -> dict[str, list[Check]]:
-    """A loop of independent estimates that does not close within its sigma, by pair: any of them may be wrong.
-
-    Each would have to move by what closes the loop.
-    """
-    limits = limits or ChecksConfig()
-    found = loop_sigmas(solution)
-    if found is None or solution.loop_rotation_rad is None or solution.loop_translation_m is None:
-        return {}
-    rotation, translation = found
-    sentences = []
-    if solution.loop_rotation_rad > limits.max_loop_sigmas * rotation:
-        open_deg, sigma_deg = np.degrees(solution.loop_rotation_rad), np.degrees(rotation)
-        sentences.append(f"the loop is open by {open_deg:.2f} deg, its sigma is {sigma_deg:.2f} deg")
-    if solution.loop_translation_m > limits.max_loop_sigmas * translation:
-        open_m = solution.loop_translation_m
-        sentences.append(f"the loop is open by {open_m:.3f} m, its sigma is {translation:.3f} m")
-    return {
-        pair: [
-            Check(s, "witnesses_disagree", error=_change(solution, pair, T), covariance=covariance)
-            for s in sentences
-        ]
-        for pair, (T, covariance) in (_by_others(solution) if sentences else {}).items()
-    }
-
-
-def _change(solution: Solution, pair: str, T: Float[np.ndarray, "4 4"]) -> Change:
-    return change_of(change_between(solution.pairs[pair].T, T))
-
-
-def _by_others(
-    solution: Solution,
-) -> dict[str, tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "6 6"]]]:
-    """Pose of each pair that the other two give, which would close the loop, and its covariance."""
-    cl, lr, cr = (solution.pairs[p] for p in ("camera_lidar", "lidar_radar", "camera_radar"))
-    of_camera, back = cr.T @ inverse(lr.T), adjoint(inverse(cl.T))
-    return {
-        "camera_lidar": (of_camera, compose_covariance(of_camera, cr.covariance, lr.covariance)),
-        "camera_radar": (cl.T @ lr.T, compose_covariance(cl.T, cl.covariance, lr.covariance)),
-        "lidar_radar": (inverse(cl.T) @ cr.T, back @ (cl.covariance + cr.covariance) @ back.T),
-    }
-
-
-def heading_failures(
-    solution: Solution,
-    prior: Prior,
-    observations: Sequence[Observation],
-    limits: ChecksConfig | None = None,
-) -> list[Check]:
-    """Failed check of camera-lidar if the heading that it was solved with contradicts the prior.
-
-    A camera's time offset moves the cloud along the car's heading, which the radar's mounting gives. If
-    lidar-radar rotates the radar by many of the prior's sigmas, one of the two is wrong. Camera-lidar may then
-    have a lateral error of time offset times speed times this rotation.
-
-    Args:
-        prior: prior whose T_lidar_radar lidar-radar moved.
-        limits: threshold for a wrong heading; None = the default.
-    """
-    limits = limits or ChecksConfig()
-    if not {"camera_lidar", "lidar_radar"} <= solution.pairs.keys():
-        return []
-    found = solution.pairs["camera_lidar"]
-    turn = abs(float(change_between(prior.T_lidar_radar, solution.pairs["lidar_radar"].T)[2]))
-    speeds = [abs(o.ego_speed_mps) for o in observations if o.ego_speed_mps is not None]
-    if not speeds or turn < limits.heading_change_prior_sigmas * prior.rotation_sigma_rad:
-        return []
-    # What lies between sweep and image on the way, where the stamps' constant gap is the clock's.
-    expected_s = constant_gap_s(camera_gaps_s(observations))
-    way_s = 0.0 if found.time_offset_s is None else abs(found.time_offset_s - expected_s)
-    lateral_m = round(turn * way_s * float(np.mean(speeds)), 2)  # less than a centimetre is nothing
-    off = f"heading off by {np.degrees(turn):.1f} deg between prior and lidar-radar"
-    sentence = f"{off}: up to {lateral_m:.2f} m lateral error through the camera's time offset"
-    error = change_of([0.0, 0.0, 0.0, *(lateral_m * found.T[:3, 1])])  # along the lidar's y
-    return [Check(sentence, error=error)] if lateral_m else []
-
-
-def loop_sigmas(solution: Solution) -> tuple[float, float] | None:
-    """Sigma of the loop's angle [rad] and translation [m] if all three pairs were estimated independently."""
-    if solution.loop_rotation_rad is None or solution.loop_translation_m is None:
-        return None
-    covariance = _loop_covariance(solution)
-    return float(np.sqrt(np.trace(covariance[:3, :3]))), float(np.sqrt(np.trace(covariance[3:, 3:])))
-
-
-def _loop_covariance(solution: Solution) -> np.ndarray:
-    """Covariance (6 6) of T_camera_lidar T_lidar_radar T_radar_camera, with independent factors (first order)."""
-    cl, lr, cr = (solution.pairs[p] for p in ("camera_lidar", "lidar_radar", "camera_radar"))
-    A = adjoint(cl.T)
-    B = adjoint(cl.T @ lr.T @ inverse(cr.T))
-    return cl.covariance + A @ lr.covariance @ A.T + B @ cr.covariance @ B.T
 
 
 # --------------------------------------------------------------------------------------------------
@@ -152,11 +53,8 @@ def scene_failures(fitted: Sequence[Observation]) -> list[Check]:
 # Alarms: a mounting or a clock that the day puts many sigmas from its prior.
 #
 # A degree of freedom that the day leaves at the prior has the prior's error, even if that exceeds the stated
-# sigma. So each other source of information on such a prior is compared with it. One is the pair's own day
-# without the prior, which is too uncertain to be a result but may still be ten sigmas away. The other is the
-# other pair of the same sensor. If the camera finds the lidar .3 m lower than tf_static, one of the two is
-# mounted elsewhere; if it is the lidar, the radar's height above it has the same error, and nothing in
-# lidar-radar shows it.
+# sigma. The pair's own day without the prior is too uncertain to be a result, but may still be ten sigmas away.
+# What another edge of the same sensor shows of its prior is in `wrong_priors`.
 
 
 # By which the day's own position must differ as well, where frames confirm it; else as many as of the prior.
@@ -264,14 +162,6 @@ def _solver(day: FoundDay) -> Mapping[str, Sequence[Check]]:
     return day.solution.failed_checks
 
 
-def _heading(day: FoundDay) -> Mapping[str, Sequence[Check]]:
-    return {"camera_lidar": heading_failures(day.solution, day.prior, day.observations, day.limits)}
-
-
-def _loop(day: FoundDay) -> Mapping[str, Sequence[Check]]:
-    return loop_failures(day.solution, day.limits)
-
-
 def _scenes(day: FoundDay) -> Mapping[str, Sequence[Check]]:
     fitted = day.selection.fit.items()
     return {pair: scene_failures([day.observations[i] for i in frames]) for pair, frames in fitted}
@@ -296,8 +186,6 @@ def _alarms(day: FoundDay) -> Mapping[str, Sequence[Check]]:
 DAY_CHECKS: tuple[DayCheck, ...] = (
     _motion,
     _solver,
-    _heading,
-    _loop,
     _scenes,
     _constancy,
     _alarms,

@@ -9,7 +9,6 @@ from pipeline.calibrate.numerics.covariance import (
     posterior,
     response,
     widening,
-    with_ends,
 )
 from pipeline.calibrate.numerics.frame_blocks import bootstrap_blocks
 
@@ -126,19 +125,6 @@ def test_the_optimum_follows_along_the_valley_and_leaves_alone_what_is_held():
     given, held = np.array([False, True, False]), np.array([False, False, True])
     np.testing.assert_allclose(response(curvature, given, held), [[-0.5], [1.0], [0.0]])
     np.testing.assert_allclose(response(curvature, given, np.zeros(3, bool)), [[-0.5], [1.0], [-1 / 3]])
-
-
-def test_two_ends_beyond_a_sigma_add_their_scatter_along_the_way_between_them_and_nothing_across():
-    covariance, apart = np.diag([1.0, 4.0]), np.array([3.0, -1.5])
-    wider = with_ends(covariance, apart)
-    way, across = apart / np.linalg.norm(apart), np.array([1.5, 3.0])
-    assert way @ (wider - covariance) @ way == pytest.approx(apart @ apart / 2)
-    assert across @ wider @ across == pytest.approx(across @ covariance @ across)
-    assert with_ends(covariance, np.array([0.9, -1.9])) is covariance
-    # Where either end is as likely the right one, errors are as large as the sigma says.
-    rng = np.random.default_rng(0)
-    truth = rng.integers(2, size=4000)[:, None] * apart + rng.multivariate_normal([0, 0], covariance, 4000)
-    assert np.mean(truth**2, axis=0) == pytest.approx(np.diag(wider), rel=0.1)
 
 
 def test_no_direction_is_surer_than_the_information():

@@ -6,17 +6,15 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.numerics.search_range import SearchRange
-from pipeline.calibrate.verify.day_checks import heading_failures, loop_failures
 from pipeline.calibrate.verify.edge_result import EdgeResult
 from pipeline.calibrate.verify.held_out import HeldOutTest, paired_test
 from pipeline.calibrate.verify.target_accuracy import DIRECTIONS, Claim
 from pipeline.calibrate.verify.verdict import Evidence, judge
 from pipeline.core.config import ChecksConfig
 from pipeline.rig.checks import HARMLESS, Check, change_of
-from pipeline.rig.estimates import PairEstimate, Prior, Solution
-from pipeline.rig.se3 import exp_se3, exp_so3, from_rotation_translation
+from pipeline.rig.estimates import PairEstimate, Prior
+from pipeline.rig.se3 import exp_so3, from_rotation_translation
 from pipeline.rig.targets import DEFAULT_TARGETS
-from tests.makers.solve_scenes import make_day
 
 PRIOR = Prior(np.eye(4), np.eye(4), np.radians(2), 0.05)
 SIGMA = np.array([np.radians(0.1)] * 3 + [0.02] * 3)
@@ -356,39 +354,6 @@ def test_each_limit_of_the_verdict_decides(change, turn_deg, after, words):
     assert words in strict.reason
 
 
-def solution(turn_deg=0.0, shift_m=0.0, loop=True):
-    """A loop that camera-radar leaves open about the vertical, and along z."""
-    pairs = {p: estimate(pair=p) for p in ("camera_lidar", "camera_radar", "lidar_radar")}
-    T = from_rotation_translation(exp_so3(np.array([0, 0, np.radians(turn_deg)])), np.array([0, 0, shift_m]))
-    pairs["camera_radar"] = replace(pairs["camera_radar"], T=T)
-    return Solution("joint", pairs, *((np.radians(turn_deg), shift_m) if loop else (None, None)))
-
-
-def test_a_loop_beyond_three_sigma_fails_every_pair_by_what_would_close_it():
-    turned = loop_failures(solution(2.0))
-    assert turned.keys() == {"camera_lidar", "camera_radar", "lidar_radar"}
-    assert all("open by 2.00 deg" in checks[0].sentence for checks in turned.values())
-    assert {p: round(np.degrees(checks[0].error[2])) for p, checks in turned.items()} == {
-        "camera_lidar": 2, "camera_radar": -2, "lidar_radar": 2,
-    }  # fmt: skip
-    assert "open by 0.500 m" in loop_failures(solution(0.0, 0.5))["lidar_radar"][0].sentence
-    # The other two know it to a tenth of a degree each.
-    covariance = turned["lidar_radar"][0].covariance
-    assert np.degrees(np.sqrt(np.diag(covariance)[:3])) == pytest.approx(0.1 * np.sqrt(2))
-
-
-def test_loop_failures_come_at_their_rate_when_the_sigmas_are_right():
-    rng = np.random.default_rng(0)
-    hits = 0
-    for _ in range(400):
-        cl, lr, cr = (exp_se3(rng.normal(size=6) * SIGMA) for _ in range(3))
-        loop = cl @ lr @ np.linalg.inv(cr)
-        angle = float(np.arccos(np.clip((np.trace(loop[:3, :3]) - 1) / 2, -1, 1)))
-        size = angle, float(np.linalg.norm(loop[:3, 3]))
-        hits += bool(loop_failures(Solution("joint", solution().pairs, *size)))
-    assert hits <= 4
-
-
 def test_paired_test_counts_blocks_not_frames():
     rng = np.random.default_rng(0)
     blocks = np.repeat(np.arange(10), 50)
@@ -427,29 +392,6 @@ def test_two_blocks_are_no_proof_however_well_they_agree():
     found = paired_test(before, after, blocks)
     assert (after.mean() - 0) / found.standard_error > 15
     assert 1 < found.z < 2.5
-
-
-def test_a_radar_that_turned_beyond_its_prior_holds_what_was_solved_along_its_heading():
-    day = make_day(5, ego_speed_mps=30.0)
-
-    def failures(turn_deg, dt_s):
-        T = from_rotation_translation(exp_so3(np.array([0, 0, np.radians(turn_deg)])), np.zeros(3))
-        pairs = {
-            "camera_lidar": replace(estimate(), time_offset_s=dt_s),
-            "lidar_radar": replace(estimate(pair="lidar_radar"), T=T),
-        }
-        return heading_failures(Solution("joint", pairs), PRIOR, day)
-
-    (check,) = failures(9.0, 0.02)
-    assert "heading off by 9.0 deg" in check.sentence
-    assert "up to 0.09 m lateral error" in check.sentence
-    assert check.error[3:] == pytest.approx((0, 0.09, 0))
-    assert verdict(estimate(1.5), BETTER, [check]).status == "held"
-    (little,) = failures(9.0, 0.005)
-    assert verdict(estimate(1.5), BETTER, [little]).status == "accepted"
-    assert failures(9.0, 0.0) == []  # nothing was moved
-    assert failures(9.0, None) == []
-    assert failures(2.0, 0.02) == []  # within the prior's sigma: the covariance's business
 
 
 def test_a_wrong_principal_point_is_right_in_the_image_and_certifies_no_mounting():

@@ -190,11 +190,7 @@ def analyse_camera_lidar(
     analysis = analyse_observability(problem, aligned.state, aligned.kernel, rng)
     fixed = analysis.fixed | (np.arange(8) == FOCAL)
     scored = Scored(problem.terms, analysis.kernel, analysis.prior, problem.config)
-    halves = []
-    for k in (0, 1):
-        half = replace(scored, terms=problem.terms.of_frames(np.arange(k, problem.terms.frames, 2)))
-        halves.append(refine(half, analysis.state, steps=SCHEDULE.half_steps, fixed=fixed))
-    diagnostics = _diagnostics(problem.terms, analysis, aligned.basin, halves)
+    diagnostics = _diagnostics(problem.terms, analysis, aligned.basin)
     own_tz = analysis.profile.shift_from(float(problem.prior.T_camera_lidar[2, 3]))
     own_dt_s, z = far_time_offset(problem.terms, analysis.state, analysis.kernel, rng)
     diagnostics |= {
@@ -281,10 +277,8 @@ def _diagnostics(
     terms: Terms,
     analysis: ObservabilityAnalysis,
     basin: Basin,
-    halves: list[AlignmentState],
 ) -> dict[str, float]:
     """Numbers behind the verdict."""
-    apart = difference(halves[0], halves[1])
     kernel, profile = analysis.kernel, analysis.profile
     return {
         "candidates": float(basin.candidates),
@@ -292,9 +286,6 @@ def _diagnostics(
         "basin_needed": basin.needed,
         "basin_rival_deg": float(np.degrees(basin.rival_rad)),
         "basin_rival_z": float(min(basin.rival_z, 1e3)),
-        **{f"halves_{n}_deg": float(np.degrees(abs(apart[i]))) for i, n in enumerate(("rx", "ry", "rz"))},
-        **{f"halves_{n}_m": float(abs(apart[3 + i])) for i, n in enumerate(("tx", "ty", "tz"))},
-        "halves_dt_s": float(abs(apart[6])),
         **{
             f"edge_match_share_{n}": float(terms.mean_match(kernel)[i])
             for i, n in enumerate(("left", "right", "above", "below"))

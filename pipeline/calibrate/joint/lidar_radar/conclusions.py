@@ -7,17 +7,15 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
-from pipeline.calibrate.joint.lidar_radar.elevation_errors import contradiction, own_numbers, radar_tilt_axes
+from pipeline.calibrate.joint.lidar_radar.elevation_errors import contradiction, own_numbers
 from pipeline.calibrate.joint.lidar_radar.observability import ObservabilityAnalysis, with_measured_curvature
 from pipeline.calibrate.joint.lidar_radar.problem import DT, RANGE, RadarProblem, RadarState
 from pipeline.calibrate.joint.lidar_radar.search import comparison_cost, finish
 from pipeline.calibrate.numerics.bias_floors import RADAR_ELEVATION_BIAS_RAD, RANGE_BIAS_SIGMA_M
 from pipeline.calibrate.numerics.covariance import bootstrap_covariance
 from pipeline.rig.changes import change_between
-from pipeline.rig.checks import Check, change_of
-from pipeline.rig.estimates import PairEstimate
 
-__all__ = ["diagnostics_of", "lidar_radar_failures", "notes_of", "own_position"]
+__all__ = ["diagnostics_of", "notes_of", "own_position"]
 
 # --------------------------------------------------------------------------------------------------
 # Horizontal position of the radar from the day alone, without its prior; for an alarm, not an estimate.
@@ -90,11 +88,6 @@ def _z(difference: Float[np.ndarray, " F"], block: Int64[np.ndarray, " F"]) -> f
 
 _DT_UNSURE_S = 0.005  # a time offset known no better than this gets a note
 _NAMES = np.array(["roll", "pitch", "yaw", "x", "y", "z"])
-_SIGMAS = 3.0
-# Restarts end before the last steps: only another basin counts, and only in certified axes.
-_RESTART_ROTATION_RAD, _RESTART_SHIFT_M = np.radians(0.15), 0.05
-_HALVES_FACTOR = 2  # two halves differ by twice the error of the whole, if their errors are independent
-_DOF_UNITS = ("rx_rad", "ry_rad", "rz_rad", "tx_m", "ty_m", "tz_m")
 
 
 def notes_of(analysis: ObservabilityAnalysis, *, has_elevation: bool) -> list[str]:
@@ -141,13 +134,9 @@ def notes_of(analysis: ObservabilityAnalysis, *, has_elevation: bool) -> list[st
     return notes
 
 
-def diagnostics_of(
-    analysis: ObservabilityAnalysis, ends: list[RadarState], halves: list[RadarState]
-) -> dict[str, float]:
-    """Numbers of a solution, of the ends of its starts and of the day's halves; non-finite values are left out."""
+def diagnostics_of(analysis: ObservabilityAnalysis) -> dict[str, float]:
+    """Numbers of a solution; non-finite values are left out."""
     state, linear = analysis.state, analysis.linear
-    half = change_between(halves[1].T_lidar_radar, halves[0].T_lidar_radar)
-    apart = change_between(ends[-1].T_lidar_radar, ends[0].T_lidar_radar)
     diagnostics = {
         "azimuth_sigma_rad": float(state.sigma[0]),
         "elevation_sigma_rad": float(state.sigma[1]),
@@ -158,76 +147,8 @@ def diagnostics_of(
         **({} if analysis.heights is None else {"displaced_share": analysis.heights.displaced}),
         "assigned_share": float(linear.registration.assigned.mean()),
         "moving_azimuth_sigma_rad": linear.mover_sigma_rad,
-        "registration_roll_offset_rad": float(linear.registration_step[0]),
-        "registration_roll_sigma_rad": float(linear.floor[0]),
-        "registration_pitch_offset_rad": float(linear.registration_step[1]),
-        "registration_pitch_sigma_rad": float(linear.floor[1]),
         **own_numbers(analysis.sources),
         "doppler_frames": float(linear.travel_frames),
         "doppler_scatter_rad": linear.travel_scatter_rad,
-        **{f"halves_{n}": float(v) for n, v in zip(_DOF_UNITS, half, strict=True)},
-        "halves_dt_s": halves[0].dt_s - halves[1].dt_s,
-        "restarts_rz_rad": float(apart[2]),
-        "restarts_tx_m": float(apart[3]),
-        "restarts_ty_m": float(apart[4]),
     }  # fmt: skip
     return {k: v for k, v in diagnostics.items() if np.isfinite(v)}
-
-
-def lidar_radar_failures(estimate: PairEstimate) -> list[Check]:
-    """Restarts, halves, and the registration against the camera's boxes."""
-    if not estimate.diagnostics:
-        return []
-    failed = [_restarts(estimate), _halves(estimate), *_registration(estimate)]
-    return [check for check in failed if check is not None]
-
-
-def _restarts(estimate: PairEstimate) -> Check | None:
-    """Ends of the search in different basins: if another one is right, the pose is off by all of their distance."""
-    least = np.array([np.inf, np.inf, _RESTART_ROTATION_RAD, _RESTART_SHIFT_M, _RESTART_SHIFT_M, np.inf])
-    apart = _known(estimate, "restarts")
-    return _difference("restarts", apart, np.maximum(least, _SIGMAS * _sigma(estimate)), apart)
-
-
-def _halves(estimate: PairEstimate) -> Check | None:
-    """The pose lies between those of the halves."""
-    apart = _known(estimate, "halves")
-    return _difference("disjoint halves", apart, _SIGMAS * _HALVES_FACTOR * _sigma(estimate), apart / 2)
-
-
-def _difference(
-    who: str, apart: Float[np.ndarray, " 6"], allowed: Float[np.ndarray, " 6"], error: Float[np.ndarray, " 6"]
-) -> Check | None:
-    beyond = np.flatnonzero(np.abs(apart) > allowed)
-    if not len(beyond):
-        return None
-    sizes = " and ".join(f"{_NAMES[k]} by {_size(k, float(apart[k]))}" for k in beyond.tolist())
-    return Check(f"{who} disagree in {sizes}", "witnesses_disagree", error=change_of(error))
-
-
-def _registration(estimate: PairEstimate) -> list[Check]:
-    """What turns the radar's roll or pitch if the registration alone is right."""
-    d, failed = estimate.diagnostics, []
-    for axis, name in zip(radar_tilt_axes(estimate.T).T, ("roll", "pitch"), strict=True):
-        offset, floor = d[f"registration_{name}_offset_rad"], d[f"registration_{name}_sigma_rad"]
-        known = estimate.observable[int(np.argmax(np.abs(axis)))]
-        own = float(np.sqrt(axis @ estimate.covariance[:2, :2] @ axis))
-        if known and abs(offset) > _SIGMAS * np.hypot(floor, own):
-            turned = f"would turn {name} by {np.degrees(offset):+.1f} deg, camera and prior would not"
-            error = change_of([*(axis * offset), 0.0, 0.0, 0.0, 0.0])
-            failed.append(Check(f"the registration {turned}", "witnesses_disagree", error=error))
-    return failed
-
-
-def _known(estimate: PairEstimate, of: str) -> Float[np.ndarray, " 6"]:
-    """A change in the diagnostics, 0 where it is not there or the day did not determine it."""
-    change = np.array([estimate.diagnostics.get(f"{of}_{key}", 0.0) for key in _DOF_UNITS])
-    return np.where(estimate.observable, change, 0.0)
-
-
-def _sigma(estimate: PairEstimate) -> Float[np.ndarray, " 6"]:
-    return np.sqrt(np.diag(estimate.covariance))
-
-
-def _size(k: int, value: float) -> str:
-    return f"{np.degrees(value):+.2f} deg" if k < 3 else f"{value:+.3f} m"

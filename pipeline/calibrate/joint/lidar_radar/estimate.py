@@ -44,9 +44,7 @@ from pipeline.calibrate.joint.lidar_radar.search import (
 from pipeline.calibrate.joint.part_turn import PartTurn
 from pipeline.calibrate.numerics.change_point import parts_of_day, with_parts
 from pipeline.calibrate.numerics.covariance import (
-    CLEARLY,
     bootstrap_covariance,
-    with_ends,
 )
 from pipeline.calibrate.numerics.frame_blocks import blocks_of, scenes_of
 from pipeline.core.config import SolveConfig
@@ -105,14 +103,7 @@ def estimate_lidar_radar(
     analysis = _with_sources(analysis, sources, without_way)
     block = blocks_of(problem.observations, config.bootstrap_blocks)
     analysis = _with_other_dips(problem, analysis, block[problem.frames.frame])
-    parts = [problem.of_frames(np.arange(k, count, 2)) for k in (0, 1)]
-    halves = [finish(part, analysis.state, analysis.fixed)[0] for part in parts]
-    rival = _second_best(ends, costs)
-    if rival is not best:
-        # Annealed ends lie a few steps before their optimum: only where they end up do they agree or not.
-        rival = finish(problem, rival.with_fixed(problem.prior, analysis.fixed), analysis.fixed)[0]
-    compared = [analysis.state, analysis.state if rival is best else rival]
-    found = _conclude(problem, analysis, compared, halves, rejected)
+    found = _conclude(problem, analysis, rejected)
     own = own_position(problem, analysis.state, analysis.fixed, block)
     own |= far_time_offset(problem, analysis.state)
     found = with_parts(found, _parts(problem, analysis, config, rng))
@@ -258,29 +249,12 @@ def _consistent_with_odometry(observations: Sequence[Observation]) -> list[Obser
     return [o for o, w in zip(observations, wrong, strict=True) if not w]
 
 
-def _second_best(ends: list[RadarState], costs: list[np.ndarray]) -> RadarState:
-    """The end of another start if its cost is not clearly higher than the best one; else the best end."""
-    best = int(np.argmin([c.mean() for c in costs]))
-    for end, cost in zip(ends, costs, strict=True):
-        worse = cost - costs[best]
-        if end is not ends[best] and worse.mean() < CLEARLY * worse.std() / np.sqrt(len(worse)):
-            return end
-    return ends[best]
-
-
 def _conclude(
-    problem: RadarProblem,
-    analysis: ObservabilityAnalysis,
-    ends: list[RadarState],
-    halves: list[RadarState],
-    rejected: dict[str, int],
+    problem: RadarProblem, analysis: ObservabilityAnalysis, rejected: dict[str, int]
 ) -> PairEstimate:
     state, fixed = analysis.state, analysis.fixed
     notes = notes_of(analysis, has_elevation=bool(problem.frames.has_elevation.any()))
-    # Elevation has sources of its own.
-    compared = np.isin(np.arange(6), (_YAW, 3, 4)) & ~fixed[:6]
-    apart = change_between(ends[-1].T_lidar_radar, ends[0].T_lidar_radar)
-    covariance = with_ends(analysis.covariance[:6, :6], np.where(compared, apart, 0.0))
+    covariance = analysis.covariance[:6, :6]
     # The record's covariance is of a left perturbation: a turn about the lidar carries the radar along.
     J = np.linalg.inv(change_jacobian(state.T_lidar_radar))
     return PairEstimate(
@@ -293,7 +267,7 @@ def _conclude(
         {reason: count for reason, count in rejected.items() if count},
         analysis.dt_weight * state.dt_s - problem.constant_gap_s,
         float(np.sqrt(analysis.covariance[DT, DT])),
-        diagnostics_of(analysis, ends, halves),
+        diagnostics_of(analysis),
         notes,
         common_part(J @ analysis.common[:6, :6] @ J.T, J @ covariance @ J.T),
         bias={EDGE: J @ analysis.bias[:6, :6] @ J.T},

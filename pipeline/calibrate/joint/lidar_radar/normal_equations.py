@@ -82,8 +82,6 @@ def linearise(problem: RadarProblem, state: RadarState, widen: float, stride: in
         prior_gradient,
         equations,
         mover_sigma,
-        registration_step,
-        floor,
         tuple(w for w in (seen, by_travel, by_heights) if w is not None),
         0 if by_travel is None or problem.travel is None else problem.travel.count,
         travel_scatter,

@@ -132,8 +132,6 @@ class Linear:
     registration: NormalEquations
     mover_sigma_rad: float
     # 3: where the registration's elevations alone would move roll, pitch (about the radar's own axes), z
-    registration_step: np.ndarray
-    floor: np.ndarray  # 3: sigma that those elevations leave of roll, pitch [rad] and z [m]
     sources: tuple[PartTurn, ...]  # of pitch
     travel_frames: int
     travel_scatter_rad: float  # of the frames' ways beyond their own sigmas
