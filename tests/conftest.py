@@ -13,6 +13,7 @@ import pytest  # noqa: E402 - numeric libraries read the environment while they 
 from hypothesis import settings  # noqa: E402
 
 from tests.budgets import BUDGETS, beyond, slowness  # noqa: E402
+from tests.makers.s3_server import S3, running  # noqa: E402
 
 # No deadline: the machine may be busy. The same examples each time: a red run must come again when it is looked at.
 settings.register_profile("house", deadline=None, derandomize=True)
@@ -65,6 +66,27 @@ def real_segmenter() -> Path:
     if not path.is_file():
         pytest.skip("the real segmenter is not on this machine")
     return path
+
+
+@pytest.fixture(scope="session")
+def s3_server() -> Generator[S3]:
+    """A server of a bucket on loopback, for all of this process."""
+    with running() as server:
+        yield server
+
+
+@pytest.fixture
+def s3(s3_server: S3, monkeypatch: pytest.MonkeyPatch) -> Generator[S3]:
+    """The server without faults, and this process set to use it."""
+    from pipeline.store import object_store  # not before the shape checks hook the product's imports
+
+    for name, value in s3_server.environment.items():
+        monkeypatch.setenv(name, value)
+    object_store._client.cache_clear()
+    s3_server.faults(fail=0, stall=0)
+    yield s3_server
+    s3_server.faults(fail=0, stall=0)
+    object_store._client.cache_clear()
 
 
 # Where the heavy files are, so that no worker begins one when the other has nothing left. Others keep their order.

@@ -13,26 +13,13 @@ from pipeline.ingest.containers.reader import content_identity, open_log
 from pipeline.store.object_store import Bucket
 from pipeline.store.remote_logs import RemoteLog, log_at
 from tests.ingest.test_reading_plan import BUDGET, in_bursts, long_drive, same_but_numbers
-from tests.makers.s3_server import BUCKET, running
+from tests.makers.s3_server import BUCKET
 
 
-@pytest.fixture(scope="module")
-def server():
-    with running() as s3:
-        yield s3
-
-
-@pytest.fixture
-def s3(server, monkeypatch):
-    for name, value in server.environment.items():
-        monkeypatch.setenv(name, value)
+@pytest.fixture(autouse=True)
+def _soon_given_up(monkeypatch):
     for name, value in {"REQUEST_S": 5.0, "RETRIES": 2, "RETRY_S": 2.0}.items():
         monkeypatch.setattr(pipeline.store.object_store, name, value)
-    pipeline.store.object_store._client.cache_clear()
-    server.faults(fail=0, stall=0)
-    yield server
-    server.faults(fail=0, stall=0)
-    pipeline.store.object_store._client.cache_clear()
 
 
 @pytest.fixture

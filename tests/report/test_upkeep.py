@@ -16,7 +16,7 @@ from pipeline.store.object_store import Bucket
 from pipeline.store.partitions import Lake, Partition
 from schemas.calibrations import CALIBRATIONS
 from tests.audit.fleet_records import vehicle_records
-from tests.makers.s3_server import BUCKET, running
+from tests.makers.s3_server import BUCKET
 from tests.makers.stages import audit_fleet
 from tests.report.test_pages import KNOCK, _config
 
@@ -133,25 +133,22 @@ def test_a_page_that_cannot_be_drawn_is_named_and_drawn_the_next_time(tmp_path, 
 
 
 @pytest.mark.slow
-def test_a_lake_in_a_bucket_is_sent_no_page_that_it_has(monkeypatch, drawn):
-    with running() as s3:
-        for name, value in s3.environment.items():
-            monkeypatch.setenv(name, value)
-        lake = Lake.at(f"s3://{BUCKET}/lake")
-        out = PurePosixPath("lake/report/fleet.html")
-        files = Bucket(BUCKET)
-        commit_records(lake, CALIBRATIONS, days_of("a", 4) + days_of("b", 4))
-        assert len(report(lake, out, files=files)) == 1 + 8
-        assert len(drawn) == 8
-        drawn.clear()
-        s3.faults(fail=4, every=3)
-        pages = report(lake, out, files=files)
-        assert (len(pages), drawn) == (1 + 8, [])
-        assert s3.faults()["failed"] == 4
-        assert {str(p) for p in files.find(out.parent, "**/*")} >= {str(p) for p in pages}
-        files.delete(pages[3])
-        report(lake, out, files=files)
-        assert len(drawn) == 1
+def test_a_lake_in_a_bucket_is_sent_no_page_that_it_has(s3, drawn):
+    lake = Lake.at(f"s3://{BUCKET}/lake")
+    out = PurePosixPath("lake/report/fleet.html")
+    files = Bucket(BUCKET)
+    commit_records(lake, CALIBRATIONS, days_of("a", 4) + days_of("b", 4))
+    assert len(report(lake, out, files=files)) == 1 + 8
+    assert len(drawn) == 8
+    drawn.clear()
+    s3.faults(fail=4, every=3)
+    pages = report(lake, out, files=files)
+    assert (len(pages), drawn) == (1 + 8, [])
+    assert s3.faults()["failed"] == 4
+    assert {str(p) for p in files.find(out.parent, "**/*")} >= {str(p) for p in pages}
+    files.delete(pages[3])
+    report(lake, out, files=files)
+    assert len(drawn) == 1
 
 
 def test_pages_in_a_folder_leave_nothing_half_written(tmp_path):

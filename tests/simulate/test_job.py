@@ -31,10 +31,17 @@ def test_the_job_ends_with_one_line_of_json_that_says_where_things_are(tmp_path,
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"first_day": "yesterday"}, {"faults": "x"}, {"frames": 0}, {"rig": "van", "reflectors": True}]
-)
-def test_the_job_refuses_what_cannot_be_before_it_writes_anything(wrong, tmp_path):
-    with pytest.raises(ConfigError):
+    ("wrong", "named"),
+    [
+        ({"first_day": "yesterday"}, "yesterday"), ({"faults": "x"}, "faults"), ({"frames": 0}, "frames"),
+        ({"vehicles": 0}, "vehicles"), ({"rate_hz": -1.0}, "rate_hz"), ({"rig": "van", "reflectors": True}, "van"),
+        *(({"rig": rig}, "corner-left") for rig in ("corner-middle", "random-", "random-x")),
+        ({"rig": "rows-32"}, "rows-ROWS-DEGREES"),
+        *(({"environments": world}, "world-SEED") for world in ("world-", "world-x", "moon", "random-1")),
+    ],
+)  # fmt: skip
+def test_the_job_refuses_what_cannot_be_before_it_writes_anything(wrong, named, tmp_path):
+    with pytest.raises(ConfigError, match=named):
         simulate(out=tmp_path / "out", **wrong)
     assert not (tmp_path / "out").exists()
 

@@ -5,8 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.core.errors import ConfigError
-from pipeline.simulate.fleet import FleetSpec
 from pipeline.simulate.sensors.data_sheets import LidarSpec
 from pipeline.simulate.sensors.lidar import sweep_lidar
 from pipeline.simulate.world.actors import HOLLOW, actor_mesh
@@ -92,9 +90,3 @@ def test_a_world_of_a_seed_is_always_the_same_and_seeds_differ():
     assert len({replace(world, name="") for world in drawn}) == 40
     for what in ("fast", "markings", "infrared", "glass", "side_light", "surface"):
         assert len({getattr(world, what) for world in drawn}) > 1, what
-
-
-@pytest.mark.parametrize("name", ["world-", "world-x", "moon", "random-1"])
-def test_an_unknown_world_is_refused_by_name(name):
-    with pytest.raises(ConfigError, match="world-SEED"):
-        FleetSpec(environments=name)

@@ -1,17 +1,18 @@
-"""Logs of a simulated day: the same for a seed, in every container, whole or not at all."""
+"""Logs of a simulated day: the same for a seed, in every container, whole or not at all, by their sensors' clocks."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from jobs.simulate import simulate_days
 from pipeline.core.config import load_fleet
-from pipeline.core.errors import ConfigError
 from pipeline.rig.topics import TOPICS
 from pipeline.simulate.fleet import FleetSpec, simulate_fleet, simulate_vehicle_day
-from pipeline.simulate.logs.recording import CONTAINERS, log_name, open_log
+from pipeline.simulate.logs.recording import CONTAINERS, free_clocks, log_name, open_log
 from pipeline.simulate.reflectors import simulate_reflectors
+from pipeline.simulate.sensors.rigs import rig_named
 
 SMALL = {"vehicles": 1, "days": 1, "frames": 2, "drives": 1, "environments": "urban"}
 
@@ -76,12 +77,6 @@ def test_workers_give_what_one_process_gives(mcap_day, tmp_path, the_log):
     assert the_log(tmp_path).read_bytes() == the_log(mcap_day).read_bytes()
 
 
-@pytest.mark.parametrize(("field", "value"), [("vehicles", 0), ("frames", 0), ("rate_hz", -1.0)])
-def test_an_impossible_fleet_is_refused_by_name(field, value):
-    with pytest.raises(ConfigError, match=field):
-        FleetSpec(**{field: value})
-
-
 def test_reflectors_are_picked_where_all_sensors_agree_under_the_truth(tmp_path, read):
     spec = FleetSpec(vehicles=1, days=1)
     path = simulate_reflectors(spec, 0, 0, tmp_path, frames=12)
@@ -117,3 +112,33 @@ def test_a_log_that_is_broken_off_leaves_the_old_one_and_nothing_else(container,
         raise StopError
     assert sorted(p for p in tmp_path.rglob("*")) == before
     assert [stamp for _, stamp, _ in read(path)] == [5]
+
+
+def test_free_clocks_drift_through_all_gaps_even_where_rates_are_multiples():
+    clocks = free_clocks(rig_named("paper-free"), np.random.default_rng(0))
+    camera = clocks["camera"]
+    sweeps = [clocks["lidar"].nearest(t)[0] for t in np.arange(0, 60, 0.5)]
+    gaps = np.array([camera.nearest(t)[0] - t for t in sweeps])
+    assert np.abs(gaps).max() <= camera.period_s / 2 + 1e-12
+    assert np.ptp(gaps) > 0.9 * camera.period_s
+
+
+def stamps_of(read, log, topic):
+    return np.array([t for name, t, _ in read(log) if name == topic]) * 1e-9
+
+
+def test_a_free_running_log_holds_the_nearest_image_and_scan_and_some_that_are_not(
+    tmp_path, read, the_log, monkeypatch
+):
+    rates = {s.name: s.rate_hz for s in rig_named("paper-free").sensors}
+    free = rig_named("demo").changed(lambda s: replace(s, rate_hz=rates[s.name]))
+    monkeypatch.setattr("pipeline.simulate.fleet.rig_named", lambda _: free)
+    simulate_vehicle_day(FleetSpec(**SMALL | {"frames": 5}), 0, 0, tmp_path)
+    log = the_log(tmp_path)
+    sweeps, images, scans = (stamps_of(read, log, TOPICS[n]) for n in ("lidar", "image", "radar"))
+    assert len(sweeps) == 5
+    assert (len(images), len(scans)) == (7, 7)  # with the first and the fifth sweep two of each
+    for stamps, period_s in ((images, 1 / 30), (scans, 1 / 13)):
+        nearest = np.abs(stamps - sweeps[:, None]).min(1)
+        assert nearest.max() <= 0.51 * period_s
+        assert nearest.max() > 0.005

@@ -13,18 +13,6 @@ from pipeline.simulate.sensors.semantics import Box, SemanticsSpec, noisy_boxes,
 from pipeline.simulate.world.materials import LABELS
 
 
-def test_the_paper_rig_has_the_data_sheet_of_the_paper():
-    rig = rig_named("paper")
-    camera = rig["camera"].sheet.nominal()
-    assert (camera.width_px, camera.height_px, camera.model) == (1824, 940, "equidistant")
-    edges = camera.unproject(np.array([[-0.5, 469.5], [1823.5, 469.5], [911.5, -0.5], [911.5, 939.5]]))
-    np.testing.assert_allclose(np.degrees(np.arccos(edges[0] @ edges[1])), 116.0, atol=0.1)
-    np.testing.assert_allclose(np.degrees(np.arccos(edges[2] @ edges[3])), 58.5, atol=0.1)
-    assert (rig["lidar"].sheet.columns, rig["lidar"].sheet.rows) == (240, 96)
-    radar = rig["radar"].sheet
-    assert (radar.azimuth_resolution_deg, radar.elevation_resolution_deg) == (1.6, 6.0)
-
-
 def test_doppler_is_quantised_and_folded_into_one_period(highway):
     shot = highway[0]
     spec = replace(shot.rig["radar"].sheet, doppler_period_mps=10.394, doppler_step_mps=0.0812)

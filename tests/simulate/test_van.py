@@ -144,12 +144,6 @@ def test_a_mistaken_cable_sends_a_radar_s_points_under_its_neighbour_s_name(days
     assert elsewhere.header.frame_id == "corner_fl"
 
 
-@pytest.mark.parametrize("item", ["top:time:0.1", "radar:yaw:1", "top:intrinsics:0.1", "front:swap:1"])
-def test_faults_name_sensors_of_the_rig_that_they_can_happen_to(item):
-    with pytest.raises(ConfigError, match="happens to"):
-        parse_faults(f"vehicle-1:0:{item}", [DAY], VAN)
-
-
 def test_vehicles_of_one_fleet_can_carry_other_sensors_than_the_rest(tmp_path):
     spec = FleetSpec(vehicles=2, days=1, frames=2, drives=1, own_rigs=(("vehicle-2", "duo"),), own_frames=1)
     simulate_fleet(spec, tmp_path)

@@ -1,31 +1,10 @@
 """Lakes in a folder, and in a bucket of a server on loopback."""
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 
-import pipeline.store.object_store
 from pipeline.store.partitions import Lake
-from tests.makers.s3_server import BUCKET, running
-
-
-@pytest.fixture(scope="session")
-def server() -> Iterator[object]:
-    """The server, for all of this process."""
-    with running() as s3:
-        yield s3
-
-
-@pytest.fixture
-def s3(server: object, monkeypatch: pytest.MonkeyPatch) -> Iterator[object]:
-    """The server without faults, and this process set to use it."""
-    for name, value in server.environment.items():
-        monkeypatch.setenv(name, value)
-    pipeline.store.object_store._client.cache_clear()
-    server.faults(fail=0, stall=0)
-    yield server
-    pipeline.store.object_store._client.cache_clear()
+from tests.makers.s3_server import BUCKET
 
 
 @pytest.fixture

@@ -52,7 +52,7 @@ def test_frames_and_observations_come_back_as_they_were(sensors, lake):
     rows = frames(20, sensors=sensors, priors=wanted)
     write_frames(lake, DAY, rows)
     found = list(frames_of(lake, DAY))
-    if sensors == ["camera", "lidar", "radar"]:
+    if len(sensors) == 3:
         assert all(
             same(replace(a, priors={}), replace(b, priors={})) for a, b in zip(rows, found, strict=True)
         )
@@ -117,12 +117,9 @@ def test_a_file_of_other_work_is_not_read_with_these_moments(lake, tmp_path):
 def test_an_error_while_writing_leaves_the_old_day_and_nothing_else(lake):
     write_two_cameras(lake)
     before = sorted(p for p in lake.root.rglob("*") if p.is_file())
-    with (
-        pytest.raises(RuntimeError, match="sensor"),
-        write_moments(lake, MOMENTS, DAY, "k2", "test") as writer,
-    ):
+    with pytest.raises(RuntimeError), write_moments(lake, MOMENTS, DAY, "k2", "test") as writer:
         for frame in frames(40):
             writer.append(*joined_of(frame))
-        raise RuntimeError("sensor")
+        raise RuntimeError
     assert sorted(p for p in lake.root.rglob("*") if p.is_file()) == before
     assert len(list(frames_of(lake, DAY))) == 5

@@ -14,14 +14,9 @@ from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake
 from schemas.calibrations import CALIBRATIONS
 from tests.audit.fleet_records import vehicle_records
-from tests.jobs.test_exit_codes import DAY, rig_of
+from tests.jobs.test_exit_codes import DAY, night, rig_of
 
-IN_ITS_OWN = (
-    "unshare",
-    "--user",
-    "--map-root-user",
-    "--mount",
-)  # mounts that nobody else sees; needs no root
+IN_ITS_OWN = ("unshare", "--user", "--map-root-user", "--mount")  # mounts of its own; needs no root
 # With the disk mounted: do FIRST, fill what it leaves but for SPARE kilobytes, and run the command.
 SCRIPT = """mount -t tmpfs -o size=64m tmpfs "$DISK" && sh -c "$FIRST" || exit 9
 mount -o remount,size=$(( $(du -sk "$DISK" | cut -f1) + SPARE ))k "$DISK" || exit 9
@@ -34,10 +29,8 @@ def on_full_disk(tmp_path):
     """Run a command that fails for want of space; returns the summary. `.disk` has `spare` kilobytes left."""
     disk = tmp_path / "disk"
     disk.mkdir()
-    if (
-        not shutil.which("unshare")
-        or subprocess.run([*IN_ITS_OWN, "true"], capture_output=True, check=False).returncode
-    ):
+    tried = [*IN_ITS_OWN, "true"] if shutil.which("unshare") else ["false"]
+    if subprocess.run(tried, capture_output=True, check=False).returncode:
         pytest.skip("no namespace can be made here, so no small disk be mounted")
 
     def run(spare, *command, first="true", **env):
@@ -52,30 +45,20 @@ def on_full_disk(tmp_path):
     return run
 
 
-def night(folder, lake):
-    logs = f"{folder}/logs/{{vehicle}}/{{day}}/*"
-    options = ["--lake", lake, "--logs", logs, "--executor", "inline", "--no-pictures"]
-    return ["nightly", "--fleet", f"{folder}/fleet.toml", *options]
-
-
 @pytest.mark.parametrize(
     ("spare", "table"), [(40, "sweeps"), pytest.param(200, "features", marks=pytest.mark.slow)]
 )
 def test_a_partition_without_space_is_named(spare, table, on_full_disk, tmp_path):
-    rig_of(tmp_path, car="default")
     lake = on_full_disk.disk / "lake"
-    summary = on_full_disk(spare, *night(tmp_path, lake))
-    [problem] = summary["problems"]
+    [problem] = on_full_disk(spare, *night(rig_of(tmp_path, car="default"), lake))["problems"]
     assert problem["status"] == "failed"
-    assert "No space left" in problem["reason"]
-    assert f"{lake}/" in problem["reason"]
-    assert f"{table}/vehicle=car/day={DAY}" in problem["reason"]
+    for named in ("No space left", f"{lake}/", f"{table}/vehicle=car/day={DAY}"):
+        assert named in problem["reason"]
 
 
 def test_a_record_table_without_space_is_named(on_full_disk, tmp_path):
-    commit_records(
-        Lake.at(tmp_path / "lake"), CALIBRATIONS, vehicle_records("v", 3, np.random.default_rng(1))
-    )
+    records = vehicle_records("v", 3, np.random.default_rng(1))
+    commit_records(Lake.at(tmp_path / "lake"), CALIBRATIONS, records)
     lake = on_full_disk.disk / "lake"
     event = ["--vehicle", "v", "--day", "2026-03-02", "--kind", "repair"]
     copied = f"cp -r {tmp_path}/lake {on_full_disk.disk}"
@@ -89,7 +72,7 @@ def test_a_temporary_folder_without_space_is_named_and_the_log_not_called_damage
     log = tmp_path / "logs" / "car" / DAY / "a.mcap"
     Path(f"{log}.zstd").write_bytes(zstandard.compress(log.read_bytes()))
     log.unlink()
-    summary = on_full_disk(16, *night(tmp_path, tmp_path / "lake"), TMPDIR=on_full_disk.disk)
+    summary = on_full_disk(16, *night(tmp_path), TMPDIR=on_full_disk.disk)
     [problem] = summary["problems"]
     assert problem["status"] == "failed"  # another night tries it again
     assert f"{on_full_disk.disk}/boresight-unpacked" in problem["reason"]

@@ -25,13 +25,10 @@ def fill_and_read(lake):
     commit_records(lake, CALIBRATIONS, [make_record(rng, "A")])
 
     def read():
-        groups = row_groups(lake, FRAMES, DAY)
-        return (
-            len(read_rows(lake, FRAMES, DAY, WholeFrame)),
-            len(read_columns(lake, FRAMES, DAY, ["frame_index"])["frame_index"]),
-            len(read_group(lake, FRAMES, groups[0], WholeFrame)),
-            len(read_calibrations(lake)),
-        )
+        columns = read_columns(lake, FRAMES, DAY, ["frame_index"])["frame_index"]
+        group = read_group(lake, FRAMES, row_groups(lake, FRAMES, DAY)[0], WholeFrame)
+        rows = read_rows(lake, FRAMES, DAY, WholeFrame), columns, group, read_calibrations(lake)
+        return tuple(map(len, rows))
 
     return read
 

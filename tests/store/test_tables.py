@@ -59,9 +59,16 @@ def contents(lake):
 def test_rows_of_every_table_come_back_as_they_were(table, case, lake, rng):
     schema, row_type = ROW_TYPES[table]
     options = {"nulls": case == "nulls", "free": 0 if case == "empty arrays" else 5}
-    rows = [make_row(table, rng, **options) for _ in range(5)]
-    write(lake, rows, schema=schema)
-    assert all(same(a, b) for a, b in zip(rows, read_rows(lake, schema, DAY, row_type), strict=True))
+    if schema.is_record_table:
+        of = [{"vehicle": "car", "day": f"2026-0{i}-02", "work_key": str(i)} for i in (1, 2, 3)]
+        rows = [make_row(table, rng, **options, **values) for values in of]
+        commit_records(lake, schema, rows)
+        found = read_records(lake, schema, row_type)
+    else:
+        rows = [make_row(table, rng, **options) for _ in range(5)]
+        write(lake, rows, schema=schema)
+        found = read_rows(lake, schema, DAY, row_type)
+    assert all(same(a, b) for a, b in zip(rows, found, strict=True))
 
 
 def test_partitions_are_written_whole_found_and_read_by_row_and_column(any_lake, rng):
@@ -94,12 +101,9 @@ def test_an_error_while_writing_leaves_the_old_partition_and_nothing_else(any_la
     write(any_lake, [make_row("frames", rng, frame_index=7)])
     before = contents(any_lake)
     assert len(before) == 1
-    with (
-        pytest.raises(RuntimeError, match="sensor"),
-        write_partition(any_lake, FRAMES, DAY, "k2", "0.1") as writer,
-    ):
+    with pytest.raises(RuntimeError), write_partition(any_lake, FRAMES, DAY, "k2", "0.1") as writer:
         writer.append([make_row("frames", rng)])
-        raise RuntimeError("sensor")
+        raise RuntimeError
     assert contents(any_lake) == before
 
 
@@ -250,14 +254,15 @@ def test_leftovers_go_when_their_writer_is_dead_or_a_day_has_passed(lake, rng):
     folder.mkdir(parents=True)
     host = socket.gethostname()
     dead = next(pid for pid in range(4_000_000, 3_000_000, -1) if not psutil.pid_exists(pid))
-    names = {
-        "dead": f".writing-{host}-{dead}-aa.tmp",
-        "alive": f".writing-{host}-{os.getppid()}-bb.tmp",
-        "elsewhere": ".writing-other-host-1-cc.tmp",
-        "old": ".writing-other-host-1-dd.tmp",
+    written_by = {
+        "dead": f"{host}-{dead}",
+        "alive": f"{host}-{os.getppid()}",
+        "elsewhere": "other-host-1",
+        "old": "o-1",
     }
-    for name in names.values():
-        (folder / name).write_bytes(b"half")
-    os.utime(folder / names["old"], (0, 0))
+    files = {key: folder / f".writing-{name}-aa.tmp" for key, name in written_by.items()}
+    for path in files.values():
+        path.write_bytes(b"half")
+    os.utime(files["old"], (0, 0))
     write(lake, [make_row("frames", rng)])
-    assert {key for key, name in names.items() if (folder / name).exists()} == {"alive", "elsewhere"}
+    assert {key for key, path in files.items() if path.exists()} == {"alive", "elsewhere"}
