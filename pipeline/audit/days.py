@@ -24,7 +24,6 @@ __all__ = [
     "charts_of_fleet",
     "clipped_days",
     "edges_of_fleet",
-    "last_level",
     "pair_days",
     "reference_of",
     "with_reference",
@@ -126,7 +125,7 @@ def reference_of(days: PairDays, count: int) -> Reference | None:
     """Mean of the first accepted days; None for fewer than two."""
     rows = np.flatnonzero(days.accepted)[:count]
     first = days.at(rows)
-    first = first.at(slice(0, _step(first, np.ones(DOFS))))  # before something moved among these already
+    first = first.at(slice(0, _step(first)))  # before something moved among these already
     if len(first.day) < 2:
         return None
     value, seen = _clipped(first), first.observable
@@ -139,21 +138,11 @@ def reference_of(days: PairDays, count: int) -> Reference | None:
     )
 
 
-def last_level(days: PairDays, scale: Float[np.ndarray, " 6"]) -> PairDays:
-    """The days since the last visible change, for an edge with too few days for a chart.
-
-    `scale` is the ratio of the vehicle's scatter to its sigmas by DoF.
-    """
-    while (step := _step(days, scale)) is not None:
-        days = days.at(slice(step, None))
-    return days
-
-
-def _step(days: PairDays, scale: Float[np.ndarray, " 6"]) -> int | None:
+def _step(days: PairDays) -> int | None:
     """Number of days before the clearest step; None if there is none."""
     if len(days.day) < 4:
         return None
-    found = scan(_as_charts(days), _clipped(days).T, scale, _ALIKE * np.ones(DOFS))
+    found = scan(_as_charts(days), _clipped(days).T, np.ones(DOFS), _ALIKE * np.ones(DOFS))
     z = np.abs(found.z).max(axis=0)
     return int(np.argmax(z)) + 1 if z.max() > _MOVED_SIGMAS else None
 

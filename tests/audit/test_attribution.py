@@ -79,8 +79,8 @@ def knock(rng, sensor):
     return np.r_[np.radians(0.5) * axis / np.linalg.norm(axis), np.zeros(3)]
 
 
-CAMERA_LIDAR, CAMERA_RADAR, LIDAR_RADAR = (
-    EDGE_OF_PAIR[p] for p in ("camera_lidar", "camera_radar", "lidar_radar")
+CAMERA_LIDAR, CAMERA_RADAR, LIDAR_RADAR = map(
+    EDGE_OF_PAIR.get, ("camera_lidar", "camera_radar", "lidar_radar")
 )
 KNOCK = np.array([0.0, 0.0, np.radians(1.0), 0.0, 0.03, 0.0])  # a turned bracket: yaw and a little sideways
 

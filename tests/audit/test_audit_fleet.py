@@ -15,7 +15,6 @@ from pipeline.rig.changes import change_between
 from pipeline.rig.se3 import exp_so3, from_quaternion, from_rotation_translation, to_quaternion
 from pipeline.store.commits import commit_records
 from pipeline.store.current import current_drift
-from pipeline.store.partitions import Lake
 from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS
 from schemas.drift import DRIFT, DriftFinding
@@ -39,11 +38,6 @@ def day_name(k):
 def knocked(first, twist=KNOCK, sensor="radar"):
     """The motion of a sensor that is turned before a day."""
     return lambda d: {sensor: twist} if d >= first else {}
-
-
-@pytest.fixture
-def lake(tmp_path):
-    return Lake.at(tmp_path / "lake")
 
 
 def write(lake, rows, suffix=""):

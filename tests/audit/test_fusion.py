@@ -1,5 +1,7 @@
 """A sensor's pose from several days: it errs as its sigma states, and each source of information counts once."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -98,9 +100,8 @@ def test_an_axis_that_no_day_determines_stays_at_the_prior_to_the_last_digit():
     days, _ = days_of(6, rng, noise=blind, bias=np.zeros(6))
     found = fuse(days, STILL, 7)
     assert abs(change_between(days.T_prior[0], found.T)[0]) < 1e-9
-    share = np.diag(change_covariance(found.T, found.of_prior)) / np.diag(
-        change_covariance(found.T, found.covariance)
-    )
+    of_prior, whole = (np.diag(change_covariance(found.T, C)) for C in (found.of_prior, found.covariance))
+    share = of_prior / whole
     assert share[0] == pytest.approx(1.0, abs=1e-3)
     assert share[1:3].max() < 0.1
 
@@ -144,8 +145,7 @@ def test_a_step_that_the_days_do_not_prove_makes_tomorrow_less_sure():
     for knock_deg in (0.0, 0.35):
         days, _ = days_of(6, np.random.default_rng(11), bias=np.zeros(6), scatter=np.zeros(6))
         last = changed(days.T[-1], np.array([0.0, 0.0, np.radians(knock_deg), 0.0, 0.0, 0.0]))
-        unclear = PoseDays(days.day, np.concatenate([days.T[:-1], last[None]]), days.covariance, days.common,
-                           days.T_prior, days.prior_covariance)  # fmt: skip
+        unclear = replace(days, T=np.concatenate([days.T[:-1], last[None]]))
         found = fuse(unclear, Mount(SCATTER, np.zeros(6), 0.0), 7)
         assert len(found.rows) == 6
         sigma.append(np.degrees(np.sqrt(found.covariance[2, 2])))

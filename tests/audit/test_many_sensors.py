@@ -9,12 +9,9 @@ from pipeline.core.config import load_fleet
 from pipeline.core.stage_work import Task, Window
 from pipeline.core.stages import AUDIT, STATE
 from pipeline.store.commits import commit_records
-from pipeline.store.partitions import Lake
 from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS
-from schemas.drift import DriftFinding
 from schemas.poses import POSES
-from schemas.service_events import SERVICE_EVENTS, ServiceEvent
 from schemas.states import STATES, StateRow
 from tests.makers.rig_records import EDGES, POSE_SIGMA, pose_rows, rig_records
 
@@ -54,15 +51,7 @@ def fleet(tmp_path):
 def audited(fleet, lake, rows):
     commit_records(lake, CALIBRATIONS, rows)
     found = AUDIT.run(Task(fleet, lake, Window())).records
-    by_vehicle: dict[str, list[DriftFinding]] = {}
-    for finding in found:
-        by_vehicle.setdefault(finding.vehicle, []).append(finding)
-    return by_vehicle
-
-
-@pytest.fixture
-def lake(tmp_path):
-    return Lake.at(tmp_path / "lake")
+    return {vehicle: [f for f in found if f.vehicle == vehicle] for vehicle in "ab"}
 
 
 def edge(finding):
@@ -81,14 +70,6 @@ def test_the_sensor_that_moved_is_named_among_five_and_its_edges_alone_alarm(fle
     assert all(sensor in edge(f) for f in alarms)
     assert {f.vehicle_status for f in found["b"]} == {"GREEN"}
     assert {edge(f) for f in found["b"]} == EDGE_NAMES
-
-
-def test_a_service_of_one_sensor_begins_the_charts_of_its_edges_anew(fleet, lake):
-    event = ServiceEvent(vehicle="a", day="2026-03-06", sensor="left", kind="re-mount")
-    commit_records(lake, SERVICE_EVENTS, [event])
-    found = audited(fleet, lake, rig_records("a", 12, np.random.default_rng(6)))
-    days = {edge(f): f.days_used for f in found["a"]}
-    assert days == {e: 6 if "left" in e else 12 for e in EDGE_NAMES}
 
 
 def test_a_state_s_sigmas_are_of_targets_where_the_sensors_look(fleet, lake):

@@ -100,9 +100,7 @@ def test_states_keep_the_first_accepted_days_and_from_the_tenth_on_what_they_mak
 def test_what_is_kept_no_longer_counts_after_a_service_event_another_setting_or_another_record(lake):
     assert kept(lake, count=9) == {}
     event = ServiceEvent(vehicle="a", day=day_name(20), sensor="radar", kind="re-mount")
-    assert {p for v, p in kept(lake, [event]) if v == "a"} == {
-        CAMERA_LIDAR
-    }  # which has nothing to do with it
+    assert {p for v, p in kept(lake, [event]) if v == "a"} == {CAMERA_LIDAR}  # not concerned
     old = next(r for r in read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle="a", day=day_name(2)))
     commit_records(lake, CALIBRATIONS, [replace(old, work_key="again", recorded_at="", asserted_at="")])
     assert {v for v, _ in kept(lake)} == {"b", "c"}

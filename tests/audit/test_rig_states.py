@@ -13,7 +13,6 @@ from pipeline.rig.graph import tie
 from pipeline.rig.se3 import exp_se3, inverse, log_se3
 from pipeline.store.commits import commit_records
 from pipeline.store.current import transform_of
-from pipeline.store.partitions import Lake
 from schemas.drift import DriftFinding
 from schemas.poses import POSES
 from schemas.service_events import ServiceEvent
@@ -25,16 +24,10 @@ MOUNT = Mount(np.array([*np.radians([0.01] * 3), 0.001, 0.001, 0.001]), np.zeros
 REFUSED = {"status": "refused", "reason": "no edge of it can be used", "covariance": None, "qw": None}
 
 
-@pytest.fixture
-def lake(tmp_path):
-    return Lake.at(tmp_path / "lake")
-
-
 def states(lake, rows, events=(), findings=(), edges=()):
     commit_records(lake, POSES, rows)
-    [(vehicle, poses)] = [
-        (v, p) for v, p in read_poses(lake, "joint", "2026-03-01", LAST).items() if v == rows[0].vehicle
-    ]
+    vehicle = rows[0].vehicle
+    poses = read_poses(lake, "joint", "2026-03-01", LAST)[vehicle]
     mounts = {tie(sensor, poses.reference): MOUNT for sensor in poses.sensors}
     known, of_edges = (events, findings), dict.fromkeys(edges)
     found = rig_states((vehicle, LAST, "joint"), poses, of_edges, known, mounts, VerifyConfig())
@@ -205,9 +198,8 @@ def test_a_damaged_pose_is_not_fused(lake):
 def test_a_held_day_that_lies_apart_leaves_both_poses_possible(lake):
     """The day of a knock was held: the file of that night was 1 deg off, and certified."""
     of = {(4, "front"): {"status": "held", "reason": "halves of the day disagree"}}
-    turned = pose_rows(
-        "a", 5, np.random.default_rng(13), motion=lambda d: {"front": 2 * TURN * (d >= 4)}, of=of
-    )
+    turn = lambda d: {"front": 2 * TURN * (d >= 4)}  # noqa: E731
+    turned = pose_rows("a", 5, np.random.default_rng(13), motion=turn, of=of)
     front = states(lake, turned)["front"]
     assert front.days[-1] == "2026-03-04"
     assert "azimuth" not in front.determined

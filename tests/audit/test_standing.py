@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jobs.audit import audit
 from jobs.service import service
 from jobs.state import state
 from jobs.status import status
@@ -19,6 +18,7 @@ from pipeline.store.repair import repair_table
 from schemas.calibrations import CALIBRATIONS
 from tests.audit.fleet_records import vehicle_records
 from tests.audit.test_audit_fleet import knocked
+from tests.makers.commands import command
 from tests.makers.fleet_files import fleet_toml
 
 
@@ -33,10 +33,7 @@ def files(tmp_path):
 
 
 def audited(files, capsys):
-    """Exit code and summary of the command."""
-    capsys.readouterr()
-    code = audit(fleet=files[0], lake=str(files[1]))
-    return code, json.loads(capsys.readouterr().out.splitlines()[-1])
+    return command(capsys, "audit", "--fleet", files[0], "--lake", files[1])[:2]
 
 
 def lose(lake: Path, vehicle: str) -> tuple[Path, bytes]:

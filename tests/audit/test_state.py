@@ -23,11 +23,6 @@ from tests.audit.fleet_records import T_CAMERA_LIDAR, T_LIDAR_RADAR, poses_of, v
 from tests.audit.test_audit_fleet import day_name, fleet_config, knocked
 
 
-@pytest.fixture
-def lake(tmp_path):
-    return Lake.at(tmp_path / "lake")
-
-
 def write(lake, records, common=None):
     if common is not None:
         records = [r if r.covariance is None else replace(r, common_covariance=common) for r in records]
@@ -44,9 +39,8 @@ def states_of(lake):
 
 def test_a_state_rests_on_the_accepted_days_since_the_last_change(lake):
     status = {3: "held", 17: "held", 18: "refused"}
-    records = vehicle_records(
-        "v", 22, np.random.default_rng(5), motion=knocked(13), status=lambda d: status.get(d, "accepted")
-    )
+    of_day = lambda d: status.get(d, "accepted")  # noqa: E731
+    records = vehicle_records("v", 22, np.random.default_rng(5), motion=knocked(13), status=of_day)
     write(lake, records, np.diag([1e-4] * 3 + [5e-3] * 3) ** 2)
     states = states_of(lake)
     days = [day_name(k) for k in (13, 14, 15, 16, 19, 20, 21)]
@@ -96,9 +90,8 @@ def test_a_service_event_and_the_state_after_it_are_commands(kind, by, lake, cap
 
 
 def test_a_service_event_is_withdrawn_and_an_impossible_one_is_refused(lake, capsys):
-    commit_records(
-        lake, CALIBRATIONS, vehicle_records("v", 20, np.random.default_rng(22), motion=knocked(10))
-    )
+    records = vehicle_records("v", 20, np.random.default_rng(22), motion=knocked(10))
+    commit_records(lake, CALIBRATIONS, records)
     where = str(lake.root)
     event = {"lake": where, "vehicle": "v", "day": "2026-03-15", "kind": "repair", "sensor": "radar"}
     for wrong, words in (

@@ -48,15 +48,11 @@ CLEAREST = {
         ({"camera_lidar_ry": UNSEEN}, "UNKNOWN", None, "the camera or lidar may have turned unseen"),
         ({"lidar_radar_rz": UNSEEN}, "UNKNOWN", None, "the radar may have turned unseen"),
         (
-            {"camera_lidar_rx": UNSEEN, "lidar_radar_rz": UNSEEN},
-            "UNKNOWN",
-            None,
+            {"camera_lidar_rx": UNSEEN, "lidar_radar_rz": UNSEEN}, "UNKNOWN", None,
             "the camera or lidar and radar may have turned unseen",
         ),
         (  # since a repair of the radar
-            {"camera_lidar_rx": UNSEEN, "lidar_radar_rz": UNSEEN | {"days_used": 0}},
-            "UNKNOWN",
-            None,
+            {"camera_lidar_rx": UNSEEN, "lidar_radar_rz": UNSEEN | {"days_used": 0}}, "UNKNOWN", None,
             "lidar_radar rz: why not",
         ),
         # Radar yaw may be watched from the camera instead.

@@ -18,22 +18,9 @@ from tests.makers.stages import ingest_day
 @pytest.fixture(scope="session")
 def kit() -> SimpleNamespace:
     """Everything that the tests of this room write logs with."""
-    names = (
-        "Kit",
-        "IMAGE",
-        "INFO",
-        "LIDAR",
-        "RADAR",
-        "LABELS",
-        "DETECTIONS",
-        "ODOMETRY",
-        "START_NS",
-        "PERIOD_NS",
-    )
-    functions = {"fleet": "fleet_config", "lidar": "lidar_columns", "radar": "radar_columns"}
-    same = {n: n for n in (*names, "WIDTH", "HEIGHT", "jpeg", "label_png")}
-    found = {short: getattr(written_logs, name) for short, name in (same | functions).items()}
-    return SimpleNamespace(sqlite=sqlite3, **found)
+    short = {"fleet": "fleet_config", "lidar": "lidar_columns", "radar": "radar_columns"}
+    named = vars(written_logs)
+    return SimpleNamespace(**named, sqlite=sqlite3, **{name: named[whole] for name, whole in short.items()})
 
 
 @pytest.fixture

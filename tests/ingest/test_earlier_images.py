@@ -10,7 +10,7 @@ from pipeline.store.partitions import Lake, Partition
 from schemas.moments import MOMENTS
 from tests.makers import written_logs
 from tests.makers.stages import ingest_day
-from tests.makers.written_logs import IMAGE, INFO, ODOMETRY, PERIOD_NS, START_NS, Kit, jpeg
+from tests.makers.written_logs import IMAGE, INFO, LIDAR, ODOMETRY, PERIOD_NS, RADAR, START_NS, Kit, jpeg
 
 TWO_CAMERAS = {
     "fleet": {"name": "test"},
@@ -38,6 +38,12 @@ def drive(kit=None, speed_mps=10.0, yaw_rate=lambda _: 0.0):
     return kit
 
 
+def with_few_sweeps(kit):
+    """Sweeps of every tenth frame alone: the others' images belong to no moment."""
+    kit.messages = [m for m in kit.messages if m[0] != LIDAR or (m[2] - START_NS) % (10 * PERIOD_NS) == 0]
+    return kit
+
+
 @pytest.fixture
 def images(tmp_path):
     def read(kit, **sections):
@@ -60,12 +66,7 @@ def test_images_of_moments_are_named_and_not_kept_again(images):
 
 
 def test_an_image_between_moments_is_kept_without_colour(images):
-    kit = drive()
-    # Sweeps of every tenth frame alone: the others' images belong to no moment.
-    kit.messages = [
-        m for m in kit.messages if m[0] != "/lidar/points" or (m[2] - START_NS) % (10 * PERIOD_NS) == 0
-    ]
-    row = images(kit)[1]
+    row = images(with_few_sweeps(drive()))[1]
     pixels = cv2.imdecode(np.frombuffer(row.earlier_image, np.uint8), cv2.IMREAD_UNCHANGED)
     assert pixels.shape == (written_logs.HEIGHT, written_logs.WIDTH)  # a small image: no smaller
     assert row.stamp_ns - row.earlier_stamp_ns == 3 * PERIOD_NS
@@ -97,10 +98,7 @@ def test_a_standing_car_stamps_that_jump_and_a_picture_again_are_named(images):
             kit.messages[k] = (topic, kind, logged, message)
     assert "stamps_jump" in {row.earlier_missing for row in images(kit)}
 
-    kit = drive()
-    kit.messages = [
-        m for m in kit.messages if m[0] != "/lidar/points" or (m[2] - START_NS) % (10 * PERIOD_NS) == 0
-    ]
+    kit = with_few_sweeps(drive())
     for topic, _, logged, message in kit.messages:
         if topic == IMAGE and logged == START_NS + 7 * PERIOD_NS:
             message.data = np.frombuffer(jpeg(10), np.uint8)
@@ -109,9 +107,8 @@ def test_a_standing_car_stamps_that_jump_and_a_picture_again_are_named(images):
 
 def test_a_car_with_cameras_alone_has_moments_of_its_images(tmp_path):
     kit = drive()
-    kit.messages = [m for m in kit.messages if m[0] not in ("/lidar/points", "/radar/points")]
-    of_a = list(enumerate(kit.messages))
-    for k, (topic, kind, logged, message) in of_a:
+    kit = kit.without(LIDAR).without(RADAR)
+    for k, (topic, kind, logged, message) in list(enumerate(kit.messages)):
         if topic == IMAGE:
             kit.add("/b/image", kind, logged, kit.compressed(logged + 3_000_000, jpeg(50 + k)))
         if topic == INFO:

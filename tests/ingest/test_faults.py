@@ -29,7 +29,7 @@ def test_a_missing_file_or_unknown_vehicle_is_a_mistake_of_the_caller(kit, tmp_p
 
 def test_a_link_to_a_lost_log_is_named_with_where_it_leads(tmp_path, run_ingest):
     (tmp_path / "a.mcap").symlink_to("/unmounted/a.mcap")
-    with pytest.raises(LogError, match=r"a\.mcap.* is a link to /unmounted/a\.mcap, which is not there"):
+    with pytest.raises(LogError, match=r"a\.mcap.* is a link to /unmounted/a\.mcap"):
         run_ingest(tmp_path / "a.mcap")
 
 
@@ -73,12 +73,9 @@ def test_a_disk_that_fails_half_way_costs_the_rest_of_the_log(kit, tmp_path, run
 
 @pytest.mark.parametrize("container", ["mcap", "bag", "db3"])
 def test_a_recording_cut_off_keeps_the_frames_before_the_cut(kit, tmp_path, run_ingest, container):
-    if container == "mcap":
-        log = kit.Kit(frames=20).drive().mcap(tmp_path / "a.mcap")
-    elif container == "bag":
-        log = kit.Kit(ros=1, frames=20).drive().bag(tmp_path / "a.bag")
-    else:
-        log = next(kit.Kit(frames=20).drive().folder(tmp_path / "bag").glob("*.db3"))
+    drive = kit.Kit(ros=1 if container == "bag" else 2, frames=20).drive()
+    log = getattr(drive, {"db3": "folder"}.get(container, container))(tmp_path / f"a.{container}")
+    log = next(log.glob("*.db3")) if container == "db3" else log
     log.write_bytes(log.read_bytes()[: int(log.stat().st_size * 0.6)])
     result, frames = run_ingest(log)
     assert result.status == "done"

@@ -62,9 +62,7 @@ def known(arguments):
 
 def lines_of(unit):
     text = (SYSTEMD / unit).read_text().replace("\\\n", " ")
-    return [
-        line.partition("=")[::2] for line in text.splitlines() if "=" in line and not line.startswith("#")
-    ]
+    return [x.partition("=")[::2] for x in text.splitlines() if "=" in x and not x.startswith("#")]
 
 
 def test_systemd_tries_again_what_may_help_and_nothing_else():
@@ -113,11 +111,12 @@ def test_cron_mails_what_is_wrong_and_nothing_else(code, fake_night, monkeypatch
     [line] = [x for x in (SYSTEMD / "crontab").read_text().splitlines() if not x.startswith("#")]
     *when, user, command = line.split(maxsplit=6)
     assert (when, user) == (["30", "1", "*", "*", "*"], "boresight")
-    command = (
-        command.replace("\\%", "%")
-        .replace("/var/lib/boresight", str(tmp_path))
-        .replace(". /etc/boresight/night.env;", "")
-    )
+    for old, new in (
+        ("\\%", "%"),
+        ("/var/lib/boresight", str(tmp_path)),
+        (". /etc/boresight/night.env;", ""),
+    ):
+        command = command.replace(old, new)
     done = subprocess.run(["/bin/sh", "-c", command], capture_output=True, text=True, check=False)
     assert bool(done.stdout) == (code != 0)
     assert options_of(fake_night)["--held-exit-code"] == "0"
@@ -125,9 +124,7 @@ def test_cron_mails_what_is_wrong_and_nothing_else(code, fake_night, monkeypatch
 
 
 def test_the_settings_are_all_that_the_commands_ask_for():
-    given = {
-        line.partition("=")[0] for line in (SYSTEMD / "night.env").read_text().splitlines() if "=" in line
-    }
+    given = {x.partition("=")[0] for x in (SYSTEMD / "night.env").read_text().splitlines() if "=" in x}
     files = [*SYSTEMD.glob("*.service"), SYSTEMD / "crontab"]
     asked = {name for f in files for name in re.findall(r'"\$(BORESIGHT\w*)"', f.read_text())}
     assert given == asked
@@ -197,41 +194,10 @@ def pods():
     ]
 
 
-# KubeRay's CRD is on no package index: these are its field names and types as its API reference (v1) states them.
-RAYJOB_FIELDS = {
-    "entrypoint": str, "submissionMode": str, "backoffLimit": int, "activeDeadlineSeconds": int,
-    "shutdownAfterJobFinishes": bool, "ttlSecondsAfterFinished": int, "rayClusterSpec": dict,
-}  # fmt: skip
-CLUSTER_FIELDS = {
-    "rayVersion": str, "enableInTreeAutoscaling": bool, "autoscalerOptions": dict, "headGroupSpec": dict,
-    "workerGroupSpecs": list,
-}  # fmt: skip
-GROUP_FIELDS = {
-    "groupName": str, "replicas": int, "minReplicas": int, "maxReplicas": int, "rayStartParams": dict, "template": dict,
-}  # fmt: skip
-
-
-def assert_fields(found, fields):
-    assert found.keys() <= fields.keys()
-    assert all(isinstance(value, fields[name]) for name, value in found.items())
-
-
-def test_a_rayjob_has_the_structure_that_kuberay_asks_for():
-    told = manifest(RAYJOB)
-    assert (told["apiVersion"], told["kind"]) == ("ray.io/v1", "RayJob")
-    cluster = told["spec"]["rayClusterSpec"]
-    assert_fields(told["spec"], RAYJOB_FIELDS)
-    assert_fields(cluster, CLUSTER_FIELDS)
-    for group in (cluster["headGroupSpec"], *cluster["workerGroupSpecs"]):
-        assert_fields(group, GROUP_FIELDS)
-        assert all(isinstance(v, str) for v in group["rayStartParams"].values())
-    assert told["spec"]["submissionMode"] in {"K8sJobMode", "HTTPMode", "SidecarMode", "InteractiveMode"}
-    assert told["spec"]["ttlSecondsAfterFinished"] == 0 or told["spec"]["shutdownAfterJobFinishes"]
-
-
 def test_a_rayjob_runs_the_night_with_the_ray_that_was_tested():
     spec = manifest(RAYJOB)["spec"]
     cluster = spec["rayClusterSpec"]
+    assert spec["ttlSecondsAfterFinished"] == 0 or spec["shutdownAfterJobFinishes"]
     arguments = spec["entrypoint"].split()
     assert arguments[:4] == ["boresight", "nightly", "--executor", "ray"]
     assert known(arguments)

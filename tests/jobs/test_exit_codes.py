@@ -91,27 +91,20 @@ def nothing_certified(folder: Path) -> list[str]:
     return ["export", "ros2", "--lake", f"{folder}/lake", *day, "--out", f"{folder}/out"]
 
 
-def mistyped_rig(folder: Path) -> list[str]:
-    return night(rig_of(folder, car="default", van="mistyped"))
-
-
-def short_drive(folder: Path) -> list[str]:
-    return night(rig_of(folder, car="default"))
+def no_day_yet(folder: Path) -> list[str]:
+    (folder / "logs" / "car" / "2999-03-02").mkdir(parents=True)
+    (folder / "logs" / "car" / "2999-03-02" / "a.mcap").touch()
+    (folder / "fleet.toml").write_text(fleet_toml("car"))
+    return night(folder)
 
 
 def short_log(folder: Path) -> list[str]:
     rig_of(folder, car="default")
-    return [
-        "verify",
-        f"{folder}/logs/car/{DAY}/a.mcap",
-        "--fleet",
-        f"{folder}/fleet.toml",
-        "--vehicle",
-        "car",
-    ]
+    log = f"{folder}/logs/car/{DAY}/a.mcap"
+    return ["verify", log, "--fleet", f"{folder}/fleet.toml", "--vehicle", "car"]
 
 
-CODES = {0: nothing_new, 1: full_disk, 2: mistyped_rig, 3: short_drive, 4: nothing_certified, 5: short_log}
+CODES = {0: nothing_new, 1: full_disk, 3: no_day_yet, 4: nothing_certified, 5: short_log}
 
 
 @pytest.mark.parametrize(("code", "command"), CODES.items())
@@ -134,19 +127,19 @@ def test_a_stopped_command_ends_with_the_code_of_its_signal(code, tmp_path):
         process.send_signal(signal.Signals(code - 128))
         out, _ = process.communicate(timeout=60)
     assert process.returncode == code
-    assert set(table()) == {*CODES, 130, 143}  # each is tried here
+    assert set(table()) == {*CODES, 2, 130, 143}  # each is tried here
     assert json.loads(out.splitlines()[-1])["status"] in table()[code].split(", ")
 
 
 def test_a_rig_whose_days_are_all_misconfigured_is_named_and_the_others_go_on(tmp_path, capsys):
-    assert main(mistyped_rig(tmp_path)) == 2
+    assert main(night(rig_of(tmp_path, car="default", van="mistyped"))) == 2
     summary = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert summary["status"] in table()[2].split(", ")
     assert set(summary["misconfigured"]) == {"mistyped"}
     assert "/camera/imag" in summary["misconfigured"]["mistyped"]
     why = {p["vehicle"]: p["reason"] for p in summary["problems"]}
     assert "in fleet.toml" in why["van"]
     assert "in fleet.toml" not in why["car"]
-    assert main(night(tmp_path)) == 2  # what is known to be refused is still misconfigured
     # One day of several without its topic says nothing of fleet.toml.
     fleet = tmp_path / "fleet.toml"
     fleet.write_text(fleet.read_text().replace('rig = "mistyped"', 'rig = "default"'))
@@ -155,3 +148,29 @@ def test_a_rig_whose_days_are_all_misconfigured_is_named_and_the_others_go_on(tm
     assert main(night(tmp_path)) == 3
     summary = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert (summary["status"], summary["refused"]) == ("refused", 2)
+
+
+def told(capfd, command: list[str]) -> tuple[int, dict, str]:
+    """Exit code, summary and what goes to stderr."""
+    code = main(command)
+    out, err = capfd.readouterr()
+    return code, json.loads(out.splitlines()[-1]), err
+
+
+def test_a_refused_day_is_a_success_where_the_scheduler_knows_no_other(tmp_path, capfd):
+    command = no_day_yet(tmp_path)
+    code, summary, _ = told(capfd, [*command, "--held-exit-code", "0"])
+    assert (code, summary["status"], summary["refused"]) == (0, "refused", 1)
+    assert main([*command, "--held-exit-code", "1"]) == 2  # no other can be asked for
+
+
+def test_a_night_is_told_to_monitoring_and_metrics_that_cannot_be_written_fail_nothing(tmp_path, capfd):
+    pytest.importorskip("prometheus_client", reason="pip install 'boresight[ops]'")
+    command = no_day_yet(tmp_path)
+    assert main([*command, "--metrics", f"{tmp_path}/night.prom"]) == 3
+    metrics = (tmp_path / "night.prom").read_text()
+    assert 'boresight_vehicle_days{fleet="tests",status="refused"} 1.0' in metrics
+    assert "boresight_last_success_timestamp_seconds" in metrics
+    code, summary, err = told(capfd, [*command, "--metrics", f"{tmp_path}/missing/night.prom"])
+    assert (code, summary["status"]) == (3, "refused")
+    assert f"{tmp_path}/missing/night.prom" in err

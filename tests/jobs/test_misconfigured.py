@@ -137,10 +137,8 @@ def test_a_topic_of_another_type_is_a_mistake(tmp_path, capsys):
     made.messages += [(f"{DETECTIONS}x", *m[1:]) for m in made.messages if m[0] == DETECTIONS]
     driven(tmp_path, made)
     named = night(tmp_path, capsys)[1]["misconfigured"]["default"]
-    assert (
-        f"{DETECTIONS}x (lidar): type vision_msgs/msg/Detection2DArray, not sensor_msgs/msg/PointCloud2"
-        in named
-    )
+    wrong = "type vision_msgs/msg/Detection2DArray, not sensor_msgs/msg/PointCloud2"
+    assert f"{DETECTIONS}x (lidar): {wrong}" in named
 
 
 @pytest.mark.parametrize("how", ["not logged", "not calibrated"])
@@ -169,8 +167,8 @@ def test_a_camera_without_intrinsics_is_named_by_every_command(tmp_path, capsys,
 
 
 def test_a_vehicle_that_fleet_toml_lacks_is_named_and_the_others_go_on(tmp_path, capsys):
-    driven(tmp_path)
-    driven(tmp_path, vehicle="carr")
+    for vehicle in ("car", "carr"):
+        driven(tmp_path, Kit(frames=4).drive(), vehicle)
     configured(tmp_path)
     for _ in range(2):
         code, summary = night(tmp_path, capsys)
@@ -191,7 +189,7 @@ def test_a_vehicle_that_fleet_toml_lacks_is_named_and_the_others_go_on(tmp_path,
 def test_logs_that_the_pattern_leaves_out_for_their_format_are_named_with_the_pattern_to_use(
     tmp_path, capsys
 ):
-    log = driven(tmp_path)
+    log = driven(tmp_path, Kit(frames=4).drive())
     Kit(frames=4, ros=1).drive(START_NS + 10**11).bag(log.parent / "b.bag")
     Kit(frames=4).drive(START_NS + 2 * 10**11).folder(log.parent / "c")
     (log.parent / "notes.txt").write_text("none of ours")
@@ -208,14 +206,12 @@ def test_logs_that_the_pattern_leaves_out_for_their_format_are_named_with_the_pa
     assert said not in summary["next_steps"]
     code, failed = night(tmp_path, capsys, "*.db3")
     assert code == 2
-    assert (
-        f'--logs leaves out 3 logs of 1 vehicle-day in another format, as {log}: use --logs "{wider}"'
-        in failed["reason"]
-    )
+    said = f'--logs leaves out 3 logs of 1 vehicle-day in another format, as {log}: use --logs "{wider}"'
+    assert said in failed["reason"]
 
 
 def test_an_unknown_vehicle_of_a_lake_is_an_error_that_names_those_it_has(tmp_path, capsys):
-    driven(tmp_path)
+    driven(tmp_path, Kit(frames=4).drive())
     configured(tmp_path)
     night(tmp_path, capsys)
     for command in ("state", "status"):

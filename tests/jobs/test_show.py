@@ -1,12 +1,14 @@
-"""`boresight show` and `boresight status` on tables that are not calibrations."""
+"""`boresight show`, for people and as JSON and nothing else, and `boresight status`."""
 
 import json
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from jobs.show import show
 from jobs.status import status
+from pipeline.rig.se3 import from_quaternion
 from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake
 from schemas.calibrations import CALIBRATIONS
@@ -14,6 +16,7 @@ from schemas.outcomes import OUTCOMES, OutcomeRow
 from schemas.poses import POSES
 from schemas.service_events import SERVICE_EVENTS, ServiceEvent
 from tests.audit.fleet_records import vehicle_records
+from tests.makers.lakes import write_records
 from tests.makers.table_rows import make_row
 
 
@@ -22,12 +25,11 @@ def test_every_record_table_is_shown_for_people_and_for_machines(tmp_path, capsy
     of = {"vehicle": "car", "day": "2026-03-02"}
     refused = OutcomeRow(**of, stage="ingest", method="", status="refused", reason="no [radar]", work_key="k")
     commit_records(lake, OUTCOMES, [refused])
-    commit_records(
-        lake, SERVICE_EVENTS, [ServiceEvent(**of, sensor="radar", kind="repair", note="new bracket")]
-    )
+    event = ServiceEvent(**of, sensor="radar", kind="repair", note="new bracket")
+    commit_records(lake, SERVICE_EVENTS, [event])
     for table, column, value in (
         ("outcomes", "reason", "no [radar]"),
-        ("service_events", "note", "new bracket"),
+        ("service_events", "note", event.note),
     ):
         assert show(table, lake=str(tmp_path)) == 0
         assert value in capsys.readouterr().out
@@ -76,3 +78,48 @@ def test_faults_of_records_are_said_in_plain_words_by_show_and_status(tmp_path, 
     summary = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert summary["method"] == "joint"
     assert [day["faults"] for day in summary["days"]] == [["labels_offset"]]
+
+
+@pytest.fixture
+def lake(tmp_path):
+    """Two days of one vehicle, the first calibrated twice; the second refused."""
+    rng = np.random.default_rng(1)
+    for key in ("first", "second"):
+        rows = vehicle_records("v", 1, rng)
+        write_records(Lake.at(tmp_path), CALIBRATIONS, rows, key)
+    rows = [r for r in vehicle_records("v", 2, rng, status=lambda _: "refused") if r.day == "2026-03-02"]
+    write_records(Lake.at(tmp_path), CALIBRATIONS, rows, "third")
+    return tmp_path
+
+
+def test_json_has_every_column_and_the_transform_as_a_matrix(lake, capsys):
+    assert show("calibrations", lake=str(lake), json=True) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert len(rows) == 9
+    for row in rows:
+        assert set(row) == {c.name for c in CALIBRATIONS.columns} | {"T"}
+        if row["status"] == "refused":
+            assert row["T"] is None
+            continue
+        q, t = [row[f"q{k}"] for k in "wxyz"], [row[f"t{k}_m"] for k in "xyz"]
+        np.testing.assert_allclose(row["T"], from_quaternion(np.array(q), np.array(t)), atol=1e-12)
+        assert np.shape(row["covariance"]) == (6, 6)
+
+
+def test_filters_choose_vehicle_day_and_method(lake, capsys):
+    for kwargs, count in (
+        ({"vehicle": "v", "day": "2026-03-01"}, 6),
+        ({"vehicle": "v", "day": "2026-03-01", "current": True}, 3),
+        ({"method": "tracking"}, 0),
+        ({"vehicle": "w"}, 0),
+    ):
+        assert show("calibrations", lake=str(lake), json=True, **kwargs) == 0
+        assert len(json.loads(capsys.readouterr().out)) == count
+
+
+def test_a_lake_without_records_is_an_empty_list(tmp_path, capsys):
+    for table in ("calibrations", "drift", "moments", "perceived"):
+        assert show(table, lake=str(tmp_path), json=True) == 0
+        assert json.loads(capsys.readouterr().out) == []
+        assert show(table, lake=str(tmp_path)) == 0
+        assert capsys.readouterr().out == f"{table}: no matching rows in {tmp_path}\n"

@@ -11,6 +11,7 @@ from jobs.cli import main
 from jobs.verify import _as_prior
 from pipeline.rig.day_prior import read_transforms
 from pipeline.rig.se3 import exp_so3, from_rotation_translation
+from tests.makers.fleet_files import fleet_toml
 from tests.makers.simulated_days import simulated_day
 
 FRAMES = 30
@@ -33,9 +34,8 @@ def calibration(path, truth, turned_deg=0.0):
 
 def verify(car, file, capsys, *more):
     fleet, logs, _ = car
-    code = main(
-        ["verify", *map(str, logs), "--fleet", str(fleet), "--calibration", str(file), "--json", *more]
-    )
+    options = ["--fleet", str(fleet), "--calibration", str(file), "--json", *more]
+    code = main(["verify", *map(str, logs), *options])
     return code, json.loads(capsys.readouterr().out)
 
 
@@ -81,8 +81,9 @@ def test_a_calibration_in_the_format_of_another_program_becomes_the_prior(tmp_pa
         np.testing.assert_allclose(prior[pair], matrix, atol=1e-12)
 
 
-def test_nonsense_is_refused_before_a_log_is_opened(car, tmp_path, capsys):
-    fleet = car[0]
+def test_nonsense_is_refused_before_a_log_is_opened(tmp_path, capsys):
+    fleet = tmp_path / "fleet.toml"
+    fleet.write_text(fleet_toml("car"))
     (tmp_path / "empty.json").write_text("{}")
     calls = {
         "T_camera_lidar": ["no.mcap", "--calibration", str(tmp_path / "empty.json")],

@@ -17,11 +17,8 @@ def run(method, error_deg):
 
 
 def tables():
-    return [
-        TableView(
-            "Table 1", ["method", "runs"], [(False, ["joint", "2"]), (True, ["paper: joint SSL", "other"])]
-        )
-    ]
+    rows = [(False, ["joint", "2"]), (True, ["paper: joint SSL", "other"])]
+    return [TableView("Table 1", ["method", "runs"], rows)]
 
 
 def test_every_run_is_a_dot_per_pair_and_every_prior_a_cross():
@@ -47,9 +44,7 @@ def test_honest_sigmas_follow_the_grey_curve_and_small_ones_lie_below():
     for scale in (1.0, 2.0):
         html = evaluation_page(tables(), [run("joint", 0.1)], [], {"joint": scale * z}, [])
         curves = [p.split('"')[0].split() for p in html.split('<polyline points="')[1:]]
-        at_one = [
-            float(curve[20].split(",")[1]) for curve in curves
-        ]  # 20 of 80 steps to 4 sigma; down is positive
+        at_one = [float(curve[20].split(",")[1]) for curve in curves]  # 20 of 80 steps to 4 sigma; down is +
         heights.append(at_one[1] - at_one[0])
     assert abs(heights[0]) < 10
     assert heights[1] > 50

@@ -17,9 +17,8 @@ from tests.makers.rig_records import EDGES, rig_records
 
 
 def test_records_are_drawn_of_the_first_sensors_and_of_every_other_camera_with_its_lidar():
-    rows = dict(
-        zip((words_of(e) for e in EDGES), rig_records("van", 1, np.random.default_rng(1)), strict=True)
-    )
+    records = rig_records("van", 1, np.random.default_rng(1))
+    rows = dict(zip(map(words_of, EDGES), records, strict=True))
     first = drawn_records(rows)
     assert names_drawn(first) == {"camera": "front", "lidar": "top", "radar": "bumper"}
     assert other_cameras(rows, first) == ["left"]

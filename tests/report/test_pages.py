@@ -3,7 +3,7 @@
 import json
 import re
 from dataclasses import replace
-from urllib.parse import quote
+from urllib.parse import quote, unquote
 
 import numpy as np
 import pytest
@@ -78,8 +78,6 @@ def test_the_fleet_page_says_first_what_moved_since_when_and_how_sure(fleet):
 
 
 def test_the_fleet_page_links_every_day_page_by_a_relative_path(fleet):
-    from urllib.parse import unquote
-
     links = re.findall(r'href="([^"#]+\.html)"', fleet[1].read_text())
     assert len(links) == 12
     for link in links:
@@ -112,7 +110,7 @@ def test_the_truth_table_counts_the_axes_within_three_sigmas(fleet):
         (
             "b",
             "2026-03-01",
-            "Not any more. The radar moved on 2026-03-03, after this day. Only camera-lidar",
+            "Not any more. The radar moved on 2026-03-03, after this day. Only camera",
             "bad",
         ),
         ("c", "2026-03-03", "No. Nothing was accepted", "bad"),
@@ -132,19 +130,14 @@ def test_a_day_page_answers_first_whether_its_numbers_can_be_trusted(
 
 def test_a_held_day_after_a_move_says_that_nothing_is_safe(tmp_path):
     lake = Lake.at(tmp_path / "lake")
-    records = vehicle_records(
-        "v", 5, np.random.default_rng(5), motion=lambda d: {"radar": 3 * KNOCK} if d > 2 else {}
-    )
-    _store(
-        lake,
-        [replace(r, status="held") if r.day > "2026-03-03" and "radar" in r.pair else r for r in records],
-    )
+    knocked = lambda d: {"radar": 3 * KNOCK} if d > 2 else {}  # noqa: E731
+    records = vehicle_records("v", 5, np.random.default_rng(5), motion=knocked)
+    is_held = lambda r: r.day > "2026-03-03" and "radar" in r.pair  # noqa: E731
+    _store(lake, [replace(r, status="held") if is_held(r) else r for r in records])
     audit_fleet(lake, _config())
     text = write_day_page(lake, Partition("v", "2026-03-05"), _config(), tmp_path / "d.html").read_text()
-    assert (
-        "Only camera-lidar may be used. Nothing is safe for camera-radar, lidar-radar: the radar moved"
-        in text
-    )
+    said = "Only camera-lidar may be used. Nothing is safe for camera-radar, lidar-radar: the radar moved"
+    assert said in text
 
 
 def test_the_copied_json_is_the_record_and_a_page_without_pictures_has_none(fleet, tmp_path):
@@ -267,9 +260,7 @@ def test_vehicles_whose_names_look_alike_have_pages_of_their_own(tmp_path):
         _store(lake, vehicle_records(vehicle, 1, rng))
     pages = write_fleet_report(lake, _config(), Pages(tmp_path / "fleet.html"))
     assert len(set(pages)) == len(pages) == 4
-    titles = {
-        vehicle for vehicle in ("a b", "a_b", "ä b") for p in pages[1:] if f"{vehicle}" in p.read_text()
-    }
-    assert titles == {"a b", "a_b", "ä b"}
+    texts = [p.read_text() for p in pages[1:]]
+    assert all(any(vehicle in text for text in texts) for vehicle in ("a b", "a_b", "ä b"))
     for page in pages[1:]:
         assert quote(page.name) in (tmp_path / "fleet.html").read_text()

@@ -17,11 +17,8 @@ LABELS = ("prior", "calibrated")
 def test_each_pair_turns_by_the_share_of_its_whole_turn(share):
     before = _turned(4.0)
     state = between(before, GOOD, share)
-    for T, T_before in (
-        (state.T_camera_lidar, before.T_camera_lidar),
-        (state.T_lidar_radar, before.T_lidar_radar),
-    ):
-        turned = np.degrees(rotation_angle_rad(T @ inverse(T_before)))
+    for name in ("T_camera_lidar", "T_lidar_radar"):
+        turned = np.degrees(rotation_angle_rad(getattr(state, name) @ inverse(getattr(before, name))))
         assert turned == pytest.approx(4.0 * share, abs=1e-6)
     np.testing.assert_allclose(between(before, GOOD, 1.0).T_camera_radar, GOOD.T_camera_radar, atol=1e-12)
 
@@ -42,11 +39,8 @@ def test_a_browser_s_formats_are_written_and_play_for_ever(tmp_path, suffix):
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
 def test_a_still_is_the_page_s_front_view(tmp_path, suffix):
     path = write_picture(tmp_path / f"still{suffix}", _scene(), _turned(3.0), GOOD, LABELS)
-    found, drawn = (
-        cv2.imread(str(path)).astype(int),
-        front_view(_scene(), _turned(3.0), GOOD, LABELS).astype(int),
-    )
-    assert np.abs(found - drawn).mean() < 3.0  # what JPEG loses
+    drawn = front_view(_scene(), _turned(3.0), GOOD, LABELS).astype(int)
+    assert np.abs(cv2.imread(str(path)) - drawn).mean() < 3.0  # what JPEG loses
 
 
 def test_the_window_holds_what_the_lidar_sees():

@@ -1,20 +1,21 @@
 """Time offsets in pictures: what stands still lies where it is, at any speed, in any turn, with either offset wrong."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from pipeline.report.residuals import TimeOffsets, as_stamped, frame_residuals, time_offsets_of
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse, transform_points
-from schemas.calibrations import FRAMES_OF_PAIR, CalibrationRecord
-from schemas.observations import Observation
+from schemas.calibrations import PAIRS
+from tests.makers.table_rows import make_record
 from tests.report.test_pictures import GOOD, T_CL, T_LR, _scene
 
 POSTS_MAP = np.array([[20.0, 2.0, 0.0], [35.0, -6.0, 1.0], [12.0, 5.0, -1.0]])
 
 
-def _driving(speed_mps, yaw_rate_radps, **more):
-    known = {"ego_speed_mps": speed_mps, "ego_yaw_rate_radps": yaw_rate_radps, **more}
-    return Observation(**(vars(_scene().observation) | known))
+def _driving(speed_mps, yaw_rate_radps):
+    return replace(_scene().observation, ego_speed_mps=speed_mps, ego_yaw_rate_radps=yaw_rate_radps)
 
 
 def _seen_by_lidar(t_s, speed_mps, yaw_rate_radps):
@@ -45,16 +46,12 @@ def test_gaps_of_the_frame_s_own_stamps_are_bridged_as_offsets_are():
     """An image stamped as much later as its clock is off, and a scan as much earlier, were taken with the sweep."""
     frame = _driving(20.0, 0.2)
     now = frame.stamp_ns
-    together = Observation(
-        **(vars(frame) | {"camera_stamp_ns": now + 40_000_000, "radar_stamp_ns": now - 30_000_000})
-    )
+    together = replace(frame, camera_stamp_ns=now + 40_000_000, radar_stamp_ns=now - 30_000_000)
     state = as_stamped(GOOD, together, TimeOffsets(0.04, 0.03))
     np.testing.assert_allclose(state.T_camera_lidar, GOOD.T_camera_lidar, atol=1e-9)
     np.testing.assert_allclose(state.T_lidar_radar, GOOD.T_lidar_radar, atol=1e-9)
-    same, right = (
-        as_stamped(GOOD, frame, TimeOffsets(-0.04, -0.03)),
-        as_stamped(GOOD, together, TimeOffsets(0.0, 0.0)),
-    )
+    same = as_stamped(GOOD, frame, TimeOffsets(-0.04, -0.03))
+    right = as_stamped(GOOD, together, TimeOffsets(0.0, 0.0))
     np.testing.assert_allclose(right.T_camera_lidar, same.T_camera_lidar, atol=1e-9)
     np.testing.assert_allclose(right.T_lidar_radar, same.T_lidar_radar, atol=1e-9)
 
@@ -72,29 +69,14 @@ def test_without_offsets_or_speed_nothing_moves():
 def test_edges_meet_their_silhouettes_again_once_the_offset_is_known():
     still = _driving(20.0, 0.0)
     later = np.array([2.0, 0.0, 0.0], np.float32)  # the sweep is a tenth of a second after the image
-    late = Observation(**(vars(still) | {"lidar_edge_xyz_m": still.lidar_edge_xyz_m - later}))
+    late = replace(still, lidar_edge_xyz_m=still.lidar_edge_xyz_m - later)
     without, with_clock = frame_residuals([late], (GOOD, GOOD), (TimeOffsets(), TimeOffsets(0.1)))
     assert with_clock["camera_lidar"][0] > 90 > without["camera_lidar"][0]
 
 
 def test_a_run_gives_the_offsets_that_it_estimated_and_says_them():
-    run = {
-        pair: CalibrationRecord(
-            vehicle="car",
-            day="2026-01-01",
-            method="joint",
-            pair=pair,
-            parent_frame=parent,
-            child_frame=child,
-            status="accepted",
-            reason="",
-            work_key="key",
-            code_version="1",
-            seed=0,
-            time_offset_s=s,
-        )
-        for (pair, (parent, child)), s in zip(FRAMES_OF_PAIR.items(), (0.0281, None, None), strict=True)
-    }
+    offsets_s, rng = dict(zip(PAIRS, (0.0281, None, None), strict=True)), np.random.default_rng(0)
+    run = {pair: make_record(rng, "key", pair=pair, time_offset_s=s) for pair, s in offsets_s.items()}
     assert time_offsets_of(run) == TimeOffsets(0.0281, None)
     assert time_offsets_of(run).in_words() == "camera +28 ms"
     assert TimeOffsets().in_words() == ""
