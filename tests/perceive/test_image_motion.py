@@ -84,6 +84,19 @@ def test_motion_comes_out_within_its_sigma_for_any_camera_and_way(name, directio
     assert 0.3 < np.mean(z) < 3.0
 
 
+@pytest.mark.parametrize("direction", [(0.05, -0.02, 1.0), (0.0, 0.1, -1.0)])
+def test_a_known_turn_sharpens_the_direction_by_the_stated_correlation(direction):
+    """Of a camera that looks ahead or back, an error of the turn about y is one of the direction along x."""
+    alone, known = [], []
+    for seed in range(40):
+        tracks, turn, u = tracks_of(CAMERAS["pinhole"], direction=direction, seed=seed, way_m=1.0)
+        found = motion_of_tracks(tracks, SIZE)
+        by_turn = found.covariance[3, 1] / found.covariance[1, 1]
+        alone.append((found.direction - u)[0])
+        known.append(alone[-1] - by_turn * (found.turn - turn)[1])
+    assert np.std(known) < 0.85 * np.std(alone)
+
+
 def test_the_jacobian_is_that_of_the_residuals():
     tracks, turn, u = tracks_of(CAMERAS["f-theta"], turn=np.radians([1.0, 4.0, -2.0]), noise_px=0.0)
     J = _residuals(tracks, turn, u)[1]

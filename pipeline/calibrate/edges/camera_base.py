@@ -37,9 +37,13 @@ __all__ = ["estimate_camera_base", "solve"]
 # A body pitches and yaws so much from image to image, however sharp the tracks are.
 _LEAST_RAD = np.radians(0.1)
 _LEVER_SIGMA_M = 1.5  # as of a radar: place of the rear axle, slip
+_ROLL_AXIS_M, _HEIGHT_SIGMA_M = 0.4, 0.5  # about which a body rolls, over the road
 _NO_SCALE, _DRIFT_SIGMA_RADPS = 1.0, 0.003  # of a yaw rate beside the camera's
 _MOST_TURN_RAD = np.radians(0.6)  # a metre, of a car of which nothing shows the way: straight driving
 _TURNING_RAD = np.radians(0.4)
+# Of yaw: free; lever arm, height [m]; what the base's turn is off by: scale, clock [s], drift [rad/s].
+_YAW_PRIORS = np.array([np.inf, _LEVER_SIGMA_M, _HEIGHT_SIGMA_M, 0.02, 0.05, 0.0007])
+_WAY_M = 3.0  # between two images of a car of which nothing shows it: what ingest looks for
 _BEND_M = 50.0
 _FLOOR_RAD = np.radians(0.02)  # of yaw and pitch by matching, as of radars
 _ROLL_FLOOR_RAD = np.radians(0.05)  # roads that lean to one side in bends
@@ -114,19 +118,32 @@ def _rows(travel: CameraTravel, T: np.ndarray) -> dict[str, Rows]:
     off = np.arctan2(direction[:, 1], direction[:, 0]) - np.arctan2(expected[:, 1], expected[:, 0])
     off = np.arctan2(np.sin(off), np.cos(off))
     # Of an azimuth, beside the direction of travel: other than directions these are nearly along x.
-    curvature = np.where(
-        np.isnan(travel.driven_m), turn[:, 2], turn[:, 2] / np.nan_to_num(travel.driven_m, nan=1.0)
-    )
+    by_way = turn / np.nan_to_num(travel.driven_m, nan=_WAY_M)[:, None]
     one, free = np.ones(len(off)), np.inf
-    turning = np.stack([one, curvature], 1)
-    yaw = Rows(turning, -off, _sigma(of_direction, 1), bend, np.array([free, _LEVER_SIGMA_M]), one)
     ahead = np.copysign(1.0, direction[:, 0])
+    with_turn = ahead * ((travel.covariance[:, :3, 3:] @ R[1]) @ R[2])
+    of_yaw, known = (
+        of_turn[:, 2, 2],
+        np.isfinite(travel.turned_rad) & np.isfinite(travel.turned_by_clock_radps),
+    )
+    slope = np.where(known, with_turn / of_yaw, 0.0)  # of the azimuth, by an error of the camera's turn
+    turned, by_clock = np.nan_to_num(travel.turned_rad), np.nan_to_num(travel.turned_by_clock_radps)
+    by_base = slope[:, None] * np.stack([turned, -by_clock, travel.span_s], 1)
+    design = np.concatenate([np.stack([one, by_way[:, 2], by_way[:, 0]], 1), by_base], 1)
+    azimuth = off - slope * (turn[:, 2] - turned)
+    left = of_direction[:, 1, 1] - slope**2 * of_yaw
+    yaw = Rows(design, -azimuth, np.sqrt(left + _LEAST_RAD**2), bend, _YAW_PRIORS, one)
     elevation = np.arctan2(direction[:, 2], np.hypot(direction[:, 0], direction[:, 1])) * ahead
-    by_way = Rows(one[:, None], elevation, _sigma(of_direction, 2), bend, np.array([free]), one)
-    turned = np.abs(turn[:, 2]) > _TURNING_RAD
-    roll = Rows(turn[:, 2:], turn[:, 1], _sigma(of_turn, 1), bend, np.array([free]), one).some(turned)
-    by_axis = Rows(-turn[:, 2:], turn[:, 0], _sigma(of_turn, 0), bend, np.array([free]), one).some(turned)
-    return {"yaw": yaw.some(straight), "pitch": by_way.some(straight), "roll": roll, "pitch_by_axis": by_axis}
+    by_travel = Rows(one[:, None], elevation, _sigma(of_direction, 2), bend, np.array([free]), one)
+    turning = np.abs(turn[:, 2]) > _TURNING_RAD
+    roll = Rows(turn[:, 2:], turn[:, 1], _sigma(of_turn, 1), bend, np.array([free]), one).some(turning)
+    by_axis = Rows(-turn[:, 2:], turn[:, 0], _sigma(of_turn, 0), bend, np.array([free]), one).some(turning)
+    return {
+        "yaw": yaw.some(straight),
+        "pitch": by_travel.some(straight),
+        "roll": roll,
+        "pitch_by_axis": by_axis,
+    }
 
 
 def _sigma(covariance: np.ndarray, axis: int) -> np.ndarray:
@@ -134,13 +151,19 @@ def _sigma(covariance: np.ndarray, axis: int) -> np.ndarray:
 
 
 def _expected(travel: CameraTravel, T: np.ndarray, turn: np.ndarray) -> Float[np.ndarray, "N 2"]:
-    """Way of the camera in axes of the base midway: the base's own, and the turn times the lever arm."""
+    """Way of the camera in axes of the base midway: the base's own, and the turn times the lever arm.
+
+    A body that rolls moves a camera on its roof aside: on the real car .1 deg of roll over 3 m is .06 deg of travel.
+    """
     way = np.where(
-        np.isnan(travel.driven_m), np.copysign(1.0, (travel.direction @ T[:3, :3].T)[:, 0]), travel.driven_m
+        np.isnan(travel.driven_m),
+        np.copysign(_WAY_M, (travel.direction @ T[:3, :3].T)[:, 0]),
+        travel.driven_m,
     )
     chord = way * np.sinc(turn[:, 2] / (2 * np.pi))
-    across = np.where(np.isnan(travel.driven_m), 0.0, 2 * np.sin(turn[:, 2] / 2))
-    return np.stack([chord - across * T[1, 3], across * T[0, 3]], 1)
+    across = 2 * np.sin(turn[:, 2] / 2)
+    rolled = turn[:, 0] * (T[2, 3] - _ROLL_AXIS_M)
+    return np.stack([chord - across * T[1, 3], across * T[0, 3] - rolled], 1)
 
 
 def _is_straight(travel: CameraTravel, T: np.ndarray) -> Bool[np.ndarray, " N"]:

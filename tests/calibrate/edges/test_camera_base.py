@@ -26,7 +26,7 @@ def mounted(yaw_deg=0.0, pitch_deg=3.0, roll_deg=-1.0):
     )
 
 
-def day(T, seed=1, *, turning=0.25, late_s=LATE_S, body_deg=0.1, scale=1.0):
+def day(T, seed=1, *, turning=0.25, late_s=LATE_S, body_deg=0.1, scale=1.0, noise=NOISE):
     """A drive along bends of a camera at T = T_base_camera, whose base pitches and leans from pair to pair."""
     rng = np.random.default_rng(seed)
     t = np.arange(N) * STEP_S
@@ -45,10 +45,10 @@ def day(T, seed=1, *, turning=0.25, late_s=LATE_S, body_deg=0.1, scale=1.0):
     translation = np.stack([way, 0 * way, 0 * way], 1) + np.cross(turn, T[:3, 3]) * [1, 1, 0]
     translation[:, 2] += rng.normal(0, np.radians(body_deg), N) * way
     direction = translation / np.linalg.norm(translation, axis=1, keepdims=True)
-    noisy = direction @ T[:3, :3] + rng.normal(0, NOISE, (N, 3))
-    covariance = np.tile(np.eye(6) * NOISE**2, (N, 1, 1))
+    noisy = direction @ T[:3, :3] + rng.normal(0, noise, (N, 3))
+    covariance = np.tile(np.eye(6) * noise**2, (N, 1, 1))
     return CameraTravel(
-        (turn @ T[:3, :3] + rng.normal(0, NOISE, (N, 3))) * scale,
+        (turn @ T[:3, :3] + rng.normal(0, noise, (N, 3))) * scale,
         noisy / np.linalg.norm(noisy, axis=1, keepdims=True),
         covariance, way, turned(t) + rng.normal(0, 1e-4, N), rate(t) - rate(t - SPAN_S), np.full(N, SPAN_S),
         (t * 1e9).astype(np.int64), np.arange(N) // 120, np.arange(N) // 4,
@@ -88,6 +88,39 @@ def test_a_wrong_lever_arm_is_no_yaw():
     moved[0, 3] += 1.0
     error, sigma = error_and_sigma(estimate_camera_base(EDGE, day(T), start(moved)), T)
     assert abs(error[2]) < 3 * sigma[2]
+
+
+def test_a_body_that_rolls_about_another_axis_is_no_yaw_and_hardly_noise():
+    T = mounted()
+    higher = T.copy()
+    higher[2, 3] += 0.4
+    plain, moved = (estimate_camera_base(EDGE, day(T, body_deg=0.4), start(of)) for of in (T, higher))
+    error, sigma = error_and_sigma(moved, T)
+    assert abs(error[2]) < 3 * sigma[2]
+    assert sigma[2] < 1.3 * error_and_sigma(plain, T)[1][2]
+
+
+def test_what_the_base_turns_corrects_the_direction_of_travel():
+    """Tracks confuse a turn with a shift: by the base's turn the error of the direction goes, with its sigma."""
+    T, confused = mounted(), np.radians(0.03)
+    travel = day(T, turning=0.05, noise=np.radians(0.005))
+    error = np.random.default_rng(5).normal(0.03, 0.03, N)[:, None] * np.radians(1)
+    turn = travel.turn + error * T[2, :3]
+    direction = travel.direction - 8 * error * T[1, :3]
+    covariance = travel.covariance.copy()
+    covariance[:, :3, :3] += confused**2 * np.outer(T[2, :3], T[2, :3])
+    covariance[:, 3:, 3:] += 64 * confused**2 * np.outer(T[1, :3], T[1, :3])
+    covariance[:, :3, 3:] -= 8 * confused**2 * np.outer(T[2, :3], T[1, :3])
+    covariance[:, 3:, :3] = covariance[:, :3, 3:].transpose(0, 2, 1)
+    confused_travel = replace(travel, turn=turn, direction=direction, covariance=covariance)
+    silent = np.full(N, np.nan)
+    unaided = replace(confused_travel, driven_m=silent, turned_rad=silent, turned_by_clock_radps=silent)
+    with_turn, alone = (
+        error_and_sigma(estimate_camera_base(EDGE, of, start(T)), T) for of in (confused_travel, unaided)
+    )
+    assert abs(alone[0][2]) > np.radians(0.15)
+    assert abs(with_turn[0][2]) < np.radians(0.06)
+    assert np.radians(0.04) < with_turn[1][2] < np.radians(0.12)  # by what a yaw rate may drift
 
 
 def test_straight_driving_determines_neither_roll_nor_clock_and_says_so():
