@@ -10,6 +10,8 @@ errors are this edge's own; an error of the intrinsics turns what any edge of th
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
@@ -106,44 +108,63 @@ def estimate_camera_base(
     )  # fmt: skip
 
 
+@dataclass(frozen=True, eq=False)
+class _Apart:
+    """Azimuth of travel and yaw of a camera at a T_base_camera, less those of the base.
+
+    Tracks confuse a turn with a shift aside, so that what one of the two is known to be sharpens the other.
+
+    Args:
+        azimuth, yaw: N [rad]; yaw 0 where the base's is unknown.
+        variances, covariance: N of the azimuth, N of the yaw; N of both, 0 where the base's yaw is unknown.
+        by_base: N 3, derivative of the base's yaw by scale, clock [s] and drift [rad/s].
+    """
+
+    azimuth: np.ndarray
+    yaw: np.ndarray
+    variances: tuple[np.ndarray, np.ndarray]
+    covariance: np.ndarray
+    by_base: np.ndarray
+
+
+def _apart(travel: CameraTravel, T: np.ndarray) -> _Apart:
+    R = T[:3, :3]
+    direction, turn = travel.direction @ R.T, travel.turn @ R.T
+    expected = _expected(travel, T, turn)
+    off = np.arctan2(direction[:, 1], direction[:, 0]) - np.arctan2(expected[:, 1], expected[:, 0])
+    known = _knows_yaw(travel)
+    turned, by_clock = np.nan_to_num(travel.turned_rad), np.nan_to_num(travel.turned_by_clock_radps)
+    # Of an azimuth, beside the direction of travel: other than directions these are nearly along x.
+    both = np.copysign(1.0, direction[:, 0]) * ((travel.covariance[:, :3, 3:] @ R[1]) @ R[2])
+    return _Apart(
+        np.arctan2(np.sin(off), np.cos(off)), np.where(known, turn[:, 2] - turned, 0.0),
+        (R[1] @ travel.covariance[:, 3:, 3:] @ R[1] + _LEAST_RAD**2, R[2] @ travel.covariance[:, :3, :3] @ R[2]),
+        np.where(known, both, 0.0), np.stack([turned, -by_clock, travel.span_s], 1),
+    )  # fmt: skip
+
+
 def _rows(travel: CameraTravel, T: np.ndarray) -> dict[str, Rows]:
     """Regressions of the changes of T_base_camera: yaw and pitch by the way, roll and pitch by the axis of turns."""
     R = T[:3, :3]
     direction, turn = travel.direction @ R.T, travel.turn @ R.T
     of_turn = R @ travel.covariance[:, :3, :3] @ R.T
-    of_direction = R @ travel.covariance[:, 3:, 3:] @ R.T
-    bend = _bends(travel)
-    straight = _is_straight(travel, T)
-    expected = _expected(travel, T, turn)
-    off = np.arctan2(direction[:, 1], direction[:, 0]) - np.arctan2(expected[:, 1], expected[:, 0])
-    off = np.arctan2(np.sin(off), np.cos(off))
-    # Of an azimuth, beside the direction of travel: other than directions these are nearly along x.
+    bend, straight = _bends(travel), _is_straight(travel, T)
     by_way = turn / np.nan_to_num(travel.driven_m, nan=_WAY_M)[:, None]
-    one, free = np.ones(len(off)), np.inf
-    ahead = np.copysign(1.0, direction[:, 0])
-    with_turn = ahead * ((travel.covariance[:, :3, 3:] @ R[1]) @ R[2])
-    of_yaw, known = (
-        of_turn[:, 2, 2],
-        np.isfinite(travel.turned_rad) & np.isfinite(travel.turned_by_clock_radps),
-    )
-    slope = np.where(known, with_turn / of_yaw, 0.0)  # of the azimuth, by an error of the camera's turn
-    turned, by_clock = np.nan_to_num(travel.turned_rad), np.nan_to_num(travel.turned_by_clock_radps)
-    by_base = slope[:, None] * np.stack([turned, -by_clock, travel.span_s], 1)
-    design = np.concatenate([np.stack([one, by_way[:, 2], by_way[:, 0]], 1), by_base], 1)
-    azimuth = off - slope * (turn[:, 2] - turned)
-    left = of_direction[:, 1, 1] - slope**2 * of_yaw
-    yaw = Rows(design, -azimuth, np.sqrt(left + _LEAST_RAD**2), bend, _YAW_PRIORS, one)
-    elevation = np.arctan2(direction[:, 2], np.hypot(direction[:, 0], direction[:, 1])) * ahead
-    by_travel = Rows(one[:, None], elevation, _sigma(of_direction, 2), bend, np.array([free]), one)
+    one, free = np.ones(len(turn)), np.array([np.inf])
+    apart = _apart(travel, T)
+    slope = apart.covariance / apart.variances[1]
+    design = np.column_stack([one, by_way[:, 2], by_way[:, 0], slope[:, None] * apart.by_base])
+    left = np.sqrt(apart.variances[0] - slope * apart.covariance)
+    yaw = Rows(design, slope * apart.yaw - apart.azimuth, left, bend, _YAW_PRIORS, one)
+    elevation = np.arctan2(direction[:, 2], np.hypot(direction[:, 0], direction[:, 1]))
+    elevation *= np.copysign(1.0, direction[:, 0])
+    of_direction = R @ travel.covariance[:, 3:, 3:] @ R.T
+    pitch = Rows(one[:, None], elevation, _sigma(of_direction, 2), bend, free, one)
     turning = np.abs(turn[:, 2]) > _TURNING_RAD
-    roll = Rows(turn[:, 2:], turn[:, 1], _sigma(of_turn, 1), bend, np.array([free]), one).some(turning)
-    by_axis = Rows(-turn[:, 2:], turn[:, 0], _sigma(of_turn, 0), bend, np.array([free]), one).some(turning)
-    return {
-        "yaw": yaw.some(straight),
-        "pitch": by_travel.some(straight),
-        "roll": roll,
-        "pitch_by_axis": by_axis,
-    }
+    roll = Rows(turn[:, 2:], turn[:, 1], _sigma(of_turn, 1), bend, free, one)
+    by_axis = Rows(-turn[:, 2:], turn[:, 0], _sigma(of_turn, 0), bend, free, one)
+    ways = {"yaw": yaw.some(straight), "pitch": pitch.some(straight)}
+    return ways | {"roll": roll.some(turning), "pitch_by_axis": by_axis.some(turning)}
 
 
 def _sigma(covariance: np.ndarray, axis: int) -> np.ndarray:
@@ -201,14 +222,19 @@ def _clock(travel: CameraTravel, T: np.ndarray) -> Regression | None:
 
     A camera that is late shows earlier turns: its turn less the base's is minus the delay times the yaw rate's change.
     """
-    turned = (travel.turn @ T[:3, :3].T)[:, 2]
-    known = np.isfinite(travel.turned_rad) & np.isfinite(travel.turned_by_clock_radps)
-    base, by_clock = np.nan_to_num(travel.turned_rad), np.nan_to_num(travel.turned_by_clock_radps)
-    covariance = T[2, :3] @ travel.covariance[:, :3, :3] @ T[2, :3]
-    sigma, one = np.sqrt(covariance + (0.2 * _LEAST_RAD) ** 2), np.ones(len(turned))
-    design = np.stack([-by_clock, base, travel.span_s], 1)
-    priors = np.array([_NO_CLOCK_S, _NO_SCALE, _DRIFT_SIGMA_RADPS])
-    return regress(Rows(design, turned - base, sigma, _bends(travel), priors, one).some(known))
+    apart = _apart(travel, T)
+    slope = apart.covariance / apart.variances[0]
+    sigma = np.sqrt(apart.variances[1] - slope * apart.covariance + (0.2 * _LEAST_RAD) ** 2)
+    design, priors = apart.by_base[:, [1, 0, 2]], np.array([_NO_CLOCK_S, _NO_SCALE, _DRIFT_SIGMA_RADPS])
+    turned = Rows(
+        design, apart.yaw - slope * apart.azimuth, sigma, _bends(travel), priors, np.ones(len(sigma))
+    )
+    return regress(turned.some(_knows_yaw(travel)))
+
+
+def _knows_yaw(travel: CameraTravel) -> Bool[np.ndarray, " N"]:
+    """Pairs over which the base's yaw is known."""
+    return np.asarray(np.isfinite(travel.turned_rad) & np.isfinite(travel.turned_by_clock_radps))
 
 
 def _checks(edge: Edge, clock: Regression | None) -> tuple[Check, ...]:
