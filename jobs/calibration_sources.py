@@ -43,15 +43,16 @@ def read_calibration(
     force: bool,
     frames: FrameOptions | None = None,
     own_frames: bool = False,
+    is_signed: bool = False,
     mount: str | None = None,
 ) -> ExportedCalibration:
     """Read a day's records (without a day: the vehicle's state) for a file; ConfigError if there are none.
 
-    With `own_frames`, frames that no option names get their names from the logs.
+    `is_signed`: the state signed off last; `own_frames`: frames that no option names have the names of the logs.
     """
     lake = Lake.existing(location)
     try:
-        found = pairs_of(lake, vehicle, day, method)
+        found = pairs_of(lake, vehicle, day, method, is_signed=is_signed)
     except ConfigError:
         require_vehicle(lake, vehicle)  # names the vehicles of the lake, if this is none of them
         raise
@@ -71,7 +72,9 @@ def read_calibration(
         T_base = tree.lookup(names.base, names.of(reference_of(edges).name))
     source = f"record of {day}"
     if day is None:
-        source = f"state of {max((str(d['day']) for d in details), default='no day')}"
+        source = (
+            f"{'signed-off ' * is_signed}state of {max((str(d['day']) for d in details), default='no day')}"
+        )
     tell_damage(lake)
     return ExportedCalibration(
         vehicle, source, method, CODE_VERSION, pairs, None, names, T_base, without, word,

@@ -15,7 +15,7 @@ from rich.console import Console
 from jobs.extras import needs
 from jobs.nightly import Drawing, close_night, watch_night
 from jobs.simulate import simulate_days
-from jobs.terminal.demo_table import print_comparison, print_methods
+from jobs.terminal.demo_table import errors_of, print_comparison
 from jobs.terminal.summary import exit_code, is_terminal, print_summary
 from jobs.terminal.vehicle_status import count_statuses, moved_sensors
 from pipeline.core.config import config_hash, load_fleet
@@ -75,7 +75,7 @@ def demo(
     drawing = Drawing(out / "report" / "fleet.html", True, "process", workers, truth)
     findings, pages = close_night(night, None, drawing, outcomes)
     errors = print_comparison(night.lake, night.method, truth, dates[-1], findings)
-    errors += print_methods(night.lake, (night.method, _NETWORK), truth, dates[-1])[_NETWORK]
+    errors += errors_of(night.lake, _NETWORK, truth, dates[-1])
     (out / "comparison.json").write_text(json.dumps(errors, indent=1) + "\n")
     knocked = [{"vehicle": f.vehicle, "sensor": f.sensor, "since": dates[f.day]} for f in spec.faults]
     return _summarise(

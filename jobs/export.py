@@ -42,6 +42,7 @@ def export(
     vehicle: str | None = None,
     day: str | None = None,
     method: str = "joint",
+    signed_off: bool = False,
     force: bool = False,
     mount: str | None = None,
     update: Path | None = None,
@@ -69,6 +70,7 @@ def export(
         vehicle: vehicle id.
         day: YYYY-MM-DD: export the records of this day; default: the vehicle's state.
         method: calibration method.
+        signed_off: the state that was signed off last (`boresight state --sign-off`), not tonight's.
         force: with --day, write held pairs too, marked as held; the exit code is that without --force.
         mount: pose of the reference lidar on the car (from --base-frame to the lidar's frame): log:FILE (its
             /tf_static) or FORMAT:FILE, as in urdf:car.urdf; default: from the car's logs, where their /tf_static
@@ -92,6 +94,8 @@ def export(
         return 0
     if lake is None or vehicle is None:
         raise ConfigError("command line", "lake, vehicle", "a calibration needs --lake and --vehicle")
+    if signed_off and day is not None:
+        raise ConfigError("command line", "signed-off", "is of a state: leave out --day")
     if force and day is None:
         problem = "a state has no held pairs: what no day determines is at its prior; --force goes with --day"
         raise ConfigError("command line", "force", problem)
@@ -99,7 +103,7 @@ def export(
     own_frames = not (generic_frames or what == "autoware")
     calibration = read_calibration(
         lake, vehicle, day, method, force=force, frames=frames,
-        own_frames=own_frames, mount=mount,
+        own_frames=own_frames, is_signed=signed_off, mount=mount,
     )  # fmt: skip
     if what == "foxglove":
         return _export_drive(out, calibration, lake, day, most_frames, sensor)

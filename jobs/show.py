@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any, Literal
 
+from jobs.state import state_text
 from jobs.terminal.record_tables import print_table
 from jobs.terminal.summary import left_out, print_json
 from pipeline.core.errors import ContractError
@@ -33,6 +34,7 @@ Table = Literal[
     "states",
     "outcomes",
     "service_events",
+    "sign_offs",
     "moments",
     "perceived",
 ]
@@ -68,6 +70,8 @@ def show(
         rows = _records(tables, table, vehicle, day, method, current=current)
     if json:
         print_json(rows, indent=2)
+    elif rows and table == "states":
+        sys.stdout.write(state_text(rows))
     elif rows:
         print_table(table, rows)
     else:
@@ -85,6 +89,7 @@ def _records(
         "states": current_states,
         "outcomes": list,
         "service_events": current_events,
+        "sign_offs": list,
     }
     rows: list[Any] = read_records(lake, TABLES[table], TABLES[table].row_type, vehicle=vehicle, day=day)
     rows = [r for r in rows if method in (None, getattr(r, "method", None))]

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
 from textwrap import wrap
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from jobs.terminal.summary import left_out, print_json
 from jobs.terminal.vehicle_status import require_vehicle
+from pipeline.core.errors import ConfigError
+from pipeline.export.lake import signed_state
 from pipeline.rig.changes import change_between
 from pipeline.rig.se3 import to_quaternion
 from pipeline.store.current import current_states, state_values
 from pipeline.store.partitions import Lake
 from pipeline.store.records import read_records
+from pipeline.store.sign_offs import read_sign_offs, sign
+from schemas.sign_offs import SignOff
 from schemas.states import STATES, StateRow
 
 __all__ = ["state"]
@@ -24,18 +29,32 @@ __all__ = ["state"]
 _WIDTH, _INDENT = 80, 4
 
 
-def state(*, lake: str, vehicle: str | None = None, method: str = "joint", json: bool = False) -> int:
+def state(
+    *,
+    lake: str,
+    vehicle: str | None = None,
+    method: str = "joint",
+    previous: bool = False,
+    sign_off: str | None = None,
+    note: str = "",
+    json: bool = False,
+) -> int:
     """Show what each vehicle should load tonight: a pose per sensor relative to the reference, with sigma.
 
     The days since a sensor last moved determine its pose; without such days it is at the prior. The sigma is that of
     tomorrow's drive.
 
-    `boresight nightly` and `boresight audit` write the table states; this command prints its latest rows.
+    `boresight nightly` and `boresight audit` write the table states; this command prints its latest rows. A person
+    may sign one off (table sign_offs: who, when, which); `boresight export --signed-off` writes the last such state.
+    To go back: --previous --sign-off NAME. Against a file or log of the car: `boresight compare VEHICLE@state FILE`.
 
     Args:
         lake: folder of the tables.
         vehicle: only this vehicle.
         method: calibration method.
+        previous: of one vehicle: the state that was signed off before the last one.
+        sign_off: of one vehicle: your name; records that the state shown is approved for loading.
+        note: free text beside the sign-off.
         json: print only a JSON list: keys as the columns of table states, "T" and "T_prior" (4x4 row-major
             T_parent_child, null if unknown), and "in_words". Rows of sensors (`sensor` is not null) and rows of the
             edges, composed of the sensors' poses.
@@ -44,23 +63,46 @@ def state(*, lake: str, vehicle: str | None = None, method: str = "joint", json:
     found = [r for r in read_records(tables, STATES, StateRow, vehicle=vehicle) if r.method == method]
     if vehicle is not None and not found:
         require_vehicle(tables, vehicle)
-    rows = state_values(current_states(found))
+    if vehicle is None and (previous or sign_off is not None):
+        raise ConfigError("command line", "vehicle", "a sign-off is of one vehicle: give --vehicle")
+    shown = current_states(found)
+    if previous and vehicle is not None:
+        shown = signed_state(tables, vehicle, method, before=True)
+    if sign_off is not None:
+        sign(tables, shown, sign_off, note)
+    signed = {s.vehicle: s for s in read_sign_offs(tables, method)}
+    rows = [row | {"signed_by": _signer(row, signed)} for row in state_values(shown)]
     if json:
         print_json(rows, indent=2)
     elif rows:
-        sys.stdout.write(state_text(rows))
+        sys.stdout.write(state_text(rows, signed))
     else:
         sys.stdout.write(f"states: none in {lake}; boresight nightly and boresight audit write them\n")
     return 3 if left_out(tables) else 0
 
 
-def state_text(rows: Sequence[dict[str, Any]]) -> str:
-    """The states of vehicles, of `state_values`; edges of a vehicle with poses are left out."""
+def _signer(row: dict[str, Any], signed: Mapping[str, SignOff]) -> str | None:
+    last = signed.get(row["vehicle"])
+    return last.signed_by if last is not None and last.state_key == row["work_key"] else None
+
+
+def state_text(rows: Sequence[dict[str, Any]], signed: Mapping[str, SignOff] = MappingProxyType({})) -> str:
+    """The states of vehicles, of `state_values`; edges of a vehicle with poses are left out.
+
+    `signed`: the last sign-off by vehicle.
+    """
     by_sensor = {(row["vehicle"], row["method"]) for row in rows if row["sensor"] is not None}
     shown = [r for r in rows if r["sensor"] is not None or (r["vehicle"], r["method"]) not in by_sensor]
     parts = []
     for (vehicle, method, day), of in groupby(shown, key=lambda r: (r["vehicle"], r["method"], r["day"])):
-        parts.append("\n".join(_vehicle(f"{vehicle}, {day}, {method}", list(of))))
+        own, last = list(of), signed.get(vehicle)
+        lines = list(_vehicle(f"{vehicle}, {day}, {method}", own))
+        if last is not None:
+            is_this = last.state_key == own[0]["work_key"]
+            which = "signed off" if is_this else f"not signed off; signed off is the state of {last.day},"
+            by = f"  {which} by {last.signed_by} at {last.asserted_at[:16]} UTC {last.note}".rstrip()
+            lines[1:1] = wrap(by, _WIDTH, subsequent_indent=" " * _INDENT)
+        parts.append("\n".join(lines))
     return "\n\n".join(parts) + "\n"
 
 
@@ -96,7 +138,7 @@ def _sensor(row: dict[str, Any]) -> Iterator[str]:
     if T is not None and T_prior is not None and row["status"] == "current":
         change = change_between(T_prior, T)
         turn, shift = _numbers(np.degrees(change[:3]), "+.3f"), _numbers(change[3:], "+.3f")
-        lines.append(f"from the prior: {turn} deg, {shift} m")
+        lines.append(f"from the prior (tf of the logs, or a file): {turn} deg, {shift} m")
     if row["azimuth_sigma_rad"] is not None:
         azimuth, elevation = np.degrees([row["azimuth_sigma_rad"], row["elevation_sigma_rad"]])
         lines.append(f"sigma of azimuth {azimuth:.3f} deg, of elevation {elevation:.3f} deg")

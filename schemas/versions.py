@@ -14,6 +14,7 @@ from schemas.moments import MOMENTS, PERCEIVED
 from schemas.outcomes import OUTCOMES
 from schemas.poses import POSES
 from schemas.service_events import SERVICE_EVENTS
+from schemas.sign_offs import SIGN_OFFS
 from schemas.states import STATES
 from schemas.training import TRAINING
 
@@ -27,7 +28,7 @@ TABLES: dict[str, TableSchema] = {
     t.name: t
     for t in (
         MOMENTS, *CAPTURES.values(), PERCEIVED, *FEATURES.values(), TRAINING, CALIBRATIONS, POSES, DRIFT,
-        STATES, OUTCOMES, SERVICE_EVENTS,
+        STATES, SIGN_OFFS, OUTCOMES, SERVICE_EVENTS,
     )
 }  # fmt: skip
 

@@ -15,14 +15,13 @@ from jobs.terminal.vehicle_status import status_lines
 from pipeline.report.truth import Truth, true_transform
 from pipeline.rig.changes import change_between, change_covariance
 from pipeline.rig.se3 import inverse, rotation_angle_rad
-from pipeline.rig.targets import errors_at_targets
 from pipeline.store.current import current_records, prior_of, transform_of
 from pipeline.store.partitions import Lake
 from pipeline.store.records import read_records
-from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
+from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.drift import DriftFinding
 
-__all__ = ["print_comparison", "print_methods"]
+__all__ = ["errors_of", "print_comparison"]
 
 _WIDTH = 124  # of the table; a narrower terminal wraps lines, which is easier to read than truncated names
 
@@ -58,56 +57,9 @@ def print_comparison(
     return errors
 
 
-def print_methods(
-    lake: Lake,
-    methods: Sequence[str],
-    truth: Truth,
-    day: str,
-) -> dict[str, list[dict[str, Any]]]:
-    """Print a row per method: mean errors of its records of one day, over vehicles on which all methods ran.
-
-    Azimuth and elevation [deg] and range [m] at the paper's targets; the first row is the prior.
-
-    Returns:
-        By method, for each record, what `print_comparison` returns.
-    """
-    records = {method: _current(lake, method, day) for method in methods}
-    shared = set.intersection(*({r.vehicle for r in own} for own in records.values()))
-    records = {method: [r for r in own if r.vehicle in shared] for method, own in records.items()}
-    table = Table(
-        title=f"Mean error by method, {day}: azimuth, elevation \\[deg], range \\[m]",
-        title_style="bold",
-        box=box.SIMPLE_HEAD,
-    )
-    for name in ("method", *PAIRS, "accepted"):
-        table.add_column(name, no_wrap=True)
-    first = records[methods[0]]
-    table.add_row("prior", *(_mean_error(first, truth, pair, before=True) for pair in PAIRS), "")
-    for method, own in records.items():
-        accepted = sum(r.status == "accepted" for r in own)
-        cells = [_mean_error(own, truth, pair, before=False) for pair in PAIRS]
-        table.add_row(method, *cells, f"{accepted} of {len(own)}")
-    _console().print(table)
-    return {method: [_errors(r, _true(truth, r)) for r in own] for method, own in records.items()}
-
-
-def _mean_error(
-    records: Sequence[CalibrationRecord],
-    truth: Truth,
-    pair: str,
-    *,
-    before: bool,
-) -> str:
-    """Mean error over the records of a pair that have a transform."""
-    found = []
-    for record in (r for r in records if r.pair == pair):
-        T = prior_of(record) if before else transform_of(record)
-        if T is not None:
-            found.append(errors_at_targets(pair, T, _true(truth, record)))
-    if not found:
-        return "refused"
-    azimuth, elevation, range_m = np.mean(found, axis=0)
-    return f"{np.degrees(azimuth):.3f} / {np.degrees(elevation):.3f} / {range_m:.3f}"
+def errors_of(lake: Lake, method: str, truth: Truth, day: str) -> list[dict[str, Any]]:
+    """Errors of the records of one day by a method, as `print_comparison` returns them."""
+    return [_errors(r, _true(truth, r)) for r in _current(lake, method, day)]
 
 
 def _true(truth: Truth, record: CalibrationRecord) -> np.ndarray:

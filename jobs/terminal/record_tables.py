@@ -36,9 +36,9 @@ def print_table(table: str, rows: list[dict[str, Any]]) -> None:
         "calibrations": _calibration_cells,
         "poses": _pose_row_cells,
         "drift": _drift_cells,
-        "states": _state_cells,
         "outcomes": _outcome_cells,
         "service_events": _event_cells,
+        "sign_offs": lambda row: _named(row, "vehicle", "day", "method", "signed_by", "asserted_at", "note"),
     }.get(table, _partition_cells)
     lines = [cells(row) for row in rows]
     view = Table(title=f"{table}: {len(rows)} row{'' if len(rows) == 1 else 's'}", title_justify="left")
@@ -127,19 +127,6 @@ def _drift_cells(row: dict[str, Any]) -> dict[str, str]:
         "since": row["start_day"] or "",
         "moved": row["moved_sensor"] or "",
         "reason": row["reason"],
-    }
-
-
-def _state_cells(row: dict[str, Any]) -> dict[str, str]:
-    days = row["days"]
-    return {
-        "vehicle": row["vehicle"],
-        "pair": _edge(row),
-        "state": row["status"],
-        **_pose_cells(row["T"], row["T_prior"]),
-        **_sure_cells(row),
-        "days": f"{len(days)}: {days[0]} to {days[-1]}" if days else "0",
-        "reason": "; ".join(text for text in (row["in_words"], row["reason"]) if text),
     }
 
 

@@ -18,6 +18,7 @@ from pipeline.rig.transform_tree import TransformTree
 from pipeline.store.current import current_poses, current_records, current_states, prior_of, transform_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
+from pipeline.store.sign_offs import read_sign_offs
 from pipeline.store.views import Chosen, frames_of, ingested, observations_of, perceived
 from schemas.calibrations import CALIBRATIONS, DOF_NAMES, CalibrationRecord
 from schemas.frames import Frame
@@ -34,6 +35,7 @@ __all__ = [
     "read_frame_ids",
     "read_scenes",
     "read_tf",
+    "signed_state",
 ]
 
 # Fields of a record or state for the provenance, if present.
@@ -44,11 +46,14 @@ _DETAILS = (
 )
 
 
-def pairs_of(lake: Lake, vehicle: str, day: str | None, method: str) -> dict[Edge, ExportedPair | str]:
+def pairs_of(
+    lake: Lake, vehicle: str, day: str | None, method: str, *, is_signed: bool = False
+) -> dict[Edge, ExportedPair | str]:
     """Edges of every sensor to the reference, of a day or (no day) of the vehicle's state; else the reason for none.
 
-    With camera-radar of a rig of three, beside the edges to the lidar. Numbers are those of the stored rows, to the
-    last digit: rows of edges where they hold the sensors' poses, else rows of the sensors.
+    `is_signed`: the state that was signed off last. With camera-radar of a rig of three, beside the edges to the lidar.
+    Numbers are those of the stored rows, to the last digit: rows of edges where they hold the sensors' poses, else rows
+    of the sensors.
 
     Raises:
         ConfigError: no state of that vehicle and method, or no record of that day; the message lists those there are.
@@ -56,7 +61,7 @@ def pairs_of(lake: Lake, vehicle: str, day: str | None, method: str) -> dict[Edg
     rows: Sequence[CalibrationRecord | StateRow]
     poses: list[tuple[str, str, str, PoseRow | StateRow]]
     if day is None:
-        states = _states(lake, vehicle, method)
+        states = signed_state(lake, vehicle, method) if is_signed else _states(lake, vehicle, method)
         rows = [r for r in states if r.sensor is None]
         poses = [(r.sensor, r.kind or "", r.parent_frame, r) for r in states if r.sensor is not None]
     else:
@@ -147,6 +152,18 @@ def _states(lake: Lake, vehicle: str, method: str) -> list[StateRow]:
         problem = f"the lake has no state of {vehicle} by {method}: run `boresight audit`, or give --day"
         raise ConfigError("command line", "vehicle", problem)
     return found
+
+
+def signed_state(lake: Lake, vehicle: str, method: str, *, before: bool = False) -> list[StateRow]:
+    """The state that was signed off last; `before`: the one that was signed off before it. ConfigError if none was."""
+    found = read_sign_offs(lake, method, vehicle)[::-1]
+    chosen = next((s for s in found if not before or s.state_key != found[0].state_key), None)
+    if chosen is None:
+        which = "only one state" if found else "no state"
+        problem = f"{which} of {vehicle} is signed off: sign one off with `boresight state --sign-off NAME`"
+        raise ConfigError("command line", "previous" if before else "signed-off", problem)
+    rows = read_records(lake, STATES, StateRow, vehicle=vehicle)
+    return current_states([r for r in rows if r.work_key == chosen.state_key])
 
 
 def _pair(row: CalibrationRecord | StateRow) -> ExportedPair | str:

@@ -41,9 +41,8 @@ def read_corrections(lake: Lake, to_day: str | None = None) -> dict[str, str]:
 
 def correction_steps(mend: Mapping[str, str]) -> list[str]:
     """A sentence per correction, after the vehicles that wait for it."""
-    return [
-        _step(what, [v for v, own in mend.items() if own == what]) for what in dict.fromkeys(mend.values())
-    ]
+    waiting = {what: [v for v, own in mend.items() if own == what] for what in mend.values()}
+    return [_step(what, vehicles) for what, vehicles in waiting.items()]
 
 
 def _step(what: str, vehicles: list[str]) -> str:

@@ -34,7 +34,6 @@ __all__ = [
     "transform_of",
 ]
 
-
 _Row = TypeVar("_Row")
 _Said = TypeVar("_Said", DriftFinding, StateRow)
 

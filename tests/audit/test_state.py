@@ -13,9 +13,11 @@ from jobs.state import state
 from pipeline.core.errors import ConfigError
 from pipeline.core.stage_work import Task, Window
 from pipeline.core.stages import AUDIT, STATE
+from pipeline.export.lake import pairs_of
 from pipeline.store.commits import commit_records
 from pipeline.store.current import transform_of
 from pipeline.store.partitions import Lake
+from pipeline.store.sign_offs import read_sign_offs
 from schemas.calibrations import CALIBRATIONS
 from schemas.poses import POSES
 from schemas.service_events import SERVICE_EVENTS, ServiceEvent
@@ -87,6 +89,44 @@ def test_a_service_event_and_the_state_after_it_are_commands(kind, by, lake, cap
     assert np.shape(found["camera_lidar"]["T"]) == (4, 4)
     assert state(lake=str(lake.root)) == 0
     assert "certified" in capsys.readouterr().out
+
+
+def test_a_state_is_signed_off_and_rolled_back_and_every_step_stays_recorded(lake, capsys):
+    where, records = str(lake.root), vehicle_records("v", 12, np.random.default_rng(6))
+    of_day = {}
+    for days in (6, 12):
+        write(lake, [r for r in records if r.day < day_name(days)])
+        of_day[days] = transform_of(states_of(lake)["radar"])
+        if days == 6:
+            with pytest.raises(ConfigError, match="no state of v is signed off"):
+                state(lake=where, vehicle="v", previous=True)
+        assert state(lake=where, vehicle="v", sign_off="anna") == 0
+    assert not np.allclose(of_day[6], of_day[12], atol=1e-6)
+
+    def signed():
+        return {
+            edge.kind: pair.T for edge, pair in pairs_of(lake, "v", None, "joint", is_signed=True).items()
+        }
+
+    assert np.array_equal(signed()["lidar_radar"], of_day[12])
+    assert state(lake=where, vehicle="v", previous=True, sign_off="ben", note="roll back") == 0
+    assert np.array_equal(signed()["lidar_radar"], of_day[6])
+    assert state(lake=where, vehicle="v", sign_off="anna") == 0  # the same state a second time
+    assert np.array_equal(signed()["lidar_radar"], of_day[12])
+    kept = [(s.signed_by, s.day, s.note) for s in read_sign_offs(lake, "joint")]
+    days = (day_name(5), day_name(11))
+    assert kept == [
+        ("anna", days[0], ""),
+        ("anna", days[1], ""),
+        ("ben", days[0], "roll back"),
+        ("anna", days[1], ""),
+    ]
+    capsys.readouterr()
+    assert state(lake=where, json=True) == 0
+    assert {row["signed_by"] for row in json.loads(capsys.readouterr().out)} == {"anna"}
+    for wrong in ({"sign_off": "anna"}, {"vehicle": "v", "sign_off": " "}):
+        with pytest.raises(ConfigError):
+            state(lake=where, **wrong)
 
 
 def test_a_service_event_is_withdrawn_and_an_impossible_one_is_refused(lake, capsys):

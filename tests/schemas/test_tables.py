@@ -15,6 +15,7 @@ from schemas.moments import MOMENTS, PERCEIVED
 from schemas.outcomes import OUTCOMES, OutcomeRow
 from schemas.poses import POSES, PoseRow
 from schemas.service_events import SERVICE_EVENTS, ServiceEvent
+from schemas.sign_offs import SIGN_OFFS, SignOff
 from schemas.states import STATES, StateRow
 from schemas.training import TRAINING, TrainingRow
 from schemas.versions import TABLES, write_json_schemas
@@ -26,6 +27,7 @@ ROW_TYPES = {
     DRIFT.name: DriftFinding,
     OUTCOMES.name: OutcomeRow,
     POSES.name: PoseRow,
+    SIGN_OFFS.name: SignOff,
     STATES.name: StateRow,
     SERVICE_EVENTS.name: ServiceEvent,
 }
