@@ -121,7 +121,7 @@ def _logged(path: Path) -> TransformTree:
 def read_sides(
     texts: Sequence[str], location: str | None, vehicle: str | None, method: str, frames: FrameOptions
 ) -> list[Side]:
-    """Read both sides of `boresight compare`: FORMAT:FILE[,FILE], a prior file, or [VEHICLE@]DAY[/METHOD].
+    """Read both sides of `boresight compare`: log:FILE, FORMAT:FILE[,FILE], a prior file, or [VEHICLE@]DAY[/METHOD].
 
     A file compared with the lake is read for the edges in the lake; two files are read for the edges of one
     camera, one lidar and one radar. METHOD may be "prior" (the prior of that day); DAY may be "state" (what
@@ -131,16 +131,19 @@ def read_sides(
         ConfigError: a side has another form, or does not exist.
     """
     forms = [text.partition(":")[0] if ":" in text else "" for text in texts]
-    forms = [form if form in FORMATS else "" for form in forms]
+    forms = [form if form in {*FORMATS, "log"} else "" for form in forms]
     of_file = [bool(form) or text.endswith(".json") for form, text in zip(forms, texts, strict=True)]
     sides = {
         k: _side_of_lake(text, location, vehicle, method) for k, text in enumerate(texts) if not of_file[k]
     }
     known = tuple(pair.edge for side in sides.values() for pair in side.pairs.values()) or ESTIMATED_EDGES
+    of_lake, logged = next(iter(sides.values()), None), {}
+    if "log" in forms and location is not None and of_lake is not None:
+        logged = read_frame_ids(Lake.existing(location), of_lake.vehicle, of_lake.days)
     for k, text in enumerate(texts):
         if of_file[k]:
             files = text.partition(":")[2] if forms[k] else text
-            names = frames.names_in(files.split(","))
+            names = frames.names(logged) if forms[k] == "log" else frames.names_in(files.split(","))
             sides[k] = _side_of_files(text, forms[k], files, names, known)
     return [sides[k] for k in range(len(texts))]
 
@@ -176,7 +179,11 @@ def poses_in_use(
 
 
 def _side_of_files(text: str, form: str, files: str, names: FrameNames, edges: tuple[Edge, ...]) -> Side:
-    if form:
+    if form == "log":
+        tree = _logged(Path(files))
+        chains = {words_of(e): tree.lookup(names.of(e.parent.name), names.of(e.child.name)) for e in edges}
+        found = {words: T for words, T in chains.items() if T is not None}
+    elif form:
         found = format_named(form).pairs(read_files([Path(f) for f in files.split(",")]), names, edges)
     else:
         found = read_transforms(Path(text))

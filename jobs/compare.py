@@ -41,9 +41,9 @@ def compare(
 ) -> int:
     """Compare two calibrations: the change from A to B per pair and axis, with sigma, and in units of sigma.
 
-    A and B are each one of: FORMAT:FILE[,FILE] (formats of `boresight export`); a prior file, *.json; or,
-    from a lake, [VEHICLE@]DAY[/METHOD], as in 2026-03-02, 2026-03-02/joint-ssl, 2026-03-02/prior (the prior
-    of that day), state (to load tonight), car-2@state. Held records are compared too, and marked.
+    A and B are each one of: log:FILE (what the car runs: its /tf_static); FORMAT:FILE[,FILE] (formats of `boresight
+    export`); a prior file, *.json; or, from a lake, [VEHICLE@]DAY[/METHOD], as in 2026-03-02, 2026-03-02/joint-ssl,
+    2026-03-02/prior (the prior of that day), state (to load tonight), car-2@state. Held records are marked.
 
     Args:
         a: first calibration.

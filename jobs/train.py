@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["parse_duration", "train"]
 
+_NOT_VALIDATED = "not validated, so not fit for use: run the command again, up to the validation of step {}"
 _UNIT_S = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
 
@@ -73,11 +74,11 @@ def train(  # options of the command
         frames_per_day: of perception: maximum number of samples per vehicle-day, evenly spaced; 30 or 100.
         rows: rows of the lidar's range image, over its field of view; 48.
         columns: columns of the lidar's range image, over 360 deg; 1024.
-        budget: of calibration: duration of the whole run, as in 25m; the learning rate decays over it.
+        budget: of calibration: duration of the whole run, over all calls, as in 25m; the learning rate decays over it.
         seed: random seed.
         start_from: of calibration: finished run, or exported model.onnx, with the initial weights of a new run, for
             fine-tuning.
-        time_limit: stop after this duration, as in 9m, with a checkpoint to continue from.
+        time_limit: stop this call after this duration, as in 9m; the same command continues from its checkpoint.
         device: of calibration: cpu, cuda, or the best one available (auto).
         compiled: of calibration: compile the encoders (takes minutes at the start, faster afterwards).
         threads: of perception: CPU threads; 1.
@@ -145,7 +146,8 @@ def _run(request: TrainRequest, settings: TrainConfig) -> int:
         return 128 + result.signal if result.signal else 0
     with progress_reporter(f"train {request.out.name}") as progress:
         result = run(request, settings, progress)
-    return _tell(result, request.out)
+    steps = [] if (request.out / "best.pt").exists() else [_NOT_VALIDATED.format(settings.validate_every)]
+    return _tell(result, request.out, next_steps=steps)
 
 
 def _tell(result: TrainResult, out: Path, report: str = "report", **more: object) -> int:

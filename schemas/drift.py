@@ -155,9 +155,9 @@ def next_step(findings: Sequence[DriftFinding], lake: str) -> str:
     if stored.status == "UNKNOWN":
         return f"{vehicle}: {_until_it_is_known(stored.days_needed, quote(lake))}"
     if stored.status == "YELLOW" and stored.days_needed:
-        return f"{vehicle}: drive on; look again tomorrow: `boresight status {of}`."
+        return f"{vehicle}: drive, and look again tomorrow: `boresight status {of}`."
     load = (
-        f"load the state of tonight, which rests on the days since: `boresight export ros2 {of} "
+        f"load tonight's state, from the days since the change: `boresight export ros2 {of} "
         f"--out {quote(f'tonight/{vehicle}')}` (`boresight export --help` lists other formats)"
     )
     what = f"the {stored.sensor}" if stored.sensor else "all sensors"
@@ -165,21 +165,21 @@ def next_step(findings: Sequence[DriftFinding], lake: str) -> str:
     kind, done = ("repair", day) if is_red else ("re-mount", stored.since or day)
     service = f"`boresight service {of} --day {done} --kind {kind} --sensor {quote(stored.sensor or 'all')}`"
     if is_red:
-        mounted = f"inspect how {what} {'is' if stored.sensor else 'are'} mounted"
-        when = f"{day} is the last audited day: put the day of the repair if it was a later one"
-        return f"{vehicle}: {mounted}; when it is mended, run {service} ({when}). Until then {load}."
-    when = f"{done} is the first day that shows it: put the day of the work if it was an earlier one"
-    look = f"If somebody moved {what}, run {service} ({when}); else look at the mounting at the next service."
+        when = f"replace {day}, the last audited day, by the day of the repair"
+        repaired = f"after the repair, run {service} ({when})"
+        return f"{vehicle}: inspect the mounting of {what}; {repaired}. Until then {load}."
+    when = f"replace {done}, the first day with the change, by the day of the work"
+    look = f"If somebody moved {what}, run {service} ({when}); else inspect the mounting at the next service."
     return f"{vehicle}: {load}. {look}"
 
 
 def _until_it_is_known(days: int | None, lake: str) -> str:
     """What a vehicle that is UNKNOWN needs: a repair of tables, or more days."""
     if days is None:
-        return f"restore what can be restored of the tables: `boresight repair --lake {lake}`."
+        return f"repair the tables: `boresight repair --lake {lake}`."
     if days > _WITHIN_REACH:
         return (
-            f"drive other roads: of days like these, {days} more accepted ones would be needed; "
-            "the pages of its days name what to drive next time."
+            f"drive other roads: {days} more accepted days like these would be required. "
+            "The pages of its days list what to drive."
         )
-    return f"drive; {'1 more accepted day is' if days == 1 else f'{days} more accepted days are'} needed."
+    return f"drive; {'1 more accepted day is' if days == 1 else f'{days} more accepted days are'} required."

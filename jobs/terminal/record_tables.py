@@ -37,7 +37,10 @@ def print_table(table: str, rows: list[dict[str, Any]]) -> None:
         "poses": _pose_row_cells,
         "drift": _drift_cells,
         "outcomes": _outcome_cells,
-        "service_events": _event_cells,
+        "service_events": lambda row: (
+            _named(row, "vehicle", "day", "sensor", "kind", "note")
+            | {"withdrawn": "yes" if row["withdrawn"] else ""}
+        ),
         "sign_offs": lambda row: _named(row, "vehicle", "day", "method", "signed_by", "asserted_at", "note"),
     }.get(table, _partition_cells)
     lines = [cells(row) for row in rows]
@@ -138,11 +141,6 @@ def _outcome_cells(row: dict[str, Any]) -> dict[str, str]:
         "rows": str(row["rows"]),
         "reason": row["reason"],
     }
-
-
-def _event_cells(row: dict[str, Any]) -> dict[str, str]:
-    told = _named(row, "vehicle", "day", "sensor", "kind", "note")
-    return told | {"withdrawn": "yes" if row["withdrawn"] else ""}
 
 
 def _partition_cells(row: dict[str, Any]) -> dict[str, str]:

@@ -54,14 +54,14 @@ def decide_status(findings: Sequence[DriftFinding]) -> VehicleStatus:
             clearest.status, reason, clearest.moved_sensor, clearest.start_day, clearest.days_needed
         )
     if not findings:
-        return VehicleStatus("UNKNOWN", "too little data to say whether a sensor moved")
+        return VehicleStatus("UNKNOWN", "undecided: no day has data")
     blind = {}  # of each group of sensors that may have turned unseen, charts of the edge that needs the fewest days
     for sensors, edges in _watched({edge_of(f) for f in findings}).items():
         if fewest := min((_blind(findings, edge) for edge in edges), key=_days_needed):
             blind[sensors] = fewest
     few = sum(f.status != "GREEN" for f in findings)
     if not blind:
-        rest = f", enough to exclude a turn of any sensor; {few} have too little data" if few else ""
+        rest = f", enough to exclude a rotation of any sensor; {few} have too little data" if few else ""
         of = f"{len(findings) - few} of {len(findings)} charts exclude a change above the limit"
         return VehicleStatus("GREEN", f"no sensor moved: {of}{rest}")
     # Of several, the one that has fewest days: those that begin again after a service event state it.
@@ -69,11 +69,11 @@ def decide_status(findings: Sequence[DriftFinding]) -> VehicleStatus:
     slowest = max(charts, key=lambda f: _days_needed([f]))
     if max(f.days_used for f in findings) > 1:
         *some, last = blind
-        turned = f"the {', '.join(some)}{' and ' * bool(some)}{last} may have turned unseen"
+        turned = f"undecided whether {', '.join(some)}{' and ' * bool(some)}{last} turned"
         counts = f"{few} of {len(findings)} charts have too little data"
-        reason = f"{turned}: {counts}; {words_of(edge_of(slowest))} {slowest.dof}: {slowest.reason}"
+        reason = f"{turned}: {words_of(edge_of(slowest))} {slowest.dof}: {slowest.reason}; {counts}"
     else:
-        reason = f"too little data to say whether a sensor moved: {slowest.reason}"
+        reason = f"undecided: {slowest.reason}"
     return VehicleStatus("UNKNOWN", reason, days_needed=_days_needed(charts))
 
 
@@ -98,6 +98,6 @@ def _clarity(alarm: DriftFinding) -> tuple[bool, bool, float]:
 
 def _what_happened(alarm: DriftFinding) -> str:
     if alarm.moved_sensor is None:
-        return f"something changed on {alarm.start_day}"
+        return f"a sensor moved on {alarm.start_day}, the charts do not show which"
     verb = "has been drifting since" if alarm.kind == "slow drift" else "moved on"
     return f"the {alarm.moved_sensor} {verb} {alarm.start_day}"

@@ -32,10 +32,12 @@ _HEAVY = 2 / 3  # of the sigmas that one day may lie off, where single days are 
 _TAIL = 4.0  # power by which days far off fall with the distance: Student's t with four degrees of freedom
 _TAME = 2  # days in a row that are no chance where single days are seldom far off
 _LASTING = "a lasting change above the limit"
-_ONE_DAY = "one day stands out: the next day will show whether it lasts"
-_FEW_DAYS = "two days stand out, and single days are often far off: the next day will show whether it lasts"
-_MAYBE = "a change that may be above the limit: the next days will show it"
-_BEGUN = "a change may have begun: the next days will show it"
+_ONE_DAY = "one day differs: the next day decides whether the change lasts"
+_FEW_DAYS = (
+    "two days differ, and single days of this fleet often do: the next day decides whether the change lasts"
+)
+_MAYBE = "a change that may be above the limit: the next days decide"
+_BEGUN = "a change may have begun: the next days decide"
 
 
 @dataclass(frozen=True)
@@ -144,7 +146,7 @@ def _verdict(seen: _Judged, m: int) -> ChartVerdict:
     days = int(seen.charts.count[m])
     if days < 2:
         needed = max(seen.baseline_days + 1, 2)
-        reason = f"{_count(days)} of data, {needed} needed"
+        reason = f"{_count(days)} of data, {needed} required"
         return ChartVerdict("UNKNOWN", reason, days, None, None, None, None, needed - days)
     levels = None
     if seen.statistic[m] > seen.threshold[m]:
@@ -215,14 +217,14 @@ def _unchanged(seen: _Judged, m: int, levels: Levels | None) -> ChartVerdict:
             return judged("YELLOW", _BEGUN, 1, begun)
     if days <= seen.baseline_days:
         needed = seen.baseline_days + 1
-        return judged("UNKNOWN", f"{_count(days)} of data, {needed} needed", needed - days)
+        return judged("UNKNOWN", f"{_count(days)} of data, {needed} required", needed - days)
     if visible > limit:
         # The smallest visible change decreases with the square root of the days.
         needed = max(math.ceil(days * (visible / limit) ** 2) - days, 1)
         return judged(
             "UNKNOWN", _too_inaccurate(DOF_NAMES[m % len(DOF_NAMES)], visible, limit, needed), needed
         )
-    return judged("GREEN", "no change" if levels is None else "back where the reference is")
+    return judged("GREEN", "no change" if levels is None else "back at the reference")
 
 
 def _one_day(seen: _Judged, m: int) -> ChartVerdict:
@@ -240,10 +242,8 @@ def _too_inaccurate(dof: str, visible: float, limit: float, needed: int) -> str:
     """Reason of a chart that would miss a change above its limit [rad or m]."""
     scale, unit = (180 / math.pi, "deg") if dof.startswith("r") else (1.0, "m")
     such = "1 more such day is" if needed == 1 else f"{needed} more such days are"
-    return (
-        f"only a change above {visible * scale:.2g} {unit} would show (limit {limit * scale:.2g} {unit}); about {such} "
-        "needed"
-    )
+    would_hide = f"a change below {visible * scale:.2g} {unit} would not be noticed yet"
+    return f"{would_hide} (limit {limit * scale:.2g} {unit}); about {such} required"
 
 
 def _count(days: int) -> str:

@@ -158,15 +158,15 @@ def headline_for(verdicts: FleetVerdicts, views: Sequence[FindingView]) -> tuple
         where = f"on {statuses.count(worst)} of {vehicles}"
         return (
             worst,
-            f"No change seen, but {where} the days are too few or too inaccurate to exclude one above the limit.",
+            f"No change found, but {where} more days are required to exclude one above the limit.",
         )
     of_these = [v for v in views if v.status == worst]
     named = [f"{v.vehicle}: {v.sensor} since {v.since}" for v in of_these[:3]]
     more = "" if len(of_these) <= 3 else f" and {len(of_these) - 3} more"
-    verb = "A sensor moved" if worst == "RED" else "Something may have moved"
+    verb = "A sensor moved" if worst == "RED" else "A sensor may have moved"
     said = f"{verb} on {statuses.count(worst)} of {vehicles}: {'; '.join(named)}{more}."
     if worst == "RED" and "YELLOW" in statuses:
-        said += f" Something may have moved on {statuses.count('YELLOW')} more."
+        said += f" A sensor may have moved on {statuses.count('YELLOW')} more."
     return worst, said
 
 
@@ -201,7 +201,7 @@ def _finding_view(vehicle: str, clearest: DriftFinding, own: Sequence[DriftFindi
     return FindingView(
         vehicle,
         clearest.status,
-        clearest.moved_sensor or "not clear which",
+        clearest.moved_sensor or "undecided",
         f"{clearest.start_day}" + ("" if earliest == latest else f" ({earliest} to {latest})"),
         clearest.kind or "",
         motion,
@@ -213,10 +213,10 @@ def _finding_view(vehicle: str, clearest: DriftFinding, own: Sequence[DriftFindi
 def _sure(finding: DriftFinding) -> str:
     parts = []
     if finding.statistic is not None and finding.threshold is not None:
-        parts.append(f"change {finding.statistic:.1f} sigma, alarm from {finding.threshold:.1f}")
+        parts.append(f"change of {finding.statistic:.1f} sigma (alarm above {finding.threshold:.1f})")
     if finding.moved_probability is not None:
         share = 100 * finding.moved_probability
-        parts.append(f"sensor {'> 99.9' if share > 99.9 else f'{share:.1f}'} %")
+        parts.append(f"this sensor with {'> 99.9' if share > 99.9 else f'{share:.1f}'} %")
     return "; ".join(parts)
 
 

@@ -152,7 +152,7 @@ def _events_since(lake: Lake, first: str | None) -> list[ServiceEvent]:
 def _budget(fleet: FleetConfig) -> str:
     rate = fleet.audit.false_alarms_per_1000_vehicle_days
     text = f"False alarms expected: at most {rate:g} in 1000 vehicle-days over all charts"
-    return f"{text}, as far as the sigmas are honest."
+    return f"{text}, if the stated sigmas are right."
 
 
 def _provenance(window: FleetWindow, verdicts: FleetVerdicts) -> list[tuple[str, str]]:

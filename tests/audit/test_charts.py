@@ -197,10 +197,10 @@ def test_slow_drift_and_step_are_told_apart():
 @pytest.mark.parametrize(
     ("values", "limit", "sigma", "status", "words"),
     [
-        ([0, 0, 0, 0, 0, 9], 1.0, 0.5, "YELLOW", "one day stands out"),
+        ([0, 0, 0, 0, 0, 9], 1.0, 0.5, "YELLOW", "one day differs"),
         ([0, 0, 0, 0, 0, 9, 9], 1.0, 0.5, "RED", ""),
         ([0, 0, 14, 0, 0, 0], 2.0, 0.5, "GREEN", ""),  # it did not last
-        ([0] * 8 + [9] * 6 + [0] * 3, 1.0, 0.3, "GREEN", "back where the reference is"),
+        ([0] * 8 + [9] * 6 + [0] * 3, 1.0, 0.3, "GREEN", "back at the reference"),
         ([0] * 8 + [9] * 6 + [0], 1.0, 0.3, "RED", ""),  # one day is no repair yet
         ([0] * 8 + [9] * 14 + [15] * 3, 1.0, 0.3, "RED", ""),
         ([0, 0, 0, 0.2, 0.2, 0.2], 0.25, 0.01, "YELLOW", "below"),
@@ -208,7 +208,7 @@ def test_slow_drift_and_step_are_told_apart():
         ([0] * 10 + [0.3] * 4, 0.25, 0.08, "YELLOW", "may be above the limit"),
         ([0] * 10 + [0.3] * 4, 0.2, 0.08, "RED", ""),
         ([0] * 4, 0.25, 0.1, "GREEN", ""),
-        ([0] * 4, 0.25, 0.3, "UNKNOWN", "above 34 deg would show (limit 14 deg); about 20 more"),
+        ([0] * 4, 0.25, 0.3, "UNKNOWN", "below 34 deg would not be noticed yet (limit 14 deg); about 20 more"),
         ([], 1.0, 0.01, "UNKNOWN", ""),
         ([0, 0], 1.0, 0.01, "UNKNOWN", ""),
     ],

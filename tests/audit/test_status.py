@@ -44,12 +44,12 @@ CLEAREST = {
     ("changes", "status", "sensor", "words"),
     [
         ({}, "GREEN", None, "no sensor moved: 3 of 18 charts exclude a change above the limit, enough"),
-        ({"camera_lidar_rx": UNSEEN}, "UNKNOWN", None, "16 of 18 charts have too little data; camera_lidar rx: why"),
-        ({"camera_lidar_ry": UNSEEN}, "UNKNOWN", None, "the camera or lidar may have turned unseen"),
-        ({"lidar_radar_rz": UNSEEN}, "UNKNOWN", None, "the radar may have turned unseen"),
+        ({"camera_lidar_rx": UNSEEN}, "UNKNOWN", None, "camera_lidar rx: why not; 16 of 18 charts"),
+        ({"camera_lidar_ry": UNSEEN}, "UNKNOWN", None, "whether camera or lidar turned"),
+        ({"lidar_radar_rz": UNSEEN}, "UNKNOWN", None, "whether radar turned"),
         (
             {"camera_lidar_rx": UNSEEN, "lidar_radar_rz": UNSEEN}, "UNKNOWN", None,
-            "the camera or lidar and radar may have turned unseen",
+            "whether camera or lidar and radar turned",
         ),
         (  # since a repair of the radar
             {"camera_lidar_rx": UNSEEN, "lidar_radar_rz": UNSEEN | {"days_used": 0}}, "UNKNOWN", None,
@@ -57,7 +57,7 @@ CLEAREST = {
         ),
         # Radar yaw may be watched from the camera instead.
         ({"lidar_radar_rz": UNSEEN, "camera_radar_ry": {"status": "GREEN"}}, "GREEN", None, ""),
-        ({"camera_lidar_tz": alarm("YELLOW")}, "YELLOW", None, "something changed on 2026-03-05: why"),
+        ({"camera_lidar_tz": alarm("YELLOW")}, "YELLOW", None, "2026-03-05"),
         ({"camera_lidar_tz": alarm("YELLOW", statistic=90.0), "lidar_radar_rz": alarm("RED")}, "RED", None, ""),
         (CLEAREST, "RED", "radar", "the radar moved on 2026-03-06: why"),
     ],
@@ -90,6 +90,5 @@ def test_a_vehicle_lacks_the_days_of_the_charts_that_its_status_depends_on(chang
 
 def test_one_day_is_too_little_data():
     rows = [replace(f, status="UNKNOWN", days_used=1) for f in charts()]
-    assert decide_status(rows).reason.startswith("too little data")
-    assert decide_status([]).status == "UNKNOWN"
+    assert decide_status(rows).status == decide_status([]).status == "UNKNOWN"
     assert status_of([]).reason == "no audit yet"

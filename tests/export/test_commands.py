@@ -151,6 +151,9 @@ def test_the_car_hangs_on_its_own_base_where_a_file_says_where_the_lidar_sits(ex
     np.testing.assert_allclose(found.lookup("base_link", "top")[:3, 3], [0.9, 0, 2])
     assert command(capsys, "import", "urdf", file, *named, "--out", tmp_path / "p.json").code == 0
     np.testing.assert_allclose(tree("--mount", f"log:{log}").lookup("base_link", "lidar"), T_BASE_LIDAR)
+    same = json.loads(command(capsys, "compare", f"log:{log}", f"tf-static:{log}", "--json").out)["pairs"]
+    assert {p["pair"] for p in same} >= {"camera_lidar", "lidar_radar"}
+    assert max(abs(axis["change"]) for p in same for axis in p["axes"]) < 1e-9
     for wrong in (["--lidar-frame", "side", "--mount", f"urdf:{mount}"],
                   ["--base-frame", "map", "--mount", f"log:{log}"]):  # fmt: skip
         assert export("urdf", file, "--day", DAYS[0], *wrong).code == 2

@@ -86,7 +86,7 @@ def test_a_red_vehicle_says_what_to_do_with_the_commands(lake, tmp_path, capsys)
     rows = [f for own in stored(lake).values() for f in own]
     steps = next_steps(rows, "my lake")
     assert [step.split(":")[0] for step in steps] == ["red", "yellow", "blind", "unknown"]
-    assert "how the radar is mounted" in steps[0]
+    assert "the mounting of the radar" in steps[0]
     command = "--vehicle red --day 2026-03-06 --kind repair --sensor radar"
     assert f"boresight service --lake 'my lake' {command}" in steps[0]
     assert "boresight export ros2 --lake 'my lake' --vehicle red --out tonight/red" in steps[0]
@@ -99,7 +99,7 @@ def test_a_red_vehicle_says_what_to_do_with_the_commands(lake, tmp_path, capsys)
     assert status_of(stored(own)["red"]).status == "RED"
     audit_fleet(own, _config())
     assert status_of(stored(own)["red"]).status == "UNKNOWN"  # its charts begin anew
-    assert next_step(stored(own)["red"], "L") == "red: drive; 3 more accepted days are needed."
+    assert next_step(stored(own)["red"], "L") == "red: drive; 3 more accepted days are required."
     page = write_fleet_page(own, _config(), tmp_path / "after.html")
     assert '<td>red</td><td class="w">2026-03-06</td><td>radar</td><td>repair</td>' in page  # the list
     assert '"repair of the radar on 2026-03-06"' in page  # the charts
@@ -119,18 +119,18 @@ def _row(status, reason, **rest):
     [
         (
             _row("YELLOW", "one day stands out", vehicle_days_needed=1),
-            "v: drive on; look again tomorrow: `boresight status --lake L --vehicle v`.",
+            "tomorrow: `boresight status --lake L --vehicle v`.",
         ),
         (
             _row("YELLOW", "a change below the limit", vehicle_sensor="camera", vehicle_since="2026-03-04"),
             "`boresight service --lake L --vehicle v --day 2026-03-04 --kind re-mount --sensor camera`",
         ),
-        (_row("UNKNOWN", "too few", vehicle_days_needed=2), "v: drive; 2 more accepted days are needed."),
+        (_row("UNKNOWN", "too few", vehicle_days_needed=2), "2 more accepted days"),
         (
             _row("UNKNOWN", "too few", vehicle_days_needed=335),
-            "v: drive other roads: of days like these, 335 more",
+            "335 more",
         ),
-        (_row("UNKNOWN", "too few", vehicle_days_needed=1), "v: drive; 1 more accepted day is needed."),
+        (_row("UNKNOWN", "too few", vehicle_days_needed=1), "1 more accepted day "),
         (_row("UNKNOWN", "no change; some of its records cannot be read"), "`boresight repair --lake L`"),
     ],
 )
