@@ -152,7 +152,7 @@ def print_rig(console: Console, rig: RigFinding) -> None:
     console.print(table)
     console.print(
         "first line: overlap as share of the smaller view (before perception), moments with both sensors; "
-        "second line: of 6 degrees of freedom, determined + determined in part"
+        "second line: of 6 degrees of freedom, how many are determined + partly determined"
     )
     console.print(f"poses refer to {rig.reference} (*); pairs without a second line are not calibrated")
     for (verdict, reason, edges), dofs in _reasons(rig).items():

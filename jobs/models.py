@@ -60,7 +60,7 @@ def models(
         rows = {
             "for": card.get("purpose", ""), "licence": card.get("license", ""), "size": size,
             "sha256": card.get("sha256", ""), "made by": card.get("command", ""),
-            "card": str(model.file.with_suffix(".md")), "file": "; ".join(model.problems) or "as its card says",
+            "card": str(model.file.with_suffix(".md")), "file": "; ".join(model.problems) or "as in its card",
         }  # fmt: skip
         _print_block(model.name, rows)
     for other in () if json else CATALOGUE:

@@ -77,7 +77,7 @@ def prepare(
         progress(0, 0, "compare views")
         inventory = take_inventory(tables, config.prepare.split.duplicate_bits)
     path = write_inventory(tables, inventory, _about(config) | {"choices": [asdict(c) for c in choices]})
-    print_choices(choices)
+    print_choices(choices, len(inventory.leaks))
     statuses = [r.status for r in results] + (["held"] if _empty_sides(config, inventory) else [])
     code = exit_code(statuses)
     print_summary(
@@ -218,27 +218,26 @@ def _problems(config: FleetConfig, results: Sequence[Outcome], inventory: Invent
         if r.status not in ("done", "cached")
     ]
     by = ", ".join(config.prepare.split.by)
-    return found + [
-        {
-            "side": side,
-            "status": "held",
-            "reason": f"no frames: too few to split them by {by} (prepare.split.by)",
-        }
-        for side in _empty_sides(config, inventory)
-    ]
+    few = {"status": "held", "reason": f"no frames: too few to split them by {by} (prepare.split.by)"}
+    return found + [{"side": side} | few for side in _empty_sides(config, inventory)]
 
 
-def print_choices(choices: Sequence[Choice]) -> None:
-    """Print the splits as a table on stderr, the chosen split first."""
+def print_choices(choices: Sequence[Choice], leaks: int = 0) -> None:
+    """Print the splits as a table on stderr, the chosen split first, and the number of frames that leak."""
     table = Table(box=None, title="frames kept and lost by split", title_justify="left")
-    for name in ("split_by", "train", "val", "test", "lost", "of them", "days without"):
-        table.add_column(name, justify="left" if name in ("split_by", "of them") else "right")
+    for name in ("by", "train", "val", "test", "lost", "of them", "days without"):
+        table.add_column(name, justify="left" if name in ("by", "of them") else "right")
     for choice in choices:
         table.add_row(
-            " ".join(choice.split_by) + (" (made)" if choice.chosen else ""),
+            " ".join(choice.split_by) + (" (taken)" if choice.chosen else ""),
             *(str(count) for count in choice.frames.values()),
             str(sum(choice.lost.values())),
             ", ".join(f"{count} {_WORDS.get(reason, reason)}" for reason, count in choice.lost.items()),
             str(choice.empty_vehicle_days),
         )
-    Console(stderr=True, width=_WIDTH).print(table)
+    console = Console(stderr=True, width=_WIDTH)
+    console.print(table)
+    if leaks:
+        console.print(
+            f"leaks: {leaks} frames of val and test look like one of train; training leaves them out"
+        )

@@ -157,7 +157,7 @@ def next_step(findings: Sequence[DriftFinding], lake: str) -> str:
     if stored.status == "YELLOW" and stored.days_needed:
         return f"{vehicle}: drive, and look again tomorrow: `boresight status {of}`."
     load = (
-        f"load tonight's state, from the days since the change: `boresight export ros2 {of} "
+        f"load the state of tonight, from the days since the change: `boresight export ros2 {of} "
         f"--out {quote(f'tonight/{vehicle}')}` (`boresight export --help` lists other formats)"
     )
     what = f"the {stored.sensor}" if stored.sensor else "all sensors"

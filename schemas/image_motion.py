@@ -27,7 +27,7 @@ class EarlierColumns:
     )
     earlier_missing: str | None = column("why there is none", default=None)
     ego_driven_m: float | None = column(
-        "way of the vehicle frame from the earlier image to this one, negative backwards; null without odometry",
+        "distance driven from the earlier image to this one, negative backwards; null without odometry",
         default=None,
     )
     ego_turned_rad: float | None = column(

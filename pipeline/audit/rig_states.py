@@ -145,7 +145,7 @@ def _sensor_row(
     names = [day_name(int(day)) for day in counted.poses.day]
     if found.moved_on is not None:
         base = replace(base, since=day_name(found.moved_on))
-        why = f"its days show another pose since {base.since}"
+        why = f"its pose changed on {base.since}"
     later = np.flatnonzero(days.held.day > counted.poses.day[-1])[-1:]
     doubted = with_held_day(found, days.held.at(later), mount) if len(later) else None
     if doubted is not None:

@@ -69,4 +69,4 @@ def _with_less(reason: str) -> str:
 
 
 def _kept(reason: str, day: str) -> str:
-    return reason if reason.startswith(_KEPT) else f"{_KEPT} (said on {day}): {reason}"
+    return reason if reason.startswith(_KEPT) else f"{_KEPT} (audit of {day}): {reason}"

@@ -287,7 +287,7 @@ def _verdict(
     """Status and reason: a radar needs azimuth only, other sensors need both directions."""
     doubts = ", ".join(e.name for e in found.doubts)
     if doubts:
-        return "held", f"its edges contradict each other and nothing tells which is wrong: {doubts}"
+        return "held", f"its edges contradict each other, undecided which is wrong: {doubts}"
     if not found.determined.any():
         return "held", "the day determines no degree of freedom: the pose stays at the prior"
     needed = ("azimuth",) if sensor.kind == "radar" else tuple(claims)

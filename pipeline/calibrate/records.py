@@ -212,7 +212,7 @@ def _assumed(estimate: PairEstimate, observations: Sequence[Observation]) -> lis
         *assumed,
         (
             f"camera intrinsics as logged: a focal length wrong by 0.1 % puts the image's edge {worth:.2f} deg off, a "
-            f"principal point wrong by 1 px is a camera turned by {turn:.2f} deg: alignments hardly tell the two apart"
+            f"principal point wrong by 1 px is a camera turned by {turn:.2f} deg: alignments hardly separate the two"
         ),
     ]
 

@@ -177,5 +177,5 @@ def _compared(file: Path) -> ShippedModel:
         problems.append(f"no readable card for users, {file.stem}.md")
     digest = hashlib.sha256(file.read_bytes()).hexdigest()
     if card.get("sha256") not in (None, digest):
-        problems.append(f"sha256 is {digest}, the card says {card['sha256']}: another file")
+        problems.append(f"sha256 is {digest}; its card states {card['sha256']}: another file")
     return ShippedModel(file, card, tuple(problems))

@@ -34,7 +34,7 @@ __all__ = ["CheckReport", "SyncQuality", "TopicFinding", "check_logs"]
 
 _NO_TIMES = (
     "the lidar logs no time per point: its sweeps stay as logged. If it turns, and its driver does not de-skew, "
-    'say how in fleet.toml, below points: turn = { sense = "right", begins_deg = 180.0 }'
+    'state its turn in fleet.toml, below points: turn = { sense = "right", begins_deg = 180.0 }'
 )
 _SAMPLE = 40  # frames that are decoded; of the others only the stamps are read
 

@@ -165,12 +165,12 @@ def _mounting(record: CalibrationRecord) -> str:
         return ""
     azimuth, elevation = record.mounting_azimuth_sigma_rad, record.mounting_elevation_sigma_rad
     if azimuth is None or elevation is None:
-        return "not certified: nothing says how well CameraInfo's principal point is known (centre_sigma_px)"
+        return "not certified: give the sigma of CameraInfo's principal point (centre_sigma_px)"
     certified = " and ".join(record.mounting_determined) or "not"
     known = f"{np.degrees(azimuth):.2f} deg of azimuth and {np.degrees(elevation):.2f} deg of elevation"
     return (
-        f"{certified} certified; known to {known} (1 sigma), which includes how well CameraInfo's principal point is "
-        "known. Use it for geometry in the car's axes; to project into this camera's image, the sigma above"
+        f"{certified} certified; sigma {known}, with the uncertainty of CameraInfo's principal point. "
+        "Use it for geometry in the car's axes; to project into this camera's image, the sigma above"
         if record.pair.startswith("camera")
         else f"{certified} certified; known to {known} (1 sigma)"
     )

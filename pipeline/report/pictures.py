@@ -1,6 +1,6 @@
 """Pictures of a vehicle-day: chosen frames drawn, as text inside a page, as a page of one frame, as files.
 
-The view from above is split into prior and calibrated: lidar by height, radar black.
+The view from above: lidar by height, radar orange at the prior and black at the result.
 
 Source: paper, figures 1b, 3 and 4. Its points are a bitmap, axes and words are SVG around it.
 """
@@ -52,6 +52,7 @@ _CLOSE_UPS = 3
 _CLOSE_UP_WIDTH_PX = 420
 _AHEAD_M, _BEHIND_M, _SIDE_M = 60.0, 3.0, 30.0
 _PX_PER_M = 16
+_PRIOR_BGR = (58, 129, 224)  # orange, as the prior in charts
 _HIGH_M = 4.0  # end of the height colours: a lorry's roof
 _WIDTH_PX = 960
 _STEPS = 16
@@ -119,7 +120,7 @@ def scene_pictures(
 
 
 def top_view(scene: Scene, before: Extrinsics, after: Extrinsics, labels: tuple[str, str]) -> Markup:
-    """Bird's-eye view in the lidar frame: radar left of the car at `before`, right of it at `after`."""
+    """Bird's-eye view in the lidar frame, radar at both states; at one where the labels are equal."""
     plot = Plot(44.0, 8.0, 540.0, 567.0, (-_SIDE_M, _SIDE_M), (-_BEHIND_M, _AHEAD_M))
     uri = png_uri(top_bitmap(scene, before, after))
     plot.parts.append(
@@ -127,9 +128,9 @@ def top_view(scene: Scene, before: Extrinsics, after: Extrinsics, labels: tuple[
     )
     sides = [(float(x), f"{x:g}") for x in range(-30, 31, 10)]
     plot.frame(sides, [(float(y), f"{y:g}") for y in range(0, 61, 10)])
-    said = ((labels[0], 52.0, "start"), (labels[1], 576.0, "end"))
-    for text, u, anchor in said[: len(set(labels))]:
-        plot.text(u, 26.0, text, anchor=anchor, colour="#111", size=14.0, bold=True)
+    named = dict(zip(labels, ("#{2:02x}{1:02x}{0:02x}".format(*_PRIOR_BGR), "#111"), strict=True))
+    for k, (text, colour) in enumerate(named.items()):
+        plot.text(52.0, 26.0 + 18.0 * k, text, colour=colour, size=14.0, bold=True)
     plot.text(314.0, 604.0, "to the right of the lidar [m]; up: ahead [m]", anchor="middle")
     for k, height in enumerate(np.linspace(0.0, _HIGH_M, 9)):
         colour = "#{2:02x}{1:02x}{0:02x}".format(*_height_colours(np.array([height]))[0])
@@ -137,8 +138,7 @@ def top_view(scene: Scene, before: Extrinsics, after: Extrinsics, labels: tuple[
         if k % 2 == 0:
             plot.text(610.0, 454.0 - 40.0 * k, f"{height:g} m")
     plot.text(594.0, 490.0, "height")
-    sides_said = f"left {labels[0]}, right {labels[1]}" if len(set(labels)) > 1 else labels[0]
-    return document(650.0, 612.0, plot.parts, f"From above: radar over lidar, {sides_said}")
+    return document(650.0, 612.0, plot.parts, f"From above: radar over lidar, {' and '.join(named)}")
 
 
 def top_bitmap(scene: Scene, before: Extrinsics, after: Extrinsics) -> UInt8[np.ndarray, "H W 3"]:
@@ -154,13 +154,11 @@ def top_bitmap(scene: Scene, before: Extrinsics, after: Extrinsics) -> UInt8[np.
         colour = _height_colours(height[order])
         for dx, dy in ((0, 0), (1, 0), (0, 1), (1, 1), (2, 0), (2, 1), (0, 2), (1, 2), (2, 2)):
             image[np.clip(row + dy, 0, size[0] - 1), np.clip(column + dx, 0, size[1] - 1)] = colour
-    for state, side in ((before, 1), (after, -1)):
+    for state, colour in ((before, _PRIOR_BGR), (after, (0, 0, 0))):
         points = transform_points(state.T_lidar_radar, scene.frame.radar_xyz_m.astype(np.float64))
-        points = points[points[:, 1] * side > 0]
         at, inside = _pixels(points, size)
         for u, v in at[inside]:
-            cv2.circle(image, (int(u), int(v)), 2, (0, 0, 0), -1, cv2.LINE_AA)
-    cv2.line(image, (size[1] // 2, 0), (size[1] // 2, size[0]), (0, 0, 0), 2)
+            cv2.circle(image, (int(u), int(v)), 2, colour, -1, cv2.LINE_AA)
     return image
 
 

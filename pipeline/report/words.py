@@ -28,7 +28,7 @@ __all__ = [
 LEFT_OUT = {
     "held_out": "held out to check the result",
     "next_to_held_out": "too near in time to a held-out frame",
-    "not_needed": "show what the frames used show already",
+    "not_needed": "same scenes as frames that are used",
     "sync": "stamps too far apart",
     "empty": "nothing to align",
 }

@@ -147,7 +147,7 @@ def test_the_sensor_that_the_audit_found_moved_begins_anew_and_the_others_keep_t
     for name in ("front", "left", "bumper", "corner"):
         assert rows[name].days == (days(4, 5, 6, 7) if name in anew else days(*range(1, 8)))
         assert (" moved" in rows[name].reason) == (name in anew)
-        assert ("the days do not show which" in rows[name].reason) == (name in anew and moved is None)
+        assert ("undecided which" in rows[name].reason) == (name in anew and moved is None)
 
 
 def test_too_few_days_for_a_chart_still_show_a_knock_and_the_state_is_that_of_after_it(lake):
@@ -155,7 +155,7 @@ def test_too_few_days_for_a_chart_still_show_a_knock_and_the_state_is_that_of_af
     rows = states(lake, knocked)
     assert rows["front"].days == days(4, 5)
     assert rows["front"].since == "2026-03-04"
-    assert "show another pose since 2026-03-04" in rows["front"].reason
+    assert "changed on 2026-03-04" in rows["front"].reason
     assert np.abs(error(rows["front"], TURN)).max() < 3
     assert rows["left"].days == days(1, 2, 3, 4, 5)
 

@@ -29,7 +29,9 @@ def test_the_page_has_a_picture_of_every_camera(lake, tmp_path):  # noqa: F811
     (tmp_path / "fleet.toml").write_text(RIGS)
     fleet = load_fleet(tmp_path / "fleet.toml")
     page = write_day_page(Lake.at(lake), DAY, fleet, tmp_path / "day.html").read_text()
-    found = re.findall(r'<h3>(front|left)</h3>\s*<figure><img src="data:image/jpeg;base64,([^"]+)"', page)
+    found = re.findall(
+        r'(?s)<h3>(front|left)</h3>\s*<figure class="flip">.*?<img src="data:image/jpeg;base64,([^"]+)"', page
+    )
     names = [name for name, _ in found]
     assert names == ["front", "front", "front", "left"]
     front, left = (cv2.imdecode(np.frombuffer(base64.b64decode(found[k][1]), np.uint8), 1) for k in (0, 3))

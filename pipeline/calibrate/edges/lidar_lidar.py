@@ -177,7 +177,7 @@ def estimate_lidar_lidar(
     ends = sorted((_climbed(moments, X) for X in starts), key=lambda e: -e.share)
     if ends[0].share < _LEAST_SHARE:
         raise SolveError(
-            f"{edge.name}: {ends[0].share:.0%} of what one lidar shows lies on what the other one sees"
+            f"{edge.name}: {ends[0].share:.0%} of one lidar's points lie on surfaces of the other"
         )
     # De-skewed along the pose that was found, the child is laid on once more.
     T = inverse(A) @ ends[0].X @ A @ T_parent_child

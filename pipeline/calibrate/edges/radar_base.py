@@ -82,7 +82,7 @@ def solve(edge: Edge, sources: DaySources) -> tuple[EdgeEvidence, int]:
     ego = sources.ego_at(rows, without=name)
     if not np.isfinite(ego.velocity_mps).any():
         said = f": the car drives backwards by {', '.join(wrong)}" if wrong else ""
-        raise SolveError(f"nothing but {name} itself shows how the car moves{said}")
+        raise SolveError(f"no other source than {name} measures how the car moves{said}")
     directions = _directions(name, rows, sources)
     found = estimate_radar_base(edge, radar, ego, stamps, Scenes.of(rows), directions)
     compared = compared_sources(rows, radar.T_base_radar)

@@ -162,7 +162,7 @@ def _radar(radar: FoundCloud, meaning: RadarMeaning) -> Iterator[str]:
         shown = f"by {meaning.scans} scans: else the car drives backwards"
         yield _with(f'doppler_positive = "{meaning.positive}"', shown)
     elif not radar.msgtype.endswith("RadarTracks"):
-        yield '# doppler_positive = "receding"     # or "approaching": these logs do not show it, the data sheet does'
+        yield '# doppler_positive = "receding"     # or "approaching": undecided by these logs, see its data sheet'
     if meaning.period_mps is not None:
         shown = "the Doppler wraps at this"
         yield _with(f"doppler_period_mps = {meaning.period_mps:.5g}", shown)

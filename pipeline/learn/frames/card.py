@@ -22,8 +22,8 @@ _CONVENTIONS = (
     "the sensor. range_rate is positive where a target recedes, and holds the car's own motion."
 )
 _SYNCHRONISED = (
-    "Sensors of a frame measured within ingest's limit of each other, each at its own stamp; a sweep says whether it "
-    "is de-skewed to it."
+    "Sensors of a frame measured within ingest's limit of each other, each at its own stamp; each sweep states "
+    "whether it is de-skewed to it."
 )
 _OPEN = {
     "parquet": (

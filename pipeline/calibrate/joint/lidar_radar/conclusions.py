@@ -111,7 +111,7 @@ def notes_of(analysis: ObservabilityAnalysis, *, has_elevation: bool) -> list[st
     if analysis.heights is not None:
         notes.append(
             f"radar pitch allows for detections between things and their mirror images in the road: a share of "
-            f"{analysis.heights.displaced:.2f} of those of low things, which this day tells no better than to "
+            f"{analysis.heights.displaced:.2f} of those of low things, which this day determines to "
             f"{np.degrees(analysis.heights.floor_rad):.2f} deg of pitch"
         )
     disagreement = contradiction(analysis.sources)
