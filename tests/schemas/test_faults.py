@@ -7,7 +7,6 @@ from jobs.cli import COMMANDS
 from pipeline.report.day import _ADVICE
 from pipeline.report.words import LEFT_OUT
 from schemas.calibrations import STATUSES
-from schemas.drift import DRIFT_STATUSES, DriftFinding, next_step
 from schemas.faults import FAULTS, in_words
 from schemas.outcomes import OUTCOME_STATUSES
 from schemas.words import DAY_WORDS, day_word
@@ -31,29 +30,7 @@ def test_every_status_and_command_has_a_sentence_that_passes_at_first_reading():
     of_days = {day_word(pairs) for pairs in ([], *([status] for status in STATUSES))}
     assert {*of_days, *OUTCOME_STATUSES} <= set(DAY_WORDS)
     assert set(_ADVICE) == set(STATUSES)
-    row = {"vehicle": "v", "day": "2026-03-09", "method": "joint", "pair": "camera_lidar", "dof": "rx"}
-    steps = []
-    for status in DRIFT_STATUSES:
-        of = row | {
-            "parent_frame": "camera",
-            "child_frame": "lidar",
-            "status": status,
-            "reason": "",
-            "limit": 0.1,
-        }
-        finding = DriftFinding(
-            **of, vehicle_status=status, vehicle_reason="", days_used=4, vehicle_days_needed=2
-        )
-        steps.append(next_step([finding], "L"))
-        assert bool(steps[-1]) == (status != "GREEN")
-    helped = [text for _, text in COMMANDS.values()]
-    for sentence in [
-        *FAULTS.values(),
-        *DAY_WORDS.values(),
-        *_ADVICE.values(),
-        *LEFT_OUT.values(),
-        *helped,
-        *steps,
-    ]:
+    helped = {name: text for name, (_, text) in COMMANDS.items()}
+    for sentence in [s for of in (FAULTS, DAY_WORDS, _ADVICE, LEFT_OUT, helped) for s in of.values()]:
         assert not RETIRED.search(sentence), sentence
-        assert all(len(part.split()) <= 25 for part in re.split(r"[.;:`]", sentence)), sentence
+        assert len(sentence.split()) <= 25, sentence
