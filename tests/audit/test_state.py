@@ -113,13 +113,9 @@ def test_a_state_is_signed_off_and_rolled_back_and_every_step_stays_recorded(lak
     assert state(lake=where, vehicle="v", sign_off="anna") == 0  # the same state a second time
     assert np.array_equal(signed(), of_day[12])
     kept = [(s.signed_by, s.day, s.note) for s in read_sign_offs(lake, "joint")]
-    days = (day_name(5), day_name(11))
-    assert kept == [
-        ("anna", days[0], ""),
-        ("anna", days[1], ""),
-        ("ben", days[0], "roll back"),
-        ("anna", days[1], ""),
-    ]
+    first, last = day_name(5), day_name(11)
+    notes = [("anna", first, ""), ("anna", last, ""), ("ben", first, "roll back"), ("anna", last, "")]
+    assert kept == notes
     capsys.readouterr()
     assert state(lake=where, json=True) == 0
     assert {row["signed_by"] for row in json.loads(capsys.readouterr().out)} == {"anna"}
