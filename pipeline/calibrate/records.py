@@ -211,8 +211,8 @@ def _assumed(estimate: PairEstimate, observations: Sequence[Observation]) -> lis
     return [
         *assumed,
         (
-            f"camera intrinsics as logged: a focal length wrong by 0.1 % puts the image's edge {worth:.2f} deg off, a "
-            f"principal point wrong by 1 px is a camera turned by {turn:.2f} deg: alignments hardly separate the two"
+            f"camera intrinsics as logged: a focal length 0.1 % off moves the image's edge by {worth:.2f} deg; a "
+            f"principal point 1 px off has the effect of a camera turned by {turn:.2f} deg"
         ),
     ]
 

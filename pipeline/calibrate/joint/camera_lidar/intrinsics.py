@@ -107,14 +107,13 @@ class DayIntrinsics:
         (right, down), (right_sigma, down_sigma) = self.centre_px, self.centre_sigma_px
         return [
             (
-                "azimuth and elevation are directions in the image with CameraInfo's principal point; by "
-                f"{source}, what is not known of that point leaves {yaw:.2f} deg of yaw and {pitch:.2f} deg of pitch "
-                "(1 sigma) open in the camera's mounting"
+                "azimuth and elevation are directions in the image with CameraInfo's principal point. As a mounting, "
+                f"that point adds a sigma of {yaw:.2f} deg of yaw and {pitch:.2f} deg of pitch (from {source})"
             ),
             (
-                f"by the day alone the focal length is {self.focal - 1:+.1%} +- {self.focal_sigma:.1%} off "
-                f"CameraInfo's, the principal point {right:+.0f} +- {right_sigma:.0f} px right and "
-                f"{down:+.0f} +- {down_sigma:.0f} px down of it"
+                f"difference from CameraInfo by the day alone: focal length {self.focal - 1:+.1%} +- "
+                f"{self.focal_sigma:.1%}, principal point {right:+.0f} +- {right_sigma:.0f} px to the right, "
+                f"{down:+.0f} +- {down_sigma:.0f} px down"
             ),
             # By a profile like the time offset's it errs by tens of ms: study `intrinsics.py`.
             f"image rows are exposed within {1e3 * known.readout_s:.0f} ms (readout_s): a day does not determine it",
