@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -32,7 +33,7 @@ _PIPE_WIDTH = 280  # characters; output to a pipe or file need not fit a window
 
 def print_table(table: str, rows: list[dict[str, Any]]) -> None:
     """Print at least one row of a table, with its columns as headings."""
-    cells = {
+    known: dict[str, Callable[[dict[str, Any]], dict[str, str]]] = {
         "calibrations": _calibration_cells,
         "poses": _pose_row_cells,
         "drift": _drift_cells,
@@ -42,8 +43,8 @@ def print_table(table: str, rows: list[dict[str, Any]]) -> None:
             | {"withdrawn": "yes" if row["withdrawn"] else ""}
         ),
         "sign_offs": lambda row: _named(row, "vehicle", "day", "method", "signed_by", "asserted_at", "note"),
-    }.get(table, _partition_cells)
-    lines = [cells(row) for row in rows]
+    }
+    lines = [known.get(table, _partition_cells)(row) for row in rows]
     view = Table(title=f"{table}: {len(rows)} row{'' if len(rows) == 1 else 's'}", title_justify="left")
     for name in lines[0]:
         # Only the text at the end of a line may wrap, never numbers and names.

@@ -154,11 +154,11 @@ def top_bitmap(scene: Scene, before: Extrinsics, after: Extrinsics) -> UInt8[np.
         colour = _height_colours(height[order])
         for dx, dy in ((0, 0), (1, 0), (0, 1), (1, 1), (2, 0), (2, 1), (0, 2), (1, 2), (2, 2)):
             image[np.clip(row + dy, 0, size[0] - 1), np.clip(column + dx, 0, size[1] - 1)] = colour
-    for state, colour in ((before, _PRIOR_BGR), (after, (0, 0, 0))):
+    for state, dot in ((before, _PRIOR_BGR), (after, (0, 0, 0))):
         points = transform_points(state.T_lidar_radar, scene.frame.radar_xyz_m.astype(np.float64))
         at, inside = _pixels(points, size)
         for u, v in at[inside]:
-            cv2.circle(image, (int(u), int(v)), 2, colour, -1, cv2.LINE_AA)
+            cv2.circle(image, (int(u), int(v)), 2, dot, -1, cv2.LINE_AA)
     return image
 
 
