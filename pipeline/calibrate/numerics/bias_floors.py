@@ -56,7 +56,9 @@ CAMERA_LIDAR_DT_FLOOR_S = 0.004
 # the sources of one day are compared with.
 EDGE_SIDE_MOST_PX, EDGE_SIDE_MOST_OF_GAP = 1.0, 0.4
 # Variance of the bias by borders, in units of the scatter of their pulls over sides, thirds of range and halves of the
-# image: 66 days of drawn worlds, rows and rigs allow 3 to 6; days of clean labels alone would ask for none.
+# image: 66 days of drawn worlds, rows and rigs allow 3 to 6; days of clean labels alone would ask for none. On 63 fresh
+# drawn worlds 5.8, with the floor of rotations at .01 deg for .03 and 1.25 of the variance by traffic, accepted 15
+# camera-lidar records for 19, at a log score .06 to .09 nats an axis worse.
 BORDER_SHARE = 3.0
 # One side alone is off by at least this share of a label pixel and of the angle between beams, in quadrature: no other
 # side takes back what its labels or the beams' gaps move it by (tops of one height, rows 1 deg apart: .5 deg).

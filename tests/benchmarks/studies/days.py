@@ -132,7 +132,7 @@ SETS: dict[str, list[DaySpec]] = {
     "dev-worlds": _worlds(60, 16),
     "table1": [DaySpec(4600 + i, "urban" if i < 5 else "highway", 100) for i in range(10)],
     "coverage": _both(4300, 100),
-    "worlds": _worlds(6400, 128),
+    "worlds": _worlds(6800, 64),
     # Of 60 frames some 40 are fitted. Of these about 100 are, as of the days that the README asks for.
     "worlds-full": _worlds(6660, 32, 150),
 }
