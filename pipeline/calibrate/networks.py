@@ -14,9 +14,10 @@ from pipeline.core.config import SolveConfig, config_hash
 from pipeline.core.errors import ConfigError, SolveError
 from pipeline.core.results import Progress
 from pipeline.core.stage_work import Task
-from pipeline.learn.infer.onnx_networks import model_files, models_key, open_networks
+from pipeline.learn.infer.onnx_networks import OnnxNetwork, model_files, models_key, open_networks
 from pipeline.learn.infer.pitch_by_travel import informed_by_way
 from pipeline.learn.infer.vehicle_day import single_frame_solution, solve_by_networks
+from pipeline.rig.checks import Check
 from pipeline.rig.estimates import Prior, Solution
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_columns
@@ -26,7 +27,7 @@ from schemas.frames import Frame
 from schemas.moments import PERCEIVED
 from schemas.observations import Observation
 
-__all__ = ["FrameCalibration", "calibrate_frame", "ssl_settings", "ssl_solver"]
+__all__ = ["FrameCalibration", "calibrate_frame", "held_if_unfit", "ssl_settings", "ssl_solver"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,10 +65,11 @@ def ssl_solver(method: str, task: Task, chosen: Chosen | None = None) -> Solver:
             raise SolveError(
                 f"no frames of this day: {method} looks at images and sweeps, not at observations alone"
             )
+        networks = open_networks(model_files(method, fleet), fleet.learn, fleet.prepare)
         solution = solve_by_networks(
             observations,
             prior,
-            networks=open_networks(model_files(method, fleet), fleet.learn, fleet.prepare),
+            networks=networks,
             frames=_frames_of(lake, partition, chosen),
             method=method,
             seed=seed,
@@ -77,10 +79,20 @@ def ssl_solver(method: str, task: Task, chosen: Chosen | None = None) -> Solver:
         if "doppler" in config.terms:
             solution = informed_by_way(solution, observations["lidar_radar"], prior)
         if not config.polish:
-            return solution
+            return held_if_unfit(solution, networks)
         return _polished(solution, observations, prior, config, seed, triggered, progress)
 
     return solve
+
+
+def held_if_unfit(solution: Solution, networks: Sequence[OnnxNetwork]) -> Solution:
+    """The solution with a failed check in the pairs of each network that its card does not allow to be used."""
+    why = {pair: network.unfit for network in networks if network.unfit for pair in network.pairs}
+    pairs = {
+        pair: replace(found, failed_checks=[*found.failed_checks, Check(why[pair])]) if pair in why else found
+        for pair, found in solution.pairs.items()
+    }
+    return replace(solution, pairs=pairs)
 
 
 def calibrate_frame(task: Task, frame: int) -> FrameCalibration:

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.core.errors import ConfigError
+from pipeline.learn.infer.onnx_networks import UNFIT
 from pipeline.learn.train.loop import BEST, LAST, load_checkpoint, read_metrics
 
 __all__ = ["LIMITS", "card_of_run", "write_card"]
 
-UNFIT = "Not fit for use"
 LIMITS = (
     "Trained without ground truth: answers have the losses' biases, which averaging over a fleet does not reduce.",
     "Looks 38 deg to each side of the camera's axis; guesses within about 5 deg, best with 2 or 3 passes.",

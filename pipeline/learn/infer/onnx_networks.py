@@ -29,8 +29,9 @@ from schemas.frames import Frame
 from schemas.observations import Observation
 from schemas.training import TrainingRow
 
-__all__ = ["SHIPPED", "OnnxNetwork", "model_files", "models_key", "open_networks"]
+__all__ = ["SHIPPED", "UNFIT", "OnnxNetwork", "model_files", "models_key", "open_networks"]
 
+UNFIT = "Not fit for use"  # so begins the limit of a network whose training was never validated
 SHIPPED = Path(__file__).parent.parent / "models"
 _NOBODY = About("", "", "", "", "", "")
 
@@ -95,6 +96,12 @@ class OnnxNetwork:
         self._iterations, self._camera, self._rows = config.iterations, config.camera, rows
         self._prepare = _prepare_for(self._calibrator.grid, prepare)
         self._bias_sigma = _bias_of_card(path, self._calibrator.metadata.get("card", "{}"))
+
+    @property
+    def unfit(self) -> str:
+        """Why its card does not allow it to be used; empty if it does."""
+        limits = json.loads(self._calibrator.metadata.get("card", "{}")).get("limits", ())
+        return next((str(limit) for limit in limits if str(limit).startswith(UNFIT)), "")
 
     @property
     def bias_sigma(self) -> Mapping[str, np.ndarray]:

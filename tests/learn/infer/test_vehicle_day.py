@@ -8,10 +8,11 @@ import onnx
 import pytest
 
 from jobs.cli import main
+from pipeline.calibrate.networks import held_if_unfit
 from pipeline.core.errors import ConfigError, ModelError, SolveError
 from pipeline.learn.export.onnx_file import export_onnx
 from pipeline.learn.infer.frame_network import FrameAnswer
-from pipeline.learn.infer.onnx_networks import model_files, models_key, open_networks
+from pipeline.learn.infer.onnx_networks import UNFIT, model_files, models_key, open_networks
 from pipeline.learn.infer.vehicle_day import single_frame_solution, solve_by_networks
 from pipeline.learn.network.calibration_network import build_network
 from pipeline.learn.sample.frame_sample import SampleReason, SampleRejectedError
@@ -271,10 +272,10 @@ def test_another_model_is_other_work(lake, tmp_path):
         open_networks({"joint": other}, fleet.learn, fleet.prepare)
 
 
-def with_bias(path, out, bias):
+def with_card(path, out, **more):
     model = onnx.load(path)
     card = next(p for p in model.metadata_props if p.key == "card")
-    card.value = json.dumps(json.loads(card.value) | {"bias_sigma": bias})
+    card.value = json.dumps(json.loads(card.value) | more)
     onnx.save(model, out)
     return {"joint": out}
 
@@ -285,18 +286,32 @@ def test_a_card_may_say_by_what_all_answers_are_off_alike(lake, tmp_path):
     fleet = load_fleet(lake / "fleet.toml")
     files = model_files("joint-ssl", fleet)
     assert open_networks(files, fleet.learn, fleet.prepare)[0].bias_sigma == {}
-    told = with_bias(
-        files["joint"], tmp_path / "told.onnx", {"lidar_radar": [0.3, 0.2, 0.1, 0.03, 0.02, 0.01]}
-    )
+    bias = {"lidar_radar": [0.3, 0.2, 0.1, 0.03, 0.02, 0.01]}
+    told = with_card(files["joint"], tmp_path / "told.onnx", bias_sigma=bias)
     [network] = open_networks(told, fleet.learn, fleet.prepare)
     assert network.bias_sigma["lidar_radar"] == pytest.approx(
         [*np.radians([0.3, 0.2, 0.1]), 0.03, 0.02, 0.01]
     )
     for wrong in ({"lidar_radar": [0.3]}, {"sonar": [0.1] * 6}, {"lidar_radar": [-1] * 6}, [1]):
         with pytest.raises(ModelError, match="bias_sigma"):
-            open_networks(
-                with_bias(files["joint"], tmp_path / "wrong.onnx", wrong), fleet.learn, fleet.prepare
-            )
+            other = with_card(files["joint"], tmp_path / "wrong.onnx", bias_sigma=wrong)
+            open_networks(other, fleet.learn, fleet.prepare)
+
+
+def test_a_network_that_was_not_validated_fails_a_check_in_each_of_its_pairs(frames, lake, tmp_path):
+    from pipeline.core.config import load_fleet
+
+    fleet = load_fleet(lake / "fleet.toml")
+    files = model_files("joint-ssl", fleet)
+    solution, by = solve(frames, [Oracle()], prior_off(0.02)), {}
+    for limits in (["Trained without ground truth."], [f"{UNFIT}: trained for 9 steps."]):
+        path = with_card(files["joint"], tmp_path / "card.onnx", limits=limits)
+        networks = open_networks(path, fleet.learn, fleet.prepare)
+        found = held_if_unfit(solution, networks)
+        by[networks[0].unfit] = {p: len(e.failed_checks) for p, e in found.pairs.items()}
+    fit, unfit = by.values()
+    assert list(by) == ["", f"{UNFIT}: trained for 9 steps."]
+    assert unfit == {pair: count + 1 for pair, count in fit.items()}
 
 
 def test_a_missing_model_names_its_key(lake, tmp_path):
