@@ -31,11 +31,12 @@ def night_of(day):
 
 @pytest.fixture
 def bare(tmp_path):
-    """A knocked vehicle, a good one that was held at times, and one that joined a week ago; two months."""
+    """A knocked vehicle, a good one that was held at times, two that joined one and two weeks ago; two months."""
     rng = np.random.default_rng(41)
     rows = vehicle_records("a", DAYS, rng, status=lambda d: "held" if d % 7 == 3 else "accepted")
     rows += vehicle_records("b", DAYS, rng, motion=lambda d: {"radar": KNOCK} if d > 50 else {})
     rows += [r for r in vehicle_records("c", DAYS, rng) if r.day >= day_name(54)]
+    rows += [r for r in vehicle_records("d", DAYS, rng) if r.day >= day_name(44)]
     lake = Lake.at(tmp_path / "bare")
     commit_records(lake, CALIBRATIONS, [replace(r, recorded_at=night_of(r.day)) for r in rows])
     return lake
@@ -90,7 +91,7 @@ def without_states(bare, tmp_path):
 
 def test_states_keep_the_first_accepted_days_and_from_the_tenth_on_what_they_make(lake):
     found = kept(lake)
-    assert set(found) == {(v, edge) for v in "abc" for edge in EDGE_OF_PAIR.values()}
+    assert set(found) == {(v, edge) for v in "abcd" for edge in EDGE_OF_PAIR.values()}
     a, c = (found[v, CAMERA_LIDAR] for v in "ac")
     assert a.days == tuple(day_name(d) for d in range(12) if d % 7 != 3)
     assert [name_of(d) for d in a.reference.days] == list(a.days)
@@ -101,9 +102,14 @@ def test_what_is_kept_no_longer_counts_after_a_service_event_another_setting_or_
     assert kept(lake, count=9) == {}
     event = ServiceEvent(vehicle="a", day=day_name(20), sensor="radar", kind="re-mount")
     assert {p for v, p in kept(lake, [event]) if v == "a"} == {CAMERA_LIDAR}  # not concerned
-    old = next(r for r in read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle="a", day=day_name(2)))
-    commit_records(lake, CALIBRATIONS, [replace(old, work_key="again", recorded_at="", asserted_at="")])
-    assert {v for v, _ in kept(lake)} == {"b", "c"}
+    whole = kept(lake)["d", CAMERA_LIDAR]
+    for vehicle, day in (("a", day_name(2)), ("d", day_name(46))):
+        old = next(iter(read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle=vehicle, day=day)))
+        commit_records(lake, CALIBRATIONS, [replace(old, work_key="again", recorded_at="", asserted_at="")])
+    found = kept(lake)
+    assert {v for v, _ in found} == {"b", "c", "d"}
+    again = found["d", CAMERA_LIDAR]  # one of its own days, which are read anyway
+    assert (again.days, again.reference, whole.reference is None) == (whole.days, None, False)
 
 
 def test_the_states_of_every_night_keep_the_same_reference(lake):
