@@ -2,7 +2,8 @@
 
 Each command is a function in a file of its own. It is imported when called, and returns an exit code.
 Exit codes: 0 done or up to date; 1 failed, a retry may help; 2 usage or configuration; 3 done, but something
-was held or refused; 130 and 143 after SIGINT and SIGTERM.
+was held or refused; 4 nothing certified (export) or wrong (verify); 5 inconclusive (verify); 130 and 143 after
+SIGINT and SIGTERM.
 """
 
 from __future__ import annotations
