@@ -1,9 +1,8 @@
 """The command `boresight`: the table of its commands, and exit codes.
 
 Each command is a function in a file of its own. It is imported when called, and returns an exit code.
-Exit codes: 0 done or up to date; 1 failed, a retry may help; 2 usage or configuration; 3 done, but something
-was held or refused; 4 nothing certified (export) or wrong (verify); 5 inconclusive (verify); 130 and 143 after
-SIGINT and SIGTERM.
+Exit codes: 0 done or up to date; 1 failed, a retry may help; 2 usage or configuration; 3 done, something was held
+or refused; 4 nothing certified (export), wrong (verify); 5 inconclusive (verify); 130, 143 after SIGINT, SIGTERM.
 """
 
 from __future__ import annotations
