@@ -29,8 +29,9 @@ _STANDING_MPS = 0.3
 _STEPS = 12  # of the integral of odometry
 _QUALITY = 92
 # Why an image has no earlier one; perception adds its own reasons.
-NO_EARLIER, STAMPS_JUMP, STANDING, SAME_IMAGE = (
+NO_EARLIER, TOO_FAR, STAMPS_JUMP, STANDING, SAME_IMAGE = (
     "no_earlier_image",
+    "images_too_far_apart",
     "stamps_jump",
     "standing",
     "same_image_again",
@@ -97,6 +98,7 @@ class EarlierImages:
         stamps, located = self._captures.stamps, self._captures.located
         now_ns, found, last_ns, driven_m = stamps[place], list[_Candidate](), stamps[place], 0.0
         speed = self._index.ego.motion_at(np.array([now_ns], np.int64))[0][0]
+        nearest = np.nan, np.inf
         for k in range(place - 1, -1, -1):
             if located[k].log != located[place].log or now_ns - stamps[k] > _MOST_S * 1e9:
                 break
@@ -106,12 +108,18 @@ class EarlierImages:
             driven_m += float(self._index.ego.motion_at(ends)[0].mean()) * (last_ns - stamps[k]) * 1e-9
             last_ns = stamps[k]
             span_s = (now_ns - stamps[k]) * 1e-9
+            nearest = (driven_m, span_s) if k == place - 1 else nearest
             is_near = span_s <= _LATEST_S if np.isnan(driven_m) else _LEAST_M <= abs(driven_m) <= _MOST_M
             if is_near and span_s >= _LEAST_S:
                 found.append(_Candidate(k, span_s, driven_m, k in self._kept))
-        if not found:
-            return STANDING if abs(speed) < _STANDING_MPS else NO_EARLIER
-        return min(found, key=lambda c: c.off)
+        if found:
+            return min(found, key=lambda c: c.off)
+        if abs(speed) < _STANDING_MPS:
+            return STANDING
+        has_one = place > 0 and located[place - 1].log == located[place].log
+        way_m, span_s = nearest
+        is_far = span_s > _LATEST_S if np.isnan(way_m) else abs(way_m) > _MOST_M
+        return TOO_FAR if has_one and is_far else NO_EARLIER
 
     def _motion(self, earlier_ns: int, place: int) -> Mapping[str, float]:
         """The car's motion by odometry, from the earlier image to this one; empty if it is not known throughout."""

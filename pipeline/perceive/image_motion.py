@@ -56,6 +56,7 @@ class MotionReason(StrEnum):
     """Reasons why two images show no motion; the value ends the key of the counts."""
 
     NO_EARLIER = "no_earlier_image"
+    TOO_FAR = "images_too_far_apart"
     STAMPS_JUMP = "stamps_jump"
     SAME_IMAGE = "same_image_again"
     STANDING = "standing"

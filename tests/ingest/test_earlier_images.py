@@ -105,6 +105,18 @@ def test_a_standing_car_stamps_that_jump_and_a_picture_again_are_named(images):
     assert images(kit)[1].earlier_missing == "same_image_again"
 
 
+@pytest.mark.parametrize(
+    ("speed_mps", "reason"), [(30.0, "images_too_far_apart"), (0.1, "standing"), (6.0, None)]
+)
+def test_a_camera_too_slow_for_the_speed_is_named(images, speed_mps, reason):
+    """At 2 Hz images lie 15 m apart at 30 m/s, and 3 m at 6 m/s."""
+    kit = drive(speed_mps=speed_mps)
+    kit.messages = [m for m in kit.messages if m[0] != IMAGE or (m[2] - START_NS) % (5 * PERIOD_NS) == 0]
+    first, *others = images(kit)
+    assert first.earlier_missing == ("standing" if speed_mps < 0.3 else "no_earlier_image")
+    assert {row.earlier_missing for row in others} == {reason}
+
+
 def test_a_car_with_cameras_alone_has_moments_of_its_images(tmp_path):
     kit = drive()
     kit = kit.without(LIDAR).without(RADAR)
