@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from pipeline.perceive import image_motion
 from pipeline.perceive.earlier_greys import EarlierGreys
 from pipeline.perceive.image_motion import (
     MotionReason,
@@ -211,6 +212,22 @@ def test_a_picture_again_under_a_new_stamp_the_night_and_a_standing_car_are_name
     assert reason == MotionReason.FEW_TRACKS
     _, reason = greys.columns(image(1.2, 0.95), street(2.0), None, None)  # its moment was not perceived
     assert reason == MotionReason.NO_EARLIER
+
+
+def test_an_image_costs_a_bounded_number_of_tracks_and_steps(monkeypatch):
+    """Nearly all of its time: half of it to track two thousand times, a third for twelve passes over the tracks."""
+    tracked, passes = [], []
+    flow, residuals = cv2.calcOpticalFlowPyrLK, image_motion._residuals
+    monkeypatch.setattr(
+        cv2, "calcOpticalFlowPyrLK", lambda *a, **k: (tracked.append(len(a[2])), flow(*a, **k))[1]
+    )
+    monkeypatch.setattr(image_motion, "_residuals", lambda *a: (passes.append(1), residuals(*a))[1])
+    greys = EarlierGreys()
+    greys.columns(image(0.0), street(0.0), None, None)
+    _, reason = greys.columns(image(0.3, 0.0), street(2.0), None, None)
+    assert reason is None
+    assert 500 < sum(tracked) <= 2000
+    assert len(passes) <= 12
 
 
 def test_corners_of_road_users_are_left_out():
