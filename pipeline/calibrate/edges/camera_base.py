@@ -53,7 +53,8 @@ _CENTRE_RAD = np.radians(0.03)  # by principal point and focal length
 # Noise of tracks draws the direction of travel towards or from the middle of the view: .25 and .40 deg outward in yaw
 # of the two side cameras of a tuning day (seed 6701), .10 and less of the front one.
 _ASIDE_RAD = np.radians(0.3)
-_CLOCK_FLOOR_S, _NO_CLOCK_S = 0.002, 1.0
+# A worse clock is none: those of side cameras were 10 to 300 ms off at stated 32 to 141 (days 6701 to 6712).
+_CLOCK_FLOOR_S, _MOST_CLOCK_S, _NO_CLOCK_S = 0.002, 0.025, 1.0
 _FEWEST = 8
 _PASSES = 4
 
@@ -90,7 +91,7 @@ def estimate_camera_base(
         change, variance = _combined(fits)
         T = from_rotation_translation(exp_so3(change) @ T[:3, :3], T[:3, 3])
     clock = _clock(travel, T)
-    timed = None if clock is None or clock.covariance[0, 0] > (_NO_CLOCK_S / 2) ** 2 else clock
+    timed = None if clock is None or clock.covariance[0, 0] > _MOST_CLOCK_S**2 else clock
     J = np.zeros((4, 7))
     J[:3, :6] = changes_by_left(T)[:3]
     J[3, 6] = 1.0
@@ -160,9 +161,11 @@ def _rows(travel: CameraTravel, T: np.ndarray) -> dict[str, Rows]:
     elevation *= np.copysign(1.0, direction[:, 0])
     of_direction = R @ travel.covariance[:, 3:, 3:] @ R.T
     pitch = Rows(one[:, None], elevation, _sigma(of_direction, 2), bend, free, one)
-    turning = np.abs(turn[:, 2]) > _TURNING_RAD
-    roll = Rows(turn[:, 2:], turn[:, 1], _sigma(of_turn, 1), bend, free, one)
-    by_axis = Rows(-turn[:, 2:], turn[:, 0], _sigma(of_turn, 0), bend, free, one)
+    # Errors of a camera's turns about two axes go together: the base's turn has neither.
+    yawed = np.where(_knows_yaw(travel), np.nan_to_num(travel.turned_rad), turn[:, 2])
+    turning = np.abs(yawed) > _TURNING_RAD
+    roll = Rows(yawed[:, None], turn[:, 1], _sigma(of_turn, 1), bend, free, one)
+    by_axis = Rows(-yawed[:, None], turn[:, 0], _sigma(of_turn, 0), bend, free, one)
     ways = {"yaw": yaw.some(straight), "pitch": pitch.some(straight)}
     return ways | {"roll": roll.some(turning), "pitch_by_axis": by_axis.some(turning)}
 
