@@ -13,7 +13,8 @@ from tests.makers.fleet_files import fleet_toml
 @pytest.fixture
 def fleet(tmp_path):
     path = tmp_path / "fleet.toml"
-    path.write_text(fleet_toml("car", radar='doppler_positive = "approaching"'))
+    text = fleet_toml("car", radar='doppler_positive = "approaching"')
+    path.write_text(text.replace("default", "trio"))  # the only rig needs no name of its own
     return path
 
 
