@@ -44,7 +44,9 @@ def test_check_exits_0_1_2_for_yes_partly_no(kit, tmp_path, fleet, capsys):
     assert {v["pair"] for v in report["verdicts"]} == {"camera_lidar", "lidar_radar", "camera_radar"}
     assert report["sync"]["moments"] == 40
     assert check(fleet, good.without(kit.LABELS).mcap(tmp_path / "unlabelled.mcap")) == 1
-    summary = last_line(capsys)
+    printed = capsys.readouterr()
+    assert "radar elevation: yes" in " ".join(printed.err.split())
+    summary = json.loads(printed.out.splitlines()[-1])
     assert summary["status"] == "partly"
     assert summary["pairs"] == {"camera_lidar": "no", "lidar_radar": "partly", "camera_radar": "no"}
     assert check(fleet, good.without(kit.RADAR).mcap(tmp_path / "blind.mcap")) == 2

@@ -74,8 +74,10 @@ def test_faults_of_records_are_said_in_plain_words_by_show_and_status(tmp_path, 
     words = "semantic labels are shifted"
     assert show("calibrations", lake=str(tmp_path)) == 0
     assert words in " ".join(capsys.readouterr().out.split())
+    assert status(lake=str(tmp_path)) == 0
+    assert "shifted" in capsys.readouterr().out
     assert status(lake=str(tmp_path), json=True) == 0
-    summary = json.loads(capsys.readouterr().out.splitlines()[-1])
+    summary = json.loads(capsys.readouterr().out)  # and nothing else
     assert summary["method"] == "joint"
     assert [day["faults"] for day in summary["days"]] == [["labels_offset"]]
 
