@@ -72,6 +72,7 @@ def test_a_trio_of_a_drive_is_found_with_all_its_topics_in_every_container(tmp_p
         assert rig["lidar"] == {"points": "/lidar/points"}
         assert rig["radar"]["points"] == "/radar/points"
         assert rig["radar"]["doppler_field"] == "doppler"
+        assert "Cityscapes train ids" in found.text
         assert found.missing == ()
 
 
