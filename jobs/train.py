@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from jobs.extras import needs
+from jobs.terminal.logging import logger
 from jobs.terminal.summary import print_summary, progress_reporter
 from pipeline.core.config import FleetConfig, load_fleet, validated
 from pipeline.core.errors import ConfigError
@@ -76,8 +77,7 @@ def train(  # options of the command
         columns: columns of the lidar's range image, over 360 deg; 1024.
         budget: of calibration: duration of the whole run, over all calls, as in 25m; the learning rate decays over it.
         seed: random seed.
-        start_from: of calibration: finished run, or exported model.onnx, with the initial weights of a new run, for
-            fine-tuning.
+        start_from: of calibration: finished run, or exported model.onnx, with the first weights of a new run.
         time_limit: stop this call after this duration, as in 9m; the same command continues from its checkpoint.
         device: of calibration: cpu, cuda, or the best one available (auto).
         compiled: of calibration: compile the encoders (takes minutes at the start, faster afterwards).
@@ -139,11 +139,13 @@ def _train_perception(
 
 def _run(request: TrainRequest, settings: TrainConfig) -> int:
     """Train in this process, or as one process of torchrun; prints the summary once."""
+    from pipeline.learn.prepare.inventory import doubts
     from pipeline.learn.train.run import train as run
 
     if os.environ.get("RANK", "0") != "0":  # a process of torchrun: only the first one prints
-        result = run(request, settings)
-        return 128 + result.signal if result.signal else 0
+        return 128 + signal if (signal := run(request, settings).signal) else 0
+    for doubt in doubts(Lake.at(request.data), referenced=settings.needs_reference):
+        logger().warning(doubt, data=request.data)
     with progress_reporter(f"train {request.out.name}") as progress:
         result = run(request, settings, progress)
     steps = [] if (request.out / "best.pt").exists() else [_NOT_VALIDATED.format(settings.validate_every)]
@@ -164,9 +166,7 @@ def parse_duration(text: str, option: str) -> float:
     try:
         seconds = float(number) * _UNIT_S[unit]
     except ValueError as err:
-        raise ConfigError(
-            "command line", option, f"{text!r} is not a duration, as in 90s, 25m or 1h"
-        ) from err
+        raise ConfigError("command line", option, f"{text!r} is no duration like 90s, 25m or 1h") from err
     if not 0 < seconds < float("inf"):
         raise ConfigError("command line", option, f"{text!r}: must be above 0")
     return seconds

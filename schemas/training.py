@@ -21,7 +21,6 @@ from schemas.columns import TableSchema, array, column, per_point, points, row
 
 __all__ = [
     "CLASS_OF_LABEL",
-    "DISTANCE_GROUPS",
     "GRID_CLASSES",
     "NO_EDGE",
     "POINT_IS_EDGE",
@@ -55,21 +54,11 @@ UNKNOWN_CLASS = 255  # in grid_class: void, or outside the image
 CLASS_OF_LABEL = np.full(256, UNKNOWN_CLASS, np.uint8)
 for _index, _labels in enumerate(_LABELS_OF_CLASS.values()):
     CLASS_OF_LABEL[list(_labels)] = _index
-# Groups whose distance maps are stored: the paper's "reflecting" objects. The minimum over all is the paper's
-# mask.
-DISTANCE_GROUPS: dict[str, tuple[str, ...]] = {
-    "vehicle": ("vehicle",),
-    "person": ("person",),
-    "two_wheeler": ("two_wheeler",),
-    "pole": ("pole",),
-    "structure": ("building", "fence"),
-    "vegetation": ("vegetation",),
-}
 POINT_IS_EDGE, POINT_IS_GROUND = 1, 2  # bits of lidar_flags
 NO_EDGE = -128  # in edge_offset: no boundary of this direction within reach
 
-_PRIOR_CAMERA_LIDAR = "reference T_camera_lidar: the day's prior, never a truth"
-_PRIOR_LIDAR_RADAR = "reference T_lidar_radar: the day's prior, never a truth"
+_CAMERA_LIDAR = "T_camera_lidar of `reference`; never a truth"
+_LIDAR_RADAR = "T_lidar_radar of `reference`; never a truth"
 
 
 @row(eq=False)
@@ -98,12 +87,6 @@ class TrainingRow:
     )
     grid_class: np.ndarray = per_point("H W: index into GRID_CLASSES, by majority, or UNKNOWN_CLASS", "|u1")
     grid_seen: np.ndarray = per_point("H W: 1 if the image shows the whole cell", "|u1")
-    class_distance: np.ndarray = array(
-        "|u1",
-        (6, "N"),
-        "by DISTANCE_GROUPS, each H W: angle to the nearest pixel of the group [0.1 deg], 255 = 25.5 deg or "
-        "more",
-    )
     edge_offset: np.ndarray = array(
         "|i1",
         (4, "N"),
@@ -111,7 +94,6 @@ class TrainingRow:
         "nearest mask boundary of that direction, along the row (left, right; positive = to the right) or "
         "column (above, below; positive = downwards) [0.05 deg]; NO_EDGE = none within 6.35 deg",
     )
-    sky_depth: np.ndarray = per_point("H W: depth inside the sky [0.1 deg], 0 outside it", "|u1")
     detection_box_rad: np.ndarray = array(
         "<f4",
         (24, 4),
@@ -128,11 +110,6 @@ class TrainingRow:
     )
     lidar_flags: np.ndarray = per_point("POINT_IS_EDGE | POINT_IS_GROUND", "|u1")
     lidar_count: int = column("number of valid rows of lidar_*", kind="int32")
-    cluster_xyz_m: np.ndarray = points(
-        "uniform sample of the object clusters' points, lidar frame; for losses"
-    )
-    cluster_id: np.ndarray = per_point("row in cluster_centre_m, -1 = not among its rows", "<i2")
-    cluster_point_count: int = column("number of valid rows of cluster_xyz_m", kind="int32")
     cluster_centre_m: np.ndarray = array(
         "<f4", (48, 3), "centres of the largest object clusters, lidar frame"
     )
@@ -140,11 +117,6 @@ class TrainingRow:
     edge_xyz_m: np.ndarray = points("depth jumps, lidar frame; for losses")
     edge_side: np.ndarray = per_point("EDGE_LEFT/RIGHT/ABOVE/BELOW: side of the foreground", "|u1")
     edge_count: int = column("number of valid rows of edge_*", kind="int32")
-    drivable_xyz_m: np.ndarray = array(
-        "<f4", (512, 3), "sample of 1 m cells of drivable ground ahead, lidar frame"
-    )
-    drivable_count: int = column("number of valid rows of drivable_xyz_m, of 512", kind="int32")
-    drivable_area_m2: float = column("area that these cells represent")
     ground_plane: np.ndarray = array(
         "<f8", (4,), "n.p + d = 0 in the lidar frame, n up; zeros if none was found"
     )
@@ -159,36 +131,35 @@ class TrainingRow:
     radar_has_elevation: bool = column("False if all elevations are 0")
     track_xyz_m: np.ndarray = array("<f4", (24, 3), "centres of tracked moving clusters, radar frame")
     track_count: int = column("number of valid rows of track_xyz_m, of 24", kind="int32")
-    radar_drivable: np.ndarray = array(
-        "|u1",
-        (80, 160),
-        "drivable area by radar, 255 = certain: x ahead by rows, y from right to left by columns, cells of 1 "
-        "m (row r, column c: x = r + 1/2, y = c - 79.5)",
-    )
     # the whole
-    ego_speed_mps: float = column("as in perceived; 0 if unknown")
-    camera_lag_s: float = column("camera_stamp - stamp")
-    radar_lag_s: float = column("radar_stamp - stamp")
-    prior_camera_lidar_qw: float = column(_PRIOR_CAMERA_LIDAR)
-    prior_camera_lidar_qx: float = column(_PRIOR_CAMERA_LIDAR)
-    prior_camera_lidar_qy: float = column(_PRIOR_CAMERA_LIDAR)
-    prior_camera_lidar_qz: float = column(_PRIOR_CAMERA_LIDAR)
-    prior_camera_lidar_tx_m: float = column(_PRIOR_CAMERA_LIDAR)
-    prior_camera_lidar_ty_m: float = column(_PRIOR_CAMERA_LIDAR)
-    prior_camera_lidar_tz_m: float = column(_PRIOR_CAMERA_LIDAR)
-    prior_lidar_radar_qw: float = column(_PRIOR_LIDAR_RADAR)
-    prior_lidar_radar_qx: float = column(_PRIOR_LIDAR_RADAR)
-    prior_lidar_radar_qy: float = column(_PRIOR_LIDAR_RADAR)
-    prior_lidar_radar_qz: float = column(_PRIOR_LIDAR_RADAR)
-    prior_lidar_radar_tx_m: float = column(_PRIOR_LIDAR_RADAR)
-    prior_lidar_radar_ty_m: float = column(_PRIOR_LIDAR_RADAR)
-    prior_lidar_radar_tz_m: float = column(_PRIOR_LIDAR_RADAR)
+    ego_velocity_mps: np.ndarray = array("<f4", (3,), "own velocity in the lidar frame; 0 if unknown")
+    ego_yaw_rate_radps: float = column("as in perceived; 0 if unknown")
+    camera_lag_s: float = column("time of the image after `stamp_ns`, by the lidar's clock")
+    radar_lag_s: float = column("time of the scan after `stamp_ns`, by the lidar's clock")
+    reference: str = column(
+        "joint: poses and clocks of the day's record of joint (accepted, or held for its sigma alone); prior: those "
+        "before the day"
+    )
+    reference_camera_lidar_qw: float = column(_CAMERA_LIDAR)
+    reference_camera_lidar_qx: float = column(_CAMERA_LIDAR)
+    reference_camera_lidar_qy: float = column(_CAMERA_LIDAR)
+    reference_camera_lidar_qz: float = column(_CAMERA_LIDAR)
+    reference_camera_lidar_tx_m: float = column(_CAMERA_LIDAR)
+    reference_camera_lidar_ty_m: float = column(_CAMERA_LIDAR)
+    reference_camera_lidar_tz_m: float = column(_CAMERA_LIDAR)
+    reference_lidar_radar_qw: float = column(_LIDAR_RADAR)
+    reference_lidar_radar_qx: float = column(_LIDAR_RADAR)
+    reference_lidar_radar_qy: float = column(_LIDAR_RADAR)
+    reference_lidar_radar_qz: float = column(_LIDAR_RADAR)
+    reference_lidar_radar_tx_m: float = column(_LIDAR_RADAR)
+    reference_lidar_radar_ty_m: float = column(_LIDAR_RADAR)
+    reference_lidar_radar_tz_m: float = column(_LIDAR_RADAR)
 
 
 TRAINING = TableSchema(
     TrainingRow,
     "training",
-    4,
+    5,
     "One frame per row. Padded rows of arrays are 0.",
     made_by="prepare",
 )

@@ -241,7 +241,6 @@ class PrepareConfig(Section):
     """Training data: points per cloud, frames per vehicle-day, the split, and the camera's grid."""
 
     lidar_points: Annotated[int, Field(ge=256)] = 8192
-    cluster_points: Annotated[int, Field(ge=64)] = 1024
     edge_points: Annotated[int, Field(ge=64)] = 768
     max_frames: Annotated[int, Field(gt=0)] | None = None  # per vehicle-day, evenly spread; None = all
     # Shortest distance driven between frames: a frame from the same place adds nothing new.

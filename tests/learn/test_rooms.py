@@ -17,7 +17,7 @@ STANDS_ON = {
     "train": {"sample", "prepare", "batches", "network"},
     "export": {"sample", "network", "train"},
     "infer": {"sample"},
-    "perception_training": {"train", "export"},
+    "perception_training": {"prepare", "train", "export"},
 }
 
 

@@ -3,14 +3,11 @@
 One degree of freedom at a time, the others at the truth. Axes are those of the vehicle in all pairs: x forward, y left,
 z up; for camera pairs they turn about the camera. A degree of freedom counts as determined where the standard error of
 the minimum, by the frames' own scatter, is below a third of what is asked of it (0.15 deg, 5 cm).
-
-The simulator's clocks differ by a constant that no term knows; it would show as a shift along the way driven, so
-`with_true_clocks` takes it out of the lags.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,6 +17,7 @@ from scipy.interpolate import CubicSpline
 
 from pipeline.core.config import load_fleet
 from pipeline.learn.batches.batch import TrainingBatch, collate
+from pipeline.learn.prepare.reference import reference_of, usable_records
 from pipeline.learn.sample.frame_sample import About, make_row
 from pipeline.learn.train.frame_objective import PAIR_OF_TERM, FrameObjective, frame_objective, weighted
 from pipeline.learn.train.settings import LossConfig
@@ -47,24 +45,22 @@ class Minimum:
         return self.error < tolerance / 3
 
 
-def day_batch(lake: Lake, partition: Partition, fleet: Path) -> TrainingBatch:
-    """Rows of a perceived day as one batch."""
+def day_batch(
+    lake: Lake, partition: Partition, fleet: Path, told: Mapping[str, float] | None = None
+) -> TrainingBatch:
+    """Rows of a perceived day as one batch, by its record of `joint` where it has a usable one, or by true clocks."""
     config = load_fleet(fleet)
     observations = list(observations_of(lake, partition))
     logged = {f.frame_index: f for f in list(frames_of(lake, partition))}
-    reference = read_prior(observations, config, partition.vehicle)
+    records = usable_records(lake, partition, config.rig_of(partition.vehicle).one_of_each("training"))
+    reference = reference_of(records, read_prior(observations, config, partition.vehicle))
+    if told is not None:
+        reference = replace(
+            reference, **{f"{dt}_s": told[f"{dt}_s"] for dt in ("dt_camera_lidar", "dt_lidar_radar")}
+        )
     about = About(partition.vehicle, partition.day, "rig", "train", "place", "unknown")
     return collate(
         [make_row(logged[o.frame_index], o, reference, about, config.prepare) for o in observations]
-    )
-
-
-def with_true_clocks(batch: TrainingBatch, truth: dict[str, float]) -> TrainingBatch:
-    """Lags by true time: stamp_camera = stamp_lidar + dt_camera_lidar, stamp_lidar = stamp_radar + dt_lidar_radar."""
-    return replace(
-        batch,
-        camera_lag_s=batch.camera_lag_s - truth["dt_camera_lidar_s"],
-        radar_lag_s=batch.radar_lag_s + truth["dt_lidar_radar_s"],
     )
 
 
@@ -82,12 +78,12 @@ def moved(T: np.ndarray, pair: str, dof: int, offset: float) -> np.ndarray:
 
 
 def minima(
-    batch: TrainingBatch, truth: dict[str, np.ndarray], weights: LossConfig
+    batch: TrainingBatch, truth: dict[str, np.ndarray], weights: LossConfig, dofs: Sequence[int] = range(6)
 ) -> dict[str, list[Minimum]]:
-    """By term, and by pair for the weighted sum of its terms: the minimum along each degree of freedom."""
+    """By term, and by pair for the weighted sum of its terms: the minimum along degrees of freedom."""
     objective = [frame_objective(batch[slice(i, i + 8)]) for i in range(0, len(batch), 8)]
     found: dict[str, list[Minimum]] = {}
-    for dof in range(6):
+    for dof in dofs:
         offsets = STEPS * TOLERANCE[dof]
         curves = _curves(objective, truth, dof, offsets)
         for pair in PAIRS:

@@ -26,10 +26,10 @@ TOPICS = {
     "radar": {"points": "/radar"},
 }  # fmt: skip
 SMALL = {
-    "lidar_points": 1024, "cluster_points": 256, "edge_points": 128,
+    "lidar_points": 1024, "edge_points": 128,
     "grid": {"width_deg": 51.2, "height_deg": 25.6},
 }  # fmt: skip
-_OF_POINTS = ("lidar_points", "cluster_points", "edge_points", "max_frames", "min_step_m", "seed")
+_OF_POINTS = ("lidar_points", "edge_points", "max_frames", "min_step_m", "seed")
 PALETTE = np.random.default_rng(7).integers(0, 255, (256, 3)).astype(np.uint8)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int8, Int16, Int32, Int64, UInt8
+from jaxtyping import Bool, Float, Int8, Int32, Int64, UInt8
 
 from pipeline.core.errors import ContractError
 from pipeline.learn.sample.clouds import padded_rows
@@ -24,28 +24,24 @@ _MAPS = {
     "image": (3,),
     "grid_class": (),
     "grid_seen": (),
-    "class_distance": (6,),
     "edge_offset": (4,),
-    "sky_depth": (),
 }
 _ARRAYS = (
     "detection_box_rad", "lidar_xyz_m",
-    "cluster_xyz_m", "cluster_id", "cluster_centre_m", "edge_xyz_m", "edge_side",
-    "drivable_xyz_m", "radar_xyz_m", "radar_motion", "track_xyz_m",
-    "radar_drivable",
+    "cluster_centre_m", "edge_xyz_m", "edge_side",
+    "radar_xyz_m", "radar_motion", "track_xyz_m",
+    "ego_velocity_mps",
 )  # fmt: skip
 # Mask -> how many rows are real, and an array that has all of them.
 _MASKS = {
     "detection_valid": ("detection_count", "detection_box_rad"),
     "lidar_valid": ("lidar_count", "lidar_xyz_m"),
-    "cluster_point_valid": ("cluster_point_count", "cluster_id"),
     "cluster_valid": ("cluster_count", "cluster_centre_m"),
     "edge_valid": ("edge_count", "edge_side"),
-    "drivable_valid": ("drivable_count", "drivable_xyz_m"),
     "radar_valid": ("radar_count", "radar_motion"),
     "track_valid": ("track_count", "track_xyz_m"),
 }
-_NUMBERS = ("ego_speed_mps", "camera_lag_s", "radar_lag_s", "drivable_area_m2")
+_NUMBERS = ("ego_yaw_rate_radps", "camera_lag_s", "radar_lag_s")
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,32 +55,23 @@ class TrainingBatch:
     grid_step_deg: float
     vehicle: tuple[str, ...]
     day: tuple[str, ...]
-    environment: tuple[str, ...]
     frame_index: Int32[Tensor, " B"]
     # camera, on the equirectangular grid of its optical frame
     image: UInt8[Tensor, "B 3 H W"]  # red, green, blue
     grid_class: UInt8[Tensor, "B H W"]  # index into GRID_CLASSES, UNKNOWN_CLASS
     grid_seen: UInt8[Tensor, "B H W"]  # 1 where the image shows the whole cell
-    class_distance: UInt8[Tensor, "B 6 H W"]  # 0.1 deg, by DISTANCE_GROUPS
     edge_offset: Int8[Tensor, "B 4 H W"]  # 0.05 deg, by EDGE_LEFT/RIGHT/ABOVE/BELOW, NO_EDGE
-    sky_depth: UInt8[Tensor, "B H W"]  # 0.1 deg
     detection_box_rad: Float[Tensor, "B G 4"]  # azimuth left, elevation top, azimuth right, elevation bottom
     detection_valid: Bool[Tensor, "B G"]
     # lidar frame
     lidar_xyz_m: Float[Tensor, "B N 3"]
     lidar_features: Float[Tensor, "B N 4"]  # LIDAR_FEATURES
     lidar_valid: Bool[Tensor, "B N"]
-    cluster_xyz_m: Float[Tensor, "B C 3"]
-    cluster_id: Int16[Tensor, "B C"]
-    cluster_point_valid: Bool[Tensor, "B C"]
     cluster_centre_m: Float[Tensor, "B K 3"]
     cluster_valid: Bool[Tensor, "B K"]
     edge_xyz_m: Float[Tensor, "B E 3"]
     edge_side: UInt8[Tensor, "B E"]
     edge_valid: Bool[Tensor, "B E"]
-    drivable_xyz_m: Float[Tensor, "B D 3"]
-    drivable_valid: Bool[Tensor, "B D"]
-    drivable_area_m2: Float[Tensor, " B"]
     ground_plane: Float[Tensor, "B 4"]
     # radar frame
     radar_xyz_m: Float[Tensor, "B R 3"]
@@ -94,13 +81,13 @@ class TrainingBatch:
     radar_has_elevation: Bool[Tensor, " B"]
     track_xyz_m: Float[Tensor, "B T 3"]
     track_valid: Bool[Tensor, "B T"]
-    radar_drivable: UInt8[Tensor, "B X Y"]  # soft, cells of 1 m: x = r + 1/2, y = c - Y/2 + 1/2
     # the whole
-    ego_speed_mps: Float[Tensor, " B"]
+    ego_velocity_mps: Float[Tensor, "B 3"]  # lidar frame
+    ego_yaw_rate_radps: Float[Tensor, " B"]
     camera_lag_s: Float[Tensor, " B"]
     radar_lag_s: Float[Tensor, " B"]
-    T_camera_lidar: Float[Tensor, "B 4 4"]  # the prior
-    T_lidar_radar: Float[Tensor, "B 4 4"]  # the prior
+    T_camera_lidar: Float[Tensor, "B 4 4"]  # the reference
+    T_lidar_radar: Float[Tensor, "B 4 4"]  # the reference
 
     def __len__(self) -> int:
         """Frames of the batch."""
@@ -108,7 +95,7 @@ class TrainingBatch:
 
     @property
     def T_camera_radar(self) -> Float[Tensor, "B 4 4"]:
-        """The prior's, composed."""
+        """The reference's, composed."""
         return self.T_camera_lidar @ self.T_lidar_radar
 
     def to(self, device: torch.device | str, *, non_blocking: bool = False) -> TrainingBatch:
@@ -126,7 +113,7 @@ class TrainingBatch:
     def take(self, rows: Int64[Tensor, " K"]) -> TrainingBatch:
         """Frames by number, in any order; `rows` on the batch's device."""
         part = self._map(lambda t: t[rows])
-        picked, words = rows.tolist(), ("vehicle", "day", "environment")
+        picked, words = rows.tolist(), ("vehicle", "day")
         names: dict[str, Any] = {n: tuple(getattr(self, n)[i] for i in picked) for n in words}
         return replace(part, **names)
 
@@ -164,12 +151,11 @@ def collate(rows: Sequence[TrainingRow]) -> TrainingBatch:
         grid_step_deg=step,
         vehicle=tuple(r.vehicle for r in rows),
         day=tuple(r.day for r in rows),
-        environment=tuple(r.environment for r in rows),
         frame_index=torch.tensor([r.frame_index for r in rows], dtype=torch.int32),
         ground_plane=torch.from_numpy(np.stack([r.ground_plane for r in rows]).astype(np.float32)),
         radar_has_elevation=torch.tensor([r.radar_has_elevation for r in rows]),
-        T_camera_lidar=_transforms(rows, "prior_camera_lidar_"),
-        T_lidar_radar=_transforms(rows, "prior_lidar_radar_"),
+        T_camera_lidar=_transforms(rows, "reference_camera_lidar_"),
+        T_lidar_radar=_transforms(rows, "reference_lidar_radar_"),
         **tensors,
     )
 

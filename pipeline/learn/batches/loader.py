@@ -40,6 +40,7 @@ class TrainingLoader:
     Args:
         seed: of the frames' order, the same on all ranks.
         rank_of: rank of this process and number of processes; each takes its own row groups.
+        referenced: leave out days without a usable record of `joint`.
         window_groups: row groups that are mixed with each other and held in memory, twice (5-10 MB each).
 
     Raises:
@@ -53,11 +54,12 @@ class TrainingLoader:
         *,
         seed: int = 0,
         rank_of: tuple[int, int] = (0, 1),
+        referenced: bool = False,
         window_groups: int = 16,
     ) -> None:
         self._lake, self._batch_size, self._seed = lake, batch_size, seed
         (self._rank, self._ranks), self._window = rank_of, window_groups
-        self._chunks, self._data_key = _find_chunks(lake, "train")
+        self._chunks, self._data_key = _find_chunks(lake, "train", referenced)
         if len(self._chunks) < self._ranks:
             problem = f"train has {len(self._chunks)} row groups, not enough for {self._ranks} processes"
             raise ContractError(str(lake.root / TRAINING.name), problem)
@@ -145,9 +147,11 @@ class TrainingLoader:
                 self._held[group] = self._reader.submit(read_group, self._lake, TRAINING, group, TrainingRow)
 
 
-def load_split(lake: Lake, split: str, *, limit: int | None = None) -> TrainingBatch:
-    """All frames of a split (at most `limit`, evenly spread) as one batch."""
-    chunks, _ = _find_chunks(lake, split)
+def load_split(
+    lake: Lake, split: str, *, limit: int | None = None, referenced: bool = False
+) -> TrainingBatch:
+    """All frames of a split (at most `limit`, evenly spread) as one batch; `referenced` as of `TrainingLoader`."""
+    chunks, _ = _find_chunks(lake, split, referenced)
     frames = [(chunk.group, row) for chunk in chunks for row in chunk.rows]
     if limit is not None and len(frames) > limit:
         frames = [frames[i] for i in np.linspace(0, len(frames) - 1, limit).astype(int)]
@@ -158,16 +162,16 @@ def load_split(lake: Lake, split: str, *, limit: int | None = None) -> TrainingB
     return collate(rows)
 
 
-def _find_chunks(lake: Lake, split: str) -> tuple[list[_Chunk], list[str]]:
+def _find_chunks(lake: Lake, split: str, referenced: bool) -> tuple[list[_Chunk], list[str]]:
     """Row groups with frames of the split, in order, and their work keys."""
     leaks = read_leaks(lake)
     chunks, keys = [], []
     for partition in lake.partitions(TRAINING.name):
-        light = read_columns(lake, TRAINING, partition, ["frame_index", "split"])
+        light = read_columns(lake, TRAINING, partition, ["frame_index", "split", "reference"])
         barred = leaks.get(partition, set())
         wanted = [
-            side == split and index not in barred
-            for index, side in zip(light["frame_index"], light["split"], strict=True)
+            side == split and index not in barred and (reference == "joint" or not referenced)
+            for index, side, reference in zip(*light.values(), strict=True)
         ]
         first = 0
         for group in row_groups(lake, TRAINING, partition):
@@ -178,7 +182,8 @@ def _find_chunks(lake: Lake, split: str) -> tuple[list[_Chunk], list[str]]:
         manifest = read_manifest(lake, TRAINING, partition)
         keys.append(manifest.work_key if manifest else "")
     if not chunks:
-        problem = f"no frames of split {split!r}: run `boresight prepare` first"
+        missing = "`boresight calibrate` (method joint) for its days, and then " if referenced else ""
+        problem = f"no frames of split {split!r}: run {missing}`boresight prepare`"
         raise ContractError(str(lake.root / TRAINING.name), problem)
     barred_key = hashlib.sha256(repr(sorted((p, sorted(i)) for p, i in leaks.items())).encode()).hexdigest()
     return chunks, [split, barred_key[:16], *keys]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -44,23 +43,29 @@ def card_of_run(folder: Path, notes: Path | None = None) -> dict[str, Any]:
         for k, v in report.items()
         if k.startswith("validation/")
     }
-    return {
+    unfit = _unfit(chosen["step"], judged=best)
+    card = {
         "weights": f"of step {chosen['step']}, {'the best on held-out frames' if best else 'the last'}",
         "data": {key: last[key] for key in ("frames", "data_key") if key in last}
         | {"cell_deg": config["cell_deg"], "frames_per_step": config["batch_size"]},
         "seeds": [config["seed"]],
         "time": {"steps": last["step"], "minutes": round(last.get("trained_s", 0.0) / 60, 1)},
         "results": validation,
-        "limits": [*_unfit(last["step"], config["validate_every"], validation), *LIMITS],
+        "limits": [*unfit, *LIMITS],
         "training": config,
-    } | _notes(notes)
+    }
+    return card | _notes(notes) | {"validated": not unfit}
 
 
-def _unfit(steps: int, validate_every: int, validation: Mapping[str, float]) -> list[str]:
-    """Warning for a network whose training ended before its first validation."""
-    if validation and steps >= validate_every:
-        return []
-    return [f"{UNFIT}: trained for {steps} steps, and validated from step {validate_every} on."]
+def _unfit(step: int, *, judged: bool) -> list[str]:
+    """Warning for weights that no held-out frames chose, or that are those of the start."""
+    if not judged:
+        return [f"{UNFIT}: no held-out frames have judged it, so that `calibrate` holds all that it finds."]
+    if step == 0:
+        return [
+            f"{UNFIT}: training made no weights that are better on held-out frames than those it began with."
+        ]
+    return []
 
 
 def write_card(model: Path, card: dict[str, Any]) -> None:

@@ -19,6 +19,7 @@ from pipeline.learn.network.matching_network import MatchingCore
 from pipeline.learn.network.outputs import CoreOutputs, Predictions
 from pipeline.learn.network.views import RenderedView, render
 from pipeline.learn.sample.layout import NetworkConfig
+from pipeline.objective.differentiable.poses import inverse, transform_points
 
 __all__ = ["CalibrationNetwork", "NetworkConfig", "build_network", "compose", "turns_only"]
 
@@ -91,6 +92,10 @@ class CalibrationNetwork(nn.Module):
             outputs.corrections, inputs.T_camera_lidar, inputs.T_camera_radar, inputs.T_lidar_radar,
             composed=self.config.composed,
         )  # fmt: skip
+        evidence = outputs.evidence
+        if evidence is not None:
+            points_m = transform_points(inverse(inputs.T_camera_lidar), evidence.points_m)
+            evidence = replace(evidence, points_m=points_m)
         return Predictions(
             T_camera_lidar,
             T_camera_radar,
@@ -100,6 +105,7 @@ class CalibrationNetwork(nn.Module):
             outputs.lidar_logits,
             outputs.radar_logits,
             index,
+            evidence,
         )
 
 

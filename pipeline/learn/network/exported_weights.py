@@ -21,6 +21,7 @@ from pipeline.core.errors import ModelError
 from pipeline.learn.network.calibration_network import CalibrationNetwork
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import NetworkConfig
+from schemas.training import GRID_CLASSES
 
 __all__ = ["WEIGHTS", "network_of_file", "weight_places"]
 
@@ -44,7 +45,11 @@ def weight_places(state: Mapping[str, Tensor], model: onnx.ModelProto) -> dict[s
 
 
 def network_of_file(path: Path) -> CalibrationNetwork:
-    """The network of a file of `boresight export onnx`, on the CPU; ModelError for files older than 0.8.0."""
+    """The network of a file of `boresight export onnx`, on the CPU.
+
+    Raises:
+        ModelError: the file is older than 0.8.0, or its network has other classes.
+    """
     try:
         model = onnx.load(str(path))
         metadata = {entry.key: entry.value for entry in model.metadata_props}
@@ -53,6 +58,9 @@ def network_of_file(path: Path) -> CalibrationNetwork:
         config = NetworkConfig(**(values | {"grid": Grid(**values["grid"])}))
     except Exception as err:  # protobuf has its own exceptions, different by version
         raise ModelError(str(path), "does not list its weights, so training cannot continue from it") from err
+    if (classes := json.loads(metadata.get("classes", "[]"))) != list(GRID_CLASSES):
+        problem = f"its classes are {', '.join(classes)}, those of table training {', '.join(GRID_CLASSES)}"
+        raise ModelError(str(path), problem)
     held = {i.name: numpy_helper.to_array(i) for i in model.graph.initializer}
     network = CalibrationNetwork(config)
     network.load_state_dict(

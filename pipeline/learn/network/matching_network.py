@@ -85,7 +85,7 @@ class MatchingCore(nn.Module):
         self.heads = Heads(128, pairs, _RESIDUAL_STD)
 
     def forward(self, view: RenderedView) -> CoreOutputs:
-        """Corrections and log variances; their gradients do not reach the encoders, which learn from classes."""
+        """Corrections, log variances, and the evidence, whose gradient alone reaches the encoders."""
         camera_logits = self.camera_encoder(view.camera) if self.camera_encoder is not None else None
         likelihood = None if camera_logits is None else self.camera_log_likelihood(view.camera, camera_logits)
         return self.match(view, likelihood, camera_logits)
@@ -111,7 +111,7 @@ class MatchingCore(nn.Module):
         gain by leaving well-classified cells: a narrow image would push the sweep out.
         """
         # Classes last: runtimes are five times slower along another axis.
-        probability = torch.softmax(logits.detach().permute(0, 2, 3, 1), -1).clamp(min=float(np.exp(FLOOR)))
+        probability = torch.softmax(logits.permute(0, 2, 3, 1), -1).clamp(min=float(np.exp(FLOOR)))
         if self.confusions is not None:
             probability = probability @ self.confusions
         log_probability = torch.log(probability).clamp(min=FLOOR).permute(0, 3, 1, 2)
@@ -134,7 +134,7 @@ class MatchingCore(nn.Module):
             assert likelihood is not None
             row, column, _ = self._cells(view.points_camera)
             lidar_logits, logits = self._lidar_logits(view.lidar_grid, row, column)
-            probability = torch.softmax(logits.detach(), -1)
+            probability = torch.softmax(logits, -1)
             weight = view.point_weight * self._worth(likelihood, view.points_camera)
             edge = cell_values(view.lidar_grid[:, _EDGE : _EDGE + 1], row * self.grid.width + column)
             maps, probability = self._with_edges(likelihood[:, :-1], probability, edge)
@@ -143,8 +143,9 @@ class MatchingCore(nn.Module):
                 marked = view.mark_weight * self._worth(likelihood, view.marks_camera)
                 maps, probability = self._with_marks(view.camera, maps, probability)
                 points, weight = torch.cat([points, view.marks_camera], 1), torch.cat([weight, marked], 1)
-            evidence = ClassEvidence(maps, probability, weight)
-            found = self.lidar_matcher(maps, points, probability, weight)
+            evidence = ClassEvidence(maps, probability, weight, points)
+            # Not through the search: it costs more than all else, and its answer is the evidence's maximum.
+            found = self.lidar_matcher(maps.detach(), points, probability.detach(), weight.detach())
             bases["camera_lidar"] = found
             features.append(_features(found.surfaces.flatten(1), found))
         if "lidar_radar" in self.pairs:
@@ -160,7 +161,9 @@ class MatchingCore(nn.Module):
             radar_logits = self.radar_encoder(view.radar_features, distance)
             probability = torch.softmax(radar_logits.detach(), -1)
             weight = view.radar_valid.to(probability.dtype) * self._worth(likelihood, view.radar_camera)
-            found = self.radar_class_matcher(likelihood[:, :-1], view.radar_camera, probability, weight)
+            found = self.radar_class_matcher(
+                likelihood[:, :-1].detach(), view.radar_camera, probability, weight
+            )
             bases["camera_radar"] = found
             features.append(_features(found.surfaces.flatten(1), found))
         fused = self.fusion(torch.cat([s(f) for s, f in zip(self.summaries, features, strict=True)], -1))
@@ -190,7 +193,7 @@ class MatchingCore(nn.Module):
     def _with_marks(self, camera: Tensor, maps: Tensor, probability: Tensor) -> tuple[Tensor, Tensor]:
         """Paint as the last class, and behind the points MARKED_POINTS that have no other."""
         assert self.log_mark_worth is not None
-        paint, enough = log_markings(camera, maps[:, :_CLASSES])
+        paint, enough = log_markings(camera, maps[:, :_CLASSES].detach())
         frames, points, classes = probability.shape
         worth = (torch.exp(self.log_mark_worth) * enough)[:, None, None].expand(frames, MARKED_POINTS, 1)
         of_marks = torch.cat([probability.new_zeros(frames, MARKED_POINTS, classes), worth], -1)

@@ -20,13 +20,16 @@ _LOG_VARIANCE = (-10.5, -10.5, -10.5, -6.0, -6.0, -6.0)
 
 @dataclass(frozen=True, eq=False)
 class ClassEvidence:
-    """Matching evidence of camera and lidar: points in the order points_camera, marks_camera."""
+    """Matching evidence of camera and lidar, with gradients to both encoders: points, then marks."""
 
     maps: Float[
         Tensor, "B K H W"
     ]  # log-likelihood of classes; of boundaries and paint where these are matched
     probability: Float[Tensor, "B N K"]  # of each point's classes
     worth: Float[Tensor, "B N"]
+    points_m: Float[
+        Tensor, "B N 3"
+    ]  # of CoreOutputs: optical frame at the guess; of Predictions: lidar frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +64,7 @@ class Predictions:
     lidar_logits: Float[Tensor, "B K H W"] | None
     radar_logits: Float[Tensor, "B M K"] | None
     lidar_index: Int64[Tensor, "B HW"]
+    evidence: ClassEvidence | None = None
 
 
 class Heads(nn.Module):

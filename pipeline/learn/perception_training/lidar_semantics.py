@@ -35,14 +35,13 @@ from pipeline.learn.perception_training.trainer import (
     split_days,
     vehicle_days,
 )
+from pipeline.learn.prepare.reference import usable_records
 from pipeline.learn.train.settings import Count
 from pipeline.rig.day_prior import read_prior
 from pipeline.rig.range_image import EMPTY, channels_of, project
-from pipeline.store.current import current_records, transform_of
+from pipeline.store.current import transform_of
 from pipeline.store.partitions import Lake, Partition
-from pipeline.store.records import read_records
 from pipeline.store.views import frames_of, observations_of
-from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.frames import Frame
 from schemas.observations import Observation
 
@@ -138,30 +137,22 @@ class SweepNetwork(nn.Module):
 
 
 def labelled_sweeps(fleet: FleetConfig, lake: Lake, config: SweepTraining) -> Samples[SweepImages]:
-    """Sweeps of all vehicle-days with observations.
-
-    Each day by its accepted camera-lidar calibration where the lake has one, else by its prior.
-    """
+    """Sweeps of all vehicle-days with observations, each by its usable record of `joint`, else by its prior."""
     days = vehicle_days(fleet, lake)
     chosen = {day.vehicle: fleet.rig_of(day.vehicle).one_of_each("training") for day in days}
-    sensors = {(vehicle, names.get("camera"), names.get("lidar")) for vehicle, names in chosen.items()}
-    accepted = {
-        (r.vehicle, r.day): transform_of(r)
-        for r in current_records(read_records(lake, CALIBRATIONS, CalibrationRecord))
-        if r.status == "accepted" and (r.vehicle, r.parent_frame, r.child_frame) in sensors
-    }
+    known = {day: usable_records(lake, day, chosen[day.vehicle]).get("camera_lidar") for day in days}
     first = (next(frames_of(lake, day, chosen=chosen[day.vehicle])) for day in days)
     layout = layout_of(first, config.rows, config.columns)
 
     def of_day(day: Partition) -> SweepImages:
         names = chosen[day.vehicle]
         rows = list(observations_of(lake, day, chosen=names))
-        known = accepted.get((day.vehicle, day.day))
-        T = read_prior(rows, fleet, day.vehicle).T_camera_lidar if known is None else known
+        T = None if (record := known[day]) is None else transform_of(record)
+        T = read_prior(rows, fleet, day.vehicle).T_camera_lidar if T is None else T
         return day_images(frames_of(lake, day, chosen=names), rows, T, layout, config.frames_per_day)
 
     found = cut(split_days(days, of_day))
-    calibrated = sum((day.vehicle, day.day) in accepted for day in days)
+    calibrated = sum(record is not None for record in known.values())
     return replace(found, numbers=found.numbers | {"calibrated_days": calibrated})
 
 

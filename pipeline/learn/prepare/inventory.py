@@ -24,6 +24,7 @@ __all__ = [
     "MANIFEST_FILE",
     "Inventory",
     "alike",
+    "doubts",
     "read_leaks",
     "require_sides",
     "take_inventory",
@@ -116,6 +117,26 @@ def require_sides(lake: Lake) -> None:
             "[prepare.split] by (`boresight prepare` names one); val_fraction = 0 trains without validation"
         )
         raise ContractError(str(path), problem)
+
+
+def doubts(lake: Lake, *, referenced: bool) -> list[str]:
+    """What a user should know of the frames before a network learns from them; `referenced` as of `TrainingLoader`."""
+    drives, without = set(), []
+    for day in lake.partitions(TRAINING.name):
+        light = read_columns(lake, TRAINING, day, ("drive", "split", "reference"))
+        if referenced and "prior" in light["reference"]:
+            without.append(f"{day.vehicle} {day.day}")
+        else:
+            drives |= {
+                (day, d) for d, side in zip(light["drive"], light["split"], strict=True) if side == "train"
+            }
+    named = ", ".join(without[:5]) + (" ..." if len(without) > 5 else "")
+    left_out = (
+        f"left out, without a record of joint that is accepted or held for its sigma alone: {named}; run "
+    )
+    found = [left_out + "`boresight calibrate`, then `boresight prepare`"] if without else []
+    one = "all frames of side train are of one drive, so that a network learns that street: add drives"
+    return found + ([one] if len(drives) == 1 else [])
 
 
 def _leaks(

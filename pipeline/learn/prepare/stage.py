@@ -8,21 +8,20 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Generator, Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
-from pipeline.core.config import PrepareConfig
 from pipeline.core.errors import SolveError
 from pipeline.core.stage_work import Run, Task, Work
+from pipeline.learn.prepare.reference import reference_of, usable_records
 from pipeline.learn.prepare.sides import frame_sides, split_rule
 from pipeline.learn.prepare.split import SplitPlan, Unit
 from pipeline.learn.prepare.survey import Survey, survey_day
 from pipeline.learn.sample.frame_sample import About, SampleReason, SampleRejectedError, make_row
 from pipeline.rig.day_prior import prior_key, read_prior
-from pipeline.rig.estimates import Prior
 from pipeline.store.views import Chosen, frames_of, observations_of
-from schemas.calibrations import PAIRS, SENSORS
-from schemas.frames import Frame
+from schemas.calibrations import PAIRS, SENSORS, CalibrationRecord
 from schemas.observations import Observation
 from schemas.training import SAMPLED, TrainingRow
 
@@ -38,7 +37,12 @@ def work(task: Task) -> Work:
     prior, chosen = rig.prior, rig.one_of_each("training")
     survey = survey_day(task.partition, task.lake, config)
     sides, rejected = frame_sides(survey, plan, config)
-    settings = {"prior_file": prior_key(task.fleet, vehicle), "sides": [s or "" for s in sides]}
+    settings: dict[str, Any] = {
+        "prior_file": prior_key(task.fleet, vehicle),
+        "sides": [s or "" for s in sides],
+    }
+    records = usable_records(task.lake, task.partition, chosen)
+    settings["joint"] = {pair: row.work_key for pair, row in records.items()}
     settings |= {} if rig.three is None else {"three": rig.three}
     about = _about(survey, task.fleet.vehicle(vehicle).rig, sides)
     extra = {
@@ -51,7 +55,7 @@ def work(task: Task) -> Work:
     def rows(run: Run) -> Generator[TrainingRow, None, None]:
         run.rejected.update(rejected)
         run.extra |= extra
-        for seen, row in enumerate(_samples(task, about, chosen, run.rejected), 1):
+        for seen, row in enumerate(_samples(task, about, chosen, records, run.rejected), 1):
             run.progress(seen, len(about), "prepare")
             if row is not None:
                 run.kept.update((row.split, f"{row.split} {row.environment}"))
@@ -72,7 +76,11 @@ def _about(survey: Survey, rig: str, sides: Sequence[str | None]) -> dict[int, A
 
 
 def _samples(
-    task: Task, about: Mapping[int, About], chosen: Chosen, rejected: Counter[str]
+    task: Task,
+    about: Mapping[int, About],
+    chosen: Chosen,
+    records: Mapping[str, CalibrationRecord],
+    rejected: Counter[str],
 ) -> Iterator[TrainingRow | None]:
     """The row of each wanted frame in order; None, counted in `rejected`, if it gives no sample."""
     if not about:
@@ -92,7 +100,7 @@ def _samples(
     if prior is None or not all(prior.knows(pair) for pair in PAIRS):
         rejected[SampleReason.NO_PRIOR.value] += len(about)
         return
-    first = _logged_prior(observation)
+    first, reference = _logged_prior(observation), reference_of(records, prior)
     for frame in frames:
         while observation.frame_index < frame.frame_index:
             following = next(whole, None)
@@ -104,23 +112,16 @@ def _samples(
             yield None
             continue
         try:
-            yield _sample(frame, observation, prior, first, about[frame.frame_index], fleet.prepare)
+            _require_same(_logged_prior(observation), first)
+            yield make_row(frame, observation, reference, about[frame.frame_index], fleet.prepare)
         except SampleRejectedError as rejection:
             rejected[rejection.reason.value] += 1
             yield None
 
 
-def _sample(
-    frame: Frame,
-    observation: Observation,
-    prior: Prior,
-    first: np.ndarray,
-    about: About,
-    config: PrepareConfig,
-) -> TrainingRow:
-    if not np.allclose(_logged_prior(observation), first, atol=_SAME, rtol=0, equal_nan=True):
+def _require_same(logged: np.ndarray, first: np.ndarray) -> None:
+    if not np.allclose(logged, first, atol=_SAME, rtol=0, equal_nan=True):
         raise SampleRejectedError(SampleReason.PRIOR_CHANGED)
-    return make_row(frame, observation, prior, about, config)
 
 
 def _logged_prior(observation: Observation) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Maps of one label image on the camera's grid: classes, distances, boundaries, depth inside the sky.
+"""Maps of one label image on the camera's grid: classes and boundaries.
 
 Maps are computed on a fine grid of 0.1 deg and sampled at the centres of the cells, so large cells do not
 blur boundaries. On this grid a horizontal step is shorter than a vertical one by the cosine of the elevation:
@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import no_type_check
 
-import cv2
 import numba
 import numpy as np
 from jaxtyping import Bool, Float32, Int8, Int32, UInt8
@@ -20,13 +19,12 @@ from pipeline.learn.sample.grid import Grid, grid_rays
 from pipeline.learn.sample.layout import CLASS_CONFIDENCE
 from pipeline.objective.camera_lidar.image_maps import NO_BOUNDARY, boundary_offsets
 from pipeline.rig.cameras import Camera
-from schemas.training import CLASS_OF_LABEL, DISTANCE_GROUPS, GRID_CLASSES, NO_EDGE, UNKNOWN_CLASS
+from schemas.training import CLASS_OF_LABEL, GRID_CLASSES, NO_EDGE, UNKNOWN_CLASS
 
 __all__ = ["FINE_DEG", "CameraFeatures", "camera_features", "class_likelihood", "stored_grid"]
 
-FINE_DEG = 0.1  # one step of the stored distances
+FINE_DEG = 0.1
 _VOID_LABEL = 255
-_FARTHEST = 255  # 25.5 deg
 _EDGE_STEPS = 2  # boundaries are stored in halves of a fine cell: centres of cells lie between fine cells
 
 
@@ -35,9 +33,7 @@ class CameraFeatures:
     """Columns of table `training` computed from labels, as maps on the grid."""
 
     grid_class: UInt8[np.ndarray, "H W"]
-    class_distance: UInt8[np.ndarray, "6 H W"]
     edge_offset: Int8[np.ndarray, "4 H W"]
-    sky_depth: UInt8[np.ndarray, "H W"]
 
 
 def stored_grid(shape: tuple[int, int], step_deg: float) -> Grid:
@@ -51,12 +47,9 @@ def camera_features(labels: UInt8[np.ndarray, "Y X"], camera: Camera, grid: Grid
     fine = _sample_finely(labels, camera, grid)
     per_cell = round(grid.cell_deg / FINE_DEG)
     classes = CLASS_OF_LABEL[fine.labels]
-    distance = np.stack([_group_distance(classes, names, per_cell) for names in DISTANCE_GROUPS.values()])
     return CameraFeatures(
         _majority(classes, per_cell, len(GRID_CLASSES)),
-        distance,
         _edge_offsets(fine.labels, per_cell),
-        _sky_depth(classes, fine.seen, per_cell),
     )
 
 
@@ -109,47 +102,6 @@ def _pixels(
     seen = valid & (u >= 0) & (v >= 0) & (u < size[1]) & (v < size[0])
     index = np.where(seen, v * size[1] + u, 0).astype(np.int32)
     return index, seen
-
-
-def _group_distance(classes: np.ndarray, names: tuple[str, ...], per_cell: int) -> np.ndarray:
-    """Angle from each cell's centre to the nearest pixel of the group, in steps of the fine grid, 0..255."""
-    others = np.ones(classes.shape, np.uint8)
-    for name in names:
-        others[classes == GRID_CLASSES.index(name)] = 0
-    if others.all():
-        height, width = classes.shape
-        return np.full((height // per_cell, width // per_cell), _FARTHEST, np.uint8)
-    return _at_centres(_distance(others), per_cell)
-
-
-def _sky_depth(classes: np.ndarray, seen: np.ndarray, per_cell: int) -> np.ndarray:
-    """Angle from each cell's centre to the border of the sky; beyond the image the sky continues."""
-    inside = ((classes == GRID_CLASSES.index("sky")) | ~seen).astype(np.uint8)
-    if inside.all():
-        height, width = classes.shape
-        depth = np.full((height // per_cell, width // per_cell), _FARTHEST, np.uint8)
-    else:
-        depth = _at_centres(_distance(inside), per_cell)
-    shown = seen.reshape(depth.shape[0], per_cell, depth.shape[1], per_cell).all(axis=(1, 3))
-    return np.asarray(depth * shown, np.uint8)
-
-
-def _distance(mask: np.ndarray) -> np.ndarray:
-    """Distance to the border of the zeros, which is half a pixel before the centre of the first zero."""
-    to_centre = cv2.distanceTransform(mask, cv2.DIST_L2, cv2.DIST_MASK_5)
-    return np.maximum(to_centre - 0.5, 0.0)
-
-
-def _at_centres(fine: np.ndarray, per_cell: int) -> np.ndarray:
-    """Values at the cells' centres, rounded to bytes."""
-    first, second = (per_cell - 1) // 2, per_cell // 2  # the same fine cell where their number is odd
-    value = (
-        fine[first::per_cell, first::per_cell]
-        + fine[first::per_cell, second::per_cell]
-        + fine[second::per_cell, first::per_cell]
-        + fine[second::per_cell, second::per_cell]
-    ) / 4
-    return np.minimum(np.rint(value), _FARTHEST).astype(np.uint8)
 
 
 def _edge_offsets(labels: np.ndarray, per_cell: int) -> np.ndarray:

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Integer, UInt8
+from jaxtyping import Bool, Float, Float32, Int, Integer, UInt8
 from scipy.spatial import cKDTree
 
 from pipeline.core.config import PrepareConfig
-from pipeline.objective.paper.lidar_radar import drivable_map
 from pipeline.rig.scan_rows import rows_of
 from pipeline.rig.se3 import transform_points
 from pipeline.rig.spherical import camera_direction_angles, to_spherical
@@ -18,12 +17,21 @@ from schemas.frames import Frame
 from schemas.observations import Observation
 from schemas.training import POINT_IS_EDGE, POINT_IS_GROUND
 
-__all__ = ["View", "input_points", "lidar_columns", "padded_rows", "radar_columns", "range_edges"]
+__all__ = [
+    "View",
+    "input_points",
+    "lidar_columns",
+    "own_velocity",
+    "padded_rows",
+    "radar_columns",
+    "range_edges",
+]
 
 _NEAR_M, _FAR_M = 2.5, 120.0
+_SLOW_MPS = 3.0  # a slower car's Doppler shows no direction
 _SAME_POINT_M = 0.5  # a point of the sweep and its voxel's in the map are nearer than this
 _LOSS_RANGE_M = 80.0  # the paper's far limit
-_CLUSTERS, _DRIVABLE, _DETECTIONS, _TRACKS = 48, 512, 384, 24
+_CLUSTERS, _DETECTIONS, _TRACKS = 48, 384, 24
 # As in perception: a jump must exceed both, and a beam may be missing between the two.
 _JUMP_M, _JUMP_FRACTION, _JUMP_STEPS = 0.8, 0.06, 2.6
 
@@ -33,6 +41,7 @@ class View:
     """The camera's grid with a margin, at the guess T_camera_lidar; the margin covers errors of the guess."""
 
     T_camera_lidar: np.ndarray
+    T_lidar_radar: np.ndarray
     half_width_rad: float
     half_height_rad: float
     margin_rad: float
@@ -54,20 +63,19 @@ def lidar_columns(
     """Columns of table `training` computed from the lidar."""
     return (
         input_points(frame, observation, view, config.lidar_points, rng)
-        | _cluster_columns(observation, view, config.cluster_points, rng)
+        | _cluster_columns(observation, view)
         | _edge_columns(observation, view, config.edge_points, rng)
-        | _drivable_columns(observation, rng)
     )
 
 
 def input_points(
     frame: Frame, observation: Observation, view: View, count: int, rng: np.random.Generator
 ) -> dict[str, Any]:
-    """Input points of the sweep: at most one per cell of the grid, then others up to the array's size.
+    """Input points of the sweep at its stamp: at most one per cell of the grid, then others up to the array's size.
 
     The result does not depend on the camera's image; `view` only determines which points are kept.
     """
-    xyz = frame.lidar_xyz_m
+    xyz = _at_stamp(frame, observation, view.T_lidar_radar)
     flags = range_edges(xyz, frame.lidar_ring).astype(np.uint8) * POINT_IS_EDGE
     distance = np.linalg.norm(xyz, axis=1)
     angles = view.angles(xyz)
@@ -81,6 +89,31 @@ def input_points(
         "lidar_flags": padded_rows(flags[rows], count),
         "lidar_count": len(rows),
     }
+
+
+def own_velocity(
+    observation: Observation, T_lidar_radar: Float[np.ndarray, "4 4"]
+) -> Float[np.ndarray, " 3"]:
+    """Level velocity in the lidar frame [m/s]: the speed in the direction of the radar's Doppler, else along x."""
+    velocity, speed = observation.radar_velocity_mps, observation.ego_speed_mps or 0.0
+    ahead = np.array([1.0, 0.0])
+    if velocity is not None and np.isfinite(T_lidar_radar).all():
+        level = (T_lidar_radar[:3, :3] @ velocity)[:2]
+        ahead = (
+            np.sign(speed) * level / max(float(np.hypot(*level)), 1e-6) if abs(speed) > _SLOW_MPS else ahead
+        )
+    return speed * np.append(ahead, 0.0)
+
+
+def _at_stamp(
+    frame: Frame, observation: Observation, T_lidar_radar: Float[np.ndarray, "4 4"]
+) -> Float32[np.ndarray, "N 3"]:
+    """The sweep as perception saw it: moved to its stamp, if it was logged as measured and perception did so."""
+    time_s = frame.lidar_time_s
+    if frame.lidar_deskewed or time_s is None or observation.lidar_map_time_s is None:
+        return frame.lidar_xyz_m
+    moved = time_s.astype(np.float64)[:, None] * own_velocity(observation, T_lidar_radar)
+    return (frame.lidar_xyz_m + moved).astype(np.float32)
 
 
 def range_edges(
@@ -118,9 +151,6 @@ def radar_columns(observation: Observation, rng: np.random.Generator) -> dict[st
     picked = _some(len(observation.radar_xyz_m), _DETECTIONS, rng)
     power = observation.radar_power_db
     relative = np.zeros(len(picked)) if power is None else power[picked] - np.nanmedian(power)
-    soft = drivable_map(observation.radar_drivable_azimuth_rad, observation.radar_drivable_range_m)
-    ahead, across = soft.shape
-    metres = soft.reshape(ahead // 2, 2, across // 2, 2).mean(axis=(1, 3))
     return {
         "radar_xyz_m": padded_rows(observation.radar_xyz_m[picked], _DETECTIONS),
         "radar_residual_mps": padded_rows(np.nan_to_num(observation.radar_residual_mps[picked]), _DETECTIONS),
@@ -130,7 +160,6 @@ def radar_columns(observation: Observation, rng: np.random.Generator) -> dict[st
         "radar_has_elevation": observation.radar_has_elevation,
         "track_xyz_m": padded_rows(observation.radar_track_xyz_m[:_TRACKS], _TRACKS),
         "track_count": min(len(observation.radar_track_xyz_m), _TRACKS),
-        "radar_drivable": np.rint(np.clip(metres, 0, 1) * 255).astype(np.uint8),
     }
 
 
@@ -173,23 +202,14 @@ def _ranks(intensity: np.ndarray | None, count: int) -> UInt8[np.ndarray, " N"]:
     return np.rint(rank * (255.0 / max(count, 1))).astype(np.uint8)
 
 
-def _cluster_columns(
-    observation: Observation, view: View, count: int, rng: np.random.Generator
-) -> dict[str, Any]:
+def _cluster_columns(observation: Observation, view: View) -> dict[str, Any]:
     cloud, cluster = observation.lidar_map_xyz_m, observation.lidar_map_cluster
     distance = np.linalg.norm(cloud, axis=1)
     inside = (cluster >= 0) & (distance > _NEAR_M) & (distance < _LOSS_RANGE_M)
     inside &= view.contains(view.angles(cloud))
-    rows = np.flatnonzero(inside)
     # Clusters are numbered by size: the largest of those in view.
-    largest = np.unique(cluster[rows])[:_CLUSTERS]
-    number = np.full(len(observation.lidar_cluster_centre_m) + 1, -1, np.int16)
-    number[largest] = np.arange(len(largest))
-    picked = rows[_some(len(rows), count, rng)]
+    largest = np.unique(cluster[inside])[:_CLUSTERS]
     return {
-        "cluster_xyz_m": padded_rows(cloud[picked], count),
-        "cluster_id": padded_rows(number[cluster[picked]], count),
-        "cluster_point_count": len(picked),
         "cluster_centre_m": padded_rows(observation.lidar_cluster_centre_m[largest], _CLUSTERS),
         "cluster_count": len(largest),
     }
@@ -204,19 +224,7 @@ def _edge_columns(
         "edge_xyz_m": padded_rows(observation.lidar_edge_xyz_m[picked], count),
         "edge_side": padded_rows(observation.lidar_edge_side[picked], count),
         "edge_count": len(picked),
-    }
-
-
-def _drivable_columns(observation: Observation, rng: np.random.Generator) -> dict[str, Any]:
-    cells = observation.lidar_drivable_xyz_m
-    cells = cells[(np.linalg.norm(cells[:, :2], axis=1) < _LOSS_RANGE_M) & (cells[:, 0] > 0)]
-    picked = cells[_some(len(cells), _DRIVABLE, rng)]
-    plane = observation.ground_plane
-    return {
-        "drivable_xyz_m": padded_rows(picked, _DRIVABLE),
-        "drivable_count": len(picked),
-        "drivable_area_m2": float(len(cells)),  # on a grid of 1 m
-        "ground_plane": np.zeros(4) if plane is None else plane,
+        "ground_plane": np.zeros(4) if observation.ground_plane is None else observation.ground_plane,
     }
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 
 from pipeline.core.config import PrepareConfig
 from pipeline.learn.sample.camera_maps import camera_features, stored_grid
-from pipeline.learn.sample.clouds import View, lidar_columns, padded_rows, radar_columns
+from pipeline.learn.sample.clouds import View, lidar_columns, own_velocity, padded_rows, radar_columns
 from pipeline.learn.sample.grid import Grid, resample_camera
 from pipeline.objective.paper.classes import labels_of
 from pipeline.rig.cameras import Camera, camera_of
@@ -21,10 +21,11 @@ from pipeline.rig.estimates import Prior
 from pipeline.rig.spherical import camera_direction_angles
 from schemas.frames import Frame
 from schemas.observations import Observation
-from schemas.training import DISTANCE_GROUPS, TrainingRow
+from schemas.training import TrainingRow
 
 __all__ = [
     "About",
+    "Reference",
     "SampleReason",
     "SampleRejectedError",
     "decode_small",
@@ -75,20 +76,38 @@ class About:
     environment: str
 
 
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """Poses and clocks at which a day's losses look: of its record of `joint`, else those before the day.
+
+    Args:
+        poses: transforms of the three sensors.
+        name: "joint" or "prior".
+        dt_camera_lidar_s: stamp_camera = stamp_lidar + dt.
+        dt_lidar_radar_s: stamp_lidar = stamp_radar + dt.
+    """
+
+    poses: Prior
+    name: str = "prior"
+    dt_camera_lidar_s: float = 0.0
+    dt_lidar_radar_s: float = 0.0
+
+
 def make_row(
-    frame: Frame, observation: Observation, prior: Prior, about: About, config: PrepareConfig
+    frame: Frame, observation: Observation, reference: Reference, about: About, config: PrepareConfig
 ) -> TrainingRow:
     """The row of one frame, deterministic; raises SampleRejectedError if the frame shows too little."""
-    sensors = sensor_row(frame, observation, prior, about, config)
+    sensors = sensor_row(frame, observation, reference.poses, about, config)
     grid = stored_grid(config.grid.shape, config.grid.step_deg)
     camera = camera_of(observation)
     features = camera_features(labels_of(observation), camera, grid)
     return replace(
         sensors,
         grid_class=features.grid_class.ravel(),
-        class_distance=features.class_distance.reshape(len(features.class_distance), -1),
         edge_offset=features.edge_offset.reshape(4, -1),
-        sky_depth=features.sky_depth.ravel(),
+        reference=reference.name,
+        camera_lag_s=sensors.camera_lag_s - reference.dt_camera_lidar_s,
+        radar_lag_s=sensors.radar_lag_s + reference.dt_lidar_radar_s,
         **_detection_columns(observation, camera),
     )
 
@@ -126,9 +145,7 @@ def sensor_row(
         image=small[..., ::-1].transpose(2, 0, 1).reshape(3, -1),  # OpenCV decodes blue first
         grid_seen=seen.ravel(),
         grid_class=np.zeros(cells, np.uint8),
-        class_distance=np.zeros((len(DISTANCE_GROUPS), cells), np.uint8),
         edge_offset=np.zeros((4, cells), np.int8),
-        sky_depth=np.zeros(cells, np.uint8),
         detection_box_rad=np.zeros((_DETECTIONS, 4), np.float32),
         detection_count=0,
         **lidar,
@@ -172,8 +189,9 @@ def _decoded(blob: bytes, flag: int) -> np.ndarray | None:
 def _view(prior: Prior, grid: Grid) -> View:
     half = np.radians([grid.left_deg, grid.top_deg])
     return View(
-        prior.T_camera_lidar, float(half[0]), float(half[1]), _MARGIN_RAD, float(np.radians(grid.cell_deg))
-    )
+        prior.T_camera_lidar, prior.T_lidar_radar, float(half[0]), float(half[1]), _MARGIN_RAD,
+        float(np.radians(grid.cell_deg)),
+    )  # fmt: skip
 
 
 def _detection_columns(observation: Observation, camera: Camera) -> dict[str, Any]:
@@ -198,12 +216,14 @@ def _box_angles(boxes_px: Float[np.ndarray, "N 4"], camera: Camera) -> Float[np.
 
 
 def _reference_columns(observation: Observation, prior: Prior) -> dict[str, Any]:
-    """The camera, the clocks and the prior."""
+    """Own motion, the clocks as stamped, and the poses."""
     columns: dict[str, Any] = {
-        "ego_speed_mps": observation.ego_speed_mps or 0.0,
+        "reference": "prior",
+        "ego_velocity_mps": own_velocity(observation, prior.T_lidar_radar).astype(np.float32),
+        "ego_yaw_rate_radps": observation.ego_yaw_rate_radps or 0.0,
         "camera_lag_s": (observation.camera_stamp_ns - observation.stamp_ns) * 1e-9,
         "radar_lag_s": (observation.radar_stamp_ns - observation.stamp_ns) * 1e-9,
     }
     for pair in ("camera_lidar", "lidar_radar"):
-        columns |= pose_columns(prior.of(pair), f"prior_{pair}_")
+        columns |= pose_columns(prior.of(pair), f"reference_{pair}_")
     return columns

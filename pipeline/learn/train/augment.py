@@ -67,7 +67,7 @@ def turned_view(batch: TrainingBatch, R_turned_camera: Float[Tensor, "B 3 3"]) -
 
     Cells outside the stored grid are unseen and of unknown class.
     """
-    height, width = batch.sky_depth.shape[1:]
+    height, width = batch.grid_seen.shape[1:]
     step = batch.grid_step_deg * _RAD
     rays = _rays(height, width, step, R_turned_camera.device)
     # A ray of the turned grid comes from R^T ray of the stored one.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -16,12 +17,14 @@ from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import PAIRS
 from pipeline.learn.train.augment import Guess, random_guess, turned_view
 from pipeline.learn.train.domain_randomisation import made_strange
-from pipeline.learn.train.frame_objective import frame_objective, weighted
+from pipeline.learn.train.frame_objective import at_lag, frame_objective, weighted
 from pipeline.learn.train.paper_objective import PaperFrames
-from pipeline.learn.train.running_mean import DayMeans, uncertainty_loss
 from pipeline.learn.train.semantics_loss import class_of_points, semantics_loss
 from pipeline.learn.train.settings import PAIRS_OF, TrainConfig
+from pipeline.learn.train.uncertainty import twist_between, uncertainty_loss
 from pipeline.objective.differentiable.poses import pose, transform_points
+from pipeline.objective.differentiable.projection import GridProjection
+from pipeline.objective.differentiable.terms import class_evidence_cost
 
 __all__ = ["Passes", "StepLoss", "batch_loss"]
 
@@ -54,7 +57,6 @@ def batch_loss(
     passes: nn.Module,
     batch: TrainingBatch,
     config: TrainConfig,
-    day_means: DayMeans,
     generator: torch.Generator,
     network: CalibrationNetwork,
     *,
@@ -65,7 +67,6 @@ def batch_loss(
 
     Args:
         passes: a `Passes` of the network, bare or wrapped for data parallelism.
-        day_means: running mean of each day's answers; the batch's answers join it.
         matched: whether poses are estimated and judged, or encoders learn classes only.
         paper: if `loss.definition` is "paper": the inputs of its losses.
     """
@@ -75,18 +76,25 @@ def batch_loss(
     sensors = made_strange(sensor_inputs(view, grid), config.strange, generator)
     inputs = NetworkInputs(sensors, guess.T_camera_lidar, guess.T_camera_radar, guess.T_lidar_radar)
     answers: list[Predictions] = passes(inputs, matched=matched)
-    semantics = _semantics(answers, view, guess, batch, day_means, grid)
+    turned = pose(guess.R_turned_camera, torch.zeros_like(guess.R_turned_camera[..., 0]))
+    semantics = _semantics(answers, view, turned, grid)
     if not matched:
         loss = config.loss.semantics * semantics
         return StepLoss(loss, {"loss": loss.detach(), "semantics": semantics.detach()})
     pairs = PAIRS_OF[config.pairs]
     total, terms = _alignment(answers, guess, batch, config, paper)
-    uncertainty, scatter = _uncertainty(answers[-1], guess, batch, day_means)
-    loss = total + config.loss.semantics * semantics + config.uncertainty_weight * uncertainty
+    evidence = _evidence(answers, batch, turned, grid, generator)
+    uncertainty, twist = _uncertainty(answers[-1], guess, batch)
+    judged = total + config.loss.evidence * evidence
+    loss = judged + config.loss.semantics * semantics + config.uncertainty_weight * uncertainty
     report = {f"term/{name}": value.detach().mean() for name, value in terms.items()}
     report |= {"loss": loss.detach(), "alignment": total.detach(), "semantics": semantics.detach()}
-    report |= {"uncertainty": uncertainty.detach()}
-    report |= {f"scatter_deg/{pair}": scatter[i] * _DEG for i, pair in enumerate(PAIRS) if pair in pairs}
+    report |= {"uncertainty": uncertainty.detach(), "evidence": evidence.detach(), "judged": judged.detach()}
+    for i, pair in enumerate(PAIRS):
+        if pair in pairs:
+            turns_deg = twist[:, i, :3] * _DEG
+            report[f"scatter_deg/{pair}"] = turns_deg.square().sum(-1).mean().sqrt()
+            report |= {f"mean_deg/{pair}/{a}": turns_deg[:, k].mean() for k, a in enumerate("xyz")}
     return StepLoss(loss, report)
 
 
@@ -115,40 +123,43 @@ def _alignment(
     return total, terms
 
 
-def _semantics(
-    answers: list[Predictions],
-    view: TrainingBatch,
-    guess: Guess,
-    batch: TrainingBatch,
-    day_means: DayMeans,
-    grid: Grid,
-) -> Tensor:
-    """Cross-entropy of the encoders; each day's running mean carries the classes to points."""
-    turned = pose(guess.R_turned_camera, torch.zeros_like(guess.R_turned_camera[..., 0]))
+def _semantics(answers: list[Predictions], view: TrainingBatch, turned: Tensor, grid: Grid) -> Tensor:
+    """Cross-entropy of the encoders; the reference carries the classes to points as the image saw them."""
     grid_class = crop(view.grid_class, view.grid_step_deg, grid)
-    clouds = (batch.lidar_xyz_m, batch.lidar_valid), (batch.radar_xyz_m, batch.radar_valid)
-    priors = batch.T_camera_lidar, batch.T_camera_radar
-    of_points = []
-    for k, ((xyz, valid), prior) in enumerate(zip(clouds, priors, strict=True)):
-        T = turned @ day_means.pose(_days(batch), k, prior)
-        of_points.append(class_of_points(grid_class, transform_points(T, xyz), valid, grid))
+    lidar = at_lag(view, view.lidar_xyz_m, view.camera_lag_s)
+    of_points = [
+        class_of_points(grid_class, transform_points(turned @ T, xyz), valid, grid)
+        for T, xyz, valid in (
+            (view.T_camera_lidar, lidar, view.lidar_valid),
+            (view.T_camera_radar, view.radar_xyz_m, view.radar_valid),
+        )
+    ]
     # The camera's logits are the same in all passes; the lidar is rendered anew in each.
     return torch.stack([semantics_loss(a, grid_class, *of_points) for a in answers]).mean()
 
 
-def _uncertainty(
-    answer: Predictions, guess: Guess, batch: TrainingBatch, day_means: DayMeans
-) -> tuple[Tensor, Tensor]:
-    """Negative log-likelihood of the scatter, and the root mean square of its angles by pair [rad]."""
+def _evidence(
+    answers: list[Predictions],
+    batch: TrainingBatch,
+    turned: Tensor,
+    grid: Grid,
+    generator: torch.Generator,
+) -> Tensor:
+    """Loss of the passes' evidence at the day's reference; 0 for networks without any."""
+    total, T = torch.zeros((), device=batch.T_camera_lidar.device), turned @ batch.T_camera_lidar
+    left, top, step = (math.radians(deg) for deg in (grid.left_deg, grid.top_deg, grid.cell_deg))
+    projection = GridProjection(step / 2 - left, step / 2 - top, step)
+    for e in (answer.evidence for answer in answers if answer.evidence is not None):
+        points = transform_points(T, at_lag(batch, e.points_m, batch.camera_lag_s))
+        cost = class_evidence_cost(projection, points, e.maps, e.probability, e.worth, generator)
+        total = total + cost / len(answers)
+    return total
+
+
+def _uncertainty(answer: Predictions, guess: Guess, batch: TrainingBatch) -> tuple[Tensor, Tensor]:
+    """Negative log-likelihood of the answers' scatter, and their twists about the reference."""
     camera = guess.unturned(answer.T_camera_lidar), guess.unturned(answer.T_camera_radar)
-    answers = torch.stack([*camera, answer.T_lidar_radar], 1)
+    answers = torch.stack([*camera, answer.T_lidar_radar], 1).detach()
     references = torch.stack([batch.T_camera_lidar, batch.T_camera_radar, batch.T_lidar_radar], 1)
-    days = _days(batch)
-    known = torch.tensor(day_means.known(days), device=answers.device).float()
-    scatter = day_means.scatter(days, answers, references)
-    apart = scatter[..., :3].square().sum(-1).mean(0).sqrt()
-    return uncertainty_loss(answer.log_variance, scatter, known), apart
-
-
-def _days(batch: TrainingBatch) -> list[str]:
-    return [f"{vehicle}/{day}" for vehicle, day in zip(batch.vehicle, batch.day, strict=True)]
+    twist = twist_between(answers, references)
+    return uncertainty_loss(answer.log_variance, twist), twist

@@ -1,7 +1,7 @@
 """Training loss of a batch: terms of the three pairs and the loop, as in the estimator's objective.
 
 Angles in degrees, translations in metres, per-frame means over valid rows. No term uses a true transform: the
-reference only decides which points the camera sees for certain.
+reference is what `joint` found on the day, or the prior.
 
 Source: paper section 4.4 (SSL minimises L_P + L_G); edges, static points and the prior's term are new here.
 """
@@ -15,10 +15,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pipeline.learn.batches.batch import TrainingBatch
-from pipeline.learn.train.running_mean import twist_between
 from pipeline.learn.train.settings import PAIRS_OF, LossConfig
-from pipeline.objective.differentiable.paper import smooth_iou
-from pipeline.objective.differentiable.poses import inverse, loop_loss, transform_points
+from pipeline.learn.train.uncertainty import twist_between
+from pipeline.objective.differentiable.poses import exp_so3, loop_loss, transform_points
 from pipeline.objective.differentiable.projection import GridProjection, nearest_pixel
 from pipeline.objective.differentiable.static import (
     StaticFrames,
@@ -30,34 +29,26 @@ from pipeline.objective.differentiable.terms import (
     DEG,
     GridMaps,
     RadarTracks,
-    cluster_class_cost,
     edge_cost,
-    sky_cost,
     track_cluster_cost,
     track_detection_cost,
 )
 
-__all__ = ["PAIR_OF_TERM", "FrameObjective", "frame_objective"]
+__all__ = ["PAIR_OF_TERM", "FrameObjective", "at_lag", "frame_objective"]
 
 PAIR_OF_TERM = {
-    "classes": "camera_lidar",
     "edges": "camera_lidar",
-    "sky": "camera_lidar",
     "tracks_camera": "camera_radar",
-    "radar_sky": "camera_radar",
     "static": "lidar_radar",
     "tracks_lidar": "lidar_radar",
-    "drivable": "lidar_radar",
     "loop": "joint",
     "prior_camera_lidar": "camera_lidar",
     "prior_camera_radar": "camera_radar",
     "prior_lidar_radar": "lidar_radar",
 }
 _MARGIN_DEG = 3.0  # how wrong the reference may be, where points must lie in view
-_RADAR_SKY_FREE_DEG = 2.0  # radar elevation is noisy: only detections this deep in the sky count as wrong
 _LOOP_METRE = 5.0  # 0.2 m counts as a degree, by which it moves what is 11 m away
 _PRIOR_ROUND_DEG = 0.05  # below this the absolute value is rounded off
-_RADAR_CELL_M = 1.0  # of the stored drivable map
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,9 +57,7 @@ class FrameObjective:
 
     batch: TrainingBatch
     maps: GridMaps
-    cluster_in_view: Bool[Tensor, "B C"]
     edge_in_view: Bool[Tensor, "B E"]
-    radar_in_view: Bool[Tensor, "B R"]
     centres_rad: Float[Tensor, "B G 2"]
     tracks: RadarTracks
     radar_tells_elevation: Bool[Tensor, "B R"]
@@ -81,11 +70,13 @@ class FrameObjective:
         pairs: tuple[str, ...] = PAIRS_OF["joint"],
     ) -> dict[str, Float[Tensor, "*batch B"]]:
         """Every term of the pairs (`joint`: the loop) and frames, unweighted, by the names of PAIR_OF_TERM."""
-        found: dict[str, Tensor] = {}
+        found, b = dict[str, Tensor](), self.batch
         if "camera_lidar" in pairs:
-            found |= self._camera_lidar(T_camera_lidar)
+            edge, side = at_lag(b, b.edge_xyz_m, b.camera_lag_s), b.edge_side.long()
+            found["edges"] = edge_cost(self.maps, T_camera_lidar, edge, side, self.edge_in_view)
         if "camera_radar" in pairs:
-            found |= self._camera_radar(T_camera_radar)
+            seen = self.centres_rad, b.detection_valid
+            found["tracks_camera"] = track_detection_cost(T_camera_radar, self.tracks, *seen)
         if "lidar_radar" in pairs:
             found |= self._lidar_radar(T_lidar_radar)
         if "joint" in pairs:
@@ -93,69 +84,35 @@ class FrameObjective:
                 T_camera_lidar, T_lidar_radar, T_camera_radar, angle_unit=DEG, metre_unit=_LOOP_METRE
             )
         poses = {
-            "camera_lidar": (T_camera_lidar, self.batch.T_camera_lidar),
-            "camera_radar": (T_camera_radar, self.batch.T_camera_radar),
-            "lidar_radar": (T_lidar_radar, self.batch.T_lidar_radar),
+            "camera_lidar": (T_camera_lidar, b.T_camera_lidar),
+            "camera_radar": (T_camera_radar, b.T_camera_radar),
+            "lidar_radar": (T_lidar_radar, b.T_lidar_radar),
         }
         return found | {f"prior_{pair}": _from_prior(*poses[pair]) for pair in pairs if pair in poses}
 
-    def _camera_lidar(self, T: Tensor) -> dict[str, Tensor]:
-        b = self.batch
-        cluster, edge = (_at_lag(b, points, b.camera_lag_s) for points in (b.cluster_xyz_m, b.edge_xyz_m))
-        most = b.cluster_centre_m.shape[1]
-        return {
-            "classes": cluster_class_cost(
-                self.maps, T, cluster, b.cluster_id.long(), self.cluster_in_view, most
-            ),
-            "edges": edge_cost(self.maps, T, edge, b.edge_side.long(), self.edge_in_view),
-            "sky": sky_cost(self.maps, T, cluster, self.cluster_in_view),
-        }
-
-    def _camera_radar(self, T: Tensor) -> dict[str, Tensor]:
-        b = self.batch
-        return {
-            "tracks_camera": track_detection_cost(T, self.tracks, self.centres_rad, b.detection_valid),
-            "radar_sky": sky_cost(self.maps, T, b.radar_xyz_m, self.radar_in_view, _RADAR_SKY_FREE_DEG),
-        }
-
     def _lidar_radar(self, T: Tensor) -> dict[str, Tensor]:
         b = self.batch
-        lidar, still = _at_lag(b, b.lidar_xyz_m, b.radar_lag_s), b.radar_valid & (b.radar_motion == 0)
+        lidar, still = at_lag(b, b.lidar_xyz_m, b.radar_lag_s), b.radar_valid & (b.radar_motion == 0)
         frames = StaticFrames(
             b.radar_xyz_m, still, lidar, b.lidar_valid, b.ground_plane, self.radar_tells_elevation
         )
         return {
             "static": static_cost(T, frames),
             "tracks_lidar": track_cluster_cost(T, self.tracks, b.cluster_centre_m, b.cluster_valid),
-            "drivable": self._drivable(T),
         }
-
-    def _drivable(self, T_lidar_radar: Tensor) -> Tensor:
-        """1 - IoU; 0 where a frame lacks one of the areas."""
-        b = self.batch
-        soft = b.radar_drivable.float() / 255
-        area = soft.sum((1, 2)) * _RADAR_CELL_M**2
-        seen = transform_points(inverse(T_lidar_radar), b.drivable_xyz_m)
-        lidar_area = b.drivable_area_m2.to(soft.dtype)
-        iou = smooth_iou(seen, b.drivable_valid, lidar_area, soft, area, _RADAR_CELL_M)
-        return (1 - iou) * ((area > 0) & (lidar_area > 0))
 
 
 def frame_objective(batch: TrainingBatch) -> FrameObjective:
     """Prepare the objective of a batch, on the batch's device."""
     step_rad = batch.grid_step_deg / DEG
-    height, width = batch.sky_depth.shape[1:]
+    height, width = batch.grid_seen.shape[1:]
     projection = GridProjection(-(width - 1) / 2 * step_rad, -(height - 1) / 2 * step_rad, step_rad)
-    maps = GridMaps(
-        batch.class_distance, batch.edge_offset, batch.sky_depth, batch.grid_seen.bool(), projection
-    )
+    maps = GridMaps(batch.edge_offset, batch.grid_seen.bool(), projection)
     box = batch.detection_box_rad
     return FrameObjective(
         batch,
         maps,
-        batch.cluster_point_valid & _surely_in_view(maps, batch.T_camera_lidar, batch.cluster_xyz_m),
         batch.edge_valid & _surely_in_view(maps, batch.T_camera_lidar, batch.edge_xyz_m),
-        batch.radar_valid & _surely_in_view(maps, batch.T_camera_radar, batch.radar_xyz_m),
         torch.stack([(box[..., 0] + box[..., 2]) / 2, (box[..., 1] + box[..., 3]) / 2], -1),
         RadarTracks(batch.track_xyz_m, batch.track_valid, batch.radar_has_elevation),
         tells_elevation(
@@ -170,11 +127,10 @@ def frame_objective(batch: TrainingBatch) -> FrameObjective:
 def _from_prior(
     T: Float[Tensor, "*batch 4 4"], T_prior: Float[Tensor, "*batch 4 4"]
 ) -> Float[Tensor, "*batch"]:
-    """Distance of a pose to the day's prior: absolute angles [deg] and shifts (a metre as in the loop), smooth at 0.
+    """Distance of a pose to the reference: absolute angles [deg] and shifts (a metre as in the loop), smooth at 0.
 
-    Absolute values, not squares: over a fleet, the priors' errors cancel in the median. The small constant
-    gradient keeps undetermined axes at the prior (a shift along the camera's axis, a radar's height), which
-    the bias of another term would move; determined axes have larger gradients.
+    Absolute values, not squares: over a fleet, the references' errors cancel in the median, and the bias of another
+    term moves no axis as long as its gradient is smaller.
     """
     twist = twist_between(T, T_prior.to(T.dtype))
     scaled = torch.cat([twist[..., :3] * DEG, twist[..., 3:] * _LOOP_METRE], -1)
@@ -197,13 +153,12 @@ def _weight(weights: LossConfig, name: str) -> float:
     return float(weights.prior if name.startswith("prior_") else getattr(weights, name))
 
 
-def _at_lag(batch: TrainingBatch, points: Float[Tensor, "B N 3"], lag_s: Float[Tensor, " B"]) -> Tensor:
-    """Static points in the lidar frame `lag_s` later, when another sensor measures: the car has moved.
-
-    A constant time offset that stamps do not show remains as a shift along the direction of travel.
-    """
-    ahead = (batch.ego_speed_mps * lag_s)[:, None]
-    return torch.stack([points[..., 0] - ahead, points[..., 1], points[..., 2]], -1)
+def at_lag(batch: TrainingBatch, points: Float[Tensor, "B N 3"], lag_s: Float[Tensor, " B"]) -> Tensor:
+    """Static points in the lidar frame `lag_s` later, when another sensor measures: the car has moved and turned."""
+    moved = points - (batch.ego_velocity_mps * lag_s[:, None])[:, None]
+    turn = torch.zeros_like(batch.ego_velocity_mps)
+    turn[:, 2] = -batch.ego_yaw_rate_radps * lag_s
+    return moved @ exp_so3(turn).transpose(1, 2)
 
 
 def _surely_in_view(maps: GridMaps, T: Tensor, points: Tensor) -> Tensor:

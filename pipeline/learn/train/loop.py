@@ -207,7 +207,7 @@ class Run(ABC):
         return True
 
     def validate(self, folder: Path, log: MetricsLog | None) -> None:  # noqa: B027 - not every run validates
-        """Called after every step."""
+        """Called at the start and after every step."""
 
     def state(self) -> dict[str, Any]:
         """Content of a checkpoint; every process must call this."""
@@ -276,6 +276,8 @@ def run_loop(
     def samples_since(step: int) -> int:
         return (run.step - step) * config.batch_size * processes.count
 
+    if run.step == 0:
+        run.validate(folder, log)
     while not run.finished:
         now = time.monotonic()
         run.trained_s, tick = run.trained_s + now - tick, now

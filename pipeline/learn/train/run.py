@@ -41,7 +41,6 @@ from pipeline.learn.train.loop import (
 )
 from pipeline.learn.train.paper_objective import PaperFrames, with_paper_inputs
 from pipeline.learn.train.processes import Processes, joined
-from pipeline.learn.train.running_mean import DayMeans
 from pipeline.learn.train.settings import TrainConfig
 from pipeline.store.partitions import Lake
 
@@ -57,7 +56,10 @@ class BatchStream:
 
     def __init__(self, data: str, config: TrainConfig, processes: Processes) -> None:
         rank_of = (processes.rank, processes.count)
-        self._loader = TrainingLoader(Lake.at(data), config.batch_size, seed=config.seed, rank_of=rank_of)
+        self._loader = TrainingLoader(
+            Lake.at(data), config.batch_size, seed=config.seed, rank_of=rank_of,
+            referenced=config.needs_reference,
+        )  # fmt: skip
         self._device, self._place = processes.device, self._loader.state_dict()
         self._ahead = ThreadPoolExecutor(1, "next-batch") if self._device.type == "cuda" else None
         self._next: Future[tuple[TrainingBatch, dict[str, Any]]] | None = None
@@ -117,7 +119,7 @@ class RunState(Run):
         if processes.count > 1:
             # A pair's network uses a part of the encoders only.
             self.passes = DistributedDataParallel(self.passes, find_unused_parameters=True)
-        self.day_means, self.best = DayMeans(), math.inf
+        self.best = math.inf
         self.held_out = _held_out(data, config) if processes.leads else None
         super().__init__(network, config, _steps(config, stream.frames, processes.count), processes)
 
@@ -135,41 +137,40 @@ class RunState(Run):
     def losses(self) -> dict[str, Tensor]:
         """Losses of the step's batch, from random guesses."""
         found = batch_loss(
-            self.passes, self.stream.batch(), self.config, self.day_means,
+            self.passes, self.stream.batch(), self.config,
             _generator(self.config.seed, self.step, self.processes.rank), self.network,
             matched=self.comparable(), paper=self.paper,
         )  # fmt: skip
         return found.report | {"loss": found.loss}
 
     def validate(self, folder: Path, log: MetricsLog | None) -> None:
-        """At intervals, report the losses of held-out frames from the same guesses; keep the best weights."""
+        """At the start and at intervals, judge held-out frames from the same guesses; keep the best weights.
+
+        The start is judged like what follows, so that no checkpoint is kept that is worse than it.
+        """
         frames, sums = self.held_out, dict[str, float]()
         if frames is None or not (self.step % self.config.validate_every == 0 or self.finished):
             return
         passes, generator = Passes(self.network, self.config.iterations), torch.Generator()
         generator.manual_seed(_VALIDATION_SEED)
-        day_means = DayMeans()
         self.network.eval()
         with torch.no_grad():
             for first in range(0, len(frames), 16):
                 part = frames[first : first + 16].to(self.processes.device)
-                found = batch_loss(
-                    passes, part, self.config, day_means, generator, self.network, paper=self.paper
-                )
+                found = batch_loss(passes, part, self.config, generator, self.network, paper=self.paper)
                 for name, value in found.report.items():
                     sums[name] = sums.get(name, 0.0) + float(value) * len(part) / len(frames)
         self.network.train()
         if log is not None:
             log.report(self.step, {f"validation/{name}": value for name, value in sums.items()})
-        if sums["alignment"] < self.best:
-            self.best = sums["alignment"]
-            content = {"network": self.network.state_dict(), "step": self.step, "alignment": self.best}
+        if sums["judged"] < self.best:
+            self.best = sums["judged"]
+            content = {"network": self.network.state_dict(), "step": self.step, "judged": self.best}
             save_checkpoint(folder / BEST, self._about() | content)
 
     def state(self) -> dict[str, Any]:
         """Content of a checkpoint; every process must call this."""
-        # "consensus": name of the running day means in checkpoints of format 1.
-        own = {"stream": self.stream.state_dict(), "consensus": self.day_means.state_dict()}
+        own = {"stream": self.stream.state_dict()}
         everyone = {"processes": self.processes.gather(own), "best": self.best}
         return super().state() | self._about() | everyone
 
@@ -181,7 +182,6 @@ class RunState(Run):
         super().load(state)
         own = state["processes"][self.processes.rank]
         self.stream.load_state_dict(own["stream"])
-        self.day_means.load_state_dict(own["consensus"])
         self.best = float(state["best"])
 
     def _about(self) -> dict[str, Any]:
@@ -275,7 +275,9 @@ def _steps(config: TrainConfig, frames: int, processes: int) -> int:
 def _held_out(data: str, config: TrainConfig) -> TrainingBatch | None:
     """Frames to validate on; None if the data has none."""
     try:
-        return load_split(Lake.at(data), "val", limit=config.validation_frames)
+        return load_split(
+            Lake.at(data), "val", limit=config.validation_frames, referenced=config.needs_reference
+        )
     except ContractError:
         return None
 

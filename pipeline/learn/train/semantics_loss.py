@@ -1,8 +1,6 @@
-"""Loss of the encoders: the camera's precomputed classes, carried to lidar and radar points by a guess.
+"""Loss of the encoders: the camera's precomputed classes, carried to lidar and radar points by the day's reference.
 
-Lidar semantics are not needed: a point takes the class of its image cell. A wrong guess blurs these labels,
-but does not bias them over a fleet. Once the network's own estimate is better than the day's prior, it is the
-guess.
+Lidar semantics are not needed: a point takes the class of its image cell.
 """
 
 from __future__ import annotations
@@ -43,11 +41,7 @@ def semantics_loss(
     lidar_class: Int64[Tensor, "B N"],
     radar_class: Int64[Tensor, "B M"],
 ) -> Float[Tensor, ""]:
-    """Cross-entropy of all encoders of one pass; 0 for networks without any.
-
-    `grid_class` is cropped as the image was; the classes of lidar points and detections are by
-    `class_of_points`.
-    """
+    """Cross-entropy of all encoders of one pass, 0 without any; `grid_class` is cropped as the image was."""
     loss = torch.zeros((), device=grid_class.device)
     if predictions.camera_logits is not None:
         loss = loss + _cross_entropy(predictions.camera_logits, grid_class.long())

@@ -12,35 +12,30 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int8, Int64, UInt8
+from jaxtyping import Bool, Float, Int8, Int64
 from torch import Tensor
+from torch.nn import functional as F  # noqa: N812 - the name that everybody uses
 
 from pipeline.objective.camera_lidar.image_maps import NO_BOUNDARY
-from pipeline.objective.differentiable.poses import transform_points
+from pipeline.objective.differentiable.poses import exp_so3, transform_points
 from pipeline.objective.differentiable.projection import (
     GridProjection,
-    bilinear_groups,
     masked_mean,
     nearest_pixel,
 )
-from pipeline.objective.paper.camera_lidar import SCALE_RAD as CLASS_SCALE_RAD
 from pipeline.objective.radar.registration import SIGMA_START
 
 __all__ = [
     "GridMaps",
     "RadarTracks",
-    "cluster_class_cost",
+    "class_evidence_cost",
     "edge_cost",
     "edge_residuals_px",
-    "sky_cost",
     "track_cluster_cost",
     "track_detection_cost",
 ]
 
 DEG = 180.0 / torch.pi
-# The paper loss's robust scale: there its cost is four fifths of all.
-CLASS_CLAMP_DEG = 2 * CLASS_SCALE_RAD * DEG
-_CLASS_TAU_DEG = 0.1  # of the soft choice of a cluster's class
 EDGE_CLAMP_DEG = 4.0  # evidence: convex to +-4 deg
 # Most jumps match no boundary. What they add to a wide cost biases it (roll by 0.3, yaw by 0.15 deg on a simulated
 # highway). Sharp kernels of the shape that `camera_lidar.edges` uses halve that; a share of the wide one leads to them.
@@ -50,16 +45,18 @@ DETECTION_TAU_DEG, DETECTION_CLAMP_DEG = 0.5, 8.0
 CLUSTER_TAU_M, CLUSTER_CLAMP_M = 0.3, 5.0
 # Weight of elevation: azimuth sigma over elevation sigma of a radar; ground bounce biases elevations as well.
 _ELEVATION_WEIGHT = float(SIGMA_START[0] / SIGMA_START[1])
-DISTANCE_STEP_DEG, OFFSET_STEP_DEG = 0.1, 0.05  # of the stored maps
+OFFSET_STEP_DEG = 0.05  # of the stored maps
+# Poses beside the reference: standard deviation of their turns about the camera's axes (right, down, ahead), and how
+# many, each with its opposite.
+_BESIDE_DEG, _BESIDE = (0.5, 0.5, 1.0), 6
+_EVIDENCE_WORTH = 30.0  # of a frame's mean log-likelihood, as days of it show
 
 
 @dataclass(frozen=True, eq=False)
 class GridMaps:
     """Maps of F frames on one equirectangular grid in the optical frame; steps as in `schemas.training`."""
 
-    class_distance: UInt8[Tensor, "F G H W"]
     edge_offset: Int8[Tensor, "F 4 H W"]
-    sky_depth: UInt8[Tensor, "F H W"]
     seen: Bool[Tensor, "F H W"]  # the camera sees this cell
     projection: GridProjection
 
@@ -76,38 +73,6 @@ class GridMaps:
         row, column, inside = nearest_pixel(self.size, uv, valid)
         frame = torch.arange(len(self.seen), device=uv.device)[:, None]
         return uv, inside & self.seen[frame, row, column]
-
-
-def cluster_class_cost(
-    maps: GridMaps,
-    T_camera_lidar: Float[Tensor, "*batch #F 4 4"],
-    points: Float[Tensor, "F N 3"],
-    cluster: Int64[Tensor, "F N"],
-    present: Bool[Tensor, "F N"],
-    clusters: int,
-) -> Float[Tensor, "*batch F"]:
-    """Distance of lidar clusters to objects of the ONE reflecting class that fits each cluster best at this pose [deg].
-
-    If neighbouring objects differ in class, this cost is steeper than that of the union of classes. It needs
-    no lidar semantics. A point out of view costs as much as one far from any object.
-
-    Args:
-        cluster: which cluster, below `clusters`; -1 counts as a cluster of its own kind.
-    """
-    uv, seen = maps.pixels(T_camera_lidar, points)
-    distance = bilinear_groups(maps.class_distance, uv, seen) * DISTANCE_STEP_DEG
-    far = torch.full_like(distance, CLASS_CLAMP_DEG)
-    cost = torch.where(seen[..., None], soft_clamp(distance, CLASS_CLAMP_DEG), far)
-    cost = cost * present.to(cost.dtype)[..., None]
-    index = torch.where(cluster < 0, torch.full_like(cluster, clusters), cluster)
-    batch = cost.shape[:-2]
-    by_cluster = cost.new_zeros(*batch, clusters + 1, cost.shape[-1])
-    by_cluster = by_cluster.scatter_add(-2, index[..., None].expand_as(cost), cost)
-    count = present.to(cost.dtype).new_zeros(len(points), clusters + 1)
-    count = count.scatter_add(-1, index, present.to(cost.dtype))
-    mean = by_cluster / count.clamp_min(1)[..., None]
-    best = soft_minimum(mean, _CLASS_TAU_DEG)
-    return (best * count).sum(-1) / count.sum(-1).clamp_min(1)
 
 
 def edge_cost(
@@ -162,20 +127,36 @@ def edge_residuals_px(
     return offset.to(uv.dtype) * step_px + shift_px + (centre - at), inside & (offset != NO_BOUNDARY)
 
 
-def sky_cost(
-    maps: GridMaps,
-    T_camera_points: Float[Tensor, "*batch #F 4 4"],
-    points: Float[Tensor, "F N 3"],
-    present: Bool[Tensor, "F N"],
-    free_deg: float = 0.0,
-) -> Float[Tensor, "*batch F"]:
-    """Depth of points inside the sky's mask beyond `free_deg`, 0 outside [deg]: the sky has no echoes.
+def class_evidence_cost(
+    projection: GridProjection,
+    points_camera: Float[Tensor, "F N 3"],
+    maps: Float[Tensor, "F K H W"],
+    probability: Float[Tensor, "F N K"],
+    weight: Float[Tensor, "F N"],
+    generator: torch.Generator,
+) -> Float[Tensor, ""]:
+    """Negative log-probability of a reference pose, against poses turned to opposite sides of it; mean over frames.
 
-    It is a constraint, not an alignment term, because it only moves points downwards.
+    A day's fit sums over frames how well classified points lie on a camera's likelihoods. Where the sum of a frame
+    prefers the reference to all other poses, it has no slope there.
+
+    Args:
+        points_camera: points at the reference.
+        maps: log-likelihood of classes.
+        probability: of each point's classes.
+
+    Source: van den Oord et al. 2018, "Representation learning with contrastive predictive coding".
     """
-    uv, seen = maps.pixels(T_camera_points, points)
-    depth = bilinear_groups(maps.sky_depth[:, None], uv, seen)[..., 0] * DISTANCE_STEP_DEG
-    return masked_mean(torch.where(seen, (depth - free_deg).clamp_min(0), torch.zeros_like(depth)), present)
+    sigma = torch.tensor(_BESIDE_DEG) / DEG
+    turns = exp_so3(torch.randn(_BESIDE, 3, generator=generator) * sigma)
+    R = torch.cat([torch.eye(3)[None], turns, turns.transpose(1, 2)]).to(points_camera)
+    uv, ahead = projection.project(torch.einsum("kij,fnj->fkni", R, points_camera))
+    size = uv.new_tensor([maps.shape[3], maps.shape[2]])
+    found = F.grid_sample(maps, (2 * uv + 1) / size - 1, padding_mode="border", align_corners=False)
+    weight = weight * ahead[:, 0]
+    fitting = torch.einsum("fckn,fnc,fn->fk", found, probability, weight)
+    scores = _EVIDENCE_WORTH * fitting / weight.sum(1, keepdim=True).clamp_min(1e-3)
+    return -torch.log_softmax(scores, 1)[:, 0].mean()
 
 
 @dataclass(frozen=True, eq=False)

@@ -91,7 +91,7 @@ def test_a_batch_holds_what_the_rows_hold(lake):
     assert batch.lidar_valid[3].sum() == row.lidar_count
     assert not batch.lidar_xyz_m[3][~batch.lidar_valid[3]].any()
     assert batch.track_valid.sum(1).tolist() == [r.track_count for r in rows]
-    assert batch.T_camera_lidar[3, 0, 3] == pytest.approx(row.prior_camera_lidar_tx_m)
+    assert batch.T_camera_lidar[3, 0, 3] == pytest.approx(row.reference_camera_lidar_tx_m)
     assert torch.allclose(batch.T_camera_lidar[:, :3, :3].det(), torch.ones(10))
     some = batch.take(torch.tensor([7, 3]))
     assert names(some) == [names(batch)[7], names(batch)[3]]

@@ -8,6 +8,8 @@ import pytest
 import torch
 
 from jobs.cli import main
+from pipeline.core.config import LearnConfig, PrepareConfig
+from pipeline.learn.infer.onnx_networks import open_networks
 from pipeline.learn.infer.single_frame import SingleFrameCalibrator
 from pipeline.learn.network.calibration_network import build_network
 from pipeline.learn.sample.grid import Grid
@@ -29,7 +31,7 @@ def run(tmp_path_factory):
         "grid": asdict(Grid()),
         "network": network.state_dict(),
     }
-    save_checkpoint(folder / BEST, state | {"step": 40, "alignment": 1.0})
+    save_checkpoint(folder / BEST, state | {"step": 40, "judged": 1.0})
     save_checkpoint(folder / LAST, state | {"step": 60, "trained_s": 120.0})
     reports = [
         {"step": 20, "validation/loss": 3.0},
@@ -58,17 +60,25 @@ def test_a_run_becomes_a_file_with_its_card(run, tmp_path, capsys):
     assert card["limits"]
 
 
-@pytest.mark.parametrize(("steps", "is_told"), [(6, True), (500, False)])
-def test_a_network_that_was_hardly_trained_is_called_unfit_on_the_screen_and_on_its_card(
-    run, tmp_path, capsys, steps, is_told
+@pytest.mark.parametrize(
+    ("best", "why"), [(40, None), (0, "better on held-out frames"), (None, "no held-out frames")]
+)
+def test_a_network_that_held_out_frames_did_not_choose_is_called_unfit_wherever_it_goes(
+    run, tmp_path, capsys, best, why
 ):
-    hardly = tmp_path / "hardly"
-    shutil.copytree(run, hardly)
-    save_checkpoint(hardly / LAST, load_checkpoint(run / LAST) | {"step": steps})
-    assert main(["export", "onnx", "--run", str(hardly), "--out", str(tmp_path / "m.onnx")]) == 0
-    assert ("Not fit for use" in capsys.readouterr().err) == is_told
+    folder, notes = shutil.copytree(run, tmp_path / "run"), tmp_path / "notes.json"
+    save_checkpoint(folder / BEST, load_checkpoint(run / BEST) | {"step": best})
+    if best is None:
+        (folder / BEST).unlink()
+    notes.write_text('{"validated": true}')  # which nobody can claim
+    out = tmp_path / "m.onnx"
+    assert main(["export", "onnx", "--run", str(folder), "--out", str(out), "--notes", str(notes)]) == 0
+    assert ("Not fit for use" in capsys.readouterr().err) == (why is not None)
     card = json.loads((tmp_path / "m.json").read_text())
-    assert card["limits"][0].startswith(f"Not fit for use: trained for {steps} steps") == is_told
+    assert card["validated"] == (why is None)
+    assert why is None or why in card["limits"][0]
+    [network] = open_networks({"joint": out}, LearnConfig(), PrepareConfig())
+    assert network.is_validated == (why is None)
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from pipeline.learn.network.calibration_network import build_network
 from pipeline.learn.network.exported_weights import network_of_file, weight_places
 from pipeline.learn.network.inputs import NetworkInputs, crop, given_classes, sensor_inputs
 from pipeline.learn.network.views import render
-from pipeline.learn.sample.frame_sample import About, make_row
+from pipeline.learn.sample.frame_sample import About, Reference, make_row
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import PAIRS, NetworkConfig
 from pipeline.learn.sample.rendering import frame_sensors
@@ -39,7 +39,7 @@ def row():
     prior = Prior(solve_scenes.T_CAMERA_LIDAR, solve_scenes.T_LIDAR_RADAR, 0.02, 0.05)
     about = About("v", "2026-01-01", "default", "train", "p", "urban")
     config = training_lakes.fleet_of(["v"], lidar_points=4096).prepare
-    return make_row(training_lakes.frame_of(observation, rng), observation, prior, about, config)
+    return make_row(training_lakes.frame_of(observation, rng), observation, Reference(prior), about, config)
 
 
 def classes():

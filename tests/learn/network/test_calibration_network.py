@@ -11,11 +11,13 @@ from pipeline.learn.batches.batch import TrainingBatch, collate
 from pipeline.learn.network.calibration_network import build_network
 from pipeline.learn.network.inputs import NetworkInputs, crop, sensor_inputs
 from pipeline.learn.network.views import render
-from pipeline.learn.sample.frame_sample import About, make_row
+from pipeline.learn.sample.frame_sample import About, Reference, make_row
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import GRAPH_INPUTS, PAIRS, NetworkConfig
 from pipeline.learn.train.semantics_loss import class_of_points, semantics_loss
 from pipeline.objective.differentiable.poses import transform_points
+from pipeline.objective.differentiable.projection import GridProjection
+from pipeline.objective.differentiable.terms import class_evidence_cost
 from pipeline.rig.estimates import Prior
 from tests.makers import solve_scenes, training_lakes
 
@@ -26,13 +28,13 @@ KINDS = [(a, p) for a in ("matching", "concat") for p in ("joint", *PAIRS)]
 @lru_cache
 def batch(frames=2) -> TrainingBatch:
     config = training_lakes.fleet_of(["v"]).prepare
-    prior = Prior(solve_scenes.T_CAMERA_LIDAR, solve_scenes.T_LIDAR_RADAR, 0.02, 0.05)
+    seen = Reference(Prior(solve_scenes.T_CAMERA_LIDAR, solve_scenes.T_LIDAR_RADAR, 0.02, 0.05))
     about = About("v", "2026-01-01", "default", "train", "p", "urban")
     rows = []
     for seed in range(frames):
         rng = np.random.default_rng(seed)
         observation = solve_scenes.make_observation(rng, seed, 0, float(seed))
-        rows.append(make_row(training_lakes.frame_of(observation, rng), observation, prior, about, config))
+        rows.append(make_row(training_lakes.frame_of(observation, rng), observation, seen, about, config))
     return collate(rows)
 
 
@@ -111,6 +113,22 @@ def test_alignment_teaches_heads_and_temperatures_and_classes_teach_encoders():
     classes = crop(data.grid_class, data.grid_step_deg, GRID)
     semantics_loss(answer, classes, *of_points(data, inputs, classes)).backward()
     assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in network.parameters())
+
+
+def test_evidence_at_the_reference_teaches_both_encoders():
+    network, inputs, step = small(), inputs_of(batch()), np.radians(GRID.cell_deg)
+    projection = GridProjection(*(step / 2 - np.radians(deg) for deg in (GRID.left_deg, GRID.top_deg)), step)
+    optimiser, costs = torch.optim.Adam(network.parameters(), 1e-2), []
+    for _ in range(8):
+        optimiser.zero_grad()
+        e, generator = network(inputs).evidence, torch.Generator().manual_seed(0)
+        points = transform_points(inputs.T_camera_lidar, e.points_m)
+        costs.append(class_evidence_cost(projection, points, e.maps, e.probability, e.worth, generator))
+        costs[-1].backward()
+        optimiser.step()
+    reached = {n.split(".")[1] for n, p in network.named_parameters() if p.grad is not None}
+    assert reached == {"camera_encoder", "lidar_encoder"}
+    assert costs[-1] < 0.9 * costs[0]
 
 
 @pytest.mark.parametrize("pairs", ["camera_lidar", "camera_radar"])

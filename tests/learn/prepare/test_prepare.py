@@ -11,14 +11,17 @@ from pipeline.core.config import load_fleet
 from pipeline.learn.prepare.inventory import read_leaks, take_inventory, write_inventory
 from pipeline.learn.prepare.sides import frame_sides
 from pipeline.learn.prepare.survey import plan_days, survey_day
-from pipeline.rig.se3 import exp_se3
+from pipeline.rig.se3 import exp_se3, to_quaternion
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_manifest, read_rows
 from pipeline.store.views import frames_of, observations_of, perceived_days
+from schemas.calibrations import CALIBRATIONS
+from schemas.columns import POSE_COLUMNS
 from schemas.training import SPLITS, TRAINING, TrainingRow
-from tests.makers import training_lakes
+from tests.makers import solve_scenes, training_lakes
 from tests.makers.fleet_files import fleet_toml
-from tests.makers.lakes import write_frames, write_observations
+from tests.makers.lakes import write_frames, write_observations, write_records
+from tests.makers.table_rows import make_record
 
 VEHICLES = ("a", "b", "c", "d", "e")
 
@@ -217,7 +220,6 @@ def test_any_number_of_workers_writes_the_same_rows(tmp_path, capsys):
 PREPARE = """
 [prepare]
 lidar_points = 512
-cluster_points = 64
 edge_points = 64
 [prepare.split]
 by = ["vehicle"]
@@ -259,3 +261,23 @@ def test_the_job_tells_counts_and_exit_codes(tmp_path, capsys):
     assert run("--from", "2027-01-01")[0] == 2
     assert run("--vehicles", "nobody")[0] == 2
     assert run("--workers", "0")[0] == 2
+
+
+@pytest.mark.parametrize(
+    ("status", "unsure", "name"), [("accepted", 0, "joint"), ("held", 1, "joint"), ("held", 0, "prior")]
+)
+def test_samples_look_through_what_joint_found_that_day(tmp_path, status, unsure, name):
+    lake = Lake.at(tmp_path)
+    training_lakes.fill(lake, "a", "2026-01-01", frames=5)
+    T = exp_se3(np.array([0.01, 0.02, -0.01, 0.1, 0.0, 0.0])) @ solve_scenes.T_CAMERA_LIDAR
+    told = dict(zip(POSE_COLUMNS, [*to_quaternion(T), *T[:3, 3]], strict=True)) | {"time_offset_s": 0.03}
+    told |= {"status": status, "diagnostics": {"unsure_only": float(unsure)}}
+    record = make_record(np.random.default_rng(0), "key", "a", "2026-01-01", **told)
+    write_records(lake, CALIBRATIONS, [record], "key")
+    training_lakes.prepare_all(lake, training_lakes.fleet_of(["a"], val_fraction=0, test_fraction=0))
+    expected, dt_s = (T, 0.03) if name == "joint" else (solve_scenes.T_CAMERA_LIDAR, 0.0)
+    for row in rows_of(lake):
+        assert row.reference == name
+        shift = [row.reference_camera_lidar_tx_m, row.reference_camera_lidar_ty_m]
+        np.testing.assert_allclose(shift, expected[:2, 3], atol=1e-9)
+        assert row.camera_lag_s == pytest.approx(0.001 - dt_s)

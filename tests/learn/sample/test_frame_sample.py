@@ -11,6 +11,7 @@ from pipeline.learn.sample.camera_maps import camera_features, stored_grid
 from pipeline.learn.sample.clouds import range_edges
 from pipeline.learn.sample.frame_sample import (
     About,
+    Reference,
     SampleReason,
     SampleRejectedError,
     fingerprint,
@@ -23,7 +24,7 @@ from pipeline.rig.estimates import Prior
 from pipeline.rig.se3 import transform_points
 from pipeline.rig.spherical import camera_direction_angles
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
-from schemas.training import DISTANCE_GROUPS, GRID_CLASSES, NO_EDGE, POINT_IS_GROUND
+from schemas.training import GRID_CLASSES, NO_EDGE, POINT_IS_GROUND
 from tests.makers import solve_scenes, training_lakes
 
 ABOUT = About("v", "2026-01-01", "default", "train", "p", "urban")
@@ -61,12 +62,6 @@ def test_distances_and_boundaries_are_angles_from_the_centre_of_the_cell(step_de
     azimuth, elevation = angles(grid)
     level = np.abs(elevation + 2) < 1  # near the horizon the grid's angles are the world's
 
-    car = found.class_distance[list(DISTANCE_GROUPS).index("vehicle")] / 10.0
-    expected = np.clip(np.maximum(azimuth - 5.03, -3.17 - azimuth), 0, 25.5)
-    assert np.abs(car - expected)[level].max() < 0.11
-    assert abs(np.mean((car - expected)[level & (expected > 0.2) & (azimuth > 0)])) < 0.05
-    assert abs(np.mean((car - expected)[level & (expected > 0.2) & (azimuth < 0)])) < 0.05
-
     # Offsets are positive to the right, azimuth to the left. The car is the foreground: it lies right of its left end.
     for side, end in ((EDGE_RIGHT, 5.03), (EDGE_LEFT, -3.17)):
         offset = found.edge_offset[side]
@@ -78,9 +73,6 @@ def test_distances_and_boundaries_are_angles_from_the_centre_of_the_cell(step_de
     middle = (np.abs(azimuth) < 1) & (np.abs(elevation - 1.0) < 0.7)  # above lies the sky's border
     below = found.edge_offset[EDGE_BELOW] * 0.05
     assert np.abs(below - (elevation - 1.0))[middle].max() < 0.11
-    aside = (azimuth > 8) & (elevation > 2.5) & (elevation < 6)
-    assert np.abs(found.sky_depth / 10.0 - (elevation - 2.5))[aside].max() < 0.11
-    assert (found.sky_depth[elevation < 2.4] == 0).all()
     # Pixels make stairs of a side.
     upright = level & (np.abs(azimuth - 5.03) > 0.3) & (np.abs(azimuth + 3.17) > 0.3)
     assert (found.edge_offset[EDGE_ABOVE][upright] == NO_EDGE).all()
@@ -109,13 +101,14 @@ def scene(seed=0, **changes):
 
 def row_of(frame, observation):
     config = training_lakes.fleet_of(["v"]).prepare
-    return make_row(frame, observation, PRIOR, ABOUT, config)
+    return make_row(frame, observation, Reference(PRIOR), ABOUT, config)
 
 
 def test_lidar_points_fall_on_their_object_in_the_grid_and_boxes_around_it():
     row = row_of(*scene())
     grid = stored_grid((row.grid_height, row.grid_width), row.grid_step_deg)
-    points = row.cluster_xyz_m[: row.cluster_point_count].astype(float)
+    is_object = (row.lidar_flags & POINT_IS_GROUND) == 0
+    points = row.lidar_xyz_m[: row.lidar_count][is_object[: row.lidar_count]].astype(float)
     azimuth, elevation = np.degrees(
         camera_direction_angles(transform_points(solve_scenes.T_CAMERA_LIDAR, points))
     ).T
@@ -127,8 +120,6 @@ def test_lidar_points_fall_on_their_object_in_the_grid_and_boxes_around_it():
     azimuth, elevation, line, column = (x[seen] for x in (azimuth, elevation, line, column))
     shown = row.grid_class.reshape(grid.height, grid.width)[line, column]
     assert np.mean(shown == GRID_CLASSES.index("vehicle")) > 0.9
-    car = row.class_distance.reshape(6, grid.height, grid.width)[0, line, column]
-    assert np.mean(car <= 4) > 0.97
     left, top, right, bottom = np.degrees(row.detection_box_rad[: row.detection_count, :, None]).transpose(
         1, 0, 2
     )
@@ -176,7 +167,7 @@ def test_a_network_is_asked_with_the_same_numbers_that_it_was_taught_with():
     taught = row_of(frame, observation)
     config = training_lakes.fleet_of(["v"]).prepare
     asked = sensor_row(frame, observation, PRIOR, ABOUT, config)
-    semantic = {"grid_class", "class_distance", "edge_offset", "sky_depth"}
+    semantic = {"grid_class", "edge_offset"}
     for name in taught.__dataclass_fields__:
         same = np.array_equal(getattr(asked, name), getattr(taught, name))
         assert same is not (name in semantic or name.startswith("detection_")), name
@@ -223,3 +214,18 @@ def test_fingerprints_are_near_for_the_same_view_and_far_for_others():
     others = differing[:8, :8][~np.eye(8, dtype=bool)]
     assert same.max() < 16
     assert others.min() > 60
+
+
+@pytest.mark.parametrize("deskewed", [False, True])
+def test_a_sweep_is_shown_at_its_stamp_with_the_ground_that_perception_found(deskewed):
+    frame, observation = scene()
+    time_s = np.linspace(-0.1, 0.0, len(frame.lidar_x_m), dtype=np.float32)
+    measured = (
+        {} if deskewed else {"lidar_x_m": frame.lidar_x_m - 12.0 * time_s}
+    )  # of a car that drives at 12 m/s
+    seen = replace(frame, lidar_time_s=time_s, lidar_deskewed=deskewed, **measured)
+    moving = {"ego_speed_mps": 12.0, "radar_velocity_mps": None, "lidar_map_time_s": time_s}
+    row = row_of(seen, replace(observation, **moving))
+    still = row_of(frame, observation)
+    np.testing.assert_allclose(row.lidar_xyz_m, still.lidar_xyz_m, atol=1e-4)
+    assert np.array_equal(row.lidar_flags & POINT_IS_GROUND, still.lidar_flags & POINT_IS_GROUND)

@@ -9,7 +9,7 @@ import torch
 from pipeline.calibrate.paper.pairwise import joint_costs, pair_problem
 from pipeline.core.errors import ConfigError
 from pipeline.learn.batches.batch import collate
-from pipeline.learn.sample.frame_sample import About, make_row
+from pipeline.learn.sample.frame_sample import About, Reference, make_row
 from pipeline.learn.train.loop import read_metrics
 from pipeline.learn.train.paper_objective import PaperFrames
 from pipeline.learn.train.run import TrainRequest, network_of_run, train
@@ -47,7 +47,8 @@ def day(tmp_path_factory):
     frames = {f.frame_index: f for f in list(frames_of(day.lake, day.partition))}
     prior = read_prior(day.observations, day.fleet, "vehicle-1")
     about = About("vehicle-1", day.partition.day, "demo", "train", "here", "urban")
-    rows = [make_row(frames[o.frame_index], o, prior, about, day.fleet.prepare) for o in day.observations]
+    of_row = Reference(prior), about, day.fleet.prepare
+    rows = [make_row(frames[o.frame_index], o, *of_row) for o in day.observations]
     with write_partition(day.lake, TRAINING, Partition("vehicle-1", day.partition.day), "key", "0") as writer:
         writer.append(rows)
         writer.describe(kept={}, rejected={})

@@ -14,8 +14,10 @@ import torch
 
 from jobs.train import parse_duration
 from pipeline.core.errors import ConfigError, ContractError
+from pipeline.learn.export.model_card import card_of_run
 from pipeline.learn.network.calibration_network import build_network
-from pipeline.learn.sample.frame_sample import About, make_row
+from pipeline.learn.prepare.inventory import doubts
+from pipeline.learn.sample.frame_sample import About, Reference, make_row
 from pipeline.learn.sample.layout import NetworkConfig
 from pipeline.learn.train.loop import (
     DivergedError,
@@ -27,10 +29,10 @@ from pipeline.learn.train.loop import (
 from pipeline.learn.train.run import TrainRequest, network_of_run, train
 from pipeline.learn.train.settings import TrainConfig, load_train_config
 from pipeline.rig.day_prior import read_prior
-from pipeline.store.partitions import Partition
-from pipeline.store.tables import write_partition
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.tables import read_rows, write_partition
 from pipeline.store.views import frames_of
-from schemas.training import TRAINING
+from schemas.training import TRAINING, TrainingRow
 from tests.makers.processes import started
 from tests.makers.simulated_days import simulated_day
 
@@ -52,9 +54,9 @@ def data(tmp_path_factory):
     folder = tmp_path_factory.mktemp("data")
     day = simulated_day(folder, frames=6, environment="mixed")  # the same as of other tests: made once
     frames = {f.frame_index: f for f in list(frames_of(day.lake, day.partition))}
-    prior = read_prior(day.observations, day.fleet, "vehicle-1")
+    seen, config = Reference(read_prior(day.observations, day.fleet, "vehicle-1"), "joint"), day.fleet.prepare
     about = About("vehicle-1", day.partition.day, "demo", "train", "here", "urban")
-    rows = [make_row(frames[o.frame_index], o, prior, about, day.fleet.prepare) for o in day.observations]
+    rows = [make_row(frames[o.frame_index], o, seen, about, config) for o in day.observations]
     rows = [replace(row, split="train" if i < len(rows) - 2 else "val") for i, row in enumerate(rows)]
     with write_partition(day.lake, TRAINING, Partition("vehicle-1", day.partition.day), "key", "0") as writer:
         for first in range(0, len(rows), 2):
@@ -108,7 +110,7 @@ def test_a_finished_run_reports_falls_validates_and_gives_its_network(data, tmp_
     assert all(math.isfinite(v) for r in trained for v in r.values())
     assert trained[-1]["semantics"] < 0.9 * trained[0]["semantics"]  # the encoders learn what is easy
     assert trained[-1]["learning_rate"] < 0.02 * 1e-2  # the cosine has come down
-    assert [r["step"] for r in lines if "validation/alignment" in r] == [10, 20, 30]
+    assert [r["step"] for r in lines if "validation/judged" in r] == [0, 10, 20, 30]
     assert (out / "best.pt").exists()
     assert any((out / "events").iterdir())
     network = network_of_run(out)
@@ -116,6 +118,35 @@ def test_a_finished_run_reports_falls_validates_and_gives_its_network(data, tmp_
     assert not network.training
     again = train(TrainRequest(data, out, "cpu"), config(steps=30, learning_rate=1e-2))
     assert (again.status, again.samples) == ("done", 0)
+
+
+def test_a_checkpoint_that_is_worse_than_the_start_is_not_kept(data, tmp_path):
+    settings = config(steps=10, learning_rate=0.3, gradient_norm=1e6, diverged_factor=1e6)
+    train(TrainRequest(data, tmp_path, "cpu"), settings)
+    before, after = (r["validation/judged"] for r in reports(tmp_path) if "validation/judged" in r)
+    assert after > before
+    kept, start = network_of_run(tmp_path), build_network(NetworkConfig(width=4, hidden=16), settings.seed)
+    assert all(torch.equal(a, b) for a, b in zip(kept.parameters(), start.parameters(), strict=True))
+    card = card_of_run(tmp_path)
+    assert not card["validated"]
+    assert "no weights that are better" in card["limits"][0]
+
+
+def test_days_without_a_record_of_joint_teach_no_classes_and_are_named_before(data, tmp_path):
+    lake, day = Lake.at(tmp_path / "lake"), Partition("vehicle-1", "2026-03-02")
+    [known] = Lake.at(data).partitions(TRAINING.name)
+    rows = [
+        replace(row, reference="prior", drive=0)
+        for row in read_rows(Lake.at(data), TRAINING, known, TrainingRow)
+    ]
+    with write_partition(lake, TRAINING, day, "key", "0") as writer:
+        writer.append(rows)
+        writer.describe(kept={}, rejected={})
+    with pytest.raises(ContractError, match="`boresight calibrate`"):
+        train(TrainRequest(str(tmp_path / "lake"), tmp_path / "run", "cpu"), config(steps=1))
+    assert "vehicle-1 2026-03-02" in doubts(lake, referenced=True)[0]
+    assert "one drive" in doubts(lake, referenced=False)[0]
+    assert doubts(Lake.at(data), referenced=True) == []
 
 
 def test_a_budget_of_time_brings_the_rate_down_whatever_the_speed(data, tmp_path):
@@ -184,7 +215,9 @@ def test_two_processes_train_one_network(data, tmp_path):
     assert state["step"] == 3
     first, second = (p["stream"] for p in state["processes"])
     assert first["order"] != second["order"]  # other frames
-    assert len(reports(tmp_path / "run")) == 2  # one of them writes: the last step's report, and validation's
+    assert (
+        len(reports(tmp_path / "run")) == 3
+    )  # one of them writes: the last step's report, and two validations
     with pytest.raises(ConfigError, match="begun by 2"):
         train(TrainRequest(data, tmp_path / "run", "cpu"), TrainConfig.model_validate(SMALL | {"steps": 3}))
 
@@ -233,7 +266,8 @@ def test_encoders_may_learn_at_every_step_and_matchers_at_every_third(data, tmp_
     lines = [r for r in reports(tmp_path) if "loss" in r]
     assert ["alignment" in r for r in lines] == [False, False, True] * 3
     assert all("semantics" in r for r in lines)
-    start, trained = build_network(NetworkConfig(width=4, hidden=16), settings.seed), network_of_run(tmp_path)
+    start = build_network(NetworkConfig(width=4, hidden=16), settings.seed)
+    trained = network_of_run(tmp_path, best=False)
     for part in ("camera_encoder", "lidar_encoder", "lidar_matcher", "radar_matcher", "heads"):
         ours, theirs = getattr(trained.core, part).state_dict(), getattr(start.core, part).state_dict()
         assert any(not torch.equal(ours[name], theirs[name]) for name in ours), part
