@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["parse_duration", "train"]
 
-_NOT_VALIDATED = "not validated, so not fit for use: run the command again, up to the validation of step {}"
+_NOT_VALIDATED = "not validated, so not fit for use: prepare a side val, and train in a new folder"
 _UNIT_S = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
 
@@ -148,7 +148,7 @@ def _run(request: TrainRequest, settings: TrainConfig) -> int:
         logger().warning(doubt, data=request.data)
     with progress_reporter(f"train {request.out.name}") as progress:
         result = run(request, settings, progress)
-    steps = [] if (request.out / "best.pt").exists() else [_NOT_VALIDATED.format(settings.validate_every)]
+    steps = [] if (request.out / "best.pt").exists() else [_NOT_VALIDATED]
     return _tell(result, request.out, next_steps=steps)
 
 

@@ -15,7 +15,7 @@ STANDS_ON = {
     "batches": {"sample", "prepare"},
     "network": {"sample", "batches"},
     "train": {"sample", "prepare", "batches", "network"},
-    "export": {"sample", "network", "train"},
+    "export": {"sample", "network", "train", "infer"},
     "infer": {"sample"},
     "perception_training": {"prepare", "train", "export"},
 }

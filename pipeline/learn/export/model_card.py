@@ -51,10 +51,11 @@ def card_of_run(folder: Path, notes: Path | None = None) -> dict[str, Any]:
         "seeds": [config["seed"]],
         "time": {"steps": last["step"], "minutes": round(last.get("trained_s", 0.0) / 60, 1)},
         "results": validation,
-        "limits": [*unfit, *LIMITS],
+        "limits": LIMITS,
         "training": config,
     }
-    return card | _notes(notes) | {"validated": not unfit}
+    card |= _notes(notes)
+    return card | {"limits": [*unfit, *card["limits"]]}  # which no notes take away
 
 
 def _unfit(step: int, *, judged: bool) -> list[str]:

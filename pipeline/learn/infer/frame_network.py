@@ -46,11 +46,6 @@ class FrameNetwork(Protocol):
         """By pair, sigma of the bias that all answers share (see `aggregate`); a pair is missing where unknown."""
         ...
 
-    @property
-    def is_validated(self) -> bool:
-        """Whether frames that it did not learn from chose its weights, by the file's card; else nothing is accepted."""
-        ...
-
     def sensors(self, frame: Frame, observation: Observation, prior: Prior) -> Any:
         """Inputs of `answer` from a frame; raises SampleRejectedError if it shows too little."""
         ...

@@ -95,8 +95,7 @@ class OnnxNetwork:
         self._path, self._calibrator = path, SingleFrameCalibrator(path, config.threads)
         self._iterations, self._camera, self._rows = config.iterations, config.camera, rows
         self._prepare = _prepare_for(self._calibrator.grid, prepare)
-        card = self._calibrator.metadata.get("card", "{}")
-        self._bias_sigma, self._is_validated = _facts_of_card(path, card)
+        self._bias_sigma = _bias_of_card(path, self._calibrator.metadata.get("card", "{}"))
 
     @property
     def unfit(self) -> str:
@@ -108,11 +107,6 @@ class OnnxNetwork:
     def bias_sigma(self) -> Mapping[str, np.ndarray]:
         """Sigma of the bias that all answers share, (bearing rotation [rad], translation [m]), by the file's card."""
         return self._bias_sigma
-
-    @property
-    def is_validated(self) -> bool:
-        """Whether frames that it did not learn from chose its weights, by the file's card."""
-        return self._is_validated
 
     @property
     def pairs(self) -> tuple[str, ...]:
@@ -161,24 +155,19 @@ class _LastRow:
         return self.row
 
 
-def _facts_of_card(path: Path, card: str) -> tuple[dict[str, np.ndarray], bool]:
-    """`bias_sigma` of a card (three angles [deg] and three shifts [m] by pair), and whether frames validated it.
-
-    Before 0.13 cards do not state that: they have results where there were held-out frames. ModelError: unreadable.
-    """
+def _bias_of_card(path: Path, card: str) -> dict[str, np.ndarray]:
+    """`bias_sigma` of a card: by pair, three angles [deg] and three shifts [m]; else ModelError."""
     try:
-        told = json.loads(card)
-        found = {pair: np.array(values, np.float64) for pair, values in told.get("bias_sigma", {}).items()}
-        is_validated = bool(told.get("validated", told.get("results")))
+        given = json.loads(card).get("bias_sigma", {})
+        found = {pair: np.array(values, np.float64) for pair, values in given.items()}
     except (AttributeError, TypeError, ValueError) as err:
-        raise ModelError(str(path), f"its card, or bias_sigma in it, is unreadable: {err}") from err
+        raise ModelError(str(path), f"bias_sigma of its card is unreadable: {err}") from err
     for pair, values in found.items():
         if pair not in PAIRS or values.shape != (6,) or not (np.isfinite(values) & (values >= 0)).all():
             raise ModelError(
                 str(path), f"bias_sigma of its card: {pair} needs three degrees and three metres"
             )
-    sigma = {pair: np.append(np.radians(values[:3]), values[3:]) for pair, values in found.items()}
-    return sigma, is_validated
+    return {pair: np.append(np.radians(values[:3]), values[3:]) for pair, values in found.items()}
 
 
 def _prepare_for(grid: Grid, config: PrepareConfig) -> PrepareConfig:

@@ -70,15 +70,15 @@ def test_a_network_that_held_out_frames_did_not_choose_is_called_unfit_wherever_
     save_checkpoint(folder / BEST, load_checkpoint(run / BEST) | {"step": best})
     if best is None:
         (folder / BEST).unlink()
-    notes.write_text('{"validated": true}')  # which nobody can claim
+    notes.write_text('{"limits": ["none"]}')  # which nobody can claim
     out = tmp_path / "m.onnx"
     assert main(["export", "onnx", "--run", str(folder), "--out", str(out), "--notes", str(notes)]) == 0
     assert ("Not fit for use" in capsys.readouterr().err) == (why is not None)
     card = json.loads((tmp_path / "m.json").read_text())
-    assert card["validated"] == (why is None)
-    assert why is None or why in card["limits"][0]
+    assert card["limits"][-1] == "none"
     [network] = open_networks({"joint": out}, LearnConfig(), PrepareConfig())
-    assert network.is_validated == (why is None)
+    assert (why or "") in network.unfit
+    assert bool(network.unfit) == (why is not None)
 
 
 @pytest.mark.parametrize(
