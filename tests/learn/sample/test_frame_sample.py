@@ -220,10 +220,8 @@ def test_fingerprints_are_near_for_the_same_view_and_far_for_others():
 def test_a_sweep_is_shown_at_its_stamp_with_the_ground_that_perception_found(deskewed):
     frame, observation = scene()
     time_s = np.linspace(-0.1, 0.0, len(frame.lidar_x_m), dtype=np.float32)
-    measured = (
-        {} if deskewed else {"lidar_x_m": frame.lidar_x_m - 12.0 * time_s}
-    )  # of a car that drives at 12 m/s
-    seen = replace(frame, lidar_time_s=time_s, lidar_deskewed=deskewed, **measured)
+    x_m = frame.lidar_x_m - (0.0 if deskewed else 12.0) * time_s  # of a car that drives at 12 m/s
+    seen = replace(frame, lidar_time_s=time_s, lidar_deskewed=deskewed, lidar_x_m=x_m)
     moving = {"ego_speed_mps": 12.0, "radar_velocity_mps": None, "lidar_map_time_s": time_s}
     row = row_of(seen, replace(observation, **moving))
     still = row_of(frame, observation)

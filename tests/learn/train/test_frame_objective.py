@@ -28,16 +28,6 @@ DATA_ALONE = LossConfig(prior=0.0)
 
 
 @pytest.fixture(scope="module")
-def day(tmp_path_factory):
-    return simulated_day(tmp_path_factory.mktemp("fleet"), frames=32, environment="mixed")
-
-
-@pytest.fixture(scope="module")
-def batch(day):
-    return day_batch(day.lake, day.partition, day.fleet_file, day.told)
-
-
-@pytest.fixture(scope="module")
 def few(tmp_path_factory):
     """Four frames of a short day: quick tests do not wait for the long one."""
     day = simulated_day(tmp_path_factory.mktemp("short"), frames=6, environment="mixed")
@@ -45,7 +35,9 @@ def few(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_the_minimum_over_a_fleet_is_at_the_truth_in_all_that_it_determines(batch, day):
+def test_the_minimum_over_a_fleet_is_at_the_truth_in_all_that_it_determines(tmp_path):
+    day = simulated_day(tmp_path, frames=32, environment="mixed")
+    batch = day_batch(day.lake, day.partition, day.fleet_file, day.told)
     found = minima(batch, day.truth, DATA_ALONE)
     determined = {
         (pair, dof): found[pair][dof].offset

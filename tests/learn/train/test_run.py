@@ -133,12 +133,9 @@ def test_a_checkpoint_that_is_worse_than_the_start_is_not_kept(data, tmp_path):
 def test_days_without_a_record_of_joint_teach_no_classes_and_are_named_before(data, tmp_path):
     lake, day = Lake.at(tmp_path / "lake"), Partition("vehicle-1", "2026-03-02")
     [known] = Lake.at(data).partitions(TRAINING.name)
-    rows = [
-        replace(row, reference="prior", drive=0)
-        for row in read_rows(Lake.at(data), TRAINING, known, TrainingRow)
-    ]
+    rows = read_rows(Lake.at(data), TRAINING, known, TrainingRow)
     with write_partition(lake, TRAINING, day, "key", "0") as writer:
-        writer.append(rows)
+        writer.append([replace(row, reference="prior", drive=0) for row in rows])
         writer.describe(kept={}, rejected={})
     with pytest.raises(ContractError, match="`boresight calibrate`"):
         train(TrainRequest(str(tmp_path / "lake"), tmp_path / "run", "cpu"), config(steps=1))
