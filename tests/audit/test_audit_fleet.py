@@ -198,15 +198,19 @@ def test_a_record_of_a_day_to_come_and_one_of_nonsense_are_named_and_left_out(la
     records = vehicle_records("v", 8, rng)
     write(lake, records + vehicle_records("w", 8, rng))
     whole = [f.status for f in audit(lake, "v", "w")]
+    beyond_one = records[9].covariance.copy()  # a correlation that is none
+    beyond_one[0, 1] = beyond_one[1, 0] = 2 * np.sqrt(beyond_one[0, 0] * beyond_one[1, 1])
     spoiled = [
         replace(records[0], day="2099-01-01", work_key="k1"),
         replace(records[6], covariance=np.full((6, 6), np.nan)),
+        replace(records[9], covariance=beyond_one),
         replace(records[3], status="odd"),
     ]
     write(lake, spoiled, suffix="-again")
     outcome = AUDIT.run(Task(fleet_config("v", "w"), lake, Window()))
     assert "v 2099-01-01 camera_lidar is of a day that has not come yet" in outcome.reason
-    assert f"v {records[6].day} camera_lidar holds no covariance" in outcome.reason
+    for k in (6, 9):
+        assert f"v {records[k].day} camera_lidar holds no covariance" in outcome.reason
     assert f"v {records[3].day} {records[3].pair} is of a pair or has a status" in outcome.reason
     assert {f.day for f in outcome.records} == {day_name(7)}
     assert sum(a == f.status for a, f in zip(whole, outcome.records, strict=True)) >= 34
