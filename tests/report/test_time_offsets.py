@@ -15,7 +15,9 @@ POSTS_MAP = np.array([[20.0, 2.0, 0.0], [35.0, -6.0, 1.0], [12.0, 5.0, -1.0]])
 
 
 def _driving(speed_mps, yaw_rate_radps):
-    return replace(_scene().observation, ego_speed_mps=speed_mps, ego_yaw_rate_radps=yaw_rate_radps)
+    stamps = dict.fromkeys(("stamp_ns", "camera_stamp_ns", "radar_stamp_ns"), 1_700_000_000_000_000_000)
+    ego = {"ego_speed_mps": speed_mps, "ego_yaw_rate_radps": yaw_rate_radps}
+    return replace(_scene().observation, **stamps, **ego)
 
 
 def _seen_by_lidar(t_s, speed_mps, yaw_rate_radps):
