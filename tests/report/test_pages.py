@@ -153,6 +153,7 @@ def test_the_copied_json_is_the_record_and_a_page_without_pictures_has_none(flee
     assert "without pictures" in text
     assert "data:image" not in text
     assert "Not determined by this day: rx (roll), tz (up)." in text
+    assert "no highway: radar roll is weak" in text  # a note of the record
 
 
 def test_a_hostile_name_cannot_leave_its_place(tmp_path):

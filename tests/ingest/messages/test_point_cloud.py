@@ -42,8 +42,10 @@ def test_a_field_of_several_values_does_not_disturb_the_others(kit):
     assert first_field(points, ("descriptor",)) is None  # several values are no column
 
 
-def test_points_without_return_nan_and_far_ones_are_dropped_and_counted(kit):
+@pytest.mark.parametrize("kind_of_ring", ["u2", "f4"])
+def test_points_without_return_nan_and_far_ones_are_dropped_and_counted(kit, kind_of_ring):
     columns = kit.lidar(0, 12)
+    columns["ring"] = columns["ring"].astype(kind_of_ring)
     columns["x"][:3] = np.nan
     columns["z"][3] = np.inf
     for name in "xyz":
