@@ -1,7 +1,7 @@
 """Agreement of the sensors in each frame, before and after calibration; for readers, not for the verdict.
 
 A low residual does not prove accuracy: a calibration can be repeatable, have the best fit and still be
-wrong. The verdict depends on held-out frames, restarts and sigmas (pipeline.calibrate.verify). The numbers
+wrong. The verdict depends on held-out frames, checks and sigmas (pipeline.calibrate.verify). The numbers
 of this module can be compared with the pictures.
 
 Between sweep, image and scan of a frame, the car moves. The time is the gap of the frame's stamps plus the
