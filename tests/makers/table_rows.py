@@ -15,6 +15,7 @@ from schemas.observations import Observation
 from schemas.outcomes import OUTCOMES, OutcomeRow
 from schemas.poses import POSES, PoseRow
 from schemas.service_events import SERVICE_EVENTS, ServiceEvent
+from schemas.sign_offs import SIGN_OFFS
 from schemas.states import STATES, StateRow
 from schemas.training import TRAINING, TrainingRow
 from tests.makers.whole_tables import FRAMES, OBSERVATIONS, WholeFrame, WholeObservation
@@ -30,6 +31,7 @@ ROW_TYPES = {
     POSES.name: (POSES, PoseRow),
     STATES.name: (STATES, StateRow),
     SERVICE_EVENTS.name: (SERVICE_EVENTS, ServiceEvent),
+    SIGN_OFFS.name: (SIGN_OFFS, SIGN_OFFS.row_type),
 }
 
 

@@ -35,13 +35,6 @@ def test_the_standing_world_is_the_same_from_everywhere():
         assert np.mean(hits) > 0.8  # single precision turns some last digits
 
 
-def test_the_window_on_the_world_stays_small_on_a_long_drive():
-    world = World(Drive(2, "highway", 300.0, 0))
-    sizes = [len(world.moment(float(t)).standing.mesh) for t in (1, 100, 200, 299)]
-    assert max(sizes) < 3 * min(sizes)
-    assert len(world._chunks) < 10
-
-
 @pytest.mark.parametrize("environment", ["urban", "highway"])
 def test_nobody_drives_through_us(environment):
     drive = Drive(4, environment, 20.0, 0)
