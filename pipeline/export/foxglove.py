@@ -1,10 +1,4 @@
-"""A vehicle-day as a Foxglove MCAP: sensor data at the prior and at the calibration, and the uncertainty.
-
-Topics are named after the sensors. Images are copied byte for byte, each cloud is in the frame of its sensor, and the
-reference lidar's depth jumps are drawn in every image. The reference is the root (or base, if its pose is known).
-The same points are also written in frames at the prior: `NAME_prior`, child of the reference, and the reference's
-own, child of the first camera. A viewer shows both, and either can be hidden.
-"""
+"""#"""
 
 from __future__ import annotations
 
@@ -20,16 +14,84 @@ from foxglove import messages as fg
 from jaxtyping import Float
 
 from pipeline.export import foxglove_messages as its
-from pipeline.export.calibration import ExportedCalibration, poses_of
-from pipeline.export.foxglove_table import TABLE_SCHEMA, table_of
-from pipeline.export.provenance import provenance_of
+from pipeline.export.calibration import ExportedCalibration, ExportedPair, poses_of, sigmas_of
+from pipeline.export.provenance import provenance_of, used_lines, warnings_of
 from pipeline.export.texts import to_json
 from pipeline.rig.cameras import camera_of
+from pipeline.rig.changes import change_between
 from pipeline.rig.graph import Sensor
+from schemas.calibrations import DOF_NAMES
 from schemas.frames import Frame
 from schemas.observations import Observation
 
-__all__ = ["TABLE_TOPIC", "TF_TOPIC", "layout_of", "write_foxglove"]
+__all__ = ["TABLE_SCHEMA", "TABLE_TOPIC", "TF_TOPIC", "layout_of", "table_of", "write_foxglove"]
+
+# --------------------------------------------------------------------------------------------------
+# Changes and sigmas of a calibration as one JSON message for a table panel.
+
+
+_IN_UNITS = np.array([np.degrees(1.0)] * 3 + [100.0] * 3)  # rad to deg, m to cm
+_ROW = {
+    "pair": {"type": "string"},
+    "axis": {"type": "string"},
+    "change": {"type": "number"},
+    "sigma": {"type": "number"},
+    "unit": {"type": "string"},
+    "determined": {"type": "boolean"},
+    "status": {"type": "string"},
+}
+TABLE_SCHEMA: dict[str, Any] = {
+    "type": "object",
+    "title": "boresight.Calibration",
+    "properties": {
+        "vehicle": {"type": "string"},
+        "source": {"type": "string"},
+        "method": {"type": "string"},
+        "warnings": {"type": "array", "items": {"type": "string"}},
+        "in_words": {"type": "array", "items": {"type": "string"}},
+        "rows": {"type": "array", "items": {"type": "object", "properties": _ROW}},
+    },
+}
+
+
+def table_of(
+    calibration: ExportedCalibration, priors: Mapping[str, Float[np.ndarray, "4 4"]]
+) -> dict[str, Any]:
+    """A row per pair and axis: change from the prior along the parent's axes, with sigma [deg, cm]."""
+    rows = [row for pair in calibration.pairs.values() for row in _rows(pair, priors.get(pair.pair))]
+    told = {"vehicle": calibration.vehicle, "source": calibration.source, "method": calibration.method}
+    words = {"warnings": warnings_of(calibration), "in_words": used_lines(calibration)}
+    return told | words | {"rows": rows}
+
+
+def _rows(pair: ExportedPair, prior: Float[np.ndarray, "4 4"] | None) -> list[dict[str, Any]]:
+    change: list[float | None] = [None] * 6
+    if prior is not None:
+        change = (change_between(prior, pair.T) * _IN_UNITS).tolist()
+    known = sigmas_of(pair.T, pair.covariance)
+    sigma: list[float | None] = (
+        [None] * 6
+        if known is None
+        else [float(s * u) for s, u in zip(known.values(), _IN_UNITS, strict=True)]
+    )
+    units = ["deg"] * 3 + ["cm"] * 3
+    rows = [
+        {"pair": pair.pair, "axis": axis, "change": c, "sigma": s, "unit": unit, "determined": bool(seen),
+         "status": pair.status}
+        for axis, c, s, unit, seen in zip(DOF_NAMES, change, sigma, units, pair.observable, strict=True)
+    ]  # fmt: skip
+    return [{name: value for name, value in row.items() if value is not None} for row in rows]
+
+
+# --------------------------------------------------------------------------------------------------
+# A vehicle-day as a Foxglove MCAP: sensor data at the prior and at the calibration, and the uncertainty.
+#
+# Topics are named after the sensors. Images are copied byte for byte, each cloud is in the frame of its
+# sensor, and the reference lidar's depth jumps are drawn in every image. The reference is the root (or
+# base, if its pose is known). The same points are also written in frames at the prior: `NAME_prior`, child
+# of the reference, and the reference's own, child of the first camera. A viewer shows both, and either can
+# be hidden.
+
 
 Scene = tuple[Frame, Observation | None]
 TF_TOPIC, TABLE_TOPIC = "/tf", "/boresight/calibration"

@@ -11,8 +11,7 @@ from collections.abc import Callable, Generator, Sequence
 from typing import TypeVar
 
 from pipeline.core.results import Progress
-from pipeline.fleet.attempts import Executor, Finished, Watch, attempt, usable_cpus
-from pipeline.fleet.processes import run_processes
+from pipeline.fleet.processes import Executor, Finished, Watch, attempt, run_processes, usable_cpus
 from pipeline.fleet.ray_tasks import run_on_ray
 
 __all__ = ["EXECUTORS", "Executor", "Finished", "Watch", "run_inline", "usable_cpus"]

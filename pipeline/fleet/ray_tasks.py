@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 from pipeline.core.errors import ConfigError, ContractError
 from pipeline.core.results import Progress
-from pipeline.fleet.attempts import ONE_THREAD, Finished, Turns, Watch, attempt, usable_cpus
+from pipeline.fleet.processes import ONE_THREAD, Finished, Turns, Watch, attempt, usable_cpus
 from pipeline.fleet.ray_cluster import Cluster, connected, sigterm_between_calls
 from schemas.versions import CODE_VERSION
 

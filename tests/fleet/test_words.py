@@ -51,7 +51,8 @@ def test_the_table_lists_the_words_that_the_code_has():
     assert listed["a stage of a vehicle-day"] == list(OUTCOME_STATUSES)
     assert set(listed["a vehicle"]) == set(DRIFT_STATUSES)
     assert all(word in STATES.column("status").doc for word in listed["the state of a sensor or a pair"])
-    assert len(listed) == 6
+    assert listed["a training run"] == ["done", "time_limit", "stopped"]
+    assert len(listed) == 7
     assert {*DAY_WORDS, "cached"} - {"missing"} == set(_MARKS)
     assert set(RECORD_WORDS) | set(DRIFT_STATUSES) <= set(STATUS_STYLES)
 
