@@ -31,12 +31,6 @@ __all__ = [
 ]
 
 # --------------------------------------------------------------------------------------------------
-# Checks of what a method solved: the loop of all pairs, and the heading.
-#
-# Each states by how much a pose would be wrong if it is right, so that only what matters holds a record.
-
-
-# --------------------------------------------------------------------------------------------------
 # Whether a day shows enough different scenes for anything to be certified: frames of a standing car are one.
 
 
