@@ -120,4 +120,4 @@ def test_four_pixels_are_right_in_the_image_and_certify_no_mounting(traced):
     assert record.diagnostics["camera_cx_px"] == info[0, 2]
     page = pair_view(record)
     assert "in the image with this CameraInfo" in page.certified
-    assert page.mounting.startswith("not certified; known to")
+    assert page.mounting.startswith("not certified; sigma")
