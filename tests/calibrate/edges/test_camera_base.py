@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.edges.camera_base import estimate_camera_base
-from pipeline.calibrate.edges.camera_travel import CameraTravel
+from pipeline.calibrate.edges.camera_travel import CameraTravel, camera_travel
 from pipeline.calibrate.edges.on_base import changes_by_left
+from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.core.errors import SolveError
+from pipeline.objective.ego_motion import EgoMotion
 from pipeline.rig.changes import change_between
 from pipeline.rig.graph import BASE, Edge, Sensor
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
+from tests.makers.solve_scenes import make_day
 
 EDGE = Edge(Sensor("front", "camera"), BASE)
 N, SPAN_S, STEP_S, LATE_S = 240, 0.3, 0.5, 0.012
@@ -180,3 +183,14 @@ def test_a_camera_that_looks_aside_promises_no_sharp_yaw(yaw_deg, aside):
     floor_deg = np.degrees(np.sqrt(np.diag(J @ found.bias["edge"] @ J.T)[:3]))
     assert floor_deg[2] == pytest.approx(aside, abs=0.04)
     assert floor_deg[1] < 0.03
+
+
+def test_where_no_odometry_is_logged_way_and_yaw_are_those_of_the_moments_around():
+    shown = {"motion_turn_rad": np.zeros(3), "motion_direction": np.eye(3)[0], "motion_covariance": np.eye(6)}
+    rows = [replace(o, motion_span_s=0.3, **shown) for o in make_day(6)]
+    velocity, rate = np.tile([10.0, 0.0], (6, 1)), np.full(6, 0.1)
+    ego = EgoMotion(velocity, rate, np.tile(np.eye(3), (6, 1, 1)))
+    found = camera_travel(rows, ego, Scenes.of(rows, 10))
+    np.testing.assert_allclose(found.driven_m, 3.0)
+    np.testing.assert_allclose(found.turned_rad, 0.03)
+    np.testing.assert_allclose(found.turned_by_clock_radps, 0.0, atol=1e-12)

@@ -8,7 +8,6 @@ import pytest
 from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
 from pipeline.calibrate.verify.day_checks import clock_alarms, prior_alarms
 from pipeline.core.config import ChecksConfig, SolveConfig
-from pipeline.rig.changes import change_jacobian
 from pipeline.rig.estimates import PairEstimate, Prior
 from tests.makers.radar_scenes import T_LIDAR_RADAR, street_day
 from tests.makers.solve_scenes import T_CAMERA_LIDAR
@@ -18,23 +17,12 @@ SIGMA_M = 0.03
 PRIOR = Prior(T_CAMERA_LIDAR, T_LIDAR_RADAR, np.radians(1.2), SIGMA_M)
 
 
-def estimate_of(pair, shift_m=(0, 0, 0), kept=(), **found):
-    """A pair that moved so far along its parent's axes, with a few positions left to the prior."""
-    T = PRIOR.of(pair).copy()
-    T[:3, 3] += shift_m
+def estimate_of(pair, kept=(), dt_s=0.0, **found):
+    """A pair at its prior, with a few positions left to it."""
     observable = ~np.isin(np.arange(6), kept)
-    sigma = np.where(observable, [0.0005] * 3 + [0.01] * 3, [0.02] * 3 + [SIGMA_M] * 3)
-    J = np.linalg.inv(change_jacobian(T))
+    covariance, timed = np.eye(6) * SIGMA_M**2, {"time_offset_s": dt_s, "time_offset_sigma_s": 0.005}
     return PairEstimate(
-        pair,
-        T,
-        J @ np.diag(sigma**2) @ J.T,
-        observable * 1.0,
-        observable,
-        50,
-        time_offset_s=found.pop("dt_s", 0.0),
-        time_offset_sigma_s=0.005,
-        diagnostics=found,
+        pair, PRIOR.of(pair), covariance, observable * 1.0, observable, 50, diagnostics=found, **timed
     )
 
 
