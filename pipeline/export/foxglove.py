@@ -1,4 +1,4 @@
-"""#"""
+"""A vehicle-day and its calibration as a Foxglove MCAP, with the uncertainty as a table."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""#"""
+"""The paper's optimisation methods: each pair alone, then all pairs refined together under the loop."""
 
 from __future__ import annotations
 
