@@ -53,11 +53,7 @@ def records_of_rows(
 
 
 def perturbed(prior: Prior, perturb: tuple[float, float] | None, seed: int) -> Prior:
-    """The prior with all transforms moved by an exact angle [deg] and shift [m]; sigmas at least as large.
-
-    The sigmas become max(configured sigma, size of the perturbation): the size is known, like the tolerance
-    of a workshop, but the direction is not.
-    """
+    """The prior with all transforms moved by an exact angle [deg] and shift [m]; its sigmas at least as large."""
     if perturb is None:
         return prior
     angle, shift = np.radians(perturb[0]), perturb[1]
