@@ -10,6 +10,7 @@ errors are this edge's own; an error of the intrinsics turns what any edge of th
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,21 +18,23 @@ from jaxtyping import Bool, Float, Int64
 
 from pipeline.calibrate.edges.camera_travel import CameraTravel, camera_travel
 from pipeline.calibrate.edges.day_sources import DaySources
-from pipeline.calibrate.edges.lidar_base import STANCE
 from pipeline.calibrate.edges.on_base import (
+    STANCE,
     Regression,
     Rows,
     Series,
     changes_by_left,
     first_and_last,
+    of_stance_and,
     other_scenes,
     regress,
 )
 from pipeline.calibrate.numerics.frame_blocks import Scenes
+from pipeline.calibrate.numerics.nuisances import Considered, by_sensor
 from pipeline.core.errors import SolveError
 from pipeline.rig.checks import Check
-from pipeline.rig.evidence import EDGE, EdgeEvidence
-from pipeline.rig.graph import BASE, Edge
+from pipeline.rig.evidence import EdgeEvidence
+from pipeline.rig.graph import Edge
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
 
 __all__ = ["estimate_camera_base", "solve"]
@@ -103,7 +106,7 @@ def estimate_camera_base(
     series = Series(2, rows["yaw"], travel.scene[straight], travel.stamp_ns[straight], float(STANCE[2]))
     return EdgeEvidence(
         edge, inverse(T), 0.0 if timed is None else float(timed.value[0]), (J.T * weight) @ J,
-        np.zeros(7), _biases(edge, T), frames_used=len(travel.span_s), checks=_checks(edge, clock),
+        np.zeros(7), _errors(edge, T), frames_used=len(travel.span_s), checks=_checks(edge, clock),
         diagnostics=_numbers(travel, fits, clock), notes=_notes(fits, timed),
         others=other_scenes(T, halves), parts=first_and_last(T, series),
     )  # fmt: skip
@@ -248,20 +251,13 @@ def _checks(edge: Edge, clock: Regression | None) -> tuple[Check, ...]:
     return (Check(told, "orientation", disproves=True),)
 
 
-def _biases(edge: Edge, T: np.ndarray) -> dict[str, np.ndarray]:
-    """Biases: the car's stance, the matching, the camera's intrinsics."""
-    axes = np.zeros((4, 6))
-    axes[[0, 1, 2, 3], [0, 1, 2, 5]] = 1.0
-    floor = np.diag([_ROLL_FLOOR_RAD, _FLOOR_RAD, _FLOOR_RAD, 0.0, 0.0, 0.0]) ** 2
+def _errors(edge: Edge, T: np.ndarray) -> Mapping[str, np.ndarray]:
+    """Biases by owner: the car's stance, the matching, the camera's intrinsics."""
+    matching = np.diag([_ROLL_FLOOR_RAD, _FLOOR_RAD, _FLOOR_RAD, 0.0, 0.0, 0.0])
     about = np.cross(T[:3, 2], [1.0, 0.0, 0.0])  # as long as the sine of the angle between view and travel
-    floor[:3, :3] += _ASIDE_RAD**2 * np.outer(about, about)
-    to_camera = np.linalg.inv(changes_by_left(T))
-    intrinsics = np.diag([_CENTRE_RAD, _CENTRE_RAD, 0.0, 0.0, 0.0, 0.0]) ** 2
-    return {
-        BASE.name: axes.T @ np.diag(STANCE**2) @ axes,
-        EDGE: to_camera @ floor @ to_camera.T,
-        edge.parent.name: intrinsics,
-    }
+    aside = _ASIDE_RAD * np.append(about, np.zeros(3))[None]
+    centre = Considered("centre", _CENTRE_RAD * np.eye(2, 6))
+    return by_sensor([*of_stance_and(T, matching=matching, aside=aside), centre], edge)
 
 
 def _numbers(

@@ -4,7 +4,7 @@ The road determines roll, pitch and height. The direction of travel determines y
 because the rear axle follows the road. Both are means over scenes, so slopes, bends and bumps cancel. Pitch
 and roll of the body under acceleration are fitted as functions of the acceleration. x and y have no
 information. Base is thus the frame of road and wheels: z up from the road, x along straight driving. A frame
-fixed to the body differs by the car's stance (load, springs) and rolling direction (toe); `STANCE` is the
+fixed to the body differs by the car's stance (load, springs) and rolling direction (toe); `on_base.STANCE` is the
 size of this difference.
 
 The road under the car, per sweep: height, slope and cross slope in axes of the base.
@@ -16,7 +16,7 @@ way the strip is a parabola, because roads bend; it is evaluated at the base's o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,28 +24,28 @@ from jaxtyping import Float
 
 from pipeline.calibrate.edges.day_sources import DaySources
 from pipeline.calibrate.edges.on_base import (
+    CHANGES,
+    STANCE,
     Regression,
     Rows,
     Series,
     changes_by_left,
     first_and_last,
+    of_stance_and,
     other_scenes,
     regress,
 )
 from pipeline.calibrate.edges.sweep_travel import Sweep, SweepTravel, deskewed_again, sweep_travel, sweeps_of
 from pipeline.calibrate.numerics.frame_blocks import Scenes
+from pipeline.calibrate.numerics.nuisances import Considered, by_sensor
 from pipeline.objective.ego_motion import EgoMotion
 from pipeline.rig.checks import Check
-from pipeline.rig.evidence import EDGE, EdgeEvidence, OtherScenes
-from pipeline.rig.graph import BASE, Edge
+from pipeline.rig.evidence import EdgeEvidence, OtherScenes
+from pipeline.rig.graph import Edge
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse, transform_points
 
 __all__ = ["estimate_lidar_base", "solve"]
 
-# What all days of a car err by alike, as one sigma of roll, pitch, yaw and height of the base. Roads fall by about 2 %
-# to the side that is driven on, so bodies that lean by some 5 deg/g and rear axles that slip by some 3 deg/g (Gillespie
-# 1992, Fundamentals of vehicle dynamics) stand 0.1 deg off, on part of the roads. Tyres settle by a centimetre.
-STANCE = np.array([*np.radians([0.05, 0.05, 0.05]), 0.01])
 # A lidar's own: ranges are good to 3 cm by data sheets, at 8 m and 1.8 m above the road that is 7 mm of height.
 _RANGES_M = 0.007
 # Beyond what scenes scatter by, errors of 8 tuning days: roll 0.017 deg RMS, pitch 0.012, yaw 0.016, height 2 mm.
@@ -56,7 +56,6 @@ _LONGEST_WAY_M = 20.0  # beyond, scatter is the road's and no longer the registr
 _AGAIN_RAD = np.radians(2.0)  # so far from the start the sweeps are looked at again
 _MEASURED_SIGMAS = 4.0
 _AXES = ("roll", "pitch", "yaw", "height")
-_CHANGES = (0, 1, 2, 5)  # these of a change of T_base_lidar
 _ASIDE_M, _ALONG_M = 1.6, (-12.0, 22.0)
 _OFF_M = 0.7  # from where the prior expects the road: what lies further off is no road, or no prior
 _CELL_M = (2.0, 0.4)  # stretches of road that count alike: rings crowd near the car
@@ -152,7 +151,7 @@ def estimate_lidar_base(
         checks += contradicts
     information, gradient = _by_left_perturbation(T, change, variance)
     return EdgeEvidence(
-        edge, inverse(T), 0.0, information, gradient, _biases(edge, T),
+        edge, inverse(T), 0.0, information, gradient, _errors(edge, T),
         frames_used=len(set(roads.moment) | set(travel.moment)),
         checks=tuple(checks), diagnostics=_numbers(travel, roads, shown), notes=_notes(variance),
         others=_others(T, shown), parts=first_and_last(T, _series(travel, rows["yaw"], sweeps, scenes)),
@@ -233,7 +232,7 @@ def _with_measured(
 def _others(T: np.ndarray, shown: _Shown) -> OtherScenes:
     """Halves of the scenes, beyond the car's stance; pitch by the way, which is sharper than that by the road."""
     fits = (shown.roll, shown.pitch_by_way, shown.yaw, shown.height)
-    return other_scenes(T, list(zip(_CHANGES, fits, STANCE.tolist(), strict=True)))
+    return other_scenes(T, list(zip(CHANGES, fits, STANCE.tolist(), strict=True)))
 
 
 def _series(travel: SweepTravel, yaw: Rows, sweeps: Sequence[Sweep], scenes: Scenes) -> Series:
@@ -247,24 +246,17 @@ def _by_left_perturbation(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Information and gradient of T_lidar_base, from changes of T_base_lidar: roll, pitch, yaw, height."""
     J = np.zeros((4, 7))
-    J[:, :6] = changes_by_left(T)[list(_CHANGES)]
+    J[:, :6] = changes_by_left(T)[list(CHANGES)]
     weight = 1 / variance
     return (J.T * weight) @ J, J.T @ (weight * change)
 
 
-def _biases(edge: Edge, T: np.ndarray) -> dict[str, np.ndarray]:
-    """Errors common to all days: the car's stance, the lidar's ranges, the matching."""
+def _errors(edge: Edge, T: np.ndarray) -> Mapping[str, np.ndarray]:
+    """Biases by owner: the car's stance, the lidar's ranges, the matching."""
     up = inverse(T)[:3, :3] @ [0.0, 0.0, 1.0]
-    of_lidar = np.zeros((6, 6))
-    of_lidar[3:, 3:] = _RANGES_M**2 * np.outer(up, up)
-    axes = np.zeros((4, 6))
-    axes[range(4), _CHANGES] = 1.0
-    to_lidar = np.linalg.inv(changes_by_left(T)) @ axes.T
-    return {
-        BASE.name: axes.T @ np.diag(STANCE**2) @ axes,
-        edge.parent.name: of_lidar,
-        EDGE: to_lidar @ np.diag(_MATCHING**2) @ to_lidar.T,
-    }
+    ranges = Considered("ranges", _RANGES_M * np.append(np.zeros(3), up)[None])
+    matching = np.diag(_MATCHING) @ np.eye(6)[list(CHANGES)]
+    return by_sensor([*of_stance_and(T, matching=matching), ranges], edge)
 
 
 def _numbers(travel: SweepTravel, roads: RoadUnder, shown: _Shown) -> dict[str, float]:

@@ -19,12 +19,13 @@ from pipeline.calibrate.edges.sweep_travel import Sweep, deskewed_again, sweeps_
 from pipeline.calibrate.numerics.bias_floors import SWEEP_S, TYPICAL_RANGE_M
 from pipeline.calibrate.numerics.change_point import parts_of_day
 from pipeline.calibrate.numerics.frame_blocks import Scenes
+from pipeline.calibrate.numerics.nuisances import Considered, by_sensor
 from pipeline.core.errors import SolveError
 from pipeline.objective.ego_motion import EgoMotion
 from pipeline.objective.sweep_registration import Surfaces, plane_equations
 from pipeline.rig.checks import Check
 from pipeline.rig.estimates import DayParts
-from pipeline.rig.evidence import EDGE, EdgeEvidence, OtherScenes
+from pipeline.rig.evidence import EdgeEvidence, OtherScenes
 from pipeline.rig.graph import BASE, Edge
 from pipeline.rig.se3 import (
     adjoint,
@@ -188,11 +189,12 @@ def estimate_lidar_lidar(
     T = inverse(A) @ end.X @ A @ T
     seen = _Seen.of(end, block_of[frames])
     information, gradient = seen.evidence(A)
+    floor = _floor(pair, moments)
     numbers = {"share": end.share, "scatter_m": end.scatter_m, "moments": float(len(moments))}
     return EdgeEvidence(
-        edge, T, end.dt_s, information, gradient, {EDGE: _floor(pair, moments)},
+        edge, T, end.dt_s, information, gradient, by_sensor([Considered("matching", np.diag(floor))], edge),
         frames_used=len(moments), checks=_other_ends(ends), diagnostics=numbers, notes=_notes(information),
-        others=_others(seen, moments, at_prior, A, _floor(pair, moments)),
+        others=_others(seen, moments, at_prior, A, np.diag(floor**2)),
         parts=_parts(seen, moments, T, A, [pair.parent[k].stamp_ns for k in frames], scenes.scene[frames]),
     )  # fmt: skip
 
@@ -290,14 +292,14 @@ def _other_ends(ends: Sequence[_End]) -> tuple[Check, ...]:
 
 
 def _floor(pair: LidarPair, moments: Sequence[_Moment]) -> np.ndarray:
-    """Errors common to all moments: ranges, and de-skewing with a wrong base."""
+    """Sigmas of errors common to all moments: ranges, and de-skewing with a wrong base."""
     speed = float(np.sqrt(np.mean([m.motion[3] ** 2 + m.motion[4] ** 2 for m in moments])))
     lifted = (
         speed
         * pair.base_sigma_rad
         * np.array([*[_SWEEP_S_PER_RAD / TYPICAL_RANGE_M] * 3, *[SWEEP_S / 2] * 3])
     )
-    return np.asarray(np.diag(_MATCHING**2 + lifted**2))
+    return np.hypot(_MATCHING, lifted)
 
 
 def _refitted(end: _End, moments: Sequence[_Moment], some: np.ndarray) -> _End:

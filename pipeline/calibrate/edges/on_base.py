@@ -9,12 +9,24 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipeline.calibrate.numerics.change_point import parts_of_day
+from pipeline.calibrate.numerics.nuisances import Considered
 from pipeline.rig.changes import change_jacobian, changed
 from pipeline.rig.estimates import DayParts
 from pipeline.rig.evidence import OtherScenes
 from pipeline.rig.se3 import adjoint, inverse
 
-__all__ = ["Regression", "Rows", "Series", "changes_by_left", "first_and_last", "other_scenes", "regress"]
+__all__ = [
+    "CHANGES",
+    "STANCE",
+    "Regression",
+    "Rows",
+    "Series",
+    "changes_by_left",
+    "first_and_last",
+    "of_stance_and",
+    "other_scenes",
+    "regress",
+]
 
 # --------------------------------------------------------------------------------------------------
 # Robust linear regression with a covariance from the scatter of blocks of frames.
@@ -124,6 +136,11 @@ def _halves(A: np.ndarray, y: np.ndarray, blocks: np.ndarray, held: np.ndarray, 
 # A sensor on the vehicle frame: from changes of T_base_sensor to T_sensor_base, over halves and parts of a day.
 
 
+# What all days of a car err by alike, as one sigma of roll, pitch, yaw and height of the base. Roads fall by about 2 %
+# to the side that is driven on, so bodies that lean by some 5 deg/g and rear axles that slip by some 3 deg/g (Gillespie
+# 1992, Fundamentals of vehicle dynamics) stand 0.1 deg off, on part of the roads. Tyres settle by a centimetre.
+STANCE = np.array([*np.radians([0.05, 0.05, 0.05]), 0.01])
+CHANGES = (0, 1, 2, 5)  # these of a change of T_base_sensor
 _UNKNOWN_RAD = np.pi  # sigma of a part of the day that determines nothing
 
 
@@ -149,6 +166,15 @@ def changes_by_left(T_base_sensor: Float[np.ndarray, "4 4"]) -> Float[np.ndarray
     exp(xi) T_sensor_base is the inverse of exp(-Ad(T_base_sensor) xi) T_base_sensor.
     """
     return np.asarray(-change_jacobian(T_base_sensor) @ adjoint(T_base_sensor))
+
+
+def of_stance_and(
+    T_base_sensor: Float[np.ndarray, "4 4"], **changes: Float[np.ndarray, "_ 6"]
+) -> list[Considered]:
+    """The car's stance, and nuisances stated as changes of T_base_sensor, each in axes of its owner."""
+    to_left = np.linalg.inv(changes_by_left(T_base_sensor))
+    of_edge = [Considered(name, rows).of_pose(to_left) for name, rows in changes.items()]
+    return [Considered("stance", np.diag(STANCE) @ np.eye(6)[list(CHANGES)]), *of_edge]
 
 
 def other_scenes(

@@ -11,31 +11,33 @@ determine the clock. The motion must come from sources other than this radar.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int64
 
 from pipeline.calibrate.edges.day_sources import DaySources
-from pipeline.calibrate.edges.lidar_base import STANCE
 from pipeline.calibrate.edges.on_base import (
+    STANCE,
     Regression,
     Rows,
     Series,
     changes_by_left,
     first_and_last,
+    of_stance_and,
     other_scenes,
     regress,
 )
 from pipeline.calibrate.numerics.frame_blocks import Scenes
+from pipeline.calibrate.numerics.nuisances import by_sensor
 from pipeline.calibrate.verify.motion_sources import compared_sources
 from pipeline.core.errors import SolveError
 from pipeline.objective.ego_motion import DopplerMotion, EgoMotion
 from pipeline.objective.radar.travel import TravelDirections, travel_directions
 from pipeline.rig.checks import Check
-from pipeline.rig.evidence import EDGE, EdgeEvidence
-from pipeline.rig.graph import BASE, Edge
+from pipeline.rig.evidence import EdgeEvidence
+from pipeline.rig.graph import Edge
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
 from schemas.observations import Observation
 
@@ -121,7 +123,7 @@ def estimate_radar_base(
     halves = [(1, pitch, float(STANCE[1])), (2, yaw, float(STANCE[2]))]
     return EdgeEvidence(
         edge, inverse(T), 0.0 if clock is None else float(clock.value[0]), (J.T / variance) @ J, np.zeros(7),
-        _biases(T, 0.0 if directions is None else directions.bias_rad()),
+        _errors(edge, T, 0.0 if directions is None else directions.bias_rad()),
         frames_used=len(moving), diagnostics=_numbers(yaw, len(moving)), notes=_notes(yaw, pitch, clock),
         others=other_scenes(T, halves), parts=first_and_last(T, day),
     )  # fmt: skip
@@ -186,13 +188,10 @@ def _accelerations(ego: EgoMotion, stamps: Stamps) -> Float[np.ndarray, " F"]:
     return found
 
 
-def _biases(T: np.ndarray, pitch_rad: float) -> dict[str, np.ndarray]:
-    """Biases: the car's stance, and the matching; for pitch, the effect of detections measured too low."""
-    axes = np.zeros((4, 6))
-    axes[[0, 1, 2, 3], [0, 1, 2, 5]] = 1.0
-    floor = np.diag([0.0, pitch_rad, _YAW_FLOOR_RAD, 0.0, 0.0, 0.0]) ** 2
-    to_radar = np.linalg.inv(changes_by_left(T))
-    return {BASE.name: axes.T @ np.diag(STANCE**2) @ axes, EDGE: to_radar @ floor @ to_radar.T}
+def _errors(edge: Edge, T: np.ndarray, pitch_rad: float) -> Mapping[str, np.ndarray]:
+    """Biases by owner: the car's stance, the matching, and detections measured too low."""
+    of_changes = {"matching": _YAW_FLOOR_RAD * np.eye(6)[[2]], "seen_low": pitch_rad * np.eye(6)[[1]]}
+    return by_sensor(of_stance_and(T, **of_changes), edge)
 
 
 def _numbers(yaw: Regression | None, moments: int) -> dict[str, float]:

@@ -21,6 +21,7 @@ from pipeline.calibrate.numerics.bias_floors import (
 )
 from pipeline.calibrate.numerics.covariance import Posterior, covariance_with_fixed, posterior
 from pipeline.calibrate.numerics.frame_blocks import blocks_of
+from pipeline.calibrate.numerics.nuisances import Considered, estimate_biases
 from pipeline.core.config import SolveConfig
 from pipeline.objective.radar.moving_clusters import (
     MATCH_RAD,
@@ -141,8 +142,7 @@ def estimate_camera_radar(
         common_covariance=J
         @ common_of(after.covariance, prior_covariance, np.diag(CAMERA_RADAR_BIAS**2))
         @ J.T,
-        # How a radar sees cars, whichever camera has their boxes.
-        bias={"radar": J @ np.diag(np.where(after.observable, CAMERA_RADAR_BIAS, 0.0) ** 2) @ J.T},
+        **estimate_biases([Considered("boxes", np.diag(CAMERA_RADAR_BIAS * after.observable))], J),
     )
 
 

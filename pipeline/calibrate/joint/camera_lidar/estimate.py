@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from pipeline.calibrate.joint.camera_lidar.initialise import (
     MARGIN_RAD,
@@ -50,7 +50,7 @@ from pipeline.calibrate.joint.part_turn import PartTurn
 from pipeline.calibrate.numerics.bias_floors import TZ_COMMON_BIAS_M
 from pipeline.calibrate.numerics.covariance import OBSERVABLE
 from pipeline.calibrate.numerics.frame_blocks import Scenes
-from pipeline.calibrate.numerics.nuisances import by_owner, considered_numbers
+from pipeline.calibrate.numerics.nuisances import Considered, considered_numbers, estimate_biases
 from pipeline.calibrate.numerics.search_range import search_range
 from pipeline.core.config import SolveConfig
 from pipeline.core.errors import SolveError
@@ -195,7 +195,7 @@ def analyse_camera_lidar(
     own_dt_s, z = far_time_offset(problem.terms, analysis.state, analysis.kernel, rng)
     diagnostics |= {
         "label_width_px": aligned.label_width_px,
-        **considered_numbers(analysis.considered),
+        **considered_numbers(analysis.considered, of_camera=True),
         "left_out_dt_s": float(np.linalg.norm(analysis.considered[-1].rows[:, DT])),
     }
     diagnostics |= {"own_dt_s": aligned.expected_dt_s + own_dt_s, "own_dt_z": z}
@@ -334,15 +334,13 @@ def _conclude(
         notes=notes,
         common_covariance=common_part(to_left @ analysis.common[:6, :6] @ to_left.T, covariance),
         failed_checks=disagreement(turns),
-        bias={owner: to_left @ B @ to_left.T for owner, B in by_owner(analysis.considered).items()},
-        bias_in_weights=to_left @ np.diag(_tz_bias(analysis)) @ to_left.T,
         time_offset_prior_s=aligned.expected_dt_s,
+        **estimate_biases([*analysis.considered, _tz_bias(analysis)], to_left),
     )
 
 
-def _tz_bias(analysis: ObservabilityAnalysis) -> Float[np.ndarray, " 6"]:
-    """Variance of tz due to common errors of edges and markings, with the weight of its profile against the prior."""
+def _tz_bias(analysis: ObservabilityAnalysis) -> Considered:
+    """Common errors of edges and markings in tz, with the weight of its profile against the prior."""
     weight = max(float(analysis.observability[TZ]), 0.0)
-    known = weight >= OBSERVABLE
-    variance = weight**2 * (analysis.profile.bias_m**2 + TZ_COMMON_BIAS_M**2) if known else 0.0
-    return np.where(np.arange(6) == TZ, variance, 0.0)
+    sigma_m = float(np.hypot(analysis.profile.bias_m, TZ_COMMON_BIAS_M)) if weight >= OBSERVABLE else 0.0
+    return Considered("optical_axis", weight * sigma_m * np.eye(6)[[TZ]], in_weights=True)

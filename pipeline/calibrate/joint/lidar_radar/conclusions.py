@@ -13,6 +13,7 @@ from pipeline.calibrate.joint.lidar_radar.problem import DT, RANGE, RadarProblem
 from pipeline.calibrate.joint.lidar_radar.search import comparison_cost, finish
 from pipeline.calibrate.numerics.bias_floors import RADAR_ELEVATION_BIAS_RAD, RANGE_BIAS_SIGMA_M
 from pipeline.calibrate.numerics.covariance import bootstrap_covariance
+from pipeline.calibrate.numerics.nuisances import considered_numbers
 from pipeline.rig.changes import change_between
 
 __all__ = ["diagnostics_of", "notes_of", "own_position"]
@@ -148,6 +149,7 @@ def diagnostics_of(analysis: ObservabilityAnalysis) -> dict[str, float]:
         "assigned_share": float(linear.registration.assigned.mean()),
         "moving_azimuth_sigma_rad": linear.mover_sigma_rad,
         **own_numbers(analysis.sources),
+        **considered_numbers(analysis.considered, of_camera=False),
         "doppler_frames": float(linear.travel_frames),
         "doppler_scatter_rad": linear.travel_scatter_rad,
     }  # fmt: skip

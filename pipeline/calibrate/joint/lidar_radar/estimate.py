@@ -47,6 +47,7 @@ from pipeline.calibrate.numerics.covariance import (
     bootstrap_covariance,
 )
 from pipeline.calibrate.numerics.frame_blocks import blocks_of, scenes_of
+from pipeline.calibrate.numerics.nuisances import estimate_biases
 from pipeline.core.config import SolveConfig
 from pipeline.core.errors import SolveError
 from pipeline.objective.radar.heights import displaced_heights
@@ -57,7 +58,6 @@ from pipeline.objective.stamp_gaps import constant_gap_s, radar_gaps_s
 from pipeline.rig.changes import change_between, change_jacobian
 from pipeline.rig.common_share import common_part
 from pipeline.rig.estimates import DayParts, PairEstimate, Prior
-from pipeline.rig.evidence import EDGE
 from schemas.observations import Observation
 
 __all__ = ["estimate_lidar_radar"]
@@ -158,7 +158,7 @@ def _parts(
     if not len(turns):
         return None
     # What all frames of a day err by alike comes of where it was driven: the parts were driven elsewhere.
-    of_scenes = analysis.floors[:3, :3] + analysis.bias[:3, :3]
+    of_scenes = analysis.of_scenes[:3, :3]
 
     def solve(rows: np.ndarray) -> tuple[RadarState, np.ndarray, np.ndarray]:
         part = about.of_frames(rows)
@@ -270,7 +270,6 @@ def _conclude(
         diagnostics_of(analysis),
         notes,
         common_part(J @ analysis.common[:6, :6] @ J.T, J @ covariance @ J.T),
-        bias={EDGE: J @ analysis.bias[:6, :6] @ J.T},
-        bias_in_weights=J @ analysis.floors_alike[:6, :6] @ J.T,
         time_offset_prior_s=-problem.constant_gap_s,
+        **estimate_biases(analysis.considered, J),
     )

@@ -25,6 +25,7 @@ from pipeline.calibrate.joint.part_turn import PartTurn
 from pipeline.calibrate.numerics.bias_floors import LIDAR_RADAR_BIAS, LIDAR_RADAR_DT_FLOOR_S
 from pipeline.calibrate.numerics.covariance import OBSERVABLE, covariance_with_fixed
 from pipeline.calibrate.numerics.frame_blocks import blocks_of
+from pipeline.calibrate.numerics.nuisances import Considered, considered_covariance, root_rows
 from pipeline.core.config import SolveConfig
 from pipeline.objective.radar.heights import Heights
 from pipeline.rig.common_share import prior_share
@@ -86,10 +87,8 @@ class ObservabilityAnalysis:
     linear: Linear
     covariance: np.ndarray  # P P, of all unknowns, turns about the radar
     common: np.ndarray  # P P, of the covariance what all days of a vehicle err by alike
-    bias: np.ndarray  # 7 7, of the common part what was added to all else
-    # P P: what all frames of the day err by alike, in the weights of elevation's sources; of that, what all days share.
-    floors: np.ndarray
-    floors_alike: np.ndarray
+    considered: tuple[Considered, ...]  # of the common part what is no prior's
+    of_scenes: np.ndarray  # P P, of the covariance what all frames of the day err by alike
     fixed: np.ndarray  # P, bool
     observability: np.ndarray  # 7, of pose and dt
     sources: tuple[PartTurn, ...]  # of pitch, asked where the car's way had no say yet
@@ -129,20 +128,23 @@ def analyse_observability(
         follow @ _left_by(scatter, curvature, fixed) @ follow.T
         for scatter in (linear.floors, linear.floors_alike)
     )
+    sigmas = np.diag(np.append(np.sqrt(bias), np.zeros(UNKNOWNS - len(bias))))
+    added = Considered("surfaces", sigmas[:DT]), Considered("clock", sigmas[[DT]])
     # How low things are seen is the radar's and its roads': it is no less a bias for being estimated.
-    alike = alike + np.outer(full[SEEN_LOW], full[SEEN_LOW]) / variance[SEEN_LOW]
+    seen_low = full[[SEEN_LOW]] / np.sqrt(variance[SEEN_LOW])
+    weighted = (
+        Considered("elevations", root_rows(alike), in_weights=True),
+        Considered("seen_low", seen_low, in_weights=True),
+    )
     others = np.arange(len(variance)) != SEEN_LOW
-    common = alike + prior_share(full, np.diag(others / variance))
-    for covariance in (full, common):
-        covariance[np.arange(DT + 1), np.arange(DT + 1)] += bias
+    of_prior = prior_share(full, np.diag(others / variance))
     return ObservabilityAnalysis(
         state,
         linear,
-        full,
-        common,
-        np.diag(bias),
-        floors,
-        alike,
+        full + considered_covariance(added),
+        of_prior + considered_covariance([*added, *weighted]),
+        (*added, *weighted),
+        floors + considered_covariance(added),
         fixed,
         observability,
         linear.sources,
