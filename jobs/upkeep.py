@@ -6,9 +6,9 @@ import datetime as dt
 
 from jobs.terminal.summary import print_summary, progress_reporter
 from pipeline.core.errors import ConfigError
-from pipeline.store.partitions import Lake
+from pipeline.store.partitions import Lake, days_after
 from pipeline.store.repair import repair_table
-from pipeline.store.retention import collect, collect_pages, first_day_kept
+from pipeline.store.retention import collect, collect_pages
 from schemas.moments import MOMENTS, PERCEIVED
 from schemas.versions import TABLES
 
@@ -61,16 +61,16 @@ def gc(
     for name, days in (("images-days", images_days), ("observations-days", observations_days)):
         if days is not None and days < 1:
             raise ConfigError("command line", name, f"{days} is less than one")
-    tables, today = Lake.existing(lake), dt.datetime.now(dt.UTC).date()
+    tables, today = Lake.existing(lake), dt.datetime.now(dt.UTC).date().isoformat()
     kept = {MOMENTS: images_days} | ({} if observations_days is None else {PERCEIVED: observations_days})
     with progress_reporter("gc") as progress:
         gone = {}
         for schema, days in kept.items():
             progress(0, 0, schema.name)
-            found = collect(tables, schema, first_day_kept(today, days), today.isoformat(), dry_run=dry_run)
+            found = collect(tables, schema, days_after(today, 1 - days), today, dry_run=dry_run)
             gone[schema.name] = list(found)
         progress(0, 0, "pages")
-        pages = collect_pages(tables, first_day_kept(today, images_days), dry_run=dry_run)
+        pages = collect_pages(tables, days_after(today, 1 - images_days), dry_run=dry_run)
     print_summary(
         "gc",
         "planned" if dry_run else "done" if pages or any(gone.values()) else "cached",

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-__all__ = ["NO_SPACE", "atomic_write", "is_running", "naming", "remove_abandoned"]
+__all__ = ["NO_SPACE", "atomic_write", "is_running", "naming"]
 
 # No vehicle-day takes a day: an older temporary file was left by a killed writer on another machine.
 _ABANDONED_S = 24 * 3600.0
@@ -29,7 +29,9 @@ def atomic_write(path: Path) -> Iterator[BinaryIO]:
     The temporary file does not end in .parquet, so that no glob of a table matches it. A killed writer leaves
     it behind; the next writer in that folder removes it, in a large folder the next process that writes there.
     """
-    _tidy(path.parent)
+    owner = path.parent, os.getpid()
+    if owner not in _large and _remove_abandoned(path.parent) > _LARGE:
+        _large.add(owner)
     temporary = path.parent / f".writing-{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex}.tmp"
     try:
         # "x" and not mkstemp: the file gets the permissions of the umask, so that others can read the lake.
@@ -55,13 +57,7 @@ def naming(path: object) -> Iterator[None]:
         raise OSError(err.errno, os.strerror(err.errno), str(path)) from err
 
 
-def _tidy(folder: Path) -> None:
-    """Remove files of killed writers, in a large folder only before this process's first file."""
-    if (folder, os.getpid()) not in _large and remove_abandoned(folder) > _LARGE:
-        _large.add((folder, os.getpid()))
-
-
-def remove_abandoned(folder: Path) -> int:
+def _remove_abandoned(folder: Path) -> int:
     """Remove files of killed writers: of this machine at once, others after a day; returns the number of files."""
     files = list(folder.iterdir())
     for temporary in files:

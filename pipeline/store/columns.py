@@ -59,7 +59,5 @@ def ordinals(days: pa.ChunkedArray) -> Int[np.ndarray, " N"]:
 
 def places(column: pa.ChunkedArray, names: Sequence[str]) -> Int[np.ndarray, " N"]:
     """Index of each value of a column in `names`; -1 if it is not among them."""
-    coded = pc.fill_null(column, "").combine_chunks().dictionary_encode()
-    known = {name: place for place, name in enumerate(names)}
-    place = np.array([known.get(name, -1) for name in coded.dictionary.to_pylist()], np.int64)
-    return place[np.asarray(coded.indices)]
+    found = pc.index_in(column, pa.array(names, pa.string()))
+    return np.asarray(pc.fill_null(found, -1)).astype(np.int64)

@@ -10,10 +10,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-import pyarrow as pa
 import pyarrow.compute as pc
 
-from pipeline.store.delta import merge_rows, stored_schema
+from pipeline.store.delta import merge_rows, with_months
 from pipeline.store.partitions import Lake
 from pipeline.store.records import read_columns, read_last_columns
 from pipeline.store.rows import to_table
@@ -33,22 +32,7 @@ def commit_records(lake: Lake, schema: TableSchema, rows: Iterable[Any]) -> int:
         OSError: the storage does not answer.
     """
     unique = {schema.about_of(row) + (row.work_key,): row for row in rows}
-    if not unique:
-        return 0
-    known = _known(lake, schema, unique.values())
-    now = dt.datetime.now(dt.UTC)
-    changed = []
-    for row in unique.values():
-        rivals = known.get(schema.about_of(row), {})
-        latest = max(rivals.values(), default="")
-        given = row.asserted_at or row.recorded_at
-        if row.work_key in rivals and max(rivals[row.work_key], given) == latest:
-            continue
-        stamp = given or _after(now, latest)
-        changed.append(replace(row, recorded_at=row.recorded_at or stamp, asserted_at=stamp))
-    if changed:
-        merge_rows(lake, schema, _stored(schema, changed))
-    return len(changed)
+    return _commit(lake, schema, list(unique.values()), insert=True)
 
 
 def commit_last(lake: Lake, schema: TableSchema, rows: Sequence[Any]) -> int:
@@ -69,27 +53,37 @@ def commit_last(lake: Lake, schema: TableSchema, rows: Sequence[Any]) -> int:
 
 def assert_records(lake: Lake, schema: TableSchema, rows: Sequence[Any]) -> int:
     """Make recorded rows current again if others became current since; returns how many did."""
+    unstamped = [replace(row, recorded_at="", asserted_at="") for row in rows]
+    return _commit(lake, schema, unstamped, insert=False)
+
+
+def _commit(lake: Lake, schema: TableSchema, rows: Sequence[Any], *, insert: bool) -> int:
+    """Make rows current, those that are not recorded only with `insert`; returns how many changed."""
     known = _known(lake, schema, rows)
     now = dt.datetime.now(dt.UTC)
     changed = []
     for row in rows:
         rivals = known.get(schema.about_of(row), {})
         latest = max(rivals.values(), default="")
-        if row.work_key in rivals and rivals[row.work_key] != latest:
-            changed.append(replace(row, asserted_at=_after(now, latest)))
+        given = row.asserted_at or row.recorded_at
+        if max(rivals[row.work_key], given) == latest if row.work_key in rivals else not insert:
+            continue
+        stamp = given or _after(now, latest)
+        changed.append(replace(row, recorded_at=row.recorded_at or stamp, asserted_at=stamp))
     if changed:
-        merge_rows(lake, schema, _stored(schema, changed), insert=False)
+        table = to_table(sorted(changed, key=lambda r: (r.vehicle, r.day)), schema)
+        merge_rows(lake, schema, with_months(table, schema), insert=insert)
     return len(changed)
 
 
-def _known(lake: Lake, schema: TableSchema, rows: Iterable[Any]) -> Mapping[tuple[str, ...], dict[str, str]]:
+def _known(lake: Lake, schema: TableSchema, rows: Sequence[Any]) -> Mapping[tuple[str, ...], dict[str, str]]:
     """Recorded rows by key: work key to `asserted_at`."""
-    rows = list(rows)
-    days = sorted({row.day for row in rows})
-    vehicles = {row.vehicle for row in rows}
+    if not rows:
+        return {}
+    vehicles, days = {row.vehicle for row in rows}, {row.day for row in rows}
     one = vehicles if len(vehicles) == 1 else None
     columns = [*schema.about, "work_key", "asserted_at"]
-    found = read_columns(lake, schema, (), first=days[0], last=days[-1], vehicle=one) if rows else None
+    found = read_columns(lake, schema, (), first=min(days), last=max(days), vehicle=one)
     known: dict[tuple[str, ...], dict[str, str]] = {}
     if found is not None:
         values = [found.column(name).to_pylist() for name in columns]
@@ -108,11 +102,3 @@ def _after(now: dt.datetime, latest: str) -> str:
 
 def _iso(stamp: dt.datetime) -> str:
     return stamp.astimezone(dt.UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
-
-
-def _stored(schema: TableSchema, rows: Sequence[Any]) -> pa.Table:
-    ordered = sorted(rows, key=lambda r: (r.vehicle, r.day))
-    table = to_table(ordered, schema).append_column(
-        "month", pa.array([r.day[:7] for r in ordered], pa.string())
-    )
-    return table.cast(stored_schema(schema))

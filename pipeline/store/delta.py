@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import random
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,10 +38,11 @@ __all__ = [
     "merge_rows",
     "open_table",
     "read_file",
+    "set_aside",
     "set_aside_damaged",
     "spans_of_file",
-    "stored_schema",
     "tidy_table",
+    "with_months",
 ]
 
 _MONTH = "month"
@@ -99,8 +101,14 @@ class LiveFile:
     in_log: bool = True  # False: found without the log, so other files may hold the same rows
 
 
-def stored_schema(schema: TableSchema) -> pa.Schema:
-    """Arrow schema of a record table's files: its columns, and the month."""
+def with_months(rows: pa.Table, schema: TableSchema) -> pa.Table:
+    """All columns of a record table's files: its own, in any order in `rows`, and the month."""
+    months = pc.utf8_slice_codeunits(rows["day"], 0, 7).cast(pa.string())
+    stored = _stored_schema(schema)
+    return rows.append_column(_MONTH, months).select(stored.names).cast(stored)
+
+
+def _stored_schema(schema: TableSchema) -> pa.Schema:
     return pa.schema([*schema.arrow_schema(), pa.field(_MONTH, pa.string(), nullable=False)])
 
 
@@ -179,8 +187,9 @@ def read_file(
         with opened_parquet(lake.files, path, coded) as file:
             there = [c for c in dict.fromkeys([*asked, *mapped]) if c in file.names]
             # One by one: pyarrow 26 cannot read dictionary-encoded map keys of several row groups at once.
-            groups = _groups(file.metadata, wanted or Wanted())
-            parts = [file.groups([g], there) for g in groups]
+            wanted = wanted or Wanted()
+            spans = _spans(file.metadata, "day", "vehicle", "asserted_at")
+            parts = [file.groups([g], there) for g, own in enumerate(spans) if wanted.may_be_within(*own)]
             table = pa.concat_tables(parts) if parts else file.groups([], there)
     except (PermissionError, pa.ArrowNotImplementedError):
         raise  # no permission is not damage: leaving the file out would hide its records from every audit
@@ -208,40 +217,32 @@ def _mapped(columns: Sequence[str]) -> dict[str, list[str]]:
     return found
 
 
-def _groups(metadata: pq.FileMetaData, wanted: Wanted) -> list[int]:
-    """Row groups that may contain requested rows."""
-    place = {metadata.schema.column(i).path: i for i in range(metadata.num_columns)}
-    return [
-        g
-        for g in range(metadata.num_row_groups)
-        if wanted.may_be_within(
-            *(_span(metadata.row_group(g), place.get(c)) for c in ("day", "vehicle", "asserted_at"))
-        )
-    ]
-
-
 def spans_of_file(
     lake: Lake, schema: TableSchema, name: str
 ) -> tuple[tuple[str, str] | None, tuple[str, str] | None]:
     """Ranges of days and vehicles of a data file, from its footer; None if unreadable."""
-    found: list[tuple[str, str] | None] = []
     try:
         with opened_parquet(lake.files, lake.record_file(schema.name, name)) as file:
-            metadata = file.metadata
+            spans = _spans(file.metadata, "day", "vehicle")
     except (pa.ArrowException, OSError):
         return None, None
-    place = {metadata.schema.column(i).path: i for i in range(metadata.num_columns)}
-    for column in ("day", "vehicle"):
-        spans = [_span(metadata.row_group(g), place.get(column)) for g in range(metadata.num_row_groups)]
+
+    def whole(spans: list[tuple[str, str] | None]) -> tuple[str, str] | None:
         known = [s for s in spans if s is not None]
-        whole = known and len(known) == len(spans)
-        found.append((min(s[0] for s in known), max(s[1] for s in known)) if whole else None)
-    return found[0], found[1]
+        is_whole = known and len(known) == len(spans)
+        return (min(s[0] for s in known), max(s[1] for s in known)) if is_whole else None
+
+    return whole([days for days, _ in spans]), whole([vehicles for _, vehicles in spans])
 
 
-def _span(group: pq.RowGroupMetaData, column: int | None) -> tuple[str, str] | None:
-    statistics = group.column(column).statistics if column is not None else None
-    return (statistics.min, statistics.max) if statistics is not None and statistics.has_min_max else None
+def _spans(metadata: pq.FileMetaData, *columns: str) -> list[list[tuple[str, str] | None]]:
+    """For each row group, the range of each column; None if unknown."""
+    place = {metadata.schema.column(i).path: i for i in range(metadata.num_columns)}
+    found: list[list[tuple[str, str] | None]] = []
+    for g in range(metadata.num_row_groups):
+        of = [metadata.row_group(g).column(place[c]).statistics if c in place else None for c in columns]
+        found.append([(s.min, s.max) if s is not None and s.has_min_max else None for s in of])
+    return found
 
 
 def _values_of(maps: pa.ChunkedArray | None, key: str, rows: int) -> pa.Array:
@@ -263,7 +264,7 @@ def merge_rows(lake: Lake, schema: TableSchema, rows: pa.Table, *, insert: bool 
     """Add rows whose work is not recorded; for others update only `asserted_at`, if it is later.
 
     Args:
-        rows: with all columns of `stored_schema`, without duplicates of key and work.
+        rows: of `with_months`, without duplicates of key and work.
         insert: False = only update `asserted_at`.
 
     Raises:
@@ -310,7 +311,7 @@ def create_table(lake: Lake, schema: TableSchema) -> DeltaTable:
         (lake.root / schema.name).mkdir(parents=True, exist_ok=True)
     return DeltaTable.create(
         lake.table(schema.name),
-        Schema.from_arrow(stored_schema(schema)),
+        Schema.from_arrow(_stored_schema(schema)),
         mode="ignore",
         partition_by=[_MONTH],
         name=schema.name,
@@ -334,11 +335,16 @@ def set_aside_damaged(lake: Lake, schema: TableSchema) -> list[str]:
     for file in live_files(table) if table is not None else []:
         if read_file(lake, schema, file.name, [c.name for c in schema.columns]) is None:
             bad.append(file.name)
-            path = lake.record_file(schema.name, file.name)
-            lake.files.move(path, lake.root / schema.name / DAMAGED / file.name.replace("/", "_"))
+            set_aside(lake, schema, file.name)
     if bad and table is not None:
         table.repair()  # removes missing files from the log
     return bad
+
+
+def set_aside(lake: Lake, schema: TableSchema, name: str) -> None:
+    """Move a data file, if it exists, into `_damaged`."""
+    to = lake.root / schema.name / DAMAGED / name.replace("/", "_")
+    lake.files.move(lake.record_file(schema.name, name), to)
 
 
 def tidy_table(lake: Lake, schema: TableSchema) -> Iterator[str]:
@@ -349,24 +355,16 @@ def tidy_table(lake: Lake, schema: TableSchema) -> Iterator[str]:
     table = open_table(lake, schema)
     if table is None:
         return
-    files = live_files(table)
-    months: dict[str, int] = {}
-    for file in files:
-        month = file.name.partition("/")[0].removeprefix(f"{_MONTH}=")
-        months[month] = months.get(month, 0) + 1
+    months = Counter(f.name.partition("/")[0].removeprefix(f"{_MONTH}=") for f in live_files(table))
     try:
         for month in sorted(m for m, count in months.items() if count > _FILES_A_MONTH):
-            yield from _compacted(table, month)
+            done: dict[str, Any] = table.optimize.compact(
+                [(_MONTH, "=", month)], target_size=_FILE_BYTES, writer_properties=_WRITER
+            )
+            if done["numFilesRemoved"]:
+                yield f"{month}: {done['numFilesRemoved']} files are {done['numFilesAdded']} now"
         table.vacuum(_KEEP_HOURS, dry_run=False)
     except CommitFailedError:
         return
     except DeltaError:
         yield from (f"set aside {name}" for name in set_aside_damaged(lake, schema))
-
-
-def _compacted(table: DeltaTable, month: str) -> Iterator[str]:
-    done: dict[str, Any] = table.optimize.compact(
-        [(_MONTH, "=", month)], target_size=_FILE_BYTES, writer_properties=_WRITER
-    )
-    if done["numFilesRemoved"]:
-        yield f"{month}: {done['numFilesRemoved']} files are {done['numFilesAdded']} now"

@@ -47,27 +47,23 @@ class MomentWriter:
 
     def __init__(self, stack: ExitStack, lake: Lake, partition: Partition, index: PartitionWriter) -> None:
         self._stack, self._lake, self._partition, self._index = stack, lake, partition, index
-        self._held: list[Any] = []
+        self.moments: list[Any] = []  # about a kilobyte each
         self.files: dict[str, PartitionWriter] = {}
 
     @property
     def rows(self) -> int:
         """Number of moments so far."""
-        return len(self._held)
+        return len(self.moments)
 
     def append(self, moment: Any, captures: Mapping[str, Any]) -> None:
         """Add a moment and its rows by sensor name."""
         rows = {sensor: self._file(sensor, row).add(row) for sensor, row in captures.items()}
-        self._held.append(replace(moment, rows=rows))
+        self.moments.append(replace(moment, rows=rows))
 
     def describe(self, **told: Any) -> None:
         """Counts and words for the manifest; see `PartitionWriter.describe`."""
         files = {sensor: file.schema.name for sensor, file in self.files.items()}
         self._index.describe(**told | {FILES: files})
-
-    def finish(self) -> None:
-        """Write the moments."""
-        self._index.append(self._held)  # about a kilobyte per moment
 
     def _file(self, sensor: str, row: Any) -> PartitionWriter:
         if sensor not in self.files:
@@ -96,12 +92,14 @@ def write_moments(
         index = stack.enter_context(opened_for_writing(lake, path, schema))
         writer = MomentWriter(stack, lake, partition, index)
         yield writer
-        writer.finish()
+        index.append(writer.moments)
         for file in writer.files.values():
             file.close(work_key, code_version)
         index.close(work_key, code_version, inputs)
         lake.files.delete(path)
-    _tidy(lake, schema, partition, writer.files)
+    kept = {lake.file(f.schema.name, partition, sensor) for sensor, f in writer.files.items()}
+    for gone in set(sensor_files(lake, schema, partition)) - kept:  # of sensors that the day no longer has
+        lake.files.delete(gone)
 
 
 def is_whole(lake: Lake, partition: Partition, manifest: Manifest) -> bool:
@@ -145,9 +143,9 @@ def joined(
         DamagedError: a file cannot be read.
         CollectedError: the rows were deleted at the end of their retention.
     """
-    wanted = None if moments is None else set(moments)
     rows: list[Any] = read_rows(lake, schema, partition, schema.row_type)
-    index = [m for m in rows if wanted is None or m.moment in wanted]
+    wanted = {m.moment for m in rows} if moments is None else {*moments}
+    index = [m for m in rows if m.moment in wanted]
     manifest = read_manifest(lake, schema, partition)
     assert manifest is not None, "its rows were just read"
     files = manifest.extra.get(FILES, {})
@@ -175,13 +173,3 @@ def _rows_of(
     chunks: Iterator[list[Any]] = iterate_rows(lake, schema, partition, schema.row_type, rows, sensor)
     for chunk in chunks:
         yield from chunk
-
-
-def _tidy(
-    lake: Lake, schema: TableSchema, partition: Partition, files: Mapping[str, PartitionWriter]
-) -> None:
-    """Remove files of sensors that the day no longer has."""
-    kept = {lake.file(f.schema.name, partition, sensor) for sensor, f in files.items()}
-    for path in sensor_files(lake, schema, partition):
-        if path not in kept:
-            lake.files.delete(path)

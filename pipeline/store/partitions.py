@@ -66,8 +66,7 @@ class Partition:
     def __post_init__(self) -> None:
         if not is_vehicle(self.vehicle):
             raise ConfigError("command line", "vehicle", f"{self.vehicle!r} cannot be a vehicle's name")
-        if not is_day(self.day):
-            raise ConfigError("command line", "day", f"{self.day!r} is not a day of the form YYYY-MM-DD")
+        check_day("day", self.day)
 
     @property
     def folder(self) -> str:

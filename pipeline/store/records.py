@@ -6,18 +6,21 @@ Months, files and columns that are not requested are not read, and damaged files
 from __future__ import annotations
 
 import datetime as dt
+import math
 from collections.abc import Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import MISSING, fields, replace
+from functools import reduce
 from itertools import groupby
 from operator import itemgetter
+from pathlib import PurePosixPath
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from pipeline.store.data_files import data_files, once
-from pipeline.store.delta import Wanted, read_file
+from pipeline.core.errors import DamagedLogError
+from pipeline.store.delta import LiveFile, Wanted, live_files, open_table, read_file, spans_of_file
 from pipeline.store.partitions import Lake, LostRows
 from pipeline.store.rows import from_table
 from schemas.columns import TableSchema
@@ -25,9 +28,11 @@ from schemas.columns import TableSchema
 __all__ = [
     "Assertion",
     "RecordIndex",
+    "files_there",
     "first_day",
     "last_assertion",
     "last_day",
+    "once",
     "read_columns",
     "read_last",
     "read_last_columns",
@@ -155,8 +160,8 @@ def read_latest(
     row_type: type[Row],
     *,
     first: str,
-    last: str | None = None,
-    columns: Sequence[str] | None = None,
+    last: str,
+    columns: Sequence[str],
 ) -> list[Row]:
     """Records of the last recorded day of each vehicle and method, in the order of `read_records`.
 
@@ -166,10 +171,7 @@ def read_latest(
     if keys is None:
         return []
     latest = keys.group_by(["vehicle", "method"]).aggregate([("day", "max")])
-    day_of = {
-        (v, m): day
-        for v, m, day in zip(*(latest[n].to_pylist() for n in ("vehicle", "method", "day_max")), strict=True)
-    }
+    day_of = {(row["vehicle"], row["method"]): row["day_max"] for row in latest.to_pylist()}
     found: list[Any] = []
     for day in sorted(set(day_of.values())):
         of_day: list[Any] = read_records(lake, schema, row_type, day=day, columns=columns)
@@ -183,7 +185,7 @@ def last_assertion(lake: Lake, schema: TableSchema, method: str | None = None) -
     Files are read from the last written one on, until the others are older than the stamp found.
     """
     found: Assertion | None = None
-    for file in sorted(data_files(lake, schema), key=lambda f: f.written_s, reverse=True):
+    for file in sorted(_data_files(lake, schema), key=lambda f: f.written_s, reverse=True):
         stamp = found.asserted_at if found else None
         if stamp and file.written_s + _CLOCKS_DIFFER_S < dt.datetime.fromisoformat(stamp).timestamp():
             break
@@ -227,25 +229,41 @@ def read_last_columns(
 
 def first_day(lake: Lake, schema: TableSchema) -> str | None:
     """First day of any record of a table, from its log; None if there is none."""
-    spans = [f.days for f in data_files(lake, schema)]
-    return min((days[0] for days in spans if days is not None), default=None)
+    return min((f.days[0] for f in _data_files(lake, schema) if f.days is not None), default=None)
 
 
 def last_day(lake: Lake, schema: TableSchema) -> str | None:
     """Last day of any record of a table, from its log; None if there is none."""
-    spans = [f.days for f in data_files(lake, schema)]
-    return max((days[1] for days in spans if days is not None), default=None)
+    return max((f.days[1] for f in _data_files(lake, schema) if f.days is not None), default=None)
 
 
 def _wanted(vehicle: str | AbstractSet[str] | None, first: str | None, last: str | None) -> Wanted:
-    own = (
-        frozenset([vehicle]) if isinstance(vehicle, str) else None if vehicle is None else frozenset(vehicle)
-    )
-    return Wanted(own, first, last)
+    own = {vehicle} if isinstance(vehicle, str) else vehicle
+    return Wanted(None if own is None else frozenset(own), first, last)
+
+
+def _data_files(lake: Lake, schema: TableSchema) -> list[LiveFile]:
+    """Data files of a table; if its log is damaged, all existing ones, with a note in `lake.damage`."""
+    try:
+        table = open_table(lake, schema)
+    except DamagedLogError as err:
+        lake.damage.append(str(err))
+        return [
+            LiveFile(name, *spans_of_file(lake, schema, name), math.inf, in_log=False)
+            for name in files_there(lake, schema)
+        ]
+    return live_files(table) if table is not None else []
+
+
+def files_there(lake: Lake, schema: TableSchema) -> list[str]:
+    """Names of all data files of a table, in its log or not."""
+    folder = lake.root / schema.name
+    found = lake.files.find(folder, "month=*/*.parquet")
+    return sorted(str(PurePosixPath(path.relative_to(folder))) for path in found)
 
 
 def _rows_of(lake: Lake, schema: TableSchema, columns: Sequence[str], wanted: Wanted) -> pa.Table | None:
-    files = [f for f in data_files(lake, schema) if wanted.may_be_within(f.days, f.vehicles)]
+    files = [f for f in _data_files(lake, schema) if wanted.may_be_within(f.days, f.vehicles)]
     parts = []
     for file in files:
         part = read_file(lake, schema, file.name, columns, wanted)
@@ -263,14 +281,22 @@ def _rows_of(lake: Lake, schema: TableSchema, columns: Sequence[str], wanted: Wa
 def _chosen(rows: pa.Table, wanted: Wanted) -> pa.Table:
     conditions = []
     if wanted.vehicles is not None:
-        among = pa.array(sorted(wanted.vehicles), pa.string())
-        conditions.append(pc.is_in(rows["vehicle"], among))
+        conditions.append(pc.is_in(rows["vehicle"], pa.array(sorted(wanted.vehicles), pa.string())))
     if wanted.first is not None:
         conditions.append(pc.greater_equal(rows["day"], wanted.first))
     if wanted.last is not None:
         conditions.append(pc.less_equal(rows["day"], wanted.last))
     if wanted.asserted_after is not None:
         conditions.append(pc.greater(rows["asserted_at"], wanted.asserted_after))
-    for condition in conditions[1:]:
-        conditions[0] = pc.and_(conditions[0], condition)
-    return rows.filter(conditions[0]) if conditions else rows
+    return rows.filter(reduce(pc.and_, conditions)) if conditions else rows
+
+
+def once(rows: pa.Table, schema: TableSchema) -> pa.Table:
+    """Rows without duplicates of the same work and key (the last asserted one stays)."""
+    names = [*schema.about, "work_key", "asserted_at"]
+    if not set(names) <= set(rows.column_names):
+        return rows
+    last: dict[tuple[str, ...], tuple[str, int]] = {}
+    for at, (*key, asserted) in enumerate(zip(*(rows[n].to_pylist() for n in names), strict=True)):
+        last[tuple(key)] = max(last.get(tuple(key), ("", -1)), (asserted, at))
+    return rows.take(pa.array(sorted(at for _, at in last.values()), pa.int64()))

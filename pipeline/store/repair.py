@@ -9,7 +9,6 @@ from typing import Any
 import pyarrow as pa
 
 from pipeline.core.errors import DamagedLogError
-from pipeline.store.data_files import files_there, once
 from pipeline.store.delta import (
     DAMAGED,
     LOG,
@@ -18,10 +17,12 @@ from pipeline.store.delta import (
     merge_rows,
     open_table,
     read_file,
+    set_aside,
     set_aside_damaged,
-    stored_schema,
+    with_months,
 )
 from pipeline.store.partitions import Lake
+from pipeline.store.records import files_there, once
 from schemas.columns import TableSchema
 
 __all__ = ["Repaired", "repair_table"]
@@ -82,18 +83,13 @@ def _take_in(lake: Lake, schema: TableSchema, name: str, done: Repaired, bad: se
     elif rows.num_rows:
         merge_rows(lake, schema, rows)
         done.files += 1
-    lake.files.move(
-        lake.record_file(schema.name, name), lake.root / schema.name / DAMAGED / name.replace("/", "_")
-    )
+    set_aside(lake, schema, name)
 
 
 def _words(name: str, vehicles: tuple[str, str] | None, days: tuple[str, str] | None) -> str:
-    spans = [
-        f"{what} {of[0]} to {of[1]}"
-        for what, of in (("vehicles", vehicles), ("days", days))
-        if of is not None
-    ]
-    return f"{name}: rows of {', '.join(spans) or 'unknown vehicles and days'}"
+    spans = {"vehicles": vehicles, "days": days}
+    known = [f"{what} {of[0]} to {of[1]}" for what, of in spans.items() if of is not None]
+    return f"{name}: rows of {', '.join(known) or 'unknown vehicles and days'}"
 
 
 def _said_by_entries(lake: Lake, schema: TableSchema) -> dict[str, str]:
@@ -134,6 +130,4 @@ def _whole_rows(lake: Lake, schema: TableSchema, name: str) -> pa.Table | None:
     rows = read_file(lake, schema, name, [c.name for c in schema.columns])
     if rows is None or rows.num_columns < len(schema.columns):
         return None
-    rows = once(rows, schema)
-    months = pa.array([day[:7] for day in rows["day"].to_pylist()], pa.string())
-    return rows.append_column("month", months).select(stored_schema(schema).names).cast(stored_schema(schema))
+    return with_months(once(rows, schema), schema)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime as dt
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -12,7 +11,7 @@ from pipeline.store.partitions import Lake, Partition, is_day
 from pipeline.store.tables import COLLECTED, read_manifest, write_manifest
 from schemas.columns import TableSchema
 
-__all__ = ["Collected", "collect", "collect_pages", "first_day_kept"]
+__all__ = ["Collected", "collect", "collect_pages"]
 
 
 @dataclass(frozen=True)
@@ -72,8 +71,3 @@ def collect_pages(lake: Lake, before: str, *, dry_run: bool = False) -> list[str
             if not dry_run:
                 lake.files.delete(page)
     return gone
-
-
-def first_day_kept(today: dt.date, days: int) -> str:
-    """First day to keep if `days` days are kept, today included."""
-    return (today - dt.timedelta(days=days - 1)).isoformat()

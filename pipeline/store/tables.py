@@ -104,9 +104,11 @@ class PartitionWriter:
         """Write the remaining rows, then the manifest."""
         self._write_held()
         of = self.schema.name, self.schema.version, work_key, code_version, list(inputs), self.rows
-        manifest = Manifest(*of, **self.manifest_fields)
+        self.seal(Manifest(*of, **self.manifest_fields))
+
+    def seal(self, manifest: Manifest) -> None:
+        """Write the manifest."""
         self._writer.add_key_value_metadata({_KEY.decode(): json.dumps(manifest.__dict__)})
-        self._writer.close()
 
 
 def _bytes_of(row: Any) -> int:
@@ -118,7 +120,10 @@ def _bytes_of(row: Any) -> int:
 @contextmanager
 def opened_for_writing(lake: Lake, path: PurePath, schema: TableSchema) -> Iterator[PartitionWriter]:
     """A file of a partition, which is renamed to its name when the block ends without an error."""
-    with _replacing(lake, path, schema) as parquet:
+    with (
+        lake.files.replacing(path) as stream,
+        pq.ParquetWriter(stream, schema.arrow_schema(), **_writer_options(schema)) as parquet,
+    ):
         yield PartitionWriter(parquet, schema)
 
 
@@ -139,8 +144,8 @@ def write_partition(
 
 def write_manifest(lake: Lake, schema: TableSchema, partition: Partition, manifest: Manifest) -> None:
     """Replace a partition by its manifest, without rows."""
-    with _replacing(lake, lake.file(schema.name, partition), schema) as parquet:
-        parquet.add_key_value_metadata({_KEY.decode(): json.dumps(manifest.__dict__)})
+    with opened_for_writing(lake, lake.file(schema.name, partition), schema) as writer:
+        writer.seal(manifest)
 
 
 def read_manifest(
@@ -149,9 +154,20 @@ def read_manifest(
     """Manifest of a partition, or of its file of a sensor; None if there is no such file."""
     path = lake.file(schema.name, partition, sensor)
     try:
-        return _manifest(lake, path, schema)
+        with naming_damage(path), opened_parquet(lake.files, path) as file:
+            raw = (file.metadata.metadata or {}).get(_KEY)
     except FileNotFoundError:
         return None
+    if raw is None:
+        raise ContractError(str(path), "was not written by Boresight (no manifest in the footer)")
+    values = json.loads(raw)
+    found, version = values.get("table"), values.get("version")
+    if (found, version) != (schema.name, schema.version):
+        release, reads = values.get("code_version", "?"), f"{schema.name}/{schema.version}"
+        is_newer = found == schema.name and version > schema.version
+        remedy = "use that release" if is_newer else "make it anew"
+        raise OtherVersionError(str(path), f"{found}/{version}", release, reads, remedy)
+    return Manifest(**{f.name: values[f.name] for f in fields(Manifest) if f.name in values})
 
 
 def absence(schema: TableSchema, partition: Partition) -> str:
@@ -249,18 +265,8 @@ def _with_rows(lake: Lake, schema: TableSchema, partition: Partition, sensor: st
     return path
 
 
-@contextmanager
-def _replacing(lake: Lake, path: PurePath, schema: TableSchema) -> Iterator[pq.ParquetWriter]:
-    with (
-        lake.files.replacing(path) as stream,
-        pq.ParquetWriter(stream, schema.arrow_schema(), **_writer_options(schema)) as parquet,
-    ):
-        yield parquet
-
-
 def _writer_options(schema: TableSchema) -> dict[str, Any]:
     arrow = schema.arrow_schema()
-    nested = any(pa.types.is_nested(f.type) for f in arrow)
     # JPEG and PNG do not compress further; zstd on them only costs time. Nested columns list their leaves
     # separately. Arrays: LZ4 writes in half zstd's time and reads in a quarter, for a tenth more space (on a
     # real day). Low bits of coordinates and times are noise: compressing them takes twice the time for a
@@ -278,18 +284,13 @@ def _writer_options(schema: TableSchema) -> dict[str, Any]:
     compressed = {
         c.name: "NONE" if c.name in coded else "LZ4" if c.is_array else "ZSTD" for c in schema.columns
     }
-    if nested:
-        for f in arrow:
-            if pa.types.is_list(f.type):
-                compressed[f"{f.name}.list.element"] = "ZSTD"
-            elif pa.types.is_map(f.type):
-                compressed |= {f"{f.name}.key_value.key": "ZSTD", f"{f.name}.key_value.value": "ZSTD"}
-    flat = [
-        f.name
-        for f in arrow
-        if f.name in {"frame_index", "stamp_ns", "vehicle", "day", "method", "pair", "status"}
-    ]
-    return {"compression": compressed, "use_dictionary": False, "write_statistics": flat}
+    for f in arrow:
+        if pa.types.is_list(f.type):
+            compressed[f"{f.name}.list.element"] = "ZSTD"
+        elif pa.types.is_map(f.type):
+            compressed |= {f"{f.name}.key_value.key": "ZSTD", f"{f.name}.key_value.value": "ZSTD"}
+    flat = {"frame_index", "stamp_ns", "vehicle", "day", "method", "pair", "status"} & {*arrow.names}
+    return {"compression": compressed, "use_dictionary": False, "write_statistics": sorted(flat)}
 
 
 @contextmanager
@@ -303,18 +304,3 @@ def naming_damage(path: PurePath) -> Iterator[None]:
         if err.errno is not None:  # a problem of disk or network, not of the file
             raise
         raise DamagedError(str(path), str(err).splitlines()[0]) from err
-
-
-def _manifest(lake: Lake, path: PurePath, schema: TableSchema) -> Manifest:
-    with naming_damage(path), opened_parquet(lake.files, path) as file:
-        raw = (file.metadata.metadata or {}).get(_KEY)
-    if raw is None:
-        raise ContractError(str(path), "was not written by Boresight (no manifest in the footer)")
-    values = json.loads(raw)
-    found, version = values.get("table"), values.get("version")
-    if (found, version) != (schema.name, schema.version):
-        release, reads = values.get("code_version", "?"), f"{schema.name}/{schema.version}"
-        is_newer = found == schema.name and version > schema.version
-        remedy = "use that release" if is_newer else "make it anew"
-        raise OtherVersionError(str(path), f"{found}/{version}", release, reads, remedy)
-    return Manifest(**{f.name: values[f.name] for f in fields(Manifest) if f.name in values})
