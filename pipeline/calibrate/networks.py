@@ -73,6 +73,7 @@ def ssl_solver(method: str, task: Task, chosen: Chosen | None = None) -> Solver:
             frames=_frames_of(lake, partition, chosen),
             method=method,
             seed=seed,
+            clock_sigma_s=config.time_offset_sigma_s,
             triggered=triggered,
             progress=progress,
         )

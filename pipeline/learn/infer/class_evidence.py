@@ -7,7 +7,7 @@ pose, with the gradient of the score, so that `joint_fit` can use all frames of 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import no_type_check
 
 import numba
@@ -16,6 +16,7 @@ from jaxtyping import Float, Float32, Int
 
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import NEAR_M
+from pipeline.rig.se3 import exp_se3
 from schemas.training import GRID_CLASSES
 
 __all__ = ["FrameEvidence", "scores"]
@@ -25,13 +26,20 @@ _BEHIND = -5.0  # log-likelihood of a point behind the camera: the floor of the 
 
 @dataclass(frozen=True, eq=False)
 class FrameEvidence:
-    """One frame: a map of log-likelihoods, and lidar points with the probability of their classes."""
+    """One frame: a map of log-likelihoods, and lidar points with the probability of their classes.
+
+    Args:
+        travel: twist per second of the lidar in its own axes [rad/s, m/s].
+        lag_s: by how much later than the sweep the image was taken, by their stamps.
+    """
 
     grid: Grid
     maps: Float32[np.ndarray, "H W K"]
     points_m: Float32[np.ndarray, "N 3"]  # lidar frame
     probability: Float32[np.ndarray, "N K"]
     worth: Float32[np.ndarray, " N"]  # 0 = absent
+    travel: Float[np.ndarray, " 6"] = field(default_factory=lambda: np.zeros(6))
+    lag_s: float = 0.0
 
     @property
     def kinds(self) -> Int[np.ndarray, " K"]:
@@ -40,18 +48,23 @@ class FrameEvidence:
 
 
 def scores(
-    frames: Sequence[FrameEvidence], T_camera_lidar: Float[np.ndarray, "4 4"]
-) -> tuple[Float[np.ndarray, "F E"], Float[np.ndarray, "F E 6"]]:
+    frames: Sequence[FrameEvidence], T_camera_lidar: Float[np.ndarray, "4 4"], dt_s: float = 0.0
+) -> tuple[Float[np.ndarray, "F E"], Float[np.ndarray, "F E 7"]]:
     """Mean expected log-likelihood of each frame's points by kind of evidence, and its gradient.
 
-    The gradient is by a left twist (per rad, per m). All frames have the same kinds.
+    The gradient is by a left twist and by `dt_s` (per rad, per m, per s): stamp_camera = stamp_lidar + dt. Points are
+    where a standing world has them when the image is taken. All frames have the same kinds.
     """
     kinds = frames[0].kinds
-    value, gradient = np.zeros((len(frames), kinds[-1] + 1)), np.zeros((len(frames), kinds[-1] + 1, 6))
-    T = np.ascontiguousarray(T_camera_lidar[:3], dtype=np.float64)
+    value, gradient = np.zeros((len(frames), kinds[-1] + 1)), np.zeros((len(frames), kinds[-1] + 1, 7))
+    travel, late_s = np.stack([f.travel for f in frames]), np.array([dt_s - f.lag_s for f in frames])
+    T = T_camera_lidar @ exp_se3(late_s[:, None] * travel)
     for i, f in enumerate(frames):
         limits = np.radians([f.grid.top_deg, f.grid.left_deg, f.grid.cell_deg])
-        _score(f.points_m, f.probability, f.worth, f.maps, T, limits, kinds, value[i], gradient[i])
+        _score(f.points_m, f.probability, f.worth, f.maps, T[i, :3], limits, kinds, value[i], gradient[i])
+    turn, shift = np.einsum("fij,fkj->kfi", T[:, :3, :3], travel.reshape(-1, 2, 3))
+    by_clock = np.concatenate([turn, shift + np.cross(T[:, :3, 3], turn)], axis=1)
+    gradient[..., 6] = np.einsum("fei,fi->fe", gradient[..., :6], by_clock)
     return value, gradient
 
 

@@ -1,9 +1,9 @@
-"""Camera-lidar of a vehicle-day from all frames together: candidates, vote, climb, covariance."""
+"""Camera-lidar of a vehicle-day and its clock from all frames together: candidates, vote, climb, covariance."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -12,13 +12,15 @@ from scipy.optimize import minimize
 from pipeline.learn.infer.aggregate import measured_estimate
 from pipeline.learn.infer.class_evidence import FrameEvidence, scores
 from pipeline.rig.checks import Check
-from pipeline.rig.estimates import PairEstimate, Prior
+from pipeline.rig.estimates import PairEstimate
 from pipeline.rig.se3 import exp_se3, inverse, log_se3, rotation_angle_rad
 
 __all__ = [
-    "APART_RAD", "JOINT_BIAS_SIGMA", "JointDay", "JointFit", "climbed", "fit_of", "fitted_day",
+    "APART_RAD", "JOINT_BIAS_SIGMA", "Expected", "JointDay", "JointFit", "climbed", "fit_of", "fitted_day",
     "rival_score", "voted",
 ]  # fmt: skip
+
+_Place = tuple[np.ndarray, float]  # T_camera_lidar, and the clock beyond what is expected [s]
 
 _ROUNDS, _CONVERGED_RAD = 3, np.radians(0.1)  # of choosing points anew where the fit has turned
 _CLEAR_SIGMAS = 3.0  # by which frames must prefer the fit to the best other place
@@ -29,29 +31,62 @@ JOINT_BIAS_SIGMA = np.array([*np.radians([0.05, 0.03, 0.1]), 0.015, 0.015, 0.15]
 
 
 @dataclass(frozen=True, eq=False)
+class Expected:
+    """What is known before the day.
+
+    Args:
+        T: T_camera_lidar.
+        covariance: of its left twist [rad, m].
+        clock_sigma_s: of the camera's clock against the lidar's, by which stamps may be apart besides `clock_s`.
+        clock_s: constant gap of the stamps, as if the sensors measured together: stamp_camera = stamp_lidar + dt.
+    """
+
+    T: Float[np.ndarray, "4 4"]
+    covariance: Float[np.ndarray, "6 6"]
+    clock_sigma_s: float
+    clock_s: float = 0.0
+
+    @property
+    def precision(self) -> Float[np.ndarray, "7 7"]:
+        """Inverse covariance of twist and clock."""
+        out = np.zeros((7, 7))
+        out[:6, :6], out[6, 6] = np.linalg.inv(self.covariance), self.clock_sigma_s**-2
+        return out
+
+
+@dataclass(frozen=True, eq=False)
 class JointDay:
     """A day's frames with their fit, and checks that it failed."""
 
     frames: Sequence[FrameEvidence]
     block: Int[np.ndarray, " F"]
+    expected: Expected
     fit: JointFit
     failed: list[Check]
 
-    def estimate(self, prior: Prior, rows: Bool[np.ndarray, " F"] | None = None) -> PairEstimate:
+    def estimate(self, rows: Bool[np.ndarray, " F"] | None = None) -> PairEstimate:
         """Of camera-lidar, by all frames or by some."""
-        T_prior, covariance = prior.of("camera_lidar"), prior.covariance("camera_lidar")
-        fit = self.fit
+        fit, expected = self.fit, self.expected
         if rows is not None:
             some = [frame for frame, kept in zip(self.frames, rows, strict=True) if kept]
-            fit = fit_of(some, self.block[rows], fit.T, T_prior, covariance)
-        return measured_estimate(fit.T, fit.information, JOINT_BIAS_SIGMA, T_prior, covariance, fit.frames)
+            fit = fit_of(some, self.block[rows], (fit.T, fit.dt_s), expected)
+        found = measured_estimate(
+            fit.T, fit.of_pose(expected), JOINT_BIAS_SIGMA, expected.T, expected.covariance, fit.frames
+        )
+        sigma_s = float(np.sqrt(np.linalg.inv(fit.information + expected.precision)[6, 6]))
+        return replace(
+            found,
+            time_offset_s=expected.clock_s + fit.dt_s,
+            time_offset_sigma_s=sigma_s,
+            time_offset_prior_s=expected.clock_s,
+        )
 
 
 def fitted_day(
     evidence: Callable[[np.ndarray], list[FrameEvidence]],
     block: Int[np.ndarray, " F"],
     candidates: Sequence[Float[np.ndarray, "4 4"]],
-    prior: Prior,
+    expected: Expected,
 ) -> JointDay | None:
     """Vote, optimise and select points again until the fit is stable; None if the network has no evidence.
 
@@ -60,26 +95,25 @@ def fitted_day(
         candidates: poses that rounds and single frames found; the first ones are on no better footing than
             others.
     """
-    T_prior, covariance = prior.of("camera_lidar"), prior.covariance("camera_lidar")
     frames = evidence(candidates[-1])
     if not frames:
         return None
     ordered = voted(frames, candidates)
-    T = climbed(frames, ordered[0], T_prior, covariance)
+    T, dt_s = climbed(frames, (ordered[0], 0.0), expected)
     others = [C for C in ordered if float(rotation_angle_rad(C @ inverse(T))) > APART_RAD]
     failed = []
     if others:
-        rival = climbed(frames, others[0], T_prior, covariance)
-        clear = rival_score(frames, block, T, rival)
-        failed = _not_clear(abs(clear), T, rival)
-        T = T if clear > 0 else rival
+        rival = climbed(frames, (others[0], dt_s), expected)
+        clear = rival_score(frames, block, (T, dt_s), rival)
+        failed = _not_clear(abs(clear), T, rival[0])
+        T, dt_s = (T, dt_s) if clear > 0 else rival
     for _ in range(_ROUNDS):
         before, frames = T, evidence(T)
-        fit = fit_of(frames, block, T, T_prior, covariance)
-        T = fit.T
+        fit = fit_of(frames, block, (T, dt_s), expected)
+        T, dt_s = fit.T, fit.dt_s
         if float(rotation_angle_rad(T @ inverse(before))) < _CONVERGED_RAD:
             break
-    return JointDay(frames, block, fit, failed)
+    return JointDay(frames, block, expected, fit, failed)
 
 
 def _not_clear(sigmas: float, T: np.ndarray, T_rival: np.ndarray) -> list[Check]:
@@ -90,10 +124,11 @@ def _not_clear(sigmas: float, T: np.ndarray, T_rival: np.ndarray) -> list[Check]
     return [Check(sentence, "witnesses_disagree")]
 
 
-_UNIT = np.array([0.01] * 3 + [0.1] * 3)  # rad, m: steps of one are alike
+# Twist, then the clock: rad, m, s. Steps of one are alike.
+_UNIT = np.array([0.01] * 3 + [0.1] * 3 + [0.01])
 # Half a cell of the grid, and the shift that moves a point 15 m away by as much. With it sigmas on the real day are
 # what leaving out tenths of its scenes gives (0.08 / 0.06 deg against 0.08 / 0.08), over a whole cell 1.6 times that.
-_STEP = np.array([0.0035] * 3 + [0.05] * 3)
+_STEP = np.array([0.0035] * 3 + [0.05] * 3 + [0.005])
 _FIRST_WORTH = 30.0  # of a frame's mean log-likelihood, before the day tells it
 _LEAST_CURVED = 0.02  # of the greatest curvature: flatter directions do not tell what the sum is worth
 _CLIMB = 60  # steps at most
@@ -103,11 +138,17 @@ APART_RAD = np.radians(0.5)  # a candidate farther away may lie on another peak
 
 @dataclass(frozen=True, eq=False)
 class JointFit:
-    """Peak of prior and frames together, with its covariance (left twist [rad, m])."""
+    """Peak of prior and frames together, with its covariance (left twist [rad, m], clock [s])."""
 
     T: Float[np.ndarray, "4 4"]
-    information: Float[np.ndarray, "6 6"]  # of the frames alone
+    dt_s: float  # of the clock beyond what is expected
+    information: Float[np.ndarray, "7 7"]  # of the frames alone
     frames: int
+
+    def of_pose(self, expected: Expected) -> Float[np.ndarray, "6 6"]:
+        """Information of the frames on the pose, with the clock as uncertain as it is."""
+        H, h = self.information[:6, :6], self.information[:6, 6]
+        return np.asarray(H - np.outer(h, h) / (self.information[6, 6] + expected.precision[6, 6]))
 
 
 def voted(
@@ -121,38 +162,39 @@ def voted(
 
 def climbed(
     frames: Sequence[FrameEvidence],
-    T_start: Float[np.ndarray, "4 4"],
-    T_prior: Float[np.ndarray, "4 4"],
-    prior_covariance: Float[np.ndarray, "6 6"],
+    start: _Place,
+    expected: Expected,
     worth: float | Float[np.ndarray, " E"] = _FIRST_WORTH,
-) -> Float[np.ndarray, "4 4"]:
+) -> _Place:
     """Peak above a start, of frames and prior together; `worth` weights each kind of evidence."""
-    precision = np.linalg.inv(prior_covariance)
+    precision = expected.precision
+
+    def at(step: np.ndarray) -> _Place:
+        x = step * _UNIT
+        return exp_se3(x[:6]) @ start[0], start[1] + float(x[6])
 
     def cost(step: np.ndarray) -> tuple[float, np.ndarray]:
-        T = exp_se3(step * _UNIT) @ T_start
-        value, gradient = scores(frames, T)
-        off = log_se3(T @ inverse(T_prior))
+        T, dt_s = at(step)
+        value, gradient = scores(frames, T, dt_s)
+        off = np.append(log_se3(T @ inverse(expected.T)), dt_s)
         total = -float((worth * value.sum(0)).sum()) + 0.5 * float(off @ precision @ off)
         told = (np.reshape(worth, (-1, 1)) * gradient.sum(0)).sum(0)
         return total, (-told + precision @ off) * _UNIT
 
-    found = minimize(cost, np.zeros(6), jac=True, method="L-BFGS-B", options={"maxiter": _CLIMB})
-    return np.asarray(exp_se3(found.x * _UNIT) @ T_start)
+    return at(minimize(cost, np.zeros(7), jac=True, method="L-BFGS-B", options={"maxiter": _CLIMB}).x)
 
 
 def fit_of(
     frames: Sequence[FrameEvidence],
     block: Int[np.ndarray, " F"],
-    T_start: Float[np.ndarray, "4 4"],
-    T_prior: Float[np.ndarray, "4 4"],
-    prior_covariance: Float[np.ndarray, "6 6"],
+    start: _Place,
+    expected: Expected,
 ) -> JointFit:
-    """Optimise from `T_start`, and estimate the peak's sigma; errors within a `block` (scene) are correlated."""
-    T, worth = T_start, np.full(frames[0].kinds[-1] + 1, _FIRST_WORTH)
+    """Optimise from a start, and estimate the peak's sigma; errors within a `block` (scene) are correlated."""
+    at, worth = start, np.full(frames[0].kinds[-1] + 1, _FIRST_WORTH)
     for _ in range(2):
-        T = climbed(frames, T, T_prior, prior_covariance, worth)
-        H, gradient = _curvature(frames, T), scores(frames, T)[1]
+        at = climbed(frames, at, expected, worth)
+        H, gradient = _curvature(frames, at), scores(frames, *at)[1]
         common = _worth(H.sum(0), _scatter(gradient.sum(1), block)) or _FIRST_WORTH
         own = np.array([_worth(H[e], _scatter(gradient[:, e], block)) for e in range(len(worth))])
         # Mean of each kind and of all: with few scenes one kind may seem certain by chance.
@@ -160,19 +202,19 @@ def fit_of(
         together = _scatter(np.einsum("e,fei->fi", share, gradient), block)
         # Kinds of one scene err together too.
         worth = share * _worth(np.einsum("e,eij->ij", share, H), together)
-    return JointFit(T, _positive_part(np.einsum("e,eij->ij", worth, H)), len(frames))
+    return JointFit(*at, _positive_part(np.einsum("e,eij->ij", worth, H)), len(frames))
 
 
 def rival_score(
     frames: Sequence[FrameEvidence],
     block: Int[np.ndarray, " F"],
-    T: Float[np.ndarray, "4 4"],
-    T_rival: Float[np.ndarray, "4 4"],
+    place: _Place,
+    rival: _Place,
 ) -> float:
     """By how many sigmas of the scenes' scatter frames prefer a pose to its rival; infinite where both are one peak."""
-    if float(rotation_angle_rad(T @ inverse(T_rival))) < APART_RAD:
+    if float(rotation_angle_rad(place[0] @ inverse(rival[0]))) < APART_RAD:
         return float("inf")
-    better = (scores(frames, T)[0] - scores(frames, T_rival)[0]).sum(1)
+    better = (scores(frames, *place)[0] - scores(frames, *rival)[0]).sum(1)
     sums = np.bincount(np.unique(block, return_inverse=True)[1].ravel(), better)
     return float(better.sum() / (np.sqrt(np.square(sums - sums.mean()).sum()) + 1e-12))
 
@@ -187,28 +229,30 @@ def _worth(H: np.ndarray, J: np.ndarray) -> float:
     return float(1 / np.mean(scatter[curved] / values[curved]))
 
 
-def _curvature(frames: Sequence[FrameEvidence], T: np.ndarray) -> Float[np.ndarray, "E 6 6"]:
+def _curvature(frames: Sequence[FrameEvidence], place: _Place) -> Float[np.ndarray, "E 7 7"]:
     """Of the sum over frames, by kind of evidence; positive at a peak."""
-    H = []
+    (T, dt_s), H = place, []
     for k, h in enumerate(_STEP):
-        step = np.zeros(6)
+        step = np.zeros(7)
         step[k] = h
-        ahead, behind = (scores(frames, exp_se3(s) @ T)[1].sum(0) for s in (step, -step))
+        ahead, behind = (
+            scores(frames, exp_se3(s[:6]) @ T, dt_s + float(s[6]))[1].sum(0) for s in (step, -step)
+        )
         H.append((behind - ahead) / (2 * h))
     found = np.stack(H, axis=1)
     return np.asarray((found + found.transpose(0, 2, 1)) / 2)
 
 
-def _positive_part(M: Float[np.ndarray, "6 6"]) -> Float[np.ndarray, "6 6"]:
+def _positive_part(M: Float[np.ndarray, "P P"]) -> Float[np.ndarray, "P P"]:
     """Symmetric matrix without its negative eigenvalues, which carry no information."""
     values, vectors = np.linalg.eigh(M * np.outer(_UNIT, _UNIT))
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T / np.outer(_UNIT, _UNIT))
 
 
-def _scatter(gradient: Float[np.ndarray, "F 6"], block: Int[np.ndarray, " F"]) -> Float[np.ndarray, "6 6"]:
+def _scatter(gradient: Float[np.ndarray, "F P"], block: Int[np.ndarray, " F"]) -> Float[np.ndarray, "P P"]:
     """Covariance of the sum of frames' gradients, from scene to scene."""
     names, rows = np.unique(block, return_inverse=True)
-    sums = np.zeros((len(names), 6))
+    sums = np.zeros((len(names), gradient.shape[1]))
     np.add.at(sums, rows.ravel(), gradient)
     sums -= sums.mean(0)
     return np.asarray(sums.T @ sums * len(names) / max(len(names) - 1, 1))

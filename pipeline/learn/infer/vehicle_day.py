@@ -15,8 +15,10 @@ from pipeline.core.results import Progress, silent
 from pipeline.learn.infer.aggregate import Answers, day_estimate, mean_answer, twists_about
 from pipeline.learn.infer.class_evidence import FrameEvidence
 from pipeline.learn.infer.frame_network import FrameNetwork, FrameSource
-from pipeline.learn.infer.joint_day import JointDay, fitted_day
+from pipeline.learn.infer.joint_day import Expected, JointDay, fitted_day
+from pipeline.learn.sample.clouds import own_velocity
 from pipeline.learn.sample.frame_sample import SampleRejectedError
+from pipeline.objective.stamp_gaps import camera_gaps_s, constant_gap_s
 from pipeline.rig.checks import Check
 from pipeline.rig.estimates import PairEstimate, Prior, Solution
 from pipeline.rig.se3 import exp_se3, inverse, log_se3, rotation_angle_rad
@@ -51,6 +53,7 @@ def solve_by_networks(
     frames: FrameSource,
     method: str,
     seed: int,
+    clock_sigma_s: float,
     triggered: Sequence[str] = PAIRS,
     progress: Progress = silent,
 ) -> Solution:
@@ -59,19 +62,22 @@ def solve_by_networks(
     Args:
         observations: selected frames per pair; each is used for all pairs.
         networks: together they estimate each pair once.
+        clock_sigma_s: of the camera's clock against the lidar's.
 
     Raises:
         SolveError: too few frames can be shown to the networks.
     """
     rng = np.random.default_rng([seed, 7])
-    asked, found, rejected, together = _asked_day(observations, prior, networks, frames, rng, progress)
+    asked, found, rejected, together = _asked_day(
+        observations, prior, networks, frames, rng, progress, clock_sigma_s
+    )
 
     def estimate(pair: str, rows: np.ndarray | None = None) -> PairEstimate:
         answers = found[pair] if rows is None else _part(found[pair], rows)
         of_answers = _estimate(pair, answers, asked, rng)
         if pair != "camera_lidar" or together is None:
             return of_answers
-        return replace(together.estimate(prior, rows), diagnostics=of_answers.diagnostics)
+        return replace(together.estimate(rows), diagnostics=of_answers.diagnostics)
 
     estimates = {
         pair: replace(estimate(pair), frames_rejected=dict(rejected))
@@ -168,6 +174,7 @@ def _asked_day(
     frames: FrameSource,
     rng: np.random.Generator,
     progress: Progress,
+    clock_sigma_s: float,
 ) -> tuple[_Asked, dict[str, Answers], Counter[str], JointDay | None]:
     """Prepare all frames, iterate the guess on pilot frames, fit camera-lidar to all frames, run all frames.
 
@@ -190,7 +197,7 @@ def _asked_day(
             f"too few frames for a network: {len(asked.sensors)} of {total} ({why or 'short day'})"
         )
     centre, candidates = _pilot_centre(asked, rng)
-    together = _fitted_together(asked, candidates)
+    together = _fitted_together(asked, candidates, clock_sigma_s)
     if together is not None:
         centre["camera_lidar"] = together.fit.T
     everything = range(len(asked.sensors))
@@ -198,19 +205,33 @@ def _asked_day(
     return asked, found, rejected, together
 
 
-def _fitted_together(asked: _Asked, candidates: Sequence[np.ndarray]) -> JointDay | None:
-    """Camera-lidar by all frames at once, if a network returns its evidence."""
+def _fitted_together(
+    asked: _Asked, candidates: Sequence[np.ndarray], clock_sigma_s: float
+) -> JointDay | None:
+    """Camera-lidar and the camera's clock by all frames at once, if a network returns its evidence."""
     which = next((i for i, n in enumerate(asked.networks) if "camera_lidar" in n.pairs), None)
     if which is None:
         return None
 
+    gaps_s = camera_gaps_s(asked.observations)
+    clock_s = constant_gap_s(gaps_s)
+    travels = [_travel(o, asked.prior) for o in asked.observations]
+
     def evidence(T: np.ndarray) -> list[FrameEvidence]:
         network = asked.networks[which]
         found = (network.evidence(sensors[which], T) for sensors in asked.sensors)
-        return [frame for frame in found if frame is not None]
+        moving = zip(found, travels, (gaps_s - clock_s).tolist(), strict=True)
+        return [replace(f, travel=travel, lag_s=lag_s) for f, travel, lag_s in moving if f is not None]
 
-    block = _blocks([o.drive for o in asked.observations])
-    return fitted_day(evidence, block, candidates, asked.prior)
+    block, pair = _blocks([o.drive for o in asked.observations]), "camera_lidar"
+    expected = Expected(asked.prior.of(pair), asked.prior.covariance(pair), clock_sigma_s, clock_s)
+    return fitted_day(evidence, block, candidates, expected)
+
+
+def _travel(observation: Observation, prior: Prior) -> Float[np.ndarray, " 6"]:
+    """Twist per second of the lidar in its own axes [rad/s, m/s]."""
+    yaw_rate_radps = observation.ego_yaw_rate_radps or 0.0
+    return np.array([0.0, 0.0, yaw_rate_radps, *own_velocity(observation, prior.T_lidar_radar)])
 
 
 def _chosen(observations: Mapping[str, Sequence[Observation]]) -> list[Observation]:

@@ -4,20 +4,23 @@ import numpy as np
 import pytest
 
 from pipeline.learn.infer.class_evidence import FrameEvidence, scores
-from pipeline.learn.infer.joint_day import climbed, fit_of, fitted_day
+from pipeline.learn.infer.joint_day import Expected, climbed, fit_of, fitted_day
 from pipeline.learn.sample.grid import Grid
-from pipeline.rig.estimates import Prior
 from pipeline.rig.se3 import exp_se3, inverse, log_se3, transform_points
 from schemas.training import GRID_CLASSES
-from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR
+from tests.makers.solve_scenes import T_CAMERA_LIDAR
 
 GRID = Grid(0.4, 38.4, 16.0, -22.4)
 P = np.diag([np.radians(2.0) ** 2] * 3 + [0.2**2] * 3)
+CLOCK_SIGMA_S = 0.05
 CLASSES = 3
 
 
-def frame(seed, T=T_CAMERA_LIDAR, objects=14):
-    """Boxes of one class each in front of a background, as an image would have them, and points on both."""
+def frame(seed, T=T_CAMERA_LIDAR, objects=14, late_s=0.0):
+    """Boxes of one class each in front of a background, as an image would have them, and points on both.
+
+    The car drives at another speed in each frame; the image is taken `late_s` after the sweep.
+    """
     rng = np.random.default_rng(seed)
     width, height = GRID.width, GRID.height
     likely = np.full((height, width, CLASSES), 0.05)
@@ -39,12 +42,14 @@ def frame(seed, T=T_CAMERA_LIDAR, objects=14):
         classes.append(np.where(hit, kind, 0))
     seen = np.concatenate(points)
     probability = np.where(np.arange(CLASSES) == np.concatenate(classes)[:, None], 0.9, 0.05)
+    travel = np.array([0.0, 0.0, rng.uniform(-0.2, 0.2), rng.uniform(2, 20), 0.0, 0.0])
     return FrameEvidence(
         GRID,
         np.log(likely).astype(np.float32),
-        transform_points(inverse(T), seen).astype(np.float32),
+        transform_points(exp_se3(late_s * travel) @ inverse(T), seen).astype(np.float32),
         probability.astype(np.float32),
         np.ones(len(seen), np.float32),
+        travel,
     )
 
 
@@ -76,13 +81,17 @@ def off_by(*step):
     return exp_se3(np.array(step)) @ T_CAMERA_LIDAR
 
 
+def known(T):
+    return Expected(T, P, CLOCK_SIGMA_S)
+
+
 def test_the_gradient_is_the_scores_own_derivative(day):
     T = off_by(0.011, -0.007, 0.013, 0.05, -0.03, 0.08)
-    _, gradient = scores(day, T)
-    for k, h in enumerate([1e-6] * 3 + [1e-5] * 3):
-        step = np.zeros(6)
+    _, gradient = scores(day, T, 0.01)
+    for k, h in enumerate([1e-6] * 3 + [1e-5] * 3 + [1e-6]):
+        step = np.zeros(7)
         step[k] = h
-        ahead, behind = (scores(day, exp_se3(s) @ T)[0] for s in (step, -step))
+        ahead, behind = (scores(day, exp_se3(s[:6]) @ T, 0.01 + s[6])[0] for s in (step, -step))
         # Between cells' centres the score has corners, which single points meet.
         wrong = np.abs((ahead - behind) / (2 * h) - gradient[..., k])
         assert np.median(wrong) < 0.02 * np.abs(gradient[..., k]).max()
@@ -90,19 +99,29 @@ def test_the_gradient_is_the_scores_own_derivative(day):
 
 def test_all_frames_together_find_rotation_and_shift_from_two_degrees_away(day):
     start = off_by(*np.radians([1.2, -1.2, 1.0]), 0.12, -0.1, 0.1)
-    fit = fit_of(day, BLOCK, start, start, P)
+    fit = fit_of(day, BLOCK, (start, 0.0), known(start))
     error = log_se3(fit.T @ inverse(T_CAMERA_LIDAR))
     assert np.abs(np.degrees(error[:3])).max() < 0.15
     assert np.abs(error[3:5]).max() < 0.05
-    sigma = np.sqrt(np.diag(np.linalg.inv(fit.information + np.linalg.inv(P))))
-    assert np.abs(error / sigma).max() < 3.5
+    sigma = np.sqrt(np.diag(np.linalg.inv(fit.information + known(start).precision)))
+    assert np.abs(np.append(error, fit.dt_s) / sigma).max() < 3.5
+
+
+def test_a_clock_that_is_off_moves_the_clock_and_not_the_camera():
+    """Images were stamped 60 ms after they were taken."""
+    late = [frame(seed, late_s=-0.06) for seed in range(16)]
+    fit = fit_of(late, BLOCK, (T_CAMERA_LIDAR, 0.0), known(T_CAMERA_LIDAR))
+    assert fit.dt_s == pytest.approx(0.06, abs=0.006)
+    error = log_se3(fit.T @ inverse(T_CAMERA_LIDAR))
+    assert np.abs(np.degrees(error[:3])).max() < 0.1
+    assert np.abs(error[3:]).max() < 0.05
 
 
 def test_frames_that_show_nothing_leave_the_prior_and_say_so(day):
     blank = [FrameEvidence(f.grid, 0 * f.maps - 1, f.points_m, f.probability, f.worth) for f in day]
     prior = off_by(0.02, 0, 0, 0, 0, 0)
-    assert climbed(blank, prior, prior, P) == pytest.approx(prior)
-    found = fit_of(blank, BLOCK, prior, prior, P)
+    assert climbed(blank, (prior, 0.0), known(prior))[0] == pytest.approx(prior)
+    found = fit_of(blank, BLOCK, (prior, 0.0), known(prior))
     assert pytest.approx(prior) == found.T
     assert not found.information.any()
 
@@ -111,24 +130,25 @@ def test_evidence_that_is_astray_by_scenes_weighs_little():
     """Paint of every scene is turned by another degree: the classes decide."""
     turn = np.radians(np.random.default_rng(3).normal(0, 1.0, (8, 3)))
     frames = [with_paint(frame(s), frame(s + 90, off_by(*turn[s // 2], 0, 0, 0))) for s in range(16)]
-    found = fit_of(frames, BLOCK, T_CAMERA_LIDAR, T_CAMERA_LIDAR, P).T
-    by_paint = climbed(frames, T_CAMERA_LIDAR, T_CAMERA_LIDAR, P, np.array([3.0, 300.0]))
+    start, before = (T_CAMERA_LIDAR, 0.0), known(T_CAMERA_LIDAR)
+    found = fit_of(frames, BLOCK, start, before).T
+    by_paint = climbed(frames, start, before, np.array([3.0, 300.0]))[0]
     error_deg, astray_deg = (np.degrees(log_se3(T @ inverse(T_CAMERA_LIDAR))[:3]) for T in (found, by_paint))
     assert np.linalg.norm(error_deg) < 0.06
     assert np.linalg.norm(astray_deg) > 0.2
 
 
 def fitted(frames, candidates):
-    prior = Prior(off_by(*np.radians([1.0, 1.0, 0.5]), 0.05, 0.05, 0.05), T_LIDAR_RADAR, np.radians(2.0), 0.2)
-    return fitted_day(lambda _: frames, BLOCK, candidates, prior), prior
+    before = known(off_by(*np.radians([1.0, 1.0, 0.5]), 0.05, 0.05, 0.05))
+    return fitted_day(lambda _: frames, BLOCK, candidates, before)
 
 
 def test_a_day_whose_pilots_went_astray_comes_back_by_the_frames_that_did_not(day):
     """The mean of the pilot frames is 3 deg off; two frames of twelve had answered rightly."""
     astray = [off_by(*np.radians([0.3, 3.0, 0.0]), 0, 0, 0) for _ in range(10)]
     right = [off_by(*np.radians([0.3, -0.2, 0.1]), 0, 0, 0)] * 2
-    found, prior = fitted(day, [*astray, *right, astray[0]])
-    error = np.degrees(log_se3(found.estimate(prior).T @ inverse(T_CAMERA_LIDAR))[:3])
+    found = fitted(day, [*astray, *right, astray[0]])
+    error = np.degrees(log_se3(found.estimate().T @ inverse(T_CAMERA_LIDAR))[:3])
     assert np.abs(error).max() < 0.2
     assert found.failed == []
 
@@ -137,5 +157,5 @@ def test_frames_that_fit_in_two_places_alike_fail_a_check():
     """Half of the frames were taken with a camera turned by 3 deg."""
     turned = off_by(0, np.radians(3.0), 0, 0, 0, 0)
     mixed = [frame(seed, turned if seed // 2 % 2 else T_CAMERA_LIDAR) for seed in range(16)]
-    found, _ = fitted(mixed, [T_CAMERA_LIDAR, turned])
+    found = fitted(mixed, [T_CAMERA_LIDAR, turned])
     assert any("frames do not agree" in check.sentence for check in found.failed)

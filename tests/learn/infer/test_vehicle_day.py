@@ -87,6 +87,7 @@ def solve(frames, networks, prior, triggered=PAIRS, seed=0):
         frames=lambda indices: iter([images[i] for i in indices]),
         method="joint-ssl",
         seed=seed,
+        clock_sigma_s=0.05,
         triggered=triggered,
     )
 
