@@ -64,6 +64,14 @@ lint: setup ## style, types, and the lines of each room against tests/budgets.to
 	$(BIN)/mypy
 	$(BIN)/python -m tests.budgets
 
+# Days, lakes and lines of results stay: it goes on where it was stopped, and code of other commits does not count.
+STUDY = $(ONE_THREAD) $(BIN)/python -m tests.benchmarks.studies
+benchmark: setup ## measure what the README's rows state on this commit, in about two hours on two cores
+	for study in table1 coverage worlds worlds-full starts faults; do \
+		$(STUDY).run $$study --root benchmark --workers $(WORKERS) || exit 1; done
+	$(STUDY).nights --root benchmark --fleets van no_lidar & $(STUDY).nights --root benchmark --fleets demo; wait
+	logs=../shared/data/astyx; test ! -d $$logs || $(STUDY).real --root benchmark --logs $$logs
+
 results: setup ## write the result tables of both READMEs from what was measured
 	$(BIN)/python -m tests.benchmarks.results_table
 
@@ -90,4 +98,4 @@ audit-dependencies: $(LOOKERS)/.ready ## known vulnerabilities of what constrain
 clean: ## remove what the other targets made
 	rm -rf .venv $(LOOKERS) $(READERS) sbom.json demo .pytest_cache .mypy_cache .ruff_cache
 
-.PHONY: help setup view readers demo test browser lint results accuracy-accept licenses sbom audit-dependencies clean
+.PHONY: help setup view readers demo test browser lint benchmark results accuracy-accept licenses sbom audit-dependencies clean

@@ -2,7 +2,7 @@
 
     python -m tests.benchmarks.studies.run table1 --root DAYS [--methods joint] [--workers 2]
     python -m tests.benchmarks.studies.run coverage --root DAYS
-    python -m tests.benchmarks.studies.run worlds --root DAYS [--seeds 6460 6461]     (or worlds-full)
+    python -m tests.benchmarks.studies.run worlds --root DAYS [--seeds 7200 7201]     (or worlds-full, starts, faults)
 
 Days that are not in DAYS are made first. Lines go to results/STUDY.jsonl, their table to results/STUDY.md.
 
@@ -10,7 +10,8 @@ Days that are not in DAYS are made first. Lines go to results/STUDY.jsonl, their
 0.2 m off. Joint-optimisation has a row for each of two readings: each pair's loss divided by its pairwise minimum
 (the default), and equation 2 to the letter. A radar's errors are against where its detections point.
 `coverage`: 100 days of 40 frames; priors drawn from the normal distribution that their sigmas state.
-`worlds`: a world and a rig drawn by each seed, priors drawn with 2 deg and 5 cm.
+`worlds`: a world and a rig drawn by each seed, priors drawn with 2 deg and 5 cm. `starts`: some of them, from priors
+exactly 2, 5 and 10 deg off. `faults`: days with a fault each, priors as in `worlds`.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "tracking": ("tracking", {}),
 }
 PRIOR = ("exact", 2.0, 0.2)
+STARTS_DEG, FOUND_DEG = (2.0, 5.0, 10.0), 0.15
 UNITS = (("deg", 180 / np.pi),) * 3 + (("m", 1.0),) * 3
 Results = Sequence[dict[str, Any]]
 
@@ -46,7 +48,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("study", choices=["table1", "coverage", "worlds", "worlds-full"])
+    parser.add_argument("study", choices=["table1", *SUMMARIES])
     parser.add_argument("--root", type=Path, required=True, help="folder of the days")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--limit", type=int, help="at most so many new runs")
@@ -61,7 +63,7 @@ def main() -> None:
     )  # fmt: skip
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
-    tuning = "dev-worlds" if args.study.startswith("worlds") else "dev"
+    tuning = "dev-worlds" if args.study in ("worlds", "worlds-full", "starts") else "dev"
     days = [
         d for d in SETS[tuning if args.tuning else args.study] if args.seeds is None or d.seed in args.seeds
     ]
@@ -76,8 +78,15 @@ def main() -> None:
             lambda run: next(n for n, r in METHODS.items() if r == (run.method, run.solve)),
         )
         return
-    summary = coverage if args.study == "coverage" else worlds
-    run_study([Run(day, seed=day.seed) for day in days], args, summary, lambda run: run.method)
+    runs = [Run(day, seed=day.seed) for day in days]
+    if args.study == "starts":
+        runs = [Run(day, prior=("exact", deg, 0.05), seed=day.seed) for deg in STARTS_DEG for day in days]
+    run_study(runs, args, SUMMARIES[args.study], _row_of)
+
+
+def _row_of(run: Run) -> str:
+    """Of `starts` how far off, of `faults` the fault, else the method."""
+    return run.day.fault or (f"{run.prior[1]:g} deg" if run.prior[0] == "exact" else run.method)
 
 
 def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -152,6 +161,23 @@ def worlds(results: Results) -> str:
         body.append([pair, f"{len(accepted)} of {len(results)}", str(wrong), beyond, f"{rms(z):.2f}"])
     return table(["pair", "accepted", "wrong and accepted", "beyond 3 sigma", "RMS sigma"], body)
 
+
+def by_row(results: Results) -> str:
+    """Of each start or fault: days, camera-lidars within .15 deg, accepted records, those of them that are wrong."""
+    body = []
+    for name in dict.fromkeys(r["row"] for r in results):
+        own = [r["pairs"] for r in results if r["row"] == name]
+        accepted = [(pair, p) for pairs in own for pair, p in pairs.items() if p["status"] == "accepted"]
+        near = [p for pairs in own if "az_deg" in (p := pairs.get("camera_lidar", {}))]
+        found = sum(max(p["az_deg"], p["el_deg"]) <= FOUND_DEG for p in near)
+        wrong = sum(not within(pair, p, claimed=True) for pair, p in accepted)
+        body.append([name, str(len(own)), str(found), str(len(accepted)), str(wrong)])
+    return table(["row", "days", "camera-lidar found", "records accepted", "of these wrong"], body)
+
+
+SUMMARIES = {
+    "coverage": coverage, "worlds": worlds, "worlds-full": worlds, "starts": by_row, "faults": by_row,
+}  # fmt: skip
 
 if __name__ == "__main__":
     main()
