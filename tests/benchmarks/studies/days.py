@@ -75,14 +75,19 @@ class Day:
 
 
 def generated_day(spec: DaySpec, root: Path) -> Day:
-    """Observations, truth and configuration of a day; simulated, ingested and perceived first where it is not there."""
+    """Observations, truth and configuration of a day; simulated, ingested and perceived first where it is not there.
+
+    A day that ingest refuses has no observations.
+    """
     folder = root / spec.name
     if not (folder / _FINISHED).exists():
         _generate(spec, folder)
     note = json.loads((folder / _FINISHED).read_text())
     return Day(
         spec,
-        list(observations_of(Lake.at(folder / "lake"), Partition(VEHICLE, DATE))),
+        list(observations_of(Lake.at(folder / "lake"), Partition(VEHICLE, DATE)))
+        if note["kept_frames"]
+        else [],
         json.loads((folder / "truth" / VEHICLE / f"{DATE}.json").read_text()),
         load_fleet(folder / "fleet.toml"),
         {name: note[name] for name in ("simulated_by", "perceived_by")},
@@ -105,11 +110,12 @@ def _generate(spec: DaySpec, folder: Path) -> None:
         Lake.at(folder / "lake"),
         Partition(VEHICLE, DATE),
     )
-    ingest_day(sorted((folder / "logs" / VEHICLE / DATE).iterdir()), partition, fleet, lake)
-    result = perceive_day(partition, fleet, lake)
+    result = ingest_day(sorted((folder / "logs" / VEHICLE / DATE).iterdir()), partition, fleet, lake)
+    if result.rows:
+        result = perceive_day(partition, fleet, lake)
     shutil.rmtree(folder / "logs")
     for table in (MOMENTS, *CAPTURES.values()):
-        shutil.rmtree(folder / "lake" / table.name)
+        shutil.rmtree(folder / "lake" / table.name, ignore_errors=True)
     note = asdict(spec) | {"kept_frames": result.rows, "cpu_s": round(time.process_time() - began, 1)}
     note |= {"simulated_by": commit, "perceived_by": commit}
     (folder / _FINISHED).write_text(json.dumps(note) + "\n")

@@ -105,6 +105,8 @@ def search_range(how: tuple[str, float, float]) -> dict[str, float]:
 
 def calibrate_once(run: Run, day: Day) -> dict[str, Any]:
     """Calibrate a day as a run says and measure every pair against truth."""
+    if not day.rows:
+        return {"refused": "ingest refused the day", "pairs": {}}
     camera = day.fleet.rig_of(next(iter(day.fleet.vehicles))).camera.known
     prior = replace(prior_of(day, run.prior, run.seed), camera=camera)
     fleet = day.fleet.changed(solve=search_range(run.prior) | run.solve)
