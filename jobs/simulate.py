@@ -82,12 +82,11 @@ def simulate(
 
 def _write(spec: FleetSpec, out: Path, reflectors: bool, workers: int) -> int:
     """Write logs and truth to `out`, and print the summary."""
-    from pipeline.simulate.fleet import day_names, vehicle_names
     from pipeline.simulate.reflectors import simulate_reflectors
 
     result = {
-        "vehicles": vehicle_names(spec),
-        "days": day_names(spec.first_day, spec.days),
+        "vehicles": spec.names,
+        "days": spec.dates,
         "frames": spec.vehicles * spec.days * spec.frames,
         "logs": simulate_days(spec, out, "synthetic", workers),
         "fleet": str(out / "fleet.toml"),
@@ -105,10 +104,10 @@ def _write(spec: FleetSpec, out: Path, reflectors: bool, workers: int) -> int:
 
 def simulate_days(spec: FleetSpec, out: Path, fleet: str, workers: int | None) -> int:
     """Write fleet.toml and all vehicle-days, in so many processes, with progress; returns the number of logs."""
-    from pipeline.simulate.fleet import begin_fleet, day_names, remove_half_logs, vehicle_names
+    from pipeline.simulate.fleet import begin_fleet, remove_half_logs
 
     work, logs = begin_fleet(spec, out, fleet), 0
-    names = [f"{vehicle_names(spec)[v]} {day_names(spec.first_day, spec.days)[d]}" for v, d in work]
+    names = [f"{spec.names[v]} {spec.dates[d]}" for v, d in work]
     run = EXECUTORS["process" if workers is None or workers > 1 else "inline"]
     try:
         with (

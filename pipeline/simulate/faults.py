@@ -27,16 +27,18 @@ import numpy as np
 
 from pipeline.core.errors import ConfigError
 from pipeline.rig.cameras import Camera
-from pipeline.rig.se3 import exp_so3
-from pipeline.simulate.sensors.mounting import Mounted, Mounting
+from pipeline.simulate.sensors.data_sheets import CameraSpec
+from pipeline.simulate.sensors.mounting import Mounted, Mounting, disturbed
 from pipeline.simulate.sensors.rig_spec import RigSpec, SensorSpec
 from pipeline.simulate.sensors.rigs import RIGS
+from pipeline.simulate.sensors.semantics import SemanticsSpec
 
 __all__ = [
     "KINDS",
     "DayFaults",
     "Fault",
     "faults_on",
+    "labelled_in_the_dark",
     "misread",
     "parse_faults",
     "shaken",
@@ -155,13 +157,9 @@ def _moved(mounted: Mounted, fault: Fault, day: int, share: float) -> Mounted:
         return replace(mounted, delay_s=mounted.delay_s + fault.amount, phase_s=phase_s)
     how, _, kind = fault.kind.rpartition("-")
     amount = fault.amount * {"drift": day - fault.day + 1, "warm": share, "": 1}[how]
-    T = mounted.T_vehicle.copy()
-    axis = np.eye(3)[_AXES[kind]]
-    if kind in ("x", "y", "z"):
-        T[:3, 3] += amount * axis
-    else:
-        T[:3, :3] = exp_so3(np.radians(amount) * axis) @ T[:3, :3]
-    return replace(mounted, T_vehicle=T)
+    step, still = amount * np.eye(3)[_AXES[kind]], np.zeros(3)
+    rotation, shift = (still, step) if kind in ("x", "y", "z") else (np.radians(step), still)
+    return replace(mounted, T_vehicle=disturbed(mounted.T_vehicle, rotation, shift))
 
 
 def faults_on(faults: tuple[Fault, ...], vehicle: str, day: int, share: float = 1.0) -> DayFaults:
@@ -169,9 +167,30 @@ def faults_on(faults: tuple[Fault, ...], vehicle: str, day: int, share: float = 
     return DayFaults(tuple(f for f in faults if f.vehicle == vehicle and f.day == day and f.after <= share))
 
 
-def misread(camera: Camera, today: DayFaults, name: str) -> Camera:
+def misread(sensor: SensorSpec, today: DayFaults) -> Camera:
     """The camera in the day's logs: focal length or principal point may be wrong."""
+    assert isinstance(sensor.sheet, CameraSpec)
+    camera, name = sensor.sheet.nominal(), sensor.name
     K = camera.K.copy()
     K[[0, 1], [0, 1]] *= 1 + today.amount("intrinsics", name)
     K[:2, 2] += (today.amount("centre", name), today.amount("centre-v", name))
     return replace(camera, K=K)
+
+
+def labelled_in_the_dark(spec: SemanticsSpec, today: DayFaults) -> SemanticsSpec:
+    """Errors of day-trained networks at night: outlines three times as noisy, half of the boxes missed.
+
+    At dusk outlines are 2 label pixels noisier; classes of visible objects are as reliable as by day.
+    """
+    if today.has("dusk"):
+        return replace(spec, boundary_px=spec.boundary_px + 2.0, miss=0.5)
+    if not today.has("night"):
+        return spec
+    return replace(
+        spec,
+        boundary_px=3 * spec.boundary_px,
+        confusion=0.35,
+        miss=0.5,
+        box_jitter=3 * spec.box_jitter,
+        false_boxes=3 * spec.false_boxes,
+    )

@@ -19,12 +19,12 @@ from jaxtyping import Float
 from pipeline.core.results import Progress, silent
 from pipeline.rig.se3 import inverse, transform_points
 from pipeline.rig.topics import TOPICS
-from pipeline.simulate.fleet import FleetSpec, day_names, mounting_on, rig_of, vehicle_names
-from pipeline.simulate.logs.frame_messages import Setup, messages_of
-from pipeline.simulate.logs.recording import nominal_poses, open_log
-from pipeline.simulate.sensors.mounting import Mounting
+from pipeline.simulate.faults import misread
+from pipeline.simulate.fleet import FleetSpec, mounting_on
+from pipeline.simulate.logs.frame_messages import messages_of
+from pipeline.simulate.logs.recording import open_log
 from pipeline.simulate.sensors.radar import Scan
-from pipeline.simulate.sensors.simulated_frame import Scene, Seat, frame_of, triggered_stamps
+from pipeline.simulate.sensors.simulated_frame import Scene, Setup, frame_of, triggered_stamps
 from pipeline.simulate.world.casting import Moment, standing_of
 from pipeline.simulate.world.drives import Parked
 from pipeline.simulate.world.meshes import Mesh, MeshBuilder, Number
@@ -43,47 +43,47 @@ def simulate_reflectors(
     spec: FleetSpec, vehicle: int, day: int, out: Path, frames: int = 150, progress: Progress = silent
 ) -> Path:
     """Write `reflectors/<vehicle>/<day>.mcap` and `<day>.json` (picks and truth); returns the latter."""
-    name, day_name = vehicle_names(spec)[vehicle], day_names(spec.first_day, spec.days)[day]
-    rig, mounting = rig_of(spec, vehicle), mounting_on(spec, vehicle, day)
+    name, day_name = spec.names[vehicle], spec.dates[day]
+    rig, mounting = spec.rigs[name], mounting_on(spec, vehicle, day)
     rng = np.random.default_rng([spec.seed, vehicle, day, 71])
     scene = Scene(Parked(), _SUN, beacons_map=REFLECTORS_VEHICLE)
     moment = Moment(standing_of(_lot(), np.zeros(3), _SUN, lambda p: p, 8.0), [], 0.0)
     start_ns = (
         int((datetime.fromisoformat(day_name).replace(tzinfo=UTC) + timedelta(hours=18)).timestamp()) * 10**9
     )
-    folder, seen = out / "reflectors" / name, []
+    folder, scans = out / "reflectors" / name, list[Scan]()
 
     def at(t_s: float) -> int:
         return start_ns + round(t_s * 1e9)
 
     setup = Setup(rig, mounting, spec.semantics)
     with open_log(folder / f"{day_name}.mcap", "mcap") as log:
-        log.put(TOPICS["tf"], at(0.0), log.messages.sensor_poses(at(0.0), nominal_poses(mounting)))
+        log.put(TOPICS["tf"], at(0.0), log.messages.sensor_poses(at(0.0), mounting.nominal()))
         for k in range(frames):
             stamps = triggered_stamps(rig, mounting, 1.0 + k / _RATE_HZ, rng)
-            frame = frame_of(Seat(moment, scene, rig, mounting), stamps, rng, spec.semantics)
-            items = messages_of(log.messages, frame, setup, at, rng)
+            frame = frame_of(moment, scene, setup, stamps, rng)
+            stamps_ns = {n: at(t) for n, t in stamps.items()}
+            items = messages_of(log.messages, frame, stamps_ns, setup, rng)
             for time_ns, topic, message in sorted(items, key=lambda p: p[0]):
                 log.put(topic, time_ns, message)
-            seen.append(frame.scans["radar"])
+            scans += [m for m in frame.values() if isinstance(m, Scan)]
             progress(k + 1, frames, f"{name} {day_name} reflectors")
     path = folder / f"{day_name}.json"
-    path.write_text(json.dumps(_picks(name, day_name, mounting, seen, rng), indent=1))
+    about = {"vehicle": name, "day": day_name, "frames": frames, "reflector": {"edge_m": _EDGE_M}}
+    path.write_text(json.dumps(about | _picks(setup, scans, rng), indent=1))
     return path
 
 
 def _lot() -> Mesh:
     """Level asphalt with bays, a fence at its far end, and the reflectors on tripods."""
     b = MeshBuilder()
-    b.quads(_level(-40, 90, -60, 60, 0.0), "asphalt", uv=_level(-40, 90, -60, 60, 0.0)[..., :2])
+    lot = _level(-40, 90, -60, 60, 0.0)
+    b.quads(lot, "asphalt", uv=lot[..., :2])
     for side in (-1, 1):
         for x in np.arange(6.0, 60.0, 2.6):
             y0, y1 = sorted((side * 8.0, side * 13.0))
-            b.quads(
-                _level(x - 0.06, x + 0.06, y0, y1, 0.004),
-                "paint",
-                uv=_level(x - 0.06, x + 0.06, y0, y1, 0)[..., :2],
-            )
+            line = _level(x - 0.06, x + 0.06, y0, y1, 0.004)
+            b.quads(line, "paint", uv=line[..., :2])
     b.box((75.0, 0.0, 0.9), (0.1, 110.0, 1.8), "slats")
     rng = np.random.default_rng(72)
     for y in np.arange(-50.0, 51.0, 8.0):
@@ -116,22 +116,17 @@ def _trihedral(b: MeshBuilder, apex: np.ndarray) -> None:
         b.tube(ground, foot - [0, 0, 0.22], 0.02, "tripod", 5)
 
 
-def _picks(
-    vehicle: str, day: str, m: Mounting, scans: list[Scan], rng: np.random.Generator
-) -> dict[str, Any]:
+def _picks(setup: Setup, scans: list[Scan], rng: np.random.Generator) -> dict[str, Any]:
     """Careful manual picks in each sensor's data, and the truth."""
+    m = setup.mounting
     seen, lidar, radar = (
         transform_points(inverse(m[n].T_vehicle), REFLECTORS_VEHICLE) for n in ("camera", "lidar", "radar")
     )
-    camera, logged = m.camera("camera")
+    camera, logged = m.camera("camera"), misread(setup.rig["camera"], setup.faults)
     pixels, _ = camera.project(seen)
     positions = zip(pixels, lidar, radar, strict=True)
     targets = [_target(scans, *position, camera.width_px, rng) for position in positions]
     return {
-        "vehicle": vehicle,
-        "day": day,
-        "frames": len(scans),
-        "reflector": {"edge_m": _EDGE_M},
         "targets": targets,
         "camera": {
             "model": logged.model,

@@ -1,7 +1,8 @@
 """A few simulated frames that the tests of this room share."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,56 +11,41 @@ from rosbags.rosbag1 import Reader as Bag1
 from rosbags.rosbag2 import Reader as Bag2
 
 from pipeline.core.ros_messages import RosMessages
-from pipeline.simulate.sensors.lidar import Sweep
-from pipeline.simulate.sensors.mounting import Mounting, mounting_of
-from pipeline.simulate.sensors.radar import Scan
-from pipeline.simulate.sensors.rig_spec import RigSpec
+from pipeline.simulate.sensors.mounting import mounting_of
 from pipeline.simulate.sensors.rigs import rig_named
 from pipeline.simulate.sensors.semantics import SemanticsSpec
-from pipeline.simulate.sensors.simulated_frame import Image, Scene, Seat, frame_of, scene_of, triggered_stamps
-from pipeline.simulate.world.casting import Moment, World
+from pipeline.simulate.sensors.simulated_frame import Setup, frame_of, scene_of, triggered_stamps
+from pipeline.simulate.world.casting import World
 from pipeline.simulate.world.drives import Drive
 
 
-@dataclass(frozen=True, eq=False)
-class Shot:
-    """One simulated moment and everything that is known about it."""
-
-    drive: Drive
-    scene: Scene
-    moment: Moment
-    rig: RigSpec
-    mounting: Mounting
-    lidar_stamp_s: float
-    camera_stamp_s: float
-    image: Image
-    sweep: Sweep
-    scan: Scan
-
-
-def shots_of(environment, *, rig=None, times=(1.0, 4.0), seed=5, night=False):
-    rig = rig or rig_named("demo")
-    mounting = mounting_of(rig, 3, 0, 0)
-    drive = Drive(seed, environment, 8.0, 0, night)
-    world, scene, shots = World(drive), scene_of(drive), []
+def shots_of(environment, rig, times=(1.0, 4.0)):
+    """Simulated moments and everything that is known about them."""
+    drive, mounting = Drive(5, environment, 8.0, 0), mounting_of(rig, 3, 0, 0)
+    world, shots = World(drive), []
     for t in times:
         moment = world.moment(t - rig["lidar"].sheet.sweep_s / 2)
         rng = np.random.default_rng([7, int(10 * t)])
         stamps = triggered_stamps(rig, mounting, t, rng)
-        seen = frame_of(Seat(moment, scene, rig, mounting), stamps, rng, SemanticsSpec())
-        measured = seen.images["camera"], seen.sweeps["lidar"], seen.scans["radar"]
-        shots.append(Shot(drive, scene, moment, rig, mounting, t, stamps["camera"], *measured))
+        scene = scene_of(drive)
+        seen = frame_of(moment, scene, Setup(rig, mounting, SemanticsSpec()), stamps, rng)
+        shots.append(
+            SimpleNamespace(
+                scene=scene, moment=moment, rig=rig, mounting=mounting, lidar_stamp_s=t,
+                camera_stamp_s=stamps["camera"], image=seen["camera"], sweep=seen["lidar"], scan=seen["radar"],
+            )
+        )  # fmt: skip
     return shots
 
 
 @pytest.fixture(scope="session")
 def urban():
-    return shots_of("urban")
+    return shots_of("urban", rig_named("demo"))
 
 
 @pytest.fixture(scope="session")
 def highway():
-    return shots_of("highway")
+    return shots_of("highway", rig_named("demo"))
 
 
 @pytest.fixture(scope="session")
@@ -76,7 +62,7 @@ def shots_of_rig():
         around = rig["lidar"].sheet.azimuth_deg[1] == 180
         lidar = replace(rig["lidar"].sheet, columns=450) if around else rig["lidar"].sheet
         small = rig.changed(lambda s: replace(s, sheet=lidar) if s.name == "lidar" else s)
-        return shots_of(environment, rig=small, times=(2.0,))[0]
+        return shots_of(environment, small, times=(2.0,))[0]
 
     return make
 

@@ -5,29 +5,36 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.core.rows import join_rows
+from pipeline.rig.se3 import inverse, transform_points
+from pipeline.simulate.sensors.camera import render, view_of
 from pipeline.simulate.sensors.data_sheets import LidarSpec
 from pipeline.simulate.sensors.lidar import sweep_lidar
+from pipeline.simulate.sensors.rigs import rig_named
 from pipeline.simulate.world.actors import HOLLOW, actor_mesh
 from pipeline.simulate.world.casting import Moment, chunk_mesh, standing_of
 from pipeline.simulate.world.drives import Drive, Parked
 from pipeline.simulate.world.landscapes import LANDSCAPES, landscape_named
 from pipeline.simulate.world.materials import LABELS, MATERIALS
-from pipeline.simulate.world.meshes import MeshBuilder, join, placed
+from pipeline.simulate.world.meshes import MeshBuilder, placed
 
 CAR_M = 9.0
 HIGH = np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1.73], [0, 0, 0, 1]])
 
 
+def lot(*meshes, ground="asphalt", sun=(0.0, 0.0, 1.0), landscape=LANDSCAPES["suburb"]):
+    """A moment of what stands on a lot with a wall 20 m ahead."""
+    b, level = MeshBuilder(), np.array([[-50.0, -50, 0], [50, -50, 0], [50, 50, 0], [-50, 50, 0]])
+    b.quads(level, ground, uv=level[:, :2])
+    b.quads(np.array([[20, -30, 0], [20, 30, 0], [20, 30, 8], [20, -30, 8]]), "stone")
+    mesh = join_rows([b.mesh(), *meshes])
+    return Moment(standing_of(mesh, np.zeros(3), np.array(sun), lambda p: p, 0.0), [], 0.0, landscape)
+
+
 def sweep_of(*meshes, landscape=LANDSCAPES["suburb"]):
-    """A sweep over what stands on a lot, with a wall behind it."""
-    b = MeshBuilder()
-    b.quads(np.array([[[-50, -50, 0], [50, -50, 0], [50, 50, 0], [-50, 50, 0]]]), "asphalt")
-    b.quads(np.array([[[20, -30, 0], [20, 30, 0], [20, 30, 8], [20, -30, 8]]]), "stone")
-    standing = standing_of(join([b.mesh(), *meshes]), np.zeros(3), np.array([0.0, 0, 1]), lambda p: p, 0.0)
     spec = LidarSpec((-20.0, 20.0), (-12.0, 2.0), 160, 60, divergence_deg=0.01, min_range_m=1.0)
-    return sweep_lidar(
-        Moment(standing, [], 0.0, landscape), Parked(), HIGH, spec, 0.0, np.random.default_rng(1)
-    )
+    moment = lot(*meshes, landscape=landscape)
+    return sweep_lidar(moment, Parked(), HIGH, spec, 0.0, np.random.default_rng(1))
 
 
 def behind_windows(variant):
@@ -52,6 +59,41 @@ def test_beams_pass_the_windows_of_hollow_cars_to_the_seats_and_to_what_stands_b
     assert through > 0.03 * found
     _, deep, through = np.sum([behind_windows(v) for v in range(6)], axis=0)
     assert deep == through == 0
+
+
+def test_echoes_come_from_their_surfaces_and_weaken_at_grazing_angles():
+    sweep = sweep_of()
+    wall, road = (sweep.label == LABELS.index(name) for name in ("wall", "road"))
+    assert np.std(sweep.xyz_m[wall, 0] - 20) == pytest.approx(0.02, rel=0.1)  # the data sheet's
+    assert np.abs(sweep.xyz_m[road, 2] + 1.73).max() < 0.03
+    # Reflectivity .32 frontally, .10 at a few degrees: textures between .7 and 1.2, cosine to the power .35.
+    assert sweep.intensity[wall].mean() == pytest.approx(32, rel=0.15)
+    assert 2 < sweep.intensity[road].mean() < 8
+
+
+def test_a_shadow_lies_where_the_sun_puts_it_and_has_the_light_of_the_sky_alone():
+    b, sun = MeshBuilder(), np.array([0.0, np.sqrt(0.5), np.sqrt(0.5)])
+    b.box((12.0, 0.0, 1.0), (2.0, 2.0, 2.0), "concrete")
+    T, camera = HIGH.copy(), rig_named("demo")["camera"].sheet.nominal()
+    T[:3, :3], T[2, 3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]], 3.0
+    green = []
+    for meshes in ((), (b.mesh(),)):
+        moment = lot(*meshes, ground="paint", sun=sun)
+        image = render(moment, view_of(moment, camera, T), sun, np.random.default_rng(1))
+        green.append((image[..., 1] / 255.0) ** 2.2)
+
+    def share(x_m, y_m):
+        """Light on a square metre beside the box, relative to the same without the box."""
+        x, y = (a.ravel() for a in np.meshgrid(*(np.linspace(-0.4, 0.4, 9) + at for at in (x_m, y_m))))
+        uv = camera.project(transform_points(inverse(T), np.stack([x, y, 0 * x], 1)))[0]
+        u, v = np.rint(uv).astype(int).T
+        return green[1][v, u].mean() / green[0][v, u].mean()
+
+    # The box is 2 m high and the sun 45 deg: its shadow is 2 m long, opposite the sun.
+    sky, whole = 0.42, 0.42 + 0.95 * np.sqrt(0.5)
+    assert share(12.0, -1.9) == pytest.approx(sky / whole, rel=0.06)
+    for x_m, y_m in ((12.0, -3.9), (10.0, -1.9), (14.2, -2.2), (12.0, 1.9)):
+        assert share(x_m, y_m) == pytest.approx(1.0, abs=0.03)
 
 
 def test_where_the_infrared_is_blind_a_lidar_does_not_see_markings():

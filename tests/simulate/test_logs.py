@@ -10,7 +10,7 @@ from jobs.simulate import simulate_days
 from pipeline.core.config import load_fleet
 from pipeline.rig.topics import TOPICS
 from pipeline.simulate.fleet import FleetSpec, simulate_fleet, simulate_vehicle_day
-from pipeline.simulate.logs.recording import CONTAINERS, free_clocks, log_name, open_log
+from pipeline.simulate.logs.recording import SUFFIXES, free_clocks, open_log
 from pipeline.simulate.reflectors import simulate_reflectors
 from pipeline.simulate.sensors.rigs import rig_named
 
@@ -96,9 +96,9 @@ def test_reflectors_are_picked_where_all_sensors_agree_under_the_truth(tmp_path,
     assert sum(topic == TOPICS["lidar"] for topic, _, _ in messages) == 12
 
 
-@pytest.mark.parametrize("container", CONTAINERS)
+@pytest.mark.parametrize("container", SUFFIXES)
 def test_a_log_that_is_broken_off_leaves_the_old_one_and_nothing_else(container, tmp_path, read):
-    path = tmp_path / log_name("drive", container)
+    path = tmp_path / f"drive{SUFFIXES[container]}"
     nominal = {"lidar": np.eye(4)}
     with open_log(path, container) as (messages, put):
         put(TOPICS["tf"], 5, messages.sensor_poses(5, nominal))

@@ -1,5 +1,7 @@
 """Rigs that differ from the paper's: laws of their sensors, seen through one simulated trio each."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -29,6 +31,16 @@ def test_a_rig_has_a_fleet_file_and_true_poses_near_its_drawings(name, tmp_path)
         turn = np.degrees(np.arccos(np.clip((np.trace(true[:3, :3].T @ drawn[:3, :3]) - 1) / 2, -1, 1)))
         assert 0 < turn < 4
         assert np.linalg.norm(true[:3, 3] - drawn[:3, 3]) < 0.15
+
+
+@every_rig
+def test_a_camera_is_as_wide_and_as_high_as_its_data_sheet(name):
+    sheet = rig_named(name)["camera"].sheet
+    camera = replace(sheet, distortion=(0.0,) * len(sheet.distortion)).nominal()
+    border = np.array([[-0.5, camera.K[1, 2]], [camera.K[0, 2], -0.5]])
+    x, y, z = camera.unproject(border).T
+    angles_deg = np.degrees(np.arctan2(np.hypot(x, y), z))
+    np.testing.assert_allclose(2 * angles_deg, [sheet.horizontal_deg, sheet.vertical_deg], atol=1e-6)
 
 
 def test_a_rig_named_by_its_rows_has_so_many_over_so_many_degrees():
@@ -69,7 +81,7 @@ def test_a_sensor_looks_to_the_left_by_a_positive_yaw_and_down_by_a_positive_pit
 
 def nearest_deg(spec, first_s, second_s):
     """Angle from each beam of the second sweep to the nearest of the first."""
-    first, second = (np.degrees(beams_of(spec, t).angles) for t in (first_s, second_s))
+    first, second = (np.degrees(beams_of(spec, t)) for t in (first_s, second_s))
     return cKDTree(first).query(second)[0]
 
 

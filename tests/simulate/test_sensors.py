@@ -5,6 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from pipeline.rig.spherical import to_spherical
 from pipeline.simulate.sensors.camera import _exposed
 from pipeline.simulate.sensors.lidar import sweep_lidar
 from pipeline.simulate.sensors.radar import RadarErrors, scan_radar
@@ -23,6 +24,15 @@ def test_doppler_is_quantised_and_folded_into_one_period(highway):
     assert np.abs(free.range_rate_mps).max() > 12
     steps = folded.range_rate_mps / 0.0812
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-3)
+
+
+def test_a_radar_sees_its_whole_field_and_nothing_beyond_it_or_below_its_threshold(shots):
+    sheet = shots[0].rig["radar"].sheet
+    azimuth, elevation, range_m = np.concatenate([to_spherical(s.scan.xyz_m.astype(float)) for s in shots]).T
+    for angle, half_deg in ((azimuth, sheet.azimuth_deg), (elevation, 1.1 * sheet.elevation_deg)):
+        assert 0.93 < np.degrees(np.abs(angle)).max() / half_deg <= 1.0
+    assert sheet.min_range_m < range_m.min() < range_m.max() < sheet.max_range_m
+    assert min(s.scan.power_db.min() for s in shots) > 30 + 10 * np.log10(12) - 0.01
 
 
 def test_a_dirty_radar_sees_things_between_them_and_their_image_in_the_road(shots):

@@ -16,7 +16,7 @@ from pipeline.simulate.sensors.data_sheets import CameraSpec, LidarSpec
 from pipeline.simulate.sensors.mounting import Mounting, mounting_of
 from pipeline.simulate.sensors.rigs import rig_named
 from pipeline.simulate.sensors.semantics import SemanticsSpec
-from pipeline.simulate.sensors.simulated_frame import Seat, frame_of, scene_of
+from pipeline.simulate.sensors.simulated_frame import Setup, frame_of, scene_of
 from pipeline.simulate.world.casting import World
 from pipeline.simulate.world.drives import Drive
 
@@ -102,15 +102,14 @@ def test_a_sensor_measures_its_delay_before_its_stamp():
 
     def seen(delay_s, stamp_s):
         late = {n: replace(m, delay_s=delay_s) for n, m in prompt.sensors.items()}
-        seat, rng = Seat(moment, scene, rig, Mounting(late)), np.random.default_rng(1)
-        return frame_of(seat, dict.fromkeys(names, stamp_s), rng, SemanticsSpec())
+        setup = Setup(rig, Mounting(late), SemanticsSpec())
+        return frame_of(moment, scene, setup, dict.fromkeys(names, stamp_s), np.random.default_rng(1))
 
     one, same, other = seen(0.0, 2.0), seen(0.125, 2.125), seen(-0.125, 2.125)
     for frame, is_same in ((same, True), (other, False)):
-        assert (frame.images["left"].jpeg == one.images["left"].jpeg) is is_same
-        for clouds in ("sweeps", "scans"):
-            ((name, cloud),) = getattr(frame, clouds).items()
-            assert np.array_equal(cloud.xyz_m, getattr(one, clouds)[name].xyz_m) is is_same
+        assert (frame["left"].jpeg == one["left"].jpeg) is is_same
+        for name in ("grille", "corner_fl"):
+            assert np.array_equal(frame[name].xyz_m, one[name].xyz_m) is is_same
 
 
 def test_a_fault_of_one_sensor_is_its_alone(days):

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from typing import Any
 
 import cv2
@@ -11,49 +10,37 @@ import numpy as np
 
 from pipeline.core.ros_messages import RosMessages
 from pipeline.rig.topics import topics_of
-from pipeline.simulate.faults import DayFaults, misread, swapped_with
+from pipeline.simulate.faults import misread, swapped_with
 from pipeline.simulate.sensors.data_sheets import LidarSpec, RadarSpec
 from pipeline.simulate.sensors.lidar import Sweep
-from pipeline.simulate.sensors.mounting import Mounting
 from pipeline.simulate.sensors.radar import Scan
-from pipeline.simulate.sensors.rig_spec import RigSpec, SensorSpec
-from pipeline.simulate.sensors.semantics import Box, SemanticsSpec, encode_png
-from pipeline.simulate.sensors.simulated_frame import Image, SimulatedFrame
+from pipeline.simulate.sensors.rig_spec import SensorSpec, Sheet
+from pipeline.simulate.sensors.semantics import Box, encode_png
+from pipeline.simulate.sensors.simulated_frame import Image, Measurement, Setup
 
-__all__ = ["At", "Sent", "Setup", "messages_of"]
+__all__ = ["Sent", "messages_of"]
 
-At = Callable[[float], int]  # stamp [ns] of a time of the drive [s]
 Sent = tuple[int, str, Any]  # log time [ns], topic, message
 
 
-@dataclass(frozen=True, eq=False)
-class Setup:
-    """A vehicle at one moment: rig, mounting, label networks, faults."""
-
-    rig: RigSpec
-    mounting: Mounting
-    semantics: SemanticsSpec
-    faults: DayFaults = field(default_factory=DayFaults)
-
-
 def messages_of(
-    messages: RosMessages, frame: SimulatedFrame, setup: Setup, at: At, rng: np.random.Generator
+    messages: RosMessages,
+    frame: Mapping[str, Measurement],
+    stamps_ns: Mapping[str, int],
+    setup: Setup,
+    rng: np.random.Generator,
 ) -> list[Sent]:
-    """The messages of one frame, `at` giving stamps by time of the drive; a missing sensor has none."""
+    """The messages of one frame; a missing sensor has none."""
     sent: list[Sent] = []
     for sensor in setup.rig.sensors:
         name = sensor.name
-        if name not in frame.stamps_s or setup.faults.has("missing", name):
+        if name not in frame or setup.faults.has("missing", name):
             continue
-        stamp = at(frame.stamps_s[name])
-        if name in frame.images:
-            sent += _of_camera(messages, frame.images[name], setup, sensor, stamp, rng)
+        measured, stamp = frame[name], stamps_ns[name]
+        if isinstance(measured, Image):
+            sent += _of_camera(messages, measured, setup, sensor, stamp, rng)
         else:
-            columns = (
-                _of_lidar(frame.sweeps[name], sensor)
-                if name in frame.sweeps
-                else _of_radar(frame.scans[name], sensor)
-            )
+            columns = _columns(measured, sensor.sheet)
             plug = _plugged(sensor, setup)
             # A reader gets the frame id from the driver of the swapped sensor.
             owner = plug if plug.kind == sensor.kind else sensor
@@ -83,11 +70,10 @@ def _of_camera(
 ) -> list[Sent]:
     """An image with its intrinsics, labels and detections."""
     today, name = setup.faults, sensor.name
-    info = misread(setup.mounting.camera(name)[1], today, name)
     labels = _permuted(image.labels_png, rng) if today.has("labels", name) else image.labels_png
     header = messages.at(stamp, name)
     made = {
-        "info": messages.camera_info(header, info),
+        "info": messages.camera_info(header, misread(sensor, today)),
         "image": messages.image(header, image.jpeg, "jpeg"),
         "labels": messages.image(header, labels, "mono8; png compressed"),
         "detections": _detections(messages, header, image.boxes),
@@ -112,19 +98,16 @@ def _detections(ros: RosMessages, header: Any, boxes: list[Box]) -> Any:
     return ros.make("vision_msgs/Detection2DArray", header=header, detections=items)
 
 
-def _of_lidar(sweep: Sweep, sensor: SensorSpec) -> dict[str, np.ndarray]:
-    assert isinstance(sensor.sheet, LidarSpec)
-    points = dict(zip("xyz", sweep.xyz_m.T, strict=True))
-    # Drivers of solid-state lidars call their lasers lines, and readers treat them as rings.
-    laser = "ring" if sensor.sheet.pattern == "rows" else "line"
-    return points | {"intensity": sweep.intensity, laser: sweep.ring, "time": sweep.time_s}
-
-
-def _of_radar(scan: Scan, sensor: SensorSpec) -> dict[str, np.ndarray]:
-    assert isinstance(sensor.sheet, RadarSpec)
-    sign = np.float32(-1.0 if sensor.sheet.doppler_positive == "approaching" else 1.0)
-    detections = dict(zip("xyz", scan.xyz_m.T, strict=True))
-    return detections | {"doppler": sign * scan.range_rate_mps, "power": scan.power_db}
+def _columns(measured: Sweep | Scan, sheet: Sheet) -> dict[str, np.ndarray]:
+    """Columns of a point cloud."""
+    columns = dict(zip("xyz", measured.xyz_m.T, strict=True))
+    if isinstance(measured, Sweep):
+        # Drivers of solid-state lidars call their lasers lines, and readers treat them as rings.
+        laser = "line" if isinstance(sheet, LidarSpec) and sheet.pattern == "rosette" else "ring"
+        return columns | {"intensity": measured.intensity, laser: measured.ring, "time": measured.time_s}
+    is_turned = isinstance(sheet, RadarSpec) and sheet.doppler_positive == "approaching"
+    rate = np.float32(-1.0 if is_turned else 1.0) * measured.range_rate_mps
+    return columns | {"doppler": rate, "power": measured.power_db}
 
 
 def _permuted(png: bytes, rng: np.random.Generator) -> bytes:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from rosbags.rosbag1 import Writer as Bag1Writer
@@ -16,35 +16,22 @@ from rosbags.rosbag2 import Writer as Bag2Writer
 from pipeline.core.ros_messages import McapLog, RosMessages
 from pipeline.rig.se3 import from_rotation_translation
 from pipeline.rig.topics import TOPICS, topics_of
-from pipeline.simulate.faults import DayFaults
-from pipeline.simulate.logs.frame_messages import Sent, Setup, messages_of
-from pipeline.simulate.sensors.data_sheets import LidarSpec
-from pipeline.simulate.sensors.mounting import Mounting
+from pipeline.simulate.logs.frame_messages import Sent, messages_of
 from pipeline.simulate.sensors.rig_spec import RigSpec
-from pipeline.simulate.sensors.semantics import SemanticsSpec
 from pipeline.simulate.sensors.simulated_frame import (
-    Seat,
-    SimulatedFrame,
+    Image,
+    Measurement,
+    Scene,
+    Setup,
     frame_of,
     scene_of,
     triggered_stamps,
 )
-from pipeline.simulate.world.casting import World
-from pipeline.simulate.world.drives import Drive
+from pipeline.simulate.world.casting import Moment, World
+from pipeline.simulate.world.drives import Drive, rotation
 
-__all__ = [
-    "CONTAINERS",
-    "FIRST_FRAME_S",
-    "PARTIAL",
-    "Ticks",
-    "free_clocks",
-    "log_name",
-    "nominal_poses",
-    "open_log",
-    "record_drive",
-]
+__all__ = ["FIRST_FRAME_S", "PARTIAL", "SUFFIXES", "Ticks", "free_clocks", "open_log", "record_drive"]
 
-T = TypeVar("T")
 _ODOMETRY_HZ: Final = 20.0
 FIRST_FRAME_S: Final = 1.0  # the log of a drive starts this long before its first frame
 # For free-running sensors the log has the measurement nearest to the reference's sweep, because rendering
@@ -54,7 +41,7 @@ _WAY_M, _TRIGGER_S = 3.0, 0.1  # between the two images of a pair; period of a c
 # Relative rate errors: mechanical lidars keep theirs to some parts in a thousand, quartzes to a hundred in a
 # million. Without them, 30 and 10 Hz would keep a constant gap for a whole drive, as if triggered.
 _RATE_SD: Final = {"camera": 1e-4, "lidar": 3e-3, "radar": 1e-4}
-CONTAINERS: Final = ("mcap", "ros1", "db3")
+SUFFIXES: Final = {"mcap": ".mcap", "ros1": ".bag", "db3": ""}  # of a log's name, by container
 PARTIAL: Final = ".partial-"  # a folder of this beginning holds a log that is being written
 
 
@@ -94,27 +81,27 @@ def record_drive(
         return drive.start_ns + round(t_s * 1e9)
 
     odometry = _odometry(drive, rng)
-    log.put(TOPICS["tf"], at(0.0), messages.sensor_poses(at(0.0), nominal_poses(setups[0].mounting)))
-    scene = scene_of(drive)
+    log.put(TOPICS["tf"], at(0.0), messages.sensor_poses(at(0.0), setups[0].mounting.nominal()))
+    scene, sweep_s = scene_of(drive), getattr(rig.reference.sheet, "sweep_s", 0.0)
     clocks = free_clocks(rig, np.random.default_rng([drive.seed, 53]))
-    first: dict[str, SimulatedFrame] = {}
+    first: dict[str, Measurement] = {}
     for k, setup in enumerate(setups):
         stamp = FIRST_FRAME_S + k / rate_hz + rng.uniform(0, 0.02)
         if rig.reference.name in clocks:
             stamp = clocks[rig.reference.name].nearest(stamp)[0]
-        seat = Seat(world.moment(stamp - _sweep_s(rig) / 2), scene, rig, setup.mounting)
-        semantics = _labelled_in_the_dark(setup.semantics, setup.faults)
+        moment = world.moment(stamp - sweep_s / 2)
         near, next_near = _stamps(setup, clocks, stamp, rng)
         alone = [{n: t} for n, t in next_near.items()] if k % _NEIGHBOURS_EVERY == 0 else []
         pending: list[Sent] = []
         for group in ([near], alone):
-            frames = [frame_of(seat, stamps, rng, semantics) for stamps in group]
-            for frame in frames:
-                first |= {name: frame for name in frame.stamps_s if name not in first}
-                shown = _resent(frame, first, setup.faults)
-                pending += messages_of(messages, shown, setup, at, rng)
+            frames = [frame_of(moment, scene, setup, stamps, rng) for stamps in group]
+            for stamps, frame in zip(group, frames, strict=True):
+                first = frame | first
+                shown = {n: first[n] if setup.faults.has("stuck", n) else m for n, m in frame.items()}
+                stamps_ns = {n: at(t) for n, t in stamps.items()}
+                pending += messages_of(messages, shown, stamps_ns, setup, rng)
         if rig.image_pairs:
-            pending += _images_before(messages, seat, setup, clocks, near, rate_hz, at)
+            pending += _images_before(messages, moment, scene, setup, clocks, near, rate_hz, at)
         while odometry and odometry[0][0] <= stamp + 0.1:
             t, T, speed, yaw_rate = odometry.pop(0)
             pending.append((at(t), TOPICS["odometry"], messages.odometry(at(t), T, speed, yaw_rate)))
@@ -123,14 +110,10 @@ def record_drive(
         tick(k + 1)
 
 
-def _sweep_s(rig: RigSpec) -> float:
-    sheet = rig.reference.sheet
-    return sheet.sweep_s if isinstance(sheet, LidarSpec) else 0.0
-
-
 def _images_before(
     messages: RosMessages,
-    seat: Seat,
+    moment: Moment,
+    scene: Scene,
     setup: Setup,
     clocks: Mapping[str, Ticks],
     stamps_s: Mapping[str, float],
@@ -141,20 +124,18 @@ def _images_before(
 
     Its draws are its own: the moment's are those of a rig without such images.
     """
-    sent, speed = (
-        list[Sent](),
-        float(np.linalg.norm(seat.scene.ego.velocities(np.array([seat.moment.t_s]))[0])),
-    )
+    sent: list[Sent] = []
+    speed = float(np.linalg.norm(scene.ego.velocities(np.array([moment.t_s]))[0]))
     if speed / rate_hz < _WAY_M * 1.3:
         return sent
-    for sensor in seat.rig.of_kind("camera"):
-        name, stamp_s = sensor.name, stamps_s.get(sensor.name)
-        if stamp_s is None or setup.faults.has("missing", name) or setup.faults.has("stuck", name):
+    for name in (s.name for s in setup.rig.of_kind("camera")):
+        if setup.faults.has("missing", name) or setup.faults.has("stuck", name):
             continue
         period_s = clocks[name].period_s if name in clocks else _TRIGGER_S
-        stamp_s -= period_s * max(1, round(_WAY_M / speed / period_s))
+        stamp_s = stamps_s[name] - period_s * max(1, round(_WAY_M / speed / period_s))
         rng = np.random.default_rng([round(stamp_s * 1e6), 67])
-        image = frame_of(seat, {name: stamp_s}, rng, setup.semantics).images[name]
+        image = frame_of(moment, scene, setup, {name: stamp_s}, rng)[name]
+        assert isinstance(image, Image)
         jpeg = messages.image(messages.at(at(stamp_s), name), image.jpeg, "jpeg")
         sent.append((at(stamp_s), topics_of(name, "camera")["image"], jpeg))
     return sent
@@ -173,44 +154,6 @@ def _stamps(
     return {n: first + phase[n] for n, (first, _) in near.items()}, others
 
 
-def _resent(frame: SimulatedFrame, first: Mapping[str, SimulatedFrame], today: DayFaults) -> SimulatedFrame:
-    """A frame in which stuck sensors repeat their first data."""
-
-    def held(by_name: Mapping[str, T], of: Callable[[SimulatedFrame], Mapping[str, T]]) -> dict[str, T]:
-        return {n: of(first[n])[n] if today.has("stuck", n) else value for n, value in by_name.items()}
-
-    return SimulatedFrame(
-        frame.stamps_s,
-        held(frame.images, lambda f: f.images),
-        held(frame.sweeps, lambda f: f.sweeps),
-        held(frame.scans, lambda f: f.scans),
-    )
-
-
-def nominal_poses(mounting: Mounting) -> dict[str, np.ndarray]:
-    """T_vehicle_sensor as in /tf_static."""
-    return {name: mounted.T_vehicle_nominal for name, mounted in mounting.sensors.items()}
-
-
-def _labelled_in_the_dark(spec: SemanticsSpec, today: DayFaults) -> SemanticsSpec:
-    """Errors of day-trained networks at night: outlines three times as noisy, half of the boxes missed.
-
-    At dusk outlines are 2 label pixels noisier; classes of visible objects are as reliable as by day.
-    """
-    if today.has("dusk"):
-        return replace(spec, boundary_px=spec.boundary_px + 2.0, miss=0.5)
-    if not today.has("night"):
-        return spec
-    return replace(
-        spec,
-        boundary_px=3 * spec.boundary_px,
-        confusion=0.35,
-        miss=0.5,
-        box_jitter=3 * spec.box_jitter,
-        false_boxes=3 * spec.false_boxes,
-    )
-
-
 def _odometry(drive: Drive, rng: np.random.Generator) -> list[tuple[float, np.ndarray, float, float]]:
     """Dead reckoning from wheels and a gyro: (time, T_odom_vehicle, speed, yaw rate)."""
     t = np.arange(0.0, drive.duration_s, 1 / _ODOMETRY_HZ)
@@ -221,9 +164,7 @@ def _odometry(drive: Drive, rng: np.random.Generator) -> list[tuple[float, np.nd
     yaw_rate = np.einsum("ij,ij->i", omega, T[:, :3, 2]) + rng.normal(0, 5e-4) + rng.normal(0, 0.002, len(t))
     yaw = np.cumsum(yaw_rate) / _ODOMETRY_HZ
     x, y = np.cumsum(speed * np.cos(yaw)) / _ODOMETRY_HZ, np.cumsum(speed * np.sin(yaw)) / _ODOMETRY_HZ
-    R = np.zeros((len(t), 3, 3))
-    R[:, 0, 0], R[:, 0, 1] = np.cos(yaw), -np.sin(yaw)
-    R[:, 1, 0], R[:, 1, 1], R[:, 2, 2] = np.sin(yaw), np.cos(yaw), 1.0
+    R = rotation(yaw, np.zeros_like(yaw), np.zeros_like(yaw))
     poses = from_rotation_translation(R, np.stack([x, y, np.zeros_like(x)], 1))
     return [(float(a), b, float(c), float(d)) for a, b, c, d in zip(t, poses, speed, yaw_rate, strict=True)]
 
@@ -235,11 +176,6 @@ def free_clocks(rig: RigSpec, rng: np.random.Generator) -> dict[str, Ticks]:
     periods = 1 / (rates * (1 + rng.normal(0, sd)))
     phases = rng.uniform(0, periods)
     return {n: Ticks(float(p), float(a)) for n, p, a in zip(free, periods, phases, strict=True)}
-
-
-def log_name(stem: str, container: str) -> str:
-    """File (or folder) name of a log."""
-    return {"mcap": f"{stem}.mcap", "ros1": f"{stem}.bag", "db3": stem}[container]
 
 
 @contextmanager

@@ -22,6 +22,14 @@ __all__ = ["RollingShutter", "View", "encode_jpeg", "render", "view_of"]
 
 # Brightness changes slowly: rows of a band are lit at one time (in 30 ms / 12 oncoming cars move by some cm).
 _BANDS: Final = 12
+_HALF_SIZE_M: Final = {  # length and width of a body's shadow
+    "car": (2.2, 0.9),
+    "van": (2.8, 1.0),
+    "truck": (5.5, 1.25),
+    "bus": (5.9, 1.27),
+    "cyclist": (0.9, 0.25),
+    "pedestrian": (0.3, 0.3),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,11 +47,6 @@ class RollingShutter:
     def poses(self, t_s: float, rows: int) -> Float64[np.ndarray, "H 4 4"]:
         """T_map_camera of each row of an image taken at `t_s` of the drive."""
         return np.asarray(self.ego.poses(t_s + self.delays_s(rows)) @ self.T_vehicle_camera)
-
-    def bands(self, rows: int) -> list[slice]:
-        """Bands of rows lit at one time."""
-        edges = np.linspace(0, rows, _BANDS + 1).round().astype(int).tolist()
-        return [slice(a, b) for a, b in pairwise(edges) if b > a]
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,14 +85,13 @@ def view_of(
     With a rolling shutter every ray starts at the camera's position when its row is exposed, in the world at
     that time; `T_map_camera` is the pose for the middle row.
     """
-    half, half_rows = _aimed(moment, camera.scaled(0.5), T_map_camera, shutter)
-    full, full_rows = _aimed(moment, camera, T_map_camera, shutter)
-    coarse = _seen(moment, half, half_rows, np.arange(half[..., 0].size)).reshape(half.shape[:2])
+    half, full = (_aimed(moment, c, T_map_camera, shutter) for c in (camera.scaled(0.5), camera))
+    height, width = half.rays.shape[:2]
+    coarse = _seen(moment, half, np.arange(height * width)).reshape(height, width)
     guess, unsure = _upsampled(coarse, _surfaces(moment), camera.height_px, camera.width_px)
-    guess.reshape(-1)[unsure] = _seen(moment, full, full_rows, unsure)
-    return View(
-        coarse, guess, full, (T_map_camera[:3, 3] - moment.standing.origin).astype(np.float32), shutter
-    )
+    guess.reshape(-1)[unsure] = _seen(moment, full, unsure)
+    origin = (T_map_camera[:3, 3] - moment.standing.origin).astype(np.float32)
+    return View(coarse, guess, full.rays, origin, shutter)
 
 
 @no_type_check  # keeps the tests' shape checks out of compiled code
@@ -114,31 +116,31 @@ def _upsampled(coarse, surface, height, width):  # noqa: ANN001, ANN202 - compil
     return out, unsure[:n]
 
 
-class _Rows(NamedTuple):
-    """Start of the rays of each image row, in the moment's coordinates, and delay after the moment."""
+class _Aimed(NamedTuple):
+    """Directions of all pixels in the map; start of each row's rays from the moment's origin, and its delay."""
 
-    origin: np.ndarray
+    rays: np.ndarray
+    start: np.ndarray
     delay_s: np.ndarray
 
 
 def _aimed(
     moment: Moment, camera: Camera, T_map_camera: np.ndarray, shutter: RollingShutter | None
-) -> tuple[np.ndarray, _Rows]:
-    """Directions of all pixels in the map, and their rows."""
+) -> _Aimed:
     rows = camera.height_px
     if shutter is None:
         R = T_map_camera[:3, :3].astype(np.float32)
         origin = (T_map_camera[:3, 3] - moment.standing.origin).astype(np.float32)
-        return _rays_of(camera) @ R.T, _Rows(np.broadcast_to(origin, (rows, 3)), np.zeros(rows, np.float32))
+        return _Aimed(_rays_of(camera) @ R.T, np.broadcast_to(origin, (rows, 3)), np.zeros(rows, np.float32))
     T = shutter.poses(moment.t_s, rows)
     origin = (T[:, :3, 3] - moment.standing.origin).astype(np.float32)
     rays = np.einsum("hij,hwj->hwi", T[:, :3, :3].astype(np.float32), _rays_of(camera))
-    return rays, _Rows(origin, shutter.delays_s(rows).astype(np.float32))
+    return _Aimed(rays, origin, shutter.delays_s(rows).astype(np.float32))
 
 
-def _seen(moment: Moment, rays: np.ndarray, rows: _Rows, pixels: np.ndarray) -> np.ndarray:
-    row = pixels // rays.shape[1]
-    return moment.cast(rows.origin[row], rays.reshape(-1, 3)[pixels], rows.delay_s[row]).triangle
+def _seen(moment: Moment, aimed: _Aimed, pixels: np.ndarray) -> np.ndarray:
+    row = pixels // aimed.rays.shape[1]
+    return moment.cast(aimed.start[row], aimed.rays.reshape(-1, 3)[pixels], aimed.delay_s[row]).triangle
 
 
 def _surfaces(moment: Moment) -> np.ndarray:
@@ -168,42 +170,23 @@ def _lit_in_bands(moment: Moment, view: View, shutter: RollingShutter, light: Li
     rows = len(view.full)
     delays, T_map_camera = shutter.delays_s(rows), shutter.poses(moment.t_s, rows)
     parts = []
-    for band in shutter.bands(rows):
-        middle = (band.start + band.stop) // 2
+    for first, last in pairwise(np.linspace(0, rows, _BANDS + 1).round().astype(int).tolist()):
+        middle = (first + last) // 2
         origin = (T_map_camera[middle, :3, 3] - moment.standing.origin).astype(np.float32)
-        sight = Sight(view.full[band], view.rays_map[band], origin)
+        sight = Sight(view.full[first:last], view.rays_map[first:last], origin)
         parts.append(_lit(moment.advanced(moment.t_s + float(delays[middle])), sight, light))
     return np.concatenate(parts)
 
 
 def _lit(moment: Moment, sight: Sight, light: Light) -> np.ndarray:
     mesh = moment.mesh
-    patches = np.array(
-        [_footprint(a.T_map_actor, moment.standing.origin, a.kind) for a in moment.actors], np.float32
-    ).reshape(-1, 8)
-    return shade(
-        sight,
-        Surfaces(mesh.corners, moment.normals, mesh.material, mesh.tint, mesh.uv),
-        TABLE,
-        light,
-        moment.standing.shadows,
-        patches,
-    )
-
-
-def _footprint(T_map_actor: np.ndarray, origin: np.ndarray, kind: str) -> list[float]:
-    """Soft dark patch under a body on the ground: x, y, cos, sin, half length, half width, height, unused."""
-    sizes = {
-        "car": (2.2, 0.9),
-        "van": (2.8, 1.0),
-        "truck": (5.5, 1.25),
-        "bus": (5.9, 1.27),
-        "cyclist": (0.9, 0.25),
-        "pedestrian": (0.3, 0.3),
-    }
-    half_length, half_width = sizes[kind]
-    x, y, z = T_map_actor[:3, 3] - origin
-    return [x, y, T_map_actor[0, 0], T_map_actor[1, 0], half_length, half_width, z, 0.0]
+    patches = []  # soft dark ones under bodies on the ground
+    for actor in moment.actors:
+        x, y, z = actor.T_map_actor[:3, 3] - moment.standing.origin
+        patches.append([x, y, *actor.T_map_actor[:2, 0], *_HALF_SIZE_M[actor.kind], z])
+    surfaces = Surfaces(mesh.corners, moment.normals, mesh.material, mesh.tint, mesh.uv)
+    blobs = np.array(patches, np.float32).reshape(-1, 7)
+    return shade(sight, surfaces, TABLE, light, moment.standing.shadows, blobs)
 
 
 @lru_cache(maxsize=1)

@@ -61,11 +61,6 @@ class LidarSpec:
     divergence_deg: float = 0.10  # half angle of the footprint
     row_elevation_deg: tuple[float, ...] = ()
     pattern: Literal["rows", "rosette"] = "rows"
-    prisms_hz: tuple[float, float] = (121.57, -77.73)  # Livox Mid-40: 7294 and -4664 turns per minute
-
-    def __post_init__(self) -> None:
-        if self.row_elevation_deg and len(self.row_elevation_deg) != self.rows:
-            raise ValueError(f"{len(self.row_elevation_deg)} row elevations for {self.rows} rows")
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,4 @@
-"""Measurements of a scanning lidar: each beam from the sensor's position at the beam's own time.
-
-Directions and times of a lidar's beams: rows of a scanner, or the rosette of two rotating prisms.
+"""Measurements of a scanner or of rotating prisms: each beam from the sensor's position at its own time.
 
 Source of the rosette: Marshall 1999, "Risley prism scan patterns" (SPIE 3787): each prism adds a rotating
 deflection, and their sum is periodic only if the ratio of their rates is one of small whole numbers.
@@ -13,7 +11,7 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float, Float64, Int64, UInt16
+from jaxtyping import Float, Float64
 
 from pipeline.rig.spherical import from_spherical
 from pipeline.simulate.sensors.data_sheets import LidarSpec
@@ -35,15 +33,7 @@ _ELSEWHERE_M: Final = 1000.0
 _FAINTEST: Final = 0.018
 _MOST_PASSED: Final = 6  # maximum number of panes and leaves that one beam passes
 _SKIN_M: Final = 0.01
-
-
-@dataclass(frozen=True, eq=False)
-class Beams:
-    """All beams of a sweep in order of firing: (azimuth, elevation) [rad], laser, firing."""
-
-    angles: Float64[np.ndarray, "N 2"]
-    laser: UInt16[np.ndarray, " N"]
-    column: Int64[np.ndarray, " N"]
+_PRISMS_HZ: Final = (121.57, -77.73)  # Livox Mid-40: 7294 and -4664 turns per minute
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,21 +59,19 @@ def sweep_lidar(
     rng: np.random.Generator,
 ) -> Sweep:
     """One sweep that ends at `end_s` of the drive."""
-    beams = beams_of(spec, end_s)
-    angles, ring, column = beams.angles, beams.laser, beams.column
-    column_time = np.linspace(-spec.sweep_s, 0.0, spec.columns)
+    angles, column_time = beams_of(spec, end_s), np.linspace(-spec.sweep_s, 0.0, spec.columns)
     T = ego.poses(end_s + column_time) @ T_vehicle_lidar
-    R, origin = T[:, :3, :3], T[:, :3, 3] - moment.standing.origin
-    delay = (end_s + column_time - moment.t_s)[column]
+    origins = np.repeat(T[:, :3, 3] - moment.standing.origin, spec.rows, axis=0)
+    delay = np.repeat(end_s + column_time - moment.t_s, spec.rows)
     parts = []
     # A beam has a footprint: a second ray in it finds edges where two surfaces share one beam.
     for spread in (0.0, np.radians(spec.divergence_deg)):
         a = angles + spread * rng.uniform(-1, 1, angles.shape) if spread else angles
         body = from_spherical(np.concatenate([a, np.ones((len(a), 1))], 1))
-        rays = np.einsum("cij,crj->cri", R, body.reshape(spec.columns, spec.rows, 3)).reshape(-1, 3)
-        origins = np.repeat(origin, spec.rows, axis=0)
-        parts.append((_echo(moment, _met(moment, origins, rays, delay, rng), rays, spec, rng), rays))
-    (range_m, strength, label), seen = _mixed(parts[0][0], parts[1][0], rng)
+        body = body.reshape(spec.columns, spec.rows, 3)
+        rays = np.einsum("cij,crj->cri", T[:, :3, :3], body).reshape(-1, 3)
+        parts.append(_echo(moment, _met(moment, origins, rays, delay, rng), rays, spec, rng))
+    (range_m, strength, label), seen = _mixed(parts[0], parts[1], rng)
     keep = seen & (rng.random(len(seen)) > 0.004)
     body = from_spherical(np.concatenate([angles[keep], range_m[keep, None]], 1))
     intensity = np.clip(
@@ -94,8 +82,8 @@ def sweep_lidar(
     return Sweep(
         body.astype(np.float32),
         np.round(intensity).astype(np.float32),
-        ring[keep],
-        column_time[column][keep].astype(np.float32),
+        np.tile(np.arange(spec.rows, dtype=np.uint16), spec.columns)[keep],
+        np.repeat(column_time, spec.rows)[keep].astype(np.float32),
         label[keep],
     )
 
@@ -131,7 +119,8 @@ def _echo(
     cosine = np.abs(np.einsum("ij,ij->i", moment.normals[k], rays[found].astype(np.float32)))
     # Dark paint and cloth are dark to the lidar too, but less so.
     reflectivity = TABLE.reflectivity[m] * (0.25 + 0.75 * np.minimum(moment.mesh.tint[k].mean(1), 1.0))
-    at = _surface_coordinates(moment, k, hits.barycentric[found])
+    uv, (b, c) = moment.mesh.uv[k], hits.barycentric[found].T[..., None]
+    at = uv[:, 0] * (1 - b - c) + uv[:, 1] * b + uv[:, 2] * c
     gain, glass = textures(TABLE.texture[m], at)
     if not moment.landscape.infrared:
         on_road = label == _ROAD
@@ -148,20 +137,11 @@ def _echo(
         (echo < _FAINTEST * rng.uniform(0.6, 1.6, len(k))) | (r > spec.max_range_m) | (r < spec.min_range_m)
     )
     lost |= pane | ((label == _VEGETATION) & (rng.random(len(k)) < 0.08))
-    range_m, strength, labels = (
-        np.full(len(rays), np.inf),
-        np.zeros(len(rays)),
-        np.full(len(rays), 255, np.uint8),
-    )
+    range_m, strength, labels = np.full(len(rays), np.inf), np.zeros(len(rays)), np.zeros(len(rays), np.uint8)
     back = found[~lost]
     range_m[back], labels[back] = r[~lost], label[~lost]
     strength[back] = (reflectivity * cosine**0.35)[~lost]
     return range_m, strength, labels
-
-
-def _surface_coordinates(moment: Moment, triangle: np.ndarray, barycentric: np.ndarray) -> np.ndarray:
-    uv, (b, c) = moment.mesh.uv[triangle], barycentric.T[..., None]
-    return uv[:, 0] * (1 - b - c) + uv[:, 1] * b + uv[:, 2] * c
 
 
 def _mixed(
@@ -185,34 +165,32 @@ def _mixed(
     return (range_m, np.where(use_two, two[1], one[1]), np.where(use_two, two[2], one[2])), seen
 
 
-def beams_of(spec: LidarSpec, end_s: float) -> Beams:
-    """The beams of the sweep that ends at `end_s`; a scanner has the same in every sweep."""
+def beams_of(spec: LidarSpec, end_s: float) -> Float64[np.ndarray, "N 2"]:
+    """Azimuth, elevation [rad] of the beams of a sweep that ends at `end_s`: firing by firing, laser by laser.
+
+    A scanner has the same in every sweep.
+    """
     return _scanned(spec) if spec.pattern == "rows" else _rosette(spec, end_s)
 
 
 @lru_cache(maxsize=8)
-def _scanned(spec: LidarSpec) -> Beams:
+def _scanned(spec: LidarSpec) -> np.ndarray:
     azimuth = np.radians(np.linspace(spec.azimuth_deg[1], spec.azimuth_deg[0], spec.columns, endpoint=False))
     elevation = np.radians(spec.row_elevation_deg or np.linspace(*spec.elevation_deg, spec.rows))
     a, e = np.meshgrid(azimuth, elevation, indexing="ij")
-    return Beams(np.stack([a.ravel(), e.ravel()], 1), *_numbers(spec))
+    return np.stack([a.ravel(), e.ravel()], 1)
 
 
-def _rosette(spec: LidarSpec, end_s: float) -> Beams:
+def _rosette(spec: LidarSpec, end_s: float) -> np.ndarray:
     """An ellipse that fills the field of view; every laser has its own phase."""
     t = end_s + np.linspace(-spec.sweep_s, 0.0, spec.columns)
     phase = np.arange(spec.rows) / spec.rows * 2 * np.pi
     first, second = (
-        2 * np.pi * f * t[:, None] + sign * phase for f, sign in zip(spec.prisms_hz, (1, 2), strict=True)
+        2 * np.pi * f * t[:, None] + sign * phase for f, sign in zip(_PRISMS_HZ, (1, 2), strict=True)
     )
     along, up = (np.cos(first) + np.cos(second)) / 2, (np.sin(first) + np.sin(second)) / 2
     angles = [
         np.radians((low + high) / 2 + (high - low) / 2 * share)
         for (low, high), share in ((spec.azimuth_deg, along), (spec.elevation_deg, up))
     ]
-    return Beams(np.stack([a.ravel() for a in angles], 1), *_numbers(spec))
-
-
-def _numbers(spec: LidarSpec) -> tuple[np.ndarray, np.ndarray]:
-    column, laser = np.meshgrid(np.arange(spec.columns), np.arange(spec.rows), indexing="ij")
-    return laser.ravel().astype(np.uint16), column.ravel()
+    return np.stack([a.ravel() for a in angles], 1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
@@ -15,7 +15,7 @@ from pipeline.simulate.sensors.data_sheets import CameraSpec
 from pipeline.simulate.sensors.radar import RadarErrors
 from pipeline.simulate.sensors.rig_spec import RigSpec, SensorSpec, Triple
 
-__all__ = ["Mounted", "Mounting", "mounting_of"]
+__all__ = ["Mounted", "Mounting", "disturbed", "mounting_of"]
 
 # Optical axes (x right, y down, z forward) in a frame with x forward, y left, z up.
 _R_BODY_OPTICAL: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -30,7 +30,8 @@ class Mounted:
         T_vehicle_nominal: pose in /tf_static.
         delay_s: its stamp of an event minus the reference lidar's.
         phase_s: constant offset of its stamps after the moment, without jitter.
-        nominal_camera: logged intrinsics.
+        camera: true intrinsics of a camera.
+        errors: of a radar.
     """
 
     T_vehicle: np.ndarray
@@ -38,8 +39,7 @@ class Mounted:
     delay_s: float = 0.0
     phase_s: float = 0.0
     camera: Camera | None = None
-    nominal_camera: Camera | None = None
-    errors: RadarErrors | None = None
+    errors: RadarErrors = field(default_factory=RadarErrors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +52,10 @@ class Mounting:
         """The sensor of that name."""
         return self.sensors[name]
 
+    def nominal(self) -> dict[str, np.ndarray]:
+        """T_vehicle_sensor as in /tf_static."""
+        return {name: mounted.T_vehicle_nominal for name, mounted in self.sensors.items()}
+
     def between(self, parent: str, child: str) -> Float[np.ndarray, "4 4"]:
         """True T_parent_child of two sensors."""
         return inverse(self[parent].T_vehicle) @ self[child].T_vehicle
@@ -61,12 +65,11 @@ class Mounting:
         pairs = (("camera", "lidar"), ("lidar", "radar"), ("camera", "radar"))
         return {f"T_{a}_{b}": self.between(a, b).tolist() for a, b in pairs}
 
-    def camera(self, name: str) -> tuple[Camera, Camera]:
-        """Intrinsics of a camera: true, and as logged."""
-        mounted = self[name]
-        assert mounted.camera is not None
-        assert mounted.nominal_camera is not None
-        return mounted.camera, mounted.nominal_camera
+    def camera(self, name: str) -> Camera:
+        """True intrinsics of a camera."""
+        camera = self[name].camera
+        assert camera is not None, f"{name} is a camera"
+        return camera
 
 
 def mounting_of(rig: RigSpec, seed: int, vehicle: int, day: int) -> Mounting:
@@ -74,20 +77,19 @@ def mounting_of(rig: RigSpec, seed: int, vehicle: int, day: int) -> Mounting:
     built = np.random.default_rng([seed, vehicle, 41])
     remount = np.random.default_rng([seed, vehicle, day, 42])
     poses = {s.name: _poses(rig, s, built, remount) for s in rig.sensors}
-    lenses = {s.name: _lens(s.sheet, built) for s in rig.sensors if isinstance(s.sheet, CameraSpec)}
+    cameras = {s.name: _camera(s.sheet, built) for s in rig.sensors if isinstance(s.sheet, CameraSpec)}
     delays = {s.name: s.delay_s + built.normal(0, rig.delay_sd_s) for s in rig.sensors if s != rig.reference}
     # Range bias [m], elevation bias [deg].
     errors = {
         s.name: RadarErrors(built.normal(0, 0.03), np.radians(built.normal(0, 0.15)))
         for s in rig.of_kind("radar")
     }
-    sensors = {}
-    for name, pose in poses.items():
-        true, nominal = lenses.get(name, (None, None))
-        sensors[name] = Mounted(
-            *pose, delays.get(name, 0.0), camera=true, nominal_camera=nominal, errors=errors.get(name)
-        )
-    return Mounting(sensors)
+    return Mounting(
+        {
+            n: Mounted(*pose, delays.get(n, 0.0), camera=cameras.get(n), errors=errors.get(n, RadarErrors()))
+            for n, pose in poses.items()
+        }
+    )
 
 
 def _poses(
@@ -99,19 +101,19 @@ def _poses(
     axis = built.normal(size=3)
     angle = np.radians(rig.prior_rotation_deg) * np.clip(abs(built.normal(1.0, 0.3)), 0.3, 1.7) / np.sqrt(2)
     shift = built.normal(0, rig.prior_translation_m, 3)
-    T = _disturbed(nominal, angle * axis / np.linalg.norm(axis), shift)
+    T = disturbed(nominal, angle * axis / np.linalg.norm(axis), shift)
     rotation = np.radians(rig.remount_rotation_deg) * remount.normal(size=3)
-    return _disturbed(T, rotation, rig.remount_translation_m * remount.normal(size=3)), nominal
+    return disturbed(T, rotation, rig.remount_translation_m * remount.normal(size=3)), nominal
 
 
-def _lens(sheet: CameraSpec, built: np.random.Generator) -> tuple[Camera, Camera]:
-    """True and logged intrinsics."""
+def _camera(sheet: CameraSpec, built: np.random.Generator) -> Camera:
+    """True intrinsics."""
     logged = sheet.nominal()
     K = logged.K.copy()
     K[0, 0] *= 1 + built.normal(0, sheet.focal_error)
     K[1, 1] *= K[0, 0] / logged.K[0, 0]
     K[:2, 2] += built.normal(0, sheet.centre_error_px * sheet.width_px / 1824, 2)
-    return Camera(logged.model, K, logged.D, logged.width_px, logged.height_px), logged
+    return replace(logged, K=K)
 
 
 def _turned(rpy_deg: Triple) -> np.ndarray:
@@ -121,6 +123,6 @@ def _turned(rpy_deg: Triple) -> np.ndarray:
     return R
 
 
-def _disturbed(T: np.ndarray, rotation_rad: np.ndarray, translation_m: np.ndarray) -> np.ndarray:
+def disturbed(T: np.ndarray, rotation_rad: np.ndarray, translation_m: np.ndarray) -> np.ndarray:
     """Rotated about the vehicle's axes at the sensor's position, and shifted along them."""
     return from_rotation_translation(exp_so3(rotation_rad) @ T[:3, :3], T[:3, 3] + translation_m)

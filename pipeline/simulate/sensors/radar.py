@@ -1,16 +1,12 @@
 """FMCW radar: scatterers from cast rays, merged by resolution cell, with road reflections and aliasing.
 
-Source: Skolnik, Radar Handbook, ch. 2 (equation, fluctuation); Barton 1974, "Low-angle radar tracking"
-(glint).
-
-Multipath over the road, combined with the direct echo: power and apparent elevation.
-
 Object and mirror image in the road share one range cell, and their amplitudes add: each is a sum of many
 scatterers, hence complex normal, and at 77 GHz their paths differ by many wavelengths. The radar estimates
 one elevation between the object and its image, weighted by amplitude, different in every scan. Echoes that
 the image strengthens are detected more often than those it weakens, so the mean elevation is too low.
 
-Source: Barton 1974, "Low-angle radar tracking"; Howard 1959, "Radar target angular scintillation".
+Source: Skolnik, Radar Handbook, ch. 2 (equation, fluctuation); Barton 1974, "Low-angle radar tracking"
+(glint); Howard 1959, "Radar target angular scintillation".
 """
 
 from __future__ import annotations
@@ -30,7 +26,7 @@ from pipeline.simulate.world.casting import Moment
 from pipeline.simulate.world.drives import Motion
 from pipeline.simulate.world.materials import LABELS, TABLE, material
 
-__all__ = ["RadarErrors", "Scan", "faded_by_road", "scan_radar"]
+__all__ = ["RadarErrors", "Scan", "scan_radar"]
 
 _GROUND: Final = tuple(LABELS.index(n) for n in ("road", "sidewalk", "terrain"))
 _PLANTS: Final = LABELS.index("vegetation")
@@ -152,14 +148,8 @@ def _scatterers(
     rate = np.einsum("ij,ij->i", v - velocity_radar, rays[near])
     # Power per ray: gain x solid angle / r^2; 9,000 rays of gain 1 at 120 m make a signal-to-noise ratio of 1
     # each.
-    snr = (
-        TABLE.radar_gain[m]
-        * shape
-        * (120.0 / r) ** 2
-        * (9000 / len(rays))
-        * rng.exponential(1.0, len(k))
-        * np.exp(-inside / 2.0)
-    )
+    gain = TABLE.radar_gain[m] * shape * (120.0 / r) ** 2 * (9000 / len(rays))
+    snr = gain * rng.exponential(1.0, len(k)) * np.exp(-inside / 2.0)
     aer = np.stack([a[near], e[near], r + inside], 1)
     moving = np.linalg.norm(moment.velocity_of_triangle[k], axis=1) > 0.1
     return _Cells(aer, rate, snr, np.isin(label, _GROUND), moving)
@@ -167,18 +157,9 @@ def _scatterers(
 
 def _merged(echoes: _Cells, T_vehicle_radar: np.ndarray, spec: RadarSpec, rng: np.random.Generator) -> _Cells:
     """One detection per resolution cell with enough total power, at the power-weighted mean of its echoes."""
-    size = spec.cell
-    index = np.floor(
-        np.concatenate([echoes.aer / size, echoes.rate[:, None] / spec.doppler_resolution_mps], 1)
-    ).astype(np.int64)
-    key = (
-        ((index[:, 0] + 512) * 64 + index[:, 1] + 32) * 4096 * 4096
-        + (index[:, 2] + 1024) * 4096
-        + index[:, 3]
-        + 2048
-    )
-    _, cell = np.unique(key, return_inverse=True)
-    n = int(cell.max()) + 1 if len(cell) else 0
+    index = np.floor(_in_cells(echoes, spec)).astype(np.int64)
+    cells, cell = np.unique(index, axis=0, return_inverse=True)
+    n, cell = len(cells), cell.ravel()
     total = np.bincount(cell, echoes.snr, n)
     mean = [
         np.bincount(cell, echoes.snr * c, n) / np.maximum(total, 1e-12)
@@ -187,23 +168,22 @@ def _merged(echoes: _Cells, T_vehicle_radar: np.ndarray, spec: RadarSpec, rng: n
     aer = np.stack(mean[:3], 1)
     # Swerling I: the whole cell fades from scan to scan.
     if spec.road_mirror:
-        height_m, image = image_in_road(aer, T_vehicle_radar)
-        fade, share = faded_by_road(height_m, spec.road_mirror, rng)
+        height_m, image = _image_in_road(aer, T_vehicle_radar)
+        fade, share = _faded_by_road(height_m, spec.road_mirror, rng)
         aer[:, 1] += share * (image[:, 1] - aer[:, 1])
     else:
         fade = rng.exponential(1.0, n)
     snr = total * fade + 1.0
     keep = snr > _THRESHOLD
     found = _Cells(aer[keep], mean[3][keep], snr[keep], mean[4][keep] > 0.5, mean[5][keep] > 0.5)
-    return _peaks(found, np.append(size, spec.doppler_resolution_mps))
+    # Local maxima: of two detections closer than the resolution in all four dimensions, the stronger one.
+    strongest = np.argsort(-found.snr)
+    return take_rows(found, strongest[_unsuppressed(_in_cells(found, spec)[strongest])])
 
 
-def _peaks(cells: _Cells, size: np.ndarray) -> _Cells:
-    """Local maxima: drops the weaker of two detections closer than the resolution in all four dimensions."""
-    strongest = np.argsort(-cells.snr)
-    x = (np.concatenate([cells.aer, cells.rate[:, None]], 1) / size)[strongest]
-    keep = strongest[_unsuppressed(x)]
-    return take_rows(cells, keep)
+def _in_cells(cells: _Cells, spec: RadarSpec) -> np.ndarray:
+    """Azimuth, elevation, range and range rate in units of the resolution."""
+    return np.concatenate([cells.aer / spec.cell, cells.rate[:, None] / spec.doppler_resolution_mps], 1)
 
 
 @no_type_check
@@ -224,21 +204,18 @@ def _unsuppressed(x: np.ndarray) -> np.ndarray:
 
 def _bounced(cells: _Cells, T_vehicle_radar: np.ndarray, spec: RadarSpec, rng: np.random.Generator) -> _Cells:
     """Road reflections: an unresolved image changes the elevation; a resolved one is a second detection."""
-    height, aer_image = image_in_road(cells.aer, T_vehicle_radar)
-    radar_height = T_vehicle_radar[2, 3]
-    n = len(cells.snr)
-    mirror = (
-        0.6 * rng.random(n) * np.exp(1j * rng.uniform(0, 2 * np.pi, n)) * (~cells.ground & (height > 0.15))
-    )
+    height, aer_image = _image_in_road(cells.aer, T_vehicle_radar)
+    radar_height, n = T_vehicle_radar[2, 3], len(cells.snr)
+    has_image = ~cells.ground & (height > _LEAST_HEIGHT_M)
+    mirror = 0.6 * rng.random(n) * np.exp(1j * rng.uniform(0, 2 * np.pi, n)) * has_image
     apart = aer_image[:, 1] - cells.aer[:, 1]
     resolved = np.abs(apart) > np.radians(spec.elevation_resolution_deg)
     bend = np.clip(np.real(mirror / (1 + mirror)), -1.0, 1.0) * apart
     aer = cells.aer.copy()
-    aer[:, 1] += np.where(resolved, 0.0, bend)
     # The path over the road is longer by about 2 h1 h2 / r; half of it adds to the range.
-    aer[:, 2] += np.where(
-        resolved, 0.0, np.abs(mirror) ** 2 * np.maximum(height, 0) * radar_height / np.maximum(aer[:, 2], 5.0)
-    )
+    longer = np.abs(mirror) ** 2 * np.maximum(height, 0) * radar_height / np.maximum(aer[:, 2], 5.0)
+    aer[:, 1] += np.where(resolved, 0.0, bend)
+    aer[:, 2] += np.where(resolved, 0.0, longer)
     aer_image[:, 2] = aer[:, 2] + 2 * height * radar_height / aer[:, 2]
     images = replace(cells, aer=aer_image, snr=np.abs(mirror) ** 4 * cells.snr)
     second = resolved & (images.snr > _THRESHOLD)
@@ -257,28 +234,18 @@ def _ghosts(
     image[:, 1] = 2 * side - image[:, 1]
     first = to_spherical(transform_points(inverse(T_vehicle_radar), image))
     second = doubled.aer * [1.0, 1.0, 2.0]
-    return join_rows(
-        [
-            replace(mirrored, aer=first, snr=mirrored.snr / 4),
-            replace(doubled, aer=second, rate=2 * doubled.rate, snr=doubled.snr / 5),
-        ]
-    )
+    behind = replace(mirrored, aer=first, snr=mirrored.snr / 4)
+    return join_rows([behind, replace(doubled, aer=second, rate=2 * doubled.rate, snr=doubled.snr / 5)])
 
 
 def _clutter(spec: RadarSpec, rng: np.random.Generator) -> _Cells:
     """False alarms, uniform in the data cube."""
     n = int(rng.poisson(5))
     half = np.radians([spec.azimuth_deg, spec.elevation_deg])
-    aer = np.stack(
-        [*(rng.uniform(-h, h, n) for h in half), rng.uniform(spec.min_range_m, spec.max_range_m, n)], 1
-    )
-    return _Cells(
-        aer,
-        rng.uniform(-20, 20, n),
-        _THRESHOLD * (1 + rng.exponential(0.3, n)),
-        np.zeros(n, bool),
-        np.zeros(n, bool),
-    )
+    angles = [rng.uniform(-h, h, n) for h in half]
+    aer = np.stack([*angles, rng.uniform(spec.min_range_m, spec.max_range_m, n)], 1)
+    rate, snr, no = rng.uniform(-20, 20, n), _THRESHOLD * (1 + rng.exponential(0.3, n)), np.zeros(n, bool)
+    return _Cells(aer, rate, snr, no, no)
 
 
 def _measured(
@@ -289,11 +256,8 @@ def _measured(
     # resolution, because of the array's calibration.
     sigma = spec.cell * np.maximum(1 / (1.6 * np.sqrt(2 * seen.snr)), 0.1)[:, None]
     sigma[:, 1] *= spec.elevation_noise
-    aer = (
-        seen.aer
-        + sigma * rng.standard_normal(sigma.shape)
-        + [0.0, errors.elevation_bias_rad, errors.range_bias_m]
-    )
+    bias = [0.0, errors.elevation_bias_rad, errors.range_bias_m]
+    aer = seen.aer + sigma * rng.standard_normal(sigma.shape) + bias
     grid = spec.cell / 8
     aer = np.round(aer / grid) * grid
     rate = seen.rate + 0.35 * spec.doppler_resolution_mps * rng.standard_normal(len(sigma))
@@ -303,7 +267,7 @@ def _measured(
     return aer, np.round(rate / spec.doppler_step_mps) * spec.doppler_step_mps
 
 
-def faded_by_road(
+def _faded_by_road(
     height_m: Float[np.ndarray, " N"], mirrored: float, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, " N"]]:
     """Power of every echo relative to its mean, and its position between object (0) and mirror image (1).
@@ -318,7 +282,7 @@ def faded_by_road(
     return np.abs(both) ** 2, np.clip(np.real(image / both), 0.0, 1.0)
 
 
-def image_in_road(
+def _image_in_road(
     aer: Float[np.ndarray, "N 3"], T_vehicle_radar: Float[np.ndarray, "4 4"]
 ) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, "N 3"]]:
     """Height above the road [m], and mirror image as azimuth, elevation and range in the radar frame."""

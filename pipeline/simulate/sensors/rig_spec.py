@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 from pipeline.rig.graph import Kind
 from pipeline.simulate.sensors.data_sheets import CameraSpec, LidarSpec, RadarSpec
 
-__all__ = ["RigSpec", "SensorSpec", "Sheet", "short_rig"]
+__all__ = ["RigSpec", "SensorSpec", "Sheet", "Triple"]
 
 Triple = tuple[float, float, float]
 Sheet = CameraSpec | LidarSpec | RadarSpec
@@ -90,26 +89,3 @@ class RigSpec:
     def changed(self, change: Callable[[SensorSpec], SensorSpec]) -> RigSpec:
         """The rig with `change` applied to every sensor."""
         return replace(self, sensors=tuple(map(change, self.sensors)))
-
-
-def short_rig(
-    name: str,
-    camera: CameraSpec,
-    lidar: LidarSpec,
-    radar: RadarSpec,
-    *,
-    xyz_m: tuple[Triple, Triple, Triple] = ((1.62, 0.02, 1.62), (1.50, 0.00, 1.80), (1.66, -0.22, 1.58)),
-    rpy_deg: tuple[Triple, Triple, Triple] = ((0.0, 0.0, 0.0),) * 3,
-    delay_s: tuple[float, float] = (0.012, -0.018),
-    free_hz: Triple | None = None,
-    **car: Any,
-) -> RigSpec:
-    """A rig of three sensors named camera, lidar and radar, in this order in the arguments.
-
-    `delay_s` is of camera and radar; `free_hz` None = the lidar triggers both; `**car` are fields of RigSpec.
-    """
-    rates, delays = free_hz or (None,) * 3, (delay_s[0], 0.0, delay_s[1])
-    rows = zip(
-        ("camera", "lidar", "radar"), (camera, lidar, radar), xyz_m, rpy_deg, delays, rates, strict=True
-    )
-    return RigSpec(name, tuple(SensorSpec(*row) for row in rows), **car)

@@ -15,7 +15,7 @@ import numpy as np
 
 from pipeline.core.errors import ConfigError
 from pipeline.simulate.sensors.data_sheets import CameraSpec, LidarSpec, RadarSpec
-from pipeline.simulate.sensors.rig_spec import RigSpec, SensorSpec, Sheet, short_rig
+from pipeline.simulate.sensors.rig_spec import RigSpec, SensorSpec, Sheet, Triple
 
 __all__ = ["RIGS", "rig_named"]
 
@@ -66,7 +66,7 @@ _VAN_CORNER: Final = RadarSpec(
 )
 
 
-def _van_camera(name: str, sheet: CameraSpec, xyz_m: tuple[float, float, float], yaw_deg: float, pitch_deg: float,
+def _van_camera(name: str, sheet: CameraSpec, xyz_m: Triple, yaw_deg: float, pitch_deg: float,
             delay_s: float) -> SensorSpec:  # fmt: skip
     return SensorSpec(name, sheet, xyz_m, (0.0, pitch_deg, yaw_deg), delay_s, 30.0)
 
@@ -109,46 +109,58 @@ _NO_LIDAR: Final = RigSpec(
 )
 
 
-def _demo(
+def _trio(
     name: str,
     camera: CameraSpec = _CAMERA,
     lidar: LidarSpec = _LIDAR,
     radar: RadarSpec = _RADAR,
-    **where: Any,
+    *,
+    xyz_m: tuple[Triple, Triple, Triple] = (_CAMERA_M, _LIDAR_M, (1.66, -0.22, 1.58)),
+    rpy_deg: tuple[Triple, Triple, Triple] = (_LEVEL,) * 3,
+    delay_s: tuple[float, float] = (0.012, -0.018),
+    free_hz: Triple | None = None,
+    **car: Any,
 ) -> RigSpec:
-    """The rig demo with other sensors, or with sensors in other places."""
-    return short_rig(name, camera, lidar, radar, **where)
+    """A rig of three sensors named camera, lidar and radar, in this order in the arguments; by default the demo's.
+
+    `delay_s` is of camera and radar; `free_hz` None = the lidar triggers both; `**car` are fields of RigSpec.
+    """
+    rates, delays = free_hz or (None,) * 3, (delay_s[0], 0.0, delay_s[1])
+    rows = zip(
+        ("camera", "lidar", "radar"), (camera, lidar, radar), xyz_m, rpy_deg, delays, rates, strict=True
+    )
+    return RigSpec(name, tuple(SensorSpec(*row) for row in rows), **car)
 
 
 _ALL: Final = (
-    short_rig("paper", *_PAPER),
+    _trio("paper", *_PAPER),
     # One clock without delays, as in the paper's car: required by methods without time offsets.
-    short_rig("paper-one-clock", *_PAPER, delay_s=(0.0, 0.0), delay_sd_s=0.0),
+    _trio("paper-one-clock", *_PAPER, delay_s=(0.0, 0.0), delay_sd_s=0.0),
     # No common trigger: every sensor with its own rate and phase, as on most cars.
-    short_rig("paper-free", *_PAPER, free_hz=(30.0, 10.0, 13.0)),
-    _demo("demo"),
-    _demo(
+    _trio("paper-free", *_PAPER, free_hz=(30.0, 10.0, 13.0)),
+    _trio("demo"),
+    _trio(
         "ring16",
         lidar=LidarSpec((-180.0, 180.0), (-15.0, 15.0), 1800, 16, 0.1, 0.8, 100.0),
         radar=RadarSpec(rays=6000, doppler_period_mps=10.394, doppler_positive="approaching"),
     ),
     # Radars at the corners of the bumper look beyond the view of a forward lidar.
-    _demo(
+    _trio(
         "corner-left", lidar=_SPINNING, radar=_CORNER,
         xyz_m=(_CAMERA_M, _LIDAR_M, (3.60, 0.80, 0.60)), rpy_deg=(_LEVEL, _LEVEL, (0.0, 0.0, 45.0)),
     ),
-    _demo(
+    _trio(
         "corner-right", lidar=_SPINNING, radar=_CORNER,
         xyz_m=(_CAMERA_M, _LIDAR_M, (3.60, -0.80, 0.60)), rpy_deg=(_LEVEL, _LEVEL, (0.0, 0.0, -45.0)),
     ),
-    _demo(
+    _trio(
         "spin128",
         lidar=LidarSpec(
             (-180.0, 180.0), (-25.0, 15.0), 1200, 128, 0.1, 0.8, 120.0, row_elevation_deg=_ROWS_128
         ),
     ),
     # A narrow image strip and a 360 deg lidar of 64 rows, 1/3 deg apart above and 1/2 deg below.
-    _demo(
+    _trio(
         "hdl64",
         camera=CameraSpec(1242, 376, 81.4, 29.2, model="plumb_bob", distortion=(0.0,) * 5),
         lidar=LidarSpec(
@@ -159,38 +171,38 @@ _ALL: Final = (
     ),
     # A lidar of 24 x 10 deg in the middle of an image of 150 deg, and a 360 deg lidar with an image of 32
     # deg.
-    _demo(
+    _trio(
         "keyhole",
         camera=CameraSpec(1024, 512, 150.0, 75.0),
         lidar=LidarSpec((-12.0, 12.0), (-7.0, 3.0), 160, 64, max_range_m=120.0),
     ),
-    _demo(
+    _trio(
         "telephoto",
         camera=CameraSpec(960, 540, 32.0, 18.3, model="plumb_bob", distortion=(0.0,) * 5),
         lidar=replace(_SPINNING, columns=1800),
     ),
     # 240,000 beams a second over 82 x 25 deg, as in Livox' Horizon; six lasers behind the same prisms.
-    _demo(
+    _trio(
         "rosette",
         lidar=LidarSpec((-41.0, 41.0), (-14.5, 10.5), 4000, 6, 0.1, 1.0, 100.0, pattern="rosette"),
     ),
-    _demo("fisheye", camera=CameraSpec(1280, 960, 190.0, 142.5), lidar=_SPINNING),
-    _demo(
+    _trio("fisheye", camera=CameraSpec(1280, 960, 190.0, 142.5), lidar=_SPINNING),
+    _trio(
         "pinhole",
         camera=CameraSpec(
             1280, 720, 72.0, 44.5, model="plumb_bob", distortion=(-0.32, 0.11, 5e-4, -4e-4, -0.015)
         ),
     ),
-    _demo("rolling", camera=replace(_CAMERA, readout_s=0.03)),
+    _trio("rolling", camera=replace(_CAMERA, readout_s=0.03)),
     # A cab: all sensors except the radar are high and look down.
-    _demo(
+    _trio(
         "truck", lidar=replace(_LIDAR, elevation_deg=(-21.0, 3.0)),
         xyz_m=((2.10, 0.10, 2.55), (1.90, 0.0, 3.00), (2.60, -0.15, 0.65)),
         rpy_deg=((0.0, 6.0, 0.0), _LEVEL, _LEVEL),
     ),
-    _demo("bumper", xyz_m=(_CAMERA_M, _LIDAR_M, (3.70, 0.05, 0.50))),
+    _trio("bumper", xyz_m=(_CAMERA_M, _LIDAR_M, (3.70, 0.05, 0.50))),
     # Nose down, and twice as fast.
-    _demo("tilted", lidar=replace(_LIDAR, sweep_s=0.04), rpy_deg=(_LEVEL, (0.0, 5.0, 0.0), _LEVEL)),
+    _trio("tilted", lidar=replace(_LIDAR, sweep_s=0.04), rpy_deg=(_LEVEL, (0.0, 5.0, 0.0), _LEVEL)),
     _VAN,
     _DUO,
     _NO_LIDAR,
@@ -231,7 +243,7 @@ def _by_rows(name: str) -> RigSpec | None:
     rows, degrees = (int(part) for part in asked)
     # 32 rows are 1 deg apart; columns are 0.3 deg apart whatever the width.
     sheet = LidarSpec((-degrees / 2, degrees / 2), (-20.0, 11.0), round(degrees / 0.3), rows, 0.1, 0.8, 100.0)
-    return _demo(name, lidar=sheet)
+    return _trio(name, lidar=sheet)
 
 
 def _with_radar(change: dict[str, Any], sensor: SensorSpec) -> SensorSpec:
@@ -244,36 +256,36 @@ def random_rig(seed: int) -> RigSpec:
     even = rng.uniform
 
     def turned(roll: float, pitch: float, yaw: float) -> tuple[float, float, float]:
-        return float(even(-roll, roll)), float(even(-pitch, pitch)), float(even(-yaw, yaw))
+        return even(-roll, roll), even(-pitch, pitch), even(-yaw, yaw)
 
-    high = float(even(1.25, 2.4))  # of the camera: a car's mirror to a van's roof
-    above = float(even(0.0, 0.5))
+    high = even(1.25, 2.4)  # of the camera: a car's mirror to a van's roof
+    above = even(0.0, 0.5)
     in_grille = rng.random() < 0.6
-    radar_xyz = (float(even(3.2, 3.8)), float(even(-0.4, 0.4)), float(even(0.4, 0.8)))
+    radar_xyz = (even(3.2, 3.8), even(-0.4, 0.4), even(0.4, 0.8))
     if not in_grille:
-        radar_xyz = (float(even(1.3, 1.8)), float(even(-0.3, 0.3)), high + float(even(-0.1, 0.3)))
-    return short_rig(
+        radar_xyz = (even(1.3, 1.8), even(-0.3, 0.3), high + even(-0.1, 0.3))
+    return _trio(
         f"random-{seed}",
         _camera(rng),
         _lidar(rng),
         _radar(rng),
         xyz_m=(
-            (float(even(1.2, 2.1)), float(even(-0.15, 0.15)), high),
-            (float(even(0.9, 1.9)), float(even(-0.15, 0.15)), high + above),
+            (even(1.2, 2.1), even(-0.15, 0.15), high),
+            (even(0.9, 1.9), even(-0.15, 0.15), high + above),
             radar_xyz,
         ),
         rpy_deg=(turned(1.0, 3.0, 1.5), turned(1.0, 2.0, 1.5), turned(1.0, 1.5, 2.0)),
-        delay_s=(float(even(-0.02, 0.03)), float(even(-0.03, 0.03))),
-        sync_jitter_s=float(even(0.0005, 0.003)),
-        prior_rotation_deg=float(even(0.5, 1.5)),
-        prior_translation_m=float(even(0.01, 0.05)),
+        delay_s=(even(-0.02, 0.03), even(-0.03, 0.03)),
+        sync_jitter_s=even(0.0005, 0.003),
+        prior_rotation_deg=even(0.5, 1.5),
+        prior_translation_m=even(0.01, 0.05),
     )
 
 
 def _camera(rng: np.random.Generator) -> CameraSpec:
     pinhole = rng.random() < 0.5
-    across = float(rng.uniform(*(_PINHOLE_DEG if pinhole else _F_THETA_DEG)))
-    aspect = float(rng.uniform(*_ASPECT))
+    across = rng.uniform(*(_PINHOLE_DEG if pinhole else _F_THETA_DEG))
+    aspect = rng.uniform(*_ASPECT)
     pixels = rng.uniform(*_PIXELS)
     width = 16 * round(np.sqrt(pixels * aspect) / 16)
     height = 2 * round(width / aspect / 2)
@@ -284,11 +296,11 @@ def _camera(rng: np.random.Generator) -> CameraSpec:
         else across * share
     )
     bent = rng.random() < 0.5
-    k1 = float(rng.uniform(-0.25, 0.0)) if bent else 0.0
+    k1 = rng.uniform(-0.25, 0.0) if bent else 0.0
     return CameraSpec(
         width, height, across, upright,
-        focal_error=float(rng.uniform(0.0, 0.002)),
-        centre_error_px=float(rng.uniform(0.0, 1.0)),
+        focal_error=rng.uniform(0.0, 0.002),
+        centre_error_px=rng.uniform(0.0, 1.0),
         jpeg_quality=int(rng.integers(55, 96)),
         model="plumb_bob" if pinhole else "equidistant",
         # The second coefficient compensates most of the first one at the corners, as in real lenses.
@@ -300,31 +312,31 @@ def _lidar(rng: np.random.Generator) -> LidarSpec:
     sparse = rng.random() < _SPARSE_SHARE
     rows = int(rng.choice(_SPARSE_ROWS if sparse else _DENSE_ROWS))
     around = sparse and rng.random() < 0.5
-    side = 180.0 if around else float(rng.uniform(32.0, 65.0))
-    step = float(rng.uniform(0.2, 0.4))
-    lowest, highest = float(rng.uniform(-25.0, -12.0)), float(rng.uniform(3.0, 15.0))
+    side = 180.0 if around else rng.uniform(32.0, 65.0)
+    step = rng.uniform(0.2, 0.4)
+    lowest, highest = rng.uniform(-25.0, -12.0), rng.uniform(3.0, 15.0)
     return LidarSpec(
         (-side, side),
         (lowest, highest),
         columns=round(2 * side / step),
         rows=rows,
         sweep_s=float(rng.choice([0.05, 0.1])),
-        min_range_m=float(rng.uniform(0.8, 5.0)),
-        max_range_m=float(rng.uniform(70.0, 120.0)),
-        range_sigma_m=float(rng.uniform(0.01, 0.03)),
-        divergence_deg=float(rng.uniform(0.05, 0.15)),
+        min_range_m=rng.uniform(0.8, 5.0),
+        max_range_m=rng.uniform(70.0, 120.0),
+        range_sigma_m=rng.uniform(0.01, 0.03),
+        divergence_deg=rng.uniform(0.05, 0.15),
     )
 
 
 def _radar(rng: np.random.Generator) -> RadarSpec:
     return RadarSpec(
-        azimuth_deg=float(rng.uniform(28.0, 60.0)),
-        elevation_deg=float(rng.uniform(8.0, 15.0)),
-        min_range_m=float(rng.uniform(1.0, 5.0)),
-        max_range_m=float(rng.uniform(70.0, 120.0)),
-        azimuth_resolution_deg=float(rng.uniform(1.0, 3.0)),
-        elevation_resolution_deg=float(rng.uniform(3.0, 9.0)),
-        range_resolution_m=float(rng.uniform(0.2, 0.6)),
+        azimuth_deg=rng.uniform(28.0, 60.0),
+        elevation_deg=rng.uniform(8.0, 15.0),
+        min_range_m=rng.uniform(1.0, 5.0),
+        max_range_m=rng.uniform(70.0, 120.0),
+        azimuth_resolution_deg=rng.uniform(1.0, 3.0),
+        elevation_resolution_deg=rng.uniform(3.0, 9.0),
+        range_resolution_m=rng.uniform(0.2, 0.6),
         doppler_period_mps=float(rng.choice([10.4, 20.0, 40.0, 80.0])),
         doppler_positive=str(rng.choice(["receding", "approaching"])),
         rays=int(rng.integers(5000, 9000)),

@@ -24,51 +24,27 @@ _THINGS: Final = tuple(
     LABELS.index(n)
     for n in ("pole", "traffic light", "traffic sign", "person", "rider", "car", "truck", "bus", "bicycle")
 )
-_COCO: Final = {
-    "person": "person",
-    "rider": "person",
-    "car": "car",
-    "truck": "truck",
-    "bus": "bus",
-    "bicycle": "bicycle",
-    "motorcycle": "motorcycle",
-}
-# Class -> classes it is confused with, from published confusion matrices of Cityscapes networks.
+_COCO: Final = {n: n for n in ("person", "car", "truck", "bus", "bicycle")} | {"rider": "person"}
+# By class: the one that it is confused with, from published confusion matrices of Cityscapes networks, and how
+# often (1 = the mean): roads rarely, walls and fences often.
 _CONFUSED: Final = {
-    "road": "sidewalk",
-    "sidewalk": "road",
-    "building": "wall",
-    "wall": "building",
-    "fence": "vegetation",
-    "pole": "building",
-    "traffic light": "building",
-    "traffic sign": "building",
-    "vegetation": "terrain",
-    "terrain": "vegetation",
-    "person": "rider",
-    "rider": "person",
-    "car": "truck",
-    "truck": "car",
-    "bus": "truck",
-    "bicycle": "vegetation",
-    "sky": "building",
-}
-_PRONENESS: Final = {
-    "road": 0.12,
-    "sky": 0.01,
-    "sidewalk": 1.6,
-    "building": 0.9,
-    "wall": 6.0,
-    "fence": 5.0,
-    "pole": 2.5,
-    "terrain": 2.5,
-    "vegetation": 0.8,
-    "car": 0.6,
-    "truck": 4.0,
-    "bus": 3.0,
-    "traffic sign": 2.0,
-    "rider": 3.0,
-    "bicycle": 2.5,
+    "road": ("sidewalk", 0.12),
+    "sidewalk": ("road", 1.6),
+    "building": ("wall", 0.9),
+    "wall": ("building", 6.0),
+    "fence": ("vegetation", 5.0),
+    "pole": ("building", 2.5),
+    "traffic light": ("building", 1.0),
+    "traffic sign": ("building", 2.0),
+    "vegetation": ("terrain", 0.8),
+    "terrain": ("vegetation", 2.5),
+    "person": ("rider", 1.0),
+    "rider": ("person", 3.0),
+    "car": ("truck", 0.6),
+    "truck": ("car", 4.0),
+    "bus": ("truck", 3.0),
+    "bicycle": ("vegetation", 2.5),
+    "sky": ("building", 0.01),
 }
 
 
@@ -116,16 +92,11 @@ def noisy_labels(
     h, w = true.shape
     x, y = np.meshgrid(np.arange(w, dtype=np.float32), np.arange(h, dtype=np.float32))
     # Mostly slow variation of whole outlines, with some noise.
-    dx, dy = (
-        spec.boundary_px * (0.85 * _field((h, w), 14.0, rng) + 0.45 * _field((h, w), 4.0, rng)) for _ in "xy"
-    )
-    out = cv2.remap(
-        true,
-        x + dx.astype(np.float32),
-        y + dy.astype(np.float32),
-        cv2.INTER_NEAREST,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
+    at = [
+        (axis + spec.boundary_px * (0.85 * _field((h, w), 14.0, rng) + 0.45 * _field((h, w), 4.0, rng)))
+        for axis in (x, y)
+    ]
+    out = cv2.remap(true, *at, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
     things = np.where(np.isin(out, _THINGS), out, np.uint8(0))
     grown = cv2.dilate(things, np.ones((3, 3), np.uint8))
     swell = (
@@ -145,13 +116,9 @@ def _quantile(share: float) -> float:
 
 def _confused(labels: np.ndarray, share: float, rng: np.random.Generator) -> np.ndarray:
     """Change the class of patches of a few dozen pixels to one it is confused with."""
-    table = np.arange(256, dtype=np.uint8)
-    for name, other in _CONFUSED.items():
-        table[LABELS.index(name)] = LABELS.index(other)
-    # Roads are rarely confused, walls and fences often: share of each class, 1 = the mean.
-    proneness = np.ones(256)
-    for name, factor in _PRONENESS.items():
-        proneness[LABELS.index(name)] = factor
+    table, proneness = np.arange(256, dtype=np.uint8), np.ones(256)
+    for name, (other, factor) in _CONFUSED.items():
+        table[LABELS.index(name)], proneness[LABELS.index(name)] = LABELS.index(other), factor
     threshold = np.array([np.sqrt(2) * _quantile(min(share * p, 0.45)) for p in proneness], np.float32)
     w = labels.shape[1]
     field = 0.9 * _field(labels.shape, w / 13, rng) + 0.42 * _field(labels.shape, w / 50, rng)
@@ -167,22 +134,11 @@ def boxes_of(moment: Moment, coarse: Int32[np.ndarray, "h w"]) -> list[tuple[Box
     group = np.full(len(mesh), -1, np.int64)
     group[bodies] = number
     found = []
-    for key, (x0, y0, x1, y1, pixels) in zip(keys, _extents(coarse, group, len(keys)), strict=True):
+    for key, (*corners, pixels) in zip(keys, _extents(coarse, group, len(keys)).tolist(), strict=True):
         if pixels > 0 and LABELS[key % 32] in _COCO:
             # half-size pixel j covers full-size pixels 2j and 2j + 1
-            found.append(
-                (
-                    Box(
-                        2.0 * x0 - 0.5,
-                        2.0 * y0 - 0.5,
-                        2.0 * x1 + 1.5,
-                        2.0 * y1 + 1.5,
-                        _COCO[LABELS[key % 32]],
-                        1.0,
-                    ),
-                    int(pixels),
-                )
-            )
+            x0, y0, x1, y1 = (2.0 * np.array(corners) + [-0.5, -0.5, 1.5, 1.5]).tolist()
+            found.append((Box(x0, y0, x1, y1, _COCO[LABELS[key % 32]], 1.0), pixels))
     return found
 
 
@@ -216,35 +172,22 @@ def noisy_boxes(
         visible = np.clip((h / height - 0.012) / 0.025, 0, 1) * np.clip((filled - 0.18) / 0.25, 0, 1)
         if rng.random() > (1 - spec.miss) * visible:
             continue
-        jitter = spec.box_jitter * np.array([w, h, w, h]) * rng.standard_normal(
-            4
-        ) + 0.5 * rng.standard_normal(4)
-        edges = np.array([box.x0, box.y0, box.x1, box.y1]) + jitter
+        jitter = spec.box_jitter * np.array([w, h, w, h]) * rng.standard_normal(4)
+        edges = np.array([box.x0, box.y0, box.x1, box.y1]) + (jitter + 0.5 * rng.standard_normal(4))
         name = "truck" if box.name == "car" and rng.random() < 0.03 else box.name
-        out.append(
-            _clipped(
-                edges,
-                width,
-                height,
-                name,
-                float(np.clip(0.35 + 0.6 * visible + 0.08 * rng.standard_normal(), 0.25, 0.99)),
-            )
-        )
+        score = np.clip(0.35 + 0.6 * visible + 0.08 * rng.standard_normal(), 0.25, 0.99)
+        out.append(_clipped(edges, size_px, name, float(score)))
     for _ in range(rng.poisson(spec.false_boxes)):
         x, y, h = rng.uniform(0, width), height * rng.uniform(0.45, 0.7), height * rng.uniform(0.04, 0.15)
         edges = np.array([x, y, x + h * rng.uniform(0.5, 1.8), y + h])
-        out.append(
-            _clipped(
-                edges, width, height, ("car", "person")[int(rng.integers(2))], float(rng.uniform(0.25, 0.6))
-            )
-        )
+        name = ("car", "person")[int(rng.integers(2))]
+        out.append(_clipped(edges, size_px, name, rng.uniform(0.25, 0.6)))
     return out
 
 
-def _clipped(edges: Float[np.ndarray, " 4"], width: int, height: int, name: str, score: float) -> Box:
-    x0, x1 = np.clip(edges[[0, 2]], -0.5, width - 0.5)
-    y0, y1 = np.clip(edges[[1, 3]], -0.5, height - 0.5)
-    return Box(float(x0), float(y0), float(x1), float(y1), name, score)
+def _clipped(edges: Float[np.ndarray, " 4"], size_px: tuple[int, int], name: str, score: float) -> Box:
+    x0, y0, x1, y1 = np.clip(edges, -0.5, np.tile(size_px, 2) - 0.5).tolist()
+    return Box(x0, y0, x1, y1, name, score)
 
 
 def encode_png(labels: UInt8[np.ndarray, "h w"]) -> bytes:

@@ -70,8 +70,8 @@ def shade(sight, surfaces, materials, light, shadows, blobs):
     """Linear RGB of each pixel, float32, H W 3.
 
     Args:
-        blobs: patches under road users, B 8: x, y [m], cosine and sine of the heading, half length, half
-            width, height of the ground [m], unused.
+        blobs: patches under road users, B 7: x, y [m], cosine and sine of the heading, half length, half
+            width, height of the ground [m].
     """
     # One long body, because some thirty scalars of a pixel are shared by its steps.
     seen, rays, origin = sight
@@ -148,24 +148,13 @@ def shade(sight, surfaces, materials, light, shadows, blobs):
                 rx, ry, rz = dx - 2 * facing * nx, dy - 2 * facing * ny, dz - 2 * facing * nz
                 fresnel = 0.06 + 0.94 * (1.0 + facing) ** 5
                 strength = (0.25 + fresnel) * mirror if mirror > 0 else 0.35 * fresnel
+                cr, cg, cb, share = 1.0, 1.0, 1.0, 0.10
                 if rz > 0:
                     cr, cg, cb = _sky(rx, ry, rz, sun[0], sun[1], sun[2])
-                    r, g, b = (
-                        r + strength * 0.55 * cr * sky_gain,
-                        g + strength * 0.55 * cg * sky_gain,
-                        b + strength * 0.55 * cb * sky_gain,
-                    )
-                else:
-                    r, g, b = (
-                        r + strength * 0.10 * sky_gain,
-                        g + strength * 0.10 * sky_gain,
-                        b + strength * 0.10 * sky_gain,
-                    )
-                r, g, b = (
-                    r + glow[m] * tint[k, 0] * albedo[m, 0],
-                    g + glow[m] * tint[k, 1] * albedo[m, 1],
-                    b + glow[m] * tint[k, 2] * albedo[m, 2],
-                )
+                    share = 0.55
+                r += strength * share * cr * sky_gain + glow[m] * tint[k, 0] * albedo[m, 0]
+                g += strength * share * cg * sky_gain + glow[m] * tint[k, 1] * albedo[m, 1]
+                b += strength * share * cb * sky_gain + glow[m] * tint[k, 2] * albedo[m, 2]
             haze = 1.0 - np.exp(-t / 900.0)
             out[i, j, 0] = r + (0.72 * sky_gain - r) * haze
             out[i, j, 1] = g + (0.78 * sky_gain - g) * haze

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from pipeline.rig.graph import Kind
+from pipeline.simulate.faults import DayFaults
 from pipeline.simulate.sensors.camera import RollingShutter, encode_jpeg, render, view_of
-from pipeline.simulate.sensors.data_sheets import CameraSpec, LidarSpec, RadarSpec
+from pipeline.simulate.sensors.data_sheets import CameraSpec, LidarSpec
 from pipeline.simulate.sensors.lidar import Sweep, sweep_lidar
 from pipeline.simulate.sensors.mounting import Mounting
 from pipeline.simulate.sensors.radar import Scan, scan_radar
-from pipeline.simulate.sensors.rig_spec import RigSpec
+from pipeline.simulate.sensors.rig_spec import RigSpec, SensorSpec
 from pipeline.simulate.sensors.semantics import (
     Box,
     SemanticsSpec,
@@ -26,7 +27,9 @@ from pipeline.simulate.sensors.semantics import (
 from pipeline.simulate.world.casting import Moment
 from pipeline.simulate.world.drives import Drive, Motion
 
-__all__ = ["Image", "Scene", "Seat", "SimulatedFrame", "frame_of", "scene_of", "triggered_stamps"]
+__all__ = ["Image", "Measurement", "Scene", "Setup", "frame_of", "scene_of", "triggered_stamps"]
+
+_DRAWN: tuple[Kind, ...] = ("lidar", "camera", "radar")
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,19 +37,12 @@ class Image:
     """An image with the outputs of networks; `true_labels` is not logged."""
 
     jpeg: bytes
-    labels_png: bytes
     boxes: list[Box]
     true_labels: np.ndarray = field(repr=False)
+    labels_png: bytes = b""
 
 
-@dataclass(frozen=True, eq=False)
-class SimulatedFrame:
-    """Measurements of the sensors at one moment, by name; stamps in seconds of the drive."""
-
-    stamps_s: Mapping[str, float]
-    images: Mapping[str, Image]
-    sweeps: Mapping[str, Sweep]
-    scans: Mapping[str, Scan]
+Measurement = Image | Sweep | Scan
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +56,16 @@ class Scene:
     beacons_map: np.ndarray | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """A vehicle at one moment: rig, mounting, label networks, faults."""
+
+    rig: RigSpec
+    mounting: Mounting
+    semantics: SemanticsSpec
+    faults: DayFaults = field(default_factory=DayFaults)
+
+
 def scene_of(drive: Drive) -> Scene:
     """Scene of a drive; rails (highway) and house fronts (urban) are radar mirrors."""
     layout = drive.layout
@@ -68,36 +74,21 @@ def scene_of(drive: Drive) -> Scene:
     return Scene(drive.ego, drive.sun, drive.night, mirrors)
 
 
-@dataclass(frozen=True, eq=False)
-class Seat:
-    """Inputs of one moment: world at that time, surroundings, and the vehicle's sensors."""
-
-    moment: Moment
-    scene: Scene
-    rig: RigSpec
-    mounting: Mounting
-
-
 def frame_of(
-    seat: Seat, stamps_s: Mapping[str, float], rng: np.random.Generator, semantics: SemanticsSpec
-) -> SimulatedFrame:
+    moment: Moment, scene: Scene, setup: Setup, stamps_s: Mapping[str, float], rng: np.random.Generator
+) -> dict[str, Measurement]:
     """Measurements of the named sensors with these stamps; a sensor measures earlier than its stamp by its delay.
 
     The moment should be near the middle of the reference lidar's sweep. The order of random draws defines a
-    day: lidars, then camera images, radars, and last the networks' outputs.
+    day: lidars, then camera images, radars, and last the networks' labels.
     """
-
-    def at(kind: Kind) -> dict[str, float]:
-        return {s.name: stamps_s[s.name] for s in seat.rig.of_kind(kind) if s.name in stamps_s}
-
-    sweeps = {n: _sweep(seat, n, t, rng) for n, t in at("lidar").items()}
-    exposed = {n: _exposed(seat, n, t, rng, semantics) for n, t in at("camera").items()}
-    scans = {n: _scan(seat, n, t, rng) for n, t in at("radar").items()}
-    images = {
-        n: Image(jpeg, encode_png(noisy_labels(true, semantics, rng)), boxes, true)
-        for n, (jpeg, true, boxes) in exposed.items()
-    }
-    return SimulatedFrame(dict(stamps_s), images, sweeps, scans)
+    sensors = [s for kind in _DRAWN for s in setup.rig.of_kind(kind) if s.name in stamps_s]
+    found = {s.name: _measured(moment, scene, setup, s, stamps_s[s.name], rng) for s in sensors}
+    for name, image in found.items():
+        if isinstance(image, Image):
+            labels = noisy_labels(image.true_labels, setup.semantics, rng)
+            found[name] = replace(image, labels_png=encode_png(labels))
+    return found
 
 
 def triggered_stamps(
@@ -111,36 +102,24 @@ def triggered_stamps(
     return found | {rig.reference.name: stamp_s}
 
 
-def _sweep(seat: Seat, name: str, stamp_s: float, rng: np.random.Generator) -> Sweep:
-    sheet, mounted = seat.rig[name].sheet, seat.mounting[name]
-    assert isinstance(sheet, LidarSpec)
-    end_s = stamp_s - mounted.delay_s
-    return sweep_lidar(seat.moment, seat.scene.ego, mounted.T_vehicle, sheet, end_s, rng)
-
-
-def _scan(seat: Seat, name: str, stamp_s: float, rng: np.random.Generator) -> Scan:
-    sheet, mounted, scene = seat.rig[name].sheet, seat.mounting[name], seat.scene
-    assert isinstance(sheet, RadarSpec)
-    assert mounted.errors is not None
-    moment = seat.moment.advanced(stamp_s - mounted.delay_s)
-    return scan_radar(
-        moment, scene.ego, mounted.T_vehicle, sheet, mounted.errors, rng, scene.mirrors_m, scene.beacons_map
-    )
-
-
-def _exposed(
-    seat: Seat, name: str, stamp_s: float, rng: np.random.Generator, semantics: SemanticsSpec
-) -> tuple[bytes, np.ndarray, list[Box]]:
-    """JPEG, true labels and noisy boxes of the image with a stamp."""
-    sheet, mounted, scene = seat.rig[name].sheet, seat.mounting[name], seat.scene
-    assert isinstance(sheet, CameraSpec)
-    camera, _ = seat.mounting.camera(name)
-    exposure = seat.moment.advanced(stamp_s - mounted.delay_s)
-    T_map_camera = scene.ego.poses(np.array([exposure.t_s]))[0] @ mounted.T_vehicle
-    shutter = RollingShutter(scene.ego, mounted.T_vehicle, sheet.readout_s) if sheet.readout_s else None
-    view = view_of(exposure, camera, T_map_camera, shutter)
-    image = render(exposure, view, scene.sun, rng, night=scene.night)
-    true = label_image(exposure, view.coarse)
+def _measured(
+    moment: Moment, scene: Scene, setup: Setup, sensor: SensorSpec, stamp_s: float, rng: np.random.Generator
+) -> Measurement:
+    """Measurement of one sensor; labels of an image are missing."""
+    sheet, mounted = sensor.sheet, setup.mounting[sensor.name]
+    T, at_s = mounted.T_vehicle, stamp_s - mounted.delay_s
+    if isinstance(sheet, LidarSpec):
+        return sweep_lidar(moment, scene.ego, T, sheet, at_s, rng)
+    moment = moment.advanced(at_s)
+    if not isinstance(sheet, CameraSpec):
+        return scan_radar(
+            moment, scene.ego, T, sheet, mounted.errors, rng, scene.mirrors_m, scene.beacons_map
+        )
+    camera = setup.mounting.camera(sensor.name)
+    T_map_camera = scene.ego.poses(np.array([at_s]))[0] @ T
+    shutter = RollingShutter(scene.ego, T, sheet.readout_s) if sheet.readout_s else None
+    view = view_of(moment, camera, T_map_camera, shutter)
+    image = render(moment, view, scene.sun, rng, night=scene.night)
     size_px = (camera.width_px, camera.height_px)
-    boxes = noisy_boxes(boxes_of(exposure, view.coarse), size_px, semantics, rng)
-    return encode_jpeg(image, sheet.jpeg_quality), true, boxes
+    boxes = noisy_boxes(boxes_of(moment, view.coarse), size_px, setup.semantics, rng)
+    return Image(encode_jpeg(image, sheet.jpeg_quality), boxes, label_image(moment, view.coarse))

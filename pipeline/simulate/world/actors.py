@@ -55,7 +55,7 @@ def actor_mesh(kind: str, variant: int) -> Mesh:
         _cyclist(b, rng)
     else:
         _person(b, rng, "cloth", (0.32, 0.12, -0.24, 0.0)[variant % 4], seated=False)
-    return glazed(b.mesh(1), float(rng.uniform(0.5, 1.0))) if hollow else b.mesh(1)
+    return glazed(b.mesh(1), rng.uniform(0.5, 1.0)) if hollow else b.mesh(1)
 
 
 def _van(b: MeshBuilder, rng: np.random.Generator, colour: Colour) -> None:
@@ -153,21 +153,11 @@ def _person(b: MeshBuilder, rng: np.random.Generator, cloth: str, stride_m: floa
         top,
     )
     head = np.array([lean + 0.02, 0.0, neck + lift + 0.60 * (height - neck)])
-    b.tube(
-        head - [0, 0, 0.14],
-        head - [0, 0, 0.03],
-        0.055,
-        "skin" if cloth == "cloth" else cloth,
-        5,
-        (1, 1, 1) if cloth == "cloth" else (0.4, 0.27, 0.2),
-    )
-    b.blob(
-        head,
-        np.array([0.10, 0.085, 0.125]),
-        "skin" if cloth == "cloth" else cloth,
-        rng,
-        (1, 1, 1) if cloth == "cloth" else top,
-    )
+    skin, throat, face = cloth, (0.4, 0.27, 0.2), top
+    if cloth == "cloth":
+        skin, throat, face = "skin", (1.0, 1.0, 1.0), (1.0, 1.0, 1.0)
+    b.tube(head - [0, 0, 0.14], head - [0, 0, 0.03], 0.055, skin, 5, throat)
+    b.blob(head, np.array([0.10, 0.085, 0.125]), skin, rng, face)
 
 
 def _cyclist(b: MeshBuilder, rng: np.random.Generator) -> None:
@@ -177,13 +167,9 @@ def _cyclist(b: MeshBuilder, rng: np.random.Generator) -> None:
         ring = np.stack([x + 0.34 * np.cos(phi), np.zeros(13), 0.35 + 0.34 * np.sin(phi)], 1)
         for a, c in itertools.pairwise(ring):
             b.tube(a, c, 0.025, "bike_tyre", 4)
-    rear, front, seat, bottom, bar = (
-        [-0.53, 0, 0.35],
-        [0.53, 0, 0.35],
-        [-0.18, 0, 0.95],
-        [-0.02, 0, 0.33],
-        [0.42, 0, 0.95],
-    )
-    for p, q in ((rear, seat), (rear, bottom), (seat, bottom), (seat, bar), (bottom, bar), (bar, front)):
-        b.tube(np.array(p), np.array(q), 0.022, "bike_metal", 4)
+    places = {"rear": (-0.53, 0.35), "front": (0.53, 0.35), "seat": (-0.18, 0.95), "low": (-0.02, 0.33)}
+    at = {name: np.array([x, 0, z]) for name, (x, z) in (places | {"bar": (0.42, 0.95)}).items()}
+    for tube in ("rear seat", "rear low", "seat low", "seat bar", "low bar", "bar front"):
+        one, other = tube.split()
+        b.tube(at[one], at[other], 0.022, "bike_metal", 4)
     b.tube(np.array([0.42, -0.28, 1.02]), np.array([0.42, 0.28, 1.02]), 0.018, "bike_metal", 4)

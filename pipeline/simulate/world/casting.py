@@ -17,16 +17,17 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Float
 
+from pipeline.core.rows import join_rows
 from pipeline.simulate.world.actors import actor_mesh
 from pipeline.simulate.world.chunk import CHUNK_M, Chunk
 from pipeline.simulate.world.drives import Drive
 from pipeline.simulate.world.landscapes import LANDSCAPES, Landscape
-from pipeline.simulate.world.meshes import Mesh, join, placed
+from pipeline.simulate.world.meshes import Mesh, placed
 from pipeline.simulate.world.plots import add_halls, add_plots, add_rows
 from pipeline.simulate.world.street import add_asphalt, add_motorway, add_street
 from pipeline.simulate.world.traffic import Actor, actors_at
 
-__all__ = ["Hits", "Moment", "ShadowMap", "Standing", "World", "chunk_mesh", "shadow_map", "standing_of"]
+__all__ = ["Hits", "Moment", "ShadowMap", "Standing", "World", "chunk_mesh", "standing_of"]
 
 _AHEAD_M: Final = 170.0
 _BEHIND_M: Final = 60.0
@@ -81,7 +82,7 @@ class World:
                 i: self._chunks.get(i) or chunk_mesh(self.drive, i) for i in range(window[0], window[1] + 1)
             }
             origin = np.round(self.drive.road.to_map(np.array([[s_m, 0.0, 0.0]]))[0])
-            mesh, road = join(list(self._chunks.values())), self.drive.road
+            mesh, road = join_rows(list(self._chunks.values())), self.drive.road
             shadows_behind_m = _SHADOWS_BEHIND_M + self._behind_m - _BEHIND_M
             self._window = window
             self._standing = standing_of(mesh, origin, self.drive.sun, road.to_map, s_m, shadows_behind_m)
@@ -115,7 +116,7 @@ class Moment:
             T = actor.T_map_actor.copy()
             T[:3, 3] -= self.standing.origin
             parts.append(placed(actor_mesh(actor.kind, actor.variant), T, actor.key))
-        return join(parts)
+        return join_rows(parts)
 
     @cached_property
     def normals(self) -> Float[np.ndarray, "T 3"]:
@@ -255,25 +256,6 @@ def _cast(
     return range_m, triangle, np.stack([found["u"], found["v"]], axis=1)
 
 
-def shadow_map(
-    scene: EmbreeScene,
-    origin: np.ndarray,
-    sun: np.ndarray,
-    to_map: Callable[[np.ndarray], np.ndarray],
-    s_m: float,
-    behind_m: float,
-) -> ShadowMap:
-    """Cast shadow rays from the ground around an arc length; once per window, not per image."""
-    cell, half = 0.4, 22.0
-    s0 = s_m - behind_m
-    s, d = np.meshgrid(np.arange(s0, s_m + 95.0, cell), np.arange(-half, half, cell), indexing="ij")
-    ground = to_map(np.stack([s.ravel(), d.ravel(), np.full(s.size, 0.2)], 1)) - origin
-    hit = (
-        _cast(scene, ground.astype(np.float32), np.broadcast_to(sun, ground.shape).astype(np.float32))[1] >= 0
-    )
-    return ShadowMap(np.where(hit, 0.0, 1.0).astype(np.float32).reshape(s.shape), s0, -half, cell)
-
-
 def standing_of(
     mesh: Mesh,
     origin: np.ndarray,
@@ -282,13 +264,15 @@ def standing_of(
     s_m: float,
     shadows_behind_m: float = _SHADOWS_BEHIND_M,
 ) -> Standing:
-    """A static world from a mesh in the map."""
-    corners = (mesh.corners - origin.astype(np.float32)).astype(np.float32)
-    local = replace(mesh, corners=corners)
-    scene = _scene(local)
-    return Standing(
-        origin, local, scene, shadow_map(scene, origin, sun, to_map, s_m, shadows_behind_m), _normals(corners)
-    )
+    """A static world from a mesh in the map, with sunlight on the ground around an arc length."""
+    local = replace(mesh, corners=mesh.corners - origin.astype(np.float32))
+    scene, cell, half, s0 = _scene(local), 0.4, 22.0, s_m - shadows_behind_m
+    # Once per window, not per image: shadow rays from 0.2 m above the road.
+    s, d = np.meshgrid(np.arange(s0, s_m + 95.0, cell), np.arange(-half, half, cell), indexing="ij")
+    ground = to_map(np.stack([s.ravel(), d.ravel(), np.full(s.size, 0.2)], 1)) - origin
+    _, hit, _ = _cast(scene, ground, np.broadcast_to(sun, ground.shape))
+    light = np.where(hit >= 0, np.float32(0.0), np.float32(1.0)).reshape(s.shape)
+    return Standing(origin, local, scene, ShadowMap(light, s0, -half, cell), _normals(local.corners))
 
 
 def chunk_mesh(drive: Drive, index: int) -> Mesh:
@@ -307,4 +291,4 @@ def chunk_mesh(drive: Drive, index: int) -> Mesh:
         add_rows(chunk)
     flat = chunk.along.mesh()
     bent = drive.road.to_map(flat.corners.astype(np.float64)).astype(np.float32)
-    return join([replace(flat, corners=bent), *chunk.rigid])
+    return join_rows([replace(flat, corners=bent), *chunk.rigid])

@@ -31,9 +31,15 @@ class Chunk:
         """Arc length at the start of the chunk."""
         return self.index * CHUNK_M
 
+    @property
+    def whole(self) -> Span:
+        """Arc lengths at its start and its end."""
+        return self.s0, self.s0 + CHUNK_M
+
     def strip(self, d: Span, h: Span, name: str, step: float = 5.0) -> None:
-        """Add a band along the whole chunk, d rising."""
-        self.band((self.s0, self.s0 + CHUNK_M), d, h, name, step)
+        """Add a band along the whole chunk between two offsets, in either order, and their heights."""
+        (d0, h0), (d1, h1) = sorted(zip(d, h, strict=True))
+        self.band(self.whole, (d0, d1), (h0, h1), name, step)
 
     def band(self, s: Span, d: Span, h: Span, name: str, step: float = 5.0, tint: Colour = (1, 1, 1)) -> None:
         """Add a band of a material between arc lengths `s` and lateral offsets `d` (left) at heights `h`.

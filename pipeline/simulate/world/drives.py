@@ -6,6 +6,7 @@ consecutive frames show the same world.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final, NamedTuple, Protocol, runtime_checkable
@@ -16,7 +17,7 @@ from jaxtyping import Float
 from pipeline.rig.se3 import from_rotation_translation
 from pipeline.simulate.world.landscapes import Landscape, landscape_named
 
-__all__ = ["Drive", "EgoMotion", "Motion", "Parked", "Road", "RoadLayout", "layout_of"]
+__all__ = ["Drive", "EgoMotion", "Motion", "Parked", "Road", "RoadLayout", "layout_of", "rotation"]
 
 _STEP_M: Final = 1.0
 _STEP_S: Final = 0.02
@@ -56,6 +57,16 @@ def layout_of(landscape: Landscape, seed: int) -> RoadLayout:
     return RoadLayout(landscape, lane, own, tuple(-d for d in own), -edge, edge, parking)
 
 
+def _summed(s: np.ndarray, waves: Iterable[tuple[float, float]], rng: np.random.Generator) -> np.ndarray:
+    """Sum of sines (period, amplitude) with drawn phases and periods near the given ones."""
+    total = np.zeros_like(s)
+    for period, amplitude in waves:
+        total += amplitude * np.sin(
+            2 * np.pi * s / (period * rng.uniform(0.8, 1.3)) + rng.uniform(0, 2 * np.pi)
+        )
+    return total
+
+
 @dataclass(frozen=True)
 class Road:
     """Endless smooth centre line in the map: x, y, z and heading over arc length."""
@@ -68,34 +79,17 @@ class Road:
     def _table(self) -> tuple[np.ndarray, ...]:
         rng = np.random.default_rng([self.seed, 12])
         s = np.arange(-200.0, self.length_m + 400.0, _STEP_M)
-        waves = ((600, 0.0009), (350, 0.0006)) if self.fast else ((170, 0.0045), (90, 0.0030))
-        curvature = np.zeros_like(s)
-        for period, amplitude in waves:
-            curvature += amplitude * np.sin(
-                2 * np.pi * s / (period * rng.uniform(0.8, 1.3)) + rng.uniform(0, 2 * np.pi)
-            )
-        heading = np.cumsum(curvature) * _STEP_M
+        waves = ((600.0, 0.0009), (350.0, 0.0006)) if self.fast else ((170.0, 0.0045), (90.0, 0.0030))
+        hills = ((900.0, 5.0), (400.0, 1.2)) if self.fast else ((420.0, 1.6), (150.0, 0.35))
+        heading = np.cumsum(_summed(s, waves, rng)) * _STEP_M
         heading -= heading[200]
         x, y = np.cumsum(np.cos(heading)) * _STEP_M, np.cumsum(np.sin(heading)) * _STEP_M
-        z = np.zeros_like(s)
-        for period, amplitude in ((900, 5.0), (400, 1.2)) if self.fast else ((420, 1.6), (150, 0.35)):
-            z += amplitude * np.sin(
-                2 * np.pi * s / (period * rng.uniform(0.8, 1.3)) + rng.uniform(0, 2 * np.pi)
-            )
-        return s, x, y, z, heading
+        return s, x, y, _summed(s, hills, rng), heading
 
-    def centre(
-        self, s_m: Float[np.ndarray, "*batch"]
-    ) -> tuple[
-        Float[np.ndarray, "*batch"],
-        Float[np.ndarray, "*batch"],
-        Float[np.ndarray, "*batch"],
-        Float[np.ndarray, "*batch"],
-    ]:
-        """(x, y, z [m], heading [rad]) at arc lengths."""
-        s, x, y, z, heading = self._table
-        at = [np.asarray(np.interp(s_m, s, column)) for column in (x, y, z, heading)]
-        return at[0], at[1], at[2], at[3]
+    def centre(self, s_m: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, " 4 *batch"]:
+        """x, y, z [m] and heading [rad] at arc lengths."""
+        s, *columns = self._table
+        return np.stack([np.interp(s_m, s, column) for column in columns])
 
     def to_map(self, s_d_h: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """Map coordinates of points (arc length, offset to the left, height above the centre line)."""
@@ -110,19 +104,14 @@ class Road:
         p = self.to_map(np.array([[s_m - 1.0, d_m, h_m], [s_m, d_m, h_m], [s_m + 1.0, d_m, h_m]]))
         grade = np.arctan2(p[2, 2] - p[0, 2], 2.0) * np.cos(yaw_rad)
         heading = float(self.centre(np.array([s_m]))[3][0]) + yaw_rad
-        return from_rotation_translation(_rotation(np.array(heading), np.array(-grade), np.array(0.0)), p[1])
+        return from_rotation_translation(rotation(np.array(heading), np.array(-grade), np.array(0.0)), p[1])
 
 
-def _rotation(yaw: np.ndarray, pitch: np.ndarray, roll: np.ndarray) -> np.ndarray:
+def rotation(
+    yaw: Float[np.ndarray, "*batch"], pitch: Float[np.ndarray, "*batch"], roll: Float[np.ndarray, "*batch"]
+) -> Float[np.ndarray, "*batch 3 3"]:
     """R = Rz(yaw) Ry(pitch) Rx(roll); positive pitch points down (x forward, z up)."""
-    cy, sy, cp, sp, cr, sr = (
-        np.cos(yaw),
-        np.sin(yaw),
-        np.cos(pitch),
-        np.sin(pitch),
-        np.cos(roll),
-        np.sin(roll),
-    )
+    (cy, sy), (cp, sp), (cr, sr) = ((np.cos(a), np.sin(a)) for a in (yaw, pitch, roll))
     rows = [
         np.stack([cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr], -1),
         np.stack([sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr], -1),
@@ -223,11 +212,8 @@ class EgoMotion:
         if len(lanes) > 1:  # one lane change and back per cycle
             shift = lanes[1] - lanes[0]
             cycle = (s / rng.uniform(500, 900) + rng.uniform()) % 1.0
-            d += (
-                shift
-                * (np.clip((cycle - 0.45) / 0.08, 0, 1) - np.clip((cycle - 0.85) / 0.08, 0, 1))
-                * (rng.random() < 0.5)
-            )
+            there, back = (np.clip((cycle - at) / 0.08, 0, 1) for at in (0.45, 0.85))
+            d += shift * (there - back) * (rng.random() < 0.5)
         return _smoothed(d, 100)
 
     def arc(self, t_s: float) -> float:
@@ -250,25 +236,17 @@ class EgoMotion:
             np.sin(0.9 * s / 2.1) * np.sin(0.11 * s) + 0.4 * np.sin(1.7 * s / 2.1 + 1.0)
         )
         roll = rough * (np.sin(0.7 * s / 2.3 + 2.0) * np.cos(0.07 * s))
-        return from_rotation_translation(_rotation(heading, pitch, roll), here)
+        return from_rotation_translation(rotation(heading, pitch, roll), here)
 
     def velocities(
         self, t_s: Float[np.ndarray, " N"]
     ) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3"]]:
-        """(linear velocity of the vehicle's origin, angular velocity), both in the map [m/s, rad/s]."""
+        """As `Motion.velocities`."""
         h = 0.01
         before, after = self.poses(t_s - h), self.poses(t_s + h)
-        spin = (
-            (after[:, :3, :3] - before[:, :3, :3]) / (2 * h) @ np.swapaxes(self.poses(t_s)[:, :3, :3], 1, 2)
-        )
-        omega = (
-            np.stack(
-                [spin[:, 2, 1] - spin[:, 1, 2], spin[:, 0, 2] - spin[:, 2, 0], spin[:, 1, 0] - spin[:, 0, 1]],
-                -1,
-            )
-            / 2
-        )
-        return (after[:, :3, 3] - before[:, :3, 3]) / (2 * h), omega
+        change = (after - before) / (2 * h)
+        spin = change[:, :3, :3] @ np.swapaxes(self.poses(t_s)[:, :3, :3], 1, 2)
+        return change[:, :3, 3], (spin - spin.swapaxes(1, 2))[:, [2, 0, 1], [1, 2, 0]] / 2
 
 
 @dataclass(frozen=True)

@@ -134,20 +134,20 @@ def _drawn(seed: int) -> Landscape:
 
     weights = rng.dirichlet(np.ones(len(_GARDENS)))
     gardens = tuple((kind, float(w)) for (kind, _), w in zip(_GARDENS, weights, strict=True))
-    lowest = float(rng.uniform(4.0, 45.0))
+    lowest = rng.uniform(4.0, 45.0)
     drawn = replace(
         base,
         name=f"{WORLD}{seed}",
         base=base.name,
         plain=False,
-        pace=base.pace * float(rng.uniform(0.7, 1.2)),
+        pace=base.pace * rng.uniform(0.7, 1.2),
         parking=float(often(0.5)) if base.parking else 0.0,
-        traffic=base.traffic * float(rng.uniform(0.3, 1.3)),
+        traffic=base.traffic * rng.uniform(0.3, 1.3),
         fences=gardens if base.houses else base.fences,
-        houses=base.houses * float(rng.uniform(0.4, 1.0)),
-        green=base.green * float(rng.uniform(0.2, 2.0)),
-        trees_m=float(rng.uniform(5.0, 16.0)) if often(0.4) else 0.0,
-        poles_m=float(rng.uniform(4.0, 50.0)) if often(0.6) else 0.0,
+        houses=base.houses * rng.uniform(0.4, 1.0),
+        green=base.green * rng.uniform(0.2, 2.0),
+        trees_m=rng.uniform(5.0, 16.0) if often(0.4) else 0.0,
+        poles_m=rng.uniform(4.0, 50.0) if often(0.6) else 0.0,
         surface=_SURFACES[int(rng.integers(len(_SURFACES)))],
         markings=often(0.6),
         infrared=often(0.6),

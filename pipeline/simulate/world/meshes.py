@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.core.rows import columns_of, join_rows, take_rows
+from pipeline.core.rows import join_rows, take_rows
 from pipeline.simulate.world.materials import material
 
-__all__ = ["Colour", "Mesh", "MeshBuilder", "Number", "join", "placed"]
+__all__ = ["Colour", "Mesh", "MeshBuilder", "Number", "placed"]
 
 # Integers are numbers too: beartype does not take them for floats.
 Number = float | int
@@ -28,17 +28,6 @@ _FACES = {
 }
 
 
-_TRIANGLE = np.dtype(
-    [
-        ("corners", "f4", (3, 3)),
-        ("material", "u1"),
-        ("tint", "f4", 3),
-        ("uv", "f4", (3, 2)),
-        ("instance", "i4"),
-    ]
-)
-
-
 @dataclass(frozen=True, eq=False)
 class Mesh:
     """T triangles; all arrays have T rows."""
@@ -52,11 +41,6 @@ class Mesh:
     def __len__(self) -> int:
         """Number of triangles."""
         return len(self.material)
-
-
-def join(meshes: list[Mesh]) -> Mesh:
-    """All triangles of some meshes."""
-    return join_rows(meshes or [Mesh(**columns_of([], _TRIANGLE))])
 
 
 def placed(mesh: Mesh, T_map_mesh: Float[np.ndarray, "4 4"], instance: int | None = None) -> Mesh:
@@ -82,18 +66,9 @@ class MeshBuilder:
         """Add Q quads (Q 4 3); uv (Q 4 2) defaults to lengths along the first and the last edge."""
         c = np.asarray(corners, np.float32).reshape(-1, 4, 3)
         if uv is None:
-            along = np.linalg.norm(c[:, 1] - c[:, 0], axis=1)
-            up = np.linalg.norm(c[:, 3] - c[:, 0], axis=1)
+            along, up = (np.linalg.norm(c[:, k] - c[:, 0], axis=1) for k in (1, 3))
             o = np.zeros_like(along)
-            uv = np.stack(
-                [
-                    np.stack([o, o], 1),
-                    np.stack([along, o], 1),
-                    np.stack([along, up], 1),
-                    np.stack([o, up], 1),
-                ],
-                1,
-            )
+            uv = np.stack([o, o, along, o, along, up, o, up], 1)
         w = np.asarray(uv, np.float32).reshape(-1, 4, 2)
         n = 2 * len(c)
         self._parts.append(
@@ -106,12 +81,6 @@ class MeshBuilder:
             )
         )
 
-    def hexahedron(self, corners: np.ndarray, faces: dict[str, str], tint: Colour = _WHITE) -> None:
-        """Add the named faces (face name -> material) of 8 corners in the order of _FACES."""
-        c = np.asarray(corners, np.float32)
-        for face, name in faces.items():
-            self.quads(c[list(_FACES[face])][None], name, tint)
-
     def frustum(
         self,
         bottom: tuple[Number, Number, Number, Number, Number],
@@ -119,12 +88,12 @@ class MeshBuilder:
         faces: dict[str, str] | str,
         tint: Colour = _WHITE,
     ) -> None:
-        """Add a block between two level rectangles (x0, x1, y0, y1, z)."""
+        """Add a block between two level rectangles (x0, x1, y0, y1, z); `faces` has materials of some or all."""
         corners = []
         for x0, x1, y0, y1, z in (bottom, top):
             corners += [(x0, y0, z), (x1, y0, z), (x1, y1, z), (x0, y1, z)]
-        named = dict.fromkeys(_FACES, faces) if isinstance(faces, str) else faces
-        self.hexahedron(np.array(corners), named, tint)
+        for face, name in (dict.fromkeys(_FACES, faces) if isinstance(faces, str) else faces).items():
+            self.quads(np.array(corners, np.float32)[list(_FACES[face])], name, tint)
 
     def box(
         self,
@@ -187,7 +156,7 @@ class MeshBuilder:
 
     def mesh(self, instance: int = 0) -> Mesh:
         """The triangles so far, without degenerate ones."""
-        every = join(self._parts)
+        every = join_rows(self._parts)
         a, b, c = every.corners.swapaxes(0, 1)
         kept = take_rows(every, np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-8)
         return replace(kept, instance=np.full(len(kept), instance, np.int32))

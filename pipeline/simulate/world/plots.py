@@ -18,13 +18,13 @@ def add_plots(c: Chunk) -> None:
     """Both sides of a street or a country road: pavement or verge, parked cars, plots with their objects."""
     layout, landscape = c.drive.layout, c.drive.landscape
     style = np.random.default_rng([c.drive.seed, 35])
-    walk = float(style.uniform(*landscape.walk_m))
+    walk = style.uniform(*landscape.walk_m)
     for side in (-1, 1):
         if walk:
             add_pavement(c, side, walk)
         else:
-            near, far = sorted((side * layout.left_edge, side * 90.0))
-            c.strip((near, far), (0.0, 0.0), "soil" if style.random() < 0.3 else "grass", 10.0)
+            ground = "soil" if style.random() < 0.3 else "grass"
+            c.strip((side * layout.left_edge, side * 90.0), (0.0, 0.0), ground, 10.0)
         if layout.parking_m:
             add_parked(c, side, layout.left_edge - layout.parking_m / 2)
         _plots(c, side, layout.left_edge + max(walk, 0.0 if landscape.houses > 0.5 else 2.5))
@@ -35,30 +35,23 @@ def _plots(c: Chunk, side: int, d: float) -> None:
     rng, landscape, s = c.rng, c.drive.landscape, c.s0
     kinds, weights = zip(*landscape.fences, strict=True)
     while s < c.s0 + CHUNK_M - 4.0:
-        width = min(float(rng.uniform(9, 18)), c.s0 + CHUNK_M - s)
+        width = min(rng.uniform(9, 18), c.s0 + CHUNK_M - s)
         _fence(c, (s, s + width), side, d + 0.1, kinds[int(rng.choice(len(kinds), p=weights))])
         back = d + float(rng.choice(landscape.setback_m))
         if rng.random() < landscape.houses:
             add_house(c, side, s, width, back, landscape.storeys)
         for _ in range(int(rng.poisson(landscape.green))):
-            for plant, near, far in (
-                (tree(int(rng.integers(40))), 2.0, 14.0),
-                (bush(int(rng.integers(20))), 0.8, 3.0),
-            ):
-                c.put(
-                    plant,
-                    s + rng.uniform(1, width),
-                    side * (d + rng.uniform(near, far)),
-                    0.1,
-                    rng.uniform(0, 6),
-                )
+            plants = tree(int(rng.integers(40))), bush(int(rng.integers(20)))
+            for plant, reach in zip(plants, ((2.0, 14.0), (0.8, 3.0)), strict=True):
+                at, beside = s + rng.uniform(1, width), side * (d + rng.uniform(*reach))
+                c.put(plant, at, beside, 0.1, rng.uniform(0, 6))
         s += width
 
 
 def _fence(c: Chunk, s: Span, side: int, d: float, kind: Fence) -> None:
     """Boundary between a plot and the pavement."""
     rng = c.rng
-    height, thick = float(rng.uniform(1.0, 2.0)), float(rng.uniform(0.5, 1.0))
+    height, thick = rng.uniform(1.0, 2.0), rng.uniform(0.5, 1.0)
     tint = tuple(rng.uniform(0.7, 1.2, 3).tolist())
     if kind == "wall":
         c.wall(s, side * d, (0.0, height), "stone")
@@ -99,14 +92,14 @@ def _pole(b: MeshBuilder) -> None:
 def add_halls(c: Chunk) -> None:
     """Walls and a ceiling with lamps, `inner_m` from the road's edge; cars between columns, nose in."""
     landscape, edge = c.drive.landscape, c.drive.layout.left_edge
-    wall, top, s = edge + landscape.inner_m, landscape.ceiling_m, (c.s0, c.s0 + CHUNK_M)
-    c.band(s, (-wall, wall), (top, top), "ceiling")
+    wall, top = edge + landscape.inner_m, landscape.ceiling_m
+    c.strip((-wall, wall), (top, top), "ceiling")
     for lamp in c.every(8.0):
         c.band((lamp, lamp + 1.2), (-0.15, 0.15), (top - 0.02, top - 0.02), "ceiling_lamp")
     for side in (-1, 1):
-        near, far = sorted((side * edge, side * wall))
-        c.wall(s, side * wall, (0.0, top), "concrete")
-        c.strip((near, far), (0.0, 0.0), landscape.surface if landscape.columns_m else "paving")
+        c.wall(c.whole, side * wall, (0.0, top), "concrete")
+        floor = landscape.surface if landscape.columns_m else "paving"
+        c.strip((side * edge, side * wall), (0.0, 0.0), floor)
         for beam in c.every(landscape.columns_m) if landscape.columns_m else ():
             c.put(_column(top), beam, side * (edge + 0.5))
             _bays(c, side, beam + 0.5, edge + 3.2)

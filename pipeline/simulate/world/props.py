@@ -107,7 +107,7 @@ def tree(b: MeshBuilder, variant: int) -> None:
     rng = np.random.default_rng([61, variant])
     scale = rng.uniform(0.8, 1.6)
     trunk, tall = rng.uniform(1.8, 2.6) * scale, rng.uniform(4.0, 6.5) * scale
-    green = (float(rng.uniform(0.7, 1.3)), float(rng.uniform(0.75, 1.2)), float(rng.uniform(0.6, 1.2)))
+    green = (rng.uniform(0.7, 1.3), rng.uniform(0.75, 1.2), rng.uniform(0.6, 1.2))
     b.tube(np.zeros(3), np.array([0, 0, trunk + 0.6]), 0.13 * scale + 0.03, "bark", 7)
     for _ in range(7):
         p = np.array([*rng.uniform(-1.0, 1.0, 2) * scale, rng.uniform(trunk + 0.7, tall)])

@@ -40,12 +40,11 @@ def add_street(c: Chunk) -> None:
 
 def add_pavement(c: Chunk, side: int, walk: float) -> None:
     """Kerb and pavement of one side, and grass behind them."""
-    kerb = side * c.drive.layout.left_edge
-    far = side * (c.drive.layout.left_edge + walk)
-    c.band((c.s0, c.s0 + CHUNK_M), (kerb, kerb + side * 0.001), (0.0, 0.12), "kerb", 5.0)
-    c.strip((min(kerb, kerb + side * 0.15), max(kerb, kerb + side * 0.15)), (0.12, 0.12), "kerb")
-    c.strip((min(kerb + side * 0.15, far), max(kerb + side * 0.15, far)), (0.12, 0.12), "paving")
-    c.strip((min(far, side * 90.0), max(far, side * 90.0)), (0.10, 0.10), "grass", 10.0)
+    kerb, far = side * c.drive.layout.left_edge, side * (c.drive.layout.left_edge + walk)
+    c.band(c.whole, (kerb, kerb + side * 0.001), (0.0, 0.12), "kerb")
+    c.strip((kerb, kerb + side * 0.15), (0.12, 0.12), "kerb")
+    c.strip((kerb + side * 0.15, far), (0.12, 0.12), "paving")
+    c.strip((far, side * 90.0), (0.10, 0.10), "grass", 10.0)
 
 
 def _furniture(c: Chunk, side: int, edge: float, walk: float) -> None:
@@ -56,13 +55,8 @@ def _furniture(c: Chunk, side: int, edge: float, walk: float) -> None:
         c.put(sign(int(rng.integers(24))), s, side * (edge + 0.5), 0.12, 0.0 if side < 0 else np.pi)
     avenue = np.random.default_rng([c.drive.seed, 33, side + 1]).random() < 0.55
     for s in c.every(9.0, 1.5, 0.75 if avenue else 0.12):
-        c.put(
-            tree(int(rng.integers(40))),
-            s,
-            side * (edge + min(1.3, walk - 0.8)),
-            0.12,
-            rng.uniform(0, 6.28),
-        )
+        plant = tree(int(rng.integers(40)))
+        c.put(plant, s, side * (edge + min(1.3, walk - 0.8)), 0.12, rng.uniform(0, 6.28))
     for s in c.every(14.0, 4.0, 0.35):
         c.put(bollards(), s, side * (edge + 0.35), 0.12)
     for s in c.every(26.0, 8.0, 0.4):
@@ -73,20 +67,15 @@ def _frontage(c: Chunk, side: int, d: float) -> None:
     """Houses, gardens, walls and gaps behind the pavement, as plots of about 13 m."""
     rng, s = c.rng, c.s0
     while s < c.s0 + CHUNK_M - 4.0:
-        width = min(float(rng.uniform(9, 18)), c.s0 + CHUNK_M - s)
+        width = min(rng.uniform(9, 18), c.s0 + CHUNK_M - s)
         kind = rng.random()
         if kind < 0.50:
             add_house(c, side, s, width, d + float(rng.choice([0.2, 3.0, 5.0, 8.0])))
         elif kind < 0.62:
-            c.wall((s, s + width), side * (d + 0.1), (0.0, float(rng.uniform(1.2, 2.2))), "stone")
+            c.wall((s, s + width), side * (d + 0.1), (0.0, rng.uniform(1.2, 2.2)), "stone")
         elif kind < 0.76:
-            c.wall(
-                (s, s + width),
-                side * (d + 0.1),
-                (0.0, float(rng.uniform(1.0, 1.8))),
-                "slats",
-                (0.8, 0.8, float(rng.uniform(0.6, 1.2))),
-            )
+            height, blue = rng.uniform(1.0, 1.8), rng.uniform(0.6, 1.2)
+            c.wall((s, s + width), side * (d + 0.1), (0.0, height), "slats", (0.8, 0.8, blue))
         if kind > 0.45:
             for _ in range(int(rng.integers(1, 4))):
                 for plant, kinds, near, far in ((tree, 40, 3, 14), (bush, 20, 1.2, 3)):
@@ -100,36 +89,20 @@ def add_house(
 ) -> None:
     """A house with its front `d` from the centre line, with a number of storeys drawn from the given ones."""
     rng = c.rng
-    top, depth, gap = (
-        3.0 * int(rng.choice(storeys)) + 0.6,
-        float(rng.uniform(8, 12)),
-        float(rng.choice([0.0, 0.0, 1.5])),
-    )
-    tone = rng.uniform(0.55, 1.35)
-    tint = (
-        float(tone * rng.uniform(0.9, 1.15)),
-        float(tone * rng.uniform(0.9, 1.1)),
-        float(tone * rng.uniform(0.75, 1.1)),
-    )
+    top, depth = 3.0 * int(rng.choice(storeys)) + 0.6, rng.uniform(8, 12)
+    gap, tone = float(rng.choice([0.0, 0.0, 1.5])), rng.uniform(0.55, 1.35)
+    tint = (tone * rng.uniform(0.9, 1.15), tone * rng.uniform(0.9, 1.1), tone * rng.uniform(0.75, 1.1))
     s1, near, far = s + width - gap, side * d, side * (d + depth)
     c.wall((s, s1), near, (0.0, top), "facade", tint)
     for end in (s, s1):
         face = np.array([[[end, near, 0.0], [end, far, 0.0], [end, far, top], [end, near, top]]])
         c.along.quads(face, "facade", tint, np.abs(face[..., 1:]))
-    ridge = top + float(rng.uniform(0.3, 3.0))
-    middle = (near + far) / 2
+    ridge = [(near + far) / 2, top + rng.uniform(0.3, 3.0)]
     for edge in (near, far):
-        c.along.quads(
-            np.array([[[s, edge, top], [s1, edge, top], [s1, middle, ridge], [s, middle, ridge]]]),
-            "roof",
-            tint,
-        )
+        c.along.quads(np.array([[s, edge, top], [s1, edge, top], [s1, *ridge], [s, *ridge]]), "roof", tint)
     for end in (s, s1):
-        c.along.quads(
-            np.array([[[end, near, top], [end, far, top], [end, middle, ridge], [end, middle, ridge]]]),
-            "facade",
-            tint,
-        )
+        gable = np.array([[end, near, top], [end, far, top], [end, *ridge], [end, *ridge]])
+        c.along.quads(gable, "facade", tint)
 
 
 def add_parked(c: Chunk, side: int, d: float) -> None:
@@ -166,16 +139,15 @@ def _verge(c: Chunk, side: int, style: np.random.Generator) -> float:
     """Banks, rail and noise wall of one side; returns the height of the bank [m]."""
     edge = side * c.drive.layout.left_edge
     walled, railed = style.random() < 0.35, style.random() < 0.75
-    foot, slope = edge + side * 3.0, float(style.uniform(-1.0, 2.5))
-    _sloped(c, edge, foot, 0.0, -0.1, "grass")
-    _sloped(c, foot, edge + side * 14.0, -0.1, slope, "grass")
+    foot, slope = edge + side * 3.0, style.uniform(-1.0, 2.5)
+    c.strip((edge, foot), (0.0, -0.1), "grass", 10.0)
+    c.strip((foot, edge + side * 14.0), (-0.1, slope), "grass", 10.0)
     field = "soil" if style.random() < 0.3 else "grass"
-    _sloped(c, edge + side * 14.0, side * 150.0, slope, slope + 2.0, field)
+    c.strip((edge + side * 14.0, side * 150.0), (slope, slope + 2.0), field, 10.0)
     if railed:
         _guard_rail(c, edge + side * 0.8, both=False)
     if walled and (c.index // 6) % 2 == 0:
-        top = float(3.5 + 0.5 * (c.index % 2))
-        c.wall((c.s0, c.s0 + CHUNK_M), edge + side * 4.5, (-0.2, top), "noise_wall")
+        c.wall(c.whole, edge + side * 4.5, (-0.2, 3.5 + 0.5 * (c.index % 2)), "noise_wall")
     return slope
 
 
@@ -192,18 +164,11 @@ def _plants(c: Chunk, side: int, slope: float) -> None:
         c.put(plant, s, edge + side * rng.uniform(5, 10), 0.2 * slope, rng.uniform(0, 6.28))
 
 
-def _sloped(c: Chunk, d0: float, d1: float, h0: float, h1: float, name: str) -> None:
-    if d0 > d1:
-        d0, d1, h0, h1 = d1, d0, h1, h0
-    c.strip((d0, d1), (h0, h1), name, 10.0)
-
-
 def _guard_rail(c: Chunk, d: float, *, both: bool) -> None:
     for offset in (-0.18, 0.18) if both else (0.0,):
         for low, high, out in ((0.48, 0.58, 0.0), (0.58, 0.68, 0.05), (0.68, 0.78, 0.0)):
-            c.band(
-                (c.s0, c.s0 + CHUNK_M), (d + offset + out, d + offset + out + 1e-3), (low, high), "rail", 4.0
-            )
+            d0 = d + offset + out
+            c.strip((d0, d0 + 1e-3), (low, high), "rail", 4.0)
     for s in c.every(4.0):
         c.put(rail_post(), s, d)
 
@@ -217,12 +182,8 @@ def _gantry(c: Chunk, s: float) -> None:
     for z in (6.6, 7.5):
         b.tube(np.array([0, left, z]), np.array([0, right, z]), 0.10, "metal_pole", 6)
     for d in layout.lanes_own:
-        b.frustum(
-            (-0.25, -0.20, d - 1.6, d + 1.6, 5.6),
-            (-0.25, -0.20, d - 1.6, d + 1.6, 8.0),
-            PANEL,
-            SIGN_COLOURS[2],
-        )
+        panel = (-0.25, -0.20, d - 1.6, d + 1.6)
+        b.frustum((*panel, 5.6), (*panel, 8.0), PANEL, SIGN_COLOURS[2])
     c.put(b.mesh(), s, 0.0)
 
 
@@ -231,16 +192,10 @@ def add_asphalt(c: Chunk) -> None:
     layout, lift = c.drive.layout, 0.004
     c.strip((layout.right_edge, layout.left_edge), (0.0, 0.0), c.drive.landscape.surface)
     for _ in range(int(c.rng.integers(0, 4))):  # repairs: dark in the image, less so for the lidar
-        s, d = (
-            c.s0 + c.rng.uniform(2, 30),
-            c.rng.uniform(layout.right_edge + 1, max(layout.left_edge, 3.0) - 3),
-        )
-        c.band(
-            (s, s + c.rng.uniform(1.5, 9)),
-            (d, d + c.rng.uniform(0.6, 2.4)),
-            (lift / 2, lift / 2),
-            "asphalt_patch",
-        )
+        s = c.s0 + c.rng.uniform(2, 30)
+        d = c.rng.uniform(layout.right_edge + 1, max(layout.left_edge, 3.0) - 3)
+        length, width = c.rng.uniform(1.5, 9), c.rng.uniform(0.6, 2.4)
+        c.band((s, s + length), (d, d + width), (lift / 2, lift / 2), "asphalt_patch")
     for _ in range(int(c.rng.integers(0, 3))):
         s, d = c.s0 + c.rng.uniform(0, 39), c.rng.uniform(layout.right_edge + 1, layout.left_edge - 1)
         c.band((s, s + 0.62), (d, d + 0.62), (lift, lift), "manhole")
@@ -269,12 +224,8 @@ def _lanes(c: Chunk) -> None:
         if layout.parking_m:
             c.strip((edge - w, edge + w), (lift, lift), "paint")
             for s in c.every(6.5):
-                c.band(
-                    (s - w, s + w),
-                    (min(edge, side * layout.left_edge), max(edge, side * layout.left_edge)),
-                    (lift, lift),
-                    "paint",
-                )
+                d0, d1 = sorted((edge, side * layout.left_edge))
+                c.band((s - w, s + w), (d0, d1), (lift, lift), "paint")
     if c.index % 4 == 1 and layout.lanes_oncoming and not c.drive.landscape.ceiling_m:
         _crossing(c, c.s0 + 20.0)
 
@@ -299,7 +250,6 @@ def _crossing(c: Chunk, s: float) -> None:
 
 def _arrow(c: Chunk, s: float, d: float) -> None:
     c.band((s, s + 2.4), (d - 0.08, d + 0.08), (0.005, 0.005), "paint")
-    head = np.array(
-        [[[s + 2.4, d - 0.35, 0.005], [s + 4.0, d, 0.005], [s + 4.0, d, 0.005], [s + 2.4, d + 0.35, 0.005]]]
-    )
+    tip = [s + 4.0, d, 0.005]
+    head = np.array([[s + 2.4, d - 0.35, 0.005], tip, tip, [s + 2.4, d + 0.35, 0.005]])
     c.along.quads(head, "paint", uv=head[..., :2])

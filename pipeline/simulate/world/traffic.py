@@ -9,7 +9,6 @@ from jaxtyping import Float
 
 from pipeline.simulate.world.actors import HOLLOW, VARIANTS
 from pipeline.simulate.world.drives import Drive, RoadLayout
-from pipeline.simulate.world.landscapes import Landscape
 
 __all__ = ["Actor", "actors_at"]
 
@@ -44,17 +43,6 @@ class _Stream:
     height_m: float = 0.0
 
 
-@dataclass(frozen=True)
-class _Place:
-    """Position and speed of a road user along the road; negative speed = oncoming."""
-
-    s_m: float
-    d_m: float
-    speed_mps: float
-    h_m: float = 0.0
-    yaw_rad: float = 0.0
-
-
 def actors_at(drive: Drive, t_s: float, within_m: tuple[float, float] = (45.0, 150.0)) -> list[Actor]:
     """Road users from `within_m[0]` behind the ego vehicle to `within_m[1]` ahead."""
     here = drive.ego.arc(t_s)
@@ -68,19 +56,21 @@ def actors_at(drive: Drive, t_s: float, within_m: tuple[float, float] = (45.0, 1
 
 def _streams(drive: Drive) -> list[_Stream]:
     rng = np.random.default_rng([drive.seed, 21])
-    streams = (_highway_streams if drive.landscape.fast else _urban_streams)(drive.layout, rng)
-    return [s if s.height_m else _dense(s, drive.landscape) for s in streams]
-
-
-def _dense(stream: _Stream, landscape: Landscape) -> _Stream:
-    """A stream on the road with the landscape's density and speed; people on pavements do not change."""
-    return replace(
-        stream,
-        speed_mps=stream.speed_mps * landscape.pace,
-        spacing_m=stream.spacing_m * landscape.spacing,
-        occupancy=stream.occupancy * landscape.traffic,
-        kinds=landscape.kinds or stream.kinds,
-    )
+    landscape = drive.landscape
+    streams = (_highway_streams if landscape.fast else _urban_streams)(drive.layout, rng)
+    return [
+        # Streams on the road have the landscape's density and speed; people on pavements do not change.
+        s
+        if s.height_m
+        else replace(
+            s,
+            speed_mps=s.speed_mps * landscape.pace,
+            spacing_m=s.spacing_m * landscape.spacing,
+            occupancy=s.occupancy * landscape.traffic,
+            kinds=landscape.kinds or s.kinds,
+        )
+        for s in streams
+    ]
 
 
 def _highway_streams(layout: RoadLayout, rng: np.random.Generator) -> list[_Stream]:
@@ -113,39 +103,33 @@ def _urban_streams(layout: RoadLayout, rng: np.random.Generator) -> list[_Stream
     return streams
 
 
-def _member(drive: Drive, stream: _Stream, k: int, t_s: float) -> tuple[float, float, float, str, int] | None:
-    """(arc length, offset, speed, kind, variant) of the k-th place of a stream; None if it is empty."""
-    rng = np.random.default_rng([drive.seed, 22, stream.number, k + 1_000_000])
-    if rng.random() > stream.occupancy:
-        return None
-    kind = stream.kinds[int(rng.integers(len(stream.kinds)))]
-    swing, rate, phase = rng.uniform(0.5, 2.5), rng.uniform(0.1, 0.35), rng.uniform(0, 2 * np.pi)
-    if kind == "pedestrian":
-        swing = 0.2
-    jitter = rng.uniform(-0.2, 0.2) * stream.spacing_m
-    s = k * stream.spacing_m + jitter + stream.speed_mps * t_s + swing * np.sin(rate * t_s + phase)
-    d = stream.offset_m + rng.uniform(-0.25, 0.25)
-    speed = stream.speed_mps + swing * rate * np.cos(rate * t_s + phase)
-    return float(s), float(d), float(speed), kind, int(rng.integers(VARIANTS[kind]))
-
-
 def _members(
     drive: Drive, stream: _Stream, t_s: float, here_m: float, within_m: tuple[float, float]
 ) -> list[Actor]:
+    """Road users of a stream; every place has its own draws."""
     behind, ahead = within_m
     base = here_m - stream.speed_mps * t_s
     first, last = int((base - behind) // stream.spacing_m) - 1, int((base + ahead) // stream.spacing_m) + 1
     actors = []
     for k in range(first, last + 1):
-        found = _member(drive, stream, k, t_s)
-        if found is None or not -behind <= found[0] - here_m <= ahead:
+        rng = np.random.default_rng([drive.seed, 22, stream.number, k + 1_000_000])
+        if rng.random() > stream.occupancy:
             continue
-        s, d, speed, kind, variant = found
+        kind = stream.kinds[int(rng.integers(len(stream.kinds)))]
+        swing, rate, phase = rng.uniform(0.5, 2.5), rng.uniform(0.1, 0.35), rng.uniform(0, 2 * np.pi)
+        swing = 0.2 if kind == "pedestrian" else swing
+        jitter = rng.uniform(-0.2, 0.2) * stream.spacing_m
+        s = k * stream.spacing_m + jitter + stream.speed_mps * t_s + swing * np.sin(rate * t_s + phase)
+        if not -behind <= s - here_m <= ahead:
+            continue
+        d = stream.offset_m + rng.uniform(-0.25, 0.25)
+        speed = stream.speed_mps + swing * rate * np.cos(rate * t_s + phase)
+        variant = int(rng.integers(VARIANTS[kind]))
         if kind == "pedestrian":  # gait: the pose changes twice a second
             variant = variant // 4 * 4 + int(t_s * 2.2 + k) % 4
-        yaw = 0.0 if stream.speed_mps > 0 else np.pi
         key = 1 + ((stream.number + 1) * 100_003 + k * 7919) % 1_000_000
-        actors.append(_actor(drive, key, kind, variant, _Place(s, d, speed, stream.height_m, yaw)))
+        yaw = 0.0 if stream.speed_mps > 0 else np.pi
+        actors.append(_actor(drive, key, kind, variant, (s, d, stream.height_m), speed, yaw))
     return actors
 
 
@@ -165,16 +149,24 @@ def _leaders(drive: Drive, t_s: float, here_m: float, within_m: tuple[float, flo
             s = drive.ego.arc(t) + sign * gap
             if -within_m[0] <= s - here_m <= within_m[1]:
                 speed = (drive.ego.arc(t + 0.05) - drive.ego.arc(t - 0.05)) / 0.1
-                d = drive.layout.lanes_own[0] + float(rng.uniform(-0.2, 0.2))
+                d = drive.layout.lanes_own[0] + rng.uniform(-0.2, 0.2)
                 key = 900_000 + 10 * (sign + 1) + i
-                actors.append(_actor(drive, key, kind, variant, _Place(s, d, speed)))
+                actors.append(_actor(drive, key, kind, variant, (s, d, 0.0), speed))
     return actors
 
 
-def _actor(drive: Drive, key: int, kind: str, variant: int, at: _Place) -> Actor:
-    T = drive.road.pose(at.s_m, at.d_m, at.h_m, at.yaw_rad)
-    ahead = drive.road.to_map(np.array([[at.s_m - 0.5, at.d_m, at.h_m], [at.s_m + 0.5, at.d_m, at.h_m]]))
-    return Actor(key, kind, variant, T, at.speed_mps * (ahead[1] - ahead[0]))
+def _actor(
+    drive: Drive,
+    key: int,
+    kind: str,
+    variant: int,
+    s_d_h: tuple[float, float, float],
+    speed_mps: float,
+    yaw_rad: float = 0.0,
+) -> Actor:
+    """A road user at a place of the road; negative speed = oncoming."""
+    before, after = drive.road.to_map(np.array(s_d_h) + [[-0.5, 0, 0], [0.5, 0, 0]])
+    return Actor(key, kind, variant, drive.road.pose(*s_d_h, yaw_rad), speed_mps * (after - before))
 
 
 def _apart(actors: list[Actor], T_map_vehicle: Float[np.ndarray, "4 4"]) -> list[Actor]:
@@ -184,11 +176,11 @@ def _apart(actors: list[Actor], T_map_vehicle: Float[np.ndarray, "4 4"]) -> list
     reach = {"car": 2.6, "van": 3.2, "truck": 7.4, "bus": 6.2, "cyclist": 1.0, "pedestrian": 0.4}
     for actor in actors:
         p, r = actor.T_map_actor[:2, 3], reach[actor.kind]
-        clear = True
-        for q, axis, other in places:
-            along, across = abs((p - q) @ axis), abs((p - q) @ np.array([-axis[1], axis[0]]))
-            clear &= bool(along > r + other or across > (2.2 if min(r, other) > 2 else 1.5))
-        if clear:
+        if all(
+            abs((p - q) @ axis) > r + other
+            or abs((p - q) @ np.array([-axis[1], axis[0]])) > (2.2 if min(r, other) > 2 else 1.5)
+            for q, axis, other in places
+        ):
             kept.append(actor)
             places.append((p, actor.T_map_actor[:2, 0], r))
     return kept
