@@ -27,7 +27,7 @@ from pipeline.rig.cameras import Camera
 from pipeline.rig.graph import Kind
 from pipeline.rig.se3 import inverse
 
-__all__ = ["Layout", "read_kitti", "read_view_of_delft"]
+__all__ = ["read_kitti", "read_view_of_delft"]
 
 _PERIOD_NS = 100_000_000
 _PAUSE_NS = 60 * 10**9
@@ -37,7 +37,7 @@ _VOD_RADAR = ("x", "y", "z", "power", "doppler", "", "")  # the last two are der
 
 
 @dataclass(frozen=True)
-class Layout:
+class _Layout:
     """Layout of a folder.
 
     Args:
@@ -61,15 +61,10 @@ class Layout:
 def read_view_of_delft(folder: Path, vehicle: str, day: str) -> list[Recording]:
     """Recording of a View-of-Delft folder (`lidar`, `radar`); ConfigError if no frame is complete."""
     lidar, radar = "lidar/training", "radar/training"
-    layout = Layout(
-        {"camera": f"{lidar}/image_2"},
-        f"{lidar}/velodyne",
-        f"{radar}/velodyne",
-        f"{lidar}/calib",
-        f"{radar}/calib",
-        f"{lidar}/pose",
-        _VOD_RADAR,
-    )
+    layout = _Layout(
+        images={"camera": f"{lidar}/image_2"}, lidar=f"{lidar}/velodyne", radar=f"{radar}/velodyne",
+        calib=f"{lidar}/calib", radar_calib=f"{radar}/calib", poses=f"{lidar}/pose", radar_columns=_VOD_RADAR,
+    )  # fmt: skip
     return [_read(folder, layout, vehicle, day)]
 
 
@@ -87,11 +82,11 @@ def read_kitti(folder: Path, vehicle: str, day: str, radar_columns: Sequence[str
     radar = "radar" if (folder / "radar").is_dir() else ""
     pair = {"left": "image_2", "right": "image_3"}
     images = pair if (folder / "image_3").is_dir() else {"camera": "image_2"}
-    layout = Layout(images, "velodyne", radar, "calib", "", "pose", tuple(radar_columns))
+    layout = _Layout(images, "velodyne", radar, "calib", "", "pose", tuple(radar_columns))
     return [_read(folder, layout, vehicle, day)]
 
 
-def _read(folder: Path, layout: Layout, vehicle: str, day: str) -> Recording:
+def _read(folder: Path, layout: _Layout, vehicle: str, day: str) -> Recording:
     images = {name: _images(folder / held) for name, held in layout.images.items()}
     clouds = {"lidar": layout.lidar} | ({"radar": layout.radar} if layout.radar else {})
     columns = {"lidar": _LIDAR_COLUMNS, "radar": layout.radar_columns}
@@ -125,7 +120,7 @@ def _images(folder: Path) -> dict[str, Path]:
 
 
 def _calibration(
-    folder: Path, layout: Layout, frame: str, images: Mapping[str, Path]
+    folder: Path, layout: _Layout, frame: str, images: Mapping[str, Path]
 ) -> tuple[dict[str, Camera], dict[str, Float[np.ndarray, "4 4"]]]:
     """Cameras by name, and T_lidar_sensor of all sensors: the lidar's pose on the car is unknown."""
     path = folder / layout.calib / f"{frame}.txt"
@@ -136,13 +131,13 @@ def _calibration(
         cameras[name] = _camera(image, P)
         T_lidar[name] = inverse(_rectified(path, lines, P) @ _matrix(path, lines, "Tr_velo_to_cam"))
     T_lidar["lidar"] = np.eye(4)
-    if layout.radar and not layout.radar_calib:
-        T_lidar["radar"] = _matrix(path, lines, "Tr_radar_to_velo")
-    elif layout.radar:
+    if layout.radar_calib:
         path, first = folder / layout.radar_calib / f"{frame}.txt", next(iter(images))
         own, P = _lines(path), _matrix(path, lines, f"P{layout.images[first][-1]}")
         T_camera_radar = _rectified(path, own, P) @ _matrix(path, own, "Tr_velo_to_cam")
         T_lidar["radar"] = T_lidar[first] @ T_camera_radar
+    elif layout.radar:
+        T_lidar["radar"] = _matrix(path, lines, "Tr_radar_to_velo")
     return cameras, T_lidar
 
 
@@ -209,29 +204,19 @@ def _stamps(frames: Sequence[str], T_odom_base: Mapping[str, np.ndarray], day: s
     start, pauses, found = int(noon.timestamp()) * 10**9, 0, {}
     numbers = [int(n) if n.isdecimal() else k for k, n in enumerate(frames)]
     for k, n in enumerate(frames):
-        pauses += k > 0 and _is_jump(T_odom_base, frames[k - 1], n, numbers[k] - numbers[k - 1])
+        before, here = T_odom_base.get(frames[k - 1]), T_odom_base.get(n)
+        if k and before is not None and here is not None:
+            most_m = _JUMP_M * max(numbers[k] - numbers[k - 1], 1)
+            pauses += int(np.linalg.norm(here[:3, 3] - before[:3, 3]) > most_m)
         found[n] = start + (numbers[k] - numbers[0]) * _PERIOD_NS + pauses * _PAUSE_NS
     return found
 
 
-def _is_jump(T_odom_base: Mapping[str, np.ndarray], before: str, after: str, frames: int) -> bool:
-    if before not in T_odom_base or after not in T_odom_base:
-        return False
-    way = np.linalg.norm(T_odom_base[after][:3, 3] - T_odom_base[before][:3, 3])
-    return bool(way > _JUMP_M * max(frames, 1))
-
-
 def _drives(stamps: Mapping[str, int], T_odom_base: Mapping[str, np.ndarray]) -> list[list[str]]:
     """Frames with a pose, split at pauses of the stamps."""
-    drives: list[list[str]] = []
-    last = -_PAUSE_NS
-    for n, stamp in stamps.items():
-        if n in T_odom_base:
-            if stamp - last >= _PAUSE_NS:
-                drives.append([])
-            drives[-1].append(n)
-            last = stamp
-    return drives
+    known = [n for n in stamps if n in T_odom_base]
+    gaps = np.diff([stamps[n] for n in known])
+    return [part.tolist() for part in np.split(np.array(known), np.flatnonzero(gaps >= _PAUSE_NS) + 1)]
 
 
 def _points(path: Path, columns: Sequence[str]) -> dict[str, np.ndarray]:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.convert.recording import Event, Recording, image_format
+from pipeline.convert.recording import Event, Recording
 from pipeline.core.ros_messages import McapLog, RosMessages
 from pipeline.rig.graph import Kind
 from pipeline.rig.topics import TOPICS, frame_of, topics_of
@@ -45,10 +45,8 @@ def _messages(ros: RosMessages, recording: Recording, event: Event) -> list[tupl
     topics, header = topics_of(name, recording.kinds[name]), ros.at(at_ns, name)
     if name not in recording.cameras:
         return [(topics["points"], ros.cloud(header, held))]
-    return [
-        (topics["image"], ros.image(header, held, image_format(held))),
-        (topics["info"], ros.camera_info(header, recording.cameras[name])),
-    ]
+    image = ros.image(header, held, "png" if held.startswith(b"\x89PNG") else "jpeg")
+    return [(topics["image"], image), (topics["info"], ros.camera_info(header, recording.cameras[name]))]
 
 
 _TURN = '\nturn = { sense = "right", begins_deg = 180.0 }'
@@ -88,12 +86,10 @@ def _section(sensor: str, kind: Kind, models: tuple[str, str] | None) -> str:
     topics = topics_of(sensor, kind)
     head = f"[rigs.default.{kind if sensor == kind else f'{kind}s.{sensor}'}]"
     if kind == "camera":
-        if models is None:
-            semantics = {"source": "topics"} | {n: topics[n] for n in ("labels", "detections")}
-        else:
+        semantics = {"source": "topics"} | {n: topics[n] for n in ("labels", "detections")}
+        if models is not None:
             semantics = {"source": "onnx", "segmenter": models[0], "detector": models[1]}
         inline = ", ".join(f"{key} = {json.dumps(value)}" for key, value in semantics.items())
-        image, info = topics["image"], topics["info"]
-        return f'{head}\nimage = "{image}"\ninfo = "{info}"\nsemantics = {{ {inline} }}'
+        return f'{head}\nimage = "{topics["image"]}"\ninfo = "{topics["info"]}"\nsemantics = {{ {inline} }}'
     doppler = '\ndoppler_field = "doppler"\ndoppler_positive = "receding"' if kind == "radar" else ""
     return f'{head}\npoints = "{topics["points"]}"{doppler}'

@@ -18,11 +18,9 @@ from pipeline.rig.graph import Kind
 from pipeline.rig.se3 import inverse, log_so3
 
 __all__ = [
-    "EgoMotion",
     "Event",
     "Recording",
     "ego_events",
-    "image_format",
     "read_bytes",
     "read_float_rows",
     "read_json",
@@ -32,16 +30,11 @@ __all__ = [
 _PCD_TYPES = {"F": "f", "I": "i", "U": "u"}
 
 
-class EgoMotion(NamedTuple):
-    """Pose T_odom_base, forward speed [m/s], yaw rate [rad/s, positive to the left]."""
-
-    T_odom_base: np.ndarray
-    speed_mps: float
-    yaw_rate_radps: float
-
-
 class Event(NamedTuple):
-    """One measurement; `load` returns JPEG or PNG bytes, columns of points by name, or an EgoMotion."""
+    """One measurement; `load` returns JPEG or PNG bytes, columns of points by name, or motion.
+
+    Motion is T_odom_base, forward speed [m/s], yaw rate [rad/s, positive to the left].
+    """
 
     stamp_ns: int
     sensor: str  # name of the sensor, or ego
@@ -76,18 +69,9 @@ def ego_events(stamps_ns: Sequence[int], T_odom_base: Sequence[Float[np.ndarray,
         if dt_s <= 0:
             continue
         step = inverse(T_odom_base[before]) @ T_odom_base[after]
-        motion = EgoMotion(T, float(step[0, 3] / dt_s), float(log_so3(step[:3, :3])[2] / dt_s))
-        events.append(Event(stamp, "ego", partial(_same, motion)))
+        motion = T, float(step[0, 3] / dt_s), float(log_so3(step[:3, :3])[2] / dt_s)
+        events.append(Event(stamp, "ego", partial(tuple, motion)))
     return events
-
-
-def _same(motion: EgoMotion) -> EgoMotion:
-    return motion
-
-
-def image_format(data: bytes) -> str:
-    """'jpeg' or 'png', from the first bytes."""
-    return "png" if data.startswith(b"\x89PNG") else "jpeg"
 
 
 def read_bytes(path: Path) -> bytes:
@@ -121,10 +105,8 @@ def read_pcd(path: Path) -> np.ndarray:
     lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
     header = {line[0]: line[1:] for line in lines if line}
     try:
-        kinds = [
-            f"<{_PCD_TYPES[kind]}{size}" for kind, size in zip(header["TYPE"], header["SIZE"], strict=True)
-        ]
-        dtype = np.dtype(list(zip(header["FIELDS"], kinds, strict=True)))
+        columns = zip(header["FIELDS"], header["TYPE"], header["SIZE"], strict=True)
+        dtype = np.dtype([(name, f"<{_PCD_TYPES[kind]}{size}") for name, kind, size in columns])
         count = int(header["POINTS"][0])
         is_single = set(header.get("COUNT", ["1"])) == {"1"}
     except (KeyError, IndexError, ValueError, TypeError) as err:

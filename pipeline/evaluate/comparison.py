@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.evaluate.recording import ReflectorFiles
+from pipeline.evaluate.recording import ReflectorFiles, file_of_day
 from pipeline.rig.day_prior import read_transforms
 from pipeline.rig.differences import ComparedRun, Comparison
 from pipeline.rig.se3 import from_quaternion, inverse, log_se3
@@ -30,19 +30,14 @@ __all__ = ["compare", "compare_runs", "current_runs"]
 
 def current_runs(records: Sequence[CalibrationRecord]) -> list[dict[str, CalibrationRecord]]:
     """Records by run; if runs differ only in code or configuration, the last one."""
-    runs: dict[tuple[object, ...], dict[str, CalibrationRecord]] = {}
     by_key: dict[tuple[str, str, str, str], dict[str, CalibrationRecord]] = {}
     for r in records:
         by_key.setdefault((r.vehicle, r.day, r.method, r.work_key), {})[r.pair] = r
-    for (vehicle, day, method, _), run in by_key.items():
-        first = run.get("camera_lidar")
-        start = (
-            None
-            if first is None or first.prior_qw is None
-            else (first.prior_qw, first.prior_qx, first.prior_tx_m)
-        )
-        seed = next(iter(run.values())).seed
-        runs[(vehicle, day, method, seed, start)] = run
+    runs = {}
+    for about, run in by_key.items():
+        first, seed = run.get("camera_lidar"), next(iter(run.values())).seed
+        start = first and (first.prior_qw, first.prior_qx, first.prior_tx_m)
+        runs[*about[:3], seed, start] = run
     return list(runs.values())
 
 
@@ -60,8 +55,7 @@ def compare(
     """
     if set(run) != set(PAIRS) or any(r.qw is None for r in run.values()):
         return None
-    T = {pair: _transform(run[pair], "") for pair in PAIRS}
-    priors = {pair: _transform(run[pair], "prior_") for pair in PAIRS}
+    T, priors = ({pair: _transform(run[pair], prefix) for pair in PAIRS} for prefix in ("", "prior_"))
     first = run["camera_lidar"]
 
     def errors(of: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -89,17 +83,17 @@ def compare(
         np.concatenate([_normalised(run[pair], T[pair], truth[pair], truth_sigma) for pair in PAIRS])
         if truth
         else np.zeros(0),
-        _independent_loop(run),
+        next(
+            (
+                (r.loop_rotation_rad, r.loop_translation_m)
+                for r in run.values()
+                if r.loop_rotation_rad is not None
+            ),
+            None,
+        ),
         pick_sigmas(picks.spread if picks else None),
         pick_sigmas(picks.sigma if picks else None),
     )
-
-
-def _independent_loop(run: Mapping[str, CalibrationRecord]) -> tuple[float, float | None] | None:
-    for record in run.values():
-        if record.loop_rotation_rad is not None:
-            return record.loop_rotation_rad, record.loop_translation_m
-    return None
 
 
 def _transform(record: CalibrationRecord, prefix: str) -> np.ndarray:
@@ -132,7 +126,8 @@ def compare_runs(
     compared, counts = [], {"refused_runs": 0, "runs_without_truth": 0}
     for run in current_runs(records):
         first = next(iter(run.values()))
-        known = None if truth is None else _truth_of(truth, first)
+        path = file_of_day(truth, first.vehicle, first.day)
+        known = None if path is None else read_transforms(path)
         file = files.of(first.vehicle, first.day)
         if known is None and file is None:
             counts["runs_without_truth"] += 1
@@ -144,10 +139,3 @@ def compare_runs(
         else:
             compared.append(ComparedRun(run, known, picks, comparison))
     return compared, counts
-
-
-def _truth_of(truth: Path, record: CalibrationRecord) -> dict[str, np.ndarray] | None:
-    path = truth / record.vehicle / f"{record.day}.json" if truth.is_dir() else truth
-    if truth.is_dir() and not path.exists():
-        return None
-    return read_transforms(path)

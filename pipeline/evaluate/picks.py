@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -95,17 +96,24 @@ def find_again(
         lidar: points and intensities of each frame; None if the log has no intensity.
         radar: points and power of each frame; None if the log has no power.
     """
-    picks, edge = file.picks, file.edge_m
+    picks, edge = deepcopy(file.picks), file.edge_m
     in_lidar = [find_in_lidar(lidar, at, edge) if lidar else None for at in picks.lidar_m]
     in_radar = [find_in_radar(radar, at) if radar else None for at in picks.radar_m]
-    moved = _moved(_moved(picks, "lidar_m", in_lidar), "radar_m", in_radar)
+    none = PickUncertainty(*(np.zeros_like(at) for at in (picks.pixels, picks.lidar_m, picks.radar_m)))
+    picks = replace(picks, spread=picks.spread or none, sigma=picks.sigma or deepcopy(none))
+    for sensor, all_found in (("lidar_m", in_lidar), ("radar_m", in_radar)):
+        for k, found in enumerate(all_found):
+            if found is not None:
+                getattr(picks, sensor)[k] = found.position_m
+                getattr(picks.spread, sensor)[k] = found.spread_m
+                getattr(picks.sigma, sensor)[k] = found.sigma_m
     how = f"apex of a {edge:g} m trihedral" if edge else "centre of the bright echoes, its apex is deeper,"
     sources = (
         file.sources[0],
         _source(f"lidar: {how}", in_lidar, where, file.sources[1]),
         _source("radar: strongest echo", in_radar, where, file.sources[2]),
     )
-    return replace(file, picks=moved, sources=sources)
+    return replace(file, picks=picks, sources=sources)
 
 
 def _source(what: str, found: Sequence[Found | None], where: str, picked: str) -> str:
@@ -116,31 +124,6 @@ def _source(what: str, found: Sequence[Found | None], where: str, picked: str) -
         return f"{picked}; none was found in {where}"
     text = f"{what} found in {where}, reflectors {', '.join(hits)}"
     return f"{text}; not found: {', '.join(lost)}, {picked}" if lost else text
-
-
-def _moved(picks: Picks, sensor: str, found: Sequence[Found | None]) -> Picks:
-    """Picks with positions, standard deviation and sigma of one sensor replaced by those found."""
-    values = {
-        "position_m": getattr(picks, sensor).copy(),
-        "spread_m": getattr(picks.spread or _none(picks), sensor).copy(),
-        "sigma_m": getattr(picks.sigma or _none(picks), sensor).copy(),
-    }
-    for k, one in enumerate(found):
-        if one is not None:
-            for name, rows in values.items():
-                rows[k] = getattr(one, name)
-    changes: dict[str, Any] = {
-        sensor: values["position_m"],
-        "spread": replace(picks.spread or _none(picks), **{sensor: values["spread_m"]}),
-        "sigma": replace(picks.sigma or _none(picks), **{sensor: values["sigma_m"]}),
-    }
-    return replace(picks, **changes)
-
-
-def _none(picks: Picks) -> PickUncertainty:
-    return PickUncertainty(
-        np.zeros_like(picks.pixels), np.zeros_like(picks.lidar_m), np.zeros_like(picks.radar_m)
-    )
 
 
 def _each(targets: list[dict[str, Any]], group: str, key: str, default: np.ndarray) -> np.ndarray:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from pipeline.core.errors import ConfigError, ContractError
 from pipeline.evaluate.picks import ReflectorFile, find_again, read_reflectors
 from pipeline.evaluate.reflectors import Echoes
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import frames_of
 
-__all__ = ["ReflectorFiles", "standing_echoes"]
+__all__ = ["ReflectorFiles", "file_of_day"]
 
 _STANDING_MPS = 0.3  # odometry of a parked car is not exactly zero
 
@@ -28,10 +30,8 @@ class ReflectorFiles:
 
     def of(self, vehicle: str, day: str) -> ReflectorFile | None:
         """The file valid for the mounting of that vehicle-day; None if there is none."""
-        if self._path is None:
-            return None
-        path = self._path / vehicle / f"{day}.json" if self._path.is_dir() else self._path
-        if self._path.is_dir() and not path.exists():
+        path = file_of_day(self._path, vehicle, day)
+        if path is None:
             return None
         if path not in self._read:
             self._read[path] = self._load(path)
@@ -60,26 +60,34 @@ class ReflectorFiles:
             raise ConfigError(
                 str(path), "vehicle", "a recording is found by the vehicle and day of its picks"
             )
-        lidar, radar = standing_echoes(Lake.at(lake), Partition(file.vehicle, day))
+        lidar, radar = _standing_echoes(Lake.at(lake), Partition(file.vehicle, day))
         return find_again(file, lidar, radar, f"{Path(lake).name} {file.vehicle} {day}")
 
 
-def standing_echoes(lake: Lake, partition: Partition) -> tuple[list[Echoes] | None, list[Echoes] | None]:
+def file_of_day(path: Path | None, vehicle: str, day: str) -> Path | None:
+    """VEHICLE/DAY.json of a folder, None if missing; or the one file for all days."""
+    if path is None or not path.is_dir():
+        return path
+    own = path / vehicle / f"{day}.json"
+    return own if own.exists() else None
+
+
+def _standing_echoes(lake: Lake, partition: Partition) -> tuple[list[Echoes] | None, list[Echoes] | None]:
     """Points and intensities of every frame, of lidar and radar; None for a sensor without intensity.
 
     Raises:
         ContractError: there is no such partition, or the car moves in it.
     """
-    lidar: list[Echoes] = []
-    radar: list[Echoes] = []
-    frames = 0
+    lidar, radar = [], []
     for frame in frames_of(lake, partition):
         if abs(frame.ego_speed_mps or 0.0) > _STANDING_MPS:
             problem = f"{partition.vehicle} moves on {partition.day}: no standing reflector recording"
             raise ContractError(str(lake), problem)
-        frames += 1
-        if frame.lidar_intensity is not None:
-            lidar.append((frame.lidar_xyz_m, frame.lidar_intensity))
-        if frame.radar_power_db is not None:
-            radar.append((frame.radar_xyz_m, frame.radar_power_db))
-    return (lidar if len(lidar) == frames else None), (radar if len(radar) == frames else None)
+        lidar.append((frame.lidar_xyz_m, frame.lidar_intensity))
+        radar.append((frame.radar_xyz_m, frame.radar_power_db))
+    return _whole(lidar), _whole(radar)
+
+
+def _whole(frames: list[tuple[np.ndarray, np.ndarray | None]]) -> list[Echoes] | None:
+    known = [(points, strength) for points, strength in frames if strength is not None]
+    return known if len(known) == len(frames) else None

@@ -31,9 +31,8 @@ _BRIGHT: Final = 0.5  # of the brightest echo near the guess
 _OVER_MEDIAN: Final = 4.0
 _CELL_RAD: Final = np.radians(0.1)  # returns of one beam of a standing sensor are in one cell
 _RANGE_SIGMA_M: Final = 0.02  # of a beam's mean range on a plate: mixed returns, range quantisation
-_FACING_SIGMA_RAD: Final = np.radians(
-    2.0
-)  # alignment of a reflector to the car by hand, and tilt of the lidar
+# Alignment of a reflector to the car by hand, and tilt of the lidar.
+_FACING_SIGMA_RAD: Final = np.radians(2.0)
 _BLOCKS: Final = 8
 
 
@@ -80,9 +79,7 @@ def find_in_radar(frames: Sequence[Echoes], guess_m: Float[np.ndarray, " 3"]) ->
 
 
 def find_in_lidar(
-    frames: Sequence[Echoes],
-    guess_m: Float[np.ndarray, " 3"],
-    edge_m: float | None = None,
+    frames: Sequence[Echoes], guess_m: Float[np.ndarray, " 3"], edge_m: float | None = None
 ) -> Found | None:
     """Apex of a trihedral from the bright echoes near the guess; if its edge is unknown, their centre.
 
@@ -99,15 +96,12 @@ def find_in_lidar(
     bright = [b for points, intensity in frames if len(b := _bright(points, intensity, guess_m))]
     if len(bright) < _FEWEST_FRAMES:
         return None
-    centres = np.array([b.mean(axis=0) for b in bright])
-    mean, spread, count = robust_mean(centres)
+    mean, spread, count = robust_mean(np.array([b.mean(axis=0) for b in bright]))
+    everything = np.concatenate(bright)
     if edge_m is None:
-        everything = np.concatenate(bright)
-        beams = max(len(everything) / len(bright), 1.0)
-        return Found(
-            mean, np.hypot(spread / np.sqrt(count), everything.std(axis=0) / np.sqrt(beams)), spread, count
-        )
-    apex, sigma = _fit_apex(np.concatenate(bright), edge_m)
+        of_beams = everything.std(axis=0) / np.sqrt(len(everything) / len(bright))
+        return Found(mean, np.hypot(spread / np.sqrt(count), of_beams), spread, count)
+    apex, sigma = _fit_apex(everything, edge_m)
     if sigma.max() > edge_m / 4:
         return None
     parts = [np.concatenate(bright[i::_BLOCKS]) for i in range(_BLOCKS)]

@@ -30,6 +30,11 @@ COLUMNS = (
     "loop_elevation_deg",
     "loop_range_m",
 )
+_KINDS = {
+    **dict.fromkeys(("table", "method", "environment", "source"), pa.string()),
+    **dict.fromkeys(("runs", "accepted_pairs", "pairs"), pa.int64()),
+    **dict.fromkeys(("independent_loop_deg", "independent_loop_m"), pa.float64()),
+}
 _TABLES = {"all": "Table 1", "highway": "Extended data table 1", "urban": "Extended data table 1"}
 _NAN = float("nan")
 _CLOSED = 1e-6  # degrees or metres: rounding of stored quaternions
@@ -90,7 +95,16 @@ def table_rows(comparisons: Sequence[Comparison]) -> list[TableRow]:
     A row is the mean of absolute errors over runs (and reflectors), as in the paper; environment "all"
     includes every run, highway and urban only runs whose drives were all of that kind.
     """
-    rows = [*_reference_rows(comparisons)]
+    references = {
+        "(prior)": [c.prior_errors for c in comparisons],
+        "(truth: spread of one frame's pick)": [c.truth_spread for c in comparisons if c.truth_spread],
+        "(truth: 1 sigma of the positions)": [c.truth_sigma for c in comparisons if c.truth_sigma],
+    }
+    rows = [
+        TableRow("Table 1", name, "all", "ours", len(errors), _values(errors))
+        for name, errors in references.items()
+        if errors
+    ]
     for environment, table in _TABLES.items():
         printed = {method: (name, values) for method, env, name, values in _PAPER if env == environment}
         for method in METHODS:
@@ -121,14 +135,7 @@ def as_markdown(
 
 def as_parquet(rows: Sequence[TableRow], notes: Sequence[str] = ()) -> bytes:
     """The rows as one Parquet file: degrees and metres, null for a dash, notes in the footer."""
-    names = ("table", "method", "environment", "source", "runs", "accepted_pairs", "pairs")
-    integers = {"runs", "accepted_pairs", "pairs"}
-    arrays = {
-        n: pa.array([getattr(r, n) for r in rows], pa.int64() if n in integers else pa.string())
-        for n in names
-    }
-    for column in ("independent_loop_deg", "independent_loop_m"):
-        arrays[column] = pa.array([getattr(r, column) for r in rows], pa.float64())
+    arrays = {n: pa.array([getattr(r, n) for r in rows], kind) for n, kind in _KINDS.items()}
     for k, column in enumerate(COLUMNS):
         arrays[column] = pa.array([r.values[k] for r in rows], pa.float64(), from_pandas=True)
     sink = pa.BufferOutputStream()
@@ -143,24 +150,6 @@ _HEADER = (
     ),
     "|---|---|---|---|---|---|---|---|",
 )
-
-
-def _reference_rows(comparisons: Sequence[Comparison]) -> list[TableRow]:
-    """Rows for the error of the prior and the uncertainty of the truth."""
-    if not comparisons:
-        return []
-    rows = [_mean_row("(prior)", [c.prior_errors for c in comparisons])]
-    spreads = [c.truth_spread for c in comparisons if c.truth_spread]
-    if spreads:
-        rows.append(_mean_row("(truth: spread of one frame's pick)", spreads))
-    sigmas = [c.truth_sigma for c in comparisons if c.truth_sigma]
-    if sigmas:
-        rows.append(_mean_row("(truth: 1 sigma of the positions)", sigmas))
-    return rows
-
-
-def _mean_row(name: str, errors: Sequence[Mapping[str, np.ndarray]]) -> TableRow:
-    return TableRow("Table 1", name, "all", "ours", len(errors), _values(errors))
 
 
 def _our_row(table: str, method: str, environment: str, members: Sequence[Comparison]) -> TableRow:
@@ -185,14 +174,10 @@ def _our_row(table: str, method: str, environment: str, members: Sequence[Compar
 
 def _loop_remarks(rows: Sequence[TableRow]) -> list[str]:
     """Notes on methods that close the loop by construction: the loop of their independent pair estimates."""
-    closed = [
-        r
-        for r in rows
-        if r.source == "ours" and r.pairs and r.environment == "all" and max(r.values[7:]) < _CLOSED
-    ]
     return [
         f"{r.method} closes the loop by construction; loop of its independent pairs: {_apart(r)}"
-        for r in closed
+        for r in rows
+        if r.source == "ours" and r.pairs and r.environment == "all" and max(r.values[7:]) < _CLOSED
     ]
 
 
@@ -206,14 +191,9 @@ def _apart(row: TableRow) -> str:
 
 def _values(errors: Sequence[Mapping[str, np.ndarray]]) -> tuple[float, ...]:
     of = {name: np.mean([e[name] for e in errors], axis=0) for name in (*PAIRS, "loop")}
-    degrees = {name: np.array([*np.degrees(e[:2]), e[2]]) for name, e in of.items()}
-    parts = (
-        degrees["camera_lidar"][:2],
-        degrees["camera_radar"][:2],
-        degrees["lidar_radar"],
-        degrees["loop"],
-    )
-    return tuple(float(v) for v in np.concatenate(parts))
+    degrees = {name: [*np.degrees(e[:2]).tolist(), float(e[2])] for name, e in of.items()}
+    cameras = (*degrees["camera_lidar"][:2], *degrees["camera_radar"][:2])
+    return (*cameras, *degrees["lidar_radar"], *degrees["loop"])
 
 
 def _line(row: TableRow) -> str:

@@ -89,7 +89,6 @@ class Shown:
     """A moment: its number and the total, data and features by sensor."""
 
     number: int
-    stamp_ns: int
     captures: Mapping[str, Image | Sweep | Scan]
     found: Mapping[str, Any]
 
@@ -303,11 +302,11 @@ def read_moment(lake: Lake, partition: Partition, number: int | None = None) -> 
     chosen = _rich_moment(lake, partition) if number is None else number
     if not 0 <= chosen < count:
         raise ConfigError("command line", "moment", f"{chosen}: the day has moments 0 to {count - 1}")
-    [(moment, captures)] = joined(lake, MOMENTS, partition, None, [chosen])
+    [(_, captures)] = joined(lake, MOMENTS, partition, None, [chosen])
     found = next((rows for _, rows in joined(lake, PERCEIVED, partition, None, [chosen])), {}) if (
         perceived(lake, partition) is not None
     ) else {}  # fmt: skip
-    return Shown(chosen, moment.stamp_ns, captures, found)
+    return Shown(chosen, captures, found)
 
 
 def _rich_moment(lake: Lake, partition: Partition) -> int:

@@ -27,21 +27,6 @@ _DRIVER = "libvulkan1 mesa-vulkan-drivers"  # the second also draws on the CPU
 _INSTANCE_CREATE_INFO = 1  # VkStructureType
 
 
-class _InstanceInfo(ctypes.Structure):
-    """VkInstanceCreateInfo without layers and extensions."""
-
-    _fields_ = (
-        ("kind", ctypes.c_uint32),
-        ("next", ctypes.c_void_p),
-        ("flags", ctypes.c_uint32),
-        ("application", ctypes.c_void_p),
-        ("layer_count", ctypes.c_uint32),
-        ("layers", ctypes.c_void_p),
-        ("extension_count", ctypes.c_uint32),
-        ("extensions", ctypes.c_void_p),
-    )
-
-
 def import_open3d() -> Any:
     """The module open3d; MissingLibraryError if a system library that it links is not installed."""
     try:
@@ -62,7 +47,7 @@ def require_renderer() -> None:
     except OSError as err:
         raise MissingLibraryError("open3d", "libvulkan.so.1", _DRIVER) from err
     instance, count = ctypes.c_void_p(), ctypes.c_uint32()
-    info = _InstanceInfo(kind=_INSTANCE_CREATE_INFO)
+    info = (ctypes.c_uint64 * 8)(_INSTANCE_CREATE_INFO)  # VkInstanceCreateInfo without layers and extensions
     if vulkan.vkCreateInstance(ctypes.byref(info), None, ctypes.byref(instance)) == 0:
         vulkan.vkEnumeratePhysicalDevices(instance, ctypes.byref(count), None)
         vulkan.vkDestroyInstance(instance, None)

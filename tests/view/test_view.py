@@ -87,7 +87,7 @@ def scene():
         "top": sweep([[10, 3, 0], [10, -3, 0], [-10, 0, 0]]),
         "nose": scan([[10, 0, 0], [5, 0, 0]], [-4.0, 0.0]),
     }
-    return Shown(0, 0, captures, {}), rig(front=AHEAD, top=np.eye(4), nose=T_nose)
+    return Shown(0, captures, {}), rig(front=AHEAD, top=np.eye(4), nose=T_nose)
 
 
 def drawn(turned=None, **how):
