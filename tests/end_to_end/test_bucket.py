@@ -1,25 +1,14 @@
 """The night on a lake in a bucket, while the store now and then answers 503: the same records as on a folder."""
 
 import json
-import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 
 from pipeline.simulate.fleet import FleetSpec
+from tests.makers.commands import boresight
 from tests.makers.kept_days import kept_fleet
 from tests.makers.s3_server import BUCKET, running
-
-BORESIGHT = f"{sys.prefix}/bin/boresight"
-
-
-def run(environment, *arguments):
-    done = subprocess.run(
-        [BORESIGHT, *arguments], env=environment, capture_output=True, text=True, check=False, timeout=300
-    )
-    return done.returncode, done.stdout, done.stderr
 
 
 @pytest.mark.slow
@@ -29,20 +18,18 @@ def test_a_night_on_a_bucket_records_what_a_night_on_a_folder_does(tmp_path):
     common = ["--fleet", f"{tmp_path}/fleet.toml", "--executor", "inline", "--logs", logs, "--no-pictures"]
     records = {}
     with running() as s3:
-        environment = os.environ | s3.environment
         for lake in (f"{tmp_path}/lake", f"s3://{BUCKET}/night/lake"):
             s3.faults(fail=20, every=5)
-            code, out, stderr = run(environment, "nightly", "--lake", lake, *common)
+            code, summary, _, stderr = boresight("nightly", "--lake", lake, *common, **s3.environment)
             assert code in (0, 3), stderr
-            summary = json.loads(out.splitlines()[-1])
             assert summary["vehicle_days"] == 1
             assert summary["damaged"] == []
             assert summary["report"].startswith(lake)
-            records[lake] = json.loads(run(environment, "show", "calibrations", "--lake", lake, "--json")[1])
+            shown = boresight("show", "calibrations", "--lake", lake, "--json", **s3.environment)
+            records[lake] = json.loads(shown.out)
         # Of the bucket alone: `test_nightly` asks the same of a folder.
-        again = json.loads(run(environment, "nightly", "--lake", lake, *common)[1].splitlines()[-1])
-        assert again["done"] == 0
-        status = json.loads(run(environment, "status", "--lake", lake)[1].splitlines()[-1])
+        assert boresight("nightly", "--lake", lake, *common, **s3.environment).summary["done"] == 0
+        status = boresight("status", "--lake", lake, **s3.environment).summary
         assert status["failed"] + status["missing"] == 0
         assert s3.faults()["failed"] > 0
     here, there = records.values()

@@ -1,8 +1,6 @@
 """The demo, with fewer frames than a person gets to see: every step, the table, the report, and a second run."""
 
 import json
-import subprocess
-import sys
 from collections import Counter
 from pathlib import Path
 
@@ -12,8 +10,9 @@ import pytest
 from pipeline.store.partitions import Lake
 from pipeline.store.records import read_records
 from schemas.drift import DRIFT, DriftFinding
+from tests.makers.commands import boresight
 
-BORESIGHT = f"{sys.prefix}/bin/boresight"
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
@@ -23,29 +22,23 @@ def demo(tmp_path_factory):
 
 
 def run(out):
-    command = [BORESIGHT, "demo", "--out", str(out), "--frames", "12"]
-    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=600)
+    return boresight("demo", "--out", out, "--frames", 12)
 
 
-@pytest.mark.slow
 def test_the_demo_ends_with_a_table_a_report_and_a_summary(demo):
-    _, done = demo
-    summary = json.loads(done.stdout.splitlines()[-1])
-    assert done.returncode in (0, 3), done.stderr[-2000:]
+    _, (code, summary, table, err) = demo
+    assert code in (0, 3), err[-2000:]
     assert summary["vehicle_days"] == 12
     assert Path(summary["report"]).read_text().startswith("<!doctype html>")
     assert summary["knocked"] == [{"vehicle": "vehicle-2", "sensor": "radar", "since": "2026-03-04"}]
-    table = done.stdout
     for vehicle in ("vehicle-1", "vehicle-2", "vehicle-3"):
         assert table.count(vehicle) >= 4  # three pairs, and what the audit says
     assert "turn deg" in table
     assert "shift cm" in table
 
 
-@pytest.mark.slow
 def test_the_knocked_radar_is_found_with_its_day_and_size_and_nobody_else_is_accused(demo):
-    out, done = demo
-    summary = json.loads(done.stdout.splitlines()[-1])
+    out, (_, summary, *_) = demo
     assert summary["moved"] == summary["knocked"]
     found = read_records(Lake.at(out / "lake"), DRIFT, DriftFinding)
     alarms = {f.vehicle for f in found if f.status in ("RED", "YELLOW")}
@@ -58,38 +51,28 @@ def test_the_knocked_radar_is_found_with_its_day_and_size_and_nobody_else_is_acc
     assert np.degrees(sigma) < 0.15
 
 
-@pytest.mark.slow
 def test_the_comparison_with_the_truth_is_kept(demo):
     out, _ = demo
     rows = json.loads((out / "comparison.json").read_text())
     pairs = ("camera_lidar", "camera_radar", "lidar_radar")
     # Two vehicles of three sensors, and one of two cameras and two radars, which the network is not run on.
     expected = {(method, pair): 2 for method in ("joint", "joint-ssl") for pair in pairs}
-    of_many = {
-        "camera_lidar": 4,
-        "camera_radar": 6,
-        "lidar_radar": 4,
-        "lidar_base": 1,
-        "radar_base": 2,
-        "camera_base": 2,
-    }
-    assert Counter((r["method"], r["pair"]) for r in rows) == expected | {
-        ("joint", kind): count for kind, count in of_many.items()
-    }
+    of_many = {"camera_lidar": 4, "camera_radar": 6, "lidar_radar": 4}
+    of_many |= {"lidar_base": 1, "radar_base": 2, "camera_base": 2}
+    expected |= {("joint", kind): count for kind, count in of_many.items()}
+    assert Counter((r["method"], r["pair"]) for r in rows) == expected
     computed = [r for r in rows if r["status"] != "refused"]
     assert any(r["method"] == "joint" for r in computed)  # else nothing below says anything
     # The prior is what the drawing says: wrong by as much as sensors are mounted askew, and by the knock.
     assert all(0 < r["rotation_error_prior_deg"] < 6 for r in computed)
 
 
-@pytest.mark.slow
 def test_a_second_demo_makes_nothing_anew(demo):
     out, first = demo
     logs = {p: p.stat().st_mtime_ns for p in (out / "logs").rglob("*") if p.is_file()}
     records = {p: p.read_bytes() for p in (out / "lake" / "calibrations").rglob("*.parquet")}
     assert logs
     assert records
-    again = run(out)
-    assert again.returncode == first.returncode
+    assert run(out).code == first.code
     assert {p: p.stat().st_mtime_ns for p in (out / "logs").rglob("*") if p.is_file()} == logs
     assert {p: p.read_bytes() for p in (out / "lake" / "calibrations").rglob("*.parquet")} == records

@@ -1,8 +1,6 @@
 """The command evaluate on real files: the picks as the simulator wrote them, the recording, an error of known size."""
 
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -13,29 +11,23 @@ from pipeline.simulate.fleet import FleetSpec
 from pipeline.simulate.reflectors import simulate_reflectors
 from pipeline.store.partitions import Lake
 from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, PAIRS, CalibrationRecord
+from schemas.columns import POSE_COLUMNS
+from tests.makers.commands import boresight
 from tests.makers.kept_days import kept_fleet
 from tests.makers.lakes import write_records
 
 pytestmark = pytest.mark.slow
-BORESIGHT = f"{sys.prefix}/bin/boresight"
 VEHICLE, DAY = "vehicle-1", "2026-03-02"
 YAW_DEG = 0.6  # put into camera-lidar, and into nothing else
 
 
-def boresight(*arguments):
-    done = subprocess.run([BORESIGHT, *map(str, arguments)], capture_output=True, text=True, check=False)
-    return done.returncode, json.loads(done.stdout.splitlines()[-1]), done.stderr
-
-
 def record(pair, T, environment="urban", day=DAY):
-    values = [*to_quaternion(T), *T[:3, 3]]
-    names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
-    pose = {prefix + n: float(v) for prefix in ("", "prior_") for n, v in zip(names, values, strict=True)}
+    values, (parent, child) = [*to_quaternion(T), *T[:3, 3]], FRAMES_OF_PAIR[pair]
+    prefixed = ((prefix, *of) for prefix in ("", "prior_") for of in zip(POSE_COLUMNS, values, strict=True))
     return CalibrationRecord(
-        vehicle=VEHICLE, day=day, method="joint-optimisation", pair=pair, parent_frame=FRAMES_OF_PAIR[pair][0],
-        child_frame=FRAMES_OF_PAIR[pair][1], status="accepted", reason="", work_key="key", code_version="0",
-        seed=0,
-        environment=environment, **pose,
+        vehicle=VEHICLE, day=day, method="joint-optimisation", pair=pair, parent_frame=parent, child_frame=child,
+        status="accepted", reason="", work_key="key", code_version="0", seed=0, environment=environment,
+        **{prefix + name: float(value) for prefix, name, value in prefixed},
     )  # fmt: skip
 
 
@@ -46,7 +38,7 @@ def folder(tmp_path_factory):
     spec = FleetSpec(vehicles=1, days=1, first_day=DAY, frames=3, drives=1)
     kept_fleet(spec, out)
     simulate_reflectors(spec, 0, 0, out, frames=20)
-    code, summary, stderr = boresight(
+    code, summary, _, stderr = boresight(
         "ingest", out / f"reflectors/{VEHICLE}/{DAY}.mcap", "--fleet", out / "fleet.toml",
         "--lake", out / "standing", "--vehicle", VEHICLE, "--day", DAY,
     )  # fmt: skip
@@ -86,7 +78,7 @@ def check_errors(path):
 
 def test_the_picks_that_simulate_wrote_are_read_as_they_are(folder):
     out = folder / "picked"
-    code, summary, stderr = boresight(
+    code, summary, _, stderr = boresight(
         "evaluate", "--lake", folder / "lake", "--reflectors", folder / "reflectors", "--out", out
     )
     assert (code, summary["runs"], summary["runs_without_truth"]) == (0, 1, 1)
@@ -121,7 +113,7 @@ def test_lidar_and_radar_positions_are_found_in_the_recording_near_rough_guesses
             target[key] = (np.array(target[key]) + rng.uniform(-0.3, 0.3, 3)).tolist()
     rough, out = folder / "rough.json", folder / "found.parquet"
     rough.write_text(json.dumps(content))
-    code, summary, _ = boresight(
+    code, summary, *_ = boresight(
         "evaluate", "--lake", folder / "lake", "--reflectors", rough,
         "--recording-lake", folder / "standing", "--out", out,
     )  # fmt: skip
@@ -138,12 +130,12 @@ def test_lidar_and_radar_positions_are_found_in_the_recording_near_rough_guesses
 
 
 def test_a_recording_in_which_the_car_drives_is_refused(folder):
-    code, _, stderr = boresight(
+    code, _, _, stderr = boresight(
         "ingest", *(folder / f"logs/{VEHICLE}/{DAY}").iterdir(), "--fleet", folder / "fleet.toml",
         "--lake", folder / "lake", "--vehicle", VEHICLE, "--day", DAY,
     )  # fmt: skip
     assert code == 0, stderr
-    code, _, stderr = boresight(
+    code, _, _, stderr = boresight(
         "evaluate", "--lake", folder / "lake", "--reflectors", folder / "reflectors", "--recording-day", DAY
     )
     assert code not in (0, 3)

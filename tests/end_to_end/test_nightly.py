@@ -5,7 +5,6 @@ import json
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,12 +17,12 @@ from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
 from pipeline.store.views import observations_of
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
+from tests.makers.commands import BORESIGHT, boresight
 from tests.makers.fleet_files import fleet_toml
 from tests.makers.kept_days import kept_fleet
 from tests.makers.processes import descendants, started, works
 from tests.makers.ray_clusters import two_nodes
 
-BORESIGHT = f"{sys.prefix}/bin/boresight"
 DAYS = ("2026-03-02", "2026-03-03")
 
 
@@ -37,32 +36,25 @@ def fleet(tmp_path_factory):
     (poisoned / "a.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(range(256)) * 100)
     with (out / "fleet.toml").open("a") as file:
         file.write('\n[vehicles."vehicle-3"]\nrig = "demo"\n')
-    stranger = out / "logs" / "stranger" / DAYS[0]
-    source = next((out / "logs" / "vehicle-1" / DAYS[0]).iterdir())
-    shutil.copytree(source, stranger / source.name) if source.is_dir() else (
-        stranger.mkdir(parents=True),
-        shutil.copy(source, stranger),
-    )
+    shutil.copytree(out / "logs" / "vehicle-1" / DAYS[0], out / "logs" / "stranger" / DAYS[0])
     return out
 
 
 def command(fleet, lake, *options, vehicles="{vehicle}"):
     about = ["--fleet", f"{fleet}/fleet.toml", "--lake", str(lake)]
-    return [BORESIGHT, "nightly", *about, "--logs", f"{fleet}/logs/{vehicles}/{{day}}/*", *options]
+    return ["nightly", *about, "--logs", f"{fleet}/logs/{vehicles}/{{day}}/*", *options]
 
 
 def run(*arguments):
-    done = subprocess.run(arguments, capture_output=True, text=True, check=False, timeout=300)
-    return done.returncode, json.loads(done.stdout.splitlines()[-1]), done.stderr
+    code, summary, _, err = boresight(*arguments)
+    return code, summary, err
 
 
 def good_days(lake):
     """Vehicle-days with a record of every pair."""
     found = read_records(Lake.at(lake), CALIBRATIONS, CalibrationRecord)
-    pairs = {}
-    for record in found:
-        pairs.setdefault((record.vehicle, record.day), set()).add(record.pair)
-    return {key for key, of_day in pairs.items() if of_day == set(PAIRS)}
+    has = {(r.vehicle, r.day, r.pair) for r in found}
+    return {(v, d) for v, d, _ in has if all((v, d, pair) in has for pair in PAIRS)}
 
 
 WANTED = {(v, d) for v in ("vehicle-1", "vehicle-2") for d in DAYS}
@@ -108,7 +100,7 @@ def test_a_second_night_finds_nothing_to_do_and_changes_no_byte(fleet, first_nig
 @pytest.mark.slow
 def test_status_and_a_dry_run_say_how_every_day_stands_and_why(fleet, first_night, tmp_path):
     lake, _, summary, _ = first_night
-    code, told, _ = run(BORESIGHT, "status", "--lake", str(lake), "--json")
+    code, told, _ = run("status", "--lake", str(lake), "--json")
     days = {(d["vehicle"], d["day"]): d for d in told["days"]}
     assert code == 0
     # The poisoned vehicle and the stranger have logs of one day.
@@ -120,7 +112,7 @@ def test_status_and_a_dry_run_say_how_every_day_stands_and_why(fleet, first_nigh
     assert days["vehicle-3", DAYS[0]]["stage"] == "ingest"
     assert days["vehicle-3", DAYS[0]]["reason"].startswith("no usable message")
     assert all(days[key]["seconds"] > 0.1 and days[key]["pairs"] for key in WANTED)
-    assert run(BORESIGHT, "status", "--lake", str(lake))[1]["done"] == told["done"]
+    assert run("status", "--lake", str(lake))[1]["done"] == told["done"]
     before = sorted(lake.rglob("*"))
     code, plan, stderr = run(*command(fleet, lake, "--dry-run"))
     why = {(p["vehicle"], p["day"]): (p["stages"], p["why"]) for p in plan["plan"]}
@@ -148,7 +140,7 @@ def test_damaged_tables_cost_the_fleet_nothing_and_the_next_night_heals_them(fle
         whole = path.read_bytes()
         path.write_bytes(whole[:keep] + bytes(len(whole) // 2) + whole[keep + len(whole) // 2 :])
     told = Lake.at(lake)
-    assert run(BORESIGHT, "audit", "--fleet", f"{fleet}/fleet.toml", "--lake", str(lake))[1]["damaged"]
+    assert run("audit", "--fleet", f"{fleet}/fleet.toml", "--lake", str(lake))[1]["damaged"]
     code, summary, _ = run(*command(fleet, lake, "--executor", "inline"))
     assert (code, summary["failed"]) == (2, 0)
     assert good_days(lake) == WANTED | {("vehicle-3", DAYS[0])}
@@ -160,7 +152,7 @@ def test_damaged_tables_cost_the_fleet_nothing_and_the_next_night_heals_them(fle
 @contextmanager
 def nightly_with_workers(fleet, lake):
     """A night in the background, and its workers once they are at work."""
-    arguments = command(fleet, lake, "--workers", "2", "--to", DAYS[0])
+    arguments = [BORESIGHT, *command(fleet, lake, "--workers", "2", "--to", DAYS[0])]
     with started(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         deadline = time.monotonic() + 60
         workers = []
@@ -184,7 +176,7 @@ def test_all_executors_record_the_same_though_a_worker_and_a_node_of_a_cluster_d
     fleet, first_night, tmp_path
 ):
     told = ("--metrics", f"{tmp_path}/night.prom")
-    night = command(fleet, tmp_path / "ray", "--executor", "ray", "--to", DAYS[0], *told)
+    night = [BORESIGHT, *command(fleet, tmp_path / "ray", "--executor", "ray", "--to", DAYS[0], *told)]
     with (
         two_nodes() as (cluster, (node, _)),
         started(night, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process,

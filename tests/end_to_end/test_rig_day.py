@@ -1,23 +1,18 @@
 """A day of two cameras, a lidar and two radars, from logs to a pose of every sensor with the truth beside it."""
 
-import json
-
 import numpy as np
 import pytest
 from scipy.linalg import eigh
 
-from pipeline.core.config import load_fleet
 from pipeline.core.stage_work import Task
 from pipeline.core.stages import CALIBRATE
 from pipeline.rig.se3 import inverse, log_se3
-from pipeline.simulate.fleet import FleetSpec
 from pipeline.store.current import current_poses, prior_of, transform_of
-from pipeline.store.partitions import Lake, Partition
+from pipeline.store.partitions import Partition
 from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.poses import POSES, PoseRow
-from tests.makers.kept_days import kept_fleet
-from tests.makers.stages import ingest_day, perceive_day
+from tests.makers.simulated_days import simulated_day
 
 pytestmark = pytest.mark.slow
 DAY, MOMENTS = Partition("vehicle-1", "2026-03-02"), 60
@@ -25,17 +20,11 @@ DAY, MOMENTS = Partition("vehicle-1", "2026-03-02"), 60
 
 @pytest.fixture(scope="module")
 def day(tmp_path_factory):
-    out = tmp_path_factory.mktemp("duo")
-    kept_fleet(
-        FleetSpec(vehicles=1, days=1, frames=MOMENTS, drives=2, rig="duo", environments="mixed", seed=31), out
-    )
-    fleet, lake = load_fleet(out / "fleet.toml"), Lake.at(out / "lake")
-    ingest_day(sorted((out / "logs" / DAY.vehicle / DAY.day).iterdir()), DAY, fleet, lake)
-    perceive_day(DAY, fleet, lake)
-    task = Task(fleet=fleet, lake=lake, of=DAY, method="joint")
+    about = {"rig": "duo", "environment": "mixed", "seed": 31}
+    made = simulated_day(tmp_path_factory.mktemp("duo"), frames=MOMENTS, drives=2, **about)
+    task = Task(fleet=made.fleet, lake=made.lake, of=DAY, method="joint")
     outcome = CALIBRATE.run(task)
-    truth = json.loads((out / "truth" / DAY.vehicle / f"{DAY.day}.json").read_text())
-    return task, outcome, {name: np.array(T) for name, T in truth["T_base_sensor"].items()}
+    return task, outcome, {name: np.array(T) for name, T in made.told["T_base_sensor"].items()}
 
 
 def poses_of(task):
