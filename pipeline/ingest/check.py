@@ -16,7 +16,7 @@ from pipeline.core.errors import ConfigError, SolveError
 from pipeline.core.results import Progress, silent
 from pipeline.ingest.directions_and_units import prior_transform
 from pipeline.ingest.index import DayIndex, index_logs
-from pipeline.ingest.moments import MomentBuilder
+from pipeline.ingest.moments import MomentBuilder, spread
 from pipeline.ingest.readiness import DofVerdict, Evidence, Unheard, overall, unheard_topics
 from pipeline.ingest.rig_sample import RigFinding, RigSample
 from pipeline.ingest.roles import NEEDED, topics_of
@@ -105,7 +105,11 @@ def check_logs(
     try:
         anchored, rejected = pick_moments(index, rig, fleet.ingest)
         builder = MomentBuilder(index, rig, fleet.ingest, read_file_prior(rig, fleet))
-        built, looked, damaged = builder.sample(anchored, _SAMPLE, progress, "frames looked at")
+        picked, damaged = [anchored[i] for i in spread(len(anchored), _SAMPLE)], Counter[str]()
+        built = list(builder.built(picked, damaged, progress))
+        for reason in damaged:
+            if not any(problem.startswith(reason) for problem in index.problems):
+                index.complain(reason)
         rejected += damaged
         without = Counter({k: n for k, n in builder.counts.items() if k.startswith("without_")})
         unheard = unheard_topics(index, rig)
@@ -122,7 +126,7 @@ def check_logs(
     prior = _prior(rows, fleet, rig, index.problems)
     of_tracks = {t.topic for t in topics if any(kind.endswith("RadarTracks") for kind in t.types)}
     tracked = [name for name, radar in rig.radars.items() if radar.points in of_tracks]
-    sample = RigSample(rig, built, looked, present, logged_stars(rows), prior, silent, tracked)
+    sample = RigSample(rig, built, len(picked), present, logged_stars(rows), prior, silent, tracked)
     verdicts = [v for own in sample.verdicts.values() for v in own]
     first = sample.frames({str(kind): sensor for sensor, kind in reversed(index.kinds.items())})
     return CheckReport(

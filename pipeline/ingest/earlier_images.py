@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from pipeline.ingest.index import DayIndex
+from pipeline.ingest.messages.decoding import DECODE_ERRORS
 from pipeline.ingest.messages.image import EncodedImage
 from schemas.image_motion import tracking_scale
 
@@ -57,22 +58,11 @@ class EarlierImages:
     """Finds the earlier image of each image of one camera; asked in the order of moments.
 
     Args:
-        picture: reads the image of a message; raises one of `errors` if it is damaged.
+        picture: reads the image of a message; raises one of DECODE_ERRORS if it is damaged.
     """
 
-    def __init__(
-        self,
-        index: DayIndex,
-        sensor: str,
-        picture: Callable[[int], EncodedImage],
-        errors: tuple[type[Exception], ...],
-    ) -> None:
-        self._index, self._captures, self._picture, self._errors = (
-            index,
-            index.captures(sensor),
-            picture,
-            errors,
-        )
+    def __init__(self, index: DayIndex, sensor: str, picture: Callable[[int], EncodedImage]) -> None:
+        self._index, self._captures, self._picture = index, index.captures(sensor), picture
         self._kept: set[int] = set()  # images of moments
 
     def columns(self, place: int, now: bytes) -> Mapping[str, Any]:
@@ -85,7 +75,7 @@ class EarlierImages:
         if not found.is_kept:
             try:
                 earlier = self._picture(found.place)
-            except self._errors:
+            except DECODE_ERRORS:
                 return {"earlier_missing": NO_EARLIER}
             if earlier.data == now:
                 return {"earlier_missing": SAME_IMAGE}

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int64
@@ -22,6 +23,7 @@ from pipeline.ingest.messages.decoding import (
     content_without_stamp,
     decode,
     encoding_fault,
+    header_frame_id,
     header_stamp_ns,
 )
 from pipeline.ingest.messages.detections import DETECTIONS_3D
@@ -131,10 +133,6 @@ class DayIndex:
         """Messages of a role; empty if there are none."""
         return self.streams.setdefault(role, Stream())
 
-    def types_of(self, topic: str) -> set[str]:
-        """Types of the messages on a topic of the rig."""
-        return {kind for name, kind in self.types_seen if name == topic}
-
     def types_beside(self) -> Collection[tuple[str, str]]:
         """Topics and types in the logs, without a survey those at the beginning of some of them."""
         if not self.surveyed:
@@ -147,9 +145,10 @@ class DayIndex:
                     self.surveyed[message.channel.topic, message.channel.msgtype] += 1
         return self.surveyed
 
-    def read(self, located: Located) -> memoryview:
-        """Payload of a message."""
-        return self.logs[located.log].read(located.position)
+    def read(self, located: Located) -> tuple[Any, str]:
+        """A decoded message and its frame id; raises one of DECODE_ERRORS."""
+        data = self.logs[located.log].read(located.position)
+        return decode(located.channel, data), header_frame_id(located.channel, data)
 
     def camera_at(self, sensor: str, log: int, stamp_ns: int) -> Camera | None:
         """Intrinsics nearest in time within the same log, else in any log; None if no log has any."""
@@ -344,7 +343,7 @@ def _take_transforms(index: DayIndex, number: int, message: RawMessage) -> None:
         index.damage["bad_transforms"] += index.trees[number].add_message(
             decode(message.channel, message.data)
         )
-    except (LogError, *DECODE_ERRORS) as err:
+    except DECODE_ERRORS as err:
         index.damage["tf_static_undecodable"] += 1
         index.complain(f"{index.log_names[number]}: {err}")
 
@@ -353,7 +352,7 @@ def _take_odometry(index: DayIndex, stamp: int, message: RawMessage) -> None:
     try:
         if not index.ego.add(stamp, decode(message.channel, message.data)):
             index.damage["bad_odometry"] += 1
-    except (LogError, *DECODE_ERRORS):
+    except DECODE_ERRORS:
         index.damage["odometry_undecodable"] += 1
 
 
@@ -364,7 +363,7 @@ def _take_camera(index: DayIndex, number: int, stamp: int, message: RawMessage, 
     if camera is None:
         try:
             camera = read_camera_info(decode(message.channel, message.data))
-        except (LogError, *DECODE_ERRORS) as err:
+        except DECODE_ERRORS as err:
             camera = str(err)
         if len(index.camera_of_bytes) < _MOST_CAMERAS:
             index.camera_of_bytes[content] = camera

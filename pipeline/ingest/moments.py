@@ -12,7 +12,7 @@ of a few objects may be; it is not checked.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,8 +23,6 @@ from pipeline.core.config import IngestConfig
 from pipeline.core.results import Progress
 from pipeline.ingest.captures import Read, Rejected, readers_of
 from pipeline.ingest.index import DayIndex
-from pipeline.ingest.messages.point_cloud import LidarCloud
-from pipeline.ingest.messages.radar import RadarCloud
 from pipeline.ingest.sync import Rejection, none_near
 from pipeline.rig.edges import pose_columns
 from pipeline.rig.graph import BASE, possible_edges
@@ -40,7 +38,6 @@ REPEATED = {
     "lidar": Rejection.LIDAR_REPEATED,
     "radar": Rejection.RADAR_REPEATED,
 }
-_FEWEST_POINTS = 10
 
 
 class LoggedPrior:
@@ -130,7 +127,24 @@ class MomentBuilder:
         self._contents: dict[str, set[int]] = {sensor: set() for sensor in self._readers}
         self._whole_ns = -SAME_SCENE_NS  # stamp of the last moment with all sensors
 
-    def build(self, at: Anchored, moment: int) -> tuple[Moment, dict[str, Capture]]:
+    def built(
+        self, anchored: Sequence[Anchored], rejected: Counter[str], progress: Progress
+    ) -> Iterator[tuple[Moment, dict[str, Capture]]]:
+        """Rows of the moments that are kept, numbered from 0; the others are counted in `rejected` by reason."""
+        moment = 0
+        for done, at in enumerate(anchored, 1):
+            try:
+                row = self._build(at, moment)
+            except Rejected as outcome:
+                rejected[outcome.reason] += 1
+                if rejected[outcome.reason] == 1 and outcome.detail:
+                    self._index.complain(str(outcome))
+            else:
+                moment += 1
+                yield row
+            progress(done, len(anchored), "frames")
+
+    def _build(self, at: Anchored, moment: int) -> tuple[Moment, dict[str, Capture]]:
         """Rows of a moment and its sensors, called in order of time; raises Rejected if it is not kept."""
         missing: dict[str, Rejected] = {}
         parts = {s: part for s in self._readers if (part := self._part(s, at, moment, missing)) is not None}
@@ -156,21 +170,6 @@ class MomentBuilder:
         )  # fmt: skip
         return row, captures
 
-    def sample(
-        self, anchored: Sequence[Anchored], count: int, progress: Progress, what: str
-    ) -> tuple[list[tuple[Moment, dict[str, Capture]]], int, Counter[str]]:
-        """Up to `count` moments spread over the day; how many were tried, and those not kept by reason."""
-        built, rejected = [], Counter[str]()
-        picked = spread(len(anchored), count)
-        for done, i in enumerate(picked.tolist(), 1):
-            try:
-                built.append(self.build(anchored[i], i))
-            except Rejected as outcome:
-                rejected[outcome.reason] += 1
-                self._index.complain(str(outcome))
-            progress(done, len(picked), what)
-        return built, len(picked), rejected
-
     def _is_worth_having(self, parts: Collection[str], stamp_ns: int) -> bool:
         """Whether an incomplete moment shows a scene that no complete one shows."""
         if len(set(self._kinds.values())) == len(self._kinds):
@@ -184,8 +183,12 @@ class MomentBuilder:
         kind = self._kinds[sensor]
         try:
             if sensor in at.places:
-                part = self._readers[sensor].read(at.places[sensor], moment)
-                if self._is_new(sensor, part.measured):
+                part = self._readers[sensor](at.places[sensor], moment)
+                # Random collisions among a day's thousands of captures are negligible with 2**64 values, at a
+                # third of a digest's time.
+                content, seen = hash(part.content), self._contents[sensor]
+                if not part.content or content not in seen:
+                    seen.add(content)
                     return part
                 missing[sensor] = Rejected(REPEATED[kind])
             else:
@@ -195,15 +198,6 @@ class MomentBuilder:
             missing[sensor] = why
         return None
 
-    def _is_new(self, sensor: str, measured: LidarCloud | RadarCloud | bytes) -> bool:
-        """Whether this image, sweep or scan is new, apart from its stamp."""
-        # Random collisions among a day's thousands of captures are negligible with 2**64 values, at a third
-        # of a digest's time.
-        content, seen = _content(measured), self._contents[sensor]
-        known = bool(content) and hash(content) in seen
-        seen.add(hash(content))
-        return not known
-
     def _count(self, missing: Mapping[str, Rejected]) -> None:
         """Count the missing sensors of the moment by reason; each payload problem is reported once."""
         for sensor, why in missing.items():
@@ -211,16 +205,6 @@ class MomentBuilder:
             self.counts[name] += 1
             if self.counts[name] == 1 and why.detail:
                 self._index.complain(str(why))
-
-
-def _content(part: LidarCloud | RadarCloud | bytes) -> tuple[bytes, ...]:
-    """Measured content, without stamps; empty if equal content may be two measurements."""
-    if isinstance(part, LidarCloud):
-        return part.x_m.tobytes(), part.y_m.tobytes(), part.z_m.tobytes()
-    if isinstance(part, RadarCloud):
-        few = len(part.xyz_m) < _FEWEST_POINTS
-        return () if few else (part.xyz_m.tobytes(), part.range_rate_mps.tobytes())
-    return (part,)
 
 
 def spread(count: int, limit: int | None) -> Int64[np.ndarray, " N"]:

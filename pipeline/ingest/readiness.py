@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from difflib import SequenceMatcher
 
@@ -224,13 +224,9 @@ def unheard_topics(index: DayIndex, rig: Rig) -> list[Unheard]:
 
     Transforms are not among them: a prior file may take their place.
     """
-    return list(_unheard(index, rig))
-
-
-def _unheard(index: DayIndex, rig: Rig) -> Iterator[Unheard]:
-    named = topics_of(rig)
+    found, named = list[Unheard](), topics_of(rig)
     for topic, role in named.items():
-        wanted, types = set(ACCEPTED_TYPES[role.what]), index.types_of(topic)
+        wanted, types = set(ACCEPTED_TYPES[role.what]), {k for name, k in index.types_seen if name == topic}
         is_shown = role.what == INFO and bool(index.captures(role.sensor).stamps)
         is_blind = is_shown and not index.cameras.get(role.sensor)
         if role == TF_STATIC or (wanted & types and not is_blind):
@@ -242,4 +238,5 @@ def _unheard(index: DayIndex, rig: Rig) -> Iterator[Unheard]:
             others = [name for name in others if alike[name] >= _MISTYPED]
             if not (others or types):
                 continue
-        yield Unheard(topic, role, tuple(sorted(types)), tuple(others), is_shown)
+        found.append(Unheard(topic, role, tuple(sorted(types)), tuple(others), is_shown))
+    return found

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int64
 
-from pipeline.core.errors import LogError
 from pipeline.core.rigs import RadarTopics
 from pipeline.ingest.containers.reader import LogReader, RawMessage
 from pipeline.ingest.containers.timeline import PAUSE_NS, Stretches, Timeline
@@ -71,24 +70,17 @@ class PossibleBursts:
     sweeps: int
 
 
-@dataclass(frozen=True, eq=False)
-class BurstMotion:
-    """Motion of the car in the middle of each possible burst; NaN where it was not measured."""
+# Motion of the car in the middle of each possible burst: speed [m/s], yaw rate [rad/s] (positive to the left) and
+# position [m] in any frame that is constant for the day; NaN where it was not measured.
+BurstMotion = Float[np.ndarray, "M 4"]
 
-    speed_mps: Float[np.ndarray, " M"]
-    yaw_rate_radps: Float[np.ndarray, " M"]  # positive to the left
-    position_m: Float[np.ndarray, "M 2"]  # in any frame that is constant for the day
 
-    @classmethod
-    def unknown(cls, count: int) -> BurstMotion:
-        """Unknown motion for `count` bursts."""
-        return cls(np.full(count, np.nan), np.full(count, np.nan), np.full((count, 2), np.nan))
-
-    def take(self, i: int, state: EgoState | None) -> None:
-        """Set the motion of a burst, if it was measured."""
-        if state is not None:
-            self.speed_mps[i], self.yaw_rate_radps[i] = state.speed_mps, state.yaw_rate_radps
-            self.position_m[i] = state.T_odom_vehicle[:2, 3]
+def _motion_of(state: EgoState | None) -> tuple[float, ...]:
+    return (
+        (np.nan,) * 4
+        if state is None
+        else (state.speed_mps, state.yaw_rate_radps, *state.T_odom_vehicle[:2, 3])
+    )
 
 
 @dataclass(frozen=True)
@@ -161,9 +153,7 @@ def plan_sweeps(
     order = np.argsort(logged_ns, kind="stable")
     possible = possible_bursts(logged_ns[order], budget, is_motion_known=len(ego) > 0)
     stamps = stamps_ns[order][np.searchsorted(logged_ns[order], possible.middle_ns[:, 1])]
-    motion = BurstMotion.unknown(len(stamps))
-    for i, stamp in enumerate(stamps.tolist()):
-        motion.take(i, ego.at(stamp))
+    motion = np.array([_motion_of(ego.at(stamp)) for stamp in stamps.tolist()], np.float64)
     return _reading(possible, motion, len(order), budget, 0)
 
 
@@ -187,21 +177,21 @@ def _reading(
 
 def _motion_at(day: _Day, middle_ns: Int64[np.ndarray, "M 3"], by: Role | None) -> BurstMotion:
     """Motion of the car at these sweeps, from odometry or from a radar scan's Doppler."""
-    motion = BurstMotion.unknown(len(middle_ns))
+    motion = np.full((len(middle_ns), 4), np.nan)
     if by is None:
         return motion
     edges = _between(middle_ns)
     for _, message in day.messages({by}, _glances(middle_ns, _GLANCE_NS)):
         i = int(np.searchsorted(edges, message.log_time_ns))
-        if not np.isnan(motion.speed_mps[i]):
+        if not np.isnan(motion[i, 0]):
             continue
-        with suppress(LogError, *DECODE_ERRORS):
+        with suppress(*DECODE_ERRORS):
             if by.what == RADAR:
-                motion.speed_mps[i] = _speed_by_doppler(message, day.rig.radars[by.sensor])
+                motion[i, 0] = _speed_by_doppler(message, day.rig.radars[by.sensor])
             else:
                 track = EgoTrack()
                 track.add(0, decode(message.channel, message.data))
-                motion.take(i, track.at(0))
+                motion[i] = _motion_of(track.at(0))
     return motion
 
 
@@ -311,17 +301,12 @@ def choose_bursts(motion: BurstMotion, count: int) -> list[int]:
 
 def _classes(motion: BurstMotion, count: int) -> Int64[np.ndarray, "M 4"]:
     """Class of each burst in time, speed, turn and place; -1 if unknown."""
-    possible = len(motion.speed_mps)
-    speed = np.searchsorted(_SPEEDS_MPS, np.abs(motion.speed_mps))
-    turn = np.searchsorted(_YAW_RATES_RADPS, motion.yaw_rate_radps)
-    cell = np.floor(np.nan_to_num(motion.position_m) / _PLACE_M)
+    possible, unknown = len(motion), np.isnan(motion)
+    time = np.arange(possible) * count // max(possible, 1)
+    speed = np.searchsorted(_SPEEDS_MPS, np.abs(motion[:, 0]))
+    turn = np.searchsorted(_YAW_RATES_RADPS, motion[:, 1])
+    cell = np.floor(np.nan_to_num(motion[:, 2:]) / _PLACE_M)
     place = np.unique(cell, axis=0, return_inverse=True)[1].reshape(-1)
-    return np.stack(
-        [
-            np.arange(possible) * count // max(possible, 1),
-            np.where(np.isnan(motion.speed_mps), -1, speed),
-            np.where(np.isnan(motion.yaw_rate_radps), -1, turn),
-            np.where(np.isnan(motion.position_m).any(axis=1), -1, place),
-        ],
-        axis=1,
-    ).astype(np.int64)
+    classes = np.stack([time, speed, turn, place], axis=1).astype(np.int64)
+    classes[:, 1:][unknown[:, :3]] = -1  # of a place, x and y are known or neither
+    return classes

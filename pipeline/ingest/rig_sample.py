@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Final, TypeVar
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float
@@ -36,7 +36,6 @@ from schemas.moments import Moment
 
 __all__ = ["PairFinding", "RigFinding", "RigSample", "dof_counts", "rig_finding"]
 
-Topics = TypeVar("Topics")
 _COUNTED: Final = ("roll", "pitch", "yaw", "x", "y", "z")
 
 
@@ -146,13 +145,27 @@ class RigSample:
         tied = [
             between(self.stars.get(m.log, {}), edge.parent.name, edge.child.name) is not None for m in own
         ]
-        found = _evidence(self.frames(chosen), _only(self.rig, chosen), self.motion(chosen))
-        return replace(
-            found,
+        motion, frames = self.motion(chosen), self.frames(chosen)
+        semantics = self.rig.cameras[chosen["camera"]].semantics if "camera" in chosen else None
+        # Without a camera, or one that is silent, no labels are lacking, but there are no boxes either.
+        computed = isinstance(semantics, OnnxSemantics)
+        seen, swept, scanned = ([f for f in frames if kind in f.sensors] for kind in SENSORS)
+        labelled = _share([f.labels_png is not None for f in seen])
+        return Evidence(
             frames=self._usable(len(own)),
-            rings=self._rings(chosen),
             has_prior=2 * sum(tied) > len(tied),
+            labels_share=1.0 if not seen or computed else labelled,
+            detections_share=1.0 if computed else _share([f.detection_boxes_px is not None for f in seen]),
+            has_intensity=_share([f.lidar_intensity is not None for f in swept]) > 0.5,
+            rings=self._rings(chosen),
+            elevation_share=_share([f.radar_has_elevation for f in scanned]),
+            moving_share=motion.moving_share,
+            doppler_problem=motion.doppler_problem,
+            doppler_is_wrong=motion.doppler_is_wrong,
+            wrong=motion.wrong,
             missing=tuple(why for name in self.missing if name in ends for why in self.missing[name]),
+            has_odometry=any(f.ego_speed_mps is not None for f in frames),
+            names_semantics=not seen or semantics is not None,
         )
 
     def frames(self, chosen: Mapping[str, str]) -> list[Frame]:
@@ -223,20 +236,6 @@ class RigSample:
         return {name: view for name, view in views.items() if view is not None}
 
 
-def _only(rig: Rig, chosen: Mapping[str, str]) -> Rig:
-    """The rig with only these sensors, at most one of a kind."""
-
-    def kept(kind: str, of: Mapping[str, Topics]) -> dict[str, Topics]:
-        return {name: topics for name, topics in of.items() if chosen.get(kind) == name}
-
-    cameras, lidars, radars = (
-        kept("camera", rig.cameras),
-        kept("lidar", rig.lidars),
-        kept("radar", rig.radars),
-    )
-    return rig.model_copy(update={"cameras": cameras, "lidars": lidars, "radars": radars})
-
-
 def _points(capture: Sweep | Scan) -> Float[np.ndarray, "N 3"]:
     if isinstance(capture, Sweep):
         xyz = np.stack((capture.lidar_x_m, capture.lidar_y_m, capture.lidar_z_m), -1)
@@ -245,31 +244,8 @@ def _points(capture: Sweep | Scan) -> Float[np.ndarray, "N 3"]:
     return xyz[np.isfinite(xyz).all(axis=1)]
 
 
-def _evidence(frames: list[Frame], rig: Rig, motion: Motion) -> Evidence:
-    """Facts on at most one camera, lidar and radar; frame counts and rings are computed elsewhere."""
-
-    def share(flags: list[bool]) -> float:
-        return float(np.mean(flags)) if flags else 0.0
-
-    # Without a camera, or one that is silent, no labels are lacking, but there are no boxes either.
-    computed = isinstance(rig.semantics, OnnxSemantics)
-    seen, swept, scanned = ([f for f in frames if kind in f.sensors] for kind in SENSORS)
-    labelled = share([f.labels_png is not None for f in seen])
-    return Evidence(
-        frames=len(frames),
-        has_prior=True,
-        labels_share=1.0 if not seen or computed else labelled,
-        detections_share=1.0 if computed else share([f.detection_boxes_px is not None for f in seen]),
-        has_intensity=share([f.lidar_intensity is not None for f in swept]) > 0.5,
-        rings=0,
-        elevation_share=share([f.radar_has_elevation for f in scanned]),
-        moving_share=motion.moving_share,
-        doppler_problem=motion.doppler_problem,
-        doppler_is_wrong=motion.doppler_is_wrong,
-        wrong=motion.wrong,
-        has_odometry=any(f.ego_speed_mps is not None for f in frames),
-        names_semantics=not seen or rig.semantics is not None,
-    )
+def _share(flags: list[bool]) -> float:
+    return float(np.mean(flags)) if flags else 0.0
 
 
 def _rings(frame: Frame) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 from collections import Counter
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,9 +12,7 @@ from jaxtyping import Int64
 
 from pipeline.core.config import FleetConfig, IngestConfig
 from pipeline.core.errors import ConfigError
-from pipeline.core.results import Progress
 from pipeline.core.stage_work import NothingUsable, Run, Task, Work
-from pipeline.ingest.captures import Rejected
 from pipeline.ingest.containers.reader import content_identity, leads_nowhere
 from pipeline.ingest.index import DayIndex, index_logs
 from pipeline.ingest.moments import REPEATED, Anchored, MomentBuilder, spread
@@ -46,7 +44,7 @@ from schemas.moments import (
     Moment,
 )
 
-__all__ = ["find_moments", "pick_moments", "read_file_prior", "work"]
+__all__ = ["pick_moments", "read_file_prior", "work"]
 
 _PROBLEMS_SHOWN = 3
 # Rejections that state a fault.
@@ -109,14 +107,13 @@ def _rows(
         builder = MomentBuilder(index, rig, config, file_prior)
         anchored, rejected = pick_moments(index, rig, config)
         made = 0
-        for row in _built(anchored, builder, index, rejected, run.progress):
-            made += 1
+        for made, row in enumerate(builder.built(anchored, rejected, run.progress), 1):  # noqa: B007
             yield row
         counts = rejected + index.damage + builder.counts
         run.rejected.update({str(k): int(v) for k, v in counts.items() if v})
         run.kept.update(_reading_counts(index))
         if not made:
-            raise NothingUsable(*refusal(index, rig, rejected, config, unheard))
+            raise NothingUsable(*_refusal(index, rig, rejected, config, unheard))
         _complain_of_date(index, task.partition.day)
         run.extra |= {
             "problems": index.problems,
@@ -125,7 +122,7 @@ def _rows(
         }
         run.extra[PRIOR] = builder.prior.rows()
         run.extra[TF] = builder.prior.frames_above()
-        run.extra[SENSORS_ABSENT] = absences(index, rig, builder.counts, config, unheard)
+        run.extra[SENSORS_ABSENT] = _absences(index, rig, builder.counts, config, unheard)
         run.extra[STATED_FAULTS] = ["configuration"] if any(u.is_misconfigured for u in unheard) else []
         run.remarks = _shorten(index.problems)
     finally:
@@ -144,7 +141,7 @@ def _complain_of_date(index: DayIndex, day: str) -> None:
 
 def pick_moments(index: DayIndex, rig: Rig, config: IngestConfig) -> tuple[list[Anchored], Counter[str]]:
     """Captures by moment, in order of time, at most `max_frames`; and unused sweeps by reason."""
-    found, drives = find_moments(index, rig, config), _drives(index)
+    found, drives = _find_moments(index, rig, config), _drives(index)
     picked = spread(len(found.anchor), config.max_frames)
     places = {index.anchor: found.anchor, **found.others}
     anchored = [
@@ -158,7 +155,7 @@ def pick_moments(index: DayIndex, rig: Rig, config: IngestConfig) -> tuple[list[
     return anchored, +(found.rejected + Counter({Rejection.NOT_PICKED: len(found.anchor) - len(picked)}))
 
 
-def find_moments(index: DayIndex, rig: Rig, config: IngestConfig) -> Matched:
+def _find_moments(index: DayIndex, rig: Rig, config: IngestConfig) -> Matched:
     """All moments of the day, or of its bursts, within the configured gate.
 
     Moments are built about the sweeps of the first lidar; without any sweep, about the first radar's scans.
@@ -185,7 +182,7 @@ def _tied(rig: Rig, anchor: str) -> set[str] | None:
     return {s.name for s in sensors if rig.base is not None or {s.name, anchor} in ends}
 
 
-def refusal(
+def _refusal(
     index: DayIndex, rig: Rig, rejected: Counter[str], config: IngestConfig, unheard: Sequence[Unheard]
 ) -> tuple[str, ...]:
     """Reason why a day gives no frame, with topic and remedy; then the faults that it states."""
@@ -209,7 +206,7 @@ def refusal(
     return _shorten([what, *index.problems]), *faults
 
 
-def absences(
+def _absences(
     index: DayIndex, rig: Rig, counts: Counter[str], config: IngestConfig, unheard: Sequence[Unheard]
 ) -> dict[str, str]:
     """By missing sensor, the reason, with topic and remedy."""
@@ -265,25 +262,6 @@ def _drives(index: DayIndex) -> Int64[np.ndarray, " N"]:
     drives = np.zeros(len(order), np.int64)
     drives[order] = number_drives([sweeps.stamps[i] for i in order], [sweeps.located[i].log for i in order])
     return drives
-
-
-def _built(
-    anchored: list[Anchored],
-    builder: MomentBuilder,
-    index: DayIndex,
-    rejected: Counter[str],
-    progress: Progress,
-) -> Iterator[tuple[Moment, dict[str, Capture]]]:
-    moment = 0
-    for done, at in enumerate(anchored, 1):
-        try:
-            yield builder.build(at, moment)
-            moment += 1
-        except Rejected as outcome:
-            rejected[outcome.reason] += 1
-            if rejected[outcome.reason] == 1 and outcome.detail:
-                index.complain(f"{outcome.reason}: {outcome.detail}")
-        progress(done, len(anchored), "frames")
 
 
 def _reading_counts(index: DayIndex) -> dict[str, int]:

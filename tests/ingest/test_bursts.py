@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.ingest.containers.timeline import Chunk, Stretches, Timeline, timeline_of_chunks
-from pipeline.ingest.reading_plan import BURST_TRIOS, BurstMotion, choose_bursts, possible_bursts
+from pipeline.ingest.containers.timeline import Chunk, Stretches, timeline_of_chunks
+from pipeline.ingest.reading_plan import BURST_TRIOS, choose_bursts, possible_bursts
 
 S = 10**9
 gaps = st.lists(st.tuples(st.integers(1, 4000), st.integers(3, 4000)), min_size=1, max_size=12)
@@ -40,19 +40,6 @@ def test_possible_bursts_hold_equally_many_sweeps_without_a_pause_where_that_can
     assert len(found.spans_ns) <= -(-budget // length) * (3 if known else 1)
 
 
-def test_sweeps_in_clumps_are_read_as_many_at_a_time_as_those_that_come_evenly():
-    # Clumps of 1 to 12 sweeps, seconds to a minute apart: 400 sweeps in which no stretch is as long as a burst.
-    rng = np.random.default_rng(1)
-    sizes = rng.integers(1, 13, 80)
-    starts = np.cumsum(rng.uniform(3, 60, 80) + sizes / 10)
-    times = np.concatenate([start + np.arange(n) / 10 for start, n in zip(starts, sizes, strict=True)])
-    times = (times * S).astype(np.int64)
-    found = possible_bursts(times, 80, is_motion_known=False)
-    assert found.sweeps < BURST_TRIOS  # there are no tracks to gain, and so more scenes are seen
-    held = [int(((times >= a) & (times <= b)).sum()) for a, b in found.spans_ns]
-    assert held == [found.sweeps] * (80 // found.sweeps)
-
-
 @given(st.lists(st.tuples(st.integers(0, 100), st.integers(0, 100)), max_size=20), st.integers(-5, 110))
 def test_a_moment_is_in_stretches_where_it_is_in_one_of_the_spans_they_were_merged_from(spans, moment):
     spans = [(min(s), max(s)) for s in spans]
@@ -64,8 +51,7 @@ def test_a_moment_is_in_stretches_where_it_is_in_one_of_the_spans_they_were_merg
 @given(st.integers(1, 60), st.integers(1, 30), st.integers(0, 2**32 - 1))
 def test_as_many_bursts_are_chosen_as_asked_for_each_once_and_in_order(possible, count, seed):
     rng = np.random.default_rng(seed)
-    of_each = rng.uniform(0, 30, possible), rng.normal(0, 0.1, possible)
-    drive = BurstMotion(*of_each, rng.normal(0, 1e3, (possible, 2)))
+    drive = rng.normal((15, 0, 0, 0), (5, 0.1, 1e3, 1e3), (possible, 4))
     chosen = choose_bursts(drive, count)
     assert len(chosen) == min(possible, count)
     assert chosen == sorted(set(chosen))
@@ -73,29 +59,28 @@ def test_as_many_bursts_are_chosen_as_asked_for_each_once_and_in_order(possible,
 
 
 def test_nothing_known_of_the_motion_leaves_bursts_spread_over_time():
-    chosen = choose_bursts(BurstMotion.unknown(60), 20)
+    chosen = choose_bursts(np.full((60, 4), np.nan), 20)
     assert np.all(np.diff(chosen) <= 5)
     assert np.bincount(np.array(chosen) // 3, minlength=20).tolist() == [1] * 20
 
 
 def test_of_a_day_that_mostly_stood_the_driven_part_is_read():
     # 60 possible bursts: parked but for 15, at several speeds, in bends and at several places.
-    speed, yaw_rate, position = np.zeros(60), np.zeros(60), np.zeros((60, 2))
-    driven = np.arange(20, 35)
-    speed[driven] = np.linspace(2, 30, 15)
-    yaw_rate[driven] = np.linspace(-0.3, 0.3, 15)
-    position[driven, 0] = 250.0 * np.arange(15)
-    chosen = choose_bursts(BurstMotion(speed, yaw_rate, position), 20)
+    motion, driven = np.zeros((60, 4)), np.arange(20, 35)
+    motion[driven, 0] = np.linspace(2, 30, 15)
+    motion[driven, 1] = np.linspace(-0.3, 0.3, 15)
+    motion[driven, 2] = 250.0 * np.arange(15)
+    chosen = choose_bursts(motion, 20)
     assert np.isin(driven, chosen).sum() >= 13  # an even spread would have 5
     assert min(chosen) < 20  # and the rest of the day is not forgotten
     assert max(chosen) >= 35
 
 
-@pytest.mark.parametrize(("kind", "value"), [("speed", 28.0), ("turn", 0.2), ("place", 5e3)])
+@pytest.mark.parametrize(("kind", "value"), [(0, 28.0), (1, 0.2), (2, 5e3)], ids=["speed", "turn", "place"])
 def test_what_comes_once_a_day_is_read(kind, value):
-    speed, yaw_rate, position = np.full(60, 12.0), np.zeros(60), np.zeros((60, 2))
-    {"speed": speed, "turn": yaw_rate, "place": position}[kind][47] = value
-    assert 47 in choose_bursts(BurstMotion(speed, yaw_rate, position), 20)
+    motion = np.tile([12.0, 0, 0, 0], (60, 1))
+    motion[47, kind] = value
+    assert 47 in choose_bursts(motion, 20)
 
 
 def test_a_pause_within_a_chunk_is_no_recorded_time():
@@ -109,19 +94,3 @@ def test_a_pause_within_a_chunk_is_no_recorded_time():
     found = possible_bursts(timeline.counted["/lidar"].times_ns(), 400, is_motion_known=False).spans_ns
     read = sum(int(((times >= start) & (times <= end)).sum()) for start, end in found)
     assert read == pytest.approx(400, rel=0.1)
-
-
-def test_an_index_that_counts_messages_says_when_each_was_logged_to_within_its_chunk():
-    # Clumps: one chunk has twelve sweeps within a second, the next one within ten.
-    rng = np.random.default_rng(2)
-    starts = np.cumsum(rng.uniform(3, 30, 50)) + 1_700_000_000
-    sizes = rng.integers(1, 13, 50)
-    chunks = [
-        Chunk(i, 1, int(at * S), int((at + 1) * S), frozenset({1, 2}), {1: int(n), 2: 7})
-        for i, (at, n) in enumerate(zip(starts, sizes, strict=True))
-    ]
-    timeline = timeline_of_chunks(chunks, {1: "/lidar", 2: "/odometry"}, {1: int(sizes.sum()), 2: 350})
-    times = timeline.counted["/lidar"].times_ns()
-    assert [sum(c.start_ns <= t <= c.end_ns for t in times) for c in chunks] == sizes.tolist()
-    both = Timeline.joined([timeline, timeline]).counted["/lidar"].times_ns()
-    np.testing.assert_allclose(both[::2], times, atol=S)

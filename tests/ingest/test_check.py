@@ -15,7 +15,7 @@ from pipeline.ingest.check import check_logs
 from pipeline.ingest.directions_and_units import doppler_speed
 from pipeline.ingest.readiness import Evidence, judge_edge, overall
 from pipeline.rig.rig import Rig
-from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, SENSORS
+from schemas.calibrations import FRAMES_OF_PAIR, PAIRS
 from tests.makers.fleet_files import fleet_toml
 
 GOOD = Evidence(
@@ -31,46 +31,31 @@ def judge(**changes):
 
 
 @pytest.mark.parametrize(
-    ("changes", "answer"), [({}, "yes"), ({"frames": 3}, "no"), ({"has_prior": False}, "no")]
-)
-def test_good_evidence_gives_a_yes_and_no_evidence_a_no(changes, answer):
-    assert judge(**changes)[1] == answer
-
-
-@pytest.mark.parametrize(
-    ("lack", "pair", "dof", "word"),
+    ("changes", "pair", "dof", "verdict", "reason", "answer"),
     [
-        ({"elevation_share": 0.0}, "lidar_radar", "roll, pitch and z", "elevation"),
-        ({"elevation_share": 0.0}, "camera_radar", "roll and pitch", "elevation"),
-        ({"labels_share": 0.0}, "camera_lidar", "pitch", "semantic labels"),
-        ({"labels_share": 0.0, "names_semantics": False}, "camera_radar", "yaw", "models --fetch"),
-        ({"moving_share": 0.0}, "lidar_radar", "time offset", "moves in 0%"),
-    ],
-)
-def test_what_is_lacking_costs_just_the_dof_that_need_it(lack, pair, dof, word):
-    found, answer = judge(**lack)
-    assert (found[pair, dof].verdict, answer) == ("no", "partly")
-    assert word in found[pair, dof].reasons[0]
-    assert found["lidar_radar", "yaw, x and y"].verdict == "yes"
-
-
-@pytest.mark.parametrize(
-    ("changes", "pair", "dof", "verdict", "reason"),
-    [
-        ({"frames": 15}, "camera_lidar", "yaw and roll", "weak", "15 usable frames; 30 or more make it sharp"),
-        ({"has_intensity": False}, "camera_lidar", "pitch", "weak", ""),
-        ({"has_intensity": False, "rings": 64}, "camera_lidar", "pitch", "yes", ""),
-        ({"doppler_problem": "odd"}, "lidar_radar", "yaw, x and y", "weak", "odd"),
+        ({}, "camera_lidar", "yaw and roll", "yes", "", "yes"),
+        ({"frames": 3}, "camera_lidar", "yaw and roll", "no", "3 usable", "no"),
+        ({"has_prior": False}, "lidar_radar", "yaw, x and y", "no", "no prior", "no"),
+        ({"elevation_share": 0.0}, "lidar_radar", "roll, pitch and z", "no", "the radar measures no elevation", "partly"),
+        ({"elevation_share": 0.0}, "camera_radar", "roll and pitch", "no", "the radar measures no elevation", "partly"),
+        ({"labels_share": 0.0}, "camera_lidar", "pitch", "no", "no semantic labels", "partly"),
+        ({"labels_share": 0.0, "names_semantics": False}, "camera_radar", "yaw", "no", "no boxes", "partly"),
+        ({"moving_share": 0.0}, "lidar_radar", "time offset", "no", "the car moves in 0%", "partly"),
+        ({"frames": 15}, "camera_lidar", "yaw and roll", "weak", "15 usable frames; 30 or more make it sharp", "yes"),
+        ({"has_intensity": False}, "camera_lidar", "pitch", "weak", "the lidar has few rings", "yes"),
+        ({"has_intensity": False, "rings": 64}, "camera_lidar", "pitch", "yes", "", "yes"),
+        ({"doppler_problem": "odd"}, "lidar_radar", "yaw, x and y", "weak", "odd", "yes"),
         (
             {"frames": 0, "has_prior": False, "labels_share": 0.0}, "camera_lidar", "yaw and roll", "no",
-            "0 usable synchronised frames; at least 10 are needed (",
+            "0 usable synchronised frames; at least 10 are needed (", "no",
         ),
     ],
 )  # fmt: skip
-def test_weak_evidence_is_called_weak_with_its_reason(changes, pair, dof, verdict, reason):
-    found = judge(**changes)[0][pair, dof]
-    assert found.verdict == verdict
-    assert not reason or found.reasons[0].startswith(reason)
+def test_what_is_lacking_costs_just_the_dof_that_need_it(changes, pair, dof, verdict, reason, answer):
+    found, overall_answer = judge(**changes)
+    assert (found[pair, dof].verdict, overall_answer) == (verdict, answer)
+    assert "".join(found[pair, dof].reasons[:1]).startswith(reason)
+    assert answer == "no" or found["lidar_radar", "yaw, x and y"].verdict != "no"
 
 
 @settings(max_examples=40, deadline=None)
@@ -98,10 +83,8 @@ def report_on(kit, tmp_path, drive, **fleet):
 def with_clouds(kit, frames, topic, columns, drive=None):
     """A drive with other clouds on a topic: `columns` makes those of a frame."""
     drive = drive or kit.Kit(frames=frames).drive()
-    for i in range(frames):
-        stamp, frame_id = kit.START_NS + i * kit.PERIOD_NS, "lidar" if topic == kit.LIDAR else "radar"
-        drive.replaced(topic, i, drive.cloud(stamp, columns(i), frame_id=frame_id))
-    return drive
+    frame_id = "lidar" if topic == kit.LIDAR else "radar"
+    return drive.each(topic, lambda i, at: drive.cloud(at, columns(i), frame_id=frame_id))
 
 
 def test_a_complete_drive_is_fit_and_its_facts_are_right(kit, tmp_path):
@@ -144,17 +127,6 @@ def test_without_a_sensors_topic_its_pairs_alone_fail_and_nothing_else_is_said_t
         assert "/mistyped" in found.reasons[0]
         assert found.reasons[0].endswith("(prior, labels and motion were therefore not checked)")
         assert found.reasons[1:] == []
-
-
-@pytest.mark.parametrize("sensor", SENSORS)
-def test_a_rig_of_two_sensors_is_judged_by_its_one_pair(kit, tmp_path, sensor):
-    config = kit.fleet(ingest={"min_lidar_points": 500})
-    rig = config.rigs["default"].model_copy(update={f"{sensor}s": {}})
-    report = check_logs([kit.Kit(frames=40).drive().mcap(tmp_path / "a.mcap")], rig, config)
-    (pair,) = {v.pair for v in report.verdicts}
-    assert sensor not in FRAMES_OF_PAIR[pair]
-    assert report.answer in ("yes", "partly")
-    assert (report.sync.sweeps, report.sync.moments) == (40, 40)
 
 
 def test_a_planar_radar_is_noticed(kit, tmp_path):
@@ -254,12 +226,9 @@ def test_points_in_another_unit_are_named_with_the_unit_that_fits(
         assert f"{unit} fit" in found.reasons[0]
     result, _ = run_ingest(tmp_path / "a.mcap", fleet=kit.fleet(ingest={"min_lidar_points": 500}))
     assert result.rejected[f"without_{sensor}_{sensor}_points_in_another_unit"] == 12
-
-
-def test_a_log_in_which_both_clouds_are_in_millimetres_is_refused_as_unit(kit, tmp_path, run_ingest):
-    drive = with_clouds(kit, 12, kit.LIDAR, lambda i: scaled(kit.lidar(i), 1000))
-    with_clouds(kit, 12, kit.RADAR, lambda i: scaled(kit.radar(i), 1000), drive)
-    result, _ = run_ingest(drive.mcap(tmp_path / "a.mcap"))
+    for other, of in (("LIDAR", kit.lidar), ("RADAR", kit.radar)):
+        with_clouds(kit, 12, getattr(kit, other), lambda i, of=of: scaled(of(i), 1000), drive)
+    result, _ = run_ingest(drive.mcap(tmp_path / "both.mcap"), name="both")
     assert (result.status, result.faults) == ("refused", ("unit",))
 
 
@@ -326,12 +295,7 @@ def test_a_sensor_that_looks_back_is_told_from_a_sign(kit, tmp_path, street, dop
 def test_odometry_and_doppler_that_differ_by_a_unit_or_a_sign_are_named(
     kit, tmp_path, odometry, doppler, words, answer
 ):
-    drive = street_drive(kit, factor=doppler)
-    for i in range(-1, 21):
-        stamp = kit.START_NS + i * kit.PERIOD_NS
-        message = drive.odometry(stamp, 0.0, 0.0, odometry, 0.0)
-        drive.messages.append((kit.ODOMETRY, message.__msgtype__, stamp, message))
-    report = report_on(kit, tmp_path, drive)
+    report = report_on(kit, tmp_path, street_drive(kit, factor=doppler).driven(odometry))
     evidence = report.evidence
     shown = "; ".join([evidence.doppler_problem, *evidence.wrong])
     assert words in shown

@@ -151,8 +151,7 @@ def test_a_rig_without_a_sensor_reads_the_other_two(kit, tmp_path, run_ingest, s
 
 def test_a_wrong_type_on_a_topic_is_named(kit, tmp_path, run_ingest):
     drive = kit.Kit().drive()
-    for i in range(4):
-        drive.replaced(kit.RADAR, i, drive.info(kit.START_NS))
+    drive.each(kit.RADAR, lambda _, at: drive.info(at))
     result, _ = run_ingest(drive.mcap(tmp_path / "a.mcap"))
     assert result.status == "done"
     assert result.rejected["without_radar_no_radar_in_gate"] == 4
@@ -205,13 +204,12 @@ def test_each_fault_of_one_frame_costs_that_frame_under_its_own_name(kit, tmp_pa
 def test_an_image_that_is_late_by_as_much_as_all_others_costs_nothing_and_one_that_is_late_alone_goes(
     kit, tmp_path, run_ingest
 ):
-    drive, late = kit.Kit(frames=24).drive(), 40_000_000
-    for i in range(24):
-        stamp = kit.START_NS + i * kit.PERIOD_NS + late + (30_000_000 if i == 5 else 0)
-        drive.replaced(kit.IMAGE, i, drive.compressed(stamp, kit.jpeg(i)))
-    for i in range(-1, 26):
-        stamp = kit.START_NS + i * kit.PERIOD_NS
-        drive.add(kit.ODOMETRY, "nav_msgs/msg/Odometry", stamp, drive.odometry(stamp, 0.0, 0.0, 100.0, 0.0))
+    drive, late = kit.Kit(frames=24).drive().driven(100.0), 40_000_000
+
+    def image(i, at):
+        return drive.compressed(at + late + (30_000_000 if i == 5 else 0), kit.jpeg(i))
+
+    drive.each(kit.IMAGE, image)
     log = drive.mcap(tmp_path / "a.mcap")
     result, frames = run_ingest(log)
     assert [f.frame_index for f in frames] == list(range(23))
@@ -224,8 +222,7 @@ def test_an_image_that_is_late_by_as_much_as_all_others_costs_nothing_and_one_th
 
 def test_intrinsics_that_are_not_calibrated_cost_the_camera_with_what_to_do(kit, tmp_path, run_ingest):
     drive = kit.Kit().drive()
-    for i in range(4):
-        drive.replaced(kit.INFO, i, drive.info(kit.START_NS + i * kit.PERIOD_NS, focal_px=0.0))
+    drive.each(kit.INFO, lambda _, at: drive.info(at, focal_px=0.0))
     result, _ = run_ingest(drive.mcap(tmp_path / "a.mcap"))
     assert "zero K" in result.reason
     assert result.rejected["camera_info_unusable"] == 4

@@ -15,16 +15,6 @@ from tests.makers import foxglove_logs
 RNG = np.random.default_rng(0)
 
 
-def drive(kit, **options):
-    made = kit.Kit(**options).drive()
-    for i in range(10):  # from before the first sweep to after the last
-        stamp = kit.START_NS + i * kit.PERIOD_NS // 2 - kit.PERIOD_NS
-        made.add(
-            kit.ODOMETRY, "nav_msgs/msg/Odometry", stamp, made.odometry(stamp, 0.5 * i, 0.02 * i, 10.0, 0.4)
-        )
-    return made
-
-
 def assert_same_rows(frames, others):
     assert len(frames) == len(others) > 0
     for a, b in zip(frames, others, strict=True):
@@ -34,7 +24,7 @@ def assert_same_rows(frames, others):
 
 
 def test_a_foxglove_log_gives_the_rows_of_the_ros_log(kit, tmp_path, run_ingest):
-    made = drive(kit)
+    made = kit.Kit().drive().driven(10.0, 0.4)
     _, ros = run_ingest(made.mcap(tmp_path / "ros.mcap"), name="a")
     result, protobuf = run_ingest(foxglove_logs.write(made, tmp_path / "foxglove.mcap"), name="b")
     assert result.status == "done"
@@ -109,8 +99,7 @@ def test_the_ros_2_messages_of_foxglove_are_read_too(kit, tmp_path, run_ingest):
 
 def test_a_camera_that_says_nothing_of_its_lens_is_left_out_by_name(kit, tmp_path, run_ingest):
     made = kit.Kit().drive()
-    for i in range(4):
-        made.replaced(kit.INFO, i, made.info(kit.START_NS + i * kit.PERIOD_NS, focal_px=0.0))
+    made.each(kit.INFO, lambda _, at: made.info(at, focal_px=0.0))
     result, frames = run_ingest(foxglove_logs.write(made, tmp_path / "foxglove.mcap"))
     assert not any("camera" in f.sensors for f in frames)
     assert "the camera is not calibrated" in result.reason
@@ -170,7 +159,7 @@ def test_a_protobuf_channel_without_a_schema_is_refused_in_words(kit):
 
 
 def test_check_says_of_a_foxglove_log_what_it_says_of_the_ros_log(kit, tmp_path):
-    made, fleet = drive(kit), kit.fleet()
+    made, fleet = kit.Kit().drive().driven(10.0, 0.4), kit.fleet()
     logs = made.mcap(tmp_path / "ros.mcap"), foxglove_logs.write(made, tmp_path / "foxglove.mcap")
     ros, protobuf = (check_logs([log], fleet.rig_of("car"), fleet) for log in logs)
     assert {t.problem for t in protobuf.topics} == {""}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -323,6 +324,20 @@ class Kit:
         place = [i for i, m in enumerate(self.messages) if m[0] == topic][number]
         _, kind, log_time, _ = self.messages[place]
         self.messages[place] = (topic, getattr(message, "__msgtype__", kind), log_time, message)
+        return self
+
+    def each(self, topic: str, make: Callable[[int, int], Any]) -> Kit:
+        """Put `make(number, stamp of its frame)` in the place of the message of every frame of a topic."""
+        for i in range(self.frames):
+            self.replaced(topic, i, make(i, START_NS + i * PERIOD_NS))
+        return self
+
+    def driven(self, speed_mps: float, yaw_rate: float = 0.0) -> Kit:
+        """Add odometry of a constant motion, two messages a frame, from before the first to after the last."""
+        for i in range(-3, 2 * self.frames + 4):
+            stamp = START_NS + i * PERIOD_NS // 2
+            message = self.odometry(stamp, 0.05 * i * speed_mps, 0.05 * i * yaw_rate, speed_mps, yaw_rate)
+            self.add(ODOMETRY, "nav_msgs/msg/Odometry", stamp, message)
         return self
 
     # -- containers ----------------------------------------------------------

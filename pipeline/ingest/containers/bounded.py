@@ -8,7 +8,7 @@ from typing import Any
 import lz4.frame
 import zstandard
 
-__all__ = ["MOST_CHUNK_BYTES", "OversizedError", "most_bytes", "unpack", "unpack_zstd"]
+__all__ = ["MOST_CHUNK_BYTES", "ZSTD_MAGIC", "OversizedError", "most_bytes", "unpack", "unpack_zstd"]
 
 # Logs compress by 2 to 10, only label images by some hundred; data beyond that ratio and beyond a worker's
 # memory is a decompression bomb. A single chunk or message of up to 32 MiB (a raw picture of 8 Mpx has 24)
@@ -16,6 +16,7 @@ __all__ = ["MOST_CHUNK_BYTES", "OversizedError", "most_bytes", "unpack", "unpack
 _MOST_RATIO = 100
 _ANYWAY_BYTES = 32 << 20
 MOST_CHUNK_BYTES = 512 << 20
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _DECOMPRESSORS: dict[str, Any] = {"lz4": lz4.frame.LZ4FrameDecompressor, "bz2": bz2.BZ2Decompressor}
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Collection, Iterator
+from contextlib import suppress
 from io import BytesIO
 
 from mcap.data_stream import ReadDataStream
@@ -68,12 +69,8 @@ class McapLog(ChunkedLog):
                 channel_id, _, log_time, _ = _MESSAGE.unpack_from(content)
                 channel = self._wanted(channel_id, topics)
                 if channel is not None:
-                    yield RawMessage(
-                        channel,
-                        log_time,
-                        (-1, start + _MESSAGE.size, start + length),
-                        memoryview(content)[_MESSAGE.size :],
-                    )
+                    position = -1, start + _MESSAGE.size, start + length
+                    yield RawMessage(channel, log_time, position, memoryview(content)[_MESSAGE.size :])
             else:
                 self._learn(opcode, content)
 
@@ -109,15 +106,11 @@ class McapLog(ChunkedLog):
             start, end = position + _RECORD.size, position + _RECORD.size + length
             next_chunk = self._next_chunk(position)
             overruns = end > self._size or (next_chunk is not None and end > next_chunk)
-            if overruns or not (0 < opcode <= _LAST_OPCODE or opcode >= 0x80):
+            is_whole = not overruns and (0 < opcode <= _LAST_OPCODE or opcode >= 0x80)
+            if not is_whole or opcode in (Opcode.DATA_END, Opcode.FOOTER):
                 if next_chunk is None:
-                    self.damage["truncated" if end > self._size else "damaged_records"] += 1
-                    return
-                self.damage["damaged_records"] += 1
-                position = next_chunk
-                continue
-            if opcode in (Opcode.DATA_END, Opcode.FOOTER):
-                if next_chunk is None:
+                    if not is_whole:
+                        self.damage["truncated" if end > self._size else "damaged_records"] += 1
                     return
                 self.damage["damaged_records"] += 1
                 position = next_chunk
@@ -133,7 +126,7 @@ class McapLog(ChunkedLog):
         """Chunks listed in the summary, none if it is lost; also reads schemas, channels and counts."""
         try:
             tail = self._content(max(self._size - _FOOTER_SIZE - _MAGIC_SIZE, 0), _FOOTER_SIZE)
-            footer = Footer.read(ReadDataStream(BytesIO(tail[_RECORD.size :])))
+            footer = Footer.read(_stream(tail[_RECORD.size :]))
             summary_end = self._size - _FOOTER_SIZE - _MAGIC_SIZE
             first = max(summary_end - MOST_CHUNK_BYTES, 1)
             if tail[0] != Opcode.FOOTER or not first <= footer.summary_start < summary_end:
@@ -146,9 +139,10 @@ class McapLog(ChunkedLog):
                 content = summary[start:end]
                 self._learn(opcode, content)
                 if opcode == Opcode.CHUNK_INDEX:
-                    chunks.append(_chunk_of(ChunkIndex.read(ReadDataStream(BytesIO(content)))))
+                    chunks.append(_chunk_of(ChunkIndex.read(_stream(content))))
                 elif opcode == Opcode.STATISTICS:
-                    self._messages = _counts_of(content)
+                    with suppress(*_DAMAGED):
+                        self._messages = Statistics.read(_stream(content)).channel_message_counts
             self._trusted = footer.summary_crc != 0
             return sorted((c for c in chunks if c.position < footer.summary_start), key=lambda c: c.position)
         except _DAMAGED:
@@ -157,11 +151,11 @@ class McapLog(ChunkedLog):
     def _learn(self, opcode: int, content: bytes) -> None:
         try:
             if opcode == Opcode.SCHEMA:
-                schema = Schema.read(ReadDataStream(BytesIO(content)))
+                schema = Schema.read(_stream(content))
                 if not (self._trusted and schema.id in self._schemas):
                     self._schemas[schema.id] = schema
             elif opcode == Opcode.CHANNEL:
-                channel = ChannelRecord.read(ReadDataStream(BytesIO(content)))
+                channel = ChannelRecord.read(_stream(content))
                 if not (self._trusted and channel.id in self._channels):
                     self._channels[channel.id] = channel
                     self._resolved.pop(channel.id, None)
@@ -212,21 +206,12 @@ class McapLog(ChunkedLog):
 
 def _chunk_of(index: ChunkIndex) -> Chunk:
     channels = frozenset(index.message_index_offsets) or None  # a writer may leave message indexes out
-    return Chunk(
-        index.chunk_start_offset,
-        index.chunk_length,
-        index.message_start_time,
-        index.message_end_time,
-        channels,
-    )
+    span = index.message_start_time, index.message_end_time
+    return Chunk(index.chunk_start_offset, index.chunk_length, *span, channels)
 
 
-def _counts_of(statistics: bytes) -> dict[int, int]:
-    """Number of messages by channel; empty if the record is damaged."""
-    try:
-        return dict(Statistics.read(ReadDataStream(BytesIO(statistics))).channel_message_counts)
-    except _DAMAGED:
-        return {}
+def _stream(content: bytes) -> ReadDataStream:
+    return ReadDataStream(BytesIO(content))
 
 
 def _inner_records(data: bytes) -> Iterator[tuple[int, int, int]]:
@@ -248,6 +233,5 @@ def _channel(record: ChannelRecord, schema: Schema | None) -> Channel:
         definition = schema.data.decode(BYTES_AS_TEXT)
         return Channel(record.topic, schema.name, record.message_encoding, definition, PROTOBUF)
     name = schema.name if schema.name.count("/") != 1 else schema.name.replace("/", "/msg/")  # ROS 1 spelling
-    return Channel(
-        record.topic, name, record.message_encoding, schema.data.decode(errors="replace"), definition_format
-    )
+    definition = schema.data.decode(errors="replace")
+    return Channel(record.topic, name, record.message_encoding, definition, definition_format)

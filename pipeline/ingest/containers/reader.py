@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from pipeline.core.errors import LogError
+from pipeline.ingest.containers.bounded import ZSTD_MAGIC
 from pipeline.ingest.containers.timeline import Stretches, Timeline
 from pipeline.store.remote_logs import LogPath, RemoteLog
 
@@ -94,16 +95,16 @@ BACKENDS: dict[str, str] = {
     ".mcap": "pipeline.ingest.containers.mcap:McapLog",
     ".bag": "pipeline.ingest.containers.rosbag1:BagLog",
     ".db3": "pipeline.ingest.containers.rosbag2_sqlite:Db3Log",
-    ".zstd": "pipeline.ingest.containers.rosbag2_folder:CompressedLog",
+    ".zstd": "pipeline.ingest.containers.rosbag2_folder:CopiedLog",
     "folder": "pipeline.ingest.containers.rosbag2_folder:FolderLog",
-    "fetched": "pipeline.ingest.containers.rosbag2_folder:FetchedLog",
+    "fetched": "pipeline.ingest.containers.rosbag2_folder:CopiedLog",
 }
 _BY_RANGES = (".mcap", ".bag")  # logs in buckets that are read in place, by byte ranges
 _MAGIC = {
     b"\x89MCAP": ".mcap",
     b"#ROSBAG": ".bag",
     b"SQLite format 3\0": ".db3",
-    b"\x28\xb5\x2f\xfd": ".zstd",
+    ZSTD_MAGIC: ".zstd",
 }
 # Errors of container libraries for damaged bytes; backends turn them into counted damage or a LogError.
 READ_ERRORS = (

@@ -45,9 +45,8 @@ class BagLog(ChunkedLog):
             elif header["op"] == bytes([_MESSAGE]):  # bags without chunks
                 channel, stamp = self._message(header, topics)
                 if channel is not None:
-                    yield RawMessage(
-                        channel, stamp, (-1, start, start + length), memoryview(self._content(start, length))
-                    )
+                    content = memoryview(self._content(start, length))
+                    yield RawMessage(channel, stamp, (-1, start, start + length), content)
             elif header["op"] == bytes([_CONNECTION]):
                 self._learn(header, self._content(start, length))
 
@@ -134,12 +133,8 @@ class BagLog(ChunkedLog):
             package, *_, name = fields["type"].decode().split("/")
             if not package or package == name:
                 raise ValueError("type")
-            channel = Channel(
-                header["topic"].decode(),
-                f"{package}/msg/{name}",
-                "ros1",
-                fields["message_definition"].decode(),
-            )
+            definition = fields["message_definition"].decode()
+            channel = Channel(header["topic"].decode(), f"{package}/msg/{name}", "ros1", definition)
             self._channels[_U32.unpack(header["conn"])[0]] = channel
         except _DAMAGED:
             self.damage["damaged_records"] += 1
@@ -162,11 +157,8 @@ class BagLog(ChunkedLog):
             header_length = _U32.unpack_from(chunk, position)[0] if position + 4 <= size else size
             start = position + 8 + header_length
             header = _fields(chunk[position + 4 : start - 4]) if start <= size else None
-            if header is None:
-                self.damage["damaged_records"] += 1
-                return
-            end = start + _U32.unpack_from(chunk, start - 4)[0]
-            if end > size:
+            end = size + 1 if header is None else start + _U32.unpack_from(chunk, start - 4)[0]
+            if header is None or end > size:
                 self.damage["damaged_records"] += 1
                 return
             if header["op"] == bytes([_MESSAGE]):

@@ -6,28 +6,25 @@ import os
 import shutil
 import tempfile
 import time
-from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Collection, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import BinaryIO, cast
 
 import zstandard
 
 from pipeline.core.errors import LogError, StorageError
-from pipeline.ingest.containers.bounded import most_bytes
+from pipeline.ingest.containers.bounded import ZSTD_MAGIC, most_bytes
 from pipeline.ingest.containers.reader import ChunkCache, LogReader, Position, RawMessage, open_log
 from pipeline.ingest.containers.timeline import Stretches, Timeline
 from pipeline.store.atomic_write import NO_SPACE, is_running
-from pipeline.store.remote_logs import LogPath
+from pipeline.store.remote_logs import LogPath, RemoteLog
 
-__all__ = ["CompressedLog", "FetchedLog", "FolderLog"]
+__all__ = ["CopiedLog", "FolderLog"]
 
 # Size limit of one object, because a worker's scratch disk is small. MCAP and .bag have no limit.
 _MOST_FETCHED_BYTES = 16 << 30
 
-_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _UNPACKED = "boresight-unpacked-"  # followed by the id of the process that unpacked it
 _LEFT_BEHIND_S = 86400.0  # longer than any log is open
 _FILES = ("*.db3", "*.mcap", "*.db3.zstd", "*.mcap.zstd")
@@ -80,44 +77,31 @@ class FolderLog:
             log.close()
 
 
-class _CopiedLog(ABC):
-    """LogReader of a temporary copy of a log, which is removed on closing."""
+class CopiedLog:
+    """LogReader of a temporary copy, which is removed on closing.
+
+    For a file that rosbag2 compressed as a whole (.zstd), and for an object of a bucket that cannot be read in
+    place: a database, or such a file.
+    """
 
     def __init__(self, path: LogPath, cache: ChunkCache) -> None:
-        self.path = path
         _remove_left_behind()
         self._folder = tempfile.TemporaryDirectory(prefix=f"{_UNPACKED}{os.getpid()}-")
-        where = self._folder.name
+        where = Path(self._folder.name)
         try:
-            self._log = open_log(self._copied(Path(where)), cache)
+            copy = _unpacked(path, where) if isinstance(path, Path) else _fetched(path, where)
+            self._log = open_log(copy, cache)
         except (zstandard.ZstdError, OSError, LogError) as err:
             self._folder.cleanup()
             # a problem of this machine, not of the log
             if isinstance(err, OSError) and err.errno in NO_SPACE:
-                raise StorageError(where, f"no space left to unpack {path}") from err
+                raise StorageError(str(where), f"no space left to unpack {path}") from err
             raise LogError(str(path), f"cannot be unpacked: {err}") from err
         except BaseException:
             self._folder.cleanup()
             raise
-        self.damage = self._log.damage
-
-    @abstractmethod
-    def _copied(self, folder: Path) -> Path:
-        """Path of the copy in the folder."""
-
-    def timeline(self) -> Timeline | None:
-        """See LogReader."""
-        return self._log.timeline()
-
-    def scan(
-        self, topics: Collection[str] | None = None, within: Stretches | None = None
-    ) -> Iterator[RawMessage]:
-        """See LogReader."""
-        return self._log.scan(topics, within)
-
-    def read(self, position: Position) -> memoryview:
-        """See LogReader."""
-        return self._log.read(position)
+        self.path, self.damage = path, self._log.damage
+        self.timeline, self.scan, self.read = self._log.timeline, self._log.scan, self._log.read
 
     def close(self) -> None:
         """See LogReader."""
@@ -125,38 +109,30 @@ class _CopiedLog(ABC):
         self._folder.cleanup()
 
 
-class CompressedLog(_CopiedLog):
-    """A file that rosbag2 compressed as a whole (.zstd)."""
-
-    def _copied(self, folder: Path) -> Path:
-        plain = folder / self.path.name.removesuffix(".zstd")
-        most = most_bytes(self.path.stat().st_size)
-        with self.path.open("rb") as source, plain.open("wb") as target:
-            unpacked = zstandard.ZstdDecompressor().stream_reader(cast("BinaryIO", source))
-            while block := unpacked.read(1 << 22):
-                if target.tell() + len(block) > most:
-                    raise LogError(str(self.path), f"unpacks to more than {most} bytes, as no recording does")
-                target.write(block)
-        with plain.open("rb") as content:
-            if content.read(len(_ZSTD_MAGIC)) == _ZSTD_MAGIC:
-                raise LogError(str(self.path), "is compressed twice, as no recording is")
-        return plain
+def _unpacked(path: Path, folder: Path) -> Path:
+    plain = folder / path.name.removesuffix(".zstd")
+    most = most_bytes(path.stat().st_size)
+    with path.open("rb") as source, plain.open("wb") as target:
+        unpacked = zstandard.ZstdDecompressor().stream_reader(source)
+        while block := unpacked.read(1 << 22):
+            if target.tell() + len(block) > most:
+                raise LogError(str(path), f"unpacks to more than {most} bytes, as no recording does")
+            target.write(block)
+    with plain.open("rb") as content:
+        if content.read(len(ZSTD_MAGIC)) == ZSTD_MAGIC:
+            raise LogError(str(path), "is compressed twice, as no recording is")
+    return plain
 
 
-class FetchedLog(_CopiedLog):
-    """A bucket object that cannot be read in place: a database, or a file compressed as a whole."""
-
-    def _copied(self, folder: Path) -> Path:
-        size = self.path.stat().st_size
-        if size > _MOST_FETCHED_BYTES:
-            most = _MOST_FETCHED_BYTES >> 30
-            raise LogError(
-                str(self.path), f"has {size >> 30} GiB, and more than {most} are not fetched: use MCAP"
-            )
-        copy = folder / self.path.name
-        with self.path.open("rb") as source, copy.open("wb") as target:
-            shutil.copyfileobj(source, target, 1 << 24)
-        return copy
+def _fetched(path: RemoteLog, folder: Path) -> Path:
+    size, most = path.stat().st_size, _MOST_FETCHED_BYTES
+    if size > most:
+        what = f"has {size >> 30} GiB, and more than {most >> 30} are not fetched: use MCAP"
+        raise LogError(str(path), what)
+    copy = folder / path.name
+    with path.open("rb") as source, copy.open("wb") as target:
+        shutil.copyfileobj(source, target, 1 << 24)
+    return copy
 
 
 def _remove_left_behind() -> None:

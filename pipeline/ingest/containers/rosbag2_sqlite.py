@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterator
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -17,14 +18,14 @@ import numpy as np
 import zstandard
 
 from pipeline.core.errors import LogError
-from pipeline.ingest.containers.bounded import OversizedError, most_bytes, unpack_zstd
+from pipeline.ingest.containers.bounded import ZSTD_MAGIC, OversizedError, most_bytes, unpack_zstd
 from pipeline.ingest.containers.reader import Channel, ChunkCache, Position, RawMessage
 from pipeline.ingest.containers.timeline import Counted, Stretches, Timeline
 
 __all__ = ["Db3Log"]
 
-# rosbag2 can compress single messages; CDR starts with a zero byte, so this is unambiguous.
-_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+_ROWS = "SELECT id, topic_id, timestamp, data FROM messages WHERE"
+_DAMAGED = (apsw.Error, OverflowError, UnicodeDecodeError)
 _MOST_ROWS_SKIPPED = 1 << 20  # this many consecutive unreadable rows are treated as a lost tail
 # Exact counts by topic would read all rows, because there is no index of topics. A minute of a car's day has
 # some thousand rows; the first rows give the share of every periodic topic.
@@ -50,7 +51,7 @@ class Db3Log:
             query = "SELECT timestamp FROM messages ORDER BY timestamp"
             times = np.array([t for (t,) in self._db.execute(query)], np.int64)
             rows: Any = self._db.execute(_FIRST_ROWS).fetchall()
-        except (apsw.Error, OverflowError, UnicodeDecodeError, TypeError, ValueError):
+        except (*_DAMAGED, TypeError, ValueError):
             return None
         numbers = [(int(i), int(n), int(t)) for i, n, t in rows]
         seen = [(self._channels[i].topic, n, t) for i, n, t in numbers if i in self._channels]
@@ -102,10 +103,7 @@ class Db3Log:
 
     def _rows(self, wanted: list[int]) -> Iterator[tuple[int, int, int, object]]:
         marks = ",".join("?" * len(wanted))
-        query = (
-            "SELECT id, topic_id, timestamp, data FROM messages "  # noqa: S608  # marks are question marks
-            f"WHERE id > ? AND topic_id IN ({marks}) ORDER BY id"
-        )
+        query = f"{_ROWS} id > ? AND topic_id IN ({marks}) ORDER BY id"  # marks are question marks
         last, skip = 0, 1
         limit = self._last_row()
         while last <= limit and skip <= _MOST_ROWS_SKIPPED:
@@ -113,7 +111,7 @@ class Db3Log:
                 for row in self._db.execute(query, (last, *wanted)):
                     last, skip = row[0], 1
                     yield row
-            except (apsw.Error, OverflowError, UnicodeDecodeError):
+            except _DAMAGED:
                 # Skip the damaged row, and twice as many at each further failure: a lost tail ends soon.
                 self.damage["damaged_rows"] += 1
                 last, skip = last + skip, skip * 2
@@ -123,14 +121,11 @@ class Db3Log:
     def _rows_in(self, wanted: list[int], within: Stretches) -> Iterator[tuple[int, int, int, object]]:
         """Rows logged in these stretches, found by the index; a stretch with a damaged page ends there."""
         marks = ",".join("?" * len(wanted))
-        query = (
-            "SELECT id, topic_id, timestamp, data FROM messages "  # noqa: S608  # marks are question marks
-            f"WHERE timestamp BETWEEN ? AND ? AND +topic_id IN ({marks}) ORDER BY timestamp, id"
-        )
+        query = f"{_ROWS} timestamp BETWEEN ? AND ? AND +topic_id IN ({marks}) ORDER BY timestamp, id"
         for span in within.spans_ns:
             try:
                 yield from self._db.execute(query, (*span, *wanted))
-            except (apsw.Error, OverflowError, UnicodeDecodeError):
+            except _DAMAGED:
                 self.damage["damaged_rows"] += 1
 
     def _has_time_index(self) -> bool:
@@ -152,16 +147,14 @@ class Db3Log:
     def _read_channels(self) -> dict[int, Channel]:
         try:
             topics = self._db.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
-        except (apsw.Error, UnicodeDecodeError, OverflowError) as err:
+        except _DAMAGED as err:
             raise LogError(str(self.path), f"is not a readable ROS 2 bag: {err}") from err
         definitions: dict[str, tuple[str, str]] = {}
-        try:
+        with suppress(*_DAMAGED):  # bags up to ROS 2 Humble have no definitions
             rows = self._db.execute(
                 "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
             ).fetchall()
             definitions = {str(t): (str(text), "idl" if e == "ros2idl" else "msg") for t, e, text in rows}
-        except (apsw.Error, UnicodeDecodeError, OverflowError):
-            pass  # bags up to ROS 2 Humble have no definitions
         return {
             int(i): Channel(str(name), str(kind), str(encoding), *definitions.get(str(kind), ("", "msg")))
             for i, name, kind, encoding in topics
@@ -190,9 +183,7 @@ class _WholePagesFile(apsw.VFSFile):
         return size // self._page_size * self._page_size
 
 
-@lru_cache(maxsize=8)
-def _whole_pages(page_size: int) -> _WholePages:
-    return _WholePages(page_size)
+_whole_pages = lru_cache(maxsize=8)(_WholePages)
 
 
 def _open(path: Path) -> apsw.Connection:
@@ -219,7 +210,8 @@ def _open(path: Path) -> apsw.Connection:
 def _payload(data: object) -> bytes | None:
     if not isinstance(data, bytes):
         return None
-    if data[:4] != _ZSTD_MAGIC:
+    # rosbag2 can compress single messages; CDR starts with a zero byte, so this is unambiguous.
+    if data[:4] != ZSTD_MAGIC:
         return data
     try:
         announced = zstandard.get_frame_parameters(data).content_size

@@ -86,10 +86,8 @@ class Counted:
 
     def evened(self, recorded: Stretches) -> Counted:
         """Counts with one span per stretch of steady messages: chunks end by size, not by time."""
-        begins, kept = (
-            np.array([start for start, _ in recorded.spans_ns], np.int64),
-            list[tuple[int, int, float]](),
-        )
+        begins = np.array([start for start, _ in recorded.spans_ns], np.int64)
+        kept: list[tuple[int, int, float]] = []
         stretch = np.searchsorted(begins, self.start_ns, "right")
         order = np.lexsort((self.end_ns, stretch))
         for part in np.split(order, np.flatnonzero(np.diff(stretch[order])) + 1):

@@ -30,8 +30,10 @@ __all__ = [
     "header_stamp_ns",
 ]
 
-# errors of rosbags and numpy for malformed bytes
-DECODE_ERRORS = (*READ_ERRORS, struct.error, SerdeError, TypesysError, TypeError, AttributeError, MemoryError)
+# For malformed bytes, errors of `decode` and of the functions that read a decoded message.
+DECODE_ERRORS = (
+    LogError, *READ_ERRORS, struct.error, SerdeError, TypesysError, TypeError, AttributeError, MemoryError,
+)  # fmt: skip
 # CDR: 4 bytes of encapsulation, seconds, nanoseconds; ROS 1: sequence number, seconds, nanoseconds.
 _STAMP_END = 12
 _SEPARATOR = "=" * 80 + "\n"

@@ -31,20 +31,17 @@ __all__ = [
 ]
 
 
-def decode_other(data: bytes, check_size: Callable[[int, int], object]) -> np.ndarray:
-    """Pixels as 8 bit grey or BGR; `check_size` sees width and height first, and raises if implausible.
-
-    Raises:
-        ValueError: another format, or damaged.
-    """
+def _decode_other(data: bytes) -> np.ndarray:
+    """Pixels of another codec as 8 bit grey or BGR; raises ValueError as `inspect_image`."""
     sizes = next((of for at, magic, of in _FORMATS if data[at : at + len(magic)] == magic), None)
     if sizes is None:
         raise ValueError("neither JPEG, PNG, WebP, AVIF nor JPEG 2000")
+    flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         found = list(sizes(data))
         for width_px, height_px in found:
-            check_size(width_px, height_px)
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), _FLAGS) if found else None
+            _possible(width_px, height_px)
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if found else None
     except (cv2.error, struct.error):
         pixels = None
     if pixels is None:
@@ -79,7 +76,6 @@ def _jpeg2000_sizes(data: bytes) -> Iterator[tuple[int, int]]:
         yield right - left, bottom - top
 
 
-_FLAGS = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
 # For each format: position and value of its signature, and the function that reads the sizes in its header.
 _FORMATS: tuple[tuple[int, bytes, Callable[[bytes], Iterator[tuple[int, int]]]], ...] = (
     (8, b"WEBP", _webp_sizes),
@@ -100,38 +96,32 @@ _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _JPEG_EOI = b"\xff\xd9"
 _JPEG_SOF = {0xC0, 0xC1, 0xC2, 0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF}
 _JPEG_SOS, _JPEG_ALONE = 0xDA, {0x01, *range(0xD0, 0xD9)}
-# ROS names a Bayer pattern by its first two pixels, OpenCV by the middle of the second row: hence RGGB =
-# "BG".
-_CONVERSIONS = {
-    "rgb8": cv2.COLOR_RGB2BGR,
-    "rgba8": cv2.COLOR_RGBA2BGR,
-    "bgra8": cv2.COLOR_BGRA2BGR,
-    "bayer_rggb8": cv2.COLOR_BayerBG2BGR,
-    "bayer_bggr8": cv2.COLOR_BayerRG2BGR,
-    "bayer_gbrg8": cv2.COLOR_BayerGR2BGR,
-    "bayer_grbg8": cv2.COLOR_BayerGB2BGR,
-    "yuv422": cv2.COLOR_YUV2BGR_UYVY,
-    "uyvy": cv2.COLOR_YUV2BGR_UYVY,
-    "yuv422_yuy2": cv2.COLOR_YUV2BGR_YUYV,
-    "yuyv": cv2.COLOR_YUV2BGR_YUYV,
-    "nv12": cv2.COLOR_YUV2BGR_NV12,
-}
-_CHANNELS = {
-    "rgb8": 3,
-    "bgr8": 3,
-    "8uc3": 3,
-    "rgba8": 4,
-    "bgra8": 4,
-    "yuv422": 2,
-    "uyvy": 2,
-    "yuv422_yuy2": 2,
-    "yuyv": 2,
+# Channels, bytes per value, and conversion to BGR. ROS names a Bayer pattern by its first two pixels, OpenCV by
+# the middle of the second row: hence RGGB = "BG".
+_RAW: dict[str, tuple[int, int, int | None]] = {
+    "mono8": (1, 1, None),
+    "8uc1": (1, 1, None),
+    "mono16": (1, 2, None),
+    "16uc1": (1, 2, None),
+    "bgr8": (3, 1, None),
+    "8uc3": (3, 1, None),
+    "rgb8": (3, 1, cv2.COLOR_RGB2BGR),
+    "rgba8": (4, 1, cv2.COLOR_RGBA2BGR),
+    "bgra8": (4, 1, cv2.COLOR_BGRA2BGR),
+    "bayer_rggb8": (1, 1, cv2.COLOR_BayerBG2BGR),
+    "bayer_bggr8": (1, 1, cv2.COLOR_BayerRG2BGR),
+    "bayer_gbrg8": (1, 1, cv2.COLOR_BayerGR2BGR),
+    "bayer_grbg8": (1, 1, cv2.COLOR_BayerGB2BGR),
+    "yuv422": (2, 1, cv2.COLOR_YUV2BGR_UYVY),
+    "uyvy": (2, 1, cv2.COLOR_YUV2BGR_UYVY),
+    "yuv422_yuy2": (2, 1, cv2.COLOR_YUV2BGR_YUYV),
+    "yuyv": (2, 1, cv2.COLOR_YUV2BGR_YUYV),
+    "nv12": (1, 1, cv2.COLOR_YUV2BGR_NV12),
 }
 _LEAST_FOCAL_PX = 10.0  # a fisheye of 190 deg on 64 pixels has 20
 # Four times the pixels of car cameras (8 Mpx): decoding the size in a forged header would take minutes and
 # all memory.
 MOST_PIXELS = 32_000_000
-_BYTES = {"mono16": 2, "16uc1": 2}
 
 
 @dataclass(frozen=True)
@@ -157,7 +147,7 @@ def inspect_image(data: bytes) -> EncodedImage:
     if data[:8] == _PNG_MAGIC:
         width, height, *_ = _png_header(data)
         return EncodedImage(data, "png", *_possible(width, height))
-    return encode_pixels(decode_other(data, _possible))
+    return encode_pixels(_decode_other(data))
 
 
 def encode_pixels(pixels: np.ndarray) -> EncodedImage:
@@ -174,8 +164,9 @@ def encode_raw_image(message: Any) -> EncodedImage:
     """
     encoding = str(message.encoding).lower()
     pixels = _raw_pixels(message, encoding)
-    if encoding in _CONVERSIONS:
-        pixels = cv2.cvtColor(pixels, _CONVERSIONS[encoding])
+    conversion = _RAW[encoding][2]
+    if conversion is not None:
+        pixels = cv2.cvtColor(pixels, conversion)
     return EncodedImage(_to_png(pixels), "png", int(message.width), int(message.height))
 
 
@@ -288,9 +279,9 @@ def _png_header(data: bytes) -> tuple[int, int, int, int]:
 
 
 def _raw_pixels(message: Any, encoding: str) -> np.ndarray:
-    if encoding not in {*_CONVERSIONS, *_CHANNELS, *_BYTES, "mono8", "8uc1"}:
+    if encoding not in _RAW:
         raise ValueError(f"image encoding {message.encoding!r} is not supported")
-    channels, size = _CHANNELS.get(encoding, 1), _BYTES.get(encoding, 1)
+    channels, size, _ = _RAW[encoding]
     height, width, row = int(message.height), int(message.width), int(message.width) * channels * size
     if encoding == "nv12":  # below the luma rows, half as many rows hold the colours of 2x2 pixels each
         if height % 2 or width % 2:

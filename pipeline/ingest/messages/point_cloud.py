@@ -9,24 +9,26 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt16
 
-__all__ = ["TIME_FIELDS", "LidarCloud", "cloud_columns", "first_field", "read_lidar", "unit_that_fits"]
+__all__ = [
+    "TIME_FIELDS",
+    "LidarCloud",
+    "cloud_columns",
+    "first_field",
+    "read_lidar",
+    "unit_that_fits",
+    "within",
+]
 
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _INTENSITY = ("intensity", "reflectivity", "intensities", "i", "remission", "signal")
 _RING = ("ring", "channel", "line", "laser_id", "beam", "row")
 TIME_FIELDS = (
-    "time",
-    "t",
-    "timestamp",
-    "time_stamp",
-    "time_offset",
-    "offset_time",
-    "timeoffset",
-    "timestampOffset",
+    "time", "t", "timestamp", "time_stamp", "time_offset", "offset_time", "timeoffset", "timestampOffset",
     "point_time_offset",
-)
-# Drivers write (0, 0, 0) for a beam without return; real returns are never this near.
+)  # fmt: skip
+# Drivers write (0, 0, 0) for a beam without return; real returns of lidar and radar are never this near.
 _MIN_RANGE_M = 0.05
+_DROPPED = ("lidar_points_not_finite", "lidar_points_without_return", "lidar_points_beyond_range")
 _LONGEST_SWEEP_S = 1.0
 # 12 days after 1970, in seconds and nanoseconds: longer than any sweep, earlier than any date.
 _DATE_S, _DATE_NS = 1e6, 10**15
@@ -60,13 +62,9 @@ def cloud_columns(message: Any) -> np.ndarray:
     for f in message.fields:
         if int(f.datatype) not in _DATATYPES:
             raise ValueError(f"field {f.name!r} has the unknown datatype {f.datatype}")
-        count = max(int(f.count), 1)  # 0 violates the standard but is common
+        kind, count = order + _DATATYPES[int(f.datatype)], int(f.count)
         names.append(str(f.name))
-        formats.append(
-            (order + _DATATYPES[int(f.datatype)], (count,))
-            if count > 1
-            else order + _DATATYPES[int(f.datatype)]
-        )
+        formats.append((kind, (count,)) if count > 1 else kind)  # 0 violates the standard but is common
         offsets.append(int(f.offset))
     if height * width == 0:
         return np.zeros(0, np.dtype([(n, fmt) for n, fmt in zip(names, formats, strict=True)]))
@@ -107,7 +105,7 @@ def read_lidar(message: Any, stamp_ns: int, max_range_m: float) -> LidarCloud:
     points = cloud_columns(message)
     x, y, z = _coordinates(points)
     range2 = x * x + y * y + z * z
-    keep, dropped = _within(range2, max_range_m)
+    keep, dropped = within(range2, max_range_m, _DROPPED)
     intensity, ring = first_field(points, _INTENSITY), first_field(points, _RING)
     return LidarCloud(
         x[keep],
@@ -130,20 +128,24 @@ def _coordinates(points: np.ndarray) -> list[Float32[np.ndarray, " N"]]:
     return [points[n].astype(np.float32) for n in "xyz"]
 
 
-def _within(
-    range2: Float32[np.ndarray, " N"], max_range_m: float
+def within(
+    range2: Float[np.ndarray, " N"],
+    max_range_m: float,
+    reasons: tuple[str, str, str],
+    is_measured: bool | Bool[np.ndarray, " N"] = True,
 ) -> tuple[slice | Bool[np.ndarray, " N"], Counter[str]]:
-    """Index of the points with a return within range, and counts of dropped points by reason."""
-    keep = (range2 >= _MIN_RANGE_M**2) & (range2 <= max_range_m**2)  # False for NaN
+    """Index of the measured points within range, and counts of dropped points by reason.
+
+    Args:
+        range2: squared distances [m^2].
+        reasons: names of the counts of points that are not finite, that are too near, and that are too far.
+    """
+    keep = (range2 >= _MIN_RANGE_M**2) & (range2 <= max_range_m**2) & is_measured  # False for NaN
     if keep.all():
         return slice(None), Counter()
-    finite, near = np.isfinite(range2), range2 < _MIN_RANGE_M**2
-    dropped = {
-        "lidar_points_not_finite": int(np.sum(~finite)),
-        "lidar_points_without_return": int(np.sum(near)),
-        "lidar_points_beyond_range": int(np.sum(finite & ~near & ~keep)),
-    }
-    return keep, +Counter(dropped)
+    finite, near = np.isfinite(range2) & is_measured, range2 < _MIN_RANGE_M**2
+    counts = (int(np.sum(of)) for of in (~finite, finite & near, finite & ~near & ~keep))
+    return keep, +Counter(dict(zip(reasons, counts, strict=True)))
 
 
 def _ring(ring: np.ndarray | None, keep: slice | Bool[np.ndarray, " N"]) -> UInt16[np.ndarray, " M"] | None:
@@ -176,13 +178,9 @@ def _relative_time_s(
         seconds = kept.astype(np.float32)
     else:
         ticks = kept.astype(np.int64)
-        seconds = ((ticks - stamp_ns if len(ticks) and ticks[0] > _DATE_NS else ticks) * 1e-9).astype(
-            np.float32
-        )
-    is_within_sweep = not len(seconds) or (
-        seconds.min() > -_LONGEST_SWEEP_S and seconds.max() < _LONGEST_SWEEP_S
-    )
-    return seconds if is_within_sweep else None  # False for NaN too
+        ticks = ticks - stamp_ns if len(ticks) and ticks[0] > _DATE_NS else ticks
+        seconds = (ticks * 1e-9).astype(np.float32)
+    return seconds if np.all(np.abs(seconds) < _LONGEST_SWEEP_S) else None  # False for NaN too
 
 
 _IN_METRES = {"millimetres": 1e-3, "centimetres": 1e-2}

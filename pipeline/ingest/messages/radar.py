@@ -7,15 +7,16 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Float, Float32
 
 from pipeline.core.rigs import RadarTopics
-from pipeline.ingest.messages.point_cloud import cloud_columns, first_field, unit_that_fits
+from pipeline.ingest.messages.point_cloud import cloud_columns, first_field, unit_that_fits, within
 
 __all__ = ["RadarCloud", "read_radar"]
 
 _POWER = ("power", "rcs", "amplitude", "intensity", "snr", "snr_db", "power_db")
-_MIN_RANGE_M, _MAX_RANGE_M = 0.05, 1000.0  # automotive radars have shorter ranges; larger values are damaged
+_DROPPED = ("radar_points_not_finite", "radar_points_at_no_range", "radar_points_beyond_range")
+_MAX_RANGE_M = 1000.0  # automotive radars have shorter ranges; larger values are damaged
 _REACH_M = 300.0  # from data sheets of car radars
 _FLAT_RAD = 1e-6
 
@@ -45,7 +46,7 @@ def read_radar(message: Any, msgtype: str, config: RadarTopics) -> RadarCloud:
     kind = msgtype.rsplit("/", 1)[-1]
     xyz, range_rate, power = {"RadarScan": _scan, "RadarTracks": _tracks}.get(kind, _cloud)(message, config)
     range2 = np.einsum("ij,ij->i", xyz, xyz)
-    keep, dropped = _within(range2, range_rate)
+    keep, dropped = within(range2, _MAX_RANGE_M, _DROPPED, np.isfinite(range_rate))
     unit = unit_that_fits(np.sqrt(range2), _REACH_M) if 2 * dropped.total() > len(xyz) else ""
     xyz = xyz[keep]
     return RadarCloud(
@@ -56,23 +57,6 @@ def read_radar(message: Any, msgtype: str, config: RadarTopics) -> RadarCloud:
         dropped,
         unit,
     )
-
-
-def _within(
-    range2: Float[np.ndarray, " N"], range_rate_mps: Float[np.ndarray, " N"]
-) -> tuple[slice | Bool[np.ndarray, " N"], Counter[str]]:
-    """Index of the valid detections, and counts of dropped ones by reason."""
-    measured = np.isfinite(range_rate_mps)
-    keep = (range2 >= _MIN_RANGE_M**2) & (range2 <= _MAX_RANGE_M**2) & measured  # False for NaN
-    if keep.all():
-        return slice(None), Counter()
-    finite, near = np.isfinite(range2) & measured, range2 < _MIN_RANGE_M**2
-    dropped = {
-        "radar_points_not_finite": int(np.sum(~finite)),
-        "radar_points_at_no_range": int(np.sum(finite & near)),
-        "radar_points_beyond_range": int(np.sum(finite & ~near & ~keep)),
-    }
-    return keep, +Counter(dropped)
 
 
 _Columns = tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, " N"], Float[np.ndarray, " N"] | None]
@@ -116,12 +100,8 @@ def _scan(message: Any, config: RadarTopics) -> _Columns:
 
 
 def _tracks(message: Any, _config: RadarTopics) -> _Columns:
-    xyz = np.array([(t.position.x, t.position.y, t.position.z) for t in message.tracks], np.float64).reshape(
-        -1, 3
-    )
-    velocity = np.array(
-        [(t.velocity.x, t.velocity.y, t.velocity.z) for t in message.tracks], np.float64
-    ).reshape(-1, 3)
+    both = [(v.x, v.y, v.z) for t in message.tracks for v in (t.position, t.velocity)]
+    xyz, velocity = np.array(both, np.float64).reshape(-1, 2, 3).transpose(1, 0, 2)
     return xyz, _along(xyz, velocity), None
 
 

@@ -5,17 +5,19 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from pipeline.core.models import semantics_line
 from pipeline.ingest.messages.point_cloud import TIME_FIELDS
 from pipeline.ingest.propose.sensors import FoundCamera, FoundCloud, FoundSensors
 
-__all__ = ["Facts", "RadarMeaning", "fleet_text", "left_out", "names_of"]
+__all__ = ["RadarMeaning", "fleet_text", "left_out", "names_of"]
 
 _NO_NAME = re.compile(r"[^A-Za-z0-9_]+")
 _ENDINGS = ("_optical_frame", "_optical", "_frame", "_link")
 _COLUMN = 60  # column of comments behind a line
+_NO_TIMES = "# These clouds have no time per point. If the lidar turns, and its driver does not de-skew:"
+_NO_ODOMETRY = '# odometry = "/..."     # none in these logs: speed comes from Doppler'
 
 
 @dataclass(frozen=True)
@@ -32,28 +34,10 @@ class RadarMeaning:
     has_sign: bool = True
 
 
-@dataclass(frozen=True)
-class Facts:
-    """Content of the text in addition to the sensors.
-
-    Args:
-        untied: sensors that no chain of transforms reaches, with their frame ids.
-        vehicle_frames: frames of the transforms that may be the vehicle's.
-    """
-
-    static_topic: str
-    untied: Mapping[str, str]
-    vehicle_frames: Sequence[str]
-    meanings: Mapping[str, RadarMeaning] = field(default_factory=dict)
-
-
 def names_of(found: FoundSensors) -> dict[str, FoundCamera | FoundCloud]:
     """Sensors by name: their kind if there is one of each, else from frame ids."""
-    of_kind: dict[str, Sequence[FoundCamera | FoundCloud]] = {
-        "camera": found.cameras,
-        "lidar": found.lidars,
-        "radar": found.radars,
-    }
+    of_kind: dict[str, Sequence[FoundCamera | FoundCloud]]
+    of_kind = {"camera": found.cameras, "lidar": found.lidars, "radar": found.radars}
     if all(len(sensors) <= 1 for sensors in of_kind.values()):
         return {kind: sensors[0] for kind, sensors in of_kind.items() if sensors}
     names: dict[str, FoundCamera | FoundCloud] = {}
@@ -69,14 +53,25 @@ def names_of(found: FoundSensors) -> dict[str, FoundCamera | FoundCloud]:
 
 
 def fleet_text(
-    fleet: str, found: FoundSensors, names: Mapping[str, FoundCamera | FoundCloud], facts: Facts
+    fleet: str,
+    found: FoundSensors,
+    names: Mapping[str, FoundCamera | FoundCloud],
+    static_topic: str,
+    untied: Mapping[str, str],
+    vehicle_frame: str | None,
+    meanings: Mapping[str, RadarMeaning],
 ) -> str:
-    """Text of the file for a fleet of that name."""
+    """Text of the file for a fleet of that name.
+
+    Args:
+        untied: sensors that no chain of transforms reaches, with their frame ids.
+        vehicle_frame: frame of the transforms that may be the vehicle's.
+    """
     is_short = all(name in ("camera", "lidar", "radar") for name in names)
     lines = [
         "[fleet]",
         f"name = {json.dumps(fleet)}",
-        *_of_rig(facts, is_comment=is_short and bool(found.lidars)),
+        *_of_rig(vehicle_frame, is_comment=is_short and bool(found.lidars)),
     ]
     for name, sensor in names.items():
         kind = "camera" if isinstance(sensor, FoundCamera) else "lidar" if sensor in found.lidars else "radar"
@@ -86,21 +81,14 @@ def fleet_text(
         else:
             lines += [f"points = {json.dumps(sensor.topic)}"]
             if kind == "radar":
-                lines += _radar(sensor, facts.meanings.get(name, RadarMeaning()))
+                lines += _radar(sensor, meanings.get(name, RadarMeaning()))
             elif sensor.fields and not set(sensor.fields) & set(TIME_FIELDS):
-                lines += [
-                    "# These clouds have no time per point. If the lidar turns, and its driver does not de-skew:"
-                ]
-                lines += ['# turn = { sense = "right", begins_deg = 180.0 }']
+                lines += [_NO_TIMES, '# turn = { sense = "right", begins_deg = 180.0 }']
     if found.odometry:
         lines += ["", "[rigs.default.ego]", f"odometry = {json.dumps(found.odometry)}"]
     else:
-        lines += [
-            "",
-            "# [rigs.default.ego]",
-            '# odometry = "/..."     # none in these logs: speed comes from Doppler',
-        ]
-    lines += ["", *_prior(facts), "", '[vehicles."*"]', 'rig = "default"']
+        lines += ["", "# [rigs.default.ego]", _NO_ODOMETRY]
+    lines += ["", *_prior(static_topic, untied), "", '[vehicles."*"]', 'rig = "default"']
     lines += ["", *(f"# {what}" for what in left_out(found))] if found.left_out else []
     if found.passed_over:
         lines += ["", "# Not used:", *(f"#   {what}" for what in sorted(found.passed_over))]
@@ -115,11 +103,11 @@ def left_out(found: FoundSensors) -> list[str]:
     ]
 
 
-def _of_rig(facts: Facts, *, is_comment: bool) -> list[str]:
+def _of_rig(vehicle_frame: str | None, *, is_comment: bool) -> list[str]:
     """Lines on the vehicle frame, if it is logged: a comment where a lidar's x axis shows the way ahead."""
-    if not facts.vehicle_frames:
+    if vehicle_frame is None:
         return []
-    line = f"base = {json.dumps(facts.vehicle_frames[0])}"
+    line = f"base = {json.dumps(vehicle_frame)}"
     if is_comment:
         return ["", "# [rigs.default]", _with(f"# {line}", "for poses on the vehicle, too")]
     return ["", "[rigs.default]", _with(line, "the vehicle's frame")]
@@ -129,11 +117,9 @@ def _camera(camera: FoundCamera) -> Iterator[str]:
     yield f"image = {json.dumps(camera.image)}"
     yield f"info = {json.dumps(camera.info)}"
     if not (camera.labels and camera.detections):
-        has = "no" if not (camera.labels or camera.detections) else "only"
-        what = (
-            "label images or detections" if has == "no" else "label images" if camera.labels else "detections"
-        )
-        yield f"# The logs have {has} {what} of this camera; semantics are both. Without them, its borders are steps"
+        only = "only label images" if camera.labels else "only detections" if camera.detections else ""
+        has = only or "no label images or detections"
+        yield f"# The logs have {has} of this camera; semantics are both. Without them, its borders are steps"
         yield "# of brightness, and it has no edge to a radar. Better: log both, or name two models, of yours or those"
         yield "# that `boresight models --fetch` downloads into models/ (mind their licences):"
         yield f"# {semantics_line('models')}"
@@ -164,24 +150,19 @@ def _radar(radar: FoundCloud, meaning: RadarMeaning) -> Iterator[str]:
     elif not radar.msgtype.endswith("RadarTracks"):
         yield '# doppler_positive = "receding"     # or "approaching": undecided by these logs, see its data sheet'
     if meaning.period_mps is not None:
-        shown = "the Doppler wraps at this"
-        yield _with(f"doppler_period_mps = {meaning.period_mps:.5g}", shown)
+        yield _with(f"doppler_period_mps = {meaning.period_mps:.5g}", "the Doppler wraps at this")
 
 
-def _prior(facts: Facts) -> Iterator[str]:
+def _prior(static_topic: str, untied: Mapping[str, str]) -> Iterator[str]:
     yield "[rigs.default.prior]"
-    if facts.untied or not facts.static_topic:
-        frames = ", ".join(f"{name} ({frame or 'no frame id'})" for name, frame in facts.untied.items())
-        why = (
-            f"No chain of transforms to {frames}."
-            if facts.static_topic
-            else "The logs have no static transforms."
-        )
-        yield f"# {why} Log them, or write them down:"
+    if untied or not static_topic:
+        frames = ", ".join(f"{name} ({frame or 'no frame id'})" for name, frame in untied.items())
+        why = f"No chain of transforms to {frames}" if static_topic else "The logs have no static transforms"
+        yield f"# {why}. Log them, or write them down:"
         yield '# source = "file"'
         yield '# file = "prior.json"     # {"reference": SENSOR, "T": {SENSOR: 4x4, ...}}, or by `boresight import`'
-    if facts.static_topic not in ("", "/tf_static"):
-        yield f"topic = {json.dumps(facts.static_topic)}"
+    if static_topic not in ("", "/tf_static"):
+        yield f"topic = {json.dumps(static_topic)}"
     yield _with("rotation_sigma_deg = 2.0", "how far off the prior may be (1 sigma)")
     yield "translation_sigma_m = 0.05"
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,8 @@ from pipeline.core.errors import ConfigError
 from pipeline.core.results import Progress, silent
 from pipeline.ingest.directions_and_units import AskedRadar, doppler_speed, motion_of, opposed_signs
 from pipeline.ingest.index import index_logs
-from pipeline.ingest.moments import MomentBuilder
-from pipeline.ingest.propose.fleet_file import Facts, RadarMeaning, fleet_text, left_out, names_of
+from pipeline.ingest.moments import MomentBuilder, spread
+from pipeline.ingest.propose.fleet_file import RadarMeaning, fleet_text, left_out, names_of
 from pipeline.ingest.propose.sensors import FoundCamera, FoundCloud, FoundSensors, find_sensors
 from pipeline.ingest.propose.survey import Survey, survey_logs
 from pipeline.ingest.rig_sample import RigSample
@@ -66,12 +67,9 @@ def propose_fleet(logs: Sequence[Path], fleet: str, progress: Progress = silent)
     static, tree = _static(survey)
     tied_to = next((s.frame_id for s in [*found.lidars, *found.radars] if s.frame_id), "")
     untied = {n: s.frame_id for n, s in names.items() if tree.lookup(tied_to, s.frame_id) is None}
-    frames = [f for f in _VEHICLE_FRAMES if tree.lookup(tied_to, f) is not None]
-
-    def text(meanings: Mapping[str, RadarMeaning]) -> str:
-        return fleet_text(fleet, found, names, Facts(static, untied, frames, meanings))
-
-    meanings = _meanings(survey, text({}), found, names, frames, progress)
+    base = next((f for f in _VEHICLE_FRAMES if tree.lookup(tied_to, f) is not None), None)
+    text = partial(fleet_text, fleet, found, names, static, untied, base)
+    meanings = _meanings(survey, text({}), found, names, base, progress)
     signs = opposed_signs({name: m.positive for name, m in meanings.items()})
     problems = [*survey.problems, *left_out(found), *signs]
     problems += [f"{n}: {p}" for n, m in meanings.items() for p in m.problems]
@@ -95,7 +93,7 @@ def _meanings(
     text: str,
     found: FoundSensors,
     names: Mapping[str, FoundCamera | FoundCloud],
-    vehicle_frames: Sequence[str],
+    base: str | None,
     progress: Progress,
 ) -> dict[str, RadarMeaning]:
     """Doppler of each radar, tested on moments of the logs, in the direction in which it looks by tf."""
@@ -104,7 +102,6 @@ def _meanings(
     if not can_be_tried:
         return {}
     fleet = validated(FleetConfig, tomllib.loads(text), "fleet.toml")
-    base = next(iter(vehicle_frames), None)
     sample = _sample(survey.logs, fleet.rigs["default"].model_copy(update={"base": base}), fleet, progress)
     tracked = [n for n in can_be_tried if radars[n].msgtype.endswith("RadarTracks")]
     return {n: _meaning(replace(sample, tracked=tracked), n) for n in can_be_tried}
@@ -129,13 +126,14 @@ def _meaning(sample: RigSample, radar: str) -> RadarMeaning:
 def _sample(logs: Sequence[Path], rig: Rig, fleet: FleetConfig, progress: Progress) -> RigSample:
     index = index_logs(logs, rig)
     try:
-        anchored, _ = pick_moments(index, rig, fleet.ingest)
+        anchored, rejected = pick_moments(index, rig, fleet.ingest)
         builder = MomentBuilder(index, rig, fleet.ingest)
-        built, tried, _ = builder.sample(anchored, _SAMPLE, progress, "moments tried")
+        picked = [anchored[i] for i in spread(len(anchored), _SAMPLE)]
+        built = list(builder.built(picked, rejected, progress))
     finally:
         index.close()
     present = [frozenset(a.places) for a in anchored]
-    return RigSample(rig, built, tried, present, logged_stars(builder.prior.rows()), None, {})
+    return RigSample(rig, built, len(picked), present, logged_stars(builder.prior.rows()), None, {})
 
 
 def doppler_period(frames: Sequence[Frame], radar: AskedRadar) -> float | None:

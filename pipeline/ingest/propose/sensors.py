@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import cache
+from itertools import takewhile
 from typing import Any
 
 import cv2
@@ -16,6 +17,7 @@ from pipeline.ingest.messages.image import inspect_image, label_image, read_came
 from pipeline.ingest.messages.point_cloud import cloud_columns
 from pipeline.ingest.messages.video import video_codec
 from pipeline.ingest.propose.survey import Survey, Topic
+from pipeline.rig.cameras import Camera
 
 __all__ = ["FoundCamera", "FoundCloud", "FoundSensors", "find_sensors"]
 
@@ -40,7 +42,6 @@ class FoundCamera:
     frame_id: str
     image: str
     info: str
-    size_px: tuple[int, int]
     labels: str = ""
     label_set: str = ""
     labels_say: str = ""
@@ -180,7 +181,7 @@ def _camera(info: Topic, pictures: dict[str, tuple[Topic, tuple[int, int]]]) -> 
         )
 
     image = max(same, key=fit)
-    return FoundCamera(image.frame_id, image.name, info.name, size)
+    return FoundCamera(image.frame_id, image.name, info.name)
 
 
 def _with_semantics(
@@ -196,10 +197,11 @@ def _with_semantics(
     label, detection = of([t for t, _ in labels.values()]), of(detections)
     values = None if label is None else labels[label.name][1]
     known, say = ("", "") if values is None else _label_set(values)
-    return FoundCamera(
-        camera.frame_id, camera.image, camera.info, camera.size_px,
-        "" if label is None else label.name, known, say, "" if detection is None else detection.name,
-    )  # fmt: skip
+    topics = {
+        "labels": "" if label is None else label.name,
+        "detections": detection.name if detection else "",
+    }
+    return replace(camera, label_set=known, labels_say=say, **topics)
 
 
 def _label_set(values: np.ndarray) -> tuple[str, str]:
@@ -248,12 +250,11 @@ def _size_px(topic: Topic) -> tuple[int, int] | None:
     return None
 
 
-def _intrinsics(message: Any) -> Any:
+def _intrinsics(message: Any) -> Camera | None:
     try:
-        camera = read_camera_info(message)
+        return read_camera_info(message)
     except ValueError:
         return None
-    return None if isinstance(camera, str) else camera
 
 
 def _moves(topic: Topic) -> bool:
@@ -264,11 +265,5 @@ def _moves(topic: Topic) -> bool:
 @cache
 def _shared(a: str, b: str) -> int:
     """Number of leading words that two topic names share."""
-    return sum(1 for _ in _same(re.split(r"[/_]", a.strip("/")), re.split(r"[/_]", b.strip("/"))))
-
-
-def _same(a: Sequence[str], b: Sequence[str]) -> Iterator[str]:
-    for x, y in zip(a, b, strict=False):
-        if x != y:
-            return
-        yield x
+    words = zip(*(re.split(r"[/_]", name.strip("/")) for name in (a, b)), strict=False)
+    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], words))

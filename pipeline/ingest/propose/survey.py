@@ -97,7 +97,7 @@ def _take(message: RawMessage, topic: Topic, survey: Survey) -> None:
             return
         topic.samples.append(decoded)
         topic.frame_id = header_frame_id(message.channel, message.data)
-    except (LogError, *DECODE_ERRORS) as err:
+    except DECODE_ERRORS as err:
         problem = f"topic {topic.name}: {err}"
         if problem not in survey.problems:
             survey.problems.append(problem)

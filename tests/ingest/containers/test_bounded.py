@@ -32,43 +32,15 @@ def test_content_of_the_size_announced_comes_back_and_any_other_is_refused(compr
             unpack(compression, PACKED[compression], size)
 
 
-def test_a_zstd_frame_that_does_not_say_its_size_is_read_up_to_the_limit():
+def test_a_zstd_frame_is_read_up_to_the_limit_whether_its_header_has_no_size_or_another():
     frame = zstandard.ZstdCompressor(write_content_size=False).compress(CONTENT)
-    assert unpack_zstd(frame, len(CONTENT)) == CONTENT
-    assert unpack_zstd(frame, 1 << 24) == CONTENT
-    with pytest.raises(ValueError, match="announced"):
-        unpack_zstd(frame, len(CONTENT) - 1)
-
-
-def test_a_frame_that_claims_terabytes_is_refused_before_memory_is_taken():
+    assert unpack_zstd(frame, len(CONTENT)) == unpack_zstd(frame, 1 << 24) == CONTENT
     frame = bytearray(zstandard.ZstdCompressor().compress(bytes(1 << 20)))
     # Frame header (RFC 8878, 3.1.1): magic, descriptor, window or single segment, then the content size.
-    assert zstandard.get_frame_parameters(bytes(frame)).content_size == 1 << 20
     at = bytes(frame).index(struct.pack("<I", 1 << 20))
-    frame[at : at + 4] = struct.pack("<I", 0xFFFFFFF0)
+    frame[at : at + 4] = struct.pack("<I", 0xFFFFFFF0)  # before memory is taken
     with pytest.raises(ValueError, match="4294967280"):
         unpack_zstd(bytes(frame), 1 << 20)
-
-
-def test_a_forged_chunk_costs_that_chunk_and_the_rest_of_the_day_is_read(kit, tmp_path, run_ingest):
-    path = kit.Kit().drive().mcap(tmp_path / "day.mcap")
-    data = bytearray(path.read_bytes())
-    first = data.index(b"\x28\xb5\x2f\xfd")
-    descriptor = data[first + 4]
-    size_at = first + 5 + (0 if descriptor & 0x20 else 1)
-    width = (1 if descriptor & 0x20 else 0, 2, 4, 8)[descriptor >> 6]
-    data[size_at : size_at + width] = b"\xff" * width
-    path.write_bytes(data)
-    assert sum(log_damage(path).values()) >= 1
-    result, _ = run_ingest(path)
-    assert result.status in {"done", "refused"}  # and no MemoryError
-
-
-def log_damage(path):
-    log = open_log(path)
-    list(log.scan())
-    log.close()
-    return log.damage
 
 
 def test_a_pipe_is_named_and_not_waited_for(tmp_path):

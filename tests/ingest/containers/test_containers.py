@@ -1,6 +1,8 @@
 """The same drive comes out of every container the same, bit for bit."""
 
 import shutil
+import sqlite3
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,37 +10,61 @@ import zstandard
 
 from pipeline.rig.se3 import to_quaternion
 
-CONTAINERS = (
-    "mcap",
-    "mcap_lz4",
-    "mcap_plain",
-    "mcap_unchunked",
-    "bag",
-    "bag_lz4",
-    "bag_bz2",
-    "db3",
-    "db3_file",
-    "mcap_folder",
-)
+MCAP = {
+    "mcap": {}, "mcap_lz4": {"compression": "LZ4"}, "mcap_plain": {"compression": "NONE"},
+    "mcap_unchunked": {"use_chunking": False},
+}  # fmt: skip
+BAGS = {"bag": None, "bag_lz4": "LZ4", "bag_bz2": "BZ2"}
+
+
+def edited(file, edit):
+    with sqlite3.connect(file) as db:
+        edit(db)
+    db.close()
+
+
+def with_packed_messages(db):
+    rows = db.execute("SELECT id, data FROM messages").fetchall()
+    packed = [(zstandard.ZstdCompressor().compress(data), i) for i, data in rows]
+    db.executemany("UPDATE messages SET data = ? WHERE id = ?", packed)
+
+
+def without_definitions(db):
+    db.execute("DROP TABLE message_definitions")  # as ROS 2 up to Humble
+
+
+def packed_whole(file):
+    Path(f"{file}.zstd").write_bytes(zstandard.ZstdCompressor().compress(file.read_bytes()))
+    file.unlink()
+
+
+# What befalls the file of a ROS 2 bag.
+FOLDERS = {
+    "db3": lambda _: None,
+    "db3_without_metadata": lambda file: (file.parent / "metadata.yaml").unlink(),
+    "db3_zstd": packed_whole,
+    "db3_packed_messages": lambda file: edited(file, with_packed_messages),
+    "db3_without_definitions": lambda file: edited(file, without_definitions),
+}
 
 
 def write(kit, tmp_path, container):
-    if container.startswith("bag"):
-        compression = {"bag": None, "bag_lz4": "LZ4", "bag_bz2": "BZ2"}[container]
-        return kit.Kit(ros=1).drive().bag(tmp_path / f"{container}.bag", compression)
+    if container in BAGS:
+        return kit.Kit(ros=1).drive().bag(tmp_path / f"{container}.bag", BAGS[container])
     drive = kit.Kit().drive()
-    if container.startswith("db3"):
-        folder = drive.folder(tmp_path / container)
-        return folder if container == "db3" else next(folder.glob("*.db3"))
+    if container in MCAP:
+        return drive.mcap(tmp_path / f"{container}.mcap", **MCAP[container])
     if container == "mcap_folder":
         return drive.folder(tmp_path / container, "MCAP")
-    options = {"mcap_lz4": {"compression": "LZ4"}, "mcap_plain": {"compression": "NONE"}}.get(container, {})
-    if container == "mcap_unchunked":
-        options = {"use_chunking": False}
-    return drive.mcap(tmp_path / f"{container}.mcap", **options)
+    folder = drive.folder(tmp_path / container)
+    file = next(folder.glob("*.db3"))
+    if container == "db3_file":
+        return file
+    FOLDERS[container](file)
+    return folder
 
 
-@pytest.mark.parametrize("container", CONTAINERS)
+@pytest.mark.parametrize("container", [*MCAP, *BAGS, *FOLDERS, "db3_file", "mcap_folder"])
 def test_every_container_gives_every_frame_as_logged(kit, tmp_path, run_ingest, container):
     log = write(kit, tmp_path, container)
     result, frames = run_ingest(log)
@@ -68,56 +94,15 @@ def test_every_container_gives_every_frame_as_logged(kit, tmp_path, run_ingest, 
         assert to_quaternion(frame.priors["camera_lidar"])[0] == pytest.approx(0.5)
 
 
-def test_a_folder_without_its_metadata_is_read_by_its_files(kit, tmp_path, run_ingest):
-    folder = kit.Kit().drive().folder(tmp_path / "bag")
-    (folder / "metadata.yaml").unlink()
-    assert run_ingest(folder)[0].rows == 4
-
-
-def test_a_compressed_bag_file_is_unpacked(kit, tmp_path, run_ingest):
-    folder = kit.Kit().drive().folder(tmp_path / "bag")
-    plain = next(folder.glob("*.db3"))
-    (folder / f"{plain.name}.zstd").write_bytes(zstandard.ZstdCompressor().compress(plain.read_bytes()))
-    plain.unlink()
-    result, frames = run_ingest(folder)
-    assert result.rows == 4
-    assert frames[3].image == kit.jpeg(3)
-
-
-def test_singly_compressed_messages_of_a_ros2_bag_are_unpacked(kit, tmp_path, run_ingest):
-    folder = kit.Kit().drive().folder(tmp_path / "bag")
-    with kit.sqlite.connect(next(folder.glob("*.db3"))) as db:
-        rows = db.execute("SELECT id, data FROM messages").fetchall()
-        packed = [(zstandard.ZstdCompressor().compress(data), i) for i, data in rows]
-        db.executemany("UPDATE messages SET data = ? WHERE id = ?", packed)
-    db.close()
-    result, frames = run_ingest(folder)
-    assert result.rows == 4
-    assert frames[2].labels_png == kit.label_png(2)
-
-
-@pytest.mark.parametrize("kind", ["detections", "radar scan"])
-def test_an_old_ros2_bag_without_definitions_is_read_by_those_of_its_distribution(
-    kit, tmp_path, run_ingest, kind
-):
+def test_an_old_ros2_bag_without_definitions_is_read_by_those_of_its_distribution(kit, tmp_path, run_ingest):
     drive = kit.Kit().drive()
-    if kind == "radar scan":
-        for i in range(4):
-            stamp = kit.START_NS + i * kit.PERIOD_NS
-            drive.replaced(kit.RADAR, i, scan_message(drive, stamp))
+    values = {"range": 10.0, "azimuth": 0.1, "elevation": 0.0, "doppler_velocity": -3.0, "amplitude": 9.0}
+    one = drive.new("radar_msgs/msg/RadarReturn", **values)
+    kind = "radar_msgs/msg/RadarScan"
+    drive.each(kit.RADAR, lambda _, at: drive.new(kind, header=drive.header(at, "radar"), returns=[one]))
     folder = drive.folder(tmp_path / "bag")
-    with kit.sqlite.connect(next(folder.glob("*.db3"))) as db:
-        db.execute("DROP TABLE message_definitions")
-    db.close()
-    result, frames = run_ingest(folder)
-    assert result.rows == 4
-    assert frames[0].detection_classes == ["car"]
-
-
-def scan_message(drive, stamp):
-    kind = "radar_msgs/msg/RadarReturn"
-    one = drive.new(kind, range=10.0, azimuth=0.1, elevation=0.0, doppler_velocity=-3.0, amplitude=9.0)
-    return drive.new("radar_msgs/msg/RadarScan", header=drive.header(stamp, "radar"), returns=[one])
+    edited(next(folder.glob("*.db3")), without_definitions)
+    assert [len(f.radar_xyz_m) for f in run_ingest(folder)[1]] == [1] * 4
 
 
 def test_a_recording_split_by_time_is_one_day_and_its_first_file_holds_the_transforms(

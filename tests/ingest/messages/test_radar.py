@@ -55,15 +55,13 @@ def test_radar_points_that_are_not_finite_are_dropped_and_counted(kit):
 def test_radar_scans_are_read_by_their_angles(kit, tmp_path, run_ingest, ros, azimuth_positive):
     drive = kit.Kit(ros=ros).drive()
     azimuth, elevation, distance = np.array([0.5, -0.2]), np.array([0.1, -0.05]), np.array([20.0, 50.0])
-    for i in range(4):
-        kind = "radar_msgs/msg/RadarReturn"
-        returns = [
-            drive.new(kind, range=r, azimuth=a, elevation=e, doppler_velocity=-5.0, amplitude=12.0)
-            for r, a, e in zip(distance, azimuth, elevation, strict=True)
-        ]
-        stamp = kit.START_NS + i * kit.PERIOD_NS
-        scan = drive.new("radar_msgs/msg/RadarScan", header=drive.header(stamp, "radar"), returns=returns)
-        drive.replaced(kit.RADAR, i, scan)
+    kind = "radar_msgs/msg/RadarReturn"
+    returns = [
+        drive.new(kind, range=r, azimuth=a, elevation=e, doppler_velocity=-5.0, amplitude=12.0)
+        for r, a, e in zip(distance, azimuth, elevation, strict=True)
+    ]
+    kind = "radar_msgs/msg/RadarScan"
+    drive.each(kit.RADAR, lambda _, at: drive.new(kind, header=drive.header(at, "radar"), returns=returns))
     log = drive.bag(tmp_path / "a.bag") if ros == 1 else drive.mcap(tmp_path / "a.mcap")
     fleet = kit.fleet(radar={"azimuth_positive": azimuth_positive, "doppler_positive": "receding"})
     _, frames = run_ingest(log, fleet=fleet)
@@ -88,11 +86,10 @@ def test_radar_tracks_are_read_by_the_definition_in_the_log_whichever_version_it
         del rest["track_id"]
         uuid = drive.new("unique_identifier_msgs/msg/UUID", uuid=np.arange(16, dtype=np.uint8))
         rest |= {"uuid": uuid, "classification": 32001}
-    for i in range(4):
-        at, velocity = drive.vector("Point", 30, 40, 0), drive.vector("Vector3", 3, 4, 0)
-        track = drive.new("radar_msgs/msg/RadarTrack", position=at, velocity=velocity, **rest)
-        header = drive.header(kit.START_NS + i * kit.PERIOD_NS, "radar")
-        drive.replaced(kit.RADAR, i, drive.new("radar_msgs/msg/RadarTracks", header=header, tracks=[track]))
+    at, velocity = drive.vector("Point", 30, 40, 0), drive.vector("Vector3", 3, 4, 0)
+    track = drive.new("radar_msgs/msg/RadarTrack", position=at, velocity=velocity, **rest)
+    kind = "radar_msgs/msg/RadarTracks"
+    drive.each(kit.RADAR, lambda _, at: drive.new(kind, header=drive.header(at, "radar"), tracks=[track]))
     _, frames = run_ingest(drive.mcap(tmp_path / "a.mcap"))
     np.testing.assert_array_equal(frames[2].radar_xyz_m, [[30, 40, 0]])
     np.testing.assert_allclose(frames[2].radar_range_rate_mps, [5.0])  # along the line of sight, moving away

@@ -30,26 +30,23 @@ from tests.makers.written_logs import (
 )
 
 
-def areas(kit, i):
-    pixels = np.repeat(np.arange(HEIGHT, dtype=np.uint8) % 11, WIDTH).reshape(HEIGHT, WIDTH)
-    return kit.compressed(
-        START_NS + i * PERIOD_NS + 1_000_000, cv2.imencode(".png", pixels)[1].tobytes(), "png"
-    )
+def with_labels(made, pixels):
+    def label(_, at):
+        return made.compressed(at + 1_000_000, cv2.imencode(".png", pixels())[1].tobytes(), "png")
+
+    return made.each(LABELS, label)
 
 
 def drive(frames=12, **kit):
-    made = Kit(frames=frames, **kit).drive()
-    for i in range(frames):
-        made.replaced(LABELS, i, areas(made, i))
-    return made
+    rows = np.repeat(np.arange(HEIGHT, dtype=np.uint8) % 11, WIDTH).reshape(HEIGHT, WIDTH)
+    return with_labels(Kit(frames=frames, **kit).drive(), lambda: rows)
 
 
-def with_doppler(made, change, topic=RADAR):
-    for i in range(made.frames):
-        columns = radar_columns(i)
-        scan = made.cloud(START_NS + i * PERIOD_NS - 2_000_000, change(columns), frame_id="radar")
-        made.replaced(topic, i, scan)
-    return made
+def with_doppler(made, change):
+    def scan(i, at):
+        return made.cloud(at - 2_000_000, change(radar_columns(i)), frame_id="radar")
+
+    return made.each(RADAR, scan)
 
 
 def proposed(*logs):
@@ -123,11 +120,10 @@ def test_without_labels_a_camera_is_told_what_it_lacks_and_the_rest_runs(tmp_pat
 
 
 def test_a_grey_picture_is_no_label_image(tmp_path):
-    made, rng = drive().without(LABELS), np.random.default_rng(0)
-    for i in range(made.frames):
-        grey = cv2.GaussianBlur(rng.integers(0, 255, (HEIGHT, WIDTH), np.uint8), (9, 9), 2)
-        made.add(LABELS, "sensor_msgs/msg/CompressedImage", START_NS + i * PERIOD_NS, made.compressed(
-            START_NS + i * PERIOD_NS, cv2.imencode(".png", grey)[1].tobytes(), "png"))  # fmt: skip
+    rng = np.random.default_rng(0)
+    made = with_labels(
+        drive(), lambda: cv2.GaussianBlur(rng.integers(0, 255, (HEIGHT, WIDTH), np.uint8), (9, 9), 2)
+    )
     _, found = proposed(made.mcap(tmp_path / "a.mcap"))
     assert any(m.startswith("camera: semantics") for m in found.missing)
 
