@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -15,7 +16,7 @@ from pipeline.core.rigs import CameraTopics, RadarTopics, TopicSemantics
 from pipeline.ingest.earlier_images import EarlierImages
 from pipeline.ingest.index import DayIndex, Located, Stream
 from pipeline.ingest.messages.decoding import DECODE_ERRORS
-from pipeline.ingest.messages.detections import DETECTIONS_3D, read_detections, read_detections_3d
+from pipeline.ingest.messages.detections import DETECTIONS_3D, Detections, read_detections, read_detections_3d
 from pipeline.ingest.messages.image import (
     EncodedImage,
     encode_pixels,
@@ -35,6 +36,7 @@ from schemas.captures import Capture, Image, Scan, Sweep
 
 __all__ = ["Read", "Rejected", "deskew", "readers_of"]
 
+T = TypeVar("T")
 _FEWEST_POINTS = 10
 _SAME_IMAGE_NS = 5_000_000  # labels and detections have the stamp of the image they were computed from
 
@@ -102,11 +104,14 @@ class _Images:
         if camera is None:
             raise Rejected(Rejection.CAMERA_INFO)
         image, frame_id = self._image(place, camera)
-        boxes, classes, scores = self._detections(place, camera, frame_id)
+        labels = self._logged_with(LABELS, place, self._labels)
+        found = self._logged_with(DETECTIONS, place, partial(self._boxes, camera, frame_id))
+        boxes, classes, scores, dropped = found or (None, None, None, 0)
+        self._counts["detections_without_box_or_class"] += dropped
         row = Image(
             moment=moment, stamp_ns=stamp_ns, image=image.data, image_format=image.format,
             image_width_px=camera.width_px, image_height_px=camera.height_px,
-            camera_model=camera.model, camera_K=camera.K, camera_D=camera.D, labels_png=self._labels(place),
+            camera_model=camera.model, camera_K=camera.K, camera_D=camera.D, labels_png=labels,
             detection_boxes_px=boxes, detection_classes=classes, detection_scores=scores,
             **self._earlier.columns(place, image.data),
         )  # fmt: skip
@@ -135,42 +140,26 @@ class _Images:
         message, _ = self._index.read(self._stream.located[place])
         return str(message.format), bytes(message.data)
 
-    def _logged_at(self, what: str, place: int) -> Located | None:
-        """Message of type `what` for this image; None if none was logged."""
+    def _logged_with(self, what: str, place: int, read: Callable[[Located], T]) -> T | None:
+        """What was logged for this image; None (and counted) if it was not, or is damaged."""
         stream, partner = self._logged[what]
         if partner[place] < 0:
             self._counts[f"frames_without_{what}"] += self._logged_semantics
             return None
-        return stream.located[int(partner[place])]
-
-    def _labels(self, place: int) -> bytes | None:
-        located = self._logged_at(LABELS, place)
-        if located is None:
-            return None
         try:
-            return label_image(self._index.read(located)[0])
+            return read(stream.located[int(partner[place])])
         except DECODE_ERRORS as err:
-            self._counts["labels_damaged"] += 1
-            self._index.complain(f"labels: {err}")
+            self._counts[f"{what}_damaged"] += 1
+            self._index.complain(f"{what}: {err}")
             return None
 
-    def _detections(
-        self, place: int, camera: Camera, camera_frame: str
-    ) -> tuple[np.ndarray | None, list[str] | None, np.ndarray | None]:
-        located = self._logged_at(DETECTIONS, place)
-        if located is None:
-            return None, None, None
-        try:
-            message, _ = self._index.read(located)
-            is_3d = located.channel.msgtype in DETECTIONS_3D
-            found = read_detections_3d(message, camera, camera_frame) if is_3d else read_detections(message)
-        except DECODE_ERRORS as err:
-            self._counts["detections_damaged"] += 1
-            self._index.complain(f"detections: {err}")
-            return None, None, None
-        boxes, classes, scores, dropped = found
-        self._counts["detections_without_box_or_class"] += dropped
-        return boxes, classes, scores
+    def _labels(self, located: Located) -> bytes:
+        return label_image(self._index.read(located)[0])
+
+    def _boxes(self, camera: Camera, camera_frame: str, located: Located) -> Detections:
+        message, _ = self._index.read(located)
+        is_3d = located.channel.msgtype in DETECTIONS_3D
+        return read_detections_3d(message, camera, camera_frame) if is_3d else read_detections(message)
 
 
 def _sweep(

@@ -101,7 +101,7 @@ def check_logs(
     if missing:
         raise ConfigError("command line", "LOG", f"no such file: {', '.join(missing)}")
     progress(0, 0, "reading the index")
-    index = index_logs(logs, rig, survey=True)
+    index = index_logs(logs, rig)
     try:
         anchored, rejected = pick_moments(index, rig, fleet.ingest)
         builder = MomentBuilder(index, rig, fleet.ingest, read_file_prior(rig, fleet))
@@ -188,7 +188,7 @@ def _topics(index: DayIndex, rig: Rig, unheard: Sequence[Unheard]) -> list[Topic
     problems = {found.topic: found.problem for found in unheard}
     findings = []
     for topic, role in topics_of(rig).items():
-        types = Counter({kind: n for (name, kind), n in index.surveyed.items() if name == topic})
+        types = index.types_of(topic)
         stamps = np.unique(index.stream(role).stamps_ns)
         rate = float(1e9 / np.median(np.diff(stamps))) if len(stamps) > 2 else None
         problem = problems.get(topic, "" if types else "no message")

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -39,19 +38,10 @@ NO_EARLIER, TOO_FAR, STAMPS_JUMP, STANDING, SAME_IMAGE = (
 )
 
 
-@dataclass(frozen=True)
-class _Candidate:
-    place: int
-    span_s: float
-    driven_m: float  # NaN if unknown
-    is_kept: bool
-
-    @property
-    def off(self) -> float:
-        """How far it is from the best one; an image that is kept anyway comes first."""
-        by_way = abs(np.log(abs(self.driven_m) / _WAY_M)) if np.isfinite(self.driven_m) else np.nan
-        by_span = abs(np.log(self.span_s / _SPAN_S))
-        return float(by_span if np.isnan(by_way) else by_way) + (0.0 if self.is_kept else _ANOTHER)
+def _off(span_s: float, driven_m: float, *, is_kept: bool) -> float:
+    """How far an image is from the best one; one that is kept anyway comes first. `driven_m` is NaN if unknown."""
+    by_way = np.log(span_s / _SPAN_S) if np.isnan(driven_m) else np.log(abs(driven_m) / _WAY_M)
+    return float(abs(by_way)) + (0.0 if is_kept else _ANOTHER)
 
 
 class EarlierImages:
@@ -72,21 +62,21 @@ class EarlierImages:
         if isinstance(found, str):
             return {"earlier_missing": found}
         image = None
-        if not found.is_kept:
+        if found not in self._kept:
             try:
-                earlier = self._picture(found.place)
+                earlier = self._picture(found)
             except DECODE_ERRORS:
                 return {"earlier_missing": NO_EARLIER}
             if earlier.data == now:
                 return {"earlier_missing": SAME_IMAGE}
             image = _small_grey(earlier)
-        stamp_ns = self._captures.stamps[found.place]
+        stamp_ns = self._captures.stamps[found]
         return {"earlier_stamp_ns": stamp_ns, "earlier_image": image, **self._motion(stamp_ns, place)}
 
-    def _nearest(self, place: int) -> _Candidate | str:
+    def _nearest(self, place: int) -> int | str:
         """The best earlier image, or why there is none."""
         stamps, located = self._captures.stamps, self._captures.located
-        now_ns, found, last_ns, driven_m = stamps[place], list[_Candidate](), stamps[place], 0.0
+        now_ns, found, last_ns, driven_m = stamps[place], dict[int, float](), stamps[place], 0.0
         speed = self._index.ego.motion_at(np.array([now_ns], np.int64))[0][0]
         nearest = np.nan, np.inf
         for k in range(place - 1, -1, -1):
@@ -101,9 +91,9 @@ class EarlierImages:
             nearest = (driven_m, span_s) if k == place - 1 else nearest
             is_near = span_s <= _LATEST_S if np.isnan(driven_m) else _LEAST_M <= abs(driven_m) <= _MOST_M
             if is_near and span_s >= _LEAST_S:
-                found.append(_Candidate(k, span_s, driven_m, k in self._kept))
+                found[k] = _off(span_s, driven_m, is_kept=k in self._kept)
         if found:
-            return min(found, key=lambda c: c.off)
+            return min(found, key=found.__getitem__)
         if abs(speed) < _STANDING_MPS:
             return STANDING
         has_one = place > 0 and located[place - 1].log == located[place].log

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import resource
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -104,8 +105,7 @@ class DayIndex:
     cameras: dict[str, list[tuple[int, int, Camera]]] = field(default_factory=dict)
     trees: list[TransformTree] = field(default_factory=list)
     ego: EgoTrack = field(default_factory=EgoTrack)
-    types_seen: set[tuple[str, str]] = field(default_factory=set)  # topics of the rig, with types
-    surveyed: Counter[tuple[str, str]] = field(default_factory=Counter)  # (topic, type) -> messages
+    messages: Counter[tuple[str, str]] = field(default_factory=Counter)  # by topic of the rig and type
     problems: list[str] = field(default_factory=list)
     encodings_right: set[tuple[int, str]] = field(default_factory=set)  # log and topic
     damage: Counter[str] = field(default_factory=Counter)
@@ -133,17 +133,22 @@ class DayIndex:
         """Messages of a role; empty if there are none."""
         return self.streams.setdefault(role, Stream())
 
-    def types_beside(self) -> Collection[tuple[str, str]]:
-        """Topics and types in the logs, without a survey those at the beginning of some of them."""
-        if not self.surveyed:
-            for log in self.logs[:_GLANCES]:
-                first_ns = None
-                for message in log.scan():
-                    first_ns = message.log_time_ns if first_ns is None else first_ns
-                    if message.log_time_ns > first_ns + _GLANCE_NS:
-                        break
-                    self.surveyed[message.channel.topic, message.channel.msgtype] += 1
-        return self.surveyed
+    def types_of(self, topic: str) -> dict[str, int]:
+        """Number of messages on a topic of the rig by type."""
+        return {kind: count for (name, kind), count in self.messages.items() if name == topic}
+
+    @cached_property
+    def types_beside(self) -> set[tuple[str, str]]:
+        """Topics and types of any messages at the beginning of some logs."""
+        found = set[tuple[str, str]]()
+        for log in self.logs[:_GLANCES]:
+            first_ns = None
+            for message in log.scan():
+                first_ns = message.log_time_ns if first_ns is None else first_ns
+                if message.log_time_ns > first_ns + _GLANCE_NS:
+                    break
+                found.add((message.channel.topic, message.channel.msgtype))
+        return found
 
     def read(self, located: Located) -> tuple[Any, str]:
         """A decoded message and its frame id; raises one of DECODE_ERRORS."""
@@ -168,27 +173,24 @@ class DayIndex:
             log.close()
 
 
-def index_logs(
-    paths: Sequence[LogPath], rig: Rig, *, survey: bool = False, budget: int | None = None
-) -> DayIndex:
+def index_logs(paths: Sequence[LogPath], rig: Rig, *, budget: int | None = None) -> DayIndex:
     """Scan the logs once; of images and clouds only the stamp is read. Unreadable logs become problems.
 
     Args:
-        survey: count the messages of every topic in `surveyed`; else those of a glance, when asked for.
         budget: largest number of sweeps; a longer day is read in bursts. None = read the whole day.
     """
     index = DayIndex({role.sensor: role.kind for role in topics_of(rig).values() if role.is_capture})
     _allow_open_files()
     try:
         _open_logs(index, paths)
-        _read_day(index, rig, budget, survey=survey)
+        _read_day(index, rig, budget)
     except BaseException:  # e.g. the object store does not answer: the open logs must be closed here
         index.close()
         raise
     return index
 
 
-def _read_day(index: DayIndex, rig: Rig, budget: int | None, *, survey: bool) -> None:
+def _read_day(index: DayIndex, rig: Rig, budget: int | None) -> None:
     topics = topics_of(rig)
     timelines = [None if budget is None else log.timeline() for log in index.logs]
     if budget is not None:
@@ -196,7 +198,7 @@ def _read_day(index: DayIndex, rig: Rig, budget: int | None, *, survey: bool) ->
         index.reading = plan_reading(logs, rig, topics, budget)
     for number, timeline in enumerate(timelines):
         if index.reading is None:
-            _read_log(index, number, topics, survey=survey)
+            _read_log(index, number, topics)
         else:
             _read_bursts(index, number, topics, timeline, index.reading.around)
     if budget is not None and index.reading is None and len(index.captures(index.anchor).stamps) > budget:
@@ -221,22 +223,11 @@ def _open_logs(index: DayIndex, paths: Sequence[LogPath]) -> None:
             index.trees.append(TransformTree())
 
 
-def _read_log(
-    index: DayIndex,
-    number: int,
-    topics: dict[str, Role],
-    within: Stretches | None = None,
-    *,
-    survey: bool = False,
-) -> None:
+def _read_log(index: DayIndex, number: int, topics: dict[str, Role], within: Stretches | None = None) -> None:
     log = index.logs[number]
     try:
-        for message in log.scan(None if survey else topics, within):
-            if survey:
-                index.surveyed[message.channel.topic, message.channel.msgtype] += 1
-            role = topics.get(message.channel.topic)
-            if role is not None:
-                _index_message(index, number, message, role)
+        for message in log.scan(topics, within):
+            _index_message(index, number, message, topics[message.channel.topic])
     except OSError as err:  # a disk or share failed on the way: messages read so far are used
         index.complain(f"{log.path}: cannot be read further: {err}")
         index.damage["logs_lost_while_reading"] += 1
@@ -286,7 +277,7 @@ def _allow_open_files() -> None:
 
 
 def _index_message(index: DayIndex, number: int, message: RawMessage, role: Role) -> None:
-    index.types_seen.add((message.channel.topic, message.channel.msgtype))
+    index.messages[message.channel.topic, message.channel.msgtype] += 1
     if message.channel.msgtype not in ACCEPTED_TYPES[role.what]:
         index.damage["wrong_type"] += 1
         index.complain(f"{index.log_names[number]}, topic {message.channel.topic}: {_refusal(message, role)}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from difflib import SequenceMatcher
 
@@ -68,8 +67,7 @@ class Unheard:
 class Evidence:
     """Facts that a verdict is based on; shares are of the sampled frames, and meaningless without frames.
 
-    `missing` has the topics without usable messages (none, or of another type) by sensor. `frames_of` counts
-    the frames with both sensors by pair of the rig; None = all frames have all sensors. Without
+    `missing` has the topics without usable messages (none, or of another type) by sensor. Without
     `names_semantics`, fleet.toml has a camera and no source of its labels and road users.
     """
 
@@ -85,7 +83,6 @@ class Evidence:
     doppler_is_wrong: bool = False  # its sign or unit is certainly wrong and must be corrected first
     wrong: tuple[str, ...] = ()  # other sources of motion and directions that are certainly wrong
     missing: tuple[str, ...] = ()
-    frames_of: Mapping[str, int] | None = None
     names_semantics: bool = True
     has_odometry: bool = False
 
@@ -226,12 +223,12 @@ def unheard_topics(index: DayIndex, rig: Rig) -> list[Unheard]:
     """
     found, named = list[Unheard](), topics_of(rig)
     for topic, role in named.items():
-        wanted, types = set(ACCEPTED_TYPES[role.what]), {k for name, k in index.types_seen if name == topic}
+        wanted, types = set(ACCEPTED_TYPES[role.what]), set(index.types_of(topic))
         is_shown = role.what == INFO and bool(index.captures(role.sensor).stamps)
         is_blind = is_shown and not index.cameras.get(role.sensor)
         if role == TF_STATIC or (wanted & types and not is_blind):
             continue
-        alike = {name: SequenceMatcher(None, topic, name).ratio() for name, kind in index.types_beside()
+        alike = {name: SequenceMatcher(None, topic, name).ratio() for name, kind in index.types_beside
                  if kind in wanted and name not in named}  # fmt: skip
         others = sorted(alike, key=lambda name: (-alike[name], name))
         if role.what not in NEEDED:

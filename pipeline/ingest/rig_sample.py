@@ -126,7 +126,6 @@ class RigSample:
             frames=self._usable(len(self.built)),
             has_prior=all(e.has_prior for e in self.evidence.values()),
             missing=tuple(why for own in self.missing.values() for why in own),
-            frames_of={self.name(edge): of.frames for edge, of in self.evidence.items()},
         )
 
     def name(self, edge: Edge) -> str:

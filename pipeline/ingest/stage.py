@@ -50,16 +50,8 @@ _PROBLEMS_SHOWN = 3
 # Rejections that state a fault.
 _STATED = dict.fromkeys(REPEATED.values(), "stuck_sensor") | dict.fromkeys(WRONG_UNIT.values(), "unit")
 _FAR_FROM_DAY = dt.timedelta(hours=12 + 14 + 12)  # half a day, the earliest time zone, and a drive at night
-_UNUSABLE = (
-    Rejection.IMAGE_DAMAGED,
-    Rejection.IMAGE_SIZE,
-    Rejection.CAMERA_INFO,
-    Rejection.LIDAR_DAMAGED,
-    Rejection.LIDAR_SPARSE,
-    Rejection.RADAR_DAMAGED,
-    Rejection.RADAR_SPARSE,
-    *_STATED,
-)
+_USABLE = {Rejection.DUPLICATE_STAMP, Rejection.NO_LIDAR, Rejection.NOT_PICKED}
+_UNUSABLE = [r for r in Rejection if r not in _USABLE]  # what a sensor gave was of no use
 
 
 def work(task: Task) -> Work:
@@ -193,7 +185,7 @@ def _refusal(
         return _shorten(index.problems), "configuration"
     if len(topics) - len(absent) < 2:
         what = _nothing_on(", ".join(f"{topics[role]} ({role})" for role in absent))
-        faults = ("configuration",) if index.types_beside() else ()  # no message at all is no fault of topics
+        faults = ("configuration",) if index.types_beside else ()  # no message at all is no fault of topics
     elif not set(rejected) & set(_UNUSABLE):
         of = {"camera": "an image", "lidar": "a sweep", "radar": "a scan"}
         met = " and ".join(f"{of[r.kind]} of {topic}" for r, topic in topics.items() if r not in absent)

@@ -66,13 +66,11 @@ class Matched:
 
     Args:
         others: by sensor, -1 if a moment does not have it.
-        constant_ns: by sensor, the constant gap of its stamps to the anchor's, found before gating.
     """
 
     anchor: Int64[np.ndarray, " N"]
     others: Mapping[str, Int64[np.ndarray, " N"]]
     rejected: Counter[str] = field(default_factory=Counter)
-    constant_ns: Mapping[str, int] = field(default_factory=dict)
 
 
 def none_near(sensor: str) -> str:
@@ -100,12 +98,9 @@ def match_nearest(
     sorted_b = b_ns[order_b].astype(np.int64)
     low = np.searchsorted(sorted_b, a_ns - gate_ns, "left")
     high = np.searchsorted(sorted_b, a_ns + gate_ns, "right")
-    i = np.repeat(np.arange(len(a_ns)), high - low)
-    j = (
-        np.arange(len(i))
-        - np.repeat(np.cumsum(high - low) - (high - low), high - low)
-        + np.repeat(low, high - low)
-    )
+    count = high - low
+    i = np.repeat(np.arange(len(a_ns)), count)
+    j = np.arange(len(i)) + np.repeat(low - np.cumsum(count) + count, count)
     gap = np.abs(a_ns[i].astype(np.int64) - sorted_b[j])
     taken = np.zeros(len(b_ns), bool)
     for k in np.lexsort((a_ns[i], gap)):
@@ -136,18 +131,18 @@ def match_moments(
     anchor = first_occurrences(anchor_ns)
     own, names, is_fixed = anchor_ns[anchor], list(others_ns), isinstance(gate_ns, int)
     gates = np.full(len(own), gate_ns, np.int64) if isinstance(gate_ns, int) else gate_ns[anchor]
-    constant_ns, places = dict.fromkeys(names, 0), {}
+    places = {}
     gap, has = np.zeros((len(names), len(own)), np.int64), np.zeros((len(names), len(own)), bool)
     for k, s in enumerate(names):
         once = first_occurrences(others_ns[s])
-        stamps, reach_ns = others_ns[s][once], int(np.max(gate_ns, initial=0))
+        stamps, reach_ns, constant_ns = others_ns[s][once], int(np.max(gate_ns, initial=0)), 0
         if not is_fixed:
-            constant_ns[s] = constant_gap_ns(own, stamps)
+            constant_ns = constant_gap_ns(own, stamps)
             period = _period_ns(stamps)
             reach_ns = reach_ns if period is None else int(_HALF_A_PERIOD * period)
-        partner = match_nearest(own + constant_ns[s], stamps, reach_ns)
+        partner = match_nearest(own + constant_ns, stamps, reach_ns)
         near = partner >= 0
-        gap[k, near] = stamps[partner[near]] - own[near] - constant_ns[s]
+        gap[k, near] = stamps[partner[near]] - own[near] - constant_ns
         has[k] = near & (np.abs(gap[k]) <= gates)
         places[s] = np.append(once, -1)[partner]
     if tied is None:
@@ -163,7 +158,7 @@ def match_moments(
         first, second = sorted(apart.get(int(i), (0, 0)))
         rejected[none_near(lacking) if lacking else f"{names[first]}_{names[second]}_outside_gate"] += 1
     others = {s: np.where(together[k, kept], places[s][kept], -1) for k, s in enumerate(names)}
-    return Matched(anchor[kept], others, +rejected, constant_ns)
+    return Matched(anchor[kept], others, +rejected)
 
 
 def constant_gap_ns(lidar_ns: Int[np.ndarray, " L"], stamps_ns: Int[np.ndarray, " M"]) -> int:
@@ -227,7 +222,6 @@ def number_drives(stamps_ns: Sequence[int], logs: Sequence[int]) -> Int64[np.nda
     """Number of each sweep's stretch of driving, from 0: new where the log changes or stamps gap by 10 s."""
     if not len(stamps_ns):
         return np.zeros(0, np.int64)
-    new = (np.diff(np.asarray(stamps_ns, np.int64)) > _DRIVE_GAP_NS) | (
-        np.diff(np.asarray(logs, np.int64)) != 0
-    )
-    return np.concatenate([[0], np.cumsum(new)]).astype(np.int64)
+    is_late = np.diff(np.asarray(stamps_ns, np.int64)) > _DRIVE_GAP_NS
+    is_other = np.diff(np.asarray(logs, np.int64)) != 0
+    return np.concatenate([[0], np.cumsum(is_late | is_other)]).astype(np.int64)

@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.core.stage_work import Task
 from pipeline.core.stages import CALIBRATE
-from pipeline.ingest.index import DayIndex
+from pipeline.ingest import index
 from pipeline.rig.day_prior import prior_of_three, rig_prior
 from pipeline.rig.se3 import inverse, log_se3
 from pipeline.store.moments import sensors_of
@@ -51,15 +51,14 @@ def test_every_sensor_has_a_file_and_what_it_lacks_is_counted_under_its_name(day
 )
 def test_what_is_damaged_of_one_camera_costs_that_camera_alone(day, tmp_path, monkeypatch, of_camera, counts):
     lake, fleet, _, (before, perceived_before) = day
-    topic, whole, seen = of_camera(fleet.rig_of(DAY.vehicle).cameras["left"]), DayIndex.read, []
+    topic, whole, seen = of_camera(fleet.rig_of(DAY.vehicle).cameras["left"]), index.decode, []
 
-    def damaged(self, located):
-        payload = whole(self, located)
-        seen.append(located.channel.topic)
+    def damaged(channel, data):
+        seen.append(channel.topic)
         is_bad = seen[-1] == topic and seen.count(topic) % 2 == 0
-        return payload[: len(payload) // 2] if is_bad else payload
+        return whole(channel, data[: len(data) // 2] if is_bad else data)
 
-    monkeypatch.setattr(DayIndex, "read", damaged)
+    monkeypatch.setattr(index, "decode", damaged)
     logs = sorted((lake.root.parent / "logs" / DAY.vehicle / DAY.day).iterdir())
     copy = Lake.at(tmp_path / "lake")
     found, shown = ingest_day(logs, DAY, fleet, copy), perceive_day(DAY, fleet, copy)

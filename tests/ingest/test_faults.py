@@ -13,6 +13,7 @@ from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import ingested
 from schemas.calibrations import SENSORS
 from schemas.moments import SENSORS_ABSENT
+from tests.ingest.containers.test_containers import write
 from tests.makers.stages import ingest_day
 
 
@@ -71,11 +72,9 @@ def test_a_disk_that_fails_half_way_costs_the_rest_of_the_log(kit, tmp_path, run
     assert result.rejected["logs_lost_while_reading"] == 1
 
 
-@pytest.mark.parametrize("container", ["mcap", "bag", "db3"])
+@pytest.mark.parametrize("container", ["mcap", "bag", "db3_file"])
 def test_a_recording_cut_off_keeps_the_frames_before_the_cut(kit, tmp_path, run_ingest, container):
-    drive = kit.Kit(ros=1 if container == "bag" else 2, frames=20).drive()
-    log = getattr(drive, {"db3": "folder"}.get(container, container))(tmp_path / f"a.{container}")
-    log = next(log.glob("*.db3")) if container == "db3" else log
+    log = write(kit, tmp_path, container, frames=20)
     log.write_bytes(log.read_bytes()[: int(log.stat().st_size * 0.6)])
     result, frames = run_ingest(log)
     assert result.status == "done"

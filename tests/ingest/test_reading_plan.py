@@ -9,7 +9,6 @@ from pipeline.ingest.containers.mcap import McapLog
 from pipeline.ingest.containers.rosbag1 import BagLog
 from pipeline.ingest.reading_plan import BURST_TRIOS
 from tests.ingest.containers.test_containers import write
-from tests.makers.written_logs import Kit
 
 FRAMES, BUDGET = 200, 40
 INDEXED = ("mcap", "mcap_plain", "bag", "bag_lz4", "db3", "db3_file", "mcap_folder")
@@ -68,13 +67,9 @@ def test_rows_of_bursts_are_those_of_the_whole_day_and_the_outcome_counts_them(k
 
 
 @pytest.mark.parametrize("container", INDEXED)
-def test_every_container_with_an_index_is_read_in_bursts(kit, tmp_path, run_ingest, container, monkeypatch):
-    # Written by the kit's drive, 60 frames, of which a burst of 20 is read.
-    monkeypatch.setattr(Kit, "frames", 60)
-    kit_of = type("K", (), {"Kit": lambda **k: Kit(frames=60, **k), "START_NS": kit.START_NS})
-    result, frames = run_ingest(
-        write(kit_of, tmp_path, container), fleet=kit.fleet(ingest={"read_sweeps": 20})
-    )
+def test_every_container_with_an_index_is_read_in_bursts(kit, tmp_path, run_ingest, container):
+    log = write(kit, tmp_path, container, frames=60)
+    result, frames = run_ingest(log, fleet=kit.fleet(ingest={"read_sweeps": 20}))
     numbers = frame_numbers(kit, frames)
     assert (result.reason, result.rejected) == ("", {})
     assert result.kept["sweeps_in_logs"] == 60

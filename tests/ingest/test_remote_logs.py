@@ -12,6 +12,7 @@ from pipeline.ingest.containers import rosbag2_folder
 from pipeline.ingest.containers.reader import content_identity, open_log
 from pipeline.store.object_store import Bucket
 from pipeline.store.remote_logs import RemoteLog, log_at
+from tests.ingest.containers.test_containers import write
 from tests.ingest.test_reading_plan import BUDGET, in_bursts, long_drive, same_but_numbers
 from tests.makers.s3_server import BUCKET
 
@@ -40,20 +41,10 @@ def fetched(s3, work):
     return work(), s3.faults()["bytes_sent"] - before
 
 
-@pytest.mark.parametrize("container", ["mcap", "bag", "db3", "db3.zstd"])
+@pytest.mark.parametrize("container", ["mcap", "bag_lz4", "db3", "db3_zstd"])
 def test_a_log_of_any_container_gives_the_rows_that_the_file_gives(kit, tmp_path, put, run_ingest, container):
-    if container == "bag":
-        file = kit.Kit(ros=1).drive().bag(tmp_path / "a.bag", "LZ4")
-    elif container == "mcap":
-        file = kit.Kit().drive().mcap(tmp_path / "a.mcap")
-    else:
-        file = next(kit.Kit().drive().folder(tmp_path / "bag").glob("*.db3"))
-        if container.endswith("zstd"):
-            import zstandard
-
-            packed = file.with_name(f"{file.name}.zstd")
-            packed.write_bytes(zstandard.ZstdCompressor().compress(file.read_bytes()))
-            file = packed
+    file = write(kit, tmp_path, container)
+    file = next(file.glob("*.db3*")) if file.is_dir() else file
     local, rows = run_ingest(file, name="local")
     result, frames = run_ingest(put(file), name="remote")
     assert (result.status, result.rows, result.kept) == (local.status, 4, local.kept)

@@ -17,7 +17,7 @@ from jaxtyping import Float, Float32
 from pipeline.rig.cameras import Camera
 from pipeline.rig.se3 import from_quaternion, transform_points
 
-__all__ = ["DETECTIONS_3D", "read_detections", "read_detections_3d"]
+__all__ = ["DETECTIONS_3D", "Detections", "read_detections", "read_detections_3d"]
 
 DETECTIONS_3D = (
     "vision_msgs/msg/Detection3DArray",
@@ -31,10 +31,10 @@ _ON_A_BOX = np.array(list(product((-0.5, 0.0, 0.5), repeat=3)))
 _UNIT_TOLERANCE = 0.01  # largest deviation of a quaternion's length from 1; beyond it is damaged
 _Box = Float[np.ndarray, " 4"] | None
 # Boxes, classes, scores, and the number of detections without a box or a class.
-_Read = tuple[Float32[np.ndarray, "N 4"], list[str], Float32[np.ndarray, " N"], int]
+Detections = tuple[Float32[np.ndarray, "N 4"], list[str], Float32[np.ndarray, " N"], int]
 
 
-def read_detections(message: Any) -> _Read:
+def read_detections(message: Any) -> Detections:
     """Boxes (x0 y0 x1 y1 [px]), classes as logged, scores, and number of detections without box or class.
 
     A rotated box becomes its upright bounding box. Version 3 and later of vision_msgs name a class
@@ -43,7 +43,7 @@ def read_detections(message: Any) -> _Read:
     return _columns((_upright_box(d.bbox), *_likeliest(d)) for d in message.detections)
 
 
-def read_detections_3d(message: Any, camera: Camera, camera_frame: str) -> _Read:
+def read_detections_3d(message: Any, camera: Camera, camera_frame: str) -> Detections:
     """The same of boxes in 3D, of a vision_msgs/Detection3DArray or Autoware's DetectedObjects.
 
     Raises:
@@ -61,7 +61,7 @@ def read_detections_3d(message: Any, camera: Camera, camera_frame: str) -> _Read
     return _columns((box, name or None, score) for box, name, score in found)
 
 
-def _columns(found: Iterable[tuple[_Box, str | None, float]]) -> _Read:
+def _columns(found: Iterable[tuple[_Box, str | None, float]]) -> Detections:
     """Columns of the detections with a box and a class, and the number of the others."""
     rows = list(found)
     kept = [(box, name, score) for box, name, score in rows if box is not None and name is not None]

@@ -31,7 +31,7 @@ class EgoTrack:
 
     def __init__(self) -> None:
         self._rows: list[tuple[float, ...]] = []
-        self._sorted: tuple[np.ndarray, np.ndarray] | None = None
+        self._is_sorted = False
         self.vehicle_frame = ""
 
     def __len__(self) -> int:
@@ -45,7 +45,7 @@ class EgoTrack:
         if not all(map(math.isfinite, numbers)) or not 0.5 < q.w**2 + q.x**2 + q.y**2 + q.z**2 < 2:
             return False
         self._rows.append((stamp_ns, *numbers))
-        self._sorted = None
+        self._is_sorted = False
         self.vehicle_frame = str(message.child_frame_id).lstrip("/") or self.vehicle_frame
         return True
 
@@ -53,42 +53,37 @@ class EgoTrack:
         """State at a stamp between two odometry messages at most half a second apart, else None."""
         if not self._rows:
             return None
-        stamps, values = self._arrays()
-        i = int(np.searchsorted(stamps, stamp_ns, "right"))
-        if i and stamps[i - 1] == stamp_ns:
-            return _state(values[i - 1], values[i - 1], 0.0)
-        if i == 0 or i == len(stamps) or stamps[i] - stamps[i - 1] > _LONGEST_GAP_S * 1e9:
+        before, after, share, known = self._between(np.array([stamp_ns], np.int64))
+        if not known[0]:
             return None
-        share = (stamp_ns - stamps[i - 1]) / (stamps[i] - stamps[i - 1])
-        return _state(values[i - 1], values[i], float(share))
+        both = self._values[[before[0], after[0]]]
+        T_a, T_b = from_quaternion(both[:, 3:7], both[:, :3])
+        R = T_a[:3, :3] @ exp_so3(share[0] * log_so3(T_a[:3, :3].T @ T_b[:3, :3]))
+        mixed = both[0] + share[0] * (both[1] - both[0])
+        return EgoState(float(mixed[7]), float(mixed[8]), from_rotation_translation(R, mixed[:3]))
 
     def motion_at(
         self, stamps_ns: Int[np.ndarray, " N"]
     ) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, " N"]]:
         """Forward speed [m/s] and yaw rate [rad/s] at many stamps, NaN where `at` returns None."""
-        unknown = np.full(len(stamps_ns), np.nan)
-        if len(self._rows) < 2:
-            return unknown, unknown
-        stamps, values = self._arrays()
-        i = np.clip(np.searchsorted(stamps, stamps_ns, "right"), 1, len(stamps) - 1)
-        known = (stamps_ns >= stamps[0]) & (stamps_ns <= stamps[-1])
-        known &= stamps[i] - stamps[i - 1] <= _LONGEST_GAP_S * 1e9
-        known |= (stamps[i - 1] == stamps_ns) | (stamps[i] == stamps_ns)
-        share = (stamps_ns - stamps[i - 1]) / (stamps[i] - stamps[i - 1])
-        mixed = values[i - 1] + share[:, None] * (values[i] - values[i - 1])
-        return np.where(known, mixed[:, 7], np.nan), np.where(known, mixed[:, 8], np.nan)
+        if not self._rows:
+            return np.full(len(stamps_ns), np.nan), np.full(len(stamps_ns), np.nan)
+        before, after, share, known = self._between(stamps_ns)
+        a, b = self._values[before, 7:9], self._values[after, 7:9]
+        speed, yaw_rate = np.where(known, (a + share[:, None] * (b - a)).T, np.nan)
+        return speed, yaw_rate
 
-    def _arrays(self) -> tuple[np.ndarray, np.ndarray]:
-        if self._sorted is None:
+    def _between(self, stamps_ns: Int[np.ndarray, " N"]) -> tuple[np.ndarray, ...]:
+        """Indices of the messages before and after each stamp, its share of the gap, and whether it is known."""
+        if not self._is_sorted:
             stamps = np.array([r[0] for r in self._rows], np.int64)
             order = np.unique(stamps, return_index=True)[1]
-            self._sorted = stamps[order], np.array([r[1:] for r in self._rows], np.float64)[order]
-        return self._sorted
-
-
-def _state(a: Float[np.ndarray, " 9"], b: Float[np.ndarray, " 9"], share: float) -> EgoState:
-    both = np.stack([a, b])
-    T_a, T_b = from_quaternion(both[:, 3:7], both[:, :3])
-    R = T_a[:3, :3] @ exp_so3(share * log_so3(T_a[:3, :3].T @ T_b[:3, :3]))
-    mixed = a + share * (b - a)
-    return EgoState(float(mixed[7]), float(mixed[8]), from_rotation_translation(R, mixed[:3]))
+            self._stamps = stamps[order]
+            self._values = np.array([r[1:] for r in self._rows], np.float64)[order]
+            self._is_sorted = True
+        stamps = self._stamps
+        after = np.minimum(np.searchsorted(stamps, stamps_ns), len(stamps) - 1)
+        before = np.where(stamps[after] == stamps_ns, after, np.maximum(after - 1, 0))
+        gap = stamps[after] - stamps[before]
+        known = (stamps_ns >= stamps[0]) & (stamps_ns <= stamps[-1]) & (gap <= _LONGEST_GAP_S * 1e9)
+        return before, after, (stamps_ns - stamps[before]) / np.maximum(gap, 1), known

@@ -48,10 +48,11 @@ FOLDERS = {
 }
 
 
-def write(kit, tmp_path, container):
+def write(kit, tmp_path, container, **options):
+    """The log of a drive in this container; `options` as of Kit."""
     if container in BAGS:
-        return kit.Kit(ros=1).drive().bag(tmp_path / f"{container}.bag", BAGS[container])
-    drive = kit.Kit().drive()
+        return kit.Kit(ros=1, **options).drive().bag(tmp_path / f"{container}.bag", BAGS[container])
+    drive = kit.Kit(**options).drive()
     if container in MCAP:
         return drive.mcap(tmp_path / f"{container}.mcap", **MCAP[container])
     if container == "mcap_folder":

@@ -7,17 +7,10 @@ import pytest
 
 from pipeline.core.errors import BoresightError
 from schemas.calibrations import SENSORS
+from tests.ingest.containers.test_containers import write
 
+CONTAINERS = {"mcap": "mcap_plain", "bag": "bag_lz4", "db3": "db3_file"}
 TRIALS = 20  # per container and kind of damage: 20 x 3 x 3 logs
-
-
-def good_log(kit, tmp_path, container):
-    if container == "bag":
-        return kit.Kit(ros=1, frames=6).drive().bag(tmp_path / "good.bag", "LZ4")
-    drive = kit.Kit(frames=6).drive()
-    if container == "mcap":
-        return drive.mcap(tmp_path / "good.mcap", compression="NONE")
-    return next(drive.folder(tmp_path / "bag").glob("*.db3"))
 
 
 def damaged(data, kind, rng):
@@ -37,10 +30,10 @@ def damaged(data, kind, rng):
     return data
 
 
-@pytest.mark.parametrize("container", ["mcap", "bag", "db3"])
+@pytest.mark.parametrize("container", CONTAINERS)
 @pytest.mark.parametrize("kind", ["cut", "flipped", "torn"])
 def test_damaged_logs_give_only_whole_frames_or_a_plain_refusal(kit, tmp_path, run_ingest, container, kind):
-    good = good_log(kit, tmp_path, container)
+    good = write(kit, tmp_path, CONTAINERS[container], frames=6)
     data = good.read_bytes()
     truth = {f.stamp_ns: f for f in run_ingest(good, name="good")[1]}
     assert len(truth) == 6
