@@ -8,7 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from jobs.terminal.summary import exit_code, left_out, print_summary, progress_reporter
-from jobs.terminal.vehicle_status import count_statuses, moved_sensors, next_steps
+from jobs.terminal.vehicle_status import next_steps, told_of
 from pipeline.calibrate.methods import method_named
 from pipeline.core.config import load_fleet
 from pipeline.core.stage_work import Task, Window
@@ -63,9 +63,8 @@ def audit(
         status,
         reason=outcome.reason,
         vehicles=len({f.vehicle for f in findings}),
-        statuses=count_statuses(findings),
         charts={s: charts.count(s) for s in DRIFT_STATUSES},
-        moved=moved_sensors(findings),
+        **told_of(findings),
         next_steps=next_steps(findings, lake, mend),
         misconfigured=mend,
         damaged=damaged,

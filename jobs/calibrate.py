@@ -18,7 +18,7 @@ from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import perceived
 from schemas.words import day_word
 
-__all__ = ["calibrate", "parse_pair", "parse_perturb"]
+__all__ = ["calibrate", "parse_pair"]
 
 
 # The parameters of a command are its options: more than eight, because a user sets each of them.
@@ -59,7 +59,8 @@ def calibrate(
     require_named_files(config)
     if polish:
         config = config.changed(solve={"polish": True})
-    task = Task(config, Lake.at(lake), Partition(vehicle, day), method, seed, parse_perturb(perturb))
+    shifted = None if perturb is None else parse_pair(perturb, "perturb")
+    task = Task(config, Lake.at(lake), Partition(vehicle, day), method, seed, shifted)
     if frame is None:
         return _calibrate_day(task)
     return _calibrate_frame(replace(task, method="joint-ssl") if method == "joint" else task, frame, page)
@@ -74,7 +75,7 @@ def _calibrate_day(task: Task) -> int:
             f"the lake has no observations of {vehicle} on {day}: run `boresight ingest` and `perceive` first"
         )
         raise ConfigError("command line", "day", problem)
-    with progress_reporter(f"calibrate {task.partition.vehicle} {task.partition.day}") as progress:
+    with progress_reporter(f"calibrate {vehicle} {day}") as progress:
         outcome = CALIBRATE.run(replace(task, progress=progress))
     record_outcome(task.lake, outcome, task.method or "")
     word = day_word(status for status, pairs in outcome.kept.items() if pairs)
@@ -131,11 +132,6 @@ def _calibrate_frame(task: Task, frame: int, page: Path | None) -> int:
         reason="one frame: no verdict and no record",
     )
     return 0
-
-
-def parse_perturb(text: str | None) -> tuple[float, float] | None:
-    """Parse "ROT_DEG,TRANS_M" to (degrees, metres); None stays None; else ConfigError."""
-    return None if text is None else parse_pair(text, "perturb")
 
 
 def parse_pair(text: str, option: str) -> tuple[float, float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -31,7 +31,7 @@ from pipeline.store.partitions import Lake
 from schemas.versions import CODE_VERSION
 from schemas.words import day_word
 
-__all__ = ["FrameOptions", "mounting", "poses_in_use", "read_calibration", "read_sides"]
+__all__ = ["FrameOptions", "at_prior", "pairs_to", "poses_in_use", "read_calibration", "read_sides"]
 
 
 def read_calibration(
@@ -66,7 +66,7 @@ def read_calibration(
     seen = sorted({sensor.name for edge in edges for sensor in edge.sensors if sensor.kind == "camera"})
     cameras = read_cameras(lake, vehicle, days, seen)
     tree = read_tf(lake, vehicle, days)
-    T_base = None if mount is None else mounting(mount, names, edges)
+    T_base = None if mount is None else _mounting(mount, names, edges)
     on_base = {e for e in edges if BASE in e.sensors and words_of(e) in pairs}
     if T_base is None and not on_base:  # the car's own root, where its tf has one
         T_base = tree.lookup(names.base, names.of(reference_of(edges).name))
@@ -82,11 +82,25 @@ def read_calibration(
     )  # fmt: skip
 
 
+def at_prior(calibration: ExportedCalibration, lake: Lake, day: str) -> ExportedCalibration:
+    """The calibration with the priors of a day in place of its estimates."""
+    found = priors_of_day(lake, calibration.vehicle, day, calibration.method)
+    known = {name: pair for name, pair in found.items() if not isinstance(pair, str)}
+    return replace(calibration, pairs=known, known=tuple(pair.edge for pair in known.values()))
+
+
+def pairs_to(found: ExportedCalibration, sensor: str) -> tuple[list[ExportedPair], str]:
+    """Pairs on the chain from the reference to a sensor, and their statuses in words."""
+    way = found.way(found.reference.name, sensor) or ()
+    pairs = [pair for pair in found.pairs.values() if pair.edge in way]
+    return pairs, ", ".join(sorted({pair.status for pair in pairs}))
+
+
 def _listed(value: object) -> list[object]:
     return list(value) if isinstance(value, list) else []
 
 
-def mounting(text: str, names: FrameNames, edges: tuple[Edge, ...]) -> np.ndarray:
+def _mounting(text: str, names: FrameNames, edges: tuple[Edge, ...]) -> np.ndarray:
     """Read T_base_lidar of the reference sensor from log:FILE (/tf_static) or FORMAT:FILE."""
     name, colon, path = text.partition(":")
     if not colon:

@@ -134,7 +134,6 @@ def _measured(report: CheckReport) -> list[str]:
 
 
 _NAMED = 4  # edges named per line; the others are counted
-_COLOUR_OF_PAIR = {"yes": "green", "weak": "yellow", "no": "red"}
 
 
 def print_rig(console: Console, rig: RigFinding) -> None:
@@ -143,9 +142,8 @@ def print_rig(console: Console, rig: RigFinding) -> None:
     columns = [s for s in rig.sensors if any(child == s for _, child in pairs)]
     rows = [s for s in rig.sensors if any(parent == s for parent, _ in pairs)]
     table = Table(title="Shared views", title_justify="left", padding=(0, 1, 0, 0), pad_edge=False)
-    table.add_column("")
-    for column in columns:
-        table.add_column(column, justify="right")
+    for column in ("", *columns):
+        table.add_column(column, justify="right" if column else "left")
     for row in rows:
         name = f"{row} *" if row == rig.reference else row
         table.add_row(name, *(_cell(pairs.get((row, column))) for column in columns))
@@ -156,12 +154,9 @@ def print_rig(console: Console, rig: RigFinding) -> None:
     )
     console.print(f"poses refer to {rig.reference} (*); pairs without a second line are not calibrated")
     for (verdict, reason, edges), dofs in _reasons(rig).items():
-        named = ", ".join(edges[:_NAMED]) + (
-            f" and {len(edges) - _NAMED} more" if len(edges) > _NAMED else ""
-        )
-        console.print(
-            f"  - [{_COLOUR_OF_PAIR[verdict]}]{verdict}[/]: {'; '.join(dofs)} of {named}: {escape(reason)}"
-        )
+        more = f" and {len(edges) - _NAMED} more" if len(edges) > _NAMED else ""
+        of = f"{'; '.join(dofs)} of {', '.join(edges[:_NAMED])}{more}"
+        console.print(f"  - [{_COLOUR[verdict]}]{verdict}[/]: {of}: {escape(reason)}")
     if rig.loose:
         console.print(f"  - no edge joins {', '.join(rig.loose)} to {rig.reference}", markup=False)
 

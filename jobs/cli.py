@@ -47,7 +47,7 @@ _HELP = {
     "view": "Show one vehicle-day in 3D, before and after its calibration.",
     "status": "Show which vehicle-days are done, held, refused, failed or missing, and why.",
     "gc": "Delete old images, and pages that show them, from a lake.",
-    "export": "Write a calibration for ROS 2, Autoware, KITTI, ...; JSON Schemas; a network as ONNX.",
+    "export": "Write a calibration (ROS 2, Autoware, KITTI, ...), frames for training, JSON Schemas or a network.",
     "export frames": "Write frames of many days with calibration: Parquet, nuScenes.",
     "import": "Convert calibration files of other programs to a prior file.",
     "compare": "Compare two calibrations axis by axis: records, days, methods, files.",
@@ -83,7 +83,7 @@ app = App(
     suppress_keyboard_interrupt=False,
 )
 for _name, (_path, _help) in COMMANDS.items():
-    app.command(_path, name=_name, help=_help)
+    app.command(_path, name=_name, help=_help, show=" " not in _name)  # two words: in the help of the first
 
 
 def main(argv: Sequence[str] | None = None) -> int:

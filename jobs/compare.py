@@ -63,18 +63,13 @@ def compare(
         raise ConfigError("command line", "A, B", f"no pair in common; {'; '.join(notes)}".rstrip("; "))
     if page is not None:
         write_page(page, comparison_page(titles[0], titles[1], found, notes))
-    plain: dict[str, Any] = {
-        "a": titles[0],
-        "b": titles[1],
-        "notes": notes,
-        "pairs": [_plain(p) for p in found],
-    }
+    pairs = [_plain(p) for p in found]
     if json:
-        print_json(plain, indent=2)
+        print_json({"a": titles[0], "b": titles[1], "notes": notes, "pairs": pairs}, indent=2)
         return 0
 
-    print_comparison(titles, found, notes)
-    largest = max((row["z"] for p in plain["pairs"] for row in p["axes"] if row["z"]), key=abs, default=None)
+    _print_comparison(titles, found, notes)
+    largest = max((row["z"] for p in pairs for row in p["axes"] if row["z"]), key=abs, default=None)
     print_summary("compare", "done", a=titles[0], b=titles[1], largest_z=largest, page=page)
     return 0
 
@@ -104,7 +99,7 @@ def _plain(difference: PairDifference) -> dict[str, Any]:
     }
 
 
-def print_comparison(titles: Sequence[str], found: Sequence[PairDifference], notes: Sequence[str]) -> None:
+def _print_comparison(titles: Sequence[str], found: Sequence[PairDifference], notes: Sequence[str]) -> None:
     """Print the change from the first to the second; changes that sigmas do not explain are bold."""
     view = Table(title=f"from {titles[0]} to {titles[1]}", title_justify="left")
     for name in ("pair", "axis", "change", "sigma", "z", ""):

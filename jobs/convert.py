@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -10,19 +9,15 @@ from jobs.terminal.summary import print_summary, progress_reporter
 from pipeline.convert.kitti_shaped import read_kitti, read_view_of_delft
 from pipeline.convert.log_file import fleet_text, write_log
 from pipeline.convert.nuscenes import read_nuscenes
-from pipeline.convert.recording import Recording
 from pipeline.core.errors import ConfigError
 from pipeline.rig.graph import Kind
 from pipeline.store.partitions import Partition
 
 __all__ = ["convert"]
 
-DataSet = Literal["nuscenes", "vod", "kitti"]
-RADAR_COLUMNS = "x,y,z,power,doppler"
-
 
 def convert(
-    data_set: DataSet,
+    data_set: Literal["nuscenes", "vod", "kitti"],
     folder: Path,
     /,
     *,
@@ -32,7 +27,7 @@ def convert(
     camera: str | None = None,
     lidar: str | None = None,
     radar: str | None = None,
-    radar_columns: str = RADAR_COLUMNS,
+    radar_columns: str = "x,y,z,power,doppler",
     segmenter: str | None = None,
     detector: str | None = None,
 ) -> int:
@@ -55,59 +50,34 @@ def convert(
             fleet.toml yourself.
         detector: model manifest for fleet.toml.
     """
-    models = _models_of(segmenter, detector)
-    owner = vehicle or str(data_set)
+    if (segmenter is None) != (detector is None):
+        raise ConfigError("command line", "segmenter, detector", "give both or neither")
+    models = None if segmenter is None or detector is None else (segmenter, detector)
+    owner, messages = vehicle or str(data_set), 0
     Partition(owner, day)  # raises for invalid names
-    messages = 0
     with progress_reporter("convert") as progress:
         progress(0, 0, f"tables of {folder}")
-        named: dict[Kind, str | None] = {"camera": camera, "lidar": lidar, "radar": radar}
-        recordings = _recordings_of(data_set, folder, owner, day, named, radar_columns)
-        folders = [Partition(r.vehicle, r.day) for r in recordings]  # raises for invalid names
-        named_logs = zip(folders, recordings, strict=True)
-        paths = [out / "logs" / p.vehicle / p.day / f"{r.name}.mcap" for p, r in named_logs]
+        if data_set == "nuscenes":
+            named: dict[Kind, str | None] = {"camera": camera, "lidar": lidar, "radar": radar}
+            recordings = read_nuscenes(folder, {k: c.split(",") for k, c in named.items() if c is not None})
+        elif data_set == "vod":
+            recordings = read_view_of_delft(folder, owner, day)
+        else:
+            recordings = read_kitti(folder, owner, day, radar_columns.split(","))
+        places = [Partition(r.vehicle, r.day) for r in recordings]  # raises for invalid names
+        paths = [
+            out / "logs" / p.vehicle / p.day / f"{r.name}.mcap"
+            for p, r in zip(places, recordings, strict=True)
+        ]
         for done, (path, recording) in enumerate(zip(paths, recordings, strict=True)):
             progress(done, len(paths), recording.name)
             messages += write_log(path, recording)
-    fleet = _write_fleet(out, data_set, recordings, models)
-    print_summary("convert", "done", fleet=fleet, logs=paths, messages=messages)
-    return 0
-
-
-def _models_of(segmenter: str | None, detector: str | None) -> tuple[str, str] | None:
-    """Manifests of both models, or None; ConfigError for one of them."""
-    if segmenter is None and detector is None:
-        return None
-    if segmenter is None or detector is None:
-        raise ConfigError("command line", "segmenter, detector", "give both or neither")
-    return segmenter, detector
-
-
-def _recordings_of(
-    data_set: DataSet,
-    folder: Path,
-    owner: str,
-    day: str,
-    named: Mapping[Kind, str | None],
-    radar_columns: str,
-) -> list[Recording]:
-    """Recordings of a data set's folder; `named` has channels of nuScenes, separated by commas."""
-    if data_set == "nuscenes":
-        return read_nuscenes(folder, {k: c.split(",") for k, c in named.items() if c is not None})
-    if data_set == "vod":
-        return read_view_of_delft(folder, owner, day)
-    return read_kitti(folder, owner, day, radar_columns.split(","))
-
-
-def _write_fleet(
-    out: Path, data_set: DataSet, recordings: Sequence[Recording], models: tuple[str, str] | None
-) -> Path:
-    """Write fleet.toml for recordings."""
-    has_ego = all(any(e.sensor == "ego" for e in r.events) for r in recordings)
     vehicles = sorted({r.vehicle for r in recordings})
     kinds = {name: kind for r in recordings for name, kind in r.kinds.items()}
+    ego = all(any(e.sensor == "ego" for e in r.events) for r in recordings)
     base = data_set == "nuscenes"  # the others give poses in a sensor's frame
     out.mkdir(parents=True, exist_ok=True)
     fleet = out / "fleet.toml"
-    fleet.write_text(fleet_text(data_set, vehicles, kinds, models, ego=has_ego, base=base))
-    return fleet
+    fleet.write_text(fleet_text(data_set, vehicles, kinds, models, ego=ego, base=base))
+    print_summary("convert", "done", fleet=fleet, logs=paths, messages=messages)
+    return 0

@@ -8,22 +8,23 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from jobs.extras import needs
-from jobs.nightly import Drawing, close_night, watch_night
+from jobs.extras import require
+from jobs.nightly import close_night, watch_night
 from jobs.simulate import simulate_days
 from jobs.terminal.demo_table import errors_of, print_comparison
 from jobs.terminal.summary import exit_code, is_terminal, print_summary
-from jobs.terminal.vehicle_status import count_statuses, moved_sensors
+from jobs.terminal.vehicle_status import told_of
 from pipeline.core.config import config_hash, load_fleet
 from pipeline.fleet.nightly import DayOutcome, Night
+from pipeline.fleet.pages import OnWorkers
 from pipeline.fleet.pattern import find_vehicle_days
+from pipeline.report.stage import Pages
 from pipeline.report.truth import read_truth
 from pipeline.store.partitions import Lake
-from schemas.drift import DriftFinding
 from schemas.versions import CODE_VERSION
 
 if TYPE_CHECKING:
@@ -41,7 +42,6 @@ _OWN_RIGS = (("vehicle-3", "duo"),)
 _FEWEST = 12
 
 
-@needs("simulate")
 def demo(
     *,
     out: Path = Path("demo"),
@@ -62,6 +62,7 @@ def demo(
         workers: processes at a time; default: one per CPU that this process may use.
         seed: random seed of the fleet.
     """
+    require("simulate")
     began = time.monotonic()
     spec, dates = _plan(vehicles, days, frames, seed)
     bump = "; before day 3 someone bumps a radar" if spec.faults else ""
@@ -72,21 +73,27 @@ def demo(
     outcomes = _calibrate(night, out / "logs", dates, workers)
     _say("[bold]3/3[/]  the audit: which sensor moved, and since when")
     truth = read_truth(out / "truth")
-    drawing = Drawing(out / "report" / "fleet.html", True, "process", workers, truth)
-    findings, pages = close_night(night, None, drawing, outcomes)
-    errors = print_comparison(night.lake, night.method, truth, dates[-1], findings)
-    errors += errors_of(night.lake, _NETWORK, truth, dates[-1])
+    pages = Pages(out / "report" / "fleet.html", truth, fan_out=OnWorkers("process", workers))
+    findings, drawn = close_night(night, None, pages, outcomes)
+    print_comparison(night.lake, night.method, truth, dates[-1], findings)
+    methods = (night.method, _NETWORK)
+    errors = [error for m in methods for error in errors_of(night.lake, m, truth, dates[-1])]
     (out / "comparison.json").write_text(json.dumps(errors, indent=1) + "\n")
     knocked = [{"vehicle": f.vehicle, "sensor": f.sensor, "since": dates[f.day]} for f in spec.faults]
-    return _summarise(
-        [o.status for o in outcomes],
-        findings,
-        report=pages[0] if pages else None,
-        seconds=round(time.monotonic() - began, 1),
+    page, seconds = drawn[0] if drawn else None, round(time.monotonic() - began, 1)
+    _say(f"\n[bold]{page or 'no report'}[/]  open it in a browser ({seconds:.0f} s in all)")
+    code = exit_code(o.status for o in outcomes)
+    print_summary(
+        "demo",
+        {0: "done", 1: "failed", 3: "held"}[code],
+        report=page,
+        seconds=seconds,
         vehicle_days=vehicles * days,
         knocked=knocked,
         comparison=out / "comparison.json",
+        **told_of(findings),
     )
+    return code
 
 
 def _plan(vehicles: int, days: int, frames: int, seed: int) -> tuple[FleetSpec, list[str]]:
@@ -119,16 +126,6 @@ def _calibrate(night: Night, logs: Path, dates: Sequence[str], workers: int | No
         *watch_night(night, work, "process", workers),
         *watch_night(by_network, last_day, "process", workers),
     ]
-
-
-def _summarise(statuses: Sequence[str], findings: Sequence[DriftFinding], **told: Any) -> int:
-    """Print the path of the report and the summary; returns the exit code."""
-    code = exit_code(statuses)
-    page = told["report"] or "no report"
-    _say(f"\n[bold]{page}[/]  open it in a browser ({told['seconds']:.0f} s in all)")
-    audited = {"statuses": count_statuses(findings), "moved": moved_sensors(findings)}
-    print_summary("demo", {0: "done", 1: "failed", 3: "held"}[code], **told, **audited)
-    return code
 
 
 def _simulate(spec: FleetSpec, out: Path, workers: int | None) -> None:

@@ -22,8 +22,6 @@ from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 
 __all__ = ["evaluate"]
 
-_KINDS = ("", ".md", ".parquet", ".html")  # of --out; without a suffix it is a folder
-
 
 def evaluate(
     *,
@@ -58,7 +56,13 @@ def evaluate(
         out: FILE.md, FILE.parquet, FILE.html (a page with the paper's figures for these days), or a folder
             for all of them as table_1.*; the tables are printed on stderr in any case.
     """
-    _check(truth, reflectors, recording_lake or recording_day, out)
+    if (truth is None) == (reflectors is None):
+        raise ConfigError("command line", "truth", "give either --truth or --reflectors")
+    if truth is not None and (recording_lake or recording_day):
+        raise ConfigError("command line", "recording-lake", "a reflector recording needs --reflectors")
+    if out is not None and not out.is_dir() and out.suffix not in ("", ".md", ".parquet", ".html"):
+        problem = f"{out.name} is neither a folder nor one of .md, .parquet, .html"
+        raise ConfigError("command line", "out", problem)
     tables = Lake.existing(lake)
     records = [r for r in read_records(tables, CALIBRATIONS, CalibrationRecord) if method in (None, r.method)]
     recording = (recording_lake or lake, recording_day) if recording_lake or recording_day else None
@@ -80,18 +84,8 @@ def evaluate(
     return 0 if compared else 3
 
 
-def _check(truth: Path | None, reflectors: Path | None, recording: str | None, out: Path | None) -> None:
-    """Raise ConfigError for options that contradict each other, before any work."""
-    if (truth is None) == (reflectors is None):
-        raise ConfigError("command line", "truth", "give either --truth or --reflectors")
-    if truth is not None and recording:
-        raise ConfigError("command line", "recording-lake", "a reflector recording needs --reflectors")
-    if out is not None and not out.is_dir() and out.suffix not in _KINDS:
-        kinds = ", ".join(kind for kind in _KINDS if kind)
-        raise ConfigError("command line", "out", f"{out.name} is neither a folder nor one of {kinds}")
-
-
 def _write(out: Path, compared: Sequence[ComparedRun], notes: Sequence[str], lake: Lake) -> None:
+    """Write the file of --out by its suffix; a folder, or a path without suffix, gets all of them."""
     comparisons = [c.comparison for c in compared]
     rows = table_rows(comparisons)
     texts = as_markdown(rows, comparisons, notes)

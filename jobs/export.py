@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from jobs.calibration_sources import FrameOptions, read_calibration
+from jobs.calibration_sources import FrameOptions, at_prior, read_calibration
 from jobs.extras import require
 from jobs.terminal.logging import logger
 from jobs.terminal.summary import print_summary, progress_reporter
@@ -18,9 +17,8 @@ from pipeline.core.errors import ConfigError
 from pipeline.export.calibration import USABLE, ExportedCalibration, written_pairs
 from pipeline.export.files import updated_file, write_files, written_files
 from pipeline.export.formats import format_named
-from pipeline.export.lake import priors_of_day, read_scenes
+from pipeline.export.lake import read_scenes
 from pipeline.export.provenance import not_certified, used_lines, warnings_of
-from pipeline.rig.graph import Sensor
 from pipeline.store.atomic_write import atomic_write
 from pipeline.store.partitions import Lake, Partition
 from schemas.versions import write_json_schemas
@@ -54,6 +52,8 @@ def export(
     notes: Path | None = None,
 ) -> int:
     """Write a file for other programs: a calibration in one of many formats, JSON Schemas, or a network.
+
+    For frames of many days with their calibration: `boresight export frames --help`.
 
     A calibration is a vehicle's state, or with --day the records of that day. In a state, a sensor without usable
     days is at its prior; of a day, held and refused pairs are left out. The file and the summary have the reasons.
@@ -105,35 +105,20 @@ def export(
         lake, vehicle, day, method, force=force, frames=frames,
         own_frames=own_frames, is_signed=signed_off, mount=mount,
     )  # fmt: skip
+    outputs: list[Path] = []
     if what == "foxglove":
-        return _export_drive(out, calibration, lake, day, most_frames, sensor)
-    return _export_calibration(what, out, calibration, update)
-
-
-def _export_calibration(what: str, out: Path, calibration: ExportedCalibration, update: Path | None) -> int:
-    files = {}
-    if written_pairs(calibration):
+        if day is None:
+            raise ConfigError("command line", "day", "foxglove shows a day's drive: give --day")
+        if written_pairs(calibration):
+            outputs = _export_drive(calibration, lake, day, out, most_frames, sensor)
+    elif written_pairs(calibration):
         form = format_named(what)
         files = (
             updated_file(form, calibration, update, out) if update else written_files(form, calibration, out)
         )
-    write_files(files)
-    return _tell(what, calibration, list(files))
-
-
-def _export_drive(
-    out: Path,
-    calibration: ExportedCalibration,
-    lake: str | None,
-    day: str | None,
-    most_frames: int,
-    sensors: tuple[str, ...],
-) -> int:
-    if lake is None or day is None:
-        raise ConfigError("command line", "day", "foxglove shows a day's drive: give --day")
-    wanted = bool(written_pairs(calibration))
-    outputs = export_foxglove(calibration, lake, day, out, most_frames, sensors) if wanted else []
-    return _tell("foxglove", calibration, outputs)
+        write_files(files)
+        outputs = list(files)
+    return _tell(what, calibration, outputs)
 
 
 def _tell(what: str, calibration: ExportedCalibration, outputs: list[Path]) -> int:
@@ -173,7 +158,7 @@ def _export_onnx(out: Path, run: Path | None, notes: Path | None) -> list[Path]:
     return [out, out.with_suffix(".json"), out.with_suffix(".md")]
 
 
-def export_foxglove(
+def _export_drive(
     calibration: ExportedCalibration,
     location: str,
     day: str,
@@ -192,12 +177,13 @@ def export_foxglove(
         raise ConfigError("command line", "out", f"{out} must end in .mcap")
     from pipeline.export.foxglove import layout_of, write_foxglove
 
+    there = {s.name: s for s in calibration.sensors}
+    if unknown := [name for name in sensors if name not in there]:
+        problem = f"no {', '.join(unknown)}: the rig has {', '.join(there)}"
+        raise ConfigError("command line", "sensor", problem)
+    shown = [there[name] for name in sensors or there]
     lake, reference = Lake.existing(location), calibration.reference
-    found = priors_of_day(lake, calibration.vehicle, day, calibration.method)
-    known = {name: pair for name, pair in found.items() if not isinstance(pair, str)}
-    before = replace(calibration, pairs=known, known=tuple(pair.edge for pair in known.values()))
     partition, layout = Partition(calibration.vehicle, day), out.with_suffix(".layout.json")
-    shown = _shown(calibration, sensors)
     beside = {"lidar": reference.name} if reference.kind == "lidar" else {}
     scenes = {
         s: read_scenes(
@@ -207,19 +193,7 @@ def export_foxglove(
     }
     out.parent.mkdir(parents=True, exist_ok=True)
     with progress_reporter("export foxglove"), atomic_write(out) as stream:
-        write_foxglove(stream, calibration, before, scenes)
-    text = layout_of(shown, reference.name, calibration.names.of(reference.name))
+        write_foxglove(stream, calibration, at_prior(calibration, lake, day), scenes)
     with atomic_write(layout) as stream:
-        stream.write(text)
+        stream.write(layout_of(shown, reference.name, calibration.names.of(reference.name)))
     return [out, layout]
-
-
-def _shown(calibration: ExportedCalibration, sensors: Sequence[str]) -> list[Sensor]:
-    """The sensors with these names, or all without a name; ConfigError if a name is unknown."""
-    there = {s.name: s for s in calibration.sensors}
-    unknown = [name for name in sensors if name not in there]
-    if unknown:
-        raise ConfigError(
-            "command line", "sensor", f"no {', '.join(unknown)}: the rig has {', '.join(there)}"
-        )
-    return [there[name] for name in sensors] if sensors else list(there.values())

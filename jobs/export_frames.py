@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
 from jobs.frame_calibrations import mounting_of
 from jobs.prepare import days_with_observations, over_days
-from jobs.terminal.summary import print_summary, progress_reporter
+from jobs.terminal.summary import exit_code, print_summary, progress_reporter
 from pipeline.core.config import FleetConfig, load_fleet
 from pipeline.core.errors import ConfigError, SolveError
 from pipeline.learn.frames.card import write_card
@@ -75,39 +75,43 @@ def export_frames(
     known, left_out = _mountings(tables, config, days, calibration, method, sensor, force=force)
     if not known:
         raise ConfigError("command line", "calibration", f"no vehicle-day has one: {left_out[0]['reason']}")
-    moved = None if perturb is None else Perturbation(*perturb, seed, perturb_per)
-    settings = {
+    settings: dict[str, Any] = {
         "format": format,
         "calibration": calibration,
         "method": method,
         "sensors": list(sensor),
-        "seed": seed,
     }
-    settings |= {"perturb": None if perturb is None else list(perturb), "perturb_per": perturb_per}
+    settings |= {"seed": seed, "perturb": None if perturb is None else list(perturb)}
+    settings |= {"perturb_per": perturb_per}
     whole = {"val_fraction": 0.0, "test_fraction": 0.0} if unsplit else {}
     prepare = config.prepare.split_with(**whole)
     with progress_reporter("plan") as progress:
         planned, settings = plan_frames(tables, list(known), prepare, output, settings, progress)
+    moved = None if perturb is None else Perturbation(*perturb, seed, perturb_per)
     tasks = [
         DayTask(tables, day, output, format, places, dict(lost), known[day], moved)
         for day, (places, lost) in planned.items()
     ]
-    counts, failed = _run(tasks, executor, workers)
-    broken = {(f["vehicle"], f["day"]) for f in failed}
-    done = [day for day in planned if (day.vehicle, day.day) not in broken]
-    card = write_card(output, settings, done, [*left_out, *failed])
-    status = "failed" if failed and not done else "held" if left_out or failed else "done"
-    told = {n: card[n] for n in ("frames", "frames_left_out")}
+    counts, failed, done = Counter[str](), list[dict[str, str]](), list[Partition]()
+    for end in over_days("frames", export_day, tasks, executor, workers):
+        counts[end.value or "failed"] += 1
+        if end.value is None:
+            failed.append(_left_out(end.item.partition, end.error))
+        else:
+            done.append(end.item.partition)
+    left_out += sorted(failed, key=lambda f: (f["vehicle"], f["day"]))
+    card = write_card(output, settings, [day for day in planned if day in done], left_out)
+    status = "failed" if failed and not done else "held" if left_out else "done"
     print_summary(
         "export frames",
         status,
         format=format,
-        vehicle_days=counts,
-        **told,
-        left_out=[*left_out, *failed],
+        vehicle_days=dict(counts),
+        **{n: card[n] for n in ("frames", "frames_left_out")},
+        left_out=left_out,
         out=out,
     )
-    return {"done": 0, "held": 3, "failed": 1}[status]
+    return exit_code([status])
 
 
 def _mountings(
@@ -128,18 +132,9 @@ def _mountings(
         except (ConfigError, SolveError) as err:
             if isinstance(err, ConfigError) and err.key == "sensor":
                 raise
-            without.append({"vehicle": day.vehicle, "day": day.day, "reason": str(err)})
+            without.append(_left_out(day, str(err)))
     return known, without
 
 
-def _run(
-    tasks: Sequence[DayTask], executor: str, workers: int | None
-) -> tuple[dict[str, int], list[dict[str, str]]]:
-    """Export all days and report progress: number of days done and cached, and the failed days."""
-    counts, failed = Counter[str](), list[dict[str, str]]()
-    for end in over_days("frames", export_day, tasks, executor, workers):
-        day = end.item.partition
-        counts[end.value or "failed"] += 1
-        if end.value is None:
-            failed.append({"vehicle": day.vehicle, "day": day.day, "reason": end.error})
-    return dict(counts), sorted(failed, key=lambda f: (f["vehicle"], f["day"]))
+def _left_out(day: Partition, reason: str) -> dict[str, str]:
+    return {"vehicle": day.vehicle, "day": day.day, "reason": reason}

@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import wraps
 from importlib.util import find_spec
-from typing import ParamSpec, TypeVar
 
-__all__ = ["EXTRAS", "needs", "require"]
-
-P = ParamSpec("P")
-R = TypeVar("R")
+__all__ = ["require"]
 
 # Extra -> a module that commands with this extra import.
-EXTRAS = {
+_EXTRAS = {
     "simulate": "embreex",
     "train": "torch",
     "ray": "ray",
@@ -23,23 +17,9 @@ EXTRAS = {
 }
 
 
-def needs(extra: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Mark a command that needs an extra."""
-
-    def mark(command: Callable[P, R]) -> Callable[P, R]:
-        @wraps(command)
-        def checked(*args: P.args, **kwargs: P.kwargs) -> R:
-            require(extra)
-            return command(*args, **kwargs)
-
-        return checked
-
-    return mark
-
-
 def require(extra: str) -> None:
     """Raise MissingExtraError before any work, so that no file is half-written."""
     from pipeline.core.errors import MissingExtraError
 
-    if find_spec(EXTRAS[extra]) is None:
-        raise MissingExtraError(extra, EXTRAS[extra])
+    if find_spec(_EXTRAS[extra]) is None:
+        raise MissingExtraError(extra, _EXTRAS[extra])

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from jobs.calibration_sources import read_calibration
+from jobs.calibration_sources import pairs_to, read_calibration
 from pipeline.core.config import FleetConfig
 from pipeline.core.errors import ConfigError, SolveError
-from pipeline.export.calibration import ExportedCalibration, sigmas_of
+from pipeline.export.calibration import sigmas_of
 from pipeline.learn.frames.frame import Mounting
 from pipeline.rig.day_prior import rig_prior
 from pipeline.rig.graph import BASE
@@ -45,10 +45,6 @@ def mounting_of(
         raise ConfigError("command line", "sensor", problem)
     of_prior = kind == "prior"
     found = _of_prior(lake, fleet, day) if of_prior else _of_calibration(lake, day, kind, method, force=force)
-    return _of_sensors(found, sensors)
-
-
-def _of_sensors(found: Mounting, sensors: Sequence[str]) -> Mounting:
     T = {n: T for n, T in found.T.items() if not sensors or n in sensors}
     if len(T) < 2:
         problem = f"{found.source} has poses of {', '.join(T) or 'no sensor'}, and a frame needs two"
@@ -74,15 +70,20 @@ def _of_calibration(lake: Lake, day: Partition, kind: str, method: str, *, force
     found = read_calibration(str(lake), day.vehicle, of_day, method, force=force)
     reference = found.reference.name
     T, about = {reference: np.eye(4)}, {reference: _about("reference", [0.0] * 3, [0.0] * 3)}
-    for sensor in found.sensors:
-        pose = None if sensor.name == reference else found.between(reference, sensor.name)
-        if pose is not None:
-            _require_since(found, reference, sensor.name, day)
-            T[sensor.name] = pose[0]
-            sigma = list((sigmas_of(*pose) or {}).values())
-            turn = [float(np.degrees(s)) for s in sigma[:3]] or None
-            about[sensor.name] = _about(_status(found, reference, sensor.name), turn, sigma[3:] or None)
-            about[sensor.name] |= _doubts(found, reference, sensor.name)
+    for sensor in (s.name for s in found.sensors if s.name != reference):
+        pose = found.between(reference, sensor)
+        if pose is None:
+            continue
+        pairs, status = pairs_to(found, sensor)
+        for since in (pair.details.get("since") for pair in pairs):
+            if since and str(since) > day.day:
+                counts = f"{found.source} counts since {since} (--calibration day takes each day's own)"
+                raise SolveError(f"{sensor} moved: {counts}")
+        sigma = list((sigmas_of(*pose) or {}).values())
+        T[sensor] = pose[0]
+        about[sensor] = _about(status, [float(np.degrees(s)) for s in sigma[:3]] or None, sigma[3:] or None)
+        if at_prior := sorted({dof for pair in pairs for dof in pair.at_prior}):
+            about[sensor] |= {"kept_at_prior": at_prior}  # or no check covers them
     return Mounting(found.source, reference, T, about, found.T_base, dict(found.left_out))
 
 
@@ -90,29 +91,3 @@ def _about(
     status: str, rotation_deg: list[float] | None, translation_m: list[float] | None
 ) -> dict[str, Any]:
     return {"status": status, "sigma_rotation_deg": rotation_deg, "sigma_translation_m": translation_m}
-
-
-def _require_since(found: ExportedCalibration, a: str, b: str, day: Partition) -> None:
-    """Raise SolveError if the state of a pose starts after the day: the sensor moved in between."""
-    for pair in _pairs(found, a, b):
-        since = pair.details.get("since")
-        if since and str(since) > day.day:
-            problem = (
-                f"{b} moved: {found.source} counts since {since} (--calibration day takes each day's own)"
-            )
-            raise SolveError(problem)
-
-
-def _pairs(found: ExportedCalibration, a: str, b: str) -> list[Any]:
-    way = found.way(a, b) or ()
-    return [pair for pair in found.pairs.values() if pair.edge in way]
-
-
-def _status(found: ExportedCalibration, a: str, b: str) -> str:
-    return ", ".join(sorted({pair.status for pair in _pairs(found, a, b)}))
-
-
-def _doubts(found: ExportedCalibration, a: str, b: str) -> dict[str, Any]:
-    """Axes of a pose that kept the prior or that no check covers; empty if there are none."""
-    axes = sorted({dof for pair in _pairs(found, a, b) for dof in pair.at_prior})
-    return {"kept_at_prior": axes} if axes else {}

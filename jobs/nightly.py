@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path, PurePath
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
@@ -15,7 +15,7 @@ from jobs.extras import require
 from jobs.terminal.logging import logger
 from jobs.terminal.night_view import night_view
 from jobs.terminal.summary import exit_code, left_out, print_summary, progress_reporter
-from jobs.terminal.vehicle_status import count_statuses, moved_sensors, next_steps
+from jobs.terminal.vehicle_status import count_statuses, moved_sensors, next_steps, told_of
 from pipeline.calibrate.methods import method_named
 from pipeline.core.config import load_fleet
 from pipeline.core.errors import ConfigError
@@ -26,7 +26,7 @@ from pipeline.fleet.metrics import NightEnd, Tally, write_metrics
 from pipeline.fleet.misconfigured import night_statuses, to_mend, vehicles_to_mend
 from pipeline.fleet.nightly import DayOutcome, Night, refused_at_once, run_night
 from pipeline.fleet.pages import OnWorkers
-from pipeline.fleet.pattern import VehicleDay, find_logs
+from pipeline.fleet.pattern import FoundLogs, VehicleDay, find_logs
 from pipeline.fleet.plan import plan_night
 from pipeline.fleet.status import night_word
 from pipeline.report.stage import Pages
@@ -38,7 +38,7 @@ from schemas.drift import DRIFT, DriftFinding
 from schemas.versions import TABLES
 from schemas.words import DAY_WORDS
 
-__all__ = ["Drawing", "close_night", "nightly", "tidy", "watch_night"]
+__all__ = ["close_night", "nightly", "watch_night"]
 
 
 # The parameters of a command are its options: more than eight, because a user sets each of them.
@@ -89,28 +89,43 @@ def nightly(
     tables = Lake.at(lake)
     night = Night(config, tables, method_named(method or config.audit.method).name, seed)
     found = find_logs(logs, from_day, to_day)
-    days, beside = found.days, found.problem
-    if beside:
-        logger().warning(beside)
+    if found.problem:
+        logger().warning(found.problem)
     if dry_run:
-        return _print_plan(night, days, beside)
+        return _print_plan(night, found)
     tally, began_s = Tally(), time.time()
-    outcomes = watch_night(night, days, executor, workers, tally.add)
-    drawing = Drawing(report, pictures, executor, workers)
-    findings, pages = close_night(night, to_day, drawing, outcomes, tally.add_stage) if outcomes else ([], [])
-    tidy(tables)
+    outcomes = watch_night(night, found.days, executor, workers, tally.add)
+    files = tables.files if report is None else LocalFiles()
+    pages = Pages(
+        report or tables.root / "report" / "fleet.html",
+        pictures=pictures,
+        files=files,
+        fan_out=OnWorkers(executor, workers),
+    )
+    findings, drawn = close_night(night, to_day, pages, outcomes, tally.add_stage) if outcomes else ([], [])
+    for schema in TABLES.values():
+        for what in tidy_table(tables, schema) if schema.is_record_table else ():
+            logger().info("tidied", table=schema.name, what=what)
     code = exit_code([*night_statuses(outcomes, config), *(["incomplete"] if tables.damage else [])])
     if metrics is not None:
         _write_metrics(metrics, config.fleet.name, tally, code, began_s, findings)
     steps = next_steps(findings, str(tables), vehicles_to_mend(outcomes, config))
-    told = {"misconfigured": to_mend(outcomes, config), "logs_left_out": beside}
-    _print_end(
-        tables,
-        code,
-        outcomes,
-        findings,
-        pages,
-        told | {"next_steps": [*([beside] if beside else []), *steps]},
+    print_summary(
+        "nightly",
+        {0: "done", 1: "failed", 2: "failed", 3: night_word(o.status for o in outcomes)}[code],
+        vehicle_days=len(outcomes),
+        **{s: sum(o.status == s for o in outcomes) for s in ("cached", *DAY_WORDS) if s != "missing"},
+        problems=[
+            {name: getattr(o, name) for name in ("vehicle", "day", "status", "reason", "pairs")}
+            for o in outcomes
+            if o.status not in ("done", "cached")
+        ],
+        **told_of(findings),
+        misconfigured=to_mend(outcomes, config),
+        logs_left_out=found.problem,
+        next_steps=[found.problem, *steps] if found.problem else steps,
+        damaged=left_out(tables),
+        report=drawn[0] if drawn else None,
     )
     return held_exit_code if code == 3 else code
 
@@ -126,36 +141,9 @@ def _write_metrics(
         logger().warning("no metrics", file=str(file), reason=str(err))
 
 
-def _print_end(
-    tables: Lake,
-    code: int,
-    outcomes: Sequence[DayOutcome],
-    findings: Sequence[DriftFinding],
-    pages: Sequence[str],
-    told: Mapping[str, Any],
-) -> None:
-    """Print the summary of the night: statuses of vehicle-days and vehicles, and paths of the pages."""
-    print_summary(
-        "nightly",
-        {0: "done", 1: "failed", 2: "failed", 3: night_word(o.status for o in outcomes)}[code],
-        vehicle_days=len(outcomes),
-        **{s: sum(o.status == s for o in outcomes) for s in ("cached", *DAY_WORDS) if s != "missing"},
-        problems=[
-            {name: getattr(o, name) for name in ("vehicle", "day", "status", "reason", "pairs")}
-            for o in outcomes
-            if o.status not in ("done", "cached")
-        ],
-        statuses=count_statuses(findings),
-        moved=moved_sensors(findings),
-        **told,
-        damaged=left_out(tables),
-        report=pages[0] if pages else None,
-    )
-
-
-def _print_plan(night: Night, days: Sequence[VehicleDay], beside: str) -> int:
+def _print_plan(night: Night, found: FoundLogs) -> int:
     """Print what the night would do with each vehicle-day, as a table and as the summary."""
-    plans = list(plan_night(night, days))
+    plans = list(plan_night(night, found.days))
     for plan in plans:
         sys.stderr.write(f"{plan.vehicle} {plan.day}: {', '.join(plan.stages) or 'nothing'} ({plan.why})\n")
     print_summary(
@@ -163,19 +151,11 @@ def _print_plan(night: Night, days: Sequence[VehicleDay], beside: str) -> int:
         "planned",
         vehicle_days=len(plans),
         would_run=sum(bool(p.stages) for p in plans),
-        logs_left_out=beside,
+        logs_left_out=found.problem,
         damaged=left_out(night.lake),
         plan=[asdict(p) for p in plans],
     )
     return 0
-
-
-def tidy(lake: Lake) -> None:
-    """Compact the record tables after a night. The log lists what was done; failures are ignored."""
-    for schema in TABLES.values():
-        if schema.is_record_table:
-            for what in tidy_table(lake, schema):
-                logger().info("tidied", table=schema.name, what=what)
 
 
 def watch_night(
@@ -197,33 +177,16 @@ def watch_night(
         for outcome in run_night(night, days, executor, workers, view.watch):
             view.finished(outcome)
             take(outcome)
-            outcomes.append(
-                replace(outcome, results=())
-            )  # the records of a whole fleet would not fit in memory
+            # Without records: those of a whole fleet would not fit in memory.
+            outcomes.append(replace(outcome, results=()))
     return outcomes
-
-
-@dataclass(frozen=True)
-class Drawing:
-    """Settings for drawing the pages of a night.
-
-    Args:
-        pictures: False = pages without images of public roads.
-        workers: processes or tasks at a time; None = one per CPU that the executor finds.
-    """
-
-    report: Path | None = None
-    pictures: bool = True
-    executor: str = "inline"
-    workers: int | None = 1
-    truth: Any = None
 
 
 def close_night(
     night: Night,
     to_day: str | None,
-    drawing: Drawing,
-    outcomes: Sequence[DayOutcome] = (),
+    pages: Pages,
+    outcomes: Sequence[DayOutcome],
     told: Callable[[Outcome], None] = lambda _: None,
 ) -> tuple[list[DriftFinding], list[str]]:
     """Audit the fleet, compute vehicle states, and write the pages; returns the findings and the page paths.
@@ -231,26 +194,17 @@ def close_night(
     The charts cover the last `audit.window_days` days, however few days this night processed. Days of this
     night get a page however old they are. `told` receives the outcome of each of these stages.
     """
+    task = Task(night.fleet, night.lake, Window(None, to_day), night.method)
     with progress_reporter("audit") as progress:
-        task = Task(night.fleet, night.lake, Window(None, to_day), night.method, progress=progress)
-        audit = AUDIT.run(task)
-        told(audit)
-        told(STATE.run(task))
+        audit, state = (stage.run(replace(task, progress=progress)) for stage in (AUDIT, STATE))
+    told(audit)
+    told(state)
     findings = DRIFT.rows_among(audit.records)
     if not findings:
         return [], []
-    files = night.lake.files if drawing.report is None else LocalFiles()
+    pages = replace(pages, also=[Partition(o.vehicle, o.day) for o in outcomes if o.pairs])
     with progress_reporter("report") as progress:
         progress(0, 0, "pages")
-        pages = Pages(
-            drawing.report or night.lake.root / "report" / "fleet.html",
-            drawing.truth,
-            drawing.pictures,
-            files,
-            [Partition(o.vehicle, o.day) for o in outcomes if o.pairs],
-            OnWorkers(drawing.executor, drawing.workers),
-        )
-        task = Task(night.fleet, night.lake, Window(), night.method, given=pages, progress=progress)
-        report = REPORT.run(task)
-        told(report)
-    return findings, [files.uri(PurePath(path)) for path in report.outputs]
+        report = REPORT.run(replace(task, of=Window(), given=pages, progress=progress))
+    told(report)
+    return findings, [pages.files.uri(PurePath(path)) for path in report.outputs]

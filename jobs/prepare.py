@@ -21,7 +21,7 @@ from pipeline.core.runner import try_stage
 from pipeline.core.stage_work import Task
 from pipeline.core.stages import PREPARE
 from pipeline.fleet.executor import EXECUTORS
-from pipeline.learn.prepare.inventory import Inventory, take_inventory, write_inventory
+from pipeline.learn.prepare.inventory import take_inventory, write_inventory
 from pipeline.learn.prepare.sides import Choice, decided_sides, price_choices, settled_keys
 from pipeline.learn.prepare.split import SplitPlan, Unit
 from pipeline.learn.prepare.survey import plan_days, survey_day
@@ -72,14 +72,33 @@ def prepare(
     for vehicle in {day.vehicle for day in days}:
         config.rig_of(vehicle).one_of_each("training")
     config, planned, choices = _plan(config, tables, days)
-    results = _run(planned, executor, workers)
+    results: list[Outcome] = []
+    for end in over_days("prepare", partial(try_stage, PREPARE), planned, executor, workers):
+        day = end.item.partition
+        results.append(end.value or Outcome("prepare", day.vehicle, day.day, "failed", "", reason=end.error))
+    split = config.prepare.split
     with progress_reporter("inventory") as progress:
         progress(0, 0, "compare views")
-        inventory = take_inventory(tables, config.prepare.split.duplicate_bits)
-    path = write_inventory(tables, inventory, _about(config) | {"choices": [asdict(c) for c in choices]})
-    print_choices(choices, len(inventory.leaks))
-    statuses = [r.status for r in results] + (["held"] if _empty_sides(config, inventory) else [])
-    code = exit_code(statuses)
+        inventory = take_inventory(tables, split.duplicate_bits)
+    about = {
+        "table": TRAINING.name,
+        "version": TRAINING.version,
+        "code_version": CODE_VERSION,
+        "settings": config.prepare.model_dump(mode="json"),
+        "choices": [asdict(c) for c in choices],
+    }
+    path = write_inventory(tables, inventory, about)
+    _print_choices(choices, len(inventory.leaks))
+    shares = {"train": 1.0, "val": split.val_fraction, "test": split.test_fraction}
+    wanted = [side for side, share in shares.items() if share > 0]
+    empty = [side for side in wanted if not inventory.frames[side]]
+    few = f"no frames: too few to split them by {', '.join(split.by)} (prepare.split.by)"
+    problems = [
+        {name: getattr(r, name) for name in ("vehicle", "day", "status", "reason")}
+        for r in results
+        if r.status not in ("done", "cached")
+    ]
+    code = exit_code([*(r.status for r in results), *("held" for _ in empty)])
     print_summary(
         "prepare",
         {0: "done", 1: "failed", 3: "held"}[code],
@@ -88,10 +107,12 @@ def prepare(
         frames=inventory.frames,
         environments=inventory.environments,
         rejected=inventory.rejected,
-        choices=[asdict(c) for c in choices],
+        choices=about["choices"],
         leaks=len(inventory.leaks),
-        problems=_problems(config, results, inventory),
-        next_steps=_next_steps(config, fleet, lake, choices, _empty_sides(config, inventory)),
+        problems=[*problems, *({"side": side, "status": "held", "reason": few} for side in empty)],
+        next_steps=[
+            _next_step(fleet, choices, wanted) if empty else f"boresight train --data {lake} --out run"
+        ],
         manifest=path,
     )
     return code
@@ -167,62 +188,18 @@ def over_days(
                 yield end
 
 
-def _run(work: Sequence[Task], executor: str, workers: int | None) -> list[Outcome]:
-    """Prepare all days; returns their outcomes."""
-    results: list[Outcome] = []
-    for end in over_days("prepare", partial(try_stage, PREPARE), work, executor, workers):
-        day = end.item.partition
-        results.append(end.value or Outcome("prepare", day.vehicle, day.day, "failed", "", reason=end.error))
-    return results
-
-
-def _about(config: FleetConfig) -> dict[str, Any]:
-    return {
-        "table": TRAINING.name,
-        "version": TRAINING.version,
-        "code_version": CODE_VERSION,
-        "settings": config.prepare.model_dump(mode="json"),
-    }
-
-
-def _empty_sides(config: FleetConfig, inventory: Inventory) -> list[str]:
-    return [side for side in _wanted_sides(config) if not inventory.frames[side]]
-
-
-def _wanted_sides(config: FleetConfig) -> list[str]:
-    split = config.prepare.split
-    shares = {"train": 1.0, "val": split.val_fraction, "test": split.test_fraction}
-    return [side for side, share in shares.items() if share > 0]
-
-
-def _next_steps(
-    config: FleetConfig, fleet: Path, lake: str, choices: Sequence[Choice], empty: Sequence[str]
-) -> list[str]:
-    """The next command: train, or, if a side is empty, the first alternative split without empty sides."""
-    if not empty:
-        return [f"boresight train --data {lake} --out run"]
-    wanted = _wanted_sides(config)
+def _next_step(fleet: Path, choices: Sequence[Choice], wanted: Sequence[str]) -> str:
+    """What to do where a side is empty: the first other split that has all wanted sides, if there is one."""
     for choice in choices:
         if all(choice.frames[side] for side in wanted):
             by = ", ".join(f'"{name}"' for name in choice.split_by)
             frames = ", ".join(f"{choice.frames[side]} {side}" for side in wanted)
-            return [f"set by = [{by}] under [prepare.split] in {fleet}: {frames} frames; then prepare again"]
+            return f"set by = [{by}] under [prepare.split] in {fleet}: {frames} frames; then prepare again"
     without = "val_fraction and test_fraction to 0 under [prepare.split]"
-    return [f"set {without} in {fleet}, or add days; then prepare again"]
+    return f"set {without} in {fleet}, or add days; then prepare again"
 
 
-def _problems(config: FleetConfig, results: Sequence[Outcome], inventory: Inventory) -> list[dict[str, str]]:
-    found = [
-        {name: getattr(r, name) for name in ("vehicle", "day", "status", "reason")}
-        for r in results
-        if r.status not in ("done", "cached")
-    ]
-    by = ", ".join(config.prepare.split.by)
-    few = {"status": "held", "reason": f"no frames: too few to split them by {by} (prepare.split.by)"}
-    return found + [{"side": side} | few for side in _empty_sides(config, inventory)]
-
-
-def print_choices(choices: Sequence[Choice], leaks: int = 0) -> None:
+def _print_choices(choices: Sequence[Choice], leaks: int) -> None:
     """Print the splits as a table on stderr, the chosen split first, and the number of frames that leak."""
     table = Table(box=None, title="frames kept and lost by split", title_justify="left")
     for name in ("by", "train", "val", "test", "lost", "of them", "days without"):

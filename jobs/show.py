@@ -27,6 +27,13 @@ from schemas.versions import TABLES
 
 __all__ = ["show"]
 
+_CURRENT: dict[str, Callable[[list[Any]], list[Any]]] = {
+    "calibrations": current_records,
+    "poses": current_poses,
+    "drift": current_drift,
+    "states": current_states,
+    "service_events": current_events,
+}
 Table = Literal[
     "calibrations",
     "poses",
@@ -82,28 +89,21 @@ def show(
 def _records(
     lake: Lake, table: Table, vehicle: str | None, day: str | None, method: str | None, *, current: bool
 ) -> list[dict[str, Any]]:
-    kinds: dict[str, Callable[[list[Any]], list[Any]]] = {
-        "calibrations": current_records,
-        "poses": current_poses,
-        "drift": current_drift,
-        "states": current_states,
-        "outcomes": list,
-        "service_events": current_events,
-        "sign_offs": list,
-    }
-    rows: list[Any] = read_records(lake, TABLES[table], TABLES[table].row_type, vehicle=vehicle, day=day)
+    schema = TABLES[table]
+    rows: list[Any] = read_records(lake, schema, schema.row_type, vehicle=vehicle, day=day)
     rows = [r for r in rows if method in (None, getattr(r, "method", None))]
-    names = [c.name for c in TABLES[table].columns]
-    chosen = kinds[table](rows) if current else rows
+    if current and table in _CURRENT:
+        rows = _CURRENT[table](rows)
     if current and table == "drift":  # what the last audit left out is not current
-        last = {last_assertion(lake, TABLES[table], m) for m in {r.method for r in chosen}}
-        chosen = [r for r in chosen if Assertion(r.asserted_at, r.day, r.method) in last]
+        last = {last_assertion(lake, schema, m) for m in {r.method for r in rows}}
+        rows = [r for r in rows if Assertion(r.asserted_at, r.day, r.method) in last]
     if table == "states":
-        return state_values(chosen)
-    shown = [{n: getattr(r, n) for n in names} for r in chosen]
-    if table in ("calibrations", "poses"):
-        return [row | {"T": transform_of(r)} for row, r in zip(shown, chosen, strict=True)]
-    return shown
+        return state_values(rows)
+    with_T = table in ("calibrations", "poses")
+    return [
+        {c.name: getattr(r, c.name) for c in schema.columns} | ({"T": transform_of(r)} if with_T else {})
+        for r in rows
+    ]
 
 
 def _partitions(lake: Lake, table: Table, vehicle: str | None, day: str | None) -> list[dict[str, Any]]:

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from jobs.extras import needs
+from jobs.extras import require
 from jobs.terminal.night_view import night_view
 from jobs.terminal.summary import print_summary, progress_reporter
 from pipeline.core.errors import ConfigError, LogError
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 __all__ = ["simulate", "simulate_days"]
 
 
-@needs("simulate")
 def simulate(
     *,
     out: Path,
@@ -64,6 +63,7 @@ def simulate(
         seed: random seed; the same seed gives the same logs.
         workers: number of processes.
     """
+    require("simulate")
     from pipeline.simulate.faults import parse_faults
     from pipeline.simulate.fleet import FleetSpec, day_names
     from pipeline.simulate.sensors.rigs import rig_named

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from jobs.terminal.record_tables import numbers
 from jobs.terminal.summary import left_out, print_json
 from jobs.terminal.vehicle_status import require_vehicle
 from pipeline.core.errors import ConfigError
@@ -124,27 +125,19 @@ def _name(row: dict[str, Any]) -> str:
 
 def _sensor(row: dict[str, Any]) -> Iterator[str]:
     days = row["days"]
-    of_days = (
-        f", {len(days)} days from {days[0]} to {days[-1]}"
-        if days[1:]
-        else "".join(f", {day}" for day in days)
-    )
+    of_days = f", {len(days)} days from {days[0]} to {days[-1]}" if days[1:] else ", ".join(["", *days])
     yield f"  {row['parent_frame']} -> {row['child_frame']}: {row['status']}{of_days}"
     T, T_prior = row["T"], row["T_prior"]
     lines = []
     if T is not None:
-        lines.append(f"qw qx qy qz {_numbers(to_quaternion(T), '.6f')}")
-        lines.append(f"x y z {_numbers(T[:3, 3], '.4f')} m")
+        lines.append(f"qw qx qy qz {numbers(to_quaternion(T), '.6f')}")
+        lines.append(f"x y z {numbers(T[:3, 3], '.4f')} m")
     if T is not None and T_prior is not None and row["status"] == "current":
         change = change_between(T_prior, T)
-        turn, shift = _numbers(np.degrees(change[:3]), "+.3f"), _numbers(change[3:], "+.3f")
+        turn, shift = numbers(np.degrees(change[:3]), "+.3f"), numbers(change[3:], "+.3f")
         lines.append(f"from the prior (tf of the logs, or a file): {turn} deg, {shift} m")
     if row["azimuth_sigma_rad"] is not None:
         azimuth, elevation = np.degrees([row["azimuth_sigma_rad"], row["elevation_sigma_rad"]])
         lines.append(f"sigma of azimuth {azimuth:.3f} deg, of elevation {elevation:.3f} deg")
     for text in (*lines, row["in_words"], row["reason"]):
         yield from wrap(text, _WIDTH, initial_indent=" " * _INDENT, subsequent_indent=" " * (_INDENT + 2))
-
-
-def _numbers(values: Any, form: str) -> str:
-    return " ".join(f"{value:{form}}" for value in values)

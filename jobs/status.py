@@ -13,13 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from jobs.terminal.summary import exit_code, left_out, print_summary
-from jobs.terminal.vehicle_status import (
-    count_statuses,
-    moved_sensors,
-    next_steps,
-    require_vehicle,
-    status_lines,
-)
+from jobs.terminal.vehicle_status import next_steps, require_vehicle, status_lines, told_of
 from pipeline.fleet.status import DayStatus, day_statuses
 from pipeline.store.corrections import read_corrections
 from pipeline.store.partitions import Lake, check_day, days_after
@@ -79,8 +73,7 @@ def status(
         method=method,
         vehicles=len({s.vehicle for s in found}),
         **{name: sum(s.status == name for s in found) for name in DAY_WORDS},
-        statuses=count_statuses(findings),
-        moved=moved_sensors(findings),
+        **told_of(findings),
         next_steps=steps,
         misconfigured=mend,
         damaged=damaged,

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from jobs.extras import needs
+from jobs.extras import require
 from jobs.terminal.logging import logger
 from jobs.terminal.summary import print_summary, progress_reporter
 from pipeline.core.config import FleetConfig, load_fleet, validated
@@ -25,7 +25,6 @@ _NOT_VALIDATED = "not validated, so not fit for use: prepare a side val, and tra
 _UNIT_S = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
 
-@needs("train")
 def train(  # options of the command
     *,
     data: str,
@@ -83,6 +82,7 @@ def train(  # options of the command
         compiled: of calibration: compile the encoders (takes minutes at the start, faster afterwards).
         threads: of perception: CPU threads; 1.
     """
+    require("train")
     limit = None if time_limit is None else parse_duration(time_limit, "time-limit")
     options = {
         "architecture": architecture, "pairs": pairs, "steps": steps, "batch_size": batch_size,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,14 +13,13 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from jobs.calibration_sources import FrameOptions, poses_in_use, read_sides
+from jobs.calibration_sources import FrameOptions, poses_in_use
 from jobs.terminal.summary import print_json, print_summary, progress_reporter
 from pipeline.core.config import FleetConfig, load_fleet
 from pipeline.core.errors import ConfigError
-from pipeline.core.results import Progress
-from pipeline.core.stage_work import Probes, Task
+from pipeline.core.stage_work import Task
 from pipeline.core.stages import CALIBRATE, INGEST, PERCEIVE
-from pipeline.export.files import prior_text, reference_of_rig, require_all, star_text
+from pipeline.export.files import reference_of_rig, require_all, star_text
 from pipeline.report.comparison import in_use_view
 from pipeline.report.stage import write_day_page
 from pipeline.rig.day_prior import require_named_files
@@ -41,7 +40,7 @@ from pipeline.verify.one_log import check_poses, for_one_look, prior_in_use, wit
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.poses import POSES, PoseRow
 
-__all__ = ["verify"]
+__all__ = ["verify", "with_calibration"]
 
 # Exit codes of its own: schedulers take 3 for success.
 _EXIT_CODES = {"right": 0, "wrong": 4, "inconclusive": 5}
@@ -94,27 +93,29 @@ def verify(
     """
     if not logs:
         raise ConfigError("command line", "LOG", "name at least one log of the car")
-    config = load_fleet(fleet)
+    config, asked_deg = load_fleet(fleet), (camera_lidar_deg, radar_deg)
     name = _vehicle(config, vehicle)
+    of_sensors = not config.rig_of(name).is_one_of_each
+    config, lacking = for_one_look(config, frames), list[Sensor]()
     with TemporaryDirectory(prefix="boresight-verify-") as folder:
-        of_sensors = not config.rig_of(name).is_one_of_each
-        config = for_one_look(config, frames)
-        lacking: tuple[Sensor, ...] = ()
-        if calibration is not None and of_sensors:
-            config, lacking = _of_poses(
-                Path(folder), config, name, calibration, lake, named or FrameOptions()
+        if calibration is not None:
+            in_use = Path(folder) / "in_use.json"
+            config, lacking = with_calibration(
+                in_use, config, name, calibration, lake, named or FrameOptions()
             )
-        elif calibration is not None:
-            file = _as_prior(Path(folder), calibration, lake, name, named or FrameOptions())
-            config = config.with_prior_file(name, file)
         require_named_files(config)
-        tables = Lake.at(Path(folder) / "lake")
         with progress_reporter(f"verify {name}") as progress:
-            checks, reason = _checked(
-                config, tables, (name, lacking if of_sensors else None), logs, (camera_lidar_deg, radar_deg), page,
-                progress,
+            task = Task(
+                config, Lake.at(Path(folder) / "lake"), Partition(name, _DAY), "joint",
+                probe_deg=probes(asked_deg), logs=logs, progress=progress,
             )  # fmt: skip
+            records = _calibrate(task)
+            checks = _checks(task, records, lacking if of_sensors else None, asked_deg)
+            if page is not None:
+                view = in_use_view(answer_of(checks), [asdict(c) for c in checks], errors_in_words(checks))
+                write_day_page(task.lake, task.partition, config, page, "joint", in_use=view)
     answer, sensors = answer_of(checks), answers_by_sensor(checks) if of_sensors else {}
+    reason = "; ".join(sorted({r.reason for r in records if r.status == "refused"}))
     told: dict[str, Any] = {"vehicle": name, "reason": reason, "page": page}
     told |= {"wrong_sensors": wrong_sensors(checks), "errors": errors_in_words(checks)}
     told |= {"next_steps": [_NEXT_STEPS[answer]] if answer in _NEXT_STEPS else []}
@@ -137,90 +138,56 @@ def _vehicle(config: FleetConfig, vehicle: str | None) -> str:
     return next(iter(config.named_vehicles), _ANY_CAR)
 
 
-def _as_prior(folder: Path, calibration: str, lake: str | None, vehicle: str, named: FrameOptions) -> Path:
-    """Write the calibration of `--calibration` as a prior file; raises before the first log is opened."""
-    [side] = read_sides([calibration], lake, vehicle, "joint", named)
-    for pair, why in side.missing.items():
-        raise ConfigError(side.title, pair, f"no transform to verify: {why}")
-    file = folder / "in_use.json"
-    file.write_bytes(prior_text({pair: p.T for pair, p in side.pairs.items()}, side.title, [calibration]))
-    return file
+def with_calibration(
+    file: Path, config: FleetConfig, vehicle: str, calibration: str, lake: str | None, named: FrameOptions
+) -> tuple[FleetConfig, list[Sensor]]:
+    """Configuration with the calibration in use as prior, and the sensors that it lacks, in a rig of many.
 
-
-def _of_poses(
-    folder: Path, config: FleetConfig, vehicle: str, calibration: str, lake: str | None, named: FrameOptions
-) -> tuple[FleetConfig, tuple[Sensor, ...]]:
-    """Configuration with the calibration in use of a rig of many sensors, and the sensors without a pose.
+    Args:
+        file: written, unless the calibration is a prior file itself.
 
     Raises:
-        ConfigError: neither a file nor a lake, or fewer than two sensors; raised before a log is opened.
+        ConfigError: neither a file nor a lake, or too few sensors; raised before a log is opened.
     """
     if calibration.endswith(".json") and ":" not in calibration:
-        return config.with_prior_file(vehicle, Path(calibration)), ()
+        return config.with_prior_file(vehicle, Path(calibration)), []
     rig = config.rig_of(vehicle)
     poses, names = poses_in_use(calibration, lake, vehicle, rig, named)
     kept = {*poses, reference_of_rig(rig).name}
     if len(kept) < 2:
         raise ConfigError(calibration, "sensors", f"has none of {', '.join(n.name for n in rig.nodes)}")
-    lacking = tuple(n for n in rig.nodes if n.name not in kept)
-    part = rig.of_sensors(kept)
-    file = folder / "in_use.json"
+    part = rig if rig.is_one_of_each else rig.of_sensors(kept)
     file.write_bytes(star_text(require_all(poses, [calibration], names, part), part, "verify", [calibration]))
+    lacking = [n for n in rig.nodes if n not in part.nodes]
     return config.with_rig(vehicle, part).with_prior_file(vehicle, file), lacking
 
 
-def _checked(
-    config: FleetConfig,
-    lake: Lake,
-    of: tuple[str, tuple[Sensor, ...] | None],
-    logs: tuple[Path, ...],
-    asked_deg: tuple[float, float],
-    page: Path | None,
-    progress: Progress,
-) -> tuple[list[AxisCheck], str]:
-    """Check every axis; returns the checks, and the reason if the log could not be used at all.
-
-    `of`: the vehicle, and for a rig of many sensors those without a pose in the calibration in use.
-    """
-    vehicle, lacking = of
-    partition = Partition(vehicle, _DAY)
-    _calibrate(config, lake, partition, logs, probes(asked_deg), progress)
-    records = read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle=vehicle)
-    if lacking is None:
-        checks = [
-            c
-            for r in records
-            for c in check_axes(r, limits_of(r.pair, config.verify, asked_deg), config.verify)
-        ]
-    else:
-        poses, prior = (
-            read_records(lake, POSES, PoseRow, vehicle=vehicle),
-            prior_in_use(config, lake, partition),
-        )
-        checks = check_poses(poses, prior, lacking, config.verify, asked_deg, records)
-    if page is not None:
-        view = in_use_view(answer_of(checks), [asdict(c) for c in checks], errors_in_words(checks))
-        write_day_page(lake, partition, config, page, "joint", in_use=view)
-    reasons = {r.reason for r in records if r.status == "refused"}
-    return checks, "; ".join(sorted(reasons))
-
-
-def _calibrate(
-    config: FleetConfig,
-    lake: Lake,
-    partition: Partition,
-    logs: tuple[Path, ...],
-    probe_deg: Probes,
-    progress: Progress,
-) -> None:
-    """Calibrate from the log, with the calibration in use as prior."""
-    task = Task(config, lake, partition, "joint", probe_deg=probe_deg, logs=logs, progress=progress)
+def _calibrate(task: Task) -> list[CalibrationRecord]:
+    """Records of the log, with the calibration in use as prior."""
     for stage in (INGEST, PERCEIVE):
         stage.run(task)
-    prior = prior_in_use(config, lake, partition)
-    known = prior is not None and not prior.untied  # a sensor is silent: its prior stays as logged
-    started = with_prior(config, lake, partition.vehicle, prior) if prior is not None and known else config
-    CALIBRATE.run(replace(task, fleet=started))
+    vehicle = task.partition.vehicle
+    prior = prior_in_use(task.fleet, task.lake, task.partition)
+    if prior is not None and not prior.untied:  # else a sensor is silent: its prior stays as logged
+        CALIBRATE.run(replace(task, fleet=with_prior(task.fleet, task.lake, vehicle, prior)))
+    else:
+        CALIBRATE.run(task)
+    return read_records(task.lake, CALIBRATIONS, CalibrationRecord, vehicle=vehicle)
+
+
+def _checks(
+    task: Task,
+    records: Sequence[CalibrationRecord],
+    lacking: Sequence[Sensor] | None,
+    asked_deg: tuple[float, float],
+) -> list[AxisCheck]:
+    """Checks per pair and axis; per sensor and axis with `lacking`, the sensors without a pose in use."""
+    verify = task.fleet.verify
+    if lacking is None:
+        return [c for r in records for c in check_axes(r, limits_of(r.pair, verify, asked_deg), verify)]
+    poses = read_records(task.lake, POSES, PoseRow, vehicle=task.partition.vehicle)
+    prior = prior_in_use(task.fleet, task.lake, task.partition)
+    return check_poses(poses, prior, lacking, verify, asked_deg, records)
 
 
 def _print_table(checks: list[AxisCheck], answer: str, sensors: Mapping[str, str]) -> None:

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from jobs.calibration_sources import read_calibration
-from jobs.extras import needs
+from jobs.calibration_sources import at_prior, pairs_to, read_calibration
+from jobs.extras import require
 from jobs.terminal.summary import print_summary
 from pipeline.core.errors import ConfigError
-from pipeline.export.calibration import ExportedCalibration
-from pipeline.export.lake import priors_of_day
 from pipeline.store.atomic_write import atomic_write
 from pipeline.store.partitions import Lake, Partition
 from pipeline.view.layers import Rig, Shown, count_moments, layers_of, read_moment
@@ -21,7 +18,6 @@ from pipeline.view.layers import Rig, Shown, count_moments, layers_of, read_mome
 __all__ = ["view"]
 
 
-@needs("view")
 def view(
     *,
     lake: str,
@@ -46,6 +42,7 @@ def view(
         method: of the records.
         out: draw into this PNG, without a window.
     """
+    require("view")
     from pipeline.view.system import import_open3d, require_display, require_renderer
 
     if out is not None and out.suffix != ".png":
@@ -97,9 +94,7 @@ def _draw(rig: Rig, shown: Shown, title: str, state: str, out: Path) -> None:
 def _rig(lake: Lake, vehicle: str, day: str, method: str) -> Rig:
     """Poses before and after the day; a sensor without an estimate keeps its prior pose; else ConfigError."""
     after = read_calibration(str(lake.root), vehicle, day, method, force=True)
-    found = priors_of_day(lake, vehicle, day, method)
-    known = {name: pair for name, pair in found.items() if not isinstance(pair, str)}
-    before = replace(after, pairs=known, known=tuple(pair.edge for pair in known.values()))
+    before = at_prior(after, lake, day)
     reference = after.reference
     prior, calibrated = ({reference.name: np.eye(4)} for _ in range(2))
     status = {}
@@ -107,7 +102,7 @@ def _rig(lake: Lake, vehicle: str, day: str, method: str) -> Rig:
         if sensor.name == reference.name:
             continue
         old, new = before.between(reference.name, sensor.name), after.between(reference.name, sensor.name)
-        status[sensor.name] = "refused" if new is None else _status(after, sensor.name)
+        status[sensor.name] = "refused" if new is None else pairs_to(after, sensor.name)[1]
         first, last = old or new, new or old
         if first is not None and last is not None:
             prior[sensor.name], calibrated[sensor.name] = first[0], last[0]
@@ -115,11 +110,6 @@ def _rig(lake: Lake, vehicle: str, day: str, method: str) -> Rig:
     return Rig(
         {s.name: s.kind for s in after.sensors}, T_car, {"prior": prior, "calibrated": calibrated}, status
     )
-
-
-def _status(found: ExportedCalibration, sensor: str) -> str:
-    way = found.way(found.reference.name, sensor) or ()
-    return ", ".join(sorted({pair.status for pair in found.pairs.values() if pair.edge in way}))
 
 
 def _upright(kind: str) -> np.ndarray:

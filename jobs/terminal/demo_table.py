@@ -27,38 +27,28 @@ _WIDTH = 124  # of the table; a narrower terminal wraps lines, which is easier t
 
 
 def print_comparison(
-    lake: Lake,
-    method: str,
-    truth: Truth,
-    day: str,
-    findings: Sequence[DriftFinding],
-) -> list[dict[str, Any]]:
+    lake: Lake, method: str, truth: Truth, day: str, findings: Sequence[DriftFinding]
+) -> None:
     """Print the records of one day next to the truth, and the findings of the audit.
 
     Both are shown as differences from the prior (the nominal pose): rotation vector [deg] and shift of the
     child's origin [cm], in the axes of the pair's parent sensor. An estimate in brackets is a DoF that the
     day did not determine.
-
-    Returns:
-        For each record: errors of rotation [deg] and translation [m] against the truth, before and after.
     """
-    found, console = _current(lake, method, day), _console()
-    table, errors = _table(day), []
+    found, console, table = _current(lake, method, day), Console(highlight=False), _table(day)
+    console.width = max(console.width, _WIDTH)
     for record in found:
-        T_true = _true(truth, record)
-        errors.append(_errors(record, T_true))
-        for row in _rows(record, T_true):
+        for row in _rows(record, _true(truth, record)):
             table.add_row(*row)
     console.print(table)
     for record in (r for r in found if r.status == "refused"):
         console.print(f"{_styled(record.status)}  {record.vehicle} {_name(record)}: {record.reason}")
     for line in status_lines(findings):
         console.print(line)
-    return errors
 
 
 def errors_of(lake: Lake, method: str, truth: Truth, day: str) -> list[dict[str, Any]]:
-    """Errors of the records of one day by a method, as `print_comparison` returns them."""
+    """For each record of one day by a method: errors of rotation [deg] and translation [m], before and after."""
     return [_errors(r, _true(truth, r)) for r in _current(lake, method, day)]
 
 
@@ -71,12 +61,6 @@ def _true(truth: Truth, record: CalibrationRecord) -> np.ndarray:
 def _current(lake: Lake, method: str, day: str) -> list[CalibrationRecord]:
     found = read_records(lake, CALIBRATIONS, CalibrationRecord, day=day)
     return current_records([r for r in found if r.method == method])
-
-
-def _console() -> Console:
-    console = Console(highlight=False)
-    console.width = max(console.width, _WIDTH)
-    return console
 
 
 def _table(day: str) -> Table:

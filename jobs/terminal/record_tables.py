@@ -17,7 +17,7 @@ from pipeline.rig.edges import POSE, edge_named, pose_of, words_of
 from pipeline.rig.se3 import to_quaternion
 from schemas.faults import in_words
 
-__all__ = ["STATUS_STYLES", "print_table"]
+__all__ = ["STATUS_STYLES", "numbers", "print_table"]
 
 STATUS_STYLES = {
     "accepted": "green",
@@ -58,59 +58,55 @@ def print_table(table: str, rows: list[dict[str, Any]]) -> None:
 def _calibration_cells(row: dict[str, Any]) -> dict[str, str]:
     sigma = np.full(6, np.nan) if row["covariance"] is None else np.sqrt(np.diag(row["covariance"]))
     seen = row["observable"] or [False] * 6
-    degrees = " ".join(_sigma(s, o, 3) for s, o in zip(np.degrees(sigma[:3]), seen[:3], strict=True))
-    metres = " ".join(_sigma(s, o, 3) for s, o in zip(sigma[3:], seen[3:], strict=True))
+    sigma[:3] = np.degrees(sigma[:3])
+    shown = [f"{s:.3f}" if is_seen else "  -  " for s, is_seen in zip(sigma, seen, strict=True)]
     return {
         **_named(row, "vehicle", "day", "method"),
         "pair": _edge(row),
         "status": row["status"],
-        **_pose_cells(row["T"], pose_of(row.__getitem__, "prior_")),
-        "sigma [deg, m]": f"{degrees} deg\n{metres} m",
+        "qw qx qy qz, x y z": _pose(row["T"]),
+        "change from prior": _change(row["T"], pose_of(row.__getitem__, "prior_")),
+        "sigma [deg, m]": f"{' '.join(shown[:3])} deg\n{' '.join(shown[3:])} m",
         "frames": str(row["frames_used"]),
         "certified": ", ".join(row["determined"]),
         "of the mounting": ", ".join(row["mounting_determined"]),
-        "reason": "; ".join(text for text in (in_words(row["faults"] or ()), row["reason"]) if text),
+        "reason": _reason(row),
     }
 
 
 def _pose_row_cells(row: dict[str, Any]) -> dict[str, str]:
-    return {
-        **_named(row, "vehicle", "day", "method", "sensor", "reference", "status"),
-        **_pose_cells(row["T"], None, with_change=False),
-        **_sure_cells(row),
-        "edges": ", ".join(row["edges"]),
-        "reason": "; ".join(text for text in (in_words(row["faults"] or ()), row["reason"]) if text),
-    }
-
-
-def _sure_cells(row: dict[str, Any]) -> dict[str, str]:
-    """Sigmas of azimuth and elevation, and the certified directions among them."""
     sigmas = (row["azimuth_sigma_rad"], row["elevation_sigma_rad"])
     azimuth, elevation = ("" if s is None else f"{s * 180 / math.pi:.3f}" for s in sigmas)
     return {
+        **_named(row, "vehicle", "day", "method", "sensor", "reference", "status"),
+        "qw qx qy qz, x y z": _pose(row["T"]),
         "sigma azimuth [deg]": azimuth,
         "elevation [deg]": elevation,
         "certified": ", ".join(row["determined"]),
+        "edges": ", ".join(row["edges"]),
+        "reason": _reason(row),
     }
 
 
-def _pose_cells(T: Any, T_prior: Any, *, with_change: bool = True) -> dict[str, str]:
-    """Pose of the child in the parent, and its change from the prior, along the parent's axes."""
-
-    def words(numbers: Any, form: str) -> str:
-        return " ".join(f"{number:{form}}" for number in numbers)
-
-    pose = moved = ""
-    if T is not None:
-        pose = f"{words(to_quaternion(T), '.5f')}\n{words(T[:3, 3], '.3f')} m"
-        change = None if T_prior is None else change_between(T_prior, T)
-        if change is not None:
-            moved = f"{words(np.degrees(change[:3]), '+.3f')} deg\n{words(change[3:], '+.3f')} m"
-    return {"qw qx qy qz, x y z": pose} | ({"change from prior": moved} if with_change else {})
+def _pose(T: Any) -> str:
+    return "" if T is None else f"{numbers(to_quaternion(T), '.5f')}\n{numbers(T[:3, 3], '.3f')} m"
 
 
-def _sigma(sigma: float, observable: bool, digits: int) -> str:
-    return f"{sigma:.{digits}f}" if observable else "  -  "
+def _change(T: Any, T_prior: Any) -> str:
+    """Change from the prior, along the parent's axes."""
+    if T is None or T_prior is None:
+        return ""
+    change = change_between(T_prior, T)
+    return f"{numbers(np.degrees(change[:3]), '+.3f')} deg\n{numbers(change[3:], '+.3f')} m"
+
+
+def numbers(values: Any, form: str) -> str:
+    """Numbers in one line, each in the form."""
+    return " ".join(f"{value:{form}}" for value in values)
+
+
+def _reason(row: dict[str, Any]) -> str:
+    return "; ".join(text for text in (in_words(row["faults"] or ()), row["reason"]) if text)
 
 
 def _drift_cells(row: dict[str, Any]) -> dict[str, str]:
@@ -146,13 +142,8 @@ def _outcome_cells(row: dict[str, Any]) -> dict[str, str]:
 
 def _partition_cells(row: dict[str, Any]) -> dict[str, str]:
     counts = ", ".join(f"{count} {why}" for why, count in row["rejected"].items())
-    return {
-        "vehicle": row["vehicle"],
-        "day": row["day"],
-        "rows": str(row["rows"]),
-        "work key": row["work_key"],
-        "rejected": counts,
-    }
+    told = {"rows": str(row["rows"]), "work key": row["work_key"], "rejected": counts}
+    return _named(row, "vehicle", "day") | told
 
 
 def _named(row: dict[str, Any], *names: str) -> dict[str, str]:

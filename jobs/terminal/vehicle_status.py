@@ -19,7 +19,7 @@ from schemas.drift import DRIFT_STATUSES, DriftFinding, VehicleStatus, next_step
 from schemas.outcomes import OUTCOMES
 from schemas.states import STATES
 
-__all__ = ["count_statuses", "moved_sensors", "next_steps", "require_vehicle", "status_lines"]
+__all__ = ["count_statuses", "moved_sensors", "next_steps", "require_vehicle", "status_lines", "told_of"]
 
 _STEPS = 40  # vehicles whose next steps are printed; the others are counted
 
@@ -45,6 +45,11 @@ def moved_sensors(findings: Sequence[DriftFinding]) -> list[dict[str, Any]]:
         for vehicle, stored in _statuses(findings).items()
         if stored.sensor
     ]
+
+
+def told_of(findings: Sequence[DriftFinding]) -> dict[str, Any]:
+    """What every summary after an audit has of the vehicles."""
+    return {"statuses": count_statuses(findings), "moved": moved_sensors(findings)}
 
 
 def next_steps(

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from jobs.calibrate import calibrate, parse_perturb
+from jobs.calibrate import calibrate, parse_pair
 from jobs.evaluate import evaluate
 from jobs.status import status
 from pipeline.core.errors import ConfigError
@@ -124,7 +124,7 @@ def test_evaluate_wants_exactly_one_kind_of_truth(workplace):
 @pytest.mark.parametrize("text", ["2", "2,0.1,3", "a,b", "-1,0", "200,0", "1,nan"])
 def test_perturb_must_be_two_possible_numbers(text):
     with pytest.raises(ConfigError, match="perturb"):
-        parse_perturb(text)
+        parse_pair(text, "perturb")
 
 
 def test_records_without_a_truth_are_counted_not_compared(workplace, capsys, tmp_path):

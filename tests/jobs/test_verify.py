@@ -8,9 +8,10 @@ import pytest
 
 from jobs.calibration_sources import FrameOptions
 from jobs.cli import main
-from jobs.verify import _as_prior
-from pipeline.rig.day_prior import read_transforms
-from pipeline.rig.se3 import exp_so3, from_rotation_translation
+from jobs.verify import with_calibration
+from pipeline.core.config import load_fleet
+from pipeline.rig.day_prior import read_star
+from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
 from tests.makers.fleet_files import fleet_toml
 from tests.makers.simulated_days import simulated_day
 
@@ -76,9 +77,15 @@ def test_a_calibration_in_the_format_of_another_program_becomes_the_prior(tmp_pa
     for pair, matrix in T.items():
         storage.write(f"T_{pair}", matrix)
     storage.release()
-    prior = read_transforms(_as_prior(tmp_path, f"opencv:{file}", None, "car", FrameOptions()))
-    for pair, matrix in T.items():
-        np.testing.assert_allclose(prior[pair], matrix, atol=1e-12)
+    (tmp_path / "fleet.toml").write_text(fleet_toml("car"))
+    given = (load_fleet(tmp_path / "fleet.toml"), "car", f"opencv:{file}", None, FrameOptions())
+    config, lacking = with_calibration(tmp_path / "prior.json", *given)
+    assert lacking == []
+    rig = config.rig_of("car")
+    prior = read_star(tmp_path / "prior.json", rig)
+    assert rig.prior.file == str(tmp_path / "prior.json")
+    np.testing.assert_allclose(inverse(prior["lidar", "camera"]), T["camera_lidar"], atol=1e-12)
+    np.testing.assert_allclose(prior["lidar", "radar"], T["lidar_radar"], atol=1e-12)
 
 
 def test_nonsense_is_refused_before_a_log_is_opened(tmp_path, capsys):

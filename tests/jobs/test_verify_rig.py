@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jobs.calibration_sources import FrameOptions, poses_in_use
-from jobs.verify import _of_poses
+from jobs.verify import with_calibration
 from pipeline.core.config import load_fleet
 from pipeline.core.errors import ConfigError
 from pipeline.rig.day_prior import read_star
@@ -26,7 +26,7 @@ def fleet(tmp_path):
 
 
 def in_use(fleet, folder, text, lake=None):
-    return _of_poses(folder, fleet, "van-1", text, lake, FrameOptions())
+    return with_calibration(folder / "written.json", fleet, "van-1", text, lake, FrameOptions())
 
 
 @pytest.mark.parametrize("form", ["urdf", "autoware", "kalibr"])
@@ -49,7 +49,7 @@ def test_a_prior_file_is_taken_as_it_is(fleet, tmp_path):
     file = tmp_path / "in_use.json"
     file.write_text(json.dumps({"reference": "top", "T": {n: T.tolist() for n, T in T_TOP.items()}}))
     config, lacking = in_use(fleet, tmp_path, str(file))
-    assert (config.rig_of("van-1").prior.file, lacking) == (str(file), ())
+    assert (config.rig_of("van-1").prior.file, lacking) == (str(file), [])
 
 
 def test_a_day_of_a_lake_is_taken_by_its_poses(fleet, tmp_path):
