@@ -19,8 +19,8 @@ from jobs.terminal.demo_table import errors_of, print_comparison
 from jobs.terminal.summary import exit_code, is_terminal, print_summary
 from jobs.terminal.vehicle_status import told_of
 from pipeline.core.config import config_hash, load_fleet
+from pipeline.fleet.executor import OnWorkers
 from pipeline.fleet.nightly import DayOutcome, Night
-from pipeline.fleet.pages import OnWorkers
 from pipeline.fleet.pattern import find_vehicle_days
 from pipeline.report.stage import Pages
 from pipeline.report.truth import read_truth

@@ -22,13 +22,12 @@ from pipeline.core.errors import ConfigError
 from pipeline.core.results import Outcome
 from pipeline.core.stage_work import Task, Window
 from pipeline.core.stages import AUDIT, REPORT, STATE
+from pipeline.fleet.executor import OnWorkers
 from pipeline.fleet.metrics import NightEnd, Tally, write_metrics
-from pipeline.fleet.misconfigured import night_statuses, to_mend, vehicles_to_mend
 from pipeline.fleet.nightly import DayOutcome, Night, refused_at_once, run_night
-from pipeline.fleet.pages import OnWorkers
-from pipeline.fleet.pattern import FoundLogs, VehicleDay, find_logs
+from pipeline.fleet.pattern import VehicleDay, find_logs
 from pipeline.fleet.plan import plan_night
-from pipeline.fleet.status import night_word
+from pipeline.fleet.status import night_statuses, night_word, to_mend, vehicles_to_mend
 from pipeline.report.stage import Pages
 from pipeline.rig.day_prior import require_named_files
 from pipeline.store.delta import tidy_table
@@ -88,13 +87,13 @@ def nightly(
     require_named_files(config)
     tables = Lake.at(lake)
     night = Night(config, tables, method_named(method or config.audit.method).name, seed)
-    found = find_logs(logs, from_day, to_day)
-    if found.problem:
-        logger().warning(found.problem)
+    days, left_out_logs = find_logs(logs, from_day, to_day)
+    if left_out_logs:
+        logger().warning(left_out_logs)
     if dry_run:
-        return _print_plan(night, found)
+        return _print_plan(night, days, left_out_logs)
     tally, began_s = Tally(), time.time()
-    outcomes = watch_night(night, found.days, executor, workers, tally.add)
+    outcomes = watch_night(night, days, executor, workers, tally.add)
     files = tables.files if report is None else LocalFiles()
     pages = Pages(
         report or tables.root / "report" / "fleet.html",
@@ -122,8 +121,8 @@ def nightly(
         ],
         **told_of(findings),
         misconfigured=to_mend(outcomes, config),
-        logs_left_out=found.problem,
-        next_steps=[found.problem, *steps] if found.problem else steps,
+        logs_left_out=left_out_logs,
+        next_steps=[left_out_logs, *steps] if left_out_logs else steps,
         damaged=left_out(tables),
         report=drawn[0] if drawn else None,
     )
@@ -141,9 +140,9 @@ def _write_metrics(
         logger().warning("no metrics", file=str(file), reason=str(err))
 
 
-def _print_plan(night: Night, found: FoundLogs) -> int:
+def _print_plan(night: Night, days: Sequence[VehicleDay], left_out_logs: str) -> int:
     """Print what the night would do with each vehicle-day, as a table and as the summary."""
-    plans = list(plan_night(night, found.days))
+    plans = list(plan_night(night, days))
     for plan in plans:
         sys.stderr.write(f"{plan.vehicle} {plan.day}: {', '.join(plan.stages) or 'nothing'} ({plan.why})\n")
     print_summary(
@@ -151,7 +150,7 @@ def _print_plan(night: Night, found: FoundLogs) -> int:
         "planned",
         vehicle_days=len(plans),
         would_run=sum(bool(p.stages) for p in plans),
-        logs_left_out=found.problem,
+        logs_left_out=left_out_logs,
         damaged=left_out(night.lake),
         plan=[asdict(p) for p in plans],
     )

@@ -6,17 +6,11 @@ import difflib
 import hashlib
 import json
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
-from pydantic import (
-    BaseModel,
-    Field,
-    PrivateAttr,
-    ValidationError,
-    model_validator,
-)
+from pydantic import BaseModel, Field, PrivateAttr, ValidationError, model_validator
 
 from pipeline.core.errors import ConfigError
 from pipeline.core.models import PREFIX, shipped_manifest
@@ -129,20 +123,15 @@ class FleetConfig(Section):
 
     def require_files(self) -> None:
         """Raise ConfigError for a missing file of the vehicles' rigs or [learn], before a log is opened."""
-        for key, name in self._named_files():
-            if not self.path_of(name).is_file():
-                raise ConfigError(str(self._file), key, f"no such file: {self.path_of(name)}")
-
-    def _named_files(self) -> Iterator[tuple[str, str]]:
+        named = {f"learn.pairwise_models.{pair}": model for pair, model in self.learn.pairwise_models.items()}
+        named |= {} if self.learn.model is None else {"learn.model": self.learn.model}
         for name in sorted({v.rig for v in self.vehicles.values()}):
-            rig, key = self.rigs[name], f"rigs.{name}"
-            yield from ((f"{key}.{of}", file) for of, file in rig.named_models())
-            if rig.prior.file is not None:
-                yield f"{key}.prior.file", rig.prior.file
-        if self.learn.model is not None:
-            yield "learn.model", self.learn.model
-        for pair, model in self.learn.pairwise_models.items():
-            yield f"learn.pairwise_models.{pair}", model
+            rig = self.rigs[name]
+            named |= {f"rigs.{name}.{of}": file for of, file in rig.named_models()}
+            named |= {} if rig.prior.file is None else {f"rigs.{name}.prior.file": rig.prior.file}
+        for key, file in named.items():
+            if not self.path_of(file).is_file():
+                raise ConfigError(str(self._file), key, f"no such file: {self.path_of(file)}")
 
     def path_of(self, name: str) -> Path:
         """Path of a file named in fleet.toml (relative to its folder), or of a network of the package."""

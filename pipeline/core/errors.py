@@ -58,12 +58,16 @@ class LogError(BoresightError):
         super().__init__(f"{where}: {problem}")
 
 
-class ContractError(BoresightError):
-    """A table without the schema, version or content that its contract requires."""
+class _PlacedError(BoresightError):
+    """An error at one place: a file, folder or address."""
 
     def __init__(self, path: str, problem: str) -> None:
         self.path, self.problem = path, problem
         super().__init__(f"{path}: {problem}")
+
+
+class ContractError(_PlacedError):
+    """A table without the schema, version or content that its contract requires."""
 
 
 class OtherVersionError(ContractError):
@@ -107,12 +111,8 @@ class MissingExtraError(BoresightError):
         )
 
 
-class DownloadError(BoresightError):
+class DownloadError(_PlacedError):
     """A download that failed; no file was written."""
-
-    def __init__(self, url: str, problem: str) -> None:
-        self.url, self.problem = url, problem
-        super().__init__(f"{url}: {problem}")
 
 
 class MissingLibraryError(BoresightError):
@@ -127,26 +127,18 @@ class MissingLibraryError(BoresightError):
         super().__init__(f"{needed_by} needs {missing}, which this machine lacks: {what}")
 
 
-class ModelError(BoresightError):
+class ModelError(_PlacedError):
     """A model file that does not match its manifest."""
 
     exit_code = 2
-
-    def __init__(self, manifest: str, problem: str) -> None:
-        self.manifest, self.problem = manifest, problem
-        super().__init__(f"{manifest}: {problem}")
 
 
 class ModelOutputError(ModelError):
     """Impossible output values of a model; the day is refused."""
 
 
-class StorageError(BoresightError):
+class StorageError(_PlacedError):
     """An object store that does not answer after several tries; nothing is damaged, so try again later."""
-
-    def __init__(self, place: str, problem: str) -> None:
-        self.place, self.problem = place, problem
-        super().__init__(f"{place}: {problem}")
 
 
 class TooMuchMemoryError(BoresightError):

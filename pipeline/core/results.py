@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, TypeVar, overload
+from typing import Any, TypeVar
 
 __all__ = ["Effort", "MadeWhenAsked", "Outcome", "Progress", "measured", "plain", "silent"]
 
@@ -22,7 +22,7 @@ Item = TypeVar("Item")
 
 
 class MadeWhenAsked(Sequence[Item]):
-    """Sequence whose items are built on access, so that few of thousands are in memory.
+    """Sequence whose items are built on access, one at a time, so that few of thousands are in memory.
 
     Args:
         count: number of items.
@@ -35,13 +35,8 @@ class MadeWhenAsked(Sequence[Item]):
     def __len__(self) -> int:
         return self._count
 
-    @overload
-    def __getitem__(self, index: int) -> Item: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[Item]: ...
-    def __getitem__(self, index: int | slice) -> Item | list[Item]:
-        places = range(self._count)[index]
-        return self._make(places) if isinstance(places, int) else [self._make(i) for i in places]
+    def __getitem__(self, index: Any) -> Any:
+        return self._make(range(self._count)[index])
 
 
 def silent(done: int, total: int, what: str) -> None:

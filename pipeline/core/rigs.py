@@ -28,6 +28,7 @@ __all__ = [
 Positive = Annotated[float, Field(gt=0)]
 Topic = Annotated[str, Field(pattern=r"^/\S+$")]
 TF_STATIC = "/tf_static"
+_MODELS = ("segmenter", "detector", "model")  # keys of a network that name a file
 # Plausible range of a value on a car, by the unit at the end of its name. 0 is always allowed and has its own
 # meaning.
 _OF_THIS_WORLD = {"deg": (1e-4, 180.0), "m": (1e-4, 1e3), "s": (1e-6, 86_400.0), "mps": (0.01, 1000.0)}
@@ -112,6 +113,13 @@ class _Sensor(Section):
     # Left out of dumps: only calibration uses it, so a change must not ingest a rig's logs again.
     prior: SensorPrior = Field(default=SensorPrior(), exclude=True)
 
+    def named_models(self) -> Iterator[tuple[str, str]]:
+        """Model files of this sensor as (key, path)."""
+        for key in ("semantics", "drivable"):
+            network = getattr(self, key, None)
+            if network is not None and network.source == "onnx":
+                yield from ((f"{key}.{of}", file) for of, file in network if of in _MODELS)
+
 
 class CameraTopics(_Sensor):
     """Topics of a camera, and what CameraInfo does not contain."""
@@ -134,12 +142,6 @@ class CameraTopics(_Sensor):
         default=CameraPrior.focal_sigma, exclude=True
     )
     centre_sigma_px: Annotated[float, Field(ge=0, le=100)] | None = Field(default=None, exclude=True)
-
-    def named_models(self) -> Iterator[tuple[str, str]]:
-        """Model files of this sensor as (key, path)."""
-        if isinstance(self.semantics, OnnxSemantics):
-            yield "semantics.segmenter", self.semantics.segmenter
-            yield "semantics.detector", self.semantics.detector
 
     @property
     def known(self) -> CameraPrior:
@@ -187,11 +189,6 @@ class LidarTopics(_Sensor):
             raise ValueError("height_m and height_sigma_m go together: give both, or neither")
         return self
 
-    def named_models(self) -> Iterator[tuple[str, str]]:
-        """Model files of this sensor as (key, path)."""
-        if self.semantics is not None:
-            yield "semantics.segmenter", self.semantics.segmenter
-
 
 class OnnxDrivable(Section):
     """Drivable area of the radar, computed by a network; path of its manifest, relative to fleet.toml."""
@@ -216,11 +213,6 @@ class RadarTopics(_Sensor):
     # None = from geometry. Left out of dumps: only perception uses it, so a change must not ingest a rig's
     # logs again.
     drivable: OnnxDrivable | None = Field(default=None, exclude=True)
-
-    def named_models(self) -> Iterator[tuple[str, str]]:
-        """Model files of this sensor as (key, path)."""
-        if self.drivable is not None:
-            yield "drivable.model", self.drivable.model
 
     @model_validator(mode="after")
     def _one_way_to_say_velocity(self) -> RadarTopics:

@@ -7,8 +7,8 @@ outcome. Every executor runs this code: in the same process, in a pool, or on an
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
-from contextlib import AbstractContextManager, closing
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,12 +21,12 @@ from pipeline.store.commits import assert_records, commit_last, commit_records
 from pipeline.store.moments import MomentWriter, is_whole, write_moments
 from pipeline.store.partitions import Partition, work_key
 from pipeline.store.records import read_records
-from pipeline.store.tables import Manifest, PartitionWriter, absence, read_manifest, write_partition
+from pipeline.store.tables import Manifest, absence, read_manifest, write_partition
 from schemas.columns import TableSchema
 from schemas.moments import STATED_FAULTS
 from schemas.versions import CODE_VERSION
 
-__all__ = ["Stage", "run_stage", "try_stage", "why_to_run"]
+__all__ = ["Stage", "try_stage", "why_to_run"]
 
 
 @dataclass(frozen=True)
@@ -55,24 +55,26 @@ class Stage:
         return function
 
     def run(self, task: Task) -> Outcome:
-        """Do the task unless it is done already; see `run_stage`."""
-        return run_stage(self, task)
+        """Run the task unless the same work is done already.
 
+        Equal code version, settings and inputs give an equal work key; a partition or record with that key is
+        not made again ("cached"). If a stage raises or is killed, tables stay as they were.
 
-def run_stage(stage: Stage, task: Task) -> Outcome:
-    """Run the task unless the same work is done already.
-
-    Equal code version, settings and inputs give an equal work key; a partition or record with that key is not
-    made again ("cached"). If a stage raises or is killed, tables stay as they were.
-
-    Raises:
-        ConfigError: unknown vehicle, or a configuration that the stage refuses.
-        ContractError: an input table of the vehicle-day is missing, or a row breaks the contract of its
-            table.
-    """
-    with measured() as effort:
-        outcome = _run_stage(stage, task)
-    return replace(outcome, effort=effort())
+        Raises:
+            ConfigError: unknown vehicle, or a configuration that the stage refuses.
+            ContractError: an input table of the vehicle-day is missing, or a row breaks the contract of its
+                table.
+        """
+        with measured() as effort:
+            task, work, run = _prepared(self, task)
+            if not self.writes:  # it writes each file atomically itself, and yields its path
+                with closing(work.rows(run)) as paths:
+                    outcome = _outcome(self, task, "done", run.work_key, outputs=[str(p) for p in paths])
+            elif self.writes[0].is_record_table:
+                outcome = _add_records(self, task, work, run)
+            else:
+                outcome = _replace_partition(self, task, work, run)
+        return replace(outcome, inputs=run.inputs, effort=effort())
 
 
 def why_to_run(stage: Stage, task: Task) -> str:
@@ -97,16 +99,6 @@ def why_to_run(stage: Stage, task: Task) -> str:
     return "other configuration" if sorted(inputs) == sorted(run.inputs) else "other inputs"
 
 
-def _run_stage(stage: Stage, task: Task) -> Outcome:
-    task, work, run = _prepared(stage, task)
-    if not stage.writes:
-        return _write_files(stage, task, work, run)
-    schema = stage.writes[0]
-    if schema.is_record_table:
-        return _add_records(stage, task, work, run)
-    return _replace_partition(stage, task, work, run, schema)
-
-
 def _prepared(stage: Stage, task: Task) -> tuple[Task, Work, Run]:
     """The task with its inputs, the stage's work for it, and the run with its work key."""
     if isinstance(task.of, Partition):
@@ -126,7 +118,7 @@ def _wider_keys(stage: Stage, work: Work, run: Run) -> list[str]:
 
 
 def try_stage(stage: Stage, task: Task, progress: Progress) -> Outcome:
-    """`run_stage` with errors turned into outcomes, so that one vehicle-day never stops the others."""
+    """`Stage.run` with errors turned into outcomes, so that one vehicle-day never stops the others."""
     with measured() as effort:
         try:
             return stage.run(replace(task, progress=progress))
@@ -154,21 +146,23 @@ def _inputs(stage: Stage, task: Task) -> dict[str, Manifest]:
     return found
 
 
-def _replace_partition(stage: Stage, task: Task, work: Work, run: Run, schema: TableSchema) -> Outcome:
+def _replace_partition(stage: Stage, task: Task, work: Work, run: Run) -> Outcome:
     """Write the rows into the partition, which appears as a whole or not at all."""
+    schema = stage.writes[0]
     done = _readable(task, schema)
     keys = (run.work_key, *_wider_keys(stage, work, run))
     if done is not None and done.work_key in keys and not work.again:
         # The same remarks again: if the night that made the partition was killed, they were never printed.
-        return replace(_partition_outcome(stage, task, work, "cached", done), inputs=run.inputs)
+        return _partition_outcome(stage, task, work, "cached", done)
     refused = _refused_before(stage, task, run)
     if refused is not None:
         return refused
+    write = write_moments if any(s.of_sensor for s in stage.writes) else write_partition
     try:
         with (
             at_most(task.fleet.fleet.memory_gb),
             closing(work.rows(run)) as rows,
-            _writer(stage)(task.lake, schema, task.partition, run.work_key, CODE_VERSION, run.inputs) as out,
+            write(task.lake, schema, task.partition, run.work_key, CODE_VERSION, run.inputs) as out,
         ):
             if isinstance(out, MomentWriter):
                 for moment, captures in rows:
@@ -180,12 +174,11 @@ def _replace_partition(stage: Stage, task: Task, work: Work, run: Run, schema: T
             out.describe(**counts, remarks=run.remarks, **run.extra)
     except (NothingUsable, TooMuchMemoryError) as refusal:
         counts = {"kept": {"frames": 0, **run.kept}, "rejected": dict(run.rejected)}
-        told = counts | {"reason": str(refusal), "faults": refusal.faults, "inputs": run.inputs}
+        told = counts | {"reason": str(refusal), "faults": refusal.faults}
         return _outcome(stage, task, "refused", run.work_key, **told)
     written = read_manifest(task.lake, schema, task.partition)
     assert written is not None, "the partition was just written"
-    outcome = _partition_outcome(stage, task, work, "done", written)
-    return replace(outcome, inputs=run.inputs)
+    return _partition_outcome(stage, task, work, "done", written)
 
 
 def _refused_before(stage: Stage, task: Task, run: Run) -> Outcome | None:
@@ -196,7 +189,7 @@ def _refused_before(stage: Stage, task: Task, run: Run) -> Outcome | None:
             continue
         if (row.stage, row.status, row.work_key) == (stage.name, "refused", run.work_key):
             counts = {"rows": row.rows, "kept": row.kept, "rejected": row.rejected}
-            told = counts | {"reason": row.reason, "faults": tuple(row.faults), "inputs": run.inputs}
+            told = counts | {"reason": row.reason, "faults": tuple(row.faults)}
             return _outcome(stage, task, "refused", run.work_key, **told)
     return None
 
@@ -208,10 +201,6 @@ def _readable(task: Task, schema: TableSchema) -> Manifest | None:
         return found if found is None or is_whole(task.lake, task.partition, found) else None
     except (ContractError, ValueError, OSError):
         return None
-
-
-def _writer(stage: Stage) -> Callable[..., AbstractContextManager[PartitionWriter | MomentWriter]]:
-    return write_moments if any(s.of_sensor for s in stage.writes) else write_partition
 
 
 def _partition_outcome(stage: Stage, task: Task, work: Work, status: str, manifest: Manifest) -> Outcome:
@@ -236,13 +225,12 @@ def _partition_outcome(stage: Stage, task: Task, work: Work, status: str, manife
 
 def _add_records(stage: Stage, task: Task, work: Work, run: Run) -> Outcome:
     """Record work that is not recorded yet; commit it here unless the task's owner does."""
-    recorded = [] if work.again else _recorded(stage, task, run.work_key)
+    recorded = [] if work.again else [r for r in _recorded(stage, task) if r.work_key == run.work_key]
     if stage.writes[0].rows_among(recorded):
         if task.commit:
             for schema in stage.writes:
                 assert_records(task.lake, schema, schema.rows_among(recorded))
-        cached = _record_outcome(stage, task, work, "cached", run.work_key, recorded)
-        return replace(cached, inputs=run.inputs)
+        return _record_outcome(stage, task, work, "cached", run.work_key, recorded)
     written: list[Any] = []
     with at_most(task.fleet.fleet.memory_gb), closing(work.rows(run)) as batches:
         for records in batches:
@@ -253,20 +241,19 @@ def _add_records(stage: Stage, task: Task, work: Work, run: Run) -> Outcome:
             is_said_of_all = isinstance(task.of, Window) and schema is stage.writes[0]
             commit = commit_last if is_said_of_all else commit_records
             commit(task.lake, schema, schema.rows_among(written))
-    outcome = _record_outcome(stage, task, work, "done", run.work_key, written)
-    return replace(outcome, inputs=run.inputs)
+    return _record_outcome(stage, task, work, "done", run.work_key, written)
 
 
-def _recorded(stage: Stage, task: Task, key: str) -> list[Any]:
-    """Records that the same work has made already."""
+def _recorded(stage: Stage, task: Task) -> Sequence[Any]:
+    """Records of the vehicle-day in the tables of the stage."""
     if task.recorded is not None:
-        return [r for r in task.recorded if r.work_key == key]
+        return task.recorded
     vehicle, day = task.partition.vehicle, task.partition.day
     found: list[Any] = []
     for schema in stage.writes:
         of_day: list[Any] = read_records(task.lake, schema, schema.row_type, vehicle=vehicle, day=day)
         found += of_day
-    return [r for r in found if r.work_key == key]
+    return found
 
 
 def _record_outcome(stage: Stage, task: Task, work: Work, status: str, key: str, rows: list[Any]) -> Outcome:
@@ -285,13 +272,6 @@ def _record_outcome(stage: Stage, task: Task, work: Work, status: str, key: str,
         outputs=[task.lake.table(t.name) for t in stage.writes if t.rows_among(rows)],
         records=tuple(rows),
     )
-
-
-def _write_files(stage: Stage, task: Task, work: Work, run: Run) -> Outcome:
-    """Run a stage that writes no table: it writes each file atomically itself and yields its path."""
-    with closing(work.rows(run)) as paths:
-        outputs = [str(path) for path in paths]
-    return _outcome(stage, task, "done", run.work_key, outputs=outputs)
 
 
 def _outcome(stage: Stage, task: Task, status: str, key: str, **told: Any) -> Outcome:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from pipeline.core.results import Outcome
@@ -34,13 +34,13 @@ class Known:
     outcomes: tuple[OutcomeRow, ...] = ()
 
 
-@dataclass
-class _Waiting:
-    """Rows of one table that are not committed yet, and recorded rows to become current again."""
-
-    schema: TableSchema
-    new: list[Any] = field(default_factory=list)
-    again: list[Any] = field(default_factory=list)
+# Commit order: a calibration's poses are committed before it, and outcomes come last. Columns that a night
+# does not read.
+_UNREAD = {
+    POSES: ("inputs",),
+    CALIBRATIONS: ("frames_rejected", "inputs"),
+    OUTCOMES: ("rows", "kept", "rejected", "faults"),
+}
 
 
 class Ledger:
@@ -55,48 +55,54 @@ class Ledger:
             if schema.is_record_table:
                 open_table(lake, schema)  # reports an unwritable table before the night's work
         self._lake = lake
-        # Commit order: a calibration's poses are committed before it, and outcomes come last.
-        self._waiting = [_Waiting(t) for t in (POSES, CALIBRATIONS, OUTCOMES)]
+        # Rows that are not committed yet, and recorded rows to become current again.
+        self._new: dict[TableSchema, list[Any]] = {schema: [] for schema in _UNREAD}
+        self._again: dict[TableSchema, list[Any]] = {schema: [] for schema in _UNREAD}
         self._committed_at = time.monotonic()
         days = sorted({p.day for p in partitions})
         # a night without vehicle-days needs no tables
         span = (days[0], days[-1]) if days else ("9999-12-31", "0001-01-01")
-        self._records = RecordIndex(
-            lake, CALIBRATIONS, CalibrationRecord, *span, ("frames_rejected", "inputs")
-        )
-        self._poses = RecordIndex(lake, POSES, PoseRow, *span, ("inputs",))
-        self._outcomes = RecordIndex(
-            lake, OUTCOMES, OutcomeRow, *span, ("rows", "kept", "rejected", "faults")
-        )
+        self._recorded: dict[TableSchema, RecordIndex[Any]] = {
+            schema: RecordIndex(lake, schema, schema.row_type, *span, unread)
+            for schema, unread in _UNREAD.items()
+        }
 
     def known(self, partition: Partition) -> Known:
         """Rows of a vehicle-day at the beginning of the night; the current one of a key comes last."""
-        of = (partition.vehicle, partition.day)
-        found = self._records.of(*of), self._poses.of(*of)
-        return Known((*found[0], *found[1]), tuple(self._outcomes.of(*of)))
+        poses, records, outcomes = (
+            index.of(partition.vehicle, partition.day) for index in self._recorded.values()
+        )
+        return Known((*records, *poses), tuple(outcomes))
 
     def add(self, outcome: Outcome, method: str) -> None:
         """Add an outcome and its records, and commit if it is time; on an OSError the rows are kept."""
-        poses, records, outcomes = self._waiting
-        of = (outcome.vehicle, outcome.day)
-        if outcome.records:
-            _sort(poses, POSES.rows_among(outcome.records), self._poses.of(*of))
-            _sort(records, CALIBRATIONS.rows_among(outcome.records), self._records.of(*of))
-        _sort(outcomes, [outcome_row(outcome, method)], self._outcomes.of(*of))
-        waiting = sum(len(w.new) + len(w.again) for w in self._waiting)
+        rows = [*outcome.records, outcome_row(outcome, method)]
+        for schema in _UNREAD:
+            if own := schema.rows_among(rows):
+                self._sort(schema, own, self._recorded[schema].of(outcome.vehicle, outcome.day))
+        waiting = sum(map(len, (*self._new.values(), *self._again.values())))
         if waiting >= _ROWS or (waiting and time.monotonic() - self._committed_at > _EVERY_S):
             self.commit()
+
+    def _sort(self, schema: TableSchema, rows: Sequence[Any], recorded: Sequence[Any]) -> None:
+        """Sort rows: unrecorded rows are new; recorded rows that were replaced become current again."""
+        last = {schema.about_of(r): r.work_key for r in recorded}
+        keys = {(schema.about_of(r), r.work_key) for r in recorded}
+        for row in rows:
+            about = schema.about_of(row)
+            if (about, row.work_key) not in keys:
+                self._new[schema].append(row)
+            elif last[about] != row.work_key:
+                self._again[schema].append(row)
 
     def commit(self) -> None:
         """Commit all waiting rows; on an OSError they are kept."""
         self._committed_at = time.monotonic()
-        for waiting in self._waiting:
-            if waiting.new:
-                commit_records(self._lake, waiting.schema, waiting.new)
-                waiting.new = []
-            if waiting.again:
-                assert_records(self._lake, waiting.schema, waiting.again)
-                waiting.again = []
+        for schema in _UNREAD:
+            for waiting, commit in ((self._new, commit_records), (self._again, assert_records)):
+                if waiting[schema]:
+                    commit(self._lake, schema, waiting[schema])
+                    waiting[schema] = []
 
 
 def record_outcome(lake: Lake, outcome: Outcome, method: str = "") -> None:
@@ -127,16 +133,3 @@ def outcome_row(outcome: Outcome, method: str) -> OutcomeRow:
         inputs=list(outcome.inputs),
         faults=list(outcome.faults),
     )
-
-
-def _sort(waiting: _Waiting, rows: Sequence[Any], recorded: Sequence[Any]) -> None:
-    """Sort rows: unrecorded rows are new; recorded rows that were replaced become current again."""
-    about_of = waiting.schema.about_of
-    last = {about_of(r): r.work_key for r in recorded}
-    keys = {(about_of(r), r.work_key) for r in recorded}
-    for row in rows:
-        key = about_of(row)
-        if (key, row.work_key) not in keys:
-            waiting.new.append(row)
-        elif last[key] != row.work_key:
-            waiting.again.append(row)

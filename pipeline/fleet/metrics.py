@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pipeline.core.results import Outcome
 from pipeline.fleet.nightly import DayOutcome
 from schemas.versions import CODE_VERSION
 from schemas.words import DAY_WORDS
 
-if TYPE_CHECKING:
-    from prometheus_client import CollectorRegistry
-
 __all__ = ["NightEnd", "Tally", "write_metrics"]
 
 _SUCCESS = (0, 3)  # held and refused days are valid results: a night with only those is a success
-_LAST_SUCCESS = "boresight_last_success_timestamp_seconds"
+_LAST_SUCCESS = "last_success_timestamp_seconds"
 
 
 @dataclass
@@ -81,72 +78,45 @@ def write_metrics(path: Path, fleet: str, tally: Tally, end: NightEnd) -> None:
     Raises:
         OSError: the file cannot be written; it stays as it was.
     """
-    from prometheus_client import CollectorRegistry, write_to_textfile  # noqa: PLC0415 - an extra
+    from prometheus_client import CollectorRegistry, Gauge, write_to_textfile  # noqa: PLC0415 - an extra
 
     registry = CollectorRegistry()
-    last = end.ended_s if end.exit_code in _SUCCESS else _last_success(path, fleet)
-    _about_the_night(registry, fleet, tally, end, last)
-    _about_stages(registry, fleet, tally)
+    for name, what, labels, values in _gauges(fleet, path, tally, end):
+        # All metrics are gauges: counts of different nights do not add up.
+        gauge = Gauge(f"boresight_{name}", what, ("fleet", *labels), registry=registry)
+        for of, value in sorted(values.items()):
+            gauge.labels(fleet, *of).set(value)
     write_to_textfile(str(path), registry)
 
 
-def _about_the_night(
-    registry: CollectorRegistry, fleet: str, tally: Tally, end: NightEnd, last_success_s: float | None
-) -> None:
-    add = _Gauges(registry, fleet)
-    add("boresight_info", "Release that ran.", {(CODE_VERSION,): 1}, ("version",))
-    add("boresight_last_run_timestamp_seconds", "When the last night ended.", {(): end.ended_s})
-    if last_success_s is not None:
-        add(_LAST_SUCCESS, "When the last night ended without a failure.", {(): last_success_s})
-    add(
-        "boresight_exit_code",
-        "Exit code of the last night: 0, 1 failed, 2 misconfigured, 3 held or refused.",
-        {(): end.exit_code},
-    )
-    add("boresight_duration_seconds", "Duration of the last night.", {(): end.ended_s - end.began_s})
+_Gauge = tuple[str, str, tuple[str, ...], Mapping[Any, int | float]]
+
+
+def _gauges(fleet: str, path: Path, tally: Tally, end: NightEnd) -> Iterator[_Gauge]:
+    """Name, meaning, labels, and values by label of every metric."""
+    last = end.ended_s if end.exit_code in _SUCCESS else _last_success(path, fleet)
     days = {(s,): tally.vehicle_days[s] for s in ("cached", *DAY_WORDS) if s != "missing"}
-    add("boresight_vehicle_days", "Vehicle-days of the last night.", days, ("status",))
-    add(
-        "boresight_records",
-        "Current records of the last night's vehicle-days.",
-        tally.records,
-        ("pair", "status"),
-    )
-    vehicles = {(status,): count for status, count in end.vehicles.items()}
-    add("boresight_vehicles", "Vehicles by status of the last audit.", vehicles, ("status",))
     moved = {(m["vehicle"], m["sensor"], m["since"] or ""): 1 for m in end.moved}
-    add("boresight_sensor_moved", "1 for a sensor that moved.", moved, ("vehicle", "sensor", "since"))
-
-
-def _about_stages(registry: CollectorRegistry, fleet: str, tally: Tally) -> None:
-    add = _Gauges(registry, fleet)
-    add("boresight_stage_ends", "Vehicle-days by how a stage ended.", tally.stages, ("stage", "status"))
+    vehicles = {(status,): count for status, count in end.vehicles.items()}
+    codes = "Exit code of the last night: 0, 1 failed, 2 misconfigured, 3 held or refused."
+    records = "Current records of the last night's vehicle-days."
+    yield "info", "Release that ran.", ("version",), {(CODE_VERSION,): 1}
+    yield "last_run_timestamp_seconds", "When the last night ended.", (), {(): end.ended_s}
+    if last is not None:
+        yield _LAST_SUCCESS, "When the last night ended without a failure.", (), {(): last}
+    yield "exit_code", codes, (), {(): end.exit_code}
+    yield "duration_seconds", "Duration of the last night.", (), {(): end.ended_s - end.began_s}
+    yield "vehicle_days", "Vehicle-days of the last night.", ("status",), days
+    yield "records", records, ("pair", "status"), tally.records
+    yield "vehicles", "Vehicles by status of the last audit.", ("status",), vehicles
+    yield "sensor_moved", "1 for a sensor that moved.", ("vehicle", "sensor", "since"), moved
+    yield "stage_ends", "Vehicle-days by how a stage ended.", ("stage", "status"), tally.stages
     for name, what, counts in (
-        ("boresight_stage_seconds", "Workers' seconds in a stage.", tally.seconds),
-        ("boresight_stage_read_bytes", "Bytes that workers read in a stage.", tally.bytes_read),
-        ("boresight_stage_written_bytes", "Bytes that workers wrote in a stage.", tally.bytes_written),
+        ("stage_seconds", "Workers' seconds in a stage.", tally.seconds),
+        ("stage_read_bytes", "Bytes that workers read in a stage.", tally.bytes_read),
+        ("stage_written_bytes", "Bytes that workers wrote in a stage.", tally.bytes_written),
     ):
-        add(name, what, {(stage,): value for stage, value in counts.items()}, ("stage",))
-
-
-class _Gauges:
-    """Adds gauges of one fleet. All metrics are gauges: counts of different nights do not add up."""
-
-    def __init__(self, registry: CollectorRegistry, fleet: str) -> None:
-        self._registry, self._fleet = registry, fleet
-
-    def __call__(
-        self,
-        name: str,
-        what: str,
-        values: Mapping[Any, int | float],
-        labels: Sequence[str] = (),
-    ) -> None:
-        from prometheus_client import Gauge  # noqa: PLC0415 - an extra
-
-        gauge = Gauge(name, what, ("fleet", *labels), registry=self._registry)
-        for of, value in sorted(values.items()):
-            gauge.labels(self._fleet, *of).set(value)
+        yield name, what, ("stage",), {(stage,): value for stage, value in counts.items()}
 
 
 def _last_success(path: Path, fleet: str) -> float | None:
@@ -156,7 +126,7 @@ def _last_success(path: Path, fleet: str) -> float | None:
     try:
         for family in text_string_to_metric_families(path.read_text()):
             for sample in family.samples:
-                if sample.name == _LAST_SUCCESS and sample.labels.get("fleet") == fleet:
+                if sample.name == f"boresight_{_LAST_SUCCESS}" and sample.labels.get("fleet") == fleet:
                     return float(sample.value)
     except (OSError, ValueError):
         return None

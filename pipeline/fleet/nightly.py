@@ -15,24 +15,33 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from pipeline.core.config import FleetConfig
-from pipeline.core.results import MadeWhenAsked, Outcome, Progress, silent
-from pipeline.core.runner import Stage, try_stage
+from pipeline.core.results import Effort, MadeWhenAsked, Outcome, Progress, silent
+from pipeline.core.runner import try_stage
 from pipeline.core.stage_work import Task
 from pipeline.core.stages import CALIBRATE, INGEST, PERCEIVE
 from pipeline.fleet.executor import EXECUTORS, Finished, Watch
 from pipeline.fleet.ledger import Known, Ledger
-from pipeline.fleet.more_frames import MOST_TIMES_MORE, asks_for_more, spent_before, with_more_sweeps
 from pipeline.fleet.pattern import VehicleDay
 from pipeline.rig.edges import edge_of, words_of
 from pipeline.store.partitions import Lake, Partition, last_possible_day
-from schemas.calibrations import CalibrationRecord
+from schemas.calibrations import ASKS_FOR_FRAMES, CalibrationRecord
+from schemas.moments import SWEEPS_LOGGED, SWEEPS_PLANNED
 from schemas.words import day_word
 
-__all__ = ["DayOutcome", "Night", "refused_at_once", "run_night", "run_vehicle_day", "task_of"]
+__all__ = [
+    "DayOutcome",
+    "Night",
+    "asks_for_more",
+    "refused_at_once",
+    "run_night",
+    "run_vehicle_day",
+    "task_of",
+]
 
 
 @dataclass(frozen=True)
@@ -66,6 +75,10 @@ class DayOutcome:
 
 
 _NAMED = 5  # vehicles of fleet.toml named beside an unknown one
+# Number of doublings: 1,600 sweeps at most, and all passes together cost seven times the first. Sigmas fall
+# with the root of the number of frames in a calibration; if four times the choice does not help, more will
+# not.
+_MOST_TIMES_MORE = 2
 
 # Configuration of the vehicle, the day with its logs, and its rows in the lake.
 _Job = tuple[dict[str, Any], VehicleDay, Known]
@@ -84,23 +97,18 @@ def run_night(
     known = [day for day, reason in zip(days, why, strict=True) if not reason]
     ledger = Ledger(night.lake, [day.partition for day in days])
     jobs, run = _jobs(night, known, ledger), partial(_run_job, _shared(night))
+    refused = (
+        _refused(night, day.partition, reason) for day, reason in zip(days, why, strict=True) if reason
+    )
     try:
-        for day, reason in zip(days, why, strict=True):
-            if reason:
-                yield _told(ledger, night, _refused(night, day.partition, reason))
         with closing(EXECUTORS[executor](run, jobs, workers, watch)) as results:
-            for finished in results:
-                yield _told(ledger, night, _outcome(finished))
+            for outcome in chain(refused, map(_outcome, results)):
+                for result in outcome.results:
+                    with suppress(OSError):  # the storage may answer again before the night ends
+                        ledger.add(result, night.method)
+                yield outcome
     finally:
         ledger.commit()
-
-
-def _told(ledger: Ledger, night: Night, outcome: DayOutcome) -> DayOutcome:
-    """The outcome, whose results are in the ledger."""
-    for result in outcome.results:
-        with suppress(OSError):  # the storage may answer again before the night ends
-            ledger.add(result, night.method)
-    return outcome
 
 
 def refused_at_once(night: Night, of: Partition) -> str:
@@ -136,13 +144,47 @@ def run_vehicle_day(night: Night, work: VehicleDay, known: Known, progress: Prog
     if damaged:
         night.lake.set_aside(damaged)  # its inputs exist: make it again, once
         outcome = _through_stages(task, progress)
-    for _ in range(MOST_TIMES_MORE):
+    for _ in range(_MOST_TIMES_MORE):
         if not asks_for_more(outcome.results):
             break
-        task, before = with_more_sweeps(task), outcome
+        wider = task.fleet.model_copy(update={"ingest": task.fleet.ingest.wider})
+        task, before = replace(task, fleet=wider), outcome
         outcome = _through_stages(task, progress)
-        outcome = replace(outcome, results=spent_before(before.results, outcome.results))
+        outcome = replace(outcome, results=_with_efforts(before.results, outcome.results))
     return outcome
+
+
+def asks_for_more(results: Sequence[Outcome]) -> bool:
+    """Whether there are unread sweeps and a pair, or the whole day, lacks nothing but frames."""
+    read = next((r for r in results if r.stage == INGEST.name), None)
+    if read is None or read.kept.get(SWEEPS_LOGGED, 0) <= read.kept.get(SWEEPS_PLANNED, 0):
+        return False
+    if any(r.status == "failed" for r in results):
+        return False
+    if any(r.status == "refused" for r in results if r.stage != CALIBRATE.name):
+        return True
+    # More frames may remove every clause of a reason.
+    return any(
+        all(any(words in clause for words in ASKS_FOR_FRAMES) for clause in r.reason.split("; "))
+        for r in results[-1].records
+        if r.status != "accepted"
+    )
+
+
+def _with_efforts(earlier: Sequence[Outcome], later: Sequence[Outcome]) -> tuple[Outcome, ...]:
+    """The later results, with the effort of an earlier pass added to the same stages."""
+    efforts = {r.stage: r.effort for r in earlier}
+    return tuple(replace(r, effort=_sum(efforts.get(r.stage), r.effort)) for r in later)
+
+
+def _sum(a: Effort | None, b: Effort) -> Effort:
+    if a is None:
+        return b
+    read, written = (
+        None if x is None or y is None else x + y
+        for x, y in ((a.bytes_read, b.bytes_read), (a.bytes_written, b.bytes_written))
+    )
+    return Effort(a.began_at, a.seconds + b.seconds, read, written)
 
 
 def task_of(night: Night, work: VehicleDay, known: Known, progress: Progress = silent) -> Task:
@@ -164,7 +206,11 @@ def task_of(night: Night, work: VehicleDay, known: Known, progress: Progress = s
 def _through_stages(task: Task, progress: Progress) -> DayOutcome:
     partition, done = task.partition, list[Outcome]()
     for stage in (INGEST, PERCEIVE, CALIBRATE):
-        done.append(try_stage(stage, task, _named(stage, progress)))
+
+        def named(done: int, total: int, what: str, name: str = stage.name) -> None:
+            progress(done, total, f"{name} {what}")
+
+        done.append(try_stage(stage, task, named))
         if done[-1].status == "failed":
             break
         if done[-1].status == "refused" and stage is not CALIBRATE:
@@ -197,10 +243,6 @@ def _shared(night: Night) -> Night:
 def _run_job(night: Night, job: _Job, progress: Progress) -> DayOutcome:
     own, day, known = job
     return run_vehicle_day(replace(night, fleet=night.fleet.model_copy(update=own)), day, known, progress)
-
-
-def _named(stage: Stage, progress: Progress) -> Progress:
-    return lambda done, total, what: progress(done, total, f"{stage.name} {what}")
 
 
 def _outcome(finished: Finished[_Job, DayOutcome]) -> DayOutcome:

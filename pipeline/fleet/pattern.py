@@ -19,7 +19,7 @@ from pipeline.core.errors import ConfigError
 from pipeline.store.partitions import Partition, check_day, is_day
 from pipeline.store.remote_logs import LogPath, find_remote_logs
 
-__all__ = ["FoundLogs", "VehicleDay", "find_logs", "find_vehicle_days"]
+__all__ = ["VehicleDay", "find_logs", "find_vehicle_days"]
 
 _SUFFIXES = (".mcap", ".bag", ".db3", ".zstd")
 _ROS2_FILES = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")  # as `ingest` reads them from a folder
@@ -41,33 +41,16 @@ def find_vehicle_days(
     pattern: str, from_day: str | None = None, to_day: str | None = None
 ) -> list[VehicleDay]:
     """Vehicle-days of all logs that match, as `find_logs`."""
-    return find_logs(pattern, from_day, to_day).days
+    return find_logs(pattern, from_day, to_day)[0]
 
 
-@dataclass(frozen=True)
-class FoundLogs:
-    """Vehicle-days of the logs that match a pattern, and logs of another format that it leaves out.
-
-    `wider` is a pattern that matches them too; empty if nothing is left out.
-    """
-
-    days: list[VehicleDay]
-    left_out: list[VehicleDay]
-    wider: str = ""
-
-    @property
-    def problem(self) -> str:
-        """What is left out, and the pattern to use; empty if nothing is."""
-        if not self.left_out:
-            return ""
-        count = sum(len(day.logs) for day in self.left_out)
-        few = f"{count} log{'s' * (count != 1)} of {len(self.left_out)} vehicle-day{'s' * (len(self.left_out) != 1)}"
-        beside = f"in another format, as {self.left_out[0].logs[0]}"
-        return f'--logs leaves out {few} {beside}: use --logs "{self.wider}"'
-
-
-def find_logs(pattern: str, from_day: str | None = None, to_day: str | None = None) -> FoundLogs:
+def find_logs(
+    pattern: str, from_day: str | None = None, to_day: str | None = None
+) -> tuple[list[VehicleDay], str]:
     """Vehicle-days of all logs that match, in order of day and vehicle, so that a night finishes day by day.
+
+    The second value names logs that the pattern leaves out for their format, and the pattern to use; empty
+    if there are none.
 
     Args:
         pattern: a path with {vehicle} and {day} (YYYY-MM-DD or YYYYMMDD), each at least once, also inside
@@ -86,13 +69,22 @@ def find_logs(pattern: str, from_day: str | None = None, to_day: str | None = No
         raise ConfigError("command line", "--from", f"{from_day} is after --to {to_day}")
     wanted, others = (_vehicle_days(logs) for logs in _found(pattern))
     if not wanted:
-        beside = FoundLogs([], others, _wider(pattern)).problem
-        raise ConfigError("command line", "--logs", beside or f"no log matches {pattern!r}")
-    within = [
+        problem = _left_out(others, pattern) or f"no log matches {pattern!r}"
+        raise ConfigError("command line", "--logs", problem)
+    within, beside = (
         [d for d in days if (from_day or "") <= d.partition.day <= (to_day or "9999")]
         for days in (wanted, others)
-    ]
-    return FoundLogs(within[0], within[1], _wider(pattern) if within[1] else "")
+    )
+    return within, _left_out(beside, pattern)
+
+
+def _left_out(days: Sequence[VehicleDay], pattern: str) -> str:
+    if not days:
+        return ""
+    count = sum(len(day.logs) for day in days)
+    few = f"{count} log{'s' * (count != 1)} of {len(days)} vehicle-day{'s' * (len(days) != 1)}"
+    beside = f"in another format, as {days[0].logs[0]}"
+    return f'--logs leaves out {few} {beside}: use --logs "{_wider(pattern)}"'
 
 
 def _vehicle_days(logs: Mapping[_Owner, Iterable[LogPath]]) -> list[VehicleDay]:

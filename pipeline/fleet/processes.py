@@ -16,7 +16,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from multiprocessing import connection, get_context, parent_process
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 from pipeline.core.memory import MODEL_THREADS, usable_cpus
 from pipeline.core.results import Progress
@@ -30,7 +30,6 @@ __all__ = [
     "Watch",
     "attempt",
     "run_processes",
-    "usable_cpus",
 ]
 
 # --------------------------------------------------------------------------------------------------
@@ -61,22 +60,13 @@ class Finished(Generic[Item, Outcome]):
     trace: str = ""
 
 
-class Executor(Protocol):
-    """`function(item, progress)` must be importable and picklable, and safe to run again.
-
-    Data shared by all items are bound to the function (`functools.partial`), which each worker receives once;
-    `items` may build each item on access. `workers` None = one per available CPU.
-    """
-
-    def __call__(
-        self,
-        function: Callable[[Any, Progress], Any],
-        items: Sequence[Any],
-        workers: int | None,
-        watch: Watch,
-    ) -> Generator[Finished[Any, Any], None, None]:
-        """Yield the result of each item in order of completion."""
-        ...
+# Yields the result of each item in order of completion. The function, of an item and its progress, must be
+# importable, picklable and safe to run again. Data shared by all items are bound to it (`functools.partial`),
+# which each worker receives once; the items may be built on access. Number of workers None = one per available CPU.
+Executor = Callable[
+    [Callable[[Any, Progress], Any], Sequence[Any], int | None, Watch],
+    Generator[Finished[Any, Any], None, None],
+]
 
 
 class Turns:

@@ -6,18 +6,25 @@ tasks are tried again elsewhere, without blame. Needs the extra [ray]; see READM
 
 from __future__ import annotations
 
+import logging
+import os
+import secrets
 import signal
+import socket
+import sys
+import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Generator, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import replace
+from types import ModuleType
 from typing import Any, TypeVar
 
-from pipeline.core.errors import ConfigError, ContractError
+from pipeline.core.errors import ConfigError, ContractError, MissingExtraError
+from pipeline.core.memory import usable_cpus
 from pipeline.core.results import Progress
-from pipeline.fleet.processes import ONE_THREAD, Finished, Turns, Watch, attempt, usable_cpus
-from pipeline.fleet.ray_cluster import Cluster, connected, sigterm_between_calls
+from pipeline.fleet.processes import ONE_THREAD, Finished, Turns, Watch, attempt
 from schemas.versions import CODE_VERSION
 
 __all__ = ["run_on_ray"]
@@ -27,6 +34,9 @@ Outcome = TypeVar("Outcome")
 
 # Memory limit of a worker in DESIGN, for logs of any length (long_log.json of 62eb5928: 455 MB).
 _MEMORY_BYTES = 2 << 30
+# Vehicle-days and their records are kilobytes, a page is a megabyte; by default Ray takes 30 % of the memory.
+_STORE_BYTES = 200 << 20
+_ANSWER_S = 10.0  # a connection takes milliseconds
 # Two tasks per CPU: the second waits for the first, and shows an autoscaler that more nodes have work.
 _TASKS_PER_CPU = 2
 # An item that was in work on this many lost nodes may be the cause: it goes on alone. If spot nodes disappear
@@ -55,9 +65,9 @@ def run_on_ray(
     """
     if not items:
         return
-    cluster, turns = connected(workers or usable_cpus()), Turns(len(items))
-    with sigterm_between_calls() as obey:
-        crew = _Crew(cluster, function, items, watch)
+    ray, turns = _connected(workers or usable_cpus()), Turns(len(items))
+    with _sigterm_between_calls() as obey:
+        crew = _Crew(ray, function, items, watch)
         try:
             while turns:
                 alone = turns.alone
@@ -79,19 +89,26 @@ class _Crew:
     """
 
     def __init__(
-        self, cluster: Cluster, function: Callable[[Any, Progress], Any], items: Sequence[Any], watch: Watch
+        self, ray: ModuleType, function: Callable[[Any, Progress], Any], items: Sequence[Any], watch: Watch
     ) -> None:
-        self._ray, self._items, self._watch = cluster.ray, items, watch
+        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy  # noqa: PLC0415 - an extra
+
+        self._ray, self._items, self._watch = ray, items, watch
+        is_shared = bool(os.environ.get("RAY_ADDRESS"))
         # on a single machine `workers` limits the memory
-        self._memory = _MEMORY_BYTES if cluster.is_shared else 0
+        self._memory = _MEMORY_BYTES if is_shared else 0
+        # What tasks need for imports; a shared cluster must have the same installation.
+        path = {} if is_shared else {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
         self._function = self._ray.put(function)
-        self._board = cluster.beside_the_driver(_Board)
+        # The board is an actor on this node, and ends with the driver.
+        here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=True)
+        self._board = ray.remote(_Board).options(num_cpus=0, scheduling_strategy=here).remote()
         self._reading, self._read_at = self._board.read.remote(), time.monotonic()
         self._task = self._ray.remote(_work).options(
             num_cpus=1,
             memory=self._memory or None,
             max_retries=0,  # Ray would retry a poisoned item beside the others
-            runtime_env={"env_vars": cluster.environment | ONE_THREAD},
+            runtime_env={"env_vars": path | ONE_THREAD},
         )
         self._running: dict[Any, int] = {}
         self._nodes_lost = Counter[int]()
@@ -217,3 +234,84 @@ def _work(
     signal.signal(signal.SIGINT, signal.default_int_handler)
     finished = attempt(function, item, progress)
     return Finished(None, finished.value, finished.error, finished.trace)
+
+
+def _connected(workers: int) -> ModuleType:
+    """Connect to the cluster in $RAY_ADDRESS, else start one on this machine with `workers` CPUs.
+
+    Raises:
+        MissingExtraError: Ray is not installed.
+        ConfigError: $RAY_ADDRESS cannot be reached, or is that of a Ray client.
+    """
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # no usage data leaves the cluster
+    try:
+        import ray  # noqa: PLC0415 - an extra
+    except ImportError as err:
+        raise MissingExtraError("ray", "ray") from err
+    address = os.environ.get("RAY_ADDRESS", "")
+    if "://" in address:
+        problem = f"{address!r}: the night must run in the cluster (`ray job submit`), not as a client of it"
+        raise ConfigError("environment", "RAY_ADDRESS", problem)
+    if not ray.is_initialized():
+        _require_answer(address)
+        own = {"num_cpus": workers, "object_store_memory": _STORE_BYTES, "include_dashboard": False}
+        if not address:
+            # Otherwise Ray writes one into the home folder.
+            os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex())
+        quiet = {"log_to_driver": False, "logging_level": logging.ERROR}
+        with _signals_stay():
+            try:
+                ray.init(address or "local", **quiet, **({} if address else own))
+            except ConnectionError as err:
+                raise ConfigError("environment", "RAY_ADDRESS", f"no cluster at {address!r}") from err
+        # Ray would print dead workers to stdout, which is for the summary; the executor reports them.
+        ray._private.worker.print_to_stdstream = lambda *_args, **_kwargs: None  # noqa: SLF001 - there is no other way
+    return ray
+
+
+def _require_answer(address: str) -> None:
+    """Raise ConfigError if HOST:PORT does not answer: Ray itself would try for a quarter of an hour."""
+    host, separator, port = address.rpartition(":")
+    if not separator:  # no port, or "auto"
+        return
+    try:
+        socket.create_connection((host, int(port)), _ANSWER_S).close()
+    except (OSError, ValueError) as err:
+        raise ConfigError("environment", "RAY_ADDRESS", f"no cluster at {address!r}: {err}") from err
+
+
+@contextmanager
+def _signals_stay() -> Iterator[None]:
+    """Keep the process's SIGTERM handler: Ray's would end it with another exit code."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        yield
+    except SystemExit:  # Ray's reaction to SIGTERM
+        sys.exit(128 + signal.SIGTERM)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@contextmanager
+def _sigterm_between_calls() -> Iterator[Callable[[], None]]:
+    """Defer SIGTERM to calls of the returned function: inside a call of Ray, every exit code becomes 1."""
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: None
+        return
+    noted: list[int] = []
+    before = signal.signal(signal.SIGTERM, lambda signum, _frame: noted.append(signum))
+
+    def obey() -> None:
+        if noted:
+            noted.clear()
+            signal.signal(signal.SIGTERM, before)
+            signal.raise_signal(signal.SIGTERM)
+
+    try:
+        yield obey
+        obey()
+    finally:
+        signal.signal(signal.SIGTERM, before)

@@ -10,9 +10,9 @@ from pipeline.core.config import FleetConfig
 from pipeline.core.errors import CollectedError, ConfigError, DamagedError, LogError
 from pipeline.core.results import Outcome
 from pipeline.core.runner import Stage
-from pipeline.fleet.misconfigured import night_statuses
 from pipeline.fleet.nightly import Night, run_night
 from pipeline.fleet.pattern import VehicleDay
+from pipeline.fleet.status import night_statuses
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, PAIRS, CalibrationRecord
@@ -183,16 +183,6 @@ def test_what_is_damaged_or_left_the_lake_is_set_aside_and_made_anew_at_once(err
     assert [p.name for p in path.parent.iterdir()] == ["part-0.parquet.damaged"]
 
 
-def test_unknown_vehicles_are_refused_and_the_others_go_on(night, monkeypatch):
-    script = StagesThatSay(monkeypatch, night.lake)
-    found = outcomes(night, ("tram", "car"))
-    assert found["tram"].status == "refused"
-    assert "tram" in found["tram"].reason
-    assert "fleet.toml" in found["tram"].reason
-    assert found["car"].status == "done"
-    assert {vehicle for _, vehicle in script.called} == {"car"}
-
-
 def test_a_wrong_configuration_fails_the_day_that_shows_it(night, monkeypatch):
     StagesThatSay(
         monkeypatch, night.lake, ingest=ConfigError("prior.json", "T_camera_lidar", "is no transform")
@@ -217,11 +207,3 @@ def test_a_refusal_is_one_of_the_configuration_by_its_fault_and_not_by_its_words
     assert [r.faults for r in records(night)] == [list(faults)] * 3
     [row] = [r for r in read_records(night.lake, OUTCOMES, OutcomeRow) if r.stage == "ingest"]
     assert row.faults == list(faults)
-
-
-def test_a_day_that_has_not_come_yet_is_refused_at_once(night, monkeypatch):
-    script = StagesThatSay(monkeypatch, night.lake)
-    days = [VehicleDay(Partition("car", "2099-01-01"), (Path("a.mcap"),))]
-    [car] = run_night(night, days, "inline", 1, lambda *_: None)
-    assert (car.status, car.reason) == ("refused", "2099-01-01 is in the future: correct the logs' path")
-    assert not script.called

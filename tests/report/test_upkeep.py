@@ -6,7 +6,7 @@ from pathlib import PurePosixPath
 import numpy as np
 import pytest
 
-from pipeline.fleet.pages import OnWorkers
+from pipeline.fleet.executor import OnWorkers
 from pipeline.report import upkeep
 from pipeline.report.stage import Pages, write_fleet_report
 from pipeline.report.upkeep import one_by_one
