@@ -45,7 +45,6 @@ class LoggedPrior:
 
     def __init__(self, index: DayIndex, rig: Rig, given: Star | None) -> None:
         self._index, self._rig, self._given = index, rig, given
-        self._found: dict[tuple[int, tuple[str, str], tuple[str, str]], np.ndarray | None] = {}
         self._stars: dict[tuple[int, tuple[tuple[str, str], ...]], tuple[Star, bool]] = {}
         self._untied: set[tuple[str, str]] = set()
         self.frame_ids: dict[str, list[str]] = {}
@@ -93,15 +92,13 @@ class LoggedPrior:
 
     def _lookup(self, log: int, a: tuple[str, str], b: tuple[str, str]) -> np.ndarray | None:
         """T_a_b of two sensors with their frames."""
-        if (log, a, b) not in self._found:
-            T = self._index.trees[log].lookup(a[1], b[1])
-            self._found[log, a, b] = T
-            # Report each sensor once: if several have no chain, no two of them are connected.
-            if T is None and not {a, b} <= self._untied:
-                self._untied |= {a, b}
-                names = f"{a[1] or '(no frame id)'} to {b[1] or '(no frame id)'}"
-                self._index.complain(f"{self._rig.prior.topic} has no chain from {names}: no prior")
-        return self._found[log, a, b]
+        T = self._index.trees[log].lookup(a[1], b[1])
+        # Report each sensor once: if several have no chain, no two of them are connected.
+        if T is None and not {a, b} <= self._untied:
+            self._untied |= {a, b}
+            names = f"{a[1] or '(no frame id)'} to {b[1] or '(no frame id)'}"
+            self._index.complain(f"{self._rig.prior.topic} has no chain from {names}: no prior")
+        return T
 
 
 @dataclass(frozen=True, slots=True)

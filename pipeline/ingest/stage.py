@@ -157,11 +157,11 @@ def _find_moments(index: DayIndex, rig: Rig, config: IngestConfig) -> Matched:
     others_ns = {s: index.captures(s).stamps_ns for s in index.kinds if s != index.anchor}
     tied = _tied(rig, index.anchor)
     if config.sync_gate_s is not None:
-        found = match_moments(anchors_ns, others_ns, round(config.sync_gate_s * 1e9), tied)
+        gate_ns: int | Int64[np.ndarray, " N"] = round(config.sync_gate_s * 1e9)
     else:
-        speed, yaw_rate = index.ego.motion_at(anchors_ns)
-        gates = motion_gates_ns(speed, yaw_rate, config.sync_gate_m, float(np.radians(config.sync_gate_deg)))
-        found = match_moments(anchors_ns, others_ns, gates, tied)
+        turn_rad = float(np.radians(config.sync_gate_deg))
+        gate_ns = motion_gates_ns(*index.ego.motion_at(anchors_ns), config.sync_gate_m, turn_rad)
+    found = match_moments(anchors_ns, others_ns, gate_ns, tied)
     return replace(found, anchor=wanted[found.anchor])
 
 

@@ -57,7 +57,7 @@ class ChunkedLog(ABC):
             return memoryview(self._content(start, end - start))
         chunk = self._cache.get((str(self.path), chunk_start))
         if chunk is None:
-            chunk = self._chunk_again(chunk_start)
+            chunk = self._chunk_at(chunk_start, check=False)
             if chunk is None or len(chunk) < end:
                 raise LogError(str(self.path), "changed while it was read")
             self._cache.put((str(self.path), chunk_start), chunk)
@@ -75,7 +75,7 @@ class ChunkedLog(ABC):
             if indexed.channels is not None and not indexed.channels & wanted:
                 continue
             start = indexed.position + self._head
-            chunk = self._cache.get((str(self.path), start)) or self._indexed_chunk(indexed)
+            chunk = self._cache.get((str(self.path), start)) or self._chunk_at(start, check=True)
             if chunk is not None:
                 self._cache.offer((str(self.path), start), chunk)
                 yield from self._scan_chunk(chunk, start, topics)
@@ -107,9 +107,5 @@ class ChunkedLog(ABC):
         """Messages of a chunk."""
 
     @abstractmethod
-    def _indexed_chunk(self, indexed: Chunk) -> bytes | None:
-        """Decompressed records of a chunk in the index; None (and counted) if it is damaged."""
-
-    @abstractmethod
-    def _chunk_again(self, start: int) -> bytes | None:
-        """Decompressed records of a chunk that was scanned before."""
+    def _chunk_at(self, start: int, *, check: bool) -> bytes | None:
+        """Decompressed records of a chunk, with or without their checksum; None (and counted) if it is damaged."""

@@ -74,23 +74,19 @@ class McapLog(ChunkedLog):
             else:
                 self._learn(opcode, content)
 
-    def _chunk_again(self, start: int) -> bytes | None:
-        length = self._lengths.get(start)
+    def _chunk_at(self, start: int, *, check: bool) -> bytes | None:
+        # in one read, if the summary lists it
+        position, length = start - _RECORD.size, self._lengths.get(start)
         if length is None:
-            length = _RECORD.unpack(self._content(start - _RECORD.size, _RECORD.size))[1]
-        return self._open_chunk(self._content(start, length), check=False)
-
-    def _indexed_chunk(self, indexed: Chunk) -> bytes | None:
-        """Records of a chunk listed in the summary, in one read; None (and counted) if it is damaged."""
-        if indexed.length > MOST_CHUNK_BYTES:
+            length = _RECORD.unpack(self._content(position, _RECORD.size))[1]
+        if length > MOST_CHUNK_BYTES:
             self.damage["oversized_chunks"] += 1
             return None
-        record = self._content(indexed.position, indexed.length)
-        is_chunk = len(record) > _RECORD.size and record[0] == Opcode.CHUNK
-        if not is_chunk or _RECORD.unpack_from(record)[1] != indexed.length - _RECORD.size:
+        record = self._content(position, _RECORD.size + length)
+        if len(record) < _RECORD.size or _RECORD.unpack_from(record) != (Opcode.CHUNK, length):
             self.damage["damaged_records"] += 1
             return None
-        return self._open_chunk(record[_RECORD.size :], check=True)
+        return self._open_chunk(record[_RECORD.size :], check=check)
 
     # -- records ------------------------------------------------------------
 

@@ -50,16 +50,12 @@ class BagLog(ChunkedLog):
             elif header["op"] == bytes([_CONNECTION]):
                 self._learn(header, self._content(start, length))
 
-    def _indexed_chunk(self, indexed: Chunk) -> bytes | None:
-        record = self._record(indexed.position)
+    def _chunk_at(self, start: int, *, check: bool) -> bytes | None:  # noqa: ARG002 - bags have no checksums
+        record = self._record(start)
         if record is None or record[0]["op"] != bytes([_CHUNK]):
             self.damage["damaged_records"] += 1
             return None
         return self._open_chunk(*record)
-
-    def _chunk_again(self, start: int) -> bytes | None:
-        record = self._record(start)
-        return self._open_chunk(*record) if record is not None else None
 
     # -- records ------------------------------------------------------------
 
