@@ -103,10 +103,9 @@ class LoggedPrior:
 
 @dataclass(frozen=True, slots=True)
 class Anchored:
-    """Captures of one moment (indices by sensor), the sensor that stamps it, and its stretch of driving."""
+    """Captures of one moment (indices by sensor), and its stretch of driving; the anchor of the day stamps it."""
 
     places: Mapping[str, int]
-    anchor: str
     drive: int
 
 
@@ -116,7 +115,8 @@ class MomentBuilder:
     def __init__(
         self, index: DayIndex, rig: Rig, ingest: IngestConfig, file_prior: Star | None = None
     ) -> None:
-        self._index, self._rig = index, rig
+        self._index, self._rig, self._anchor = index, rig, index.anchor
+        self._stream = index.captures(index.anchor)
         self.counts: Counter[str] = Counter()
         self.prior = LoggedPrior(index, rig, file_prior)
         self._readers = readers_of(index, rig, ingest, self.counts)
@@ -145,8 +145,8 @@ class MomentBuilder:
         """Rows of a moment and its sensors, called in order of time; raises Rejected if it is not kept."""
         missing: dict[str, Rejected] = {}
         parts = {s: part for s in self._readers if (part := self._part(s, at, moment, missing)) is not None}
-        stream = self._index.captures(at.anchor)
-        stamp_ns, log = stream.stamps[at.places[at.anchor]], stream.located[at.places[at.anchor]].log
+        place = at.places[self._anchor]
+        stamp_ns, log = self._stream.stamps[place], self._stream.located[place].log
         damaged = [why for sensor, why in missing.items() if sensor in at.places]
         if damaged and not self._is_worth_having(parts, stamp_ns):
             raise damaged[0]

@@ -90,7 +90,6 @@ class RigSample:
     missing: Mapping[str, tuple[str, ...]]
     tracked: Collection[str] = ()
     _motions: dict[tuple[str, str], Motion] = field(default_factory=dict)
-    _ring_counts: dict[str, int] = field(default_factory=dict)
 
     @cached_property
     def overlaps(self) -> tuple[Overlap, ...]:
@@ -156,7 +155,7 @@ class RigSample:
             labels_share=1.0 if not seen or computed else labelled,
             detections_share=1.0 if computed else _share([f.detection_boxes_px is not None for f in seen]),
             has_intensity=_share([f.lidar_intensity is not None for f in swept]) > 0.5,
-            rings=self._rings(chosen),
+            rings=self._rings.get(chosen.get("lidar", ""), 0),
             elevation_share=_share([f.radar_has_elevation for f in scanned]),
             moving_share=motion.moving_share,
             doppler_problem=motion.doppler_problem,
@@ -193,12 +192,14 @@ class RigSample:
                 ahead[log] = T[:3, :3]
         return AskedRadar(radar, self.rig.radars[radar], ahead, radar not in self.tracked)
 
-    def _rings(self, chosen: Mapping[str, str]) -> int:
-        """Number of rings of the chosen lidar, computed once."""
-        lidar = chosen.get("lidar", "")
-        if lidar not in self._ring_counts:
-            self._ring_counts[lidar] = max((_rings(f) for f in self.frames(chosen)), default=0)
-        return self._ring_counts[lidar]
+    @cached_property
+    def _rings(self) -> dict[str, int]:
+        """Number of rows of each lidar in the log; 0 if its rings are lasers of a scan pattern without rows."""
+        found = dict.fromkeys(self.rig.lidars, 0)
+        for name in found:
+            sweeps = [captures[name] for _, captures in self.built if name in captures]
+            found[name] = max((_rows(s) for s in sweeps if isinstance(s, Sweep)), default=0)
+        return found
 
     @property
     def advice(self) -> list[str]:
@@ -236,10 +237,7 @@ class RigSample:
 
 
 def _points(capture: Sweep | Scan) -> Float[np.ndarray, "N 3"]:
-    if isinstance(capture, Sweep):
-        xyz = np.stack((capture.lidar_x_m, capture.lidar_y_m, capture.lidar_z_m), -1)
-    else:
-        xyz = np.stack((capture.radar_x_m, capture.radar_y_m, capture.radar_z_m), -1)
+    xyz = capture.lidar_xyz_m if isinstance(capture, Sweep) else capture.radar_xyz_m
     return xyz[np.isfinite(xyz).all(axis=1)]
 
 
@@ -247,13 +245,12 @@ def _share(flags: list[bool]) -> float:
     return float(np.mean(flags)) if flags else 0.0
 
 
-def _rings(frame: Frame) -> int:
-    """Number of rows in the log; 0 if its rings are lasers of a scan pattern without rows."""
-    if frame.lidar_ring is None:
+def _rows(sweep: Sweep) -> int:
+    if sweep.lidar_ring is None:
         return 0
-    xyz = frame.lidar_xyz_m.astype(np.float64)
+    xyz = sweep.lidar_xyz_m.astype(np.float64)
     finite = np.isfinite(xyz).all(axis=1)
-    rows = rows_of(to_spherical(xyz[finite]), frame.lidar_ring[finite])
+    rows = rows_of(to_spherical(xyz[finite]), sweep.lidar_ring[finite])
     return 0 if rows is None else int(rows.row.max()) + 1
 
 

@@ -133,15 +133,12 @@ def _complain_of_date(index: DayIndex, day: str) -> None:
 
 def pick_moments(index: DayIndex, rig: Rig, config: IngestConfig) -> tuple[list[Anchored], Counter[str]]:
     """Captures by moment, in order of time, at most `max_frames`; and unused sweeps by reason."""
-    found, drives = _find_moments(index, rig, config), _drives(index)
+    found, anchors = _find_moments(index, rig, config), index.captures(index.anchor)
+    drives = number_drives(anchors.stamps_ns, [at.log for at in anchors.located])
     picked = spread(len(found.anchor), config.max_frames)
     places = {index.anchor: found.anchor, **found.others}
     anchored = [
-        Anchored(
-            {sensor: int(at[i]) for sensor, at in places.items() if at[i] >= 0},
-            index.anchor,
-            int(drives[found.anchor[i]]),
-        )
+        Anchored({s: int(at[i]) for s, at in places.items() if at[i] >= 0}, int(drives[found.anchor[i]]))
         for i in picked
     ]
     return anchored, +(found.rejected + Counter({Rejection.NOT_PICKED: len(found.anchor) - len(picked)}))
@@ -245,15 +242,6 @@ def _near_enough(config: IngestConfig) -> str:
 def read_file_prior(rig: Rig, fleet: FleetConfig) -> Star | None:
     """Transforms of a prior file; None if the prior comes from static transforms."""
     return None if rig.prior.file is None else read_star(fleet.path_of(rig.prior.file), rig)
-
-
-def _drives(index: DayIndex) -> Int64[np.ndarray, " N"]:
-    """Number of the drive of each sweep."""
-    sweeps = index.captures(index.anchor)
-    order = np.argsort(sweeps.stamps_ns, kind="stable")
-    drives = np.zeros(len(order), np.int64)
-    drives[order] = number_drives([sweeps.stamps[i] for i in order], [sweeps.located[i].log for i in order])
-    return drives
 
 
 def _reading_counts(index: DayIndex) -> dict[str, int]:

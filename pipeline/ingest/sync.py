@@ -218,10 +218,11 @@ def _worth_having(
     return (sensors >= least) & (most == sensors)
 
 
-def number_drives(stamps_ns: Sequence[int], logs: Sequence[int]) -> Int64[np.ndarray, " N"]:
+def number_drives(stamps_ns: Int64[np.ndarray, " N"], logs: Sequence[int]) -> Int64[np.ndarray, " N"]:
     """Number of each sweep's stretch of driving, from 0: new where the log changes or stamps gap by 10 s."""
-    if not len(stamps_ns):
-        return np.zeros(0, np.int64)
-    is_late = np.diff(np.asarray(stamps_ns, np.int64)) > _DRIVE_GAP_NS
-    is_other = np.diff(np.asarray(logs, np.int64)) != 0
-    return np.concatenate([[0], np.cumsum(is_late | is_other)]).astype(np.int64)
+    order = np.argsort(stamps_ns, kind="stable")
+    is_late = np.diff(stamps_ns[order]) > _DRIVE_GAP_NS
+    is_other = np.diff(np.asarray(logs, np.int64)[order]) != 0
+    drives = np.zeros(len(order), np.int64)
+    drives[order[1:]] = np.cumsum(is_late | is_other)
+    return drives

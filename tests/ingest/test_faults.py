@@ -148,17 +148,6 @@ def test_a_rig_without_a_sensor_reads_the_other_two(kit, tmp_path, run_ingest, s
     assert not any(key.startswith("frames_without") for key in result.rejected)
 
 
-def test_a_wrong_type_on_a_topic_is_named(kit, tmp_path, run_ingest):
-    drive = kit.Kit().drive()
-    drive.each(kit.RADAR, lambda _, at: drive.info(at))
-    result, _ = run_ingest(drive.mcap(tmp_path / "a.mcap"))
-    assert result.status == "done"
-    assert result.rejected["without_radar_no_radar_in_gate"] == 4
-    assert result.rejected["wrong_type"] == 4
-    assert kit.RADAR in result.reason
-    assert "sensor_msgs/msg/CameraInfo, not sensor_msgs/msg/PointCloud2" in result.reason
-
-
 def test_a_definition_that_does_not_fit_its_bytes_is_refused_not_guessed(kit, tmp_path, run_ingest):
     log = kit.Kit().drive().mcap(tmp_path / "a.mcap", compression="NONE", enable_crcs=False)
     data = log.read_bytes()
@@ -219,25 +208,39 @@ def test_an_image_that_is_late_by_as_much_as_all_others_costs_nothing_and_one_th
     assert "leave it out to gate by motion" in manifest_of(tmp_path, "paper").extra[SENSORS_ABSENT]["camera"]
 
 
-def test_intrinsics_that_are_not_calibrated_cost_the_camera_with_what_to_do(kit, tmp_path, run_ingest):
-    drive = kit.Kit().drive()
-    drive.each(kit.INFO, lambda _, at: drive.info(at, focal_px=0.0))
-    result, _ = run_ingest(drive.mcap(tmp_path / "a.mcap"))
-    assert "zero K" in result.reason
-    assert result.rejected["camera_info_unusable"] == 4
-    assert result.rejected["without_camera_no_usable_camera_info"] == 4
-    assert "CameraInfo with a calibrated K" in manifest_of(tmp_path).extra[SENSORS_ABSENT]["camera"]
-
-
-def test_without_a_chain_of_transforms_there_is_no_prior_rather_than_an_identity(kit, tmp_path, run_ingest):
-    result, frames = run_ingest(kit.Kit().drive().without("/tf_static").mcap(tmp_path / "a.mcap"))
-    assert all(f.priors == {} for f in frames)
-    assert result.rejected["frames_without_prior"] == 4
-    assert "/tf_static has no chain from camera_optical to lidar" in result.reason
+@pytest.mark.parametrize(
+    ("spoil", "counts", "words"),
+    [
+        (
+            lambda drive, kit: drive.each(kit.RADAR, lambda _, at: drive.info(at)),
+            {"wrong_type": 4, "without_radar_no_radar_in_gate": 4},
+            "/radar/points: sensor_msgs/msg/CameraInfo, not sensor_msgs/msg/PointCloud2",
+        ),
+        (
+            lambda drive, kit: drive.each(kit.INFO, lambda _, at: drive.info(at, focal_px=0.0)),
+            {"camera_info_unusable": 4, "without_camera_no_usable_camera_info": 4},
+            "zero K",
+        ),
+        (
+            lambda drive, _: drive.without("/tf_static"),
+            {"frames_without_prior": 4},
+            "/tf_static has no chain from camera_optical to lidar: no prior",
+        ),
+    ],
+    ids=["a wrong type", "no calibration", "no transforms"],
+)
+def test_what_a_whole_day_lacks_is_counted_and_named(kit, tmp_path, run_ingest, spoil, counts, words):
+    result, frames = run_ingest(spoil(kit.Kit().drive(), kit).mcap(tmp_path / "a.mcap"))
     manifest = manifest_of(tmp_path)
-    assert (manifest.rejected, manifest.kept) == (result.rejected, {"frames": 4})
+    assert (result.status, manifest.rejected, manifest.kept) == ("done", result.rejected, {"frames": 4})
+    assert result.rejected == counts
+    assert words in result.reason
+    assert any(words in problem for problem in manifest.extra["problems"])
     assert manifest.inputs[0].startswith("a.mcap:")
-    assert any("no prior" in p for p in manifest.extra["problems"])
+    if "camera_info_unusable" in counts:
+        assert "CameraInfo with a calibrated K" in manifest.extra[SENSORS_ABSENT]["camera"]
+    if "frames_without_prior" in counts:  # rather than an identity
+        assert all(f.priors == {} for f in frames)
 
 
 def test_damaged_labels_and_detections_are_absent_not_empty(kit, tmp_path, run_ingest):

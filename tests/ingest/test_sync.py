@@ -177,5 +177,7 @@ def test_the_constant_of_a_free_running_sensor_is_none():
 def test_a_drive_ends_where_the_log_changes_or_ten_seconds_pass():
     second = 10**9
     stamps_ns = np.array([0, 1, 11, 22, 23, 24]) * second
-    assert number_drives(stamps_ns.tolist(), [0, 0, 0, 0, 0, 1]).tolist() == [0, 0, 0, 1, 1, 2]
-    assert number_drives([], []).tolist() == []
+    logs, drives = np.array([0, 0, 0, 0, 0, 1]), np.array([0, 0, 0, 1, 1, 2])
+    mixed = np.array([3, 0, 5, 4, 1, 2])
+    assert number_drives(stamps_ns[mixed], logs[mixed].tolist()).tolist() == drives[mixed].tolist()
+    assert number_drives(stamps_ns[:0], []).tolist() == []
