@@ -23,9 +23,9 @@ import numpy as np
 
 from schemas.calibrations import PAIRS
 from tests.accuracy.days import FIXED, WHOLE, FixedDay, make_day, measure_day
-from tests.accuracy.naive_cost import unit_s
 from tests.benchmarks.studies.commits import commit_now
 from tests.benchmarks.studies.metrics import within
+from tests.budgets import slowness
 
 __all__ = [
     "BASELINE",
@@ -37,7 +37,6 @@ __all__ = [
     "wrong_and_accepted",
     "z_scores",
 ]
-
 BASELINE = Path(__file__).parent / "baseline.json"
 _DRAWS = range(4)  # calibrations of a day behind a baseline
 _NOISE_SD = 3.0
@@ -158,18 +157,20 @@ def together(results: Iterable[Mapping[str, Any]]) -> dict[str, float]:
 
 
 def _drawn(fixed: FixedDay, draws: Sequence[int]) -> tuple[list[dict[str, Any]], float] | None:
-    """A day's calibrations, and the cheapest in units of naive NumPy; None where its recordings are not here."""
+    """A day's calibrations, and the cheapest in CPU seconds of the budgets' machine; None without its recordings."""
     with tempfile.TemporaryDirectory() as folder:
         made = make_day(fixed, Path(folder))
     if made is None:
         print(f"{fixed.name}: its recordings are not on this machine")
         return None
     results = [measure_day(made, draw) for draw in draws]
-    units = min(result["cpu_s"] for result in results) / unit_s()
-    print(f"{fixed.name}: {len(made.day.rows)} frames, made in {made.cpu_s:.1f} CPU s, {units:.0f} units")
+    cpu_s = min(result["cpu_s"] for result in results) / slowness()
+    print(
+        f"{fixed.name}: {len(made.day.rows)} frames, made in {made.cpu_s:.1f} CPU s, calibrated in {cpu_s:.0f}"
+    )
     for result in results:
         print("   ", verdicts(result), result["cpu_s"], numbers(result), flush=True)
-    return results, units
+    return results, cpu_s
 
 
 def main() -> None:
@@ -197,8 +198,8 @@ def main() -> None:
 def _content(here: Mapping[str, tuple[Sequence[dict[str, Any]], float]]) -> dict[str, Any]:
     """The baseline of days' calibrations and cost."""
     days = baseline_of({name: results for name, (results, _) in here.items()})
-    for name, (_, units) in here.items():
-        days[name]["cpu_units"] = {"value": round(units, 1), "noise": round(_NOISE_CPU * units, 1)}
+    for name, (_, cpu_s) in here.items():
+        days[name]["cpu_s"] = {"value": round(cpu_s, 1), "noise": round(_NOISE_CPU * cpu_s, 1)}
     draws = range(len(next(iter(here.values()))[0]))
     rms = [together(here[name][0][draw] for name in WHOLE) for draw in draws]
     return {

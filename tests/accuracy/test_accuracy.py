@@ -19,14 +19,12 @@ from tests.accuracy.baseline import (
     z_scores,
 )
 from tests.accuracy.days import FIXED, WHOLE, make_day, measure_day
-from tests.accuracy.naive_cost import unit_s
 from tests.benchmarks.studies.engine import Run, calibrate_once
+from tests.budgets import slowness
 
 pytestmark = pytest.mark.slow
 _BASELINE = json.loads(BASELINE.read_text())
 KNOWN = _BASELINE["days"]
-
-
 EVERY_DAY = pytest.mark.parametrize("fixed", FIXED, ids=lambda fixed: fixed.name)
 
 
@@ -80,11 +78,11 @@ def test_errors_are_as_large_as_their_sigmas_say(measured):
 @EVERY_DAY
 def test_a_calibration_costs_no_more_than_the_baseline(measured, fixed):
     made, result = measured(fixed)
-    known = KNOWN[fixed.name]["cpu_units"]
+    known = KNOWN[fixed.name]["cpu_s"]
     limit = known["value"] + known["noise"]
     # Once more where it was too much: the first of a process compiles, and neighbours come and go.
-    if result["cpu_s"] / unit_s() > limit:
-        assert measure_day(made)["cpu_s"] / unit_s() <= limit
+    if result["cpu_s"] / slowness() > limit:
+        assert measure_day(made)["cpu_s"] / slowness() <= limit
 
 
 def test_the_real_radars_elevation_has_witnesses_that_agree(measured):
