@@ -13,12 +13,11 @@ from pipeline.core.ros_messages import RosMessages
 from pipeline.rig.day_prior import read_prior
 from pipeline.rig.targets import errors_at_targets
 from pipeline.rig.topics import TOPICS
-from pipeline.store.current import targets_of
+from pipeline.store.current import targets_of, transform_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
 from pipeline.store.views import observations_of
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
-from tests.benchmarks.studies.metrics import transform_of
 from tests.makers.calibrated_days import perturbed, records_of_rows
 from tests.makers.real_models import write_real_manifests
 

@@ -10,11 +10,12 @@ from pipeline.calibrate.records import Inputs
 from pipeline.core.config import load_fleet
 from pipeline.rig.day_prior import read_prior
 from pipeline.rig.targets import errors_at_targets
+from pipeline.store.current import transform_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import observations_of
 from schemas.observations import WITHOUT_LABELS
 from tests.accuracy.days import SHARED
-from tests.benchmarks.studies.metrics import LIMITS_DEG, transform_of
+from tests.benchmarks.studies.metrics import LIMITS_DEG
 from tests.makers.calibrated_days import perturbed, records_of_rows
 from tests.makers.stages import ingest_day, perceive_day
 

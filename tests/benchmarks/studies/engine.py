@@ -27,12 +27,13 @@ from pipeline.rig.day_prior import read_prior
 from pipeline.rig.estimates import Prior
 from pipeline.rig.se3 import exp_so3, from_rotation_translation
 from pipeline.rig.targets import loop_errors
+from pipeline.store.current import transform_of
 from pipeline.store.partitions import Partition
 from schemas.calibrations import PAIRS
 from tests.benchmarks.studies.commits import commit_now, is_accepted
 from tests.benchmarks.studies.days import DATE, VEHICLE, Day, DaySpec, generated_day
 from tests.benchmarks.studies.looks import look
-from tests.benchmarks.studies.metrics import measure, mounting_error, transform_of
+from tests.benchmarks.studies.metrics import measure, mounting_error
 from tests.makers.calibrated_days import perturbed, records_of_rows
 
 __all__ = ["RESULTS", "Run", "calibrate_once", "run_study"]

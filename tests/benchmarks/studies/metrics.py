@@ -10,12 +10,11 @@ from jaxtyping import Float
 
 from pipeline.rig.changes import change_between, change_covariance
 from pipeline.rig.estimates import Prior
-from pipeline.rig.se3 import from_quaternion
 from pipeline.rig.targets import errors_at_targets
-from pipeline.store.current import targets_of
+from pipeline.store.current import targets_of, transform_of
 from schemas.calibrations import CalibrationRecord
 
-__all__ = ["LIMITS_DEG", "inside_share", "measure", "mounting_error", "rms", "transform_of", "within"]
+__all__ = ["LIMITS_DEG", "inside_share", "measure", "mounting_error", "rms", "within"]
 
 # The issue's limits for an accepted result, and the axes of the parent frame that turn azimuth and elevation.
 LIMITS_DEG = {"camera_lidar": 0.2, "camera_radar": 0.4, "lidar_radar": 0.4}
@@ -73,16 +72,6 @@ def mounting_error(record: CalibrationRecord, T_mounted: Float[np.ndarray, "4 4"
     if T is None or not record.pair.endswith("radar"):
         return {}
     return {"mounting_el_deg": _number(np.degrees(errors_at_targets(record.pair, T, T_mounted)[1]))}
-
-
-def transform_of(record: CalibrationRecord) -> Float[np.ndarray, "4 4"] | None:
-    """T_parent_child of a record; None where it was refused."""
-    if record.qw is None:
-        return None
-    return from_quaternion(
-        np.array([record.qw, record.qx, record.qy, record.qz], np.float64),
-        np.array([record.tx_m, record.ty_m, record.tz_m], np.float64),
-    )
 
 
 def within(pair: str, measured: Mapping[str, Any], *, claimed: bool = False) -> bool:
