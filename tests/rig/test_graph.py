@@ -1,8 +1,11 @@
-"""The rig as a graph: names, ends, ways and cycles."""
+"""The rig as a graph: names, ends, ways and cycles; transforms between any two sensors and their covariances."""
 
+import numpy as np
 import pytest
 
+from pipeline.rig.extrinsics import Extrinsics
 from pipeline.rig.graph import BASE, Edge, RigGraph, Sensor, edge_between
+from pipeline.rig.se3 import exp_se3, inverse, log_se3
 
 TOP, SIDE = Sensor("top", "lidar"), Sensor("side", "lidar")
 FRONT, REAR = Sensor("front", "camera"), Sensor("rear", "camera")
@@ -12,17 +15,6 @@ CORNER = Sensor("corner", "radar")
 def rig(*pairs):
     sensors = (TOP, SIDE, FRONT, REAR, CORNER, BASE)
     return RigGraph(sensors, tuple(edge_between(a, b) for a, b in pairs), TOP)
-
-
-@pytest.mark.parametrize(("a", "b"), [(FRONT, REAR), (TOP, TOP)])
-def test_what_shares_nothing_is_no_edge(a, b):
-    with pytest.raises(ValueError, match=r"joins two sensors|cannot be calibrated"):
-        edge_between(a, b)
-
-
-def test_an_edge_in_the_wrong_order_is_refused():
-    with pytest.raises(ValueError, match="cannot be calibrated"):
-        Edge(TOP, FRONT)
 
 
 def test_only_edges_on_a_cycle_are_checked_by_others():
@@ -37,7 +29,10 @@ def test_only_edges_on_a_cycle_are_checked_by_others():
     assert rig((FRONT, TOP), (TOP, CORNER)).cycles() == ()
 
 
-def test_a_rig_that_contradicts_itself_is_refused():
+def test_an_edge_of_what_shares_nothing_and_a_rig_that_contradicts_itself_are_refused():
+    for make, a, b in ((edge_between, FRONT, REAR), (edge_between, TOP, TOP), (Edge, TOP, FRONT)):
+        with pytest.raises(ValueError, match=r"joins two sensors|cannot be calibrated"):
+            make(a, b)
     with pytest.raises(ValueError, match="two sensors are called top"):
         RigGraph((TOP, Sensor("top", "radar")), (), TOP)
     with pytest.raises(ValueError, match="no sensor of the rig"):
@@ -52,3 +47,40 @@ def test_components_begin_with_the_references():
     graph = rig((FRONT, TOP), (CORNER, BASE))
     names = [[s.name for s in c] for c in graph.components()]
     assert names == [["top", "front"], ["side"], ["rear"], ["corner", "base"]]
+
+
+NAMES = ("front", "corner")
+
+
+@pytest.fixture
+def poses():
+    rng = np.random.default_rng(3)
+    T = {"top": np.eye(4)} | {n: exp_se3(rng.normal(0, 0.7, 6)) for n in NAMES}
+    root = rng.normal(0, 0.01, (12, 12))
+    return Extrinsics(Sensor("top", "lidar"), T, NAMES, root @ root.T, 0.25 * root @ root.T)
+
+
+def moved(poses, x):
+    T = {n: exp_se3(x[6 * k : 6 * k + 6]) @ poses.T[n] for k, n in enumerate(poses.order)}
+    return inverse(T.get("front", np.eye(4))) @ T["corner"], inverse(T["front"])
+
+
+def test_the_jacobian_between_two_sensors_is_that_of_finite_differences(poses):
+    for a, b, which in (("front", "corner", 0), ("front", "top", 1)):
+        J, step = poses.jacobian_between(a, b), 1e-6
+        for k in range(12):
+            x = step * (np.arange(12) == k)
+            plus, minus = (log_se3(moved(poses, s)[which] @ inverse(poses.between(a, b))) for s in (x, -x))
+            np.testing.assert_allclose((plus - minus) / (2 * step), J[:, k], atol=1e-7)
+
+
+def test_a_covariance_between_two_sensors_uses_what_they_share(poses):
+    J = poses.jacobian_between("front", "corner")
+    np.testing.assert_allclose(poses.covariance_between("front", "corner"), J @ poses.covariance @ J.T)
+    quarter = poses.covariance_between("front", "corner", common=True)
+    np.testing.assert_allclose(quarter, 0.25 * poses.covariance_between("front", "corner"))
+
+
+def test_a_sensor_against_the_reference_has_its_own_rows(poses):
+    np.testing.assert_allclose(poses.covariance_between("top", "front"), poses.covariance[:6, :6])
+    np.testing.assert_array_equal(poses.between("top", "corner"), poses.T["corner"])

@@ -1,3 +1,8 @@
+"""Laws of SE(3), covariances against Monte Carlo, spherical coordinates, and static transforms along a tree."""
+
+from itertools import product
+from types import SimpleNamespace as Space
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,9 +12,20 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from pipeline.rig import se3
+from pipeline.rig.changes import change_between, change_covariance
+from pipeline.rig.se3 import exp_se3, inverse, to_quaternion
+from pipeline.rig.spherical import (
+    camera_direction_angles,
+    from_spherical,
+    spherical_jacobian,
+    to_spherical,
+    wrap_angle,
+)
+from pipeline.rig.transform_tree import TransformTree
 
 finite = st.floats(-3.0, 3.0)
 batches = st.sampled_from([(), (1,), (4,), (2, 3), (0,)])
+
 # Angles where series, quaternion branches and the wrap at pi can go wrong.
 angles = st.one_of(
     st.floats(0.0, np.pi - 1e-3),
@@ -98,9 +114,8 @@ def whitened(C, C_expected):
     return L @ C @ L.T
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_composed_covariances_agree_with_monte_carlo(seed):
-    rng = np.random.default_rng(seed)
+def test_composed_covariances_agree_with_monte_carlo():
+    rng = np.random.default_rng(0)
     T_a_b, T_b_c = se3.exp_se3(rng.normal(size=6) * [1, 1, 1, 2, 2, 2]), se3.exp_se3(rng.normal(size=6))
     cov_a_b, cov_b_c = covariance(rng, 0.01, 0.02), covariance(rng, 0.02, 0.01)
     n = 40_000  # spread of an estimated variance: sqrt(2/n) = 0.7 %
@@ -127,10 +142,78 @@ def test_left_perturbation_of_a_point_has_the_derivative_that_conventions_state(
 
 
 def test_covariance_of_a_change_agrees_with_monte_carlo():
-    from pipeline.rig.changes import change_between, change_covariance
-
     rng = np.random.default_rng(4)
     T, C = se3.exp_se3(rng.normal(size=6)), covariance(rng, 0.01, 0.01)
     samples = se3.exp_se3(rng.multivariate_normal(np.zeros(6), C, 20_000)) @ T
     found = np.cov(np.array([change_between(T, S) for S in samples]).T)
     np.testing.assert_allclose(whitened(found, change_covariance(T, C)), np.eye(6), atol=0.06)
+
+
+shapes = st.sampled_from([(3,), (4, 3), (2, 3, 3), (0, 3)])
+points = shapes.flatmap(lambda s: hnp.arrays(np.float64, s, elements=st.floats(-200, 200)))
+
+
+@given(points)
+def test_spherical_round_trip(xyz):
+    np.testing.assert_allclose(from_spherical(to_spherical(xyz)), xyz, atol=1e-9)
+
+
+def test_azimuth_grows_to_the_left_and_elevation_upwards():
+    left, up, back = to_spherical(np.array([[1.0, 1, 0], [1, 0, 1], [-2, 0, 0]]))
+    np.testing.assert_allclose(left, [np.pi / 4, 0, np.sqrt(2)])
+    np.testing.assert_allclose(up, [0, np.pi / 4, np.sqrt(2)])
+    np.testing.assert_allclose(back, [np.pi, 0, 2])
+    np.testing.assert_array_equal(to_spherical(np.zeros(3)), np.zeros(3))
+
+
+def test_camera_angles_have_the_signs_of_the_other_sensors():
+    # optical frame: x right, y down, z forward
+    left, up = camera_direction_angles(np.array([[-1.0, 0, 1], [0, -1, 1]]))
+    np.testing.assert_allclose(left, [np.pi / 4, 0])
+    np.testing.assert_allclose(up, [0, np.pi / 4])
+
+
+def test_spherical_jacobian_agrees_with_central_differences():
+    xyz = np.random.default_rng(0).uniform(-30, 30, (60, 3))
+    xyz = xyz[np.hypot(xyz[:, 0], xyz[:, 1]) > 1]
+    J, step = spherical_jacobian(xyz), 1e-5
+    for i in range(3):
+        d = np.eye(3)[i] * step
+        difference = to_spherical(xyz + d) - to_spherical(xyz - d)
+        difference[:, 0] = wrap_angle(difference[:, 0])
+        np.testing.assert_allclose(J[..., i], difference / (2 * step), atol=1e-6)
+
+
+def test_transforms_are_found_along_the_tree_in_both_directions():
+    rng = np.random.default_rng(1)
+    parents = {
+        "base": "map",
+        "kit": "base",
+        "camera": "kit",
+        "lidar": "kit",
+        "radar": "base",
+        "island": "alone",
+    }
+    T_map = {"map": np.eye(4), "alone": np.eye(4)}
+    tree = TransformTree()
+    for child, parent in parents.items():
+        T = exp_se3(rng.normal(size=6))
+        T_map[child] = T_map[parent] @ T
+        assert tree.add(f"/{parent}", child, tuple(to_quaternion(T)), tuple(T[:3, 3]))
+    for a, b in product(("map", "base", "kit", "camera", "lidar", "radar"), repeat=2):
+        np.testing.assert_allclose(tree.lookup(a, b), inverse(T_map[a]) @ T_map[b], atol=1e-12)
+    assert tree.lookup("camera", "island") is None
+    assert tree.lookup("camera", "nowhere") is None
+    assert tree.lookup("", "camera") is None
+
+
+@pytest.mark.parametrize(
+    "q", [(0.0, 0.0, 0.0, 0.0), (np.nan, 0.0, 0.0, 1.0), (2.0, 0.0, 0.0, 0.0), (0.5, 0.0, 0.0, 0.0)]
+)
+def test_what_is_no_rotation_is_not_taken(q):
+    tree = TransformTree()
+    assert not tree.add("a", "b", q, (0.0, 0.0, 0.0))
+    assert tree.lookup("a", "b") is None
+    moved = Space(rotation=Space(**dict(zip("wxyz", q, strict=True))), translation=Space(x=0.0, y=0.0, z=0.0))
+    entry = Space(header=Space(frame_id="a"), child_frame_id="b", transform=moved)
+    assert tree.add_message(Space(transforms=[entry])) == 1

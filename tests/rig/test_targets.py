@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.rig.se3 import exp_so3, inverse, transform_points
+from pipeline.rig.changes import changed
+from pipeline.rig.se3 import inverse, transform_points
 from pipeline.rig.targets import (
     DEFAULT_TARGETS,
     Picks,
@@ -26,9 +27,7 @@ TRUTH = {
 
 
 def turned(T, axis, angle_deg):
-    T = T.copy()
-    T[:3, :3] = exp_so3(np.radians(angle_deg) * np.eye(3)[axis]) @ T[:3, :3]
-    return T
+    return changed(T, np.radians(angle_deg) * np.eye(6)[axis])
 
 
 @pytest.mark.parametrize(
