@@ -2,22 +2,19 @@
 
 import json
 
-import numpy as np
 import pytest
 
 from jobs.calibrate import calibrate, parse_pair
 from jobs.evaluate import evaluate
 from jobs.status import status
 from pipeline.core.errors import ConfigError
-from pipeline.rig.se3 import inverse, transform_points
-from pipeline.rig.targets import DEFAULT_TARGETS
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
 from schemas.outcomes import OUTCOMES, OutcomeRow
 from schemas.words import day_word
 from tests.makers.fleet_files import fleet_toml
 from tests.makers.lakes import write_observations
-from tests.makers.solve_scenes import CAMERA, T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
+from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
 
 FLEET = fleet_toml(
     "v", sections="[select]\nframes = 12\n[solve]\npaper_population = 12\npaper_generations = 5\n"
@@ -89,31 +86,6 @@ def test_evaluate_compares_with_a_folder_or_a_file_of_truth_and_writes_the_table
     assert "| pairwise-optimisation | all | 1 |" in out.read_text()
     file = workplace / "truth" / "v" / "2024-05-06.json"
     assert evaluate(lake=str(workplace / "lake"), truth=file) == 0
-
-
-def test_evaluate_reads_picked_reflectors(workplace):
-    run(workplace)
-    pixels = CAMERA.project(transform_points(T_CAMERA_LIDAR, DEFAULT_TARGETS))[0]
-    radar = transform_points(inverse(T_LIDAR_RADAR), DEFAULT_TARGETS)
-    columns = zip(pixels, DEFAULT_TARGETS, radar, strict=True)
-    content = {
-        "camera": {"model": "plumb_bob", "K": CAMERA.K.tolist(), "D": [], "width_px": 640, "height_px": 320},
-        "targets": [{"pixel": [*p], "lidar_m": [*q], "radar_m": [*r]} for p, q, r in columns],
-    }
-    path = workplace / "picks.json"
-    path.write_text(json.dumps(content))
-    by_truth, by_picks = workplace / "a.md", workplace / "b.md"
-    evaluate(lake=str(workplace / "lake"), truth=workplace / "truth", out=by_truth)
-    assert evaluate(lake=str(workplace / "lake"), reflectors=path, out=by_picks) == 0
-    rows = [
-        next(line for line in f.read_text().splitlines() if "| pairwise-opt" in line)
-        for f in (by_truth, by_picks)
-    ]
-    numbers = [np.array([float(v) for v in row.split("|")[4].split("/")]) for row in rows]
-    np.testing.assert_allclose(*numbers, atol=0.05)
-    path.write_text(json.dumps(content | {"targets": [{"pixel": [1, 2]}]}))
-    with pytest.raises(ConfigError, match="not a readable reflector file"):
-        evaluate(lake=str(workplace / "lake"), reflectors=path)
 
 
 def test_evaluate_wants_exactly_one_kind_of_truth(workplace):

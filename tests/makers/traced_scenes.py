@@ -8,6 +8,7 @@ the other, the middle one at the image's time.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import cv2
 import numpy as np
@@ -30,7 +31,7 @@ GREY = np.full(256, 120, np.uint8)
 GREY[[ROAD, TERRAIN, VEGETATION, POLE, SKY, CAR]] = 80, 105, 50, 150, 230, 30
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Rig:
     """A camera at label size times two, and a lidar's beams."""
 
@@ -62,15 +63,23 @@ def traced_day(
     dt_s: float = 0.0,
     *,
     reflective: bool = True,
-    gaps_s: Sequence[float] | None = None,
+    gaps_s: Sequence[float] = (),
     readout_s: float = 0.0,
 ) -> list[Observation]:
-    """Observations of independent scenes, six frames to a drive, every third standing; gaps of images to sweeps."""
+    """Observations of independent scenes, six frames to a drive, every third standing; gaps of images to sweeps.
+
+    Traced once a process.
+    """
+    return list(_traced(rig, frames, seed, dt_s, reflective, tuple(gaps_s) or (0.0,) * frames, readout_s))
+
+
+@cache
+def _traced(rig, frames, seed, dt_s, reflective, gaps_s, readout_s):
     rng = np.random.default_rng(seed)
     speeds = [0.0 if i % 3 == 0 else float(rng.uniform(5, 25)) for i in range(frames)]
     return [
         traced_frame(rig, rng, i, speeds[i], dt_s, gap_s, reflective=reflective, readout_s=readout_s)
-        for i, gap_s in enumerate(gaps_s or [0.0] * frames)
+        for i, gap_s in enumerate(gaps_s)
     ]
 
 

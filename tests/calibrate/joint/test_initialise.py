@@ -1,4 +1,4 @@
-"""The basin: each term beyond chance, the evidence that an end leads, the search range as a hard limit."""
+"""The basin: each term beyond chance, the evidence that an end leads, the search range as a hard limit; refinement."""
 
 from dataclasses import replace
 
@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.joint.camera_lidar import initialise
+from pipeline.calibrate.joint.camera_lidar import refine as module
 from pipeline.calibrate.joint.camera_lidar.initialise import Basin, difference, find_basin
-from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, Scored, refine
+from pipeline.calibrate.joint.camera_lidar.profiles import far_time_offset
+from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, Scored, prior_value, refine, scales
 from pipeline.calibrate.joint.camera_lidar.rotation_search import (
     TERMS,
     Evidence,
@@ -24,19 +26,20 @@ from pipeline.objective.camera_lidar.points import Points, lidar_velocities
 from pipeline.objective.camera_lidar.score import Alignments, KernelSettings, prepare_terms
 from pipeline.rig.cameras import camera_of
 from pipeline.rig.changes import change_between
-from pipeline.rig.estimates import Prior
 from pipeline.rig.se3 import (
     exp_so3,
     from_rotation_translation,
     inverse,
     log_so3,
-    perturb_exactly,
+    rotation_angle_rad,
     transform_points,
 )
+from tests.makers.camera_lidar import prior_off_by
 from tests.makers.traced_scenes import DENSE, T_TRUE, traced_day
 
 REACH_RAD = np.radians(8.0)
 _BRIGHT = 600  # pixels of each image on which markings are put
+KERNEL = KernelSettings.wide(*SCHEDULE.kernels[0])
 KERNEL_DEG = 0.8  # at which ends are compared: 4 px of 300 px/rad
 
 
@@ -52,16 +55,10 @@ def terms(day):
 
 
 def searched(terms, prior, limits=None):
-    kernel = KernelSettings.wide(*SCHEDULE.kernels[0])
     config = SolveConfig()
     limits = limits or search_range(prior.sigmas, config)
-    thin = Scored(terms.sharp(MAX_GAP_PX), kernel, prior, config, limits)
+    thin = Scored(terms.sharp(MAX_GAP_PX), KERNEL, prior, config, limits)
     return find_basin(terms, thin, np.random.default_rng(0), np.arange(terms.frames))
-
-
-def off_by(degrees, metres, seed):
-    T = perturb_exactly(T_TRUE, np.radians(degrees), metres, np.random.default_rng(seed))
-    return Prior(T, np.eye(4), np.radians(2.0), 0.05)
 
 
 def bright_on_bright(terms, T):
@@ -84,11 +81,11 @@ def turned(T, turn_rad):
 
 
 def degrees_off(T):
-    return np.degrees(np.linalg.norm(log_so3(T[:3, :3] @ T_TRUE[:3, :3].T)))
+    return np.degrees(rotation_angle_rad(T @ inverse(T_TRUE)))
 
 
 def test_a_grid_of_rotations_has_the_truth_among_its_maxima(terms):
-    off, rng = off_by(7.0, 0.05, 1), np.random.default_rng(0)
+    off, rng = prior_off_by(7.0, 0.05, 1), np.random.default_rng(0)
     wrong = wrong_poses(off, REACH_RAD, 0.05, rng)
     found = grid_maxima(terms.sharp(MAX_GAP_PX), off, REACH_RAD, wrong, rng)
     assert [name for name, _ in found][1:4] == list(TERMS)  # each term's own best is among them
@@ -97,55 +94,45 @@ def test_a_grid_of_rotations_has_the_truth_among_its_maxima(terms):
 
 
 def test_the_basin_is_found_from_five_degrees_and_leads_over_all_other_ends(terms):
-    for seed in (1, 2):
-        basin = searched(terms, off_by(5.0, 0.05, seed))
-        assert degrees_off(basin.state.T_camera_lidar) < KERNEL_DEG
-        assert not basin.doubt
-        assert sum(basin.evidence) > basin.needed
-        assert basin.rival_z > CLEARLY
+    basin = searched(terms, prior_off_by(5.0, 0.05, 1))
+    assert degrees_off(basin.state.T_camera_lidar) < KERNEL_DEG
+    assert not basin.doubt
+    assert sum(basin.evidence) > basin.needed
+    assert basin.rival_z > CLEARLY
 
 
 def test_bright_stretches_of_road_at_a_wrong_roll_do_not_outvote_the_edges(terms):
     """As on a day of another simulator: markings know nothing of the truth, and score thousands 7 deg off."""
-    prior = off_by(5.0, 0.05, 1)
+    prior = prior_off_by(5.0, 0.05, 1)
     elsewhere = turned(T_TRUE, np.radians([0.0, 0.0, 7.0]))
     misled = replace(terms, markings=bright_on_bright(terms, elsewhere))
-    kernel = KernelSettings.wide(*SCHEDULE.kernels[0])
     wrong_at, true_at = AlignmentState(elsewhere).alone, AlignmentState(T_TRUE).alone
-    ahead = [(misled.score(at, kernel)).sum() for at in (wrong_at, true_at)]
+    ahead = [(misled.score(at, KERNEL)).sum() for at in (wrong_at, true_at)]
     assert ahead[0] > ahead[1]  # by the sum of the scores the wrong pose wins
     basin = searched(misled, prior)
     assert degrees_off(basin.state.T_camera_lidar) < KERNEL_DEG
 
 
 def test_a_truth_out_of_reach_is_not_found(terms):
-    for seed in (1, 2, 3):
-        prior = replace(off_by(1.0, 0.02, seed), T_camera_lidar=turned(T_TRUE, np.radians([9.0, 25.0, 0.0])))
-        basin = searched(terms, prior)
-        assert degrees_off(basin.state.T_camera_lidar) > 5.0
-        assert basin.doubt
-
-
-def test_an_end_that_the_frames_do_not_tell_from_another_is_doubted(terms, monkeypatch):
-    monkeypatch.setattr(initialise, "CLEARLY", 1e6)
-    far = turned(T_TRUE, np.radians([4.0, -4.0, 0.0]))
-    monkeypatch.setattr(initialise, "grid_maxima", lambda *_: [("edges", far)])
-    assert "fits the frames as well" in searched(terms, off_by(1.0, 0.02, 5)).doubt
+    prior = replace(prior_off_by(1.0, 0.02, 1), T_camera_lidar=turned(T_TRUE, np.radians([9.0, 25.0, 0.0])))
+    basin = searched(terms, prior)
+    assert degrees_off(basin.state.T_camera_lidar) > 5.0
+    assert basin.doubt
 
 
 @pytest.mark.parametrize(("frames", "said"), [(10, "markings contradict"), (1, "")])
 def test_a_term_contradicts_an_end_only_where_its_own_lead_holds_over_the_frames(terms, frames, said):
     """A lidar that is blind to paint has its brightest places somewhere too: in one frame, and so in their sum."""
-    prior, kernel = off_by(1.0, 0.02, 5), KernelSettings.wide(*SCHEDULE.kernels[0])
+    prior = prior_off_by(1.0, 0.02, 5)
     wrong = wrong_poses(prior, REACH_RAD, 0.05, np.random.default_rng(0))
     elsewhere = turned(T_TRUE, np.radians([0.0, 0.0, 7.0]))
     bright = bright_on_bright(terms, elsewhere)
     misled = replace(terms, markings=bright.chosen(np.arange(len(bright.xyz_m)) < frames * _BRIGHT))
-    evidence = Evidence(misled, kernel, ((40.0, 30.0), (-40.0, -30.0))).measured(wrong)
-    scored = Scored(misled, kernel, prior, SolveConfig())
+    evidence = Evidence(misled, KERNEL, ((40.0, 30.0), (-40.0, -30.0))).measured(wrong)
+    scored = Scored(misled, KERNEL, prior, SolveConfig())
     search = initialise._Search(scored, evidence, np.arange(terms.frames))
     best, rival = (search._end("edges", AlignmentState(T)) for T in (T_TRUE, elsewhere))
-    basin = Basin(best.state, kernel, "edges", 2, (40.0, 0.0, 0.0), 13.0, 0.1, np.inf)
+    basin = Basin(best.state, KERNEL, "edges", 2, (40.0, 0.0, 0.0), 13.0, 0.1, np.inf)
     ahead = replace(rival, evidence=np.array([0.0, 30.0, 0.0]))
     doubt = search._doubt(basin, [ahead], is_last=True)
     assert doubt.startswith(said)
@@ -156,10 +143,10 @@ def test_a_term_contradicts_an_end_only_where_its_own_lead_holds_over_the_frames
 
 
 def test_a_term_without_data_weighs_nothing(terms):
-    prior, rng = off_by(1.0, 0.02, 5), np.random.default_rng(0)
+    prior, rng = prior_off_by(1.0, 0.02, 5), np.random.default_rng(0)
     wrong = wrong_poses(prior, REACH_RAD, 0.05, rng)
     blank = terms.of_kinds(edges=True, markings=False)
-    evidence = Evidence(blank, KernelSettings.wide(*SCHEDULE.kernels[0]), ((40.0, 30.0),)).measured(wrong)
+    evidence = Evidence(blank, KERNEL, ((40.0, 30.0),)).measured(wrong)
     assert evidence.weighted().marking_weight == 0.0
     assert evidence.weighted().edge_weight == 1.0
     assert evidence.of(wrong)[:, 1].tolist() == [0.0] * len(wrong)
@@ -173,7 +160,7 @@ def test_the_best_of_many_chance_poses_shows_as_much_as_drawn_ones():
 
 
 def test_the_state_of_an_earlier_day_is_looked_at_where_the_day_does_not_decide(terms, monkeypatch):
-    prior = replace(off_by(5.0, 0.05, 6), T_camera_lidar_before=T_TRUE)
+    prior = replace(prior_off_by(5.0, 0.05, 6), T_camera_lidar_before=T_TRUE)
     decided = searched(terms, prior)
     alone = searched(terms, replace(prior, T_camera_lidar_before=None))
     assert np.array_equal(decided.state.T_camera_lidar, alone.state.T_camera_lidar)  # it changes no bit of it
@@ -185,10 +172,9 @@ def test_the_state_of_an_earlier_day_is_looked_at_where_the_day_does_not_decide(
 
 
 def test_no_climb_leaves_the_search_range(terms):
-    prior = off_by(4.0, 0.05, 7)
+    prior = prior_off_by(4.0, 0.05, 7)
     limits = SearchRange(np.radians(2.0), 0.03)
-    kernel = KernelSettings.wide(*SCHEDULE.kernels[0])
-    scored = Scored(terms.sharp(MAX_GAP_PX), kernel, prior, SolveConfig(), limits)
+    scored = Scored(terms.sharp(MAX_GAP_PX), KERNEL, prior, SolveConfig(), limits)
     state = refine(scored, AlignmentState(prior.T_camera_lidar), steps=12)
     turn = log_so3(state.T_camera_lidar[:3, :3] @ prior.T_camera_lidar[:3, :3].T)
     assert np.abs(turn).max() < limits.rotation_rad + 1e-9
@@ -199,7 +185,7 @@ def test_no_climb_leaves_the_search_range(terms):
 
 
 def test_a_state_within_the_range_is_not_touched():
-    prior, limits = off_by(1.0, 0.02, 8), SearchRange(np.radians(6.0), 0.3)
+    prior, limits = prior_off_by(1.0, 0.02, 8), SearchRange(np.radians(6.0), 0.3)
     state = AlignmentState(T_TRUE, 0.01)
     assert state.within(prior, limits) is state
     far = AlignmentState(turned(prior.T_camera_lidar, np.radians([10.0, 1.0, 0.0])), 0.01)
@@ -219,29 +205,11 @@ def test_edges_in_view_are_those_that_the_camera_model_projects_into_the_image(d
     assert 0 < inside.sum() < len(inside)
 
 
-def test_an_end_that_still_pays_a_prior_on_its_way_is_optimised_before_it_is_rejected(terms):
-    """From 15 deg away the right end was given up for a focal length that its climb had not yet brought back."""
-    prior, kernel = off_by(1.0, 0.02, 5), KernelSettings.wide(*SCHEDULE.kernels[0])
-    wrong = wrong_poses(prior, REACH_RAD, 0.05, np.random.default_rng(0))
-    evidence = Evidence(terms, kernel, ((40.0, 30.0), (-40.0, -30.0))).measured(wrong)
-    search = initialise._Search(
-        Scored(terms, kernel, prior, SolveConfig()), evidence, np.arange(terms.frames)
-    )
-    T_near = turned(T_TRUE, np.radians([0.0, 0.4, 0.0]))
-    on_its_way = search._end("edges", AlignmentState(T_near, focal=1.01))
-    elsewhere = turned(T_TRUE, np.radians([0.0, 0.0, 7.0]))
-    ahead = search._end("markings", AlignmentState(elsewhere))
-    ahead = replace(ahead, prior=on_its_way.total - ahead.evidence.sum() + 20.0)
-    arrived = search._arrived(on_its_way, ahead)
-    assert arrived.is_finished
-    assert arrived.total > on_its_way.total + 1.0
-    assert degrees_off(arrived.state.T_camera_lidar) < 0.2
-    assert search._finished(arrived) is arrived
-
-
 def test_a_rival_near_by_is_asked_again_by_a_sharper_kernel(terms):
-    basin = replace(searched(terms, off_by(1.0, 0.02, 5)), rival_z=1.0, doubt="")
-    scored = Scored(terms, KernelSettings.wide(*SCHEDULE.kernels[-1]), off_by(1.0, 0.02, 5), SolveConfig())
+    basin = replace(searched(terms, prior_off_by(1.0, 0.02, 5)), rival_z=1.0, doubt="")
+    scored = Scored(
+        terms, KernelSettings.wide(*SCHEDULE.kernels[-1]), prior_off_by(1.0, 0.02, 5), SolveConfig()
+    )
     best, same, other = (
         AlignmentState(turned(T_TRUE, np.radians([angle, 0.0, 0.0]))) for angle in (0.0, 0.1, 1.0)
     )
@@ -249,3 +217,34 @@ def test_a_rival_near_by_is_asked_again_by_a_sharper_kernel(terms):
     assert not initialise.settled(basin, scored, best, other).doubt  # the frames reject it
     assert "fits the frames as well" in initialise.settled(basin, scored, other, best).doubt
     assert initialise.settled(replace(basin, doubt="chance"), scored, best, same).doubt == "chance"
+
+
+@pytest.fixture(scope="module")
+def scored(terms):
+    return Scored(terms, KernelSettings.wide(1.5, 2), prior_off_by(0.0, 0.0, 0), SolveConfig())
+
+
+def value(scored, state):
+    score = float(scored.terms.score(state.alone, scored.kernel).sum())
+    return score + float(prior_value(state.alone, scored.prior, scored.config)[0])
+
+
+@pytest.mark.parametrize("radius", [1.8, 8.0])
+def test_a_refinement_never_ends_lower_than_it_began_however_wide_its_surface(scored, radius, monkeypatch):
+    monkeypatch.setattr(module, "_SURFACE_SIZE", radius)
+    rng = np.random.default_rng(1)
+    scale = scales(scored.terms, scored.kernel)
+    for steps in (1, 5):
+        for _ in range(4):
+            start = AlignmentState(T_TRUE).stepped(rng.normal(size=8) * scale)
+            end = refine(scored, start, steps=steps)
+            assert value(scored, end) >= value(scored, start)
+
+
+def test_a_camera_whose_clock_is_half_a_second_off_is_seen_from_where_nothing_matches():
+    day = traced_day(DENSE, 12, seed=5, dt_s=0.02)
+    terms = prepare_terms(day, T_TRUE, lidar_velocities(day, np.eye(4)), reach_rad=np.radians(8.0))
+    slid = AlignmentState(T_TRUE, dt_s=0.52)
+    found_s, z = far_time_offset(terms, slid, KernelSettings.wide(1.5, 2), np.random.default_rng(0))
+    assert abs(found_s - 0.02) < 0.04
+    assert z > 2

@@ -1,22 +1,24 @@
-"""Method `joint`: three pairs that rest on nothing of each other, their loop, pairs that cannot be solved."""
+"""Method `joint`: three pairs that rest on nothing of each other, their loop, and terms that are left out."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from pipeline.calibrate.joint.camera_lidar.estimate import Aligned, AlignmentState
 from pipeline.calibrate.joint.camera_lidar.initialise import Basin
 from pipeline.calibrate.joint.camera_lidar.intrinsics import DayIntrinsics
 from pipeline.calibrate.joint.solve import solve_joint
-from pipeline.core.config import SolveConfig
+from pipeline.core.config import TERMS, SolveConfig
 from pipeline.objective.camera_lidar.kernel_settings import KernelSettings
 from pipeline.objective.ego_motion import shown_heading
 from pipeline.rig.estimates import PairEstimate, Prior
 from pipeline.rig.se3 import exp_se3, log_se3, perturb_exactly
 from schemas.calibrations import PAIRS
 from tests.makers.radar_scenes import T_LIDAR_RADAR, street_day
-from tests.makers.solve_scenes import T_CAMERA_LIDAR
+from tests.makers.solve_scenes import PRIORS, T_CAMERA_LIDAR, make_day
 
 PRIOR = Prior(T_CAMERA_LIDAR, T_LIDAR_RADAR, np.radians(2.0), 0.05)
 SMALL = np.diag([np.radians(0.1) ** 2] * 3 + [0.02**2] * 3)
@@ -83,18 +85,6 @@ def solved_with_camera(monkeypatch, day, doubt, prior=PRIOR):
     return solve_joint(dict.fromkeys(PAIRS, day), prior, SolveConfig(), seed=0), headings
 
 
-@pytest.mark.slow
-def test_a_basin_in_doubt_disproves_its_own_pair_alone(monkeypatch):
-    day = street_day(12)
-    found, _ = solved_with_camera(monkeypatch, day, "")
-    assert not found.pairs["camera_lidar"].disproved
-    lost, _ = solved_with_camera(monkeypatch, day, "another end, 2.6 deg away")
-    assert "2.6 deg away" in lost.pairs["camera_lidar"].disproved
-    for pair in ("lidar_radar", "camera_radar"):
-        assert not lost.pairs[pair].disproved
-        assert np.array_equal(lost.pairs[pair].T, found.pairs[pair].T)  # nothing of the camera's is in them
-
-
 def test_boxes_count_once_and_the_radar_s_turn_gives_the_heading(monkeypatch):
     found, headings = solved_with_camera(monkeypatch, street_day(12), "")
     assert "boxes" not in found.pairs["lidar_radar"].diagnostics
@@ -116,3 +106,41 @@ def test_an_untriggered_camera_lidar_stays_at_the_prior_and_the_radar_is_found_w
     error = log_se3(solution.pairs["lidar_radar"].T @ np.linalg.inv(T_LIDAR_RADAR))
     assert abs(error[2]) < np.radians(0.15)
     assert told[-1][0] == told[-1][1]
+
+
+@cache
+def solve_without(*terms: str):
+    config = SolveConfig(terms=tuple(t for t in TERMS if t not in terms))
+    prior = replace(PRIOR, T_lidar_radar=PRIORS["lidar_radar"])
+    return solve_joint(dict.fromkeys(PAIRS, make_day(10, seed=3)), prior, config, seed=1)
+
+
+@pytest.mark.parametrize(
+    "terms", [("edges", "reflectivity"), ("static", "moving"), ("edges", "edges"), ("edges", "colour"), ()]
+)
+def test_a_choice_of_terms_that_solves_nothing_or_names_one_twice_is_refused(terms):
+    with pytest.raises(ValidationError):
+        SolveConfig(terms=terms)
+
+
+def test_without_time_offsets_none_is_estimated():
+    pairs = solve_without("time_offsets").pairs
+    for pair in ("camera_lidar", "lidar_radar"):
+        # The stamps' constant gaps are +1 and -1 ms.
+        assert abs(pairs[pair].time_offset_s - 1e-3) < 1e-4
+
+
+def test_without_the_position_prior_positions_are_less_sure_and_what_the_day_leaves_open_is_open():
+    kept, free = solve_without(), solve_without("translation_prior")
+    for pair in ("camera_lidar", "lidar_radar"):
+        sigma = [np.sqrt(np.diag(s.pairs[pair].covariance)[3:]) for s in (kept, free)]
+        assert (sigma[1] > sigma[0]).all()
+    assert not free.pairs["camera_lidar"].observable[5]  # along the camera's axis
+    assert sigma[0].max() < 0.06
+
+
+def test_without_static_detections_the_registration_says_nothing():
+    alone = solve_without("static")
+    both = solve_without()
+    sigma = [np.sqrt(s.pairs["lidar_radar"].covariance[2, 2]) for s in (alone, both)]
+    assert sigma[0] > sigma[1]

@@ -1,4 +1,4 @@
-"""Sides of the edges and paint against each other: where they contradict, pitch is held."""
+"""Parts of a camera-lidar day against each other: sides of the edges and paint, halves of the image and its clock."""
 
 from dataclasses import replace
 
@@ -6,13 +6,22 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.joint.camera_lidar import part_turns as parts
+from pipeline.calibrate.joint.camera_lidar.observability import IS_TZ
 from pipeline.calibrate.joint.camera_lidar.part_turns import box_offsets, disagreement
+from pipeline.calibrate.joint.camera_lidar.profiles import (
+    DT,
+    TimeOffsetProfile,
+    left_out_in_time,
+    profile_time_offset,
+)
+from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, Scored
 from pipeline.calibrate.joint.part_turn import PartTurn
 from pipeline.core.config import SolveConfig
+from pipeline.objective.camera_lidar.score import KernelSettings, prepare_terms
 from pipeline.rig.estimates import Prior
-from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse, log_so3, perturb_exactly
+from pipeline.rig.se3 import exp_so3, from_rotation_translation
 from schemas.observations import EDGE_BELOW
-from tests.makers.camera_lidar import estimate_camera_lidar
+from tests.makers.camera_lidar import estimate_camera_lidar, prior_off_by, turn_and_sigma_deg
 from tests.makers.solve_scenes import T_CAMERA_LIDAR, make_day
 from tests.makers.traced_scenes import DENSE, GROUND_M, T_TRUE, traced_day
 
@@ -41,19 +50,13 @@ def with_windows(day, depth_rad=0.02, sills=3, within_m=np.inf):
     return out
 
 
-def solved(day):
-    T = perturb_exactly(T_TRUE, np.radians(0.5), 0.02, np.random.default_rng(0))
-    prior = Prior(T, np.eye(4), float(np.radians(2.0)), 0.05)
-    return estimate_camera_lidar(day, prior, SolveConfig(), np.random.default_rng(0))
-
-
 @pytest.fixture(scope="module")
 def day():
     return traced_day(DENSE, 12, seed=1)
 
 
 def test_cars_with_windows_are_held(day):
-    found = solved(with_windows(day))
+    found = estimate_camera_lidar(with_windows(day), prior_off_by(0.5, 0.02))
     (check,) = found.failed_checks
     assert check.fault == "witnesses_disagree"
     assert "on pitch" in check.sentence
@@ -66,9 +69,9 @@ def test_cars_with_windows_are_held(day):
 @pytest.mark.parametrize(("within_m", "faults"), [(0.0, []), (18.0, ["witnesses_disagree"])])
 def test_windows_in_cars_of_one_kind_only_are_seen_where_no_paint_tells(within_m, faults):
     day = traced_day(DENSE, 12, seed=1, reflective=False)
-    found = solved(with_windows(day, sills=2, within_m=within_m))
+    found = estimate_camera_lidar(with_windows(day, sills=2, within_m=within_m), prior_off_by(0.5, 0.02))
     assert [check.fault for check in found.failed_checks] == faults
-    turn_deg = np.degrees(abs(log_so3((found.T @ inverse(T_TRUE))[:3, :3])[0]))
+    turn_deg = abs(turn_and_sigma_deg(found)[0][0])
     assert (turn_deg > 0.5) == bool(faults)  # the fit follows the sills
     for check in found.failed_checks:
         assert np.degrees(abs(check.error[0])) > 0.8 * turn_deg
@@ -117,3 +120,87 @@ def test_a_part_that_hardly_prefers_its_own_place_does_not_contradict_the_fit(na
     offset, sigma = parts._maximum(turn, score, np.arange(20), np.random.default_rng(0))
     assert np.degrees(offset) == pytest.approx(-2.0)
     assert (sigma < abs(offset) / 3) == is_sure
+
+
+STATE = AlignmentState(T_TRUE)
+SPEED_MPS = 20.0
+PRIOR = Prior(T_TRUE, np.eye(4), float(np.radians(0.2)), 0.05)
+
+
+@pytest.fixture(scope="module")
+def passing():
+    """Scenes that the car passes at one speed, images with their sweeps; none of the objects moves."""
+    day = traced_day(DENSE, 12, seed=2)
+    return prepare_terms(day, T_TRUE, np.array([[SPEED_MPS, 0.0, 0.0]] * len(day)), reach_rad=0.03)
+
+
+@pytest.fixture(scope="module")
+def kernel(passing):
+    return passing.fitted(STATE.alone, KernelSettings.wide(1.5, 2), np.random.default_rng(0))
+
+
+def profile_of(passing, kernel):
+    scored = Scored(passing, kernel, PRIOR, SolveConfig())
+    return profile_time_offset(scored, STATE, IS_TZ, np.arange(passing.frames))
+
+
+def with_traffic(passing, left_m, right_m):
+    """What is seen on either half of the image has moved by so much between its point and the image."""
+    xyz = passing.edges.xyz_m
+    is_left = xyz[:, 1] > 0
+    moved = xyz.copy()
+    moved[:, 0] += np.where(is_left, left_m, right_m)
+    return replace(passing, edges=replace(passing.edges, xyz_m=moved))
+
+
+def unsure_s(profile):
+    return float(np.linalg.norm(left_out_in_time(profile, IS_TZ)[:, DT]))
+
+
+def test_oncoming_cars_on_one_half_of_the_image_make_the_time_offset_unsure_by_what_they_draw_it(
+    passing, kernel
+):
+    assert unsure_s(profile_of(passing, kernel)) < 0.008
+    way_m = 1.0  # of a car that drives towards us, in a twentieth of a second
+    for left_m in (way_m, -way_m):
+        profile = profile_of(with_traffic(passing, left_m, 0.0), kernel)
+        off_s = abs(profile.state.dt_s)
+        assert unsure_s(profile) > 0.5 * max(off_s, 0.5 * way_m / SPEED_MPS)
+        assert np.sqrt(profile.variance_s2) < 0.5 * unsure_s(profile)  # frames do not show it
+
+
+def test_a_time_offset_without_a_half_is_where_its_own_profile_has_it(passing, kernel):
+    mixed = with_traffic(passing, 0.8, 0.0)
+    profile = profile_of(mixed, kernel)
+    rows, whole = left_out_in_time(profile, IS_TZ), profile.state.dt_s
+    is_right = mixed.edges.xyz_m @ T_TRUE[0, :3] + T_TRUE[0, 3] > 0
+    for k, rest in enumerate((~is_right, is_right)):
+        half = replace(mixed, edges=mixed.edges.chosen(rest))
+        said = rows[k, DT] / np.sqrt(1 - 1 / 2)
+        assert said == pytest.approx(profile_of(half, kernel).state.dt_s - whole, abs=0.012)  # a step
+
+
+@pytest.mark.slow
+def test_a_day_of_oncoming_traffic_states_a_time_offset_near_what_is_expected_that_its_sigma_covers():
+    day = []
+    for o in traced_day(DENSE, 12, seed=3):
+        xyz = o.lidar_edge_xyz_m.copy()
+        xyz[xyz[:, 1] > 0, 0] += 1.0
+        day.append(replace(o, ego_speed_mps=SPEED_MPS, lidar_edge_xyz_m=xyz))
+    prior = replace(PRIOR, rotation_sigma_rad=float(np.radians(1.0)))
+    expected, vague = (
+        estimate_camera_lidar(day, prior, SolveConfig(time_offset_sigma_s=s)) for s in (0.05, 0.2)
+    )
+    assert 0.02 < abs(expected.time_offset_s) < 2 * expected.time_offset_sigma_s
+    assert expected.diagnostics["left_out_dt_s"] > 0.5 * abs(expected.time_offset_s)
+    # The less is told by the day, the more counts what is expected: no offset.
+    assert abs(expected.time_offset_s) < 0.95 * abs(vague.time_offset_s)
+
+
+def test_what_is_at_the_prior_stays_there_and_a_profile_without_ends_says_nothing(passing, kernel):
+    profile = profile_of(with_traffic(passing, 0.8, 0.0), kernel)
+    fixed = np.isin(np.arange(8), (1, 5))
+    rows = left_out_in_time(profile, fixed)
+    assert np.all(rows[:, fixed] == 0)
+    assert np.abs(rows[:, [0, DT]]).max(axis=0).min() > 0
+    assert left_out_in_time(TimeOffsetProfile(STATE, 1e-6, 0.0), IS_TZ).shape == (0, 8)

@@ -1,6 +1,7 @@
 """Labels beside their picture are measured, named, and moved back or held; what is open widens the covariance."""
 
 from dataclasses import replace
+from functools import cache
 
 import cv2
 import numpy as np
@@ -17,7 +18,8 @@ SKY, BUILDING, CAR, POLE, ROAD = 10, 2, 13, 5, 0
 _GREYS = {SKY: 220, BUILDING: 130, CAR: 60, POLE: 40, ROAD: 100}
 
 
-def picture_and_labels(seed: int) -> tuple[np.ndarray, np.ndarray]:
+@cache
+def picture_and_labels(seed):
     """A noisy grey picture and labels without an error."""
     rng = np.random.default_rng(seed)
     labels = np.full((HEIGHT, WIDTH), ROAD, np.uint8)
@@ -31,37 +33,30 @@ def picture_and_labels(seed: int) -> tuple[np.ndarray, np.ndarray]:
     return np.clip(cv2.GaussianBlur(grey, (0, 0), 0.8), 0, 255).astype(np.uint8), labels
 
 
-def moved(
-    labels: np.ndarray, right_px: float = 0, down_px: float = 0, wider: float = 0, higher: float = 0
-) -> np.ndarray:
+def moved(labels, right_px=0, down_px=0, wider=0, higher=0):
     """Labels shifted, and stretched by a share about their middle."""
     height, width = labels.shape
-    across, along = 1 + wider, 1 + higher
     M = np.array(
         [
-            [across, 0, right_px - wider * (width - 1) / 2],
-            [0, along, down_px - higher * (height - 1) / 2],
+            [1 + wider, 0, right_px - wider * (width - 1) / 2],
+            [0, 1 + higher, down_px - higher * (height - 1) / 2],
         ]
     )
-    return cv2.warpAffine(
-        labels, M, (width, height), flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE
-    )
+    how = {"flags": cv2.INTER_NEAREST, "borderMode": cv2.BORDER_REPLICATE}
+    return cv2.warpAffine(labels, M.astype(float), (width, height), **how)
 
 
-def widened(labels: np.ndarray, wide_px: int) -> np.ndarray:
+def widened(labels, wide_px):
     """Labels whose objects are some pixels too wide on each side, as a coarse network's; not what is behind."""
     things = np.where(np.isin(labels, (CAR, POLE)), labels, 0).astype(np.uint8)
     grown = cv2.dilate(things, np.ones((2 * wide_px + 1, 2 * wide_px + 1), np.uint8))
     return np.where(grown > 0, grown, labels).astype(np.uint8)
 
 
-def gradients_of(frames: int, wide_px: int = 0, **slip: float) -> np.ndarray:
+def gradients_of(frames, wide_px=0, **slip):
     """Column `label_gradients` of frames whose labels slipped."""
-    found = []
-    for seed in range(frames):
-        grey, labels = picture_and_labels(seed)
-        found.append(label_gradients(grey, moved(widened(labels, wide_px), **slip)))
-    return np.stack(found)
+    made = [picture_and_labels(seed) for seed in range(frames)]
+    return np.stack([label_gradients(grey, moved(widened(labels, wide_px), **slip)) for grey, labels in made])
 
 
 FRAMES = 12
@@ -88,16 +83,12 @@ def test_labels_in_place_are_not_flagged():
     assert (offset.open_px == 0).all()
 
 
-@pytest.mark.parametrize("size", [1, 2, 3])
-@pytest.mark.parametrize("right", [-1, 0, 1])
-@pytest.mark.parametrize("down", [-1, 0, 1])
-def test_a_shift_of_whole_pixels_is_measured_with_its_sign_and_flagged(size, right, down):
-    if right == down == 0:
-        return
-    offset = measure_label_offset(gradients_of(FRAMES, right_px=size * right, down_px=size * down), BLOCKS)
+@pytest.mark.parametrize("shift", [(-1, 0), (1, -1), (2, 0), (0, -2), (-2, 2), (3, 3), (0, 3), (-3, 0)])
+def test_a_shift_of_whole_pixels_is_measured_with_its_sign_and_flagged(shift):
+    offset = measure_label_offset(gradients_of(FRAMES, right_px=shift[0], down_px=shift[1]), BLOCKS)
     assert offset.is_beside
     # The picture lies where the labels came from.
-    assert offset.shift_px == pytest.approx([-size * right, -size * down], abs=0.35)
+    assert offset.shift_px == pytest.approx([-shift[0], -shift[1]], abs=0.35)
 
 
 # Three per cent of a whole image's rows are 7 px at its ends; here 3 % of the columns are 5 px, 5 % of the rows 4.
@@ -113,11 +104,10 @@ def test_a_slip_of_scale_shows_at_the_ends_and_not_in_the_middle(slip):
     assert abs(offset.shift_px[axis]) < 0.6
 
 
-@pytest.mark.parametrize("wide_px", [1, 2, 4])
+@pytest.mark.parametrize("wide_px", [1, 4])
 def test_labels_too_wide_are_not_displaced_ones_where_the_skyline_is_in_place(wide_px):
     """Labels of a coarse network seemed beside their picture on seven of eight days."""
-    gradients = gradients_of(FRAMES, wide_px=wide_px)
-    offset = measure_label_offset(gradients, BLOCKS)
+    offset = measure_label_offset(gradients_of(FRAMES, wide_px=wide_px), BLOCKS)
     assert not offset.is_beside
     assert np.abs(offset.shift_px).max() < 0.35
     shifted = measure_label_offset(gradients_of(FRAMES, wide_px=wide_px, down_px=1), BLOCKS)

@@ -1,17 +1,21 @@
-"""Which sensor moved within the day, by pairs that shift and pairs that stay; and what records keep of it."""
+"""Which sensor moved within the day and what records keep of it; mounting or clock far from the prior."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
 from pipeline.calibrate.numerics.change_point import with_parts
 from pipeline.calibrate.records import half_days_of
 from pipeline.calibrate.verify.constancy import constancy_failures, moved_failures
+from pipeline.calibrate.verify.day_checks import clock_alarms, prior_alarms
+from pipeline.core.config import ChecksConfig, SolveConfig
 from pipeline.rig.edges import edge_named
-from pipeline.rig.estimates import DayParts, PairEstimate
+from pipeline.rig.estimates import DayParts, PairEstimate, Prior
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
-from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR
+from tests.makers.radar_scenes import T_LIDAR_RADAR, street_day
+from tests.makers.solve_scenes import T_CAMERA_LIDAR
 
 CUT_NS = (1772447400 * 10**9, 1772447700 * 10**9)  # 10:30:00 and 10:35:00 UTC
 SIGMA_RAD = {"camera_lidar": np.radians(0.05), "lidar_radar": np.radians(0.06)}
@@ -55,7 +59,7 @@ def test_a_quiet_day_fails_nothing():
 
 @pytest.mark.parametrize(
     ("sensor", "turn_deg"),
-    [("camera", (0.0, 1.0, 0.0)), ("lidar", (0.0, 0.0, -1.0)), ("radar", (0.0, 0.0, 1.0))],
+    [("camera", (0, 1, 0)), ("lidar", (0, 0, -1)), ("radar", (0, 0, 1)), ("radar", (0, 0, -1))],
 )
 def test_the_sensor_whose_two_pairs_shift_is_named_with_time_and_size(sensor, turn_deg):
     failed = constancy_failures(estimates(sensor, turn_deg))
@@ -67,13 +71,8 @@ def test_the_sensor_whose_two_pairs_shift_is_named_with_time_and_size(sensor, tu
     assert "1.00 deg" in sentences
     assert "between 10:30:00 and 10:35:00 UTC" in sentences
     assert f"the {sensor} moved" in sentences
-
-
-def test_the_turn_has_the_sign_of_the_later_part():
-    (check,) = constancy_failures(estimates("radar", (0.0, 0.0, 1.0)))["lidar_radar"]
-    assert "+1.00 deg" in check.sentence
-    (check,) = constancy_failures(estimates("radar", (0.0, 0.0, -1.0)))["lidar_radar"]
-    assert "-1.00 deg" in check.sentence
+    if sensor == "radar":  # the turn has the sign of the later part
+        assert f"{turn_deg[2]:+d}.00 deg" in failed["lidar_radar"][0].sentence
 
 
 @pytest.mark.parametrize(("sensor", "with_radar"), [("lidar", True), ("camera", False)])
@@ -85,17 +84,6 @@ def test_a_tilt_that_the_radar_does_not_see_leaves_two_sensors(sensor, with_rada
     assert (
         failed["lidar_radar"][0].sentence == "the camera or lidar moved during the day, as camera-lidar shows"
     )
-
-
-def test_a_tilt_that_the_radar_shows_in_part_does_not_blame_the_camera():
-    """Elevation rests on witnesses with floors of their own, so that parts turn less than the lidar did."""
-    found = estimates("lidar", (0.0, 1.0, 0.0))
-    radar, sure = found["lidar_radar"], np.eye(3) * np.radians(0.2) ** 2
-    first, last = (turned("lidar", np.array((0.0, 1.0, 0.0)), share)["lidar_radar"] for share in (0.4, 0.6))
-    parts = DayParts((first, last), (sure, sure), CUT_NS, (0, 1, 2))
-    failed = constancy_failures(found | {"lidar_radar": replace(radar, parts=parts)})
-    assert "the camera or lidar moved" in failed["camera_lidar"][0].sentence
-    assert failed["lidar_radar"]
 
 
 def test_the_one_sensor_of_a_rig_that_moved_loses_edges_that_do_not_show_it():
@@ -170,3 +158,61 @@ def test_a_radar_that_turned_on_the_car_is_told_from_the_car():
     assert failed(nose=1.0)["nose"].startswith("yaw turned by about -1.00 deg")
     assert failed(nose=1.0)["nose"].endswith("the nose moved")
     assert failed(nose=1.0, tail=1.0)["tail"].endswith("the base moved")
+
+
+LIMITS = ChecksConfig()
+SIGMA_M = 0.03
+KNOWN = Prior(T_CAMERA_LIDAR, T_LIDAR_RADAR, np.radians(1.2), SIGMA_M)
+
+
+def estimate_of(pair, kept=(), dt_s=0.0, **found):
+    """A pair at its prior, with a few positions left to it."""
+    observable = ~np.isin(np.arange(6), kept)
+    covariance, timed = np.eye(6) * SIGMA_M**2, {"time_offset_s": dt_s, "time_offset_sigma_s": 0.005}
+    return PairEstimate(
+        pair, KNOWN.of(pair), covariance, observable * 1.0, observable, 50, diagnostics=found, **timed
+    )
+
+
+def test_a_position_left_to_the_prior_is_an_alarm_where_the_day_puts_it_elsewhere():
+    z = {"own_z_prior": -2.0, "own_z_beyond": -2.0}
+    cases = [
+        ({"own_tx_m": 0.5, "own_tx_sigma_m": 0.1} | z, True),
+        ({"own_tx_m": 0.1, "own_tx_sigma_m": 0.01} | z, False),  # a prior may be three sigmas off
+        ({"own_tx_m": 0.5, "own_tx_sigma_m": 0.4} | z, False),  # the day does not know
+        ({"own_tx_m": 0.5, "own_tx_sigma_m": 0.1} | z | {"own_z_beyond": 1.0}, False),  # a slope, no dip
+    ]
+    for found, is_alarm in cases:
+        alarms = prior_alarms({"lidar_radar": estimate_of("lidar_radar", kept=[3], **found)}, KNOWN, LIMITS)
+        assert [c.fault for c in alarms["lidar_radar"]] == ["prior"] * is_alarm
+
+
+def test_a_clock_that_is_further_off_than_stated_is_an_alarm():
+    for dt_s, named in ((0.12, []), (-0.5, ["time_offset"]), (0.5, ["time_offset"])):
+        found = clock_alarms({"lidar_radar": estimate_of("lidar_radar", dt_s=dt_s)}, 0.05, LIMITS)
+        assert [c.fault for c in found.get("lidar_radar", [])] == named
+    assert not clock_alarms({"lidar_radar": estimate_of("lidar_radar", dt_s=0.5)}, 0.2, LIMITS)
+
+
+@pytest.mark.parametrize(
+    ("own", "is_alarm"), [((0.5, -5.0), True), ((0.5, -0.7), False), ((0.06, -5.0), False)]
+)
+def test_frames_that_align_far_better_at_another_offset_are_an_alarm_though_none_was_solved_for(
+    own, is_alarm
+):
+    estimate = estimate_of("lidar_radar", own_dt_s=own[0], own_dt_z=own[1])
+    found = clock_alarms({"lidar_radar": estimate}, 0.05, LIMITS)
+    assert [c.fault for c in found.get("lidar_radar", [])] == ["time_offset"] * is_alarm
+
+
+@pytest.mark.parametrize("off_m", [0.0, 0.4])
+def test_a_radar_mounted_further_ahead_than_its_prior_says_is_found_though_x_is_left_to_the_prior(off_m):
+    T = T_LIDAR_RADAR.copy()
+    T[0, 3] += off_m
+    prior = replace(KNOWN, T_lidar_radar=T, translation_sigma_m=0.01)
+    found = estimate_lidar_radar(street_day(24, seed=5), prior, SolveConfig(), np.random.default_rng(0))
+    alarms = prior_alarms({"lidar_radar": found}, prior, LIMITS)["lidar_radar"]
+    own = found.diagnostics
+    assert not found.observable[3]
+    assert abs(own["own_tx_m"] + off_m) < 4 * own["own_tx_sigma_m"]
+    assert [c.fault for c in alarms] == ["prior"] * (off_m > 0)
