@@ -19,10 +19,8 @@ from tests.rig.test_overlap import VAN, rig
 def config(sensors=VAN, **keys):
     values = {"cameras": {}, "lidars": {}, "radars": {}} | keys
     for name, kind, *_ in sensors:
-        topics = (
-            {"image": f"/{name}", "info": f"/{name}/info"} if kind == "camera" else {"points": f"/{name}"}
-        )
-        values[f"{kind}s"][name] = topics
+        camera = {"image": f"/{name}", "info": f"/{name}/info"}
+        values[f"{kind}s"][name] = camera if kind == "camera" else {"points": f"/{name}"}
     return FleetConfig.model_validate({"fleet": {"name": "f"}, "rigs": {"van": values}}).rigs["van"]
 
 
@@ -32,11 +30,7 @@ def names(method, rig, overlaps):
 
 def test_the_three_that_share_most_are_taken_unless_the_rig_names_others():
     overlaps = overlaps_of(*rig())
-    assert names("tracking", config(), overlaps) == {
-        "camera": "front",
-        "lidar": "top",
-        "radar": "ahead",
-    }
+    assert names("tracking", config(), overlaps) == {"camera": "front", "lidar": "top", "radar": "ahead"}
     named = config(three=["left", "top", "fl"])
     assert names("tracking", named, overlaps) == {"camera": "left", "lidar": "top", "radar": "fl"}
 
@@ -104,10 +98,7 @@ def test_a_vehicle_without_an_accepted_day_has_none(lake):
 
 
 def test_a_damaged_record_of_another_day_costs_that_day_only(lake):
-    days = {
-        p: pq.read_table(p, columns=["day"], partitioning=None)
-        for p in lake.root.glob("calibrations/*/*.parquet")
-    }
-    for path in (p for p, rows in days.items() if rows["day"][0].as_py() == "2026-03-05"):
-        path.write_bytes(path.read_bytes()[:100])
+    for path in lake.root.glob("calibrations/*/*.parquet"):
+        if pq.read_table(path, columns=["day"], partitioning=None)["day"][0].as_py() == "2026-03-05":
+            path.write_bytes(path.read_bytes()[:100])
     assert shift_of(lake, "2026-03-06") == 0.1

@@ -6,14 +6,14 @@ import pytest
 
 from pipeline.calibrate.paper.triggers import trigger_metrics
 from pipeline.calibrate.unlabelled import noted, notes_of_pair, unlabelled_pairs
-from schemas.calibrations import PAIRS, CalibrationRecord
 from schemas.faults import FAULTS
 from schemas.observations import STEP_RIGHT, WITHOUT_LABELS
-from schemas.poses import PoseRow
 from tests.calibrate.test_calibrate_day import DAY, fleet_of, lake_with, records_of
-from tests.makers.solve_scenes import LABEL_SCALE, PRIORS, make_day
+from tests.makers.solve_scenes import LABEL_SCALE, TRUTH, make_day
 from tests.makers.stages import calibrate_day
+from tests.makers.table_rows import make_row
 
+RNG = np.random.default_rng(0)
 NOBODY = {"road_user_boxes_px": np.zeros((0, 4), np.float32), "road_user_classes": [],
           "road_user_scores": np.zeros(0, np.float32)}  # fmt: skip
 
@@ -47,20 +47,16 @@ def test_the_note_names_what_does_not_check_the_pose(day):
 
 
 def test_poses_of_the_camera_have_the_note_and_those_of_others_do_not():
-    about = {
-        "vehicle": "v",
-        "day": "d",
-        "method": "joint",
-        "status": "held",
-        "reason": "",
-        "code_version": "0",
-    }
-    record = CalibrationRecord(
-        **about, pair="camera_lidar", parent_frame="front", child_frame="top", seed=0, inputs=[], frames_total=1,
+    record = make_row(
+        "calibrations",
+        RNG,
+        pair="camera_lidar",
+        parent_frame="front",
+        child_frame="top",
         notes=[WITHOUT_LABELS],
-    )  # fmt: skip
-    poses = [PoseRow(**about, sensor=s, kind=k, reference="top", inputs=[])
-             for s, k in (("front", "camera"), ("left", "camera"), ("top", "lidar"))]  # fmt: skip
+    )
+    kinds = {"front": "camera", "left": "camera", "top": "lidar"}
+    poses = [make_row("poses", RNG, sensor=s, kind=k, reference="top", notes=[]) for s, k in kinds.items()]
     assert [row.notes for row in noted(poses, [record])] == [[WITHOUT_LABELS], [], []]
 
 
@@ -74,7 +70,6 @@ def test_other_methods_are_refused_for_lack_of_labels(day, tmp_path, method):
 
 
 def test_triggers_are_not_measured_against_labels_that_are_not_there(day):
-    transforms = dict.fromkeys(PAIRS, np.eye(4)) | PRIORS
-    found = trigger_metrics(day[:3], transforms)
+    found = trigger_metrics(day[:3], TRUTH)
     assert found["camera_lidar"] == found["camera_radar"] == {}
     assert found["lidar_radar"]

@@ -20,6 +20,7 @@ T_LIDAR_RADAR = from_rotation_translation(
     exp_so3(np.array([0.01, 0.005, -0.03])), np.array([0.6, 0.05, -0.9])
 )
 PRIORS = {"camera_lidar": T_CAMERA_LIDAR, "lidar_radar": T_LIDAR_RADAR}
+TRUTH = PRIORS | {"camera_radar": T_CAMERA_LIDAR @ T_LIDAR_RADAR}
 CAMERA = Camera(
     "plumb_bob", np.array([[500.0, 0, 319.5], [0, 500.0, 159.5], [0, 0, 1]]), np.zeros(0), 640, 320
 )

@@ -17,13 +17,7 @@ from pipeline.rig.targets import (
     loop_errors,
 )
 from schemas.calibrations import PAIRS
-from tests.makers.solve_scenes import CAMERA, T_CAMERA_LIDAR, T_LIDAR_RADAR
-
-TRUTH = {
-    "camera_lidar": T_CAMERA_LIDAR,
-    "lidar_radar": T_LIDAR_RADAR,
-    "camera_radar": T_CAMERA_LIDAR @ T_LIDAR_RADAR,
-}
+from tests.makers.solve_scenes import CAMERA, T_CAMERA_LIDAR, T_LIDAR_RADAR, TRUTH
 
 
 def turned(T, axis, angle_deg):

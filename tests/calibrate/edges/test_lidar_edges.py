@@ -7,7 +7,6 @@ import pytest
 
 from pipeline.calibrate.edges.lidar_base import estimate_lidar_base
 from pipeline.calibrate.edges.lidar_lidar import LidarPair, _equations, _Moment, estimate_lidar_lidar
-from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.calibrate.verify.constancy import MOVED_SIGMAS, PART_FLOOR_RAD
 from pipeline.calibrate.verify.held_out import paired_test
 from pipeline.core.errors import SolveError
@@ -131,24 +130,6 @@ def test_a_car_that_nods_when_it_brakes_keeps_its_pitch(street):
     assert np.abs(faster).max() > 1.0
     error, _ = errors(estimated(replace(street, sweeps={"top": nodding})), T_BASE_TOP)
     assert abs(error[1]) < LIMITS[1]
-
-
-def test_a_car_that_parks_on_a_kerb_for_half_of_the_day_is_one_scene(street):
-    sweeps = street.sweeps["top"]
-    parked = [turned(sweeps[-1], [np.radians(4.0), 0.0, 0.0])] * len(sweeps)
-    ego = EgoMotion(
-        np.concatenate([street.ego.velocity_mps, 0 * street.ego.velocity_mps]),
-        np.concatenate([street.ego.yaw_rate_radps, 0 * street.ego.yaw_rate_radps]),
-        np.concatenate([street.ego.covariance] * 2),
-    )
-    scene, block = (
-        np.concatenate([a, np.full(len(a), a[-1] + 1)]) for a in (street.scenes.scene, street.scenes.block)
-    )
-    error, _ = errors(
-        estimated(replace(street, sweeps={"top": [*sweeps, *parked]}, ego=ego, scenes=Scenes(scene, block))),
-        T_BASE_TOP,
-    )
-    assert abs(error[0]) < LIMITS[0]
 
 
 def test_a_lidar_that_turned_at_noon_shows_it(street, evidence):
@@ -278,19 +259,6 @@ def test_lidars_without_overlap_have_no_edge(both):
     back = [replace(s, xyz_m=s.xyz_m - [400.0, 0, 0]) for s in both.sweeps["side"]]
     with pytest.raises(SolveError, match="lie on surfaces of the other"):
         estimate_lidar_lidar(PAIR, replace(given(both), child=back), both.ego, true_pose(), both.scenes)
-
-
-@pytest.mark.slow
-def test_an_empty_square_shows_height_and_tilt_alone(both):
-    def flat(sweeps):
-        kept = [(s, np.abs(s.xyz_m[:, 1]) < 30) for s in sweeps]
-        return [chosen(s, k & s.is_ground) for s, k in kept]
-
-    pair = replace(given(both), parent=flat(both.sweeps["top"]), child=flat(both.sweeps["side"]))
-    evidence = estimate_lidar_lidar(PAIR, pair, both.ego, true_pose(), both.scenes)
-    assert np.linalg.matrix_rank(evidence.information, tol=1e-6 * evidence.information.max()) == 3
-    shift = np.r_[np.zeros(3), 1.0, 0, 0, 0]  # of the child along the parent's x
-    assert shift @ evidence.information @ shift < 1.0
 
 
 def test_the_gradient_of_a_small_error_is_what_the_information_says():

@@ -179,9 +179,8 @@ def test_no_climb_leaves_the_search_range(terms):
     turn = log_so3(state.T_camera_lidar[:3, :3] @ prior.T_camera_lidar[:3, :3].T)
     assert np.abs(turn).max() < limits.rotation_rad + 1e-9
     assert np.abs(turn).max() > 0.9 * limits.rotation_rad  # the truth lies beyond: it went as far as it may
-    assert (
-        np.abs(state.T_camera_lidar[:3, 3] - prior.T_camera_lidar[:3, 3]).max() < limits.translation_m + 1e-9
-    )
+    shift = state.T_camera_lidar[:3, 3] - prior.T_camera_lidar[:3, 3]
+    assert np.abs(shift).max() < limits.translation_m + 1e-9
 
 
 def test_a_state_within_the_range_is_not_touched():
@@ -207,9 +206,8 @@ def test_edges_in_view_are_those_that_the_camera_model_projects_into_the_image(d
 
 def test_a_rival_near_by_is_asked_again_by_a_sharper_kernel(terms):
     basin = replace(searched(terms, prior_off_by(1.0, 0.02, 5)), rival_z=1.0, doubt="")
-    scored = Scored(
-        terms, KernelSettings.wide(*SCHEDULE.kernels[-1]), prior_off_by(1.0, 0.02, 5), SolveConfig()
-    )
+    sharper = KernelSettings.wide(*SCHEDULE.kernels[-1])
+    scored = Scored(terms, sharper, prior_off_by(1.0, 0.02, 5), SolveConfig())
     best, same, other = (
         AlignmentState(turned(T_TRUE, np.radians([angle, 0.0, 0.0]))) for angle in (0.0, 0.1, 1.0)
     )

@@ -123,12 +123,10 @@ def test_much_of_roll_is_drawn_anew_every_day_and_most_of_pitch_is_not(day):
 
 
 def test_frames_of_a_turn_that_no_odometry_measured_are_left_out(day):
-    turning = {
-        "radar_velocity_mps": np.array([8.0, 1.0, 0.0]),
-        "ego_speed_mps": 8.0,
-        "ego_yaw_rate_radps": None,
-    }
-    turn = [replace(o, **turning) for o in day[:6]]
+    slides = np.array([8.0, 1.0, 0.0])
+    turn = [
+        replace(o, radar_velocity_mps=slides, ego_speed_mps=8.0, ego_yaw_rate_radps=None) for o in day[:6]
+    ]
     straight = [replace(o, ego_yaw_rate_radps=None) for o in day[6:24]]
     found = solve([*turn, *straight], prior_off_by(1, 0.02))
     assert found.frames_used == len(straight)
@@ -152,13 +150,10 @@ def test_a_radar_of_poor_elevation_is_not_trusted_with_roll(day, found):
 def with_road(day, pitched_deg=0.0):
     """The same day with its ground known, and velocities that point up by so much."""
     up = exp_so3(np.array([0.0, -np.radians(pitched_deg), 0.0]))
+    ground = [(o.lidar_map_xyz_m[:, 2] < GROUND_M + 0.01).astype(np.uint8) for o in day]
     return [
-        replace(
-            o,
-            lidar_map_is_ground=(o.lidar_map_xyz_m[:, 2] < GROUND_M + 0.01).astype(np.uint8),
-            radar_velocity_mps=up @ o.radar_velocity_mps,
-        )
-        for o in day
+        replace(o, lidar_map_is_ground=g, radar_velocity_mps=up @ o.radar_velocity_mps)
+        for o, g in zip(day, ground, strict=True)
     ]
 
 
@@ -248,10 +243,8 @@ def test_a_radar_that_tilted_at_noon_tilts_its_parts_and_leaves_yaw(day):
 
 
 def test_the_held_out_cost_of_camera_radar_prefers_the_truth_and_names_frames_that_cannot_tell(day):
-    frames = [
-        *day[:8],
-        replace(day[8], radar_velocity_mps=None, radar_cluster=np.full_like(day[8].radar_cluster, -1)),
-    ]
+    silent = {"radar_velocity_mps": None, "radar_cluster": np.full_like(day[8].radar_cluster, -1)}
+    frames = [*day[:8], replace(day[8], **silent)]
     wrong = exp_se3(np.array([0, 0, np.radians(1.0), 0, 0, 0])) @ T_LIDAR_RADAR
     camera_right, camera_wrong = (
         camera_radar_cost(frames, T_CAMERA_LIDAR @ T) for T in (T_LIDAR_RADAR, wrong)

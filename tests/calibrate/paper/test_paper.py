@@ -19,7 +19,7 @@ from pipeline.core.config import SolveConfig, TriggerConfig
 from pipeline.core.errors import ConfigError
 from pipeline.rig.changes import changed
 from pipeline.rig.estimates import Prior
-from pipeline.rig.se3 import perturb_exactly, rotation_angle_rad
+from pipeline.rig.se3 import log_se3, perturb_exactly, rotation_angle_rad
 from pipeline.rig.targets import errors_at_targets
 from schemas.calibrations import METHODS as METHOD_NAMES
 from schemas.calibrations import PAIRS
@@ -129,8 +129,6 @@ def test_sandwich_covariance_is_that_of_the_mean_for_independent_quadratic_losse
     centres = rng.normal(size=(4000, 6)) * sigma
 
     def frame_losses(T):
-        from pipeline.rig.se3 import log_se3
-
         return (((log_se3(T)[:, None] - centres[None]) / sigma) ** 2).sum(axis=2)
 
     wide = np.eye(6) * 100.0
@@ -181,11 +179,8 @@ def with_ages(observation, age):
 
 
 def transforms(camera_lidar=T_CAMERA_LIDAR, lidar_radar=T_LIDAR_RADAR):
-    return {
-        "camera_lidar": camera_lidar,
-        "camera_radar": camera_lidar @ lidar_radar,
-        "lidar_radar": lidar_radar,
-    }
+    given = {"camera_lidar": camera_lidar, "lidar_radar": lidar_radar}
+    return given | {"camera_radar": camera_lidar @ lidar_radar}
 
 
 def turned(T, axis, angle_deg):

@@ -21,39 +21,31 @@ from pipeline.calibrate.verify.target_accuracy import (
 )
 from pipeline.core.rigs import CameraPrior, CameraTopics
 from pipeline.rig.estimates import PairEstimate, Prior, Solution
-from pipeline.rig.se3 import exp_se3, exp_so3, from_rotation_translation, inverse, transform_points
+from pipeline.rig.se3 import exp_se3, inverse, transform_points
 from pipeline.rig.spherical import from_spherical, to_spherical
 from pipeline.rig.targets import DEFAULT_TARGETS, errors_at_targets, target_sigmas
 from schemas.calibrations import PAIRS
+from tests.makers.fleet_files import THREE_SENSORS
 from tests.makers.radar_scenes import street_day
-from tests.makers.solve_scenes import CAMERA, T_CAMERA_LIDAR, T_LIDAR_RADAR
+from tests.makers.solve_scenes import CAMERA, T_CAMERA_LIDAR, T_LIDAR_RADAR, TRUTH
 
-AXES = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # camera from lidar
-T_CAMERA = from_rotation_translation(AXES, np.array([0.1, -0.3, -0.5]))
-T_RADAR = from_rotation_translation(exp_so3(np.array([0.0, 0.02, 0.1])), np.array([2.0, 0.2, -1.0]))
-POSES = {"camera_lidar": T_CAMERA, "camera_radar": T_CAMERA @ T_RADAR, "lidar_radar": T_RADAR}
 SIGMA = np.array([*np.radians([0.05] * 3), 0.02, 0.02, 0.02])
 
 
-@pytest.mark.parametrize("pair", POSES)
+@pytest.mark.parametrize("pair", TRUTH)
 def test_the_jacobian_predicts_the_errors_at_the_targets(pair):
     rng = np.random.default_rng(0)
-    J = target_jacobian(pair, POSES[pair])
+    J = target_jacobian(pair, TRUTH[pair])
     for _ in range(5):
         xi = rng.normal(size=6) * 1e-3
-        found = errors_at_targets(pair, exp_se3(xi) @ POSES[pair], POSES[pair])
+        found = errors_at_targets(pair, exp_se3(xi) @ TRUTH[pair], TRUTH[pair])
         np.testing.assert_allclose(np.abs(J @ xi).mean(axis=1), found[:2], atol=2e-5)
 
 
 def test_the_bound_is_the_quantile_of_the_absolute_error():
-    for shift, sigma, confidence in (
-        (0.0, 0.1, 0.995),
-        (0.05, 0.1, 0.995),
-        (1.0, 0.1, 0.995),
-        (0.02, 0.1, 0.9),
-    ):
-        bound = Claim(sigma, shift, 1e-3, 9.0, 0.2, confidence).bound_rad
-        inside = norm.cdf(bound, shift, sigma) - norm.cdf(-bound, shift, sigma)
+    for shift, confidence in ((0.0, 0.995), (0.05, 0.995), (1.0, 0.995), (0.02, 0.9)):
+        bound = Claim(0.1, shift, 1e-3, 9.0, 0.2, confidence).bound_rad
+        inside = norm.cdf(bound, shift, 0.1) - norm.cdf(-bound, shift, 0.1)
         assert inside == pytest.approx(confidence, abs=1e-9)
 
 
@@ -108,9 +100,8 @@ def test_a_held_out_update_is_right_about_its_own_sigma_however_much_scenes_scat
 def test_frames_that_say_nothing_change_nothing_and_two_scenes_are_too_few():
     rng = np.random.default_rng(0)
     block = np.repeat(np.arange(6), 2)
-    found = held_out_update(
-        quadratic_frames(np.zeros(8), block, rng, information=1e-6), COVARIANCE, BIAS, block
-    )
+    silent = quadratic_frames(np.zeros(8), block, rng, information=1e-6)
+    found = held_out_update(silent, COVARIANCE, BIAS, block)
     np.testing.assert_allclose(found.covariance, COVARIANCE[:6, :6], rtol=1e-3)
     assert np.all(np.abs(found.shift) < 1e-3 * SIGMA)
     two = np.repeat([0, 1], 6)
@@ -137,20 +128,15 @@ ANGLES_DEG = np.degrees(to_spherical(DEFAULT_TARGETS)[:, :2])
 OF_LIDAR = np.diag([*np.radians([0.3, 0.1, 0.05]), 0.03, 0.02, 0.05]) ** 2
 
 
-def turn(degrees, axis=2):
-    return from_rotation_translation(exp_so3(np.radians(degrees) * np.eye(3)[axis]), np.zeros(3))
+def turn(degrees):
+    return exp_se3(np.radians(degrees) * np.eye(6)[2])
 
 
 def around(azimuths_deg, elevations_deg=(-20.0, 10.0), seed=0):
     """Points of a sensor that sees these azimuths."""
-    rng = np.random.default_rng(seed)
-    low, high = np.radians(azimuths_deg)
-    n = 4000
-    return from_spherical(
-        np.stack(
-            [rng.uniform(low, high, n), np.radians(rng.uniform(*elevations_deg, n)), np.full(n, 20.0)], -1
-        )
-    ).astype(np.float32)
+    rng, n = np.random.default_rng(seed), 4000
+    angles = np.radians([rng.uniform(*azimuths_deg, n), rng.uniform(*elevations_deg, n)])
+    return from_spherical(np.column_stack([*angles, np.full(n, 20.0)])).astype(np.float32)
 
 
 def day(lidar=(-180.0, 180.0), radar=(-50.0, 50.0)):
@@ -160,10 +146,6 @@ def day(lidar=(-180.0, 180.0), radar=(-50.0, 50.0)):
 
 def prior(T_camera_lidar=T_CAMERA_LIDAR, T_lidar_radar=T_LIDAR_RADAR):
     return Prior(T_camera_lidar, T_lidar_radar, np.radians(2.0), 0.05)
-
-
-def azimuths_deg(targets):
-    return np.degrees(to_spherical(targets)[:, 0])
 
 
 @pytest.mark.parametrize("pair", PAIRS)
@@ -199,8 +181,8 @@ def test_a_rig_turned_on_its_lidar_has_the_same_sigmas(degrees):
 def test_targets_stay_in_the_view_of_the_narrower_sensor():
     views = views_of(day(lidar=(20.0, 34.0)))
     targets = seen_targets("camera_lidar", prior(), views)
-    assert (azimuths_deg(targets) > 19).all()
-    assert (azimuths_deg(targets) < 35).all()
+    azimuths_deg = np.degrees(to_spherical(targets)[:, 0])
+    assert ((azimuths_deg > 19) & (azimuths_deg < 35)).all()
     assert views["lidar"](targets).all()
     uv, valid = CAMERA.project(transform_points(T_CAMERA_LIDAR, targets))
     assert valid.all()
@@ -215,38 +197,30 @@ def test_sensors_that_look_apart_have_no_targets_and_the_check_says_so():
     assert "camera and radar see no direction in common" in unseen_failure("camera_radar").sentence
 
 
-MOUNTED = {
-    "camera_lidar": T_CAMERA_LIDAR,
-    "camera_radar": T_CAMERA_LIDAR @ T_LIDAR_RADAR,
-    "lidar_radar": T_LIDAR_RADAR,
-}
 OF_POSE = np.diag([*np.radians([0.03] * 3), 0.01, 0.01, 0.01]) ** 2
 K = np.array([[400.0, 0, 320], [0, 500.0, 200], [0, 0, 1]])
 
 
 def solution(**diagnostics):
-    seen = np.ones(6, bool)
-    known = (OF_POSE, np.ones(6), seen, 40)
-    return Solution(
-        "joint", {p: PairEstimate(p, T, *known, diagnostics=diagnostics) for p, T in MOUNTED.items()}
-    )
+    known = (OF_POSE, np.ones(6), np.ones(6, bool), 40)
+    pairs = {p: PairEstimate(p, T, *known, diagnostics=diagnostics) for p, T in TRUTH.items()}
+    return Solution("joint", pairs)
 
 
 @pytest.mark.parametrize("pair", ["camera_lidar", "camera_radar"])
 def test_a_pixel_of_the_principal_point_is_a_turn_of_the_camera(pair):
     turn = camera_turn_sigma_rad(solution(), CameraPrior(centre_sigma_px=4.0, centre_is_stated=True), K)
     assert turn == pytest.approx([4 / 500, 4 / 400])
-    T = MOUNTED[pair]
+    T = TRUTH[pair]
     own = target_sigmas(pair, T, OF_POSE)
-    wider = mounting_covariance(pair, T, OF_POSE, turn)
-    mounted = target_sigmas(pair, T, wider)
+    mounted = target_sigmas(pair, T, mounting_covariance(pair, T, OF_POSE, turn))
     bias = RADAR_ELEVATION_BIAS_RAD * (pair == "camera_radar")
     np.testing.assert_allclose(mounted, np.hypot(own, np.hypot([4 / 400, 4 / 500], [0, bias])), rtol=0.03)
 
 
 @pytest.mark.parametrize("pair", ["camera_radar", "lidar_radar"])
 def test_a_radars_own_elevation_error_turns_it_about_itself_and_leaves_azimuth(pair):
-    T = MOUNTED[pair]
+    T = TRUTH[pair]
     bent = T @ exp_se3(RADAR_ELEVATION_BIAS_RAD * np.eye(6)[1])
     azimuth, elevation, _ = errors_at_targets(pair, bent, T)
     wider = mounting_covariance(pair, T, OF_POSE, np.zeros(2))
@@ -259,21 +233,16 @@ def test_what_the_day_measured_counts_before_what_is_stated_and_a_default_states
     measured = solution(mounting_pitch_sigma_rad=0.002, mounting_yaw_sigma_rad=0.003)
     assert camera_turn_sigma_rad(measured, CameraPrior(), K) == pytest.approx([0.002, 0.003])
     assert camera_turn_sigma_rad(solution(), CameraPrior(), K) is None
-    topics = {
-        "image": "/i",
-        "info": "/c",
-        "semantics": {"source": "topics", "labels": "/l", "detections": "/d"},
-    }
+    topics = THREE_SENSORS["camera"]
     assert not CameraTopics.model_validate(topics).known.centre_is_stated
     stated = CameraTopics.model_validate(topics | {"centre_sigma_px": 1.0}).known
-    assert stated == replace(
-        CameraPrior(), centre_is_stated=True
-    )  # the default's number, but somebody's word
+    # The default's number, but somebody's word.
+    assert stated == replace(CameraPrior(), centre_is_stated=True)
 
 
 def test_where_nobody_knows_the_principal_point_the_image_is_certified_and_the_mounting_is_not():
     def claims(pair, turn):
-        T = MOUNTED[pair]
+        T = TRUTH[pair]
         mounting = mounting_covariance(pair, T, OF_POSE, turn)
         return claims_of(pair, T, OF_POSE, None, np.radians(0.2), 0.995, mounting=mounting)
 
