@@ -1,4 +1,4 @@
-"""What one log may say of the calibration in use: fail, warn, pass, or that it cannot tell."""
+"""What one log may say of the calibration in use: fail, warn, pass, or that it cannot tell; other spellings of it."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.core.config import VerifyConfig
-from pipeline.rig.se3 import exp_se3, inverse, to_quaternion
+from pipeline.rig.se3 import exp_se3, inverse, log_se3, to_quaternion
 from pipeline.verify.axes import (
     answer_of,
     answers_by_sensor,
@@ -19,12 +19,15 @@ from pipeline.verify.axes import (
     wrong_sensors,
 )
 from pipeline.verify.one_axis import AxisLimits, HeldOut, power_of
+from pipeline.verify.one_log import on_grid
 from schemas.calibrations import FRAMES_OF_PAIR, CalibrationRecord
 from schemas.poses import PoseRow
 from tests.makers.solve_scenes import T_CAMERA_LIDAR
 
 ASKED_DEG = (0.5, 1.0)
+
 DEG = np.pi / 180
+
 NAMES = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 
 
@@ -105,14 +108,9 @@ def test_a_log_whose_own_answer_failed_a_check_says_nothing_of_the_one_in_use(of
 
 
 def test_a_record_held_for_its_sigma_alone_is_believed_as_far_as_that_goes():
-    wide = record(
-        0.5, 0.09, status="held", reason="azimuth is known to 0.09 deg", diagnostics={"unsure_only": 1.0}
-    )
-    assert axes(wide)["azimuth"].status == "fail"
-    assert (
-        axes(record(0.5, 0.2, status="held", diagnostics={"unsure_only": 1.0}))["azimuth"].status
-        == "inconclusive"
-    )
+    held = {"status": "held", "diagnostics": {"unsure_only": 1.0}}
+    assert axes(record(0.5, 0.09, **held))["azimuth"].status == "fail"
+    assert axes(record(0.5, 0.2, **held))["azimuth"].status == "inconclusive"
 
 
 def turned(sensor, axis, deg):
@@ -157,9 +155,8 @@ def test_the_answer_needs_every_axis_that_a_pair_is_good_for():
     good = [c for p in FRAMES_OF_PAIR for c in axes(record(0.01, pair=p)).values()]
     assert answer_of(good) == "right"
     coarse = [replace(c, status="inconclusive") if c.axis == "elevation" else c for c in good]
-    assert (
-        answer_of([c for c in coarse if c.pair != "camera_lidar"]) == "right"
-    )  # a radar need not know its own
+    # A radar need not know its own.
+    assert answer_of([c for c in coarse if c.pair != "camera_lidar"]) == "right"
     assert answer_of(coarse) == "inconclusive"
     assert answer_of([*good[1:], replace(good[0], status="fail")]) == "wrong"
     assert answer_of([]) == "inconclusive"
@@ -202,9 +199,8 @@ def test_of_many_sensors_each_is_right_wrong_or_undecided_by_its_own_pose():
 
 
 def test_a_sensor_whose_edges_contradict_each_other_or_that_is_not_in_the_calibration_is_undecided():
-    row, in_use = pose(
-        off_deg=0.5, faults=["witnesses_disagree"], status="held", reason="its edges contradict"
-    )
+    held = {"faults": ["witnesses_disagree"], "status": "held", "reason": "its edges contradict"}
+    row, in_use = pose(off_deg=0.5, **held)
     assert answers_by_sensor(pose_checks(row, in_use)) == {"front": "undecided"}
     assert "its edges contradict" in pose_checks(row, in_use)[0].reason
     checks = pose_checks(pose()[0], None)
@@ -250,3 +246,14 @@ def test_an_axis_that_held_out_frames_do_not_see_is_inconclusive_and_says_so():
     assert np.isnan(found["roll"].shown_rad)
     # Turns of 0.5 deg were tried, and an error of that size would have failed.
     assert found["azimuth"].shown_rad <= np.radians(0.5)
+
+
+def test_digits_beyond_any_measurement_do_not_matter_and_the_pose_stays_where_it_is():
+    rng = np.random.default_rng(4)
+    alike = 0
+    for _ in range(300):
+        T = exp_se3(rng.normal(size=6))
+        otherwise = T + rng.uniform(-3e-8, 3e-8, (4, 4)) * (np.arange(4)[:, None] < 3)
+        alike += np.array_equal(on_grid(T), on_grid(otherwise))
+        assert np.abs(log_se3(on_grid(T) @ inverse(T))).max() < 4e-4
+    assert alike > 295
