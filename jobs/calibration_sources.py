@@ -220,14 +220,9 @@ def _side_of_lake(text: str, location: str | None, vehicle: str | None, method: 
     else:
         found = {words_of(edge): pair for edge, pair in pairs_of(lake, owner, of_day, by).items()}
     pairs, missing = choose_pairs(found, force=True)
-    days = frozenset[str]() if named == "prior" else _days(pairs, day)
-    return Side(f"{owner} {rest}", pairs, owner, days, missing)
-
-
-def _days(pairs: dict[str, ExportedPair], day: str) -> frozenset[str]:
-    """Days that the pairs were estimated from."""
     listed = {str(d) for pair in pairs.values() for d in _listed(pair.details.get("days"))}
-    return frozenset(listed if day == "state" else {day})
+    days = set() if named == "prior" else listed if day == "state" else {day}
+    return Side(f"{owner} {rest}", pairs, owner, frozenset(days), missing)
 
 
 _KINDS = ("camera", "lidar", "radar", "base")
@@ -243,10 +238,10 @@ class FrameOptions:
     ] = None
     lidar: Annotated[str | None, Parameter(name="--lidar-frame", help="frame of the lidar")] = None
     radar: Annotated[str | None, Parameter(name="--radar-frame", help="frame of the radar")] = None
-    base: Annotated[str | None, Parameter(name="--base-frame", help="frame of the car, of --mount")] = None
+    base: Annotated[str | None, Parameter(name="--base-frame", help="frame of the car, for --mount")] = None
     frame: Annotated[
         tuple[str, ...],
-        Parameter(name="--frame", help="SENSOR=NAME, of any sensor; again for each", negative=()),
+        Parameter(name="--frame", help="SENSOR=NAME: frame of any sensor; repeat for several", negative=()),
     ] = ()
 
     def names(self, known: Mapping[str, str] | None = None) -> FrameNames:

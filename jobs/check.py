@@ -149,8 +149,8 @@ def print_rig(console: Console, rig: RigFinding) -> None:
         table.add_row(name, *(_cell(pairs.get((row, column))) for column in columns))
     console.print(table)
     console.print(
-        "first line: overlap as share of the smaller view (before perception), moments with both sensors; "
-        "second line: of 6 degrees of freedom, how many are determined + partly determined"
+        "first line: overlap as a share of the smaller view, and moments with both sensors; "
+        "second line: determined + partly determined degrees of freedom, of 6"
     )
     console.print(f"poses refer to {rig.reference} (*); pairs without a second line are not calibrated")
     for (verdict, reason, edges), dofs in _reasons(rig).items():

@@ -38,7 +38,7 @@ _HELP = {
     "calibrate": "Estimate extrinsics of one vehicle-day and record them.",
     "prepare": "Make training data from many vehicle-days.",
     "train": "Train a network without ground truth: calibration, lidar semantics, drivable area.",
-    "models": "List the networks included and those that --fetch downloads, for cameras without labels.",
+    "models": "List the included networks, and download others for cameras without labels.",
     "audit": "Find sensors that moved, by control charts over days.",
     "service": "Record a repair, a re-mount or a software release: charts restart.",
     "state": "Show the calibration that each vehicle should load tonight, with sigmas.",

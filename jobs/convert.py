@@ -42,8 +42,8 @@ def convert(
             days.
         day: day for vod and kitti, which have no stamps, YYYY-MM-DD.
         camera: nuScenes channels, separated by commas; default: all.
-        lidar: likewise.
-        radar: likewise.
+        lidar: the same for lidars.
+        radar: the same for radars.
         radar_columns: columns of kitti's radar/*.bin (float32); doppler is the range rate, positive =
             receding.
         segmenter: model manifest for fleet.toml, path relative to it; without one, add semantics to

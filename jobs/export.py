@@ -70,7 +70,7 @@ def export(
         vehicle: vehicle id.
         day: YYYY-MM-DD: export the records of this day; default: the vehicle's state.
         method: calibration method.
-        signed_off: the state that was signed off last (`boresight state --sign-off`), not tonight's.
+        signed_off: write the state that was signed off last (`boresight state --sign-off`) instead of tonight's.
         force: with --day, write held pairs too, marked as held; the exit code is that without --force.
         mount: pose of the reference lidar on the car (from --base-frame to the lidar's frame): log:FILE (its
             /tf_static) or FORMAT:FILE, as in urdf:car.urdf; default: from the car's logs, where their /tf_static
@@ -95,9 +95,9 @@ def export(
     if lake is None or vehicle is None:
         raise ConfigError("command line", "lake, vehicle", "a calibration needs --lake and --vehicle")
     if signed_off and day is not None:
-        raise ConfigError("command line", "signed-off", "is of a state: leave out --day")
+        raise ConfigError("command line", "signed-off", "only a state is signed off: leave out --day")
     if force and day is None:
-        problem = "a state has no held pairs: what no day determines is at its prior; --force goes with --day"
+        problem = "a state has no held pairs: leave out --force, which goes with --day"
         raise ConfigError("command line", "force", problem)
     # Autoware's sensor kit has the camera's link, while logs name its optical frame.
     own_frames = not (generic_frames or what == "autoware")

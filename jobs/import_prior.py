@@ -23,6 +23,7 @@ from pipeline.export.formats import format_named
 from pipeline.export.tree import ESTIMATED_PAIRS
 from pipeline.rig.day_prior import read_star, read_transforms
 from pipeline.rig.prior import between
+from pipeline.rig.rig import Rig
 
 __all__ = ["import_prior"]
 
@@ -49,32 +50,32 @@ def import_prior(
         rig: rig of fleet.toml; default: the only one.
         frames: frame names in the files.
     """
-    read = read_files(files)
+    read, options = read_files(files), frames or FrameOptions()
     if fleet is not None:
-        taken = _of_rig(form, read, out, also, (fleet, rig), frames or FrameOptions())
-        print_summary("import", "done", format=form, files=list(read), sensors=taken, outputs=[out])
-        return 0
-    pairs = format_named(form).pairs(read, (frames or FrameOptions()).names_in(files))
-    taken = sorted(pairs)
-    if also is not None:
-        known = read_transforms(also)
-        pairs = {pair: known[pair] for pair in ESTIMATED_PAIRS} | pairs
-    write_files({out: prior_text(pairs, form, list(read))})
-    print_summary("import", "done", format=form, files=list(read), pairs=taken, outputs=[out])
+        content, taken = _of_rig(form, read, also, load_fleet(fleet).rigs, rig, options)
+        told = {"sensors": taken}
+    else:
+        pairs = format_named(form).pairs(read, options.names_in(files))
+        told = {"pairs": sorted(pairs)}
+        if also is not None:
+            known = read_transforms(also)
+            pairs = {pair: known[pair] for pair in ESTIMATED_PAIRS} | pairs
+        content = prior_text(pairs, form, list(read))
+    write_files({out: content})
+    print_summary("import", "done", format=form, files=list(read), **told, outputs=[out])
     return 0
 
 
 def _of_rig(
     form: str,
     read: Mapping[str, bytes],
-    out: Path,
     also: Path | None,
-    of: tuple[Path, str | None],
+    rigs: Mapping[str, Rig],
+    name: str | None,
     frames: FrameOptions,
-) -> list[str]:
-    """Write the prior file of all sensors of a rig; returns them; ConfigError if one is missing or twice."""
-    rigs, name = load_fleet(of[0]).rigs, of[1]
-    name = next(iter(rigs)) if name is None and len(rigs) == 1 else name
+) -> tuple[bytes, list[str]]:
+    """Prior file of all sensors of a rig, and which the files have; ConfigError if one is missing or twice."""
+    name = next(iter(rigs)) if name is None and len(rigs) == 1 else name or ""
     if name not in rigs:
         raise ConfigError("command line", "rig", f"name one of {', '.join(rigs)} with --rig")
     rig = rigs[name]
@@ -86,5 +87,4 @@ def _of_rig(
         star, reference = read_star(also, rig), reference_of_rig(rig).name
         of_star = {n.name: between(star, reference, n.name) for n in rig.nodes if n.name != reference}
         poses = {n: T for n, T in of_star.items() if T is not None} | poses
-    write_files({out: star_text(require_all(poses, list(read), names, rig), rig, form, list(read))})
-    return taken
+    return star_text(require_all(poses, list(read), names, rig), rig, form, list(read)), taken

@@ -32,7 +32,7 @@ def ingest(*logs: str, fleet: Path, lake: str, vehicle: str, day: str) -> int:
     if not logs:
         raise ConfigError("command line", "LOG", "name at least one log of the day")
     if day > last_possible_day():
-        raise ConfigError("command line", "day", f"{day} has not come yet")
+        raise ConfigError("command line", "day", f"{day} is in the future")
     return _run(INGEST, fleet, Lake.at(lake), Partition(vehicle, day), tuple(log_at(log) for log in logs))
 
 

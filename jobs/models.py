@@ -35,23 +35,23 @@ def models(
     mirror: str | None = None,
     json: bool = False,
 ) -> int:
-    """List the models that ship, compared with the sha256 of their cards, and those that --fetch downloads.
+    """List the shipped models and those that --fetch downloads.
 
-    Exit code 1 where a file is not the one that its card speaks of, or a card lacks something.
+    Each shipped file is compared with the sha256 in its card. Exit code 1 if one differs, or a card is incomplete.
 
     Args:
-        names: models to fetch; default: a segmenter and a detector, which a camera without logged labels needs both.
-        fetch: download models of other people, with manifests. Address, size and licence are shown first; the sha256
-            is checked before a file appears.
+        names: models to fetch; default: a segmenter and a detector. A camera without logged labels needs both.
+        fetch: download third-party models, with manifests. Address, size and licence are printed first. A file with
+            another sha256 is discarded.
         into: folder for the files; fleet.toml names it relative to itself.
         mirror: address of a folder with the files NAME.onnx, in place of the pinned addresses.
-        json: the summary's "models" and "to_fetch" hold all that is known of them.
+        json: put the whole cards into "models" and "to_fetch" of the summary.
     """
     if fetch:
         return _fetch(named(names), into, mirror)
     if names:
         raise ConfigError(
-            "command line", "NAME", f"{' '.join(names)}: names go with --fetch, which downloads them"
+            "command line", "NAME", f"{' '.join(names)}: add --fetch to download models by name"
         )
     found = shipped_models()
     for model in () if json else found:

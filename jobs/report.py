@@ -38,9 +38,8 @@ def report(
         day: YYYY-MM-DD.
         method: calibration method of the records; default: audit.method.
         truth: JSON with the true extrinsics of a simulated fleet, shown next to the estimates.
-        picture: picture file to write as well, of the frame with most features: .jpg or .png is a still (left:
-            prior, right: result); .webp or .gif moves from one to the other. Needs --vehicle and
-            --day.
+        picture: picture to write of the frame with most features; needs --vehicle and --day. A .jpg or .png shows the
+            prior on the left and the result on the right; a .webp or .gif moves from one to the other.
         pictures: --no-pictures draws pages without images of public roads.
     """
     if (vehicle is None) != (day is None):

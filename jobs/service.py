@@ -45,22 +45,20 @@ def service(
     tables = Lake.existing(lake)
     Partition(vehicle, day)  # raises for impossible names
     if day > last_possible_day():
-        raise ConfigError("command line", "day", f"{day} has not come yet")
+        raise ConfigError("command line", "day", f"{day} is in the future")
     require_vehicle(tables, vehicle)
     _require_sensor(tables, vehicle, sensor)
     noted = events_until(tables, None).get(vehicle, [])
     if withdraw and (day, sensor, kind) not in [(e.day, e.sensor, e.kind) for e in noted]:
         there = "; ".join(f"{e.kind} of {e.sensor} on {e.day}" for e in noted) or "none"
-        raise ConfigError(
-            "command line", "withdraw", f"no such event of {vehicle} is noted; noted are: {there}"
-        )
+        raise ConfigError("command line", "withdraw", f"{vehicle} has no such event; it has: {there}")
     key = work_key("service", "", f"{vehicle} {day} {sensor} {kind}", [note, *(["withdrawn"] * withdraw)])
     event = ServiceEvent(
         vehicle=vehicle, day=day, sensor=sensor, kind=kind, note=note, work_key=key, withdrawn=withdraw
     )
     commit_records(tables, SERVICE_EVENTS, [event])
     about = {"vehicle": vehicle, "day": day, "sensor": sensor, "kind": kind, "withdrawn": withdraw}
-    step = "status and states change with the next night, or with `boresight audit`"
+    step = "run `boresight audit`, or wait for the next night: status and states change then"
     print_summary("service", "done", **about, outputs=[tables.table(SERVICE_EVENTS.name)], next_steps=[step])
     return exit_code(["done"])
 

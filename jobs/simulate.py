@@ -66,6 +66,7 @@ def simulate(
     require("simulate")
     from pipeline.simulate.faults import parse_faults
     from pipeline.simulate.fleet import FleetSpec, day_names
+    from pipeline.simulate.reflectors import simulate_reflectors
     from pipeline.simulate.sensors.rigs import rig_named
 
     spec_of_rig = rig_named(rig)
@@ -77,17 +78,10 @@ def simulate(
         vehicles=vehicles, days=days, first_day=first_day, frames=frames, rate_hz=rate_hz, rig=rig, seed=seed,
         environments=environments, container=container, faults=named, remount_deg=remount_deg,
     )  # fmt: skip
-    return _write(spec, out, reflectors, workers)
-
-
-def _write(spec: FleetSpec, out: Path, reflectors: bool, workers: int) -> int:
-    """Write logs and truth to `out`, and print the summary."""
-    from pipeline.simulate.reflectors import simulate_reflectors
-
     result = {
         "vehicles": spec.names,
         "days": spec.dates,
-        "frames": spec.vehicles * spec.days * spec.frames,
+        "frames": vehicles * days * frames,
         "logs": simulate_days(spec, out, "synthetic", workers),
         "fleet": str(out / "fleet.toml"),
         "truth": str(out / "truth"),
@@ -95,8 +89,7 @@ def _write(spec: FleetSpec, out: Path, reflectors: bool, workers: int) -> int:
     if reflectors:
         with progress_reporter("reflectors") as progress:
             result["reflectors"] = [
-                str(simulate_reflectors(spec, v, spec.days - 1, out, progress=progress))
-                for v in range(spec.vehicles)
+                str(simulate_reflectors(spec, v, days - 1, out, progress=progress)) for v in range(vehicles)
             ]
     print_summary("simulate", "done", **result)
     return 0

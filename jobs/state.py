@@ -65,7 +65,7 @@ def state(
     if vehicle is not None and not found:
         require_vehicle(tables, vehicle)
     if vehicle is None and (previous or sign_off is not None):
-        raise ConfigError("command line", "vehicle", "a sign-off is of one vehicle: give --vehicle")
+        raise ConfigError("command line", "vehicle", "sign off one vehicle at a time: give --vehicle")
     shown = current_states(found)
     if previous and vehicle is not None:
         shown = signed_state(tables, vehicle, method, before=True)

@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 
 __all__ = ["parse_duration", "train"]
 
-_NOT_VALIDATED = "not validated, so not fit for use: prepare a side val, and train in a new folder"
+_NOT_VALIDATED = (
+    "prepare a side val and train in a new folder: this network is not validated, so do not use it"
+)
 _UNIT_S = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
 
@@ -50,13 +52,13 @@ def train(  # options of the command
 ) -> int:
     """Train a calibration network, or with --task a network of perception; or continue the run in OUT.
 
-    Calibration learns from the table training (by `boresight prepare`). Several processes:
+    Calibration learns from the table training (written by `boresight prepare`). Several processes:
     `torchrun --nproc-per-node N $(which boresight) train ...`.
 
-    Lidar semantics learn from the camera, the radar's drivable area from the lidar. Labels come through the day's
-    prior; those of the lidar through the day's accepted calibration if there is one. Every fifth vehicle-day is held
-    out (at least one); of a single vehicle-day, its last fifth. A finished run has TASK.onnx and TASK.toml; set the
-    .toml in fleet.toml: `semantics = { source = "onnx", segmenter = "lidar_semantics.toml" }` under the rig's lidar,
+    Lidar semantics learn from the camera, the radar's drivable area from the lidar. The day's prior projects the
+    labels; for a lidar the day's accepted calibration does, if there is one. Every fifth vehicle-day is held out (at
+    least one); of a single vehicle-day, its last fifth. A finished run has TASK.onnx and TASK.toml. Name the .toml in
+    fleet.toml: `semantics = { source = "onnx", segmenter = "lidar_semantics.toml" }` under the rig's lidar,
     or `drivable = { source = "onnx", model = "radar_drivable.toml" }` under its radar.
 
     Args:

@@ -37,10 +37,10 @@ def view(
         lake: folder of the tables.
         vehicle: vehicle id.
         day: YYYY-MM-DD.
-        moment: which one, from 0; default: one with many road users.
-        state: of --out: calibrated, prior, or both side by side.
-        method: of the records.
-        out: draw into this PNG, without a window.
+        moment: number of the moment, from 0; default: one with many road users.
+        state: poses in the picture of --out: calibrated, prior, or both side by side.
+        method: calibration method of the records.
+        out: PNG to write instead of opening a window.
     """
     require("view")
     from pipeline.view.system import import_open3d, require_display, require_renderer

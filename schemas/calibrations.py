@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from itertools import combinations
 
 import numpy as np
 
@@ -23,12 +24,8 @@ __all__ = [
 ]
 
 SENSORS = ("camera", "lidar", "radar")
-PAIRS = ("camera_lidar", "camera_radar", "lidar_radar")
-FRAMES_OF_PAIR = {
-    "camera_lidar": ("camera", "lidar"),
-    "camera_radar": ("camera", "radar"),
-    "lidar_radar": ("lidar", "radar"),
-}
+FRAMES_OF_PAIR = {f"{parent}_{child}": (parent, child) for parent, child in combinations(SENSORS, 2)}
+PAIRS = tuple(FRAMES_OF_PAIR)
 METHODS = ("joint", "tracking", "pairwise-optimisation", "joint-optimisation", "pairwise-ssl", "joint-ssl")
 STATUSES = ("accepted", "held", "refused")
 # Beginnings and parts of reasons that more frames may clear: too few frames, or a sigma above the limit.

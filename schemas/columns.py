@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import Field, dataclass, field, fields
 from types import UnionType
-from typing import Any, Literal, TypeVar, dataclass_transform, get_args, get_type_hints
+from typing import Any, TypeVar, dataclass_transform, get_args, get_type_hints
 
 import numpy as np
 import pyarrow as pa
@@ -35,9 +35,6 @@ POSE_COLUMNS = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 
 Row = TypeVar("Row")
 
-ScalarKind = Literal["int64", "int32", "float64", "string", "bool", "binary", "list<string>", "list<float64>",
-                     "list<bool>", "map<string,float64>", "map<string,int64>"]  # fmt: skip
-
 # Kind -> its type in Arrow, and in JSON Schema.
 _TYPES: dict[str, tuple[pa.DataType, dict[str, Any]]] = {
     "int64": (pa.int64(), {"type": "integer"}),
@@ -58,7 +55,7 @@ _TYPES: dict[str, tuple[pa.DataType, dict[str, Any]]] = {
         {"type": "object", "additionalProperties": {"type": "integer"}},
     ),
 }
-_KINDS: dict[Any, ScalarKind] = {
+_KINDS: dict[Any, str] = {
     int: "int64",
     float: "float64",
     str: "string",
@@ -77,7 +74,7 @@ class Column:
     """One column. The name includes the unit; `shape` is set for arrays, with "N" for the free axis."""
 
     name: str
-    kind: ScalarKind
+    kind: str  # key of _TYPES
     doc: str
     nullable: bool = False
     dtype: str | None = None
@@ -117,13 +114,10 @@ class TableSchema:
     # as a whole.
     about: tuple[str, ...] = ()
     of_sensor: bool = False  # a partition has a file per sensor, joined by another table
-    columns: tuple[
-        Column, ...
-    ] = ()  # default: the fields of the row type in their order, inherited ones last
+    # The fields of the row type in their order, inherited ones last.
+    columns: tuple[Column, ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        if self.columns:
-            return
         bases = reversed([*enumerate(self.row_type.__mro__)])
         of_base = {name: k for k, base in bases for name in vars(base).get("__annotations__", ())}
         types = get_type_hints(self.row_type)
@@ -149,10 +143,10 @@ class TableSchema:
 
     def column(self, name: str) -> Column:
         """The column with this name; raises KeyError if the table has none."""
-        for column in self.columns:
-            if column.name == name:
-                return column
-        raise KeyError(f"table {self.name} has no column {name}")
+        found = {column.name: column for column in self.columns}
+        if name not in found:
+            raise KeyError(f"table {self.name} has no column {name}")
+        return found[name]
 
     def json_schema(self) -> dict[str, Any]:
         """JSON Schema (2020-12) of one row."""

@@ -23,49 +23,41 @@ REPO = Path(__file__).resolve().parent.parent
 SHARED = REPO.parent / "shared"
 
 
+def shared(path: str) -> Path:
+    """A folder or file of the shared data; the test is left out where they are absent."""
+    if not (SHARED / path).exists():
+        pytest.skip(f"the shared {path} is not on this machine")
+    return SHARED / path
+
+
 @pytest.fixture(scope="session")
 def real_logs() -> Path:
     """Folder with the recordings of the real vehicle-day."""
-    folder = SHARED / "data" / "astyx"
-    if not folder.is_dir():
-        pytest.skip("the real recordings are not on this machine")
-    return folder
+    return shared("data/astyx")
 
 
 @pytest.fixture(scope="session")
 def kitti_logs() -> Path:
     """Folder with the recording of a street of KITTI."""
-    folder = SHARED / "data" / "kitti"
-    if not folder.is_dir():
-        pytest.skip("the frames of KITTI are not on this machine")
-    return folder
+    return shared("data/kitti")
 
 
 @pytest.fixture(scope="session")
 def van_logs() -> Path:
     """Folder with a day of another simulator's van: two radars, two cameras, a lidar, odometry."""
-    folder = SHARED / "data" / "other_van"
-    if not folder.is_dir():
-        pytest.skip("the van's logs are not on this machine")
-    return folder
+    return shared("data/other_van")
 
 
 @pytest.fixture(scope="session")
 def real_detector() -> Path:
     """A real third-party ONNX detector."""
-    path = SHARED / "models" / "yolox_nano.onnx"
-    if not path.is_file():
-        pytest.skip("the real detector is not on this machine")
-    return path
+    return shared("models/yolox_nano.onnx")
 
 
 @pytest.fixture(scope="session")
 def real_segmenter() -> Path:
     """The real third-party ONNX segmenter that made the logged labels."""
-    path = SHARED / "models" / "espnetv2_city.onnx"
-    if not path.is_file():
-        pytest.skip("the real segmenter is not on this machine")
-    return path
+    return shared("models/espnetv2_city.onnx")
 
 
 @pytest.fixture(scope="session")

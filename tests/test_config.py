@@ -26,36 +26,40 @@ def test_a_small_file_is_enough_and_defaults_are_physical(tmp_path):
     assert fleet.rigs["default"].ego is None
 
 
+WRONG = {
+    "[ingest]\nsync_gate_s = 0": "ingest.sync_gate_s",
+    "[select]\nholdout_fraction = 1.0": "select.holdout_fraction",
+    "[rigs.default.prior]\nsource = 'file'": "prior",
+    "[rigs.default.prior]\nrotation_sigma_deg = 181": "prior.rotation_sigma_deg",
+    "[rigs.default.prior]\ntranslation_sigma_m = 1e9": "prior.translation_sigma_m",
+    "[audit]\nmethod = 'best'": "audit.method",
+    "[audit]\nwindow_days = 1_000_000_000": "audit.window_days",
+    "[perceive]\nlabel_scale = 1e-9": "perceive.label_scale",
+    "[solve]\nsearch_rotation_deg = 1e9": "solve.search_rotation_deg: 1e+09 deg",
+    "[solve]\nseed = -1": "solve.seed",
+}
+
+
 @pytest.mark.parametrize(
     ("change", "key"),
     [
+        *((("[fleet]", f"{section}\n[fleet]"), key) for section, key in WRONG.items()),
         (("[fleet]", "[fleet]\ncolour = 1"), "fleet.colour"),
-        (
-            ('points = "/radar/points"', 'points = "/radar/points"\ndoppler_period_mps = -1'),
-            "doppler_period_mps",
-        ),
+        (('"/radar/points"', '"/radar/points"\ndoppler_period_mps = -1'), "doppler_period_mps"),
         (('points = "/radar/points"', 'points = "radar"'), "radar.points"),
         (('source = "topics"', 'source = "magic"'), "semantics"),
         (('rig = "default"', 'rig = "other"'), "vehicles.car-1.rig"),
-        (("[fleet]", "[ingest]\nsync_gate_s = 0\n[fleet]"), "ingest.sync_gate_s"),
-        (("[fleet]", "[select]\nholdout_fraction = 1.0\n[fleet]"), "select.holdout_fraction"),
-        (("[fleet]", "[rigs.default.prior]\nsource = 'file'\n[fleet]"), "prior"),
         (('name = "tests"', ""), "fleet.name"),
-        (("[fleet]", "[audit]\nmethod = 'best'\n[fleet]"), "audit.method"),
-        (("[fleet]", "[audit]\nwindow_days = 1_000_000_000\n[fleet]"), "audit.window_days"),
-        (("[fleet]", "[perceive]\nlabel_scale = 1e-9\n[fleet]"), "perceive.label_scale"),
-        (("[fleet]", "[solve]\nsearch_rotation_deg = 1e9\n[fleet]"), "solve.search_rotation_deg: 1e+09 deg"),
-        (("[fleet]", "[rigs.default.prior]\nrotation_sigma_deg = 181\n[fleet]"), "prior.rotation_sigma_deg"),
-        (
-            ("[fleet]", "[rigs.default.prior]\ntranslation_sigma_m = 1e9\n[fleet]"),
-            "prior.translation_sigma_m",
-        ),
-        (("[fleet]", "[solve]\nseed = -1\n[fleet]"), "solve.seed"),
         (('points = "/radar/points"', 'points = "/lidar/points"'), "/lidar/points"),
-        (('[vehicles."car-1"]', '[vehicles."a/b"]'), "a/b"),
-        (('[vehicles."car-1"]', '[vehicles.""]'), "vehicle's name"),
-        (('[vehicles."car-1"]', '[vehicles."../../etc"]'), "../../etc"),
-        (('[vehicles."car-1"]', f'[vehicles."{300 * "v"}"]'), "vehicle's name"),
+        *(
+            (("car-1", name), said)
+            for name, said in (
+                ("a/b", "a/b"),
+                ("", "vehicle's name"),
+                ("../../etc", "../../etc"),
+                (300 * "v", "vehicle's name"),
+            )
+        ),
     ],
 )
 def test_what_cannot_be_right_is_refused_by_the_name_of_its_key(change, key, tmp_path):

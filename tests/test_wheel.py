@@ -9,6 +9,7 @@ import os
 import re
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -79,6 +80,17 @@ def wheel(tmp_path_factory):
     code = f"import hatchling.build, os; os.chdir({str(REPO)!r}); print(hatchling.build.build_wheel({str(folder)!r}))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     return folder / done.stdout.split()[-1]
+
+
+def test_a_wheel_holds_all_modules_and_data_files_and_nothing_else(wheel):
+    names = {n for n in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in n}
+    packages = {"jobs", "pipeline", "schemas"}
+    listed = subprocess.run(
+        ["git", "ls-files", *packages], cwd=REPO, capture_output=True, text=True, check=True
+    )
+    assert set(listed.stdout.split()) <= names
+    assert any(n.startswith("pipeline/report/templates/") for n in names)
+    assert {n.split("/")[0] for n in names} == packages
 
 
 @pytest.fixture(scope="module")

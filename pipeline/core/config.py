@@ -101,7 +101,7 @@ class FleetConfig(Section):
         for name, vehicle in self.vehicles.items():
             if not is_vehicle(name):
                 raise ValueError(
-                    f"{name!r} cannot be a vehicle's name: it becomes a folder name, so no / or =, and shorter"
+                    f"{name!r} cannot be a vehicle's name: use a shorter one without / and =, as for a folder"
                 )
             if vehicle.rig not in self.rigs:
                 raise ValueError(

@@ -82,7 +82,7 @@ class DamagedError(ContractError):
     """A file of a table that cannot be read; with the file moved away, its stage makes it again."""
 
     def __init__(self, path: str, problem: str) -> None:
-        super().__init__(path, f"is damaged, make it anew: {problem}")
+        super().__init__(path, f"is damaged: run its stage again ({problem})")
 
 
 class DamagedLogError(ContractError):
@@ -96,7 +96,7 @@ class CollectedError(DamagedError):
     """A partition whose rows were deleted at the end of their retention. Ingest makes them again."""
 
     def __init__(self, path: str, day: str) -> None:
-        ContractError.__init__(self, path, f"its rows left the lake on {day}: ingest the day's logs again")
+        ContractError.__init__(self, path, f"its rows were deleted on {day}: ingest the day's logs again")
 
 
 class MissingExtraError(BoresightError):
@@ -149,7 +149,7 @@ class TooMuchMemoryError(BoresightError):
     def __init__(self, gigabytes: float) -> None:
         self.gigabytes = gigabytes
         super().__init__(
-            f"needed more than {gigabytes:g} GB of memory (fleet.memory_gb): look for a damaged log, or raise it"
+            f"needed more than {gigabytes:g} GB of memory (fleet.memory_gb): look for a damaged log, or raise the limit"
         )
 
 

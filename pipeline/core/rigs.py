@@ -218,9 +218,7 @@ class RadarTopics(_Sensor):
     def _one_way_to_say_velocity(self) -> RadarTopics:
         both = {"doppler_field", "doppler_positive"} & self.model_fields_set
         if self.velocity_fields is not None and both:
-            raise ValueError(
-                f"velocity_fields stands in place of {' and '.join(sorted(both))}: leave one out"
-            )
+            raise ValueError(f"velocity_fields replaces {' and '.join(sorted(both))}: leave one out")
         return self
 
 

@@ -140,7 +140,7 @@ class SolveConfig(Section):
     @model_validator(mode="after")
     def _terms_differ_and_show_the_lidar(self) -> SolveConfig:
         if len(set(self.terms)) < len(self.terms):
-            raise ValueError(f"terms names one twice: {', '.join(self.terms)}")
+            raise ValueError(f"terms has an entry twice: {', '.join(self.terms)}")
         if not {"edges", "reflectivity"} & set(self.terms):
             raise ValueError("terms needs edges or reflectivity: no other term connects camera and lidar")
         if not {"static", "moving"} & set(self.terms):

@@ -59,7 +59,7 @@ def day_statuses(rows: Sequence[OutcomeRow], method: str | None = None) -> list[
         for vehicle in sorted(vehicles):
             current = stages.get((day, vehicle))
             if current is None:
-                reason = "no logs of this vehicle were found on a day on which others have some"
+                reason = "no logs of this vehicle were found, although other vehicles have some"
                 found.append(DayStatus(vehicle, day, "", "missing", reason=reason))
                 continue
             known = sorted({of for stage, of in current if stage == _LAST_STAGE}) or [""]
@@ -88,7 +88,11 @@ def _of_method(vehicle: str, day: str, method: str, rows: Sequence[OutcomeRow]) 
     said = failed or (refused if last is None or last.status == "refused" else None) or last
     if said is None:
         latest = max(own, key=lambda r: r.asserted_at)
-        status, reason, stage = "missing", f"no {_LAST_STAGE} after {latest.stage} yet", latest.stage
+        status, reason, stage = (
+            "missing",
+            f"the night ended after {latest.stage}, before {_LAST_STAGE}",
+            latest.stage,
+        )
     else:
         status, reason, stage = _status(said), said.reason, said.stage
     return DayStatus(

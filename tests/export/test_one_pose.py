@@ -280,4 +280,4 @@ def test_a_vehicle_without_any_usable_day_gets_its_priors_and_exit_code_4(lake, 
 def test_force_has_nothing_to_force_in_a_state(lake, tmp_path, capsys):
     said, files = export(capsys, lake, "van", "ros2", tmp_path / "out", "--force")
     assert (said.code, files) == (2, {})
-    assert "--force goes with --day" in said.summary["reason"]
+    assert "leave out --force" in said.summary["reason"]

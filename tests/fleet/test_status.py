@@ -52,7 +52,7 @@ def test_a_vehicle_that_others_drove_without_and_a_night_that_ended_early_are_mi
     found = statuses(row("a", "d1", "calibrate"), row("b", "d2", "ingest"))
     assert found["b", "d1", ""][0] == "missing"
     assert "no logs" in found["b", "d1", ""][1]
-    assert found["b", "d2", ""] == ("missing", "no calibrate after ingest yet")
+    assert found["b", "d2", ""] == ("missing", "the night ended after ingest, before calibrate")
 
 
 def test_methods_stand_apart_and_efforts_add_up():

@@ -48,7 +48,7 @@ def test_old_frames_leave_with_their_bytes_and_nothing_else_does(lake):
     [gone] = frames_before(lake)
     assert (gone.partition, gone.freed_bytes) == (OLD, size)
     assert [file.exists() for file in files] == [True, False, False, False]
-    with pytest.raises(CollectedError, match=r"left the lake on 2026-04-01: ingest the day's logs again"):
+    with pytest.raises(CollectedError, match=r"were deleted on 2026-04-01: ingest the day's logs again"):
         next(frames_of(lake, OLD))
     with pytest.raises(CollectedError):
         read_columns(lake, MOMENTS, OLD, ["moment"])

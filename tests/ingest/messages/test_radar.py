@@ -111,5 +111,5 @@ def test_velocity_components_give_the_range_rate_that_doppler_gives(kit):
 
 
 def test_doppler_and_velocity_components_cannot_both_be_named():
-    with pytest.raises(ValueError, match="velocity_fields stands in place of doppler_field"):
+    with pytest.raises(ValueError, match="velocity_fields replaces doppler_field"):
         config(velocity_fields=("vx", "vy"), doppler_field="v")
