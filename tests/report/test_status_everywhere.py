@@ -95,7 +95,7 @@ def test_a_red_vehicle_says_what_to_do_with_the_commands(lake, tmp_path, capsys)
     own = Lake.at(shutil.copytree(lake.root, tmp_path / "lake"))
     command = next_steps(rows, str(own.root))[0].split("`")[1]
     assert main(shlex.split(command)[1:]) == 0
-    assert "with the next night, or with `boresight audit`" in capsys.readouterr().out
+    assert "run `boresight audit`, or wait for the next night" in capsys.readouterr().out
     assert status_of(stored(own)["red"]).status == "RED"
     audit_fleet(own, _config())
     assert status_of(stored(own)["red"]).status == "UNKNOWN"  # its charts begin anew
