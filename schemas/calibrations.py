@@ -29,7 +29,7 @@ PAIRS = tuple(FRAMES_OF_PAIR)
 METHODS = ("joint", "tracking", "pairwise-optimisation", "joint-optimisation", "pairwise-ssl", "joint-ssl")
 STATUSES = ("accepted", "held", "refused")
 # Beginnings and parts of reasons that more frames may clear: too few frames, or a sigma above the limit.
-ASKS_FOR_FRAMES = ("too few frames", "too few held-out frames", "(1 sigma), not within ")
+ASKS_FOR_FRAMES = ("too few frames", "too few held-out frames", "is too large for ")
 # Start of the names in diagnostics of what held-out frames say of a turn of the result, e.g. probe_z_roll_-0.5 [deg].
 PROBE_Z = "probe_z_"
 # Order of the covariance and of every per-DoF list: left perturbation T <- exp(xi) T, rotation vector then

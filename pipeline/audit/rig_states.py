@@ -101,7 +101,7 @@ def rig_states(
     every_day = sorted({day for row in rows.values() for day in row.days})
     first = replace(
         empty, **_columns(identity), child_frame=reference.name, sensor=reference.name, kind=reference.kind,
-        status="current", reason="poses refer to it", days=every_day,
+        status="current", reason="it is the reference of all poses", days=every_day,
     )  # fmt: skip
     rows[reference.name] = first
     of_edges = [_edge_row(empty, edge, seen[edge], rows, poses, verify) for edge in edges]
@@ -236,7 +236,7 @@ def _with_claims(
     reach_deg = float(ndtri(0.5 + verify.confidence / 2)) * np.degrees(sigma_rad)
     limits_deg = np.degrees(verify.limits_rad(edge.kind))
     open_claims = [
-        f"{name} not certified: known to {np.degrees(sigma):.2f} deg (1 sigma), not within {most:.2f} deg at "
+        f"{name} not certified: its sigma of {np.degrees(sigma):.2f} deg is too large for {most:.2f} deg at "
         f"{100 * verify.confidence:.3g} %"
         for name, sigma, reach, most in zip(_DIRECTIONS, sigma_rad, reach_deg, limits_deg, strict=True)
         if reach > most

@@ -208,7 +208,7 @@ def _contradictions(
             found[f"{other.name} and the other edges"] = [other]
     checks = []
     for who, out in found.items():
-        sentence = f"{who} contradict each other, undecided which is wrong"
+        sentence = f"{who} contradict each other; which of them is wrong is undecided"
         around = _around(edge, out[0], rig, estimates) if len(out) == 1 else None
         if around is None:  # nobody knows by how much
             checks.append(Check(sentence, "witnesses_disagree"))

@@ -228,7 +228,7 @@ def _judged(
         held = [j.verdict for j in judged.values() if j.verdict.status != "accepted"]
         if pair in composed and held:
             disproved = any(v.disproved for v in held)
-            checks.append(Check("composed of a pair that is not accepted", disproves=disproved))
+            checks.append(Check("it is composed of a pair that is not accepted", disproves=disproved))
         judged[pair] = judging.pair(solution.pairs[pair], checks, together=pair in composed)
     return judged
 

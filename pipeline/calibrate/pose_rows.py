@@ -36,7 +36,7 @@ _OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 _AT_REFERENCE: dict[str, Any] = pose_columns(np.eye(4)) | {
     "covariance": np.zeros((6, 6)), "common_covariance": np.zeros((6, 6)),
-    "status": "accepted", "reason": "poses refer to it", "dt_s": 0.0,
+    "status": "accepted", "reason": "it is the reference of all poses", "dt_s": 0.0,
 }  # fmt: skip
 
 
@@ -81,7 +81,7 @@ def poses_of_records(about: Inputs, records: Sequence[CalibrationRecord]) -> lis
         "kind": kinds[reference],
         "sensor": reference,
         "status": "accepted",
-        "reason": "poses refer to it",
+        "reason": "it is the reference of all poses",
     }
     exact: dict[str, Any] = {"covariance": np.zeros((6, 6)), "common_covariance": np.zeros((6, 6))}
     first = PoseRow(**told, **own, **exact, **pose_columns(np.eye(4)), dt_s=0.0)
@@ -287,14 +287,14 @@ def _verdict(
     """Status and reason: a radar needs azimuth only, other sensors need both directions."""
     doubts = ", ".join(e.name for e in found.doubts)
     if doubts:
-        return "held", f"its edges contradict each other, undecided which is wrong: {doubts}"
+        return "held", f"its edges contradict each other; which of them is wrong is undecided: {doubts}"
     if not found.determined.any():
         return "held", "the day determines no degree of freedom: the pose stays at the prior"
     needed = ("azimuth",) if sensor.kind == "radar" else tuple(claims)
     said = [f"{sentence}: {' and '.join(names)} not certified" for sentence, names in doubted.items()]
     unsure = "; ".join(
-        f"{name} known to {np.degrees(c.sigma_rad):.2f} deg (1 sigma), not within {np.degrees(c.limit_rad):.2f} deg "
-        f"at {100 * c.confidence:g} %"
+        f"sigma of {name} is {np.degrees(c.sigma_rad):.2f} deg, too large for {np.degrees(c.limit_rad):.2f} deg at "
+        f"{100 * c.confidence:g} %"
         for name, c in claims.items()
         if c.margin < 0
     )

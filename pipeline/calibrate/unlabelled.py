@@ -15,7 +15,7 @@ from schemas.poses import PoseRow
 __all__ = ["noted", "notes_of_pair", "unlabelled_pairs"]
 
 # Checks of camera-lidar with labels that need what such a camera lacks.
-_UNCHECKED: Final = "no road users were detected: neither their boxes nor a radar check the pose"
+_UNCHECKED: Final = "no road users were detected: neither boxes nor a radar confirm the pose"
 
 
 def unlabelled_pairs(

@@ -47,7 +47,7 @@ class WrongPrior:
     @property
     def sentence(self) -> str:
         """For what rests on it."""
-        return f"the prior pose of {self.sensor}, on which it rests, is contradicted by {self.edge.name}"
+        return f"it depends on the prior pose of {self.sensor}, which {self.edge.name} contradicts"
 
     def error(self, rig: AdjustedRig, a: str, b: str) -> Float[np.ndarray, " 6"]:
         """By how much T_a_b of the adjusted rig would be wrong, as left perturbation [rad, m]."""

@@ -105,7 +105,7 @@ def attribute(shifts: Mapping[Edge, PairShift], known_by: float = np.inf) -> Att
     if len(shifts) < 2:
         names = [sensor.name for edge in shifts for sensor in edge.sensors]
         return Attribution(
-            f"{' or '.join(names) or 'any sensor'}: only one pair has data, which does not tell its sensors apart"
+            f"{' or '.join(names) or 'any sensor'}: only one pair has data, so its sensors cannot be distinguished"
         )
     total = sum(float(s.xi @ np.linalg.solve(s.covariance, s.xi)) for s in shifts.values())
     sensors = sorted(
@@ -122,10 +122,10 @@ def attribute(shifts: Mapping[Edge, PairShift], known_by: float = np.inf) -> Att
         moved = {best: Moved(probability[best], motion, covariance)}
         return Attribution(f"the {best} moved", moved, probability)
     if not explains and (two := _two(names, weighed, total, known_by)):
-        return Attribution(f"the {' and the '.join(two)} moved, each for itself", two, probability)
+        return Attribution(f"the {' and the '.join(two)} moved separately", two, probability)
     if probability[best] < _CLEAR_PROBABILITY:
         rivals = [name for name in names if probability[name] > 1 - _CLEAR_PROBABILITY]
-        return Attribution(f"cannot tell {' from '.join(rivals)}", {}, probability)
+        return Attribution(f"{' and '.join(rivals)} cannot be distinguished", {}, probability)
     text = f"no single sensor explains it ({best} comes nearest): several moved, or sigmas are too small"
     return Attribution(text, {}, probability)
 

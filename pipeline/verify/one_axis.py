@@ -154,7 +154,7 @@ def _status(
             why = f"held-out frames align as well with an error of {asked}"
         return "inconclusive", f"{distance}. This log cannot prove it: {why}"
     if is_measured:
-        return "warn", f"{distance}: more than chance, within the limit of {_deg(limits.limit_rad)}"
+        return "warn", f"{distance}: significant, but within the limit of {_deg(limits.limit_rad)}"
     return "pass", distance
 
 

@@ -201,7 +201,7 @@ def test_a_leaf_and_the_only_sensor_that_it_meets_are_not_told_apart():
     shifts[alone] = PairShift(exp_se3(rng.normal(size=6)), np.r_[0.01, np.zeros(5)], np.eye(6) * 1e-7)
     found = attribute(shifts)
     assert found.sensor is None
-    assert found.explanation == "cannot tell rear from tail"
+    assert found.explanation == "rear and tail cannot be distinguished"
 
 
 def test_a_vehicle_frame_that_moved_against_all_sensors_is_told_from_a_reference_that_moved():

@@ -21,7 +21,7 @@ from tests.makers.rig_records import EDGES, POSE_SIGMA, T_TOP, pose_rows
 TURN = np.array([0.0, np.radians(0.5), 0.0, 0.0, 0.0, 0.0])
 LAST = "2026-03-30"
 MOUNT = Mount(np.array([*np.radians([0.01] * 3), 0.001, 0.001, 0.001]), np.zeros(6), 0.0)
-REFUSED = {"status": "refused", "reason": "no edge of it can be used", "covariance": None, "qw": None}
+REFUSED = {"status": "refused", "reason": "none of its edges can be used", "covariance": None, "qw": None}
 
 
 def states(lake, rows, events=(), findings=(), edges=()):
@@ -85,7 +85,7 @@ def test_a_sensor_without_a_usable_day_is_at_its_prior_with_what_its_last_day_sh
     left = rows["left"]
     assert (left.status, left.days, left.determined) == ("prior", [], [])
     np.testing.assert_allclose(transform_of(left), T_TOP["left"], atol=1e-12)
-    assert left.reason == "no usable day; 2026-03-04 refused: no edge of it can be used"
+    assert left.reason == "no usable day; 2026-03-04 refused: none of its edges can be used"
     assert rows["front"].status == "current"
     assert [rows[edge].status for edge in (("left", "top"), ("front", "top"))] == ["prior", "current"]
     assert "left is at its prior" in rows["left", "top"].reason
@@ -147,7 +147,7 @@ def test_the_sensor_that_the_audit_found_moved_begins_anew_and_the_others_keep_t
     for name in ("front", "left", "bumper", "corner"):
         assert rows[name].days == (days(4, 5, 6, 7) if name in anew else days(*range(1, 8)))
         assert (" moved" in rows[name].reason) == (name in anew)
-        assert ("undecided which" in rows[name].reason) == (name in anew and moved is None)
+        assert ("is undecided" in rows[name].reason) == (name in anew and moved is None)
 
 
 def test_too_few_days_for_a_chart_still_show_a_knock_and_the_state_is_that_of_after_it(lake):

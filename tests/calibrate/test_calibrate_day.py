@@ -193,7 +193,7 @@ def test_the_verdicts_thresholds_are_those_of_the_configuration(tmp_path, day):
     result = calibrate_day(DAY, strict, lake, method="pairwise-optimisation")
     assert result.kept["accepted"] == 0
     records = [r for r in result.records if isinstance(r, CalibrationRecord)]
-    assert all("prior sigmas" in r.reason for r in records)
+    assert all("sigmas of the prior" in r.reason for r in records)
 
 
 @pytest.mark.parametrize(

@@ -70,7 +70,7 @@ def test_a_radar_within_its_prior_is_accepted_for_its_azimuth_and_used():
 
 
 @pytest.mark.parametrize(
-    ("off_deg", "words"), [(9.0, "yaw moved 4."), (25.0, "beyond the search range"), (179.0, "")]
+    ("off_deg", "words"), [(9.0, "yaw moved by 4."), (25.0, "beyond the search range"), (179.0, "")]
 )
 def test_a_radar_far_from_its_prior_is_held_names_the_prior_and_is_not_used(off_deg, words):
     _, prior, evidence = radar_day(off_deg)
@@ -89,7 +89,8 @@ def test_a_sensor_that_turned_in_its_bracket_is_not_shifted_by_its_lever_arm():
 
 
 @pytest.mark.parametrize(
-    ("rpy_deg", "z_m", "words"), [((0, 0, 0), 0.5, "moved 0.50 m, beyond"), ((0, 9, 0), 0, "pitch moved 4.5")]
+    ("rpy_deg", "z_m", "words"),
+    [((0, 0, 0), 0.5, "0.50 m off the prior, beyond"), ((0, 9, 0), 0, "pitch moved by 4.5")],
 )
 def test_a_lidar_far_from_its_prior_is_held(rpy_deg, z_m, words):
     T, edge = turned(np.eye(4), xyz_m=(1.2, 0.0, 1.8)), Edge(TOP, BASE)
@@ -110,7 +111,7 @@ def test_scenes_that_contradict_a_fit_hold_it_by_what_they_would_move_and_name_i
 
     found, record = beside(0.5)
     assert (record.status, record.faults, record.determined) == ("held", ["witnesses_disagree"], [])
-    assert "azimuth is 0.50 deg off by held-out frames" in record.reason
+    assert "azimuth: held-out frames put it 0.50 deg off" in record.reason
     assert found.against
     assert beside(0.1)[1].status == "accepted"  # two sigmas
     assert beside(0.2)[1].status == "accepted"  # four, and within the limit

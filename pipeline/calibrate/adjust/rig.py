@@ -262,7 +262,7 @@ def _left(equations: Equations, edge: LinearEdge) -> float:
 
 
 def _contradiction(edge: Edge, rivals: Collection[Edge], sigmas: float) -> Check:
-    others = "" if not rivals else f", or {', '.join(e.name for e in rivals)} is wrong"
+    others = "" if not rivals else f"; it or {', '.join(e.name for e in rivals)} is wrong"
     return Check(
         f"{edge.name} contradicts the other edges by {sigmas:.1f} sigmas{others}",
         "witnesses_disagree",
@@ -317,10 +317,10 @@ def _untied(graph: RigGraph, sensor: Sensor, used: Sequence[Edge]) -> str:
     with_it = [s.name for part in in_use.components() if sensor in part for s in part if s != sensor]
     if not with_it:
         lost = ", ".join(e.name for e in graph.edges_of(sensor))
-        return f"no edge of it can be used: {lost}" if lost else "shares nothing with another sensor"
+        return f"none of its edges can be used: {lost}" if lost else "it shares no view with another sensor"
     return (
-        f"nothing ties it, {', '.join(with_it)} to the reference {graph.reference.name}: "
-        "what joins them is the prior"
+        f"no usable edge joins it and {', '.join(with_it)} to the reference {graph.reference.name}: "
+        "only the prior does"
     )
 
 

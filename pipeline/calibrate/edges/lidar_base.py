@@ -223,7 +223,7 @@ def _with_measured(
     if not np.isfinite(variance):
         return off_m, sigma_m**2, []
     apart = abs(off_m - change) / np.sqrt(variance + sigma_m**2 + STANCE[3] ** 2 + _RANGES_M**2)
-    told = f"the road shows a height {100 * (change - off_m):+.0f} cm beside the measured one"
+    told = f"the road shows a height {100 * (change - off_m):+.0f} cm off the measured one"
     checks = [Check(told, "witnesses_disagree")] if apart > _MEASURED_SIGMAS else []
     total = 1 / (1 / variance + 1 / sigma_m**2)
     return total * (change / variance + off_m / sigma_m**2), total, checks

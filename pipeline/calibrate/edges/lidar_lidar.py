@@ -287,7 +287,7 @@ def _other_ends(ends: Sequence[_End]) -> tuple[Check, ...]:
         for other in ends[1:]
         if rotation_angle_rad(inverse(best.X) @ other.X) > _APART_RAD and other.share > _NEARLY * best.share
     ]
-    told = "another start leads to another pose with as many matching points"
+    told = "a search from another start ends at another pose with as many matching points"
     return (Check(told, "witnesses_disagree"),) if apart else ()
 
 

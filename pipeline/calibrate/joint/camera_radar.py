@@ -120,7 +120,9 @@ def estimate_camera_radar(
     notes = ["translation stays at the prior"]
     if rival > _SCHEDULE.rival_share:
         after = _with_open_azimuth(after, prior_covariance)
-        notes.append(f"azimuth is open: another turn matches {rival:.0%} as many moving clusters to boxes")
+        notes.append(
+            f"azimuth is not determined: another rotation matches {rival:.0%} as many moving clusters to boxes"
+        )
     frames = len(np.unique(seen.clusters.frame))
     diagnostics = {
         "box_sigma_rad": last.box_sigma_rad,

@@ -176,10 +176,10 @@ def missing_content(observations: Sequence[Observation], pair: str) -> list[str]
     missing = []
     speeds = np.array([abs(o.ego_speed_mps) for o in observations if o.ego_speed_mps is not None])
     if len(speeds) and np.mean(speeds > _BRISK_MPS) < _SCARCE:
-        missing.append(f"drive faster than {_BRISK_MPS:.0f} m/s: time offsets stay unknown without")
+        missing.append(f"drive faster than {_BRISK_MPS:.0f} m/s: slower frames do not determine time offsets")
     if "radar" in FRAMES_OF_PAIR[pair]:
         if np.mean([len(o.radar_track_xyz_m) > 0 for o in observations]) < _SCARCE:
-            missing.append("drive where others drive: the radar hardly sees moving road users")
+            missing.append("drive in traffic: the radar hardly sees moving road users")
         if not any(o.radar_has_elevation for o in observations):
             missing.append(
                 "no drive determines roll, pitch and height of this radar: it measures no elevation"
@@ -189,7 +189,7 @@ def missing_content(observations: Sequence[Observation], pair: str) -> list[str]
         and not any(o.is_unlabelled for o in observations)
         and np.mean([len(o.road_user_boxes_px) > 0 for o in observations]) < _SCARCE
     ):
-        missing.append("drive where others drive: the images hardly show road users")
+        missing.append("drive in traffic: the images hardly show road users")
     if len(np.unique(scenes_of(observations))) < FEWEST_SCENES:
         missing.append("drive some 100 m further: the frames show the same street from the same place")
     return missing + missing_in_view(observations, pair)
@@ -287,7 +287,7 @@ def _silent(pair: str, observations: Sequence[Observation], absent: Mapping[str,
         return SolveError(unlabelled, fault="no_labels")
     if known and len(observations) < MIN_FRAMES:
         both = sum(set(FRAMES_OF_PAIR[pair]) <= set(o.sensors) for o in observations)
-        told = f"{both} moments have both sensors, {MIN_FRAMES} are needed ({known[0]})"
+        told = f"only {both} moments have both sensors, {MIN_FRAMES} are needed ({known[0]})"
         return SolveError(told, fault=_fault_in(known[0]))
     for sensor in FRAMES_OF_PAIR[pair]:
         seen = sum(sensor in o.sensors for o in observations)
@@ -305,5 +305,5 @@ def _fault_in(why: str) -> str:
 
 def _too_few(pair: str, chosen: Sequence[int], reasons: Sequence[Sequence[str]], fewest: int) -> str:
     counts: Mapping[str, int] = Counter(r for unmet in reasons for r in unmet)
-    why = ", ".join(f"{name} {n}" for name, n in sorted(counts.items())) or "the day is that short"
+    why = ", ".join(f"{name} {n}" for name, n in sorted(counts.items())) or "the day has no more frames"
     return f"too few frames: {pair} has {len(chosen)} of {len(reasons)}, needs {fewest} ({why})"

@@ -70,7 +70,7 @@ def prior_alarms(
     return {
         pair: [
             Check(
-                f"the day itself puts {DOF_NAMES[k]} {shift:+.2f} +- {own_positions(estimate)[k][1]:.2f} m from the"
+                f"by this day alone {DOF_NAMES[k]} is {shift:+.2f} +- {own_positions(estimate)[k][1]:.2f} m off the"
                 f" prior, whose sigma is {sigma_m:g} m: measure the mounting",
                 "prior",
             )
@@ -120,7 +120,7 @@ def clock_alarms(
             shown = f"the stamps are apart by {shown} ({1e3 * sigma_s:.0f} ms)"
         else:
             continue
-        out[pair] = [Check(f"{shown}: set the clocks, or state how far they may be off", "time_offset")]
+        out[pair] = [Check(f"{shown}: synchronise the clocks, or raise time_offset_sigma_s", "time_offset")]
     return out
 
 

@@ -97,8 +97,8 @@ class LabelOffset:
             self.shift_px, self.shift_sigma_px, self.ends_px, self.ends_sigma_px
         )  # fmt: skip
         return (
-            f"it is {u:+.1f} +- {su:.1f} label px right and {v:+.1f} +- {sv:.1f} down of them in the middle, "
-            f"{a:+.1f} +- {sa:.1f} and {b:+.1f} +- {sb:.1f} more at the right and lower end"
+            f"in the middle it lies {u:+.1f} +- {su:.1f} label px right of them and {v:+.1f} +- {sv:.1f} px below, "
+            f"at the right and lower end {a:+.1f} +- {sa:.1f} and {b:+.1f} +- {sb:.1f} px more"
         )
 
 
@@ -212,7 +212,7 @@ def _half_width_px(day: list[np.ndarray], at: Float[np.ndarray, " 4"]) -> float:
 # one that differs over the image, or one that the day does not show well leaves the labels as they are.
 
 
-_CAUSES = "padding, resize or another image in the segmenter?"
+_CAUSES = "check padding, resizing and the image that the segmenter was given"
 
 
 @dataclass(frozen=True, eq=False)

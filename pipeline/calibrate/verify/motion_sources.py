@@ -225,8 +225,8 @@ def _wrong_axes(observations: Sequence[Observation], T_lidar_radar: np.ndarray) 
     met, how = max((_met(observations, T), how) for how, T in tried.items())
     if met < max(_LEAST_MET, _MORE * as_given):
         return []
-    shown = f"{met:.0%} of the radar's detections meet the lidar where {how}, {as_given:.0%} as given"
-    return [Check(f"{shown}: mend its axes or its transform", "orientation")]
+    shown = f"{met:.0%} of the radar's detections match the lidar if {how}, {as_given:.0%} as given"
+    return [Check(f"{shown}: correct its axes or its transform", "orientation")]
 
 
 def _lidar_agrees(slopes: dict[str, _Slope]) -> bool:

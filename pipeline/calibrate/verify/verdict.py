@@ -175,19 +175,19 @@ def _moves_little(result: EdgeResult, limits: ChecksConfig) -> list[Check]:
     worst = int(np.argmax(ratio))
     return [
         Check(
-            f"moved {np.degrees(rotation):.1f} deg, beyond the search range",
+            f"the result is {np.degrees(rotation):.1f} deg off the prior, beyond the search range",
             margin=1 - rotation / reach,
             disproves=True,
             fault="prior",
         ),
         Check(
-            f"moved {translation:.2f} m, beyond the search range",
+            f"the result is {translation:.2f} m off the prior, beyond the search range",
             margin=1 - translation / search.translation_m,
             disproves=True,
             fault="prior",
         ),
         Check(
-            f"{result.names[worst]} moved {ratio[worst]:.1f} prior sigmas",
+            f"{result.names[worst]} moved by {ratio[worst]:.1f} sigmas of the prior",
             margin=float(1 - ratio[worst] / limits.max_move_prior_sigmas),
             fault="prior",
         ),
@@ -212,8 +212,8 @@ def _aligns_better(
     name, ratio = _largest_move(result)
     same = 1 - ratio / limits.prior_agreement_sigmas
     better = (-test.z - limits.better_alignment_z) / limits.better_alignment_z
-    moved = f"{name} moved {ratio:.1f} of its sigmas"
-    sentence = f"{moved}, and held-out frames align no better (z = {test.z:.1f})"
+    moved = f"{name} moved by {ratio:.1f} of its sigmas"
+    sentence = f"{moved}, but held-out frames do not align better (z = {test.z:.1f})"
     return Check(sentence, margin=min(1.0, max(same, better, near)))
 
 
@@ -261,7 +261,7 @@ def _claims_hold(result: EdgeResult, claims: Mapping[str, Claim]) -> list[Check]
     """
     needed = KIND_OF_EDGE[result.kind].required
     checks = {
-        name: Check(f"{name} is {_known(claim)}", margin=claim.margin, of_sigma=not claim.is_exceeded)
+        name: Check(f"{name}: {_known(claim)}", margin=claim.margin, of_sigma=not claim.is_exceeded)
         for name, claim in claims.items()
     }
     if needed is not None:
@@ -275,9 +275,9 @@ def _claims_hold(result: EdgeResult, claims: Mapping[str, Claim]) -> list[Check]
 
 
 def _known(claim: Claim) -> str:
-    off = f"{_deg(claim.shift_rad)} off by held-out frames and " if claim.is_exceeded else ""
-    within = f"not within {_deg(claim.limit_rad)} at {100 * claim.confidence:.3g} %"
-    return f"{off}known to {_deg(claim.sigma_rad)} (1 sigma), {within}"
+    off = f"held-out frames put it {_deg(claim.shift_rad)} off, and " if claim.is_exceeded else ""
+    limit = f"{_deg(claim.limit_rad)} at {100 * claim.confidence:.3g} %"
+    return f"{off}its sigma of {_deg(claim.sigma_rad)} is too large for {limit}"
 
 
 def _reservations(result: EdgeResult, claims: Mapping[str, Claim]) -> list[str]:

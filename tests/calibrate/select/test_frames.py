@@ -104,7 +104,7 @@ def test_what_the_drive_lacks_is_said_per_pair(day):
     assert "time offsets" in missing_content(slow, "camera_lidar")[0]
     assert "no elevation" in missing_content(slow, "lidar_radar")[1]
     empty = [replace(o, radar_track_xyz_m=np.zeros((0, 3), np.float32)) for o in day]
-    assert "drive where others drive: the radar hardly sees moving road users" in missing_content(
+    assert "drive in traffic: the radar hardly sees moving road users" in missing_content(
         empty, "lidar_radar"
     )
 

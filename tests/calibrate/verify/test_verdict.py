@@ -151,15 +151,15 @@ def test_a_result_near_its_prior_is_held_where_held_out_frames_may_lead_beyond_t
         (estimate(shift_m=0.1), WORSE, False, "held", "align worse"),  # .25 deg of targets 25 m away
         (estimate(shift_m=0.005), WORSE, False, "accepted", ""),
         (estimate(0.2), SAME, False, "accepted", ""),  # agrees with the prior
-        (estimate(1.0), SAME, False, "held", "ry moved 10.0 of its sigmas"),
+        (estimate(1.0), SAME, False, "held", "ry moved by 10.0 of its sigmas"),
         (estimate(1.0, observable=[1, 0, 1, 1, 1, 1]), SAME, False, "accepted", "not determined by the day: ry"),
         (estimate(0.0, observable=[0] * 6), SAME, False, "held", "no degree of freedom"),
         (replace(estimate(0.03), covariance=SURER), SAME, False, "accepted", ""),  # six sigmas that do not matter
-        (replace(estimate(0.3), covariance=SURER), SAME, False, "held", "align no better"),
+        (replace(estimate(0.3), covariance=SURER), SAME, False, "held", "do not align better"),
         (estimate(1.0), None, False, "held", ""),
         (estimate(1.0), replace(BETTER, frames=2), False, "held", "too few held-out frames"),
         (estimate(11.0), BETTER, False, "held", "beyond the search range"),
-        (estimate(8.5), BETTER, False, "held", "prior sigmas"),
+        (estimate(8.5), BETTER, False, "held", "sigmas of the prior"),
         (estimate(0.5, 0.31), BETTER, False, "held", "beyond the search range"),
         # Where others have a say, two turns within the search range may add up to more than one range,
         (estimate(12.0, 0.4), BETTER, True, "accepted", ""),
@@ -178,7 +178,7 @@ def test_moves_are_accepted_by_how_far_they_lead_and_how_held_out_frames_align(
     found = verdict(result, test, together=together)
     assert found.status == status
     assert words in found.reason
-    assert (found.faults == ("prior",)) == (words in {"beyond the search range", "prior sigmas"})
+    assert (found.faults == ("prior",)) == (words in {"beyond the search range", "sigmas of the prior"})
 
 
 def test_what_a_check_shows_to_be_wrong_is_told_from_what_is_only_unproved():
@@ -211,9 +211,9 @@ def claim(sigma_deg, shift_deg=0.0, shift_sigma_deg=0.1):
 def test_what_the_purpose_needs_more_exactly_than_it_is_known_is_held_but_for_a_radars_elevation():
     found = verdict(estimate(1.5), BETTER, claims=SURE | {"azimuth": claim(0.3)})
     assert found.status == "held"
-    assert found.reason == "azimuth is known to 0.30 deg (1 sigma), not within 0.20 deg at 99.5 %"
-    off = "0.15 deg off by held-out frames"
-    for elevation, words in ((claim(0.5), "known to 0.50 deg"), (claim(0.05, 0.15, 0.04), off)):
+    assert found.reason == "azimuth: its sigma of 0.30 deg is too large for 0.20 deg at 99.5 %"
+    off = "held-out frames put it 0.15 deg off"
+    for elevation, words in ((claim(0.5), "its sigma of 0.50 deg"), (claim(0.05, 0.15, 0.04), off)):
         claims = SURE | {"elevation": elevation}
         assert verdict(estimate(1.5), BETTER, claims=claims).status == "held"
         found = verdict(estimate(1.5, pair="lidar_radar"), BETTER, claims=claims)
@@ -228,7 +228,7 @@ def test_a_shift_that_contradicts_by_its_sigmas_holds_where_it_matters_against_t
     found = verdict(estimate(1.5), BETTER, claims=off)
     assert found.status == status
     assert not found.unsure_only
-    assert ("elevation is 0.15 deg off by held-out frames" in found.reason) == (status == "held")
+    assert ("elevation: held-out frames put it 0.15 deg off" in found.reason) == (status == "held")
 
 
 def test_a_sigma_that_held_out_frames_exceed_is_not_only_too_large():
@@ -273,10 +273,10 @@ def test_a_day_held_for_its_sigma_counts_in_the_state_and_one_that_is_too_short_
 @pytest.mark.parametrize(
     ("change", "turn_deg", "after", "words"),
     [
-        ({"max_move_prior_sigmas": 0.5}, 1.5, 0.8, "prior sigmas"),
+        ({"max_move_prior_sigmas": 0.5}, 1.5, 0.8, "sigmas of the prior"),
         ({"worse_alignment_z": 0.5}, 0.2, 1.02, "align worse"),
-        ({"better_alignment_z": 3.0}, 1.5, 0.95, "align no better"),
-        ({"prior_agreement_sigmas": 1.0}, 0.2, 0.99, "align no better"),
+        ({"better_alignment_z": 3.0}, 1.5, 0.95, "do not align better"),
+        ({"prior_agreement_sigmas": 1.0}, 0.2, 0.99, "do not align better"),
         ({"min_fit_frames": 51}, 1.5, 0.8, "needs 51"),
         ({"min_held_out_frames": 21}, 1.5, 0.8, "needs 21"),
     ],

@@ -99,21 +99,21 @@ def notes_of(analysis: ObservabilityAnalysis, *, has_elevation: bool) -> list[st
         notes.append(f"not determined by this day, kept at the prior: {', '.join(_NAMES[fixed[:6]])}")
     dt_sigma_s = float(np.sqrt(analysis.covariance[DT, DT]))
     if fixed[DT]:
-        notes.append("time offset not determined by this day, kept at what its stamps' constant gap suggests")
+        notes.append("time offset: not determined by this day; the constant gap of its stamps is kept")
     elif dt_sigma_s > _DT_UNSURE_S:
         notes.append(
-            f"time offset known to {1e3 * dt_sigma_s:.0f} ms only: where the car keeps one speed, x looks the same"
+            f"time offset known to {1e3 * dt_sigma_s:.0f} ms only: at constant speed a shift in x has the same effect"
         )
     notes.append("vehicle boxes are not used: roll and pitch depend on the registration and the prior")
     if linear.travel_frames:
         notes.append(
-            "radar pitch assumes that the car drives along its road, as the lidar sees it under the car"
+            "radar pitch assumes that the car drives parallel to the road that the lidar sees under it"
         )
     if analysis.heights is not None:
         notes.append(
-            f"radar pitch allows for detections between things and their mirror images in the road: a share of "
-            f"{analysis.heights.displaced:.2f} of those of low things, which this day determines to "
-            f"{np.degrees(analysis.heights.floor_rad):.2f} deg of pitch"
+            f"{analysis.heights.displaced:.0%} of the detections of low objects lie between the object and its mirror "
+            f"image in the road; radar pitch allows for them, with a sigma of "
+            f"{np.degrees(analysis.heights.floor_rad):.2f} deg"
         )
     disagreement = contradiction(analysis.sources)
     if disagreement is not None:

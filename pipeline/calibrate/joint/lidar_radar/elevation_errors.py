@@ -295,7 +295,7 @@ def contradiction(sources: Sequence[PartTurn]) -> Contradiction | None:
         f"{w.name} {np.degrees(w.offset_rad):+.2f} +- {np.degrees(w.sigma_rad):.2f} deg" for w in sources
     )
     sentence = (
-        f"sources of radar pitch contradict each other ({said}): its sigma is {factor:.1f} times as wide"
+        f"sources of radar pitch contradict each other ({said}): its sigma is multiplied by {factor:.1f}"
     )
     return Contradiction(factor, sentence)
 
