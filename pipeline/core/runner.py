@@ -162,7 +162,7 @@ def _replace_partition(stage: Stage, task: Task, work: Work, run: Run) -> Outcom
         with (
             at_most(task.fleet.fleet.memory_gb),
             closing(work.rows(run)) as rows,
-            write(task.lake, schema, task.partition, run.work_key, CODE_VERSION, run.inputs) as out,
+            write(task.lake, schema, task.partition, run.work_key, run.inputs) as out,
         ):
             if isinstance(out, MomentWriter):
                 for moment, captures in rows:

@@ -79,7 +79,6 @@ def write_moments(
     schema: TableSchema,
     partition: Partition,
     work_key: str,
-    code_version: str,
     inputs: Iterable[str] = (),
 ) -> Iterator[MomentWriter]:
     """Replace the moments of a vehicle-day and the files of its sensors; on an error the old ones stay.
@@ -94,8 +93,8 @@ def write_moments(
         yield writer
         index.append(writer.moments)
         for file in writer.files.values():
-            file.close(work_key, code_version)
-        index.close(work_key, code_version, inputs)
+            file.close(work_key)
+        index.close(work_key, inputs)
         lake.files.delete(path)
     kept = {lake.file(f.schema.name, partition, sensor) for sensor, f in writer.files.items()}
     for gone in set(sensor_files(lake, schema, partition)) - kept:  # of sensors that the day no longer has

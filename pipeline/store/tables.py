@@ -17,6 +17,7 @@ from pipeline.store.parquet_file import opened_parquet
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.rows import from_table, to_table
 from schemas.columns import TableSchema
+from schemas.versions import CODE_VERSION
 
 __all__ = [
     "COLLECTED",
@@ -100,10 +101,10 @@ class PartitionWriter:
         """Set counts and texts of the manifest."""
         self.manifest_fields = {"kept": kept, "rejected": rejected, "remarks": remarks, "extra": extra}
 
-    def close(self, work_key: str, code_version: str, inputs: Iterable[str] = ()) -> None:
+    def close(self, work_key: str, inputs: Iterable[str] = ()) -> None:
         """Write the remaining rows, then the manifest."""
         self._write_held()
-        of = self.schema.name, self.schema.version, work_key, code_version, list(inputs), self.rows
+        of = self.schema.name, self.schema.version, work_key, CODE_VERSION, list(inputs), self.rows
         self.seal(Manifest(*of, **self.manifest_fields))
 
     def seal(self, manifest: Manifest) -> None:
@@ -133,13 +134,12 @@ def write_partition(
     schema: TableSchema,
     partition: Partition,
     work_key: str,
-    code_version: str,
     inputs: Iterable[str] = (),
 ) -> Iterator[PartitionWriter]:
     """Replace one partition as a whole, atomically; on an error the old file stays."""
     with opened_for_writing(lake, lake.file(schema.name, partition), schema) as writer:
         yield writer
-        writer.close(work_key, code_version, inputs)
+        writer.close(work_key, inputs)
 
 
 def write_manifest(lake: Lake, schema: TableSchema, partition: Partition, manifest: Manifest) -> None:

@@ -32,7 +32,7 @@ AROUND = np.random.default_rng(7).uniform((-30, -30, -1), (30, 30, 2), (60, 3)).
 
 
 def write(lake, table, made):
-    with write_moments(lake, table, DAY, "key", "test") as writer:
+    with write_moments(lake, table, DAY, "key") as writer:
         for k in range(COUNT):
             moment, _ = joined_of(made(k))
             rows = {

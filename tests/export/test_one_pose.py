@@ -83,7 +83,7 @@ def lake(tmp_path_factory, fleet):
     write_frames(tables, Partition("car", LAST), [], "key", frame_ids=FRAME_IDS, tf_static=to_rows([LOGGED]))
     write_observations(tables, Partition("car", LAST), [seen], "key")
     moment, parts = joined_of(seen)
-    with write_moments(tables, PERCEIVED, Partition("van", LAST), "key", "test") as writer:
+    with write_moments(tables, PERCEIVED, Partition("van", LAST), "key") as writer:
         writer.append(moment, {name: parts[kind] for name, kind in SENSORS["van"].items()})
         writer.describe(kept={"frames": 1}, rejected={})
     return tables.root

@@ -58,12 +58,6 @@ def test_as_many_bursts_are_chosen_as_asked_for_each_once_and_in_order(possible,
     assert chosen == choose_bursts(drive, count)
 
 
-def test_nothing_known_of_the_motion_leaves_bursts_spread_over_time():
-    chosen = choose_bursts(np.full((60, 4), np.nan), 20)
-    assert np.all(np.diff(chosen) <= 5)
-    assert np.bincount(np.array(chosen) // 3, minlength=20).tolist() == [1] * 20
-
-
 def test_of_a_day_that_mostly_stood_the_driven_part_is_read():
     # 60 possible bursts: parked but for 15, at several speeds, in bends and at several places.
     motion, driven = np.zeros((60, 4)), np.arange(20, 35)

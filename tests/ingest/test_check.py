@@ -152,30 +152,6 @@ def test_what_fleet_toml_has_wrong_of_a_radar_is_noticed_and_costs_its_pairs(
     assert answer == "yes" or refused >= {"lidar_radar", "camera_radar"}
 
 
-@pytest.mark.parametrize("logged", ["its heading", "straight ahead"])
-def test_a_radar_in_the_corner_fits_the_standing_world_where_the_log_says_how_it_is_turned(
-    kit, tmp_path, logged
-):
-    """Turned by 45 deg to the left; where tf_static calls that straight ahead, its heading is what is wrong."""
-
-    def cornered(i):
-        columns, half = kit.radar(i), np.sqrt(0.5)
-        x, y = columns["x"], columns["y"]
-        return columns | {"x": half * (x + y), "y": half * (y - x)}
-
-    drive = with_clouds(kit, 20, kit.RADAR, cornered)
-    q = (np.cos(np.pi / 8), 0, 0, np.sin(np.pi / 8)) if logged == "its heading" else (1, 0, 0, 0)
-    optical, stamp = (0.5, -0.5, 0.5, -0.5), kit.START_NS
-    turned = drive.tf(
-        drive.transform(stamp, "base_link", "camera_optical", optical, (1.5, 0, 1.4)),
-        drive.transform(stamp, "base_link", "lidar", t=(1.0, 0, 1.8)),
-        drive.transform(stamp, "base_link", "radar", q, (3.6, 0.8, 0.5)),
-    )
-    drive.replaced("/tf_static", 0, turned)
-    problem = report_on(kit, tmp_path, drive).evidence.doppler_problem
-    assert problem == "" if logged == "its heading" else "heading" in problem
-
-
 def test_a_camera_frame_that_is_not_optical_is_noticed(kit, tmp_path):
     drive = kit.Kit(frames=12).drive()
     level = [drive.transform(0, "base_link", f) for f in ("camera_optical", "lidar", "radar")]

@@ -2,12 +2,15 @@
 
 import dataclasses
 import json
+import os
+import resource
 
 import numpy as np
 import pytest
 
 from pipeline.core.errors import ConfigError, LogError
 from pipeline.ingest.containers.mcap import McapLog
+from pipeline.ingest.index import index_logs
 from pipeline.ingest.sync import Rejection, none_near
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import ingested
@@ -53,6 +56,25 @@ def test_one_bad_log_does_not_cost_the_others(kit, tmp_path, run_ingest):
     assert (result.status, len(frames)) == ("done", 4)
     assert result.rejected["unreadable_logs"] == 1
     assert "bad.bag" in result.reason
+
+
+@pytest.fixture
+def few_open_files():
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (128, limits[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+
+
+@pytest.mark.usefixtures("few_open_files")
+def test_a_day_in_more_logs_than_a_process_may_open_at_first_is_read_whole(kit, tmp_path):
+    log = kit.Kit().drive().mcap(tmp_path / "0.mcap")
+    logs = [log, *(tmp_path / f"{i}.mcap" for i in range(1, 200))]
+    for other in logs[1:]:
+        os.link(log, other)
+    index = index_logs(logs, kit.fleet().rig_of("car"))
+    assert (len(index.logs), index.problems) == (200, [])
+    index.close()
 
 
 def test_a_disk_that_fails_half_way_costs_the_rest_of_the_log(kit, tmp_path, run_ingest, monkeypatch):

@@ -47,7 +47,7 @@ def joined_of(seen: Frame | Observation) -> tuple[Moment | Perceived, dict[str, 
 
 
 def _write(lake, partition, schema, seen, key, extra):
-    with write_moments(lake, schema, partition, key, "test") as writer:
+    with write_moments(lake, schema, partition, key) as writer:
         for one in seen:
             writer.append(*joined_of(one))
         counts = {"kept": {"frames": len(seen)}, "rejected": {}}

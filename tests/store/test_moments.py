@@ -33,7 +33,7 @@ def write_two_cameras(lake, count=5, key="key"):
         {"log": "a.mcap", "parent": parent, "child": child, "q": [1.0, 0.0, 0.0, 0.0], "t_m": [x, 0.0, 0.0]}
         for parent, child, x in (("front", "top", 1.0), ("left", "top", 2.0), ("top", "nose", 4.0))
     ]
-    with write_moments(lake, MOMENTS, DAY, key, "test") as writer:
+    with write_moments(lake, MOMENTS, DAY, key) as writer:
         for i, frame in enumerate(rows):
             moment, found = joined_of(frame)
             captures = {"front": found["camera"], "top": found["lidar"], "nose": found["radar"]}
@@ -117,7 +117,7 @@ def test_a_file_of_other_work_is_not_read_with_these_moments(lake, tmp_path):
 def test_an_error_while_writing_leaves_the_old_day_and_nothing_else(lake):
     write_two_cameras(lake)
     before = sorted(p for p in lake.root.rglob("*") if p.is_file())
-    with pytest.raises(RuntimeError), write_moments(lake, MOMENTS, DAY, "k2", "test") as writer:
+    with pytest.raises(RuntimeError), write_moments(lake, MOMENTS, DAY, "k2") as writer:
         for frame in frames(40):
             writer.append(*joined_of(frame))
         raise RuntimeError

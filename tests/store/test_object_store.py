@@ -26,7 +26,7 @@ def lake(bucket_lake):
 
 
 def write(lake, rows, key="k1"):
-    with write_partition(lake, FRAMES, DAY, key, "0.1", ["in"]) as writer:
+    with write_partition(lake, FRAMES, DAY, key, ["in"]) as writer:
         for first in range(0, len(rows), 2):
             writer.append(rows[first : first + 2])
 

@@ -20,7 +20,7 @@ DAY = Partition("car", "2026-03-02")
 def fill_and_read(lake):
     """Write a partition and a record, and read them in every way there is."""
     rng = np.random.default_rng(0)
-    with write_partition(lake, FRAMES, DAY, "key", "0.1") as writer:
+    with write_partition(lake, FRAMES, DAY, "key") as writer:
         writer.append([make_row("frames", rng, frame_index=i) for i in range(3)])
     commit_records(lake, CALIBRATIONS, [make_record(rng, "A")])
 

@@ -36,7 +36,7 @@ DAY = Partition("bus 7%", "2026-03-02")  # a name that must be quoted
 
 
 def write(lake, rows, key="k1", schema=FRAMES, partition=DAY, group=2):
-    with write_partition(lake, schema, partition, key, "0.1", ["in"]) as writer:
+    with write_partition(lake, schema, partition, key, ["in"]) as writer:
         for first in range(0, len(rows), group):
             writer.append(rows[first : first + group])
         writer.describe(kept={"frames": len(rows)}, rejected={"dark": 2}, note="x")
@@ -101,7 +101,7 @@ def test_an_error_while_writing_leaves_the_old_partition_and_nothing_else(any_la
     write(any_lake, [make_row("frames", rng, frame_index=7)])
     before = contents(any_lake)
     assert len(before) == 1
-    with pytest.raises(RuntimeError), write_partition(any_lake, FRAMES, DAY, "k2", "0.1") as writer:
+    with pytest.raises(RuntimeError), write_partition(any_lake, FRAMES, DAY, "k2") as writer:
         writer.append([make_row("frames", rng)])
         raise RuntimeError
     assert contents(any_lake) == before
@@ -138,7 +138,7 @@ def test_what_another_release_wrote_is_refused_with_file_version_and_release(tab
         ]
     else:
         write(lake, [make_row(table, rng)], schema=other)
-        release, remedy = r"0\.1", "use that release" if step > 0 else "make it anew"
+        release, remedy = CODE_VERSION, "use that release" if step > 0 else "make it anew"
         refused = [lambda: read_rows(lake, schema, DAY, row_type)]
     for call in refused:
         with pytest.raises(

@@ -38,7 +38,6 @@ _MESSAGE = struct.Struct("<HIQQ")  # channel id, sequence, log time, publish tim
 _CHUNK = struct.Struct("<QQQII")
 _FOOTER_SIZE = _RECORD.size + 20
 _LAST_OPCODE = max(Opcode)
-_DAMAGED = (*READ_ERRORS, struct.error)
 
 
 class McapLog(ChunkedLog):
@@ -137,11 +136,11 @@ class McapLog(ChunkedLog):
                 if opcode == Opcode.CHUNK_INDEX:
                     chunks.append(_chunk_of(ChunkIndex.read(_stream(content))))
                 elif opcode == Opcode.STATISTICS:
-                    with suppress(*_DAMAGED):
+                    with suppress(*READ_ERRORS):
                         self._messages = Statistics.read(_stream(content)).channel_message_counts
             self._trusted = footer.summary_crc != 0
             return sorted((c for c in chunks if c.position < footer.summary_start), key=lambda c: c.position)
-        except _DAMAGED:
+        except READ_ERRORS:
             return []
 
     def _learn(self, opcode: int, content: bytes) -> None:
@@ -155,7 +154,7 @@ class McapLog(ChunkedLog):
                 if not (self._trusted and channel.id in self._channels):
                     self._channels[channel.id] = channel
                     self._resolved.pop(channel.id, None)
-        except _DAMAGED:
+        except READ_ERRORS:
             self.damage["damaged_records"] += 1
 
     # -- chunks ------------------------------------------------------------
@@ -166,7 +165,7 @@ class McapLog(ChunkedLog):
             _, _, size, crc, name_length = _CHUNK.unpack_from(content)
             name_end = _CHUNK.size + name_length
             compression = content[_CHUNK.size : name_end].decode()
-        except _DAMAGED:
+        except READ_ERRORS:
             self.damage["damaged_chunks"] += 1
             return None
         data = self._unpacked(compression, memoryview(content)[name_end + 8 :], size)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib
+import struct
 from collections import Counter, OrderedDict
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
@@ -117,6 +118,7 @@ READ_ERRORS = (
     RuntimeError,
     ArithmeticError,
     AssertionError,
+    struct.error,
 )
 
 

@@ -23,7 +23,6 @@ _KNOWN = (_MESSAGE, _BAG_HEADER, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION)
 _U32 = struct.Struct("<I")
 _PAIR = struct.Struct("<II")
 _MAX_HEADER_BYTES = 1 << 20
-_DAMAGED = (*READ_ERRORS, struct.error)
 
 
 class BagLog(ChunkedLog):
@@ -105,7 +104,7 @@ class BagLog(ChunkedLog):
                 elif header["op"] == bytes([_CONNECTION]):
                     self._learn(header, self._content(start, length))
                 position = start + length
-        except _DAMAGED:
+        except READ_ERRORS:
             return []
         return sorted(chunks, key=lambda c: c.position)
 
@@ -115,7 +114,7 @@ class BagLog(ChunkedLog):
         try:
             messages = dict(_PAIR.iter_unpack(counts))
             start, end = _time_ns(header["start_time"]), _time_ns(header["end_time"])
-        except _DAMAGED:
+        except READ_ERRORS:
             return Chunk(position, 0, 0, 0, None)
         self._messages.update(messages)
         return Chunk(position, 0, start, end, frozenset(messages), messages)
@@ -132,7 +131,7 @@ class BagLog(ChunkedLog):
             definition = fields["message_definition"].decode()
             channel = Channel(header["topic"].decode(), f"{package}/msg/{name}", "ros1", definition)
             self._channels[_U32.unpack(header["conn"])[0]] = channel
-        except _DAMAGED:
+        except READ_ERRORS:
             self.damage["damaged_records"] += 1
 
     # -- chunks ------------------------------------------------------------
@@ -140,7 +139,7 @@ class BagLog(ChunkedLog):
     def _open_chunk(self, header: dict[str, bytes], start: int, length: int) -> bytes | None:
         try:
             size, compression = _U32.unpack(header["size"])[0], header["compression"].decode()
-        except _DAMAGED:
+        except READ_ERRORS:
             self.damage["damaged_chunks"] += 1
             return None
         return self._unpacked(compression, self._content(start, min(length, MOST_CHUNK_BYTES)), size)
@@ -171,7 +170,7 @@ class BagLog(ChunkedLog):
         try:
             channel = self._channels.get(_U32.unpack(header["conn"])[0])
             stamp = _time_ns(header["time"])
-        except _DAMAGED:
+        except READ_ERRORS:
             self.damage["damaged_records"] += 1
             return None, 0
         if channel is None:

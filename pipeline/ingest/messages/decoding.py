@@ -8,6 +8,7 @@ CDR counts and writes a zero after the name, ROS 1 does not.
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
@@ -17,8 +18,7 @@ from rosbags.typesys.store import Typestore
 
 from pipeline.core.errors import LogError
 from pipeline.core.ros_messages import DEFINITIONS, register
-from pipeline.ingest.containers.reader import PROTOBUF, READ_ERRORS, Channel
-from pipeline.ingest.messages import protobuf
+from pipeline.ingest.containers.reader import BYTES_AS_TEXT, PROTOBUF, READ_ERRORS, Channel
 from pipeline.ingest.messages.foxglove import as_ros
 
 __all__ = [
@@ -32,10 +32,11 @@ __all__ = [
 
 # For malformed bytes, errors of `decode` and of the functions that read a decoded message.
 DECODE_ERRORS = (
-    LogError, *READ_ERRORS, struct.error, SerdeError, TypesysError, TypeError, AttributeError, MemoryError,
+    LogError, *READ_ERRORS, SerdeError, TypesysError, TypeError, AttributeError, MemoryError,
 )  # fmt: skip
 # CDR: 4 bytes of encapsulation, seconds, nanoseconds; ROS 1: sequence number, seconds, nanoseconds.
 _STAMP_END = 12
+_LAST_S = 2**33  # beyond it nanoseconds overflow int64: a damaged number
 _SEPARATOR = "=" * 80 + "\n"
 _WRITTEN_BY = {"cdr": "ROS 2", "ros1": "ROS 1"}
 _NAME = 16  # offset of the frame's name; its length is in the 4 bytes before
@@ -48,32 +49,36 @@ def header_stamp_ns(channel: Channel, data: memoryview) -> int | None:
     Foxglove's ROS 2 messages start with the same bytes; for a protobuf message it is the `timestamp`.
     """
     if channel.encoding == PROTOBUF:
-        return protobuf.stamp_ns_of(channel, data)
-    if len(data) < _STAMP_END:
+        try:
+            stamp = _parsed(channel, data).timestamp
+            seconds, nanoseconds = int(stamp.seconds), int(stamp.nanos)
+        except (ValueError, AttributeError):
+            return None
+    elif len(data) < _STAMP_END:
         return None
-    seconds, nanoseconds = struct.unpack_from(_order(channel, data) + "iI", data, 4)
-    return (
-        seconds * 10**9 + nanoseconds
-        if seconds >= 0 and 0 <= nanoseconds < 10**9 and seconds + nanoseconds > 0
-        else None
-    )
+    else:
+        seconds, nanoseconds = struct.unpack_from(_order(channel, data) + "iI", data, 4)
+    is_time = 0 <= seconds < _LAST_S and 0 <= nanoseconds < 10**9 and seconds + nanoseconds > 0
+    return seconds * 10**9 + nanoseconds if is_time else None
 
 
 def header_frame_id(channel: Channel, data: memoryview) -> str:
     """Frame id of such a message, without ROS 1's leading slash; "" if there is none."""
     if channel.encoding == PROTOBUF:
-        return protobuf.frame_id_of(channel, data)
-    if len(data) < _STAMP_END + 4:
+        return str(getattr(_parsed(channel, data), "frame_id", "")).lstrip("/")
+    if len(data) < _NAME:
         return ""
-    length = struct.unpack_from(_order(channel, data) + "I", data, _STAMP_END)[0]
-    raw = bytes(data[_STAMP_END + 4 : _STAMP_END + 4 + min(length, 1024)])
+    length = struct.unpack_from(_order(channel, data) + "I", data, _NAME - 4)[0]
+    raw = bytes(data[_NAME : _NAME + min(length, _LONGEST_NAME)])
     return raw.rstrip(b"\0").decode(errors="replace").lstrip("/")
 
 
 def content_without_stamp(channel: Channel, data: memoryview) -> bytes:
     """Bytes that are equal for messages that differ only in stamp and sequence number."""
     if channel.encoding == PROTOBUF:
-        return protobuf.content_without_stamp(channel, data)
+        message = _parsed(channel, data)
+        message.ClearField("timestamp")
+        return bytes(message.SerializeToString(deterministic=True))
     return bytes(data[_STAMP_END:])
 
 
@@ -87,7 +92,7 @@ def decode(channel: Channel, data: memoryview) -> Any:
     """
     try:
         if channel.encoding == PROTOBUF:
-            message = protobuf.parse(channel, data)
+            message = _parsed(channel, data)
         elif channel.encoding == "ros1":
             message = _typestore(channel).deserialize_ros1(data, channel.msgtype)
         else:
@@ -97,6 +102,32 @@ def decode(channel: Channel, data: memoryview) -> Any:
         raise LogError(
             "", f"{channel.msgtype} cannot be decoded: {type(err).__name__}: {err}", topic=channel.topic
         ) from err
+
+
+def _parsed(channel: Channel, data: memoryview) -> Any:
+    """A protobuf message by the schema in the MCAP; raises ValueError if schema or bytes are invalid."""
+    from google.protobuf.message import DecodeError  # noqa: PLC0415  # logs of ROS alone need no protobuf
+
+    try:
+        return _protobuf_decoder(channel)(bytes(data))
+    except DecodeError as err:
+        raise ValueError(f"bytes do not fit the schema: {err}") from err
+
+
+@lru_cache(maxsize=64)
+def _protobuf_decoder(channel: Channel) -> Callable[[bytes], Any]:
+    from mcap.exceptions import McapError  # noqa: PLC0415
+    from mcap.records import Schema  # noqa: PLC0415
+    from mcap_protobuf.decoder import DecoderFactory  # noqa: PLC0415
+
+    schema = Schema(1, channel.definition.encode(BYTES_AS_TEXT), channel.definition_format, channel.msgtype)
+    try:
+        decoder = DecoderFactory().decoder_for(PROTOBUF, schema)
+    except (McapError, TypeError, KeyError) as err:
+        raise ValueError(f"the log's schema of it cannot be used: {err}") from err
+    if decoder is None:
+        raise ValueError("the log carries no protobuf schema of it")
+    return decoder
 
 
 def _order(channel: Channel, data: memoryview) -> str:

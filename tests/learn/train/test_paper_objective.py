@@ -49,7 +49,7 @@ def day(tmp_path_factory):
     about = About("vehicle-1", day.partition.day, "demo", "train", "here", "urban")
     of_row = Reference(prior), about, day.fleet.prepare
     rows = [make_row(frames[o.frame_index], o, *of_row) for o in day.observations]
-    with write_partition(day.lake, TRAINING, Partition("vehicle-1", day.partition.day), "key", "0") as writer:
+    with write_partition(day.lake, TRAINING, Partition("vehicle-1", day.partition.day), "key") as writer:
         writer.append(rows)
         writer.describe(kept={}, rejected={})
     return day, prior, rows

@@ -58,7 +58,7 @@ def data(tmp_path_factory):
     about = About("vehicle-1", day.partition.day, "demo", "train", "here", "urban")
     rows = [make_row(frames[o.frame_index], o, seen, about, config) for o in day.observations]
     rows = [replace(row, split="train" if i < len(rows) - 2 else "val") for i, row in enumerate(rows)]
-    with write_partition(day.lake, TRAINING, Partition("vehicle-1", day.partition.day), "key", "0") as writer:
+    with write_partition(day.lake, TRAINING, Partition("vehicle-1", day.partition.day), "key") as writer:
         for first in range(0, len(rows), 2):
             writer.append(rows[first : first + 2])
         writer.describe(kept={}, rejected={})
@@ -134,7 +134,7 @@ def test_days_without_a_record_of_joint_teach_no_classes_and_are_named_before(da
     lake, day = Lake.at(tmp_path / "lake"), Partition("vehicle-1", "2026-03-02")
     [known] = Lake.at(data).partitions(TRAINING.name)
     rows = read_rows(Lake.at(data), TRAINING, known, TrainingRow)
-    with write_partition(lake, TRAINING, day, "key", "0") as writer:
+    with write_partition(lake, TRAINING, day, "key") as writer:
         writer.append([replace(row, reference="prior", drive=0) for row in rows])
         writer.describe(kept={}, rejected={})
     with pytest.raises(ContractError, match="`boresight calibrate`"):
