@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from jobs.terminal.summary import print_summary, progress_reporter
 from pipeline.core.errors import ConfigError
@@ -24,8 +21,6 @@ from pipeline.perceive.models.download import download
 from pipeline.store.atomic_write import atomic_write
 
 __all__ = ["models"]
-
-_WIDTH = 120  # columns, also where nobody watches: a sha256 and a path fit
 
 
 def models(
@@ -110,9 +105,5 @@ def _facts(model: ThirdPartyModel) -> dict[str, str]:
 
 def _print_block(title: str, rows: Mapping[str, object]) -> None:
     """One model, for people, on stderr."""
-    table = Table(box=None, show_header=False, title=title, title_justify="left", title_style="bold")
-    table.add_column()
-    table.add_column(overflow="fold")
-    for name, value in rows.items():
-        table.add_row(f"  {name}", escape(str(value)))  # a card may say `[learn]`, which is no style
-    Console(stderr=True, width=_WIDTH, highlight=False).print(table)
+    lines = [title, *(f"  {name:8} {value}" for name, value in rows.items())]
+    sys.stderr.write("\n".join(lines) + "\n")

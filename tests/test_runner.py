@@ -17,7 +17,7 @@ from pipeline.core.config import load_fleet
 from pipeline.core.errors import ConfigError, ContractError, LogError
 from pipeline.core.results import Outcome
 from pipeline.core.runner import Stage, try_stage, why_to_run
-from pipeline.core.stage_work import NothingUsable, Records, Run, Task, Told, Window, Work
+from pipeline.core.stage_work import NothingUsable, Run, Task, Told, Window, Work
 from pipeline.core.stages import CALIBRATE, PERCEIVE, PREPARE, REPORT, STAGES
 from pipeline.fleet.ledger import outcome_row
 from pipeline.learn.prepare.split import SplitPlan
@@ -265,7 +265,7 @@ def record(work_key):
 @pytest.mark.parametrize("again", [False, True])
 def test_records_are_added_once_unless_they_shall_become_current_again(again, task, stage):
     def rows(run):
-        yield Records([record(run.work_key)])
+        yield record(run.work_key)
 
     told = {"tell": lambda rows: Told({"held": len(rows)}, reason="close"), "again": again}
     recording, made = stage(rows, writes=(CALIBRATIONS,), **told)

@@ -112,14 +112,8 @@ def _errors(record: CalibrationRecord, T_true: np.ndarray) -> dict[str, Any]:
         return round(angle, 4), round(float(np.linalg.norm(T[:3, 3] - T_true[:3, 3])), 4)
 
     before, after = error(prior_of(record)), error(transform_of(record))
-    return {
-        "vehicle": record.vehicle,
-        "day": record.day,
-        "method": record.method,
-        "pair": record.pair,
-        "parent_frame": record.parent_frame,
-        "child_frame": record.child_frame,
-        "status": record.status,
+    names = ("vehicle", "day", "method", "pair", "parent_frame", "child_frame", "status")
+    return {name: getattr(record, name) for name in names} | {
         "rotation_error_prior_deg": before[0],
         "rotation_error_deg": after[0],
         "translation_error_prior_m": before[1],

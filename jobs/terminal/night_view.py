@@ -61,7 +61,6 @@ class _Lines:
     """Lines for a log file, updated five times a second: a shorter stage may get no line, a long one gets several."""
 
     def __init__(self, names: list[str], total: int, title: str) -> None:
-
         self._names, self._total, self._title, self._ended = names, total, title, 0
         self._stages = {stage.name for stage in STAGES}
         self._in_work: dict[int, str] = {}
@@ -81,19 +80,9 @@ class _Lines:
         self._ended += 1
         log = logger().error if outcome.status == "failed" else logger().info
         trace = {"trace": outcome.trace} if outcome.trace else {}
-        log(
-            "vehicle-day",
-            vehicle=outcome.vehicle,
-            day=outcome.day,
-            status=outcome.status,
-            reason=outcome.reason,
-            stages=outcome.stages,
-            pairs=outcome.pairs,
-            frames=outcome.frames,
-            ended=self._ended,
-            total=self._total,
-            **trace,
-        )
+        names = ("vehicle", "day", "status", "reason", "stages", "pairs", "frames")
+        told = {name: getattr(outcome, name) for name in names}
+        log("vehicle-day", **told, ended=self._ended, total=self._total, **trace)
 
     def ended(self, name: str) -> None:
         self._ended += 1

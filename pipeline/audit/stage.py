@@ -21,13 +21,12 @@ from pipeline.audit.vehicle import VehicleVerdict
 from pipeline.core.config import AuditConfig, FleetConfig, config_hash
 from pipeline.core.errors import ConfigError
 from pipeline.core.results import Progress
-from pipeline.core.stage_work import Records, Task, Told, Window, Work
+from pipeline.core.stage_work import Task, Told, Window, Work
 from pipeline.rig.edges import edge_of
 from pipeline.rig.graph import KINDS, Edge, edge_between
 from pipeline.rig.kinds import EDGE_KINDS
 from pipeline.store.partitions import (
     Lake,
-    Partition,
     check_day,
     content_hash,
     days_after,
@@ -102,7 +101,7 @@ def _judged(
     vehicles: Mapping[str, _Vehicle],
     window: tuple[str, str, str],
     progress: Progress,
-) -> Generator[Records, None, None]:
+) -> Generator[DriftFinding, None, None]:
     """Findings of each vehicle, judged together."""
     fleet, (first, _, method) = task.fleet, window
     begin = dt.date.fromisoformat(first).toordinal()
@@ -115,7 +114,8 @@ def _judged(
     before = _found_before(task.lake, method, dict(zip(vehicles, verdicts, strict=True)), first)
     for done, ((name, vehicle), verdict) in enumerate(zip(vehicles.items(), verdicts, strict=True)):
         progress(done, len(vehicles), name)
-        yield _findings(fleet, name, vehicle, verdict, window, (of_model[models[done]], before.get(name, {})))
+        known = of_model[models[done]], before.get(name, {})
+        yield from _findings(fleet, name, vehicle, verdict, window, known)
     progress(len(vehicles), len(vehicles), "")
 
 
@@ -162,7 +162,7 @@ def _findings(
     verdict: VehicleVerdict,
     window: tuple[str, str, str],
     known: tuple[Mapping[tuple[Edge, str], FleetShift], Mapping[tuple[Edge, str], DriftFinding]],
-) -> Records:
+) -> list[DriftFinding]:
     (first, last, method), (shifts, before) = window, known
     records = vehicle.records.at(
         np.flatnonzero(vehicle.records.day >= dt.date.fromisoformat(first).toordinal())
@@ -176,7 +176,7 @@ def _findings(
     rows = standing(rows, vehicle.said, vehicle.events, last)
     # All vehicles are judged side by side, so a verdict rests on more than this vehicle's records: the key has it too.
     key = work_key("audit", CODE_VERSION, config, [*inputs, content_hash(rows)])
-    return Records([replace(row, work_key=key) for row in rows], Partition(name, last), key, inputs)
+    return [replace(row, work_key=key) for row in rows]
 
 
 def _possible_edges(fleet: FleetConfig, name: str) -> list[Edge]:

@@ -21,10 +21,10 @@ from pipeline.audit.rig_states import rig_states
 from pipeline.audit.vehicle import limit_of
 from pipeline.audit.wander import with_wander
 from pipeline.core.config import AuditConfig, FleetConfig, config_hash
-from pipeline.core.stage_work import Records, Run, Task, Told, Window, Work
+from pipeline.core.stage_work import Run, Task, Told, Window, Work
 from pipeline.rig.edges import edge_of
 from pipeline.rig.graph import Edge, tie
-from pipeline.store.partitions import Partition, content_hash, days_after, last_possible_day, work_key
+from pipeline.store.partitions import content_hash, days_after, last_possible_day, work_key
 from pipeline.store.records import last_day, read_last
 from schemas.calibrations import CALIBRATIONS, DOF_NAMES
 from schemas.drift import DRIFT, DriftFinding
@@ -62,7 +62,7 @@ def work(task: Task) -> Work:
         changes.setdefault(finding.vehicle, []).append(finding)
     references = _references(history, records, (first, last), events, fleet.audit) if last else {}
 
-    def rows(run: Run) -> Generator[Records, None, None]:
+    def rows(run: Run) -> Generator[StateRow, None, None]:
         own_mounts = _mounts(poses, fleet)
         for done, vehicle in enumerate(records.vehicles):
             run.progress(done, len(records.vehicles), vehicle)
@@ -80,8 +80,7 @@ def work(task: Task) -> Work:
             config = config_hash(fleet.audit, fleet.verify, {"to": last, "method": method})
             inputs = sorted({key for row in whole for key in row.inputs})
             key = work_key("state", CODE_VERSION, config, [*inputs, content_hash(whole)])
-            stamped = [replace(r, work_key=key) for r in whole]
-            yield Records(stamped, Partition(vehicle, last), key, inputs)
+            yield from (replace(r, work_key=key) for r in whole)
 
     settings = (fleet.audit, fleet.verify, {"to": last, "method": method})
     of_poses = {key for own in poses.values() for days in own.sensors.values() for key in days.work_keys}

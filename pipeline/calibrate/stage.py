@@ -19,7 +19,7 @@ from pipeline.calibrate.unlabelled import noted
 from pipeline.calibrate.verify.target_accuracy import views_of
 from pipeline.core.errors import ConfigError, SolveError
 from pipeline.core.results import Outcome, Progress
-from pipeline.core.stage_work import Records, Run, Task, Told, Work
+from pipeline.core.stage_work import Run, Task, Told, Work
 from pipeline.rig.day_prior import prior_key, prior_of_three, rig_prior
 from pipeline.rig.edges import edge_of, words_of
 from pipeline.rig.estimates import Prior
@@ -77,7 +77,7 @@ def work(task: Task) -> Work:
     tables = (ingested, perceived) if method.needs_images else (perceived,)
     manifests = [manifest_of(task.lake, task.partition) for manifest_of in tables]
 
-    def rows(run: Run) -> Generator[Records, None, None]:
+    def rows(run: Run) -> Generator[Any, None, None]:
         absent = _absent(task.lake, task.partition)
         about = Inputs(
             task.partition, method.name, run.work_key, seed, run.inputs, pairs_of(rig.kinds), absent,
@@ -88,7 +88,7 @@ def work(task: Task) -> Work:
             found = _rows_of_day(task, about, run.progress)
         except SolveError as err:
             found = refused_edges(about, rig, err.reason, err.fault)
-        yield Records(found)
+        yield from found
 
     return Work(
         (fleet.select, fleet.trigger, fleet.solve, fleet.verify, prior, settings),
@@ -107,9 +107,9 @@ def _refusal(refused: Outcome, partition: Partition, method: Method, seed: int, 
     """Records of a day that was refused before the solver, with the reason."""
     reason = f"{refused.stage}: {refused.reason}"
 
-    def rows(run: Run) -> Generator[Records, None, None]:
+    def rows(run: Run) -> Generator[Any, None, None]:
         about = Inputs(partition, method.name, run.work_key, seed, run.inputs, pairs_of(rig.kinds))
-        yield Records(refused_edges(about, rig, reason, *refused.faults))
+        yield from refused_edges(about, rig, reason, *refused.faults)
 
     inputs = (refused.work_key,) if refused.work_key else ()
     # Recorded each time: an older record of a day that was not refused then must not pass for the current one.

@@ -8,7 +8,7 @@ import json
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, Field, PrivateAttr, ValidationError, model_validator
 
@@ -240,22 +240,11 @@ def _written(loc: Sequence[str | int], values: Any) -> Sequence[str | int]:
 
 def _unknown_key(key: str | int, whole: type[BaseModel]) -> str:
     """Message for an unknown key; it suggests the most similar known key."""
-    known = {name for kind in _kinds(whole, set()) for name in kind.model_fields}
+    schema = whole.model_json_schema()
+    sections = (schema, *schema.get("$defs", {}).values())
+    known = {name for section in sections for name in section.get("properties", ())}
     near = difflib.get_close_matches(str(key), known, n=1)
     return f"unknown key; did you mean {near[0]!r}?" if near else "unknown key"
-
-
-def _kinds(annotation: Any, seen: set[type[BaseModel]]) -> set[type[BaseModel]]:
-    """All sections that are reachable from an annotation."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        if annotation not in seen:
-            seen.add(annotation)
-            for field in annotation.model_fields.values():
-                _kinds(field.annotation, seen)
-    else:
-        for part in get_args(annotation):
-            _kinds(part, seen)
-    return seen
 
 
 def config_hash(*sections: BaseModel | dict[str, Any]) -> str:

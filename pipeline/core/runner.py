@@ -231,10 +231,8 @@ def _add_records(stage: Stage, task: Task, work: Work, run: Run) -> Outcome:
             for schema in stage.writes:
                 assert_records(task.lake, schema, schema.rows_among(recorded))
         return _record_outcome(stage, task, work, "cached", run.work_key, recorded)
-    written: list[Any] = []
-    with at_most(task.fleet.fleet.memory_gb), closing(work.rows(run)) as batches:
-        for records in batches:
-            written += records.rows
+    with at_most(task.fleet.fleet.memory_gb), closing(work.rows(run)) as rows:
+        written = list(rows)
     if task.commit:
         # The first table is committed last: if its rows are there, the rows of the other tables are too.
         for schema in reversed(stage.writes):

@@ -16,7 +16,7 @@ from pipeline.store.remote_logs import LogPath
 from pipeline.store.tables import Manifest
 from schemas.outcomes import OutcomeRow
 
-__all__ = ["NO_PROBES", "NothingUsable", "Probes", "Records", "Run", "Task", "Told", "Window", "Work"]
+__all__ = ["NO_PROBES", "NothingUsable", "Probes", "Run", "Task", "Told", "Window", "Work"]
 
 
 Probes = tuple[tuple[float, ...], tuple[float, ...]]
@@ -99,23 +99,13 @@ class Run:
 
 
 @dataclass(frozen=True)
-class Records:
-    """Rows of a record table that are written together; None = key, inputs and partition of the task."""
-
-    rows: Sequence[Any]
-    partition: Partition | None = None
-    work_key: str | None = None
-    inputs: Sequence[str] | None = None
-
-
-@dataclass(frozen=True)
 class Work:
     """Work of a stage for a task. The runner calls `rows` only if the work is not done already.
 
     Args:
         settings: all parts of the configuration that affect the result; they enter the work key.
-        rows: the stage itself, a generator of rows of its table (`Records` for a record table, paths of files
-            if it writes no table). It raises `NothingUsable` if nothing can be written.
+        rows: the stage itself, a generator of rows of its tables (paths of files if it writes no table). It raises
+            `NothingUsable` if nothing can be written.
         inputs: work keys of the inputs; None = those of all tables of `task.inputs`.
         nothing: first words of the reason for a partition without rows; the counted rejections follow.
         tell: summarises record rows for the outcome.

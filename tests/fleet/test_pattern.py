@@ -19,40 +19,58 @@ def found(pattern, root, *days):
     }
 
 
-def test_placeholders_may_be_folders(tmp_path):
-    touch(
-        tmp_path / "car/2026-03-02/a.mcap",
-        tmp_path / "car/2026-03-03/b.mcap",
-        tmp_path / "bus/2026-03-02/c.mcap",
-    )
-    touch(tmp_path / "car/2026-03-02/notes.txt", tmp_path / "car/latest/a.mcap")
-    assert found("{vehicle}/{day}/*.mcap", tmp_path) == {
-        ("bus", "2026-03-02"): ["bus/2026-03-02/c.mcap"],
-        ("car", "2026-03-02"): ["car/2026-03-02/a.mcap"],
-        ("car", "2026-03-03"): ["car/2026-03-03/b.mcap"],
-    }
+CAR = ("car", "2026-03-02")
+DAY = "car/2026-03-02"
+ONE = "my_car-1_2026-03-02_0"
+LAYOUTS = {
+    "folders": (
+        "{vehicle}/{day}/*.mcap",
+        [
+            f"{DAY}/a.mcap",
+            "car/2026-03-03/b.mcap",
+            "bus/2026-03-02/c.mcap",
+            f"{DAY}/notes.txt",
+            "car/latest/a.mcap",
+        ],
+        {
+            ("bus", "2026-03-02"): ["bus/2026-03-02/c.mcap"],
+            CAR: [f"{DAY}/a.mcap"],
+            ("car", "2026-03-03"): ["car/2026-03-03/b.mcap"],
+        },
+    ),
+    "inside names, containers mixed": (
+        "{vehicle}_{day}_*",
+        [f"{ONE}0.mcap", f"{ONE}1.bag", f"{ONE}2/metadata.yaml", f"{ONE}2/x.db3", f"{ONE}3/lost_metadata.db3"]
+        + ["my_car-1_2026-03-02_calibration.json", "my_car-1_2026-02-30_00.mcap"],
+        {("my_car-1", "2026-03-02"): [f"{ONE}0.mcap", f"{ONE}1.bag", f"{ONE}2", f"{ONE}3"]},
+    ),
+    "a folder stands for its logs": (
+        "{vehicle}/{day}/",
+        [f"{DAY}/a.mcap", f"{DAY}/b.bag", f"{DAY}/readme.md"],
+        {CAR: [f"{DAY}/a.mcap", f"{DAY}/b.bag"]},
+    ),
+    "a bag beside a ROS 2 recording": (
+        "{vehicle}/{day}",
+        [f"{DAY}/{name}" for name in ("metadata.yaml", "rec_0.mcap", "rec_1.mcap", "older.bag")],
+        {CAR: [DAY, f"{DAY}/older.bag"]},
+    ),
+    "a range of letters": (
+        "{vehicle}/{day}/a[0-1].mcap",
+        [f"{DAY}/{n}.mcap" for n in ("a0", "a1", "a2", "b0")],
+        {CAR: [f"{DAY}/a0.mcap", f"{DAY}/a1.mcap"]},
+    ),
+    "any letter": (
+        "{vehicle}/{day}/?0.mcap",
+        [f"{DAY}/{n}.mcap" for n in ("a0", "a1", "b0")],
+        {CAR: [f"{DAY}/a0.mcap", f"{DAY}/b0.mcap"]},
+    ),
+}
 
 
-def test_placeholders_may_be_inside_names_and_containers_may_be_mixed(tmp_path):
-    touch(tmp_path / "my_car-1_2026-03-02_00.mcap", tmp_path / "my_car-1_2026-03-02_01.bag")
-    touch(tmp_path / "my_car-1_2026-03-02_02/metadata.yaml", tmp_path / "my_car-1_2026-03-02_02/x.db3")
-    touch(tmp_path / "my_car-1_2026-03-02_03/lost_metadata.db3")
-    touch(tmp_path / "my_car-1_2026-03-02_calibration.json", tmp_path / "my_car-1_2026-02-30_00.mcap")
-    names = [f"my_car-1_2026-03-02_0{i}" for i in range(4)]
-    assert found("{vehicle}_{day}_*", tmp_path) == {
-        ("my_car-1", "2026-03-02"): [names[0] + ".mcap", names[1] + ".bag", names[2], names[3]]
-    }
-
-
-def test_a_folder_of_logs_stands_for_its_logs(tmp_path):
-    touch(
-        tmp_path / "car/2026-03-02/a.mcap",
-        tmp_path / "car/2026-03-02/b.bag",
-        tmp_path / "car/2026-03-02/readme.md",
-    )
-    logs = ["car/2026-03-02/a.mcap", "car/2026-03-02/b.bag"]
-    assert found("{vehicle}/{day}", tmp_path) == {("car", "2026-03-02"): logs}
-    assert found("{vehicle}/{day}/", tmp_path) == {("car", "2026-03-02"): logs}
+@pytest.mark.parametrize(("pattern", "files", "days"), LAYOUTS.values(), ids=LAYOUTS)
+def test_a_pattern_gives_each_log_to_its_vehicle_day(pattern, files, days, tmp_path):
+    touch(*(tmp_path / file for file in files))
+    assert found(pattern, tmp_path) == days
 
 
 def test_days_are_filtered_and_come_in_order(tmp_path):
@@ -76,14 +94,6 @@ def test_vehicles_that_share_a_folder_are_never_mixed_whatever_else_lies_there(s
         (f"car-{i}", f"2026-03-0{d}"): [f"car-{i}_2026-03-0{d}.db3", f"car-{i}_2026-03-0{d}.mcap"]
         for i in (1, 2)
         for d in (2, 3)
-    }
-
-
-def test_a_bag_beside_a_ros2_recording_is_a_log_of_its_own(tmp_path):
-    day = tmp_path / "car/2026-03-02"
-    touch(*(day / name for name in ("metadata.yaml", "rec_0.mcap", "rec_1.mcap", "older.bag")))
-    assert found("{vehicle}/{day}", tmp_path) == {
-        ("car", "2026-03-02"): ["car/2026-03-02", "car/2026-03-02/older.bag"]
     }
 
 
@@ -123,12 +133,3 @@ def test_what_cannot_be_meant_is_refused(pattern, days, match, tmp_path):
     with pytest.raises(ConfigError, match=match) as caught:
         find_vehicle_days(str(tmp_path / pattern), *days)
     assert caught.value.exit_code == 2
-
-
-def test_shell_wildcards_choose_the_files(tmp_path):
-    touch(*(tmp_path / f"car/2026-03-02/{n}.mcap" for n in ("a0", "a1", "a2", "b0")))
-    assert found("{vehicle}/{day}/a[0-1].mcap", tmp_path)["car", "2026-03-02"] == [
-        "car/2026-03-02/a0.mcap",
-        "car/2026-03-02/a1.mcap",
-    ]
-    assert len(found("{vehicle}/{day}/?0.mcap", tmp_path)["car", "2026-03-02"]) == 2
