@@ -48,9 +48,9 @@ def simulate(
         rate_hz: moments per second within a drive.
         rig: sensors: demo, paper, paper-one-clock, paper-free, ring16, corner-left, corner-right, spin128,
             rosette, hdl64, keyhole, telephoto, fisheye, pinhole, rolling, truck, bumper, tilted, van (6
-            cameras, 2 lidars, 5 radars), duo (2, 1, 2) or no_lidar (3, 0, 3); append `-flat` for radars
-            without elevation, `-dirty` for radars with strong road reflections and twice the noise, or
-            `-pairs` for a second image before each moment. pipeline/simulate/README.md describes each rig.
+            cameras, 2 lidars, 5 radars), duo (2, 1, 2) or no_lidar (3, 0, 3). Append `-flat` for radars
+            without elevation, or `-pairs` for a second image before each moment. Append `-dirty` for radars with
+            strong road reflections and twice the noise. pipeline/simulate/README.md describes each rig.
         environments: surroundings of the drives: urban and highway in turn (mixed), one of them, suburb, jam,
             alley, country, deck, tunnel, or world-SEED, drawn from SEED.
         container: ROS 2 MCAP, ROS 1 bag, ROS 2 bag folder, or each in turn.
@@ -96,7 +96,7 @@ def simulate(
 
 
 def simulate_days(spec: FleetSpec, out: Path, fleet: str, workers: int | None) -> int:
-    """Write fleet.toml and all vehicle-days, in so many processes, with progress; returns the number of logs."""
+    """Write fleet.toml and all vehicle-days, with progress; returns the number of logs."""
     from pipeline.simulate.fleet import begin_fleet, remove_half_logs
 
     work, logs = begin_fleet(spec, out, fleet), 0

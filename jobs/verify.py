@@ -206,7 +206,7 @@ def _print_table(checks: list[AxisCheck], answer: str, sensors: Mapping[str, str
             console.print(f"{c.pair} {c.axis}: {c.reason}.", markup=False, highlight=False)
     for sentence in errors_in_words(checks):
         console.print(f"Wrong: {sentence}.", style="red", markup=False, highlight=False)
-    for said in ("right", "wrong", "undecided"):
-        if own := [sensor for sensor, is_said in sensors.items() if is_said == said]:
-            console.print(f"{said}: {', '.join(own)}", markup=False, highlight=False)
+    for word in ("right", "wrong", "undecided"):
+        if own := [sensor for sensor, found in sensors.items() if found == word]:
+            console.print(f"{word}: {', '.join(own)}", markup=False, highlight=False)
     console.print(f"Is the calibration in use right: [bold]{answer}[/]")

@@ -38,8 +38,8 @@ _MARKS = {
 def night_view(names: list[str], total: int, title: str = "night") -> Iterator[_Lines | _Bars]:
     """A view of `total` vehicle-days; `names` are those in work, in order of index.
 
-    It is told of progress (`watch`, by index), of finished vehicle-days (`finished`), and of other work that ended
-    without errors or remarks (`ended`, by name).
+    Call `watch` with progress (by index), `finished` with the outcome of a vehicle-day, and `ended` with the name of
+    other work that ended.
     """
     if not is_terminal():
         yield _Lines(names, total, title)

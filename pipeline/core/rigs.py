@@ -171,7 +171,7 @@ class LidarTurn(Section):
 
 
 class LidarTopics(_Sensor):
-    """Topic of a lidar, its height if measured, and how it turns if its clouds do not tell."""
+    """Topic of a lidar, its height if measured, and how it turns, for clouds without times."""
 
     points: Topic
     # None = from geometry. Left out of dumps: only perception uses it, so a change must not ingest a rig's

@@ -208,17 +208,15 @@ class RosMessages:
             "nav_msgs/Odometry",
             header=self.header(stamp_ns, "odom"),
             child_frame_id=frame_of("base"),
-            pose=self.pose(T_odom_vehicle, with_covariance=True),
+            pose=self.pose(T_odom_vehicle),
             twist=self.make("geometry_msgs/TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
         )
 
-    def pose(self, T: Float[np.ndarray, "4 4"], *, with_covariance: bool = False) -> Any:
-        """Pose, or PoseWithCovariance with a covariance of zeros (in ROS: unknown)."""
+    def pose(self, T: Float[np.ndarray, "4 4"]) -> Any:
+        """PoseWithCovariance with a covariance of zeros (in ROS: unknown)."""
         x, y, z = (float(v) for v in T[:3, 3])
         position = self.make("geometry_msgs/Point", x=x, y=y, z=z)
         pose = self.make("geometry_msgs/Pose", position=position, orientation=self._quaternion(T))
-        if not with_covariance:
-            return pose
         return self.make("geometry_msgs/PoseWithCovariance", pose=pose, covariance=np.zeros(36))
 
     def _quaternion(self, T: np.ndarray) -> Any:

@@ -155,7 +155,7 @@ def run_vehicle_day(night: Night, work: VehicleDay, known: Known, progress: Prog
 
 
 def asks_for_more(results: Sequence[Outcome]) -> bool:
-    """Whether there are unread sweeps and a pair, or the whole day, lacks nothing but frames."""
+    """Whether there are unread sweeps and a pair, or the whole day, lacks only frames."""
     read = next((r for r in results if r.stage == INGEST.name), None)
     if read is None or read.kept.get(SWEEPS_LOGGED, 0) <= read.kept.get(SWEEPS_PLANNED, 0):
         return False

@@ -84,7 +84,7 @@ def _of_camera(
 
 def _detections(ros: RosMessages, header: Any, boxes: list[Box]) -> Any:
     """Detection2DArray; boxes in full-image pixels."""
-    pose, items = ros.pose(np.eye(4), with_covariance=True), []
+    pose, items = ros.pose(np.eye(4)), []
     for i, box in enumerate(boxes):
         hypothesis = ros.make("vision_msgs/ObjectHypothesis", class_id=box.name, score=box.score)
         result = ros.make("vision_msgs/ObjectHypothesisWithPose", hypothesis=hypothesis, pose=pose)
