@@ -144,8 +144,7 @@ def _export_onnx(out: Path, run: Path | None, notes: Path | None) -> list[Path]:
         raise ConfigError("command line", "out", f"{out} must end in .onnx")
 
     require("train")
-    from pipeline.learn.export.model_card import card_of_run
-    from pipeline.learn.export.onnx_file import export_onnx
+    from pipeline.learn.export.onnx_file import card_of_run, export_onnx
     from pipeline.learn.infer.onnx_networks import UNFIT
     from pipeline.learn.train.run import network_of_run
 

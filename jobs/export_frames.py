@@ -18,10 +18,9 @@ from pipeline.core.config import FleetConfig, load_fleet
 from pipeline.core.errors import ConfigError, SolveError
 from pipeline.export.calibration import sigmas_of
 from pipeline.learn.frames.card import write_card
-from pipeline.learn.frames.day import DayTask, export_day
+from pipeline.learn.frames.days import DayTask, export_day, plan_frames
 from pipeline.learn.frames.frame import Mounting, Perturbation
 from pipeline.learn.frames.output import Output
-from pipeline.learn.frames.plan import plan_frames
 from pipeline.rig.day_prior import rig_prior
 from pipeline.rig.graph import BASE
 from pipeline.store.partitions import Lake, Partition

@@ -47,7 +47,6 @@ def train(  # options of the command
     start_from: Path | None = None,
     time_limit: str | None = None,
     device: Literal["auto", "cpu", "cuda"] | None = None,
-    compiled: bool = False,
     threads: int | None = None,
 ) -> int:
     """Train a calibration network, or with --task a network of perception; or continue the run in OUT.
@@ -81,7 +80,6 @@ def train(  # options of the command
         start_from: of calibration: finished run, or exported model.onnx, with the first weights of a new run.
         time_limit: stop this call after this duration, as in 9m; the same command continues from its checkpoint.
         device: of calibration: cpu, cuda, or the best one available (auto).
-        compiled: of calibration: compile the encoders (takes minutes at the start, faster afterwards).
         threads: of perception: CPU threads; 1.
     """
     require("train")
@@ -96,9 +94,9 @@ def train(  # options of the command
         from pipeline.learn.train.run import TrainRequest
 
         _refuse(task, fleet=fleet, threads=threads)
-        request = TrainRequest(data, out, device or "auto", limit, compiled, start_from)
+        request = TrainRequest(data, out, device or "auto", limit, start_from)
         return _run(request, load_train_config(config, given))
-    _refuse(task, config=config, start_from=start_from, device=device, compiled=compiled or None)
+    _refuse(task, config=config, start_from=start_from, device=device)
     if fleet is None:
         raise ConfigError("command line", "fleet", f"{task} needs --fleet, for each vehicle's prior")
     return _train_perception(task, load_fleet(fleet), Lake.at(data), out, given, limit, threads or 1)

@@ -19,7 +19,7 @@ from pipeline.core.config import load_fleet
 from pipeline.learn.batches.batch import TrainingBatch, collate
 from pipeline.learn.prepare.reference import reference_of, usable_records
 from pipeline.learn.sample.frame_sample import About, make_row
-from pipeline.learn.train.frame_objective import PAIR_OF_TERM, FrameObjective, frame_objective, weighted
+from pipeline.learn.train.frame_objective import FrameObjective, frame_objective, weighted
 from pipeline.learn.train.settings import LossConfig
 from pipeline.rig.day_prior import read_prior
 from pipeline.rig.se3 import exp_so3
@@ -80,16 +80,14 @@ def moved(T: np.ndarray, pair: str, dof: int, offset: float) -> np.ndarray:
 def minima(
     batch: TrainingBatch, truth: dict[str, np.ndarray], weights: LossConfig, dofs: Sequence[int] = range(6)
 ) -> dict[str, list[Minimum]]:
-    """By term, and by pair for the weighted sum of its terms: the minimum along degrees of freedom."""
+    """By pair, of the weighted sum of its terms: the minimum along degrees of freedom."""
     objective = [frame_objective(batch[slice(i, i + 8)]) for i in range(0, len(batch), 8)]
-    found: dict[str, list[Minimum]] = {}
+    found: dict[str, list[Minimum]] = {pair: [] for pair in PAIRS}
     for dof in dofs:
         offsets = STEPS * TOLERANCE[dof]
-        curves = _curves(objective, truth, dof, offsets)
-        for pair in PAIRS:
-            curves[pair] = weighted({k: v for k, v in curves.items() if k in PAIR_OF_TERM}, weights, (pair,))
-        for name, curve in curves.items():
-            found.setdefault(name, []).append(minimum(offsets, curve.numpy()))
+        poses = {pair: np.stack([moved(truth[pair], pair, dof, o) for o in offsets]) for pair in PAIRS}
+        for pair, own in found.items():
+            own.append(minimum(offsets, _curve(objective, poses, weights, pair)))
     return found
 
 
@@ -108,22 +106,21 @@ def minimum(offsets: np.ndarray, curve: np.ndarray) -> Minimum:
     return Minimum(float(lowest), float(slopes.std() / np.sqrt(curve.shape[1]) / bend))
 
 
-def _curves(
-    objective: Sequence[FrameObjective], truth: dict[str, np.ndarray], dof: int, offsets: np.ndarray
-) -> dict[str, torch.Tensor]:
-    poses = {
-        pair: torch.tensor(np.stack([moved(truth[pair], pair, dof, o) for o in offsets]), dtype=torch.float32)
-        for pair in PAIRS
-    }
-    parts: dict[str, list[torch.Tensor]] = {}
+def _curve(
+    objective: Sequence[FrameObjective], poses: dict[str, np.ndarray], weights: LossConfig, pair: str
+) -> np.ndarray:
+    """Weighted sum of a pair's terms at poses of all pairs: poses x frames."""
+    T = [torch.tensor(poses[name], dtype=torch.float32) for name in PAIRS]
     with torch.no_grad():
-        for part in objective:
-            count = len(part.centres_rad)
-            by_pose = [
-                part.terms(*(poses[pair][i].expand(count, 4, 4) for pair in PAIRS))
-                for i in range(len(offsets))
-            ]
-            for name in by_pose[0]:
-                if name != "loop":
-                    parts.setdefault(name, []).append(torch.stack([t[name] for t in by_pose]))
-    return {name: torch.cat(values, 1) for name, values in parts.items()}
+        parts = [
+            torch.stack(
+                [
+                    weighted(
+                        part.terms(*(t.expand(len(part.centres_rad), 4, 4) for t in at), (pair,)), weights
+                    )
+                    for at in zip(*T, strict=True)
+                ]
+            )
+            for part in objective
+        ]
+    return torch.cat(parts, 1).numpy()

@@ -9,10 +9,13 @@ import numpy as np
 from pipeline.core.config import FleetConfig
 from pipeline.learn.prepare.sides import decided_sides
 from pipeline.learn.prepare.survey import plan_days, survey_day
+from pipeline.learn.sample.frame_sample import About, Reference, make_row
+from pipeline.rig.estimates import Prior
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import perceived_days
 from schemas.frames import Frame
 from schemas.observations import Observation
+from schemas.training import TrainingRow
 from tests.makers import solve_scenes
 from tests.makers.lakes import write_frames, write_observations
 from tests.makers.stages import prepare_day
@@ -29,6 +32,7 @@ SMALL = {
     "lidar_points": 1024, "edge_points": 128,
     "grid": {"width_deg": 51.2, "height_deg": 25.6},
 }  # fmt: skip
+WIDE = {"width_deg": 102.4, "height_deg": 57.6}  # a grid that holds the networks' own, turned by 4 deg
 _OF_POINTS = ("lidar_points", "edge_points", "max_frames", "min_step_m", "seed")
 PALETTE = np.random.default_rng(7).integers(0, 255, (256, 3)).astype(np.uint8)
 
@@ -83,6 +87,16 @@ def frame_of(observation: Observation, rng: np.random.Generator, **changes) -> F
         "radar_range_rate_mps": np.zeros(len(radar), np.float32),
     }  # fmt: skip
     return Frame(**(values | changes))
+
+
+def sample_of(seed: int = 0, **prepare) -> TrainingRow:
+    """A row of table training from a scene, by its true poses."""
+    rng = np.random.default_rng(seed)
+    observation = solve_scenes.make_observation(rng, seed, 0, float(seed))
+    poses = Prior(solve_scenes.T_CAMERA_LIDAR, solve_scenes.T_LIDAR_RADAR, 0.02, 0.05)
+    about = About("v", "2026-01-01", "default", "train", "p", "urban")
+    config = fleet_of(["v"], **prepare).prepare
+    return make_row(frame_of(observation, rng), observation, Reference(poses), about, config)
 
 
 def fleet_lake(folder: Path, vehicles=("a", "b", "c", "d"), days=("2026-01-01",), frames: int = 6) -> Lake:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int8, Int32, Int64, UInt8
+from torch import Tensor
 
 from pipeline.core.errors import ContractError
 from pipeline.learn.sample.clouds import padded_rows
@@ -19,13 +20,7 @@ from schemas.training import TrainingRow
 
 __all__ = ["TrainingBatch", "collate"]
 
-Tensor = torch.Tensor
-_MAPS = {
-    "image": (3,),
-    "grid_class": (),
-    "grid_seen": (),
-    "edge_offset": (4,),
-}
+_MAPS = {"image": (3,), "grid_class": (), "grid_seen": (), "edge_offset": (4,)}
 _ARRAYS = (
     "detection_box_rad", "lidar_xyz_m",
     "cluster_centre_m", "edge_xyz_m", "edge_side",
@@ -98,13 +93,9 @@ class TrainingBatch:
         """The reference's, composed."""
         return self.T_camera_lidar @ self.T_lidar_radar
 
-    def to(self, device: torch.device | str, *, non_blocking: bool = False) -> TrainingBatch:
+    def to(self, device: torch.device | str) -> TrainingBatch:
         """The same batch on a device."""
-        return self._map(lambda t: t.to(device, non_blocking=non_blocking))
-
-    def pin_memory(self) -> TrainingBatch:
-        """The batch in page-locked memory, which a GPU reads directly."""
-        return self._map(torch.Tensor.pin_memory)
+        return self._map(lambda t: t.to(device))
 
     def __getitem__(self, rows: slice) -> TrainingBatch:
         """Some of the frames."""
@@ -112,34 +103,26 @@ class TrainingBatch:
 
     def take(self, rows: Int64[Tensor, " K"]) -> TrainingBatch:
         """Frames by number, in any order; `rows` on the batch's device."""
-        part = self._map(lambda t: t[rows])
-        picked, words = rows.tolist(), ("vehicle", "day")
-        names: dict[str, Any] = {n: tuple(getattr(self, n)[i] for i in picked) for n in words}
-        return replace(part, **names)
+        vehicle, day = (tuple(names[i] for i in rows.tolist()) for names in (self.vehicle, self.day))
+        return replace(self._map(lambda t: t[rows]), vehicle=vehicle, day=day)
 
     def _map(self, function: Callable[[Tensor], Tensor]) -> TrainingBatch:
-        values: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
-        mapped: dict[str, Any] = {n: function(v) for n, v in values.items() if isinstance(v, torch.Tensor)}
+        mapped: dict[str, Any] = {n: function(v) for n, v in vars(self).items() if isinstance(v, Tensor)}
         return replace(self, **mapped)
 
 
 def collate(rows: Sequence[TrainingRow]) -> TrainingBatch:
     """Stack rows of one table; raises ContractError if they differ in grid or counts."""
-    height, width, step = rows[0].grid_height, rows[0].grid_width, rows[0].grid_step_deg
-    if any((r.grid_height, r.grid_width, r.grid_step_deg) != (height, width, step) for r in rows):
-        raise ContractError(
-            "training", "rows have different grids: run `boresight prepare` for all days again"
-        )
-    try:
-        arrays = {name: np.stack([getattr(r, name) for r in rows]) for name in (*_MAPS, *_ARRAYS)}
-        features = {
-            "lidar_features": [padded_rows(lidar_features(r), len(r.lidar_xyz_m)) for r in rows],
-            "radar_features": [padded_rows(radar_features(r), len(r.radar_xyz_m)) for r in rows],
-        }
-        arrays |= {name: np.stack(values) for name, values in features.items()}
-    except ValueError as err:
-        problem = "rows have different counts of points: run `boresight prepare` for all days again"
-        raise ContractError("training", problem) from err
+    sizes = {
+        (r.grid_height, r.grid_width, r.grid_step_deg, len(r.lidar_xyz_m), len(r.edge_xyz_m)) for r in rows
+    }
+    if len(sizes) > 1:
+        problem = "rows have different grids or counts of points: run `boresight prepare` for all days again"
+        raise ContractError("training", problem)
+    [(height, width, step, lidar, _)] = sizes
+    arrays = {name: np.stack([getattr(r, name) for r in rows]) for name in (*_MAPS, *_ARRAYS)}
+    arrays["lidar_features"] = np.stack([padded_rows(lidar_features(r), lidar) for r in rows])
+    arrays["radar_features"] = np.stack([padded_rows(radar_features(r), len(r.radar_xyz_m)) for r in rows])
     tensors = {name: torch.from_numpy(values) for name, values in arrays.items()}
     tensors |= {n: tensors[n].reshape(len(rows), *planes, height, width) for n, planes in _MAPS.items()}
     for mask, (count, counted) in _MASKS.items():

@@ -1,12 +1,12 @@
-"""A trained network as one ONNX file, with its card inside.
+"""A trained network as one ONNX file, with its card inside and beside it as JSON and Markdown.
 
-The graph is the part that depends on weights: from rendered sensors to corrections (`RenderedView` names the
-inputs). Compiled code renders outside it. `camera_log_likelihood` is an output, so that a caller can cut the
-graph there and encode the camera once for several refinements (`infer/single_frame.py`).
+The graph is the part that depends on weights, from rendered sensors (`RenderedView`) to corrections. With output
+`camera_log_likelihood`, a caller can cut it and encode the camera once for several refinements.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import warnings
 from collections.abc import Sequence
@@ -19,7 +19,8 @@ import torch
 from torch import Tensor, nn
 from torch.jit._trace import TracerWarning
 
-from pipeline.learn.export.model_card import write_card
+from pipeline.core.errors import ConfigError
+from pipeline.learn.infer.onnx_networks import UNFIT
 from pipeline.learn.network.calibration_network import CalibrationNetwork
 from pipeline.learn.network.exported_weights import WEIGHTS, weight_places
 from pipeline.learn.network.views import RenderedView
@@ -36,12 +37,20 @@ from pipeline.learn.sample.layout import (
     RADAR_POINTS,
     NetworkConfig,
 )  # fmt: skip
+from pipeline.learn.train.loop import BEST, LAST, load_checkpoint, read_metrics
 from schemas.training import GRID_CLASSES
 from schemas.versions import CODE_VERSION
 
-__all__ = ["OPSET", "export_onnx", "trace_to_onnx"]
+__all__ = ["card_of_run", "export_onnx", "trace_to_onnx", "write_card"]
 
-OPSET = 18
+_OPSET = 18
+_LIMITS = (
+    "Trained without ground truth: answers have the losses' biases, which averaging over a fleet does not reduce.",
+    "Looks 38 deg to each side of the camera's axis; guesses within about 5 deg, best with 2 or 3 passes.",
+    "A single frame determines rotations of camera-lidar best; translations stay close to their guess.",
+    "Log variances describe the scatter between frames; they do not include errors common to all frames.",
+    "Rigs, lenses or weather that are not in the data were not learned.",
+)
 
 
 class _Graph(nn.Module):
@@ -73,15 +82,33 @@ def export_onnx(network: CalibrationNetwork, out: Path, card: dict[str, Any] | N
     unfinished = out.with_suffix(".part")
     model = trace_to_onnx(graph, examples, unfinished, GRAPH_INPUTS, names)
     _shorten_names(model, {*GRAPH_INPUTS, *names})
-    metadata = _metadata(network.config, card or {})
-    metadata[WEIGHTS] = json.dumps(weight_places(network.state_dict(), model))
+    config = network.config
+    metadata = {
+        "network": json.dumps(asdict(config)),
+        "architecture": config.architecture,
+        "pairs": json.dumps(PAIRS),
+        "classes": json.dumps(GRID_CLASSES),
+        "grid": json.dumps(asdict(config.grid)),
+        "code_version": CODE_VERSION,
+        "card": json.dumps(card or {}, default=str),
+        WEIGHTS: json.dumps(weight_places(network.state_dict(), model)),
+    }
     for key, value in metadata.items():
         entry = model.metadata_props.add()
         entry.key, entry.value = key, value
     onnx.checker.check_model(model)
     onnx.save(model, str(unfinished))
     unfinished.replace(out)
-    write_card(out, _card_of(network, metadata, card or {}))
+    about = {
+        "purpose": f"calibration from single frames ({config.pairs}): methods joint-ssl and pairwise-ssl",
+        "command": "boresight train, boresight export onnx",
+        "parameters": sum(p.numel() for p in network.parameters()),
+        "architecture": config.architecture,
+        "network": asdict(config),
+        "classes": list(GRID_CLASSES),
+        "code_version": CODE_VERSION,
+    }
+    write_card(out, about | (card or {}))
     return out
 
 
@@ -118,31 +145,6 @@ def _shorten_names(model: onnx.ModelProto, kept: set[str]) -> None:
     del model.graph.value_info[:]
 
 
-def _metadata(config: NetworkConfig, card: dict[str, Any]) -> dict[str, str]:
-    return {
-        "network": json.dumps(asdict(config)),
-        "architecture": config.architecture,
-        "pairs": json.dumps(PAIRS),
-        "classes": json.dumps(GRID_CLASSES),
-        "grid": json.dumps(asdict(config.grid)),
-        "code_version": CODE_VERSION,
-        "card": json.dumps(card, default=str),
-    }
-
-
-def _card_of(network: CalibrationNetwork, metadata: dict[str, str], card: dict[str, Any]) -> dict[str, Any]:
-    return {
-        "purpose": f"calibration from single frames ({network.config.pairs}): methods joint-ssl and pairwise-ssl",
-        "command": "boresight train, boresight export onnx",
-        "parameters": sum(p.numel() for p in network.parameters()),
-        "architecture": network.config.architecture,
-        "network": json.loads(metadata["network"]),
-        "classes": list(GRID_CLASSES),
-        "code_version": CODE_VERSION,
-        **card,
-    }
-
-
 def trace_to_onnx(
     graph: nn.Module, examples: tuple[Tensor, ...], path: Path, inputs: Sequence[str], outputs: Sequence[str]
 ) -> onnx.ModelProto:
@@ -155,7 +157,81 @@ def trace_to_onnx(
         warnings.filterwarnings("ignore", category=TracerWarning)
         warnings.filterwarnings("ignore", message=".*Constant folding.*")
         torch.onnx.export(
-            graph, examples, str(path), dynamo=False, opset_version=OPSET,
+            graph, examples, str(path), dynamo=False, opset_version=_OPSET,
             input_names=list(inputs), output_names=list(outputs),
         )  # fmt: skip
     return onnx.load(str(path))
+
+
+def card_of_run(folder: Path, notes: Path | None = None) -> dict[str, Any]:
+    """The card of a run of `boresight train`.
+
+    Args:
+        notes: JSON object whose entries are placed first: measurements after training, and facts about the
+            data.
+
+    Raises:
+        ContractError: no readable checkpoint.
+        ConfigError: notes that are no JSON object.
+    """
+    best = (folder / BEST).exists()
+    chosen, last = load_checkpoint(folder / (BEST if best else LAST)), load_checkpoint(folder / LAST)
+    config = chosen["config"]
+    validation = {
+        k.removeprefix("validation/"): v
+        for report in read_metrics(folder)
+        if report["step"] <= chosen["step"]
+        for k, v in report.items()
+        if k.startswith("validation/")
+    }
+    unfit = []  # for weights that no held-out frames chose, or that are those of the start
+    if not best:
+        unfit = [f"{UNFIT}: no held-out frames have judged it, so that `calibrate` holds all that it finds."]
+    elif chosen["step"] == 0:
+        unfit = [
+            f"{UNFIT}: training made no weights that are better on held-out frames than those it began with."
+        ]
+    card = {
+        "weights": f"of step {chosen['step']}, {'the best on held-out frames' if best else 'the last'}",
+        "data": {"cell_deg": config["cell_deg"], "frames_per_step": config["batch_size"]},
+        "seeds": [config["seed"]],
+        "time": {"steps": last["step"], "minutes": round(last["trained_s"] / 60, 1)},
+        "results": validation,
+        "limits": _LIMITS,
+        "training": config,
+    }
+    card |= _notes(notes)
+    return card | {"limits": [*unfit, *card["limits"]]}  # which no notes take away
+
+
+def write_card(model: Path, card: dict[str, Any]) -> None:
+    """Write the card next to the model's file as .json and .md, with size and sha256."""
+    content = model.read_bytes()
+    told = {"file": model.name, "bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+    card = told | {key: value for key, value in card.items() if key not in told}
+    model.with_suffix(".json").write_text(json.dumps(card, indent=2, default=str) + "\n")
+    model.with_suffix(".md").write_text(_markdown(card))
+
+
+def _markdown(card: dict[str, Any]) -> str:
+    lines = [f"# Model card of {card['file']}", ""]
+    for key, value in card.items():
+        name = key.replace("_", " ")
+        if isinstance(value, (dict, list, tuple)):
+            rows = [f"{k}: {v}" for k, v in value.items()] if isinstance(value, dict) else value
+            lines += [f"## {name}", "", *(f"- {row}" for row in rows), ""]
+        else:
+            lines += [f"- {name}: {value}", ""]
+    return "\n".join(lines)
+
+
+def _notes(path: Path | None) -> dict[str, Any]:
+    if path is None:
+        return {}
+    try:
+        notes = json.loads(path.read_text())
+    except (OSError, ValueError) as err:
+        raise ConfigError(str(path), "", f"no readable JSON: {err}") from err
+    if not isinstance(notes, dict):
+        raise ConfigError(str(path), "", "holds no JSON object")
+    return notes

@@ -1,1 +1,1 @@
-"""Frames of a lake with their calibration for other people's networks: shards, Parquet, KITTI, nuScenes."""
+"""Frames of a lake with their calibration for other people's networks: Parquet, nuScenes."""

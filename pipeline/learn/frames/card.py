@@ -82,18 +82,19 @@ def write_card(
 
 def _page(card: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
     days = card["vehicle_days"]
-    worst = _worst(days)
+    lost = [f"- {n} frames: {r.replace('_', ' ')}" for r, n in sorted(card["frames_left_out"].items())]
     moved = settings["perturb"]
     lines = [
         f"# Frames of {len({d['vehicle'] for d in days})} vehicles, {len(days)} vehicle-days",
         f"Made by {card['made_by']}; all of this page is in card.json too.\n",
         "| split | frames |\n|---|---|\n" + "\n".join(f"| {s} | {n} |" for s, n in card["frames"].items()),
         f"\nNo two splits share a {', '.join(settings['split']['split_by'])}. {_SYNCHRONISED}",
-        "\n## Left out\n" + (_listed(card["frames_left_out"]) or "No frame."),
+        "\n## Left out\n" + ("\n".join(lost) or "No frame."),
         *(f"- {d['vehicle']} {d['day']}: {d['reason']}" for d in card["vehicle_days_left_out"]),
         *_without_pose(days),
         f"\n## Calibration: {settings['calibration']}\n{card['conventions']}",
-        "\n| sensor | largest sigma of rotation [deg] | of place [m] |\n|---|---|---|\n" + "\n".join(worst),
+        "\n| sensor | largest sigma of rotation [deg] | of place [m] |\n|---|---|---|\n"
+        + "\n".join(_worst(days)),
     ]
     if moved is not None:
         lines.append(
@@ -103,10 +104,6 @@ def _page(card: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
         )
     lines += [f"\n## Open it\n{_OPEN[settings['format']]}", f"\nLabels: {card['labels']}.\n"]
     return "\n".join(lines)
-
-
-def _listed(counts: Mapping[str, int]) -> str:
-    return "\n".join(f"- {n} frames: {reason.replace('_', ' ')}" for reason, n in sorted(counts.items()))
 
 
 def _without_pose(days: Sequence[Mapping[str, Any]]) -> list[str]:

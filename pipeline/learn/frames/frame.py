@@ -43,14 +43,8 @@ class Mounting:
     def digest(self) -> str:
         """A hash that changes where any number does."""
         T_base = [] if self.T_base_reference is None else self.T_base_reference.tolist()
-        told = (
-            self.source,
-            self.reference,
-            T_base,
-            {n: T.tolist() for n, T in self.T.items()},
-            dict(self.about),
-            dict(self.left_out),
-        )
+        T = {name: pose.tolist() for name, pose in self.T.items()}
+        told = (self.source, self.reference, T_base, T, dict(self.about), dict(self.left_out))
         return hashlib.sha256(repr(told).encode()).hexdigest()[:16]
 
 
@@ -64,14 +58,12 @@ class Perturbation:
     per: str  # "frame" or "day": what has one draw
 
     def moved(self, mounting: Mounting, *names: str) -> dict[str, Float[np.ndarray, "4 4"]]:
-        """T_reference_sensor, moved by a draw that depends on vehicle, day and frame only."""
-        out = {}
-        for sensor, T in mounting.T.items():
+        """T_reference_sensor, moved by a draw that depends on the names (vehicle, day, frame) only."""
+        out, angle_rad = dict(mounting.T), float(np.radians(self.rotation_deg))
+        for sensor in out.keys() - {mounting.reference}:
             text = "\0".join((str(self.seed), *names, sensor))
             rng = np.random.default_rng(int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big"))
-            move = sensor != mounting.reference
-            angle = float(np.radians(self.rotation_deg))
-            out[sensor] = perturb_exactly(T, angle, self.translation_m, rng) if move else T
+            out[sensor] = perturb_exactly(out[sensor], angle_rad, self.translation_m, rng)
         return out
 
 
@@ -145,20 +137,19 @@ def read_frames(
     """Wanted frames of a vehicle-day in order; None for a frame with fewer than two posed sensors."""
     moments, sensors = [p.moment for p in places], list(mounting.T)
     seen = joined(lake, PERCEIVED, partition, sensors, moments)
-    day = (partition.vehicle, partition.day)
-    whole_day = perturbation.moved(mounting, *day) if perturbation else dict(mounting.T)
     for at, (moment, captures), (_, found) in zip(
         places, joined(lake, MOMENTS, partition, sensors, moments), seen, strict=True
     ):
         if len(captures) < 2:
             yield None
             continue
-        per_frame = perturbation is not None and perturbation.per == "frame"
-        T = perturbation.moved(mounting, *day, str(at.moment)) if perturbation and per_frame else whole_day
-        answer = None if perturbation is None else {n: mounting.T[n] for n in captures}
+        T, answer = {n: mounting.T[n] for n in captures}, None
+        if perturbation is not None:
+            frame = (str(at.moment),) if perturbation.per == "frame" else ()
+            moved = perturbation.moved(mounting, partition.vehicle, partition.day, *frame)
+            T, answer = {n: moved[n] for n in captures}, T
         labels = {n: f for n, f in found.items() if isinstance(f, ImageFeatureColumns)}
-        own = {n: T[n] for n in captures}
-        yield Frame(partition, at, moment, captures, labels, mounting, own, answer)
+        yield Frame(partition, at, moment, captures, labels, mounting, T, answer)
 
 
 def facts_of(frame: Frame) -> dict[str, Any]:
@@ -206,26 +197,19 @@ def _sensor(frame: Frame, name: str) -> dict[str, Any]:
         told |= {"kind": "radar", "fields": RADAR_FIELDS, "has_elevation": capture.radar_has_elevation}
         told["doppler_period_mps"] = capture.doppler_period_mps
     else:
-        told |= {"kind": "camera"} | _camera(capture) | _seen(frame.seen.get(name))
+        told |= {
+            "kind": "camera",
+            "camera_model": capture.camera_model,
+            "camera_K": capture.camera_K.tolist(),
+            "camera_D": capture.camera_D.tolist(),
+            "width_px": capture.image_width_px,
+            "height_px": capture.image_height_px,
+        }
+        if (found := frame.seen.get(name)) is not None:
+            told |= {
+                "label_scale": found.label_scale,
+                "boxes_px": found.road_user_boxes_px.tolist(),
+                "box_classes": found.road_user_classes,
+                "box_scores": found.road_user_scores.tolist(),
+            }
     return told
-
-
-def _camera(image: Image) -> dict[str, Any]:
-    return {
-        "camera_model": image.camera_model,
-        "camera_K": image.camera_K.tolist(),
-        "camera_D": image.camera_D.tolist(),
-        "width_px": image.image_width_px,
-        "height_px": image.image_height_px,
-    }
-
-
-def _seen(found: ImageFeatureColumns | None) -> dict[str, Any]:
-    if found is None:
-        return {}
-    return {
-        "label_scale": found.label_scale,
-        "boxes_px": found.road_user_boxes_px.tolist(),
-        "box_classes": found.road_user_classes,
-        "box_scores": found.road_user_scores.tolist(),
-    }

@@ -32,8 +32,7 @@ __all__ = ["VERSION", "NuScenesWriter", "finish_nuscenes", "token_of"]
 
 # Channels of sensors that are called by their kinds, as loaders expect them.
 _CHANNELS = {"camera": "CAM_FRONT", "lidar": "LIDAR_TOP", "radar": "RADAR_FRONT"}
-_PREFIX = {Image: "CAM", Sweep: "LIDAR", Scan: "RADAR"}
-_MODALITY = {Image: "camera", Sweep: "lidar", Scan: "radar"}
+_KINDS = {Image: ("CAM", "camera"), Sweep: ("LIDAR", "lidar"), Scan: ("RADAR", "radar")}
 _T_NUSCENES_LIDAR = from_rotation_translation(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.zeros(3))
 _RADAR = (
     "x:f4 y:f4 z:f4 dyn_prop:i1 id:i2 rcs:f4 vx:f4 vy:f4 vx_comp:f4 vy_comp:f4 is_quality_valid:i1 ambig_state:i1 "
@@ -48,8 +47,7 @@ class NuScenesWriter:
     A row is written when the next row of its chain, to which it refers, is known.
     """
 
-    def __init__(self, output: DayOutput, stack: ExitStack) -> None:
-        del stack  # files are whole when they are written
+    def __init__(self, output: DayOutput, _stack: ExitStack) -> None:
         self._output = output
         self._count = 0  # samples of the scene that is open
         self._last: dict[str, Any] = {}
@@ -68,16 +66,14 @@ class NuScenesWriter:
         if scene != self._scene:
             self.close()
             self._scene = scene
+        if not self._count:
+            self._first = frame
         sample = {
             "token": token_of("sample", frame.key),
             "timestamp": _us(frame.moment.stamp_ns),
-            "scene_token": "",
+            "scene_token": token_of("scene", self._first.key),
             "prev": self._last.get("token", ""),
-            "next": "",
         }
-        if not self._count:
-            self._first = frame
-        sample["scene_token"] = token_of("scene", self._first.key)
         self._follow("sample", self._last, sample["token"])
         self._last, self._count = sample, self._count + 1
         for name in frame.captures:
@@ -96,15 +92,10 @@ class NuScenesWriter:
             "first_sample_token": token_of("sample", first), "last_sample_token": self._last["token"],
             "description": f"{self._first.at.split}, {self._first.moment.log}, {self._first.at.environment}",
         }  # fmt: skip
-        row = {
-            "token": log,
-            "logfile": self._first.moment.log,
-            "vehicle": at.vehicle,
-            "date_captured": at.day,
-        }
         self._output.list("scene", scene)
         self._output.list(self._first.at.split, first)
-        self._once("log", row | {"location": "unknown"})
+        about = {"vehicle": at.vehicle, "date_captured": at.day, "location": "unknown"}
+        self._once("log", {"token": log, "logfile": self._first.moment.log, **about})
         self._last, self._latest, self._count = {}, {}, 0
 
     def _follow(self, table: str, row: dict[str, Any], following: Any) -> None:
@@ -125,7 +116,7 @@ class NuScenesWriter:
         row = {
             "token": token, "sample_token": sample, "ego_pose_token": token, "timestamp": _us(capture.stamp_ns),
             "calibrated_sensor_token": self._calibrated(frame, name, channel), "fileformat": suffix.strip("."),
-            "is_key_frame": True, "filename": path, "next": "", "prev": before.get("token", ""),
+            "is_key_frame": True, "filename": path, "prev": before.get("token", ""),
             "height": capture.image_height_px if isinstance(capture, Image) else 0,
             "width": capture.image_width_px if isinstance(capture, Image) else 0,
         }  # fmt: skip
@@ -135,37 +126,28 @@ class NuScenesWriter:
             "ego_pose", {"token": token, "timestamp": _us(capture.stamp_ns)} | _pose(T_odom_ego)
         )
         if isinstance(capture, Image):
-            self._seen(frame, name, channel, token)
+            self._seen(frame, name, channel, token, capture)
 
-    def _seen(self, frame: Frame, name: str, channel: str, token: str) -> None:
-        image, seen = frame.captures[name], frame.seen.get(name)
-        if seen is None or not isinstance(image, Image):
+    def _seen(self, frame: Frame, name: str, channel: str, token: str, image: Image) -> None:
+        if (seen := frame.seen.get(name)) is None:
             return
         undistortion = undistortion_of(image, name)
         self._output.put(f"labels/{channel}/{frame.key}.png", undistortion.labels(seen))
         for k, (box, kind, score) in enumerate(undistortion.boxes(seen)):
-            category = {"token": token_of("category", kind), "name": kind, "description": "", "index": 0}
-            self._once("category", category)
-            told = {
-                "token": token_of("box", token, str(k)),
-                "sample_data_token": token,
-                "bbox": box,
-                "score": score,
-            }
-            self._output.list(
-                "object_ann",
-                told | {"category_token": category["token"], "attribute_tokens": [], "mask": None},
-            )
+            category = token_of("category", kind)
+            self._once("category", {"token": category, "name": kind, "description": "", "index": 0})
+            self._output.list("object_ann", {
+                "token": token_of("box", token, str(k)), "sample_data_token": token, "category_token": category,
+                "bbox": box, "score": score, "attribute_tokens": [], "mask": None,
+            })  # fmt: skip
 
     def _calibrated(self, frame: Frame, name: str, channel: str) -> str:
-        capture = frame.captures[name]
-        self._once(
-            "sensor",
-            {"token": token_of("sensor", channel), "channel": channel, "modality": _MODALITY[type(capture)]},
-        )
+        capture, sensor = frame.captures[name], token_of("sensor", channel)
+        modality = _KINDS[type(capture)][1]
+        self._once("sensor", {"token": sensor, "channel": channel, "modality": modality})
         K = capture.camera_K.tolist() if isinstance(capture, Image) else []
         given = _pose(_channel_pose(frame, frame.T[name], capture))
-        row = {"sensor_token": token_of("sensor", channel), **given, "camera_intrinsic": K}
+        row = {"sensor_token": sensor, **given, "camera_intrinsic": K}
         row["token"] = token_of("calibrated", frame.partition.folder, channel, repr(row))
         self._once("calibrated_sensor", row)
         if frame.answer is not None:
@@ -181,10 +163,8 @@ class NuScenesWriter:
 
 
 def _channel(frame: Frame, name: str) -> str:
-    prefix = _PREFIX[type(frame.captures[name])]
-    return _CHANNELS.get(name) or (
-        name.upper() if name.upper().startswith(prefix) else f"{prefix}_{name.upper()}"
-    )
+    prefix, upper = _KINDS[type(frame.captures[name])][0], name.upper()
+    return _CHANNELS.get(name) or (upper if upper.startswith(prefix) else f"{prefix}_{upper}")
 
 
 def _channel_pose(frame: Frame, T: np.ndarray, capture: object) -> np.ndarray:
@@ -271,19 +251,9 @@ def _compensated_range_rate(frame: Frame, sensor: str, scan: Scan) -> Float[np.n
 VERSION = "v1.0-boresight"
 # Tables that the devkit opens; the last three are of others.
 _TABLES = (
-    *(
-        "category",
-        "attribute",
-        "visibility",
-        "instance",
-        "sensor",
-        "calibrated_sensor",
-        "ego_pose",
-        "log",
-        "scene",
-    ),
-    *("sample", "sample_data", "sample_annotation", "map", "object_ann", "calibrated_sensor_answer"),
-)
+    "category", "attribute", "visibility", "instance", "sensor", "calibrated_sensor", "ego_pose", "log",
+    "scene", "sample", "sample_data", "sample_annotation", "map", "object_ann", "calibrated_sensor_answer",
+)  # fmt: skip
 _SHARED = {"sensor", "category"}
 
 

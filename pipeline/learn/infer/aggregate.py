@@ -80,8 +80,7 @@ class Answers:
     variance: Float[np.ndarray, "N 6"]  # as the network predicts it
     block: Int[np.ndarray, " N"]  # frames of one block see the same things
     frames: int  # different ones among the N
-    # (bearing rotation, translation); None: BIAS_SIGMA of the pair.
-    bias_sigma: Float[np.ndarray, " 6"] | None = None
+    bias_sigma: Float[np.ndarray, " 6"]  # of all answers, (bearing rotation [rad], translation [m])
     # Where searches that started all over the prior ended, about the centre; None: nobody looked (days have frames).
     ends: Float[np.ndarray, "M 6"] | None = None
 
@@ -117,10 +116,9 @@ def day_estimate(
     m0 = S @ log_se3(T_prior @ inverse(answers.T_centre))
     P = S @ prior_covariance @ S.T
     H = np.eye(6) - gain
-    ignored = np.diag(H) < _LEAST_GAIN
-    if unobservable is not None:
-        ignored |= unobservable
-    spread = _spread(pair, answers, draws, ignored)
+    blind = np.zeros(6, bool) if unobservable is None else unobservable
+    ignored = blind | (np.diag(H) < _LEAST_GAIN)
+    spread = _spread(answers, draws, ignored)
     gain_variance = draws[:, 1:].transpose(0, 2, 1).var(axis=0)
     x, covariance, R = _updated_thrice(m0, P, H, spread, mean, gain_variance)
     stated = np.zeros((6, 6)) if answers.ends is None else np.diag(np.square(FRAME_SIGMA[pair]))
@@ -130,26 +128,23 @@ def day_estimate(
     )
     observability = np.clip(observability, 0.0, 1.0)
     observable = observability >= OBSERVABLE
-    asked = np.ones(3, bool) if unobservable is None else ~unobservable[:3]
-    if answers.ends is not None and (weighed[:3] < OBSERVABLE)[asked].any():
+    if answers.ends is not None and (weighed < OBSERVABLE)[:3][~blind[:3]].any():
         observable[:] = False  # searches end apart: an answer is right or wrong as a whole
     if not observable.all():
         x, covariance = _update(m0, P, H, R, mean, keep=~observable)
     covariance = covariance + np.where(np.outer(observable, observable), stated, 0.0)
-    x, covariance = twist_of_bearing @ x, twist_of_bearing @ covariance @ twist_of_bearing.T
+    covariance = twist_of_bearing @ covariance @ twist_of_bearing.T
+    covariance = (covariance + covariance.T) / 2
+    bias = twist_of_bearing @ np.diag(np.square(answers.bias_sigma)) @ twist_of_bearing.T
     return PairEstimate(
         pair,
-        exp_se3(x) @ answers.T_centre,
-        (covariance + covariance.T) / 2,
+        exp_se3(twist_of_bearing @ x) @ answers.T_centre,
+        covariance,
         observability,
         observable,
         answers.frames,
         diagnostics=_diagnostics(fit, gain, answers),
-        common_covariance=common_of(
-            (covariance + covariance.T) / 2,
-            prior_covariance,
-            twist_of_bearing @ np.diag(np.square(_bias_sigma(pair, answers))) @ twist_of_bearing.T,
-        ),
+        common_covariance=common_of(covariance, prior_covariance, bias),
     )
 
 
@@ -238,19 +233,14 @@ def _bearing_of_twist(T_centre: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "
     return S
 
 
-def _spread(pair: str, answers: Answers, draws: np.ndarray, ignored: np.ndarray) -> Float[np.ndarray, "6 6"]:
+def _spread(answers: Answers, draws: np.ndarray, ignored: np.ndarray) -> Float[np.ndarray, "6 6"]:
     """Covariance of the mean answer: bootstrap, at least the network's prediction, plus the bias."""
     spread = np.cov(draws[:, 0].T)
     predicted = np.median(answers.variance, axis=0) / answers.frames
-    bias = _bias_sigma(pair, answers)
-    spread += np.diag(np.maximum(predicted - np.diag(spread), 0.0) + np.square(bias))
+    spread += np.diag(np.maximum(predicted - np.diag(spread), 0.0) + np.square(answers.bias_sigma))
     if answers.ends is not None:
         spread[:3, :3] += ENDS_FACTOR**2 * np.cov(answers.ends[:, :3].T)
     return np.asarray(spread + np.diag(np.where(ignored, _IGNORED, 0.0)))
-
-
-def _bias_sigma(pair: str, answers: Answers) -> Float[np.ndarray, " 6"]:
-    return np.asarray(BIAS_SIGMA[pair] if answers.bias_sigma is None else answers.bias_sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,7 +259,7 @@ def _robust_regression(answers: Answers) -> _Fit:
     scatter = answers.answer.std(axis=0) + 1e-9
     for _ in range(_ROUNDS):
         B = _solve(answers.guess, answers.answer, weight, scatter)
-        residual = answers.answer - _design(answers.guess) @ B
+        residual = answers.answer - B[0] - answers.guess @ B[1:]
         scaled = residual * np.sqrt(trust)
         scatter = 1.4826 * np.median(np.abs(scaled - np.median(scaled, axis=0)), axis=0) + 1e-9
         u = np.minimum(np.abs(scaled) / (_TUKEY * scatter), 1.0)
@@ -278,15 +268,11 @@ def _robust_regression(answers: Answers) -> _Fit:
     return _Fit(B, weight, scatter)
 
 
-def _design(guess: np.ndarray) -> np.ndarray:
-    return np.column_stack([np.ones(len(guess)), guess])
-
-
 def _solve(
     guess: np.ndarray, answer: np.ndarray, weight: np.ndarray, scatter: np.ndarray
 ) -> Float[np.ndarray, "7 6"]:
     """Weighted least squares by column of the answer, with a prior on the gains."""
-    A = _design(guess)
+    A = np.column_stack([np.ones(len(guess)), guess])
     B = np.empty((7, 6))
     for j in range(6):
         w = weight[:, j]
@@ -326,13 +312,12 @@ def _update(
 
 def _diagnostics(fit: _Fit, gain: np.ndarray, answers: Answers) -> dict[str, float]:
     """Scatter of one frame's answers, the share of a guess that answers repeat, and how many answers are outliers."""
-    turned = np.diag(gain)[:3]
     ends = np.zeros((2, 3)) if answers.ends is None else answers.ends[:, :3]
     return {
         "ends_apart_deg": float(np.degrees(np.linalg.norm(ends.std(axis=0)))),
         "frame_scatter_deg": float(np.degrees(np.linalg.norm(fit.scatter[:3]))),
         "frame_scatter_m": float(np.linalg.norm(fit.scatter[3:])),
-        "repeated_rotation": float(np.abs(turned).max()),
+        "repeated_rotation": float(np.abs(np.diag(gain)[:3]).max()),
         "repeated_translation": float(np.abs(np.diag(gain)[3:]).max()),
         "answers": float(len(answers.answer)),
         "answers_outlying": float(np.sum(fit.weight.max(axis=1) <= 0)),

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipeline.core.errors import SolveError
 from pipeline.core.results import Progress, silent
-from pipeline.learn.infer.aggregate import Answers, day_estimate, mean_answer, twists_about
+from pipeline.learn.infer.aggregate import BIAS_SIGMA, Answers, day_estimate, mean_answer, twists_about
 from pipeline.learn.infer.class_evidence import FrameEvidence
-from pipeline.learn.infer.frame_network import FrameNetwork, FrameSource
 from pipeline.learn.infer.joint_day import Expected, JointDay, fitted_day
 from pipeline.learn.sample.clouds import own_velocity
 from pipeline.learn.sample.frame_sample import SampleRejectedError
@@ -26,7 +25,7 @@ from schemas.calibrations import PAIRS
 from schemas.frames import Frame
 from schemas.observations import Observation
 
-__all__ = ["single_frame_solution", "solve_by_networks"]
+__all__ = ["FrameAnswer", "FrameNetwork", "FrameSource", "single_frame_solution", "solve_by_networks"]
 
 # Guesses are scattered by this much (standard deviation per axis): several times the scatter of one frame's answers.
 _SCATTER_RAD, _SCATTER_M = np.radians(0.4), 0.03
@@ -43,6 +42,50 @@ _BY_ELEVATION = {
     "camera_radar": np.array([1, 0, 1, 0, 1, 0], bool),
     "lidar_radar": np.array([1, 1, 0, 0, 0, 1], bool),
 }
+
+
+# frames(indices) yields the frames of a day with these frame_index, in order.
+FrameSource = Callable[[Sequence[int]], Iterator[Frame]]
+
+
+@dataclass(frozen=True, eq=False)
+class FrameAnswer:
+    """A network's answer to one frame and guess, for the pairs that it estimates."""
+
+    T: Mapping[str, np.ndarray]
+    variance: Mapping[str, np.ndarray]  # of a twist on the left [rad^2, m^2]
+
+
+@runtime_checkable
+class FrameNetwork(Protocol):
+    """A network as a vehicle-day uses it."""
+
+    @property
+    def pairs(self) -> tuple[str, ...]:
+        """Pairs that it estimates."""
+        ...
+
+    @property
+    def composed(self) -> bool:
+        """True if camera_radar is the product of the other two pairs before its correction."""
+        ...
+
+    @property
+    def bias_sigma(self) -> Mapping[str, np.ndarray]:
+        """By pair, sigma of the bias that all answers share (see `aggregate`); a pair is missing where unknown."""
+        ...
+
+    def sensors(self, frame: Frame, observation: Observation, prior: Prior) -> Any:
+        """Inputs of `answer` from a frame; raises SampleRejectedError if it shows too little."""
+        ...
+
+    def evidence(self, sensors: Any, T_camera_lidar: np.ndarray) -> FrameEvidence | None:
+        """Matching evidence of camera and lidar, points chosen at a guess; None if the network returns none."""
+        ...
+
+    def answer(self, sensors: Any, guess: Mapping[str, np.ndarray]) -> FrameAnswer:
+        """Transforms from one frame, started at a guess for every pair."""
+        ...
 
 
 def solve_by_networks(
@@ -88,11 +131,12 @@ def solve_by_networks(
     failed = {pair: _halves_disagree(pair, found[pair].block, estimate) for pair in triggered}
     if together is not None and "camera_lidar" in failed:
         failed["camera_lidar"] += together.failed
-    if any(n.composed for n in networks) or len(triggered) < len(PAIRS):
+    if asked.composed or len(triggered) < len(PAIRS):
         # A loop that closes by construction is no evidence.
         return Solution(method, estimates, failed_checks=failed)
-    rotation_rad, translation_m = _loop(estimates)
-    return Solution(method, estimates, rotation_rad, translation_m, failed)
+    loop = estimates["camera_lidar"].T @ estimates["lidar_radar"].T @ inverse(estimates["camera_radar"].T)
+    translation_m = float(np.linalg.norm(loop[:3, 3]))
+    return Solution(method, estimates, float(rotation_angle_rad(loop)), translation_m, failed)
 
 
 def single_frame_solution(
@@ -121,9 +165,8 @@ def single_frame_solution(
         pair: _estimate(pair, replace(found[pair], ends=twists_about(centre[pair], ends[pair])), asked, rng)
         for pair in PAIRS
     }
-    if not estimates[
-        "camera_lidar"
-    ].observable.any():  # the picture does not determine it, so nor the radar's pose
+    if not estimates["camera_lidar"].observable.any():
+        # The picture does not determine it, so nor the radar's pose.
         estimates["camera_radar"] = PairEstimate.at_prior("camera_radar", prior)
     return Solution(method, estimates)
 
@@ -133,15 +176,14 @@ def _searched(asked: _Asked, rng: np.random.Generator) -> tuple[dict[str, np.nda
 
     Only far starts show that a frame fits in several places: near ones all end in the same place.
     """
-    prior, networks = asked.prior, asked.networks
+    prior = asked.prior
     starts = _scattered(_STARTS_OF_ONE_FRAME, rng, prior.rotation_sigma_rad, prior.translation_sigma_m)
     guess = {pair: prior.of(pair) for pair in PAIRS}
-    composed = any(n.composed for n in networks)
     ends: dict[str, list[np.ndarray]] = {pair: [] for pair in PAIRS}
     for offsets in starts:
-        at = _guess(guess, offsets, composed=composed)
+        at = _guess(guess, offsets, composed=asked.composed)
         for _ in range(_SEARCH_ROUNDS):
-            for network, sensors in zip(networks, asked.sensors[0], strict=True):
+            for network, sensors in zip(asked.networks, asked.sensors[0], strict=True):
                 at |= network.answer(sensors, at).T
         for pair in PAIRS:
             ends[pair].append(at[pair])
@@ -160,6 +202,11 @@ class _Asked:
     prior: Prior
     sensors: list[list[Any]]  # by frame, by network
     observations: list[Observation]
+
+    @property
+    def composed(self) -> bool:
+        """Whether a network makes camera_radar of the other two pairs, so that the loop closes by construction."""
+        return any(n.composed for n in self.networks)
 
     def unobservable(self, pair: str) -> Bool[np.ndarray, " 6"]:
         """Degrees of freedom that no frame of the day can determine."""
@@ -273,8 +320,7 @@ def _ask(
 ) -> dict[str, Answers]:
     """Answers of all networks on these frames, each at its own guess about the centre."""
     offsets = _scattered(len(rows), rng)
-    composed = any(n.composed for n in asked.networks)
-    guesses = [_guess(centre, offsets[i], composed=composed) for i in range(len(rows))]
+    guesses = [_guess(centre, own, composed=asked.composed) for own in offsets]
     answers: dict[str, list[np.ndarray]] = {pair: [] for pair in PAIRS}
     variances: dict[str, list[np.ndarray]] = {pair: [] for pair in PAIRS}
     for i, row in enumerate(rows):
@@ -285,7 +331,9 @@ def _ask(
                 answers[pair].append(answer.T[pair])
                 variances[pair].append(answer.variance[pair])
     block = _blocks([asked.observations[row].drive for row in rows])
-    bias = {pair: n.bias_sigma[pair] for n in asked.networks for pair in n.pairs if pair in n.bias_sigma}
+    bias = {pair: np.array(sigma) for pair, sigma in BIAS_SIGMA.items()}
+    for network in asked.networks:
+        bias |= {pair: network.bias_sigma[pair] for pair in network.pairs if pair in network.bias_sigma}
     return {
         pair: Answers(
             centre[pair],
@@ -294,7 +342,7 @@ def _ask(
             np.stack(variances[pair]),
             block,
             len(set(rows)),
-            bias.get(pair),
+            bias[pair],
         )
         for pair in PAIRS
     }
@@ -343,16 +391,9 @@ def _halves_disagree(
     ratio = np.where(both, np.abs(apart) / sigma, 0.0)
     if ratio.max() <= _HALVES_SIGMAS:
         return []
-    sentence = f"two halves of the day differ by {ratio.max():.1f} of their sigmas"
-    return [Check(sentence, "witnesses_disagree")]
+    return [Check(f"two halves of the day differ by {ratio.max():.1f} of their sigmas", "witnesses_disagree")]
 
 
 def _part(answers: Answers, rows: np.ndarray) -> Answers:
     kept = {name: getattr(answers, name)[rows] for name in ("guess", "answer", "variance", "block")}
     return replace(answers, **kept, frames=max(1, round(answers.frames * float(rows.mean()))))
-
-
-def _loop(estimates: Mapping[str, PairEstimate]) -> tuple[float, float]:
-    """Rotation angle [rad] and translation [m] of the loop of three independent estimates."""
-    T = estimates["camera_lidar"].T @ estimates["lidar_radar"].T @ inverse(estimates["camera_radar"].T)
-    return float(rotation_angle_rad(T)), float(np.linalg.norm(T[:3, 3]))

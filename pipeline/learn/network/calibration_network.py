@@ -8,20 +8,20 @@ evidence, and residuals. `concat` is the paper's: encode, concatenate, fuse, reg
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
 from pipeline.learn.network.concat_network import ConcatCore
-from pipeline.learn.network.inputs import NetworkInputs
 from pipeline.learn.network.matching_network import MatchingCore
 from pipeline.learn.network.outputs import CoreOutputs, Predictions
-from pipeline.learn.network.views import RenderedView, render
+from pipeline.learn.network.views import NetworkInputs, RenderedView, render
 from pipeline.learn.sample.layout import NetworkConfig
 from pipeline.objective.differentiable.poses import inverse, transform_points
 
-__all__ = ["CalibrationNetwork", "NetworkConfig", "build_network", "compose", "turns_only"]
+__all__ = ["CalibrationNetwork", "build_network"]
 
 
 class CalibrationNetwork(nn.Module):
@@ -30,23 +30,7 @@ class CalibrationNetwork(nn.Module):
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.config = config
-        self.core: MatchingCore | ConcatCore
-        if config.architecture == "matching":
-            self.core = MatchingCore(
-                config.grid,
-                config.estimated,
-                config.width,
-                config.hidden,
-                config.camera_channels,
-                config.marks,
-            )
-        else:
-            self.core = ConcatCore(config.grid, config.estimated, config.width, config.hidden)
-
-    def forward(self, inputs: NetworkInputs) -> Predictions:
-        """One pass."""
-        view, index = self._render(inputs)
-        return self._predictions(inputs, self.core(view), index)
+        self.core = MatchingCore(config) if config.architecture == "matching" else ConcatCore(config)
 
     def encode(self, inputs: NetworkInputs) -> Predictions:
         """Class logits alone, at the guess: training signal of the encoders of `matching`."""
@@ -72,14 +56,9 @@ class CalibrationNetwork(nn.Module):
                 outputs = self.core(view)
                 likelihood, logits = outputs.camera_log_likelihood, outputs.camera_logits
             found.append(self._predictions(inputs, outputs, index))
-            turned = replace(outputs, corrections=turns_only(outputs.corrections.detach()))
-            guess = self._predictions(inputs, turned, index)
-            inputs = replace(
-                inputs,
-                T_camera_lidar=guess.T_camera_lidar,
-                T_camera_radar=guess.T_camera_radar,
-                T_lidar_radar=guess.T_lidar_radar,
-            )
+            turns = outputs.corrections.detach().clone()
+            turns[..., :3, 3] = 0.0
+            inputs = replace(inputs, **self._corrected(turns, inputs))
         return found
 
     def _render(self, inputs: NetworkInputs) -> tuple[RenderedView, Int64[Tensor, "B HW"]]:
@@ -88,51 +67,28 @@ class CalibrationNetwork(nn.Module):
     def _predictions(
         self, inputs: NetworkInputs, outputs: CoreOutputs, index: Int64[Tensor, "B HW"]
     ) -> Predictions:
-        T_camera_lidar, T_camera_radar, T_lidar_radar = compose(
-            outputs.corrections, inputs.T_camera_lidar, inputs.T_camera_radar, inputs.T_lidar_radar,
-            composed=self.config.composed,
-        )  # fmt: skip
         evidence = outputs.evidence
         if evidence is not None:
             points_m = transform_points(inverse(inputs.T_camera_lidar), evidence.points_m)
             evidence = replace(evidence, points_m=points_m)
-        return Predictions(
-            T_camera_lidar,
-            T_camera_radar,
-            T_lidar_radar,
-            outputs.log_variance,
-            outputs.camera_logits,
-            outputs.lidar_logits,
-            outputs.radar_logits,
-            index,
-            evidence,
-        )
+        poses = self._corrected(outputs.corrections, inputs)
+        return Predictions(**vars(outputs) | {"evidence": evidence}, **poses, lidar_index=index)
 
+    def _corrected(self, corrections: Float[Tensor, "B 3 4 4"], inputs: NetworkInputs) -> dict[str, Any]:
+        """Corrected transforms (B 4 4) by the names of `NetworkInputs`.
 
-def turns_only(corrections: Float[Tensor, "B 3 4 4"]) -> Float[Tensor, "B 3 4 4"]:
-    """The corrections without their shifts."""
-    turned = corrections.clone()
-    turned[..., :3, 3] = 0.0
-    return turned
-
-
-def compose(
-    corrections: Float[Tensor, "B 3 4 4"],
-    T_camera_lidar: Float[Tensor, "B 4 4"],
-    T_camera_radar: Float[Tensor, "B 4 4"],
-    T_lidar_radar: Float[Tensor, "B 4 4"],
-    *,
-    composed: bool,
-) -> tuple[Float[Tensor, "B 4 4"], Float[Tensor, "B 4 4"], Float[Tensor, "B 4 4"]]:
-    """Corrected transforms (camera-lidar, camera-radar, lidar-radar).
-
-    With `composed` the camera-radar correction is applied to the product of the other two instead of to the
-    guess: radar is matched to the lidar six times better than to the image.
-    """
-    camera_lidar = corrections[:, 0] @ T_camera_lidar
-    lidar_radar = corrections[:, 2] @ T_lidar_radar
-    base = camera_lidar @ lidar_radar if composed else T_camera_radar
-    return camera_lidar, corrections[:, 1] @ base, lidar_radar
+        If the network composes, the camera-radar correction is applied to the product of the other two instead
+        of to the guess: radar is matched to the lidar six times better than to the image.
+        """
+        T_camera_lidar = corrections[:, 0] @ inputs.T_camera_lidar
+        T_lidar_radar = corrections[:, 2] @ inputs.T_lidar_radar
+        base = T_camera_lidar @ T_lidar_radar if self.config.composed else inputs.T_camera_radar
+        T_camera_radar = corrections[:, 1] @ base
+        return {
+            "T_camera_lidar": T_camera_lidar,
+            "T_camera_radar": T_camera_radar,
+            "T_lidar_radar": T_lidar_radar,
+        }
 
 
 def build_network(config: NetworkConfig, seed: int = 0) -> CalibrationNetwork:

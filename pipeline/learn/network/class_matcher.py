@@ -18,12 +18,12 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 - the name that everybody uses
 
-from pipeline.learn.network.least_squares import angular_jacobian, inverse_spd, small_rotation_vector
-from pipeline.learn.network.rendering import grid_cells, sphere
+from pipeline.learn.network.least_squares import Match, angular_jacobian, damped_match
+from pipeline.learn.network.views import grid_cells, sphere
 from pipeline.learn.sample.grid import Grid
 from pipeline.objective.differentiable.poses import exp_so3
 
-__all__ = ["NEUTRAL", "ClassMatcher", "Level", "Match", "levels_for"]
+__all__ = ["FLOOR", "NEUTRAL", "ClassMatcher"]
 
 NEUTRAL = float(np.log(0.1))  # log-likelihood of any of ten classes where the camera sees nothing
 FLOOR = -5.0  # a confident mistake of the camera costs no more than this
@@ -32,7 +32,7 @@ _NEAR_FAR_M = 18.0  # about the median range of what a car's lidar meets; parall
 
 
 @dataclass(frozen=True)
-class Level:
+class _Level:
     """One resolution of the search: `reach` cells of `cell_deg` to each side, `rolls` steps of roll to each side."""
 
     factor: int  # cells of the grid per cell of this level
@@ -40,20 +40,11 @@ class Level:
     rolls: int
 
 
-def levels_for(grid: Grid) -> tuple[Level, ...]:
+def _levels_for(grid: Grid) -> tuple[_Level, ...]:
     """Cells of 1.6 deg (+- 8 deg), 0.8 deg (+- 3.2), 0.4 deg (+- 1.2) and 0.2 deg (+- 0.6) where the grid has them."""
     wanted = ((1.6, 5, 1), (0.8, 4, 3), (0.4, 3, 3), (0.2, 3, 3))
     found = [(round(cell / grid.cell_deg), reach, rolls) for cell, reach, rolls in wanted]
-    return tuple(Level(*level) for level in found if level[0] >= 1)
-
-
-@dataclass(frozen=True, eq=False)
-class Match:
-    """Result of a matcher: left twist in the optical frame, its variance, and the last surfaces."""
-
-    twist: Float[Tensor, "B 6"]  # rotation vector [rad], translation [m]
-    variance: Float[Tensor, "B 6"]
-    surfaces: Float[Tensor, "B G S S"]  # log-probability of shifts by group, last level
+    return tuple(_Level(*level) for level in found if level[0] >= 1)
 
 
 class ClassMatcher(nn.Module):
@@ -62,7 +53,7 @@ class ClassMatcher(nn.Module):
     def __init__(self, grid: Grid) -> None:
         super().__init__()
         self.grid = grid
-        self.levels = levels_for(grid)
+        self.levels = _levels_for(grid)
         # exp: how many independent observations a frame's mean log-likelihood is worth; 150 by the oracle's spread.
         self.log_sharpness = nn.Parameter(torch.full((len(self.levels),), float(np.log(150.0))))
         # Prior sigmas of the last step: rotation [rad] and translation [m].
@@ -71,7 +62,7 @@ class ClassMatcher(nn.Module):
 
     @property
     def surface_size(self) -> int:
-        """Values of `Match.surfaces` per frame."""
+        """Length of `Match.surfaces`."""
         return 2 * _STRIPS * (2 * self.levels[-1].reach + 1) ** 2
 
     def forward(
@@ -81,7 +72,7 @@ class ClassMatcher(nn.Module):
         probability: Float[Tensor, "B N K"],
         weight: Float[Tensor, "B N"],
     ) -> Match:
-        """Find the turn (and shift) of the points that fits best.
+        """Find the turn (and shift) of the points that fits best, in the optical frame; surfaces of the last level.
 
         Args:
             log_likelihood: of each class in the camera's cells, NEUTRAL where it sees nothing.
@@ -103,7 +94,7 @@ class ClassMatcher(nn.Module):
             strip_scores = by_group[:, :_STRIPS] + by_group[:, _STRIPS:]
             omega = self._turn(level, strip_scores, directions, sharpness)
             R = exp_so3(omega) @ R
-        return self._finish(self.levels[-1], by_group, _centres(sums), sharpness, omega, R)
+        return self._finish(by_group, _centres(sums), sharpness, omega, R)
 
     def _pyramid(self, log_likelihood: Tensor) -> list[Tensor]:
         """Maps per level, padded by the reach of a border point, classes last: of a cell and the next."""
@@ -132,7 +123,7 @@ class ClassMatcher(nn.Module):
     def _scores(
         self,
         table: Tensor,
-        level: Level,
+        level: _Level,
         places: tuple[Tensor, Tensor],
         probability: Tensor,
         groups: Tensor,
@@ -167,7 +158,7 @@ class ClassMatcher(nn.Module):
             + corner[:, 3, :, 1:, 1:]
         )
 
-    def _turn(self, level: Level, strips: Tensor, directions: Tensor, sharpness: Tensor) -> Tensor:
+    def _turn(self, level: _Level, strips: Tensor, directions: Tensor, sharpness: Tensor) -> Tensor:
         """Rotation vector by soft-argmax over roll, elevation and azimuth shifts; all strips vote together."""
         cell = float(np.radians(self.grid.cell_deg * level.factor))
         size = 2 * level.reach + 1
@@ -191,19 +182,18 @@ class ClassMatcher(nn.Module):
         return torch.stack([up, -left, about_axis], -1)
 
     def _finish(
-        self, level: Level, by_group: Tensor, centre: tuple[Tensor, Tensor], sharpness: Tensor,
-        omega: Tensor, R: Tensor,
-    ) -> Match:  # fmt: skip
+        self, by_group: Tensor, centre: tuple[Tensor, Tensor], sharpness: Tensor, omega: Tensor, R: Tensor
+    ) -> Match:
         """Least squares over the groups' shifts: the remaining rotation, and the translation by parallax."""
+        level = self.levels[-1]
         cell = float(np.radians(self.grid.cell_deg * level.factor))
         size = 2 * level.reach + 1
         log_posterior = torch.log_softmax((by_group * sharpness[:, None, None, None]).flatten(2), -1)
         log_posterior = log_posterior.reshape(by_group.shape)
         posterior = torch.exp(log_posterior)
         shift = (torch.arange(size, device=R.device, dtype=R.dtype) - level.reach) * cell
-        marginals = torch.stack(
-            [posterior.sum(2), posterior.sum(3)], 2
-        )  # azimuth (columns), elevation (rows)
+        # Azimuth by columns, elevation by rows.
+        marginals = torch.stack([posterior.sum(2), posterior.sum(3)], 2)
         mean = (marginals * shift).sum(-1)
         spread = (marginals * (shift * shift)).sum(-1) - mean * mean + torch.exp(2 * self.log_error_floor)
         # The window itself is a prior with its width; a flat surface must have no information.
@@ -211,16 +201,8 @@ class ClassMatcher(nn.Module):
         information = (1 / spread - 1 / window).clamp(min=0)
         J = angular_jacobian(*centre)
         turned = (J[..., :3] @ omega[:, None, :, None])[..., 0]
-        residual = -mean / spread - information * turned
-        rows = J.flatten(1, 2).transpose(1, 2)
-        H = (rows * information.flatten(1)[:, None]) @ J.flatten(1, 2)
-        H = H + torch.eye(6, device=R.device) * torch.exp(-2 * self.log_prior_sigma)
-        covariance = inverse_spd(H)
-        step = (covariance @ (rows @ residual.flatten(1)[..., None]))[..., 0]
-        total = exp_so3(step[:, :3]) @ R
-        twist = torch.cat([small_rotation_vector(total), step[:, 3:]], -1)
-        variance = (covariance * torch.eye(6, device=covariance.device)).sum(-1)
-        return Match(twist, variance, log_posterior)
+        gradient = -mean / spread - information * turned
+        return damped_match(J, information, gradient, self.log_prior_sigma, R, log_posterior.flatten(1))
 
 
 def _sums(groups: Tensor, points: Tensor) -> Tensor:

@@ -13,21 +13,20 @@ from torch import nn
 from pipeline.learn.network.encoders import standardised
 from pipeline.learn.network.outputs import CoreOutputs, Heads
 from pipeline.learn.network.views import RenderedView
-from pipeline.learn.sample.grid import Grid
-from pipeline.learn.sample.layout import LIDAR_CHANNELS, PAIRS, RADAR_CHANNELS
+from pipeline.learn.sample.layout import CAMERA_CHANNELS, LIDAR_CHANNELS, PAIRS, RADAR_CHANNELS, NetworkConfig
 
 __all__ = ["ConcatCore"]
 
-_CHANNELS = {"camera": 4, "lidar": LIDAR_CHANNELS, "radar": RADAR_CHANNELS}
+_CHANNELS = {"camera": CAMERA_CHANNELS, "lidar": LIDAR_CHANNELS, "radar": RADAR_CHANNELS}
 _STD = 1e-2  # heads start near no correction
 
 
 class ConcatCore(nn.Module):
     """Network on one rendered view, for the sensors of its pairs."""
 
-    def __init__(self, grid: Grid, pairs: tuple[str, ...], width: int, hidden: int) -> None:
+    def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
-        self.pairs = pairs
+        grid, pairs, width = config.grid, config.estimated, config.width
         channels = {name: _CHANNELS[name] for name in _CHANNELS if any(name in pair for pair in pairs)}
         self.encoders = nn.ModuleDict({name: _encoder(c, width) for name, c in channels.items()})
         self.fusion = nn.Sequential(
@@ -41,16 +40,12 @@ class ConcatCore(nn.Module):
         one_hot = torch.eye(rows * columns).reshape(-1, 1, rows, columns)
         regions = nn.functional.adaptive_avg_pool2d(one_hot, (2, 4)).flatten(1)
         self.register_buffer("regions", regions, persistent=False)
-        self.last = nn.Sequential(nn.Linear(6 * width * 8, hidden), nn.ReLU())
-        self.heads = Heads(hidden, pairs, _STD)
+        self.last = nn.Sequential(nn.Linear(6 * width * 8, config.hidden), nn.ReLU())
+        self.heads = Heads(config.hidden, pairs, _STD)
 
     def forward(self, view: RenderedView) -> CoreOutputs:
         """Corrections and log variances from the sensors' grids at the current guess."""
-        grids = {
-            "camera": standardised(view.camera),
-            "lidar": view.lidar_grid,
-            "radar": view.radar_grid,
-        }
+        grids = {"camera": standardised(view.camera), "lidar": view.lidar_grid, "radar": view.radar_grid}
         maps = self.fusion(torch.cat([encoder(grids[name]) for name, encoder in self.encoders.items()], 1))
         fused = self.last((maps.flatten(2) @ self.regions).flatten(1))
         found = self.heads(fused)

@@ -19,7 +19,6 @@ from torch import Tensor
 
 from pipeline.core.errors import ModelError
 from pipeline.learn.network.calibration_network import CalibrationNetwork
-from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import NetworkConfig
 from schemas.training import GRID_CLASSES
 
@@ -54,8 +53,7 @@ def network_of_file(path: Path) -> CalibrationNetwork:
         model = onnx.load(str(path))
         metadata = {entry.key: entry.value for entry in model.metadata_props}
         places: dict[str, Place] = json.loads(metadata[WEIGHTS])
-        values = json.loads(metadata["network"])
-        config = NetworkConfig(**(values | {"grid": Grid(**values["grid"])}))
+        config = NetworkConfig.of_json(metadata["network"])
     except Exception as err:  # protobuf has its own exceptions, different by version
         raise ModelError(str(path), "does not list its weights, so training cannot continue from it") from err
     if (classes := json.loads(metadata.get("classes", "[]"))) != list(GRID_CLASSES):

@@ -2,14 +2,50 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-__all__ = ["angular_jacobian", "inverse_spd", "small_rotation_vector", "spherical_jacobian"]
+from pipeline.objective.differentiable.poses import exp_so3
+
+__all__ = ["Match", "angular_jacobian", "damped_match", "small_rotation_vector", "spherical_jacobian"]
 
 
-def inverse_spd(H: Float[Tensor, "B P P"]) -> Float[Tensor, "B P P"]:
+@dataclass(frozen=True, eq=False)
+class Match:
+    """Result of a matcher: left twist, its variance, and log-probabilities of shifts."""
+
+    twist: Float[Tensor, "B 6"]  # rotation vector [rad], translation [m]
+    variance: Float[Tensor, "B 6"]
+    surfaces: Float[Tensor, "B S"]
+
+
+def damped_match(
+    J: Float[Tensor, "B N R 6"],
+    information: Float[Tensor, "B N R"],
+    gradient: Float[Tensor, "B N R"],
+    log_prior_sigma: Float[Tensor, " 6"],
+    R: Float[Tensor, "B 3 3"],
+    surfaces: Float[Tensor, "B S"],
+) -> Match:
+    """One step of least squares behind a rotation R that the search has found.
+
+    Args:
+        J: derivative of the predictions by a left twist.
+        gradient: measured less predicted, times the information.
+        log_prior_sigma: of the step, as logarithm [rad, m].
+    """
+    identity, rows = torch.eye(6, device=J.device), J.flatten(1, 2).transpose(1, 2)
+    H = (rows * information.flatten(1)[:, None]) @ J.flatten(1, 2)
+    covariance = _inverse_spd(H + identity * torch.exp(-2 * log_prior_sigma))
+    step = (covariance @ (rows @ gradient.flatten(1)[..., None]))[..., 0]
+    twist = torch.cat([small_rotation_vector(exp_so3(step[:, :3]) @ R), step[:, 3:]], -1)
+    return Match(twist, (covariance * identity).sum(-1), surfaces)
+
+
+def _inverse_spd(H: Float[Tensor, "B P P"]) -> Float[Tensor, "B P P"]:
     """Inverse of symmetric positive definite matrices by Gauss-Jordan elimination, which needs no pivoting there."""
     size = H.shape[-1]
     identity = torch.eye(size, dtype=H.dtype, device=H.device).expand_as(H)
@@ -44,21 +80,19 @@ def spherical_jacobian(
     x, y, z = directions.unbind(-1)
     h = torch.sqrt((x * x + y * y).clamp(min=1e-6))
     o = torch.zeros_like(x)
-    inverse = 1 / range_m.clamp(min=0.5)
     d_azimuth = torch.stack([-y / (h * h), x / (h * h), o], -1)
     d_elevation = torch.stack([-x * z / h, -y * z / h, h], -1)
-    angles = _with_rotation(torch.stack([d_azimuth, d_elevation], -2), directions, inverse)
-    no_turn = torch.zeros_like(directions)
-    d_range = torch.cat([no_turn, directions], -1)
+    by_direction = torch.stack([d_azimuth, d_elevation], -2)
+    angles = _with_rotation(by_direction, directions, 1 / range_m.clamp(min=0.5))
+    d_range = torch.cat([torch.zeros_like(directions), directions], -1)
     return torch.cat([angles, d_range[..., None, :]], -2)
 
 
 def _with_rotation(by_direction: Tensor, directions: Tensor, inverse_range: Tensor) -> Tensor:
     """Rows by direction (B N R 3) to rows by twist: a rotation w moves d by w x d, a translation t by t/range."""
     # row . (w x d) = w . (d x row), written out: cross products of broadcast tensors trouble some exporters
-    d = directions[..., None, :]
     a, b, c = by_direction.unbind(-1)
-    dx, dy, dz = d.unbind(-1)
+    dx, dy, dz = directions[..., None, :].unbind(-1)
     turn = torch.stack([dy * c - dz * b, dz * a - dx * c, dx * b - dy * a], -1)
     return torch.cat([turn, by_direction * inverse_range[..., None, None]], -1)
 

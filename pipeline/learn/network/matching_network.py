@@ -8,13 +8,12 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 - the name that everybody uses
 
-from pipeline.learn.network.class_matcher import FLOOR, NEUTRAL, ClassMatcher, Match
+from pipeline.learn.network.class_matcher import FLOOR, NEUTRAL, ClassMatcher
 from pipeline.learn.network.encoders import CameraEncoder, LidarEncoder, PointEncoder, cell_values
-from pipeline.learn.network.occupancy_matcher import OccupancyMatch, OccupancyMatcher
+from pipeline.learn.network.least_squares import Match
+from pipeline.learn.network.occupancy_matcher import OccupancyMatcher
 from pipeline.learn.network.outputs import ClassEvidence, CoreOutputs, Heads, pose_of_twist
-from pipeline.learn.network.rendering import grid_cells, sphere
-from pipeline.learn.network.views import RenderedView
-from pipeline.learn.sample.grid import Grid
+from pipeline.learn.network.views import RenderedView, grid_cells, sphere
 from pipeline.learn.sample.layout import (
     CAMERA_CHANNELS,
     LIDAR_CHANNELS,
@@ -24,10 +23,11 @@ from pipeline.learn.sample.layout import (
     MARKED_POINTS,
     PAIRS,
     RADAR_FEATURES,
+    NetworkConfig,
 )
 from schemas.training import GRID_CLASSES
 
-__all__ = ["MatchingCore", "confusions_of", "continued_beyond", "log_boundaries", "log_markings"]
+__all__ = ["MatchingCore", "log_markings"]
 
 _CLASSES = len(GRID_CLASSES)
 # Of a point that the guess puts outside the image, against one inside: with true classes on 32 frames of a real car,
@@ -41,7 +41,7 @@ _ALIKE = (
     ("person", "vehicle", "two_wheeler"),
 )
 _SOLID = (*_ALIKE[1], *_ALIKE[2])
-_CONFUSED_ALIKE, _CONFUSED_SOLID = 0.6, 0.3
+_CONFUSED_ALIKE, _CONFUSED_SOLID = 0.6, 0.3  # shares spread over classes of one kind, and of all objects
 _NO_BOUNDARY = 0.1  # likelihood of an edge where the image has no boundary: branches, kerbs, what labels miss
 _EDGE = 2 + LIDAR_FEATURES.index("edge")  # channel of the rendered sweep
 _RESIDUAL_STD = 1e-3  # of the heads' weights: an untrained network answers as its matchers
@@ -50,32 +50,30 @@ _AXES_CAMERA_OF_LIDAR = (1, 2, 0)
 
 
 class MatchingCore(nn.Module):
-    """Network on one rendered view; `pairs` selects its matchers."""
+    """Network on one rendered view, with the matchers of its pairs."""
 
     confusions: Tensor | None
 
-    def __init__(
-        self, grid: Grid, pairs: tuple[str, ...], width: int, hidden: int, channels: int = CAMERA_CHANNELS,
-        marks: bool = False,
-    ) -> None:  # fmt: skip
+    def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
-        self.grid, self.pairs = grid, pairs
-        confusions = confusions_of(_CONFUSED_ALIKE, _CONFUSED_SOLID) if channels > CAMERA_CHANNELS else None
-        self.register_buffer("confusions", confusions, persistent=False)
+        self.grid = grid = config.grid
+        self.pairs = pairs = config.estimated
+        width, hidden = config.width, config.hidden
+        self.register_buffer("confusions", _confusions() if config.takes_classes else None, persistent=False)
         uses_camera = pairs != ("lidar_radar",)
-        self.camera_encoder = CameraEncoder(_CLASSES, width, channels) if uses_camera else None
+        self.camera_encoder = CameraEncoder(_CLASSES, width, config.camera_channels) if uses_camera else None
         sizes = []
         if "camera_lidar" in pairs:
             self.lidar_encoder = LidarEncoder(LIDAR_CHANNELS, _CLASSES, width)
             self.lidar_matcher = ClassMatcher(grid)
             # exp: weight of an edge of the sweep on a boundary, relative to a point of one class.
-            self.log_edge_worth = nn.Parameter(torch.zeros(())) if channels > CAMERA_CHANNELS else None
+            self.log_edge_worth = nn.Parameter(torch.zeros(())) if config.takes_classes else None
             # exp: weight of bright ground on paint, relative to a point of one class.
-            self.log_mark_worth = nn.Parameter(torch.zeros(())) if marks else None
+            self.log_mark_worth = nn.Parameter(torch.zeros(())) if config.marks else None
             sizes.append(self.lidar_matcher.surface_size + 12)
         if "lidar_radar" in pairs:
             self.radar_matcher = OccupancyMatcher(len(RADAR_FEATURES))
-            sizes.append(self.radar_matcher.profile_size + 12)
+            sizes.append(self.radar_matcher.surface_size + 12)
         if pairs == ("camera_radar",):
             self.radar_encoder = PointEncoder(len(RADAR_FEATURES), _CLASSES)
             self.radar_class_matcher = ClassMatcher(grid)
@@ -117,7 +115,7 @@ class MatchingCore(nn.Module):
         log_probability = torch.log(probability).clamp(min=FLOOR).permute(0, 3, 1, 2)
         seen = camera[:, CAMERA_CHANNELS - 1 : CAMERA_CHANNELS]
         blind = 1 - seen.amax((2, 3), keepdim=True)
-        continued = continued_beyond(log_probability, seen) * (1 - blind) + NEUTRAL * blind
+        continued = _continued_beyond(log_probability, seen) * (1 - blind) + NEUTRAL * blind
         return torch.cat([continued, seen], 1)
 
     def match(
@@ -127,9 +125,8 @@ class MatchingCore(nn.Module):
         camera_logits: Float[Tensor, "B K H W"] | None = None,
     ) -> CoreOutputs:
         """The part that depends on the guess: matchers, residuals, log variances."""
-        bases: dict[str, Match | OccupancyMatch] = {}
+        bases: dict[str, Match] = {}
         lidar_logits = radar_logits = evidence = None
-        features = []
         if "camera_lidar" in self.pairs:
             assert likelihood is not None
             row, column, _ = self._cells(view.points_camera)
@@ -145,27 +142,24 @@ class MatchingCore(nn.Module):
                 points, weight = torch.cat([points, view.marks_camera], 1), torch.cat([weight, marked], 1)
             evidence = ClassEvidence(maps, probability, weight, points)
             # Not through the search: it costs more than all else, and its answer is the evidence's maximum.
-            found = self.lidar_matcher(maps.detach(), points, probability.detach(), weight.detach())
-            bases["camera_lidar"] = found
-            features.append(_features(found.surfaces.flatten(1), found))
+            bases["camera_lidar"] = self.lidar_matcher(
+                maps.detach(), points, probability.detach(), weight.detach()
+            )
         if "lidar_radar" in self.pairs:
-            occupied = self.radar_matcher(
+            bases["lidar_radar"] = self.radar_matcher(
                 view.radar_lidar, view.radar_features, view.radar_valid, view.radar_has_elevation,
                 view.objects, view.object_weight,
             )  # fmt: skip
-            bases["lidar_radar"] = occupied
-            features.append(_features(occupied.profiles, occupied))
         if self.pairs == ("camera_radar",):
             assert likelihood is not None
             distance = view.radar_camera.norm(dim=-1)
             radar_logits = self.radar_encoder(view.radar_features, distance)
             probability = torch.softmax(radar_logits.detach(), -1)
             weight = view.radar_valid.to(probability.dtype) * self._worth(likelihood, view.radar_camera)
-            found = self.radar_class_matcher(
+            bases["camera_radar"] = self.radar_class_matcher(
                 likelihood[:, :-1].detach(), view.radar_camera, probability, weight
             )
-            bases["camera_radar"] = found
-            features.append(_features(found.surfaces.flatten(1), found))
+        features = [_features(base) for base in bases.values()]
         fused = self.fusion(torch.cat([s(f) for s, f in zip(self.summaries, features, strict=True)], -1))
         corrections, log_variance = self._combine(bases, fused)
         logits_of = (camera_logits, lidar_logits, radar_logits)
@@ -188,7 +182,7 @@ class MatchingCore(nn.Module):
         if self.log_edge_worth is None:
             return maps, probability
         worth = torch.exp(self.log_edge_worth) * edge
-        return torch.cat([maps, log_boundaries(maps)], 1), torch.cat([probability, worth], -1)
+        return torch.cat([maps, _log_boundaries(maps)], 1), torch.cat([probability, worth], -1)
 
     def _with_marks(self, camera: Tensor, maps: Tensor, probability: Tensor) -> tuple[Tensor, Tensor]:
         """Paint as the last class, and behind the points MARKED_POINTS that have no other."""
@@ -222,7 +216,7 @@ class MatchingCore(nn.Module):
         inside = (row >= 0) & (column >= 0) & (row < height) & (column < width)
         return row.long().clamp(0, height - 1), column.long().clamp(0, width - 1), inside
 
-    def _combine(self, bases: dict[str, Match | OccupancyMatch], fused: Tensor) -> tuple[Tensor, Tensor]:
+    def _combine(self, bases: dict[str, Match], fused: Tensor) -> tuple[Tensor, Tensor]:
         residuals = self.heads(fused)
         variances = {pair: base.variance for pair, base in bases.items()}
         if "camera_radar" not in bases and "camera_radar" in self.pairs:
@@ -243,22 +237,16 @@ class MatchingCore(nn.Module):
         return torch.stack(corrections, 1), torch.stack(log_variance, 1)
 
 
-def confusions_of(alike: float, solid: float) -> Float[Tensor, "K K"]:
-    """Probability that a point on something of one class (row) is classified as another (column).
-
-    `alike` is the share spread over classes of the same kind, `solid` over all classes of objects on the ground.
-    """
+def _confusions() -> Float[Tensor, "K K"]:
+    """Probability that a point on something of one class (row) is classified as another (column)."""
     found = torch.eye(_CLASSES)
-    for kind in _ALIKE:
-        rows = torch.tensor([GRID_CLASSES.index(name) for name in kind])
-        even = torch.zeros(_CLASSES).index_fill(0, rows, 1 / len(rows))
-        found[rows] = (1 - alike) * found[rows] + alike * even
-    rows = torch.tensor([GRID_CLASSES.index(name) for name in _SOLID])
-    found[rows] = (1 - solid) * found[rows] + solid * found[rows].mean(0)
+    for kinds, share in (*((kind, _CONFUSED_ALIKE) for kind in _ALIKE), (_SOLID, _CONFUSED_SOLID)):
+        rows = torch.tensor([GRID_CLASSES.index(name) for name in kinds])
+        found[rows] = (1 - share) * found[rows] + share * found[rows].mean(0)
     return found
 
 
-def continued_beyond(
+def _continued_beyond(
     maps: Float[Tensor, "B K H W"], seen: Float[Tensor, "B 1 H W"]
 ) -> Float[Tensor, "B K H W"]:
     """The maps, with the nearest seen cell's values in unseen cells: first vertically, then horizontally.
@@ -280,7 +268,7 @@ def continued_beyond(
     return cell_values(maps, cell.flatten(1)).transpose(1, 2).reshape(maps.shape)
 
 
-def log_boundaries(maps: Float[Tensor, "B K H W"]) -> Float[Tensor, "B 1 H W"]:
+def _log_boundaries(maps: Float[Tensor, "B K H W"]) -> Float[Tensor, "B 1 H W"]:
     """Logarithm of how much the classes change along the row: rows of a sweep jump where objects end to the side."""
     beside = F.pad(torch.exp(maps), (1, 1, 0, 0), mode="replicate")
     change = 0.5 * (beside[..., 2:] - beside[..., :-2]).abs().sum(1, keepdim=True)
@@ -291,9 +279,9 @@ def _summary(inputs: int, hidden: int) -> nn.Sequential:
     return nn.Sequential(nn.LayerNorm(inputs), nn.Linear(inputs, hidden), nn.ReLU())
 
 
-def _features(surfaces: Tensor, found: Match | OccupancyMatch) -> Tensor:
+def _features(found: Match) -> Tensor:
     """Surfaces, the base in cells and its log variance, all of the order of one to ten."""
-    return torch.cat([surfaces.clamp(min=-12.0), found.twist * 100.0, torch.log(found.variance)], -1)
+    return torch.cat([found.surfaces.clamp(min=-12.0), found.twist * 100.0, torch.log(found.variance)], -1)
 
 
 # Of the image: narrower than the sweep's, for it is dense, and three rows high.

@@ -8,36 +8,24 @@ likelihood bounds the cost of clutter.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from pipeline.learn.network.least_squares import inverse_spd, small_rotation_vector, spherical_jacobian
+from pipeline.learn.network.least_squares import Match, damped_match, spherical_jacobian
 from pipeline.objective.differentiable.poses import exp_so3
 
-__all__ = ["OccupancyMatch", "OccupancyMatcher"]
+__all__ = ["OccupancyMatcher"]
 
 # Steps stay well below the kernels' widths, between which densities are interpolated.
 _REACH_DEG, _YAW_STEP_DEG, _PITCH_STEP_DEG = 8.0, 0.4, 0.5
 _FIELD_DEG = (48.0, 28.0)  # azimuth and elevation to each side: what lidar and radar share ahead
-_SECTORS = 3
 _ROLLS_DEG = 1.5 * np.arange(-4, 5)
 _HALF = float(np.sqrt(0.5))
 # Kernels end at exp(-37) = 1e-16, which adds nothing to the floor: products of two of them with a density stay normal
 # numbers. With subnormal ones a matrix product takes ten times as long.
 _FARTHEST = 37.0
-
-
-@dataclass(frozen=True, eq=False)
-class OccupancyMatch:
-    """Result: left twist in the lidar frame, its variance, and likelihood profiles."""
-
-    twist: Float[Tensor, "B 6"]  # rotation vector [rad], translation [m]
-    variance: Float[Tensor, "B 6"]
-    profiles: Float[Tensor, "B S"]  # log-probability over yaw, then over pitch
 
 
 class OccupancyMatcher(nn.Module):
@@ -69,8 +57,8 @@ class OccupancyMatcher(nn.Module):
         )
 
     @property
-    def profile_size(self) -> int:
-        """Values of `OccupancyMatch.profiles` per frame."""
+    def surface_size(self) -> int:
+        """Length of `Match.surfaces`: over yaw, then over pitch."""
         return len(self.yaws) + len(self.pitches)
 
     def forward(
@@ -81,8 +69,8 @@ class OccupancyMatcher(nn.Module):
         has_elevation: Bool[Tensor, " B"],
         objects: Float[Tensor, "B L 3"],
         object_weight: Float[Tensor, "B L"],
-    ) -> OccupancyMatch:
-        """Find the turn (and shift) of the radar that fits best.
+    ) -> Match:
+        """Find the turn (and shift) of the radar that fits best, in the lidar frame.
 
         Args:
             radar_lidar: detections seen through the guess, lidar frame [m].
@@ -111,11 +99,8 @@ class OccupancyMatcher(nn.Module):
         pitch_surface, up, roll = self._tilt(pitch_logits, azimuth, weight, total)
         # Elevation ahead grows by a turn about -y, elevation to the left by one about x.
         omega = torch.stack([roll * tall[:, 0], -up * tall[:, 0], yaw], -1)
-        R = exp_so3(omega)
-        step, variance = self._finish(radar_lidar @ R.transpose(1, 2), weight, tall, lidar, density, width)
-        twist = torch.cat([small_rotation_vector(exp_so3(step[:, :3]) @ R), step[:, 3:]], -1)
-        profiles = torch.cat([torch.log_softmax(yaw_surface, -1), torch.log_softmax(pitch_surface, -1)], -1)
-        return OccupancyMatch(twist, variance, profiles)
+        surfaces = torch.cat([torch.log_softmax(yaw_surface, -1), torch.log_softmax(pitch_surface, -1)], -1)
+        return self._finish(radar_lidar, exp_so3(omega), weight, tall, lidar, density, surfaces)
 
     def _profile(
         self,
@@ -130,8 +115,8 @@ class OccupancyMatcher(nn.Module):
 
         The density is tabulated over absolute angles once (a matrix product) and looked up per detection.
         """
-        step = float(np.radians((_YAW_STEP_DEG, _PITCH_STEP_DEG)[axis]))
-        bins = round(2 * _FIELD_DEG[axis] / (_YAW_STEP_DEG, _PITCH_STEP_DEG)[axis])
+        step_deg = (_YAW_STEP_DEG, _PITCH_STEP_DEG)[axis]
+        step, bins = float(np.radians(step_deg)), round(2 * _FIELD_DEG[axis] / step_deg)
         lowest = -bins / 2 * step
         centres = lowest + step * torch.arange(bins + 1, device=away.device)
         width = torch.exp(self.log_width[axis])
@@ -148,13 +133,9 @@ class OccupancyMatcher(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Score over pitch, elevation shift ahead and roll, from the scores of sectors of azimuth."""
         edges = torch.tensor([-3.2, -10 * np.pi / 180, 10 * np.pi / 180, 3.2], device=logits.device)
-        member = torch.stack(
-            [
-                ((azimuth >= edges[s]) & (azimuth < edges[s + 1])).to(weight.dtype) * weight
-                for s in range(_SECTORS)
-            ],
-            1,
-        )
+        ahead = azimuth[:, None]
+        inside = (ahead >= edges[:-1, None]) & (ahead < edges[1:, None])
+        member = inside.to(weight.dtype) * weight[:, None]
         sectors = (member @ logits) / total[..., None]
         side = (member @ torch.sin(azimuth)[..., None])[..., 0] / member.sum(-1).clamp(min=1e-3)
         step = float(np.radians(_PITCH_STEP_DEG))
@@ -173,11 +154,19 @@ class OccupancyMatcher(nn.Module):
         return torch.logsumexp(volume, 1), up, roll
 
     def _finish(
-        self, radar_lidar: Tensor, weight: Tensor, tall: Tensor, lidar: Tensor, density: Tensor, width: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """One step of damped least squares towards the softly associated lidar points."""
+        self,
+        radar_lidar: Tensor,
+        R: Tensor,
+        weight: Tensor,
+        tall: Tensor,
+        lidar: Tensor,
+        density: Tensor,
+        surfaces: Tensor,
+    ) -> Match:
+        """One step of damped least squares from a rotation R towards the softly associated lidar points."""
+        radar_lidar, one = radar_lidar @ R.transpose(1, 2), torch.ones_like(tall)
         radar = _spherical(radar_lidar)
-        scale = torch.stack([torch.ones_like(tall), tall, torch.ones_like(tall)], -1) / width
+        scale = torch.stack([one, tall, one], -1) / torch.exp(self.log_width)
         near, far = radar * scale, lidar * scale
         away_azimuth, away_elevation, away_range = (_away(far[..., i], near[..., i]) for i in range(3))
         # The mean gap is the mean place less the own one: a product, not another array of all pairs.
@@ -188,17 +177,11 @@ class OccupancyMatcher(nn.Module):
         mean = summed[..., :3] / mass.clamp(min=1e-6)[..., None] - radar
         mean = mean * (mass > 1e-6)[..., None].to(mean.dtype)
         inlier = mass / (mass + torch.exp(self.log_floor)) * weight
-        one = torch.ones_like(tall)
         precision = torch.exp(-2 * self.log_noise) * torch.cat([one, tall, one], -1)
         distance = radar[..., 2].clamp(min=0.5)
         J = spherical_jacobian(radar_lidar / distance[..., None], distance)
         information = inlier[..., None] * precision[:, None]
-        rows = J.flatten(1, 2).transpose(1, 2)
-        H = (rows * information.flatten(1)[:, None]) @ J.flatten(1, 2)
-        H = H + torch.eye(6, device=J.device) * torch.exp(-2 * self.log_prior_sigma)
-        covariance = inverse_spd(H)
-        step = (covariance @ (rows @ (information * mean).flatten(1)[..., None]))[..., 0]
-        return step, (covariance * torch.eye(6, device=J.device)).sum(-1)
+        return damped_match(J, information, information * mean, self.log_prior_sigma, R, surfaces)
 
 
 def _away(columns: Tensor, rows: Tensor, width: Tensor | float = 1.0) -> Tensor:

@@ -24,7 +24,7 @@ class ClassEvidence:
 
     maps: Float[
         Tensor, "B K H W"
-    ]  # log-likelihood of classes; of boundaries and paint where these are matched
+    ]  # log-likelihood of classes, and of boundaries and paint if these are matched
     probability: Float[Tensor, "B N K"]  # of each point's classes
     worth: Float[Tensor, "B N"]
     points_m: Float[
@@ -34,7 +34,12 @@ class ClassEvidence:
 
 @dataclass(frozen=True, eq=False)
 class CoreOutputs:
-    """Outputs of the exported graph; rows of corrections are PAIRS, identity for pairs not estimated."""
+    """Outputs of the exported graph; rows of corrections are PAIRS, identity for pairs not estimated.
+
+    `log_variance` is of a left twist of each transform (rotation vector [rad], translation [m]). Logits serve
+    distillation: camera and lidar per cell of the grid (None in `concat` and in pairs without that sensor),
+    radar per detection.
+    """
 
     corrections: Float[Tensor, "B 3 4 4"]
     log_variance: Float[Tensor, "B 3 6"]
@@ -47,24 +52,14 @@ class CoreOutputs:
     evidence: ClassEvidence | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class Predictions:
-    """Corrected extrinsics, and their variances.
-
-    `log_variance` is of a left twist of each transform (rotation vector [rad], translation [m]), rows as
-    PAIRS. Logits serve distillation: camera and lidar per cell of the grid (None in `concat` and in pairs
-    without that sensor), radar per detection; `lidar_index` is the lidar point shown by each cell, or -1.
-    """
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Predictions(CoreOutputs):
+    """Outputs with the corrected extrinsics; `lidar_index` is the lidar point shown by each cell, or -1."""
 
     T_camera_lidar: Float[Tensor, "B 4 4"]
     T_camera_radar: Float[Tensor, "B 4 4"]
     T_lidar_radar: Float[Tensor, "B 4 4"]
-    log_variance: Float[Tensor, "B 3 6"]
-    camera_logits: Float[Tensor, "B K H W"] | None
-    lidar_logits: Float[Tensor, "B K H W"] | None
-    radar_logits: Float[Tensor, "B M K"] | None
     lidar_index: Int64[Tensor, "B HW"]
-    evidence: ClassEvidence | None = None
 
 
 class Heads(nn.Module):
@@ -75,7 +70,6 @@ class Heads(nn.Module):
 
     def __init__(self, features: int, pairs: tuple[str, ...], std: float) -> None:
         super().__init__()
-        self.pairs = pairs
         self.layers = nn.ModuleDict({pair: nn.Linear(features, 12) for pair in pairs})
         for layer in self.layers.values():
             assert isinstance(layer, nn.Linear)

@@ -7,4 +7,6 @@ from pipeline.learn.perception_training.trainer import Task
 
 __all__ = ["TASKS"]
 
-TASKS: dict[str, Task[Any]] = {task.name: task for task in (lidar_semantics.TASK, radar_drivable.TASK)}
+TASKS: dict[str, type[Task[Any]]] = {
+    task.name: task for task in (lidar_semantics.LidarSemantics, radar_drivable.RadarDrivable)
+}

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float16, Float32, Int, UInt8
+from jaxtyping import Float, Float16, Int, UInt8
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -26,9 +26,7 @@ from pipeline.learn.perception_training.lidar_labels import (
     project_labels,
 )
 from pipeline.learn.perception_training.trainer import (
-    Graph,
     Labelled,
-    Learner,
     Samples,
     Task,
     TrainingConfig,
@@ -45,16 +43,8 @@ from pipeline.store.views import frames_of, observations_of
 from schemas.frames import Frame
 from schemas.observations import Observation
 
-__all__ = [
-    "TASK", "SweepImages", "SweepLayout", "SweepTraining", "cut", "day_images", "kind_scores",
-    "layout_of",
-]  # fmt: skip
+__all__ = ["LidarSemantics", "SweepImages", "SweepLayout", "SweepTraining", "cut", "day_images"]
 
-LIMITS = (
-    "Learned from the camera's classes through a calibration, with the errors of both.",
-    "Thin objects were learned from their middles only; objects outside the camera's view were not learned.",
-    "Valid for the lidars, roads and weather of its samples only; remission must be logged as by these lidars.",
-)
 _CHANNELS = 5
 _DILATIONS = ((1, 1), (1, 2), (2, 4), (1, 1))  # rows, columns
 _BRIGHTEST = 60_000.0  # in sixteen bits
@@ -98,20 +88,6 @@ class SweepImages(Labelled):
     layout: SweepLayout  # of the whole images
 
 
-@dataclass(frozen=True)
-class Normal:
-    """Mean and deviation of the five channels where points are, as in the manifest."""
-
-    mean: tuple[float, ...]
-    std: tuple[float, ...]
-
-    def apply(self, channels: np.ndarray) -> Float32[np.ndarray, "N 5 H W"]:
-        """Normalised channels, 0 in empty pixels."""
-        mean, std = (np.array(v, np.float32)[:, None, None] for v in (self.mean, self.std))
-        filled = channels[:, :1] != EMPTY
-        return np.where(filled, (channels.astype(np.float32) - mean) / std, 0).astype(np.float32)
-
-
 class SweepNetwork(nn.Module):
     """Normalised range image to logits of the 20 labels: 60 k parameters at width 16. Even numbers of columns."""
 
@@ -136,36 +112,7 @@ class SweepNetwork(nn.Module):
         return logits
 
 
-def labelled_sweeps(fleet: FleetConfig, lake: Lake, config: SweepTraining) -> Samples[SweepImages]:
-    """Sweeps of all vehicle-days with observations, each by its usable record of `joint`, else by its prior."""
-    days = vehicle_days(fleet, lake)
-    chosen = {day.vehicle: fleet.rig_of(day.vehicle).one_of_each("training") for day in days}
-    known = {day: usable_records(lake, day, chosen[day.vehicle]).get("camera_lidar") for day in days}
-    first = (next(frames_of(lake, day, chosen=chosen[day.vehicle])) for day in days)
-    layout = layout_of(first, config.rows, config.columns)
-
-    def of_day(day: Partition) -> SweepImages:
-        names = chosen[day.vehicle]
-        rows = list(observations_of(lake, day, chosen=names))
-        T = None if (record := known[day]) is None else transform_of(record)
-        T = read_prior(rows, fleet, day.vehicle).T_camera_lidar if T is None else T
-        return day_images(frames_of(lake, day, chosen=names), rows, T, layout, config.frames_per_day)
-
-    found = cut(split_days(days, of_day))
-    calibrated = sum(record is not None for record in known.values())
-    return replace(found, numbers=found.numbers | {"calibrated_days": calibrated})
-
-
-def normal_of(images: SweepImages) -> Normal:
-    """Statistics of the channels where points are; a channel that never changes is left as it is."""
-    values = images.channels.transpose(1, 0, 2, 3)[:, images.channels[:, 0] != EMPTY].astype(np.float64)
-    std = values.std(axis=1)
-    return Normal(
-        tuple(float(v) for v in values.mean(axis=1)), tuple(float(s) if s > 0 else 1.0 for s in std)
-    )
-
-
-def sweep_of(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+def _sweep_of(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
     """Finite points and their remission as logged; a log without intensity has none, 0 everywhere."""
     xyz = np.stack([frame.lidar_x_m, frame.lidar_y_m, frame.lidar_z_m], axis=1)
     intensity = np.zeros(len(xyz), np.float32) if frame.lidar_intensity is None else frame.lidar_intensity
@@ -173,11 +120,11 @@ def sweep_of(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
     return xyz[kept], np.clip(np.nan_to_num(intensity[kept].astype(np.float32)), 0, _BRIGHTEST)
 
 
-def layout_of(frames: Iterable[Frame], rows: int, columns: int) -> SweepLayout:
+def _layout_of(frames: Iterable[Frame], rows: int, columns: int) -> SweepLayout:
     """A layout that holds nearly all points of these sweeps."""
     elevations = []
     for frame in frames:
-        xyz, _ = sweep_of(frame)
+        xyz, _ = _sweep_of(frame)
         range_m = np.linalg.norm(xyz, axis=1)
         elevations.append(np.degrees(np.arcsin(xyz[range_m > 0, 2] / range_m[range_m > 0])))
     low, high = np.percentile(np.concatenate(elevations), [0.1, 99.9])
@@ -225,7 +172,7 @@ def cut(samples: Samples[SweepImages]) -> Samples[SweepImages]:
 def _image(
     frame: Frame, observation: Observation, T_camera_lidar: np.ndarray, layout: SweepLayout
 ) -> tuple[np.ndarray, np.ndarray]:
-    xyz, remission = sweep_of(frame)
+    xyz, remission = _sweep_of(frame)
     image = project(xyz, layout.size, layout.fov_up_deg, layout.fov_down_deg)
     labels = project_labels(observation, T_camera_lidar, xyz)
     filled = image.point != EMPTY
@@ -234,46 +181,91 @@ def _image(
     return channels_of(image, xyz, remission), drawn
 
 
-class SweepLearner(Learner[SweepImages]):
-    """Loss and scores, by channels normalised and labels weighted as in the samples to learn from."""
+class LidarSemantics(Task[SweepImages]):
+    """Channels are normalised and labels weighted as in the samples to learn from."""
+
+    name = "lidar_semantics"
+    purpose = "classes of lidar points (paper, section 4.2): lidar.semantics of a rig"
+    limits = (
+        "Learned from the camera's classes through a calibration, with the errors of both.",
+        "Thin objects were learned from their middles only; objects outside the camera's view were not learned.",
+        "Valid for the lidars, roads and weather of its samples only; remission must be logged as by these lidars.",
+    )
+    config = SweepTraining
+    unlabelled = UNLABELLED
+    network = SweepNetwork
 
     def __init__(self, train: SweepImages) -> None:
-        self.normal, self.weight = normal_of(train), _weights(train.label)
+        super().__init__(train)
+        values = train.channels.transpose(1, 0, 2, 3)[:, train.channels[:, 0] != EMPTY].astype(np.float64)
+        std = values.std(axis=1)
+        # Of the channels where points are; a channel that never changes is left as it is.
+        self.mean, self.std = values.mean(axis=1), np.where(std > 0, std, 1.0)
+        self.weight = _weights(train.label)
+
+    @staticmethod
+    def samples(fleet: FleetConfig, lake: Lake, config: SweepTraining) -> Samples[SweepImages]:
+        """Sweeps of all vehicle-days with observations, each by its usable record of `joint`, else by its prior."""
+        days = vehicle_days(fleet, lake)
+        chosen = {day.vehicle: fleet.rig_of(day.vehicle).one_of_each("training") for day in days}
+        known = {day: usable_records(lake, day, chosen[day.vehicle]).get("camera_lidar") for day in days}
+        first = (next(frames_of(lake, day, chosen=chosen[day.vehicle])) for day in days)
+        layout = _layout_of(first, config.rows, config.columns)
+
+        def of_day(day: Partition) -> SweepImages:
+            names = chosen[day.vehicle]
+            rows = list(observations_of(lake, day, chosen=names))
+            T = None if (record := known[day]) is None else transform_of(record)
+            T = read_prior(rows, fleet, day.vehicle).T_camera_lidar if T is None else T
+            return day_images(frames_of(lake, day, chosen=names), rows, T, layout, config.frames_per_day)
+
+        found = cut(split_days(days, of_day))
+        calibrated = sum(record is not None for record in known.values())
+        return replace(found, numbers=found.numbers | {"calibrated_days": calibrated})
 
     def loss(self, network: nn.Module, batch: SweepImages, rng: np.random.Generator) -> Float[Tensor, ""]:
         """Weighted cross-entropy of the varied batch over its labelled pixels."""
         channels, label = _varied(batch, rng)
         target = torch.from_numpy(label.astype(np.int64))
-        logits = network(torch.from_numpy(self.normal.apply(channels)))
+        logits = network(self._normalised(channels))
         total = functional.cross_entropy(
             logits, target, self.weight, ignore_index=UNLABELLED, reduction="sum"
         )
         return total / self.weight[target].sum().clamp(min=1e-6)
 
     def scores(self, network: nn.Module, held_out: SweepImages) -> dict[str, float]:
-        """Share of labelled pixels with the right kind, and IoU of ground and of each labelled kind."""
+        """Share of labelled pixels with the right kind, and IoU of ground and of each kind among the labels."""
+        batches = (held_out.channels[i : i + 8] for i in range(0, len(held_out), 8))
         with torch.no_grad():
-            found = np.concatenate(
-                [
-                    network(torch.from_numpy(self.normal.apply(held_out.channels[i : i + 8])))
-                    .argmax(1)
-                    .numpy()
-                    for i in range(0, len(held_out), 8)
-                ]
-            )
+            label = np.concatenate([network(self._normalised(b)).argmax(1).numpy() for b in batches])
         known = held_out.label != UNLABELLED
-        return kind_scores(KIND_OF_LABEL[found[known]], KIND_OF_LABEL[held_out.label[known]])
+        found, wanted = KIND_OF_LABEL[label[known]], KIND_OF_LABEL[held_out.label[known]]
+        scores = {"accuracy": float(np.mean(found == wanted))}
+        sets = {"ground": GROUND} | {KINDS[k]: (k,) for k in range(1, len(KINDS))}
+        for name, kinds in sets.items():
+            a, b = np.isin(found, kinds), np.isin(wanted, kinds)
+            if b.any():
+                scores[f"iou_{name}"] = float(np.sum(a & b) / np.sum(a | b))
+        return scores
 
+    def graph(self, network: nn.Module) -> tuple[nn.Module, Tensor, tuple[str, str], str]:
+        """Range image to logits, in RangeNet++'s convention."""
+        layout = self.train.layout
+        image = {
+            "size": list(layout.size), "fov_up_deg": layout.fov_up_deg, "fov_down_deg": layout.fov_down_deg,
+            "mean": self.mean.tolist(), "std": self.std.tolist(), "empty": "zero",
+        }  # fmt: skip
+        lines = "".join(f"{key} = {json.dumps(value)}\n" for key, value in image.items())
+        output = '[output]\nlayout = "logits"\nlabel_set = "semantickitti"\n'
+        manifest = f'task = "segment_points"\n\n[input]\n{lines}\n{output}'
+        return network, torch.zeros(1, _CHANNELS, *layout.size), ("points", "logits"), manifest
 
-def kind_scores(found: UInt8[np.ndarray, " N"], wanted: UInt8[np.ndarray, " N"]) -> dict[str, float]:
-    """Accuracy of kinds, IoU of ground and of each kind that occurs in the labels."""
-    scores = {"accuracy": float(np.mean(found == wanted))}
-    sets = {"ground": GROUND} | {KINDS[k]: (k,) for k in range(1, len(KINDS))}
-    for name, kinds in sets.items():
-        a, b = np.isin(found, kinds), np.isin(wanted, kinds)
-        if b.any():
-            scores[f"iou_{name}"] = float(np.sum(a & b) / np.sum(a | b))
-    return scores
+    def _normalised(self, channels: np.ndarray) -> Float[Tensor, "N 5 H W"]:
+        """Normalised channels, 0 in empty pixels."""
+        mean, std = (v.astype(np.float32)[:, None, None] for v in (self.mean, self.std))
+        filled = channels[:, :1] != EMPTY
+        values = np.where(filled, (channels.astype(np.float32) - mean) / std, 0)
+        return torch.from_numpy(values.astype(np.float32))
 
 
 def _varied(batch: SweepImages, rng: np.random.Generator) -> tuple[np.ndarray, Int[np.ndarray, "N H W"]]:
@@ -303,29 +295,3 @@ def _weights(label: np.ndarray) -> torch.Tensor:
     share /= share.sum()
     weight = np.where(share > 0, 1 / np.sqrt(np.maximum(share, 1e-4)), 0)
     return torch.from_numpy((weight / (weight * share).sum()).astype(np.float32))
-
-
-def sweep_graph(network: nn.Module, train: SweepImages) -> Graph:
-    """Range image to logits, in RangeNet++'s convention."""
-    layout, normal = train.layout, normal_of(train)
-    image = {
-        "size": list(layout.size), "fov_up_deg": layout.fov_up_deg, "fov_down_deg": layout.fov_down_deg,
-        "mean": list(normal.mean), "std": list(normal.std), "empty": "zero",
-    }  # fmt: skip
-    lines = "".join(f"{key} = {json.dumps(value)}\n" for key, value in image.items())
-    output = '[output]\nlayout = "logits"\nlabel_set = "semantickitti"\n'
-    manifest = f'task = "segment_points"\n\n[input]\n{lines}\n{output}'
-    return Graph(network, torch.zeros(1, _CHANNELS, *layout.size), ("points", "logits"), manifest)
-
-
-TASK = Task(
-    "lidar_semantics",
-    "classes of lidar points (paper, section 4.2): lidar.semantics of a rig",
-    LIMITS,
-    SweepTraining,
-    UNLABELLED,
-    labelled_sweeps,
-    SweepNetwork,
-    SweepLearner,
-    sweep_graph,
-)

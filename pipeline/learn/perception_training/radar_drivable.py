@@ -22,9 +22,7 @@ from torch.nn import functional
 from pipeline.core.config import FleetConfig
 from pipeline.core.rows import columns_of
 from pipeline.learn.perception_training.trainer import (
-    Graph,
     Labelled,
-    Learner,
     Samples,
     Task,
     TrainingConfig,
@@ -48,15 +46,10 @@ from pipeline.store.views import observations_of
 from schemas.observations import Observation
 
 __all__ = [
-    "BLOCKED", "FREE", "TASK", "UNKNOWN", "DrivableSamples", "DrivableTraining", "area_iou",
-    "day_samples", "label_grid", "probabilities", "samples_of_day", "scan_of",
+    "BLOCKED", "FREE", "UNKNOWN", "DrivableSamples", "DrivableTraining", "RadarDrivable", "area_iou",
+    "day_samples", "label_grid", "probabilities",
 ]  # fmt: skip
 
-LIMITS = (
-    "Learned from the lidar's drivable ground through each day's prior, with the errors of both.",
-    "Valid for the radars, roads and weather of its samples only.",
-    "Cells without lidar returns were not used in training: large free ranges are extrapolated.",
-)
 _DILATIONS = ((1, 1), (1, 2), (2, 4), (2, 8), (1, 1))  # directions, ranges
 BLOCKED, FREE, UNKNOWN = 0, 1, 255
 _SAMPLE = np.dtype(
@@ -102,30 +95,6 @@ class DrivableNetwork(nn.Module):
         return logits
 
 
-class _Probabilities(nn.Module):
-    """The network with probabilities in place of logits."""
-
-    def __init__(self, network: nn.Module) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, features: Tensor) -> Tensor:
-        return torch.sigmoid(self.network(features))
-
-
-def drivable_samples(fleet: FleetConfig, lake: Lake, config: DrivableTraining) -> Samples[DrivableSamples]:
-    """Samples of all vehicle-days with observations."""
-    return split_days(
-        vehicle_days(fleet, lake), lambda day: samples_of_day(fleet, lake, day, config.frames_per_day)
-    )
-
-
-def samples_of_day(fleet: FleetConfig, lake: Lake, day: Partition, frames_per_day: int) -> DrivableSamples:
-    """At most `frames_per_day` samples of a vehicle-day, evenly spread, labelled through its prior."""
-    rows = list(observations_of(lake, day, chosen=fleet.rig_of(day.vehicle).one_of_each("training")))
-    return day_samples(rows, read_prior(rows, fleet, day.vehicle).T_lidar_radar, frames_per_day)
-
-
 def day_samples(
     observations: Sequence[Observation], T_lidar_radar: Float[np.ndarray, "4 4"], limit: int
 ) -> DrivableSamples:
@@ -139,10 +108,9 @@ def day_samples(
     return DrivableSamples(**columns_of(list(_rows(observations, T_lidar_radar, kept)), _SAMPLE))
 
 
-def scan_of(observation: Observation) -> Scan:
+def _scan_of(observation: Observation) -> Scan:
     """The scan as perception had it when it wrote the row."""
-    velocity = observation.radar_velocity_mps
-    speed = observation.ego_speed_mps
+    velocity, speed = observation.radar_velocity_mps, observation.ego_speed_mps
     own = None if speed is None else (float(speed), 0.0)
     return Scan(
         observation.radar_stamp_ns,
@@ -177,7 +145,7 @@ def _rows(
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     memory = ScanMemory()
     for i, observation in enumerate(observations):
-        features = memory.features(scan_of(observation))
+        features = memory.features(_scan_of(observation))
         if i in kept:
             geometric = sector_mask(
                 observation.radar_drivable_azimuth_rad, observation.radar_drivable_range_m
@@ -199,12 +167,35 @@ def _cell(xyz_m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.where(inside, cell[:, 0], 0), np.where(inside, cell[:, 1], 0), inside
 
 
-class DrivableLearner(Learner[DrivableSamples]):
-    """Loss and scores, which compare with the best constant answer: the most frequent label of each cell."""
+class RadarDrivable(Task[DrivableSamples]):
+    """Scores compare with the best constant answer: the most frequent label of each cell."""
+
+    name = "radar_drivable"
+    purpose = "drivable area of a radar's scan (paper, section 4.2): radar.drivable of a rig"
+    limits = (
+        "Learned from the lidar's drivable ground through each day's prior, with the errors of both.",
+        "Valid for the radars, roads and weather of its samples only.",
+        "Cells without lidar returns were not used in training: large free ranges are extrapolated.",
+    )
+    config = DrivableTraining
+    unlabelled = UNKNOWN
+    network = DrivableNetwork
 
     def __init__(self, train: DrivableSamples) -> None:
+        super().__init__(train)
         free, known = (train.label == FREE).sum(axis=0), (train.label != UNKNOWN).sum(axis=0)
         self.guess = 2 * free > known
+
+    @staticmethod
+    def samples(fleet: FleetConfig, lake: Lake, config: DrivableTraining) -> Samples[DrivableSamples]:
+        """Samples of all vehicle-days with observations, labelled through their priors."""
+
+        def of_day(day: Partition) -> DrivableSamples:
+            rows = list(observations_of(lake, day, chosen=fleet.rig_of(day.vehicle).one_of_each("training")))
+            prior = read_prior(rows, fleet, day.vehicle)
+            return day_samples(rows, prior.T_lidar_radar, config.frames_per_day)
+
+        return split_days(vehicle_days(fleet, lake), of_day)
 
     def loss(self, network: nn.Module, batch: DrivableSamples, rng: np.random.Generator) -> Float[Tensor, ""]:
         """Binary cross-entropy per labelled cell, by the root of the cell's area; half of the scans are mirrored."""
@@ -227,6 +218,13 @@ class DrivableLearner(Learner[DrivableSamples]):
             "iou_constant": area_iou(np.broadcast_to(self.guess, held_out.label.shape), held_out.label),
         }
 
+    def graph(self, network: nn.Module) -> tuple[nn.Module, Tensor, tuple[str, str], str]:
+        """Features to probabilities."""
+        layout = "".join(f"{key} = {json.dumps(value)}\n" for key, value in grid_layout().items())
+        manifest = f'task = "radar_drivable"\n\n[grid]\n{layout}'
+        example = torch.zeros(1, len(CHANNELS), *SHAPE)
+        return nn.Sequential(network, nn.Sigmoid()), example, ("features", "drivable"), manifest
+
 
 def area_iou(answer: np.ndarray, label: np.ndarray) -> float:
     """IoU of areas [m2] over all samples; cells without label do not count."""
@@ -243,24 +241,3 @@ def probabilities(network: nn.Module, samples: DrivableSamples) -> Float[np.ndar
             for i in range(0, len(samples), 16)
         ]
     return torch.cat(parts).numpy()
-
-
-def drivable_graph(network: nn.Module, _train: DrivableSamples) -> Graph:
-    """Features to probabilities."""
-    layout = "".join(f"{key} = {json.dumps(value)}\n" for key, value in grid_layout().items())
-    manifest = f'task = "radar_drivable"\n\n[grid]\n{layout}'
-    example = torch.zeros(1, len(CHANNELS), *SHAPE)
-    return Graph(_Probabilities(network), example, ("features", "drivable"), manifest)
-
-
-TASK = Task(
-    "radar_drivable",
-    "drivable area of a radar's scan (paper, section 4.2): radar.drivable of a rig",
-    LIMITS,
-    DrivableTraining,
-    UNKNOWN,
-    drivable_samples,
-    DrivableNetwork,
-    DrivableLearner,
-    drivable_graph,
-)

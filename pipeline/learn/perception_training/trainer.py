@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 import onnx
@@ -20,8 +20,7 @@ from pipeline.core.config import FleetConfig
 from pipeline.core.errors import ConfigError, ContractError
 from pipeline.core.results import Progress, silent
 from pipeline.core.rows import join_rows, take_rows
-from pipeline.learn.export.model_card import write_card
-from pipeline.learn.export.onnx_file import trace_to_onnx
+from pipeline.learn.export.onnx_file import trace_to_onnx, write_card
 from pipeline.learn.train.loop import (
     LAST,
     MetricsLog,
@@ -37,8 +36,8 @@ from pipeline.store.views import perceived_days
 from schemas.versions import CODE_VERSION
 
 __all__ = [
-    "Graph", "Labelled", "Learner", "Samples", "Task", "TrainingConfig", "build_network",
-    "export_model", "split_days", "train_network", "vehicle_days",
+    "Labelled", "Samples", "Task", "TrainingConfig", "export_model", "split_days", "train_network",
+    "vehicle_days",
 ]  # fmt: skip
 
 _HELD_OUT_EVERY = 5  # vehicle-days; the second one already, so that two are enough
@@ -79,8 +78,27 @@ class Samples(Generic[R]):
     numbers: dict[str, int]
 
 
-class Learner(ABC, Generic[R]):
-    """What a task makes of the samples to learn from: a loss, and scores."""
+class Task(ABC, Generic[R]):
+    """A network that perception uses, taught by some samples; `name` is of the command and of the model's files."""
+
+    name: ClassVar[str]
+    purpose: ClassVar[str]
+    limits: ClassVar[tuple[str, ...]]
+    config: ClassVar[type[TrainingConfig]]
+    unlabelled: ClassVar[int]
+
+    def __init__(self, train: R) -> None:
+        self.train = train
+
+    @staticmethod
+    @abstractmethod
+    def samples(fleet: FleetConfig, lake: Lake, config: Any) -> Samples[R]:
+        """Samples of all days of a lake; ContractError if there are no days."""
+
+    @staticmethod
+    @abstractmethod
+    def network(width: int) -> nn.Module:
+        """Fresh weights."""
 
     @abstractmethod
     def loss(self, network: nn.Module, batch: R, rng: np.random.Generator) -> Float[Tensor, ""]:
@@ -90,38 +108,9 @@ class Learner(ABC, Generic[R]):
     def scores(self, network: nn.Module, held_out: R) -> dict[str, float]:
         """Scores of the network in evaluation mode, by name."""
 
-
-@dataclass(frozen=True, eq=False)
-class Graph:
-    """What is exported: `manifest` is the model's .toml after path and sha256: task, layout of input and output."""
-
-    module: nn.Module
-    example: Tensor
-    names: tuple[str, str]  # of input and output
-    manifest: str
-
-
-@dataclass(frozen=True, eq=False)
-class Task(Generic[R]):
-    """A network that perception uses.
-
-    Args:
-        name: of the task in the command, and of the model's files.
-        samples: of all days of a lake; ContractError if there are too few days.
-        network: fresh weights at a width.
-        learner: from the samples to learn from.
-        graph: network and samples to what is exported.
-    """
-
-    name: str
-    purpose: str
-    limits: tuple[str, ...]
-    config: type[TrainingConfig]
-    unlabelled: int
-    samples: Callable[[FleetConfig, Lake, Any], Samples[R]]
-    network: Callable[[int], nn.Module]
-    learner: Callable[[R], Learner[R]]
-    graph: Callable[[nn.Module, R], Graph]
+    @abstractmethod
+    def graph(self, network: nn.Module) -> tuple[nn.Module, Tensor, tuple[str, str], str]:
+        """What is exported: module, example, names of input and output, and the model's .toml after path and sha256."""
 
 
 def vehicle_days(fleet: FleetConfig, lake: Lake) -> list[Partition]:
@@ -136,23 +125,21 @@ def vehicle_days(fleet: FleetConfig, lake: Lake) -> list[Partition]:
 def split_days(days: Sequence[Partition], samples_of: Callable[[Partition], R]) -> Samples[R]:
     """Samples of all days, every fifth day held out; of a single day, the first 0.7 against the last 0.2."""
     parts = [samples_of(day) for day in days]
-    if len(parts) == 1:
+    held = [part for i, part in enumerate(parts) if i % _HELD_OUT_EVERY == 1]
+    if held:
+        train = join_rows([part for i, part in enumerate(parts) if i % _HELD_OUT_EVERY != 1])
+        held_out = join_rows(held)
+    else:
         # Neighbouring scans are alike: a tenth between the two sides belongs to neither.
         rows, total = np.arange(len(parts[0])), len(parts[0])
-        train, held_out = (
-            take_rows(parts[0], r) for r in (rows[: int(0.7 * total)], rows[int(0.8 * total) :])
-        )
-    else:
-        train, held_out = (
-            join_rows([p for i, p in enumerate(parts) if (i % _HELD_OUT_EVERY == 1) == side])
-            for side in (False, True)
-        )
+        train = take_rows(parts[0], rows[: int(0.7 * total)])
+        held_out = take_rows(parts[0], rows[int(0.8 * total) :])
     numbers = {"vehicle_days": len(days), "samples": len(train), "held_out_samples": len(held_out)}
     return Samples(train, held_out, numbers)
 
 
 def train_network(
-    task: Task[R],
+    task: type[Task[R]],
     samples: Samples[R],
     out: Path,
     config: TrainingConfig,
@@ -172,33 +159,29 @@ def train_network(
         if not np.any(side.label != task.unlabelled):
             problem = f"no labels in the {len(side)} samples {name}: both are needed"
             raise ContractError(str(out), problem)
-    network, learner = build_network(task, config.width, config.seed), task.learner(samples.train)
+    taught = task(samples.train)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed)
+        network = task.network(config.width)
     out.mkdir(parents=True, exist_ok=True)
-    run = _TaskRun(network, learner, samples.train, config)
+    run = _TaskRun(network, taught, config)
     if (out / LAST).exists():
         run.resume(out / LAST)
     with stop_signals() as stops, closing(MetricsLog(out, run.step, events=False)) as log:
         result = run_loop(run, out, log, stops, time_limit_s, progress)
-        scores = learner.scores(network.eval(), samples.held_out)
+        scores = taught.scores(network.eval(), samples.held_out)
         log.report(run.step, {f"held_out/{name}": value for name, value in scores.items()})
     return network, replace(result, report=scores)
 
 
-def build_network(task: Task[R], width: int, seed: int) -> nn.Module:
-    """New weights; the caller's random state is not changed."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        return task.network(width)
-
-
-def export_model(task: Task[R], network: nn.Module, train: R, folder: Path, card: dict[str, Any]) -> Path:
+def export_model(
+    task: type[Task[R]], network: nn.Module, train: R, folder: Path, card: dict[str, Any]
+) -> Path:
     """Write NAME.onnx, NAME.toml (the manifest), NAME.json and NAME.md (the card); returns the manifest."""
-    graph = task.graph(network.eval(), train)
+    module, example, names, manifest = task(train).graph(network.eval())
     folder.mkdir(parents=True, exist_ok=True)
     model, unfinished = folder / f"{task.name}.onnx", folder / f"{task.name}.part"
-    onnx.checker.check_model(
-        trace_to_onnx(graph.module, (graph.example,), unfinished, graph.names[:1], graph.names[1:])
-    )
+    onnx.checker.check_model(trace_to_onnx(module, (example,), unfinished, names[:1], names[1:]))
     unfinished.replace(model)
     about = {
         "code_version": CODE_VERSION,
@@ -211,24 +194,25 @@ def export_model(task: Task[R], network: nn.Module, train: R, folder: Path, card
     write_card(model, about)
     digest = hashlib.sha256(model.read_bytes()).hexdigest()
     path = folder / f"{task.name}.toml"
-    path.write_text(f'path = "{model.name}"\nsha256 = "{digest}"\n{graph.manifest}')
+    path.write_text(f'path = "{model.name}"\nsha256 = "{digest}"\n{manifest}')
     return path
 
 
 class _TaskRun(Run):
-    def __init__(self, network: nn.Module, learner: Learner[R], train: R, config: TrainingConfig) -> None:
+    def __init__(self, network: nn.Module, task: Task[R], config: TrainingConfig) -> None:
         super().__init__(network, config, config.steps)
-        self.learner, self.train, self.config = learner, train, config
+        self.task, self.config = task, config
         digest = hashlib.sha256()
-        for array in vars(train).values():
+        for array in vars(task.train).values():
             if isinstance(array, np.ndarray):
                 digest.update(np.ascontiguousarray(array).data)
         self.data_key = digest.hexdigest()[:16]
 
     def losses(self) -> dict[str, Tensor]:
         rng = np.random.default_rng([self.config.seed, self.step])
-        batch = take_rows(self.train, rng.integers(0, len(self.train), self.config.batch_size))
-        return {"loss": self.learner.loss(self.network, batch, rng)}
+        train = self.task.train
+        batch = take_rows(train, rng.integers(0, len(train), self.config.batch_size))
+        return {"loss": self.task.loss(self.network, batch, rng)}
 
     def state(self) -> dict[str, Any]:
         return super().state() | {"config": self.config.model_dump(), "data_key": self.data_key}

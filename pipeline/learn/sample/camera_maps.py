@@ -7,11 +7,9 @@ blur boundaries. On this grid a horizontal step is shorter than a vertical one b
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import no_type_check
 
-import numba
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int8, Int32, UInt8
 
@@ -21,19 +19,11 @@ from pipeline.objective.camera_lidar.image_maps import NO_BOUNDARY, boundary_off
 from pipeline.rig.cameras import Camera
 from schemas.training import CLASS_OF_LABEL, GRID_CLASSES, NO_EDGE, UNKNOWN_CLASS
 
-__all__ = ["FINE_DEG", "CameraFeatures", "camera_features", "class_likelihood", "stored_grid"]
+__all__ = ["camera_features", "class_likelihood", "stored_grid"]
 
-FINE_DEG = 0.1
+_FINE_DEG = 0.1
 _VOID_LABEL = 255
 _EDGE_STEPS = 2  # boundaries are stored in halves of a fine cell: centres of cells lie between fine cells
-
-
-@dataclass(frozen=True, eq=False)
-class CameraFeatures:
-    """Columns of table `training` computed from labels, as maps on the grid."""
-
-    grid_class: UInt8[np.ndarray, "H W"]
-    edge_offset: Int8[np.ndarray, "4 H W"]
 
 
 def stored_grid(shape: tuple[int, int], step_deg: float) -> Grid:
@@ -42,34 +32,28 @@ def stored_grid(shape: tuple[int, int], step_deg: float) -> Grid:
     return Grid(step_deg, width / 2 * step_deg, height / 2 * step_deg, -height / 2 * step_deg)
 
 
-def camera_features(labels: UInt8[np.ndarray, "Y X"], camera: Camera, grid: Grid) -> CameraFeatures:
-    """Features of a label image (Cityscapes train ids); `camera` belongs to the full image."""
+def camera_features(
+    labels: UInt8[np.ndarray, "Y X"], camera: Camera, grid: Grid
+) -> tuple[UInt8[np.ndarray, "H W"], Int8[np.ndarray, "4 H W"]]:
+    """Columns grid_class and edge_offset of table `training`, as maps.
+
+    A cell has the class of at least half of it. `labels` are Cityscapes train ids; `camera` belongs to the full
+    image.
+    """
     fine = _sample_finely(labels, camera, grid)
-    per_cell = round(grid.cell_deg / FINE_DEG)
-    classes = CLASS_OF_LABEL[fine.labels]
-    return CameraFeatures(
-        _majority(classes, per_cell, len(GRID_CLASSES)),
-        _edge_offsets(fine.labels, per_cell),
-    )
+    share = _shares(fine, grid)
+    grid_class = np.where(share.max(axis=0) >= 0.5, share.argmax(axis=0), UNKNOWN_CLASS).astype(np.uint8)
+    return grid_class, _edge_offsets(fine, round(grid.cell_deg / _FINE_DEG))
 
 
 def class_likelihood(
     labels: UInt8[np.ndarray, "Y X"], camera: Camera, grid: Grid
 ) -> Float32[np.ndarray, "C H W"]:
-    """Class input of a network from a label image: see `likelihood_of_shares`.
+    """Class input of a network: likelihood of each class, and 1 if at least half of the cell has a class, else 0.
 
-    A cell that a boundary crosses has shares of both classes; `camera` belongs to the full image.
+    A cell that a boundary crosses has shares of both classes; arguments as of `camera_features`.
     """
-    fine = _sample_finely(labels, camera, grid)
-    per_cell = round(grid.cell_deg / FINE_DEG)
-    classes = CLASS_OF_LABEL[fine.labels]
-    cells = (grid.height, per_cell, grid.width, per_cell)
-    share = [(classes == k).reshape(cells).mean(axis=(1, 3)) for k in range(len(GRID_CLASSES))]
-    return likelihood_of_shares(np.stack(share).astype(np.float32))
-
-
-def likelihood_of_shares(share: Float32[np.ndarray, "K H W"]) -> Float32[np.ndarray, "C H W"]:
-    """Likelihood of each class, then one more channel: 1 if at least half of the cell has a class, else 0."""
+    share = _shares(_sample_finely(labels, camera, grid), grid)
     total = share.sum(axis=0)
     known = (total >= 0.5).astype(np.float32)
     doubt = np.float32((1 - CLASS_CONFIDENCE) / len(share))
@@ -77,16 +61,17 @@ def likelihood_of_shares(share: Float32[np.ndarray, "K H W"]) -> Float32[np.ndar
     return np.concatenate([likelihood * known, known[None]]).astype(np.float32)
 
 
-@dataclass(frozen=True, eq=False)
-class _FineLabels:
-    labels: UInt8[np.ndarray, "Y X"]
-    seen: Bool[np.ndarray, "Y X"]
+def _shares(fine: np.ndarray, grid: Grid) -> Float32[np.ndarray, "K H W"]:
+    """Share of each class in each cell of finely sampled labels."""
+    classes, size = CLASS_OF_LABEL[fine], (grid.width, grid.height)
+    planes = ((classes == k).astype(np.float32) for k in range(len(GRID_CLASSES)))
+    return np.stack([cv2.resize(plane, size, interpolation=cv2.INTER_AREA) for plane in planes])
 
 
-def _sample_finely(labels: np.ndarray, camera: Camera, grid: Grid) -> _FineLabels:
+def _sample_finely(labels: np.ndarray, camera: Camera, grid: Grid) -> UInt8[np.ndarray, "Y X"]:
     key = (camera.model, camera.K.tobytes(), camera.D.tobytes(), camera.width_px, camera.height_px)
     index, seen = _pixels(key, labels.shape, grid)
-    return _FineLabels(np.where(seen, labels.ravel()[index], _VOID_LABEL).astype(np.uint8), seen)
+    return np.where(seen, labels.ravel()[index], _VOID_LABEL).astype(np.uint8)
 
 
 @lru_cache(maxsize=4)  # one camera per vehicle-day; the projection costs more than all the rest
@@ -97,7 +82,7 @@ def _pixels(
     model, K, D, width, height = camera_key
     camera = Camera(model, np.frombuffer(K).reshape(3, 3), np.frombuffer(D), width, height)
     small = camera.scaled(size[1] / width)
-    uv, valid = small.project(grid_rays(grid.finer(round(grid.cell_deg / FINE_DEG))))
+    uv, valid = small.project(grid_rays(grid.finer(round(grid.cell_deg / _FINE_DEG))))
     u, v = np.rint(uv[..., 0]), np.rint(uv[..., 1])  # pixel centres are integers
     seen = valid & (u >= 0) & (v >= 0) & (u < size[1]) & (v < size[0])
     index = np.where(seen, v * size[1] + u, 0).astype(np.int32)
@@ -113,24 +98,3 @@ def _edge_offsets(labels: np.ndarray, per_cell: int) -> np.ndarray:
     halves = _EDGE_STEPS * offsets + 1 - (per_cell - 1 - 2 * middle)
     known = (offsets != NO_BOUNDARY) & (np.abs(halves) <= 127)
     return np.where(known, halves, NO_EDGE).astype(np.int8)
-
-
-@no_type_check  # keeps the tests' shape checks out of compiled code
-@numba.njit(cache=True, nogil=True)
-def _majority(classes: np.ndarray, per_cell: int, count: int) -> np.ndarray:
-    """The class that holds at least half of a cell, else UNKNOWN_CLASS."""
-    height, width = classes.shape[0] // per_cell, classes.shape[1] // per_cell
-    out = np.full((height, width), UNKNOWN_CLASS, np.uint8)
-    votes = np.zeros(count, np.int64)
-    for i in range(height):
-        for j in range(width):
-            votes[:] = 0
-            for a in range(per_cell):
-                for b in range(per_cell):
-                    c = classes[i * per_cell + a, j * per_cell + b]
-                    if c < count:
-                        votes[c] += 1
-            winner = np.argmax(votes)
-            if 2 * votes[winner] >= per_cell * per_cell:
-                out[i, j] = winner
-    return out

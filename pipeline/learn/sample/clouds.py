@@ -10,6 +10,8 @@ from jaxtyping import Bool, Float, Float32, Int, Integer, UInt8
 from scipy.spatial import cKDTree
 
 from pipeline.core.config import PrepareConfig
+from pipeline.learn.sample.grid import Grid
+from pipeline.rig.estimates import Prior
 from pipeline.rig.scan_rows import rows_of
 from pipeline.rig.se3 import transform_points
 from pipeline.rig.spherical import camera_direction_angles, to_spherical
@@ -19,7 +21,6 @@ from schemas.training import POINT_IS_EDGE, POINT_IS_GROUND
 
 __all__ = [
     "View",
-    "input_points",
     "lidar_columns",
     "own_velocity",
     "padded_rows",
@@ -28,6 +29,7 @@ __all__ = [
 ]
 
 _NEAR_M, _FAR_M = 2.5, 120.0
+_MARGIN_RAD = np.radians(6.0)  # beyond the grid: what a guess wrong by so much still brings into view
 _SLOW_MPS = 3.0  # a slower car's Doppler shows no direction
 _SAME_POINT_M = 0.5  # a point of the sweep and its voxel's in the map are nearer than this
 _LOSS_RANGE_M = 80.0  # the paper's far limit
@@ -36,51 +38,38 @@ _CLUSTERS, _DETECTIONS, _TRACKS = 48, 384, 24
 _JUMP_M, _JUMP_FRACTION, _JUMP_STEPS = 0.8, 0.06, 2.6
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class View:
-    """The camera's grid with a margin, at the guess T_camera_lidar; the margin covers errors of the guess."""
+    """The camera's grid about the optical axis with a margin, at the poses of `prior`."""
 
-    T_camera_lidar: np.ndarray
-    T_lidar_radar: np.ndarray
-    half_width_rad: float
-    half_height_rad: float
-    margin_rad: float
-    step_rad: float
+    prior: Prior
+    grid: Grid
 
     def angles(self, xyz_m: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 2"]:
         """Azimuth and elevation in the camera of points in the lidar frame."""
-        return camera_direction_angles(transform_points(self.T_camera_lidar, xyz_m.astype(np.float64)))
+        return camera_direction_angles(transform_points(self.prior.T_camera_lidar, xyz_m.astype(np.float64)))
 
     def contains(self, angles: Float[np.ndarray, "N 2"]) -> Bool[np.ndarray, " N"]:
         """True inside the grid and its margin."""
-        limit = np.array([self.half_width_rad, self.half_height_rad]) + self.margin_rad
+        limit = np.radians([self.grid.left_deg, self.grid.top_deg]) + _MARGIN_RAD
         return np.all(np.abs(angles) <= limit, axis=1)
 
 
 def lidar_columns(
     frame: Frame, observation: Observation, view: View, config: PrepareConfig, rng: np.random.Generator
 ) -> dict[str, Any]:
-    """Columns of table `training` computed from the lidar."""
-    return (
-        input_points(frame, observation, view, config.lidar_points, rng)
-        | _cluster_columns(observation, view)
-        | _edge_columns(observation, view, config.edge_points, rng)
-    )
+    """Columns of table `training` computed from the lidar; `view` determines which points are kept.
 
-
-def input_points(
-    frame: Frame, observation: Observation, view: View, count: int, rng: np.random.Generator
-) -> dict[str, Any]:
-    """Input points of the sweep at its stamp: at most one per cell of the grid, then others up to the array's size.
-
-    The result does not depend on the camera's image; `view` only determines which points are kept.
+    Input points are of the sweep at its stamp: at most one per cell of the grid, then others up to the array's
+    size. They do not depend on the camera's image.
     """
-    xyz = _at_stamp(frame, observation, view.T_lidar_radar)
+    count, xyz = config.lidar_points, _at_stamp(frame, observation, view.prior.T_lidar_radar)
     flags = range_edges(xyz, frame.lidar_ring).astype(np.uint8) * POINT_IS_EDGE
     distance = np.linalg.norm(xyz, axis=1)
     angles = view.angles(xyz)
     inside = view.contains(angles) & (distance > _NEAR_M) & (distance < _FAR_M)  # NaN: not inside
-    rows = _thinned(np.flatnonzero(inside), angles, view.step_rad, count, rng)
+    step_rad = float(np.radians(view.grid.cell_deg))
+    rows = _thinned(np.flatnonzero(inside), angles, step_rad, count, rng)
     flags[rows] |= _ground_flags(xyz[rows], observation) * POINT_IS_GROUND
     rank = _ranks(frame.lidar_intensity, len(xyz))
     return {
@@ -88,6 +77,8 @@ def input_points(
         "lidar_intensity": padded_rows(rank[rows], count),
         "lidar_flags": padded_rows(flags[rows], count),
         "lidar_count": len(rows),
+        **_cluster_columns(observation, view),
+        **_edge_columns(observation, view, config.edge_points, rng),
     }
 
 
@@ -99,9 +90,8 @@ def own_velocity(
     ahead = np.array([1.0, 0.0])
     if velocity is not None and np.isfinite(T_lidar_radar).all():
         level = (T_lidar_radar[:3, :3] @ velocity)[:2]
-        ahead = (
-            np.sign(speed) * level / max(float(np.hypot(*level)), 1e-6) if abs(speed) > _SLOW_MPS else ahead
-        )
+        if abs(speed) > _SLOW_MPS:
+            ahead = np.sign(speed) * level / max(float(np.hypot(*level)), 1e-6)
     return speed * np.append(ahead, 0.0)
 
 
@@ -186,11 +176,10 @@ def _ground_flags(xyz_m: np.ndarray, observation: Observation) -> np.ndarray:
     """1 for ground points of perception's map, which has one point per voxel."""
     if not len(observation.lidar_map_xyz_m) or not len(xyz_m):
         return np.zeros(len(xyz_m), np.uint8)
-    distance, nearest = cKDTree(observation.lidar_map_xyz_m).query(xyz_m, distance_upper_bound=_SAME_POINT_M)
-    found = np.isfinite(distance)
-    flags = np.zeros(len(xyz_m), np.uint8)
-    flags[found] = observation.lidar_map_is_ground[nearest[found]]
-    return flags
+    _, nearest = cKDTree(observation.lidar_map_xyz_m).query(xyz_m, distance_upper_bound=_SAME_POINT_M)
+    return np.append(observation.lidar_map_is_ground, 0).astype(np.uint8)[
+        nearest
+    ]  # one behind the last: none
 
 
 def _ranks(intensity: np.ndarray | None, count: int) -> UInt8[np.ndarray, " N"]:

@@ -8,12 +8,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
 from pipeline.core.config import PrepareConfig
 from pipeline.learn.sample.camera_maps import camera_features, stored_grid
 from pipeline.learn.sample.clouds import View, lidar_columns, own_velocity, padded_rows, radar_columns
-from pipeline.learn.sample.grid import Grid, resample_camera
+from pipeline.learn.sample.grid import resample_camera
 from pipeline.objective.paper.classes import labels_of
 from pipeline.rig.cameras import Camera, camera_of
 from pipeline.rig.edges import pose_columns
@@ -28,14 +28,12 @@ __all__ = [
     "Reference",
     "SampleReason",
     "SampleRejectedError",
-    "decode_small",
     "fingerprint",
     "make_row",
     "sensor_row",
 ]
 
 _DETECTIONS = 24
-_MARGIN_RAD = np.radians(6.0)  # beyond the grid: what a guess wrong by so much still brings into view
 _MIN_POINTS = 300  # fewer in view show a network no shape
 _MIN_SEEN = 0.2  # of the grid: a camera narrower than that has another grid
 
@@ -100,11 +98,11 @@ def make_row(
     sensors = sensor_row(frame, observation, reference.poses, about, config)
     grid = stored_grid(config.grid.shape, config.grid.step_deg)
     camera = camera_of(observation)
-    features = camera_features(labels_of(observation), camera, grid)
+    grid_class, edge_offset = camera_features(labels_of(observation), camera, grid)
     return replace(
         sensors,
-        grid_class=features.grid_class.ravel(),
-        edge_offset=features.edge_offset.reshape(4, -1),
+        grid_class=grid_class.ravel(),
+        edge_offset=edge_offset.reshape(4, -1),
         reference=reference.name,
         camera_lag_s=sensors.camera_lag_s - reference.dt_camera_lidar_s,
         radar_lag_s=sensors.radar_lag_s + reference.dt_lidar_radar_s,
@@ -126,10 +124,10 @@ def sensor_row(
     rng = np.random.default_rng([frame.stamp_ns & 0x7FFFFFFFFFFFFFFF, frame.frame_index, config.seed])
     height, width = config.grid.shape
     grid = stored_grid((height, width), config.grid.step_deg)
-    small, seen = resample_camera(decode_small(frame, config.grid.step_deg), camera_of(observation), grid)
+    small, seen = resample_camera(_decode_small(frame, config.grid.step_deg), camera_of(observation), grid)
     if seen.mean() < _MIN_SEEN:
         raise SampleRejectedError(SampleReason.NARROW_VIEW)
-    lidar = lidar_columns(frame, observation, _view(prior, grid), config, rng)
+    lidar = lidar_columns(frame, observation, View(prior, grid), config, rng)
     if lidar["lidar_count"] < _MIN_POINTS:
         raise SampleRejectedError(SampleReason.FEW_LIDAR_POINTS)
     cells = height * width
@@ -154,7 +152,7 @@ def sensor_row(
     )
 
 
-def decode_small(frame: Frame, cell_deg: float) -> UInt8[np.ndarray, "Y X 3"]:
+def _decode_small(frame: Frame, cell_deg: float) -> UInt8[np.ndarray, "Y X 3"]:
     """The image as BGR, JPEG reduced while decoding to at least two pixels per cell.
 
     Raises:
@@ -164,7 +162,10 @@ def decode_small(frame: Frame, cell_deg: float) -> UInt8[np.ndarray, "Y X 3"]:
     per_cell = np.radians(cell_deg) * focal_px
     reduction = next((r for r in (4, 2) if per_cell >= 2 * r), 1) if frame.image_format == "jpeg" else 1
     flag = {1: cv2.IMREAD_COLOR, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4}[reduction]
-    image = _decoded(frame.image, flag | cv2.IMREAD_IGNORE_ORIENTATION)
+    try:
+        image = cv2.imdecode(np.frombuffer(frame.image, np.uint8), flag | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:
+        image = None
     sides = (frame.image_height_px, frame.image_width_px)
     if image is None or image.shape[:2] != tuple(-(-side // reduction) for side in sides):
         raise SampleRejectedError(SampleReason.UNDECODABLE_IMAGE)
@@ -177,42 +178,18 @@ def fingerprint(image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, " 32"]:
     return np.packbits(grey[:, 1:] > grey[:, :-1])
 
 
-def _decoded(blob: bytes, flag: int) -> np.ndarray | None:
-    if not blob:
-        return None
-    try:
-        return cv2.imdecode(np.frombuffer(blob, np.uint8), flag)
-    except cv2.error:
-        return None
-
-
-def _view(prior: Prior, grid: Grid) -> View:
-    half = np.radians([grid.left_deg, grid.top_deg])
-    return View(
-        prior.T_camera_lidar, prior.T_lidar_radar, float(half[0]), float(half[1]), _MARGIN_RAD,
-        float(np.radians(grid.cell_deg)),
-    )  # fmt: skip
-
-
 def _detection_columns(observation: Observation, camera: Camera) -> dict[str, Any]:
-    """Boxes as angles; those that leave the camera's model are dropped."""
-    boxes = observation.road_user_boxes_px.astype(np.float64).reshape(-1, 4)
-    angles = _box_angles(boxes, camera)
+    """Boxes as angles at the middles of their sides (left, top, right, bottom), without those beyond the camera."""
+    x0, y0, x1, y1 = observation.road_user_boxes_px.astype(np.float64).reshape(-1, 4).T
+    x, y = (x0 + x1) / 2, (y0 + y1) / 2
+    sides = np.stack([np.stack(p, -1) for p in ((x0, y), (x, y0), (x1, y), (x, y1))], 1)
+    angles = camera_direction_angles(camera.unproject(sides))[:, range(4), [0, 1, 0, 1]]
     rows = np.flatnonzero(np.isfinite(angles).all(axis=1))
     rows = rows[np.argsort(-observation.road_user_scores[rows], kind="stable")][:_DETECTIONS]
     return {
         "detection_box_rad": padded_rows(angles[rows].astype(np.float32), _DETECTIONS),
         "detection_count": len(rows),
     }
-
-
-def _box_angles(boxes_px: Float[np.ndarray, "N 4"], camera: Camera) -> Float[np.ndarray, "N 4"]:
-    """Azimuth left, elevation top, azimuth right, elevation bottom at the middles of the boxes' sides."""
-    x0, y0, x1, y1 = boxes_px.T
-    x, y = (x0 + x1) / 2, (y0 + y1) / 2
-    sides = np.stack([np.stack(p, -1) for p in ((x0, y), (x, y0), (x1, y), (x, y1))], 1)
-    angles = camera_direction_angles(camera.unproject(sides))
-    return np.stack([angles[:, 0, 0], angles[:, 1, 1], angles[:, 2, 0], angles[:, 3, 1]], -1)
 
 
 def _reference_columns(observation: Observation, prior: Prior) -> dict[str, Any]:

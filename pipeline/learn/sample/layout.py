@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -9,11 +10,10 @@ from pipeline.learn.sample.grid import Grid
 from schemas.training import GRID_CLASSES
 
 __all__ = [
-    "CAMERA_CHANNELS", "CLASS_CHANNELS", "CLASS_CONFIDENCE", "EDGE_BONUS", "FEATURE_UNITS", "GRAPH_INPUTS",
-    "GROUND_WEIGHT", "INDEX_BITS", "LIDAR_CHANNELS", "LIDAR_FEATURES", "LIKELIHOOD", "MARGIN_DEG",
-    "MARKED_POINTS", "MARK_FLAT", "MARK_LEAST_SHARE", "MARK_SIGMAS", "MARK_WINDOW", "MATCHED_POINTS",
-    "MILLIMETRES", "NEARNESS_M", "NEAR_M", "OBJECT_BONUS", "OBJECT_POINTS", "PAIRS", "RADAR_CHANNELS",
-    "RADAR_FEATURES", "RADAR_POINTS", "NetworkConfig",
+    "CAMERA_CHANNELS", "CLASS_CHANNELS", "CLASS_CONFIDENCE", "EVIDENCE", "FEATURE_UNITS", "GRAPH_INPUTS",
+    "LIDAR_CHANNELS", "LIDAR_FEATURES", "LIKELIHOOD", "MARKED_POINTS", "MARK_FLAT", "MARK_LEAST_SHARE",
+    "MATCHED_POINTS", "NEAR_M", "OBJECT_POINTS", "PAIRS", "RADAR_CHANNELS", "RADAR_FEATURES", "RADAR_POINTS",
+    "NetworkConfig",
 ]  # fmt: skip
 
 PAIRS = ("camera_lidar", "camera_radar", "lidar_radar")
@@ -29,22 +29,12 @@ CLASS_CHANNELS = len(GRID_CLASSES) + 1
 CLASS_CONFIDENCE = 0.9
 LIDAR_CHANNELS = 2 + len(LIDAR_FEATURES)  # of a rendered sweep: occupied, nearness, features
 RADAR_CHANNELS = 2 + len(RADAR_FEATURES)
-NEARNESS_M = 8.0  # nearness = this over the range, at most 2
 NEAR_M = 0.5  # nothing outside the car is nearer
-MILLIMETRES = 1000.0  # ranges are compared in millimetres
-INDEX_BITS = 20  # up to a million points share a key with their range
 MATCHED_POINTS = 1536  # lidar points whose classes are matched with the camera's
 MARKED_POINTS = 192  # points of bright ground that are matched with the image's paint
-# Ground of that many sigmas above what lies beside it is paint, within 10 deg to each side of the cell.
-MARK_SIGMAS, MARK_WINDOW = 3.0, 51
 MARK_FLAT, MARK_LEAST_SHARE = 1e-3, 1e-4  # a spread below, and ground about a cell below, are rounding
 OBJECT_POINTS = 512  # lidar points off the ground that radar detections are matched with
 RADAR_POINTS = 384  # as table training holds them
-# Added to a rank in 0..1 to choose points: edges first, then objects. Unequal fractions of a rank's step, so that no
-# two scores are the same and all machines pick the same points.
-EDGE_BONUS, OBJECT_BONUS = 1.0 + 2.0**-19, 0.5 + 2.0**-18
-GROUND_WEIGHT = 0.3  # ground is most of the points, and its classes are the least sharp
-MARGIN_DEG = 8.0  # beyond the grid's border: for guesses that are wrong
 
 # Inputs of the exported graph in order: the fields of `network.views.RenderedView`.
 GRAPH_INPUTS = (
@@ -75,6 +65,12 @@ class NetworkConfig:
     hidden: int = 192
     takes_classes: bool = False
     marks: bool = False
+
+    @classmethod
+    def of_json(cls, text: str) -> NetworkConfig:
+        """Configuration from the metadata of a file; KeyError, TypeError or ValueError if it is none."""
+        values = json.loads(text)
+        return cls(**values | {"grid": Grid(**values["grid"])})
 
     @property
     def camera_channels(self) -> int:

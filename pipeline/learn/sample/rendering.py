@@ -5,6 +5,7 @@ Per cell of the camera's grid the nearest point wins.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import no_type_check
@@ -18,35 +19,37 @@ from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import (
     CAMERA_CHANNELS,
     CLASS_CHANNELS,
-    EDGE_BONUS,
     FEATURE_UNITS,
-    GROUND_WEIGHT,
-    INDEX_BITS,
     LIDAR_FEATURES,
-    MARGIN_DEG,
     MARK_FLAT,
     MARK_LEAST_SHARE,
-    MARK_SIGMAS,
-    MARK_WINDOW,
     MARKED_POINTS,
     MATCHED_POINTS,
-    MILLIMETRES,
     NEAR_M,
-    NEARNESS_M,
-    OBJECT_BONUS,
     OBJECT_POINTS,
     RADAR_POINTS,
+    NetworkConfig,
 )  # fmt: skip
 from pipeline.rig.se3 import transform_points
 from schemas.training import POINT_IS_EDGE, POINT_IS_GROUND, TrainingRow
 
 __all__ = [
-    "FrameSensors", "frame_sensors", "lidar_features", "mark_strength", "nearest_points",
+    "NEARNESS_M", "FrameSensors", "frame_sensors", "lidar_features", "mark_strength", "nearest_points",
     "radar_features", "render_frame", "render_lidar", "render_radar",
 ]  # fmt: skip
 
 _INTENSITY = LIDAR_FEATURES.index("intensity")
 _EDGE, _GROUND = LIDAR_FEATURES.index("edge"), LIDAR_FEATURES.index("ground")
+NEARNESS_M = 8.0  # nearness = this over the range, at most 2
+_MILLIMETRES = 1000.0  # ranges are compared in millimetres
+_INDEX_BITS = 20  # up to a million points share a key with their range
+# Ground of that many sigmas above what lies beside it is paint, within 10 deg to each side of the cell.
+_MARK_SIGMAS, _MARK_WINDOW = 3.0, 51
+# Added to a rank in 0..1 to choose points: edges first, then objects. Unequal fractions of a rank's step, so that no
+# two scores are the same and all machines pick the same points.
+_EDGE_BONUS, _OBJECT_BONUS = 1.0 + 2.0**-19, 0.5 + 2.0**-18
+_GROUND_WEIGHT = 0.3  # ground is most of the points, and its classes are the least sharp
+_MARGIN_DEG = 8.0  # beyond the grid's border: for guesses that are wrong
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,24 +129,19 @@ def radar_features(row: TrainingRow) -> Float32[np.ndarray, "M 3"]:
 
 
 def render_frame(
-    sensors: FrameSensors,
-    T_camera_lidar: Float[np.ndarray, "4 4"],
-    T_camera_radar: Float[np.ndarray, "4 4"],
-    T_lidar_radar: Float[np.ndarray, "4 4"],
-    grid: Grid,
-    camera_channels: int = CAMERA_CHANNELS,
-    *,
-    marks: bool = True,
+    sensors: FrameSensors, guess: Mapping[str, Float[np.ndarray, "4 4"]], config: NetworkConfig
 ) -> dict[str, np.ndarray]:
-    """Inputs of the exported graph by name, batch 1; without `marks` those of bright ground are empty."""
-    radar_camera = transform_points(T_camera_radar, sensors.radar_xyz_m).astype(np.float32)
-    radar_lidar = transform_points(T_lidar_radar, sensors.radar_xyz_m).astype(np.float32)
+    """Inputs of the exported graph by name, batch 1, at a guess of every pair."""
+    radar_camera = transform_points(guess["camera_radar"], sensors.radar_xyz_m).astype(np.float32)
+    radar_lidar = transform_points(guess["lidar_radar"], sensors.radar_xyz_m).astype(np.float32)
     count = min(len(radar_camera), RADAR_POINTS)
-    lidar, _ = render_lidar(sensors.lidar_xyz_m, sensors.lidar_features, T_camera_lidar, grid, marks=marks)
+    lidar, _ = render_lidar(
+        sensors.lidar_xyz_m, sensors.lidar_features, guess["camera_lidar"], config.grid, marks=config.marks
+    )
     return {
-        "camera": sensors.camera_channels(camera_channels),
+        "camera": sensors.camera_channels(config.camera_channels),
         **{name: values[None] for name, values in lidar.items()},
-        "radar_grid": render_radar(radar_camera, sensors.radar_features, grid)[None],
+        "radar_grid": render_radar(radar_camera, sensors.radar_features, config.grid)[None],
         "radar_lidar": padded_rows(radar_lidar[:count], RADAR_POINTS)[None],
         "radar_camera": padded_rows(radar_camera[:count], RADAR_POINTS)[None],
         "radar_features": padded_rows(sensors.radar_features[:count], RADAR_POINTS)[None],
@@ -163,15 +161,16 @@ def render_lidar(
 ) -> tuple[dict[str, np.ndarray], Int32[np.ndarray, " HW"]]:
     """A sweep's inputs of the graph by name, and the point of each cell, -1 in empty ones.
 
-    `nearness` multiplies the rendered nearness (training looks at frames as if they were farther or nearer).
+    Without `marks` those of bright ground are empty. `nearness` multiplies the rendered nearness (training looks
+    at frames as if they were farther or nearer).
     """
     lidar_camera = transform_points(T_camera_lidar, xyz_m).astype(np.float32)
     edge, ground = features[:, _EDGE], features[:, _GROUND]
     in_view = _in_view(lidar_camera, grid)
     rank = _importance(len(lidar_camera))
-    matched = _best(rank + EDGE_BONUS * edge + OBJECT_BONUS * (1 - ground), in_view, MATCHED_POINTS)
+    matched = _best(rank + _EDGE_BONUS * edge + _OBJECT_BONUS * (1 - ground), in_view, MATCHED_POINTS)
     solid = _best(rank, in_view & (ground < 0.5), OBJECT_POINTS)
-    weight = np.where(ground > 0.5, np.float32(GROUND_WEIGHT), np.float32(1))
+    weight = np.where(ground > 0.5, np.float32(_GROUND_WEIGHT), np.float32(1))
     painted, index = _painted(lidar_camera, features, grid, nearness)
     strength, marked = _marks(painted, index) if marks else (np.zeros(0, np.float32), index[:0])
     return {
@@ -192,24 +191,22 @@ def render_radar(
     return _painted(points_camera, features, grid)[0]
 
 
-def nearest_points(
-    points_camera: Float[np.ndarray, "N 3"], valid: Bool[np.ndarray, " N"], grid: Grid
-) -> Int32[np.ndarray, " HW"]:
+def nearest_points(points_camera: Float[np.ndarray, "N 3"], grid: Grid) -> Int32[np.ndarray, " HW"]:
     """Index of the nearest point in each cell (row by row), -1 in empty cells."""
     out = np.full(grid.height * grid.width, -1, np.int32)
     limits = np.radians([grid.top_deg, grid.left_deg, grid.cell_deg]).astype(np.float32)
     points = np.ascontiguousarray(points_camera, dtype=np.float32)
-    _nearest(points, np.ascontiguousarray(valid), limits, grid.height, grid.width, out)
+    _nearest(points, limits, grid.height, grid.width, out)
     return out
 
 
 @no_type_check  # keeps the tests' shape checks out of compiled code
 @numba.njit(cache=True, nogil=True)
-def _nearest(points, valid, limits, height, width, out):  # noqa: ANN001, ANN202 - compiled
+def _nearest(points, limits, height, width, out):  # noqa: ANN001, ANN202 - compiled
     best = np.full(height * width, np.iinfo(np.int64).max, np.int64)
     for n in range(len(points)):
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
-        if not valid[n] or z <= NEAR_M:
+        if z <= NEAR_M:
             continue
         flat = np.sqrt(x * x + z * z)
         row = (limits[0] - np.arctan(-y / flat)) / limits[2]
@@ -217,8 +214,8 @@ def _nearest(points, valid, limits, height, width, out):  # noqa: ANN001, ANN202
         if row < 0 or column < 0 or row >= height or column >= width:
             continue
         cell = np.int64(row) * width + np.int64(column)
-        millimetres = np.int64(np.sqrt(flat * flat + y * y) * np.float32(MILLIMETRES))
-        key = (millimetres << INDEX_BITS) | n
+        millimetres = np.int64(np.sqrt(flat * flat + y * y) * np.float32(_MILLIMETRES))
+        key = (millimetres << _INDEX_BITS) | n
         if key < best[cell]:
             best[cell] = key
             out[cell] = n
@@ -228,7 +225,7 @@ def _painted(
     points_camera: np.ndarray, features: np.ndarray, grid: Grid, nearness: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """C H W: occupied, nearness and features of the points that won their cells; and which points these are."""
-    index = nearest_points(points_camera, np.ones(len(points_camera), bool), grid)
+    index = nearest_points(points_camera, grid)
     out = np.zeros((2 + features.shape[1], len(index)), np.float32)
     full = np.flatnonzero(index >= 0)
     winners = index[full]
@@ -240,7 +237,7 @@ def _painted(
 
 
 def mark_strength(painted: Float32[np.ndarray, "6 H W"]) -> Float32[np.ndarray, "H W"]:
-    """Contrast of each cell's ground with its neighbours in the row: 0 up to one sigma, 1 from MARK_SIGMAS on.
+    """Contrast of each cell's ground with its neighbours in the row: 0 up to one sigma, 1 from _MARK_SIGMAS on.
 
     Zero everywhere if no reflectivity is logged.
     """
@@ -248,10 +245,10 @@ def mark_strength(painted: Float32[np.ndarray, "6 H W"]) -> Float32[np.ndarray, 
     values = painted[2 + _INTENSITY] * ground
     share = _row_sums(ground)
     above = (
-        painted[2 + _INTENSITY] - _row_sums(values) / np.maximum(share, MARK_LEAST_SHARE * MARK_WINDOW)
+        painted[2 + _INTENSITY] - _row_sums(values) / np.maximum(share, MARK_LEAST_SHARE * _MARK_WINDOW)
     ) * ground
     spread = np.sqrt((above * above).sum() / max(ground.sum(), 1.0)) + MARK_FLAT
-    return np.clip((above / spread - 1) / (MARK_SIGMAS - 1), 0, 1).astype(np.float32)
+    return np.clip((above / spread - 1) / (_MARK_SIGMAS - 1), 0, 1).astype(np.float32)
 
 
 def _marks(painted: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -263,8 +260,8 @@ def _marks(painted: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _row_sums(values: np.ndarray) -> np.ndarray:
-    """Sums over MARK_WINDOW columns about each, as if beyond the grid there were zeros."""
-    half, width = MARK_WINDOW // 2, values.shape[1]
+    """Sums over _MARK_WINDOW columns about each, as if beyond the grid there were zeros."""
+    half, width = _MARK_WINDOW // 2, values.shape[1]
     total = np.zeros((len(values), width + 1))
     np.cumsum(values, axis=1, out=total[:, 1:])
     column = np.arange(width)
@@ -285,17 +282,16 @@ def _heights(xyz: np.ndarray, plane: np.ndarray) -> np.ndarray:
 def _in_view(points_camera: np.ndarray, grid: Grid) -> Bool[np.ndarray, " N"]:
     x, y, z = points_camera.T
     flat = np.sqrt(x * x + z * z)
-    side = np.tan(np.radians(grid.left_deg + MARGIN_DEG))
-    up, down = np.tan(np.radians([grid.top_deg + MARGIN_DEG, grid.bottom_deg - MARGIN_DEG]))
+    side = np.tan(np.radians(grid.left_deg + _MARGIN_DEG))
+    up, down = np.tan(np.radians([grid.top_deg + _MARGIN_DEG, grid.bottom_deg - _MARGIN_DEG]))
     return (z > NEAR_M) & (np.abs(x) < side * z) & (-y < up * flat) & (-y > down * flat)
 
 
 @lru_cache(maxsize=4)
 def _importance(count: int) -> Float32[np.ndarray, " N"]:
     """A fixed irregular number in 0..1 per row: picks points evenly, and the same ones on every machine."""
-    return ((np.arange(count, dtype=np.int64) * 2654435761) % 65536).astype(np.float32) / np.float32(
-        65536
-    )  # Knuth's multiplicative hash
+    knuth = (np.arange(count, dtype=np.int64) * 2654435761) % 65536  # his multiplicative hash
+    return knuth.astype(np.float32) / np.float32(65536)
 
 
 def _best(score: np.ndarray, allowed: np.ndarray, count: int) -> np.ndarray:

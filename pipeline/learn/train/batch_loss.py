@@ -3,32 +3,38 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int64, UInt8
 from torch import Tensor, nn
+from torch.nn import functional as F  # noqa: N812 - the name that everybody uses
 
 from pipeline.learn.batches.batch import TrainingBatch
 from pipeline.learn.network.calibration_network import CalibrationNetwork
-from pipeline.learn.network.inputs import NetworkInputs, crop, sensor_inputs
 from pipeline.learn.network.outputs import Predictions
+from pipeline.learn.network.views import NetworkInputs, crop, grid_cells, sensor_inputs, sphere
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import PAIRS
 from pipeline.learn.train.augment import Guess, random_guess, turned_view
 from pipeline.learn.train.domain_randomisation import made_strange
-from pipeline.learn.train.frame_objective import at_lag, frame_objective, weighted
+from pipeline.learn.train.frame_objective import (
+    at_lag,
+    frame_objective,
+    twist_between,
+    uncertainty_loss,
+    weighted,
+)
 from pipeline.learn.train.paper_objective import PaperFrames
-from pipeline.learn.train.semantics_loss import class_of_points, semantics_loss
 from pipeline.learn.train.settings import PAIRS_OF, TrainConfig
-from pipeline.learn.train.uncertainty import twist_between, uncertainty_loss
 from pipeline.objective.differentiable.poses import pose, transform_points
 from pipeline.objective.differentiable.projection import GridProjection
 from pipeline.objective.differentiable.terms import class_evidence_cost
+from schemas.training import UNKNOWN_CLASS
 
-__all__ = ["Passes", "StepLoss", "batch_loss"]
+__all__ = ["Passes", "batch_loss", "class_of_points", "semantics_loss"]
 
 _DEG = 180.0 / torch.pi
+_RADAR_WEIGHT = 0.2  # of semantics: a detection's features hardly determine its class
 
 
 class Passes(nn.Module):
@@ -45,14 +51,6 @@ class Passes(nn.Module):
         return self.network.refine(inputs, self.iterations)
 
 
-@dataclass(frozen=True, eq=False)
-class StepLoss:
-    """The loss, and values to report (means over the batch, of the last pass)."""
-
-    loss: Float[Tensor, ""]
-    report: dict[str, Tensor]
-
-
 def batch_loss(
     passes: nn.Module,
     batch: TrainingBatch,
@@ -62,8 +60,8 @@ def batch_loss(
     *,
     matched: bool = True,
     paper: PaperFrames | None = None,
-) -> StepLoss:
-    """The loss of one batch from random guesses.
+) -> dict[str, Tensor]:
+    """The `loss` of one batch from random guesses, differentiable, and means to report, of the last pass.
 
     Args:
         passes: a `Passes` of the network, bare or wrapped for data parallelism.
@@ -79,8 +77,7 @@ def batch_loss(
     turned = pose(guess.R_turned_camera, torch.zeros_like(guess.R_turned_camera[..., 0]))
     semantics = _semantics(answers, view, turned, grid)
     if not matched:
-        loss = config.loss.semantics * semantics
-        return StepLoss(loss, {"loss": loss.detach(), "semantics": semantics.detach()})
+        return {"loss": config.loss.semantics * semantics, "semantics": semantics.detach()}
     pairs = PAIRS_OF[config.pairs]
     total, terms = _alignment(answers, guess, batch, config, paper)
     evidence = _evidence(answers, batch, turned, grid, generator)
@@ -88,14 +85,14 @@ def batch_loss(
     judged = total + config.loss.evidence * evidence
     loss = judged + config.loss.semantics * semantics + config.uncertainty_weight * uncertainty
     report = {f"term/{name}": value.detach().mean() for name, value in terms.items()}
-    report |= {"loss": loss.detach(), "alignment": total.detach(), "semantics": semantics.detach()}
+    report |= {"loss": loss, "alignment": total.detach(), "semantics": semantics.detach()}
     report |= {"uncertainty": uncertainty.detach(), "evidence": evidence.detach(), "judged": judged.detach()}
     for i, pair in enumerate(PAIRS):
         if pair in pairs:
             turns_deg = twist[:, i, :3] * _DEG
             report[f"scatter_deg/{pair}"] = turns_deg.square().sum(-1).mean().sqrt()
             report |= {f"mean_deg/{pair}/{a}": turns_deg[:, k].mean() for k, a in enumerate("xyz")}
-    return StepLoss(loss, report)
+    return report
 
 
 def _alignment(
@@ -114,7 +111,7 @@ def _alignment(
         poses = (T_camera_lidar, T_camera_radar, answer.T_lidar_radar)
         if objective is not None:
             terms = objective.terms(*poses, pairs)
-            value = weighted(terms, config.loss, pairs)
+            value = weighted(terms, config.loss)
         else:
             assert paper is not None
             terms = paper.terms(batch, *poses, pairs)
@@ -163,3 +160,44 @@ def _uncertainty(answer: Predictions, guess: Guess, batch: TrainingBatch) -> tup
     references = torch.stack([batch.T_camera_lidar, batch.T_camera_radar, batch.T_lidar_radar], 1)
     twist = twist_between(answers, references)
     return uncertainty_loss(answer.log_variance, twist), twist
+
+
+def class_of_points(
+    grid_class: UInt8[Tensor, "B H W"],
+    points_camera: Float[Tensor, "B N 3"],
+    valid: Bool[Tensor, "B N"],
+    grid: Grid,
+) -> Int64[Tensor, "B N"]:
+    """Class of the cell that each point falls into; UNKNOWN_CLASS outside the grid."""
+    row, column = grid_cells(sphere(points_camera), grid)
+    inside = valid & (points_camera[..., 2] > 0.5) & (row >= 0) & (column >= 0)
+    inside = inside & (row < grid.height) & (column < grid.width)
+    cell = torch.where(inside, row.long() * grid.width + column.long(), 0)
+    found = grid_class.flatten(1).long().gather(1, cell)
+    return torch.where(inside, found, UNKNOWN_CLASS)
+
+
+def semantics_loss(
+    predictions: Predictions,
+    grid_class: UInt8[Tensor, "B H W"],
+    lidar_class: Int64[Tensor, "B N"],
+    radar_class: Int64[Tensor, "B M"],
+) -> Float[Tensor, ""]:
+    """Cross-entropy of all encoders of one pass, 0 without any; `grid_class` is cropped as the image was."""
+    loss = torch.zeros((), device=grid_class.device)
+    if predictions.camera_logits is not None:
+        loss = loss + _cross_entropy(predictions.camera_logits, grid_class.long())
+    if predictions.lidar_logits is not None:
+        # Each cell has the class of the point that it shows.
+        index = predictions.lidar_index
+        target = torch.where(index >= 0, lidar_class.gather(1, index.clamp(min=0)), UNKNOWN_CLASS)
+        loss = loss + _cross_entropy(predictions.lidar_logits, target.reshape(grid_class.shape))
+    if predictions.radar_logits is not None:
+        radar = _cross_entropy(predictions.radar_logits.transpose(1, 2), radar_class)
+        loss = loss + _RADAR_WEIGHT * radar
+    return loss
+
+
+def _cross_entropy(logits: Tensor, target: Tensor) -> Tensor:
+    known = (target != UNKNOWN_CLASS).sum().clamp(min=1)
+    return F.cross_entropy(logits.float(), target, ignore_index=UNKNOWN_CLASS, reduction="sum") / known

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional as F  # noqa: N812 - the name that everybody uses
 
-from pipeline.learn.network.inputs import SensorInputs
+from pipeline.learn.network.views import SensorInputs
 from pipeline.learn.sample.layout import CAMERA_CHANNELS, FEATURE_UNITS, LIDAR_FEATURES
 from pipeline.learn.train.settings import StrangeConfig
 

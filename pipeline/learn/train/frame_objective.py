@@ -16,8 +16,7 @@ from torch import Tensor
 
 from pipeline.learn.batches.batch import TrainingBatch
 from pipeline.learn.train.settings import PAIRS_OF, LossConfig
-from pipeline.learn.train.uncertainty import twist_between
-from pipeline.objective.differentiable.poses import exp_so3, loop_loss, transform_points
+from pipeline.objective.differentiable.poses import exp_so3, inverse, loop_loss, transform_points
 from pipeline.objective.differentiable.projection import GridProjection, nearest_pixel
 from pipeline.objective.differentiable.static import (
     StaticFrames,
@@ -34,21 +33,14 @@ from pipeline.objective.differentiable.terms import (
     track_detection_cost,
 )
 
-__all__ = ["PAIR_OF_TERM", "FrameObjective", "at_lag", "frame_objective"]
+__all__ = [
+    "FrameObjective", "at_lag", "frame_objective", "twist_between", "uncertainty_loss", "weighted",
+]  # fmt: skip
 
-PAIR_OF_TERM = {
-    "edges": "camera_lidar",
-    "tracks_camera": "camera_radar",
-    "static": "lidar_radar",
-    "tracks_lidar": "lidar_radar",
-    "loop": "joint",
-    "prior_camera_lidar": "camera_lidar",
-    "prior_camera_radar": "camera_radar",
-    "prior_lidar_radar": "lidar_radar",
-}
 _MARGIN_DEG = 3.0  # how wrong the reference may be, where points must lie in view
 _LOOP_METRE = 5.0  # 0.2 m counts as a degree, by which it moves what is 11 m away
 _PRIOR_ROUND_DEG = 0.05  # below this the absolute value is rounded off
+_LOG_VARIANCE = (-18.0, 2.0)  # sigmas of 0.1 mrad to 3 m: what lies beyond has no gradient
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +61,7 @@ class FrameObjective:
         T_lidar_radar: Float[Tensor, "*batch B 4 4"],
         pairs: tuple[str, ...] = PAIRS_OF["joint"],
     ) -> dict[str, Float[Tensor, "*batch B"]]:
-        """Every term of the pairs (`joint`: the loop) and frames, unweighted, by the names of PAIR_OF_TERM."""
+        """Every term of the pairs (`joint`: the loop) and frames, unweighted: LossConfig's names, prior by pair."""
         found, b = dict[str, Tensor](), self.batch
         if "camera_lidar" in pairs:
             edge, side = at_lag(b, b.edge_xyz_m, b.camera_lag_s), b.edge_side.long()
@@ -78,7 +70,14 @@ class FrameObjective:
             seen = self.centres_rad, b.detection_valid
             found["tracks_camera"] = track_detection_cost(T_camera_radar, self.tracks, *seen)
         if "lidar_radar" in pairs:
-            found |= self._lidar_radar(T_lidar_radar)
+            lidar, still = at_lag(b, b.lidar_xyz_m, b.radar_lag_s), b.radar_valid & (b.radar_motion == 0)
+            frames = StaticFrames(
+                b.radar_xyz_m, still, lidar, b.lidar_valid, b.ground_plane, self.radar_tells_elevation
+            )
+            found["static"] = static_cost(T_lidar_radar, frames)
+            found["tracks_lidar"] = track_cluster_cost(
+                T_lidar_radar, self.tracks, b.cluster_centre_m, b.cluster_valid
+            )
         if "joint" in pairs:
             found["loop"] = loop_loss(
                 T_camera_lidar, T_lidar_radar, T_camera_radar, angle_unit=DEG, metre_unit=_LOOP_METRE
@@ -89,17 +88,6 @@ class FrameObjective:
             "lidar_radar": (T_lidar_radar, b.T_lidar_radar),
         }
         return found | {f"prior_{pair}": _from_prior(*poses[pair]) for pair in pairs if pair in poses}
-
-    def _lidar_radar(self, T: Tensor) -> dict[str, Tensor]:
-        b = self.batch
-        lidar, still = at_lag(b, b.lidar_xyz_m, b.radar_lag_s), b.radar_valid & (b.radar_motion == 0)
-        frames = StaticFrames(
-            b.radar_xyz_m, still, lidar, b.lidar_valid, b.ground_plane, self.radar_tells_elevation
-        )
-        return {
-            "static": static_cost(T, frames),
-            "tracks_lidar": track_cluster_cost(T, self.tracks, b.cluster_centre_m, b.cluster_valid),
-        }
 
 
 def frame_objective(batch: TrainingBatch) -> FrameObjective:
@@ -137,20 +125,10 @@ def _from_prior(
     return (torch.sqrt(scaled.square() + _PRIOR_ROUND_DEG**2) - _PRIOR_ROUND_DEG).sum(-1)
 
 
-def weighted(
-    terms: dict[str, Float[Tensor, "*batch"]], weights: LossConfig, pairs: tuple[str, ...]
-) -> Float[Tensor, "*batch"]:
-    """Weighted sum of the terms of some pairs, and of the loop where all three are there."""
-    chosen = [
-        _weight(weights, name) * value
-        for name, value in terms.items()
-        if PAIR_OF_TERM[name] in pairs and _weight(weights, name) > 0
-    ]
-    return torch.stack(chosen).sum(0)
-
-
-def _weight(weights: LossConfig, name: str) -> float:
-    return float(weights.prior if name.startswith("prior_") else getattr(weights, name))
+def weighted(terms: dict[str, Float[Tensor, "*batch"]], weights: LossConfig) -> Float[Tensor, "*batch"]:
+    """Sum of the terms that have a weight."""
+    of_term = {name: getattr(weights, "prior" if name.startswith("prior_") else name) for name in terms}
+    return torch.stack([w * terms[name] for name, w in of_term.items() if w > 0]).sum(0)
 
 
 def at_lag(batch: TrainingBatch, points: Float[Tensor, "B N 3"], lag_s: Float[Tensor, " B"]) -> Tensor:
@@ -171,3 +149,30 @@ def _surely_in_view(maps: GridMaps, T: Tensor, points: Tensor) -> Tensor:
         row, column, inside = nearest_pixel(maps.size, uv + uv.new_tensor([du, dv]), valid)
         out = out & inside & maps.seen[frame, row, column]
     return out
+
+
+def twist_between(
+    T_a: Float[Tensor, "*batch 4 4"], T_b: Float[Tensor, "*batch 4 4"]
+) -> Float[Tensor, "*batch 6"]:
+    """Rotation vector [rad] and translation [m] of T_a T_b^-1, for angles well below pi."""
+    delta = T_a @ inverse(T_b)
+    R = delta[..., :3, :3]
+    skew = (
+        torch.stack(
+            [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1
+        )
+        / 2
+    )
+    sine = skew.norm(dim=-1, keepdim=True)
+    cosine = (R.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True) - 1) / 2
+    small = sine < 1e-6
+    scale = torch.where(small, torch.ones_like(sine), torch.atan2(sine, cosine) / sine.clamp_min(1e-6))
+    return torch.cat([scale * skew, delta[..., :3, 3]], -1)
+
+
+def uncertainty_loss(
+    log_variance: Float[Tensor, "B 3 6"], scatter: Float[Tensor, "B 3 6"]
+) -> Float[Tensor, ""]:
+    """Negative log-likelihood of the scatter; only the variances learn from it, because the scatter has no gradient."""
+    bounded = log_variance.clamp(*_LOG_VARIANCE)
+    return 0.5 * (scatter.square() * torch.exp(-bounded) + bounded).mean()

@@ -15,7 +15,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from types import FrameType
 from typing import Any, TextIO
@@ -30,7 +30,7 @@ from pipeline.learn.train.settings import DescentConfig
 
 __all__ = [
     "BEST", "LAST", "DivergedError", "DivergenceGuard", "MetricsLog", "Run", "TrainResult",
-    "cosine_rate", "load_checkpoint", "read_metrics", "run_loop", "save_checkpoint", "stop_signals",
+    "load_checkpoint", "read_metrics", "run_loop", "save_checkpoint", "stop_signals",
 ]  # fmt: skip
 
 LAST, BEST = "last.pt", "best.pt"
@@ -120,20 +120,14 @@ class DivergedError(BoresightError):
         super().__init__(f"training diverged at step {step}: {reason}")
 
 
-def cosine_rate(progress: float, first: float, last: float) -> float:
-    """Learning rate at `progress` (0..1, held beyond)."""
-    share = min(max(progress, 0.0), 1.0)
-    return last + 0.5 * (first - last) * (1 + math.cos(math.pi * share))
-
-
+@dataclass
 class DivergenceGuard:
-    """Raises if the loss is not finite, or a multiple of its smallest smoothed value."""
+    """Raises if the loss is not finite, or `factor` times its smallest smoothed value; the rest is its state."""
 
-    def __init__(self, factor: float) -> None:
-        self._factor = factor
-        self._smooth: float | None = None
-        self._least = math.inf
-        self._seen = 0
+    factor: float
+    smooth: float | None = None
+    least: float = math.inf
+    seen: int = 0
 
     def check(self, step: int, loss: float, gradient_norm: float) -> None:
         """Check the loss of one step."""
@@ -141,25 +135,14 @@ class DivergenceGuard:
             raise DivergedError(step, f"the loss is {loss}")
         if not math.isfinite(gradient_norm):
             raise DivergedError(step, f"the gradient's norm is {gradient_norm}")
-        self._seen += 1
-        self._smooth = loss if self._smooth is None else self._smooth + _SMOOTHING * (loss - self._smooth)
-        self._least = min(self._least, self._smooth)
+        self.seen += 1
+        self.smooth = loss if self.smooth is None else self.smooth + _SMOOTHING * (loss - self.smooth)
+        self.least = min(self.least, self.smooth)
         # Likelihood terms may take the sum below zero: a loss near zero has no useful multiple.
-        limit = self._factor * max(abs(self._least), 1.0)
-        if self._seen > _PATIENCE and self._smooth > limit:
-            told = f"is more than {self._factor:g} times its least, {self._least:.3g}"
-            raise DivergedError(step, f"the smoothed loss {self._smooth:.3g} {told}")
-
-    def state_dict(self) -> dict[str, float | int | None]:
-        """For checkpoints."""
-        return {"smooth": self._smooth, "least": self._least, "seen": self._seen}
-
-    def load_state_dict(self, state: dict[str, float | int | None]) -> None:
-        """From checkpoints."""
-        smooth, least, seen = state["smooth"], state["least"], state["seen"]
-        self._smooth = None if smooth is None else float(smooth)
-        self._least = math.inf if least is None else float(least)
-        self._seen = int(seen or 0)
+        limit = self.factor * max(abs(self.least), 1.0)
+        if self.seen > _PATIENCE and self.smooth > limit:
+            told = f"is more than {self.factor:g} times its least, {self.least:.3g}"
+            raise DivergedError(step, f"the smoothed loss {self.smooth:.3g} {told}")
 
 
 @dataclass(frozen=True)
@@ -214,7 +197,7 @@ class Run(ABC):
         return {
             "network": self.network.state_dict(),
             "optimiser": self.optimiser.state_dict(),
-            "guard": self.guard.state_dict(),
+            "guard": asdict(self.guard),
             "step": self.step,
             "trained_s": self.trained_s,
         }
@@ -223,8 +206,8 @@ class Run(ABC):
         """Continue from a checkpoint."""
         self.network.load_state_dict(state["network"])
         self.optimiser.load_state_dict(state["optimiser"])
-        self.guard.load_state_dict(state["guard"])
-        self.step, self.trained_s = int(state["step"]), float(state.get("trained_s", 0.0))
+        self.guard = replace(self.guard, **state["guard"])
+        self.step, self.trained_s = int(state["step"]), float(state["trained_s"])
 
     def save(self, folder: Path) -> None:
         """Write the last checkpoint; every process must call."""
@@ -235,7 +218,8 @@ class Run(ABC):
     def descend(self) -> dict[str, Tensor]:
         """One step of Adam; returns values to report."""
         config, comparable = self.descent, self.comparable()
-        rate = cosine_rate(self.progress, config.learning_rate, config.final_learning_rate)
+        cosine, last = math.cos(math.pi * min(self.progress, 1.0)), config.final_learning_rate
+        rate = last + 0.5 * (config.learning_rate - last) * (1 + cosine)
         for group in self.optimiser.param_groups:
             group["lr"] = rate
         found = self.losses()

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import math
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -22,11 +21,8 @@ from pipeline.core.results import Progress, silent
 from pipeline.learn.batches.batch import TrainingBatch
 from pipeline.learn.batches.loader import TrainingLoader, load_split
 from pipeline.learn.network.calibration_network import CalibrationNetwork, build_network
-from pipeline.learn.network.encoders import CameraEncoder, LidarEncoder
 from pipeline.learn.network.exported_weights import network_of_file
 from pipeline.learn.prepare.inventory import require_sides
-from pipeline.learn.sample.grid import Grid
-from pipeline.learn.sample.layout import NetworkConfig
 from pipeline.learn.train.batch_loss import Passes, batch_loss
 from pipeline.learn.train.loop import (
     BEST,
@@ -44,60 +40,10 @@ from pipeline.learn.train.processes import Processes, joined
 from pipeline.learn.train.settings import TrainConfig
 from pipeline.store.partitions import Lake
 
-__all__ = ["BatchStream", "RunState", "TrainRequest", "accelerate", "begin_run", "network_of_run", "train"]
-
+__all__ = ["TrainRequest", "network_of_run", "train"]
 
 _ENDLESS = 10**9  # steps, where time is what ends a run
 _VALIDATION_SEED = 977  # the guesses of validation are the same every time
-
-
-class BatchStream:
-    """Endless batches of split `train` for this process, prefetched on a GPU; else ContractError."""
-
-    def __init__(self, data: str, config: TrainConfig, processes: Processes) -> None:
-        rank_of = (processes.rank, processes.count)
-        self._loader = TrainingLoader(
-            Lake.at(data), config.batch_size, seed=config.seed, rank_of=rank_of,
-            referenced=config.needs_reference,
-        )  # fmt: skip
-        self._device, self._place = processes.device, self._loader.state_dict()
-        self._ahead = ThreadPoolExecutor(1, "next-batch") if self._device.type == "cuda" else None
-        self._next: Future[tuple[TrainingBatch, dict[str, Any]]] | None = None
-
-    @property
-    def frames(self) -> int:
-        """Frames of the split."""
-        return self._loader.frames
-
-    def batch(self) -> TrainingBatch:
-        """The next step's batch, on the device."""
-        if self._ahead is None:
-            batch, self._place = self._fetch()
-            return batch
-        future = self._next or self._ahead.submit(self._fetch)
-        batch, self._place = future.result()
-        self._next = self._ahead.submit(self._fetch)
-        return batch.to(self._device, non_blocking=True)
-
-    def state_dict(self) -> dict[str, Any]:
-        """The place after the last batch."""
-        return self._place
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on there."""
-        self._loader.load_state_dict(state)
-        self._place = state
-
-    def close(self) -> None:
-        """Release threads and memory."""
-        if self._ahead is not None:
-            self._ahead.shutdown(wait=True, cancel_futures=True)
-        self._loader.close()
-
-    def _fetch(self) -> tuple[TrainingBatch, dict[str, Any]]:
-        batch = next(self._loader)
-        place = self._loader.state_dict()
-        return (batch.pin_memory() if self._device.type == "cuda" else batch), place
 
 
 class RunState(Run):
@@ -105,23 +51,20 @@ class RunState(Run):
 
     network: CalibrationNetwork
 
-    def __init__(
-        self, data: str, config: TrainConfig, processes: Processes, stream: BatchStream, *, compiled: bool
-    ) -> None:
-        self.config, self.grid, self.stream = config, Grid(config.cell_deg), stream
-        network = build_network(_network_config(config, self.grid), config.seed).to(processes.device)
+    def __init__(self, lake: Lake, config: TrainConfig, processes: Processes, loader: TrainingLoader) -> None:
+        self.config, self.loader = config, loader
+        network = build_network(config.network, config.seed).to(processes.device)
         self.paper: PaperFrames | None = None
         if config.loss.definition == "paper":
             with_paper_inputs(network)
-            self.paper = PaperFrames(Lake.at(data))
-        accelerate(network, half=processes.device.type == "cuda", compiled=compiled)
+            self.paper = PaperFrames(lake)
         self.passes: nn.Module = Passes(network, config.iterations)
         if processes.count > 1:
             # A pair's network uses a part of the encoders only.
             self.passes = DistributedDataParallel(self.passes, find_unused_parameters=True)
         self.best = math.inf
-        self.held_out = _held_out(data, config) if processes.leads else None
-        super().__init__(network, config, _steps(config, stream.frames, processes.count), processes)
+        self.held_out = _held_out(lake, config) if processes.leads else None
+        super().__init__(network, config, _steps(config, loader.frames, processes.count), processes)
 
     @property
     def progress(self) -> float:
@@ -136,12 +79,12 @@ class RunState(Run):
 
     def losses(self) -> dict[str, Tensor]:
         """Losses of the step's batch, from random guesses."""
-        found = batch_loss(
-            self.passes, self.stream.batch(), self.config,
-            _generator(self.config.seed, self.step, self.processes.rank), self.network,
+        batch = next(self.loader).to(self.processes.device)
+        generator = _generator(self.config.seed, self.step, self.processes.rank)
+        return batch_loss(
+            self.passes, batch, self.config, generator, self.network,
             matched=self.comparable(), paper=self.paper,
         )  # fmt: skip
-        return found.report | {"loss": found.loss}
 
     def validate(self, folder: Path, log: MetricsLog | None) -> None:
         """At the start and at intervals, judge held-out frames from the same guesses; keep the best weights.
@@ -158,7 +101,7 @@ class RunState(Run):
             for first in range(0, len(frames), 16):
                 part = frames[first : first + 16].to(self.processes.device)
                 found = batch_loss(passes, part, self.config, generator, self.network, paper=self.paper)
-                for name, value in found.report.items():
+                for name, value in found.items():
                     sums[name] = sums.get(name, 0.0) + float(value) * len(part) / len(frames)
         self.network.train()
         if log is not None:
@@ -170,9 +113,8 @@ class RunState(Run):
 
     def state(self) -> dict[str, Any]:
         """Content of a checkpoint; every process must call this."""
-        own = {"stream": self.stream.state_dict()}
-        everyone = {"processes": self.processes.gather(own), "best": self.best}
-        return super().state() | self._about() | everyone
+        everyone = self.processes.gather({"stream": self.loader.state_dict()})
+        return super().state() | self._about() | {"processes": everyone, "best": self.best}
 
     def load(self, state: dict[str, Any]) -> None:
         """Continue from a checkpoint; raises ConfigError if another number of processes wrote it."""
@@ -180,37 +122,11 @@ class RunState(Run):
             problem = f"begun by {len(state['processes'])}, now {self.processes.count}"
             raise ConfigError("train", "processes", f"a run continues with as many as it was {problem}")
         super().load(state)
-        own = state["processes"][self.processes.rank]
-        self.stream.load_state_dict(own["stream"])
+        self.loader.load_state_dict(state["processes"][self.processes.rank]["stream"])
         self.best = float(state["best"])
 
     def _about(self) -> dict[str, Any]:
-        return {"config": self.config.model_dump(mode="json"), "grid": asdict(self.grid)}
-
-
-def begin_run(
-    data: str,
-    folder: Path,
-    config: TrainConfig,
-    processes: Processes,
-    *,
-    compiled: bool,
-    start: Path | None = None,
-) -> RunState:
-    """A new run, or the run in the folder at its last checkpoint; arguments and errors as of `train`."""
-    stream = BatchStream(data, config, processes)
-    try:
-        run = RunState(data, config, processes, stream, compiled=compiled)
-        if (folder / LAST).exists():
-            state = load_checkpoint(folder / LAST, processes.device)
-            _same_config(folder, state["config"], config)
-            run.load(state)
-        elif start is not None:
-            _take_weights(run.network, start)
-    except BaseException:
-        stream.close()
-        raise
-    return run
+        return {"config": self.config.model_dump(mode="json")}
 
 
 def network_of_run(folder: Path, *, best: bool = True) -> CalibrationNetwork:
@@ -219,8 +135,7 @@ def network_of_run(folder: Path, *, best: bool = True) -> CalibrationNetwork:
     if not path.exists():
         raise ContractError(str(folder), f"no run: there is neither {BEST} nor {LAST}")
     state = load_checkpoint(path)
-    config = TrainConfig.model_validate(state["config"])
-    network = CalibrationNetwork(_network_config(config, Grid(**state["grid"])))
+    network = CalibrationNetwork(TrainConfig.model_validate(state["config"]).network)
     network.load_state_dict(state["network"])
     return network.eval()
 
@@ -252,18 +167,6 @@ def _widened(trained: dict[str, Tensor], fresh: dict[str, Tensor]) -> dict[str, 
     return found
 
 
-def _network_config(config: TrainConfig, grid: Grid) -> NetworkConfig:
-    return NetworkConfig(
-        config.architecture,
-        config.pairs,
-        grid,
-        config.width,
-        config.hidden,
-        config.takes_classes,
-        config.marks,
-    )
-
-
 def _steps(config: TrainConfig, frames: int, processes: int) -> int:
     if config.steps is not None:
         return config.steps
@@ -272,12 +175,10 @@ def _steps(config: TrainConfig, frames: int, processes: int) -> int:
     return max(1, math.ceil(config.epochs * frames / (config.batch_size * processes)))
 
 
-def _held_out(data: str, config: TrainConfig) -> TrainingBatch | None:
+def _held_out(lake: Lake, config: TrainConfig) -> TrainingBatch | None:
     """Frames to validate on; None if the data has none."""
     try:
-        return load_split(
-            Lake.at(data), "val", limit=config.validation_frames, referenced=config.needs_reference
-        )
+        return load_split(lake, "val", limit=config.validation_frames, referenced=config.needs_reference)
     except ContractError:
         return None
 
@@ -298,31 +199,6 @@ def _same_config(folder: Path, begun: dict[str, Any], config: TrainConfig) -> No
         raise ConfigError(str(folder), other[0], problem)
 
 
-def accelerate(network: nn.Module, *, half: bool, compiled: bool) -> None:
-    """Set the image encoders to bfloat16, compile them, or both; parameters and outputs stay float32.
-
-    Of the encoders only: geometry in sixteen bits would be wrong by metres.
-    """
-    for module in network.modules():
-        if isinstance(module, CameraEncoder | LidarEncoder):
-            if half:
-                _in_bfloat16(module)
-            if compiled:
-                module.compile()
-
-
-def _in_bfloat16(module: nn.Module) -> None:
-    forward = module.forward
-
-    def in_bfloat16(inputs: Tensor) -> Tensor:
-        with torch.autocast(inputs.device.type, torch.bfloat16):
-            output: Tensor = forward(inputs)
-        return output.float()
-
-    # In place of hooks, which a compiler would have to stop at.
-    module.forward = in_bfloat16
-
-
 @dataclass(frozen=True)
 class TrainRequest:
     """Options of a training command in addition to the configuration.
@@ -338,7 +214,6 @@ class TrainRequest:
     out: Path
     device: str = "auto"
     time_limit_s: float | None = None
-    compiled: bool = False
     start: Path | None = None
 
 
@@ -352,14 +227,24 @@ def train(request: TrainRequest, config: TrainConfig, progress: Progress = silen
             weights in `start`.
         DivergedError: the loss is not finite or has grown too much; the last checkpoint is from before.
     """
-    out = request.out
-    require_sides(Lake.at(request.data))
+    out, lake = request.out, Lake.at(request.data)
+    require_sides(lake)
     out.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
         processes = stack.enter_context(joined(request.device))
         stops = stack.enter_context(stop_signals())
-        run = begin_run(request.data, out, config, processes, compiled=request.compiled, start=request.start)
-        stack.callback(run.stream.close)
+        loader = TrainingLoader(
+            lake, config.batch_size, seed=config.seed, rank_of=(processes.rank, processes.count),
+            referenced=config.needs_reference,
+        )  # fmt: skip
+        stack.callback(loader.close)
+        run = RunState(lake, config, processes, loader)
+        if (out / LAST).exists():
+            state = load_checkpoint(out / LAST, processes.device)
+            _same_config(out, state["config"], config)
+            run.load(state)
+        elif request.start is not None:
+            _take_weights(run.network, request.start)
         log: MetricsLog | None = None
         if processes.leads:
             (out / "train.json").write_text(json.dumps(config.model_dump(mode="json"), indent=1) + "\n")

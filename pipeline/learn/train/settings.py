@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from pipeline.core.config import read_toml, validated
 from pipeline.learn.sample.grid import Grid
+from pipeline.learn.sample.layout import PAIRS, NetworkConfig
 
 __all__ = [
     "PAIRS_OF",
@@ -26,14 +27,11 @@ __all__ = [
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
+Share = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(gt=0)]
 
-PAIRS_OF: dict[str, tuple[str, ...]] = {
-    "joint": ("camera_lidar", "camera_radar", "lidar_radar", "joint"),
-    "camera_lidar": ("camera_lidar",),
-    "camera_radar": ("camera_radar",),
-    "lidar_radar": ("lidar_radar",),
-}
+# Pairs whose terms a network is judged by; `joint` stands for the loop.
+PAIRS_OF: dict[str, tuple[str, ...]] = {"joint": (*PAIRS, "joint"), **{pair: (pair,) for pair in PAIRS}}
 
 
 class _Section(BaseModel):
@@ -68,7 +66,7 @@ class AugmentConfig(_Section):
     rotation_deg: NotNegative = 3.0  # per axis, even
     translation_m: NotNegative = 0.1  # per axis, even
     # Of the frames, moved by u^2 of that with u even in 0..1.
-    small_share: Annotated[float, Field(ge=0, le=1)] = 0.5
+    small_share: Share = 0.5
     view_deg: NotNegative = 4.0  # per axis, even; the stored grid must be wider than the network's by as much
 
 
@@ -78,20 +76,15 @@ class StrangeConfig(_Section):
     Inputs of the losses stay as they are. All off by default, for a fleet's own logs.
     """
 
-    image: NotNegative = (
-        0.0  # light, colour, texture, blur and noise; at 1 a road may be reddish or half in shadow
-    )
-    classes: NotNegative = (
-        0.0  # errors of the given classes, beyond those that the labels have; 1 = a weak segmenter
-    )
-    no_classes: Annotated[float, Field(ge=0, le=1)] = 1 / 3  # of the frames: the image alone
-    no_image: Annotated[float, Field(ge=0, le=1)] = 0.0  # of the frames with classes: the classes alone
-    lidar: NotNegative = (
-        0.0  # echoes, heights, missing points; at 1 about what lidars of two makers differ by
-    )
-    fewer_rows: Annotated[float, Field(ge=0, le=1)] = (
-        0.0  # of the frames: rows of the sweep 1 to 2.2 deg apart
-    )
+    # Light, colour, texture, blur and noise; at 1 a road may be reddish or half in shadow.
+    image: NotNegative = 0.0
+    # Errors of the given classes, beyond those that the labels have; 1 = a weak segmenter.
+    classes: NotNegative = 0.0
+    no_classes: Share = 1 / 3  # of the frames: the image alone
+    no_image: Share = 0.0  # of the frames with classes: the classes alone
+    # Echoes, heights, missing points; at 1 about what lidars of two makers differ by.
+    lidar: NotNegative = 0.0
+    fewer_rows: Share = 0.0  # of the frames: rows of the sweep 1 to 2.2 deg apart
 
 
 class DescentConfig(_Section):
@@ -124,9 +117,8 @@ class TrainConfig(DescentConfig):
     cell_deg: Annotated[float, Field(ge=0.1, le=0.5)] = 0.4
     width: Count = 16  # channels of the encoders' first stage
     hidden: Count = 192
-    takes_classes: bool = (
-        False  # besides its image the camera shows what a segmenter makes of it, where there is one
-    )
+    # Besides its image the camera shows what a segmenter makes of it, where there is one.
+    takes_classes: bool = False
     marks: bool = False  # bright ground of the sweep is matched with paint in the image
     iterations: Annotated[int, Field(ge=1, le=5)] = 1  # passes per frame; losses of all passes are averaged
     # Encoders learn from classes alone, at every step; matchers have few weights and cost half of a step: they join at
@@ -148,24 +140,24 @@ class TrainConfig(DescentConfig):
         """Whether encoders learn classes of points, which only a day's record of `joint` carries to them unbiased."""
         return self.architecture == "matching" and self.pairs != "lidar_radar"
 
+    @property
+    def network(self) -> NetworkConfig:
+        """Structure of the network that is trained."""
+        return NetworkConfig(
+            self.architecture, self.pairs, Grid(self.cell_deg), self.width, self.hidden, self.takes_classes,
+            self.marks,
+        )  # fmt: skip
+
     @model_validator(mode="after")
-    def _cells_fit(self) -> TrainConfig:
+    def _fits_together(self) -> TrainConfig:
         try:
             Grid(self.cell_deg)
         except ValueError as err:
             raise ValueError(f"cell_deg = {self.cell_deg:g}: {err}") from err
-        return self
-
-    @model_validator(mode="after")
-    def _encoders_exist(self) -> TrainConfig:
-        if self.takes_classes and (self.architecture == "concat" or self.pairs == "lidar_radar"):
+        if self.takes_classes and not self.needs_reference:
             raise ValueError("takes_classes must be false where no classes are matched: concat, lidar_radar")
-        if self.matched_every > 1 and (self.architecture == "concat" or self.pairs == "lidar_radar"):
+        if self.matched_every > 1 and not self.needs_reference:
             raise ValueError("matched_every must be 1 where no classes are learned: concat, lidar_radar")
-        return self
-
-    @model_validator(mode="after")
-    def _paper_is_whole(self) -> TrainConfig:
         own = (self.architecture, self.augment.view_deg, self.takes_classes, self.strange)
         if self.loss.definition == "paper" and own != ("concat", 0.0, False, StrangeConfig()):
             problem = 'architecture = "concat", augment.view_deg = 0, and neither takes_classes nor [strange]'

@@ -9,8 +9,7 @@ import torch
 
 from jobs.cli import main
 from pipeline.core.config import LearnConfig, PrepareConfig
-from pipeline.learn.infer.onnx_networks import open_networks
-from pipeline.learn.infer.single_frame import SingleFrameCalibrator
+from pipeline.learn.infer.onnx_networks import OnnxNetwork, open_networks
 from pipeline.learn.network.calibration_network import build_network
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import NetworkConfig
@@ -49,7 +48,7 @@ def test_a_run_becomes_a_file_with_its_card(run, tmp_path, capsys):
     assert main(["export", "onnx", "--run", str(run), "--out", str(out), "--notes", str(notes)]) == 0
     summary = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert summary["outputs"] == [str(out), str(tmp_path / "model.json"), str(tmp_path / "model.md")]
-    calibrator = SingleFrameCalibrator(out)
+    calibrator = OnnxNetwork(out)
     assert calibrator.config.architecture == "concat"
     card = json.loads(calibrator.metadata["card"])
     assert card["weights"].startswith("of step 40, the best")

@@ -11,16 +11,13 @@ import torch
 from pipeline.core.errors import ModelError
 from pipeline.learn.batches.batch import collate
 from pipeline.learn.export.onnx_file import export_onnx
-from pipeline.learn.infer.single_frame import SingleFrameCalibrator
+from pipeline.learn.infer.onnx_networks import OnnxNetwork
 from pipeline.learn.network.calibration_network import build_network
 from pipeline.learn.network.exported_weights import network_of_file, weight_places
-from pipeline.learn.network.inputs import NetworkInputs, crop, given_classes, sensor_inputs
-from pipeline.learn.network.views import render
-from pipeline.learn.sample.frame_sample import About, Reference, make_row
+from pipeline.learn.network.views import NetworkInputs, crop, given_classes, render, sensor_inputs
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import PAIRS, NetworkConfig
 from pipeline.learn.sample.rendering import frame_sensors
-from pipeline.rig.estimates import Prior
 from pipeline.rig.se3 import exp_so3, transform_points
 from schemas.training import GRID_CLASSES
 from schemas.versions import CODE_VERSION
@@ -34,12 +31,7 @@ KINDS = ["matching-joint", "classes-joint", *(pytest.param(kind, marks=pytest.ma
 
 @lru_cache
 def row():
-    rng = np.random.default_rng(0)
-    observation = solve_scenes.make_observation(rng, 0, 0, 0.0)
-    prior = Prior(solve_scenes.T_CAMERA_LIDAR, solve_scenes.T_LIDAR_RADAR, 0.02, 0.05)
-    about = About("v", "2026-01-01", "default", "train", "p", "urban")
-    config = training_lakes.fleet_of(["v"], lidar_points=4096).prepare
-    return make_row(training_lakes.frame_of(observation, rng), observation, Reference(prior), about, config)
+    return training_lakes.sample_of(lidar_points=4096)
 
 
 def classes():
@@ -79,7 +71,7 @@ def exported(request, tmp_path_factory):
 def test_the_file_computes_what_the_network_computes_in_one_pass_and_in_three(exported):
     network, path = exported
     sensors = frame_sensors(row(), GRID, classes())
-    ours = SingleFrameCalibrator(path).estimate(sensors, guess())
+    ours = OnnxNetwork(path).estimate(sensors, guess())
     with torch.no_grad():
         theirs = network.refine(inputs(), 3)
     assert sum(np.abs(T - guess()[p]).max() for p, T in ours[0].T.items()) > 1e-3  # else parity of nothing
@@ -97,7 +89,7 @@ def test_the_file_computes_what_the_network_computes_in_one_pass_and_in_three(ex
 def test_what_a_file_matches_by_is_what_the_network_matches_by(exported):
     network, path = exported
     T_camera_lidar = guess()["camera_lidar"]
-    told = SingleFrameCalibrator(path).evidence(frame_sensors(row(), GRID, classes()), T_camera_lidar)
+    told = OnnxNetwork(path).evidence(frame_sensors(row(), GRID, classes()), T_camera_lidar)
     with torch.no_grad():
         view, _ = render(inputs(), GRID, classes=network.config.takes_classes)
         evidence = network.core(view).evidence
@@ -116,7 +108,7 @@ def test_a_file_that_takes_classes_answers_without_them_and_otherwise(exported):
     network, path = exported
     sensors = frame_sensors(row(), GRID, classes())
     asked = [sensors, frame_sensors(row(), GRID), sensors.without_image()]
-    answers = [np.stack([*SingleFrameCalibrator(path).estimate(s, guess())[-1].T.values()]) for s in asked]
+    answers = [np.stack([*OnnxNetwork(path).estimate(s, guess())[-1].T.values()]) for s in asked]
     differs = not np.allclose(answers[0], answers[1], atol=1e-6)
     assert differs == network.config.takes_classes
     assert np.isfinite(answers).all()
@@ -151,13 +143,13 @@ def test_a_network_can_be_trained_on_from_its_file(exported):
 def test_a_file_that_is_no_such_model_is_refused_by_name(tmp_path):
     path = tmp_path / "model.onnx"
     with pytest.raises(ModelError, match=r"model\.onnx"):
-        SingleFrameCalibrator(path)
+        OnnxNetwork(path)
     path.write_bytes(b"nonsense")
     with pytest.raises(ModelError, match="ONNX"):
-        SingleFrameCalibrator(path)
+        OnnxNetwork(path)
     graph = onnx.helper.make_graph([], "empty", [], [])
     onnx.save(onnx.helper.make_model(graph), path)
     with pytest.raises(ModelError, match="boresight export"):
-        SingleFrameCalibrator(path)
+        OnnxNetwork(path)
     with pytest.raises(ModelError, match="weights"):
         network_of_file(path)

@@ -11,9 +11,8 @@ from jobs.cli import main
 from pipeline.calibrate.networks import held_if_unfit
 from pipeline.core.errors import ConfigError, ModelError, SolveError
 from pipeline.learn.export.onnx_file import export_onnx
-from pipeline.learn.infer.frame_network import FrameAnswer
 from pipeline.learn.infer.onnx_networks import UNFIT, model_files, models_key, open_networks
-from pipeline.learn.infer.vehicle_day import single_frame_solution, solve_by_networks
+from pipeline.learn.infer.vehicle_day import FrameAnswer, single_frame_solution, solve_by_networks
 from pipeline.learn.network.calibration_network import build_network
 from pipeline.learn.sample.frame_sample import SampleReason, SampleRejectedError
 from pipeline.learn.sample.layout import NetworkConfig

@@ -9,33 +9,22 @@ import torch
 
 from pipeline.learn.batches.batch import TrainingBatch, collate
 from pipeline.learn.network.calibration_network import build_network
-from pipeline.learn.network.inputs import NetworkInputs, crop, sensor_inputs
-from pipeline.learn.network.views import render
-from pipeline.learn.sample.frame_sample import About, Reference, make_row
+from pipeline.learn.network.views import NetworkInputs, crop, render, sensor_inputs
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import GRAPH_INPUTS, PAIRS, NetworkConfig
-from pipeline.learn.train.semantics_loss import class_of_points, semantics_loss
+from pipeline.learn.train.batch_loss import class_of_points, semantics_loss
 from pipeline.objective.differentiable.poses import transform_points
 from pipeline.objective.differentiable.projection import GridProjection
 from pipeline.objective.differentiable.terms import class_evidence_cost
-from pipeline.rig.estimates import Prior
-from tests.makers import solve_scenes, training_lakes
+from tests.makers import training_lakes
 
 GRID = Grid(0.4, 25.6, 12.8, -12.8)
 KINDS = [(a, p) for a in ("matching", "concat") for p in ("joint", *PAIRS)]
 
 
 @lru_cache
-def batch(frames=2) -> TrainingBatch:
-    config = training_lakes.fleet_of(["v"]).prepare
-    seen = Reference(Prior(solve_scenes.T_CAMERA_LIDAR, solve_scenes.T_LIDAR_RADAR, 0.02, 0.05))
-    about = About("v", "2026-01-01", "default", "train", "p", "urban")
-    rows = []
-    for seed in range(frames):
-        rng = np.random.default_rng(seed)
-        observation = solve_scenes.make_observation(rng, seed, 0, float(seed))
-        rows.append(make_row(training_lakes.frame_of(observation, rng), observation, seen, about, config))
-    return collate(rows)
+def batch() -> TrainingBatch:
+    return collate([training_lakes.sample_of(seed) for seed in range(2)])
 
 
 def inputs_of(data, **changes) -> NetworkInputs:
@@ -48,8 +37,8 @@ def small(architecture="matching", pairs="joint", seed=0):
     return build_network(NetworkConfig(architecture, pairs, GRID, width=8, hidden=32), seed)
 
 
-def names_of(pair):
-    return f"T_{pair}"
+def asked(network, inputs):
+    return network.refine(inputs, 1)[0]
 
 
 @pytest.mark.parametrize(("architecture", "pairs"), KINDS)
@@ -57,13 +46,13 @@ def test_a_network_corrects_its_pairs_rigidly_and_leaves_the_others(architecture
     inputs = inputs_of(batch())
     network = small(architecture, pairs)
     with torch.no_grad():
-        answer = network(inputs)
+        answer = asked(network, inputs)
     for pair in PAIRS:
-        T = getattr(answer, names_of(pair))
+        T = getattr(answer, f"T_{pair}")
         assert torch.allclose(
             T[:, :3, :3] @ T[:, :3, :3].transpose(1, 2), torch.eye(3).expand(2, 3, 3), atol=1e-5
         )
-        moved = (T - getattr(inputs, names_of(pair))).abs().max() > 1e-7
+        moved = (T - getattr(inputs, f"T_{pair}")).abs().max() > 1e-7
         assert bool(moved) == (pairs in ("joint", pair))
     assert answer.log_variance.shape == (2, 3, 6)
     assert torch.isfinite(answer.log_variance).all()
@@ -77,11 +66,9 @@ def test_refinement_hands_turns_on_but_no_shifts_and_encodes_the_camera_once():
         answers = network.refine(inputs, 3)
         by_hand = inputs
         for answer in answers:
-            again = network(by_hand)
+            again = asked(network, by_hand)
             for pair in PAIRS:
-                assert torch.allclose(
-                    getattr(again, names_of(pair)), getattr(answer, names_of(pair)), atol=1e-6
-                )
+                assert torch.allclose(getattr(again, f"T_{pair}"), getattr(answer, f"T_{pair}"), atol=1e-6)
             view, _ = render(by_hand, GRID)
             turns = network.core(view).corrections
             turns[:, :, :3, 3] = 0.0
@@ -92,26 +79,24 @@ def test_refinement_hands_turns_on_but_no_shifts_and_encodes_the_camera_once():
     assert len(calls) == 1 + 6  # once in refine, twice in each pass by hand
 
 
-def of_points(data, inputs, classes):
-    """Classes of lidar points and radar detections through the guess."""
+def of_points(inputs):
+    """Classes of the grid, and of lidar points and radar detections through the guess."""
+    data = batch()
+    classes = crop(data.grid_class, data.grid_step_deg, GRID)
     lidar = transform_points(inputs.T_camera_lidar, data.lidar_xyz_m)
     radar = transform_points(inputs.T_camera_radar, data.radar_xyz_m)
-    return (
-        class_of_points(classes, xyz, valid, GRID)
-        for xyz, valid in ((lidar, data.lidar_valid), (radar, data.radar_valid))
-    )
+    seen = ((lidar, data.lidar_valid), (radar, data.radar_valid))
+    return classes, *(class_of_points(classes, xyz, valid, GRID) for xyz, valid in seen)
 
 
 def test_alignment_teaches_heads_and_temperatures_and_classes_teach_encoders():
     network, inputs = small(), inputs_of(batch())
-    answer = network(inputs)
-    loss = sum(getattr(answer, names_of(p)).pow(2).sum() for p in PAIRS) + answer.log_variance.sum()
+    answer = asked(network, inputs)
+    loss = sum(getattr(answer, f"T_{p}").pow(2).sum() for p in PAIRS) + answer.log_variance.sum()
     loss.backward(retain_graph=True)
     untaught = {n for n, p in network.named_parameters() if p.grad is None}
     assert untaught == {n for n, _ in network.named_parameters() if "_encoder" in n}
-    data = batch()
-    classes = crop(data.grid_class, data.grid_step_deg, GRID)
-    semantics_loss(answer, classes, *of_points(data, inputs, classes)).backward()
+    semantics_loss(answer, *of_points(inputs)).backward()
     assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in network.parameters())
 
 
@@ -121,7 +106,7 @@ def test_evidence_at_the_reference_teaches_both_encoders():
     optimiser, costs = torch.optim.Adam(network.parameters(), 1e-2), []
     for _ in range(8):
         optimiser.zero_grad()
-        e, generator = network(inputs).evidence, torch.Generator().manual_seed(0)
+        e, generator = asked(network, inputs).evidence, torch.Generator().manual_seed(0)
         points = transform_points(inputs.T_camera_lidar, e.points_m)
         costs.append(class_evidence_cost(projection, points, e.maps, e.probability, e.worth, generator))
         costs[-1].backward()
@@ -133,14 +118,11 @@ def test_evidence_at_the_reference_teaches_both_encoders():
 
 @pytest.mark.parametrize("pairs", ["camera_lidar", "camera_radar"])
 def test_a_dozen_steps_on_two_frames_teach_classes(pairs):
-    network, data = small(pairs=pairs), batch()
-    inputs = inputs_of(data)
-    classes = crop(data.grid_class, data.grid_step_deg, GRID)
+    network, inputs, losses = small(pairs=pairs), inputs_of(batch()), []
     optimiser = torch.optim.Adam(network.parameters(), 1e-2)
-    losses = []
     for _ in range(12):
         optimiser.zero_grad()
-        loss = semantics_loss(network(inputs), classes, *of_points(data, inputs, classes))
+        loss = semantics_loss(network.encode(inputs), *of_points(inputs))
         loss.backward()
         optimiser.step()
         losses.append(float(loss.detach()))
@@ -167,7 +149,7 @@ def test_exposure_and_contrast_do_not_matter(architecture):
     darker = torch.cat([(camera[:, :3] * 0.5 + 0.1) * seen, seen], 1)
     other = replace(inputs, sensors=replace(inputs.sensors, camera=darker))
     with torch.no_grad():
-        first, second = network(inputs), network(other)
+        first, second = asked(network, inputs), asked(network, other)
     assert torch.allclose(first.T_camera_lidar, second.T_camera_lidar, atol=2e-4)
 
 

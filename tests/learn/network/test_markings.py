@@ -9,7 +9,7 @@ import torch
 from pipeline.learn.network.matching_network import MatchingCore, log_markings
 from pipeline.learn.network.outputs import pose_of_twist
 from pipeline.learn.sample.grid import Grid, grid_rays
-from pipeline.learn.sample.layout import LIDAR_CHANNELS, LIDAR_FEATURES, MARKED_POINTS
+from pipeline.learn.sample.layout import LIDAR_CHANNELS, LIDAR_FEATURES, MARKED_POINTS, NetworkConfig
 from pipeline.learn.sample.rendering import mark_strength
 from pipeline.rig.se3 import exp_so3
 
@@ -54,7 +54,7 @@ def photograph(exposure=1.0):
 
 
 def turn_left_over(camera, likelihood, strength, points, turn):
-    core = MatchingCore(GRID, ("camera_lidar",), 8, 32, marks=True)
+    core = MatchingCore(NetworkConfig("matching", "camera_lidar", GRID, 8, 32, marks=True))
     weight, cell = torch.topk(torch.from_numpy(strength).flatten()[None], MARKED_POINTS, dim=1)
     R = turn
     with torch.no_grad():

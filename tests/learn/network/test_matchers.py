@@ -16,7 +16,7 @@ from pipeline.learn.network.matching_network import MatchingCore
 from pipeline.learn.network.occupancy_matcher import OccupancyMatcher, _away, _kernel
 from pipeline.learn.network.outputs import pose_of_twist
 from pipeline.learn.sample.grid import Grid, grid_rays
-from pipeline.learn.sample.layout import CAMERA_CHANNELS, CLASS_CHANNELS
+from pipeline.learn.sample.layout import NetworkConfig
 from pipeline.rig.se3 import exp_se3, exp_so3
 from pipeline.rig.spherical import camera_direction_angles, to_spherical
 
@@ -103,10 +103,8 @@ def test_a_narrow_image_does_not_push_points_out_of_itself():
     seen = torch.zeros(1, 1, GRID.height, GRID.width)
     seen[..., 20:50, 60:140] = 1
     doubtful = torch.log(torch.exp(likelihood) * 0.5 + 0.05)
-    core, view = (
-        MatchingCore(GRID, ("camera_lidar",), 8, 32),
-        torch.cat([torch.zeros(1, 3, *seen.shape[2:]), seen], 1),
-    )
+    core = MatchingCore(NetworkConfig(pairs="camera_lidar", grid=GRID, width=8, hidden=32))
+    view = torch.cat([torch.zeros(1, 3, *seen.shape[2:]), seen], 1)
     turned = points @ torch.tensor(exp_so3(np.radians([1.5, -2.0, 0.5])), dtype=torch.float32).T
     with torch.no_grad():
         known = core.camera_log_likelihood(view, doubtful)
@@ -139,7 +137,7 @@ def test_edges_find_the_boundaries_of_what_nobody_knows_the_class_of():
     rays = np.stack([-np.cos(e) * np.sin(a), -np.sin(e), np.cos(e) * np.cos(a)], -1)
     turn = exp_so3(np.radians([0.0, 2.5, 0.0]))
     points = torch.tensor(20 * rays @ turn.T, dtype=torch.float32)[None]
-    core = MatchingCore(GRID, ("camera_lidar",), 8, 32, CAMERA_CHANNELS + CLASS_CHANNELS)
+    core = MatchingCore(NetworkConfig("matching", "camera_lidar", GRID, 8, 32, takes_classes=True))
     nothing = torch.zeros(1, 400, 10)
     left = {}
     for edges in (0.0, 1.0):

@@ -14,7 +14,7 @@ import torch
 from jobs.cli import main
 from pipeline.core.errors import ConfigError, ContractError
 from pipeline.core.rows import take_rows
-from pipeline.learn.perception_training import TASKS, lidar_semantics, radar_drivable
+from pipeline.learn.perception_training import TASKS
 from pipeline.learn.perception_training.lidar_labels import (
     LABELS,
     UNLABELLED,
@@ -137,7 +137,7 @@ def roads(count, seed):
 class Case:
     """A task, its samples, few steps of it, and enough to learn."""
 
-    task: Task[Any]
+    task: type[Task[Any]]
     samples: Samples[Any]
     quick: TrainingConfig
     enough: TrainingConfig
@@ -148,7 +148,7 @@ def sweeps():
     torch.set_num_threads(1)
     samples = cut(Samples(images_of(1, 24), images_of(2, 8), {}))
     quick = SweepTraining(steps=6, batch_size=2, width=4, log_every=1)
-    return Case(lidar_semantics.TASK, samples, quick, SweepTraining(steps=120, width=8))
+    return Case(TASKS["lidar_semantics"], samples, quick, SweepTraining(steps=120, width=8))
 
 
 @pytest.fixture(scope="module")
@@ -156,7 +156,7 @@ def scans():
     torch.set_num_threads(1)
     samples = Samples(day_samples(roads(48, 1), PRIOR, 99), day_samples(roads(16, 2), PRIOR, 99), {})
     quick = DrivableTraining(steps=6, batch_size=2, width=4, log_every=1)
-    return Case(radar_drivable.TASK, samples, quick, DrivableTraining(steps=160, batch_size=4, width=12))
+    return Case(TASKS["radar_drivable"], samples, quick, DrivableTraining(steps=160, batch_size=4, width=12))
 
 
 @pytest.fixture(params=TASKS)
@@ -346,7 +346,7 @@ def test_an_option_of_the_other_task_is_refused_by_name(tmp_path, capsys):
     perception = ["--task", "radar_drivable", "--fleet", str(fleet)]
     for options, named in (
         ([*perception, "--rows", "24"], "rows"),
-        ([*perception, "--compiled"], "compiled"),
+        ([*perception, "--device", "cpu"], "device"),
         (perception[:2], "fleet"),
         (perception[2:], "fleet"),
         (["--columns", "24"], "columns"),

@@ -58,39 +58,39 @@ def test_distances_and_boundaries_are_angles_from_the_centre_of_the_cell(step_de
     labels = labels_by_angle(
         lambda a, e: np.where((a < 5.03) & (a > -3.17) & (e < 1.0), CAR, np.where(e > 2.5, SKY, ROAD))
     )
-    found = camera_features(labels, FTHETA, grid)
+    _, edge_offset = camera_features(labels, FTHETA, grid)
     azimuth, elevation = angles(grid)
     level = np.abs(elevation + 2) < 1  # near the horizon the grid's angles are the world's
 
     # Offsets are positive to the right, azimuth to the left. The car is the foreground: it lies right of its left end.
     for side, end in ((EDGE_RIGHT, 5.03), (EDGE_LEFT, -3.17)):
-        offset = found.edge_offset[side]
+        offset = edge_offset[side]
         near = level & (np.abs(azimuth - end) < 6)
         assert np.abs(offset[near] * 0.05 - (azimuth - end)[near]).max() < 0.11
         assert abs(np.mean(offset[near] * 0.05 - (azimuth - end)[near])) < 0.05
         assert (offset[level & (np.abs(azimuth - end) > 6.6)] == NO_EDGE).all()
 
     middle = (np.abs(azimuth) < 1) & (np.abs(elevation - 1.0) < 0.7)  # above lies the sky's border
-    below = found.edge_offset[EDGE_BELOW] * 0.05
+    below = edge_offset[EDGE_BELOW] * 0.05
     assert np.abs(below - (elevation - 1.0))[middle].max() < 0.11
     # Pixels make stairs of a side.
     upright = level & (np.abs(azimuth - 5.03) > 0.3) & (np.abs(azimuth + 3.17) > 0.3)
-    assert (found.edge_offset[EDGE_ABOVE][upright] == NO_EDGE).all()
+    assert (edge_offset[EDGE_ABOVE][upright] == NO_EDGE).all()
 
 
 def test_cells_have_the_class_of_most_of_them_and_none_outside_the_image():
     grid = stored_grid((128, 304), 0.4)  # wider than the camera
     labels = labels_by_angle(lambda _, e: np.where(e > 1.1, BUILDING, ROAD))
-    found = camera_features(labels, FTHETA, grid)
+    grid_class, _ = camera_features(labels, FTHETA, grid)
     azimuth, elevation = angles(grid)
     inside = resample_camera(np.zeros((*labels.shape, 3), np.uint8), FTHETA, grid)[1] == 1
     expected = np.where(elevation > 1.1, GRID_CLASSES.index("building"), GRID_CLASSES.index("road"))
     clear = inside & (np.abs(elevation - 1.1) > 0.2)
-    assert (found.grid_class == expected)[clear].all()
+    assert (grid_class == expected)[clear].all()
     horizon = np.abs(elevation) < 1  # elsewhere an f-theta image has other borders than an azimuth
     assert not inside[horizon & (np.abs(azimuth) > 48.2)].any()
     assert inside[horizon & (np.abs(azimuth) < 47.5)].all()
-    assert (found.grid_class[horizon & (np.abs(azimuth) > 48.4)] == 255).all()
+    assert (grid_class[horizon & (np.abs(azimuth) > 48.4)] == 255).all()
 
 
 def scene(seed=0, **changes):

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.learn.sample.grid import Grid, grid_rays, resample_camera
-from pipeline.learn.sample.layout import NEARNESS_M
-from pipeline.learn.sample.rendering import nearest_points, render_radar
+from pipeline.learn.sample.rendering import NEARNESS_M, nearest_points, render_radar
 from pipeline.rig.cameras import Camera
 from pipeline.rig.spherical import camera_direction_angles
 
@@ -18,9 +17,8 @@ CAMERAS = {
 }
 
 
-def cells(points, valid=None):
-    points = np.asarray(points, np.float32)
-    return nearest_points(points, np.ones(len(points), bool) if valid is None else np.array(valid), GRID)
+def cells(points):
+    return nearest_points(np.asarray(points, np.float32), GRID)
 
 
 def test_cells_look_where_their_row_and_column_say():

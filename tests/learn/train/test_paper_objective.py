@@ -1,15 +1,12 @@
 """Training on the paper's loss: the numbers of `joint-optimisation` on the same frames, and the paper's inputs."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 
 from pipeline.calibrate.paper.pairwise import joint_costs, pair_problem
 from pipeline.core.errors import ConfigError
-from pipeline.learn.batches.batch import collate
-from pipeline.learn.sample.frame_sample import About, Reference, make_row
+from pipeline.learn.batches.loader import load_split
 from pipeline.learn.train.loop import read_metrics
 from pipeline.learn.train.paper_objective import PaperFrames
 from pipeline.learn.train.run import TrainRequest, network_of_run, train
@@ -17,13 +14,13 @@ from pipeline.learn.train.settings import PAIRS_OF, load_train_config
 from pipeline.objective.paper.loop import loop_loss, loop_transform
 from pipeline.rig.changes import changed
 from pipeline.rig.day_prior import read_prior
-from pipeline.store.partitions import Partition
-from pipeline.store.tables import write_partition
-from pipeline.store.views import frames_of
+from pipeline.store.partitions import Lake, Partition
+from pipeline.store.views import observations_of
 from schemas.calibrations import PAIRS
-from schemas.training import TRAINING
-from tests.makers.simulated_days import simulated_day
+from tests.makers import training_lakes
 
+DAY = Partition("vehicle-1", "2026-03-02")
+FLEET = training_lakes.fleet_of(["vehicle-1"], val_fraction=0, test_fraction=0, grid=training_lakes.WIDE)
 PAPER = """
 architecture = "concat"
 width = 4
@@ -40,31 +37,24 @@ view_deg = 0.0
 
 
 @pytest.fixture(scope="module")
-def day(tmp_path_factory):
-    """Three frames with their rows of table training, all of side train."""
-    day = simulated_day(tmp_path_factory.mktemp("day"), frames=6, environment="mixed")
-    day = replace(day, observations=day.observations[:3])
-    frames = {f.frame_index: f for f in list(frames_of(day.lake, day.partition))}
-    prior = read_prior(day.observations, day.fleet, "vehicle-1")
-    about = About("vehicle-1", day.partition.day, "demo", "train", "here", "urban")
-    of_row = Reference(prior), about, day.fleet.prepare
-    rows = [make_row(frames[o.frame_index], o, *of_row) for o in day.observations]
-    with write_partition(day.lake, TRAINING, Partition("vehicle-1", day.partition.day), "key") as writer:
-        writer.append(rows)
-        writer.describe(kept={}, rejected={})
-    return day, prior, rows
+def lake(tmp_path_factory):
+    """A day of three frames, prepared, all of side train."""
+    lake = Lake.at(tmp_path_factory.mktemp("day"))
+    training_lakes.fill(lake, DAY.vehicle, DAY.day, 3)
+    training_lakes.prepare_all(lake, FLEET)
+    return lake
 
 
-def test_the_loss_that_trains_is_the_objective_of_joint_optimisation_on_the_same_frames(day):
-    made, prior, rows = day
-    batch, rng = collate(rows), np.random.default_rng(0)
+def test_the_loss_that_trains_is_the_objective_of_joint_optimisation_on_the_same_frames(lake):
+    observations, rng = list(observations_of(lake, DAY)), np.random.default_rng(0)
+    prior, batch = read_prior(observations, FLEET, DAY.vehicle), load_split(lake, "train")
     x = rng.uniform(-1, 1, (3, 18)) * np.tile([0.05, 0.05, 0.05, 0.2, 0.2, 0.2], 3)
-    frames = PaperFrames(made.lake)
-    problems = {pair: pair_problem(pair, made.observations, prior, made.fleet.solve) for pair in PAIRS}
+    frames = PaperFrames(lake)
+    problems = {pair: pair_problem(pair, observations, prior, FLEET.solve) for pair in PAIRS}
     letter = joint_costs(problems, prior, dict.fromkeys(PAIRS, 1.0), x)
     for k, moves in enumerate(x):
         T = {pair: changed(prior.of(pair), moves[None, 6 * i : 6 * i + 6]) for i, pair in enumerate(PAIRS)}
-        given = [torch.tensor(np.repeat(T[pair], len(rows), 0), dtype=torch.float32) for pair in PAIRS]
+        given = [torch.tensor(np.repeat(T[pair], len(batch), 0), dtype=torch.float32) for pair in PAIRS]
         terms = frames.terms(batch, *given, PAIRS_OF["joint"])
         mean = {}
         for pair in PAIRS:
@@ -78,13 +68,12 @@ def test_the_loss_that_trains_is_the_objective_of_joint_optimisation_on_the_same
         assert equation_2 == pytest.approx(letter[k], rel=1e-3)
 
 
-def test_a_run_on_the_papers_loss_descends_its_terms_and_learns_nothing_of_derived_channels(day, tmp_path):
-    made, _, _ = day
+def test_a_run_on_the_papers_loss_descends_its_terms_and_learns_nothing_of_derived_channels(lake, tmp_path):
     recipe = tmp_path / "train.toml"
     recipe.write_text(PAPER)
     config = load_train_config(recipe, {})
     out = tmp_path / "run"
-    assert train(TrainRequest(str(made.lake.root), out, "cpu"), config).status == "done"
+    assert train(TrainRequest(str(lake.root), out, "cpu"), config).status == "done"
     reports = [r for r in read_metrics(out) if "term/loop" in r]
     total = sum(reports[-1][f"term/{name}"] for name in (*PAIRS, "loop"))
     assert reports[-1]["alignment"] == pytest.approx(total, rel=1e-4)
@@ -92,13 +81,7 @@ def test_a_run_on_the_papers_loss_descends_its_terms_and_learns_nothing_of_deriv
     lidar = network.core.encoders["lidar"][0].weight.abs().amax(dim=(0, 2, 3))
     assert (lidar > 0).tolist() == [True, True, True, False, False, False]  # occupied, nearness, intensity
     radar = network.core.encoders["radar"][0].weight.abs().amax(dim=(0, 2, 3))
-    assert (radar > 0).tolist() == [
-        True,
-        True,
-        True,
-        True,
-        False,
-    ]  # ..., Doppler, power; not whether it moves
+    assert (radar > 0).tolist() == [True] * 4 + [False]  # ..., Doppler, power; not whether it moves
 
 
 def test_the_papers_loss_is_refused_with_what_is_not_the_papers(tmp_path):

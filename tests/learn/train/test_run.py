@@ -14,11 +14,9 @@ import torch
 
 from jobs.train import parse_duration
 from pipeline.core.errors import ConfigError, ContractError
-from pipeline.learn.export.model_card import card_of_run
+from pipeline.learn.export.onnx_file import card_of_run
 from pipeline.learn.network.calibration_network import build_network
 from pipeline.learn.prepare.inventory import doubts
-from pipeline.learn.sample.frame_sample import About, Reference, make_row
-from pipeline.learn.sample.layout import NetworkConfig
 from pipeline.learn.train.loop import (
     DivergedError,
     DivergenceGuard,
@@ -26,17 +24,18 @@ from pipeline.learn.train.loop import (
     read_metrics,
     save_checkpoint,
 )
-from pipeline.learn.train.run import TrainRequest, network_of_run, train
+from pipeline.learn.train.run import TrainRequest, network_of_run
+from pipeline.learn.train.run import train as run
 from pipeline.learn.train.settings import TrainConfig, load_train_config
-from pipeline.rig.day_prior import read_prior
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_rows, write_partition
-from pipeline.store.views import frames_of
 from schemas.training import TRAINING, TrainingRow
 from tests.makers.processes import started
-from tests.makers.simulated_days import simulated_day
+from tests.makers.training_lakes import WIDE, sample_of
 
-SMALL = {"width": 4, "hidden": 16, "batch_size": 2, "validate_every": 10, "validation_frames": 4}
+# What a run does is the same for `concat`, whose step costs a fifth of one of `matching`.
+SMALL = {"architecture": "concat", "width": 4, "hidden": 16, "batch_size": 2, "validate_every": 10}
+DAY = Partition("vehicle-1", "2026-03-02")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -48,25 +47,36 @@ def one_thread():
     torch.set_num_threads(before)
 
 
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    """Table training of four frames to train on, in two row groups, and two held out."""
-    folder = tmp_path_factory.mktemp("data")
-    day = simulated_day(folder, frames=6, environment="mixed")  # the same as of other tests: made once
-    frames = {f.frame_index: f for f in list(frames_of(day.lake, day.partition))}
-    seen, config = Reference(read_prior(day.observations, day.fleet, "vehicle-1"), "joint"), day.fleet.prepare
-    about = About("vehicle-1", day.partition.day, "demo", "train", "here", "urban")
-    rows = [make_row(frames[o.frame_index], o, seen, about, config) for o in day.observations]
-    rows = [replace(row, split="train" if i < len(rows) - 2 else "val") for i, row in enumerate(rows)]
-    with write_partition(day.lake, TRAINING, Partition("vehicle-1", day.partition.day), "key") as writer:
+def write_rows(lake, rows):
+    """Table training, in row groups of two."""
+    with write_partition(lake, TRAINING, DAY, "key") as writer:
         for first in range(0, len(rows), 2):
             writer.append(rows[first : first + 2])
         writer.describe(kept={}, rejected={})
-    return str(folder / "lake")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """Four frames to train on, and two held out."""
+    lake = tmp_path_factory.mktemp("data")
+    rows = [replace(sample_of(seed, grid=WIDE), reference="joint") for seed in range(6)]
+    write_rows(Lake.at(lake), [replace(row, split="train" if i < 4 else "val") for i, row in enumerate(rows)])
+    return str(lake)
+
+
+def train(data, out, progress=lambda *_: None, start=None, **changes):
+    """A run on this data; returns its result."""
+    return run(TrainRequest(data, out, "cpu", start=start), config(**changes), progress)
 
 
 def config(**changes):
     return TrainConfig.model_validate(SMALL | {"steps": 20, "log_every": 5} | changes)
+
+
+def toml(folder, **changes):
+    lines = (f"{key} = {json.dumps(value)}" for key, value in (SMALL | changes).items())
+    (folder / "train.toml").write_text("\n".join(lines))
+    return str(folder / "train.toml")
 
 
 def reports(folder):
@@ -84,70 +94,77 @@ def stop_at(step):
     return report
 
 
-@pytest.mark.slow
 def test_a_run_that_was_stopped_goes_on_to_the_same_bits(data, tmp_path):
-    whole = train(TrainRequest(data, tmp_path / "whole", "cpu"), config())
-    assert (whole.status, whole.step) == ("done", 20)
-    half = train(TrainRequest(data, tmp_path / "parts", "cpu"), config(), stop_at(10))
-    assert (half.status, half.step, half.signal) == ("stopped", 10, signal.SIGTERM)
-    rest = train(TrainRequest(data, tmp_path / "parts", "cpu"), config())
-    assert (rest.status, rest.step) == ("done", 20)
+    settings = {"architecture": "matching", "steps": 6, "log_every": 1, "validate_every": 3}
+    whole = train(data, tmp_path / "whole", **settings)
+    assert (whole.status, whole.step) == ("done", 6)
+    half = train(data, tmp_path / "parts", stop_at(3), **settings)
+    assert (half.status, half.step, half.signal) == ("stopped", 3, signal.SIGTERM)
+    rest = train(data, tmp_path / "parts", **settings)
+    assert (rest.status, rest.step) == ("done", 6)
     assert reports(tmp_path / "parts") == reports(tmp_path / "whole")
     a, b = (load_checkpoint(tmp_path / name / "last.pt") for name in ("whole", "parts"))
     for name, weight in a["network"].items():
         assert torch.equal(weight, b["network"][name]), name
     for key, values in a["optimiser"]["state"].items():
         assert all(torch.equal(v, b["optimiser"]["state"][key][n]) for n, v in values.items())
-    assert a["processes"][0]["stream"] == b["processes"][0]["stream"]
+    assert (a["processes"], a["guard"], a["best"]) == (b["processes"], b["guard"], b["best"])
 
 
 def test_a_finished_run_reports_falls_validates_and_gives_its_network(data, tmp_path):
-    out = tmp_path / "run"
-    train(TrainRequest(data, out, "cpu"), config(steps=30, learning_rate=1e-2))
-    lines = reports(out)
-    trained = [r for r in lines if "loss" in r]
-    assert [r["step"] for r in trained] == [5, 10, 15, 20, 25, 30]
+    """Encoders learn at every step, matchers at every third."""
+    settings = {
+        "architecture": "matching", "matched_every": 3, "steps": 30, "log_every": 1, "validate_every": 15,
+        "learning_rate": 1e-2,
+    }  # fmt: skip
+    train(data, tmp_path, **settings)
+    trained = [r for r in reports(tmp_path) if "loss" in r]
+    assert [r["step"] for r in trained] == list(range(1, 31))
+    assert ["alignment" in r for r in trained] == [False, False, True] * 10
     assert all(math.isfinite(v) for r in trained for v in r.values())
     assert trained[-1]["semantics"] < 0.9 * trained[0]["semantics"]  # the encoders learn what is easy
     assert trained[-1]["learning_rate"] < 0.02 * 1e-2  # the cosine has come down
-    assert [r["step"] for r in lines if "validation/judged" in r] == [0, 10, 20, 30]
-    assert (out / "best.pt").exists()
-    assert any((out / "events").iterdir())
-    network = network_of_run(out)
-    assert network.config.width == SMALL["width"]
+    assert [r["step"] for r in reports(tmp_path) if "validation/judged" in r] == [0, 15, 30]
+    assert (tmp_path / "best.pt").exists()
+    assert any((tmp_path / "events").iterdir())
+    network, start = network_of_run(tmp_path, best=False), build_network(config(**settings).network)
     assert not network.training
-    again = train(TrainRequest(data, out, "cpu"), config(steps=30, learning_rate=1e-2))
+    for part in ("camera_encoder", "lidar_encoder", "lidar_matcher", "radar_matcher", "heads"):
+        ours, theirs = getattr(network.core, part).state_dict(), getattr(start.core, part).state_dict()
+        assert any(not torch.equal(ours[name], theirs[name]) for name in ours), part
+    again = train(data, tmp_path, **settings)
     assert (again.status, again.samples) == ("done", 0)
+    with pytest.raises(ConfigError, match="seed"):
+        train(data, tmp_path, **settings, seed=5)
 
 
 def test_a_checkpoint_that_is_worse_than_the_start_is_not_kept(data, tmp_path):
-    settings = config(steps=10, learning_rate=0.3, gradient_norm=1e6, diverged_factor=1e6)
-    train(TrainRequest(data, tmp_path, "cpu"), settings)
+    settings = {"steps": 10, "learning_rate": 0.3, "gradient_norm": 1e6, "diverged_factor": 1e6}
+    train(data, tmp_path, **settings)
     before, after = (r["validation/judged"] for r in reports(tmp_path) if "validation/judged" in r)
     assert after > before
-    kept, start = network_of_run(tmp_path), build_network(NetworkConfig(width=4, hidden=16), settings.seed)
+    kept, start = network_of_run(tmp_path), build_network(config(**settings).network)
     assert all(torch.equal(a, b) for a, b in zip(kept.parameters(), start.parameters(), strict=True))
     assert "no weights that are better" in card_of_run(tmp_path)["limits"][0]
 
 
 def test_days_without_a_record_of_joint_teach_no_classes_and_are_named_before(data, tmp_path):
-    lake, day = Lake.at(tmp_path / "lake"), Partition("vehicle-1", "2026-03-02")
-    [known] = Lake.at(data).partitions(TRAINING.name)
-    rows = read_rows(Lake.at(data), TRAINING, known, TrainingRow)
-    with write_partition(lake, TRAINING, day, "key") as writer:
-        writer.append([replace(row, reference="prior", drive=0) for row in rows])
-        writer.describe(kept={}, rejected={})
+    lake = Lake.at(tmp_path / "lake")
+    rows = read_rows(Lake.at(data), TRAINING, DAY, TrainingRow)
+    write_rows(lake, [replace(row, reference="prior") for row in rows])
     with pytest.raises(ContractError, match="`boresight calibrate`"):
-        train(TrainRequest(str(tmp_path / "lake"), tmp_path / "run", "cpu"), config(steps=1))
+        train(str(tmp_path / "lake"), tmp_path / "run", architecture="matching", steps=1)
     assert "vehicle-1 2026-03-02" in doubts(lake, referenced=True)[0]
     assert "one drive" in doubts(lake, referenced=False)[0]
-    assert doubts(Lake.at(data), referenced=True) == []
+    write_rows(lake, [replace(row, drive=i) for i, row in enumerate(rows)])
+    assert doubts(lake, referenced=True) == []
 
 
 def test_a_budget_of_time_brings_the_rate_down_whatever_the_speed(data, tmp_path):
     told = []
-    settings = config(steps=None, budget_minutes=0.05, log_every=1)
-    result = train(TrainRequest(data, tmp_path, "cpu"), settings, lambda *done: told.append(done))
+    result = train(
+        data, tmp_path, lambda *done: told.append(done), steps=None, budget_minutes=0.02, log_every=1
+    )
     assert result.status == "done"
     assert told[-1][1] <= 2 * result.step  # what is told as the whole run is what fits into the budget
     rates = [r["learning_rate"] for r in reports(tmp_path) if "loss" in r]
@@ -157,11 +174,8 @@ def test_a_budget_of_time_brings_the_rate_down_whatever_the_speed(data, tmp_path
 
 @pytest.mark.slow
 def test_sigterm_ends_the_command_with_143_and_a_whole_checkpoint(data, tmp_path):
-    (tmp_path / "train.toml").write_text(
-        "\n".join(f"{k} = {v}" for k, v in (SMALL | {"log_every": 1}).items())
-    )
     command = [sys.executable, "-m", "jobs.cli", "train", "--data", data, "--out", str(tmp_path / "run")]
-    command += ["--config", str(tmp_path / "train.toml"), "--device", "cpu", "--steps", "100000"]
+    command += ["--config", toml(tmp_path, log_every=1), "--device", "cpu", "--steps", "100000"]
     with started(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         deadline = time.monotonic() + 120
         while not read_metrics(tmp_path / "run") and time.monotonic() < deadline and process.poll() is None:
@@ -176,9 +190,9 @@ def test_sigterm_ends_the_command_with_143_and_a_whole_checkpoint(data, tmp_path
 
 
 def test_a_diverging_run_stops_with_its_reason_and_keeps_the_last_good_checkpoint(data, tmp_path):
-    settings = config(learning_rate=1e6, steps=200, gradient_norm=1e9, checkpoint_minutes=1e-6)
+    settings = {"learning_rate": 1e6, "steps": 200, "gradient_norm": 1e9, "checkpoint_minutes": 1e-6}
     with pytest.raises(DivergedError, match="diverged at step") as caught:
-        train(TrainRequest(data, tmp_path, "cpu"), settings)
+        train(data, tmp_path, **settings)
     assert caught.value.exit_code == 1
     state = load_checkpoint(tmp_path / "last.pt")
     assert state["step"] <= caught.value.step
@@ -200,10 +214,9 @@ def test_the_guard_knows_no_number_and_growth_but_not_noise():
 
 @pytest.mark.slow
 def test_two_processes_train_one_network(data, tmp_path):
-    (tmp_path / "train.toml").write_text("\n".join(f"{k} = {v}" for k, v in SMALL.items()))
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     command += ["-m", "jobs.cli", "train", "--data", data, "--out", str(tmp_path / "run"), "--steps", "3"]
-    command += ["--config", str(tmp_path / "train.toml"), "--device", "cpu"]
+    command += ["--config", toml(tmp_path), "--device", "cpu"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
     state = load_checkpoint(tmp_path / "run" / "last.pt")
@@ -214,13 +227,7 @@ def test_two_processes_train_one_network(data, tmp_path):
         len(reports(tmp_path / "run")) == 3
     )  # one of them writes: the last step's report, and two validations
     with pytest.raises(ConfigError, match="begun by 2"):
-        train(TrainRequest(data, tmp_path / "run", "cpu"), TrainConfig.model_validate(SMALL | {"steps": 3}))
-
-
-def test_a_folder_takes_one_configuration(data, tmp_path):
-    train(TrainRequest(data, tmp_path, "cpu"), config(steps=1))
-    with pytest.raises(ConfigError, match="seed"):
-        train(TrainRequest(data, tmp_path, "cpu"), config(steps=1, seed=5))
+        run(TrainRequest(data, tmp_path / "run", "cpu"), TrainConfig.model_validate(SMALL | {"steps": 3}))
 
 
 def test_what_cannot_be_right_is_named(tmp_path):
@@ -238,7 +245,7 @@ def test_what_cannot_be_right_is_named(tmp_path):
             load_train_config(path, {})
     assert load_train_config(None, {"seed": 3, "steps": None}).seed == 3
     with pytest.raises(ContractError, match="prepare"):
-        train(TrainRequest(str(tmp_path), tmp_path / "run", "cpu"), config())
+        train(str(tmp_path), tmp_path / "run")
     for text in ("", "m", "-3m", "2x", "0", "inf"):
         with pytest.raises(ConfigError):
             parse_duration(text, "time-limit")
@@ -255,40 +262,26 @@ def test_checkpoints_are_whole_or_not_there(tmp_path):
         load_checkpoint(path)
 
 
-def test_encoders_may_learn_at_every_step_and_matchers_at_every_third(data, tmp_path):
-    settings = config(matched_every=3, steps=9, log_every=1)
-    train(TrainRequest(data, tmp_path), settings)
-    lines = [r for r in reports(tmp_path) if "loss" in r]
-    assert ["alignment" in r for r in lines] == [False, False, True] * 3
-    assert all("semantics" in r for r in lines)
-    start = build_network(NetworkConfig(width=4, hidden=16), settings.seed)
-    trained = network_of_run(tmp_path, best=False)
-    for part in ("camera_encoder", "lidar_encoder", "lidar_matcher", "radar_matcher", "heads"):
-        ours, theirs = getattr(trained.core, part).state_dict(), getattr(start.core, part).state_dict()
-        assert any(not torch.equal(ours[name], theirs[name]) for name in ours), part
-
-
 def test_a_run_may_start_from_anothers_weights_and_then_goes_on_with_its_own(data, tmp_path):
-    train(TrainRequest(data, tmp_path / "old", "cpu"), config(steps=3))
+    one = {"architecture": "matching", "steps": 1}
+    train(data, tmp_path / "old", **one)
     # So small a rate moves nothing that counts: what was handed over is what is there.
-    still = config(steps=2, learning_rate=1e-9, final_learning_rate=1e-9, seed=5)
-    request = TrainRequest(data, tmp_path / "new", "cpu", start=tmp_path / "old")
-    assert train(request, still).status == "done"
+    still = one | {"learning_rate": 1e-9, "final_learning_rate": 1e-9, "seed": 5}
+    assert train(data, tmp_path / "new", start=tmp_path / "old", **still).status == "done"
     old, new = network_of_run(tmp_path / "old"), network_of_run(tmp_path / "new", best=False)
     for a, b in zip(old.parameters(), new.parameters(), strict=True):
         assert torch.allclose(a, b, atol=1e-7)
     # What lies in the folder wins: the run is finished, whatever it might start from.
-    assert train(TrainRequest(data, tmp_path / "new", "cpu", start=tmp_path / "gone"), still).step == 2
+    assert train(data, tmp_path / "new", start=tmp_path / "gone", **still).samples == 0
     with pytest.raises(ContractError, match="neither"):
-        train(TrainRequest(data, tmp_path / "x", "cpu", start=tmp_path / "gone"), still)
+        train(data, tmp_path / "x", start=tmp_path / "gone", **still)
     with pytest.raises(ConfigError, match=r"width.*another kind: set width = 4"):
-        train(TrainRequest(data, tmp_path / "y", "cpu", start=tmp_path / "old"), config(steps=1, width=8))
+        train(data, tmp_path / "y", start=tmp_path / "old", **one, width=8)
     # What the old network never saw counts nothing at first.
-    wider = still.model_copy(update={"takes_classes": True})
-    train(TrainRequest(data, tmp_path / "z", "cpu", start=tmp_path / "old"), wider)
+    train(data, tmp_path / "z", start=tmp_path / "old", **still, takes_classes=True)
     first = network_of_run(tmp_path / "z", best=False).core.camera_encoder.down[0][0].weight
     assert torch.allclose(first[:, :4], old.core.camera_encoder.down[0][0].weight, atol=1e-7)
     assert first[:, 4:].abs().max() < 1e-7
     # Classes cannot be taken away again.
     with pytest.raises(ConfigError, match=r"takes_classes.*another kind: set takes_classes = true"):
-        train(TrainRequest(data, tmp_path / "v", "cpu", start=tmp_path / "z"), config(steps=1))
+        train(data, tmp_path / "v", start=tmp_path / "z", **one)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import torch
 
-from pipeline.learn.network.inputs import SensorInputs, given_classes
+from pipeline.learn.network.views import SensorInputs, given_classes
 from pipeline.learn.train.domain_randomisation import made_strange
 from pipeline.learn.train.settings import StrangeConfig
 

@@ -9,8 +9,8 @@ import torch
 
 from pipeline.core.config import FleetConfig
 from pipeline.learn.perception_training.radar_drivable import (
-    TASK,
     DrivableTraining,
+    RadarDrivable,
     day_samples,
     probabilities,
 )
@@ -55,8 +55,8 @@ def test_a_network_taught_by_a_days_lidar_tells_the_days_radar_where_the_road_is
     before = rows(lake)
     samples = day_samples(before, np.eye(4), 8)
     training = DrivableTraining(steps=30, batch_size=4, width=8)
-    network, _ = train_network(TASK, Samples(samples, samples, {}), tmp_path / "run", training)
-    export_model(TASK, network, samples, tmp_path, {})
+    network, _ = train_network(RadarDrivable, Samples(samples, samples, {}), tmp_path / "run", training)
+    export_model(RadarDrivable, network, samples, tmp_path, {})
     result = perceive_day(DAY, fleet(file, **MODEL), lake)
     assert result.status == "done"  # not taken from the cache of the geometric one
     assert result.work_key != geometric_key

@@ -1,27 +1,34 @@
-"""Frames of an export by vehicle-day and split, stored with the export so that later runs agree."""
+"""Vehicle-days of an export: the split of their frames, then one at a time, with a marker that it is complete."""
 
 from __future__ import annotations
 
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
 from typing import Any
 
 from pipeline.core.config import PrepareConfig
 from pipeline.core.errors import ConfigError
 from pipeline.core.results import Progress
-from pipeline.learn.frames.frame import Place, to_json
-from pipeline.learn.frames.output import Output
+from pipeline.learn.frames.frame import Mounting, Perturbation, Place, read_frames, to_json
+from pipeline.learn.frames.nuscenes import NuScenesWriter
+from pipeline.learn.frames.output import DayOutput, Output
+from pipeline.learn.frames.shards import ShardWriter
 from pipeline.learn.prepare.sides import decided_sides, frame_sides, settled_keys, split_settings
 from pipeline.learn.prepare.survey import plan_days, survey_day
-from pipeline.store.partitions import Lake, Partition
+from pipeline.store.partitions import Lake, Partition, work_key
+from pipeline.store.tables import read_manifest
+from schemas.moments import MOMENTS, PERCEIVED
 from schemas.training import SPLITS
+from schemas.versions import CODE_VERSION
 
-__all__ = ["Planned", "plan_frames"]
+__all__ = ["DayTask", "export_day", "plan_frames"]
 
 _FILE = "plan.json"
 _KEYS = {"split_by": "[prepare.split] by", "seed": "[prepare] seed"}  # in fleet.toml, of `split_settings`
-Planned = dict[Partition, tuple[list[Place], Counter[str]]]  # wanted frames, and those left out by reason
+_Planned = dict[Partition, tuple[list[Place], Counter[str]]]  # wanted frames, and those left out by reason
 
 
 def plan_frames(
@@ -31,7 +38,7 @@ def plan_frames(
     output: Output,
     settings: Mapping[str, Any],
     progress: Progress,
-) -> tuple[Planned, dict[str, Any]]:
+) -> tuple[_Planned, dict[str, Any]]:
     """Divide the frames of all days by `[prepare]`; splits of earlier runs and of table `training` stay.
 
     Returns the frames, and the settings of the export with those of its splits.
@@ -46,14 +53,13 @@ def plan_frames(
     for done, day in enumerate(days):
         progress(done, len(days), f"{day.vehicle} {day.day}")
         surveys.append(survey_day(day, lake, config))
-    decided = {}
     if before is not None:
         decided = {(kind, value): side for kind, value, side in before["sides"]}
     else:
         config = config.split_with(by=settled_keys(surveys, config, lake))
         decided = decided_sides(lake, config)
     plan = plan_days(surveys, config, decided)
-    planned: Planned = {}
+    planned: _Planned = {}
     for survey in surveys:
         sides, lost = frame_sides(survey, plan, config)
         wanted = [k for k, side in enumerate(sides) if side is not None]
@@ -88,7 +94,7 @@ def _with_split(settings: Mapping[str, Any], config: PrepareConfig) -> dict[str,
     return whole
 
 
-def _require_splits(config: PrepareConfig, planned: Planned) -> None:
+def _require_splits(config: PrepareConfig, planned: _Planned) -> None:
     """Raise ConfigError if a requested split has no frame."""
     counts = Counter(place.split for places, _ in planned.values() for place in places)
     shares = dict(zip(SPLITS, (1.0, config.split.val_fraction, config.split.test_fraction), strict=True))
@@ -99,3 +105,70 @@ def _require_splits(config: PrepareConfig, planned: Planned) -> None:
             f'{", ".join(config.split.by)}; set by = "place", or export with --unsplit: all into train'
         )
         raise ConfigError("fleet.toml", "prepare.split.by", problem)
+
+
+_TOO_FEW = "fewer_than_two_sensors"
+
+
+_FORMATS: dict[str, type[ShardWriter | NuScenesWriter]] = {"parquet": ShardWriter, "nuscenes": NuScenesWriter}
+
+
+@dataclass(frozen=True)
+class DayTask:
+    """Input of a worker for one vehicle-day."""
+
+    lake: Lake
+    partition: Partition
+    output: Output
+    format: str
+    places: Sequence[Place]
+    lost: dict[str, int]
+    mounting: Mounting
+    perturbation: Perturbation | None
+
+
+def export_day(task: DayTask, progress: Progress) -> str:
+    """Write a vehicle-day unless it exists from the same data, calibration and plan: 'done' or 'cached'."""
+    output, key = task.output, _key(task)
+    before = output.done(task.partition)
+    if before is not None and before["work_key"] == key:
+        return "cached"
+    with output.writing(task.partition) as own:
+        told = _write(task, own, progress)
+    mounting = task.mounting
+    poses = {
+        n: {"T_reference_sensor": T.tolist()} | dict(mounting.about.get(n, {})) for n, T in mounting.T.items()
+    }
+    calibration = {
+        "source": mounting.source,
+        "reference": mounting.reference,
+        "sensors": poses,
+        "left_out": dict(mounting.left_out),
+    }
+    about = {"work_key": key, "vehicle": task.partition.vehicle, "day": task.partition.day}
+    output.finish(task.partition, about | told | {"calibration": calibration})
+    return "done"
+
+
+def _write(task: DayTask, output: DayOutput, progress: Progress) -> dict[str, dict[str, int]]:
+    """Write the frames; counts by split, of those left out by reason, and of sensors' data."""
+    kept, lost, sensors = Counter[str](), Counter(task.lost), Counter[str]()
+    with ExitStack() as stack:
+        writer = _FORMATS[task.format](output, stack)
+        frames = read_frames(task.lake, task.partition, task.places, task.mounting, task.perturbation)
+        for done, frame in enumerate(frames):
+            progress(done, len(task.places), "frames")
+            if frame is None:
+                lost[_TOO_FEW] += 1
+                continue
+            writer.add(frame)
+            kept[frame.at.split] += 1
+            sensors.update(list(frame.captures))
+        writer.close()
+    return {"frames": dict(kept), "left_out": dict(lost), "sensors": dict(sensors)}
+
+
+def _key(task: DayTask) -> str:
+    inputs = [m.work_key for t in (MOMENTS, PERCEIVED) if (m := read_manifest(task.lake, t, task.partition))]
+    settings = repr((task.format, task.places, task.mounting.digest, task.perturbation))
+    return work_key("frames", CODE_VERSION, settings, inputs)
