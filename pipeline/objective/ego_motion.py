@@ -4,10 +4,10 @@ A radar measures its own velocity: the base's, plus the yaw rate times its lever
 completes the sources: its rear axle does not slip, so one radar ahead of it determines the yaw rate.
 
 Radars have rotation errors in their brackets. Each is corrected by the difference of its own direction of
-travel from that of all radars. This is a constant of the day that averaging over moments does not reduce
-(`heading_sigma_rad`). A source whose speed differs from that of the others in most moments is left out and
-reported. If there are only two, it is unknown which one is wrong, and `calibrate/verify/motion_sources`
-compares both with the lidar's sweeps.
+travel from that of all radars. This is a constant of the day that averaging over moments does not reduce. A
+source whose speed differs from that of the others in most moments is left out and reported. If there are
+only two, it is unknown which one is wrong, and `calibrate/verify/motion_sources` compares both with the
+lidar's sweeps.
 
 Source: Kellner et al. 2014, "Instantaneous ego-motion estimation using multiple Doppler radars".
 """
@@ -86,15 +86,12 @@ class EgoMotion:
         velocity_mps: F 2, velocity of the base's origin: ahead, to the left.
         yaw_rate_radps: F, positive to the left.
         covariance: F 3 3, of both; errors of different moments are independent.
-        heading_sigma_rad: sigma of the direction of all velocities together, due to the mountings that they
-        depend on.
         left_out: sources that contradict the others, with reasons.
     """
 
     velocity_mps: np.ndarray
     yaw_rate_radps: np.ndarray
     covariance: np.ndarray
-    heading_sigma_rad: float = 0.0
     left_out: Mapping[str, str] = field(default_factory=dict)
 
     def at_sensor(self, T_base_sensor: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "F 3"]:
@@ -149,13 +146,13 @@ def ego_motion(
     turn, scatter = np.nan_to_num(odometry.yaw_rate_radps), _scatter(radars, odometry)
     for _ in range(_ROUNDS):  # how radars are mounted shows once turns are known, and the other way round
         mounted = [_direction(r, turn) for r in radars]
-        way, way_sigma = _mean(mounted, [r.yaw_sigma_rad for r in radars]) if heading is None else heading
+        way, _ = _mean(mounted, [r.yaw_sigma_rad for r in radars]) if heading is None else heading
         equations = _of_the_car(odometry, scatter, way)
         u, H = _fused(equations, [_turned(r, way - m) for r, m in zip(radars, mounted, strict=True)])
         turn = np.where(np.isfinite(odometry.yaw_rate_radps), turn, u[:, 2])
     unknown = ~np.isfinite(np.stack(list(speeds.values()))).any(0)
     u[unknown] = np.nan
-    return EgoMotion(u[:, :2], u[:, 2], np.linalg.inv(H), way_sigma, left_out)
+    return EgoMotion(u[:, :2], u[:, 2], np.linalg.inv(H), left_out)
 
 
 def _fused(

@@ -17,22 +17,20 @@ from jaxtyping import Float, Int64
 
 from schemas.observations import Observation
 
-__all__ = ["camera_gaps_s", "constant_gap_s", "motion_gates_ns", "radar_gaps_s", "scan_to_image_s"]
+__all__ = ["constant_gap_s", "gaps_s", "motion_gates_ns", "scan_to_image_s", "turned"]
 
 # What is taken for a car that nobody measured, and for others that drive past one that stands.
 _UNKNOWN_MPS, _UNKNOWN_RADPS, _OTHERS_MPS = 40.0, float(np.radians(30.0)), 10.0
 
 
-def camera_gaps_s(observations: Sequence[Observation]) -> Float[np.ndarray, " F"]:
-    """Image stamp minus sweep stamp of each frame [s]; frames without a camera get the median of the others."""
-    gaps = np.array([(o.camera_stamp_ns - o.stamp_ns) * 1e-9 for o in observations], np.float64)
-    return _filled(gaps, "camera", observations)
+def gaps_s(observations: Sequence[Observation], sensor: str) -> Float[np.ndarray, " F"]:
+    """Stamp of the camera or radar minus the sweep's of each frame [s].
 
-
-def radar_gaps_s(observations: Sequence[Observation]) -> Float[np.ndarray, " F"]:
-    """Scan stamp minus sweep stamp of each frame [s]; frames without a radar get the median of the others."""
-    gaps = np.array([(o.radar_stamp_ns - o.stamp_ns) * 1e-9 for o in observations], np.float64)
-    return _filled(gaps, "radar", observations)
+    Frames without the sensor get the constant gap, so that they have no effect.
+    """
+    stamps = [getattr(o, f"{sensor}_stamp_ns") - o.stamp_ns for o in observations]
+    gaps, there = np.array(stamps, np.float64) * 1e-9, [sensor in o.sensors for o in observations]
+    return gaps if all(there) else np.where(there, gaps, constant_gap_s(gaps[there]))
 
 
 def constant_gap_s(gaps_s: Float[np.ndarray, " F"]) -> float:
@@ -42,7 +40,7 @@ def constant_gap_s(gaps_s: Float[np.ndarray, " F"]) -> float:
 
 def scan_to_image_s(observations: Sequence[Observation]) -> Float[np.ndarray, " F"]:
     """Time from each image to its scan [s], with constant gaps removed as errors of the clocks."""
-    radar, camera = radar_gaps_s(observations), camera_gaps_s(observations)
+    radar, camera = gaps_s(observations, "radar"), gaps_s(observations, "camera")
     return (radar - constant_gap_s(radar)) - (camera - constant_gap_s(camera))
 
 
@@ -61,7 +59,10 @@ def motion_gates_ns(
     return (1e9 * np.minimum(move_m / speed, turn_rad / np.maximum(turn, 1e-6))).astype(np.int64)
 
 
-def _filled(gaps_s: np.ndarray, sensor: str, observations: Sequence[Observation]) -> np.ndarray:
-    """The gaps; frames without the sensor get the constant gap, so that they have no effect."""
-    there = np.array([sensor in o.sensors for o in observations], bool)
-    return gaps_s if there.all() else np.where(there, gaps_s, constant_gap_s(gaps_s[there]))
+def turned(
+    points: Float[np.ndarray, "N 3"], angle_rad: Float[np.ndarray, " N"] | float
+) -> Float[np.ndarray, "N 3"]:
+    """Points turned to the left about the vertical, by one angle or by one each."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    x, y, z = points.T
+    return np.stack([c * x - s * y, s * x + c * y, z], -1)

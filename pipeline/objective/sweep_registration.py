@@ -25,8 +25,7 @@ from scipy.spatial import cKDTree
 from pipeline.rig.se3 import exp_se3, inverse, log_se3, transform_points
 
 __all__ = [
-    "PlaneEquations", "Registration", "Surfaces", "arc_between", "occupied_share", "one_per_cell", "plane_equations",
-    "register",
+    "PlaneEquations", "Surfaces", "arc_between", "occupied_share", "one_per_cell", "plane_equations", "register",
 ]  # fmt: skip
 
 _NEIGHBOURS = 10
@@ -150,34 +149,24 @@ class PlaneEquations:
     share: float  # of the points that lie on a surface
 
 
-@dataclass(frozen=True, eq=False)
-class Registration:
-    """T_target_source, and the equations of the data alone there."""
-
-    T: np.ndarray  # 4 4
-    found: PlaneEquations
-
-
 def register(
     source_m: Float[np.ndarray, "N 3"],
     target: Surfaces,
     start: Float[np.ndarray, "4 4"],
     sigmas: Float[np.ndarray, " 6"],
-    gates_m: tuple[float, ...] = _GATES_M,
-) -> Registration | None:
-    """Find T_target_source.
+) -> tuple[Float[np.ndarray, "4 4"], PlaneEquations] | None:
+    """Find T_target_source, and the equations of the data alone there.
 
     Args:
         sigmas: sigmas of the start, for left perturbations; directions that no surface constrains stay at the
             start.
-        gates_m: points farther than this from all others are not used; one round for each gate.
 
     Returns:
         None if hardly any point meets a surface.
     """
     T, held = start, np.diag(sigmas**-2.0)
     found = None
-    for gate in gates_m:
+    for gate in _GATES_M:
         for _ in range(_STEPS):
             found = plane_equations(transform_points(T, source_m), target, gate)
             if found is None:
@@ -187,7 +176,7 @@ def register(
             T = exp_se3(step) @ T
             if np.abs(step).max() < _CONVERGED:
                 break
-    return None if found is None else Registration(T, found)
+    return None if found is None else (T, found)
 
 
 def plane_equations(

@@ -2,18 +2,17 @@
 
 Along a ring the beams are close together, so a jump is a sharp edge (EDGE_LEFT, EDGE_RIGHT). Between rings
 it is only an interval with the width of the gap (EDGE_ABOVE, EDGE_BELOW with `gap_rad`): 0.25 deg on one
-lidar, 2 deg on another. A sweep without rows (a rosette) has neither; there, each point is compared with its
-neighbours (`scattered_edges`).
+lidar, 2 deg on another.
 
 Source: the foreground range at mid-beam direction is where the silhouette is expected, because the last
 foreground beam lies anywhere between 0 and one beam inside it; jumps as in Levinson, Thrun 2013, "Automatic
 online calibration of cameras and lasers".
 
-Of a sweep without rows, each point is compared with its nearest neighbours to the four sides. A silhouette
-is between two neighbours if the nearer one belongs to a standing object and the farther one does not belong
-to it. A neighbour counts as left if its vertical distance is at most half of its horizontal one. All
-neighbours behind the silhouette determine its side: at a post's left edge, the beam above may miss the post
-too, but this is not an upper edge.
+A sweep without rows (a rosette) has neither: each point is compared with its nearest neighbours to the four
+sides. A silhouette is between two neighbours if the nearer one belongs to a standing object and the farther
+one does not belong to it. A neighbour counts as left if its vertical distance is at most half of its
+horizontal one. All neighbours behind the silhouette determine its side: at a post's left edge, the beam
+above may miss the post too, but this is not an upper edge.
 """
 
 from __future__ import annotations
@@ -100,20 +99,17 @@ def lidar_edges(
     aer = aer[keep]
     rows = rows_of(aer, None if ring is None else ring[keep])
     if rows is None:
-        found = jumps_between_neighbours(aer, cluster[keep], config.edge_jump_m, config.edge_jump_fraction)
+        found = _between_neighbours(aer, cluster[keep], config)
         return _edges(found, keep, cluster, has_rows=False)
     aer, row, keep = aer[rows.order], rows.row[rows.order], keep[rows.order]
-    step_rad = _azimuth_step(aer[:, 0], row)
+    steps = np.diff(aer[:, 0])[np.diff(row) == 0]
+    steps = steps[steps > 1e-5]
+    step_rad = (
+        float(np.median(steps)) if steps.size else np.radians(0.2)
+    )  # missing returns do not widen the median
     along = _along_rings(aer, row, step_rad, config)
     between = _between_rings(aer, row, cluster[keep], step_rad, config)
     return _edges([*along, *between], keep, cluster, has_rows=True)
-
-
-def _azimuth_step(azimuth: np.ndarray, row: np.ndarray) -> float:
-    """Nominal angle between beams of a ring [rad]: the median, which missing returns cannot widen."""
-    steps = np.diff(azimuth)[np.diff(row) == 0]
-    steps = steps[steps > 1e-5]
-    return float(np.median(steps)) if steps.size else np.radians(0.2)
 
 
 def _along_rings(aer: np.ndarray, row: np.ndarray, step_rad: float, config: PerceiveConfig) -> list[Jumps]:
@@ -206,27 +202,22 @@ def _edges(found: list[Jumps], keep: np.ndarray, cluster: np.ndarray, *, has_row
     )
 
 
-def jumps_between_neighbours(
-    aer: Float[np.ndarray, "N 3"],
-    cluster: Int32[np.ndarray, " N"],
-    edge_jump_m: float,
-    edge_jump_fraction: float,
-) -> list[Jumps]:
-    """Jumps in range from clustered points to neighbours that are not of their cluster.
+def _between_neighbours(aer: np.ndarray, cluster: np.ndarray, config: PerceiveConfig) -> list[Jumps]:
+    """Jumps from clustered points to neighbours that are not of their cluster.
 
-    `aer` is azimuth, elevation [rad] and range [m]. Unclustered points make no edges: neighbours differ in
-    elevation, so even the ground has jumps. A jump must exceed `edge_jump_m`, and `edge_jump_fraction` of the
-    nearer range.
+    Unclustered points make no edges: neighbours differ in elevation, so even the ground has jumps.
     """
     if len(aer) <= _NEIGHBOURS:
         return []
     near = _neighbours(aer[:, :2])
     range_m = aer[:, 2]
-    least = np.maximum(edge_jump_m, edge_jump_fraction * range_m)
+    least = np.maximum(config.edge_jump_m, config.edge_jump_fraction * range_m)
     is_behind = (range_m[near.point] - range_m[:, None] > least[:, None]) & (
         cluster[near.point] != cluster[:, None]
     )
-    towards = _towards(near, is_behind)
+    # Sum of the directions to them: towards the background, across the silhouette.
+    distance = np.maximum(np.linalg.norm(near.offset_rad, axis=-1, keepdims=True), 1e-9)
+    towards = np.sum(near.offset_rad / distance * (is_behind & near.reachable)[..., None], axis=1)
     found = []
     for side, axis, sign in _SIDES:
         there, seen = _nearest_to(near, axis, sign)
@@ -241,12 +232,6 @@ def jumps_between_neighbours(
         gap = np.abs(aer[there[here], axis] - aer[here, axis])
         found.append(Jumps(np.column_stack([middle, range_m[here]]), side, jump[here], gap, here))
     return found
-
-
-def _towards(near: _Neighbours, chosen: Bool[np.ndarray, "N K"]) -> Float[np.ndarray, "N 2"]:
-    """Sum of the directions to some neighbours: towards the background, across the silhouette."""
-    distance = np.maximum(np.linalg.norm(near.offset_rad, axis=-1, keepdims=True), 1e-9)
-    return np.sum(near.offset_rad / distance * (chosen & near.reachable)[..., None], axis=1)
 
 
 def _neighbours(directions: Float[np.ndarray, "N 2"]) -> _Neighbours:

@@ -55,7 +55,12 @@ def free_sector(
     xyz_m: Float32[np.ndarray, "M 3"], motion: UInt8[np.ndarray, " M"], has_elevation: bool
 ) -> FreeSector:
     """Range to the nearest supported static return per azimuth bin; moving road users do not end it."""
-    points = _supported(xyz_m[_could_bound(xyz_m, motion, has_elevation)])
+    range_m = np.hypot(xyz_m[:, 0], xyz_m[:, 1])
+    could_end = (motion == _STATIC) & (range_m > _MIN_RANGE_M) & (range_m < _MAX_RANGE_M)
+    could_end &= np.abs(np.arctan2(xyz_m[:, 1], xyz_m[:, 0])) < _HALF_SECTOR_RAD
+    if has_elevation:
+        could_end &= np.abs(xyz_m[:, 2]) < _HEIGHT_M
+    points = _supported(xyz_m[could_end])
     azimuth = np.arctan2(points[:, 1], points[:, 0])
     bins = round(2 * _HALF_SECTOR_RAD / _BIN_RAD)
     nearest = np.full(bins, np.inf)
@@ -66,13 +71,6 @@ def free_sector(
     )
     centres = -_HALF_SECTOR_RAD + (np.arange(bins) + 0.5) * _BIN_RAD
     return _bridge_gaps(centres, nearest)
-
-
-def _could_bound(xyz_m: np.ndarray, motion: np.ndarray, has_elevation: bool) -> np.ndarray:
-    range_m = np.hypot(xyz_m[:, 0], xyz_m[:, 1])
-    inside = np.abs(np.arctan2(xyz_m[:, 1], xyz_m[:, 0])) < _HALF_SECTOR_RAD
-    level = np.abs(xyz_m[:, 2]) < _HEIGHT_M if has_elevation else True
-    return (motion == _STATIC) & inside & level & (range_m > _MIN_RANGE_M) & (range_m < _MAX_RANGE_M)
 
 
 def _supported(points_m: np.ndarray) -> np.ndarray:

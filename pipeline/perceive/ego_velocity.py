@@ -102,8 +102,9 @@ def radar_motion(
     if usable.sum() < _MIN_POINTS:
         return undecided
     power = None if power_db is None else power_db[usable].astype(np.float64)
+    directions = xyz_m[usable] * np.array([1.0, 1.0, float(has_elevation)])
     scan = _Doppler(
-        _directions(xyz_m[usable].astype(np.float64), has_elevation),
+        directions / np.linalg.norm(directions, axis=1, keepdims=True),
         range_rate_mps[usable].astype(np.float64),
         period_mps or 0.0,
         config.static_gate_mps,
@@ -120,12 +121,6 @@ def radar_motion(
     motion[usable & (np.abs(residual) > config.static_gate_mps)] = MOVING
     cluster = cluster_moving(xyz_m, residual, motion == MOVING, period_mps or 0.0, config.radar_cluster_eps_m)
     return RadarMotion(velocity, covariance, residual.astype(np.float32), motion, cluster)
-
-
-def _directions(xyz: np.ndarray, has_elevation: bool) -> np.ndarray:
-    """Unit vectors; horizontal ones if elevations are not measured."""
-    xyz = xyz if has_elevation else xyz * [1.0, 1.0, 0.0]
-    return xyz / np.linalg.norm(xyz, axis=1, keepdims=True)
 
 
 _Fit = tuple[np.ndarray, np.ndarray, float]  # velocity, covariance, noise
@@ -153,9 +148,10 @@ class _Doppler:
         return float(np.mean(np.exp(-0.5 * (self.residual(fit[0]) / 0.15) ** 2))) + self.static_share(fit)
 
     def best_fit(self, starts: np.ndarray) -> _Fit | None:
-        """The refined start that explains most; None without starts."""
-        fits = [_refine(self, np.append(start, 0.0)) for start in starts]
-        return max(fits, key=self.value, default=None)
+        """The start that explains most, refined by reweighted least squares; None without starts."""
+        about = self.u, self.rate, self.period, self.gate
+        fits = (_reweighted(*about, np.append(start, 0.0)) for start in starts)
+        return max(((v, np.linalg.inv(A), noise) for v, A, noise in fits), key=self.value, default=None)
 
 
 def _fit(scan: _Doppler, power: np.ndarray | None, travel: Travel, rng: np.random.Generator) -> _Fit | None:
@@ -277,18 +273,15 @@ def _scores(
     return out
 
 
-def _refine(scan: _Doppler, velocity: np.ndarray) -> _Fit:
-    """Reweighted least squares (Geman-McClure, from the gate to the noise), weak prior on the vertical."""
-    velocity, information, noise = _reweighted(scan.u, scan.rate, scan.period, scan.gate, velocity)
-    return velocity, np.linalg.inv(information), noise
-
-
 @no_type_check
 @njit(cache=True)
 def _reweighted(
     u: np.ndarray, rate: np.ndarray, period: float, gate: float, velocity: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Velocity after twelve steps; information matrix and noise of the last one."""
+    """Velocity after twelve steps; information matrix and noise of the last one.
+
+    Weights are Geman-McClure's, from the gate to the noise; the vertical has a weak prior.
+    """
     v, A, g = velocity.copy(), np.zeros((3, 3)), np.zeros(3)
     residual, near = np.empty(len(rate)), np.empty(len(rate))
     scale = noise = max(gate, _GRID_SIGMA_MPS)

@@ -1,33 +1,22 @@
-"""Features of one image, sweep or scan: a function per kind of sensor, from captures to features.
-
-Steps of brightness in an image, in the place of label borders, for a camera without semantics.
-
-No step shows which side is nearer, so each is a border of both. Strong, long steps are taken: outlines of
-poles, cars and houses, kerbs and paint, not the grain of leaves and asphalt.
-
-Move a sweep's points to its stamp by the radar's velocity, for logs without odometry.
-
-One scan gives the radar's velocity but not the car's yaw rate, because the lever arm is not logged. Points
-are therefore moved as if the car drove straight. In a turn the rotation between a point and the stamp
-remains: half a degree at 10 deg/s and half a sweep. Lidar-radar leaves such frames out.
-"""
+"""Features of one image, sweep or scan: a function per kind of sensor, from captures to features."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, UInt8
 
 from pipeline.core.config import PerceiveConfig
+from pipeline.core.rows import take_rows
 from pipeline.perceive.camera import CameraSemantics, FrameReason, SemanticsSource, decode_grey, encode_png
 from pipeline.perceive.depth_edges import lidar_edges
 from pipeline.perceive.drivable import DrivableSource, free_sector
 from pipeline.perceive.earlier_greys import EarlierGreys
-from pipeline.perceive.ego_velocity import RadarMotion, Travel, radar_motion
+from pipeline.perceive.ego_velocity import RadarMotion
 from pipeline.perceive.ground import PointSource, find_ground
 from pipeline.perceive.image_motion import MotionReason
 from pipeline.perceive.labels import ROAD_ID, VOID_ID, label_gradients
@@ -36,22 +25,18 @@ from pipeline.perceive.road_markings import lidar_markings, road_contrast
 from pipeline.perceive.tracks import EgoMotion, TrackState, advance_tracks, measure_clusters
 from pipeline.rig.cameras import camera_of
 from pipeline.rig.radar_grid import Scan as RadarScan
-from schemas.captures import CameraColumns, Capture, Image, Scan, Sweep, SweepColumns
+from schemas.captures import CameraColumns, Capture, Image, Scan, Sweep
 from schemas.features import ImageFeatures, ScanFeatures, SweepFeatures
 from schemas.moments import Moment
 from schemas.observations import STEP_BELOW, STEP_RIGHT
 
 __all__ = [
     "brightness_steps",
-    "deskew_straight",
     "deskewed",
-    "heading_of",
-    "motion_of",
     "perceive_image",
     "perceive_scan",
     "perceive_sweep",
     "speed_of",
-    "velocity_ahead",
     "why_unusable",
 ]
 
@@ -138,21 +123,27 @@ def perceive_sweep(
     sweep: Sweep, config: PerceiveConfig, rng: np.random.Generator, points: PointSource | None
 ) -> tuple[SweepFeatures, bool]:
     """Ground, objects, edges and markings of a sweep; and whether it has rows, which a rosette has not."""
-    finite = _finite(sweep)
-    xyz = finite.xyz_m
-    kind = None if points is None else points.kinds(xyz, finite.intensity)
+    finite = take_rows(sweep, _is_finite(sweep))
+    xyz, intensity, ring, time_s = (
+        finite.lidar_xyz_m,
+        finite.lidar_intensity,
+        finite.lidar_ring,
+        finite.lidar_time_s,
+    )
+    kind = None if points is None else points.kinds(xyz, intensity)
     ground = find_ground(xyz, config.ground_inlier_m, rng, kind)
     cluster = cluster_objects(xyz, ground.is_ground, config.cluster_eps_m, config.cluster_min_points)
     boxes = cluster_boxes(xyz, cluster)
     sample = sample_uniformly(xyz, config.voxel_m)
-    edges = lidar_edges(xyz, finite.ring, cluster, config)
-    markings = lidar_markings(xyz, finite.intensity, finite.ring, ground.is_road)
+    edges = lidar_edges(xyz, ring, cluster, config)
+    markings = lidar_markings(xyz, intensity, ring, ground.is_road)
     features = SweepFeatures(
         **_begin(sweep),
         lidar_map_xyz_m=xyz[sample],
         lidar_map_is_ground=ground.is_ground[sample].astype(np.uint8),
         lidar_map_cluster=cluster[sample],
-        lidar_map_time_s=None if finite.time_s is None else finite.time_s[sample],
+        # It is unknown whether the driver de-skewed the points that it logged.
+        lidar_map_time_s=None if time_s is None or not sweep.lidar_deskewed else time_s[sample],
         lidar_cluster_centre_m=boxes.centre_m,
         lidar_cluster_min_m=boxes.min_m,
         lidar_cluster_max_m=boxes.max_m,
@@ -179,8 +170,13 @@ def perceive_scan(
     sector = (
         free_sector(xyz, motion.motion, scan.radar_has_elevation)
         if drivable is None
-        else drivable.free_sector(_as_scan(scan, moment, motion, ego))
-    )
+        else drivable.free_sector(
+            RadarScan(
+                scan.stamp_ns, moment.drive, xyz, scan.radar_power_db, motion.residual_mps, motion.motion,
+                scan.radar_has_elevation, ego.velocity_mps, ego.yaw_rate_radps,
+            )
+        )
+    )  # fmt: skip
     features = ScanFeatures(
         **_begin(scan),
         radar_xyz_m=xyz,
@@ -202,39 +198,23 @@ def perceive_scan(
     return features, state
 
 
-def motion_of(
-    scan: Scan,
-    speed_mps: float | None,
-    heading: float | None,
-    config: PerceiveConfig,
-    rng: np.random.Generator,
-) -> RadarMotion:
-    """Motion of a scan's detections, and the radar's velocity, searched near odometry and heading.
-
-    `heading` is the azimuth of the direction of travel in radar axes; None = unknown, like `speed_mps`.
-    """
-    return radar_motion(
-        scan.radar_xyz_m, scan.radar_range_rate_mps, scan.radar_power_db, scan.doppler_period_mps,
-        Travel(speed_mps, heading), scan.radar_has_elevation, config, rng,
-    )  # fmt: skip
-
-
-def heading_of(T_lidar_radar: Float[np.ndarray, "4 4"] | None) -> float | None:
-    """Azimuth of a lidar's x axis, which points ahead, in radar axes; None if the radar's pose is unknown."""
-    if T_lidar_radar is None:
-        return None
-    ahead = T_lidar_radar[0, :3]
-    return float(np.arctan2(ahead[1], ahead[0]))
-
-
 def deskewed(sweep: Sweep, motion: RadarMotion, heading: float | None) -> Sweep:
-    """The sweep, moved to its stamp by a radar's velocity if that is known."""
+    """The sweep, moved to its stamp by a radar's velocity if that is known.
+
+    One scan gives the radar's velocity but not the car's yaw rate, because the lever arm is not logged. Points
+    are therefore moved as if the car drove straight and level. In a turn the rotation between a point and the
+    stamp remains: half a degree at 10 deg/s and half a sweep. Lidar-radar leaves such frames out.
+
+    `heading` is the azimuth of the lidar's x axis in radar axes [rad].
+    """
     time_s = sweep.lidar_time_s
     if motion.velocity_mps is None or heading is None or time_s is None:
         return sweep
-    velocity = velocity_ahead(motion.velocity_mps, heading)
-    x, y, z = deskew_straight(sweep.lidar_xyz_m, time_s, velocity).T
-    return replace(sweep, lidar_x_m=x, lidar_y_m=y, lidar_z_m=z, lidar_deskewed=True)
+    c, s, vx, vy = np.cos(heading), np.sin(heading), *motion.velocity_mps[:2].astype(np.float64)
+    since_s = time_s.astype(np.float64)
+    x_m = (sweep.lidar_x_m + since_s * (c * vx + s * vy)).astype(np.float32)
+    y_m = (sweep.lidar_y_m + since_s * (c * vy - s * vx)).astype(np.float32)
+    return replace(sweep, lidar_x_m=x_m, lidar_y_m=y_m, lidar_deskewed=True)
 
 
 def speed_of(
@@ -253,27 +233,7 @@ def speed_of(
     return float(np.copysign(np.hypot(vx, vy), vx * np.cos(heading) + vy * np.sin(heading)))
 
 
-@dataclass(frozen=True, eq=False)
-class _Finite:
-    """The finite points of one sweep."""
-
-    xyz_m: np.ndarray
-    intensity: np.ndarray | None
-    ring: np.ndarray | None
-    time_s: np.ndarray | None
-
-
-def _finite(sweep: SweepColumns) -> _Finite:
-    xyz, finite = sweep.lidar_xyz_m, _is_finite(sweep)
-    # It is unknown whether the driver de-skewed the points that it logged.
-    times = sweep.lidar_time_s if sweep.lidar_deskewed else None
-    columns = (sweep.lidar_intensity, sweep.lidar_ring, times)
-    if finite.all():
-        return _Finite(xyz, *columns)
-    return _Finite(xyz[finite], *(None if column is None else column[finite] for column in columns))
-
-
-def _is_finite(sweep: SweepColumns) -> Bool[np.ndarray, " N"]:
+def _is_finite(sweep: Sweep) -> Bool[np.ndarray, " N"]:
     return np.isfinite(sweep.lidar_x_m) & np.isfinite(sweep.lidar_y_m) & np.isfinite(sweep.lidar_z_m)
 
 
@@ -290,22 +250,13 @@ def _ego_motion(moment: Moment, motion: RadarMotion) -> EgoMotion:
     return EgoMotion(None if speed is None else (speed, 0.0), moment.ego_yaw_rate_radps)
 
 
-def _as_scan(scan: Scan, moment: Moment, motion: RadarMotion, ego: EgoMotion) -> RadarScan:
-    return RadarScan(
-        scan.stamp_ns,
-        moment.drive,
-        scan.radar_xyz_m,
-        scan.radar_power_db,
-        motion.residual_mps,
-        motion.motion,
-        scan.radar_has_elevation,
-        ego.velocity_mps,
-        ego.yaw_rate_radps,
-    )
-
-
 def brightness_steps(grey: UInt8[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W"]:
-    """Bits of each pixel: STEP_RIGHT if brightness steps between it and the next one of its row; STEP_BELOW."""
+    """Bits of each pixel: STEP_RIGHT if brightness steps between it and the next one of its row; STEP_BELOW.
+
+    They take the place of label borders for a camera without semantics. No step shows which side is nearer, so each
+    is a border of both. Strong, long steps are taken: outlines of poles, cars and houses, kerbs and paint, not the
+    grain of leaves and asphalt.
+    """
     right, below = _steps_along_rows(grey), _steps_along_rows(grey.T).T
     return np.asarray(STEP_RIGHT * right + STEP_BELOW * below, np.uint8)
 
@@ -325,25 +276,3 @@ def _steps_along_rows(grey: UInt8[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]
     is_long = stats[:, cv2.CC_STAT_HEIGHT] >= _SHORTEST_RUN_PX
     is_long[0] = False  # the background
     return np.asarray(is_long[run])
-
-
-def deskew_straight(
-    points_lidar: Float32[np.ndarray, "N 3"],
-    time_s: Float32[np.ndarray, " N"],
-    velocity_lidar_mps: Float[np.ndarray, " 3"],
-) -> Float32[np.ndarray, "N 3"]:
-    """Points in the lidar frame at the stamp [m]; velocity in lidar axes, times relative to the stamp."""
-    moved = points_lidar + time_s.astype(np.float64)[:, None] * velocity_lidar_mps
-    return moved.astype(np.float32)
-
-
-def velocity_ahead(
-    velocity_radar_mps: Float[np.ndarray, " 3"], heading_rad: float
-) -> Float[np.ndarray, " 3"]:
-    """Level velocity of the car in lidar axes, from that in radar axes without its vertical part.
-
-    `heading_rad` is the azimuth of the lidar's x axis in radar axes.
-    """
-    c, s = np.cos(heading_rad), np.sin(heading_rad)
-    vx, vy = float(velocity_radar_mps[0]), float(velocity_radar_mps[1])
-    return np.array([c * vx + s * vy, c * vy - s * vx, 0.0])

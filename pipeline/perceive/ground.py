@@ -108,7 +108,9 @@ def find_ground(
     if kind is not None:  # a road user blocks by its feet and wheels too
         user = (kind == PointKind.ROAD_USER) & (above_local < _OBSTACLE_M[1])
         blocks = (blocks & ~is_ground) | user
-    free = _reachable(azimuth, range_m, blocks)
+    # Reachable is what has no nearer obstacle in its direction; the own vehicle is none.
+    direction = np.minimum(((azimuth + np.pi) / (2 * np.pi) * _FREE_BINS).astype(np.int32), _FREE_BINS - 1)
+    free = range_m < _second_nearest(direction, range_m, blocks & (range_m > _NEAR_M))[direction]
     return Ground(plane, is_ground, is_road, _on_grid(xyz_m, is_road & free))
 
 
@@ -262,14 +264,6 @@ def _walk(height: np.ndarray, start: np.ndarray, sectors: int, bins: int, inlier
                 gap += 1
             surface[s, b] = level
     return surface
-
-
-def _reachable(azimuth: np.ndarray, range_m: np.ndarray, blocks: np.ndarray) -> np.ndarray:
-    """True for cells without a nearer obstacle in the same direction; the own vehicle is not an obstacle."""
-    direction = np.minimum(((azimuth + np.pi) / (2 * np.pi) * _FREE_BINS).astype(np.int32), _FREE_BINS - 1)
-    blocks = blocks & (range_m > _NEAR_M)
-    limit = _second_nearest(direction, range_m, blocks)
-    return range_m < limit[direction]
 
 
 @no_type_check  # keeps the tests' shape checks out of compiled code

@@ -35,7 +35,6 @@ __all__ = [
     "ROAD_USERS",
     "SKY_ID",
     "VOID_ID",
-    "detector_names",
     "label_gradients",
     "road_user_name",
     "to_cityscapes",
@@ -66,6 +65,7 @@ LABEL_SETS: dict[str, dict[str, tuple[int, ...]]] = {
 }
 # Classes that a model of a set gives; Cityscapes' also with void as the last.
 LABEL_COUNTS: dict[str, tuple[int, ...]] = {"cityscapes": (19, 20), "ade20k": (150,), "coco": (182,)}
+# Class index -> road user; other classes are left out.
 DETECTOR_SETS: dict[str, dict[int, str]] = {
     "coco": {0: "person", 1: "bicycle", 2: "car", 3: "motorcycle", 5: "bus", 6: "train", 7: "truck"},
     "road_users": dict(enumerate(ROAD_USERS)),
@@ -79,13 +79,10 @@ _ALIASES = {
     "lorry": "truck", "trailer": "truck", "coach": "bus", "tram": "train",
     "motorbike": "motorcycle", "motor": "motorcycle", "scooter": "motorcycle", "bike": "bicycle",
 }  # fmt: skip
-REACH_PX: Final = (
-    16  # gradients are kept from -16 to +16 label pixels: 2 % of 912 pixels shift the image's ends by 9
-)
+# Gradients are kept from -16 to +16 label pixels: 2 % of 912 pixels shift the image's ends by 9.
+REACH_PX: Final = 16
 BINS: Final = 6  # equal parts of the image's width (left, right) or height (above, below)
-_RUN_PX = (
-    16  # length of border over which gradients are summed with their sign: on nights twice the contrast of 1
-)
+_RUN_PX = 16  # of border over which gradients are summed with their sign: on nights twice the contrast of 1
 _FLOOR_GREY = 5.0  # gradients of a border without contrast count less than those of one with this much
 _SKY, _BACKDROP, _OBJECT, _GROUND = (10,), (2, 3, 4, 8), (5, 6, 7, 11, 12, 13, 14, 15, 16, 17, 18), (0, 1, 9)
 
@@ -116,11 +113,6 @@ def to_cityscapes(label_set: str | Mapping[StreetClass, tuple[int, ...]]) -> UIn
     for name, foreign in meaning.items():
         table[list(foreign)] = CITYSCAPES.index(name)
     return table
-
-
-def detector_names(label_set: str) -> dict[int, str]:
-    """Class index -> road user of a detector's label set; other classes are left out."""
-    return DETECTOR_SETS[label_set]
 
 
 def road_user_name(logged: str) -> str | None:

@@ -22,11 +22,9 @@ from pipeline.perceive.camera import (
 )
 from pipeline.perceive.drivable import DrivableSource
 from pipeline.perceive.earlier_greys import EarlierGreys
-from pipeline.perceive.ego_velocity import RadarMotion
+from pipeline.perceive.ego_velocity import RadarMotion, Travel, radar_motion
 from pipeline.perceive.features import (
     deskewed,
-    heading_of,
-    motion_of,
     perceive_image,
     perceive_scan,
     perceive_sweep,
@@ -183,7 +181,8 @@ class Shown:
         lidars = [s for s, kind in self.kinds.items() if kind == "lidar"]
         ahead = [*lidars, BASE.name] if lidar is None else [lidar]
         known = (between(self.star, name, radar) for name in ahead)
-        return heading_of(next((T for T in known if T is not None), None))
+        T_ahead_radar = next((T for T in known if T is not None), None)
+        return None if T_ahead_radar is None else float(np.arctan2(T_ahead_radar[0, 1], T_ahead_radar[0, 0]))
 
 
 class Found(NamedTuple):
@@ -229,8 +228,13 @@ def perceive_moment(
     headings = {radar: shown.heading(radar) for radar in scans}
 
     def motions_by(generator: np.random.Generator) -> dict[str, RadarMotion]:
-        speed = moment.ego_speed_mps
-        return {r: motion_of(scan, speed, headings[r], config, generator) for r, scan in scans.items()}
+        return {
+            radar: radar_motion(
+                scan.radar_xyz_m, scan.radar_range_rate_mps, scan.radar_power_db, scan.doppler_period_mps,
+                Travel(moment.ego_speed_mps, headings[radar]), scan.radar_has_elevation, config, generator,
+            )
+            for radar, scan in scans.items()
+        }  # fmt: skip
 
     skewed = sources.deskew and any(_is_skewed(c) for c in asked.values())
     early = motions_by(np.random.default_rng([*seed, 1])) if skewed else None
@@ -243,11 +247,15 @@ def perceive_moment(
     motions = motions_by(rng) if early is None else early
     after = {}
     for radar, scan in scans.items():
-        before = tracks.get(radar) or TrackState.empty()
+        before = tracks.get(radar) or TrackState()
         features[radar], after[radar] = perceive_scan(
             scan, moment, motions[radar], before, sources.radars[radar]
         )
-    return Found(_row(moment, speed_of(moment, motions, headings)), features, after, notes, unusable)
+    row = Perceived(
+        moment=moment.moment, log=moment.log, drive=moment.drive, stamp_ns=moment.stamp_ns, rows={},
+        ego_speed_mps=speed_of(moment, motions, headings), ego_yaw_rate_radps=moment.ego_yaw_rate_radps,
+    )  # fmt: skip
+    return Found(row, features, after, notes, unusable)
 
 
 def _is_worth_having(shown: Shown, usable: Collection[str], *, alone: bool) -> bool:
@@ -255,13 +263,6 @@ def _is_worth_having(shown: Shown, usable: Collection[str], *, alone: bool) -> b
     if len(set(shown.kinds.values())) == len(shown.kinds):
         return alone
     return bool(possible_edges([BASE, *(Sensor(s, cast("Kind", shown.kinds[s])) for s in usable)]))
-
-
-def _row(moment: Moment, speed_mps: float | None) -> Perceived:
-    return Perceived(
-        moment=moment.moment, log=moment.log, drive=moment.drive, stamp_ns=moment.stamp_ns, rows={},
-        ego_speed_mps=speed_mps, ego_yaw_rate_radps=moment.ego_yaw_rate_radps,
-    )  # fmt: skip
 
 
 def _less(captures: Mapping[str, Any], unusable: Mapping[str, FrameReason]) -> dict[str, Any]:
@@ -318,7 +319,7 @@ def _drivable(radar: RadarTopics, fleet: FleetConfig) -> DrivableSource | None:
         return None
     from pipeline.perceive.models.radar_drivable import RadarDrivable  # noqa: PLC0415 - as in _source
 
-    return RadarDrivable.load(radar.drivable, fleet)
+    return RadarDrivable(fleet.path_of(radar.drivable.model))
 
 
 def _points(lidar: LidarTopics, fleet: FleetConfig) -> PointSource | None:
@@ -326,4 +327,4 @@ def _points(lidar: LidarTopics, fleet: FleetConfig) -> PointSource | None:
         return None
     from pipeline.perceive.models.range_image import RangeImageSegmenter  # noqa: PLC0415 - as in _source
 
-    return RangeImageSegmenter.load(lidar.semantics, fleet)
+    return RangeImageSegmenter(fleet.path_of(lidar.semantics.segmenter), lidar.semantics.remission_scale)

@@ -54,18 +54,13 @@ class EgoMotion:
 
 @dataclass(frozen=True, eq=False)
 class TrackState:
-    """State between frames."""
+    """State between frames; by default nothing is tracked yet."""
 
     stamp_ns: int | None = None
     drive: int = -1
     ego: EgoMotion = EgoMotion(None, None)
     next_identity: int = 0
     filters: Filters = field(default_factory=Filters.none)
-
-    @classmethod
-    def empty(cls) -> TrackState:
-        """Nothing tracked yet."""
-        return cls()
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,16 +114,13 @@ def advance_tracks(
     if state.stamp_ns is not None and state.drive == drive:
         velocities = (state.ego.velocity_mps, ego.velocity_mps)
         dt_s = (stamp_ns - state.stamp_ns) / 1e9
-        filters = carried(state.filters, dt_s, velocities, _mean_yaw_rate(state.ego, ego))
+        rates = [m.yaw_rate_radps for m in (state.ego, ego) if m.yaw_rate_radps is not None]
+        yaw_rate = (float(np.mean(rates)), 0.01) if rates else (0.0, _YAW_RATE_SIGMA_RADPS)
+        filters = carried(state.filters, dt_s, velocities, yaw_rate)
     measured = _measured(returns, stamp_ns, period_mps)
     filters, identity = advance(filters, measured, _born, state.next_identity, _GATE, _MAX_MISSED_S)
     following = max(state.next_identity, int(identity.max(initial=-1)) + 1)
     return TrackState(stamp_ns, drive, ego, following, filters), _report(filters, identity, returns)
-
-
-def _mean_yaw_rate(a: EgoMotion, b: EgoMotion) -> tuple[float, float]:
-    known = [m.yaw_rate_radps for m in (a, b) if m.yaw_rate_radps is not None]
-    return (float(np.mean(known)), 0.01) if known else (0.0, _YAW_RATE_SIGMA_RADPS)
 
 
 def _measured(returns: ClusterReturns, stamp_ns: int, period_mps: float | None) -> Measurements:

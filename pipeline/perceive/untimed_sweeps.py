@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, NamedTuple, Protocol, runtime_checkable
+from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt16
@@ -18,8 +18,9 @@ from pipeline.rig.scan_rows import rows_of
 from pipeline.rig.se3 import exp_se3, log_se3
 from pipeline.rig.spherical import to_spherical
 from schemas.captures import Sweep
+from schemas.moments import Moment
 
-__all__ = ["BY_AZIMUTH", "WITHOUT_TIMES", "Arc", "Turning", "motions", "surfaces_of", "turning_of"]
+__all__ = ["BY_AZIMUTH", "WITHOUT_TIMES", "Arc", "Turning", "turning_of"]
 
 # Among the manifest's kept: sweeps that have their times from the azimuth; and those of a spinning lidar that drives,
 # for which fleet.toml has no `turn`. They are left as they were logged.
@@ -35,22 +36,6 @@ _MOST_POINTS, _MOST_SURFACES = 1800, 12_000
 # Of the start of a registration: a car neither rolls, nods nor climbs between two sweeps.
 _START_SIGMAS = np.array([1e-3, 1e-3, 0.1, 1.0, 1.0, 0.01])
 _OF_STAMP: Final = {"begin": 0.0, "middle": 0.5, "end": 1.0}
-
-
-@runtime_checkable
-class Seen(Protocol):
-    """Data of a moment that this module uses."""
-
-    @property
-    def moment(self) -> int: ...
-    @property
-    def drive(self) -> int: ...
-    @property
-    def stamp_ns(self) -> int: ...
-    @property
-    def ego_speed_mps(self) -> float | None: ...
-    @property
-    def ego_yaw_rate_radps(self) -> float | None: ...
 
 
 class Arc(NamedTuple):
@@ -73,7 +58,7 @@ class Turning:
     turn: LidarTurn | None
     motion: Mapping[int, Arc]
 
-    def timed(self, seen: Seen, sweep: Sweep) -> tuple[Sweep, str]:
+    def timed(self, seen: Moment, sweep: Sweep) -> tuple[Sweep, str]:
         """The sweep with times, moved to its stamp if its motion is known, and the counts for the manifest.
 
         The motion is the odometry's, or else that between sweeps. Without both, a radar's Doppler may move it later.
@@ -88,39 +73,37 @@ class Turning:
         timed = replace(sweep, lidar_time_s=time_s, lidar_deskewed=True)
         if stands:
             return timed, BY_AZIMUTH
-        xyz = sweep.lidar_xyz_m.astype(np.float64)
-        x, y, z = (xyz + time_s[:, None] * _velocity_of(xyz, motion)).astype(np.float32).T
+        # Against the lidar's motion, by the times.
+        x, y = sweep.lidar_x_m.astype(np.float64), sweep.lidar_y_m.astype(np.float64)
+        x_m = (x + time_s * (motion.x - motion.yaw_rad * y)).astype(np.float32)
+        y_m = (y + time_s * (motion.yaw_rad * x)).astype(np.float32)
         # Moved points lie in no order and at no common elevation: rows are those that were measured.
-        moved = replace(timed, lidar_x_m=x, lidar_y_m=y, lidar_z_m=z, lidar_ring=_rows_of(sweep))
-        return moved, BY_AZIMUTH
+        return replace(timed, lidar_x_m=x_m, lidar_y_m=y_m, lidar_ring=_rows_of(sweep)), BY_AZIMUTH
 
 
-def turning_of(sweeps: Iterable[tuple[Seen, Sweep]], turn: LidarTurn | None) -> Turning | None:
+def turning_of(sweeps: Iterable[tuple[Moment, Sweep]], turn: LidarTurn | None) -> Turning | None:
     """A lidar's rotation as in fleet.toml; None if the sweeps have times, or it does not spin.
 
     Where odometry has no motion, pairs of sweeps give it.
     """
     surfaces, pairs = {}, []
-    before: Seen | None = None
+    before: Moment | None = None
     for seen, sweep in sweeps:
         if before is None and (sweep.lidar_deskewed or sweep.lidar_time_s is not None or not _spins(sweep)):
             return None
         if turn is None:
             return Turning(None, {})
         if _told(seen) is None:
-            surfaces[seen.moment] = surfaces_of(sweep.lidar_xyz_m)
-        if (
-            before is not None
-            and before.drive == seen.drive
-            and surfaces.keys() >= {before.moment, seen.moment}
-        ):
+            surfaces[seen.moment] = _surfaces_of(sweep.lidar_xyz_m)
+        if before is not None and before.drive == seen.drive and before.moment in surfaces:
             gap_s = (seen.stamp_ns - before.stamp_ns) * 1e-9
-            pairs += [(before.moment, seen.moment, gap_s)] if 0 < gap_s < _NEIGHBOUR_S else []
+            if seen.moment in surfaces and 0 < gap_s < _NEIGHBOUR_S:
+                pairs.append((before.moment, seen.moment, gap_s))
         before = seen
-    return Turning(turn, motions(surfaces, pairs))
+    return Turning(turn, _motions(surfaces, pairs))
 
 
-def surfaces_of(xyz_m: np.ndarray) -> Surfaces | None:
+def _surfaces_of(xyz_m: np.ndarray) -> Surfaces | None:
     """Surfaces of a sweep, its points thinned; None if it has too few."""
     far_m = np.hypot(xyz_m[:, 0], xyz_m[:, 1])
     near = np.isfinite(xyz_m).all(1) & (far_m > _NEAREST_M) & (far_m < _REACH_M)
@@ -130,7 +113,7 @@ def surfaces_of(xyz_m: np.ndarray) -> Surfaces | None:
     return Surfaces.of(xyz[:: max(1, len(xyz) // _MOST_SURFACES)])
 
 
-def motions(
+def _motions(
     surfaces: Mapping[int, Surfaces | None], pairs: Sequence[tuple[int, int, float]]
 ) -> dict[int, Arc]:
     """Motion per second at each sweep of a pair (earlier, later, seconds between): the mean of its pairs.
@@ -140,15 +123,13 @@ def motions(
     held: dict[int, list[Arc]] = {}
     before: tuple[int, Arc] | None = None
     for i, j, gap_s in pairs:
-        first, last = surfaces[i], surfaces[j]
-        arc = start = None
+        first, last, arc = surfaces[i], surfaces[j], None
         if first is not None and last is not None:
             own = arc_between(_standing(first), _standing(last), gap_s)
-            start = Arc(own[0], 0.0, own[1]) if own is not None else None
+            start = None if own is None else Arc(own[0], 0.0, own[1])
             if start is None and before is not None and before[0] == i:
                 start = before[1]
-        if first is not None and last is not None and start is not None:
-            arc = _matched(first, last, start, gap_s)
+            arc = None if start is None else _matched(first, last, start, gap_s)
         before = None if arc is None else (j, arc)
         if arc is not None:
             for k in (i, j):
@@ -164,7 +145,7 @@ def _matched(first: Surfaces, last: Surfaces, start: Arc, gap_s: float) -> Arc |
     found = register(points, first, exp_se3(twist), _START_SIGMAS)
     if found is None:
         return None
-    rate = log_se3(found.T) / gap_s
+    rate = log_se3(found[0]) / gap_s
     return Arc(float(rate[3]), float(rate[4]), float(rate[2]))
 
 
@@ -183,13 +164,7 @@ def _times_of(turn: LidarTurn, xyz_m: Float32[np.ndarray, "N 3"]) -> Float32[np.
     return ((share - _OF_STAMP[turn.stamp]) * turn.period_s).astype(np.float32)
 
 
-def _velocity_of(xyz_m: Float[np.ndarray, "N 3"], motion: Arc) -> Float[np.ndarray, "N 3"]:
-    """Velocity of standing points relative to the lidar; with it, points are moved by their time to the stamp."""
-    x = motion.x - motion.yaw_rad * xyz_m[:, 1]
-    return np.stack([x, motion.yaw_rad * xyz_m[:, 0], np.zeros(len(xyz_m))], axis=1)
-
-
-def _told(seen: Seen) -> Arc | None:
+def _told(seen: Moment) -> Arc | None:
     """The odometry's motion; lidars are assumed to look ahead."""
     if seen.ego_speed_mps is None:
         return None

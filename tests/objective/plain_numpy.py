@@ -31,15 +31,6 @@ def registration(frames, T_lidar_radar, dt_s, sigma, bounce_prior, outlier):
     return H, g, info, cost
 
 
-def registration_cost(frames, T_lidar_radar, dt_s, sigma, bounce_prior, outlier):
-    """The cost [F] alone."""
-    out = np.zeros(frames.count)
-    for f in range(frames.count):
-        _, wd, wb, _ = _assignments(frames, f, T_lidar_radar, dt_s, sigma, bounce_prior)
-        out[f] = -np.log((wd + wb).sum(1) + outlier).mean()
-    return out
-
-
 def _assignments(frames, f, T_lidar_radar, dt_s, sigma, bounce_prior):
     """Distances in sigmas (azimuth, elevation, range) and weights of all pairs, and whose elevation counts."""
     radar = frames.radar_m[frames.radar_first[f] : frames.radar_first[f + 1]]

@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 
-from pipeline.objective.camera_lidar.image_maps import Start, free_ground, step_offsets
+from pipeline.objective.camera_lidar.image_maps import NO_BOUNDARY, REACH_PX, Start, free_ground, step_offsets
 from pipeline.rig.cameras import Camera
 from pipeline.rig.se3 import exp_so3, from_rotation_translation
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT, STEP_BELOW, STEP_RIGHT
 from tests.makers.solve_scenes import AXES
 
-NONE, REACH_PX = -128, 20
 CAMERA = Camera(
     "plumb_bob", np.array([[300.0, 0, 159.5], [0, 300.0, 79.5], [0, 0, 1]]), np.zeros(0), 320, 160
 )
@@ -19,15 +18,17 @@ GROUND = np.array([[x, y, -1.5] for x in np.arange(5.0, 41) for y in np.arange(-
 
 
 def test_offsets_point_to_the_nearest_step_and_no_further_than_they_reach():
-    steps = np.zeros((40, 60), np.uint8)
-    steps[:, 30] = STEP_RIGHT
-    steps[10] |= STEP_BELOW
-    offsets = step_offsets(steps, REACH_PX, NONE)
-    u, v = np.arange(60), np.arange(40)
-    for side in (EDGE_LEFT, EDGE_RIGHT):
-        np.testing.assert_array_equal(offsets[side, 5], np.where(np.abs(30 - u) <= REACH_PX, 30 - u, NONE))
-    for side in (EDGE_ABOVE, EDGE_BELOW):
-        np.testing.assert_array_equal(offsets[side, :, 5], np.where(np.abs(10 - v) <= REACH_PX, 10 - v, NONE))
+    steps = np.zeros((240, 260), np.uint8)
+    steps[:, 130] = STEP_RIGHT
+    steps[110] |= STEP_BELOW
+    offsets = step_offsets(steps)
+    to_column, to_row = 130 - np.arange(260), 110 - np.arange(240)
+    for side, along, to in (
+        (EDGE_LEFT, offsets[EDGE_LEFT, 5], to_column), (EDGE_RIGHT, offsets[EDGE_RIGHT, 5], to_column),
+        (EDGE_ABOVE, offsets[EDGE_ABOVE, :, 5], to_row), (EDGE_BELOW, offsets[EDGE_BELOW, :, 5], to_row),
+    ):  # fmt: skip
+        expected = np.where(np.abs(to) <= REACH_PX, to, NO_BOUNDARY)
+        np.testing.assert_array_equal(along, expected, err_msg=str(side))
 
 
 @pytest.mark.parametrize("turn_deg", [-1.9, 1.9])

@@ -21,7 +21,7 @@ SKY, CAR = 10, 13
 @pytest.fixture(scope="module", params=[SPARSE, DENSE], ids=["16 rings pinhole", "dense f-theta"])
 def terms(request):
     day = traced_day(request.param, 6, seed=2, dt_s=0.03)
-    return prepare_terms(day, T_TRUE, lidar_velocities(day, np.eye(4)), reach_rad=0.1).sharp(5.0)
+    return prepare_terms(day, T_TRUE, lidar_velocities(day, np.eye(4)), reach_rad=0.1).sharp()
 
 
 CAMERAS = {

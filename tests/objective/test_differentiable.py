@@ -1,5 +1,10 @@
-"""The torch losses against the compiled ones on perceived rows, their gradients against differences; poses, loop."""
+"""The torch losses against the compiled ones on perceived rows, their gradients against differences; poses, loop.
 
+Static detections, also beyond the lidar's limits: streets drawn by hand (`tests.makers.radar_scenes`) with posts that
+stand out of the lidar's view at the top, so that a share of detections counts by azimuth and range alone.
+"""
+
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,22 +27,35 @@ from pipeline.objective.differentiable.poses import (
     transform_points,
 )
 from pipeline.objective.differentiable.projection import camera_projection
+from pipeline.objective.differentiable.static import StaticFrames, static_cost, tells_elevation
 from pipeline.objective.differentiable.terms import edge_residuals_px
-from pipeline.objective.paper import loop
+from pipeline.objective.paper import classes
 from pipeline.objective.paper.camera_lidar import camera_lidar_loss
 from pipeline.objective.paper.camera_radar import camera_radar_loss
 from pipeline.objective.paper.cost_maps import fold_frames, frame_costs
 from pipeline.objective.paper.lidar_radar import lidar_radar_loss
+from pipeline.objective.radar.registration import (
+    BOUNCE_PRIOR,
+    RANGE_M,
+    SIDE_RAD,
+    SIGMA_START,
+    VIEW_MARGIN_RAD,
+    normal_equations,
+    registration_frames,
+)
 from pipeline.rig import se3
 from pipeline.rig.day_prior import read_prior
 from pipeline.store.partitions import Lake, Partition
+from tests.makers.radar_scenes import T_LIDAR_RADAR, street_day
 from tests.makers.simulated_days import perceived, simulated_day
 from tests.makers.torch_poses import exp_se3
 from tests.objective.test_kernels import CAMERAS, PENALTY, cloud, poses, smooth_cost
-from tests.objective.test_static_parity import check_static
 
 PAIRS = ("camera_lidar", "camera_radar", "lidar_radar")
 MARGIN_RAD = np.radians(3.0)
+PARITY = 1e-3
+ALL = 10**6  # thin nothing out
+TRUSTED_RAD = np.array([-0.2, 0.12])  # a lidar that sees less upwards than the radar does
 
 
 @pytest.fixture(scope="module")
@@ -194,7 +212,7 @@ def test_projection_equals_the_camera_and_its_jacobian(name):
 def test_the_loop_loss_is_the_numpy_one_and_zero_where_the_three_agree():
     T = [se3.exp_se3(x) for x in np.random.default_rng(2).normal(size=(3, 7, 6)) * 0.3]
     ours = loop_loss(*(torch.tensor(t) for t in T))
-    np.testing.assert_allclose(ours, loop.loop_loss(loop.loop_transform(*T)), atol=1e-12)
+    np.testing.assert_allclose(ours, classes.loop_loss(classes.loop_transform(*T)), atol=1e-12)
     closed = loop_loss(torch.tensor(T[0]), torch.tensor(T[1]), torch.tensor(T[0] @ T[1]))
     np.testing.assert_allclose(closed, 0, atol=1e-12)
 
@@ -205,6 +223,92 @@ def test_poses_equal_their_numpy_versions():
     T = exp_se3(torch.tensor(xi))
     np.testing.assert_allclose(T, se3.exp_se3(xi), atol=1e-12)
     np.testing.assert_allclose(inverse(T), se3.inverse(se3.exp_se3(xi)), atol=1e-12)
-    np.testing.assert_allclose(euler_angles(T), loop.euler_angles(se3.exp_se3(xi)), atol=1e-12)
+    np.testing.assert_allclose(euler_angles(T), classes.euler_angles(se3.exp_se3(xi)), atol=1e-12)
     back = pose_of_euler_angles(euler_angles(T), T[:, :3, 3])
     np.testing.assert_allclose(back, T, atol=1e-12)
+
+
+def tensors(rows, limits_rad):
+    """What the torch term takes, from what is perceived."""
+    radar = padded([o.radar_xyz_m for o in rows], torch.float64)
+    still = padded([np.tile(o.radar_motion[:, None] == 0, 3) for o in rows], torch.float64)[0][..., 0] > 0
+    plane = [np.zeros(4) if o.ground_plane is None else o.ground_plane for o in rows]
+    return (
+        radar[0],
+        radar[1] & still,
+        *padded([o.lidar_map_xyz_m for o in rows], torch.float64),
+        torch.tensor(np.array(plane, np.float64)),
+        torch.tensor([bool(o.radar_has_elevation) for o in rows]),
+        torch.tensor(limits_rad, dtype=torch.float64).expand(len(rows), 2),
+    )
+
+
+def cost_of(T, inputs, **how):
+    """The torch term with all detections and points; whose elevation counts is asked at the same poses."""
+    radar, present, lidar, lidar_present, plane, has_elevation, limits = inputs
+    tells = tells_elevation(T, radar, has_elevation, limits)
+    frames = StaticFrames(radar, present, lidar, lidar_present, plane, tells)
+    return static_cost(T, frames, detections=ALL, points=ALL, **how)
+
+
+def kernels_frames(rows, T, limits_rad):
+    """The registration's own choice of detections and points, at no lag."""
+    frames = registration_frames(rows, T, np.random.default_rng(0), radar_points=ALL)
+    assert frames.count == len(rows)
+    return replace(frames, stamp_gap_s=np.zeros(len(rows)), lidar_elevation_rad=np.array(limits_rad))
+
+
+def beyond(inputs, T):
+    """Share of the counting detections that lie beyond what the lidar tells of, by its own arithmetic."""
+    radar, present, _, _, _, _, limits = inputs
+    p = transform_points(torch.tensor(T), radar)
+    angle = torch.atan2(p[..., 2], p[..., :2].norm(dim=-1))
+    margin = VIEW_MARGIN_RAD + (0.25 * (limits[:, 1] - limits[:, 0])).clamp_max(2 * SIGMA_START[1])
+    outside = (angle <= (limits[:, 0] + margin)[:, None]) | (angle >= (limits[:, 1] - margin)[:, None])
+    over_ground, azimuth = radar[..., :2].norm(dim=-1), torch.atan2(radar[..., 1], radar[..., 0])
+    counts = present & (over_ground > RANGE_M[0]) & (over_ground < RANGE_M[1]) & (azimuth.abs() < SIDE_RAD)
+    return float((outside & counts).sum() / counts.sum())
+
+
+def check_costs(inputs, frames, T, **how):
+    """Costs and slopes are the kernel's; steps are so small that no point enters or leaves between them."""
+    value, gradient = value_and_gradient(lambda poses: cost_of(poses, inputs, **how), T)
+
+    def kernel(poses):
+        return np.stack([normal_equations(frames, t, 0.0, SIGMA_START, **how).cost for t in poses])
+
+    np.testing.assert_allclose(value, kernel(T), rtol=PARITY)
+    assert_close(gradient, by_differences(kernel, T, h=1e-7))
+
+
+def check_static(rows, T_true, thin=1):
+    """Value and gradient near the truth, under the day's own limits and under ones that cut detections off."""
+    rng = np.random.default_rng(5)
+    T = se3.exp_se3(rng.normal(size=(2, 6)) * np.array([0.01] * 3 + [0.08] * 3)) @ T_true
+    rows = [replace(o, radar_xyz_m=o.radar_xyz_m[::thin], radar_motion=o.radar_motion[::thin]) for o in rows]
+    own = registration_frames(rows, T_true, np.random.default_rng(0)).lidar_elevation_rad
+    low, high = own
+    for limits_rad, least in ((own, 0.0), ((0.5 * low, 0.5 * high), 0.02)):
+        inputs = tensors(rows, limits_rad)
+        assert beyond(inputs, T[0]) > least
+        frames = kernels_frames(rows, T_true, limits_rad)
+        check_costs(inputs, frames, T, outlier=1.0)
+
+
+@pytest.mark.slow
+def test_value_and_gradient_are_the_kernels_on_streets():
+    check_static(street_day(3), T_LIDAR_RADAR)
+
+
+@pytest.mark.parametrize(
+    ("outlier", "bounce_prior", "elevation"),
+    [(0.2, BOUNCE_PRIOR, True), (1.0, 0.0, True), (0.2, 0.12, False)],
+)
+def test_they_are_for_every_outlier_weight_with_and_without_bounce_and_elevation(
+    outlier, bounce_prior, elevation
+):
+    rows = street_day(4, seed=3, elevation=elevation)
+    T = se3.exp_se3(np.array([[0.004, 0.006, -0.003, 0.05, -0.04, 0.02]])) @ T_LIDAR_RADAR
+    frames = kernels_frames(rows, T_LIDAR_RADAR, TRUSTED_RAD)
+    how = {"outlier": outlier, "bounce_prior": bounce_prior}
+    check_costs(tensors(rows, TRUSTED_RAD), frames, T, **how)

@@ -75,20 +75,10 @@ def test_costs_equal_the_numpy_reference_for_every_camera_model(name):
     assert np.mean(np.abs(got - want) / frames.counts) < 3e-3
 
 
-def test_points_out_of_view_and_behind_the_camera_cost_the_penalty():
-    frames = fold_frames(
-        [np.array([[0.0, 0, -5], [100.0, 0, 5], [0, 0, 0.1]])],
-        [np.zeros((HEIGHT, WIDTH))],
-        [CAMERAS["f-theta"]],
-        2.5,
-    )
-    assert frame_costs(frames, np.eye(4)[None])[0, 0] == pytest.approx(
-        5.0
-    )  # f-theta sees what is near as well
-    frames = fold_frames(
-        [np.array([[0.0, 0, -5], [100.0, 0, 5], [0, 0, 0.1]])],
-        [np.zeros((HEIGHT, WIDTH))],
-        [CAMERAS["pinhole"]],
-        2.5,
-    )
-    assert frame_costs(frames, np.eye(4)[None])[0, 0] == pytest.approx(7.5)
+@pytest.mark.parametrize(
+    ("name", "unseen"), [("f-theta", 2), ("pinhole", 3)]
+)  # f-theta sees what is near as well
+def test_points_out_of_view_and_behind_the_camera_cost_the_penalty(name, unseen):
+    points = np.array([[0.0, 0, -5], [100.0, 0, 5], [0, 0, 0.1]])
+    frames = fold_frames([points], [np.zeros((HEIGHT, WIDTH))], [CAMERAS[name]], 2.5)
+    assert frame_costs(frames, np.eye(4)[None])[0, 0] == pytest.approx(2.5 * unseen)

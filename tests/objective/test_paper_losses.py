@@ -5,8 +5,8 @@ import pytest
 
 from pipeline.objective.paper.camera_lidar import camera_lidar_loss
 from pipeline.objective.paper.camera_radar import camera_radar_loss
+from pipeline.objective.paper.classes import loop_loss, loop_transform
 from pipeline.objective.paper.lidar_radar import lidar_radar_loss
-from pipeline.objective.paper.loop import loop_loss, loop_transform
 from pipeline.rig.se3 import exp_so3, inverse
 from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
 

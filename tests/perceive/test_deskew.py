@@ -11,9 +11,11 @@ from scipy.spatial import cKDTree
 from pipeline.core.config import PerceiveConfig
 from pipeline.core.rigs import TopicSemantics
 from pipeline.perceive.camera import TopicSource
-from pipeline.perceive.features import deskew_straight, velocity_ahead
+from pipeline.perceive.ego_velocity import RadarMotion
+from pipeline.perceive.features import deskewed
 from pipeline.perceive.stage import AS_LOGGED, BY_DOPPLER, Shown, Sources, perceive_moment
 from pipeline.rig.se3 import exp_so3
+from schemas.captures import Sweep
 from tests.makers.lakes import joined_of
 
 SPEED_MPS = 8.0  # of the made frames
@@ -28,9 +30,14 @@ def test_a_world_seen_by_a_car_that_drives_straight_stands_still(speed, heading,
     time = np.linspace(-0.1, 0.02, 40)
     seen = world - time[:, None] * [speed, 0.0, 0.0]  # the lidar looks ahead, the radar anywhere
     velocity_radar = exp_so3(np.array([0.0, 0.0, heading])) @ [speed, 0.0, 0.0]
-    v = velocity_ahead(velocity_radar, heading)
-    still = deskew_straight(seen.astype(np.float32), time.astype(np.float32), v)
-    np.testing.assert_allclose(still, world, atol=1e-4)
+    none = np.zeros(0, np.float32)
+    motion = RadarMotion(velocity_radar, np.eye(3), none, none.astype(np.uint8), none.astype(np.int32))
+    x, y, z, time_s = np.column_stack([seen, time]).astype(np.float32).T
+    sweep = Sweep(
+        moment=0, stamp_ns=0, lidar_x_m=x, lidar_y_m=y, lidar_z_m=z, lidar_intensity=None, lidar_ring=None,
+        lidar_time_s=time_s, lidar_deskewed=False,
+    )  # fmt: skip
+    np.testing.assert_allclose(deskewed(sweep, motion, heading).lidar_xyz_m, world, atol=1e-4)
 
 
 def skewed(made_frame, **changes):

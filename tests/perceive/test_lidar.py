@@ -77,3 +77,7 @@ def test_the_sample_holds_one_measured_point_per_occupied_voxel(seed, voxel, cou
     assert len(np.unique(rows)) == len(rows)
     assert outside[rows].all()
     assert len(np.unique(cells[rows], axis=0)) == len(rows) == len(np.unique(cells[outside], axis=0))
+    for row in rows:  # the nearest to the mean of its voxel
+        inside = points[outside & (cells == cells[row]).all(axis=1)].astype(float)
+        far = np.linalg.norm(inside - inside.mean(axis=0), axis=1)
+        assert np.linalg.norm(points[row] - inside.mean(axis=0)) == pytest.approx(far.min())

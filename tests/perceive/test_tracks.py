@@ -45,7 +45,7 @@ class World:
         return ClusterReturns(np.array(centre, np.float32).reshape(-1, 3), rate.astype(np.float32), count)
 
     def follow(self, times, drives=None, ego_known=True):
-        state, found = TrackState.empty(), []
+        state, found = TrackState(), []
         for i, t in enumerate(times):
             ego = EgoMotion((self.speed, 0.0) if ego_known else None, self.yaw_rate)
             drive = 0 if drives is None else drives[i]
@@ -103,5 +103,5 @@ def test_cluster_rates_are_averaged_on_the_circle_of_the_period(period, rate):
     assert returns.rate_mps[1] == pytest.approx(2.0, abs=1e-5)
     assert returns.points.tolist() == [2, 1]
     none = measure_clusters(xyz, residual, np.full(3, -1, np.int32), period)
-    state, tracks = advance_tracks(TrackState.empty(), 0, 0, EgoMotion((0.0, 0.0), None), none, period)
+    state, tracks = advance_tracks(TrackState(), 0, 0, EgoMotion((0.0, 0.0), None), none, period)
     assert (tracks.xyz_m.shape, state.filters.state.shape) == ((0, 3), (0, 4))

@@ -1,6 +1,6 @@
 """Times of a spinning lidar's points from their azimuth, as fleet.toml says that it turns."""
 
-from dataclasses import dataclass, replace
+from dataclasses import fields, replace
 from functools import cache
 
 import numpy as np
@@ -13,6 +13,7 @@ from pipeline.simulate.sensors.lidar import sweep_lidar
 from pipeline.simulate.world.casting import World
 from pipeline.simulate.world.drives import Drive
 from schemas.captures import Sweep
+from schemas.moments import EgoColumns, Moment
 from tests.makers.swept_streets import AROUND, pose
 
 GAP_S, SWEEPS = 0.5, 14
@@ -23,15 +24,11 @@ _AZIMUTH = np.linspace(-np.pi, np.pi, 20_000)
 ANY = np.stack([9 * np.cos(_AZIMUTH), 9 * np.sin(_AZIMUTH), np.tile([-1.0, 0.0, 1.0, 2.0], 5_000)], 1)
 
 
-@dataclass
-class Seen:
-    """A moment, as far as this is concerned."""
-
-    moment: int
-    stamp_ns: int
-    drive: int = 0
-    ego_speed_mps: float | None = None
-    ego_yaw_rate_radps: float | None = None
+def seen_at(stamp_s, speed_mps=None):
+    """A moment of the one drive; moments are told apart by their numbers."""
+    ego = dict.fromkeys(f.name for f in fields(EgoColumns)) | {"ego_speed_mps": speed_mps}
+    number, stamp_ns = round(10 * stamp_s), round(1e9 * stamp_s)
+    return Moment(moment=number, log="", drive=0, stamp_ns=stamp_ns, rows={}, gap_ns={}, **ego)
 
 
 @cache
@@ -73,7 +70,7 @@ def off_m(cloud, still):
 @pytest.mark.parametrize(("change", "sense"), [(np.asarray, "right"), (mirrored, "left")])
 def test_points_are_moved_to_the_stamp_by_the_motion_between_sweeps(change, sense):
     raw, still, since_s = zip(*drive(), strict=True)
-    seen = [(Seen(k, round(1e9 * k * GAP_S)), sweep(change(xyz))) for k, xyz in enumerate(raw)]
+    seen = [(seen_at(k * GAP_S), sweep(change(xyz))) for k, xyz in enumerate(raw)]
     turning = turning_of(seen, LidarTurn(sense=sense, begins_deg=180.0))
     wrong = replace(
         turning, turn=LidarTurn(sense={"left": "right", "right": "left"}[sense], begins_deg=180.0)
@@ -92,7 +89,7 @@ def test_points_are_moved_to_the_stamp_by_the_motion_between_sweeps(change, sens
 @pytest.mark.parametrize(("speed_mps", "note"), [(0.0, ""), (8.0, WITHOUT_TIMES)])
 def test_a_lidar_of_which_nobody_knows_is_counted_where_the_car_drives(speed_mps, note):
     as_logged = sweep(ANY)
-    assert Turning(None, {}).timed(Seen(0, 0, ego_speed_mps=speed_mps), as_logged) == (as_logged, note)
+    assert Turning(None, {}).timed(seen_at(0.0, speed_mps), as_logged) == (as_logged, note)
 
 
 @pytest.mark.parametrize(
@@ -103,6 +100,6 @@ def test_what_fleet_toml_says_needs_no_car_that_moves(sense, stamp, times):
     azimuth = np.radians([-89.9999, 0.0] if sense == "left" else [-90.0001, 0.0])
     ahead = np.stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth], 1)
     cloud = sweep(np.vstack([10 * ahead, ANY]))
-    timed, note = turning_of([(Seen(0, 0), cloud)], told).timed(Seen(0, 0), cloud)
+    timed, note = turning_of([(seen_at(0.0), cloud)], told).timed(seen_at(0.0), cloud)
     np.testing.assert_allclose(timed.lidar_time_s[:2], times, atol=1e-4)
     assert (note, timed.lidar_deskewed) == (BY_AZIMUTH, False)

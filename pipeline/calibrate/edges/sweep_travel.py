@@ -172,11 +172,11 @@ def _between(
     (vx, vy), turn = ego.velocity_mps[[i, j]].mean(0), ego.yaw_rate_radps[[i, j]].mean()
     start = exp_se3(np.array([0.0, 0.0, turn, vx, vy, 0.0]) * gap_s)
     found = register(after[:: max(1, len(after) // _MOST_POINTS)], surfaces, start, _START_SIGMAS)
-    if found is None or found.found.share < _LEAST_SHARE:
+    if found is None or found[1].share < _LEAST_SHARE:
         return None
-    xi = log_se3(found.T) / gap_s
+    xi = log_se3(found[0]) / gap_s
     way_m = float(np.linalg.norm(xi[3:])) * gap_s
-    aside_m, up_m = _sigmas_m(found.found.information, way_m)
+    aside_m, up_m = _sigmas_m(found[1].information, way_m)
     if max(aside_m, up_m) > _HELD_SHARE * _LOOSE_M or way_m < _LEAST_WAY_M / 2:
         return None
     faster = (ego.velocity_mps[j, 0] - ego.velocity_mps[i, 0]) / gap_s

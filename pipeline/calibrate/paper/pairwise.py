@@ -16,8 +16,8 @@ from pipeline.core.config import SolveConfig
 from pipeline.core.results import Progress, silent
 from pipeline.objective.paper.camera_lidar import CameraLidarLoss, camera_lidar_loss
 from pipeline.objective.paper.camera_radar import CameraRadarLoss, camera_radar_loss
+from pipeline.objective.paper.classes import loop_loss, loop_transform
 from pipeline.objective.paper.lidar_radar import LidarRadarLoss, lidar_radar_loss
-from pipeline.objective.paper.loop import joint_objective, loop_loss, loop_transform
 from pipeline.rig.changes import changed
 from pipeline.rig.checks import Check
 from pipeline.rig.common_share import common_of
@@ -311,4 +311,4 @@ def joint_costs(
         (problems[pair].loss(poses[pair]) / scale for pair, scale in scales.items()), np.zeros(len(x))
     )
     loop = loop_transform(poses["camera_lidar"], poses["lidar_radar"], poses["camera_radar"])
-    return joint_objective(pairwise, loop_loss(loop))
+    return (1 + pairwise) * (1 + loop_loss(loop))  # equation 2

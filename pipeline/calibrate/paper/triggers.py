@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from pipeline.core.config import TriggerConfig
 from pipeline.objective.paper.camera_lidar import cluster_points
-from pipeline.objective.paper.classes import REFLECTING, camera_at_label_size, in_camera, labels_of
+from pipeline.objective.paper.classes import REFLECTING, camera_at_label_size, labels_of
 from pipeline.objective.paper.lidar_radar import CELL_M, FAR_M, drivable_map
 from pipeline.rig.cameras import Camera
 from pipeline.rig.se3 import inverse, transform_points
@@ -81,10 +81,10 @@ def _append(found: dict[str, list[float]], **values: float | None) -> None:
 def _lidar_outside(observation: Observation, labels: np.ndarray, T_camera_lidar: np.ndarray) -> float | None:
     """Cluster points that fall on no reflecting class, as a share of the cloud in view."""
     camera = camera_at_label_size(observation, labels)
-    cloud = _classes(camera, labels, in_camera(T_camera_lidar, observation.lidar_map_xyz_m))
+    cloud = _classes(camera, labels, transform_points(T_camera_lidar, observation.lidar_map_xyz_m))
     if not len(cloud):
         return None
-    clusters = _classes(camera, labels, in_camera(T_camera_lidar, cluster_points(observation)))
+    clusters = _classes(camera, labels, transform_points(T_camera_lidar, cluster_points(observation)))
     return float(np.sum(~np.isin(clusters, REFLECTING)) / len(cloud))
 
 
@@ -95,7 +95,9 @@ def _radar_outside_image(
     camera, dynamic = camera_at_label_size(observation, labels), _dynamic(observation)
     if not len(dynamic):
         return None
-    return float(np.sum(~np.isin(_classes(camera, labels, in_camera(T_camera_radar, dynamic)), ROAD_USERS)))
+    return float(
+        np.sum(~np.isin(_classes(camera, labels, transform_points(T_camera_radar, dynamic)), ROAD_USERS))
+    )
 
 
 def _classes(camera: Camera, labels: np.ndarray, points_camera: np.ndarray) -> np.ndarray:

@@ -40,7 +40,7 @@ from pipeline.objective.radar.registration import (
     registration_cost,
     registration_frames,
 )
-from pipeline.objective.stamp_gaps import camera_gaps_s, constant_gap_s, radar_gaps_s
+from pipeline.objective.stamp_gaps import constant_gap_s, gaps_s
 from pipeline.rig.changes import change_jacobian
 from pipeline.rig.estimates import PairEstimate, Prior
 from pipeline.rig.se3 import exp_se3, exp_so3, from_rotation_translation, log_so3, rotation_angle_rad
@@ -109,7 +109,7 @@ def _camera_lidar(
     focal = estimate.diagnostics.get("focal_scale", 1.0)
     # Of methods that estimate none: as if sensors of constant gaps measured together.
     dt_s = (
-        constant_gap_s(camera_gaps_s(observations))
+        constant_gap_s(gaps_s(observations, "camera"))
         if estimate.time_offset_s is None
         else estimate.time_offset_s
     )
@@ -121,7 +121,8 @@ def _camera_lidar(
 
     def cost(T: np.ndarray) -> np.ndarray:
         at = Alignments(T[None], np.array([dt_s]), np.array([focal]))
-        score = (terms.edge_excess(at, sharp) + terms.marking_excess(at, sharp))[0]
+        edges, paint = (terms.beyond_chance(s, at, sharp) for s in (Terms.edge_score, Terms.marking_score))
+        score = (edges + paint)[0]
         return np.where(has_points, -score, np.nan)
 
     def derivatives(step: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
@@ -150,7 +151,7 @@ def _lidar_radar(
     frames = registration_frames(observations, estimate.T, np.random.default_rng(0))
     range_bias_m = estimate.diagnostics.get("range_bias_m", 0.0)
     dt_s = (
-        -constant_gap_s(radar_gaps_s(observations))
+        -constant_gap_s(gaps_s(observations, "radar"))
         if estimate.time_offset_s is None
         else estimate.time_offset_s
     )

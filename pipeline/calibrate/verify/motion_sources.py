@@ -20,7 +20,7 @@ from pipeline.rig.checks import Check
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, transform_points
 from schemas.observations import Observation
 
-__all__ = ["MotionFindings", "SweepMotion", "compared_sources", "sweep_motion"]
+__all__ = ["MotionFindings", "compared_sources", "sweep_motion"]
 
 _GAP_S, _LONGEST_GAP_S = 0.5, 0.8  # as long as scenes still overlap: at 0.1 s half a cell is 2.5 m/s
 _MOST_PAIRS = 30
@@ -122,16 +122,16 @@ def _sources(observations: Sequence[Observation], T_lidar_radar: np.ndarray) -> 
 
 def _slopes(observations: Sequence[Observation], sources: _Sources) -> dict[str, _Slope]:
     """Ratios and lag of the sources, from moving and turning frames."""
-    lidar = sweep_motion(observations)
+    pairs, speed_mps, yaw_rate_radps = sweep_motion(observations)
     odometry, turn, doppler = (
-        np.array([values[i : j + 1].mean() for i, j in zip(lidar.first, lidar.last, strict=True)], np.float64)
+        np.array([values[i : j + 1].mean() for i, j in pairs], np.float64)
         for values in (sources.odometry_mps, sources.yaw_rate_radps, sources.doppler_mps)
     )
     found = {
-        "odometry_by_lidar": _slope(odometry, lidar.speed_mps, _MOVING_MPS),
-        "doppler_by_lidar": _slope(doppler, lidar.speed_mps, _MOVING_MPS),
+        "odometry_by_lidar": _slope(odometry, speed_mps, _MOVING_MPS),
+        "doppler_by_lidar": _slope(doppler, speed_mps, _MOVING_MPS),
         "odometry_by_doppler": _slope(sources.odometry_mps, sources.doppler_mps, _MOVING_MPS),
-        "yaw_rate_by_lidar": _slope(turn, lidar.yaw_rate_radps, _TURNING_RADPS),
+        "yaw_rate_by_lidar": _slope(turn, yaw_rate_radps, _TURNING_RADPS),
         "odometry_lag_s": _lag(observations, sources),
     }
     return {name: slope for name, slope in found.items() if slope is not None}
@@ -298,27 +298,24 @@ def _share(y: np.ndarray, expected: np.ndarray) -> float:
 # -- the lidar's own sweeps, without odometry, Doppler or calibration --------------
 
 
-@dataclass(frozen=True, eq=False)
-class SweepMotion:
-    """Motion between pairs of sweeps that determine it. Lidar axes: x ahead, positive yaw to the left."""
+def sweep_motion(
+    observations: Sequence[Observation],
+) -> tuple[Int64[np.ndarray, "P 2"], Float[np.ndarray, " P"], Float[np.ndarray, " P"]]:
+    """Motion between sweeps about half a second apart that determine it, of at most 30 pairs over the day.
 
-    first: Int64[np.ndarray, " P"]  # place of the earlier observation
-    last: Int64[np.ndarray, " P"]
-    speed_mps: Float[np.ndarray, " P"]
-    yaw_rate_radps: Float[np.ndarray, " P"]
-
-
-def sweep_motion(observations: Sequence[Observation]) -> SweepMotion:
-    """Motion between sweeps about half a second apart, of at most 30 pairs over the day."""
+    Returns:
+        Places of the earlier and the later observation, speed [m/s] and yaw rate [rad/s] in lidar axes: x ahead,
+        positive yaw to the left.
+    """
     pairs = _pairs(observations)
     pairs = pairs[np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), _MOST_PAIRS)).astype(int))]
-    found = [
-        (i, j, *motion)
-        for i, j in pairs
-        if (motion := _between(observations[i], observations[j])) is not None
-    ]
-    first, last, speed, turn = np.array(found, np.float64).reshape(-1, 4).T
-    return SweepMotion(first.astype(np.int64), last.astype(np.int64), speed, turn)
+    found = []
+    for i, j in pairs:
+        a, b = observations[i], observations[j]
+        arc = arc_between(_standing(a), _standing(b), (b.stamp_ns - a.stamp_ns) * 1e-9)
+        found += [] if arc is None else [(i, j, *arc)]
+    table = np.array(found, np.float64).reshape(-1, 4)
+    return table[:, :2].astype(np.int64), table[:, 2], table[:, 3]
 
 
 def _pairs(observations: Sequence[Observation]) -> Int64[np.ndarray, "P 2"]:
@@ -332,11 +329,6 @@ def _pairs(observations: Sequence[Observation]) -> Int64[np.ndarray, "P 2"]:
         if 0 < gap[j] <= _LONGEST_GAP_S:
             out.append((i, i + 1 + j))
     return np.array(out, np.int64).reshape(-1, 2)
-
-
-def _between(before: Observation, after: Observation) -> tuple[float, float] | None:
-    """Speed and yaw rate from one sweep to the other; None if undetermined."""
-    return arc_between(_standing(before), _standing(after), (after.stamp_ns - before.stamp_ns) * 1e-9)
 
 
 def _standing(o: Observation) -> Float[np.ndarray, "N 2"]:

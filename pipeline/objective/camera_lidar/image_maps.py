@@ -66,9 +66,8 @@ class CameraMaps:
 
     camera: Camera  # scaled to label size
     offsets: np.ndarray  # int8, F 4 H W: by EDGE_*, k of k + 1/2 px along u (left, right) or v (above, below)
-    contrast: (
-        np.ndarray
-    )  # int8, L F H W: road contrast in CONTRAST_STEP standard deviations of its row, 0 outside
+    # int8, L F H W: road contrast in CONTRAST_STEP standard deviations of its row, 0 outside
+    contrast: np.ndarray
     labels: np.ndarray  # uint8, F H W
 
 
@@ -172,7 +171,7 @@ def contrast_levels(
     band = slice(rows[0], rows[-1] + 1)
     inside = is_road[band].astype(np.float32)
     value = contrast[band].astype(np.float32) * inside
-    count = np.maximum(_row_sums(inside), 1.0)
+    count = np.maximum(_over_rows(inside.sum(1, keepdims=True)), 1.0)
     smooth = np.empty_like(value)
     sums = np.empty((2, len(value), 1), np.float32)
     for level, blur in enumerate(blurs_px):
@@ -222,11 +221,6 @@ def _blurred(x: np.ndarray, sigma_px: float) -> np.ndarray:
     return cv2.blur(cv2.blur(x, size), size)
 
 
-def _row_sums(x: np.ndarray) -> np.ndarray:
-    """Sums over each row and, with falling weight, the rows about it, as a column."""
-    return _over_rows(x.sum(1, keepdims=True))
-
-
 def _over_rows(x: np.ndarray) -> np.ndarray:
     """Gaussian blur along the columns."""
     return cv2.GaussianBlur(x, (1, 25), 0, sigmaY=4.0)
@@ -249,7 +243,7 @@ def prepare_maps(
         if o.steps_png is None:
             _scan(_FOREGROUND, labels[f], offsets[f])
         else:
-            offsets[f] = step_offsets(_decoded(o.steps_png), REACH_PX, NO_BOUNDARY)
+            offsets[f] = step_offsets(_decoded(o.steps_png))
             is_road = free_ground(o.lidar_drivable_xyz_m.astype(np.float64), camera, start)
         if o.road_contrast_png is not None:
             contrast[:, f] = contrast_levels(_decoded(o.road_contrast_png), is_road, blurs_px)
@@ -261,24 +255,19 @@ def _decoded(png: bytes) -> UInt8[np.ndarray, "H W"]:
     return np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE), np.uint8)
 
 
-def step_offsets(steps: UInt8[np.ndarray, "H W"], reach_px: int, none: int) -> Int8[np.ndarray, "4 H W"]:
-    """Offsets k (of k + 1/2 px) to each pixel's nearest step, by EDGE_* class; `none` out of reach.
-
-    A step shows no side, so left and right have the same offsets, and above and below.
-    """
-    out = np.empty((4, *steps.shape), np.int8)
-    out[:2] = _along_rows((steps & STEP_RIGHT) > 0, reach_px, none)
-    out[2:] = _along_rows((steps.T & STEP_BELOW) > 0, reach_px, none).T
-    return out
+def step_offsets(steps: UInt8[np.ndarray, "H W"]) -> Int8[np.ndarray, "4 H W"]:
+    """As `boundary_offsets`, of steps of brightness: they show no side, so opposite classes have the same offsets."""
+    right, below = _along_rows((steps & STEP_RIGHT) > 0), _along_rows((steps.T & STEP_BELOW) > 0).T
+    return np.stack([right, right, below, below])
 
 
-def _along_rows(is_step: Bool[np.ndarray, "H W"], reach_px: int, none: int) -> Int8[np.ndarray, "H W"]:
+def _along_rows(is_step: Bool[np.ndarray, "H W"]) -> Int8[np.ndarray, "H W"]:
     column = np.arange(is_step.shape[1])
     behind = np.maximum.accumulate(np.where(is_step, column, -_FAR_PX), axis=1)
     behind = np.pad(behind, ((0, 0), (1, 0)), constant_values=-_FAR_PX)[:, :-1] - column
     ahead = np.minimum.accumulate(np.where(is_step, column, _FAR_PX)[:, ::-1], axis=1)[:, ::-1] - column
     nearest = np.where(2 * ahead + 1 < -2 * behind - 1, ahead, behind)
-    return np.where(np.abs(nearest) <= reach_px, nearest, none).astype(np.int8)
+    return np.where(np.abs(nearest) <= REACH_PX, nearest, NO_BOUNDARY).astype(np.int8)
 
 
 def free_ground(xyz_m: Float[np.ndarray, "N 3"], camera: Camera, start: Start) -> Bool[np.ndarray, "H W"]:

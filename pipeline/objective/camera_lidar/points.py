@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.objective.ego_motion import shown_heading
+from pipeline.objective.stamp_gaps import turned
 from pipeline.rig.cameras import Camera
 from schemas.observations import Observation
 
@@ -30,9 +31,7 @@ __all__ = [
     "EDGE_KINDS",
     "Points",
     "exposed",
-    "gather_classes",
-    "gather_edges",
-    "gather_markings",
+    "gathered",
     "is_near_view",
     "lidar_velocities",
     "motion_in_camera",
@@ -64,7 +63,7 @@ class Points:
     Frame f uses the maps of row image[f], so that maps need not be copied for a selection of frames.
 
     `exposure_s` is the time of a point's image row after the middle row, if points were moved to that time
-    (`rolling_shutter.exposed`).
+    (`exposed`).
     """
 
     xyz_m: np.ndarray
@@ -77,68 +76,40 @@ class Points:
 
     def chosen(self, keep: np.ndarray) -> Points:
         """The points of a mask."""
-        counts = np.concatenate([[0], np.cumsum(keep)])
-        return Points(
-            np.ascontiguousarray(self.xyz_m[keep]),
-            counts[self.start],
-            self.side[keep],
-            self.kind[keep],
-            self.gap_rad[keep],
-            self.exposure_s[keep],
-            self.image,
-        )
+        return self._rows(keep, np.concatenate([[0], np.cumsum(keep)])[self.start], self.image)
 
     def of_frames(self, frames: np.ndarray) -> Points:
         """The points of some frames, in the order given."""
         rows = [np.arange(self.start[f], self.start[f + 1]) for f in frames]
         start = np.concatenate([[0], np.cumsum([len(r) for r in rows])]).astype(np.int64)
-        index = np.concatenate(rows) if rows else np.empty(0, np.int64)
-        return Points(
-            np.ascontiguousarray(self.xyz_m[index]),
-            start,
-            self.side[index],
-            self.kind[index],
-            self.gap_rad[index],
-            self.exposure_s[index],
-            self.image[frames],
-        )
+        return self._rows(np.concatenate([np.empty(0, np.int64), *rows]), start, self.image[frames])
+
+    def _rows(self, rows: np.ndarray, start: np.ndarray, image: np.ndarray) -> Points:
+        columns = (self.side, self.kind, self.gap_rad, self.exposure_s)
+        side, kind, gap_rad, exposure_s = (c[rows] for c in columns)
+        return Points(self.xyz_m[rows], start, side, kind, gap_rad, exposure_s, image)
 
 
-def gather_edges(
+def gathered(
     observations: Sequence[Observation],
     T_camera_lidar: Float[np.ndarray, "4 4"],
     camera: Camera,
     reach_rad: float,
-) -> Points:
-    """Depth jumps with their direction and kind."""
-    kinds = _kinds(observations)
-    columns = [
-        (o.lidar_edge_xyz_m, o.lidar_edge_side, k, o.lidar_edge_gap_rad)
-        for o, k in zip(observations, kinds, strict=True)
-    ]
-    return _gather(columns, T_camera_lidar, camera, reach_rad)
+) -> tuple[Points, Points, Points]:
+    """Points in the camera's view or near it: depth jumps with direction and kind, markings, the sampled cloud.
 
+    Markings are ground points with a higher reflectivity than the road; the cloud has its class of height and range.
+    """
+    edges, markings, bounds = [], [], view_bounds(camera)
 
-def gather_markings(
-    observations: Sequence[Observation],
-    T_camera_lidar: Float[np.ndarray, "4 4"],
-    camera: Camera,
-    reach_rad: float,
-) -> Points:
-    """Ground points with a higher reflectivity than the road."""
-    bright = [o.marking_xyz_m[o.marking_z > _MARKING_Z] for o in observations]
-    plain = [np.zeros(len(b), np.uint8) for b in bright]
-    return _gather(list(zip(bright, plain, plain, plain, strict=True)), T_camera_lidar, camera, reach_rad)
+    def near(frames: Sequence[tuple[np.ndarray, ...]]) -> Points:
+        return _gather(frames, T_camera_lidar, bounds, reach_rad)
 
-
-def gather_classes(
-    observations: Sequence[Observation],
-    T_camera_lidar: Float[np.ndarray, "4 4"],
-    camera: Camera,
-    reach_rad: float,
-) -> Points:
-    """The sampled cloud with its class of height and range."""
-    return _gather([_height_classes(o) for o in observations], T_camera_lidar, camera, reach_rad)
+    for o, kind in zip(observations, _kinds(observations), strict=True):
+        edges.append((o.lidar_edge_xyz_m, o.lidar_edge_side, kind, o.lidar_edge_gap_rad))
+        bright = o.marking_xyz_m[o.marking_z > _MARKING_Z]
+        markings.append((bright, *[np.zeros(len(bright), np.uint8)] * 3))
+    return near(edges), near(markings), near([_height_classes(o) for o in observations])
 
 
 def view_bounds(camera: Camera) -> Float[np.ndarray, " 4"]:
@@ -185,7 +156,7 @@ def _kinds(observations: Sequence[Observation]) -> list[np.ndarray]:
     return out
 
 
-def _height_classes(o: Observation) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _height_classes(o: Observation) -> tuple[np.ndarray, ...]:
     """Every eighth point of the sampled cloud with its class; none if the road was not found."""
     xyz = o.lidar_map_xyz_m[::_CLASS_STRIDE] if o.ground_plane is not None else o.lidar_map_xyz_m[:0]
     plane = o.ground_plane if o.ground_plane is not None else np.zeros(4)
@@ -195,13 +166,12 @@ def _height_classes(o: Observation) -> tuple[np.ndarray, np.ndarray, np.ndarray,
 
 
 def _gather(
-    frames: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]],
+    frames: Sequence[tuple[np.ndarray, ...]],
     T_camera_lidar: np.ndarray,
-    camera: Camera,
+    bounds: np.ndarray,
     reach_rad: float,
 ) -> Points:
     """Points of all frames in or near the camera's field of view."""
-    bounds = view_bounds(camera)
     kept, counts = [], [0]
     for xyz, side, kind, gap in frames:
         near = is_near_view(xyz, T_camera_lidar, bounds, reach_rad)
@@ -303,7 +273,7 @@ def exposed(
     """
     frame = np.repeat(np.arange(len(poses)), np.diff(points.start))
     velocity, turn = velocity_lidar[frame], yaw_rate[frame]
-    still = _turned(points.xyz_m.astype(np.float64), turn * points.exposure_s)
+    still = turned(points.xyz_m.astype(np.float64), turn * points.exposure_s)
     still += velocity * points.exposure_s[:, None]
     exposure_s, moved = np.zeros(len(frame)), still
     for _ in range(_ROUNDS if readout_s else 0):
@@ -311,16 +281,5 @@ def exposed(
         uv, valid = camera.project(np.einsum("nij,nj->ni", rows[:, :, :3], moved) + rows[:, :, 3])
         exposure_s = np.where(valid, row_delays_s(uv[:, 1], camera.height_px, readout_s), 0.0)
         # The car was there `exposure_s` later, so static objects were nearer by its motion.
-        moved = _turned(still - velocity * exposure_s[:, None], -turn * exposure_s)
-    return replace(
-        points,
-        xyz_m=np.ascontiguousarray(moved, np.float32),
-        exposure_s=exposure_s.astype(np.float32),
-    )
-
-
-def _turned(points: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
-    """Each point turned about the lidar's vertical by its own angle."""
-    c, s = np.cos(angle_rad), np.sin(angle_rad)
-    x, y = points[:, 0], points[:, 1]
-    return np.stack([c * x - s * y, s * x + c * y, points[:, 2]], -1)
+        moved = turned(still - velocity * exposure_s[:, None], -turn * exposure_s)
+    return replace(points, xyz_m=moved.astype(np.float32), exposure_s=exposure_s.astype(np.float32))

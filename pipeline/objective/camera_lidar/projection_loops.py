@@ -26,7 +26,6 @@ __all__ = [
 
 _PINHOLE, _DISTORTED, _EQUIDISTANT = 0.0, 1.0, 2.0
 _POLYNOMIAL_DEGREE = 9
-_MIN_DEPTH_M = 0.3
 
 
 def camera_parameters(camera: Camera) -> np.ndarray:

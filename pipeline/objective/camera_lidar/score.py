@@ -22,23 +22,20 @@ from pipeline.objective.camera_lidar.edges import (
 )
 from pipeline.objective.camera_lidar.image_maps import CONTRAST_STEP, CameraMaps, Start, prepare_maps
 from pipeline.objective.camera_lidar.kernel_settings import MAX_GAP_PX, WIDEST_GAP_RAD, KernelSettings
-from pipeline.objective.camera_lidar.mutual_information import class_information
 from pipeline.objective.camera_lidar.points import (
     CLASSES,
     EDGE_KINDS,
     Points,
     exposed,
-    gather_classes,
-    gather_edges,
-    gather_markings,
+    gathered,
     is_near_view,
     motion_in_camera,
     moving_poses,
     view_bounds,
 )
 from pipeline.objective.camera_lidar.projection_loops import camera_parameters, count_in_view
-from pipeline.objective.camera_lidar.reflectivity import marking_gradients, marking_scores
-from pipeline.objective.stamp_gaps import camera_gaps_s
+from pipeline.objective.camera_lidar.readings import class_information, marking_gradients, marking_scores
+from pipeline.objective.stamp_gaps import gaps_s
 from schemas.observations import EDGE_ABOVE, Observation
 
 __all__ = [
@@ -99,12 +96,12 @@ class Terms:
     @cached_property
     def narrow(self) -> Terms:
         """With edges alone that localise a silhouette within MAX_GAP_PX."""
-        return replace(self.of_kinds(edges=False, markings=False), edges=self.edges.chosen(~self._is_wide))
+        return self.sharp().of_kinds(edges=True, markings=False)
 
     @cached_property
     def wide(self) -> Terms:
         """With the other edges alone."""
-        return replace(self.of_kinds(edges=False, markings=False), edges=self.edges.chosen(self._is_wide))
+        return replace(self, edges=self.edges.chosen(self._is_wide)).of_kinds(edges=True, markings=False)
 
     def of_kinds(self, *, edges: bool, markings: bool) -> Terms:
         """With or without edges, and markings."""
@@ -114,10 +111,9 @@ class Terms:
         ]
         return replace(self, edges=kept[0], markings=kept[1])
 
-    def sharp(self, max_gap_px: float) -> Terms:
-        """Without the edges whose interval is wider than `max_gap_px`."""
-        narrow = self.edges.gap_rad * self.camera[1] <= max_gap_px
-        return replace(self, edges=self.edges.chosen(narrow))
+    def sharp(self) -> Terms:
+        """Without the edges whose interval is wider than MAX_GAP_PX."""
+        return replace(self, edges=self.edges.chosen(~self._is_wide))
 
     def telling(self) -> Terms:
         """Without wide edges, unless most edges between rows are wide: then only they determine pitch.
@@ -127,7 +123,7 @@ class Terms:
         between = self.edges.side >= EDGE_ABOVE
         mostly_wide = 2 * np.count_nonzero(between & self._is_wide) > np.count_nonzero(between)
         if not mostly_wide:
-            return self.sharp(MAX_GAP_PX)
+            return self.sharp()
         return replace(self, edges=self.edges.chosen(self.edges.gap_rad <= WIDEST_GAP_RAD))
 
     def in_view(self, T_camera_lidar: Float[np.ndarray, "4 4"], margin_rad: float) -> Terms:
@@ -164,15 +160,9 @@ class Terms:
 
     def of_frames(self, frames: np.ndarray) -> Terms:
         """The terms of a selection of the frames; maps are shared."""
-        return replace(
-            self,
-            edges=self.edges.of_frames(frames),
-            markings=self.markings.of_frames(frames),
-            classes=self.classes.of_frames(frames),
-            velocity_lidar=self.velocity_lidar[frames],
-            yaw_rate=self.yaw_rate[frames],
-            gap_s=self.gap_s[frames],
-        )
+        points = {name: getattr(self, name).of_frames(frames) for name in ("edges", "markings", "classes")}
+        rows = {name: getattr(self, name)[frames] for name in ("velocity_lidar", "yaw_rate", "gap_s")}
+        return replace(self, **points, **rows)
 
     def gaps_beyond(self, constant_s: float) -> Terms:
         """With gaps minus a constant, so that time offsets are relative to it."""
@@ -225,35 +215,24 @@ class Terms:
         xyz = np.ascontiguousarray(self.edges.xyz_m.T)
         return count_in_view(self.camera, xyz, self.edges.start, self.poses(at), width, height)
 
-    def edge_excess(
-        self,
-        at: Alignments,
-        settings: KernelSettings,
-        shifts_px: Sequence[tuple[float, float]] = _SHIFTS_PX,
-    ) -> Float[np.ndarray, "P F"]:
-        """Edge score minus the score of the same edges in shifted images: 0 for a pose that matches by chance.
-
-        This makes poses comparable that see different numbers of edges: turning edges out of view gains
-        nothing.
-        """
-        return self._beyond_chance(Terms.edge_score, at, settings, shifts_px)
-
-    def marking_excess(
-        self,
-        at: Alignments,
-        settings: KernelSettings,
-        shifts_px: Sequence[tuple[float, float]] = _SHIFTS_PX,
-    ) -> Float[np.ndarray, "P F"]:
-        """As `edge_excess`, of the markings: a pose that lays them onto a bright stretch of road gains nothing."""
-        return self._beyond_chance(Terms.marking_score, at, settings, shifts_px)
-
-    def _beyond_chance(
+    def beyond_chance(
         self,
         score: Callable[[Terms, Alignments, KernelSettings], np.ndarray],
         at: Alignments,
         settings: KernelSettings,
-        shifts_px: Sequence[tuple[float, float]],
+        shifts_px: Sequence[tuple[float, float]] = _SHIFTS_PX,
     ) -> Float[np.ndarray, "P F"]:
+        """Score minus that of the same points in shifted images: 0 for a pose that matches by chance.
+
+        This makes poses comparable that see different numbers of edges: turning edges out of view gains
+        nothing, nor does laying markings onto a bright stretch of road.
+
+        Args:
+            score: `Terms.edge_score` or `Terms.marking_score`.
+            at: the alignments.
+            settings: kernel of the score.
+            shifts_px: of the image (right, down).
+        """
         shifted = np.zeros((len(at.dt_s), self.frames))
         for u, v in shifts_px:
             camera = self.camera.copy()
@@ -361,10 +340,9 @@ def prepare_terms(
     """
     start = Start(T_camera_lidar, reach_rad) if start is None else start
     maps = prepare_maps(observations, CONTRAST_BLURS_PX, start)
-    view = (observations, T_camera_lidar, maps.camera, reach_rad)
-    edges, markings, classes = gather_edges(*view), gather_markings(*view), gather_classes(*view)
     yaw_rate = np.array([o.ego_yaw_rate_radps or 0.0 for o in observations])
-    gap_s = camera_gaps_s(observations)
-    camera = camera_parameters(maps.camera)
-    at_px = observations[0].label_offset_px
-    return Terms(maps, camera, edges, markings, classes, velocity_lidar, yaw_rate, gap_s, readout_s, at_px)
+    gap_s, at_px = gaps_s(observations, "camera"), observations[0].label_offset_px
+    points = gathered(observations, T_camera_lidar, maps.camera, reach_rad)
+    return Terms(
+        maps, camera_parameters(maps.camera), *points, velocity_lidar, yaw_rate, gap_s, readout_s, at_px
+    )

@@ -38,7 +38,6 @@ __all__ = [
     "folded_tensors",
     "lidar_radar_tensors",
     "padded",
-    "smooth_iou",
 ]
 
 
@@ -109,9 +108,12 @@ class LidarRadarTensors:
     def drivable_iou(self, T_lidar_radar: Float[Tensor, "*batch #F 4 4"]) -> Float[Tensor, "*batch F"]:
         """Smooth IoU of the two drivable areas, 0..1; 0 where a frame lacks one of them."""
         seen = transform_points(inverse(T_lidar_radar), self.drivable)
-        return smooth_iou(
-            seen, self.drivable_present, self.lidar_area_m2, self.radar_maps, self.radar_area_m2
-        )
+        row = seen[..., 0] / lidar_radar.CELL_M - 0.5
+        column = seen[..., 1] / lidar_radar.CELL_M - 0.5 + self.radar_maps.shape[2] // 2
+        known = torch.ones_like(row, dtype=torch.bool)
+        inside = bilinear(self.radar_maps, torch.stack([column, row], -1), known, 0.0)
+        overlap = masked_mean(inside, self.drivable_present) * self.lidar_area_m2
+        return overlap / (self.lidar_area_m2 + self.radar_area_m2 - overlap).clamp_min(1e-9)
 
     def _nearest_costs(self, T_lidar_radar: Tensor) -> Tensor:
         delta = transform_points(T_lidar_radar, self.tracks)[..., :, None, :] - self.centres[:, None]
@@ -119,23 +121,6 @@ class LidarRadarTensors:
         squared = delta[..., :2].square().sum(-1) + height.square()
         squared = squared.masked_fill(~self.centre_present[:, None], 1e12)
         return distance_cost(squared.amin(-1), lidar_radar.SCALE_M)
-
-
-def smooth_iou(
-    drivable_radar: Float[Tensor, "*batch F N 3"],
-    present: Bool[Tensor, "F N"],
-    lidar_area_m2: Float[Tensor, " F"],
-    radar_maps: Float[Tensor, "F ahead across"],
-    radar_area_m2: Float[Tensor, " F"],
-    cell_m: float = lidar_radar.CELL_M,
-) -> Float[Tensor, "*batch F"]:
-    """IoU of the lidar's drivable cells, in radar axes, with the radar's soft drivable map of cells `cell_m` wide."""
-    row = drivable_radar[..., 0] / cell_m - 0.5
-    column = drivable_radar[..., 1] / cell_m - 0.5 + radar_maps.shape[2] // 2
-    uv = torch.stack([column, row], -1)
-    share = masked_mean(bilinear(radar_maps, uv, torch.ones_like(row, dtype=torch.bool), 0.0), present)
-    overlap = share * lidar_area_m2
-    return overlap / (lidar_area_m2 + radar_area_m2 - overlap).clamp_min(1e-9)
 
 
 def camera_radar_tensors(loss: CameraRadarLoss, dtype: torch.dtype = torch.float32) -> CameraRadarTensors:

@@ -98,7 +98,7 @@ def loop_loss(
 ) -> Float[Tensor, "*batch"]:
     """l1 norm of Euler angles and translation of the loop T_camera_lidar T_lidar_radar T_camera_radar^-1.
 
-    The units are factors [1/rad] and [1/m]; the paper names none, so 1 as in `pipeline.objective.paper.loop`.
+    The units are factors [1/rad] and [1/m]; the paper names none, so 1 as in `pipeline.objective.paper.classes`.
     """
     loop = T_camera_lidar @ T_lidar_radar @ inverse(T_camera_radar)
     return angle_unit * euler_angles(loop).abs().sum(-1) + metre_unit * loop[..., :3, 3].abs().sum(-1)

@@ -20,7 +20,6 @@ __all__ = [
     "CameraProjection",
     "GridProjection",
     "bilinear",
-    "bilinear_groups",
     "camera_projection",
     "masked_mean",
     "nearest_pixel",
@@ -101,10 +100,7 @@ def _pinhole(points: Tensor, d: Tensor, max_angle: Tensor) -> tuple[Tensor, Tens
     x, y, z = points.unbind(-1)
     ahead = z > NEAR_M
     safe = torch.where(ahead, z, torch.ones_like(z))
-    a, b = (
-        torch.where(ahead, x, torch.zeros_like(x)) / safe,
-        torch.where(ahead, y, torch.zeros_like(y)) / safe,
-    )
+    a, b = (torch.where(ahead, q, torch.zeros_like(q)) / safe for q in (x, y))
     r2 = a * a + b * b
     valid = ahead & (r2 <= torch.tan(max_angle) ** 2)
     # What lies beyond the model must not overflow its gradient.
@@ -138,23 +134,18 @@ def bilinear(
     outside: float,
 ) -> Float[Tensor, "*batch F N"]:
     """Map values at pixels; `outside` (without gradient) beyond the image's outermost pixel centres."""
-    return bilinear_groups(maps[:, None], uv, valid, outside)[..., 0]
-
-
-def bilinear_groups(
-    maps: Shaped[Tensor, "F G H W"],
-    uv: Float[Tensor, "*batch F N 2"],
-    valid: Bool[Tensor, "*batch F N"],
-    outside: float = 0.0,
-) -> Float[Tensor, "*batch F N G"]:
-    """Values of G maps of each frame at pixels; `outside` where not valid or beyond the image."""
-    frames, groups, height, width = maps.shape
-    at, a, b, inside = _cell(height, width, uv, valid)
-    plane = torch.arange(frames, device=maps.device)[:, None] * (groups * height * width)
-    # Groups last: the four neighbours are gathered for all of them at once.
-    at = (plane + at)[..., None] + torch.arange(groups, device=maps.device) * (height * width)
-    value = _between(maps.reshape(-1), at, width, a[..., None], b[..., None])
-    return torch.where(inside[..., None], value, outside)
+    frames, height, width = maps.shape
+    u, v = uv.unbind(-1)
+    inside = valid & (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
+    u, v = (torch.where(inside, q, torch.zeros_like(q)) for q in (u, v))
+    # The last pixel belongs to the cell before it: all four neighbours exist.
+    column, row = u.detach().long().clamp_max(width - 2), v.detach().long().clamp_max(height - 2)
+    frame = torch.arange(frames, device=maps.device)[:, None]
+    at, flat = (frame * height + row) * width + column, maps.reshape(-1)
+    m00, m01, m10, m11 = (flat[at + step].to(u.dtype) for step in (0, 1, width, width + 1))
+    a, b = u - column, v - row
+    top, bottom = m00 + a * (m01 - m00), m10 + a * (m11 - m10)
+    return torch.where(inside, top + b * (bottom - top), outside)
 
 
 def nearest_pixel(
@@ -174,19 +165,3 @@ def masked_mean(
     """Mean over the valid points of a frame, 0 without any."""
     weight = present.to(values.dtype)
     return (values * weight).sum(-1) / weight.sum(-1).clamp_min(1)
-
-
-def _cell(height: int, width: int, uv: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Index of the upper left neighbour, distances from it to the right and down, and a mask of points inside."""
-    u, v = uv.unbind(-1)
-    inside = valid & (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
-    u, v = (torch.where(inside, q, torch.zeros_like(q)) for q in (u, v))
-    # The last pixel belongs to the cell before it: all four neighbours exist.
-    column, row = u.detach().long().clamp_max(width - 2), v.detach().long().clamp_max(height - 2)
-    return row * width + column, u - column, v - row, inside
-
-
-def _between(flat: Tensor, at: Tensor, width: int, a: Tensor, b: Tensor) -> Tensor:
-    m00, m01, m10, m11 = (flat[at + step].to(a.dtype) for step in (0, 1, width, width + 1))
-    top, bottom = m00 + a * (m01 - m00), m10 + a * (m11 - m10)
-    return top + b * (bottom - top)

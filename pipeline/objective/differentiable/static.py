@@ -83,7 +83,9 @@ def static_cost(
     direct = (-0.5 * direct).masked_fill(~reached, _NEVER).exp().sum(-1)
     bounced = (-0.5 * bounced).masked_fill(~bounces, _NEVER).exp().sum(-1)
     likelihood = torch.log((1 - bounce_prior) * direct + bounce_prior * bounced + outlier)
-    counts = radar_present & _useful(radar)
+    over_ground, azimuth = radar[..., :2].norm(dim=-1), torch.atan2(radar[..., 1], radar[..., 0])
+    is_near = (over_ground > RANGE_M[0]) & (over_ground < RANGE_M[1])
+    counts = radar_present & is_near & (azimuth.abs() < SIDE_RAD)
     return -(likelihood * counts).sum(-1) / counts.sum(-1).clamp_min(1)
 
 
@@ -122,13 +124,6 @@ def elevation_limits(
     high = torch.where(lidar_present, -angle, away).sort(-1).values.gather(-1, stray)
     found = torch.cat([low, -high], -1)
     return torch.where(found.isfinite(), found, found.new_tensor([-_STEEPEST_RAD, _STEEPEST_RAD]))
-
-
-def _useful(radar: Tensor) -> Tensor:
-    """Detections that the registration uses."""
-    over_ground = radar[..., :2].norm(dim=-1)
-    ahead = torch.atan2(radar[..., 1], radar[..., 0]).abs() < SIDE_RAD
-    return (over_ground > RANGE_M[0]) & (over_ground < RANGE_M[1]) & ahead
 
 
 def _spherical(points: Tensor) -> Tensor:

@@ -184,9 +184,10 @@ class RadarTracks:
             clamp: largest distance.
         """
         weight = _ELEVATION_WEIGHT * self.has_elevation.to(upwards.dtype)[:, None, None]
-        distance = safe_sqrt(flat + (weight * upwards).square())
+        distance = (flat + (weight * upwards).square() + 1e-8).sqrt()  # a finite slope at 0
         clamped = soft_clamp(distance, clamp).masked_fill(~target_present[:, None], 2 * clamp)
-        return masked_mean(soft_minimum(clamped, tau), self.present) * target_present.any(-1)
+        least = -tau * torch.logsumexp(-clamped / tau, -1)
+        return masked_mean(least, self.present) * target_present.any(-1)
 
 
 def track_detection_cost(
@@ -196,7 +197,7 @@ def track_detection_cost(
     present: Bool[Tensor, "F G"],
 ) -> Float[Tensor, "*batch F"]:
     """Distance of tracked clusters to road users' box centres, by azimuth (left) and elevation (up) [deg]."""
-    directions_rad = torch.stack(directions(transform_points(T_camera_radar, tracks.xyz_m)), -1)
+    directions_rad = _directions(transform_points(T_camera_radar, tracks.xyz_m))
     off = (directions_rad[..., :, None, :] - centres_rad[:, None]) * DEG
     return tracks.nearest_cost(
         off[..., 0].square(), off[..., 1], present, DETECTION_TAU_DEG, DETECTION_CLAMP_DEG
@@ -215,29 +216,15 @@ def track_cluster_cost(
     return tracks.nearest_cost(flat, off[..., 2], present, CLUSTER_TAU_M, CLUSTER_CLAMP_M)
 
 
-def directions(
-    points_camera: Float[Tensor, "*batch 3"],
-) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+def _directions(points_camera: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2"]:
     """Azimuth to the left and elevation upwards [rad], as `camera_direction_angles`; (0, 0) for the origin."""
     x, y, z = points_camera.unbind(-1)
     h2 = x * x + z * z
     off = h2 > 1e-6
-    azimuth = torch.where(off, torch.atan2(-x, torch.where(off, z, torch.ones_like(z))), torch.zeros_like(x))
-    return azimuth, torch.where(
-        off, torch.atan2(-y, torch.where(off, h2, torch.ones_like(h2)).sqrt()), torch.zeros_like(y)
-    )
-
-
-def soft_minimum(values: Float[Tensor, "*batch N"], tau: float) -> Float[Tensor, "*batch"]:
-    """Smooth lower bound of the smallest value, equal to it for a single finite one."""
-    return -tau * torch.logsumexp(-values / tau, -1)
+    ahead, h = torch.where(off, z, torch.ones_like(z)), torch.where(off, h2, torch.ones_like(h2)).sqrt()
+    return torch.stack([torch.atan2(-x, ahead), torch.atan2(-y, h)], -1) * off[..., None]
 
 
 def soft_clamp(values: Float[Tensor, "*shape"], limit: float) -> Float[Tensor, "*shape"]:
     """Nearly the value itself if small, with a smooth saturation at `limit`; for values >= 0."""
     return limit * torch.tanh(values / limit)
-
-
-def safe_sqrt(squared: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """Square root with a finite slope at 0."""
-    return (squared + 1e-8).sqrt()

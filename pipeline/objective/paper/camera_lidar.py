@@ -21,7 +21,6 @@ from pipeline.objective.paper.classes import (
     SKY,
     camera_at_label_size,
     distance_cost,
-    in_camera,
     in_range,
     labels_of,
     safely_in_view,
@@ -29,6 +28,7 @@ from pipeline.objective.paper.classes import (
 )
 from pipeline.objective.paper.cost_maps import FoldedFrames, fold_frames, frame_costs
 from pipeline.rig.cameras import Camera
+from pipeline.rig.se3 import transform_points
 from schemas.observations import Observation
 
 __all__ = ["CameraLidarLoss", "camera_lidar_loss", "cluster_points", "object_cost_map"]
@@ -63,7 +63,7 @@ def camera_lidar_loss(
         labels = labels_of(observation)
         camera = camera_at_label_size(observation, labels)
         cloud = cluster_points(observation)
-        seen = safely_in_view(camera, in_camera(T_prior, cloud), margin_rad)
+        seen = safely_in_view(camera, transform_points(T_prior, cloud), margin_rad)
         points.append(thin(cloud[seen].astype(np.float64), _POINTS))
         costs.append(object_cost_map(labels, camera))
         cameras.append(camera)

@@ -19,13 +19,13 @@ from pipeline.objective.paper.classes import (
     SKY,
     camera_at_label_size,
     distance_cost,
-    in_camera,
     in_range,
     labels_of,
     safely_in_view,
     thin,
 )
 from pipeline.objective.paper.cost_maps import FoldedFrames, fold_frames, frame_costs
+from pipeline.rig.se3 import transform_points
 from schemas.observations import Observation
 
 __all__ = ["CameraRadarLoss", "camera_radar_loss"]
@@ -83,7 +83,7 @@ def camera_radar_loss(
         camera = camera_at_label_size(observation, labels)
         cameras.append(camera)
         near = in_range(observation.radar_track_xyz_m)
-        near = near[safely_in_view(camera, in_camera(T_prior, near), margin_rad)]
+        near = near[safely_in_view(camera, transform_points(T_prior, near), margin_rad)]
         tracks.append(near)
         frame_of.append(np.full(len(near), index))
         boxes = observation.road_user_boxes_px.astype(np.float64).reshape(-1, 4)
@@ -91,7 +91,9 @@ def camera_radar_loss(
         middle = ((boxes[:, :2] + boxes[:, 2:]) / 2 + 0.5) * observation.label_scale - 0.5
         centres.append(middle - observation.label_offset_px)
         cloud = in_range(observation.radar_xyz_m)
-        clouds.append(thin(cloud[safely_in_view(camera, in_camera(T_prior, cloud), margin_rad)], _DETECTIONS))
+        clouds.append(
+            thin(cloud[safely_in_view(camera, transform_points(T_prior, cloud), margin_rad)], _DETECTIONS)
+        )
         costs.append(np.where(labels == SKY, PENALTY, 0.0))
     return CameraRadarLoss(
         tracks_radar=np.concatenate(tracks) if tracks else np.zeros((0, 3)),

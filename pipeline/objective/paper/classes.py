@@ -1,4 +1,8 @@
-"""Shared code of the paper's losses and triggers: classes, robust distance, points in view, stacks of poses."""
+"""Shared code of the paper's losses and triggers: classes, robust distance, points in view; the loop that joins losses.
+
+Source: sections 4.3, 4.4 and 4.5.3, equations 1 and 2. The paper writes T_lidar^camera T_radar^lidar T_camera^radar;
+in the house's names that is T_camera_lidar T_lidar_radar T_camera_radar^-1.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from pipeline.core.errors import ContractError
 from pipeline.rig.cameras import Camera, camera_of
-from pipeline.rig.se3 import transform_points
+from pipeline.rig.se3 import inverse
 from schemas.observations import Observation
 
 __all__ = [
@@ -17,9 +21,11 @@ __all__ = [
     "SKY",
     "camera_at_label_size",
     "distance_cost",
-    "in_camera",
+    "euler_angles",
     "in_range",
     "labels_of",
+    "loop_loss",
+    "loop_transform",
     "safely_in_view",
     "thin",
 ]
@@ -79,6 +85,27 @@ def thin(points: Float[np.ndarray, "N 3"], limit: int) -> Float[np.ndarray, "M 3
     return points if len(points) <= limit else points[np.linspace(0, len(points) - 1, limit).astype(int)]
 
 
-def in_camera(T_camera_points: Float[np.ndarray, "4 4"], points: np.ndarray) -> Float[np.ndarray, "N 3"]:
-    """Points in the optical frame, as float64."""
-    return transform_points(T_camera_points, points.astype(np.float64))
+def loop_transform(
+    T_camera_lidar: Float[np.ndarray, "*batch 4 4"],
+    T_lidar_radar: Float[np.ndarray, "*batch 4 4"],
+    T_camera_radar: Float[np.ndarray, "*batch 4 4"],
+) -> Float[np.ndarray, "*batch 4 4"]:
+    """The closed loop, identity where the three agree."""
+    return T_camera_lidar @ T_lidar_radar @ inverse(T_camera_radar)
+
+
+def loop_loss(T_loop: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch"]:
+    """l1 norm of the loop's Euler angles [rad] and translation [m], added as they are: the paper names no units."""
+    return np.asarray(np.abs(euler_angles(T_loop)).sum(-1) + np.abs(T_loop[..., :3, 3]).sum(-1))
+
+
+def euler_angles(T: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 3"]:
+    """Roll, pitch, yaw [rad] of R = Rz(yaw) Ry(pitch) Rx(roll); pitch in [-pi/2, pi/2]."""
+    return np.stack(
+        [
+            np.arctan2(T[..., 2, 1], T[..., 2, 2]),
+            -np.arcsin(np.clip(T[..., 2, 0], -1, 1)),
+            np.arctan2(T[..., 1, 0], T[..., 0, 0]),
+        ],
+        -1,
+    )

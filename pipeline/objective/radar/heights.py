@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Float, Int64
 from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 from scipy.special import ndtr
@@ -110,16 +110,10 @@ class Heights:
 class _Detections:
     range_m: Float[np.ndarray, " N"]
     azimuth: Float[np.ndarray, " N"]
-    elevation: Float[
-        np.ndarray, " N"
-    ]  # of the detection over the road where it stands, seen from the radar's height
+    # Of the detection over the road where it stands, seen from the radar's height.
+    elevation: Float[np.ndarray, " N"]
     mirror: Float[np.ndarray, "N J"]  # ... of lidar points there
     frame: Int64[np.ndarray, " N"]
-
-    @property
-    def stands(self) -> Bool[np.ndarray, " N"]:
-        """True if the lidar shows an object there, False for bare road."""
-        return np.asarray(self.mirror.any(1))
 
 
 def displaced_heights(
@@ -169,8 +163,9 @@ def _log_likelihood(day: _Detections, x: np.ndarray) -> np.ndarray:
 def _densities(day: _Detections, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Density of each detection as direct, image, displaced and from anywhere (4 N), and its rotated elevation (N)."""
     displaced, image, sigma = _share(x[2]), _share(x[6]), float(np.exp(x[3]))
-    anywhere = np.where(day.stands, _share(x[4]), _share(x[5]))
-    view_rad = np.where(day.stands, _VIEW_RAD, max(np.sqrt(12.0) * np.std(day.elevation), _LEAST_VIEW_RAD))
+    stands = day.mirror.any(1)  # the lidar shows an object there, not bare road
+    anywhere = np.where(stands, _share(x[4]), _share(x[5]))
+    view_rad = np.where(stands, _VIEW_RAD, max(np.sqrt(12.0) * np.std(day.elevation), _LEAST_VIEW_RAD))
     turned = day.elevation - x[0] * np.cos(day.azimuth) + x[1] * np.sin(day.azimuth)
     z, m = turned[:, None] / sigma, day.mirror / sigma
     half = np.maximum(m, _NARROWEST)

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from pipeline.core.rows import columns_of
 from pipeline.objective.radar.registration import robust_equations, rows_of_frames
 from pipeline.objective.radar.vehicle_boxes import median_of_rows
-from pipeline.objective.stamp_gaps import radar_gaps_s, scan_to_image_s
+from pipeline.objective.stamp_gaps import gaps_s, scan_to_image_s, turned
 from pipeline.rig.cameras import camera_of
 from pipeline.rig.se3 import inverse, transform_points
 from pipeline.rig.spherical import camera_direction_angles, wrap_angle
@@ -105,10 +105,7 @@ class MovingClusters:
 
     def _earlier(self, by_s: Float[np.ndarray, " B"]) -> Float[np.ndarray, "B 3"]:
         """Positions at an earlier time: moved back along the line of sight, and by the car's rotation."""
-        p = self.point_radar_m - self.relative_mps * by_s[:, None]
-        turn = self.yaw_rate_radps * by_s
-        c, s = np.cos(turn), np.sin(turn)
-        return np.stack([c * p[:, 0] - s * p[:, 1], s * p[:, 0] + c * p[:, 1], p[:, 2]], -1)
+        return turned(self.point_radar_m - self.relative_mps * by_s[:, None], self.yaw_rate_radps * by_s)
 
 
 def moving_clusters(observations: Sequence[Observation], with_boxes: bool = True) -> MovingClusters:
@@ -131,7 +128,7 @@ def moving_clusters(observations: Sequence[Observation], with_boxes: bool = True
     frame = clusters["frame"]
     return MovingClusters(
         **clusters,
-        stamp_gap_s=radar_gaps_s(observations)[frame],
+        stamp_gap_s=gaps_s(observations, "radar")[frame],
         after_image_s=scan_to_image_s(observations)[frame],
         yaw_rate_radps=np.array([o.ego_yaw_rate_radps or 0.0 for o in observations], np.float64)[frame],
         lidar_centres_m=[_object_centres(o) for o in observations],
@@ -190,11 +187,7 @@ def camera_azimuth_residuals(
     h2 = p[:, 0] ** 2 + p[:, 2] ** 2
     # azimuth = atan2(-x, z); dp = dphi x p + drho
     gradient = np.stack([-p[:, 2] / h2, np.zeros(len(p)), p[:, 0] / h2], -1)
-    return (
-        residual,
-        np.concatenate([np.cross(p, gradient), gradient], 1),
-        clusters.frame[chosen],
-    )
+    return residual, np.concatenate([np.cross(p, gradient), gradient], 1), clusters.frame[chosen]
 
 
 def _box_table(clusters: MovingClusters) -> tuple[Float[np.ndarray, "F M"], Float[np.ndarray, "F M"]]:
@@ -259,25 +252,17 @@ def camera_radar_cost(
     out = np.full(len(observations), np.nan)
     if not clusters.count:
         return out
-    visible = _in_view(clusters, observations, T_camera_radar)
+    points, visible = (
+        transform_points(T_camera_radar, clusters.at_image_time()),
+        np.zeros(clusters.count, bool),
+    )
+    for f in np.unique(clusters.frame):
+        own = clusters.frame == f
+        uv, valid = camera_of(observations[f]).project(points[own])
+        visible[own] = valid & (uv[:, 0] > 0) & (uv[:, 0] < observations[f].image_width_px - 1)
     residual, _, frame = camera_azimuth_residuals(clusters, T_camera_radar, 3 * MATCH_RAD)
     gain = np.bincount(frame, 1 / (1 + (residual / MATCH_RAD) ** 2), minlength=len(observations))
     total = np.bincount(clusters.frame[visible], minlength=len(observations))
     informative = (total > 0) & np.array([len(o.road_user_classes) > 0 for o in observations])
     out[informative] = 1 - np.minimum(gain[informative] / total[informative], 1.0)
-    return out
-
-
-def _in_view(
-    clusters: MovingClusters, observations: Sequence[Observation], T_camera_radar: np.ndarray
-) -> np.ndarray:
-    """Clusters whose azimuth the camera covers."""
-    points = transform_points(T_camera_radar, clusters.at_image_time())
-    out = np.zeros(clusters.count, bool)
-    for f in np.unique(clusters.frame):
-        o = observations[f]
-        camera = camera_of(o)
-        index = np.flatnonzero(clusters.frame == f)
-        uv, valid = camera.project(points[index])
-        out[index] = valid & (uv[:, 0] > 0) & (uv[:, 0] < o.image_width_px - 1)
     return out

@@ -144,7 +144,9 @@ def registration_frames(
             continue
         radar.append(static)
         lidar.append(near)
-        rows.append(_frame_columns(o, index))
+        has_plane, turn = o.ground_plane is not None, o.ego_yaw_rate_radps or 0.0  # alike all over the car
+        gap_s, plane = (o.radar_stamp_ns - o.stamp_ns) * 1e-9, o.ground_plane if has_plane else np.zeros(4)
+        rows.append((plane, has_plane, o.radar_has_elevation, o.radar_velocity_mps, turn, gap_s, index))
     (radar_m, radar_first), (lidar_m, lidar_first) = _pack(radar), _pack(lidar)
     return RegistrationFrames(
         radar_m,
@@ -258,19 +260,6 @@ def updated_sigma(
     shown = sigma * np.maximum(equations.second_moment, 1e-6)
     bounce = float(np.clip(equations.bounced, 0.01, _BOUNCE_MOST)) if bounce_prior > 0 else 0.0
     return np.clip(shown, _SIGMA_LEAST, _SIGMA_MOST), bounce
-
-
-def _frame_columns(o: Observation, index: int) -> tuple[object, ...]:
-    """A row of _FRAME."""
-    return (
-        o.ground_plane if o.ground_plane is not None else np.zeros(4),
-        o.ground_plane is not None,
-        o.radar_has_elevation,
-        o.radar_velocity_mps,
-        o.ego_yaw_rate_radps or 0.0,  # about the vertical, alike at every place of the car
-        (o.radar_stamp_ns - o.stamp_ns) * 1e-9,
-        index,
-    )
 
 
 def _elevation_limits(observations: Sequence[Observation]) -> np.ndarray:

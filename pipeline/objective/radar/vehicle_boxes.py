@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from pipeline.core.rows import columns_of
-from pipeline.objective.radar.registration import robust_equations, rows_of_frames
-from pipeline.objective.stamp_gaps import scan_to_image_s
+from pipeline.objective.radar.registration import robust_equations
+from pipeline.objective.stamp_gaps import scan_to_image_s, turned
 from pipeline.rig.cameras import camera_of
 from pipeline.rig.se3 import hat, transform_points
 from pipeline.rig.spherical import camera_direction_angles, from_spherical, to_spherical
@@ -65,10 +65,6 @@ class VehicleBoxes:
     expected_m: Float[np.ndarray, " B"]  # range that the height suggests
     frame: Int64[np.ndarray, " B"]  # index into the observations given
 
-    def of_frames(self, frames: Int64[np.ndarray, " S"]) -> VehicleBoxes:
-        """The part of some observations, which are renumbered in the given order."""
-        return rows_of_frames(self, frames)
-
 
 @dataclass(frozen=True, eq=False)
 class BoxPairs:
@@ -88,16 +84,14 @@ class BoxPairs:
 
 def vehicle_boxes(observations: Sequence[Observation]) -> VehicleBoxes:
     """Whole, unoccluded vehicle boxes of frames whose radar measures elevation."""
-    rows = [np.zeros((0, 6))]
-    frames = [np.zeros(0, np.int64)]
-    for index, o in enumerate(observations):
-        if o.radar_has_elevation and len(o.road_user_boxes_px) and len(o.radar_xyz_m):
-            rows.append(_boxes_of_frame(o))
-            frames.append(np.full(len(rows[-1]), index, np.int64))
-    table = np.concatenate(rows)
-    kind, azimuth, elevation, left, right, expected_m = table.T
-    frame = np.concatenate(frames)
-    return VehicleBoxes(kind.astype(np.int64), azimuth, elevation, left, right, expected_m, frame)
+    rows = [
+        _boxes_of_frame(o, index)
+        for index, o in enumerate(observations)
+        if o.radar_has_elevation and len(o.road_user_boxes_px) and len(o.radar_xyz_m)
+    ]
+    kind, azimuth, elevation, left, right, expected_m, frame = np.concatenate([np.zeros((0, 7)), *rows]).T
+    numbers = kind.astype(np.int64), frame.astype(np.int64)
+    return VehicleBoxes(numbers[0], azimuth, elevation, left, right, expected_m, numbers[1])
 
 
 def box_pairs(
@@ -115,7 +109,7 @@ def box_pairs(
     turns = scan_to_image_s(observations) * [o.ego_yaw_rate_radps or 0.0 for o in observations]
     for index in np.unique(boxes.frame):
         # Where they were when the image was taken; what they moved along the line of sight changes no direction.
-        radar = _turned(observations[index].radar_xyz_m.astype(np.float64), turns[index])
+        radar = turned(observations[index].radar_xyz_m.astype(np.float64), turns[index])
         in_camera = transform_points(T_camera_radar, radar)
         angles = camera_direction_angles(in_camera)
         distance = np.linalg.norm(in_camera, axis=1)
@@ -160,13 +154,8 @@ def box_equations(
     return robust_equations(*found, pairs.frame, frames)
 
 
-def _turned(points: np.ndarray, yaw_rad: float) -> np.ndarray:
-    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
-    return points @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _boxes_of_frame(o: Observation) -> np.ndarray:
-    """Rows (class index, azimuth, elevation, azimuth of left and right side, range by height) of one frame's boxes."""
+def _boxes_of_frame(o: Observation, frame: int) -> np.ndarray:
+    """Rows of one frame's boxes: columns of VehicleBoxes."""
     camera = camera_of(o)
     boxes = o.road_user_boxes_px.astype(np.float64)
     x0, y0, x1, y1 = boxes.T
@@ -180,8 +169,8 @@ def _boxes_of_frame(o: Observation) -> np.ndarray:
     height_rad = np.maximum(angle[3, :, 1] - angle[4, :, 1], 1e-3)
     kind = kinds[chosen]
     expected_m = np.array(_HEIGHT_M)[kind] / height_rad
-    columns = (kind, angle[0, :, 0], angle[0, :, 1], angle[1, :, 0], angle[2, :, 0], expected_m)
-    rows = np.stack([c.astype(np.float64) for c in columns], -1)
+    middle, left, right = angle[0], angle[1, :, 0], angle[2, :, 0]
+    rows = np.column_stack([kind, middle, left, right, expected_m, np.full(len(kind), frame)])
     return rows[np.isfinite(rows).all(1)]
 
 

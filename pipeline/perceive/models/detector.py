@@ -12,7 +12,7 @@ from jaxtyping import Float32, Int, UInt8
 from pipeline.core.errors import ModelError, ModelOutputError
 from pipeline.core.rows import join_rows, take_rows
 from pipeline.perceive.camera import Detections
-from pipeline.perceive.labels import DETECTOR_COUNTS, detector_names
+from pipeline.perceive.labels import DETECTOR_COUNTS, DETECTOR_SETS
 from pipeline.perceive.models.manifest import Manifest
 from pipeline.perceive.models.session import Session, fit_image
 
@@ -36,7 +36,7 @@ class Detector:
     def __init__(self, manifest: Manifest, providers: Sequence[str] = ()) -> None:
         self._manifest = manifest
         self._session = Session(manifest, (3, *manifest.input.size), providers)
-        self._names = detector_names(manifest.output.label_set)
+        self._names = DETECTOR_SETS[manifest.output.label_set]
 
     def detect(self, image_bgr: UInt8[np.ndarray, "H W 3"]) -> Detections:
         """Road users in full-image pixels, the best score first.
@@ -45,13 +45,9 @@ class Detector:
             ModelError: another shape than the layout's.
             ModelOutputError: other classes than the label set's, not finite, or the same for several images.
         """
-        if not self._manifest.input.tile_scales:
-            found = [self._of_tile(image_bgr, 1.0, 0, 0, image_bgr.shape)]
-        else:
-            found = [
-                c for scale in self._manifest.input.tile_scales for c in self._of_scale(image_bgr, scale)
-            ]
-        joined = join_rows(found)
+        scales = self._manifest.input.tile_scales
+        found = [c for scale in scales for c in self._of_scale(image_bgr, scale)]
+        joined = join_rows(found or [self._of_tile(image_bgr, 1.0, 0, 0, image_bgr.shape)])
         joined = take_rows(joined, np.isin(joined.classes, list(self._names)))
         kept = take_rows(joined, suppress(joined, self._manifest.output.nms_iou))
         height, width = image_bgr.shape[:2]
@@ -64,18 +60,14 @@ class Detector:
         """Candidates of all tiles of the image at one size."""
         rows, columns = self._manifest.input.size
         height, width = image_bgr.shape[:2]
-        small = cv2.resize(
-            image_bgr,
-            (max(1, round(width * scale)), max(1, round(height * scale))),
-            interpolation=cv2.INTER_LINEAR,
-        )
+        size = (max(1, round(width * scale)), max(1, round(height * scale)))
+        small = cv2.resize(image_bgr, size, interpolation=cv2.INTER_LINEAR)
         overlap = self._manifest.input.tile_overlap
-        found = []
-        for y in _tile_starts(small.shape[0], rows, overlap):
-            for x in _tile_starts(small.shape[1], columns, overlap):
-                tile = small[y : y + rows, x : x + columns]
-                found.append(self._of_tile(tile, scale, x, y, small.shape))
-        return found
+        return [
+            self._of_tile(small[y : y + rows, x : x + columns], scale, x, y, small.shape)
+            for y in _tile_starts(small.shape[0], rows, overlap)
+            for x in _tile_starts(small.shape[1], columns, overlap)
+        ]
 
     def _of_tile(
         self, tile_bgr: np.ndarray, scale: float, x: int, y: int, whole: tuple[int, ...]

@@ -13,9 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.core.config import FleetConfig
 from pipeline.core.errors import ModelError, ModelOutputError
-from pipeline.core.rigs import OnnxDrivable
 from pipeline.perceive.drivable import FreeSector
 from pipeline.perceive.models.manifest import ModelFile, read_manifest
 from pipeline.perceive.models.session import Session
@@ -44,11 +42,6 @@ class RadarDrivable:
         self._file, self._session = str(manifest_file), Session(manifest, (len(CHANNELS), *SHAPE))
         self._memory = ScanMemory()
         self.provenance: dict[str, Any] = {"radar_drivable": manifest.sha256}
-
-    @classmethod
-    def load(cls, wanted: OnnxDrivable, fleet: FleetConfig) -> RadarDrivable:
-        """The model named in fleet.toml, relative to it; errors as the constructor."""
-        return cls(fleet.path_of(wanted.model))
 
     def probability(self, scan: Scan) -> Float[np.ndarray, "A R"]:
         """Probability that each cell is drivable; the scan is kept for the following ones.

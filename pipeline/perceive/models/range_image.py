@@ -1,15 +1,6 @@
 """Classes of lidar points by a range-image ONNX model in RangeNet++'s convention.
 
-A manifest next to the model describes its input and output:
-
-```toml path = "darknet53.onnx"           # relative to the manifest sha256 = "..." task = "segment_points"
-[input]                           # float32 1x5xHxW: range, x, y, z [m], remission size = [64, 2048]
-# rows, columns fov_up_deg = 3.0 fov_down_deg = -25.0 mean = [12.12, 10.88, 0.23, -1.04, 0.21] std = [12.32,
-11.47, 6.91, 0.86, 0.16] empty = "zero"                    # pixels without a point, once normalised; or
-"minus_one", before that [output] layout = "logits"                 # 1xCxHxW; probabilities do as well
-label_set = "semantickitti"       # 20 labels, 0 = unlabelled [knn]                             # optional:
-how pixels' labels become points' labels neighbours = 5 search = 5 sigma_px = 1.0 cutoff_m = 1.0 ```
-
+An example of its manifest: `pipeline/perceive/README.md`.
 Source: Milioto et al., RangeNet++ (IROS 2019); paper, section 4.2 (RangeNet++ and RANSAC successively).
 """
 
@@ -22,9 +13,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from pydantic import Field, model_validator
 
-from pipeline.core.config import FleetConfig
 from pipeline.core.errors import ModelOutputError
-from pipeline.core.rigs import OnnxPointSemantics
 from pipeline.perceive.ground import PointKind
 from pipeline.perceive.models.manifest import ModelFile, Section, read_manifest
 from pipeline.perceive.models.session import Session
@@ -121,11 +110,6 @@ class RangeImageSegmenter:
         self._kinds = np.array(list(POINT_LABEL_SETS[manifest.output.label_set].values()), np.uint8)
         told = manifest.model_dump(mode="json", exclude={"file", "path"})
         self.provenance: dict[str, Any] = {"lidar_segmenter": told | {"remission_scale": remission_scale}}
-
-    @classmethod
-    def load(cls, wanted: OnnxPointSemantics, fleet: FleetConfig) -> RangeImageSegmenter:
-        """The model named in fleet.toml, relative to it; errors as the constructor."""
-        return cls(fleet.path_of(wanted.segmenter), wanted.remission_scale)
 
     def kinds(
         self, xyz_m: Float32[np.ndarray, "N 3"], intensity: Float32[np.ndarray, " N"] | None

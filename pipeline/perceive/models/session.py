@@ -6,7 +6,6 @@ import os
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -17,7 +16,7 @@ from pipeline.core.errors import ModelError, ModelOutputError
 from pipeline.core.memory import MODEL_THREADS, usable_cpus
 from pipeline.perceive.models.manifest import InputSpec, ModelFile
 
-__all__ = ["AlikeCheck", "Fit", "Session", "fit_image", "model_threads", "open_session"]
+__all__ = ["AlikeCheck", "Fit", "Session", "fit_image"]
 
 _CUDA, _CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
 _MOST_ALIKE = 3  # successive answers that are the same to the last bit though the inputs differ
@@ -64,7 +63,7 @@ class Session:
         self, manifest: ModelFile, shape: tuple[int, int, int], providers: Sequence[str] = ()
     ) -> None:
         self._file = str(manifest.file)
-        self._session = open_session(manifest.model_file, manifest.file, providers)
+        self._session = _open(manifest, providers)
         self._input, self._takes_batches = self._checked_input(shape)
         self._check_alike = AlikeCheck(manifest.file)
         self.provider = str(self._session.get_providers()[0])
@@ -124,25 +123,26 @@ class Session:
         return str(inputs[0].name), not isinstance(taken[0], int)
 
 
-def open_session(
-    model_file: Path, manifest_file: Path, providers: Sequence[str] = ()
-) -> ort.InferenceSession:
+def _open(manifest: ModelFile, providers: Sequence[str]) -> ort.InferenceSession:
     """A session on the first available provider; raises ModelError if there is none, or no model."""
-    options = ort.SessionOptions()
-    options.inter_op_num_threads, options.intra_op_num_threads = 1, model_threads()
+    file, options = str(manifest.file), ort.SessionOptions()
+    # Threads on the CPU: the share of a worker of the night, else all that the process may use.
+    share = os.environ.get(MODEL_THREADS) or os.environ.get("OMP_NUM_THREADS") or ""
+    options.inter_op_num_threads = 1
+    options.intra_op_num_threads = max(1, int(share)) if share.isdigit() else usable_cpus()
     # Workers run side by side, and a spinning pool would steal their cores.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.add_session_config_entry("session.inter_op.allow_spinning", "0")
     options.log_severity_level = 3  # its warnings are about graph optimisation, not about results
-    chosen = _chosen_providers(providers, str(manifest_file))
+    chosen = _chosen_providers(providers, file)
     try:
-        session = ort.InferenceSession(str(model_file), options, providers=chosen)
+        session = ort.InferenceSession(str(manifest.model_file), options, providers=chosen)
     except Exception as err:  # onnxruntime's own exceptions share no base but this
-        raise ModelError(str(manifest_file), f"path: onnxruntime cannot load the model: {err}") from err
+        raise ModelError(file, f"path: onnxruntime cannot load the model: {err}") from err
     # Where a provider's libraries do not load, onnxruntime falls back to the CPU by itself.
     if providers and session.get_providers()[0] not in providers:
         told = f"onnxruntime could not start {' or '.join(chosen)}: are its driver and libraries installed?"
-        raise ModelError(str(manifest_file), f"perceive.providers: {told}")
+        raise ModelError(file, f"perceive.providers: {told}")
     return session
 
 
@@ -159,12 +159,6 @@ def _chosen_providers(wanted: Sequence[str], manifest_file: str) -> list[str]:
     return chosen
 
 
-def model_threads() -> int:
-    """Threads of one model on the CPU: the share of a worker of the night, else all that the process may use."""
-    share = os.environ.get(MODEL_THREADS) or os.environ.get("OMP_NUM_THREADS") or ""
-    return max(1, int(share)) if share.isdigit() else usable_cpus()
-
-
 def fit_image(
     image_bgr: UInt8[np.ndarray, "H W 3"], spec: InputSpec
 ) -> tuple[Float32[np.ndarray, "1 3 h w"], Fit]:
@@ -175,11 +169,7 @@ def fit_image(
     if spec.fit != "stretch":
         scale_x = scale_y = min(scale_x, scale_y)
     inner = (max(1, round(width * scale_x)), max(1, round(height * scale_y)))
-    resized = (
-        image_bgr
-        if inner == (width, height)
-        else cv2.resize(image_bgr, inner, interpolation=cv2.INTER_LINEAR)
-    )
+    resized = cv2.resize(image_bgr, inner, interpolation=cv2.INTER_LINEAR)
     left, top = (columns - inner[0]) // 2, (rows - inner[1]) // 2
     if spec.fit == "letterbox_top_left":
         left, top = 0, 0
@@ -187,9 +177,8 @@ def fit_image(
     canvas[top : top + inner[1], left : left + inner[0]] = resized
     if spec.colour == "rgb":
         canvas = canvas[..., ::-1]
-    normal = (canvas * np.float32(spec.scale) - np.array(spec.mean, np.float32)) / np.array(
-        spec.std, np.float32
-    )
+    mean, std = (np.array(v, np.float32) for v in (spec.mean, spec.std))
+    normal = (canvas * np.float32(spec.scale) - mean) / std
     tensor = np.ascontiguousarray(normal.transpose(2, 0, 1)[None], np.float32)
     # The true ratio after rounding to whole pixels, not the wanted one.
     return tensor, Fit(inner[0] / width, inner[1] / height, left, top, inner[0], inner[1])

@@ -21,7 +21,6 @@ from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
 from pipeline.calibrate.numerics.covariance import CLEARLY
 from pipeline.calibrate.numerics.search_range import SearchRange, search_range
 from pipeline.core.config import SolveConfig
-from pipeline.objective.camera_lidar.kernel_settings import MAX_GAP_PX
 from pipeline.objective.camera_lidar.points import Points, lidar_velocities
 from pipeline.objective.camera_lidar.score import Alignments, KernelSettings, prepare_terms
 from pipeline.rig.cameras import camera_of
@@ -57,7 +56,7 @@ def terms(day):
 def searched(terms, prior, limits=None):
     config = SolveConfig()
     limits = limits or search_range(prior.sigmas, config)
-    thin = Scored(terms.sharp(MAX_GAP_PX), KERNEL, prior, config, limits)
+    thin = Scored(terms.sharp(), KERNEL, prior, config, limits)
     return find_basin(terms, thin, np.random.default_rng(0), np.arange(terms.frames))
 
 
@@ -87,7 +86,7 @@ def degrees_off(T):
 def test_a_grid_of_rotations_has_the_truth_among_its_maxima(terms):
     off, rng = prior_off_by(7.0, 0.05, 1), np.random.default_rng(0)
     wrong = wrong_poses(off, REACH_RAD, 0.05, rng)
-    found = grid_maxima(terms.sharp(MAX_GAP_PX), off, REACH_RAD, wrong, rng)
+    found = grid_maxima(terms.sharp(), off, REACH_RAD, wrong, rng)
     assert [name for name, _ in found][1:4] == list(TERMS)  # each term's own best is among them
     # Half a step of the grid per axis, and roll's is twice as wide; the shift turns near points a little.
     assert degrees_off(found[0][1]) < 1.6
@@ -174,7 +173,7 @@ def test_the_state_of_an_earlier_day_is_looked_at_where_the_day_does_not_decide(
 def test_no_climb_leaves_the_search_range(terms):
     prior = prior_off_by(4.0, 0.05, 7)
     limits = SearchRange(np.radians(2.0), 0.03)
-    scored = Scored(terms.sharp(MAX_GAP_PX), KERNEL, prior, SolveConfig(), limits)
+    scored = Scored(terms.sharp(), KERNEL, prior, SolveConfig(), limits)
     state = refine(scored, AlignmentState(prior.T_camera_lidar), steps=12)
     turn = log_so3(state.T_camera_lidar[:3, :3] @ prior.T_camera_lidar[:3, :3].T)
     assert np.abs(turn).max() < limits.rotation_rad + 1e-9

@@ -80,13 +80,12 @@ def told(day, T=T_LIDAR_RADAR):
 
 
 def test_the_lidar_alone_shows_speed_and_yaw_rate_of_the_car(day):
-    motion = sweep_motion(day)
-    assert len(motion.first) >= 25
-    ends = list(zip(motion.first, motion.last, strict=True))
-    speed = np.array([(day[i].ego_speed_mps + day[j].ego_speed_mps) / 2 for i, j in ends])
-    turn = np.array([(day[i].ego_yaw_rate_radps + day[j].ego_yaw_rate_radps) / 2 for i, j in ends])
-    assert np.abs(motion.speed_mps - speed).max() < 0.8
-    assert np.abs(motion.yaw_rate_radps - turn).max() < 0.04
+    pairs, speed_mps, yaw_rate_radps = sweep_motion(day)
+    assert len(pairs) >= 25
+    speed = np.array([(day[i].ego_speed_mps + day[j].ego_speed_mps) / 2 for i, j in pairs])
+    turn = np.array([(day[i].ego_yaw_rate_radps + day[j].ego_yaw_rate_radps) / 2 for i, j in pairs])
+    assert np.abs(speed_mps - speed).max() < 0.8
+    assert np.abs(yaw_rate_radps - turn).max() < 0.04
 
 
 def test_sources_that_agree_raise_no_alarm(day):

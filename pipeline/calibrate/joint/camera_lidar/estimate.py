@@ -58,7 +58,7 @@ from pipeline.objective.camera_lidar.image_maps import Start
 from pipeline.objective.camera_lidar.label_width import label_width_px, widened
 from pipeline.objective.camera_lidar.points import lidar_velocities
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms, prepare_terms
-from pipeline.objective.stamp_gaps import camera_gaps_s, constant_gap_s
+from pipeline.objective.stamp_gaps import constant_gap_s, gaps_s
 from pipeline.rig.changes import change_jacobian
 from pipeline.rig.common_share import common_part
 from pipeline.rig.estimates import PairEstimate, Prior
@@ -142,7 +142,7 @@ def align_camera_lidar(
         prior.translation_sigma_m**2,
     )
     intrinsics = measure_intrinsics(problem, state, kernel, frames[0].label_scale, rng)
-    expected_dt_s = constant_gap_s(camera_gaps_s(frames))
+    expected_dt_s = constant_gap_s(gaps_s(frames, "camera"))
     return Aligned(problem, frames, rejected, basin, state, kernel, expected_dt_s, intrinsics, width_px)
 
 

@@ -31,7 +31,6 @@ from pipeline.calibrate.joint.camera_lidar.rotation_search import (
 from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
 from pipeline.calibrate.numerics.covariance import CLEARLY, widening
 from pipeline.calibrate.numerics.search_range import search_range
-from pipeline.objective.camera_lidar.kernel_settings import MAX_GAP_PX
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms
 from pipeline.rig.se3 import inverse, log_so3, transform_points
 
@@ -151,7 +150,7 @@ def _candidates(
     """Starts, their origins, and whether the search may end with them, which requires that each term was searched."""
     prior = scored.prior
     yield "prior", AlignmentState(prior.T_camera_lidar), False
-    found = grid_maxima(terms.sharp(MAX_GAP_PX), prior, reach, wrong, rng)
+    found = grid_maxima(terms.sharp(), prior, reach, wrong, rng)
     for number, (name, T) in enumerate(found):
         yield name, AlignmentState(T), number >= len(TERMS)
     if prior.T_camera_lidar_before is not None:

@@ -125,7 +125,8 @@ class Evidence:
 
     def _excess(self, at: Alignments) -> tuple[np.ndarray, np.ndarray]:
         how = (at, self.kernel, self.shifts_px)
-        return self.terms.edge_excess(*how), self.terms.marking_excess(*how)
+        beyond = self.terms.beyond_chance
+        return beyond(Terms.edge_score, *how), beyond(Terms.marking_score, *how)
 
     def _median_edge(self, wrong: Float[np.ndarray, "P 4 4"]) -> float:
         at = _batches(wrong)

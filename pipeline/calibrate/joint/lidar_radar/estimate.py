@@ -54,7 +54,7 @@ from pipeline.objective.radar.heights import displaced_heights
 from pipeline.objective.radar.moving_clusters import moving_clusters
 from pipeline.objective.radar.registration import registration_frames
 from pipeline.objective.radar.travel import travel_directions
-from pipeline.objective.stamp_gaps import constant_gap_s, radar_gaps_s
+from pipeline.objective.stamp_gaps import constant_gap_s, gaps_s
 from pipeline.rig.changes import change_between, change_jacobian
 from pipeline.rig.common_share import common_part
 from pipeline.rig.estimates import DayParts, PairEstimate, Prior
@@ -131,7 +131,7 @@ def _problem(
         raise SolveError(
             f"lidar-radar needs {_FEWEST_FRAMES} frames with static detections, the day has {frames.count}"
         )
-    gap_s = constant_gap_s(radar_gaps_s(observations))
+    gap_s = constant_gap_s(gaps_s(observations, "radar"))
     movers = moving_clusters(observations, with_boxes=False)
     problem = RadarProblem(
         observations,
