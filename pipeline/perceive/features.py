@@ -123,13 +123,10 @@ def perceive_sweep(
     sweep: Sweep, config: PerceiveConfig, rng: np.random.Generator, points: PointSource | None
 ) -> tuple[SweepFeatures, bool]:
     """Ground, objects, edges and markings of a sweep; and whether it has rows, which a rosette has not."""
-    finite = take_rows(sweep, _is_finite(sweep))
-    xyz, intensity, ring, time_s = (
-        finite.lidar_xyz_m,
-        finite.lidar_intensity,
-        finite.lidar_ring,
-        finite.lidar_time_s,
-    )
+    is_finite = _is_finite(sweep)
+    finite = sweep if is_finite.all() else take_rows(sweep, is_finite)
+    xyz, intensity = finite.lidar_xyz_m, finite.lidar_intensity
+    ring, time_s = finite.lidar_ring, finite.lidar_time_s
     kind = None if points is None else points.kinds(xyz, intensity)
     ground = find_ground(xyz, config.ground_inlier_m, rng, kind)
     cluster = cluster_objects(xyz, ground.is_ground, config.cluster_eps_m, config.cluster_min_points)

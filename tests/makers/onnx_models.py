@@ -8,7 +8,8 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 
-def _save(path, nodes, inputs, outputs, constants):
+def save_graph(path, nodes, inputs, outputs, constants):
+    """A checked graph of nodes and named constants."""
     graph = helper.make_graph(
         nodes, "made", inputs, outputs, [numpy_helper.from_array(v, k) for k, v in constants.items()]
     )
@@ -30,7 +31,7 @@ def save_segmenter(path, size, stride, colours, classes=150):
         ),
         helper.make_node("Conv", ["small", "weights", "bias"], ["logits"]),
     ]
-    _save(
+    save_graph(
         path, nodes,
         [helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 3, rows, columns])],
         [helper.make_tensor_value_info("logits", TensorProto.FLOAT, small)],
@@ -46,7 +47,7 @@ def save_constant(path, output, size=(96, 160)):
         helper.make_node("Mul", ["mean", "zero"], ["nothing"]),
         helper.make_node("Add", ["answer", "nothing"], ["output"]),
     ]
-    _save(
+    save_graph(
         path, nodes,
         [helper.make_tensor_value_info("image", TensorProto.FLOAT, shape)],
         [helper.make_tensor_value_info("output", TensorProto.FLOAT, list(output.shape))],

@@ -1,9 +1,8 @@
 """Lidar semantics by range-image models: their labels, their faults, and whole days."""
 
 import numpy as np
-import onnx
 import pytest
-from onnx import TensorProto, helper, numpy_helper
+from onnx import TensorProto, helper
 
 from pipeline.core.config import load_fleet
 from pipeline.core.errors import ModelError
@@ -14,7 +13,7 @@ from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import observations_of
 from tests.makers.fleet_files import fleet_toml
 from tests.makers.lakes import write_frames
-from tests.makers.onnx_models import write_manifest
+from tests.makers.onnx_models import save_graph, write_manifest
 from tests.makers.range_scenes import DOWN, SIZE, UP, points_of
 from tests.makers.stages import perceive_day
 
@@ -38,15 +37,12 @@ def save_linear(path, rules, *, size=SIZE, window=1, classes=20, channels=5):
         helper.make_node("Concat", ["points", "magnitude"], ["both"], axis=1),
         helper.make_node("Conv", ["both", "weights", "bias"], ["logits"], pads=[window // 2] * 4),
     ]
-    graph = helper.make_graph(
-        nodes, "made",
+    save_graph(
+        path, nodes,
         [helper.make_tensor_value_info("points", TensorProto.FLOAT, [1, channels, *size])],
         [helper.make_tensor_value_info("logits", TensorProto.FLOAT, [1, classes, *size])],
-        [numpy_helper.from_array(weights, "weights"), numpy_helper.from_array(bias, "bias")],
+        {"weights": weights, "bias": bias},
     )  # fmt: skip
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    onnx.checker.check_model(model)
-    onnx.save(model, path)
 
 
 NONE = (0, 0, 0, 0, 0)
