@@ -59,10 +59,8 @@ def motion_gates_ns(
     return (1e9 * np.minimum(move_m / speed, turn_rad / np.maximum(turn, 1e-6))).astype(np.int64)
 
 
-def turned(
-    points: Float[np.ndarray, "N 3"], angle_rad: Float[np.ndarray, " N"] | float
-) -> Float[np.ndarray, "N 3"]:
-    """Points turned to the left about the vertical, by one angle or by one each."""
+def turned(points: Float[np.ndarray, "N 3"], angle_rad: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N 3"]:
+    """Points, each turned to the left about the vertical by its own angle."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     x, y, z = points.T
     return np.stack([c * x - s * y, s * x + c * y, z], -1)

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int64
 
 from pipeline.core.rows import columns_of
 from pipeline.objective.radar.registration import robust_equations
-from pipeline.objective.stamp_gaps import scan_to_image_s, turned
+from pipeline.objective.stamp_gaps import scan_to_image_s
 from pipeline.rig.cameras import camera_of
 from pipeline.rig.se3 import hat, transform_points
 from pipeline.rig.spherical import camera_direction_angles, from_spherical, to_spherical
@@ -109,7 +109,9 @@ def box_pairs(
     turns = scan_to_image_s(observations) * [o.ego_yaw_rate_radps or 0.0 for o in observations]
     for index in np.unique(boxes.frame):
         # Where they were when the image was taken; what they moved along the line of sight changes no direction.
-        radar = turned(observations[index].radar_xyz_m.astype(np.float64), turns[index])
+        c, s = np.cos(turns[index]), np.sin(turns[index])
+        to_image = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        radar = observations[index].radar_xyz_m.astype(np.float64) @ to_image
         in_camera = transform_points(T_camera_radar, radar)
         angles = camera_direction_angles(in_camera)
         distance = np.linalg.norm(in_camera, axis=1)
