@@ -17,7 +17,7 @@ from pipeline.learn.infer.class_evidence import FrameEvidence
 from pipeline.learn.infer.joint_day import Expected, JointDay, fitted_day
 from pipeline.learn.sample.clouds import own_velocity
 from pipeline.learn.sample.frame_sample import SampleRejectedError
-from pipeline.objective.stamp_gaps import camera_gaps_s, constant_gap_s
+from pipeline.objective.stamp_gaps import constant_gap_s, gaps_s
 from pipeline.rig.checks import Check
 from pipeline.rig.estimates import PairEstimate, Prior, Solution
 from pipeline.rig.se3 import exp_se3, inverse, log_se3, rotation_angle_rad
@@ -260,14 +260,14 @@ def _fitted_together(
     if which is None:
         return None
 
-    gaps_s = camera_gaps_s(asked.observations)
-    clock_s = constant_gap_s(gaps_s)
+    gap_s = gaps_s(asked.observations, "camera")
+    clock_s = constant_gap_s(gap_s)
     travels = [_travel(o, asked.prior) for o in asked.observations]
 
     def evidence(T: np.ndarray) -> list[FrameEvidence]:
         network = asked.networks[which]
         found = (network.evidence(sensors[which], T) for sensors in asked.sensors)
-        moving = zip(found, travels, (gaps_s - clock_s).tolist(), strict=True)
+        moving = zip(found, travels, (gap_s - clock_s).tolist(), strict=True)
         return [replace(f, travel=travel, lag_s=lag_s) for f, travel, lag_s in moving if f is not None]
 
     block, pair = _blocks([o.drive for o in asked.observations]), "camera_lidar"
