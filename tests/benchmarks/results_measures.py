@@ -14,6 +14,7 @@ from scipy.stats import beta
 
 from schemas.calibrations import PAIRS
 from tests.benchmarks.studies.metrics import within
+from tests.benchmarks.studies.run import FOUND_DEG
 
 __all__ = ["MEASURES", "interval", "rate"]
 
@@ -71,6 +72,58 @@ def clock_sigmas(lines: Lines, row: Row) -> str:
     return f"{rate(int(np.sum(np.abs(z) <= 3)), len(z))}, {np.sqrt(np.mean(z**2)):.2f} sigma"
 
 
+def found(lines: Lines, row: Row) -> str:
+    """Runs of each of `rows` whose camera-lidar is within .15 deg, and those in which it was accepted."""
+    by_row = [[r["pairs"].get("camera_lidar", {}) for r in lines if r["row"] == name] for name in row["rows"]]
+    near = [sum(max(p["az_deg"], p["el_deg"]) <= FOUND_DEG for p in own if "az_deg" in p) for own in by_row]
+    taken = [sum(p.get("status") == "accepted" for p in own) for own in by_row]
+    return f"{_slashed(near)}; {_slashed(taken)} of {len(by_row[0])}"
+
+
+def wrong_records(lines: Lines, _row: Row) -> str:
+    """Accepted records with an angle that they certify beyond its limit, of all that were accepted."""
+    records = [(pair, p) for r in lines for pair, p in r["pairs"].items()]
+    accepted = [(pair, p) for pair, p in records if p["status"] == "accepted"]
+    wrong = sum(not within(pair, p, claimed=True) for pair, p in accepted)
+    return f"{wrong} of {len(accepted)} accepted ({len(records)} records)"
+
+
+def nights_wrong(lines: Lines, _row: Row) -> str:
+    """Certified records, poses and states of fleets that are wrong, of all that certify a direction."""
+    counts = []
+    for what in ("records", "poses", "states"):
+        every = [x for r in lines for x in r[what] if x["certified"]]
+        counts.append(f"{sum(x['is_wrong'] for x in every)} of {len(every)} {what}")
+    return ", ".join(counts)
+
+
+def states_after(lines: Lines, row: Row) -> str:
+    """Sensors whose state certifies a direction after each of `nights`."""
+    shares = []
+    for night in row["nights"]:
+        states = [s for r in lines if r["night"] == night - 1 for s in r["states"]]
+        shares.append(f"{sum(bool(s['certified']) for s in states)}/{len(states)}")
+    return ", ".join(shares)
+
+
+def named_red(lines: Lines, _row: Row) -> str:
+    """Moved sensors that audit names RED, and vehicles that are RED for another reason."""
+    moved = {(r["row"], r["vehicle"]): r["moved"] for r in lines if r["moved"]}
+    named = {
+        (r["row"], r["vehicle"])
+        for r in lines
+        if r["moved"] and r["moved"][0] in r["red"] and r["night"] >= r["moved"][1]
+    }
+    early = {
+        (r["row"], r["vehicle"]) for r in lines if r["red"] and (not r["moved"] or r["night"] < r["moved"][1])
+    }
+    return f"{len(named)} of {len(moved)}; {len(early)} others RED"
+
+
+def _slashed(numbers: Sequence[int]) -> str:
+    return "/".join(map(str, numbers))
+
+
 def interval(hits: int, trials: int) -> tuple[float, float]:
     """Clopper and Pearson's 95 % interval of a rate; one-sided if none or all succeed (about 3 / trials wide)."""
     if not 0 <= hits <= trials or trials < 1:
@@ -91,6 +144,7 @@ def rate(hits: int, trials: int) -> str:
     return f"{hits} of {trials} ({low:.0f} to {high:.0f} %)"
 
 
-MEASURES: dict[str, Callable[[Lines, Row], str]] = {
-    f.__name__: f for f in (accepted_days, clock_sigmas, errors, inside, wrong_days)
-}
+_ALL = (
+    accepted_days, clock_sigmas, errors, found, inside, named_red, nights_wrong, states_after, wrong_days, wrong_records,
+)  # fmt: skip
+MEASURES: dict[str, Callable[[Lines, Row], str]] = {f.__name__: f for f in _ALL}

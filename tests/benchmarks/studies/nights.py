@@ -46,9 +46,11 @@ from schemas.captures import CAPTURES
 from schemas.drift import DRIFT, DriftFinding
 from schemas.poses import POSES, PoseRow
 from schemas.states import STATES, StateRow
+from tests.benchmarks.results_measures import named_red, nights_wrong, states_after
 from tests.benchmarks.studies.commits import commit_now, is_accepted
 from tests.benchmarks.studies.engine import RESULTS
 from tests.benchmarks.studies.looks import look
+from tests.benchmarks.studies.run import table as markdown
 
 __all__ = ["FLEETS", "run_fleets"]
 
@@ -236,39 +238,24 @@ def _errors(
 
 
 def table(lines: Sequence[Mapping[str, Any]]) -> str:
-    """A row per fleet: accepted and wrong of records, poses and states; states after each night; RED."""
-    rows = ["| fleet | records | poses | states | certified after nights 1, 2, 3, ... | moved: RED | CPU s |"]
-    rows.append("|" + "---|" * 7)
+    """A row per fleet: what is certified and wrong, states by night, sensors RED, farther than the prior, CPU."""
+    heads = [
+        "fleet",
+        "wrong of certified",
+        "states certified after each night",
+        "moved: RED",
+        "farther than the prior",
+    ]
+    body = []
     for name in dict.fromkeys(r["row"] for r in lines):
         own = [r for r in lines if r["row"] == name]
-        cells = [_counts([x for r in own for x in r[what]]) for what in ("records", "poses", "states")]
-        nights = sorted({r["night"] for r in own})
-        shares = [_share([s for r in own if r["night"] == n for s in r["states"]]) for n in nights]
-        cpu_s = np.mean([r["cpu_s"] for r in own])
-        rows.append(f"| {name} | {' | '.join(cells)} | {', '.join(shares)} | {_red(own)} | {cpu_s:.0f} |")
-    return "\n".join(rows)
-
-
-def _counts(found: Sequence[Mapping[str, Any]]) -> str:
-    certified = [x for x in found if x["certified"]]
-    wrong, farther = sum(x["is_wrong"] for x in found), sum(x.get("is_farther", False) for x in found)
-    return f"{len(certified)} of {len(found)} certified, {wrong} wrong, {farther} farther than the prior"
-
-
-def _share(states: Sequence[Mapping[str, Any]]) -> str:
-    return f"{sum(bool(s['certified']) for s in states)}/{len(states)}"
-
-
-def _red(lines: Sequence[Mapping[str, Any]]) -> str:
-    """Moved vehicles whose sensor is named RED, and how many others ever are."""
-    moved = {r["vehicle"]: r["moved"] for r in lines if r["moved"]}
-    named = {
-        r["vehicle"]
-        for r in lines
-        if r["moved"] and r["moved"][0] in r["red"] and r["night"] >= r["moved"][1]
-    }
-    before = {r["vehicle"] for r in lines if r["red"] and (not r["moved"] or r["night"] < r["moved"][1])}
-    return f"{len(named)} of {len(moved)}, {len(before)} others"
+        nights = {"nights": sorted({r["night"] + 1 for r in own})}
+        states = [s for r in own for s in r["states"]]
+        farther = f"{sum(s.get('is_farther', False) for s in states)} of {len(states)}"
+        cpu_s = f"{np.mean([r['cpu_s'] for r in own]):.0f}"
+        cells = (nights_wrong(own, {}), states_after(own, nights), named_red(own, {}), farther, cpu_s)
+        body.append([name, *cells])
+    return markdown([*heads, "CPU s a vehicle-day"], body)
 
 
 if __name__ == "__main__":
