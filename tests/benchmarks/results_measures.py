@@ -145,6 +145,7 @@ def rate(hits: int, trials: int) -> str:
 
 
 _ALL = (
-    accepted_days, clock_sigmas, errors, found, inside, named_red, nights_wrong, states_after, wrong_days, wrong_records,
+    accepted_days, clock_sigmas, errors, found, inside, named_red, nights_wrong, states_after, wrong_days,
+    wrong_records,
 )  # fmt: skip
 MEASURES: dict[str, Callable[[Lines, Row], str]] = {f.__name__: f for f in _ALL}

@@ -29,14 +29,7 @@ from pipeline.core.config import VerifyConfig
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse, rotation_angle_rad
 from pipeline.rig.targets import DEFAULT_TARGETS, errors_at_targets
 from pipeline.simulate.faults import parse_faults
-from pipeline.simulate.fleet import (
-    FleetSpec,
-    day_names,
-    fleet_toml,
-    rigs_of,
-    simulate_vehicle_day,
-    vehicle_names,
-)  # fmt: skip
+from pipeline.simulate.fleet import FleetSpec, begin_fleet, day_names, simulate_vehicle_day
 from pipeline.simulate.sensors.rigs import rig_named
 from pipeline.store.current import current_poses, current_records, current_states, prior_of, transform_of
 from pipeline.store.partitions import Lake
@@ -128,8 +121,7 @@ def _night(fleet: Fleet, night: int, folder: Path) -> list[dict[str, Any]]:
     spec, day, lake = fleet.spec, day_names(FIRST_DAY, fleet.nights)[night], Lake.at(folder / "lake")
     if night == 0:
         shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True)
-        (folder / "fleet.toml").write_text(fleet_toml("nights", rigs_of(spec)))
+        begin_fleet(spec, folder, "nights")
     for vehicle in range(fleet.vehicles):
         simulate_vehicle_day(spec, vehicle, night, folder)
     began, said = time.process_time(), io.StringIO()
@@ -150,7 +142,7 @@ def _night(fleet: Fleet, night: int, folder: Path) -> list[dict[str, Any]]:
     return [
         about | {"vehicle": name, "moved": moved.get(name), "cpu_s": round(cpu_s, 1)}
         | _measured(lake, name, day, _truth(folder, name, day))
-        for name in vehicle_names(spec)
+        for name in spec.names
     ]  # fmt: skip
 
 
