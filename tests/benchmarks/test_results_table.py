@@ -58,3 +58,11 @@ def test_a_second_look_at_a_seed_is_called_one():
     assert results_table._look([second], {}) == "second"
     assert results_table._look([second | {"commit": "8a615de"}], {}) == "first"
     assert results_table._look([{"day": {"seed": 171}, "commit": "a"}], {}) == "tuned on"
+
+
+def test_what_make_benchmark_runs_can_be_begun():
+    from tests.benchmarks.studies import nights, real, run  # noqa: PLC0415 - they import the whole product
+
+    assert all(fleet.spec.names for fleet in nights.FLEETS.values())
+    assert {len(method) for method in real.STARTS} == {2}
+    assert set(run.SUMMARIES) < set(run.SETS)
