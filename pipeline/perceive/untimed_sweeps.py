@@ -45,11 +45,6 @@ class Arc(NamedTuple):
     y: float
     yaw_rad: float
 
-    @property
-    def way(self) -> float:
-        """Speed [m/s]."""
-        return float(np.hypot(self.x, self.y))
-
 
 @dataclass(frozen=True, eq=False)
 class Turning:
@@ -64,7 +59,11 @@ class Turning:
         The motion is the odometry's, or else that between sweeps. Without both, a radar's Doppler may move it later.
         """
         motion = _told(seen) or self.motion.get(seen.moment)
-        stands = motion is not None and motion.way < _MOVES_MPS and abs(motion.yaw_rad) < _STANDS_RADPS
+        stands = (
+            motion is not None
+            and np.hypot(motion.x, motion.y) < _MOVES_MPS
+            and abs(motion.yaw_rad) < _STANDS_RADPS
+        )
         if self.turn is None:
             return sweep, "" if stands else WITHOUT_TIMES
         time_s = _times_of(self.turn, sweep.lidar_xyz_m)

@@ -17,17 +17,9 @@ from pipeline.objective.radar.vehicle_boxes import (
 from pipeline.rig.se3 import exp_se3
 from tests.makers.radar_scenes import DT_S, T_LIDAR_RADAR, street_day
 from tests.makers.solve_scenes import T_CAMERA_LIDAR
+from tests.objective.plain_numpy import central_differences
 
 T_CAMERA_RADAR = T_CAMERA_LIDAR @ T_LIDAR_RADAR
-
-
-def central_differences(residual, unknowns, h=1e-6):
-    columns = []
-    for k in range(unknowns):
-        step = np.zeros(unknowns)
-        step[k] = h
-        columns.append((residual(step) - residual(-step)) / (2 * h))
-    return np.stack(columns, -1)
 
 
 def test_box_jacobian_agrees_with_central_differences():

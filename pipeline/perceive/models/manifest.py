@@ -10,7 +10,15 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    PositiveFloat,
+    PositiveInt,
+    ValidationError,
+    model_validator,
+)
 
 from pipeline.core.errors import ModelError
 from pipeline.perceive.labels import DETECTOR_SETS, LABEL_SETS
@@ -18,8 +26,6 @@ from pipeline.perceive.labels import DETECTOR_SETS, LABEL_SETS
 __all__ = ["InputSpec", "Manifest", "ModelFile", "OutputSpec", "Section", "load_manifest", "read_manifest"]
 
 _Unit = Annotated[float, Field(ge=0, le=1)]
-_Size = Annotated[int, Field(gt=0)]
-_Triple = tuple[float, float, float]
 
 
 class Section(BaseModel):
@@ -47,21 +53,15 @@ _Kind = TypeVar("_Kind", bound=ModelFile)
 class InputSpec(Section):
     """How an image becomes the model's input, float32 1x3xHxW."""
 
-    size: tuple[_Size, _Size]
-    mean: _Triple = (0.0, 0.0, 0.0)
-    std: _Triple = (1.0, 1.0, 1.0)
-    scale: Annotated[float, Field(gt=0)] = 1.0
+    size: tuple[PositiveInt, PositiveInt]
+    mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    std: tuple[PositiveFloat, PositiveFloat, PositiveFloat] = (1.0, 1.0, 1.0)
+    scale: PositiveFloat = 1.0
     colour: Literal["rgb", "bgr"] = "rgb"
     fit: Literal["letterbox_top_left", "letterbox_centre", "stretch"] = "letterbox_centre"
     pad: float = 114.0
     tile_scales: tuple[Annotated[float, Field(gt=0, le=1)], ...] = ()
     tile_overlap: Annotated[float, Field(ge=0, lt=1)] = 0.35
-
-    @model_validator(mode="after")
-    def _std_divides(self) -> InputSpec:
-        if min(self.std) <= 0:
-            raise ValueError("std must be positive")
-        return self
 
 
 class OutputSpec(Section):
@@ -69,7 +69,7 @@ class OutputSpec(Section):
 
     layout: Literal["yolox", "yolov5", "yolov8", "logits", "labels"]
     label_set: str
-    strides: tuple[_Size, ...] = (8, 16, 32)
+    strides: tuple[PositiveInt, ...] = (8, 16, 32)
     nms_iou: _Unit = 0.5
     min_score: _Unit = 0.05  # candidates for non-maximum suppression; the config's threshold comes after
 
