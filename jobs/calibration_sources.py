@@ -23,7 +23,7 @@ from pipeline.export.tree import ESTIMATED_EDGES
 from pipeline.ingest.containers.reader import open_log
 from pipeline.ingest.messages.decoding import decode
 from pipeline.rig.day_prior import read_transforms
-from pipeline.rig.edges import words_of
+from pipeline.rig.edges import EDGE_OF_PAIR, words_of
 from pipeline.rig.graph import BASE, Edge, tie
 from pipeline.rig.rig import Rig
 from pipeline.rig.transform_tree import TransformTree
@@ -69,7 +69,7 @@ def read_calibration(
     T_base = None if mount is None else _mounting(mount, names, edges)
     on_base = {e for e in edges if BASE in e.sensors and words_of(e) in pairs}
     if T_base is None and not on_base:  # the car's own root, where its tf has one
-        T_base = tree.lookup(names.base, names.of(reference_of(edges).name))
+        T_base = tree.lookup(names.of(BASE.name), names.of(reference_of(edges).name))
     source = f"record of {day}"
     if day is None:
         source = (
@@ -77,8 +77,7 @@ def read_calibration(
         )
     tell_damage(lake)
     return ExportedCalibration(
-        vehicle, source, method, CODE_VERSION, pairs, None, names, T_base, without, word,
-        known=edges, cameras=cameras, own_tree=tree.edges,
+        vehicle, source, method, CODE_VERSION, pairs, edges, names, T_base, without, word, cameras, tree.edges
     )  # fmt: skip
 
 
@@ -86,7 +85,7 @@ def at_prior(calibration: ExportedCalibration, lake: Lake, day: str) -> Exported
     """The calibration with the priors of a day in place of its estimates."""
     found = priors_of_day(lake, calibration.vehicle, day, calibration.method)
     known = {name: pair for name, pair in found.items() if not isinstance(pair, str)}
-    return replace(calibration, pairs=known, known=tuple(pair.edge for pair in known.values()))
+    return replace(calibration, pairs=known, edges=tuple(pair.edge for pair in known.values()))
 
 
 def pairs_to(found: ExportedCalibration, sensor: str) -> tuple[list[ExportedPair], str]:
@@ -114,12 +113,12 @@ def _mounting(text: str, names: FrameNames, edges: tuple[Edge, ...]) -> np.ndarr
         if form.tree is None:
             raise ConfigError("command line", "mount", f"{name} files have no frames of a car")
         tree = form.tree(read_files([Path(path)]))
-    reference = names.of(reference_of(edges).name)
-    T = tree.lookup(names.base, reference)
+    base, reference = names.of(BASE.name), names.of(reference_of(edges).name)
+    T = tree.lookup(base, reference)
     if T is None:
         frames = ", ".join(sorted({*tree.edges, *tree.edges.values()}))
         problem = f"no chain joins these frames; the file has: {frames or 'none'}"
-        raise ConfigError(path, f"{names.base}, {reference}", problem)
+        raise ConfigError(path, f"{base}, {reference}", problem)
     return T
 
 
@@ -201,8 +200,8 @@ def _side_of_files(text: str, form: str, files: str, names: FrameNames, edges: t
         found = format_named(form).pairs(read_files([Path(f) for f in files.split(",")]), names, edges)
     else:
         found = read_transforms(Path(text))
-    of = {words_of(edge): edge for edge in edges}
-    pairs = {pair: ExportedPair(pair, T, status="given", of=of.get(pair)) for pair, T in found.items()}
+    of = {words_of(edge): edge for edge in (*EDGE_OF_PAIR.values(), *edges)}
+    pairs = {pair: ExportedPair(of[pair], T, status="given") for pair, T in found.items()}
     return Side(text, composed(pairs))
 
 
@@ -252,7 +251,7 @@ class FrameOptions:
             if not (sensor and equals and name):
                 raise ConfigError("command line", "frame", f"{text!r} is not SENSOR=NAME, as front=cam_front")
             asked[sensor] = name
-        return FrameNames.named({**(known or {}), **asked})
+        return FrameNames({**(known or {}), **asked})
 
     def names_in(self, files: Iterable[str | Path]) -> FrameNames:
         """Frame names for reading files: from options, else from an export's notes in or beside them."""

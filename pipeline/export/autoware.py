@@ -22,6 +22,7 @@ from pipeline.export.provenance import comment_lines
 from pipeline.export.texts import edit_yaml, field_of, load_yaml, number_of, to_yaml
 from pipeline.export.tree import T_LINK_OPTICAL, pose_of_rpy, require_frames, rpy_of
 from pipeline.export.urdf import xml_of
+from pipeline.rig.graph import BASE
 from pipeline.rig.se3 import inverse
 from pipeline.rig.transform_tree import TransformTree
 
@@ -38,35 +39,34 @@ _KIT_FILE, _CAR_FILE, _XACRO_FILE = (
 
 def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
     """Files of a calibration; the kit is placed at the reference lidar unless the base frame is the kit."""
-    names, T_base_lidar = calibration.names, calibration.T_base
-    lidar = names.of(calibration.reference.name)
-    is_kit_known = T_base_lidar is not None and names.base == _KIT
-    T_kit_lidar = T_base_lidar if is_kit_known and T_base_lidar is not None else np.eye(4)
-    poses = {lidar: T_kit_lidar} | _links(calibration, T_kit_lidar)
+    T_base_lidar, base = calibration.T_base, calibration.names.of(BASE.name)
+    lidar = calibration.names.of(calibration.reference.name)
+    T_kit_lidar = T_base_lidar if base == _KIT else None
+    poses = {lidar: np.eye(4) if T_kit_lidar is None else T_kit_lidar}
+    poses |= _links(calibration, poses[lidar])
     comments = comment_lines(
         calibration, "pose of the camera's link (x forward, y left, z up), not of its optical frame"
     )
-    if not is_kit_known:
+    if T_kit_lidar is None:
         comments.append(f"{_KIT} sits at {lidar}")
     children = {child: _entry(T) for child, T in poses.items()}
     files = {
         _KIT_FILE: to_yaml({_KIT: children}, comments),
         _XACRO_FILE: xml_of(_xacro(list(poses)), comments),
     }
-    if T_base_lidar is not None and not is_kit_known:
-        files[_CAR_FILE] = to_yaml({names.base: {_KIT: _entry(T_base_lidar)}}, comments)
+    if T_base_lidar is not None and T_kit_lidar is None:
+        files[_CAR_FILE] = to_yaml({base: {_KIT: _entry(T_base_lidar)}}, comments)
     return files
 
 
 def _links(calibration: ExportedCalibration, T_kit_lidar: np.ndarray) -> dict[str, np.ndarray]:
     """Poses in the kit of camera links and of the other sensors, for the sensors in the calibration."""
-    poses, reference = {}, calibration.reference.name
+    poses, reference = {}, calibration.reference
     for sensor in calibration.sensors:
-        found = None if sensor.name == reference else calibration.between(reference, sensor.name)
-        if found is not None:
-            T = T_kit_lidar @ found[0]
-            is_camera = sensor.kind == "camera"
-            poses[calibration.names.of(sensor.name)] = T @ inverse(T_LINK_OPTICAL) if is_camera else T
+        T = calibration.T_between(reference.name, sensor.name)
+        if T is not None and sensor != reference:
+            T_sensor_link = inverse(T_LINK_OPTICAL) if sensor.kind == "camera" else np.eye(4)
+            poses[calibration.names.of(sensor.name)] = T_kit_lidar @ T @ T_sensor_link
     return poses
 
 

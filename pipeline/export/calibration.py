@@ -13,7 +13,7 @@ from jaxtyping import Float
 from pipeline.core.errors import ConfigError
 from pipeline.rig.cameras import Camera
 from pipeline.rig.changes import change_covariance
-from pipeline.rig.edges import EDGE_OF_PAIR, edge_order, words_of
+from pipeline.rig.edges import words_of
 from pipeline.rig.graph import BASE, KINDS, Edge, RigGraph, Sensor
 from pipeline.rig.se3 import adjoint, inverse
 from schemas.calibrations import DOF_NAMES
@@ -37,6 +37,7 @@ __all__ = [
 # Statuses of a pair that may be loaded, of records and of states.
 USABLE = ("accepted", "current", "prior")
 _KINDS = ("camera", "lidar", "radar", "base")
+_BASE_LINK = "base_link"  # frame of base, if no other name is given
 _REFERENCES = ("lidar", "radar", "camera")  # sensor kinds in order of preference as reference of the poses
 # Valid as a ROS frame, and without quotes in XML, YAML, a shell and a xacro expression.
 _FRAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_./-]*")
@@ -49,38 +50,23 @@ def is_frame(name: str) -> bool:
 
 @dataclass(frozen=True)
 class FrameNames:
-    """Frame names by sensor in the exported file; sensors that are not in `others` keep their names.
+    """Frame names by sensor in the exported file; other sensors keep their names. ConfigError if they are invalid."""
 
-    `base` is used if its pose is known.
-    """
-
-    camera: str = "camera"
-    lidar: str = "lidar"
-    radar: str = "radar"
-    base: str = "base_link"
-    others: Mapping[str, str] = field(default_factory=dict)
+    frames: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        values = {sensor: self.of(sensor) for sensor in (*_KINDS, *self.others)}
-        for option, name in values.items():
+        for option, name in self.frames.items():
             if not is_frame(name):
                 problem = (
                     f"{name!r} is not a valid frame name: letters, digits and _ - . / only, no / in front"
                 )
                 raise ConfigError("command line", f"{option}-frame", problem)
-        # In a rig whose sensors have other names, the defaults apply to none.
-        require_different([values[sensor] for sensor in self.others or _KINDS])
-
-    @classmethod
-    def named(cls, frames: Mapping[str, str]) -> FrameNames:
-        """Frame names from a mapping by sensor; raises ConfigError if they are invalid."""
-        known = {sensor: name for sensor, name in frames.items() if sensor in _KINDS}
-        return cls(**known, others={s: n for s, n in frames.items() if s not in _KINDS})
+        # In a rig whose sensors have other names, the names of three sensors apply to none.
+        require_different([self.of(s) for s in [s for s in self.frames if s not in _KINDS] or _KINDS])
 
     def of(self, sensor: str) -> str:
         """Frame name of a sensor or of base."""
-        known = {"camera": self.camera, "lidar": self.lidar, "radar": self.radar, "base": self.base}
-        return {**known, **self.others}.get(sensor, sensor)
+        return self.frames.get(sensor, _BASE_LINK if sensor == BASE.name else sensor)
 
 
 def require_different(names: Sequence[str]) -> None:
@@ -94,7 +80,6 @@ class ExportedPair:
     """One edge: T_parent_child, its uncertainty and its origin.
 
     Args:
-        pair: name of the edge: camera_lidar, camera_radar, lidar_radar, or sensor names such as front-top.
         covariance: 6x6 of the left perturbation, rx ry rz tx ty tz in parent axes [rad, m]; None if unknown.
         observable: per DoF, whether the data determined it; the other DoF keep the prior.
         certified: whether azimuth and elevation are within their limits.
@@ -102,7 +87,7 @@ class ExportedPair:
         details: more about its origin, in plain values (work key, days, time offset, notes).
     """
 
-    pair: str
+    edge: Edge
     T: Float[np.ndarray, "4 4"]
     covariance: Float[np.ndarray, "6 6"] | None = None
     status: str = "accepted"
@@ -111,12 +96,11 @@ class ExportedPair:
     certified: tuple[str, ...] = ("azimuth", "elevation")
     common: Float[np.ndarray, "6 6"] | None = None
     details: Mapping[str, object] = field(default_factory=dict)
-    of: Edge | None = None
 
     @property
-    def edge(self) -> Edge:
-        """The edge; if not given, the pair name is read as sensor kinds."""
-        return EDGE_OF_PAIR[self.pair] if self.of is None else self.of
+    def pair(self) -> str:
+        """Name of the edge: camera_lidar, camera_radar, lidar_radar, or sensor names such as front-top."""
+        return words_of(self.edge)
 
     @property
     def identifier(self) -> str:
@@ -142,12 +126,11 @@ class ExportedCalibration:
     Args:
         pairs: edges by name. A file holds poses relative to the reference along edges with a lidar. An edge
             of camera and radar contributes its sigma only, unless no other edge connects them.
-        camera: intrinsics of the only camera, if known.
         T_base_lidar: pose of the reference on the car; None = from an edge to base, or the reference is the
             root.
         left_out: reason by name, for edges that are not in `pairs`.
         word: status of the record or state as a whole, one of DAY_WORDS.
-        known: all edges of the vehicle, those left out included; empty = those of camera, lidar and radar.
+        edges: all edges of the vehicle, those left out included, in order.
         own_tree: parent of each frame above the sensors in the car's own /tf_static.
     """
 
@@ -156,22 +139,16 @@ class ExportedCalibration:
     method: str
     code_version: str
     pairs: Mapping[str, ExportedPair]
-    camera: Camera | None = None
+    edges: tuple[Edge, ...]
     names: FrameNames = field(default_factory=FrameNames)
     T_base_lidar: Float[np.ndarray, "4 4"] | None = None
     left_out: Mapping[str, str] = field(default_factory=dict)
     word: str = "done"
     cameras: Mapping[str, Camera] = field(default_factory=dict)
-    known: tuple[Edge, ...] = ()
     own_tree: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         require_different([self.names.of(sensor.name) for sensor in (*self.sensors, BASE)])
-
-    @property
-    def edges(self) -> tuple[Edge, ...]:
-        """All edges of the vehicle, in order."""
-        return tuple(sorted(set(self.known or EDGE_OF_PAIR.values()), key=edge_order))
 
     @property
     def sensors(self) -> tuple[Sensor, ...]:
@@ -187,38 +164,34 @@ class ExportedCalibration:
     @property
     def root(self) -> str:
         """Name of the root frame."""
-        return self.names.of(self.reference.name) if self.T_base is None else self.names.base
+        return self.names.of(self.reference.name if self.T_base is None else BASE.name)
 
     @property
     def T_base(self) -> Float[np.ndarray, "4 4"] | None:
         """T_base_reference, as given or from an edge to base; None if unknown."""
-        if self.T_base_lidar is not None:
-            return self.T_base_lidar
-        found = self.between(BASE.name, self.reference.name) if self._has(BASE.name) else None
-        return None if found is None else found[0]
-
-    def camera_of(self, sensor: str) -> Camera | None:
-        """Intrinsics of a camera; None if unknown."""
-        only = [s.name for s in self.sensors if s.kind == "camera"] == [sensor]
-        return self.cameras.get(sensor, self.camera if only else None)
+        return (
+            self.T_between(BASE.name, self.reference.name) if self.T_base_lidar is None else self.T_base_lidar
+        )
 
     def T_root(self, sensor: str) -> Float[np.ndarray, "4 4"] | None:
         """T_root_sensor; None if the calibration does not have it."""
-        found = self.between(self.reference.name, sensor)
-        if found is None:
-            return None
-        T_base = self.T_base
-        return found[0] if T_base is None else T_base @ found[0]
+        T, T_base = self.T_between(self.reference.name, sensor), self.T_base
+        return T if T is None or T_base is None else T_base @ T
 
     def way(self, a: str, b: str) -> tuple[Edge, ...] | None:
         """Chain of edges from one sensor to another, with or without estimates; None if not connected."""
         nodes = {s.name: s for edge in self.edges for s in edge.sensors}
         if a not in nodes or b not in nodes:
-            return () if a == b else None
+            return None
         graph = RigGraph(tuple(nodes.values()), self.edges, nodes[a])
         sure = graph.without([edge for edge in self.edges if edge.kind == "camera_radar"])
         way = sure.path(nodes[a], nodes[b])
         return graph.path(nodes[a], nodes[b]) if way is None else way
+
+    def T_between(self, a: str, b: str) -> Float[np.ndarray, "4 4"] | None:
+        """T_a_b; None if there is no estimate."""
+        found = self.between(a, b)
+        return None if found is None else found[0]
 
     def between(
         self, a: str, b: str
@@ -227,16 +200,16 @@ class ExportedCalibration:
         pairs, way = {pair.edge: pair for pair in self.pairs.values()}, self.way(a, b)
         if way is None or any(edge not in pairs for edge in way):
             return None
-        T, covariance, here = np.eye(4), None, a
-        for k, edge in enumerate(way):
-            step, sure = _step(pairs[edge], here)
-            A = adjoint(T)
-            covariance = sure if k == 0 else _sum(covariance, None if sure is None else A @ sure @ A.T)
-            T, here = step if k == 0 else T @ step, edge.other(here).name
-        return T, covariance
-
-    def _has(self, node: str) -> bool:
-        return any(node in (s.name for s in edge.sensors) for edge in self.edges)
+        T, covariance, here = np.eye(4), np.zeros((6, 6)), a
+        for edge in way:
+            step, C = pairs[edge].T, pairs[edge].covariance
+            C = np.full((6, 6), np.nan) if C is None else C
+            if edge.parent.name != here:
+                step = inverse(step)
+                C = adjoint(step) @ C @ adjoint(step).T
+            covariance = covariance + adjoint(T) @ C @ adjoint(T).T
+            T, here = T @ step, edge.other(here).name
+        return T, None if np.isnan(covariance).any() else covariance
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,7 +228,7 @@ def poses_of(calibration: ExportedCalibration) -> list[Pose]:
     names, reference = calibration.names, calibration.reference.name
     poses, T_base = [], calibration.T_base
     if T_base is not None:
-        poses.append(Pose(reference, names.base, names.of(reference), T_base))
+        poses.append(Pose(reference, names.of(BASE.name), names.of(reference), T_base))
     for sensor in calibration.sensors:
         found = None if sensor.name == reference else calibration.between(reference, sensor.name)
         if found is not None:
@@ -286,19 +259,6 @@ def written_pairs(calibration: ExportedCalibration) -> list[str]:
     return [name for name, pair in calibration.pairs.items() if pair.edge in used]
 
 
-def _step(pair: ExportedPair, here: str) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "6 6"] | None]:
-    """Transform of an edge from sensor `here` to the other one, with its covariance in axes of `here`."""
-    if pair.edge.parent.name == here:
-        return pair.T, pair.covariance
-    T = inverse(pair.T)
-    A = adjoint(T)
-    return T, None if pair.covariance is None else A @ pair.covariance @ A.T
-
-
-def _sum(a: np.ndarray | None, b: np.ndarray | None) -> np.ndarray | None:
-    return None if a is None or b is None else a + b
-
-
 def sigmas_of(
     T: Float[np.ndarray, "4 4"], covariance: Float[np.ndarray, "6 6"] | None
 ) -> dict[str, float] | None:
@@ -314,7 +274,7 @@ def cameras_of(calibration: ExportedCalibration, by: str) -> list[str]:
     """Cameras with a known pose; raises ConfigError, with the reason for a camera left out, if none."""
     reference = calibration.reference.name
     cameras = [s.name for s in calibration.sensors if s.kind == "camera"]
-    found = [name for name in cameras if calibration.between(reference, name) is not None]
+    found = [name for name in cameras if calibration.T_between(reference, name) is not None]
     if found:
         return found
     lacking = {words_of(edge) for name in cameras for edge in calibration.way(reference, name) or ()}
@@ -325,8 +285,7 @@ def cameras_of(calibration: ExportedCalibration, by: str) -> list[str]:
 
 def needed_camera(calibration: ExportedCalibration, by: str, sensor: str) -> Camera:
     """Intrinsics of a camera, for formats that require them; raises ConfigError if unknown."""
-    camera = calibration.camera_of(sensor)
-    if camera is None:
+    if sensor not in calibration.cameras:
         problem = "the format needs intrinsics, and the observations of these days are no longer in the lake"
         raise ConfigError(f"export {by}", sensor, problem)
-    return camera
+    return calibration.cameras[sensor]

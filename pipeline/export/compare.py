@@ -12,7 +12,7 @@ from pipeline.export.calibration import ExportedPair
 from pipeline.export.tree import ESTIMATED_PAIRS
 from pipeline.rig.changes import change_between, change_covariance
 from pipeline.rig.differences import PairDifference
-from pipeline.rig.edges import edge_order
+from pipeline.rig.edges import EDGE_OF_PAIR, edge_order
 from pipeline.rig.se3 import inverse, log_se3
 from pipeline.rig.targets import target_sigmas
 
@@ -70,7 +70,9 @@ def composed(pairs: Mapping[str, ExportedPair]) -> dict[str, ExportedPair]:
     found = dict(pairs)
     if "camera_radar" not in found and all(p in found for p in ESTIMATED_PAIRS):
         first, second = (found[p] for p in ESTIMATED_PAIRS)
-        found["camera_radar"] = ExportedPair("camera_radar", first.T @ second.T, status=first.status)
+        found["camera_radar"] = ExportedPair(
+            EDGE_OF_PAIR["camera_radar"], first.T @ second.T, status=first.status
+        )
     return found
 
 

@@ -78,10 +78,11 @@ def cloud_columns(frame: Frame, kind: str) -> tuple[dict[str, np.ndarray], int]:
     """Points of the frame's lidar or radar by field, and their stamp [ns]; range rate positive = receding."""
     columns = {axis: getattr(frame, f"{kind}_{axis}_m") for axis in "xyz"}
     if kind == "lidar":
-        more = {"intensity": frame.lidar_intensity}
-        return columns | {n: c for n, c in more.items() if c is not None}, frame.stamp_ns
-    more = {"range_rate_mps": frame.radar_range_rate_mps, "power_db": frame.radar_power_db}
-    return columns | {n: c for n, c in more.items() if c is not None}, frame.radar_stamp_ns
+        columns["intensity"], stamp_ns = frame.lidar_intensity, frame.stamp_ns
+    else:
+        columns |= {"range_rate_mps": frame.radar_range_rate_mps, "power_db": frame.radar_power_db}
+        stamp_ns = frame.radar_stamp_ns
+    return {name: column for name, column in columns.items() if column is not None}, stamp_ns
 
 
 def cloud_message(columns: Mapping[str, np.ndarray], frame_id: str, stamp_ns: int) -> fg.PointCloud:

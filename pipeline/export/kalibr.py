@@ -7,6 +7,7 @@ cameras, so all entries are under cam0, cam1, ...); T_cam_lidar as in Oxford Spi
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -29,10 +30,8 @@ _RADTAN = 4  # k1 k2 p1 p2
 def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
     cameras = cameras_of(calibration, "kalibr")
     chain = {f"cam{k}": _camera(calibration, name) for k, name in enumerate(cameras)}
-    for k, (name, before) in enumerate(zip(cameras[1:], cameras, strict=False), start=1):
-        found = calibration.between(name, before)
-        assert found is not None, "both have a pose to the reference"
-        chain[f"cam{k}"]["T_cn_cnm1"] = found[0].tolist()
+    for k, (before, name) in enumerate(pairwise(cameras), start=1):
+        chain[f"cam{k}"]["T_cn_cnm1"] = calibration.T_between(name, before)
     comments = [
         *comment_lines(calibration),
         "T_cam_x maps coordinates from x to the camera's optical frame; rostopic is only a label",
@@ -54,11 +53,8 @@ def _camera(calibration: ExportedCalibration, name: str) -> dict[str, Any]:
         "rostopic": f"/{calibration.names.of(name)}/image_raw",
         "cam_overlaps": [],
     }
-    for other in (s.name for s in calibration.sensors if s.kind != "camera"):
-        found = calibration.between(name, other)
-        if found is not None:
-            cam[f"T_cam_{other}"] = found[0].tolist()
-    return cam
+    others = {s.name: calibration.T_between(name, s.name) for s in calibration.sensors if s.kind != "camera"}
+    return cam | {f"T_cam_{other}": T for other, T in others.items() if T is not None}
 
 
 def _distortion(name: str, camera: Camera) -> tuple[str, list[float]]:

@@ -44,24 +44,21 @@ def _of_camera(calibration: ExportedCalibration, name: str) -> bytes:
     camera, lidar = needed_camera(calibration, "kitti", name), calibration.reference.name
     P = np.hstack([camera.K, np.zeros((3, 1))])
     T_lidar_base = np.eye(4) if calibration.T_base is None else inverse(calibration.T_base)
-    values = {f"P{k}": P for k in range(4)} | {
+    values: dict[str, np.ndarray | None] = {
+        **{f"P{k}": P for k in range(4)},
         _RECTIFIED: np.eye(3),
-        _CAMERA: _pose(calibration, name, lidar)[:3],
-        "Tr_imu_to_velo": T_lidar_base[:3],
+        _CAMERA: calibration.T_between(name, lidar),
+        "Tr_imu_to_velo": T_lidar_base,
     }
     others = [s.name for s in calibration.sensors if s.kind != "camera" and s.name != lidar]
-    for other in others:  # Tr_radar_to_velo for a radar named "radar"
-        if calibration.between(lidar, other) is not None:
-            values[f"Tr_{other}{_TO_LIDAR}"] = _pose(calibration, lidar, other)[:3]
+    values |= {f"Tr_{other}{_TO_LIDAR}": calibration.T_between(lidar, other) for other in others}
     # KITTI prints 12 digits after the point; with 16, reading gives the same float64.
-    lines = (f"{name}: {' '.join(f'{v:.16e}' for v in M.reshape(-1))}\n" for name, M in values.items())
+    lines = (
+        f"{name}: {' '.join(f'{v:.16e}' for v in M[:3].reshape(-1))}\n"
+        for name, M in values.items()
+        if M is not None
+    )
     return "".join(lines).encode()  # some readers fail on the blank line at the end of KITTI's own files
-
-
-def _pose(calibration: ExportedCalibration, a: str, b: str) -> np.ndarray:
-    found = calibration.between(a, b)
-    assert found is not None, "asked for sensors whose pose is known"
-    return found[0]
 
 
 def _read(files: Files, edges: Sequence[Edge], _names: FrameNames) -> dict[str, np.ndarray]:

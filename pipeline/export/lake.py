@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -74,13 +74,13 @@ def pairs_of(
     ties = {tie(nodes[n], nodes[r]): (n, row) for n, _, r, row in poses if n != r and r in nodes}
     of_three = is_one_of_each(nodes.values())
     chosen: dict[Edge, ExportedPair | str] = {
-        edge: _pair_of_pose(row, name, edge)
+        edge: _pair(edge, row, name)
         if edge not in of_edge or _is_left_out(of_edge[edge])
-        else _pair(of_edge[edge])
+        else _pair(edge, of_edge[edge])
         for edge, (name, row) in ties.items()
     }
     if of_three or not ties:
-        chosen |= {edge: _pair(row) for edge, row in of_edge.items() if edge not in chosen}
+        chosen |= {edge: _pair(edge, row) for edge, row in of_edge.items() if edge not in chosen}
     return {edge: chosen[edge] for edge in sorted(chosen, key=edge_order)}
 
 
@@ -89,45 +89,36 @@ def _is_left_out(row: CalibrationRecord | StateRow) -> bool:
     return isinstance(row, CalibrationRecord) and row.used is False and row.own_covariance is None
 
 
-def _pair_of_pose(row: PoseRow | StateRow, sensor: str, edge: Edge) -> ExportedPair | str:
-    """Pose of a sensor as its edge to the reference, whichever of the two is the parent."""
+def _pair(
+    edge: Edge, row: CalibrationRecord | StateRow | PoseRow, sensor: str | None = None
+) -> ExportedPair | str:
+    """An edge by its own row, or by the pose of its `sensor` in the other one; the reason if it has no transform."""
     T, covariance, common = transform_of(row), row.covariance, row.common_covariance
-    if T is None or covariance is None:
+    if T is None or (sensor is not None and covariance is None):
         return f"{row.status}: {row.reason}"
     seen, reason = tuple(row.observable or [True] * 6), row.reason
     if edge.parent.name == sensor:
         T = inverse(T)
         A = adjoint(T)
-        covariance, common = A @ covariance @ A.T, None if common is None else A @ common @ A.T
+        covariance, common = (None if C is None else A @ C @ A.T for C in (covariance, common))
         unseen = ", ".join(dof for dof, is_seen in zip(DOF_NAMES, seen, strict=True) if not is_seen)
         if row.status != "prior":
             # The degrees of freedom refer to axes of the reference; in axes of the sensor they are mixed.
             own = f"{unseen} along the axes of {edge.child.name} kept at the prior" if unseen else ""
             seen, reason = (True,) * 6, "; ".join(words for words in (reason, own) if words)
-    return ExportedPair(
-        words_of(edge),
-        T,
-        covariance,
-        row.status,
-        reason,
-        seen,
-        tuple(row.determined),
-        common,
-        _details(row),
-        of=edge,
-    )
+    given = {name: getattr(row, name, None) for name in _DETAILS}
+    details = {name: value for name, value in given.items() if value not in (None, "", [])}
+    return ExportedPair(edge, T, covariance, row.status, reason, seen, tuple(row.determined), common, details)
 
 
 def priors_of_day(lake: Lake, vehicle: str, day: str, method: str) -> dict[str, ExportedPair | str]:
-    """Priors of the day's records by edge name, or the reason for none; errors as `pairs_of_day`."""
+    """Priors of the day's records by edge name, or the reason for none; errors as `pairs_of`."""
     found: dict[str, ExportedPair | str] = {}
-    for record in _records(lake, vehicle, day, method):
-        T, edge = prior_of(record), edge_of(record)
-        words = words_of(edge)
-        found[words] = (
-            "no prior was given"
-            if T is None
-            else ExportedPair(words, T, record.prior_covariance, "prior", certified=(), of=edge)
+    records = {edge_of(record): record for record in _records(lake, vehicle, day, method)}
+    for edge in sorted(records, key=edge_order):
+        T, C = prior_of(records[edge]), records[edge].prior_covariance
+        found[words_of(edge)] = (
+            "no prior was given" if T is None else ExportedPair(edge, T, C, "prior", certified=())
         )
     return found
 
@@ -164,29 +155,6 @@ def signed_state(lake: Lake, vehicle: str, method: str, *, before: bool = False)
         raise ConfigError("command line", "previous" if before else "signed-off", problem)
     rows = read_records(lake, STATES, StateRow, vehicle=vehicle)
     return current_states([r for r in rows if r.work_key == chosen.state_key])
-
-
-def _pair(row: CalibrationRecord | StateRow) -> ExportedPair | str:
-    T = transform_of(row)
-    if T is None:
-        return f"{row.status}: {row.reason}"
-    edge = edge_of(row)
-    return ExportedPair(
-        words_of(edge),
-        T,
-        row.covariance,
-        row.status,
-        row.reason,
-        tuple(row.observable or [True] * 6),
-        tuple(row.determined),
-        row.common_covariance,
-        _details(row),
-        of=edge,
-    )
-
-
-def _details(row: CalibrationRecord | StateRow | PoseRow) -> dict[str, object]:
-    return {name: value for name in _DETAILS if (value := getattr(row, name, None)) not in (None, "", [])}
 
 
 def choose_pairs(
@@ -228,34 +196,32 @@ def read_cameras(lake: Lake, vehicle: str, days: Iterable[str], cameras: Sequenc
 def read_tf(lake: Lake, vehicle: str, days: Iterable[str]) -> TransformTree:
     """The car's own tree above its sensors, from /tf_static of the latest of these days that has one."""
     tree = TransformTree()
-    for day in sorted(days, reverse=True):
-        try:
-            manifest = ingested(lake, Partition(vehicle, day))
-        except ContractError as err:  # damaged
-            lake.damage.append(str(err))
-            continue
-        for row in () if manifest is None else manifest.extra.get(TF, ()):
-            tree.add_transform(row["parent"], row["child"], transform_of_row(row))
-        if tree.edges:
-            break
+    for row in next((rows for own in _ingested(lake, vehicle, days) if (rows := own.get(TF))), ()):
+        tree.add_transform(row["parent"], row["child"], transform_of_row(row))
     return tree
 
 
 def read_frame_ids(lake: Lake, vehicle: str, days: Iterable[str]) -> dict[str, str]:
     """Frame of each sensor in the logs of the latest of these days, unless it has several."""
+    for own in _ingested(lake, vehicle, days):
+        known = own.get("frame_ids", {})
+        names = {sensor: ids[0].lstrip("/") for sensor, ids in known.items() if len(ids) == 1}
+        if names:
+            is_sound = len(set(names.values())) == len(names) and all(map(is_frame, names.values()))
+            return names if is_sound else {}
+    return {}
+
+
+def _ingested(lake: Lake, vehicle: str, days: Iterable[str]) -> Iterator[Mapping[str, Any]]:
+    """What ingest noted of these days, the latest first."""
     for day in sorted(days, reverse=True):
         try:
             manifest = ingested(lake, Partition(vehicle, day))
         except ContractError as err:  # damaged
             lake.damage.append(str(err))
             continue
-        known = {} if manifest is None else manifest.extra.get("frame_ids", {})
-        names = {sensor: ids[0].lstrip("/") for sensor, ids in known.items() if len(ids) == 1}
-        if names:
-            return (
-                names if len(set(names.values())) == len(names) and all(map(is_frame, names.values())) else {}
-            )
-    return {}
+        if manifest is not None:
+            yield manifest.extra
 
 
 def read_scenes(

@@ -45,10 +45,10 @@ def _write(calibration: ExportedCalibration, *, distortion: bool) -> dict[str, b
             "sensor_token": sensor["token"],
             "translation": [float(v) + 0.0 for v in T[:3, 3]],
             "rotation": [float(v) + 0.0 for v in to_quaternion(T)],
-            "camera_intrinsic": [] if camera is None else camera.K.tolist(),
+            "camera_intrinsic": [] if camera is None else camera.K,
         }
         if distortion:
-            row["camera_distortion"] = [] if camera is None else camera.D.tolist()
+            row["camera_distortion"] = [] if camera is None else camera.D
         sensors.append(sensor)
         calibrated.append(row)
     return {"sensor.json": to_json(sensors), "calibrated_sensor.json": to_json(calibrated)}

@@ -34,7 +34,7 @@ def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
             storage.write(f"covariance_{name}", pair.covariance)
     cameras = [sensor.name for sensor in calibration.sensors if sensor.kind == "camera"]
     for name in cameras:
-        camera, of = calibration.camera_of(name), f"_{name}" * (len(cameras) > 1)
+        camera, of = calibration.cameras.get(name), f"_{name}" * (len(cameras) > 1)
         if camera is not None:
             D = (camera.D if len(camera.D) else np.zeros(4)).reshape(1, -1)
             storage.write(f"image_width{of}", camera.width_px)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from pipeline.core.results import plain
 from pipeline.export.calibration import (
     USABLE,
     ExportedCalibration,
@@ -16,6 +16,7 @@ from pipeline.export.calibration import (
     replaced_transforms,
     sigmas_of,
 )
+from pipeline.rig.graph import BASE
 from schemas.words import axes_in_words
 
 __all__ = ["comment_lines", "not_certified", "provenance_of", "used_lines", "warnings_of"]
@@ -35,7 +36,8 @@ _DIRECTIONS = ("azimuth", "elevation")
 
 def provenance_of(calibration: ExportedCalibration) -> dict[str, Any]:
     """All information on a calibration in plain values, for a side file or a format's metadata."""
-    return {
+    names = (*(sensor.name for sensor in calibration.sensors), BASE.name)
+    found: dict[str, Any] = {
         "written_by": f"Boresight {calibration.code_version}",
         "vehicle": calibration.vehicle,
         "source": calibration.source,
@@ -43,12 +45,21 @@ def provenance_of(calibration: ExportedCalibration) -> dict[str, Any]:
         "warnings": warnings_of(calibration),
         "convention": _CONVENTION,
         "frames": _frames(calibration),
-        "frame_names": _frame_names(calibration),
-        "poses": [_pose(edge) for edge in poses_of(calibration)],
+        "frame_names": {name: calibration.names.of(name) for name in names},
+        "poses": [
+            {
+                "parent": p.parent,
+                "child": p.child,
+                "T_parent_child": p.T,
+                "sigma": sigmas_of(p.T, p.covariance),
+            }
+            for p in poses_of(calibration)
+        ],
         "pairs": {name: _pair(pair) for name, pair in calibration.pairs.items()},
-        "left_out": dict(calibration.left_out),
+        "left_out": calibration.left_out,
         "replaces_in_tf_static": replaced_transforms(calibration),
     }
+    return {name: plain(value) for name, value in found.items()}
 
 
 def warnings_of(calibration: ExportedCalibration) -> list[str]:
@@ -69,10 +80,11 @@ def warnings_of(calibration: ExportedCalibration) -> list[str]:
 
 def used_lines(calibration: ExportedCalibration) -> list[str]:
     """For each pair one line: axes that are used, certified directions, axes at the prior."""
-    return [
-        f"{pair.pair}: {axes_in_words(pair.edge.parent.kind, pair.observable, pair.certified)}"
-        for pair in calibration.pairs.values()
-    ]
+    return [f"{pair.pair}: {_used(pair)}" for pair in calibration.pairs.values()]
+
+
+def _used(pair: ExportedPair) -> str:
+    return axes_in_words(pair.edge.parent.kind, pair.observable, pair.certified)
 
 
 def not_certified(calibration: ExportedCalibration) -> dict[str, str]:
@@ -115,13 +127,8 @@ def _frames(calibration: ExportedCalibration) -> dict[str, str]:
     if calibration.T_base is None:
         axes[names.of(calibration.reference.name)] += "; the root: its pose on the car is unknown"
     else:
-        axes[names.base] = "x forward, y left, z up; the root"
+        axes[names.of(BASE.name)] = "x forward, y left, z up; the root"
     return axes
-
-
-def _frame_names(calibration: ExportedCalibration) -> dict[str, str]:
-    names = (*(sensor.name for sensor in calibration.sensors), "base")
-    return {name: calibration.names.of(name) for name in names}
 
 
 def _in_words(edge: Pose) -> str:
@@ -131,28 +138,15 @@ def _in_words(edge: Pose) -> str:
     return f"{turn} deg about and {shift} m along the axes of {edge.parent}"
 
 
-def _pose(edge: Pose) -> dict[str, Any]:
-    sigma = sigmas_of(edge.T, edge.covariance)
-    return {"parent": edge.parent, "child": edge.child, "T_parent_child": edge.T.tolist(), "sigma": sigma}
-
-
 def _pair(pair: ExportedPair) -> dict[str, Any]:
     return {
         "status": pair.status,
         "reason": pair.reason,
-        "certified": list(pair.certified),
+        "certified": pair.certified,
         "kept_at_prior": pair.at_prior,
-        "in_words": axes_in_words(pair.edge.parent.kind, pair.observable, pair.certified),
-        f"T_{pair.identifier}": pair.T.tolist(),
+        "in_words": _used(pair),
+        f"T_{pair.identifier}": pair.T,
         "sigma": sigmas_of(pair.T, pair.covariance),
-        "covariance": None if pair.covariance is None else pair.covariance.tolist(),
-        **_plain(pair.details),
-    }
-
-
-def _plain(details: Mapping[str, object]) -> dict[str, Any]:
-    """Values that JSON supports."""
-    return {
-        name: list(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
-        for name, value in details.items()
+        "covariance": pair.covariance,
+        **pair.details,
     }

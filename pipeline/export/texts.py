@@ -52,48 +52,49 @@ def to_json(value: Any) -> bytes:
 
 def load_json(file: str, content: bytes) -> Any:
     """Value of a JSON file; raises ConfigError if it is not JSON."""
-    try:
-        return json.loads(text_of(file, content))
-    except (ValueError, RecursionError) as err:
-        raise ConfigError(file, "", f"not readable JSON: {err}") from err
+    return _read(file, content, json.loads, "JSON")
 
 
 def to_yaml(value: Mapping[str, Any], comments: Sequence[str]) -> bytes:
     """Block-style YAML under comment lines; lists of numbers on one line, floats with all their digits."""
-    stream = io.StringIO()
-    yaml = YAML()
-    yaml.Representer = _Representer
-    yaml.default_flow_style = False
-    yaml.width = 4096  # keeps a row of numbers on one line
-    yaml.dump(_styled(value), stream)
-    return ("".join(f"# {line}\n" for line in comments) + stream.getvalue()).encode()
+    text = _dump(_round_trip(), _styled(plain(value)))
+    return "".join(f"# {line}\n" for line in comments).encode() + text
 
 
 def load_yaml(file: str, content: bytes) -> Any:
     """Value of a YAML file without OpenCV's first line `%YAML:1.0`; raises ConfigError if it is not YAML."""
-    text = text_of(file, content)
-    if text.startswith("%YAML:"):
-        text = text.partition("\n")[2]
-    try:
-        return YAML(typ="safe", pure=True).load(text)
-    except (YAMLError, ValueError, RecursionError) as err:
-        raise ConfigError(file, "", f"not readable YAML: {' '.join(str(err).split())[:200]}") from err
+    if content.startswith(b"%YAML:"):
+        content = content.partition(b"\n")[2]
+    return _read(file, content, YAML(typ="safe", pure=True).load, "YAML")
 
 
 def edit_yaml(file: str, content: bytes, edit: Callable[[Any], None]) -> bytes:
     """Change values of a YAML file in place; other values, their order and all comments stay."""
+    yaml = _round_trip()
+    held = _read(file, content, yaml.load, "YAML")
+    edit(held)
+    return _dump(yaml, held)
+
+
+def _read(file: str, content: bytes, load: Callable[[str], Any], kind: str) -> Any:
+    try:
+        return load(text_of(file, content))
+    except (YAMLError, ValueError, RecursionError) as err:
+        raise ConfigError(file, "", f"not readable {kind}: {' '.join(str(err).split())[:200]}") from err
+
+
+def _round_trip() -> YAML:
     yaml = YAML()
     yaml.Representer = _Representer
     yaml.preserve_quotes = True
-    yaml.width = 4096
-    try:
-        held = yaml.load(text_of(file, content))
-    except (YAMLError, ValueError, RecursionError) as err:
-        raise ConfigError(file, "", f"not readable YAML: {' '.join(str(err).split())[:200]}") from err
-    edit(held)
-    stream = io.StringIO()
-    yaml.dump(held, stream)
-    return stream.getvalue().encode()
+    yaml.width = 4096  # keeps a row of numbers on one line
+    return yaml
+
+
+def _dump(yaml: YAML, value: Any) -> bytes:
+    stream = io.BytesIO()
+    yaml.dump(value, stream)
+    return stream.getvalue()
 
 
 def field_of(file: str, value: Any, *path: str | int) -> Any:

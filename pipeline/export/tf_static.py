@@ -49,34 +49,26 @@ def _write(calibration: ExportedCalibration) -> dict[str, bytes]:
 
 
 def _tree(files: Files) -> TransformTree:
-    tree = TransformTree()
+    tree, store = TransformTree(), get_typestore(Stores.ROS2_HUMBLE)
     for file, content in files.items():
-        read_static_transforms(file, content, tree)
+        if len(content) > _MOST_BYTES:
+            problem = f"is larger than {_MOST_BYTES >> 30} GiB: give a file with /tf_static alone"
+            raise ConfigError(file, "", problem)
+        seen = 0
+        try:
+            for schema, _, message in make_reader(io.BytesIO(content)).iter_messages(topics=[_TOPIC]):
+                if schema is None or schema.name != _TYPE:
+                    found = schema.name if schema else "no schema"
+                    raise ConfigError(file, _TOPIC, f"holds {found}, not {_TYPE}")
+                bad = tree.add_message(store.deserialize_cdr(message.data, _TYPE))
+                if bad:
+                    raise ConfigError(file, _TOPIC, f"{bad} of its entries are not rigid transforms")
+                seen += 1
+        except (McapError, struct.error, ValueError, IndexError, AssertionError) as err:
+            raise ConfigError(file, _TOPIC, f"not a readable MCAP: {err}") from err
+        if not seen:
+            raise ConfigError(file, _TOPIC, "no message")
     return tree
-
-
-def read_static_transforms(file: str, content: bytes, tree: TransformTree) -> None:
-    """Add every transform on /tf_static of a ROS 2 MCAP to a tree; else ConfigError."""
-    if len(content) > _MOST_BYTES:
-        raise ConfigError(
-            file, "", f"is larger than {_MOST_BYTES >> 30} GiB: give a file with /tf_static alone"
-        )
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    seen = 0
-    try:
-        for schema, _, message in make_reader(io.BytesIO(content)).iter_messages(topics=[_TOPIC]):
-            if schema is None or schema.name != _TYPE:
-                raise ConfigError(
-                    file, _TOPIC, f"holds {schema.name if schema else 'no schema'}, not {_TYPE}"
-                )
-            bad = tree.add_message(store.deserialize_cdr(message.data, _TYPE))
-            if bad:
-                raise ConfigError(file, _TOPIC, f"{bad} of its entries are not rigid transforms")
-            seen += 1
-    except (McapError, struct.error, ValueError, IndexError, AssertionError) as err:
-        raise ConfigError(file, _TOPIC, f"not a readable MCAP: {err}") from err
-    if not seen:
-        raise ConfigError(file, _TOPIC, "no message")
 
 
 TF_STATIC = Format("tf-static", _write, tree=_tree, holds_provenance=True)

@@ -224,7 +224,7 @@ def test_autoware_s_own_kit_keeps_its_comments_its_other_sensors_and_its_lidar(e
     assert set(changed) <= set(range(3, 9))  # the six numbers of the camera
     side = json.loads((tmp_path / "sensor_kit_calibration.provenance.json").read_text())
     assert side["updated"] == ["front/camera_link"]
-    frames = FrameNames("front/camera_link", "top_base_link")
+    frames = FrameNames({"camera": "front/camera_link", "lidar": "top_base_link"})
     found = format_named("autoware").pairs({"kit": kit.read_bytes()}, frames)
     records = read_records(Lake.at(lake), CALIBRATIONS, CalibrationRecord, vehicle="v", day=DAYS[0])
     [wanted] = [transform_of(r) for r in records if r.pair == "camera_lidar"]

@@ -24,7 +24,7 @@ COMMON = np.diag([5e-4, 4e-3, 1e-4, 0.02, 0.01, 0.05]) ** 2
 
 
 def side(title, T, covariance=None, vehicle="v", days=("2026-03-01",), **values):
-    pair = ExportedPair("camera_lidar", T, covariance, **values)
+    pair = ExportedPair(EDGE_OF_PAIR["camera_lidar"], T, covariance, **values)
     return Side(title, {"camera_lidar": pair}, vehicle, frozenset(days))
 
 
@@ -72,10 +72,8 @@ def test_days_in_common_are_said_and_nothing_is_taken_out_of_their_sigmas():
 
 
 def test_a_file_of_two_pairs_has_the_third_by_composition():
-    pairs = {
-        "camera_lidar": ExportedPair("camera_lidar", T_CAMERA_LIDAR),
-        "lidar_radar": ExportedPair("lidar_radar", T_LIDAR_RADAR),
-    }
+    T = {"camera_lidar": T_CAMERA_LIDAR, "lidar_radar": T_LIDAR_RADAR}
+    pairs = {pair: ExportedPair(EDGE_OF_PAIR[pair], own) for pair, own in T.items()}
     T = [[-1, 0, 0, -0.25], [0, 0, -1, 1.5], [0, -1, 0, 1], [0, 0, 0, 1]]  # worked out in the head
     np.testing.assert_array_equal(composed(pairs)["camera_radar"].T, T)
 

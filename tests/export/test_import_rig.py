@@ -50,9 +50,9 @@ def exported(folder, form, sensors=OTHERS):
     pairs = {}
     for sensor, edge in ((s, ties[s]) for s in sensors):
         T = T_TOP[sensor.name] if edge.parent == TOP else inverse(T_TOP[sensor.name])
-        pairs[words_of(edge)] = ExportedPair(words_of(edge), T, of=edge)
+        pairs[words_of(edge)] = ExportedPair(edge, T)
     calibration = ExportedCalibration(
-        "van-1", "record", "joint", "0.11.0", pairs, known=tuple(ties.values()), names=FrameNames.named(NAMES),
+        "van-1", "record", "joint", "0.11.0", pairs, tuple(ties.values()), FrameNames(NAMES),
         cameras={"front": CAMERA, "left": CAMERA},
     )  # fmt: skip
     files = written_files(format_named(form), calibration, folder / form)

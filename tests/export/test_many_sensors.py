@@ -47,10 +47,10 @@ rig = "van"
 
 def five(edges=EDGES, T=T_of, **values):
     """The five sensors; every edge says its own, so that ways which differ would show."""
-    pairs = {words_of(e): ExportedPair(words_of(e), T(e), covariance_of(e), of=e) for e in edges}
+    pairs = {words_of(e): ExportedPair(e, T(e), covariance_of(e)) for e in edges}
     fields = {
         "vehicle": "van-1", "source": "record of 2026-03-02", "method": "joint", "code_version": "0.11.0",
-        "pairs": pairs, "known": tuple(edges), "names": FrameNames.named(NAMES),
+        "pairs": pairs, "edges": tuple(edges), "names": FrameNames(NAMES),
         "cameras": {"front": CAMERA, "left": CAMERA},
     }  # fmt: skip
     return ExportedCalibration(**fields | values)
@@ -92,8 +92,8 @@ def test_an_edge_to_base_says_where_the_rig_sits_on_the_car():
 
 def test_two_frames_of_one_name_are_refused_by_a_rig_s_own_sensors():
     with pytest.raises(ConfigError, match="must differ"):
-        five(names=FrameNames.named({"front": "top"}))
-    assert five(names=FrameNames.named({"front": "camera"})).names.of("front") == "camera"
+        five(names=FrameNames({"front": "top"}))
+    assert five(names=FrameNames({"front": "camera"})).names.of("front") == "camera"
 
 
 def test_formats_of_cameras_have_a_part_per_camera_with_every_other_sensor():

@@ -138,7 +138,7 @@ def test_every_format_of_a_state_reads_back_as_the_one_pose_of_each_sensor(
     assert {other for other, _ in tied.values()} == set(others)
     own = {n: content for n, content in files.items() if "provenance" not in n}
     asked = [edge_named(row["pair"], row["parent_frame"], row["child_frame"]) for _, row in tied.values()]
-    found = format_named(form).pairs(own, FrameNames.named(frames), asked)
+    found = format_named(form).pairs(own, FrameNames(frames), asked)
     side, text = side_of(files), b"".join(own.values()).decode(errors="replace")
     for name, (other, row) in tied.items():
         T, kind = np.array(row["T"]), SENSORS[vehicle][other]
@@ -156,7 +156,7 @@ def test_every_format_of_a_state_reads_back_as_the_one_pose_of_each_sensor(
             assert row[column] == sensors[other][column], column
         assert row["reason"].endswith(sensors[other]["reason"])
         assert f"{name}: {row['in_words']}" in said.err
-        pose = next(p for p in side["poses"] if p["child"] == FrameNames.named(frames).of(other))
+        pose = next(p for p in side["poses"] if p["child"] == FrameNames(frames).of(other))
         np.testing.assert_allclose(pose["T_parent_child"], sensors[other]["T"], atol=1e-12)
         np.testing.assert_allclose(list(pose["sigma"].values()), sigmas(sensors[other]), rtol=1e-9)
         if form in COMMENTED:
@@ -252,8 +252,8 @@ def test_the_tree_has_the_root_of_the_car_s_own_tf_and_names_what_it_replaces(la
 )
 def test_what_would_give_a_frame_two_parents_or_a_place_above_itself_is_replaced(own, replaced):
     edge = edge_named("camera_lidar", "front", "top")
-    pairs = {"front-top": ExportedPair("front-top", inverse(T_TOP["front"]), of=edge)}
-    sent = ExportedCalibration("v", "", "joint", "", pairs, known=(edge,), own_tree=own)
+    pairs = {"front-top": ExportedPair(edge, inverse(T_TOP["front"]))}
+    sent = ExportedCalibration("v", "", "joint", "", pairs, (edge,), own_tree=own)
     assert replaced_transforms(sent) == replaced
 
 

@@ -1,6 +1,7 @@
 """What is exported comes back: to 1e-12 everywhere, bit for bit where a format holds the very matrices."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -58,8 +59,12 @@ def test_warnings_frames_and_sigma_are_in_the_file_or_beside_it(name, tmp_path):
 
     sent = calibration()
     pair = sent.pairs["lidar_radar"]
-    held = type(pair)(
-        "lidar_radar", pair.T, pair.covariance, "held", "roll -- halves\ndisagree", (True,) * 5 + (False,), ()
+    held = replace(
+        pair,
+        status="held",
+        reason="roll -- halves\ndisagree",
+        observable=(True,) * 5 + (False,),
+        certified=(),
     )
     files = written_files(
         format_named(name), calibration(pairs=sent.pairs | {"lidar_radar": held}), tmp_path / "o"
@@ -83,19 +88,19 @@ def test_warnings_frames_and_sigma_are_in_the_file_or_beside_it(name, tmp_path):
 def test_a_lens_that_a_format_does_not_know_is_refused_and_not_cut_short(name, D, model):
     lens = Camera(model, CAMERA.K, np.array(D), 1280, 720)
     with pytest.raises(ConfigError, match="distortion"):
-        format_named(name).write(calibration(camera=lens))
+        format_named(name).write(calibration(cameras={"camera": lens}))
 
 
 @pytest.mark.parametrize("D", [[], [0.1, 0.01, -0.02, 0.003]])
 def test_a_fisheye_is_written_as_one(D):
-    lens = calibration(camera=Camera("equidistant", CAMERA.K, np.array(D), 1280, 720))
+    lens = calibration(cameras={"camera": Camera("equidistant", CAMERA.K, np.array(D), 1280, 720)})
     assert b"distortion_model: equidistant" in format_named("kalibr").write(lens)["camchain.yaml"]
 
 
 @pytest.mark.parametrize("name", ["kitti", "nuscenes", "t4", "kalibr"])
 def test_formats_that_need_intrinsics_say_so(name):
     with pytest.raises(ConfigError, match="camera: the format needs intrinsics"):
-        format_named(name).write(calibration(camera=None))
+        format_named(name).write(calibration(cameras={}))
 
 
 def test_what_is_not_finite_is_null_in_json():

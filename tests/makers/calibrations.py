@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from pipeline.export.calibration import ExportedCalibration, ExportedPair, FrameNames
+from pipeline.export.calibration import ExportedCalibration, ExportedPair
 from pipeline.rig.cameras import Camera
+from pipeline.rig.edges import EDGE_OF_PAIR
 from pipeline.rig.se3 import exp_se3
 
 SIGMA = np.array([1e-3, 2e-3, 3e-3, 0.01, 0.02, 0.03])
@@ -30,10 +31,10 @@ def calibration(T_camera_lidar=T_CAMERA_LIDAR, T_lidar_radar=T_LIDAR_RADAR, **va
         "camera_radar": T_camera_lidar @ T_lidar_radar,
         "lidar_radar": T_lidar_radar,
     }
-    pairs = {pair: ExportedPair(pair, T[pair], np.diag(SIGMA**2)) for pair in T}
+    pairs = {pair: ExportedPair(EDGE_OF_PAIR[pair], T[pair], np.diag(SIGMA**2)) for pair in T}
     fields = {
         "vehicle": "car-1", "source": "record of 2026-03-02", "method": "joint", "code_version": "0.7.0",
-        "pairs": pairs, "camera": CAMERA, "names": FrameNames(),
+        "pairs": pairs, "edges": tuple(EDGE_OF_PAIR.values()), "cameras": {"camera": CAMERA},
     }  # fmt: skip
     return ExportedCalibration(**fields | values)
 
