@@ -29,25 +29,19 @@ _ANSWERS = {
 
 def comparison_page(first: str, second: str, pairs: Sequence[PairDifference], notes: Sequence[str]) -> str:
     """HTML of the change from one calibration to another."""
-    clear = [
-        f"{p.edge.name} {dof_title(p.edge.kind, dof)}"
-        for p in pairs
-        for k, dof in enumerate(DOF_NAMES)
-        if p.sigma is not None and abs(p.change[k]) > _CLEAR_SIGMAS * p.sigma[k]
-    ]
-    known = any(p.sigma is not None for p in pairs)
+    views = [_view(p) for p in pairs]
     return render(
         "comparison.html",
         first=first,
         second=second,
-        known=known,
-        clear=clear,
-        notes=list(notes),
-        pairs=[_view(p) for p in pairs],
+        known=any(p.sigma is not None for p in pairs),
+        clear=[f"{v['title']} {axis['title']}" for v in views for axis in v["axes"] if axis["beyond"]],
+        notes=notes,
+        pairs=views,
     )
 
 
-def _view(p: PairDifference) -> dict[str, object]:
+def _view(p: PairDifference) -> dict[str, Any]:
     azimuth, elevation = np.degrees(p.targets_rad)
     axes = []
     for k, dof in enumerate(DOF_NAMES):
@@ -94,10 +88,8 @@ def in_use_view(
     rows = [_row(check) for check in checks]
     mood, headline = _ANSWERS[answer]
     unsure = ", ".join(f"{r['pair']} {r['axis']}" for r in rows if r["status"] == "inconclusive")
-    sentences = [
-        *(f"Wrong: {e}." for e in errors),
-        *[f"This log does not determine: {unsure}."] * bool(unsure),
-    ]
+    sentences = [f"Wrong: {e}." for e in errors]
+    sentences += [f"This log does not determine: {unsure}."] if unsure else []
     explained = " ".join(sentences) or "Every axis that is judged passes."
     return {"mood": mood, "headline": headline, "explained": explained, "rows": rows}
 

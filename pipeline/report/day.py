@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -20,8 +21,6 @@ from schemas.poses import PoseRow
 
 __all__ = [
     "Answered",
-    "DofRow",
-    "PairView",
     "answer_for",
     "answered",
     "clearest_alarm",
@@ -38,53 +37,6 @@ _ADVICE = {
 }
 
 
-@dataclass(frozen=True)
-class DofRow:
-    """One line of a pair's table: numbers in words."""
-
-    name: str
-    unit: str
-    prior: str
-    change: str
-    sigma: str
-    prior_sigma: str
-    observability: str
-    observable: bool
-
-
-@dataclass(frozen=True)
-class PairView:
-    """One edge on the page."""
-
-    pair: str  # names of its sensors, as T_PAIR has them
-    title: str
-    sensors: tuple[str, str]
-    status: str
-    advice: str
-    reason: str
-    faults: str
-    known_to: str
-    undetermined: str
-    moved_by: str
-    rows: list[DofRow]
-    matrix: str
-    quaternion: str
-    translation: str
-    json_text: str
-    triggers: list[tuple[str, str, str]]
-    alignment: str
-    frames: str
-    rejected: list[tuple[str, int]]
-    time_offset: str
-    loop: str
-    certified: str
-    mounting: str  # what of it holds for the mounting, beside the direction in the image
-    notes: list[str]
-    assumptions: list[str]
-    missing: list[str]
-    diagnostics: list[tuple[str, str]]
-
-
 def sigmas_of(record: CalibrationRecord) -> tuple[np.ndarray | None, np.ndarray | None]:
     """Sigmas (rotation [rad], origin [m]) of the prior and of the estimate; None if there is none."""
     T_prior, T = prior_of(record), transform_of(record)
@@ -97,49 +49,65 @@ def sigmas_of(record: CalibrationRecord) -> tuple[np.ndarray | None, np.ndarray 
     return prior, np.sqrt(np.diag(change_covariance(T, record.covariance)))
 
 
-def pair_view(record: CalibrationRecord) -> PairView:
-    """Content of the page about one edge."""
-    T, T_prior = transform_of(record), prior_of(record)
+def pair_view(record: CalibrationRecord) -> dict[str, Any]:
+    """Content of the page about one edge, by name."""
+    T, T_prior, ends = transform_of(record), prior_of(record), (record.parent_frame, record.child_frame)
     prior_sigma, sigma = sigmas_of(record)
     observable = record.observable or [sigma is not None] * 6
-    rows = _dof_rows(record, T, T_prior, prior_sigma, sigma, observable)
+    change = change_between(T_prior, T) if T is not None and T_prior is not None else None
     unseen = [dof_title(record.pair, d) for d, o in zip(DOF_NAMES, observable, strict=True) if not o]
     quaternion = [record.qw, record.qx, record.qy, record.qz]
     translation = [record.tx_m, record.ty_m, record.tz_m]
-    return PairView(
-        pair=f"{record.parent_frame}_{record.child_frame}",
-        title=f"{record.parent_frame}-{record.child_frame}",
-        sensors=(record.parent_frame, record.child_frame),
-        status=record.status,
-        advice=_ADVICE[record.status],
-        reason="; ".join(
-            part for part in record.reason.split("; ") if not part.startswith(_SAID_BY_THE_AXES)
-        ),
-        faults=in_words(record.faults or ()),
-        known_to=_known_to(sigma, observable),
-        undetermined=", ".join(unseen) if sigma is not None else "",
-        moved_by=_moved_by(T, T_prior),
-        rows=rows,
-        matrix="" if T is None else "\n".join("".join(f"{v:12.6f}" for v in row) for row in T),
-        quaternion=_numbers(quaternion, 7),
-        translation=_numbers(translation, 4),
-        json_text=_json_text(record, T),
-        triggers=_triggers(record),
-        alignment=_before_after(record.alignment_before, record.alignment_after),
-        frames=f"{record.frames_used} of {record.frames_total}",
-        rejected=[
+    triggers = sorted({*record.trigger_before, *record.trigger_after})
+    reasons = [part for part in record.reason.split("; ") if not part.startswith(_SAID_BY_THE_AXES)]
+    return {
+        "pair": "_".join(ends),  # as T_PAIR has it
+        "title": "-".join(ends),
+        "sensors": ends,
+        "status": record.status,
+        "advice": _ADVICE[record.status],
+        "reason": "; ".join(reasons),
+        "faults": in_words(record.faults or ()),
+        "known_to": _known_to(sigma, observable),
+        "undetermined": ", ".join(unseen) if sigma is not None else "",
+        "moved_by": _moved_by(change),
+        "rows": [
+            {
+                "name": dof_title(record.pair, dof),
+                "unit": unit_of(dof),
+                "prior": "" if T_prior is None or k < 3 else f"{T_prior[k - 3, 3]:+.3f}",
+                "change": "" if change is None else f"{scaled(change[k], dof):+.3f}",
+                "sigma": "" if sigma is None else f"{scaled(sigma[k], dof):.3f}",
+                "prior_sigma": "" if prior_sigma is None else f"{scaled(prior_sigma[k], dof):.3f}",
+                "observability": ""
+                if record.observability is None
+                else f"{100 * record.observability[k]:.0f} %",
+                "observable": observable[k],
+            }
+            for k, dof in enumerate(DOF_NAMES)
+        ],
+        "matrix": "" if T is None else "\n".join("".join(f"{v:12.6f}" for v in row) for row in T),
+        "quaternion": ", ".join(f"{v:.7f}" for v in quaternion if v is not None),
+        "translation": ", ".join(f"{v:.4f}" for v in translation if v is not None),
+        "json_text": _json_text(record, T),
+        "triggers": [
+            (n, _number(record.trigger_before.get(n)), _number(record.trigger_after.get(n))) for n in triggers
+        ],
+        "alignment": _before_after(record.alignment_before, record.alignment_after),
+        "frames": f"{record.frames_used} of {record.frames_total}",
+        "rejected": [
             (LEFT_OUT.get(why, why.replace("_", " ")), n)
             for why, n in sorted(record.frames_rejected.items(), key=lambda kv: -kv[1])
         ],
-        time_offset=_time_offset(record),
-        loop=_loop(record),
-        certified=_certified(record),
-        mounting=_mounting(record),
-        notes=[note for note in record.notes if not note.startswith(_SAID_BY_THE_AXES)],
-        assumptions=list(record.assumptions),
-        missing=list(record.drive_missing),
-        diagnostics=[(name, f"{value:.4g}") for name, value in sorted(record.diagnostics.items())],
-    )
+        "time_offset": _time_offset(record),
+        "loop": _loop(record),
+        "certified": _certified(record),
+        "mounting": _mounting(record),  # what of it holds for the mounting, beside the direction in the image
+        "notes": [note for note in record.notes if not note.startswith(_SAID_BY_THE_AXES)],
+        "assumptions": record.assumptions,
+        "missing": record.drive_missing,
+        "diagnostics": [(name, f"{value:.4g}") for name, value in sorted(record.diagnostics.items())],
+    }
 
 
 def _certified(record: CalibrationRecord) -> str:
@@ -178,7 +146,7 @@ def _mounting(record: CalibrationRecord) -> str:
 
 @dataclass(frozen=True)
 class Answered:
-    """Content of the first sentence about a sensor; attributes as those of `PairView`."""
+    """A sensor or an edge in the page's first sentence; `certified` names its directions, in any text."""
 
     title: str
     status: str
@@ -186,17 +154,17 @@ class Answered:
     certified: str
 
 
-def answered(views: Sequence[PairView | Answered], poses: Sequence[PoseRow]) -> Sequence[PairView | Answered]:
-    """Sensors if the day has poses of them, without the reference; else edges."""
+def answered(views: Sequence[Mapping[str, Any]], poses: Sequence[PoseRow]) -> list[Answered]:
+    """Sensors if the day has poses of them, without the reference; else edges (`pair_view`)."""
     return [
         Answered(p.sensor, p.status, (p.sensor,), ", ".join(p.determined))
         for p in poses
         if p.sensor != p.reference
-    ] or views
+    ] or [Answered(v["title"], v["status"], v["sensors"], v["certified"]) for v in views]
 
 
 def answer_for(
-    views: Sequence[PairView | Answered],
+    views: Sequence[Answered],
     day: str,
     findings: Sequence[DriftFinding],
     loaded: Sequence[Answered] = (),
@@ -251,7 +219,7 @@ def _of_state(loaded: Sequence[Answered]) -> tuple[str, str]:
     return "partly" if used or at_prior else "good", sentence + in_one
 
 
-def _one_direction(views: Sequence[PairView | Answered]) -> str:
+def _one_direction(views: Sequence[Answered]) -> str:
     """Sentences on what is used and certified in one direction only; empty if there is nothing."""
     used = [v for v in views if v.status in ("accepted", "current")]
     words = ""
@@ -289,33 +257,6 @@ def clearest_alarm(findings: Sequence[DriftFinding]) -> DriftFinding | None:
     return max(rests_on, key=lambda f: (f.statistic or 0.0) / (f.threshold or 1.0), default=None)
 
 
-def _dof_rows(
-    record: CalibrationRecord,
-    T: np.ndarray | None,
-    T_prior: np.ndarray | None,
-    prior_sigma: np.ndarray | None,
-    sigma: np.ndarray | None,
-    observable: Sequence[bool],
-) -> list[DofRow]:
-    change = change_between(T_prior, T) if T is not None and T_prior is not None else None
-    rows = []
-    for k, dof in enumerate(DOF_NAMES):
-        value = "" if T_prior is None or dof.startswith("r") else f"{T_prior[k - 3, 3]:+.3f}"
-        rows.append(
-            DofRow(
-                dof_title(record.pair, dof),
-                unit_of(dof),
-                value,
-                "" if change is None else f"{scaled(change[k], dof):+.3f}",
-                "" if sigma is None else f"{scaled(sigma[k], dof):.3f}",
-                "" if prior_sigma is None else f"{scaled(prior_sigma[k], dof):.3f}",
-                "" if record.observability is None else f"{100 * record.observability[k]:.0f} %",
-                bool(observable[k]),
-            )
-        )
-    return rows
-
-
 def _known_to(sigma: np.ndarray | None, observable: Sequence[bool]) -> str:
     if sigma is None:
         return "nothing was computed"
@@ -329,17 +270,11 @@ def _known_to(sigma: np.ndarray | None, observable: Sequence[bool]) -> str:
     return ", ".join(parts) or "no degree of freedom"
 
 
-def _moved_by(T: np.ndarray | None, T_prior: np.ndarray | None) -> str:
-    if T is None or T_prior is None:
+def _moved_by(change: np.ndarray | None) -> str:
+    if change is None:
         return ""
-    change = change_between(T_prior, T)
     angle, shift = np.degrees(np.linalg.norm(change[:3])), np.linalg.norm(change[3:])
     return f"{angle:.2f} deg and {100 * shift:.1f} cm from the prior"
-
-
-def _triggers(record: CalibrationRecord) -> list[tuple[str, str, str]]:
-    names = sorted({*record.trigger_before, *record.trigger_after})
-    return [(n, _number(record.trigger_before.get(n)), _number(record.trigger_after.get(n))) for n in names]
 
 
 def _before_after(before: float | None, after: float | None) -> str:
@@ -384,10 +319,6 @@ def _json_text(record: CalibrationRecord, T: np.ndarray | None) -> str:
         "observable": record.observable, "work_key": record.work_key,
     }  # fmt: skip
     return json.dumps(fields)
-
-
-def _numbers(values: Sequence[float | None], digits: int) -> str:
-    return ", ".join(f"{v:.{digits}f}" for v in values if v is not None)
 
 
 def _number(value: float | None) -> str:

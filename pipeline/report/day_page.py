@@ -17,7 +17,6 @@ from pipeline.core.results import plain
 from pipeline.core.sections import ReportConfig
 from pipeline.report.day import (
     Answered,
-    PairView,
     answer_for,
     answered,
     pair_view,
@@ -26,7 +25,7 @@ from pipeline.report.day import (
 )
 from pipeline.report.motion_view import motion_pictures
 from pipeline.report.page import render, write_page
-from pipeline.report.pictures import ScenePictures, scene_pictures, write_picture
+from pipeline.report.pictures import scene_pictures, write_picture
 from pipeline.report.reading import (
     day_poses,
     day_records,
@@ -59,17 +58,6 @@ _SCENES = 3
 P = TypeVar("P", bound=PurePath)
 BEFORE, AFTER = "#e0813a", "#3b82c4"
 _COLUMNS, _SIGMA_HEIGHT = 3, 272.0  # edges side by side, and the height of a row of them
-
-
-@dataclass(frozen=True, eq=False)
-class SigmaPanel:
-    """One edge of the figure: title and kind, sigmas of prior and result (None = there is none), observed DoF."""
-
-    title: str
-    pair: str
-    prior: np.ndarray | None
-    sigma: np.ndarray | None
-    observable: Sequence[bool] | None
 
 
 @dataclass(frozen=True)
@@ -156,7 +144,7 @@ def write_day_picture(
     seen = [o for o in spread if "camera" in o.sensors]
     scene = scenes_among(lake, partition, seen, after.T_camera_lidar, 1, fleet.report, chosen)[0]
     stamped = as_stamped(after, scene.observation, time_offsets_of(drawn))
-    labels = ("prior", _after_label([pair_view(r) for r in records.values()]))
+    labels = ("prior", _after_label(records))
     return write_picture(out, scene, before, stamped, labels)
 
 
@@ -167,7 +155,7 @@ def _content(
     records, findings = read.records, read.findings
     poses = day_poses(lake, partition, records)
     views = [pair_view(record) for record in records.values()]
-    of_three, labels = drawn_records(records), ("prior", _after_label(views))
+    of_three, labels = drawn_records(records), ("prior", _after_label(records))
     drawn, residual_svg, no_pictures = (
         _pictures(lake, partition, of_three, labels, pictures)
         if pictures is not None
@@ -194,7 +182,7 @@ def _content(
         "no_pictures": no_pictures,
         "offsets": time_offsets_of(of_three).in_words(),
         "rig_svg": rig_of_day(poses, records.values()),
-        "sigma_svg": _sigma_svg(records),
+        "sigma_svg": _sigma_figure(list(records.values())),
         "residual_svg": residual_svg,
         "provenance": _provenance(list(records.values())),
     }
@@ -221,8 +209,8 @@ def _as_of(read: DayRead, lake: Lake) -> tuple[str, str]:
     return status, f"{sentence} (Audit until {read.findings[0].day}.)" if read.findings else sentence
 
 
-def _after_label(views: Sequence[PairView]) -> str:
-    word = day_word(v.status for v in views)
+def _after_label(records: Mapping[str, CalibrationRecord]) -> str:
+    word = day_word(r.status for r in records.values())
     return "calibrated" if word == "done" else f"result, {word}{' accepted' * (word == 'partly')}"
 
 
@@ -233,7 +221,7 @@ def _pictures(
     labels: tuple[str, str],
     config: ReportConfig,
     count: int = _SCENES,
-) -> tuple[list[ScenePictures], Any, str]:
+) -> tuple[list[dict[str, Any]], Any, str]:
     """Pictures, residuals, and why there are none; the result is drawn with its time offsets, the prior without."""
     states, offsets = states_of(records), time_offsets_of(records)
     if states is None:
@@ -247,7 +235,7 @@ def _pictures(
             return [], "", "no frame of the day could be used"
         at_prior, at_result = frame_residuals(spread, states, (TimeOffsets(), offsets))
         there = [pair for pair in PAIRS if any(pair in pairs_of(o.sensors) for o in spread)]
-        residuals = residual_figure(at_prior, at_result, there)
+        residuals = _residual_figure(at_prior, at_result, there)
         scenes = scenes_among(lake, partition, spread, after.T_camera_lidar, count, config, chosen)
     except DamagedError as err:
         lake.damage.append(str(err))
@@ -256,16 +244,6 @@ def _pictures(
     at_stamp = [(s, before, as_stamped(after, s.observation, offsets)) for s in scenes]
     pictures = [scene_pictures(*of, labels, camera) for of in at_stamp]
     return pictures, residuals, "no frame of the day could be drawn"
-
-
-def _sigma_svg(records: Mapping[str, CalibrationRecord]) -> str:
-    panels = []
-    for record in records.values():
-        prior, sigma = sigmas_of(record)
-        seen = None if sigma is None else record.observable or [True] * 6
-        title = f"{record.parent_frame}-{record.child_frame}"
-        panels.append(SigmaPanel(title, record.pair, prior, sigma, seen))
-    return sigma_figure(panels)
 
 
 def _provenance(records: Sequence[CalibrationRecord]) -> list[tuple[str, str]]:
@@ -277,26 +255,33 @@ def _provenance(records: Sequence[CalibrationRecord]) -> list[tuple[str, str]]:
     ]
 
 
-def sigma_figure(panels: Sequence[SigmaPanel]) -> Markup:
+def _sigma_figure(records: Sequence[CalibrationRecord]) -> Markup:
     """Sigma of each DoF next to that of the prior, on a log scale; hollow if the day did not determine it."""
     parts: list[str] = []
-    for place, panel in enumerate(panels):
+    for place, record in enumerate(records):
+        prior, sigma = sigmas_of(record)
+        known = [source for source in (prior, sigma) if source is not None]
         left, above = place % _COLUMNS * 410.0, place // _COLUMNS * _SIGMA_HEIGHT
         for row, dofs in enumerate((DOF_NAMES[:3], DOF_NAMES[3:])):
-            known = [source for source in (panel.prior, panel.sigma) if source is not None]
-            low, high = _decades([s for source in known for s in _page_units(source, dofs)])
+            values = [
+                scaled(s, dof) for source in known for s, dof in zip(source[3 * row :], dofs, strict=False)
+            ]
+            # With room for bars on the left and numbers on the right.
+            low = float(np.log10(min(values))) - 0.5 if values else -3.0
+            high = float(np.log10(max(values))) + 0.9 if values else 1.0
             plot = Plot(left + 80.0, above + row * 132.0 + 24.0, 310.0, 84.0, (low, high), (3.0, 0.0))
             if row == 0:
-                plot.text(left, above + 12.0, panel.title, bold=True, size=12.5)
+                title = f"{record.parent_frame}-{record.child_frame}"
+                plot.text(left, above + 12.0, title, bold=True, size=12.5)
             decades = [(float(d), f"{10.0**d:g}") for d in np.arange(np.ceil(low), high + 1e-9)]
             plot.frame(decades, [])
             unit = f"sigma [{unit_of(dofs[0])}], log"
             plot.text(plot.left + 310, plot.top + 110, unit, anchor="end", colour=MUTED)
             for k, dof in enumerate(dofs):
-                plot.text(plot.left - 6, plot.top + 28 * k + 18, dof_title(panel.pair, dof), anchor="end")
-                _sigma_bars(plot, k, DOF_NAMES.index(dof), panel.prior, panel.sigma, panel.observable)
+                plot.text(plot.left - 6, plot.top + 28 * k + 18, dof_title(record.pair, dof), anchor="end")
+                _sigma_bars(plot, k, 3 * row + k, record, prior, sigma)
             parts += plot.parts
-    height = _SIGMA_HEIGHT * max(1, -(-len(panels) // _COLUMNS))
+    height = _SIGMA_HEIGHT * max(1, -(-len(records) // _COLUMNS))
     return document(1210.0, height, parts, "Sigma of each degree of freedom, of the prior and of the result")
 
 
@@ -304,25 +289,25 @@ def _sigma_bars(
     plot: Plot,
     row: int,
     k: int,
+    record: CalibrationRecord,
     prior: np.ndarray | None,
     sigma: np.ndarray | None,
-    observable: Sequence[bool] | None,
 ) -> None:
-    low = plot.x[0]
+    low, dof = plot.x[0], DOF_NAMES[k]
     if prior is not None:
-        end = float(np.log10(scaled(prior[k], DOF_NAMES[k])))
+        end = float(np.log10(scaled(prior[k], dof)))
         plot.area((low, row + 0.48), (end, row + 0.14), MUTED, 0.45)
-    if sigma is None or observable is None:
+    if sigma is None:
         return
-    value = scaled(sigma[k], DOF_NAMES[k])
+    value, observable = scaled(sigma[k], dof), record.observable is None or record.observable[k]
     end = float(np.log10(value))
-    plot.area((low, row + 0.88), (end, row + 0.54), AFTER, 1.0 if observable[k] else 0.0, AFTER)
+    plot.area((low, row + 0.88), (end, row + 0.54), AFTER, 1.0 if observable else 0.0, AFTER)
     u, v = plot.at(end, row + 0.71)
-    plot.text(u + 5, v + 3.5, f"{value:.2g}" + ("" if observable[k] else " not determined"), size=10.0)
+    plot.text(u + 5, v + 3.5, f"{value:.2g}" + ("" if observable else " not determined"), size=10.0)
 
 
-def residual_figure(
-    before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray], pairs: Sequence[str] = PAIRS
+def _residual_figure(
+    before: Mapping[str, np.ndarray], after: Mapping[str, np.ndarray], pairs: Sequence[str]
 ) -> Markup:
     """Measures of `frame_residuals` over the day's frames."""
     parts: list[str] = []
@@ -361,14 +346,3 @@ def _residual_dots(plot: Plot, values: np.ndarray, colour: str, label: str, lege
         plot.dot(float(i), y, colour, f"{label}: {values[i]:.3g}", radius=2.3, opacity=0.65)
     plot.line((plot.x[0], min(level, plot.y[1])), (plot.x[1], min(level, plot.y[1])), colour, 1.6)
     plot.text(legend_u, 186.0, f"{label}: median {level:.2g}", colour=colour, bold=True)
-
-
-def _page_units(sigma: np.ndarray, dofs: Sequence[str]) -> list[float]:
-    return [scaled(sigma[DOF_NAMES.index(d)], d) for d in dofs]
-
-
-def _decades(values: Sequence[float]) -> tuple[float, float]:
-    """Range of a log axis with room for bars on the left and numbers on the right."""
-    if not values:
-        return -3.0, 1.0
-    return float(np.log10(min(values))) - 0.5, float(np.log10(max(values))) + 0.9

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -23,7 +24,7 @@ from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import frames_of, ingested, observations_of, perceived
 from schemas.calibrations import PAIRS, CalibrationRecord
 
-__all__ = ["EvaluatedRun", "TableView", "View", "evaluation_page", "page_of_runs"]
+__all__ = ["EvaluatedRun", "View", "evaluation_page", "page_of_runs"]
 
 _COLOURS = {
     "joint": "#1f6fc0",
@@ -36,15 +37,6 @@ _COLOURS = {
 _DECADES = (0.001, 0.01, 0.1, 1.0, 10.0)
 _AHEAD_M = 50.0
 _FAVOURITES = ("joint", "joint-ssl", "joint-optimisation")  # whose pictures are worth a look, best first
-
-
-@dataclass(frozen=True)
-class TableView:
-    """One table; lines with the paper's printed numbers are marked."""
-
-    title: str
-    header: Sequence[str]
-    lines: Sequence[tuple[bool, Sequence[str]]]  # from the paper?, cells
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,16 +65,8 @@ class View:
     caption: str = ""
 
 
-@dataclass(frozen=True)
-class _Pictures:
-    title: str
-    caption: str
-    fronts: list[tuple[str, str]] = field(default_factory=list)  # words, data URI
-    tops: list[tuple[str, Markup]] = field(default_factory=list)
-
-
 def evaluation_page(
-    tables: Sequence[TableView],
+    tables: Sequence[Mapping[str, Any]],
     runs: Sequence[EvaluatedRun],
     views: Sequence[View],
     normalised: dict[str, Float[np.ndarray, " N"]],
@@ -92,6 +76,7 @@ def evaluation_page(
     """HTML of the whole page, no outside resources.
 
     Args:
+        tables: title, header, and lines: whether the paper printed it, and its cells.
         normalised: by method, errors over their own sigmas of all observable DoF; empty if truth is
             positions.
         notes: source of the truth, and other notes on the tables.
@@ -112,19 +97,18 @@ def evaluation_page(
     )
 
 
-def _draw(view: View) -> _Pictures:
+def _draw(view: View) -> dict[str, Any]:
     """Both states in one picture, as in figures 1 and 3, or one above the other, as in figure 4."""
-    labels = ("uncalibrated", "calibrated")
-    pictures = _Pictures(view.title, view.caption)
+    labels, states = ("uncalibrated", "calibrated"), (view.before, view.after)
     if view.split:
         words = f"left {labels[0]}, right {labels[1]}"
-        pictures.fronts.append((words, jpeg_uri(front_view(view.scene, view.before, view.after, labels))))
-        pictures.tops.append((words, top_view(view.scene, view.before, view.after, labels)))
-        return pictures
-    for word, state in zip(labels, (view.before, view.after), strict=True):
-        pictures.fronts.append((word, jpeg_uri(whole_view(view.scene, state, word), 900)))
-        pictures.tops.append((word, top_view(view.scene, state, state, (word, word))))
-    return pictures
+        fronts = [(words, jpeg_uri(front_view(view.scene, *states, labels)))]
+        tops = [(words, top_view(view.scene, *states, labels))]
+    else:
+        of_each = list(zip(labels, states, strict=True))
+        fronts = [(word, jpeg_uri(whole_view(view.scene, state, word), 900)) for word, state in of_each]
+        tops = [(word, top_view(view.scene, state, state, (word, word))) for word, state in of_each]
+    return {"title": view.title, "caption": view.caption, "fronts": fronts, "tops": tops}
 
 
 def _errors(runs: Sequence[EvaluatedRun]) -> Markup:
@@ -221,11 +205,12 @@ def page_of_runs(lake: Lake, compared: Sequence[ComparedRun], texts: Mapping[str
     )
 
 
-def _table(title: str, text: str) -> TableView:
+def _table(title: str, text: str) -> dict[str, Any]:
     """The lines of a Markdown table."""
     block = text.split("\n\n")[1].splitlines()
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in block if line.startswith("|")]
-    return TableView(title, cells[0], [(row[0].startswith("paper:"), row) for row in cells[2:]])
+    lines = [(row[0].startswith("paper:"), row) for row in cells[2:]]
+    return {"title": title, "header": cells[0], "lines": lines}
 
 
 def _evaluated(compared: ComparedRun) -> EvaluatedRun:
@@ -292,9 +277,7 @@ def _scene(
         return None
     states = []
     for of in (prior_of, transform_of):
-        known = [
-            T for pair in ("camera_lidar", "camera_radar", "lidar_radar") if (T := of(run[pair])) is not None
-        ]
+        known = [T for pair in PAIRS if (T := of(run[pair])) is not None]
         if len(known) < len(PAIRS):
             return None
         states.append(Extrinsics(*known))

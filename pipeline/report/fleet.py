@@ -63,7 +63,7 @@ class VehicleRow:
 
 @dataclass(frozen=True)
 class FindingView:
-    """One vehicle in which something changed."""
+    """One vehicle in which something changed, in words."""
 
     vehicle: str
     status: str
@@ -89,10 +89,9 @@ def fleet_rows(
     first = max(0, len(names) - _COLUMNS)
     rows = []
     for vehicle in sorted({*window.vehicles, *verdicts.vehicles}):
-        status, sentence = status_sentence(
-            verdicts.findings.get(vehicle, []), lake, verdicts.corrections.get(vehicle, "")
-        )
-        stored = status_of(verdicts.findings.get(vehicle, []))
+        own = verdicts.findings.get(vehicle, [])
+        status, sentence = status_sentence(own, lake, verdicts.corrections.get(vehicle, ""))
+        stored = status_of(own)
         shown = letters[place[vehicle]] if vehicle in place else "." * len(names)
         marked = [
             letter.upper() if letter != "." and (vehicle, day) in pages else letter
@@ -119,36 +118,23 @@ def index_row(row: VehicleRow, sentences: dict[str, int], finding: FindingView |
     stem = page_stem(row.vehicle)
     said = sentences.setdefault(row.sentence, len(sentences))
     change = [finding.kind, finding.motion, finding.sure, finding.charts] if finding is not None else 0
-    status = DRIFT_STATUSES.index(row.status)
-    own = stem if stem != row.vehicle else 0
     return [
-        row.vehicle,
-        status,
-        row.sensor,
-        row.since,
-        said,
-        row.days,
-        row.last_day,
-        own,
-        row.older or 0,
-        change,
-    ]
+        row.vehicle, DRIFT_STATUSES.index(row.status), row.sensor, row.since, said, row.days, row.last_day,
+        stem if stem != row.vehicle else 0, row.older or 0, change,
+    ]  # fmt: skip
 
 
 def finding_views(findings: Mapping[str, Sequence[DriftFinding]]) -> list[FindingView]:
     """Changes by vehicle: RED before YELLOW, the latest change first."""
-    views = []
-    for vehicle, own in findings.items():
-        clearest = clearest_alarm(own)
-        if clearest is not None:
-            views.append(_finding_view(vehicle, clearest, own))
+    alarms = ((vehicle, own, clearest_alarm(own)) for vehicle, own in findings.items())
+    views = [_finding_view(vehicle, alarm, own) for vehicle, own, alarm in alarms if alarm is not None]
     return sorted(views, key=_attention)
 
 
 def headline_for(verdicts: FleetVerdicts, views: Sequence[FindingView]) -> tuple[str, str]:
     """(the most urgent status in the fleet; the page's first sentence)."""
     statuses = [status_of(own).status for own in verdicts.findings.values()]
-    vehicles = _count(len(statuses), "vehicle")
+    vehicles = f"{len(statuses)} vehicle{'s' * (len(statuses) != 1)}"
     if not statuses:
         return "UNKNOWN", "No audit yet: run `boresight audit`."
     worst = min(statuses, key=DRIFT_STATUSES.index)
@@ -156,10 +142,7 @@ def headline_for(verdicts: FleetVerdicts, views: Sequence[FindingView]) -> tuple
         return worst, f"No sensor moved on {vehicles}."
     if worst == "UNKNOWN":
         where = f"on {statuses.count(worst)} of {vehicles}"
-        return (
-            worst,
-            f"No change found, but {where} more days are required to exclude one above the limit.",
-        )
+        return worst, f"No change found, but {where} more days are required to exclude one above the limit."
     of_these = [v for v in views if v.status == worst]
     named = [f"{v.vehicle}: {v.sensor} since {v.since}" for v in of_these[:3]]
     more = "" if len(of_these) <= 3 else f" and {len(of_these) - 3} more"
@@ -225,7 +208,3 @@ def _chart_words(finding: DriftFinding) -> str:
     if finding.magnitude is None or finding.magnitude_sigma is None:
         return chart
     return f"{chart} {with_sigma(finding.magnitude, finding.magnitude_sigma, finding.dof)}"
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}" + ("" if number == 1 else "s")

@@ -12,7 +12,6 @@ from urllib.parse import quote
 
 import numpy as np
 
-from pipeline.core.config import FleetConfig
 from pipeline.report.charts import charted_edges, fleet_charts
 from pipeline.report.fleet import DAY_LETTERS, VehicleRow, finding_views, fleet_rows, headline_for, index_row
 from pipeline.report.page import page_stem, render, write_page
@@ -72,7 +71,7 @@ def render_fleet_page(
         method=album.method,
         span=" to ".join(dates) or "no calibration record yet",
         headline=headline_for(verdicts, views),
-        budget=_budget(album.fleet),
+        false_alarms=f"{album.fleet.audit.false_alarms_per_1000_vehicle_days:g}",
         corrections=correction_steps(verdicts.corrections),
         findings=views[:_FINDINGS],
         findings_left=max(0, len(views) - _FINDINGS),
@@ -147,12 +146,6 @@ def _events_since(lake: Lake, first: str | None) -> list[ServiceEvent]:
     """Service events, the latest first."""
     found = current_events(read_records(lake, SERVICE_EVENTS, ServiceEvent, first=first))
     return sorted(found, key=lambda e: (e.day, e.vehicle), reverse=True)
-
-
-def _budget(fleet: FleetConfig) -> str:
-    rate = fleet.audit.false_alarms_per_1000_vehicle_days
-    text = f"False alarms expected: at most {rate:g} in 1000 vehicle-days over all charts"
-    return f"{text}, if the stated sigmas are right."
 
 
 def _provenance(window: FleetWindow, verdicts: FleetVerdicts) -> list[tuple[str, str]]:

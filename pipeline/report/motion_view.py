@@ -7,7 +7,6 @@ ahead, so the picture is of a moment that hardly turns.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -27,26 +26,17 @@ from schemas.calibrations import CalibrationRecord
 from schemas.frames import Frame
 from schemas.observations import Observation
 
-__all__ = ["MotionPicture", "draw_motion", "motion_pictures"]
+__all__ = ["draw_motion", "motion_pictures"]
 
 _WIDTH_PX = 1000
 _TRACK, _BEFORE, _AFTER, _SEEN = (90, 220, 90), (200, 200, 200), (255, 170, 60), (60, 60, 255)
 _STRAIGHT_RAD = np.radians(0.3)  # of the turn between both images
 
 
-@dataclass(frozen=True)
-class MotionPicture:
-    """One camera's picture as a data URI, with its caption."""
-
-    camera: str
-    picture: str
-    caption: str
-
-
 def motion_pictures(
     lake: Lake, partition: Partition, records: Iterable[CalibrationRecord], config: ReportConfig
-) -> list[MotionPicture]:
-    """A picture of each camera with an edge to the vehicle frame; none where the day has no frames left."""
+) -> list[dict[str, str]]:
+    """Picture (data URI) and caption of each camera with an edge to the vehicle frame, if the day still has frames."""
     found = []
     for record in records:
         before, after = prior_of(record), transform_of(record)
@@ -63,7 +53,9 @@ def motion_pictures(
             lake.damage.append(str(err))
             continue
         picture = draw_motion(scene_of(frame, shown, config).frame, shown, before, after)
-        found.append(MotionPicture(record.parent_frame, jpeg_uri(picture), _caption(shown)))
+        found.append(
+            {"camera": record.parent_frame, "picture": jpeg_uri(picture), "caption": _caption(shown)}
+        )
     return found
 
 

@@ -154,12 +154,8 @@ def _drawn(scene: Scene, state: Extrinsics) -> np.ndarray:
     """The image, dimmed, `_CANVAS_PX` wide, with lidar and radar data."""
     scale = _CANVAS_PX / scene.frame.image_width_px
     camera = camera_of(scene.frame).scaled(scale)
-    size = (camera.width_px, camera.height_px)
-    dimmed = _dimmed(cv2.resize(decode_image(scene.frame), size, interpolation=_interpolation(scale)))
-    return _draw(dimmed, scene, camera, scale, state)
-
-
-def _draw(image: np.ndarray, scene: Scene, camera: Camera, scale: float, state: Extrinsics) -> np.ndarray:
+    size, by = (camera.width_px, camera.height_px), cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+    image = _dimmed(cv2.resize(decode_image(scene.frame), size, interpolation=by))
     uv, distance = _project(camera, state.T_camera_lidar, scene.frame.lidar_xyz_m)
     # Sparse lidars get larger dots, so that a sweep is seen whatever the number of its rings.
     radius = int(np.clip(np.sqrt(0.012 * image.shape[0] * image.shape[1] / max(len(uv), 1)), 1, 3))
@@ -219,10 +215,6 @@ def _dimmed(image: np.ndarray, brightness: float = 0.7) -> np.ndarray:
     return cv2.addWeighted(image, 0.35 * gain, grey, 0.65 * gain, 0)
 
 
-def _interpolation(scale: float) -> int:
-    return cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
-
-
 def _tag(image: np.ndarray, text: str, at: tuple[int, int]) -> None:
     (width, height), base = cv2.getTextSize(text, _FONT, 0.8, 2)
     cv2.rectangle(image, (at[0] - 6, at[1] - height - 8), (at[0] + width + 6, at[1] + base + 2), _BLACK, -1)
@@ -233,8 +225,6 @@ def _colour_bar(image: np.ndarray) -> None:
     width, height = 220, 12
     x0, y0 = image.shape[1] - width - 70, image.shape[0] - height - 14
     image[y0 - 4 : y0 + height + 4, x0 - 60 : x0 + width + 66] //= 3
-    image[y0 : y0 + height, x0 : x0 + width] = np.array(_range_colours(np.geomspace(_NEAR_M, _FAR_M, width)))[
-        None
-    ]
+    image[y0 : y0 + height, x0 : x0 + width] = _range_colours(np.geomspace(_NEAR_M, _FAR_M, width))
     for text, x in ((f"{_NEAR_M:.0f} m", x0 - 48), (f"{_FAR_M:.0f} m", x0 + width + 8)):
         cv2.putText(image, text, (x, y0 + height), _FONT, 0.5, _WHITE, 1, cv2.LINE_AA)

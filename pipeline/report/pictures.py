@@ -8,8 +8,8 @@ Source: paper, figures 1b, 3 and 4. Its points are a bitmap, axes and words are 
 from __future__ import annotations
 
 import base64
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -36,10 +36,7 @@ from pipeline.rig.se3 import exp_se3, inverse, log_se3, rotation_angle_rad, tran
 from schemas.calibrations import DOF_NAMES, PAIRS, SENSORS
 
 __all__ = [
-    "CloseUps",
-    "ScenePictures",
     "between",
-    "close_ups_of",
     "jpeg_uri",
     "scene_pictures",
     "top_bitmap",
@@ -65,64 +62,42 @@ _LABELS = ("before", "from this frame")
 _JPEG_QUALITY = 82
 
 
-@dataclass(frozen=True)
-class CloseUps:
-    """The same windows before and after, as data URIs."""
-
-    pairs: list[tuple[str, str]]
-    zoom: int
-    window_deg: str
-
-
-@dataclass(frozen=True)
-class ScenePictures:
-    """One frame on the page; pictures as data URIs, empty if the frame lacks a sensor that they need."""
-
-    frame_index: int
-    log: str
-    drive: int
-    front: str
-    shown: str  # in the front view, in words
-    top: str
-    close_ups: CloseUps | None
-    camera: str = ""  # which one, where the rig has several
-
-
-def close_ups_of(scene: Scene, before: Extrinsics, after: Extrinsics) -> CloseUps:
-    """Windows with most lidar edges at silhouettes, enlarged, at both states."""
+def _close_ups(scene: Scene, before: Extrinsics, after: Extrinsics) -> dict[str, Any]:
+    """Windows with most lidar edges at silhouettes, enlarged, at both states: pairs of data URIs."""
     windows = choose_windows(scene.observation, after.T_camera_lidar, _CLOSE_UPS)
     width = windows[0].size_px[0] if windows else 1
     zoom = max(2, round(_CLOSE_UP_WIDTH_PX / width))
-    close_ups = []
-    for window in windows:
-        pair = [jpeg_uri(close_up(scene, s, window, zoom)) for s in (before, after)]
-        close_ups.append((pair[0], pair[1]))
+    pairs = [[jpeg_uri(close_up(scene, s, window, zoom)) for s in (before, after)] for window in windows]
     angle = np.degrees(width / camera_of(scene.frame).focal_px[0])
-    return CloseUps(close_ups, zoom, f"{angle:.1f}")
+    return {"pairs": pairs, "zoom": zoom, "window_deg": f"{angle:.1f}"}
 
 
 def scene_pictures(
-    scene: Scene, before: Extrinsics, after: Extrinsics, labels: tuple[str, str], camera_name: str = ""
-) -> ScenePictures:
-    """Draw and encode all pictures of a chosen frame."""
+    scene: Scene, before: Extrinsics, after: Extrinsics, labels: tuple[str, str], camera_name: str
+) -> dict[str, Any]:
+    """All pictures of a frame as data URIs, empty if the frame lacks a sensor that they need, and words about it.
+
+    `camera_name`: which one, if the rig has several.
+    """
     camera, lidar, radar = (sensor in scene.observation.sensors for sensor in SENSORS)
     kinds = ["lidar by range"] * lidar + ["moving radar clusters as white +"] * radar
-    return ScenePictures(
-        scene.frame.frame_index,
-        scene.frame.log,
-        scene.frame.drive,
-        jpeg_uri(front_view(scene, before, after, labels)) if camera else "",
-        ", ".join([*kinds, "detected road users as boxes"]).capitalize(),
-        top_view(scene, before, after, labels) if lidar and radar else "",
-        close_ups_of(scene, before, after) if camera and lidar else None,
-        camera_name,
-    )
+    return {
+        "frame_index": scene.frame.frame_index,
+        "log": scene.frame.log,
+        "drive": scene.frame.drive,
+        "front": jpeg_uri(front_view(scene, before, after, labels)) if camera else "",
+        "shown": ", ".join([*kinds, "detected road users as boxes"]).capitalize(),
+        "top": top_view(scene, before, after, labels) if lidar and radar else "",
+        "close_ups": _close_ups(scene, before, after) if camera and lidar else None,
+        "camera": camera_name,
+    }
 
 
 def top_view(scene: Scene, before: Extrinsics, after: Extrinsics, labels: tuple[str, str]) -> Markup:
     """Bird's-eye view in the lidar frame, radar at both states; at one where the labels are equal."""
     plot = Plot(44.0, 8.0, 540.0, 567.0, (-_SIDE_M, _SIDE_M), (-_BEHIND_M, _AHEAD_M))
-    uri = png_uri(top_bitmap(scene, before, after))
+    # PNG is lossless: single dots stay sharp.
+    uri = _uri("png", top_bitmap(scene, before, after), [cv2.IMWRITE_PNG_COMPRESSION, 6])
     plot.parts.append(
         f'<image x="44" y="8" width="540" height="567" href="{uri}" preserveAspectRatio="none"/>'
     )
@@ -219,17 +194,16 @@ def _animation(scene: Scene, before: Extrinsics, after: Extrinsics) -> cv2.Anima
 
 
 def _drawn(scene: Scene, state: Extrinsics, after: Extrinsics, window: Window) -> UInt8[np.ndarray, "H W 3"]:
-    angle_deg, shift_m = _distance(state.T_camera_lidar, after.T_camera_lidar)
-    label = f"camera-lidar: {angle_deg:.2f} deg, {100 * shift_m:.0f} cm from the result"
+    label = f"camera-lidar: {_distance(state.T_camera_lidar, after.T_camera_lidar)} from the result"
     image = lidar_view(scene, state, window, label)
     height = round(image.shape[0] * _WIDTH_PX / image.shape[1])
     return cv2.resize(image, (_WIDTH_PX, height), interpolation=cv2.INTER_AREA)
 
 
-def _distance(T: Float[np.ndarray, "4 4"], T_other: Float[np.ndarray, "4 4"]) -> tuple[float, float]:
-    """Angle [deg] and shift [m] between two poses."""
-    angle = float(np.degrees(rotation_angle_rad(T_other @ inverse(T))))
-    return angle, float(np.linalg.norm(T_other[:3, 3] - T[:3, 3]))
+def _distance(T: Float[np.ndarray, "4 4"], T_other: Float[np.ndarray, "4 4"]) -> str:
+    """Angle and shift between two poses in words."""
+    angle_deg = float(np.degrees(rotation_angle_rad(T_other @ inverse(T))))
+    return f"{angle_deg:.2f} deg, {100 * np.linalg.norm(T_other[:3, 3] - T[:3, 3]):.0f} cm"
 
 
 def write_frame_page(path: Path, scene: Scene, prior: Prior, solution: Solution, title: str) -> Path:
@@ -250,7 +224,7 @@ def write_frame_page(path: Path, scene: Scene, prior: Prior, solution: Solution,
         method=solution.method,
         labels=_LABELS,
         views=views,
-        close_ups=close_ups_of(scene, before, after),
+        close_ups=_close_ups(scene, before, after),
         pairs=[_told(pair, prior, solution) for pair in PAIRS],
     )
     return write_page(path, html)
@@ -259,8 +233,7 @@ def write_frame_page(path: Path, scene: Scene, prior: Prior, solution: Solution,
 def _told(pair: str, prior: Prior, solution: Solution) -> dict[str, str]:
     """Text of the page about a pair."""
     estimate, T = solution.pairs[pair], prior.of(pair)
-    R = estimate.T[:3, :3] @ T[:3, :3].T
-    turned_deg = np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1.0, 1.0)))
+    turned_deg = np.degrees(rotation_angle_rad(estimate.T @ inverse(T)))
     shifted_m = float(np.linalg.norm(estimate.T[:3, 3] - T[:3, 3]))
     sigma = np.sqrt(np.diag(estimate.covariance))
     seen = zip(DOF_NAMES[:3], sigma[:3], estimate.observable[:3], strict=True)
@@ -279,11 +252,6 @@ def jpeg_uri(image_bgr: UInt8[np.ndarray, "H W 3"], width_px: int | None = None)
         height = round(image_bgr.shape[0] * width_px / image_bgr.shape[1])
         image_bgr = cv2.resize(image_bgr, (width_px, height), interpolation=cv2.INTER_AREA)
     return _uri("jpeg", image_bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-
-
-def png_uri(image_bgr: UInt8[np.ndarray, "H W 3"]) -> str:
-    """Image as a PNG data URI: lossless, so that single dots stay sharp."""
-    return _uri("png", image_bgr, [cv2.IMWRITE_PNG_COMPRESSION, 6])
 
 
 def _uri(kind: str, image_bgr: UInt8[np.ndarray, "H W 3"], options: list[int]) -> str:

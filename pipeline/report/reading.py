@@ -96,8 +96,8 @@ def day_poses(lake: Lake, partition: Partition, records: Mapping[str, Calibratio
 
 def vehicle_states(lake: Lake, vehicle: str, method: str) -> list[StateRow]:
     """What a vehicle should load, by the last audit."""
-    found = [s for s in read_records(lake, STATES, StateRow, vehicle=vehicle) if s.method == method]
-    return current_states(found)
+    states = read_records(lake, STATES, StateRow, vehicle=vehicle)
+    return current_states([s for s in states if s.method == method])
 
 
 def fleet_records(lake: Lake, method: str, window_days: int) -> list[CalibrationRecord]:
@@ -120,9 +120,8 @@ def records_of_day(
     lake: Lake, method: str, day: str, among: Collection[str]
 ) -> dict[str, dict[str, CalibrationRecord]]:
     """Current records of some vehicles on a day, whole, by vehicle and edge, in order of edges."""
-    rows = read_records(lake, CALIBRATIONS, CalibrationRecord, day=day, vehicle=set(among))
     by_vehicle: dict[str, list[CalibrationRecord]] = {}
-    for record in rows:
+    for record in read_records(lake, CALIBRATIONS, CalibrationRecord, day=day, vehicle=set(among)):
         if record.method == method:
             by_vehicle.setdefault(record.vehicle, []).append(record)
     return {vehicle: _by_edge(own) for vehicle, own in by_vehicle.items()}
@@ -145,20 +144,21 @@ def drawn_records(
     # Of each kind the sensor that is drawn.
     names: dict[str, str] = {} if camera is None else {"camera": camera, "radar": ""}
     for record in records.values():
-        ends = dict(zip(record.pair.split("_"), (record.parent_frame, record.child_frame), strict=True))
+        ends = _ends(record)
         if record.pair in PAIRS and all(names.get(kind, name) == name for kind, name in ends.items()):
             chosen[record.pair] = record
             names |= ends
     return chosen
 
 
+def _ends(record: CalibrationRecord) -> dict[str, str]:
+    """Names of an edge's sensors by their kinds."""
+    return dict(zip(record.pair.split("_"), (record.parent_frame, record.child_frame), strict=True))
+
+
 def names_drawn(drawn: Mapping[str, CalibrationRecord]) -> Chosen | None:
     """The sensors of such records by kind; None for a vehicle whose sensors are named camera, lidar and radar."""
-    names = {
-        kind: name
-        for record in drawn.values()
-        for kind, name in zip(record.pair.split("_"), (record.parent_frame, record.child_frame), strict=True)
-    }
+    names = {kind: name for record in drawn.values() for kind, name in _ends(record).items()}
     return None if all(kind == name for kind, name in names.items()) else cast("Chosen", names)
 
 
@@ -181,13 +181,11 @@ def states_of(records: Mapping[str, CalibrationRecord]) -> tuple[Extrinsics, Ext
 
     A pair without a result stays at its prior; one without either is NaN.
     """
-    prior = {p: prior_of(r) for p, r in records.items()}
-    result = {p: transform_of(r) for p, r in records.items()}
-    before = {p: T for p, T in prior.items() if T is not None}
-    after = before | {p: T for p, T in result.items() if T is not None}
-    if not after:
-        return None
-    return _extrinsics(before), _extrinsics(after)
+    before = {p: T for p, r in records.items() if (T := prior_of(r)) is not None}
+    after = before | {p: T for p, r in records.items() if (T := transform_of(r)) is not None}
+    unknown = np.full((4, 4), np.nan)
+    first, last = (Extrinsics(*(of.get(pair, unknown) for pair in PAIRS)) for of in (before, after))
+    return (first, last) if after else None
 
 
 def has_frames(lake: Lake, partition: Partition) -> bool:
@@ -230,10 +228,6 @@ def scenes_among(
     return [scene_of(f, o, config) for f, o in there]
 
 
-def _extrinsics(pairs: Mapping[str, np.ndarray]) -> Extrinsics:
-    return Extrinsics(*(pairs.get(pair, np.full((4, 4), np.nan)) for pair in PAIRS))
-
-
 def without_road_users(frame: Frame, observation: Observation) -> Frame:
     """The frame with its road users in mosaic; without an image where its bytes are no picture."""
     image = cv2.imdecode(np.frombuffer(frame.image, np.uint8), cv2.IMREAD_COLOR) if frame.image else None
@@ -266,7 +260,7 @@ def road_user_mask(observation: Observation, size_px: tuple[int, int]) -> Bool[n
     if labels is not None:
         found = ((labels >= _FIRST_ROAD_USER) & (labels <= _LAST_ROAD_USER)).astype(np.uint8)
         grown = cv2.dilate(found, np.ones((2 * _GROWN_PX + 1,) * 2, np.uint8))
-        mask = cv2.resize(grown, (width, height), interpolation=cv2.INTER_NEAREST)
+        mask = cv2.resize(grown, size_px, interpolation=cv2.INTER_NEAREST)
     for x0, y0, x1, y1 in observation.road_user_boxes_px.astype(np.float64):
         dx, dy = _MARGIN_SHARE * (x1 - x0), _MARGIN_SHARE * (y1 - y0)
         left, right = (int(np.clip(v, 0, width)) for v in (x0 - dx, np.ceil(x1 + dx)))

@@ -17,13 +17,10 @@ from pipeline.store.current import transform_of
 from schemas.calibrations import CalibrationRecord
 from schemas.poses import PoseRow
 
-__all__ = ["DrawnEdge", "DrawnSensor", "rig_figure", "rig_of_day"]
+__all__ = ["DrawnSensor", "rig_figure", "rig_of_day"]
 
-_WIDTH, _MARGIN, _PICTURE = (
-    900.0,
-    240.0,
-    420.0,
-)  # of the drawing, of a column of names, of the rig between them
+# Of the drawing, of a column of names, of the rig between them.
+_WIDTH, _MARGIN, _PICTURE = 900.0, 240.0, 420.0
 _ROW = 34.0  # of two lines of text
 _COLOURS: Final[Mapping[str, str]] = {
     "camera": "#2b6cb0",
@@ -67,22 +64,16 @@ class DrawnSensor:
         return float(np.arctan2(y, x))
 
 
-@dataclass(frozen=True)
-class DrawnEdge:
-    """A pair of sensors: its status (accepted, held, refused) and a sentence for the tooltip."""
-
-    a: str
-    b: str
-    status: str
-    sentence: str
-
-
-def rig_figure(sensors: Sequence[DrawnSensor], edges: Sequence[DrawnEdge]) -> Markup:
+def rig_figure(sensors: Sequence[DrawnSensor], edges: Iterable[CalibrationRecord]) -> Markup:
     """The rig from above, forward up; the names and sentences of the sensors are on the left and right."""
     height = max(_PICTURE, _ROW * (len(sensors) / 2 + 2)) + _ROW
     place = _places(sensors, height)
     parts = [_view(s, place[s.name]) for s in sorted(sensors, key=lambda s: -s.width_rad)]
-    parts += [_edge(e, place[e.a], place[e.b]) for e in edges if e.a in place and e.b in place]
+    parts += [
+        _edge(e, place[e.parent_frame], place[e.child_frame])
+        for e in edges
+        if e.parent_frame in place and e.child_frame in place
+    ]
     for side in ("left", "right"):
         parts += _column(side, _on_side(sensors, side), place, height)
     parts += [_dot(s, place[s.name]) for s in sensors]
@@ -108,16 +99,7 @@ def rig_of_day(poses: Sequence[PoseRow], records: Iterable[CalibrationRecord]) -
         )
         for name, pose in T.items()
     ]
-    edges = [
-        DrawnEdge(
-            r.parent_frame,
-            r.child_frame,
-            r.status,
-            f"{r.parent_frame}-{r.child_frame}: {r.status}. {r.reason}",
-        )
-        for r in records
-    ]
-    return rig_figure(sensors, edges)
+    return rig_figure(sensors, records)
 
 
 def _upright(kind: str) -> Float[np.ndarray, "4 4"]:
@@ -162,10 +144,11 @@ def _view(sensor: DrawnSensor, place: tuple[float, float]) -> str:
     return f'<path d="M{u:.1f} {v:.1f}L{x0:.1f} {y0:.1f}{arc}Z" {style}/>'
 
 
-def _edge(edge: DrawnEdge, a: tuple[float, float], b: tuple[float, float]) -> str:
+def _edge(edge: CalibrationRecord, a: tuple[float, float], b: tuple[float, float]) -> str:
     colour = _STATUS_COLOURS.get(edge.status, MUTED)
     dash = "" if edge.status == "accepted" else ' stroke-dasharray="5 4"'
-    title = f"<title>{escape(edge.sentence)}</title>"
+    sentence = f"{edge.parent_frame}-{edge.child_frame}: {edge.status}. {edge.reason}"
+    title = f"<title>{escape(sentence)}</title>"
     # Bent a little, so that edges along one line do not hide each other.
     bend = ((a[0] + b[0] + _BEND * (b[1] - a[1])) / 2, (a[1] + b[1] - _BEND * (b[0] - a[0])) / 2)
     return (

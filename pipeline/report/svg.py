@@ -54,14 +54,12 @@ class Plot:
         end: tuple[Number, Number],
         colour: str,
         width: Number = 1.0,
-        dash: str = "",
     ) -> None:
         """A line between two data points."""
         (x0, y0), (x1, y1) = self.at(*start), self.at(*end)
-        extra = f' stroke-dasharray="{dash}"' if dash else ""
         self.parts.append(
             f'<line x1="{x0:.1f}" y1="{y0:.1f}" x2="{x1:.1f}" y2="{y1:.1f}" '
-            f'stroke="{colour}" stroke-width="{width:g}"{extra}/>'
+            f'stroke="{colour}" stroke-width="{width:g}"/>'
         )
 
     def area(
@@ -91,7 +89,7 @@ class Plot:
     ) -> None:
         """A dot with a tooltip."""
         u, v = self.at(x, y)
-        title = f"<title>{escape(tooltip)}</title>" if tooltip else ""
+        title = f"<title>{escape(tooltip)}</title>"
         circle = f'<circle cx="{u:.1f}" cy="{v:.1f}" r="{radius:g}" fill="{colour}"/>'
         self.parts.append(f'<g opacity="{opacity:g}">{title}{circle}</g>')
 

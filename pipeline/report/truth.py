@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,24 +17,10 @@ from pipeline.rig.se3 import inverse
 from pipeline.store.current import prior_of, transform_of
 from schemas.calibrations import DOF_NAMES, CalibrationRecord
 
-__all__ = ["TruthRow", "read_truth", "true_transform", "truth_rows", "truth_summary"]
+__all__ = ["read_truth", "true_transform", "truth_rows", "truth_summary"]
 
 # (vehicle, day) -> sensor, or base -> T_base_sensor
 Truth = Mapping[tuple[str, str], Mapping[str, np.ndarray]]
-
-
-@dataclass(frozen=True)
-class TruthRow:
-    """Estimate minus truth of one pair on one day, per DoF with its sigma; in degrees and metres."""
-
-    vehicle: str
-    day: str
-    title: str
-    status: str
-    prior_error: str
-    errors: list[str]
-    within: list[bool]  # of three sigmas
-    determined: list[bool]
 
 
 def read_truth(folder: Path) -> Truth:
@@ -68,46 +53,42 @@ def true_transform(truth: Truth, record: CalibrationRecord) -> Float[np.ndarray,
     return inverse(poses[record.parent_frame]) @ poses[record.child_frame]
 
 
-def truth_rows(records: Sequence[CalibrationRecord], truth: Truth) -> list[TruthRow]:
-    """Rows for all records whose truth is known."""
-    rows = []
-    for record in records:
-        T_true = true_transform(truth, record)
-        if T_true is not None:
-            rows.append(_row(record, T_true))
-    return rows
+def truth_rows(records: Sequence[CalibrationRecord], truth: Truth) -> list[dict[str, Any]]:
+    """Estimate minus truth of each record whose truth is known: by DoF in words, and whether within three sigmas."""
+    found = ((record, true_transform(truth, record)) for record in records)
+    return [_row(record, T_true) for record, T_true in found if T_true is not None]
 
 
-def truth_summary(rows: Sequence[TruthRow]) -> str:
+def truth_summary(rows: Sequence[Mapping[str, Any]]) -> str:
     """Number of determined axes of accepted days with errors within three of their sigmas."""
-    axes = [
-        w for r in rows if r.status == "accepted" for w, d in zip(r.within, r.determined, strict=True) if d
-    ]
+    accepted = [r for r in rows if r["status"] == "accepted"]
+    axes = [w for r in accepted for w, d in zip(r["within"], r["determined"], strict=True) if d]
     if not axes:
         return "no accepted estimate"
     return f"{sum(axes)} of {len(axes)} determined axes are within three sigmas"
 
 
-def _row(record: CalibrationRecord, T_true: np.ndarray) -> TruthRow:
+def _row(record: CalibrationRecord, T_true: np.ndarray) -> dict[str, Any]:
     T, T_prior = transform_of(record), prior_of(record)
-    prior_error = ""
-    if T_prior is not None:
-        off = change_between(T_true, T_prior)
-        prior_error = f"{np.degrees(np.linalg.norm(off[:3])):.2f} deg, {100 * np.linalg.norm(off[3:]):.1f} cm"
-    head = (
-        record.vehicle,
-        record.day,
-        f"{record.parent_frame}-{record.child_frame}",
-        record.status,
-        prior_error,
-    )
+    off = None if T_prior is None else change_between(T_true, T_prior)
+    row = {
+        "vehicle": record.vehicle,
+        "day": record.day,
+        "title": f"{record.parent_frame}-{record.child_frame}",
+        "status": record.status,
+        "prior_error": ""
+        if off is None
+        else f"{np.degrees(np.linalg.norm(off[:3])):.2f} deg, {100 * np.linalg.norm(off[3:]):.1f} cm",
+    }
     if T is None or record.covariance is None:
-        return TruthRow(*head, [""] * 6, [True] * 6, [False] * 6)
+        return row | {"errors": [""] * 6, "within": [True] * 6, "determined": [False] * 6}
     error = change_between(T_true, T)
     sigma = np.sqrt(np.diag(change_covariance(T, record.covariance)))
-    words = [
-        f"{scaled(e, d):+.3f} ± {scaled(s, d):.3f}" for e, s, d in zip(error, sigma, DOF_NAMES, strict=True)
-    ]
-    return TruthRow(
-        *head, words, (np.abs(error) <= 3 * sigma).tolist(), list(record.observable or [True] * 6)
-    )
+    return row | {
+        "errors": [
+            f"{scaled(e, d):+.3f} ± {scaled(s, d):.3f}"
+            for e, s, d in zip(error, sigma, DOF_NAMES, strict=True)
+        ],
+        "within": np.abs(error) <= 3 * sigma,
+        "determined": record.observable or [True] * 6,
+    }

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.report.evaluation import EvaluatedRun, TableView, View, evaluation_page
+from pipeline.report.evaluation import EvaluatedRun, View, evaluation_page
 from schemas.calibrations import PAIRS
 from tests.report.test_pictures import GOOD, _scene, _turned
 
@@ -18,7 +18,7 @@ def run(method, error_deg):
 
 def tables():
     rows = [(False, ["joint", "2"]), (True, ["paper: joint SSL", "other"])]
-    return [TableView("Table 1", ["method", "runs"], rows)]
+    return [{"title": "Table 1", "header": ["method", "runs"], "lines": rows}]
 
 
 def test_every_run_is_a_dot_per_pair_and_every_prior_a_cross():

@@ -4,8 +4,9 @@ import re
 
 import numpy as np
 
-from pipeline.report.rig_figure import DrawnEdge, DrawnSensor, rig_figure
+from pipeline.report.rig_figure import DrawnSensor, rig_figure
 from pipeline.rig.se3 import exp_so3, from_rotation_translation
+from tests.makers.table_rows import make_record
 
 OPTICAL = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # axes of a camera that looks forward
 
@@ -40,7 +41,10 @@ def test_a_view_to_the_left_is_drawn_to_the_left():
 
 def test_every_sensor_and_edge_is_there_and_names_cannot_break_the_page():
     sensors = [sensor(f"s<{k}>", "radar", 30 * k, np.cos(k), np.sin(k), status="none") for k in range(9)]
-    edges = [DrawnEdge("s<0>", "s<1>", "held", "by 2 < 3 sigmas"), DrawnEdge("s<0>", "gone", "held", "")]
+    edges = [
+        make_record(np.random.default_rng(0), "k", parent_frame="s<0>", child_frame=b, status="held")
+        for b in ("s<1>", "gone")
+    ]
     drawing = str(rig_figure(sensors, edges))
     assert "s<0>" not in drawing
     assert all(drawing.count(f"s&lt;{k}&gt;</t") + drawing.count(f"s&lt;{k}&gt;<ts") for k in range(9))
