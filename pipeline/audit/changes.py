@@ -84,7 +84,7 @@ def levels_of(chart: Charts, value: Float[np.ndarray, " N"], noise: Noise, thres
     """
 
     def split(first: int, end: int) -> int | None:
-        part = scan_by(chart.row(0, first, end), value[None, first:end], noise)
+        part = scan_by(chart.row(0, np.arange(first, end)), value[None, first:end], noise)
         z = np.abs(part.z[0])
         return first + 1 + int(np.argmax(z)) if len(z) and z.max() > threshold else None
 
@@ -136,7 +136,7 @@ def describe(levels: Levels) -> Change:
         return _drift(whole, day, int(np.argmax(drift_gain)))
     # Of the splits, those about where the first level was left: a later change must not move it.
     end = levels.start + levels.days_after
-    near = scan_by(chart.row(0, 0, end), levels.value[None, :end], levels.noise)
+    near = scan_by(chart.row(0, np.arange(end)), levels.value[None, :end], levels.noise)
     first, earliest, latest = start_interval(near.z[0] ** 2, day)
     if int(day[levels.start]) != first:
         first = int(day[levels.start])
@@ -209,14 +209,6 @@ def _against(
 ) -> tuple[float, float]:
     """Difference of two levels and its sigma."""
     columns = np.r_[slice(*reference), slice(*level)]
-    part = Charts(
-        chart.day[:, columns],
-        chart.value[:, columns],
-        chart.sigma[:, columns],
-        chart.accepted[:, columns],
-        chart.reference_days,
-        np.array([len(columns)]),
-    )
-    found = scan_by(part, value[None, columns], noise)
+    found = scan_by(chart.row(0, columns), value[None, columns], noise)
     at = reference[1] - reference[0] - 1
     return float(found.size[0, at]), float(found.sigma[0, at])

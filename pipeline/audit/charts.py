@@ -54,17 +54,14 @@ class Charts:
         """Rows whose first column is a fixed reference."""
         return self.reference_days > 0
 
-    def row(self, m: int, first: int = 0, end: int | None = None) -> Charts:
-        """One chart alone, or the part of its days from column `first` to before `end`."""
-        end = int(self.count[m]) if end is None else end
-        part = (slice(m, m + 1), slice(first, end))
+    def row(self, m: int, columns: Int[np.ndarray, " C"] | None = None) -> Charts:
+        """One chart alone, with all of its days or those of some columns."""
+        columns = np.arange(self.count[m]) if columns is None else columns
+        part = slice(m, m + 1), columns
+        reference_days = self.reference_days[[m]] * (columns[0] == 0)
+        count = np.array([len(columns)])
         return Charts(
-            self.day[part],
-            self.value[part],
-            self.sigma[part],
-            self.accepted[part],
-            self.reference_days[m : m + 1] * (first == 0),
-            np.array([end - first]),
+            self.day[part], self.value[part], self.sigma[part], self.accepted[part], reference_days, count
         )
 
 

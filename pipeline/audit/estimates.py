@@ -31,6 +31,8 @@ __all__ = [
     "estimates_at",
     "estimates_of",
     "faults_of",
+    "is_covariance",
+    "is_rigid",
     "joined",
 ]
 
@@ -240,29 +242,38 @@ def faults_of(records: Estimates, latest_day: str) -> dict[int, str]:
     future = records.day > dt.date.fromisoformat(latest_day).toordinal()
     unknown = (records.edge < 0) | (records.status < 0)
     looked_at = ~future & ~unknown & ~records.refused
-    estimated, C = looked_at & records.has_estimate, records.covariance
-    pose = np.where(np.isfinite(records.pose), records.pose, np.inf)
-    rigid = np.isfinite(pose).all(axis=1) & (np.abs((pose[:, :4] ** 2).sum(axis=1) - 1) <= _ROUNDING)
-    said = np.isfinite(C).all(axis=(1, 2))
-    diagonal = np.einsum("nii->ni", C)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        said &= (diagonal > 0).all(axis=1)
-        # No correlation is beyond 1: what a damaged covariance fails, at a fraction of what eigenvalues cost.
-        scale = 1 / np.sqrt(diagonal)
-        said &= (np.abs(C * scale[:, :, None] * scale[:, None, :]) < 1 + _ROUNDING).all(axis=(1, 2))
+    estimated = looked_at & records.has_estimate
     common = ~records.has_common | np.isfinite(records.common).all(axis=(1, 2))
     faults: dict[int, str] = {}
     for wrong, why in (
         (future, "is of a day that has not come yet"),
         (unknown, "is of a pair or has a status that this release does not know"),
         (looked_at & ~records.has_estimate & (records.status != _HELD), "has no pose"),
-        (estimated & ~rigid, "holds no rigid transform"),
-        (estimated & ~said, "holds no covariance"),
+        (estimated & ~is_rigid(records.pose), "holds no rigid transform"),
+        (estimated & ~is_covariance(records.covariance), "holds no covariance"),
         (estimated & ~common, "has no covariance of the errors common to all days"),
     ):
         for row in np.flatnonzero(wrong).tolist():
             faults.setdefault(row, why)
     return dict(sorted(faults.items()))
+
+
+def is_rigid(pose: Float[np.ndarray, "N 7"]) -> Bool[np.ndarray, " N"]:
+    """Finite numbers, with a quaternion of length 1."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        unit = np.abs((pose[:, :4] ** 2).sum(axis=1) - 1) <= _ROUNDING
+    return np.asarray(unit & np.isfinite(pose).all(axis=1))
+
+
+def is_covariance(C: Float[np.ndarray, "N 6 6"]) -> Bool[np.ndarray, " N"]:
+    """Finite, with positive variances and no correlation beyond 1, at a fraction of what eigenvalues cost."""
+    diagonal = np.einsum("nii->ni", C)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        scale = 1 / np.sqrt(diagonal)
+        sound = np.isfinite(C).all(axis=(1, 2)) & (diagonal > 0).all(axis=1)
+        return np.asarray(
+            sound & (np.abs(C * scale[:, :, None] * scale[:, None, :]) < 1 + _ROUNDING).all(axis=(1, 2))
+        )
 
 
 @lru_cache(maxsize=4096)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,36 +20,27 @@ from pipeline.rig.graph import Edge
 from schemas.calibrations import DOF_NAMES, STATUSES
 from schemas.drift import DriftFinding
 
-__all__ = ["VehicleAudit", "vehicle_findings"]
-
-
-@dataclass(frozen=True)
-class VehicleAudit:
-    """Columns of `drift` common to all rows of one audit of one vehicle."""
-
-    vehicle: str
-    day: str
-    method: str
-    work_key: str
-    inputs: list[str]
+__all__ = ["vehicle_findings"]
 
 
 def vehicle_findings(
-    audit: VehicleAudit,
+    about: tuple[str, str, str],
     records: Estimates,
     verdict: VehicleVerdict,
     config: AuditConfig,
     remarks: Mapping[tuple[Edge, str], str],
-    before: Mapping[tuple[Edge, str], DriftFinding] | None = None,
-    edges: Sequence[Edge] = (),
+    before: Mapping[tuple[Edge, str], DriftFinding],
+    edges: Sequence[Edge],
 ) -> list[DriftFinding]:
     """Rows in order of edge and DoF; a DoF without a chart has a reason. Only edges of the vehicle have rows.
 
-    `before` are rows of the latest earlier audit, which include days before the window. `edges` are the edges
-    of the rig, for a vehicle without records.
+    Args:
+        about: vehicle, last day, method.
+        before: rows of the latest earlier audit, which include days before the window.
+        edges: of the rig, for a vehicle without records.
     """
-    findings = []
-    known = {*records.own_edges(), *(edge for edge, _ in before or ())} or {*edges}
+    (vehicle, day, method), findings, inputs = about, [], records.keys()
+    known = {*records.own_edges(), *(edge for edge, _ in before)} or {*edges}
     for edge in sorted(known, key=edge_order):
         without_data = _without_data(records, edge, max(config.baseline_days + 1, 2))
         last_estimate = _last_estimate(records, edge)
@@ -59,14 +50,13 @@ def vehicle_findings(
                 chart = replace(chart, reason=f"{chart.reason}; no estimate after {last_estimate}")
             if (edge, dof) in remarks:
                 chart = replace(chart, reason=f"{chart.reason}; {remarks[edge, dof]}")
-            if before is not None:
-                chart = _begun_before(chart, before.get((edge, dof)))
+            chart = _begun_before(chart, before.get((edge, dof)))
             base = DriftFinding(
-                vehicle=audit.vehicle, day=audit.day, method=audit.method, pair=edge.kind,
+                vehicle=vehicle, day=day, method=method, pair=edge.kind,
                 parent_frame=edge.parent.name, child_frame=edge.child.name, dof=dof,
                 status=chart.status, reason=chart.reason, days_used=chart.days_used, days_needed=chart.days_needed,
-                limit=limit_of(edge, dof, config), work_key=audit.work_key, statistic=chart.statistic,
-                threshold=chart.threshold, inputs=audit.inputs,
+                limit=limit_of(edge, dof, config), statistic=chart.statistic, threshold=chart.threshold,
+                inputs=inputs,
             )  # fmt: skip
             columns = _change_columns(chart, edge, verdict.attribution)
             findings.append(replace(base, **columns))

@@ -19,7 +19,7 @@ from pipeline.core.config import AuditConfig
 from pipeline.rig.graph import Edge
 from schemas.calibrations import DOF_NAMES
 
-__all__ = ["FleetShift", "judge_without_fleet_shifts", "shifts_of"]
+__all__ = ["FleetShift", "judge_without_fleet_shifts"]
 
 # Fewer vehicles are no fleet: three knocked on one day may have met the same kerb.
 _FEWEST_VEHICLES = 6
@@ -39,30 +39,18 @@ class FleetShift:
 
 
 def judge_without_fleet_shifts(
-    fleet: Sequence[Mapping[Edge, PairDays]], config: AuditConfig, models: Sequence[str] = ()
-) -> tuple[list[VehicleVerdict], dict[tuple[str, Edge, str], FleetShift]]:
-    """Verdicts on all vehicles, and the removed changes by (model, edge, dof).
-
-    `models` has the model of each vehicle; empty = all vehicles have the same one.
-    """
+    fleet: Sequence[Mapping[Edge, PairDays]], config: AuditConfig, models: Sequence[str]
+) -> tuple[list[VehicleVerdict], dict[str, dict[tuple[Edge, str], FleetShift]]]:
+    """Verdicts on all vehicles, and the removed changes of each model by edge and DoF; `models` by vehicle."""
     verdicts = judge_fleet(fleet, config, models)
-    names = list(models) or [""] * len(fleet)
-    shifts: dict[tuple[str, Edge, str], FleetShift] = {}
-    for model in sorted(set(names)):
-        rows = [v for v, name in enumerate(names) if name == model]
-        found = _shifts([fleet[v] for v in rows], [verdicts[v] for v in rows])
-        shifts |= {(model, *key): shift for key, shift in found.items()}
-    if not shifts:
-        return verdicts, {}
-    without = [_without(pairs, shifts_of(name, shifts)) for name, pairs in zip(names, fleet, strict=True)]
-    return judge_fleet(without, config, models), shifts
-
-
-def shifts_of(
-    model: str, shifts: Mapping[tuple[str, Edge, str], FleetShift]
-) -> dict[tuple[Edge, str], FleetShift]:
-    """Changes of one model."""
-    return {(edge, dof): shift for (of, edge, dof), shift in shifts.items() if of == model}
+    shifts: dict[str, dict[tuple[Edge, str], FleetShift]] = {}
+    for model in sorted(set(models)):
+        rows = [v for v, name in enumerate(models) if name == model]
+        shifts[model] = _shifts([fleet[v] for v in rows], [verdicts[v] for v in rows])
+    if any(shifts.values()):
+        without = [_without(pairs, shifts[name]) for name, pairs in zip(models, fleet, strict=True)]
+        verdicts = judge_fleet(without, config, models)
+    return verdicts, shifts
 
 
 def _shifts(

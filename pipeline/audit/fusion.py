@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
+from pipeline.audit.scan import alike
 from pipeline.rig.changes import change_between, change_jacobian, changed
 
 __all__ = [
@@ -124,7 +125,7 @@ def fuse(days: PoseDays, mount: Mount, tomorrow: int) -> Fused:
     origin, last = own.T[-1], slice(-1, None)
     prior, moment = _of_prior(own.at(last), origin)
     information = prior
-    H, g, alike = _of_days(own, origin, mount)
+    H, g, bias = _of_days(own, origin, mount)
     walk = np.diag(np.append(mount.wander, np.zeros(_DOFS)))
     for k, gap in enumerate(np.diff(own.day, append=tomorrow)):
         information, moment = information + H[k], moment + g[k]
@@ -139,7 +140,7 @@ def fuse(days: PoseDays, mount: Mount, tomorrow: int) -> Fused:
     T = changed(origin, x)
     K = np.linalg.inv(change_jacobian(T))
     earlier = [i for i in range(kept[0]) if i not in left_out]
-    covariance = level + np.diag(_of_tomorrow(mount, alike) + _unclear_step(own, mount))
+    covariance = level + np.diag(_of_tomorrow(mount, bias) + _unclear_step(own, mount))
     parts = (covariance, common, of_prior)
     covariance, common, of_prior = (_symmetric(K @ part @ K.T) for part in parts)
     moved_on = int(days.day[kept[0]]) if earlier else None
@@ -262,8 +263,8 @@ def _of_days(
     # Of the result's common part, c^2 is the prior's error; the rest is the data's, in units of their own sigma.
     own = (Vt @ B @ V - c[:, :, None] ** 2 * np.eye(_DOFS)) / _outer((1 - c) * np.sqrt(ratio))
     own = _between(own * _outer(shown * 1.0), 0.0, 1 - _LEAST_VARYING)
-    alike = _alike(len(days.day), mount.autocorrelation)
-    noise = alike * (np.eye(_DOFS) - own) * _outer(scale) + Vt @ np.diag(mount.scatter**2) @ V
+    [more] = alike(np.array([len(days.day)]), np.array([mount.autocorrelation]))
+    noise = more * (np.eye(_DOFS) - own) * _outer(scale) + Vt @ np.diag(mount.scatter**2) @ V
     noise = noise * _outer(shown * 1.0) + np.eye(_DOFS) * ~shown[:, None, :]
     W = np.linalg.inv(noise) * _outer(shown * 1.0)
     bias = back @ (own * _outer(scale)) @ back.swapaxes(1, 2)
@@ -271,24 +272,17 @@ def _of_days(
     x, x0 = change_between(origin, days.T), change_between(origin, days.T_prior)
     v = np.einsum("nij,nj->ni", Vt, x) + ratio * np.einsum("nij,nj->ni", Vt, x - x0)
     AtW = A.swapaxes(1, 2) @ W
-    alike_by_dof = np.median(np.einsum("nii->ni", bias), axis=0)
-    return AtW @ A, np.einsum("nij,nj->ni", AtW, v), alike_by_dof
+    return AtW @ A, np.einsum("nij,nj->ni", AtW, v), np.median(np.einsum("nii->ni", bias), axis=0)
 
 
-def _of_tomorrow(mount: Mount, alike: Float[np.ndarray, " 6"]) -> Float[np.ndarray, " 6"]:
+def _of_tomorrow(mount: Mount, bias: Float[np.ndarray, " 6"]) -> Float[np.ndarray, " 6"]:
     """Variance by DoF of tomorrow's mounting about its level.
 
     Where days scatter more than by their varying part, the mount moves, or less of their error is alike than was said.
     The sigma of the level counts all of that as alike; what scatters beyond it too is the mount's.
     """
     scatter = mount.scatter**2
-    return np.minimum(scatter, np.maximum(scatter - alike, LEAST_SCATTER**2))
-
-
-def _alike(count: int, autocorrelation: float) -> float:
-    """Factor of AR(1) errors on the variance of a mean of so many days."""
-    lag = np.arange(1, count)
-    return 1 + 2 * float(np.sum((1 - lag / count) * autocorrelation**lag))
+    return np.minimum(scatter, np.maximum(scatter - bias, LEAST_SCATTER**2))
 
 
 def _in_changes(

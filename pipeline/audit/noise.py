@@ -1,20 +1,16 @@
 """Scatter of the days: its ratio to their sigmas, and the correlation of errors from day to day.
 
-Both are learnt for each vehicle model, edge and degree of freedom, from differences between days, which a few
-real changes hardly affect. A `Prior` for an unknown fleet is updated by the fleet's days, and this by a
-vehicle's own days. The spread between vehicles is learnt too (Smyth 2004, Stat. Appl. Genet. Mol. Biol. 3(1),
-moments of log-variances). An outlying vehicle uses its own days only.
-
-Differences between days of a fleet's charts, which show the scatter of days.
-
-A few real changes do not affect them: variances are winsorised, spans over a jump and the newest days are
-left out.
+Both are learnt for each vehicle model, edge and degree of freedom, from differences between days. A few real changes
+do not affect them: variances are winsorised, spans over a jump and the newest days are left out. A `Prior` for an
+unknown fleet is updated by the fleet's days, and this by a vehicle's own days. The spread between vehicles is learnt
+too (Smyth 2004, Stat. Appl. Genet. Mol. Biol. 3(1), moments of log-variances). An outlying vehicle uses its own days
+only.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -116,7 +112,7 @@ class Noise:
     Args:
         far: share of differences between days above three sigmas, without lasting changes; the largest of all
             edges.
-        wander: variance that a level gains per day without a change; None = none.
+        wander: variance that a level gains per day without a change.
         less_alike: the noise with the smallest autocorrelation that the days allow; None if it is the same.
     """
 
@@ -124,7 +120,7 @@ class Noise:
     freedom: Float[np.ndarray, " M"]
     autocorrelation: Float[np.ndarray, " M"]
     far: Float[np.ndarray, " M"]
-    wander: Float[np.ndarray, " M"] | None = None
+    wander: Float[np.ndarray, " M"]
     less_alike: Noise | None = None
 
     @property
@@ -140,10 +136,10 @@ class Noise:
     def at(self, rows: slice) -> Noise:
         """The noise of a selection of the charts."""
         other = None if self.less_alike is None else self.less_alike.at(rows)
-        wander = None if self.wander is None else self.wander[rows]
         return Noise(
-            self.scale[rows], self.freedom[rows], self.autocorrelation[rows], self.far[rows], wander, other
-        )
+            self.scale[rows], self.freedom[rows], self.autocorrelation[rows], self.far[rows], self.wander[rows],
+            other,
+        )  # fmt: skip
 
 
 def estimate_noise(
@@ -164,7 +160,7 @@ def estimate_noise(
     """
     vehicles = len(charts.count) // (edges * dofs)
     _, model_of = np.unique(list(models) or [""] * vehicles, return_inverse=True)
-    out = np.ones((2, 4, vehicles, edges, dofs))
+    out = np.zeros((2, 5, vehicles, edges, dofs))
     differences = [Differences.of(charts, lag, (vehicles, edges, dofs)) for lag in (1, APART)]
     for model in np.unique(model_of):
         own = np.flatnonzero(model_of == model)
@@ -176,13 +172,8 @@ def estimate_noise(
             phi = _autocorrelation(near, far, most, prior)
             out[k, :2, own] = np.stack(_scatter(near, phi, prior), axis=1)
             out[k, 2, own] = phi
-    most_alike, least_alike = (tuple(part.reshape(4, -1)) for part in out)
-    return _noise(most_alike, _noise(least_alike))
-
-
-def _noise(columns: tuple[np.ndarray, ...], less_alike: Noise | None = None) -> Noise:
-    scale, freedom, autocorrelation, far = columns
-    return Noise(scale, freedom, autocorrelation, far, None, less_alike)
+    most_alike, least_alike = (Noise(*columns) for columns in out.reshape(2, 5, -1))
+    return replace(most_alike, less_alike=least_alike)
 
 
 def _autocorrelation(

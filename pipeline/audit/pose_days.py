@@ -12,6 +12,7 @@ import pyarrow.compute as pc
 from jaxtyping import Bool, Float, Int
 
 from pipeline.audit.days import PairDays, pair_days
+from pipeline.audit.estimates import is_covariance, is_rigid
 from pipeline.audit.fusion import PoseDays
 from pipeline.rig.graph import KINDS, Sensor
 from pipeline.rig.se3 import from_quaternion
@@ -27,7 +28,6 @@ __all__ = ["SensorDays", "VehiclePoses", "read_poses"]
 _PRIOR = tuple(f"prior_{name}" for name in POSE_COLUMNS)
 _WORDS = ("vehicle", "day", "sensor", "kind", "reference", "status", "reason", "unsure_only")
 _MOVED = "moved_in_day"
-_ROUNDING = 1e-3  # of what should be 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,8 +125,8 @@ def _sensor(rows: pa.Table, at: Sequence[int]) -> SensorDays:
     counts = accepted | np.array([s == "held" and bool(u) for s, u in zip(status, unsure, strict=True)])
     pose, prior = (_transforms(rows, names) for names in (POSE_COLUMNS, _PRIOR))
     C, B, P = (matrices(rows[name]) for name in ("covariance", "common_covariance", "prior_covariance"))
-    knows_prior = np.isfinite(prior).all(axis=(1, 2)) & _is_covariance(P)
-    sound = np.isfinite(pose).all(axis=(1, 2)) & _is_covariance(C) & np.isfinite(B).all(axis=(1, 2))
+    knows_prior = np.isfinite(prior).all(axis=(1, 2)) & is_covariance(P)
+    sound = np.isfinite(pose).all(axis=(1, 2)) & is_covariance(C) & np.isfinite(B).all(axis=(1, 2))
     kept, left = (np.flatnonzero(of & sound & knows_prior) for of in (counts, ~counts))
     days: Int[np.ndarray, " N"] = ordinals(rows["day"])
     targets, keys = matrices(rows["targets_m"], (3, 3)), rows["work_key"].to_pylist()
@@ -150,20 +150,7 @@ def _sensor(rows: pa.Table, at: Sequence[int]) -> SensorDays:
 def _transforms(rows: pa.Table, names: Sequence[str]) -> Float[np.ndarray, "N 4 4"]:
     """T of the rows; not finite where a row has none, or no rotation."""
     numbers = np.stack([rows[name].cast(pa.float64()).to_numpy() for name in names], axis=1)
-    whole = np.all([there(rows[name]) for name in names], axis=0) & np.isfinite(numbers).all(axis=1)
-    with np.errstate(invalid="ignore"):
-        whole &= np.abs((numbers[:, :4] ** 2).sum(axis=1) - 1) <= _ROUNDING
+    whole = np.all([there(rows[name]) for name in names], axis=0) & is_rigid(numbers)
     T = np.full((len(numbers), 4, 4), np.nan)
     T[whole] = from_quaternion(numbers[whole, :4], numbers[whole, 4:])
     return T
-
-
-def _is_covariance(C: Float[np.ndarray, "N 6 6"]) -> Bool[np.ndarray, " N"]:
-    """Finite, with positive variances, and no correlation beyond 1."""
-    diagonal = np.einsum("nii->ni", C)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        scale = 1 / np.sqrt(diagonal)
-        whole = np.isfinite(C).all(axis=(1, 2)) & (diagonal > 0).all(axis=1)
-        return np.asarray(
-            whole & (np.abs(C * scale[:, :, None] * scale[:, None, :]) < 1 + _ROUNDING).all(axis=(1, 2))
-        )

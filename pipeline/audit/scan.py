@@ -23,10 +23,10 @@ from numba import njit
 from pipeline.audit.charts import Charts
 from pipeline.audit.noise import Noise
 
-__all__ = ["Scan", "alike", "errors_of", "scan", "scan_by"]
+__all__ = ["SAME", "Scan", "alike", "errors_of", "scan", "scan_by"]
 
 _FIRST = 3  # days that show a level: as many as are no chance where single days are often far off
-_SAME = 0.02  # autocorrelations that differ by less are equivalent
+SAME = 0.02  # autocorrelations that differ by less are equivalent
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +129,7 @@ def scan_by(
     """
     found = scan(charts, value, noise.scale, noise.autocorrelation, noise.wander, reach)
     other = noise.less_alike
-    if other is None or not np.any(noise.autocorrelation - other.autocorrelation > _SAME):
+    if other is None or not np.any(noise.autocorrelation - other.autocorrelation > SAME):
         return found
     less = scan(charts, value, other.scale, other.autocorrelation, other.wander, reach)
     step, slow = np.abs(less.z) < np.abs(found.z), np.abs(less.drift_z) < np.abs(found.drift_z)

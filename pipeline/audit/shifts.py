@@ -41,7 +41,7 @@ class Whitened:
         cls,
         days: PairDays,
         autocorrelation: Float[np.ndarray, " 6"],
-        wander: Float[np.ndarray, " 6"] | None = None,
+        wander: Float[np.ndarray, " 6"],
     ) -> Whitened:
         """Days whitened for this autocorrelation per axis and for a level that gains variance `wander` a day."""
         N, sigma = len(days.day), days.sigma
@@ -58,11 +58,8 @@ class Whitened:
         gap = np.abs(days.day[:, None] - days.day)[:, :, None]
         covariance = np.einsum("iac,ijc,jbc->iajb", root, autocorrelation**gap, root)
         covariance[np.arange(N), :, np.arange(N)] += own
-        if wander is not None:
-            since = days.day - days.day[0]
-            covariance[:, range(DOFS), :, range(DOFS)] += wander[:, None, None] * np.minimum.outer(
-                since, since
-            )
+        since = days.day - days.day[0]
+        covariance[:, range(DOFS), :, range(DOFS)] += wander[:, None, None] * np.minimum.outer(since, since)
         L = np.linalg.cholesky(covariance.reshape(DOFS * N, DOFS * N))
         return cls(days.day, days.origin, solve_triangular(L, days.change.ravel(), lower=True), L)
 

@@ -11,9 +11,9 @@ from itertools import combinations
 import numpy as np
 
 from pipeline.audit.days import FEWEST_DAYS, PairDays, Reference, charted, reference_of
-from pipeline.audit.estimates import Estimates, days_of
-from pipeline.audit.findings import VehicleAudit, vehicle_findings
-from pipeline.audit.fleet_shift import FleetShift, judge_without_fleet_shifts, shifts_of
+from pipeline.audit.estimates import Estimates, day_name, days_of
+from pipeline.audit.findings import vehicle_findings
+from pipeline.audit.fleet_shift import FleetShift, judge_without_fleet_shifts
 from pipeline.audit.history import History, last_audited_day, models_of
 from pipeline.audit.restarts import events_until, restart_of
 from pipeline.audit.standing import said_before, standing
@@ -104,32 +104,35 @@ def _judged(
 ) -> Generator[DriftFinding, None, None]:
     """Findings of each vehicle, judged together."""
     fleet, (first, _, method) = task.fleet, window
-    begin = dt.date.fromisoformat(first).toordinal()
+    begin = _ordinal(first)
     if not any(v.said or (v.records.day >= begin).any() for v in vehicles.values()):
         return
     days = [_charted(vehicle, window, fleet.audit) for vehicle in vehicles.values()]
     models = models_of(fleet, vehicles)
     verdicts, shifts = judge_without_fleet_shifts(days, fleet.audit, models)
-    of_model = {model: shifts_of(model, shifts) for model in set(models)}
     before = _found_before(task.lake, method, dict(zip(vehicles, verdicts, strict=True)), first)
     for done, ((name, vehicle), verdict) in enumerate(zip(vehicles.items(), verdicts, strict=True)):
         progress(done, len(vehicles), name)
-        known = of_model[models[done]], before.get(name, {})
+        known = shifts[models[done]], before.get(name, {})
         yield from _findings(fleet, name, vehicle, verdict, window, known)
     progress(len(vehicles), len(vehicles), "")
 
 
 def _charted(vehicle: _Vehicle, window: tuple[str, str, str], config: AuditConfig) -> dict[Edge, PairDays]:
     """The window's days of each edge with its reference, since the last service event."""
-    first, last = (dt.date.fromisoformat(day).toordinal() for day in window[:2])
+    first, last = (_ordinal(day) for day in window[:2])
     charts = {}
     for edge, days in days_of(vehicle.records, config.held_sigma_factor).items():
         restart = restart_of(vehicle.events, edge, window[1])
-        since = 0 if restart is None else dt.date.fromisoformat(restart.day).toordinal() + 1
+        since = 0 if restart is None else _ordinal(restart.day) + 1
         own = days.between(since, last)
         reference = vehicle.references.get(edge) or reference_of(own, config.reference_days)
         charts[edge] = charted(own, first, last, reference)
     return charts
+
+
+def _ordinal(day: str) -> int:
+    return dt.date.fromisoformat(day).toordinal()
 
 
 def _told(findings: Sequence[DriftFinding], left_out: Sequence[str]) -> Told:
@@ -164,15 +167,12 @@ def _findings(
     known: tuple[Mapping[tuple[Edge, str], FleetShift], Mapping[tuple[Edge, str], DriftFinding]],
 ) -> list[DriftFinding]:
     (first, last, method), (shifts, before) = window, known
-    records = vehicle.records.at(
-        np.flatnonzero(vehicle.records.day >= dt.date.fromisoformat(first).toordinal())
-    )
+    records = vehicle.records.at(np.flatnonzero(vehicle.records.day >= _ordinal(first)))
     inputs = records.keys()
     config = config_hash(fleet.audit, {"from": first, "to": last, "method": method})
-    audit = VehicleAudit(name, last, method, "", inputs)
     remarks = _remarks(vehicle, last, shifts)
     possible = () if len(records.edge) else _possible_edges(fleet, name)
-    rows = vehicle_findings(audit, records, verdict, fleet.audit, remarks, before, possible)
+    rows = vehicle_findings((name, last, method), records, verdict, fleet.audit, remarks, before, possible)
     rows = standing(rows, vehicle.said, vehicle.events, last)
     # All vehicles are judged side by side, so a verdict rests on more than this vehicle's records: the key has it too.
     key = work_key("audit", CODE_VERSION, config, [*inputs, content_hash(rows)])
@@ -196,7 +196,7 @@ def _found_before(
     lake: Lake, method: str, verdicts: Mapping[str, VehicleVerdict], first: str
 ) -> dict[str, dict[tuple[Edge, str], DriftFinding]]:
     """Rows of the last audit by vehicle, for changes that may have begun before the window."""
-    window = dt.date.fromisoformat(first).toordinal()
+    window = _ordinal(first)
     asked = {
         name
         for name, verdict in verdicts.items()
@@ -220,7 +220,6 @@ def _remarks(
         if restart is not None:
             remarks |= {(edge, dof): f"since the {restart.in_words}" for dof in DOF_NAMES}
     for key, shift in shifts.items():
-        day = dt.date.fromordinal(shift.day).isoformat()
-        text = f"without what {shift.vehicles} of {shift.of} vehicles show since {day}"
+        text = f"without what {shift.vehicles} of {shift.of} vehicles show since {day_name(shift.day)}"
         remarks[key] = f"{remarks[key]}; {text}" if key in remarks else text
     return remarks

@@ -149,7 +149,7 @@ def mounts_of(
     charts, shape = charts_of_fleet(fleet, edges), (len(fleet), len(edges), DOFS)
     limit = np.tile([limit_of(edge, dof, config) for edge in edges for dof in DOF_NAMES], len(fleet))
     noise = with_wander(charts, estimate_noise(charts, DOFS, len(edges), models), limit, shape, models)
-    least = noise if noise.less_alike is None else noise.less_alike
+    least = noise.less_alike or noise
     # Days that scatter by more than their sigmas do so because the mount does, or because the sigmas are too small:
     # either way tomorrow lies that far off.
     sigma = np.where(np.isfinite(charts.sigma), charts.sigma, np.nan)
@@ -158,7 +158,7 @@ def mounts_of(
     typical[known] = np.nanmedian(sigma[known], axis=1)
     beyond = ((noise.scale**2 - 1) * typical**2).reshape(shape)
     alike = (0.5 * (noise.autocorrelation + least.autocorrelation)).reshape(shape).mean(axis=-1)
-    wander = np.zeros(shape) if noise.wander is None else noise.wander.reshape(shape)
+    wander = noise.wander.reshape(shape)
     return [
         {
             edge: Mount(np.sqrt(LEAST_SCATTER**2 + beyond[v, p]), wander[v, p], float(alike[v, p]))

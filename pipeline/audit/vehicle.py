@@ -11,6 +11,7 @@ from jaxtyping import Int
 from pipeline.audit.changes import Change, start_interval
 from pipeline.audit.days import DOFS, PairDays, charts_of_fleet, clipped_days, edges_of_fleet
 from pipeline.audit.noise import Noise, estimate_noise
+from pipeline.audit.scan import SAME
 from pipeline.audit.shifts import Whitened
 from pipeline.audit.verdicts import ChartVerdict, judge_charts
 from pipeline.audit.wander import with_wander
@@ -24,7 +25,6 @@ __all__ = ["VehicleVerdict", "independent_edges", "judge_fleet", "limit_of"]
 # Share of vehicle-nights with a YELLOW that nothing caused, for a change that may have begun: a person looks again the
 # next day, nobody opens a car.
 _YELLOW = 0.02
-_SAME = 0.02  # autocorrelations that differ by less are equivalent
 # A camera-radar edge is composed of two others where it is nearer to them than this [rad, m].
 _COMPOSED_WITHIN = 1e-6
 
@@ -110,7 +110,7 @@ def _judged(
 def _as_alike_as_may_be(noise: Mapping[Edge, Noise]) -> list[Mapping[Edge, Noise]]:
     """The noise with the highest plausible autocorrelation, and that with the lowest if it differs."""
     less = {edge: found.less_alike or found for edge, found in noise.items()}
-    if all(np.allclose(noise[e].autocorrelation, less[e].autocorrelation, atol=_SAME) for e in noise):
+    if all(np.allclose(noise[e].autocorrelation, less[e].autocorrelation, atol=SAME) for e in noise):
         return [noise]
     return [noise, less]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -154,13 +154,13 @@ class Answered:
     certified: str
 
 
-def answered(views: Sequence[Mapping[str, Any]], poses: Sequence[PoseRow]) -> list[Answered]:
-    """Sensors if the day has poses of them, without the reference; else edges (`pair_view`)."""
+def answered(edges: Sequence[Answered], poses: Sequence[PoseRow]) -> Sequence[Answered]:
+    """Sensors if the day has poses of them, without the reference; else edges."""
     return [
         Answered(p.sensor, p.status, (p.sensor,), ", ".join(p.determined))
         for p in poses
         if p.sensor != p.reference
-    ] or [Answered(v["title"], v["status"], v["sensors"], v["certified"]) for v in views]
+    ] or edges
 
 
 def answer_for(

@@ -165,6 +165,7 @@ def _content(
         for camera in other_cameras(records, of_three):
             drawn += _pictures(lake, partition, drawn_records(records, camera), labels, pictures, 1)[0]
     moving = [] if pictures is None else motion_pictures(lake, partition, records.values(), pictures)
+    edges = [Answered(v["title"], v["status"], v["sensors"], v["certified"]) for v in views]
     load = _to_load(read.states, partition.day)
     loaded = [
         Answered(row["sensor"], row["status"], (row["sensor"],), ", ".join(row["determined"]))
@@ -172,7 +173,7 @@ def _content(
     ]
     return {
         "environment": next(iter(records.values())).environment,
-        "answer": answer_for(answered(views, poses), partition.day, findings, loaded),
+        "answer": answer_for(answered(edges, poses), partition.day, findings, loaded),
         "drift": _as_of(read, lake),
         "load": load,
         "pairs": views,

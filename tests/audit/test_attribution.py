@@ -82,6 +82,7 @@ def knock(rng, sensor):
 CAMERA_LIDAR, CAMERA_RADAR, LIDAR_RADAR = map(
     EDGE_OF_PAIR.get, ("camera_lidar", "camera_radar", "lidar_radar")
 )
+STILL = np.zeros(6)
 KNOCK = np.array([0.0, 0.0, np.radians(1.0), 0.0, 0.03, 0.0])  # a turned bracket: yaw and a little sideways
 
 
@@ -93,7 +94,7 @@ def _days(moved, seed):
 def _shifts(moved, seed):
     days, is_after = _days(moved, seed), np.array([0.0, 0, 1, 1])
     own = independent_edges(days, days[CAMERA_LIDAR].day)
-    return {pair: Whitened.of(d, np.zeros(6)).shift(is_after) for pair, d in own.items()}
+    return {pair: Whitened.of(d, STILL, STILL).shift(is_after) for pair, d in own.items()}
 
 
 def test_a_motion_lost_in_the_noise_is_not_pinned_on_a_sensor():
@@ -144,7 +145,7 @@ def test_a_shift_through_days_that_err_alike_is_as_unsure_as_it_says(reference_d
             day, np.repeat(np.eye(4)[None], 8, axis=0), change, spread, np.ones((8, 6), bool), np.ones(8, bool),
             np.eye(4), reference_days,
         )  # fmt: skip
-        found.append(Whitened.of(days, np.full(6, 0.6)).shift((np.arange(8) >= 3).astype(float)))
+        found.append(Whitened.of(days, np.full(6, 0.6), STILL).shift((np.arange(8) >= 3).astype(float)))
     scatter = np.std([s.xi for s in found])
     assert scatter == pytest.approx(np.sqrt(found[0].covariance[0, 0]), rel=0.04)
 
@@ -157,9 +158,9 @@ def test_the_day_of_a_step_is_the_split_that_gains_most():
     every = np.ones((12, 6), bool)
     T = np.repeat(np.eye(4)[None], 12, axis=0)
     days = PairDays(np.arange(12), T, change, spread, every, every[:, 0], np.eye(4))
-    gains = Whitened.of(days, np.full(6, 0.4)).step_gains()
+    gains = Whitened.of(days, np.full(6, 0.4), STILL).step_gains()
     assert int(np.argmax(gains)) == 6
-    whitened = Whitened.of(days, np.zeros(6))
+    whitened = Whitened.of(days, STILL, STILL)
     for s in range(11):  # of days that err independently, the gain of means by their covariances
         size = change[s + 1 :].mean(axis=0) - change[: s + 1].mean(axis=0)
         expected = size @ size / (1e-6 * (1 / (s + 1) + 1 / (11 - s)))
