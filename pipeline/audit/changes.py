@@ -43,14 +43,11 @@ class Levels:
     """Difference of a chart's last level from its first; for a chart without levels, the size of its drift.
 
     Args:
-        chart: one row.
-        value: its clipped values.
-        noise: noise of this chart.
+        value: clipped values of the chart, which has one row.
         whole: the scan of the whole chart.
         start: column at which it left the first level for good; 0 if it returned, or drifts.
         size: last level minus first level.
-        sigma: sigma of the size.
-        threshold: threshold on size over sigma.
+        threshold: on size over sigma.
         returned: True if the chart left the first level and the last level equals it again.
     """
 
@@ -74,14 +71,7 @@ class Levels:
 
 
 def levels_of(chart: Charts, value: Float[np.ndarray, " N"], noise: Noise, threshold: float) -> Levels:
-    """Cut a chart into levels, and compare the last with the first.
-
-    Args:
-        chart: one row.
-        value: its clipped values.
-        noise: of this chart.
-        threshold: sigmas beyond which two levels differ.
-    """
+    """Cut a chart (one row, clipped values) into levels that differ by `threshold` sigmas; compare last and first."""
 
     def split(first: int, end: int) -> int | None:
         part = scan_by(chart.row(0, np.arange(first, end)), value[None, first:end], noise)
@@ -150,15 +140,13 @@ def clearest(
     day: Int[np.ndarray, " N"],
     limit: float,
     threshold: Float[np.ndarray, " 2"],
-    days_after: int = 1,
+    days_after: int,
 ) -> Change | None:
     """The most significant step or drift above a size and a threshold; None if there is none.
 
     Args:
-        whole: the scan of one chart.
-        day: day of each column.
         limit: size of a change that matters [rad or m].
-        threshold: thresholds on size over sigma, for a step and for a drift.
+        threshold: on size over sigma, for a step and for a drift.
         days_after: minimum number of days since the change.
     """
     last = len(day) - days_after

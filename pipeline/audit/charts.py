@@ -91,21 +91,18 @@ def thresholds(
     count: Int[np.ndarray, " M"],
     freedom: Float[np.ndarray, " M"],
     probability: Float[np.ndarray, " M"],
-    autocorrelation: Float[np.ndarray, " M"] | float = 0.0,
-    of: str = "step",
+    autocorrelation: Float[np.ndarray, " M"],
+    of: str,
 ) -> Float[np.ndarray, " M"]:
     """Threshold on max |z| of each chart; infinite for fewer than two days.
 
     Args:
-        count: number of days.
         freedom: degrees of freedom of the scale.
-        probability: probability of an alarm without a change.
-        autocorrelation: correlation of errors on successive days.
+        probability: of an alarm without a change.
         of: "step" or "drift"; drifts that start on neighbouring days are more correlated.
     """
     freedom = np.rint(_MOST_FREEDOM / np.rint(_MOST_FREEDOM / np.clip(freedom, 1, _MOST_FREEDOM)))
-    phi = np.broadcast_to(np.rint(10 * np.asarray(autocorrelation)) / 10, count.shape)
-    keys = np.stack([count, freedom, probability, phi], axis=1)
+    keys = np.stack([count, freedom, probability, np.rint(10 * autocorrelation) / 10], axis=1)
     unique, index = np.unique(keys, axis=0, return_inverse=True)
     found = [_threshold(int(n), int(f), float(p), float(r), of) if n > 1 else np.inf for n, f, p, r in unique]
     return np.array(found)[index.ravel()]

@@ -73,16 +73,9 @@ class PairDays:
         """Some of the days; a reference among them stays one."""
         kept = np.zeros(len(self.day), bool)
         kept[rows] = True
-        return replace(
-            self,
-            day=self.day[rows],
-            T=self.T[rows],
-            change=self.change[rows],
-            spread=self.spread[rows],
-            observable=self.observable[rows],
-            accepted=self.accepted[rows],
-            reference_days=self.reference_days if len(kept) and kept[0] else 0,
-        )
+        per_day = ("day", "T", "change", "spread", "observable", "accepted")
+        own = {name: getattr(self, name)[rows] for name in per_day}
+        return replace(self, **own, reference_days=self.reference_days if len(kept) and kept[0] else 0)
 
 
 @dataclass(frozen=True, eq=False)

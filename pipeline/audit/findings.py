@@ -126,4 +126,4 @@ def _without_data(records: Estimates, edge: Edge, needed: int) -> ChartVerdict:
     kinds = [(name, found.count(STATUSES.index(name))) for name in ("held", "refused")]
     counts = ", ".join(f"{count} {name}" for name, count in kinds if count)
     reason = f"no estimate in the window ({counts})" if counts else "no record in the window"
-    return ChartVerdict("UNKNOWN", f"{reason}, {needed} days required", 0, None, None, None, None, needed)
+    return ChartVerdict("UNKNOWN", f"{reason}, {needed} days required", 0, None, None, None, needed)

@@ -64,8 +64,8 @@ class History:
         window: tuple[str, str],
         events: Mapping[str, Sequence[ServiceEvent]],
         enough: tuple[int, int],
-        asked: Collection[str] = (),
-    ) -> tuple[Estimates, dict[tuple[str, Edge], Reference]]:
+        asked: Collection[str],
+    ) -> tuple[Estimates, dict[str, dict[Edge, Reference]]]:
         """Records for the charts, and references that need no records, by vehicle and edge.
 
         Args:
@@ -89,14 +89,14 @@ class History:
         usable = known.at(np.flatnonzero(known.usable))
         # A chart of few days shows the days of the reference too, instead of their mean.
         often = {key for key, days in Counter(_edges(usable)).items() if days > fewest}
-        made = {
-            key: kept[key].reference
-            for key in often & kept.keys()
-            if (own := kept[key].reference) is not None and day_name(own.days[-1]) < begin[key[0]]
-        }
-        lacking = {key: first_accepted(kept.get(key)) for key in set(_edges(known)) - made.keys()}
-        found = joined([known, *self.references(begin, window, events, count, lacking)])
-        return found, {key: own for key, own in made.items() if own is not None}
+        lacking = {key: first_accepted(kept.get(key)) for key in set(_edges(known))}
+        made: dict[str, dict[Edge, Reference]] = {}
+        for vehicle, edge in often & kept.keys():
+            own = kept[vehicle, edge].reference
+            if own is not None and day_name(own.days[-1]) < begin[vehicle]:
+                made.setdefault(vehicle, {})[edge] = own
+                del lacking[vehicle, edge]
+        return joined([known, *self.references(begin, window, events, count, lacking)]), made
 
     def references(
         self,

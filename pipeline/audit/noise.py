@@ -153,10 +153,9 @@ def estimate_noise(
 
     Args:
         charts: rows in order of vehicle, edge and degree of freedom; a chart without days has count 0.
-        dofs: number of degrees of freedom of an edge.
-        edges: edges of all vehicles; an edge has the same name and position on every vehicle of a model.
+        dofs: degrees of freedom of an edge.
+        edges: number of edges; an edge has the same position on every vehicle of a model.
         models: model of each vehicle; none = all are of one model.
-        prior: prior knowledge of the noise.
     """
     vehicles = len(charts.count) // (edges * dofs)
     _, model_of = np.unique(list(models) or [""] * vehicles, return_inverse=True)

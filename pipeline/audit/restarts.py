@@ -33,11 +33,8 @@ def last_restart(
     cannot tell which end of an edge moved, either may have.
     """
     ends = {sensor.name, reference.name}
-    first, why = "", ""
-    for event in events:
-        begin = days_after(event.day, 1)
-        if event.day <= last_day and event.touches(ends) and begin > first:
-            first, why = begin, f"after the {event.in_words}"
+    event = _last_touching(events, ends, last_day)
+    first, why = ("", "") if event is None else (days_after(event.day, 1), f"after the {event.in_words}")
     for finding in findings:
         begin = finding.start_day_latest or ""
         if finding.status not in _ALARMS or begin <= first or not ends & _moved_by(finding):
@@ -83,6 +80,9 @@ def restart_of(events: Sequence[ServiceEvent], edge: Edge, last_day: str) -> Ser
 
     The day of the event belongs to neither side, because the drive may be before or after it.
     """
-    names = [sensor.name for sensor in edge.sensors]
+    return _last_touching(events, {sensor.name for sensor in edge.sensors}, last_day)
+
+
+def _last_touching(events: Sequence[ServiceEvent], names: set[str], last_day: str) -> ServiceEvent | None:
     touching = [e for e in events if e.day <= last_day and e.touches(names)]
     return max(touching, key=lambda e: e.day, default=None)

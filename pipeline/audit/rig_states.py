@@ -235,21 +235,17 @@ def _with_claims(
     sigma_rad = target_sigmas(edge.kind, pose.T, pose.covariance, seen)
     reach_deg = float(ndtri(0.5 + verify.confidence / 2)) * np.degrees(sigma_rad)
     limits_deg = np.degrees(verify.limits_rad(edge.kind))
+    row = replace(row, azimuth_sigma_rad=float(sigma_rad[0]), elevation_sigma_rad=float(sigma_rad[1]))
+    if row.status != "current":
+        return replace(row, determined=[])
+    certified = [n for n, r, most in zip(_DIRECTIONS, reach_deg, limits_deg, strict=True) if r <= most]
     open_claims = [
         f"{name} not certified: its sigma of {np.degrees(sigma):.2f} deg is too large for {most:.2f} deg at "
         f"{100 * verify.confidence:.3g} %"
-        for name, sigma, reach, most in zip(_DIRECTIONS, sigma_rad, reach_deg, limits_deg, strict=True)
-        if reach > most
+        for name, sigma, most in zip(_DIRECTIONS, sigma_rad, limits_deg, strict=True)
+        if name not in certified
     ]
-    certified = [n for n, r, most in zip(_DIRECTIONS, reach_deg, limits_deg, strict=True) if r <= most]
-    is_current = row.status == "current"
-    return replace(
-        row,
-        azimuth_sigma_rad=float(sigma_rad[0]),
-        elevation_sigma_rad=float(sigma_rad[1]),
-        determined=certified if is_current else [],
-        reason=_sentences([row.reason, *(open_claims if is_current else [])]),
-    )
+    return replace(row, determined=certified, reason=_sentences([row.reason, *open_claims]))
 
 
 def _between(parent: _Pose, child: _Pose) -> _Pose:

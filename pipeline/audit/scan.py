@@ -75,8 +75,7 @@ def scan(
     of the other days. A fixed reference is the mean of earlier days.
 
     Args:
-        charts: charts of days.
-        value: their values, clipped or not.
+        value: values of the charts' days, clipped or not.
         scale: factor on the sigmas.
         autocorrelation: correlation of errors on successive days, below 1; over n days it is its n-th power.
         wander: variance that the level gains per day; None = none.

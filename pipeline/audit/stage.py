@@ -79,11 +79,9 @@ def work(task: Task) -> Work:
     records, references = history.window((first, last), events, enough, fleet.named_vehicles)
     said = said_before(task.lake, method)
     names = sorted({*records.vehicles, *fleet.named_vehicles, *said})
-    made: dict[str, dict[Edge, Reference]] = {}
-    for (name, edge), reference in references.items():
-        made.setdefault(name, {})[edge] = reference
     vehicles = {
-        v: _Vehicle(records.of(v), events.get(v, ()), made.get(v, {}), said.get(v, ())) for v in names
+        name: _Vehicle(records.of(name), events.get(name, ()), references.get(name, {}), said.get(name, ()))
+        for name in names
     }
     done = sorted([e.vehicle, e.day, e.sensor, e.kind] for v in vehicles.values() for e in v.events)
     settings = (fleet.audit, {"from": first, "to": last, "method": method, "events": done})

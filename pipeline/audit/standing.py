@@ -49,7 +49,12 @@ def standing(
     before, now = (_CALMEST_FIRST.index(rows[0].vehicle_status or "UNKNOWN") for rows in (said, found))
     alarmed = before >= _CALMEST_FIRST.index("YELLOW")
     if before < now or (before == now and not alarmed):
-        kept = [replace(row, vehicle_reason=_with_less(row.vehicle_reason or "")) for row in found]
+        kept = [
+            row
+            if _LESS in (row.vehicle_reason or "")
+            else replace(row, vehicle_reason=f"{row.vehicle_reason}; {_LESS}")
+            for row in found
+        ]
     else:
         since = said[0].day
         kept = [
@@ -62,10 +67,6 @@ def standing(
     return [
         replace(row, vehicle_days_needed=None) if row.vehicle_status == "UNKNOWN" else row for row in kept
     ]
-
-
-def _with_less(reason: str) -> str:
-    return reason if _LESS in reason else f"{reason}; {_LESS}"
 
 
 def _kept(reason: str, day: str) -> str:

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.audit.days import DOFS, PairDays, charts_of_fleet, edges_of_fleet
+from pipeline.audit.days import DOFS, charts_of_fleet, edges_of_fleet
 from pipeline.audit.estimates import Estimates, days_of, estimates_of, joined
 from pipeline.audit.fusion import LEAST_SCATTER, Mount
 from pipeline.audit.history import History, models_of
@@ -62,27 +62,25 @@ def work(task: Task) -> Work:
         changes.setdefault(finding.vehicle, []).append(finding)
     references = _references(history, records, (first, last), events, fleet.audit) if last else {}
 
+    settings = (fleet.audit, fleet.verify, {"to": last, "method": method})
+
     def rows(run: Run) -> Generator[StateRow, None, None]:
-        own_mounts = _mounts(poses, fleet)
+        own_mounts, count = _mounts(poses, fleet), fleet.audit.reference_days
         for done, vehicle in enumerate(records.vehicles):
             run.progress(done, len(records.vehicles), vehicle)
             edges = _edges_of(records.of(vehicle))
             known = events.get(vehicle, ()), changes.get(vehicle, ())
             about, mounts = (vehicle, last, method), own_mounts.get(vehicle, {})
-            found = rig_states(about, poses.get(vehicle), edges, known, mounts, fleet.verify)
-            count = fleet.audit.reference_days
             whole = [
-                r
-                if r.sensor is not None
-                else replace(r, **kept_columns(references[vehicle, edge_of(r)], count))
-                for r in found
+                row
+                if row.sensor is not None
+                else replace(row, **kept_columns(references[vehicle, edge_of(row)], count))
+                for row in rig_states(about, poses.get(vehicle), edges, known, mounts, fleet.verify)
             ]
-            config = config_hash(fleet.audit, fleet.verify, {"to": last, "method": method})
             inputs = sorted({key for row in whole for key in row.inputs})
-            key = work_key("state", CODE_VERSION, config, [*inputs, content_hash(whole)])
-            yield from (replace(r, work_key=key) for r in whole)
+            key = work_key("state", CODE_VERSION, config_hash(*settings), [*inputs, content_hash(whole)])
+            yield from (replace(row, work_key=key) for row in whole)
 
-    settings = (fleet.audit, fleet.verify, {"to": last, "method": method})
     of_poses = {key for own in poses.values() for days in own.sensors.values() for key in days.work_keys}
     read = tuple(sorted({*records.keys(), *of_poses}))
     return Work(settings, rows, inputs=read, tell=_told, again=True)
@@ -115,15 +113,6 @@ def _references(
     return found
 
 
-def _mounts(poses: Mapping[str, VehiclePoses], fleet: FleetConfig) -> dict[str, dict[Edge, Mount]]:
-    """How the mounts of every vehicle move, by tie of sensor and reference."""
-    days = [
-        {tie(s, own.reference): d.charted() for s, d in own.sensors.items() if len(d.poses.day)}
-        for own in poses.values()
-    ]
-    return dict(zip(poses, mounts_of(days, fleet.audit, models_of(fleet, poses)), strict=True))
-
-
 def _edges_of(records: Estimates) -> dict[Edge, Float[np.ndarray, "3 3"] | None]:
     """Edges of a vehicle's records, with the targets of the last record that has them."""
     found: dict[Edge, Float[np.ndarray, "3 3"] | None] = {}
@@ -139,15 +128,21 @@ def _told(rows: Sequence[StateRow]) -> Told:
     return Told(counts, reason="" if rows else "no calibration record", refused=not rows)
 
 
-def mounts_of(
-    fleet: Sequence[Mapping[Edge, PairDays]], config: AuditConfig, models: Sequence[str]
-) -> list[dict[Edge, Mount]]:
-    """The mount of each sensor of each vehicle, by tie of sensor and reference."""
-    edges = edges_of_fleet(fleet)
+def _mounts(poses: Mapping[str, VehiclePoses], fleet: FleetConfig) -> dict[str, dict[Edge, Mount]]:
+    """How the mounts of every vehicle move, by tie of sensor and reference."""
+    days = [
+        {tie(s, own.reference): d.charted() for s, d in own.sensors.items() if len(d.poses.day)}
+        for own in poses.values()
+    ]
+    edges = edges_of_fleet(days)
     if not edges:
-        return [{} for _ in fleet]
-    charts, shape = charts_of_fleet(fleet, edges), (len(fleet), len(edges), DOFS)
-    limit = np.tile([limit_of(edge, dof, config) for edge in edges for dof in DOF_NAMES], len(fleet))
+        return {}
+    models, charts, shape = (
+        models_of(fleet, poses),
+        charts_of_fleet(days, edges),
+        (len(days), len(edges), DOFS),
+    )
+    limit = np.tile([limit_of(edge, dof, fleet.audit) for edge in edges for dof in DOF_NAMES], len(days))
     noise = with_wander(charts, estimate_noise(charts, DOFS, len(edges), models), limit, shape, models)
     least = noise.less_alike or noise
     # Days that scatter by more than their sigmas do so because the mount does, or because the sigmas are too small:
@@ -159,11 +154,11 @@ def mounts_of(
     beyond = ((noise.scale**2 - 1) * typical**2).reshape(shape)
     alike = (0.5 * (noise.autocorrelation + least.autocorrelation)).reshape(shape).mean(axis=-1)
     wander = noise.wander.reshape(shape)
-    return [
-        {
+    return {
+        vehicle: {
             edge: Mount(np.sqrt(LEAST_SCATTER**2 + beyond[v, p]), wander[v, p], float(alike[v, p]))
             for p, edge in enumerate(edges)
             if edge in own
         }
-        for v, own in enumerate(fleet)
-    ]
+        for v, (vehicle, own) in enumerate(zip(poses, days, strict=True))
+    }

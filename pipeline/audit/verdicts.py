@@ -49,7 +49,6 @@ class ChartVerdict:
     days_used: int
     statistic: float | None
     threshold: float | None
-    visible_size: float | None  # smallest change of a well-placed step that the chart would show [rad or m]
     change: Change | None
     days_needed: int | None = None  # accepted days that it lacks for a verdict, at least; None: it has one
 
@@ -85,7 +84,6 @@ def judge_charts(
 
     Args:
         charts: day estimates, in order of edge and DoF.
-        noise: their noise.
         limit: size of a change that matters [rad or m].
         probability: false-alarm probabilities of each chart: of an alarm tonight, and of a change that may
         have begun.
@@ -147,7 +145,7 @@ def _verdict(seen: _Judged, m: int) -> ChartVerdict:
     if days < 2:
         needed = max(seen.baseline_days + 1, 2)
         reason = f"{_count(days)} of data, {needed} required"
-        return ChartVerdict("UNKNOWN", reason, days, None, None, None, None, needed - days)
+        return ChartVerdict("UNKNOWN", reason, days, None, None, None, needed - days)
     levels = None
     if seen.statistic[m] > seen.threshold[m]:
         levels = levels_of(
@@ -168,30 +166,20 @@ def _changed(seen: _Judged, m: int, levels: Levels) -> ChartVerdict | None:
         return None
     change, limit = describe(levels), float(seen.limit[m])
     status, reason = "RED", _LASTING
+    # Before a change one more, because a chance outlier among the first days persists for weeks.
+    more = seen.believed[m] > _TAME and not seen.charts.has_reference[m]
     if abs(change.size) < limit:
         status, reason = "YELLOW", "a change below the limit"
-    elif (days := min(levels.days_before - _more(seen, m), levels.days_after)) < seen.believed[m]:
+    elif (days := min(levels.days_before - int(more), levels.days_after)) < seen.believed[m]:
         status, reason = "YELLOW", _ONE_DAY if days < 2 else _FEW_DAYS
     elif abs(change.size) - _SURELY * change.size_sigma < limit:
         status, reason = "YELLOW", _MAYBE
     elif levels.doubtful_sides:
         # Held days agree by chance only within their enlarged sigmas, so two of them stand for an accepted one.
         reason = _LASTING + "; depends on days whose calibration was held"
-    return ChartVerdict(
-        status,
-        reason,
-        int(seen.charts.count[m]),
-        levels.statistic,
-        levels.threshold,
-        float(seen.visible[m]),
-        change,
-        1 if reason in (_ONE_DAY, _FEW_DAYS, _MAYBE) else None,
-    )
-
-
-def _more(seen: _Judged, m: int) -> int:
-    """Additional days required before a change, because a chance outlier among the first days persists for weeks."""
-    return int(seen.believed[m] > _TAME and not seen.charts.has_reference[m])
+    needed = 1 if reason in (_ONE_DAY, _FEW_DAYS, _MAYBE) else None
+    days = int(seen.charts.count[m])
+    return ChartVerdict(status, reason, days, levels.statistic, levels.threshold, change, needed)
 
 
 def _unchanged(seen: _Judged, m: int, levels: Levels | None) -> ChartVerdict:
@@ -204,9 +192,7 @@ def _unchanged(seen: _Judged, m: int, levels: Levels | None) -> ChartVerdict:
     def judged(
         status: str, reason: str, needed: int | None = None, change: Change | None = None
     ) -> ChartVerdict:
-        return ChartVerdict(
-            status, reason, days, statistic, float(seen.threshold[m]), visible, change, needed
-        )
+        return ChartVerdict(status, reason, days, statistic, float(seen.threshold[m]), change, needed)
 
     if days > 2 and seen.last_day[m] > seen.alone[m] and abs(seen.last_size[m]) > limit:
         return _one_day(seen, m)
@@ -234,8 +220,9 @@ def _one_day(seen: _Judged, m: int) -> ChartVerdict:
     sigma = float(charts.sigma[m, last] * seen.noise.scale[m] * np.sqrt(2))
     before = int(charts.day[m, last - 1]) + 1
     change = Change(day, before, day, "step", float(seen.last_size[m]), sigma, day)
-    threshold, visible = float(seen.threshold[m]), float(seen.visible[m])
-    return ChartVerdict("YELLOW", _ONE_DAY, last + 1, float(seen.last_day[m]), threshold, visible, change, 1)
+    return ChartVerdict(
+        "YELLOW", _ONE_DAY, last + 1, float(seen.last_day[m]), float(seen.threshold[m]), change, 1
+    )
 
 
 def _too_inaccurate(dof: str, visible: float, limit: float, needed: int) -> str:

@@ -37,12 +37,8 @@ def with_wander(
 ) -> Noise:
     """The noise of all charts of a fleet, with the variance of their levels per day.
 
-    Args:
-        charts: rows in order of vehicle, edge and degree of freedom.
-        noise: noise of their days.
-        limit: size of a change that matters [rad or m].
-        shape: vehicles, edges, degrees of freedom.
-        models: model of each vehicle; none = all are of one model.
+    Charts are in order of vehicle, edge and degree of freedom (`shape`); `limit` is the size of a change that matters
+    [rad or m]; without `models`, all vehicles are of one model.
     """
     _, model_of = np.unique(list(models) or [""] * shape[0], return_inverse=True)
     less = noise.less_alike

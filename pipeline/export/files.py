@@ -48,13 +48,15 @@ def written_files(form: Format, calibration: ExportedCalibration, out: Path) -> 
         raise ConfigError("command line", "format", f"{form.name} can only be imported")
     files = form.write(calibration)
     is_one = len(files) == 1 and out.suffix != "" and not out.is_dir()
-    first = out if is_one else out / next(iter(files))
-    found = {first: next(iter(files.values()))} if is_one else {out / n: text for n, text in files.items()}
+    found = {out if is_one else out / name: content for name, content in files.items()}
     if not form.holds_provenance:
         notes = {"format": form.name, "notes": list(form.notes)}
-        stem = first.name.partition(".")[0]
-        found[first.with_name(stem + SIDE_FILE)] = to_json(provenance_of(calibration) | notes)
+        found[_beside(next(iter(found)))] = to_json(provenance_of(calibration) | notes)
     return found
+
+
+def _beside(path: Path) -> Path:
+    return path.with_name(path.name.partition(".")[0] + SIDE_FILE)
 
 
 def updated_file(
@@ -66,7 +68,7 @@ def updated_file(
     [(name, content)] = read_files([template]).items()
     text, changed = form.update(name, content, calibration)
     side = provenance_of(calibration) | {"format": form.name, "updated": changed}
-    return {out: text, out.with_name(out.name.partition(".")[0] + SIDE_FILE): to_json(side)}
+    return {out: text, _beside(out): to_json(side)}
 
 
 def write_files(files: Mapping[Path, bytes]) -> None:
@@ -97,7 +99,7 @@ def read_files(paths: Sequence[Path]) -> dict[str, bytes]:
 def noted_frames(paths: Sequence[Path]) -> dict[str, str]:
     """Frame of each sensor as noted by an export, in the files or beside them; empty if there is no note."""
     for path in paths:
-        for file in (path.with_name(path.name.partition(".")[0] + SIDE_FILE), path):
+        for file in (_beside(path), path):
             if file.suffix == ".json" and file.is_file() and file.stat().st_size <= _MOST_BYTES:
                 with suppress(ValueError):
                     found = _within(json.loads(file.read_bytes()), "frame_names")

@@ -194,9 +194,7 @@ def _finding_view(vehicle: str, clearest: DriftFinding, own: Sequence[DriftFindi
 
 
 def _sure(finding: DriftFinding) -> str:
-    parts = []
-    if finding.statistic is not None and finding.threshold is not None:
-        parts.append(f"change of {finding.statistic:.1f} sigma (alarm above {finding.threshold:.1f})")
+    parts = [f"change of {finding.statistic:.1f} sigma (alarm above {finding.threshold:.1f})"]
     if finding.moved_probability is not None:
         share = 100 * finding.moved_probability
         parts.append(f"this sensor with {'> 99.9' if share > 99.9 else f'{share:.1f}'} %")

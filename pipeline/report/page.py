@@ -13,7 +13,7 @@ from markupsafe import Markup, escape
 from pipeline.core.config import config_hash
 from pipeline.store.files import Files, LocalFiles
 
-__all__ = ["commands", "page_name", "page_stem", "render", "write_page"]
+__all__ = ["page_stem", "render", "write_page"]
 
 P = TypeVar("P", bound=PurePath)
 _COPY = '<button type="button" class="copy">Copy</button>'
@@ -32,7 +32,7 @@ def render(template: str, **values: Any) -> str:
         trim_blocks=True,
     )
     environment.filters["safe_json"] = _safe_json
-    environment.filters["commands"] = commands
+    environment.filters["commands"] = _commands
     return environment.get_template(template).render(**values)
 
 
@@ -43,19 +43,17 @@ def write_page(path: P, html: str, files: Files | None = None) -> P:
     return path
 
 
-def commands(text: str) -> Markup:
+def _commands(text: str) -> Markup:
     """HTML of a sentence: text between backticks as code, and a command of this program with a button to copy it.
 
     `templates/fleet.js` does the same to the sentences that it is given.
     """
     html = re.sub(
-        r"`([^`]*)`", lambda found: f"<code>{found[1]}</code>{_COPY * _is_ours(found[1])}", str(escape(text))
+        r"`([^`]*)`",
+        lambda found: f"<code>{found[1]}</code>{_COPY * found[1].startswith('boresight ')}",
+        str(escape(text)),
     )
     return Markup(html)  # noqa: S704 (escaped before)
-
-
-def _is_ours(command: str) -> bool:
-    return command.startswith("boresight ")
 
 
 def _safe_json(text: str) -> Markup:
@@ -73,8 +71,3 @@ def page_stem(vehicle: str) -> str:
         return vehicle
     readable = re.sub(r"[^a-z0-9_-]", "_", vehicle.lower())[:_READABLE]
     return f"{readable}~{config_hash({'vehicle': vehicle})[:12]}"
-
-
-def page_name(vehicle: str, day: str) -> str:
-    """A vehicle-day's page, relative to the folder of the days' pages."""
-    return f"{day}/{page_stem(vehicle)}.html"

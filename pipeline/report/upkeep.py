@@ -15,7 +15,7 @@ from urllib.parse import quote
 from pipeline.core.config import FleetConfig, config_hash
 from pipeline.core.results import MadeWhenAsked, Progress, silent
 from pipeline.report.day_page import DayRead, write_day_page
-from pipeline.report.page import page_name
+from pipeline.report.page import page_stem
 from pipeline.report.reading import records_of_day
 from pipeline.report.verdicts import FleetVerdicts
 from pipeline.store.current import current_states
@@ -76,7 +76,7 @@ class Album:
 
     def path(self, vehicle: str, day: str) -> PurePath:
         """A vehicle-day's page."""
-        return self.folder / page_name(vehicle, day)
+        return self.folder / day / f"{page_stem(vehicle)}.html"
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,6 @@ __all__ = [
     "pose_text",
     "scaled",
     "sigma_text",
-    "significant_motion",
     "unit_of",
     "with_sigma",
 ]
@@ -60,17 +59,11 @@ def dof_title(pair: str, dof: str) -> str:
     return f"{dof} ({names[DOF_NAMES.index(dof)]})"
 
 
-def significant_motion(motion: list[float], sigma: list[float]) -> list[int]:
-    """Components of a motion that exceed their sigma significantly, largest ratio first."""
-    ratio = np.abs(motion) / np.maximum(sigma, 1e-12)
-    return [int(k) for k in np.argsort(-ratio) if ratio[k] >= _CLEAR_SIGMAS]
-
-
 def motion_in_words(kind: str, motion: list[float], sigma: list[float]) -> str:
-    """Significant components, as `yaw +1.02 ± 0.05 deg, left +0.031 ± 0.010 m`, in axes of this kind of sensor."""
-    names = AXIS_NAMES[kind]
-    shown = significant_motion(motion, sigma)
-    parts = [f"{names[k]} {with_sigma(motion[k], sigma[k], DOF_NAMES[k])}" for k in shown]
+    """Significant components, the clearest first, as `yaw +1.02 ± 0.05 deg`, in axes of this kind of sensor."""
+    ratio = np.abs(motion) / np.maximum(sigma, 1e-12)
+    shown = [k for k in np.argsort(-ratio).tolist() if ratio[k] >= _CLEAR_SIGMAS]
+    parts = [f"{AXIS_NAMES[kind][k]} {with_sigma(motion[k], sigma[k], DOF_NAMES[k])}" for k in shown]
     return ", ".join(parts) or "no single axis is significant"
 
 

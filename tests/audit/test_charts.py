@@ -65,7 +65,9 @@ def test_false_alarms_stay_within_the_budget_and_do_not_waste_it(days: int):
 
 
 def test_a_scale_that_is_hardly_known_needs_more_sigmas():
-    found = thresholds(np.array([10, 10, 1]), np.array([8.0, 1e9, 8.0]), np.full(3, PROBABILITY))
+    found = thresholds(
+        np.array([10, 10, 1]), np.array([8.0, 1e9, 8.0]), np.full(3, PROBABILITY), np.zeros(3), "step"
+    )
     assert found[0] > found[1] + 1
     surely = alarm_threshold(np.ones(10), PROBABILITY)
     assert found[1] == pytest.approx(surely, rel=0.04)  # 200 are taken for sure

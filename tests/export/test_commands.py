@@ -14,7 +14,6 @@ from pipeline.store.current import transform_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
-from schemas.states import STATES, StateRow
 from tests.audit.fleet_records import vehicle_records
 from tests.makers.calibrations import CAMERA, T_BASE_LIDAR, calibration
 from tests.makers.commands import command
@@ -42,16 +41,6 @@ def lake(tmp_path_factory):
     rows = [replace(r, **changed.get((r.day, r.pair), refused if r.day == DAYS[3] else {})) for r in records]
     lake = Lake.at(tmp_path_factory.mktemp("lake"))
     commit_records(lake, CALIBRATIONS, rows)
-    shared = ("vehicle", "method", "pair", "parent_frame", "child_frame", "covariance", *POSE)
-    states = [
-        StateRow(
-            **{name: getattr(r, name) for name in shared}, day=DAYS[3], status="current", reason="",
-            work_key="state", common_covariance=0.5 * r.covariance, observable=[True] * 6,
-            determined=BOTH, days=[DAYS[0]],
-        )
-        for r in rows if r.day == DAYS[0]
-    ]  # fmt: skip
-    commit_records(lake, STATES, states)
     row = make_observation(
         np.random.default_rng(2), nulls=True, camera_model=CAMERA.model, camera_K=CAMERA.K,
         camera_D=CAMERA.D, image_width_px=CAMERA.width_px, image_height_px=CAMERA.height_px,
@@ -68,7 +57,7 @@ def export(lake, capsys):
     )
 
 
-def test_an_accepted_day_and_a_state_go_out_and_come_back_as_a_prior(export, lake, tmp_path, capsys):
+def test_an_accepted_day_goes_out_and_comes_back_as_a_prior(export, lake, tmp_path, capsys):
     told = export("kitti", tmp_path / "a.txt", "--day", DAYS[0])
     assert (told.code, told.summary["status"]) == (0, "done")
     assert told.summary["pairs"] == ["camera_lidar", "lidar_radar"]
@@ -84,8 +73,6 @@ def test_an_accepted_day_and_a_state_go_out_and_come_back_as_a_prior(export, lak
             assert held[f"T_{r.pair}"] == transform_of(r).tolist()
     read = read_transforms(tmp_path / "prior.json")
     np.testing.assert_allclose(read["camera_lidar"], held["T_camera_lidar"], atol=1e-14)
-    told = export("ros2", tmp_path / "ros")
-    assert (told.code, told.summary["source"]) == (0, f"state of {DAYS[3]}")
 
 
 def test_a_direction_that_is_not_certified_is_named_in_the_file_on_stderr_and_in_the_summary(

@@ -119,11 +119,13 @@ def test_an_export_is_its_record_and_every_kind_of_source_can_be_named(lake, tmp
         changes = [row["change"] for p in json.loads(told.out)["pairs"] for row in p["axes"]]
         assert (told.code, len(changes)) == (0, 18)
         assert np.abs(changes).max() < 1e-12
-    for other in ("2026-03-01/prior", "2026-03-01/tracking", "w@2026-03-01"):
+    # A prior rests on no day.
+    for other, same in (("2026-03-01/prior", False), ("2026-03-01/tracking", True), ("w@2026-03-01", False)):
         told = command(capsys, "compare", "v@2026-03-01", other, *of_v, "--json")
-        found = json.loads(told.out)["pairs"]
-        assert (told.code, len(found)) == (0, 3)
-    assert {p["status_b"] for p in found} == {"held"}
+        found = json.loads(told.out)
+        assert (told.code, len(found["pairs"])) == (0, 3)
+        assert any("same days" in note for note in found["notes"]) == same
+    assert {p["status_b"] for p in found["pairs"]} == {"held"}
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from pipeline.rig.day_prior import read_star
 from pipeline.rig.edges import words_of
 from pipeline.rig.graph import Sensor, tie
 from pipeline.rig.se3 import inverse
+from tests.audit.test_many_sensors import RIGS
 from tests.makers.calibrations import CAMERA, random_transform
 from tests.makers.commands import command
 
@@ -22,23 +23,8 @@ OTHERS = (
     Sensor("front", "camera"), Sensor("left", "camera"), Sensor("side", "lidar"),
     Sensor("bumper", "radar"), Sensor("corner", "radar"),
 )  # fmt: skip
-FLEET = """
-[fleet]
-name = "vans"
-[rigs.van]
-reference = "top"
-[rigs.van.cameras]
-front = { image = "/f", info = "/fi" }
-left = { image = "/l", info = "/li" }
-[rigs.van.lidars]
-side = { points = "/side" }
-top = { points = "/top" }
-[rigs.van.radars]
-bumper = { points = "/bumper" }
-corner = { points = "/corner" }
-[vehicles."*"]
-rig = "van"
-"""
+ANOTHER_LIDAR = '[rigs.van]\nreference = "top"\n[rigs.van.lidars.side]\npoints = "/side"\n[rigs.van.prior]'
+FLEET = RIGS.replace("[rigs.van.prior]", ANOTHER_LIDAR)
 T_TOP = dict(
     zip((s.name for s in OTHERS), (random_transform(np.random.default_rng(k)) for k in range(5)), strict=True)
 )
@@ -107,10 +93,9 @@ def test_a_sensor_that_the_files_lack_is_named_and_taken_from_another_prior_wher
     np.testing.assert_allclose(star["top", "side"], T_TOP["side"], atol=1e-9)
 
 
-def test_a_sensor_that_stands_twice_is_named(fleet, tmp_path, capsys):
-    [first, *_] = exported(tmp_path, "urdf")
+def test_a_sensor_that_stands_twice_or_in_a_chain_without_its_name_is_named(fleet, tmp_path, capsys):
+    [first, *_], other = exported(tmp_path, "urdf"), tmp_path / "other.urdf"
     text = (tmp_path / "urdf" / "sensors.urdf").read_text()
-    other = tmp_path / "other.urdf"
     other.write_text(re.sub(r'xyz="[^"]*"', 'xyz="0 0 0"', text, count=1))
     code, summary = imported(capsys, "urdf", [first, str(other)], fleet, tmp_path / "prior.json")
     assert code == 2
@@ -122,11 +107,8 @@ def test_a_sensor_that_stands_twice_is_named(fleet, tmp_path, capsys):
     code, summary = imported(capsys, "kalibr", [str(chain)], fleet, tmp_path / "prior.json")
     assert code == 2
     assert "a sensor occurs twice" in summary["reason"]
-
-
-def test_a_chain_whose_topics_name_no_camera_is_not_guessed_at(fleet, tmp_path, capsys):
+    # Topics that name no camera are not guessed at.
     exported(tmp_path, "kalibr", [s for s in OTHERS if s.name != "left"])
-    chain = tmp_path / "kalibr" / "camchain.yaml"
     chain.write_text(chain.read_text().replace("/cam_front_optical/image_raw", "/cam0/image_raw"))
     code, summary = imported(capsys, "kalibr", [str(chain)], fleet, tmp_path / "prior.json")
     assert code == 2

@@ -16,33 +16,18 @@ from pipeline.core.stages import AUDIT, STATE
 from pipeline.export.calibration import ExportedCalibration, ExportedPair, FrameNames, poses_of
 from pipeline.export.formats import format_named
 from pipeline.rig.edges import edge_named, words_of
-from pipeline.rig.se3 import adjoint, exp_se3, inverse, to_quaternion
+from pipeline.rig.se3 import adjoint, exp_se3, inverse
 from pipeline.store.commits import commit_records
+from pipeline.store.current import transform_of
 from pipeline.store.partitions import Lake
 from schemas.calibrations import CALIBRATIONS
 from schemas.poses import POSES
+from tests.audit.test_many_sensors import RIGS
 from tests.makers.calibrations import CAMERA, T_BASE_LIDAR, random_transform
 from tests.makers.commands import command
 from tests.makers.rig_records import EDGES, T_TOP, T_of, covariance_of, pose_rows, rig_records
-from tests.makers.table_rows import make_row
 
 NAMES = {"front": "cam_front_optical", "corner": "ars548_fl"}
-RIG = """
-[fleet]
-name = "vans"
-[rigs.van.prior]
-source = "tf_static"
-[rigs.van.cameras]
-front = { image = "/f", info = "/fi" }
-left = { image = "/l", info = "/li" }
-[rigs.van.lidars]
-top = { points = "/top" }
-[rigs.van.radars]
-bumper = { points = "/bumper" }
-corner = { points = "/corner" }
-[vehicles."*"]
-rig = "van"
-"""
 
 
 def five(edges=EDGES, T=T_of, **values):
@@ -156,43 +141,30 @@ def test_commands_name_frames_of_any_sensor_and_the_file_is_as_the_day_it_was_wr
 
 
 def test_what_the_rig_does_without_is_exported_by_its_poses_and_not_by_what_the_edge_found(tmp_path, capsys):
-    lake, left_out = str(tmp_path / "lake"), rig_records("van", 2, np.random.default_rng(2))
-    commit_records(Lake.at(lake), CALIBRATIONS, [replace(r, used=False) for r in left_out])
-    rng, moved = np.random.default_rng(8), exp_se3(np.r_[0, 0, 0.004, 0.01, 0, 0])
-    names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
-    for sensor, kind, status in (
-        ("front", "camera", "accepted"), ("left", "camera", "accepted"),
-        ("bumper", "radar", "accepted"), ("corner", "radar", "held"),
-    ):  # fmt: skip
-        T = moved @ T_TOP[sensor]
-        pose = dict(zip(names, (*to_quaternion(T).tolist(), *T[:3, 3].tolist()), strict=True))
-        row = make_row(
-            "poses", rng, vehicle="van", day="2026-03-01", method="joint", sensor=sensor, kind=kind, reference="top",
-            status=status, determined=["azimuth", "elevation"], observable=[True] * 6, recorded_at="", asserted_at="",
-            covariance=np.eye(6) * 1e-6, common_covariance=np.eye(6) * 1e-7, **pose,
-        )  # fmt: skip
-        commit_records(Lake.at(lake), POSES, [row])
-    told = command(capsys, "export", "urdf", "--lake", lake, *OF_DAY, "--out", tmp_path / "car.urdf")
+    lake, left_out = Lake.at(tmp_path / "lake"), rig_records("van", 2, np.random.default_rng(2))
+    commit_records(lake, CALIBRATIONS, [replace(r, used=False) for r in left_out])
+    poses = pose_rows("van", 1, np.random.default_rng(8), of={(0, "corner"): {"status": "held"}})
+    commit_records(lake, POSES, poses)
+    told = command(capsys, "export", "urdf", "--lake", lake.root, *OF_DAY, "--out", tmp_path / "car.urdf")
     assert (told.code, told.summary["pairs"]) == (3, ["front-top", "left-top", "top-bumper"])
     assert told.summary["not_certified"]["top-corner"].startswith("held")
     tree = format_named("urdf").tree({"car.urdf": (tmp_path / "car.urdf").read_bytes()})
-    for sensor in ("front", "left", "bumper"):
-        np.testing.assert_allclose(tree.lookup("top", sensor), moved @ T_TOP[sensor], atol=1e-9)
-    assert tree.lookup("top", "corner") is None
+    assert {row.sensor for row in poses} - set(tree.edges) == {"top", "corner"}
+    for row in poses:
+        if row.sensor in tree.edges:
+            np.testing.assert_allclose(tree.lookup("top", row.sensor), transform_of(row), atol=1e-9)
 
 
 @pytest.fixture(scope="module")
 def with_state(tmp_path_factory):
     """A lake with the state of five sensors, of which the left camera has no usable day."""
-    lake, refused = (
-        Lake.at(tmp_path_factory.mktemp("lake")),
-        {"status": "refused", "reason": "nothing to see", "qw": None},
-    )
+    lake = Lake.at(tmp_path_factory.mktemp("lake"))
+    refused = {"status": "refused", "reason": "nothing to see", "qw": None}
     rows = pose_rows("van", 3, np.random.default_rng(5), of={(k, "left"): refused for k in range(3)})
     commit_records(lake, CALIBRATIONS, rig_records("van", 3, np.random.default_rng(2)))
     commit_records(lake, POSES, rows)
     for stage in (AUDIT, STATE):
-        stage.run(Task(FleetConfig.model_validate(tomllib.loads(RIG)), lake, Window()))
+        stage.run(Task(FleetConfig.model_validate(tomllib.loads(RIGS)), lake, Window()))
     return lake.root
 
 
