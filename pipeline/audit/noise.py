@@ -1,7 +1,7 @@
 """Scatter of the days: its ratio to their sigmas, and the correlation of errors from day to day.
 
 Both are learnt for each vehicle model, edge and degree of freedom, from differences between days. A few real changes
-do not affect them: variances are winsorised, spans over a jump and the newest days are left out. A `Prior` for an
+do not affect them: variances are winsorised, spans over a jump and the newest days are left out. What is assumed of an
 unknown fleet is updated by the fleet's days, and this by a vehicle's own days. The spread between vehicles is learnt
 too (Smyth 2004, Stat. Appl. Genet. Mol. Biol. 3(1), moments of log-variances). An outlying vehicle uses its own days
 only.
@@ -18,8 +18,12 @@ from scipy.special import digamma, polygamma
 
 from pipeline.audit.charts import Charts
 
-__all__ = ["Noise", "Prior", "estimate_noise", "older_days", "winsorised_variance"]
+__all__ = ["VEHICLES", "Noise", "estimate_noise", "older_days", "winsorised_variance"]
 
+# Before any day of a fleet: degrees of freedom of the chi-squared distribution of its vehicles' variances, relative to
+# the squares of their sigmas (sigmas that are wrong by a log-normal factor of 0.25 have 1 / (2 0.25^2) = 8), the number
+# of vehicles that this is worth, and the largest autocorrelation with its standard deviation over vehicles and fleets.
+_FREEDOM, VEHICLES, _ALIKE, _ALIKE_SIGMA = 8.0, 8.0, 0.6, 0.15
 # Of n differences of neighbouring days, degrees of freedom of their variance: they share days, and are winsorised.
 _EFFICIENCY = 0.6
 # Days that scatter more than this times their sigmas do not scatter: something moves, and is to be found. Four
@@ -85,26 +89,6 @@ class Differences:
         return self.size / np.sqrt(np.maximum(self.square - 2 * rho * self.product, 1e-12 * self.square))
 
 
-@dataclass(frozen=True)
-class Prior:
-    """Prior knowledge before any day; it may come from a larger fleet or from the same model.
-
-    Args:
-        variance: variance of days, relative to the square of their sigmas.
-        freedom: degrees of freedom of the chi-squared distribution of variances over vehicles. If sigmas are
-            wrong by a log-normal factor of 0.25, variances have 1 / (2 0.25^2) = 8 degrees of freedom.
-        vehicles: weight of `freedom`, as a number of vehicles.
-        autocorrelation: largest assumed correlation of errors on successive days.
-        autocorrelation_sigma: its standard deviation over vehicles and fleets.
-    """
-
-    variance: float = 1.0
-    freedom: float = 8.0
-    vehicles: float = 8.0
-    autocorrelation: float = 0.6
-    autocorrelation_sigma: float = 0.15
-
-
 @dataclass(frozen=True, eq=False)
 class Noise:
     """For each chart: factor on its sigmas (>= 1), degrees of freedom of this factor, and the autocorrelation.
@@ -142,42 +126,32 @@ class Noise:
         )  # fmt: skip
 
 
-def estimate_noise(
-    charts: Charts,
-    dofs: int,
-    edges: int,
-    models: Sequence[str] = (),
-    prior: Prior = Prior(),
-) -> Noise:
+def estimate_noise(charts: Charts, shape: tuple[int, int, int], models: Sequence[str] = ()) -> Noise:
     """Noise of all charts of a fleet.
 
     Args:
         charts: rows in order of vehicle, edge and degree of freedom; a chart without days has count 0.
-        dofs: degrees of freedom of an edge.
-        edges: number of edges; an edge has the same position on every vehicle of a model.
+        shape: their numbers; an edge has the same position on every vehicle of a model.
         models: model of each vehicle; none = all are of one model.
     """
-    vehicles = len(charts.count) // (edges * dofs)
-    _, model_of = np.unique(list(models) or [""] * vehicles, return_inverse=True)
-    out = np.zeros((2, 5, vehicles, edges, dofs))
-    differences = [Differences.of(charts, lag, (vehicles, edges, dofs)) for lag in (1, APART)]
+    _, model_of = np.unique(list(models) or [""] * shape[0], return_inverse=True)
+    out = np.zeros((2, 5, *shape))
+    differences = [Differences.of(charts, lag, shape) for lag in (1, APART)]
     for model in np.unique(model_of):
         own = np.flatnonzero(model_of == model)
         near, far = (found.at(own) for found in differences)
         # An edge composed of two others is less often far off than they are, and errs with them.
         out[:, 3, own] = far_off(near.in_sigmas(0.0)).max()
         leave_out_steps(near, far)
-        for k, most in enumerate((prior.autocorrelation, 0.0)):
-            phi = _autocorrelation(near, far, most, prior)
-            out[k, :2, own] = np.stack(_scatter(near, phi, prior), axis=1)
+        for k, most in enumerate((_ALIKE, 0.0)):
+            phi = _autocorrelation(near, far, most)
+            out[k, :2, own] = np.stack(_scatter(near, phi), axis=1)
             out[k, 2, own] = phi
     most_alike, least_alike = (Noise(*columns) for columns in out.reshape(2, 5, -1))
     return replace(most_alike, less_alike=least_alike)
 
 
-def _autocorrelation(
-    near: Differences, far: Differences, most: float, prior: Prior
-) -> Float[np.ndarray, "V P D"]:
+def _autocorrelation(near: Differences, far: Differences, most: float) -> Float[np.ndarray, "V P D"]:
     """Autocorrelation phi by vehicle, edge and axis.
 
     Over three days, the variance of differences increases by 1 + phi + phi^2. Each value is shrunk towards
@@ -186,15 +160,15 @@ def _autocorrelation(
     z = [np.where(d.gap == d.lag, d.size / np.sqrt(d.square), np.nan) for d in (near, far)]
     V, P, D, _ = near.size.shape
     by_axis = [np.moveaxis(part, 0, 2) for part in z]
-    worth = _OF_ONE / prior.autocorrelation_sigma**2
+    worth = _OF_ONE / _ALIKE_SIGMA**2
     of_edge = _drawn(_alike([part.reshape(P, -1) for part in by_axis]), np.full(P, most), worth)
     of_axes = np.broadcast_to(of_edge[:, None], (P, D))
     of_axis = _drawn(_alike([part.reshape(P, D, -1) for part in by_axis]), of_axes, _OF_ONE / _AXES_DIFFER**2)
     found, seen = _alike([part.reshape(V, P, -1) for part in z])
     known = np.isfinite(found) & (seen > 0)
     beyond = ((found - of_edge) ** 2 - _OF_ONE / np.maximum(seen, 1))[known]
-    differ = prior.vehicles * prior.autocorrelation_sigma**2 + max(float(beyond.sum()), 0.0) / P
-    worth = _OF_ONE / (differ / (prior.vehicles + known.sum() / P))
+    differ = VEHICLES * _ALIKE_SIGMA**2 + max(float(beyond.sum()), 0.0) / P
+    worth = _OF_ONE / (differ / (VEHICLES + known.sum() / P))
     return _drawn((found[..., None], seen[..., None]), np.broadcast_to(of_axis, (V, P, D)), worth)
 
 
@@ -212,7 +186,7 @@ def _drawn(alike: tuple[np.ndarray, np.ndarray], towards: np.ndarray, worth: flo
 
 
 def _scatter(
-    near: Differences, phi: np.ndarray, prior: Prior
+    near: Differences, phi: np.ndarray
 ) -> tuple[Float[np.ndarray, "V P D"], Float[np.ndarray, "V P D"]]:
     """Ratio of the days' scatter to their sigmas, and the degrees of freedom of its estimate."""
     z = near.in_sigmas(phi)
@@ -220,14 +194,14 @@ def _scatter(
     found, seen = winsorised_variance(np.moveaxis(z, 0, 2).reshape(P, D, V * S))
     worth, most = _EFFICIENCY * seen, _MOST_SCALE**2
     found = np.where(seen > 0, np.minimum(found, most), 0.0)
-    of_fleet = np.maximum((prior.freedom * prior.variance + worth * found) / (prior.freedom + worth), 1.0)
+    of_fleet = np.maximum((_FREEDOM + worth * found) / (_FREEDOM + worth), 1.0)
     relative = z / np.sqrt(of_fleet)[None, :, :, None]
     found, seen = winsorised_variance(relative.reshape(V, P, D * S))
     freedom = _EFFICIENCY * seen * _independent(z)[None] / D
-    vehicle = _drawn_to_fleet(np.minimum(found, most / of_fleet.max(axis=1)), freedom, 1.0, prior)
+    vehicle = _drawn_to_fleet(np.minimum(found, most / of_fleet.max(axis=1)), freedom, 1.0)
     own, seen = winsorised_variance(relative)
     own = np.minimum(own, most / of_fleet)
-    variance, freedom = _drawn_to_fleet(own, _EFFICIENCY * seen, vehicle[0][..., None], prior)
+    variance, freedom = _drawn_to_fleet(own, _EFFICIENCY * seen, vehicle[0][..., None])
     scale = np.sqrt(np.clip(of_fleet[None] * variance, 1.0, _MOST_SCALE**2))
     # The autocorrelation is uncertain with few days, and the scatter depends on it.
     alike = _OF_ONE / (worth / _EFFICIENCY + _OF_ONE / _AXES_DIFFER**2) / (2 * (1 - phi) ** 2)
@@ -236,19 +210,19 @@ def _scatter(
 
 
 def _drawn_to_fleet(
-    found: np.ndarray, freedom: np.ndarray, fleet: np.ndarray | float, prior: Prior
+    found: np.ndarray, freedom: np.ndarray, fleet: np.ndarray | float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Variances shrunk towards the fleet's, more so if vehicles differ little, and their degrees of freedom."""
     known = (freedom > 1) & (found > 0)
     d = np.where(known, freedom, 1.0)
     off = np.log(np.where(known, found / fleet, 1.0)) - digamma(d / 2) + np.log(d / 2)
     chance, count = polygamma(1, d / 2), int(known.sum())
-    differ = polygamma(1, prior.freedom / 2)
+    differ = polygamma(1, _FREEDOM / 2)
     middle = 0.0
     if count:
         middle = float(np.median(off[known]))
         beyond = (1.4826 * np.median(np.abs(off[known] - middle))) ** 2 - chance[known].mean()
-        differ = (prior.vehicles * differ + count * max(beyond, 0.0)) / (prior.vehicles + count)
+        differ = (VEHICLES * differ + count * max(beyond, 0.0)) / (VEHICLES + count)
     # trigamma(x) is 1 / x + 1 / (2 x^2), to a hundredth where x is 1 and more
     like = (1 + np.sqrt(1 + 2 * differ)) / differ
     away = (off - middle) ** 2 / (differ + chance)

@@ -16,7 +16,6 @@ from pipeline.audit.findings import vehicle_findings
 from pipeline.audit.fleet_shift import FleetShift, judge_without_fleet_shifts
 from pipeline.audit.history import History, last_audited_day, models_of
 from pipeline.audit.restarts import events_until, restart_of
-from pipeline.audit.standing import said_before, standing
 from pipeline.audit.vehicle import VehicleVerdict
 from pipeline.core.config import AuditConfig, FleetConfig, config_hash
 from pipeline.core.errors import ConfigError
@@ -34,9 +33,10 @@ from pipeline.store.partitions import (
     work_key,
 )
 from pipeline.store.records import read_last
-from schemas.calibrations import DOF_NAMES
+from schemas.calibrations import CALIBRATIONS, DOF_NAMES
 from schemas.drift import DRIFT, DriftFinding
 from schemas.service_events import ServiceEvent
+from schemas.states import STATES
 from schemas.versions import CODE_VERSION
 
 __all__ = ["work"]
@@ -44,6 +44,10 @@ __all__ = ["work"]
 # Columns read of an earlier audit's rows.
 _OF_BEFORE = ("start_day", "start_day_earliest", "start_day_latest", "kind")
 _NAMED = 5  # records that an outcome names where they were left out; the others it counts
+# From least to most urgent.
+_CALMEST_FIRST = ("GREEN", "UNKNOWN", "YELLOW", "RED")
+_LESS = "some of its records cannot be read"
+_KEPT = f"kept, for {_LESS}"
 
 
 @dataclass(frozen=True)
@@ -77,7 +81,7 @@ def work(task: Task) -> Work:
     events = events_until(task.lake, last)
     enough = (FEWEST_DAYS, fleet.audit.reference_days)
     records, references = history.window((first, last), events, enough, fleet.named_vehicles)
-    said = said_before(task.lake, method)
+    said = _said_before(task.lake, method)
     names = sorted({*records.vehicles, *fleet.named_vehicles, *said})
     vehicles = {
         name: _Vehicle(records.of(name), events.get(name, ()), references.get(name, {}), said.get(name, ()))
@@ -171,7 +175,7 @@ def _findings(
     remarks = _remarks(vehicle, last, shifts)
     possible = () if len(records.edge) else _possible_edges(fleet, name)
     rows = vehicle_findings((name, last, method), records, verdict, fleet.audit, remarks, before, possible)
-    rows = standing(rows, vehicle.said, vehicle.events, last)
+    rows = _standing(rows, vehicle.said, vehicle.events, last)
     # All vehicles are judged side by side, so a verdict rests on more than this vehicle's records: the key has it too.
     key = work_key("audit", CODE_VERSION, config, [*inputs, content_hash(rows)])
     return [replace(row, work_key=key) for row in rows]
@@ -221,3 +225,56 @@ def _remarks(
         text = f"without what {shift.vehicles} of {shift.of} vehicles show since {day_name(shift.day)}"
         remarks[key] = f"{remarks[key]}; {text}" if key in remarks else text
     return remarks
+
+
+def _said_before(lake: Lake, method: str) -> Mapping[str, list[DriftFinding]]:
+    """Last audit's findings of vehicles whose records may be among the unreadable ones."""
+    lost = [rows for rows in lake.lost if rows.table in (CALIBRATIONS.name, STATES.name)]
+    said: dict[str, list[DriftFinding]] = {}
+    for finding in read_last(lake, DRIFT, DriftFinding, method) if lost else ():
+        if any(rows.may_be_of(finding.vehicle) for rows in lost):
+            said.setdefault(finding.vehicle, []).append(finding)
+    return said
+
+
+def _standing(
+    found: list[DriftFinding], said: Sequence[DriftFinding], events: Sequence[ServiceEvent], day: str
+) -> list[DriftFinding]:
+    """The valid findings of a vehicle tonight, with the reason: the last audit's if tonight's are less severe.
+
+    `said` is empty if all of the vehicle's records could be read. Service events since the last audit end its
+    findings.
+    """
+    if not said or any(event.recorded_at > said[0].asserted_at for event in events):
+        return found
+    again = [replace(row, day=day, recorded_at="", asserted_at="") for row in said]
+    if not found:  # nothing of the vehicle can be read
+        found = [
+            replace(row, status="UNKNOWN", vehicle_status="UNKNOWN", reason=_LESS, vehicle_reason=_LESS)
+            for row in again
+        ]
+    before, now = (_CALMEST_FIRST.index(rows[0].vehicle_status or "UNKNOWN") for rows in (said, found))
+    alarmed = before >= _CALMEST_FIRST.index("YELLOW")
+    if before < now or (before == now and not alarmed):
+        kept = [
+            row
+            if _LESS in (row.vehicle_reason or "")
+            else replace(row, vehicle_reason=f"{row.vehicle_reason}; {_LESS}")
+            for row in found
+        ]
+    else:
+        since = said[0].day
+        kept = [
+            replace(
+                row, reason=_kept(row.reason, since), vehicle_reason=_kept(row.vehicle_reason or "", since)
+            )
+            for row in again
+        ]
+    # More days do not replace the records of an UNKNOWN vehicle that cannot be read.
+    return [
+        replace(row, vehicle_days_needed=None) if row.vehicle_status == "UNKNOWN" else row for row in kept
+    ]
+
+
+def _kept(reason: str, day: str) -> str:
+    return reason if reason.startswith(_KEPT) else f"{_KEPT} (audit of {day}): {reason}"

@@ -143,7 +143,7 @@ def _mounts(poses: Mapping[str, VehiclePoses], fleet: FleetConfig) -> dict[str, 
         (len(days), len(edges), DOFS),
     )
     limit = np.tile([limit_of(edge, dof, fleet.audit) for edge in edges for dof in DOF_NAMES], len(days))
-    noise = with_wander(charts, estimate_noise(charts, DOFS, len(edges), models), limit, shape, models)
+    noise = with_wander(charts, estimate_noise(charts, shape, models), limit, shape, models)
     least = noise.less_alike or noise
     # Days that scatter by more than their sigmas do so because the mount does, or because the sigmas are too small:
     # either way tomorrow lies that far off.

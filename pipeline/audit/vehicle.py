@@ -55,8 +55,8 @@ def judge_fleet(
     charts = charts_of_fleet(fleet, edges)
     limit = np.array([limit_of(edge, dof, config) for edge in edges for dof in DOF_NAMES])
     limit = np.tile(limit, len(fleet))
-    noise = estimate_noise(charts, DOFS, len(edges), models)
-    noise = with_wander(charts, noise, limit, (len(fleet), len(edges), DOFS), models)
+    shape = len(fleet), len(edges), DOFS
+    noise = with_wander(charts, estimate_noise(charts, shape, models), limit, shape, models)
     per_vehicle = len(edges) * DOFS
     live = (charts.count > 1).reshape(len(fleet), per_vehicle).sum(axis=1)
     # An audit is one vehicle-night: its expected number of alarms stays within the budget whatever the nights
@@ -71,17 +71,13 @@ def judge_fleet(
         np.repeat(probability, per_vehicle, axis=1),
         config.baseline_days,
     )
-    return [
-        _judged(own, verdicts[v * per_vehicle : (v + 1) * per_vehicle], _noise_of(noise, v, edges))
-        for v, own in enumerate(fleet)
-    ]
-
-
-def _noise_of(noise: Noise, v: int, edges: Sequence[Edge]) -> dict[Edge, Noise]:
-    """Noise of one vehicle by edge, six charts each."""
-    first = v * len(edges) * DOFS
-    parts = [slice(first + k * DOFS, first + (k + 1) * DOFS) for k in range(len(edges))]
-    return {edge: noise.at(at) for edge, at in zip(edges, parts, strict=True)}
+    found = []
+    for own, first in zip(fleet, range(0, len(verdicts), per_vehicle), strict=True):
+        by_edge = {
+            edge: noise.at(slice(first + k * DOFS, first + (k + 1) * DOFS)) for k, edge in enumerate(edges)
+        }
+        found.append(_judged(own, verdicts[first : first + per_vehicle], by_edge))
+    return found
 
 
 def _judged(

@@ -14,13 +14,12 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.audit.charts import Charts, clipped
-from pipeline.audit.noise import Noise, older_days, winsorised_variance
+from pipeline.audit.noise import VEHICLES, Noise, older_days, winsorised_variance
 from pipeline.audit.scan import errors_of, scan
 
 __all__ = ["with_wander"]
 
 _FEWEST = 14  # days of a chart, to estimate it
-_WORTH = 8.0  # vehicles that a fleet without a swing is worth: as many as `Prior.vehicles`
 _SHARE = 1 / 3  # of a chart's days at either end, where no reference stands for the first of them
 # Sigmas of a step, if nothing wandered, that is a change and no wandering: all vehicles of a fleet may do it at once.
 _STEP = 4.0
@@ -63,8 +62,8 @@ def _wander(
         known = np.isfinite(off[own])
         all_moved = (step[own] >= _STEP).sum(axis=0) > known.sum(axis=0)
         found, seen = winsorised_variance(np.moveaxis(off[own] / np.sqrt(chance[own]), 0, -1))
-        beyond = np.where(seen > 0, seen * (found - 1), 0.0).clip(min=1e-9) / (seen + _WORTH)
-        beyond = (beyond - 2 / (seen + _WORTH) / beyond).clip(min=0)  # less what chance shows of it
+        beyond = np.where(seen > 0, seen * (found - 1), 0.0).clip(min=1e-9) / (seen + VEHICLES)
+        beyond = (beyond - 2 / (seen + VEHICLES) / beyond).clip(min=0)  # less what chance shows of it
         daily = np.where(known, beyond * chance[own] / lever[own], np.inf)
         out[own] = np.where((beyond > 0) & ~all_moved, np.minimum(daily, most[own]).min(axis=0), 0.0)
     return out.ravel()

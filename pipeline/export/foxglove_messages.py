@@ -89,13 +89,10 @@ def cloud_message(columns: Mapping[str, np.ndarray], frame_id: str, stamp_ns: in
     """Points as a message; the columns have equal length."""
     points = np.stack([np.asarray(c, "<f4") for c in columns.values()], axis=1)
     fields = [fg.PackedElementField(name=n, offset=4 * i, type=_FLOAT32) for i, n in enumerate(columns)]
-    origin = fg.Pose(
-        position=fg.Vector3(x=0.0, y=0.0, z=0.0), orientation=fg.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
-    )
     return fg.PointCloud(
         timestamp=time_message(stamp_ns),
         frame_id=frame_id,
-        pose=origin,
+        pose=_unturned(0.0, 0.0, 0.0),
         point_stride=4 * len(columns),
         fields=fields,
         data=points.tobytes(),
@@ -153,9 +150,7 @@ def clusters_message(observation: Observation, frame_id: str, stamp_ns: int) -> 
     low, high = observation.lidar_cluster_min_m.astype(float), observation.lidar_cluster_max_m.astype(float)
     cubes = [
         fg.CubePrimitive(
-            pose=fg.Pose(
-                position=fg.Vector3(x=c[0], y=c[1], z=c[2]), orientation=fg.Quaternion(x=0, y=0, z=0, w=1)
-            ),
+            pose=_unturned(*c),
             size=fg.Vector3(x=s[0], y=s[1], z=s[2]),
             color=_colour(_BOX, 0.25),
         )
@@ -163,6 +158,11 @@ def clusters_message(observation: Observation, frame_id: str, stamp_ns: int) -> 
     ]
     entity = fg.SceneEntity(timestamp=time_message(stamp_ns), frame_id=frame_id, id="clusters", cubes=cubes)
     return fg.SceneUpdate(entities=[entity])
+
+
+def _unturned(x: float, y: float, z: float) -> fg.Pose:
+    turn = fg.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
+    return fg.Pose(position=fg.Vector3(x=x, y=y, z=z), orientation=turn)
 
 
 def _colour(rgb: tuple[float, ...], opacity: float = 1.0) -> fg.Color:

@@ -32,17 +32,14 @@ def read_truth(folder: Path) -> Truth:
     truth = {}
     for path in sorted(folder.glob("*/*.json")):
         try:
-            truth[(path.parent.name, path.stem)] = _poses(json.loads(path.read_text()))
+            poses = json.loads(path.read_text())["T_base_sensor"]
+            of_sensors = {name: np.array(T, dtype=float) for name, T in poses.items()}
+            truth[path.parent.name, path.stem] = of_sensors | {"base": np.eye(4)}
         except (KeyError, ValueError, TypeError, AttributeError) as err:
             raise ConfigError(str(path), "", f"has no true extrinsics: {err}") from err
     if not truth:
         raise ConfigError(str(folder), "truth", "holds no <vehicle>/<day>.json")
     return truth
-
-
-def _poses(content: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    of = content["T_base_sensor"]
-    return {name: np.array(T, dtype=float) for name, T in of.items()} | {"base": np.eye(4)}
 
 
 def true_transform(truth: Truth, record: CalibrationRecord) -> Float[np.ndarray, "4 4"] | None:

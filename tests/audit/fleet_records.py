@@ -15,8 +15,9 @@ from pipeline.audit.days import PairDays
 from pipeline.audit.estimates import COLUMNS, estimates_of
 from pipeline.calibrate.pose_rows import poses_of_records
 from pipeline.calibrate.records import Inputs
+from pipeline.rig.edges import pose_columns
 from pipeline.rig.graph import Edge
-from pipeline.rig.se3 import adjoint, exp_se3, from_rotation_translation, inverse, to_quaternion
+from pipeline.rig.se3 import adjoint, exp_se3, from_rotation_translation, inverse
 from pipeline.store.partitions import Partition
 from pipeline.store.rows import to_table
 from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, PAIRS, CalibrationRecord
@@ -116,7 +117,6 @@ def _record(
     parent, child = FRAMES_OF_PAIR[pair]
     prior = {"camera_lidar": T_CAMERA_LIDAR, "lidar_radar": T_LIDAR_RADAR}.get(pair)
     prior = T_CAMERA_LIDAR @ T_LIDAR_RADAR if prior is None else prior
-    prior_q = to_quaternion(prior).tolist()
     common = {
         "vehicle": vehicle, "day": (FIRST_DAY + dt.timedelta(days=day)).isoformat(), "method": "joint",
         "pair": pair,
@@ -124,19 +124,16 @@ def _record(
         "reason": "" if status == "accepted" else "held-out frames are no better than at the prior",
         "work_key": f"{vehicle}-{day}", "code_version": "0.1.0", "environment": "urban", "triggered": day > 1,
         "frames_used": 0 if status == "refused" else 80, "frames_rejected": {"no road users": 25, "sync": 15},
-        "prior_qw": prior_q[0], "prior_qx": prior_q[1], "prior_qy": prior_q[2], "prior_qz": prior_q[3],
-        "prior_tx_m": prior[0, 3], "prior_ty_m": prior[1, 3], "prior_tz_m": prior[2, 3],
+        **pose_columns(prior, "prior_"),
         "prior_covariance": np.diag([np.radians(2.0) ** 2] * 3 + [0.05**2] * 3),
-        "trigger_before": {"lidar_outside_fraction": 0.04}, "trigger_after": {"lidar_outside_fraction":
-        0.004},
+        "trigger_before": {"lidar_outside_fraction": 0.04}, "trigger_after": {"lidar_outside_fraction": 0.004},
         "inputs": ["observations"],
     }  # fmt: skip
     if status == "refused":
         return CalibrationRecord(**common)
-    q = to_quaternion(T).tolist()
     seen = [k not in unobservable for k in range(6)]
     return CalibrationRecord(
-        **common, qw=q[0], qx=q[1], qy=q[2], qz=q[3], tx_m=T[0, 3], ty_m=T[1, 3], tz_m=T[2, 3],
+        **common, **pose_columns(T),
         covariance=cov, observability=[0.97 if s else 0.05 for s in seen], observable=seen,
         alignment_before=0.62, alignment_after=0.41, time_offset_s=0.021, time_offset_sigma_s=0.004,
         notes=["no highway: radar roll is weak"], diagnostics={"halves_rotation_deg": 0.04},

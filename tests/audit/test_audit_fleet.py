@@ -12,9 +12,10 @@ from pipeline.core.errors import ConfigError
 from pipeline.core.stage_work import Task, Window
 from pipeline.core.stages import AUDIT
 from pipeline.rig.changes import change_between
-from pipeline.rig.se3 import exp_so3, from_quaternion, from_rotation_translation, to_quaternion
+from pipeline.rig.edges import pose_columns
+from pipeline.rig.se3 import exp_so3, from_rotation_translation
 from pipeline.store.commits import commit_records
-from pipeline.store.current import current_drift
+from pipeline.store.current import current_drift, transform_of
 from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS
 from schemas.drift import DRIFT, DriftFinding
@@ -239,18 +240,14 @@ def test_a_knock_within_a_day_is_found_on_that_day(lake, since):
     for k, (b, a) in enumerate(zip(before, after, strict=True)):
         if b.day != "2026-03-05" or b.pair == "camera_lidar":
             continue
-        T_b, T_a = (
-            from_quaternion(np.array([r.qw, r.qx, r.qy, r.qz]), np.array([r.tx_m, r.ty_m, r.tz_m]))
-            for r in (b, a)
-        )
+        T_b, T_a = transform_of(b), transform_of(a)
         half = since * change_between(T_b, T_a)
         T = from_rotation_translation(exp_so3(half[:3]) @ T_b[:3, :3], T_b[:3, 3] + half[3:])
-        q = to_quaternion(T)
         sigma = np.full(6, 1e-4)
         half_days = np.array([[change_between(T, T_b), sigma], [change_between(T, T_a), sigma]])
         records[k] = replace(
             b, status="held", reason="yaw turned within the day", faults=["moved_in_day"], half_days=half_days,
-            qw=q[0], qx=q[1], qy=q[2], qz=q[3], tx_m=T[0, 3], ty_m=T[1, 3], tz_m=T[2, 3],
+            **pose_columns(T),
         )  # fmt: skip
     write(lake, records)
     red = [f for f in audit(lake, "v") if f.status == "RED"]

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from pipeline.rig.cameras import Camera
-from pipeline.rig.se3 import exp_se3, from_quaternion, inverse, to_quaternion, transform_points
+from pipeline.rig.edges import pose_columns
+from pipeline.rig.se3 import exp_se3, from_quaternion, inverse, transform_points
 from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import frames_of
@@ -38,14 +39,6 @@ INTRINSICS = {
 }  # fmt: skip
 
 
-def columns(prefix, transform):
-    if transform is None:
-        return {}
-    numbers = (*to_quaternion(transform), *transform[:3, 3])
-    names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
-    return {prefix + n: float(v) for n, v in zip(names, numbers, strict=True)}
-
-
 def frame(i):
     rng, stamp = np.random.default_rng(i), START_NS + i * 100_000_000
     stamps = {"stamp_ns": stamp, "lidar_stamp_ns": stamp, "camera_stamp_ns": stamp + 10**6,
@@ -72,8 +65,8 @@ def records():
         said = {"vehicle": "car", "day": DAY.day, "method": "joint", "pair": pair, "status": "accepted", "reason": "",
                 "parent_frame": parent, "child_frame": child, "determined": ["azimuth", "elevation"],
                 "observable": [True] * 5 + [False], "covariance": np.diag(SIGMA**2), "work_key": pair}  # fmt: skip
-        prior = columns("prior_", inverse(TURN) @ pose)
-        found.append(make_row("calibrations", rng, **said, **columns("", pose), **prior))
+        prior = pose_columns(inverse(TURN) @ pose, "prior_")
+        found.append(make_row("calibrations", rng, **said, **pose_columns(pose), **prior))
     return found
 
 

@@ -4,8 +4,8 @@ import datetime as dt
 
 import numpy as np
 
-from pipeline.rig.edges import edge_named
-from pipeline.rig.se3 import exp_se3, from_rotation_translation, inverse, to_quaternion
+from pipeline.rig.edges import edge_named, pose_columns
+from pipeline.rig.se3 import exp_se3, from_rotation_translation, inverse
 from schemas.calibrations import CalibrationRecord
 from schemas.poses import PoseRow
 
@@ -58,14 +58,11 @@ def rig_records(vehicle, days, rng, *, motion=lambda _day: {}, edges=EDGES):
 
 
 def record_of(vehicle, day, edge, T):
-    q, q_prior, T_prior = to_quaternion(T), to_quaternion(T_of(edge)), T_of(edge)
-    names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
     return CalibrationRecord(
         vehicle=vehicle, day=(FIRST_DAY + dt.timedelta(days=day)).isoformat(), method="joint", pair=edge.kind,
         parent_frame=edge.parent.name, child_frame=edge.child.name, status="accepted", reason="", seed=0,
         code_version="0.11.0", work_key=f"{vehicle}-{day}", frames_total=120, frames_used=80, environment="urban",
-        **dict(zip(names, (*q.tolist(), *T[:3, 3].tolist()), strict=True)),
-        **{f"prior_{n}": v for n, v in zip(names, (*q_prior.tolist(), *T_prior[:3, 3].tolist()), strict=True)},
+        **pose_columns(T), **pose_columns(T_of(edge), "prior_"),
         prior_covariance=np.diag([np.radians(2.0) ** 2] * 3 + [0.05**2] * 3), covariance=covariance_of(edge),
         common_covariance=0.1 * covariance_of(edge), observability=[0.97] * 6, observable=[True] * 6,
         determined=["azimuth", "elevation"],
@@ -93,7 +90,6 @@ def pose_rows(vehicle, days, rng, *, motion=lambda _day: {}, reference="top", **
             if name != reference:
                 T = exp_se3(np.sqrt(0.9) * POSE_SIGMA * rng.normal(size=6)) @ T
             prior = inverse(T_TOP[reference]) @ T_TOP[name]
-            names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
             is_other = float(name != reference)
             own = {
                 "vehicle": vehicle, "day": (FIRST_DAY + dt.timedelta(days=day)).isoformat(), "method": "joint",
@@ -101,9 +97,7 @@ def pose_rows(vehicle, days, rng, *, motion=lambda _day: {}, reference="top", **
                 "code_version": "0.11.0", "work_key": f"{vehicle}-{day}", "observable": [True] * 6,
                 "determined": ["azimuth", "elevation"], "covariance": is_other * np.diag(POSE_SIGMA**2),
                 "common_covariance": is_other * 0.1 * np.diag(POSE_SIGMA**2),
-                **dict(zip(names, (*to_quaternion(T).tolist(), *T[:3, 3].tolist()), strict=True)),
-                **dict(zip((f"prior_{n}" for n in names), (*to_quaternion(prior).tolist(), *prior[:3, 3].tolist()),
-                           strict=True)),
+                **pose_columns(T), **pose_columns(prior, "prior_"),
                 "prior_covariance": np.diag([np.radians(2.0) ** 2] * 3 + [0.05**2] * 3),
             }  # fmt: skip
             rows.append(PoseRow(**own | columns | of_one.get((day, name), {})))

@@ -16,8 +16,8 @@ from pipeline.report.charts import fleet_charts
 from pipeline.report.fleet_page import render_fleet_page
 from pipeline.report.page import page_stem
 from pipeline.report.upkeep import Album
-from pipeline.report.verdicts import ChartVerdicts, FleetVerdicts, read_verdicts
-from pipeline.report.window import FleetWindow, read_window
+from pipeline.report.verdicts import read_verdicts
+from pipeline.report.window import read_window
 from pipeline.store.commits import commit_records
 from pipeline.store.files import LocalFiles
 from pipeline.store.partitions import Lake
@@ -66,21 +66,24 @@ def repeated(window, verdicts, count, rare=25):
     charts = [np.flatnonzero(verdicts.charts.owner == verdicts.vehicles.index(kind)) for _, kind in names]
     at, on = np.concatenate(rows), np.concatenate(charts)
     owner, chart_owner = (np.repeat(np.arange(count), [len(r) for r in of]) for of in (rows, charts))
-    c = verdicts.charts
     return (
-        FleetWindow(
-            [name for name, _ in names], window.edges, owner, window.day[at], window.edge[at], window.status[at],
-            window.T[at], window.sigma[at], window.observable[at], [window.work_key[i] for i in at],
-            window.code_versions,
+        replace(
+            picked(window, at, "day", "edge", "status", "T", "sigma", "observable"),
+            vehicles=[name for name, _ in names], owner=owner, work_key=[window.work_key[i] for i in at],
         ),
-        FleetVerdicts(
-            [name for name, _ in names],
-            {name: [replace(f, vehicle=name) for f in verdicts.findings[kind]] for name, kind in names},
-            ChartVerdicts(c.edges, chart_owner, c.edge[on], c.dof[on], c.status[on], c.limit[on], c.start[on]),
-            verdicts.audited,
-            verdicts.work_keys,
+        replace(
+            verdicts,
+            vehicles=[name for name, _ in names],
+            findings={name: [replace(f, vehicle=name) for f in verdicts.findings[kind]] for name, kind in names},
+            charts=replace(
+                picked(verdicts.charts, on, "edge", "dof", "status", "limit", "start"), owner=chart_owner
+            ),
         ),
     )  # fmt: skip
+
+
+def picked(columns, rows, *names):
+    return replace(columns, **{name: getattr(columns, name)[rows] for name in names})
 
 
 VEHICLES = 10_000
