@@ -14,7 +14,6 @@ from pipeline.export.files import (
     prior_text,
     read_files,
     reference_of_rig,
-    require_all,
     rig_poses,
     star_text,
     write_files,
@@ -87,4 +86,4 @@ def _of_rig(
         star, reference = read_star(also, rig), reference_of_rig(rig).name
         of_star = {n.name: between(star, reference, n.name) for n in rig.nodes if n.name != reference}
         poses = {n: T for n, T in of_star.items() if T is not None} | poses
-    return star_text(require_all(poses, list(read), names, rig), rig, form, list(read)), taken
+    return star_text(poses, names, rig, form, list(read)), taken

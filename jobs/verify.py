@@ -19,7 +19,7 @@ from pipeline.core.config import FleetConfig, load_fleet
 from pipeline.core.errors import ConfigError
 from pipeline.core.stage_work import Task
 from pipeline.core.stages import CALIBRATE, INGEST, PERCEIVE
-from pipeline.export.files import reference_of_rig, require_all, star_text
+from pipeline.export.files import reference_of_rig, star_text
 from pipeline.report.comparison import in_use_view
 from pipeline.report.stage import write_day_page
 from pipeline.rig.day_prior import require_named_files
@@ -157,7 +157,7 @@ def with_calibration(
     if len(kept) < 2:
         raise ConfigError(calibration, "sensors", f"has none of {', '.join(n.name for n in rig.nodes)}")
     part = rig if rig.is_one_of_each else rig.of_sensors(kept)
-    file.write_bytes(star_text(require_all(poses, [calibration], names, part), part, "verify", [calibration]))
+    file.write_bytes(star_text(poses, names, part, "verify", [calibration]))
     lacking = [n for n in rig.nodes if n not in part.nodes]
     return config.with_rig(vehicle, part).with_prior_file(vehicle, file), lacking
 

@@ -30,7 +30,6 @@ __all__ = [
     "prior_text",
     "read_files",
     "reference_of_rig",
-    "require_all",
     "rig_poses",
     "star_text",
     "updated_file",
@@ -123,8 +122,8 @@ def prior_text(pairs: Mapping[str, np.ndarray], form: str, files: Sequence[str])
     if missing:
         problem = "missing, but a prior needs it: give a prior file that has it with --also"
         raise ConfigError(", ".join(files), f"T_{missing[0]}", problem)
-    transforms = {f"T_{pair}": np.asarray(pairs[pair]).tolist() for pair in ESTIMATED_PAIRS}
-    return to_json(transforms | {"imported_from": {"format": form, "files": list(files)}})
+    transforms = {f"T_{pair}": pairs[pair] for pair in ESTIMATED_PAIRS}
+    return to_json(transforms | {"imported_from": {"format": form, "files": files}})
 
 
 def reference_of_rig(rig: Rig) -> Sensor:
@@ -152,12 +151,17 @@ def from_ties(ties: Mapping[Edge, np.ndarray], reference: Sensor) -> dict[str, F
     }
 
 
-def require_all(
-    poses: Mapping[str, np.ndarray], files: Sequence[str], names: FrameNames, rig: Rig
-) -> dict[str, Float[np.ndarray, "4 4"]]:
-    """The poses in the rig's order; raises ConfigError that lists sensors that are missing."""
+def star_text(
+    poses: Mapping[str, np.ndarray], names: FrameNames, rig: Rig, form: str, files: Sequence[str]
+) -> bytes:
+    """Prior file (`[rigs.*.prior] source = "file"`) with T_reference_sensor of a whole rig, in the rig's order.
+
+    Raises:
+        ConfigError: with the names of the sensors that are missing.
+    """
     reference = reference_of_rig(rig)
-    missing = [n.name for n in rig.nodes if n != reference and n.name not in poses]
+    others = [n.name for n in rig.nodes if n != reference]
+    missing = [name for name in others if name not in poses]
     if missing:
         frames = ", ".join(f"{n} (frame {names.of(n)})" if names.of(n) != n else n for n in missing)
         problem = (
@@ -165,11 +169,5 @@ def require_all(
             "--also"
         )
         raise ConfigError(", ".join(files), "sensors", problem)
-    return {n.name: poses[n.name] for n in rig.nodes if n != reference}
-
-
-def star_text(poses: Mapping[str, np.ndarray], rig: Rig, form: str, files: Sequence[str]) -> bytes:
-    """Prior file (`[rigs.*.prior] source = "file"`) with these poses."""
-    T = {name: np.asarray(pose).tolist() for name, pose in poses.items()}
-    origin = {"format": form, "files": list(files)}
-    return to_json({"reference": reference_of_rig(rig).name, "T": T, "imported_from": origin})
+    T = {name: poses[name] for name in others}
+    return to_json({"reference": reference.name, "T": T, "imported_from": {"format": form, "files": files}})
