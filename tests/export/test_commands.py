@@ -147,6 +147,7 @@ def test_the_car_hangs_on_its_own_base_where_a_file_says_where_the_lidar_sits(ex
 
 
 OF_V = ["--lake", "{lake}", "--vehicle", "v"]
+OF_DAY = [*OF_V, "--day", DAYS[0]]
 
 
 @pytest.mark.parametrize(
@@ -156,11 +157,11 @@ OF_V = ["--lake", "{lake}", "--vehicle", "v"]
         (["kitti", "--lake", "{lake}", "--vehicle", "w"], "the lake has no day of 'w'"),
         (["kitti", *OF_V, "--day", "2020-01-01"], "no record of v 2020-01-01"),
         (["kitti", *OF_V, "--day", "yesterday"], "is not a day"),
-        (["urdf", *OF_V, "--lidar-frame", "a b"], "is not a valid frame name"),
-        (["urdf", *OF_V, "--lidar-frame", "radar"], "must differ"),
-        (["urdf", *OF_V, "--mount", "car.urdf"], "is not log:FILE or FORMAT:FILE"),
-        (["urdf", *OF_V, "--mount", "urdf:none.urdf"], "cannot be read"),
-        (["urdf", *OF_V, "--mount", "kitti:none"], "files have no frames of a car"),
+        (["urdf", *OF_DAY, "--lidar-frame", "a b"], "is not a valid frame name"),
+        (["urdf", *OF_DAY, "--lidar-frame", "radar"], "must differ"),
+        (["urdf", *OF_DAY, "--mount", "car.urdf"], "is not log:FILE or FORMAT:FILE"),
+        (["urdf", *OF_DAY, "--mount", "urdf:none.urdf"], "cannot be read"),
+        (["urdf", *OF_DAY, "--mount", "kitti:none"], "files have no frames of a car"),
         (["stl", *OF_V], "stl"),
     ],
 )

@@ -8,6 +8,7 @@ import pytest
 
 from pipeline.rig.se3 import from_quaternion, inverse, transform_points
 from pipeline.store.commits import commit_records
+from pipeline.store.current import transform_of
 from pipeline.store.moments import write_moments
 from pipeline.store.partitions import Lake, Partition
 from schemas.calibrations import CALIBRATIONS
@@ -28,6 +29,7 @@ SENSORS = {
     "bumper": ("radar", 0),
     "corner": ("radar", 10),
 }
+RECORDS = rig_records("van", 1, np.random.default_rng(4))
 AROUND = np.random.default_rng(7).uniform((-30, -30, -1), (30, 30, 2), (60, 3)).astype(np.float32)
 
 
@@ -51,12 +53,17 @@ def lake(tmp_path_factory):
     lake = Lake.at(tmp_path_factory.mktemp("rig") / "lake")
     write(lake, MOMENTS, frame)
     write(lake, PERCEIVED, observation)
-    records = rig_records("van", 1, np.random.default_rng(4))
     held = {"status": "held", "reason": "too few frames"}
     commit_records(
-        lake, CALIBRATIONS, [replace(r, **held) if r.child_frame == "corner" else r for r in records]
+        lake, CALIBRATIONS, [replace(r, **held) if r.child_frame == "corner" else r for r in RECORDS]
     )
     return lake.root
+
+
+def of_day(parent, child):
+    """T_parent_child of the day's record."""
+    [found] = [transform_of(r) for r in RECORDS if (r.parent_frame, r.child_frame) == (parent, child)]
+    return found
 
 
 def exported(capsys, lake, out, *more):
@@ -104,18 +111,19 @@ def test_frames_hang_where_the_day_and_the_prior_have_them(lake, tmp_path, capsy
     np.testing.assert_allclose(tree["top_prior"][1], inverse(T_TOP["front"]), atol=1e-9)
     for name in ("bumper", "corner"):
         np.testing.assert_allclose(tree[f"{name}_prior"][1], T_TOP[name], atol=1e-9)
-    assert 1e-6 < np.abs(tree["bumper"][1] - T_TOP["bumper"]).max() < 0.3
+    np.testing.assert_allclose(tree["bumper"][1], of_day("top", "bumper"), atol=1e-9)
+    np.testing.assert_allclose(tree["front"][1], inverse(of_day("front", "top")), atol=1e-9)
 
 
 def test_the_reference_lidar_s_edges_lie_in_every_camera_s_image(lake, tmp_path, capsys):
     _, found = exported(capsys, lake, tmp_path / "drive.mcap")
     for name in ("front", "left"):
-        drawn = found[f"/{name}/overlay_prior"][1]
-        points = transform_points(inverse(T_TOP[name]), AROUND.astype(float))
-        uv, valid = CAMERA.project(points)
-        wanted = uv[valid & CAMERA.contains(uv)] + 0.5
-        assert len(wanted) > 3
-        np.testing.assert_allclose([[p.x, p.y] for p in drawn.points[0].points], wanted, atol=1e-6)
+        for topic, T in (("overlay", of_day(name, "top")), ("overlay_prior", inverse(T_TOP[name]))):
+            uv, valid = CAMERA.project(transform_points(T, AROUND.astype(float)))
+            wanted = uv[valid & CAMERA.contains(uv)] + 0.5
+            assert len(wanted) > 3
+            [drawn] = found[f"/{name}/{topic}"][1].points
+            np.testing.assert_allclose([[p.x, p.y] for p in drawn.points], wanted, atol=1e-6)
 
 
 def test_only_the_sensors_that_are_named_are_shown_and_an_unknown_one_is_refused(lake, tmp_path, capsys):

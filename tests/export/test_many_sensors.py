@@ -1,7 +1,6 @@
 """Calibrations of rigs of many sensors, in every format: as many poses as sensors, the same numbers when read."""
 
 import json
-import tomllib
 from dataclasses import replace
 
 import cv2
@@ -9,10 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.core.config import FleetConfig
 from pipeline.core.errors import ConfigError
-from pipeline.core.stage_work import Task, Window
-from pipeline.core.stages import AUDIT, STATE
 from pipeline.export.calibration import ExportedCalibration, ExportedPair, FrameNames, poses_of
 from pipeline.export.formats import format_named
 from pipeline.rig.edges import edge_named, words_of
@@ -22,7 +18,6 @@ from pipeline.store.current import transform_of
 from pipeline.store.partitions import Lake
 from schemas.calibrations import CALIBRATIONS
 from schemas.poses import POSES
-from tests.audit.test_many_sensors import RIGS
 from tests.makers.calibrations import CAMERA, T_BASE_LIDAR, random_transform
 from tests.makers.commands import command
 from tests.makers.rig_records import EDGES, T_TOP, T_of, covariance_of, pose_rows, rig_records
@@ -153,37 +148,3 @@ def test_what_the_rig_does_without_is_exported_by_its_poses_and_not_by_what_the_
     for row in poses:
         if row.sensor in tree.edges:
             np.testing.assert_allclose(tree.lookup("top", row.sensor), transform_of(row), atol=1e-9)
-
-
-@pytest.fixture(scope="module")
-def with_state(tmp_path_factory):
-    """A lake with the state of five sensors, of which the left camera has no usable day."""
-    lake = Lake.at(tmp_path_factory.mktemp("lake"))
-    refused = {"status": "refused", "reason": "nothing to see", "qw": None}
-    rows = pose_rows("van", 3, np.random.default_rng(5), of={(k, "left"): refused for k in range(3)})
-    commit_records(lake, CALIBRATIONS, rig_records("van", 3, np.random.default_rng(2)))
-    commit_records(lake, POSES, rows)
-    for stage in (AUDIT, STATE):
-        stage.run(Task(FleetConfig.model_validate(tomllib.loads(RIGS)), lake, Window()))
-    return lake.root
-
-
-def test_a_state_is_compared_with_the_file_that_was_written_of_it(with_state, tmp_path, capsys):
-    of_van, urdf = ("--lake", with_state, "--vehicle", "van"), tmp_path / "car.urdf"
-    command(capsys, "export", "urdf", "--out", urdf, *of_van)
-    told = command(capsys, "compare", f"urdf:{urdf}", "state", *of_van, "--json")
-    found = json.loads(told.out)["pairs"]
-    assert {p["pair"] for p in found} == {"front-top", "left-top", "top-bumper", "top-corner"}
-    assert max(abs(axis["change"]) for p in found for axis in p["axes"]) < 1e-9
-
-
-def test_the_state_of_a_rig_is_a_line_per_sensor(with_state, capsys):
-    out = command(capsys, "state", "--lake", with_state).out
-    assert out.startswith("van, 2026-03-03, joint: load bumper, corner, front; keep left at the prior\n")
-    assert "top -> front: current, 3 days from 2026-03-01 to 2026-03-03" in out
-    assert "no usable day; 2026-03-03 refused: nothing to see" in out
-    assert "front-top" not in out
-    assert max(map(len, out.splitlines())) <= 80
-    rows = json.loads(command(capsys, "state", "--lake", with_state, "--json").out)
-    assert {r["sensor"] for r in rows} == {None, "top", "front", "left", "bumper", "corner"}
-    np.testing.assert_allclose({r["sensor"]: r["T"] for r in rows}["left"], T_TOP["left"], atol=1e-12)

@@ -227,6 +227,20 @@ def test_a_sensor_without_usable_days_is_in_the_launch_file_at_its_prior_and_nam
     assert said.summary["not_certified"]["left-top"].startswith("left is at its prior: no usable day")
 
 
+def test_a_state_is_as_the_file_that_was_written_of_it_and_a_line_per_sensor(lake, tmp_path, capsys):
+    of_van, urdf = ("--lake", lake, "--vehicle", "van"), tmp_path / "car.urdf"
+    command(capsys, "export", "urdf", "--out", urdf, *of_van)
+    found = json.loads(command(capsys, "compare", f"urdf:{urdf}", "state", *of_van, "--json").out)["pairs"]
+    assert {p["pair"] for p in found} == {"front-top", "left-top", "top-bumper", "top-corner"}
+    assert max(abs(axis["change"]) for p in found for axis in p["axes"]) < 1e-9
+    out = command(capsys, "state", *of_van).out
+    assert out.startswith(f"van, {LAST}, joint: load bumper, corner, front; keep left at the prior\n")
+    assert f"top -> front: current, 4 days from 2026-03-01 to {LAST}" in out
+    assert f"no usable day; {LAST} refused: nothing to see" in out
+    assert "front-top" not in out
+    assert max(map(len, out.splitlines())) <= 80
+
+
 def test_the_tree_has_the_root_of_the_car_s_own_tf_and_names_what_it_replaces(lake, tmp_path, capsys):
     sensors, *_ = states_of(capsys, lake, "car")
     said, files = export(capsys, lake, "car", "ros2", tmp_path / "out")

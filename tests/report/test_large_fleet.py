@@ -67,23 +67,21 @@ def repeated(window, verdicts, count, rare=25):
     at, on = np.concatenate(rows), np.concatenate(charts)
     owner, chart_owner = (np.repeat(np.arange(count), [len(r) for r in of]) for of in (rows, charts))
     return (
-        replace(
-            picked(window, at, "day", "edge", "status", "T", "sigma", "observable"),
-            vehicles=[name for name, _ in names], owner=owner, work_key=[window.work_key[i] for i in at],
+        picked(
+            window, at, "day", "edge", "status", "T", "sigma", "observable", owner=owner,
+            vehicles=[name for name, _ in names], work_key=[window.work_key[i] for i in at],
         ),
         replace(
             verdicts,
             vehicles=[name for name, _ in names],
             findings={name: [replace(f, vehicle=name) for f in verdicts.findings[kind]] for name, kind in names},
-            charts=replace(
-                picked(verdicts.charts, on, "edge", "dof", "status", "limit", "start"), owner=chart_owner
-            ),
+            charts=picked(verdicts.charts, on, "edge", "dof", "status", "limit", "start", owner=chart_owner),
         ),
     )  # fmt: skip
 
 
-def picked(columns, rows, *names):
-    return replace(columns, **{name: getattr(columns, name)[rows] for name in names})
+def picked(columns, rows, *names, **given):
+    return replace(columns, **{name: getattr(columns, name)[rows] for name in names}, **given)
 
 
 VEHICLES = 10_000
