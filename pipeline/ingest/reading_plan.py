@@ -76,11 +76,9 @@ BurstMotion = Float[np.ndarray, "M 4"]
 
 
 def _motion_of(state: EgoState | None) -> tuple[float, ...]:
-    return (
-        (np.nan,) * 4
-        if state is None
-        else (state.speed_mps, state.yaw_rate_radps, *state.T_odom_vehicle[:2, 3])
-    )
+    if state is None:
+        return (np.nan,) * 4
+    return state.speed_mps, state.yaw_rate_radps, *state.T_odom_vehicle[:2, 3]
 
 
 @dataclass(frozen=True)

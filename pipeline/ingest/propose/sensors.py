@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import takewhile
@@ -132,14 +132,13 @@ def _doppler_of(fields: Sequence[str]) -> tuple[str, ...]:
 
 
 def _find_cameras(survey: Survey, found: FoundSensors) -> None:
-    pictures = dict[str, tuple[Topic, tuple[int, int]]]()
-    labels = dict[str, tuple[Topic, np.ndarray]]()
+    pictures, labels = dict[Topic, tuple[int, int]](), dict[Topic, np.ndarray]()
     for topic in survey.of("image"):
         values = _label_values(topic) if topic.is_a("labels") else None
         if values is not None:
-            labels[topic.name] = topic, values
+            labels[topic] = values
         elif (size := _size_px(topic)) is not None:
-            pictures[topic.name] = topic, size
+            pictures[topic] = size
         else:
             found.passed_over.append(f"{topic.name} (no picture that can be read: depth, or damaged)")
     for info in survey.of("info"):
@@ -149,24 +148,24 @@ def _find_cameras(survey: Survey, found: FoundSensors) -> None:
         elif all(camera.frame_id != other.frame_id for other in found.cameras):
             found.cameras.append(camera)
     of_frame = {c.frame_id: c.image for c in found.cameras}
-    for name, (topic, _) in pictures.items():
+    for topic in pictures:
         image = of_frame.get(topic.frame_id)
         if image is None:
-            found.left_out.setdefault(topic.frame_id, []).append(name)
-        elif image != name:
-            found.passed_over.append(f"{name} (the camera of {image} too)")
+            found.left_out.setdefault(topic.frame_id, []).append(topic.name)
+        elif image != topic.name:
+            found.passed_over.append(f"{topic.name} (the camera of {image} too)")
     found.cameras = [
         _with_semantics(c, found.cameras, labels, survey.of("detections")) for c in found.cameras
     ]
 
 
-def _camera(info: Topic, pictures: dict[str, tuple[Topic, tuple[int, int]]]) -> FoundCamera | None:
+def _camera(info: Topic, pictures: Mapping[Topic, tuple[int, int]]) -> FoundCamera | None:
     """Camera of a CameraInfo: an image of its size and frame with the most similar topic name."""
-    camera = next((c for c in (_intrinsics(m) for m in info.samples) if c is not None), None)
+    camera = next((c for c in map(_intrinsics, info.samples) if c is not None), None)
     if camera is None:
         return None
     size = (camera.width_px, camera.height_px)
-    fitting = [t for t, of_size in pictures.values() if of_size in (size, _VIDEO)]
+    fitting = [t for t, of_size in pictures.items() if of_size in (size, _VIDEO)]
     same = [t for t in fitting if t.frame_id == info.frame_id]
     same = same or [t for t in fitting if _shared(t.name, info.name) > 1]
     if not same:
@@ -174,11 +173,8 @@ def _camera(info: Topic, pictures: dict[str, tuple[Topic, tuple[int, int]]]) -> 
     is_straight = not np.any(camera.D)  # a rectified image has no distortion
 
     def fit(topic: Topic) -> tuple[int, bool, bool]:
-        return (
-            _shared(topic.name, info.name),
-            ("rect" in topic.name) == is_straight,
-            "ompressed" in topic.msgtype,
-        )
+        is_rectified = "rect" in topic.name
+        return _shared(topic.name, info.name), is_rectified == is_straight, "ompressed" in topic.msgtype
 
     image = max(same, key=fit)
     return FoundCamera(image.frame_id, image.name, info.name)
@@ -187,21 +183,20 @@ def _camera(info: Topic, pictures: dict[str, tuple[Topic, tuple[int, int]]]) -> 
 def _with_semantics(
     camera: FoundCamera,
     cameras: Sequence[FoundCamera],
-    labels: dict[str, tuple[Topic, np.ndarray]],
+    labels: Mapping[Topic, np.ndarray],
     detections: Sequence[Topic],
 ) -> FoundCamera:
-    def of(topics: Sequence[Topic]) -> Topic | None:
-        own = [t for t in topics if t.frame_id == camera.frame_id] or ([*topics] if len(cameras) == 1 else [])
-        return max(own, key=lambda t: _shared(t.name, camera.image), default=None)
+    def of(topics: Iterable[Topic]) -> Topic | None:
+        near = [t for t in topics if t.frame_id == camera.frame_id or len(cameras) == 1]
+        return max(
+            near, key=lambda t: (t.frame_id == camera.frame_id, _shared(t.name, camera.image)), default=None
+        )
 
-    label, detection = of([t for t, _ in labels.values()]), of(detections)
-    values = None if label is None else labels[label.name][1]
-    known, say = ("", "") if values is None else _label_set(values)
-    topics = {
-        "labels": "" if label is None else label.name,
-        "detections": detection.name if detection else "",
-    }
-    return replace(camera, label_set=known, labels_say=say, **topics)
+    label, detection = of(labels), of(detections)
+    if label is not None:
+        known, say = _label_set(labels[label])
+        camera = replace(camera, labels=label.name, label_set=known, labels_say=say)
+    return camera if detection is None else replace(camera, detections=detection.name)
 
 
 def _label_set(values: np.ndarray) -> tuple[str, str]:
