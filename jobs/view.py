@@ -76,8 +76,7 @@ def _draw(rig: Rig, shown: Shown, title: str, state: str, out: Path) -> None:
 
     from pipeline.view.draw import render, viewpoint
 
-    cameras = [name for name, kind in rig.kinds.items() if kind == "camera"]
-    place = viewpoint(rig.placed("calibrated"), cameras)
+    place = viewpoint(rig)
     states = ("prior", "calibrated") if state == "both" else (state,)
     size = (1600 // len(states), 900)
     drawn = [

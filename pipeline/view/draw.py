@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -14,7 +14,7 @@ import open3d
 from jaxtyping import Float, UInt8
 from open3d.visualization import rendering
 
-from pipeline.view.layers import Dots, Layer, Name, Picture, Strokes
+from pipeline.view.layers import Dots, Layer, Name, Picture, Rig, Strokes
 
 __all__ = ["BACKGROUND", "VERTICAL_DEG", "add_layers", "quiet_stdout", "render", "viewpoint"]
 
@@ -37,12 +37,11 @@ def quiet_stdout() -> Iterator[None]:
         os.close(kept)
 
 
-def viewpoint(
-    T_car: Mapping[str, Float[np.ndarray, "4 4"]], cameras: Iterable[str]
-) -> tuple[Float[np.ndarray, 3], Float[np.ndarray, 3]]:
+def viewpoint(rig: Rig) -> tuple[Float[np.ndarray, 3], Float[np.ndarray, 3]]:
     """Target and eye of the view: from behind and above, along the mean direction of the cameras, else forward."""
-    looks = [T_car[name][:3, 2] for name in cameras if name in T_car]
-    way = np.array([1.0, 0.0, 0.0]) if not looks else np.mean(looks, axis=0) * [1, 1, 0]
+    T_car = rig.placed("calibrated")
+    looks = [T[:3, 2] for name, T in T_car.items() if rig.kinds[name] == "camera"]
+    way = np.mean(looks or [[1.0, 0.0, 0.0]], axis=0) * [1, 1, 0]
     # Cameras all around look nowhere on the whole.
     way = way / np.linalg.norm(way) if np.linalg.norm(way) > 0.3 else np.array([1.0, 0.0, 0.0])
     middle = np.mean([T[:3, 3] for T in T_car.values()], axis=0)
@@ -56,7 +55,7 @@ def add_layers(scene: Any, layers: Iterable[Layer], parts: Iterable[str], scale:
     wanted = set(parts)
     for number, layer in enumerate(layers):
         if layer.part in wanted and not isinstance(layer, Name):
-            scene.add_geometry(f"{layer.part}-{number}", *_MAKERS[type(layer)](layer, scale))
+            scene.add_geometry(f"{layer.part}-{number}", *_geometry(layer, scale))
 
 
 def render(
@@ -75,17 +74,14 @@ def render(
         add_layers(renderer.scene, layers, {layer.part for layer in layers})
         renderer.setup_camera(VERTICAL_DEG, target, eye, [0, 0, 1])
         image = np.asarray(renderer.render_to_image()).copy()
-        view, projection = (
-            renderer.scene.camera.get_view_matrix(),
-            renderer.scene.camera.get_projection_matrix(),
-        )
+        camera = renderer.scene.camera
+        projection = camera.get_projection_matrix() @ camera.get_view_matrix()
         del renderer
     names = []
-    for layer in layers:
-        if isinstance(layer, Name):
-            u, v, w = (projection @ view @ [*layer.xyz, 1.0])[[0, 1, 3]]
-            if w > 0:
-                names.append((int((1 - v / w) / 2 * height), int((u / w + 1) / 2 * width), layer))
+    for layer in (layer for layer in layers if isinstance(layer, Name)):
+        u, v, w = (projection @ [*layer.xyz, 1.0])[[0, 1, 3]]
+        if w > 0:
+            names.append((int((1 - v / w) / 2 * height), int((u / w + 1) / 2 * width), layer))
     row = 0
     for v, u, layer in sorted(names, key=lambda name: name[:2]):
         row = max(row + _ROW_PX, v - 6)  # below each other, where sensors sit together
@@ -99,46 +95,25 @@ def _write(image: np.ndarray, text: str, at: tuple[int, int], rgb: tuple[int, ..
         cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, colour, thickness, cv2.LINE_AA)
 
 
-def _dots(layer: Dots, scale: float) -> tuple[Any, Any]:
-    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(layer.xyz))
-    cloud.colors = open3d.utility.Vector3dVector(layer.rgb)
-    material = _material("defaultUnlit")
-    material.point_size = layer.size_px * scale
-    return cloud, material
-
-
-def _strokes(layer: Strokes, scale: float) -> tuple[Any, Any]:
-    lines = open3d.geometry.LineSet(
-        open3d.utility.Vector3dVector(layer.ends.reshape(-1, 3)),
-        open3d.utility.Vector2iVector(np.arange(2 * len(layer.ends)).reshape(-1, 2)),
-    )
-    lines.colors = open3d.utility.Vector3dVector(layer.rgb)
-    material = _material("unlitLine")
-    material.line_width = layer.width_px * scale
-    return lines, material
-
-
-def _picture(layer: Picture, _: float) -> tuple[Any, Any]:
-    both = np.concatenate([layer.triangles, layer.triangles[:, ::-1]])  # to be seen from either side
-    mesh = open3d.geometry.TriangleMesh(
-        open3d.utility.Vector3dVector(layer.xyz), open3d.utility.Vector3iVector(both)
-    )
-    mesh.triangle_uvs = open3d.utility.Vector2dVector([0.0, 1.0] + [1.0, -1.0] * layer.uv[both.reshape(-1)])
-    material = _material("defaultUnlit")
-    # The shader takes pictures, not colours of points, for sRGB and makes them linear: undone beforehand.
-    encoded = np.round(255 * (np.arange(256) / 255) ** (1 / 2.2)).astype(np.uint8)
-    material.albedo_img = open3d.geometry.Image(np.ascontiguousarray(encoded[layer.rgb]))
-    return mesh, material
-
-
-def _material(shader: str) -> Any:
-    material = rendering.MaterialRecord()
-    material.shader = shader
-    return material
-
-
-_MAKERS: Mapping[type, Callable[[Any, float], tuple[Any, Any]]] = {
-    Dots: _dots,
-    Strokes: _strokes,
-    Picture: _picture,
-}
+def _geometry(layer: Dots | Strokes | Picture, scale: float) -> tuple[Any, Any]:
+    """A layer's geometry and its material."""
+    points, material = open3d.utility.Vector3dVector, rendering.MaterialRecord()
+    if isinstance(layer, Dots):
+        shape: Any = open3d.geometry.PointCloud(points(layer.xyz))
+        shape.colors = points(layer.rgb)
+        material.shader, material.point_size = "defaultUnlit", layer.size_px * scale
+    elif isinstance(layer, Strokes):
+        ends = open3d.utility.Vector2iVector(np.arange(2 * len(layer.ends)).reshape(-1, 2))
+        shape = open3d.geometry.LineSet(points(layer.ends.reshape(-1, 3)), ends)
+        shape.colors = points(layer.rgb)
+        material.shader, material.line_width = "unlitLine", layer.width_px * scale
+    else:
+        both = np.concatenate([layer.triangles, layer.triangles[:, ::-1]])  # to be seen from either side
+        shape = open3d.geometry.TriangleMesh(points(layer.xyz), open3d.utility.Vector3iVector(both))
+        corners_uv = [0.0, 1.0] + [1.0, -1.0] * layer.uv[both.reshape(-1)]
+        shape.triangle_uvs = open3d.utility.Vector2dVector(corners_uv)
+        # The shader takes pictures, not colours of points, for sRGB and makes them linear: undone beforehand.
+        encoded = np.round(255 * (np.arange(256) / 255) ** (1 / 2.2)).astype(np.uint8)
+        material.shader = "defaultUnlit"
+        material.albedo_img = open3d.geometry.Image(np.ascontiguousarray(encoded[layer.rgb]))
+    return shape, material

@@ -167,7 +167,11 @@ def layers_of(shown: Shown, rig: Rig, T_car: Mapping[str, Float[np.ndarray, "4 4
             layers += _detections(capture, found if isinstance(found, ScanFeatures) else None, T)
     for eye in eyes:
         layers += _frustum(eye)
-    layers += [_axes(T_car)]
+    ends = [
+        np.stack([np.tile(T[:3, 3], (3, 1)), T[:3, 3] + 0.5 * T[:3, :3].T], axis=1) for T in T_car.values()
+    ]
+    # Axes x, y, z of every sensor in red, green, blue.
+    layers.append(Strokes("names", np.concatenate(ends), np.tile(np.eye(3), (len(ends), 1)), 4.0))
     for name in shown.captures:
         if name in T_car:
             words = f"{name} ({rig.status[name]})" if rig.status.get(name) else name
@@ -199,34 +203,24 @@ def _eye(name: str, image: Image, shown: Shown, T_car_camera: np.ndarray) -> _Ey
     return _Eye(name, camera, inverse(T_car_camera), np.ascontiguousarray(bgr[..., ::-1]), users)
 
 
-# -- radar ------------------------------------------------------------------
-
-
 def _detections(scan: Scan, found: ScanFeatures | None, T: Float[np.ndarray, "4 4"]) -> list[Layer]:
     """Detections, with an arrow along the beam for moving ones: over ground if perception has it."""
-    radar = scan.radar_xyz_m.astype(np.float64) if found is None else found.radar_xyz_m.astype(np.float64)
-    speed = (scan.radar_range_rate_mps if found is None else found.radar_residual_mps).astype(np.float64)
+    radar, speed = scan.radar_xyz_m.astype(np.float64), scan.radar_range_rate_mps.astype(np.float64)
     if found is not None:
-        speed = np.where(found.radar_motion == _MOVING, speed, 0.0)
+        radar = found.radar_xyz_m.astype(np.float64)
+        speed = np.where(found.radar_motion == _MOVING, found.radar_residual_mps, 0.0).astype(np.float64)
     xyz = transform_points(T, radar)
     dots = Dots("radar", xyz, np.broadcast_to(COLOURS["radar"], xyz.shape).copy(), 4.0)
     moves = np.abs(speed) > _SLOWEST_MPS
     beam = radar[moves] / np.maximum(np.linalg.norm(radar[moves], axis=1, keepdims=True), 1e-9)
     way = (beam * speed[moves, None] * _ARROW_S) @ T[:3, :3].T
     rgb = np.where(speed[moves, None] < 0, _APPROACHING, _RECEDING)
-    return [dots, Strokes("radar", *_arrows(xyz[moves], way, rgb), 3.0)]
+    # Shafts with two horizontal barbs each.
+    tip, aside = xyz[moves] + way, np.cross(way, [0.0, 0.0, 1.0])
+    ends = [xyz[moves], *(tip - 0.25 * way + sign * 0.15 * aside for sign in (-1, 1))]
+    arrows = np.stack([np.concatenate(ends), np.tile(tip, (3, 1))], axis=1)
+    return [dots, Strokes("radar", arrows, np.tile(rgb, (3, 1)), 3.0)]
 
-
-def _arrows(
-    start: Float[np.ndarray, "N 3"], way: Float[np.ndarray, "N 3"], rgb: Float[np.ndarray, "N 3"]
-) -> tuple[Float[np.ndarray, "M 2 3"], Float[np.ndarray, "M 3"]]:
-    """Horizontal shafts with two barbs each."""
-    tip, aside = start + way, np.cross(way, [0.0, 0.0, 1.0])
-    barbs = [np.stack([tip, tip - 0.25 * way + sign * 0.15 * aside], axis=1) for sign in (-1, 1)]
-    return np.concatenate([np.stack([start, tip], axis=1), *barbs]), np.tile(rgb, (3, 1))
-
-
-# -- lidar ------------------------------------------------------------------
 
 _CORNERS = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)], bool)
 _EDGES = np.array([(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b).bit_count() == 1])
@@ -258,9 +252,8 @@ def _frustum(eye: _Eye) -> list[Layer]:
     number = np.arange((_GRID + 1) ** 2).reshape(_GRID + 1, _GRID + 1)
     a, b, c, d = (n.reshape(-1) for n in (number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]))
     triangles = np.concatenate([np.stack([a, c, b], 1), np.stack([b, c, d], 1)])
-    triangles = triangles[
-        np.isfinite(xyz[triangles]).all(axis=(1, 2))
-    ]  # pixels that no ray of the lens meets
+    # Without pixels that no ray of the lens meets.
+    triangles = triangles[np.isfinite(xyz[triangles]).all(axis=(1, 2))]
     rgb = eye.rgb.copy()
     for box in eye.users_px.round().astype(int).tolist():
         colour = tuple(round(255 * c) for c in _ROAD_USER)
@@ -268,18 +261,10 @@ def _frustum(eye: _Eye) -> list[Layer]:
     picture = Picture("cameras", np.nan_to_num(xyz), at.reshape(-1, 2), triangles, rgb)
     border = xyz[np.concatenate([number[0, :-1], number[:-1, -1], number[-1, :0:-1], number[:0:-1, 0]])]
     origin = inverse(eye.T_camera_car)[:3, 3]
-    sides = [np.stack([np.broadcast_to(origin, (4, 3)), border[::_GRID]], axis=1)]
-    ends = np.concatenate([*sides, np.stack([border, np.roll(border, -1, axis=0)], axis=1)])
+    sides = np.stack([np.broadcast_to(origin, (4, 3)), border[::_GRID]], axis=1)
+    ends = np.concatenate([sides, np.stack([border, np.roll(border, -1, axis=0)], axis=1)])
     ends = ends[np.isfinite(ends).all(axis=(1, 2))]
     return [picture, Strokes("cameras", ends, np.tile(COLOURS["camera"], (len(ends), 1)), 2.0)]
-
-
-def _axes(T_car: Mapping[str, Float[np.ndarray, "4 4"]]) -> Strokes:
-    """Axes x, y, z of every sensor in red, green, blue."""
-    ends = [
-        np.stack([np.tile(T[:3, 3], (3, 1)), T[:3, 3] + 0.5 * T[:3, :3].T], axis=1) for T in T_car.values()
-    ]
-    return Strokes("names", np.concatenate(ends), np.tile(np.eye(3), (len(ends), 1)), 4.0)
 
 
 def count_moments(lake: Lake, partition: Partition) -> int:

@@ -36,9 +36,8 @@ class Viewer:
         self.window.set_on_layout(self._lay_out)
         self.window.set_on_key(self.press)
         self._draw()
-        T, cameras = rig.placed(self.state), [n for n, kind in rig.kinds.items() if kind == "camera"]
         self._scene.setup_camera(VERTICAL_DEG, self._scene.scene.bounding_box, np.zeros(3))
-        self._scene.look_at(*viewpoint(T, cameras), [0, 0, 1])
+        self._scene.look_at(*viewpoint(rig), [0, 0, 1])
 
     def press(self, event: Any) -> bool:
         """Space: switch between prior and calibrated; left, right: previous, next moment. True for these keys."""

@@ -35,20 +35,24 @@ WHAT = {
 }
 
 
+def frames_in(folder, name, *options):
+    """Logs that convert writes of a folder's data, and the frames that ingest makes of them."""
+    call = ["convert", name, str(folder / "data"), "--out", str(folder), "--day", "2021-05-04"]
+    assert main([*call, *options]) == 0
+    vehicle, day, _ = WHAT[name]
+    logs = sorted(map(str, (folder / "logs" / vehicle / day).iterdir()))
+    about = ["--fleet", f"{folder}/fleet.toml", "--lake", f"{folder}/lake"]
+    assert main(["ingest", *logs, *about, "--vehicle", vehicle, "--day", day]) == 0
+    return logs, list(frames_of(Lake.at(folder / "lake"), Partition(vehicle, day)))
+
+
 @pytest.fixture(scope="module", params=MAKERS)
 def converted(request, tmp_path_factory):
-    """Name, folder of what convert wrote, and the frames that ingest made of it."""
+    """Name, folder of what convert wrote, its logs, and the frames that ingest made of it."""
     name, folder = request.param, tmp_path_factory.mktemp(request.param)
     MAKERS[name](folder / "data")
-    call = ["convert", name, str(folder / "data"), "--out", str(folder / "out"), "--day", "2021-05-04"]
-    call += ["--camera", "CAM_FRONT"] if name == "nuscenes" else []
-    assert main(call) == 0
-    vehicle, day, _ = WHAT[name]
-    logs = sorted(map(str, (folder / "out" / "logs" / vehicle / day).iterdir()))
-    lake = folder / "lake"
-    about = ["--fleet", str(folder / "out" / "fleet.toml"), "--lake", str(lake)]
-    assert main(["ingest", *logs, *about, "--vehicle", vehicle, "--day", day]) == 0
-    return name, folder, logs, list(frames_of(Lake.at(lake), Partition(vehicle, day)))
+    options = ["--camera", "CAM_FRONT"] if name == "nuscenes" else []
+    return name, folder, *frames_in(folder, name, *options)
 
 
 def test_every_frame_of_the_data_set_becomes_a_trio(converted):
@@ -63,14 +67,8 @@ def test_every_frame_of_the_data_set_becomes_a_trio(converted):
 def test_a_folder_of_kitti_s_own_without_a_radar_becomes_a_rig_of_camera_and_lidar(tmp_path):
     data_sets.kitti(tmp_path / "data")
     shutil.rmtree(tmp_path / "data" / "radar")
-    assert main(["convert", "kitti", str(tmp_path / "data"), "--out", str(tmp_path), "--vehicle", "k"]) == 0
-    fleet = load_fleet(tmp_path / "fleet.toml")
-    assert fleet.rigs["default"].sensors == ("camera", "lidar")
-    logs = [str(p) for p in (tmp_path / "logs" / "k" / "2000-01-01").iterdir()]
-    lake = tmp_path / "lake"
-    about = ["--fleet", str(tmp_path / "fleet.toml"), "--lake", str(lake), "--vehicle", "k"]
-    assert main(["ingest", *logs, *about, "--day", "2000-01-01"]) == 0
-    frames = list(frames_of(Lake.at(lake), Partition("k", "2000-01-01")))
+    _, frames = frames_in(tmp_path, "kitti")
+    assert load_fleet(tmp_path / "fleet.toml").rigs["default"].sensors == ("camera", "lidar")
     assert len(frames) == WHAT["kitti"][2]
     assert all(f.sensors == ["camera", "lidar"] and not len(f.radar_x_m) for f in frames)
     wanted = np.linalg.inv(T_BASE_CAMERA) @ T_BASE_LIDAR
@@ -79,13 +77,11 @@ def test_a_folder_of_kitti_s_own_without_a_radar_becomes_a_rig_of_camera_and_lid
 
 def test_sensors_are_where_the_data_set_says(converted):
     _, _, _, frames = converted
-    wanted = {
-        "camera_lidar": np.linalg.inv(T_BASE_CAMERA) @ T_BASE_LIDAR,
-        "lidar_radar": np.linalg.inv(T_BASE_LIDAR) @ T_BASE_RADAR,
-    }
-    for pair, T in wanted.items():
-        found = frames[0].priors[pair]
-        np.testing.assert_allclose(found, T, atol=1e-9, err_msg=pair)
+    for pair, one, other in (
+        ("camera_lidar", T_BASE_CAMERA, T_BASE_LIDAR),
+        ("lidar_radar", T_BASE_LIDAR, T_BASE_RADAR),
+    ):
+        np.testing.assert_allclose(frames[0].priors[pair], np.linalg.inv(one) @ other, atol=1e-9)
 
 
 def test_points_are_in_front_of_the_car_and_what_stands_still_comes_nearer(converted):
@@ -115,7 +111,7 @@ def test_the_car_drives_as_its_poses_say(converted):
 
 def test_check_finds_every_topic_but_semantics_and_has_no_complaint_about_the_radar(converted, capsys):
     _, folder, logs, _ = converted
-    assert main(["check", str(folder / "out" / "fleet.toml"), *logs, "--json"]) in (1, 2)
+    assert main(["check", str(folder / "fleet.toml"), *logs, "--json"]) in (1, 2)
     report = json.loads(capsys.readouterr().out)
     problems = {t["role"]: t["problem"] for t in report["topics"]}
     assert {role for role, problem in problems.items() if problem} == {"labels", "detections"}
@@ -124,11 +120,7 @@ def test_check_finds_every_topic_but_semantics_and_has_no_complaint_about_the_ra
 
 def test_a_jump_of_the_poses_begins_another_drive(tmp_path):
     data_sets.view_of_delft(tmp_path / "data", frames=8, jump_at=5)
-    assert main(["convert", "vod", str(tmp_path / "data"), "--out", str(tmp_path)]) == 0
-    about = ["--fleet", str(tmp_path / "fleet.toml"), "--lake", str(tmp_path / "lake"), "--vehicle", "vod"]
-    log = next((tmp_path / "logs").rglob("*.mcap"))
-    assert main(["ingest", str(log), *about, "--day", "2000-01-01"]) == 0
-    frames = list(frames_of(Lake.at(tmp_path / "lake"), Partition("vod", "2000-01-01")))
+    _, frames = frames_in(tmp_path, "vod")
     assert [f.drive for f in frames] == [0] * 5 + [1] * 3
     np.testing.assert_allclose([f.ego_speed_mps for f in frames], SPEED_MPS, atol=1e-3)
 
@@ -142,7 +134,7 @@ def test_a_jump_of_the_poses_begins_another_drive(tmp_path):
             "nuscenes",
             "v1.0-mini/sample_data.json",
             b'[{"token": "a"}]',
-            "sample_data.json: calibrated_sensor_token",
+            "sample_data.json: calibrated_sensor",
         ),
         ("nuscenes", "samples/LIDAR_TOP/0.pcd.bin", b"123", "0.pcd.bin: 3 bytes are not rows of 5 float32"),
         ("nuscenes", "samples/RADAR_FRONT/0.pcd", b"FIELDS x\n", "0.pcd: not a readable PCD"),
@@ -202,8 +194,6 @@ def test_models_are_named_in_fleet_toml_and_a_radar_without_doppler_is_refused(t
     assert "lacks doppler" in capsys.readouterr().out
     assert main([*call, "--segmenter", "s.toml"]) == 2
     assert main([*call, "--segmenter", "s.toml", "--detector", "d.toml", "--vehicle", 'the "red" one']) == 0
-    from pipeline.core.config import load_fleet
-
     fleet = load_fleet(tmp_path / "fleet.toml")
     assert fleet.rigs["default"].camera.semantics.segmenter == "s.toml"
     assert list(fleet.vehicles) == ['the "red" one']

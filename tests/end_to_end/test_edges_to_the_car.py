@@ -40,14 +40,10 @@ def calibrated(made, folder, sensors, *, turned=(), off=None):
     out, truth = made
     fleet = load_fleet(out / "fleet.toml")
     rig = fleet.rigs["duo"]
-    other = {"receding": "approaching", "approaching": "receding"}
-    radars = {
-        name: radar.model_copy(update={"doppler_positive": other[radar.doppler_positive]})
-        if name in turned
-        else radar
-        for name, radar in rig.radars.items()
-    }
-    lidars = {name: lidar for name, lidar in rig.lidars.items() if name in sensors}
+    radars, lidars = dict(rig.radars), {name: of for name, of in rig.lidars.items() if name in sensors}
+    for name in turned:
+        other = {"receding": "approaching", "approaching": "receding"}[radars[name].doppler_positive]
+        radars[name] = radars[name].model_copy(update={"doppler_positive": other})
     changes = {"cameras": {}, "lidars": lidars, "radars": radars, "reference": sensors[0]}
     if off is not None:
         path = folder / "prior.json"

@@ -15,6 +15,7 @@ from pipeline.rig.topics import TOPICS
 from pipeline.simulate.fleet import FleetSpec
 from tests.conftest import SHARED
 from tests.makers import data_sets
+from tests.makers.commands import command
 from tests.makers.kept_days import kept_fleet
 from tests.makers.real_models import write_real_manifests
 
@@ -53,11 +54,9 @@ def shared(name):
 
 def said(capsys, *arguments, codes=(0,)):
     """What a command prints: its summary, or the list that `--json` asks for."""
-    capsys.readouterr()
-    code = main(list(arguments))
-    out = capsys.readouterr().out
-    assert code in codes, out
-    return json.loads(out if "--json" in arguments else out.splitlines()[-1])
+    told = command(capsys, *arguments)
+    assert told.code in codes, told.out
+    return json.loads(told.out) if "--json" in arguments else told.summary
 
 
 def simulated(folder):
@@ -91,10 +90,11 @@ def kitti(folder):
 
 
 LOGS = {make.__name__: make for make in (simulated, real_car, other_world, nuscenes, kitti)}
+THREE = {"camera_lidar", "camera_radar", "lidar_radar"}
 PAIRS = {
-    "simulated": {"camera_lidar", "camera_radar", "lidar_radar"},
-    "real_car": {"camera_lidar", "camera_radar", "lidar_radar"},
-    "other_world": {"camera_lidar", "camera_radar", "lidar_radar"},
+    "simulated": THREE,
+    "real_car": THREE,
+    "other_world": THREE,
     # Its cameras have no labels, so their borders are steps of brightness; its radar sees no clusters.
     "nuscenes": {"camera_lidar", "lidar_base", "radar_base"},
     "kitti": {"camera_lidar"},  # it has no radar
@@ -122,9 +122,8 @@ def test_logs_alone_lead_to_a_record(name, tmp_path, monkeypatch, capsys):
 def frames_reach_a_torch_loader(capsys):
     """With --force: camera-lidar of twelve frames is held, and the camera would be left out."""
     call = ["export", "frames", "--fleet", "fleet.toml", "--lake", "lake", "--out", "frames"]
-    card = said(
-        capsys, *call, "--format", "parquet", "--calibration", "day", "--force", "--unsplit", codes=(0, 3)
-    )
+    call += ["--format", "parquet", "--calibration", "day", "--force", "--unsplit"]
+    card = said(capsys, *call, codes=(0, 3))
     frames = Frames("frames", "train")
     batch = next(iter(DataLoader(frames, batch_size=2, collate_fn=list)))
     assert len(frames) == card["frames"]["train"] > 2

@@ -14,16 +14,7 @@ from mcap_protobuf.schema import build_file_descriptor_set
 from tests.makers.written_logs import Kit
 
 # sensor_msgs/PointField's datatype -> PackedElementField.NumericType
-_NUMBERS = {
-    1: "INT8",
-    2: "UINT8",
-    3: "INT16",
-    4: "UINT16",
-    5: "INT32",
-    6: "UINT32",
-    7: "FLOAT32",
-    8: "FLOAT64",
-}
+_NUMBERS = ("", "INT8", "UINT8", "INT16", "UINT16", "INT32", "UINT32", "FLOAT32", "FLOAT64")
 
 
 def schema(name: str) -> Any:
@@ -61,19 +52,20 @@ def write(kit: Kit, path: Path, translate: Any = foxglove) -> Path:
         channels: dict[tuple[str, str], int] = {}
         for topic, kind, log_time, message in kit.messages:
             said = translate(message)
-            is_ros = hasattr(said, "__msgtype__")
-            name = kind if is_ros else said.DESCRIPTOR.full_name
+            if hasattr(said, "__msgtype__"):
+                name, encodings = kind, ("ros2msg", "cdr")
+                data = bytes(kit.store.serialize_cdr(said, kind))
+            else:
+                name, encodings, data = said.DESCRIPTOR.full_name, ("protobuf",) * 2, said.SerializeToString()
             if (topic, name) not in channels:
+                is_ros = encodings[1] == "cdr"
                 text = (
                     kit.store.generate_msgdef(kind, ros_version=2)[0].encode()
                     if is_ros
                     else descriptors(said)
                 )
-                number = writer.register_schema(name, "ros2msg" if is_ros else "protobuf", text)
-                channels[topic, name] = writer.register_channel(
-                    topic, "cdr" if is_ros else "protobuf", number
-                )
-            data = bytes(kit.store.serialize_cdr(said, kind)) if is_ros else said.SerializeToString()
+                number = writer.register_schema(name, encodings[0], text)
+                channels[topic, name] = writer.register_channel(topic, encodings[1], number)
             writer.add_message(channels[topic, name], log_time, data, log_time)
         writer.finish()
     return path

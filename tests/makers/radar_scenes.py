@@ -52,23 +52,14 @@ def _street(rng: np.random.Generator, o: Observation, dt_s: float, elevation: bo
     rate = rng.uniform(3, 9, 3)
     movers = []
     for centre, over_ground in zip(cars[moving], rate, strict=True):
-        p = transform_points(inverse(T_LIDAR_RADAR), centre + rng.normal(0, 0.4, (6, 3)) * [1, 1, 0.5])
+        p = _echoes(rng, centre)
         u = p / np.linalg.norm(p, axis=1, keepdims=True)
-        relative = (over_ground - u @ velocity)[:, None] * u
-        movers.append(_measure(rng, p + relative * tau))
-    parked = [
-        _measure(
-            rng,
-            transform_points(inverse(T_LIDAR_RADAR), c + rng.normal(0, 0.4, (6, 3)) * [1, 1, 0.5])
-            - velocity * tau,
-        )
-        for c in cars[~moving]
-    ]
+        movers.append(_measure(rng, p + (over_ground - u @ velocity)[:, None] * u * tau))
+    parked = [_measure(rng, _echoes(rng, centre) - velocity * tau) for centre in cars[~moving]]
     clutter = _measure(rng, from_spherical(rng.uniform([-0.9, -0.1, 4], [0.9, 0.1, 50], (40, 3))))
     radar = np.concatenate([static, *parked, clutter, *movers])
     if not elevation:
-        flat = to_spherical(radar) * [1, 0, 1]
-        radar = from_spherical(flat)
+        radar = from_spherical(to_spherical(radar) * [1, 0, 1])
     n = len(radar) - 18
     boxes, inside = _boxes(cars)
     return {
@@ -97,6 +88,11 @@ def _measure(rng: np.random.Generator, points_radar: np.ndarray) -> np.ndarray:
     return from_spherical(to_spherical(points_radar) + rng.normal(size=(len(points_radar), 3)) * SIGMA)
 
 
+def _echoes(rng: np.random.Generator, car: np.ndarray) -> np.ndarray:
+    """Where six echoes of a car come from, radar frame."""
+    return transform_points(inverse(T_LIDAR_RADAR), car + rng.normal(0, 0.4, (6, 3)) * [1, 1, 0.5])
+
+
 def _poles(rng: np.random.Generator) -> np.ndarray:
     foot = np.stack([rng.uniform(5, 45, 14), rng.choice([-1, 1], 14) * rng.uniform(5, 12, 14)], -1)
     heights = np.arange(GROUND_M, 2.5, 0.25)
@@ -112,10 +108,8 @@ def _fronts(rng: np.random.Generator) -> np.ndarray:
             length, offset = rng.uniform(4, 9), side * rng.uniform(10, 15)
             x = rng.uniform(start, start + length, 120)
             pieces.append(np.column_stack([x, np.full(120, offset), rng.uniform(GROUND_M, 2.3, 120)]))
-            depth = rng.uniform(0, 4, 60)
-            pieces.append(
-                np.column_stack([np.full(60, start), offset + side * depth, rng.uniform(GROUND_M, 2.3, 60)])
-            )
+            y = offset + side * rng.uniform(0, 4, 60)
+            pieces.append(np.column_stack([np.full(60, start), y, rng.uniform(GROUND_M, 2.3, 60)]))
             start += length + rng.uniform(1, 4)
     return np.concatenate(pieces)
 

@@ -59,14 +59,21 @@ def rig_records(vehicle, days, rng, *, motion=lambda _day: {}, edges=EDGES):
 
 def record_of(vehicle, day, edge, T):
     return CalibrationRecord(
-        vehicle=vehicle, day=(FIRST_DAY + dt.timedelta(days=day)).isoformat(), method="joint", pair=edge.kind,
-        parent_frame=edge.parent.name, child_frame=edge.child.name, status="accepted", reason="", seed=0,
-        code_version="0.11.0", work_key=f"{vehicle}-{day}", frames_total=120, frames_used=80, environment="urban",
-        **pose_columns(T), **pose_columns(T_of(edge), "prior_"),
-        prior_covariance=np.diag([np.radians(2.0) ** 2] * 3 + [0.05**2] * 3), covariance=covariance_of(edge),
-        common_covariance=0.1 * covariance_of(edge), observability=[0.97] * 6, observable=[True] * 6,
-        determined=["azimuth", "elevation"],
+        pair=edge.kind, parent_frame=edge.parent.name, child_frame=edge.child.name, seed=0, frames_total=120,
+        frames_used=80, environment="urban", observability=[0.97] * 6, covariance=covariance_of(edge),
+        common_covariance=0.1 * covariance_of(edge), **_about(vehicle, day, T, T_of(edge)),
     )  # fmt: skip
+
+
+def _about(vehicle, day, T, T_prior):
+    """Columns that records and poses have in common."""
+    return {
+        "vehicle": vehicle, "day": (FIRST_DAY + dt.timedelta(days=day)).isoformat(), "method": "joint",
+        "status": "accepted", "reason": "", "code_version": "0.11.0", "work_key": f"{vehicle}-{day}",
+        "observable": [True] * 6, "determined": ["azimuth", "elevation"],
+        "prior_covariance": np.diag([np.radians(2.0) ** 2] * 3 + [0.05**2] * 3),
+        **pose_columns(T), **pose_columns(T_prior, "prior_"),
+    }  # fmt: skip
 
 
 def _noise(edge, rng):
@@ -89,16 +96,9 @@ def pose_rows(vehicle, days, rng, *, motion=lambda _day: {}, reference="top", **
             T = inverse(moved[reference]) @ moved[name]
             if name != reference:
                 T = exp_se3(np.sqrt(0.9) * POSE_SIGMA * rng.normal(size=6)) @ T
-            prior = inverse(T_TOP[reference]) @ T_TOP[name]
-            is_other = float(name != reference)
-            own = {
-                "vehicle": vehicle, "day": (FIRST_DAY + dt.timedelta(days=day)).isoformat(), "method": "joint",
-                "sensor": name, "kind": kind, "reference": reference, "status": "accepted", "reason": "",
-                "code_version": "0.11.0", "work_key": f"{vehicle}-{day}", "observable": [True] * 6,
-                "determined": ["azimuth", "elevation"], "covariance": is_other * np.diag(POSE_SIGMA**2),
-                "common_covariance": is_other * 0.1 * np.diag(POSE_SIGMA**2),
-                **pose_columns(T), **pose_columns(prior, "prior_"),
-                "prior_covariance": np.diag([np.radians(2.0) ** 2] * 3 + [0.05**2] * 3),
-            }  # fmt: skip
+            covariance = float(name != reference) * np.diag(POSE_SIGMA**2)
+            own = _about(vehicle, day, T, inverse(T_TOP[reference]) @ T_TOP[name])
+            own |= {"sensor": name, "kind": kind, "reference": reference}
+            own |= {"covariance": covariance, "common_covariance": 0.1 * covariance}
             rows.append(PoseRow(**own | columns | of_one.get((day, name), {})))
     return rows

@@ -98,13 +98,10 @@ def make_value(column, rng, free):
 
 def same(a, b):
     """Two rows are the same, field by field."""
-    for name, value in vars(a).items():
-        other = getattr(b, name)
-        if isinstance(value, np.ndarray):
-            if not (
-                isinstance(other, np.ndarray) and value.dtype == other.dtype and np.array_equal(value, other)
-            ):
-                return False
-        elif value != other:
-            return False
-    return True
+    return all(_equal(value, getattr(b, name)) for name, value in vars(a).items())
+
+
+def _equal(a, b):
+    if not isinstance(a, np.ndarray):
+        return a == b
+    return isinstance(b, np.ndarray) and a.dtype == b.dtype and np.array_equal(a, b)

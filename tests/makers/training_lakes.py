@@ -17,17 +17,10 @@ from schemas.frames import Frame
 from schemas.observations import Observation
 from schemas.training import TrainingRow
 from tests.makers import solve_scenes
+from tests.makers.fleet_files import THREE_SENSORS
 from tests.makers.lakes import write_frames, write_observations
 from tests.makers.stages import prepare_day
 
-TOPICS = {
-    "camera": {
-        "image": "/image", "info": "/info",
-        "semantics": {"source": "topics", "labels": "/labels", "detections": "/detections"},
-    },
-    "lidar": {"points": "/lidar"},
-    "radar": {"points": "/radar"},
-}  # fmt: skip
 SMALL = {
     "lidar_points": 1024, "edge_points": 128,
     "grid": {"width_deg": 51.2, "height_deg": 25.6},
@@ -44,7 +37,7 @@ def fleet_of(vehicles, grid=None, **prepare) -> FleetConfig:
     return FleetConfig.model_validate(
         {
             "fleet": {"name": "tests"},
-            "rigs": {"default": TOPICS},
+            "rigs": {"default": THREE_SENSORS},
             "vehicles": {v: {"rig": "default"} for v in vehicles},
             "prepare": SMALL | points | {"split": split, "grid": SMALL["grid"] | (grid or {})},
         }

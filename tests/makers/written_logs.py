@@ -23,7 +23,10 @@ IMAGE, INFO, LIDAR, RADAR = "/camera/image", "/camera/info", "/lidar/points", "/
 LABELS, DETECTIONS, ODOMETRY = "/perception/labels", "/perception/detections", "/odometry"
 WIDTH, HEIGHT = 96, 64
 _DATATYPE = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
-_NEW_DETECTIONS = {
+_DETECTIONS = {
+    "vision_msgs/msg/Detection2DArray": "std_msgs/Header header\nvision_msgs/Detection2D[] detections\n"
+}
+_NEW_DETECTIONS = _DETECTIONS | {
     "vision_msgs/msg/Point2D": "float64 x\nfloat64 y\n",
     "vision_msgs/msg/Pose2D": "vision_msgs/Point2D position\nfloat64 theta\n",
     "vision_msgs/msg/BoundingBox2D": "vision_msgs/Pose2D center\nfloat64 size_x\nfloat64 size_y\n",
@@ -35,9 +38,8 @@ _NEW_DETECTIONS = {
         "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
         "vision_msgs/BoundingBox2D bbox\nstring id\n"
     ),
-    "vision_msgs/msg/Detection2DArray": "std_msgs/Header header\nvision_msgs/Detection2D[] detections\n",
 }
-_OLD_DETECTIONS = {
+_OLD_DETECTIONS = _DETECTIONS | {
     "vision_msgs/msg/BoundingBox2D": "geometry_msgs/Pose2D center\nfloat64 size_x\nfloat64 size_y\n",
     "vision_msgs/msg/ObjectHypothesisWithPose": (
         "string id\nfloat64 score\ngeometry_msgs/PoseWithCovariance pose\n"
@@ -46,28 +48,18 @@ _OLD_DETECTIONS = {
         "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
         "vision_msgs/BoundingBox2D bbox\n"
     ),
-    "vision_msgs/msg/Detection2DArray": "std_msgs/Header header\nvision_msgs/Detection2D[] detections\n",
 }
 _RADAR = {
     "radar_msgs/msg/RadarReturn": (
         "float32 range\nfloat32 azimuth\nfloat32 elevation\nfloat32 doppler_velocity\nfloat32 amplitude\n"
     ),
     "radar_msgs/msg/RadarScan": "std_msgs/Header header\nradar_msgs/RadarReturn[] returns\n",
-}
-_NEW_TRACKS = {
-    "radar_msgs/msg/RadarTrack": (
-        "unique_identifier_msgs/UUID uuid\ngeometry_msgs/Point position\ngeometry_msgs/Vector3 velocity\n"
-        "geometry_msgs/Vector3 acceleration\ngeometry_msgs/Vector3 size\nuint16 classification\n"
-    ),
     "radar_msgs/msg/RadarTracks": "std_msgs/Header header\nradar_msgs/RadarTrack[] tracks\n",
 }
-_OLD_TRACKS = {
-    "radar_msgs/msg/RadarTrack": (
-        "uint16 track_id\ngeometry_msgs/Point position\ngeometry_msgs/Vector3 velocity\n"
-        "geometry_msgs/Vector3 acceleration\ngeometry_msgs/Vector3 size\nstring classification\n"
-    ),
-    "radar_msgs/msg/RadarTracks": "std_msgs/Header header\nradar_msgs/RadarTrack[] tracks\n",
-}
+_TRACK = (
+    "{}\ngeometry_msgs/Point position\ngeometry_msgs/Vector3 velocity\n"
+    "geometry_msgs/Vector3 acceleration\ngeometry_msgs/Vector3 size\n{} classification\n"
+)
 
 
 @dataclass
@@ -83,13 +75,13 @@ class Kit:
         self.store = get_typestore(Stores.ROS2_HUMBLE if self.ros == 2 else Stores.ROS1_NOETIC)
         for name in [n for n in self.store.fielddefs if n.startswith(("vision_msgs/", "radar_msgs/"))]:
             del self.store.fielddefs[name]
-        detections, tracks = (
-            (_OLD_DETECTIONS, _OLD_TRACKS) if self.old_types else (_NEW_DETECTIONS, _NEW_TRACKS)
-        )
+        types = _RADAR | (_OLD_DETECTIONS if self.old_types else _NEW_DETECTIONS)
+        is_old = self.old_types or self.ros == 1  # rosbags' ROS 1 store lacks UUID and tf2
+        track = ("uint16 track_id", "string") if is_old else ("unique_identifier_msgs/UUID uuid", "uint16")
+        types["radar_msgs/msg/RadarTrack"] = _TRACK.format(*track)
         if self.ros == 1:
-            tracks = _OLD_TRACKS  # rosbags' ROS 1 store lacks UUID and tf2
-            tracks |= {"tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n"}
-        for name, text in {**detections, **_RADAR, **tracks}.items():
+            types["tf2_msgs/msg/TFMessage"] = "geometry_msgs/TransformStamped[] transforms\n"
+        for name, text in types.items():
             self.store.register(get_types_from_msg(text, name))
 
     # -- messages ------------------------------------------------------------
@@ -102,6 +94,9 @@ class Kit:
         sequence = {"seq": 0} if self.ros == 1 else {}
         return self.new("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id, **sequence)
 
+    def stamped(self, kind: str, stamp_ns: int, frame_id: str, **fields: Any) -> Any:
+        return self.new(kind, header=self.header(stamp_ns, frame_id), **fields)
+
     def vector(self, kind: str, x: float, y: float, z: float) -> Any:
         return self.new(f"geometry_msgs/msg/{kind}", x=float(x), y=float(y), z=float(z))
 
@@ -111,26 +106,17 @@ class Kit:
     def compressed(
         self, stamp_ns: int, data: bytes, form: str = "jpeg", frame_id: str = "camera_optical"
     ) -> Any:
-        array = np.frombuffer(data, np.uint8)
-        return self.new(
-            "sensor_msgs/msg/CompressedImage", header=self.header(stamp_ns, frame_id), format=form, data=array
-        )
+        kind, array = "sensor_msgs/msg/CompressedImage", np.frombuffer(data, np.uint8)
+        return self.stamped(kind, stamp_ns, frame_id, format=form, data=array)
 
     def image(self, stamp_ns: int, pixels: np.ndarray, encoding: str, step: int | None = None) -> Any:
         height, width = pixels.shape[:2]
         rows = np.ascontiguousarray(pixels).view(np.uint8).reshape(height, -1)
         if step is not None:
             rows = np.pad(rows, ((0, 0), (0, step - rows.shape[1])), constant_values=77)
-        return self.new(
-            "sensor_msgs/msg/Image",
-            header=self.header(stamp_ns, "camera_optical"),
-            height=height,
-            width=width,
-            encoding=encoding,
-            is_bigendian=0,
-            step=rows.shape[1],
-            data=rows.reshape(-1),
-        )
+        size = {"height": height, "width": width, "step": rows.shape[1]}
+        data = {"encoding": encoding, "is_bigendian": 0, "data": rows.reshape(-1)}
+        return self.stamped("sensor_msgs/msg/Image", stamp_ns, "camera_optical", **size, **data)
 
     def info(
         self, stamp_ns: int, focal_px: float = 80.0, model: str = "plumb_bob", D: Any = (0.0,) * 5
@@ -138,23 +124,13 @@ class Kit:
         K = np.array(
             [focal_px, 0, WIDTH / 2, 0, focal_px, HEIGHT / 2, 0, 0, 1 if focal_px else 0], np.float64
         )
-        P = np.zeros(12)
-        roi = self.new(
-            "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
-        )
-        names = ("d", "k", "r", "p") if self.ros == 2 else ("D", "K", "R", "P")
-        arrays = dict(zip(names, (np.array(D, np.float64), K, np.eye(3).reshape(-1), P), strict=True))
-        return self.new(
-            "sensor_msgs/msg/CameraInfo",
-            header=self.header(stamp_ns, "camera_optical"),
-            height=HEIGHT,
-            width=WIDTH,
-            distortion_model=model,
-            binning_x=0,
-            binning_y=0,
-            roi=roi,
-            **arrays,
-        )
+        none = dict.fromkeys(("x_offset", "y_offset", "height", "width"), 0)
+        roi = self.new("sensor_msgs/msg/RegionOfInterest", do_rectify=False, **none)
+        arrays = (np.array(D, np.float64), K, np.eye(3).reshape(-1), np.zeros(12))
+        fields = dict(zip("dkrp" if self.ros == 2 else "DKRP", arrays, strict=True))
+        fields |= {"height": HEIGHT, "width": WIDTH, "distortion_model": model, "roi": roi}
+        kind = "sensor_msgs/msg/CameraInfo"
+        return self.stamped(kind, stamp_ns, "camera_optical", binning_x=0, binning_y=0, **fields)
 
     def cloud(
         self,
@@ -169,27 +145,16 @@ class Kit:
         counts: dict[str, int] | None = None,
     ) -> Any:
         """A PointCloud2 of these columns in this order; dtypes are the columns' own."""
-        order, counts, offset, fields, names = ">" if big_endian else "<", counts or {}, padding, [], []
+        order, counts, offset, fields, formats = ">" if big_endian else "<", counts or {}, padding, [], []
         for name, values in columns.items():
             code = values.dtype.str[1:]
-            fields.append(
-                self.new(
-                    "sensor_msgs/msg/PointField",
-                    name=name,
-                    offset=offset,
-                    datatype=_DATATYPE[code],
-                    count=counts.get(name, 1),
-                )
-            )
-            names.append((name, order + code, offset, values.shape[1:]))
+            about = {"name": name, "offset": offset, "datatype": _DATATYPE[code]}
+            fields.append(self.new("sensor_msgs/msg/PointField", count=counts.get(name, 1), **about))
+            formats.append((order + code, values.shape[1:]))
             offset += values.dtype.itemsize * int(np.prod(values.shape[1:], dtype=int)) + padding
+        offsets = [f.offset for f in fields]
         dtype = np.dtype(
-            {
-                "names": [n[0] for n in names],
-                "formats": [(n[1], n[3]) for n in names],
-                "offsets": [n[2] for n in names],
-                "itemsize": max(offset, 1),
-            }
+            {"names": [*columns], "formats": formats, "offsets": offsets, "itemsize": max(offset, 1)}
         )
         count = len(next(iter(columns.values())))
         points = np.full(count * dtype.itemsize, 0xAB, np.uint8).view(dtype)
@@ -197,66 +162,43 @@ class Kit:
             points[name] = values
         data = points.view(np.uint8).reshape(rows, -1)
         data = np.pad(data, ((0, 0), (0, row_padding)), constant_values=0xCD)
-        return self.new(
-            "sensor_msgs/msg/PointCloud2",
-            header=self.header(stamp_ns, frame_id),
-            height=rows,
-            width=count // rows,
-            fields=fields,
-            is_bigendian=big_endian,
-            point_step=dtype.itemsize,
-            row_step=data.shape[1],
-            data=data.reshape(-1),
-            is_dense=False,
-        )
+        layout = {"height": rows, "width": count // rows, "row_step": data.shape[1], "data": data.reshape(-1)}
+        layout |= {"fields": fields, "point_step": dtype.itemsize, "is_bigendian": big_endian}
+        return self.stamped("sensor_msgs/msg/PointCloud2", stamp_ns, frame_id, is_dense=False, **layout)
 
     def transform(
         self, stamp_ns: int, parent: str, child: str, q: Any = (1, 0, 0, 0), t: Any = (0, 0, 0)
     ) -> Any:
-        body = self.new(
-            "geometry_msgs/msg/Transform",
-            translation=self.vector("Vector3", *t),
-            rotation=self.quaternion(*q),
-        )
-        return self.new(
-            "geometry_msgs/msg/TransformStamped",
-            header=self.header(stamp_ns, parent),
-            child_frame_id=child,
-            transform=body,
-        )
+        parts = {"translation": self.vector("Vector3", *t), "rotation": self.quaternion(*q)}
+        body = self.new("geometry_msgs/msg/Transform", **parts)
+        kind = "geometry_msgs/msg/TransformStamped"
+        return self.stamped(kind, stamp_ns, parent, child_frame_id=child, transform=body)
 
     def tf(self, *transforms: Any) -> Any:
         return self.new("tf2_msgs/msg/TFMessage", transforms=list(transforms))
 
     def odometry(self, stamp_ns: int, x: float, yaw: float, speed: float, yaw_rate: float) -> Any:
-        covariance = np.zeros(36)
+        speeds = {
+            "linear": self.vector("Vector3", speed, 0, 0),
+            "angular": self.vector("Vector3", 0, 0, yaw_rate),
+        }
+        twist = self.new("geometry_msgs/msg/Twist", **speeds)
+        parts = {
+            "pose": self.pose(x, self.quaternion(np.cos(yaw / 2), 0, 0, np.sin(yaw / 2))),
+            "twist": self.new("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
+        }
+        return self.stamped("nav_msgs/msg/Odometry", stamp_ns, "odom", child_frame_id="base_link", **parts)
+
+    def pose(self, x: float, orientation: Any) -> Any:
+        """A PoseWithCovariance on the x axis."""
         pose = self.new(
-            "geometry_msgs/msg/Pose",
-            position=self.vector("Point", x, 0, 0),
-            orientation=self.quaternion(np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)),
+            "geometry_msgs/msg/Pose", position=self.vector("Point", x, 0, 0), orientation=orientation
         )
-        twist = self.new(
-            "geometry_msgs/msg/Twist",
-            linear=self.vector("Vector3", speed, 0, 0),
-            angular=self.vector("Vector3", 0, 0, yaw_rate),
-        )
-        return self.new(
-            "nav_msgs/msg/Odometry",
-            header=self.header(stamp_ns, "odom"),
-            child_frame_id="base_link",
-            pose=self.new("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=covariance),
-            twist=self.new("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=covariance),
-        )
+        return self.new("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36))
 
     def detections(self, stamp_ns: int, boxes: list[tuple[float, float, float, float, str, float]]) -> Any:
         """Boxes as centre x, y, width, height, class, score."""
-        origin = self.new(
-            "geometry_msgs/msg/Pose",
-            position=self.vector("Point", 0, 0, 0),
-            orientation=self.quaternion(1, 0, 0, 0),
-        )
-        pose = self.new("geometry_msgs/msg/PoseWithCovariance", pose=origin, covariance=np.zeros(36))
-        header, found = self.header(stamp_ns, "camera_optical"), []
+        pose, found = self.pose(0, self.quaternion(1, 0, 0, 0)), []
         for x, y, width, height, name, score in boxes:
             kind = "vision_msgs/msg/ObjectHypothesisWithPose"
             if self.old_types:
@@ -267,49 +209,35 @@ class Kit:
                 result, rest = self.new(kind, hypothesis=hypothesis, pose=pose), {"id": ""}
                 point = self.new("vision_msgs/msg/Point2D", x=x, y=y)
                 centre = self.new("vision_msgs/msg/Pose2D", position=point, theta=0.0)
-            bbox = self.new("vision_msgs/msg/BoundingBox2D", center=centre, size_x=width, size_y=height)
-            found.append(
-                self.new("vision_msgs/msg/Detection2D", header=header, results=[result], bbox=bbox, **rest)
+            rest["bbox"] = self.new(
+                "vision_msgs/msg/BoundingBox2D", center=centre, size_x=width, size_y=height
             )
-        return self.new("vision_msgs/msg/Detection2DArray", header=header, detections=found)
+            kind = "vision_msgs/msg/Detection2D"
+            found.append(self.stamped(kind, stamp_ns, "camera_optical", results=[result], **rest))
+        kind = "vision_msgs/msg/Detection2DArray"
+        return self.stamped(kind, stamp_ns, "camera_optical", detections=found)
 
     # -- a drive -------------------------------------------------------------
 
     def drive(self, start_ns: int = START_NS) -> Kit:
         """Append a drive: tf_static once, then the six messages of every frame."""
         begun = (start_ns - START_NS) // PERIOD_NS  # of two drives no message is the same
-        optical = (0.5, -0.5, 0.5, -0.5)
-        self.add(
-            "/tf_static",
-            "tf2_msgs/msg/TFMessage",
-            start_ns,
-            self.tf(
-                self.transform(start_ns, "base_link", "camera_optical", optical, (1.5, 0, 1.4)),
-                self.transform(start_ns, "base_link", "lidar", t=(1.0, 0, 1.8)),
-                self.transform(start_ns, "base_link", "radar", t=(3.6, 0.1, 0.5)),
-            ),
-        )
+        places = {"camera_optical": ((0.5, -0.5, 0.5, -0.5), (1.5, 0, 1.4))}
+        places |= {"lidar": ((1, 0, 0, 0), (1.0, 0, 1.8)), "radar": ((1, 0, 0, 0), (3.6, 0.1, 0.5))}
+        tf = self.tf(*(self.transform(start_ns, "base_link", name, *of) for name, of in places.items()))
+        self.add("/tf_static", tf.__msgtype__, start_ns, tf)
         for i in range(self.frames):
             stamp = start_ns + i * PERIOD_NS
-            self.add(INFO, "sensor_msgs/msg/CameraInfo", stamp, self.info(stamp + 1_000_000))
-            self.add(
-                IMAGE,
-                "sensor_msgs/msg/CompressedImage",
-                stamp,
-                self.compressed(stamp + 1_000_000, jpeg(i + begun)),
-            )
-            labels = self.compressed(stamp + 1_000_000, label_png(i), "mono8; png compressed")
-            self.add(LABELS, "sensor_msgs/msg/CompressedImage", stamp, labels)
-            boxes = [(20.0 + i, 30.0, 10.0, 8.0, "car", 0.9)]
-            self.add(
-                DETECTIONS,
-                "vision_msgs/msg/Detection2DArray",
-                stamp,
-                self.detections(stamp + 1_000_000, boxes),
-            )
-            self.add(LIDAR, "sensor_msgs/msg/PointCloud2", stamp, self.cloud(stamp, lidar_columns(i + begun)))
-            scan = self.cloud(stamp - 2_000_000, radar_columns(i + begun), frame_id="radar")
-            self.add(RADAR, "sensor_msgs/msg/PointCloud2", stamp, scan)
+            seen, boxes = stamp + 1_000_000, [(20.0 + i, 30.0, 10.0, 8.0, "car", 0.9)]
+            for topic, message in (
+                (INFO, self.info(seen)),
+                (IMAGE, self.compressed(seen, jpeg(i + begun))),
+                (LABELS, self.compressed(seen, label_png(i), "mono8; png compressed")),
+                (DETECTIONS, self.detections(seen, boxes)),
+                (LIDAR, self.cloud(stamp, lidar_columns(i + begun))),
+                (RADAR, self.cloud(stamp - 2_000_000, radar_columns(i + begun), frame_id="radar")),
+            ):
+                self.add(topic, message.__msgtype__, stamp, message)
         return self
 
     def add(self, topic: str, kind: str, log_time_ns: int, message: Any) -> None:
@@ -368,35 +296,26 @@ class Kit:
         if compression is not None:
             writer.set_compression(BagWriter.CompressionFormat[compression])
         writer.chunk_threshold = 40_000
+        return self._bag(path, writer, self.store.serialize_ros1)
+
+    def folder(self, path: Path, storage: str = "SQLITE3") -> Path:
+        writer = FolderWriter(path, version=9, storage_plugin=StoragePlugin[storage])
+        return self._bag(path, writer, self.store.serialize_cdr)
+
+    def _bag(self, path: Path, writer: Any, serialise: Any) -> Path:
         with writer:
             connections: dict[tuple[str, str], Any] = {}
             for topic, kind, log_time, message in self.messages:
                 if (topic, kind) not in connections:
                     connections[topic, kind] = writer.add_connection(topic, kind, typestore=self.store)
-                writer.write(
-                    connections[topic, kind], log_time, bytes(self.store.serialize_ros1(message, kind))
-                )
-        return path
-
-    def folder(self, path: Path, storage: str = "SQLITE3") -> Path:
-        with FolderWriter(path, version=9, storage_plugin=StoragePlugin[storage]) as writer:
-            connections: dict[tuple[str, str], Any] = {}
-            for topic, kind, log_time, message in self.messages:
-                if (topic, kind) not in connections:
-                    connections[topic, kind] = writer.add_connection(topic, kind, typestore=self.store)
-                writer.write(
-                    connections[topic, kind], log_time, bytes(self.store.serialize_cdr(message, kind))
-                )
+                writer.write(connections[topic, kind], log_time, bytes(serialise(message, kind)))
         return path
 
 
 def lidar_columns(i: int, count: int = 800) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(100 + i)
     xyz = rng.uniform((2, -20, -1.7), (60, 20, 3), (count, 3)).astype(np.float32)
-    return {
-        "x": xyz[:, 0],
-        "y": xyz[:, 1],
-        "z": xyz[:, 2],
+    return dict(zip("xyz", xyz.T, strict=True)) | {
         "intensity": rng.uniform(0, 255, count).astype(np.float32),
         "ring": (np.arange(count) % 16).astype(np.uint16),
         "time": np.linspace(-0.1, 0, count).astype(np.float32),
@@ -407,7 +326,7 @@ def radar_columns(i: int, count: int = 60) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(200 + i)
     xyz = rng.uniform((5, -20, -1), (80, 20, 2), (count, 3)).astype(np.float32)
     doppler = (10.0 * xyz[:, 0] / np.linalg.norm(xyz, axis=1)).astype(np.float32)  # approaching at 10 m/s
-    return {"x": xyz[:, 0], "y": xyz[:, 1], "z": xyz[:, 2], "doppler": doppler, "power": doppler * 0 + 30}
+    return dict(zip("xyz", xyz.T, strict=True)) | {"doppler": doppler, "power": doppler * 0 + 30}
 
 
 def jpeg(i: int) -> bytes:
@@ -416,19 +335,14 @@ def jpeg(i: int) -> bytes:
 
 
 def label_png(i: int) -> bytes:
-    return cv2.imencode(".png", np.random.default_rng(i).integers(0, 19, (HEIGHT, WIDTH), np.uint8))[
-        1
-    ].tobytes()
+    labels = np.random.default_rng(i).integers(0, 19, (HEIGHT, WIDTH), np.uint8)
+    return cv2.imencode(".png", labels)[1].tobytes()
 
 
 def fleet_config(**sections: Any) -> FleetConfig:
-    camera = {
-        "image": IMAGE,
-        "info": INFO,
-        "semantics": {"source": "topics", "labels": LABELS, "detections": DETECTIONS},
-    }
+    semantics = {"source": "topics", "labels": LABELS, "detections": DETECTIONS}
     rig = {
-        "camera": camera,
+        "camera": {"image": IMAGE, "info": INFO, "semantics": semantics},
         "lidar": {"points": LIDAR},
         "radar": {"points": RADAR, "doppler_positive": "approaching"},
         "ego": {"odometry": ODOMETRY},

@@ -1,8 +1,7 @@
 """Simulated rigs by name, and drawn from a seed.
 
-Rigs are drawn so that networks do not learn one car by heart: every number within stated limits. The limits
-are those of available sensors and their usual places on cars, not of one product. The number of pixels and
-beams is limited so that a frame costs about as much as one of the rig `demo`.
+Rigs are drawn so that networks do not learn one car by heart; limits are those of available sensors and their
+usual places on cars. The number of pixels and beams is limited: a frame costs about as much as one of `demo`.
 """
 
 from __future__ import annotations
@@ -29,13 +28,8 @@ _CAMERA, _LIDAR, _RADAR = CameraSpec(912, 470), LidarSpec(columns=160, rows=64),
 _SPINNING: Final = LidarSpec((-180.0, 180.0), (-25.0, 15.0), 900, 32, 0.1, 0.8, 100.0)
 # Steps of data sheets with 128 channels: 0.125 deg around the horizon, 0.5 deg above and below, 1 deg at the
 # ends.
-_ROWS_128: Final = (
-    *np.arange(-25.0, -14.0, 1.0).tolist(),
-    *np.arange(-14.0, -7.0, 0.5).tolist(),
-    *np.arange(-7.0, 3.0, 0.125).tolist(),
-    *np.arange(3.0, 13.0, 0.5).tolist(),
-    *np.arange(13.0, 15.5, 1.0).tolist(),
-)
+_STEPS_128: Final = ((-25, -14, 1), (-14, -7, 0.5), (-7, 3, 0.125), (3, 13, 0.5), (13, 15.5, 1))
+_ROWS_128: Final = tuple(np.concatenate([np.arange(*map(float, step)) for step in _STEPS_128]).tolist())
 _CORNER: Final = RadarSpec(azimuth_deg=60.0, azimuth_resolution_deg=3.2, rays=9000)
 _CAMERA_M, _LIDAR_M, _LEVEL = (1.62, 0.02, 1.62), (1.50, 0.00, 1.80), (0.0, 0.0, 0.0)
 _PAPER: Final = (CameraSpec(), LidarSpec(), RadarSpec())

@@ -69,7 +69,7 @@ class Setup:
 def scene_of(drive: Drive) -> Scene:
     """Scene of a drive; rails (highway) and house fronts (urban) are radar mirrors."""
     layout = drive.layout
-    right = layout.right_edge - 0.8 - layout.lanes_own[0]
+    right = -layout.edge - 0.8 - layout.lanes_own[0]
     mirrors = (right, -layout.lanes_own[0]) if drive.landscape.fast else (right - 3.0,)
     return Scene(drive.ego, drive.sun, drive.night, mirrors)
 

@@ -11,14 +11,12 @@ import numpy as np
 from pipeline.simulate.world.cars import add_car, add_load, add_seats, add_wheels, glazed
 from pipeline.simulate.world.meshes import Colour, Mesh, MeshBuilder
 
-__all__ = ["ACTOR_KINDS", "CAR_COLOURS", "HOLLOW", "actor_mesh"]
+__all__ = ["HOLLOW", "VARIANTS", "actor_mesh"]
 
-ACTOR_KINDS: Final = ("car", "van", "truck", "bus", "cyclist", "pedestrian")
 VARIANTS: Final = {"car": 24, "van": 6, "truck": 8, "bus": 3, "cyclist": 6, "pedestrian": 12}
-HOLLOW: Final = (
-    1000  # added to a variant: the same road user with windows transparent to beams, and open loads
-)
-CAR_COLOURS: Final = (
+# Added to a variant: the same road user with windows transparent to beams, and open loads.
+HOLLOW: Final = 1000
+_COLOURS: Final = (
     (0.70, 0.70, 0.70),
     (0.45, 0.46, 0.48),
     (0.03, 0.03, 0.035),
@@ -36,10 +34,10 @@ CAR_COLOURS: Final = (
 
 @lru_cache(maxsize=256)
 def actor_mesh(kind: str, variant: int) -> Mesh:
-    """Mesh of one of ACTOR_KINDS; variants differ in size, shape and colour and repeat."""
+    """Mesh of one of the kinds in VARIANTS, which differ in size, shape and colour and repeat."""
     hollow, variant = variant >= HOLLOW, variant % HOLLOW % VARIANTS[kind]
-    rng = np.random.default_rng([ACTOR_KINDS.index(kind), variant])
-    colour = CAR_COLOURS[int(rng.integers(len(CAR_COLOURS)))]
+    rng = np.random.default_rng([list(VARIANTS).index(kind), variant])
+    colour = _COLOURS[int(rng.integers(len(_COLOURS)))]
     b = MeshBuilder()
     if kind == "car":
         add_car(b, rng, colour, hollow=hollow)
@@ -88,7 +86,7 @@ def _truck(b: MeshBuilder, rng: np.random.Generator, colour: Colour, *, open_loa
     cargo, w, height = rng.uniform(5.5, 12.0), 1.25, rng.uniform(3.2, 3.9)
     half = (cargo + 2.4) / 2
     cab_start = half - 2.1
-    tarpaulin = CAR_COLOURS[int(rng.integers(len(CAR_COLOURS)))]
+    tarpaulin = _COLOURS[int(rng.integers(len(_COLOURS)))]
     if open_load:
         add_load(b, rng, (-half, cab_start - 0.3), w, tarpaulin)
     else:
@@ -116,7 +114,7 @@ def _truck(b: MeshBuilder, rng: np.random.Generator, colour: Colour, *, open_loa
 def _bus(b: MeshBuilder, colour: Colour) -> None:
     half, w = 5.9, 1.27
     b.frustum((-half, half, -w, w, 0.35), (-half, half, -w, w, 1.25), "bus_paint", colour)
-    faces = {"front": "bus_glass", "rear": "bus_glass", "left": "bus_glass", "right": "bus_glass"}
+    faces = dict.fromkeys(("front", "rear", "left", "right"), "bus_glass")
     b.frustum((-half, half, -w, w, 1.25), (-half, half - 0.1, -w + 0.03, w - 0.03, 2.45), faces, colour)
     b.frustum(
         (-half, half - 0.1, -w + 0.03, w - 0.03, 2.45),

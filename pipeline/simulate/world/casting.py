@@ -130,15 +130,13 @@ class Moment:
     @cached_property
     def velocity_of_triangle(self) -> Float[np.ndarray, "T 3"]:
         """Velocity in the map [m/s]."""
-        v = np.zeros((len(self.mesh), 3), np.float32)
-        for actor, start in zip(self.actors, self._starts, strict=True):
-            v[start : start + len(actor_mesh(actor.kind, actor.variant))] = actor.velocity_map
-        return v
+        velocities = np.array([np.zeros(3), *(a.velocity_map for a in self.actors)], np.float32)
+        return np.repeat(velocities, self._sizes, axis=0)
 
     @cached_property
-    def _starts(self) -> list[int]:
-        sizes = [len(self.standing.mesh)] + [len(actor_mesh(a.kind, a.variant)) for a in self.actors]
-        return [int(n) for n in np.cumsum(sizes)[:-1]]
+    def _sizes(self) -> list[int]:
+        """Triangles of the static world, and of every actor."""
+        return [len(self.standing.mesh), *(len(actor_mesh(a.kind, a.variant)) for a in self.actors)]
 
     def cast(
         self,
@@ -154,7 +152,7 @@ class Moment:
         axis, cosine = _cone(directions)
         if np.ptp(origins, axis=0).max() > _ONE_PLACE_M:
             cosine = -1.0
-        for actor, start in zip(self.actors, self._starts, strict=True):
+        for actor, start in zip(self.actors, np.cumsum(self._sizes)[:-1].tolist(), strict=True):
             proto = _prototype(actor.kind, actor.variant)
             R, v = actor.T_map_actor[:3, :3].astype(np.float32), actor.velocity_map.astype(np.float32)
             p = (actor.T_map_actor[:3, 3] - self.standing.origin).astype(np.float32)

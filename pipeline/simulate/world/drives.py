@@ -31,8 +31,7 @@ class RoadLayout:
     lane_m: float
     lanes_own: tuple[float, ...]  # lane centres in our direction, ours first
     lanes_oncoming: tuple[float, ...]
-    right_edge: float  # edge of the asphalt
-    left_edge: float
+    edge: float  # of the asphalt on the left; on the right it is as far away
     parking_m: float  # width of the parking strip inside each edge, 0 = none
 
 
@@ -44,17 +43,17 @@ def layout_of(landscape: Landscape, seed: int) -> RoadLayout:
         own = tuple(-2.4 - 3.7 * (lanes - 1 - i) for i in range(lanes))
         order = own[1:] + own[:1] if lanes == 3 else own
         edge = 2.4 + 3.7 * (lanes - 0.5) + 2.6
-        return RoadLayout(landscape, 3.7, order, tuple(-d for d in own), -edge, edge, 0.0)
+        return RoadLayout(landscape, 3.7, order, tuple(-d for d in own), edge, 0.0)
     parking = 2.3 if rng.random() < landscape.parking else 0.0
     lanes = 2 if rng.random() < landscape.two_lanes else 1
     lane = landscape.lane_m
     if landscape.one_way:
         edge = lane / 2 + parking
-        return RoadLayout(landscape, lane, (0.0,), (), -edge, edge, parking)
+        return RoadLayout(landscape, lane, (0.0,), (), edge, parking)
     first = lane / 2 + 0.05
     own = tuple(-first - lane * (lanes - 1 - i) for i in range(lanes))
     edge = first + lane * (lanes - 0.5) + 0.15 + parking
-    return RoadLayout(landscape, lane, own, tuple(-d for d in own), -edge, edge, parking)
+    return RoadLayout(landscape, lane, own, tuple(-d for d in own), edge, parking)
 
 
 def _summed(s: np.ndarray, waves: Iterable[tuple[float, float]], rng: np.random.Generator) -> np.ndarray:
@@ -192,11 +191,8 @@ class EgoMotion:
         mean, swing = (10.0 * pace, 2.6 * pace) if urban else (27.0 * pace, 3.0 * pace)
         speed = np.full_like(t, mean * rng.uniform(0.85, 1.15))
         for period in (23.0, 11.0):
-            speed += (
-                swing
-                * rng.uniform(0.4, 0.9)
-                * np.sin(2 * np.pi * t / (period * rng.uniform(0.8, 1.3)) + rng.uniform(0, 6.28))
-            )
+            size, longer, begin = rng.uniform(0.4, 0.9), rng.uniform(0.8, 1.3), rng.uniform(0, 6.28)
+            speed += swing * size * np.sin(2 * np.pi * t / (period * longer) + begin)
         if urban:  # a red light now and then: brake, stand, start
             period = rng.uniform(45, 70)
             phase = (t + rng.uniform(0, period)) % period / period

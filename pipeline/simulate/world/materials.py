@@ -124,17 +124,13 @@ class MaterialTable(NamedTuple):
     gloss: np.ndarray
 
 
-TABLE: Final = MaterialTable(
-    label=np.array([LABELS.index(m.label) for m in MATERIALS], np.uint8),
-    albedo=np.array([m.albedo for m in MATERIALS], np.float32),
-    reflectivity=np.array([m.reflectivity for m in MATERIALS], np.float32),
-    radar_gain=np.array([m.radar_gain for m in MATERIALS], np.float32),
-    texture=np.array([m.texture for m in MATERIALS], np.uint8),
-    glass=np.array([m.glass for m in MATERIALS], np.float32),
-    glow=np.array([m.glow for m in MATERIALS], np.float32),
-    passes=np.array([m.passes for m in MATERIALS], np.float32),
-    gloss=np.array([m.gloss for m in MATERIALS]),
-)
+def _column(name: str) -> np.ndarray:
+    kind = {"texture": np.uint8, "gloss": np.bool_}.get(name, np.float32)
+    return np.array([getattr(m, name) for m in MATERIALS], kind)
+
+
+_LABEL = np.array([LABELS.index(m.label) for m in MATERIALS], np.uint8)
+TABLE: Final = MaterialTable(_LABEL, *map(_column, MaterialTable._fields[1:]))
 
 
 def material(name: str) -> int:

@@ -24,10 +24,10 @@ def add_plots(c: Chunk) -> None:
             add_pavement(c, side, walk)
         else:
             ground = "soil" if style.random() < 0.3 else "grass"
-            c.strip((side * layout.left_edge, side * 90.0), (0.0, 0.0), ground, 10.0)
+            c.strip((side * layout.edge, side * 90.0), (0.0, 0.0), ground, 10.0)
         if layout.parking_m:
-            add_parked(c, side, layout.left_edge - layout.parking_m / 2)
-        _plots(c, side, layout.left_edge + max(walk, 0.0 if landscape.houses > 0.5 else 2.5))
+            add_parked(c, side, layout.edge - layout.parking_m / 2)
+        _plots(c, side, layout.edge + max(walk, 0.0 if landscape.houses > 0.5 else 2.5))
 
 
 def _plots(c: Chunk, side: int, d: float) -> None:
@@ -76,7 +76,7 @@ def _post(b: MeshBuilder, height_m: float) -> None:
 def add_rows(c: Chunk) -> None:
     """Trees and poles at even distances along both sides, closer to the road than other objects."""
     landscape = c.drive.landscape
-    beside = c.drive.layout.left_edge + (1.6 if landscape.fast else 0.6)
+    beside = c.drive.layout.edge + (1.6 if landscape.fast else 0.6)
     for side in (-1, 1):
         for s in c.every(landscape.trees_m) if landscape.trees_m else ():
             c.put(tree(int(c.rng.integers(40))), s, side * (beside + 1.0), 0.0, c.rng.uniform(0, 6.28))
@@ -91,7 +91,7 @@ def _pole(b: MeshBuilder) -> None:
 
 def add_halls(c: Chunk) -> None:
     """Walls and a ceiling with lamps, `inner_m` from the road's edge; cars between columns, nose in."""
-    landscape, edge = c.drive.landscape, c.drive.layout.left_edge
+    landscape, edge = c.drive.landscape, c.drive.layout.edge
     wall, top = edge + landscape.inner_m, landscape.ceiling_m
     c.strip((-wall, wall), (top, top), "ceiling")
     for lamp in c.every(8.0):

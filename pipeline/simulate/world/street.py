@@ -32,15 +32,15 @@ def add_street(c: Chunk) -> None:
     walk = style.uniform(2.6, 4.2)
     for side in (-1, 1):
         add_pavement(c, side, walk)
-        _furniture(c, side, layout.left_edge, walk)
-        _frontage(c, side, layout.left_edge + walk)
+        _furniture(c, side, layout.edge, walk)
+        _frontage(c, side, layout.edge + walk)
         if layout.parking_m:
-            add_parked(c, side, layout.left_edge - layout.parking_m / 2)
+            add_parked(c, side, layout.edge - layout.parking_m / 2)
 
 
 def add_pavement(c: Chunk, side: int, walk: float) -> None:
     """Kerb and pavement of one side, and grass behind them."""
-    kerb, far = side * c.drive.layout.left_edge, side * (c.drive.layout.left_edge + walk)
+    kerb, far = side * c.drive.layout.edge, side * (c.drive.layout.edge + walk)
     c.band(c.whole, (kerb, kerb + side * 0.001), (0.0, 0.12), "kerb")
     c.strip((kerb, kerb + side * 0.15), (0.12, 0.12), "kerb")
     c.strip((kerb + side * 0.15, far), (0.12, 0.12), "paving")
@@ -126,7 +126,7 @@ def add_motorway(c: Chunk) -> None:
         slope = _verge(c, side, style)
         _plants(c, side, slope)
         for s in c.every(55.0, 15.0, 0.7):
-            d = side * (c.drive.layout.left_edge + 1.7)
+            d = side * (c.drive.layout.edge + 1.7)
             c.put(sign(int(rng.integers(24))), s, d, 0.0, 0.0 if side < 0 else np.pi)
     if c.index % 7 == 3:
         _gantry(c, c.s0 + 20.0)
@@ -137,7 +137,7 @@ def add_motorway(c: Chunk) -> None:
 
 def _verge(c: Chunk, side: int, style: np.random.Generator) -> float:
     """Banks, rail and noise wall of one side; returns the height of the bank [m]."""
-    edge = side * c.drive.layout.left_edge
+    edge = side * c.drive.layout.edge
     walled, railed = style.random() < 0.35, style.random() < 0.75
     foot, slope = edge + side * 3.0, style.uniform(-1.0, 2.5)
     c.strip((edge, foot), (0.0, -0.1), "grass", 10.0)
@@ -153,7 +153,7 @@ def _verge(c: Chunk, side: int, style: np.random.Generator) -> float:
 
 def _plants(c: Chunk, side: int, slope: float) -> None:
     """Delineators, trees and bushes on the bank of one side."""
-    rng, edge = c.rng, side * c.drive.layout.left_edge
+    rng, edge = c.rng, side * c.drive.layout.edge
     for s in c.every(25.0):
         c.put(delineator(), s, edge + side * 1.4)
     for s in c.every(6.0, 3.0, 0.55):
@@ -175,7 +175,7 @@ def _guard_rail(c: Chunk, d: float, *, both: bool) -> None:
 
 def _gantry(c: Chunk, s: float) -> None:
     layout = c.drive.layout
-    left, right = 0.0, layout.right_edge - 1.6
+    left, right = 0.0, -layout.edge - 1.6
     b = MeshBuilder()
     for d in (left, right):
         b.tube(np.array([0, d, 0.0]), np.array([0, d, 7.6]), 0.16, "metal_pole", 8)
@@ -190,14 +190,14 @@ def _gantry(c: Chunk, s: float) -> None:
 def add_asphalt(c: Chunk) -> None:
     """Asphalt with repairs and manholes, lane markings, crossings with their signals."""
     layout, lift = c.drive.layout, 0.004
-    c.strip((layout.right_edge, layout.left_edge), (0.0, 0.0), c.drive.landscape.surface)
+    c.strip((-layout.edge, layout.edge), (0.0, 0.0), c.drive.landscape.surface)
     for _ in range(int(c.rng.integers(0, 4))):  # repairs: dark in the image, less so for the lidar
         s = c.s0 + c.rng.uniform(2, 30)
-        d = c.rng.uniform(layout.right_edge + 1, max(layout.left_edge, 3.0) - 3)
+        d = c.rng.uniform(-layout.edge + 1, max(layout.edge, 3.0) - 3)
         length, width = c.rng.uniform(1.5, 9), c.rng.uniform(0.6, 2.4)
         c.band((s, s + length), (d, d + width), (lift / 2, lift / 2), "asphalt_patch")
     for _ in range(int(c.rng.integers(0, 3))):
-        s, d = c.s0 + c.rng.uniform(0, 39), c.rng.uniform(layout.right_edge + 1, layout.left_edge - 1)
+        s, d = c.s0 + c.rng.uniform(0, 39), c.rng.uniform(-layout.edge + 1, layout.edge - 1)
         c.band((s, s + 0.62), (d, d + 0.62), (lift, lift), "manhole")
     if c.drive.landscape.markings:
         _lanes(c)
@@ -220,11 +220,11 @@ def _lanes(c: Chunk) -> None:
     else:
         _dashes(c, 0.0, 3.0, 9.0)
     for side in (-1, 1):
-        edge = side * (layout.left_edge - layout.parking_m)
+        edge = side * (layout.edge - layout.parking_m)
         if layout.parking_m:
             c.strip((edge - w, edge + w), (lift, lift), "paint")
             for s in c.every(6.5):
-                d0, d1 = sorted((edge, side * layout.left_edge))
+                d0, d1 = sorted((edge, side * layout.edge))
                 c.band((s - w, s + w), (d0, d1), (lift, lift), "paint")
     if c.index % 4 == 1 and layout.lanes_oncoming and not c.drive.landscape.ceiling_m:
         _crossing(c, c.s0 + 20.0)
@@ -237,7 +237,7 @@ def _dashes(c: Chunk, d: float, dash_m: float, period_m: float) -> None:
 
 def _crossing(c: Chunk, s: float) -> None:
     layout = c.drive.layout
-    edge = layout.left_edge
+    edge = layout.edge
     for d in np.arange(-edge + 0.5, edge - 0.5, 1.0):
         c.band((s, s + 3.5), (float(d), float(d) + 0.5), (0.005, 0.005), "paint")
     c.band((s - 1.6, s - 1.2), (-edge + layout.parking_m, 0.0), (0.005, 0.005), "paint")

@@ -93,7 +93,7 @@ def _urban_streams(layout: RoadLayout, rng: np.random.Generator) -> list[_Stream
         streams.append(_Stream(i, d, rng.uniform(7, 13), rng.uniform(18, 28), 0.7, own))
     for i, d in enumerate(layout.lanes_oncoming):
         streams.append(_Stream(10 + i, d, -rng.uniform(7, 13), rng.uniform(20, 32), 0.7, oncoming))
-    edge = -layout.right_edge
+    edge = layout.edge
     for i, (side, walk) in enumerate(((-1, 1.3), (-1, -1.2), (1, -1.4), (1, 1.1))):
         d, speed = side * (edge + 1.0 + 0.8 * (i % 2)), walk * rng.uniform(0.8, 1.2)
         streams.append(_Stream(20 + i, d, speed, rng.uniform(12, 22), 0.5, ("pedestrian",), 0.12))
