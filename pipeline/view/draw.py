@@ -41,7 +41,7 @@ def viewpoint(rig: Rig) -> tuple[Float[np.ndarray, 3], Float[np.ndarray, 3]]:
     """Target and eye of the view: from behind and above, along the mean direction of the cameras, else forward."""
     T_car = rig.placed("calibrated")
     looks = [T[:3, 2] for name, T in T_car.items() if rig.kinds[name] == "camera"]
-    way = np.mean(looks or [[1.0, 0.0, 0.0]], axis=0) * [1, 1, 0]
+    way = np.mean(looks or [np.array([1.0, 0.0, 0.0])], axis=0) * [1, 1, 0]
     # Cameras all around look nowhere on the whole.
     way = way / np.linalg.norm(way) if np.linalg.norm(way) > 0.3 else np.array([1.0, 0.0, 0.0])
     middle = np.mean([T[:3, 3] for T in T_car.values()], axis=0)
