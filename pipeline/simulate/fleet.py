@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
 from typing import Any, Final
@@ -19,8 +19,8 @@ from pipeline.simulate.faults import (
     DayFaults,
     Fault,
     faults_on,
-    labelled_in_the_dark,
     misread,
+    networks_on,
     shaken,
 )
 from pipeline.simulate.logs.recording import FIRST_FRAME_S, PARTIAL, SUFFIXES, open_log, record_drive
@@ -28,7 +28,6 @@ from pipeline.simulate.sensors.data_sheets import CameraSpec, RadarSpec
 from pipeline.simulate.sensors.mounting import Mounting, mounting_of
 from pipeline.simulate.sensors.rig_spec import RigSpec, SensorSpec
 from pipeline.simulate.sensors.rigs import rig_named
-from pipeline.simulate.sensors.semantics import SemanticsSpec
 from pipeline.simulate.sensors.simulated_frame import Setup
 from pipeline.simulate.world.casting import World
 from pipeline.simulate.world.drives import Drive
@@ -67,7 +66,6 @@ class FleetSpec:
     faults: tuple[Fault, ...] = ()
     seed: int = 1
     remount_deg: float | None = None  # sd per axis and day; None = the rig's (fixed sensors: hundredths)
-    semantics: SemanticsSpec = field(default_factory=SemanticsSpec)
 
     def __post_init__(self) -> None:
         for name in ("vehicles", "days", "frames", "drives", "rate_hz"):
@@ -175,8 +173,7 @@ def _setup(spec: FleetSpec, vehicle: int, day: int, share: float) -> Setup:
     """State of the vehicle after a share of a day's frames."""
     name = spec.names[vehicle]
     today = faults_on(spec.faults, name, day, share)
-    semantics = labelled_in_the_dark(spec.semantics, today)
-    return Setup(spec.rigs[name], mounting_on(spec, vehicle, day, share), semantics, today)
+    return Setup(spec.rigs[name], mounting_on(spec, vehicle, day, share), networks_on(today), today)
 
 
 def drive_of(spec: FleetSpec, vehicle: int, day: int, number: int, frames: int) -> Drive:

@@ -56,7 +56,7 @@ def simulate_reflectors(
     def at(t_s: float) -> int:
         return start_ns + round(t_s * 1e9)
 
-    setup = Setup(rig, mounting, spec.semantics)
+    setup = Setup(rig, mounting)
     with open_log(folder / f"{day_name}.mcap", "mcap") as log:
         log.put(TOPICS["tf"], at(0.0), log.messages.sensor_poses(at(0.0), mounting.nominal()))
         for k in range(frames):

@@ -7,32 +7,22 @@ import numpy as np
 from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, PAIRS, SENSORS, CalibrationRecord
 from schemas.captures import CAPTURES
-from schemas.drift import DRIFT, DriftFinding
+from schemas.drift import DRIFT
 from schemas.features import FEATURES
 from schemas.frames import Frame
 from schemas.moments import MOMENTS, PERCEIVED
 from schemas.observations import Observation
-from schemas.outcomes import OUTCOMES, OutcomeRow
-from schemas.poses import POSES, PoseRow
-from schemas.service_events import SERVICE_EVENTS, ServiceEvent
+from schemas.outcomes import OUTCOMES
+from schemas.poses import POSES
+from schemas.service_events import SERVICE_EVENTS
 from schemas.sign_offs import SIGN_OFFS
-from schemas.states import STATES, StateRow
-from schemas.training import TRAINING, TrainingRow
-from tests.makers.whole_tables import FRAMES, OBSERVATIONS, WholeFrame, WholeObservation
+from schemas.states import STATES
+from schemas.training import TRAINING
+from tests.makers.whole_tables import FRAMES, OBSERVATIONS
 
-ROW_TYPES = {
-    **{t.name: (t, t.row_type) for t in (MOMENTS, PERCEIVED, *CAPTURES.values(), *FEATURES.values())},
-    FRAMES.name: (FRAMES, WholeFrame),
-    OBSERVATIONS.name: (OBSERVATIONS, WholeObservation),
-    TRAINING.name: (TRAINING, TrainingRow),
-    CALIBRATIONS.name: (CALIBRATIONS, CalibrationRecord),
-    DRIFT.name: (DRIFT, DriftFinding),
-    OUTCOMES.name: (OUTCOMES, OutcomeRow),
-    POSES.name: (POSES, PoseRow),
-    STATES.name: (STATES, StateRow),
-    SERVICE_EVENTS.name: (SERVICE_EVENTS, ServiceEvent),
-    SIGN_OFFS.name: (SIGN_OFFS, SIGN_OFFS.row_type),
-}
+_MOMENTS = (MOMENTS, PERCEIVED, *CAPTURES.values(), *FEATURES.values(), FRAMES, OBSERVATIONS, TRAINING)
+_RECORDS = (CALIBRATIONS, DRIFT, OUTCOMES, POSES, STATES, SERVICE_EVENTS, SIGN_OFFS)
+ROW_TYPES = {table.name: (table, table.row_type) for table in (*_MOMENTS, *_RECORDS)}
 
 
 def make_row(table, rng, *, nulls=False, free=5, **values):

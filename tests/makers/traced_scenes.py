@@ -170,21 +170,13 @@ def _degrees_of(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 def scatter_boxes(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Boxes (lower, upper corner) and their labels: cars, poles, and a hedge far behind."""
-    lower, upper, labels = [], [], []
-    for _ in range(7):
-        x, y = rng.uniform(8, 40), rng.uniform(-12, 12)
-        lower.append([x, y - 0.9, GROUND_M])
-        upper.append([x + 4.0, y + 0.9, GROUND_M + 1.6])
-        labels.append(CAR)
-    for _ in range(8):
-        x, y = rng.uniform(7, 35), rng.choice([-1, 1]) * rng.uniform(4, 14)
-        lower.append([x, y - 0.15, GROUND_M])
-        upper.append([x + 0.3, y + 0.15, GROUND_M + 5.0])
-        labels.append(POLE)
-    lower.append([60.0, -80, GROUND_M])
-    upper.append([62.0, 80, GROUND_M + 3.0])
-    labels.append(VEGETATION)
-    return np.stack([lower, upper]), np.array(labels)
+    cars = [(rng.uniform(8, 40), rng.uniform(-12, 12)) for _ in range(7)]
+    poles = [(rng.uniform(7, 35), rng.choice([-1, 1]) * rng.uniform(4, 14)) for _ in range(8)]
+    boxes = [((x, y - 0.9), (x + 4.0, y + 0.9), 1.6, CAR) for x, y in cars]
+    boxes += [((x, y - 0.15), (x + 0.3, y + 0.15), 5.0, POLE) for x, y in poles]
+    near, far, height, label = zip(*boxes, ((60.0, -80), (62.0, 80), 3.0, VEGETATION), strict=True)
+    ground = np.full(len(label), GROUND_M)
+    return np.stack([np.c_[near, ground], np.c_[far, ground + height]]), np.array(label)
 
 
 def trace(

@@ -13,7 +13,6 @@ from rosbags.rosbag2 import Reader as Bag2
 from pipeline.core.ros_messages import RosMessages
 from pipeline.simulate.sensors.mounting import mounting_of
 from pipeline.simulate.sensors.rigs import rig_named
-from pipeline.simulate.sensors.semantics import SemanticsSpec
 from pipeline.simulate.sensors.simulated_frame import Setup, frame_of, scene_of, triggered_stamps
 from pipeline.simulate.world.casting import World
 from pipeline.simulate.world.drives import Drive
@@ -28,7 +27,7 @@ def shots_of(environment, rig, times=(1.0, 4.0)):
         rng = np.random.default_rng([7, int(10 * t)])
         stamps = triggered_stamps(rig, mounting, t, rng)
         scene = scene_of(drive)
-        seen = frame_of(moment, scene, Setup(rig, mounting, SemanticsSpec()), stamps, rng)
+        seen = frame_of(moment, scene, Setup(rig, mounting), stamps, rng)
         shots.append(
             SimpleNamespace(
                 scene=scene, moment=moment, rig=rig, mounting=mounting, lidar_stamp_s=t,

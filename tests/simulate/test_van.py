@@ -15,7 +15,6 @@ from pipeline.simulate.fleet import FleetSpec, simulate_fleet
 from pipeline.simulate.sensors.data_sheets import CameraSpec, LidarSpec
 from pipeline.simulate.sensors.mounting import Mounting, mounting_of
 from pipeline.simulate.sensors.rigs import rig_named
-from pipeline.simulate.sensors.semantics import SemanticsSpec
 from pipeline.simulate.sensors.simulated_frame import Setup, frame_of, scene_of
 from pipeline.simulate.world.casting import World
 from pipeline.simulate.world.drives import Drive
@@ -102,7 +101,7 @@ def test_a_sensor_measures_its_delay_before_its_stamp():
 
     def seen(delay_s, stamp_s):
         late = {n: replace(m, delay_s=delay_s) for n, m in prompt.sensors.items()}
-        setup = Setup(rig, Mounting(late), SemanticsSpec())
+        setup = Setup(rig, Mounting(late))
         return frame_of(moment, scene, setup, dict.fromkeys(names, stamp_s), np.random.default_rng(1))
 
     one, same, other = seen(0.0, 2.0), seen(0.125, 2.125), seen(-0.125, 2.125)

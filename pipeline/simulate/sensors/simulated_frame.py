@@ -62,7 +62,7 @@ class Setup:
 
     rig: RigSpec
     mounting: Mounting
-    semantics: SemanticsSpec
+    semantics: SemanticsSpec = field(default_factory=SemanticsSpec)
     faults: DayFaults = field(default_factory=DayFaults)
 
 

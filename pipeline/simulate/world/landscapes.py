@@ -22,7 +22,6 @@ class Landscape:
     """Parameters of a landscape; everything else is random along the road.
 
     Args:
-        base: the named landscape that a seed changed.
         fast: curves, speeds, traffic and banks of a motorway; else of a street.
         plain: the roadsides of `urban`.
         pace: factor of the usual speed.
@@ -48,7 +47,6 @@ class Landscape:
     """
 
     name: str
-    base: str = ""
     fast: bool = False
     plain: bool = False
     pace: float = 1.0
@@ -138,7 +136,6 @@ def _drawn(seed: int) -> Landscape:
     drawn = replace(
         base,
         name=f"{WORLD}{seed}",
-        base=base.name,
         plain=False,
         pace=base.pace * rng.uniform(0.7, 1.2),
         parking=float(often(0.5)) if base.parking else 0.0,
