@@ -31,6 +31,8 @@ def names(method, rig, overlaps):
 def test_the_three_that_share_most_are_taken_unless_the_rig_names_others():
     overlaps = overlaps_of(*rig())
     assert names("tracking", config(), overlaps) == {"camera": "front", "lidar": "top", "radar": "ahead"}
+    few = [s for s in VAN if s[0] in ("front", "top")]  # of which nothing is asked
+    assert names("tracking", config(few), []) == {"camera": "front", "lidar": "top"}
     named = config(three=["left", "top", "fl"])
     assert names("tracking", named, overlaps) == {"camera": "left", "lidar": "top", "radar": "fl"}
 
@@ -44,11 +46,6 @@ def test_three_that_share_nothing_are_refused_in_one_sentence():
     blind = [s for s in VAN if s[1] != "camera"]
     with pytest.raises(SolveError, match="no three of the rig do"):
         three_sensors("tracking", config(blind), overlaps_of(*rig(blind)))
-
-
-def test_a_rig_with_one_of_each_is_asked_nothing():
-    few = [s for s in VAN if s[0] in ("front", "top")]
-    assert names("tracking", config(few), []) == {"camera": "front", "lidar": "top"}
 
 
 CAMERA_LIDAR = EDGE_OF_PAIR["camera_lidar"]
@@ -90,9 +87,6 @@ def test_the_last_accepted_camera_lidar_before_the_day_is_taken(lake):
     assert shift_of(lake, "2026-03-06") == 0.5
     assert shift_of(lake, "2026-03-05") == 0.1  # not the day's own
     assert shift_of(lake, "2026-03-04", "tracking") == 0.4
-
-
-def test_a_vehicle_without_an_accepted_day_has_none(lake):
     assert shift_of(lake, "2026-03-01") is None
     assert accepted_before(lake, Partition("w", "2026-03-06"), "joint", CAMERA_LIDAR) is None
 

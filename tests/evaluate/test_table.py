@@ -13,8 +13,7 @@ from pipeline.rig.se3 import inverse, to_quaternion, transform_points
 from pipeline.rig.targets import DEFAULT_TARGETS, Picks, PickUncertainty
 from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, CalibrationRecord
 from schemas.columns import POSE_COLUMNS
-from tests.makers.solve_scenes import CAMERA, T_CAMERA_LIDAR, T_LIDAR_RADAR, TRUTH
-from tests.rig.test_targets import turned
+from tests.makers.solve_scenes import CAMERA, T_CAMERA_LIDAR, T_LIDAR_RADAR, TRUTH, turned
 
 
 def columns(T, prefix=""):

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from pipeline.rig.cameras import Camera
+from pipeline.rig.changes import changed
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse, transform_points
 from schemas.calibrations import SENSORS
 from schemas.observations import EDGE_LEFT, EDGE_RIGHT, Observation
@@ -29,6 +30,11 @@ GROUND_M = -1.7
 HALF_SIZE_M = np.array([2.0, 0.9, 0.8])
 ROAD, VEGETATION, SKY, CAR = 0, 8, 10, 13
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+
+
+def turned(T: np.ndarray, axis: int, degrees: float) -> np.ndarray:
+    """T_parent_child with the child turned in its place about an axis of the parent."""
+    return changed(T, np.radians(degrees) * np.eye(6)[axis])
 
 
 def make_day(

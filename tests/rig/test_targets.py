@@ -17,29 +17,22 @@ from pipeline.rig.targets import (
     loop_errors,
 )
 from schemas.calibrations import PAIRS
-from tests.makers.solve_scenes import CAMERA, T_CAMERA_LIDAR, T_LIDAR_RADAR, TRUTH
-
-
-def turned(T, axis, angle_deg):
-    return changed(T, np.radians(angle_deg) * np.eye(6)[axis])
+from tests.makers.solve_scenes import CAMERA, T_CAMERA_LIDAR, T_LIDAR_RADAR, TRUTH, turned
 
 
 @pytest.mark.parametrize(
     ("pair", "yaw_axis", "pitch_axis"),
     [("camera_lidar", 1, 0), ("camera_radar", 1, 0), ("lidar_radar", 2, 1)],
 )
-def test_a_turn_shows_as_its_angle(pair, yaw_axis, pitch_axis):
+def test_a_turn_shows_as_its_angle_and_a_shift_ahead_as_range(pair, yaw_axis, pitch_axis):
     yawed = errors_at_targets(pair, turned(TRUTH[pair], yaw_axis, 0.5), TRUTH[pair])
     assert np.degrees(yawed[0]) == pytest.approx(0.5, abs=0.03)
     assert np.degrees(yawed[1]) < 0.05
     pitched = errors_at_targets(pair, turned(TRUTH[pair], pitch_axis, 0.5), TRUTH[pair])
     assert np.degrees(pitched[1]) == pytest.approx(0.5, abs=0.03)
-
-
-def test_a_shift_ahead_shows_as_range():
-    T = T_LIDAR_RADAR.copy()
-    T[0, 3] += 0.2
-    assert errors_at_targets("lidar_radar", T, T_LIDAR_RADAR)[2] == pytest.approx(0.2, abs=0.005)
+    ahead = changed(TRUTH[pair], 0.2 * np.eye(6)[3])
+    if pair == "lidar_radar":
+        assert errors_at_targets(pair, ahead, TRUTH[pair])[2] == pytest.approx(0.2, abs=0.005)
 
 
 def test_the_loop_of_consistent_transforms_is_closed_and_an_open_one_shows_its_angle():
@@ -55,13 +48,10 @@ def picks_of(shift_px=(0.0, 0.0)):
 
 
 @pytest.mark.parametrize("pair", PAIRS)
-def test_picks_of_the_truth_show_no_error(pair):
+def test_picks_of_the_truth_show_no_error_and_pixel_deviations_become_angles(pair):
     error = errors_of_picks(pair, TRUTH[pair], picks_of())
     assert np.degrees(np.nanmax(error[:2])) < 1e-6
     assert np.isnan(error[2]) == (pair != "lidar_radar")
-
-
-def test_pixel_deviations_become_angles():
     error = errors_of_picks("camera_lidar", T_CAMERA_LIDAR, picks_of(shift_px=(5.0, 0.0)))
     assert error[0] == pytest.approx(5 / 500, rel=0.1)  # off-axis pixels span a little less
     assert np.degrees(error[1]) < 0.03

@@ -230,6 +230,9 @@ def test_a_radar_that_turned_at_noon_shows_in_the_parts_of_the_day_with_time_and
     assert parts.sigmas(PART_FLOOR_RAD)[2] > MOVED_SIGMAS
     assert np.degrees(parts.step[2]) == pytest.approx(0.5, abs=0.1)
     assert parts.cut_ns == (day[19].stamp_ns, day[20].stamp_ns)
+    wide = turned_at_noon(day, 2, -5.0)  # wider than the registration reaches
+    assert abs(wide.sigmas(PART_FLOOR_RAD)[2]) > 10 * MOVED_SIGMAS
+    assert np.degrees(wide.step[2]) == pytest.approx(-5.0, abs=0.2)
     quiet = turned_at_noon(day, 2, 0.0)
     assert quiet.tested == (0, 1, 2)
     assert np.abs(quiet.sigmas(PART_FLOOR_RAD)).max() < MOVED_SIGMAS
@@ -274,9 +277,3 @@ def test_camera_and_radar_alone_find_their_azimuth(day):
     assert abs(error[1]) < np.radians(0.5)
     assert np.all((np.abs(error) < 3.5 * sigma_of(found))[:3][found.observable[:3]])
     assert not found.observable[3:].any()
-
-
-def test_a_knock_wider_than_the_registration_reaches_shows_in_the_parts_too(day):
-    parts = turned_at_noon(day, 2, -5.0)
-    assert abs(parts.sigmas(PART_FLOOR_RAD)[2]) > 10 * MOVED_SIGMAS
-    assert np.degrees(parts.step[2]) == pytest.approx(-5.0, abs=0.2)

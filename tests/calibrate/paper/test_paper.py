@@ -23,7 +23,7 @@ from pipeline.rig.se3 import log_se3, perturb_exactly, rotation_angle_rad
 from pipeline.rig.targets import errors_at_targets
 from schemas.calibrations import METHODS as METHOD_NAMES
 from schemas.calibrations import PAIRS
-from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day
+from tests.makers.solve_scenes import T_CAMERA_LIDAR, T_LIDAR_RADAR, make_day, turned
 
 CONFIG = SolveConfig(
     search_rotation_deg=4.0, search_translation_m=0.2, paper_population=40, paper_generations=30
@@ -181,10 +181,6 @@ def with_ages(observation, age):
 def transforms(camera_lidar=T_CAMERA_LIDAR, lidar_radar=T_LIDAR_RADAR):
     given = {"camera_lidar": camera_lidar, "lidar_radar": lidar_radar}
     return given | {"camera_radar": camera_lidar @ lidar_radar}
-
-
-def turned(T, axis, angle_deg):
-    return changed(T, np.radians(angle_deg) * np.eye(6)[axis])
 
 
 def test_nothing_fires_at_the_truth(aged):

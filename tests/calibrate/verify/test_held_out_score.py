@@ -17,6 +17,7 @@ from pipeline.rig.se3 import inverse, rotation_angle_rad
 from pipeline.rig.spherical import from_spherical
 from pipeline.rig.targets import DEFAULT_TARGETS
 from tests.makers.radar_scenes import DT_S, GROUND_M, T_LIDAR_RADAR, street_day
+from tests.makers.solve_scenes import turned
 from tests.makers.traced_scenes import DENSE, ROAD, T_TRUE, TERRAIN, traced_day
 
 SIGMA = np.array([*np.radians([0.05] * 3), 0.02, 0.02, 0.02])
@@ -33,10 +34,6 @@ def result(pair, T):
 
 def score_of(pair, T, day, prior=PRIOR):
     return held_out_score(result(pair, T), day, prior, SolveConfig())
-
-
-def turned(T, axis, degrees):
-    return changed(T, np.radians(degrees) * np.eye(6)[axis])
 
 
 def claims(pair, T, day):

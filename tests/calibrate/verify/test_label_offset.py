@@ -81,6 +81,7 @@ def test_labels_in_place_are_not_flagged():
     assert not offset.is_beside
     assert np.abs(offset.shift_px).max() < 0.3
     assert (offset.open_px == 0).all()
+    assert day_labels(make_day(3, seed=1), 0.01) is None  # of a camera without semantics
 
 
 @pytest.mark.parametrize("shift", [(-1, 0), (1, -1), (2, 0), (0, -2), (-2, 2), (3, 3), (0, 3), (-3, 0)])
@@ -92,16 +93,17 @@ def test_a_shift_of_whole_pixels_is_measured_with_its_sign_and_flagged(shift):
 
 
 # Three per cent of a whole image's rows are 7 px at its ends; here 3 % of the columns are 5 px, 5 % of the rows 4.
-SLIPS = {"wider": (0.03, 0, WIDTH / 2), "higher": (0.05, 1, HEIGHT / 2)}
-
-
-@pytest.mark.parametrize("slip", SLIPS)
-def test_a_slip_of_scale_shows_at_the_ends_and_not_in_the_middle(slip):
-    share, axis, half = SLIPS[slip]
+@pytest.mark.parametrize(
+    ("slip", "share", "axis", "half"), [("wider", 0.03, 0, WIDTH / 2), ("higher", 0.05, 1, HEIGHT / 2)]
+)
+def test_a_slip_of_scale_shows_at_the_ends_and_not_in_the_middle_and_is_not_taken_back(
+    slip, share, axis, half
+):
     offset = measure_label_offset(gradients_of(FRAMES, **{slip: share}), BLOCKS)
     assert offset.is_beside
     assert offset.ends_px[axis] == pytest.approx(-share * half, rel=0.35)
     assert abs(offset.shift_px[axis]) < 0.6
+    assert day_labels(day(**{slip: share}), 1.0).moved_px is None
 
 
 @pytest.mark.parametrize("wide_px", [1, 4])
@@ -149,11 +151,6 @@ def test_an_offset_within_the_limit_is_taken_back_and_its_sigma_is_the_records()
     assert estimate.diagnostics["label_moved_u_px"] == labels.moved_px[0]
 
 
-@pytest.mark.parametrize("slip", SLIPS)
-def test_a_slip_of_scale_is_not_taken_back(slip):
-    assert day_labels(day(**{slip: SLIPS[slip][0]}), 1.0).moved_px is None
-
-
 def test_scenes_that_disagree_leave_a_pixel_open_down_the_image_and_widen_pitch_by_it():
     gradients = gradients_of(FRAMES)
     gradients[::2, 2:4] = np.roll(gradients[::2, 2:4], 4, -1)
@@ -169,7 +166,3 @@ def test_scenes_that_disagree_leave_a_pixel_open_down_the_image_and_widen_pitch_
     assert more[0] == pytest.approx(open_px[1] / focal_px(rows))
     assert more[1] == pytest.approx(open_px[0] / focal_px(rows))
     assert more[2:].max() < 1e-9
-
-
-def test_a_camera_without_semantics_has_no_labels_to_move():
-    assert day_labels(make_day(3, seed=1), 0.01) is None
