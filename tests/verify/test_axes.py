@@ -61,11 +61,32 @@ def test_a_calibration_that_agrees_passes_with_what_the_pass_is_worth():
     assert azimuth.shown_rad == pytest.approx((0.2 + 1.645 * 0.04) * DEG, rel=0.05)
 
 
-def test_an_error_beyond_chance_and_limit_fails_on_its_own_axis_alone():
-    of_yaw, of_pitch, of_roll = (axes(record(0.5, axis=a)) for a in (1, 0, 2))
-    assert {a for a, c in of_yaw.items() if c.status == "fail"} == {"azimuth"}
-    assert {a for a, c in of_pitch.items() if c.status == "fail"} == {"elevation"}
-    assert {a for a, c in of_roll.items() if c.status == "fail"} == {"roll"}
+UNSURE = {"status": "held", "diagnostics": {"unsure_only": 1.0}}
+
+
+@pytest.mark.parametrize(
+    ("of", "axis", "status"),
+    [
+        (record(0.5, axis=1), "azimuth", "fail"),
+        (record(0.5, axis=0), "elevation", "fail"),
+        (record(0.5, axis=2), "roll", "fail"),
+        (record(0.15, 0.03), "azimuth", "warn"),  # measured, and does not matter
+        (record(0.0, 0.2), "azimuth", "inconclusive"),  # it would not have shown the error asked for
+        # A record held for its sigma alone counts as far as that goes.
+        (record(0.5, 0.09, **UNSURE), "azimuth", "fail"),
+        (record(0.5, 0.2, **UNSURE), "azimuth", "inconclusive"),
+        # A radar's limits are its own.
+        (record(0.5, pair="lidar_radar", axis=2), "azimuth", "fail"),
+        (record(0.35, pair="lidar_radar", axis=2), "azimuth", "warn"),
+        (record(0.5, pair="lidar_radar", axis=1), "elevation", "warn"),
+    ],
+)
+def test_an_axis_fails_alone_warns_or_cannot_tell_by_error_sigma_and_limit(of, axis, status):
+    found = axes(of)
+    assert found[axis].status == status
+    assert [a for a, c in found.items() if c.status == "fail"] == [axis] * (status == "fail")
+    assert status != "inconclusive" or found[axis].power < VerifyConfig().confidence
+    assert ("roll" in found) == (of.pair == "camera_lidar")
 
 
 def test_of_many_sensors_it_is_right_where_pairs_that_pass_tie_them_all():
@@ -80,23 +101,6 @@ def test_of_many_sensors_it_is_right_where_pairs_that_pass_tie_them_all():
     assert answer_of(checks(("left", "top", 0.04), ("right", "nose", 0.04))) == "inconclusive"
 
 
-def test_an_error_that_is_measured_but_does_not_matter_is_a_warning():
-    assert axes(record(0.15, 0.03))["azimuth"].status == "warn"
-
-
-def test_a_log_that_would_not_have_shown_the_error_asked_for_is_inconclusive_and_never_passes():
-    azimuth = axes(record(0.0, 0.2))["azimuth"]
-    assert azimuth.status == "inconclusive"
-    assert azimuth.power < VerifyConfig().confidence
-
-
-def test_a_radars_limits_are_its_own():
-    assert axes(record(0.5, pair="lidar_radar", axis=2))["azimuth"].status == "fail"
-    assert axes(record(0.35, pair="lidar_radar", axis=2))["azimuth"].status == "warn"
-    assert axes(record(0.5, pair="lidar_radar", axis=1))["elevation"].status == "warn"
-    assert "roll" not in axes(record(pair="lidar_radar"))
-
-
 @pytest.mark.parametrize("off_deg", [0.0, 0.5])
 def test_a_log_whose_own_answer_failed_a_check_says_nothing_of_the_one_in_use(off_deg):
     held = record(off_deg, status="held", reason="restarts disagree", diagnostics={"unsure_only": 0.0})
@@ -105,12 +109,6 @@ def test_a_log_whose_own_answer_failed_a_check_says_nothing_of_the_one_in_use(of
     refused = replace(held, status="refused", qw=None, covariance=None, reason="no observations")
     assert {c.status for c in axes(refused).values()} == {"inconclusive"}
     assert "no observations" in axes(refused)["azimuth"].reason
-
-
-def test_a_record_held_for_its_sigma_alone_is_believed_as_far_as_that_goes():
-    held = {"status": "held", "diagnostics": {"unsure_only": 1.0}}
-    assert axes(record(0.5, 0.09, **held))["azimuth"].status == "fail"
-    assert axes(record(0.5, 0.2, **held))["azimuth"].status == "inconclusive"
 
 
 def turned(sensor, axis, deg):
