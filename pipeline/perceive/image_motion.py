@@ -95,11 +95,6 @@ class Tracks:
         """Some of the tracks."""
         return Tracks(self.before_px[of], self.now_px[of], self.before[of], self.now[of], self.pixel_rad[of])
 
-    @property
-    def moved_px(self) -> Float[np.ndarray, " N"]:
-        """How far each track went."""
-        return np.linalg.norm(self.now_px - self.before_px, axis=1)
-
 
 @dataclass(frozen=True, eq=False)
 class ImageMotion:
@@ -211,7 +206,7 @@ def _moving(tracks: Tracks) -> Bool[np.ndarray, " N"]:
     """Tracks that move; raises NoMotionError for too few."""
     if len(tracks.pixel_rad) < _FEWEST:
         raise NoMotionError(MotionReason.FEW_TRACKS)
-    moving = tracks.moved_px > _STILL_PX
+    moving = np.linalg.norm(tracks.now_px - tracks.before_px, axis=1) > _STILL_PX
     if np.mean(moving) < _STANDING:
         raise NoMotionError(MotionReason.STANDING)
     if np.count_nonzero(moving) < _FEWEST:

@@ -310,7 +310,7 @@ def _source(
     # onnxruntime loads only where it is used.
     from pipeline.perceive.models.source import ModelSource  # noqa: PLC0415
 
-    models = ModelSource.load(wanted, fleet)
+    models = ModelSource(wanted, fleet)
     return models, {"source": "onnx", **models.provenance}
 
 

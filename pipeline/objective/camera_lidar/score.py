@@ -164,10 +164,6 @@ class Terms:
         rows = {name: getattr(self, name)[frames] for name in ("velocity_lidar", "yaw_rate", "gap_s")}
         return replace(self, **points, **rows)
 
-    def gaps_beyond(self, constant_s: float) -> Terms:
-        """With gaps minus a constant, so that time offsets are relative to it."""
-        return replace(self, gap_s=self.gap_s - constant_s)
-
     def exposed_at(self, at: Alignments, velocity_lidar: Float[np.ndarray, "F 3"] | None = None) -> Terms:
         """With points where their image rows saw them at ONE alignment; maybe with other velocities from then on."""
         velocity = self.velocity_lidar if velocity_lidar is None else velocity_lidar

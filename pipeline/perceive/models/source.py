@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from pipeline.core.config import FleetConfig, PerceiveConfig
+from pipeline.core.config import FleetConfig
 from pipeline.core.errors import ModelError
 from pipeline.core.rigs import OnnxSemantics
 from pipeline.perceive.camera import CameraSemantics, FrameRejectedError, decode_colour, label_size
@@ -26,14 +26,21 @@ def check_models(rig: Rig, fleet: FleetConfig) -> None:
     """
     for camera in rig.cameras.values():
         if isinstance(camera.semantics, OnnxSemantics):
-            load_manifest(fleet.path_of(camera.semantics.segmenter), "segment")
-            load_manifest(fleet.path_of(camera.semantics.detector), "detect")
+            _manifests(camera.semantics, fleet)
+
+
+def _manifests(wanted: OnnxSemantics, fleet: FleetConfig) -> tuple[Manifest, Manifest]:
+    """Of segmenter and detector, named in fleet.toml relative to it."""
+    segmenter = load_manifest(fleet.path_of(wanted.segmenter), "segment")
+    return segmenter, load_manifest(fleet.path_of(wanted.detector), "detect")
 
 
 class ModelSource:
     """Semantics of images from ONNX models."""
 
-    def __init__(self, segmenter: Manifest, detector: Manifest, config: PerceiveConfig) -> None:
+    def __init__(self, wanted: OnnxSemantics, fleet: FleetConfig) -> None:
+        """Load the models named in fleet.toml; raises ModelError as `check_models`."""
+        (segmenter, detector), config = _manifests(wanted, fleet), fleet.perceive
         self._segmenter = Segmenter(segmenter, config.providers)
         self._detector, self._config = Detector(detector, config.providers), config
         self._known: dict[int, CameraSemantics | Exception] = {}
@@ -42,13 +49,6 @@ class ModelSource:
             "segmenter": segmenter.model_dump(mode="json", exclude={"file", "path"}),
             "detector": detector.model_dump(mode="json", exclude={"file", "path"}),
         }
-
-    @classmethod
-    def load(cls, wanted: OnnxSemantics, fleet: FleetConfig) -> ModelSource:
-        """Load the models named in fleet.toml, relative to it; raises ModelError as `check_models`."""
-        segmenter = load_manifest(fleet.path_of(wanted.segmenter), "segment")
-        detector = load_manifest(fleet.path_of(wanted.detector), "detect")
-        return cls(segmenter, detector, fleet.perceive)
 
     def read(self, frame: ImageColumns) -> CameraSemantics:
         """Run both models on the frame's image.

@@ -226,7 +226,7 @@ def _terms(
     reach, T = search_range(prior.sigmas, config).rotation_rad + MARGIN_RAD, prior.T_camera_lidar
     readout_s, start = prior.camera.readout_s, Start(T, prior.rotation_sigma_rad)
     terms = prepare_terms(frames, T, velocity_lidar, reach_rad=reach, readout_s=readout_s, start=start)
-    terms = terms.gaps_beyond(constant_gap_s(terms.gap_s))
+    terms = replace(terms, gap_s=terms.gap_s - constant_gap_s(terms.gap_s))  # so that dt is beyond it
     terms = terms.of_kinds(edges="edges" in config.terms, markings="reflectivity" in config.terms)
     if "edges" in config.terms and len(terms.edges.xyz_m) < _FEWEST_EDGES * len(frames):
         raise SolveError("camera-lidar: hardly any depth edges in the camera's field of view")
