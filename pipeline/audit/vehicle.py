@@ -99,7 +99,9 @@ def _judged(
         days = days[(days < strongest.day) | (days >= strongest.settled)]
     alone = len(days) > 0 and strongest.day == int(days[-1])  # a last day that stands alone is what it is
     whitened = [_whitened(seen, some, days, alone=alone) for some in _as_alike_as_may_be(noise)]
-    charts = _share_start(charts, _joint_start(whitened[0], days))
+    if len(days) > 1:  # by the full 6x6 covariances of all edges, on the days that all of them have
+        gains = np.sum([found.step_gains() for found in whitened[0].values()], axis=0)
+        charts = _share_start(charts, start_interval(gains, days))
     return VehicleVerdict(charts, _attribute(_strongest(list(charts.values())), whitened, noise, days))
 
 
@@ -151,11 +153,9 @@ def independent_edges(own: Mapping[Edge, PairDays], days: Int[np.ndarray, " N"])
 
 
 def _share_start(
-    verdicts: dict[tuple[Edge, str], ChartVerdict], joint: tuple[int, int, int] | None
+    verdicts: dict[tuple[Edge, str], ChartVerdict], joint: tuple[int, int, int]
 ) -> dict[tuple[Edge, str], ChartVerdict]:
     """Give all steps that may be one event the start day that all DoFs together find."""
-    if joint is None:
-        return verdicts
     first, earliest, latest = joint
     shared = {}
     for key, verdict in verdicts.items():
@@ -164,13 +164,6 @@ def _share_start(
             change = replace(change, day=first, earliest=earliest, latest=latest)
         shared[key] = replace(verdict, change=change)
     return shared
-
-
-def _joint_start(own: Mapping[Edge, Whitened], days: Int[np.ndarray, " N"]) -> tuple[int, int, int] | None:
-    """Start day and interval from the full 6x6 covariances of all edges on the days that all of them have."""
-    if len(days) < 2:
-        return None
-    return start_interval(np.sum([found.step_gains() for found in own.values()], axis=0), days)
 
 
 def _attribute(

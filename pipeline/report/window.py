@@ -120,11 +120,8 @@ def _rare(parts: list[pa.Table]) -> list[str]:
 
 
 def _window_of(table: pa.Table | None) -> FleetWindow:
-    if table is None:
-        none = np.zeros(0, np.int64)
-        T, sigma = np.zeros((0, 4, 4)), np.zeros((0, 6))
-        return FleetWindow([], (), none, none, none, none, T, sigma, np.zeros((0, 6), bool), [], [])
-    found = current_rows(table, CALIBRATIONS)
+    found = CALIBRATIONS.arrow_schema().empty_table() if table is None else table
+    found = current_rows(found, CALIBRATIONS)
     # What no release writes is not drawn; the audit names such records.
     found = known_rows(found, {"pair": EDGE_KINDS, "status": STATUSES})
     edges, edge = edges_of_rows(found)

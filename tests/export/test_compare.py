@@ -125,6 +125,7 @@ def test_an_export_is_its_record_and_every_kind_of_source_can_be_named(lake, tmp
         found = json.loads(told.out)
         assert (told.code, len(found["pairs"])) == (0, 3)
         assert any("same days" in note for note in found["notes"]) == same
+        assert any("depends on its prior" in note for note in found["notes"]) == other.endswith("/prior")
     assert {p["status_b"] for p in found["pairs"]} == {"held"}
 
 

@@ -80,10 +80,9 @@ def lake(tmp_path_factory):
     return lake
 
 
-def export(capsys, lake, out, day=DAY.day):
-    return command(
-        capsys, "export", "foxglove", "--lake", lake.root, "--vehicle", "car", "--day", day, "--out", out
-    )
+def export(capsys, lake, out, day=DAY.day, *more):
+    call = ("export", "foxglove", "--lake", lake.root, "--vehicle", "car", "--day", day, "--out", out, *more)
+    return command(capsys, *call)
 
 
 @pytest.fixture
@@ -108,6 +107,12 @@ def test_every_topic_has_its_messages_and_images_pass_byte_for_byte(messages):
     assert {topic: len(found) for topic, found in messages.items()} == counts
     assert [m.data for m in messages[TOPICS["image"]]] == [jpeg(i) for i in range(COUNT)]
     assert {m.frame_id for m in messages[TOPICS["image"]]} == {"camera"}
+
+
+def test_fewer_frames_are_spread_over_the_day(lake, tmp_path, capsys):
+    export(capsys, lake, tmp_path / "few.mcap", DAY.day, "--most-frames", 2)
+    images = messages_of(tmp_path / "few.mcap")[TOPICS["image"]]
+    assert [m.data for m in images] == [jpeg(0), jpeg(COUNT - 1)]
 
 
 def test_the_camera_is_called_what_foxglove_calls_it(messages):

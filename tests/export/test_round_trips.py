@@ -66,13 +66,14 @@ def test_warnings_frames_and_sigma_are_in_the_file_or_beside_it(name, tmp_path):
         observable=(True,) * 5 + (False,),
         certified=(),
     )
-    files = written_files(
-        format_named(name), calibration(pairs=sent.pairs | {"lidar_radar": held}), tmp_path / "o"
-    )
+    whole = replace(sent.pairs["camera_lidar"], reason="since it moved")  # no warning: all of it is certified
+    pairs = sent.pairs | {"camera_lidar": whole, "lidar_radar": held}
+    files = written_files(format_named(name), calibration(pairs=pairs), tmp_path / "o")
     text = b"".join(files.values()).decode(errors="replace")
     at_prior = "certified: nothing; at the prior: up"
     for words in ("lidar_radar is HELD", at_prior, "optical: x right, y down, z forward"):
         assert words in text
+    assert "camera_lidar: since it moved" not in text
     side = [path for path in files if path.name.endswith(".provenance.json")]
     assert bool(side) != format_named(name).holds_provenance
     if side:
