@@ -1,6 +1,5 @@
 """The table of words in pipeline/fleet/README.md, walked through on one lake: each place that names a state."""
 
-import json
 import re
 from dataclasses import replace
 from itertools import chain, combinations_with_replacement
@@ -9,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jobs.cli import main
 from jobs.terminal.night_view import _MARKS
 from jobs.terminal.record_tables import STATUS_STYLES
 from pipeline.core.results import Outcome
@@ -23,6 +21,7 @@ from schemas.outcomes import OUTCOME_STATUSES
 from schemas.states import STATES
 from schemas.words import DAY_WORDS, day_word
 from tests.audit.fleet_records import vehicle_records
+from tests.makers.commands import command
 from tests.makers.fleet_pages import write_fleet_page
 from tests.makers.stages import audit_fleet
 from tests.report.test_pages import _config
@@ -87,19 +86,14 @@ def lake(tmp_path_factory) -> tuple[Lake, dict[str, str]]:
     return lake, days
 
 
-def summary_of(capsys, *command: object) -> dict:
-    main([str(part) for part in command])
-    return json.loads(capsys.readouterr().out.splitlines()[-1])
-
-
 def test_status_page_and_export_call_each_day_by_the_same_word(lake, tmp_path, capsys):
     lake, days = lake
-    told = summary_of(capsys, "status", "--lake", lake.root, "--json")
+    told = command(capsys, "status", "--lake", lake.root, "--json").summary
     assert {d["day"]: d["status"] for d in told["days"]} == days
     assert [told[word] for word in DAYS] == [1, 1, 1, 1]
     page = write_fleet_page(lake, _config(), tmp_path / "fleet.html")
     chips = dict(re.findall(r'class="c \w+"[^>]* title="(\d{4}-\d\d-\d\d): (\w+)', page))
     assert chips == days
     of_v = ["--lake", lake.root, "--vehicle", "v", "--out", tmp_path / "out"]
-    exported = {day: summary_of(capsys, "export", "ros2", *of_v, "--day", day)["status"] for day in days}
+    exported = {d: command(capsys, "export", "ros2", *of_v, "--day", d).summary["status"] for d in days}
     assert exported == days

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jobs.cli import main
 from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake
 from schemas.calibrations import CALIBRATIONS
 from tests.audit.fleet_records import vehicle_records
+from tests.makers.commands import command
 from tests.makers.fleet_files import fleet_toml
 from tests.makers.processes import started
 from tests.makers.written_logs import Kit
@@ -59,17 +59,9 @@ def rig_of(folder: Path, **rigs: str) -> Path:
     return folder
 
 
-def night(folder: Path, lake: Path | None = None) -> list[str]:
+def night(folder: Path) -> list[str]:
     logs = f"{folder}/logs/{{vehicle}}/{{day}}/*"
-    options = [
-        "--lake",
-        f"{lake or folder / 'lake'}",
-        "--logs",
-        logs,
-        "--executor",
-        "inline",
-        "--no-pictures",
-    ]
+    options = ["--lake", f"{folder}/lake", "--logs", logs, "--executor", "inline", "--no-pictures"]
     return ["nightly", "--fleet", f"{folder}/fleet.toml", *options]
 
 
@@ -78,10 +70,10 @@ def nothing_new(folder: Path) -> list[str]:
 
 
 def full_disk(folder: Path) -> list[str]:
-    command = night(rig_of(folder, car="default"))
+    asked = night(rig_of(folder, car="default"))
     (folder / "lake").mkdir()
     (folder / "lake" / "moments").touch()  # no folder can be made here
-    return command
+    return asked
 
 
 def nothing_certified(folder: Path) -> list[str]:
@@ -107,20 +99,20 @@ def short_log(folder: Path) -> list[str]:
 CODES = {0: nothing_new, 1: full_disk, 3: no_day_yet, 4: nothing_certified, 5: short_log}
 
 
-@pytest.mark.parametrize(("code", "command"), CODES.items())
+@pytest.mark.parametrize(("code", "asked"), CODES.items())
 def test_each_code_of_the_table_is_what_a_command_returns_with_the_status_it_lists(
-    code, command, tmp_path, capsys
+    code, asked, tmp_path, capsys
 ):
-    assert main(command(tmp_path)) == code
-    summary = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert summary["status"] in table()[code].split(", ")
+    told = command(capsys, *asked(tmp_path))
+    assert told.code == code
+    assert told.summary["status"] in table()[code].split(", ")
 
 
 @pytest.mark.parametrize("code", [130, 143])
 def test_a_stopped_command_ends_with_the_code_of_its_signal(code, tmp_path):
     options = ["--out", str(tmp_path / "fleet"), "--vehicles", "1", "--days", "9", "--frames", "300"]
-    command = [sys.executable, "-c", LISTENING, "simulate", *options]
-    with started(command, stdout=subprocess.PIPE, text=True) as process:
+    call = [sys.executable, "-c", LISTENING, "simulate", *options]
+    with started(call, stdout=subprocess.PIPE, text=True) as process:
         while not list(tmp_path.rglob("logs/*/*")):
             assert process.poll() is None
             time.sleep(0.1)
@@ -132,8 +124,8 @@ def test_a_stopped_command_ends_with_the_code_of_its_signal(code, tmp_path):
 
 
 def test_a_rig_whose_days_are_all_misconfigured_is_named_and_the_others_go_on(tmp_path, capsys):
-    assert main(night(rig_of(tmp_path, car="default", van="mistyped"))) == 2
-    summary = json.loads(capsys.readouterr().out.splitlines()[-1])
+    code, summary, *_ = command(capsys, *night(rig_of(tmp_path, car="default", van="mistyped")))
+    assert code == 2
     assert summary["status"] in table()[2].split(", ")
     assert set(summary["misconfigured"]) == {"mistyped"}
     assert "/camera/imag" in summary["misconfigured"]["mistyped"]
@@ -144,33 +136,24 @@ def test_a_rig_whose_days_are_all_misconfigured_is_named_and_the_others_go_on(tm
     fleet = tmp_path / "fleet.toml"
     fleet.write_text(fleet.read_text().replace('rig = "mistyped"', 'rig = "default"'))
     Kit(frames=4).drive().without("/lidar/points").mcap(tmp_path / "logs" / "van" / DAY / "a.mcap")
-    capsys.readouterr()
-    assert main(night(tmp_path)) == 3
-    summary = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert (summary["status"], summary["refused"]) == ("refused", 2)
+    code, summary, *_ = command(capsys, *night(tmp_path))
+    assert (code, summary["status"], summary["refused"]) == (3, "refused", 2)
 
 
-def told(capfd, command: list[str]) -> tuple[int, dict, str]:
-    """Exit code, summary and what goes to stderr."""
-    code = main(command)
-    out, err = capfd.readouterr()
-    return code, json.loads(out.splitlines()[-1]), err
-
-
-def test_a_refused_day_is_a_success_where_the_scheduler_knows_no_other(tmp_path, capfd):
-    command = no_day_yet(tmp_path)
-    code, summary, _ = told(capfd, [*command, "--held-exit-code", "0"])
+def test_a_refused_day_is_a_success_where_the_scheduler_knows_no_other(tmp_path, capsys):
+    asked = no_day_yet(tmp_path)
+    code, summary, *_ = command(capsys, *asked, "--held-exit-code", "0")
     assert (code, summary["status"], summary["refused"]) == (0, "refused", 1)
-    assert main([*command, "--held-exit-code", "1"]) == 2  # no other can be asked for
+    assert command(capsys, *asked, "--held-exit-code", "1").code == 2  # no other can be asked for
 
 
-def test_a_night_is_told_to_monitoring_and_metrics_that_cannot_be_written_fail_nothing(tmp_path, capfd):
+def test_a_night_is_told_to_monitoring_and_metrics_that_cannot_be_written_fail_nothing(tmp_path, capsys):
     pytest.importorskip("prometheus_client", reason="pip install 'boresight[ops]'")
-    command = no_day_yet(tmp_path)
-    assert main([*command, "--metrics", f"{tmp_path}/night.prom"]) == 3
+    asked = no_day_yet(tmp_path)
+    assert command(capsys, *asked, "--metrics", f"{tmp_path}/night.prom").code == 3
     metrics = (tmp_path / "night.prom").read_text()
     assert 'boresight_vehicle_days{fleet="tests",status="refused"} 1.0' in metrics
     assert "boresight_last_success_timestamp_seconds" in metrics
-    code, summary, err = told(capfd, [*command, "--metrics", f"{tmp_path}/missing/night.prom"])
-    assert (code, summary["status"]) == (3, "refused")
-    assert f"{tmp_path}/missing/night.prom" in err
+    told = command(capsys, *asked, "--metrics", f"{tmp_path}/missing/night.prom")
+    assert (told.code, told.summary["status"]) == (3, "refused")
+    assert f"{tmp_path}/missing/night.prom" in told.err

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from jobs.cli import main
+from tests.makers.commands import command
 from tests.makers.fleet_files import fleet_toml
 from tests.makers.written_logs import DETECTIONS, IMAGE, INFO, LABELS, LIDAR, START_NS, Kit
 
@@ -31,28 +31,23 @@ def configured(folder, *vehicles, old="", new=""):
     return folder / "fleet.toml"
 
 
-def last_line(capsys):
-    return json.loads(capsys.readouterr().out.splitlines()[-1])
-
-
 def night(folder, capsys, logs="*", *more):
     """Exit code and summary of a night."""
     options = ["--lake", f"{folder}/lake", "--logs", f"{folder}/logs/{{vehicle}}/{{day}}/{logs}"]
     options += ["--executor", "inline", "--no-pictures", *more]
-    code = main(["nightly", "--fleet", f"{folder}/fleet.toml", *options])
-    return code, last_line(capsys)
+    return command(capsys, "nightly", "--fleet", f"{folder}/fleet.toml", *options)[:2]
 
 
 def status(folder, capsys, *more):
-    code = main(["status", "--lake", f"{folder}/lake", *more])
-    return code, last_line(capsys)
+    return command(capsys, "status", "--lake", f"{folder}/lake", *more)[:2]
 
 
 def check(folder, log, capsys):
-    code = main(["check", f"{folder}/fleet.toml", str(log), "--json"])
-    report = json.loads(capsys.readouterr().out)
-    assert main(["check", f"{folder}/fleet.toml", str(log)]) == code
-    return report, last_line(capsys)["next_steps"]
+    asked = ("check", f"{folder}/fleet.toml", log)
+    code, report, *_ = command(capsys, *asked, "--json")
+    told = command(capsys, *asked)
+    assert told.code == code
+    return report, told.summary["next_steps"]
 
 
 def on_pages(folder):
@@ -86,8 +81,9 @@ def test_a_mistyped_topic_is_misconfigured_though_the_night_goes_on_with_the_oth
         assert (code, summary["misconfigured"], summary["next_steps"]) == (2, {"default": MISTYPED}, [step])
         assert MISTYPED in problem["reason"]
     code, of_status = status(tmp_path, capsys)
-    assert main(["audit", "--fleet", f"{tmp_path}/fleet.toml", "--lake", f"{tmp_path}/lake"]) == 0
-    for summary in (of_status, last_line(capsys)):
+    audited = command(capsys, "audit", "--fleet", f"{tmp_path}/fleet.toml", "--lake", f"{tmp_path}/lake")
+    assert audited.code == 0
+    for summary in (of_status, audited.summary):
         assert (summary["misconfigured"], summary["next_steps"]) == ({"car": MISTYPED}, [step])
     assert_on_pages(tmp_path, step)
     _, steps = check(tmp_path, log, capsys)
@@ -160,8 +156,7 @@ def test_a_camera_without_intrinsics_is_named_by_every_command(tmp_path, capsys,
     assert CALIBRATED in reasons["camera_lidar"]
     assert CALIBRATED not in reasons["lidar_radar"]
     out = tmp_path / "found.toml"
-    assert main(["init", str(log), "--out", str(out)]) == 0
-    (problem,) = last_line(capsys)["problems"]
+    (problem,) = command(capsys, "init", log, "--out", out).summary["problems"]
     assert problem.startswith(f"Camera left out: no usable CameraInfo of {IMAGE}")
     assert f"# {problem}" in out.read_text()
 
@@ -214,24 +209,13 @@ def test_an_unknown_vehicle_of_a_lake_is_an_error_that_names_those_it_has(tmp_pa
     driven(tmp_path, Kit(frames=4).drive())
     configured(tmp_path)
     night(tmp_path, capsys)
-    for command in ("state", "status"):
-        assert main([command, "--lake", f"{tmp_path}/lake", "--vehicle", "kar"]) == 2
-        assert last_line(capsys)["reason"].endswith("the lake has no day of 'kar'; it has car")
-        assert main([command, "--lake", f"{tmp_path}/lake", "--vehicle", "car"]) == 0
-        capsys.readouterr()
-    for day in ([], ["--day", DAY]):
-        asked = [
-            "export",
-            "ros2",
-            "--lake",
-            f"{tmp_path}/lake",
-            "--out",
-            f"{tmp_path}/out",
-            "--vehicle",
-            "kar",
-        ]
-        assert main([*asked, *day]) == 2
-        assert last_line(capsys)["reason"].endswith("the lake has no day of 'kar'; it has car")
+    of_lake, out = ("--lake", f"{tmp_path}/lake"), ("--out", f"{tmp_path}/out")
+    for name in ("state", "status"):
+        assert command(capsys, name, *of_lake, "--vehicle", "car").code == 0
+    for asked in (["state"], ["status"], ["export", "ros2", *out], ["export", "ros2", *out, "--day", DAY]):
+        told = command(capsys, *asked, *of_lake, "--vehicle", "kar")
+        assert told.code == 2
+        assert told.summary["reason"].endswith("the lake has no day of 'kar'; it has car")
 
 
 def test_without_transforms_the_next_step_is_a_prior(tmp_path, capsys):
@@ -244,9 +228,9 @@ def test_without_transforms_the_next_step_is_a_prior(tmp_path, capsys):
 
 
 def test_an_error_is_printed_once_where_both_streams_go_to_one_place(tmp_path):
-    command = [sys.executable, "-m", "jobs.cli", "status", "--lake", f"{tmp_path}/none"]
-    told = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
+    call = [sys.executable, "-m", "jobs.cli", "status", "--lake", f"{tmp_path}/none"]
+    told = subprocess.run(call, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
     assert told.stdout.count("no such folder") == 1
     assert json.loads(told.stdout.splitlines()[-1])["exit_code"] == told.returncode == 2
-    apart = subprocess.run(command, capture_output=True, text=True, check=False)
+    apart = subprocess.run(call, capture_output=True, text=True, check=False)
     assert [s.count("no such folder") for s in (apart.stdout, apart.stderr)] == [1, 1]

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from jobs.calibration_sources import FrameOptions, poses_in_use
-from jobs.cli import main
 from jobs.verify import with_calibration
 from pipeline.core.config import load_fleet
 from pipeline.core.errors import ConfigError
@@ -19,6 +18,7 @@ from pipeline.store.partitions import Lake
 from schemas.calibrations import CALIBRATIONS
 from schemas.poses import POSES
 from tests.export.test_import_rig import FLEET, OTHERS, T_TOP, exported
+from tests.makers.commands import command
 from tests.makers.fleet_files import fleet_toml
 from tests.makers.rig_records import pose_rows, rig_records
 from tests.makers.simulated_days import simulated_day
@@ -43,9 +43,8 @@ def calibration(path, truth, turned_deg=0.0):
 
 def verify(car, file, capsys, *more):
     fleet, logs, _ = car
-    options = ["--fleet", str(fleet), "--calibration", str(file), "--json", *more]
-    code = main(["verify", *map(str, logs), *options])
-    return code, json.loads(capsys.readouterr().out)
+    options = ["--fleet", fleet, "--calibration", file, "--json", *more]
+    return command(capsys, "verify", *logs, *options)[:2]
 
 
 def status_of(answer, pair, axis):
@@ -107,8 +106,8 @@ def test_nonsense_is_refused_before_a_log_is_opened(tmp_path, capsys):
         "name at least one log": [],
     }
     for said, arguments in calls.items():
-        assert main(["verify", *arguments, "--fleet", str(fleet)]) == 2
-        assert said in capsys.readouterr().out
+        told = command(capsys, "verify", *arguments, "--fleet", fleet)
+        assert (told.code, said in told.out) == (2, True)
 
 
 # A rig of many sensors.
