@@ -14,7 +14,7 @@ from cyclopts import Parameter
 from jobs.extras import require
 from jobs.terminal.logging import logger
 from jobs.terminal.night_view import night_view
-from jobs.terminal.summary import exit_code, left_out, print_summary, progress_reporter
+from jobs.terminal.summary import exit_code, left_out, print_summary, problems_of, progress_reporter
 from jobs.terminal.vehicle_status import count_statuses, moved_sensors, next_steps, told_of
 from pipeline.calibrate.methods import method_named
 from pipeline.core.config import load_fleet
@@ -114,11 +114,7 @@ def nightly(
         {0: "done", 1: "failed", 2: "failed", 3: night_word(o.status for o in outcomes)}[code],
         vehicle_days=len(outcomes),
         **{s: sum(o.status == s for o in outcomes) for s in ("cached", *DAY_WORDS) if s != "missing"},
-        problems=[
-            {name: getattr(o, name) for name in ("vehicle", "day", "status", "reason", "pairs")}
-            for o in outcomes
-            if o.status not in ("done", "cached")
-        ],
+        problems=problems_of(outcomes, "vehicle", "day", "status", "reason", "pairs"),
         **told_of(findings),
         misconfigured=to_mend(outcomes, config),
         logs_left_out=left_out_logs,

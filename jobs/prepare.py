@@ -13,7 +13,7 @@ from cyclopts import Parameter
 from rich.console import Console
 from rich.table import Table
 
-from jobs.terminal.summary import exit_code, print_summary, progress_reporter
+from jobs.terminal.summary import exit_code, print_summary, problems_of, progress_reporter
 from pipeline.core.config import FleetConfig, load_fleet
 from pipeline.core.errors import ConfigError
 from pipeline.core.results import Outcome
@@ -93,11 +93,6 @@ def prepare(
     wanted = [side for side, share in shares.items() if share > 0]
     empty = [side for side in wanted if not inventory.frames[side]]
     few = f"no frames: too few to split them by {', '.join(split.by)} (prepare.split.by)"
-    problems = [
-        {name: getattr(r, name) for name in ("vehicle", "day", "status", "reason")}
-        for r in results
-        if r.status not in ("done", "cached")
-    ]
     code = exit_code([*(r.status for r in results), *("held" for _ in empty)])
     print_summary(
         "prepare",
@@ -109,7 +104,10 @@ def prepare(
         rejected=inventory.rejected,
         choices=about["choices"],
         leaks=len(inventory.leaks),
-        problems=[*problems, *({"side": side, "status": "held", "reason": few} for side in empty)],
+        problems=[
+            *problems_of(results, "vehicle", "day", "status", "reason"),
+            *({"side": side, "status": "held", "reason": few} for side in empty),
+        ],
         next_steps=[
             _next_step(fleet, choices, wanted) if empty else f"boresight train --data {lake} --out run"
         ],

@@ -7,7 +7,7 @@ from itertools import combinations
 
 import numpy as np
 
-from schemas.columns import Posed, TableSchema, array, column, row
+from schemas.columns import FAULTS_DOC, OBSERVABILITY_DOC, STATUS_DOC, Posed, TableSchema, array, column, row
 
 __all__ = [
     "ASKS_FOR_FRAMES",
@@ -55,9 +55,7 @@ class CalibrationRecord(Posed):
     pair: str = column("kind of the edge: kinds of its two sensors, e.g. camera_lidar")
     parent_frame: str = column("frame a of T_a_b: name of a sensor, or base")
     child_frame: str = column("frame b of T_a_b: name of a sensor, or base")
-    observability: list[float] | None = column(
-        "per DoF: 1 - posterior/prior variance along it; 0 = the day adds nothing to the prior", default=None
-    )
+    observability: list[float] | None = column(OBSERVABILITY_DOC, default=None)
     prior_qw: float | None = column(_PRIOR, default=None)
     prior_qx: float | None = column(_PRIOR, default=None)
     prior_qy: float | None = column(_PRIOR, default=None)
@@ -78,13 +76,9 @@ class CalibrationRecord(Posed):
         "<f8", (6, 6), "the part of it that is common to all days", default=None
     )
     own_observable: list[bool] | None = column(f"per DoF: determined {_OWN}", default=None)
-    status: str = column(
-        "accepted (use it), held (computed, the prior stays current), refused (nothing computed)"
-    )
+    status: str = column(STATUS_DOC)
     reason: str = column("reason for the status; empty if accepted without remark")
-    faults: list[str] = column(
-        "faults named in the reason, keys of FAULTS in schemas/faults.py", default_factory=list
-    )
+    faults: list[str] = column(FAULTS_DOC, default_factory=list)
     score: float | None = column(
         "smallest margin over the checks of the verdict: 1 = far inside, 0 = at a limit, below 0 = beyond",
         default=None,

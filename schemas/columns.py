@@ -18,7 +18,10 @@ import numpy as np
 import pyarrow as pa
 
 __all__ = [
+    "FAULTS_DOC",
+    "OBSERVABILITY_DOC",
     "POSE_COLUMNS",
+    "STATUS_DOC",
     "Column",
     "Posed",
     "Recorded",
@@ -32,6 +35,11 @@ __all__ = [
 
 # Columns of a pose T_a_b; where a row has several, each has a prefix (prior_qw, ego_tx_m).
 POSE_COLUMNS = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+
+# Descriptions of columns that several tables have.
+OBSERVABILITY_DOC = "per DoF: 1 - posterior/prior variance along it; 0 = the day adds nothing to the prior"
+STATUS_DOC = "accepted (use it), held (computed, the prior stays current), refused (nothing computed)"
+FAULTS_DOC = "faults named in the reason, keys of FAULTS in schemas/faults.py"
 
 Row = TypeVar("Row")
 

@@ -105,11 +105,7 @@ class VehicleStatus:
 
 
 def status_of(findings: Sequence[DriftFinding]) -> VehicleStatus:
-    """The stored verdict on a vehicle; UNKNOWN, with a reason, without an audit.
-
-    Args:
-        findings: current rows of one vehicle and method.
-    """
+    """The stored verdict on a vehicle, from its current rows of one method; UNKNOWN without an audit."""
     if not findings:
         return VehicleStatus("UNKNOWN", "no audit yet")
     first = findings[0]
@@ -123,12 +119,7 @@ def status_of(findings: Sequence[DriftFinding]) -> VehicleStatus:
 
 
 def kind_of_sensor(name: str, findings: Sequence[DriftFinding]) -> str:
-    """Kind of a sensor (camera, lidar, radar or base), from the edges in findings.
-
-    Args:
-        name: name of the sensor.
-        findings: findings of its vehicle.
-    """
+    """Kind of a sensor (camera, lidar, radar or base), from the edges in its vehicle's findings."""
     known = {
         frame: kind
         for f in findings

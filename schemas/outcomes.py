@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from schemas.columns import Recorded, TableSchema, column, row
+from schemas.columns import FAULTS_DOC, Recorded, TableSchema, column, row
 
 __all__ = ["OUTCOMES", "OUTCOME_STATUSES", "OutcomeRow"]
 
@@ -21,9 +21,7 @@ class OutcomeRow(Recorded):
         "done, refused (the same inputs are not tried again) or failed (tried again every night)"
     )
     reason: str = column("reason for the status; may be empty")
-    faults: list[str] = column(
-        "faults named in the reason, keys of FAULTS in schemas/faults.py", default_factory=list
-    )
+    faults: list[str] = column(FAULTS_DOC, default_factory=list)
     rows: int = column("number of frames, observations or records written", default=0)
     kept: dict[str, int] = column(
         "number kept, by kind; for calibrate by status of the pair", default_factory=dict

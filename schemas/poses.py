@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from schemas.columns import Posed, TableSchema, array, column, row
+from schemas.columns import FAULTS_DOC, OBSERVABILITY_DOC, STATUS_DOC, Posed, TableSchema, array, column, row
 
 __all__ = ["POSES", "PoseRow"]
 
@@ -24,16 +24,10 @@ class PoseRow(Posed):
     sensor: str = column("name of the sensor, or base for the vehicle frame: frame b of T_a_b")
     kind: str = column("camera, lidar, radar or base")
     reference: str = column("name of the reference sensor of all poses: frame a of T_a_b")
-    observability: list[float] | None = column(
-        "per DoF: 1 - posterior/prior variance along it; 0 = the day adds nothing to the prior", default=None
-    )
-    status: str = column(
-        "accepted (use it), held (computed, the prior stays current), refused (nothing computed)"
-    )
+    observability: list[float] | None = column(OBSERVABILITY_DOC, default=None)
+    status: str = column(STATUS_DOC)
     reason: str = column("reason for the status; empty if accepted without remark")
-    faults: list[str] = column(
-        "faults named in the reason, keys of FAULTS in schemas/faults.py", default_factory=list
-    )
+    faults: list[str] = column(FAULTS_DOC, default_factory=list)
     targets_m: np.ndarray | None = array(
         "<f8",
         (3, 3),

@@ -22,6 +22,7 @@ __all__ = [
     "left_out",
     "print_json",
     "print_summary",
+    "problems_of",
     "progress_reporter",
 ]
 
@@ -50,6 +51,11 @@ def exit_code(statuses: Iterable[str]) -> int:
     if seen & {"failed", "misconfigured"}:
         return 1 if "failed" in seen else 2
     return 3 if seen & {"partly", "held", "refused", "incomplete"} else 0
+
+
+def problems_of(results: Iterable[Any], *names: str) -> list[dict[str, Any]]:
+    """The named fields of each result that is neither done nor up to date."""
+    return [{n: getattr(r, n) for n in names} for r in results if r.status not in ("done", "cached")]
 
 
 def left_out(lake: Lake) -> list[str]:
