@@ -1,9 +1,7 @@
 """Batches of table `training`: shuffled by row group, the same for the same seed, resumed to the frame.
 
-The order of an epoch is decided before anything is read: row groups in random order, cut into windows, and
-the frames of each window in random order. A position in the stream is therefore two numbers (epoch, frames
-taken), and a resumed loader gives the same batches as one that never stopped. The next window is read while
-one is used.
+The order of an epoch is decided before anything is read, so that a place in the stream is two numbers (epoch, frames
+taken): row groups in random order, cut into windows, and the frames of each window in random order.
 """
 
 from __future__ import annotations
@@ -64,10 +62,9 @@ class TrainingLoader:
             problem = f"train has {len(self._chunks)} row groups, not enough for {self._ranks} processes"
             raise ContractError(str(lake.root / TRAINING.name), problem)
         self._epoch, self._taken = 0, 0
-        self._order: list[tuple[RowGroup, int]] = []
-        self._windows: list[tuple[int, list[RowGroup]]] = []  # first position, groups
-        self._starts: set[int] = set()
-        self._ordered_epoch = -1
+        self._ordered_epoch = self._held_window = -1
+        self._order: list[tuple[int, RowGroup, int]] = []  # window, group and row of each frame
+        self._windows: list[list[RowGroup]] = []
         self._reader = ThreadPoolExecutor(1, "training-reader")
         self._held: dict[RowGroup, Future[list[TrainingRow]]] = {}
 
@@ -124,27 +121,22 @@ class TrainingLoader:
         self._order, self._windows = [], []
         for first in range(0, len(mine), self._window):
             window = mine[first : first + self._window]
-            frames = [(chunk.group, row) for chunk in window for row in chunk.rows]
-            picked = rng.permutation(len(frames))
-            self._windows += [(len(self._order), [chunk.group for chunk in window])]
-            self._order += [frames[i] for i in picked]
-        self._starts = {start for start, _ in self._windows}
-        self._ordered_epoch = self._epoch
+            frames = [(len(self._windows), chunk.group, row) for chunk in window for row in chunk.rows]
+            self._order += [frames[i] for i in rng.permutation(len(frames))]
+            self._windows.append([chunk.group for chunk in window])
+        self._ordered_epoch, self._held_window = self._epoch, -1
 
     def _row(self, position: int) -> TrainingRow:
-        group, row = self._order[position]
-        if group not in self._held or position in self._starts:
-            self._read_ahead(position)
+        """A row of the current window, which is in memory with the next one; all others are dropped."""
+        window, group, row = self._order[position]
+        if window != self._held_window:
+            held, self._held = self._held, {}
+            for wanted in (g for groups in self._windows[window : window + 2] for g in groups):
+                self._held[wanted] = held.get(wanted) or self._reader.submit(
+                    read_group, self._lake, TRAINING, wanted, TrainingRow
+                )
+            self._held_window = window
         return self._held[group].result()[row]
-
-    def _read_ahead(self, position: int) -> None:
-        """Keep the current window and the next one in memory; drop all others."""
-        at = max(i for i, (start, _) in enumerate(self._windows) if start <= position)
-        wanted = [group for _, window in self._windows[at : at + 2] for group in window]
-        self._held = {g: f for g, f in self._held.items() if g in set(wanted)}
-        for group in wanted:
-            if group not in self._held:
-                self._held[group] = self._reader.submit(read_group, self._lake, TRAINING, group, TrainingRow)
 
 
 def load_split(

@@ -129,7 +129,9 @@ class DayTask:
 
 def export_day(task: DayTask, progress: Progress) -> str:
     """Write a vehicle-day unless it exists from the same data, calibration and plan: 'done' or 'cached'."""
-    output, key = task.output, _key(task)
+    output, settings = task.output, (task.format, task.places, task.mounting.digest, task.perturbation)
+    inputs = [m.work_key for t in (MOMENTS, PERCEIVED) if (m := read_manifest(task.lake, t, task.partition))]
+    key = work_key("frames", CODE_VERSION, repr(settings), inputs)
     before = output.done(task.partition)
     if before is not None and before["work_key"] == key:
         return "cached"
@@ -166,9 +168,3 @@ def _write(task: DayTask, output: DayOutput, progress: Progress) -> dict[str, di
             sensors.update(list(frame.captures))
         writer.close()
     return {"frames": dict(kept), "left_out": dict(lost), "sensors": dict(sensors)}
-
-
-def _key(task: DayTask) -> str:
-    inputs = [m.work_key for t in (MOMENTS, PERCEIVED) if (m := read_manifest(task.lake, t, task.partition))]
-    settings = repr((task.format, task.places, task.mounting.digest, task.perturbation))
-    return work_key("frames", CODE_VERSION, settings, inputs)

@@ -26,9 +26,8 @@ class Undistortion:
     """From a camera's images to those of a pinhole camera with the same K and size; edges of a wide view are lost."""
 
     camera: Camera
-    maps: (
-        tuple[np.ndarray, np.ndarray] | None
-    )  # where in the image each pixel comes from; None: it has no distortion
+    # Where in the image each pixel comes from; None: it has no distortion.
+    maps: tuple[np.ndarray, np.ndarray] | None
 
     def pixels(self, data: bytes) -> UInt8[np.ndarray, "H W 3"]:
         """Decoded image, black where the camera saw nothing; raises ConfigError if it cannot be decoded."""

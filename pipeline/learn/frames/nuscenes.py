@@ -104,7 +104,9 @@ class NuScenesWriter:
             self._output.list(table, row | {"next": following})
 
     def _sample_data(self, frame: Frame, name: str, sample: str) -> None:
-        capture, channel = frame.captures[name], _channel(frame, name)
+        capture, upper = frame.captures[name], name.upper()
+        prefix = _KINDS[type(capture)][0]
+        channel = _CHANNELS.get(name) or (upper if upper.startswith(prefix) else f"{prefix}_{upper}")
         T_odom_ego = _pose_at(frame, capture.stamp_ns)
         if T_odom_ego is None:
             problem = "nuScenes needs the car's pose at each sample, and the logs have no odometry: take another format"
@@ -160,11 +162,6 @@ class NuScenesWriter:
         if (key := f"{table} {row['token']}") not in self._known:
             self._known.add(key)
             self._output.list(table, row)
-
-
-def _channel(frame: Frame, name: str) -> str:
-    prefix, upper = _KINDS[type(frame.captures[name])][0], name.upper()
-    return _CHANNELS.get(name) or (upper if upper.startswith(prefix) else f"{prefix}_{upper}")
 
 
 def _channel_pose(frame: Frame, T: np.ndarray, capture: object) -> np.ndarray:

@@ -95,15 +95,12 @@ class Output:
                 self.delete(name)
         self.delete(_of(partition, "rows.jsonl"))
         if self.read(_of(partition, "begun.json")) is not None:
-            self._sweep(partition)
+            # Files of a killed writer are named by the day's key.
+            own = re.compile(re.escape(day_key(partition)) + r"[_-]\d{6,}")
+            for path in [p for folder in _FOLDERS for p in self.files.find(self.root / folder, "**/*")]:
+                if own.fullmatch(path.name.partition(".")[0]):
+                    self.files.delete(path)
             self.delete(_of(partition, "begun.json"))
-
-    def _sweep(self, partition: Partition) -> None:
-        """Remove files of a killed writer, which are named by the day's key."""
-        own = re.compile(re.escape(day_key(partition)) + r"[_-]\d{6,}")
-        for path in [p for folder in _FOLDERS for p in self.files.find(self.root / folder, "**/*")]:
-            if own.fullmatch(path.name.partition(".")[0]):
-                self.files.delete(path)
 
 
 @dataclass(frozen=True)

@@ -51,7 +51,11 @@ class ShardWriter:
             self._open[split] = writer, own
             self._output.list("files", name)
             self._output.list(split, name)
-        self._open[split][0].write_table(pa.Table.from_pylist([_row(frame)], _SCHEMA))
+        facts = facts_of(frame)
+        row = {name: facts.get(name) for name in _SCHEMA.names}
+        row |= {"about": json.dumps(facts, sort_keys=True, allow_nan=False)}
+        row |= {"sensors": [_sensor(frame, name) for name in frame.captures]}
+        self._open[split][0].write_table(pa.Table.from_pylist([row], _SCHEMA))
         self._count[split] = count + 1
 
     def close(self) -> None:
@@ -62,13 +66,6 @@ class ShardWriter:
     def _close(self, split: str) -> None:
         if split in self._open:
             self._open.pop(split)[1].close()
-
-
-def _row(frame: Frame) -> dict[str, Any]:
-    facts = facts_of(frame)
-    row = {name: facts.get(name) for name in _SCHEMA.names}
-    row |= {"about": json.dumps(facts, sort_keys=True, allow_nan=False)}
-    return row | {"sensors": [_sensor(frame, name) for name in frame.captures]}
 
 
 def _sensor(frame: Frame, name: str) -> dict[str, Any]:

@@ -1,20 +1,13 @@
 """One pair's estimate with its covariance from a network's answers on single frames.
 
-A network that has learned nothing returns its guess, and all answers to one guess then agree. Every frame
-therefore gets a guess of its own, and a robust regression separates the part of the answers that comes from
-the frame from the part that comes from the guess:
+A network that has learned nothing returns its guess. So every frame has a guess of its own, and a robust regression
+separates the part of the answers that comes from the frame: answer = H x + (1 - H) guess + noise, with the gain H = 1
+where the network determines a degree of freedom, 0 where it repeats its guess. The day is the linear-Gaussian update
+of the prior by H x.
 
-    answer_i = H x + (1 - H) guess_i + noise_i,
-
-with x the true pose; all poses are twists about a common centre. H is the gain: 1 where the network
-determines a degree of freedom, 0 where it repeats its guess. The day's estimate is the linear-Gaussian update
-of the prior by the measurement H x; where H is 0 the prior stays, value and sigma.
-
-The regression uses (bearing rotation, translation) in place of (rotation, translation). The bearing rotation
-of a twist is the rotation that turns the directions to points 15 to 40 m ahead as the twist does, by least
-squares. A network that aligns directions compensates a wrong translation by a rotation of about shift over
-distance; its bearing rotation is right all the same. In these coordinates H is nearly diagonal, and few noisy
-frames suffice for it. Where the translation keeps its prior, the rotation follows from both.
+Twists are (bearing rotation, translation) about a common centre. The bearing rotation turns the directions to points
+15 to 40 m ahead as the twist does, by least squares: a network that aligns directions compensates a wrong translation
+by a rotation, and its bearing rotation is right all the same. So H is nearly diagonal, and few frames suffice.
 """
 
 from __future__ import annotations
@@ -120,7 +113,10 @@ def day_estimate(
     ignored = blind | (np.diag(H) < _LEAST_GAIN)
     spread = _spread(answers, draws, ignored)
     gain_variance = draws[:, 1:].transpose(0, 2, 1).var(axis=0)
-    x, covariance, R = _updated_thrice(m0, P, H, spread, mean, gain_variance)
+    x, covariance, R = m0, P, spread
+    for _ in range(3):  # errors of H count by how far the truth may lie
+        R = spread + np.diag(gain_variance @ (np.diag(covariance) + x * x))
+        x, covariance = _update(m0, P, H, R, mean)
     stated = np.zeros((6, 6)) if answers.ends is None else np.diag(np.square(FRAME_SIGMA[pair]))
     weighed, observability = (
         1 - np.diag(twist_of_bearing @ C @ twist_of_bearing.T) / np.diag(prior_covariance)
@@ -146,22 +142,6 @@ def day_estimate(
         diagnostics=_diagnostics(fit, gain, answers),
         common_covariance=common_of(covariance, prior_covariance, bias),
     )
-
-
-def _updated_thrice(
-    m0: np.ndarray,
-    P: np.ndarray,
-    H: np.ndarray,
-    spread: np.ndarray,
-    mean: np.ndarray,
-    gain_variance: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Update, its covariance, and that of the answers: errors of H count by how far the truth may lie."""
-    x, covariance, R = m0, P, spread
-    for _ in range(3):
-        R = spread + np.diag(gain_variance @ (np.diag(covariance) + x * x))
-        x, covariance = _update(m0, P, H, R, mean)
-    return x, covariance, R
 
 
 def measured_estimate(

@@ -171,9 +171,8 @@ class OnnxNetwork:
         """Matching evidence, points chosen at a guess; None if the file has no such output."""
         if self._evidence is None:
             return None
-        guess = dict.fromkeys(PAIRS, np.eye(4)) | {
-            "camera_lidar": T_camera_lidar
-        }  # the radar has no part in it
+        no_radar = np.eye(4)  # which has no part in it
+        guess = {"camera_lidar": T_camera_lidar, "camera_radar": no_radar, "lidar_radar": no_radar}
         view = render_frame(sensors, guess, self.config)
         names = [i.name for i in self._evidence.get_inputs()]
         maps, probability, worth = self._evidence.run(EVIDENCE, {name: view[name] for name in names})

@@ -1,15 +1,9 @@
-"""A second measurement of the radar's pitch, from the direction of travel.
+"""A second measurement of the radar's pitch, from the direction of travel, fused with a network's answer for a day.
 
-A network finds the radar's elevation by matching detections with the lidar's objects. If elevations are noisier than
-scenes are tall, its answer is wrong by a degree or more, equally in all frames, so averaging does not help. The
-direction of travel needs no match: Doppler gives the velocity in radar axes, and the road gives the direction of the
-velocity (`pipeline.objective.radar.travel`). Reflections from below the road bias it; its sigma includes that.
-
-The network's answer for a day is fused with this measurement by their covariances. If the two differ by more than
-their sigmas allow, the network's variance is increased (Cauchy weights) and the measurement's is not: its sigma comes
-from this day's frames, the network's from other vehicles.
-
-Only the rotation about one axis changes; all other unknowns enter as considered parameters (Schmidt 1966).
+A network's matches err equally in all frames where elevations are noisier than scenes are tall. Doppler and the road
+need no match (`pipeline.objective.radar.travel`). If the two differ by more than their sigmas allow, the network's
+variance is increased (Cauchy weights): its sigma comes from other vehicles, the measurement's from this day's frames.
+Only the rotation about one axis changes; all other unknowns are considered parameters (Schmidt 1966).
 """
 
 from __future__ import annotations
@@ -157,7 +151,13 @@ def updated_by_way(
     observability = np.clip(1 - np.diag(covariance) / np.diag(prior_covariance), 0.0, 1.0)
     told = np.append(np.abs(way.axis) > _LEAST_SHARE, np.zeros(3, bool)) & (observability >= OBSERVABLE)
     apart = way.turn_rad / np.sqrt(own + measured)
-    notes = [_sentence(way, apart)] if abs(apart) > _CONTRADICTION_SIGMAS and way.frames > 1 else []
+    notes = list(estimate.notes)
+    if abs(apart) > _CONTRADICTION_SIGMAS and way.frames > 1:
+        differs = f"{np.degrees(way.turn_rad):+.2f} +- {np.degrees(way.sigma_rad):.2f} deg of pitch"
+        notes.append(
+            f"the direction of travel (Doppler, road, {way.frames} frames) differs by {differs} from the network's "
+            f"answer, {abs(apart):.1f} sigmas: the network's answer has less weight"
+        )
     return replace(
         estimate,
         T=_turned(estimate.T, gain * way.turn_rad * way.axis),
@@ -171,7 +171,7 @@ def updated_by_way(
             "doppler_pitch_sigma_rad": way.sigma_rad,
             "doppler_frames": float(way.frames),
         },
-        notes=[*estimate.notes, *notes],
+        notes=notes,
     )
 
 
@@ -200,11 +200,3 @@ def _turned(T: Float[np.ndarray, "4 4"], omega: Float[np.ndarray, " 3"]) -> Floa
     out = T.copy()
     out[:3, :3] = exp_so3(omega) @ T[:3, :3]
     return out
-
-
-def _sentence(way: WayTurn, sigmas: float) -> str:
-    return (
-        f"the direction of travel (Doppler, road, {way.frames} frames) differs by {np.degrees(way.turn_rad):+.2f} +- "
-        f"{np.degrees(way.sigma_rad):.2f} deg of pitch from the network's answer, {abs(sigmas):.1f} sigmas: "
-        "the network's answer has less weight"
-    )

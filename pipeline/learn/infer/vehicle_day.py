@@ -116,7 +116,10 @@ def solve_by_networks(
     )
 
     def estimate(pair: str, rows: np.ndarray | None = None) -> PairEstimate:
-        answers = found[pair] if rows is None else _part(found[pair], rows)
+        answers = found[pair]
+        if rows is not None:
+            kept = {name: getattr(answers, name)[rows] for name in ("guess", "answer", "variance", "block")}
+            answers = replace(answers, **kept, frames=max(1, round(answers.frames * float(rows.mean()))))
         of_answers = _estimate(pair, answers, asked, rng)
         if pair != "camera_lidar" or together is None:
             return of_answers
@@ -392,8 +395,3 @@ def _halves_disagree(
     if ratio.max() <= _HALVES_SIGMAS:
         return []
     return [Check(f"two halves of the day differ by {ratio.max():.1f} of their sigmas", "witnesses_disagree")]
-
-
-def _part(answers: Answers, rows: np.ndarray) -> Answers:
-    kept = {name: getattr(answers, name)[rows] for name in ("guess", "answer", "variance", "block")}
-    return replace(answers, **kept, frames=max(1, round(answers.frames * float(rows.mean()))))

@@ -61,19 +61,13 @@ def network_of_file(path: Path) -> CalibrationNetwork:
         raise ModelError(str(path), problem)
     held = {i.name: numpy_helper.to_array(i) for i in model.graph.initializer}
     network = CalibrationNetwork(config)
-    network.load_state_dict(
-        {name: _weight(places[name], held, value.shape) for name, value in network.state_dict().items()}
-    )
+    state = network.state_dict()
+    for name, weight in state.items():
+        place = places[name]
+        found = np.array(place["values"], np.float32) if "values" in place else held[place["name"]]
+        state[name] = torch.tensor((found.T if place.get("turned") else found).reshape(tuple(weight.shape)))
+    network.load_state_dict(state)
     return network.eval()
-
-
-def _weight(place: Place, held: Mapping[str, np.ndarray], shape: torch.Size) -> Tensor:
-    if "values" in place:
-        values = np.array(place["values"], np.float32)
-    else:
-        values = held[place["name"]]
-        values = values.T if place["turned"] else values
-    return torch.tensor(values.reshape(tuple(shape)))
 
 
 def _digest(values: np.ndarray) -> bytes:

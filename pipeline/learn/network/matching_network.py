@@ -78,7 +78,9 @@ class MatchingCore(nn.Module):
             self.radar_encoder = PointEncoder(len(RADAR_FEATURES), _CLASSES)
             self.radar_class_matcher = ClassMatcher(grid)
             sizes.append(self.radar_class_matcher.surface_size + 12)
-        self.summaries = nn.ModuleList([_summary(size, hidden) for size in sizes])
+        self.summaries = nn.ModuleList(
+            nn.Sequential(nn.LayerNorm(size), nn.Linear(size, hidden), nn.ReLU()) for size in sizes
+        )
         self.fusion = nn.Sequential(nn.Linear(hidden * len(sizes), 128), nn.ReLU())
         self.heads = Heads(128, pairs, _RESIDUAL_STD)
 
@@ -273,10 +275,6 @@ def _log_boundaries(maps: Float[Tensor, "B K H W"]) -> Float[Tensor, "B 1 H W"]:
     beside = F.pad(torch.exp(maps), (1, 1, 0, 0), mode="replicate")
     change = 0.5 * (beside[..., 2:] - beside[..., :-2]).abs().sum(1, keepdim=True)
     return torch.log(_NO_BOUNDARY + (1 - _NO_BOUNDARY) * change.clamp(max=1.0))
-
-
-def _summary(inputs: int, hidden: int) -> nn.Sequential:
-    return nn.Sequential(nn.LayerNorm(inputs), nn.Linear(inputs, hidden), nn.ReLU())
 
 
 def _features(found: Match) -> Tensor:

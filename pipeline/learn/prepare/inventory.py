@@ -6,7 +6,7 @@ The split separates vehicles, days and places. This module compares images, beca
 from __future__ import annotations
 
 import json
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,9 +21,7 @@ from pipeline.store.tables import read_columns, read_manifest
 from schemas.training import SPLITS, TRAINING
 
 __all__ = [
-    "MANIFEST_FILE",
     "Inventory",
-    "alike",
     "doubts",
     "read_leaks",
     "require_sides",
@@ -31,7 +29,6 @@ __all__ = [
     "write_inventory",
 ]
 
-MANIFEST_FILE = "manifest.json"
 _CHUNK = 4096
 _COLUMNS = ("frame_index", "split", "environment", "fingerprint")
 
@@ -70,7 +67,7 @@ def take_inventory(lake: Lake, duplicate_bits: int) -> Inventory:
     )
 
 
-def alike(
+def _alike(
     views: UInt8[np.ndarray, "N 32"], others: UInt8[np.ndarray, "M 32"], bits: int
 ) -> Bool[np.ndarray, " N"]:
     """True for views that differ from one of the others in fewer than `bits` of 256 bits."""
@@ -84,9 +81,13 @@ def alike(
     return out
 
 
+def _path(lake: Lake) -> Path:
+    return lake.local_root / TRAINING.name / "manifest.json"
+
+
 def write_inventory(lake: Lake, inventory: Inventory, about: dict[str, Any]) -> Path:
     """Write `training/manifest.json` next to the partitions, with the run's facts in `about`."""
-    path = lake.local_root / TRAINING.name / MANIFEST_FILE
+    path = _path(lake)
     path.parent.mkdir(parents=True, exist_ok=True)
     content = about | inventory.__dict__
     with atomic_write(path) as stream:
@@ -96,18 +97,16 @@ def write_inventory(lake: Lake, inventory: Inventory, about: dict[str, Any]) -> 
 
 def read_leaks(lake: Lake) -> dict[Partition, set[int]]:
     """Frames that must not be used, by partition; empty without an inventory."""
-    path = lake.local_root / TRAINING.name / MANIFEST_FILE
-    out: dict[Partition, set[int]] = {}
-    if path.exists():
+    out: dict[Partition, set[int]] = defaultdict(set)
+    if (path := _path(lake)).exists():
         for vehicle, day, index in json.loads(path.read_text())["leaks"]:
-            out.setdefault(Partition(vehicle, day), set()).add(int(index))
+            out[Partition(vehicle, day)].add(index)
     return out
 
 
 def require_sides(lake: Lake) -> None:
     """Raise ContractError if the inventory has no training frame, or lacks requested validation frames."""
-    path = lake.local_root / TRAINING.name / MANIFEST_FILE
-    if not path.exists():
+    if not (path := _path(lake)).exists():
         return
     told = json.loads(path.read_text())
     wanted = ["train", *(["val"] if told["settings"]["split"]["val_fraction"] > 0 else [])]
@@ -130,13 +129,18 @@ def doubts(lake: Lake, *, referenced: bool) -> list[str]:
             drives |= {
                 (day, d) for d, side in zip(light["drive"], light["split"], strict=True) if side == "train"
             }
-    named = ", ".join(without[:5]) + (" ..." if len(without) > 5 else "")
-    left_out = (
-        f"left out, without a record of joint that is accepted or held for its sigma alone: {named}; run "
-    )
-    found = [left_out + "`boresight calibrate`, then `boresight prepare`"] if without else []
-    one = "all frames of side train are of one drive, so that a network learns that street: add drives"
-    return found + ([one] if len(drives) == 1 else [])
+    found = []
+    if without:
+        named = ", ".join(without[:5]) + (" ..." if len(without) > 5 else "")
+        found.append(
+            f"left out, without a record of joint that is accepted or held for its sigma alone: {named}; "
+            "run `boresight calibrate`, then `boresight prepare`"
+        )
+    if len(drives) == 1:
+        found.append(
+            "all frames of side train are of one drive, so that a network learns that street: add drives"
+        )
+    return found
 
 
 def _leaks(
@@ -148,7 +152,7 @@ def _leaks(
     for side, others in (("val", ("train", "test")), ("test", ("train",))):
         same = np.zeros(len(stacked[side]), bool)
         for other in others:
-            same |= alike(stacked[side], stacked[other], bits)
+            same |= _alike(stacked[side], stacked[other], bits)
         found += [names[side][i] for i in np.flatnonzero(same)]
     return found
 

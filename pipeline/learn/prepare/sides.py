@@ -57,13 +57,11 @@ def price_choices(surveys: Sequence[Survey], plan: SplitPlan, config: PrepareCon
 
     Frames without a sample (without a prior, for example) count as kept, because nothing has been read yet.
     """
-    ways = [tuple(plan.by), *(c for c in _CHOICES if set(c) != set(plan.by))]
-    out = []
-    for way in ways:
-        chosen = way == tuple(plan.by)
-        settings = config if chosen else config.split_with(by=way)
-        out.append(_price(surveys, plan if chosen else plan_days(surveys, settings, {}), settings, chosen))
-    return out
+    others = [config.split_with(by=keys) for keys in _CHOICES if set(keys) != set(plan.by)]
+    return [
+        _price(surveys, plan, config, chosen=True),
+        *(_price(surveys, plan_days(surveys, settings, {}), settings) for settings in others),
+    ]
 
 
 def settled_keys(surveys: Sequence[Survey], config: PrepareConfig, lake: Lake) -> tuple[Key, ...]:
@@ -81,7 +79,7 @@ def settled_keys(surveys: Sequence[Survey], config: PrepareConfig, lake: Lake) -
     shares = (1, config.split.val_fraction, config.split.test_fraction)
     wanted = [side for side, share in zip(SPLITS, shares, strict=True) if share > 0]
     for way, settings in ways.items():
-        price = _price(surveys, plan_days(surveys, settings, {}), settings, True)
+        price = _price(surveys, plan_days(surveys, settings, {}), settings)
         cut = sum(price.lost.get(reason.value, 0) for reason in _BETWEEN)
         if all(price.frames[s] for s in wanted) and cut <= _FEW * (sum(price.frames.values()) + cut):
             return way
@@ -134,7 +132,9 @@ def _near_other_place(
     return near
 
 
-def _price(surveys: Sequence[Survey], plan: SplitPlan, config: PrepareConfig, chosen: bool) -> Choice:
+def _price(
+    surveys: Sequence[Survey], plan: SplitPlan, config: PrepareConfig, *, chosen: bool = False
+) -> Choice:
     frames, lost, empty = Counter(dict.fromkeys(SPLITS, 0)), Counter[str](), 0
     for survey in surveys:
         sides, rejected = frame_sides(survey, plan, config)

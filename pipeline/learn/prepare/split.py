@@ -116,34 +116,26 @@ def _deal_groups(
     total = sum(u.frames for g in groups for u in g)
     have: Counter[str] = Counter()
     sides: dict[tuple[str, str], str] = {}
+
+    def assign(group: Sequence[Unit], side: str) -> None:
+        have[side] += sum(unit.frames for unit in group)
+        sides.update(dict.fromkeys((key for unit in group for key in unit.keys(by)), side))
+
+    def rank(group: Sequence[Unit]) -> tuple[int, str]:
+        kind, value = min(unit.keys(by)[0] for unit in group)
+        digest = hashlib.sha256(f"{seed}/{kind}/{value}".encode()).hexdigest()
+        return -sum(unit.frames for unit in group), digest
+
     free = []
     for group in groups:
         earlier = Counter(known[key] for unit in group for key in unit.keys(by) if key in known)
         if earlier:
-            _assign(group, by, max(SPLITS, key=lambda side: earlier[side]), sides, have)
+            assign(group, max(SPLITS, key=lambda side: earlier[side]))
         else:
             free.append(group)
-    free.sort(key=lambda g: (-sum(u.frames for u in g), _rank(min(u.keys(by)[0] for u in g), seed)))
-    for position, group in enumerate(free):
+    for position, group in enumerate(sorted(free, key=rank)):
         empty = [side for side in shares if not have[side]]
         open_to = empty if len(empty) >= len(free) - position else list(shares)
         lacks = {side: shares[side] * total - have[side] for side in open_to}
-        _assign(group, by, max(open_to, key=lambda s: lacks[s]), sides, have)
+        assign(group, max(open_to, key=lambda s: lacks[s]))
     return sides
-
-
-def _assign(
-    group: Sequence[Unit],
-    by: Sequence[str],
-    side: str,
-    sides: dict[tuple[str, str], str],
-    have: Counter[str],
-) -> None:
-    for unit in group:
-        have[side] += unit.frames
-        for key in unit.keys(by):
-            sides[key] = side
-
-
-def _rank(key: tuple[str, str], seed: int) -> str:
-    return hashlib.sha256(f"{seed}/{key[0]}/{key[1]}".encode()).hexdigest()

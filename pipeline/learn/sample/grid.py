@@ -33,28 +33,21 @@ class Grid:
     bottom_deg: float = -22.4
 
     def __post_init__(self) -> None:
-        for name, count in (("width", self._columns), ("height", self._rows)):
+        spans_deg = {"width": 2 * self.left_deg, "height": self.top_deg - self.bottom_deg}
+        for name, count in ((name, span / self.cell_deg) for name, span in spans_deg.items()):
             # Three halvings down and up again in the camera's encoder, and three levels of cells in the matcher.
             if abs(count - round(count)) > 1e-6 or round(count) % 16:
                 raise ValueError(f"the grid's {name} of {count:g} cells is no multiple of 16")
 
     @property
-    def _columns(self) -> float:
-        return 2 * self.left_deg / self.cell_deg
-
-    @property
-    def _rows(self) -> float:
-        return (self.top_deg - self.bottom_deg) / self.cell_deg
-
-    @property
     def width(self) -> int:
         """Columns."""
-        return round(self._columns)
+        return round(2 * self.left_deg / self.cell_deg)
 
     @property
     def height(self) -> int:
         """Rows."""
-        return round(self._rows)
+        return round((self.top_deg - self.bottom_deg) / self.cell_deg)
 
     def finer(self, factor: int) -> Grid:
         """The same view in cells 1/`factor` as large."""
@@ -96,15 +89,6 @@ def grid_rays(grid: Grid) -> Float[np.ndarray, "H W 3"]:
     return np.stack([-c * np.sin(azimuth), -np.sin(elevation), c * np.cos(azimuth)], -1)
 
 
-def _pixels(camera: Camera, grid: Grid, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Pixel (float32) of each cell in the camera's image at size (height, width), and whether it exists."""
-    uv, valid = camera.project(grid_rays(grid))
-    seen = np.asarray(valid & camera.contains(uv))
-    # By axis: sides are rounded to whole pixels, and 0.07 cells of elevation were lost to one factor for both.
-    scale = np.array([size[1] / camera.width_px, size[0] / camera.height_px])
-    return ((uv + 0.5) * scale - 0.5).astype(np.float32), seen
-
-
 def resample_camera(
     image: UInt8[np.ndarray, "Y X 3"], camera: Camera, grid: Grid
 ) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"]]:
@@ -119,8 +103,12 @@ def resample_camera(
     if scale < 1.0:
         size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA).reshape(size[1], size[0], 3)
-    uv, valid = _pixels(camera, fine, (image.shape[0], image.shape[1]))
-    sampled = cv2.remap(image, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    uv, valid = camera.project(grid_rays(fine))
+    valid = np.asarray(valid & camera.contains(uv))
+    # By axis: sides are rounded to whole pixels, and 0.07 cells of elevation were lost to one factor for both.
+    factor = np.array([image.shape[1] / camera.width_px, image.shape[0] / camera.height_px])
+    u, v = np.moveaxis(((uv + 0.5) * factor - 0.5).astype(np.float32), -1, 0)
+    sampled = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     whole = np.asarray(valid.reshape(grid.height, 2, grid.width, 2).all(axis=(1, 3)))
     reduced = cv2.resize(sampled, (grid.width, grid.height), interpolation=cv2.INTER_AREA)
     return np.where(whole[..., None], reduced, 0).astype(np.uint8), whole.astype(np.uint8)

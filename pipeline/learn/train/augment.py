@@ -13,11 +13,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from pipeline.learn.batches.batch import TrainingBatch
+from pipeline.learn.sample.camera_maps import stored_grid
+from pipeline.learn.sample.grid import grid_rays
 from pipeline.learn.train.settings import AugmentConfig
 from pipeline.objective.differentiable.poses import exp_so3, inverse, pose
 from schemas.training import UNKNOWN_CLASS
@@ -69,7 +72,8 @@ def turned_view(batch: TrainingBatch, R_turned_camera: Float[Tensor, "B 3 3"]) -
     """
     height, width = batch.grid_seen.shape[1:]
     step = batch.grid_step_deg * _RAD
-    rays = _rays(height, width, step, R_turned_camera.device)
+    cells = grid_rays(stored_grid((height, width), batch.grid_step_deg)).astype(np.float32)
+    rays = torch.from_numpy(cells).to(R_turned_camera.device)
     # A ray of the turned grid comes from R^T ray of the stored one.
     source = torch.einsum("byx,hwy->bhwx", R_turned_camera, rays)
     azimuth = torch.atan2(-source[..., 0], source[..., 2])
@@ -89,14 +93,6 @@ def turned_view(batch: TrainingBatch, R_turned_camera: Float[Tensor, "B 3 3"]) -
         grid_class=label.to(torch.uint8),
         grid_seen=seen.to(torch.uint8),
     )
-
-
-def _rays(height: int, width: int, step: float, device: torch.device) -> Tensor:
-    azimuth = ((width - 1) / 2 - torch.arange(width, device=device)) * step
-    elevation = (((height - 1) / 2 - torch.arange(height, device=device)) * step)[:, None]
-    c = torch.cos(elevation)
-    x, y, z = -torch.sin(azimuth) * c, -torch.sin(elevation), torch.cos(azimuth) * c
-    return torch.stack([x, y.expand_as(x), z], -1)
 
 
 def _sampled(maps: Tensor, at: Tensor, mode: str) -> Tensor:

@@ -56,7 +56,6 @@ def batch_loss(
     batch: TrainingBatch,
     config: TrainConfig,
     generator: torch.Generator,
-    network: CalibrationNetwork,
     *,
     matched: bool = True,
     paper: PaperFrames | None = None,
@@ -68,7 +67,7 @@ def batch_loss(
         matched: whether poses are estimated and judged, or encoders learn classes only.
         paper: if `loss.definition` is "paper": the inputs of its losses.
     """
-    grid = network.config.grid
+    grid = Grid(config.cell_deg)
     guess = random_guess(batch, config.augment, generator)
     view = turned_view(batch, guess.R_turned_camera) if config.augment.view_deg > 0 else batch
     sensors = made_strange(sensor_inputs(view, grid), config.strange, generator)
@@ -81,7 +80,12 @@ def batch_loss(
     pairs = PAIRS_OF[config.pairs]
     total, terms = _alignment(answers, guess, batch, config, paper)
     evidence = _evidence(answers, batch, turned, grid, generator)
-    uncertainty, twist = _uncertainty(answers[-1], guess, batch)
+    last = answers[-1]
+    camera = guess.unturned(last.T_camera_lidar), guess.unturned(last.T_camera_radar)
+    found = torch.stack([*camera, last.T_lidar_radar], 1).detach()
+    references = torch.stack([batch.T_camera_lidar, batch.T_camera_radar, batch.T_lidar_radar], 1)
+    twist = twist_between(found, references)
+    uncertainty = uncertainty_loss(last.log_variance, twist)
     judged = total + config.loss.evidence * evidence
     loss = judged + config.loss.semantics * semantics + config.uncertainty_weight * uncertainty
     report = {f"term/{name}": value.detach().mean() for name, value in terms.items()}
@@ -151,15 +155,6 @@ def _evidence(
         cost = class_evidence_cost(projection, points, e.maps, e.probability, e.worth, generator)
         total = total + cost / len(answers)
     return total
-
-
-def _uncertainty(answer: Predictions, guess: Guess, batch: TrainingBatch) -> tuple[Tensor, Tensor]:
-    """Negative log-likelihood of the answers' scatter, and their twists about the reference."""
-    camera = guess.unturned(answer.T_camera_lidar), guess.unturned(answer.T_camera_radar)
-    answers = torch.stack([*camera, answer.T_lidar_radar], 1).detach()
-    references = torch.stack([batch.T_camera_lidar, batch.T_camera_radar, batch.T_lidar_radar], 1)
-    twist = twist_between(answers, references)
-    return uncertainty_loss(answer.log_variance, twist), twist
 
 
 def class_of_points(

@@ -16,14 +16,15 @@ from pipeline.learn.network.views import SensorInputs
 from pipeline.learn.sample.layout import CAMERA_CHANNELS, FEATURE_UNITS, LIDAR_FEATURES
 from pipeline.learn.train.settings import StrangeConfig
 
-__all__ = ["made_strange", "strange_classes", "strange_image", "strange_lidar"]
+__all__ = ["made_strange"]
 
 _DEG = 180.0 / torch.pi
 _INTENSITY, _HEIGHT, _GROUND = (LIDAR_FEATURES.index(name) for name in ("intensity", "height", "ground"))
 _FEWEST_POINTS = 300  # a sweep is not thinned below what makes a sample
 # At strength 1; chosen by looking at a hundred frames, not by results.
 _GAMMA, _MIX, _TINT, _TEXTURE, _LIGHT, _NOISE = 0.8, 0.25, 0.15, 0.12, 0.5, 0.08
-_SHIFTED_CELLS, _GROWN, _CONFUSED, _DOUBT = 0.8, 0.6, 0.15, 0.3
+_SHIFTED_CELLS, _GROWN, _DOUBT = 0.8, 0.6, 0.3
+_CONFUSED = 1.0364  # sigmas, beyond which 15 % of an image lie
 _HOLE = 2.0  # sigmas
 # On a real car a third of the road's points were not flagged as ground, where simulated sweeps flag all but 1 %, leaves
 # echoed half as strongly as simulated ones, and the road's heights scattered by 6 cm.
@@ -34,11 +35,10 @@ _NEARER = 1.0  # trees 15 m away were taken for lorries, as simulated trees stan
 def made_strange(sensors: SensorInputs, config: StrangeConfig, generator: torch.Generator) -> SensorInputs:
     """The sensors with all configured randomisations."""
     camera, classes = sensors.camera, sensors.classes
-    true = classes
     if config.classes > 0:
-        classes = strange_classes(classes, config.classes, generator)
+        classes = _strange_classes(classes, config.classes, generator)
     if config.image > 0:
-        camera = strange_image(camera, true, config.image, generator)
+        camera = _strange_image(camera, sensors.classes, config.image, generator)
     without = _chosen(len(camera), config.no_classes, generator, camera.device)
     classes = classes * (~without)[:, None, None, None]
     blank = _chosen(len(camera), config.no_image, generator, camera.device) & ~without
@@ -46,11 +46,11 @@ def made_strange(sensors: SensorInputs, config: StrangeConfig, generator: torch.
     camera = torch.cat([colours, camera[:, CAMERA_CHANNELS - 1 :]], 1)
     sensors = replace(sensors, camera=camera, classes=classes)
     if config.lidar > 0 or config.fewer_rows > 0:
-        sensors = strange_lidar(sensors, config, generator)
+        sensors = _strange_lidar(sensors, config, generator)
     return sensors
 
 
-def strange_image(
+def _strange_image(
     camera: Float[Tensor, "B 4 H W"],
     classes: Float[Tensor, "B C H W"],
     strength: float,
@@ -79,7 +79,7 @@ def strange_image(
     return torch.cat([colours.clamp(0.0, 1.0) * seen, seen], 1)
 
 
-def strange_classes(
+def _strange_classes(
     classes: Float[Tensor, "B C H W"], strength: float, generator: torch.Generator
 ) -> Float[Tensor, "B C H W"]:
     """Random segmenter: outlines wander, objects grow, patches are confused or missing, confidence varies."""
@@ -92,9 +92,7 @@ def strange_classes(
     things = (draw.even(count, channels - 1, 1, 1) < 0.3).float()  # some classes swell, others not
     likelihood = moved[:, :-1] + size * _GROWN * things * (grown - moved[:, :-1])
     likelihood = likelihood / likelihood.sum(1, keepdim=True).clamp(min=1e-3)
-    confused = (
-        draw.field(count, 1, height, width, 16) > _normal_quantile(_CONFUSED) / size.clamp(min=0.01).sqrt()
-    )
+    confused = draw.field(count, 1, height, width, 16) > _CONFUSED / size.clamp(min=0.01).sqrt()
     other = torch.stack([draw.permutation(channels - 1) for _ in range(count)])
     taken = likelihood.gather(1, other[..., None, None].expand_as(likelihood))
     likelihood = torch.where(confused, taken, likelihood)
@@ -105,7 +103,7 @@ def strange_classes(
     return torch.cat([likelihood * known, known], 1)
 
 
-def strange_lidar(sensors: SensorInputs, config: StrangeConfig, generator: torch.Generator) -> SensorInputs:
+def _strange_lidar(sensors: SensorInputs, config: StrangeConfig, generator: torch.Generator) -> SensorInputs:
     """Another lidar: echoes on another scale, a ground a little off and flagged in part, points missing, rows apart."""
     count, points = sensors.lidar_valid.shape
     draw, strength = _Draw(generator, sensors.lidar_xyz_m.device), config.lidar
@@ -160,11 +158,6 @@ def _displaced(maps: Tensor, cells: Tensor) -> Tensor:
 
 def _chosen(count: int, share: float, generator: torch.Generator, device: torch.device) -> Bool[Tensor, " B"]:
     return (torch.rand(count, generator=generator) < share).to(device)
-
-
-def _normal_quantile(share: float) -> float:
-    """Value that a standard normal variable exceeds with this probability."""
-    return float(torch.special.ndtri(torch.tensor(1 - share)))
 
 
 class _Draw:

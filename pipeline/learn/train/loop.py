@@ -94,9 +94,7 @@ class MetricsLog:
 def read_metrics(folder: Path) -> list[dict[str, Any]]:
     """All complete lines of a run's reports, oldest first."""
     path = folder / "metrics.jsonl"
-    if not path.exists():
-        return []
-    lines = path.read_text().split("\n")
+    lines = path.read_text().split("\n") if path.exists() else []
     return [json.loads(line) for line in lines[:-1]]  # a killed run may leave its last line unfinished
 
 

@@ -74,11 +74,7 @@ def joined(device: str) -> Iterator[Processes]:
 
 
 def _device(name: str, local_rank: int) -> torch.device:
-    if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
-    if name not in ("cpu", "cuda"):
-        raise ConfigError("train", "device", f"{name!r} is none of auto, cpu, cuda")
-    if name == "cpu":
+    if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
         return torch.device("cpu")
     if not torch.cuda.is_available():
         raise ConfigError("train", "device", "no CUDA device here; use cpu")

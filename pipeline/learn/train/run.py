@@ -82,9 +82,8 @@ class RunState(Run):
         batch = next(self.loader).to(self.processes.device)
         generator = _generator(self.config.seed, self.step, self.processes.rank)
         return batch_loss(
-            self.passes, batch, self.config, generator, self.network,
-            matched=self.comparable(), paper=self.paper,
-        )  # fmt: skip
+            self.passes, batch, self.config, generator, matched=self.comparable(), paper=self.paper
+        )
 
     def validate(self, folder: Path, log: MetricsLog | None) -> None:
         """At the start and at intervals, judge held-out frames from the same guesses; keep the best weights.
@@ -100,7 +99,7 @@ class RunState(Run):
         with torch.no_grad():
             for first in range(0, len(frames), 16):
                 part = frames[first : first + 16].to(self.processes.device)
-                found = batch_loss(passes, part, self.config, generator, self.network, paper=self.paper)
+                found = batch_loss(passes, part, self.config, generator, paper=self.paper)
                 for name, value in found.items():
                     sums[name] = sums.get(name, 0.0) + float(value) * len(part) / len(frames)
         self.network.train()
@@ -109,12 +108,13 @@ class RunState(Run):
         if sums["judged"] < self.best:
             self.best = sums["judged"]
             content = {"network": self.network.state_dict(), "step": self.step, "judged": self.best}
-            save_checkpoint(folder / BEST, self._about() | content)
+            save_checkpoint(folder / BEST, content | {"config": self.config.model_dump(mode="json")})
 
     def state(self) -> dict[str, Any]:
         """Content of a checkpoint; every process must call this."""
         everyone = self.processes.gather({"stream": self.loader.state_dict()})
-        return super().state() | self._about() | {"processes": everyone, "best": self.best}
+        config = self.config.model_dump(mode="json")
+        return super().state() | {"config": config, "processes": everyone, "best": self.best}
 
     def load(self, state: dict[str, Any]) -> None:
         """Continue from a checkpoint; raises ConfigError if another number of processes wrote it."""
@@ -124,9 +124,6 @@ class RunState(Run):
         super().load(state)
         self.loader.load_state_dict(state["processes"][self.processes.rank]["stream"])
         self.best = float(state["best"])
-
-    def _about(self) -> dict[str, Any]:
-        return {"config": self.config.model_dump(mode="json")}
 
 
 def network_of_run(folder: Path, *, best: bool = True) -> CalibrationNetwork:
@@ -142,8 +139,9 @@ def network_of_run(folder: Path, *, best: bool = True) -> CalibrationNetwork:
 
 def _take_weights(network: CalibrationNetwork, start: Path) -> None:
     trained = network_of_file(start) if start.suffix == ".onnx" else network_of_run(start)
+    own = asdict(network.config)
     for name, theirs in asdict(trained.config).items():
-        ours = asdict(network.config)[name]
+        ours = own[name]
         # Between stages a camera may be shown classes that it was not shown before, and paint be matched or not.
         may_differ = name == "marks" or (name == "takes_classes" and ours)
         if theirs != ours and not may_differ:
@@ -152,19 +150,14 @@ def _take_weights(network: CalibrationNetwork, start: Path) -> None:
                 f"{start} has a network of another kind: set {key} = {json.dumps(value)}, or start afresh"
             )
             raise ConfigError("train", key, problem)
-    network.load_state_dict(_widened(trained.state_dict(), network.state_dict()))
-
-
-def _widened(trained: dict[str, Tensor], fresh: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The weights, with zeros for channels that their source network lacks, so that its answers do not change."""
-    found = {}
-    for name, value in fresh.items():
-        weight = trained.get(name, value)
-        if weight.shape != value.shape:
-            weight = torch.zeros_like(value)
-            weight[:, : trained[name].shape[1]] = trained[name]
-        found[name] = weight
-    return found
+    weights, given = network.state_dict(), trained.state_dict()
+    for name in weights.keys() & given.keys():
+        if weights[name].shape == given[name].shape:
+            weights[name] = given[name]
+        else:  # zeros for channels that the source network lacks, so that its answers do not change
+            weights[name] = torch.zeros_like(weights[name])
+            weights[name][:, : given[name].shape[1]] = given[name]
+    network.load_state_dict(weights)
 
 
 def _steps(config: TrainConfig, frames: int, processes: int) -> int:

@@ -101,6 +101,7 @@ def test_files_hold_every_frame_once(lake, tmp_path):
         np.testing.assert_allclose(inverse(T["lidar"]) @ T["radar"], frame.priors["lidar_radar"], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_two_workers_of_torch_read_parquet_by_the_copy_of_the_dataset_that_lies_beside_it(lake, tmp_path):
     export(lake, tmp_path, "parquet")
     (tmp_path / "use.py").write_text(

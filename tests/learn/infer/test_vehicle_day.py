@@ -9,6 +9,7 @@ import pytest
 
 from jobs.cli import main
 from pipeline.calibrate.networks import held_if_unfit
+from pipeline.core.config import load_fleet
 from pipeline.core.errors import ConfigError, ModelError, SolveError
 from pipeline.learn.export.onnx_file import export_onnx
 from pipeline.learn.infer.onnx_networks import UNFIT, model_files, models_key, open_networks
@@ -196,8 +197,9 @@ def test_a_frame_that_looks_alike_from_two_places_cannot_tell_and_says_so(frames
 
 
 def exported(folder, *kinds):
+    """Untrained networks of the architecture that is cheap to trace and to open."""
     for pairs in kinds:
-        network = build_network(NetworkConfig(pairs=pairs, width=8, hidden=32))
+        network = build_network(NetworkConfig("concat", pairs, width=8, hidden=32))
         export_onnx(network, folder / f"{pairs}.onnx", {})
 
 
@@ -260,8 +262,6 @@ def test_one_frame_on_the_command_line_prints_transforms_and_records_nothing(lak
 
 
 def test_another_model_is_other_work(lake, tmp_path):
-    from pipeline.core.config import load_fleet
-
     fleet = load_fleet(lake / "fleet.toml")
     files = model_files("joint-ssl", fleet)
     assert files == {"joint": lake / "joint.onnx"}
@@ -281,17 +281,13 @@ def with_card(path, out, **more):
 
 
 def test_a_card_may_say_by_what_all_answers_are_off_alike(lake, tmp_path):
-    from pipeline.core.config import load_fleet
-
     fleet = load_fleet(lake / "fleet.toml")
     files = model_files("joint-ssl", fleet)
     assert open_networks(files, fleet.learn, fleet.prepare)[0].bias_sigma == {}
-    bias = {"lidar_radar": [0.3, 0.2, 0.1, 0.03, 0.02, 0.01]}
-    told = with_card(files["joint"], tmp_path / "told.onnx", bias_sigma=bias)
+    bias = [0.3, 0.2, 0.1, 0.03, 0.02, 0.01]
+    told = with_card(files["joint"], tmp_path / "told.onnx", bias_sigma={"lidar_radar": bias})
     [network] = open_networks(told, fleet.learn, fleet.prepare)
-    assert network.bias_sigma["lidar_radar"] == pytest.approx(
-        [*np.radians([0.3, 0.2, 0.1]), 0.03, 0.02, 0.01]
-    )
+    assert network.bias_sigma["lidar_radar"] == pytest.approx([*np.radians(bias[:3]), *bias[3:]])
     for wrong in ({"lidar_radar": [0.3]}, {"sonar": [0.1] * 6}, {"lidar_radar": [-1] * 6}, [1]):
         with pytest.raises(ModelError, match="bias_sigma"):
             other = with_card(files["joint"], tmp_path / "wrong.onnx", bias_sigma=wrong)
@@ -299,8 +295,6 @@ def test_a_card_may_say_by_what_all_answers_are_off_alike(lake, tmp_path):
 
 
 def test_a_network_that_was_not_validated_fails_a_check_in_each_of_its_pairs(frames, lake, tmp_path):
-    from pipeline.core.config import load_fleet
-
     fleet = load_fleet(lake / "fleet.toml")
     files = model_files("joint-ssl", fleet)
     solution, by = solve(frames, [Oracle()], prior_off(0.02)), {}
@@ -322,8 +316,6 @@ def test_a_missing_model_names_its_key(lake, tmp_path):
 
 
 def test_a_day_without_frames_is_refused_not_crashed(lake, tmp_path):
-    from pipeline.core.config import load_fleet
-
     training_lakes.fill(Lake.at(tmp_path), "a", "2026-01-01", 24)
     Lake.at(tmp_path).file("moments", DAY).unlink()
     result = calibrate_day(DAY, load_fleet(lake / "fleet.toml"), Lake.at(tmp_path), method="joint-ssl")

@@ -104,7 +104,7 @@ def test_evidence_at_the_reference_teaches_both_encoders():
     network, inputs, step = small(), inputs_of(batch()), np.radians(GRID.cell_deg)
     projection = GridProjection(*(step / 2 - np.radians(deg) for deg in (GRID.left_deg, GRID.top_deg)), step)
     optimiser, costs = torch.optim.Adam(network.parameters(), 1e-2), []
-    for _ in range(8):
+    for _ in range(5):
         optimiser.zero_grad()
         e, generator = asked(network, inputs).evidence, torch.Generator().manual_seed(0)
         points = transform_points(inputs.T_camera_lidar, e.points_m)

@@ -10,10 +10,10 @@ from pipeline.rig.spherical import camera_direction_angles
 
 GRID = Grid()
 WIDE = np.array([[900.0, 0, 911.5], [0, 920, 469.5], [0, 0, 1]])
-NARROW = np.array([[700.0, 0, 639.5], [0, 700, 359.5], [0, 0, 1]])
+NARROW = np.array([[450.0, 0, 399.5], [0, 450, 224.5], [0, 0, 1]])
 CAMERAS = {
     "f-theta": Camera("equidistant", WIDE, np.zeros(4), 1824, 940),
-    "pinhole": Camera("plumb_bob", NARROW, np.array([-0.05, 0.01, 0.001, 0, 0]), 1280, 720),
+    "pinhole": Camera("plumb_bob", NARROW, np.array([-0.05, 0.01, 0.001, 0, 0]), 800, 450),
 }
 
 
