@@ -9,16 +9,17 @@ from pipeline.ingest.containers.mcap import McapLog
 from pipeline.ingest.containers.rosbag1 import BagLog
 from pipeline.ingest.reading_plan import BURST_TRIOS
 from tests.ingest.containers.test_containers import write
+from tests.makers.written_logs import DETECTIONS, IMAGE, INFO, LABELS, LIDAR, RADAR
 
 FRAMES, BUDGET = 200, 40
 INDEXED = ("mcap", "mcap_plain", "bag", "bag_lz4", "db3", "db3_file", "mcap_folder")
 
 
-def long_drive(kit, odometry=True, late_ns=0):
+def long_drive(kit, odometry=True, late_ns=0, late=(IMAGE,)):
     """Frames at 10 Hz: the first half parked, then ever faster; images are logged late."""
     drive = kit.Kit(frames=FRAMES).drive()
     if late_ns:
-        drive.messages = [(t, k, at + late_ns * (t == kit.IMAGE), m) for t, k, at, m in drive.messages]
+        drive.messages = [(t, k, at + late_ns * (t in late), m) for t, k, at, m in drive.messages]
     for i in range(2 * FRAMES if odometry else 0):
         stamp = kit.START_NS + i * kit.PERIOD_NS // 2
         speed = max(0.0, (i - FRAMES) * 0.1)
@@ -101,12 +102,17 @@ def test_only_the_bytes_of_the_bursts_and_of_the_index_are_read(
 
 
 @pytest.mark.parametrize(
-    ("late_ns", "why"), [(1_700_000_000, ""), (60 * 10**9, "log times do not follow the stamps")]
+    ("late_ns", "late", "why"),
+    [
+        (1_700_000_000, {IMAGE}, ""),
+        (60 * 10**9, {IMAGE}, "log times do not follow the stamps"),
+        (60 * 10**9, {IMAGE, INFO, LIDAR, RADAR, LABELS, DETECTIONS}, ""),  # the recorder's own clock
+    ],
 )
 def test_images_that_are_logged_late_are_found_for_every_sweep_of_a_burst_if_need_be_by_a_whole_read(
-    kit, tmp_path, run_ingest, late_ns, why
+    kit, tmp_path, run_ingest, late_ns, late, why
 ):
-    log = long_drive(kit, late_ns=late_ns).mcap(tmp_path / "late.mcap")
+    log = long_drive(kit, odometry=len(late) == 1, late_ns=late_ns, late=late).mcap(tmp_path / "late.mcap")
     result, frames = run_ingest(log, fleet=in_bursts(kit))
     assert result.reason.startswith(f"{why}, so all of the day's 200 sweeps were read" if why else "")
     assert why or (result.reason, result.rejected) == ("", {})
