@@ -208,27 +208,28 @@ def charts_of_fleet(fleet: Sequence[Mapping[Edge, PairDays]], edges: Sequence[Ed
     day, value = np.zeros(shape, np.int64), np.zeros(shape)
     sigma, accepted = np.full(shape, np.inf), np.ones(shape, bool)
     count, reference_days = np.zeros(shape[:3], np.int64), np.zeros(shape[:3], np.int64)
+    dof, column = np.arange(DOFS)[:, None], np.arange(shape[3])
     for v, own in enumerate(fleet):
         for p, edge in enumerate(edges):
             days = own.get(edge)
             if days is None or not len(days.day):
                 continue
-            n = len(days.day)
-            if days.observable.all():
-                day[v, p, :, :n], value[v, p, :, :n] = days.day, days.change.T
-                sigma[v, p, :, :n], accepted[v, p, :, :n] = days.sigma.T, days.accepted
-                count[v, p], reference_days[v, p] = n, days.reference_days
-                continue
-            all_sigma = days.sigma
-            for k in range(DOFS):
-                rows = np.flatnonzero(days.observable[:, k])
-                m = len(rows)
-                day[v, p, k, :m], value[v, p, k, :m] = days.day[rows], days.change[rows, k]
-                sigma[v, p, k, :m], accepted[v, p, k, :m] = all_sigma[rows, k], days.accepted[rows]
-                count[v, p, k] = m
-                reference_days[v, p, k] = days.reference_days if m and rows[0] == 0 else 0
-    flat = (-1, shape[3])
-    charts = Charts(
+            seen = days.observable.T
+            rows = np.argsort(~seen, axis=1, kind="stable")  # days that determine the DoF first
+            at, live = (v, p, slice(None), slice(len(days.day))), np.take_along_axis(seen, rows, axis=1)
+            day[at], value[at] = (
+                np.where(live, days.day[rows], 0),
+                np.where(live, days.change[rows, dof], 0.0),
+            )
+            sigma[at], accepted[at] = (
+                np.where(live, days.sigma[rows, dof], np.inf),
+                days.accepted[rows] | ~live,
+            )
+            count[v, p], reference_days[v, p] = seen.sum(axis=1), days.reference_days * seen[:, 0]
+    # Columns beyond a chart's days repeat its last day, so that no gap is negative.
+    last = np.take_along_axis(day, np.maximum(count - 1, 0)[..., None], -1)
+    day, flat = np.where(column >= count[..., None], last, day), (-1, shape[3])
+    return Charts(
         day.reshape(flat),
         value.reshape(flat),
         sigma.reshape(flat),
@@ -236,7 +237,3 @@ def charts_of_fleet(fleet: Sequence[Mapping[Edge, PairDays]], edges: Sequence[Ed
         reference_days.ravel(),
         count.ravel(),
     )
-    # Columns beyond a chart's days repeat its last day, so that no gap is negative.
-    last = np.take_along_axis(charts.day, np.maximum(charts.count - 1, 0)[:, None], 1)
-    beyond = np.arange(flat[1]) >= charts.count[:, None]
-    return replace(charts, day=np.where(beyond, last, charts.day))

@@ -107,19 +107,16 @@ def _vehicle(rows: pa.Table) -> VehiclePoses | None:
     if kind is None:
         return None
     others = sorted({day for day, name in zip(days, references, strict=True) if name != reference})
-    own: dict[Sensor, SensorDays] = {}
     of_sensor: dict[str, list[int]] = {}
     for k, name in enumerate(sensors):
         if references[k] == reference != name:
             of_sensor.setdefault(name, []).append(k)
-    for name, at in of_sensor.items():
-        own[Sensor(name, kinds[at[-1]])] = _sensor(rows.slice(at[0], at[-1] + 1 - at[0]), at)
+    own = {Sensor(name, kinds[at[-1]]): _sensor(rows.take(pa.array(at))) for name, at in of_sensor.items()}
     in_order = dict(sorted(own.items(), key=lambda item: (KINDS.index(item[0].kind), item[0].name)))
     return VehiclePoses(Sensor(reference, kind), in_order, tuple(others))
 
 
-def _sensor(rows: pa.Table, at: Sequence[int]) -> SensorDays:
-    rows = rows.take(pa.array([k - at[0] for k in at]))
+def _sensor(rows: pa.Table) -> SensorDays:
     status, unsure = rows["status"].to_pylist(), rows["unsure_only"].to_pylist()
     accepted = np.array([s == "accepted" for s in status])
     counts = accepted | np.array([s == "held" and bool(u) for s, u in zip(status, unsure, strict=True)])

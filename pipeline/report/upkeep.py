@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path, PurePath
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 from urllib.parse import quote
 
 from pipeline.core.config import FleetConfig, config_hash
@@ -32,15 +32,8 @@ __all__ = ["Album", "DayJob", "FanOut", "draw_days", "one_by_one", "stamp_of"]
 _DRAWN = "drawn.json"  # of each day's folder: what its pages were drawn from, by file name
 
 
-@runtime_checkable
-class FanOut(Protocol):
-    """Runs a function on many items, here or elsewhere; results come in any order."""
-
-    def __call__(
-        self, function: Callable[[Any, Progress], Any], items: Sequence[Any], progress: Progress
-    ) -> Iterator[tuple[Any, Any, str]]:
-        """Yield (item, value, error): value or error of each item."""
-        ...
+# Runs a function on many items, here or elsewhere: (item, value, error) of each, in any order.
+FanOut = Callable[[Callable[[Any, Progress], Any], Sequence[Any], Progress], Iterator[tuple[Any, Any, str]]]
 
 
 def one_by_one(
