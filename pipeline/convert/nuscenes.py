@@ -53,18 +53,16 @@ def read_nuscenes(folder: Path, channels: Mapping[Kind, Sequence[str]]) -> list[
         ConfigError: a table, row or channel is missing; the message names the file.
     """
     tables = _Tables(folder)
-    calibrated = {row["token"]: row for row in tables.rows("calibrated_sensor")}
+    calibrated, poses, logs = (tables.by_token(name) for name in ("calibrated_sensor", "ego_pose", "log"))
     sensors = _sensors(tables, channels)
     of_scene = _by_scene(tables, {token: name for token, (name, _) in sensors.items()}, calibrated)
     kinds = dict(sensors.values())
-    poses = {row["token"]: row for row in tables.rows("ego_pose")}
-    logs = {row["token"]: row for row in tables.rows("log")}
     recordings = []
     for scene in tables.rows("scene"):
         rows = of_scene[scene["token"]]
         there = {name: kind for name, kind in kinds.items() if rows[name]}
         if len(there) > 1:
-            log = tables.found("log", logs, scene["log_token"])
+            log = logs[scene["log_token"]]
             about = (str(log["vehicle"]), str(log["date_captured"]), str(scene["name"]))
             recordings.append(_recording(folder, about, there, rows, calibrated, poses))
     if not recordings:
@@ -88,12 +86,12 @@ def _sensors(tables: _Tables, channels: Mapping[Kind, Sequence[str]]) -> dict[st
 
 def _by_scene(tables: _Tables, name_of: Mapping[str, str], calibrated: Mapping[str, Any]) -> _OfScene:
     """Rows of sample_data by scene and sensor name."""
-    scene_of = {row["token"]: row["scene_token"] for row in tables.rows("sample")}
+    samples = tables.by_token("sample")
     of_scene: _OfScene = defaultdict(lambda: defaultdict(list))
     for row in tables.rows("sample_data"):
-        sensor = tables.found("calibrated_sensor", calibrated, row["calibrated_sensor_token"])["sensor_token"]
-        if sensor in name_of:
-            of_scene[tables.found("sample", scene_of, row["sample_token"])][name_of[sensor]].append(row)
+        name = name_of.get(calibrated[row["calibrated_sensor_token"]]["sensor_token"])
+        if name is not None:
+            of_scene[samples[row["sample_token"]]["scene_token"]][name].append(row)
     return of_scene
 
 
@@ -116,14 +114,12 @@ class _Tables:
             raise ConfigError(str(self.path(table)), "", "is not a list of rows")
         return [_Row(str(self.path(table)), row) for row in rows]
 
-    def found(self, table: str, rows: Mapping[str, Any], token: str) -> Any:
-        if token not in rows:
-            raise ConfigError(str(self.path(table)), token, "no such row")
-        return rows[token]
+    def by_token(self, table: str) -> dict[str, Any]:
+        return _Row(str(self.path(table)), {row["token"]: row for row in self.rows(table)})
 
 
 class _Row(dict[str, Any]):
-    """A row whose error for a missing field names the table."""
+    """A row, or rows by token, whose error for a missing key names the table."""
 
     def __init__(self, file: str, values: Mapping[str, Any]) -> None:
         super().__init__(values)

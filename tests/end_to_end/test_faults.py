@@ -9,11 +9,10 @@ import json
 import cv2
 import numpy as np
 import pytest
-from mcap.writer import CompressionType, Writer
+from mcap.reader import make_reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pipeline.core.config import load_fleet
-from pipeline.ingest.containers.reader import open_log
 from pipeline.rig.se3 import exp_so3, from_quaternion, from_rotation_translation, to_quaternion
 from pipeline.rig.targets import errors_at_targets
 from pipeline.simulate.fleet import FleetSpec
@@ -21,6 +20,7 @@ from pipeline.store.current import transform_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
+from tests.makers.copied_logs import copy_log
 from tests.makers.kept_days import kept_fleet
 from tests.makers.simulated_days import DATE, transforms_of
 from tests.makers.stages import calibrate_day, ingest_day, perceive_day
@@ -34,41 +34,20 @@ def rewrite_logs(logs, out, topics, edit):
     """Copy CDR logs of a vehicle-day, in order of time, as MCAP into `out`, with an edit of `topics`."""
     count, number = dict.fromkeys(topics, 0), dict.fromkeys(topics, 0)
     for log in logs:
-        reader = open_log(log)
-        for raw in reader.scan(set(topics)):
-            count[raw.channel.topic] += 1
-        reader.close()
-    paths = []
-    for k, log in enumerate(logs):
-        paths.append(out / f"{k:02d}.mcap")
-        _copy(log, paths[-1], edit, count, number)
-    return paths
+        with log.open("rb") as stream:
+            summary = make_reader(stream).get_summary()
+        for channel, messages in summary.statistics.channel_message_counts.items():
+            if (topic := summary.channels[channel].topic) in count:
+                count[topic] += messages
 
+    def edited(topic, kind, data):
+        if topic not in count:
+            return data
+        message = edit(_STORE.deserialize_cdr(data, kind), number[topic] / count[topic])
+        number[topic] += 1
+        return None if message is None else bytes(_STORE.serialize_cdr(message, kind))
 
-def _copy(log, path, edit, count, number):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    reader, channels = open_log(log), {}
-    with path.open("wb") as stream:
-        writer = Writer(stream, chunk_size=4 << 20, compression=CompressionType.LZ4)
-        writer.start(profile="ros2", library="tests")
-        for raw in reader.scan():
-            channel, data = raw.channel, bytes(raw.data)
-            if (topic := channel.topic) in count:
-                message = edit(_STORE.deserialize_cdr(data, channel.msgtype), number[topic] / count[topic])
-                number[topic] += 1
-                if message is None:
-                    continue
-                data = bytes(_STORE.serialize_cdr(message, channel.msgtype))
-            if topic not in channels:
-                definition = channel.definition.encode()
-                schema = writer.register_schema(name=channel.msgtype, encoding="ros2msg", data=definition)
-                channels[topic] = writer.register_channel(
-                    topic=topic, message_encoding=channel.encoding, schema_id=schema
-                )
-            at = raw.log_time_ns
-            writer.add_message(channels[topic], log_time=at, publish_time=at, data=data)
-        writer.finish()
-    reader.close()
+    return [copy_log(log, out / f"{k:02d}.mcap", edited) for k, log in enumerate(logs)]
 
 
 def silent(_message, _share):
