@@ -6,12 +6,12 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from pipeline.rig.se3 import exp_so3, to_quaternion
+from pipeline.rig.edges import pose_columns
+from pipeline.rig.se3 import exp_so3
 from pipeline.simulate.fleet import FleetSpec
 from pipeline.simulate.reflectors import simulate_reflectors
 from pipeline.store.partitions import Lake
 from schemas.calibrations import CALIBRATIONS, FRAMES_OF_PAIR, PAIRS, CalibrationRecord
-from schemas.columns import POSE_COLUMNS
 from tests.makers.commands import boresight
 from tests.makers.kept_days import kept_fleet
 from tests.makers.lakes import write_records
@@ -22,12 +22,11 @@ YAW_DEG = 0.6  # put into camera-lidar, and into nothing else
 
 
 def record(pair, T, environment="urban", day=DAY):
-    values, (parent, child) = [*to_quaternion(T), *T[:3, 3]], FRAMES_OF_PAIR[pair]
-    prefixed = ((prefix, *of) for prefix in ("", "prior_") for of in zip(POSE_COLUMNS, values, strict=True))
+    parent, child = FRAMES_OF_PAIR[pair]
     return CalibrationRecord(
         vehicle=VEHICLE, day=day, method="joint-optimisation", pair=pair, parent_frame=parent, child_frame=child,
         status="accepted", reason="", work_key="key", code_version="0", seed=0, environment=environment,
-        **{prefix + name: float(value) for prefix, name, value in prefixed},
+        **pose_columns(T), **pose_columns(T, "prior_"),
     )  # fmt: skip
 
 

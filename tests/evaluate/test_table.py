@@ -9,15 +9,11 @@ import pytest
 
 from pipeline.evaluate.comparison import compare, current_runs
 from pipeline.evaluate.table import as_markdown, as_parquet, table_rows
-from pipeline.rig.se3 import inverse, to_quaternion, transform_points
+from pipeline.rig.edges import pose_columns
+from pipeline.rig.se3 import inverse, transform_points
 from pipeline.rig.targets import DEFAULT_TARGETS, Picks, PickUncertainty
 from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, CalibrationRecord
-from schemas.columns import POSE_COLUMNS
 from tests.makers.solve_scenes import CAMERA, T_CAMERA_LIDAR, T_LIDAR_RADAR, TRUTH, turned
-
-
-def columns(T, prefix=""):
-    return {prefix + n: float(v) for n, v in zip(POSE_COLUMNS, (*to_quaternion(T), *T[:3, 3]), strict=True)}
 
 
 def make_run(method="joint", seed=0, key="k1", off_deg=0.2, environment="urban"):
@@ -31,8 +27,8 @@ def make_run(method="joint", seed=0, key="k1", off_deg=0.2, environment="urban")
         CalibrationRecord(
             pair=pair,
             **dict(zip(frames, FRAMES_OF_PAIR[pair], strict=True)),
-            **columns(turned(TRUTH[pair], axis, off_deg)),
-            **columns(turned(TRUTH[pair], axis, 2.0), "prior_"),
+            **pose_columns(turned(TRUTH[pair], axis, off_deg)),
+            **pose_columns(turned(TRUTH[pair], axis, 2.0), "prior_"),
             **about,
         )
         for pair, axis in axes.items()
