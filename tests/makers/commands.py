@@ -28,7 +28,7 @@ def command(capsys, *arguments):
 def boresight(*arguments, **environment):
     """Run the installed command in a process of its own."""
     call, env = [BORESIGHT, *map(str, arguments)], os.environ | environment
-    done = subprocess.run(call, env=env, capture_output=True, text=True, check=False, timeout=600)
+    done = subprocess.run(call, env=env, capture_output=True, text=True, check=False, timeout=1800)
     return _told(done.returncode, done.stdout, done.stderr)
 
 
