@@ -23,17 +23,18 @@ from pipeline.store.partitions import Partition
 from tests.makers.radar_scenes import T_LIDAR_RADAR
 from tests.makers.solve_scenes import T_CAMERA_LIDAR
 
-ROOF, FRONT = Sensor("top", "lidar"), Sensor("nose", "radar")
-EDGE = edge_between(ROOF, FRONT)
+TOP, LEFT = Sensor("top", "lidar"), Sensor("left", "camera")
+NOSE, REAR = Sensor("nose", "radar"), Sensor("rear", "radar")
+EDGE = edge_between(TOP, NOSE)
 ABOUT = Inputs(Partition("car", "2026-03-02"), "joint", "key", 0, ())
 
 
 @pytest.mark.parametrize(("seen", "status"), [(True, "accepted"), (False, "held")])
 def test_a_sure_prior_alone_certifies_nothing(seen, status):
     tight = np.diag([1e-8] * 3 + [1e-6] * 3)
-    poses = Extrinsics(ROOF, {"top": np.eye(4), "nose": np.eye(4)}, ("nose",), tight, tight)
+    poses = Extrinsics(TOP, {"top": np.eye(4), "nose": np.eye(4)}, ("nose",), tight, tight)
     found = AdjustedSensor(np.full(6, float(seen)), np.full(6, seen), (EDGE,), "", (), 0.01)
-    graph = RigGraph((ROOF, FRONT), (EDGE,), ROOF)
+    graph = RigGraph((TOP, NOSE), (EDGE,), TOP)
     top, nose = pose_rows(
         ABOUT, graph, AdjustedRig(poses, tight, poses, {"nose": found}, {}), poses, {}, VerifyConfig()
     )
@@ -44,19 +45,17 @@ def test_a_sure_prior_alone_certifies_nothing(seen, status):
 def test_a_sensor_whose_edges_are_all_left_out_says_what_fault_they_name():
     checks = (Check("too few held-out frames"), Check("the nose moved", "moved_in_day"))
     evidence = EdgeEvidence(EDGE, np.eye(4), 0.0, np.eye(7), np.zeros(7), checks=checks)
-    poses = Extrinsics(ROOF, {"top": np.eye(4), "nose": np.eye(4)}, ("nose",), np.eye(6), np.eye(6))
+    poses = Extrinsics(TOP, {"top": np.eye(4), "nose": np.eye(4)}, ("nose",), np.eye(6), np.eye(6))
     untied = AdjustedSensor(
         np.zeros(6), np.zeros(6, bool), (), "no edge of it can be used: top-nose", (), 0.01
     )
     edges = {EDGE: AdjustedEdge(evidence, None, checks)}
     found = AdjustedRig(poses, np.eye(6), poses, {"nose": untied}, edges)
-    _, nose = pose_rows(ABOUT, RigGraph((ROOF, FRONT), (EDGE,), ROOF), found, poses, {}, VerifyConfig())
+    _, nose = pose_rows(ABOUT, RigGraph((TOP, NOSE), (EDGE,), TOP), found, poses, {}, VerifyConfig())
     assert (nose.status, nose.faults) == ("refused", ["moved_in_day"])
     assert nose.reason.endswith("top-nose; the nose moved")
 
 
-TOP, LEFT = Sensor("top", "lidar"), Sensor("left", "camera")
-NOSE, REAR = Sensor("nose", "radar"), Sensor("rear", "radar")
 BEHIND = from_rotation_translation(np.diag([-1.0, -1.0, 1.0]), np.array([-2.0, 0.0, -1.0]))
 PRIOR = RigPrior(
     (LEFT, TOP, NOSE, REAR),
@@ -133,13 +132,13 @@ def test_a_radar_that_sits_further_ahead_is_off_as_far_for_the_camera_that_takes
 
 def test_a_pose_that_rests_on_it_certifies_no_direction_that_it_would_move_beyond_the_limit():
     edges = [lower(), solved(TOP, NOSE, kept=[X, Z]), solved(TOP, REAR, kept=[X])]
-    rig, about = rig_of(edges), Inputs(Partition("car", "2026-03-02"), "joint", "key", 0, ())
+    rig = rig_of(edges)
     graph, before = RigGraph(PRIOR.nodes, tuple(e.edge for e in edges), TOP), PRIOR.extrinsics()
     up = np.array([0, 0, 0, 0, 0, 0.3])
     # Though the rear radar, which is asked for it, denies it.
     top = WrongPrior("top", edges[0].edge, np.tile(up, 3))
-    found = {row.sensor: row for row in pose_rows(about, graph, rig, before, {}, VerifyConfig(), None, [top])}
-    plain = {row.sensor: row for row in pose_rows(about, graph, rig, before, {}, VerifyConfig())}
+    found = {row.sensor: row for row in pose_rows(ABOUT, graph, rig, before, {}, VerifyConfig(), None, [top])}
+    plain = {row.sensor: row for row in pose_rows(ABOUT, graph, rig, before, {}, VerifyConfig())}
     assert "elevation" not in found["nose"].determined
     assert "prior" in found["nose"].faults
     for what in ("status", "determined", "faults"):

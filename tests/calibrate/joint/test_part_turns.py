@@ -128,29 +128,29 @@ PRIOR = Prior(T_TRUE, np.eye(4), float(np.radians(0.2)), 0.05)
 
 
 @pytest.fixture(scope="module")
-def passing():
+def terms():
     """Scenes that the car passes at one speed, images with their sweeps; none of the objects moves."""
     day = traced_day(DENSE, 12, seed=2)
     return prepare_terms(day, T_TRUE, np.array([[SPEED_MPS, 0.0, 0.0]] * len(day)), reach_rad=0.03)
 
 
 @pytest.fixture(scope="module")
-def kernel(passing):
-    return passing.fitted(STATE.alone, KernelSettings.wide(1.5, 2), np.random.default_rng(0))
+def kernel(terms):
+    return terms.fitted(STATE.alone, KernelSettings.wide(1.5, 2), np.random.default_rng(0))
 
 
-def profile_of(passing, kernel):
-    scored = Scored(passing, kernel, PRIOR, SolveConfig())
-    return profile_time_offset(scored, STATE, IS_TZ, np.arange(passing.frames))
+def profile_of(terms, kernel):
+    scored = Scored(terms, kernel, PRIOR, SolveConfig())
+    return profile_time_offset(scored, STATE, IS_TZ, np.arange(terms.frames))
 
 
-def with_traffic(passing, left_m, right_m):
+def with_traffic(terms, left_m, right_m):
     """What is seen on either half of the image has moved by so much between its point and the image."""
-    xyz = passing.edges.xyz_m
+    xyz = terms.edges.xyz_m
     is_left = xyz[:, 1] > 0
     moved = xyz.copy()
     moved[:, 0] += np.where(is_left, left_m, right_m)
-    return replace(passing, edges=replace(passing.edges, xyz_m=moved))
+    return replace(terms, edges=replace(terms.edges, xyz_m=moved))
 
 
 def unsure_s(profile):
@@ -158,19 +158,19 @@ def unsure_s(profile):
 
 
 def test_oncoming_cars_on_one_half_of_the_image_make_the_time_offset_unsure_by_what_they_draw_it(
-    passing, kernel
+    terms, kernel
 ):
-    assert unsure_s(profile_of(passing, kernel)) < 0.008
+    assert unsure_s(profile_of(terms, kernel)) < 0.008
     way_m = 1.0  # of a car that drives towards us, in a twentieth of a second
     for left_m in (way_m, -way_m):
-        profile = profile_of(with_traffic(passing, left_m, 0.0), kernel)
+        profile = profile_of(with_traffic(terms, left_m, 0.0), kernel)
         off_s = abs(profile.state.dt_s)
         assert unsure_s(profile) > 0.5 * max(off_s, 0.5 * way_m / SPEED_MPS)
         assert np.sqrt(profile.variance_s2) < 0.5 * unsure_s(profile)  # frames do not show it
 
 
-def test_a_time_offset_without_a_half_is_where_its_own_profile_has_it(passing, kernel):
-    mixed = with_traffic(passing, 0.8, 0.0)
+def test_a_time_offset_without_a_half_is_where_its_own_profile_has_it(terms, kernel):
+    mixed = with_traffic(terms, 0.8, 0.0)
     profile = profile_of(mixed, kernel)
     rows, whole = left_out_in_time(profile, IS_TZ), profile.state.dt_s
     is_right = mixed.edges.xyz_m @ T_TRUE[0, :3] + T_TRUE[0, 3] > 0
@@ -197,8 +197,8 @@ def test_a_day_of_oncoming_traffic_states_a_time_offset_near_what_is_expected_th
     assert abs(expected.time_offset_s) < 0.95 * abs(vague.time_offset_s)
 
 
-def test_what_is_at_the_prior_stays_there_and_a_profile_without_ends_says_nothing(passing, kernel):
-    profile = profile_of(with_traffic(passing, 0.8, 0.0), kernel)
+def test_what_is_at_the_prior_stays_there_and_a_profile_without_ends_says_nothing(terms, kernel):
+    profile = profile_of(with_traffic(terms, 0.8, 0.0), kernel)
     fixed = np.isin(np.arange(8), (1, 5))
     rows = left_out_in_time(profile, fixed)
     assert np.all(rows[:, fixed] == 0)

@@ -162,7 +162,7 @@ def test_a_radar_that_turned_on_the_car_is_told_from_the_car():
 
 LIMITS = ChecksConfig()
 SIGMA_M = 0.03
-KNOWN = Prior(T_CAMERA_LIDAR, T_LIDAR_RADAR, np.radians(1.2), SIGMA_M)
+PRIOR = Prior(T_CAMERA_LIDAR, T_LIDAR_RADAR, np.radians(1.2), SIGMA_M)
 
 
 def estimate_of(pair, kept=(), dt_s=0.0, **found):
@@ -170,7 +170,7 @@ def estimate_of(pair, kept=(), dt_s=0.0, **found):
     observable = ~np.isin(np.arange(6), kept)
     covariance, timed = np.eye(6) * SIGMA_M**2, {"time_offset_s": dt_s, "time_offset_sigma_s": 0.005}
     return PairEstimate(
-        pair, KNOWN.of(pair), covariance, observable * 1.0, observable, 50, diagnostics=found, **timed
+        pair, PRIOR.of(pair), covariance, observable * 1.0, observable, 50, diagnostics=found, **timed
     )
 
 
@@ -183,7 +183,7 @@ def test_a_position_left_to_the_prior_is_an_alarm_where_the_day_puts_it_elsewher
         ({"own_tx_m": 0.5, "own_tx_sigma_m": 0.1} | z | {"own_z_beyond": 1.0}, False),  # a slope, no dip
     ]
     for found, is_alarm in cases:
-        alarms = prior_alarms({"lidar_radar": estimate_of("lidar_radar", kept=[3], **found)}, KNOWN, LIMITS)
+        alarms = prior_alarms({"lidar_radar": estimate_of("lidar_radar", kept=[3], **found)}, PRIOR, LIMITS)
         assert [c.fault for c in alarms["lidar_radar"]] == ["prior"] * is_alarm
 
 
@@ -209,7 +209,7 @@ def test_frames_that_align_far_better_at_another_offset_are_an_alarm_though_none
 def test_a_radar_mounted_further_ahead_than_its_prior_says_is_found_though_x_is_left_to_the_prior(off_m):
     T = T_LIDAR_RADAR.copy()
     T[0, 3] += off_m
-    prior = replace(KNOWN, T_lidar_radar=T, translation_sigma_m=0.01)
+    prior = replace(PRIOR, T_lidar_radar=T, translation_sigma_m=0.01)
     found = estimate_lidar_radar(street_day(24, seed=5), prior, SolveConfig(), np.random.default_rng(0))
     alarms = prior_alarms({"lidar_radar": found}, prior, LIMITS)["lidar_radar"]
     own = found.diagnostics
