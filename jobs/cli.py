@@ -140,13 +140,12 @@ def _end(command: str, reason: str, code: int) -> int:
     return code
 
 
-def _is_one_place(*streams: TextIO) -> bool:
+def _is_one_place(a: TextIO, b: TextIO) -> bool:
     """Whether streams are the same terminal, file or pipe."""
     try:
-        places = [os.fstat(stream.fileno()) for stream in streams]
+        return os.path.sameopenfile(a.fileno(), b.fileno())
     except (OSError, ValueError):  # not a file, as in tests
         return False
-    return len({(place.st_dev, place.st_ino) for place in places}) == 1
 
 
 if __name__ == "__main__":

@@ -24,9 +24,8 @@ from pipeline.core.stage_work import Task, Window
 from pipeline.core.stages import AUDIT, REPORT, STATE
 from pipeline.fleet.executor import OnWorkers
 from pipeline.fleet.metrics import NightEnd, Tally, write_metrics
-from pipeline.fleet.nightly import DayOutcome, Night, refused_at_once, run_night
+from pipeline.fleet.nightly import DayOutcome, Night, plan_night, refused_at_once, run_night
 from pipeline.fleet.pattern import VehicleDay, find_logs
-from pipeline.fleet.plan import plan_night
 from pipeline.fleet.status import night_statuses, night_word, to_mend, vehicles_to_mend
 from pipeline.report.stage import Pages
 from pipeline.rig.day_prior import require_named_files

@@ -20,8 +20,9 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.core.config import FleetConfig
+from pipeline.core.errors import BoresightError
 from pipeline.core.results import Effort, MadeWhenAsked, Outcome, Progress, silent
-from pipeline.core.runner import try_stage
+from pipeline.core.runner import try_stage, why_to_run
 from pipeline.core.stage_work import Task
 from pipeline.core.stages import CALIBRATE, INGEST, PERCEIVE
 from pipeline.fleet.executor import EXECUTORS, Finished, Watch
@@ -35,12 +36,12 @@ from schemas.words import day_word
 
 __all__ = [
     "DayOutcome",
+    "DayPlan",
     "Night",
     "asks_for_more",
+    "plan_night",
     "refused_at_once",
     "run_night",
-    "run_vehicle_day",
-    "task_of",
 ]
 
 
@@ -74,6 +75,7 @@ class DayOutcome:
     results: tuple[Outcome, ...] = field(default=(), repr=False)  # of the stages, with the records to commit
 
 
+_STAGES = (INGEST, PERCEIVE, CALIBRATE)
 _NAMED = 5  # vehicles of fleet.toml named beside an unknown one
 # Number of doublings: 1,600 sweeps at most, and all passes together cost seven times the first. Sigmas fall
 # with the root of the number of frames in a calibration; if four times the choice does not help, more will
@@ -133,12 +135,14 @@ def _refused(night: Night, of: Partition, reason: str) -> DayOutcome:
     return replace(refused, mend=reason, results=(result,))
 
 
-def run_vehicle_day(night: Night, work: VehicleDay, known: Known, progress: Progress) -> DayOutcome:
+def _run_job(night: Night, job: _Job, progress: Progress) -> DayOutcome:
     """Ingest, perceive and calibrate one vehicle-day; a refusal is a refused record.
 
-    Its records are in the outcome, for the caller to commit. `known` are records and outcomes in the lake.
+    Its records are in the outcome, for the caller to commit.
     """
-    task = task_of(night, work, known, progress)
+    own, work, known = job
+    night = replace(night, fleet=night.fleet.model_copy(update=own))
+    task = _task_of(night, work, known, progress)
     outcome = _through_stages(task, progress)
     damaged = next((r.damaged for r in outcome.results if r.damaged), "")
     if damaged:
@@ -187,7 +191,7 @@ def _sum(a: Effort | None, b: Effort) -> Effort:
     return Effort(a.began_at, a.seconds + b.seconds, read, written)
 
 
-def task_of(night: Night, work: VehicleDay, known: Known, progress: Progress = silent) -> Task:
+def _task_of(night: Night, work: VehicleDay, known: Known, progress: Progress = silent) -> Task:
     """Task of a vehicle-day for the stages; the caller commits the records."""
     return Task(
         night.fleet,
@@ -205,7 +209,7 @@ def task_of(night: Night, work: VehicleDay, known: Known, progress: Progress = s
 
 def _through_stages(task: Task, progress: Progress) -> DayOutcome:
     partition, done = task.partition, list[Outcome]()
-    for stage in (INGEST, PERCEIVE, CALIBRATE):
+    for stage in _STAGES:
 
         def named(done: int, total: int, what: str, name: str = stage.name) -> None:
             progress(done, total, f"{name} {what}")
@@ -240,11 +244,6 @@ def _shared(night: Night) -> Night:
     return replace(night, fleet=fleet.read_from(file), lake=night.lake.absolute())
 
 
-def _run_job(night: Night, job: _Job, progress: Progress) -> DayOutcome:
-    own, day, known = job
-    return run_vehicle_day(replace(night, fleet=night.fleet.model_copy(update=own)), day, known, progress)
-
-
 def _outcome(finished: Finished[_Job, DayOutcome]) -> DayOutcome:
     if finished.value is not None:
         return finished.value
@@ -269,3 +268,48 @@ def _summarise(partition: Partition, results: Sequence[Outcome]) -> DayOutcome:
         next((r.rows for r in results if r.stage == INGEST.name), 0),
         mend=next((r.reason for r in results if "configuration" in r.faults), ""),
     )
+
+
+# The plan of a night (`--dry-run`): the stages that would run, and why.
+
+
+@dataclass(frozen=True)
+class DayPlan:
+    """Stages that would run on a vehicle-day, in order, and the reason of the first; none = up to date."""
+
+    vehicle: str
+    day: str
+    stages: tuple[str, ...]
+    why: str
+
+
+def plan_night(night: Night, days: Sequence[VehicleDay]) -> Iterator[DayPlan]:
+    """The plan of every vehicle-day, in order; logs are read only to identify their content.
+
+    If a stage's new result equals the old one, the stages after it turn out to be up to date.
+    """
+    known = [d for d in days if not refused_at_once(night, d.partition)]
+    ledger = Ledger(night.lake, [d.partition for d in known])
+    for day in days:
+        vehicle, date = day.partition.vehicle, day.partition.day
+        why_not = refused_at_once(night, day.partition)
+        if why_not:
+            yield DayPlan(vehicle, date, (), f"{why_not}: refused")
+            continue
+        task = _task_of(night, day, ledger.known(day.partition))
+        try:
+            yield DayPlan(vehicle, date, *_would_run(task))
+        except (BoresightError, OSError) as err:
+            yield DayPlan(vehicle, date, (), f"would fail: {err}")
+
+
+def _would_run(task: Task) -> tuple[tuple[str, ...], str]:
+    for at, stage in enumerate(_STAGES):
+        before = next((r for r in reversed(task.before) if r.stage == stage.name), None)
+        why = why_to_run(stage, task)
+        if why:
+            failed = f", failed before: {before.reason}" if before and before.status == "failed" else ""
+            return tuple(s.name for s in _STAGES[at:]), why + failed
+        if before is not None and before.status == "refused" and stage is not CALIBRATE:
+            return (), f"refused by {stage.name}: {before.reason}"
+    return (), "up to date"
