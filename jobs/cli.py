@@ -95,6 +95,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, _stop)
     configure()
     try:
+        if command in COMMANDS and {"--help", "-h"} & set(tokens):
+            app[command].help = None  # so the function's own text is shown; the line above is for the list
         result: Any = app(tokens, exit_on_error=False, print_error=False)
     except CycloptsError as err:
         code, reason = USAGE, str(err)

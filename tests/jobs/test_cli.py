@@ -83,6 +83,13 @@ def test_wrong_usage_exits_with_2_and_says_why(arguments, tmp_path, monkeypatch,
     assert list(tmp_path.iterdir()) == []
 
 
+def test_the_help_of_a_command_is_the_whole_text_of_its_function(capsys):
+    assert cli.main(["export", "--help"]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "boresight export frames --help" in shown
+    assert "Exit codes: 0 all that the vehicle has is current" in shown
+
+
 READERS = {
     "audit": [],
     "report": ["--out", "x.html"],
