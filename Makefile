@@ -70,7 +70,7 @@ benchmark: setup ## measure what the README's rows state on this commit, in abou
 	for study in table1 coverage worlds worlds-full starts faults; do \
 		$(STUDY).run $$study --root benchmark --workers $(WORKERS) || exit 1; done
 	$(STUDY).nights --root benchmark --fleets van no_lidar & $(STUDY).nights --root benchmark --fleets demo; wait
-	logs=../shared/data/astyx; test ! -d $$logs || $(STUDY).real --root benchmark --logs $$logs
+	$(STUDY).real --root benchmark
 
 results: setup ## write the result tables of both READMEs from what was measured
 	$(BIN)/python -m tests.benchmarks.results_table
