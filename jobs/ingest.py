@@ -54,5 +54,6 @@ def _run(stage: Stage, fleet: Path, lake: Lake, of: Partition, logs: tuple[LogPa
     with progress_reporter(f"{stage.name} {of.vehicle} {of.day}") as progress:
         outcome = stage.run(Task(config, lake, of, logs=logs, progress=progress))
     record_outcome(lake, outcome)
-    print_summary(stage.name, outcome.status, **outcome.counts())
+    names = ("stage", "vehicle", "day", "work_key", "rows", "kept", "rejected", "reason", "outputs", "faults")
+    print_summary(stage.name, outcome.status, **{name: getattr(outcome, name) for name in names})
     return exit_code([outcome.status])

@@ -30,6 +30,5 @@ def is_pattern(name: str) -> bool:
 
 def matches(pattern: str, vehicle: str) -> bool:
     """Whether a vehicle's name matches a pattern: * for any number of letters, ? for one."""
-    return (
-        re.fullmatch("".join(_WILD.get(letter, re.escape(letter)) for letter in pattern), vehicle) is not None
-    )
+    wild = "".join(_WILD.get(letter, re.escape(letter)) for letter in pattern)
+    return re.fullmatch(wild, vehicle) is not None

@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -76,11 +76,6 @@ class Outcome:
     inputs: tuple[str, ...] = ()
     effort: Effort = field(default=Effort(), compare=False, repr=False)
     records: tuple[Any, ...] = field(default=(), repr=False)  # rows of a record table, also for a cached day
-
-    def counts(self) -> dict[str, Any]:
-        """All fields but the status that belong in a command's summary."""
-        left_out = ("status", "records", "damaged", "inputs", "effort")
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in left_out}
 
 
 @contextmanager
