@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from dataclasses import asdict
 
 import pytest
 import torch
@@ -11,8 +10,6 @@ from jobs.cli import main
 from pipeline.core.config import LearnConfig, PrepareConfig
 from pipeline.learn.infer.onnx_networks import OnnxNetwork, open_networks
 from pipeline.learn.network.calibration_network import build_network
-from pipeline.learn.sample.grid import Grid
-from pipeline.learn.sample.layout import NetworkConfig
 from pipeline.learn.train.loop import BEST, LAST, load_checkpoint, save_checkpoint
 from pipeline.learn.train.settings import TrainConfig
 
@@ -22,21 +19,13 @@ def run(tmp_path_factory):
     """What training leaves, in little."""
     folder = tmp_path_factory.mktemp("run")
     config = TrainConfig(architecture="concat", width=8, hidden=16, seed=7)
-    network = build_network(NetworkConfig("concat", "joint", Grid(), 8, 16))
+    network = build_network(config.network)
     with torch.no_grad():
         network.core.heads.layers["lidar_radar"].bias[2] = 1.0
-    state = {
-        "config": config.model_dump(mode="json"),
-        "grid": asdict(Grid()),
-        "network": network.state_dict(),
-    }
+    state = {"config": config.model_dump(mode="json"), "network": network.state_dict()}
     save_checkpoint(folder / BEST, state | {"step": 40, "judged": 1.0})
     save_checkpoint(folder / LAST, state | {"step": 60, "trained_s": 120.0})
-    reports = [
-        {"step": 20, "validation/loss": 3.0},
-        {"step": 40, "validation/loss": 2.0},
-        {"step": 60, "validation/loss": 9},
-    ]
+    reports = ({"step": step, "validation/loss": loss} for step, loss in ((20, 3.0), (40, 2.0), (60, 9.0)))
     (folder / "metrics.jsonl").write_text("".join(json.dumps(r) + "\n" for r in reports))
     return folder
 

@@ -53,7 +53,7 @@ def inputs():
 
 @pytest.fixture(scope="module", params=KINDS)
 def exported(request, tmp_path_factory):
-    """A network with weights as large as trained ones, and its file."""
+    """A network with weights as large as trained ones, its file, and the file opened."""
     architecture, pairs = request.param.split("-")
     takes_classes = architecture == "classes"
     architecture = "matching" if takes_classes else architecture
@@ -65,13 +65,14 @@ def exported(request, tmp_path_factory):
         for layer in network.core.heads.layers.values():
             size = 0.01 if architecture == "matching" else 0.05  # half a degree of residuals
             layer.weight += size * torch.randn(layer.weight.shape, generator=generator)
-    return network, export_onnx(network, tmp_path_factory.mktemp("model") / "model.onnx", CARD)
+    path = export_onnx(network, tmp_path_factory.mktemp("model") / "model.onnx", CARD)
+    return network, path, OnnxNetwork(path)
 
 
 def test_the_file_computes_what_the_network_computes_in_one_pass_and_in_three(exported):
-    network, path = exported
+    network, _, opened = exported
     sensors = frame_sensors(row(), GRID, classes())
-    ours = OnnxNetwork(path).estimate(sensors, guess())
+    ours = opened.estimate(sensors, guess())
     with torch.no_grad():
         theirs = network.refine(inputs(), 3)
     assert sum(np.abs(T - guess()[p]).max() for p, T in ours[0].T.items()) > 1e-3  # else parity of nothing
@@ -87,9 +88,9 @@ def test_the_file_computes_what_the_network_computes_in_one_pass_and_in_three(ex
 
 
 def test_what_a_file_matches_by_is_what_the_network_matches_by(exported):
-    network, path = exported
+    network, _, opened = exported
     T_camera_lidar = guess()["camera_lidar"]
-    told = OnnxNetwork(path).evidence(frame_sensors(row(), GRID, classes()), T_camera_lidar)
+    told = opened.evidence(frame_sensors(row(), GRID, classes()), T_camera_lidar)
     with torch.no_grad():
         view, _ = render(inputs(), GRID, classes=network.config.takes_classes)
         evidence = network.core(view).evidence
@@ -105,17 +106,17 @@ def test_what_a_file_matches_by_is_what_the_network_matches_by(exported):
 
 
 def test_a_file_that_takes_classes_answers_without_them_and_otherwise(exported):
-    network, path = exported
+    network, _, opened = exported
     sensors = frame_sensors(row(), GRID, classes())
     asked = [sensors, frame_sensors(row(), GRID), sensors.without_image()]
-    answers = [np.stack([*OnnxNetwork(path).estimate(s, guess())[-1].T.values()]) for s in asked]
+    answers = [np.stack([*opened.estimate(s, guess(), 1)[0].T.values()]) for s in asked]
     differs = not np.allclose(answers[0], answers[1], atol=1e-6)
     assert differs == network.config.takes_classes
     assert np.isfinite(answers).all()
 
 
 def test_the_file_is_a_checked_graph_of_a_recent_opset_and_carries_its_card(exported):
-    network, path = exported
+    network, path, _ = exported
     model = onnx.load(path)
     onnx.checker.check_model(model, full_check=True)
     assert {o.version for o in model.opset_import if o.domain == ""} == {18}
@@ -132,7 +133,7 @@ def test_the_file_is_a_checked_graph_of_a_recent_opset_and_carries_its_card(expo
 
 
 def test_a_network_can_be_trained_on_from_its_file(exported):
-    network, path = exported
+    network, path, _ = exported
     again = network_of_file(path)
     assert again.config == network.config
     for name, value in network.state_dict().items():

@@ -14,7 +14,8 @@ from tests.makers.fleet_files import fleet_toml
 # Both days are longer than what writers and allocators hold at a time: 5 to 12 MiB more for 160 frames than for 40,
 # 1 to 2 MiB more for 320 than for 160. Were frames held, twice as many would be 60 MiB more (see `picture`).
 FRAMES, MOST_MIB = 160, 12
-POSE = {"ego_qw": 1.0, "ego_qx": 0.0, "ego_qy": 0.0, "ego_qz": 0.0, "ego_ty_m": 0.0, "ego_tz_m": 0.0}
+EGO = dict.fromkeys(("ego_qx", "ego_qy", "ego_qz", "ego_tx_m", "ego_ty_m", "ego_tz_m"), 0.0)
+EGO |= {"ego_qw": 1.0, "ego_speed_mps": 10.0, "ego_yaw_rate_radps": 0.0}
 EXPORT = """
 import sys
 from jobs.cli import main
@@ -35,8 +36,7 @@ def lakes(tmp_path_factory):
     for frames in (FRAMES, 2 * FRAMES):
         folder = tmp_path_factory.mktemp("lake")
         (folder / "fleet.toml").write_text(fleet_toml("a"))
-        about = {"image": picture, "ego_speed_mps": 10.0, "ego_yaw_rate_radps": 0.0, "ego_tx_m": 0.0, **POSE}
-        training_lakes.fill(Lake.at(folder), "a", "2026-01-01", frames, **about)
+        training_lakes.fill(Lake.at(folder), "a", "2026-01-01", frames, image=picture, **EGO)
         made.append((frames, folder))
     return made
 

@@ -3,8 +3,7 @@
 import json
 import os
 import signal
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -37,13 +36,7 @@ from pipeline.learn.perception_training.radar_drivable import (
     day_samples,
     label_grid,
 )
-from pipeline.learn.perception_training.trainer import (
-    Samples,
-    Task,
-    TrainingConfig,
-    export_model,
-    train_network,
-)
+from pipeline.learn.perception_training.trainer import Samples, export_model, train_network
 from pipeline.learn.train.loop import load_checkpoint
 from pipeline.perceive.drivable import free_sector
 from pipeline.perceive.ground import PointKind
@@ -133,35 +126,19 @@ def roads(count, seed):
     return [road(rng) for _ in range(count)]
 
 
-@dataclass
-class Case:
-    """A task, its samples, few steps of it, and enough to learn."""
-
-    task: type[Task[Any]]
-    samples: Samples[Any]
-    quick: TrainingConfig
-    enough: TrainingConfig
-
-
 @pytest.fixture(scope="module")
-def sweeps():
+def samples():
     torch.set_num_threads(1)
-    samples = cut(Samples(images_of(1, 24), images_of(2, 8), {}))
-    quick = SweepTraining(steps=6, batch_size=2, width=4, log_every=1)
-    return Case(TASKS["lidar_semantics"], samples, quick, SweepTraining(steps=120, width=8))
-
-
-@pytest.fixture(scope="module")
-def scans():
-    torch.set_num_threads(1)
-    samples = Samples(day_samples(roads(48, 1), PRIOR, 99), day_samples(roads(16, 2), PRIOR, 99), {})
-    quick = DrivableTraining(steps=6, batch_size=2, width=4, log_every=1)
-    return Case(TASKS["radar_drivable"], samples, quick, DrivableTraining(steps=160, batch_size=4, width=12))
+    scans = [day_samples(roads(count, seed), PRIOR, 99) for count, seed in ((48, 1), (16, 2))]
+    sweeps = cut(Samples(images_of(1, 24), images_of(2, 8), {}))
+    return {"lidar_semantics": sweeps, "radar_drivable": Samples(*scans, {})}
 
 
 @pytest.fixture(params=TASKS)
-def case(request):
-    return request.getfixturevalue({"lidar_semantics": "sweeps", "radar_drivable": "scans"}[request.param])
+def case(request, samples):
+    """A task, its samples, and few steps of it."""
+    task = TASKS[request.param]
+    return task, samples[request.param], task.config(steps=6, batch_size=2, width=4, log_every=1)
 
 
 def test_points_take_their_pixels_class_and_none_near_boundaries_in_the_sky_or_behind_the_camera():
@@ -169,19 +146,9 @@ def test_points_take_their_pixels_class_and_none_near_boundaries_in_the_sky_or_b
     image = np.full((observation.image_height_px // 2, observation.image_width_px // 2), 10, np.uint8)
     half, scale = image.shape[1] // 2, observation.image_height_px // 2
     image[scale // 2 :, :half], image[scale // 2 :, half:] = 0, 13
-    changed = make_observation(
-        np.random.default_rng(0),
-        0,
-        0,
-        0.0,
-        labels_png=cv2.imencode(".png", image)[1].tobytes(),
-        label_scale=0.5,
-    )
-    pixels = np.array([[0.25, 0.8], [0.75, 0.8], [0.5, 0.8], [0.25, 0.2]]) * [
-        CAMERA.width_px,
-        CAMERA.height_px,
-    ]
-    rays = CAMERA.unproject(pixels) * 12.0
+    changed = replace(observation, labels_png=cv2.imencode(".png", image)[1].tobytes(), label_scale=0.5)
+    places = np.array([[0.25, 0.8], [0.75, 0.8], [0.5, 0.8], [0.25, 0.2]])
+    rays = CAMERA.unproject(places * [CAMERA.width_px, CAMERA.height_px]) * 12.0
     inverse = np.linalg.inv(T_CAMERA_LIDAR)
     xyz = (rays @ inverse[:3, :3].T + inverse[:3, 3]).astype(np.float32)
     behind = -xyz[:1]
@@ -223,13 +190,14 @@ def test_labels_are_free_where_the_lidar_saw_road_blocked_where_it_saw_else_and_
 
 
 @pytest.mark.slow
-def test_the_network_learns_classes_and_perception_gets_them_from_the_exported_model(sweeps, tmp_path):
-    network, result = train_network(sweeps.task, sweeps.samples, tmp_path, sweeps.enough)
+def test_the_network_learns_classes_and_perception_gets_them_from_the_exported_model(samples, tmp_path):
+    task, sweeps = TASKS["lidar_semantics"], samples["lidar_semantics"]
+    network, result = train_network(task, sweeps, tmp_path, SweepTraining(steps=120, width=8))
     assert result.status == "done"
     # Whoever calls everything by one name has half of it; seconds of training are not the end.
     assert result.report["iou_ground"] > 0.8
     assert result.report["iou_road_user"] > 0.8
-    segmenter = RangeImageSegmenter(export_model(sweeps.task, network, sweeps.samples.train, tmp_path, {}))
+    segmenter = RangeImageSegmenter(export_model(task, network, sweeps.train, tmp_path, {}))
     for frame, _, road in street(4, 3):
         xyz = np.stack([frame.lidar_x_m, frame.lidar_y_m, frame.lidar_z_m], 1)
         turned = np.stack([-xyz[:, 1], xyz[:, 0], xyz[:, 2]], 1)  # to the left, where no camera looked
@@ -239,8 +207,9 @@ def test_the_network_learns_classes_and_perception_gets_them_from_the_exported_m
 
 
 @pytest.mark.slow
-def test_the_network_beats_geometry_and_the_best_guess_on_roads_that_it_has_not_seen(scans, tmp_path):
-    _, result = train_network(scans.task, scans.samples, tmp_path, scans.enough)
+def test_the_network_beats_geometry_and_the_best_guess_on_roads_that_it_has_not_seen(samples, tmp_path):
+    enough = DrivableTraining(steps=160, batch_size=4, width=12)
+    _, result = train_network(TASKS["radar_drivable"], samples["radar_drivable"], tmp_path, enough)
     assert result.status == "done"
     assert result.report["iou_network"] > result.report["iou_geometric"] + 0.2
     assert result.report["iou_network"] > result.report["iou_constant"] + 0.2
@@ -248,7 +217,8 @@ def test_the_network_beats_geometry_and_the_best_guess_on_roads_that_it_has_not_
 
 def test_a_stopped_run_goes_on_to_the_same_weights(case, tmp_path):
     def run(folder, **options):
-        return train_network(case.task, case.samples, tmp_path / folder, case.quick, **options)[1]
+        task, samples, quick = case
+        return train_network(task, samples, tmp_path / folder, quick, **options)[1]
 
     def stop(step, *_):
         if step == 4:
@@ -267,17 +237,18 @@ def test_a_stopped_run_goes_on_to_the_same_weights(case, tmp_path):
 
 
 def test_a_run_goes_on_with_its_own_configuration_and_samples_only(case, tmp_path):
-    few, samples = case.quick.model_copy(update={"steps": 1}), case.samples
-    train_network(case.task, samples, tmp_path, few)
+    task, samples, quick = case
+    few = quick.model_copy(update={"steps": 1})
+    train_network(task, samples, tmp_path, few)
     with pytest.raises(ConfigError, match="another folder"):
-        train_network(case.task, samples, tmp_path, case.quick)
+        train_network(task, samples, tmp_path, quick)
     with pytest.raises(ContractError, match="other samples"):
         swapped = replace(samples, train=samples.held_out, held_out=samples.train)
-        train_network(case.task, swapped, tmp_path, few)
+        train_network(task, swapped, tmp_path, few)
     for side in ("train", "held_out"):
         nobody = replace(samples, **{side: take_rows(samples.train, np.arange(0))})
         with pytest.raises(ContractError, match="both are needed"):
-            train_network(case.task, nobody, tmp_path / "new", few)
+            train_network(task, nobody, tmp_path / "new", few)
 
 
 def test_cells_without_label_do_not_count():

@@ -30,7 +30,7 @@ def sides(plan, units):
 def test_no_key_is_on_two_sides(by):
     rng = np.random.default_rng(1)
     kept = 0
-    for _ in range(150):
+    for _ in range(50):
         units = random_fleet(rng)
         of = sides(plan_split(units, by, 0.15, 0.15), units)
         for kind in by:
@@ -39,7 +39,7 @@ def test_no_key_is_on_two_sides(by):
                 if side is not None:
                     assert seen.setdefault(getattr(unit, kind), side) == side
                     kept += 1
-    assert kept > 1000
+    assert kept > 300
 
 
 def test_separate_groups_lose_no_frame_and_come_near_the_shares():
@@ -64,7 +64,7 @@ def test_a_fleet_that_hangs_together_is_one_group_and_vehicles_alone_divide_it()
 def test_what_was_decided_stays_when_the_fleet_grows():
     rng = np.random.default_rng(2)
     changed = 0
-    for k in range(60):
+    for k in range(30):
         units, by = random_fleet(rng), (ALL, ("vehicle",))[k % 2]
         before = units[: len(units) // 2 + 1]
         first = plan_split(before, by, 0.15, 0.15)

@@ -28,18 +28,8 @@ def sensors() -> SensorInputs:
     radar = torch.rand(FRAMES, 5, 3)
     valid = torch.ones(FRAMES, xyz.shape[1], dtype=torch.bool)
     camera = torch.cat([0.3 + 0.4 * torch.rand(FRAMES, 3, 32, 64), torch.ones(FRAMES, 1, 32, 64)], 1) * seen
-    return SensorInputs(
-        camera,
-        given_classes(kind),
-        xyz,
-        features,
-        valid,
-        radar,
-        radar,
-        valid[:, :5],
-        valid[:, 0],
-        torch.ones(FRAMES),
-    )
+    of_radar = radar, radar, valid[:, :5], valid[:, 0]
+    return SensorInputs(camera, given_classes(kind), xyz, features, valid, *of_radar, torch.ones(FRAMES))
 
 
 def strange(config, seed=0):
