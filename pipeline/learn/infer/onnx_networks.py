@@ -116,6 +116,9 @@ class OnnxNetwork:
         # Why its card does not allow it to be used (empty if it does), and the bias of all answers by pair.
         self.unfit, self.bias_sigma = _read_card(path, self.metadata.get("card", "{}"))
         self._prepare = _prepare_for(self.config.grid, prepare or PrepareConfig())
+        model = onnx.shape_inference.infer_shapes(
+            model, data_prop=True
+        )  # for all parts at once: it takes most
         once, by_pass = split_graph(model, "camera", _ANSWERS)
         threads = self._learn.threads
         self._once = None if once is None else _session(once, threads)
@@ -237,7 +240,7 @@ def _evidence_session(model: onnx.ModelProto, threads: int) -> onnxruntime.Infer
     """Session for the matching evidence; None for files without it: of other pairs, `concat`, or before 0.12."""
     if not {o.name for o in model.graph.output}.issuperset(EVIDENCE):
         return None
-    cut = onnx.utils.Extractor(onnx.shape_inference.infer_shapes(model, data_prop=True))
+    cut = onnx.utils.Extractor(model)
     return _session(cut.extract_model([i.name for i in model.graph.input], list(EVIDENCE)), threads)
 
 
@@ -266,12 +269,12 @@ def split_graph(
 ) -> tuple[onnx.ModelProto | None, onnx.ModelProto]:
     """Two models that together compute `answers`: the part of input `fixed` alone (or None), the rest.
 
-    Input `fixed` does not depend on the guess, and is the same in all passes. The cut is found from the graph, so it
-    works on files of any version.
+    The model has inferred shapes. Input `fixed` does not depend on the guess, and is the same in all passes. The cut
+    is found from the graph, so it works on files of any version.
     """
     others = [i.name for i in model.graph.input if i.name != fixed]
     first, passed_on = _crossing(model.graph, fixed, others)
-    cut = onnx.utils.Extractor(onnx.shape_inference.infer_shapes(model, data_prop=True))
+    cut = onnx.utils.Extractor(model)
     if not first:
         # A network of lidar and radar alone has no such input.
         return None, cut.extract_model([i.name for i in model.graph.input], list(answers))
