@@ -207,7 +207,7 @@ def test_a_standing_car_does_not_determine_the_time_offset():
     found = solve(still, prior_off_by(1, 0.02))
     assert found.time_offset_s == pytest.approx(0.001)  # what the stamps' constant gap of -1 ms suggests
     assert found.time_offset_sigma_s == pytest.approx(CONFIG.time_offset_sigma_s)
-    assert any("time offset not determined" in note for note in found.notes)
+    assert any("time offset: not determined" in note for note in found.notes)
 
 
 def test_too_few_frames_are_refused(day):
