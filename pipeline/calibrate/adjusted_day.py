@@ -189,12 +189,18 @@ def _contradictions(
 
     An edge that others in use confirm on another way is not contradicted by what is left out, and none is by an edge
     that lies far from its prior, which holds what rests on that prior (`wrong_priors`). Camera-lidar is not
-    checked: its held-out frames would show any error that a radar's edges can show.
+    checked, for its held-out frames would show any error that a radar's edges can show, unless its camera's motion
+    takes part: held-out borders err with the others.
     """
     edge = solved.edge
-    if edge.kind == "camera_lidar" and solved.judged.verdict.status == "accepted":
-        return []
     own, found = rig.edges[edge], dict[str, list[Edge]]()
+    by_motion = [e for e in rig.edges if e.kind == "camera_base" and e.parent == edge.parent]
+    is_out = not (own.used or own.doubts or solved.evidence.checks)
+    if edge.kind == "camera_lidar" and any(is_out and rig.edges[e].used for e in by_motion):
+        found[f"{edge.name} and the other edges"] = [edge]
+    is_accepted = edge.kind == "camera_lidar" and solved.judged.verdict.status == "accepted"
+    if is_accepted and not found and not set(by_motion) & set(own.doubts):
+        return []
     of_ends = (d for s in edge.sensors if s.name in rig.sensors for d in rig.sensors[s.name].doubts)
     doubts = tuple(dict.fromkeys([*own.doubts, *of_ends]))  # its own, and of edges that its pose rests on
     if doubts:

@@ -18,6 +18,7 @@ from pipeline.calibrate.adjust.rig import AdjustedRig
 from pipeline.calibrate.adjusted_day import Concluded, SolvedEdge, adjusted_rig, conclude
 from pipeline.calibrate.day import solve_day
 from pipeline.calibrate.edges.day_sources import DaySources
+from pipeline.calibrate.edges.travel_base import with_travel
 from pipeline.calibrate.judging import EdgeJudging
 from pipeline.calibrate.methods import Solver, method_named, resolved
 from pipeline.calibrate.records import Inputs, record_of_edge, refused_edge, refused_record
@@ -77,7 +78,8 @@ class RigDay:
     def _mounted(self, lidar: str, headings: Headings) -> Sequence[tuple[float, float]]:
         """Headings in a lidar's axes; from its mounting on the vehicle frame if the day does not determine one."""
         found = headings.get(lidar, [])
-        T = self.prior.between(lidar, BASE.name) if BASE in self.graph.sensors else None
+        is_mounted = BASE in self.graph.sensors and not self.prior.is_base_loose
+        T = self.prior.between(lidar, BASE.name) if is_mounted else None
         if found or T is None:
             return found
         return [(_azimuth(T), self.prior.sigmas_between(lidar, BASE.name)[0])]
@@ -105,6 +107,10 @@ def calibrate_rig(
 
     `solver` is for methods that need more than observations (`Method.needs_images`); None = the method's own.
     """
+    asked = day.graph.edges
+    if not method_named(about.method).of_three:
+        graph, known = with_travel(day.graph, day.prior, day.rows)
+        day = replace(day, graph=graph, prior=known)
     measured = day.rig.road_z_m, day.rig.measured_heights
     sources = DaySources(day.prior, tuple(day.rig.lidars), tuple(day.rig.radars), day.rows, *measured)
     found, done = _Found(), 0
@@ -123,8 +129,9 @@ def calibrate_rig(
     edges, rig = _adjusted(day, fleet, about, found.edges)
     wrong = [] if rig is None else wrong_priors(edges, rig, fleet.verify.checks)
     concluded = conclude(edges, rig, lambda edge: _against(edge, rig, wrong))
-    order = {(e.parent.name, e.child.name): k for k, e in enumerate(day.graph.edges)}
+    order = {(e.parent.name, e.child.name): k for k, e in enumerate(asked)}
     records = [*found.refused, *(c.record for c in concluded)]
+    records = [r for r in records if (r.parent_frame, r.child_frame) in order]
     records.sort(key=lambda r: order[r.parent_frame, r.child_frame])
     middle = day.graph.reference
     to_middle = {c.edge.other(middle.name).name: c for c in concluded if middle in c.edge.sensors}
@@ -222,7 +229,7 @@ def _solve_other(
     evidence = replace(shown, checks=judged.verdict.against)
     record = partial(record_of_edge, about, judging, frames)
     found.edges.append(SolvedEdge(edge, own, judged, evidence, shown.checks, judging.edge, record))
-    if edge.kind == "lidar_base" and not evidence.checks:
+    if edge.kind == "lidar_base" and not evidence.checks and not day.prior.is_base_loose:
         heading = _azimuth(own.T), float(np.sqrt(own.covariance[2, 2]))
         found.headings.setdefault(edge.parent.name, []).append(heading)
 

@@ -59,12 +59,14 @@ class RigPrior:
         T: transforms of the stars, by (parent, child).
         sigmas: sigma of each sensor's mounting: rotation [rad] and translation [m], isotropic about the
             sensor.
+        is_base_loose: no sensor is mounted on the vehicle frame, which the day places (`edges/travel_base`).
     """
 
     nodes: tuple[Sensor, ...]
     reference: Sensor
     T: Star
     sigmas: Mapping[str, tuple[float, float]]
+    is_base_loose: bool = False
 
     def between(self, a: str, b: str) -> Float[np.ndarray, "4 4"] | None:
         """T_a_b; None if the star does not connect them."""
@@ -81,7 +83,7 @@ class RigPrior:
     @property
     def _exact(self) -> tuple[str]:
         """The node on which the others are mounted."""
-        return (BASE.name,) if BASE in self.nodes else (self.reference.name,)
+        return (BASE.name,) if BASE in self.nodes and not self.is_base_loose else (self.reference.name,)
 
     @property
     def untied(self) -> tuple[Sensor, ...]:

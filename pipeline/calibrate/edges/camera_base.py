@@ -11,7 +11,7 @@ errors are this edge's own; an error of the intrinsics turns what any edge of th
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int64
@@ -37,7 +37,7 @@ from pipeline.rig.evidence import EdgeEvidence
 from pipeline.rig.graph import Edge
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
 
-__all__ = ["estimate_camera_base", "solve"]
+__all__ = ["FEWEST", "estimate_camera_base", "solve"]
 
 # A body pitches and yaws so much from image to image, however sharp the tracks are.
 _LEAST_RAD = np.radians(0.1)
@@ -58,7 +58,8 @@ _CENTRE_RAD = np.radians(0.03)  # by principal point and focal length
 _ASIDE_RAD = np.radians(0.3)
 # A worse clock is none: those of side cameras were 10 to 300 ms off at stated 32 to 141 (days 6701 to 6712).
 _CLOCK_FLOOR_S, _MOST_CLOCK_S, _NO_CLOCK_S = 0.002, 0.025, 1.0
-_FEWEST = 8
+FEWEST = 8
+_BY_WAY = ("yaw", "pitch")
 _PASSES = 4
 
 
@@ -69,28 +70,32 @@ def solve(edge: Edge, sources: DaySources) -> tuple[EdgeEvidence, int]:
     rows = sources.rows({"camera": name})
     if not rows:
         raise SolveError(f"{name} is silent: the day has no image of it", "silent_sensor")
-    travel = camera_travel(rows, sources.ego_at(rows), Scenes.of(rows))
-    return estimate_camera_base(edge, travel, T), len(rows)
+    travel, is_loose = camera_travel(rows, sources.ego_at(rows), Scenes.of(rows)), sources.prior.is_base_loose
+    if is_loose and not any(o.ego_turned_rad is not None for o in rows):
+        unknown = np.full(len(travel.span_s), np.nan)  # Doppler's yaw rate: by a lever that nobody measured
+        travel = replace(travel, turned_rad=unknown, turned_by_clock_radps=unknown)
+    return estimate_camera_base(edge, travel, T, by_axis=not is_loose), len(rows)
 
 
 def estimate_camera_base(
-    edge: Edge, travel: CameraTravel, T_base_camera: Float[np.ndarray, "4 4"]
+    edge: Edge, travel: CameraTravel, T_base_camera: Float[np.ndarray, "4 4"], *, by_axis: bool = True
 ) -> EdgeEvidence:
     """Evidence of a day on T_camera_base and on the base's clock.
 
     Args:
         T_base_camera: the start, whose rotation does not contribute to the information.
+        by_axis: whether axes of turns take part: a body that leans 2.4 deg in its bends shows that as roll.
 
     Raises:
         SolveError: too few pairs of images show a motion.
     """
-    if len(travel.span_s) < _FEWEST:
-        told = f"{len(travel.span_s)} of {_FEWEST} pairs of images that are needed show how {edge.parent.name} moves"
+    if len(travel.span_s) < FEWEST:
+        told = f"{len(travel.span_s)} of {FEWEST} pairs of images that are needed show how {edge.parent.name} moves"
         raise SolveError(told, "few_scenes")
     T = T_base_camera
     for _ in range(_PASSES):
         rows = _rows(travel, T)
-        fits = {name: regress(of) for name, of in rows.items()}
+        fits = {name: regress(of) if by_axis or name in _BY_WAY else None for name, of in rows.items()}
         change, variance = _combined(fits)
         T = from_rotation_translation(exp_so3(change) @ T[:3, :3], T[:3, 3])
     clock = _clock(travel, T)
