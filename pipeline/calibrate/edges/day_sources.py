@@ -68,23 +68,17 @@ class DaySources:
         return ego_motion(measured, odometry, heading=(0.0, 0.0))
 
     def ego_by_cameras(self, radar: DopplerMotion, rows: Sequence[Observation]) -> EgoMotion:
-        """Motion of the base at the rows' moments: turns of cameras, the radar's speed; NaN where none shows a turn.
-
-        It has no speed of its own, so that it shows no clock.
-        """
+        """Motion of the base at the rows' moments: turns by cameras, the radar's own speed, which shows no clock."""
         turns: dict[int, list[float]] = {}
         for name in (node.name for node in self.prior.nodes if node.kind == "camera"):
-            R = self.on_base(name)[2, :3]
+            z = self.on_base(name)[2, :3]
             for o in self.rows({"camera": name}):
                 if o.motion_turn_rad is not None and o.motion_span_s is not None:
-                    turns.setdefault(o.frame_index, []).append(float(R @ o.motion_turn_rad) / o.motion_span_s)
+                    turns.setdefault(o.frame_index, []).append(float(z @ o.motion_turn_rad) / o.motion_span_s)
         yaw_rate = np.array([np.mean(turns.get(o.frame_index, [np.nan])) for o in rows])
         ahead, aside = radar.level()[0].T
-        speed = np.copysign(np.hypot(ahead, aside), ahead)
-        velocity = np.where(
-            np.isfinite(yaw_rate)[:, None], np.stack([speed, np.zeros_like(speed)], 1), np.nan
-        )
-        return EgoMotion(velocity, yaw_rate, np.zeros((len(rows), 3, 3)))
+        speed = np.where(np.isfinite(yaw_rate), np.copysign(np.hypot(ahead, aside), ahead), np.nan)
+        return EgoMotion(np.stack([speed, 0.0 * speed], 1), yaw_rate, np.zeros((len(rows), 3, 3)))
 
     @cached_property
     def backwards(self) -> list[str]:

@@ -39,31 +39,23 @@ def with_travel(
     The same ones where the rig has a frame, no camera shows how it moves, or no lidar shows the road.
     """
     reference, lidar = prior.reference.name, next((s.name for s in graph.of_kind("lidar")), "")
-    T = prior.between(reference, lidar)
-    if BASE in graph.sensors or T is None:
+    T, cameras = prior.between(reference, lidar), graph.of_kind("camera")
+    if BASE in graph.sensors or T is None or not any(_moves(rows({"camera": c.name})) for c in cameras):
         return graph, prior
-    if not any(_moves(rows({"camera": camera.name})) for camera in graph.of_kind("camera")):
-        return graph, prior
-    found = []
-    for radar in graph.of_kind("radar"):
-        T_lidar_radar = prior.between(lidar, radar.name)
-        both = [] if T_lidar_radar is None else rows({"lidar": lidar, "radar": radar.name})
-        heading = None if T_lidar_radar is None else shown_heading(both, T_lidar_radar)
-        if heading is not None:
-            found.append((heading, prior.sigmas_between(lidar, radar.name)[0]))
-    heading_rad, _ = mean_heading(found) or (0.0, 0.0)
-    T_lidar_base = _on_road(sweeps_of(rows({"lidar": lidar})), heading_rad)
+    headings = list[tuple[float, float]]()
+    for radar in (r.name for r in graph.of_kind("radar")):
+        mounted = prior.between(lidar, radar)
+        way = None if mounted is None else shown_heading(rows({"lidar": lidar, "radar": radar}), mounted)
+        headings += [] if way is None else [(way, prior.sigmas_between(lidar, radar)[0])]
+    T_lidar_base = _on_road(sweeps_of(rows({"lidar": lidar})), (mean_heading(headings) or (0.0, 0.0))[0])
     if T_lidar_base is None:
         return graph, prior
     tied = [s for s in graph.sensors if prior.between(reference, s.name) is not None]
     edges = (*graph.edges, *(edge_between(s, BASE) for s in tied))
-    return RigGraph((*graph.sensors, BASE), edges, graph.reference), replace(
-        prior,
-        nodes=(*prior.nodes, BASE),
-        T={**prior.T, (reference, BASE.name): T @ T_lidar_base},
-        sigmas={**prior.sigmas, BASE.name: _SIGMAS},
-        is_base_loose=True,
-    )
+    known = {**prior.T, (reference, BASE.name): T @ T_lidar_base}
+    nodes, sigmas = (*prior.nodes, BASE), {**prior.sigmas, BASE.name: _SIGMAS}
+    prior = replace(prior, nodes=nodes, T=known, sigmas=sigmas, is_base_loose=True)
+    return RigGraph((*graph.sensors, BASE), edges, graph.reference), prior
 
 
 def _moves(rows: Sequence[Observation]) -> bool:
