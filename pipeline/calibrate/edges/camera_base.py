@@ -72,19 +72,19 @@ def solve(edge: Edge, sources: DaySources) -> tuple[EdgeEvidence, int]:
         raise SolveError(f"{name} is silent: the day has no image of it", "silent_sensor")
     travel, is_loose = camera_travel(rows, sources.ego_at(rows), Scenes.of(rows)), sources.prior.is_base_loose
     if is_loose and not any(o.ego_turned_rad is not None for o in rows):
-        unknown = np.full(len(travel.span_s), np.nan)  # Doppler's yaw rate: by a lever that nobody measured
+        unknown = travel.turned_rad * np.nan  # Doppler's yaw rate: by a lever that nobody measured
         travel = replace(travel, turned_rad=unknown, turned_by_clock_radps=unknown)
-    return estimate_camera_base(edge, travel, T, by_axis=not is_loose), len(rows)
+    return estimate_camera_base(edge, travel, T, by_turns=not is_loose), len(rows)
 
 
 def estimate_camera_base(
-    edge: Edge, travel: CameraTravel, T_base_camera: Float[np.ndarray, "4 4"], *, by_axis: bool = True
+    edge: Edge, travel: CameraTravel, T_base_camera: Float[np.ndarray, "4 4"], *, by_turns: bool = True
 ) -> EdgeEvidence:
     """Evidence of a day on T_camera_base and on the base's clock.
 
     Args:
         T_base_camera: the start, whose rotation does not contribute to the information.
-        by_axis: whether axes of turns take part: a body that leans 2.4 deg in its bends shows that as roll.
+        by_turns: whether axes and amounts of turns take part: bodies lean in bends, 2.4 deg on a real car.
 
     Raises:
         SolveError: too few pairs of images show a motion.
@@ -95,10 +95,10 @@ def estimate_camera_base(
     T = T_base_camera
     for _ in range(_PASSES):
         rows = _rows(travel, T)
-        fits = {name: regress(of) if by_axis or name in _BY_WAY else None for name, of in rows.items()}
+        fits = {name: regress(of) if by_turns or name in _BY_WAY else None for name, of in rows.items()}
         change, variance = _combined(fits)
         T = from_rotation_translation(exp_so3(change) @ T[:3, :3], T[:3, 3])
-    clock = _clock(travel, T)
+    clock = _clock(travel, T) if by_turns else None
     timed = None if clock is None or clock.covariance[0, 0] > _MOST_CLOCK_S**2 else clock
     J = np.zeros((4, 7))
     J[:3, :6] = changes_by_left(T)[:3]

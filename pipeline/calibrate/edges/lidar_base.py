@@ -50,9 +50,11 @@ __all__ = ["estimate_lidar_base", "solve"]
 _RANGES_M = 0.007
 # Beyond what scenes scatter by, errors of 8 tuning days: roll 0.017 deg RMS, pitch 0.012, yaw 0.016, height 2 mm.
 _MATCHING = np.array([*np.radians([0.01, 0.01, 0.01]), 0.001])
-# Beams' elevations are good to .1 deg by data sheets. The road alone rests on them, travel does not: on a real car with
-# 16 rings pitch by the road and a camera's by travel were .23 deg apart.
+# By data sheets; the road alone rests on it: pitch of a real car's 16 rings and of its camera's travel were .23 deg apart.
 _BEAMS = Considered("beams", np.radians(0.1) * np.eye(2, 6))
+_PAIRS_OF_TRAVEL = (
+    20  # of successive sweeps: a lidar's way to .03 deg, as cameras know theirs, at a third of the cost
+)
 _AXLE_SIGMA_M = 1.5  # how far from the base the point may lie that follows the car's way: a wheelbase's half
 _NODS_SIGMA = np.radians(0.3)  # per m/s2, along and across: 3 deg/g
 _LONGEST_WAY_M = 20.0  # beyond, scatter is the road's and no longer the registration's
@@ -112,6 +114,8 @@ def solve(edge: Edge, sources: DaySources) -> tuple[EdgeEvidence, int]:
     """Evidence of a day, and its number of moments; raises SolveError if there are too few."""
     name = edge.parent.name
     rows, T = sources.sweeps(name), sources.on_base(name)
+    if sources.prior.is_base_loose:
+        rows = [o for k, o in enumerate(rows) if k % max(2, len(rows) // _PAIRS_OF_TRAVEL) < 2]
     ego, heights = sources.ego_at(rows), sources.heights.get(name)
     found = estimate_lidar_base(
         edge, sweeps_of(rows), ego, T, Scenes.of(rows), road_z_m=sources.road_z_m, height_m=heights

@@ -90,7 +90,8 @@ def solve(edge: Edge, sources: DaySources) -> tuple[EdgeEvidence, int]:
     if not np.isfinite(ego.velocity_mps).any():
         said = f": the car drives backwards by {', '.join(wrong)}" if wrong else ""
         raise SolveError(f"no other source than {name} measures how the car moves{said}")
-    directions = _directions(name, rows, sources)
+    # The pair lidar-radar has these elevations already; a frame by travel adds nothing to them.
+    directions = None if sources.prior.is_base_loose else _directions(name, rows, sources)
     found = estimate_radar_base(edge, radar, ego, stamps, Scenes.of(rows), directions)
     compared = compared_sources(rows, radar.T_base_radar)
     return replace(found, checks=(*found.checks, *compared.wrong)), len(rows)

@@ -39,8 +39,11 @@ def with_travel(
     The same ones where the rig has a frame, no camera shows how it moves, or no lidar shows the road.
     """
     reference, lidar = prior.reference.name, next((s.name for s in graph.of_kind("lidar")), "")
-    T, cameras = prior.between(reference, lidar), graph.of_kind("camera")
-    if BASE in graph.sensors or T is None or not any(_moves(rows({"camera": c.name})) for c in cameras):
+    T = prior.between(reference, lidar)
+    if BASE in graph.sensors or T is None:
+        return graph, prior
+    seen = (rows({"camera": camera.name}) for camera in graph.of_kind("camera"))
+    if all(sum(o.motion_turn_rad is not None for o in of_camera) < FEWEST for of_camera in seen):
         return graph, prior
     headings = list[tuple[float, float]]()
     for radar in (r.name for r in graph.of_kind("radar")):
@@ -56,10 +59,6 @@ def with_travel(
     nodes, sigmas = (*prior.nodes, BASE), {**prior.sigmas, BASE.name: _SIGMAS}
     prior = replace(prior, nodes=nodes, T=known, sigmas=sigmas, is_base_loose=True)
     return RigGraph((*graph.sensors, BASE), edges, graph.reference), prior
-
-
-def _moves(rows: Sequence[Observation]) -> bool:
-    return sum(o.motion_turn_rad is not None for o in rows) >= FEWEST
 
 
 def _on_road(sweeps: Sequence[Sweep], heading_rad: float) -> Float[np.ndarray, "4 4"] | None:
