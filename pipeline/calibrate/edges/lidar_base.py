@@ -50,11 +50,9 @@ __all__ = ["estimate_lidar_base", "solve"]
 _RANGES_M = 0.007
 # Beyond what scenes scatter by, errors of 8 tuning days: roll 0.017 deg RMS, pitch 0.012, yaw 0.016, height 2 mm.
 _MATCHING = np.array([*np.radians([0.01, 0.01, 0.01]), 0.001])
-# By data sheets; the road alone rests on it: pitch of a real car's 16 rings and of its camera's travel were .23 deg apart.
+# By data sheets; the road alone rests on it: by a real car's 16 rings its pitch was .23 deg from a camera's travel.
 _BEAMS = Considered("beams", np.radians(0.1) * np.eye(2, 6))
-_PAIRS_OF_TRAVEL = (
-    20  # of successive sweeps: a lidar's way to .03 deg, as cameras know theirs, at a third of the cost
-)
+_PAIRS_OF_TRAVEL = 20  # of sweeps: they show a way to .03 deg, as cameras do, at a third of the cost
 _AXLE_SIGMA_M = 1.5  # how far from the base the point may lie that follows the car's way: a wheelbase's half
 _NODS_SIGMA = np.radians(0.3)  # per m/s2, along and across: 3 deg/g
 _LONGEST_WAY_M = 20.0  # beyond, scatter is the road's and no longer the registration's

@@ -53,8 +53,7 @@ def with_travel(
     T_lidar_base = _on_road(sweeps_of(rows({"lidar": lidar})), (mean_heading(headings) or (0.0, 0.0))[0])
     if T_lidar_base is None:
         return graph, prior
-    tied = [s for s in graph.sensors if prior.between(reference, s.name) is not None]
-    edges = (*graph.edges, *(edge_between(s, BASE) for s in tied))
+    edges = (*graph.edges, *(edge_between(s, BASE) for s in graph.sensors if s not in prior.untied))
     known = {**prior.T, (reference, BASE.name): T @ T_lidar_base}
     nodes, sigmas = (*prior.nodes, BASE), {**prior.sigmas, BASE.name: _SIGMAS}
     prior = replace(prior, nodes=nodes, T=known, sigmas=sigmas, is_base_loose=True)
