@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 
@@ -16,11 +15,13 @@ from pipeline.rig.estimates import Prior
 from pipeline.rig.graph import BASE, RigGraph, Sensor, edge_between
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
 from pipeline.store.partitions import Partition
+from schemas.observations import Observation
 from tests.makers.calibrated_days import perturbed, records_of_rows, rig_prior_of
 from tests.makers.simulated_days import simulated_day
 from tests.makers.solve_scenes import make_day
 
 KINDS = ("camera", "lidar", "radar")
+OF_BOXES = [name for name in Observation.__dataclass_fields__ if name.startswith("road_user_")]
 SENSORS = tuple(Sensor(kind, kind) for kind in KINDS)
 GRAPH = RigGraph(SENSORS, tuple(EDGE_OF_PAIR.values()), SENSORS[1])
 
@@ -42,11 +43,12 @@ def records_of(made, rows):
     }
 
 
-def moved(o, right_px):
-    """The frame with labels and their picture further right: nothing in the image shows that they are."""
-    labels = cv2.imdecode(np.frombuffer(o.labels_png, np.uint8), cv2.IMREAD_UNCHANGED)
-    labels_png = cv2.imencode(".png", np.roll(labels, right_px, 1))[1].tobytes()
-    return replace(o, labels_png=labels_png, label_gradients=np.roll(o.label_gradients, right_px, -1))
+def turned(o, deg):
+    """The frame without boxes, its borders and paint beside the picture that moves: to them, motion is turned."""
+    R, none = exp_so3(np.radians([0.0, deg, 0.0])), {name: getattr(o, name)[:0] for name in OF_BOXES}
+    if o.motion_turn_rad is None:
+        return replace(o, **none)
+    return replace(o, **none, motion_turn_rad=R @ o.motion_turn_rad, motion_direction=R @ o.motion_direction)
 
 
 @pytest.mark.slow
@@ -69,7 +71,7 @@ def test_camera_lidar_and_camera_radar_by_travel_alone_are_right_from_two_degree
 
 @pytest.mark.slow
 def test_borders_that_motion_contradicts_are_held_by_name_though_held_out_frames_agree(made):
-    good, beside = (records_of(made, [moved(o, px) for o in made.observations]) for px in (0, 4))
+    good, beside = (records_of(made, [turned(o, deg) for o in made.observations]) for deg in (0.0, 0.8))
     assert set(good) == set(EDGE_OF_PAIR)  # the frame of travel has no record
     assert (good["camera_lidar"].status, good["camera_lidar"].faults) == ("accepted", [])
     assert (beside["camera_lidar"].status, beside["camera_lidar"].faults) == ("held", ["witnesses_disagree"])
