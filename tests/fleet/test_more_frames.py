@@ -12,7 +12,7 @@ from pipeline.calibrate.verify.held_out import HeldOutTest
 from pipeline.calibrate.verify.target_accuracy import Claim
 from pipeline.calibrate.verify.verdict import Evidence, judge
 from pipeline.core.config import ChecksConfig
-from pipeline.core.results import Outcome
+from pipeline.core.results import Effort, Outcome
 from pipeline.core.runner import Stage, why_to_run
 from pipeline.core.stage_work import Task
 from pipeline.core.stages import INGEST
@@ -71,7 +71,10 @@ def night_of(monkeypatch, tmp_path, enough):
 
     def run(stage, task):
         budget = task.fleet.ingest.read_sweeps
-        found = results("" if budget >= enough else UNSURE, planned=budget)
+        spent = Effort("", 1.0, 10, None)
+        found = [
+            replace(r, effort=spent) for r in results("" if budget >= enough else UNSURE, planned=budget)
+        ]
         if stage is INGEST:
             asked.append(budget)
             return found[0]
@@ -90,7 +93,10 @@ def test_a_night_doubles_what_is_read_until_it_is_enough_and_not_for_ever(
     outcome, budgets = night_of(monkeypatch, tmp_path, enough)
     assert budgets == asked
     assert outcome.status == ("done" if enough <= 1600 else "partly")
-    assert len(outcome.results) == 3  # of the last pass: one record per pair becomes current
+    # Results are of the last pass: one record per pair becomes current; their efforts are of all passes.
+    passes = len(asked)
+    efforts = [(r.effort.seconds, r.effort.bytes_read, r.effort.bytes_written) for r in outcome.results]
+    assert efforts == [(passes, 10 * passes, None)] * 3
 
 
 def test_a_day_that_was_read_wider_is_up_to_date_and_one_that_was_read_less_is_not(tmp_path):
