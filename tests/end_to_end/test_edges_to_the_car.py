@@ -110,7 +110,7 @@ def test_a_base_whose_prior_is_half_a_metre_and_five_degrees_off_is_held(made, t
     records, poses = calibrated(made, tmp_path, ALL, off=off)
     record = records["top", "base"]
     assert (record.status, record.faults, record.used) == ("held", ["prior"], False)
-    assert "moved 0." in record.reason
+    assert "m off the prior" in record.reason
     assert "top-base" not in poses["nose"].edges
     assert (poses["base"].determined, poses["base"].status) == ([], "held")
     assert poses["base"].faults == ["prior"]

@@ -59,9 +59,17 @@ def rig_of(folder: Path, **rigs: str) -> Path:
     return folder
 
 
-def night(folder: Path) -> list[str]:
+def night(folder: Path, lake: Path | None = None) -> list[str]:
     logs = f"{folder}/logs/{{vehicle}}/{{day}}/*"
-    options = ["--lake", f"{folder}/lake", "--logs", logs, "--executor", "inline", "--no-pictures"]
+    options = [
+        "--lake",
+        f"{lake or folder / 'lake'}",
+        "--logs",
+        logs,
+        "--executor",
+        "inline",
+        "--no-pictures",
+    ]
     return ["nightly", "--fleet", f"{folder}/fleet.toml", *options]
 
 
