@@ -134,7 +134,7 @@ def _worlds(first: int, count: int, frames: int = 60) -> list[DaySpec]:
 # What happens every day on some car of a fleet, in the simulator's words.
 _FAULTS = (
     "camera:intrinsics:0.03", "camera:centre:40", "camera:labels:1", "camera:night:1", "camera:dusk:1", "camera:few:12",
-    "camera:stuck:1@0.5", "radar:stuck:1@0.5", "lidar:missing:1@0.5", "camera:stamp:0.15", "lidar:stamp:0.15",
+    "camera:stuck:1@0.5", "radar:stuck:1@0.5", "lidar:missing:1@0.5", "camera:stamp:0.15", "lidar:stuck:1@0.5",
     "radar:stamp:0.2", "radar:swap:1", "camera:yaw:1.0@0.5", "lidar:pitch:1.0@0.5", "radar:yaw:1.5@0.5",
     "camera:warm-pitch:0.6", "camera:x:0.3", "lidar:z:0.3", "radar:yaw:8.0",
 )  # fmt: skip
