@@ -69,7 +69,8 @@ STUDY = $(ONE_THREAD) $(BIN)/python -m tests.benchmarks.studies
 benchmark: setup ## measure what the README's rows state on this commit, in about two hours on two cores
 	for study in table1 coverage worlds worlds-full starts faults; do \
 		$(STUDY).run $$study --root benchmark --workers $(WORKERS) || exit 1; done
-	$(STUDY).nights --root benchmark --fleets van no_lidar & $(STUDY).nights --root benchmark --fleets demo; wait
+	$(STUDY).nights --root benchmark --fleets van no_lidar & beside=$$!; \
+		$(STUDY).nights --root benchmark --fleets demo && wait $$beside
 	$(STUDY).real --root benchmark
 
 results: setup ## write the result tables of both READMEs from what was measured

@@ -83,10 +83,8 @@ def solve(edge: Edge, sources: DaySources) -> tuple[EdgeEvidence, int]:
     stamps = Stamps(*(np.array(column) for column in of_rows))
     ego = sources.ego_at(rows, without=name)
     if sources.prior.is_base_loose and not np.isfinite(ego.velocity_mps).any():
-        ego, stamps = (
-            sources.ego_by_cameras(radar, rows),
-            replace(stamps, drive=np.arange(len(rows))),
-        )  # no clock
+        ego = sources.ego_by_cameras(radar, rows)
+        stamps = replace(stamps, drive=np.arange(len(rows)))  # a drive each: no change of speed, no clock
     if not np.isfinite(ego.velocity_mps).any():
         said = f": the car drives backwards by {', '.join(wrong)}" if wrong else ""
         raise SolveError(f"no other source than {name} measures how the car moves{said}")

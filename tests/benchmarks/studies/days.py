@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import shutil
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -149,6 +149,8 @@ SETS: dict[str, list[DaySpec]] = {
     # Of 60 frames some 40 are fitted; of 150 about 100, as of the days that the README asks for.
     "worlds": _worlds(7200, 40),
     "worlds-full": _worlds(7260, 16, 150),
+    # With images at the camera's own rate, which show how it moves.
+    "worlds-motion": [replace(day, rig=f"{day.rig}-pairs") for day in _worlds(6900, 8)],
     "starts": _worlds(7200, 8),
     "faults": [
         DaySpec(7300 + k, "urban" if k % 2 else "highway", 60, fault=fault)

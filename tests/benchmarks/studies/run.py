@@ -2,7 +2,8 @@
 
     python -m tests.benchmarks.studies.run table1 --root DAYS [--methods joint] [--workers 2]
     python -m tests.benchmarks.studies.run coverage --root DAYS
-    python -m tests.benchmarks.studies.run worlds --root DAYS [--seeds 7200 7201]     (or worlds-full, starts, faults)
+    python -m tests.benchmarks.studies.run worlds --root DAYS [--seeds 7200 7201]
+        (or worlds-full, worlds-motion, starts, faults)
 
 Days that are not in DAYS are made first. Lines go to results/STUDY.jsonl, their table to results/STUDY.md.
 
@@ -63,7 +64,7 @@ def main() -> None:
     )  # fmt: skip
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
-    tuning = "dev-worlds" if args.study in ("worlds", "worlds-full", "starts") else "dev"
+    tuning = "dev-worlds" if args.study in ("worlds", "worlds-full", "worlds-motion", "starts") else "dev"
     days = [
         d for d in SETS[tuning if args.tuning else args.study] if args.seeds is None or d.seed in args.seeds
     ]
@@ -176,7 +177,8 @@ def by_row(results: Results) -> str:
 
 
 SUMMARIES = {
-    "coverage": coverage, "worlds": worlds, "worlds-full": worlds, "starts": by_row, "faults": by_row,
+    "coverage": coverage, "worlds": worlds, "worlds-full": worlds, "worlds-motion": worlds, "starts": by_row,
+    "faults": by_row,
 }  # fmt: skip
 
 if __name__ == "__main__":
