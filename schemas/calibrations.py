@@ -37,7 +37,7 @@ PROBE_Z = "probe_z_"
 DOF_NAMES = ("rx", "ry", "rz", "tx", "ty", "tz")
 
 _PRIOR = "prior transform T_parent_child; null if there is none"
-_OWN = "by the edge's own data and prior alone; null where T is that, as without an adjustment of the rig"
+_OWN = "from this edge's own data and prior alone; null if equal to T, as in a rig without adjustment"
 
 
 def pairs_of(sensors: Collection[str]) -> tuple[str, ...]:
@@ -73,11 +73,11 @@ class CalibrationRecord(Posed):
     own_tz_m: float | None = column(_OWN, default=None)
     own_covariance: np.ndarray | None = array("<f8", (6, 6), f"covariance {_OWN}", default=None)
     own_common_covariance: np.ndarray | None = array(
-        "<f8", (6, 6), "the part of it that is common to all days", default=None
+        "<f8", (6, 6), "part of own_covariance from errors common to all days", default=None
     )
     own_observable: list[bool] | None = column(f"per DoF: determined {_OWN}", default=None)
     status: str = column(STATUS_DOC)
-    reason: str = column("reason for the status; empty if accepted without remark")
+    reason: str = column("reason for the status; empty if accepted without a remark")
     faults: list[str] = column(FAULTS_DOC, default_factory=list)
     score: float | None = column(
         "smallest margin over the checks of the verdict: 1 = far inside, 0 = at a limit, below 0 = beyond",

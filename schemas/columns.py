@@ -37,8 +37,8 @@ __all__ = [
 POSE_COLUMNS = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 
 # Descriptions of columns that several tables have.
-OBSERVABILITY_DOC = "per DoF: 1 - posterior/prior variance along it; 0 = the day adds nothing to the prior"
-STATUS_DOC = "accepted (use it), held (computed, the prior stays current), refused (nothing computed)"
+OBSERVABILITY_DOC = "per DoF: 1 - posterior/prior variance along it; 0 = the day adds no information"
+STATUS_DOC = "accepted (use it), held (computed, the prior stays in use), refused (nothing computed)"
 FAULTS_DOC = "faults named in the reason, keys of FAULTS in schemas/faults.py"
 
 Row = TypeVar("Row")

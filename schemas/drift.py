@@ -44,7 +44,7 @@ class DriftFinding(Recorded):
     reason: str = column("reason for the status")
     days_used: int = column("number of days on the chart")
     days_needed: int | None = column(
-        "accepted days that this chart lacks for a verdict, at least; null if it has one", default=None
+        "minimum of further accepted days until this chart has a verdict; null if it has one", default=None
     )
     statistic: float | None = column("maximum of the alarm statistic", default=None)
     threshold: float | None = column("alarm threshold for the false-alarm budget", default=None)
@@ -78,8 +78,8 @@ class DriftFinding(Recorded):
     vehicle_since: str | None = column("first day after the vehicle's clearest change", default=None)
     vehicle_reason: str | None = column("reason for the vehicle's status", default=None)
     vehicle_days_needed: int | None = column(
-        "accepted days that the vehicle's status lacks, at least; null if days do not change it: where it is UNKNOWN, "
-        "records cannot be read",
+        "minimum of further accepted days until the vehicle's status may change; null if days do not change it (if "
+        "UNKNOWN: records cannot be read)",
         default=None,
     )
 
@@ -146,9 +146,9 @@ def next_step(findings: Sequence[DriftFinding], lake: str) -> str:
     if stored.status == "UNKNOWN":
         return f"{vehicle}: {_until_it_is_known(stored.days_needed, quote(lake))}"
     if stored.status == "YELLOW" and stored.days_needed:
-        return f"{vehicle}: drive, and look again tomorrow: `boresight status {of}`."
+        return f"{vehicle}: drive, then look again tomorrow: `boresight status {of}`."
     load = (
-        f"load the state of tonight, from the days since the change: `boresight export ros2 {of} "
+        f"load the state of tonight, which has only days since the change: `boresight export ros2 {of} "
         f"--out {quote(f'tonight/{vehicle}')}` (`boresight export --help` lists other formats)"
     )
     what = f"the {stored.sensor}" if stored.sensor else "all sensors"

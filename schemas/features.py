@@ -50,13 +50,13 @@ class ImageFeatureColumns(MotionColumns, CameraColumns):
     label_gradients: np.ndarray | None = array(
         "<f4",
         (8, 6, 33),
-        "image gradients across the labels' borders: by EDGE_* side of objects, then of what stands before the sky; "
-        "by sixth of the image and distance from -16 to 16 label pixels; null without an image or semantics",
+        "image gradients across label borders, by EDGE_* side of objects, then of objects before the sky; by sixth of "
+        "the image; by distance, -16 to 16 label pixels; null without an image or semantics",
         default=None,
     )
     steps_png: bytes | None = column(
-        "PNG mono8 at label size, of a camera without semantics: where brightness steps, as bits STEP_RIGHT and "
-        "STEP_BELOW; null with labels",
+        "PNG mono8 at label size: steps of brightness as bits STEP_RIGHT and STEP_BELOW; null if the camera has "
+        "semantics",
         default=None,
     )
 

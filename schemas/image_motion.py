@@ -20,12 +20,12 @@ def tracking_scale(width_px: int) -> float:
 class EarlierColumns:
     """An earlier image of the same camera, 1 to 6 m of driving before, and the car's motion in between by odometry."""
 
-    earlier_stamp_ns: int | None = column("its stamp; null if the log has none", default=None)
+    earlier_stamp_ns: int | None = column("stamp of that image; null if there is none", default=None)
     earlier_image: bytes | None = column(
         "JPEG mono8 at half size, up to 1000 px wide at full size; null if it is the image of an earlier row",
         default=None,
     )
-    earlier_missing: str | None = column("why there is none", default=None)
+    earlier_missing: str | None = column("reason why there is no earlier image", default=None)
     ego_driven_m: float | None = column(
         "distance driven from the earlier image to this one, negative backwards; null without odometry",
         default=None,
@@ -46,7 +46,7 @@ class MotionColumns:
     coordinates in all three: R_earlier_now = exp(motion_turn_rad).
     """
 
-    motion_span_s: float | None = column("stamp of this image less that of the earlier one", default=None)
+    motion_span_s: float | None = column("stamp of this image minus that of the earlier one", default=None)
     motion_turn_rad: np.ndarray | None = array(
         "<f8", (3,), "rotation vector of R_earlier_now, camera axes", default=None
     )
@@ -56,8 +56,8 @@ class MotionColumns:
     motion_covariance: np.ndarray | None = array(
         "<f8",
         (6, 6),
-        "of motion_turn_rad and motion_direction from the scatter of the tracks; of rank 5, for the direction has no "
-        "length",
+        "covariance of motion_turn_rad and motion_direction from the scatter of the tracks; rank 5, because the "
+        "direction has unit length",
         default=None,
     )
     motion_tracks: int | None = column("corners seen in both images", kind="int32", default=None)

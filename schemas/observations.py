@@ -24,7 +24,7 @@ EDGE_LEFT, EDGE_RIGHT, EDGE_ABOVE, EDGE_BELOW = 0, 1, 2, 3
 # Bits of `steps_png`: brightness steps between a pixel and the next one of its row, or of its column.
 STEP_RIGHT, STEP_BELOW = 1, 2
 # What records, poses and pages state of a camera without semantics.
-WITHOUT_LABELS = "no labels: borders are steps of brightness"
+WITHOUT_LABELS = "no labels: borders are brightness steps"
 
 
 @row()

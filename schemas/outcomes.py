@@ -29,7 +29,7 @@ class OutcomeRow(Recorded):
     rejected: dict[str, int] = column("number rejected, by reason", default_factory=dict)
     began_at: str = column("UTC, ISO 8601 with microseconds", default="")
     seconds: float = column("duration", default=0.0)
-    bytes_read: int | None = column("bytes read by the worker meanwhile; null if unknown", default=None)
+    bytes_read: int | None = column("bytes that the worker read in this stage; null if unknown", default=None)
     bytes_written: int | None = column("and wrote", default=None)
     code_version: str = column("boresight version", default="")
     inputs: list[str] = column("work keys, or names and hashes, of the inputs", default_factory=list)

@@ -26,7 +26,7 @@ class PoseRow(Posed):
     reference: str = column("name of the reference sensor of all poses: frame a of T_a_b")
     observability: list[float] | None = column(OBSERVABILITY_DOC, default=None)
     status: str = column(STATUS_DOC)
-    reason: str = column("reason for the status; empty if accepted without remark")
+    reason: str = column("reason for the status; empty if accepted without a remark")
     faults: list[str] = column(FAULTS_DOC, default_factory=list)
     targets_m: np.ndarray | None = array(
         "<f8",

@@ -31,13 +31,13 @@ class StateRow(Posed):
         "current (days since the last change determine it), prior (no such day: the pose is the prior) or none (not "
         "even a prior is known)"
     )
-    reason: str = column("why days before `since` do not count, days left out, and what is not certified")
+    reason: str = column("reason for `since`, days left out, and directions that are not certified")
     sensor: str | None = column(
         "sensor of a pose row, same as child_frame; null in rows of edges", default=None
     )
     kind: str | None = column("kind of that sensor: camera, lidar, radar or base", default=None)
-    since: str | None = column("first day that may count; null = no limit", default=None)
-    days: list[str] = column("days that it rests on", default_factory=list)
+    since: str | None = column("first day that may be used; null = no limit", default=None)
+    days: list[str] = column("days from which the pose is computed", default_factory=list)
     inputs: list[str] = column("work keys of the records of these days", default_factory=list)
     prior_qw: float | None = column(_PRIOR, default=None)
     prior_qx: float | None = column(_PRIOR, default=None)

@@ -16,7 +16,7 @@ DAY_WORDS: Final = {
     "failed": "an error occurred; the next night tries again",
     "missing": "no logs, although other vehicles drove; or the night ended early",
     "refused": "nothing computed",
-    "held": "computed, the prior stays current",
+    "held": "computed, the prior stays in use",
     "partly": "some pairs accepted",
     "done": "all pairs accepted, use it",
 }

@@ -246,11 +246,11 @@ def faults_of(records: Estimates, latest_day: str) -> dict[int, str]:
     common = ~records.has_common | np.isfinite(records.common).all(axis=(1, 2))
     faults: dict[int, str] = {}
     for wrong, why in (
-        (future, "is of a day that has not come yet"),
-        (unknown, "is of a pair or has a status that this release does not know"),
+        (future, "is of a day in the future"),
+        (unknown, "has a pair or a status that is unknown to this release"),
         (looked_at & ~records.has_estimate & (records.status != _HELD), "has no pose"),
-        (estimated & ~is_rigid(records.pose), "holds no rigid transform"),
-        (estimated & ~is_covariance(records.covariance), "holds no covariance"),
+        (estimated & ~is_rigid(records.pose), "has no rigid transform"),
+        (estimated & ~is_covariance(records.covariance), "has no valid covariance"),
         (estimated & ~common, "has no covariance of the errors common to all days"),
     ):
         for row in np.flatnonzero(wrong).tolist():

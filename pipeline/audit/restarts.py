@@ -41,7 +41,7 @@ def last_restart(
             continue
         named = finding.moved_sensor
         edge = f"{finding.parent_frame} or {finding.child_frame}"
-        who = f"{named} moved" if named else f"{edge} moved; which one is undecided"
+        who = f"{named} moved" if named else f"{edge} moved, undecided which"
         first, why = begin, f"since {begin}: {who}"
     return first, why
 

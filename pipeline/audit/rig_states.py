@@ -151,18 +151,16 @@ def _sensor_row(
     if doubted is not None:
         found = doubted
         held = day_name(int(days.held.day[later[0]]))
-        remarks.append(
-            f"{held} was held and lies apart: the sensor may have moved, so both poses are possible"
-        )
+        remarks.append(f"{held} was held and differs from the days before: the sensor may have moved")
     if moved > counted.poses.day[-1]:
         found = after_a_move(found)
         remarks.append(
-            f"it or {reference.name} moved within {day_name(moved)}, and no later day counts yet: drive"
+            f"it or {reference.name} moved during {day_name(moved)}, and no later day is usable yet: drive"
         )
     before = counted.poses.T_prior[-1], counted.poses.prior_covariance[-1]
     pose = _Pose(found.T, found.covariance, found.common, found.of_prior, *before)
     left_out = ", ".join(names[k] for k in found.left_out)
-    remarks += [f"left out, apart from the later days: {left_out}"] if left_out else []
+    remarks += [f"not counted, because they differ from the later days: {left_out}"] if left_out else []
     row = replace(
         base,
         **_columns(pose),
@@ -181,7 +179,7 @@ def _counted(
     counted = days.since(dt.date.fromisoformat(first).toordinal() if first else 0)
     anew = counted.since(moved + 1)
     if 0 < len(anew.poses.day) < len(counted.poses.day):
-        return anew, day_name(moved + 1), f"since it or {reference.name} moved within {day_name(moved)}"
+        return anew, day_name(moved + 1), f"since it or {reference.name} moved during {day_name(moved)}"
     return counted, first, why
 
 

@@ -222,7 +222,7 @@ def _remarks(
         if restart is not None:
             remarks |= {(edge, dof): f"since the {restart.in_words}" for dof in DOF_NAMES}
     for key, shift in shifts.items():
-        text = f"without what {shift.vehicles} of {shift.of} vehicles show since {day_name(shift.day)}"
+        text = f"less the change of {shift.vehicles} of {shift.of} vehicles since {day_name(shift.day)}"
         remarks[key] = f"{remarks[key]}; {text}" if key in remarks else text
     return remarks
 

@@ -98,6 +98,6 @@ def _clarity(alarm: DriftFinding) -> tuple[bool, bool, float]:
 
 def _what_happened(alarm: DriftFinding) -> str:
     if alarm.moved_sensor is None:
-        return f"a sensor moved on {alarm.start_day}, the charts do not show which"
+        return f"a sensor moved on {alarm.start_day}, undecided which"
     verb = "has been drifting since" if alarm.kind == "slow drift" else "moved on"
     return f"the {alarm.moved_sensor} {verb} {alarm.start_day}"

@@ -296,8 +296,8 @@ def three_sensors(method: str, rig: Rig, overlaps: Sequence[Overlap]) -> Sequenc
     among = [o for o in overlaps if not named or {s.name for s in o.edge.sensors} <= set(named)]
     best = best_three(among)
     if best is None:
-        which = "no three of the rig do"
+        which = "the rig has no such three"
         if named:
-            which = f"{', '.join(named[:2])} and {named[2]} share none, name others as three of the rig"
+            which = f"{', '.join(named[:2])} and {named[2]} do not: name others as `three` of the rig"
         raise SolveError(f"method {method} works on a camera, a lidar and a radar that share a view: {which}")
     return best

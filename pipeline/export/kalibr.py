@@ -97,7 +97,7 @@ def _cameras_in(file: str, chain: Any, edges: Sequence[Edge], names: FrameNames)
     if found and len(found) < sum(topic in known for topic in topics.values()):
         raise ConfigError(file, "rostopic", "two cameras have the same topic: a sensor occurs twice")
     if not found and len(cameras) not in (0, 1, len(topics)):
-        problem = f"names none of {', '.join(known)}, and there are {len(topics)} cameras: which is which?"
+        problem = f"names none of {', '.join(known)}, and there are {len(topics)} cameras: use these topics"
         raise ConfigError(file, "rostopic", problem)
     return found or {name: f"cam{k}" for k, name in enumerate(cameras)}
 

@@ -25,11 +25,11 @@ __all__ = ["KITTI", "VOD"]
 
 _CAMERA, _TO_LIDAR, _RECTIFIED, _IMAGE = "Tr_velo_to_cam", "_to_velo", "R0_rect", "P2"
 _NOTES = (
-    "P0 to P3 are all K [I | 0] of the one camera: undistort its images before use.",
+    "P0 to P3 are all K [I | 0] of the same camera: undistort its images before use.",
     "R0_rect is the identity: the camera's optical frame is used as the rectified frame.",
     (
-        "Tr_imu_to_velo is the inverse of the lidar's pose on the car where that is known, else the identity is in its "
-        "place: no IMU is calibrated here."
+        "Tr_imu_to_velo is the inverse of the lidar's pose on the car, or the identity if that pose is unknown: no IMU "
+        "is calibrated."
     ),
 )
 

@@ -191,10 +191,10 @@ def _assumed_sign(radar: AskedRadar, sign: int) -> tuple[str, ...]:
         return ()
     whose = "" if radar.name == "radar" else f" of {radar.name}"
     absent = f'fleet.toml does not set doppler_positive{whose}, so "{topics.doppler_positive}" is assumed'
-    shown = {1: "the log shows that it is", -1: "the log shows the opposite", 0: "this log does not show it"}[
+    shown = {1: "the log confirms it", -1: "the log shows the opposite", 0: "this log does not determine it"}[
         sign
     ]
-    return (f"{absent}; {shown}: write it down" if sign else f"{absent}; {shown}: drive, or look it up",)
+    return (f"{absent}; {shown}: enter it" if sign else f"{absent}; {shown}: drive, or see the data sheet",)
 
 
 def _ratio_problem(both: Sequence[tuple[float, float]]) -> tuple[str, str]:
@@ -206,7 +206,7 @@ def _ratio_problem(both: Sequence[tuple[float, float]]) -> tuple[str, str]:
     agreed = np.abs(odometry - ratio * doppler) < _NEAR * np.abs(ratio * doppler) + MOVING_MPS / 2
     if abs(ratio - 1) < _OFF or agreed.mean() < _MOST:
         return "", ""
-    shown = f"odometry shows {ratio:+.2f} times the speed that the Doppler does"
+    shown = f"the speed of the odometry is {ratio:+.2f} times the speed of the Doppler"
     if abs(ratio * _KMH - 1) < _NEAR:
         return f"{shown}: km/h for m/s fits the Doppler", ""
     sign = "the other sign" if ratio < 0 else ""
@@ -226,8 +226,8 @@ def _turned_round(frames: Sequence[Frame], sign: int) -> str:
         return ""
     # If the Doppler confirms the radar's heading, the lidar is turned.
     who = {1: "the lidar", -1: "the radar", 0: "the lidar or the radar"}[sign]
-    met = f"{turned:.0%} of the detections match the sweeps if it is turned round"
-    return f"{who} looks the other way: {met}, {given:.0%} by the prior; correct its transform"
+    met = f"{turned:.0%} of the detections match the sweeps if it is turned by 180 deg"
+    return f"{who} points backwards: {met}, {given:.0%} by the prior; correct its transform"
 
 
 def _met(frame: Frame) -> list[float]:

@@ -265,7 +265,7 @@ def _take_bursts(index: DayIndex, timelines: Sequence[Timeline | None], budget: 
     index.reading = plan_sweeps(logged_ns, sweeps.stamps_ns, index.ego, budget)
     unusable = [n for n, t in zip(index.log_names, timelines, strict=True) if t is None]
     why = f"{', '.join(unusable[:3])}: no usable index" if unusable else "log times do not follow the stamps"
-    index.complain(f"{why}, so all of the day's {len(sweeps.stamps)} sweeps were read to take some")
+    index.complain(f"{why}, so all of the day's {len(sweeps.stamps)} sweeps were read, not a selection")
 
 
 def _allow_open_files() -> None:

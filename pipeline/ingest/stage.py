@@ -186,7 +186,7 @@ def _refusal(
     elif not set(rejected) & set(_UNUSABLE):
         of = {"camera": "an image", "lidar": "a sweep", "radar": "a scan"}
         met = " and ".join(f"{of[r.kind]} of {topic}" for r, topic in topics.items() if r not in absent)
-        what = f"{met} never come {_near_enough(config)}"
+        what = f"{met} are never {_near_enough(config)}"
     else:
         reason = max(_UNUSABLE, key=lambda r: rejected[r])
         what = f"no moment has two usable sensors, most often {reason} ({rejected[reason]})"
@@ -215,7 +215,7 @@ def _absences(
         elif not index.captures(sensor).stamps:
             found[sensor] = _nothing_on(f"{topic} ({role})")
         elif reason == near:
-            found[sensor] = f"nothing of {topic} is near enough: not {_near_enough(config)}"
+            found[sensor] = f"no message of {topic} is {_near_enough(config)}"
         else:
             stated = f"{FAULTS[_STATED[reason]]}: " if reason in _STATED else ""
             why = next((p for p in index.problems if p.startswith(f"{reason}: ")), reason)
@@ -230,11 +230,11 @@ def _nothing_on(topics: str) -> str:
 def _near_enough(config: IngestConfig) -> str:
     """The gate in words, and the remedy if no capture is within it."""
     if config.sync_gate_s is not None:
-        gate = f"within {config.sync_gate_s * 1e3:g} ms"
+        gate = f"within {config.sync_gate_s * 1e3:g} ms of each other"
         return f"{gate}: check their clocks, raise ingest.sync_gate_s, or leave it out to gate by motion"
-    gate = f"before the car drives {config.sync_gate_m:g} m or turns {config.sync_gate_deg:g} deg"
+    gate = f"within {config.sync_gate_m:g} m of driving and {config.sync_gate_deg:g} deg of turning"
     return (
-        f"{gate}, constant offsets aside: check the sensors' clocks and rates, or raise "
+        f"{gate}, apart from constant offsets: check the sensors' clocks and rates, or raise "
         "ingest.sync_gate_m and sync_gate_deg"
     )
 

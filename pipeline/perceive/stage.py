@@ -154,7 +154,7 @@ class Sources:
         wanted = self.config.providers[:1]
         found = {s.provider for s in self.cameras.values() if isinstance(s, BatchedSource)}
         return [
-            f"models ran on {p}: {wanted[0]} could not be had"
+            f"models ran on {p}: {wanted[0]} was not available"
             for p in sorted(found.difference(wanted))
             if wanted
         ]

@@ -21,9 +21,9 @@ _REACH = 6.0  # sigmas to either side that a bar has room for
 _WIDTH, _HEIGHT = 240, 18  # px of a bar
 _MOODS = {"pass": "good", "warn": "partly", "fail": "bad", "inconclusive": "none"}
 _ANSWERS = {
-    "right": ("good", "Yes, as far as it matters"),
+    "right": ("good", "Yes, within the limits"),
     "wrong": ("bad", "No"),
-    "inconclusive": ("partly", "This log does not decide"),
+    "inconclusive": ("partly", "Undecided: this log is not sufficient"),
 }
 
 

@@ -123,7 +123,7 @@ def _certified(record: CalibrationRecord) -> str:
     together = f"{' and '.join(record.determined)} within {np.degrees(record.limit_rad):.2g} deg"
     where = "at 15 to 40 m" + (", in the image with this CameraInfo" * record.pair.startswith("camera"))
     what = f"{together if same else ' and '.join(each)} {where}"
-    margin = f"closest check: margin {record.score:.2f} (1 = far inside its limit, 0 = at it)"
+    margin = f"closest check: margin {record.score:.2f} (1 = far inside its limit, 0 = at the limit)"
     return f"{what if record.determined else 'nothing'}; {margin}"
 
 
@@ -137,10 +137,10 @@ def _mounting(record: CalibrationRecord) -> str:
     certified = " and ".join(record.mounting_determined) or "not"
     known = f"{np.degrees(azimuth):.2f} deg of azimuth and {np.degrees(elevation):.2f} deg of elevation"
     return (
-        f"{certified} certified; sigma {known}, with the uncertainty of CameraInfo's principal point. "
-        "Use it for geometry in the car's axes; to project into this camera's image, the sigma above"
+        f"{certified} certified; sigma {known}, including the uncertainty of CameraInfo's principal point. "
+        "Use this sigma for geometry in the car's axes, and the sigma above for projections into this image"
         if record.pair.startswith("camera")
-        else f"{certified} certified; known to {known} (1 sigma)"
+        else f"{certified} certified; sigma {known}"
     )
 
 
@@ -190,8 +190,8 @@ def answer_for(
     unsafe = [t for t in other if t in touched]
     if unsafe:
         first = f"Only {', '.join(accepted)} may be used." if accepted else "No."
-        why = f"the {sensor} moved on {stored.since}, and this day's numbers were not accepted"
-        return "bad", f"{first} Nothing is safe for {', '.join(unsafe)}: {why}."
+        why = f"The {sensor} moved on {stored.since}, and this day was not accepted"
+        return "bad", f"{first} {why}: the car has no valid calibration of {', '.join(unsafe)}."
     if not accepted:
         return "bad", "No. Nothing was accepted: keep the transforms that the car has."
     if not other:

@@ -107,7 +107,7 @@ def _caption(seen: Observation) -> str:
     count = 0 if seen.motion_tracks_px is None else len(seen.motion_tracks_px)
     way = "" if seen.ego_driven_m is None else f" and {abs(seen.ego_driven_m):.1f} m of driving"
     return (
-        f"Frame {seen.frame_index}: {count} tracks from the image {seen.motion_span_s or 0.0:.2f} s{way} before. "
-        "Red cross: the point from which they expand, where the camera travels to. Straight ahead of the vehicle: grey "
-        "square at the prior, blue diamond at the result; of a camera that looks aside they lie outside its image."
+        f"Frame {seen.frame_index}: {count} tracks from the image {seen.motion_span_s or 0.0:.2f} s{way} earlier. "
+        "Red cross: the point of expansion, the direction of travel. Grey square and blue diamond: straight ahead of "
+        "the vehicle, by the prior and by the result. For a side camera, both are outside the image."
     )

@@ -322,7 +322,7 @@ def _listed(names: Any) -> str:
 
 def _only(section: str, of: Mapping[str, _Topics]) -> _Topics | None:
     if len(of) > 1:
-        problem = f"this works on one of {section} so far, and the rig has {_listed(of)}"
+        problem = f"this command supports one of {section}, and the rig has {_listed(of)}"
         raise ConfigError("fleet.toml", f"rigs.*.{section}", problem)
     return next(iter(of.values()), None)
 

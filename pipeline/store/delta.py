@@ -283,7 +283,7 @@ def merge_rows(lake: Lake, schema: TableSchema, rows: pa.Table, *, insert: bool 
                 raise OSError(f"{lake.table(schema.name)}: {err}") from err
         else:
             return
-    raise OSError(f"{lake.table(schema.name)}: {_TRIES} commits of others came in between")
+    raise OSError(f"{lake.table(schema.name)}: {_TRIES} commits of others came first: run this again")
 
 
 def _merge(table: DeltaTable, schema: TableSchema, rows: pa.Table, *, insert: bool) -> None:

@@ -167,7 +167,7 @@ def _rows_of(
         return
     found = read_manifest(lake, schema, partition, sensor)
     if found is None or found.work_key != index.work_key:
-        problem = f"is not what {index.table} refer to: run `boresight {schema.made_by}` again"
+        problem = f"does not match table {index.table}: run `boresight {schema.made_by}` again"
         raise ContractError(str(lake.file(schema.name, partition, sensor)), problem)
     chunks: Iterator[list[Any]] = iterate_rows(lake, schema, partition, schema.row_type, rows, sensor)
     for chunk in chunks:

@@ -68,10 +68,8 @@ def repair_table(lake: Lake, schema: TableSchema) -> Repaired:
     for name in [n for n in there if n not in beside]:
         _take_in(lake, schema, name, done, bad)
     if done.files or bad:
-        done.found = (
-            done.found or f"{done.files} files that its log does not know, {len(bad)} that cannot be read"
-        )
-    done.lost = [words.get(name) or f"{name}: rows without known content" for name in sorted(bad)]
+        done.found = done.found or f"{done.files} files are not in its log, {len(bad)} cannot be read"
+    done.lost = [words.get(name) or f"{name}: content unknown" for name in sorted(bad)]
     return done
 
 

@@ -75,7 +75,7 @@ class Viewer:
     def _make_panel(self) -> tuple[Any, Any]:
         em = self.window.theme.font_size
         panel, said = gui.Vert(0.4 * em, gui.Margins(em, em, em, em)), gui.Label("")
-        keys = gui.Label("space: prior / calibrated\nleft, right: moments\nmouse: turn, wheel: nearer")
+        keys = gui.Label("space: prior / calibrated\nleft, right: moments\nmouse: rotate, wheel: zoom")
         for child in (gui.Label(self._title), said, keys):
             panel.add_child(child)
         for part in PARTS:

@@ -190,7 +190,7 @@ def test_a_change_of_most_vehicles_on_one_day_is_told_from_that_of_one_and_of_ha
         later = audit(lake, *vehicles, last=days - 1)
         assert {v: status(later, v)[0] for v in vehicles} == expected
         assert status(findings, "v3")[1:] == ("radar", day_name(10))
-        words = "without what 8 of 8 vehicles show since 2026-03-11"
+        words = "less the change of 8 of 8 vehicles since 2026-03-11"
         assert words in chart(findings, "camera_lidar", "ry", "v0").reason
 
 
@@ -209,10 +209,10 @@ def test_a_record_of_a_day_to_come_and_one_of_nonsense_are_named_and_left_out(la
     ]
     write(lake, spoiled, suffix="-again")
     outcome = AUDIT.run(Task(fleet_config("v", "w"), lake, Window()))
-    assert "v 2099-01-01 camera_lidar is of a day that has not come yet" in outcome.reason
+    assert "v 2099-01-01 camera_lidar is of a day in the future" in outcome.reason
     for k in (6, 9):
-        assert f"v {records[k].day} camera_lidar holds no covariance" in outcome.reason
-    assert f"v {records[3].day} {records[3].pair} is of a pair or has a status" in outcome.reason
+        assert f"v {records[k].day} camera_lidar has no valid covariance" in outcome.reason
+    assert f"v {records[3].day} {records[3].pair} has a pair or a status" in outcome.reason
     assert {f.day for f in outcome.records} == {day_name(7)}
     assert sum(a == f.status for a, f in zip(whole, outcome.records, strict=True)) >= 34
 

@@ -64,6 +64,6 @@ def test_a_rear_radar_of_the_wrong_sign_is_held_for_it_and_turns_no_other(car, c
     front = records["front"]
     assert front["faults"] == []
     if front["status"] == "refused":  # without odometry no other source is left
-        assert front["reason"].endswith("how the car moves: the car drives backwards by back")
+        assert front["reason"].endswith("the car's motion: the car drives backwards by back")
     else:
         assert yaw_sigmas(front, FRONT.yaw_deg) < 3

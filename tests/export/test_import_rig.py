@@ -112,7 +112,7 @@ def test_a_sensor_that_stands_twice_or_in_a_chain_without_its_name_is_named(flee
     chain.write_text(chain.read_text().replace("/cam_front_optical/image_raw", "/cam0/image_raw"))
     code, summary = imported(capsys, "kalibr", [str(chain)], fleet, tmp_path / "prior.json")
     assert code == 2
-    assert "which is which" in summary["reason"]
+    assert "use these topics" in summary["reason"]
 
 
 def test_a_rig_is_named_where_the_fleet_has_several(fleet, tmp_path, capsys):

@@ -238,8 +238,8 @@ def street_drive(kit, lidar_turn=1.0, **radar):
     ("street", "doppler", "wrong"),
     [
         ({}, "", ""),
-        ({"turn": -1.0}, "the radar looks the other way", ""),
-        ({"lidar_turn": -1.0}, "", "the lidar looks the other way"),
+        ({"turn": -1.0}, "the radar points backwards", ""),
+        ({"lidar_turn": -1.0}, "", "the lidar points backwards"),
         ({"factor": -1.0}, 'doppler_positive is probably "receding"', ""),
     ],
 )
@@ -282,7 +282,7 @@ def test_odometry_and_doppler_that_differ_by_a_unit_or_a_sign_are_named(
 
 @pytest.mark.parametrize(
     ("factor", "words"),
-    [(-1.0, "the log shows that it is"), (1.0, "the log shows the opposite"), (0.0, "does not show it")],
+    [(-1.0, "the log confirms it"), (1.0, "the log shows the opposite"), (0.0, "does not determine it")],
 )
 def test_a_sign_that_nobody_wrote_down_is_said_with_what_the_log_shows(kit, tmp_path, factor, words):
     log = street_drive(kit, factor=factor).mcap(tmp_path / "a.mcap")

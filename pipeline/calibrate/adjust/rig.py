@@ -320,7 +320,7 @@ def _untied(graph: RigGraph, sensor: Sensor, used: Sequence[Edge]) -> str:
         return f"none of its edges can be used: {lost}" if lost else "it shares no view with another sensor"
     return (
         f"no usable edge joins it and {', '.join(with_it)} to the reference {graph.reference.name}: "
-        "only the prior does"
+        "it stays at the prior"
     )
 
 

@@ -90,7 +90,7 @@ def estimate_camera_base(
         SolveError: too few pairs of images show a motion.
     """
     if len(travel.span_s) < FEWEST:
-        told = f"{len(travel.span_s)} of {FEWEST} pairs of images that are needed show how {edge.parent.name} moves"
+        told = f"{len(travel.span_s)} pairs of images determine the motion of {edge.parent.name}, {FEWEST} are required"
         raise SolveError(told, "few_scenes")
     T = T_base_camera
     for _ in range(_PASSES):

@@ -87,7 +87,7 @@ def solve(edge: Edge, sources: DaySources) -> tuple[EdgeEvidence, int]:
         stamps = replace(stamps, drive=np.arange(len(rows)))  # a drive each: no change of speed, no clock
     if not np.isfinite(ego.velocity_mps).any():
         said = f": the car drives backwards by {', '.join(wrong)}" if wrong else ""
-        raise SolveError(f"no other source than {name} measures how the car moves{said}")
+        raise SolveError(f"no source except {name} measures the car's motion{said}")
     # The pair lidar-radar has these elevations already; a frame by travel adds nothing to them.
     directions = None if sources.prior.is_base_loose else _directions(name, rows, sources)
     found = estimate_radar_base(edge, radar, ego, stamps, Scenes.of(rows), directions)
@@ -234,7 +234,7 @@ def _directions(radar: str, rows: Sequence[Observation], sources: DaySources) ->
 def _turned_round(edge: Edge, radar: DopplerMotion) -> EdgeEvidence:
     """A radar by whose Doppler the car drives backwards, at its prior."""
     shown = f"by the Doppler of {radar.name} the car drives backwards, by other sources it does not"
-    fits = "the other sign fits (doppler_positive in fleet.toml), or its transform is turned round"
+    fits = "correct doppler_positive in fleet.toml, or the transform if it is turned by 180 deg"
     nothing, moments = np.zeros((7, 7)), int(np.isfinite(radar.velocity_mps).all(1).sum())
     return EdgeEvidence(
         edge, inverse(radar.T_base_radar), 0.0, nothing, nothing[0], frames_used=moments,

@@ -252,7 +252,7 @@ class DayLabels:
         turned = [f"{name} by {d[f'labels_moved_{name}_deg']:+.2f} deg"
                   for name in ("pitch", "yaw") if f"labels_moved_{name}_deg" in d]  # fmt: skip
         effect = f", which turned {' and '.join(turned)}" if turned else ""
-        return Check(f"{said}; they are moved back{effect}", "labels_offset", error=HARMLESS)
+        return Check(f"{said}; the offset was removed{effect}", "labels_offset", error=HARMLESS)
 
     def _widened(self, estimate: PairEstimate) -> PairEstimate:
         """Labels too far right rotate the camera about its y axis, labels too far down about its x axis."""

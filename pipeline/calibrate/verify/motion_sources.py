@@ -43,7 +43,7 @@ _FACTORS = ((3.6, "km/h for m/s"), (1 / 3.6, "m/s for km/h"), (180 / np.pi, "deg
 _NEAR = 0.1
 _SPEEDS = ("odometry_by_lidar", "doppler_by_lidar", "odometry_by_doppler")
 _NAMED_FACTORS = tuple(sign * f for f in (1.0, 3.6, 1 / 3.6, 2.0, 0.5) for sign in (-1, 1) if sign * f != 1)
-_KEY = " (doppler_positive in fleet.toml; or its transform is turned round)"
+_KEY = " (doppler_positive in fleet.toml, or the transform if it is turned by 180 deg)"
 _NAMES = {"odometry": "odometry", "doppler": "the radar's Doppler", "lidar": "the lidar's sweeps"}
 
 
@@ -218,8 +218,8 @@ def _wrong_axes(observations: Sequence[Observation], T_lidar_radar: np.ndarray) 
     tried = {
         "left and right of the lidar are swapped": swap @ T_lidar_radar,
         "left and right of the radar are swapped": T_lidar_radar @ swap,
-        "the lidar is turned round": turn @ T_lidar_radar,
-        "the radar is turned round": T_lidar_radar @ turn,
+        "the lidar is turned by 180 deg": turn @ T_lidar_radar,
+        "the radar is turned by 180 deg": T_lidar_radar @ turn,
     }
     as_given = _met(observations, T_lidar_radar)
     met, how = max((_met(observations, T), how) for how, T in tried.items())

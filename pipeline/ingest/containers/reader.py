@@ -148,7 +148,7 @@ def content_identity(path: LogPath) -> str:
     if isinstance(path, RemoteLog):
         return path.identity
     if leads_nowhere(path):
-        raise LogError(str(path), f"is a link to {path.readlink()}, which is not there")
+        raise LogError(str(path), f"is a link to {path.readlink()}, which does not exist")
     if path.exists() and not (path.is_dir() or path.is_file()):
         raise LogError(str(path), "is neither a file nor a folder")
     digest = hashlib.sha256(path.name.encode())

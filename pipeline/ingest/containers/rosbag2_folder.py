@@ -116,18 +116,18 @@ def _unpacked(path: Path, folder: Path) -> Path:
         unpacked = zstandard.ZstdDecompressor().stream_reader(source)
         while block := unpacked.read(1 << 22):
             if target.tell() + len(block) > most:
-                raise LogError(str(path), f"unpacks to more than {most} bytes, as no recording does")
+                raise LogError(str(path), f"unpacks to more than {most} bytes: it is no recording")
             target.write(block)
     with plain.open("rb") as content:
         if content.read(len(ZSTD_MAGIC)) == ZSTD_MAGIC:
-            raise LogError(str(path), "is compressed twice, as no recording is")
+            raise LogError(str(path), "is compressed twice: unpack it once")
     return plain
 
 
 def _fetched(path: RemoteLog, folder: Path) -> Path:
     size, most = path.stat().st_size, _MOST_FETCHED_BYTES
     if size > most:
-        what = f"has {size >> 30} GiB, and more than {most >> 30} are not fetched: use MCAP"
+        what = f"has {size >> 30} GiB, and at most {most >> 30} GiB are downloaded: use MCAP"
         raise LogError(str(path), what)
     copy = folder / path.name
     with path.open("rb") as source, copy.open("wb") as target:

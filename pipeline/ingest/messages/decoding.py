@@ -178,7 +178,7 @@ def encoding_fault(channel: Channel, data: memoryview) -> str:
         return ""
     return (
         f"is logged as {said} ({_WRITTEN_BY[said]}), but its bytes are {found} ({_WRITTEN_BY[found]}): convert the "
-        f"recording again with a tool that writes what its bytes are, as `mcap convert` does from a .bag or .db3"
+        f"original .bag or .db3 again, with `mcap convert`"
     )
 
 

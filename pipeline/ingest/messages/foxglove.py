@@ -24,7 +24,7 @@ REFUSED = {
     "LaserScan": "it has no Doppler, without which no radar can be calibrated: log the radar as a PointCloud",
     "CompressedPointCloud": "its compression is not read: log the points as a PointCloud",
     "SceneUpdate": "it has no boxes in the image: log 2D detections",
-    "ImageAnnotations": "what it draws has no classes: log 2D detections",
+    "ImageAnnotations": "its annotations have no classes: log 2D detections",
 }
 
 

@@ -107,7 +107,7 @@ def _find_clouds(survey: Survey, found: FoundSensors) -> None:
     for (kind, _), clouds in best.items():
         clouds.sort(key=lambda c: -c[1])
         (found.radars if kind == "radar" else found.lidars).append(clouds[0][0])
-        found.passed_over += [f"{c.topic} ({kind} {c.frame_id} too)" for c, _ in clouds[1:]]
+        found.passed_over += [f"{c.topic} (second topic of {kind} {c.frame_id})" for c, _ in clouds[1:]]
 
 
 def _columns(message: Any) -> np.ndarray:
@@ -140,7 +140,7 @@ def _find_cameras(survey: Survey, found: FoundSensors) -> None:
         elif (size := _size_px(topic)) is not None:
             pictures[topic] = size
         else:
-            found.passed_over.append(f"{topic.name} (no picture that can be read: depth, or damaged)")
+            found.passed_over.append(f"{topic.name} (no readable image: depth, or damaged)")
     for info in survey.of("info"):
         camera = _camera(info, pictures)
         if camera is None:
@@ -153,7 +153,7 @@ def _find_cameras(survey: Survey, found: FoundSensors) -> None:
         if image is None:
             found.left_out.setdefault(topic.frame_id, []).append(topic.name)
         elif image != topic.name:
-            found.passed_over.append(f"{topic.name} (the camera of {image} too)")
+            found.passed_over.append(f"{topic.name} (same camera as {image})")
     found.cameras = [
         _with_semantics(c, found.cameras, labels, survey.of("detections")) for c in found.cameras
     ]

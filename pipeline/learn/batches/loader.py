@@ -99,9 +99,9 @@ class TrainingLoader:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue at a `state_dict`; raises ContractError if the table or the order differs."""
         here = self.state_dict()
-        for name, what in (("data", "table training has changed"), ("order", "seed or ranks are others")):
+        for name, what in (("data", "table training"), ("order", "seed or processes")):
             if list(state[name]) != list(here[name]):
-                raise ContractError(str(self._lake.root / TRAINING.name), f"cannot resume: {what} since")
+                raise ContractError(str(self._lake.root / TRAINING.name), f"cannot resume: other {what}")
         self._epoch, self._taken = int(state["epoch"]), int(state["taken"])
 
     def close(self) -> None:

@@ -186,11 +186,9 @@ def card_of_run(folder: Path, notes: Path | None = None) -> dict[str, Any]:
     }
     unfit = []  # for weights that no held-out frames chose, or that are those of the start
     if not best:
-        unfit = [f"{UNFIT}: no held-out frames have judged it, so that `calibrate` holds all that it finds."]
+        unfit = [f"{UNFIT}: not validated on held-out frames. `calibrate` holds all its results."]
     elif chosen["step"] == 0:
-        unfit = [
-            f"{UNFIT}: training made no weights that are better on held-out frames than those it began with."
-        ]
+        unfit = [f"{UNFIT}: on held-out frames, training did not improve on the initial weights."]
     card = {
         "weights": f"of step {chosen['step']}, {'the best on held-out frames' if best else 'the last'}",
         "data": {"cell_deg": config["cell_deg"], "frames_per_step": config["batch_size"]},

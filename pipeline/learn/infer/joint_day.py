@@ -120,7 +120,7 @@ def _not_clear(sigmas: float, T: np.ndarray, T_rival: np.ndarray) -> list[Check]
     if sigmas >= _CLEAR_SIGMAS:
         return []
     apart = np.degrees(float(rotation_angle_rad(T @ inverse(T_rival))))
-    sentence = f"frames do not agree: they fit {apart:.1f} deg apart nearly as well ({sigmas:.1f} sigmas)"
+    sentence = f"frames disagree: a pose {apart:.1f} deg away fits nearly as well ({sigmas:.1f} sigmas)"
     return [Check(sentence, "witnesses_disagree")]
 
 

@@ -155,9 +155,9 @@ def train_network(
         ConfigError: the run was begun with another configuration.
         DivergedError: the loss is not finite or has grown too much.
     """
-    for side, name in ((samples.train, "to learn from"), (samples.held_out, "held out")):
+    for side, name in ((samples.train, "for training"), (samples.held_out, "held out")):
         if not np.any(side.label != task.unlabelled):
-            problem = f"no labels in the {len(side)} samples {name}: both are needed"
+            problem = f"no labels in the {len(side)} samples {name}: add days with labels"
             raise ContractError(str(out), problem)
     taught = task(samples.train)
     with torch.random.fork_rng(devices=[]):

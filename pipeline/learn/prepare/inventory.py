@@ -112,7 +112,7 @@ def require_sides(lake: Lake) -> None:
     wanted = ["train", *(["val"] if told["settings"]["split"]["val_fraction"] > 0 else [])]
     if empty := [side for side in wanted if not told["frames"][side]]:
         problem = (
-            f"no frames on side {', '.join(empty)}: prepare again with more vehicle-days or another "
+            f"no frames on side {', '.join(empty)}: run prepare again with more vehicle-days or another "
             "[prepare.split] by (`boresight prepare` names one); val_fraction = 0 trains without validation"
         )
         raise ContractError(str(path), problem)
@@ -133,12 +133,12 @@ def doubts(lake: Lake, *, referenced: bool) -> list[str]:
     if without:
         named = ", ".join(without[:5]) + (" ..." if len(without) > 5 else "")
         found.append(
-            f"left out, without a record of joint that is accepted or held for its sigma alone: {named}; "
+            f"left out, because method joint has no usable record of them: {named}; "
             "run `boresight calibrate`, then `boresight prepare`"
         )
     if len(drives) == 1:
         found.append(
-            "all frames of side train are of one drive, so that a network learns that street: add drives"
+            "all frames of side train are of one drive: add drives, or the network learns that street only"
         )
     return found
 

@@ -139,7 +139,7 @@ class DivergenceGuard:
         # Likelihood terms may take the sum below zero: a loss near zero has no useful multiple.
         limit = self.factor * max(abs(self.least), 1.0)
         if self.seen > _PATIENCE and self.smooth > limit:
-            told = f"is more than {self.factor:g} times its least, {self.least:.3g}"
+            told = f"is more than {self.factor:g} times its minimum of {self.least:.3g}"
             raise DivergedError(step, f"the smoothed loss {self.smooth:.3g} {told}")
 
 

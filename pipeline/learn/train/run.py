@@ -119,8 +119,8 @@ class RunState(Run):
     def load(self, state: dict[str, Any]) -> None:
         """Continue from a checkpoint; raises ConfigError if another number of processes wrote it."""
         if len(state["processes"]) != self.processes.count:
-            problem = f"begun by {len(state['processes'])}, now {self.processes.count}"
-            raise ConfigError("train", "processes", f"a run continues with as many as it was {problem}")
+            problem = f"{self.processes.count}, and the run began with {len(state['processes'])}: use as many"
+            raise ConfigError("train", "processes", problem)
         super().load(state)
         self.loader.load_state_dict(state["processes"][self.processes.rank]["stream"])
         self.best = float(state["best"])

@@ -34,7 +34,7 @@ def download(url: str, file: Path, size_bytes: int, sha256: str, progress: Progr
     try:
         models.fetch(file.name, downloader=source)
     except (OSError, ValueError) as err:
-        told = f"{err}; nothing was kept; or copy the file from another machine to {file}, and call again"
+        told = f"{err}; try again, or copy the file from another machine to {file}"
         raise DownloadError(url, told) from err
     file.chmod(0o644)  # pooch leaves it to its owner alone
     return True
@@ -49,9 +49,7 @@ class _Shown:
     def _begin(self, announced_bytes: int) -> None:
         self.done = 0
         if announced_bytes > self.size_bytes:
-            raise DownloadError(
-                self.url, f"more than {self.size_bytes:,} bytes come: another file than is meant"
-            )
+            raise DownloadError(self.url, f"has more than {self.size_bytes:,} bytes: not the expected file")
 
     total = property(fset=_begin)
 

@@ -48,7 +48,7 @@ class AlikeCheck:
             self._alike = self._alike + 1 if np.array_equal(answer, self._before) else 0
             self._shown, self._before = own, answer
         if self._alike >= _MOST_ALIKE:
-            told = f"the model gives the same answer for {_MOST_ALIKE + 1} different inputs on end"
+            told = f"the model gives the same answer for {_MOST_ALIKE + 1} different inputs in a row"
             raise ModelOutputError(self._file, told)
 
 
@@ -89,7 +89,7 @@ class Session:
         output = self._first_output(np.concatenate(tensors))
         if output.shape[:1] != (len(tensors),):
             told = f"{len(tensors)} images give {list(output.shape)}: set perceive.batch = 1"
-            raise ModelError(self._file, f"the output has no axis of the batch, though the input has: {told}")
+            raise ModelError(self._file, f"the input has a batch axis, the output has none: {told}")
         return [self._checked(tensor, output[i : i + 1]) for i, tensor in enumerate(tensors)]
 
     def _first_output(self, tensor: np.ndarray) -> np.ndarray:

@@ -152,7 +152,7 @@ def test_of_two_clouds_of_one_lidar_the_raw_one_is_taken_and_the_other_is_named(
         made.add("/lidar/ground", "sensor_msgs/msg/PointCloud2", stamp, made.cloud(stamp, xyz))
     values, found = proposed(made.mcap(tmp_path / "a.mcap"))
     assert values["rigs"]["default"]["lidar"]["points"] == "/lidar/points"
-    assert "#   /lidar/ground (lidar lidar too)" in found.text
+    assert "#   /lidar/ground (second topic of lidar lidar)" in found.text
 
 
 def test_one_sensor_alone_is_refused_with_what_the_log_holds(tmp_path):
@@ -220,4 +220,4 @@ def test_the_real_car_s_sign_and_period_are_read_off_its_logs(real_logs):
 def test_kitti_lacks_its_semantics_alone(kitti_logs):
     values, found = proposed(*kitti_logs.glob("*.mcap"))
     assert set(values["rigs"]["default"]) == {"camera", "lidar", "prior"}
-    assert found.missing == ("camera: semantics (recommended; no labels: borders are steps of brightness)",)
+    assert found.missing == ("camera: semantics (recommended; no labels: borders are brightness steps)",)

@@ -102,7 +102,7 @@ def test_a_batch_holds_what_the_rows_hold(lake):
 
 def test_a_changed_table_or_another_order_refuses_to_resume(lake, tmp_path):
     state = TrainingLoader(lake, 3, seed=1).state_dict()
-    with pytest.raises(ContractError, match="seed or ranks"):
+    with pytest.raises(ContractError, match="other seed or processes"):
         TrainingLoader(lake, 3, seed=2).load_state_dict(state)
     other = training_lakes.fleet_lake(tmp_path, VEHICLES[:3], frames=3)
     training_lakes.prepare_all(other, training_lakes.fleet_of(VEHICLES, by=["vehicle"]))

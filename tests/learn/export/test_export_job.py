@@ -49,7 +49,7 @@ def test_a_run_becomes_a_file_with_its_card(run, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("best", "why"), [(40, None), (0, "better on held-out frames"), (None, "no held-out frames")]
+    ("best", "why"), [(40, None), (0, "did not improve"), (None, "not validated on held-out frames")]
 )
 def test_a_network_that_held_out_frames_did_not_choose_is_called_unfit_wherever_it_goes(
     run, tmp_path, capsys, best, why

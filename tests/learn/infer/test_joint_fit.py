@@ -158,4 +158,4 @@ def test_frames_that_fit_in_two_places_alike_fail_a_check():
     turned = off_by(0, np.radians(3.0), 0, 0, 0, 0)
     mixed = [frame(seed, turned if seed // 2 % 2 else T_CAMERA_LIDAR) for seed in range(16)]
     found = fitted(mixed, [T_CAMERA_LIDAR, turned])
-    assert any("frames do not agree" in check.sentence for check in found.failed)
+    assert any("frames disagree" in check.sentence for check in found.failed)

@@ -247,7 +247,7 @@ def test_a_run_goes_on_with_its_own_configuration_and_samples_only(case, tmp_pat
         train_network(task, swapped, tmp_path, few)
     for side in ("train", "held_out"):
         nobody = replace(samples, **{side: take_rows(samples.train, np.arange(0))})
-        with pytest.raises(ContractError, match="both are needed"):
+        with pytest.raises(ContractError, match="add days with labels"):
             train_network(task, nobody, tmp_path / "new", few)
 
 

@@ -145,7 +145,7 @@ def test_a_checkpoint_that_is_worse_than_the_start_is_not_kept(data, tmp_path):
     assert after > before
     kept, start = network_of_run(tmp_path), build_network(config(**settings).network)
     assert all(torch.equal(a, b) for a, b in zip(kept.parameters(), start.parameters(), strict=True))
-    assert "no weights that are better" in card_of_run(tmp_path)["limits"][0]
+    assert "did not improve" in card_of_run(tmp_path)["limits"][0]
 
 
 def test_days_without_a_record_of_joint_teach_no_classes_and_are_named_before(data, tmp_path):

@@ -129,7 +129,7 @@ def settled(basin: Basin, scored: Scored, best: AlignmentState, rival: Alignment
 
 def _fits_as_well(basin: Basin) -> str:
     return (
-        f"another end of the search fits the frames as well: {np.degrees(basin.rival_rad):.1f} deg "
+        f"another minimum of the search fits the frames as well: {np.degrees(basin.rival_rad):.1f} deg "
         f"from the best one ({basin.origin}), {basin.rival_z:.1f} standard errors behind"
     )
 
@@ -221,8 +221,8 @@ class _Search:
         """Reason why the best end cannot be accepted."""
         if (total := sum(basin.evidence)) < basin.needed:
             return (
-                f"no end of the search stands out from chance: the best one ({basin.origin}) shows {total:.0f} "
-                f"where chance alone shows {basin.needed:.0f}"
+                f"no minimum of the search is significant: the best one ({basin.origin}) scores {total:.0f}, "
+                f"chance alone {basin.needed:.0f}"
             )
         if basin.rival_z < CLEARLY and basin.rival_rad >= MARGIN_RAD:
             return _fits_as_well(basin)
@@ -234,9 +234,7 @@ class _Search:
                 is_ahead &= self._holds(rival.state, basin.state)
             if is_ahead.any():
                 name = TERMS[int(np.argmax(is_ahead))]
-                return (
-                    f"{name} contradict the best end of the search ({basin.origin}): they show another place"
-                )
+                return f"{name} contradict the best minimum of the search ({basin.origin}): they fit another pose"
         return ""
 
     def _holds(self, there: AlignmentState, here: AlignmentState) -> Bool[np.ndarray, " 3"]:
