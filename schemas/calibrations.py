@@ -108,10 +108,7 @@ class CalibrationRecord(Posed):
         default=None,
     )
     mounting_covariance: np.ndarray | None = array(
-        "<f8",
-        (6, 6),
-        "covariance of the mounting pose, same order; null like its sigmas",
-        default=None,
+        "<f8", (6, 6), "covariance of the mounting pose, same order; null like its sigmas", default=None
     )
     trigger_before: dict[str, float] = column(
         "trigger metrics of the paper at the prior; empty unless the method is the paper's or triggers decide",
@@ -152,8 +149,7 @@ class CalibrationRecord(Posed):
         default=None,
     )
     used: bool | None = column(
-        "whether the adjustment of the whole rig uses this edge; null without an adjustment",
-        default=None,
+        "whether the adjustment of the whole rig uses this edge; null without an adjustment", default=None
     )
     environment: str = column("highway, urban, mixed or unknown", default="unknown")
     time_offset_s: float | None = column(

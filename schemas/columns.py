@@ -17,6 +17,8 @@ from typing import Any, TypeVar, dataclass_transform, get_args, get_type_hints
 import numpy as np
 import pyarrow as pa
 
+from schemas.words import RECORD_WORDS, listed
+
 __all__ = [
     "FAULTS_DOC",
     "OBSERVABILITY_DOC",
@@ -38,7 +40,7 @@ POSE_COLUMNS = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 
 # Descriptions of columns that several tables have.
 OBSERVABILITY_DOC = "per DoF: 1 - posterior/prior variance along it; 0 = the day adds no information"
-STATUS_DOC = "accepted (use it), held (computed, the prior stays in use), refused (nothing computed)"
+STATUS_DOC = listed(RECORD_WORDS)
 FAULTS_DOC = "faults named in the reason, keys of FAULTS in schemas/faults.py"
 
 Row = TypeVar("Row")

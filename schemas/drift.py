@@ -11,19 +11,19 @@ from dataclasses import dataclass
 from shlex import quote
 
 from schemas.columns import Recorded, TableSchema, column, row
+from schemas.words import NEXT_STEPS, VEHICLE_WORDS, listed
 
 __all__ = [
     "DRIFT",
     "DRIFT_STATUSES",
     "DriftFinding",
     "VehicleStatus",
-    "kind_of_sensor",
     "next_step",
     "status_of",
 ]
 
 # Most urgent first; lists of vehicles are in this order.
-DRIFT_STATUSES = ("RED", "YELLOW", "UNKNOWN", "GREEN")
+DRIFT_STATUSES = tuple(VEHICLE_WORDS)
 
 
 @row(eq=True)
@@ -67,13 +67,11 @@ class DriftFinding(Recorded):
     moved_motion_sigma: list[float] | None = column("sigmas of moved_motion", default=None)
     inputs: list[str] = column("work keys of the records on the chart", default_factory=list)
     vehicle_status: str = column(
-        "status of the whole vehicle, equal in all its rows of one audit: RED or YELLOW if a chart is, "
-        "GREEN if a rotation of any sensor would have been detected, else UNKNOWN",
+        f"status of the whole vehicle, equal in all its rows of one audit: {listed(VEHICLE_WORDS)}",
         default="UNKNOWN",
     )
     vehicle_sensor: str | None = column(
-        "name of the sensor that moved; null if none moved or the data do not identify it",
-        default=None,
+        "name of the sensor that moved; null if none moved or the data do not identify it", default=None
     )
     vehicle_since: str | None = column("first day after the vehicle's clearest change", default=None)
     vehicle_reason: str | None = column("reason for the vehicle's status", default=None)
@@ -118,16 +116,6 @@ def status_of(findings: Sequence[DriftFinding]) -> VehicleStatus:
     )
 
 
-def kind_of_sensor(name: str, findings: Sequence[DriftFinding]) -> str:
-    """Kind of a sensor (camera, lidar, radar or base), from the edges in its vehicle's findings."""
-    known = {
-        frame: kind
-        for f in findings
-        for frame, kind in zip((f.parent_frame, f.child_frame), f.pair.split("_"), strict=True)
-    }
-    return known.get(name, name)
-
-
 _WITHIN_REACH = 28  # days: the audit's window, four weeks by default, never has more
 
 
@@ -141,36 +129,18 @@ def next_step(findings: Sequence[DriftFinding], lake: str) -> str:
     stored = status_of(findings)
     if not findings or stored.status == "GREEN":
         return ""
-    vehicle, day = findings[0].vehicle, findings[0].day
-    of = f"--lake {quote(lake)} --vehicle {quote(vehicle)}"
+    vehicle, day, days = findings[0].vehicle, findings[0].day, stored.days_needed
+    step, kind, done = stored.status, "repair", day
     if stored.status == "UNKNOWN":
-        return f"{vehicle}: {_until_it_is_known(stored.days_needed, quote(lake))}"
-    if stored.status == "YELLOW" and stored.days_needed:
-        return f"{vehicle}: drive, then look again tomorrow: `boresight status {of}`."
-    load = (
-        f"load the state of tonight, which has only days since the change: `boresight export ros2 {of} "
-        f"--out {quote(f'tonight/{vehicle}')}` (`boresight export --help` lists other formats)"
+        step += ", tables" if days is None else ", many days" if days > _WITHIN_REACH else ", days"
+    elif stored.status == "YELLOW":
+        step, kind, done = "YELLOW, days" if days else step, "re-mount", stored.since or day
+    of = f"--lake {quote(lake)} --vehicle {quote(vehicle)}"
+    what, sensor = (
+        ("all sensors", "all") if not stored.sensor else (f"the {stored.sensor}", quote(stored.sensor))
     )
-    what = f"the {stored.sensor}" if stored.sensor else "all sensors"
-    is_red = stored.status == "RED"
-    kind, done = ("repair", day) if is_red else ("re-mount", stored.since or day)
-    service = f"`boresight service {of} --day {done} --kind {kind} --sensor {quote(stored.sensor or 'all')}`"
-    if is_red:
-        when = f"replace {day}, the last audited day, by the day of the repair"
-        repaired = f"after the repair, run {service} ({when})"
-        return f"{vehicle}: inspect the mounting of {what}; {repaired}. Until then {load}."
-    when = f"replace {done}, the first day with the change, by the day of the work"
-    look = f"If somebody moved {what}, run {service} ({when}); else inspect the mounting at the next service."
-    return f"{vehicle}: {load}. {look}"
-
-
-def _until_it_is_known(days: int | None, lake: str) -> str:
-    """What a vehicle that is UNKNOWN needs: a repair of tables, or more days."""
-    if days is None:
-        return f"repair the tables: `boresight repair --lake {lake}`."
-    if days > _WITHIN_REACH:
-        return (
-            f"drive other roads: {days} more accepted days like these would be required. "
-            "The pages of its days list what to drive."
-        )
-    return f"drive; {'1 more accepted day is' if days == 1 else f'{days} more accepted days are'} required."
+    service = f"`boresight service {of} --day {done} --kind {kind} --sensor {sensor}`"
+    more = f"{days} more accepted day{'s' * (days != 1)}"
+    tables = {"lake": quote(lake), "out": quote(f"tonight/{vehicle}"), "of": of}
+    words = NEXT_STEPS[step].format(what=what, service=service, day=done, days=more, **tables)
+    return f"{vehicle}: {words}"

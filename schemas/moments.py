@@ -65,8 +65,7 @@ class Joined:
     moment: int = column("0, 1, 2, ... in order of stamp within the vehicle-day", kind="int32")
     log: str = column("file name of the log with this moment")
     drive: int = column(
-        "number of the continuous drive; increments with a new log or a gap of more than 10 s",
-        kind="int32",
+        "number of the continuous drive; increments with a new log or a gap of more than 10 s", kind="int32"
     )
     stamp_ns: int = column(
         "time of the moment: stamp of the reference lidar's sweep; of a radar scan if the day has no sweep"

@@ -51,8 +51,7 @@ class PoseRow(Posed):
     prior_tz_m: float | None = column(_PRIOR, default=None)
     prior_covariance: np.ndarray | None = array("<f8", (6, 6), "prior covariance, same order", default=None)
     unsure_only: bool = column(
-        "held for its sigma alone, which exceeds the limits: the day counts in the state",
-        default=False,
+        "held for its sigma alone, which exceeds the limits: the day counts in the state", default=False
     )
     notes: list[str] = column("remarks", default_factory=list)
     code_version: str = column("boresight version")

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from schemas.columns import Posed, TableSchema, array, column, row
+from schemas.words import STATE_WORDS, listed
 
 __all__ = ["STATES", "StateRow"]
 
@@ -27,10 +28,7 @@ class StateRow(Posed):
     )
     parent_frame: str = column("frame a of T_a_b: name of a sensor, or base; for poses the reference")
     child_frame: str = column("frame b of T_a_b: name of a sensor, or base")
-    status: str = column(
-        "current (days since the last change determine it), prior (no such day: the pose is the prior) or none (not "
-        "even a prior is known)"
-    )
+    status: str = column(listed(STATE_WORDS))
     reason: str = column("reason for `since`, days left out, and directions that are not certified")
     sensor: str | None = column(
         "sensor of a pose row, same as child_frame; null in rows of edges", default=None

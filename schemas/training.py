@@ -157,9 +157,5 @@ class TrainingRow:
 
 
 TRAINING = TableSchema(
-    TrainingRow,
-    "training",
-    5,
-    "One frame per row. Padded rows of arrays are 0.",
-    made_by="prepare",
+    TrainingRow, "training", 5, "One frame per row. Padded rows of arrays are 0.", made_by="prepare"
 )

@@ -1,11 +1,14 @@
-"""A status word for each vehicle-day, shared by summaries, commands, files and pages."""
+"""Every status with its sentence, and every next step: shared by tables, summaries, commands, files and pages."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Final
 
-__all__ = ["AXIS_NAMES", "DAY_WORDS", "axes_in_words", "day_word"]
+__all__ = [
+    "AXIS_NAMES", "DAY_WORDS", "NEXT_STEPS", "RECORD_WORDS", "STATE_WORDS", "VEHICLE_WORDS",
+    "axes_in_words", "day_word", "listed",
+]  # fmt: skip
 
 _BODY = ("roll", "pitch", "yaw", "forward", "left", "up")
 _OPTICAL = ("pitch", "yaw", "roll", "right", "down", "forward")
@@ -20,6 +23,42 @@ DAY_WORDS: Final = {
     "partly": "some pairs accepted",
     "done": "all pairs accepted, use it",
 }
+RECORD_WORDS: Final = {
+    "accepted": "shown to be better than the prior",
+    "held": "not shown to be better than the prior, which stays in use",
+    "refused": "nothing computed",
+}
+STATE_WORDS: Final = {
+    "current": "days since the last change determine it",
+    "prior": "no such day: the pose is the prior",
+    "none": "not even a prior is known",
+}
+VEHICLE_WORDS: Final = {
+    "RED": "a chart is RED: a lasting change above the limit",
+    "YELLOW": "a chart is YELLOW: a change below the limit, or not yet certain",
+    "UNKNOWN": "a rotation of some sensor might not have been detected",
+    "GREEN": "a rotation of any sensor would have been detected",
+}
+_LOAD = (
+    "load the state of tonight, which has only days since the change: `boresight export ros2 {of} --out {out}` "
+    "(`boresight export --help` lists other formats)."
+)
+# By a vehicle's status, after the comma what it lacks. Commands run as printed.
+NEXT_STEPS: Final = {
+    "RED": "inspect the mounting of {what}; after the repair, run {service} (replace {day}, the last audited day, by "
+    f"the day of the repair). Until then {_LOAD}",
+    "YELLOW": f"{_LOAD} If somebody moved {{what}}, run {{service}} (replace {{day}}, the first day with the change, "
+    "by the day of the work); else inspect the mounting at the next service.",
+    "YELLOW, days": "drive, then look again tomorrow: `boresight status {of}`.",
+    "UNKNOWN, days": "drive: {days} required.",
+    "UNKNOWN, many days": "drive other roads: {days} would be required. The pages of its days list what to drive.",
+    "UNKNOWN, tables": "repair the tables: `boresight repair --lake {lake}`.",
+}
+
+
+def listed(words: Mapping[str, str]) -> str:
+    """Statuses with their sentences, as columns describe them."""
+    return ", ".join(f"{word} ({sentence})" for word, sentence in words.items())
 
 
 def day_word(pairs: Iterable[str]) -> str:

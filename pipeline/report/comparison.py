@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from pipeline.report.answers import ANSWERS
 from pipeline.report.page import render
 from pipeline.report.words import dof_title, scaled, unit_of
 from pipeline.rig.differences import PairDifference
@@ -20,11 +21,7 @@ _CLEAR_SIGMAS = 3.0
 _REACH = 6.0  # sigmas to either side that a bar has room for
 _WIDTH, _HEIGHT = 240, 18  # px of a bar
 _MOODS = {"pass": "good", "warn": "partly", "fail": "bad", "inconclusive": "none"}
-_ANSWERS = {
-    "right": ("good", "Yes, within the limits"),
-    "wrong": ("bad", "No"),
-    "inconclusive": ("partly", "Undecided: this log is not sufficient"),
-}
+_MOOD_OF = {"right": "good", "wrong": "bad", "inconclusive": "partly"}
 
 
 def comparison_page(first: str, second: str, pairs: Sequence[PairDifference], notes: Sequence[str]) -> str:
@@ -86,12 +83,11 @@ def in_use_view(
 ) -> dict[str, Any]:
     """The page's first screen, from the answer, the checks and the errors in the JSON of `boresight verify`."""
     rows = [_row(check) for check in checks]
-    mood, headline = _ANSWERS[answer]
     unsure = ", ".join(f"{r['pair']} {r['axis']}" for r in rows if r["status"] == "inconclusive")
-    sentences = [f"Wrong: {e}." for e in errors]
-    sentences += [f"This log does not determine: {unsure}."] if unsure else []
-    explained = " ".join(sentences) or "Every axis that is judged passes."
-    return {"mood": mood, "headline": headline, "explained": explained, "rows": rows}
+    sentences = [ANSWERS["wrong sensor"].format(error=e) for e in errors]
+    sentences += [ANSWERS["open"].format(axes=unsure)] if unsure else []
+    explained = " ".join(sentences) or ANSWERS["passes"]
+    return {"mood": _MOOD_OF[answer], "headline": ANSWERS[answer], "explained": explained, "rows": rows}
 
 
 def _row(check: Mapping[str, Any]) -> dict[str, Any]:

@@ -9,15 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.report.words import LEFT_OUT, dof_title, motion_in_words, scaled, unit_of
+from pipeline.report.answers import ANSWERS
+from pipeline.report.words import LEFT_OUT, dof_title, kind_of_sensor, motion_in_words, scaled, unit_of
 from pipeline.rig.changes import change_between, change_covariance
 from pipeline.store.corrections import correction_steps
 from pipeline.store.current import prior_of, transform_of
 from pipeline.store.partitions import Lake
 from schemas.calibrations import DOF_NAMES, CalibrationRecord
-from schemas.drift import DriftFinding, kind_of_sensor, next_step, status_of
+from schemas.drift import DriftFinding, next_step, status_of
 from schemas.faults import in_words
 from schemas.poses import PoseRow
+from schemas.words import RECORD_WORDS
 
 __all__ = [
     "Answered",
@@ -30,11 +32,6 @@ __all__ = [
 ]
 
 _SAID_BY_THE_AXES = "not determined by the day"  # the page lists those axes by name
-_ADVICE = {
-    "accepted": "shown to be better than the prior",
-    "held": "not shown to be better than the prior",
-    "refused": "nothing computed",
-}
 
 
 def sigmas_of(record: CalibrationRecord) -> tuple[np.ndarray | None, np.ndarray | None]:
@@ -65,7 +62,7 @@ def pair_view(record: CalibrationRecord) -> dict[str, Any]:
         "title": "-".join(ends),
         "sensors": ends,
         "status": record.status,
-        "advice": _ADVICE[record.status],
+        "advice": RECORD_WORDS[record.status],
         "reason": "; ".join(reasons),
         "faults": in_words(record.faults or ()),
         "known_to": _known_to(sigma, observable),
@@ -164,10 +161,7 @@ def answered(edges: Sequence[Answered], poses: Sequence[PoseRow]) -> Sequence[An
 
 
 def answer_for(
-    views: Sequence[Answered],
-    day: str,
-    findings: Sequence[DriftFinding],
-    loaded: Sequence[Answered] = (),
+    views: Sequence[Answered], day: str, findings: Sequence[DriftFinding], loaded: Sequence[Answered] = ()
 ) -> tuple[str, str]:
     """The headline of the page: (good, partly or bad; a sentence) on whether these numbers may be used on the car.
 
@@ -181,25 +175,23 @@ def answer_for(
     stored = status_of(findings)
     sensor = stored.sensor if stored.status == "RED" else None
     touched = [v.title for v in views if sensor in v.sensors]
+    about = {"sensor": sensor, "since": stored.since}
     if (stored.since or "") > day and set(touched) & set(accepted):
-        left = [t for t in accepted if t not in touched]
-        still = f" Only {', '.join(left)} still holds." if left else ""
-        return "bad", f"Not any more. The {sensor} moved on {stored.since}, after this day.{still}"
+        left = ", ".join(t for t in accepted if t not in touched)
+        still = ANSWERS["moved since, others"].format(titles=left) if left else ""
+        return "bad", ANSWERS["moved since"].format(**about) + still
     if loaded:
         return _of_state(loaded)
-    unsafe = [t for t in other if t in touched]
-    if unsafe:
-        first = f"Only {', '.join(accepted)} may be used." if accepted else "No."
-        why = f"The {sensor} moved on {stored.since}, and this day was not accepted"
-        return "bad", f"{first} {why}: the car has no valid calibration of {', '.join(unsafe)}."
+    titles = ", ".join(accepted)
+    if unsafe := ", ".join(t for t in other if t in touched):
+        first = ANSWERS["moved, accepted"].format(titles=titles) if accepted else "No."
+        return "bad", ANSWERS["moved"].format(first=first, titles=unsafe, **about)
     if not accepted:
-        return "bad", "No. Nothing was accepted: keep the transforms that the car has."
+        return "bad", ANSWERS["nothing"]
     if not other:
         what = "pairs" if any(len(v.sensors) > 1 for v in views) else "sensors"
-        sentence = f"Yes. All {what} are accepted: they may go on the car, with the sigmas below."
-        return "good", sentence + _one_direction(views)
-    sentence = f"Partly. Accepted: {', '.join(accepted)}. Keep what the car has for {', '.join(other)}."
-    return "partly", sentence + _one_direction(views)
+        return "good", ANSWERS["all"].format(what=what) + _one_direction(views)
+    return "partly", ANSWERS["partly"].format(titles=titles, others=", ".join(other)) + _one_direction(views)
 
 
 def _of_state(loaded: Sequence[Answered]) -> tuple[str, str]:
@@ -208,15 +200,13 @@ def _of_state(loaded: Sequence[Answered]) -> tuple[str, str]:
     used = [s.title for s in loaded if s.status == "current" and not s.certified]
     at_prior = [s.title for s in loaded if s.status != "current"]
     if not certified:
-        return "bad", "No. Nothing in tonight's state is certified: keep what the car has."
-    of, in_one = ", ".join(s.title for s in certified), _one_direction(certified)
-    least = ", in azimuth or elevation at least" if in_one else ""
-    sentence = f"Yes. Load tonight's state: all sensors are certified{least}."
-    if used or at_prior:
-        sentence = f"Partly. Load tonight's state. Certified: {of}."
-    sentence += f" Used, but not certified: {', '.join(used)}." if used else ""
-    sentence += f" At the prior: {', '.join(at_prior)}." if at_prior else ""
-    return "partly" if used or at_prior else "good", sentence + in_one
+        return "bad", ANSWERS["state, nothing"]
+    in_one = _one_direction(certified)
+    if not used and not at_prior:
+        return "good", ANSWERS["state, all in one" if in_one else "state, all"] + in_one
+    of = {"state, partly": [s.title for s in certified], "used": used, "at prior": at_prior}
+    words = [ANSWERS[key].format(titles=", ".join(titles)) for key, titles in of.items() if titles]
+    return "partly", "".join([*words, in_one])
 
 
 def _one_direction(views: Sequence[Answered]) -> str:
@@ -225,7 +215,7 @@ def _one_direction(views: Sequence[Answered]) -> str:
     words = ""
     for one, other in (("azimuth", "elevation"), ("elevation", "azimuth")):
         of = ", ".join(v.title for v in used if one in v.certified and other not in v.certified)
-        words += f" Certified in {one} only: {of}." if of else ""
+        words += ANSWERS["in one"].format(one=one, titles=of) if of else ""
     return words
 
 

@@ -11,14 +11,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
+from pipeline.report.answers import ANSWERS
 from pipeline.report.day import clearest_alarm, status_sentence
 from pipeline.report.page import page_stem
 from pipeline.report.verdicts import FleetVerdicts
 from pipeline.report.window import FleetWindow
-from pipeline.report.words import motion_in_words, with_sigma
+from pipeline.report.words import kind_of_sensor, motion_in_words, with_sigma
 from pipeline.store.partitions import Lake
 from schemas.calibrations import STATUSES
-from schemas.drift import DRIFT_STATUSES, DriftFinding, kind_of_sensor, status_of
+from schemas.drift import DRIFT_STATUSES, DriftFinding, status_of
 from schemas.words import DAY_WORDS, day_word
 
 __all__ = [
@@ -136,20 +137,16 @@ def headline_for(verdicts: FleetVerdicts, views: Sequence[FindingView]) -> tuple
     statuses = [status_of(own).status for own in verdicts.findings.values()]
     vehicles = f"{len(statuses)} vehicle{'s' * (len(statuses) != 1)}"
     if not statuses:
-        return "UNKNOWN", "No audit yet: run `boresight audit`."
+        return "UNKNOWN", ANSWERS["no audit"]
     worst = min(statuses, key=DRIFT_STATUSES.index)
-    if worst == "GREEN":
-        return worst, f"No sensor moved on {vehicles}."
-    if worst == "UNKNOWN":
-        where = f"on {statuses.count(worst)} of {vehicles}"
-        return worst, f"No change found, but {where} more days are required to exclude one above the limit."
+    if worst != "GREEN":
+        vehicles = f"{statuses.count(worst)} of {vehicles}"
     of_these = [v for v in views if v.status == worst]
-    named = [f"{v.vehicle}: {v.sensor} since {v.since}" for v in of_these[:3]]
-    more = "" if len(of_these) <= 3 else f" and {len(of_these) - 3} more"
-    verb = "A sensor moved" if worst == "RED" else "A sensor may have moved"
-    said = f"{verb} on {statuses.count(worst)} of {vehicles}: {'; '.join(named)}{more}."
+    named = "; ".join(f"{v.vehicle}: {v.sensor} since {v.since}" for v in of_these[:3])
+    named += "" if len(of_these) <= 3 else f" and {len(of_these) - 3} more"
+    said = ANSWERS[worst].format(vehicles=vehicles, named=named)
     if worst == "RED" and "YELLOW" in statuses:
-        said += f" A sensor may have moved on {statuses.count('YELLOW')} more."
+        said += ANSWERS["YELLOW too"].format(more=statuses.count("YELLOW"))
     return worst, said
 
 

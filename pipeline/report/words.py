@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from pipeline.rig.se3 import to_quaternion
 from schemas.calibrations import DOF_NAMES, FRAMES_OF_PAIR
+from schemas.drift import DriftFinding
 from schemas.words import AXIS_NAMES
 
 __all__ = [
     "LEFT_OUT",
     "PAIR_TITLES",
     "dof_title",
+    "kind_of_sensor",
     "motion_in_words",
     "pose_text",
     "scaled",
@@ -81,3 +83,13 @@ def sigma_text(row: Mapping[str, Any]) -> str:
         return ""
     azimuth, elevation = np.degrees([row["azimuth_sigma_rad"], row["elevation_sigma_rad"]])
     return f"{azimuth:.3f} / {elevation:.3f}"
+
+
+def kind_of_sensor(name: str, findings: Sequence[DriftFinding]) -> str:
+    """Kind of a sensor (camera, lidar, radar or base), from the edges in its vehicle's findings."""
+    known = {
+        frame: kind
+        for f in findings
+        for frame, kind in zip((f.parent_frame, f.child_frame), f.pair.split("_"), strict=True)
+    }
+    return known.get(name, name)

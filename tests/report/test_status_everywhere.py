@@ -99,7 +99,7 @@ def test_a_red_vehicle_says_what_to_do_with_the_commands(lake, tmp_path, capsys)
     assert status_of(stored(own)["red"]).status == "RED"
     audit_fleet(own, _config())
     assert status_of(stored(own)["red"]).status == "UNKNOWN"  # its charts begin anew
-    assert next_step(stored(own)["red"], "L") == "red: drive; 3 more accepted days are required."
+    assert next_step(stored(own)["red"], "L") == "red: drive: 3 more accepted days required."
     page = write_fleet_page(own, _config(), tmp_path / "after.html")
     assert '<td>red</td><td class="w">2026-03-06</td><td>radar</td><td>repair</td>' in page  # the list
     assert '"repair of the radar on 2026-03-06"' in page  # the charts

@@ -4,12 +4,13 @@ import re
 from itertools import permutations
 
 from jobs.cli import COMMANDS
-from pipeline.report.day import _ADVICE
+from pipeline.report.answers import ANSWERS
 from pipeline.report.words import LEFT_OUT
 from schemas.calibrations import STATUSES
+from schemas.drift import DRIFT_STATUSES
 from schemas.faults import FAULTS, in_words
 from schemas.outcomes import OUTCOME_STATUSES
-from schemas.words import DAY_WORDS, day_word
+from schemas.words import DAY_WORDS, NEXT_STEPS, RECORD_WORDS, STATE_WORDS, VEHICLE_WORDS, day_word
 
 
 def test_each_code_has_a_sentence_that_begins_no_other():
@@ -29,8 +30,21 @@ RETIRED = re.compile(r"\b(witness\w*|told|tells?|says?|said|knows?|opinions?|vou
 def test_every_status_and_command_has_a_sentence_that_passes_at_first_reading():
     of_days = {day_word(pairs) for pairs in ([], *([status] for status in STATUSES))}
     assert {*of_days, *OUTCOME_STATUSES} <= set(DAY_WORDS)
-    assert set(_ADVICE) == set(STATUSES)
+    assert set(RECORD_WORDS) == set(STATUSES)
+    assert {step.partition(",")[0] for step in NEXT_STEPS} == {*DRIFT_STATUSES} - {"GREEN"}
+    assert {*DRIFT_STATUSES, "right", "wrong", "inconclusive"} <= set(ANSWERS)
     helped = {name: text for name, (_, text) in COMMANDS.items()}
-    for sentence in [s for of in (FAULTS, DAY_WORDS, _ADVICE, LEFT_OUT, helped) for s in of.values()]:
+    tables = (
+        FAULTS,
+        DAY_WORDS,
+        RECORD_WORDS,
+        STATE_WORDS,
+        VEHICLE_WORDS,
+        NEXT_STEPS,
+        ANSWERS,
+        LEFT_OUT,
+        helped,
+    )
+    for sentence in [s for of in tables for text in of.values() for s in re.split(r"[.:;] ", text)]:
         assert not RETIRED.search(sentence), sentence
         assert len(sentence.split()) <= 25, sentence
