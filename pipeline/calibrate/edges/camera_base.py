@@ -2,7 +2,8 @@
 
 In straight driving the camera's translation is the base's x axis: yaw and pitch. In turns the camera also moves by
 the turn times its lever arm, as a radar does (`radar_base`). The axis about which the camera turns is the base's z
-axis: roll and pitch, over turns. The body's own pitch and roll are means over scenes. The amount of turn is
+axis: roll and pitch, over turns, in which a body leans by so much a g of lateral acceleration. The body's own pitch and
+roll are means over scenes. The amount of turn is
 compared with the car's yaw rate: over changes of the yaw rate it determines the clock, over turns a scale, which
 is that of the focal length. Position has no information. Labels, depths and other sensors' poses take no part, so the
 errors are this edge's own; an error of the intrinsics turns what any edge of the camera shows.
@@ -52,6 +53,9 @@ _WAY_M = 3.0  # between two images of a car of which nothing shows it: what inge
 _BEND_M = 50.0
 _FLOOR_RAD = np.radians(0.02)  # of yaw and pitch by matching, as of radars
 _ROLL_FLOOR_RAD = np.radians(0.05)  # roads that lean to one side in bends
+# By which a body leans outward for each g: cars by 3 to 7 deg (Gillespie 1992), less where a road leans inward. The
+# real car leans by 7 to 8 in a bend of .36 g.
+_LEAN_RAD, _LEAN_SIGMA_RAD, _G_MPS2 = np.radians(5.0), np.radians(3.0), 9.81
 _CENTRE_RAD = np.radians(0.03)  # by principal point and focal length
 # Noise of tracks draws the direction of travel towards or from the middle of the view: .25 and .40 deg outward in yaw
 # of the two side cameras of a tuning day (seed 6701), .10 and less of the front one.
@@ -159,7 +163,7 @@ def _rows(travel: CameraTravel, T: np.ndarray) -> dict[str, Rows]:
     of_turn = R @ travel.covariance[:, :3, :3] @ R.T
     bend, straight = _bends(travel), _is_straight(travel, T)
     by_way = turn / np.nan_to_num(travel.driven_m, nan=_WAY_M)[:, None]
-    one, free = np.ones(len(turn)), np.array([np.inf])
+    one, free, leaning = np.ones(len(turn)), np.array([np.inf]), np.array([np.inf, _LEAN_SIGMA_RAD])
     apart = _apart(travel, T)
     slope = apart.covariance / apart.variances[1]
     design = np.column_stack([one, by_way[:, 2], by_way[:, 0], slope[:, None] * apart.by_base])
@@ -171,8 +175,10 @@ def _rows(travel: CameraTravel, T: np.ndarray) -> dict[str, Rows]:
     pitch = Rows(one[:, None], elevation, _sigma(of_direction, 2), bend, free, one)
     # Errors of a camera's turns about two axes go together: the base's turn has neither.
     yawed = np.where(_knows_yaw(travel), np.nan_to_num(travel.turned_rad), turn[:, 2])
-    turning = np.abs(yawed) > _TURNING_RAD
-    roll = Rows(yawed[:, None], turn[:, 1], _sigma(of_turn, 1), bend, free, one)
+    turning = (np.abs(yawed) > _TURNING_RAD) & np.isfinite(travel.driven_m)
+    aside_g = np.nan_to_num(travel.driven_m) * yawed / (travel.span_s**2 * _G_MPS2)
+    bent = np.column_stack([yawed, yawed * aside_g])
+    roll = Rows(bent, turn[:, 1] - _LEAN_RAD * bent[:, 1], _sigma(of_turn, 1), bend, leaning, one)
     by_axis = Rows(-yawed[:, None], turn[:, 0], _sigma(of_turn, 0), bend, free, one)
     ways = {"yaw": yaw.some(straight), "pitch": pitch.some(straight)}
     return ways | {"roll": roll.some(turning), "pitch_by_axis": by_axis.some(turning)}
@@ -195,7 +201,9 @@ def _expected(travel: CameraTravel, T: np.ndarray, turn: np.ndarray) -> Float[np
     chord = way * np.sinc(turn[:, 2] / (2 * np.pi))
     across = 2 * np.sin(turn[:, 2] / 2)
     rolled = turn[:, 0] * (T[2, 3] - _ROLL_AXIS_M)
-    return np.stack([chord - across * T[1, 3], across * T[0, 3] - rolled], 1)
+    # Of a yaw rate that changes evenly, the mean heading less the one midway between both images.
+    begun = chord * travel.span_s * np.nan_to_num(travel.turned_by_clock_radps) / 12
+    return np.stack([chord - across * T[1, 3], across * T[0, 3] - rolled - begun], 1)
 
 
 def _is_straight(travel: CameraTravel, T: np.ndarray) -> Bool[np.ndarray, " N"]:
@@ -281,7 +289,7 @@ def _numbers(
 def _notes(fits: dict[str, Regression | None], clock: Regression | None) -> tuple[str, ...]:
     shown = {
         "yaw and pitch to the base: too few images show the direction of travel": fits["yaw"] is not None,
-        "roll to the base: the car hardly turns": fits["roll"] is not None,
+        "roll to the base: the car hardly turns, or nothing shows its speed": fits["roll"] is not None,
         "clock against the base: the car hardly begins or ends a turn": clock is not None,
     }
     return (

@@ -50,15 +50,8 @@ def camera_travel(rows: Sequence[Observation], ego: EgoMotion, scenes: Scenes) -
     span_s = np.array([o.motion_span_s for o in seen], np.float64)
     stamp_ns = np.array([o.camera_stamp_ns for o in seen], np.int64)
     drive = np.array([o.drive for o in seen], np.int64)
-    logged = np.array(
-        [
-            [
-                np.nan if v is None else v
-                for v in (o.ego_driven_m, o.ego_turned_rad, o.ego_turned_by_clock_radps)
-            ]
-            for o in seen
-        ],
-        np.float64,
+    logged = np.array(  # NaN where not logged
+        [(o.ego_driven_m, o.ego_turned_rad, o.ego_turned_by_clock_radps) for o in seen], np.float64
     ).reshape(-1, 3)
     by_ego = _by_ego(rows, ego, stamp_ns, span_s, drive)
     driven_m, turned, by_clock = np.where(np.isfinite(logged).all(axis=1, keepdims=True), logged, by_ego).T

@@ -67,6 +67,11 @@ class DaySources:
             odometry = Odometry(odometry.speed_mps * np.nan, odometry.yaw_rate_radps * np.nan)
         return ego_motion(measured, odometry, heading=(0.0, 0.0))
 
+    def odometry_mps(self, rows: Sequence[Observation]) -> Float[np.ndarray, " F"] | None:
+        """Speed of the base at the rows' moments by odometry alone; None where none is logged, or it is backwards."""
+        speed_mps = _odometry(rows).speed_mps
+        return speed_mps if np.isfinite(speed_mps).any() and _ODOMETRY not in self.backwards else None
+
     def ego_by_cameras(self, radar: DopplerMotion, rows: Sequence[Observation]) -> EgoMotion:
         """Motion of the base at the rows' moments: turns by cameras, the radar's own speed, which shows no clock."""
         turns: dict[int, list[float]] = {}
@@ -94,22 +99,14 @@ class DaySources:
         T_base_radar = self.prior.between(BASE.name, name)
         if T_base_radar is None:
             return None
-        scans = self.dopplers[name]
-        nothing = np.full(3, np.nan)
-        velocity, covariance = [], []
-        for row in rows:
-            scan = scans.get(row.frame_index)
-            known = scan is not None and scan.radar_velocity_mps is not None
-            velocity.append(scan.radar_velocity_mps if scan is not None and known else nothing)
-            covariance.append(scan.radar_velocity_cov if scan is not None and known else np.eye(3))
-        sigma_rad = self.prior.sigmas_between(BASE.name, name)[0]
+        scans = (self.dopplers[name].get(row.frame_index) for row in rows)
+        known = [scan if scan is not None and scan.radar_velocity_mps is not None else None for scan in scans]
+        velocity = [np.full(3, np.nan) if scan is None else scan.radar_velocity_mps for scan in known]
+        covariance = [np.eye(3) if scan is None else scan.radar_velocity_cov for scan in known]
         return DopplerMotion(
-            name,
-            np.array(velocity, np.float64).reshape(-1, 3),
-            np.array(covariance, np.float64).reshape(-1, 3, 3),
-            T_base_radar,
-            sigma_rad,
-        )
+            name, np.array(velocity, np.float64).reshape(-1, 3), np.array(covariance, np.float64).reshape(-1, 3, 3),
+            T_base_radar, self.prior.sigmas_between(BASE.name, name)[0],
+        )  # fmt: skip
 
 
 def _odometry(rows: Sequence[Observation]) -> Odometry:

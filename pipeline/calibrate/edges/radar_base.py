@@ -53,7 +53,8 @@ _LEAST_SPEED_SIGMA_MPS = 0.05
 _BEND_M = 50.0  # in one bend a car slips the same way
 _LONGEST_S = 2.0  # between moments from which accelerations are computed
 _YAW_FLOOR_RAD = np.radians(0.02)  # errors of 8 tuning days were 0.018 deg RMS
-_CLOCK_FLOOR_S = 0.004  # 12 ms RMS, as scenes scatter; of no clock less is promised
+_CLOCK_FLOOR_S = 0.004  # as scenes scatter; of no clock less is promised
+_RADARS_CLOCK_S = 0.02  # of a base whose speed other radars show: each has a clock of its own
 _NO_CLOCK_S = 1.0  # a clock that is not known to half of this is not known
 _PASSES = 3
 _FEWEST_DIRECTIONS = 8  # scans whose elevations a lidar mends: fewer show no pitch
@@ -90,7 +91,8 @@ def solve(edge: Edge, sources: DaySources) -> tuple[EdgeEvidence, int]:
         raise SolveError(f"no source except {name} measures the car's motion{said}")
     # The pair lidar-radar has these elevations already; a frame by travel adds nothing to them.
     directions = None if sources.prior.is_base_loose else _directions(name, rows, sources)
-    found = estimate_radar_base(edge, radar, ego, stamps, Scenes.of(rows), directions)
+    timed = sources.odometry_mps(rows)
+    found = estimate_radar_base(edge, radar, ego, stamps, Scenes.of(rows), directions, timed)
     compared = compared_sources(rows, radar.T_base_radar)
     return replace(found, checks=(*found.checks, *compared.wrong)), len(rows)
 
@@ -102,6 +104,7 @@ def estimate_radar_base(
     stamps: Stamps,
     scenes: Scenes,
     directions: TravelDirections | None = None,
+    timed_mps: Float[np.ndarray, " F"] | None = None,
 ) -> EdgeEvidence:
     """Evidence of a day on T_radar_base and on the base's clock.
 
@@ -110,15 +113,16 @@ def estimate_radar_base(
         ego: motion of the base at the same moments, from other sources.
         directions: velocities corrected by a lidar's elevations; None for a radar without a view in common
             with a lidar.
+        timed_mps: speed by odometry, whose clock is the base's; None without: that of `ego` mixes clocks of radars.
     """
-    T = radar.T_base_radar
+    T, speed_mps = radar.T_base_radar, ego.velocity_mps[:, 0] if timed_mps is None else timed_mps
     for _ in range(_PASSES):
-        turns, clock = _by_doppler(radar, T, ego, stamps)
+        turns, clock = _by_doppler(radar, T, ego, stamps, speed_mps)
         yaw, pitch = regress(turns), None if directions is None else _pitch(directions, T, scenes)
         turn = np.array([0.0, 0.0 if pitch is None else pitch.value[0], 0.0 if yaw is None else yaw.value[0]])
         T = from_rotation_translation(exp_so3(turn) @ T[:3, :3], T[:3, 3])
     variance = np.array([np.inf if fit is None else fit.covariance[0, 0] for fit in (pitch, yaw, clock)])
-    variance += np.array([0.0, 0.0, _CLOCK_FLOOR_S]) ** 2
+    variance[2] += (_RADARS_CLOCK_S if timed_mps is None else _CLOCK_FLOOR_S) ** 2
     J = np.zeros((3, 7))
     J[:2, :6] = changes_by_left(T)[[1, 2]]
     J[2, 6] = 1.0
@@ -139,28 +143,28 @@ def _moving(radar: DopplerMotion, ego: EgoMotion) -> np.ndarray:
 
 
 def _by_doppler(
-    radar: DopplerMotion, T: np.ndarray, ego: EgoMotion, stamps: Stamps
+    radar: DopplerMotion, T: np.ndarray, ego: EgoMotion, stamps: Stamps, speed_mps: np.ndarray
 ) -> tuple[Rows, Regression | None]:
-    """Rows of the change of yaw, and the clock: stamp of the radar minus that of the base."""
+    """Rows of the change of yaw, and the clock: stamp of the radar minus that of the base, whose speed is given."""
     use = _moving(radar, ego)
     R, ways = T[:2, :3], np.copysign(1.0, ego.velocity_mps[use, :1])
     seen = radar.velocity_mps[use] @ R.T
     (vx, vy), turn = ego.velocity_mps[use].T, ego.yaw_rate_radps[use]
     expected = np.stack([vx - turn * T[1, 3], vy + turn * T[0, 3]], 1)
-    speed = np.hypot(*expected.T)
+    speed = np.hypot(speed_mps[use] - turn * T[1, 3], expected[:, 1])
     off = np.arctan2(*(seen * ways).T[::-1]) - np.arctan2(*(expected * ways).T[::-1])
     covariance = R @ radar.covariance[use] @ R.T
-    aside = np.sqrt(covariance[:, 1, 1] + ego.covariance[use, 1, 1]) / speed
+    aside = np.sqrt(covariance[:, 1, 1] + ego.covariance[use, 1, 1]) / np.hypot(*expected.T)
     sigma = np.hypot(aside, _LEAST_AZIMUTH_RAD)
     bend = _bends(ego, stamps)[use]
     turning = np.stack([np.ones(len(off)), turn / vx], 1)
     lever = np.array([np.inf, _LEVER_SIGMA_M])
     yaw = Rows(turning, -np.arctan2(np.sin(off), np.cos(off)), sigma, bend, lever, turning[:, 0])
-    faster, late_s = _accelerations(ego, stamps)[use], (stamps.scan_ns - stamps.moment_ns)[use] * 1e-9
+    faster, late_s = _accelerations(speed_mps, stamps)[use], (stamps.scan_ns - stamps.moment_ns)[use] * 1e-9
     apart = np.hypot(*seen.T) - speed - faster * ways[:, 0] * late_s
     sigma = np.sqrt(covariance[:, 0, 0] + _LEAST_SPEED_SIGMA_MPS**2)
     design = np.stack([-faster * ways[:, 0], speed], 1)
-    told = np.isfinite(faster)
+    told = np.isfinite(faster) & np.isfinite(speed)
     prior = np.array([_NO_CLOCK_S, _SCALE_SIGMA])
     clock = regress(Rows(design, apart, sigma, bend, prior, turning[:, 0]).some(told))
     return yaw, None if clock is None or clock.covariance[0, 0] > (_NO_CLOCK_S / 2) ** 2 else clock
@@ -182,12 +186,12 @@ def _bends(ego: EgoMotion, stamps: Stamps) -> Int64[np.ndarray, " F"]:
     return np.asarray(np.cumsum(way_m) // _BEND_M, np.int64)
 
 
-def _accelerations(ego: EgoMotion, stamps: Stamps) -> Float[np.ndarray, " F"]:
+def _accelerations(speed_mps: Float[np.ndarray, " F"], stamps: Stamps) -> Float[np.ndarray, " F"]:
     """Forward acceleration of each moment from its neighbours; NaN at ends of drives and across gaps."""
     found = np.full(len(stamps.drive), np.nan)
     span_s = (stamps.moment_ns[2:] - stamps.moment_ns[:-2]) * 1e-9
     near = (stamps.drive[2:] == stamps.drive[:-2]) & (span_s > 0) & (span_s < _LONGEST_S)
-    change = ego.velocity_mps[2:, 0] - ego.velocity_mps[:-2, 0]
+    change = speed_mps[2:] - speed_mps[:-2]
     found[1:-1] = np.where(near, change / np.where(near, span_s, 1.0), np.nan)
     return found
 

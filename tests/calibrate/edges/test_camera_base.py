@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.calibrate.edges.camera_base import estimate_camera_base
+from pipeline.calibrate.edges.camera_base import _expected, estimate_camera_base
 from pipeline.calibrate.edges.camera_travel import CameraTravel, camera_travel
 from pipeline.calibrate.edges.on_base import changes_by_left
 from pipeline.calibrate.numerics.frame_blocks import Scenes
@@ -29,8 +29,8 @@ def mounted(yaw_deg=0.0, pitch_deg=3.0, roll_deg=-1.0):
     )
 
 
-def day(T, seed=1, *, turning=0.25, late_s=LATE_S, body_deg=0.1, scale=1.0, noise=NOISE):
-    """A drive along bends of a camera at T = T_base_camera, whose base pitches and leans from pair to pair."""
+def day(T, seed=1, *, turning=0.25, late_s=LATE_S, body_deg=0.1, scale=1.0, noise=NOISE, lean_deg=7.0):
+    """A drive along bends of a camera at T = T_base_camera, whose base sways, and leans outward by so much a g."""
     rng = np.random.default_rng(seed)
     t = np.arange(N) * STEP_S
     speed = 10 + 3 * np.sin(t / 7)
@@ -43,7 +43,8 @@ def day(T, seed=1, *, turning=0.25, late_s=LATE_S, body_deg=0.1, scale=1.0, nois
 
     a = turned(t - late_s)
     body = rng.normal(0, np.radians(body_deg), (N, 2))
-    turn = np.stack([body[:, 0], body[:, 1], a], 1)
+    leaning = a * np.radians(lean_deg) * speed * rate(t - late_s - SPAN_S / 2) / 9.81
+    turn = np.stack([body[:, 0], body[:, 1] + leaning, a], 1)
     way = speed * SPAN_S
     translation = np.stack([way, 0 * way, 0 * way], 1) + np.cross(turn, T[:3, 3]) * [1, 1, 0]
     translation[:, 2] += rng.normal(0, np.radians(body_deg), N) * way
@@ -83,6 +84,31 @@ def test_pose_and_clock_come_out_within_sigma_wherever_the_camera_looks(yaw_deg)
         assert evidence.information[6, 6] ** -0.5 < 0.01
     assert 0.3 < np.sqrt(np.mean(np.square(z))) < 1.6
     assert np.sqrt(np.mean(np.square(late))) < 1.6
+
+
+def test_bends_to_one_side_leave_roll_as_unsure_as_the_lean_of_bodies():
+    T, z = mounted(), []
+    for seed, lean_deg in enumerate(np.random.default_rng(3).normal(5.0, 3.0, 12)):
+        travel = day(T, seed, lean_deg=float(lean_deg))
+        left = CameraTravel(**{n: values[travel.turned_rad > 0] for n, values in vars(travel).items()})
+        error, sigma = error_and_sigma(estimate_camera_base(EDGE, left, start(T)), T)
+        assert 0.1 < np.degrees(sigma[0]) < 0.8
+        z.append(error[0] / sigma[0])
+    assert 0.5 < np.sqrt(np.mean(np.square(z))) < 1.6
+
+
+def test_the_way_between_two_images_is_that_of_a_path_that_begins_to_bend():
+    T, span_s, speed, bends = mounted(), 0.5, 12.0, np.array([0.6, -0.4])  # rad/s^2
+    s = np.linspace(-span_s / 2, span_s / 2, 4001)
+    heading = 0.1 * s + bends[:, None] * s**2 / 2
+    turned, midway = heading[:, -1] - heading[:, 0], (heading[:, -1] + heading[:, 0]) / 2
+    path = speed * np.trapezoid(np.exp(1j * (heading - midway[:, None])), s, axis=1)
+    path += complex(*T[:2, 3]) * 2j * np.sin(turned / 2)
+    nothing = [np.zeros((2, k)) for k in (3, 3, 0)]
+    ego = np.full(2, speed * span_s), turned, bends * span_s, np.full(2, span_s)
+    travel = CameraTravel(*nothing, *ego, *[np.arange(2)] * 3)
+    found = _expected(travel, T, turned[:, None] * [0.0, 0.0, 1.0])
+    assert np.arctan2(*found.T[::-1]) == pytest.approx(np.angle(path), abs=1e-4)
 
 
 def test_a_wrong_lever_arm_is_no_yaw():
