@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.audit.estimates import Estimates, day_name
+from pipeline.audit.reasons import REASONS, because
 from pipeline.audit.status import decide_status
 from pipeline.audit.vehicle import VehicleVerdict, limit_of
 from pipeline.audit.verdicts import ChartVerdict
@@ -47,7 +48,7 @@ def vehicle_findings(
         for dof in DOF_NAMES:
             chart = verdict.charts.get((edge, dof)) or without_data
             if last_estimate:
-                chart = replace(chart, reason=f"{chart.reason}; no estimate after {last_estimate}")
+                chart = replace(chart, reason=because("ended", reason=chart.reason, day=last_estimate))
             if (edge, dof) in remarks:
                 chart = replace(chart, reason=f"{chart.reason}; {remarks[edge, dof]}")
             chart = _begun_before(chart, before.get((edge, dof)))
@@ -125,5 +126,5 @@ def _without_data(records: Estimates, edge: Edge, needed: int) -> ChartVerdict:
     found = records.status[records.is_of(edge)].tolist()
     kinds = [(name, found.count(STATUSES.index(name))) for name in ("held", "refused")]
     counts = ", ".join(f"{count} {name}" for name, count in kinds if count)
-    reason = f"no estimate in the window ({counts})" if counts else "no record in the window"
-    return ChartVerdict("UNKNOWN", f"{reason}, {needed} days required", 0, None, None, None, needed)
+    reason = because("no estimate", counts=counts) if counts else REASONS["no record"]
+    return ChartVerdict("UNKNOWN", because("then", reason=reason, needed=needed), 0, None, None, None, needed)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.audit.reasons import REASONS, because
 from pipeline.rig.graph import Edge, Sensor
 from pipeline.store.current import current_events
 from pipeline.store.partitions import Lake, days_after
@@ -34,15 +35,17 @@ def last_restart(
     """
     ends = {sensor.name, reference.name}
     event = _last_touching(events, ends, last_day)
-    first, why = ("", "") if event is None else (days_after(event.day, 1), f"after the {event.in_words}")
+    first, why = "", ""
+    if event is not None:
+        first, why = days_after(event.day, 1), because("after work", event=event.in_words)
     for finding in findings:
         begin = finding.start_day_latest or ""
         if finding.status not in _ALARMS or begin <= first or not ends & _moved_by(finding):
             continue
         named = finding.moved_sensor
         edge = f"{finding.parent_frame} or {finding.child_frame}"
-        who = f"{named} moved" if named else f"{edge} moved, undecided which"
-        first, why = begin, f"since {begin}: {who}"
+        who = REASONS["since" if named else "since, unnamed"]
+        first, why = begin, who.format(day=begin, sensor=named or edge)
     return first, why
 
 

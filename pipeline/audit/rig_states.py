@@ -18,6 +18,7 @@ from scipy.special import ndtri
 from pipeline.audit.estimates import day_name
 from pipeline.audit.fusion import Mount, after_a_move, fuse, with_held_day
 from pipeline.audit.pose_days import SensorDays, VehiclePoses
+from pipeline.audit.reasons import REASONS, because
 from pipeline.audit.restarts import drift_per_day, last_restart
 from pipeline.core.config import VerifyConfig
 from pipeline.rig.changes import change_covariance
@@ -101,7 +102,7 @@ def rig_states(
     every_day = sorted({day for row in rows.values() for day in row.days})
     first = replace(
         empty, **_columns(identity), child_frame=reference.name, sensor=reference.name, kind=reference.kind,
-        status="current", reason="it is the reference of all poses", days=every_day,
+        status="current", reason=REASONS["reference"], days=every_day,
     )  # fmt: skip
     rows[reference.name] = first
     of_edges = [_edge_row(empty, edge, seen[edge], rows, poses, verify) for edge in edges]
@@ -126,12 +127,12 @@ def _sensor_row(
     moved = int(days.moved_within.max(initial=0))
     counted, first, why = _counted(days, first, why, moved, reference)
     base = replace(empty, child_frame=sensor.name, sensor=sensor.name, kind=sensor.kind, since=first or None)
-    apart = f"not counted, because their poses refer to another sensor: {', '.join(own.other_days)}"
+    apart = because("other reference", days=", ".join(own.other_days))
     remarks = [apart] if own.other_days else []
     if mount is None or not len(counted.poses.day):
         day, status, reason = days.last
         last = f"{day} {status}: {reason}" if status != "accepted" else ""
-        row = replace(base, reason=_sentences([f"no usable day {why}".rstrip(), *remarks, last]))
+        row = replace(base, reason=_sentences([because("no usable day", why=why).rstrip(), *remarks, last]))
         if days.prior is None:
             return row, None
         T, covariance = days.prior
@@ -145,22 +146,20 @@ def _sensor_row(
     names = [day_name(int(day)) for day in counted.poses.day]
     if found.moved_on is not None:
         base = replace(base, since=day_name(found.moved_on))
-        why = f"its pose changed on {base.since}"
+        why = because("changed", day=base.since)
     later = np.flatnonzero(days.held.day > counted.poses.day[-1])[-1:]
     doubted = with_held_day(found, days.held.at(later), mount) if len(later) else None
     if doubted is not None:
         found = doubted
         held = day_name(int(days.held.day[later[0]]))
-        remarks.append(f"{held} was held and differs from the days before: the sensor may have moved")
+        remarks.append(because("held differs", day=held))
     if moved > counted.poses.day[-1]:
         found = after_a_move(found)
-        remarks.append(
-            f"it or {reference.name} moved during {day_name(moved)}, and no later day is usable yet: drive"
-        )
+        remarks.append(because("moved in day, drive", other=reference.name, day=day_name(moved)))
     before = counted.poses.T_prior[-1], counted.poses.prior_covariance[-1]
     pose = _Pose(found.T, found.covariance, found.common, found.of_prior, *before)
     left_out = ", ".join(names[k] for k in found.left_out)
-    remarks += [f"not counted, because they differ from the later days: {left_out}"] if left_out else []
+    remarks += [because("differ", days=left_out)] if left_out else []
     row = replace(
         base,
         **_columns(pose),
@@ -179,7 +178,7 @@ def _counted(
     counted = days.since(dt.date.fromisoformat(first).toordinal() if first else 0)
     anew = counted.since(moved + 1)
     if 0 < len(anew.poses.day) < len(counted.poses.day):
-        return anew, day_name(moved + 1), f"since it or {reference.name} moved during {day_name(moved)}"
+        return anew, day_name(moved + 1), because("moved in day", other=reference.name, day=day_name(moved))
     return counted, first, why
 
 
@@ -195,11 +194,11 @@ def _edge_row(
     base = replace(empty, pair=edge.kind, parent_frame=edge.parent.name, child_frame=edge.child.name)
     lacking = [sensor.name for sensor in edge.sensors if sensor.name not in poses]
     if lacking:
-        return replace(base, reason=f"no pose of {' and '.join(lacking)} is known")
+        return replace(base, reason=because("no pose", sensors=" and ".join(lacking)))
     # The reference is where it is: the other ends have days.
     ends = [row for s in edge.sensors if (row := rows[s.name]).child_frame != empty.parent_frame]
     resting = [row for row in ends if row.status == "prior"]
-    named = [f"{row.child_frame} is at its prior: {row.reason}" for row in resting]
+    named = [because("at prior", sensor=row.child_frame, reason=row.reason) for row in resting]
     named += [
         f"{row.child_frame} " * (len(ends) > 1) + row.reason
         for row in ends
@@ -238,8 +237,9 @@ def _with_claims(
         return replace(row, determined=[])
     certified = [n for n, r, most in zip(_DIRECTIONS, reach_deg, limits_deg, strict=True) if r <= most]
     open_claims = [
-        f"{name} not certified: its sigma of {np.degrees(sigma):.2f} deg is too large for {most:.2f} deg at "
-        f"{100 * verify.confidence:.3g} %"
+        because(
+            "too large", direction=name, sigma=np.degrees(sigma), limit=most, percent=100 * verify.confidence
+        )
         for name, sigma, most in zip(_DIRECTIONS, sigma_rad, limits_deg, strict=True)
         if name not in certified
     ]

@@ -15,6 +15,7 @@ from pipeline.audit.estimates import Estimates, day_name, days_of
 from pipeline.audit.findings import vehicle_findings
 from pipeline.audit.fleet_shift import FleetShift, judge_without_fleet_shifts
 from pipeline.audit.history import History, last_audited_day, models_of
+from pipeline.audit.reasons import REASONS, because
 from pipeline.audit.restarts import events_until, restart_of
 from pipeline.audit.vehicle import VehicleVerdict
 from pipeline.core.config import AuditConfig, FleetConfig, config_hash
@@ -24,14 +25,7 @@ from pipeline.core.stage_work import Task, Told, Window, Work
 from pipeline.rig.edges import edge_of
 from pipeline.rig.graph import KINDS, Edge, edge_between
 from pipeline.rig.kinds import EDGE_KINDS
-from pipeline.store.partitions import (
-    Lake,
-    check_day,
-    content_hash,
-    days_after,
-    last_possible_day,
-    work_key,
-)
+from pipeline.store.partitions import Lake, check_day, content_hash, days_after, last_possible_day, work_key
 from pipeline.store.records import read_last
 from schemas.calibrations import CALIBRATIONS, DOF_NAMES
 from schemas.drift import DRIFT, DriftFinding
@@ -46,8 +40,7 @@ _OF_BEFORE = ("start_day", "start_day_earliest", "start_day_latest", "kind")
 _NAMED = 5  # records that an outcome names where they were left out; the others it counts
 # From least to most urgent.
 _CALMEST_FIRST = ("GREEN", "UNKNOWN", "YELLOW", "RED")
-_LESS = "some of its records cannot be read"
-_KEPT = f"kept, for {_LESS}"
+_LESS, _KEPT = REASONS["damaged"], REASONS["kept"]
 
 
 @dataclass(frozen=True)
@@ -99,10 +92,7 @@ def work(task: Task) -> Work:
 
 
 def _judged(
-    task: Task,
-    vehicles: Mapping[str, _Vehicle],
-    window: tuple[str, str, str],
-    progress: Progress,
+    task: Task, vehicles: Mapping[str, _Vehicle], window: tuple[str, str, str], progress: Progress
 ) -> Generator[DriftFinding, None, None]:
     """Findings of each vehicle, judged together."""
     fleet, (first, _, method) = task.fleet, window
@@ -139,10 +129,10 @@ def _ordinal(day: str) -> int:
 
 def _told(findings: Sequence[DriftFinding], left_out: Sequence[str]) -> Told:
     counts = Counter(f.status for f in findings)
-    reasons = [] if findings else ["no calibration record in the window"]
+    reasons = [] if findings else [REASONS["no records"]]
     if left_out:
         more = f" and {len(left_out) - _NAMED} more" if len(left_out) > _NAMED else ""
-        reasons.append(f"left out: {'; '.join(left_out[:_NAMED])}{more}")
+        reasons.append(because("left out", records="; ".join(left_out[:_NAMED]), more=more))
     rejected = {"unusable record": len(left_out)} if left_out else {}
     return Told(dict(counts), rejected, "; ".join(reasons), refused=not findings)
 
@@ -220,9 +210,9 @@ def _remarks(
     for edge in vehicle.records.own_edges():
         restart = restart_of(vehicle.events, edge, last)
         if restart is not None:
-            remarks |= {(edge, dof): f"since the {restart.in_words}" for dof in DOF_NAMES}
+            remarks |= {(edge, dof): because("since work", event=restart.in_words) for dof in DOF_NAMES}
     for key, shift in shifts.items():
-        text = f"less the change of {shift.vehicles} of {shift.of} vehicles since {day_name(shift.day)}"
+        text = because("fleet", some=shift.vehicles, all=shift.of, day=day_name(shift.day))
         remarks[key] = f"{remarks[key]}; {text}" if key in remarks else text
     return remarks
 

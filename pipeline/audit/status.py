@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
+from pipeline.audit.reasons import REASONS, because
 from pipeline.rig.edges import edge_of, edge_order, words_of
 from pipeline.rig.graph import KINDS, Edge
 from pipeline.rig.kinds import KIND_OF_EDGE
@@ -54,26 +55,25 @@ def decide_status(findings: Sequence[DriftFinding]) -> VehicleStatus:
             clearest.status, reason, clearest.moved_sensor, clearest.start_day, clearest.days_needed
         )
     if not findings:
-        return VehicleStatus("UNKNOWN", "undecided: no day has data")
+        return VehicleStatus("UNKNOWN", REASONS["no day"])
     blind = {}  # of each group of sensors that may have turned unseen, charts of the edge that needs the fewest days
     for sensors, edges in _watched({edge_of(f) for f in findings}).items():
         if fewest := min((_blind(findings, edge) for edge in edges), key=_days_needed):
             blind[sensors] = fewest
     few = sum(f.status != "GREEN" for f in findings)
     if not blind:
-        rest = f", enough to exclude a rotation of any sensor; {few} have too little data" if few else ""
-        of = f"{len(findings) - few} of {len(findings)} charts exclude a change above the limit"
-        return VehicleStatus("GREEN", f"no sensor moved: {of}{rest}")
+        counts = {"clear": len(findings) - few, "all": len(findings), "few": few}
+        return VehicleStatus("GREEN", because("GREEN, but few" if few else "GREEN", **counts))
     # Of several, the one that has fewest days: those that begin again after a service event state it.
     charts = max(blind.values(), key=lambda own: (_days_needed(own), -min(f.days_used for f in own)))
     slowest = max(charts, key=lambda f: _days_needed([f]))
     if max(f.days_used for f in findings) > 1:
         *some, last = blind
-        turned = f"undecided whether {', '.join(some)}{' and ' * bool(some)}{last} turned"
-        counts = f"{few} of {len(findings)} charts have too little data"
-        reason = f"{turned}: {words_of(edge_of(slowest))} {slowest.dof}: {slowest.reason}; {counts}"
+        names = f"{', '.join(some)}{' and ' * bool(some)}{last}"
+        chart = f"{words_of(edge_of(slowest))} {slowest.dof}: {slowest.reason}"
+        reason = because("UNKNOWN", names=names, chart=chart, few=few, all=len(findings))
     else:
-        reason = f"undecided: {slowest.reason}"
+        reason = because("UNKNOWN, one day", reason=slowest.reason)
     return VehicleStatus("UNKNOWN", reason, days_needed=_days_needed(charts))
 
 
@@ -98,6 +98,6 @@ def _clarity(alarm: DriftFinding) -> tuple[bool, bool, float]:
 
 def _what_happened(alarm: DriftFinding) -> str:
     if alarm.moved_sensor is None:
-        return f"a sensor moved on {alarm.start_day}, undecided which"
-    verb = "has been drifting since" if alarm.kind == "slow drift" else "moved on"
-    return f"the {alarm.moved_sensor} {verb} {alarm.start_day}"
+        return because("moved, unnamed", day=alarm.start_day)
+    what = REASONS["drifts" if alarm.kind == "slow drift" else "moved"]
+    return what.format(sensor=alarm.moved_sensor, day=alarm.start_day)

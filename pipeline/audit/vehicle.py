@@ -11,6 +11,7 @@ from jaxtyping import Int
 from pipeline.audit.changes import Change, start_interval
 from pipeline.audit.days import DOFS, PairDays, charts_of_fleet, clipped_days, edges_of_fleet
 from pipeline.audit.noise import Noise, estimate_noise
+from pipeline.audit.reasons import REASONS, because
 from pipeline.audit.scan import SAME
 from pipeline.audit.shifts import Whitened
 from pipeline.audit.verdicts import ChartVerdict, judge_charts
@@ -65,11 +66,7 @@ def judge_fleet(
     budget = np.array([alarm, max(alarm, _YELLOW)])
     probability = budget[:, None] / np.maximum(live, 1)
     verdicts = judge_charts(
-        charts,
-        noise,
-        limit,
-        np.repeat(probability, per_vehicle, axis=1),
-        config.baseline_days,
+        charts, noise, limit, np.repeat(probability, per_vehicle, axis=1), config.baseline_days
     )
     found = []
     for own, first in zip(fleet, range(0, len(verdicts), per_vehicle), strict=True):
@@ -131,7 +128,7 @@ def _whitened(
 def _name_undetermined_days(verdict: ChartVerdict, days: int) -> ChartVerdict:
     if verdict.status != "UNKNOWN" or verdict.days_used >= days:
         return verdict
-    reason = f"determined on {verdict.days_used} of {days} days: {verdict.reason}"
+    reason = because("determined on", used=verdict.days_used, days=days, reason=verdict.reason)
     return replace(verdict, reason=reason)
 
 
@@ -175,7 +172,7 @@ def _attribute(
     """Attribution from the shifts of all edges, by the estimator that is best for any autocorrelation."""
     shape = (days >= change.day).astype(float)
     if not shape.any() or shape.all():
-        return Attribution("the pairs have no common days before and after")
+        return Attribution(REASONS["no common days"])
     if change.kind == "slow drift":  # from the last day before it on
         shape = np.maximum(days - days[shape == 0][-1], 0.0)
         shape /= shape[-1]

@@ -17,6 +17,7 @@ from pipeline.audit.changes import Change, Levels, clearest, describe, levels_of
 from pipeline.audit.charts import Charts, clipped, thresholds
 from pipeline.audit.days import FEWEST_DAYS
 from pipeline.audit.noise import Noise
+from pipeline.audit.reasons import REASONS, because
 from pipeline.audit.scan import Scan, scan_by
 from schemas.calibrations import DOF_NAMES
 
@@ -31,13 +32,7 @@ _KNOWN = 240.0
 _HEAVY = 2 / 3  # of the sigmas that one day may lie off, where single days are often far off
 _TAIL = 4.0  # power by which days far off fall with the distance: Student's t with four degrees of freedom
 _TAME = 2  # days in a row that are no chance where single days are seldom far off
-_LASTING = "a lasting change above the limit"
-_ONE_DAY = "one day differs: the next day decides whether the change lasts"
-_FEW_DAYS = (
-    "two days differ, and single days of this fleet often do: the next day decides whether the change lasts"
-)
-_MAYBE = "a change that may be above the limit: the next days decide"
-_BEGUN = "a change may have begun: the next days decide"
+_OPEN = tuple(REASONS[name] for name in ("one day", "few days", "maybe"))  # one day more may decide
 
 
 @dataclass(frozen=True)
@@ -144,15 +139,12 @@ def _verdict(seen: _Judged, m: int) -> ChartVerdict:
     days = int(seen.charts.count[m])
     if days < 2:
         needed = max(seen.baseline_days + 1, 2)
-        reason = f"{_count(days)} of data, {needed} required"
+        reason = because("few", days=_count(days), needed=needed)
         return ChartVerdict("UNKNOWN", reason, days, None, None, None, needed - days)
     levels = None
     if seen.statistic[m] > seen.threshold[m]:
         levels = levels_of(
-            seen.charts.row(m),
-            seen.value[m, :days],
-            seen.noise.at(slice(m, m + 1)),
-            float(seen.threshold[m]),
+            seen.charts.row(m), seen.value[m, :days], seen.noise.at(slice(m, m + 1)), float(seen.threshold[m])
         )
         changed = _changed(seen, m, levels)
         if changed is not None:
@@ -165,19 +157,19 @@ def _changed(seen: _Judged, m: int, levels: Levels) -> ChartVerdict | None:
     if levels.statistic <= levels.threshold:
         return None
     change, limit = describe(levels), float(seen.limit[m])
-    status, reason = "RED", _LASTING
+    status, reason = "RED", REASONS["lasting"]
     # Before a change one more, because a chance outlier among the first days persists for weeks.
     more = seen.believed[m] > _TAME and not seen.charts.has_reference[m]
     if abs(change.size) < limit:
-        status, reason = "YELLOW", "a change below the limit"
+        status, reason = "YELLOW", REASONS["small"]
     elif (days := min(levels.days_before - int(more), levels.days_after)) < seen.believed[m]:
-        status, reason = "YELLOW", _ONE_DAY if days < 2 else _FEW_DAYS
+        status, reason = "YELLOW", REASONS["one day" if days < 2 else "few days"]
     elif abs(change.size) - _SURELY * change.size_sigma < limit:
-        status, reason = "YELLOW", _MAYBE
+        status, reason = "YELLOW", REASONS["maybe"]
     elif levels.doubtful_sides:
         # Held days agree by chance only within their enlarged sigmas, so two of them stand for an accepted one.
-        reason = _LASTING + "; depends on days whose calibration was held"
-    needed = 1 if reason in (_ONE_DAY, _FEW_DAYS, _MAYBE) else None
+        reason = REASONS["lasting, held"]
+    needed = 1 if reason in _OPEN else None
     days = int(seen.charts.count[m])
     return ChartVerdict(status, reason, days, levels.statistic, levels.threshold, change, needed)
 
@@ -200,17 +192,17 @@ def _unchanged(seen: _Judged, m: int, levels: Levels | None) -> ChartVerdict:
         after = 1 if seen.believed[m] == _TAME else int(seen.believed[m])
         begun = clearest(seen.scan.row(m, days), seen.charts.day[m, :days], limit, seen.watch[:, m], after)
         if begun is not None:
-            return judged("YELLOW", _BEGUN, 1, begun)
+            return judged("YELLOW", REASONS["begun"], 1, begun)
     if days <= seen.baseline_days:
         needed = seen.baseline_days + 1
-        return judged("UNKNOWN", f"{_count(days)} of data, {needed} required", needed - days)
+        return judged("UNKNOWN", because("few", days=_count(days), needed=needed), needed - days)
     if visible > limit:
         # The smallest visible change decreases with the square root of the days.
         needed = max(math.ceil(days * (visible / limit) ** 2) - days, 1)
         return judged(
             "UNKNOWN", _too_inaccurate(DOF_NAMES[m % len(DOF_NAMES)], visible, limit, needed), needed
         )
-    return judged("GREEN", "no change" if levels is None else "back at the reference")
+    return judged("GREEN", REASONS["same" if levels is None else "back"])
 
 
 def _one_day(seen: _Judged, m: int) -> ChartVerdict:
@@ -221,17 +213,16 @@ def _one_day(seen: _Judged, m: int) -> ChartVerdict:
     before = int(charts.day[m, last - 1]) + 1
     change = Change(day, before, day, "step", float(seen.last_size[m]), sigma, day)
     return ChartVerdict(
-        "YELLOW", _ONE_DAY, last + 1, float(seen.last_day[m]), float(seen.threshold[m]), change, 1
+        "YELLOW", REASONS["one day"], last + 1, float(seen.last_day[m]), float(seen.threshold[m]), change, 1
     )
 
 
 def _too_inaccurate(dof: str, visible: float, limit: float, needed: int) -> str:
     """Reason of a chart that would miss a change above its limit [rad or m]."""
     scale, unit = (180 / math.pi, "deg") if dof.startswith("r") else (1.0, "m")
-    such = "1 more such day is" if needed == 1 else f"{needed} more such days are"
-    would_hide = f"a change below {visible * scale:.2g} {unit} would not be noticed yet"
-    return f"{would_hide} (limit {limit * scale:.2g} {unit}); about {such} required"
+    numbers = {"visible": f"{visible * scale:.2g} {unit}", "limit": f"{limit * scale:.2g} {unit}"}
+    return because("hidden", **numbers, more=_count(needed, "more such "))
 
 
-def _count(days: int) -> str:
-    return "1 day" if days == 1 else f"{days} days"
+def _count(days: int, such: str = "") -> str:
+    return f"{days} {such}day{'s' * (days != 1)}"
