@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.stats import beta
+from scipy.stats import beta, t
 
 from schemas.calibrations import PAIRS
 from tests.benchmarks.studies.metrics import within
@@ -23,12 +23,14 @@ Row = Mapping[str, Any]
 
 
 def errors(lines: Lines, row: Row) -> str:
-    """Mean errors of `pairs`: azimuth / elevation [deg], and with `range = true` / range [m]."""
-    names = ["az_deg", "el_deg", *(["range_m"] if row.get("range") else [])]
+    """Mean errors of `pairs`, azimuth / elevation [deg], and the half-widths of their intervals over days."""
     cells = []
     for pair in row.get("pairs", PAIRS):
         found = [r["pairs"][pair] for r in lines if "az_deg" in r["pairs"].get(pair, {})]
-        cells.append("/".join(f"{np.mean([p[name] for p in found]):.3f}" for name in names))
+        angles = np.array([(p["az_deg"], p["el_deg"]) for p in found])
+        half = t.ppf(0.975, len(found) - 1) * angles.std(axis=0, ddof=1) / np.sqrt(len(found))
+        mean, wide = ("/".join(f"{v:.3f}" for v in values) for values in (angles.mean(axis=0), half))
+        cells.append(f"{mean} (+- {wide})")
     return ", ".join(cells)
 
 
@@ -46,7 +48,7 @@ def accepted_days(lines: Lines, row: Row) -> str:
     """Days on which every pair of `pairs` was accepted."""
     pairs = row.get("pairs", PAIRS)
     good = [all(r["pairs"].get(pair, {}).get("status") == "accepted" for pair in pairs) for r in lines]
-    return f"{rate(sum(good), len(good))}{row.get('unit', '')}"
+    return rate(sum(good), len(good))
 
 
 def inside(lines: Lines, _row: Row) -> str:
@@ -62,14 +64,6 @@ def inside(lines: Lines, _row: Row) -> str:
     all_within = sum(bool((z <= 3).all()) for z in days)
     one = 100 * np.mean(np.concatenate(days) <= 1)
     return f"{one:.0f} % (+- {half:.0f}); in three: {rate(all_within, len(days))}"
-
-
-def clock_sigmas(lines: Lines, row: Row) -> str:
-    """Time offsets of `pairs` within three of their sigmas, and their error in sigmas (RMS)."""
-    records = [r["pairs"].get(pair, {}) for r in lines for pair in row["pairs"]]
-    known = [p for p in records if p.get("dt_s") is not None]
-    z = np.array([(p["dt_s"] - p["dt_true_s"]) / p["dt_sigma_s"] for p in known])
-    return f"{rate(int(np.sum(np.abs(z) <= 3)), len(z))}, {np.sqrt(np.mean(z**2)):.2f} sigma"
 
 
 def found(lines: Lines, row: Row) -> str:
@@ -98,17 +92,18 @@ def nights_wrong(lines: Lines, _row: Row) -> str:
 
 
 def states_after(lines: Lines, row: Row) -> str:
-    """Sensors whose state certifies a direction after each of `nights`."""
+    """Sensors whose state certifies a direction after each of `nights`, those that were run; the last as a rate."""
     shares = []
     for night in row["nights"]:
         states = [s for r in lines if r["night"] == night - 1 for s in r["states"]]
-        shares.append(f"{sum(bool(s['certified']) for s in states)}/{len(states)}")
-    return ", ".join(shares)
+        if states:
+            shares.append((sum(bool(s["certified"]) for s in states), len(states)))
+    return ", ".join([*(f"{hits}/{trials}" for hits, trials in shares[:-1]), rate(*shares[-1])])
 
 
 def named_red(lines: Lines, _row: Row) -> str:
     """Moved sensors that audit names RED, and vehicles that are RED for another reason."""
-    moved = {(r["row"], r["vehicle"]): r["moved"] for r in lines if r["moved"]}
+    moved = {(r["row"], r["vehicle"]) for r in lines if r["moved"] and r["night"] >= r["moved"][1]}
     named = {
         (r["row"], r["vehicle"])
         for r in lines
@@ -117,7 +112,16 @@ def named_red(lines: Lines, _row: Row) -> str:
     early = {
         (r["row"], r["vehicle"]) for r in lines if r["red"] and (not r["moved"] or r["night"] < r["moved"][1])
     }
-    return f"{len(named)} of {len(moved)}; {len(early)} others RED"
+    return f"{rate(len(named), len(moved))}; {len(early)} others RED" if moved else "none moved"
+
+
+def cents(lines: Lines, row: Row) -> str:
+    """Price of the CPU time of a vehicle-day, from logs to pages, by fleet."""
+    cells = []
+    for name in dict.fromkeys(r["row"] for r in lines):
+        cpu_s = float(np.mean([r["cpu_s"] for r in lines if r["row"] == name]))
+        cells.append(f"{name} {cpu_s / 3600 * row['cents_per_core_hour']:.2f} ({cpu_s:.0f} CPU s)")
+    return ", ".join(cells)
 
 
 def _slashed(numbers: Sequence[int]) -> str:
@@ -145,7 +149,6 @@ def rate(hits: int, trials: int) -> str:
 
 
 _ALL = (
-    accepted_days, clock_sigmas, errors, found, inside, named_red, nights_wrong, states_after, wrong_days,
-    wrong_records,
+    accepted_days, cents, errors, found, inside, named_red, nights_wrong, states_after, wrong_days, wrong_records,
 )  # fmt: skip
 MEASURES: dict[str, Callable[[Lines, Row], str]] = {f.__name__: f for f in _ALL}

@@ -2,7 +2,8 @@
 
     python -m tests.benchmarks.results_table          writes them (make results)
 
-A row names a question, its goal, its file and how the number is computed (`results_measures.py`). What else a reader
+A row names a question, its file, how the number is computed (`results_measures.py`), and with `top` the best number
+that others publish. A row whose file is not there is left out. What else a reader
 must know to believe the number is computed: the release of the code (results/releases.toml, kept because commits are
 rebased), whether its seeds were looked at before (results/seeds.toml), on how many distinct days it rests, and for a
 rate its 95 % interval.
@@ -49,16 +50,24 @@ def lines_of(row: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 def render(top_only: bool) -> str:
     """The table as Markdown."""
-    heads = ["question", "goal", "measured (95 % interval)", "days, look", "release"]
-    body = [_cells(row) for row in rows() if row.get("top") or not top_only]
+    heads = [
+        "question",
+        "measured (95 % interval)",
+        "days, look",
+        "best published" if top_only else "release",
+    ]
+    chosen = [row for row in rows() if row.get("top") or not top_only]
+    body = [_cells(row, top_only) for row in chosen if "file" not in row or (RESULTS / row["file"]).exists()]
     return "\n".join("| " + " | ".join(cells) + " |" for cells in [heads, ["---"] * len(heads), *body])
 
 
-def _cells(row: Mapping[str, Any]) -> list[str]:
+def _cells(row: Mapping[str, Any], top_only: bool) -> list[str]:
     lines = lines_of(row)
     text = row["measured"] if "measured" in row else MEASURES[row["measure"]](lines, row)
-    days = f"{_days(lines, row)}, {_look(lines, row)}"
-    return [row["question"], row.get("goal", ""), text, days, _release(lines, row)]
+    days, release = f"{_days(lines, row)}, {_look(lines, row)}", _release(lines, row)
+    if top_only:  # a release is named where it is another than this one
+        return [row["question"], text, f"{days}, {release}" if "older" in release else days, row["published"]]
+    return [row["question"], text, days, release]
 
 
 def _listed(value: Any) -> list[Any]:
@@ -74,11 +83,11 @@ def _at(line: Mapping[str, Any], key: str) -> Any:
 
 
 def _days(lines: Sequence[Mapping[str, Any]], row: Mapping[str, Any]) -> str:
-    """Distinct drives: a day that is calibrated twice, or with another fault put into its rows, is one."""
+    """Distinct vehicle-days: one that is calibrated twice, or with another fault put into its rows, counts once."""
     if "days" in row:
         return str(row["days"])
-    seen = {(d.get("rig"), d.get("environment"), d["seed"]) for d in (r.get("day", r) for r in lines)}
-    return str(len(seen))
+    which = ("rig", "environment", "seed", "vehicle", "night")
+    return str(len({tuple(d.get(name) for name in which) for d in (r.get("day", r) for r in lines)}))
 
 
 def _look(lines: Sequence[Mapping[str, Any]], row: Mapping[str, Any]) -> str:
