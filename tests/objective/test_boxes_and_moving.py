@@ -24,7 +24,7 @@ T_CAMERA_RADAR = T_CAMERA_LIDAR @ T_LIDAR_RADAR
 
 def test_box_jacobian_agrees_with_central_differences():
     day = street_day(6)
-    pairs = box_pairs(day, vehicle_boxes(day), T_CAMERA_RADAR, 0.2)
+    pairs = box_pairs(vehicle_boxes(day), T_CAMERA_RADAR, 0.2)
     assert pairs.count > 8
     bias = np.array([0.01, -0.01])
 

@@ -209,7 +209,7 @@ def _equations(seen: _Seen, T: np.ndarray, bias: np.ndarray, step: int) -> _Equa
     """Equations of boxes and moving clusters at a pose; `step` chooses the gates."""
     F = len(seen.observations)
     gate = BOX_ELEVATION_GATES_RAD[min(step // _SCHEDULE.steps_at_first_box_gate, 1)]
-    pairs = box_pairs(seen.observations, seen.boxes, T, float(gate))
+    pairs = box_pairs(seen.boxes, T, float(gate))
     Hb, gb, box_sigma = box_equations(pairs, T, bias, F)
     Ha, ga, azimuth_sigma = azimuth_equations_camera(seen.clusters, T, float(_AZIMUTH_GATES_RAD[step]))
     about_radar = np.eye(Hb.shape[1])

@@ -373,6 +373,7 @@ def fit_match_share(
         ratio = 0.63661977 / s / (1 + (r / s) ** 2) ** 2 / at_chance
         pi = 0.2
         for _ in range(60):
-            pi = float(np.mean(pi * ratio / (pi * ratio + 1 - pi)))
+            matched = pi * ratio
+            pi = float(np.mean(matched / (matched + 1 - pi)))
         out[c] = np.clip(pi, 1e-4, 0.9)
     return out

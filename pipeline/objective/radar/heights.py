@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float, Int64
@@ -25,6 +26,7 @@ from scipy.spatial import cKDTree
 from scipy.special import ndtr
 
 from pipeline.objective.radar.registration import rows_of_frames
+from pipeline.objective.radar.vehicle_boxes import median_of_rows
 from pipeline.rig.se3 import inverse, transform_points
 from pipeline.rig.spherical import to_spherical
 from schemas.observations import Observation
@@ -144,35 +146,58 @@ def displaced_heights(
     day = _Detections(
         *(np.concatenate(column) for column in zip(*(vars(d).values() for d in each), strict=True))
     )
-    x = minimize(lambda x: -_log_likelihood(day, x).sum(), _START, method="L-BFGS-B", bounds=_BOUNDS).x
+    kinds = _Kinds(day)
+    x = minimize(lambda x: -_log_likelihood(kinds, x).sum(), _START, method="L-BFGS-B", bounds=_BOUNDS).x
     if any(abs(x[k]) >= _BOUNDS[k][1] for k in (0, 1)):  # the end of a search, not what was measured
         return None
-    per_height, scores = _scores(day, x)
-    each_kind, turned = _densities(day, x)
+    per_height, scores = _scores(kinds, x)
+    each_kind, turned = _densities(kinds, x)
     kind = each_kind / each_kind.sum(0)
     below = float(np.mean(kind[_DISPLACED] * (turned < -_BELOW_M / day.range_m)))
     explained = float(1 - kind[_ANYWHERE].mean())
     return Heights(float(x[0]), T_lidar_radar, _share(x[2]), explained, below, per_height, scores)
 
 
-def _log_likelihood(day: _Detections, x: np.ndarray) -> np.ndarray:
+class _Kinds:
+    """Densities of a day's detections by kind, which depend on pitch, roll and sigma alone.
+
+    The last few are kept: numerical derivatives by the other unknowns ask for them again.
+    """
+
+    def __init__(self, day: _Detections) -> None:
+        self.day = day
+        self.stands = day.mirror.any(1)  # the lidar shows an object there, not bare road
+        self.of = lru_cache(maxsize=4)(self._of)
+
+    def _of(self, pitch: float, roll: float, log_sigma: float) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
+        """Densities as direct, image and displaced (N each), and the rotated elevations (N)."""
+        day, sigma = self.day, float(np.exp(log_sigma))
+        turned = day.elevation - pitch * np.cos(day.azimuth) + roll * np.sin(day.azimuth)
+        found = np.empty((3, len(turned)))
+        # Points of bare road have no height: one stands for all of a detection's.
+        for rows, mirror in ((self.stands, day.mirror[self.stands]), (~self.stands, np.zeros((1, 1)))):
+            z, m = turned[rows, None] / sigma, mirror / sigma
+            half = np.maximum(m, _NARROWEST)
+            between = (ndtr(z + half) - ndtr(z - half)) / (2 * half)
+            kinds = (np.exp(-0.5 * (z - m) ** 2) / _NORMAL, np.exp(-0.5 * (z + m) ** 2) / _NORMAL, between)
+            found[:, rows] = [kind.mean(1) for kind in kinds]
+        return tuple(found), turned
+
+
+def _log_likelihood(kinds: _Kinds, x: np.ndarray) -> np.ndarray:
     """Log likelihood of each detection, for unknowns in the order of _START."""
-    return np.asarray(np.log(_densities(day, x)[0].sum(0)))
+    return np.asarray(np.log(_densities(kinds, x)[0].sum(0)))
 
 
-def _densities(day: _Detections, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _densities(kinds: _Kinds, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Density of each detection as direct, image, displaced and from anywhere (4 N), and its rotated elevation (N)."""
     displaced, image, sigma = _share(x[2]), _share(x[6]), float(np.exp(x[3]))
-    stands = day.mirror.any(1)  # the lidar shows an object there, not bare road
+    stands = kinds.stands
     anywhere = np.where(stands, _share(x[4]), _share(x[5]))
-    view_rad = np.where(stands, _VIEW_RAD, max(np.sqrt(12.0) * np.std(day.elevation), _LEAST_VIEW_RAD))
-    turned = day.elevation - x[0] * np.cos(day.azimuth) + x[1] * np.sin(day.azimuth)
-    z, m = turned[:, None] / sigma, day.mirror / sigma
-    half = np.maximum(m, _NARROWEST)
-    between = (ndtr(z + half) - ndtr(z - half)) / (2 * half)
+    view_rad = np.where(stands, _VIEW_RAD, max(np.sqrt(12.0) * np.std(kinds.day.elevation), _LEAST_VIEW_RAD))
+    of_kind, turned = kinds.of(float(x[0]), float(x[1]), float(x[3]))
     shares = ((1 - image) * (1 - displaced), image, (1 - image) * displaced)
-    kinds = (np.exp(-0.5 * (z - m) ** 2) / _NORMAL, np.exp(-0.5 * (z + m) ** 2) / _NORMAL, between)
-    near = [share * (1 - anywhere) * kind.mean(1) / sigma for share, kind in zip(shares, kinds, strict=True)]
+    near = [share * (1 - anywhere) * kind / sigma for share, kind in zip(shares, of_kind, strict=True)]
     return np.stack([*near, anywhere / view_rad]), turned
 
 
@@ -180,14 +205,14 @@ def _share(logit: float) -> float:
     return float(1 / (1 + np.exp(-logit)))
 
 
-def _scores(day: _Detections, x: np.ndarray) -> tuple[float, HeightScores]:
+def _scores(kinds: _Kinds, x: np.ndarray) -> tuple[float, HeightScores]:
     """Derivative of pitch by the radar's height, and information and score of pitch with the other unknowns eliminated.
 
     The information is scaled to the scatter of the frames.
     """
-    steps = np.diag(_STEP)
+    day, steps = kinds.day, np.diag(_STEP)
     S = np.stack(
-        [(_log_likelihood(day, x + s) - _log_likelihood(day, x - s)) / (2 * s.sum()) for s in steps], 1
+        [(_log_likelihood(kinds, x + s) - _log_likelihood(kinds, x - s)) / (2 * s.sum()) for s in steps], 1
     )
     frame, row = np.unique(day.frame, return_inverse=True)
     H, g = S.T @ S, np.zeros((len(frame), len(x)))
@@ -227,7 +252,7 @@ def _detections(
     for k, hits in enumerate(near):
         if len(hits) >= _LEAST_POINTS:
             road, stands = over[hits][is_road[hits]], over[hits][~is_road[hits]]
-            foot = float(np.median(road)) if len(road) else 0.0
+            foot = float(median_of_rows(road)) if len(road) else 0.0
             if stands.max(initial=0.0) - foot < _TALLEST_M:
                 high = (
                     np.maximum(rng.choice(stands, _POINTS) - foot, 0.0) if len(stands) else np.zeros(_POINTS)

@@ -8,13 +8,12 @@ from it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int64
 
-from pipeline.core.rows import columns_of
 from pipeline.objective.radar.registration import robust_equations
 from pipeline.objective.stamp_gaps import scan_to_image_s
 from pipeline.rig.cameras import camera_of
@@ -42,15 +41,6 @@ _RANGE_M = (3.0, 60.0)
 _DEPTH_M = 3.5  # detections of one vehicle lie within this range interval
 _LEAST_HEIGHT_PX = 12.0
 _LEAST_DETECTIONS = 2  # fewer are not used
-_PAIR = np.dtype(  # of BoxPairs
-    [
-        ("point_radar_m", "f8", 3),
-        ("azimuth_rad", "f8"),
-        ("elevation_rad", "f8"),
-        ("kind", "i8"),
-        ("frame", "i8"),
-    ]
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +54,9 @@ class VehicleBoxes:
     right_rad: Float[np.ndarray, " B"]
     expected_m: Float[np.ndarray, " B"]  # range that the height suggests
     frame: Int64[np.ndarray, " B"]  # index into the observations given
+    # By frame, detections in radar axes where they were when the image was taken: as points [m], and as azimuth,
+    # elevation [rad], range. What they moved along the line of sight changes no direction.
+    scans: Mapping[int, tuple[Float[np.ndarray, "M 3"], Float[np.ndarray, "M 3"]]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,38 +83,38 @@ def vehicle_boxes(observations: Sequence[Observation]) -> VehicleBoxes:
         if o.radar_has_elevation and len(o.road_user_boxes_px) and len(o.radar_xyz_m)
     ]
     kind, azimuth, elevation, left, right, expected_m, frame = np.concatenate([np.zeros((0, 7)), *rows]).T
+    turns = scan_to_image_s(observations) * [o.ego_yaw_rate_radps or 0.0 for o in observations]
+    scans = {}
+    for index in np.unique(frame).astype(int).tolist():
+        c, s = np.cos(turns[index]), np.sin(turns[index])
+        to_image = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        radar = observations[index].radar_xyz_m.astype(np.float64) @ to_image
+        scans[index] = radar, to_spherical(radar)
     numbers = kind.astype(np.int64), frame.astype(np.int64)
-    return VehicleBoxes(numbers[0], azimuth, elevation, left, right, expected_m, numbers[1])
+    return VehicleBoxes(numbers[0], azimuth, elevation, left, right, expected_m, numbers[1], scans)
 
 
 def box_pairs(
-    observations: Sequence[Observation],
-    boxes: VehicleBoxes,
-    T_camera_radar: Float[np.ndarray, "4 4"],
-    elevation_gate_rad: float,
+    boxes: VehicleBoxes, T_camera_radar: Float[np.ndarray, "4 4"], elevation_gate_rad: float
 ) -> BoxPairs:
-    """Find the detections of each unoccluded vehicle box (`vehicle_boxes` of the same frames).
+    """Find the detections of each box.
 
     The azimuth of `T_camera_radar` is right to about a box's width; detections farther than
     `elevation_gate_rad` from the box's centre are left out.
     """
-    rows = []
-    turns = scan_to_image_s(observations) * [o.ego_yaw_rate_radps or 0.0 for o in observations]
-    for index in np.unique(boxes.frame):
-        # Where they were when the image was taken; what they moved along the line of sight changes no direction.
-        c, s = np.cos(turns[index]), np.sin(turns[index])
-        to_image = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-        radar = observations[index].radar_xyz_m.astype(np.float64) @ to_image
+    paired, middle = list[int](), list[np.ndarray]()
+    for index, (radar, directions) in boxes.scans.items():
         in_camera = transform_points(T_camera_radar, radar)
         angles = camera_direction_angles(in_camera)
         distance = np.linalg.norm(in_camera, axis=1)
-        for b in np.flatnonzero(boxes.frame == index):
-            chosen = _detections_of(angles, distance, boxes, int(b), elevation_gate_rad)
+        for b in np.flatnonzero(boxes.frame == index).tolist():
+            chosen = _detections_of(angles, distance, boxes, b, elevation_gate_rad)
             if len(chosen) >= _LEAST_DETECTIONS:
-                middle = from_spherical(median_of_rows(to_spherical(radar[chosen])))
-                centre = boxes.azimuth_rad[b], boxes.elevation_rad[b]
-                rows.append((middle, *centre, boxes.kind[b], index))
-    return BoxPairs(**columns_of(rows, _PAIR))
+                paired.append(b)
+                middle.append(median_of_rows(directions[chosen]))
+    points = from_spherical(np.array(middle, np.float64).reshape(-1, 3))
+    of = np.array(paired, np.int64)
+    return BoxPairs(points, boxes.azimuth_rad[of], boxes.elevation_rad[of], boxes.kind[of], boxes.frame[of])
 
 
 def elevation_residuals(

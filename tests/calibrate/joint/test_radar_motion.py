@@ -157,10 +157,10 @@ def test_an_offset_far_beyond_what_is_searched_is_seen_from_anywhere(problem, sl
 def test_the_radars_own_sigmas_bring_back_an_offset_that_wider_ones_do_not_see(problem, monkeypatch):
     right, slid = state_at(DT_S), state_at(DT_S + 0.04)
     monkeypatch.setattr(search, "comparison_cost", lambda problem, _: np.zeros(problem.frames.count))
-    found = search.better_time_offset(problem, slid)
+    found = search.better_time_offset(search.OtherOffsets(problem, slid))
     assert found is not None
     assert abs(found.dt_s - DT_S) < 0.012  # half a step of 0.2 m
-    assert search.better_time_offset(problem, right) is None
+    assert search.better_time_offset(search.OtherOffsets(problem, right)) is None
 
 
 def tunnel_day(frames, seed=3):
@@ -189,7 +189,9 @@ def tunnel_day(frames, seed=3):
 def test_a_time_offset_that_blocks_of_frames_find_anywhere_is_unsure_and_one_they_agree_on_is_not(problem):
     def scatter_s(problem):
         block = np.arange(problem.frames.count) // 2
-        return search.time_offset_scatter_s(problem, state_at(DT_S), block, np.random.default_rng(0))
+        return search.time_offset_scatter_s(
+            search.OtherOffsets(problem, state_at(DT_S)), block, np.random.default_rng(0)
+        )
 
     assert scatter_s(problem) < 0.012  # half a step of 0.2 m
     assert scatter_s(problem_of(list(tunnel_day(16)))) > 0.03

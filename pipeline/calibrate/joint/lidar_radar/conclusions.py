@@ -91,9 +91,9 @@ _DT_UNSURE_S = 0.005  # a time offset known no better than this gets a note
 _NAMES = np.array(["roll", "pitch", "yaw", "x", "y", "z"])
 
 
-def notes_of(analysis: ObservabilityAnalysis, *, has_elevation: bool) -> list[str]:
+def notes_of(analysis: ObservabilityAnalysis) -> list[str]:
     """Notes on undetermined unknowns and on assumptions."""
-    fixed, linear = analysis.fixed, analysis.linear
+    fixed, heights = analysis.fixed, analysis.problem.heights
     notes = []
     if fixed[:6].any():
         notes.append(f"not determined by this day, kept at the prior: {', '.join(_NAMES[fixed[:6]])}")
@@ -105,21 +105,21 @@ def notes_of(analysis: ObservabilityAnalysis, *, has_elevation: bool) -> list[st
             f"time offset known to {1e3 * dt_sigma_s:.0f} ms only: at constant speed a shift in x has the same effect"
         )
     notes.append("vehicle boxes are not used: roll and pitch depend on the registration and the prior")
-    if linear.travel_frames:
+    if _travel_frames(analysis):
         notes.append(
             "radar pitch assumes that the car drives parallel to the road that the lidar sees under it"
         )
-    if analysis.heights is not None:
+    if heights is not None:
         notes.append(
-            f"{analysis.heights.displaced:.0%} of the detections of low objects lie between the object and its mirror "
+            f"{heights.displaced:.0%} of the detections of low objects lie between the object and its mirror "
             f"image in the road; radar pitch allows for them, with a sigma of "
-            f"{np.degrees(analysis.heights.floor_rad):.2f} deg"
+            f"{np.degrees(heights.floor_rad):.2f} deg"
         )
     disagreement = contradiction(analysis.sources)
     if disagreement is not None:
         notes.append(disagreement.sentence)
     bias_sigma_m = float(np.sqrt(analysis.covariance[RANGE, RANGE]))
-    if has_elevation:
+    if analysis.problem.frames.has_elevation.any():
         own_deg = float(np.degrees(RADAR_ELEVATION_BIAS_RAD))
         notes.append(
             "pitch is the direction of the radar's detections: its mounting differs by the radar's own constant"
@@ -137,7 +137,7 @@ def notes_of(analysis: ObservabilityAnalysis, *, has_elevation: bool) -> list[st
 
 def diagnostics_of(analysis: ObservabilityAnalysis) -> dict[str, float]:
     """Numbers of a solution; non-finite values are left out."""
-    state, linear = analysis.state, analysis.linear
+    state, linear, heights = analysis.state, analysis.linear, analysis.problem.heights
     diagnostics = {
         "azimuth_sigma_rad": float(state.sigma[0]),
         "elevation_sigma_rad": float(state.sigma[1]),
@@ -145,12 +145,19 @@ def diagnostics_of(analysis: ObservabilityAnalysis) -> dict[str, float]:
         "range_bias_m": state.range_bias_m,
         "range_bias_sigma_m": float(np.sqrt(analysis.covariance[RANGE, RANGE])),
         "bounce_share": state.bounce,
-        **({} if analysis.heights is None else {"displaced_share": analysis.heights.displaced}),
+        **({} if heights is None else {"displaced_share": heights.displaced}),
         "assigned_share": float(linear.registration.assigned.mean()),
         "moving_azimuth_sigma_rad": linear.mover_sigma_rad,
         **own_numbers(analysis.sources),
         **considered_numbers(analysis.considered, of_camera=False),
-        "doppler_frames": float(linear.travel_frames),
+        "doppler_frames": float(_travel_frames(analysis)),
         "doppler_scatter_rad": linear.travel_scatter_rad,
     }  # fmt: skip
     return {k: v for k, v in diagnostics.items() if np.isfinite(v)}
+
+
+def _travel_frames(analysis: ObservabilityAnalysis) -> int:
+    """Number of frames by whose direction of travel pitch is known."""
+    travel = analysis.problem.travel
+    is_asked = any(source.name == "doppler" for source in analysis.sources)
+    return travel.count if travel is not None and is_asked else 0

@@ -37,21 +37,21 @@ __all__ = [
     "add_elevations",
     "add_heights",
     "add_travel",
+    "elevation_equations",
     "height_equations",
     "travel_equations",
     "turned",
 ]
 
 
-def add_travel(problem: RadarProblem, state: RadarState, sums: Sums) -> tuple[float, PartTurn | None]:
-    """Add the direction of travel by Doppler and road; returns its scatter over frames [rad], and its pitch."""
+def add_travel(problem: RadarProblem, state: RadarState, sums: Sums) -> float:
+    """Add the direction of travel by Doppler and road; returns its scatter over frames [rad]."""
     if problem.travel is None:
-        return float("nan"), None
+        return float("nan")
     H, g, scatter = pitch_equations(problem.travel, state.T_lidar_radar, len(sums.g))
-    source = travel_equations(problem, state)
     floor = (DOPPLER_PITCH_FLOOR_RAD**2 + problem.doubt_rad.get("doppler", 0.0) ** 2) * np.eye(2)
     _add_tilts(problem, state, "doppler", np.arange(2), H, g, floor, sums)
-    return scatter, source
+    return scatter
 
 
 def travel_equations(problem: RadarProblem, state: RadarState) -> PartTurn | None:
@@ -63,15 +63,13 @@ def travel_equations(problem: RadarProblem, state: RadarState) -> PartTurn | Non
     return own_equations("doppler", H_own[1:, 1:], g_own[1:], DOPPLER_PITCH_FLOOR_RAD)
 
 
-def add_heights(problem: RadarProblem, state: RadarState, sums: Sums) -> PartTurn | None:
-    """Add static elevations, which may be displaced; returns their pitch correction at this state."""
+def add_heights(problem: RadarProblem, state: RadarState, sums: Sums) -> None:
+    """Add static elevations, which may be displaced."""
     if problem.heights is None:
-        return None
+        return
     H, g = _height_equations(problem.heights, state.T_lidar_radar, len(sums.g))
-    source = height_equations(problem, state)
     floor = problem.heights.floor_rad**2 * np.diag([1.0, 1.0, 0.0])
     _add_tilts(problem, state, "heights", ELEVATION_DOF, H, g, floor, sums)
-    return source
 
 
 def height_equations(problem: RadarProblem, state: RadarState) -> PartTurn | None:
@@ -106,17 +104,9 @@ def _height_equations(
 
 
 def add_elevations(
-    problem: RadarProblem,
-    state: RadarState,
-    equations: NormalEquations,
-    stride: int,
-    floor: np.ndarray,
-    sums: Sums,
-) -> np.ndarray:
-    """Roll, pitch and z from the registration's elevations as one measurement with covariance `H^-1 + floor^2`.
-
-    Floors and the returned correction of roll, pitch and z by these elevations alone are along the radar's axes.
-    """
+    problem: RadarProblem, state: RadarState, equations: NormalEquations, stride: int, sums: Sums
+) -> None:
+    """Roll, pitch and z from the registration's elevations as one measurement with covariance `H^-1 + floor^2`."""
     at, shape = problem.frames.frame, (len(sums.g), len(ELEVATION_DOF), len(ELEVATION_DOF))
     block = np.ix_(np.arange(len(at)), ELEVATION_DOF, ELEVATION_DOF)
     He, Ie, ge = np.zeros(shape), np.zeros(shape), np.zeros(shape[:2])
@@ -125,10 +115,27 @@ def add_elevations(
     # Roll follows from what stands left and right of the road: four edges of three vehicles scattered by .15 deg over
     # their 15 days, about a mean of .02, where the floor is .2. Pitch erred by .11 about -.13.
     of_day = problem.spread.roll_of_day(float(state.sigma[1])) * np.eye(3)[0]
-    floors, roll = (along_radar(state.T_lidar_radar, part) for part in (floor, of_day))
+    floors, roll = (along_radar(state.T_lidar_radar, part) for part in (_floor(problem, state), of_day))
     _add_tilts(problem, state, "registration", ELEVATION_DOF, He, ge, floors, sums, Ie, roll)
-    H_own, g_own = tilt_of(state.T_lidar_radar, He.sum(0), ge.sum(0))
-    return np.asarray(-np.linalg.pinv(H_own, rcond=1e-6) @ g_own)
+
+
+def elevation_equations(
+    problem: RadarProblem, state: RadarState, equations: NormalEquations
+) -> PartTurn | None:
+    """Pitch correction from the registration's elevations alone; None if there are none."""
+    if not problem.frames.has_elevation.any() or "static" not in problem.terms:
+        return None
+    block = np.ix_(np.arange(problem.frames.count), ELEVATION_DOF, ELEVATION_DOF)
+    H, g = tilt_of(state.T_lidar_radar, equations.H[1][block].sum(0), equations.g[1][:, ELEVATION_DOF].sum(0))
+    step = -np.linalg.pinv(H, rcond=1e-6) @ g
+    return PartTurn("registration", float(step[1]), float(_floor(problem, state)[1]))
+
+
+def _floor(problem: RadarProblem, state: RadarState) -> Float[np.ndarray, " 3"]:
+    """Sigmas of roll, pitch and z by elevations, along the radar's axes."""
+    floor = problem.spread.floor(float(state.sigma[1]), problem.spacing_rad)
+    floor[1] = np.hypot(floor[1], problem.doubt_rad.get("registration", 0.0))
+    return floor
 
 
 def _add_tilts(

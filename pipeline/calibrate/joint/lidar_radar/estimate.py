@@ -23,7 +23,11 @@ from pipeline.calibrate.joint.lidar_radar.elevation_errors import (
     radar_tilt_axes,
     seen_low_of,
 )
-from pipeline.calibrate.joint.lidar_radar.elevation_terms import height_equations, travel_equations
+from pipeline.calibrate.joint.lidar_radar.elevation_terms import (
+    elevation_equations,
+    height_equations,
+    travel_equations,
+)
 from pipeline.calibrate.joint.lidar_radar.observability import ObservabilityAnalysis, analyse_observability
 from pipeline.calibrate.joint.lidar_radar.problem import (
     DT,
@@ -33,6 +37,7 @@ from pipeline.calibrate.joint.lidar_radar.problem import (
 from pipeline.calibrate.joint.lidar_radar.radar_velocity import contradicts_odometry, turns_unmeasured
 from pipeline.calibrate.joint.lidar_radar.schedule import SCHEDULE
 from pipeline.calibrate.joint.lidar_radar.search import (
+    OtherOffsets,
     anneal,
     better_time_offset,
     comparison_cost,
@@ -97,13 +102,15 @@ def estimate_lidar_radar(
     if {"doppler", "static"} & set(config.terms):
         problem, without_way, sources = _with_way(problem, best, rng)
     analysis = analyse_observability(problem, without_way, config, rng)
-    other = better_time_offset(problem, analysis.state)
-    if other is not None:
-        analysis = analyse_observability(problem, other, config, rng)
+    others = OtherOffsets(problem, analysis.state)
+    better = better_time_offset(others)
+    if better is not None:
+        analysis = analyse_observability(problem, better, config, rng)
+        others = OtherOffsets(problem, analysis.state)
     analysis = _with_sources(analysis, sources, without_way)
     block = blocks_of(problem.observations, config.bootstrap_blocks)
-    analysis = _with_other_dips(problem, analysis, block[problem.frames.frame])
-    found = _conclude(problem, analysis, rejected)
+    analysis = _with_other_dips(others, analysis, block[problem.frames.frame])
+    found = _conclude(analysis, rejected)
     own = own_position(problem, analysis.state, analysis.fixed, block)
     own |= far_time_offset(problem, analysis.state)
     found = with_parts(found, _parts(problem, analysis, config, rng))
@@ -201,8 +208,12 @@ def _with_way(
     has_static = "static" in problem.terms
     heights = displaced_heights(about[0], level, about[2], rng.spawn(1)[0]) if has_static else None
     seeing = replace(problem, travel=travel, heights=heights, seen_low=seen_low_of(travel, heights))
-    added = travel_equations(seeing, state), height_equations(seeing, state)
-    sources = [seeing.seen_low.expected(w) for w in (*linear.sources, *added) if w is not None]
+    asked = (
+        elevation_equations(problem, state, linear.registration),
+        travel_equations(seeing, state),
+        height_equations(seeing, state),
+    )
+    sources = [seeing.seen_low.expected(w) for w in asked if w is not None]
     doubt_rad = doubted(sources)
     wider = tuple(w.wider(doubt_rad.get(w.name, 0.0)) for w in sources)
     return replace(seeing, doubt_rad=doubt_rad), replace(state, seen_low=seeing.seen_low.mean), wider
@@ -228,7 +239,7 @@ def _with_sources(
 
 
 def _with_other_dips(
-    problem: RadarProblem, analysis: ObservabilityAnalysis, block: Int[np.ndarray, " F"]
+    others: OtherOffsets, analysis: ObservabilityAnalysis, block: Int[np.ndarray, " F"]
 ) -> ObservabilityAnalysis:
     """The analysis with the variance over blocks of frames, and the weight of the time offset against the expected one.
 
@@ -236,8 +247,8 @@ def _with_other_dips(
     """
     if analysis.fixed[DT]:
         return analysis
-    scatter_s = time_offset_scatter_s(problem, analysis.state, block, np.random.default_rng(0))
-    weight = 1 / (1 + (scatter_s / problem.dt_sigma_s) ** 2)
+    scatter_s = time_offset_scatter_s(others, block, np.random.default_rng(0))
+    weight = 1 / (1 + (scatter_s / analysis.problem.dt_sigma_s) ** 2)
     covariance = analysis.covariance.copy()
     covariance[DT, DT] += weight * scatter_s**2
     return replace(analysis, covariance=covariance, dt_weight=weight)
@@ -249,11 +260,8 @@ def _consistent_with_odometry(observations: Sequence[Observation]) -> list[Obser
     return [o for o, w in zip(observations, wrong, strict=True) if not w]
 
 
-def _conclude(
-    problem: RadarProblem, analysis: ObservabilityAnalysis, rejected: dict[str, int]
-) -> PairEstimate:
-    state, fixed = analysis.state, analysis.fixed
-    notes = notes_of(analysis, has_elevation=bool(problem.frames.has_elevation.any()))
+def _conclude(analysis: ObservabilityAnalysis, rejected: dict[str, int]) -> PairEstimate:
+    problem, state, fixed = analysis.problem, analysis.state, analysis.fixed
     covariance = analysis.covariance[:6, :6]
     # The record's covariance is of a left perturbation: a turn about the lidar carries the radar along.
     J = np.linalg.inv(change_jacobian(state.T_lidar_radar))
@@ -268,7 +276,7 @@ def _conclude(
         analysis.dt_weight * state.dt_s - problem.constant_gap_s,
         float(np.sqrt(analysis.covariance[DT, DT])),
         diagnostics_of(analysis),
-        notes,
+        notes_of(analysis),
         common_part(J @ analysis.common[:6, :6] @ J.T, J @ covariance @ J.T),
         time_offset_prior_s=-problem.constant_gap_s,
         **estimate_biases(analysis.considered, J),

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Float
 
 from pipeline.calibrate.joint.lidar_radar.elevation_terms import (
     add_elevations,
@@ -29,7 +30,6 @@ from pipeline.calibrate.joint.lidar_radar.problem import (
     RadarState,
     Sums,
 )
-from pipeline.calibrate.joint.part_turn import PartTurn
 from pipeline.calibrate.numerics.bias_floors import (
     OUTLIER_DENSITY,
     PRIOR_CONTRADICTION_SIGMAS,
@@ -40,7 +40,7 @@ from pipeline.objective.radar.registration import NormalEquations, normal_equati
 from pipeline.objective.radar.vehicle_boxes import BIAS_SIGMA_RAD
 from pipeline.rig.changes import change_between, change_jacobian
 
-__all__ = ["linearise"]
+__all__ = ["linearise", "planar_gradient"]
 
 
 def linearise(problem: RadarProblem, state: RadarState, widen: float, stride: int = 1) -> Linear:
@@ -52,42 +52,41 @@ def linearise(problem: RadarProblem, state: RadarState, widen: float, stride: in
         widen: of the registration's sigmas; only at 1 do moving clusters take part.
         stride: use every n-th static detection.
     """
-    F = len(problem.observations)
-    sums = Sums(
-        np.zeros((F, UNKNOWNS, UNKNOWNS)),
-        np.zeros((F, UNKNOWNS, UNKNOWNS)),
-        np.zeros((F, UNKNOWNS)),
-        np.zeros((UNKNOWNS, UNKNOWNS)),
-        np.zeros((UNKNOWNS, UNKNOWNS)),
-    )
-    about_radar = np.linalg.inv(change_jacobian(state.T_lidar_radar))
-    equations = _registration(problem, state, widen, stride, about_radar)
-    _add_azimuths_and_ranges(problem, equations, stride, sums)
-    floor = problem.spread.floor(float(state.sigma[1]), problem.spacing_rad)
-    floor[1] = np.hypot(floor[1], problem.doubt_rad.get("registration", 0.0))
-    registration_step = add_elevations(problem, state, equations, stride, floor, sums)
-    travel_scatter, by_travel = add_travel(problem, state, sums)
-    by_heights = add_heights(problem, state, sums)
-    own = PartTurn("registration", float(registration_step[1]), float(floor[1]))
-    seen = own if problem.frames.has_elevation.any() and "static" in problem.terms else None
-    mover_sigma = float("nan")
-    if widen == 1.0 and "moving" in problem.terms:  # partners are found only once the clusters lie near them
-        mover_sigma = _add_movers(problem, state, about_radar, sums)
-    prior_information, prior_gradient = _prior_equations(problem, state)
+    sums, equations, mover_sigma = _planar(problem, state, widen, stride)
+    add_elevations(problem, state, equations, stride, sums)
+    travel_scatter = add_travel(problem, state, sums)
+    add_heights(problem, state, sums)
     return Linear(
         sums.H,
         sums.information,
         sums.g,
-        prior_information,
-        prior_gradient,
+        *_prior_equations(problem, state),
         equations,
         mover_sigma,
-        tuple(w for w in (seen, by_travel, by_heights) if w is not None),
-        0 if by_travel is None or problem.travel is None else problem.travel.count,
         travel_scatter,
         sums.floors,
         sums.floors - sums.of_day,
     )
+
+
+def planar_gradient(problem: RadarProblem, state: RadarState) -> Float[np.ndarray, " A"]:
+    """Gradient of the data by AZIMUTH_RANGE_DOF, to which elevations contribute nothing."""
+    g: np.ndarray = _planar(problem, state, 1.0, 1)[0].g.sum(0)
+    return g[AZIMUTH_RANGE_DOF]
+
+
+def _planar(
+    problem: RadarProblem, state: RadarState, widen: float, stride: int
+) -> tuple[Sums, NormalEquations, float]:
+    """Equations of yaw, x, y, dt and range bias; all of the registration's; the sigma of movers' azimuths [rad]."""
+    sums = Sums.none(len(problem.observations))
+    about_radar = np.linalg.inv(change_jacobian(state.T_lidar_radar))
+    equations = _registration(problem, state, widen, stride, about_radar)
+    _add_azimuths_and_ranges(problem, equations, stride, sums)
+    mover_sigma = float("nan")
+    if widen == 1.0 and "moving" in problem.terms:  # partners are found only once the clusters lie near them
+        mover_sigma = _add_movers(problem, state, about_radar, sums)
+    return sums, equations, mover_sigma
 
 
 def _registration(

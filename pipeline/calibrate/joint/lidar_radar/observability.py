@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipeline.calibrate.joint.lidar_radar.elevation_errors import following_tilt
-from pipeline.calibrate.joint.lidar_radar.normal_equations import linearise
+from pipeline.calibrate.joint.lidar_radar.normal_equations import planar_gradient
 from pipeline.calibrate.joint.lidar_radar.problem import (
     AZIMUTH_RANGE_DOF,
     DT,
@@ -20,14 +20,19 @@ from pipeline.calibrate.joint.lidar_radar.problem import (
     RadarProblem,
     RadarState,
 )
-from pipeline.calibrate.joint.lidar_radar.search import NONE_FIXED, better_time_offset, finish, last_step
+from pipeline.calibrate.joint.lidar_radar.search import (
+    NONE_FIXED,
+    OtherOffsets,
+    better_time_offset,
+    finish,
+    last_step,
+)
 from pipeline.calibrate.joint.part_turn import PartTurn
 from pipeline.calibrate.numerics.bias_floors import LIDAR_RADAR_BIAS, LIDAR_RADAR_DT_FLOOR_S
 from pipeline.calibrate.numerics.covariance import OBSERVABLE, covariance_with_fixed
 from pipeline.calibrate.numerics.frame_blocks import blocks_of
 from pipeline.calibrate.numerics.nuisances import Considered, considered_covariance, root_rows
 from pipeline.core.config import SolveConfig
-from pipeline.objective.radar.heights import Heights
 from pipeline.rig.common_share import prior_share
 
 __all__ = ["ObservabilityAnalysis", "analyse_observability", "with_measured_curvature"]
@@ -53,7 +58,7 @@ def with_measured_curvature(
     for column, k in enumerate(dof):
         step = np.zeros(UNKNOWNS)
         step[k] = 0.05 * STEP_LIMIT[k]
-        ahead, behind = (_gradient(problem, state.moved(s)) for s in (step, -step))
+        ahead, behind = (planar_gradient(problem, state.moved(s)) for s in (step, -step))
         measured[:, column] = (ahead - behind) / (2 * step[k])
     # A standing car has no information on dt: what is added is far below any prior.
     L = np.linalg.cholesky(total + np.diag(1e-3 / STEP_LIMIT[dof] ** 2))
@@ -65,11 +70,6 @@ def with_measured_curvature(
         (root * np.clip(values, *_MEASURED_SHARE)) @ root.T - total
     ) / len(out)
     return out
-
-
-def _gradient(problem: RadarProblem, state: RadarState) -> np.ndarray:
-    g = linearise(problem, state, 1.0).g
-    return g.sum(0)[AZIMUTH_RANGE_DOF]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -91,8 +91,8 @@ class ObservabilityAnalysis:
     of_scenes: np.ndarray  # P P, of the covariance what all frames of the day err by alike
     fixed: np.ndarray  # P, bool
     observability: np.ndarray  # 7, of pose and dt
-    sources: tuple[PartTurn, ...]  # of pitch, asked where the car's way had no say yet
-    heights: Heights | None
+    problem: RadarProblem
+    sources: tuple[PartTurn, ...] = ()  # of pitch, asked where the car's way had no say yet
     dt_weight: float = 1.0  # of the day's time offset against the expected one
 
 
@@ -107,7 +107,7 @@ def analyse_observability(
         if fixed.any() and not fixed[DT]:
             # While free, x had followed dt through their valley; with x back at the prior, dt may be out of reach.
             state = state.with_fixed(problem.prior, fixed)
-            state = better_time_offset(problem, state) or state
+            state = better_time_offset(OtherOffsets(problem, state)) or state
         # Once the radar's sigmas are estimated they stay, so that solutions can be compared.
         sharpen = problem.travel is None and problem.heights is None and not fixed.any()
         state, linear = finish(problem, state, fixed, sharpen=sharpen)
@@ -147,8 +147,7 @@ def analyse_observability(
         floors + considered_covariance(added),
         fixed,
         observability,
-        linear.sources,
-        problem.heights,
+        problem,
     )
 
 

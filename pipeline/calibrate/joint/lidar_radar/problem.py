@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from pipeline.calibrate.joint.lidar_radar.elevation_errors import ElevationSpread, SeenLow
-from pipeline.calibrate.joint.part_turn import PartTurn
 from pipeline.core.config import TERMS
 from pipeline.objective.radar.heights import Heights
 from pipeline.objective.radar.moving_clusters import MovingClusters
@@ -131,9 +130,6 @@ class Linear:
     prior_gradient: np.ndarray  # P
     registration: NormalEquations
     mover_sigma_rad: float
-    # 3: where the registration's elevations alone would move roll, pitch (about the radar's own axes), z
-    sources: tuple[PartTurn, ...]  # of pitch
-    travel_frames: int
     travel_scatter_rad: float  # of the frames' ways beyond their own sigmas
     # P P: scatter of the total gradient by what all frames of elevation's sources err by; of that, what all days share.
     floors: np.ndarray
@@ -149,3 +145,10 @@ class Sums:
     g: np.ndarray  # F P
     floors: np.ndarray  # P P
     of_day: np.ndarray  # P P, of the floors what is another on every day
+
+    @classmethod
+    def none(cls, frames: int) -> Sums:
+        """Without any term."""
+        square = (UNKNOWNS, UNKNOWNS)
+        shapes = (frames, *square), (frames, *square), (frames, UNKNOWNS), square, square
+        return cls(*(np.zeros(shape) for shape in shapes))

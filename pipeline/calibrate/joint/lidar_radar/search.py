@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -31,6 +32,7 @@ from pipeline.rig.se3 import exp_so3, from_rotation_translation
 
 __all__ = [
     "NONE_FIXED",
+    "OtherOffsets",
     "anneal",
     "better_time_offset",
     "comparison_cost",
@@ -89,27 +91,60 @@ def scan_time_offset(problem: RadarProblem, state: RadarState, widen: float) -> 
     return replace(state, dt_s=float(offsets[int(np.argmin(value))]))
 
 
-def better_time_offset(problem: RadarProblem, state: RadarState) -> RadarState | None:
+class OtherOffsets:
+    """A solution at other time offsets, itself in the middle.
+
+    Args:
+        near: which of them are within two sigmas of what is expected.
+    """
+
+    def __init__(self, problem: RadarProblem, state: RadarState) -> None:
+        step_s = _step_s(problem.frames, SCHEDULE.dt_compare_step_m)
+        self.middle = int((2 * problem.dt_sigma_s + abs(state.dt_s)) / step_s) + SCHEDULE.dt_dip_steps
+        steps = range(-self.middle, self.middle + 1)
+        self.problem, self.states = problem, [replace(state, dt_s=state.dt_s + step_s * k) for k in steps]
+        self.near = np.array([abs(other.dt_s) <= 2 * problem.dt_sigma_s for other in self.states])
+
+    def depth(self) -> Float[np.ndarray, "K F"]:
+        """Depth of each frame's dip, at equal sigmas for all states."""
+        return dips(np.array([comparison_cost(self.problem, state) for state in self.states]))
+
+    @cached_property
+    def own_depth(self) -> Float[np.ndarray, "K F"]:
+        """The same at the radar's own sigmas, from few detections, because it is used for confirmation only."""
+        found = []
+        for state in self.states:
+            sigma = np.maximum(state.sigma, 0.5 * REGISTRATION_COMPARISON_SIGMA)  # dips as wide as steps
+            about = (
+                self.problem.frames,
+                state.T_lidar_radar,
+                state.dt_s,
+                sigma,
+                OUTLIER_DENSITY,
+                _OWN_STRIDE,
+            )
+            found.append(registration_cost(*about, state.range_bias_m))
+        return dips(np.array(found))
+
+
+def better_time_offset(others: OtherOffsets) -> RadarState | None:
     """The state with another time offset, if the frames' cost dips clearly deeper there.
 
     Sharp sigmas reach half a metre: at 30 m/s an error of 20 ms is beyond that, and would stay. Dips are
     searched twice: at equal sigmas for all states, and, without a result, at the radar's own.
     """
-    others, near = _others(problem, state)
-    count = len(others) // 2
-    for cost, clearly in ((comparison_cost, _CLEARLY), (_own_cost, _CLEARLY_BY_OWN)):
-        depth = dips(np.array([cost(problem, other) for other in others]))
-        depth -= depth[count]  # the solution's own
-        best = int(np.argmin(np.where(near, depth.mean(1), np.inf)))
-        if abs(best - count) > 1 and depth[best].mean() < -clearly * depth[best].std() / np.sqrt(
-            depth.shape[1]
-        ):
-            return others[best]
+    for by_own, clearly in ((False, _CLEARLY), (True, _CLEARLY_BY_OWN)):
+        depth = others.own_depth if by_own else others.depth()
+        depth = depth - depth[others.middle]
+        best = int(np.argmin(np.where(others.near, depth.mean(1), np.inf)))
+        error = depth[best].std() / np.sqrt(depth.shape[1])
+        if abs(best - others.middle) > 1 and depth[best].mean() < -clearly * error:
+            return others.states[best]
     return None
 
 
 def time_offset_scatter_s(
-    problem: RadarProblem, state: RadarState, block: Int[np.ndarray, " F"], rng: np.random.Generator
+    others: OtherOffsets, block: Int[np.ndarray, " F"], rng: np.random.Generator
 ) -> float:
     """Scatter [s] of the deepest dip about a solution's time offset, over resampled blocks of frames.
 
@@ -117,25 +152,16 @@ def time_offset_scatter_s(
     off on eleven drawn days, at sigmas of 3 to 11, the width of one dip. Blocks of frames disagree about which
     dip is the deepest.
     """
-    others, near = _others(problem, state)
-    near[len(others) // 2] = True  # the solution, however far it is from what is expected
-    depth = dips(np.array([_own_cost(problem, other) for other in others]))[near]
-    dt_s = np.array([other.dt_s for other, is_near in zip(others, near, strict=True) if is_near])
+    near = others.near.copy()
+    near[others.middle] = True  # the solution, however far it is from what is expected
+    dt_s = np.array([state.dt_s for state in others.states])[near]
     _, index = np.unique(block, return_inverse=True)
     blocks = int(index.max()) + 1
     by_block = np.zeros((blocks, len(dt_s)))
-    np.add.at(by_block, index, depth.T)
+    np.add.at(by_block, index, others.own_depth[near].T)
     drawn = rng.multinomial(blocks, np.full(blocks, 1 / blocks), size=_RESAMPLES)
     deepest = dt_s[np.argmin(drawn @ by_block, axis=1)]
-    return float(np.sqrt(np.mean((deepest - state.dt_s) ** 2)))
-
-
-def _others(problem: RadarProblem, state: RadarState) -> tuple[list[RadarState], Bool[np.ndarray, " K"]]:
-    """A solution at other time offsets, itself in the middle, and which are within two sigmas of what is expected."""
-    step_s = _step_s(problem.frames, SCHEDULE.dt_compare_step_m)
-    count = int((2 * problem.dt_sigma_s + abs(state.dt_s)) / step_s) + SCHEDULE.dt_dip_steps
-    others = [replace(state, dt_s=state.dt_s + step_s * k) for k in range(-count, count + 1)]
-    return others, np.array([abs(other.dt_s) <= 2 * problem.dt_sigma_s for other in others])
+    return float(np.sqrt(np.mean((deepest - others.states[others.middle].dt_s) ** 2)))
 
 
 def far_time_offset(problem: RadarProblem, state: RadarState) -> dict[str, float]:
@@ -158,13 +184,6 @@ def far_time_offset(problem: RadarProblem, state: RadarState) -> dict[str, float
         "own_dt_s": float(offsets[best]) - problem.constant_gap_s,
         "own_dt_z": float(deeper.mean() / error),
     }
-
-
-def _own_cost(problem: RadarProblem, state: RadarState) -> Float[np.ndarray, " F"]:
-    """Cost of each frame at the radar's own sigmas, from few detections, because it is used for confirmation only."""
-    sigma = np.maximum(state.sigma, 0.5 * REGISTRATION_COMPARISON_SIGMA)  # dips as wide as steps
-    T, dt_s = state.T_lidar_radar, state.dt_s
-    return registration_cost(problem.frames, T, dt_s, sigma, OUTLIER_DENSITY, _OWN_STRIDE, state.range_bias_m)
 
 
 def comparison_cost(problem: RadarProblem, state: RadarState) -> Float[np.ndarray, " F"]:
