@@ -66,7 +66,7 @@ def check(fleet: Path, /, *logs: Path, rig: str | None = None, json: bool = Fals
 def _following(report: CheckReport, fleet: Path, logs: tuple[Path, ...]) -> list[str]:
     """Next steps: what to correct, and then this check again; else labels for cameras, and the night."""
     if report.corrections:
-        again = f"boresight check {fleet} {' '.join(map(str, logs[:2]))}{' ...' if len(logs) > 2 else ''}"
+        again = f"boresight check {fleet} {' '.join(map(str, logs))}"
         return [*report.corrections, again]
     unlabelled = any("boresight models --fetch" in why for v in report.verdicts for why in v.reasons)
     fetch = ["boresight models --fetch"] if unlabelled else []

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any, TextIO
 
-from cyclopts import App, CycloptsError
+from cyclopts import App, CycloptsError, UnusedCliTokensError
 
 from jobs.terminal.logging import configure, logger
 from jobs.terminal.summary import is_terminal, print_summary
@@ -24,6 +24,7 @@ from pipeline.store.atomic_write import NO_SPACE
 __all__ = ["COMMANDS", "app", "main"]
 
 FAILED, USAGE, INTERRUPTED, TERMINATED = 1, 2, 130, 143
+_UNQUOTED = " Put a pattern of --logs in quotes, else the shell replaces it by paths."
 _OUTPUTS = ("--out", "--page", "--report")
 
 # Command -> its line in `boresight --help`.
@@ -99,7 +100,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             app[command].help = None  # so the function's own text is shown; the line above is for the list
         result: Any = app(tokens, exit_on_error=False, print_error=False)
     except CycloptsError as err:
-        code, reason = USAGE, str(err)
+        code, reason = USAGE, f"{err}{_UNQUOTED if isinstance(err, UnusedCliTokensError) else ''}"
     except BoresightError as err:
         code, reason = err.exit_code, str(err)
     except KeyboardInterrupt:

@@ -34,7 +34,7 @@ def init(*logs: Path, out: Path = Path("fleet.toml"), name: str = "fleet", force
     with atomic_write(out) as file:
         file.write(proposal.text.encode())
     read = proposal.logs
-    some = " ".join(str(p) for p in read[:2]) + (" ..." if len(read) > 2 else "")
+    some = " ".join(str(p) for p in read[:8])
     unlabelled = any(": semantics" in what for what in proposal.missing)
     fetch = ["boresight models --fetch"] if unlabelled else []
     print_summary(

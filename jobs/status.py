@@ -14,6 +14,7 @@ from rich.text import Text
 
 from jobs.terminal.summary import exit_code, left_out, print_summary
 from jobs.terminal.vehicle_status import next_steps, require_vehicle, status_lines, told_of
+from pipeline.audit.restarts import events_until
 from pipeline.fleet.status import DayStatus, day_statuses
 from pipeline.store.corrections import read_corrections
 from pipeline.store.partitions import Lake, check_day, days_after
@@ -59,7 +60,7 @@ def status(
     if vehicle is not None and not (found or findings):
         require_vehicle(tables, vehicle)
     mend = {v: what for v, what in read_corrections(tables, to_day).items() if vehicle in (None, v)}
-    steps = next_steps(findings, lake, mend)
+    steps = next_steps(findings, lake, mend, _unaudited(findings, tables))
     if not json:
         _print_table(found, [*status_lines(findings), *map(escape, steps)])
     damaged = left_out(tables)
@@ -80,6 +81,16 @@ def status(
         **({"days": [asdict(s) for s in found]} if json else {}),
     )
     return exit_code([ended])
+
+
+def _unaudited(findings: Sequence[DriftFinding], lake: Lake) -> dict[str, str]:
+    """A step for each vehicle with a service event that was recorded after its audit."""
+    audited = {finding.vehicle: finding.asserted_at for finding in findings}
+    return {
+        vehicle: f"{vehicle}: {last.kind} of {last.sensor} on {last.day} is not audited yet: run `boresight audit`"
+        for vehicle, events in events_until(lake, None).items()
+        if (last := max(events, key=lambda e: e.asserted_at)).asserted_at > audited.get(vehicle, "9")
+    }
 
 
 def _audited_method(lake: Lake, others: set[str]) -> str:

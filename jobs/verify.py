@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
+from math import isnan
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -115,8 +116,10 @@ def verify(
                 view = in_use_view(answer_of(checks), [asdict(c) for c in checks], errors_in_words(checks))
                 write_day_page(task.lake, task.partition, config, page, "joint", in_use=view)
     answer, sensors = answer_of(checks), answers_by_sensor(checks) if of_sensors else {}
-    reason = "; ".join(sorted({r.reason for r in records if r.status == "refused"}))
-    told: dict[str, Any] = {"vehicle": name, "reason": reason, "page": page}
+    refused = sorted({r.reason for r in records if r.status == "refused"})
+    undecided = [f"{c.pair} {c.axis}: {c.reason}" for c in checks if c.status == "inconclusive"]
+    reason = {"right": [], "wrong": errors_in_words(checks), "inconclusive": undecided}[answer]
+    told: dict[str, Any] = {"vehicle": name, "reason": "; ".join([*refused, *reason]), "page": page}
     told |= {"wrong_sensors": wrong_sensors(checks), "errors": errors_in_words(checks)}
     told |= {"next_steps": [_NEXT_STEPS[answer]] if answer in _NEXT_STEPS else []}
     told |= {"sensors": sensors} if of_sensors else {}
@@ -197,7 +200,8 @@ def _print_table(checks: list[AxisCheck], answer: str, sensors: Mapping[str, str
         # Text: rich reads square brackets as styles.
         table.add_column(Text(heading), justify="right" if "deg" in heading else "left")
     for c in checks:
-        numbers = [f"{degrees(v):.2f}" for v in (abs(c.off_rad), c.sigma_rad, c.shown_rad)]
+        found = [degrees(v) for v in (abs(c.off_rad), c.sigma_rad, c.shown_rad)]
+        numbers = ["-" if isnan(value) else f"{value:.2f}" for value in found]
         table.add_row(c.pair, c.axis, f"[{_COLOUR[c.status]}]{c.status}[/]", *numbers)
     console = Console(stderr=True)
     console.print(table)

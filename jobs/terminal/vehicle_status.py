@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from shlex import quote
+from types import MappingProxyType
 from typing import Any
 
 from rich.markup import escape
@@ -21,6 +22,7 @@ from schemas.states import STATES
 
 __all__ = ["count_statuses", "moved_sensors", "next_steps", "require_vehicle", "status_lines", "told_of"]
 
+_NONE: Mapping[str, str] = MappingProxyType({})
 _STEPS = 40  # vehicles whose next steps are printed; the others are counted
 
 
@@ -53,19 +55,22 @@ def told_of(findings: Sequence[DriftFinding]) -> dict[str, Any]:
 
 
 def next_steps(
-    findings: Sequence[DriftFinding], lake: str, mend: Mapping[str, str] | None = None
+    findings: Sequence[DriftFinding],
+    lake: str,
+    mend: Mapping[str, str] = _NONE,
+    unaudited: Mapping[str, str] = _NONE,
 ) -> list[str]:
     """A sentence with the next command for each vehicle that is not GREEN, the most urgent first.
 
     Before them what `mend` has: corrections by vehicle, which no further day of an UNKNOWN one replaces.
+    `unaudited`: steps of vehicles whose status is older than their last service event.
     """
-    mend = mend or {}
     first = correction_steps(mend)
     rows = _by_vehicle(findings)
     status = {vehicle: status_of(own).status for vehicle, own in rows.items()}
     waiting = {vehicle for vehicle in mend if status.get(vehicle) == "UNKNOWN"}
     urgent = sorted(rows.keys() - waiting, key=lambda v: (DRIFT_STATUSES.index(status[v]), v))
-    steps = [step for vehicle in urgent if (step := next_step(rows[vehicle], lake))]
+    steps = [step for vehicle in urgent if (step := unaudited.get(vehicle) or next_step(rows[vehicle], lake))]
     left = len(steps) - _STEPS
     more = [f"and {left} other vehicles: `boresight status --lake {quote(lake)} --vehicle VEHICLE`"]
     return first[:_STEPS] + steps[:_STEPS] + more * (left > 0)

@@ -135,7 +135,7 @@ def _absent(lake: Lake, partition: Partition) -> dict[str, str]:
 def _told(records: Sequence[CalibrationRecord]) -> Told:
     counts = {status: sum(r.status == status for r in records) for status in STATUSES}
     unlabelled = [f"{r.parent_frame}: {WITHOUT_LABELS}" for r in records if WITHOUT_LABELS in r.notes]
-    reasons = [f"{words_of(edge_of(r))}: {r.reason}" for r in records if r.reason]
+    reasons = [f"{words_of(edge_of(r))}: {r.reason}" for r in records if r.reason and r.status != "accepted"]
     return Told(
         counts,
         dict(records[0].frames_rejected) if records else {},

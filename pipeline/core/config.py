@@ -201,7 +201,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text())
     except FileNotFoundError as err:
-        raise ConfigError(str(path), "", "no such file") from err
+        raise ConfigError(str(path), "", "no such file (`boresight init` writes a fleet.toml)") from err
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, IsADirectoryError) as err:
         raise ConfigError(str(path), "", f"not a TOML file: {err}") from err
 

@@ -129,7 +129,9 @@ def _records(lake: Lake, vehicle: str, day: str, method: str) -> list[Calibratio
     found = [r for r in records if r.method == method]
     if not found:
         methods = sorted({r.method for r in records})
-        there = f"; there are records of {', '.join(methods)}" if methods else ""
+        others = read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle=vehicle)
+        last = sorted({r.day for r in others if r.method == method})[-3:]
+        there = f"; there are records of {', '.join(methods or last)}" if methods or last else ""
         raise ConfigError(
             "command line", "day", f"the lake has no record of {vehicle} {day} by {method}{there}"
         )

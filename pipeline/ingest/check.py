@@ -16,6 +16,7 @@ from pipeline.core.errors import ConfigError, SolveError
 from pipeline.core.results import Progress, silent
 from pipeline.ingest.directions_and_units import prior_transform
 from pipeline.ingest.index import DayIndex, index_logs
+from pipeline.ingest.messages.radar import CORRECT_FIELD
 from pipeline.ingest.moments import MomentBuilder, spread
 from pipeline.ingest.readiness import DofVerdict, Evidence, Unheard, overall, unheard_topics
 from pipeline.ingest.rig_sample import RigFinding, RigSample
@@ -123,7 +124,7 @@ def check_logs(
     silent |= _of_another_unit(rejected + builder.counts, rig, index.problems, shown)
     rows = builder.prior.rows()
     present = [frozenset(a.places) for a in anchored]
-    prior = _prior(rows, fleet, rig, index.problems)
+    prior = _prior(rows, fleet, rig, index.problems) if built else None
     of_tracks = {t.topic for t in topics if any(kind.endswith("RadarTracks") for kind in t.types)}
     tracked = [name for name, radar in rig.radars.items() if radar.points in of_tracks]
     sample = RigSample(rig, built, len(picked), present, logged_stars(rows), prior, silent, tracked)
@@ -142,18 +143,24 @@ def check_logs(
         rejected={str(k): int(v) for k, v in (rejected + index.damage + without).items() if v},
         problems=index.problems,
         advice=[*sample.advice, *_advice(first, rig, topics, sample.whole.frames)],
-        corrections=_corrections(unheard, sample),
+        corrections=_corrections(unheard, sample, index.problems, {p.name for p in logs}),
     )
 
 
-def _corrections(unheard: Sequence[Unheard], sample: RigSample) -> list[str]:
-    """Mistakes that no further drive mends: topics, signs and units, a missing prior."""
+def _corrections(
+    unheard: Sequence[Unheard], sample: RigSample, problems: Sequence[str], names: Collection[str]
+) -> list[str]:
+    """Mistakes that no further drive mends: topics, fields, signs and units, a missing prior, unusable logs."""
     found = [str(u) for u in unheard if u.is_misconfigured]
+    found += [p for p in problems if p.endswith(CORRECT_FIELD)]
+    if not sample.built:
+        of_logs = [p for p in problems if Path(p.split(":")[0]).name in names]
+        return found or [f"{p}: copy or record this log again" for p in of_logs]
     for of in sample.evidence.values():
         found += [of.doppler_problem] if of.doppler_is_wrong else []
         found += of.wrong
     untied = [sample.name(edge) for edge, of in sample.evidence.items() if of.frames and not of.has_prior]
-    if untied or (sample.prior is None and sample.built):
+    if untied or sample.prior is None:
         found.append(f"{no_prior(', '.join(untied) or 'any pair')} (`boresight import` writes such a file)")
     return list(dict.fromkeys(found))
 

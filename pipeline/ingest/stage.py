@@ -15,6 +15,7 @@ from pipeline.core.errors import ConfigError
 from pipeline.core.stage_work import NothingUsable, Run, Task, Work
 from pipeline.ingest.containers.reader import content_identity, leads_nowhere
 from pipeline.ingest.index import DayIndex, index_logs
+from pipeline.ingest.messages.radar import CORRECT_FIELD
 from pipeline.ingest.moments import REPEATED, Anchored, MomentBuilder, spread
 from pipeline.ingest.readiness import Unheard, unheard_topics
 from pipeline.ingest.roles import NEEDED, topics_of
@@ -115,7 +116,10 @@ def _rows(
         run.extra[PRIOR] = builder.prior.rows()
         run.extra[TF] = builder.prior.frames_above()
         run.extra[SENSORS_ABSENT] = _absences(index, rig, builder.counts, config, unheard)
-        run.extra[STATED_FAULTS] = ["configuration"] if any(u.is_misconfigured for u in unheard) else []
+        mistaken = any(u.is_misconfigured for u in unheard) or any(
+            p.endswith(CORRECT_FIELD) for p in index.problems
+        )
+        run.extra[STATED_FAULTS] = ["configuration"] if mistaken else []
         run.remarks = _shorten(index.problems)
     finally:
         index.close()

@@ -218,10 +218,9 @@ def errors_in_words(checks: Sequence[AxisCheck]) -> list[str]:
 
 def _sentence(sensors: tuple[str, ...], check: AxisCheck) -> str:
     size, limit = (f"{np.degrees(abs(rad)):.2f} deg" for rad in (check.off_rad, check.limit_rad))
-    if len(sensors) > 1:
-        return f"{' or '.join(sensors)}: {size} off in {check.axis} (limit {limit})"
-    is_left = (check.off_rad > 0) == (sensors[0] != check.sensors[0])
-    return f"{sensors[0]}: set {size} too far {_TOWARD[check.axis][not is_left]} (limit {limit})"
+    is_left = {s: (check.off_rad > 0) == (s != check.sensors[0]) for s in sensors}
+    set_so = [f"{s}: set {size} too far {_TOWARD[check.axis][not is_left[s]]}" for s in sensors]
+    return f"{', or '.join(set_so)} (limit {limit})"
 
 
 def _off(

@@ -148,6 +148,7 @@ def test_what_fleet_toml_has_wrong_of_a_radar_is_noticed_and_costs_its_pairs(
     report = report_on(kit, tmp_path, kit.Kit(frames=40).drive(), radar=radar)
     assert report.answer == answer
     assert words in "".join([report.evidence.doppler_problem, *report.problems])
+    assert words != "x, y, z, doppler, power" or words in report.corrections[0]  # before the next check
     refused = {v.pair for v in report.verdicts if v.verdict == "no"}
     assert answer == "yes" or refused >= {"lidar_radar", "camera_radar"}
 
@@ -165,6 +166,7 @@ def test_unusable_logs_are_a_no_and_missing_ones_a_mistake(kit, tmp_path):
     report = check_logs([tmp_path / "a.mcap"], config.rigs["default"], config)
     assert report.answer == "no"
     assert report.problems
+    assert ["a.mcap: is not a log" in c for c in report.corrections] == [True]  # and no other cause
     with pytest.raises(ConfigError, match="no such file"):
         check_logs([tmp_path / "none.mcap"], config.rigs["default"], config)
 

@@ -96,6 +96,10 @@ def test_a_red_vehicle_says_what_to_do_with_the_commands(lake, tmp_path, capsys)
     command = next_steps(rows, str(own.root))[0].split("`")[1]
     assert main(shlex.split(command)[1:]) == 0
     assert "run `boresight audit`, or wait for the next night" in capsys.readouterr().out
+    assert main(["status", "--lake", str(own.root), "--vehicle", "red"]) == 0
+    assert (
+        "repair of radar on 2026-03-06 is not audited yet: run `boresight audit`" in capsys.readouterr().out
+    )
     assert status_of(stored(own)["red"]).status == "RED"
     audit_fleet(own, _config())
     assert status_of(stored(own)["red"]).status == "UNKNOWN"  # its charts begin anew

@@ -146,7 +146,9 @@ def test_a_rolled_camera_is_named_with_the_lidar_where_no_other_pair_has_a_roll(
     checks = turned("camera", 2, 0.9)
     assert wrong_sensors(checks) == ["camera", "lidar"]
     [words] = errors_in_words(checks)
-    assert words.startswith("camera or lidar: 0.90 deg off in roll")
+    assert words.startswith(
+        "camera: set 0.90 deg too far clockwise, or lidar: set 0.90 deg too far counterclockwise"
+    )
 
 
 def test_the_answer_needs_every_axis_that_a_pair_is_good_for():

@@ -12,7 +12,9 @@ from jaxtyping import Float, Float32
 from pipeline.core.rigs import RadarTopics
 from pipeline.ingest.messages.point_cloud import cloud_columns, first_field, unit_that_fits, within
 
-__all__ = ["RadarCloud", "read_radar"]
+__all__ = ["CORRECT_FIELD", "RadarCloud", "read_radar"]
+
+CORRECT_FIELD = "correct the field in fleet.toml"  # end of a reason that no other log mends
 
 _POWER = ("power", "rcs", "amplitude", "intensity", "snr", "snr_db", "power_db")
 _DROPPED = ("radar_points_not_finite", "radar_points_at_no_range", "radar_points_beyond_range")
@@ -69,7 +71,8 @@ def _cloud(message: Any, config: RadarTopics) -> _Columns:
     unknown = [repr(name) for name in moving if name not in names]
     if unknown:
         what = "the Doppler" if config.velocity_fields is None else "the velocity"
-        raise ValueError(f"no field {', '.join(unknown)} for {what}; there are {', '.join(names) or 'none'}")
+        there = f"there are {', '.join(names) or 'none'}"
+        raise ValueError(f"no field {', '.join(unknown)} for {what}; {there}: {CORRECT_FIELD}")
     missing = [n for n in ("x", "y") if n not in names]
     if missing:
         raise ValueError(f"no field {' and '.join(missing)}; there are {', '.join(names)}")

@@ -59,11 +59,10 @@ def propose_fleet(logs: Sequence[Path], fleet: str, progress: Progress = silent)
     found = find_sensors(survey)
     names = names_of(found)
     if len(names) < 2:
-        seen = ", ".join(f"{t.name} ({t.msgtype})" for t in survey.topics.values()) or "no topic that is read"
-        said = "; ".join(
-            [f"there are {seen}", *survey.problems[:3], *left_out(found)[:3], *found.passed_over[:5]]
-        )
-        raise ConfigError(str(logs[0]), "LOG", f"fewer than two of camera, lidar and radar; {said}")
+        seen = ", ".join(f"{t.name} ({t.msgtype})" for t in survey.topics.values())
+        said = [*survey.problems[:3], *left_out(found)[:3], *found.passed_over[:5]]
+        said += [f"fewer than two of camera, lidar and radar; there are {seen or 'no topics'}"]
+        raise ConfigError("command line", "LOG", "; ".join(said))
     static, tree = _static(survey)
     tied_to = next((s.frame_id for s in [*found.lidars, *found.radars] if s.frame_id), "")
     untied = {n: s.frame_id for n, s in names.items() if tree.lookup(tied_to, s.frame_id) is None}
