@@ -139,8 +139,8 @@ class CalibrationRecord(Posed):
     half_days: np.ndarray | None = array(
         "<f8",
         (2, 2, 6),
-        "for a day in which a sensor moved: change of the estimate by its first and by its last part (rx ry rz "
-        "[rad], tx ty tz [m] of the child's origin, parent axes), and its sigmas; null on other days",
+        "for a day in which a sensor moved: change of the estimate by the first and the last part of the day; its "
+        "sigmas; rx ry rz [rad], tx ty tz [m] of the child's origin, parent axes; null on other days",
         default=None,
     )
     innovation_sigmas: float | None = column(

@@ -49,7 +49,7 @@ NUISANCES: Final = {
     "positions": Nuisance(EDGE, "CAMERA_LIDAR_BIAS: the same, as shifts"),
     "borders": Nuisance(EDGE, "BORDER_SHARE x scatter of the pulls of sides, ranges and halves of the image"),
     "along_paint": Nuisance(EDGE, "gradients along lines, which only run ahead"),
-    "travel": Nuisance(EDGE, "CAMERA_LIDAR_DT_FLOOR_S x way driven in it"),
+    "travel": Nuisance(EDGE, "CAMERA_LIDAR_DT_FLOOR_S x distance driven in it"),
     "traffic": Nuisance(EDGE, "the time offset, and the pose with it, without either half of the image"),
     "optical_axis": Nuisance(
         EDGE, "what edges and markings err by alike in tz: `profiles`, TZ_COMMON_BIAS_M"

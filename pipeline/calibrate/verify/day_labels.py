@@ -97,8 +97,8 @@ class LabelOffset:
             self.shift_px, self.shift_sigma_px, self.ends_px, self.ends_sigma_px
         )  # fmt: skip
         return (
-            f"in the middle it lies {u:+.1f} +- {su:.1f} label px right of them and {v:+.1f} +- {sv:.1f} px below, "
-            f"at the right and lower end {a:+.1f} +- {sa:.1f} and {b:+.1f} +- {sb:.1f} px more"
+            f"in the middle the image is {u:+.1f} +- {su:.1f} label px right of and {v:+.1f} +- {sv:.1f} px below its "
+            f"labels; {a:+.1f} +- {sa:.1f} px more at the right border, {b:+.1f} +- {sb:.1f} px more at the lower one"
         )
 
 
