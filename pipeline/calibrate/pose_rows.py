@@ -135,12 +135,12 @@ def _reversed(T: np.ndarray | None, *covariances: np.ndarray | None) -> tuple[np
 
 
 def _as_judged(row: PoseRow, concluded: Concluded | None) -> PoseRow:
-    """The pose with the verdict on its edge to the reference, unless other edges certify it without that edge."""
+    """The pose with the verdict on its edge to the reference, unless that shows nothing, or the others certify it."""
     if concluded is None or "refused" in (concluded.record.status, row.status):
         return row
-    if not concluded.is_adjusted and row.status == "accepted":
-        return row
     record = concluded.record
+    if not concluded.is_adjusted and (row.status == "accepted" or not any(record.observable or ())):
+        return row
     if concluded.is_adjusted:  # else the record's sigmas are of another pose
         row = replace(
             row, azimuth_sigma_rad=record.azimuth_sigma_rad, elevation_sigma_rad=record.elevation_sigma_rad

@@ -27,14 +27,15 @@ __all__ = ["EarlierGreys"]
 _KEPT_NS = 2 * 10**9
 _USER_IDS = tuple(range(11, 19))  # person .. bicycle
 _MARGIN_PX = 6  # about road users: corners of their outline, and their shadows
-_DRIVEN_M = 0.9
+_DRIVEN_M, _SAME_GREYS = 0.9, 0.5  # a bonnet's picture differs by its noise, a JPEG of the same one hardly
 
 
 class EarlierGreys:
     """Grey images of one camera's last moments at the size of tracking; asked in order of time."""
 
-    def __init__(self) -> None:
+    def __init__(self, readout_s: float = 0.0) -> None:
         self._greys: dict[int, np.ndarray] = {}
+        self._readout_s = readout_s  # of a rolling shutter, from the first row to the last
 
     def columns(
         self,
@@ -57,9 +58,8 @@ class EarlierGreys:
         try:
             tracks, motion = self._motion(image, grey, is_left_out)
         except NoMotionError as err:
-            is_driven = abs(image.ego_driven_m or 0.0) > _DRIVEN_M
-            is_same = err.reason == MotionReason.STANDING and is_driven
-            return {}, MotionReason.SAME_IMAGE if is_same else err.reason
+            is_of_car = err.reason == MotionReason.STANDING and _is_driven(image)
+            return {}, MotionReason.STATIC_TRACKS if is_of_car else err.reason
         finally:
             self._greys[image.stamp_ns] = grey
         assert image.earlier_stamp_ns is not None, "an earlier image was found"
@@ -87,12 +87,15 @@ class EarlierGreys:
         before = self._earlier(image, grey.shape)
         if before is None:
             raise NoMotionError(MotionReason.NO_EARLIER)
+        if _is_driven(image) and float(np.mean(cv2.absdiff(before, grey))) < _SAME_GREYS:
+            raise NoMotionError(MotionReason.SAME_IMAGE)
         camera = camera_of(image).scaled(grey.shape[1] / image.image_width_px)
         if is_left_out is not None and is_left_out.shape != grey.shape:
             small = is_left_out.astype(np.uint8)
             is_left_out = cv2.resize(small, grey.shape[::-1], interpolation=cv2.INTER_NEAREST).astype(bool)
         tracks = track(before, grey, camera, is_left_out)
-        return tracks, motion_of_tracks(tracks, (grey.shape[1], grey.shape[0]))
+        readout = self._readout_s / ((image.stamp_ns - image.earlier_stamp_ns) * 1e-9)
+        return tracks, motion_of_tracks(tracks, (grey.shape[1], grey.shape[0]), readout)
 
     def _earlier(self, image: Image, shape: tuple[int, ...]) -> np.ndarray | None:
         """The earlier image; None if its moment was not perceived, or it cannot be decoded."""
@@ -102,6 +105,10 @@ class EarlierGreys:
         if found is None or found.shape == shape:
             return found
         return np.asarray(cv2.resize(found, shape[::-1], interpolation=cv2.INTER_AREA))
+
+
+def _is_driven(image: Image) -> bool:
+    return abs(image.ego_driven_m or 0.0) > _DRIVEN_M
 
 
 def _users(

@@ -9,7 +9,7 @@ bearings will do, and its distortion plays no part.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import cv2
@@ -153,13 +153,14 @@ def _pixel_rad(rays: np.ndarray, camera: Camera) -> np.ndarray:
     return np.full(len(rays), 1 / focal) if camera.model == "equidistant" else cosine**1.5 / focal
 
 
-def motion_of_tracks(tracks: Tracks, size_px: tuple[int, int]) -> ImageMotion:
+def motion_of_tracks(tracks: Tracks, size_px: tuple[int, int], readout: float = 0.0) -> ImageMotion:
     """Motion that most tracks follow.
 
     Tracks that do not move may be of the car itself: they take part only where they fit what the others show.
 
     Args:
         size_px: width and height of the images of tracking.
+        readout: from the first row to the last of a rolling shutter, as a share of the time between both images.
 
     Raises:
         NoMotionError: with the reason why there is none.
@@ -167,6 +168,7 @@ def motion_of_tracks(tracks: Tracks, size_px: tuple[int, int]) -> ImageMotion:
     moving = _moving(tracks)
     strongest = tracks.some(moving & (np.cumsum(moving) <= _STRONGEST))
     turn, direction, noise_px, _ = solve_motion(strongest, *_by_ransac(strongest))
+    tracks = _at_once(tracks, turn, size_px[1], readout)
     used = moving | _follows(tracks, turn, direction, noise_px)
     turn, direction, noise_px, H = solve_motion(tracks.some(used), turn, direction)
     inlier = used & _follows(tracks, turn, direction, noise_px)
@@ -192,6 +194,16 @@ def motion_of_tracks(tracks: Tracks, size_px: tuple[int, int]) -> ImageMotion:
         len(np.unique(cells, axis=0)) / float(np.prod(_CELLS)),
         float(np.median(parallax_px[inlier])),
     )
+
+
+def _at_once(tracks: Tracks, turn: np.ndarray, height_px: int, readout: float) -> Tracks:
+    """Bearings as if all rows were exposed with the middle one: turns are even, and ways keep their direction."""
+    rows = np.stack([tracks.before_px, tracks.now_px])[..., 1:]
+    turns = ((rows + 0.5) / height_px - 0.5) * readout * turn
+    before, now = (
+        rays + np.cross(by, rays) for by, rays in zip(turns, (tracks.before, tracks.now), strict=True)
+    )
+    return replace(tracks, before=before, now=now)
 
 
 def _follows(

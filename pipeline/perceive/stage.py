@@ -147,6 +147,7 @@ class Sources:
     radars: Mapping[str, DrivableSource | None]
     config: PerceiveConfig
     deskew: bool = True
+    readouts_s: Mapping[str, float] = field(default_factory=dict)  # of rolling shutters
     earlier: dict[str, EarlierGreys] = field(default_factory=dict)  # of the day so far
 
     def remarks(self) -> list[str]:
@@ -213,7 +214,8 @@ def perceive_moment(
     features, notes = dict[str, Any](), list[str]()
     for camera, image in shown.of("camera", _less(asked, unusable)).items():
         try:
-            earlier = sources.earlier.setdefault(camera, EarlierGreys())
+            readout_s = sources.readouts_s.get(camera, 0.0)
+            earlier = sources.earlier.setdefault(camera, EarlierGreys(readout_s))
             features[camera], still = perceive_image(image, sources.cameras[camera], earlier, config)
             notes += [] if still is None else [f"{camera}_without_motion_{still.value}"]
         except FrameRejectedError as why:
@@ -297,7 +299,9 @@ def _sources(rig: Rig, fleet: FleetConfig) -> tuple[Sources, dict[str, Any]]:
         f"{s} turn": of.turn.model_dump(mode="json") for s, of in rig.lidars.items() if of.turn is not None
     }
     keys |= {name: model.provenance for name, model in (lidars | radars).items() if model is not None}
-    return Sources(cameras, lidars, radars, fleet.perceive, fleet.ingest.deskew), keys
+    readouts_s = {name: camera.readout_s for name, camera in rig.cameras.items() if camera.readout_s}
+    keys |= {f"{name} readout_s": readout_s for name, readout_s in readouts_s.items()}
+    return Sources(cameras, lidars, radars, fleet.perceive, fleet.ingest.deskew, readouts_s), keys
 
 
 def _source(

@@ -54,6 +54,12 @@ def simulated(folder):
     return sorted((folder / "made" / "logs").glob("*/*/*"))
 
 
+def no_lidar(folder):
+    spec = FleetSpec(vehicles=1, days=1, frames=24, drives=1, rig="no_lidar", environments="urban", seed=3)
+    kept_fleet(spec, folder / "made")
+    return sorted((folder / "made" / "logs").glob("*/*/*"))
+
+
 def real_car(folder):
     return [beginning(shared("astyx/astyx-1_2019-01-14_01.mcap"), folder, "astyx-1", "2019-01-14", 20)]
 
@@ -79,10 +85,11 @@ def kitti(folder):
     return [log]
 
 
-LOGS = {make.__name__: make for make in (simulated, real_car, other_world, nuscenes, kitti)}
+LOGS = {make.__name__: make for make in (simulated, no_lidar, real_car, other_world, nuscenes, kitti)}
 THREE = {"camera_lidar", "camera_radar", "lidar_radar"}
 PAIRS = {
     "simulated": THREE,
+    "no_lidar": {"camera_radar", "camera_base", "radar_base"},
     "real_car": THREE,
     "other_world": THREE,
     # Its cameras have no labels, so their borders are steps of brightness; its radar sees no clusters.
@@ -105,6 +112,14 @@ def test_logs_alone_lead_to_a_record(name, tmp_path, monkeypatch, capsys):
     records = said(capsys, "show", "calibrations", "--lake", "lake", "--json")
     computed = {r["pair"] for r in records if r["status"] in ("accepted", "held")}
     assert computed == PAIRS[name], {r["pair"]: (r["status"], r["reason"]) for r in records}
+    if name == "no_lidar":
+        state = said(capsys, "state", "--lake", "lake", "--json")
+        assert {"base", "front", "left", "right", "corner_fl", "corner_fr"} <= {
+            row["sensor"] for row in state
+        }
+        out = ["--out", "ros2", "--lake", "lake", "--vehicle", "vehicle-1"]
+        assert said(capsys, "export", "ros2", *out, codes=(0, 3, 4))["outputs"]
+        assert list(Path("lake/report").rglob("vehicle-1.html"))
     if name == "simulated":
         frames_reach_a_torch_loader(capsys)
 

@@ -2,11 +2,10 @@
 
 In straight driving the camera's translation is the base's x axis: yaw and pitch. In turns the camera also moves by
 the turn times its lever arm, as a radar does (`radar_base`). The axis about which the camera turns is the base's z
-axis: roll and pitch, over turns, in which a body leans by so much a g of lateral acceleration. The body's own pitch and
-roll are means over scenes. The amount of turn is
-compared with the car's yaw rate: over changes of the yaw rate it determines the clock, over turns a scale, which
-is that of the focal length. Position has no information. Labels, depths and other sensors' poses take no part, so the
-errors are this edge's own; an error of the intrinsics turns what any edge of the camera shows.
+axis: roll and pitch, over turns; a body leans by so much a g in them. The body's own pitch and roll are means over
+scenes. The amount of turn is compared with the car's yaw rate: over changes of the yaw rate it determines the clock,
+over turns a scale, which is that of the focal length. Position has no information. Labels, depths and other sensors'
+poses take no part, so the errors are this edge's own; an error of the intrinsics turns what any edge of it shows.
 """
 
 from __future__ import annotations

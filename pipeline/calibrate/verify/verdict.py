@@ -157,10 +157,13 @@ def _harmless(check: Check, result: EdgeResult, claims: Mapping[str, Claim]) -> 
 
 
 def _with_size(check: Check, result: EdgeResult, words: str) -> str:
-    """The check's sentence with the largest error that it shows at the targets, if it knows one."""
+    """The check's sentence with the largest error that it shows at the targets and knows to less than its size."""
     if check.error is None or not any(check.error):
         return check.sentence
-    off_rad, known_to_rad = max(at_targets(result, check).values(), key=lambda found: found[0])
+    known = [(off, sigma) for off, sigma in at_targets(result, check).values() if off > (sigma or 0.0)]
+    if not known:
+        return f"{check.sentence}: {words}"
+    off_rad, known_to_rad = max(known, key=lambda found: found[0])
     sigma = "" if known_to_rad is None else f" +- {np.degrees(known_to_rad):.2f}"
     return f"{check.sentence}: {np.degrees(off_rad):.2f}{sigma} deg at the targets, {words}"
 

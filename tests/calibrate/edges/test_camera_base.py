@@ -111,20 +111,12 @@ def test_the_way_between_two_images_is_that_of_a_path_that_begins_to_bend():
     assert np.arctan2(*found.T[::-1]) == pytest.approx(np.angle(path), abs=1e-4)
 
 
-def test_a_wrong_lever_arm_is_no_yaw():
-    T = mounted()
-    moved = T.copy()
-    moved[0, 3] += 1.0
-    error, sigma = error_and_sigma(estimate_camera_base(EDGE, day(T), start(moved)), T)
-    assert abs(error[2]) < 3 * sigma[2]
-
-
-def test_a_body_that_rolls_about_another_axis_is_no_yaw_and_hardly_noise():
-    T = mounted()
-    higher = T.copy()
-    higher[2, 3] += 0.4
-    plain, moved = (estimate_camera_base(EDGE, day(T, body_deg=0.4), start(of)) for of in (T, higher))
-    error, sigma = error_and_sigma(moved, T)
+@pytest.mark.parametrize(("off_m", "body_deg"), [((1.0, 0.0, 0.0), 0.1), ((0.0, 0.0, 0.4), 0.4)])
+def test_a_wrong_lever_arm_or_axis_of_rolling_is_no_yaw_and_hardly_noise(off_m, body_deg):
+    T, moved = mounted(), mounted()
+    moved[:3, 3] += off_m
+    plain, found = (estimate_camera_base(EDGE, day(T, body_deg=body_deg), start(of)) for of in (T, moved))
+    error, sigma = error_and_sigma(found, T)
     assert abs(error[2]) < 3 * sigma[2]
     assert sigma[2] < 1.3 * error_and_sigma(plain, T)[1][2]
 
@@ -197,7 +189,7 @@ def test_traffic_that_pulls_single_pairs_away_moves_little():
 def test_a_day_with_few_pairs_is_refused_with_the_number():
     T = mounted()
     few = CameraTravel(**{name: values[:5] for name, values in vars(day(T)).items()})
-    with pytest.raises(SolveError, match="5 of 8 pairs"):
+    with pytest.raises(SolveError, match=r"^5 .* 8 "):
         estimate_camera_base(EDGE, few, start(T))
 
 

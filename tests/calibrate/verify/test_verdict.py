@@ -86,7 +86,8 @@ def test_a_check_holds_where_the_pose_would_be_beyond_its_limits_if_it_is_right(
 
 @pytest.mark.parametrize(
     ("off_deg", "sigma_deg", "status"),
-    [(0.0, 0.12, "accepted"), (0.0, 0.16, "held"), (0.3, 0.01, "accepted"), (0.3, 0.05, "held"), (0.5, 0.01, "held")],
+    [(0.0, 0.12, "accepted"), (0.0, 0.16, "held"), (0.3, 0.01, "accepted"), (0.3, 0.05, "held"),
+     (0.5, 0.01, "held"), (0.8, 11.5, "held")],
 )  # fmt: skip
 def test_what_a_check_leaves_possible_counts_its_size_and_its_own_sigma_against_the_limit(
     off_deg, sigma_deg, status
@@ -101,7 +102,8 @@ def test_what_a_check_leaves_possible_counts_its_size_and_its_own_sigma_against_
     )
     found = verdict(estimate(pair="lidar_radar"), BETTER, [check], claims)
     assert found.status == status
-    assert f"{off_deg:.2f} +- {sigma_deg:.2f} deg at the targets" in found.reason or off_deg == 0
+    known = off_deg > sigma_deg  # else no size is stated
+    assert (f"{off_deg:.2f} +- {sigma_deg:.2f} deg at the targets" in found.reason) == known
 
 
 def test_a_radars_tilt_in_doubt_certifies_no_elevation_however_little_targets_see_of_it():
