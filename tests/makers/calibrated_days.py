@@ -36,11 +36,7 @@ def rig_prior_of(prior: Prior, sensors: Sequence[Sensor]) -> RigPrior:
 
 
 def records_of_rows(
-    rows: Sequence[Observation],
-    prior: Prior,
-    fleet: FleetConfig,
-    about: Inputs,
-    solver: Solver | None = None,
+    rows: Sequence[Observation], prior: Prior, fleet: FleetConfig, about: Inputs, solver: Solver | None = None
 ) -> list[CalibrationRecord]:
     """Records of the pairs `about.pairs` of sensors that are called by their kinds."""
     edges = tuple(EDGE_OF_PAIR[pair] for pair in about.pairs)

@@ -9,11 +9,7 @@ from pipeline.objective.radar.moving_clusters import (
     lidar_azimuth_residuals,
     moving_clusters,
 )
-from pipeline.objective.radar.vehicle_boxes import (
-    box_pairs,
-    elevation_residuals,
-    vehicle_boxes,
-)
+from pipeline.objective.radar.vehicle_boxes import box_pairs, elevation_residuals, vehicle_boxes
 from pipeline.rig.se3 import exp_se3
 from tests.makers.radar_scenes import DT_S, T_LIDAR_RADAR, street_day
 from tests.makers.solve_scenes import T_CAMERA_LIDAR

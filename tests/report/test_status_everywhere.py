@@ -121,23 +121,15 @@ def _row(status, reason, **rest):
 @pytest.mark.parametrize(
     ("row", "step"),
     [
-        (
-            _row("YELLOW", "one day stands out", vehicle_days_needed=1),
-            "tomorrow: `boresight status --lake L --vehicle v`.",
-        ),
-        (
-            _row("YELLOW", "a change below the limit", vehicle_sensor="camera", vehicle_since="2026-03-04"),
-            "`boresight service --lake L --vehicle v --day 2026-03-04 --kind re-mount --sensor camera`",
-        ),
-        (_row("UNKNOWN", "too few", vehicle_days_needed=2), "2 more accepted days"),
-        (
-            _row("UNKNOWN", "too few", vehicle_days_needed=335),
-            "335 more",
-        ),
+        (_row("YELLOW", "one day", vehicle_days_needed=1), "tomorrow: `boresight status --lake L --vehicle v`."),
+        (_row("YELLOW", "small", vehicle_sensor="camera", vehicle_since="2026-03-04"),
+         "`boresight service --lake L --vehicle v --day 2026-03-04 --kind re-mount --sensor camera`"),
+        (_row("UNKNOWN", "too few", vehicle_days_needed=2), "drive: 2 more accepted days required."),
+        (_row("UNKNOWN", "too few", vehicle_days_needed=335), "drive other roads: 335 more"),
         (_row("UNKNOWN", "too few", vehicle_days_needed=1), "1 more accepted day "),
         (_row("UNKNOWN", "no change; some of its records cannot be read"), "`boresight repair --lake L`"),
     ],
-)
+)  # fmt: skip
 def test_a_vehicle_that_is_yellow_or_unknown_has_a_next_step(row, step):
     assert step in next_step(row, "L")
 

@@ -5,10 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.calibrate.joint.camera_lidar.estimate import (
-    _usable,
-    align_camera_lidar,
-)
+from pipeline.calibrate.joint.camera_lidar.estimate import _usable, align_camera_lidar
 from pipeline.calibrate.joint.camera_lidar.observability import time_offset_variance
 from pipeline.calibrate.joint.camera_lidar.profiles import TimeOffsetProfile
 from pipeline.calibrate.numerics.search_range import search_range

@@ -7,11 +7,7 @@ import pytest
 import torch
 
 from pipeline.learn.network.class_matcher import NEUTRAL, ClassMatcher
-from pipeline.learn.network.least_squares import (
-    angular_jacobian,
-    small_rotation_vector,
-    spherical_jacobian,
-)
+from pipeline.learn.network.least_squares import angular_jacobian, small_rotation_vector, spherical_jacobian
 from pipeline.learn.network.matching_network import MatchingCore
 from pipeline.learn.network.occupancy_matcher import OccupancyMatcher, _away, _kernel
 from pipeline.learn.network.outputs import pose_of_twist

@@ -21,12 +21,7 @@ from pipeline.learn.perception_training.lidar_labels import (
     project_labels,
     standing_points,
 )
-from pipeline.learn.perception_training.lidar_semantics import (
-    SweepLayout,
-    SweepTraining,
-    cut,
-    day_images,
-)
+from pipeline.learn.perception_training.lidar_semantics import SweepLayout, SweepTraining, cut, day_images
 from pipeline.learn.perception_training.radar_drivable import (
     BLOCKED,
     FREE,
