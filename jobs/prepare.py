@@ -70,7 +70,7 @@ def prepare(
     config, tables = load_fleet(fleet), Lake.existing(lake)
     days = days_with_observations(config, tables, from_day, to_day, vehicles)
     for vehicle in {day.vehicle for day in days}:
-        config.rig_of(vehicle).one_of_each("training")
+        config.rig_of(vehicle).one_of_each(f"training on {vehicle}")
     config, planned, choices = _plan(config, tables, days)
     results: list[Outcome] = []
     for end in over_days("prepare", partial(try_stage, PREPARE), planned, executor, workers):

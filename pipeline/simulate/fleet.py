@@ -256,7 +256,9 @@ def _sections(rig: RigSpec) -> list[str]:
     head = f"[rigs.{rig.name}"
     sections = [f"{head}.{s.kind}{'' if rig.is_short else f's.{s.name}'}]\n{_sensor(s)}" for s in rig.sensors]
     if not rig.is_short:
-        sections.insert(0, f'{head}]\nreference = "{rig.reference.name}"\nbase = "base_link"\n')
+        first = [next((s.name for s in rig.of_kind(kind)), "") for kind in ("camera", "lidar", "radar")]
+        three = f"three = {json.dumps(first)}\n" if all(first) else ""  # for training and its networks
+        sections.insert(0, f'{head}]\nreference = "{rig.reference.name}"\nbase = "base_link"\n{three}')
     return [
         *sections,
         f'{head}.ego]\nodometry = "{TOPICS["odometry"]}"\n',
