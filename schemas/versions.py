@@ -22,7 +22,7 @@ __all__ = ["CODE_VERSION", "TABLES", "write_json_schemas"]
 
 # Part of every work key: increment it with every change that alters a number, so that old partitions are
 # replaced.
-CODE_VERSION = "0.12.0"
+CODE_VERSION = "1.0.0"
 
 TABLES: dict[str, TableSchema] = {
     t.name: t
