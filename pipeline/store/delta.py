@@ -140,18 +140,9 @@ def open_table(lake: Lake, schema: TableSchema) -> DeltaTable | None:
     if table.protocol().min_reader_version > 1 or found != str(schema.version):
         of, reads = (f"{schema.name}/{version}" for version in (found or "?", schema.version))
         remedy = "use that release, or a new lake"
-        raise OtherVersionError(where, of, _release_of(lake, schema, table), reads, remedy)
+        release = table.metadata().configuration.get(_RELEASE, "before 1.0")
+        raise OtherVersionError(where, of, release, reads, remedy)
     return table
-
-
-def _release_of(lake: Lake, schema: TableSchema, table: DeltaTable) -> str:
-    """Release that made a table; of one without this property, the release of its last rows, if they have it."""
-    told = table.metadata().configuration.get(_RELEASE)
-    if told is None and "code_version" in {f.name for f in table.schema().fields}:
-        for file in sorted(live_files(table), key=lambda f: -f.written_s)[:1]:
-            rows = read_file(lake, schema, file.name, ["code_version"])
-            told = None if rows is None else pc.max(rows["code_version"]).as_py()
-    return told or "(release unknown)"
 
 
 def live_files(table: DeltaTable) -> list[LiveFile]:

@@ -14,7 +14,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-import pipeline.store.delta
 from pipeline.core.errors import ContractError, DamagedError, OtherVersionError
 from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Partition
@@ -145,23 +144,6 @@ def test_what_another_release_wrote_is_refused_with_file_version_and_release(tab
             OtherVersionError, match=rf"{holds}, written by boresight {release}; {reads}: {remedy}$"
         ):
             call()
-
-
-@pytest.mark.parametrize(
-    ("table", "release"), [("calibrations", "0.11.0"), ("drift", r"\(release unknown\)")]
-)
-def test_a_record_table_that_does_not_name_its_release_has_it_in_its_rows_or_nowhere(
-    table, release, lake, rng, monkeypatch
-):
-    schema, row_type = ROW_TYPES[table]
-    of = {"vehicle": "v", "day": "2026-03-02", "recorded_at": "", "asserted_at": ""}
-    told = {"code_version": "0.11.0"} if table == "calibrations" else {}
-    with monkeypatch.context() as patch:  # as releases until 0.12 made tables
-        patch.setattr(pipeline.store.delta, "_RELEASE", "unread")
-        other = replace(schema, version=schema.version - 1)
-        commit_records(lake, other, [make_row(table, rng, **of, **told)])
-    with pytest.raises(OtherVersionError, match=f"written by boresight {release}; this version"):
-        read_records(lake, schema, row_type)
 
 
 @pytest.mark.parametrize("how", ["cut", "empty", "bad end", "foreign", "no more"])
