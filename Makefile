@@ -7,6 +7,8 @@ EVERYTHING ?=
 comma := ,
 # As the night's workers run: waiting threads of BLAS would count as CPU time.
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
+# Many short processes: what one of them compiled, the next ones load.
+unexport PYTHONDONTWRITEBYTECODE
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*##/\t/' | expand -t 20

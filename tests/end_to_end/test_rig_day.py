@@ -1,9 +1,12 @@
 """A day of two cameras, a lidar and two radars, from logs to a pose of every sensor with the truth beside it."""
 
+from collections import Counter
+
 import numpy as np
 import pytest
 from scipy.linalg import eigh
 
+from jobs.terminal.demo_table import errors_of, print_comparison
 from pipeline.core.stage_work import Task
 from pipeline.core.stages import CALIBRATE
 from pipeline.rig.se3 import inverse, log_se3
@@ -41,6 +44,19 @@ def test_every_edge_has_a_record_and_every_sensor_a_pose(day):
     poses = poses_of(task)
     assert set(poses) == {node.name for node in task.fleet.rig_of(DAY.vehicle).nodes}
     assert np.array_equal(transform_of(poses["top"]), np.eye(4))  # the reference, which the others refer to
+
+
+def test_the_table_of_the_demo_compares_every_edge_with_the_truth(day, capsys):
+    task, _, truth = day
+    known = {(DAY.vehicle, DAY.day): truth | {"base": np.eye(4)}}
+    errors = errors_of(task.lake, "joint", known, DAY.day)
+    of_kinds = {"camera_lidar": 2, "camera_radar": 3, "lidar_radar": 2}
+    of_kinds |= {"lidar_base": 1, "radar_base": 2, "camera_base": 2}
+    assert Counter(e["pair"] for e in errors) == of_kinds
+    assert all(0 < e["rotation_error_prior_deg"] < 6 for e in errors if e["status"] != "refused")
+    print_comparison(task.lake, "joint", known, DAY.day, [])
+    printed = capsys.readouterr().out
+    assert all(f"{e['parent_frame']}_{e['child_frame']}" in printed for e in errors)
 
 
 def test_what_is_accepted_is_right(day):

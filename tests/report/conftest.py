@@ -51,7 +51,7 @@ class Browser:
         self.call("Emulation.setEmulatedMedia", features=scheme)
         self._events.clear()
         self.call("Page.navigate", url=path.resolve().as_uri())
-        deadline = time.monotonic() + 30
+        deadline = time.monotonic() + 1800
         while not any(e["method"] == "Page.loadEventFired" for e in self._events):
             assert time.monotonic() < deadline, f"{path} did not load"
             self._pump(0.2)
@@ -83,7 +83,7 @@ class Browser:
     def close(self):
         """End the browser."""
         self._process.terminate()
-        self._process.wait(10)
+        self._process.wait(1800)
         os.close(self._read)
         os.close(self._write)
 
@@ -93,7 +93,7 @@ class Browser:
             {"sessionId": session} if session else {}
         )
         os.write(self._write, json.dumps(message).encode() + b"\0")
-        deadline = time.monotonic() + 60
+        deadline = time.monotonic() + 1800
         while True:
             for reply in self._pump(0.5):
                 if reply.get("id") == self._next:

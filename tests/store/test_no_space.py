@@ -80,11 +80,14 @@ def test_a_temporary_folder_without_space_is_named_and_the_log_not_called_damage
 
 
 @pytest.mark.parametrize(
-    "command", [["simulate", "--vehicles", 1, "--days", 1, "--frames", 3], ["export", "schemas"]]
+    ("command", "option"),
+    [
+        (["simulate", "--vehicles", 1, "--days", 1, "--frames", 3], "--out={}"),
+        (["export", "schemas"], "--out {}"),
+    ],
 )
-def test_an_output_without_space_is_named(command, on_full_disk):
+def test_an_output_without_space_is_named(command, option, on_full_disk):
     out = on_full_disk.disk / "out"
-    for option in (["--out", out], [f"--out={out}"]):
-        summary = on_full_disk(8, *command, *option)
-        assert "No space left" in summary["reason"]
-        assert str(out) in summary["reason"]
+    summary = on_full_disk(8, *command, *option.format(out).split())
+    assert "No space left" in summary["reason"]
+    assert str(out) in summary["reason"]

@@ -213,7 +213,7 @@ def test_the_window_shows_the_day_and_changes_with_its_keys_and_its_slider(lake)
         time.sleep(2)
         command = [sys.executable, str(Path(__file__).parent / "drive_window.py"), str(lake.root)]
         env = os.environ | {"DISPLAY": display}
-        done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=120, check=False)
+        done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=1800, check=False)
     finally:
         screen.terminate()
         screen.wait()
