@@ -110,8 +110,6 @@ def boresight(python, folder, *arguments):
     """Run the installed command where no checkout is near; its summary, its exit code and what it says."""
     environment = tracing(folder / "libraries") | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     environment = {k: v for k, v in environment.items() if k != "PYTHONPATH"}
-    # Nothing here is about speed: compile the loops as cheaply as can be.
-    environment["NUMBA_OPT"] = "0"
     done = subprocess.run(
         [python.parent / "boresight", *arguments],
         cwd=folder, env=environment, capture_output=True, text=True, check=False, timeout=600,

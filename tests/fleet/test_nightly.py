@@ -38,13 +38,14 @@ class StagesThatSay:
     """Stages whose answers a test dictates: a status, or an error to raise."""
 
     def __init__(self, monkeypatch, lake, **answers):
-        self.lake, self.answers, self.called = lake, answers, []
+        self.lake, self.answers, self.called, self.recorded = lake, answers, [], ()
         real = Stage.run
         # What a refused day's records are made by is no stage that a test dictates.
         monkeypatch.setattr(Stage, "run", lambda s, task: real(s, task) if task.given else self.run(s, task))
 
     def run(self, stage, task):
         task.progress(0, 1, "begin")
+        self.recorded = task.recorded
         return self.answer(stage.name, task.partition)
 
     def answer(self, name, partition):
@@ -123,7 +124,7 @@ def test_a_refused_day_leaves_refused_records_with_the_reason(stage, night, monk
 
 
 def test_a_night_says_what_became_of_each_stage_and_a_second_one_adds_nothing(night, monkeypatch):
-    StagesThatSay(monkeypatch, night.lake, perceive="cached", calibrate="held")
+    script = StagesThatSay(monkeypatch, night.lake, perceive="cached", calibrate="held")
     outcomes(night, ("car", "bus"))
     rows = read_records(night.lake, OUTCOMES, OutcomeRow)
     assert {(r.vehicle, r.stage, r.method, r.status) for r in rows} == {
@@ -134,6 +135,7 @@ def test_a_night_says_what_became_of_each_stage_and_a_second_one_adds_nothing(ni
     log = sorted((night.lake.root / "outcomes" / "_delta_log").iterdir())
     outcomes(night, ("car", "bus"))
     assert sorted((night.lake.root / "outcomes" / "_delta_log").iterdir()) == log
+    assert len(script.recorded) == 3  # what the night's method has found is not read once more
 
 
 def test_records_wait_for_a_storage_that_does_not_answer(night, monkeypatch):

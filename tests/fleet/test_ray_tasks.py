@@ -76,6 +76,8 @@ def test_a_cluster_without_room_for_a_task_is_named_after_a_while(behave, tmp_pa
     with pytest.raises(ConfigError, match="RAY_ADDRESS: no node of the cluster has 1 CPU and 2 GiB"):
         ends_of(behave, ["sleep-1"], tmp_path)
     assert not (tmp_path / "sleep-1.tmp").exists()
+    small["Resources"]["memory"] = 1e12
+    assert ends_of(behave, ["wait-2"], tmp_path)["wait-2"].value
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "nowhere:port"])
