@@ -24,6 +24,8 @@ def test_a_small_file_is_enough_and_defaults_are_physical(tmp_path):
     assert fleet.ingest.sync_gate_s is None
     assert (fleet.ingest.sync_gate_m, fleet.ingest.sync_gate_deg) == (2.5, 2.0)
     assert fleet.rigs["default"].ego is None
+    coarse = load(tmp_path, GOOD + "[prepare.grid]\nstep_deg = 0.3\n").prepare.grid
+    assert coarse.shape == (176, 304)  # 52.8 by 91.2 deg in multiples of 16 cells
 
 
 WRONG = {
@@ -37,6 +39,7 @@ WRONG = {
     "[perceive]\nlabel_scale = 1e-9": "perceive.label_scale",
     "[solve]\nsearch_rotation_deg = 1e9": "solve.search_rotation_deg: 1e+09 deg",
     "[solve]\nseed = -1": "solve.seed",
+    "[prepare.grid]\nstep_deg = 0.25": "prepare.grid.step_deg",
 }
 
 

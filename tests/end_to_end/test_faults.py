@@ -101,9 +101,6 @@ def turned(deg, axis=2):
     return exp_so3(np.radians(deg) * np.eye(3)[axis])
 
 
-empty = cloud(lambda rows, _share: rows[:0])
-
-
 def labels_right(px):
     """Label images moved; what comes in from outside is the border repeated."""
 
@@ -171,7 +168,6 @@ FAULTS = {
     "a mirrored lidar": ([LIDAR], points(np.diag([1, -1, 1])), OF_LIDAR, {"orientation", "prior"}),
     "a lidar knocked at noon": ([LIDAR], points(turned(0.5), 0.5), OF_LIDAR, {"moved_in_day"}),
     "a lidar mounted 30 cm higher": ([TF], mounted("lidar_top", RAISED), OF_CAMERA, {"prior"}),
-    "a radar without points": ([RADAR], empty, OF_RADAR, {"silent_sensor"}),
     "a radar that looks back": ([RADAR], points(turned(180)), OF_RADAR, {"orientation", "prior"}),
     "a radar knocked at noon": ([RADAR], points(turned(1), 0.5), OF_RADAR, {"moved_in_day"}),
     "odometry backwards": ([ODOMETRY], odometry(-1), OF_LIDAR, {"odometry"}),

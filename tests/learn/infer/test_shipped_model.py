@@ -17,7 +17,7 @@ MODEL, WITH_CLASSES = SHIPPED / "joint.onnx", SHIPPED / "joint_classes.onnx"
 
 @pytest.fixture(scope="module")
 def day(tmp_path_factory):
-    return simulated_day(tmp_path_factory.mktemp("day"), frames=6, rig="demo", seed=77)
+    return simulated_day(tmp_path_factory.mktemp("day"), frames=4, rig="demo", seed=77)
 
 
 @pytest.mark.parametrize("model", [MODEL, WITH_CLASSES], ids=lambda path: path.stem)

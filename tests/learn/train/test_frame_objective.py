@@ -21,11 +21,11 @@ from pipeline.learn.train.settings import AugmentConfig, LossConfig
 from pipeline.objective.camera_lidar.points import moving_poses
 from pipeline.objective.differentiable.poses import transform_points
 from pipeline.rig import se3
-from pipeline.store.partitions import Lake, Partition
+from pipeline.store.partitions import Lake
 from schemas.training import UNKNOWN_CLASS
 from tests.accuracy.days import FIXED, make_day
 from tests.makers.loss_landscapes import PAIRS, TOLERANCE, day_batch, minima
-from tests.makers.simulated_days import DATE, simulated_day
+from tests.makers.simulated_days import simulated_day
 from tests.makers.stages import calibrate_day
 from tests.makers.torch_poses import exp_se3
 from tests.makers.training_lakes import WIDE, sample_of
@@ -61,12 +61,11 @@ def test_the_minimum_over_a_fleet_is_at_the_truth_in_all_that_it_determines(tmp_
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["real car", "demo"])
-def test_the_loss_of_many_frames_is_least_where_joint_found_the_day(tmp_path, name):
-    fixed = next(fixed for fixed in FIXED if fixed.name == name)
+def test_the_loss_of_many_frames_is_least_where_joint_found_the_day(tmp_path):
+    [fixed] = [fixed for fixed in FIXED if fixed.name == "real car"]
     if (made := make_day(fixed, tmp_path)) is None:
         pytest.skip("the recordings of the real car are not on this machine")
-    partition, fleet = fixed.partition or Partition("vehicle-1", DATE), made.day.fleet
+    partition, fleet = fixed.partition, made.day.fleet
     lake = Lake.at(tmp_path / "lake")
     calibrate_day(partition, fleet, lake)
     batch = day_batch(lake, partition, fleet.file)
