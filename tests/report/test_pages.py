@@ -48,8 +48,8 @@ def fleet(tmp_path_factory):
         _store(lake, [_with_blind_roll(r) if r.pair == "lidar_radar" else r for r in records])
     audit_fleet(lake, _config())
     truth = root / "truth"
-    for day in range(4):
-        path = truth / "b" / f"2026-03-0{day + 1}.json"
+    for vehicle, day in [*(("b", day) for day in range(4)), ("c", 3)]:  # the last one was refused
+        path = truth / vehicle / f"2026-03-0{day + 1}.json"
         path.parent.mkdir(parents=True, exist_ok=True)
         lr = T_LIDAR_RADAR @ (exp_se3(KNOCK) if day > 1 else np.eye(4))
         T = {"camera": np.eye(4), "lidar": T_CAMERA_LIDAR, "radar": T_CAMERA_LIDAR @ lr}
