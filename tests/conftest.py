@@ -81,8 +81,8 @@ def s3(s3_server: S3, monkeypatch: pytest.MonkeyPatch) -> Generator[S3]:
     object_store._client.cache_clear()
 
 
-# Where the heavy files are, so that no worker begins one when the other has nothing left. Others keep their order. While
-# the first compiles the loops of the checkout, the second compiles those of the wheel, and not the same ones beside it.
+# Where the heavy files are, so that no worker begins one when the other has nothing left. Others keep their order.
+# While the first compiles the loops of the checkout, the second compiles those of the wheel, not the same ones.
 HEAVIEST_FIRST = (
     "accuracy",
     "test_wheel.py",
