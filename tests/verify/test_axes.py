@@ -243,6 +243,7 @@ def test_an_axis_that_held_out_frames_do_not_see_is_inconclusive_and_says_so():
     assert {axis: c.status for axis, c in found.items()} == {
         "azimuth": "pass", "elevation": "pass", "roll": "inconclusive",
     }  # fmt: skip
+    assert "held-out frames align" in found["roll"].reason
     assert np.isnan(found["roll"].shown_rad)
     # Turns of 0.5 deg were tried, and an error of that size would have failed.
     assert found["azimuth"].shown_rad <= np.radians(0.5)
