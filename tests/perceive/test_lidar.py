@@ -70,7 +70,7 @@ def test_ground_and_the_own_vehicle_belong_to_no_object():
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), voxel=st.floats(0.1, 2.0), count=st.integers(0, 400))
 def test_the_sample_holds_one_measured_point_per_occupied_voxel(seed, voxel, count):
-    points = np.random.default_rng(seed).uniform(-30, 30, (count, 3)).astype(np.float32)
+    points = np.random.default_rng(seed).uniform(-5, 5, (count, 3)).astype(np.float32)
     rows = sample_uniformly(points, voxel)
     outside = np.linalg.norm(points, axis=1) > 2.5
     cells = np.floor(points.astype(float) / voxel)
