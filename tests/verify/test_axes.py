@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from pipeline.core.config import VerifyConfig
+from pipeline.rig.graph import Sensor
+from pipeline.rig.prior import RigPrior
 from pipeline.rig.se3 import exp_se3, inverse, rotation_angle_rad, to_quaternion
 from pipeline.verify.axes import (
     answer_of,
@@ -19,7 +21,7 @@ from pipeline.verify.axes import (
     wrong_sensors,
 )
 from pipeline.verify.one_axis import AxisLimits, HeldOut, power_of
-from pipeline.verify.one_log import on_grid
+from pipeline.verify.one_log import check_poses, on_grid
 from schemas.calibrations import FRAMES_OF_PAIR, CalibrationRecord
 from schemas.poses import PoseRow
 from tests.makers.solve_scenes import T_CAMERA_LIDAR
@@ -187,10 +189,15 @@ def test_of_many_sensors_each_is_right_wrong_or_undecided_by_its_own_pose():
         pose("front"), pose("left", off_deg=0.5), pose("rear", sigma_deg=0.4),
         pose("corner", "radar", off_deg=0.8, axis=2), pose("nose", "radar", off_deg=0.3, axis=2),
     ]  # fmt: skip
-    checks = [c for row in rows for c in pose_checks(*row)]
+    T = {("top", row.sensor): T_in_use for row, T_in_use in rows}
+    sensors = (top := Sensor("top", "lidar"), *(Sensor(row.sensor, row.kind) for row, _ in rows))
+    prior = RigPrior(sensors, top, T, {s.name: (0.03, 0.05) for s in sensors})
+    reference, lacking = replace(rows[0][0], sensor="top", kind="lidar"), [Sensor("gone", "radar")]
+    found = [reference, *(row for row, _ in rows)]
+    checks = check_poses(found, prior, lacking, VerifyConfig(), ASKED_DEG)
     said = answers_by_sensor(checks)
-    wrong = {"left", "corner"}
-    assert said == {"front": "right", "rear": "undecided", "nose": "right"} | dict.fromkeys(wrong, "wrong")
+    wrong, undecided = {"left", "corner"}, dict.fromkeys(("rear", "gone"), "undecided")
+    assert said == {"front": "right", "nose": "right"} | undecided | dict.fromkeys(wrong, "wrong")
     assert {(c.pair, c.axis) for c in checks if c.status == "fail"} == {(name, "azimuth") for name in wrong}
     assert answer_of(checks) == "wrong"
     assert set(wrong_sensors(checks)) == wrong
