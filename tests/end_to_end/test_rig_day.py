@@ -50,7 +50,7 @@ def test_the_table_of_the_demo_compares_every_edge_with_the_truth(day, capsys):
     task, _, truth = day
     known = {(DAY.vehicle, DAY.day): truth | {"base": np.eye(4)}}
     errors = errors_of(task.lake, "joint", known, DAY.day)
-    of_kinds = {"camera_lidar": 2, "camera_radar": 3, "lidar_radar": 2}
+    of_kinds = {"camera_lidar": 2, "camera_radar": 4, "lidar_radar": 2}
     of_kinds |= {"lidar_base": 1, "radar_base": 2, "camera_base": 2}
     assert Counter(e["pair"] for e in errors) == of_kinds
     assert all(0 < e["rotation_error_prior_deg"] < 6 for e in errors if e["status"] != "refused")
