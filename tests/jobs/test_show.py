@@ -57,7 +57,8 @@ def test_poses_are_shown_with_their_transform_and_the_current_one_alone_where_as
     assert "front" in capsys.readouterr().out
 
 
-def test_faults_of_records_are_said_in_plain_words_by_show_and_status(tmp_path, capsys):
+def test_faults_of_records_are_said_in_plain_words_by_show_and_status(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "250")
     rng = np.random.default_rng(1)
     held = [
         replace(r, status="held", faults=["labels_offset"] if r.pair == "camera_lidar" else [])
@@ -73,7 +74,9 @@ def test_faults_of_records_are_said_in_plain_words_by_show_and_status(tmp_path, 
     commit_records(lake, OUTCOMES, [row])
     words = "semantic labels are shifted"
     assert show("calibrations", lake=str(tmp_path)) == 0
-    assert words in " ".join(capsys.readouterr().out.split())
+    printed = capsys.readouterr().out
+    assert words in printed
+    assert "│ camera_lidar │" in printed
     assert status(lake=str(tmp_path)) == 0
     assert "shifted" in capsys.readouterr().out
     assert status(lake=str(tmp_path), json=True) == 0
