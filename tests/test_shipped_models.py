@@ -19,7 +19,9 @@ def test_every_shipped_model_is_the_file_that_its_card_speaks_of(capsys):
     assert [m["name"] for m in told["models"]] == [model.name for model in found]
     assert all(set(REQUIRED) <= m.keys() for m in told["models"])
     assert main(["models"]) == 0
-    assert "[learn] camera" in " ".join(capsys.readouterr().err.split())
+    printed = " ".join(capsys.readouterr().err.split())
+    assert "[learn] camera" in printed
+    assert all(f"{model.file.stat().st_size / 1e6:.1f} MB" in printed for model in found)
 
 
 @pytest.mark.parametrize("spoil", ["file", "card", "missing"])
