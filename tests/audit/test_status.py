@@ -35,7 +35,9 @@ UNSEEN = {"status": "UNKNOWN", "reason": "why not", "days_needed": 4}
 CLEAREST = {
     "camera_lidar_rx": alarm("YELLOW", moved_sensor="camera", statistic=90.0),
     "lidar_radar_rz": alarm("RED", moved_sensor="radar", start_day="2026-03-06"),
-    "lidar_radar_tx": alarm("RED", moved_sensor="radar", start_day="2026-03-07", statistic=50.0, threshold=40.0),
+    "lidar_radar_tx": alarm(
+        "RED", moved_sensor="radar", start_day="2026-03-07", statistic=50.0, threshold=40.0
+    ),
     "camera_radar_ry": alarm("RED", statistic=50.0),
 }
 

@@ -11,9 +11,10 @@ import pytest
 from mcap.reader import make_reader
 
 from jobs.cli import main
+from pipeline.convert.recording import ego_events
 from pipeline.core.config import load_fleet
 from pipeline.core.ros_messages import RosMessages
-from pipeline.rig.se3 import from_quaternion
+from pipeline.rig.se3 import exp_se3, from_quaternion
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import frames_of
 from tests.makers import data_sets
@@ -107,6 +108,12 @@ def test_the_car_drives_as_its_poses_say(converted):
     else:
         np.testing.assert_allclose(speeds, SPEED_MPS, atol=1e-3)
         np.testing.assert_allclose([f.ego_yaw_rate_radps for f in frames], 0, atol=1e-6)
+
+
+def test_poses_that_turn_are_a_yaw_rate_to_the_left():
+    T = [exp_se3(t * np.array([0, 0, 0.1, SPEED_MPS, 0, 0])) for t in (0.0, 0.5, 1.0)]
+    for event in ego_events([0, 500_000_000, 1_000_000_000], T):
+        assert event.load()[1:] == pytest.approx((SPEED_MPS, 0.1), rel=2e-3)
 
 
 def test_check_finds_every_topic_but_semantics_and_has_no_complaint_about_the_radar(converted, capsys):
