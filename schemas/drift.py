@@ -140,7 +140,7 @@ def next_step(findings: Sequence[DriftFinding], lake: str) -> str:
         ("all sensors", "all") if not stored.sensor else (f"the {stored.sensor}", quote(stored.sensor))
     )
     service = f"`boresight service {of} --day {done} --kind {kind} --sensor {sensor}`"
-    more = f"{days} more accepted day{'s' * (days != 1)}"
+    more = "1 more day is" if days == 1 else f"{days} more days are"
     tables = {"lake": quote(lake), "out": quote(f"tonight/{vehicle}"), "of": of}
-    words = NEXT_STEPS[step].format(what=what, service=service, day=done, days=more, **tables)
+    words = NEXT_STEPS[step].format(what=what, service=service, day=done, days=more, number=days, **tables)
     return f"{vehicle}: {words}"

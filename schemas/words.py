@@ -50,8 +50,9 @@ NEXT_STEPS: Final = {
     "YELLOW": f"{_LOAD} If somebody moved {{what}}, run {{service}} (replace {{day}}, the first day with the change, "
     "by the day of the work); else inspect the mounting at the next service.",
     "YELLOW, days": "drive, then look again tomorrow: `boresight status {of}`.",
-    "UNKNOWN, days": "drive: {days} required.",
-    "UNKNOWN, many days": "drive other roads: {days} would be required. The pages of its days list what to drive.",
+    "UNKNOWN, days": "drive until {days} accepted.",
+    "UNKNOWN, many days": "drive other roads; {number} more days like these would be required. The pages of its days "
+    "list what to drive.",
     "UNKNOWN, tables": "repair the tables: `boresight repair --lake {lake}`.",
 }
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.audit.estimates import Estimates, day_name
-from pipeline.audit.reasons import REASONS, because
+from pipeline.audit.reasons import because
 from pipeline.audit.status import decide_status
 from pipeline.audit.vehicle import VehicleVerdict, limit_of
 from pipeline.audit.verdicts import ChartVerdict
@@ -126,5 +126,5 @@ def _without_data(records: Estimates, edge: Edge, needed: int) -> ChartVerdict:
     found = records.status[records.is_of(edge)].tolist()
     kinds = [(name, found.count(STATUSES.index(name))) for name in ("held", "refused")]
     counts = ", ".join(f"{count} {name}" for name, count in kinds if count)
-    reason = because("no estimate", counts=counts) if counts else REASONS["no record"]
-    return ChartVerdict("UNKNOWN", because("then", reason=reason, needed=needed), 0, None, None, None, needed)
+    reason = because("no estimate" if counts else "no record", counts=counts, needed=needed)
+    return ChartVerdict("UNKNOWN", reason, 0, None, None, None, needed)

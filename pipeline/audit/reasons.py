@@ -1,10 +1,8 @@
 """Every reason that charts, vehicles and states give, as one list; fields are filled where the reason is given."""
 
-from typing import Any, Final
-
 __all__ = ["REASONS", "because"]
 
-REASONS: Final = {
+REASONS = {
     # Of a chart: a change, or none.
     "lasting": "a lasting change above the limit",
     "lasting, held": "a lasting change above the limit; depends on days whose calibration was held",
@@ -18,9 +16,8 @@ REASONS: Final = {
     # Of a chart: what it lacks.
     "few": "{days} of data, {needed} required",
     "hidden": "a change below {visible} would not be noticed yet (limit {limit}); about {more} required",
-    "no estimate": "no estimate in the window ({counts})",
-    "no record": "no record in the window",
-    "then": "{reason}, {needed} days required",
+    "no estimate": "no estimate in the window ({counts}), {needed} days required",
+    "no record": "no record in the window, {needed} days required",
     "ended": "{reason}; no estimate after {day}",
     "determined on": "determined on {used} of {days} days: {reason}",
     "since work": "since the {event}",
@@ -31,7 +28,7 @@ REASONS: Final = {
     "GREEN": "no sensor moved: {clear} of {all} charts exclude a change above the limit",
     "GREEN, but few": "no sensor moved: {clear} of {all} charts exclude a change above the limit, enough to exclude a "
     "rotation of any sensor; {few} have too little data",
-    "UNKNOWN": "undecided whether {names} turned: {chart}; {few} of {all} charts have too little data",
+    "UNKNOWN": "undecided whether {names} turned; {chart}; {few} of {all} charts have too little data",
     "UNKNOWN, one day": "undecided: {reason}",
     "moved": "the {sensor} moved on {day}",
     "moved, unnamed": "a sensor moved on {day}, undecided which",
@@ -54,12 +51,11 @@ REASONS: Final = {
     "at prior": "{sensor} is at its prior: {reason}",
     "too large": "{direction} not certified: its sigma of {sigma:.2f} deg is too large for {limit:.2f} deg at "
     "{percent:.3g} %",
-    # Of a night's audit.
     "no records": "no calibration record in the window",
     "left out": "left out: {records}{more}",
 }
 
 
-def because(name: str, **fields: Any) -> str:
+def because(name: str, **fields: object) -> str:
     """A reason with its fields."""
     return REASONS[name].format(**fields)

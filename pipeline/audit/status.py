@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 
 from pipeline.audit.reasons import REASONS, because
-from pipeline.rig.edges import edge_of, edge_order, words_of
+from pipeline.rig.edges import edge_of, edge_order
 from pipeline.rig.graph import KINDS, Edge
 from pipeline.rig.kinds import KIND_OF_EDGE
+from schemas.calibrations import DOF_NAMES
 from schemas.drift import DriftFinding, VehicleStatus
+from schemas.words import AXIS_NAMES
 
 __all__ = ["decide_status"]
 
@@ -70,7 +72,8 @@ def decide_status(findings: Sequence[DriftFinding]) -> VehicleStatus:
     if max(f.days_used for f in findings) > 1:
         *some, last = blind
         names = f"{', '.join(some)}{' and ' * bool(some)}{last}"
-        chart = f"{words_of(edge_of(slowest))} {slowest.dof}: {slowest.reason}"
+        axis = AXIS_NAMES[slowest.pair.partition("_")[0]][DOF_NAMES.index(slowest.dof)]
+        chart = f"{edge_of(slowest).name} {axis}: {slowest.reason}"
         reason = because("UNKNOWN", names=names, chart=chart, few=few, all=len(findings))
     else:
         reason = because("UNKNOWN, one day", reason=slowest.reason)

@@ -15,6 +15,7 @@ from pipeline.calibrate.paper.triggers import trigger_metrics
 from pipeline.calibrate.unlabelled import notes_of_pair
 from pipeline.calibrate.verify.constancy import PART_FLOOR_RAD
 from pipeline.calibrate.verify.held_out import HeldOutTest
+from pipeline.calibrate.verify.verdict import undetermined
 from pipeline.core.errors import SolveError
 from pipeline.core.stage_work import NO_PROBES, Probes
 from pipeline.rig.cameras import camera_of
@@ -110,7 +111,7 @@ def computed_record(
         **_verdict_fields(judged),
         frames_used=found.frames_used,
         frames_rejected=dict(found.frames_rejected),
-        notes=[*notes, *_unobservable(found.observable)],
+        notes=[*notes, *undetermined(edge.kind, found.observable)],
         diagnostics=numbers,
     )
 
@@ -184,12 +185,6 @@ def _prior_fields(pair: str, prior: Prior | None) -> dict[str, Any]:
     if prior is None or not prior.knows(pair):
         return {}
     return pose_columns(prior.of(pair), "prior_") | {"prior_covariance": prior.covariance(pair)}
-
-
-def _unobservable(observable: np.ndarray) -> list[str]:
-    """A note of the degrees of freedom that the day did not determine; none if there are none."""
-    names = [name for name, seen in zip(DOF_NAMES, observable, strict=True) if not seen]
-    return [f"not determined by the day: {', '.join(names)}"] if names else []
 
 
 def _assumed(estimate: PairEstimate, observations: Sequence[Observation]) -> list[str]:

@@ -95,6 +95,7 @@ def pair_view(record: CalibrationRecord) -> dict[str, Any]:
         "rejected": [
             (LEFT_OUT.get(why, why.replace("_", " ")), n)
             for why, n in sorted(record.frames_rejected.items(), key=lambda kv: -kv[1])
+            if n
         ],
         "time_offset": _time_offset(record),
         "loop": _loop(record),

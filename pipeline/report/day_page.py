@@ -207,7 +207,7 @@ def _to_load(states: Sequence[StateRow], day: str) -> dict[str, Any] | None:
 def _as_of(read: DayRead, lake: Lake) -> tuple[str, str]:
     """The vehicle's status and the day of its audit: pages of days are not redrawn for every audit."""
     status, sentence = status_sentence(read.findings, lake, read.mend)
-    return status, f"{sentence} (Audit until {read.findings[0].day}.)" if read.findings else sentence
+    return status, f"{sentence} (Audited until {read.findings[0].day}.)" if read.findings else sentence
 
 
 def _after_label(records: Mapping[str, CalibrationRecord]) -> str:

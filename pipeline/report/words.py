@@ -13,17 +13,9 @@ from schemas.drift import DriftFinding
 from schemas.words import AXIS_NAMES
 
 __all__ = [
-    "LEFT_OUT",
-    "PAIR_TITLES",
-    "dof_title",
-    "kind_of_sensor",
-    "motion_in_words",
-    "pose_text",
-    "scaled",
-    "sigma_text",
-    "unit_of",
-    "with_sigma",
-]
+    "LEFT_OUT", "PAIR_TITLES", "dof_title", "kind_of_sensor", "motion_in_words", "pose_text",
+    "scaled", "sigma_text", "unit_of", "with_sigma",
+]  # fmt: skip
 
 # Reasons of pipeline/calibrate/select/frames.py that need more words than their names.
 LEFT_OUT = {

@@ -46,7 +46,7 @@ CLEAREST = {
     ("changes", "status", "sensor", "words"),
     [
         ({}, "GREEN", None, "no sensor moved: 3 of 18 charts exclude a change above the limit, enough"),
-        ({"camera_lidar_rx": UNSEEN}, "UNKNOWN", None, "camera_lidar rx: why not; 16 of 18 charts"),
+        ({"camera_lidar_rx": UNSEEN}, "UNKNOWN", None, "camera-lidar pitch: why not; 16 of 18 charts"),
         ({"camera_lidar_ry": UNSEEN}, "UNKNOWN", None, "whether camera or lidar turned"),
         ({"lidar_radar_rz": UNSEEN}, "UNKNOWN", None, "whether radar turned"),
         (
@@ -55,7 +55,7 @@ CLEAREST = {
         ),
         (  # since a repair of the radar
             {"camera_lidar_rx": UNSEEN, "lidar_radar_rz": UNSEEN | {"days_used": 0}}, "UNKNOWN", None,
-            "lidar_radar rz: why not",
+            "lidar-radar yaw: why not",
         ),
         # Radar yaw may be watched from the camera instead.
         ({"lidar_radar_rz": UNSEEN, "camera_radar_ry": {"status": "GREEN"}}, "GREEN", None, ""),

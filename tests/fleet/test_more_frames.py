@@ -41,7 +41,7 @@ def held_for(claim, frames):
 
 
 UNSURE, FEW_HELD_OUT = held_for(VAGUE, 20), held_for(SURE, 1)
-MOVED = "rz moved by 5.0 sigmas of the prior"
+MOVED = "yaw moved by 5.0 sigmas of the prior"
 
 
 def results(reason, logged=36000, planned=400, ingest="done"):

@@ -63,7 +63,7 @@ def _with_blind_roll(record):
     if record.status == "refused":
         return record
     return replace(
-        record, observable=[k not in (0, 5) for k in range(6)], reason="not determined by the day: rx, tz"
+        record, observable=[k not in (0, 5) for k in range(6)], reason="not determined by the day: roll, up"
     )
 
 

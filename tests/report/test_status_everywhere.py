@@ -103,7 +103,7 @@ def test_a_red_vehicle_says_what_to_do_with_the_commands(lake, tmp_path, capsys)
     assert status_of(stored(own)["red"]).status == "RED"
     audit_fleet(own, _config())
     assert status_of(stored(own)["red"]).status == "UNKNOWN"  # its charts begin anew
-    assert next_step(stored(own)["red"], "L") == "red: drive: 3 more accepted days required."
+    assert next_step(stored(own)["red"], "L") == "red: drive until 3 more days are accepted."
     page = write_fleet_page(own, _config(), tmp_path / "after.html")
     assert '<td>red</td><td class="w">2026-03-06</td><td>radar</td><td>repair</td>' in page  # the list
     assert '"repair of the radar on 2026-03-06"' in page  # the charts
@@ -124,9 +124,9 @@ def _row(status, reason, **rest):
         (_row("YELLOW", "one day", vehicle_days_needed=1), "tomorrow: `boresight status --lake L --vehicle v`."),
         (_row("YELLOW", "small", vehicle_sensor="camera", vehicle_since="2026-03-04"),
          "`boresight service --lake L --vehicle v --day 2026-03-04 --kind re-mount --sensor camera`"),
-        (_row("UNKNOWN", "too few", vehicle_days_needed=2), "drive: 2 more accepted days required."),
-        (_row("UNKNOWN", "too few", vehicle_days_needed=335), "drive other roads: 335 more"),
-        (_row("UNKNOWN", "too few", vehicle_days_needed=1), "1 more accepted day "),
+        (_row("UNKNOWN", "too few", vehicle_days_needed=2), "drive until 2 more days are accepted."),
+        (_row("UNKNOWN", "too few", vehicle_days_needed=335), "drive other roads; 335 more"),
+        (_row("UNKNOWN", "too few", vehicle_days_needed=1), "1 more day is accepted."),
         (_row("UNKNOWN", "no change; some of its records cannot be read"), "`boresight repair --lake L`"),
     ],
 )  # fmt: skip

@@ -17,6 +17,7 @@ from pipeline.rig.checks import Check
 from pipeline.rig.estimates import PairEstimate, Prior, Solution
 from schemas.calibrations import DOF_NAMES, PAIRS
 from schemas.observations import Observation
+from schemas.words import AXIS_NAMES
 
 __all__ = [
     "DAY_CHECKS",
@@ -70,8 +71,8 @@ def prior_alarms(
     return {
         pair: [
             Check(
-                f"by this day alone {DOF_NAMES[k]} is {shift:+.2f} +- {own_positions(estimate)[k][1]:.2f} m off the"
-                f" prior, whose sigma is {sigma_m:g} m: measure the mounting",
+                f"by this day alone the position is {shift:+.2f} +- {own_positions(estimate)[k][1]:.2f} m off the prior"
+                f" ({AXIS_NAMES[pair.partition('_')[0]][k]}), whose sigma is {sigma_m:g} m: measure the mounting",
                 "prior",
             )
             for k, shift in far_positions(estimate, np.full(6, sigma_m), limits).items()

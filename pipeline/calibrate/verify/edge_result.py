@@ -16,10 +16,9 @@ from pipeline.rig.kinds import KIND_OF_EDGE
 from pipeline.rig.se3 import adjoint, inverse
 from pipeline.rig.targets import errors_at_targets, target_sigmas
 from schemas.calibrations import DOF_NAMES
+from schemas.words import AXIS_NAMES
 
 __all__ = ["RANGE", "EdgeResult", "at_targets", "exceeded_by", "tilt_in_doubt"]
-
-_ON_BASE = ("roll", "pitch", "yaw", "x", "y", "z")
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +58,7 @@ class EdgeResult:
     @property
     def names(self) -> tuple[str, ...]:
         """Of the six numbers of a move."""
-        return _ON_BASE if self._is_on_base else DOF_NAMES
+        return AXIS_NAMES["base" if self._is_on_base else self.kind.partition("_")[0]]
 
     @property
     def move_sigmas(self) -> Float[np.ndarray, " 6"]:

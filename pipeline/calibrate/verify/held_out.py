@@ -237,8 +237,8 @@ def found_elsewhere(
         return []
     azimuth, elevation = np.degrees(off_rad)
     sentence = (
-        f"held-out frames, more than those of the fit, align better at another pose: {azimuth:.2f} deg of azimuth "
-        f"and {elevation:.2f} deg of elevation away (z = {test.z:.1f})"
+        f"held-out frames, more than those of the fit, align better at another pose: {azimuth:.2f} deg in azimuth "
+        f"and {elevation:.2f} deg in elevation away (z = {test.z:.1f})"
     )
     error = change_of(change_between(estimate.T, place))
     return [Check(sentence, disproves=True, error=error)]

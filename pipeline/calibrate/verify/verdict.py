@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from jaxtyping import Bool
 
 from pipeline.calibrate.select.frames import SHORTEST
 from pipeline.calibrate.verify.edge_result import RANGE, EdgeResult, at_targets, exceeded_by, tilt_in_doubt
@@ -20,9 +21,9 @@ from pipeline.calibrate.verify.target_accuracy import Claim
 from pipeline.core.config import ChecksConfig
 from pipeline.rig.checks import Check, change_of, faults_of
 from pipeline.rig.kinds import KIND_OF_EDGE
-from schemas.calibrations import DOF_NAMES
+from schemas.words import AXIS_NAMES
 
-__all__ = ["Evidence", "Verdict", "judge", "matters"]
+__all__ = ["Evidence", "Verdict", "judge", "matters", "undetermined"]
 
 _FAILED = Check.margin  # of a check that yields no number
 
@@ -288,8 +289,14 @@ def _reservations(result: EdgeResult, claims: Mapping[str, Claim]) -> list[str]:
     open_claims = [
         f"{name} not certified: {_known(claim)}" for name, claim in claims.items() if claim.margin < 0
     ]
-    kept = [name for name, seen in zip(DOF_NAMES, result.observable, strict=True) if not seen]
-    return [*open_claims, *([f"not determined by the day: {', '.join(kept)}"] if kept else [])]
+    return [*open_claims, *undetermined(result.kind, result.observable)]
+
+
+def undetermined(kind: str, observable: Bool[np.ndarray, " 6"]) -> list[str]:
+    """A sentence on the degrees of freedom that the day did not determine; none if there are none."""
+    axes = AXIS_NAMES[kind.partition("_")[0]]
+    names = ", ".join(axis for axis, seen in zip(axes, observable, strict=True) if not seen)
+    return [f"not determined by the day: {names}"] if names else []
 
 
 def _deg(angle_rad: float) -> str:

@@ -153,8 +153,8 @@ def test_a_result_near_its_prior_is_held_where_held_out_frames_may_lead_beyond_t
         (estimate(shift_m=0.1), WORSE, False, "held", "align worse"),  # .25 deg of targets 25 m away
         (estimate(shift_m=0.005), WORSE, False, "accepted", ""),
         (estimate(0.2), SAME, False, "accepted", ""),  # agrees with the prior
-        (estimate(1.0), SAME, False, "held", "ry moved by 10.0 of its sigmas"),
-        (estimate(1.0, observable=[1, 0, 1, 1, 1, 1]), SAME, False, "accepted", "not determined by the day: ry"),
+        (estimate(1.0), SAME, False, "held", "yaw moved by 10.0 of its sigmas"),
+        (estimate(1.0, observable=[1, 0, 1, 1, 1, 1]), SAME, False, "accepted", "not determined by the day: yaw"),
         (estimate(0.0, observable=[0] * 6), SAME, False, "held", "no degree of freedom"),
         (replace(estimate(0.03), covariance=SURER), SAME, False, "accepted", ""),  # six sigmas that do not matter
         (replace(estimate(0.3), covariance=SURER), SAME, False, "held", "do not align better"),
@@ -171,7 +171,7 @@ def test_a_result_near_its_prior_is_held_where_held_out_frames_may_lead_beyond_t
         (estimate(0.2), WORSE, True, "accepted", ""),
         # A radar answers only for the moves that held-out frames score: of pitch they know nothing.
         (estimate(1.0, pair="lidar_radar"), SAME, False, "accepted", ""),
-        (replace(estimate(pair="lidar_radar"), T=YAWED), SAME, False, "held", "rz moved"),
+        (replace(estimate(pair="lidar_radar"), T=YAWED), SAME, False, "held", "yaw moved"),
     ],
 )  # fmt: skip
 def test_moves_are_accepted_by_how_far_they_lead_and_how_held_out_frames_align(

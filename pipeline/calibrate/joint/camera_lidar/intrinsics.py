@@ -116,7 +116,7 @@ class DayIntrinsics:
                 f"{down:+.0f} +- {down_sigma:.0f} px down"
             ),
             # By a profile like the time offset's it errs by tens of ms: study `intrinsics.py`.
-            f"image rows are exposed within {1e3 * known.readout_s:.0f} ms (readout_s): a day does not determine it",
+            f"image rows are exposed within {1e3 * known.readout_s:.0f} ms (readout_s); a day does not measure this",
         ]
 
     def _turn_sigma_rad(self, known: CameraPrior) -> tuple[float, float]:
