@@ -63,7 +63,7 @@ def assert_on_pages(folder, step):
     assert f"<li>{step}</li>" in fleet
     for page in (fleet, day):
         assert f"To do for {step}" in page
-        assert "accepted days are required" not in page
+        assert "drive until" not in page
 
 
 MISTYPED = (
