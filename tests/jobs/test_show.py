@@ -14,30 +14,9 @@ from pipeline.store.partitions import Lake
 from schemas.calibrations import CALIBRATIONS
 from schemas.outcomes import OUTCOMES, OutcomeRow
 from schemas.poses import POSES
-from schemas.service_events import SERVICE_EVENTS, ServiceEvent
 from tests.audit.fleet_records import vehicle_records
 from tests.makers.lakes import write_records
 from tests.makers.table_rows import make_row
-
-
-def test_every_record_table_is_shown_for_people_and_for_machines(tmp_path, capsys):
-    lake = Lake.at(tmp_path)
-    of = {"vehicle": "car", "day": "2026-03-02"}
-    refused = OutcomeRow(**of, stage="ingest", method="", status="refused", reason="no [radar]", work_key="k")
-    commit_records(lake, OUTCOMES, [refused])
-    event = ServiceEvent(**of, sensor="radar", kind="repair", note="new bracket")
-    commit_records(lake, SERVICE_EVENTS, [event])
-    for table, column, value in (
-        ("outcomes", "reason", "no [radar]"),
-        ("service_events", "note", event.note),
-    ):
-        assert show(table, lake=str(tmp_path)) == 0
-        assert value in capsys.readouterr().out
-        assert show(table, lake=str(tmp_path), vehicle="car", json=True) == 0
-        [row] = json.loads(capsys.readouterr().out)
-        assert row[column] == value
-        assert show(table, lake=str(tmp_path), vehicle="bus", json=True) == 0
-        assert json.loads(capsys.readouterr().out) == []
 
 
 def test_poses_are_shown_with_their_transform_and_the_current_one_alone_where_asked(tmp_path, capsys):
