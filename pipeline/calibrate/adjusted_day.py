@@ -190,7 +190,7 @@ def _contradictions(
     An edge that others in use confirm on another way is not contradicted by what is left out, and none is by an edge
     that lies far from its prior, which holds what rests on that prior (`wrong_priors`). Camera-lidar is not
     checked, for its held-out frames would show any error that a radar's edges can show, unless its camera's motion
-    takes part: held-out borders err with the others.
+    takes part: held-out borders err with the others, and so may boxes, which are of the same networks.
     """
     edge = solved.edge
     own, found = rig.edges[edge], dict[str, list[Edge]]()
@@ -198,6 +198,11 @@ def _contradictions(
     is_out = not (own.used or own.doubts or solved.evidence.checks)
     if edge.kind == "camera_lidar" and any(is_out and rig.edges[e].used for e in by_motion):
         found[f"{edge.name} and the other edges"] = [edge]
+    outvoted = [
+        e for e in by_motion if not (rig.edges[e].used or rig.edges[e].doubts or rig.edges[e].evidence.checks)
+    ]
+    if edge.kind in ("camera_lidar", "camera_radar") and own.used and outvoted:
+        found[f"{outvoted[0].name} and the other edges"] = outvoted
     is_accepted = edge.kind == "camera_lidar" and solved.judged.verdict.status == "accepted"
     if is_accepted and not found and not set(by_motion) & set(own.doubts):
         return []

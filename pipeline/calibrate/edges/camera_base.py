@@ -277,8 +277,8 @@ def _numbers(
 ) -> dict[str, float]:
     numbers = {"image_pairs": float(len(travel.span_s))}
     if clock is not None:
-        numbers |= {"focal_by_turns": float(clock.value[1])}
-        numbers |= {"focal_by_turns_sigma": float(np.sqrt(clock.covariance[1, 1]))}
+        scale, sigma = float(clock.value[1]), float(np.sqrt(clock.covariance[1, 1]))
+        numbers |= {"focal_by_turns": scale, "focal_by_turns_sigma": sigma}
     by_way, by_axis = fits["pitch"], fits["pitch_by_axis"]
     if by_way is not None and by_axis is not None:
         numbers |= {"pitch_way_less_axis_deg": float(np.degrees(by_way.value[0] - by_axis.value[0]))}

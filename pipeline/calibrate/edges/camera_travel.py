@@ -80,10 +80,8 @@ def _by_ego(
         now = (stamp_ns[here] - first_ns) * 1e-9
         before, middle = now - span_s[here], now - span_s[here] / 2
         speed, rate = (np.interp(middle, t, v[moments]) for v in (ego.velocity_mps[:, 0], ego.yaw_rate_radps))
-        change = np.interp(now, t, ego.yaw_rate_radps[moments]) - np.interp(
-            before, t, ego.yaw_rate_radps[moments]
-        )
+        ends = (np.interp(at, t, ego.yaw_rate_radps[moments]) for at in (now, before))
         is_beside = np.abs(t[:, None] - middle).min(0) < _BESIDE_S
-        all_three = np.stack([speed * span_s[here], rate * span_s[here], change], 1)
+        all_three = np.stack([speed * span_s[here], rate * span_s[here], np.subtract(*ends)], 1)
         found[here] = np.where(is_beside[:, None], all_three, np.nan)
     return found

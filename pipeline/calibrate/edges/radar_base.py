@@ -45,7 +45,7 @@ __all__ = ["Stamps", "estimate_radar_base", "solve"]
 
 _LEAST_SPEED_MPS = 4.0  # slower, noise of 0.05 m/s is a degree
 _LEVER_SIGMA_M = (
-    1.5  # what the lever arm, the base's place before the axle, and slip differ by from the prior
+    1.5  # by which the lever arm, the base's place before the axle, and slip differ from the prior
 )
 _SCALE_SIGMA = 0.02  # of an odometer
 _LEAST_AZIMUTH_RAD = np.radians(0.1)

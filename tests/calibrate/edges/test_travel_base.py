@@ -43,9 +43,10 @@ def records_of(made, rows):
     }
 
 
-def turned(o, deg):
-    """The frame without boxes, its borders and paint beside the picture that moves: to them, motion is turned."""
-    R, none = exp_so3(np.radians([0.0, deg, 0.0])), {name: getattr(o, name)[:0] for name in OF_BOXES}
+def turned(o, deg, *, boxes=False):
+    """The frame with borders and paint beside the picture that moves: to them, motion is turned; boxes with them."""
+    none = {} if boxes else {name: getattr(o, name)[:0] for name in OF_BOXES}
+    R = exp_so3(np.radians([0.0, deg, 0.0]))
     if o.motion_turn_rad is None:
         return replace(o, **none)
     return replace(o, **none, motion_turn_rad=R @ o.motion_turn_rad, motion_direction=R @ o.motion_direction)
@@ -76,6 +77,9 @@ def test_borders_that_motion_contradicts_are_held_by_name_though_held_out_frames
     assert (good["camera_lidar"].status, good["camera_lidar"].faults) == ("accepted", [])
     assert (beside["camera_lidar"].status, beside["camera_lidar"].faults) == ("held", ["witnesses_disagree"])
     assert "camera-base" in beside["camera_lidar"].reason
+    together = records_of(made, [turned(o, 0.8, boxes=True) for o in made.observations])
+    for pair in ("camera_lidar", "camera_radar"):  # two that err alike do not outvote the motion
+        assert (together[pair].status, together[pair].faults) == ("held", ["witnesses_disagree"])
 
 
 @pytest.mark.parametrize("what", ["few motions", "no road", "a frame of its own"])
