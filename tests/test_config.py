@@ -49,7 +49,7 @@ WRONG = {
         *((("[fleet]", f"{section}\n[fleet]"), key) for section, key in WRONG.items()),
         (("[fleet]", "[fleet]\ncolour = 1"), "fleet.colour"),
         (('"/radar/points"', '"/radar/points"\ndoppler_period_mps = -1'), "doppler_period_mps"),
-        (('points = "/radar/points"', 'points = "radar"'), "radar.points"),
+        (('points = "/radar/points"', 'points = "radar"'), "rigs.default.radar.points"),
         (('source = "topics"', 'source = "magic"'), "semantics"),
         (('rig = "default"', 'rig = "other"'), "vehicles.car-1.rig"),
         (('name = "tests"', ""), "fleet.name"),

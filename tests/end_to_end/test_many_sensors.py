@@ -105,19 +105,3 @@ def test_the_prior_is_kept_once_and_ties_every_sensor_to_the_lidar(day):
     seen = next(observations_of(lake, DAY, chosen={"camera": "left", "lidar": "top", "radar": "nose"}))
     np.testing.assert_array_equal(three.T_camera_lidar, seen.priors["camera_lidar"])
     np.testing.assert_array_equal(three.T_lidar_radar, seen.priors["lidar_radar"])
-
-
-@pytest.mark.parametrize("three", [("front", "top", "nose"), None])
-def test_methods_of_three_are_run_on_three_that_share_a_view(day, tmp_path, three):
-    lake, fleet, _, _ = day
-    copy = Lake.at(tmp_path / "lake")
-    shutil.copytree(lake.root, copy.root)
-    name, rig = next(iter(fleet.rigs.items()))
-    fleet = fleet.model_copy(update={"rigs": {name: rig.model_copy(update={"three": three})}})
-    found = CALIBRATE.run(Task(fleet, copy, DAY, method="tracking"))
-    records = [r for r in found.records if isinstance(r, CalibrationRecord)]
-    camera, lidar, radar = three or ("left", "top", "corner_fl")
-    ends = {(r.pair, r.parent_frame, r.child_frame) for r in records}
-    pairs = {("camera_lidar", camera, lidar), ("camera_radar", camera, radar), ("lidar_radar", lidar, radar)}
-    assert ends == pairs
-    assert not any("share a view" in r.reason for r in records)
