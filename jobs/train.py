@@ -21,9 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["parse_duration", "train"]
 
-_NOT_VALIDATED = (
-    "prepare a side val and train in a new folder: this network is not validated, so do not use it"
-)
+_NOT_VALIDATED = "prepare a side val and train in a new folder: do not use a network that was not validated"
 _UNIT_S = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
 
@@ -148,7 +146,9 @@ def _run(request: TrainRequest, settings: TrainConfig) -> int:
         logger().warning(doubt, data=request.data)
     with progress_reporter(f"train {request.out.name}") as progress:
         result = run(request, settings, progress)
-    steps = [] if (request.out / "best.pt").exists() else [_NOT_VALIDATED]
+    again = f"give the same command again: {result.step} of {result.steps} steps are done"
+    then = f"boresight export onnx --run {request.out} --out model.onnx" if result.status == "done" else again
+    steps = [then] if (request.out / "best.pt").exists() else [_NOT_VALIDATED]
     return _tell(result, request.out, next_steps=steps)
 
 

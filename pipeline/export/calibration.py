@@ -169,9 +169,12 @@ class ExportedCalibration:
     @property
     def T_base(self) -> Float[np.ndarray, "4 4"] | None:
         """T_base_reference, as given or from an edge to base; None if unknown."""
-        return (
-            self.T_between(BASE.name, self.reference.name) if self.T_base_lidar is None else self.T_base_lidar
-        )
+        return None if (found := self.on_base()) is None else found[0]
+
+    def on_base(self) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "6 6"] | None] | None:
+        """T_base and its covariance, None for one that is given; None if unknown."""
+        given = self.T_base_lidar
+        return self.between(BASE.name, self.reference.name) if given is None else (given, None)
 
     def T_root(self, sensor: str) -> Float[np.ndarray, "4 4"] | None:
         """T_root_sensor; None if the calibration does not have it."""
@@ -226,9 +229,9 @@ class Pose:
 def poses_of(calibration: ExportedCalibration) -> list[Pose]:
     """Tree of poses, parents first: base -> reference if known, then reference -> each other sensor."""
     names, reference = calibration.names, calibration.reference.name
-    poses, T_base = [], calibration.T_base
-    if T_base is not None:
-        poses.append(Pose(reference, names.of(BASE.name), names.of(reference), T_base))
+    poses, on_base = [], calibration.on_base()
+    if on_base is not None:
+        poses.append(Pose(reference, names.of(BASE.name), names.of(reference), *on_base))
     for sensor in calibration.sensors:
         found = None if sensor.name == reference else calibration.between(reference, sensor.name)
         if found is not None:

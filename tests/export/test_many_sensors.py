@@ -1,6 +1,7 @@
 """Calibrations of rigs of many sensors, in every format: as many poses as sensors, the same numbers when read."""
 
 import json
+import re
 from dataclasses import replace
 
 import cv2
@@ -11,6 +12,7 @@ import yaml
 from pipeline.core.errors import ConfigError
 from pipeline.export.calibration import ExportedCalibration, ExportedPair, FrameNames, poses_of
 from pipeline.export.formats import format_named
+from pipeline.export.provenance import comment_lines
 from pipeline.rig.edges import edge_named, words_of
 from pipeline.rig.se3 import adjoint, exp_se3, inverse
 from pipeline.store.commits import commit_records
@@ -66,6 +68,7 @@ def test_an_edge_to_base_says_where_the_rig_sits_on_the_car():
     base = edge_named("lidar_base", "top", "base")
     sent = five([*EDGES, base], lambda e: inverse(T_BASE_LIDAR) if e == base else T_of(e), names=FrameNames())
     assert sent.root == "base_link"
+    assert any(re.match("base_link -> top: .* sigma .* deg about", line) for line in comment_lines(sent))
     tree = format_named("urdf").tree(format_named("urdf").write(sent))
     np.testing.assert_allclose(tree.lookup("base_link", "front"), T_BASE_LIDAR @ T_TOP["front"], atol=1e-12)
 
