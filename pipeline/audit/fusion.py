@@ -1,7 +1,7 @@
 """One sensor's pose for tomorrow's drive: its prior, and what each day since it last moved adds to it.
 
 A day's pose combines the day's data and the prior. Averaged over days, the prior would count once a day, so it
-is taken out of each day and enters once (as in `calibrate/adjust/evidence.py`). With x the pose as a change from
+is taken out of each day and enters once (as in `calibrate/adjust/equations.py`). With x the pose as a change from
 some pose, and u the errors common to all days in units of their sigma, day i measures
 
     x + R_i u + n_i,    n_i ~ V_i + S

@@ -4,22 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.calibrate.adjust.rig import AdjustedRig, AdjustmentLimits, adjust
+from pipeline.calibrate.adjust.rig import AdjustedRig, adjust
 from pipeline.calibrate.judging import Judged, Judging
 from pipeline.calibrate.numerics.covariance import OBSERVABLE
 from pipeline.calibrate.select.frames import Selection
 from pipeline.rig.changes import change_between
 from pipeline.rig.checks import Check, change_of
 from pipeline.rig.edges import pose_columns
-from pipeline.rig.estimates import PairEstimate, Prior, Solution
-from pipeline.rig.evidence import EdgeEvidence
-from pipeline.rig.extrinsics import Extrinsics
+from pipeline.rig.estimates import EdgeEvidence, PairEstimate, Prior, Solution
 from pipeline.rig.graph import Edge, RigGraph
+from pipeline.rig.prior import Extrinsics
 from pipeline.rig.se3 import adjoint, compose_covariance, inverse
 from schemas.calibrations import CalibrationRecord
 from schemas.observations import Observation
@@ -57,11 +56,8 @@ class SolvedDay:
     numbers: Mapping[str, float] = field(default_factory=dict)
 
 
-@runtime_checkable
-class Judge(Protocol):
-    """Verdict on an estimate of an edge; `together`: other edges take part in it."""
-
-    def __call__(self, estimate: PairEstimate, failed: Sequence[Check], *, together: bool) -> Judged: ...
+# Verdict on an estimate of an edge with its failed checks, and whether other edges take part in it.
+Judge = Callable[[PairEstimate, Sequence[Check], bool], Judged]
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +86,7 @@ class SolvedEdge:
     def with_checks(self, checks: Sequence[Check]) -> SolvedEdge:
         """The edge, judged with failed checks of the whole rig besides."""
         failed = (*self.failed, *checks)
-        judged = self.judge(self.own, failed, together=False)
+        judged = self.judge(self.own, failed, False)
         evidence = replace(self.evidence, checks=judged.verdict.against)
         return replace(self, failed=failed, judged=judged, evidence=evidence)
 
@@ -122,7 +118,7 @@ def adjusted_rig(
     expected = {e.edge: e.own.time_offset_prior_s for e in edges}
     clocks = {edge: dt_s for edge, dt_s in expected.items() if dt_s is not None}
     prior = replace(prior, dt_s=_expected_clocks(graph, clocks))
-    return adjust(graph, prior, [e.evidence for e in known], AdjustmentLimits(clock_sigma_s))
+    return adjust(graph, prior, [e.evidence for e in known], clock_sigma_s)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,11 +156,11 @@ def _concluded(
     if edge.is_active and not edge.judged.held_by:
         adjusted = _of_rig(edge, rig, estimates)
         against = [*_contradictions(edge, rig, adjusted, estimates), *more]
-        again = edge.judge(adjusted, [*edge.failed, *against], together=True)
+        again = edge.judge(adjusted, [*edge.failed, *against], True)
         if at.used or again.verdict.status == "accepted":
             estimate, judged = adjusted.doubted(again.doubt), again
         elif against and not edge.evidence.checks:  # else it is held by what it failed itself
-            judged = edge.judge(edge.own, [*edge.failed, *against], together=False)
+            judged = edge.judge(edge.own, [*edge.failed, *against], False)
     record = edge.record(estimate, judged)
     is_adjusted = estimate is not edge.own
     if is_adjusted and record.status != "refused":

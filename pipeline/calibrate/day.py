@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
-from pipeline.calibrate.adjust.evidence import evidence_of
+from pipeline.calibrate.adjust.equations import evidence_of
 from pipeline.calibrate.adjusted_day import SolvedDay, SolvedEdge
 from pipeline.calibrate.judging import Judged, Judging
 from pipeline.calibrate.methods import Method, Solver, method_named
-from pipeline.calibrate.paper.triggers import exceeded, trigger_metrics
-from pipeline.calibrate.records import Inputs, record_of, refused_record
+from pipeline.calibrate.records import Inputs, edge_of_pair, record_of, refused_record
 from pipeline.calibrate.select.frames import PAPER_SYNC_GATE_S, Selection, select_frames
-from pipeline.calibrate.unlabelled import unlabelled_pairs
+from pipeline.calibrate.select.triggers import exceeded, trigger_metrics
 from pipeline.calibrate.verify.day_checks import FoundDay, checks_of_day
 from pipeline.calibrate.verify.day_labels import day_labels
 from pipeline.calibrate.verify.motion_sources import MotionFindings, compared_sources
@@ -27,39 +26,13 @@ from pipeline.core.stage_work import Probes
 from pipeline.rig.checks import Check
 from pipeline.rig.day_prior import no_prior
 from pipeline.rig.estimates import Prior, Solution
-from pipeline.rig.graph import Edge
 from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, SENSORS, CalibrationRecord
+from schemas.faults import FAULTS
 from schemas.observations import WITHOUT_LABELS, Observation
 
-__all__ = ["DayOfPairs", "solve_day"]
+__all__ = ["solve_day", "unlabelled_pairs"]
 
 _TRIGGER_FRAMES = 40  # metrics are means over frames: more of them only cost time
-
-
-@dataclass(frozen=True, eq=False)
-class DayOfPairs:
-    """A day whose pairs were solved and judged each: records of refused pairs, and the others.
-
-    `solved` is None if every pair was refused.
-    """
-
-    refused: Mapping[str, CalibrationRecord]
-    solved: SolvedDay | None
-
-    def edges(self, about: Inputs, fleet: FleetConfig, edges: Mapping[str, Edge]) -> list[SolvedEdge]:
-        """The pairs that were solved, as edges of a rig; `edges` by pair."""
-        day = self.solved
-        return [] if day is None else [
-            SolvedEdge(
-                edges[pair], own, day.judged[pair],
-                evidence_of(
-                    own, edges[pair], day.prior, fleet.solve.time_offset_sigma_s, day.judged[pair].verdict.against
-                ),
-                tuple(day.failed[pair]), day.judging.pair, partial(record_of, about, pair, day),
-                is_active=pair in day.judging.active,
-            )
-            for pair, own in day.solution.pairs.items()
-        ]  # fmt: skip
 
 
 def solve_day(
@@ -69,8 +42,8 @@ def solve_day(
     about: Inputs,
     progress: Progress = silent,
     solver: Solver | None = None,
-) -> DayOfPairs:
-    """Select, trigger, solve, judge, each pair by its own frames.
+) -> tuple[list[CalibrationRecord], list[SolvedEdge]]:
+    """Select, trigger, solve, judge, each pair by its own frames: records of refused pairs, and the others.
 
     `solver` is for methods that need more than observations (`Method.needs_images`); None = the method's own.
 
@@ -99,7 +72,7 @@ def _solved(
     motion: MotionFindings,
     progress: Progress,
     solver: Solver | None,
-) -> DayOfPairs:
+) -> tuple[list[CalibrationRecord], list[SolvedEdge]]:
     """A day whose sources of motion were compared."""
     progress(0, 4, "select frames")
     labels = day_labels(observations, float(np.radians(fleet.verify.camera_lidar_limit_deg)))
@@ -110,12 +83,12 @@ def _solved(
     known = {**selection.refused, **unlabelled}  # no frames are enough for pairs that need labels
     refused = {p: _named(e, motion.of(p)) for p, e in _refused(method, about.pairs, known, prior).items()}
     pairs = [pair for pair in about.pairs if pair not in refused]
-    refusals = {
-        pair: refused_record(about, pair, why, observations, prior, selection.rejected[pair])
+    refusals = [
+        refused_record(about, pair, why, observations, prior, selection.rejected[pair])
         for pair, why in refused.items()
-    }
+    ]
     if not pairs:
-        return DayOfPairs(refusals, None)
+        return refusals, []
     frames = {pair: [observations[i] for i in selection.fit[pair]] for pair in pairs}
     sample, before, fired = _triggers(observations, frames, prior, method, fleet)
     active = _to_calibrate(method, fired, fleet.trigger.when)
@@ -134,7 +107,7 @@ def _solved(
     failed, judging = _judging(
         observations, selection, prior, solution, fleet, active, motion, about.probe_deg
     )
-    judged = _judged(solution, failed, judging, _composed_of(method, pairs))
+    judged = _judged(solution, failed, judging, method.composed if len(pairs) == len(PAIRS) else ())
     doubted = {pair: estimate.doubted(judged[pair].doubt) for pair, estimate in solution.pairs.items()}
     day = SolvedDay(
         observations,
@@ -150,7 +123,17 @@ def _solved(
         motion.numbers,
     )
     progress(4, 4, "done")
-    return DayOfPairs(refusals, day)
+    return refusals, [_edge(day, about, pair) for pair in day.solution.pairs]
+
+
+def _edge(day: SolvedDay, about: Inputs, pair: str) -> SolvedEdge:
+    own, judged, edge = day.solution.pairs[pair], day.judged[pair], edge_of_pair(about, pair)
+    clock_sigma_s = day.judging.fleet.solve.time_offset_sigma_s
+    return SolvedEdge(
+        edge, own, judged, evidence_of(own, edge, day.prior, clock_sigma_s, judged.verdict.against),
+        tuple(day.failed[pair]), day.judging.pair, partial(record_of, about, pair, day),
+        is_active=pair in day.judging.active,
+    )  # fmt: skip
 
 
 def _triggers(
@@ -164,17 +147,10 @@ def _triggers(
     measured = method.paper_selection or fleet.trigger.when == "triggered"
     sample = _spread(observations, frames) if measured else []
     before = trigger_metrics(sample, {pair: prior.of(pair) for pair in frames})
-    return sample, before, _fired(before, sample, fleet)
-
-
-def _fired(
-    before: Mapping[str, Mapping[str, float]], sample: Sequence[Observation], fleet: FleetConfig
-) -> dict[str, list[str]]:
-    """Triggers that the prior exceeds, by pair."""
     fired = {pair: exceeded(metrics, fleet.trigger) for pair, metrics in before.items()}
     if "camera_lidar" in fired and any(o.is_unlabelled for o in sample):
         fired["camera_lidar"] = [WITHOUT_LABELS]  # nothing shows that it need not be calibrated
-    return fired
+    return sample, before, fired
 
 
 def _selection(
@@ -229,7 +205,7 @@ def _judged(
         if pair in composed and held:
             disproved = any(v.disproved for v in held)
             checks.append(Check("it is composed of a pair that is not accepted", disproves=disproved))
-        judged[pair] = judging.pair(solution.pairs[pair], checks, together=pair in composed)
+        judged[pair] = judging.pair(solution.pairs[pair], checks, pair in composed)
     return judged
 
 
@@ -258,11 +234,6 @@ def _to_calibrate(method: Method, fired: Mapping[str, Sequence[str]], when: str)
     return [p for p in fired if p in wanted]
 
 
-def _composed_of(method: Method, pairs: Collection[str]) -> tuple[str, ...]:
-    """Pairs that the method composes of the others: none if one of these is missing."""
-    return method.composed if len(pairs) == len(PAIRS) else ()
-
-
 def _spread(
     observations: Sequence[Observation], frames: Mapping[str, Sequence[Observation]]
 ) -> list[Observation]:
@@ -271,3 +242,23 @@ def _spread(
     rows = [o for o in observations if id(o) in used]
     picked = np.unique(np.linspace(0, len(rows) - 1, min(len(rows), _TRIGGER_FRAMES)).astype(int))
     return [rows[i] for i in picked]
+
+
+def unlabelled_pairs(
+    observations: Sequence[Observation], chosen: Mapping[str, str], *, needs_labels: bool
+) -> dict[str, SolveError]:
+    """Pairs of a camera without semantics that need labels or road users, and why they are refused.
+
+    `chosen` has the names of the sensors by kind. Camera-radar compares moving clusters with the boxes of road
+    users. Camera-lidar can do with steps of brightness, unless the method `needs_labels`.
+    """
+    if not any(o.is_unlabelled for o in observations):
+        return {}
+    camera = chosen.get("camera", "camera")
+    why = {"camera_radar": "boxes of road users"} | ({"camera_lidar": "labels"} if needs_labels else {})
+    return {
+        pair: SolveError(
+            f"{FAULTS['no_labels']}, {camera}: {pair.replace('_', '-')} needs {what}", "no_labels"
+        )
+        for pair, what in why.items()
+    }

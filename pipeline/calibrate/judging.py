@@ -16,9 +16,8 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.calibrate.adjust.rig import AdjustmentLimits, adjust
+from pipeline.calibrate.adjust.rig import adjust
 from pipeline.calibrate.numerics.frame_blocks import scene_blocks
-from pipeline.calibrate.numerics.search_range import SearchRange, search_range
 from pipeline.calibrate.select.frames import Selection
 from pipeline.calibrate.verify.edge_result import EdgeResult, tilt_in_doubt
 from pipeline.calibrate.verify.held_out import (
@@ -45,13 +44,11 @@ from pipeline.core.config import FleetConfig, VerifyConfig
 from pipeline.core.stage_work import NO_PROBES, Probes
 from pipeline.rig.changes import change_covariance
 from pipeline.rig.checks import Check
-from pipeline.rig.estimates import PairEstimate, Prior
-from pipeline.rig.evidence import EdgeEvidence
-from pipeline.rig.extrinsics import Extrinsics
+from pipeline.rig.estimates import EdgeEvidence, PairEstimate, Prior
 from pipeline.rig.graph import BASE, Edge, RigGraph
 from pipeline.rig.kinds import KIND_OF_EDGE
 from pipeline.rig.overlap import View
-from pipeline.rig.prior import RigPrior
+from pipeline.rig.prior import Extrinsics, RigPrior
 from pipeline.rig.rig import sensor_turn
 from pipeline.rig.targets import DEFAULT_TARGETS
 from schemas.calibrations import PROBE_Z
@@ -108,7 +105,7 @@ class Judging:
         frames = [self.observations[i] for i in held_out]
         return held_out_place(frames, self.prior, self.fleet.solve)
 
-    def pair(self, estimate: PairEstimate, failed: Sequence[Check], *, together: bool) -> Judged:
+    def pair(self, estimate: PairEstimate, failed: Sequence[Check], together: bool) -> Judged:
         """Judge one pair; `together` is true if other pairs take part in its pose (see `judge`)."""
         pair, limits = estimate.pair, self.fleet.verify.checks
         active = pair in self.active
@@ -122,8 +119,8 @@ class Judging:
         test, claims, probes, elsewhere = self._held_out(estimate, held_out, mounting, targets)
         disproved = [Check(estimate.disproved, disproves=True)] if estimate.disproved else []
         prior_sigma = np.sqrt(np.diag(self.prior.covariance(pair)))
-        search = search_range(self.prior.sigmas, self.fleet.solve)
-        result = _result(estimate, self.prior.of(pair), prior_sigma, search, targets)
+        search = self.fleet.solve.search_range(self.prior.sigmas)
+        result = EdgeResult.of(estimate, self.prior.of(pair), prior_sigma, search, targets)
         verdict = judge(
             result,
             Evidence(test, claims, [*failed, *unseen, *elsewhere, *disproved]),
@@ -187,18 +184,6 @@ def _claims(
     )
 
 
-def _result(
-    estimate: PairEstimate,
-    prior: np.ndarray,
-    prior_sigma: np.ndarray,
-    search: SearchRange,
-    targets: np.ndarray,
-) -> EdgeResult:
-    T, covariance, observable = estimate.T, estimate.covariance, estimate.observable
-    frames = estimate.frames_used
-    return EdgeResult(estimate.pair, T, covariance, observable, prior, prior_sigma, frames, search, targets)
-
-
 def probe_numbers(
     pair: str,
     T: Float[np.ndarray, "4 4"],
@@ -251,8 +236,8 @@ class EdgeJudging:
     ) -> EdgeJudging:
         """Combine an edge's own data with its prior alone."""
         edge, child = evidence.edge, evidence.edge.child.name
-        free, limits = replace(evidence, checks=()), AdjustmentLimits(fleet.solve.time_offset_sigma_s)
-        alone = adjust(RigGraph(edge.sensors, (edge,), edge.parent), _prior_of(edge, prior), [free], limits)
+        free, clock_s = replace(evidence, checks=()), fleet.solve.time_offset_sigma_s
+        alone = adjust(RigGraph(edge.sensors, (edge,), edge.parent), _prior_of(edge, prior), [free], clock_s)
         of_child, poses = alone.sensors[child], alone.poses
         estimate = PairEstimate(
             edge.kind, poses.T[child], poses.covariance, of_child.observability, of_child.determined,
@@ -261,7 +246,7 @@ class EdgeJudging:
         )  # fmt: skip
         return cls(evidence, alone.before, estimate, prior, views, fleet)
 
-    def edge(self, estimate: PairEstimate, failed: Sequence[Check], *, together: bool) -> Judged:
+    def edge(self, estimate: PairEstimate, failed: Sequence[Check], together: bool) -> Judged:
         """Judge it at an estimate; `together` is true if other edges take part in its pose (see `judge`)."""
         edge, checks = self.evidence.edge, self.fleet.verify.checks
         targets = targets_of(estimate.T, self.views.get(edge.parent.name), self.views.get(edge.child.name))
@@ -273,7 +258,7 @@ class EdgeJudging:
         before, before_sigma = self.before.T[edge.child.name], np.repeat(sigmas, 3)
         if edge.child != BASE:  # a parent that turns swings the child
             before_sigma = np.sqrt(np.diag(change_covariance(before, self.before.covariance)))
-        result = _result(estimate, before, before_sigma, search_range(sigmas, self.fleet.solve), targets)
+        result = EdgeResult.of(estimate, before, before_sigma, self.fleet.solve.search_range(sigmas), targets)
         verdict = judge(result, Evidence(test, claims, failed), checks, together=together)
         held_by = tuple(check for check in failed if matters(check, result, claims))
         return Judged(verdict, test, claims, mounting, targets, held_by=held_by)

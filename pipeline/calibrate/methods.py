@@ -94,10 +94,10 @@ METHODS = (
         frames="all",
         needs_all=True,
     ),
-    Method("pairwise-optimisation", "pipeline.calibrate.paper.pairwise:solve_pairwise", paper_selection=True),
+    Method("pairwise-optimisation", "pipeline.calibrate.paper_methods:solve_pairwise", paper_selection=True),
     Method(
         "joint-optimisation",
-        "pipeline.calibrate.paper.pairwise:solve_joint_optimisation",
+        "pipeline.calibrate.paper_methods:solve_joint_optimisation",
         paper_selection=True,
         needs_all=True,
     ),

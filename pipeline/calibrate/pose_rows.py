@@ -11,21 +11,21 @@ from jaxtyping import Float
 
 from pipeline.calibrate.adjust.rig import AdjustedRig, AdjustedSensor
 from pipeline.calibrate.adjusted_day import Concluded
-from pipeline.calibrate.records import Inputs
+from pipeline.calibrate.records import Inputs, edge_of_pair
+from pipeline.calibrate.rig_day import WrongPrior
 from pipeline.calibrate.verify.target_accuracy import DIRECTIONS, Claim, claims_of, targets_of
-from pipeline.calibrate.wrong_priors import WrongPrior
 from pipeline.core.config import VerifyConfig
 from pipeline.rig.changes import change_jacobian
 from pipeline.rig.checks import faults_of
 from pipeline.rig.edges import pose_columns
-from pipeline.rig.extrinsics import Extrinsics
 from pipeline.rig.graph import RigGraph, Sensor
 from pipeline.rig.overlap import View
+from pipeline.rig.prior import Extrinsics
 from pipeline.rig.se3 import adjoint, exp_se3, inverse, transform_points
 from pipeline.rig.spherical import from_spherical
 from pipeline.rig.targets import DEFAULT_TARGETS, errors_at_targets
 from pipeline.store.current import prior_of, transform_of
-from schemas.calibrations import FRAMES_OF_PAIR, CalibrationRecord
+from schemas.calibrations import CalibrationRecord
 from schemas.poses import PoseRow
 from schemas.versions import CODE_VERSION
 
@@ -66,32 +66,15 @@ def pose_rows(
 
 def poses_of_records(about: Inputs, records: Sequence[CalibrationRecord]) -> list[PoseRow]:
     """A row for each sensor of a method whose records are the answer: of edges to the lidar, else to the radar."""
-    kinds = {about.chosen.get(kind, kind): kind for pair in about.pairs for kind in FRAMES_OF_PAIR[pair]}
-    reference = next(name for kind in ("lidar", "radar") for name in kinds if kinds[name] == kind)
-    to_reference = {
-        r.parent_frame if r.child_frame == reference else r.child_frame: r
-        for r in records
-        if reference in (r.parent_frame, r.child_frame)
-    }
-    told: dict[str, Any] = {
-        "vehicle": about.partition.vehicle, "day": about.partition.day, "method": about.method, "reference": reference,
-        "work_key": about.work_key, "code_version": CODE_VERSION, "inputs": list(about.inputs),
-    }  # fmt: skip
-    own: dict[str, Any] = {
-        "kind": kinds[reference],
-        "sensor": reference,
-        "status": "accepted",
-        "reason": "it is the reference of all poses",
-    }
-    exact: dict[str, Any] = {"covariance": np.zeros((6, 6)), "common_covariance": np.zeros((6, 6))}
-    first = PoseRow(**told, **own, **exact, **pose_columns(np.eye(4)), dt_s=0.0)
-    return [
-        first,
-        *(
-            PoseRow(**told, sensor=name, kind=kinds[name], **_of_record(record, reference))
-            for name, record in to_reference.items()
-        ),
-    ]
+    sensors = {s.name: s for pair in about.pairs for s in edge_of_pair(about, pair).sensors}
+    reference = next(s for kind in ("lidar", "radar") for s in sensors.values() if s.kind == kind)
+    rows = [PoseRow(**_identity(about, reference, reference), **_AT_REFERENCE)]
+    for record in records:
+        ends = record.parent_frame, record.child_frame
+        if reference.name in ends:
+            sensor = sensors[next(name for name in ends if name != reference.name)]
+            rows.append(PoseRow(**_identity(about, reference, sensor), **_of_record(record, reference.name)))
+    return rows
 
 
 def _of_record(record: CalibrationRecord, reference: str) -> dict[str, Any]:
@@ -105,17 +88,9 @@ def _of_record(record: CalibrationRecord, reference: str) -> dict[str, Any]:
         (T, C, B), (T_prior, P, _) = _reversed(T, C, B), _reversed(T_prior, P, None)
     elif targets is not None and T is not None:
         targets = transform_points(T, targets)
-    judged = (
-        "status",
-        "reason",
-        "faults",
-        "determined",
-        "azimuth_sigma_rad",
-        "elevation_sigma_rad",
-        "observable",
-    )
+    verdict = ("status", "reason", "faults", "determined", "azimuth_sigma_rad", "elevation_sigma_rad")
     return {
-        **{name: getattr(record, name) for name in judged},
+        **{name: getattr(record, name) for name in (*verdict, "observable")},
         **pose_columns(T),
         **pose_columns(T_prior, "prior_"),
         "covariance": C,
@@ -165,9 +140,13 @@ def _row(
     verify: VerifyConfig,
     wrong: Sequence[WrongPrior],
 ) -> PoseRow:
-    told = _identity(about, graph, sensor, views) | _prior(graph.reference.name, sensor.name, before)
+    told = _identity(about, graph.reference, sensor)
+    told["view_azimuth_rad"] = _azimuth_seen(views[sensor.name], sensor) if sensor.name in views else None
     if sensor == graph.reference:
         return PoseRow(**told, **_AT_REFERENCE)
+    if sensor.name in before.T:
+        told |= pose_columns(before.T[sensor.name], "prior_")
+        told["prior_covariance"] = before.covariance_between(graph.reference.name, sensor.name)
     found = None if adjusted is None else adjusted.sensors.get(sensor.name)
     if adjusted is None or found is None:
         why = "no edge of the rig has evidence" if adjusted is None else "its prior pose is unknown"
@@ -178,7 +157,8 @@ def _row(
         said = next((f"; {c.sentence}" for c in failed if c.fault), "")
         return PoseRow(**told, status="refused", reason=found.untied + why + said, faults=faults_of(failed))
     poses, reference = adjusted.poses, graph.reference.name
-    targets = _targets(sensor, poses, views)
+    targets = targets_of(poses.between(sensor.name, reference), views.get(sensor.name), None)
+    targets = DEFAULT_TARGETS if targets is None else targets
     claims = _claims(sensor, poses, targets, verify)
     doubted = _doubted(sensor, adjusted, claims, targets, wrong)
     determined = [
@@ -208,33 +188,18 @@ def _row(
     )
 
 
-def _prior(reference: str, sensor: str, before: Extrinsics) -> dict[str, Any]:
-    """Columns of the prior; empty if it is unknown."""
-    if sensor not in before.T or sensor == reference:
-        return {}
-    of_sensor = before.covariance_between(reference, sensor)
-    return {**pose_columns(before.T[sensor], "prior_"), "prior_covariance": of_sensor}
-
-
-def _identity(about: Inputs, graph: RigGraph, sensor: Sensor, views: Mapping[str, View]) -> dict[str, Any]:
+def _identity(about: Inputs, reference: Sensor, sensor: Sensor) -> dict[str, Any]:
     return {
         "vehicle": about.partition.vehicle,
         "day": about.partition.day,
         "method": about.method,
         "sensor": sensor.name,
         "kind": sensor.kind,
-        "reference": graph.reference.name,
+        "reference": reference.name,
         "work_key": about.work_key,
         "code_version": CODE_VERSION,
         "inputs": list(about.inputs),
-        "view_azimuth_rad": None if sensor.name not in views else _azimuth_seen(views[sensor.name], sensor),
     }
-
-
-def _targets(sensor: Sensor, poses: Extrinsics, views: Mapping[str, View]) -> Float[np.ndarray, "3 3"]:
-    """Targets in the sensor's view, in the reference's frame."""
-    found = targets_of(poses.between(sensor.name, poses.reference.name), views.get(sensor.name), None)
-    return DEFAULT_TARGETS if found is None else found
 
 
 def _claims(

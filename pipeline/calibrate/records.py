@@ -11,10 +11,8 @@ from jaxtyping import Float
 
 from pipeline.calibrate.adjusted_day import SolvedDay
 from pipeline.calibrate.judging import EdgeJudging, Judged
-from pipeline.calibrate.paper.triggers import trigger_metrics
-from pipeline.calibrate.unlabelled import notes_of_pair
-from pipeline.calibrate.verify.constancy import PART_FLOOR_RAD
-from pipeline.calibrate.verify.held_out import HeldOutTest
+from pipeline.calibrate.select.triggers import trigger_metrics
+from pipeline.calibrate.verify.day_checks import PART_FLOOR_RAD
 from pipeline.calibrate.verify.verdict import undetermined
 from pipeline.core.errors import SolveError
 from pipeline.core.stage_work import NO_PROBES, Probes
@@ -27,7 +25,7 @@ from pipeline.rig.se3 import adjoint, inverse
 from pipeline.rig.spherical import camera_direction_angles
 from pipeline.store.partitions import Partition
 from schemas.calibrations import DOF_NAMES, FRAMES_OF_PAIR, PAIRS, CalibrationRecord
-from schemas.observations import Observation
+from schemas.observations import WITHOUT_LABELS, Observation
 from schemas.versions import CODE_VERSION
 
 __all__ = [
@@ -36,6 +34,7 @@ __all__ = [
     "edge_of_pair",
     "environment_of",
     "half_days_of",
+    "notes_of_pair",
     "record_of",
     "record_of_edge",
     "refused_edge",
@@ -45,6 +44,8 @@ __all__ = [
 # Speeds that separate a highway from a town [m/s]: 20 m/s = 72 km/h is above town limits.
 _FAST_MPS = 20.0
 _MOVING_MPS = 1.0
+# Checks of camera-lidar with labels that need what a camera without semantics lacks.
+_UNCHECKED = "no road users were detected: neither boxes nor a radar confirm the pose"
 _OF_K = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}
 
 
@@ -71,13 +72,14 @@ def record_of(
     selection = day.selection
     trigger_after = trigger_metrics(day.trigger_sample, {pair: estimate.T})[pair]
     faults = {p: judged.verdict.faults for p, judged in day.judged.items()}
+    rejected = selection.rejected[pair], estimate.frames_rejected
     notes = [*notes_of_pair(pair, day.observations), *selection.notes.get(pair, [])]
     record = computed_record(about, edge_of_pair(about, pair), len(day.observations), estimate, judged, notes)
     return replace(
         record,
         **_prior_fields(pair, day.prior),
         **_loop_fields(day.solution),
-        frames_rejected=_add(selection.rejected[pair], estimate.frames_rejected),
+        frames_rejected={n: sum(of.get(n, 0) for of in rejected) for n in {*rejected[0], *rejected[1]}},
         environment=environment_of(day.observations),
         triggered=day.triggered[pair],
         trigger_before=dict(day.trigger_before[pair]),
@@ -94,6 +96,12 @@ def record_of(
     )
 
 
+def notes_of_pair(pair: str, observations: Sequence[Observation]) -> list[str]:
+    """Notes for the record of a pair: how its camera was aligned, and by what it was not checked."""
+    is_unlabelled = "camera" in FRAMES_OF_PAIR[pair] and any(o.is_unlabelled for o in observations)
+    return [WITHOUT_LABELS, _UNCHECKED] if is_unlabelled else []
+
+
 def computed_record(
     about: Inputs, edge: Edge, frames_total: int, found: PairEstimate, judged: Judged, notes: Sequence[str]
 ) -> CalibrationRecord:
@@ -104,7 +112,6 @@ def computed_record(
         "observability": [float(v) for v in found.observability],
         "observable": [bool(v) for v in found.observable],
     }  # fmt: skip
-    numbers = dict(found.diagnostics) | _verdict_numbers(judged) | _parts_numbers(found.parts)
     return CalibrationRecord(
         **_identity(about, edge, frames_total),
         **pose,
@@ -112,7 +119,7 @@ def computed_record(
         frames_used=found.frames_used,
         frames_rejected=dict(found.frames_rejected),
         notes=[*notes, *undetermined(edge.kind, found.observable)],
-        diagnostics=numbers,
+        diagnostics=dict(found.diagnostics) | _verdict_numbers(judged) | _parts_numbers(found.parts),
     )
 
 
@@ -181,10 +188,38 @@ def _identity(about: Inputs, edge: Edge, frames_total: int) -> dict[str, Any]:
     }
 
 
-def _prior_fields(pair: str, prior: Prior | None) -> dict[str, Any]:
-    if prior is None or not prior.knows(pair):
+def _prior_fields(pair: str, prior: Prior) -> dict[str, Any]:
+    if not prior.knows(pair):
         return {}
     return pose_columns(prior.of(pair), "prior_") | {"prior_covariance": prior.covariance(pair)}
+
+
+def _camera_numbers(pair: str, observations: Sequence[Observation]) -> dict[str, float]:
+    """The CameraInfo of the record's directions, to distinguish days with another one."""
+    o = next((o for o in observations if "camera" in o.sensors), None)
+    if "camera" not in FRAMES_OF_PAIR[pair] or o is None:
+        return {}
+    return {f"camera_{name}_px": float(o.camera_K[at]) for name, at in _OF_K.items()}
+
+
+def _loop_fields(solution: Solution) -> dict[str, Any]:
+    """Residual of the loop, with sigmas from three pairs estimated apart or from the method's own check."""
+    rotation, translation = solution.loop_rotation_rad, solution.loop_translation_m
+    sigmas: tuple[float | None, ...] = None, None
+    if rotation is not None and translation is not None:
+        # Of T_camera_lidar T_lidar_radar T_radar_camera, with independent factors (first order).
+        cl, cr, lr = (solution.pairs[pair] for pair in PAIRS)
+        A, B = adjoint(cl.T), adjoint(cl.T @ lr.T @ inverse(cr.T))
+        covariance = cl.covariance + A @ lr.covariance @ A.T + B @ cr.covariance @ B.T
+        sigmas = tuple(float(np.sqrt(np.trace(covariance[k : k + 3, k : k + 3]))) for k in (0, 3))
+    elif "camera_radar" in solution.pairs:
+        sigmas = solution.pairs["camera_radar"].diagnostics.get("loop_rotation_sigma_rad"), None
+    return {
+        "loop_rotation_rad": rotation,
+        "loop_translation_m": translation,
+        "loop_rotation_sigma_rad": sigmas[0],
+        "loop_translation_sigma_m": sigmas[1],
+    }
 
 
 def _assumed(estimate: PairEstimate, observations: Sequence[Observation]) -> list[str]:
@@ -198,7 +233,7 @@ def _assumed(estimate: PairEstimate, observations: Sequence[Observation]) -> lis
     if "camera" not in FRAMES_OF_PAIR[estimate.pair] or o is None:
         return assumed
     camera = camera_of(o)
-    wrong = replace(camera, K=_scaled(o.camera_K, 1.001))
+    wrong = replace(camera, K=o.camera_K * [[1.001, 1.0, 1.0], [1.0, 1.001, 1.0], [1.0, 1.0, 1.0]])
     edge = np.array([[0.0, o.image_height_px / 2], [o.image_width_px - 1.0, o.image_height_px / 2]])
     angles = camera_direction_angles(camera.unproject(edge)) - camera_direction_angles(wrong.unproject(edge))
     worth = float(np.degrees(np.abs(angles[:, 0]).max()))
@@ -212,12 +247,6 @@ def _assumed(estimate: PairEstimate, observations: Sequence[Observation]) -> lis
     ]
 
 
-def _scaled(K: np.ndarray, factor: float) -> np.ndarray:
-    out = np.array(K, np.float64)
-    out[[0, 1], [0, 1]] *= factor
-    return out
-
-
 def _parts_numbers(parts: DayParts | None) -> dict[str, float]:
     """How far the last part of the day turns from its first, and in how many sigmas."""
     if parts is None:
@@ -226,14 +255,9 @@ def _parts_numbers(parts: DayParts | None) -> dict[str, float]:
     return numbers | {"parts_sigmas": float(np.abs(parts.sigmas(PART_FLOOR_RAD)).max())}
 
 
-def _test_numbers(test: HeldOutTest | None) -> dict[str, float]:
-    frames = {} if test is None else {"frames": float(test.frames), "blocks": float(test.blocks), "z": test.z}
-    return {f"holdout_{name}": value for name, value in frames.items()}
-
-
 def _verdict_fields(judged: Judged) -> dict[str, Any]:
     """Fields of the verdict; sigmas and targets are missing in a refused record."""
-    verdict, test = judged.verdict, judged.test
+    verdict, test, claims = judged.verdict, judged.test, judged.claims
     fields = {
         "status": verdict.status,
         "reason": verdict.reason,
@@ -241,91 +265,37 @@ def _verdict_fields(judged: Judged) -> dict[str, Any]:
         "score": verdict.score,
         "determined": list(verdict.determined),
         "mounting_determined": list(verdict.mounting),
-        "limit_rad": judged.claims["azimuth"].limit_rad,
+        "limit_rad": claims["azimuth"].limit_rad,
         "alignment_before": test.before if test else None,
         "alignment_after": test.after if test else None,
     }
     if verdict.status == "refused":
         return fields
-    sigmas = {f"{name}_sigma_rad": claim.sigma_rad for name, claim in judged.claims.items()}
-    return fields | sigmas | {"targets_m": judged.targets} | _mounting_fields(judged)
+    fields |= {f"{name}_sigma_rad": claim.sigma_rad for name, claim in claims.items()}
+    if judged.mounting_covariance is not None:  # the principal point is known
+        fields |= {f"mounting_{name}_sigma_rad": claim.mounting_sigma_rad for name, claim in claims.items()}
+        fields["mounting_covariance"] = judged.mounting_covariance
+    return fields | {"targets_m": judged.targets}
 
 
 def _verdict_numbers(judged: Judged) -> dict[str, float]:
     """Numbers behind the verdict: held-out frames, known turns of the result, score, certified axes."""
-    return _test_numbers(judged.test) | dict(judged.probes) | _claim_numbers(judged)
-
-
-def _claim_numbers(judged: Judged) -> dict[str, float]:
-    """Score, certified axes, innovation of held-out frames, resulting sigma."""
-    certified = judged.verdict.determined
-    numbers = {
-        "confidence": judged.verdict.score,
-        "disproved": float(judged.verdict.disproved),
-        "unsure_only": float(judged.verdict.unsure_only),
-        "vouched_az": float("azimuth" in certified),
-        "vouched_el": float("elevation" in certified),
+    test, verdict = judged.test, judged.verdict
+    held_out = (
+        {} if test is None else {"frames": float(test.frames), "blocks": float(test.blocks), "z": test.z}
+    )
+    for name, claim in judged.claims.items():
+        held_out[f"{name}_shift_rad"] = claim.shift_rad
+        held_out[f"{name}_shift_sigma_rad"] = claim.shift_sigma_rad
+        held_out[f"{name}_remaining_sigma_rad"] = claim.remaining_sigma_rad
+    return dict(judged.probes) | {f"holdout_{name}": value for name, value in held_out.items()} | {
+        "confidence": verdict.score,
+        "disproved": float(verdict.disproved),
+        "unsure_only": float(verdict.unsure_only),
+        "vouched_az": float("azimuth" in verdict.determined),
+        "vouched_el": float("elevation" in verdict.determined),
         "elevation_limit_rad": judged.claims["elevation"].limit_rad,
-    }
-    return numbers | {
-        f"holdout_{name}_{what}_rad": value
-        for name, claim in judged.claims.items()
-        for what, value in (
-            ("shift", claim.shift_rad),
-            ("shift_sigma", claim.shift_sigma_rad),
-            ("remaining_sigma", claim.remaining_sigma_rad),
-        )
-    }
-
-
-def _mounting_fields(judged: Judged) -> dict[str, Any]:
-    """Covariance of the mounting; empty if the principal point is unknown."""
-    if judged.mounting_covariance is None:
-        return {}
-    sigmas = {f"mounting_{n}_sigma_rad": claim.mounting_sigma_rad for n, claim in judged.claims.items()}
-    return sigmas | {"mounting_covariance": judged.mounting_covariance}
-
-
-def _camera_numbers(pair: str, observations: Sequence[Observation]) -> dict[str, float]:
-    """The CameraInfo of the record's directions, to distinguish days with another one."""
-    o = next((o for o in observations if "camera" in o.sensors), None)
-    if "camera" not in FRAMES_OF_PAIR[pair] or o is None:
-        return {}
-    K = o.camera_K
-    return {f"camera_{name}_px": float(K[at]) for name, at in _OF_K.items()}
-
-
-def _loop_fields(solution: Solution) -> dict[str, Any]:
-    """Residual of the loop, with sigmas from three pairs estimated apart or from the method's own check."""
-    composed = solution.pairs.get("camera_radar")
-    checked = None if composed is None else composed.diagnostics.get("loop_rotation_sigma_rad")
-    rotation, translation = _loop_sigmas(solution) or (checked, None)
-    return {
-        "loop_rotation_rad": solution.loop_rotation_rad,
-        "loop_translation_m": solution.loop_translation_m,
-        "loop_rotation_sigma_rad": rotation,
-        "loop_translation_sigma_m": translation,
-    }
-
-
-def _loop_sigmas(solution: Solution) -> tuple[float, float] | None:
-    """Sigma of the loop's angle [rad] and translation [m] if all three pairs were estimated independently."""
-    if solution.loop_rotation_rad is None or solution.loop_translation_m is None:
-        return None
-    covariance = _loop_covariance(solution)
-    return float(np.sqrt(np.trace(covariance[:3, :3]))), float(np.sqrt(np.trace(covariance[3:, 3:])))
-
-
-def _loop_covariance(solution: Solution) -> np.ndarray:
-    """Covariance (6 6) of T_camera_lidar T_lidar_radar T_radar_camera, with independent factors (first order)."""
-    cl, lr, cr = (solution.pairs[p] for p in ("camera_lidar", "lidar_radar", "camera_radar"))
-    A = adjoint(cl.T)
-    B = adjoint(cl.T @ lr.T @ inverse(cr.T))
-    return cl.covariance + A @ lr.covariance @ A.T + B @ cr.covariance @ B.T
-
-
-def _add(a: Mapping[str, int], b: Mapping[str, int]) -> dict[str, int]:
-    return {name: a.get(name, 0) + b.get(name, 0) for name in {*a, *b}}
+    }  # fmt: skip
 
 
 def half_days_of(

@@ -15,7 +15,6 @@ from pipeline.calibrate.methods import Method, method_named
 from pipeline.calibrate.pose_rows import pose_rows, poses_of_records
 from pipeline.calibrate.records import Inputs, refused_edge
 from pipeline.calibrate.rig_day import RigDay, calibrate_rig
-from pipeline.calibrate.unlabelled import noted
 from pipeline.calibrate.verify.target_accuracy import views_of
 from pipeline.core.errors import ConfigError, SolveError
 from pipeline.core.results import Outcome, Progress
@@ -39,7 +38,7 @@ from schemas.moments import PRIOR, SENSORS_ABSENT
 from schemas.observations import WITHOUT_LABELS, Observation
 from schemas.poses import PoseRow
 
-__all__ = ["accepted_before", "refused_edges", "three_of_day", "three_sensors", "work"]
+__all__ = ["accepted_before", "noted", "refused_edges", "three_of_day", "three_sensors", "work"]
 
 # Days with records that are looked at: a vehicle that was held for longer has no state worth a look.
 _DAYS_BACK = 10
@@ -71,7 +70,7 @@ def work(task: Task) -> Work:
         "perturb": task.perturb,
         "seed": seed,
         "prior_file": prior_key(fleet, task.partition.vehicle),
-        "camera": _known_cameras(rig),
+        "camera": {name: asdict(camera.known) for name, camera in rig.cameras.items()},
     } | rig.told_to_calibrate
     prior = rig.prior
     tables = (ingested, perceived) if method.needs_images else (perceived,)
@@ -96,11 +95,6 @@ def work(task: Task) -> Work:
         inputs=tuple(m.work_key for m in manifests if m is not None),
         tell=_told,
     )
-
-
-def _known_cameras(rig: Rig) -> dict[str, Any]:
-    """Assumed calibration of the rig's cameras, for the work key."""
-    return {name: asdict(camera.known) for name, camera in rig.cameras.items()}
 
 
 def _refusal(refused: Outcome, partition: Partition, method: Method, seed: int, rig: Rig) -> Work:
@@ -162,6 +156,14 @@ def _rows_of_day(task: Task, about: Inputs, progress: Progress) -> list[Calibrat
     return [*found.records, *noted(poses, found.records)]
 
 
+def noted(poses: Sequence[PoseRow], records: Sequence[CalibrationRecord]) -> list[PoseRow]:
+    """The poses, with the note of cameras whose records state that they have no labels."""
+    unlabelled = {r.parent_frame for r in records if WITHOUT_LABELS in r.notes}
+    return [
+        replace(row, notes=[WITHOUT_LABELS, *row.notes]) if row.sensor in unlabelled else row for row in poses
+    ]
+
+
 def three_of_day(task: Task, seed: int) -> tuple[Chosen, Prior]:
     """The three sensors that the task's method is run on, and their prior.
 
@@ -199,18 +201,14 @@ def _read(task: Task, seed: int, method: Method) -> RigDay:
     prior, views = _known(task, rig, seed)
     overlaps = overlaps_of(prior, views)
     if method.of_three:
-        graph = _graph_of_three(three_sensors(method.name, rig, overlaps))
+        three = tuple(three_sensors(method.name, rig, overlaps))
+        graph = RigGraph(three, tuple(edge_between(*two) for two in combinations(three, 2)), middle_of(three))
         return RigDay(rig, graph, prior, views, lambda chosen: _rows(task, chosen))
     nodes = {node.name: node for node in rig.nodes}
     reference = None if rig.reference is None else nodes[rig.reference]
     graph = find_edges(prior, overlaps, named=rig.named_edges, reference=reference)
     before = partial(accepted_before, task.lake, task.partition, method.name)
     return RigDay(rig, graph, prior, views, _shared_rows(task), before)
-
-
-def _graph_of_three(sensors: Sequence[Sensor]) -> RigGraph:
-    edges = tuple(edge_between(a, b) for a, b in combinations(sensors, 2))
-    return RigGraph(tuple(sensors), edges, middle_of(sensors))
 
 
 def _known(task: Task, rig: Rig, seed: int) -> tuple[RigPrior, dict[str, View]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, NamedTuple, get_args
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
@@ -19,6 +19,7 @@ __all__ = [
     "PerceiveConfig",
     "PrepareConfig",
     "ReportConfig",
+    "SearchRange",
     "SelectConfig",
     "SolveConfig",
     "TriggerConfig",
@@ -119,6 +120,18 @@ class TriggerConfig(Section):
     drivable_outside_fraction: Fraction = 0.01
 
 
+# Half-width of the searched box per axis, in sigmas of the prior. Rotation: 95 % of the prior. Translation:
+# half a metre changes the directions of most points by a degree or two only, which local refinement covers.
+_SIGMAS_ROTATION, _SIGMAS_TRANSLATION = 2.0, 1.2
+
+
+class SearchRange(NamedTuple):
+    """Half-widths of the searched box per axis."""
+
+    rotation_rad: float
+    translation_m: float
+
+
 class SolveConfig(Section):
     """Search range and effort; `paper_*` are for the paper's differential evolution and Nelder-Mead."""
 
@@ -136,6 +149,12 @@ class SolveConfig(Section):
     )
     polish: bool = False  # of the SSL methods: method joint refines the network's answer
     seed: Annotated[int, Field(ge=0)] = 0
+
+    def search_range(self, prior_sigmas: tuple[float, float]) -> SearchRange:
+        """How far around a prior of these sigmas [rad, m] a solver must look: at least as far as configured."""
+        rotation, translation = math.radians(self.search_rotation_deg), self.search_translation_m
+        rotation = max(rotation, _SIGMAS_ROTATION * prior_sigmas[0])
+        return SearchRange(min(rotation, math.pi), max(translation, _SIGMAS_TRANSLATION * prior_sigmas[1]))
 
     @model_validator(mode="after")
     def _terms_differ_and_show_the_lidar(self) -> SolveConfig:

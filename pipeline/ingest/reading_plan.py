@@ -44,7 +44,7 @@ _LATENCY_GLANCES = 3  # at the day's begin, middle and end: clocks drift by some
 _MARGIN_NS = 500_000_000
 _MOST_MARGIN_NS = 10 * 10**9  # beyond it log time does not indicate the time of measurement
 _FIT_SHARE = 1 / 3  # of a scan's detections; below it the Doppler speed is invalid
-# Tracks of moving clusters count from their second scan on (`calibrate/paper/triggers.py`), and Doppler
+# Tracks of moving clusters count from their second scan on (`calibrate/select/triggers.py`), and Doppler
 # aliases are resolved within a few more scans; 20 scans are 2 s at 10 Hz, shorter than the blocks of held-out
 # frames. Bursts of 10 were as good on two simulated days of three, and one radar was held on the third.
 BURST_TRIOS = 20

@@ -12,7 +12,7 @@ from schemas.faults import FAULTS
 
 __all__ = ["HARMLESS", "Change", "Check", "change_of", "faults_of"]
 
-# Rotation vector and shift of the child's origin, both along the parent's axes [rad, m], as `geometry.changes`.
+# Rotation vector and shift of the child's origin, both along the parent's axes [rad, m], as `rig.changes`.
 Change = tuple[float, float, float, float, float, float]
 HARMLESS: Change = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 

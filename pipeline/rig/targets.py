@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 # Three reflectors in the shared field of view of sensors that look ahead: azimuth, elevation [rad], range
-# [m]. Records have other targets, visible to both of their sensors (`calibrate/verify/seen_targets.py`).
+# [m]. Records have other targets, visible to both of their sensors (`calibrate/verify/target_accuracy.py`).
 DEFAULT_TARGETS = from_spherical(
     np.array([[np.radians(-10), 0, 15.0], [np.radians(8), 0, 25.0], [0.0, 0, 40.0]])
 )

@@ -10,7 +10,7 @@ from pipeline.calibrate.edges.radar_base import estimate_radar_base
 from pipeline.calibrate.judging import EdgeJudging
 from pipeline.calibrate.records import Inputs, record_of_edge
 from pipeline.rig.changes import change_between
-from pipeline.rig.evidence import EdgeEvidence, OtherScenes
+from pipeline.rig.estimates import EdgeEvidence, OtherScenes
 from pipeline.rig.graph import BASE, Edge, Sensor
 from pipeline.rig.prior import RigPrior
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
@@ -38,7 +38,7 @@ def prior_of(edge, T_base_sensor, sigmas=SIGMAS):
 
 def judgement(evidence, prior):
     judging = EdgeJudging.of(evidence, prior, {}, FLEET)
-    return judging, judging.edge(judging.estimate, evidence.checks, together=False)
+    return judging, judging.edge(judging.estimate, evidence.checks, False)
 
 
 def judged(evidence, T_base_sensor, sigmas=SIGMAS):

@@ -8,16 +8,14 @@ from pipeline.calibrate.adjusted_day import SolvedEdge, adjusted_rig
 from pipeline.calibrate.judging import Judged
 from pipeline.calibrate.pose_rows import pose_rows
 from pipeline.calibrate.records import Inputs
+from pipeline.calibrate.rig_day import WrongPrior, wrong_priors
 from pipeline.calibrate.verify.verdict import Verdict
-from pipeline.calibrate.wrong_priors import WrongPrior, wrong_priors
 from pipeline.core.config import ChecksConfig, VerifyConfig
 from pipeline.rig.changes import change_covariance, change_jacobian, changed
 from pipeline.rig.checks import Check
-from pipeline.rig.estimates import PairEstimate
-from pipeline.rig.evidence import EdgeEvidence
-from pipeline.rig.extrinsics import Extrinsics
+from pipeline.rig.estimates import EdgeEvidence, PairEstimate
 from pipeline.rig.graph import RigGraph, Sensor, edge_between
-from pipeline.rig.prior import RigPrior
+from pipeline.rig.prior import Extrinsics, RigPrior
 from pipeline.rig.se3 import from_rotation_translation
 from pipeline.store.partitions import Partition
 from tests.makers.radar_scenes import T_LIDAR_RADAR

@@ -4,8 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.calibrate.paper.triggers import trigger_metrics
-from pipeline.calibrate.unlabelled import noted, notes_of_pair, unlabelled_pairs
+from pipeline.calibrate.day import unlabelled_pairs
+from pipeline.calibrate.records import notes_of_pair
+from pipeline.calibrate.select.triggers import trigger_metrics
+from pipeline.calibrate.stage import noted
 from schemas.faults import FAULTS
 from schemas.observations import STEP_RIGHT, WITHOUT_LABELS
 from tests.calibrate.test_calibrate_day import DAY, fleet_of, lake_with, records_of

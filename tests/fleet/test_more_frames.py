@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.calibrate.numerics.search_range import SearchRange
 from pipeline.calibrate.verify.edge_result import EdgeResult
 from pipeline.calibrate.verify.held_out import HeldOutTest
 from pipeline.calibrate.verify.target_accuracy import Claim
@@ -14,6 +13,7 @@ from pipeline.calibrate.verify.verdict import Evidence, judge
 from pipeline.core.config import ChecksConfig
 from pipeline.core.results import Effort, Outcome
 from pipeline.core.runner import Stage, why_to_run
+from pipeline.core.sections import SearchRange
 from pipeline.core.stage_work import Task
 from pipeline.core.stages import INGEST
 from pipeline.fleet.nightly import Night, asks_for_more, run_night

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pipeline.rig.extrinsics import Extrinsics
 from pipeline.rig.graph import BASE, Edge, RigGraph, Sensor, edge_between
+from pipeline.rig.prior import Extrinsics
 from pipeline.rig.se3 import exp_se3, inverse, log_se3
 
 TOP, SIDE = Sensor("top", "lidar"), Sensor("side", "lidar")

@@ -16,35 +16,18 @@ from pipeline.calibrate.adjust.equations import (
     LinearEdge,
     Rig,
     equations_at,
-    inverse_of_information,
 )
-from pipeline.calibrate.numerics.covariance import OBSERVABLE
+from pipeline.calibrate.numerics.covariance import OBSERVABLE, inverse_of_information
 from pipeline.rig.changes import change_jacobian
 from pipeline.rig.checks import Check
-from pipeline.rig.common_share import common_part
-from pipeline.rig.evidence import EdgeEvidence
-from pipeline.rig.extrinsics import Extrinsics
+from pipeline.rig.estimates import EdgeEvidence, common_part
 from pipeline.rig.graph import Edge, RigGraph, Sensor
+from pipeline.rig.prior import Extrinsics
 
-__all__ = ["AdjustedEdge", "AdjustedRig", "AdjustedSensor", "AdjustmentLimits", "adjust"]
+__all__ = ["AdjustedEdge", "AdjustedRig", "AdjustedSensor", "adjust"]
 
 # --------------------------------------------------------------------------------------------------
 # Result of the adjustment of a rig.
-
-
-@dataclass(frozen=True)
-class AdjustmentLimits:
-    """Assumptions of the adjustment: each sensor's clock sigma, and the limit of an edge's innovation.
-
-    `innovation_sigmas` holds for a whole rig, however many edges it has.
-    """
-
-    clock_sigma_s: float
-    innovation_sigmas: float = 3.0
-
-    def __post_init__(self) -> None:
-        assert self.clock_sigma_s > 0
-        assert self.innovation_sigmas > 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,13 +143,19 @@ _NONE = 1e-6
 
 
 def adjust(
-    graph: RigGraph, prior: Extrinsics, evidence: Sequence[EdgeEvidence], limits: AdjustmentLimits
+    graph: RigGraph,
+    prior: Extrinsics,
+    evidence: Sequence[EdgeEvidence],
+    clock_sigma_s: float,
+    innovation_sigmas: float = 3.0,
 ) -> AdjustedRig:
     """Solve poses and clocks of all sensors.
 
     Args:
         prior: poses of all sensors, each once; its `common` is the part of the errors common to all days.
         evidence: evidence of edges of the graph, each once.
+        clock_sigma_s: of each sensor's clock, before the day.
+        innovation_sigmas: limit of an edge's innovation; it holds for a whole rig, however many edges it has.
 
     Raises:
         ValueError: an edge with evidence is not in the graph, or occurs twice; the prior has other sensors
@@ -177,9 +166,9 @@ def adjust(
     doubts: dict[Edge, tuple[Edge, ...]] = {}
     while True:
         used = [e for e in evidence if e.edge not in failed]
-        rig, equations = _solved(Rig.at(prior, limits.clock_sigma_s, evidence), used)
+        rig, equations = _solved(Rig.at(prior, clock_sigma_s, evidence), used)
         found = _innovations(graph, rig, equations, [e for e in evidence if e.edge in failed])
-        worst = _worst(graph, equations, found, limits)
+        worst = _worst(graph, equations, found, innovation_sigmas)
         if worst is None:
             break
         wrong, rivals, sigmas = worst
@@ -236,7 +225,7 @@ def _innovations(
 
 
 def _worst(
-    graph: RigGraph, equations: Equations, found: Mapping[Edge, tuple[float, float]], limits: AdjustmentLimits
+    graph: RigGraph, equations: Equations, found: Mapping[Edge, tuple[float, float]], sigmas: float
 ) -> tuple[Edge, tuple[Edge, ...], float] | None:
     """Edge to leave out, equally suspect edges, and its sigmas; None if no edge contradicts the others."""
     tested = {e.evidence.edge: e for e in equations.edges if e.evidence.edge in found}
@@ -244,9 +233,7 @@ def _worst(
         return None
     # One false alarm a rig, not an edge: the limit's probability is shared among the cycles, for the edges of one cycle
     # are all as far from the others.
-    limit = float(
-        norm.isf(norm.sf(limits.innovation_sigmas) / max(len(graph.with_edges(tested).cycles()), 1))
-    )
+    limit = float(norm.isf(norm.sf(sigmas) / max(len(graph.with_edges(tested).cycles()), 1)))
     beyond = {edge: found[edge][0] for edge in tested if found[edge][1] > limit}
     if not beyond:
         return None

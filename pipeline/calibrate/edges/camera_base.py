@@ -33,7 +33,7 @@ from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.calibrate.numerics.nuisances import Considered, by_sensor
 from pipeline.core.errors import SolveError
 from pipeline.rig.checks import Check
-from pipeline.rig.evidence import EdgeEvidence
+from pipeline.rig.estimates import EdgeEvidence
 from pipeline.rig.graph import Edge
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
 

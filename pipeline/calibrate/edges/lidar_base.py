@@ -40,7 +40,7 @@ from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.calibrate.numerics.nuisances import Considered, by_sensor, considered_covariance
 from pipeline.objective.ego_motion import EgoMotion
 from pipeline.rig.checks import Check
-from pipeline.rig.evidence import EDGE, EdgeEvidence, OtherScenes
+from pipeline.rig.estimates import EDGE, EdgeEvidence, OtherScenes
 from pipeline.rig.graph import Edge
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse, transform_points
 

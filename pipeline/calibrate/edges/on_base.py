@@ -8,11 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipeline.calibrate.numerics.change_point import parts_of_day
+from pipeline.calibrate.numerics.frame_blocks import parts_of_day
 from pipeline.calibrate.numerics.nuisances import Considered
 from pipeline.rig.changes import change_jacobian, changed
-from pipeline.rig.estimates import DayParts
-from pipeline.rig.evidence import OtherScenes
+from pipeline.rig.estimates import DayParts, OtherScenes
 from pipeline.rig.se3 import adjoint, inverse
 
 __all__ = [

@@ -36,7 +36,7 @@ from pipeline.core.errors import SolveError
 from pipeline.objective.ego_motion import DopplerMotion, EgoMotion
 from pipeline.objective.radar.travel import TravelDirections, travel_directions
 from pipeline.rig.checks import Check
-from pipeline.rig.evidence import EdgeEvidence
+from pipeline.rig.estimates import EdgeEvidence
 from pipeline.rig.graph import Edge
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
 from schemas.observations import Observation

@@ -13,15 +13,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.calibrate.joint.lidar_radar.elevation_errors import tempered
-from pipeline.calibrate.numerics.bias_floors import (
+from pipeline.calibrate.numerics.covariance import Posterior, covariance_with_fixed, posterior
+from pipeline.calibrate.numerics.frame_blocks import blocks_of
+from pipeline.calibrate.numerics.nuisances import (
     BOX_ELEVATION_GATES_RAD,
     BOX_ROLL_FLOOR_CAMERA_RAD,
     CAMERA_RADAR_BIAS,
     PRIOR_CONTRADICTION_SIGMAS,
+    Considered,
+    estimate_biases,
 )
-from pipeline.calibrate.numerics.covariance import Posterior, covariance_with_fixed, posterior
-from pipeline.calibrate.numerics.frame_blocks import blocks_of
-from pipeline.calibrate.numerics.nuisances import Considered, estimate_biases
 from pipeline.core.config import SolveConfig
 from pipeline.objective.radar.moving_clusters import (
     MATCH_RAD,
@@ -39,8 +40,7 @@ from pipeline.objective.radar.vehicle_boxes import (
     vehicle_boxes,
 )
 from pipeline.rig.changes import change_jacobian
-from pipeline.rig.common_share import common_of
-from pipeline.rig.estimates import PairEstimate, Prior
+from pipeline.rig.estimates import PairEstimate, Prior, common_of
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, log_so3
 from schemas.observations import Observation
 
@@ -51,26 +51,16 @@ _YAW = 1  # of a turn about the camera's axes: its vertical
 _FIXED = np.arange(6 + len(BOX_CLASSES)) // 3 == 1  # the position: angles of far objects hardly depend on it
 
 
-@dataclass(frozen=True)
-class _Schedule:
-    """Scan about the camera's vertical, then one Newton step per gate."""
-
-    scan_step_deg: float = 0.5
-    scan_reach: float = 1.2  # times the search range
-    scan_prior: float = 2.0  # clusters that a turn at the end of the range must match more than none
-    # A turn so far from the best one that matches such a share of its clusters leaves the azimuth open. Tuned on 18
-    # days (seeds 110 to 121, 4100 to 4105): on two highways traffic in the next lane matched 0.84 to 0.98, and the
-    # azimuth was 3 deg wrong at a sigma of 0.4; elsewhere 0.46 to 0.80 but for two days.
-    rival_apart_deg: float = 2.0
-    rival_share: float = 0.82
-    azimuth_gates_deg: tuple[float, ...] = (4.0, 3.0, 2.5, 2.0, 2.0, 2.0, 2.0, 2.0)
-    steps_at_first_box_gate: int = 4
-    max_step: float = 0.05  # rad
-
-
-_SCHEDULE = _Schedule()
-_AZIMUTH_GATES_RAD = np.radians(_SCHEDULE.azimuth_gates_deg)
-_SCAN_STEP_RAD = np.radians(_SCHEDULE.scan_step_deg)
+# Scan about the camera's vertical: step, reach in search ranges, and clusters that a turn at the end of the range
+# must match more than none.
+_SCAN_STEP_RAD, _SCAN_REACH, _SCAN_PRIOR = np.radians(0.5), 1.2, 2.0
+# A turn so far from the best one that matches such a share of its clusters leaves the azimuth open. Tuned on 18
+# days (seeds 110 to 121, 4100 to 4105): on two highways traffic in the next lane matched 0.84 to 0.98, and the
+# azimuth was 3 deg wrong at a sigma of 0.4; elsewhere 0.46 to 0.80 but for two days.
+_RIVAL_APART_RAD, _RIVAL_SHARE = np.radians(2.0), 0.82
+# Then one Newton step per gate, each no longer than some rad.
+_AZIMUTH_GATES_RAD = np.radians([4.0, 3.0, 2.5, 2.0, 2.0, 2.0, 2.0, 2.0])
+_STEPS_AT_FIRST_BOX_GATE, _MAX_STEP_RAD = 4, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +108,7 @@ def estimate_camera_radar(
     J = np.linalg.inv(change_jacobian(T))
     after = posterior(covariance, prior_covariance, CAMERA_RADAR_BIAS)
     notes = ["translation stays at the prior"]
-    if rival > _SCHEDULE.rival_share:
+    if rival > _RIVAL_SHARE:
         after = _with_open_azimuth(after, prior_covariance)
         notes.append(
             f"azimuth is not determined: another rotation matches {rival:.0%} as many moving clusters to boxes"
@@ -177,7 +167,7 @@ def _solve(
         at = np.ix_(~_FIXED, ~_FIXED)
         gradient = equations.g.sum(0) + weight @ x
         step[~_FIXED] = -np.linalg.solve((equations.H.sum(0) + weight)[at], gradient[~_FIXED])
-        step *= min(1.0, _SCHEDULE.max_step / max(float(np.abs(step).max()), 1e-9))
+        step *= min(1.0, _MAX_STEP_RAD / max(float(np.abs(step).max()), 1e-9))
         T = from_rotation_translation(exp_so3(step[:3]) @ T[:3, :3], T0[:3, 3])
         bias = bias + step[6:]
     return T, equations
@@ -188,7 +178,7 @@ def _scan_azimuth(clusters: MovingClusters, T0: np.ndarray, config: SolveConfig)
 
     Also returns the matches of the best other rotation, as a share of this one's.
     """
-    reach = np.radians(_SCHEDULE.scan_reach * config.search_rotation_deg)
+    reach = np.radians(_SCAN_REACH * config.search_rotation_deg)
     turns = np.arange(-np.ceil(reach / _SCAN_STEP_RAD), np.ceil(reach / _SCAN_STEP_RAD) + 1) * _SCAN_STEP_RAD
     poses = [
         from_rotation_translation(exp_so3(np.array([0.0, a, 0.0])) @ T0[:3, :3], T0[:3, 3]) for a in turns
@@ -197,10 +187,10 @@ def _scan_azimuth(clusters: MovingClusters, T0: np.ndarray, config: SolveConfig)
     for T, turn in zip(poses, turns, strict=True):
         residual, _, _ = camera_azimuth_residuals(clusters, T, 3 * MATCH_RAD)
         # The search box as a weak prior: chance matches must not decide where nothing moves.
-        prior = _SCHEDULE.scan_prior * (turn / reach) ** 2
+        prior = _SCAN_PRIOR * (turn / reach) ** 2
         scores.append(float(np.sum(1 / (1 + (residual / MATCH_RAD) ** 2))) - prior)
     best = int(np.argmax(scores))
-    elsewhere = np.abs(turns - turns[best]) >= np.radians(_SCHEDULE.rival_apart_deg)
+    elsewhere = np.abs(turns - turns[best]) >= _RIVAL_APART_RAD
     rival = max((s for s, far in zip(scores, elsewhere, strict=True) if far), default=0.0)
     return poses[best], float(np.clip(rival / scores[best], 0.0, 1.0)) if scores[best] > 0 else 0.0
 
@@ -208,7 +198,7 @@ def _scan_azimuth(clusters: MovingClusters, T0: np.ndarray, config: SolveConfig)
 def _equations(seen: _Seen, T: np.ndarray, bias: np.ndarray, step: int) -> _Equations:
     """Equations of boxes and moving clusters at a pose; `step` chooses the gates."""
     F = len(seen.observations)
-    gate = BOX_ELEVATION_GATES_RAD[min(step // _SCHEDULE.steps_at_first_box_gate, 1)]
+    gate = BOX_ELEVATION_GATES_RAD[min(step // _STEPS_AT_FIRST_BOX_GATE, 1)]
     pairs = box_pairs(seen.boxes, T, float(gate))
     Hb, gb, box_sigma = box_equations(pairs, T, bias, F)
     Ha, ga, azimuth_sigma = azimuth_equations_camera(seen.clusters, T, float(_AZIMUTH_GATES_RAD[step]))

@@ -14,20 +14,28 @@ tends to); MacKinnon & White 1985 (HC3, what is left out); Satterthwaite 1946 (b
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float, Int, Int64
 from scipy.special import ndtri, stdtrit
+
+from pipeline.rig.se3 import exp_se3
 
 __all__ = [
     "CLEARLY",
+    "DESIGN",
     "OBSERVABLE",
     "Posterior",
+    "at_least",
     "bootstrap_covariance",
     "covariance_with_fixed",
+    "fit_quadratics",
+    "inverse_of_information",
     "posterior",
     "response",
+    "sandwich_covariance",
     "spread_to_covariance",
     "widening",
 ]
@@ -76,7 +84,7 @@ def bootstrap_covariance(
     np.add.at(H, block, information)
     np.add.at(g, block, score)
     total = H.sum(0) + prior_information
-    inverse = _inverse(total)
+    inverse = inverse_of_information(total)
     share = np.maximum(np.einsum("ij,bji->b", inverse, H) / P, 0.0)
     equal = float(share.sum() ** 2 / max((share**2).sum(), 1e-300))
     few = widening(equal + degrees)
@@ -179,8 +187,119 @@ def posterior(
     return Posterior(full * np.outer(scale, scale), observability, observable)
 
 
-def _inverse(information: np.ndarray) -> np.ndarray:
+def inverse_of_information(information: Float[np.ndarray, "P P"]) -> Float[np.ndarray, "P P"]:
     """Inverse of a positive definite matrix whose scales differ by many orders."""
     scale = 1 / np.sqrt(np.diag(information))
     inverse = np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
-    return 0.5 * (inverse + inverse.T)
+    return np.asarray(0.5 * (inverse + inverse.T))
+
+
+# --------------------------------------------------------------------------------------------------
+# Quadratic response surfaces over a ball: gradients and curvatures of scores that are rough at small scale.
+#
+# Source: Box & Wilson 1951; antithetic pairs make gradient and curvature errors independent.
+
+_DIMENSIONS = 8
+
+
+def _design() -> Float[np.ndarray, "P 8"]:
+    """Centre and antithetic pairs in the unit ball, the same for every call."""
+    rng = np.random.default_rng(7)
+    x = rng.normal(size=(66, _DIMENSIONS))
+    x *= (rng.random((66, 1)) ** (1 / 3)) / np.linalg.norm(x, axis=1, keepdims=True)
+    return np.concatenate([np.zeros((1, _DIMENSIONS)), x, -x])
+
+
+DESIGN = _design()
+_UPPER = np.triu_indices(_DIMENSIONS)
+_FIT = np.linalg.pinv(
+    np.column_stack([np.ones(len(DESIGN)), DESIGN, DESIGN[:, _UPPER[0]] * DESIGN[:, _UPPER[1]]])
+)
+
+
+def fit_quadratics(
+    value: Float[np.ndarray, "P F"],
+) -> tuple[Float[np.ndarray, "F 8"], Float[np.ndarray, "F 8 8"]]:
+    """Gradient and Hessian of the least-squares quadratic through each frame's values on the design."""
+    c = (_FIT @ value).T
+    H = np.zeros((value.shape[1], _DIMENSIONS, _DIMENSIONS))
+    H[:, _UPPER[0], _UPPER[1]] = c[:, 1 + _DIMENSIONS :]
+    return c[:, 1 : 1 + _DIMENSIONS], H + H.transpose(0, 2, 1)
+
+
+def at_least(
+    curvature: Float[np.ndarray, "8 8"], least: Float[np.ndarray, "8 8"]
+) -> Float[np.ndarray, "8 8"]:
+    """The larger of two symmetric matrices in every direction; `least` must be positive definite."""
+    return spread_to_covariance(0.5 * (curvature + curvature.T), least)
+
+
+# --------------------------------------------------------------------------------------------------
+# Covariance of a minimum of the paper's losses: block sandwich from curvature and the scatter of gradients.
+#
+# The paper gives no uncertainty. The sandwich `H^-1 S H^-1` (H: curvature of the mean loss, S: scatter of
+# the gradients over blocks of frames that share a scene) is what resampling whole blocks converges to, at
+# the price of a few evaluations; its inverse is added to the prior's information. It does not include bias,
+# and these losses are biased (their minimum lies below the truth's value): a floor measured in simulation
+# is added.
+
+
+_STEP = np.array([np.radians(0.2)] * 3 + [0.04] * 3)
+
+
+def sandwich_covariance(
+    frame_losses: Callable[[np.ndarray], np.ndarray],
+    T: Float[np.ndarray, "4 4"],
+    blocks: Int[np.ndarray, " F"],
+    prior_covariance: Float[np.ndarray, "6 6"],
+    floor: tuple[float, float],
+) -> tuple[Float[np.ndarray, "6 6"], Float[np.ndarray, " 6"]]:
+    """Covariance (left perturbation, rotation first) with the bias floor, and observability per DoF.
+
+    Args:
+        frame_losses: (P, 4, 4) -> (P, F).
+        prior_covariance: upper limit for what is not determined.
+        floor: bias floor, rotation [rad] and translation [m].
+
+    Returns:
+        Covariance, and 1 - variance / prior variance per DoF, clipped to 0..1.
+    """
+    E = np.diag(_STEP)
+    plus, minus = frame_losses(exp_se3(E) @ T), frame_losses(exp_se3(-E) @ T)
+    gradients = (plus - minus) / (2 * _STEP[:, None])  # 6 F
+    frames = gradients.shape[1]
+    names = np.unique(blocks)
+    sums = np.stack([gradients[:, blocks == b].sum(axis=1) for b in names]) / frames
+    sums -= sums.mean(axis=0)
+    S = sums.T @ sums * len(names) / max(len(names) - 1, 1)
+    H = _curvature(frame_losses, T, plus.mean(axis=1), minus.mean(axis=1))
+    information = _godambe(H, S) + np.linalg.inv(prior_covariance)
+    covariance = np.linalg.inv(information) + np.diag([floor[0] ** 2] * 3 + [floor[1] ** 2] * 3)
+    covariance = (covariance + covariance.T) / 2
+    observability = np.clip(1 - np.diag(covariance) / np.diag(prior_covariance), 0, 1)
+    return covariance, observability
+
+
+def _curvature(
+    frame_losses: Callable[[np.ndarray], np.ndarray], T: np.ndarray, plus: np.ndarray, minus: np.ndarray
+) -> np.ndarray:
+    centre = frame_losses(T[None]).mean()
+    H = np.diag((plus + minus - 2 * centre) / _STEP**2)
+    for i in range(6):
+        for j in range(i):
+            signs = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]], float)
+            xi = np.zeros((4, 6))
+            xi[:, [i, j]] = signs * _STEP[[i, j]]
+            f = frame_losses(exp_se3(xi) @ T).mean(axis=1)
+            H[i, j] = H[j, i] = (f[0] - f[1] - f[2] + f[3]) / (4 * _STEP[i] * _STEP[j])
+    return H
+
+
+def _godambe(H: np.ndarray, S: np.ndarray) -> np.ndarray:
+    """H S^-1 H, the inverse of the sandwich; 0 in directions in which both H and S vanish."""
+    scale = _STEP[:, None] * _STEP[None]
+    values, vectors = np.linalg.eigh(H * scale)
+    positive = (vectors * np.maximum(values, 0)) @ vectors.T
+    scatter = S * scale
+    floor = 1e-3 * max(float(np.linalg.eigvalsh(scatter).max()), 1e-15)
+    return positive @ np.linalg.solve(scatter + floor * np.eye(6), positive) / scale

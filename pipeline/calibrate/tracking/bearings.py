@@ -20,7 +20,7 @@ from pipeline.calibrate.numerics.covariance import bootstrap_covariance
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, hat, log_so3
 from pipeline.rig.spherical import spherical_jacobian, to_spherical, wrap_angle
 
-__all__ = ["AlignedBearings", "Bearings", "Consistency", "align_bearings", "consistency"]
+__all__ = ["AlignedBearings", "Bearings", "align_bearings", "consistency"]
 
 _INTRACLASS = 0.5  # correlation of sightings of one track
 _LEAST_SCALE = 0.2  # of the sightings' spread, in their stated sigmas
@@ -85,19 +85,6 @@ class AlignedBearings:
     residual_rad: Float[np.ndarray, " A"]  # robust standard deviation of the kept sightings
 
 
-@dataclass(frozen=True)
-class Consistency:
-    """Whether the prior explains the bearings: squared distance in sigmas, and its 99.9 % quantile."""
-
-    statistic: float
-    threshold: float
-
-    @property
-    def miscalibrated(self) -> bool:
-        """True if the rotation differs from the prior by more than chance and bias."""
-        return self.statistic > self.threshold
-
-
 def align_bearings(
     bearings: Bearings,
     T_prior: Float[np.ndarray, "4 4"],
@@ -137,8 +124,8 @@ def align_bearings(
 
 def consistency(
     aligned: AlignedBearings, T_prior: Float[np.ndarray, "4 4"], bias_floor_rad: Float[np.ndarray, " 3"]
-) -> Consistency:
-    """Test whether the rotation found differs from the prior's by more than its own uncertainty.
+) -> tuple[float, float]:
+    """Squared distance in sigmas of the rotation found from the prior's, and its 99.9 % quantile.
 
     The threshold is Hotelling's instead of chi^2, because the spread of few tracks is itself uncertain.
     Effective degrees of freedom after Welch and Satterthwaite account for the part of the sigma that is
@@ -151,15 +138,15 @@ def consistency(
     covariance = aligned.covariance[:3, :3] + np.diag(bias_floor_rad**2)
     n, p = int(aligned.kept.sum()), 3
     if n < 2:
-        return Consistency(0.0, float("inf"))
+        return 0.0, float("inf")
     # Along the axis that contributes most to the turn: share of the variance that is estimated from n tracks' spread.
     u = np.linalg.solve(covariance, turned)
     share = float(u @ aligned.spread @ u) / max(float(u @ covariance @ u), 1e-300)
     dof = (n - 1) / max(share, 1e-3) ** 2
     if dof <= p:
-        return Consistency(0.0, float("inf"))
+        return 0.0, float("inf")
     threshold = p * dof / (dof - p + 1) * f_distribution.ppf(_CONFIDENCE, p, dof - p + 1)
-    return Consistency(float(turned @ u), float(threshold))
+    return float(turned @ u), float(threshold)
 
 
 def _whitened(bearings: Bearings, T: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.calibrate.numerics.bias_floors import TRACKING_BIAS_RAD
 from pipeline.calibrate.numerics.covariance import OBSERVABLE, posterior
+from pipeline.calibrate.numerics.nuisances import TRACKING_BIAS_RAD
 from pipeline.calibrate.tracking.association import (
     Association,
     Shared,
@@ -43,8 +43,7 @@ from pipeline.core.config import SolveConfig
 from pipeline.core.errors import SolveError
 from pipeline.core.results import Progress, silent
 from pipeline.rig.checks import Check
-from pipeline.rig.common_share import common_of
-from pipeline.rig.estimates import PairEstimate, Prior, Solution
+from pipeline.rig.estimates import PairEstimate, Prior, Solution, common_of
 from pipeline.rig.se3 import compose_covariance, inverse, log_so3
 from pipeline.rig.spherical import to_spherical
 from schemas.calibrations import PAIRS
@@ -233,7 +232,7 @@ def _estimate(
     floor = np.concatenate([TRACKING_BIAS_RAD, np.zeros(3)])
     found = posterior(aligned.covariance, before, floor)
     observability = np.concatenate([found.observability[:3], np.zeros(3)])
-    test = consistency(aligned, prior.of(pair), TRACKING_BIAS_RAD)
+    statistic, threshold = consistency(aligned, prior.of(pair), TRACKING_BIAS_RAD)
     turned = log_so3(aligned.T[:3, :3] @ prior.of(pair)[:3, :3].T)
     inlier = aligned.kept[bearings.track]
     diagnostics = {
@@ -243,16 +242,16 @@ def _estimate(
         "tracks_agreeing": float(aligned.kept.sum()),
         "sightings": float(inlier.sum()),
         "residual_azimuth_rad": float(aligned.residual_rad[0]),
-        "decalibration_statistic": test.statistic,
-        "decalibration_threshold": test.threshold,
+        "decalibration_statistic": statistic,
+        "decalibration_threshold": threshold,
         "turned_rad": float(np.linalg.norm(turned)),
     }
     if tracks.elevation:
         diagnostics["residual_elevation_rad"] = float(aligned.residual_rad[1])
-    verdict = "miscalibrated" if test.miscalibrated else "consistent with the tracks"
+    verdict = "miscalibrated" if statistic > threshold else "consistent with the tracks"
     notes = [
         _ROTATION_ONLY,
-        f"the prior is {verdict}: {test.statistic:.1f}, threshold {test.threshold:.1f}",
+        f"the prior is {verdict}: {statistic:.1f}, threshold {threshold:.1f}",
         f"{int(aligned.kept.sum())} of {bearings.tracks} pairs of tracks agree",
     ]
     return PairEstimate(

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from pipeline.calibrate.numerics.search_range import SearchRange
 from pipeline.calibrate.verify.target_accuracy import DIRECTIONS, Claim
+from pipeline.core.sections import SearchRange
 from pipeline.rig.changes import change_between, change_covariance, change_jacobian, changed
 from pipeline.rig.checks import Change, Check
+from pipeline.rig.estimates import PairEstimate
 from pipeline.rig.kinds import KIND_OF_EDGE
 from pipeline.rig.se3 import adjoint, inverse
 from pipeline.rig.targets import errors_at_targets, target_sigmas
@@ -47,6 +48,19 @@ class EdgeResult:
     frames_used: int
     search: SearchRange
     targets: Float[np.ndarray, "N 3"]
+
+    @classmethod
+    def of(
+        cls,
+        estimate: PairEstimate,
+        prior: np.ndarray,
+        prior_sigma: np.ndarray,
+        search: SearchRange,
+        targets: np.ndarray,
+    ) -> EdgeResult:
+        """The result of an estimate."""
+        own = estimate.pair, estimate.T, estimate.covariance, estimate.observable
+        return cls(*own, prior, prior_sigma, estimate.frames_used, search, targets)
 
     @property
     def move(self) -> Float[np.ndarray, " 6"]:

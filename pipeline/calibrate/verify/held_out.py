@@ -99,16 +99,9 @@ def paired_test(
 FrameDerivatives = Callable[[np.ndarray, float], tuple[np.ndarray, np.ndarray]]
 
 
-@dataclass(frozen=True)
-class _Schedule:
-    """One Newton step per kernel width, each no longer than some sigmas of the result."""
-
-    # From wide to sharp: an optimum that is far off is seen by wide kernels only; the last is done twice to converge.
-    widths: tuple[float, ...] = (3.0, 1.5, 1.0, 1.0)
-    max_step_sigmas: float = 2.0  # the quadratic holds nearby only
-
-
-_SCHEDULE = _Schedule()
+# One Newton step per kernel width, from wide to sharp: an optimum that is far off is seen by wide kernels only; the
+# last is done twice to converge. Each is no longer than some sigmas of the result: the quadratic holds nearby only.
+_WIDTHS, _MAX_STEP_SIGMAS = (3.0, 1.5, 1.0, 1.0), 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +135,7 @@ def held_out_update(
     limits = limits or ChecksConfig()
     prior = np.linalg.inv(covariance)
     x, J = np.zeros(len(bias)), np.zeros_like(covariance)
-    for width in _SCHEDULE.widths:
+    for width in _WIDTHS:
         g, H = derivatives(x, width)
         informative = np.abs(g).sum(axis=1) > 0
         if len(np.unique(blocks[informative])) < limits.min_held_out_blocks:
@@ -156,7 +149,7 @@ def held_out_update(
         J, measured = less @ J, less @ (gradient + J @ x)
         step = np.linalg.solve(prior + J, measured) - x
         length = max(float(np.sqrt(step @ prior @ step)), 1e-12)
-        x = x + step * min(1.0, _SCHEDULE.max_step_sigmas / length)
+        x = x + step * min(1.0, _MAX_STEP_SIGMAS / length)
     updated = np.linalg.inv(prior + J)
     pose = np.ix_(range(6), range(6))
     shift_covariance = covariance - updated

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.calibrate.numerics.bias_floors import (
+from pipeline.calibrate.numerics.covariance import DESIGN, fit_quadratics
+from pipeline.calibrate.numerics.nuisances import (
     FOCAL_SIGMA,
     HELD_OUT_BIAS,
     OUTLIER_DENSITY,
@@ -23,7 +24,6 @@ from pipeline.calibrate.numerics.bias_floors import (
     TYPICAL_RANGE_M,
     TYPICAL_SPEED_MPS,
 )
-from pipeline.calibrate.numerics.response_surface import DESIGN, fit_quadratics
 from pipeline.calibrate.verify.held_out import FrameDerivatives
 from pipeline.core.config import SolveConfig
 from pipeline.objective.camera_lidar.label_width import widened

@@ -41,7 +41,7 @@ from jaxtyping import Float
 from scipy.optimize import brentq
 from scipy.special import ndtr, ndtri
 
-from pipeline.calibrate.numerics.bias_floors import RADAR_ELEVATION_BIAS_RAD
+from pipeline.calibrate.numerics.nuisances import RADAR_ELEVATION_BIAS_RAD
 from pipeline.calibrate.verify.held_out import HeldOutUpdate
 from pipeline.core.config import ChecksConfig
 from pipeline.core.rigs import CameraPrior
@@ -89,7 +89,9 @@ class Claim:
     limit_rad: float  # largest error that the purpose allows
     confidence: float  # probability with which the error must stay within the limit
     contradiction_sigmas: float = ChecksConfig().held_out_contradiction_sigmas
-    mounting_sigma_rad: float = np.inf  # of the estimate as the pose of what is mounted: see `mounting.py`
+    mounting_sigma_rad: float = (
+        np.inf
+    )  # of the estimate as the pose of what is mounted: see `mounting_covariance`
 
     @property
     def bound_rad(self) -> float:

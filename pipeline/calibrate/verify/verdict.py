@@ -208,7 +208,7 @@ def _aligns_better(
         return Check(few)
     near = _near_prior(result, claims)
     if test.z > limits.worse_alignment_z:
-        # The radar's registration cost has slopes of its own (`lidar_radar/time_offset`): a right result near a prior
+        # The radar's registration cost has slopes of its own (`lidar_radar/search`): a right result near a prior
         # may score worse. That leaves it unproved, no more.
         is_proof = result.kind == "camera_lidar"
         margin = max(near, 1 - test.z / limits.worse_alignment_z)

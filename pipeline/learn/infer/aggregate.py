@@ -17,8 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipeline.rig.common_share import common_of
-from pipeline.rig.estimates import PairEstimate
+from pipeline.rig.estimates import PairEstimate, common_of
 from pipeline.rig.se3 import exp_se3, hat, inverse, log_se3, transform_points
 from pipeline.rig.spherical import from_spherical
 

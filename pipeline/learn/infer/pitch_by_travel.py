@@ -22,8 +22,7 @@ from pipeline.objective.radar.travel import (
     pitch_residuals,
     travel_directions,
 )
-from pipeline.rig.common_share import common_part
-from pipeline.rig.estimates import PairEstimate, Prior, Solution
+from pipeline.rig.estimates import PairEstimate, Prior, Solution, common_part
 from pipeline.rig.se3 import exp_so3, inverse, log_se3
 from schemas.observations import Observation
 

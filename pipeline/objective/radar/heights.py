@@ -89,10 +89,7 @@ class Heights:
 
     @property
     def floor_rad(self) -> float:
-        """Sigma of pitch that more frames do not reduce.
-
-        If many detections come from anywhere (ceilings, crowns of trees), the others may be wrong as well.
-        """
+        """Sigma of pitch that more frames do not reduce: where many come from anywhere, others may be wrong too."""
         return float(_PITCH_FLOOR_RAD / self.explained)
 
     def seen_low(self, below: Float[np.ndarray, " D"]) -> float:
@@ -159,18 +156,15 @@ def displaced_heights(
 
 
 class _Kinds:
-    """Densities of a day's detections by kind, which depend on pitch, roll and sigma alone.
-
-    The last few are kept: numerical derivatives by the other unknowns ask for them again.
-    """
+    """Densities of a day's detections by kind; the last few are kept, for numerical derivatives ask for them again."""
 
     def __init__(self, day: _Detections) -> None:
         self.day = day
         self.stands = day.mirror.any(1)  # the lidar shows an object there, not bare road
         self.of = lru_cache(maxsize=4)(self._of)
 
-    def _of(self, pitch: float, roll: float, log_sigma: float) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
-        """Densities as direct, image and displaced (N each), and the rotated elevations (N)."""
+    def _of(self, pitch: float, roll: float, log_sigma: float) -> tuple[np.ndarray, np.ndarray]:
+        """Densities as direct, image and displaced (3 N), and the rotated elevations (N)."""
         day, sigma = self.day, float(np.exp(log_sigma))
         turned = day.elevation - pitch * np.cos(day.azimuth) + roll * np.sin(day.azimuth)
         found = np.empty((3, len(turned)))
@@ -178,10 +172,11 @@ class _Kinds:
         for rows, mirror in ((self.stands, day.mirror[self.stands]), (~self.stands, np.zeros((1, 1)))):
             z, m = turned[rows, None] / sigma, mirror / sigma
             half = np.maximum(m, _NARROWEST)
-            between = (ndtr(z + half) - ndtr(z - half)) / (2 * half)
-            kinds = (np.exp(-0.5 * (z - m) ** 2) / _NORMAL, np.exp(-0.5 * (z + m) ** 2) / _NORMAL, between)
-            found[:, rows] = [kind.mean(1) for kind in kinds]
-        return tuple(found), turned
+            found[0, rows], found[1, rows] = (
+                (np.exp(-0.5 * (z + sign * m) ** 2) / _NORMAL).mean(1) for sign in (-1.0, 1.0)
+            )
+            found[2, rows] = ((ndtr(z + half) - ndtr(z - half)) / (2 * half)).mean(1)
+        return found, turned
 
 
 def _log_likelihood(kinds: _Kinds, x: np.ndarray) -> np.ndarray:

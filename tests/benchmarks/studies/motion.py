@@ -26,7 +26,7 @@ from pipeline.core.config import load_fleet
 from pipeline.core.errors import SolveError
 from pipeline.rig.changes import change_between
 from pipeline.rig.day_prior import rig_prior
-from pipeline.rig.evidence import EDGE, EdgeEvidence
+from pipeline.rig.estimates import EDGE, EdgeEvidence
 from pipeline.rig.graph import BASE, Edge, Sensor
 from pipeline.rig.se3 import inverse
 from pipeline.simulate.fleet import FleetSpec, simulate_fleet

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.adjust.equations import Rig, equations_at, left_jacobian_inverse
-from pipeline.calibrate.adjust.rig import AdjustmentLimits, adjust
+from pipeline.calibrate.adjust.rig import adjust
 from pipeline.rig.checks import Check
-from pipeline.rig.evidence import EDGE, EdgeEvidence
-from pipeline.rig.extrinsics import Extrinsics
+from pipeline.rig.estimates import EDGE, EdgeEvidence
 from pipeline.rig.graph import RigGraph, Sensor, edge_between
+from pipeline.rig.prior import Extrinsics
 from pipeline.rig.se3 import compose_covariance, exp_se3, inverse, log_se3
 
-LIMITS = AdjustmentLimits(clock_sigma_s=0.02)
+CLOCK_S = 0.02
 PRIOR_SIGMA = np.array([np.radians(2.0)] * 3 + [0.05] * 3)
 SIGMAS = {
     "camera_lidar": [*np.radians([0.03] * 3), 0.01, 0.01, 0.01, 0.004],
@@ -47,7 +47,7 @@ class Scene:
 
     def draw_clocks(self):
         for n in self.prior.order:
-            self.dt_s[n] = float(self.rng.normal(0, LIMITS.clock_sigma_s))
+            self.dt_s[n] = float(self.rng.normal(0, CLOCK_S))
 
     def between(self, a, b):
         return inverse(self.true[a]) @ self.true[b]
@@ -66,7 +66,7 @@ class Scene:
 
     def adjusted(self, evidence, graph=None, **changes):
         graph = graph or RigGraph(self.sensors, tuple(e.edge for e in evidence), TOP)
-        return adjust(graph, self.prior, evidence, replace(LIMITS, **changes))
+        return adjust(graph, self.prior, evidence, CLOCK_S, **changes)
 
     def square(self, found):
         """Chi-squared of the errors of all poses."""

@@ -5,15 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.calibrate.adjust.evidence import evidence_of
-from pipeline.calibrate.adjust.rig import AdjustmentLimits, adjust
+from pipeline.calibrate.adjust.equations import evidence_of
+from pipeline.calibrate.adjust.rig import adjust
 from pipeline.rig.changes import change_between, change_covariance, change_jacobian, changed
 from pipeline.rig.checks import Check
 from pipeline.rig.edges import EDGE_OF_PAIR
-from pipeline.rig.estimates import PairEstimate, Prior
-from pipeline.rig.evidence import EDGE
-from pipeline.rig.extrinsics import Extrinsics
+from pipeline.rig.estimates import EDGE, PairEstimate, Prior
 from pipeline.rig.graph import RigGraph
+from pipeline.rig.prior import Extrinsics
 from pipeline.rig.se3 import exp_so3, from_rotation_translation
 
 CLOCK_S = 0.02
@@ -67,7 +66,7 @@ def alone(estimate, prior=PRIOR):
     covariance = to_left @ prior.covariance(edge.kind) @ to_left.T
     dt_s = {parent: 0.0, child: estimate.time_offset_prior_s}
     poses = Extrinsics(edge.parent, {parent: np.eye(4), child: T}, (child,), covariance, covariance, dt_s)
-    return adjust(RigGraph(edge.sensors, (edge,), edge.parent), poses, [evidence], AdjustmentLimits(CLOCK_S))
+    return adjust(RigGraph(edge.sensors, (edge,), edge.parent), poses, [evidence], CLOCK_S)
 
 
 @pytest.mark.parametrize("pair", ["camera_lidar", "lidar_radar"])

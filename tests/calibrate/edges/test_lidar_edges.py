@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.calibrate.edges.lidar_base import estimate_lidar_base
 from pipeline.calibrate.edges.lidar_lidar import LidarPair, _equations, _Moment, estimate_lidar_lidar
-from pipeline.calibrate.verify.constancy import MOVED_SIGMAS, PART_FLOOR_RAD
+from pipeline.calibrate.verify.day_checks import MOVED_SIGMAS, PART_FLOOR_RAD
 from pipeline.calibrate.verify.held_out import paired_test
 from pipeline.core.errors import SolveError
 from pipeline.objective.ego_motion import EgoMotion

@@ -8,7 +8,7 @@ import pytest
 from pipeline.calibrate.edges.lidar_base import STANCE
 from pipeline.calibrate.edges.radar_base import Stamps, estimate_radar_base
 from pipeline.calibrate.numerics.frame_blocks import Scenes
-from pipeline.calibrate.verify.constancy import MOVED_SIGMAS, PART_FLOOR_RAD
+from pipeline.calibrate.verify.day_checks import MOVED_SIGMAS, PART_FLOOR_RAD
 from pipeline.objective.ego_motion import DopplerMotion, EgoMotion
 from pipeline.objective.radar.travel import TravelDirections
 from pipeline.rig.changes import change_between, change_jacobian

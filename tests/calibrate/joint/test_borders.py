@@ -8,7 +8,7 @@ import pytest
 from pipeline.calibrate.joint.camera_lidar.borders import _of_image, along_paint, border_errors
 from pipeline.calibrate.joint.camera_lidar.observability import along_the_way
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, Scored, refine
-from pipeline.calibrate.numerics.bias_floors import BORDER_SHARE, EDGE_SIDE_ALONE
+from pipeline.calibrate.numerics.nuisances import BORDER_SHARE, EDGE_SIDE_ALONE
 from pipeline.core.config import SolveConfig
 from pipeline.objective.camera_lidar.label_width import OUTWARD, label_width_px, widened
 from pipeline.objective.camera_lidar.points import Points

@@ -8,8 +8,7 @@ import pytest
 from pipeline.calibrate.joint.camera_lidar.estimate import _usable, align_camera_lidar
 from pipeline.calibrate.joint.camera_lidar.observability import time_offset_variance
 from pipeline.calibrate.joint.camera_lidar.profiles import TimeOffsetProfile
-from pipeline.calibrate.numerics.search_range import search_range
-from pipeline.calibrate.verify.constancy import MOVED_SIGMAS, PART_FLOOR_RAD
+from pipeline.calibrate.verify.day_checks import MOVED_SIGMAS, PART_FLOOR_RAD
 from pipeline.core.config import SolveConfig
 from pipeline.core.errors import SolveError
 from pipeline.rig.changes import change_between, change_covariance
@@ -141,13 +140,13 @@ def test_the_search_follows_a_prior_that_says_it_may_be_far_off():
     day = traced_day(DENSE, 10, seed=1, dt_s=0.03)
     T = perturb_exactly(T_TRUE, np.radians(14.0), 0.5, np.random.default_rng(3))
     prior = Prior(T, np.eye(4), float(np.radians(14.0)), 0.5)
-    rotation, shift = search_range(prior.sigmas, SolveConfig())
+    rotation, shift = SolveConfig().search_range(prior.sigmas)
     assert np.degrees(rotation) > 14
     assert shift > 0.5
     e = estimate_camera_lidar(day, prior)
     assert np.abs(turn_and_sigma_deg(e)[0]).max() < 0.4
     near = Prior(T, np.eye(4), 0.01, 0.01)
-    assert search_range(near.sigmas, SolveConfig()) == (np.radians(6.0), 0.3)
+    assert SolveConfig().search_range(near.sigmas) == (np.radians(6.0), 0.3)
 
 
 def test_days_of_hardly_any_frame_or_edge_are_refused():

@@ -9,7 +9,14 @@ from pipeline.calibrate.joint.camera_lidar import initialise
 from pipeline.calibrate.joint.camera_lidar import refine as module
 from pipeline.calibrate.joint.camera_lidar.initialise import Basin, difference, find_basin
 from pipeline.calibrate.joint.camera_lidar.profiles import far_time_offset
-from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, Scored, prior_value, refine, scales
+from pipeline.calibrate.joint.camera_lidar.refine import (
+    SCHEDULE,
+    AlignmentState,
+    Scored,
+    prior_value,
+    refine,
+    scales,
+)
 from pipeline.calibrate.joint.camera_lidar.rotation_search import (
     TERMS,
     Evidence,
@@ -17,10 +24,9 @@ from pipeline.calibrate.joint.camera_lidar.rotation_search import (
     grid_maxima,
     wrong_poses,
 )
-from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
 from pipeline.calibrate.numerics.covariance import CLEARLY
-from pipeline.calibrate.numerics.search_range import SearchRange, search_range
 from pipeline.core.config import SolveConfig
+from pipeline.core.sections import SearchRange
 from pipeline.objective.camera_lidar.points import Points, lidar_velocities
 from pipeline.objective.camera_lidar.score import Alignments, KernelSettings, prepare_terms
 from pipeline.rig.cameras import camera_of
@@ -55,7 +61,7 @@ def terms(day):
 
 def searched(terms, prior, limits=None):
     config = SolveConfig()
-    limits = limits or search_range(prior.sigmas, config)
+    limits = limits or config.search_range(prior.sigmas)
     thin = Scored(terms.sharp(), KERNEL, prior, config, limits)
     return find_basin(terms, thin, np.random.default_rng(0), np.arange(terms.frames))
 

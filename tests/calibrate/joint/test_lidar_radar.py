@@ -8,7 +8,7 @@ import pytest
 from pipeline.calibrate.joint import camera_radar
 from pipeline.calibrate.joint.camera_radar import estimate_camera_radar
 from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
-from pipeline.calibrate.verify.constancy import MOVED_SIGMAS, PART_FLOOR_RAD
+from pipeline.calibrate.verify.day_checks import MOVED_SIGMAS, PART_FLOOR_RAD
 from pipeline.core.config import SolveConfig
 from pipeline.core.errors import SolveError
 from pipeline.objective.radar.moving_clusters import camera_radar_cost

@@ -7,10 +7,12 @@ import pytest
 
 from pipeline.calibrate.joint.lidar_radar import search
 from pipeline.calibrate.joint.lidar_radar.elevation_errors import ElevationSpread
-from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
-from pipeline.calibrate.joint.lidar_radar.problem import RadarProblem, RadarState
-from pipeline.calibrate.joint.lidar_radar.radar_velocity import contradicts_odometry, turns_unmeasured
-from pipeline.calibrate.joint.lidar_radar.schedule import SCHEDULE
+from pipeline.calibrate.joint.lidar_radar.estimate import (
+    contradicts_odometry,
+    estimate_lidar_radar,
+    turns_unmeasured,
+)
+from pipeline.calibrate.joint.lidar_radar.problem import SCHEDULE, RadarProblem, RadarState
 from pipeline.calibrate.joint.lidar_radar.search import dips
 from pipeline.core.config import SolveConfig
 from pipeline.objective.radar.moving_clusters import moving_clusters

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.calibrate.numerics.change_point import parts_of_day
 from pipeline.calibrate.numerics.covariance import (
     bootstrap_covariance,
     covariance_with_fixed,
@@ -20,13 +19,13 @@ from pipeline.calibrate.numerics.frame_blocks import (
     Scenes,
     blocks_of,
     bootstrap_blocks,
+    parts_of_day,
     scenes_of,
 )
 from pipeline.calibrate.select.frames import MIN_FRAMES, hold_out, select_frames
-from pipeline.calibrate.verify.constancy import MOVED_SIGMAS, PART_FLOOR_RAD
-from pipeline.calibrate.verify.day_checks import scene_failures
+from pipeline.calibrate.verify.day_checks import MOVED_SIGMAS, PART_FLOOR_RAD, scene_failures
 from pipeline.core.config import SelectConfig
-from pipeline.rig.common_share import common_of, common_part, prior_share
+from pipeline.rig.estimates import common_of, common_part, prior_share
 from pipeline.rig.se3 import exp_so3, from_rotation_translation
 from tests.makers.solve_scenes import make_day
 

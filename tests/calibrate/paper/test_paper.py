@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.methods import METHODS, method_named
-from pipeline.calibrate.paper.minimise import minimise
-from pipeline.calibrate.paper.pairwise import (
+from pipeline.calibrate.numerics.covariance import sandwich_covariance
+from pipeline.calibrate.paper_methods import (
     joint_costs,
+    minimise,
     pair_problem,
-    sandwich_covariance,
     solve_joint_optimisation,
     solve_pairwise,
 )
-from pipeline.calibrate.paper.triggers import exceeded, trigger_metrics
+from pipeline.calibrate.select.triggers import exceeded, trigger_metrics
 from pipeline.core.config import SolveConfig, TriggerConfig
 from pipeline.core.errors import ConfigError
 from pipeline.rig.changes import changed

@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
-from pipeline.calibrate.numerics.change_point import with_parts
+from pipeline.calibrate.numerics.frame_blocks import with_parts
 from pipeline.calibrate.records import half_days_of
-from pipeline.calibrate.verify.constancy import constancy_failures, moved_failures
-from pipeline.calibrate.verify.day_checks import clock_alarms, prior_alarms
+from pipeline.calibrate.verify.day_checks import (
+    clock_alarms,
+    constancy_failures,
+    moved_failures,
+    prior_alarms,
+)
 from pipeline.core.config import ChecksConfig, SolveConfig
 from pipeline.rig.edges import edge_named
 from pipeline.rig.estimates import DayParts, PairEstimate, Prior

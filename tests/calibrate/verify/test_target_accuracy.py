@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from pipeline.calibrate.numerics.bias_floors import RADAR_ELEVATION_BIAS_RAD
+from pipeline.calibrate.numerics.nuisances import RADAR_ELEVATION_BIAS_RAD
 from pipeline.calibrate.verify.held_out import held_out_update
 from pipeline.calibrate.verify.target_accuracy import (
     DIRECTIONS,

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.calibrate.numerics.search_range import SearchRange
 from pipeline.calibrate.verify.edge_result import EdgeResult
 from pipeline.calibrate.verify.held_out import HeldOutTest, paired_test
 from pipeline.calibrate.verify.target_accuracy import DIRECTIONS, Claim
 from pipeline.calibrate.verify.verdict import Evidence, judge
 from pipeline.core.config import ChecksConfig
+from pipeline.core.sections import SearchRange
 from pipeline.rig.checks import HARMLESS, Check, change_of
 from pipeline.rig.estimates import PairEstimate, Prior
 from pipeline.rig.se3 import exp_so3, from_rotation_translation

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.calibrate.paper.pairwise import joint_costs, pair_problem
+from pipeline.calibrate.paper_methods import joint_costs, pair_problem
 from pipeline.core.errors import ConfigError
 from pipeline.learn.batches.loader import load_split
 from pipeline.learn.train.loop import read_metrics

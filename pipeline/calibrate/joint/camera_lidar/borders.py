@@ -23,8 +23,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int8
 
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, derivatives, scales
-from pipeline.calibrate.numerics.bias_floors import BORDER_SHARE, EDGE_SIDE_ALONE
-from pipeline.calibrate.numerics.response_surface import at_least
+from pipeline.calibrate.numerics.covariance import at_least
+from pipeline.calibrate.numerics.nuisances import BORDER_SHARE, EDGE_SIDE_ALONE
 from pipeline.objective.camera_lidar.image_maps import CONTRAST_STEP
 from pipeline.objective.camera_lidar.label_width import OUTWARD
 from pipeline.objective.camera_lidar.score import Alignments, KernelSettings, Terms

@@ -29,29 +29,32 @@ from pipeline.calibrate.joint.camera_lidar.observability import (
     CameraLidarProblem,
     ObservabilityAnalysis,
     analyse_observability,
+    parts_of_alignment,
 )
 from pipeline.calibrate.joint.camera_lidar.part_turns import (
     disagreement,
     turn_numbers,
     turns_by_parts,
 )
-from pipeline.calibrate.joint.camera_lidar.parts import parts_of_alignment
 from pipeline.calibrate.joint.camera_lidar.profiles import DT, FOCAL, TZ, far_time_offset, s_per_metre
 from pipeline.calibrate.joint.camera_lidar.refine import (
     NONE_FIXED,
+    SCHEDULE,
     AlignmentState,
     Scored,
     refine,
     weighted,
 )
 from pipeline.calibrate.joint.camera_lidar.rotation_search import TERMS as BASIN_TERMS
-from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
 from pipeline.calibrate.joint.part_turn import PartTurn
-from pipeline.calibrate.numerics.bias_floors import TZ_COMMON_BIAS_M
 from pipeline.calibrate.numerics.covariance import OBSERVABLE
 from pipeline.calibrate.numerics.frame_blocks import Scenes
-from pipeline.calibrate.numerics.nuisances import Considered, considered_numbers, estimate_biases
-from pipeline.calibrate.numerics.search_range import search_range
+from pipeline.calibrate.numerics.nuisances import (
+    TZ_COMMON_BIAS_M,
+    Considered,
+    considered_numbers,
+    estimate_biases,
+)
 from pipeline.core.config import SolveConfig
 from pipeline.core.errors import SolveError
 from pipeline.objective.camera_lidar.image_maps import Start
@@ -60,8 +63,7 @@ from pipeline.objective.camera_lidar.points import lidar_velocities
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms, prepare_terms
 from pipeline.objective.stamp_gaps import constant_gap_s, gaps_s
 from pipeline.rig.changes import change_jacobian
-from pipeline.rig.common_share import common_part
-from pipeline.rig.estimates import PairEstimate, Prior
+from pipeline.rig.estimates import PairEstimate, Prior, common_part
 from schemas.observations import Observation
 
 __all__ = [
@@ -125,7 +127,7 @@ def align_camera_lidar(
 
     first = KernelSettings.wide(*SCHEDULE.kernels[0])
     sharp = terms.telling()
-    limits = search_range(prior.sigmas, config)
+    limits = config.search_range(prior.sigmas)
     thin = Scored(sharp.at_most(SCHEDULE.wide_points, rng), first, prior, config, limits)
     scenes = Scenes.of(frames, config.bootstrap_blocks)
     basin = find_basin(terms, thin, rng, scenes.block)
@@ -223,7 +225,7 @@ def _terms(
     frames: Sequence[Observation], velocity_lidar: np.ndarray, prior: Prior, config: SolveConfig
 ) -> Terms:
     """The terms selected in the config, with all points that can come into view within the search range."""
-    reach, T = search_range(prior.sigmas, config).rotation_rad + MARGIN_RAD, prior.T_camera_lidar
+    reach, T = config.search_range(prior.sigmas).rotation_rad + MARGIN_RAD, prior.T_camera_lidar
     readout_s, start = prior.camera.readout_s, Start(T, prior.rotation_sigma_rad)
     terms = prepare_terms(frames, T, velocity_lidar, reach_rad=reach, readout_s=readout_s, start=start)
     terms = replace(terms, gap_s=terms.gap_s - constant_gap_s(terms.gap_s))  # so that dt is beyond it

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, Scored, prior_value, refine
+from pipeline.calibrate.joint.camera_lidar.refine import SCHEDULE, AlignmentState, Scored, prior_value, refine
 from pipeline.calibrate.joint.camera_lidar.rotation_search import (
     GRID_SHIFTS_PX,
     TERMS,
@@ -28,9 +28,7 @@ from pipeline.calibrate.joint.camera_lidar.rotation_search import (
     grid_turns,
     wrong_poses,
 )
-from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
 from pipeline.calibrate.numerics.covariance import CLEARLY, widening
-from pipeline.calibrate.numerics.search_range import search_range
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms
 from pipeline.rig.se3 import inverse, log_so3, transform_points
 
@@ -96,7 +94,7 @@ def find_basin(terms: Terms, scored: Scored, rng: np.random.Generator, block: In
         rng: decides everything random.
         block: block of each frame; errors of different blocks are independent.
     """
-    prior, (reach, shift) = scored.prior, search_range(scored.prior.sigmas, scored.config)
+    prior, (reach, shift) = scored.prior, scored.config.search_range(scored.prior.sigmas)
     wrong = wrong_poses(prior, reach, min(shift, _SHIFT_SIGMAS * prior.translation_sigma_m), rng)
     match = np.full_like(scored.kernel.match, SCHEDULE.coarse_match)
     kernel = replace(scored.kernel, match=match)
@@ -156,7 +154,7 @@ def _candidates(
     if prior.T_camera_lidar_before is not None:
         # Last: whether an earlier day was calibrated already must not change a day whose own data decide.
         state = AlignmentState(prior.T_camera_lidar_before)
-        yield "state", state.within(prior, search_range(prior.sigmas, scored.config)), True
+        yield "state", state.within(prior, scored.config.search_range(prior.sigmas)), True
 
 
 def _climbed(scored: Scored, start: AlignmentState) -> AlignmentState:
@@ -179,7 +177,7 @@ class _Search:
         self.ends: list[_End] = []
         kernel_rad = scored.kernel.sigma_px / float(scored.terms.camera[1])
         self.same_rad = max(_SAME_OPTIMUM_RAD, _SAME_OPTIMUM_KERNELS * kernel_rad)
-        reach = search_range(scored.prior.sigmas, scored.config).rotation_rad
+        reach = scored.config.search_range(scored.prior.sigmas).rotation_rad
         self.leads_there_rad = SCHEDULE.grid_step_kernels * grid_kernel_rad(reach)
         self.poses, self.candidates = len(grid_turns(reach)), 0
 
@@ -249,7 +247,7 @@ class _Search:
     def _arrived(self, end: _End, best: _End) -> _End:
         apart = self._apart(end.state, best.state)
         # By its frames alone: on its way an end may pay a prior of the focal length that it will not pay in the end.
-        is_rival = apart < self.leads_there_rad or _rejected_by_frames(best, end) < CLEARLY
+        is_rival = apart < self.leads_there_rad or _rejected(best, end, with_prior=False) < CLEARLY
         return self._finished(end, _FINISHES) if is_rival and apart >= self.same_rad else end
 
     def _finished(self, end: _End, times: int = 1) -> _End:
@@ -272,26 +270,15 @@ class _Search:
         return _apart_rad(self.scored.terms, a, b)
 
 
-def _rejected(best: _End, other: _End) -> float:
+def _rejected(best: _End, other: _End, *, with_prior: bool = True) -> float:
     """Standard errors by which the day rejects an end, from its frames or equivalent to its evidence."""
-    return max(_by_scatter(best, other), _equivalent(best.total - other.total))
-
-
-def _rejected_by_frames(best: _End, other: _End) -> float:
-    """`_rejected`, without the priors of both."""
-    lead = best.total - best.prior - (other.total - other.prior)
-    return max(_by_scatter(best, other), _equivalent(lead))
-
-
-def _by_scatter(best: _End, other: _End) -> float:
-    lower = best.by_frame - other.by_frame
+    lower, lead = best.by_frame - other.by_frame, best.total - other.total
+    if not with_prior:
+        lead = best.total - best.prior - (other.total - other.prior)
     error = lower.std(ddof=1) / np.sqrt(len(lower)) if len(lower) > 1 else np.inf
-    return float(lower.mean() / error) if error > 0 else np.inf
-
-
-def _equivalent(lead: float) -> float:
-    """Standard errors of a normal variable with this difference of log likelihoods."""
-    return float(np.sqrt(2 * max(lead, 0.0)))
+    by_scatter = float(lower.mean() / error) if error > 0 else np.inf
+    # Of a normal variable with this difference of log likelihoods.
+    return max(by_scatter, float(np.sqrt(2 * max(lead, 0.0))))
 
 
 def _apart_rad(terms: Terms, a: AlignmentState, b: AlignmentState) -> float:

@@ -33,7 +33,7 @@ from jaxtyping import Float
 
 from pipeline.calibrate.joint.camera_lidar.observability import CameraLidarProblem
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState
-from pipeline.calibrate.numerics.bias_floors import (
+from pipeline.calibrate.numerics.nuisances import (
     DAY_CENTRE_SIGMAS,
     DAY_FOCAL_FLOOR,
     DAY_FOCAL_SIGMAS,

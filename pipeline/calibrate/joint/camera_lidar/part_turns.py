@@ -24,12 +24,12 @@ from jaxtyping import Float, Int, Int64
 
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState
 from pipeline.calibrate.joint.part_turn import PartTurn
-from pipeline.calibrate.numerics.bias_floors import (
+from pipeline.calibrate.numerics.covariance import CLEARLY
+from pipeline.calibrate.numerics.nuisances import (
     CAMERA_LIDAR_BIAS,
     EDGE_SIDE_MOST_OF_GAP,
     EDGE_SIDE_MOST_PX,
 )
-from pipeline.calibrate.numerics.covariance import CLEARLY
 from pipeline.objective.camera_lidar.points import Points
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms
 from pipeline.rig.cameras import camera_of

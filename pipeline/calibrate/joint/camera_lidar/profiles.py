@@ -9,10 +9,16 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import median_filter
 
 from pipeline.calibrate.joint.camera_lidar.initialise import difference
-from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, Scored, prior_value, refine, scales
-from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
-from pipeline.calibrate.numerics.bias_floors import TZ_COMMON_BIAS_M, TZ_UNCHECKED_BIAS_M
-from pipeline.calibrate.numerics.response_surface import DESIGN
+from pipeline.calibrate.joint.camera_lidar.refine import (
+    SCHEDULE,
+    AlignmentState,
+    Scored,
+    prior_value,
+    refine,
+    scales,
+)
+from pipeline.calibrate.numerics.covariance import DESIGN
+from pipeline.calibrate.numerics.nuisances import TZ_COMMON_BIAS_M, TZ_UNCHECKED_BIAS_M
 from pipeline.objective.camera_lidar.score import Alignments, KernelSettings, Terms
 from pipeline.rig.estimates import Prior
 

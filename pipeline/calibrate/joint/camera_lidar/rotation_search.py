@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from pipeline.calibrate.joint.camera_lidar.schedule import SCHEDULE
+from pipeline.calibrate.joint.camera_lidar.refine import SCHEDULE
 from pipeline.objective.camera_lidar.score import Alignments, KernelSettings, Terms
 from pipeline.rig.estimates import Prior
 from pipeline.rig.se3 import exp_so3, from_rotation_translation

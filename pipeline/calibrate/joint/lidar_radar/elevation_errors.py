@@ -25,7 +25,6 @@ __all__ = [
     "contradiction",
     "doubted",
     "elevation_spread",
-    "floor_scatter",
     "following_tilt",
     "own_equations",
     "own_numbers",
@@ -204,14 +203,6 @@ def tempered(
     W = np.linalg.inv(np.eye(len(floor)) + H.sum(0) @ floor)
     product = W @ H
     return 0.5 * (product + np.swapaxes(product, 1, 2)), g @ W.T
-
-
-def floor_scatter(
-    H_tempered: Float[np.ndarray, "F P P"], floor: Float[np.ndarray, "P P"]
-) -> Float[np.ndarray, "P P"]:
-    """Covariance of a measurement's total gradient by its floor alone: `J floor J`, with J as `tempered` left it."""
-    J = H_tempered.sum(0)
-    return np.asarray(J @ floor @ J)
 
 
 def following_tilt(

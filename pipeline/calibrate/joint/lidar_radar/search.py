@@ -12,14 +12,14 @@ from scipy.ndimage import median_filter
 from pipeline.calibrate.joint.lidar_radar.normal_equations import linearise
 from pipeline.calibrate.joint.lidar_radar.problem import (
     DT,
+    SCHEDULE,
     STEP_LIMIT,
     UNKNOWNS,
     Linear,
     RadarProblem,
     RadarState,
 )
-from pipeline.calibrate.joint.lidar_radar.schedule import SCHEDULE
-from pipeline.calibrate.numerics.bias_floors import OUTLIER_DENSITY, REGISTRATION_COMPARISON_SIGMA
+from pipeline.calibrate.numerics.nuisances import OUTLIER_DENSITY, REGISTRATION_COMPARISON_SIGMA
 from pipeline.core.config import SolveConfig
 from pipeline.objective.radar.registration import (
     BOUNCE_PRIOR,

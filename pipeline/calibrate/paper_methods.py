@@ -6,12 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
+from scipy.optimize import differential_evolution, minimize
 
-from pipeline.calibrate.numerics.bias_floors import PAPER_BIAS
-from pipeline.calibrate.numerics.covariance import OBSERVABLE
+from pipeline.calibrate.numerics.covariance import OBSERVABLE, sandwich_covariance
 from pipeline.calibrate.numerics.frame_blocks import scene_blocks
-from pipeline.calibrate.paper.minimise import Minimum, at_border, half_widths, minimise
+from pipeline.calibrate.numerics.nuisances import PAPER_BIAS
 from pipeline.core.config import SolveConfig
 from pipeline.core.results import Progress, silent
 from pipeline.objective.paper.camera_lidar import CameraLidarLoss, camera_lidar_loss
@@ -20,19 +20,21 @@ from pipeline.objective.paper.classes import loop_loss, loop_transform
 from pipeline.objective.paper.lidar_radar import LidarRadarLoss, lidar_radar_loss
 from pipeline.rig.changes import changed
 from pipeline.rig.checks import Check
-from pipeline.rig.common_share import common_of
-from pipeline.rig.estimates import PairEstimate, Prior, Solution
-from pipeline.rig.se3 import exp_se3, rotation_angle_rad
+from pipeline.rig.estimates import PairEstimate, Prior, Solution, common_of
+from pipeline.rig.se3 import rotation_angle_rad
 from schemas.calibrations import PAIRS
 from schemas.observations import Observation
 
 __all__ = [
+    "Minimum",
     "PairProblem",
+    "at_border",
     "estimate_of",
+    "half_widths",
     "joint_costs",
     "loop_size",
+    "minimise",
     "pair_problem",
-    "sandwich_covariance",
     "solve_joint_optimisation",
     "solve_pair",
     "solve_pairwise",
@@ -56,20 +58,11 @@ __all__ = [
 # - frames below the paper's conditions fill up days that have too few above them, and the record counts
 #   them;
 # - the search box, 90 candidates and 60 generations of the evolution are ours.
-#
-# Covariance of a minimum of the paper's losses: block sandwich from curvature and the scatter of gradients.
-#
-# The paper gives no uncertainty. The sandwich `H^-1 S H^-1` (H: curvature of the mean loss, S: scatter of
-# the gradients over blocks of frames that share a scene) is what resampling whole blocks converges to, at
-# the price of a few evaluations; its inverse is added to the prior's information. It does not include bias,
-# and these losses are biased (their minimum lies below the truth's value): a floor measured in simulation
-# is added.
 
 
 NO_UNCERTAINTY = (
     "the paper gives no uncertainty: block sandwich of its loss plus a bias floor from simulation"
 )
-_STEP = np.array([np.radians(0.2)] * 3 + [0.04] * 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,64 +177,6 @@ def border_failures(pairs: Mapping[str, PairEstimate]) -> dict[str, list[Check]]
     }
 
 
-def sandwich_covariance(
-    frame_losses: Callable[[np.ndarray], np.ndarray],
-    T: Float[np.ndarray, "4 4"],
-    blocks: Int[np.ndarray, " F"],
-    prior_covariance: Float[np.ndarray, "6 6"],
-    floor: tuple[float, float],
-) -> tuple[Float[np.ndarray, "6 6"], Float[np.ndarray, " 6"]]:
-    """Covariance (left perturbation, rotation first) with the bias floor, and observability per DoF.
-
-    Args:
-        frame_losses: (P, 4, 4) -> (P, F).
-        prior_covariance: upper limit for what is not determined.
-        floor: bias floor, rotation [rad] and translation [m].
-
-    Returns:
-        Covariance, and 1 - variance / prior variance per DoF, clipped to 0..1.
-    """
-    E = np.diag(_STEP)
-    plus, minus = frame_losses(exp_se3(E) @ T), frame_losses(exp_se3(-E) @ T)
-    gradients = (plus - minus) / (2 * _STEP[:, None])  # 6 F
-    frames = gradients.shape[1]
-    names = np.unique(blocks)
-    sums = np.stack([gradients[:, blocks == b].sum(axis=1) for b in names]) / frames
-    sums -= sums.mean(axis=0)
-    S = sums.T @ sums * len(names) / max(len(names) - 1, 1)
-    H = _curvature(frame_losses, T, plus.mean(axis=1), minus.mean(axis=1))
-    information = _godambe(H, S) + np.linalg.inv(prior_covariance)
-    covariance = np.linalg.inv(information) + np.diag([floor[0] ** 2] * 3 + [floor[1] ** 2] * 3)
-    covariance = (covariance + covariance.T) / 2
-    observability = np.clip(1 - np.diag(covariance) / np.diag(prior_covariance), 0, 1)
-    return covariance, observability
-
-
-def _curvature(
-    frame_losses: Callable[[np.ndarray], np.ndarray], T: np.ndarray, plus: np.ndarray, minus: np.ndarray
-) -> np.ndarray:
-    centre = frame_losses(T[None]).mean()
-    H = np.diag((plus + minus - 2 * centre) / _STEP**2)
-    for i in range(6):
-        for j in range(i):
-            signs = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]], float)
-            xi = np.zeros((4, 6))
-            xi[:, [i, j]] = signs * _STEP[[i, j]]
-            f = frame_losses(exp_se3(xi) @ T).mean(axis=1)
-            H[i, j] = H[j, i] = (f[0] - f[1] - f[2] + f[3]) / (4 * _STEP[i] * _STEP[j])
-    return H
-
-
-def _godambe(H: np.ndarray, S: np.ndarray) -> np.ndarray:
-    """H S^-1 H, the inverse of the sandwich; 0 in directions in which both H and S vanish."""
-    scale = _STEP[:, None] * _STEP[None]
-    values, vectors = np.linalg.eigh(H * scale)
-    positive = (vectors * np.maximum(values, 0)) @ vectors.T
-    scatter = S * scale
-    floor = 1e-3 * max(float(np.linalg.eigvalsh(scatter).max()), 1e-15)
-    return positive @ np.linalg.solve(scatter + floor * np.eye(6), positive) / scale
-
-
 # --------------------------------------------------------------------------------------------------
 # Method `joint-optimisation`: the pairwise results refined together under the loop, `(1 + L_P)(1 + L_G)`.
 #
@@ -312,3 +247,98 @@ def joint_costs(
     )
     loop = loop_transform(poses["camera_lidar"], poses["lidar_radar"], poses["camera_radar"])
     return (1 + pairwise) * (1 + loop_loss(loop))  # equation 2
+
+
+# --------------------------------------------------------------------------------------------------
+# Differential evolution, then Nelder-Mead: the paper's optimiser (section 4.5.3) over poses about a start.
+#
+# A pose is six numbers about its start: a rotation vector in the parent's axes [rad] on the rotation part
+# alone, and a shift of the origin [m]. The search range has the same meaning for any lever arm.
+
+# Costs of a batch of parameter vectors: (S, D) -> (S,)
+Objective = Callable[[np.ndarray], np.ndarray]
+
+
+_BORDER = 0.98  # of the half-width: a minimum beyond it counts as at the border
+_SIMPLEX = 0.05  # edge of Nelder-Mead's first simplex, as a share of the half-width
+_EVALUATIONS_PER_PARAMETER = 150
+
+
+@dataclass(frozen=True, eq=False)
+class Minimum:
+    """Where the search ended."""
+
+    x: np.ndarray
+    value: float
+    evaluations: int
+    at_border: bool  # within 2 % of the box: the true minimum may lie outside
+
+
+def half_widths(config: SolveConfig, poses: int) -> Float[np.ndarray, " D"]:
+    """Half the search box along each parameter of `poses` poses."""
+    return np.tile([np.radians(config.search_rotation_deg)] * 3 + [config.search_translation_m] * 3, poses)
+
+
+def minimise(
+    objective: Objective,
+    config: SolveConfig,
+    start: Float[np.ndarray, " D"],
+    rng: np.random.Generator,
+    *,
+    spread: float = 1.0,
+) -> Minimum:
+    """Minimise over the box: differential evolution (best1bin) on whole generations, then Nelder-Mead from its best.
+
+    Args:
+        start: member of the first population, and its centre.
+        spread: size of the first population as a share of the box, 1 = all of it.
+    """
+    half = half_widths(config, len(start) // 6)
+    members = start + spread * half * (2 * _latin_hypercube(config.paper_population, len(start), rng) - 1)
+    members = np.clip(members, -half, half)
+    members[0] = np.clip(start, -half, half)
+    evaluations = 0
+
+    def counted(x: np.ndarray) -> np.ndarray:
+        nonlocal evaluations
+        evaluations += len(x)
+        return objective(np.clip(x, -half, half))
+
+    found = differential_evolution(
+        lambda x: counted(x.T),
+        list(zip(-half, half, strict=True)),
+        init=members,
+        maxiter=config.paper_generations,
+        mutation=(0.5, 0.9),
+        recombination=0.8,
+        tol=1e-4,
+        polish=False,
+        vectorized=True,
+        updating="deferred",
+        rng=rng,
+    )
+    simplex = np.vstack([found.x, found.x + np.diag(_SIMPLEX * half)])
+    finished = minimize(
+        lambda x: float(counted(x[None])[0]),
+        found.x,
+        method="Nelder-Mead",
+        options={
+            "initial_simplex": simplex,
+            "xatol": 1e-5,  # 0.0006 deg, 0.01 mm
+            "fatol": 1e-7,
+            "maxfev": _EVALUATIONS_PER_PARAMETER * len(start),
+            "adaptive": len(start) > 6,
+        },
+    )
+    x = np.clip(finished.x, -half, half)
+    return Minimum(x, float(finished.fun), evaluations, at_border(x, half))
+
+
+def at_border(x: Float[np.ndarray, " D"], half_widths: Float[np.ndarray, " D"]) -> bool:
+    """Whether a minimum is so near the border of the box that the true one may be outside."""
+    return bool(np.any(np.abs(x) > _BORDER * half_widths))
+
+
+def _latin_hypercube(members: int, dimensions: int, rng: np.random.Generator) -> np.ndarray:
+    strata = np.argsort(rng.random((dimensions, members)), axis=1).T
+    return (strata + rng.random((members, dimensions))) / members

@@ -1,1 +1,0 @@
-"""The paper's direct optimisation: pairwise, then joint under the loop."""
