@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.adjust.rig import AdjustedEdge, AdjustedRig, AdjustedSensor
-from pipeline.calibrate.adjusted_day import SolvedEdge, adjusted_rig
+from pipeline.calibrate.adjusted_day import Concluded, SolvedEdge, adjusted_rig
 from pipeline.calibrate.judging import Judged
 from pipeline.calibrate.pose_rows import pose_rows
 from pipeline.calibrate.records import Inputs
@@ -18,6 +18,7 @@ from pipeline.rig.graph import RigGraph, Sensor, edge_between
 from pipeline.rig.prior import Extrinsics, RigPrior
 from pipeline.rig.se3 import from_rotation_translation
 from pipeline.store.partitions import Partition
+from schemas.calibrations import CalibrationRecord
 from tests.makers.radar_scenes import T_LIDAR_RADAR
 from tests.makers.solve_scenes import T_CAMERA_LIDAR
 
@@ -33,9 +34,14 @@ def test_a_sure_prior_alone_certifies_nothing(seen, status):
     poses = Extrinsics(TOP, {"top": np.eye(4), "nose": np.eye(4)}, ("nose",), tight, tight)
     found = AdjustedSensor(np.full(6, float(seen)), np.full(6, seen), (EDGE,), "", (), 0.01)
     graph = RigGraph((TOP, NOSE), (EDGE,), TOP)
+    nothing = CalibrationRecord(  # has no say in the pose
+        vehicle="car", day="2026-03-02", method="joint", pair=EDGE.kind, parent_frame="top", child_frame="nose", seed=0,
+        status="held", reason="too few frames", work_key="key", code_version="0", observable=[False] * 6,
+    )  # fmt: skip
     top, nose = pose_rows(
-        ABOUT, graph, AdjustedRig(poses, tight, poses, {"nose": found}, {}), poses, {}, VerifyConfig()
-    )
+        ABOUT, graph, AdjustedRig(poses, tight, poses, {"nose": found}, {}), poses, {}, VerifyConfig(),
+        {"nose": Concluded(EDGE, nothing, is_adjusted=False)},
+    )  # fmt: skip
     assert (top.status, nose.status) == ("accepted", status)
     assert seen or "no degree of freedom" in nose.reason
 
