@@ -114,7 +114,7 @@ def test_an_empty_side_is_an_error_before_training(tmp_path, capsys):
     assert main([*call, "--vehicles", "a"]) == 3
     capsys.readouterr()
     assert main(["train", "--data", str(tmp_path), "--out", str(tmp_path / "run")]) == 1
-    assert "no frames on side val: prepare again" in capsys.readouterr().out
+    assert "no frames on side val: run prepare again" in capsys.readouterr().out
     assert not (tmp_path / "run").exists()
 
 
