@@ -290,6 +290,8 @@ def test_errors_that_a_user_can_act_on_become_failed_outcomes_and_others_do_not(
     outcome = failing(LogError("a.mcap", "is empty"))
     assert (outcome.status, outcome.vehicle, outcome.day) == ("failed", "v", DAY.day)
     assert "a.mcap" in outcome.reason
+    assert outcome.faults == ()
+    assert failing(ConfigError("fleet.toml", "rigs", "are wrong")).faults == ("configuration",)
     with pytest.raises(ZeroDivisionError):
         failing(ZeroDivisionError())
 
