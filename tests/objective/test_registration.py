@@ -11,6 +11,7 @@ from pipeline.objective.radar.registration import (
     normal_equations,
     registration_frames,
 )
+from pipeline.objective.radar.registration_neighbours import _angle
 from pipeline.rig.se3 import exp_se3, inverse, transform_points
 from pipeline.rig.spherical import to_spherical
 from tests.makers.radar_scenes import DT_S, SIGMA, T_LIDAR_RADAR, street_day
@@ -118,3 +119,9 @@ def test_every_lidar_point_in_reach_takes_part(widen):
     cost = normal_equations(turning, *about).cost
     assert np.abs(cost - ours.cost).max() > 1e-3
     np.testing.assert_allclose(cost, plain_numpy.registration(turning, *about)[3], atol=1e-7)
+
+
+def test_angles_by_a_polynomial_are_those_of_atan2():
+    at = np.linspace(-1.7, 1.7, 201)
+    found = [_angle.py_func(3 * np.sin(a), 3 * np.cos(a), 3.0) for a in at]
+    np.testing.assert_allclose(found, at, atol=2e-11)
