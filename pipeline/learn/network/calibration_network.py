@@ -32,12 +32,6 @@ class CalibrationNetwork(nn.Module):
         self.config = config
         self.core = MatchingCore(config) if config.architecture == "matching" else ConcatCore(config)
 
-    def encode(self, inputs: NetworkInputs) -> Predictions:
-        """Class logits alone, at the guess: training signal of the encoders of `matching`."""
-        assert isinstance(self.core, MatchingCore)
-        view, index = self._render(inputs)
-        return self._predictions(inputs, self.core.encode(view), index)
-
     def refine(self, inputs: NetworkInputs, iterations: int) -> list[Predictions]:
         """Several passes with the same weights, each rendered at the last rotation; the camera is encoded once.
 

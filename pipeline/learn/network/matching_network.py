@@ -90,18 +90,6 @@ class MatchingCore(nn.Module):
         likelihood = None if camera_logits is None else self.camera_log_likelihood(view.camera, camera_logits)
         return self.match(view, likelihood, camera_logits)
 
-    def encode(self, view: RenderedView) -> CoreOutputs:
-        """Logits of the encoders; nothing is matched, so no pose is corrected."""
-        frames = len(view.camera)
-        identity = torch.eye(4, device=view.camera.device).expand(frames, len(PAIRS), 4, 4)
-        log_variance = self.heads.start.expand(frames, len(PAIRS), 6)
-        camera = self.camera_encoder(view.camera) if self.camera_encoder is not None else None
-        lidar = self.encode_lidar(view.lidar_grid) if "camera_lidar" in self.pairs else None
-        radar = None
-        if self.pairs == ("camera_radar",):
-            radar = self.radar_encoder(view.radar_features, view.radar_camera.norm(dim=-1))
-        return CoreOutputs(identity, log_variance, None, camera, lidar, radar)
-
     def camera_log_likelihood(
         self, camera: Float[Tensor, "B C H W"], logits: Float[Tensor, "B K H W"]
     ) -> Float[Tensor, "B L H W"]:
@@ -167,18 +155,6 @@ class MatchingCore(nn.Module):
         logits_of = (camera_logits, lidar_logits, radar_logits)
         return CoreOutputs(corrections, log_variance, likelihood, *logits_of, evidence)
 
-    def encode_lidar(self, rendered: Float[Tensor, "B C H W"]) -> Float[Tensor, "B K H W"]:
-        """Class logits of a rendered sweep; in training every other frame is mirrored.
-
-        Lidar labels come through guesses that are wrong by some angle, and an encoder that learns the borders
-        of classes would learn that angle. In mirrored frames the angle is the opposite one.
-        """
-        if not self.training:
-            return self.lidar_encoder(rendered)
-        mirrored = (torch.arange(len(rendered), device=rendered.device) % 2 == 1)[:, None, None, None]
-        logits = self.lidar_encoder(torch.where(mirrored, rendered.flip(-1), rendered))
-        return torch.where(mirrored, logits.flip(-1), logits)
-
     def _with_edges(self, maps: Tensor, probability: Tensor, edge: Tensor) -> tuple[Tensor, Tensor]:
         """Boundaries as one more class, matched with the sweep's edges for any class of their points."""
         if self.log_edge_worth is None:
@@ -199,7 +175,7 @@ class MatchingCore(nn.Module):
     def _lidar_logits(self, rendered: Tensor, row: Tensor, column: Tensor) -> tuple[Tensor, Tensor]:
         """Class logits of all cells, and of the points' cells, which are all that a graph without training needs."""
         if self.training:
-            logits = self.encode_lidar(rendered)
+            logits = self.lidar_encoder(rendered)
             return logits, cell_values(logits, row * self.grid.width + column)
         features = self.lidar_encoder.features(rendered)
         at_points = self.lidar_encoder.logits_at(features, rendered, row, column)

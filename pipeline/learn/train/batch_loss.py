@@ -15,7 +15,7 @@ from pipeline.learn.network.outputs import Predictions
 from pipeline.learn.network.views import NetworkInputs, crop, grid_cells, sensor_inputs, sphere
 from pipeline.learn.sample.grid import Grid
 from pipeline.learn.sample.layout import PAIRS
-from pipeline.learn.train.augment import Guess, random_guess, turned_view
+from pipeline.learn.train.augment import Guess, mirrored, random_guess, turned_view
 from pipeline.learn.train.domain_randomisation import made_strange
 from pipeline.learn.train.frame_objective import (
     at_lag,
@@ -44,10 +44,8 @@ class Passes(nn.Module):
         super().__init__()
         self.network, self.iterations = network, iterations
 
-    def forward(self, inputs: NetworkInputs, *, matched: bool = True) -> list[Predictions]:
-        """All passes, the best answer last; not `matched`: one pass of the encoders alone, which stays at the guess."""
-        if not matched:
-            return [self.network.encode(inputs)]
+    def forward(self, inputs: NetworkInputs) -> list[Predictions]:
+        """All passes, the best answer last."""
         return self.network.refine(inputs, self.iterations)
 
 
@@ -57,26 +55,25 @@ def batch_loss(
     config: TrainConfig,
     generator: torch.Generator,
     *,
-    matched: bool = True,
     paper: PaperFrames | None = None,
 ) -> dict[str, Tensor]:
     """The `loss` of one batch from random guesses, differentiable, and means to report, of the last pass.
 
     Args:
         passes: a `Passes` of the network, bare or wrapped for data parallelism.
-        matched: whether poses are estimated and judged, or encoders learn classes only.
         paper: if `loss.definition` is "paper": the inputs of its losses.
     """
-    grid = Grid(config.cell_deg)
-    guess = random_guess(batch, config.augment, generator)
-    view = turned_view(batch, guess.R_turned_camera) if config.augment.view_deg > 0 else batch
+    grid, augment = Grid(config.cell_deg), config.augment
+    if augment.mirror_share > 0:
+        rows = torch.rand(len(batch), generator=generator) < augment.mirror_share
+        batch = mirrored(batch, rows.to(batch.image.device))
+    guess = random_guess(batch, augment, generator)
+    view = turned_view(batch, guess.R_turned_camera) if augment.view_deg > 0 else batch
     sensors = made_strange(sensor_inputs(view, grid), config.strange, generator)
     inputs = NetworkInputs(sensors, guess.T_camera_lidar, guess.T_camera_radar, guess.T_lidar_radar)
-    answers: list[Predictions] = passes(inputs, matched=matched)
+    answers: list[Predictions] = passes(inputs)
     turned = pose(guess.R_turned_camera, torch.zeros_like(guess.R_turned_camera[..., 0]))
     semantics = _semantics(answers, view, turned, grid)
-    if not matched:
-        return {"loss": config.loss.semantics * semantics, "semantics": semantics.detach()}
     pairs = PAIRS_OF[config.pairs]
     total, terms = _alignment(answers, guess, batch, config, paper)
     evidence = _evidence(answers, batch, turned, grid, generator)

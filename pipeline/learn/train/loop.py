@@ -183,10 +183,6 @@ class Run(ABC):
     def losses(self) -> dict[str, Tensor]:
         """The next step's `loss`, differentiable, and further values to report."""
 
-    def comparable(self) -> bool:
-        """Whether the next step's loss may be compared with earlier ones, to see a run diverge."""
-        return True
-
     def validate(self, folder: Path, log: MetricsLog | None) -> None:  # noqa: B027 - not every run validates
         """Called at the start and after every step."""
 
@@ -215,7 +211,7 @@ class Run(ABC):
 
     def descend(self) -> dict[str, Tensor]:
         """One step of Adam; returns values to report."""
-        config, comparable = self.descent, self.comparable()
+        config = self.descent
         cosine, last = math.cos(math.pi * min(self.progress, 1.0)), config.final_learning_rate
         rate = last + 0.5 * (config.learning_rate - last) * (1 + cosine)
         for group in self.optimiser.param_groups:
@@ -225,8 +221,7 @@ class Run(ABC):
         found["loss"].backward()  # type: ignore[no-untyped-call]
         norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.gradient_norm)
         means = self.processes.mean(torch.stack([found["loss"].detach().float(), norm.detach().float()]))
-        if comparable:
-            self.guard.check(self.step, *means.tolist())
+        self.guard.check(self.step, *means.tolist())
         self.optimiser.step()
         self.step += 1
         return found | {"loss": means[0], "gradient_norm": means[1], "learning_rate": torch.tensor(rate)}

@@ -31,6 +31,7 @@ from pipeline.learn.train.loop import (
     Run,
     TrainResult,
     load_checkpoint,
+    read_metrics,
     run_loop,
     save_checkpoint,
     stop_signals,
@@ -53,6 +54,10 @@ class RunState(Run):
 
     def __init__(self, lake: Lake, config: TrainConfig, processes: Processes, loader: TrainingLoader) -> None:
         self.config, self.loader = config, loader
+        # Held-out frames as they are: in the mirror a mean answer has the opposite sign.
+        self.judging = config.model_copy(
+            update={"augment": config.augment.model_copy(update={"mirror_share": 0.0})}
+        )
         network = build_network(config.network, config.seed).to(processes.device)
         self.paper: PaperFrames | None = None
         if config.loss.definition == "paper":
@@ -73,22 +78,17 @@ class RunState(Run):
             return self.trained_s / (60 * self.config.budget_minutes)
         return super().progress
 
-    def comparable(self) -> bool:
-        """Whether losses are comparable; those of the encoders alone have another size."""
-        return (self.step + 1) % self.config.matched_every == 0
-
     def losses(self) -> dict[str, Tensor]:
         """Losses of the step's batch, from random guesses."""
         batch = next(self.loader).to(self.processes.device)
         generator = _generator(self.config.seed, self.step, self.processes.rank)
-        return batch_loss(
-            self.passes, batch, self.config, generator, matched=self.comparable(), paper=self.paper
-        )
+        return batch_loss(self.passes, batch, self.config, generator, paper=self.paper)
 
     def validate(self, folder: Path, log: MetricsLog | None) -> None:
         """At the start and at intervals, judge held-out frames from the same guesses; keep the best weights.
 
-        The start is judged like what follows, so that no checkpoint is kept that is worse than it.
+        The start is judged like what follows, so that no checkpoint is kept that is worse than it. Reports by how much
+        the mean answer has moved since: training that teaches an answer of its own, or a side, moves it.
         """
         frames, sums = self.held_out, dict[str, float]()
         if frames is None or not (self.step % self.config.validate_every == 0 or self.finished):
@@ -99,10 +99,16 @@ class RunState(Run):
         with torch.no_grad():
             for first in range(0, len(frames), 16):
                 part = frames[first : first + 16].to(self.processes.device)
-                found = batch_loss(passes, part, self.config, generator, paper=self.paper)
+                found = batch_loss(passes, part, self.judging, generator, paper=self.paper)
                 for name, value in found.items():
                     sums[name] = sums.get(name, 0.0) + float(value) * len(part) / len(frames)
         self.network.train()
+        first = next((r for r in read_metrics(folder) if "validation/judged" in r), {})
+        means = {name: value for name, value in sums.items() if name.startswith("mean_deg/")}
+        for name, value in means.items():
+            sums["moved_deg/" + name.removeprefix("mean_deg/")] = value - first.get(
+                f"validation/{name}", value
+            )
         if log is not None:
             log.report(self.step, {f"validation/{name}": value for name, value in sums.items()})
         if sums["judged"] < self.best:

@@ -57,10 +57,10 @@ class LossConfig(_Section):
 
 
 class AugmentConfig(_Section):
-    """Sizes of the random errors of the guess and of the turned camera view in training.
+    """Sizes of the random errors of the guess and of the turned camera view in training, and mirrored frames.
 
     The paper moves the lidar's and the radar's clouds at random. Turning the camera's view as well keeps a
-    network from memorising one viewpoint.
+    network from memorising one viewpoint, mirrored frames from learning a side.
     """
 
     rotation_deg: NotNegative = 3.0  # per axis, even
@@ -68,6 +68,7 @@ class AugmentConfig(_Section):
     # Of the frames, moved by u^2 of that with u even in 0..1.
     small_share: Share = 0.5
     view_deg: NotNegative = 4.0  # per axis, even; the stored grid must be wider than the network's by as much
+    mirror_share: Share = 0.5  # of the frames
 
 
 class StrangeConfig(_Section):
@@ -121,9 +122,6 @@ class TrainConfig(DescentConfig):
     takes_classes: bool = False
     marks: bool = False  # bright ground of the sweep is matched with paint in the image
     iterations: Annotated[int, Field(ge=1, le=5)] = 1  # passes per frame; losses of all passes are averaged
-    # Encoders learn from classes alone, at every step; matchers have few weights and cost half of a step: they join at
-    # every n-th.
-    matched_every: Count = 1
     epochs: Positive = 20.0  # where steps are not given
     # In place of epochs: the run ends, and the cosine, after so much time.
     budget_minutes: Positive | None = None
@@ -156,11 +154,16 @@ class TrainConfig(DescentConfig):
             raise ValueError(f"cell_deg = {self.cell_deg:g}: {err}") from err
         if self.takes_classes and not self.needs_reference:
             raise ValueError("takes_classes must be false where no classes are matched: concat, lidar_radar")
-        if self.matched_every > 1 and not self.needs_reference:
-            raise ValueError("matched_every must be 1 where no classes are learned: concat, lidar_radar")
-        own = (self.architecture, self.augment.view_deg, self.takes_classes, self.strange)
-        if self.loss.definition == "paper" and own != ("concat", 0.0, False, StrangeConfig()):
-            problem = 'architecture = "concat", augment.view_deg = 0, and neither takes_classes nor [strange]'
+        own = (
+            self.architecture,
+            self.augment.view_deg,
+            self.augment.mirror_share,
+            self.takes_classes,
+            self.strange,
+        )
+        if self.loss.definition == "paper" and own != ("concat", 0.0, 0.0, False, StrangeConfig()):
+            wanted = 'architecture = "concat", augment.view_deg = 0, augment.mirror_share = 0'
+            problem = f"{wanted}, and neither takes_classes nor [strange]"
             raise ValueError(f'loss.definition = "paper" needs {problem}')
         return self
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn import functional as F  # noqa: N812 - the name that everybody uses
 
 from pipeline.objective.camera_lidar.image_maps import NO_BOUNDARY
-from pipeline.objective.differentiable.poses import exp_so3, transform_points
+from pipeline.objective.differentiable.poses import exp_so3, inverse, pose, transform_points
 from pipeline.objective.differentiable.projection import (
     GridProjection,
     masked_mean,
@@ -48,7 +48,7 @@ _ELEVATION_WEIGHT = float(SIGMA_START[0] / SIGMA_START[1])
 OFFSET_STEP_DEG = 0.05  # of the stored maps
 # Poses beside the reference: standard deviation of their turns about the camera's axes (right, down, ahead), and how
 # many, each with its opposite.
-_BESIDE_DEG, _BESIDE = (0.5, 0.5, 1.0), 6
+_BESIDE_DEG, _BESIDE_M, _BESIDE = (0.5, 0.5, 1.0), (0.1, 0.1, 0.2), 6  # sigmas in camera axes, and how many
 _EVIDENCE_WORTH = 30.0  # of a frame's mean log-likelihood, as days of it show
 
 
@@ -135,7 +135,7 @@ def class_evidence_cost(
     weight: Float[Tensor, "F N"],
     generator: torch.Generator,
 ) -> Float[Tensor, ""]:
-    """Negative log-probability of a reference pose, against poses turned to opposite sides of it; mean over frames.
+    """Negative log-probability of a reference pose, against poses to opposite sides of it; mean over frames.
 
     A day's fit sums over frames how well classified points lie on a camera's likelihoods. Where the sum of a frame
     prefers the reference to all other poses, it has no slope there.
@@ -147,10 +147,10 @@ def class_evidence_cost(
 
     Source: van den Oord et al. 2018, "Representation learning with contrastive predictive coding".
     """
-    sigma = torch.tensor(_BESIDE_DEG) / DEG
-    turns = exp_so3(torch.randn(_BESIDE, 3, generator=generator) * sigma)
-    R = torch.cat([torch.eye(3)[None], turns, turns.transpose(1, 2)]).to(points_camera)
-    uv, ahead = projection.project(torch.einsum("kij,fnj->fkni", R, points_camera))
+    turns, shifts = torch.randn(2, _BESIDE, 3, generator=generator)
+    beside = pose(exp_so3(turns * torch.tensor(_BESIDE_DEG) / DEG), shifts * torch.tensor(_BESIDE_M))
+    T = torch.cat([torch.eye(4)[None], beside, inverse(beside)]).to(points_camera)
+    uv, ahead = projection.project(transform_points(T[:, None], points_camera).transpose(0, 1))
     size = uv.new_tensor([maps.shape[3], maps.shape[2]])
     found = F.grid_sample(maps, (2 * uv + 1) / size - 1, padding_mode="border", align_corners=False)
     weight = weight * ahead[:, 0]

@@ -8,7 +8,7 @@ import torch
 
 from pipeline.learn.batches.batch import collate
 from pipeline.learn.sample.camera_maps import stored_grid
-from pipeline.learn.train.augment import random_guess, turned_view
+from pipeline.learn.train.augment import mirrored, random_guess, turned_view
 from pipeline.learn.train.batch_loss import class_of_points
 from pipeline.learn.train.frame_objective import (
     at_lag,
@@ -109,11 +109,35 @@ def test_random_guesses_close_the_loop_and_stay_in_their_limits(few):
     moved = twist_between(guess.unturned(guess.T_camera_lidar), few.T_camera_lidar)
     largest_deg = np.degrees(moved[:, :3].norm(dim=1).max().item())
     assert 0.2 < largest_deg <= 3.01 * np.sqrt(3)
+    lidar = se3.inverse(few.T_camera_lidar.numpy()) @ guess.unturned(guess.T_camera_lidar).numpy()
+    np.testing.assert_allclose(lidar[0::2] @ lidar[1::2], [np.eye(4)] * 2, atol=1e-5)  # no side in two frames
     again = random_guess(few, config, torch.Generator().manual_seed(1))
     assert torch.equal(again.T_lidar_radar, guess.T_lidar_radar)
     none = AugmentConfig(rotation_deg=0, translation_m=0, view_deg=0)
     still = random_guess(few, none, torch.Generator().manual_seed(1))
     np.testing.assert_allclose(still.T_camera_lidar, few.T_camera_lidar, atol=1e-6)
+
+
+def test_a_mirrored_frame_has_the_same_losses_and_classes_at_mirrored_poses(few):
+    """Mirrored where every second frame is; what is mirrored twice is as it was."""
+    rows = torch.tensor([False, True] * 2)
+    there, back = mirrored(few, rows), mirrored(mirrored(few, rows), rows)
+    assert all(torch.equal(v, getattr(back, n)) for n, v in vars(few).items() if isinstance(v, torch.Tensor))
+    guess = random_guess(few, AugmentConfig(view_deg=0), torch.Generator().manual_seed(1))
+    poses = guess.T_camera_lidar, guess.T_camera_radar, guess.T_lidar_radar
+    camera, other = torch.diag(torch.tensor([-1.0, 1, 1, 1])), torch.diag(torch.tensor([1.0, -1, 1, 1]))
+    sides = (camera, other), (camera, other), (other, other)
+    opposite = [
+        torch.where(rows[:, None, None], a @ T @ b, T) for T, (a, b) in zip(poses, sides, strict=True)
+    ]
+    found, expected = frame_objective(there).terms(*opposite), frame_objective(few).terms(*poses)
+    for name, value in expected.items():
+        np.testing.assert_allclose(found[name], value, rtol=2e-3, atol=2e-3, err_msg=name)
+    for b, T in enumerate(opposite[0]):
+        same = class_under(there, b, transform_points(T, there.lidar_xyz_m[b])) == class_under(
+            few, b, transform_points(poses[0][b], few.lidar_xyz_m[b])
+        )
+        assert same.float().mean() > 0.999
 
 
 def test_a_turned_view_shows_the_same_things_in_the_turned_directions(few):

@@ -33,6 +33,7 @@ uncertainty_weight = 0.0
 definition = "paper"
 [augment]
 view_deg = 0.0
+mirror_share = 0.0
 """
 
 
