@@ -31,9 +31,8 @@ __all__ = ["Guess", "mirrored", "random_guess", "turned_view"]
 _RAD = torch.pi / 180.0
 # Of the camera's frame (x right, y down, z ahead), and of those of lidar and radar (x ahead, y left, z up).
 _CAMERA_MIRROR, _MIRROR = torch.tensor([-1.0, 1.0, 1.0, 1.0]), torch.tensor([1.0, -1.0, 1.0, 1.0])
-_OTHER_SIDE = torch.tensor(
-    [EDGE_RIGHT, EDGE_LEFT, EDGE_ABOVE, EDGE_BELOW]
-)  # by EDGE_LEFT, RIGHT, ABOVE, BELOW
+_OTHER_SIDE = torch.tensor([EDGE_RIGHT, EDGE_LEFT, EDGE_ABOVE, EDGE_BELOW])  # by the sides' own numbers
+_POINTS = ("lidar_xyz_m", "cluster_centre_m", "edge_xyz_m", "radar_xyz_m", "track_xyz_m", "ego_velocity_mps")
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,21 +80,11 @@ def mirrored(batch: TrainingBatch, rows: Bool[Tensor, " B"]) -> TrainingBatch:
     labels and references has no side. Every sensor's points are mirrored in its own frame, so poses stay rotations.
     """
     camera, other = (torch.diag(v).to(batch.T_camera_lidar) for v in (_CAMERA_MIRROR, _MIRROR))
-    flat = other[:3, :3]
     left, top, right, bottom = batch.detection_box_rad.unbind(-1)
     offset = batch.edge_offset[:, _OTHER_SIDE].flip(-1)
     sideways = offset[:, :2].where(offset[:, :2] == NO_EDGE, -offset[:, :2])
-    points = (
-        "lidar_xyz_m",
-        "cluster_centre_m",
-        "edge_xyz_m",
-        "radar_xyz_m",
-        "track_xyz_m",
-        "ego_velocity_mps",
-    )
-    found = {name: getattr(batch, name) @ flat for name in points}
-    found |= {name: getattr(batch, name).flip(-1) for name in ("image", "grid_class", "grid_seen")}
-    found |= {
+    found = {name: getattr(batch, name) @ other[:3, :3] for name in _POINTS} | {
+        **{name: getattr(batch, name).flip(-1) for name in ("image", "grid_class", "grid_seen")},
         "edge_offset": torch.cat([sideways, offset[:, 2:]], 1),
         "edge_side": _OTHER_SIDE.to(batch.edge_side)[batch.edge_side.long()],
         "detection_box_rad": torch.stack([-right, top, -left, bottom], -1),
@@ -104,11 +93,8 @@ def mirrored(batch: TrainingBatch, rows: Bool[Tensor, " B"]) -> TrainingBatch:
         "T_camera_lidar": camera @ batch.T_camera_lidar @ other,
         "T_lidar_radar": other @ batch.T_lidar_radar @ other,
     }
-    taken = {
-        name: torch.where(rows.reshape(-1, *[1] * (value.dim() - 1)), value, getattr(batch, name))
-        for name, value in found.items()
-    }
-    return replace(batch, **taken)
+    frames = torch.arange(len(batch), device=rows.device) + len(batch) * rows
+    return replace(batch, **{name: torch.cat([getattr(batch, name), v])[frames] for name, v in found.items()})
 
 
 def turned_view(batch: TrainingBatch, R_turned_camera: Float[Tensor, "B 3 3"]) -> TrainingBatch:

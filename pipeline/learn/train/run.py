@@ -104,11 +104,9 @@ class RunState(Run):
                     sums[name] = sums.get(name, 0.0) + float(value) * len(part) / len(frames)
         self.network.train()
         first = next((r for r in read_metrics(folder) if "validation/judged" in r), {})
-        means = {name: value for name, value in sums.items() if name.startswith("mean_deg/")}
-        for name, value in means.items():
-            sums["moved_deg/" + name.removeprefix("mean_deg/")] = value - first.get(
-                f"validation/{name}", value
-            )
+        for axis in [name.removeprefix("mean_deg/") for name in sums if name.startswith("mean_deg/")]:
+            mean = sums[f"mean_deg/{axis}"]
+            sums[f"moved_deg/{axis}"] = mean - first.get(f"validation/mean_deg/{axis}", mean)
         if log is not None:
             log.report(self.step, {f"validation/{name}": value for name, value in sums.items()})
         if sums["judged"] < self.best:

@@ -154,17 +154,13 @@ class TrainConfig(DescentConfig):
             raise ValueError(f"cell_deg = {self.cell_deg:g}: {err}") from err
         if self.takes_classes and not self.needs_reference:
             raise ValueError("takes_classes must be false where no classes are matched: concat, lidar_radar")
-        own = (
-            self.architecture,
-            self.augment.view_deg,
-            self.augment.mirror_share,
-            self.takes_classes,
-            self.strange,
-        )
+        view = self.augment.view_deg, self.augment.mirror_share
+        own = (self.architecture, *view, self.takes_classes, self.strange)
         if self.loss.definition == "paper" and own != ("concat", 0.0, 0.0, False, StrangeConfig()):
-            wanted = 'architecture = "concat", augment.view_deg = 0, augment.mirror_share = 0'
-            problem = f"{wanted}, and neither takes_classes nor [strange]"
-            raise ValueError(f'loss.definition = "paper" needs {problem}')
+            problem = (
+                "augment.view_deg = 0, augment.mirror_share = 0, and neither takes_classes nor [strange]"
+            )
+            raise ValueError(f'loss.definition = "paper" needs architecture = "concat", {problem}')
         return self
 
 

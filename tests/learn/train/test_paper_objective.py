@@ -88,7 +88,7 @@ def test_a_run_on_the_papers_loss_descends_its_terms_and_learns_nothing_of_deriv
 def test_the_papers_loss_is_refused_with_what_is_not_the_papers(tmp_path):
     recipe = tmp_path / "train.toml"
     strange = f"{PAPER}[strange]\nimage = 1.0\n"
-    changes = ("concat", "matching"), ("view_deg = 0.0", "view_deg = 4.0")
+    changes = ("concat", "matching"), ("view_deg = 0.0", "view_deg = 4.0"), ("share = 0.0", "share = 0.5")
     for wrong in (strange, *(PAPER.replace(*change) for change in changes)):
         recipe.write_text(wrong)
         with pytest.raises(ConfigError, match="definition"):
