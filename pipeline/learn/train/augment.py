@@ -12,6 +12,7 @@ new here.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -94,7 +95,8 @@ def mirrored(batch: TrainingBatch, rows: Bool[Tensor, " B"]) -> TrainingBatch:
         "T_lidar_radar": other @ batch.T_lidar_radar @ other,
     }
     frames = torch.arange(len(batch), device=rows.device) + len(batch) * rows
-    return replace(batch, **{name: torch.cat([getattr(batch, name), v])[frames] for name, v in found.items()})
+    taken: dict[str, Any] = {n: torch.cat([getattr(batch, n), v])[frames] for n, v in found.items()}
+    return replace(batch, **taken)
 
 
 def turned_view(batch: TrainingBatch, R_turned_camera: Float[Tensor, "B 3 3"]) -> TrainingBatch:

@@ -103,10 +103,10 @@ class RunState(Run):
                 for name, value in found.items():
                     sums[name] = sums.get(name, 0.0) + float(value) * len(part) / len(frames)
         self.network.train()
-        first = next((r for r in read_metrics(folder) if "validation/judged" in r), {})
+        start = next((r for r in read_metrics(folder) if "validation/judged" in r), {})
         for axis in [name.removeprefix("mean_deg/") for name in sums if name.startswith("mean_deg/")]:
             mean = sums[f"mean_deg/{axis}"]
-            sums[f"moved_deg/{axis}"] = mean - first.get(f"validation/mean_deg/{axis}", mean)
+            sums[f"moved_deg/{axis}"] = mean - start.get(f"validation/mean_deg/{axis}", mean)
         if log is not None:
             log.report(self.step, {f"validation/{name}": value for name, value in sums.items()})
         if sums["judged"] < self.best:
