@@ -12,7 +12,7 @@ from cyclopts.validators import Number
 from jobs.calibration_sources import FrameOptions, at_prior, read_calibration
 from jobs.extras import require
 from jobs.terminal.logging import logger
-from jobs.terminal.summary import print_summary, progress_reporter
+from jobs.terminal.summary import exit_code, print_summary, progress_reporter
 from pipeline.core.errors import ConfigError
 from pipeline.export.calibration import USABLE, ExportedCalibration, written_pairs
 from pipeline.export.files import updated_file, write_files, written_files
@@ -59,7 +59,7 @@ def export(
     days is at its prior; of a day, held and refused pairs are left out. The file and the summary have the reasons.
 
     Exit codes: 0 all that the vehicle has is current (of a day: accepted); 3 something is at the prior, held or left
-    out; 4 nothing is certified.
+    out, or a network is not fit for use; 4 nothing is certified.
 
     Args:
         what: format of a calibration; or "foxglove", an MCAP file of a day's drive with its calibration, for
@@ -89,9 +89,7 @@ def export(
         print_summary("export", "done", what=what, outputs=write_json_schemas(out))
         return 0
     if what == "onnx":
-        paths = _export_onnx(out, run, notes)
-        print_summary("export", "done", what=what, outputs=paths, bytes=out.stat().st_size)
-        return 0
+        return _export_onnx(out, run, notes)
     if lake is None or vehicle is None:
         raise ConfigError("command line", "lake, vehicle", "a calibration needs --lake and --vehicle")
     if signed_off and day is not None:
@@ -137,7 +135,8 @@ def _tell(what: str, calibration: ExportedCalibration, outputs: list[Path]) -> i
     return NOTHING_CERTIFIED if not certified else 0 if word == "done" else 3
 
 
-def _export_onnx(out: Path, run: Path | None, notes: Path | None) -> list[Path]:
+def _export_onnx(out: Path, run: Path | None, notes: Path | None) -> int:
+    """Write a network with its card; held, with exit code 3, is one that is not fit for use."""
     if run is None or not run.is_dir():
         raise ConfigError("command line", "run", "onnx needs --run FOLDER, written by `boresight train`")
     if out.suffix != ".onnx":
@@ -151,10 +150,12 @@ def _export_onnx(out: Path, run: Path | None, notes: Path | None) -> list[Path]:
     with progress_reporter("export onnx"):
         card = card_of_run(run, notes)
         export_onnx(network_of_run(run), out, card)
-    for limit in card["limits"]:
-        if str(limit).startswith(UNFIT):
-            logger().warning(limit, run=str(run))
-    return [out, out.with_suffix(".json"), out.with_suffix(".md")]
+    unfit = next((str(limit) for limit in card["limits"] if str(limit).startswith(UNFIT)), "")
+    if unfit:
+        logger().warning(unfit, run=str(run))
+    ended, paths = "held" if unfit else "done", [out, out.with_suffix(".json"), out.with_suffix(".md")]
+    print_summary("export", ended, what="onnx", reason=unfit, outputs=paths, bytes=out.stat().st_size)
+    return exit_code([ended])
 
 
 def _export_drive(

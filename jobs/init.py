@@ -34,7 +34,6 @@ def init(*logs: Path, out: Path = Path("fleet.toml"), name: str = "fleet", force
     with atomic_write(out) as file:
         file.write(proposal.text.encode())
     read = proposal.logs
-    some = " ".join(str(p) for p in read[:8])
     unlabelled = any(": semantics" in what for what in proposal.missing)
     fetch = ["boresight models --fetch"] if unlabelled else []
     print_summary(
@@ -44,6 +43,10 @@ def init(*logs: Path, out: Path = Path("fleet.toml"), name: str = "fleet", force
         sensors=list(proposal.sensors),
         to_enter=list(proposal.missing),
         problems=list(proposal.problems),
-        next_steps=[*fetch, f"boresight check {out} {some}", *nightly_command(out, read)],
+        next_steps=[
+            *fetch,
+            f"boresight check {out} {' '.join(map(str, read[:8]))}",
+            *nightly_command(out, read),
+        ],
     )
     return 0

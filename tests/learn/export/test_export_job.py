@@ -60,8 +60,9 @@ def test_a_network_that_held_out_frames_did_not_choose_is_called_unfit_wherever_
         (folder / BEST).unlink()
     notes.write_text('{"limits": ["none"]}')  # which nobody can claim
     out = tmp_path / "m.onnx"
-    assert main(["export", "onnx", "--run", str(folder), "--out", str(out), "--notes", str(notes)]) == 0
-    assert ("Not fit for use" in capsys.readouterr().err) == (why is not None)
+    called = ["export", "onnx", "--run", str(folder), "--out", str(out), "--notes", str(notes)]
+    assert main(called) == (0 if why is None else 3)
+    assert ('"reason": "Not fit for use' in capsys.readouterr().out) == (why is not None)
     card = json.loads((tmp_path / "m.json").read_text())
     assert card["limits"][-1] == "none"
     [network] = open_networks({"joint": out}, LearnConfig(), PrepareConfig())
