@@ -33,7 +33,7 @@ def init(*logs: Path, out: Path = Path("fleet.toml"), name: str = "fleet", force
         proposal = propose_fleet(logs, name, progress)
     with atomic_write(out) as file:
         file.write(proposal.text.encode())
-    read = proposal.logs
+    some = " ".join(str(p) for p in proposal.logs[:8])
     unlabelled = any(": semantics" in what for what in proposal.missing)
     fetch = ["boresight models --fetch"] if unlabelled else []
     print_summary(
@@ -43,10 +43,6 @@ def init(*logs: Path, out: Path = Path("fleet.toml"), name: str = "fleet", force
         sensors=list(proposal.sensors),
         to_enter=list(proposal.missing),
         problems=list(proposal.problems),
-        next_steps=[
-            *fetch,
-            f"boresight check {out} {' '.join(map(str, read[:8]))}",
-            *nightly_command(out, read),
-        ],
+        next_steps=[*fetch, f"boresight check {out} {some}", *nightly_command(out, proposal.logs)],
     )
     return 0
