@@ -48,6 +48,7 @@ def test_check_exits_0_1_2_for_yes_partly_no(kit, tmp_path, fleet, capsys):
     assert "radar elevation: yes" in " ".join(printed.err.split())
     summary = json.loads(printed.out.splitlines()[-1])
     assert summary["status"] == "partly"
+    assert "boresight nightly" in summary["next_steps"][-1]
     assert summary["pairs"] == {"camera_lidar": "no", "lidar_radar": "partly", "camera_radar": "no"}
     assert check(fleet, good.without(kit.RADAR).mcap(tmp_path / "blind.mcap")) == 2
     assert kit.RADAR in capsys.readouterr().err
