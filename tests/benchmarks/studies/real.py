@@ -11,13 +11,13 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pipeline.core.config import load_fleet
+from pipeline.core.config import FleetConfig, load_fleet
 from pipeline.core.stage_work import Task
 from pipeline.core.stages import CALIBRATE, INGEST, PERCEIVE
 from pipeline.rig.day_prior import read_transforms
@@ -53,37 +53,41 @@ def main() -> None:
         return
     known = [json.loads(line) for line in args.out.read_text().splitlines()] if args.out.exists() else []
     lines = [r for r in known if is_accepted(r["commit"], commit_now(), ())]
-    lake = _perceived(args.root / "real-car", args.logs)
+    named = sorted(p for p in args.logs.iterdir() if p.name.startswith(DAY.vehicle))
+    lake = perceived_lake(args.root / "real-car", FLEET, DAY, named)
     truth = read_transforms(args.logs / "given_calibration.json")
     for method, deg in STARTS:
         for seed in range(args.starts):
             row = f"{method}, {deg:g} deg"
             if not any((r["row"], r["seed"]) == (row, seed) for r in lines):
-                found = {"pairs": _calibrated(lake, method, deg, seed, truth)}
+                search = {"search_rotation_deg": max(6.0, 1.2 * deg)}
+                fleet = load_fleet(FLEET).changed(solve=search)
+                found = {"pairs": calibrated(fleet, lake, DAY, method, (deg, SHIFT_M), seed, truth)}
                 lines.append({"row": row, "seed": seed, "commit": commit_now()} | found)
                 with args.out.open("a") as file:
                     file.write(json.dumps(lines[-1]) + "\n")
     sys.stdout.write(by_row(lines) + "\n")
 
 
-def _perceived(folder: Path, logs: Path) -> Lake:
-    """The lake of the day, ingested and perceived by this code once."""
+def perceived_lake(folder: Path, fleet: Path, day: Partition, logs: Sequence[Path]) -> Lake:
+    """The lake of the folder, with the day of these logs ingested and perceived by this code once."""
     lake = Lake.at(folder)
-    if perceived(lake, DAY) is None:
-        named = tuple(sorted(p for p in logs.iterdir() if p.name.startswith(DAY.vehicle)))
+    if perceived(lake, day) is None:
         for stage in (INGEST, PERCEIVE):
-            stage.run(Task(load_fleet(FLEET), lake, DAY, logs=named))
+            stage.run(Task(load_fleet(fleet), lake, day, logs=tuple(logs)))
     return lake
 
 
-def _calibrated(
-    lake: Lake, method: str, deg: float, seed: int, truth: Mapping[str, np.ndarray]
-) -> dict[str, Any]:
-    search = {"search_rotation_deg": max(6.0, 1.2 * deg)}
-    fleet = load_fleet(FLEET).changed(solve=search)
-    CALIBRATE.run(Task(fleet, lake, DAY, method, perturb=(deg, SHIFT_M), seed=seed))
-    every = read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle=DAY.vehicle)
-    own = {r.pair: r for r in every if r.method == method and r.seed == seed}  # the last one of each pair
+def calibrated(
+    fleet: FleetConfig, lake: Lake, day: Partition, method: str, off: tuple[float, float], seed: int,
+    truth: Mapping[str, np.ndarray],
+) -> dict[str, Any]:  # fmt: skip
+    """Status and errors of each pair, from a prior that is exactly so much [deg, m] off."""
+    CALIBRATE.run(Task(fleet, lake, day, method, perturb=off, seed=seed))
+    every = read_records(lake, CALIBRATIONS, CalibrationRecord, vehicle=day.vehicle)
+    own = {
+        r.pair: r for r in every if (r.method, r.seed, r.day) == (method, seed, day.day)
+    }  # the last of each pair
     return {pair: _measured(own[pair], truth[pair]) for pair in PAIRS if pair in own}
 
 
