@@ -228,7 +228,7 @@ def test_two_processes_train_one_network(data, tmp_path):
     assert (
         len(reports(tmp_path / "run")) == 3
     )  # one of them writes: the last step's report, and two validations
-    with pytest.raises(ConfigError, match="begun by 2"):
+    with pytest.raises(ConfigError, match="began with 2"):
         run(TrainRequest(data, tmp_path / "run", "cpu"), TrainConfig.model_validate(SMALL | {"steps": 3}))
 
 
