@@ -135,7 +135,7 @@ def _night(fleet: Fleet, night: int, folder: Path) -> list[dict[str, Any]]:
         raise RuntimeError(f"nightly ended with {code}: {said.getvalue()[-2000:]}")
     cpu_s = (time.process_time() - began) / fleet.vehicles
     for table_ in CAPTURES.values():
-        shutil.rmtree(folder / "lake" / table_.name)
+        shutil.rmtree(folder / "lake" / table_.name, ignore_errors=True)  # no lidar, no sweeps
     shutil.rmtree(folder / "logs")
     about = {"rig": fleet.rig, "seed": fleet.seed, "night": night, "commit": commit_now()}
     moved = {f.vehicle: [f.sensor, f.day] for f in spec.faults}
