@@ -109,7 +109,8 @@ def test_methods_that_need_all_three_refuse_and_name_the_missing_sensor(night, m
 @pytest.mark.parametrize("vehicle", GONE)
 def test_what_a_rig_of_two_sensors_has_goes_out(night, vehicle, tmp_path):
     about = ["--lake", str(night / "lake"), "--vehicle", vehicle]
-    assert main(["export", "ros2", "--out", str(tmp_path / "ros2"), *about]) in (0, 3, 4)
+    codes = (4,) if vehicle == "no-lidar" else (0, 3)  # 32 frames of a camera and a radar certify nothing
+    assert main(["export", "ros2", "--out", str(tmp_path / "ros2"), *about]) in codes
     drive = ["export", "foxglove", "--out", str(tmp_path / "drive.mcap"), "--day", DAY, "--force"]
-    assert main([*drive, *about]) in (0, 3, 4)
+    assert main([*drive, *about]) in codes
     assert (tmp_path / "drive.mcap").stat().st_size > 0
