@@ -70,4 +70,4 @@ def test_what_make_benchmark_runs_can_be_begun():
     assert {len(method) for method in real.STARTS} == {2}
     assert set(run.SUMMARIES) < set(run.SETS)
     assert motion.table([]).count("\n") == 1
-    assert all((ssl.RECIPES / recipe).is_file() for recipe, _ in ssl.NETWORKS.values())
+    assert all((ssl.RECIPES / recipe).is_file() for recipe, *_ in ssl.NETWORKS.values())
