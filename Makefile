@@ -69,11 +69,12 @@ lint: setup ## style, types, and the lines of each room against tests/budgets.to
 # Days, lakes and lines of results stay: it goes on where it was stopped, and code of other commits does not count.
 STUDY = $(ONE_THREAD) $(BIN)/python -m tests.benchmarks.studies
 benchmark: setup ## measure what the README's rows state on this commit, in about two hours on two cores
-	for study in table1 coverage worlds worlds-full starts faults; do \
+	for study in table1 coverage worlds worlds-full worlds-motion starts faults; do \
 		$(STUDY).run $$study --root benchmark --workers $(WORKERS) || exit 1; done
-	$(STUDY).nights --root benchmark --fleets van no_lidar & beside=$$!; \
-		$(STUDY).nights --root benchmark --fleets demo && wait $$beside
-	$(STUDY).real --root benchmark
+	{ $(STUDY).nights --root benchmark --fleets van no_lidar && $(STUDY).real --root benchmark \
+		&& $(STUDY).ssl --root benchmark --parts real --networks untrained trained; } & beside=$$!; \
+		$(STUDY).nights --root benchmark --fleets demo && $(STUDY).ssl --root benchmark --parts fleet; \
+		mine=$$?; wait $$beside && exit $$mine
 
 results: setup ## write the result tables of both READMEs from what was measured
 	$(BIN)/python -m tests.benchmarks.results_table

@@ -124,6 +124,19 @@ def cents(lines: Lines, row: Row) -> str:
     return ", ".join(cells)
 
 
+def ageing(lines: Lines, _row: Row) -> str:
+    """CPU seconds of a fleet's audit and states after its nights, and with a year of them."""
+    return ", ".join(
+        f"{young:.0f} CPU s; after a year {old:.0f}" for young, old in (r["cpu_s"] for r in lines)
+    )
+
+
+def step_s(lines: Lines, _row: Row) -> str:
+    """CPU seconds of a step of training, and minutes of the training, start and validation included."""
+    cost = max(r["cpu_s_a_step"] for r in lines)
+    return f"{cost:.2f} CPU s a step, {lines[0]['steps'] * cost / 60:.0f} minutes"
+
+
 def _slashed(numbers: Sequence[int]) -> str:
     return "/".join(map(str, numbers))
 
@@ -149,6 +162,7 @@ def rate(hits: int, trials: int) -> str:
 
 
 _ALL = (
-    accepted_days, cents, errors, found, inside, named_red, nights_wrong, states_after, wrong_days, wrong_records,
+    accepted_days, ageing, cents, errors, found, inside, named_red, nights_wrong, states_after, step_s, wrong_days,
+    wrong_records,
 )  # fmt: skip
 MEASURES: dict[str, Callable[[Lines, Row], str]] = {f.__name__: f for f in _ALL}

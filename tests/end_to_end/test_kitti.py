@@ -1,25 +1,20 @@
 """KITTI: a real street whose labels mistake car windows for no border, from folder to records that are not wrong."""
 
-import json
-
 import numpy as np
 import pytest
-from mcap.reader import make_reader
 
 from jobs.cli import main
 from pipeline.calibrate.records import Inputs
 from pipeline.core.config import load_fleet
-from pipeline.core.ros_messages import RosMessages
 from pipeline.rig.day_prior import read_prior
 from pipeline.rig.targets import errors_at_targets
-from pipeline.rig.topics import TOPICS
 from pipeline.store.current import targets_of, transform_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
 from pipeline.store.views import observations_of
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from tests.makers.calibrated_days import perturbed, records_of_rows
-from tests.makers.real_models import write_real_manifests
+from tests.makers.kitti_street import converted_street
 
 pytestmark = [pytest.mark.real_logs, pytest.mark.slow]
 DAY = Partition("kitti-1", "2011-09-26")
@@ -27,39 +22,12 @@ START = (2.0, 0.05)  # deg and m that the given transform is off by
 REFERENCE_DEG = 0.1  # how well the given calibration is known
 
 
-def kitti_folder(log, given, folder):
-    """The frames of a log as KITTI's object kit lays them out, named by their number at 10 Hz."""
-    store, first = RosMessages(2).typestore, None
-    for path in ("image_2", "velodyne", "calib"):
-        (folder / path).mkdir(parents=True)
-    with log.open("rb") as stream:
-        for schema, channel, message in make_reader(stream).iter_messages(topics=list(TOPICS.values())):
-            first = first or message.log_time
-            name = f"{round((message.log_time - first) / 1e8):06d}"
-            held = store.deserialize_cdr(message.data, schema.name)
-            if channel.topic == TOPICS["image"]:
-                (folder / "image_2" / f"{name}.jpg").write_bytes(bytes(held.data))
-            elif channel.topic == TOPICS["lidar"]:
-                rows = np.frombuffer(held.data.tobytes(), "<f4").reshape(-1, held.point_step // 4)
-                (folder / "velodyne" / f"{name}.bin").write_bytes(rows[:, :4].tobytes())
-            elif channel.topic == TOPICS["info"]:
-                P = np.hstack([np.reshape(held.k, (3, 3)), np.zeros((3, 1))])
-                lines = {"P2": P, "R0_rect": np.eye(3), "Tr_velo_to_cam": given[:3]}
-                text = [f"{key}: {' '.join(map(repr, M.ravel().tolist()))}" for key, M in lines.items()]
-                (folder / "calib" / f"{name}.txt").write_text("\n".join(text))
-
-
 @pytest.fixture(scope="module")
 def night(kitti_logs, real_segmenter, real_detector, tmp_path_factory):
     """Folder of a night of the street, which came out of KITTI's own layout."""
     out = tmp_path_factory.mktemp("kitti")
     (log,) = kitti_logs.glob("*.mcap")
-    given = json.loads((kitti_logs / "given_calibration.json").read_text())[log.stem]
-    kitti_folder(log, np.array(given["T_camera_lidar"]), out / "data")
-    write_real_manifests(out, real_segmenter, real_detector)
-    call = ["convert", "kitti", str(out / "data"), "--out", str(out)]
-    call += ["--vehicle", DAY.vehicle, "--day", DAY.day]
-    assert main([*call, "--segmenter", "segmenter.toml", "--detector", "detector.toml"]) == 0
+    converted_street(log, out, DAY, (real_segmenter, real_detector))
     logs = f"{out}/logs/{{vehicle}}/{{day}}/*.mcap"
     call = ["nightly", "--fleet", str(out / "fleet.toml"), "--lake", str(out / "lake"), "--logs", logs]
     assert main([*call, "--executor", "inline", "--report", str(out / "pages" / "fleet.html")]) in (0, 3)

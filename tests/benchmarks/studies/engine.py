@@ -10,6 +10,8 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -36,7 +38,7 @@ from tests.benchmarks.studies.looks import look
 from tests.benchmarks.studies.metrics import measure, mounting_error
 from tests.makers.calibrated_days import perturbed, records_of_rows
 
-__all__ = ["RESULTS", "Run", "calibrate_once", "run_study"]
+__all__ = ["RESULTS", "Run", "boresight", "calibrate_once", "run_study"]
 
 # The default sigmas of `rigs.*.prior` in fleet.toml: what a user has who says nothing.
 ROTATION_SIGMA_DEG, TRANSLATION_SIGMA_M = 2.0, 0.05
@@ -207,3 +209,14 @@ def _line(result: dict[str, Any]) -> str:
         else f"{pair} {p['status']}"
         for pair, p in result["pairs"].items()
     )
+
+
+def boresight(*words: object) -> Any:
+    """Run the command; raises where it fails. Returns what the process and those that it started used."""
+    process = subprocess.Popen([sys.executable, "-m", "jobs.cli", *map(str, words)], stdout=sys.stderr)
+    _, status, used = os.wait4(process.pid, 0)
+    if os.waitstatus_to_exitcode(status) not in (0, 3):
+        raise RuntimeError(
+            f"boresight {' '.join(map(str, words))}: exit code {os.waitstatus_to_exitcode(status)}"
+        )
+    return used

@@ -18,7 +18,7 @@ import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,16 +32,19 @@ from pipeline.simulate.faults import parse_faults
 from pipeline.simulate.fleet import FleetSpec, begin_fleet, day_names, simulate_vehicle_day
 from pipeline.simulate.sensors.rigs import rig_named
 from pipeline.store.current import current_poses, current_records, current_states, prior_of, transform_of
-from pipeline.store.partitions import Lake
+from pipeline.store.delta import merge_rows, with_months
+from pipeline.store.partitions import Lake, days_after
 from pipeline.store.records import read_records
+from pipeline.store.rows import to_table
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.captures import CAPTURES
 from schemas.drift import DRIFT, DriftFinding
+from schemas.outcomes import OUTCOMES, OutcomeRow
 from schemas.poses import POSES, PoseRow
 from schemas.states import STATES, StateRow
 from tests.benchmarks.results_measures import named_red, nights_wrong, states_after
 from tests.benchmarks.studies.commits import commit_now, is_accepted
-from tests.benchmarks.studies.engine import RESULTS
+from tests.benchmarks.studies.engine import RESULTS, boresight
 from tests.benchmarks.studies.looks import look
 from tests.benchmarks.studies.run import table as markdown
 
@@ -62,6 +65,7 @@ class Fleet:
     nights: int
     frames: int
     moved: str = ""
+    is_aged: bool = False
 
     @property
     def spec(self) -> FleetSpec:
@@ -76,9 +80,9 @@ class Fleet:
 
 # Fresh seeds for each release: whoever changes the estimator on what they show draws new ones.
 FLEETS = {
-    "demo": Fleet("demo", 7401, 6, 10, 40, "vehicle-2:6:radar:yaw:0.8,vehicle-5:6:camera:pitch:-0.5"),
-    "van": Fleet("van", 7411, 2, 5, 60, "vehicle-2:3:corner_rl:yaw:1.0"),
-    "no_lidar": Fleet("no_lidar", 7421, 2, 3, 100),
+    "demo": Fleet("demo", 7441, 6, 10, 40, "vehicle-2:6:radar:yaw:0.8,vehicle-5:6:camera:pitch:-0.5", True),
+    "van": Fleet("van", 7411, 2, 3, 40, "vehicle-2:2:corner_rl:yaw:1.0"),
+    "no_lidar": Fleet("no_lidar", 7461, 2, 3, 100),
 }
 
 
@@ -106,6 +110,10 @@ def run_fleets(fleets: Iterable[tuple[str, Fleet]], root: Path, out: Path) -> li
                 with out.open("a") as file:
                     file.writelines(json.dumps(line) + "\n" for line in lines)
             found += lines
+        aged = out.with_name("aged.jsonl")
+        if fleet.is_aged and not any(r["day"]["seed"] == fleet.seed for r in _known(aged)):
+            with aged.open("a") as file:
+                file.write(json.dumps({"row": name} | _aged(fleet, folder)) + "\n")
     seen = [{"day": {"seed": r["seed"]}, "commit": r["commit"]} for r in found]
     sys.stdout.write(f"{look(out.stem, seen)}\n\n{table(found)}\n")
     return found
@@ -144,6 +152,26 @@ def _night(fleet: Fleet, night: int, folder: Path) -> list[dict[str, Any]]:
         | _measured(lake, name, day, _truth(folder, name, day))
         for name in spec.names
     ]  # fmt: skip
+
+
+def _aged(fleet: Fleet, folder: Path) -> dict[str, Any]:
+    """CPU seconds of audit and states after the fleet's nights, and with a year of such nights before them."""
+    young, old = Lake.at(folder / "lake"), folder / "lake-of-a-year"
+    shutil.rmtree(old, ignore_errors=True)
+    shutil.copytree(folder / "lake", old)
+    for schema, kind in ((CALIBRATIONS, CalibrationRecord), (POSES, PoseRow), (OUTCOMES, OutcomeRow)):
+        rows: list[Any] = read_records(young, schema, kind)
+        earlier = [
+            replace(row, day=days_after(row.day, -back), work_key=f"{row.work_key}-{back}")
+            for back in range(fleet.nights, 365, fleet.nights)
+            for row in rows
+        ]
+        merge_rows(Lake.at(old), schema, with_months(to_table(earlier, schema), schema))
+    cpu_s = []
+    for lake in (folder / "lake", old):
+        used = boresight("audit", "--fleet", folder / "fleet.toml", "--lake", lake)
+        cpu_s.append(round(used.ru_utime + used.ru_stime, 1))
+    return {"day": {"seed": fleet.seed}, "commit": commit_now(), "cpu_s": cpu_s}
 
 
 def _truth(folder: Path, vehicle: str, day: str) -> dict[str, np.ndarray]:

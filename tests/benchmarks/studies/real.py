@@ -1,17 +1,20 @@
-"""Study: a real car's four logs, calibrated from priors that are exactly so far off, against the calibration given.
+"""Study: real days, calibrated from priors that are exactly so far off, against the calibration given.
 
-    python -m tests.benchmarks.studies.real --root DAYS [--logs FOLDER] [--starts 5] [--out RESULTS.jsonl]
+    python -m tests.benchmarks.studies.real --root DAYS [--shared FOLDER] [--starts 5] [--out RESULTS.jsonl]
 
-FOLDER holds the car's logs and given_calibration.json, which is good to .2 deg. Method `joint` starts 2, 5 and 10 deg
-off, the included network 2 deg. Their day was looked at by everybody who worked on this.
+FOLDER/data/astyx holds a car's four logs and given_calibration.json, which is good to .2 deg; FOLDER/data/kitti a
+street of KITTI, whose calibration is good to .1 deg; FOLDER/models what labels its images. Method `joint` starts 2, 5
+and 10 deg off, the included network 2 deg. Everybody who worked on this looked at these days.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import shutil
 import sys
 from collections.abc import Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +33,14 @@ from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord
 from tests.benchmarks.studies.commits import commit_now, is_accepted
 from tests.benchmarks.studies.engine import RESULTS
 from tests.benchmarks.studies.run import by_row
+from tests.makers.kitti_street import converted_street, given_of
 
 FLEET = Path("tests/end_to_end/astyx.toml")
-LOGS = Path("../shared/data/astyx")
-DAY = Partition("astyx-1", "2019-01-14")
+SHARED = Path("../shared")
+DAY, STREET = Partition("astyx-1", "2019-01-14"), Partition("kitti-1", "2011-09-26")
 SHIFT_M = 0.05
+# fleet.toml, the lake with the day perceived, the day, its given transforms by pair
+Real = tuple[Path, Lake, Partition, Mapping[str, np.ndarray]]
 STARTS = (("joint", 2.0), ("joint", 5.0), ("joint", 10.0), ("joint-ssl", 2.0))
 
 
@@ -44,29 +50,45 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--root", type=Path, required=True, help="folder of the day's lake")
-    parser.add_argument("--logs", type=Path, default=LOGS, help="folder of the car's logs")
+    parser.add_argument("--shared", type=Path, default=SHARED, help="folder of the data and models")
     parser.add_argument("--starts", type=int, default=5)
     parser.add_argument("--out", type=Path, default=RESULTS / "real.jsonl")
     args = parser.parse_args()
-    if not args.logs.is_dir():
-        sys.stderr.write(f"the real car is left out: no folder {args.logs}\n")
-        return
     known = [json.loads(line) for line in args.out.read_text().splitlines()] if args.out.exists() else []
     lines = [r for r in known if is_accepted(r["commit"], commit_now(), ())]
-    named = sorted(p for p in args.logs.iterdir() if p.name.startswith(DAY.vehicle))
-    lake = perceived_lake(args.root / "real-car", FLEET, DAY, named)
-    truth = read_transforms(args.logs / "given_calibration.json")
-    for method, deg in STARTS:
-        for seed in range(args.starts):
-            row = f"{method}, {deg:g} deg"
+    for name, source, starts in (("", _car, STARTS), ("KITTI: ", _street, STARTS[:3])):
+        if not args.shared.is_dir():
+            sys.stderr.write(f"{name}real days are left out: no folder {args.shared}\n")
+            continue
+        path, lake, day, truth = source(args.shared, args.root)
+        for (method, deg), seed in product(starts, range(args.starts)):
+            row = f"{name}{method}, {deg:g} deg"
             if not any((r["row"], r["seed"]) == (row, seed) for r in lines):
-                search = {"search_rotation_deg": max(6.0, 1.2 * deg)}
-                fleet = load_fleet(FLEET).changed(solve=search)
-                found = {"pairs": calibrated(fleet, lake, DAY, method, (deg, SHIFT_M), seed, truth)}
+                fleet = load_fleet(path).changed(solve={"search_rotation_deg": max(6.0, 1.2 * deg)})
+                found = {"pairs": calibrated(fleet, lake, day, method, (deg, SHIFT_M), seed, truth)}
                 lines.append({"row": row, "seed": seed, "commit": commit_now()} | found)
                 with args.out.open("a") as file:
                     file.write(json.dumps(lines[-1]) + "\n")
     sys.stdout.write(by_row(lines) + "\n")
+
+
+def _car(shared: Path, root: Path) -> Real:
+    logs = shared / "data" / "astyx"
+    named = sorted(p for p in logs.iterdir() if p.name.startswith(DAY.vehicle))
+    truth = read_transforms(logs / "given_calibration.json")
+    return FLEET, perceived_lake(root / "real-car", FLEET, DAY, named), DAY, truth
+
+
+def _street(shared: Path, root: Path) -> Real:
+    folder, (log,) = root / "kitti", sorted((shared / "data" / "kitti").glob("*.mcap"))
+    T = given_of(log)
+    if not (folder / "fleet.toml").exists():
+        shutil.rmtree(folder, ignore_errors=True)
+        models = shared / "models"
+        converted_street(log, folder, STREET, (models / "espnetv2_city.onnx", models / "yolox_nano.onnx"))
+    logs = sorted((folder / "logs" / STREET.vehicle / STREET.day).iterdir())
+    lake = perceived_lake(folder / "lake", folder / "fleet.toml", STREET, logs)
+    return folder / "fleet.toml", lake, STREET, {"camera_lidar": T}
 
 
 def perceived_lake(folder: Path, fleet: Path, day: Partition, logs: Sequence[Path]) -> Lake:

@@ -10,7 +10,7 @@ Days that are not in DAYS are made first. Lines go to results/STUDY.jsonl, their
 `table1`: the paper's Table 1; four methods on the same ten days of 100 frames from the same priors, exactly 2 deg and
 0.2 m off. Joint-optimisation has a row for each of two readings: each pair's loss divided by its pairwise minimum
 (the default), and equation 2 to the letter. A radar's errors are against where its detections point.
-`coverage`: 100 days of 40 frames; priors drawn from the normal distribution that their sigmas state.
+`coverage`: 30 days of 40 frames; priors drawn from the normal distribution that their sigmas state.
 `worlds`: a world and a rig drawn by each seed, priors drawn with 2 deg and 5 cm. `starts`: some of them, from priors
 exactly 2, 5 and 10 deg off. `faults`: days with a fault each, priors as in `worlds`.
 """

@@ -12,9 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import shutil
-import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -34,7 +32,7 @@ from schemas.calibrations import PAIRS
 from tests.benchmarks.results_measures import errors, wrong_records
 from tests.benchmarks.studies import real
 from tests.benchmarks.studies.commits import commit_now, is_accepted
-from tests.benchmarks.studies.engine import RESULTS
+from tests.benchmarks.studies.engine import RESULTS, boresight
 from tests.benchmarks.studies.looks import look
 from tests.benchmarks.studies.run import table
 
@@ -72,7 +70,9 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--root", type=Path, required=True, help="folder of the lakes and runs")
-    parser.add_argument("--logs", type=Path, default=real.LOGS, help="folder of the real car's logs")
+    parser.add_argument(
+        "--logs", type=Path, default=real.SHARED / "data" / "astyx", help="folder of the real car's logs"
+    )
     parser.add_argument("--parts", nargs="+", choices=["real", "fleet"], default=["real", "fleet"])
     parser.add_argument(
         "--networks", nargs="+", choices=["untrained", *NETWORKS], default=["untrained", *NETWORKS]
@@ -80,8 +80,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=RESULTS / "ssl.jsonl")
     args = parser.parse_args()
     parts = []
-    if "real" in args.parts and args.logs.is_dir():
-        parts += [_real(args.root / f"ssl-real-{split[-1]}", args.logs, *split) for split in SPLITS]
+    logs = args.shared / "data" / "astyx"
+    if "real" in args.parts and logs.is_dir():
+        parts += [_real(args.root / f"ssl-real-{split[-1]}", logs, *split) for split in SPLITS]
     parts += [_fleet(args.root / f"ssl-fleet-{SEED}")] if "fleet" in args.parts else []
     known = [json.loads(line) for line in args.out.read_text().splitlines()] if args.out.exists() else []
     lines = [r for r in known if is_accepted(r["commit"], commit_now(), ())]
@@ -131,7 +132,7 @@ def _trained(part: Part, name: str) -> dict[str, float]:
     if not (folder / "training").exists():
         for day in part.taught:
             CALIBRATE.run(Task(load_fleet(part.fleet), Lake.at(folder), day, "joint"))
-        _boresight("prepare", "--fleet", part.fleet, "--lake", folder, "--executor", "inline")
+        boresight("prepare", "--fleet", part.fleet, "--lake", folder, "--executor", "inline")
     recipe, changed, is_begun = NETWORKS[name]
     used = []
     for pairs, model in _models(part, name).items():
@@ -143,10 +144,10 @@ def _trained(part: Part, name: str) -> dict[str, float]:
         config.write_text("\n".join([changed, *(r for r in rows if not r.startswith(left_out))]))
         begin = ("--start-from", SHIPPED) if is_begun else ()
         what = ("--data", folder, "--out", run, "--config", config, "--steps", STEPS, "--pairs", pairs)
-        used.append(_boresight("train", *what, *begin))
-        _boresight("export", "onnx", "--run", run, "--out", model)
+        used.append(boresight("train", *what, *begin))
+        boresight("export", "onnx", "--run", run, "--out", model)
     seconds = sum(u.ru_utime + u.ru_stime for u in used)
-    return {"cpu_s_a_step": seconds / STEPS, "peak_mb": max(u.ru_maxrss for u in used) / 1e3}
+    return {"steps": STEPS, "cpu_s_a_step": seconds / STEPS, "peak_mb": max(u.ru_maxrss for u in used) / 1e3}
 
 
 def _models(part: Part, name: str) -> dict[str, Path]:
@@ -180,17 +181,6 @@ def _table(lines: Sequence[dict[str, Any]]) -> str:
         cells = [errors(own, {"pairs": [pair]}) if pair in known else "-" for pair in PAIRS]
         body.append([row, *cells, wrong_records(own, {}), cost])
     return table(["test: network", *PAIRS, "wrong of accepted", "a step"], body)
-
-
-def _boresight(*words: object) -> Any:
-    """Run the command; raises where it fails. Returns what the process used."""
-    process = subprocess.Popen([sys.executable, "-m", "jobs.cli", *map(str, words)], stdout=sys.stderr)
-    _, status, used = os.wait4(process.pid, 0)
-    if os.waitstatus_to_exitcode(status) not in (0, 3):
-        raise RuntimeError(
-            f"boresight {' '.join(map(str, words))}: exit code {os.waitstatus_to_exitcode(status)}"
-        )
-    return used
 
 
 if __name__ == "__main__":
