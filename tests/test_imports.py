@@ -5,6 +5,7 @@ import importlib
 import subprocess
 import sys
 from pathlib import Path
+from string import Formatter
 
 import pytest
 
@@ -62,24 +63,18 @@ def room(name):
 
 def test_schemas_know_neither_pipeline_nor_jobs_and_pipeline_knows_no_jobs():
     rank = {layer: i for i, layer in enumerate(LAYERS)}
-    upward = [(a, b) for a, b in EDGES if rank[a.split(".")[0]] < rank[b.split(".")[0]]]
-    assert upward == []
+    assert [(a, b) for a, b in EDGES if rank[a.split(".")[0]] < rank[b.split(".")[0]]] == []
 
 
 def test_stage_folders_meet_only_in_the_foundations():
-    crossings = [
-        (a, b)
-        for a, b in EDGES
-        if room(a) in ROOMS and room(b) is not None and room(b) not in {room(a), *FOUNDATIONS}
-    ]
+    met = {(room(a), room(b)) for a, b in EDGES if room(a) in ROOMS}
     # The night runs the stages, so it knows their table of contents; networks are methods of calibrate.
     allowed = {("fleet", "stages"), ("fleet", "runner"), ("calibrate", "learn")}
-    assert [c for c in crossings if (room(c[0]), room(c[1])) not in allowed] == []
+    assert {(a, b) for a, b in met if b not in {None, a, *FOUNDATIONS}} <= allowed
 
 
 def test_foundations_stand_on_foundations_alone():
-    downward = [(a, b) for a, b in EDGES if room(a) in FOUNDATIONS and room(b) in ROOMS | JOINTS]
-    assert downward == []
+    assert [(a, b) for a, b in EDGES if room(a) in FOUNDATIONS and room(b) in ROOMS | JOINTS] == []
 
 
 def test_every_folder_of_pipeline_has_a_place_in_these_rules():
@@ -132,3 +127,19 @@ def test_help_loads_few_modules_and_nothing_heavy():
     assert heavy == "loaded: []"
     assert all(command in "\n".join(page) for command in COMMANDS if " " not in command)
     assert int(of_help) < 3 * int(of_python)  # 332 and 141; numpy alone adds 140
+
+
+@pytest.mark.parametrize("room", ["audit", "calibrate", "ingest"])
+def test_every_reason_of_a_room_is_given_and_with_all_its_fields(room):
+    reasons = importlib.import_module(f"pipeline.{room}.reasons").REASONS
+    others = [
+        path for name, path in modules() if name.startswith(f"pipeline.{room}.") and path.stem != "reasons"
+    ]
+    nodes = [node for path in others for node in ast.walk(ast.parse(path.read_text()))]
+    assert reasons.keys() <= {node.value for node in nodes if isinstance(node, ast.Constant)}
+    for call in (n for n in nodes if isinstance(n, ast.Call) and ast.unparse(n.func) == "because"):
+        name, given = call.args[0], {keyword.arg for keyword in call.keywords}
+        named = [c.value for c in ast.walk(name) if isinstance(c, ast.Constant) and c.value in reasons]
+        needed = {f for reason in named for _, f, _, _ in Formatter().parse(reasons[reason]) if f}
+        assert named or not isinstance(name, ast.Constant), ast.unparse(call)
+        assert None in given or needed <= given, ast.unparse(call)

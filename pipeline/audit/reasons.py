@@ -1,5 +1,7 @@
 """Every reason that charts, vehicles and states give, as one list; fields are filled where the reason is given."""
 
+from pipeline.core.sentences import sentences_of
+
 __all__ = ["REASONS", "because"]
 
 REASONS = {
@@ -49,13 +51,9 @@ REASONS = {
     "no usable day": "no usable day {why}",
     "no pose": "no pose of {sensors} is known",
     "at prior": "{sensor} is at its prior: {reason}",
-    "too large": "{direction} not certified: its sigma of {sigma:.2f} deg is too large for {limit:.2f} deg at "
-    "{percent:.3g} %",
+    "too large": "{direction} not certified: its sigma of {sigma:.2f} deg is too large for the limit of {limit:.2f} "
+    "deg at {percent:.3g} %",
     "no records": "no calibration record in the window",
     "left out": "left out: {records}{more}",
 }
-
-
-def because(name: str, **fields: object) -> str:
-    """A reason with its fields."""
-    return REASONS[name].format(**fields)
+because = sentences_of(REASONS)

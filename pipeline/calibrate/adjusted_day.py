@@ -12,6 +12,7 @@ from jaxtyping import Float
 from pipeline.calibrate.adjust.rig import AdjustedRig, adjust
 from pipeline.calibrate.judging import Judged, Judging
 from pipeline.calibrate.numerics.covariance import OBSERVABLE
+from pipeline.calibrate.reasons import because
 from pipeline.calibrate.select.frames import Selection
 from pipeline.rig.changes import change_between
 from pipeline.rig.checks import Check, change_of
@@ -144,10 +145,7 @@ def conclude(
 
 
 def _concluded(
-    edge: SolvedEdge,
-    rig: AdjustedRig | None,
-    estimates: Mapping[Edge, PairEstimate],
-    more: Sequence[Check],
+    edge: SolvedEdge, rig: AdjustedRig | None, estimates: Mapping[Edge, PairEstimate], more: Sequence[Check]
 ) -> Concluded:
     at = None if rig is None else rig.edges.get(edge.edge)
     if rig is None or at is None:
@@ -193,12 +191,12 @@ def _contradictions(
     by_motion = [e for e in rig.edges if e.kind == "camera_base" and e.parent == edge.parent]
     is_out = not (own.used or own.doubts or solved.evidence.checks)
     if edge.kind == "camera_lidar" and any(is_out and rig.edges[e].used for e in by_motion):
-        found[f"{edge.name} and the other edges"] = [edge]
+        found[because("other edges", edge=edge.name)] = [edge]
     outvoted = [
         e for e in by_motion if not (rig.edges[e].used or rig.edges[e].doubts or rig.edges[e].evidence.checks)
     ]
     if edge.kind in ("camera_lidar", "camera_radar") and own.used and outvoted:
-        found[f"{outvoted[0].name} and the other edges"] = outvoted
+        found[because("other edges", edge=outvoted[0].name)] = outvoted
     is_accepted = edge.kind == "camera_lidar" and solved.judged.verdict.status == "accepted"
     if is_accepted and not found and not set(by_motion) & set(own.doubts):
         return []
@@ -212,10 +210,10 @@ def _contradictions(
         if other == edge or at.used or other in doubts or is_explained:
             continue
         if (at.innovation_sigmas or 0.0) > _SIGMAS:
-            found[f"{other.name} and the other edges"] = [other]
+            found[because("other edges", edge=other.name)] = [other]
     checks = []
     for who, out in found.items():
-        sentence = f"{who} contradict each other; which of them is wrong is undecided"
+        sentence = because("edges", edges=who)
         around = _around(edge, out[0], rig, estimates) if len(out) == 1 else None
         if around is None:  # nobody knows by how much
             checks.append(Check(sentence, "witnesses_disagree"))

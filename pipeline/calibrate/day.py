@@ -12,6 +12,7 @@ from pipeline.calibrate.adjust.equations import evidence_of
 from pipeline.calibrate.adjusted_day import SolvedDay, SolvedEdge
 from pipeline.calibrate.judging import Judged, Judging
 from pipeline.calibrate.methods import Method, Solver, method_named
+from pipeline.calibrate.reasons import because
 from pipeline.calibrate.records import Inputs, edge_of_pair, record_of, refused_record
 from pipeline.calibrate.select.frames import PAPER_SYNC_GATE_S, Selection, select_frames
 from pipeline.calibrate.select.triggers import exceeded, trigger_metrics
@@ -192,10 +193,7 @@ def _judging(
 
 
 def _judged(
-    solution: Solution,
-    failed: Mapping[str, Sequence[Check]],
-    judging: Judging,
-    composed: Collection[str],
+    solution: Solution, failed: Mapping[str, Sequence[Check]], judging: Judging, composed: Collection[str]
 ) -> dict[str, Judged]:
     """Verdicts of all pairs; those that the method composes after their factors, which they are as good as."""
     judged: dict[str, Judged] = {}
@@ -204,7 +202,7 @@ def _judged(
         held = [j.verdict for j in judged.values() if j.verdict.status != "accepted"]
         if pair in composed and held:
             disproved = any(v.disproved for v in held)
-            checks.append(Check("it is composed of a pair that is not accepted", disproves=disproved))
+            checks.append(Check(because("composed"), disproves=disproved))
         judged[pair] = judging.pair(solution.pairs[pair], checks, pair in composed)
     return judged
 
@@ -217,8 +215,8 @@ def _refused(
     refused |= {p: SolveError(no_prior(p)) for p in pairs if p not in refused and not prior.knows(p)}
     if method.needs_all and (refused or len(pairs) < len(PAIRS)):
         missing = [s for s in SENSORS if not any(s in FRAMES_OF_PAIR[p] for p in pairs)]
-        why = f"the rig has no {missing[0]}" if missing else next(iter(refused.values())).reason
-        alone = SolveError(f"method {method.name} needs camera, lidar and radar: {why}")
+        why = because("lacks", kind=missing[0]) if missing else next(iter(refused.values())).reason
+        alone = SolveError(because("needs all", method=method.name, why=why))
         refused = {pair: refused.get(pair, alone) for pair in pairs}
     return {pair: refused[pair] for pair in pairs if pair in refused}
 
@@ -256,9 +254,8 @@ def unlabelled_pairs(
         return {}
     camera = chosen.get("camera", "camera")
     why = {"camera_radar": "boxes of road users"} | ({"camera_lidar": "labels"} if needs_labels else {})
+    found = {"fault": FAULTS["no_labels"], "camera": camera}
     return {
-        pair: SolveError(
-            f"{FAULTS['no_labels']}, {camera}: {pair.replace('_', '-')} needs {what}", "no_labels"
-        )
+        pair: SolveError(because("no labels", **found, pair=pair.replace("_", "-"), what=what), "no_labels")
         for pair, what in why.items()
     }

@@ -18,6 +18,7 @@ from jaxtyping import Float, Int
 
 from pipeline.calibrate.adjust.rig import adjust
 from pipeline.calibrate.numerics.frame_blocks import scene_blocks
+from pipeline.calibrate.reasons import because
 from pipeline.calibrate.select.frames import Selection
 from pipeline.calibrate.verify.edge_result import EdgeResult, tilt_in_doubt
 from pipeline.calibrate.verify.held_out import (
@@ -114,7 +115,7 @@ class Judging:
         targets = seen_targets(pair, self.prior, self._views)
         unseen = [] if targets is not None else [unseen_failure(pair)]
         if active and not held_out:
-            unseen.append(Check("the day has too few frames to hold any out, so the result is not checked"))
+            unseen.append(Check(because("none held out")))
         targets = DEFAULT_TARGETS if targets is None else targets
         test, claims, probes, elsewhere = self._held_out(estimate, held_out, mounting, targets)
         disproved = [Check(estimate.disproved, disproves=True)] if estimate.disproved else []

@@ -9,6 +9,7 @@ import numpy as np
 
 from pipeline.calibrate.joint.solve import solve_joint
 from pipeline.calibrate.methods import METHODS, Solver, method_named
+from pipeline.calibrate.reasons import because
 from pipeline.calibrate.stage import three_of_day
 from pipeline.core.config import SolveConfig, config_hash
 from pipeline.core.errors import ConfigError, SolveError
@@ -62,9 +63,7 @@ def ssl_solver(method: str, task: Task, chosen: Chosen | None = None) -> Solver:
         progress: Progress,
     ) -> Solution:
         if ingested(lake, partition) is None:
-            raise SolveError(
-                f"no frames of this day: {method} looks at images and sweeps, not at observations alone"
-            )
+            raise SolveError(because("no images", method=method))
         networks = open_networks(model_files(method, fleet), fleet.learn, fleet.prepare)
         solution = solve_by_networks(
             observations,
@@ -156,15 +155,13 @@ def _polished(
 ) -> Solution:
     """Method `joint`, started where the networks point."""
     start = replace(
-        prior,
-        T_camera_lidar=solution.pairs["camera_lidar"].T,
-        T_lidar_radar=solution.pairs["lidar_radar"].T,
+        prior, T_camera_lidar=solution.pairs["camera_lidar"].T, T_lidar_radar=solution.pairs["lidar_radar"].T
     )
     finished = solve_joint(observations, start, config, seed=seed, triggered=triggered, progress=progress)
     pairs = {}
     for pair in PAIRS:
         estimate = finished.pairs[pair]
         said = solution.pairs[pair].diagnostics
-        notes = [*estimate.notes, f"started by {solution.method}, finished by joint"]
+        notes = [*estimate.notes, because("polished", method=solution.method)]
         pairs[pair] = replace(estimate, diagnostics={**said, **estimate.diagnostics}, notes=notes)
     return replace(finished, pairs=pairs)

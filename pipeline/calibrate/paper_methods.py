@@ -12,6 +12,7 @@ from scipy.optimize import differential_evolution, minimize
 from pipeline.calibrate.numerics.covariance import OBSERVABLE, sandwich_covariance
 from pipeline.calibrate.numerics.frame_blocks import scene_blocks
 from pipeline.calibrate.numerics.nuisances import PAPER_BIAS
+from pipeline.calibrate.reasons import because
 from pipeline.core.config import SolveConfig
 from pipeline.core.results import Progress, silent
 from pipeline.objective.paper.camera_lidar import CameraLidarLoss, camera_lidar_loss
@@ -58,11 +59,6 @@ __all__ = [
 # - frames below the paper's conditions fill up days that have too few above them, and the record counts
 #   them;
 # - the search box, 90 candidates and 60 generations of the evolution are ours.
-
-
-NO_UNCERTAINTY = (
-    "the paper gives no uncertainty: block sandwich of its loss plus a bias floor from simulation"
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +129,7 @@ def estimate_of(
     used = int(problem.informative.sum())
     blank = replace(PairEstimate.at_prior(problem.pair, prior), T=T, frames_used=used)
     if minimum is None:
-        return replace(blank, notes=["not triggered: keeps the prior"])
+        return replace(blank, notes=[because("not triggered")])
     losses = problem.loss(np.stack([problem.T_prior, T]))
     diagnostics = {
         "loss_prior": float(losses[0]),
@@ -155,7 +151,7 @@ def estimate_of(
         observability=observability,
         observable=observability > OBSERVABLE,
         diagnostics=diagnostics,
-        notes=[NO_UNCERTAINTY],
+        notes=[because("no uncertainty")],
         common_covariance=common_of(covariance, base, np.diag(np.square(np.repeat(floor, 3)))),
     )
 
@@ -171,7 +167,7 @@ def loop_size(pairs: Mapping[str, PairEstimate]) -> tuple[float | None, float | 
 def border_failures(pairs: Mapping[str, PairEstimate]) -> dict[str, list[Check]]:
     """A minimum at the border of the search box is none: the loss may fall further outside."""
     return {
-        pair: [Check("the minimum lies at the border of the search range")]
+        pair: [Check(because("border"))]
         for pair, estimate in pairs.items()
         if estimate.diagnostics.get("at_search_border")
     }

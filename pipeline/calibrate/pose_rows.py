@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from pipeline.calibrate.adjust.rig import AdjustedRig, AdjustedSensor
 from pipeline.calibrate.adjusted_day import Concluded
+from pipeline.calibrate.reasons import because
 from pipeline.calibrate.records import Inputs, edge_of_pair
 from pipeline.calibrate.rig_day import WrongPrior
 from pipeline.calibrate.verify.target_accuracy import DIRECTIONS, Claim, claims_of, targets_of
@@ -36,7 +37,7 @@ _OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 _AT_REFERENCE: dict[str, Any] = pose_columns(np.eye(4)) | {
     "covariance": np.zeros((6, 6)), "common_covariance": np.zeros((6, 6)),
-    "status": "accepted", "reason": "it is the reference of all poses", "dt_s": 0.0,
+    "status": "accepted", "reason": because("reference"), "dt_s": 0.0,
 }  # fmt: skip
 
 
@@ -149,7 +150,7 @@ def _row(
         told["prior_covariance"] = before.covariance_between(graph.reference.name, sensor.name)
     found = None if adjusted is None else adjusted.sensors.get(sensor.name)
     if adjusted is None or found is None:
-        why = "no edge of the rig has evidence" if adjusted is None else "its prior pose is unknown"
+        why = because("no evidence" if adjusted is None else "no prior")
         return PoseRow(**told, status="refused", reason=why)
     if found.untied:
         why = f" ({about.absent[sensor.name]})" if sensor.name in about.absent else ""
@@ -252,20 +253,20 @@ def _verdict(
     """Status and reason: a radar needs azimuth only, other sensors need both directions."""
     doubts = ", ".join(e.name for e in found.doubts)
     if doubts:
-        return "held", f"its edges contradict each other; which of them is wrong is undecided: {doubts}"
+        return "held", because("of its edges", edges=doubts)
     if not found.determined.any():
-        return "held", "the day determines no degree of freedom: the pose stays at the prior"
+        return "held", because("at prior")
     needed = ("azimuth",) if sensor.kind == "radar" else tuple(claims)
-    said = [f"{sentence}: {' and '.join(names)} not certified" for sentence, names in doubted.items()]
-    unsure = "; ".join(
-        f"sigma of {name} is {np.degrees(c.sigma_rad):.2f} deg, too large for {np.degrees(c.limit_rad):.2f} deg at "
-        f"{100 * c.confidence:g} %"
-        for name, c in claims.items()
-        if c.margin < 0
-    )
-    if not set(needed) <= set(determined):
-        return "held", "; ".join([*said, *[unsure] * bool(unsure)])
-    return "accepted", "; ".join([*said, *[f"not certified: {unsure}"] * bool(unsure)])
+    said = [
+        because("not certified", reason=why, directions=" and ".join(names)) for why, names in doubted.items()
+    ]
+    unsure = [
+        because("uncertified", direction=name, reason=claim.reason)
+        for name, claim in claims.items()
+        if claim.margin < 0
+    ]
+    status = "accepted" if set(needed) <= set(determined) else "held"
+    return status, "; ".join([*said, *unsure])
 
 
 def _azimuth_seen(view: View, sensor: Sensor) -> float:

@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from pipeline.calibrate.adjusted_day import SolvedDay
 from pipeline.calibrate.judging import EdgeJudging, Judged
+from pipeline.calibrate.reasons import because
 from pipeline.calibrate.select.triggers import trigger_metrics
 from pipeline.calibrate.verify.day_checks import PART_FLOOR_RAD
 from pipeline.calibrate.verify.verdict import undetermined
@@ -44,8 +45,6 @@ __all__ = [
 # Speeds that separate a highway from a town [m/s]: 20 m/s = 72 km/h is above town limits.
 _FAST_MPS = 20.0
 _MOVING_MPS = 1.0
-# Checks of camera-lidar with labels that need what a camera without semantics lacks.
-_UNCHECKED = "no road users were detected: neither boxes nor a radar confirm the pose"
 _OF_K = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}
 
 
@@ -99,7 +98,7 @@ def record_of(
 def notes_of_pair(pair: str, observations: Sequence[Observation]) -> list[str]:
     """Notes for the record of a pair: how its camera was aligned, and by what it was not checked."""
     is_unlabelled = "camera" in FRAMES_OF_PAIR[pair] and any(o.is_unlabelled for o in observations)
-    return [WITHOUT_LABELS, _UNCHECKED] if is_unlabelled else []
+    return [WITHOUT_LABELS, because("unchecked")] if is_unlabelled else []
 
 
 def computed_record(
@@ -224,11 +223,10 @@ def _loop_fields(solution: Solution) -> dict[str, Any]:
 
 def _assumed(estimate: PairEstimate, observations: Sequence[Observation]) -> list[str]:
     """Assumptions of every method, and the effect of errors in them."""
-    rigid = "sensors are rigid over the day"
+    rigid = because("rigid")
     if estimate.parts is not None:
-        sigmas = float(np.abs(estimate.parts.sigmas(PART_FLOOR_RAD)).max())
-        rigid += f" (tested: its first and its last part differ by {sigmas:.1f} sigma)"
-    assumed = [rigid, "clocks keep their offsets and scales over the day"]
+        rigid = because("rigid, tested", sigmas=np.abs(estimate.parts.sigmas(PART_FLOOR_RAD)).max())
+    assumed = [rigid, because("clocks")]
     o = next((o for o in observations if "camera" in o.sensors), None)
     if "camera" not in FRAMES_OF_PAIR[estimate.pair] or o is None:
         return assumed
@@ -238,13 +236,7 @@ def _assumed(estimate: PairEstimate, observations: Sequence[Observation]) -> lis
     angles = camera_direction_angles(camera.unproject(edge)) - camera_direction_angles(wrong.unproject(edge))
     worth = float(np.degrees(np.abs(angles[:, 0]).max()))
     turn = float(np.degrees(1 / o.camera_K[0, 0]))
-    return [
-        *assumed,
-        (
-            f"camera intrinsics as logged: a focal length 0.1 % off moves the image's edge by {worth:.2f} deg; a "
-            f"principal point 1 px off has the effect of a camera turned by {turn:.2f} deg"
-        ),
-    ]
+    return [*assumed, because("camera as logged", edge=worth, turn=turn)]
 
 
 def _parts_numbers(parts: DayParts | None) -> dict[str, float]:

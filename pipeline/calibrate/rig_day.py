@@ -21,6 +21,7 @@ from pipeline.calibrate.edges.day_sources import DaySources
 from pipeline.calibrate.edges.travel_base import with_travel
 from pipeline.calibrate.judging import EdgeJudging
 from pipeline.calibrate.methods import Solver, method_named, resolved
+from pipeline.calibrate.reasons import because
 from pipeline.calibrate.records import Inputs, record_of_edge, refused_edge, refused_record
 from pipeline.calibrate.verify.day_checks import far_positions, moved_failures, own_positions
 from pipeline.core.config import ChecksConfig, FleetConfig
@@ -118,7 +119,7 @@ def calibrate_rig(
     groups = sorted(_groups(day.graph), key=lambda g: KIND_OF_EDGE[g[0].kind].order)
     inner = progress if len(groups) == 1 else silent
     for group in groups:
-        progress(done, len(day.graph.edges) + 1, f"calibrate {', '.join(edge.name for edge in group)}")
+        progress(done, len(day.graph.edges) + 1, ", ".join(edge.name for edge in group))
         done += len(group)
         if len(group) == 1 and day.prior.between(*(s.name for s in group[0].sensors)) is None:
             found.refused.append(refused_edge(about, group[0], no_prior(group[0].name), 0))
@@ -268,7 +269,7 @@ class WrongPrior:
     @property
     def sentence(self) -> str:
         """For what rests on it."""
-        return f"it depends on the prior pose of {self.sensor}, which {self.edge.name} contradicts"
+        return because("prior wrong", sensor=self.sensor, edge=self.edge.name)
 
     def error(self, rig: AdjustedRig, a: str, b: str) -> Float[np.ndarray, " 6"]:
         """By how much T_a_b of the adjusted rig would be wrong, as left perturbation [rad, m]."""

@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from pipeline.calibrate.methods import Method, method_named
 from pipeline.calibrate.pose_rows import pose_rows, poses_of_records
+from pipeline.calibrate.reasons import because
 from pipeline.calibrate.records import Inputs, refused_edge
 from pipeline.calibrate.rig_day import RigDay, calibrate_rig
 from pipeline.calibrate.verify.target_accuracy import views_of
@@ -120,7 +121,7 @@ def _absent(lake: Lake, partition: Partition) -> dict[str, str]:
             most = max(own, key=lambda name: own[name])
             why = most.removeprefix(f"without_{sensor}_")
             fault = f"{FAULTS['no_labels']}, {sensor}: " if why in _UNLABELLED else ""
-            found[sensor] = f"{fault}most often {why}, {own[most]} times"
+            found[sensor] = fault + because("cause", cause=why, times=own[most])
     for manifest in (told_before, told):
         found |= {} if manifest is None else manifest.extra.get(SENSORS_ABSENT, {})
     return found
@@ -215,7 +216,7 @@ def _known(task: Task, rig: Rig, seed: int) -> tuple[RigPrior, dict[str, View]]:
     """Prior and views of a vehicle-day."""
     manifest = perceived(task.lake, task.partition)
     if manifest is None:
-        raise SolveError("no observations of this day: ingest or perceive refused it, or did not run")
+        raise SolveError(because("no observations"))
     prior = rig_prior(manifest.extra.get(PRIOR, ()), task.fleet, rig)
     if task.perturb is not None:
         prior = moved(prior, float(np.radians(task.perturb[0])), task.perturb[1], seed)
@@ -294,8 +295,8 @@ def three_sensors(method: str, rig: Rig, overlaps: Sequence[Overlap]) -> Sequenc
     among = [o for o in overlaps if not named or {s.name for s in o.edge.sensors} <= set(named)]
     best = best_three(among)
     if best is None:
-        which = "the rig has no such three"
+        which = because("no three")
         if named:
-            which = f"{', '.join(named[:2])} and {named[2]} do not: name others as `three` of the rig"
-        raise SolveError(f"method {method} works on a camera, a lidar and a radar that share a view: {which}")
+            which = because("not these", some=", ".join(named[:2]), last=named[2])
+        raise SolveError(because("needs three", method=method, why=which))
     return best

@@ -117,7 +117,7 @@ def attempt(
 
 _POLL_S = 0.2
 _GRACE_S = 10.0  # for a worker to leave its `with` blocks; Kubernetes gives the whole pod 30 s
-_TEXT_BYTES = 48
+_TEXT_BYTES = 96
 
 
 class _Slot(ctypes.Structure):

@@ -19,6 +19,7 @@ from pipeline.ingest.index import DayIndex, index_logs
 from pipeline.ingest.messages.radar import CORRECT_FIELD
 from pipeline.ingest.moments import MomentBuilder, spread
 from pipeline.ingest.readiness import DofVerdict, Evidence, Unheard, overall, unheard_topics
+from pipeline.ingest.reasons import because
 from pipeline.ingest.rig_sample import RigFinding, RigSample
 from pipeline.ingest.roles import NEEDED, topics_of
 from pipeline.ingest.stage import pick_moments, read_file_prior
@@ -33,10 +34,6 @@ from schemas.frames import Frame
 
 __all__ = ["CheckReport", "SyncQuality", "TopicFinding", "check_logs"]
 
-_NO_TIMES = (
-    "the lidar logs no time per point: its sweeps stay as logged. If it turns, and its driver does not de-skew, "
-    'state its turn in fleet.toml, below points: turn = { sense = "right", begins_deg = 180.0 }'
-)
 _SAMPLE = 40  # frames that are decoded; of the others only the stamps are read
 
 
@@ -71,7 +68,7 @@ class SyncQuality:
 
 @dataclass(frozen=True)
 class CheckReport:
-    """Result of `boresight check`; `answer` is "yes", "partly" or "no".
+    """Result of `boresight check`; `answer` is "yes", "weak", "partly" or "no".
 
     `corrections` has what is wrong in fleet.toml or in the recording, and how to correct it: before a night.
     """
@@ -92,10 +89,7 @@ class CheckReport:
 
 
 def check_logs(
-    logs: Sequence[Path],
-    rig: Rig,
-    fleet: FleetConfig,
-    progress: Progress = silent,
+    logs: Sequence[Path], rig: Rig, fleet: FleetConfig, progress: Progress = silent
 ) -> CheckReport:
     """Check logs without writing; raises ConfigError for a missing log or an unusable prior file."""
     missing = [str(p) for p in logs if not p.exists()]
@@ -155,13 +149,13 @@ def _corrections(
     found += [p for p in problems if p.endswith(CORRECT_FIELD)]
     if not sample.built:
         of_logs = [p for p in problems if Path(p.split(":")[0]).name in names]
-        return found or [f"{p}: copy or record this log again" for p in of_logs]
+        return found or [because("again", problem=p) for p in of_logs]
     for of in sample.evidence.values():
         found += [of.doppler_problem] if of.doppler_is_wrong else []
         found += of.wrong
     untied = [sample.name(edge) for edge, of in sample.evidence.items() if of.frames and not of.has_prior]
     if untied or sample.prior is None:
-        found.append(f"{no_prior(', '.join(untied) or 'any pair')} (`boresight import` writes such a file)")
+        found.append(because("write prior", reason=no_prior(", ".join(untied) or "any pair")))
     return list(dict.fromkeys(found))
 
 
@@ -198,7 +192,7 @@ def _topics(index: DayIndex, rig: Rig, unheard: Sequence[Unheard]) -> list[Topic
         types = index.types_of(topic)
         stamps = np.unique(index.stream(role).stamps_ns)
         rate = float(1e9 / np.median(np.diff(stamps))) if len(stamps) > 2 else None
-        problem = problems.get(topic, "" if types else "no message")
+        problem = problems.get(topic, "" if types else because("no message"))
         findings.append(TopicFinding(str(role), topic, sorted(types), sum(types.values()), rate, problem))
     return findings
 
@@ -236,24 +230,16 @@ def _advice(frames: list[Frame], rig: Rig, topics: list[TopicFinding], usable: i
         # The lidar's up axis is -y in an optical frame; if it is off by more than 45 deg, the frame is not
         # optical.
         if -R[1, 2] < np.cos(np.pi / 4):
-            advice.append(
-                "the image's frame id is not an optical frame (x right, y down, z forward): check /tf_static"
-            )
+            advice.append(because("not optical"))
     if rig.ego is None and not rig.radars:
-        advice.append(
-            "no odometry configured, and no radar: the car's speed and the time offset stay unknown"
-        )
+        advice.append(because("no speed"))
     elif rig.ego is None:
-        advice.append(
-            "no odometry configured: ego speed comes from Doppler, and the lidar is de-skewed without turns"
-        )
+        advice.append(because("no odometry"))
     elif frames and all(f.ego_speed_mps is None for f in frames):
-        advice.append(
-            f"{rig.ego.odometry} has no messages around any sweep: the lidar is de-skewed by Doppler, without turns"
-        )
+        advice.append(because("odometry silent", topic=rig.ego.odometry))
     untimed = any("lidar" in f.sensors for f in frames) and all(f.lidar_time_s is None for f in frames)
     if untimed and all(lidar.turn is None for lidar in rig.lidars.values()):
-        advice.append(_NO_TIMES)
+        advice.append(because("no times"))
     if 0 < usable < 100:
-        advice.append(f"{usable} frames: a calibration uses up to 100, so log a longer drive")
+        advice.append(because("longer", frames=usable))
     return advice

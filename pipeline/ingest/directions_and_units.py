@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.core.rigs import RadarTopics
+from pipeline.ingest.reasons import because
 from schemas.frames import Frame
 
 __all__ = [
@@ -26,7 +27,6 @@ __all__ = [
 ]
 
 MOVING_MPS = 1.0
-_BACKWARDS = "the car would drive backwards"
 _FEWEST = 3  # moving frames needed to determine a sign
 _MOST = 2 / 3  # share of them that must agree
 _EXPLAINED = 1 / 3  # share of a scan's detections that a speed must explain
@@ -131,11 +131,7 @@ def opposed_signs(positive: Mapping[str, str]) -> list[str]:
         return []
     named = " and ".join(f'{", ".join(names)} "{sign}"' for sign, names in of.items())
     few = ", ".join(min((len(names), names) for names in of.values())[1])
-    needed = f"by tf the radars need different signs: doppler_positive of {named}"
-    correction = (
-        f"correct the transform of {few} if it is turned round, else keep both if the data sheets differ"
-    )
-    return [f"{needed}; {correction}"]
+    return [because("signs differ", signs=named, few=few)]
 
 
 def prior_transform(frame: Frame, pair: str) -> Float[np.ndarray, "4 4"]:
@@ -154,13 +150,13 @@ def _unfit(frames: Sequence[Frame], fits: Sequence[tuple[float, float]], radar: 
     period = radar.topics.doppler_period_mps
     spans = [float(np.ptp(f.radar_range_rate_mps)) for f in frames]
     if period is not None and spans and max(spans) > 1.05 * period:
-        return f"Doppler spans {max(spans):.1f} m/s, more than doppler_period_mps = {period:g} allows"
+        return because("span", span=max(spans), period=period)
     if not frames or np.mean([share > _EXPLAINED for _, share in fits]) >= 0.5:
         return ""
     slower = [_fit(f, radar, 1 / _KMH)[1] > _EXPLAINED for f in frames]
     if np.mean(slower) >= _MOST:
-        return f"most scans fit no static world, {np.mean(slower):.0%} do as km/h: log the Doppler in m/s"
-    return "most scans fit no static world: check doppler_field, doppler_period_mps and the radar's heading"
+        return because("km/h", share=np.mean(slower))
+    return because("no fit")
 
 
 def _sign(moved_mps: Float[np.ndarray, " N"]) -> int:
@@ -177,11 +173,11 @@ def _other(topics: RadarTopics) -> str:
 
 def _other_sign(radar: AskedRadar) -> str:
     if radar.topics.velocity_fields is not None:
-        return f"{_BACKWARDS}: velocity_fields must be relative to the radar, x ahead of it"
+        return because("backwards", remedy=because("velocity fields"))
     if not radar.has_sign:
-        return f"{_BACKWARDS}: velocities of tracks must be relative to the radar, x ahead of it"
+        return because("backwards", remedy=because("tracks"))
     whose = "" if radar.name == "radar" else f" of {radar.name}"
-    return f'{_BACKWARDS}: doppler_positive{whose} is probably "{_other(radar.topics)}"'
+    return because("backwards", remedy=because("other sign", whose=whose, sign=_other(radar.topics)))
 
 
 def _assumed_sign(radar: AskedRadar, sign: int) -> tuple[str, ...]:
@@ -190,11 +186,8 @@ def _assumed_sign(radar: AskedRadar, sign: int) -> tuple[str, ...]:
     if not radar.has_setting or "doppler_positive" in topics.model_fields_set:
         return ()
     whose = "" if radar.name == "radar" else f" of {radar.name}"
-    absent = f'fleet.toml does not set doppler_positive{whose}, so "{topics.doppler_positive}" is assumed'
-    shown = {1: "the log confirms it", -1: "the log shows the opposite", 0: "this log does not determine it"}[
-        sign
-    ]
-    return (f"{absent}; {shown}: enter it" if sign else f"{absent}; {shown}: drive, or see the data sheet",)
+    shown = because({1: "confirmed", -1: "opposite", 0: "undecided"}[sign])
+    return (because("assumed", whose=whose, sign=topics.doppler_positive, shown=shown),)
 
 
 def _ratio_problem(both: Sequence[tuple[float, float]]) -> tuple[str, str]:
@@ -206,13 +199,13 @@ def _ratio_problem(both: Sequence[tuple[float, float]]) -> tuple[str, str]:
     agreed = np.abs(odometry - ratio * doppler) < _NEAR * np.abs(ratio * doppler) + MOVING_MPS / 2
     if abs(ratio - 1) < _OFF or agreed.mean() < _MOST:
         return "", ""
-    shown = f"the speed of the odometry is {ratio:+.2f} times the speed of the Doppler"
     if abs(ratio * _KMH - 1) < _NEAR:
-        return f"{shown}: km/h for m/s fits the Doppler", ""
+        return because("ratio", ratio=ratio, fits=because("fits", fits="km/h for m/s", source="Doppler")), ""
     sign = "the other sign" if ratio < 0 else ""
     unit = "km/h for m/s" if abs(abs(ratio) / _KMH - 1) < _NEAR else ""
     fits = " and ".join(word for word in (sign, unit) if word)
-    return "", f"{shown}: {fits} fits the odometry" if fits else f"{shown}: a scale is wrong"
+    hint = because("fits", fits=fits, source="odometry") if fits else because("scale")
+    return "", because("ratio", ratio=ratio, fits=hint)
 
 
 def _turned_round(frames: Sequence[Frame], sign: int) -> str:
@@ -226,8 +219,7 @@ def _turned_round(frames: Sequence[Frame], sign: int) -> str:
         return ""
     # If the Doppler confirms the radar's heading, the lidar is turned.
     who = {1: "the lidar", -1: "the radar", 0: "the lidar or the radar"}[sign]
-    met = f"{turned:.0%} of the detections match the sweeps if it is turned by 180 deg"
-    return f"{who} points backwards: {met}, {given:.0%} by the prior; correct its transform"
+    return because("points back", sensor=who, met=turned, given=given)
 
 
 def _met(frame: Frame) -> list[float]:

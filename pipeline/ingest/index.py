@@ -32,6 +32,7 @@ from pipeline.ingest.messages.foxglove import REFUSED, foxglove_types
 from pipeline.ingest.messages.image import read_camera_info
 from pipeline.ingest.messages.odometry import EgoTrack
 from pipeline.ingest.reading_plan import Reading, plan_reading, plan_sweeps, rare_topics
+from pipeline.ingest.reasons import because
 from pipeline.ingest.roles import CAPTURED, INFO, ODOMETRY, TF_STATIC, Role, topics_of
 from pipeline.rig.cameras import Camera
 from pipeline.rig.rig import Rig
@@ -229,13 +230,13 @@ def _read_log(index: DayIndex, number: int, topics: dict[str, Role], within: Str
         for message in log.scan(topics, within):
             _index_message(index, number, message, topics[message.channel.topic])
     except OSError as err:  # a disk or share failed on the way: messages read so far are used
-        index.complain(f"{log.path}: cannot be read further: {err}")
+        index.complain(because("lost", log=log.path, error=err))
         index.damage["logs_lost_while_reading"] += 1
         return
     for name, count in log.damage.items():
         index.damage[name] += count
-        what = "is cut off" if name == "truncated" else f"{count} {name.replace('_', ' ')}"
-        index.complain(f"{log.path.name}: {what}")
+        reason = "cut off" if name == "truncated" else "damage"
+        index.complain(because(reason, log=log.path.name, count=count, damage=name.replace("_", " ")))
 
 
 def _read_bursts(
@@ -243,9 +244,7 @@ def _read_bursts(
 ) -> None:
     """Read the planned stretches of a log, and the topics before them that a driver may log only once."""
     if timeline is None:
-        index.complain(
-            f"{index.log_names[number]}: not read: it has no usable index, and other logs have one"
-        )
+        index.complain(because("unread", log=index.log_names[number]))
         index.damage["logs_left_unread"] += 1
         return
     rare, first = rare_topics(timeline, topics)
@@ -264,8 +263,8 @@ def _take_bursts(index: DayIndex, timelines: Sequence[Timeline | None], budget: 
     logged_ns = np.array([at.logged_ns for at in sweeps.located], np.int64)
     index.reading = plan_sweeps(logged_ns, sweeps.stamps_ns, index.ego, budget)
     unusable = [n for n, t in zip(index.log_names, timelines, strict=True) if t is None]
-    why = f"{', '.join(unusable[:3])}: no usable index" if unusable else "log times do not follow the stamps"
-    index.complain(f"{why}, so all of the day's {len(sweeps.stamps)} sweeps were read, not a selection")
+    reason, logs = "no index" if unusable else "log times", ", ".join(unusable[:3])
+    index.complain(because(reason, logs=logs, sweeps=len(sweeps.stamps)))
 
 
 def _allow_open_files() -> None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from difflib import SequenceMatcher
 
 from pipeline.ingest.index import ACCEPTED_TYPES, DayIndex
+from pipeline.ingest.reasons import because
 from pipeline.ingest.roles import INFO, NEEDED, TF_STATIC, Role, topics_of
 from pipeline.rig.rig import Rig
 from schemas.observations import WITHOUT_LABELS
@@ -17,9 +18,7 @@ __all__ = ["DofVerdict", "Evidence", "Unheard", "in_order", "judge_edge", "overa
 _ENOUGH_FRAMES, _FEW_FRAMES = 30, 10
 _MOVING_SHARE = 0.2  # time offsets are observable only while the car moves
 _ORDER = ("camera_lidar", "lidar_radar", "camera_radar")  # display order; other kinds come after these
-_GET_LABELS = "log labels and detections, or name models (`boresight models --fetch`)"
 _DENSE_RINGS = 32  # with fewer rings, pitch depends on reflectivity of the road
-_CALIBRATED = "log a sensor_msgs/CameraInfo with a calibrated K"
 _SHOWN = 4  # similar topics named in a sentence
 _MISTYPED = 0.8  # similarity of a mistyped name; other images, for example, are no labels
 
@@ -49,15 +48,16 @@ class Unheard:
     def problem(self) -> str:
         """Problem and correction, without the topic."""
         wanted = ACCEPTED_TYPES[self.role.what]
-        what = f"type {', '.join(self.types)}, not {' or '.join(wanted)}" if self.types else "no message"
+        what = because("no message")
+        if self.types:
+            what = because("type", types=", ".join(self.types), wanted=" or ".join(wanted))
         if set(self.types) & set(wanted):
-            return f"no usable intrinsics: {_CALIBRATED}"
+            return because("no intrinsics", remedy=because("CameraInfo"))
         if self.others:
-            named = ", ".join(self.others[:_SHOWN])
-            return f"{what}; the same type comes on {named}: correct the topic in fleet.toml"
+            return because("elsewhere", reason=what, topics=", ".join(self.others[:_SHOWN]))
         if self.is_shown:
-            return f"{what}: {_CALIBRATED}"
-        return f"{what}: correct the topic in fleet.toml" if self.types else what
+            return f"{what}: {because('CameraInfo')}"
+        return because("correct", reason=what) if self.types else what
 
     def __str__(self) -> str:
         return f"{self.topic} ({self.role}): {self.problem}"
@@ -118,15 +118,13 @@ def _needs(evidence: Evidence) -> list[tuple[str, str, _Needs]]:
     radar = [("weak", e.doppler_problem)] if e.doppler_problem and not e.doppler_is_wrong else []
     pitch = ground + camera
     if not (e.has_intensity or e.rings >= _DENSE_RINGS):
-        pitch += [
-            ("weak", "the lidar has few rings and logs no intensity: pitch depends on vertical edges only")
-        ]
+        pitch += [("weak", because("few rings"))]
     tilt = ground + radar + _elevation_needs(evidence)
     moving = ground + _moving_needs(evidence)
     boxes = camera
     if not e.names_semantics:
-        boxes = [*camera, ("no", f"no boxes of road users to compare with the radar: {_GET_LABELS}")]
-    shift = [("weak", "far objects constrain shifts weakly: the prior provides part of it")]
+        boxes = [*camera, ("no", because("no boxes"))]
+    shift = [("weak", because("shift"))]
     return [
         ("camera_lidar", "yaw and roll", ground + camera),
         ("camera_lidar", "pitch", pitch),
@@ -143,15 +141,11 @@ def _needs(evidence: Evidence) -> list[tuple[str, str, _Needs]]:
         ("lidar_lidar", "time offset", moving),
         ("lidar_base", "roll, pitch and z", ground),
         ("lidar_base", "yaw", moving),
-        ("lidar_base", "x and y", ground + [("weak", "x and y of the vehicle are observable only in turns")]),
+        ("lidar_base", "x and y", ground + [("weak", because("turns, shift"))]),
         ("radar_base", "yaw", moving + radar),
         ("radar_base", "pitch", moving + radar + _elevation_needs(evidence)),
         ("camera_base", "yaw and pitch", moving),
-        (
-            "camera_base",
-            "roll",
-            [*moving, ("weak", "roll of a camera on the vehicle is observable only in turns")],
-        ),
+        ("camera_base", "roll", [*moving, ("weak", because("turns, roll"))]),
     ]
 
 
@@ -166,46 +160,43 @@ _Needs = list[tuple[str, str]]
 
 def _without_frames(e: Evidence) -> _Needs:
     """Without frames only the reason: prior, labels and motion are unknown."""
-    why = e.missing or (f"0 usable synchronised frames; at least {_FEW_FRAMES} are needed",)
-    return [("no", f"{'; '.join(why)} (prior, labels and motion were therefore not checked)")]
+    why = e.missing or (because("too few", frames=0, needed=_FEW_FRAMES),)
+    return [("no", because("no frames", reason="; ".join(why)))]
 
 
 def _common_needs(e: Evidence) -> _Needs:
     needs: _Needs = [("no", e.doppler_problem)] if e.doppler_is_wrong else []
     needs += [("no", what) for what in e.wrong]
     if e.frames < _FEW_FRAMES:
-        needs.append(("no", f"{e.frames} usable synchronised frames; at least {_FEW_FRAMES} are needed"))
+        needs.append(("no", because("too few", frames=e.frames, needed=_FEW_FRAMES)))
     elif e.frames < _ENOUGH_FRAMES:
-        needs.append(("weak", f"{e.frames} usable frames; {_ENOUGH_FRAMES} or more make it sharp"))
+        needs.append(("weak", because("few", frames=e.frames, needed=_ENOUGH_FRAMES)))
     if not e.has_prior:
-        needs.append(("no", "no prior: log /tf_static with a chain between the sensors, or give prior.file"))
+        needs.append(("no", because("no prior")))
     return needs
 
 
 def _camera_needs(e: Evidence) -> _Needs:
     if not e.names_semantics:
-        return [("weak", f"{WITHOUT_LABELS}; better {_GET_LABELS}")]
+        return [("weak", because("no semantics", without=WITHOUT_LABELS))]
     if e.labels_share == 0:
-        without = "remove `semantics` from fleet.toml, for borders by brightness"
-        return [("no", f"no semantic labels on the topics of `semantics`: {_GET_LABELS}, or {without}")]
-    return [("weak", f"labels on {e.labels_share:.0%} of the frames only")] if e.labels_share < 0.5 else []
+        return [("no", because("no labels"))]
+    return [("weak", because("some labels", share=e.labels_share))] if e.labels_share < 0.5 else []
 
 
 def _elevation_needs(e: Evidence) -> _Needs:
     if e.elevation_share < 0.5:
-        return [("no", "the radar measures no elevation: roll, pitch and z keep their prior")]
+        return [("no", because("no elevation"))]
     if e.detections_share < 0.5:
-        return [("weak", "no camera detections to compare with the radar's elevation")]
-    return [("weak", "radar elevation is coarse: expect half a degree, and z from the prior")]
+        return [("weak", because("no detections"))]
+    return [("weak", because("elevation"))]
 
 
 def _moving_needs(e: Evidence) -> _Needs:
     if e.moving_share is None:
-        return [("weak", "Doppler and odometry do not show whether the car moves")]
+        return [("weak", because("motion unknown"))]
     if e.moving_share < _MOVING_SHARE:
-        return [
-            ("no", f"the car moves in {e.moving_share:.0%} of the frames: time offsets are not observable")
-        ]
+        return [("no", because("stands", share=e.moving_share))]
     return []
 
 

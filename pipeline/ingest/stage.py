@@ -18,15 +18,9 @@ from pipeline.ingest.index import DayIndex, index_logs
 from pipeline.ingest.messages.radar import CORRECT_FIELD
 from pipeline.ingest.moments import REPEATED, Anchored, MomentBuilder, spread
 from pipeline.ingest.readiness import Unheard, unheard_topics
+from pipeline.ingest.reasons import because
 from pipeline.ingest.roles import NEEDED, topics_of
-from pipeline.ingest.sync import (
-    WRONG_UNIT,
-    Matched,
-    Rejection,
-    match_moments,
-    none_near,
-    number_drives,
-)
+from pipeline.ingest.sync import WRONG_UNIT, Matched, Rejection, match_moments, none_near, number_drives
 from pipeline.objective.stamp_gaps import motion_gates_ns
 from pipeline.rig.day_prior import read_star
 from pipeline.rig.graph import possible_edges
@@ -130,9 +124,7 @@ def _complain_of_date(index: DayIndex, day: str) -> None:
     stamps_ns = index.captures(index.anchor).stamps_ns
     stamped = dt.datetime.fromtimestamp(float(np.median(stamps_ns)) * 1e-9, dt.UTC)
     if abs(stamped - dt.datetime.fromisoformat(f"{day}T12:00+00:00")) > _FAR_FROM_DAY:
-        index.complain(
-            f"sweeps are stamped {stamped:%Y-%m-%d %H:%M} UTC, far from the day {day} that they are filed under"
-        )
+        index.complain(because("other date", stamped=stamped, day=day))
 
 
 def pick_moments(index: DayIndex, rig: Rig, config: IngestConfig) -> tuple[list[Anchored], Counter[str]]:
@@ -185,15 +177,15 @@ def _refusal(
     if any(u.is_misconfigured and u.role.what in NEEDED for u in unheard):
         return _shorten(index.problems), "configuration"
     if len(topics) - len(absent) < 2:
-        what = _nothing_on(", ".join(f"{topics[role]} ({role})" for role in absent))
+        what = because("nothing", topics=", ".join(f"{topics[role]} ({role})" for role in absent))
         faults = ("configuration",) if index.types_beside else ()  # no message at all is no fault of topics
     elif not set(rejected) & set(_UNUSABLE):
         of = {"camera": "an image", "lidar": "a sweep", "radar": "a scan"}
         met = " and ".join(f"{of[r.kind]} of {topic}" for r, topic in topics.items() if r not in absent)
-        what = f"{met} are never {_near_enough(config)}"
+        what = because("apart", messages=met, near=_near_enough(config))
     else:
         reason = max(_UNUSABLE, key=lambda r: rejected[r])
-        what = f"no moment has two usable sensors, most often {reason} ({rejected[reason]})"
+        what = because("unusable", cause=reason, times=rejected[reason])
         if reason in _STATED:
             what, faults = f"{FAULTS[_STATED[reason]]}: {what}", (_STATED[reason],)
     return _shorten([what, *index.problems]), *faults
@@ -217,30 +209,21 @@ def _absences(
         if sensor in of_sensor:
             found[sensor] = of_sensor[sensor]
         elif not index.captures(sensor).stamps:
-            found[sensor] = _nothing_on(f"{topic} ({role})")
+            found[sensor] = because("nothing", topics=f"{topic} ({role})")
         elif reason == near:
-            found[sensor] = f"no message of {topic} is {_near_enough(config)}"
+            found[sensor] = because("none near", topic=topic, near=_near_enough(config))
         else:
             stated = f"{FAULTS[_STATED[reason]]}: " if reason in _STATED else ""
             why = next((p for p in index.problems if p.startswith(f"{reason}: ")), reason)
-            found[sensor] = f"{stated}{topic} was unusable, most often {why} ({count})"
+            found[sensor] = stated + because("sensor unusable", topic=topic, cause=why, times=count)
     return found
-
-
-def _nothing_on(topics: str) -> str:
-    return f"no usable message on {topics}: correct the topics in fleet.toml (see `boresight check`)"
 
 
 def _near_enough(config: IngestConfig) -> str:
     """The gate in words, and the remedy if no capture is within it."""
     if config.sync_gate_s is not None:
-        gate = f"within {config.sync_gate_s * 1e3:g} ms of each other"
-        return f"{gate}: check their clocks, raise ingest.sync_gate_s, or leave it out to gate by motion"
-    gate = f"within {config.sync_gate_m:g} m of driving and {config.sync_gate_deg:g} deg of turning"
-    return (
-        f"{gate}, apart from constant offsets: check the sensors' clocks and rates, or raise "
-        "ingest.sync_gate_m and sync_gate_deg"
-    )
+        return because("gate", ms=config.sync_gate_s * 1e3)
+    return because("motion gate", m=config.sync_gate_m, deg=config.sync_gate_deg)
 
 
 def read_file_prior(rig: Rig, fleet: FleetConfig) -> Star | None:

@@ -101,7 +101,7 @@ def _rows(
             run.rejected[rejection.reason.value] += 1
         except ModelOutputError as err:
             raise NothingUsable(f"{FAULTS['model_output']}: {err}", "model_output") from err
-        run.progress(seen, ingested.rows, "perceive")
+        run.progress(seen, ingested.rows, "frames")
         if found is not None:
             tracks = tracks | found.tracks
             whole_ns = whole_ns if found.unusable else moment.stamp_ns

@@ -43,7 +43,7 @@ def test_without_a_terminal_every_stage_that_begins_is_one_json_line(capsys):
         for done in range(3):
             view.watch(0, done, 3, "ingest frames")
         view.watch(2, 0, 0, "ingest frames")
-        view.watch(0, 1, 9, "perceive perceive")
+        view.watch(0, 1, 9, "perceive frames")
         view.watch(1, 1, 9, NAMES[1])  # what is simulated is no stage
     told = [(line["vehicle"], line["day"], line["stage"]) for line in lines_of(capsys)]
     car, bus = ("car", "2026-03-02"), ("bus", "2026-03-02")

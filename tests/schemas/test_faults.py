@@ -16,15 +16,12 @@ def test_each_code_has_a_sentence_that_begins_no_other():
     assert all(code.replace("_", "").isalpha() for code in FAULTS)
     assert all(sentence.strip() for sentence in FAULTS.values())
     assert not any(a.startswith(b) for a, b in permutations(FAULTS.values(), 2))
-
-
-def test_codes_are_told_in_their_sentences_and_an_unknown_one_as_it_is():
     assert in_words(FAULTS) == "; ".join(FAULTS.values())
     assert in_words(["unit", "gone"]) == f"{FAULTS['unit']}; gone"
 
 
 RETIRED = re.compile(
-    r"\b(witness\w*|told|tells?|says?|said|knows?|believ\w*|opinions?|vouch\w*|so many|way)\b"
+    r"\b(witness\w*|told|tells?|sa(ys?|id)|knows?|believ\w*|opinions?|vouch\w*|so many|way)\b"
 )
 
 
@@ -37,5 +34,4 @@ def test_every_status_has_a_sentence():
 
 
 def test_every_sentence_passes_at_first_reading():
-    spoken = [(place, s) for place, s in sentences() if RETIRED.search(s) or len(s.split()) > 25]
-    assert spoken == []
+    assert [(place, s) for place, s in sentences() if RETIRED.search(s) or len(s.split()) > 25] == []

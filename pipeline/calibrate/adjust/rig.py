@@ -11,13 +11,9 @@ from scipy.linalg import eigh
 from scipy.special import ndtri_exp
 from scipy.stats import chi2, norm
 
-from pipeline.calibrate.adjust.equations import (
-    Equations,
-    LinearEdge,
-    Rig,
-    equations_at,
-)
+from pipeline.calibrate.adjust.equations import Equations, LinearEdge, Rig, equations_at
 from pipeline.calibrate.numerics.covariance import OBSERVABLE, inverse_of_information
+from pipeline.calibrate.reasons import because
 from pipeline.rig.changes import change_jacobian
 from pipeline.rig.checks import Check
 from pipeline.rig.estimates import EdgeEvidence, common_part
@@ -249,11 +245,8 @@ def _left(equations: Equations, edge: LinearEdge) -> float:
 
 
 def _contradiction(edge: Edge, rivals: Collection[Edge], sigmas: float) -> Check:
-    others = "" if not rivals else f"; it or {', '.join(e.name for e in rivals)} is wrong"
-    return Check(
-        f"{edge.name} contradicts the other edges by {sigmas:.1f} sigmas{others}",
-        "witnesses_disagree",
-    )
+    others, reason = ", ".join(e.name for e in rivals), "contradicts, or" if rivals else "contradicts"
+    return Check(because(reason, edge=edge.name, sigmas=sigmas, others=others), "witnesses_disagree")
 
 
 def _concluded(
@@ -264,9 +257,7 @@ def _concluded(
     C = inverse_of_information(equations.H)
     follow = C[:n, :n] @ equations.prior_information[:n, :n]
     poses = replace(
-        rig.poses,
-        covariance=C[:n, :n],
-        common=common_part(equations.common(C, rig)[:n, :n], C[:n, :n]),
+        rig.poses, covariance=C[:n, :n], common=common_part(equations.common(C, rig)[:n, :n], C[:n, :n])
     )
     found = AdjustedRig(poses, follow, rig.prior, {}, edges)
     rests_on = _rests_on(equations, C, len(order))
@@ -304,11 +295,8 @@ def _untied(graph: RigGraph, sensor: Sensor, used: Sequence[Edge]) -> str:
     with_it = [s.name for part in in_use.components() if sensor in part for s in part if s != sensor]
     if not with_it:
         lost = ", ".join(e.name for e in graph.edges_of(sensor))
-        return f"none of its edges can be used: {lost}" if lost else "it shares no view with another sensor"
-    return (
-        f"no usable edge joins it and {', '.join(with_it)} to the reference {graph.reference.name}: "
-        "it stays at the prior"
-    )
+        return because("none used", edges=lost) if lost else because("no edge")
+    return because("untied", sensors=", ".join(with_it), reference=graph.reference.name)
 
 
 def innovation(

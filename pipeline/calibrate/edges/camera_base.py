@@ -31,6 +31,7 @@ from pipeline.calibrate.edges.on_base import (
 )
 from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.calibrate.numerics.nuisances import Considered, by_sensor
+from pipeline.calibrate.reasons import because
 from pipeline.core.errors import SolveError
 from pipeline.rig.checks import Check
 from pipeline.rig.estimates import EdgeEvidence
@@ -72,7 +73,7 @@ def solve(edge: Edge, sources: DaySources) -> tuple[EdgeEvidence, int]:
     T = sources.on_base(name)
     rows = sources.rows({"camera": name})
     if not rows:
-        raise SolveError(f"{name} is silent: the day has no image of it", "silent_sensor")
+        raise SolveError(because("silent", sensor=name, what="image"), "silent_sensor")
     travel, is_loose = camera_travel(rows, sources.ego_at(rows), Scenes.of(rows)), sources.prior.is_base_loose
     if is_loose and not any(o.ego_turned_rad is not None for o in rows):
         unknown = travel.turned_rad * np.nan  # Doppler's yaw rate: by a lever that nobody measured
@@ -93,8 +94,8 @@ def estimate_camera_base(
         SolveError: too few pairs of images show a motion.
     """
     if len(travel.span_s) < FEWEST:
-        told = f"{len(travel.span_s)} pairs of images determine the motion of {edge.parent.name}, {FEWEST} are required"
-        raise SolveError(told, "few_scenes")
+        counts = {"used": len(travel.span_s), "needed": FEWEST}
+        raise SolveError(because("few image pairs", camera=edge.parent.name, **counts), "few_scenes")
     T = T_base_camera
     for _ in range(_PASSES):
         rows = _rows(travel, T)
@@ -259,8 +260,7 @@ def _checks(edge: Edge, clock: Regression | None) -> tuple[Check, ...]:
     """An image that is mirrored turns the other way."""
     if clock is None or 1 + clock.value[1] + 3 * np.sqrt(clock.covariance[1, 1]) > 0:
         return ()
-    told = f"{edge.parent.name} turns right where the car turns left: a mirrored image, or a yaw rate of the wrong sign"
-    return (Check(told, "orientation", disproves=True),)
+    return (Check(because("mirrored", camera=edge.parent.name), "orientation", disproves=True),)
 
 
 def _errors(edge: Edge, T: np.ndarray) -> Mapping[str, np.ndarray]:
@@ -286,12 +286,5 @@ def _numbers(
 
 
 def _notes(fits: dict[str, Regression | None], clock: Regression | None) -> tuple[str, ...]:
-    shown = {
-        "yaw and pitch to the base: too few images show the direction of travel": fits["yaw"] is not None,
-        "roll to the base: the car hardly turns, or nothing shows its speed": fits["roll"] is not None,
-        "clock against the base: the car hardly begins or ends a turn": clock is not None,
-    }
-    return (
-        *(told for told, is_shown in shown.items() if not is_shown),
-        "x, y, z to the base: motion has no scale",
-    )
+    shown = {"camera base, yaw": fits["yaw"], "camera base, roll": fits["roll"], "camera base, clock": clock}
+    return (*(because(name) for name, fit in shown.items() if fit is None), because("camera base, shift"))

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.calibrate.reasons import because
 from pipeline.core.errors import SolveError
 from pipeline.objective.ego_motion import DopplerMotion, EgoMotion, Odometry, ego_motion, motion_of
 from pipeline.objective.ego_motion import backwards as sources_backwards
@@ -43,7 +44,7 @@ class DaySources:
         """Moments of a lidar; raises SolveError if it is silent."""
         rows = self.rows({"lidar": lidar})
         if not rows:
-            raise SolveError(f"{lidar} is silent: the day has no sweep of it", "silent_sensor")
+            raise SolveError(because("silent", sensor=lidar, what="sweep"), "silent_sensor")
         return rows
 
     def on_base(self, name: str) -> Float[np.ndarray, "4 4"]:

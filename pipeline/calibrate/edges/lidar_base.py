@@ -38,6 +38,7 @@ from pipeline.calibrate.edges.on_base import (
 from pipeline.calibrate.edges.sweep_travel import Sweep, SweepTravel, deskewed_again, sweep_travel, sweeps_of
 from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.calibrate.numerics.nuisances import Considered, by_sensor, considered_covariance
+from pipeline.calibrate.reasons import because
 from pipeline.objective.ego_motion import EgoMotion
 from pipeline.rig.checks import Check
 from pipeline.rig.estimates import EDGE, EdgeEvidence, OtherScenes
@@ -230,8 +231,8 @@ def _with_measured(
     if not np.isfinite(variance):
         return off_m, sigma_m**2, []
     apart = abs(off_m - change) / np.sqrt(variance + sigma_m**2 + STANCE[3] ** 2 + _RANGES_M**2)
-    told = f"the road shows a height {100 * (change - off_m):+.0f} cm off the measured one"
-    checks = [Check(told, "witnesses_disagree")] if apart > _MEASURED_SIGMAS else []
+    why = because("height", off=100 * (change - off_m))
+    checks = [Check(why, "witnesses_disagree")] if apart > _MEASURED_SIGMAS else []
     total = 1 / (1 / variance + 1 / sigma_m**2)
     return total * (change / variance + off_m / sigma_m**2), total, checks
 
@@ -282,9 +283,9 @@ def _numbers(travel: SweepTravel, roads: RoadUnder, shown: _Shown) -> dict[str, 
 
 def _notes(variance: np.ndarray) -> tuple[str, ...]:
     missing = [name for name, v in zip(_AXES, variance, strict=True) if not np.isfinite(v)]
-    why = {"yaw": "no pair of sweeps determines the motion"}
-    notes = [f"{name} to the base: {why.get(name, 'too little road is seen')}" for name in missing]
-    return (*notes, "x, y to the base: neither road nor motion determines them")
+    reasons = ["lidar base, yaw" if axis == "yaw" else "lidar base, road" for axis in missing]
+    notes = [because(reason, axis=axis) for axis, reason in zip(missing, reasons, strict=True)]
+    return (*notes, because("lidar base, shift"))
 
 
 def road_under(sweeps: Sequence[Sweep], T_base_lidar: Float[np.ndarray, "4 4"], road_z_m: float) -> RoadUnder:

@@ -18,6 +18,7 @@ from pipeline.calibrate.edges.day_sources import DaySources
 from pipeline.calibrate.edges.sweep_travel import Sweep, deskewed_again, sweeps_of
 from pipeline.calibrate.numerics.frame_blocks import Scenes, parts_of_day
 from pipeline.calibrate.numerics.nuisances import SWEEP_S, TYPICAL_RANGE_M, Considered, by_sensor
+from pipeline.calibrate.reasons import because
 from pipeline.core.errors import SolveError
 from pipeline.objective.ego_motion import EgoMotion
 from pipeline.objective.sweep_registration import Surfaces, plane_equations
@@ -174,9 +175,7 @@ def estimate_lidar_lidar(
     starts = [_turned(turn) for turn in (0.0, _TURN_RAD, -_TURN_RAD)]
     ends = sorted((_climbed(moments, X) for X in starts), key=lambda e: -e.share)
     if ends[0].share < _LEAST_SHARE:
-        raise SolveError(
-            f"{edge.name}: {ends[0].share:.0%} of one lidar's points lie on surfaces of the other"
-        )
+        raise SolveError(because("few surfaces", edge=edge.name, share=ends[0].share))
     # De-skewed along the pose that was found, the child is laid on once more.
     T = inverse(A) @ ends[0].X @ A @ T_parent_child
     moments = _moments(pair, ego, T, scenes)
@@ -211,7 +210,7 @@ def _moments(pair: LidarPair, ego: EgoMotion, T_parent_child: np.ndarray, scenes
             motion = np.array([0.0, 0.0, turn, vx, vy, 0.0])
             found.append(_Moment(surfaces, points, gap_s, motion, k))
     if len(found) < _FEWEST_MOMENTS:
-        raise SolveError(f"two lidars need {_FEWEST_MOMENTS} moments that both see, the day has {len(found)}")
+        raise SolveError(because("few common", needed=_FEWEST_MOMENTS, used=len(found)))
     return found
 
 
@@ -284,8 +283,7 @@ def _other_ends(ends: Sequence[_End]) -> tuple[Check, ...]:
         for other in ends[1:]
         if rotation_angle_rad(inverse(best.X) @ other.X) > _APART_RAD and other.share > _NEARLY * best.share
     ]
-    told = "a search from another start ends at another pose with as many matching points"
-    return (Check(told, "witnesses_disagree"),) if apart else ()
+    return (Check(because("other start"), "witnesses_disagree"),) if apart else ()
 
 
 def _floor(pair: LidarPair, moments: Sequence[_Moment]) -> np.ndarray:
@@ -346,8 +344,4 @@ def _parts(
 
 
 def _notes(information: np.ndarray) -> tuple[str, ...]:
-    return (
-        ()
-        if information[6, 6] > 1.0
-        else ("clocks of both lidars: the car drives too slowly to determine them",)
-    )
+    return () if information[6, 6] > 1.0 else (because("lidar clocks"),)

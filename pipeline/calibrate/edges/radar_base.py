@@ -31,6 +31,7 @@ from pipeline.calibrate.edges.on_base import (
 )
 from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.calibrate.numerics.nuisances import by_sensor
+from pipeline.calibrate.reasons import because
 from pipeline.calibrate.verify.motion_sources import compared_sources
 from pipeline.core.errors import SolveError
 from pipeline.objective.ego_motion import DopplerMotion, EgoMotion
@@ -76,7 +77,7 @@ def solve(edge: Edge, sources: DaySources) -> tuple[EdgeEvidence, int]:
     sources.on_base(name)
     radar = sources.doppler(name, rows) if rows else None
     if radar is None:
-        raise SolveError(f"{name} is silent: the day has no scan of it", "silent_sensor")
+        raise SolveError(because("silent", sensor=name, what="scan"), "silent_sensor")
     wrong = sources.backwards
     if name in wrong:
         return _turned_round(edge, radar), len(rows)
@@ -87,8 +88,8 @@ def solve(edge: Edge, sources: DaySources) -> tuple[EdgeEvidence, int]:
         ego = sources.ego_by_cameras(radar, rows)
         stamps = replace(stamps, drive=np.arange(len(rows)))  # a drive each: no change of speed, no clock
     if not np.isfinite(ego.velocity_mps).any():
-        said = f": the car drives backwards by {', '.join(wrong)}" if wrong else ""
-        raise SolveError(f"no source except {name} measures the car's motion{said}")
+        reason = "no motion, backwards" if wrong else "no motion"
+        raise SolveError(because(reason, sensor=name, others=", ".join(wrong)))
     # The pair lidar-radar has these elevations already; a frame by travel adds nothing to them.
     directions = None if sources.prior.is_base_loose else _directions(name, rows, sources)
     timed = sources.odometry_mps(rows)
@@ -208,15 +209,8 @@ def _numbers(yaw: Regression | None, moments: int) -> dict[str, float]:
 
 
 def _notes(yaw: Regression | None, pitch: Regression | None, clock: Regression | None) -> tuple[str, ...]:
-    shown = {
-        "yaw to the base: too few scans determine the direction of travel": yaw,
-        "pitch to the base: no lidar shares the radar's view": pitch,
-        "clock against the base: the car hardly changes its speed": clock,
-    }
-    return (
-        *(told for told, fit in shown.items() if fit is None),
-        "roll, x, y, z to the base: the motion does not determine them",
-    )
+    shown = {"radar base, yaw": yaw, "radar base, pitch": pitch, "radar base, clock": clock}
+    return (*(because(name) for name, fit in shown.items() if fit is None), because("radar base, rest"))
 
 
 def _directions(radar: str, rows: Sequence[Observation], sources: DaySources) -> TravelDirections | None:
@@ -237,10 +231,8 @@ def _directions(radar: str, rows: Sequence[Observation], sources: DaySources) ->
 
 def _turned_round(edge: Edge, radar: DopplerMotion) -> EdgeEvidence:
     """A radar by whose Doppler the car drives backwards, at its prior."""
-    shown = f"by the Doppler of {radar.name} the car drives backwards, by other sources it does not"
-    fits = "correct doppler_positive in fleet.toml, or the transform if it is turned by 180 deg"
     nothing, moments = np.zeros((7, 7)), int(np.isfinite(radar.velocity_mps).all(1).sum())
     return EdgeEvidence(
         edge, inverse(radar.T_base_radar), 0.0, nothing, nothing[0], frames_used=moments,
-        checks=(Check(f"{shown}: {fits}", "doppler"),),
+        checks=(Check(because("radar backwards", sensor=radar.name), "doppler"),),
     )  # fmt: skip

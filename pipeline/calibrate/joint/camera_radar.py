@@ -23,6 +23,7 @@ from pipeline.calibrate.numerics.nuisances import (
     Considered,
     estimate_biases,
 )
+from pipeline.calibrate.reasons import because
 from pipeline.core.config import SolveConfig
 from pipeline.objective.radar.moving_clusters import (
     MATCH_RAD,
@@ -107,12 +108,10 @@ def estimate_camera_radar(
     # Left perturbations about the camera carry the radar along; these were turns about the radar.
     J = np.linalg.inv(change_jacobian(T))
     after = posterior(covariance, prior_covariance, CAMERA_RADAR_BIAS)
-    notes = ["translation stays at the prior"]
+    notes = [because("no shift")]
     if rival > _RIVAL_SHARE:
         after = _with_open_azimuth(after, prior_covariance)
-        notes.append(
-            f"azimuth is not determined: another rotation matches {rival:.0%} as many moving clusters to boxes"
-        )
+        notes.append(because("azimuth open", share=rival))
     frames = len(np.unique(seen.clusters.frame))
     diagnostics = {
         "box_sigma_rad": last.box_sigma_rad,

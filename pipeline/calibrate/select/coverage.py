@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from pipeline.calibrate.reasons import because
 from pipeline.rig.se3 import transform_points
 from pipeline.rig.spherical import camera_direction_angles, to_spherical
 from schemas.observations import Observation
@@ -76,7 +77,7 @@ def missing_in_view(observations: Sequence[Observation], pair: str) -> list[str]
         views = [_seen(o, kind) for o in observations]
         azimuth, _, distance = np.concatenate(views).T if views else np.zeros((3, 0))
         if not len(azimuth):
-            missing.append(f"drive where there are {kind.words}: the frames show none")
+            missing.append(because("drive where", what=kind.words))
             continue
         parts = {
             f"left of {_SIDE_DEG:.0f} deg": azimuth > np.radians(_SIDE_DEG),
@@ -86,9 +87,7 @@ def missing_in_view(observations: Sequence[Observation], pair: str) -> list[str]
         }
         empty = [where for where, there in parts.items() if there.mean() < _SCARCE]
         if empty:
-            missing.append(
-                f"drive where there are {kind.words} {' and '.join(empty)}: the frames hardly show any"
-            )
+            missing.append(because("drive where, some", what=kind.words, where=" and ".join(empty)))
     return missing
 
 

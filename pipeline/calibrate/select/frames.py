@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from pipeline.calibrate.numerics.frame_blocks import FEWEST_SCENES, scenes_of
+from pipeline.calibrate.reasons import because
 from pipeline.calibrate.select.coverage import choose_for_information, contents_of, missing_in_view
 from pipeline.core.config import SelectConfig
 from pipeline.core.errors import SolveError
@@ -118,10 +119,7 @@ def select_frames(
 
 
 def unmet_conditions(
-    observation: Observation,
-    pair: str,
-    config: SelectConfig,
-    sync_gate_s: float | None = PAPER_SYNC_GATE_S,
+    observation: Observation, pair: str, config: SelectConfig, sync_gate_s: float | None = PAPER_SYNC_GATE_S
 ) -> list[str]:
     """The paper's conditions that a frame does not meet for a pair, by name.
 
@@ -176,22 +174,20 @@ def missing_content(observations: Sequence[Observation], pair: str) -> list[str]
     missing = []
     speeds = np.array([abs(o.ego_speed_mps) for o in observations if o.ego_speed_mps is not None])
     if len(speeds) and np.mean(speeds > _BRISK_MPS) < _SCARCE:
-        missing.append(f"drive faster than {_BRISK_MPS:.0f} m/s: slower frames do not determine time offsets")
+        missing.append(because("drive faster", speed=_BRISK_MPS))
     if "radar" in FRAMES_OF_PAIR[pair]:
         if np.mean([len(o.radar_track_xyz_m) > 0 for o in observations]) < _SCARCE:
-            missing.append("drive in traffic: the radar hardly sees moving road users")
+            missing.append(because("drive, radar"))
         if not any(o.radar_has_elevation for o in observations):
-            missing.append(
-                "no drive determines roll, pitch and height of this radar: it measures no elevation"
-            )
+            missing.append(because("no drive"))
     if (
         "camera" in FRAMES_OF_PAIR[pair]
         and not any(o.is_unlabelled for o in observations)
         and np.mean([len(o.road_user_boxes_px) > 0 for o in observations]) < _SCARCE
     ):
-        missing.append("drive in traffic: the images hardly show road users")
+        missing.append(because("drive, camera"))
     if len(np.unique(scenes_of(observations))) < FEWEST_SCENES:
-        missing.append("drive some 100 m further: the frames show the same street from the same place")
+        missing.append(because("drive on"))
     return missing + missing_in_view(observations, pair)
 
 
@@ -274,8 +270,7 @@ def _count_rejected(
 
 def _notes(pair: str, passed: int, below: Sequence[int], chosen: int, *, paper: bool) -> list[str]:
     if paper and below:
-        kept = f"the paper's frame conditions hold for {passed} frames of {pair}"
-        return [f"{kept}; {len(below)} of the {chosen} frames used are below them"]
+        return [because("below conditions", passed=passed, pair=pair, below=len(below), used=chosen)]
     return []
 
 
@@ -287,12 +282,14 @@ def _silent(pair: str, observations: Sequence[Observation], absent: Mapping[str,
         return SolveError(unlabelled, fault="no_labels")
     if known and len(observations) < MIN_FRAMES:
         both = sum(set(FRAMES_OF_PAIR[pair]) <= set(o.sensors) for o in observations)
-        told = f"only {both} moments have both sensors, {MIN_FRAMES} are needed ({known[0]})"
+        told = because("few moments", both=both, needed=MIN_FRAMES, why=known[0])
         return SolveError(told, fault=_fault_in(known[0]))
     for sensor in FRAMES_OF_PAIR[pair]:
         seen = sum(sensor in o.sensors for o in observations)
         if seen < MIN_FRAMES <= len(observations):
-            told = f"the {sensor} is silent: {seen} of {len(observations)} frames have it, {MIN_FRAMES} are needed"
+            told = because(
+                "few of a sensor", sensor=sensor, seen=seen, all=len(observations), needed=MIN_FRAMES
+            )
             why = f" ({absent[sensor]})" if sensor in absent else ""
             return SolveError(told + why, fault=_fault_in(absent.get(sensor, "")))
     return None
@@ -305,5 +302,5 @@ def _fault_in(why: str) -> str:
 
 def _too_few(pair: str, chosen: Sequence[int], reasons: Sequence[Sequence[str]], fewest: int) -> str:
     counts: Mapping[str, int] = Counter(r for unmet in reasons for r in unmet)
-    why = ", ".join(f"{name} {n}" for name, n in sorted(counts.items())) or "the day has no more frames"
-    return f"too few frames: {pair} has {len(chosen)} of {len(reasons)}, needs {fewest} ({why})"
+    why = ", ".join(f"{name} {n}" for name, n in sorted(counts.items())) or because("no more")
+    return because("few of a pair", pair=pair, used=len(chosen), all=len(reasons), needed=fewest, counts=why)

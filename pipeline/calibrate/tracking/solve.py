@@ -21,6 +21,7 @@ from jaxtyping import Float
 
 from pipeline.calibrate.numerics.covariance import OBSERVABLE, posterior
 from pipeline.calibrate.numerics.nuisances import TRACKING_BIAS_RAD
+from pipeline.calibrate.reasons import because
 from pipeline.calibrate.tracking.association import (
     Association,
     Shared,
@@ -57,7 +58,6 @@ _LEAST_ROTATION_SIGMA_RAD = np.radians(0.5)  # gate of later rounds: box against
 # Optical axes to x forward, y left, z up.
 _CAMERA_LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 _SENSOR = {"camera_lidar": "camera", "lidar_radar": "radar"}
-_ROTATION_ONLY = "only the rotation is calibrated, as in the source; the translation keeps the prior"
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +103,7 @@ def solve_tracking(
         progress(1 + k, 3, pair)
         pairs[pair] = PairEstimate.at_prior(pair, prior)
         if pair not in wanted:
-            pairs[pair] = replace(pairs[pair], notes=["not triggered: keeps the prior"])
+            pairs[pair] = replace(pairs[pair], notes=[because("not triggered")])
             continue
         usable = {o.frame_index for o in observations[pair]}
         rows = np.array([i for i, o in enumerate(frames) if o.frame_index in usable])
@@ -133,12 +133,7 @@ def solve_tracking(
 
 
 def calibrate_pair(
-    pair: str,
-    tracks: PairTracks,
-    prior: Prior,
-    rng: np.random.Generator,
-    *,
-    frames: np.ndarray | None = None,
+    pair: str, tracks: PairTracks, prior: Prior, rng: np.random.Generator, *, frames: np.ndarray | None = None
 ) -> PairEstimate:
     """Associate and align in turns, from the prior's gate to a narrow one.
 
@@ -165,9 +160,8 @@ def calibrate_pair(
         worst = float(np.sqrt(np.diag(aligned.covariance)[_steering(tracks)].max()))
         sigma, before = min(sigma, max(2 * worst, _LEAST_ROTATION_SIGMA_RAD)), found
     if aligned.kept.sum() < MIN_TRACKS:
-        raise SolveError(
-            f"only {aligned.kept.sum()} of {len(aligned.kept)} pairs of tracks agree, needs {MIN_TRACKS}"
-        )
+        counts = {"kept": aligned.kept.sum(), "all": len(aligned.kept)}
+        raise SolveError(because("tracks differ", **counts, needed=MIN_TRACKS))
     return _estimate(pair, tracks, prior, bearings, aligned, used)
 
 
@@ -248,11 +242,11 @@ def _estimate(
     }
     if tracks.elevation:
         diagnostics["residual_elevation_rad"] = float(aligned.residual_rad[1])
-    verdict = "miscalibrated" if statistic > threshold else "consistent with the tracks"
+    verdict = "tracks deny" if statistic > threshold else "tracks fit"
     notes = [
-        _ROTATION_ONLY,
-        f"the prior is {verdict}: {statistic:.1f}, threshold {threshold:.1f}",
-        f"{int(aligned.kept.sum())} of {bearings.tracks} pairs of tracks agree",
+        because("rotation only"),
+        because(verdict, statistic=statistic, threshold=threshold),
+        because("tracks agree", kept=aligned.kept.sum(), all=bearings.tracks),
     ]
     return PairEstimate(
         pair, aligned.T, found.covariance, observability, found.observable & (np.arange(6) < 3),
@@ -270,7 +264,7 @@ def _composed(camera_lidar: PairEstimate, lidar_radar: PairEstimate, prior: Prio
     return PairEstimate(
         "camera_radar", camera_lidar.T @ lidar_radar.T, covariance, observability, observability >= OBSERVABLE,
         min(camera_lidar.frames_used, lidar_radar.frames_used),
-        notes=["composed over the lidar, the reference sensor", _ROTATION_ONLY],
+        notes=[because("over lidar"), because("rotation only")],
         common_covariance=compose_covariance(camera_lidar.T, *commons) if len(commons) == 2 else None,
     )  # fmt: skip
 
@@ -278,8 +272,6 @@ def _composed(camera_lidar: PairEstimate, lidar_radar: PairEstimate, prior: Prio
 def _too_few(pair: str, tracks: PairTracks, paired: int) -> str:
     other = _SENSOR[pair]
     if not tracks.lidar:
-        return f"no moving objects in the lidar ({len(tracks.other)} tracks of the {other})"
-    return (
-        f"too few moving objects: {paired} pairs of tracks, needs {MIN_TRACKS} "
-        f"({len(tracks.lidar)} tracks of the lidar, {len(tracks.other)} of the {other})"
-    )
+        return because("no tracks", other=len(tracks.other), sensor=other)
+    counts = {"paired": paired, "needed": MIN_TRACKS, "lidar": len(tracks.lidar), "other": len(tracks.other)}
+    return because("few tracks", **counts, sensor=other)

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.calibrate.numerics.frame_blocks import FEWEST_SCENES, scenes_of
+from pipeline.calibrate.reasons import because
 from pipeline.calibrate.select.frames import Selection
 from pipeline.calibrate.verify.motion_sources import MotionFindings
 from pipeline.core.config import ChecksConfig, FleetConfig
@@ -50,8 +51,8 @@ def scene_failures(fitted: Sequence[Observation]) -> list[Check]:
     scenes = len(np.unique(scenes_of(fitted)))
     if scenes >= FEWEST_SCENES or not fitted:
         return []
-    shown = f"its {len(fitted)} frames show {scenes} different scene{'s' * (scenes != 1)}"
-    return [Check(f"too few scenes: {shown}, needs {FEWEST_SCENES}", "few_scenes")]
+    why = because("few scenes", used=len(fitted), scenes=scenes, needed=FEWEST_SCENES)
+    return [Check(why, "few_scenes")]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -80,15 +81,16 @@ def prior_alarms(
     sigma_m = prior.translation_sigma_m
     return {
         pair: [
-            Check(
-                f"by this day alone the position is {shift:+.2f} +- {own_positions(estimate)[k][1]:.2f} m off the prior"
-                f" ({AXIS_NAMES[pair.partition('_')[0]][k]}), whose sigma is {sigma_m:g} m: measure the mounting",
-                "prior",
-            )
+            Check(_far_position(pair, k, shift, own_positions(estimate)[k][1], sigma_m), "prior")
             for k, shift in far_positions(estimate, np.full(6, sigma_m), limits).items()
         ]
         for pair, estimate in pairs.items()
     }
+
+
+def _far_position(pair: str, k: int, shift_m: float, own_m: float, prior_m: float) -> str:
+    axis = AXIS_NAMES[pair.partition("_")[0]][k]
+    return because("far position", shift=shift_m, sigma=own_m, axis=axis, prior=prior_m)
 
 
 def own_positions(estimate: PairEstimate) -> dict[int, tuple[float, float]]:
@@ -124,14 +126,13 @@ def clock_alarms(
         many = limits.max_move_prior_sigmas * float(np.hypot(sigma_s, own_s))
         far_s = found.get("own_dt_s", dt_s)
         is_elsewhere = abs(far_s - dt_s) > many and abs(found.get("own_dt_z", 0.0)) > _ELSEWHERE_Z
-        shown = f"{1e3 * (far_s if is_elsewhere else dt_s):+.0f} ms, far beyond time_offset_sigma_s"
         if is_elsewhere:
-            shown = f"frames align far better with stamps moved by {shown} ({1e3 * sigma_s:.0f} ms)"
+            why = because("other clock", shift=1e3 * far_s, sigma=1e3 * sigma_s)
         elif abs(dt_s) > many:
-            shown = f"the stamps are apart by {shown} ({1e3 * sigma_s:.0f} ms)"
+            why = because("far clock", shift=1e3 * dt_s, sigma=1e3 * sigma_s)
         else:
             continue
-        out[pair] = [Check(f"{shown}: synchronise the clocks, or raise time_offset_sigma_s", "time_offset")]
+        out[pair] = [Check(why, "time_offset")]
     return out
 
 
@@ -180,21 +181,12 @@ def _alarms(day: FoundDay) -> Mapping[str, Sequence[Check]]:
     """Mountings and clocks many sigmas from their priors."""
     pairs = {p: e for p, e in day.solution.pairs.items() if e.frames_used}
     sigma_s = day.fleet.solve.time_offset_sigma_s
-    found = [
-        prior_alarms(pairs, day.prior, day.limits),
-        clock_alarms(pairs, sigma_s, day.limits),
-    ]
+    found = [prior_alarms(pairs, day.prior, day.limits), clock_alarms(pairs, sigma_s, day.limits)]
     return {pair: [check for of in found for check in of.get(pair, ())] for pair in pairs}
 
 
 # In the order in which a record states them.
-DAY_CHECKS: tuple[DayCheck, ...] = (
-    _motion,
-    _solver,
-    _scenes,
-    _constancy,
-    _alarms,
-)
+DAY_CHECKS: tuple[DayCheck, ...] = (_motion, _solver, _scenes, _constancy, _alarms)
 
 
 def checks_of_day(day: FoundDay) -> dict[str, list[Check]]:
@@ -250,8 +242,8 @@ def moved_failures(parts: Mapping[Edge, DayParts], edges: Collection[Edge]) -> d
     # Which of two moved may stay open, as with a tilt that the radar hardly sees: then no edge of either is sure.
     for edge in edges:
         if edge not in failed and {s.name for s in edge.sensors} & set(sensors):
-            sentence = f"the {' or '.join(sensors)} moved during the day, as {surest.name} shows"
-            failed[edge] = [Check(sentence, "moved_in_day")]
+            why = because("moved, other", sensor=" or ".join(sensors), edge=surest.name)
+            failed[edge] = [Check(why, "moved_in_day")]
     return failed
 
 
@@ -259,10 +251,10 @@ def _failure(edge: Edge, parts: DayParts, sigmas: float, sensors: list[str]) -> 
     axis = int(np.argmax(np.abs(parts.sigmas(PART_FLOOR_RAD))))
     first, last = (datetime.fromtimestamp(ns / 1e9, UTC).strftime("%H:%M:%S") for ns in parts.cut_ns)
     names = _OF_CAMERA if edge.parent.kind == "camera" else _OF_OTHERS
-    size = f"{names[axis]} turned by about {np.degrees(parts.step[axis]):+.2f} deg ({sigmas:.1f} sigma)"
+    size = {"axis": names[axis], "step": np.degrees(parts.step[axis]), "sigmas": sigmas}
     ends = [s.name for s in edge.sensors]
     who = " or ".join([s for s in ends if s in sensors] or ends)
-    return Check(f"{size} within the day, between {first} and {last} UTC: the {who} moved", "moved_in_day")
+    return Check(because("moved", **size, first=first, last=last, sensor=who), "moved_in_day")
 
 
 def _shift(parts: DayParts, is_tilt_known: bool) -> PairShift:

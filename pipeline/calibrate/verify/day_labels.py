@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from scipy.special import ndtr, stdtrit
 
 from pipeline.calibrate.numerics.frame_blocks import scene_blocks
+from pipeline.calibrate.reasons import because
 from pipeline.rig.checks import HARMLESS, Check
 from pipeline.rig.estimates import PairEstimate, Solution
 from schemas.observations import Observation
@@ -93,12 +94,10 @@ class LabelOffset:
     @property
     def in_words(self) -> str:
         """The offset in words."""
-        (u, v), (su, sv), (a, b), (sa, sb) = (
-            self.shift_px, self.shift_sigma_px, self.ends_px, self.ends_sigma_px
-        )  # fmt: skip
-        return (
-            f"in the middle the image is {u:+.1f} +- {su:.1f} label px right of and {v:+.1f} +- {sv:.1f} px below its "
-            f"labels; {a:+.1f} +- {sa:.1f} px more at the right border, {b:+.1f} +- {sb:.1f} px more at the lower one"
+        values, sigmas = [*self.shift_px, *self.ends_px], [*self.shift_sigma_px, *self.ends_sigma_px]
+        shown = [f"{value:+.1f} +- {sigma:.1f}" for value, sigma in zip(values, sigmas, strict=True)]
+        return because(
+            "labels", **dict(zip(("right", "down", "more_right", "more_down"), shown, strict=True))
         )
 
 
@@ -212,9 +211,6 @@ def _half_width_px(day: list[np.ndarray], at: Float[np.ndarray, " 4"]) -> float:
 # one that differs over the image, or one that the day does not show well leaves the labels as they are.
 
 
-_CAUSES = "check padding, resizing and the image that the segmenter was given"
-
-
 @dataclass(frozen=True, eq=False)
 class DayLabels:
     """Offset of a day's labels, and what of it is taken back.
@@ -245,14 +241,14 @@ class DayLabels:
         return replace(solution, pairs=pairs, failed_checks=failed)
 
     def _check(self, solution: Solution) -> Check:
-        said = f"labels are offset from their image: {self.offset.in_words} ({_CAUSES})"
+        reason = self.offset.in_words
         if self.moved_px is None:
-            return Check(said, "labels_offset")
+            return Check(reason, "labels_offset")
         d = solution.pairs["camera_lidar"].diagnostics
         turned = [f"{name} by {d[f'labels_moved_{name}_deg']:+.2f} deg"
                   for name in ("pitch", "yaw") if f"labels_moved_{name}_deg" in d]  # fmt: skip
         effect = f", which turned {' and '.join(turned)}" if turned else ""
-        return Check(f"{said}; the offset was removed{effect}", "labels_offset", error=HARMLESS)
+        return Check(because("labels moved", reason=reason, effect=effect), "labels_offset", error=HARMLESS)
 
     def _widened(self, estimate: PairEstimate) -> PairEstimate:
         """Labels too far right rotate the camera about its y axis, labels too far down about its x axis."""

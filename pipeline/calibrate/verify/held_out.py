@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from scipy.special import ndtr, ndtri, stdtr, stdtrit
 
 from pipeline.calibrate.joint.camera_lidar.estimate import align_camera_lidar
+from pipeline.calibrate.reasons import because
 from pipeline.core.config import ChecksConfig, SolveConfig
 from pipeline.core.errors import SolveError
 from pipeline.rig.changes import change_between
@@ -154,10 +155,7 @@ def held_out_update(
     pose = np.ix_(range(6), range(6))
     shift_covariance = covariance - updated
     return HeldOutUpdate(
-        x[:6],
-        updated[pose],
-        0.5 * (shift_covariance + shift_covariance.T)[pose],
-        np.diag(bias[:6] ** 2),
+        x[:6], updated[pose], 0.5 * (shift_covariance + shift_covariance.T)[pose], np.diag(bias[:6] ** 2)
     )
 
 
@@ -229,9 +227,6 @@ def found_elsewhere(
     if test is None or test.z > -worse_z or (off_rad <= _SIGMAS * sigma_rad).all():
         return []
     azimuth, elevation = np.degrees(off_rad)
-    sentence = (
-        f"held-out frames, more than those of the fit, align better at another pose: {azimuth:.2f} deg in azimuth "
-        f"and {elevation:.2f} deg in elevation away (z = {test.z:.1f})"
-    )
+    sentence = because("elsewhere", azimuth=azimuth, elevation=elevation, z=test.z)
     error = change_of(change_between(estimate.T, place))
     return [Check(sentence, disproves=True, error=error)]

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float, Int64
 
+from pipeline.calibrate.reasons import because
 from pipeline.objective.ego_motion import is_same, motion_of
 from pipeline.objective.sweep_registration import arc_between, occupied_share, one_per_cell
 from pipeline.rig.checks import Check
@@ -43,7 +44,6 @@ _FACTORS = ((3.6, "km/h for m/s"), (1 / 3.6, "m/s for km/h"), (180 / np.pi, "deg
 _NEAR = 0.1
 _SPEEDS = ("odometry_by_lidar", "doppler_by_lidar", "odometry_by_doppler")
 _NAMED_FACTORS = tuple(sign * f for f in (1.0, 3.6, 1 / 3.6, 2.0, 0.5) for sign in (-1, 1) if sign * f != 1)
-_KEY = " (doppler_positive in fleet.toml, or the transform if it is turned by 180 deg)"
 _NAMES = {"odometry": "odometry", "doppler": "the radar's Doppler", "lidar": "the lidar's sweeps"}
 
 
@@ -104,12 +104,11 @@ def compared_sources(
     of_radar = [check for check in wrong if is_radars.get(check.fault, False)]
     turning, lag = slopes.get("yaw_rate_by_lidar"), slopes.get("odometry_lag_s")
     if not wrong and turning is not None and turning.is_off(1.0, _TURN_SHARE):
-        shown = f"odometry turns {turning.slope:+.2f} times as fast as the lidar's sweeps"
-        wrong.append(Check(f"{shown}: {_hint(turning.slope)}", "odometry"))
+        why = because("turning", ratio=turning.slope, hint=_hint(turning.slope))
+        wrong.append(Check(why, "odometry"))
     if lag is not None and not wrong and lag.is_off(0.0, _LAG_S):
-        way = "behind" if lag.slope > 0 else "ahead of"
-        shown = f"odometry is {abs(1e3 * lag.slope):.0f} ms {way} the radar's Doppler"
-        wrong.append(Check(f"{shown}: check the stamps of both", "odometry"))
+        order = "behind" if lag.slope > 0 else "ahead of"
+        wrong.append(Check(because("lag", lag=abs(1e3 * lag.slope), order=order), "odometry"))
     numbers = {f"motion_{name}": s.slope for name, s in slopes.items()}
     same = {f"motion_{n}_same": s.same for n, s in slopes.items() if n in _SPEEDS}
     return MotionFindings(wrong, numbers | same, of_radar)
@@ -150,7 +149,7 @@ def _wrong_speeds(slopes: dict[str, _Slope], doppler_mps: np.ndarray) -> list[Ch
     is_backwards = len(forward) >= _FEWEST and bool(np.mean(forward < 0) > 2 / 3)
     if between is None and is_backwards and "doppler" not in by_lidar:
         # Without other evidence: no car drives backwards for most of a day.
-        return [Check(f"by the radar's Doppler the car drives backwards: {_hint(-1.0)}{_KEY}", "doppler")]
+        return [Check(because("backwards", hint=because("doppler sign", hint=_hint(-1.0))), "doppler")]
     if between is None or between.same >= _AGREED:
         return []
     if (between.fits < 0 and is_backwards) or abs(abs(between.fits) * 3.6 - 1) < _NEAR:
@@ -161,28 +160,25 @@ def _wrong_speeds(slopes: dict[str, _Slope], doppler_mps: np.ndarray) -> list[Ch
 def _against_the_lidar(odometry: _Slope, *, agreed: bool) -> list[Check]:
     """Reasons if the lidar contradicts odometry and Doppler, which may agree with each other or not."""
     if agreed and odometry.fits == -1:
-        return [
-            Check("by odometry and Doppler the lidar drives backwards: its x must point ahead", "orientation")
-        ]
+        return [Check(because("lidar backwards"), "orientation")]
     # A Doppler is searched where odometry expects it, and may fit there. Sweeps that are mistaken (posts that meet the
     # next posts) show no constant factor.
     return [_wrong_speed("odometry", "lidar", odometry)] if odometry.agreed >= _AGREED else []
 
 
 def _wrong_speed(name: str, against: str, found: _Slope) -> Check:
-    key = _KEY if name == "doppler" and found.fits < 0 else ""
-    where = f"in {found.same:.0%} of what moves" if found.same > 0.005 else "nowhere"
-    shown = (
-        f"{_NAMES[name]} agrees with {_NAMES[against]} {where}, and shows {found.fits:+.2f} times the speed"
-    )
-    return Check(f"{shown}: {_hint(found.fits)}{key}", name)
+    hint = _hint(found.fits)
+    if name == "doppler" and found.fits < 0:
+        hint = because("doppler sign", hint=hint)
+    numbers = {"share": found.same, "ratio": found.fits, "hint": hint}
+    return Check(because("speed", source=_NAMES[name], other=_NAMES[against], **numbers), name)
 
 
 def _hint(ratio: float) -> str:
     """An explanation that fits: a sign, a unit, or none."""
     fits = ["the other sign"] if ratio < 0 else []
     fits += [unit for factor, unit in _FACTORS if abs(abs(ratio) / factor - 1) < _NEAR]
-    return f"{' and '.join(fits)} fits" if fits else "its scale is wrong"
+    return because("fits", fits=" and ".join(fits)) if fits else because("scale")
 
 
 def _silent_doppler(observations: Sequence[Observation]) -> list[Check]:
@@ -191,8 +187,7 @@ def _silent_doppler(observations: Sequence[Observation]) -> list[Check]:
     silent = len(explained) - sum(explained)
     if len(explained) < _FEWEST or silent <= _MOST_SILENT * len(explained):
         return []
-    shown = f"no velocity of the radar explains {silent} of {len(explained)} scans"
-    return [Check(f"{shown}: check doppler_field, its unit, and doppler_period_mps", "doppler")]
+    return [Check(because("no velocity", silent=silent, all=len(explained)), "doppler")]
 
 
 def _is_explained(o: Observation) -> bool:
@@ -225,8 +220,7 @@ def _wrong_axes(observations: Sequence[Observation], T_lidar_radar: np.ndarray) 
     met, how = max((_met(observations, T), how) for how, T in tried.items())
     if met < max(_LEAST_MET, _MORE * as_given):
         return []
-    shown = f"{met:.0%} of the radar's detections match the lidar if {how}, {as_given:.0%} as given"
-    return [Check(f"{shown}: correct its axes or its transform", "orientation")]
+    return [Check(because("axes", met=met, how=how, given=as_given), "orientation")]
 
 
 def _lidar_agrees(slopes: dict[str, _Slope]) -> bool:

@@ -42,6 +42,7 @@ from scipy.optimize import brentq
 from scipy.special import ndtr, ndtri
 
 from pipeline.calibrate.numerics.nuisances import RADAR_ELEVATION_BIAS_RAD
+from pipeline.calibrate.reasons import because
 from pipeline.calibrate.verify.held_out import HeldOutUpdate
 from pipeline.core.config import ChecksConfig
 from pipeline.core.rigs import CameraPrior
@@ -111,6 +112,13 @@ class Claim:
         """The mounting's own error is within the limit as well."""
         sigma = self.mounting_sigma_rad
         return bool(np.isfinite(sigma) and self._bound_rad(sigma) <= self.limit_rad)
+
+    @property
+    def reason(self) -> str:
+        """Why the direction is not certified, if its margin is negative."""
+        off, sigma, limit = np.degrees([self.shift_rad, self.sigma_rad, self.limit_rad])
+        reason = because("too large", sigma=sigma, limit=limit, percent=100 * self.confidence)
+        return because("exceeded", off=off, reason=reason) if self.is_exceeded else reason
 
     def _bound_rad(self, sigma_rad: float) -> float:
         shift = self.shift_rad if self.is_contradicted else 0.0
@@ -320,4 +328,4 @@ def targets_of(
 def unseen_failure(pair: str) -> Check:
     """Reason why a pair without overlapping views cannot be accepted."""
     parent, child = FRAMES_OF_PAIR[pair]
-    return Check(f"{parent} and {child} see no direction in common at the prior: nothing to certify")
+    return Check(because("no view", parent=parent, child=child))

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool
 
+from pipeline.calibrate.reasons import because
 from pipeline.calibrate.select.frames import SHORTEST
 from pipeline.calibrate.verify.edge_result import RANGE, EdgeResult, at_targets, exceeded_by, tilt_in_doubt
 from pipeline.calibrate.verify.held_out import HeldOutTest
@@ -82,17 +83,17 @@ def judge(
             worse, and they must not contradict it.
     """
     if not triggered:
-        return Verdict("held", "not triggered: the prior stays", _FAILED)
+        return Verdict("held", because("not triggered"), _FAILED)
     faults = dict.fromkeys(faults_of(evidence.failed_checks))
     checks: list[Check] = []
     if result.frames_used < limits.min_fit_frames:
-        few = f"too few frames: {result.frames_used}, needs {limits.min_fit_frames}"
+        few = because("few frames", used=result.frames_used, needed=limits.min_fit_frames)
         sentences = [check.sentence for check in evidence.failed_checks]
         if result.kind != "camera_lidar" or result.frames_used < SHORTEST:
             return Verdict("refused", "; ".join([*sentences, few]), _FAILED, faults=tuple(faults))
         checks.append(Check(few))
     checks += [
-        replace(check, sentence=_with_size(check, result, "not within the limit"))
+        replace(check, sentence=_with_size(check, result, because("beyond")))
         for check in evidence.failed_checks
         if matters(check, result, evidence.claims)
     ]
@@ -104,7 +105,7 @@ def judge(
             checks.append(_aligns_better(result, evidence.claims, evidence.held_out, limits))
     checks += _claims_hold(result, evidence.claims)
     if not result.observable.any():
-        checks.append(Check("the day determines no degree of freedom"))
+        checks.append(Check(because("nothing")))
     score = min(1.0, *(c.margin for c in checks))
     failed = [c for c in checks if c.margin < 0]
     return _held(failed, score, faults) if failed else _accepted(result, evidence, score)
@@ -153,20 +154,20 @@ def _exceeded(check: Check, result: EdgeResult, claims: Mapping[str, Claim]) -> 
 def _harmless(check: Check, result: EdgeResult, claims: Mapping[str, Claim]) -> str:
     """Sentence about a check that does not hold the record."""
     if exceeded := _exceeded(check, result, claims):
-        return f"{check.sentence}: {' and '.join(exceeded)} not certified"
-    return _with_size(check, result, "within the limit")
+        return because("not certified", reason=check.sentence, directions=" and ".join(exceeded))
+    return _with_size(check, result, because("within"))
 
 
-def _with_size(check: Check, result: EdgeResult, words: str) -> str:
+def _with_size(check: Check, result: EdgeResult, limit: str) -> str:
     """The check's sentence with the largest error that it shows at the targets and knows to less than its size."""
     if check.error is None or not any(check.error):
         return check.sentence
     known = [(off, sigma) for off, sigma in at_targets(result, check).values() if off > (sigma or 0.0)]
     if not known:
-        return f"{check.sentence}: {words}"
+        return f"{check.sentence}: {limit}"
     off_rad, known_to_rad = max(known, key=lambda found: found[0])
     sigma = "" if known_to_rad is None else f" +- {np.degrees(known_to_rad):.2f}"
-    return f"{check.sentence}: {np.degrees(off_rad):.2f}{sigma} deg at the targets, {words}"
+    return because("sized", reason=check.sentence, size=f"{np.degrees(off_rad):.2f}{sigma}", limit=limit)
 
 
 def _moves_little(result: EdgeResult, limits: ChecksConfig) -> list[Check]:
@@ -179,19 +180,19 @@ def _moves_little(result: EdgeResult, limits: ChecksConfig) -> list[Check]:
     worst = int(np.argmax(ratio))
     return [
         Check(
-            f"the result is {np.degrees(rotation):.1f} deg off the prior, beyond the search range",
+            because("far turn", off=np.degrees(rotation)),
             margin=1 - rotation / reach,
             disproves=True,
             fault="prior",
         ),
         Check(
-            f"the result is {translation:.2f} m off the prior, beyond the search range",
+            because("far shift", off=translation),
             margin=1 - translation / search.translation_m,
             disproves=True,
             fault="prior",
         ),
         Check(
-            f"{result.names[worst]} moved by {ratio[worst]:.1f} sigmas of the prior",
+            because("far", axis=result.names[worst], ratio=ratio[worst]),
             margin=float(1 - ratio[worst] / limits.max_move_prior_sigmas),
             fault="prior",
         ),
@@ -204,8 +205,7 @@ def _aligns_better(
     """Held-out frames align better than at the prior, or as well if the result hardly differs from the prior."""
     if test is None or test.frames < limits.min_held_out_frames:
         found = 0 if test is None else test.frames
-        few = f"too few held-out frames to judge: {found}, needs {limits.min_held_out_frames}"
-        return Check(few)
+        return Check(because("few held out", used=found, needed=limits.min_held_out_frames))
     near = _near_prior(result, claims)
     if test.z > limits.worse_alignment_z:
         # The radar's registration cost has slopes of its own (`lidar_radar/search`): a right result near a prior
@@ -216,8 +216,7 @@ def _aligns_better(
     name, ratio = _largest_move(result)
     same = 1 - ratio / limits.prior_agreement_sigmas
     better = (-test.z - limits.better_alignment_z) / limits.better_alignment_z
-    moved = f"{name} moved by {ratio:.1f} of its sigmas"
-    sentence = f"{moved}, but held-out frames do not align better (z = {test.z:.1f})"
+    sentence = because("not better", axis=name, ratio=ratio, z=test.z)
     return Check(sentence, margin=min(1.0, max(same, better, near)))
 
 
@@ -240,7 +239,7 @@ def _near_prior(result: EdgeResult, claims: Mapping[str, Claim]) -> float:
     prior, would move it by no more either.
     """
     back = change_of(np.where(KIND_OF_EDGE[result.kind].is_scored, -result.move, 0.0))
-    if exceeded_by(result, claims, Check("the prior is right", error=back)):
+    if exceeded_by(result, claims, Check(because("prior right"), error=back)):
         return _FAILED
     needed = KIND_OF_EDGE[result.kind].required or tuple(claims)
     return 0.0 if all(claims[name].agrees_with_held_out for name in needed) else _FAILED
@@ -254,8 +253,7 @@ def _largest_move(result: EdgeResult) -> tuple[str, float]:
 
 
 def _worse(test: HeldOutTest) -> str:
-    change = f"{test.after:.4g} after {test.before:.4g}, z = {test.z:.1f}"
-    return f"held-out frames align worse than at the prior ({change})"
+    return because("worse", after=test.after, before=test.before, z=test.z)
 
 
 def _claims_hold(result: EdgeResult, claims: Mapping[str, Claim]) -> list[Check]:
@@ -265,7 +263,11 @@ def _claims_hold(result: EdgeResult, claims: Mapping[str, Claim]) -> list[Check]
     """
     needed = KIND_OF_EDGE[result.kind].required
     checks = {
-        name: Check(f"{name}: {_known(claim)}", margin=claim.margin, of_sigma=not claim.is_exceeded)
+        name: Check(
+            because("claim", direction=name, reason=claim.reason),
+            margin=claim.margin,
+            of_sigma=not claim.is_exceeded,
+        )
         for name, claim in claims.items()
     }
     if needed is not None:
@@ -278,16 +280,12 @@ def _claims_hold(result: EdgeResult, claims: Mapping[str, Claim]) -> list[Check]
     return [*wrong, *(c for c in checks.values() if c.of_sigma and (best < 0 or c.margin == best))]
 
 
-def _known(claim: Claim) -> str:
-    off = f"held-out frames put it {_deg(claim.shift_rad)} off, and " if claim.is_exceeded else ""
-    limit = f"{_deg(claim.limit_rad)} at {100 * claim.confidence:.3g} %"
-    return f"{off}its sigma of {_deg(claim.sigma_rad)} is too large for {limit}"
-
-
 def _reservations(result: EdgeResult, claims: Mapping[str, Claim]) -> list[str]:
     """Axes that an accepted record does not certify."""
     open_claims = [
-        f"{name} not certified: {_known(claim)}" for name, claim in claims.items() if claim.margin < 0
+        because("uncertified", direction=name, reason=claim.reason)
+        for name, claim in claims.items()
+        if claim.margin < 0
     ]
     return [*open_claims, *undetermined(result.kind, result.observable)]
 
@@ -296,8 +294,4 @@ def undetermined(kind: str, observable: Bool[np.ndarray, " 6"]) -> list[str]:
     """A sentence on the degrees of freedom that the day did not determine; none if there are none."""
     axes = AXIS_NAMES[kind.partition("_")[0]]
     names = ", ".join(axis for axis, seen in zip(axes, observable, strict=True) if not seen)
-    return [f"not determined by the day: {names}"] if names else []
-
-
-def _deg(angle_rad: float) -> str:
-    return f"{np.degrees(angle_rad):.2f} deg"
+    return [because("undetermined", axes=names)] if names else []

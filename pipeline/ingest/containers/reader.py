@@ -101,12 +101,7 @@ BACKENDS: dict[str, str] = {
     "fetched": "pipeline.ingest.containers.rosbag2_folder:CopiedLog",
 }
 _BY_RANGES = (".mcap", ".bag")  # logs in buckets that are read in place, by byte ranges
-_MAGIC = {
-    b"\x89MCAP": ".mcap",
-    b"#ROSBAG": ".bag",
-    b"SQLite format 3\0": ".db3",
-    ZSTD_MAGIC: ".zstd",
-}
+_MAGIC = {b"\x89MCAP": ".mcap", b"#ROSBAG": ".bag", b"SQLite format 3\0": ".db3", ZSTD_MAGIC: ".zstd"}
 # Errors of container libraries for damaged bytes; backends turn them into counted damage or a LogError.
 READ_ERRORS = (
     ValueError,

@@ -331,7 +331,7 @@ def test_a_day_of_one_scene_certifies_nothing_and_says_what_to_drive(day):
     for pair, fit in chosen.fit.items():
         (check,) = scene_failures([standing[i] for i in fit])
         assert check.fault == "few_scenes"
-        assert "1 different scene," in check.sentence
+        assert "frames show 1, needs" in check.sentence
         assert any("drive some 100 m further" in what for what in chosen.missing[pair])
     assert scene_failures(day) == []
 

@@ -213,7 +213,7 @@ def claim(sigma_deg, shift_deg=0.0, shift_sigma_deg=0.1):
 def test_what_the_purpose_needs_more_exactly_than_it_is_known_is_held_but_for_a_radars_elevation():
     found = verdict(estimate(1.5), BETTER, claims=SURE | {"azimuth": claim(0.3)})
     assert found.status == "held"
-    assert found.reason == "azimuth: its sigma of 0.30 deg is too large for 0.20 deg at 99.5 %"
+    assert found.reason == "azimuth: its sigma of 0.30 deg is too large for the limit of 0.20 deg at 99.5 %"
     off = "held-out frames put it 0.15 deg off"
     for elevation, words in ((claim(0.5), "its sigma of 0.50 deg"), (claim(0.05, 0.15, 0.04), off)):
         claims = SURE | {"elevation": elevation}

@@ -31,11 +31,7 @@ from pipeline.calibrate.joint.camera_lidar.observability import (
     analyse_observability,
     parts_of_alignment,
 )
-from pipeline.calibrate.joint.camera_lidar.part_turns import (
-    disagreement,
-    turn_numbers,
-    turns_by_parts,
-)
+from pipeline.calibrate.joint.camera_lidar.part_turns import disagreement, turn_numbers, turns_by_parts
 from pipeline.calibrate.joint.camera_lidar.profiles import DT, FOCAL, TZ, far_time_offset, s_per_metre
 from pipeline.calibrate.joint.camera_lidar.refine import (
     NONE_FIXED,
@@ -55,6 +51,7 @@ from pipeline.calibrate.numerics.nuisances import (
     considered_numbers,
     estimate_biases,
 )
+from pipeline.calibrate.reasons import because
 from pipeline.core.config import SolveConfig
 from pipeline.core.errors import SolveError
 from pipeline.objective.camera_lidar.image_maps import Start
@@ -66,12 +63,7 @@ from pipeline.rig.changes import change_jacobian
 from pipeline.rig.estimates import PairEstimate, Prior, common_part
 from schemas.observations import Observation
 
-__all__ = [
-    "Aligned",
-    "AlignmentState",
-    "align_camera_lidar",
-    "analyse_camera_lidar",
-]
+__all__ = ["Aligned", "AlignmentState", "align_camera_lidar", "analyse_camera_lidar"]
 
 _FEWEST_FRAMES = 5
 _FEWEST_EDGES = 20  # per frame
@@ -97,10 +89,7 @@ class Aligned:
 
 
 def align_camera_lidar(
-    observations: Sequence[Observation],
-    prior: Prior,
-    config: SolveConfig,
-    rng: np.random.Generator,
+    observations: Sequence[Observation], prior: Prior, config: SolveConfig, rng: np.random.Generator
 ) -> Aligned:
     """Find the basin and refine in it, from wide to narrow kernels.
 
@@ -120,7 +109,7 @@ def align_camera_lidar(
     heading_rad = None if prior.heading is None else prior.heading[0]
     velocity_lidar = lidar_velocities(observations, prior.T_lidar_radar, heading_rad)
     if len(used) < _FEWEST_FRAMES:
-        raise SolveError(f"camera-lidar needs {_FEWEST_FRAMES} frames of one camera, the day has {len(used)}")
+        raise SolveError(because("few of a camera", needed=_FEWEST_FRAMES, used=len(used)))
     frames = [observations[i] for i in used]
     terms = _terms(frames, velocity_lidar[used], prior, config)
     terms = terms.exposed_at(AlignmentState(prior.T_camera_lidar).alone)
@@ -172,10 +161,7 @@ def _refined(
 
 
 def analyse_camera_lidar(
-    aligned: Aligned,
-    rng: np.random.Generator,
-    *,
-    heading_rad: float | None = None,
+    aligned: Aligned, rng: np.random.Generator, *, heading_rad: float | None = None
 ) -> PairEstimate:
     """The estimate with tz, time offset, observability and covariance.
 
@@ -231,7 +217,7 @@ def _terms(
     terms = replace(terms, gap_s=terms.gap_s - constant_gap_s(terms.gap_s))  # so that dt is beyond it
     terms = terms.of_kinds(edges="edges" in config.terms, markings="reflectivity" in config.terms)
     if "edges" in config.terms and len(terms.edges.xyz_m) < _FEWEST_EDGES * len(frames):
-        raise SolveError("camera-lidar: hardly any depth edges in the camera's field of view")
+        raise SolveError(because("few edges"))
     return terms
 
 
@@ -250,10 +236,7 @@ def _usable(observations: Sequence[Observation]) -> tuple[list[int], dict[str, i
     used = [i for i, k in enumerate(key) if k == key[0]]
     moving = [i for i in used if observations[i].ego_speed_mps is not None]
     known = moving if 2 * len(moving) >= len(used) else used
-    rejected = {
-        "another camera": len(observations) - len(used),
-        "own speed unknown": len(used) - len(known),
-    }
+    rejected = {"another camera": len(observations) - len(used), "own speed unknown": len(used) - len(known)}
     return known, {reason: count for reason, count in rejected.items() if count}
 
 
@@ -275,11 +258,7 @@ def _moved_by_labels(
     return {f"labels_moved_{n}_deg": float(np.degrees(v)) for n, v in zip(names, turned, strict=True)}
 
 
-def _diagnostics(
-    terms: Terms,
-    analysis: ObservabilityAnalysis,
-    basin: Basin,
-) -> dict[str, float]:
+def _diagnostics(terms: Terms, analysis: ObservabilityAnalysis, basin: Basin) -> dict[str, float]:
     """Numbers behind the verdict."""
     kernel, profile = analysis.kernel, analysis.profile
     return {
@@ -319,7 +298,7 @@ def _conclude(
     known = analysis.prior.camera
     notes = aligned.intrinsics.notes(known)
     if dt_sigma > _UNKNOWN_SHARE * expected_sigma:
-        notes.append("camera time offset: the day's speeds do not determine it")
+        notes.append(because("camera clock"))
     to_left = np.linalg.inv(change_jacobian(analysis.state.T_camera_lidar))
     covariance = to_left @ analysis.covariance[:6, :6] @ to_left.T
     return PairEstimate(

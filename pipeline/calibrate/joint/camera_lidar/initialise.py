@@ -29,6 +29,7 @@ from pipeline.calibrate.joint.camera_lidar.rotation_search import (
     wrong_poses,
 )
 from pipeline.calibrate.numerics.covariance import CLEARLY, widening
+from pipeline.calibrate.reasons import because
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms
 from pipeline.rig.se3 import inverse, log_so3, transform_points
 
@@ -126,10 +127,8 @@ def settled(basin: Basin, scored: Scored, best: AlignmentState, rival: Alignment
 
 
 def _fits_as_well(basin: Basin) -> str:
-    return (
-        f"another minimum of the search fits the frames as well: {np.degrees(basin.rival_rad):.1f} deg "
-        f"from the best one ({basin.origin}), {basin.rival_z:.1f} standard errors behind"
-    )
+    off = np.degrees(basin.rival_rad)
+    return because("other minimum", off=off, origin=basin.origin, z=basin.rival_z)
 
 
 def difference(a: AlignmentState, b: AlignmentState) -> Float[np.ndarray, " 8"]:
@@ -218,10 +217,7 @@ class _Search:
     def _doubt(self, basin: Basin, rivals: Sequence[_End], *, is_last: bool) -> str:
         """Reason why the best end cannot be accepted."""
         if (total := sum(basin.evidence)) < basin.needed:
-            return (
-                f"no minimum of the search is significant: the best one ({basin.origin}) scores {total:.0f}, "
-                f"chance alone {basin.needed:.0f}"
-            )
+            return because("no minimum", origin=basin.origin, total=total, needed=basin.needed)
         if basin.rival_z < CLEARLY and basin.rival_rad >= MARGIN_RAD:
             return _fits_as_well(basin)
         alone = by_chance(self.poses, 1)
@@ -231,8 +227,7 @@ class _Search:
             if is_last and is_ahead.any():
                 is_ahead &= self._holds(rival.state, basin.state)
             if is_ahead.any():
-                name = TERMS[int(np.argmax(is_ahead))]
-                return f"{name} contradict the best minimum of the search ({basin.origin}): they fit another pose"
+                return because("term", term=TERMS[int(np.argmax(is_ahead))], origin=basin.origin)
         return ""
 
     def _holds(self, there: AlignmentState, here: AlignmentState) -> Bool[np.ndarray, " 3"]:

@@ -40,6 +40,7 @@ from pipeline.calibrate.numerics.nuisances import (
     INTRINSICS_CONTRADICTION_SIGMAS,
     INTRINSICS_HALF_SIGMAS,
 )
+from pipeline.calibrate.reasons import because
 from pipeline.core.rigs import CameraPrior
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms
 from pipeline.rig.changes import change_between, change_jacobian
@@ -101,22 +102,17 @@ class DayIntrinsics:
     def notes(self, known: CameraPrior) -> list[str]:
         """Text of the assumption, and the smallest error of it that the day would have detected."""
         yaw, pitch = np.degrees(self._turn_sigma_rad(known))
-        source = (
-            "centre_sigma_px and the day" if known.centre_is_stated else "the day, without centre_sigma_px"
+        source = because("centre stated" if known.centre_is_stated else "centre by day")
+        right, down = (
+            f"{px:+.0f} +- {sigma:.0f}"
+            for px, sigma in zip(self.centre_px, self.centre_sigma_px, strict=True)
         )
-        (right, down), (right_sigma, down_sigma) = self.centre_px, self.centre_sigma_px
+        scale = {"focal": self.focal - 1, "sigma": self.focal_sigma}
         return [
-            (
-                "azimuth and elevation are directions in the image with CameraInfo's principal point. As a mounting, "
-                f"that point adds a sigma of {yaw:.2f} deg of yaw and {pitch:.2f} deg of pitch (from {source})"
-            ),
-            (
-                f"difference from CameraInfo by the day alone: focal length {self.focal - 1:+.1%} +- "
-                f"{self.focal_sigma:.1%}, principal point {right:+.0f} +- {right_sigma:.0f} px to the right, "
-                f"{down:+.0f} +- {down_sigma:.0f} px down"
-            ),
+            because("in the image", yaw=yaw, pitch=pitch, source=source),
+            because("off CameraInfo", **scale, right=right, down=down),
             # By a profile like the time offset's it errs by tens of ms: study `intrinsics.py`.
-            f"image rows are exposed within {1e3 * known.readout_s:.0f} ms (readout_s); a day does not measure this",
+            because("readout", ms=1e3 * known.readout_s),
         ]
 
     def _turn_sigma_rad(self, known: CameraPrior) -> tuple[float, float]:
@@ -134,22 +130,18 @@ def contradictions(day: DayIntrinsics, known: CameraPrior) -> list[Check]:
         is_wrong &= np.sign(off) * _off_by_sigmas(half, known) > INTRINSICS_HALF_SIGMAS
     found = []
     if is_wrong[0]:
-        found.append(
-            Check(
-                f"CameraInfo's focal length is contradicted by the day: measured {day.focal - 1:+.1%} "
-                f"+- {day.focal_sigma:.1%}",
-                "camera_info",
-            )
-        )
+        why = because("focal length", off=day.focal - 1, sigma=day.focal_sigma)
+        found.append(Check(why, "camera_info"))
     if is_wrong[1:].any():
-        (right, down), (u, v) = day.centre_px, day.centre_sigma_px
+        right, down = (
+            f"{px:+.1f} +- {sigma:.1f}" for px, sigma in zip(day.centre_px, day.centre_sigma_px, strict=True)
+        )
         left_rad = [
             float(abs(d) / f * _LEFT_OF_TURN) for d, f in zip(day.centre_px, day.focal_px, strict=True)
         ]
         found.append(
             Check(
-                f"CameraInfo's principal point is contradicted by the day: measured {right:+.1f} +- {u:.1f} px "
-                f"right, {down:+.1f} +- {v:.1f} px down: right in the image, not in the mounting",
+                because("principal point", right=right, down=down),
                 "camera_info",
                 error=(left_rad[1], left_rad[0], 0.0, 0.0, 0.0, 0.0),
             )

@@ -25,11 +25,8 @@ from jaxtyping import Float, Int, Int64
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState
 from pipeline.calibrate.joint.part_turn import PartTurn
 from pipeline.calibrate.numerics.covariance import CLEARLY
-from pipeline.calibrate.numerics.nuisances import (
-    CAMERA_LIDAR_BIAS,
-    EDGE_SIDE_MOST_OF_GAP,
-    EDGE_SIDE_MOST_PX,
-)
+from pipeline.calibrate.numerics.nuisances import CAMERA_LIDAR_BIAS, EDGE_SIDE_MOST_OF_GAP, EDGE_SIDE_MOST_PX
+from pipeline.calibrate.reasons import because
 from pipeline.objective.camera_lidar.points import Points
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms
 from pipeline.rig.cameras import camera_of
@@ -156,7 +153,7 @@ def disagreement(turns: Sequence[PartTurn]) -> list[Check]:
 def _failed(a: PartTurn, b: PartTurn) -> Check:
     right, about = max(a, b, key=lambda w: abs(w.offset_rad)), np.arange(6) == a.axis
     return Check(
-        f"the evidence disagrees on {_AXES[a.axis]}: {a.sentence}, {b.sentence}",
+        because("parts", axis=_AXES[a.axis], a=a.sentence, b=b.sentence),
         "witnesses_disagree",
         error=change_of(about * right.offset_rad),
         covariance=np.diag(about * right.sigma_rad**2),

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int64
 
 from pipeline.calibrate.joint.part_turn import PartTurn
+from pipeline.calibrate.reasons import because
 from pipeline.objective.radar.heights import Heights
 from pipeline.objective.radar.registration import RegistrationFrames
 from pipeline.objective.radar.travel import TravelDirections
@@ -282,23 +283,17 @@ def contradiction(sources: Sequence[PartTurn]) -> Contradiction | None:
     mean, _ = _mean(sources)
     chi2 = sum(((w.offset_rad - mean) / w.sigma_rad) ** 2 for w in sources)
     factor = max(1.0, float(np.sqrt(chi2 / (len(sources) - 1))))
-    said = ", ".join(
+    found = ", ".join(
         f"{w.name} {np.degrees(w.offset_rad):+.2f} +- {np.degrees(w.sigma_rad):.2f} deg" for w in sources
     )
-    sentence = (
-        f"sources of radar pitch contradict each other ({said}): its sigma is multiplied by {factor:.1f}"
-    )
-    return Contradiction(factor, sentence)
+    return Contradiction(factor, because("radar pitch", sources=found, factor=factor))
 
 
 def own_numbers(sources: Sequence[PartTurn]) -> dict[str, float]:
     """Offset and sigma of each source, for the diagnostics of a record."""
     numbers: dict[str, float] = {}
     for w in sources:
-        numbers |= {
-            f"{w.name}_pitch_offset_rad": w.offset_rad,
-            f"{w.name}_pitch_sigma_rad": w.sigma_rad,
-        }
+        numbers |= {f"{w.name}_pitch_offset_rad": w.offset_rad, f"{w.name}_pitch_sigma_rad": w.sigma_rad}
     return numbers
 
 

@@ -34,12 +34,7 @@ from pipeline.calibrate.joint.lidar_radar.observability import (
     notes_of,
     own_position,
 )
-from pipeline.calibrate.joint.lidar_radar.problem import (
-    DT,
-    SCHEDULE,
-    RadarProblem,
-    RadarState,
-)
+from pipeline.calibrate.joint.lidar_radar.problem import DT, SCHEDULE, RadarProblem, RadarState
 from pipeline.calibrate.joint.lidar_radar.search import (
     OtherOffsets,
     anneal,
@@ -51,11 +46,10 @@ from pipeline.calibrate.joint.lidar_radar.search import (
     time_offset_scatter_s,
 )
 from pipeline.calibrate.joint.part_turn import PartTurn
-from pipeline.calibrate.numerics.covariance import (
-    bootstrap_covariance,
-)
+from pipeline.calibrate.numerics.covariance import bootstrap_covariance
 from pipeline.calibrate.numerics.frame_blocks import blocks_of, parts_of_day, scenes_of, with_parts
 from pipeline.calibrate.numerics.nuisances import estimate_biases
+from pipeline.calibrate.reasons import because
 from pipeline.core.config import SolveConfig
 from pipeline.core.errors import SolveError
 from pipeline.objective.radar.heights import displaced_heights
@@ -76,10 +70,7 @@ _YAW, _ANY_RAD = 2, np.radians(20.0)
 
 
 def estimate_lidar_radar(
-    observations: Sequence[Observation],
-    prior: Prior,
-    config: SolveConfig,
-    rng: np.random.Generator,
+    observations: Sequence[Observation], prior: Prior, config: SolveConfig, rng: np.random.Generator
 ) -> PairEstimate:
     """Estimate T_lidar_radar and the radar's time offset (stamp_lidar = stamp_radar + dt).
 
@@ -120,10 +111,7 @@ def estimate_lidar_radar(
 
 
 def _problem(
-    observations: Sequence[Observation],
-    prior: Prior,
-    config: SolveConfig,
-    rng: np.random.Generator,
+    observations: Sequence[Observation], prior: Prior, config: SolveConfig, rng: np.random.Generator
 ) -> tuple[RadarProblem, dict[str, int]]:
     """The problem from usable frames, and counts of rejected frames by reason."""
     given, wrong = len(observations), contradicts_odometry(observations)
@@ -138,9 +126,7 @@ def _problem(
         "turns at an unknown yaw rate": found - frames.count,
     }
     if frames.count < _FEWEST_FRAMES:
-        raise SolveError(
-            f"lidar-radar needs {_FEWEST_FRAMES} frames with static detections, the day has {frames.count}"
-        )
+        raise SolveError(because("few static", needed=_FEWEST_FRAMES, used=frames.count))
     gap_s = constant_gap_s(gaps_s(observations, "radar"))
     movers = moving_clusters(observations, with_boxes=False)
     problem = RadarProblem(

@@ -42,6 +42,7 @@ from pipeline.calibrate.numerics.nuisances import (
     considered_numbers,
     root_rows,
 )
+from pipeline.calibrate.reasons import because
 from pipeline.core.config import SolveConfig
 from pipeline.rig.changes import change_between
 from pipeline.rig.estimates import prior_share
@@ -246,10 +247,7 @@ _GROUND = {3: "x", 4: "y"}  # of the pose's six
 
 
 def own_position(
-    problem: RadarProblem,
-    state: RadarState,
-    fixed: Bool[np.ndarray, " P"],
-    block: Int64[np.ndarray, " F"],
+    problem: RadarProblem, state: RadarState, fixed: Bool[np.ndarray, " P"], block: Int64[np.ndarray, " F"]
 ) -> dict[str, float]:
     """Shift from the prior along each ground axis that was fixed, its sigma, and its significance.
 
@@ -305,43 +303,28 @@ def notes_of(analysis: ObservabilityAnalysis) -> list[str]:
     fixed, heights = analysis.fixed, analysis.problem.heights
     notes = []
     if fixed[:6].any():
-        notes.append(f"not determined by this day, kept at the prior: {', '.join(_NAMES[fixed[:6]])}")
+        notes.append(because("at the prior", axes=", ".join(_NAMES[fixed[:6]])))
     dt_sigma_s = float(np.sqrt(analysis.covariance[DT, DT]))
     if fixed[DT]:
-        notes.append("time offset: not determined by this day; the constant gap of its stamps is kept")
+        notes.append(because("no clock"))
     elif dt_sigma_s > _DT_UNSURE_S:
-        notes.append(
-            f"time offset known to {1e3 * dt_sigma_s:.0f} ms only: at constant speed a shift in x has the same effect"
-        )
-    notes.append("vehicle boxes are not used: roll and pitch depend on the registration and the prior")
+        notes.append(because("clock unsure", ms=1e3 * dt_sigma_s))
+    notes.append(because("no boxes"))
     if _travel_frames(analysis):
-        notes.append(
-            "radar pitch assumes that the car drives parallel to the road that the lidar sees under it"
-        )
+        notes.append(because("parallel"))
     if heights is not None:
-        notes.append(
-            f"{heights.displaced:.0%} of the detections of low objects lie between the object and its mirror "
-            f"image in the road; radar pitch allows for them, with a sigma of "
-            f"{np.degrees(heights.floor_rad):.2f} deg"
-        )
+        sigma = np.degrees(heights.floor_rad)
+        notes.append(because("mirror images", share=heights.displaced, sigma=sigma))
     disagreement = contradiction(analysis.sources)
     if disagreement is not None:
         notes.append(disagreement.sentence)
     bias_sigma_m = float(np.sqrt(analysis.covariance[RANGE, RANGE]))
     if analysis.problem.frames.has_elevation.any():
-        own_deg = float(np.degrees(RADAR_ELEVATION_BIAS_RAD))
-        notes.append(
-            "pitch is the direction of the radar's detections: its mounting differs by the radar's own constant"
-            f" elevation error (0 +- {own_deg:.2f} deg)"
-        )
+        notes.append(because("own elevation", sigma=np.degrees(RADAR_ELEVATION_BIAS_RAD)))
     else:
-        notes.append(
-            "the radar measures no elevation: azimuth and range only, roll and pitch are the prior's"
-        )
-    notes += [
-        f"range bias {analysis.state.range_bias_m:+.3f} +- {bias_sigma_m:.3f} m (prior 0 +- {RANGE_BIAS_SIGMA_M:.2f})",
-    ]
-    return notes
+        notes.append(because("no elevation"))
+    sigmas = {"sigma": bias_sigma_m, "prior": RANGE_BIAS_SIGMA_M}
+    return [*notes, because("range bias", bias=analysis.state.range_bias_m, **sigmas)]
 
 
 def diagnostics_of(analysis: ObservabilityAnalysis) -> dict[str, float]:

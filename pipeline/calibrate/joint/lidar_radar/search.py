@@ -305,11 +305,7 @@ class _Valley:
 
 
 def _next_step(
-    linear: Linear,
-    state: RadarState,
-    valley: _Valley,
-    em_share: float,
-    fixed: Bool[np.ndarray, " P"],
+    linear: Linear, state: RadarState, valley: _Valley, em_share: float, fixed: Bool[np.ndarray, " P"]
 ) -> tuple[Float[np.ndarray, " P"], _Valley]:
     """EM's step (`em_share` 1), or nearly Newton's with the information that soft assignment leaves (near 0).
 
