@@ -14,18 +14,19 @@ from pipeline.core.config import load_fleet
 from pipeline.core.errors import ConfigError
 from pipeline.ingest.check import CheckReport, check_logs
 from pipeline.ingest.propose.survey import nightly_command
+from pipeline.ingest.readiness import overall
 from pipeline.ingest.rig_sample import PairFinding, RigFinding, dof_counts
 from pipeline.perceive.models.source import check_models
 from pipeline.rig.day_prior import require_named_files
 
 __all__ = ["check", "print_rig"]
 
-_EXIT = {"yes": 0, "partly": 1, "no": 2}
+_EXIT = {"yes": 0, "weak": 1, "partly": 1, "no": 2}
 _COLOUR = {"yes": "green", "weak": "yellow", "partly": "yellow", "no": "red"}
 
 
 def check(fleet: Path, /, *logs: Path, rig: str | None = None, json: bool = False) -> int:
-    """Check whether logs can be calibrated, in which DoF, and what is missing. Exit 0 yes, 1 partly, 2 no.
+    """Check whether logs can be calibrated, in which DoF, and what is missing. Exit 0 yes, 1 weakly or partly, 2 no.
 
     Args:
         fleet: fleet.toml.
@@ -50,13 +51,12 @@ def check(fleet: Path, /, *logs: Path, rig: str | None = None, json: bool = Fals
     else:
         _print_report(report, name)
         following = _following(report, fleet, logs)
-        verdicts = {p: _worst(report, p) for p in dict.fromkeys(v.pair for v in report.verdicts)}
         print_summary(
             "check",
             report.answer,
             rig=name,
             frames=report.evidence.frames,
-            pairs=verdicts,
+            pairs=_of_pairs(report),
             problems=report.problems,
             next_steps=following,
         )
@@ -73,9 +73,10 @@ def _following(report: CheckReport, fleet: Path, logs: tuple[Path, ...]) -> list
     return fetch if report.answer == "no" else [*fetch, *nightly_command(fleet, logs)]
 
 
-def _worst(report: CheckReport, pair: str) -> str:
-    verdicts = [v.verdict for v in report.verdicts if v.pair == pair]
-    return "yes" if "no" not in verdicts else "no" if set(verdicts) == {"no"} else "partly"
+def _of_pairs(report: CheckReport) -> dict[str, str]:
+    """The answer of each pair."""
+    pairs = dict.fromkeys(v.pair for v in report.verdicts)
+    return {pair: overall([v for v in report.verdicts if v.pair == pair]) for pair in pairs}
 
 
 def _print_report(report: CheckReport, rig: str) -> None:
@@ -87,21 +88,19 @@ def _print_report(report: CheckReport, rig: str) -> None:
     for t in report.topics:
         rate = "" if t.rate_hz is None else f"{t.rate_hz:.2f} Hz"
         mark = f"[red]{t.problem}[/]" if t.problem else "[green]ok[/]"
-        topics.add_row(
-            t.role,
-            t.topic,
-            ", ".join(kind.rsplit("/", 1)[-1] for kind in t.types),
-            str(t.messages),
-            rate,
-            mark,
-        )
+        kinds = ", ".join(kind.rsplit("/", 1)[-1] for kind in t.types)
+        topics.add_row(t.role, t.topic, kinds, str(t.messages), rate, mark)
     console.print(topics)
     for line in _measured(report):
         console.print(line, markup=False, highlight=False)
     print_rig(console, report.rig)
     for line in [*report.problems, *report.advice]:
         console.print(f"  - {line}", markup=False)
-    console.print(f"Can these logs be calibrated: [{_COLOUR[report.answer]} bold]{report.answer}[/]")
+    answer = report.answer
+    if answer == "weak":
+        weak = " and ".join(pair for pair, own in _of_pairs(report).items() if own == "weak")
+        answer = f"yes, but {weak} may be held: each of its axes depends on the prior"
+    console.print(f"Can these logs be calibrated: [{_COLOUR[report.answer]} bold]{escape(answer)}[/]")
 
 
 def _measured(report: CheckReport) -> list[str]:

@@ -150,9 +150,11 @@ def _needs(evidence: Evidence) -> list[tuple[str, str, _Needs]]:
 
 
 def overall(verdicts: list[DofVerdict]) -> str:
-    """Overall answer: "no" if every DoF is "no", "yes" if none is, else "partly"."""
-    refused = [v.verdict == "no" for v in verdicts]
-    return "yes" if not any(refused) else "no" if all(refused) else "partly"
+    """Answer: "no" if every DoF is "no", "partly" if one is, "weak" if some edge has no "yes", else "yes"."""
+    words = [v.verdict for v in verdicts]
+    if "no" in words:
+        return "no" if set(words) == {"no"} else "partly"
+    return "yes" if {v.pair for v in verdicts} == {v.pair for v in verdicts if v.verdict == "yes"} else "weak"
 
 
 _Needs = list[tuple[str, str]]
