@@ -20,12 +20,13 @@ from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
 from pipeline.store.sign_offs import read_sign_offs
 from pipeline.store.views import Chosen, frames_of, ingested, observations_of, perceived
-from schemas.calibrations import CALIBRATIONS, DOF_NAMES, CalibrationRecord
+from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.frames import Frame
 from schemas.moments import TF
 from schemas.observations import Observation
 from schemas.poses import POSES, PoseRow
 from schemas.states import STATES, StateRow
+from schemas.words import AXIS_NAMES
 
 __all__ = [
     "choose_pairs",
@@ -101,7 +102,8 @@ def _pair(
         T = inverse(T)
         A = adjoint(T)
         covariance, common = (None if C is None else A @ C @ A.T for C in (covariance, common))
-        unseen = ", ".join(dof for dof, is_seen in zip(DOF_NAMES, seen, strict=True) if not is_seen)
+        names = zip(AXIS_NAMES[edge.child.kind], seen, strict=True)
+        unseen = ", ".join(name for name, is_seen in names if not is_seen)
         if row.status != "prior":
             # The degrees of freedom refer to axes of the reference; in axes of the sensor they are mixed.
             own = f"{unseen} along the axes of {edge.child.name} kept at the prior" if unseen else ""

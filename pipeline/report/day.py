@@ -65,7 +65,7 @@ def pair_view(record: CalibrationRecord) -> dict[str, Any]:
         "advice": RECORD_WORDS[record.status],
         "reason": "; ".join(reasons),
         "faults": in_words(record.faults or ()),
-        "known_to": _known_to(sigma, observable),
+        "known_to": _known_to(record.pair, sigma, observable),
         "undetermined": ", ".join(unseen) if sigma is not None else "",
         "moved_by": _moved_by(change),
         "rows": [
@@ -248,7 +248,7 @@ def clearest_alarm(findings: Sequence[DriftFinding]) -> DriftFinding | None:
     return max(rests_on, key=lambda f: (f.statistic or 0.0) / (f.threshold or 1.0), default=None)
 
 
-def _known_to(sigma: np.ndarray | None, observable: Sequence[bool]) -> str:
+def _known_to(pair: str, sigma: np.ndarray | None, observable: Sequence[bool]) -> str:
     if sigma is None:
         return "nothing was computed"
     parts = []
@@ -257,7 +257,7 @@ def _known_to(sigma: np.ndarray | None, observable: Sequence[bool]) -> str:
         if seen:
             worst = max(seen, key=lambda k: sigma[k])
             text = f"{scaled(sigma[worst], DOF_NAMES[worst]):.2g} {unit_of(DOF_NAMES[worst])}"
-            parts.append(f"{name} ± {text} ({DOF_NAMES[worst]})")
+            parts.append(f"{name} ± {text} ({dof_title(pair, DOF_NAMES[worst])})")
     return ", ".join(parts) or "no degree of freedom"
 
 

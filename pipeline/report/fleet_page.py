@@ -84,7 +84,7 @@ def render_fleet_page(
         link=lambda vehicle, day: f"{quote(album.folder.name)}/{day}/{quote(page_stem(vehicle))}.html",
         shown=rows[:_CHARTS],
         index=json.dumps(_index(album, days, rows, {v.vehicle: v for v in views}, (edges, charts))),
-        dofs=[f"{d} [{'deg' if d.startswith('r') else 'm'}]" for d in DOF_NAMES],
+        dofs=[f"{how} {axis} [{unit}]" for how, unit in (("about", "deg"), ("along", "m")) for axis in "xyz"],
         truth=known,
         truth_summary=truth_summary(known),
         provenance=_provenance(window, verdicts),

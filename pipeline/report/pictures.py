@@ -33,7 +33,8 @@ from pipeline.report.svg import Plot, document
 from pipeline.rig.cameras import camera_of
 from pipeline.rig.estimates import Prior, Solution
 from pipeline.rig.se3 import exp_se3, inverse, log_se3, rotation_angle_rad, transform_points
-from schemas.calibrations import DOF_NAMES, PAIRS, SENSORS
+from schemas.calibrations import PAIRS, SENSORS
+from schemas.words import AXIS_NAMES
 
 __all__ = [
     "between",
@@ -236,7 +237,8 @@ def _told(pair: str, prior: Prior, solution: Solution) -> dict[str, str]:
     turned_deg = np.degrees(rotation_angle_rad(estimate.T @ inverse(T)))
     shifted_m = float(np.linalg.norm(estimate.T[:3, 3] - T[:3, 3]))
     sigma = np.sqrt(np.diag(estimate.covariance))
-    seen = zip(DOF_NAMES[:3], sigma[:3], estimate.observable[:3], strict=True)
+    names = AXIS_NAMES[pair.partition("_")[0]]
+    seen = zip(names[:3], sigma[:3], estimate.observable[:3], strict=True)
     known = [f"{name} {np.degrees(s):.2f} deg" for name, s, observable in seen if observable]
     return {
         "title": pair.replace("_", "-"),

@@ -48,9 +48,8 @@ def with_sigma(value: float, sigma: float, dof: str) -> str:
 
 
 def dof_title(pair: str, dof: str) -> str:
-    """As `rz (yaw)`, along the axes of the parent of an edge of this kind."""
-    names = AXIS_NAMES[pair.partition("_")[0]]
-    return f"{dof} ({names[DOF_NAMES.index(dof)]})"
+    """As `yaw`, along the axes of the parent of an edge of this kind."""
+    return AXIS_NAMES[pair.partition("_")[0]][DOF_NAMES.index(dof)]
 
 
 def motion_in_words(kind: str, motion: list[float], sigma: list[float]) -> str:

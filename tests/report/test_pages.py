@@ -152,7 +152,7 @@ def test_the_copied_json_is_the_record_and_a_page_without_pictures_has_none(flee
     assert np.linalg.norm(np.array(value["T"])[:3, 3] - T_CAMERA_LIDAR[:3, 3]) < 0.1
     assert "without pictures" in text
     assert "data:image" not in text
-    assert "Not determined by this day: rx (roll), tz (up)." in text
+    assert "Not determined by this day: roll, up." in text
     assert "no highway: radar roll is weak" in text  # a note of the record
 
 
