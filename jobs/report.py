@@ -37,7 +37,7 @@ def report(
         vehicle: vehicle id.
         day: YYYY-MM-DD.
         method: calibration method of the records; default: audit.method.
-        truth: JSON with the true extrinsics of a simulated fleet, shown next to the estimates.
+        truth: folder with the true poses of a simulated fleet (VEHICLE/DAY.json), shown next to the estimates.
         picture: picture to write of the frame with most features; needs --vehicle and --day. A .jpg or .png shows the
             prior on the left and the result on the right; a .webp or .gif moves from one to the other.
         pictures: --no-pictures draws pages without images of public roads.

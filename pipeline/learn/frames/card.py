@@ -22,8 +22,8 @@ _CONVENTIONS = (
     "the sensor. range_rate is positive where a target recedes, and holds the car's own motion."
 )
 _SYNCHRONISED = (
-    "Sensors of a frame measured within ingest's limit of each other, each at its own stamp; each sweep states "
-    "whether it is de-skewed to it."
+    "The sensors of a frame measured nearly at the same time (within the limit of [ingest]), and each has its own "
+    "stamp. Each sweep states whether it is de-skewed to its stamp."
 )
 _OPEN = {
     "parquet": (
@@ -85,10 +85,11 @@ def _page(card: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
     lost = [f"- {n} frames: {r.replace('_', ' ')}" for r, n in sorted(card["frames_left_out"].items())]
     moved = settings["perturb"]
     lines = [
-        f"# Frames of {len({d['vehicle'] for d in days})} vehicles, {len(days)} vehicle-days",
+        "# Frames with their calibration",
+        f"Vehicles: {len({d['vehicle'] for d in days})}, vehicle-days: {len(days)}.",
         f"Made by {card['made_by']}; all of this page is in card.json too.\n",
         "| split | frames |\n|---|---|\n" + "\n".join(f"| {s} | {n} |" for s, n in card["frames"].items()),
-        f"\nNo two splits share a {', '.join(settings['split']['split_by'])}. {_SYNCHRONISED}",
+        f"\nNo two splits share a {' or a '.join(settings['split']['split_by'])}. {_SYNCHRONISED}",
         "\n## Left out\n" + ("\n".join(lost) or "No frame."),
         *(f"- {d['vehicle']} {d['day']}: {d['reason']}" for d in card["vehicle_days_left_out"]),
         *_without_pose(days),
