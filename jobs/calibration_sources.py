@@ -23,8 +23,7 @@ from pipeline.export.tree import ESTIMATED_EDGES
 from pipeline.ingest.containers.reader import open_log
 from pipeline.ingest.messages.decoding import decode
 from pipeline.rig.day_prior import read_transforms
-from pipeline.rig.edges import EDGE_OF_PAIR, words_of
-from pipeline.rig.graph import BASE, Edge, tie
+from pipeline.rig.graph import BASE, EDGE_OF_PAIR, Edge, tie, words_of
 from pipeline.rig.rig import Rig
 from pipeline.rig.transform_tree import TransformTree
 from pipeline.store.partitions import Lake

@@ -7,8 +7,8 @@ from typing import Literal
 
 from jobs.terminal.summary import print_summary, progress_reporter
 from pipeline.convert.kitti_shaped import read_kitti, read_view_of_delft
-from pipeline.convert.log_file import fleet_text, write_log
 from pipeline.convert.nuscenes import read_nuscenes
+from pipeline.convert.recording import fleet_text, write_log
 from pipeline.core.errors import ConfigError
 from pipeline.rig.graph import Kind
 from pipeline.store.partitions import Partition

@@ -44,7 +44,7 @@ def evaluate(
         truth: JSON with T_camera_lidar and T_lidar_radar (4x4), or a folder with VEHICLE/DAY.json.
         reflectors: instead of --truth, JSON of reflector positions picked in each sensor's data, for one
             vehicle and day (written by `simulate --reflectors`; {"camera": {...}, "targets": [{"pixel",
-            "lidar_m", "radar_m", ...}]}, described in pipeline/evaluate/picks.py), or a folder with
+            "lidar_m", "radar_m", ...}]}, described in pipeline/evaluate/recording.py), or a folder with
             VEHICLE/DAY.json.
         recording_lake: lake with the ingested reflector recording: lidar and radar positions are then
             measured in its frames near the picks; camera pixels stay as picked. Default: --lake if

@@ -6,7 +6,7 @@ from typing import Literal
 
 from jobs.terminal.summary import exit_code, print_summary
 from jobs.terminal.vehicle_status import require_vehicle
-from pipeline.audit.restarts import events_until
+from pipeline.audit.references import events_until
 from pipeline.core.errors import ConfigError
 from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake, Partition, last_possible_day, work_key

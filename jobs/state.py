@@ -16,12 +16,11 @@ from jobs.terminal.summary import left_out, print_json
 from jobs.terminal.vehicle_status import require_vehicle
 from pipeline.core.errors import ConfigError
 from pipeline.export.lake import signed_state
-from pipeline.rig.changes import change_between
-from pipeline.rig.se3 import to_quaternion
+from pipeline.rig.se3 import change_between, to_quaternion
+from pipeline.store.corrections import read_sign_offs, sign
 from pipeline.store.current import current_states, state_values
 from pipeline.store.partitions import Lake
 from pipeline.store.records import read_records
-from pipeline.store.sign_offs import read_sign_offs, sign
 from schemas.sign_offs import SignOff
 from schemas.states import STATES, StateRow
 

@@ -14,7 +14,7 @@ from rich.text import Text
 
 from jobs.terminal.summary import exit_code, left_out, print_summary
 from jobs.terminal.vehicle_status import next_steps, require_vehicle, status_lines, told_of
-from pipeline.audit.restarts import events_until
+from pipeline.audit.references import events_until
 from pipeline.fleet.status import DayStatus, day_statuses
 from pipeline.store.corrections import read_corrections
 from pipeline.store.partitions import Lake, check_day, days_after

@@ -7,8 +7,7 @@ import datetime as dt
 from jobs.terminal.summary import print_summary, progress_reporter
 from pipeline.core.errors import ConfigError
 from pipeline.store.partitions import Lake, days_after
-from pipeline.store.repair import repair_table
-from pipeline.store.retention import collect, collect_pages
+from pipeline.store.repair import collect, collect_pages, repair_table
 from schemas.moments import MOMENTS, PERCEIVED
 from schemas.versions import TABLES
 

@@ -7,7 +7,7 @@ needs intrinsics but no extrinsics. Lidar and radar stay points, so that they ca
 The grid: cells are square angles of `grid_step_deg`, centred on the optical axis. The centre of row i, column j is
     azimuth to the LEFT  a = (W/2 - j - 1/2) step      elevation UPWARDS  e = (H/2 - i - 1/2) step
     direction in the optical frame (x right, y down, z forward) = (-sin a cos e, -sin e, cos a cos e),
-so azimuth and elevation are those of `pipeline.rig.spherical.camera_direction_angles`.
+so azimuth and elevation are those of `pipeline.rig.se3.camera_direction_angles`.
 
 No column depends on a true transform, and no lidar column on the camera: edges come from ranges, ground from a
 plane fitted to the sweep.

@@ -13,8 +13,7 @@ from rich.table import Table
 from jobs.terminal.record_tables import STATUS_STYLES
 from jobs.terminal.vehicle_status import status_lines
 from pipeline.report.truth import Truth, true_transform
-from pipeline.rig.changes import change_between, change_covariance
-from pipeline.rig.se3 import inverse, rotation_angle_rad
+from pipeline.rig.se3 import change_between, change_covariance, inverse, rotation_angle_rad
 from pipeline.store.current import current_records, prior_of, transform_of
 from pipeline.store.partitions import Lake
 from pipeline.store.records import read_records

@@ -12,9 +12,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from pipeline.rig.changes import change_between
-from pipeline.rig.edges import POSE, edge_named, pose_of, words_of
-from pipeline.rig.se3 import to_quaternion
+from pipeline.rig.graph import POSE, edge_named, pose_of, words_of
+from pipeline.rig.se3 import change_between, to_quaternion
 from schemas.faults import in_words
 
 __all__ = ["STATUS_STYLES", "numbers", "print_table"]

@@ -10,9 +10,8 @@ from jaxtyping import Bool, Float, Int
 
 from pipeline.audit.charts import Charts, clipped
 from pipeline.audit.scan import scan
-from pipeline.rig.changes import change_between, change_jacobian, changed
-from pipeline.rig.edges import edge_order
-from pipeline.rig.graph import Edge
+from pipeline.rig.graph import Edge, edge_order
+from pipeline.rig.se3 import change_between, change_jacobian, changed
 from schemas.calibrations import DOF_NAMES
 
 __all__ = [

@@ -14,12 +14,10 @@ import pyarrow.compute as pc
 from jaxtyping import Bool, Float, Int
 
 from pipeline.audit.days import PairDays, pair_days
-from pipeline.rig.changes import change_jacobian, changed
-from pipeline.rig.edges import edge_order, edges_of_rows
-from pipeline.rig.graph import Edge
-from pipeline.rig.se3 import from_quaternion
-from pipeline.store.columns import matrices, observable_dofs, ordinals, places, there
+from pipeline.rig.graph import Edge, edge_order, edges_of_rows
+from pipeline.rig.se3 import change_jacobian, changed, from_quaternion
 from pipeline.store.current import current_rows
+from pipeline.store.rows import matrices, observable_dofs, ordinals, places, there
 from schemas.calibrations import CALIBRATIONS, STATUSES
 from schemas.columns import POSE_COLUMNS
 

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from pipeline.audit.scan import alike
-from pipeline.rig.changes import change_between, change_jacobian, changed
+from pipeline.rig.se3 import change_between, change_jacobian, changed
 
 __all__ = [
     "LEAST_SCATTER",

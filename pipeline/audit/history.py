@@ -16,11 +16,9 @@ import pyarrow.compute as pc
 
 from pipeline.audit.days import Reference
 from pipeline.audit.estimates import COLUMNS, Estimates, day_name, estimates_of, faults_of, joined
-from pipeline.audit.references import first_accepted, read_kept
-from pipeline.audit.restarts import restart_of
+from pipeline.audit.references import first_accepted, read_kept, restart_of
 from pipeline.core.config import FleetConfig
-from pipeline.rig.edges import words_of
-from pipeline.rig.graph import Edge
+from pipeline.rig.graph import Edge, words_of
 from pipeline.store.partitions import Lake, days_after, months_before
 from pipeline.store.records import first_day, last_day, read_columns
 from schemas.calibrations import CALIBRATIONS

@@ -16,10 +16,10 @@ from pipeline.audit.estimates import is_covariance, is_rigid
 from pipeline.audit.fusion import PoseDays
 from pipeline.rig.graph import KINDS, Sensor
 from pipeline.rig.se3 import from_quaternion
-from pipeline.store.columns import matrices, observable_dofs, ordinals, there
 from pipeline.store.current import current_rows
 from pipeline.store.partitions import Lake
 from pipeline.store.records import read_columns
+from pipeline.store.rows import matrices, observable_dofs, ordinals, there
 from schemas.columns import POSE_COLUMNS
 from schemas.poses import POSES
 

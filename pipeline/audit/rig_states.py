@@ -19,12 +19,10 @@ from pipeline.audit.estimates import day_name
 from pipeline.audit.fusion import Mount, after_a_move, fuse, with_held_day
 from pipeline.audit.pose_days import SensorDays, VehiclePoses
 from pipeline.audit.reasons import REASONS, because
-from pipeline.audit.restarts import drift_per_day, last_restart
+from pipeline.audit.references import drift_per_day, last_restart
 from pipeline.core.config import VerifyConfig
-from pipeline.rig.changes import change_covariance
-from pipeline.rig.edges import pose_columns
-from pipeline.rig.graph import Edge, Sensor, tie
-from pipeline.rig.se3 import adjoint, inverse, transform_points
+from pipeline.rig.graph import Edge, Sensor, pose_columns, tie
+from pipeline.rig.se3 import adjoint, change_covariance, inverse, transform_points
 from pipeline.rig.targets import DEFAULT_TARGETS, target_sigmas
 from schemas.drift import DriftFinding
 from schemas.service_events import ServiceEvent

@@ -15,15 +15,21 @@ from pipeline.audit.fusion import LEAST_SCATTER, Mount
 from pipeline.audit.history import History, models_of
 from pipeline.audit.noise import estimate_noise
 from pipeline.audit.pose_days import VehiclePoses, read_poses
-from pipeline.audit.references import Kept, first_accepted, kept_columns, kept_of, read_kept
-from pipeline.audit.restarts import events_until, restart_of
+from pipeline.audit.references import (
+    Kept,
+    events_until,
+    first_accepted,
+    kept_columns,
+    kept_of,
+    read_kept,
+    restart_of,
+)
 from pipeline.audit.rig_states import rig_states
 from pipeline.audit.vehicle import limit_of
 from pipeline.audit.wander import with_wander
 from pipeline.core.config import AuditConfig, FleetConfig, config_hash
 from pipeline.core.stage_work import Run, Task, Told, Window, Work
-from pipeline.rig.edges import edge_of
-from pipeline.rig.graph import Edge, tie
+from pipeline.rig.graph import Edge, edge_of, tie
 from pipeline.store.partitions import content_hash, days_after, last_possible_day, work_key
 from pipeline.store.records import last_day, read_last
 from schemas.calibrations import CALIBRATIONS, DOF_NAMES

@@ -14,13 +14,10 @@ from pipeline.calibrate.judging import Judged, Judging
 from pipeline.calibrate.numerics.covariance import OBSERVABLE
 from pipeline.calibrate.reasons import because
 from pipeline.calibrate.select.frames import Selection
-from pipeline.rig.changes import change_between
-from pipeline.rig.checks import Check, change_of
-from pipeline.rig.edges import pose_columns
-from pipeline.rig.estimates import EdgeEvidence, PairEstimate, Prior, Solution
-from pipeline.rig.graph import Edge, RigGraph
+from pipeline.rig.estimates import Check, EdgeEvidence, PairEstimate, Prior, Solution, change_of
+from pipeline.rig.graph import Edge, RigGraph, pose_columns
 from pipeline.rig.prior import Extrinsics
-from pipeline.rig.se3 import adjoint, compose_covariance, inverse
+from pipeline.rig.se3 import adjoint, change_between, compose_covariance, inverse
 from schemas.calibrations import CalibrationRecord
 from schemas.observations import Observation
 

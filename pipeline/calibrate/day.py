@@ -24,9 +24,8 @@ from pipeline.core.config import FleetConfig
 from pipeline.core.errors import SolveError
 from pipeline.core.results import Progress, silent
 from pipeline.core.stage_work import Probes
-from pipeline.rig.checks import Check
 from pipeline.rig.day_prior import no_prior
-from pipeline.rig.estimates import Prior, Solution
+from pipeline.rig.estimates import Check, Prior, Solution
 from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, SENSORS, CalibrationRecord
 from schemas.faults import FAULTS
 from schemas.observations import WITHOUT_LABELS, Observation

@@ -43,14 +43,13 @@ from pipeline.calibrate.verify.target_accuracy import (
 from pipeline.calibrate.verify.verdict import Evidence, Verdict, judge, matters
 from pipeline.core.config import FleetConfig, VerifyConfig
 from pipeline.core.stage_work import NO_PROBES, Probes
-from pipeline.rig.changes import change_covariance
-from pipeline.rig.checks import Check
-from pipeline.rig.estimates import EdgeEvidence, PairEstimate, Prior
+from pipeline.rig.estimates import Check, EdgeEvidence, PairEstimate, Prior
 from pipeline.rig.graph import BASE, Edge, RigGraph
 from pipeline.rig.kinds import KIND_OF_EDGE
 from pipeline.rig.overlap import View
 from pipeline.rig.prior import Extrinsics, RigPrior
 from pipeline.rig.rig import sensor_turn
+from pipeline.rig.se3 import change_covariance
 from pipeline.rig.targets import DEFAULT_TARGETS
 from schemas.calibrations import PROBE_Z
 from schemas.observations import Observation

@@ -18,8 +18,7 @@ from pipeline.core.stage_work import Task
 from pipeline.learn.infer.onnx_networks import OnnxNetwork, model_files, models_key, open_networks
 from pipeline.learn.infer.pitch_by_travel import informed_by_way
 from pipeline.learn.infer.vehicle_day import single_frame_solution, solve_by_networks
-from pipeline.rig.checks import Check
-from pipeline.rig.estimates import Prior, Solution
+from pipeline.rig.estimates import Check, Prior, Solution
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.tables import read_columns
 from pipeline.store.views import Chosen, frames_of, ingested, observations_of, perceived

@@ -19,10 +19,8 @@ from pipeline.objective.paper.camera_lidar import CameraLidarLoss, camera_lidar_
 from pipeline.objective.paper.camera_radar import CameraRadarLoss, camera_radar_loss
 from pipeline.objective.paper.classes import loop_loss, loop_transform
 from pipeline.objective.paper.lidar_radar import LidarRadarLoss, lidar_radar_loss
-from pipeline.rig.changes import changed
-from pipeline.rig.checks import Check
-from pipeline.rig.estimates import PairEstimate, Prior, Solution, common_of
-from pipeline.rig.se3 import rotation_angle_rad
+from pipeline.rig.estimates import Check, PairEstimate, Prior, Solution, common_of
+from pipeline.rig.se3 import changed, rotation_angle_rad
 from schemas.calibrations import PAIRS
 from schemas.observations import Observation
 

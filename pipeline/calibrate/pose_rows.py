@@ -16,14 +16,11 @@ from pipeline.calibrate.records import Inputs, edge_of_pair
 from pipeline.calibrate.rig_day import WrongPrior
 from pipeline.calibrate.verify.target_accuracy import DIRECTIONS, Claim, claims_of, targets_of
 from pipeline.core.config import VerifyConfig
-from pipeline.rig.changes import change_jacobian
-from pipeline.rig.checks import faults_of
-from pipeline.rig.edges import pose_columns
-from pipeline.rig.graph import RigGraph, Sensor
+from pipeline.rig.estimates import faults_of
+from pipeline.rig.graph import RigGraph, Sensor, pose_columns
 from pipeline.rig.overlap import View
 from pipeline.rig.prior import Extrinsics
-from pipeline.rig.se3 import adjoint, exp_se3, inverse, transform_points
-from pipeline.rig.spherical import from_spherical
+from pipeline.rig.se3 import adjoint, change_jacobian, exp_se3, from_spherical, inverse, transform_points
 from pipeline.rig.targets import DEFAULT_TARGETS, errors_at_targets
 from pipeline.store.current import prior_of, transform_of
 from schemas.calibrations import CalibrationRecord

@@ -18,12 +18,9 @@ from pipeline.calibrate.verify.verdict import undetermined
 from pipeline.core.errors import SolveError
 from pipeline.core.stage_work import NO_PROBES, Probes
 from pipeline.rig.cameras import camera_of
-from pipeline.rig.changes import change_between
-from pipeline.rig.edges import edge_named, pose_columns
 from pipeline.rig.estimates import DayParts, PairEstimate, Prior, Solution
-from pipeline.rig.graph import Edge
-from pipeline.rig.se3 import adjoint, inverse
-from pipeline.rig.spherical import camera_direction_angles
+from pipeline.rig.graph import Edge, edge_named, pose_columns
+from pipeline.rig.se3 import adjoint, camera_direction_angles, change_between, inverse
 from pipeline.store.partitions import Partition
 from schemas.calibrations import DOF_NAMES, FRAMES_OF_PAIR, PAIRS, CalibrationRecord
 from schemas.observations import WITHOUT_LABELS, Observation

@@ -17,8 +17,8 @@ from jaxtyping import Float
 from pipeline.calibrate.adjust.rig import AdjustedRig
 from pipeline.calibrate.adjusted_day import Concluded, SolvedEdge, adjusted_rig, conclude
 from pipeline.calibrate.day import solve_day
-from pipeline.calibrate.edges.day_sources import DaySources
-from pipeline.calibrate.edges.travel_base import with_travel
+from pipeline.calibrate.edges.on_base import DaySources
+from pipeline.calibrate.edges.sweep_travel import with_travel
 from pipeline.calibrate.judging import EdgeJudging
 from pipeline.calibrate.methods import Solver, method_named, resolved
 from pipeline.calibrate.reasons import because
@@ -28,16 +28,14 @@ from pipeline.core.config import ChecksConfig, FleetConfig
 from pipeline.core.errors import SolveError
 from pipeline.core.results import Progress, silent
 from pipeline.objective.ego_motion import mean_heading, shown_heading
-from pipeline.rig.changes import change_between, change_covariance, change_jacobian, changed
-from pipeline.rig.checks import Check, change_of
 from pipeline.rig.day_prior import no_prior, prior_of_three
-from pipeline.rig.estimates import Prior
+from pipeline.rig.estimates import Check, Prior, change_of
 from pipeline.rig.graph import BASE, Edge, RigGraph, Sensor
 from pipeline.rig.kinds import KIND_OF_EDGE
 from pipeline.rig.overlap import View
 from pipeline.rig.prior import Extrinsics, RigPrior
 from pipeline.rig.rig import Rig
-from pipeline.rig.se3 import inverse, log_se3
+from pipeline.rig.se3 import change_between, change_covariance, change_jacobian, changed, inverse, log_se3
 from pipeline.store.views import Chosen
 from schemas.calibrations import SENSORS, CalibrationRecord
 from schemas.observations import Observation

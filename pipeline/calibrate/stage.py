@@ -21,9 +21,8 @@ from pipeline.core.errors import ConfigError, SolveError
 from pipeline.core.results import Outcome, Progress
 from pipeline.core.stage_work import Run, Task, Told, Work
 from pipeline.rig.day_prior import prior_key, prior_of_three, rig_prior
-from pipeline.rig.edges import edge_of, words_of
 from pipeline.rig.estimates import Prior
-from pipeline.rig.graph import Edge, RigGraph, Sensor, edge_between
+from pipeline.rig.graph import Edge, RigGraph, Sensor, edge_between, edge_of, words_of
 from pipeline.rig.overlap import FRAMES, Overlap, View, best_three, find_edges, overlaps_of
 from pipeline.rig.prior import RigPrior, middle_of, moved
 from pipeline.rig.rig import Rig

@@ -16,8 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import least_squares
 
-from pipeline.rig.se3 import exp_so3
-from pipeline.rig.spherical import to_spherical
+from pipeline.rig.se3 import exp_so3, to_spherical
 
 __all__ = ["Found", "find_in_lidar", "find_in_radar", "robust_mean"]
 

@@ -12,10 +12,8 @@ from jaxtyping import Float
 
 from pipeline.core.errors import ConfigError
 from pipeline.rig.cameras import Camera
-from pipeline.rig.changes import change_covariance
-from pipeline.rig.edges import words_of
-from pipeline.rig.graph import BASE, KINDS, Edge, RigGraph, Sensor
-from pipeline.rig.se3 import adjoint, inverse
+from pipeline.rig.graph import BASE, KINDS, Edge, RigGraph, Sensor, words_of
+from pipeline.rig.se3 import adjoint, change_covariance, inverse
 from schemas.calibrations import DOF_NAMES
 
 __all__ = [

@@ -10,10 +10,9 @@ from jaxtyping import Float
 
 from pipeline.export.calibration import ExportedPair
 from pipeline.export.tree import ESTIMATED_PAIRS
-from pipeline.rig.changes import change_between, change_covariance
 from pipeline.rig.differences import PairDifference
-from pipeline.rig.edges import EDGE_OF_PAIR, edge_order
-from pipeline.rig.se3 import inverse, log_se3
+from pipeline.rig.graph import EDGE_OF_PAIR, edge_order
+from pipeline.rig.se3 import change_between, change_covariance, inverse, log_se3
 from pipeline.rig.targets import target_sigmas
 
 __all__ = ["Side", "compare", "composed"]

@@ -16,8 +16,7 @@ from pipeline.export.formats import Files, Format
 from pipeline.export.provenance import provenance_of
 from pipeline.export.texts import to_json
 from pipeline.export.tree import ESTIMATED_PAIRS
-from pipeline.rig.edges import words_of
-from pipeline.rig.graph import Edge, Sensor, tie
+from pipeline.rig.graph import Edge, Sensor, tie, words_of
 from pipeline.rig.prior import middle_of
 from pipeline.rig.rig import Rig
 from pipeline.rig.se3 import inverse

@@ -11,8 +11,7 @@ import numpy as np
 from pipeline.core.errors import ConfigError
 from pipeline.export.calibration import ExportedCalibration, FrameNames
 from pipeline.export.tree import ESTIMATED_EDGES, pairs_of_tree
-from pipeline.rig.edges import words_of
-from pipeline.rig.graph import Edge
+from pipeline.rig.graph import Edge, words_of
 from pipeline.rig.se3 import inverse
 from pipeline.rig.transform_tree import TransformTree
 

@@ -17,8 +17,8 @@ from pipeline.export.calibration import ExportedCalibration, ExportedPair, poses
 from pipeline.export.provenance import provenance_of, used_lines, warnings_of
 from pipeline.export.texts import to_json
 from pipeline.rig.cameras import camera_of
-from pipeline.rig.changes import change_between
 from pipeline.rig.graph import Sensor
+from pipeline.rig.se3 import change_between
 from schemas.calibrations import DOF_NAMES
 from schemas.frames import Frame
 from schemas.observations import Observation

@@ -18,8 +18,7 @@ from pipeline.export.formats import Files, Format
 from pipeline.export.provenance import comment_lines
 from pipeline.export.texts import field_of, load_yaml, matrix_of, to_yaml
 from pipeline.rig.cameras import Camera
-from pipeline.rig.edges import words_of
-from pipeline.rig.graph import Edge
+from pipeline.rig.graph import Edge, words_of
 from pipeline.rig.se3 import inverse
 
 __all__ = ["KALIBR"]

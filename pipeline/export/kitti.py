@@ -17,8 +17,7 @@ from pipeline.core.errors import ConfigError
 from pipeline.export.calibration import ExportedCalibration, FrameNames, cameras_of, needed_camera
 from pipeline.export.formats import Files, Format
 from pipeline.export.texts import matrix_of, text_of
-from pipeline.rig.edges import words_of
-from pipeline.rig.graph import Edge
+from pipeline.rig.graph import Edge, words_of
 from pipeline.rig.se3 import inverse
 
 __all__ = ["KITTI", "VOD"]

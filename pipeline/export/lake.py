@@ -10,15 +10,14 @@ import numpy as np
 from pipeline.core.errors import ConfigError, ContractError
 from pipeline.export.calibration import USABLE, ExportedPair, is_frame
 from pipeline.rig.cameras import Camera, camera_of
-from pipeline.rig.edges import edge_of, edge_order, words_of
-from pipeline.rig.graph import Edge, Kind, Sensor, is_one_of_each, tie
+from pipeline.rig.graph import Edge, Kind, Sensor, edge_of, edge_order, is_one_of_each, tie, words_of
 from pipeline.rig.prior import transform_of_row
 from pipeline.rig.se3 import adjoint, inverse
 from pipeline.rig.transform_tree import TransformTree
+from pipeline.store.corrections import read_sign_offs
 from pipeline.store.current import current_poses, current_records, current_states, prior_of, transform_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
-from pipeline.store.sign_offs import read_sign_offs
 from pipeline.store.views import Chosen, frames_of, ingested, observations_of, perceived
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.frames import Frame

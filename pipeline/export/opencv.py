@@ -15,8 +15,7 @@ from pipeline.export.calibration import ExportedCalibration, FrameNames
 from pipeline.export.formats import Files, Format
 from pipeline.export.provenance import comment_lines
 from pipeline.export.texts import matrix_of, text_of
-from pipeline.rig.edges import words_of
-from pipeline.rig.graph import Edge
+from pipeline.rig.graph import Edge, words_of
 
 __all__ = ["OPENCV"]
 

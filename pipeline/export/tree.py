@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.core.errors import ConfigError
 from pipeline.export.calibration import FrameNames
-from pipeline.rig.edges import EDGE_OF_PAIR, words_of
-from pipeline.rig.graph import Edge
+from pipeline.rig.graph import EDGE_OF_PAIR, Edge, words_of
 from pipeline.rig.se3 import from_rotation_translation
 from pipeline.rig.transform_tree import TransformTree
 

@@ -28,7 +28,7 @@ from pipeline.core.stages import CALIBRATE, INGEST, PERCEIVE
 from pipeline.fleet.executor import EXECUTORS, Finished, Watch
 from pipeline.fleet.ledger import Known, Ledger
 from pipeline.fleet.pattern import VehicleDay
-from pipeline.rig.edges import edge_of, words_of
+from pipeline.rig.graph import edge_of, words_of
 from pipeline.store.partitions import Lake, Partition, last_possible_day
 from schemas.calibrations import ASKS_FOR_FRAMES, CalibrationRecord
 from schemas.moments import SWEEPS_LOGGED, SWEEPS_PLANNED

@@ -21,14 +21,15 @@ from pipeline.ingest.containers.reader import Channel, ChunkCache, LogReader, Po
 from pipeline.ingest.containers.timeline import Stretches, Timeline
 from pipeline.ingest.messages.decoding import (
     DECODE_ERRORS,
+    REFUSED,
     content_without_stamp,
     decode,
     encoding_fault,
+    foxglove_types,
     header_frame_id,
     header_stamp_ns,
 )
 from pipeline.ingest.messages.detections import DETECTIONS_3D
-from pipeline.ingest.messages.foxglove import REFUSED, foxglove_types
 from pipeline.ingest.messages.image import read_camera_info
 from pipeline.ingest.messages.odometry import EgoTrack
 from pipeline.ingest.reading_plan import Reading, plan_reading, plan_sweeps, rare_topics

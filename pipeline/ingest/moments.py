@@ -24,8 +24,7 @@ from pipeline.core.results import Progress
 from pipeline.ingest.captures import Read, Rejected, readers_of
 from pipeline.ingest.index import DayIndex
 from pipeline.ingest.sync import Rejection, none_near
-from pipeline.rig.edges import pose_columns
-from pipeline.rig.graph import BASE, possible_edges
+from pipeline.rig.graph import BASE, pose_columns, possible_edges
 from pipeline.rig.prior import Star, between, middle_of, star_of, to_rows
 from pipeline.rig.rig import Rig
 from schemas.captures import Capture

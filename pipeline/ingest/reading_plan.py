@@ -3,7 +3,7 @@
 A calibration takes about a hundred frames, and consecutive frames of a drive are similar. The day is divided
 into parts with equal numbers of sweeps, with one possible burst in the middle of each. Bursts are then chosen
 greedily to maximise the sum over classes of time, speed, turn and place of log(1 + bursts in the class). This
-function is submodular, as in the choice of frames in `calibrate/select/coverage.py`.
+function is submodular, as in the choice of frames in `calibrate/select/frames.py`.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ from pipeline.rig.overlap import (
 from pipeline.rig.prior import RigPrior, Star, between, middle_of
 from pipeline.rig.rig import Rig
 from pipeline.rig.scan_rows import rows_of
-from pipeline.rig.spherical import to_spherical
+from pipeline.rig.se3 import to_spherical
 from pipeline.store.views import frame_of, priors_of
 from schemas.calibrations import SENSORS
 from schemas.captures import Capture, Image, Scan, Sweep

@@ -27,7 +27,7 @@ from scipy.spatial import cKDTree
 
 from pipeline.core.config import PerceiveConfig
 from pipeline.rig.scan_rows import rows_of
-from pipeline.rig.spherical import from_spherical, to_spherical
+from pipeline.rig.se3 import from_spherical, to_spherical
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
 
 __all__ = ["LidarEdges", "lidar_edges"]

@@ -22,8 +22,8 @@ from jaxtyping import Float, Float32, Int32, UInt8
 from numba import njit
 
 from pipeline.core.config import PerceiveConfig
-from pipeline.perceive.moving import cluster_moving, wrapped
-from pipeline.perceive.selection import median_of
+from pipeline.perceive.dbscan import cluster_moving, wrapped
+from pipeline.perceive.ground import median_of
 
 __all__ = ["MOVING", "STATIC", "UNDECIDED", "RadarMotion", "Travel", "radar_motion"]
 

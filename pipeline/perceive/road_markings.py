@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8, UInt16
 from numba import njit
 
-from pipeline.perceive.selection import median_of
+from pipeline.perceive.ground import median_of
 
 __all__ = ["Markings", "lidar_markings", "road_contrast"]
 

@@ -15,8 +15,7 @@ from jaxtyping import Bool, Float, Float32, UInt16
 from pipeline.core.rigs import LidarTurn
 from pipeline.objective.sweep_registration import Surfaces, arc_between, one_per_cell, register
 from pipeline.rig.scan_rows import rows_of
-from pipeline.rig.se3 import exp_se3, log_se3
-from pipeline.rig.spherical import to_spherical
+from pipeline.rig.se3 import exp_se3, log_se3, to_spherical
 from schemas.captures import Sweep
 from schemas.moments import Moment
 

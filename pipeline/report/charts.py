@@ -15,9 +15,8 @@ from jaxtyping import Bool, Float, Int
 
 from pipeline.report.verdicts import ChartVerdicts, FleetVerdicts
 from pipeline.report.window import FleetWindow
-from pipeline.rig.changes import change_between
-from pipeline.rig.edges import edge_order
-from pipeline.rig.graph import Edge
+from pipeline.rig.graph import Edge, edge_order
+from pipeline.rig.se3 import change_between
 from schemas.calibrations import DOF_NAMES
 from schemas.service_events import ServiceEvent
 

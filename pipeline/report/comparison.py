@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.report.answers import ANSWERS
 from pipeline.report.page import render
-from pipeline.report.words import dof_title, scaled, unit_of
+from pipeline.report.words import ANSWERS, dof_title, scaled, unit_of
 from pipeline.rig.differences import PairDifference
 from schemas.calibrations import DOF_NAMES
 

@@ -9,9 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.report.answers import ANSWERS
-from pipeline.report.words import LEFT_OUT, dof_title, kind_of_sensor, motion_in_words, scaled, unit_of
-from pipeline.rig.changes import change_between, change_covariance
+from pipeline.report.words import (
+    ANSWERS,
+    LEFT_OUT,
+    dof_title,
+    kind_of_sensor,
+    motion_in_words,
+    scaled,
+    unit_of,
+)
+from pipeline.rig.se3 import change_between, change_covariance
 from pipeline.store.corrections import correction_steps
 from pipeline.store.current import prior_of, transform_of
 from pipeline.store.partitions import Lake

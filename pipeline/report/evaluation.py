@@ -13,8 +13,8 @@ from markupsafe import Markup
 from pipeline.report.overlays import Extrinsics, Scene, front_view, whole_view
 from pipeline.report.page import render
 from pipeline.report.pictures import jpeg_uri, top_view
+from pipeline.report.reading import choose_frames
 from pipeline.report.residuals import as_stamped, time_offsets_of
-from pipeline.report.scenes import choose_frames
 from pipeline.report.svg import MUTED, Plot, document
 from pipeline.report.words import PAIR_TITLES
 from pipeline.rig.differences import ComparedRun

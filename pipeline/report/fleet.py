@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 
-from pipeline.report.answers import ANSWERS
 from pipeline.report.day import clearest_alarm, status_sentence
 from pipeline.report.page import page_stem
 from pipeline.report.verdicts import FleetVerdicts
 from pipeline.report.window import FleetWindow
-from pipeline.report.words import kind_of_sensor, motion_in_words, with_sigma
+from pipeline.report.words import ANSWERS, kind_of_sensor, motion_in_words, with_sigma
 from pipeline.store.partitions import Lake
 from schemas.calibrations import STATUSES
 from schemas.drift import DRIFT_STATUSES, DriftFinding, status_of

@@ -28,7 +28,7 @@ from pipeline.report.overlays import (
     whole_view,
 )
 from pipeline.report.page import render, write_page
-from pipeline.report.scenes import choose_windows
+from pipeline.report.reading import choose_windows
 from pipeline.report.svg import Plot, document
 from pipeline.rig.cameras import camera_of
 from pipeline.rig.estimates import Prior, Solution

@@ -12,8 +12,7 @@ from jaxtyping import Float
 
 from pipeline.core.errors import ConfigError
 from pipeline.report.words import scaled
-from pipeline.rig.changes import change_between, change_covariance
-from pipeline.rig.se3 import inverse
+from pipeline.rig.se3 import change_between, change_covariance, inverse
 from pipeline.store.current import prior_of, transform_of
 from schemas.calibrations import DOF_NAMES, CalibrationRecord
 

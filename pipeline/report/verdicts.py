@@ -10,15 +10,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from jaxtyping import Float, Int
 
-from pipeline.rig.edges import edges_of_rows
-from pipeline.rig.graph import Edge
+from pipeline.rig.graph import Edge, edges_of_rows
 from pipeline.rig.kinds import EDGE_KINDS
-from pipeline.store.columns import known_rows, ordinals, places
 from pipeline.store.corrections import read_corrections
 from pipeline.store.current import current_rows
 from pipeline.store.partitions import Lake
 from pipeline.store.records import read_last_columns
-from pipeline.store.rows import from_table
+from pipeline.store.rows import from_table, known_rows, ordinals, places
 from schemas.calibrations import DOF_NAMES
 from schemas.drift import DRIFT, DRIFT_STATUSES, DriftFinding
 

@@ -15,15 +15,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from jaxtyping import Bool, Float, Int
 
-from pipeline.rig.changes import change_covariance
-from pipeline.rig.edges import edges_of_rows
-from pipeline.rig.graph import Edge
+from pipeline.rig.graph import Edge, edges_of_rows
 from pipeline.rig.kinds import EDGE_KINDS
-from pipeline.rig.se3 import from_quaternion
-from pipeline.store.columns import known_rows, matrices, observable_dofs, ordinals, places, there
+from pipeline.rig.se3 import change_covariance, from_quaternion
 from pipeline.store.current import current_rows
 from pipeline.store.partitions import Lake, days_after, months_before
 from pipeline.store.records import first_day, last_day, read_columns
+from pipeline.store.rows import known_rows, matrices, observable_dofs, ordinals, places, there
 from schemas.calibrations import CALIBRATIONS, STATUSES
 from schemas.columns import POSE_COLUMNS
 

@@ -1,29 +1,33 @@
-"""Inputs and outputs of a calibration method; shared by `calibrate` and `learn`."""
+"""Inputs and outputs of a calibration method, and checks of one; shared by `calibrate` and `learn`."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
 
 from pipeline.core.rigs import CameraPrior
-from pipeline.rig.changes import change_between
-from pipeline.rig.checks import Check
 from pipeline.rig.graph import Edge
-from pipeline.rig.se3 import adjoint
+from pipeline.rig.se3 import adjoint, change_between
+from schemas.faults import FAULTS
 
 __all__ = [
     "EDGE",
+    "HARMLESS",
+    "Change",
+    "Check",
     "DayParts",
     "EdgeEvidence",
     "OtherScenes",
     "PairEstimate",
     "Prior",
     "Solution",
+    "change_of",
     "common_of",
     "common_part",
+    "faults_of",
     "prior_share",
 ]
 
@@ -281,3 +285,46 @@ class EdgeEvidence:
         assert self.gradient.shape == (7,)
         owners = {EDGE, *(s.name for s in self.edge.sensors)}
         assert set(self.bias) <= owners, f"{self.edge.name} has biases of {set(self.bias) - owners}"
+
+
+# Rotation vector and shift of the child's origin, both along the parent's axes [rad, m], as `se3.changed`.
+Change = tuple[float, float, float, float, float, float]
+HARMLESS: Change = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Check:
+    """One condition: the sentence if it fails, its fault in `schemas.faults` if it has one, and what it is worth.
+
+    Args:
+        fault: key of FAULTS; empty if the check cannot name the cause.
+        disproves: the pose is certainly wrong and must not be used, not only unproved.
+        error: by how much the pose would be wrong if the check is right: it holds a record only where that
+            matters against its limits. None = nobody knows, so that it always holds.
+        covariance: of the pose that would be right then, as left perturbation [rad, m]; None where the check
+            fails from three sigmas on in all that it can show, so that it knows the error to a third.
+        margin: 1 = far inside of its limit, 0 = at it; below 0 it failed.
+        of_sigma: if it fails, the pose may still be within its sigma, but the sigma is too large.
+    """
+
+    sentence: str
+    fault: str = ""
+    disproves: bool = False
+    error: Change | None = None
+    covariance: Float[np.ndarray, "6 6"] | None = field(default=None, compare=False)
+    margin: float = -1.0
+    of_sigma: bool = False
+
+    def __post_init__(self) -> None:
+        assert not self.fault or self.fault in FAULTS, self.fault
+
+
+def change_of(change: Iterable[float]) -> Change:
+    """Six numbers as a change."""
+    rx, ry, rz, x, y, z = (float(v) for v in change)
+    return rx, ry, rz, x, y, z
+
+
+def faults_of(checks: Iterable[Check]) -> list[str]:
+    """Faults of the checks, each once, in order."""
+    return list(dict.fromkeys(check.fault for check in checks if check.fault))

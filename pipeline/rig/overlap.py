@@ -16,8 +16,7 @@ from jaxtyping import Bool, Float
 from pipeline.rig.cameras import Camera
 from pipeline.rig.graph import Edge, RigGraph, Sensor, edge_between, possible_edges
 from pipeline.rig.prior import RigPrior
-from pipeline.rig.se3 import exp_so3, inverse, transform_points
-from pipeline.rig.spherical import to_spherical
+from pipeline.rig.se3 import exp_so3, inverse, to_spherical, transform_points
 
 __all__ = [
     "FRAMES",

@@ -59,7 +59,7 @@ class RigPrior:
         T: transforms of the stars, by (parent, child).
         sigmas: sigma of each sensor's mounting: rotation [rad] and translation [m], isotropic about the
             sensor.
-        is_base_loose: no sensor is mounted on the vehicle frame, which the day places (`edges/travel_base`).
+        is_base_loose: no sensor is mounted on the vehicle frame, which the day places (`edges/sweep_travel`).
     """
 
     nodes: tuple[Sensor, ...]

@@ -6,6 +6,10 @@
 Source: Sola, Deray, Atchuthan 2018, "A micro Lie theory for state estimation in robotics", section IV and
 appendix D (their twist is translation first; here rotation comes first). SciPy turns vectors, quaternions and twists
 into matrices and back; it has neither adjoints nor covariances of composed and inverted poses.
+
+A change is (rotation vector, shift of the child's origin), both along the axes of the parent frame. Unlike the twist of
+the left perturbation, its translation is the plain difference of the columns tx_m, ty_m, tz_m: a sensor that only
+rotated in its bracket has no shift, for any lever arm.
 """
 
 from __future__ import annotations
@@ -16,19 +20,28 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 __all__ = [
     "adjoint",
+    "camera_direction_angles",
+    "change_between",
+    "change_covariance",
+    "change_jacobian",
+    "changed",
     "compose_covariance",
     "exp_se3",
     "exp_so3",
     "from_quaternion",
     "from_rotation_translation",
+    "from_spherical",
     "hat",
     "inverse",
     "log_se3",
     "log_so3",
     "perturb_exactly",
     "rotation_angle_rad",
+    "spherical_jacobian",
     "to_quaternion",
+    "to_spherical",
     "transform_points",
+    "wrap_angle",
 ]
 
 
@@ -151,3 +164,74 @@ def _rotations(R: np.ndarray) -> Rotation:
 def _rows(values: np.ndarray, *shape: int) -> np.ndarray:
     """A copy with one axis of rows, which SciPy computes in C; it refuses arrays that are read-only."""
     return np.array(values, np.float64).reshape(-1, *shape)
+
+
+def change_between(
+    T_before: Float[np.ndarray, "*#batch 4 4"], T_after: Float[np.ndarray, "*#batch 4 4"]
+) -> Float[np.ndarray, "*batch 6"]:
+    """Change (rx ry rz [rad], tx ty tz [m]) from one estimate of T_parent_child to another."""
+    rotation = log_so3(T_after[..., :3, :3] @ np.swapaxes(T_before[..., :3, :3], -1, -2))
+    return np.concatenate([rotation, T_after[..., :3, 3] - T_before[..., :3, 3]], axis=-1)
+
+
+def changed(
+    T: Float[np.ndarray, "*#batch 4 4"], change: Float[np.ndarray, "*#batch 6"]
+) -> Float[np.ndarray, "*batch 4 4"]:
+    """Apply a change to an estimate of T_parent_child; inverse of `change_between`."""
+    R = exp_so3(change[..., :3]) @ T[..., :3, :3]
+    return from_rotation_translation(R, T[..., :3, 3] + change[..., 3:])
+
+
+def change_jacobian(T: Float[np.ndarray, "*batch 4 4"]) -> Float[np.ndarray, "*batch 6 6"]:
+    """d(change)/d(xi) for a left perturbation exp(xi) T: t moves by rho + omega x t (first order)."""
+    J = np.broadcast_to(np.eye(6), (*T.shape[:-2], 6, 6)).copy()
+    J[..., 3:, :3] = -hat(T[..., :3, 3])
+    return J
+
+
+def change_covariance(
+    T: Float[np.ndarray, "*batch 4 4"], covariance: Float[np.ndarray, "*batch 6 6"]
+) -> Float[np.ndarray, "*batch 6 6"]:
+    """Covariance of (rotation vector, origin) of an estimate, given that of its left perturbation."""
+    J = change_jacobian(T)
+    return J @ covariance @ np.swapaxes(J, -1, -2)
+
+
+def to_spherical(points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+    """(azimuth, elevation [rad], range [m]), azimuth positive to the left, elevation upwards; 0, 0, 0 at the origin."""
+    x, y, z = np.moveaxis(points, -1, 0)
+    return np.stack([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y)), np.sqrt(x * x + y * y + z * z)], -1)
+
+
+def from_spherical(azimuth_elevation_range: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+    """Inverse of `to_spherical`."""
+    azimuth, elevation, range_m = np.moveaxis(azimuth_elevation_range, -1, 0)
+    c = range_m * np.cos(elevation)
+    return np.stack([c * np.cos(azimuth), c * np.sin(azimuth), range_m * np.sin(elevation)], -1)
+
+
+def spherical_jacobian(points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
+    """d(azimuth, elevation, range)/d(x, y, z); undefined on the z axis."""
+    x, y, z = np.moveaxis(points, -1, 0)
+    h2 = x * x + y * y
+    h, r2 = np.sqrt(h2), h2 + z * z
+    r, o = np.sqrt(r2), np.zeros_like(x)
+    return np.stack(
+        [
+            np.stack([-y / h2, x / h2, o], -1),
+            np.stack([-x * z / (h * r2), -y * z / (h * r2), h / r2], -1),
+            np.stack([x / r, y / r, z / r], -1),
+        ],
+        -2,
+    )
+
+
+def camera_direction_angles(points_camera: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
+    """(azimuth, elevation) [rad] of points in the optical frame, azimuth positive to the left, elevation upwards."""
+    x, y, z = np.moveaxis(points_camera, -1, 0)
+    return np.stack([np.arctan2(-x, z), np.arctan2(-y, np.hypot(x, z))], -1)
+
+
+def wrap_angle(angle: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
+    """The same angle in [-pi, pi)."""
+    return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)

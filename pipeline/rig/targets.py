@@ -15,8 +15,15 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.rig.cameras import Camera
-from pipeline.rig.se3 import exp_se3, inverse, transform_points
-from pipeline.rig.spherical import camera_direction_angles, from_spherical, to_spherical, wrap_angle
+from pipeline.rig.se3 import (
+    camera_direction_angles,
+    exp_se3,
+    from_spherical,
+    inverse,
+    to_spherical,
+    transform_points,
+    wrap_angle,
+)
 
 __all__ = [
     "DEFAULT_TARGETS",

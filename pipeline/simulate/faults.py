@@ -27,9 +27,8 @@ import numpy as np
 
 from pipeline.core.errors import ConfigError
 from pipeline.rig.cameras import Camera
-from pipeline.simulate.sensors.data_sheets import CameraSpec
 from pipeline.simulate.sensors.mounting import Mounted, Mounting, disturbed
-from pipeline.simulate.sensors.rig_spec import RigSpec, SensorSpec
+from pipeline.simulate.sensors.rig_spec import CameraSpec, RigSpec, SensorSpec
 from pipeline.simulate.sensors.rigs import RIGS
 from pipeline.simulate.sensors.semantics import SemanticsSpec
 

@@ -24,9 +24,8 @@ from pipeline.simulate.faults import (
     shaken,
 )
 from pipeline.simulate.logs.recording import FIRST_FRAME_S, PARTIAL, SUFFIXES, open_log, record_drive
-from pipeline.simulate.sensors.data_sheets import CameraSpec, RadarSpec
 from pipeline.simulate.sensors.mounting import Mounting, mounting_of
-from pipeline.simulate.sensors.rig_spec import RigSpec, SensorSpec
+from pipeline.simulate.sensors.rig_spec import CameraSpec, RadarSpec, RigSpec, SensorSpec
 from pipeline.simulate.sensors.rigs import rig_named
 from pipeline.simulate.sensors.simulated_frame import Setup
 from pipeline.simulate.world.casting import World

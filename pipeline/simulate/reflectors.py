@@ -1,6 +1,6 @@
 """The paper's controlled recording: a standing car and three trihedral corner reflectors on a level lot.
 
-The JSON next to the recording is the input of `boresight evaluate --reflectors`; pipeline/evaluate/picks.py
+The JSON next to the recording is the input of `boresight evaluate --reflectors`; pipeline/evaluate/recording.py
 describes its format. The truth is under `truth`, which evaluate does not read.
 
 Source: paper, section 2.1 (150 frames, positions picked by hand in each sensor's data) and figure 2.
@@ -21,8 +21,7 @@ from pipeline.rig.se3 import inverse, transform_points
 from pipeline.rig.topics import TOPICS
 from pipeline.simulate.faults import misread
 from pipeline.simulate.fleet import FleetSpec, mounting_on
-from pipeline.simulate.logs.frame_messages import messages_of
-from pipeline.simulate.logs.recording import open_log
+from pipeline.simulate.logs.recording import messages_of, open_log
 from pipeline.simulate.sensors.radar import Scan
 from pipeline.simulate.sensors.simulated_frame import Scene, Setup, frame_of, triggered_stamps
 from pipeline.simulate.world.casting import Moment, standing_of

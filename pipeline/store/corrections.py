@@ -1,4 +1,4 @@
-"""Mistakes of fleet.toml or of the recording that vehicles' last days met, with what corrects them."""
+"""Mistakes of fleet.toml or of recording on vehicles' last days, with what corrects them; sign-off of states."""
 
 from __future__ import annotations
 
@@ -6,12 +6,16 @@ from collections.abc import Mapping
 
 import pyarrow.compute as pc
 
+from pipeline.core.errors import ConfigError
+from pipeline.store.commits import commit_records
 from pipeline.store.current import current_rows
-from pipeline.store.partitions import Lake, days_after
-from pipeline.store.records import last_day, read_columns
+from pipeline.store.partitions import Lake, days_after, work_key
+from pipeline.store.records import last_day, read_columns, read_records
 from schemas.outcomes import OUTCOMES
+from schemas.sign_offs import SIGN_OFFS, SignOff
+from schemas.states import StateRow
 
-__all__ = ["correction_steps", "read_corrections"]
+__all__ = ["correction_steps", "read_corrections", "read_sign_offs", "sign"]
 
 _DAYS = 31  # a vehicle whose last day is older than the lake's by this has driven nothing to correct
 _NAMED = 3  # vehicles named before one correction
@@ -48,3 +52,21 @@ def correction_steps(mend: Mapping[str, str]) -> list[str]:
 def _step(what: str, vehicles: list[str]) -> str:
     more = f" and {len(vehicles) - _NAMED} more" if len(vehicles) > _NAMED else ""
     return f"{', '.join(vehicles[:_NAMED])}{more}: {what}; then run the night again."
+
+
+def read_sign_offs(lake: Lake, method: str, vehicle: str | None = None) -> list[SignOff]:
+    """Sign-offs of states of a method, the oldest first."""
+    found = sorted(read_records(lake, SIGN_OFFS, SignOff, vehicle=vehicle), key=lambda s: s.asserted_at)
+    return [s for s in found if s.method == method]
+
+
+def sign(lake: Lake, state: list[StateRow], name: str, note: str = "") -> None:
+    """Record that a person approved a vehicle's state; ConfigError without a state or a name."""
+    if not state or not name.strip():
+        raise ConfigError(
+            "command line", "sign-off", "needs a state of the vehicle, and the name of a person"
+        )
+    of, count = state[0], len(read_sign_offs(lake, state[0].method, state[0].vehicle))
+    about = {"vehicle": of.vehicle, "day": of.day, "method": of.method, "state_key": of.work_key}
+    key = work_key("sign-off", "", f"{of.vehicle} {count}", [of.work_key, name, note])  # a row each time
+    commit_records(lake, SIGN_OFFS, [SignOff(**about, signed_by=name, note=note, work_key=key)])

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from jaxtyping import Float
 
-from pipeline.rig.edges import pose_of
+from pipeline.rig.graph import pose_of
 from pipeline.rig.targets import DEFAULT_TARGETS
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord
 from schemas.columns import TableSchema

@@ -23,7 +23,7 @@ from deltalake import DeltaTable, Schema, WriterProperties
 from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundError
 
 from pipeline.core.errors import DamagedLogError, OtherVersionError
-from pipeline.store.parquet_file import opened_parquet
+from pipeline.store.files import opened_parquet
 from pipeline.store.partitions import Lake
 from schemas.columns import TableSchema
 from schemas.versions import CODE_VERSION

@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipeline.core.errors import CollectedError, ContractError, DamagedError, OtherVersionError
-from pipeline.store.parquet_file import opened_parquet
+from pipeline.store.files import opened_parquet
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.rows import from_table, to_table
 from schemas.columns import TableSchema

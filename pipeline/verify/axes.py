@@ -25,10 +25,9 @@ from scipy.stats import norm
 
 from pipeline.core.config import VerifyConfig
 from pipeline.core.stage_work import Probes
-from pipeline.rig.changes import change_between, change_covariance
-from pipeline.rig.edges import edge_of, words_of
+from pipeline.rig.graph import edge_of, words_of
 from pipeline.rig.kinds import KIND_OF_EDGE
-from pipeline.rig.se3 import adjoint, inverse, log_se3
+from pipeline.rig.se3 import adjoint, change_between, change_covariance, inverse, log_se3
 from pipeline.rig.targets import DEFAULT_TARGETS, target_jacobian, target_sigmas
 from pipeline.store.current import prior_of, targets_of, transform_of
 from pipeline.verify.one_axis import AxisCheck, AxisLimits, HeldOut, checked

@@ -15,8 +15,7 @@ from pipeline.audit.days import PairDays
 from pipeline.audit.estimates import COLUMNS, estimates_of
 from pipeline.calibrate.pose_rows import poses_of_records
 from pipeline.calibrate.records import Inputs
-from pipeline.rig.edges import pose_columns
-from pipeline.rig.graph import Edge
+from pipeline.rig.graph import Edge, pose_columns
 from pipeline.rig.se3 import adjoint, exp_se3, from_rotation_translation, inverse
 from pipeline.store.partitions import Partition
 from pipeline.store.rows import to_table

@@ -8,11 +8,9 @@ import pytest
 
 from pipeline.audit.days import PairDays
 from pipeline.audit.scan import alike
-from pipeline.audit.shifts import Whitened
-from pipeline.audit.vehicle import independent_edges
+from pipeline.audit.vehicle import Whitened, independent_edges
 from pipeline.rig.attribution import PairShift, attribute
-from pipeline.rig.edges import EDGE_OF_PAIR
-from pipeline.rig.graph import BASE, Edge, Sensor, edge_between
+from pipeline.rig.graph import BASE, EDGE_OF_PAIR, Edge, Sensor, edge_between
 from pipeline.rig.se3 import adjoint, exp_se3, from_rotation_translation, inverse
 from tests.audit.fleet_records import days_of, vehicle_records
 

@@ -11,9 +11,8 @@ from pipeline.core.config import AuditConfig, FleetConfig
 from pipeline.core.errors import ConfigError
 from pipeline.core.stage_work import Task, Window
 from pipeline.core.stages import AUDIT
-from pipeline.rig.changes import change_between
-from pipeline.rig.edges import pose_columns
-from pipeline.rig.se3 import exp_so3, from_rotation_translation
+from pipeline.rig.graph import pose_columns
+from pipeline.rig.se3 import change_between, exp_so3, from_rotation_translation
 from pipeline.store.commits import commit_records
 from pipeline.store.current import current_drift, transform_of
 from pipeline.store.records import read_records

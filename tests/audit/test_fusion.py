@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.audit.fusion import LEAST_SCATTER, Mount, PoseDays, fuse
-from pipeline.rig.changes import change_between, change_covariance, change_jacobian, changed
-from pipeline.rig.se3 import exp_se3
+from pipeline.rig.se3 import change_between, change_covariance, change_jacobian, changed, exp_se3
 
 PRIOR = np.diag([np.radians(2.0) ** 2] * 3 + [0.05**2] * 3)
 NOISE = np.array([*np.radians([0.8, 0.1, 0.08]), 0.03, 0.03, 0.02])

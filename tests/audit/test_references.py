@@ -10,7 +10,7 @@ from pipeline.audit.estimates import day_name as name_of
 from pipeline.audit.references import read_kept
 from pipeline.core.stage_work import Task, Window
 from pipeline.core.stages import AUDIT, STATE
-from pipeline.rig.edges import EDGE_OF_PAIR
+from pipeline.rig.graph import EDGE_OF_PAIR
 from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake
 from pipeline.store.records import read_records

@@ -15,9 +15,9 @@ from pipeline.core.stage_work import Task, Window
 from pipeline.core.stages import AUDIT, STATE
 from pipeline.export.lake import pairs_of
 from pipeline.store.commits import commit_records
+from pipeline.store.corrections import read_sign_offs
 from pipeline.store.current import transform_of
 from pipeline.store.partitions import Lake
-from pipeline.store.sign_offs import read_sign_offs
 from schemas.calibrations import CALIBRATIONS
 from schemas.poses import POSES
 from schemas.service_events import SERVICE_EVENTS, ServiceEvent

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from pipeline.audit.status import decide_status
+from pipeline.audit.findings import decide_status
 from schemas.calibrations import DOF_NAMES, FRAMES_OF_PAIR, PAIRS
 from schemas.drift import DriftFinding, status_of
 

@@ -5,9 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from pipeline.rig.changes import change_covariance
 from pipeline.rig.estimates import Prior
-from pipeline.rig.se3 import exp_se3, exp_so3, from_rotation_translation, to_quaternion
+from pipeline.rig.se3 import change_covariance, exp_se3, exp_so3, from_rotation_translation, to_quaternion
 from schemas.calibrations import CalibrationRecord
 from tests.benchmarks.studies.metrics import measure, within
 from tests.benchmarks.studies.run import coverage

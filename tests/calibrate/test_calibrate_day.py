@@ -8,8 +8,7 @@ import pytest
 from pipeline.calibrate.records import environment_of
 from pipeline.core.config import FleetConfig
 from pipeline.core.errors import ConfigError
-from pipeline.rig.changes import change_between
-from pipeline.rig.se3 import from_quaternion
+from pipeline.rig.se3 import change_between, from_quaternion
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS, PAIRS, CalibrationRecord

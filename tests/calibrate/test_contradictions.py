@@ -7,8 +7,7 @@ import pytest
 
 from pipeline.calibrate.records import Inputs
 from pipeline.core.config import FleetConfig
-from pipeline.rig.checks import Check
-from pipeline.rig.estimates import PairEstimate, Prior, Solution
+from pipeline.rig.estimates import Check, PairEstimate, Prior, Solution
 from pipeline.rig.se3 import exp_se3, exp_so3, from_rotation_translation, log_se3
 from pipeline.rig.targets import errors_at_targets
 from pipeline.store.current import transform_of

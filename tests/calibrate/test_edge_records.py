@@ -9,11 +9,10 @@ import pytest
 from pipeline.calibrate.edges.radar_base import estimate_radar_base
 from pipeline.calibrate.judging import EdgeJudging
 from pipeline.calibrate.records import Inputs, record_of_edge
-from pipeline.rig.changes import change_between
 from pipeline.rig.estimates import EdgeEvidence, OtherScenes
 from pipeline.rig.graph import BASE, Edge, Sensor
 from pipeline.rig.prior import RigPrior
-from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
+from pipeline.rig.se3 import change_between, exp_so3, from_rotation_translation, inverse
 from pipeline.store.partitions import Partition
 from tests.calibrate.edges.test_radar_base import ALL, EDGE, STAMPS, day, mounted
 from tests.makers.written_logs import fleet_config

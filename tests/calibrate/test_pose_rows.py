@@ -11,12 +11,10 @@ from pipeline.calibrate.records import Inputs
 from pipeline.calibrate.rig_day import WrongPrior, wrong_priors
 from pipeline.calibrate.verify.verdict import Verdict
 from pipeline.core.config import ChecksConfig, VerifyConfig
-from pipeline.rig.changes import change_covariance, change_jacobian, changed
-from pipeline.rig.checks import Check
-from pipeline.rig.estimates import EdgeEvidence, PairEstimate
+from pipeline.rig.estimates import Check, EdgeEvidence, PairEstimate
 from pipeline.rig.graph import RigGraph, Sensor, edge_between
 from pipeline.rig.prior import Extrinsics, RigPrior
-from pipeline.rig.se3 import from_rotation_translation
+from pipeline.rig.se3 import change_covariance, change_jacobian, changed, from_rotation_translation
 from pipeline.store.partitions import Partition
 from schemas.calibrations import CalibrationRecord
 from tests.makers.radar_scenes import T_LIDAR_RADAR

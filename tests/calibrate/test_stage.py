@@ -6,7 +6,7 @@ import pytest
 from pipeline.calibrate.stage import accepted_before, three_sensors
 from pipeline.core.config import FleetConfig
 from pipeline.core.errors import SolveError
-from pipeline.rig.edges import EDGE_OF_PAIR
+from pipeline.rig.graph import EDGE_OF_PAIR
 from pipeline.rig.overlap import overlaps_of
 from pipeline.rig.se3 import to_quaternion
 from pipeline.store.partitions import Lake, Partition

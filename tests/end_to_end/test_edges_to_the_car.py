@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.core.config import load_fleet
-from pipeline.rig.changes import change_between
-from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
+from pipeline.rig.se3 import change_between, exp_so3, from_rotation_translation, inverse
 from pipeline.simulate.fleet import FleetSpec
 from pipeline.store.current import transform_of
 from pipeline.store.partitions import Lake

@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from pipeline.rig.edges import pose_columns
+from pipeline.rig.graph import pose_columns
 from pipeline.rig.se3 import exp_so3
 from pipeline.simulate.fleet import FleetSpec
 from pipeline.simulate.reflectors import simulate_reflectors

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.core.errors import ConfigError
-from pipeline.evaluate.picks import find_again, read_reflectors
+from pipeline.evaluate.recording import find_again, read_reflectors
 
 CAMERA = {
     "model": "plumb_bob",

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.evaluate.reflectors import find_in_lidar, find_in_radar, robust_mean
-from pipeline.rig.se3 import exp_so3
-from pipeline.rig.spherical import from_spherical
+from pipeline.rig.se3 import exp_so3, from_spherical
 
 EDGE_M = 0.35
 

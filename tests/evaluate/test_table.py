@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.evaluate.comparison import compare, current_runs
 from pipeline.evaluate.table import as_markdown, as_parquet, table_rows
-from pipeline.rig.edges import pose_columns
+from pipeline.rig.graph import pose_columns
 from pipeline.rig.se3 import inverse, transform_points
 from pipeline.rig.targets import DEFAULT_TARGETS, Picks, PickUncertainty
 from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, CalibrationRecord

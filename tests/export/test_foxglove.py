@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.rig.cameras import Camera
-from pipeline.rig.edges import pose_columns
+from pipeline.rig.graph import pose_columns
 from pipeline.rig.se3 import exp_se3, inverse
 from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake, Partition

@@ -11,8 +11,7 @@ from pipeline.export.calibration import ExportedCalibration, ExportedPair, Frame
 from pipeline.export.files import write_files, written_files
 from pipeline.export.formats import FORMATS, format_named
 from pipeline.rig.day_prior import read_star
-from pipeline.rig.edges import words_of
-from pipeline.rig.graph import Sensor, tie
+from pipeline.rig.graph import Sensor, tie, words_of
 from pipeline.rig.se3 import inverse
 from tests.audit.test_many_sensors import RIGS
 from tests.makers.calibrations import CAMERA, random_transform

@@ -13,7 +13,7 @@ from pipeline.core.errors import ConfigError
 from pipeline.export.calibration import ExportedCalibration, ExportedPair, FrameNames, poses_of
 from pipeline.export.formats import format_named
 from pipeline.export.provenance import comment_lines
-from pipeline.rig.edges import edge_named, words_of
+from pipeline.rig.graph import edge_named, words_of
 from pipeline.rig.se3 import adjoint, exp_se3, inverse
 from pipeline.store.commits import commit_records
 from pipeline.store.current import transform_of

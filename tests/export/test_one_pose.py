@@ -16,10 +16,9 @@ from pipeline.export.calibration import ExportedCalibration, ExportedPair, Frame
 from pipeline.export.formats import FORMATS, format_named
 from pipeline.report.stage import write_day_page
 from pipeline.report.words import pose_text
-from pipeline.rig.changes import change_covariance
-from pipeline.rig.edges import edge_named, words_of
+from pipeline.rig.graph import edge_named, words_of
 from pipeline.rig.prior import to_rows
-from pipeline.rig.se3 import exp_se3, inverse
+from pipeline.rig.se3 import change_covariance, exp_se3, inverse
 from pipeline.store.commits import commit_records
 from pipeline.store.moments import write_moments
 from pipeline.store.partitions import Lake, Partition

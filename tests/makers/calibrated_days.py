@@ -11,9 +11,8 @@ from pipeline.calibrate.methods import Solver
 from pipeline.calibrate.records import Inputs
 from pipeline.calibrate.rig_day import RigDay, calibrate_rig
 from pipeline.core.config import FleetConfig
-from pipeline.rig.edges import EDGE_OF_PAIR
 from pipeline.rig.estimates import Prior
-from pipeline.rig.graph import RigGraph, Sensor
+from pipeline.rig.graph import EDGE_OF_PAIR, RigGraph, Sensor
 from pipeline.rig.prior import RigPrior, middle_of
 from pipeline.rig.se3 import perturb_exactly
 from schemas.calibrations import CalibrationRecord

@@ -4,7 +4,7 @@ import numpy as np
 
 from pipeline.export.calibration import ExportedCalibration, ExportedPair
 from pipeline.rig.cameras import Camera
-from pipeline.rig.edges import EDGE_OF_PAIR
+from pipeline.rig.graph import EDGE_OF_PAIR
 from pipeline.rig.se3 import exp_se3
 
 SIGMA = np.array([1e-3, 2e-3, 3e-3, 0.01, 0.02, 0.03])

@@ -4,8 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse, transform_points
-from pipeline.rig.spherical import from_spherical, to_spherical
+from pipeline.rig.se3 import (
+    exp_so3,
+    from_rotation_translation,
+    from_spherical,
+    inverse,
+    to_spherical,
+    transform_points,
+)
 from tests.makers.solve_scenes import make_day
 
 GROUND_M, SPEED_MPS = -1.7, 14.0

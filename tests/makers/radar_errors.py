@@ -5,8 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.rig.se3 import inverse, transform_points
-from pipeline.rig.spherical import from_spherical, to_spherical
+from pipeline.rig.se3 import from_spherical, inverse, to_spherical, transform_points
 from schemas.observations import Observation
 
 _LEAST_HEIGHT_M = 0.3  # lower, a detection is as good as its own mirror image

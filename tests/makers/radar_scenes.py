@@ -8,8 +8,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse, transform_points
-from pipeline.rig.spherical import from_spherical, to_spherical
+from pipeline.rig.se3 import (
+    exp_so3,
+    from_rotation_translation,
+    from_spherical,
+    inverse,
+    to_spherical,
+    transform_points,
+)
 from schemas.observations import EDGE_ABOVE, Observation
 from tests.makers.solve_scenes import CAMERA, T_CAMERA_LIDAR, make_day
 

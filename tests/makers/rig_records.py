@@ -4,7 +4,7 @@ import datetime as dt
 
 import numpy as np
 
-from pipeline.rig.edges import edge_named, pose_columns
+from pipeline.rig.graph import edge_named, pose_columns
 from pipeline.rig.se3 import exp_se3, from_rotation_translation, inverse
 from schemas.calibrations import CalibrationRecord
 from schemas.poses import PoseRow

@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 
 from pipeline.rig.cameras import Camera
-from pipeline.rig.changes import changed
-from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse, transform_points
+from pipeline.rig.se3 import changed, exp_so3, from_rotation_translation, inverse, transform_points
 from schemas.calibrations import SENSORS
 from schemas.observations import EDGE_LEFT, EDGE_RIGHT, Observation
 

@@ -11,8 +11,8 @@ from pipeline.objective.ego_motion import EgoMotion
 from pipeline.perceive.ground import find_ground
 from pipeline.perceive.lidar import cluster_boxes, cluster_objects, sample_uniformly
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, perturb_exactly
-from pipeline.simulate.sensors.data_sheets import LidarSpec
 from pipeline.simulate.sensors.lidar import sweep_lidar
+from pipeline.simulate.sensors.rig_spec import LidarSpec
 from pipeline.simulate.world.casting import World
 from pipeline.simulate.world.drives import Drive
 

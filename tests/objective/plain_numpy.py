@@ -4,8 +4,7 @@ import numpy as np
 
 from pipeline.objective.radar.registration import RANGE_M, VIEW_MARGIN_RAD
 from pipeline.objective.radar.registration_neighbours import CUT
-from pipeline.rig.se3 import inverse, transform_points
-from pipeline.rig.spherical import to_spherical
+from pipeline.rig.se3 import inverse, to_spherical, transform_points
 
 
 def central_differences(function, unknowns, h=1e-6):

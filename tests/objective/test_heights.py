@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.objective.radar.heights import displaced_heights
-from pipeline.rig.se3 import inverse, transform_points
-from pipeline.rig.spherical import from_spherical, to_spherical
+from pipeline.rig.se3 import from_spherical, inverse, to_spherical, transform_points
 from tests.makers.doppler_streets import GROUND_M, T_LIDAR_RADAR, turned
 from tests.makers.radar_scenes import street_day
 

@@ -12,8 +12,7 @@ from pipeline.objective.radar.registration import (
     registration_frames,
 )
 from pipeline.objective.radar.registration_neighbours import _angle
-from pipeline.rig.se3 import exp_se3, inverse, transform_points
-from pipeline.rig.spherical import to_spherical
+from pipeline.rig.se3 import exp_se3, inverse, to_spherical, transform_points
 from tests.makers.radar_scenes import DT_S, SIGMA, T_LIDAR_RADAR, street_day
 from tests.objective import plain_numpy
 

@@ -5,7 +5,7 @@ import pytest
 
 from pipeline.core.config import PerceiveConfig
 from pipeline.perceive.depth_edges import lidar_edges
-from pipeline.rig.spherical import from_spherical, to_spherical
+from pipeline.rig.se3 import from_spherical, to_spherical
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
 
 CONFIG = PerceiveConfig()

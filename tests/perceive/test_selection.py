@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.perceive.selection import kth_smallest, median_of
+from pipeline.perceive.ground import kth_smallest, median_of
 
 
 @pytest.mark.parametrize("kinds", [3, 1000])

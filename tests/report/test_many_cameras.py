@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.core.config import load_fleet
 from pipeline.report.reading import drawn_records, names_drawn, other_cameras
 from pipeline.report.stage import write_day_page
-from pipeline.rig.edges import words_of
+from pipeline.rig.graph import words_of
 from pipeline.store.partitions import Lake
 from tests.audit.test_many_sensors import RIGS
 from tests.export.test_foxglove_rig import DAY, lake  # noqa: F401 - a fixture

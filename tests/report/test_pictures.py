@@ -11,9 +11,8 @@ from pipeline.core.sections import ReportConfig
 from pipeline.report.motion_view import draw_motion
 from pipeline.report.overlays import Extrinsics, Scene, Window, close_up, decode_image, front_view, whole_view
 from pipeline.report.pictures import top_bitmap, top_view
-from pipeline.report.reading import scene_of
+from pipeline.report.reading import choose_frames, choose_windows, scene_of
 from pipeline.report.residuals import MEASURES, boundary_distance_px, frame_residuals
-from pipeline.report.scenes import choose_frames, choose_windows
 from pipeline.rig.cameras import camera_of
 from pipeline.rig.se3 import exp_se3, exp_so3, from_rotation_translation, inverse, transform_points
 from schemas.calibrations import SENSORS

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.rig.range_image import EMPTY, channels_of, project, vote_of_neighbours
-from pipeline.rig.scan_rows import rows_of
+from pipeline.rig.scan_rows import EMPTY, channels_of, project, rows_of, vote_of_neighbours
 from tests.makers.range_scenes import DOWN, SIZE, UP, full_image, points_of
 
 

@@ -8,8 +8,7 @@ import pytest
 from pipeline.rig.graph import BASE, Sensor
 from pipeline.rig.overlap import find_edges, overlaps_of
 from pipeline.rig.prior import RigPrior, star_of
-from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
-from pipeline.rig.spherical import to_spherical
+from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse, to_spherical
 
 # Name, kind, azimuth that it looks to, half-width and half-height of its view [deg].
 VAN = [

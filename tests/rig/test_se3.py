@@ -12,12 +12,15 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from pipeline.rig import se3
-from pipeline.rig.changes import change_between, change_covariance
-from pipeline.rig.se3 import exp_se3, inverse, to_quaternion
-from pipeline.rig.spherical import (
+from pipeline.rig.se3 import (
     camera_direction_angles,
+    change_between,
+    change_covariance,
+    exp_se3,
     from_spherical,
+    inverse,
     spherical_jacobian,
+    to_quaternion,
     to_spherical,
     wrap_angle,
 )

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.rig.changes import changed
-from pipeline.rig.se3 import inverse, transform_points
+from pipeline.rig.se3 import changed, inverse, transform_points
 from pipeline.rig.targets import (
     DEFAULT_TARGETS,
     Picks,

@@ -3,7 +3,7 @@
 import re
 from itertools import permutations
 
-from pipeline.report.answers import ANSWERS
+from pipeline.report.words import ANSWERS
 from schemas.calibrations import STATUSES
 from schemas.drift import DRIFT_STATUSES
 from schemas.faults import FAULTS, in_words

@@ -8,8 +8,8 @@ import pytest
 from pipeline.core.rows import join_rows
 from pipeline.rig.se3 import inverse, transform_points
 from pipeline.simulate.sensors.camera import render, view_of
-from pipeline.simulate.sensors.data_sheets import LidarSpec
 from pipeline.simulate.sensors.lidar import sweep_lidar
+from pipeline.simulate.sensors.rig_spec import LidarSpec
 from pipeline.simulate.sensors.rigs import rig_named
 from pipeline.simulate.world.actors import HOLLOW, actor_mesh
 from pipeline.simulate.world.casting import Moment, chunk_mesh, standing_of

@@ -5,7 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from pipeline.rig.spherical import to_spherical
+from pipeline.rig.se3 import to_spherical
 from pipeline.simulate.sensors.camera import _exposed
 from pipeline.simulate.sensors.lidar import sweep_lidar
 from pipeline.simulate.sensors.radar import RadarErrors, scan_radar

@@ -4,8 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.rig.se3 import exp_so3, inverse, transform_points
-from pipeline.rig.spherical import from_spherical, to_spherical
+from pipeline.rig.se3 import exp_so3, from_spherical, inverse, to_spherical, transform_points
 from pipeline.simulate.sensors.radar import RadarErrors, scan_radar
 from pipeline.simulate.world.casting import _cast
 from pipeline.simulate.world.materials import LABELS

@@ -12,8 +12,8 @@ from pipeline.report.truth import read_truth
 from pipeline.rig.se3 import inverse, log_so3
 from pipeline.simulate.faults import parse_faults
 from pipeline.simulate.fleet import FleetSpec, simulate_fleet
-from pipeline.simulate.sensors.data_sheets import CameraSpec, LidarSpec
 from pipeline.simulate.sensors.mounting import Mounting, mounting_of
+from pipeline.simulate.sensors.rig_spec import CameraSpec, LidarSpec
 from pipeline.simulate.sensors.rigs import rig_named
 from pipeline.simulate.sensors.simulated_frame import Setup, frame_of, scene_of
 from pipeline.simulate.world.casting import World

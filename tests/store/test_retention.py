@@ -15,7 +15,7 @@ from pipeline.core.stage_work import Task, Work
 from pipeline.report.reading import has_frames
 from pipeline.store.moments import sensor_files
 from pipeline.store.partitions import Lake, Partition, days_after
-from pipeline.store.retention import collect
+from pipeline.store.repair import collect
 from pipeline.store.tables import read_columns
 from pipeline.store.views import frames_of, ingested, observations_of
 from schemas.captures import CAPTURES

@@ -17,12 +17,19 @@ from jaxtyping import Float
 from scipy.linalg import eigh
 
 from pipeline.calibrate.numerics.covariance import inverse_of_information
-from pipeline.rig.changes import change_between, change_covariance, change_jacobian
-from pipeline.rig.checks import Check
-from pipeline.rig.estimates import EDGE, EdgeEvidence, PairEstimate, Prior
+from pipeline.rig.estimates import EDGE, Check, EdgeEvidence, PairEstimate, Prior
 from pipeline.rig.graph import Edge
 from pipeline.rig.prior import Extrinsics
-from pipeline.rig.se3 import adjoint, exp_se3, hat, inverse, log_se3
+from pipeline.rig.se3 import (
+    adjoint,
+    change_between,
+    change_covariance,
+    change_jacobian,
+    exp_se3,
+    hat,
+    inverse,
+    log_se3,
+)
 
 __all__ = [
     "Equations",

@@ -14,11 +14,10 @@ from scipy.stats import chi2, norm
 from pipeline.calibrate.adjust.equations import Equations, LinearEdge, Rig, equations_at
 from pipeline.calibrate.numerics.covariance import OBSERVABLE, inverse_of_information
 from pipeline.calibrate.reasons import because
-from pipeline.rig.changes import change_jacobian
-from pipeline.rig.checks import Check
-from pipeline.rig.estimates import EdgeEvidence, common_part
+from pipeline.rig.estimates import Check, EdgeEvidence, common_part
 from pipeline.rig.graph import Edge, RigGraph, Sensor
 from pipeline.rig.prior import Extrinsics
+from pipeline.rig.se3 import change_jacobian
 
 __all__ = ["AdjustedEdge", "AdjustedRig", "AdjustedSensor", "adjust"]
 

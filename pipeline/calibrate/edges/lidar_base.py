@@ -22,10 +22,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.calibrate.edges.day_sources import DaySources
 from pipeline.calibrate.edges.on_base import (
     CHANGES,
     STANCE,
+    DaySources,
     Regression,
     Rows,
     Series,
@@ -40,8 +40,7 @@ from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.calibrate.numerics.nuisances import Considered, by_sensor, considered_covariance
 from pipeline.calibrate.reasons import because
 from pipeline.objective.ego_motion import EgoMotion
-from pipeline.rig.checks import Check
-from pipeline.rig.estimates import EDGE, EdgeEvidence, OtherScenes
+from pipeline.rig.estimates import EDGE, Check, EdgeEvidence, OtherScenes
 from pipeline.rig.graph import Edge
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse, transform_points
 

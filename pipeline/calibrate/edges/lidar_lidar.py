@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.calibrate.edges.day_sources import DaySources
+from pipeline.calibrate.edges.on_base import DaySources
 from pipeline.calibrate.edges.sweep_travel import Sweep, deskewed_again, sweeps_of
 from pipeline.calibrate.numerics.frame_blocks import Scenes, parts_of_day
 from pipeline.calibrate.numerics.nuisances import SWEEP_S, TYPICAL_RANGE_M, Considered, by_sensor
@@ -22,8 +22,7 @@ from pipeline.calibrate.reasons import because
 from pipeline.core.errors import SolveError
 from pipeline.objective.ego_motion import EgoMotion
 from pipeline.objective.sweep_registration import Surfaces, plane_equations
-from pipeline.rig.checks import Check
-from pipeline.rig.estimates import DayParts, EdgeEvidence, OtherScenes
+from pipeline.rig.estimates import Check, DayParts, EdgeEvidence, OtherScenes
 from pipeline.rig.graph import BASE, Edge
 from pipeline.rig.se3 import (
     adjoint,

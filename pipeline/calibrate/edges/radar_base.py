@@ -17,9 +17,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int64
 
-from pipeline.calibrate.edges.day_sources import DaySources
 from pipeline.calibrate.edges.on_base import (
     STANCE,
+    DaySources,
     Regression,
     Rows,
     Series,
@@ -36,8 +36,7 @@ from pipeline.calibrate.verify.motion_sources import compared_sources
 from pipeline.core.errors import SolveError
 from pipeline.objective.ego_motion import DopplerMotion, EgoMotion
 from pipeline.objective.radar.travel import TravelDirections, travel_directions
-from pipeline.rig.checks import Check
-from pipeline.rig.estimates import EdgeEvidence
+from pipeline.rig.estimates import Check, EdgeEvidence
 from pipeline.rig.graph import Edge
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
 from schemas.observations import Observation

@@ -4,8 +4,11 @@ The paper's conditions (section 4.5.1) per pair: camera-lidar needs sky, drivabl
 camera-radar needs sky, road users and dynamic radar clusters; lidar-radar needs drivable area and dynamic
 clusters. All need stamps within 5 ms, which the paper's methods keep even if ingest gates by motion. If too
 few frames meet them, the nearest ones are added, with a note: a narrow camera may never see 20 % of sky. For
-method `joint` the conditions are only counted; its frames are chosen to extend the coverage (image, azimuth,
-elevation, range).
+method `joint` the conditions are only counted; its frames are chosen to extend the coverage.
+
+Coverage is of cells, intervals of azimuth, elevation and range. The hundredth edge in a cell adds less than the first,
+so a set of frames is worth the sum over cells of log(1 + points); the frame that adds most comes next (submodular:
+greedy is within 1 - 1/e of the best choice, Nemhauser et al. 1978).
 """
 
 from __future__ import annotations
@@ -15,14 +18,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from pipeline.calibrate.numerics.frame_blocks import FEWEST_SCENES, scenes_of
 from pipeline.calibrate.reasons import because
-from pipeline.calibrate.select.coverage import choose_for_information, contents_of, missing_in_view
 from pipeline.core.config import SelectConfig
 from pipeline.core.errors import SolveError
 from pipeline.objective.stamp_gaps import motion_gates_ns
+from pipeline.rig.se3 import camera_direction_angles, to_spherical, transform_points
 from schemas.calibrations import FRAMES_OF_PAIR, PAIRS, SENSORS
 from schemas.faults import FAULTS
 from schemas.observations import Observation
@@ -38,14 +41,101 @@ __all__ = [
     "unmet_conditions",
 ]
 
+_AZIMUTH_RAD = np.radians([-35.0, -20.0, -7.0, 7.0, 20.0, 35.0])
+_ELEVATION_RAD = np.radians([-6.0, -1.5, 1.5])
+_RANGE_M = np.array([10.0, 20.0, 40.0])
+_CELLS = (len(_AZIMUTH_RAD) + 1) * (len(_ELEVATION_RAD) + 1) * (len(_RANGE_M) + 1)
+_SIDE_DEG, _FAR_M, _NEAR_M = 15.0, 40.0, 10.0
+_HARDLY_ANY = 0.02  # of all points of a kind
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """Points of one kind that a pair is calibrated from."""
+
+    name: str
+    words: str
+    camera_axes: bool = False  # seen from the camera by the prior; else from the sensor that measured them
+    far: bool = True  # worth having beyond _FAR_M
+
+
+_KINDS = {
+    "camera_lidar": (
+        _Kind("lidar_edge_xyz_m", "poles, signs or cars (depth edges)", camera_axes=True),
+        _Kind("marking_xyz_m", "road markings", camera_axes=True, far=False),
+    ),
+    "camera_radar": (_Kind("radar_track_xyz_m", "moving road users"),),
+    "lidar_radar": (
+        _Kind("radar_xyz_m", "radar detections"),
+        _Kind("radar_track_xyz_m", "moving road users"),
+    ),
+}
+
+
+def _contents_of(observations: Sequence[Observation], pair: str) -> Float[np.ndarray, "F C"]:
+    """Points of each frame in each cell, kinds one after another."""
+    return np.array([np.concatenate([_cells(o, kind) for kind in _KINDS[pair]]) for o in observations])
+
+
+def _most_informative(candidates: Sequence[int], contents: Float[np.ndarray, "F C"], count: int) -> list[int]:
+    """Of each of `count` equal stretches of the candidates, the frame that adds most to those chosen before."""
+    if len(candidates) <= count:
+        return sorted(candidates)
+    total, chosen = np.zeros(contents.shape[1]), []
+    for stretch in np.array_split(np.array(sorted(candidates)), count):
+        gain = (np.log1p(total + contents[stretch]) - np.log1p(total)).sum(axis=1)
+        chosen.append(int(stretch[np.argmax(gain)]))
+        total += contents[chosen[-1]]
+    return chosen
+
+
+def _missing_in_view(observations: Sequence[Observation], pair: str) -> list[str]:
+    """Nearly empty parts of the view, in words."""
+    missing = []
+    for kind in _KINDS[pair]:
+        views = [_seen(o, kind) for o in observations]
+        azimuth, _, distance = np.concatenate(views).T if views else np.zeros((3, 0))
+        if not len(azimuth):
+            missing.append(because("drive where", what=kind.words))
+            continue
+        parts = {
+            f"left of {_SIDE_DEG:.0f} deg": azimuth > np.radians(_SIDE_DEG),
+            f"right of -{_SIDE_DEG:.0f} deg": azimuth < -np.radians(_SIDE_DEG),
+            f"beyond {_FAR_M:.0f} m": (distance > _FAR_M) | (not kind.far),
+            f"nearer than {_NEAR_M:.0f} m": distance < _NEAR_M,
+        }
+        empty = [where for where, there in parts.items() if there.mean() < _HARDLY_ANY]
+        if empty:
+            missing.append(because("drive where, some", what=kind.words, where=" and ".join(empty)))
+    return missing
+
+
+def _cells(observation: Observation, kind: _Kind) -> Float[np.ndarray, " C"]:
+    azimuth, elevation, distance = _seen(observation, kind).T
+    index = np.searchsorted(_AZIMUTH_RAD, azimuth)
+    index = index * (len(_ELEVATION_RAD) + 1) + np.searchsorted(_ELEVATION_RAD, elevation)
+    index = index * (len(_RANGE_M) + 1) + np.searchsorted(_RANGE_M, distance)
+    return np.bincount(index, minlength=_CELLS).astype(float)
+
+
+def _seen(observation: Observation, kind: _Kind) -> Float[np.ndarray, "N 3"]:
+    """Azimuth, elevation [rad] and range [m]; for the camera only points ahead."""
+    points = np.asarray(getattr(observation, kind.name), np.float64).reshape(-1, 3)
+    o = observation
+    if kind.camera_axes and "camera_lidar" in o.priors:
+        points = transform_points(o.priors["camera_lidar"], points)
+        points = points[points[:, 2] > 1.0]
+        return np.column_stack([camera_direction_angles(points), np.linalg.norm(points, axis=1)])
+    return to_spherical(points)
+
+
 PAPER_SYNC_GATE_S = 0.005  # section 4.5.1
 
 MIN_FRAMES = 8  # fewer are not accepted: 10 frames already scatter by 0.1 deg (evidence on the real logs)
 # With so many, camera-lidar of method `joint` has a covariance (README); it is held.
 SHORTEST = 5
-_HARD = frozenset(
-    {"sync", "empty", *(f"no_{sensor}" for sensor in SENSORS)}
-)  # no method can use such a frame
+# No method can use such a frame.
+_HARD = frozenset({"sync", "empty", *(f"no_{sensor}" for sensor in SENSORS)})
 _SCARCE, _BRISK_MPS = 0.1, 5.0
 _BLOCKS_S = (10.0, 7.0, 5.0, 4.0, 3.0, 20.0)
 _JUDGING_BLOCKS = 4
@@ -99,19 +189,17 @@ def select_frames(
         if len(candidates) < least == SHORTEST:  # too few to hold any out: all fit, and the record is held
             judges, candidates = [], _few_of_each(usable, scene)
         ideal = [i for i in candidates if not reasons[i]]
-        contents = contents_of(observations, pair)
-        chosen = choose_for_information(ideal if paper else candidates, contents, config.frames)
+        contents = _contents_of(observations, pair)
+        chosen = _most_informative(ideal if paper else candidates, contents, config.frames)
         if paper and len(chosen) < config.frames:
             rest = sorted(set(candidates) - set(chosen), key=lambda i: (len(reasons[i]), i))
             fewest = rest[: max(0, 2 * (config.frames - len(chosen)))]
-            chosen += choose_for_information(fewest, contents, config.frames - len(chosen))
-            chosen = sorted(chosen)
+            chosen = sorted(chosen + _most_informative(fewest, contents, config.frames - len(chosen)))
         rejected[pair] = _count_rejected(reasons, held_out, chosen, paper=paper)
         if len(chosen) < least:
             refused[pair] = silent or SolveError(_too_few(pair, chosen, reasons, least))
             continue
-        fit[pair] = chosen
-        holdout[pair] = judges
+        fit[pair], holdout[pair] = chosen, judges
         passed[pair] = sum(1 for r in reasons if not r)
         notes[pair] = _notes(pair, passed[pair], [i for i in chosen if reasons[i]], len(chosen), paper=paper)
         missing[pair] = missing_content([observations[i] for i in chosen], pair)
@@ -160,11 +248,8 @@ def _apart(
 
 def _stamps_ns(observation: Observation, pair: str) -> tuple[int, int]:
     """Stamps of a pair's two sensors."""
-    of_kind = {
-        "camera": observation.camera_stamp_ns,
-        "lidar": observation.stamp_ns,
-        "radar": observation.radar_stamp_ns,
-    }
+    o = observation
+    of_kind = {"camera": o.camera_stamp_ns, "lidar": o.stamp_ns, "radar": o.radar_stamp_ns}
     first, second = FRAMES_OF_PAIR[pair]
     return of_kind[first], of_kind[second]
 
@@ -188,7 +273,7 @@ def missing_content(observations: Sequence[Observation], pair: str) -> list[str]
         missing.append(because("drive, camera"))
     if len(np.unique(scenes_of(observations))) < FEWEST_SCENES:
         missing.append(because("drive on"))
-    return missing + missing_in_view(observations, pair)
+    return missing + _missing_in_view(observations, pair)
 
 
 def _few_of_each(candidates: Sequence[int], scene: np.ndarray) -> list[int]:

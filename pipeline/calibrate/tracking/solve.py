@@ -23,15 +23,18 @@ from pipeline.calibrate.numerics.covariance import OBSERVABLE, posterior
 from pipeline.calibrate.numerics.nuisances import TRACKING_BIAS_RAD
 from pipeline.calibrate.reasons import because
 from pipeline.calibrate.tracking.association import (
+    AlignedBearings,
     Association,
+    Bearings,
     Shared,
-    Track,
+    align_bearings,
     associate,
     bearing_sigma_rad,
+    consistency,
     shared_sightings,
 )
-from pipeline.calibrate.tracking.bearings import AlignedBearings, Bearings, align_bearings, consistency
 from pipeline.calibrate.tracking.object_tracks import (
+    Track,
     box_centres,
     camera_tracks,
     lidar_tracks,
@@ -43,10 +46,8 @@ from pipeline.calibrate.tracking.object_tracks import (
 from pipeline.core.config import SolveConfig
 from pipeline.core.errors import SolveError
 from pipeline.core.results import Progress, silent
-from pipeline.rig.checks import Check
-from pipeline.rig.estimates import PairEstimate, Prior, Solution, common_of
-from pipeline.rig.se3 import compose_covariance, inverse, log_so3
-from pipeline.rig.spherical import to_spherical
+from pipeline.rig.estimates import Check, PairEstimate, Prior, Solution, common_of
+from pipeline.rig.se3 import compose_covariance, inverse, log_so3, to_spherical
 from schemas.calibrations import PAIRS
 from schemas.observations import Observation
 
@@ -108,28 +109,19 @@ def solve_tracking(
         usable = {o.frame_index for o in observations[pair]}
         rows = np.array([i for i, o in enumerate(frames) if o.frame_index in usable])
         try:
-            pairs[pair] = calibrate_pair(
-                pair, sensors[pair], prior, np.random.default_rng([seed, k]), frames=rows
-            )
+            rng = np.random.default_rng([seed, k])
+            pairs[pair] = calibrate_pair(pair, sensors[pair], prior, rng, frames=rows)
         except SolveError as err:
             failed_checks[pair].append(Check(err.reason, err.fault))
     failed = [pair for pair in pairs if pair in wanted and failed_checks[pair]]
     if failed and len(failed) == len(wanted & set(pairs)):
-        raise SolveError(
-            "; ".join(
-                f"{_SENSOR[pair]} against lidar: {check.sentence}"
-                for pair in failed
-                for check in failed_checks[pair]
-            )
-        )
+        why = (f"{_SENSOR[p]} against lidar: {check.sentence}" for p in failed for check in failed_checks[p])
+        raise SolveError("; ".join(why))
     pairs["camera_radar"] = _composed(pairs["camera_lidar"], pairs["lidar_radar"], prior)
     failed_checks["camera_radar"] = [*failed_checks["camera_lidar"], *failed_checks["lidar_radar"]]
     progress(3, 3, "done")
-    return Solution(
-        "tracking",
-        {p: pairs[p] for p in PAIRS},
-        failed_checks={p: why for p, why in failed_checks.items() if why},
-    )
+    checks = {p: found for p, found in failed_checks.items() if found}
+    return Solution("tracking", {p: pairs[p] for p in PAIRS}, failed_checks=checks)
 
 
 def calibrate_pair(

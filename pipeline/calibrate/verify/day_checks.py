@@ -15,13 +15,10 @@ from pipeline.calibrate.select.frames import Selection
 from pipeline.calibrate.verify.motion_sources import MotionFindings
 from pipeline.core.config import ChecksConfig, FleetConfig
 from pipeline.rig.attribution import PairShift, attribute
-from pipeline.rig.changes import change_between, change_jacobian
-from pipeline.rig.checks import Check
-from pipeline.rig.edges import EDGE_OF_PAIR
-from pipeline.rig.estimates import DayParts, PairEstimate, Prior, Solution
-from pipeline.rig.graph import BASE, Edge
+from pipeline.rig.estimates import Check, DayParts, PairEstimate, Prior, Solution
+from pipeline.rig.graph import BASE, EDGE_OF_PAIR, Edge
 from pipeline.rig.kinds import KIND_OF_EDGE
-from pipeline.rig.se3 import adjoint, inverse
+from pipeline.rig.se3 import adjoint, change_between, change_jacobian, inverse
 from schemas.calibrations import DOF_NAMES, PAIRS
 from schemas.observations import Observation
 from schemas.words import AXIS_NAMES

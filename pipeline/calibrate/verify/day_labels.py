@@ -11,8 +11,7 @@ from scipy.special import ndtr, stdtrit
 
 from pipeline.calibrate.numerics.frame_blocks import scene_blocks
 from pipeline.calibrate.reasons import because
-from pipeline.rig.checks import HARMLESS, Check
-from pipeline.rig.estimates import PairEstimate, Solution
+from pipeline.rig.estimates import HARMLESS, Check, PairEstimate, Solution
 from schemas.observations import Observation
 
 __all__ = ["DayLabels", "LabelOffset", "day_labels", "measure_label_offset"]

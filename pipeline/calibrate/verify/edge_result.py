@@ -10,11 +10,9 @@ from jaxtyping import Bool, Float
 
 from pipeline.calibrate.verify.target_accuracy import DIRECTIONS, Claim
 from pipeline.core.sections import SearchRange
-from pipeline.rig.changes import change_between, change_covariance, change_jacobian, changed
-from pipeline.rig.checks import Change, Check
-from pipeline.rig.estimates import PairEstimate
+from pipeline.rig.estimates import Change, Check, PairEstimate
 from pipeline.rig.kinds import KIND_OF_EDGE
-from pipeline.rig.se3 import adjoint, inverse
+from pipeline.rig.se3 import adjoint, change_between, change_covariance, change_jacobian, changed, inverse
 from pipeline.rig.targets import errors_at_targets, target_sigmas
 from schemas.calibrations import DOF_NAMES
 from schemas.words import AXIS_NAMES

@@ -13,9 +13,8 @@ from pipeline.calibrate.joint.camera_lidar.estimate import align_camera_lidar
 from pipeline.calibrate.reasons import because
 from pipeline.core.config import ChecksConfig, SolveConfig
 from pipeline.core.errors import SolveError
-from pipeline.rig.changes import change_between
-from pipeline.rig.checks import Check, change_of
-from pipeline.rig.estimates import PairEstimate, Prior
+from pipeline.rig.estimates import Check, PairEstimate, Prior, change_of
+from pipeline.rig.se3 import change_between
 from pipeline.rig.targets import errors_at_targets
 from schemas.observations import Observation
 

@@ -41,9 +41,15 @@ from pipeline.objective.radar.registration import (
     registration_frames,
 )
 from pipeline.objective.stamp_gaps import constant_gap_s, gaps_s
-from pipeline.rig.changes import change_jacobian
 from pipeline.rig.estimates import PairEstimate, Prior
-from pipeline.rig.se3 import exp_se3, exp_so3, from_rotation_translation, log_so3, rotation_angle_rad
+from pipeline.rig.se3 import (
+    change_jacobian,
+    exp_se3,
+    exp_so3,
+    from_rotation_translation,
+    log_so3,
+    rotation_angle_rad,
+)
 from schemas.observations import Observation
 
 __all__ = ["HeldOutScore", "held_out_score"]

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int64
 from pipeline.calibrate.reasons import because
 from pipeline.objective.ego_motion import is_same, motion_of
 from pipeline.objective.sweep_registration import arc_between, occupied_share, one_per_cell
-from pipeline.rig.checks import Check
+from pipeline.rig.estimates import Check
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, transform_points
 from schemas.observations import Observation
 

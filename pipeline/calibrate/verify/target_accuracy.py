@@ -47,11 +47,9 @@ from pipeline.calibrate.verify.held_out import HeldOutUpdate
 from pipeline.core.config import ChecksConfig
 from pipeline.core.rigs import CameraPrior
 from pipeline.rig.cameras import camera_of
-from pipeline.rig.checks import Check
-from pipeline.rig.estimates import Prior, Solution
+from pipeline.rig.estimates import Check, Prior, Solution
 from pipeline.rig.overlap import FRAMES, View, view_of_camera, view_of_clouds
-from pipeline.rig.se3 import hat, transform_points
-from pipeline.rig.spherical import from_spherical, to_spherical, wrap_angle
+from pipeline.rig.se3 import from_spherical, hat, to_spherical, transform_points, wrap_angle
 from pipeline.rig.targets import DEFAULT_TARGETS, target_jacobian, target_sigmas
 from schemas.calibrations import FRAMES_OF_PAIR
 from schemas.observations import Observation

@@ -20,7 +20,7 @@ from pipeline.calibrate.verify.edge_result import RANGE, EdgeResult, at_targets,
 from pipeline.calibrate.verify.held_out import HeldOutTest
 from pipeline.calibrate.verify.target_accuracy import Claim
 from pipeline.core.config import ChecksConfig
-from pipeline.rig.checks import Check, change_of, faults_of
+from pipeline.rig.estimates import Check, change_of, faults_of
 from pipeline.rig.kinds import KIND_OF_EDGE
 from schemas.words import AXIS_NAMES
 

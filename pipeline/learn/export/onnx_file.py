@@ -21,10 +21,9 @@ from torch.jit._trace import TracerWarning
 
 from pipeline.core.errors import ConfigError
 from pipeline.learn.infer.onnx_networks import UNFIT
-from pipeline.learn.network.calibration_network import CalibrationNetwork
-from pipeline.learn.network.exported_weights import WEIGHTS, weight_places
+from pipeline.learn.network.calibration_network import WEIGHTS, CalibrationNetwork, weight_places
 from pipeline.learn.network.views import RenderedView
-from pipeline.learn.sample.layout import (
+from pipeline.learn.sample.grid import (
     EVIDENCE,
     GRAPH_INPUTS,
     LIDAR_CHANNELS,

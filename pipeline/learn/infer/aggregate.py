@@ -18,8 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from pipeline.rig.estimates import PairEstimate, common_of
-from pipeline.rig.se3 import exp_se3, hat, inverse, log_se3, transform_points
-from pipeline.rig.spherical import from_spherical
+from pipeline.rig.se3 import exp_se3, from_spherical, hat, inverse, log_se3, transform_points
 
 __all__ = ["BIAS_SIGMA", "Answers", "day_estimate", "mean_answer", "measured_estimate", "twists_about"]
 

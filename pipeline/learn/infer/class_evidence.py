@@ -14,8 +14,7 @@ import numba
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from pipeline.learn.sample.grid import Grid
-from pipeline.learn.sample.layout import NEAR_M
+from pipeline.learn.sample.grid import NEAR_M, Grid
 from pipeline.rig.se3 import exp_se3
 from schemas.training import GRID_CLASSES
 

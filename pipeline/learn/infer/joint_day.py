@@ -11,8 +11,7 @@ from scipy.optimize import minimize
 
 from pipeline.learn.infer.aggregate import measured_estimate
 from pipeline.learn.infer.class_evidence import FrameEvidence, scores
-from pipeline.rig.checks import Check
-from pipeline.rig.estimates import PairEstimate
+from pipeline.rig.estimates import Check, PairEstimate
 from pipeline.rig.se3 import exp_se3, inverse, log_se3, rotation_angle_rad
 
 __all__ = [

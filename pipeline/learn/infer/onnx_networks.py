@@ -25,10 +25,8 @@ from pipeline.core.config import FleetConfig, LearnConfig, PrepareConfig
 from pipeline.core.errors import ConfigError, ModelError
 from pipeline.learn.infer.class_evidence import FrameEvidence
 from pipeline.learn.infer.vehicle_day import FrameAnswer
-from pipeline.learn.sample.camera_maps import class_likelihood
-from pipeline.learn.sample.frame_sample import About, sensor_row
-from pipeline.learn.sample.grid import Grid
-from pipeline.learn.sample.layout import EVIDENCE, NetworkConfig
+from pipeline.learn.sample.frame_sample import About, class_likelihood, sensor_row
+from pipeline.learn.sample.grid import EVIDENCE, Grid, NetworkConfig
 from pipeline.learn.sample.rendering import FrameSensors, frame_sensors, render_frame
 from pipeline.objective.paper.classes import labels_of
 from pipeline.rig.cameras import camera_of

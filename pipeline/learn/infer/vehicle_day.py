@@ -18,8 +18,7 @@ from pipeline.learn.infer.joint_day import Expected, JointDay, fitted_day
 from pipeline.learn.sample.clouds import own_velocity
 from pipeline.learn.sample.frame_sample import SampleRejectedError
 from pipeline.objective.stamp_gaps import constant_gap_s, gaps_s
-from pipeline.rig.checks import Check
-from pipeline.rig.estimates import PairEstimate, Prior, Solution
+from pipeline.rig.estimates import Check, PairEstimate, Prior, Solution
 from pipeline.rig.se3 import exp_se3, inverse, log_se3, rotation_angle_rad
 from schemas.calibrations import PAIRS
 from schemas.frames import Frame

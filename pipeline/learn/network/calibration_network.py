@@ -3,25 +3,90 @@
 `matching` computes correspondences explicitly and learns the appearance of classes, the sharpness of
 evidence, and residuals. `concat` is the paper's: encode, concatenate, fuse, regress. Both exist for all pairs
 (joint) or one pair.
+
+An exported file is the start of further training: shipped networks exist only in this form. A graph holds weights
+under numbers, transposed or folded into others. The file's metadata map them; the few small ones that are folded are
+stored there.
+
+Source: paper, figure 6 and "SSL-based method"; layer sizes are not given there and are chosen here.
 """
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+import onnx
 import torch
 from jaxtyping import Float, Int64
+from onnx import numpy_helper
 from torch import Tensor, nn
 
-from pipeline.learn.network.concat_network import ConcatCore
+from pipeline.core.errors import ModelError
+from pipeline.learn.network.encoders import standardised
 from pipeline.learn.network.matching_network import MatchingCore
-from pipeline.learn.network.outputs import CoreOutputs, Predictions
+from pipeline.learn.network.outputs import CoreOutputs, Heads, Predictions
 from pipeline.learn.network.views import NetworkInputs, RenderedView, render
-from pipeline.learn.sample.layout import NetworkConfig
+from pipeline.learn.sample.grid import CAMERA_CHANNELS, LIDAR_CHANNELS, PAIRS, RADAR_CHANNELS, NetworkConfig
 from pipeline.objective.differentiable.poses import inverse, transform_points
+from schemas.training import GRID_CLASSES
 
-__all__ = ["CalibrationNetwork", "build_network"]
+__all__ = ["WEIGHTS", "CalibrationNetwork", "ConcatCore", "build_network", "network_of_file", "weight_places"]
+
+_CHANNELS = {"camera": CAMERA_CHANNELS, "lidar": LIDAR_CHANNELS, "radar": RADAR_CHANNELS}
+_STD = 1e-2  # heads start near no correction
+
+
+class ConcatCore(nn.Module):
+    """Network on one rendered view, for the sensors of its pairs."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        grid, pairs, width = config.grid, config.estimated, config.width
+        channels = {name: _CHANNELS[name] for name in _CHANNELS if any(name in pair for pair in pairs)}
+        self.encoders = nn.ModuleDict({name: _encoder(c, width) for name, c in channels.items()})
+        self.fusion = nn.Sequential(
+            nn.Conv2d(4 * width * len(channels), 6 * width, 3, 2, 1),
+            nn.ReLU(),
+            nn.Conv2d(6 * width, 6 * width, 3, 2, 1),
+            nn.ReLU(),
+        )
+        # Where something is must survive: averages over 2 x 4 regions, as a product that every exporter knows.
+        rows, columns = -(-grid.height // 64), -(-grid.width // 64)
+        one_hot = torch.eye(rows * columns).reshape(-1, 1, rows, columns)
+        regions = nn.functional.adaptive_avg_pool2d(one_hot, (2, 4)).flatten(1)
+        self.register_buffer("regions", regions, persistent=False)
+        self.last = nn.Sequential(nn.Linear(6 * width * 8, config.hidden), nn.ReLU())
+        self.heads = Heads(config.hidden, pairs, _STD)
+
+    def forward(self, view: RenderedView) -> CoreOutputs:
+        """Corrections and log variances from the sensors' grids at the current guess."""
+        grids = {"camera": standardised(view.camera), "lidar": view.lidar_grid, "radar": view.radar_grid}
+        maps = self.fusion(torch.cat([encoder(grids[name]) for name, encoder in self.encoders.items()], 1))
+        fused = self.last((maps.flatten(2) @ self.regions).flatten(1))
+        found = self.heads(fused)
+        identity = torch.eye(4, device=fused.device).expand(len(fused), 4, 4)
+        start = self.heads.start.expand(len(fused), 6)
+        corrections = [found[pair][0] if pair in found else identity for pair in PAIRS]
+        log_variance = [start + found[pair][1] if pair in found else start for pair in PAIRS]
+        return CoreOutputs(torch.stack(corrections, 1), torch.stack(log_variance, 1))
+
+
+def _encoder(channels: int, width: int) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    sizes = (channels, width, 2 * width, 3 * width, 4 * width)
+    for inputs, outputs in pairwise(sizes):
+        layers += [
+            nn.Conv2d(inputs, outputs, 3, 2, 1, bias=False),
+            nn.GroupNorm(max(1, outputs // 8), outputs),
+            nn.ReLU(),
+        ]
+    return nn.Sequential(*layers)
 
 
 class CalibrationNetwork(nn.Module):
@@ -90,3 +155,54 @@ def build_network(config: NetworkConfig, seed: int = 0) -> CalibrationNetwork:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return CalibrationNetwork(config)
+
+
+WEIGHTS = "weights"  # key of the metadata
+Place = Mapping[str, Any]
+
+
+def weight_places(state: Mapping[str, Tensor], model: onnx.ModelProto) -> dict[str, Place]:
+    """Location of each weight in the graph: initializer and whether it is transposed; or its values."""
+    lying: dict[bytes, Place] = {}
+    for initializer in model.graph.initializer:
+        values = numpy_helper.to_array(initializer)
+        if values.ndim == 2:
+            lying[_digest(values.T)] = {"name": initializer.name, "turned": True}
+        lying[_digest(values)] = {"name": initializer.name, "turned": False}
+    found: dict[str, Place] = {}
+    for name, weight in state.items():
+        values = weight.detach().cpu().numpy()
+        found[name] = lying.get(_digest(values)) or {"values": values.ravel().tolist()}
+    return found
+
+
+def network_of_file(path: Path) -> CalibrationNetwork:
+    """The network of a file of `boresight export onnx`, on the CPU.
+
+    Raises:
+        ModelError: the file is older than 0.8.0, or its network has other classes.
+    """
+    try:
+        model = onnx.load(str(path))
+        metadata = {entry.key: entry.value for entry in model.metadata_props}
+        places: dict[str, Place] = json.loads(metadata[WEIGHTS])
+        config = NetworkConfig.of_json(metadata["network"])
+    except Exception as err:  # protobuf has its own exceptions, different by version
+        raise ModelError(str(path), "does not list its weights, so training cannot continue from it") from err
+    if (classes := json.loads(metadata.get("classes", "[]"))) != list(GRID_CLASSES):
+        problem = f"its classes are {', '.join(classes)}, those of table training {', '.join(GRID_CLASSES)}"
+        raise ModelError(str(path), problem)
+    held = {i.name: numpy_helper.to_array(i) for i in model.graph.initializer}
+    network = CalibrationNetwork(config)
+    state = network.state_dict()
+    for name, weight in state.items():
+        place = places[name]
+        found = np.array(place["values"], np.float32) if "values" in place else held[place["name"]]
+        state[name] = torch.tensor((found.T if place.get("turned") else found).reshape(tuple(weight.shape)))
+    network.load_state_dict(state)
+    return network.eval()
+
+
+def _digest(values: np.ndarray) -> bytes:
+    """Hash of the numbers in order: shapes of equal weights differ by axes of length one only."""
+    return np.ascontiguousarray(values, np.float32).tobytes()

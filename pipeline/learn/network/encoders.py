@@ -7,7 +7,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812 - the name that everybody uses
 
-from pipeline.learn.sample.layout import CAMERA_CHANNELS
+from pipeline.learn.sample.grid import CAMERA_CHANNELS
 
 __all__ = ["CameraEncoder", "LidarEncoder", "PointEncoder", "cell_values"]
 

@@ -14,7 +14,7 @@ from pipeline.learn.network.least_squares import Match
 from pipeline.learn.network.occupancy_matcher import OccupancyMatcher
 from pipeline.learn.network.outputs import ClassEvidence, CoreOutputs, Heads, pose_of_twist
 from pipeline.learn.network.views import RenderedView, grid_cells, sphere
-from pipeline.learn.sample.layout import (
+from pipeline.learn.sample.grid import (
     CAMERA_CHANNELS,
     LIDAR_CHANNELS,
     LIDAR_FEATURES,

@@ -10,8 +10,7 @@ from jaxtyping import Bool, Float, Int64, UInt8
 from torch import Tensor
 
 from pipeline.learn.batches.batch import TrainingBatch
-from pipeline.learn.sample.grid import Grid
-from pipeline.learn.sample.layout import CLASS_CONFIDENCE
+from pipeline.learn.sample.grid import CLASS_CONFIDENCE, Grid
 from pipeline.learn.sample.rendering import render_lidar, render_radar
 from pipeline.objective.differentiable.poses import transform_points
 from schemas.training import GRID_CLASSES, UNKNOWN_CLASS
@@ -93,7 +92,7 @@ def sensor_inputs(batch: TrainingBatch, grid: Grid) -> SensorInputs:
 
 
 def given_classes(grid_class: UInt8[Tensor, "B H W"]) -> Float[Tensor, "B C H W"]:
-    """`SensorInputs.classes` of stored classes, one per cell (inference has shares: `sample.camera_maps`)."""
+    """`SensorInputs.classes` of stored classes, one per cell (inference has shares: `sample.frame_sample`)."""
     count = len(GRID_CLASSES)
     known = (grid_class != UNKNOWN_CLASS)[:, None].float()
     hot = torch.stack([(grid_class == k).float() for k in range(count)], 1)

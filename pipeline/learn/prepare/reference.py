@@ -7,8 +7,8 @@ from dataclasses import replace
 from functools import partial
 
 from pipeline.learn.sample.frame_sample import Reference
-from pipeline.rig.edges import pose_of
 from pipeline.rig.estimates import Prior
+from pipeline.rig.graph import pose_of
 from pipeline.store.current import current_records, transform_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.records import read_records

@@ -13,8 +13,7 @@ from pipeline.core.config import PrepareConfig
 from pipeline.learn.sample.grid import Grid
 from pipeline.rig.estimates import Prior
 from pipeline.rig.scan_rows import rows_of
-from pipeline.rig.se3 import transform_points
-from pipeline.rig.spherical import camera_direction_angles, to_spherical
+from pipeline.rig.se3 import camera_direction_angles, to_spherical, transform_points
 from schemas.frames import Frame
 from schemas.observations import Observation
 from schemas.training import POINT_IS_EDGE, POINT_IS_GROUND

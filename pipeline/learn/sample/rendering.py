@@ -15,8 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32
 
 from pipeline.learn.sample.clouds import padded_rows
-from pipeline.learn.sample.grid import Grid
-from pipeline.learn.sample.layout import (
+from pipeline.learn.sample.grid import (
     CAMERA_CHANNELS,
     CLASS_CHANNELS,
     FEATURE_UNITS,
@@ -28,6 +27,7 @@ from pipeline.learn.sample.layout import (
     NEAR_M,
     OBJECT_POINTS,
     RADAR_POINTS,
+    Grid,
     NetworkConfig,
 )  # fmt: skip
 from pipeline.rig.se3 import transform_points

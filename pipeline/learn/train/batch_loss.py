@@ -13,10 +13,8 @@ from pipeline.learn.batches.batch import TrainingBatch
 from pipeline.learn.network.calibration_network import CalibrationNetwork
 from pipeline.learn.network.outputs import Predictions
 from pipeline.learn.network.views import NetworkInputs, crop, grid_cells, sensor_inputs, sphere
-from pipeline.learn.sample.grid import Grid
-from pipeline.learn.sample.layout import PAIRS
-from pipeline.learn.train.augment import Guess, mirrored, random_guess, turned_view
-from pipeline.learn.train.domain_randomisation import made_strange
+from pipeline.learn.sample.grid import PAIRS, Grid
+from pipeline.learn.train.domain_randomisation import Guess, made_strange, mirrored, random_guess, turned_view
 from pipeline.learn.train.frame_objective import (
     at_lag,
     frame_objective,

@@ -20,9 +20,8 @@ from torch import Tensor
 from pipeline.core.config import SolveConfig
 from pipeline.core.errors import ContractError
 from pipeline.learn.batches.batch import TrainingBatch
-from pipeline.learn.network.calibration_network import CalibrationNetwork
-from pipeline.learn.network.concat_network import ConcatCore
-from pipeline.learn.sample.layout import LIDAR_FEATURES, RADAR_FEATURES
+from pipeline.learn.network.calibration_network import CalibrationNetwork, ConcatCore
+from pipeline.learn.sample.grid import LIDAR_FEATURES, RADAR_FEATURES
 from pipeline.objective.differentiable.paper import (
     camera_radar_tensors,
     folded_tensors,

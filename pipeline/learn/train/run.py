@@ -20,16 +20,17 @@ from pipeline.core.errors import ConfigError, ContractError
 from pipeline.core.results import Progress, silent
 from pipeline.learn.batches.batch import TrainingBatch
 from pipeline.learn.batches.loader import TrainingLoader, load_split
-from pipeline.learn.network.calibration_network import CalibrationNetwork, build_network
-from pipeline.learn.network.exported_weights import network_of_file
+from pipeline.learn.network.calibration_network import CalibrationNetwork, build_network, network_of_file
 from pipeline.learn.prepare.inventory import require_sides
 from pipeline.learn.train.batch_loss import Passes, batch_loss
 from pipeline.learn.train.loop import (
     BEST,
     LAST,
     MetricsLog,
+    Processes,
     Run,
     TrainResult,
+    joined,
     load_checkpoint,
     read_metrics,
     run_loop,
@@ -37,7 +38,6 @@ from pipeline.learn.train.loop import (
     stop_signals,
 )
 from pipeline.learn.train.paper_objective import PaperFrames, with_paper_inputs
-from pipeline.learn.train.processes import Processes, joined
 from pipeline.learn.train.settings import TrainConfig
 from pipeline.store.partitions import Lake
 

@@ -12,8 +12,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from pipeline.core.config import read_toml, validated
-from pipeline.learn.sample.grid import Grid
-from pipeline.learn.sample.layout import PAIRS, NetworkConfig
+from pipeline.learn.sample.grid import PAIRS, Grid, NetworkConfig
 
 __all__ = [
     "PAIRS_OF",

@@ -27,8 +27,7 @@ from scipy.special import ndtr
 
 from pipeline.objective.radar.registration import rows_of_frames
 from pipeline.objective.radar.vehicle_boxes import median_of_rows
-from pipeline.rig.se3 import inverse, transform_points
-from pipeline.rig.spherical import to_spherical
+from pipeline.rig.se3 import inverse, to_spherical, transform_points
 from schemas.observations import Observation
 
 __all__ = ["Heights", "displaced_heights"]

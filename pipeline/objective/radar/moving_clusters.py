@@ -20,8 +20,7 @@ from pipeline.objective.radar.registration import robust_equations, rows_of_fram
 from pipeline.objective.radar.vehicle_boxes import median_of_rows
 from pipeline.objective.stamp_gaps import gaps_s, scan_to_image_s, turned
 from pipeline.rig.cameras import camera_of
-from pipeline.rig.se3 import inverse, transform_points
-from pipeline.rig.spherical import camera_direction_angles, wrap_angle
+from pipeline.rig.se3 import camera_direction_angles, inverse, transform_points, wrap_angle
 from schemas.observations import Observation
 
 __all__ = [

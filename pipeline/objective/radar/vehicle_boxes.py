@@ -17,8 +17,7 @@ from jaxtyping import Float, Int64
 from pipeline.objective.radar.registration import robust_equations
 from pipeline.objective.stamp_gaps import scan_to_image_s
 from pipeline.rig.cameras import camera_of
-from pipeline.rig.se3 import hat, transform_points
-from pipeline.rig.spherical import camera_direction_angles, from_spherical, to_spherical
+from pipeline.rig.se3 import camera_direction_angles, from_spherical, hat, to_spherical, transform_points
 from schemas.observations import Observation
 
 __all__ = [

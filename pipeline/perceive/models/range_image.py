@@ -17,7 +17,7 @@ from pipeline.core.errors import ModelOutputError
 from pipeline.perceive.ground import PointKind
 from pipeline.perceive.models.manifest import ModelFile, Section, read_manifest
 from pipeline.perceive.models.session import Session
-from pipeline.rig.range_image import EMPTY, channels_of, project, vote_of_neighbours
+from pipeline.rig.scan_rows import EMPTY, channels_of, project, vote_of_neighbours
 
 __all__ = ["POINT_LABEL_SETS", "RangeImageManifest", "RangeImageSegmenter"]
 

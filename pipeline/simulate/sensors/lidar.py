@@ -13,12 +13,11 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float, Float64
 
-from pipeline.rig.spherical import from_spherical
-from pipeline.simulate.sensors.data_sheets import LidarSpec
+from pipeline.rig.se3 import from_spherical
+from pipeline.simulate.sensors.rig_spec import LidarSpec
 from pipeline.simulate.world.casting import Hits, Moment
 from pipeline.simulate.world.drives import Motion
-from pipeline.simulate.world.materials import LABELS, TABLE, material
-from pipeline.simulate.world.textures import textures
+from pipeline.simulate.world.materials import LABELS, TABLE, material, textures
 
 __all__ = ["Sweep", "beams_of", "sweep_lidar"]
 

@@ -11,9 +11,8 @@ from jaxtyping import Float
 
 from pipeline.rig.cameras import Camera
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
-from pipeline.simulate.sensors.data_sheets import CameraSpec
 from pipeline.simulate.sensors.radar import RadarErrors
-from pipeline.simulate.sensors.rig_spec import RigSpec, SensorSpec, Triple
+from pipeline.simulate.sensors.rig_spec import CameraSpec, RigSpec, SensorSpec, Triple
 
 __all__ = ["Mounted", "Mounting", "disturbed", "mounting_of"]
 

@@ -19,9 +19,8 @@ import numpy as np
 from jaxtyping import Float
 
 from pipeline.core.rows import join_rows, take_rows
-from pipeline.rig.se3 import inverse, transform_points
-from pipeline.rig.spherical import from_spherical, to_spherical
-from pipeline.simulate.sensors.data_sheets import RadarSpec
+from pipeline.rig.se3 import from_spherical, inverse, to_spherical, transform_points
+from pipeline.simulate.sensors.rig_spec import RadarSpec
 from pipeline.simulate.world.casting import Moment
 from pipeline.simulate.world.drives import Motion
 from pipeline.simulate.world.materials import LABELS, TABLE, material

@@ -13,8 +13,15 @@ from typing import Any, Final
 import numpy as np
 
 from pipeline.core.errors import ConfigError
-from pipeline.simulate.sensors.data_sheets import CameraSpec, LidarSpec, RadarSpec
-from pipeline.simulate.sensors.rig_spec import RigSpec, SensorSpec, Sheet, Triple
+from pipeline.simulate.sensors.rig_spec import (
+    CameraSpec,
+    LidarSpec,
+    RadarSpec,
+    RigSpec,
+    SensorSpec,
+    Sheet,
+    Triple,
+)
 
 __all__ = ["RIGS", "rig_named"]
 

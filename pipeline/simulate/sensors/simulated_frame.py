@@ -10,11 +10,10 @@ import numpy as np
 from pipeline.rig.graph import Kind
 from pipeline.simulate.faults import DayFaults
 from pipeline.simulate.sensors.camera import RollingShutter, encode_jpeg, render, view_of
-from pipeline.simulate.sensors.data_sheets import CameraSpec, LidarSpec
 from pipeline.simulate.sensors.lidar import Sweep, sweep_lidar
 from pipeline.simulate.sensors.mounting import Mounting
 from pipeline.simulate.sensors.radar import Scan, scan_radar
-from pipeline.simulate.sensors.rig_spec import RigSpec, SensorSpec
+from pipeline.simulate.sensors.rig_spec import CameraSpec, LidarSpec, RigSpec, SensorSpec
 from pipeline.simulate.sensors.semantics import (
     Box,
     SemanticsSpec,

@@ -23,8 +23,14 @@ from pipeline.simulate.world.chunk import CHUNK_M, Chunk
 from pipeline.simulate.world.drives import Drive
 from pipeline.simulate.world.landscapes import LANDSCAPES, Landscape
 from pipeline.simulate.world.meshes import Mesh, placed
-from pipeline.simulate.world.plots import add_halls, add_plots, add_rows
-from pipeline.simulate.world.street import add_asphalt, add_motorway, add_street
+from pipeline.simulate.world.street import (
+    add_asphalt,
+    add_halls,
+    add_motorway,
+    add_plots,
+    add_rows,
+    add_street,
+)
 from pipeline.simulate.world.traffic import Actor, actors_at
 
 __all__ = ["Hits", "Moment", "ShadowMap", "Standing", "World", "chunk_mesh", "standing_of"]

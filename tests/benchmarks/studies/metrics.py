@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from pipeline.rig.changes import change_between, change_covariance
 from pipeline.rig.estimates import Prior
+from pipeline.rig.se3 import change_between, change_covariance
 from pipeline.rig.targets import errors_at_targets
 from pipeline.store.current import targets_of, transform_of
 from schemas.calibrations import CalibrationRecord

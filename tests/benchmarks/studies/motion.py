@@ -20,15 +20,13 @@ from typing import Any
 import numpy as np
 
 from pipeline.calibrate.edges.camera_base import solve
-from pipeline.calibrate.edges.day_sources import DaySources
-from pipeline.calibrate.edges.on_base import changes_by_left
+from pipeline.calibrate.edges.on_base import DaySources, changes_by_left
 from pipeline.core.config import load_fleet
 from pipeline.core.errors import SolveError
-from pipeline.rig.changes import change_between
 from pipeline.rig.day_prior import rig_prior
 from pipeline.rig.estimates import EDGE, EdgeEvidence
 from pipeline.rig.graph import BASE, Edge, Sensor
-from pipeline.rig.se3 import inverse
+from pipeline.rig.se3 import change_between, inverse
 from pipeline.simulate.fleet import FleetSpec, simulate_fleet
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import observations_of, perceived

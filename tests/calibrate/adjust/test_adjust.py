@@ -7,8 +7,7 @@ import pytest
 
 from pipeline.calibrate.adjust.equations import Rig, equations_at, left_jacobian_inverse
 from pipeline.calibrate.adjust.rig import adjust
-from pipeline.rig.checks import Check
-from pipeline.rig.estimates import EDGE, EdgeEvidence
+from pipeline.rig.estimates import EDGE, Check, EdgeEvidence
 from pipeline.rig.graph import RigGraph, Sensor, edge_between
 from pipeline.rig.prior import Extrinsics
 from pipeline.rig.se3 import compose_covariance, exp_se3, inverse, log_se3

@@ -7,13 +7,17 @@ import pytest
 
 from pipeline.calibrate.adjust.equations import evidence_of
 from pipeline.calibrate.adjust.rig import adjust
-from pipeline.rig.changes import change_between, change_covariance, change_jacobian, changed
-from pipeline.rig.checks import Check
-from pipeline.rig.edges import EDGE_OF_PAIR
-from pipeline.rig.estimates import EDGE, PairEstimate, Prior
-from pipeline.rig.graph import RigGraph
+from pipeline.rig.estimates import EDGE, Check, PairEstimate, Prior
+from pipeline.rig.graph import EDGE_OF_PAIR, RigGraph
 from pipeline.rig.prior import Extrinsics
-from pipeline.rig.se3 import exp_so3, from_rotation_translation
+from pipeline.rig.se3 import (
+    change_between,
+    change_covariance,
+    change_jacobian,
+    changed,
+    exp_so3,
+    from_rotation_translation,
+)
 
 CLOCK_S = 0.02
 AHEAD = from_rotation_translation(

@@ -5,15 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.calibrate.edges.camera_base import _expected, estimate_camera_base
-from pipeline.calibrate.edges.camera_travel import CameraTravel, camera_travel
+from pipeline.calibrate.edges.camera_base import CameraTravel, _expected, camera_travel, estimate_camera_base
 from pipeline.calibrate.edges.on_base import changes_by_left
 from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.core.errors import SolveError
 from pipeline.objective.ego_motion import EgoMotion
-from pipeline.rig.changes import change_between
 from pipeline.rig.graph import BASE, Edge, Sensor
-from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
+from pipeline.rig.se3 import change_between, exp_so3, from_rotation_translation, inverse
 from tests.makers.solve_scenes import make_day
 
 EDGE = Edge(Sensor("front", "camera"), BASE)

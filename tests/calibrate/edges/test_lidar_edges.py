@@ -12,10 +12,18 @@ from pipeline.calibrate.verify.held_out import paired_test
 from pipeline.core.errors import SolveError
 from pipeline.objective.ego_motion import EgoMotion
 from pipeline.objective.sweep_registration import Surfaces
-from pipeline.rig.changes import change_between, change_jacobian
 from pipeline.rig.graph import BASE, Edge, Sensor
-from pipeline.rig.se3 import adjoint, exp_se3, exp_so3, inverse, perturb_exactly, transform_points
-from pipeline.simulate.sensors.data_sheets import LidarSpec
+from pipeline.rig.se3 import (
+    adjoint,
+    change_between,
+    change_jacobian,
+    exp_se3,
+    exp_so3,
+    inverse,
+    perturb_exactly,
+    transform_points,
+)
+from pipeline.simulate.sensors.rig_spec import LidarSpec
 from tests.makers.swept_streets import AROUND, FORWARD, Mounted, chosen, pose, swept_streets
 
 EDGE = Edge(Sensor("top", "lidar"), BASE)

@@ -11,9 +11,15 @@ from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.calibrate.verify.day_checks import MOVED_SIGMAS, PART_FLOOR_RAD
 from pipeline.objective.ego_motion import DopplerMotion, EgoMotion
 from pipeline.objective.radar.travel import TravelDirections
-from pipeline.rig.changes import change_between, change_jacobian
 from pipeline.rig.graph import BASE, Edge, Sensor
-from pipeline.rig.se3 import adjoint, exp_so3, from_rotation_translation, inverse
+from pipeline.rig.se3 import (
+    adjoint,
+    change_between,
+    change_jacobian,
+    exp_so3,
+    from_rotation_translation,
+    inverse,
+)
 
 EDGE = Edge(Sensor("corner", "radar"), BASE)
 F, STEP_S, GAP_S, LATE_S, NOISE_MPS = 160, 0.5, 0.02, -0.018, 0.05

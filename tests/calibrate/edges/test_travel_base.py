@@ -6,14 +6,12 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.edges import camera_base, lidar_base, radar_base
-from pipeline.calibrate.edges.day_sources import DaySources
-from pipeline.calibrate.edges.travel_base import with_travel
+from pipeline.calibrate.edges.on_base import DaySources
+from pipeline.calibrate.edges.sweep_travel import with_travel
 from pipeline.calibrate.records import Inputs
-from pipeline.rig.changes import change_between
-from pipeline.rig.edges import EDGE_OF_PAIR
 from pipeline.rig.estimates import Prior
-from pipeline.rig.graph import BASE, RigGraph, Sensor, edge_between
-from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
+from pipeline.rig.graph import BASE, EDGE_OF_PAIR, RigGraph, Sensor, edge_between
+from pipeline.rig.se3 import change_between, exp_so3, from_rotation_translation, inverse
 from pipeline.store.partitions import Partition
 from schemas.observations import Observation
 from tests.makers.calibrated_days import perturbed, records_of_rows, rig_prior_of

@@ -13,9 +13,8 @@ from pipeline.core.config import SolveConfig
 from pipeline.objective.camera_lidar.label_width import OUTWARD, label_width_px, widened
 from pipeline.objective.camera_lidar.points import Points
 from pipeline.objective.camera_lidar.score import KernelSettings, prepare_terms
-from pipeline.rig.changes import change_between, change_jacobian
 from pipeline.rig.estimates import Prior
-from pipeline.rig.se3 import inverse, transform_points
+from pipeline.rig.se3 import change_between, change_jacobian, inverse, transform_points
 from schemas.observations import EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
 from tests.makers.traced_scenes import DENSE, T_TRUE, traced_day
 

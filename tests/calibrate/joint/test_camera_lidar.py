@@ -11,9 +11,14 @@ from pipeline.calibrate.joint.camera_lidar.profiles import TimeOffsetProfile
 from pipeline.calibrate.verify.day_checks import MOVED_SIGMAS, PART_FLOOR_RAD
 from pipeline.core.config import SolveConfig
 from pipeline.core.errors import SolveError
-from pipeline.rig.changes import change_between, change_covariance
 from pipeline.rig.estimates import Prior
-from pipeline.rig.se3 import exp_so3, from_rotation_translation, perturb_exactly
+from pipeline.rig.se3 import (
+    change_between,
+    change_covariance,
+    exp_so3,
+    from_rotation_translation,
+    perturb_exactly,
+)
 from tests.makers.camera_lidar import estimate_camera_lidar, prior_off_by, turn_and_sigma_deg
 from tests.makers.solve_scenes import make_day
 from tests.makers.traced_scenes import DENSE, SPARSE, T_TRUE, traced_day, without_labels

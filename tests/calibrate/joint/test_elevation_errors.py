@@ -16,7 +16,7 @@ from pipeline.calibrate.joint.lidar_radar.elevation_errors import (
     tempered,
     tilt_of,
 )
-from pipeline.calibrate.joint.part_turn import PartTurn
+from pipeline.calibrate.numerics.nuisances import PartTurn
 from pipeline.objective.radar.heights import Heights, HeightScores
 from pipeline.objective.radar.travel import TravelDirections
 from pipeline.rig.se3 import exp_so3, from_rotation_translation

@@ -30,8 +30,8 @@ from pipeline.core.sections import SearchRange
 from pipeline.objective.camera_lidar.points import Points, lidar_velocities
 from pipeline.objective.camera_lidar.score import Alignments, KernelSettings, prepare_terms
 from pipeline.rig.cameras import camera_of
-from pipeline.rig.changes import change_between
 from pipeline.rig.se3 import (
+    change_between,
     exp_so3,
     from_rotation_translation,
     inverse,

@@ -5,17 +5,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.calibrate.joint import camera_radar
-from pipeline.calibrate.joint.camera_radar import estimate_camera_radar
+from pipeline.calibrate.joint import solve as method_joint
 from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
+from pipeline.calibrate.joint.solve import estimate_camera_radar
 from pipeline.calibrate.verify.day_checks import MOVED_SIGMAS, PART_FLOOR_RAD
 from pipeline.core.config import SolveConfig
 from pipeline.core.errors import SolveError
 from pipeline.objective.radar.moving_clusters import camera_radar_cost
-from pipeline.rig.changes import change_between, change_covariance, changed
 from pipeline.rig.estimates import Prior
-from pipeline.rig.se3 import exp_se3, exp_so3, log_se3, perturb_exactly
-from pipeline.rig.spherical import from_spherical, to_spherical
+from pipeline.rig.se3 import (
+    change_between,
+    change_covariance,
+    changed,
+    exp_se3,
+    exp_so3,
+    from_spherical,
+    log_se3,
+    perturb_exactly,
+    to_spherical,
+)
 from tests.makers.radar_errors import bounced, elevated
 from tests.makers.radar_scenes import DT_S, GROUND_M, T_LIDAR_RADAR, street_day
 from tests.makers.solve_scenes import T_CAMERA_LIDAR
@@ -262,8 +270,8 @@ def test_an_azimuth_that_two_turns_explain_alike_is_left_open(day, monkeypatch):
     sure = seen(day, prior, CONFIG, np.random.default_rng(0))
     assert sure.diagnostics["rival_share"] < 0.82
     assert sure.observable[1]
-    scan = camera_radar._scan_azimuth
-    monkeypatch.setattr(camera_radar, "_scan_azimuth", lambda *a: (scan(*a)[0], 0.95))
+    scan = method_joint._scan_azimuth
+    monkeypatch.setattr(method_joint, "_scan_azimuth", lambda *a: (scan(*a)[0], 0.95))
     unsure = seen(day, prior, CONFIG, np.random.default_rng(0))
     assert not unsure.observable[1]
     assert unsure.observability[1] == 0

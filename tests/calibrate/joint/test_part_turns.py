@@ -15,7 +15,7 @@ from pipeline.calibrate.joint.camera_lidar.profiles import (
     profile_time_offset,
 )
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState, Scored
-from pipeline.calibrate.joint.part_turn import PartTurn
+from pipeline.calibrate.numerics.nuisances import PartTurn
 from pipeline.core.config import SolveConfig
 from pipeline.objective.camera_lidar.score import KernelSettings, prepare_terms
 from pipeline.rig.estimates import Prior

@@ -17,10 +17,16 @@ from pipeline.calibrate.joint.lidar_radar.search import dips
 from pipeline.core.config import SolveConfig
 from pipeline.objective.radar.moving_clusters import moving_clusters
 from pipeline.objective.radar.registration import registration_frames
-from pipeline.rig.changes import change_between, change_covariance
 from pipeline.rig.estimates import Prior
-from pipeline.rig.se3 import exp_so3, inverse, transform_points
-from pipeline.rig.spherical import from_spherical, to_spherical
+from pipeline.rig.se3 import (
+    change_between,
+    change_covariance,
+    exp_so3,
+    from_spherical,
+    inverse,
+    to_spherical,
+    transform_points,
+)
 from tests.makers.radar_scenes import DT_S, SIGMA, T_LIDAR_RADAR, street_day
 from tests.makers.solve_scenes import T_CAMERA_LIDAR
 

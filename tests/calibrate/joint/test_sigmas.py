@@ -22,9 +22,8 @@ import pipeline.objective
 import pipeline.perceive
 from pipeline.calibrate.joint.lidar_radar.estimate import estimate_lidar_radar
 from pipeline.core.config import SolveConfig
-from pipeline.rig.changes import change_between, change_covariance
 from pipeline.rig.estimates import Prior
-from pipeline.rig.se3 import perturb_exactly
+from pipeline.rig.se3 import change_between, change_covariance, perturb_exactly
 from tests.makers.camera_lidar import estimate_camera_lidar
 from tests.makers.radar_scenes import DT_S, T_LIDAR_RADAR, street_day
 from tests.makers.solve_scenes import T_CAMERA_LIDAR

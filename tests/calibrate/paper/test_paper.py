@@ -17,9 +17,8 @@ from pipeline.calibrate.paper_methods import (
 from pipeline.calibrate.select.triggers import exceeded, trigger_metrics
 from pipeline.core.config import SolveConfig, TriggerConfig
 from pipeline.core.errors import ConfigError
-from pipeline.rig.changes import changed
 from pipeline.rig.estimates import Prior
-from pipeline.rig.se3 import log_se3, perturb_exactly, rotation_angle_rad
+from pipeline.rig.se3 import changed, log_se3, perturb_exactly, rotation_angle_rad
 from pipeline.rig.targets import errors_at_targets
 from schemas.calibrations import METHODS as METHOD_NAMES
 from schemas.calibrations import PAIRS

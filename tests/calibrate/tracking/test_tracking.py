@@ -5,9 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.calibrate.tracking.association import Motion, Scan, Track, associate, follow, shared_sightings
-from pipeline.calibrate.tracking.bearings import Bearings
+from pipeline.calibrate.tracking.association import Bearings, associate, shared_sightings
 from pipeline.calibrate.tracking.object_tracks import (
+    Motion,
+    Scan,
+    Track,
+    follow,
     lidar_tracks,
     motions,
     moves_over_ground,
@@ -17,9 +20,8 @@ from pipeline.calibrate.tracking.object_tracks import (
 from pipeline.calibrate.tracking.solve import PairTracks, calibrate_pair, solve_tracking
 from pipeline.core.config import SolveConfig
 from pipeline.core.errors import SolveError
-from pipeline.rig.changes import changed
 from pipeline.rig.estimates import Prior
-from pipeline.rig.se3 import exp_so3, inverse, log_so3, transform_points
+from pipeline.rig.se3 import changed, exp_so3, inverse, log_so3, transform_points
 from schemas.calibrations import PAIRS
 from tests.makers.solve_scenes import HALF_SIZE_M, T_CAMERA_LIDAR, T_LIDAR_RADAR, draw, make_day
 

@@ -15,8 +15,8 @@ from pipeline.calibrate.verify.day_checks import (
     prior_alarms,
 )
 from pipeline.core.config import ChecksConfig, SolveConfig
-from pipeline.rig.edges import edge_named
 from pipeline.rig.estimates import DayParts, PairEstimate, Prior
+from pipeline.rig.graph import edge_named
 from pipeline.rig.se3 import exp_so3, from_rotation_translation, inverse
 from tests.makers.radar_scenes import T_LIDAR_RADAR, street_day
 from tests.makers.solve_scenes import T_CAMERA_LIDAR

@@ -11,10 +11,8 @@ from pipeline.calibrate.verify.held_out import found_elsewhere, held_out_place, 
 from pipeline.calibrate.verify.held_out_score import held_out_score
 from pipeline.calibrate.verify.target_accuracy import claims_of
 from pipeline.core.config import SolveConfig
-from pipeline.rig.changes import changed
 from pipeline.rig.estimates import PairEstimate, Prior
-from pipeline.rig.se3 import inverse, rotation_angle_rad
-from pipeline.rig.spherical import from_spherical
+from pipeline.rig.se3 import changed, from_spherical, inverse, rotation_angle_rad
 from pipeline.rig.targets import DEFAULT_TARGETS
 from tests.makers.radar_scenes import DT_S, GROUND_M, T_LIDAR_RADAR, street_day
 from tests.makers.solve_scenes import turned

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.calibrate.verify.motion_sources import compared_sources, sweep_motion
-from pipeline.rig.changes import changed
-from pipeline.rig.se3 import inverse, transform_points
+from pipeline.rig.se3 import changed, inverse, transform_points
 from schemas.calibrations import PAIRS
 from tests.makers.solve_scenes import T_LIDAR_RADAR, make_day
 

@@ -21,8 +21,7 @@ from pipeline.calibrate.verify.target_accuracy import (
 )
 from pipeline.core.rigs import CameraPrior, CameraTopics
 from pipeline.rig.estimates import PairEstimate, Prior, Solution
-from pipeline.rig.se3 import exp_se3, inverse, transform_points
-from pipeline.rig.spherical import from_spherical, to_spherical
+from pipeline.rig.se3 import exp_se3, from_spherical, inverse, to_spherical, transform_points
 from pipeline.rig.targets import DEFAULT_TARGETS, errors_at_targets, target_sigmas
 from schemas.calibrations import PAIRS
 from tests.makers.fleet_files import THREE_SENSORS

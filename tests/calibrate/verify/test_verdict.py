@@ -11,8 +11,7 @@ from pipeline.calibrate.verify.target_accuracy import DIRECTIONS, Claim
 from pipeline.calibrate.verify.verdict import Evidence, judge
 from pipeline.core.config import ChecksConfig
 from pipeline.core.sections import SearchRange
-from pipeline.rig.checks import HARMLESS, Check, change_of
-from pipeline.rig.estimates import PairEstimate, Prior
+from pipeline.rig.estimates import HARMLESS, Check, PairEstimate, Prior, change_of
 from pipeline.rig.se3 import exp_so3, from_rotation_translation
 from pipeline.rig.targets import DEFAULT_TARGETS
 

@@ -12,11 +12,9 @@ from pipeline.core.errors import ModelError
 from pipeline.learn.batches.batch import collate
 from pipeline.learn.export.onnx_file import export_onnx
 from pipeline.learn.infer.onnx_networks import OnnxNetwork
-from pipeline.learn.network.calibration_network import build_network
-from pipeline.learn.network.exported_weights import network_of_file, weight_places
+from pipeline.learn.network.calibration_network import build_network, network_of_file, weight_places
 from pipeline.learn.network.views import NetworkInputs, crop, given_classes, render, sensor_inputs
-from pipeline.learn.sample.grid import Grid
-from pipeline.learn.sample.layout import PAIRS, NetworkConfig
+from pipeline.learn.sample.grid import PAIRS, Grid, NetworkConfig
 from pipeline.learn.sample.rendering import frame_sensors
 from pipeline.rig.se3 import exp_so3, transform_points
 from schemas.training import GRID_CLASSES

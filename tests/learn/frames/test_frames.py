@@ -14,7 +14,7 @@ import torch
 
 import pipeline.store.object_store
 from jobs.cli import main
-from pipeline.learn.frames.images import undistortion_of
+from pipeline.learn.frames.nuscenes import undistortion_of
 from pipeline.learn.frames.torch_dataset import Frames
 from pipeline.rig.se3 import exp_se3, inverse, log_so3, to_quaternion
 from pipeline.store.commits import commit_records

@@ -16,7 +16,7 @@ from pipeline.learn.infer.onnx_networks import UNFIT, model_files, models_key, o
 from pipeline.learn.infer.vehicle_day import FrameAnswer, single_frame_solution, solve_by_networks
 from pipeline.learn.network.calibration_network import build_network
 from pipeline.learn.sample.frame_sample import SampleReason, SampleRejectedError
-from pipeline.learn.sample.layout import NetworkConfig
+from pipeline.learn.sample.grid import NetworkConfig
 from pipeline.rig.estimates import Prior
 from pipeline.rig.se3 import exp_se3, inverse, log_se3
 from pipeline.store.partitions import Lake, Partition

@@ -10,8 +10,7 @@ import torch
 from pipeline.learn.batches.batch import TrainingBatch, collate
 from pipeline.learn.network.calibration_network import build_network
 from pipeline.learn.network.views import NetworkInputs, crop, render, sensor_inputs
-from pipeline.learn.sample.grid import Grid
-from pipeline.learn.sample.layout import GRAPH_INPUTS, PAIRS, NetworkConfig
+from pipeline.learn.sample.grid import GRAPH_INPUTS, PAIRS, Grid, NetworkConfig
 from pipeline.learn.train.batch_loss import class_of_points, semantics_loss
 from pipeline.objective.differentiable.poses import transform_points
 from pipeline.objective.differentiable.projection import GridProjection

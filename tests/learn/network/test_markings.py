@@ -8,8 +8,14 @@ import torch
 
 from pipeline.learn.network.matching_network import MatchingCore, log_markings
 from pipeline.learn.network.outputs import pose_of_twist
-from pipeline.learn.sample.grid import Grid, grid_rays
-from pipeline.learn.sample.layout import LIDAR_CHANNELS, LIDAR_FEATURES, MARKED_POINTS, NetworkConfig
+from pipeline.learn.sample.grid import (
+    LIDAR_CHANNELS,
+    LIDAR_FEATURES,
+    MARKED_POINTS,
+    Grid,
+    NetworkConfig,
+    grid_rays,
+)
 from pipeline.learn.sample.rendering import mark_strength
 from pipeline.rig.se3 import exp_so3
 

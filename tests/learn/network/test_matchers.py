@@ -11,10 +11,8 @@ from pipeline.learn.network.least_squares import angular_jacobian, small_rotatio
 from pipeline.learn.network.matching_network import MatchingCore
 from pipeline.learn.network.occupancy_matcher import OccupancyMatcher, _away, _kernel
 from pipeline.learn.network.outputs import pose_of_twist
-from pipeline.learn.sample.grid import Grid, grid_rays
-from pipeline.learn.sample.layout import NetworkConfig
-from pipeline.rig.se3 import exp_se3, exp_so3
-from pipeline.rig.spherical import camera_direction_angles, to_spherical
+from pipeline.learn.sample.grid import Grid, NetworkConfig, grid_rays
+from pipeline.rig.se3 import camera_direction_angles, exp_se3, exp_so3, to_spherical
 
 GRID = Grid()
 

@@ -14,14 +14,17 @@ from jobs.cli import main
 from pipeline.core.errors import ConfigError, ContractError
 from pipeline.core.rows import take_rows
 from pipeline.learn.perception_training import TASKS
-from pipeline.learn.perception_training.lidar_labels import (
+from pipeline.learn.perception_training.lidar_semantics import (
     LABELS,
     UNLABELLED,
+    SweepLayout,
+    SweepTraining,
+    cut,
+    day_images,
     hidden_points,
     project_labels,
     standing_points,
 )
-from pipeline.learn.perception_training.lidar_semantics import SweepLayout, SweepTraining, cut, day_images
 from pipeline.learn.perception_training.radar_drivable import (
     BLOCKED,
     FREE,

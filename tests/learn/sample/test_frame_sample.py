@@ -7,22 +7,22 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.learn.sample.camera_maps import camera_features, stored_grid
 from pipeline.learn.sample.clouds import range_edges
 from pipeline.learn.sample.frame_sample import (
     About,
     Reference,
     SampleReason,
     SampleRejectedError,
+    camera_features,
     fingerprint,
     make_row,
     sensor_row,
+    stored_grid,
 )
 from pipeline.learn.sample.grid import grid_rays, resample_camera
 from pipeline.rig.cameras import Camera
 from pipeline.rig.estimates import Prior
-from pipeline.rig.se3 import transform_points
-from pipeline.rig.spherical import camera_direction_angles
+from pipeline.rig.se3 import camera_direction_angles, transform_points
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
 from schemas.training import GRID_CLASSES, NO_EDGE, POINT_IS_GROUND
 from tests.makers import solve_scenes, training_lakes

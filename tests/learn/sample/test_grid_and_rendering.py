@@ -6,7 +6,7 @@ import pytest
 from pipeline.learn.sample.grid import Grid, grid_rays, resample_camera
 from pipeline.learn.sample.rendering import NEARNESS_M, nearest_points, render_radar
 from pipeline.rig.cameras import Camera
-from pipeline.rig.spherical import camera_direction_angles
+from pipeline.rig.se3 import camera_direction_angles
 
 GRID = Grid()
 WIDE = np.array([[900.0, 0, 911.5], [0, 920, 469.5], [0, 0, 1]])

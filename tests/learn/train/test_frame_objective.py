@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from pipeline.learn.batches.batch import collate
-from pipeline.learn.sample.camera_maps import stored_grid
-from pipeline.learn.train.augment import mirrored, random_guess, turned_view
+from pipeline.learn.sample.frame_sample import stored_grid
 from pipeline.learn.train.batch_loss import class_of_points
+from pipeline.learn.train.domain_randomisation import mirrored, random_guess, turned_view
 from pipeline.learn.train.frame_objective import (
     at_lag,
     frame_objective,

@@ -12,8 +12,8 @@ from pipeline.learn.train.paper_objective import PaperFrames
 from pipeline.learn.train.run import TrainRequest, network_of_run, train
 from pipeline.learn.train.settings import PAIRS_OF, load_train_config
 from pipeline.objective.paper.classes import loop_loss, loop_transform
-from pipeline.rig.changes import changed
 from pipeline.rig.day_prior import read_prior
+from pipeline.rig.se3 import changed
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import observations_of
 from schemas.calibrations import PAIRS

@@ -10,7 +10,7 @@ from pipeline.core.config import load_fleet
 from pipeline.core.errors import ModelError, ModelOutputError
 from pipeline.perceive.models.detector import Detector, decode_head
 from pipeline.perceive.models.manifest import load_manifest
-from pipeline.perceive.models.segmenter import Segmenter
+from pipeline.perceive.models.source import Segmenter
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import observations_of
 from tests.makers.lakes import write_frames

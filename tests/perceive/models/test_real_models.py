@@ -11,7 +11,7 @@ from pipeline.core.models import manifest_text, named
 from pipeline.perceive.labels import road_user_name
 from pipeline.perceive.models.detector import Detector
 from pipeline.perceive.models.manifest import load_manifest
-from pipeline.perceive.models.segmenter import Segmenter
+from pipeline.perceive.models.source import Segmenter
 from tests.makers.real_models import write_real_manifests
 
 pytestmark = [pytest.mark.real_logs]

@@ -42,12 +42,12 @@ from pipeline.calibrate.joint.camera_lidar.refine import (
     weighted,
 )
 from pipeline.calibrate.joint.camera_lidar.rotation_search import TERMS as BASIN_TERMS
-from pipeline.calibrate.joint.part_turn import PartTurn
 from pipeline.calibrate.numerics.covariance import OBSERVABLE
 from pipeline.calibrate.numerics.frame_blocks import Scenes
 from pipeline.calibrate.numerics.nuisances import (
     TZ_COMMON_BIAS_M,
     Considered,
+    PartTurn,
     considered_numbers,
     estimate_biases,
 )
@@ -59,8 +59,8 @@ from pipeline.objective.camera_lidar.label_width import label_width_px, widened
 from pipeline.objective.camera_lidar.points import lidar_velocities
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms, prepare_terms
 from pipeline.objective.stamp_gaps import constant_gap_s, gaps_s
-from pipeline.rig.changes import change_jacobian
 from pipeline.rig.estimates import PairEstimate, Prior, common_part
+from pipeline.rig.se3 import change_jacobian
 from schemas.observations import Observation
 
 __all__ = ["Aligned", "AlignmentState", "align_camera_lidar", "analyse_camera_lidar"]

@@ -43,9 +43,8 @@ from pipeline.calibrate.numerics.nuisances import (
 from pipeline.calibrate.reasons import because
 from pipeline.core.rigs import CameraPrior
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms
-from pipeline.rig.changes import change_between, change_jacobian
-from pipeline.rig.checks import Check
-from pipeline.rig.estimates import Prior
+from pipeline.rig.estimates import Check, Prior
+from pipeline.rig.se3 import change_between, change_jacobian
 
 __all__ = ["DayIntrinsics", "contradictions", "measure_intrinsics"]
 

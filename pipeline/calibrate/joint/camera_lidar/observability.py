@@ -50,8 +50,8 @@ from pipeline.calibrate.numerics.nuisances import (
 )
 from pipeline.core.config import SolveConfig
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms
-from pipeline.rig.changes import change_jacobian
 from pipeline.rig.estimates import DayParts, Prior, prior_share
+from pipeline.rig.se3 import change_jacobian
 from schemas.observations import Observation
 
 __all__ = [

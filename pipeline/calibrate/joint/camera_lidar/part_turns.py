@@ -23,14 +23,18 @@ import numpy as np
 from jaxtyping import Float, Int, Int64
 
 from pipeline.calibrate.joint.camera_lidar.refine import AlignmentState
-from pipeline.calibrate.joint.part_turn import PartTurn
 from pipeline.calibrate.numerics.covariance import CLEARLY
-from pipeline.calibrate.numerics.nuisances import CAMERA_LIDAR_BIAS, EDGE_SIDE_MOST_OF_GAP, EDGE_SIDE_MOST_PX
+from pipeline.calibrate.numerics.nuisances import (
+    CAMERA_LIDAR_BIAS,
+    EDGE_SIDE_MOST_OF_GAP,
+    EDGE_SIDE_MOST_PX,
+    PartTurn,
+)
 from pipeline.calibrate.reasons import because
 from pipeline.objective.camera_lidar.points import Points
 from pipeline.objective.camera_lidar.score import KernelSettings, Terms
 from pipeline.rig.cameras import camera_of
-from pipeline.rig.checks import Check, change_of
+from pipeline.rig.estimates import Check, change_of
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT, Observation
 
 __all__ = ["box_offsets", "disagreement", "turn_numbers", "turns_by_parts"]

@@ -8,12 +8,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float, Int64
 
-from pipeline.calibrate.joint.part_turn import PartTurn
+from pipeline.calibrate.numerics.nuisances import PartTurn
 from pipeline.calibrate.reasons import because
 from pipeline.objective.radar.heights import Heights
 from pipeline.objective.radar.registration import RegistrationFrames
 from pipeline.objective.radar.travel import TravelDirections
-from pipeline.rig.spherical import to_spherical
+from pipeline.rig.se3 import to_spherical
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, Observation
 
 __all__ = [

@@ -45,10 +45,9 @@ from pipeline.calibrate.joint.lidar_radar.search import (
     scan,
     time_offset_scatter_s,
 )
-from pipeline.calibrate.joint.part_turn import PartTurn
 from pipeline.calibrate.numerics.covariance import bootstrap_covariance
 from pipeline.calibrate.numerics.frame_blocks import blocks_of, parts_of_day, scenes_of, with_parts
-from pipeline.calibrate.numerics.nuisances import estimate_biases
+from pipeline.calibrate.numerics.nuisances import PartTurn, estimate_biases
 from pipeline.calibrate.reasons import because
 from pipeline.core.config import SolveConfig
 from pipeline.core.errors import SolveError
@@ -57,8 +56,8 @@ from pipeline.objective.radar.moving_clusters import moving_clusters
 from pipeline.objective.radar.registration import registration_frames
 from pipeline.objective.radar.travel import travel_directions
 from pipeline.objective.stamp_gaps import constant_gap_s, gaps_s
-from pipeline.rig.changes import change_between, change_jacobian
 from pipeline.rig.estimates import DayParts, PairEstimate, Prior, common_part
+from pipeline.rig.se3 import change_between, change_jacobian
 from schemas.observations import Observation
 
 __all__ = ["contradicts_odometry", "estimate_lidar_radar", "turns_unmeasured"]

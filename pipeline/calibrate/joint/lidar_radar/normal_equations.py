@@ -33,18 +33,18 @@ from pipeline.calibrate.joint.lidar_radar.problem import (
     RadarState,
     Sums,
 )
-from pipeline.calibrate.joint.part_turn import PartTurn
 from pipeline.calibrate.numerics.nuisances import (
     OUTLIER_DENSITY,
     PRIOR_CONTRADICTION_SIGMAS,
     RANGE_BIAS_SIGMA_M,
+    PartTurn,
 )
 from pipeline.objective.radar.heights import Heights
 from pipeline.objective.radar.moving_clusters import azimuth_equations_lidar
 from pipeline.objective.radar.registration import NormalEquations, normal_equations
 from pipeline.objective.radar.travel import DOPPLER_PITCH_FLOOR_RAD, pitch_equations
 from pipeline.objective.radar.vehicle_boxes import BIAS_SIGMA_RAD
-from pipeline.rig.changes import change_between, change_jacobian
+from pipeline.rig.se3 import change_between, change_jacobian
 
 __all__ = [
     "add_elevations",

@@ -29,7 +29,6 @@ from pipeline.calibrate.joint.lidar_radar.search import (
     finish,
     last_step,
 )
-from pipeline.calibrate.joint.part_turn import PartTurn
 from pipeline.calibrate.numerics.covariance import OBSERVABLE, bootstrap_covariance, covariance_with_fixed
 from pipeline.calibrate.numerics.frame_blocks import blocks_of
 from pipeline.calibrate.numerics.nuisances import (
@@ -38,14 +37,15 @@ from pipeline.calibrate.numerics.nuisances import (
     RADAR_ELEVATION_BIAS_RAD,
     RANGE_BIAS_SIGMA_M,
     Considered,
+    PartTurn,
     considered_covariance,
     considered_numbers,
     root_rows,
 )
 from pipeline.calibrate.reasons import because
 from pipeline.core.config import SolveConfig
-from pipeline.rig.changes import change_between
 from pipeline.rig.estimates import prior_share
+from pipeline.rig.se3 import change_between
 
 __all__ = [
     "ObservabilityAnalysis",
