@@ -17,7 +17,8 @@ from pipeline.rig.se3 import from_spherical
 from pipeline.simulate.sensors.rig_spec import LidarSpec
 from pipeline.simulate.world.casting import Hits, Moment
 from pipeline.simulate.world.drives import Motion
-from pipeline.simulate.world.materials import LABELS, TABLE, material, textures
+from pipeline.simulate.world.materials import LABELS, TABLE, material
+from pipeline.simulate.world.textures import textures
 
 __all__ = ["Sweep", "beams_of", "sweep_lidar"]
 
