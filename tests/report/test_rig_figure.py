@@ -40,12 +40,11 @@ def test_a_view_to_the_left_is_drawn_to_the_left():
 
 
 def test_every_sensor_and_edge_is_there_and_names_cannot_break_the_page():
-    sensors = [sensor(f"s<{k}>", "radar", 30 * k, np.cos(k), np.sin(k), status="none") for k in range(9)]
-    edges = [
-        make_record(np.random.default_rng(0), "k", parent_frame="s<0>", child_frame=b, status="held")
-        for b in ("s<1>", "gone")
-    ]
+    sensors = [sensor(f"s<{k}>", "radar", 30 * k, np.cos(k), np.sin(k), status="none") for k in range(30)]
+    about = {"parent_frame": "s<0>", "status": "held"}
+    edges = [make_record(np.random.default_rng(0), "k", child_frame=b, **about) for b in ("s<1>", "gone")]
     drawing = str(rig_figure(sensors, edges))
     assert "s<0>" not in drawing
-    assert all(drawing.count(f"s&lt;{k}&gt;</t") + drawing.count(f"s&lt;{k}&gt;<ts") for k in range(9))
+    assert all(drawing.count(f"s&lt;{k}&gt;</t") + drawing.count(f"s&lt;{k}&gt;<ts") for k in range(30))
+    assert 'y="-' not in drawing  # the drawing grows with its columns of names
     assert drawing.count("stroke-dasharray") == 1  # an edge to a sensor that the rig lacks is not drawn
