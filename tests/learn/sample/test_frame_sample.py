@@ -20,6 +20,7 @@ from pipeline.learn.sample.frame_sample import (
     stored_grid,
 )
 from pipeline.learn.sample.grid import grid_rays, resample_camera
+from pipeline.learn.sample.rendering import lidar_features
 from pipeline.rig.cameras import Camera
 from pipeline.rig.estimates import Prior
 from pipeline.rig.se3 import camera_direction_angles, transform_points
@@ -109,9 +110,8 @@ def test_lidar_points_fall_on_their_object_in_the_grid_and_boxes_around_it():
     grid = stored_grid((row.grid_height, row.grid_width), row.grid_step_deg)
     is_object = (row.lidar_flags & POINT_IS_GROUND) == 0
     points = row.lidar_xyz_m[: row.lidar_count][is_object[: row.lidar_count]].astype(float)
-    azimuth, elevation = np.degrees(
-        camera_direction_angles(transform_points(solve_scenes.T_CAMERA_LIDAR, points))
-    ).T
+    seen_from = transform_points(solve_scenes.T_CAMERA_LIDAR, points)
+    azimuth, elevation = np.degrees(camera_direction_angles(seen_from)).T
     column = np.floor((grid.left_deg - azimuth) / grid.cell_deg).astype(int)
     line = np.floor((grid.top_deg - elevation) / grid.cell_deg).astype(int)
     seen = (column >= 0) & (column < grid.width) & (line >= 0) & (line < grid.height)
@@ -120,9 +120,8 @@ def test_lidar_points_fall_on_their_object_in_the_grid_and_boxes_around_it():
     azimuth, elevation, line, column = (x[seen] for x in (azimuth, elevation, line, column))
     shown = row.grid_class.reshape(grid.height, grid.width)[line, column]
     assert np.mean(shown == GRID_CLASSES.index("vehicle")) > 0.9
-    left, top, right, bottom = np.degrees(row.detection_box_rad[: row.detection_count, :, None]).transpose(
-        1, 0, 2
-    )
+    boxes = np.degrees(row.detection_box_rad[: row.detection_count, :, None])
+    left, top, right, bottom = boxes.transpose(1, 0, 2)
     margin = 0.3
     inside = (azimuth < left + margin) & (azimuth > right - margin)
     inside &= (elevation < top + margin) & (elevation > bottom - margin)
@@ -160,6 +159,7 @@ def test_no_semantics_of_the_camera_reach_the_lidar_points_of_the_input():
         assert np.array_equal(getattr(a, name), getattr(b, name)), name
     flags = a.lidar_flags[: a.lidar_count]
     assert set(np.unique(flags & POINT_IS_GROUND)) == {0, POINT_IS_GROUND}
+    assert np.array_equal(lidar_features(a)[:, 3], (flags & POINT_IS_GROUND) > 0)  # as LIDAR_FEATURES has it
 
 
 def test_a_network_is_asked_with_the_same_numbers_that_it_was_taught_with():
