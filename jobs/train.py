@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["parse_duration", "train"]
 
-_NOT_VALIDATED = "prepare a side val and train in a new folder: do not use a network that was not validated"
+_NOT_VALIDATED = "do not use it, it was not validated: set val_fraction, prepare, and train in a new folder"
 _UNIT_S = {"s": 1.0, "m": 60.0, "h": 3600.0}
 
 

@@ -73,7 +73,7 @@ def warnings_of(calibration: ExportedCalibration) -> list[str]:
     replaced = replaced_transforms(calibration)
     if replaced:
         found.append(
-            f"remove these from the car's own /tf_static: a frame has one parent: {', '.join(replaced)}"
+            f"a frame has one parent: remove from the car's own /tf_static what this replaces: {', '.join(replaced)}"
         )
     return [" ".join(words.split()) for words in found]
 

@@ -36,7 +36,7 @@ REASONS = {
     "CameraInfo": "log a sensor_msgs/CameraInfo with a calibrated K",
     # What degrees of freedom lack.
     "too few": "{frames} usable synchronised frames; at least {needed} are needed",
-    "few": "{frames} usable frames; {needed} or more make it sharp",
+    "few": "{frames} usable frames: record {needed} or more",
     "no frames": "{reason} (prior, labels and motion were therefore not checked)",
     "no prior": "no prior: log /tf_static with a chain between the sensors, or give prior.file",
     "no semantics": f"{{without}}; better {_LABELS}",

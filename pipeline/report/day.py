@@ -264,7 +264,7 @@ def _known_to(pair: str, sigma: np.ndarray | None, observable: Sequence[bool]) -
         if seen:
             worst = max(seen, key=lambda k: sigma[k])
             text = f"{scaled(sigma[worst], DOF_NAMES[worst]):.2g} {unit_of(DOF_NAMES[worst])}"
-            parts.append(f"{name} ± {text} ({dof_title(pair, DOF_NAMES[worst])})")
+            parts.append(f"{name} {text} ({dof_title(pair, DOF_NAMES[worst])})")
     return ", ".join(parts) or "no degree of freedom"
 
 

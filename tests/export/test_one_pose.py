@@ -250,7 +250,7 @@ def test_the_tree_has_the_root_of_the_car_s_own_tf_and_names_what_it_replaces(la
     np.testing.assert_allclose(tree.lookup("base_link", "radar_front"), wanted, atol=1e-12)
     replaced = ["camera_link -> front_optical", "base_link -> radar_front", "base_link -> roof"]
     assert side_of(files)["replaces_in_tf_static"] == replaced
-    words = f"remove these from the car's own /tf_static: a frame has one parent: {', '.join(replaced)}"
+    words = f"a frame has one parent: remove from the car's own /tf_static what this replaces: {', '.join(replaced)}"
     assert words in said.err
     assert words in files["static_transforms.launch.yaml"].decode()
 

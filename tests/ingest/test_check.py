@@ -41,7 +41,7 @@ def judge(**changes):
         ({"labels_share": 0.0}, "camera_lidar", "pitch", "no", "no semantic labels", "partly"),
         ({"labels_share": 0.0, "names_semantics": False}, "camera_radar", "yaw", "no", "no boxes", "partly"),
         ({"moving_share": 0.0}, "lidar_radar", "time offset", "no", "the car moves in 0%", "partly"),
-        ({"frames": 15}, "camera_lidar", "yaw and roll", "weak", "15 usable frames; 30 or more make it sharp", "weak"),
+        ({"frames": 15}, "camera_lidar", "yaw and roll", "weak", "15 usable frames: record 30 or more", "weak"),
         ({"has_intensity": False}, "camera_lidar", "pitch", "weak", "the lidar has few rings", "yes"),
         ({"has_intensity": False, "rings": 64}, "camera_lidar", "pitch", "yes", "", "yes"),
         ({"doppler_problem": "odd"}, "lidar_radar", "yaw, x and y", "weak", "odd", "weak"),
