@@ -77,7 +77,7 @@ def state(
     elif rows:
         sys.stdout.write(state_text(rows, signed))
     else:
-        sys.stdout.write(f"states: none in {lake}; boresight nightly and boresight audit write them\n")
+        sys.stdout.write(f"no state in {lake}: run `boresight nightly`\n")
     return 3 if left_out(tables) else 0
 
 
