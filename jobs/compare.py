@@ -19,7 +19,7 @@ from pipeline.export.compare import compare as compare_sides
 from pipeline.report.comparison import comparison_page
 from pipeline.report.page import write_page
 from pipeline.report.words import dof_title, scaled, unit_of
-from pipeline.rig.differences import PairDifference
+from pipeline.rig.targets import PairDifference
 from schemas.calibrations import DOF_NAMES
 
 __all__ = ["compare"]

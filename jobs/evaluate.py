@@ -15,7 +15,7 @@ from pipeline.evaluate.recording import ReflectorFiles
 from pipeline.evaluate.table import as_markdown, as_parquet, table_rows
 from pipeline.report.evaluation import page_of_runs
 from pipeline.report.page import write_page
-from pipeline.rig.differences import ComparedRun
+from pipeline.rig.targets import ComparedRun
 from pipeline.store.partitions import Lake
 from pipeline.store.records import read_records
 from schemas.calibrations import CALIBRATIONS, CalibrationRecord

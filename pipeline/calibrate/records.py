@@ -75,7 +75,7 @@ def record_of(
         record,
         **_prior_fields(pair, day.prior),
         **_loop_fields(day.solution),
-        frames_rejected={n: sum(of.get(n, 0) for of in rejected) for n in {*rejected[0], *rejected[1]}},
+        frames_rejected={n: sum(of.get(n, 0) for of in rejected) for n in {**rejected[0], **rejected[1]}},
         environment=environment_of(day.observations),
         triggered=day.triggered[pair],
         trigger_before=dict(day.trigger_before[pair]),

@@ -10,9 +10,10 @@ from jaxtyping import Float
 
 from pipeline.evaluate.recording import ReflectorFiles, file_of_day
 from pipeline.rig.day_prior import read_transforms
-from pipeline.rig.differences import ComparedRun, Comparison
 from pipeline.rig.se3 import from_quaternion, inverse, log_se3
 from pipeline.rig.targets import (
+    ComparedRun,
+    Comparison,
     Picks,
     PickUncertainty,
     error_sigma_at_picks,

@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipeline.rig.differences import Comparison
+from pipeline.rig.targets import Comparison
 from schemas.calibrations import METHODS, PAIRS
 
 __all__ = ["TableRow", "as_markdown", "as_parquet", "table_rows"]

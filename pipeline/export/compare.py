@@ -10,10 +10,9 @@ from jaxtyping import Float
 
 from pipeline.export.calibration import ExportedPair
 from pipeline.export.tree import ESTIMATED_PAIRS
-from pipeline.rig.differences import PairDifference
 from pipeline.rig.graph import EDGE_OF_PAIR, edge_order
 from pipeline.rig.se3 import change_between, change_covariance, inverse, log_se3
-from pipeline.rig.targets import target_sigmas
+from pipeline.rig.targets import PairDifference, target_sigmas
 
 __all__ = ["Side", "compare", "composed"]
 

@@ -11,7 +11,7 @@ from markupsafe import Markup
 
 from pipeline.report.page import render
 from pipeline.report.words import ANSWERS, dof_title, scaled, unit_of
-from pipeline.rig.differences import PairDifference
+from pipeline.rig.targets import PairDifference
 from schemas.calibrations import DOF_NAMES
 
 __all__ = ["comparison_page", "in_use_view"]

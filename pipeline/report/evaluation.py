@@ -17,8 +17,8 @@ from pipeline.report.reading import choose_frames
 from pipeline.report.residuals import as_stamped, time_offsets_of
 from pipeline.report.svg import MUTED, Plot, document
 from pipeline.report.words import PAIR_TITLES
-from pipeline.rig.differences import ComparedRun
 from pipeline.rig.se3 import transform_points
+from pipeline.rig.targets import ComparedRun
 from pipeline.store.current import prior_of, targets_of, transform_of
 from pipeline.store.partitions import Lake, Partition
 from pipeline.store.views import frames_of, ingested, observations_of, perceived

@@ -9,9 +9,9 @@ import pytest
 from pipeline.export.calibration import ExportedPair
 from pipeline.export.compare import Side, compare, composed
 from pipeline.report.comparison import comparison_page
-from pipeline.rig.differences import PairDifference
 from pipeline.rig.graph import EDGE_OF_PAIR
 from pipeline.rig.se3 import exp_se3, exp_so3
+from pipeline.rig.targets import PairDifference
 from pipeline.store.commits import commit_records
 from pipeline.store.partitions import Lake
 from schemas.calibrations import CALIBRATIONS

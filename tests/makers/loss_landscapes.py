@@ -17,7 +17,7 @@ from scipy.interpolate import CubicSpline
 
 from pipeline.core.config import load_fleet
 from pipeline.learn.batches.batch import TrainingBatch, collate
-from pipeline.learn.prepare.reference import reference_of, usable_records
+from pipeline.learn.prepare.survey import reference_of, usable_records
 from pipeline.learn.sample.frame_sample import About, make_row
 from pipeline.learn.train.frame_objective import FrameObjective, frame_objective, weighted
 from pipeline.learn.train.settings import LossConfig

@@ -19,20 +19,20 @@ from pipeline.objective.differentiable.paper import (
     lidar_radar_tensors,
     padded,
 )
-from pipeline.objective.differentiable.poses import (
+from pipeline.objective.differentiable.projection import (
+    camera_projection,
     euler_angles,
     inverse,
     loop_loss,
     pose_of_euler_angles,
     transform_points,
 )
-from pipeline.objective.differentiable.projection import camera_projection
 from pipeline.objective.differentiable.static import StaticFrames, static_cost, tells_elevation
 from pipeline.objective.differentiable.terms import edge_residuals_px
 from pipeline.objective.paper import classes
 from pipeline.objective.paper.camera_lidar import camera_lidar_loss
 from pipeline.objective.paper.camera_radar import camera_radar_loss
-from pipeline.objective.paper.cost_maps import fold_frames, frame_costs
+from pipeline.objective.paper.classes import fold_frames, frame_costs
 from pipeline.objective.paper.lidar_radar import lidar_radar_loss
 from pipeline.objective.radar.registration import (
     BOUNCE_PRIOR,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.objective.paper.cost_maps import fold_frames, frame_costs
+from pipeline.objective.paper.classes import fold_frames, frame_costs
 from pipeline.rig.cameras import Camera
 from pipeline.rig.se3 import exp_se3
 

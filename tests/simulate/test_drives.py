@@ -5,8 +5,8 @@ import pytest
 
 from pipeline.simulate.logs.recording import _odometry
 from pipeline.simulate.world.casting import World, chunk_mesh
-from pipeline.simulate.world.chunk import CHUNK_M
 from pipeline.simulate.world.drives import Drive
+from pipeline.simulate.world.meshes import CHUNK_M
 from pipeline.simulate.world.traffic import actors_at
 
 

@@ -33,7 +33,7 @@ from pipeline.learn.network.matching_network import MatchingCore
 from pipeline.learn.network.outputs import CoreOutputs, Heads, Predictions
 from pipeline.learn.network.views import NetworkInputs, RenderedView, render
 from pipeline.learn.sample.grid import CAMERA_CHANNELS, LIDAR_CHANNELS, PAIRS, RADAR_CHANNELS, NetworkConfig
-from pipeline.objective.differentiable.poses import inverse, transform_points
+from pipeline.objective.differentiable.projection import inverse, transform_points
 from schemas.training import GRID_CLASSES
 
 __all__ = ["WEIGHTS", "CalibrationNetwork", "ConcatCore", "build_network", "network_of_file", "weight_places"]

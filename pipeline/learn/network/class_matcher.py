@@ -21,7 +21,7 @@ from torch.nn import functional as F  # noqa: N812 - the name that everybody use
 from pipeline.learn.network.least_squares import Match, angular_jacobian, damped_match
 from pipeline.learn.network.views import grid_cells, sphere
 from pipeline.learn.sample.grid import Grid
-from pipeline.objective.differentiable.poses import exp_so3
+from pipeline.objective.differentiable.projection import exp_so3
 
 __all__ = ["FLOOR", "NEUTRAL", "ClassMatcher"]
 

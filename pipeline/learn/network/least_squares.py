@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pipeline.objective.differentiable.poses import exp_so3
+from pipeline.objective.differentiable.projection import exp_so3
 
 __all__ = ["Match", "angular_jacobian", "damped_match", "small_rotation_vector", "spherical_jacobian"]
 

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from pipeline.learn.network.least_squares import Match, damped_match, spherical_jacobian
-from pipeline.objective.differentiable.poses import exp_so3
+from pipeline.objective.differentiable.projection import exp_so3
 
 __all__ = ["OccupancyMatcher"]
 

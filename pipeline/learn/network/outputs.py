@@ -9,7 +9,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
 from pipeline.learn.sample.grid import PAIRS
-from pipeline.objective.differentiable.poses import exp_so3, pose, pose_of_euler_angles
+from pipeline.objective.differentiable.projection import exp_so3, pose, pose_of_euler_angles
 
 __all__ = ["PAIRS", "ClassEvidence", "CoreOutputs", "Heads", "Predictions", "pose_of_twist"]
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from pipeline.learn.batches.batch import TrainingBatch
 from pipeline.learn.sample.grid import CLASS_CONFIDENCE, Grid
 from pipeline.learn.sample.rendering import render_lidar, render_radar
-from pipeline.objective.differentiable.poses import transform_points
+from pipeline.objective.differentiable.projection import transform_points
 from schemas.training import GRID_CLASSES, UNKNOWN_CLASS
 
 __all__ = [

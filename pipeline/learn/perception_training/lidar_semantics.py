@@ -32,7 +32,7 @@ from pipeline.learn.perception_training.trainer import (
     split_days,
     vehicle_days,
 )
-from pipeline.learn.prepare.reference import usable_records
+from pipeline.learn.prepare.survey import usable_records
 from pipeline.learn.train.settings import Count
 from pipeline.objective.paper.classes import labels_of
 from pipeline.rig.cameras import camera_of

@@ -14,10 +14,9 @@ import numpy as np
 
 from pipeline.core.errors import SolveError
 from pipeline.core.stage_work import Run, Task, Work
-from pipeline.learn.prepare.reference import reference_of, usable_records
 from pipeline.learn.prepare.sides import frame_sides, split_rule
 from pipeline.learn.prepare.split import SplitPlan, Unit
-from pipeline.learn.prepare.survey import Survey, survey_day
+from pipeline.learn.prepare.survey import Survey, reference_of, survey_day, usable_records
 from pipeline.learn.sample.frame_sample import About, SampleReason, SampleRejectedError, make_row
 from pipeline.rig.day_prior import prior_key, read_prior
 from pipeline.store.views import Chosen, frames_of, observations_of

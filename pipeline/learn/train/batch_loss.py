@@ -24,8 +24,7 @@ from pipeline.learn.train.frame_objective import (
 )
 from pipeline.learn.train.paper_objective import PaperFrames
 from pipeline.learn.train.settings import PAIRS_OF, TrainConfig
-from pipeline.objective.differentiable.poses import pose, transform_points
-from pipeline.objective.differentiable.projection import GridProjection
+from pipeline.objective.differentiable.projection import GridProjection, pose, transform_points
 from pipeline.objective.differentiable.terms import class_evidence_cost
 from schemas.training import UNKNOWN_CLASS
 

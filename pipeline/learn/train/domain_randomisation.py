@@ -26,7 +26,7 @@ from pipeline.learn.network.views import SensorInputs
 from pipeline.learn.sample.frame_sample import stored_grid
 from pipeline.learn.sample.grid import CAMERA_CHANNELS, FEATURE_UNITS, LIDAR_FEATURES, grid_rays
 from pipeline.learn.train.settings import AugmentConfig, StrangeConfig
-from pipeline.objective.differentiable.poses import exp_so3, inverse, pose
+from pipeline.objective.differentiable.projection import exp_so3, inverse, pose
 from schemas.observations import EDGE_ABOVE, EDGE_BELOW, EDGE_LEFT, EDGE_RIGHT
 from schemas.training import NO_EDGE, UNKNOWN_CLASS
 

@@ -16,8 +16,14 @@ from torch import Tensor
 
 from pipeline.learn.batches.batch import TrainingBatch
 from pipeline.learn.train.settings import PAIRS_OF, LossConfig
-from pipeline.objective.differentiable.poses import exp_so3, inverse, loop_loss, transform_points
-from pipeline.objective.differentiable.projection import GridProjection, nearest_pixel
+from pipeline.objective.differentiable.projection import (
+    GridProjection,
+    exp_so3,
+    inverse,
+    loop_loss,
+    nearest_pixel,
+    transform_points,
+)
 from pipeline.objective.differentiable.static import (
     StaticFrames,
     elevation_limits,

@@ -27,7 +27,7 @@ from pipeline.objective.differentiable.paper import (
     folded_tensors,
     lidar_radar_tensors,
 )
-from pipeline.objective.differentiable.poses import loop_loss
+from pipeline.objective.differentiable.projection import loop_loss
 from pipeline.objective.paper.camera_lidar import camera_lidar_loss
 from pipeline.objective.paper.camera_radar import camera_radar_loss
 from pipeline.objective.paper.lidar_radar import lidar_radar_loss

@@ -17,16 +17,17 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pipeline.objective.differentiable.poses import inverse, transform_points
 from pipeline.objective.differentiable.projection import (
     CameraProjection,
     bilinear,
     camera_projection,
+    inverse,
     masked_mean,
+    transform_points,
 )
 from pipeline.objective.paper import camera_radar, lidar_radar
 from pipeline.objective.paper.camera_radar import CameraRadarLoss
-from pipeline.objective.paper.cost_maps import FoldedFrames
+from pipeline.objective.paper.classes import FoldedFrames
 from pipeline.objective.paper.lidar_radar import LidarRadarLoss
 
 __all__ = [

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pipeline.objective.differentiable.poses import inverse, transform_points
+from pipeline.objective.differentiable.projection import inverse, transform_points
 from pipeline.objective.radar.registration import (
     BOUNCE_PRIOR,
     RANGE_M,

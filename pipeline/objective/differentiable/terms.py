@@ -17,11 +17,14 @@ from torch import Tensor
 from torch.nn import functional as F  # noqa: N812 - the name that everybody uses
 
 from pipeline.objective.camera_lidar.image_maps import NO_BOUNDARY
-from pipeline.objective.differentiable.poses import exp_so3, inverse, pose, transform_points
 from pipeline.objective.differentiable.projection import (
     GridProjection,
+    exp_so3,
+    inverse,
     masked_mean,
     nearest_pixel,
+    pose,
+    transform_points,
 )
 from pipeline.objective.radar.registration import SIGMA_START
 

@@ -17,14 +17,16 @@ from jaxtyping import Bool, Float
 
 from pipeline.objective.paper.classes import (
     SKY,
+    FoldedFrames,
     camera_at_label_size,
     distance_cost,
+    fold_frames,
+    frame_costs,
     in_range,
     labels_of,
     safely_in_view,
     thin,
 )
-from pipeline.objective.paper.cost_maps import FoldedFrames, fold_frames, frame_costs
 from pipeline.rig.se3 import transform_points
 from schemas.observations import Observation
 

@@ -19,10 +19,9 @@ from jaxtyping import Float
 
 from pipeline.core.rows import join_rows
 from pipeline.simulate.world.actors import actor_mesh
-from pipeline.simulate.world.chunk import CHUNK_M, Chunk
 from pipeline.simulate.world.drives import Drive
 from pipeline.simulate.world.landscapes import LANDSCAPES, Landscape
-from pipeline.simulate.world.meshes import Mesh, placed
+from pipeline.simulate.world.meshes import CHUNK_M, Chunk, Mesh, placed
 from pipeline.simulate.world.street import (
     add_asphalt,
     add_halls,

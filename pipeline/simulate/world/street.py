@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.simulate.world.actors import HOLLOW, VARIANTS, actor_mesh
-from pipeline.simulate.world.chunk import CHUNK_M, Chunk, Span
 from pipeline.simulate.world.landscapes import Fence
-from pipeline.simulate.world.meshes import MeshBuilder
+from pipeline.simulate.world.meshes import CHUNK_M, Chunk, MeshBuilder, Span
 from pipeline.simulate.world.props import (
     PANEL,
     SIGN_COLOURS,

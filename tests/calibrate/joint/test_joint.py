@@ -12,7 +12,7 @@ from pipeline.calibrate.joint.camera_lidar.initialise import Basin
 from pipeline.calibrate.joint.camera_lidar.intrinsics import DayIntrinsics
 from pipeline.calibrate.joint.solve import solve_joint
 from pipeline.core.config import TERMS, SolveConfig
-from pipeline.objective.camera_lidar.kernel_settings import KernelSettings
+from pipeline.objective.camera_lidar.score import KernelSettings
 from pipeline.objective.ego_motion import shown_heading
 from pipeline.rig.estimates import PairEstimate, Prior
 from pipeline.rig.se3 import exp_se3, log_se3, perturb_exactly

@@ -12,8 +12,7 @@ from pipeline.learn.network.calibration_network import build_network
 from pipeline.learn.network.views import NetworkInputs, crop, render, sensor_inputs
 from pipeline.learn.sample.grid import GRAPH_INPUTS, PAIRS, Grid, NetworkConfig
 from pipeline.learn.train.batch_loss import class_of_points, semantics_loss
-from pipeline.objective.differentiable.poses import transform_points
-from pipeline.objective.differentiable.projection import GridProjection
+from pipeline.objective.differentiable.projection import GridProjection, transform_points
 from pipeline.objective.differentiable.terms import class_evidence_cost
 from tests.makers import training_lakes
 

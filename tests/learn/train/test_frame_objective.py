@@ -19,7 +19,7 @@ from pipeline.learn.train.frame_objective import (
 )
 from pipeline.learn.train.settings import AugmentConfig, LossConfig
 from pipeline.objective.camera_lidar.points import moving_poses
-from pipeline.objective.differentiable.poses import transform_points
+from pipeline.objective.differentiable.projection import transform_points
 from pipeline.rig import se3
 from pipeline.store.partitions import Lake
 from schemas.training import UNKNOWN_CLASS
